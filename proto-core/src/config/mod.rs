@@ -1,0 +1,363 @@
+//! The gateway's configuration as the engine takes it: TOML on the host and postcard on the board
+//! end in these types (docs/architecture.md section 5).
+//!
+//! Bounded and plain: names are kept for messages, everything else is numbers. Nothing here has
+//! been checked until [`GatewayConfig::validate`] said so.
+
+use heapless::{String, Vec};
+
+use crate::recipe::model::{CanId, MAX_CAN_IDS, MAX_DELIMITER, Mode};
+use crate::sysvar::SysVar;
+use crate::time::Duration;
+use crate::wire::scalar::ScalarType;
+
+/// Most field ports, and most listening ports for the controller's own clients.
+pub const MAX_PORTS: usize = 8;
+/// Most recipes in one configuration.
+pub const MAX_RECIPES: usize = 16;
+/// Fields over all recipes together.
+pub const MAX_ALL_FIELDS: usize = 1024;
+/// Entries over all command tables together.
+pub const MAX_COMMANDS: usize = 32;
+/// Safe values over all ports together.
+pub const MAX_SAFE_VALUES: usize = 64;
+/// Longest name of a recipe or port, in bytes.
+pub const MAX_NAME: usize = 32;
+
+/// A recipe's or port's name.
+pub type Name = String<MAX_NAME>;
+/// A stream part's head or tail.
+pub type Delimiter = Vec<u8, MAX_DELIMITER>;
+
+/// A whole gateway file.
+#[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct GatewayConfig {
+    /// Where the controller is and what it speaks.
+    pub controller: ControllerLink,
+    /// Every recipe, in file order.
+    pub recipes: Vec<Recipe, MAX_RECIPES>,
+    /// Every port, in file order.
+    pub ports: Vec<Port, MAX_PORTS>,
+    /// The fields of all recipes; parts name ranges of it.
+    pub fields: Vec<FieldSpec, MAX_ALL_FIELDS>,
+    /// The entries of all command tables; bindings name ranges of it.
+    pub commands: Vec<CommandEntry, MAX_COMMANDS>,
+    /// What inputs become when their port times out; ports name ranges of it.
+    pub safe_values: Vec<SafeValue, MAX_SAFE_VALUES>,
+}
+
+/// The controller's side of the gateway.
+#[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct ControllerLink {
+    /// Address or host name; empty on a board that learns it otherwise.
+    pub address: String<64>,
+    /// Name of the dialect (see [`crate::wire::dialect`]).
+    pub dialect: String<16>,
+    /// Port 2000 or where it was moved to.
+    pub command_port: u16,
+    /// Port 2001.
+    pub state_port: u16,
+    /// Port 502.
+    pub modbus_port: u16,
+    /// The controller's UDP 2011 recipe server, when it is set to one of our recipes.
+    pub recipe_link: Option<RecipeLink>,
+}
+
+/// The controller's own recipe port, used as the fast way up.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct RecipeLink {
+    /// UDP port on the controller, normally 2011.
+    pub udp_port: u16,
+    /// Index into [`GatewayConfig::recipes`].
+    pub recipe: u8,
+}
+
+/// One recipe.
+#[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct Recipe {
+    /// Its name.
+    pub name: Name,
+    /// System variables, or user-defined fields.
+    pub mode: Mode,
+    /// Stream or CAN, with the parts.
+    pub parts: Parts,
+    /// What a port does while the sources of its output are stale.
+    pub on_stale: OnStale,
+    /// What makes a port send the output part.
+    pub send: SendOn,
+}
+
+/// A recipe's two parts; either may be absent, not both.
+#[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub enum Parts {
+    /// Byte streams and datagrams.
+    Stream {
+        /// User to robot.
+        input: Option<StreamPart>,
+        /// Robot to user.
+        output: Option<StreamPart>,
+    },
+    /// CAN; an absent part has no frames.
+    Can {
+        /// User to robot.
+        input: Vec<CanFramePart, MAX_CAN_IDS>,
+        /// Robot to user.
+        output: Vec<CanFramePart, MAX_CAN_IDS>,
+    },
+}
+
+/// One part of a stream recipe.
+#[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct StreamPart {
+    /// Bytes before the fields.
+    pub head: Delimiter,
+    /// Bytes after the fields.
+    pub tail: Delimiter,
+    /// The fields.
+    pub fields: Span,
+}
+
+/// One frame id of a CAN recipe's part.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct CanFramePart {
+    /// The frame's id.
+    pub id: CanId,
+    /// The fields, at most 8 bytes together.
+    pub fields: Span,
+}
+
+/// A range of one of the pools of [`GatewayConfig`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct Span {
+    /// First index.
+    pub start: u16,
+    /// How many.
+    pub len: u16,
+}
+
+impl Span {
+    /// The part of `pool` this range names; empty when it does not fit.
+    pub fn of<T>(self, pool: &[T]) -> &[T] {
+        let start = usize::from(self.start);
+        pool.get(start..start.saturating_add(usize::from(self.len))).unwrap_or(&[])
+    }
+}
+
+/// One field with what the gateway does with it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub enum FieldSpec {
+    /// A system variable of a realtime recipe.
+    System(SysVar),
+    /// A field of a user-defined recipe's input part.
+    UserInput {
+        /// The field's type on the wire.
+        ty: ScalarType,
+        /// What its value does.
+        to: InputBinding,
+    },
+    /// A field of a user-defined recipe's output part.
+    UserOutput {
+        /// The field's type on the wire.
+        ty: ScalarType,
+        /// Where its value comes from.
+        from: OutputBinding,
+    },
+}
+
+/// What a received user-defined value does.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub enum InputBinding {
+    /// Nothing.
+    Unused,
+    /// `value * scale + offset` becomes the variable's value.
+    Variable {
+        /// An input variable.
+        var: SysVar,
+        /// Factor.
+        scale: f32,
+        /// Summand, after the factor.
+        offset: f32,
+    },
+    /// The value picks a port-2000 command from a table; a value not in the table does nothing.
+    Commands {
+        /// The table, in [`GatewayConfig::commands`].
+        table: Span,
+        /// When a value acts.
+        when: CommandWhen,
+    },
+}
+
+/// When a value that picks a command acts.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub enum CommandWhen {
+    /// When it differs from the frame before; the first frame after silence only sets the base.
+    #[default]
+    Change,
+    /// With every accepted frame: for devices that send a frame only when they mean it.
+    Frame,
+}
+
+/// Where a user-defined output value comes from.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub enum OutputBinding {
+    /// `variable * scale + offset`, saturated to the field's type.
+    Variable {
+        /// Any variable that the controller shows.
+        var: SysVar,
+        /// Factor.
+        scale: f32,
+        /// Summand, after the factor.
+        offset: f32,
+    },
+    /// Always the same.
+    Constant(f64),
+    /// Frames sent so far, wrapping in the field's type.
+    Counter,
+    /// How the newest command of this port went: see [`crate::engine::ReplyCode`].
+    Reply,
+}
+
+/// One line of a command table.
+#[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct CommandEntry {
+    /// The field's value that picks the command.
+    pub value: i64,
+    /// The command as port 2000 takes it, such as `run(pick.jspf,50)`.
+    pub text: String<MAX_COMMAND_TEXT>,
+}
+
+/// Longest command a table can hold, in bytes; well below what the controller takes (D5).
+pub const MAX_COMMAND_TEXT: usize = 96;
+
+/// What a port does while the sources of its output are older than `stale_after`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub enum OnStale {
+    /// Keep sending the last values.
+    #[default]
+    Hold,
+    /// Send nothing.
+    Stop,
+}
+
+/// What makes a port send its output part.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub enum SendOn {
+    /// The port's cycle; realtime recipes know nothing else.
+    #[default]
+    Period,
+    /// A changed value, looked at each cycle.
+    Change,
+    /// Every accepted input frame: request and response.
+    Frame,
+    /// A bit going from 0 to 1.
+    Rising {
+        /// A bit variable that the controller shows.
+        var: SysVar,
+        /// Bit 0..=7.
+        bit: u8,
+    },
+}
+
+/// One port.
+#[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct Port {
+    /// Its name, as `--bind` and `--stats` use it.
+    pub name: Name,
+    /// What it is.
+    pub bus: Bus,
+    /// Index into [`GatewayConfig::recipes`].
+    pub recipe: u8,
+    /// How often the output part is sent; at least 4 ms.
+    pub cycle: Duration,
+    /// After this long without an accepted frame the port's inputs take their safe values.
+    pub timeout: Duration,
+    /// What inputs become then; those not named hold.
+    pub on_timeout: Span,
+    /// Outputs whose source is older than this are stale.
+    pub stale_after: Duration,
+}
+
+/// What a port is.
+#[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub enum Bus {
+    /// Half-duplex serial line on the field side.
+    Rs485(Rs485),
+    /// CAN bus on the field side.
+    Can {
+        /// Bit/s, 10_000..=1_000_000.
+        bitrate: u32,
+    },
+    /// Where the controller's TCP client connects to: a way up, like the recipe link.
+    TcpListen {
+        /// Address and port, such as `0.0.0.0:50000`.
+        listen: String<48>,
+    },
+    /// Where the controller's UDP client sends to: a way up, like the recipe link.
+    UdpListen {
+        /// Address and port.
+        listen: String<48>,
+    },
+}
+
+impl Bus {
+    /// Whether devices (and not the controller) are at the other end.
+    pub fn is_field(&self) -> bool {
+        matches!(self, Self::Rs485(_) | Self::Can { .. })
+    }
+}
+
+/// A serial line's settings (D19, D20, D21).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct Rs485 {
+    /// Bit/s, 1200..=4_000_000.
+    pub baud: u32,
+    /// Parity bit.
+    pub parity: Parity,
+    /// 1 or 2.
+    pub stop_bits: u8,
+    /// A partial frame is discarded when the line was silent for this long.
+    pub idle_gap: Duration,
+    /// The line must have been silent for this long before we send.
+    pub turnaround: Duration,
+}
+
+/// A serial line's parity.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub enum Parity {
+    /// No parity bit.
+    #[default]
+    None,
+    /// Even.
+    Even,
+    /// Odd.
+    Odd,
+}
+
+/// What an input variable becomes when its port times out.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct SafeValue {
+    /// An input variable that the port owns.
+    pub var: SysVar,
+    /// Its safe value.
+    pub value: crate::wire::scalar::Scalar,
+}

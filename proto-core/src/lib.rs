@@ -1,0 +1,25 @@
+#![cfg_attr(not(feature = "std"), no_std)]
+#![forbid(unsafe_code)]
+#![cfg_attr(
+    not(test),
+    deny(
+        clippy::indexing_slicing,
+        clippy::unwrap_used,
+        clippy::expect_used,
+        clippy::panic,
+        clippy::arithmetic_side_effects
+    )
+)]
+//! Wire formats, recipes and the gateway engine for the DUCO CORE controller.
+
+pub mod command;
+pub mod config;
+pub mod engine;
+pub mod image;
+pub mod link;
+pub mod modbus;
+pub mod recipe;
+pub mod schedule;
+pub mod sysvar;
+pub mod time;
+pub mod wire;

@@ -1,0 +1,67 @@
+//! What a recipe is made of, and its limits (docs/wire/recipes.md section 2, D16, D18).
+
+use crate::sysvar::SysVar;
+use crate::wire::scalar::ScalarType;
+
+/// Longest head or tail of a stream part, in bytes.
+pub const MAX_DELIMITER: usize = 8;
+/// Most fields of one part.
+pub const MAX_FIELDS: usize = 128;
+/// Longest stream frame, head and tail included, in bytes.
+pub const MAX_STREAM_FRAME: usize = 512;
+/// Most frame ids of one CAN part.
+pub const MAX_CAN_IDS: usize = 32;
+/// Most data bytes of a classic CAN frame.
+pub const MAX_CAN_DATA: usize = 8;
+
+/// What a recipe's fields are.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub enum Mode {
+    /// System variables, sent and applied by the system itself, every cycle.
+    Realtime,
+    /// Fields that the user names; a program (or the gateway's bindings) moves their values.
+    User,
+}
+
+/// One field of a part.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum Field {
+    /// A system variable; its type is the table's.
+    System(SysVar),
+    /// A field of a user-defined recipe.
+    User(ScalarType),
+}
+
+impl Field {
+    /// The field's type.
+    pub fn ty(self) -> ScalarType {
+        match self {
+            Self::System(var) => var.ty(),
+            Self::User(ty) => ty,
+        }
+    }
+}
+
+/// A CAN frame id as a recipe declares it (D17).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub enum CanId {
+    /// 11 bits.
+    Standard(u16),
+    /// 29 bits.
+    Extended(u32),
+}
+
+/// Whether frames must be found in a stream of bytes, or arrive one in each datagram (D18).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum Framing {
+    /// RS-485 and TCP: a head or a tail is needed.
+    Bytes,
+    /// UDP: one datagram is one frame; head and tail may both be empty.
+    Datagram,
+}

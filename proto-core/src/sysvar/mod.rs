@@ -1,0 +1,191 @@
+//! THE table of system variables: every other form of this knowledge is derived from it
+//! (docs/wire/sysvars.md).
+//!
+//! A [`SysVar`] is one variable, such as `RobotState[8]`. Its type, direction, unit, its place in
+//! the 2001 stream, its Modbus range and its place in the process image all come from [`SPANS`].
+
+mod name;
+mod table;
+
+pub use name::{ParseError, VarRange};
+pub use table::{SPANS, Span};
+
+use crate::wire::scalar::ScalarType;
+
+/// Which way a variable travels (docs/wire/sysvars.md sections 1 and 2).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum Direction {
+    /// User to robot.
+    Input,
+    /// Robot to user.
+    Output,
+}
+
+/// Where a variable stands in the 1468-byte state packet of port 2001.
+///
+/// A byte variable is eight bools there, one byte each, lowest number first; words and floats
+/// stand as they are.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct StreamPlace {
+    /// Offset of the first byte in the packet.
+    pub offset: u16,
+    /// Bytes the variable takes there: 8 for a byte variable, 2 for a word, 4 for a float.
+    pub len: u16,
+}
+
+/// Where a variable stands in the controller's Modbus map.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ModbusPlace {
+    /// `count` coils from `first`, the lowest-numbered item first.
+    Coils {
+        /// Address of bit 0.
+        first: u16,
+        /// 8, or 2 for the tool's inputs and outputs.
+        count: u16,
+    },
+    /// One holding register that is the value.
+    Register {
+        /// The register's address.
+        address: u16,
+    },
+    /// One holding register that carries a float as `value * per_unit`, two's complement,
+    /// saturated at ±32767: coarser than every other source of the value.
+    Scaled {
+        /// The register's address.
+        address: u16,
+        /// Counts per unit: 1000 or 10000.
+        per_unit: u16,
+    },
+}
+
+/// One system variable.
+///
+/// Inputs come first, in the specification's order, then outputs; the order is that of the
+/// process image, so a run of consecutive variables of one kind is one run of bytes there.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
+pub struct SysVar(u8);
+
+/// How many system variables there are.
+pub const COUNT: usize = table::COUNT;
+/// How many of them are inputs; they have the lowest ordinals.
+pub const INPUT_COUNT: usize = table::INPUT_COUNT;
+/// Size of the process image: every variable packed in order.
+pub const IMAGE_BYTES: usize = table::IMAGE_BYTES;
+/// Size of the image's first part, the inputs.
+pub const INPUT_BYTES: usize = table::INPUT_BYTES;
+
+impl SysVar {
+    /// The variable with this place in the table, `0..COUNT`.
+    pub const fn from_ordinal(ordinal: usize) -> Option<Self> {
+        if ordinal < COUNT { Some(Self(ordinal as u8)) } else { None }
+    }
+
+    /// Every variable, in table order.
+    pub fn all() -> impl DoubleEndedIterator<Item = Self> + ExactSizeIterator + Clone {
+        (0..COUNT as u8).map(Self)
+    }
+
+    /// The variable's place in the table, `0..COUNT`.
+    pub const fn ordinal(self) -> usize {
+        self.0 as usize
+    }
+
+    /// The table row the variable belongs to.
+    pub fn span(self) -> &'static Span {
+        table::span_of(self.ordinal())
+    }
+
+    /// The group's name: `RobotState` of `RobotState[8]`.
+    pub fn group(self) -> &'static str {
+        self.span().group
+    }
+
+    /// The 1-based index: 8 of `RobotState[8]`.
+    pub fn index(self) -> u8 {
+        let span = self.span();
+        span.first.saturating_add(self.place_in_span() as u8)
+    }
+
+    /// User to robot, or robot to user.
+    pub fn direction(self) -> Direction {
+        if self.ordinal() < INPUT_COUNT { Direction::Input } else { Direction::Output }
+    }
+
+    /// The variable's type: byte, word or float.
+    pub fn ty(self) -> ScalarType {
+        self.span().ty
+    }
+
+    /// Size in a recipe frame and in the image: 1, 2 or 4 bytes.
+    pub fn size(self) -> usize {
+        self.ty().size()
+    }
+
+    /// Offset of the variable in the process image.
+    pub fn image_offset(self) -> usize {
+        table::image_offset(self.ordinal())
+    }
+
+    /// The bits of a byte variable that mean something; 0xFF for every other type (D22).
+    pub fn valid_bits(self) -> u8 {
+        self.span().valid_bits
+    }
+
+    /// Whether the variable's bits are eight (or two) separate items, whose edges matter.
+    pub fn is_bits(self) -> bool {
+        self.ty() == ScalarType::Byte
+    }
+
+    /// The unit of a quantity, as in `m` or `rad`; empty for bits, counts and registers.
+    pub fn unit(self) -> &'static str {
+        self.span().unit
+    }
+
+    /// Where port 2001 shows the variable; for an input, where its present value can be read back.
+    pub fn stream(self) -> Option<StreamPlace> {
+        let len = if self.is_bits() { 8 } else { self.size() } as u16;
+        let first = self.span().stream?;
+        Some(StreamPlace { offset: first.saturating_add(self.place_in_span().saturating_mul(len)), len })
+    }
+
+    /// Where the Modbus map shows the variable; inputs can be written and read back there.
+    pub fn modbus(self) -> Option<ModbusPlace> {
+        let nth = self.place_in_span();
+        self.span().modbus.map(|place| match place {
+            ModbusPlace::Coils { first, count } => {
+                ModbusPlace::Coils { first: first.saturating_add(nth.saturating_mul(count)), count }
+            }
+            ModbusPlace::Register { address } => {
+                ModbusPlace::Register { address: address.saturating_add(nth) }
+            }
+            ModbusPlace::Scaled { address, per_unit } => {
+                ModbusPlace::Scaled { address: address.saturating_add(nth), per_unit }
+            }
+        })
+    }
+
+    fn place_in_span(self) -> u16 {
+        table::place_in_span(self.ordinal())
+    }
+}
+
+#[cfg(feature = "serde")]
+impl<'de> serde::Deserialize<'de> for SysVar {
+    fn deserialize<D: serde::Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let ordinal = u8::deserialize(deserializer)?;
+        Self::from_ordinal(usize::from(ordinal))
+            .ok_or_else(|| serde::de::Error::custom("no system variable has this ordinal"))
+    }
+}
+
+#[cfg(feature = "defmt")]
+impl defmt::Format for SysVar {
+    fn format(&self, f: defmt::Formatter<'_>) {
+        defmt::write!(f, "{=str}[{=u8}]", self.group(), self.index());
+    }
+}
+
+#[cfg(test)]
+mod tests;

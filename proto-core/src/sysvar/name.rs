@@ -1,0 +1,158 @@
+//! Names as people write them: `RobotState[8]`, `RobotState[8..13]`, `__RobotState_8` (D14).
+
+use core::fmt;
+
+use super::{SPANS, SysVar};
+
+/// Consecutive variables of one group, as `RobotState[8..13]` names them; at least one.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct VarRange {
+    first: SysVar,
+    last: SysVar,
+}
+
+impl VarRange {
+    /// The variables, in order.
+    pub fn iter(self) -> impl ExactSizeIterator<Item = SysVar> + Clone {
+        (self.first.0..self.last.0.saturating_add(1)).map(SysVar)
+    }
+}
+
+/// Why a name means no variable.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum ParseError {
+    /// Neither `Name[i]`, `Name[i..j]` nor `__Name_i`.
+    Syntax,
+    /// No group has this name.
+    UnknownGroup,
+    /// The group has no such index.
+    OutOfRange {
+        /// The group's name.
+        group: &'static str,
+        /// The index that was asked for.
+        index: u32,
+        /// The group's last index; the first is 1.
+        last: u8,
+    },
+    /// A range runs backwards.
+    Backwards {
+        /// The range's first index.
+        first: u32,
+        /// The range's last index.
+        last: u32,
+    },
+    /// A range where a single variable is needed.
+    NotSingle,
+}
+
+impl fmt::Display for ParseError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Syntax => {
+                f.write_str("a system variable is written Name[1], Name[1..4] for a range, or __Name_1")
+            }
+            Self::UnknownGroup => {
+                f.write_str("no such system variable; there are")?;
+                let mut last = "";
+                for span in &SPANS {
+                    if span.group != last {
+                        f.write_str(if last.is_empty() { " " } else { ", " })?;
+                        f.write_str(span.group)?;
+                        last = span.group;
+                    }
+                }
+                Ok(())
+            }
+            Self::OutOfRange { group, index, last } => {
+                write!(f, "{group} has no [{index}], only [1..{last}]")
+            }
+            Self::Backwards { first, last } => write!(f, "the range {first}..{last} runs backwards"),
+            Self::NotSingle => f.write_str("one variable is needed here, not a range"),
+        }
+    }
+}
+
+impl core::error::Error for ParseError {}
+
+impl SysVar {
+    /// The variable `name` means: `RobotState[8]` or `__RobotState_8`.
+    ///
+    /// # Errors
+    /// [`ParseError`] says what is wrong and what there is.
+    pub fn parse(name: &str) -> Result<Self, ParseError> {
+        let range = VarRange::parse(name)?;
+        if range.first == range.last { Ok(range.first) } else { Err(ParseError::NotSingle) }
+    }
+
+    /// The variable of `group` with this 1-based index.
+    ///
+    /// # Errors
+    /// [`ParseError::UnknownGroup`], or [`ParseError::OutOfRange`] with the group's last index.
+    pub fn named(group: &str, index: u32) -> Result<Self, ParseError> {
+        let mut base = 0_usize;
+        let mut known: Option<(&'static str, u8)> = None;
+        for span in &SPANS {
+            if span.group == group {
+                if (u32::from(span.first)..=u32::from(span.last)).contains(&index) {
+                    let nth = index.saturating_sub(u32::from(span.first)) as usize;
+                    if let Some(var) = Self::from_ordinal(base.saturating_add(nth)) {
+                        return Ok(var);
+                    }
+                }
+                known = Some((span.group, span.last));
+            }
+            base = base.saturating_add(span.len());
+        }
+        match known {
+            Some((group, last)) => Err(ParseError::OutOfRange { group, index, last }),
+            None => Err(ParseError::UnknownGroup),
+        }
+    }
+}
+
+impl VarRange {
+    /// The variables `name` means: one (`RobotState[8]`, `__RobotState_8`) or a range
+    /// (`RobotState[8..13]`, both ends included).
+    ///
+    /// # Errors
+    /// [`ParseError`] says what is wrong and what there is.
+    pub fn parse(name: &str) -> Result<Self, ParseError> {
+        if let Some(pendant) = name.strip_prefix("__") {
+            let (group, index) = pendant.rsplit_once('_').ok_or(ParseError::Syntax)?;
+            let var = SysVar::named(group, number(index)?)?;
+            return Ok(Self { first: var, last: var });
+        }
+        let (group, rest) = name.split_once('[').ok_or(ParseError::Syntax)?;
+        let inside = rest.strip_suffix(']').ok_or(ParseError::Syntax)?;
+        let (first, last) = match inside.split_once("..") {
+            Some((first, last)) => (number(first)?, number(last)?),
+            None => (number(inside)?, number(inside)?),
+        };
+        if last < first {
+            return Err(ParseError::Backwards { first, last });
+        }
+        Ok(Self { first: SysVar::named(group, first)?, last: SysVar::named(group, last)? })
+    }
+}
+
+fn number(text: &str) -> Result<u32, ParseError> {
+    if text.bytes().all(|b| b.is_ascii_digit()) {
+        text.parse().map_err(|_| ParseError::Syntax)
+    } else {
+        Err(ParseError::Syntax)
+    }
+}
+
+impl fmt::Display for SysVar {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}[{}]", self.group(), self.index())
+    }
+}
+
+impl core::str::FromStr for SysVar {
+    type Err = ParseError;
+    fn from_str(name: &str) -> Result<Self, ParseError> {
+        Self::parse(name)
+    }
+}

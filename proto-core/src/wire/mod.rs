@@ -1,0 +1,6 @@
+//! Stateless bytes ↔ values: nothing here knows time, connections or configuration.
+//!
+//! No function of this module can panic, whatever bytes it is given.
+
+pub mod scalar;
+pub mod state;
