@@ -1,1 +1,3 @@
-//! Host side.
+//! A simulated DUCO CORE controller and the recipe gateway on this host.
+
+pub mod config;

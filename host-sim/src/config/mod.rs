@@ -1,0 +1,11 @@
+//! Configuration files and the checked values they become.
+//!
+//! In: TOML text and `--set` overrides. Out: [`SimConfig`] for the simulated controller, or
+//! `proto_core::config::GatewayConfig` for the gateway. Nothing here opens a device or a socket.
+
+mod sim;
+
+pub use sim::{
+    AnalogInput, BitGroup, Initial, InitialTarget, Listen, Power, Robot, RobotMode, SimBus, SimCanFrame,
+    SimConfig, SimField, SimParts, SimPort, SimProgram, SimRecipe, SimStreamPart,
+};

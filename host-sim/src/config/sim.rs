@@ -1,0 +1,320 @@
+//! What the simulated controller runs on: a controller file after it was checked.
+
+use std::fmt;
+use std::net::{IpAddr, Ipv4Addr};
+
+use proto_core::config::Rs485;
+use proto_core::recipe::model::{self, CanId};
+use proto_core::sysvar::SysVar;
+use proto_core::time::Duration;
+
+/// A whole controller file.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct SimConfig {
+    /// Where it listens.
+    pub listen: Listen,
+    /// The state it starts in.
+    pub robot: Robot,
+    /// Values at the start, in file order.
+    pub initial: Vec<Initial>,
+    /// Every recipe, in file order.
+    pub recipes: Vec<SimRecipe>,
+    /// Every recipe port, in file order.
+    pub ports: Vec<SimPort>,
+    /// The programs that `run(NAME)` knows.
+    pub programs: Vec<SimProgram>,
+}
+
+/// Addresses of the controller's servers; port 0 means any free port.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Listen {
+    /// The address all of them listen on.
+    pub address: IpAddr,
+    /// Command port, 2000.
+    pub command: u16,
+    /// State stream, 2001.
+    pub state: u16,
+    /// Modbus TCP, 502.
+    pub modbus: u16,
+    /// UDP recipe server, 2011.
+    pub udp2011: u16,
+}
+
+impl Default for Listen {
+    fn default() -> Self {
+        let address = IpAddr::V4(Ipv4Addr::LOCALHOST);
+        Self { address, command: 2000, state: 2001, modbus: 502, udp2011: 2011 }
+    }
+}
+
+/// The robot at the start.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Robot {
+    /// Name of the dialect the controller speaks; one that `proto_core::wire::dialect` knows.
+    pub dialect: String,
+    /// Power.
+    pub power: Power,
+    /// Operation mode.
+    pub mode: RobotMode,
+}
+
+impl Default for Robot {
+    fn default() -> Self {
+        Self { dialect: "v2.3".to_owned(), power: Power::Enabled, mode: RobotMode::Remote }
+    }
+}
+
+/// How far the robot is powered up at the start.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Power {
+    /// Powered off.
+    Off,
+    /// Powered on, not enabled.
+    On,
+    /// Powered on and enabled.
+    Enabled,
+}
+
+/// The operation mode at the start.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum RobotMode {
+    /// Manual.
+    Manual,
+    /// Automatic.
+    Auto,
+    /// Remote.
+    Remote,
+}
+
+/// One value at the start.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Initial {
+    /// What gets it.
+    pub target: InitialTarget,
+    /// The value, which fits the target; a bit is 0 or 1.
+    pub value: f64,
+}
+
+/// What an initial value can be given to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum InitialTarget {
+    /// A whole system variable.
+    Var(SysVar),
+    /// One input or output bit, such as `DI[3]`.
+    Bit {
+        /// The group.
+        group: BitGroup,
+        /// 1-based.
+        index: u8,
+    },
+    /// One analog input of the cabinet or the tool, in mA or V.
+    Analog {
+        /// The group.
+        group: AnalogInput,
+        /// 1-based.
+        index: u8,
+    },
+}
+
+impl fmt::Display for InitialTarget {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Var(var) => var.fmt(f),
+            Self::Bit { group, index } => write!(f, "{}[{index}]", group.name()),
+            Self::Analog { group, index } => write!(f, "{}[{index}]", group.name()),
+        }
+    }
+}
+
+/// The groups of input and output bits.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum BitGroup {
+    /// Cabinet digital inputs, `DI[1..16]`.
+    Di,
+    /// Cabinet digital outputs, `DO[1..16]`.
+    Do,
+    /// Functional digital inputs, `FDI[1..8]`.
+    Fdi,
+    /// Functional digital outputs, `FDO[1..8]`.
+    Fdo,
+    /// Tool digital inputs, `ToolDI[1..2]`.
+    ToolDi,
+    /// Tool digital outputs, `ToolDO[1..2]`.
+    ToolDo,
+    /// Tool end buttons, `ToolButton[1..2]`: S and T.
+    ToolButton,
+}
+
+impl BitGroup {
+    /// Every group.
+    pub const ALL: [Self; 7] =
+        [Self::Di, Self::Do, Self::Fdi, Self::Fdo, Self::ToolDi, Self::ToolDo, Self::ToolButton];
+
+    /// The name used in files.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Di => "DI",
+            Self::Do => "DO",
+            Self::Fdi => "FDI",
+            Self::Fdo => "FDO",
+            Self::ToolDi => "ToolDI",
+            Self::ToolDo => "ToolDO",
+            Self::ToolButton => "ToolButton",
+        }
+    }
+
+    /// How many bits the group has.
+    pub fn count(self) -> u8 {
+        match self {
+            Self::Di | Self::Do => 16,
+            Self::Fdi | Self::Fdo => 8,
+            Self::ToolDi | Self::ToolDo | Self::ToolButton => 2,
+        }
+    }
+}
+
+/// The groups of analog inputs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum AnalogInput {
+    /// Cabinet current inputs in mA, `AI_C[1..4]`.
+    CabinetCurrent,
+    /// Cabinet voltage inputs in V, `AI_V[1..4]`.
+    CabinetVoltage,
+    /// Tool voltage inputs in V, `ToolAI[1..2]`.
+    Tool,
+}
+
+impl AnalogInput {
+    /// Every group.
+    pub const ALL: [Self; 3] = [Self::CabinetCurrent, Self::CabinetVoltage, Self::Tool];
+
+    /// The name used in files.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::CabinetCurrent => "AI_C",
+            Self::CabinetVoltage => "AI_V",
+            Self::Tool => "ToolAI",
+        }
+    }
+
+    /// How many inputs the group has.
+    pub fn count(self) -> u8 {
+        match self {
+            Self::CabinetCurrent | Self::CabinetVoltage => 4,
+            Self::Tool => 2,
+        }
+    }
+
+    /// The least and the greatest value: mA or V.
+    pub fn range(self) -> (f64, f64) {
+        match self {
+            Self::CabinetCurrent => (0.0, 20.0),
+            Self::CabinetVoltage | Self::Tool => (0.0, 10.0),
+        }
+    }
+}
+
+/// One recipe of the controller.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SimRecipe {
+    /// Its name.
+    pub name: String,
+    /// System variables, or user-defined fields.
+    pub mode: model::Mode,
+    /// Stream or CAN, with the parts.
+    pub parts: SimParts,
+}
+
+/// A recipe's two parts; either may be absent.
+#[derive(Debug, Clone, PartialEq)]
+pub enum SimParts {
+    /// Byte streams and datagrams.
+    Stream {
+        /// User to robot.
+        input: Option<SimStreamPart>,
+        /// Robot to user.
+        output: Option<SimStreamPart>,
+    },
+    /// CAN; an absent part has no frames.
+    Can {
+        /// User to robot.
+        input: Vec<SimCanFrame>,
+        /// Robot to user.
+        output: Vec<SimCanFrame>,
+    },
+}
+
+/// One part of a stream recipe.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SimStreamPart {
+    /// Bytes before the fields.
+    pub head: Vec<u8>,
+    /// Bytes after the fields.
+    pub tail: Vec<u8>,
+    /// The fields.
+    pub fields: Vec<SimField>,
+}
+
+/// One frame id of a CAN recipe's part.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SimCanFrame {
+    /// The frame's id.
+    pub id: CanId,
+    /// The fields, at most 8 bytes together.
+    pub fields: Vec<SimField>,
+}
+
+/// One field.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SimField {
+    /// The user's name for it, or the system variable's.
+    pub name: String,
+    /// What it is.
+    pub field: model::Field,
+}
+
+/// One recipe port of the controller.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SimPort {
+    /// Its name, as `--bind`, `--stats` and programs use it.
+    pub name: String,
+    /// What it is.
+    pub bus: SimBus,
+    /// Index into [`SimConfig::recipes`]; a port without a recipe is idle.
+    pub recipe: Option<usize>,
+    /// How often a realtime recipe's output part is sent; at least 4 ms.
+    pub cycle: Duration,
+}
+
+/// What a controller's recipe port is.
+#[derive(Debug, Clone, PartialEq)]
+pub enum SimBus {
+    /// Half-duplex serial line.
+    Rs485(Rs485),
+    /// CAN bus.
+    Can {
+        /// Bit/s, 10_000..=1_000_000.
+        bitrate: u32,
+    },
+    /// The UDP server at [`Listen::udp2011`].
+    UdpServer,
+    /// Connects to `HOST:PORT` and reconnects when the connection is lost.
+    TcpClient {
+        /// `HOST:PORT`.
+        to: String,
+    },
+    /// Sends to `HOST:PORT`.
+    UdpClient {
+        /// `HOST:PORT`.
+        to: String,
+    },
+}
+
+/// One program of the controller.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct SimProgram {
+    /// As `run(NAME)` names it.
+    pub name: String,
+    /// Its Rhai text.
+    pub script: String,
+}
