@@ -94,6 +94,7 @@ pub struct Recipe {
 /// A recipe's two parts; either may be absent, not both.
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[allow(clippy::large_enum_variant, reason = "without an allocator there is no box to put the larger one in")]
 pub enum Parts {
     /// Byte streams and datagrams.
     Stream {

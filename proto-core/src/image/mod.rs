@@ -1,1 +1,238 @@
-//! image
+//! The process image: the value, source and age of every system variable
+//! (docs/architecture.md section 4).
+//!
+//! Values are packed little-endian in one byte array, in the order of the variable table, so that
+//! neighbouring fields of a recipe are one copy. A variable's age is that of its [`GroupId`]: the
+//! frame, poll or packet that brings it. The image refuses to know recipes, ports and links.
+
+mod set;
+
+pub use set::InputSet;
+
+use crate::sysvar::{COUNT, IMAGE_BYTES, SysVar};
+use crate::time::{Duration, Instant};
+use crate::wire::scalar::{Scalar, ScalarType};
+
+/// The values alone.
+pub type ImageBytes = [u8; IMAGE_BYTES];
+
+/// Most groups of variables that arrive together.
+pub const MAX_GROUPS: usize = 96;
+
+/// Variables that arrive together and so have one age: a field frame, a Modbus block, a packet.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub struct GroupId(pub(crate) u8);
+
+const NO_GROUP: u8 = u8::MAX;
+
+/// Every system variable with value, source and age.
+#[derive(Debug, Clone)]
+pub struct Image {
+    bytes: ImageBytes,
+    group: [u8; COUNT],
+    /// When each group last arrived; [`Instant::NEVER`] before the first time.
+    stamps: [Instant; MAX_GROUPS],
+}
+
+impl Default for Image {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl Image {
+    /// All zero, and nothing known.
+    pub const fn new() -> Self {
+        Self { bytes: [0; IMAGE_BYTES], group: [NO_GROUP; COUNT], stamps: [Instant::NEVER; MAX_GROUPS] }
+    }
+
+    /// The packed values.
+    pub fn bytes(&self) -> &ImageBytes {
+        &self.bytes
+    }
+
+    /// The packed values, to be changed by a recipe or packet that fits them.
+    pub fn bytes_mut(&mut self) -> &mut ImageBytes {
+        &mut self.bytes
+    }
+
+    /// The variable's value; only meaningful when [`Self::is_known`].
+    pub fn value(&self, var: SysVar) -> Scalar {
+        let start = var.image_offset();
+        let bytes = self.bytes.get(start..start.saturating_add(var.size())).unwrap_or(&[]);
+        Scalar::decode(var.ty(), bytes).unwrap_or(Scalar::Byte(0))
+    }
+
+    /// Gives the variable a value: reserved bits are masked (D22).
+    ///
+    /// # Errors
+    /// [`NotForVariable`], with nothing changed, when the type is another or the value not finite.
+    pub fn set(&mut self, var: SysVar, value: Scalar) -> Result<(), NotForVariable> {
+        if value.ty() != var.ty() || !value.is_finite() {
+            return Err(NotForVariable { var, value });
+        }
+        let value = match value {
+            Scalar::Byte(bits) => Scalar::Byte(bits & var.valid_bits()),
+            other => other,
+        };
+        if let Some(place) = self.bytes.get_mut(var.image_offset()..) {
+            value.encode(place);
+        }
+        Ok(())
+    }
+
+    /// Says which group brings the variable.
+    pub fn assign(&mut self, var: SysVar, group: GroupId) {
+        if let Some(slot) = self.group.get_mut(var.ordinal()) {
+            *slot = group.0;
+        }
+    }
+
+    /// The group that brings the variable.
+    pub fn group(&self, var: SysVar) -> Option<GroupId> {
+        self.group.get(var.ordinal()).copied().filter(|&g| g != NO_GROUP).map(GroupId)
+    }
+
+    /// The group has just arrived.
+    pub fn stamp(&mut self, group: GroupId, now: Instant) {
+        if let Some(stamp) = self.stamps.get_mut(usize::from(group.0)) {
+            *stamp = now;
+        }
+    }
+
+    /// What the group brought is no longer known.
+    pub fn forget(&mut self, group: GroupId) {
+        self.stamp(group, Instant::NEVER);
+    }
+
+    /// When the group last arrived.
+    pub fn stamp_of(&self, group: GroupId) -> Option<Instant> {
+        self.stamps.get(usize::from(group.0)).copied().filter(|&at| at != Instant::NEVER)
+    }
+
+    /// How long ago the variable's value arrived; `None` when it never did.
+    pub fn age(&self, var: SysVar, now: Instant) -> Option<Duration> {
+        self.stamp_of(self.group(var)?).map(|at| now.saturating_since(at))
+    }
+
+    /// Whether the variable's value ever arrived.
+    pub fn is_known(&self, var: SysVar) -> bool {
+        self.group(var).and_then(|group| self.stamp_of(group)).is_some()
+    }
+}
+
+/// A value that a variable cannot take.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct NotForVariable {
+    /// The variable.
+    pub var: SysVar,
+    /// The value.
+    pub value: Scalar,
+}
+
+impl core::fmt::Display for NotForVariable {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        let Self { var, value } = self;
+        write!(f, "{var} is a finite {}, not the {} {value}", var.ty(), value.ty())
+    }
+}
+
+impl core::error::Error for NotForVariable {}
+
+/// `raw * scale + offset` as a value of `var`, the way a user-defined input field is bound.
+///
+/// Integers are rounded to the nearest, halves away from zero. `None` when the result is not
+/// finite or out of the variable's range: such a frame is rejected (D22).
+pub fn bind_to_variable(var: SysVar, raw: Scalar, scale: f32, offset: f32) -> Option<Scalar> {
+    let value = raw.as_f64() * f64::from(scale) + f64::from(offset);
+    let value = if var.ty() == ScalarType::Float { value } else { round(value) };
+    let scalar = Scalar::from_f64(var.ty(), value).ok()?;
+    match scalar {
+        Scalar::Byte(bits) if bits & !var.valid_bits() != 0 => None,
+        scalar => scalar.is_finite().then_some(scalar),
+    }
+}
+
+/// `value * scale + offset` as a field of type `ty`, the way a user-defined output field is bound:
+/// rounded like an input, and saturated at the type's range. Not a number becomes 0.
+pub fn saturate_to_field(ty: ScalarType, value: f64, scale: f32, offset: f32) -> Scalar {
+    let value = value * f64::from(scale) + f64::from(offset);
+    let value = match ty {
+        ScalarType::Float | ScalarType::Double => value,
+        _ => round(value),
+    };
+    let (low, high) = ty.range();
+    let value = if value.is_nan() { 0.0 } else { value.clamp(low, high) };
+    Scalar::from_f64(ty, value).unwrap_or(Scalar::Byte(0))
+}
+
+/// To the nearest whole number, halves away from zero; `core` has no `round`.
+fn round(value: f64) -> f64 {
+    // Beyond 2^52 every binary64 is whole, and the cast below would saturate.
+    if !(-4.5e15..=4.5e15).contains(&value) {
+        return value;
+    }
+    let half = if value < 0.0 { -0.5 } else { 0.5 };
+    (value + half) as i64 as f64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn var(name: &str) -> SysVar {
+        SysVar::parse(name).unwrap()
+    }
+
+    #[test]
+    fn a_value_is_packed_masked_and_aged() {
+        let mut image = Image::new();
+        let tool = var("DigitalOutputCommand[3]");
+        image.set(tool, Scalar::Byte(0xFF)).unwrap();
+        assert_eq!(image.value(tool), Scalar::Byte(0b11), "six bits are reserved");
+        let word = var("WordInputReg[2]");
+        image.set(word, Scalar::Word(0xBEEF)).unwrap();
+        assert_eq!(image.bytes()[word.image_offset()..][..2], [0xEF, 0xBE]);
+        assert_eq!(image.value(var("WordInputReg[1]")), Scalar::Word(0), "the neighbour is untouched");
+
+        let group = GroupId(3);
+        image.assign(word, group);
+        assert_eq!(image.age(word, Instant::from_millis(5)), None);
+        image.stamp(group, Instant::from_millis(5));
+        assert_eq!(image.age(word, Instant::from_millis(12)), Some(Duration::from_millis(7)));
+        image.forget(group);
+        assert!(!image.is_known(word));
+    }
+
+    #[test]
+    fn a_value_of_another_type_or_not_finite_changes_nothing() {
+        let mut image = Image::new();
+        let force = var("ForceEnd[1]");
+        image.set(force, Scalar::Float(2.0)).unwrap();
+        assert!(image.set(force, Scalar::Float(f32::NAN)).is_err());
+        assert!(image.set(force, Scalar::Word(1)).is_err());
+        assert_eq!(image.value(force), Scalar::Float(2.0));
+    }
+
+    #[test]
+    fn bindings_round_and_refuse_or_saturate() {
+        let word = var("WordInputReg[1]");
+        let bind = |raw, scale, offset| bind_to_variable(word, raw, scale, offset);
+        assert_eq!(bind(Scalar::Float(1.25), 10.0, 0.0), Some(Scalar::Word(13)));
+        assert_eq!(bind(Scalar::Short(-1), 1.0, 0.0), None);
+        assert_eq!(bind(Scalar::Dword(65_535), 1.0, 1.0), None);
+        assert_eq!(bind(Scalar::Float(f32::INFINITY), 1.0, 0.0), None);
+        assert_eq!(bind_to_variable(var("DigitalOutputCommand[3]"), Scalar::Byte(4), 1.0, 0.0), None);
+        assert_eq!(
+            bind_to_variable(var("FloatInputReg[1]"), Scalar::Byte(3), 0.5, 1.0),
+            Some(Scalar::Float(2.5))
+        );
+
+        let field = |value, scale| saturate_to_field(ScalarType::Char, value, scale, 0.0);
+        assert_eq!(field(-1.5, 1.0), Scalar::Char(-2));
+        assert_eq!(field(1e9, 1.0), Scalar::Char(127));
+        assert_eq!(field(f64::NAN, 1.0), Scalar::Char(0));
+        assert_eq!(saturate_to_field(ScalarType::Double, 1e300, 1.0, 0.0), Scalar::Double(1e300));
+    }
+}

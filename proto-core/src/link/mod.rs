@@ -1,1 +1,280 @@
-//! link
+//! Supervision of one controller link: when to open it, when to give it up, when to try again.
+//!
+//! In: what the driver reports and what the engine thinks of the peer. Out: [`LinkAction`]s and a
+//! deadline. Refuses to know sockets, protocols and addresses.
+
+use crate::time::{Duration, Instant};
+
+/// How patient a link is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct LinkTimings {
+    /// A connection that takes longer is given up.
+    pub connect_timeout: Duration,
+    /// The first wait after a loss; each further one is twice as long.
+    pub backoff_min: Duration,
+    /// The longest wait.
+    pub backoff_max: Duration,
+    /// A link that was up for this long starts again from the shortest wait.
+    pub settled_after: Duration,
+    /// A link on which nothing arrives for this long is closed; `None` where silence is normal.
+    pub silence: Option<Duration>,
+}
+
+impl LinkTimings {
+    /// For TCP links to the controller.
+    pub const TCP: Self = Self {
+        connect_timeout: Duration::from_secs(2),
+        backoff_min: Duration::from_millis(100),
+        backoff_max: Duration::from_secs(5),
+        settled_after: Duration::from_secs(5),
+        silence: None,
+    };
+
+    /// The same, closed after `silence` without a byte.
+    #[must_use]
+    pub const fn with_silence(self, silence: Duration) -> Self {
+        Self { silence: Some(silence), ..self }
+    }
+}
+
+/// Where a link stands.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum LinkState {
+    /// Closed; opened again at `retry_at`.
+    Down {
+        /// When.
+        retry_at: Instant,
+    },
+    /// Opened, not yet up; given up at `until`.
+    Opening {
+        /// When.
+        until: Instant,
+    },
+    /// Usable.
+    Up {
+        /// Since when.
+        since: Instant,
+    },
+}
+
+impl LinkState {
+    /// One word for people and statistics.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Down { .. } => "down",
+            Self::Opening { .. } => "opening",
+            Self::Up { .. } => "up",
+        }
+    }
+}
+
+/// What the driver has to do.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LinkAction {
+    /// Open the link and report when it is up or has failed.
+    Open,
+    /// Close it and report nothing more of it.
+    Close,
+}
+
+/// What happened to a link since the start.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
+pub struct LinkHistory {
+    /// Times the link came up.
+    pub connects: u32,
+    /// Times it was lost after it had been up, whoever closed it.
+    pub losses: u32,
+    /// Times it could not be opened.
+    pub failed_opens: u32,
+    /// Times it was closed because nothing arrived.
+    pub silences: u32,
+}
+
+/// Supervisor of one link.
+#[derive(Debug, Clone)]
+pub struct Supervisor {
+    timings: LinkTimings,
+    state: LinkState,
+    backoff: Duration,
+    heard: Instant,
+    action: Option<LinkAction>,
+    history: LinkHistory,
+}
+
+impl Supervisor {
+    /// A link that is to be opened at once.
+    pub const fn new(timings: LinkTimings) -> Self {
+        Self {
+            timings,
+            state: LinkState::Down { retry_at: Instant::ZERO },
+            backoff: timings.backoff_min,
+            heard: Instant::ZERO,
+            action: None,
+            history: LinkHistory { connects: 0, losses: 0, failed_opens: 0, silences: 0 },
+        }
+    }
+
+    /// Where the link stands.
+    pub const fn state(&self) -> LinkState {
+        self.state
+    }
+
+    /// Whether the link is usable.
+    pub const fn is_up(&self) -> bool {
+        matches!(self.state, LinkState::Up { .. })
+    }
+
+    /// What happened so far.
+    pub const fn history(&self) -> &LinkHistory {
+        &self.history
+    }
+
+    /// The driver reports that the link is up. False when that was not expected: the report is
+    /// late, and the driver has been told to close the link.
+    pub fn up(&mut self, now: Instant) -> bool {
+        if !matches!(self.state, LinkState::Opening { .. }) {
+            return false;
+        }
+        self.state = LinkState::Up { since: now };
+        self.heard = now;
+        self.history.connects = self.history.connects.saturating_add(1);
+        true
+    }
+
+    /// The driver reports that the link is gone or could not be opened. True when it was up.
+    pub fn down(&mut self, now: Instant) -> bool {
+        let was = self.state;
+        if !matches!(was, LinkState::Down { .. }) {
+            self.fall(now);
+        }
+        matches!(was, LinkState::Up { .. })
+    }
+
+    /// Bytes arrived.
+    pub fn heard(&mut self, now: Instant) {
+        self.heard = now;
+    }
+
+    /// The engine gives the link up: what the peer sends makes no sense, or nothing.
+    pub fn give_up(&mut self, now: Instant) {
+        if !matches!(self.state, LinkState::Down { .. }) {
+            self.fall(now);
+            self.action = Some(LinkAction::Close);
+        }
+    }
+
+    /// Looks at the clock. True when the link was up and has just been given up for silence.
+    pub fn advance(&mut self, now: Instant) -> bool {
+        match self.state {
+            LinkState::Down { retry_at } if now >= retry_at && self.action.is_none() => {
+                self.state = LinkState::Opening { until: now + self.timings.connect_timeout };
+                self.action = Some(LinkAction::Open);
+            }
+            LinkState::Opening { until } if now >= until => self.give_up(now),
+            LinkState::Up { .. } if now >= self.silent_at() => {
+                self.history.silences = self.history.silences.saturating_add(1);
+                self.give_up(now);
+                return true;
+            }
+            _ => {}
+        }
+        false
+    }
+
+    /// What the driver has to do now, once.
+    pub fn take_action(&mut self) -> Option<LinkAction> {
+        self.action.take()
+    }
+
+    /// When [`Self::advance`] has something to do.
+    pub fn deadline(&self) -> Instant {
+        match self.state {
+            _ if self.action.is_some() => Instant::ZERO,
+            LinkState::Down { retry_at } => retry_at,
+            LinkState::Opening { until } => until,
+            LinkState::Up { .. } => self.silent_at(),
+        }
+    }
+
+    fn silent_at(&self) -> Instant {
+        self.timings.silence.map_or(Instant::NEVER, |silence| self.heard + silence)
+    }
+
+    fn fall(&mut self, now: Instant) {
+        match self.state {
+            LinkState::Up { since } => {
+                self.history.losses = self.history.losses.saturating_add(1);
+                if now.saturating_since(since) >= self.timings.settled_after {
+                    self.backoff = self.timings.backoff_min;
+                }
+            }
+            _ => self.history.failed_opens = self.history.failed_opens.saturating_add(1),
+        }
+        self.state = LinkState::Down { retry_at: now + self.backoff };
+        self.backoff = self.backoff.saturating_mul(2).min(self.timings.backoff_max);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MS: fn(u64) -> Instant = Instant::from_millis;
+
+    fn opened(at: Instant) -> Supervisor {
+        let mut link = Supervisor::new(LinkTimings::TCP.with_silence(Duration::from_secs(2)));
+        link.advance(at);
+        assert_eq!(link.take_action(), Some(LinkAction::Open));
+        assert_eq!(link.take_action(), None, "an action is told once");
+        link
+    }
+
+    #[test]
+    fn a_refused_link_is_tried_again_later_and_later_up_to_the_bound() {
+        let mut link = opened(MS(0));
+        let mut now = MS(0);
+        for wait in [100, 200, 400, 800, 1600, 3200, 5000, 5000] {
+            assert!(!link.down(now));
+            assert_eq!(link.deadline(), now + Duration::from_millis(wait));
+            now = link.deadline();
+            link.advance(now);
+            assert_eq!(link.take_action(), Some(LinkAction::Open));
+        }
+        assert_eq!(link.history().failed_opens, 8);
+    }
+
+    #[test]
+    fn a_link_that_held_starts_again_from_the_shortest_wait() {
+        let mut link = opened(MS(0));
+        link.down(MS(0));
+        link.advance(MS(100));
+        link.take_action();
+        assert!(link.up(MS(100)));
+        link.heard(MS(5000));
+        assert!(link.down(MS(5100)));
+        assert_eq!(link.deadline(), MS(5200));
+    }
+
+    #[test]
+    fn a_connection_that_never_comes_up_is_closed() {
+        let mut link = opened(MS(0));
+        assert_eq!(link.deadline(), MS(2000));
+        link.advance(MS(2000));
+        assert_eq!(link.take_action(), Some(LinkAction::Close));
+        assert!(!link.up(MS(2001)), "too late");
+    }
+
+    #[test]
+    fn silence_closes_a_link_that_should_talk() {
+        let mut link = opened(MS(0));
+        link.up(MS(10));
+        link.heard(MS(500));
+        assert!(!link.advance(MS(2499)));
+        assert!(link.advance(MS(2500)));
+        assert_eq!(link.take_action(), Some(LinkAction::Close));
+        assert_eq!(link.history().silences, 1);
+        assert_eq!(link.history().losses, 1);
+    }
+}
