@@ -1,0 +1,312 @@
+//! `--bind NAME=DEVICE`: which device a configured port is tied to.
+//!
+//! Text goes in, a [`Bind`] or one message comes out. Nothing is opened here and no configuration is
+//! known: whether a port of that name exists and takes such a device is the shells' business.
+
+use std::fmt;
+use std::path::PathBuf;
+use std::str::FromStr;
+
+/// One `--bind NAME=DEVICE`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Bind {
+    /// The configured port's name.
+    pub port: String,
+    /// What it is tied to.
+    pub device: Device,
+}
+
+/// What a port can be tied to.
+#[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Device {
+    /// `pty:PATH` or `pty-paced:PATH`: a new pseudoterminal with a link at `link`.
+    Pty {
+        /// Where the link to the pseudoterminal appears.
+        link: PathBuf,
+        /// Whether sent bytes appear at the line's speed.
+        pace: Pace,
+    },
+    /// `serial:PATH`: a serial device that exists.
+    Serial {
+        /// The device, such as `/dev/ttyUSB0`.
+        path: PathBuf,
+    },
+    /// `socketcan:INTERFACE`: a CAN interface of the kernel.
+    SocketCan {
+        /// The interface, such as `vcan0`.
+        interface: String,
+    },
+    /// `slcan-pty:PATH`: a CAN bus of our own with a first client on a new pseudoterminal.
+    SlcanPty {
+        /// Where the link to the pseudoterminal appears.
+        link: PathBuf,
+    },
+    /// `slcan-tcp:HOST:PORT`: a CAN bus of our own whose clients connect here.
+    SlcanTcp {
+        /// Where to listen; port 0 is any free one.
+        listen: HostPort,
+    },
+    /// `tcp:HOST:PORT`: a raw byte stream to somebody who listens there.
+    Tcp {
+        /// Whom to connect to.
+        to: HostPort,
+    },
+    /// `tcp-listen:HOST:PORT`, also `tcp:HOST:0`: a raw byte stream of whoever connects, one at a time.
+    TcpListen {
+        /// Where to listen; port 0 is any free one.
+        listen: HostPort,
+    },
+}
+
+/// Whether bytes sent on a pseudoterminal appear all at once or at the line's speed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Pace {
+    /// At once. Only the time until the next frame may be sent follows the line's speed.
+    #[default]
+    AtOnce,
+    /// Byte by byte, as a UART at the line's speed would deliver them.
+    Line,
+}
+
+impl Device {
+    /// Whether a serial port of the configuration can be tied to it.
+    pub fn is_serial(&self) -> bool {
+        !self.is_can()
+    }
+
+    /// Whether a CAN port of the configuration can be tied to it.
+    pub fn is_can(&self) -> bool {
+        matches!(self, Self::SocketCan { .. } | Self::SlcanPty { .. } | Self::SlcanTcp { .. })
+    }
+}
+
+/// The forms `DEVICE` takes, for messages.
+pub const DEVICE_FORMS: &str = "pty:PATH, pty-paced:PATH, serial:PATH, socketcan:INTERFACE, slcan-pty:PATH, \
+                                slcan-tcp:HOST:PORT, tcp:HOST:PORT or tcp-listen:HOST:PORT";
+
+impl FromStr for Bind {
+    type Err = BindError;
+
+    fn from_str(text: &str) -> Result<Self, BindError> {
+        let (port, device) =
+            text.split_once('=').ok_or_else(|| BindError::NoEquals { text: text.to_owned() })?;
+        if port.is_empty() {
+            return Err(BindError::NoName { text: text.to_owned() });
+        }
+        Ok(Self { port: port.to_owned(), device: device.parse()? })
+    }
+}
+
+impl FromStr for Device {
+    type Err = BindError;
+
+    fn from_str(text: &str) -> Result<Self, BindError> {
+        let unknown = || BindError::UnknownDevice { text: text.to_owned() };
+        let (kind, rest) = text.split_once(':').ok_or_else(unknown)?;
+        let path = || -> Result<PathBuf, BindError> {
+            if rest.is_empty() { Err(BindError::Empty { kind: kind.to_owned() }) } else { Ok(rest.into()) }
+        };
+        let address = || -> Result<HostPort, BindError> {
+            rest.parse().map_err(|why| BindError::Address { kind: kind.to_owned(), why })
+        };
+        Ok(match kind {
+            "pty" => Self::Pty { link: path()?, pace: Pace::AtOnce },
+            "pty-paced" => Self::Pty { link: path()?, pace: Pace::Line },
+            "serial" => Self::Serial { path: path()? },
+            "socketcan" if rest.is_empty() => return Err(BindError::Empty { kind: kind.to_owned() }),
+            "socketcan" => Self::SocketCan { interface: rest.to_owned() },
+            "slcan-pty" => Self::SlcanPty { link: path()? },
+            "slcan-tcp" => Self::SlcanTcp { listen: address()? },
+            "tcp" => match address()? {
+                listen @ HostPort { port: 0, .. } => Self::TcpListen { listen },
+                to => Self::Tcp { to },
+            },
+            "tcp-listen" => Self::TcpListen { listen: address()? },
+            _ => return Err(unknown()),
+        })
+    }
+}
+
+impl fmt::Display for Device {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Pty { link, pace: Pace::AtOnce } => write!(f, "pty:{}", link.display()),
+            Self::Pty { link, pace: Pace::Line } => write!(f, "pty-paced:{}", link.display()),
+            Self::Serial { path } => write!(f, "serial:{}", path.display()),
+            Self::SocketCan { interface } => write!(f, "socketcan:{interface}"),
+            Self::SlcanPty { link } => write!(f, "slcan-pty:{}", link.display()),
+            Self::SlcanTcp { listen } => write!(f, "slcan-tcp:{listen}"),
+            Self::Tcp { to } => write!(f, "tcp:{to}"),
+            Self::TcpListen { listen } => write!(f, "tcp-listen:{listen}"),
+        }
+    }
+}
+
+impl fmt::Display for Bind {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}={}", self.port, self.device)
+    }
+}
+
+/// A host name or address with a port, as `HOST:PORT`; an IPv6 address stands in brackets.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct HostPort {
+    /// Name or address, without brackets.
+    pub host: String,
+    /// TCP or UDP port.
+    pub port: u16,
+}
+
+impl FromStr for HostPort {
+    type Err = HostPortError;
+
+    fn from_str(text: &str) -> Result<Self, HostPortError> {
+        let (host, port) = text.rsplit_once(':').ok_or(HostPortError::NoPort)?;
+        let host = match host.strip_prefix('[') {
+            Some(inner) => inner.strip_suffix(']').ok_or(HostPortError::Brackets)?,
+            None if host.contains(':') => return Err(HostPortError::Brackets),
+            None => host,
+        };
+        if host.is_empty() {
+            return Err(HostPortError::NoHost);
+        }
+        let port = port.parse().map_err(|_| HostPortError::BadPort)?;
+        Ok(Self { host: host.to_owned(), port })
+    }
+}
+
+impl fmt::Display for HostPort {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if self.host.contains(':') {
+            write!(f, "[{}]:{}", self.host, self.port)
+        } else {
+            write!(f, "{}:{}", self.host, self.port)
+        }
+    }
+}
+
+/// Why a `--bind` was refused.
+#[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum BindError {
+    /// No `=` between name and device.
+    NoEquals {
+        /// What was given.
+        text: String,
+    },
+    /// Nothing before the `=`.
+    NoName {
+        /// What was given.
+        text: String,
+    },
+    /// Not one of the forms.
+    UnknownDevice {
+        /// The device as given.
+        text: String,
+    },
+    /// Nothing after the device's colon.
+    Empty {
+        /// The device's kind.
+        kind: String,
+    },
+    /// The address is not one.
+    Address {
+        /// The device's kind.
+        kind: String,
+        /// What is wrong with it.
+        why: HostPortError,
+    },
+}
+
+impl fmt::Display for BindError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::NoEquals { text } => write!(f, "`{text}` has no `=`; write NAME=DEVICE, DEVICE being {DEVICE_FORMS}"),
+            Self::NoName { text } => write!(f, "`{text}` names no port before the `=`; write NAME=DEVICE"),
+            Self::UnknownDevice { text } => write!(f, "`{text}` is not a device; allowed are {DEVICE_FORMS}"),
+            Self::Empty { kind } => write!(f, "`{kind}:` is followed by nothing; allowed are {DEVICE_FORMS}"),
+            Self::Address { kind, why } => write!(f, "`{kind}:` needs HOST:PORT, but {why}"),
+        }
+    }
+}
+
+impl std::error::Error for BindError {}
+
+/// Why a text is not `HOST:PORT`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum HostPortError {
+    /// No colon.
+    NoPort,
+    /// Nothing before the colon.
+    NoHost,
+    /// The port is not a number of 0..=65535.
+    BadPort,
+    /// An IPv6 address without its brackets, or half of them.
+    Brackets,
+}
+
+impl fmt::Display for HostPortError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::NoPort => "there is no `:PORT`",
+            Self::NoHost => "there is no host before the colon",
+            Self::BadPort => "the port is not a number from 0 to 65535",
+            Self::Brackets => "an IPv6 address stands in brackets, as in [::1]:50000",
+        })
+    }
+}
+
+impl std::error::Error for HostPortError {}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_form_is_read_and_written_alike() {
+        for text in [
+            "rs485-1=pty:run/rs485-1",
+            "rs485-1=pty-paced:run/rs485-1",
+            "rs485-1=serial:/dev/ttyUSB0",
+            "can=socketcan:vcan0",
+            "can=slcan-pty:run/can",
+            "can=slcan-tcp:127.0.0.1:0",
+            "a=tcp:sensor.local:4001",
+            "a=tcp-listen:[::1]:0",
+            "name=pty:with=sign",
+        ] {
+            let bind: Bind = text.parse().unwrap();
+            assert_eq!(bind.to_string(), text);
+            assert_ne!(bind.device.is_can(), bind.device.is_serial());
+        }
+    }
+
+    #[test]
+    fn tcp_to_port_zero_listens() {
+        let bind: Bind = "a=tcp:127.0.0.1:0".parse().unwrap();
+        let listen = HostPort { host: "127.0.0.1".into(), port: 0 };
+        assert_eq!(bind.device, Device::TcpListen { listen });
+    }
+
+    #[test]
+    fn each_mistake_has_its_own_message() {
+        let message = |text: &str| text.parse::<Bind>().unwrap_err().to_string();
+        for (text, begins) in [
+            ("rs485", "`rs485` has no `=`"),
+            ("=pty:x", "`=pty:x` names no port"),
+            ("a=x", "`x` is not a device; allowed are pty:PATH"),
+            ("a=usb:x", "`usb:x` is not a device"),
+            ("a=pty:", "`pty:` is followed by nothing"),
+            ("a=socketcan:", "`socketcan:` is followed by nothing"),
+            ("a=tcp:host", "`tcp:` needs HOST:PORT, but there is no `:PORT`"),
+            ("a=tcp::5", "`tcp:` needs HOST:PORT, but there is no host"),
+            ("a=tcp:h:65536", "`tcp:` needs HOST:PORT, but the port is not a number"),
+            ("a=tcp:::1:5", "`tcp:` needs HOST:PORT, but an IPv6 address stands in brackets"),
+            ("a=tcp:[::1:5", "`tcp:` needs HOST:PORT, but an IPv6 address stands in brackets"),
+        ] {
+            assert!(message(text).starts_with(begins), "{text}: {}", message(text));
+        }
+    }
+}

@@ -1,0 +1,6 @@
+//! Devices a configured port can be tied to: pseudoterminals, serial lines, byte streams over TCP and
+//! a CAN bus in user space; and the timer that paces them.
+//!
+//! Bytes and frames go in and out; no recipe, no controller and no engine is known here.
+
+pub mod bind;

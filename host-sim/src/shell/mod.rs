@@ -1,0 +1,42 @@
+//! The tokio shells: what ties the sans-IO controller and gateway to sockets, devices and the clock.
+//!
+//! A shell is one thread with a current-thread runtime. It owns every socket and device of its side,
+//! hands what they receive to the core and carries out what the core answers; it knows no protocol.
+
+use std::fmt;
+use std::path::PathBuf;
+use std::time::Duration;
+
+use crate::bus::bind::Bind;
+
+/// What a run is told beside its file.
+#[derive(Debug, Clone, Default)]
+pub struct RunOptions {
+    /// Which device each serial or CAN port is tied to.
+    pub binds: Vec<Bind>,
+    /// Where the addresses are written once everything listens.
+    pub ready: Option<PathBuf>,
+    /// How often a line of counters is printed.
+    pub stats: Option<Duration>,
+}
+
+/// Why a run could not start: one message, nothing was left behind.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct StartError {
+    message: String,
+}
+
+impl StartError {
+    /// An error with this message.
+    pub fn new(message: impl Into<String>) -> Self {
+        Self { message: message.into() }
+    }
+}
+
+impl fmt::Display for StartError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.message)
+    }
+}
+
+impl std::error::Error for StartError {}
