@@ -1,3 +1,5 @@
 //! A simulated DUCO CORE controller and the recipe gateway on this host.
 
+pub mod bus;
 pub mod config;
+pub mod shell;

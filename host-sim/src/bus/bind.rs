@@ -222,7 +222,9 @@ pub enum BindError {
 impl fmt::Display for BindError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::NoEquals { text } => write!(f, "`{text}` has no `=`; write NAME=DEVICE, DEVICE being {DEVICE_FORMS}"),
+            Self::NoEquals { text } => {
+                write!(f, "`{text}` has no `=`; write NAME=DEVICE, DEVICE being {DEVICE_FORMS}")
+            }
             Self::NoName { text } => write!(f, "`{text}` names no port before the `=`; write NAME=DEVICE"),
             Self::UnknownDevice { text } => write!(f, "`{text}` is not a device; allowed are {DEVICE_FORMS}"),
             Self::Empty { kind } => write!(f, "`{kind}:` is followed by nothing; allowed are {DEVICE_FORMS}"),

@@ -3,6 +3,9 @@
 //! A shell is one thread with a current-thread runtime. It owns every socket and device of its side,
 //! hands what they receive to the core and carries out what the core answers; it knows no protocol.
 
+pub mod controller;
+pub mod gateway;
+
 use std::fmt;
 use std::path::PathBuf;
 use std::time::Duration;
