@@ -4,6 +4,12 @@
 //! Bounded and plain: names are kept for messages, everything else is numbers. Nothing here has
 //! been checked until [`GatewayConfig::validate`] said so.
 
+mod error;
+mod validate;
+
+pub use error::{ConfigError, ConfigErrorKind, ControllerKey, Place, PortKey, RecipeKey};
+pub use validate::{MAX_LINE_TIME, MAX_TIME, MIN_CYCLE};
+
 use heapless::{String, Vec};
 
 use crate::recipe::model::{CanId, MAX_CAN_IDS, MAX_DELIMITER, Mode};

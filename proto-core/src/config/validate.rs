@@ -1,0 +1,510 @@
+//! The checks that make a [`GatewayConfig`] fit for the engine.
+//!
+//! In: a configuration, from whatever file format. Out: nothing, or the first mistake with its
+//! place. Order: controller, recipes, ports, then what concerns several of them (ownership and
+//! ways up and down).
+
+use core::net::SocketAddr;
+
+use super::error::{ConfigError, ConfigErrorKind as Kind, ControllerKey, Place, PortKey, RecipeKey};
+use super::{
+    Bus, FieldSpec, GatewayConfig, InputBinding, OutputBinding, Parts, Port, Recipe, Rs485, SendOn, Span,
+};
+use crate::recipe::model::{Field, Mode};
+use crate::sysvar::{COUNT, Direction, INPUT_COUNT, SysVar};
+use crate::time::Duration;
+use crate::wire::scalar::{Scalar, ScalarType};
+
+/// The controller's fastest cycle, and a port's.
+pub const MIN_CYCLE: Duration = Duration::from_millis(4);
+/// Longest cycle, timeout or staleness that a configuration may ask for.
+pub const MAX_TIME: Duration = Duration::from_secs(3_600);
+/// Longest idle gap and turnaround of a serial line.
+pub const MAX_LINE_TIME: Duration = Duration::from_secs(1);
+
+type Check = Result<(), ConfigError>;
+
+impl GatewayConfig {
+    /// Checks everything that can be checked without the controller.
+    ///
+    /// # Errors
+    /// The first mistake, with its place and the numbers.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        self.check_controller()?;
+        for (index, recipe) in (0..).zip(&self.recipes) {
+            RecipeCheck { config: self, index, recipe }.check()?;
+        }
+        for (index, port) in (0..).zip(&self.ports) {
+            self.check_port(index, port)?;
+        }
+        self.check_owners()?;
+        self.check_ways_up()?;
+        self.check_sources()?;
+        self.check_safe_values()
+    }
+
+    /// The recipes on the ways up: the recipe link's, then those of the listening ports.
+    pub fn upstream_recipes(&self) -> impl Iterator<Item = (u8, &Recipe)> {
+        let link = self.controller.recipe_link.map(|link| link.recipe);
+        let ports = self.ports.iter().filter(|port| !port.bus.is_field()).map(|port| port.recipe);
+        link.into_iter().chain(ports).filter_map(|index| Some((index, self.recipes.get(usize::from(index))?)))
+    }
+
+    /// The ports with devices behind them, with their indices and recipes.
+    pub fn field_ports(&self) -> impl Iterator<Item = (u8, &Port, &Recipe)> {
+        (0..)
+            .zip(&self.ports)
+            .filter(|(_, port)| port.bus.is_field())
+            .filter_map(|(index, port)| Some((index, port, self.recipes.get(usize::from(port.recipe))?)))
+    }
+
+    /// The fields of one part of `recipe`, with the index of the CAN frame (0 in a stream) and the
+    /// index of the field in it.
+    pub fn fields_of<'a>(
+        &'a self,
+        recipe: &'a Recipe,
+        part: Direction,
+    ) -> impl Iterator<Item = (u8, u8, &'a FieldSpec)> {
+        recipe.frames(part).flat_map(move |(frame, span)| {
+            (0..).zip(span.of(&self.fields)).map(move |(index, field)| (frame, index, field))
+        })
+    }
+
+    /// The input variables that a field port writes.
+    pub fn written_by<'a>(&'a self, recipe: &'a Recipe) -> impl Iterator<Item = SysVar> + 'a {
+        self.fields_of(recipe, Direction::Input).filter_map(|(_, _, field)| field.variable())
+    }
+
+    fn check_controller(&self) -> Check {
+        let controller = &self.controller;
+        if [controller.command_port, controller.state_port, controller.modbus_port].contains(&0) {
+            return fail(Place::Controller(ControllerKey::Ports), Kind::ZeroPort);
+        }
+        let Some(link) = controller.recipe_link else { return Ok(()) };
+        let place = Place::Controller(ControllerKey::RecipeLink);
+        if link.udp_port == 0 {
+            return fail(place, Kind::ZeroPort);
+        }
+        self.check_upstream_recipe(place, link.recipe)
+    }
+
+    /// The controller's TCP and UDP ports take realtime stream recipes only (D16).
+    fn check_upstream_recipe(&self, place: Place, index: u8) -> Check {
+        let recipe = self.recipe_at(place, index)?;
+        if !matches!(recipe.parts, Parts::Stream { .. }) {
+            return fail(place, Kind::NeedsStreamRecipe { recipe: index });
+        }
+        if recipe.mode != Mode::Realtime {
+            return fail(place, Kind::NeedsRealtimeRecipe { recipe: index });
+        }
+        Ok(())
+    }
+
+    fn recipe_at(&self, place: Place, index: u8) -> Result<&Recipe, ConfigError> {
+        let recipes = self.recipes.len() as u8;
+        self.recipes
+            .get(usize::from(index))
+            .ok_or(ConfigError { place, kind: Kind::NoSuchRecipe { recipe: index, recipes } })
+    }
+
+    fn check_port(&self, index: u8, port: &Port) -> Check {
+        let at = |key| Place::Port { port: index, key };
+        check_name(at(PortKey::Name), &port.name, index, self.ports.iter().map(|port| &port.name))?;
+        let recipe = self.recipe_at(at(PortKey::Recipe), port.recipe)?;
+        let is_stream = matches!(recipe.parts, Parts::Stream { .. });
+        match &port.bus {
+            Bus::Rs485(line) => {
+                check_line(index, line)?;
+                if !is_stream {
+                    return fail(at(PortKey::Recipe), Kind::NeedsStreamRecipe { recipe: port.recipe });
+                }
+            }
+            Bus::Can { bitrate } => {
+                if !(10_000..=1_000_000).contains(bitrate) {
+                    return fail(at(PortKey::Bitrate), Kind::BitrateOutOfRange { bitrate: *bitrate });
+                }
+                if is_stream {
+                    return fail(at(PortKey::Recipe), Kind::NeedsCanRecipe { recipe: port.recipe });
+                }
+            }
+            Bus::TcpListen { listen } | Bus::UdpListen { listen } => {
+                self.check_upstream_recipe(at(PortKey::Recipe), port.recipe)?;
+                self.check_listen(index, port, listen)?;
+            }
+        }
+        if port.cycle < MIN_CYCLE {
+            return fail(at(PortKey::Cycle), Kind::CycleTooShort { cycle: port.cycle });
+        }
+        check_time(at(PortKey::Cycle), port.cycle, MAX_TIME)?;
+        check_time(at(PortKey::Timeout), port.timeout, MAX_TIME)?;
+        check_time(at(PortKey::StaleAfter), port.stale_after, MAX_TIME)?;
+        check_pool(at(PortKey::OnTimeout), port.on_timeout, self.safe_values.len())
+    }
+
+    fn check_listen(&self, index: u8, port: &Port, listen: &str) -> Check {
+        let place = Place::Port { port: index, key: PortKey::Listen };
+        let Ok(address) = listen.parse::<SocketAddr>() else {
+            return fail(place, Kind::ListenAddress);
+        };
+        if address.port() == 0 {
+            return Ok(());
+        }
+        let same = |before: &Port| match (&before.bus, &port.bus) {
+            (Bus::TcpListen { listen: theirs }, Bus::TcpListen { .. })
+            | (Bus::UdpListen { listen: theirs }, Bus::UdpListen { .. }) => {
+                theirs.parse::<SocketAddr>().is_ok_and(|theirs| theirs == address)
+            }
+            _ => false,
+        };
+        match (0..index).zip(&self.ports).find(|(_, before)| same(before)) {
+            Some((other, _)) => fail(place, Kind::ListenTwice { other }),
+            None => Ok(()),
+        }
+    }
+
+    /// One owner a variable.
+    fn check_owners(&self) -> Check {
+        let mut owners = [None; INPUT_COUNT];
+        for (index, _, recipe) in self.field_ports() {
+            for var in self.written_by(recipe) {
+                // An input variable's ordinal is below INPUT_COUNT; others were refused before.
+                let Some(owner) = owners.get_mut(var.ordinal()) else { continue };
+                match *owner {
+                    Some(other) if other != index => {
+                        let place = Place::Port { port: index, key: PortKey::Recipe };
+                        return fail(place, Kind::OwnedTwice { var, other });
+                    }
+                    _ => *owner = Some(index),
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Every variable a port writes can be carried, and everything that is carried has a value.
+    fn check_ways_up(&self) -> Check {
+        let mut owned = [false; COUNT];
+        for (port, port_config, recipe) in self.field_ports() {
+            for (frame, field, spec) in self.fields_of(recipe, Direction::Input) {
+                let Some(var) = spec.variable() else { continue };
+                mark(&mut owned, var);
+                if var.modbus().is_none() && !self.carried(Direction::Input, var) {
+                    let recipe = port_config.recipe;
+                    let place = Place::Field { recipe, part: Direction::Input, frame, field };
+                    return fail(place, Kind::NoWayUp { var, port });
+                }
+            }
+        }
+        for (index, recipe) in self.upstream_recipes() {
+            for (frame, field, spec) in self.fields_of(recipe, Direction::Input) {
+                let Some(var) = spec.variable() else { continue };
+                if var.stream().is_none() && var.modbus().is_none() && !is_marked(&owned, var) {
+                    let place = Place::Field { recipe: index, part: Direction::Input, frame, field };
+                    return fail(place, Kind::Unowned { var });
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Every variable a port sends or triggers on is shown somewhere.
+    fn check_sources(&self) -> Check {
+        for (port, port_config, recipe) in self.field_ports() {
+            let index = port_config.recipe;
+            let is_shown = |var: SysVar| {
+                var.stream().is_some() || var.modbus().is_some() || self.carried(Direction::Output, var)
+            };
+            for (frame, field, spec) in self.fields_of(recipe, Direction::Output) {
+                if let Some(var) = spec.variable().filter(|&var| !is_shown(var)) {
+                    let place = Place::Field { recipe: index, part: Direction::Output, frame, field };
+                    return fail(place, Kind::NoSource { var, port });
+                }
+            }
+            if let SendOn::Rising { var, .. } = recipe.send
+                && !is_shown(var)
+            {
+                let place = Place::Recipe { recipe: index, key: RecipeKey::Send };
+                return fail(place, Kind::NoSource { var, port });
+            }
+        }
+        Ok(())
+    }
+
+    /// Whether a way up carries `var` in its input part, or shows it in its output part.
+    fn carried(&self, part: Direction, var: SysVar) -> bool {
+        self.upstream_recipes()
+            .flat_map(|(_, recipe)| self.fields_of(recipe, part))
+            .any(|(_, _, spec)| *spec == FieldSpec::System(var))
+    }
+
+    fn check_safe_values(&self) -> Check {
+        for (index, port) in (0..).zip(&self.ports) {
+            let mut seen = [false; COUNT];
+            for (entry, safe) in (port.on_timeout.start..).zip(port.on_timeout.of(&self.safe_values)) {
+                let place = Place::SafeValue { entry };
+                let var = safe.var;
+                let owns = |(port, _, recipe): (u8, &Port, &Recipe)| {
+                    port == index && self.written_by(recipe).any(|written| written == var)
+                };
+                if !self.field_ports().any(owns) {
+                    return fail(place, Kind::NotOwned { var });
+                }
+                if safe.value.ty() != var.ty() {
+                    return fail(place, Kind::SafeType { var, ty: safe.value.ty() });
+                }
+                let reserved = matches!(safe.value, Scalar::Byte(bits) if bits & !var.valid_bits() != 0);
+                if reserved || !safe.value.is_finite() {
+                    return fail(place, Kind::SafeValue { var });
+                }
+                if is_marked(&seen, var) {
+                    return fail(place, Kind::SafeTwice { var });
+                }
+                mark(&mut seen, var);
+            }
+        }
+        Ok(())
+    }
+}
+
+impl Recipe {
+    /// The field ranges of one part: one for a stream part, one for each CAN frame.
+    pub fn frames(&self, part: Direction) -> impl Iterator<Item = (u8, Span)> + '_ {
+        let (stream, can) = match (&self.parts, part) {
+            (Parts::Stream { input, .. }, Direction::Input) => (input.as_ref(), None),
+            (Parts::Stream { output, .. }, Direction::Output) => (output.as_ref(), None),
+            (Parts::Can { input, .. }, Direction::Input) => (None, Some(input)),
+            (Parts::Can { output, .. }, Direction::Output) => (None, Some(output)),
+        };
+        let can = can.into_iter().flatten().map(|frame| frame.fields);
+        (0..).zip(stream.map(|part| part.fields).into_iter().chain(can))
+    }
+
+    /// Whether the recipe has this part.
+    pub fn has(&self, part: Direction) -> bool {
+        self.frames(part).next().is_some()
+    }
+}
+
+impl FieldSpec {
+    /// What the field is on the wire.
+    pub fn field(&self) -> Field {
+        match *self {
+            Self::System(var) => Field::System(var),
+            Self::UserInput { ty, .. } | Self::UserOutput { ty, .. } => Field::User(ty),
+        }
+    }
+
+    /// The system variable that the field is, is written to, or is read from.
+    pub fn variable(&self) -> Option<SysVar> {
+        match *self {
+            Self::System(var)
+            | Self::UserInput { to: InputBinding::Variable { var, .. }, .. }
+            | Self::UserOutput { from: OutputBinding::Variable { var, .. }, .. } => Some(var),
+            Self::UserInput { .. } | Self::UserOutput { .. } => None,
+        }
+    }
+}
+
+/// One recipe under check.
+struct RecipeCheck<'a> {
+    config: &'a GatewayConfig,
+    index: u8,
+    recipe: &'a Recipe,
+}
+
+impl RecipeCheck<'_> {
+    fn check(&self) -> Check {
+        let names = self.config.recipes.iter().map(|recipe| &recipe.name);
+        check_name(self.at(RecipeKey::Name), &self.recipe.name, self.index, names)?;
+        if !self.recipe.has(Direction::Input) && !self.recipe.has(Direction::Output) {
+            return fail(self.at(RecipeKey::Whole), Kind::NoParts);
+        }
+        for part in [Direction::Input, Direction::Output] {
+            for (frame, span) in self.recipe.frames(part) {
+                let place = Place::Frame { recipe: self.index, part, frame };
+                check_pool(place, span, self.config.fields.len())?;
+            }
+            for (frame, field, spec) in self.config.fields_of(self.recipe, part) {
+                let place = Place::Field { recipe: self.index, part, frame, field };
+                self.check_field(place, part, spec)?;
+            }
+        }
+        if self.recipe.mode == Mode::User {
+            self.check_written_once()?;
+        }
+        self.check_send()
+    }
+
+    fn at(&self, key: RecipeKey) -> Place {
+        Place::Recipe { recipe: self.index, key }
+    }
+
+    fn check_field(&self, place: Place, part: Direction, spec: &FieldSpec) -> Check {
+        match (self.recipe.mode, part, *spec) {
+            (Mode::Realtime, _, FieldSpec::System(_)) => Ok(()),
+            (Mode::User, Direction::Input, FieldSpec::UserInput { ty, to }) => {
+                self.check_input(place, ty, to)
+            }
+            (Mode::User, Direction::Output, FieldSpec::UserOutput { ty, from }) => {
+                check_output(place, ty, from)
+            }
+            (mode, part, _) => fail(place, Kind::WrongField { mode, part }),
+        }
+    }
+
+    fn check_input(&self, place: Place, ty: ScalarType, to: InputBinding) -> Check {
+        match to {
+            InputBinding::Unused => Ok(()),
+            InputBinding::Variable { var, scale, offset } => {
+                if var.direction() != Direction::Input {
+                    return fail(place, Kind::NotAnInput { var });
+                }
+                check_scale(place, scale, offset)
+            }
+            InputBinding::Commands { table, .. } => {
+                if matches!(ty, ScalarType::Float | ScalarType::Double) {
+                    return fail(place, Kind::NeedsInteger { ty });
+                }
+                self.check_commands(place, ty, table)
+            }
+        }
+    }
+
+    fn check_commands(&self, place: Place, ty: ScalarType, table: Span) -> Check {
+        let commands = &self.config.commands;
+        check_pool(place, table, commands.len())?;
+        if table.len == 0 {
+            return fail(place, Kind::EmptyTable);
+        }
+        let entries = || (table.start..).zip(table.of(commands));
+        for (entry, command) in entries() {
+            let place = Place::Command { entry };
+            let (low, high) = ty.range();
+            if !(low..=high).contains(&(command.value as f64)) {
+                return fail(place, Kind::CommandValue { value: command.value, ty });
+            }
+            if entries().any(|(other, before)| other < entry && before.value == command.value) {
+                return fail(place, Kind::DuplicateCommand { value: command.value });
+            }
+        }
+        Ok(())
+    }
+
+    /// In a realtime recipe the layout sees to this.
+    fn check_written_once(&self) -> Check {
+        let mut seen = [false; COUNT];
+        for (frame, field, spec) in self.config.fields_of(self.recipe, Direction::Input) {
+            let Some(var) = spec.variable() else { continue };
+            if is_marked(&seen, var) {
+                let place = Place::Field { recipe: self.index, part: Direction::Input, frame, field };
+                return fail(place, Kind::WrittenTwice { var });
+            }
+            mark(&mut seen, var);
+        }
+        Ok(())
+    }
+
+    fn check_send(&self) -> Check {
+        let place = self.at(RecipeKey::Send);
+        let recipe = self.recipe;
+        if recipe.send == SendOn::Period {
+            return Ok(());
+        }
+        if recipe.mode == Mode::Realtime {
+            return fail(place, Kind::RealtimeSendsByPeriod);
+        }
+        if !recipe.has(Direction::Output) {
+            return fail(place, Kind::NothingToSend);
+        }
+        match recipe.send {
+            SendOn::Period | SendOn::Change => Ok(()),
+            SendOn::Frame if recipe.has(Direction::Input) => Ok(()),
+            SendOn::Frame => fail(place, Kind::NoInputToAnswer),
+            SendOn::Rising { var, bit } => {
+                if !var.is_bits() {
+                    return fail(place, Kind::NotBits { var });
+                }
+                let is_there = 1_u8.checked_shl(bit.into()).is_some_and(|mask| var.valid_bits() & mask != 0);
+                if is_there { Ok(()) } else { fail(place, Kind::NoSuchBit { var, bit }) }
+            }
+        }
+    }
+}
+
+fn fail(place: Place, kind: Kind) -> Check {
+    Err(ConfigError { place, kind })
+}
+
+fn check_name<'a>(place: Place, name: &str, index: u8, all: impl Iterator<Item = &'a super::Name>) -> Check {
+    if name.is_empty() {
+        return fail(place, Kind::EmptyName);
+    }
+    match (0..index).zip(all).find(|(_, before)| *before == name) {
+        Some((other, _)) => fail(place, Kind::DuplicateName { other }),
+        None => Ok(()),
+    }
+}
+
+fn check_pool(place: Place, span: Span, len: usize) -> Check {
+    let end = u32::from(span.start).saturating_add(u32::from(span.len));
+    let len = len as u32;
+    if end <= len { Ok(()) } else { fail(place, Kind::OutsidePool { end, len }) }
+}
+
+fn check_line(port: u8, line: &Rs485) -> Check {
+    let at = |key| Place::Port { port, key };
+    if !(1_200..=4_000_000).contains(&line.baud) {
+        return fail(at(PortKey::Baud), Kind::BaudOutOfRange { baud: line.baud });
+    }
+    if !(1..=2).contains(&line.stop_bits) {
+        return fail(at(PortKey::StopBits), Kind::StopBits { stop_bits: line.stop_bits });
+    }
+    check_time(at(PortKey::IdleGap), line.idle_gap, MAX_LINE_TIME)?;
+    if line.turnaround > MAX_LINE_TIME {
+        let kind = Kind::TimeTooLong { time: line.turnaround, longest: MAX_LINE_TIME };
+        return fail(at(PortKey::Turnaround), kind);
+    }
+    Ok(())
+}
+
+fn check_time(place: Place, time: Duration, longest: Duration) -> Check {
+    if time == Duration::ZERO {
+        return fail(place, Kind::ZeroTime);
+    }
+    if time > longest {
+        return fail(place, Kind::TimeTooLong { time, longest });
+    }
+    Ok(())
+}
+
+fn check_scale(place: Place, scale: f32, offset: f32) -> Check {
+    if scale.is_finite() && scale != 0.0 && offset.is_finite() {
+        Ok(())
+    } else {
+        fail(place, Kind::BadScale { scale, offset })
+    }
+}
+
+fn check_output(place: Place, ty: ScalarType, from: OutputBinding) -> Check {
+    match from {
+        OutputBinding::Variable { scale, offset, .. } => check_scale(place, scale, offset),
+        OutputBinding::Constant(value) => match Scalar::from_f64(ty, value) {
+            Ok(_) => Ok(()),
+            Err(error) => fail(place, Kind::Constant(error)),
+        },
+        OutputBinding::Counter if matches!(ty, ScalarType::Float | ScalarType::Double) => {
+            fail(place, Kind::NeedsInteger { ty })
+        }
+        OutputBinding::Counter | OutputBinding::Reply => Ok(()),
+    }
+}
+
+fn mark(set: &mut [bool; COUNT], var: SysVar) {
+    if let Some(place) = set.get_mut(var.ordinal()) {
+        *place = true;
+    }
+}
+
+fn is_marked(set: &[bool; COUNT], var: SysVar) -> bool {
+    set.get(var.ordinal()).copied().unwrap_or(false)
+}
