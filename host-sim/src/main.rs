@@ -1,1 +1,3 @@
+//! The `host-sim` binary: see the library for what it does.
+
 fn main() {}
