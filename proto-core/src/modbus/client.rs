@@ -1,0 +1,198 @@
+//! The client's side of one connection, one transaction in flight (docs/wire/modbus.md section 6).
+//!
+//! In: a request to send, then the connection's bytes. Out: the request's frame, then its answer.
+//! Knows no time: a caller whose patience ends calls [`Client::abort`], and the answer that comes
+//! too late is recognised by its transaction id, counted and skipped.
+
+use core::fmt;
+
+use super::adu::{self, Adu, AduError, AduReader, HEADER_LEN};
+use super::exception::Exception;
+use super::pdu::{EncodeError, Request, RequestHead, Response, ResponseError};
+
+/// The client's side of one connection.
+#[derive(Debug, Clone)]
+pub struct Client {
+    reader: AduReader,
+    unit: u8,
+    transaction: u16,
+    pending: Option<RequestHead>,
+    stale: u32,
+}
+
+/// What the received bytes brought.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum ClientEvent<'a> {
+    /// The request was carried out.
+    Response(Response<'a>),
+    /// The server refused the request; the connection is fine.
+    Exception(Exception),
+    /// The server does not speak the protocol: the connection must be closed. The request, if one
+    /// was in flight, is over; what else the chunk brought has been dropped.
+    Violation(Violation),
+}
+
+/// How a server broke the protocol.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[non_exhaustive]
+pub enum Violation {
+    /// A header that cannot be followed.
+    Header(AduError),
+    /// An answer to a request that was never sent.
+    Transaction {
+        /// Id of the newest request.
+        newest: u16,
+        /// The one that came.
+        received: u16,
+    },
+    /// An answer from another unit.
+    Unit {
+        /// The unit that was asked.
+        expected: u8,
+        /// The one that came.
+        received: u8,
+    },
+    /// A PDU that does not answer the request.
+    Response(ResponseError),
+}
+
+impl fmt::Display for Violation {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Header(error) => error.fmt(f),
+            Self::Transaction { newest, received } => {
+                write!(f, "an answer to transaction {received}, which is not among those up to {newest}")
+            }
+            Self::Unit { expected, received } => write!(f, "unit {received} answers for unit {expected}"),
+            Self::Response(error) => error.fmt(f),
+        }
+    }
+}
+
+impl core::error::Error for Violation {}
+
+/// Why a request was not started.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[non_exhaustive]
+pub enum StartError {
+    /// Another request is in flight.
+    Busy,
+    /// The request cannot be encoded.
+    Encode(EncodeError),
+}
+
+impl fmt::Display for StartError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Busy => f.write_str("another Modbus request is in flight"),
+            Self::Encode(error) => error.fmt(f),
+        }
+    }
+}
+
+impl core::error::Error for StartError {}
+
+impl Client {
+    /// A client at the start of a connection, for the server's unit id `unit`.
+    pub const fn new(unit: u8) -> Self {
+        Self { reader: AduReader::new(), unit, transaction: 0, pending: None, stale: 0 }
+    }
+
+    /// Whether a request is in flight.
+    pub const fn busy(&self) -> bool {
+        self.pending.is_some()
+    }
+
+    /// Function code, address and count or value of the request in flight.
+    pub const fn in_flight(&self) -> Option<RequestHead> {
+        self.pending
+    }
+
+    /// Answers that came after their request had been given up, ever.
+    pub const fn stale_answers(&self) -> u32 {
+        self.stale
+    }
+
+    /// Writes the request's frame to the front of `out` and returns its length; the request is then
+    /// in flight.
+    ///
+    /// # Errors
+    /// Nothing was written and nothing changed: a request is in flight, the count is outside the
+    /// function's limits, or `out` is too short (260 bytes are always enough).
+    #[inline]
+    pub fn start(&mut self, request: Request<'_>, out: &mut [u8]) -> Result<usize, StartError> {
+        if self.pending.is_some() {
+            return Err(StartError::Busy);
+        }
+        let available = out.len();
+        let no_space = || {
+            let needed = request.encoded_len().saturating_add(HEADER_LEN);
+            StartError::Encode(EncodeError::NoSpace { needed, available })
+        };
+        let (header, body) = out.split_first_chunk_mut().ok_or_else(no_space)?;
+        let pdu_len = request.encode(body).map_err(|error| match error {
+            EncodeError::NoSpace { .. } => no_space(),
+            other => StartError::Encode(other),
+        })?;
+        self.transaction = self.transaction.wrapping_add(1);
+        *header = adu::header(self.transaction, self.unit, pdu_len);
+        self.pending = Some(request.head());
+        Ok(pdu_len.saturating_add(HEADER_LEN))
+    }
+
+    /// Takes bytes from the front of `bytes` up to the end of the next answer and returns what it
+    /// says; `None` once all of `bytes` is taken. To be called until then.
+    #[inline]
+    pub fn receive<'s, 'c: 's>(&'s mut self, bytes: &mut &'c [u8]) -> Option<ClientEvent<'s>> {
+        let place = loop {
+            let place = match self.reader.advance(bytes)? {
+                Ok(place) => place,
+                Err(error) => return Some(self.violated(bytes, Violation::Header(error))),
+            };
+            let Adu { transaction, unit, .. } = self.reader.adu(place);
+            if transaction == self.transaction && self.pending.is_some() {
+                if unit == self.unit {
+                    break place;
+                }
+                let violation = Violation::Unit { expected: self.unit, received: unit };
+                return Some(self.violated(bytes, violation));
+            }
+            // Ids count up, so the half of their circle behind the newest one is the past.
+            if self.transaction.wrapping_sub(transaction) >= 0x8000 {
+                let violation = Violation::Transaction { newest: self.transaction, received: transaction };
+                return Some(self.violated(bytes, violation));
+            }
+            self.stale = self.stale.saturating_add(1);
+        };
+        let request = self.pending.take()?;
+        match Response::parse(request, self.reader.adu(place).pdu) {
+            Ok(Ok(response)) => Some(ClientEvent::Response(response)),
+            Ok(Err(exception)) => Some(ClientEvent::Exception(exception)),
+            Err(error) => {
+                *bytes = &[];
+                Some(ClientEvent::Violation(Violation::Response(error)))
+            }
+        }
+    }
+
+    /// Gives the request in flight up, on the same connection: its answer will be skipped.
+    pub const fn abort(&mut self) {
+        self.pending = None;
+    }
+
+    /// The connection is a new one: gives up the request in flight and forgets a partial answer.
+    pub const fn reset(&mut self) {
+        self.pending = None;
+        self.reader.reset();
+    }
+
+    #[cold]
+    fn violated<'s>(&mut self, bytes: &mut &[u8], violation: Violation) -> ClientEvent<'s> {
+        self.reset();
+        *bytes = &[];
+        ClientEvent::Violation(violation)
+    }
+}

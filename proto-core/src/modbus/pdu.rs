@@ -1,0 +1,515 @@
+//! Requests and responses of the six function codes (docs/wire/modbus.md section 3).
+//!
+//! In: PDUs or values. Out: the other. Knows nothing of connections, transactions or the map.
+
+use core::fmt;
+
+pub use super::adu::MAX_PDU;
+use super::exception::Exception;
+use super::values::{Coils, Registers, packed_len};
+
+/// Most coils in one FC 1 request.
+pub const MAX_READ_COILS: u16 = 0x07D0;
+/// Most registers in one FC 3 request.
+pub const MAX_READ_REGISTERS: u16 = 0x007D;
+/// Most coils in one FC 15 request.
+pub const MAX_WRITE_COILS: u16 = 0x07B0;
+/// Most registers in one FC 16 request.
+pub const MAX_WRITE_REGISTERS: u16 = 0x007B;
+
+/// The function codes.
+pub mod function {
+    /// FC 1, read coils.
+    pub const READ_COILS: u8 = 0x01;
+    /// FC 3, read holding registers.
+    pub const READ_HOLDING: u8 = 0x03;
+    /// FC 5, write one coil.
+    pub const WRITE_COIL: u8 = 0x05;
+    /// FC 6, write one register.
+    pub const WRITE_REGISTER: u8 = 0x06;
+    /// FC 15, write several coils.
+    pub const WRITE_COILS: u8 = 0x0F;
+    /// FC 16, write several registers.
+    pub const WRITE_REGISTERS: u8 = 0x10;
+    /// Set in the function code of an exception response.
+    pub const EXCEPTION_FLAG: u8 = 0x80;
+}
+
+/// What a client asks for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum Request<'a> {
+    /// FC 1.
+    ReadCoils {
+        /// First coil.
+        address: u16,
+        /// 1..=2000.
+        count: u16,
+    },
+    /// FC 3.
+    ReadHolding {
+        /// First register.
+        address: u16,
+        /// 1..=125.
+        count: u16,
+    },
+    /// FC 5.
+    WriteCoil {
+        /// The coil.
+        address: u16,
+        /// On or off.
+        value: bool,
+    },
+    /// FC 6.
+    WriteRegister {
+        /// The register.
+        address: u16,
+        /// Its new value.
+        value: u16,
+    },
+    /// FC 15.
+    WriteCoils {
+        /// First coil.
+        address: u16,
+        /// 1..=1968 coils.
+        coils: Coils<'a>,
+    },
+    /// FC 16.
+    WriteRegisters {
+        /// First register.
+        address: u16,
+        /// 1..=123 registers.
+        registers: Registers<'a>,
+    },
+}
+
+/// What a server answers when it carried a request out.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum Response<'a> {
+    /// FC 1: the coils asked for.
+    Coils(Coils<'a>),
+    /// FC 3: the registers asked for.
+    Registers(Registers<'a>),
+    /// FC 5: an echo of the request.
+    WroteCoil {
+        /// The coil.
+        address: u16,
+        /// Its new value.
+        value: bool,
+    },
+    /// FC 6: an echo of the request.
+    WroteRegister {
+        /// The register.
+        address: u16,
+        /// Its new value.
+        value: u16,
+    },
+    /// FC 15.
+    WroteCoils {
+        /// First coil.
+        address: u16,
+        /// How many were written.
+        count: u16,
+    },
+    /// FC 16.
+    WroteRegisters {
+        /// First register.
+        address: u16,
+        /// How many were written.
+        count: u16,
+    },
+}
+
+/// Function code, address, and count or value of a request: what its response is checked against.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub struct RequestHead {
+    /// Function code.
+    pub function: u8,
+    /// First address.
+    pub address: u16,
+    /// The value as on the wire for FC 5 and 6, the count otherwise.
+    pub count_or_value: u16,
+}
+
+/// Why a request or response cannot be encoded.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[non_exhaustive]
+pub enum EncodeError {
+    /// The buffer is too short; nothing was written.
+    NoSpace {
+        /// Bytes the PDU or frame takes.
+        needed: usize,
+        /// Bytes there were.
+        available: usize,
+    },
+    /// A count of 0 or over the function's limit.
+    Count {
+        /// The count that was asked for.
+        count: u16,
+        /// The function's limit.
+        max: u16,
+    },
+}
+
+impl fmt::Display for EncodeError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::NoSpace { needed, available } => {
+                write!(f, "{needed} bytes are needed and {available} available")
+            }
+            Self::Count { count, max } => write!(f, "a count of {count} is outside 1..={max}"),
+        }
+    }
+}
+
+impl core::error::Error for EncodeError {}
+
+/// Why bytes are not an answer to the request they should answer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[non_exhaustive]
+pub enum ResponseError {
+    /// The function code of another function.
+    Function {
+        /// The request's function code.
+        expected: u8,
+        /// The one that came.
+        received: u8,
+    },
+    /// More or fewer bytes than the answer has.
+    Length {
+        /// Length of the PDU that answers the request.
+        expected: usize,
+        /// The one that came.
+        received: usize,
+    },
+    /// The byte count of a read does not fit the count asked for.
+    ByteCount {
+        /// Bytes asked for.
+        expected: u8,
+        /// The byte count that came.
+        received: u8,
+    },
+    /// The echo of a write names another address, count or value.
+    Echo {
+        /// What was requested.
+        expected: RequestHead,
+        /// What came back.
+        received: RequestHead,
+    },
+}
+
+impl fmt::Display for ResponseError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Function { expected, received } => {
+                write!(f, "function 0x{received:02x} answers a request of function 0x{expected:02x}")
+            }
+            Self::Length { expected, received } => {
+                write!(f, "the answer has {received} bytes instead of {expected}")
+            }
+            Self::ByteCount { expected, received } => {
+                write!(f, "the answer announces {received} bytes of data instead of {expected}")
+            }
+            Self::Echo { expected, received } => write!(
+                f,
+                "address {} with 0x{:04x} was to be written, the answer echoes address {} with 0x{:04x}",
+                expected.address, expected.count_or_value, received.address, received.count_or_value
+            ),
+        }
+    }
+}
+
+impl core::error::Error for ResponseError {}
+
+impl<'a> Request<'a> {
+    /// Reads a request as a server does (D10).
+    ///
+    /// # Errors
+    /// The exception to answer with: 01 for another function code, 03 for a count of 0 or over the
+    /// limit, an FC 5 value other than 0x0000 and 0xFF00, or a PDU whose length disagrees with its
+    /// function or byte count.
+    #[inline]
+    pub fn parse(pdu: &'a [u8]) -> Result<Self, Exception> {
+        let known = pdu.first().is_some_and(|function| {
+            matches!(
+                *function,
+                function::READ_COILS
+                    | function::READ_HOLDING
+                    | function::WRITE_COIL
+                    | function::WRITE_REGISTER
+                    | function::WRITE_COILS
+                    | function::WRITE_REGISTERS
+            )
+        });
+        let Some((head, rest)) = pdu.split_first_chunk() else {
+            return Err(if known { Exception::IllegalDataValue } else { Exception::IllegalFunction });
+        };
+        let RequestHead { function, address, count_or_value } = RequestHead::from_bytes(head);
+        let request = match (function, rest) {
+            (function::READ_COILS, []) if in_limit(count_or_value, MAX_READ_COILS) => {
+                Self::ReadCoils { address, count: count_or_value }
+            }
+            (function::READ_HOLDING, []) if in_limit(count_or_value, MAX_READ_REGISTERS) => {
+                Self::ReadHolding { address, count: count_or_value }
+            }
+            (function::WRITE_COIL, []) if count_or_value == COIL_OFF || count_or_value == COIL_ON => {
+                Self::WriteCoil { address, value: count_or_value == COIL_ON }
+            }
+            (function::WRITE_REGISTER, []) => Self::WriteRegister { address, value: count_or_value },
+            (function::WRITE_COILS, [byte_count, packed @ ..])
+                if in_limit(count_or_value, MAX_WRITE_COILS) =>
+            {
+                let len = packed_len(count_or_value);
+                if usize::from(*byte_count) != len || packed.len() != len {
+                    return Err(Exception::IllegalDataValue);
+                }
+                let coils = Coils::new(packed, count_or_value).ok_or(Exception::IllegalDataValue)?;
+                Self::WriteCoils { address, coils }
+            }
+            (function::WRITE_REGISTERS, [byte_count, bytes @ ..])
+                if in_limit(count_or_value, MAX_WRITE_REGISTERS) =>
+            {
+                let len = usize::from(count_or_value).saturating_mul(2);
+                if usize::from(*byte_count) != len || bytes.len() != len {
+                    return Err(Exception::IllegalDataValue);
+                }
+                let registers = Registers::new(bytes).ok_or(Exception::IllegalDataValue)?;
+                Self::WriteRegisters { address, registers }
+            }
+            _ if known => return Err(Exception::IllegalDataValue),
+            _ => return Err(Exception::IllegalFunction),
+        };
+        Ok(request)
+    }
+
+    /// Function code, address, and count or value.
+    #[inline]
+    pub const fn head(&self) -> RequestHead {
+        let (function, address, count_or_value) = match *self {
+            Self::ReadCoils { address, count } => (function::READ_COILS, address, count),
+            Self::ReadHolding { address, count } => (function::READ_HOLDING, address, count),
+            Self::WriteCoil { address, value } => (function::WRITE_COIL, address, coil_value(value)),
+            Self::WriteRegister { address, value } => (function::WRITE_REGISTER, address, value),
+            Self::WriteCoils { address, coils } => (function::WRITE_COILS, address, coils.count()),
+            Self::WriteRegisters { address, registers } => {
+                (function::WRITE_REGISTERS, address, registers.count())
+            }
+        };
+        RequestHead { function, address, count_or_value }
+    }
+
+    /// Length of the request's PDU, 5..=252.
+    #[inline]
+    pub const fn encoded_len(&self) -> usize {
+        match self {
+            Self::WriteCoils { coils, .. } => coils.packed().len().saturating_add(MULTIPLE_HEAD_LEN),
+            Self::WriteRegisters { registers, .. } => {
+                registers.as_be_bytes().len().saturating_add(MULTIPLE_HEAD_LEN)
+            }
+            _ => HEAD_LEN,
+        }
+    }
+
+    /// Whether the count is one the function allows.
+    ///
+    /// # Errors
+    /// [`EncodeError::Count`] with the function's limit.
+    #[inline]
+    pub const fn check(&self) -> Result<(), EncodeError> {
+        let (count, max) = match *self {
+            Self::ReadCoils { count, .. } => (count, MAX_READ_COILS),
+            Self::ReadHolding { count, .. } => (count, MAX_READ_REGISTERS),
+            Self::WriteCoils { coils, .. } => (coils.count(), MAX_WRITE_COILS),
+            Self::WriteRegisters { registers, .. } => (registers.count(), MAX_WRITE_REGISTERS),
+            Self::WriteCoil { .. } | Self::WriteRegister { .. } => return Ok(()),
+        };
+        if in_limit(count, max) { Ok(()) } else { Err(EncodeError::Count { count, max }) }
+    }
+
+    /// Writes the request's PDU to the front of `out` and returns its length.
+    ///
+    /// # Errors
+    /// A count the function does not allow, or too little space; nothing is written then.
+    #[inline]
+    pub fn encode(&self, out: &mut [u8]) -> Result<usize, EncodeError> {
+        self.check()?;
+        let (needed, available) = (self.encoded_len(), out.len());
+        let no_space = EncodeError::NoSpace { needed, available };
+        let out = out.get_mut(..needed).ok_or(no_space)?;
+        let (head, rest) = out.split_first_chunk_mut().ok_or(no_space)?;
+        *head = self.head().to_bytes();
+        if let Some((byte_count, data)) = rest.split_first_mut() {
+            // At most 246 bytes by the check above.
+            *byte_count = data.len() as u8;
+            match self {
+                Self::WriteCoils { coils, .. } => copy_coils(*coils, data),
+                Self::WriteRegisters { registers, .. } => data.copy_from_slice(registers.as_be_bytes()),
+                _ => {}
+            }
+        }
+        Ok(needed)
+    }
+}
+
+impl<'a> Response<'a> {
+    /// Reads the answer to `request`: a response, or the exception the server refused it with.
+    ///
+    /// # Errors
+    /// [`ResponseError`] when the bytes do not answer that request.
+    #[inline]
+    pub fn parse(request: RequestHead, pdu: &'a [u8]) -> Result<Result<Self, Exception>, ResponseError> {
+        let RequestHead { function, address, count_or_value } = request;
+        let (received, data) = match pdu.split_first() {
+            Some((received, data)) => (*received, data),
+            None => return Err(ResponseError::Length { expected: HEAD_LEN, received: 0 }),
+        };
+        if received != function {
+            return parse_exception(function, received, data).map(Err);
+        }
+        let response = match function {
+            function::READ_COILS => {
+                let packed = counted(data, packed_len(count_or_value))?;
+                Coils::new(packed, count_or_value).map(Self::Coils)
+            }
+            function::READ_HOLDING => {
+                Registers::new(counted(data, usize::from(count_or_value).saturating_mul(2))?)
+                    .map(Self::Registers)
+            }
+            _ => {
+                let echo = <&[u8; HEAD_LEN]>::try_from(pdu)
+                    .map_err(|_| ResponseError::Length { expected: HEAD_LEN, received: pdu.len() })?;
+                let echo = RequestHead::from_bytes(echo);
+                if echo != request {
+                    return Err(ResponseError::Echo { expected: request, received: echo });
+                }
+                Some(match function {
+                    function::WRITE_COIL => Self::WroteCoil { address, value: count_or_value != COIL_OFF },
+                    function::WRITE_REGISTER => Self::WroteRegister { address, value: count_or_value },
+                    function::WRITE_COILS => Self::WroteCoils { address, count: count_or_value },
+                    _ => Self::WroteRegisters { address, count: count_or_value },
+                })
+            }
+        };
+        // Only a read of nothing, which no request asks for, has no answer.
+        response.map(Ok).ok_or(ResponseError::Length { expected: HEAD_LEN, received: pdu.len() })
+    }
+
+    /// Length of the response's PDU, 3..=252.
+    pub const fn encoded_len(&self) -> usize {
+        match self {
+            Self::Coils(coils) => coils.packed().len().saturating_add(READ_HEAD_LEN),
+            Self::Registers(registers) => registers.as_be_bytes().len().saturating_add(READ_HEAD_LEN),
+            _ => HEAD_LEN,
+        }
+    }
+
+    /// Writes the response's PDU to the front of `out` and returns its length.
+    ///
+    /// # Errors
+    /// Too little space; nothing is written then.
+    pub fn encode(&self, out: &mut [u8]) -> Result<usize, EncodeError> {
+        let (needed, available) = (self.encoded_len(), out.len());
+        let no_space = EncodeError::NoSpace { needed, available };
+        let out = out.get_mut(..needed).ok_or(no_space)?;
+        let (function, address, count_or_value) = match *self {
+            Self::Coils(coils) => {
+                if let [function, byte_count, data @ ..] = out {
+                    (*function, *byte_count) = (function::READ_COILS, data.len() as u8);
+                    copy_coils(coils, data);
+                }
+                return Ok(needed);
+            }
+            Self::Registers(registers) => {
+                if let [function, byte_count, data @ ..] = out {
+                    (*function, *byte_count) = (function::READ_HOLDING, data.len() as u8);
+                    data.copy_from_slice(registers.as_be_bytes());
+                }
+                return Ok(needed);
+            }
+            Self::WroteCoil { address, value } => (function::WRITE_COIL, address, coil_value(value)),
+            Self::WroteRegister { address, value } => (function::WRITE_REGISTER, address, value),
+            Self::WroteCoils { address, count } => (function::WRITE_COILS, address, count),
+            Self::WroteRegisters { address, count } => (function::WRITE_REGISTERS, address, count),
+        };
+        *out.first_chunk_mut().ok_or(no_space)? =
+            RequestHead { function, address, count_or_value }.to_bytes();
+        Ok(needed)
+    }
+}
+
+impl RequestHead {
+    #[inline]
+    const fn from_bytes(&[function, a1, a0, c1, c0]: &[u8; HEAD_LEN]) -> Self {
+        Self { function, address: u16::from_be_bytes([a1, a0]), count_or_value: u16::from_be_bytes([c1, c0]) }
+    }
+
+    #[inline]
+    pub(super) const fn to_bytes(self) -> [u8; HEAD_LEN] {
+        let ([a1, a0], [c1, c0]) = (self.address.to_be_bytes(), self.count_or_value.to_be_bytes());
+        [self.function, a1, a0, c1, c0]
+    }
+}
+
+/// The PDU that refuses a request of `function`.
+pub fn exception_pdu(function: u8, exception: Exception) -> [u8; 2] {
+    [function | function::EXCEPTION_FLAG, exception.code()]
+}
+
+#[cold]
+fn parse_exception(function: u8, received: u8, data: &[u8]) -> Result<Exception, ResponseError> {
+    match data {
+        _ if received != function | function::EXCEPTION_FLAG => {
+            Err(ResponseError::Function { expected: function, received })
+        }
+        [code] => Ok(Exception::from_code(*code)),
+        _ => Err(ResponseError::Length { expected: 2, received: data.len().saturating_add(1) }),
+    }
+}
+
+/// The data of a read's answer, `data` being everything after the function code.
+#[inline]
+fn counted(data: &[u8], expected: usize) -> Result<&[u8], ResponseError> {
+    match data.split_first() {
+        Some((byte_count, _)) if usize::from(*byte_count) != expected => {
+            Err(ResponseError::ByteCount { expected: expected as u8, received: *byte_count })
+        }
+        Some((_, bytes)) if bytes.len() == expected => Ok(bytes),
+        _ => Err(ResponseError::Length {
+            expected: expected.saturating_add(READ_HEAD_LEN),
+            received: data.len().saturating_add(1),
+        }),
+    }
+}
+
+/// `data` has the length of the packed coils.
+#[inline]
+fn copy_coils(coils: Coils<'_>, data: &mut [u8]) {
+    data.copy_from_slice(coils.packed());
+    if let Some(last) = data.last_mut() {
+        *last &= coils.last_mask();
+    }
+}
+
+#[inline]
+const fn in_limit(count: u16, max: u16) -> bool {
+    count != 0 && count <= max
+}
+
+#[inline]
+const fn coil_value(on: bool) -> u16 {
+    if on { COIL_ON } else { COIL_OFF }
+}
+
+/// Function code, address, count or value.
+pub(super) const HEAD_LEN: usize = 5;
+/// The same and a byte count.
+const MULTIPLE_HEAD_LEN: usize = 6;
+/// Function code and byte count of a read's answer.
+pub(super) const READ_HEAD_LEN: usize = 2;
+
+const COIL_OFF: u16 = 0x0000;
+const COIL_ON: u16 = 0xFF00;

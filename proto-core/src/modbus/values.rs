@@ -1,0 +1,164 @@
+//! Coils and registers as they stand in a PDU: borrowed, length-checked views
+//! (docs/wire/modbus.md section 3).
+
+use super::pdu::MAX_READ_COILS;
+
+/// A run of coils, packed eight a byte, the first coil in the least significant bit.
+///
+/// Bits beyond the last coil are ignored when read and compared, and sent as 0.
+#[derive(Debug, Clone, Copy)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub struct Coils<'a> {
+    packed: &'a [u8],
+    count: u16,
+}
+
+impl<'a> Coils<'a> {
+    /// The first `count` coils of `packed`; `None` when `count` is 0 or over 2000, or `packed` is too
+    /// short.
+    #[inline]
+    pub fn new(packed: &'a [u8], count: u16) -> Option<Self> {
+        if count == 0 || count > MAX_READ_COILS {
+            return None;
+        }
+        packed.get(..packed_len(count)).map(|packed| Self { packed, count })
+    }
+
+    /// Packs `coils` into the front of `buffer`; `None` when there are none, or more than 2000, or
+    /// `buffer` is too short.
+    pub fn pack(coils: impl IntoIterator<Item = bool>, buffer: &'a mut [u8]) -> Option<Self> {
+        let mut count: u16 = 0;
+        for on in coils {
+            if count >= MAX_READ_COILS {
+                return None;
+            }
+            let (byte, bit) = (usize::from(count >> 3), count & 7);
+            let target = buffer.get_mut(byte)?;
+            // A fresh byte starts from zero, so the bits beyond the last coil are 0.
+            let kept = if bit == 0 { 0 } else { *target };
+            *target = kept | u8::from(on) << bit;
+            count = count.saturating_add(1);
+        }
+        Self::new(buffer, count)
+    }
+
+    /// How many coils there are, at least 1.
+    pub const fn count(self) -> u16 {
+        self.count
+    }
+
+    /// Coil `nth`, counted from 0.
+    pub fn coil(self, nth: u16) -> Option<bool> {
+        if nth >= self.count {
+            return None;
+        }
+        self.packed.get(usize::from(nth >> 3)).map(|byte| byte >> (nth & 7) & 1 == 1)
+    }
+
+    /// The coils in order.
+    pub fn iter(self) -> impl Iterator<Item = bool> + 'a {
+        (0..self.count).map_while(move |nth| self.coil(nth))
+    }
+
+    /// The packed bytes; bits beyond the last coil may have any value, see [`Coils::last_mask`].
+    pub const fn packed(self) -> &'a [u8] {
+        self.packed
+    }
+
+    /// The bits of the last packed byte that are coils.
+    pub const fn last_mask(self) -> u8 {
+        last_mask(self.count)
+    }
+}
+
+impl PartialEq for Coils<'_> {
+    fn eq(&self, other: &Self) -> bool {
+        self.count == other.count
+            && match (self.packed.split_last(), other.packed.split_last()) {
+                (Some((last, head)), Some((other_last, other_head))) => {
+                    head == other_head && (last ^ other_last) & self.last_mask() == 0
+                }
+                _ => true,
+            }
+    }
+}
+
+impl Eq for Coils<'_> {}
+
+/// A run of registers as big-endian bytes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub struct Registers<'a> {
+    bytes: &'a [u8],
+}
+
+impl<'a> Registers<'a> {
+    /// The registers in `bytes`, two big-endian bytes each; `None` when there are none, an odd
+    /// number of bytes, or more than 125 registers.
+    pub const fn new(bytes: &'a [u8]) -> Option<Self> {
+        let len = bytes.len();
+        if len == 0 || len > MAX_REGISTER_BYTES || !len.is_multiple_of(2) {
+            return None;
+        }
+        Some(Self { bytes })
+    }
+
+    /// Writes `values` big-endian into the front of `buffer`; `None` when there are none, or more
+    /// than 125, or `buffer` is too short.
+    pub fn pack(values: impl IntoIterator<Item = u16>, buffer: &'a mut [u8]) -> Option<Self> {
+        let mut count: usize = 0;
+        let (words, _) = buffer.as_chunks_mut::<2>();
+        for value in values {
+            *words.get_mut(count)? = value.to_be_bytes();
+            count = count.saturating_add(1);
+        }
+        Self::new(words.as_flattened().get(..count.saturating_mul(2))?)
+    }
+
+    /// Turns little-endian words, as the process image holds them, into registers in the front of
+    /// `buffer`; `None` where [`Registers::pack`] gives it.
+    pub fn from_little_endian(words: &[u8], buffer: &'a mut [u8]) -> Option<Self> {
+        let (words, odd) = words.as_chunks::<2>();
+        if !odd.is_empty() {
+            return None;
+        }
+        Self::pack(words.iter().map(|word| u16::from_le_bytes(*word)), buffer)
+    }
+
+    /// How many registers there are, at least 1.
+    pub const fn count(self) -> u16 {
+        // At most 125 by construction.
+        (self.bytes.len() >> 1) as u16
+    }
+
+    /// Register `nth`, counted from 0.
+    pub fn register(self, nth: u16) -> Option<u16> {
+        self.bytes.as_chunks::<2>().0.get(usize::from(nth)).map(|word| u16::from_be_bytes(*word))
+    }
+
+    /// The registers in order.
+    pub fn iter(self) -> impl ExactSizeIterator<Item = u16> + DoubleEndedIterator + Clone + 'a {
+        self.bytes.as_chunks::<2>().0.iter().map(|word| u16::from_be_bytes(*word))
+    }
+
+    /// The registers as they stand on the wire.
+    pub const fn as_be_bytes(self) -> &'a [u8] {
+        self.bytes
+    }
+}
+
+/// Bytes that `count` packed coils take.
+pub(super) const fn packed_len(count: u16) -> usize {
+    count.div_ceil(8) as usize
+}
+
+/// The bits of the last packed byte of `count` coils that are coils.
+pub(super) const fn last_mask(count: u16) -> u8 {
+    match count & 7 {
+        0 => 0xFF,
+        // 1..=7 bits: the shift is 1..=7.
+        rest => 0xFF_u8 >> (8_u16.wrapping_sub(rest) & 7),
+    }
+}
+
+const MAX_REGISTER_BYTES: usize = 250;
