@@ -9,6 +9,7 @@
 pub mod adu;
 pub mod client;
 mod exception;
+pub mod map;
 pub mod pdu;
 pub mod server;
 mod values;

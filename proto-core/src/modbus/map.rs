@@ -1,0 +1,118 @@
+//! The controller's address map (docs/wire/modbus.md sections 7 and 8).
+//!
+//! Addresses of system variables come from the table in [`crate::sysvar`]; what is not a variable
+//! is written here. The gaps between rows are checked when the crate is built: there are none.
+
+use super::exception::Exception;
+
+mod rows;
+
+/// The two address spaces the controller has.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum Space {
+    /// FC 1, 5 and 15.
+    Coils,
+    /// FC 3, 6 and 16.
+    Holding,
+}
+
+/// What a client may do with an item.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum Access {
+    /// A write is refused with exception 02.
+    ReadOnly,
+    /// Both.
+    ReadWrite,
+}
+
+/// A run of consecutive coils or registers of one kind.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Item {
+    /// Which address space.
+    pub space: Space,
+    /// First address.
+    pub first: u16,
+    /// How many addresses, at least 1.
+    pub count: u16,
+    /// Whether a client may write.
+    pub access: Access,
+    /// What it is.
+    pub content: &'static str,
+    /// Counts per unit of a quantity; 0 for coils, codes and plain words.
+    pub per_unit: u16,
+}
+
+/// How many coils there are, from address 0.
+pub const COILS: u16 = rows::end(Space::Coils);
+/// How many holding registers there are, from address 0.
+pub const HOLDING: u16 = rows::end(Space::Holding);
+
+/// The map in address order, coils first.
+pub static MAP: [Item; 27] = rows::ROWS;
+
+impl Item {
+    /// One past the last address.
+    pub const fn end(&self) -> u16 {
+        self.first.saturating_add(self.count)
+    }
+}
+
+/// Whether `count` items from `address` can be read.
+///
+/// # Errors
+/// [`Exception::IllegalDataAddress`] when one of them is outside the map.
+#[inline]
+pub fn check_read(space: Space, address: u16, count: u16) -> Result<(), Exception> {
+    let end = match space {
+        Space::Coils => COILS,
+        Space::Holding => HOLDING,
+    };
+    match address.checked_add(count) {
+        Some(past) if past <= end => Ok(()),
+        _ => Err(Exception::IllegalDataAddress),
+    }
+}
+
+/// Whether `count` items from `address` can be written, all of them (D10).
+///
+/// # Errors
+/// [`Exception::IllegalDataAddress`] when one of them is outside the map or read-only.
+#[inline]
+pub fn check_write(space: Space, address: u16, count: u16) -> Result<(), Exception> {
+    let run_end = match space {
+        Space::Coils => COIL_RUNS.get(usize::from(address)),
+        Space::Holding => HOLDING_RUNS.get(usize::from(address)),
+    };
+    match (run_end, address.checked_add(count)) {
+        (Some(run_end), Some(past)) if past <= *run_end => Ok(()),
+        _ => Err(Exception::IllegalDataAddress),
+    }
+}
+
+/// `value` as a register of `per_unit` counts per unit: to the nearest count, two's complement,
+/// saturated at ±32767, and 0 for a value that is not a number (D11).
+#[inline]
+pub fn scaled(value: f32, per_unit: u16) -> u16 {
+    let counts = f64::from(value) * f64::from(per_unit);
+    // The cast takes infinities to the ends of i32 and NaN to 0.
+    let nearest = (counts + 0.5_f64.copysign(counts)) as i32;
+    nearest.clamp(-MAX_COUNTS, MAX_COUNTS) as i16 as u16
+}
+
+/// The value of a register of `per_unit` counts per unit.
+#[inline]
+pub fn unscaled(register: u16, per_unit: u16) -> f32 {
+    f32::from(register as i16) / f32::from(per_unit.max(1))
+}
+
+const MAX_COUNTS: i32 = 32_767;
+
+/// For each coil: one past the end of the writable run it is in, or 0.
+static COIL_RUNS: [u16; COILS as usize] = rows::runs(Space::Coils);
+/// The same for each holding register.
+static HOLDING_RUNS: [u16; HOLDING as usize] = rows::runs(Space::Holding);
+
+#[cfg(test)]
+mod tests;
