@@ -1,6 +1,8 @@
 //! What a recipe is made of, and its limits (docs/wire/recipes.md section 2, D16, D18).
 
-use crate::sysvar::SysVar;
+use core::fmt;
+
+use crate::sysvar::{Direction, SysVar};
 use crate::wire::scalar::ScalarType;
 
 /// Longest head or tail of a stream part, in bytes.
@@ -23,6 +25,16 @@ pub enum Mode {
     Realtime,
     /// Fields that the user names; a program (or the gateway's bindings) moves their values.
     User,
+}
+
+/// What a part's fields must be.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub struct Rules {
+    /// System variables or user-defined fields.
+    pub mode: Mode,
+    /// Which part of the recipe this is.
+    pub direction: Direction,
 }
 
 /// One field of a part.
@@ -64,4 +76,32 @@ pub enum Framing {
     Bytes,
     /// UDP: one datagram is one frame; head and tail may both be empty.
     Datagram,
+}
+
+impl CanId {
+    /// Whether the number fits its kind: 11 or 29 bits.
+    pub const fn is_valid(self) -> bool {
+        match self {
+            Self::Standard(id) => id <= 0x7FF,
+            Self::Extended(id) => id <= 0x1FFF_FFFF,
+        }
+    }
+}
+
+impl fmt::Display for CanId {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Standard(id) => write!(f, "{id:#05x}"),
+            Self::Extended(id) => write!(f, "{id:#010x} (extended)"),
+        }
+    }
+}
+
+impl From<embedded_can::Id> for CanId {
+    fn from(id: embedded_can::Id) -> Self {
+        match id {
+            embedded_can::Id::Standard(id) => Self::Standard(id.as_raw()),
+            embedded_can::Id::Extended(id) => Self::Extended(id.as_raw()),
+        }
+    }
 }

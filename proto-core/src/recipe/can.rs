@@ -1,0 +1,361 @@
+//! The compiled part of a CAN recipe: frame ids, each with its fields
+//! (docs/wire/recipes.md section 6).
+//!
+//! In: anything that is an [`embedded_can::Frame`], or the process image. Out: the other. Frames
+//! that are not the recipe's are refused with a reason to count, never applied in part.
+
+use embedded_can::Frame;
+use heapless::Vec;
+
+use super::error::{EncodeError, FieldPlace, PartError, ValueError};
+use super::fields::{Applied, FrameFields, PlacedField, Pool, Values};
+use super::model::{CanId, Field, MAX_CAN_DATA, MAX_CAN_IDS, Rules};
+use crate::sysvar::IMAGE_BYTES;
+use crate::wire::scalar::Scalar;
+
+/// A classic CAN frame: data or remote, standard or extended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub struct CanFrame {
+    id: CanId,
+    remote: bool,
+    len: u8,
+    data: [u8; MAX_CAN_DATA],
+}
+
+/// Why a received frame is not one of the recipe's (D17).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[non_exhaustive]
+pub enum CanReject {
+    /// No frame of the part has this id.
+    UnknownId {
+        /// The received id.
+        id: CanId,
+    },
+    /// A remote frame.
+    Remote {
+        /// The received id.
+        id: CanId,
+    },
+    /// The data is not as long as the fields.
+    WrongLength {
+        /// The frame's index in the part.
+        frame: u8,
+        /// The fields' length in bytes.
+        expected: u8,
+        /// The data's.
+        got: u8,
+    },
+}
+
+/// One part of a CAN recipe, checked and ready to decode and encode; about 1.3 KiB.
+#[derive(Debug, Clone)]
+pub struct CanLayout {
+    rules: Rules,
+    /// The frames' ids, in one word each, to be searched fast.
+    keys: Vec<u32, MAX_CAN_IDS>,
+    frames: Vec<FrameEntry, MAX_CAN_IDS>,
+    pool: Pool,
+}
+
+/// One frame of a [`CanLayout`].
+#[derive(Debug, Clone, Copy)]
+pub struct CanFrameLayout<'a> {
+    id: CanId,
+    len: u8,
+    fields: FrameFields<'a>,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct FrameEntry {
+    first_field: u8,
+    last_field_end: u8,
+    first_step: u8,
+    last_step_end: u8,
+    len: u8,
+}
+
+impl CanFrame {
+    /// A data frame; `None` when the id does not fit its kind or there are more than 8 bytes.
+    pub fn new(id: CanId, data: &[u8]) -> Option<Self> {
+        let mut frame = Self { id, remote: false, len: data.len() as u8, data: [0; MAX_CAN_DATA] };
+        frame.data.get_mut(..data.len())?.copy_from_slice(data);
+        id.is_valid().then_some(frame)
+    }
+
+    /// A remote frame that asks for `len` bytes; `None` when the id does not fit its kind or `len`
+    /// is more than 8.
+    pub fn remote(id: CanId, len: usize) -> Option<Self> {
+        let fits = id.is_valid() && len <= MAX_CAN_DATA;
+        fits.then_some(Self { id, remote: true, len: len as u8, data: [0; MAX_CAN_DATA] })
+    }
+
+    /// The frame's id.
+    pub const fn id(&self) -> CanId {
+        self.id
+    }
+
+    /// Whether it is a remote frame.
+    pub const fn is_remote(&self) -> bool {
+        self.remote
+    }
+
+    /// The data; empty in a remote frame.
+    pub fn data(&self) -> &[u8] {
+        let len = if self.remote { 0 } else { usize::from(self.len) };
+        self.data.get(..len).unwrap_or(&[])
+    }
+}
+
+impl Frame for CanFrame {
+    fn new(id: impl Into<embedded_can::Id>, data: &[u8]) -> Option<Self> {
+        Self::new(id.into().into(), data)
+    }
+
+    fn new_remote(id: impl Into<embedded_can::Id>, dlc: usize) -> Option<Self> {
+        Self::remote(id.into().into(), dlc)
+    }
+
+    fn is_extended(&self) -> bool {
+        matches!(self.id, CanId::Extended(_))
+    }
+
+    fn is_remote_frame(&self) -> bool {
+        self.remote
+    }
+
+    fn id(&self) -> embedded_can::Id {
+        // The constructors let only ids through that fit, so the fallbacks are never reached.
+        match self.id {
+            CanId::Standard(id) => {
+                embedded_can::StandardId::new(id).unwrap_or(embedded_can::StandardId::ZERO).into()
+            }
+            CanId::Extended(id) => {
+                embedded_can::ExtendedId::new(id).unwrap_or(embedded_can::ExtendedId::ZERO).into()
+            }
+        }
+    }
+
+    fn dlc(&self) -> usize {
+        usize::from(self.len)
+    }
+
+    fn data(&self) -> &[u8] {
+        CanFrame::data(self)
+    }
+}
+
+impl CanLayout {
+    /// Checks a part and compiles it; each frame is its id and its fields.
+    ///
+    /// # Errors
+    /// [`PartError`] says which limit or rule is broken, and by which frame or field.
+    pub fn new<F>(rules: Rules, frames: impl IntoIterator<Item = (CanId, F)>) -> Result<Self, PartError>
+    where
+        F: IntoIterator<Item = Field>,
+    {
+        let mut layout = Self { rules, keys: Vec::new(), frames: Vec::new(), pool: Pool::new() };
+        for (id, fields) in frames {
+            layout.push(id, fields)?;
+        }
+        if layout.frames.is_empty() { Err(PartError::NoFrames) } else { Ok(layout) }
+    }
+
+    /// What the fields are and which way they go.
+    pub const fn rules(&self) -> Rules {
+        self.rules
+    }
+
+    /// The frames' ids, in declared order.
+    pub fn ids(&self) -> impl ExactSizeIterator<Item = CanId> + Clone + '_ {
+        self.keys.iter().map(|&key| id_of(key))
+    }
+
+    /// How many frames the part has, 1..=32.
+    pub fn frame_count(&self) -> usize {
+        self.frames.len()
+    }
+
+    /// Which frame of the part a received frame is.
+    ///
+    /// # Errors
+    /// [`CanReject`]: another id, a remote frame, or another length.
+    pub fn accept(&self, frame: &impl Frame) -> Result<usize, CanReject> {
+        let id = CanId::from(frame.id());
+        if frame.is_remote_frame() {
+            return Err(CanReject::Remote { id });
+        }
+        let key = key_of(id);
+        let index = self.keys.iter().position(|&other| other == key).ok_or(CanReject::UnknownId { id })?;
+        let expected = self.frames.get(index).map_or(0, |entry| entry.len);
+        let got = frame.data().len();
+        if got != usize::from(expected) {
+            return Err(CanReject::WrongLength { frame: index as u8, expected, got: got as u8 });
+        }
+        Ok(index)
+    }
+
+    /// The frame with this index in the part.
+    #[inline]
+    pub fn frame(&self, index: usize) -> Option<CanFrameLayout<'_>> {
+        let entry = self.frames.get(index)?;
+        let id = id_of(*self.keys.get(index)?);
+        let fields = usize::from(entry.first_field)..usize::from(entry.last_field_end);
+        let steps = usize::from(entry.first_step)..usize::from(entry.last_step_end);
+        Some(CanFrameLayout {
+            id,
+            len: entry.len,
+            fields: self.pool.frame(fields, steps, usize::from(entry.len)),
+        })
+    }
+
+    /// The frames in declared order.
+    pub fn frames(&self) -> impl Iterator<Item = CanFrameLayout<'_>> + Clone {
+        (0..self.frame_count()).filter_map(|index| self.frame(index))
+    }
+
+    fn push(&mut self, id: CanId, fields: impl IntoIterator<Item = Field>) -> Result<(), PartError> {
+        let nth = self.frames.len();
+        if nth >= MAX_CAN_IDS {
+            return Err(PartError::TooManyFrames);
+        }
+        let frame = nth as u8;
+        if !id.is_valid() {
+            return Err(PartError::InvalidId { frame, id });
+        }
+        if let Some(first) = self.ids().position(|other| other == id) {
+            return Err(PartError::DuplicateId { frame, first: first as u8, id });
+        }
+        let (first_field, first_step) = (self.pool.field_count(), self.pool.step_count());
+        let mut len = 0_usize;
+        for (nth, field) in fields.into_iter().enumerate() {
+            let at = FieldPlace { frame: Some(frame), field: nth.min(usize::from(u8::MAX)) as u8 };
+            let entries = &self.frames;
+            let place_of = |nth| place_among(entries, frame, nth);
+            self.pool.push(self.rules, field, at, first_step, place_of)?;
+            len = len.saturating_add(field.ty().size());
+        }
+        if len == 0 {
+            return Err(PartError::NoFields { frame: Some(frame) });
+        }
+        if len > MAX_CAN_DATA {
+            return Err(PartError::CanFrameTooLong { frame, len });
+        }
+        let entry = FrameEntry {
+            first_field: first_field as u8,
+            last_field_end: self.pool.field_count() as u8,
+            first_step: first_step as u8,
+            last_step_end: self.pool.step_count() as u8,
+            len: len as u8,
+        };
+        // There is space: the count was looked at above.
+        self.frames.push(entry).map_err(|_| PartError::TooManyFrames)?;
+        self.keys.push(key_of(id)).map_err(|_| PartError::TooManyFrames)
+    }
+}
+
+impl CanFrameLayout<'_> {
+    /// The frame's id.
+    pub const fn id(&self) -> CanId {
+        self.id
+    }
+
+    /// Its data's length in bytes, 1..=8.
+    #[allow(clippy::len_without_is_empty, reason = "no frame of a recipe is empty")]
+    pub const fn len(&self) -> usize {
+        self.len as usize
+    }
+
+    /// Its fields in order, each with its place in the data.
+    pub fn fields(&self) -> impl Iterator<Item = PlacedField> + Clone + '_ {
+        self.fields.placed()
+    }
+
+    /// The data's values, in field order; fewer when the data is too short.
+    pub fn values<'b>(&'b self, data: &'b [u8]) -> Values<'b> {
+        self.fields.values(data)
+    }
+
+    /// Whether every value of the data may be used (D22).
+    ///
+    /// # Errors
+    /// [`ValueError`]: a float or double that is not finite, or data of another length.
+    pub fn check(&self, data: &[u8]) -> Result<(), ValueError> {
+        self.fields.check(data)
+    }
+
+    /// Writes the data's values into the process image: all of them, or none. User-defined fields
+    /// have no place in it, so for them this is [`Self::check`].
+    ///
+    /// # Errors
+    /// [`ValueError`]: a float that is not finite, or data of another length.
+    #[inline]
+    pub fn apply(&self, data: &[u8], image: &mut [u8; IMAGE_BYTES]) -> Result<Applied, ValueError> {
+        self.fields.apply(data, image)
+    }
+
+    /// The frame with the image's values. User-defined fields have no place there and are zero.
+    pub fn encode(&self, image: &[u8; IMAGE_BYTES]) -> CanFrame {
+        self.filled(|data| self.fields.encode(image, data))
+    }
+
+    /// The frame with these values, one a field.
+    ///
+    /// # Errors
+    /// [`EncodeError`]: too few or too many values, or a value of another type.
+    pub fn encode_values(&self, values: &[Scalar]) -> Result<CanFrame, EncodeError> {
+        self.fields.accepts(values)?;
+        Ok(self.filled(|data| self.fields.encode_values(values, data)))
+    }
+
+    #[inline]
+    fn filled(&self, fill: impl FnOnce(&mut [u8])) -> CanFrame {
+        let mut data = [0; MAX_CAN_DATA];
+        if let Some(used) = data.get_mut(..self.len()) {
+            fill(used);
+        }
+        CanFrame { id: self.id, remote: false, len: self.len, data }
+    }
+}
+
+/// Where the n-th field of the part stands; fields past the finished frames are those of `frame`.
+fn place_among(finished: &[FrameEntry], frame: u8, nth: usize) -> FieldPlace {
+    let holds = |entry: &FrameEntry| nth < usize::from(entry.last_field_end);
+    let index = finished.iter().position(holds);
+    let first = match index.and_then(|index| finished.get(index)) {
+        Some(entry) => entry.first_field,
+        None => finished.last().map_or(0, |entry| entry.last_field_end),
+    };
+    let frame = index.map_or(frame, |index| index as u8);
+    FieldPlace { frame: Some(frame), field: nth.saturating_sub(usize::from(first)) as u8 }
+}
+
+/// Marks an extended id in a key.
+const EXTENDED: u32 = 1 << 31;
+
+const fn key_of(id: CanId) -> u32 {
+    match id {
+        CanId::Standard(id) => id as u32,
+        CanId::Extended(id) => id | EXTENDED,
+    }
+}
+
+const fn id_of(key: u32) -> CanId {
+    if key & EXTENDED == 0 { CanId::Standard(key as u16) } else { CanId::Extended(key & !EXTENDED) }
+}
+
+impl core::fmt::Display for CanReject {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        match *self {
+            Self::UnknownId { id } => write!(f, "id {id} is not in the recipe"),
+            Self::Remote { id } => write!(f, "remote frame {id}"),
+            Self::WrongLength { frame, expected, got } => {
+                let frame = u16::from(frame).saturating_add(1);
+                write!(f, "frame {frame} carries {expected} bytes, not {got}")
+            }
+        }
+    }
+}
+
+impl core::error::Error for CanReject {}

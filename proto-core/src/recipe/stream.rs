@@ -1,0 +1,168 @@
+//! The compiled part of a stream recipe: head, fields, tail (docs/wire/recipes.md section 3).
+//!
+//! In: payloads that [`Deframer`](super::Deframer) or [`datagram`](super::datagram) found, or the
+//! process image. Out: the other.
+
+use super::delimiter::{Head, Tail};
+use super::error::{EncodeError, FieldPlace, NoSpace, PartError, ValueError};
+use super::fields::{Applied, PlacedField, Pool, Values};
+use super::model::{Field, Framing, MAX_STREAM_FRAME, Mode, Rules};
+use crate::sysvar::IMAGE_BYTES;
+use crate::wire::scalar::Scalar;
+
+/// One part of a stream recipe, checked and ready to decode and encode; about 1.1 KiB.
+#[derive(Debug, Clone)]
+pub struct StreamLayout {
+    rules: Rules,
+    head: Head,
+    tail: Tail,
+    payload_len: u16,
+    frame_len: u16,
+    pool: Pool,
+}
+
+impl StreamLayout {
+    /// Checks a part and compiles it.
+    ///
+    /// # Errors
+    /// [`PartError`] says which limit or rule is broken, and by which field.
+    pub fn new(
+        rules: Rules,
+        head: &[u8],
+        tail: &[u8],
+        fields: impl IntoIterator<Item = Field>,
+        framing: Framing,
+    ) -> Result<Self, PartError> {
+        let head = Head::new(head).ok_or(PartError::HeadTooLong { len: head.len() })?;
+        let tail = Tail::new(tail).ok_or(PartError::TailTooLong { len: tail.len() })?;
+        match framing {
+            Framing::Bytes if head.len() == 0 && tail.len() == 0 => return Err(PartError::NoDelimiter),
+            Framing::Datagram if rules.mode == Mode::User => return Err(PartError::UserDatagram),
+            Framing::Bytes | Framing::Datagram => {}
+        }
+        let mut pool = Pool::new();
+        let mut payload_len = 0_usize;
+        for (nth, field) in fields.into_iter().enumerate() {
+            pool.push(rules, field, place(nth), 0, place)?;
+            payload_len = payload_len.saturating_add(field.ty().size());
+        }
+        if pool.field_count() == 0 {
+            return Err(PartError::NoFields { frame: None });
+        }
+        let frame_len = payload_len.saturating_add(head.len()).saturating_add(tail.len());
+        if frame_len > MAX_STREAM_FRAME {
+            return Err(PartError::StreamFrameTooLong { len: frame_len });
+        }
+        let (payload_len, frame_len) = (payload_len as u16, frame_len as u16);
+        Ok(Self { rules, head, tail, payload_len, frame_len, pool })
+    }
+
+    /// What the fields are and which way they go.
+    pub const fn rules(&self) -> Rules {
+        self.rules
+    }
+
+    /// Bytes of a whole frame: head, fields and tail; at most 512.
+    pub const fn frame_len(&self) -> usize {
+        self.frame_len as usize
+    }
+
+    /// Bytes of the fields.
+    pub const fn payload_len(&self) -> usize {
+        self.payload_len as usize
+    }
+
+    /// The bytes before the fields.
+    pub fn head(&self) -> &[u8] {
+        self.head.bytes()
+    }
+
+    /// The bytes after the fields.
+    pub fn tail(&self) -> &[u8] {
+        self.tail.bytes()
+    }
+
+    /// The fields in order, each with its place in the payload.
+    pub fn fields(&self) -> impl Iterator<Item = PlacedField> + Clone + '_ {
+        self.pool.whole(self.payload_len()).placed()
+    }
+
+    /// The payload's values, in field order; fewer when the payload is too short.
+    pub fn values<'a>(&'a self, payload: &'a [u8]) -> Values<'a> {
+        self.pool.whole(self.payload_len()).values(payload)
+    }
+
+    /// Whether every value of the payload may be used (D22).
+    ///
+    /// # Errors
+    /// [`ValueError`]: a float or double that is not finite, or a payload of another length.
+    pub fn check(&self, payload: &[u8]) -> Result<(), ValueError> {
+        self.pool.whole(self.payload_len()).check(payload)
+    }
+
+    /// Writes the payload's values into the process image: all of them, or none. User-defined
+    /// fields have no place in it, so for them this is [`Self::check`].
+    ///
+    /// # Errors
+    /// [`ValueError`]: a float that is not finite, or a payload of another length.
+    pub fn apply(&self, payload: &[u8], image: &mut [u8; IMAGE_BYTES]) -> Result<Applied, ValueError> {
+        self.pool.whole(self.payload_len()).apply(payload, image)
+    }
+
+    /// Writes a frame with the image's values to the front of `out` and returns its length.
+    /// User-defined fields have no place in the image and are sent as zero.
+    ///
+    /// # Errors
+    /// [`NoSpace`], with nothing written, when `out` is shorter than a frame.
+    pub fn encode(&self, image: &[u8; IMAGE_BYTES], out: &mut [u8]) -> Result<usize, NoSpace> {
+        let payload = self.delimited(out)?;
+        self.pool.whole(self.payload_len()).encode(image, payload);
+        Ok(self.frame_len())
+    }
+
+    /// Writes a frame with these values, one a field, to the front of `out` and returns its
+    /// length.
+    ///
+    /// # Errors
+    /// [`EncodeError`], with nothing written: too few or too many values, a value of another type,
+    /// or not enough space.
+    pub fn encode_values(&self, values: &[Scalar], out: &mut [u8]) -> Result<usize, EncodeError> {
+        let fields = self.pool.whole(self.payload_len());
+        fields.accepts(values)?;
+        fields.encode_values(values, self.delimited(out)?);
+        Ok(self.frame_len())
+    }
+
+    pub(super) const fn head_word(&self) -> &Head {
+        &self.head
+    }
+
+    pub(super) const fn tail_word(&self) -> &Tail {
+        &self.tail
+    }
+
+    /// The fields' bytes of a whole frame.
+    #[inline]
+    pub(super) fn payload_of<'f>(&self, frame: &'f [u8]) -> &'f [u8] {
+        let start = self.head.len();
+        frame.get(start..start.saturating_add(self.payload_len())).unwrap_or(&[])
+    }
+
+    /// Writes head and tail; the payload's place is returned and must be filled.
+    #[inline]
+    fn delimited<'o>(&self, out: &'o mut [u8]) -> Result<&'o mut [u8], NoSpace> {
+        let available = out.len();
+        let needed = self.frame_len();
+        let no_space = NoSpace { needed, available };
+        let frame = out.get_mut(..needed).ok_or(no_space)?;
+        let (head, rest) = frame.split_at_mut_checked(self.head.len()).ok_or(no_space)?;
+        let (payload, tail) = rest.split_at_mut_checked(self.payload_len()).ok_or(no_space)?;
+        head.copy_from_slice(self.head.bytes());
+        tail.copy_from_slice(self.tail.bytes());
+        Ok(payload)
+    }
+}
+
+fn place(nth: usize) -> FieldPlace {
+    FieldPlace { frame: None, field: nth as u8 }
+}
