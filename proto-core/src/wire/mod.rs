@@ -2,5 +2,6 @@
 //!
 //! No function of this module can panic, whatever bytes it is given.
 
+pub mod dialect;
 pub mod scalar;
 pub mod state;

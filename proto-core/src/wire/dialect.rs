@@ -1,0 +1,292 @@
+//! What differs between controller versions, as data (docs/wire/command.md section 7,
+//! docs/wire/state.md section 6).
+//!
+//! In: a version's name. Out: a [`Dialect`], a plain struct of choices. Nothing here looks at a
+//! connection: a dialect is configured, never guessed from what a controller answers.
+
+use super::state::{OperationMode, RobotState, SafetyState};
+
+/// What ends a text on port 2000.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum Terminator {
+    /// Nothing: the text is sent as it is.
+    None,
+    /// Line feed.
+    Lf,
+    /// Carriage return and line feed.
+    CrLf,
+}
+
+impl Terminator {
+    /// The bytes that are appended.
+    pub const fn text(self) -> &'static str {
+        match self {
+            Self::None => "",
+            Self::Lf => "\n",
+            Self::CrLf => "\r\n",
+        }
+    }
+}
+
+/// Whether a client writes an empty pair of parentheses after a bare keyword.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum Parentheses {
+    /// `poweron`
+    Omitted,
+    /// `poweron()`
+    Empty,
+}
+
+/// Whether a client puts the program's name in double quotes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum Quotes {
+    /// `run(a.jspf)`
+    None,
+    /// `run("a.jspf")`
+    Double,
+}
+
+/// What a controller answers to a `run` that it carries out.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum RunReply {
+    /// `run start`
+    Start,
+    /// `run success`
+    Success,
+}
+
+/// What a controller answers to a `speed` that it carries out.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum SpeedReply {
+    /// `set success`
+    Success,
+    /// `set speed 50%`
+    Percent,
+}
+
+/// Whether a controller tells its command clients when a program has ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum FinishNotice {
+    /// It does not; clients ask with `isprogfinish`.
+    Silent,
+    /// `script finish`, to the client that started the program, without being asked.
+    ScriptFinish,
+}
+
+/// How holding register 0 shows the operation mode.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum ModeRegister {
+    /// The register is the mode's code.
+    Code,
+    /// The units digit is the mode's code; a hundreds digit of 1 says that motion is simulated.
+    UnitsDigit,
+}
+
+/// Whether a controller moves its arm, or only computes the motion.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum Motion {
+    /// The arm moves.
+    #[default]
+    Real,
+    /// The controller is in its simulation mode.
+    Simulated,
+}
+
+/// One controller version's choices.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub struct Dialect {
+    /// The name used in configuration files.
+    pub name: &'static str,
+    /// What a client ends its commands with. A server takes all of them (D2).
+    pub terminator: Terminator,
+    /// What a client writes after a bare keyword. A server takes both (D2).
+    pub parentheses: Parentheses,
+    /// How a client writes the program's name. A server takes both (D3).
+    pub quotes: Quotes,
+    /// What a server ends its replies with. A client takes all of them (D4).
+    pub reply_terminator: Terminator,
+    /// A server's answer to a good `run`. A client takes both.
+    pub run_reply: RunReply,
+    /// A server's answer to a good `speed`. A client takes both.
+    pub speed_reply: SpeedReply,
+    /// Whether a server sends `script finish`. A client always takes it.
+    pub finish_notice: FinishNotice,
+    /// The safety state's code for "updating firmware" (SS_UPDATE): 15 or 99.
+    pub safety_update: u8,
+    /// The robot state's code for "updating" (SR_Update), where the version has one.
+    pub robot_update: Option<u8>,
+    /// What holding register 0 holds.
+    pub mode_register: ModeRegister,
+    /// TCP port of the Modbus server unless the configuration says otherwise.
+    pub modbus_port: u16,
+    /// Unit id that a client sends.
+    pub modbus_unit: u8,
+    /// Offset in the state packet of the global speed percentage (one byte), where it is sent.
+    pub global_speed: Option<u16>,
+}
+
+impl Dialect {
+    /// Controller software V2.3, as its interface description V1.5 has it.
+    pub const V2_3: Self = Self {
+        name: "v2.3",
+        terminator: Terminator::None,
+        parentheses: Parentheses::Omitted,
+        quotes: Quotes::None,
+        reply_terminator: Terminator::None,
+        run_reply: RunReply::Start,
+        speed_reply: SpeedReply::Success,
+        finish_notice: FinishNotice::Silent,
+        safety_update: 15,
+        robot_update: None,
+        mode_register: ModeRegister::Code,
+        modbus_port: 502,
+        modbus_unit: 1,
+        global_speed: None,
+    };
+
+    /// What was seen of later versions, all of it together. No single release is known to do
+    /// every one of these; as a client's dialect it is as safe as V2.3, since a client takes
+    /// every form of a reply anyway.
+    pub const V2_6: Self = Self {
+        name: "v2.6",
+        terminator: Terminator::CrLf,
+        parentheses: Parentheses::Empty,
+        quotes: Quotes::Double,
+        reply_terminator: Terminator::CrLf,
+        run_reply: RunReply::Success,
+        speed_reply: SpeedReply::Percent,
+        finish_notice: FinishNotice::ScriptFinish,
+        safety_update: 99,
+        robot_update: Some(7),
+        mode_register: ModeRegister::UnitsDigit,
+        modbus_port: 502,
+        modbus_unit: 1,
+        global_speed: Some(660),
+    };
+
+    /// Every dialect there is.
+    pub const ALL: [Self; 2] = [Self::V2_3, Self::V2_6];
+
+    /// The names that [`Dialect::named`] knows.
+    pub const NAMES: [&'static str; 2] = [Self::V2_3.name, Self::V2_6.name];
+
+    /// The dialect called `name`.
+    pub fn named(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|dialect| dialect.name == name)
+    }
+
+    /// The robot state that this version means by `code`.
+    pub fn robot_state(&self, code: u8) -> RobotState {
+        if self.robot_update == Some(code) { RobotState::Update } else { RobotState::from_code(code) }
+    }
+
+    /// This version's code for `state`; the later versions' 7 for an update in a version that
+    /// has no code of its own.
+    pub fn robot_code(&self, state: RobotState) -> u8 {
+        match state {
+            RobotState::Update => self.robot_update.unwrap_or(RobotState::Update.code()),
+            other => other.code(),
+        }
+    }
+
+    /// The safety state that this version means by `code`.
+    pub fn safety_state(&self, code: u8) -> SafetyState {
+        if code == self.safety_update {
+            return SafetyState::Update;
+        }
+        match SafetyState::from_code(code) {
+            // The code another version uses: nothing is known of it in this one.
+            SafetyState::Update => SafetyState::Unknown(code),
+            other => other,
+        }
+    }
+
+    /// This version's code for `state`.
+    pub fn safety_code(&self, state: SafetyState) -> u8 {
+        match state {
+            SafetyState::Update => self.safety_update,
+            other => other.code(),
+        }
+    }
+
+    /// Holding register 0 for an operation mode.
+    pub fn mode_to_register(&self, mode: OperationMode, motion: Motion) -> u16 {
+        let code = u16::from(mode.code());
+        match (self.mode_register, motion) {
+            (ModeRegister::UnitsDigit, Motion::Simulated) => code.saturating_add(100),
+            _ => code,
+        }
+    }
+
+    /// The operation mode that holding register 0 shows.
+    pub fn mode_from_register(&self, register: u16) -> (OperationMode, Motion) {
+        match self.mode_register {
+            ModeRegister::Code => {
+                (OperationMode::from_code(u8::try_from(register).unwrap_or(u8::MAX)), Motion::Real)
+            }
+            ModeRegister::UnitsDigit => {
+                let motion = if (register / 100) % 10 == 1 { Motion::Simulated } else { Motion::Real };
+                (OperationMode::from_code((register % 10) as u8), motion)
+            }
+        }
+    }
+}
+
+impl Default for Dialect {
+    fn default() -> Self {
+        Self::V2_3
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_find_their_dialects() {
+        for name in Dialect::NAMES {
+            assert_eq!(Dialect::named(name).unwrap().name, name);
+        }
+        assert_eq!(Dialect::named("V2.3"), None);
+        assert_eq!(Dialect::default(), Dialect::V2_3);
+    }
+
+    #[test]
+    fn every_state_code_survives_both_ways_in_every_dialect() {
+        for dialect in Dialect::ALL {
+            for code in 0..=u8::MAX {
+                assert_eq!(dialect.robot_code(dialect.robot_state(code)), code, "{}", dialect.name);
+                assert_eq!(dialect.safety_code(dialect.safety_state(code)), code, "{}", dialect.name);
+            }
+        }
+        assert_eq!(Dialect::V2_3.safety_state(15), SafetyState::Update);
+        assert_eq!(Dialect::V2_3.safety_state(99), SafetyState::Unknown(99));
+        assert_eq!(Dialect::V2_6.safety_state(99), SafetyState::Update);
+        assert_eq!(Dialect::V2_6.safety_state(15), SafetyState::Unknown(15));
+        assert_eq!(Dialect::V2_3.robot_state(7), RobotState::Unknown(7));
+        assert_eq!(Dialect::V2_6.robot_state(7), RobotState::Update);
+    }
+
+    #[test]
+    fn the_mode_register_carries_the_simulation_digit_only_where_the_dialect_has_one() {
+        let (old, new) = (Dialect::V2_3, Dialect::V2_6);
+        assert_eq!(old.mode_to_register(OperationMode::Remote, Motion::Simulated), 2);
+        assert_eq!(new.mode_to_register(OperationMode::Remote, Motion::Simulated), 102);
+        assert_eq!(new.mode_to_register(OperationMode::Auto, Motion::Real), 1);
+        assert_eq!(new.mode_from_register(102), (OperationMode::Remote, Motion::Simulated));
+        assert_eq!(new.mode_from_register(1), (OperationMode::Auto, Motion::Real));
+        assert_eq!(new.mode_from_register(65535).0, OperationMode::Unknown(5));
+        assert_eq!(old.mode_from_register(2), (OperationMode::Remote, Motion::Real));
+        assert_eq!(old.mode_from_register(102), (OperationMode::Unknown(102), Motion::Real));
+        assert_eq!(old.mode_from_register(300), (OperationMode::Unknown(255), Motion::Real));
+    }
+}

@@ -1,1 +1,0 @@
-//! The 1468-byte state packet of port 2001.
