@@ -1,1 +1,23 @@
-//! command
+//! Port 2000, both sides: short ASCII commands and their replies (docs/wire/command.md).
+//!
+//! In: bytes in pieces of any size, and the time. Out: requests for the simulated controller,
+//! replies for the gateway. Knows the texts and how they are told apart; knows no connection and
+//! never decides whether a command is allowed.
+
+mod client;
+mod reply;
+mod request;
+mod server;
+mod text;
+
+pub use client::{ClientEvent, CommandClient, MAX_REPLY, StartError};
+pub use reply::{Outcome, Reply, ReplyKind, StateCodes};
+pub use request::{Action, EncodeError, Keyword, ParseError, Percent, Request};
+pub use server::{CommandServer, ServerEvent, UnknownCommand};
+pub use text::NoSpace;
+
+/// Longest command, in bytes, without its terminator (D5).
+pub const MAX_COMMAND: usize = 256;
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,349 @@
+//! The gateway's side of a port-2000 connection: one request in flight, and where its reply ends
+//! (docs/wire/command.md section 6).
+//!
+//! In: a command to send, received bytes and the time. Out: the bytes to send, replies, texts
+//! that nobody asked for, and a timeout. Decides nothing about what to send or to send again.
+
+use core::fmt;
+
+use super::reply::{Match, Reply, ReplyKind, SCRIPT_FINISH, match_fixed, match_value};
+use super::request::{EncodeError, Keyword, ParseError, Request};
+use super::text::{is_blank, is_terminator};
+use crate::time::{Duration, Instant};
+use crate::wire::dialect::Dialect;
+
+/// Longest reply that is taken whole; the rest of a longer one is dropped and counted.
+pub const MAX_REPLY: usize = 320;
+
+/// One connection to port 2000.
+///
+/// Call [`receive`](Self::receive) with each piece until it returns `None`; call
+/// [`poll`](Self::poll) until `None` when [`deadline`](Self::deadline) has come. Polling early is
+/// harmless.
+#[derive(Debug, Clone)]
+pub struct CommandClient {
+    /// A reply that further bytes could make longer is complete after this much silence: 20 ms.
+    pub quiet_gap: Duration,
+    /// The same for the reply to `getlasterror`, whose free text may come in pieces: 100 ms.
+    pub message_gap: Duration,
+    /// A request without a reply is given up after this long: 10 s. Powering on takes seconds,
+    /// and its reply comes at its end.
+    pub timeout: Duration,
+    waiting: Option<Waiting>,
+    buffer: [u8; MAX_REPLY],
+    len: usize,
+    /// Bytes at the front that were handed out; they go at the next call.
+    handed_out: usize,
+    /// Behind a text that was too long, up to its end.
+    dropping: bool,
+    newest: Instant,
+    dropped: u32,
+}
+
+/// The request in flight.
+#[derive(Debug, Clone, Copy)]
+struct Waiting {
+    keyword: Keyword,
+    until: Instant,
+}
+
+/// What became of a request, or came unasked.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum ClientEvent<'a> {
+    /// The reply to the request in flight, which is over.
+    Reply {
+        /// What kind of answer it is.
+        kind: ReplyKind,
+        /// The answer.
+        reply: Reply<'a>,
+        /// Its text, without a terminator.
+        text: &'a [u8],
+    },
+    /// A program that was started from port 2000 has ended.
+    ScriptFinish,
+    /// A text that answers nothing in flight: a late reply, or one we do not know.
+    Unsolicited {
+        /// The text, without a terminator.
+        text: &'a [u8],
+    },
+    /// The request in flight is given up. Its reply may still come, as an unsolicited text; a
+    /// value would be taken for the next reply of its kind, so reconnect before asking again.
+    Timeout,
+}
+
+/// Why a command cannot be sent.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[non_exhaustive]
+pub enum StartError {
+    /// A request is in flight.
+    Busy,
+    /// The text is not a command.
+    Command(ParseError),
+    /// The command cannot be written.
+    Encode(EncodeError),
+}
+
+impl fmt::Display for StartError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Busy => f.write_str("the command before has not been answered yet"),
+            Self::Command(error) => error.fmt(f),
+            Self::Encode(error) => error.fmt(f),
+        }
+    }
+}
+
+impl core::error::Error for StartError {}
+
+impl CommandClient {
+    /// A client at the beginning of a connection.
+    pub const fn new() -> Self {
+        Self {
+            quiet_gap: Duration::from_millis(20),
+            message_gap: Duration::from_millis(100),
+            timeout: Duration::from_secs(10),
+            waiting: None,
+            buffer: [0; MAX_REPLY],
+            len: 0,
+            handed_out: 0,
+            dropping: false,
+            newest: Instant::ZERO,
+            dropped: 0,
+        }
+    }
+
+    /// Whether a request is in flight.
+    pub const fn busy(&self) -> bool {
+        self.waiting.is_some()
+    }
+
+    /// Bytes of texts longer than [`MAX_REPLY`] that were dropped, wrapping.
+    pub const fn dropped_bytes(&self) -> u32 {
+        self.dropped
+    }
+
+    /// Writes the command `text` in the dialect's form to the front of `out` and returns its
+    /// length; from now on its reply is waited for.
+    ///
+    /// # Errors
+    /// [`StartError`]; nothing has begun then.
+    pub fn start(
+        &mut self,
+        now: Instant,
+        text: &[u8],
+        dialect: &Dialect,
+        out: &mut [u8],
+    ) -> Result<usize, StartError> {
+        let request = Request::parse_strict(text).map_err(StartError::Command)?;
+        self.start_request(now, &request, dialect, out)
+    }
+
+    /// As [`start`](Self::start), for a request that is not text yet.
+    ///
+    /// # Errors
+    /// [`StartError`]; nothing has begun then.
+    pub fn start_request(
+        &mut self,
+        now: Instant,
+        request: &Request<'_>,
+        dialect: &Dialect,
+        out: &mut [u8],
+    ) -> Result<usize, StartError> {
+        if self.busy() {
+            return Err(StartError::Busy);
+        }
+        let len = request.encode(dialect, out).map_err(StartError::Encode)?;
+        self.drop_handed_out();
+        // What came before the request cannot be the beginning of its reply.
+        if !SCRIPT_FINISH.as_bytes().starts_with(self.received()) {
+            self.len = 0;
+        }
+        self.waiting = Some(Waiting { keyword: request.keyword(), until: now + self.timeout });
+        Ok(len)
+    }
+
+    /// Takes bytes off the front of `bytes` until something is complete. `None` means that all of
+    /// them were taken and nothing is.
+    pub fn receive(&mut self, now: Instant, bytes: &mut &[u8]) -> Option<ClientEvent<'_>> {
+        self.drop_handed_out();
+        let found = loop {
+            if let Some(found) = self.scan(now) {
+                break Some(found);
+            }
+            let Some((&byte, rest)) = bytes.split_first() else { break None };
+            *bytes = rest;
+            self.newest = now;
+            self.push(byte);
+        };
+        match found {
+            Some(found) => Some(self.hand_out(found)),
+            None if self.waiting.is_some_and(|waiting| now >= waiting.until) => {
+                self.waiting = None;
+                Some(ClientEvent::Timeout)
+            }
+            None => None,
+        }
+    }
+
+    /// What silence has completed by `now`, or a timeout.
+    pub fn poll(&mut self, now: Instant) -> Option<ClientEvent<'_>> {
+        self.receive(now, &mut &[][..])
+    }
+
+    /// When [`poll`](Self::poll) has something to say if nothing more is received.
+    pub fn deadline(&self) -> Option<Instant> {
+        let gap = self.gap().map(|gap| self.newest + gap);
+        let timeout = self.waiting.map(|waiting| waiting.until);
+        match (gap, timeout) {
+            (Some(gap), Some(timeout)) => Some(gap.min(timeout)),
+            (gap, timeout) => gap.or(timeout),
+        }
+    }
+
+    /// Forgets the request in flight and everything received, for a new connection.
+    pub fn abort(&mut self) {
+        self.waiting = None;
+        self.len = 0;
+        self.handed_out = 0;
+        self.dropping = false;
+    }
+
+    /// Looks at the front of the buffer.
+    fn scan(&mut self, now: Instant) -> Option<Found> {
+        let blanks = self.received().iter().take_while(|&&byte| is_blank(byte)).count();
+        self.drop_front(blanks);
+        let silent = self.gap().is_some_and(|gap| now >= self.newest + gap);
+        if self.dropping {
+            self.dropping = !silent;
+            return None;
+        }
+        let bytes = self.received();
+        if bytes.is_empty() {
+            return None;
+        }
+        let full = bytes.len() == MAX_REPLY;
+        match self.front(bytes) {
+            Match::Complete { len, reply } => Some(self.judge(len, &reply)),
+            Match::Open { len, reply } if silent || full => {
+                let found = self.judge(len, &reply);
+                self.dropping = full;
+                Some(found)
+            }
+            Match::Open { .. } | Match::Partial => None,
+            Match::No => {
+                let line = bytes.iter().position(|&byte| is_terminator(byte));
+                if line.is_none() && !silent && !full {
+                    return None;
+                }
+                let end = line.unwrap_or(bytes.len());
+                // A reply may be glued to a text that we do not know.
+                let glued = (1..end).find(|&at| {
+                    let rest = bytes.get(at..).unwrap_or(&[]);
+                    matches!(match_fixed(rest), Match::Complete { .. })
+                });
+                Some(Found::Unsolicited { len: glued.unwrap_or(end) })
+            }
+        }
+    }
+
+    /// What the front of `bytes` is, seen from the request in flight.
+    fn front<'b>(&self, bytes: &'b [u8]) -> Match<'b> {
+        let fixed = match_fixed(bytes);
+        if matches!(fixed, Match::Complete { .. }) {
+            return fixed;
+        }
+        match self.waiting.map_or(Match::No, |waiting| match_value(waiting.keyword, bytes)) {
+            Match::No => fixed,
+            value => value,
+        }
+    }
+
+    fn judge(&self, len: usize, reply: &Reply<'_>) -> Found {
+        match (reply, self.waiting) {
+            (Reply::ScriptFinish, _) => Found::ScriptFinish { len },
+            (reply, Some(waiting)) if reply.answers(waiting.keyword) => Found::Reply { len },
+            _ => Found::Unsolicited { len },
+        }
+    }
+
+    /// How much silence would end what is in the buffer.
+    fn gap(&self) -> Option<Duration> {
+        if self.dropping {
+            return Some(self.message_gap);
+        }
+        let bytes = self.buffer.get(self.handed_out..self.len).unwrap_or(&[]);
+        if bytes.is_empty() {
+            return None;
+        }
+        match self.front(bytes) {
+            Match::Open { reply: Reply::LastError { .. }, .. } => Some(self.message_gap),
+            Match::Open { .. } | Match::No => Some(self.quiet_gap),
+            Match::Complete { .. } | Match::Partial => None,
+        }
+    }
+
+    fn push(&mut self, byte: u8) {
+        if self.dropping {
+            self.dropping = !is_terminator(byte);
+            self.dropped = self.dropped.wrapping_add(1);
+            return;
+        }
+        match self.buffer.get_mut(self.len) {
+            Some(place) => {
+                *place = byte;
+                self.len = self.len.saturating_add(1);
+            }
+            // A beginning that fills the whole buffer does not exist: see the longest replies.
+            None => self.len = 0,
+        }
+    }
+
+    fn hand_out(&mut self, found: Found) -> ClientEvent<'_> {
+        let (Found::Reply { len } | Found::ScriptFinish { len } | Found::Unsolicited { len }) = found;
+        self.handed_out = len;
+        let waiting = self.waiting;
+        if matches!(found, Found::Reply { .. }) {
+            self.waiting = None;
+        }
+        let bytes = self.buffer.get(..self.len).unwrap_or(&[]);
+        let text = bytes.get(..len).unwrap_or(&[]);
+        match found {
+            Found::ScriptFinish { .. } => ClientEvent::ScriptFinish,
+            Found::Unsolicited { .. } => ClientEvent::Unsolicited { text },
+            Found::Reply { .. } => match waiting.and_then(|waiting| Reply::parse(waiting.keyword, text)) {
+                Some(reply) => ClientEvent::Reply { kind: reply.kind(), reply, text },
+                None => ClientEvent::Unsolicited { text },
+            },
+        }
+    }
+
+    fn received(&self) -> &[u8] {
+        self.buffer.get(..self.len).unwrap_or(&[])
+    }
+
+    fn drop_handed_out(&mut self) {
+        let count = core::mem::take(&mut self.handed_out);
+        self.drop_front(count);
+    }
+
+    fn drop_front(&mut self, count: usize) {
+        if count > 0 && count <= self.len {
+            self.buffer.copy_within(count..self.len, 0);
+            self.len = self.len.saturating_sub(count);
+        }
+    }
+}
+
+impl Default for CommandClient {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+/// What [`CommandClient::scan`] found at the front of the buffer.
+enum Found {
+    Reply { len: usize },
+    ScriptFinish { len: usize },
+    Unsolicited { len: usize },
+}

@@ -1,0 +1,387 @@
+//! What a controller answers (docs/wire/command.md sections 3 and 4).
+//!
+//! In: a [`Reply`] to be written in a [`Dialect`]'s form, or the text of one to be read. How the
+//! end of a reply is found is the client's business ([`CommandClient`](super::CommandClient)).
+
+use core::fmt;
+
+use super::request::{Action, Keyword, Percent};
+use super::text::{NoSpace, Writer, is_terminator, trim};
+use crate::wire::dialect::{Dialect, RunReply, SpeedReply, Terminator};
+use crate::wire::state::{OperationMode, ProgramState, RobotState, SafetyState};
+
+/// How an action went.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum Outcome {
+    /// Done, or begun.
+    Success,
+    /// Refused.
+    Fail,
+}
+
+impl Outcome {
+    /// The word on the wire.
+    pub const fn word(self) -> &'static str {
+        match self {
+            Self::Success => "success",
+            Self::Fail => "fail",
+        }
+    }
+}
+
+/// One reply, or the one text that comes unasked.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum Reply<'a> {
+    /// To `run`: `run start` or `run success`, `run fail`.
+    Run(Outcome),
+    /// To `speed`, done: `set success`, or `set speed 50%`. `None` when read from `set success`,
+    /// which does not say; written as `set success` in every dialect then.
+    SpeedSet(Option<Percent>),
+    /// To `speed`, refused: `set fail`.
+    SpeedRefused,
+    /// To an action.
+    Did {
+        /// The action.
+        action: Action,
+        /// How it went.
+        outcome: Outcome,
+    },
+    /// To `state`.
+    State(StateCodes),
+    /// To `isprogfinish`: whether the program has finished.
+    ProgramFinished(bool),
+    /// To `getlasterror`.
+    LastError {
+        /// The error's number, hexadecimal on the wire.
+        id: u32,
+        /// Its text; not always UTF-8.
+        message: &'a [u8],
+    },
+    /// To everything else (D5).
+    UnknownCommand,
+    /// A program that was started from port 2000 has ended.
+    ScriptFinish,
+}
+
+/// The codes of the four state machines, as `state` reports them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub struct StateCodes {
+    /// Robot state; see [`Dialect::robot_state`].
+    pub robot: u8,
+    /// Program state.
+    pub program: u8,
+    /// Safety state; see [`Dialect::safety_state`].
+    pub safety: u8,
+    /// Operation mode.
+    pub mode: u8,
+}
+
+impl StateCodes {
+    /// The codes of these states in `dialect`.
+    pub fn new(
+        dialect: &Dialect,
+        robot: RobotState,
+        program: ProgramState,
+        safety: SafetyState,
+        mode: OperationMode,
+    ) -> Self {
+        Self {
+            robot: dialect.robot_code(robot),
+            program: program.code(),
+            safety: dialect.safety_code(safety),
+            mode: mode.code(),
+        }
+    }
+}
+
+impl fmt::Display for StateCodes {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}:{}:{}:{}", self.robot, self.program, self.safety, self.mode)
+    }
+}
+
+/// What kind of answer a reply is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum ReplyKind {
+    /// The command was carried out.
+    Success,
+    /// The command was refused.
+    Fail,
+    /// A question was answered.
+    Value,
+    /// The controller does not know the command.
+    UnknownCommand,
+}
+
+impl<'a> Reply<'a> {
+    /// What kind of answer this is; [`ReplyKind::Value`] for the unasked text.
+    pub const fn kind(&self) -> ReplyKind {
+        match self {
+            Self::Run(Outcome::Success) | Self::SpeedSet(_) | Self::Did { outcome: Outcome::Success, .. } => {
+                ReplyKind::Success
+            }
+            Self::Run(Outcome::Fail) | Self::SpeedRefused | Self::Did { outcome: Outcome::Fail, .. } => {
+                ReplyKind::Fail
+            }
+            Self::UnknownCommand => ReplyKind::UnknownCommand,
+            Self::State(_) | Self::ProgramFinished(_) | Self::LastError { .. } | Self::ScriptFinish => {
+                ReplyKind::Value
+            }
+        }
+    }
+
+    /// Writes the reply, with the dialect's terminator, to the front of `out` and returns its
+    /// length. Control characters in an error's message become blanks.
+    ///
+    /// # Errors
+    /// [`NoSpace`] when `out` is too short.
+    pub fn encode(&self, dialect: &Dialect, out: &mut [u8]) -> Result<usize, NoSpace> {
+        let mut writer = Writer::new(out);
+        let mut terminator = dialect.reply_terminator;
+        match *self {
+            Self::Run(Outcome::Success) => writer.push_str(match dialect.run_reply {
+                RunReply::Start => RUN_START,
+                RunReply::Success => RUN_SUCCESS,
+            }),
+            Self::Run(Outcome::Fail) => writer.push_str(RUN_FAIL),
+            Self::SpeedSet(Some(percent)) if dialect.speed_reply == SpeedReply::Percent => {
+                writer.push_str(SET_SPEED);
+                writer.push_display(percent);
+                writer.push_str("%");
+            }
+            Self::SpeedSet(_) => writer.push_str(SET_SUCCESS),
+            Self::SpeedRefused => writer.push_str(SET_FAIL),
+            Self::Did { action, outcome } => {
+                writer.push_str(action.word());
+                writer.push_str(" ");
+                writer.push_str(outcome.word());
+            }
+            Self::State(codes) => writer.push_display(codes),
+            Self::ProgramFinished(finished) => writer.push_str(if finished { "1" } else { "0" }),
+            Self::LastError { id, message } => {
+                writer.push_display(format_args!("{id:X}:"));
+                for &byte in message {
+                    writer.push(&[if byte.is_ascii_control() { b' ' } else { byte }]);
+                }
+                // This reply has a terminator in every version (D4).
+                if terminator == Terminator::None {
+                    terminator = Terminator::Lf;
+                }
+            }
+            Self::UnknownCommand => writer.push_str(UNKNOWN_COMMAND),
+            Self::ScriptFinish => writer.push_str(SCRIPT_FINISH),
+        }
+        writer.push_str(terminator.text());
+        writer.finish()
+    }
+
+    /// Reads the whole text of a reply to `keyword`, in the form of any dialect, with or without
+    /// a terminator. `None` when it is not one.
+    pub fn parse(keyword: Keyword, text: &'a [u8]) -> Option<Self> {
+        let text = trim(text);
+        let whole = |found: Match<'a>| match found {
+            Match::Complete { len, reply } | Match::Open { len, reply, .. } if len == text.len() => {
+                Some(reply)
+            }
+            _ => None,
+        };
+        whole(match_value(keyword, text))
+            .or_else(|| whole(match_fixed(text)))
+            .filter(|reply| reply.answers(keyword) || *reply == Self::ScriptFinish)
+    }
+
+    /// Whether this is an answer that `keyword` can get.
+    pub(super) fn answers(&self, keyword: Keyword) -> bool {
+        match *self {
+            Self::Run(_) => keyword == Keyword::Run,
+            Self::SpeedSet(_) | Self::SpeedRefused => keyword == Keyword::Speed,
+            Self::Did { action, .. } => keyword == Keyword::Do(action),
+            Self::State(_) => keyword == Keyword::State,
+            Self::ProgramFinished(_) => keyword == Keyword::IsProgFinish,
+            Self::LastError { .. } => keyword == Keyword::GetLastError,
+            Self::UnknownCommand => true,
+            Self::ScriptFinish => false,
+        }
+    }
+}
+
+/// What the front of received bytes is.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum Match<'a> {
+    /// A reply of `len` bytes that no further byte could change.
+    Complete { len: usize, reply: Reply<'a> },
+    /// A reply of `len` bytes, all there are, that further bytes could make longer.
+    Open { len: usize, reply: Reply<'a> },
+    /// The beginning of a reply.
+    Partial,
+    /// None of it.
+    No,
+}
+
+/// Replies whose text does not depend on a value; none is the beginning of another.
+pub(super) fn match_fixed(bytes: &[u8]) -> Match<'static> {
+    let texts = [
+        (RUN_START, Reply::Run(Outcome::Success)),
+        (RUN_SUCCESS, Reply::Run(Outcome::Success)),
+        (RUN_FAIL, Reply::Run(Outcome::Fail)),
+        (SET_SUCCESS, Reply::SpeedSet(None)),
+        (SET_FAIL, Reply::SpeedRefused),
+        (UNKNOWN_COMMAND, Reply::UnknownCommand),
+        (SCRIPT_FINISH, Reply::ScriptFinish),
+    ];
+    let mut partial = false;
+    for (text, reply) in texts {
+        match front(bytes, text) {
+            Front::Whole(_) => return Match::Complete { len: text.len(), reply },
+            Front::Beginning => partial = true,
+            Front::Other => {}
+        }
+    }
+    for action in Action::ALL {
+        for outcome in [Outcome::Success, Outcome::Fail] {
+            let found = match front(bytes, action.word()) {
+                Front::Whole(rest) => match front(rest, " ") {
+                    Front::Whole(rest) => front(rest, outcome.word()),
+                    other => other,
+                },
+                other => other,
+            };
+            match found {
+                Front::Whole(rest) => {
+                    let len = bytes.len().saturating_sub(rest.len());
+                    return Match::Complete { len, reply: Reply::Did { action, outcome } };
+                }
+                Front::Beginning => partial = true,
+                Front::Other => {}
+            }
+        }
+    }
+    match front(bytes, SET_SPEED) {
+        Front::Whole(rest) => match match_percent(rest) {
+            Match::Complete { len, reply } => {
+                return Match::Complete { len: len.saturating_add(SET_SPEED.len()), reply };
+            }
+            Match::Partial => partial = true,
+            _ => {}
+        },
+        Front::Beginning => partial = true,
+        Front::Other => {}
+    }
+    if partial { Match::Partial } else { Match::No }
+}
+
+/// Replies that are values; they are only looked for when `keyword` asked for one.
+pub(super) fn match_value(keyword: Keyword, bytes: &[u8]) -> Match<'_> {
+    match keyword {
+        Keyword::State => match_state(bytes),
+        Keyword::IsProgFinish => match bytes {
+            [] => Match::Partial,
+            // More of a number is not this reply.
+            [_, b'0'..=b'9' | b':', ..] => Match::No,
+            [b'0', ..] => Match::Complete { len: 1, reply: Reply::ProgramFinished(false) },
+            [b'1', ..] => Match::Complete { len: 1, reply: Reply::ProgramFinished(true) },
+            _ => Match::No,
+        },
+        Keyword::GetLastError => match_error(bytes),
+        Keyword::Run | Keyword::Speed | Keyword::Do(_) => Match::No,
+    }
+}
+
+fn match_percent(bytes: &[u8]) -> Match<'static> {
+    match bytes.iter().position(|byte| !matches!(byte, b'0'..=b'9' | b'.' | b' ')) {
+        Some(at) if bytes.get(at) == Some(&b'%') => {
+            let percent = bytes.get(..at).and_then(|digits| core::str::from_utf8(digits).ok());
+            match percent.and_then(Percent::parse) {
+                Some(percent) => {
+                    Match::Complete { len: at.saturating_add(1), reply: Reply::SpeedSet(Some(percent)) }
+                }
+                None => Match::No,
+            }
+        }
+        Some(_) => Match::No,
+        None if bytes.len() <= LONGEST_PERCENT => Match::Partial,
+        None => Match::No,
+    }
+}
+
+fn match_state(bytes: &[u8]) -> Match<'static> {
+    let mut codes = [0u8; 4];
+    let mut rest = bytes;
+    let last = codes.len().saturating_sub(1);
+    for (nth, code) in codes.iter_mut().enumerate() {
+        let digits = rest.iter().take_while(|byte| byte.is_ascii_digit()).count();
+        let Some((number, behind)) = rest.split_at_checked(digits) else { return Match::No };
+        let parsed = core::str::from_utf8(number).ok().and_then(|number| number.parse().ok());
+        match (parsed, behind.first()) {
+            (None, None) if digits == 0 => return Match::Partial,
+            (None, _) => return Match::No,
+            (Some(number), _) if nth == last => *code = number,
+            (Some(_), None) => return Match::Partial,
+            (Some(number), Some(b':')) => *code = number,
+            (Some(_), Some(_)) => return Match::No,
+        }
+        rest = if nth == last { behind } else { behind.get(1..).unwrap_or(&[]) };
+    }
+    let [robot, program, safety, mode] = codes;
+    let reply = Reply::State(StateCodes { robot, program, safety, mode });
+    let len = bytes.len().saturating_sub(rest.len());
+    if rest.is_empty() { Match::Open { len, reply } } else { Match::Complete { len, reply } }
+}
+
+fn match_error(bytes: &[u8]) -> Match<'_> {
+    let number = bytes.strip_prefix(b"0x").unwrap_or(bytes);
+    let digits = number.iter().take_while(|byte| byte.is_ascii_hexdigit()).count();
+    let Some((digits, rest)) = number.split_at_checked(digits) else { return Match::No };
+    let Some((colon, message)) = rest.split_first() else {
+        // `0x` alone is a beginning too.
+        return if digits.len() <= 8 { Match::Partial } else { Match::No };
+    };
+    let id = core::str::from_utf8(digits).ok().and_then(|digits| u32::from_str_radix(digits, 16).ok());
+    let (b':', Some(id)) = (*colon, id) else {
+        return if bytes == b"0x" { Match::Partial } else { Match::No };
+    };
+    match message.iter().position(|&byte| is_terminator(byte)) {
+        Some(end) => {
+            let message = message.get(..end).unwrap_or(&[]);
+            let header = bytes.len().saturating_sub(rest.len()).saturating_add(1);
+            let reply = Reply::LastError { id, message };
+            Match::Complete { len: header.saturating_add(message.len()), reply }
+        }
+        None => Match::Open { len: bytes.len(), reply: Reply::LastError { id, message } },
+    }
+}
+
+/// How `bytes` begin, compared with `text`.
+enum Front<'a> {
+    /// With the whole text; this is behind it.
+    Whole(&'a [u8]),
+    /// They are the beginning of it.
+    Beginning,
+    /// Otherwise.
+    Other,
+}
+
+fn front<'a>(bytes: &'a [u8], text: &str) -> Front<'a> {
+    let text = text.as_bytes();
+    match bytes.strip_prefix(text) {
+        Some(rest) => Front::Whole(rest),
+        None if text.starts_with(bytes) => Front::Beginning,
+        None => Front::Other,
+    }
+}
+
+const RUN_START: &str = "run start";
+const RUN_SUCCESS: &str = "run success";
+const RUN_FAIL: &str = "run fail";
+const SET_SUCCESS: &str = "set success";
+const SET_FAIL: &str = "set fail";
+const SET_SPEED: &str = "set speed ";
+const UNKNOWN_COMMAND: &str = "unknown command";
+pub(super) const SCRIPT_FINISH: &str = "script finish";
+
+/// Longest number in `set speed V%`.
+const LONGEST_PERCENT: usize = 16;

@@ -1,0 +1,433 @@
+//! What a client asks (docs/wire/command.md section 2).
+//!
+//! In: the text of one command, found by [`CommandServer`](super::CommandServer) or taken from a
+//! command table. Out: a [`Request`]. And back, in a [`Dialect`]'s form.
+
+use core::fmt;
+
+use super::MAX_COMMAND;
+use super::text::{NoSpace, Writer, trim};
+use crate::wire::dialect::{Dialect, Parentheses, Quotes};
+
+/// One command.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum Request<'a> {
+    /// `run(NAME)` or `run(NAME,SPEED)`.
+    Run {
+        /// The program's name as written, without quotes (D3). May be empty when received.
+        program: &'a str,
+        /// Speed; `None` when it was absent or not a valid one: the current speed is used.
+        speed: Option<Percent>,
+    },
+    /// `speed(V)`; `None` when V was not a valid speed: the controller refuses it.
+    Speed(Option<Percent>),
+    /// A keyword that makes the controller do something and answers how it went.
+    Do(Action),
+    /// `state`
+    State,
+    /// `isprogfinish`
+    IsProgFinish,
+    /// `getlasterror`
+    GetLastError,
+}
+
+/// The keywords whose reply is the keyword with `success` or `fail`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum Action {
+    /// `stop`
+    Stop,
+    /// `pause`
+    Pause,
+    /// `resume`
+    Resume,
+    /// `poweron`
+    PowerOn,
+    /// `poweroff`
+    PowerOff,
+    /// `enable`
+    Enable,
+    /// `disable`
+    Disable,
+    /// `shutdown`
+    Shutdown,
+}
+
+impl Action {
+    /// Every one of them.
+    pub const ALL: [Self; 8] = [
+        Self::Stop,
+        Self::Pause,
+        Self::Resume,
+        Self::PowerOn,
+        Self::PowerOff,
+        Self::Enable,
+        Self::Disable,
+        Self::Shutdown,
+    ];
+
+    /// The word on the wire.
+    pub const fn word(self) -> &'static str {
+        match self {
+            Self::Stop => "stop",
+            Self::Pause => "pause",
+            Self::Resume => "resume",
+            Self::PowerOn => "poweron",
+            Self::PowerOff => "poweroff",
+            Self::Enable => "enable",
+            Self::Disable => "disable",
+            Self::Shutdown => "shutdown",
+        }
+    }
+}
+
+/// The word a command begins with.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum Keyword {
+    /// `run`
+    Run,
+    /// `speed`
+    Speed,
+    /// One of the actions.
+    Do(Action),
+    /// `state`
+    State,
+    /// `isprogfinish`
+    IsProgFinish,
+    /// `getlasterror`
+    GetLastError,
+}
+
+impl Keyword {
+    /// Every keyword. None is the beginning of another, so a complete one is never ambiguous.
+    pub const ALL: [Self; 13] = [
+        Self::Run,
+        Self::Speed,
+        Self::Do(Action::Stop),
+        Self::Do(Action::Pause),
+        Self::Do(Action::Resume),
+        Self::Do(Action::PowerOn),
+        Self::Do(Action::PowerOff),
+        Self::Do(Action::Enable),
+        Self::Do(Action::Disable),
+        Self::Do(Action::Shutdown),
+        Self::State,
+        Self::IsProgFinish,
+        Self::GetLastError,
+    ];
+
+    /// The word on the wire.
+    pub const fn word(self) -> &'static str {
+        match self {
+            Self::Run => "run",
+            Self::Speed => "speed",
+            Self::Do(action) => action.word(),
+            Self::State => "state",
+            Self::IsProgFinish => "isprogfinish",
+            Self::GetLastError => "getlasterror",
+        }
+    }
+
+    /// Whether the command is the keyword alone.
+    pub const fn is_bare(self) -> bool {
+        !matches!(self, Self::Run | Self::Speed)
+    }
+
+    /// The keyword written exactly so; case matters (D2).
+    pub fn from_word(word: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|keyword| keyword.word() == word)
+    }
+}
+
+/// A speed in percent, above 0 and at most 100.
+#[derive(Debug, Clone, Copy, PartialEq, PartialOrd)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub struct Percent(f32);
+
+impl Percent {
+    /// `percent` if it is in (0, 100].
+    pub fn new(percent: f32) -> Option<Self> {
+        (percent > 0.0 && percent <= 100.0).then_some(Self(percent))
+    }
+
+    /// The number, such as 50.0.
+    pub const fn value(self) -> f32 {
+        self.0
+    }
+
+    /// The speed written as a decimal number, blanks around it ignored.
+    pub fn parse(text: &str) -> Option<Self> {
+        text.trim().parse().ok().and_then(Self::new)
+    }
+}
+
+impl fmt::Display for Percent {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.fmt(f)
+    }
+}
+
+/// Why a text is not a command.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[non_exhaustive]
+pub enum ParseError {
+    /// Nothing but blanks.
+    Empty,
+    /// Longer than [`MAX_COMMAND`].
+    TooLong {
+        /// Its length in bytes.
+        len: usize,
+    },
+    /// Not UTF-8.
+    NotText {
+        /// Where it stops being UTF-8.
+        at: usize,
+    },
+    /// It begins with no keyword.
+    UnknownWord,
+    /// The parentheses do not close at the end, or open twice.
+    Parentheses,
+    /// `run` and `speed` need an argument.
+    MissingArgument {
+        /// Which of the two.
+        keyword: Keyword,
+    },
+    /// Every other keyword takes none.
+    UnexpectedArgument {
+        /// The keyword.
+        keyword: Keyword,
+    },
+    /// A speed outside (0, 100], or not a number; only [`Request::parse_strict`] says so.
+    InvalidSpeed,
+    /// A program without a name; only [`Request::parse_strict`] says so.
+    NoProgram,
+}
+
+impl fmt::Display for ParseError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match *self {
+            Self::Empty => f.write_str("the command is empty"),
+            Self::TooLong { len } => write!(f, "the command has {len} bytes; at most {MAX_COMMAND}"),
+            Self::NotText { at } => write!(f, "the command is not UTF-8 from byte {at} on"),
+            Self::UnknownWord => {
+                f.write_str("the command begins with none of")?;
+                for (nth, keyword) in Keyword::ALL.iter().enumerate() {
+                    write!(f, "{} {}", if nth == 0 { "" } else { "," }, keyword.word())?;
+                }
+                Ok(())
+            }
+            Self::Parentheses => f.write_str("the command's parentheses do not match"),
+            Self::MissingArgument { keyword } => {
+                write!(f, "{} needs an argument, as in {0}(...)", keyword.word())
+            }
+            Self::UnexpectedArgument { keyword } => write!(f, "{} takes no argument", keyword.word()),
+            Self::InvalidSpeed => f.write_str("the speed is not a number above 0 and at most 100"),
+            Self::NoProgram => f.write_str("run needs the name of a program"),
+        }
+    }
+}
+
+impl core::error::Error for ParseError {}
+
+/// Why a [`Request`] cannot be written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[non_exhaustive]
+pub enum EncodeError {
+    /// The buffer is too small.
+    NoSpace(NoSpace),
+    /// The command would be longer than [`MAX_COMMAND`].
+    TooLong {
+        /// Its length in bytes.
+        len: usize,
+    },
+    /// The program's name is empty, or begins or ends with a blank.
+    ProgramName,
+    /// The program's name holds a byte that would end it or its command.
+    ProgramByte {
+        /// The first such byte.
+        byte: u8,
+    },
+    /// `speed` without a valid speed.
+    NoSpeed,
+}
+
+impl fmt::Display for EncodeError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match *self {
+            Self::NoSpace(error) => error.fmt(f),
+            Self::TooLong { len } => write!(f, "the command has {len} bytes; at most {MAX_COMMAND}"),
+            Self::ProgramName => f.write_str("a program's name is not empty and has no blanks around it"),
+            Self::ProgramByte { byte } => write!(f, "byte {byte:#04x} cannot stand in a program's name"),
+            Self::NoSpeed => f.write_str("speed needs a number above 0 and at most 100"),
+        }
+    }
+}
+
+impl core::error::Error for EncodeError {}
+
+impl From<NoSpace> for EncodeError {
+    fn from(error: NoSpace) -> Self {
+        Self::NoSpace(error)
+    }
+}
+
+impl<'a> Request<'a> {
+    /// Reads one command as a controller does: a speed that is not valid counts as absent.
+    ///
+    /// # Errors
+    /// [`ParseError`] for everything that is answered with `unknown command`.
+    pub fn parse(text: &'a [u8]) -> Result<Self, ParseError> {
+        let (keyword, argument) = split(text)?;
+        match keyword {
+            Keyword::Run => {
+                let argument = argument.ok_or(ParseError::MissingArgument { keyword })?;
+                let (name, speed) = match argument.split_once(',') {
+                    Some((name, speed)) => (name, Percent::parse(speed)),
+                    None => (argument, None),
+                };
+                Ok(Self::Run { program: unquoted(name.trim()), speed })
+            }
+            Keyword::Speed => {
+                let argument = argument.ok_or(ParseError::MissingArgument { keyword })?;
+                Ok(Self::Speed(Percent::parse(argument)))
+            }
+            _ if argument.is_some_and(|argument| !argument.trim().is_empty()) => {
+                Err(ParseError::UnexpectedArgument { keyword })
+            }
+            Keyword::Do(action) => Ok(Self::Do(action)),
+            Keyword::State => Ok(Self::State),
+            Keyword::IsProgFinish => Ok(Self::IsProgFinish),
+            Keyword::GetLastError => Ok(Self::GetLastError),
+        }
+    }
+
+    /// Reads one command that we are going to send: as [`Request::parse`], but a speed that is
+    /// not valid and a missing program name are refused instead of left to the controller.
+    ///
+    /// # Errors
+    /// [`ParseError`].
+    pub fn parse_strict(text: &'a [u8]) -> Result<Self, ParseError> {
+        let request = Self::parse(text)?;
+        match request {
+            Self::Run { program: "", .. } => Err(ParseError::NoProgram),
+            Self::Run { speed: None, .. } if text.contains(&b',') => Err(ParseError::InvalidSpeed),
+            Self::Speed(None) => Err(ParseError::InvalidSpeed),
+            _ => Ok(request),
+        }
+    }
+
+    /// The word the command begins with.
+    pub const fn keyword(&self) -> Keyword {
+        match self {
+            Self::Run { .. } => Keyword::Run,
+            Self::Speed(_) => Keyword::Speed,
+            Self::Do(action) => Keyword::Do(*action),
+            Self::State => Keyword::State,
+            Self::IsProgFinish => Keyword::IsProgFinish,
+            Self::GetLastError => Keyword::GetLastError,
+        }
+    }
+
+    /// Writes the command, with the dialect's terminator, to the front of `out` and returns its
+    /// length.
+    ///
+    /// # Errors
+    /// [`EncodeError`] when the request cannot be written, or not into `out`.
+    pub fn encode(&self, dialect: &Dialect, out: &mut [u8]) -> Result<usize, EncodeError> {
+        let terminator = dialect.terminator.text();
+        let mut writer = Writer::new(out);
+        writer.push_str(self.keyword().word());
+        match *self {
+            Self::Run { program, speed } => {
+                check_program(program)?;
+                let quote = match dialect.quotes {
+                    Quotes::None => "",
+                    Quotes::Double => "\"",
+                };
+                for part in ["(", quote, program, quote] {
+                    writer.push_str(part);
+                }
+                if let Some(speed) = speed {
+                    writer.push_str(",");
+                    writer.push_display(speed);
+                }
+                writer.push_str(")");
+            }
+            Self::Speed(speed) => {
+                writer.push_str("(");
+                writer.push_display(speed.ok_or(EncodeError::NoSpeed)?);
+                writer.push_str(")");
+            }
+            Self::Do(_) | Self::State | Self::IsProgFinish | Self::GetLastError => {
+                if dialect.parentheses == Parentheses::Empty {
+                    writer.push_str("()");
+                }
+            }
+        }
+        if writer.len() > MAX_COMMAND {
+            return Err(EncodeError::TooLong { len: writer.len() });
+        }
+        writer.push_str(terminator);
+        Ok(writer.finish()?)
+    }
+}
+
+/// Whether more bytes can still make `text` (no leading blanks) a command.
+pub(super) fn may_become_command(text: &[u8]) -> bool {
+    Keyword::ALL.into_iter().any(|keyword| {
+        let word = keyword.word().as_bytes();
+        match text.strip_prefix(word) {
+            Some(rest) => match trim(rest).split_first() {
+                None => true,
+                // The argument of a bare keyword is empty or it is none of ours.
+                Some((b'(', rest)) => !keyword.is_bare() || trim(rest).is_empty(),
+                Some(_) => false,
+            },
+            None => word.starts_with(text),
+        }
+    })
+}
+
+fn split(text: &[u8]) -> Result<(Keyword, Option<&str>), ParseError> {
+    let text = trim(text);
+    if text.len() > MAX_COMMAND {
+        return Err(ParseError::TooLong { len: text.len() });
+    }
+    let text = core::str::from_utf8(text).map_err(|error| ParseError::NotText { at: error.valid_up_to() })?;
+    if text.is_empty() {
+        return Err(ParseError::Empty);
+    }
+    let (word, argument) = match text.split_once('(') {
+        Some((word, rest)) => (word.trim_end(), Some(rest)),
+        None => (text, None),
+    };
+    let keyword = Keyword::from_word(word).ok_or(ParseError::UnknownWord)?;
+    let argument = match argument {
+        None => None,
+        Some(rest) => match rest.strip_suffix(')') {
+            Some(inner) if !inner.contains([')', '(']) => Some(inner),
+            _ => return Err(ParseError::Parentheses),
+        },
+    };
+    Ok((keyword, argument))
+}
+
+/// `name` without a pair of double quotes around it (D3).
+fn unquoted(name: &str) -> &str {
+    name.strip_prefix('"').and_then(|name| name.strip_suffix('"')).unwrap_or(name)
+}
+
+fn check_program(program: &str) -> Result<(), EncodeError> {
+    if program.is_empty() || program.trim().len() != program.len() {
+        return Err(EncodeError::ProgramName);
+    }
+    let bad = |byte: &u8| matches!(byte, b'(' | b')' | b',' | b'"') || byte.is_ascii_control();
+    match program.bytes().find(bad) {
+        Some(byte) => Err(EncodeError::ProgramByte { byte }),
+        None => Ok(()),
+    }
+}

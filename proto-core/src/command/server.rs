@@ -1,0 +1,189 @@
+//! The controller's side of a port-2000 connection: where one command ends and the next begins
+//! (docs/wire/command.md section 5).
+//!
+//! In: received bytes and the time. Out: requests and what must be answered with
+//! `unknown command`. Carries nothing out.
+
+use super::MAX_COMMAND;
+use super::request::{Keyword, Request, may_become_command};
+use super::text::{is_blank, is_terminator, trim};
+use crate::time::{Duration, Instant};
+
+/// Splits one connection's bytes into commands.
+///
+/// Call [`receive`](Self::receive) with each piece until it returns `None`; call
+/// [`poll`](Self::poll) until `None` when [`deadline`](Self::deadline) has come. Polling early is
+/// harmless.
+#[derive(Debug, Clone)]
+pub struct CommandServer {
+    /// A bare keyword is complete after this much silence: 20 ms (D2).
+    pub keyword_gap: Duration,
+    /// Dropping a command that was too long ends after this much silence, and a text that no
+    /// further byte can make a command is given up after it: 100 ms (D5).
+    pub drop_gap: Duration,
+    buffer: [u8; MAX_COMMAND],
+    len: usize,
+    /// The buffer holds a command that was handed out; it goes at the next call.
+    handed_out: bool,
+    /// Behind a command that was too long, up to its end.
+    dropping: bool,
+    /// The command before was ended by silence: its empty parentheses may still be on the way.
+    ended_by_gap: bool,
+    /// When the newest byte came.
+    newest: Instant,
+}
+
+/// What a client sent.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum ServerEvent<'a> {
+    /// A command.
+    Request(Request<'a>),
+    /// Something else; the answer is [`Reply::UnknownCommand`](super::Reply::UnknownCommand).
+    Unknown(UnknownCommand<'a>),
+}
+
+/// What is answered with `unknown command`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum UnknownCommand<'a> {
+    /// A text that is no command.
+    Text(&'a [u8]),
+    /// More than [`MAX_COMMAND`] bytes without an end; what follows is dropped.
+    TooLong,
+}
+
+impl CommandServer {
+    /// A server at the beginning of a connection.
+    pub const fn new() -> Self {
+        Self {
+            keyword_gap: Duration::from_millis(20),
+            drop_gap: Duration::from_millis(100),
+            buffer: [0; MAX_COMMAND],
+            len: 0,
+            handed_out: false,
+            dropping: false,
+            ended_by_gap: false,
+            newest: Instant::ZERO,
+        }
+    }
+
+    /// Takes bytes off the front of `bytes` until a command is complete. `None` means that all of
+    /// them were taken and none is.
+    pub fn receive(&mut self, now: Instant, bytes: &mut &[u8]) -> Option<ServerEvent<'_>> {
+        if self.handed_out {
+            self.handed_out = false;
+            self.len = 0;
+        }
+        match self.step(now, bytes)? {
+            End::TooLong => Some(ServerEvent::Unknown(UnknownCommand::TooLong)),
+            End::Command => {
+                self.handed_out = true;
+                let text = trim(self.buffer.get(..self.len).unwrap_or(&[]));
+                Some(match Request::parse(text) {
+                    Ok(request) => ServerEvent::Request(request),
+                    Err(_) => ServerEvent::Unknown(UnknownCommand::Text(text)),
+                })
+            }
+        }
+    }
+
+    /// What silence has completed by `now`.
+    pub fn poll(&mut self, now: Instant) -> Option<ServerEvent<'_>> {
+        self.receive(now, &mut &[][..])
+    }
+
+    /// When silence completes what is there, if it would.
+    pub fn deadline(&self) -> Option<Instant> {
+        Some(self.newest + self.gap()?)
+    }
+
+    /// Forgets everything received, for a new connection.
+    pub fn reset(&mut self) {
+        let (keyword_gap, drop_gap) = (self.keyword_gap, self.drop_gap);
+        *self = Self { keyword_gap, drop_gap, ..Self::new() };
+    }
+
+    fn step(&mut self, now: Instant, bytes: &mut &[u8]) -> Option<End> {
+        if self.deadline().is_some_and(|deadline| now >= deadline) {
+            if !self.dropping {
+                self.ended_by_gap = true;
+                return Some(End::Command);
+            }
+            self.dropping = false;
+        }
+        while let Some((&byte, rest)) = bytes.split_first() {
+            *bytes = rest;
+            self.newest = now;
+            if self.dropping {
+                self.dropping = !is_terminator(byte);
+                continue;
+            }
+            if self.len == 0 && is_blank(byte) {
+                continue;
+            }
+            if is_terminator(byte) {
+                return Some(self.end());
+            }
+            let Some(place) = self.buffer.get_mut(self.len) else {
+                self.len = 0;
+                self.dropping = true;
+                self.ended_by_gap = false;
+                return Some(End::TooLong);
+            };
+            *place = byte;
+            self.len = self.len.saturating_add(1);
+            if byte == b')' && self.text().contains(&b'(') {
+                if self.ended_by_gap && is_empty_pair(self.text()) {
+                    self.ended_by_gap = false;
+                    self.len = 0;
+                    continue;
+                }
+                return Some(self.end());
+            }
+        }
+        None
+    }
+
+    fn end(&mut self) -> End {
+        self.ended_by_gap = false;
+        End::Command
+    }
+
+    /// How much silence would end what is there.
+    fn gap(&self) -> Option<Duration> {
+        if self.dropping {
+            return Some(self.drop_gap);
+        }
+        let text = if self.handed_out { &[][..] } else { trim(self.text()) };
+        if text.is_empty() {
+            return None;
+        }
+        if Keyword::ALL.into_iter().any(|k| k.is_bare() && k.word().as_bytes() == text) {
+            return Some(self.keyword_gap);
+        }
+        let awaited = may_become_command(text) || (self.ended_by_gap && text == b"(");
+        (!awaited).then_some(self.drop_gap)
+    }
+
+    fn text(&self) -> &[u8] {
+        self.buffer.get(..self.len).unwrap_or(&[])
+    }
+}
+
+impl Default for CommandServer {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+/// Why [`CommandServer::step`] stopped.
+enum End {
+    /// The buffer is a command.
+    Command,
+    /// The buffer overflowed.
+    TooLong,
+}
+
+/// `()`, perhaps with blanks between.
+fn is_empty_pair(text: &[u8]) -> bool {
+    matches!(text, [b'(', inner @ .., b')'] if trim(inner).is_empty())
+}

@@ -1,0 +1,93 @@
+//! Writing text into a caller's buffer, and the few byte classes the texts are made of.
+
+use core::fmt;
+
+/// The buffer was too small; nothing useful was written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[non_exhaustive]
+pub struct NoSpace {
+    /// Bytes the text takes.
+    pub needed: usize,
+    /// Bytes there were.
+    pub available: usize,
+}
+
+impl fmt::Display for NoSpace {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "the text takes {} bytes, the buffer has {}", self.needed, self.available)
+    }
+}
+
+impl core::error::Error for NoSpace {}
+
+/// Appends to a byte slice and goes on counting when the slice is full.
+pub(super) struct Writer<'a> {
+    out: &'a mut [u8],
+    len: usize,
+}
+
+impl<'a> Writer<'a> {
+    pub(super) fn new(out: &'a mut [u8]) -> Self {
+        Self { out, len: 0 }
+    }
+
+    pub(super) fn push(&mut self, bytes: &[u8]) {
+        let end = self.len.saturating_add(bytes.len());
+        if let Some(target) = self.out.get_mut(self.len..end) {
+            target.copy_from_slice(bytes);
+        }
+        self.len = end;
+    }
+
+    pub(super) fn push_str(&mut self, text: &str) {
+        self.push(text.as_bytes());
+    }
+
+    /// Appends what `value` displays as.
+    pub(super) fn push_display(&mut self, value: impl fmt::Display) {
+        // Writing cannot fail: what does not fit is counted.
+        let _ = fmt::Write::write_fmt(self, format_args!("{value}"));
+    }
+
+    pub(super) fn len(&self) -> usize {
+        self.len
+    }
+
+    pub(super) fn finish(self) -> Result<usize, NoSpace> {
+        let available = self.out.len();
+        if self.len <= available { Ok(self.len) } else { Err(NoSpace { needed: self.len, available }) }
+    }
+}
+
+impl fmt::Write for Writer<'_> {
+    fn write_str(&mut self, text: &str) -> fmt::Result {
+        self.push_str(text);
+        Ok(())
+    }
+}
+
+/// CR, LF and NUL end a text (D2).
+pub(super) const fn is_terminator(byte: u8) -> bool {
+    matches!(byte, b'\r' | b'\n' | 0)
+}
+
+/// Blanks and terminators: what may surround a text.
+pub(super) const fn is_blank(byte: u8) -> bool {
+    matches!(byte, b' ' | b'\t') || is_terminator(byte)
+}
+
+/// `text` without blanks and terminators at both ends.
+pub(super) fn trim(mut text: &[u8]) -> &[u8] {
+    while let Some((&first, rest)) = text.split_first()
+        && is_blank(first)
+    {
+        text = rest;
+    }
+    while let Some((&last, rest)) = text.split_last()
+        && is_blank(last)
+    {
+        text = rest;
+    }
+    text
+}
