@@ -3,9 +3,12 @@
 use core::fmt;
 
 use super::{GatewayConfig, Name};
+use crate::command::ParseError;
+use crate::recipe::PartError;
 use crate::recipe::model::Mode;
 use crate::sysvar::{Direction, SysVar};
 use crate::time::Duration;
+use crate::wire::dialect::Dialect;
 use crate::wire::scalar::{ScalarError, ScalarType};
 
 /// The first mistake that [`GatewayConfig::validate`] met.
@@ -201,7 +204,16 @@ pub enum ConfigErrorKind {
         value: i64,
     },
     /// The text is not a request of port 2000.
-    NotACommand,
+    Command(ParseError),
+    /// The recipe's part breaks a limit or a rule (D16, D18).
+    Part(PartError),
+    /// The port's line cannot carry the recipe's part.
+    Framing {
+        /// Index of the recipe.
+        recipe: u8,
+        /// What is in the way.
+        error: PartError,
+    },
     /// Input fields write input variables only.
     NotAnInput {
         /// The variable.
@@ -331,6 +343,12 @@ impl core::error::Error for ConfigError {}
 impl fmt::Display for ConfigError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         Described { config: None, error: *self }.fmt(f)
+    }
+}
+
+impl fmt::Display for ConfigErrorKind {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        DescribedKind { config: None, kind: *self }.fmt(f)
     }
 }
 
@@ -467,7 +485,13 @@ impl fmt::Display for DescribedKind<'_> {
         let recipe_name = |recipe| RecipeName(self.config, recipe);
         let port_name = |port| PortName(self.config, port);
         match self.kind {
-            Kind::UnknownDialect => f.write_str("no such dialect"),
+            Kind::UnknownDialect => {
+                f.write_str("no such dialect; there are")?;
+                for (nth, name) in Dialect::NAMES.iter().enumerate() {
+                    write!(f, "{} {name:?}", if nth == 0 { "" } else { "," })?;
+                }
+                Ok(())
+            }
             Kind::ZeroPort => f.write_str("0 is no port of the controller; 1..=65535"),
             Kind::NoSuchRecipe { recipe, recipes } => {
                 write!(f, "there is no recipe {}; there are {recipes}", one_based(recipe))
@@ -508,16 +532,17 @@ impl fmt::Display for DescribedKind<'_> {
                 write!(f, "a {ty} is never {value}, only {low}..={high}")
             }
             Kind::DuplicateCommand { value } => write!(f, "{value} picks a command before this one already"),
-            Kind::NotACommand => f.write_str(
-                "not a port-2000 command; there are run(NAME), run(NAME,SPEED), speed(V), stop, pause, resume, \
-                 poweron, poweroff, enable, disable, shutdown, state, isprogfinish, getlasterror",
-            ),
+            Kind::Command(error) => error.fmt(f),
+            Kind::Part(error) => error.fmt(f),
+            Kind::Framing { recipe, error } => write!(f, "{} does not fit: {error}", recipe_name(recipe)),
             Kind::NotAnInput { var } => write!(
                 f,
                 "{var} is shown by the robot and cannot be written; inputs are DigitalOutputCommand, BitInputReg, \
                  WordInputReg, FloatInputReg, ForceEnd, ForceBase"
             ),
-            Kind::WrittenTwice { var } => write!(f, "{var} is written by another field of this recipe already"),
+            Kind::WrittenTwice { var } => {
+                write!(f, "{var} is written by another field of this recipe already")
+            }
             Kind::NotBits { var } => {
                 write!(f, "{var} is a {}, and a trigger needs one of the variables made of bits", var.ty())
             }
@@ -527,7 +552,9 @@ impl fmt::Display for DescribedKind<'_> {
             }
             Kind::BaudOutOfRange { baud } => write!(f, "{baud} baud is out of range; 1200..=4000000"),
             Kind::StopBits { stop_bits } => write!(f, "{stop_bits} stop bits; 1 or 2"),
-            Kind::BitrateOutOfRange { bitrate } => write!(f, "{bitrate} bit/s is out of range; 10000..=1000000"),
+            Kind::BitrateOutOfRange { bitrate } => {
+                write!(f, "{bitrate} bit/s is out of range; 10000..=1000000")
+            }
             Kind::CycleTooShort { cycle } => write!(f, "a cycle of {cycle} is too short; at least 4 ms"),
             Kind::ZeroTime => f.write_str("must be longer than 0"),
             Kind::TimeTooLong { time, longest } => write!(f, "{time} is too long; at most {longest}"),
@@ -542,9 +569,9 @@ impl fmt::Display for DescribedKind<'_> {
                 "{} is user-defined, and the controller's TCP and UDP ports take realtime recipes only",
                 recipe_name(recipe)
             ),
-            Kind::ListenAddress => {
-                f.write_str("not an address to listen on; an IP address and a port, such as \"0.0.0.0:50000\"")
-            }
+            Kind::ListenAddress => f.write_str(
+                "not an address to listen on; an IP address and a port, such as \"0.0.0.0:50000\"",
+            ),
             Kind::ListenTwice { other } => write!(f, "{} listens here already", port_name(other)),
             Kind::OwnedTwice { var, other } => write!(
                 f,

@@ -8,7 +8,7 @@ mod error;
 mod validate;
 
 pub use error::{ConfigError, ConfigErrorKind, ControllerKey, Place, PortKey, RecipeKey};
-pub use validate::{MAX_LINE_TIME, MAX_TIME, MIN_CYCLE};
+pub use validate::{MAX_LINE_TIME, MAX_TIME, MIN_CYCLE, check_bitrate, check_cycle};
 
 use heapless::{String, Vec};
 

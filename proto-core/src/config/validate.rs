@@ -10,9 +10,12 @@ use super::error::{ConfigError, ConfigErrorKind as Kind, ControllerKey, Place, P
 use super::{
     Bus, FieldSpec, GatewayConfig, InputBinding, OutputBinding, Parts, Port, Recipe, Rs485, SendOn, Span,
 };
-use crate::recipe::model::{Field, Mode};
+use crate::command::Request;
+use crate::recipe::model::{Field, Framing, Mode};
+use crate::recipe::{CanLayout, PartError, Rules, StreamLayout};
 use crate::sysvar::{COUNT, Direction, INPUT_COUNT, SysVar};
 use crate::time::Duration;
+use crate::wire::dialect::Dialect;
 use crate::wire::scalar::{Scalar, ScalarType};
 
 /// The controller's fastest cycle, and a port's.
@@ -77,6 +80,9 @@ impl GatewayConfig {
 
     fn check_controller(&self) -> Check {
         let controller = &self.controller;
+        if Dialect::named(&controller.dialect).is_none() {
+            return fail(Place::Controller(ControllerKey::Dialect), Kind::UnknownDialect);
+        }
         if [controller.command_port, controller.state_port, controller.modbus_port].contains(&0) {
             return fail(Place::Controller(ControllerKey::Ports), Kind::ZeroPort);
         }
@@ -114,31 +120,63 @@ impl GatewayConfig {
         let is_stream = matches!(recipe.parts, Parts::Stream { .. });
         match &port.bus {
             Bus::Rs485(line) => {
-                check_line(index, line)?;
+                line.check().map_err(|(key, kind)| ConfigError { place: at(key), kind })?;
                 if !is_stream {
                     return fail(at(PortKey::Recipe), Kind::NeedsStreamRecipe { recipe: port.recipe });
                 }
+                self.check_framing(index, port.recipe, recipe)?;
             }
             Bus::Can { bitrate } => {
-                if !(10_000..=1_000_000).contains(bitrate) {
-                    return fail(at(PortKey::Bitrate), Kind::BitrateOutOfRange { bitrate: *bitrate });
-                }
+                check_bitrate(*bitrate).map_err(|kind| ConfigError { place: at(PortKey::Bitrate), kind })?;
                 if is_stream {
                     return fail(at(PortKey::Recipe), Kind::NeedsCanRecipe { recipe: port.recipe });
                 }
             }
             Bus::TcpListen { listen } | Bus::UdpListen { listen } => {
                 self.check_upstream_recipe(at(PortKey::Recipe), port.recipe)?;
+                if matches!(port.bus, Bus::TcpListen { .. }) {
+                    self.check_framing(index, port.recipe, recipe)?;
+                }
                 self.check_listen(index, port, listen)?;
             }
         }
-        if port.cycle < MIN_CYCLE {
-            return fail(at(PortKey::Cycle), Kind::CycleTooShort { cycle: port.cycle });
-        }
-        check_time(at(PortKey::Cycle), port.cycle, MAX_TIME)?;
+        check_cycle(port.cycle).map_err(|kind| ConfigError { place: at(PortKey::Cycle), kind })?;
         check_time(at(PortKey::Timeout), port.timeout, MAX_TIME)?;
         check_time(at(PortKey::StaleAfter), port.stale_after, MAX_TIME)?;
         check_pool(at(PortKey::OnTimeout), port.on_timeout, self.safe_values.len())
+    }
+
+    /// A byte stream needs a head or a tail to find frames by (D18); the rest holds on any line and
+    /// was checked with the recipe.
+    fn check_framing(&self, port: u8, index: u8, recipe: &Recipe) -> Check {
+        for part in [Direction::Input, Direction::Output] {
+            if let Err(error) = self.check_layout(recipe, part, Framing::Bytes) {
+                let place = Place::Port { port, key: PortKey::Recipe };
+                return fail(place, Kind::Framing { recipe: index, error });
+            }
+        }
+        Ok(())
+    }
+
+    /// Compiles one part, if it is there, only to hear what is wrong with it.
+    fn check_layout(&self, recipe: &Recipe, part: Direction, framing: Framing) -> Result<(), PartError> {
+        let rules = Rules { mode: recipe.mode, direction: part };
+        let fields = |span: Span| span.of(&self.fields).iter().map(FieldSpec::field);
+        match &recipe.parts {
+            Parts::Stream { input, output } => {
+                let part = if part == Direction::Input { input } else { output };
+                part.as_ref().map_or(Ok(()), |part| {
+                    StreamLayout::new(rules, &part.head, &part.tail, fields(part.fields), framing).map(|_| ())
+                })
+            }
+            Parts::Can { input, output } => {
+                let frames = if part == Direction::Input { input } else { output };
+                if frames.is_empty() {
+                    return Ok(());
+                }
+                CanLayout::new(rules, frames.iter().map(|frame| (frame.id, fields(frame.fields)))).map(|_| ())
+            }
+        }
     }
 
     fn check_listen(&self, index: u8, port: &Port, listen: &str) -> Check {
@@ -305,6 +343,51 @@ impl FieldSpec {
     }
 }
 
+impl Rs485 {
+    /// Whether the settings are within their ranges (D21).
+    ///
+    /// # Errors
+    /// The key and what is wrong with it.
+    pub fn check(&self) -> Result<(), (PortKey, Kind)> {
+        if !(1_200..=4_000_000).contains(&self.baud) {
+            return Err((PortKey::Baud, Kind::BaudOutOfRange { baud: self.baud }));
+        }
+        if !(1..=2).contains(&self.stop_bits) {
+            return Err((PortKey::StopBits, Kind::StopBits { stop_bits: self.stop_bits }));
+        }
+        if self.idle_gap == Duration::ZERO {
+            return Err((PortKey::IdleGap, Kind::ZeroTime));
+        }
+        for (key, time) in [(PortKey::IdleGap, self.idle_gap), (PortKey::Turnaround, self.turnaround)] {
+            if time > MAX_LINE_TIME {
+                return Err((key, Kind::TimeTooLong { time, longest: MAX_LINE_TIME }));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Whether a CAN bus can run at `bitrate` bit/s (D21).
+///
+/// # Errors
+/// [`ConfigErrorKind::BitrateOutOfRange`](Kind::BitrateOutOfRange).
+pub fn check_bitrate(bitrate: u32) -> Result<(), Kind> {
+    if (10_000..=1_000_000).contains(&bitrate) { Ok(()) } else { Err(Kind::BitrateOutOfRange { bitrate }) }
+}
+
+/// Whether a port can have this cycle: from the controller's fastest to [`MAX_TIME`].
+///
+/// # Errors
+/// [`ConfigErrorKind::CycleTooShort`](Kind::CycleTooShort) or
+/// [`ConfigErrorKind::TimeTooLong`](Kind::TimeTooLong).
+pub fn check_cycle(cycle: Duration) -> Result<(), Kind> {
+    match cycle {
+        _ if cycle < MIN_CYCLE => Err(Kind::CycleTooShort { cycle }),
+        _ if cycle > MAX_TIME => Err(Kind::TimeTooLong { time: cycle, longest: MAX_TIME }),
+        _ => Ok(()),
+    }
+}
+
 /// One recipe under check.
 struct RecipeCheck<'a> {
     config: &'a GatewayConfig,
@@ -319,10 +402,15 @@ impl RecipeCheck<'_> {
         if !self.recipe.has(Direction::Input) && !self.recipe.has(Direction::Output) {
             return fail(self.at(RecipeKey::Whole), Kind::NoParts);
         }
+        // UDP asks for the least of a stream, and takes no user-defined recipes (D16).
+        let framing = if self.recipe.mode == Mode::User { Framing::Bytes } else { Framing::Datagram };
         for part in [Direction::Input, Direction::Output] {
             for (frame, span) in self.recipe.frames(part) {
                 let place = Place::Frame { recipe: self.index, part, frame };
                 check_pool(place, span, self.config.fields.len())?;
+            }
+            if let Err(error) = self.config.check_layout(self.recipe, part, framing) {
+                return fail(self.place_of(part, error), Kind::Part(error));
             }
             for (frame, field, spec) in self.config.fields_of(self.recipe, part) {
                 let place = Place::Field { recipe: self.index, part, frame, field };
@@ -337,6 +425,15 @@ impl RecipeCheck<'_> {
 
     fn at(&self, key: RecipeKey) -> Place {
         Place::Recipe { recipe: self.index, key }
+    }
+
+    fn place_of(&self, part: Direction, error: PartError) -> Place {
+        let recipe = self.index;
+        match (error.field(), error.frame()) {
+            (Some(at), _) => Place::Field { recipe, part, frame: at.frame.unwrap_or(0), field: at.field },
+            (None, Some(frame)) => Place::Frame { recipe, part, frame },
+            (None, None) => Place::Part { recipe, part },
+        }
     }
 
     fn check_field(&self, place: Place, part: Direction, spec: &FieldSpec) -> Check {
@@ -379,6 +476,9 @@ impl RecipeCheck<'_> {
         let entries = || (table.start..).zip(table.of(commands));
         for (entry, command) in entries() {
             let place = Place::Command { entry };
+            if let Err(error) = Request::parse_strict(command.text.as_bytes()) {
+                return fail(place, Kind::Command(error));
+            }
             let (low, high) = ty.range();
             if !(low..=high).contains(&(command.value as f64)) {
                 return fail(place, Kind::CommandValue { value: command.value, ty });
@@ -449,22 +549,6 @@ fn check_pool(place: Place, span: Span, len: usize) -> Check {
     let end = u32::from(span.start).saturating_add(u32::from(span.len));
     let len = len as u32;
     if end <= len { Ok(()) } else { fail(place, Kind::OutsidePool { end, len }) }
-}
-
-fn check_line(port: u8, line: &Rs485) -> Check {
-    let at = |key| Place::Port { port, key };
-    if !(1_200..=4_000_000).contains(&line.baud) {
-        return fail(at(PortKey::Baud), Kind::BaudOutOfRange { baud: line.baud });
-    }
-    if !(1..=2).contains(&line.stop_bits) {
-        return fail(at(PortKey::StopBits), Kind::StopBits { stop_bits: line.stop_bits });
-    }
-    check_time(at(PortKey::IdleGap), line.idle_gap, MAX_LINE_TIME)?;
-    if line.turnaround > MAX_LINE_TIME {
-        let kind = Kind::TimeTooLong { time: line.turnaround, longest: MAX_LINE_TIME };
-        return fail(at(PortKey::Turnaround), kind);
-    }
-    Ok(())
 }
 
 fn check_time(place: Place, time: Duration, longest: Duration) -> Check {
