@@ -3,6 +3,7 @@
 //! In: TOML text and `--set` overrides. Out: [`SimConfig`] for the simulated controller, or
 //! `proto_core::config::GatewayConfig` for the gateway. Nothing here opens a device or a socket.
 
+pub mod file;
 mod sim;
 
 pub use sim::{

@@ -1,0 +1,160 @@
+//! What a gateway file says about a field beside its name and type, and about sending.
+
+use proto_core::config::{CommandWhen, OnStale, OutputBinding, SendOn};
+use proto_core::sysvar::SysVar;
+
+use super::reader::{Item, Reader, Result, Spot};
+
+/// What a received value does.
+pub(super) enum FileInput {
+    Unused,
+    Variable { var: SysVar, scale: f32, offset: f32 },
+    Commands { entries: Vec<FileCommand>, when: CommandWhen },
+}
+
+pub(super) struct FileCommand {
+    pub(super) spot: Spot,
+    pub(super) value: i64,
+    pub(super) text: String,
+}
+
+/// Where a sent value comes from.
+pub(super) enum FileOutput {
+    /// A program of the controller gives it.
+    Program,
+    Bound(OutputBinding),
+}
+
+/// When an output part is sent.
+#[derive(Default)]
+pub(super) struct Sending {
+    pub(super) on_stale: OnStale,
+    pub(super) send: SendOn,
+    pub(super) send_spot: Option<Spot>,
+}
+
+pub(super) fn read_sending(part: &Reader<'_>) -> Result<Sending> {
+    let mut sending = Sending::default();
+    if let Some(item) = part.optional("on_stale") {
+        sending.on_stale = item.choice(&[("hold", OnStale::Hold), ("stop", OnStale::Stop)])?;
+    }
+    if let Some(item) = part.optional("send") {
+        sending.send = read_send(&item)?;
+        sending.send_spot = Some(item.spot);
+    }
+    Ok(sending)
+}
+
+fn read_send(item: &Item<'_>) -> Result<SendOn> {
+    let text = item.string()?;
+    match text {
+        "period" => return Ok(SendOn::Period),
+        "change" => return Ok(SendOn::Change),
+        "frame" => return Ok(SendOn::Frame),
+        _ => {}
+    }
+    let Some(place) = text.strip_prefix("rising:") else {
+        return Err(item.error(format!(
+            "{text:?} is unknown; allowed: \"period\", \"change\", \"frame\", \"rising:BitOutputReg[3].0\""
+        )));
+    };
+    let bit = place.rsplit_once('.').and_then(|(name, bit)| Some((name, bit.parse::<u8>().ok()?)));
+    let Some((name, bit)) = bit else {
+        return Err(item.error(format!("{text:?} names no bit; write it as in \"rising:BitOutputReg[3].0\"")));
+    };
+    let var = SysVar::parse(name).map_err(|error| item.error(format!("{name:?}: {error}")))?;
+    Ok(SendOn::Rising { var, bit })
+}
+
+pub(super) fn read_input(field: &Reader<'_>) -> Result<FileInput> {
+    let (to, commands) = (field.optional("to"), field.optional("commands"));
+    if to.is_none() {
+        refuse(field, &["scale", "offset"], "only goes with to")?;
+    }
+    if commands.is_none() {
+        refuse(field, &["when"], "only goes with commands")?;
+    }
+    match (to, commands) {
+        (None, None) => Ok(FileInput::Unused),
+        (Some(to), None) => {
+            let (scale, offset) = read_scale(field)?;
+            Ok(FileInput::Variable { var: read_var(&to)?, scale, offset })
+        }
+        (None, Some(commands)) => {
+            let when = match field.optional("when") {
+                Some(item) => {
+                    item.choice(&[("change", CommandWhen::Change), ("frame", CommandWhen::Frame)])?
+                }
+                None => CommandWhen::default(),
+            };
+            let entries = commands.any_table()?.entries().map(read_command).collect::<Result<Vec<_>>>()?;
+            if entries.is_empty() {
+                return Err(commands.error("no commands; write them as in { 1 = \"run(pick.jspf,50)\" }"));
+            }
+            Ok(FileInput::Commands { entries, when })
+        }
+        (Some(_), Some(commands)) => Err(commands.error("a field has either to or commands, not both")),
+    }
+}
+
+fn read_command((key, key_spot, item): (&str, Spot, Item<'_>)) -> Result<FileCommand> {
+    let number = match key.strip_prefix("0x") {
+        Some(hex) => i64::from_str_radix(hex, 16),
+        None => key.parse(),
+    };
+    let Ok(value) = number else {
+        return Err(item
+            .at(key_spot)
+            .error(format!("{key:?} is not a whole number; a value of the field picks a command")));
+    };
+    Ok(FileCommand { value, text: item.string()?.to_owned(), spot: item.spot })
+}
+
+pub(super) fn read_output(field: &Reader<'_>) -> Result<FileOutput> {
+    let (from, value) = (field.optional("from"), field.optional("value"));
+    let binding = match (from, value) {
+        (None, None) => {
+            return Err(field.error(
+                "nothing says what to send; add from = \"RobotState[8]\", from = \"counter\", from = \"reply\" \
+                 or value = 125",
+            ));
+        }
+        (Some(_), Some(value)) => return Err(value.error("a field has either from or value, not both")),
+        (None, Some(value)) => OutputBinding::Constant(value.number()?),
+        (Some(from), None) => match from.string()? {
+            "counter" => OutputBinding::Counter,
+            "reply" => OutputBinding::Reply,
+            _ => {
+                let (scale, offset) = read_scale(field)?;
+                OutputBinding::Variable { var: read_var(&from)?, scale, offset }
+            }
+        },
+    };
+    if !matches!(binding, OutputBinding::Variable { .. }) {
+        refuse(field, &["scale", "offset"], "only goes with from and a variable")?;
+    }
+    Ok(FileOutput::Bound(binding))
+}
+
+fn read_var(item: &Item<'_>) -> Result<SysVar> {
+    let name = item.string()?;
+    SysVar::parse(name).map_err(|error| item.error(format!("{name:?}: {error}")))
+}
+
+fn read_scale(field: &Reader<'_>) -> Result<(f32, f32)> {
+    let read = |key, default| match field.optional(key) {
+        Some(item) => {
+            let value = item.number()? as f32;
+            if value.is_finite() { Ok(value) } else { Err(item.error("out of range for a float")) }
+        }
+        None => Ok(default),
+    };
+    Ok((read("scale", 1.0)?, read("offset", 0.0)?))
+}
+
+fn refuse(field: &Reader<'_>, keys: &[&str], why: &str) -> Result<()> {
+    match keys.iter().find_map(|key| Some((key, field.optional(key)?))) {
+        Some((_, item)) => Err(item.error(why)),
+        None => Ok(()),
+    }
+}

@@ -1,0 +1,265 @@
+//! A TOML text and its overrides as one tree that knows where everything was written.
+//!
+//! In: text, and `KEY=VALUE` overrides. Out: tables in file order. Knows no key of any file.
+
+use toml::Spanned;
+use toml::de::{DeTable, DeValue};
+
+use super::error::{FileError, Source};
+
+/// The tree and the texts it came from.
+pub(super) struct Document {
+    name: String,
+    text: String,
+    overrides: Vec<String>,
+    pub(super) root: Table,
+}
+
+/// Where something was written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum At {
+    /// Byte offset in the file.
+    File(usize),
+    /// Which override.
+    Override(usize),
+}
+
+/// A value with its place.
+#[derive(Debug, Clone)]
+pub(super) struct Node {
+    pub(super) at: At,
+    pub(super) value: Value,
+}
+
+#[derive(Debug, Clone)]
+pub(super) enum Value {
+    Str(String),
+    /// TOML's 64 bits, or what does not fit them, as it was written.
+    Int(Result<i64, String>),
+    Float(f64),
+    Bool(bool),
+    Datetime,
+    Array(Vec<Node>),
+    Table(Table),
+}
+
+impl Value {
+    /// With an article, for messages.
+    pub(super) fn kind(&self) -> &'static str {
+        match self {
+            Self::Str(_) => "a string",
+            Self::Int(_) => "a whole number",
+            Self::Float(_) => "a number",
+            Self::Bool(_) => "true or false",
+            Self::Datetime => "a date",
+            Self::Array(_) => "an array",
+            Self::Table(_) => "a table",
+        }
+    }
+}
+
+/// Entries in the order they were written.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Table {
+    pub(super) entries: Vec<Entry>,
+}
+
+#[derive(Debug, Clone)]
+pub(super) struct Entry {
+    pub(super) key: String,
+    pub(super) at: At,
+    pub(super) node: Node,
+}
+
+impl Table {
+    pub(super) fn get(&self, key: &str) -> Option<&Entry> {
+        self.entries.iter().find(|entry| entry.key == key)
+    }
+}
+
+impl Document {
+    /// Reads `text`, called `name` in messages, and puts the overrides in.
+    pub(super) fn parse(name: &str, text: &str, overrides: &[String]) -> Result<Self, FileError> {
+        let mut document = Self {
+            name: name.to_owned(),
+            text: text.to_owned(),
+            overrides: overrides.to_vec(),
+            root: Table::default(),
+        };
+        match DeTable::parse(text) {
+            Ok(table) => document.root = convert_table(table.get_ref(), &At::File),
+            Err(error) => {
+                let at = At::File(error.span().map_or(0, |span| span.start));
+                return Err(document.error(at, "", format!("not TOML: {}", one_line(error.message()))));
+            }
+        }
+        for (number, text) in overrides.iter().enumerate() {
+            document.put(number, text)?;
+        }
+        Ok(document)
+    }
+
+    pub(super) fn error(&self, at: At, key: &str, message: impl Into<String>) -> FileError {
+        let source = match at {
+            At::File(offset) => {
+                let before = self.text.get(..offset).unwrap_or(&self.text);
+                let line_start = before.rfind('\n').map_or(0, |newline| newline + 1);
+                Source::File {
+                    file: self.name.clone(),
+                    line: before.matches('\n').count() + 1,
+                    column: before[line_start..].chars().count() + 1,
+                }
+            }
+            At::Override(number) => Source::Override { text: self.overrides[number].clone() },
+        };
+        FileError { source, key: key.to_owned(), message: message.into() }
+    }
+
+    pub(super) fn whole_file_error(&self, message: impl Into<String>) -> FileError {
+        let source = Source::WholeFile { file: self.name.clone() };
+        FileError { source, key: String::new(), message: message.into() }
+    }
+
+    /// Puts one `KEY=VALUE` into the tree.
+    fn put(&mut self, number: usize, text: &str) -> Result<(), FileError> {
+        let at = At::Override(number);
+        let Some((key, value)) = text.split_once('=') else {
+            return Err(self.error(at, "", "no '='; write KEY=VALUE, such as port.rs485-1.baud=9600"));
+        };
+        let path = match split_path(key.trim()) {
+            Some(path) => path,
+            None => return Err(self.error(at, key, "not a key; write names with dots between them")),
+        };
+        let node = match parse_value(value.trim(), at) {
+            Ok(node) => node,
+            Err(message) => return Err(self.error(at, key, message)),
+        };
+        let mut root = std::mem::take(&mut self.root);
+        let done = insert(&mut root, &path, node, at);
+        self.root = root;
+        done.map_err(|message| self.error(at, key, message))
+    }
+}
+
+fn convert_table(table: &DeTable<'_>, at: &dyn Fn(usize) -> At) -> Table {
+    let mut entries: Vec<_> = table.iter().collect();
+    entries.sort_by_key(|(key, _)| key.span().start);
+    let entry = |(key, node): (&Spanned<_>, &Spanned<DeValue<'_>>)| {
+        let name: &std::borrow::Cow<'_, str> = key.get_ref();
+        Entry { key: name.to_string(), at: at(key.span().start), node: convert(node, at) }
+    };
+    Table { entries: entries.into_iter().map(entry).collect() }
+}
+
+fn convert(node: &Spanned<DeValue<'_>>, at: &dyn Fn(usize) -> At) -> Node {
+    let value = match node.get_ref() {
+        DeValue::String(text) => Value::Str(text.to_string()),
+        DeValue::Integer(number) => {
+            Value::Int(i64::from_str_radix(number.as_str(), number.radix()).map_err(|_| number.to_string()))
+        }
+        // TOML's floats are Rust's, up to the underscores that the parser took out.
+        DeValue::Float(number) => Value::Float(number.as_str().parse().unwrap_or(f64::NAN)),
+        DeValue::Boolean(value) => Value::Bool(*value),
+        DeValue::Datetime(_) => Value::Datetime,
+        DeValue::Array(items) => Value::Array(items.iter().map(|item| convert(item, at)).collect()),
+        DeValue::Table(table) => Value::Table(convert_table(table, at)),
+    };
+    Node { at: at(node.span().start), value }
+}
+
+/// An override's value: TOML where it looks like TOML, else the text itself, so that
+/// `controller.address=10.0.0.2` needs no quotes that a shell would take away.
+fn parse_value(text: &str, at: At) -> Result<Node, String> {
+    match DeValue::parse(text) {
+        Ok(value) => Ok(convert(&value, &|_| at)),
+        Err(error) if text.starts_with(['[', '{', '"', '\'']) => {
+            Err(format!("not a TOML value: {}", one_line(error.message())))
+        }
+        Err(_) => Ok(Node { at, value: Value::Str(text.to_owned()) }),
+    }
+}
+
+/// Names between dots; a name with dots in it stands in double quotes.
+fn split_path(key: &str) -> Option<Vec<String>> {
+    let mut path = vec![String::new()];
+    // The dots of `RobotState[8..13]` are part of the name.
+    let (mut quoted, mut bracket) = (false, false);
+    for c in key.chars() {
+        match c {
+            '"' => quoted = !quoted,
+            '.' if !quoted && !bracket => path.push(String::new()),
+            _ => {
+                bracket = if quoted { bracket } else { c == '[' || (bracket && c != ']') };
+                path.last_mut()?.push(c);
+            }
+        }
+    }
+    (!quoted && path.iter().all(|name| !name.is_empty())).then_some(path)
+}
+
+fn insert(table: &mut Table, path: &[String], node: Node, at: At) -> Result<(), String> {
+    let Some((key, rest)) = path.split_first() else { return Ok(()) };
+    let place = match table.entries.iter().position(|entry| entry.key == *key) {
+        Some(place) => place,
+        None => {
+            let value = if rest.is_empty() { node.value.clone() } else { Value::Table(Table::default()) };
+            table.entries.push(Entry { key: key.clone(), at, node: Node { at, value } });
+            table.entries.len() - 1
+        }
+    };
+    let entry = &mut table.entries[place];
+    if rest.is_empty() {
+        *entry = Entry { key: key.clone(), at, node };
+        return Ok(());
+    }
+    match &mut entry.node.value {
+        Value::Table(inner) => insert(inner, rest, node, at),
+        Value::Array(items) => insert_into_item(key, items, rest, node, at),
+        other => Err(format!("{key} is {}, and has no keys of its own", other.kind())),
+    }
+}
+
+/// Items of an array of tables are chosen by their `name`, or by their number counted from 1.
+fn insert_into_item(
+    key: &str,
+    items: &mut [Node],
+    path: &[String],
+    node: Node,
+    at: At,
+) -> Result<(), String> {
+    let Some((wanted, rest)) = path.split_first() else { return Ok(()) };
+    let name_of = |item: &Node| match &item.value {
+        Value::Table(table) => match table.get("name").map(|entry| &entry.node.value) {
+            Some(Value::Str(name)) => Some(name.clone()),
+            _ => None,
+        },
+        _ => None,
+    };
+    let names: Vec<_> = items.iter().map(name_of).collect();
+    let by_number = || wanted.parse::<usize>().ok().filter(|number| (1..=items.len()).contains(number));
+    let place = names
+        .iter()
+        .position(|name| name.as_ref() == Some(wanted))
+        .or_else(|| by_number().map(|number| number - 1));
+    let Some(place) = place else {
+        let names: Vec<_> = names.into_iter().flatten().map(|name| format!("{name:?}")).collect();
+        return Err(match names.len() {
+            0 => format!("there is no {key} {wanted:?}; they are chosen by number, 1..={}", items.len()),
+            _ => format!("there is no {key} {wanted:?}; there are {}", names.join(", ")),
+        });
+    };
+    match (&mut items[place], rest) {
+        (item, []) => {
+            *item = node;
+            Ok(())
+        }
+        (Node { value: Value::Table(table), .. }, rest) => insert(table, rest, node, at),
+        (Node { value, .. }, _) => {
+            Err(format!("{key} {wanted} is {}, and has no keys of its own", value.kind()))
+        }
+    }
+}
+
+fn one_line(message: &str) -> String {
+    message.split_whitespace().collect::<Vec<_>>().join(" ")
+}

@@ -1,0 +1,54 @@
+//! One mistake in a file or an override, on one line.
+
+use std::fmt;
+
+/// A mistake, as `FILE:LINE:COLUMN: KEY: what is wrong; what is allowed`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct FileError {
+    /// Where it was written.
+    pub source: Source,
+    /// The key, as a path such as `port.rs485-1.baud`; empty when the text is no TOML at all.
+    pub key: String,
+    /// What is wrong, and what is allowed.
+    pub message: String,
+}
+
+/// Where something was written.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Source {
+    /// In a file, counted from 1.
+    File {
+        /// The file as it was named.
+        file: String,
+        /// Line.
+        line: usize,
+        /// Column, in characters.
+        column: usize,
+    },
+    /// The file as a whole.
+    WholeFile {
+        /// The file as it was named.
+        file: String,
+    },
+    /// In a `--set` override.
+    Override {
+        /// As it was given.
+        text: String,
+    },
+}
+
+impl fmt::Display for FileError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match &self.source {
+            Source::File { file, line, column } => write!(f, "{file}:{line}:{column}: ")?,
+            Source::WholeFile { file } => write!(f, "{file}: ")?,
+            Source::Override { text } => write!(f, "--set {text}: ")?,
+        }
+        if !self.key.is_empty() {
+            write!(f, "{}: ", self.key)?;
+        }
+        f.write_str(&self.message)
+    }
+}
+
+impl std::error::Error for FileError {}

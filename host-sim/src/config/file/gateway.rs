@@ -1,0 +1,417 @@
+//! A gateway file: TOML to [`GatewayConfig`], checked.
+
+use std::collections::HashMap;
+use std::net::IpAddr;
+
+use heapless::Vec as Bounded;
+use proto_core::config::{
+    Bus, CanFramePart, CommandEntry, ConfigError, ControllerKey, ControllerLink, Delimiter, FieldSpec,
+    GatewayConfig, InputBinding, MAX_ALL_FIELDS, MAX_COMMAND_TEXT, MAX_COMMANDS, MAX_PORTS, MAX_RECIPES,
+    MAX_SAFE_VALUES, OutputBinding, Parts, Place, Port, PortKey, Recipe, RecipeKey, RecipeLink, SafeValue,
+    Span, StreamPart,
+};
+use proto_core::recipe::model::{Framing, MAX_CAN_IDS};
+use proto_core::sysvar::{Direction, SysVar};
+use proto_core::time::Duration;
+use proto_core::wire::dialect::Dialect;
+use proto_core::wire::scalar::Scalar;
+
+use super::bindings::{FileInput, FileOutput};
+use super::document::Document;
+use super::lines::{LINE_KEYS, key_name, read_bitrate, read_cycle, read_line};
+use super::reader::{Item, Reader, Result, Spot};
+use super::recipes::{self, FileField, FileFieldKind, FilePart, FileRecipe, Flavour};
+
+/// The top-level keys of a gateway file.
+pub(super) const KEYS: [&str; 3] = ["controller", "recipe", "port"];
+
+/// The whole file, valid.
+pub(super) fn read(document: &Document) -> Result<Box<GatewayConfig>> {
+    let root = Reader::root(document, &KEYS)?;
+    let recipes = recipes::read_all(&root, Flavour::Gateway)?;
+    let mut builder = Builder::new(&root, &recipes)?;
+    for (index, recipe) in recipes.iter().enumerate() {
+        builder.add_recipe(index, recipe)?;
+    }
+    for port in root.tables("port", &PORT_KEYS)? {
+        builder.add_port(&port, &recipes)?;
+    }
+    builder.finish()
+}
+
+const COMMON_KEYS: [&str; 6] = ["name", "bus", "recipe", "cycle_ms", "timeout_ms", "stale_after_ms"];
+const PORT_KEYS: [&str; 14] = [
+    "name",
+    "bus",
+    "recipe",
+    "cycle_ms",
+    "timeout_ms",
+    "stale_after_ms",
+    "on_timeout",
+    "baud",
+    "parity",
+    "stop_bits",
+    "idle_gap_ms",
+    "turnaround_us",
+    "bitrate",
+    "listen",
+];
+
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum BusKind {
+    Rs485,
+    Can,
+    TcpListen,
+    UdpListen,
+}
+
+const BUSES: [(&str, BusKind); 4] = [
+    ("rs485", BusKind::Rs485),
+    ("can", BusKind::Can),
+    ("tcp-listen", BusKind::TcpListen),
+    ("udp-listen", BusKind::UdpListen),
+];
+
+/// The configuration as far as it is read, and where each place of it was written.
+struct Builder<'a> {
+    document: &'a Document,
+    config: Box<GatewayConfig>,
+    spots: HashMap<Place, Spot>,
+}
+
+impl<'a> Builder<'a> {
+    fn new(root: &Reader<'a>, recipes: &[FileRecipe]) -> Result<Self> {
+        let table = root
+            .required(
+                "controller",
+                "a gateway file says where the controller is: [controller] address = \"...\"",
+            )?
+            .table(&["address", "dialect", "ports", "recipe_link"])?;
+        let mut spots = HashMap::new();
+        for (key, name) in [
+            (ControllerKey::Dialect, "dialect"),
+            (ControllerKey::Ports, "ports"),
+            (ControllerKey::RecipeLink, "recipe_link"),
+        ] {
+            let spot = table.optional(name).map_or(table.spot.clone(), |item| item.spot);
+            spots.insert(Place::Controller(key), spot);
+        }
+        let controller = read_controller(&table, recipes)?;
+        let config = GatewayConfig {
+            controller,
+            recipes: Bounded::new(),
+            ports: Bounded::new(),
+            fields: Bounded::new(),
+            commands: Bounded::new(),
+            safe_values: Bounded::new(),
+        };
+        Ok(Self { document: root.document, config: Box::new(config), spots })
+    }
+
+    fn error(&self, spot: &Spot, message: impl ToString) -> super::FileError {
+        spot.error(self.document, message)
+    }
+
+    fn add_recipe(&mut self, index: usize, recipe: &FileRecipe) -> Result<()> {
+        let Some(place) = u8::try_from(index).ok().filter(|_| index < MAX_RECIPES) else {
+            return Err(self.error(&recipe.spot, format!("one recipe too many; at most {MAX_RECIPES}")));
+        };
+        let sending = recipe.output.as_ref().map(|part| &part.sending);
+        let send_spot = sending.and_then(|sending| sending.send_spot.as_ref()).unwrap_or(&recipe.spot);
+        for (key, spot) in [
+            (RecipeKey::Whole, &recipe.spot),
+            (RecipeKey::Name, &recipe.name_spot),
+            (RecipeKey::Send, send_spot),
+        ] {
+            self.spots.insert(Place::Recipe { recipe: place, key }, spot.clone());
+        }
+        let parts = if recipe.is_can {
+            Parts::Can {
+                input: self.can_part(place, Direction::Input, recipe)?,
+                output: self.can_part(place, Direction::Output, recipe)?,
+            }
+        } else {
+            Parts::Stream {
+                input: self.stream_part(place, Direction::Input, recipe)?,
+                output: self.stream_part(place, Direction::Output, recipe)?,
+            }
+        };
+        let recipe = Recipe {
+            name: bounded_name(&recipe.name),
+            mode: recipe.mode,
+            parts,
+            on_stale: sending.map(|sending| sending.on_stale).unwrap_or_default(),
+            send: sending.map(|sending| sending.send).unwrap_or_default(),
+        };
+        // There is room: the index was checked above.
+        let _ = self.config.recipes.push(recipe);
+        Ok(())
+    }
+
+    fn stream_part(&mut self, recipe: u8, part: Direction, from: &FileRecipe) -> Result<Option<StreamPart>> {
+        let Some(file) = from.part(part) else { return Ok(None) };
+        self.spots.insert(Place::Part { recipe, part }, file.spot.clone());
+        let fields = self.add_fields(recipe, part, file, 0)?;
+        Ok(Some(StreamPart { head: delimiter(&file.head), tail: delimiter(&file.tail), fields }))
+    }
+
+    fn can_part(
+        &mut self,
+        recipe: u8,
+        part: Direction,
+        from: &FileRecipe,
+    ) -> Result<Bounded<CanFramePart, MAX_CAN_IDS>> {
+        let mut frames = Bounded::new();
+        let Some(file) = from.part(part) else { return Ok(frames) };
+        self.spots.insert(Place::Part { recipe, part }, file.spot.clone());
+        // The layout allowed no more frames than there is room for.
+        for (number, frame) in (0..).zip(&file.frames) {
+            self.spots.insert(Place::Frame { recipe, part, frame: number }, frame.spot.clone());
+            let fields = self.add_fields(recipe, part, file, number)?;
+            let _ = frames.push(CanFramePart { id: frame.id, fields });
+        }
+        Ok(frames)
+    }
+
+    fn add_fields(&mut self, recipe: u8, part: Direction, file: &FilePart, frame: u8) -> Result<Span> {
+        let start = self.config.fields.len() as u16;
+        let fields = file.frames.get(usize::from(frame)).map_or(&[][..], |frame| &frame.fields);
+        for (number, field) in (0..).zip(fields) {
+            self.spots.insert(Place::Field { recipe, part, frame, field: number }, field.spot.clone());
+            let spec = self.field_spec(field)?;
+            if self.config.fields.push(spec).is_err() {
+                let message = format!("one field too many; at most {MAX_ALL_FIELDS} in all recipes together");
+                return Err(self.error(&field.spot, message));
+            }
+        }
+        Ok(Span { start, len: fields.len() as u16 })
+    }
+
+    fn field_spec(&mut self, field: &FileField) -> Result<FieldSpec> {
+        Ok(match &field.kind {
+            FileFieldKind::System(var) => FieldSpec::System(*var),
+            FileFieldKind::UserInput { ty, to, .. } => {
+                let to = match to {
+                    FileInput::Unused => InputBinding::Unused,
+                    FileInput::Variable { var, scale, offset } => {
+                        InputBinding::Variable { var: *var, scale: *scale, offset: *offset }
+                    }
+                    FileInput::Commands { entries, when } => {
+                        let start = self.config.commands.len() as u16;
+                        for entry in entries {
+                            self.add_command(entry.value, &entry.text, &entry.spot)?;
+                        }
+                        let table = Span { start, len: entries.len() as u16 };
+                        InputBinding::Commands { table, when: *when }
+                    }
+                };
+                FieldSpec::UserInput { ty: *ty, to }
+            }
+            FileFieldKind::UserOutput { ty, from, .. } => {
+                let from = match from {
+                    FileOutput::Bound(binding) => *binding,
+                    FileOutput::Program => OutputBinding::Constant(0.0),
+                };
+                FieldSpec::UserOutput { ty: *ty, from }
+            }
+        })
+    }
+
+    fn add_command(&mut self, value: i64, text: &str, spot: &Spot) -> Result<()> {
+        let Ok(bounded) = heapless::String::try_from(text) else {
+            let message = format!("a command of {} bytes; at most {MAX_COMMAND_TEXT}", text.len());
+            return Err(self.error(spot, message));
+        };
+        let entry = self.config.commands.len() as u16;
+        self.spots.insert(Place::Command { entry }, spot.clone());
+        self.config.commands.push(CommandEntry { value, text: bounded }).map_err(|_| {
+            self.error(spot, format!("one command too many; at most {MAX_COMMANDS} in all recipes together"))
+        })
+    }
+
+    fn add_port(&mut self, table: &Reader<'a>, recipes: &[FileRecipe]) -> Result<()> {
+        let (name, _) = recipes::read_name(table)?;
+        let kind = table.required("bus", "rs485, can, tcp-listen or udp-listen")?.choice(&BUSES)?;
+        let own: &[&str] = match kind {
+            BusKind::Rs485 => &LINE_KEYS,
+            BusKind::Can => &["bitrate"],
+            BusKind::TcpListen | BusKind::UdpListen => &["listen"],
+        };
+        let safe: &[&str] = if matches!(kind, BusKind::Rs485 | BusKind::Can) { &["on_timeout"] } else { &[] };
+        let bus_name = BUSES.iter().find(|(_, bus)| *bus == kind).map_or("", |(name, _)| name);
+        table.check_keys(&[&COMMON_KEYS, own, safe].concat(), &format!(" on bus = {bus_name:?}"))?;
+
+        let index = self.config.ports.len() as u8;
+        if usize::from(index) == MAX_PORTS {
+            return Err(table.error(format!("one port too many; at most {MAX_PORTS}")));
+        }
+        for key in PORT_PLACES {
+            let spot = table.optional(key_name(key)).map_or(table.spot.clone(), |item| item.spot);
+            self.spots.insert(Place::Port { port: index, key }, spot);
+        }
+        let bus = read_bus(table, kind)?;
+        let item = table.required("recipe", "the name of one of the recipes of this file")?;
+        let recipe = recipes::find(recipes, &item)?;
+        let framing = match kind {
+            BusKind::Rs485 | BusKind::TcpListen => Some(Framing::Bytes),
+            BusKind::UdpListen => Some(Framing::Datagram),
+            BusKind::Can => None,
+        };
+        if let (Some(framing), Some(recipe)) = (framing, recipes.get(recipe).filter(|recipe| !recipe.is_can))
+        {
+            // What a user recipe on UDP is refused for is said better by the configuration's check.
+            if framing == Framing::Bytes {
+                recipe.check_framing(framing).map_err(|message| item.error(message))?;
+            }
+        }
+        let time = |key, default| {
+            table.optional(key).map_or(Ok(Duration::from_millis(default)), |item| item.time(1e3))
+        };
+        let port = Port {
+            name: bounded_name(&name),
+            bus,
+            recipe: recipe as u8,
+            cycle: read_cycle(table)?,
+            timeout: time("timeout_ms", 100)?,
+            on_timeout: self.add_safe_values(table)?,
+            stale_after: time("stale_after_ms", 500)?,
+        };
+        // There is room: the count was checked above.
+        let _ = self.config.ports.push(port);
+        Ok(())
+    }
+
+    fn add_safe_values(&mut self, table: &Reader<'a>) -> Result<Span> {
+        let start = self.config.safe_values.len() as u16;
+        let Some(item) = table.optional("on_timeout") else { return Ok(Span { start, len: 0 }) };
+        if !item.is_table() {
+            return match item.as_string() {
+                Some("hold") => Ok(Span { start, len: 0 }),
+                _ => Err(item.error(
+                    "allowed: \"hold\", or a table of safe values such as { \"DigitalOutputCommand[1]\" = 0 }",
+                )),
+            };
+        }
+        for (name, key_spot, item) in item.any_table()?.entries() {
+            let var = SysVar::parse(name).map_err(|error| self.error(&key_spot, error))?;
+            let value = Scalar::from_f64(var.ty(), item.number()?).map_err(|error| item.error(error))?;
+            let entry = self.config.safe_values.len() as u16;
+            self.spots.insert(Place::SafeValue { entry }, item.spot.clone());
+            if self.config.safe_values.push(SafeValue { var, value }).is_err() {
+                let message =
+                    format!("one safe value too many; at most {MAX_SAFE_VALUES} on all ports together");
+                return Err(self.error(&key_spot, message));
+            }
+        }
+        let len = self.config.safe_values.len() as u16 - start;
+        Ok(Span { start, len })
+    }
+
+    fn finish(self) -> Result<Box<GatewayConfig>> {
+        match self.config.validate() {
+            Ok(()) => Ok(self.config),
+            Err(ConfigError { place, kind }) => {
+                let message = self.config.describe_kind(kind).to_string();
+                Err(match self.spots.get(&place) {
+                    Some(spot) => self.error(spot, message),
+                    None => self.document.whole_file_error(format!("{place:?}: {message}")),
+                })
+            }
+        }
+    }
+}
+
+const PORT_PLACES: [PortKey; 12] = [
+    PortKey::Name,
+    PortKey::Recipe,
+    PortKey::Cycle,
+    PortKey::Timeout,
+    PortKey::OnTimeout,
+    PortKey::StaleAfter,
+    PortKey::Baud,
+    PortKey::StopBits,
+    PortKey::IdleGap,
+    PortKey::Turnaround,
+    PortKey::Bitrate,
+    PortKey::Listen,
+];
+
+fn read_controller(table: &Reader<'_>, recipes: &[FileRecipe]) -> Result<ControllerLink> {
+    let address = table.required("address", "the controller's IP address or host name")?;
+    let mut link = ControllerLink {
+        address: read_address(&address)?,
+        dialect: bounded(Dialect::V2_3.name),
+        command_port: 2000,
+        state_port: 2001,
+        modbus_port: 502,
+        recipe_link: None,
+    };
+    if let Some(item) = table.optional("dialect") {
+        let name = item.string()?;
+        link.dialect = bounded(super::known_dialect(&item, name)?);
+    }
+    link.modbus_port = Dialect::named(&link.dialect).map_or(link.modbus_port, |dialect| dialect.modbus_port);
+    let mut udp_port = 2011;
+    if let Some(ports) = table.optional("ports") {
+        let ports = ports.table(&["command", "state", "modbus", "udp2011"])?;
+        for (key, target) in [
+            ("command", &mut link.command_port),
+            ("state", &mut link.state_port),
+            ("modbus", &mut link.modbus_port),
+            ("udp2011", &mut udp_port),
+        ] {
+            if let Some(item) = ports.optional(key) {
+                *target = item.integer(1..=65_535)?;
+            }
+        }
+    }
+    if let Some(item) = table.optional("recipe_link") {
+        let table = item.table(&["udp", "recipe"])?;
+        if let Some(item) = table.optional("udp") {
+            udp_port = item.integer(1..=65_535)?;
+        }
+        let recipe = table.required("recipe", "the recipe that the controller's UDP 2011 port is set to")?;
+        let recipe = recipes::find(recipes, &recipe)? as u8;
+        link.recipe_link = Some(RecipeLink { udp_port, recipe });
+    }
+    Ok(link)
+}
+
+fn read_address(item: &Item<'_>) -> Result<heapless::String<64>> {
+    let text = item.string()?;
+    let is_name = |text: &str| {
+        !text.is_empty() && text.chars().all(|c| c.is_ascii_alphanumeric() || matches!(c, '.' | '-' | '_'))
+    };
+    if text.parse::<IpAddr>().is_err() && !is_name(text) {
+        let message = format!("{text:?} is neither an IP address nor a host name; port numbers go to ports");
+        return Err(item.error(message));
+    }
+    heapless::String::try_from(text).map_err(|_| item.error("longer than 64 bytes"))
+}
+
+fn read_bus(table: &Reader<'_>, kind: BusKind) -> Result<Bus> {
+    let listen = || -> Result<heapless::String<48>> {
+        let item = table.required("listen", "an IP address and a port, such as \"0.0.0.0:50000\"")?;
+        heapless::String::try_from(item.string()?).map_err(|_| item.error("longer than 48 bytes"))
+    };
+    Ok(match kind {
+        BusKind::Rs485 => Bus::Rs485(read_line(table)?),
+        BusKind::Can => Bus::Can { bitrate: read_bitrate(table)? },
+        BusKind::TcpListen => Bus::TcpListen { listen: listen()? },
+        BusKind::UdpListen => Bus::UdpListen { listen: listen()? },
+    })
+}
+
+/// The layout allowed no more bytes than there is room for.
+fn delimiter(bytes: &[u8]) -> Delimiter {
+    Delimiter::from_slice(bytes).unwrap_or_default()
+}
+
+/// Names were read with the same bound.
+fn bounded_name(name: &str) -> proto_core::config::Name {
+    bounded(name)
+}
+
+fn bounded<const N: usize>(text: &str) -> heapless::String<N> {
+    heapless::String::try_from(text).unwrap_or_default()
+}

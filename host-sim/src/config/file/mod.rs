@@ -1,0 +1,168 @@
+//! Configuration files: TOML to checked types, or one message that says where and what.
+//!
+//! In: a file and its `--set` overrides. Out: `GatewayConfig` or `SimConfig`. Every mistake is one
+//! [`FileError`]; the keys are those of docs/configuration.md.
+
+mod bindings;
+mod controller;
+mod document;
+mod error;
+mod gateway;
+mod lines;
+mod reader;
+mod recipes;
+
+use std::path::Path;
+
+use proto_core::config::GatewayConfig;
+use proto_core::wire::dialect::Dialect;
+
+pub use error::{FileError, Source};
+
+use super::sim::{SimConfig, SimRecipe};
+use document::Document;
+use reader::{Item, Reader, Result};
+use recipes::Flavour;
+
+/// A file of either kind.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Config {
+    /// For the gateway.
+    Gateway(Box<GatewayConfig>),
+    /// For the simulated controller.
+    Controller(SimConfig),
+}
+
+/// A configuration text with the name it has in messages.
+#[derive(Debug, Clone, Copy)]
+pub struct Text<'a> {
+    /// The file's name.
+    pub name: &'a str,
+    /// What is in it.
+    pub toml: &'a str,
+}
+
+/// Reads a file of either kind.
+///
+/// # Errors
+/// The first mistake, with its place.
+pub fn load(path: &Path, overrides: &[String]) -> Result<Config> {
+    with_text(path, |text| parse(text, overrides))
+}
+
+/// Reads a gateway file.
+///
+/// # Errors
+/// The first mistake, with its place.
+pub fn load_gateway(path: &Path, overrides: &[String]) -> Result<Box<GatewayConfig>> {
+    with_text(path, |text| parse_gateway(text, overrides))
+}
+
+/// Reads a controller file.
+///
+/// # Errors
+/// The first mistake, with its place.
+pub fn load_controller(path: &Path, overrides: &[String]) -> Result<SimConfig> {
+    with_text(path, |text| parse_controller(text, overrides))
+}
+
+/// Reads the recipes of a file of either kind, with the names of their fields.
+///
+/// # Errors
+/// The first mistake in any of the recipes, with its place.
+pub fn load_recipes(path: &Path, overrides: &[String]) -> Result<Vec<SimRecipe>> {
+    with_text(path, |text| parse_recipes(text, overrides))
+}
+
+/// Like [`load`], from a text.
+///
+/// # Errors
+/// The first mistake, with its place.
+pub fn parse(text: Text<'_>, overrides: &[String]) -> Result<Config> {
+    let document = Document::parse(text.name, text.toml, overrides)?;
+    match kind_of(&document)? {
+        Flavour::Gateway => gateway::read(&document).map(Config::Gateway),
+        Flavour::Controller => controller::read(&document).map(Config::Controller),
+    }
+}
+
+/// Like [`load_gateway`], from a text.
+///
+/// # Errors
+/// The first mistake, with its place.
+pub fn parse_gateway(text: Text<'_>, overrides: &[String]) -> Result<Box<GatewayConfig>> {
+    let document = Document::parse(text.name, text.toml, overrides)?;
+    if let Ok(Flavour::Controller) = kind_of(&document) {
+        return Err(document.whole_file_error(
+            "this is a controller file, and a gateway file is needed; host-sim controller -c FILE runs it",
+        ));
+    }
+    gateway::read(&document)
+}
+
+/// Like [`load_controller`], from a text.
+///
+/// # Errors
+/// The first mistake, with its place.
+pub fn parse_controller(text: Text<'_>, overrides: &[String]) -> Result<SimConfig> {
+    let document = Document::parse(text.name, text.toml, overrides)?;
+    if let Ok(Flavour::Gateway) = kind_of(&document) {
+        return Err(document.whole_file_error(
+            "this is a gateway file, and a controller file is needed; host-sim gateway -c FILE runs it",
+        ));
+    }
+    controller::read(&document)
+}
+
+/// Like [`load_recipes`], from a text.
+///
+/// # Errors
+/// The first mistake in any of the recipes, with its place.
+pub fn parse_recipes(text: Text<'_>, overrides: &[String]) -> Result<Vec<SimRecipe>> {
+    let document = Document::parse(text.name, text.toml, overrides)?;
+    let flavour = kind_of(&document)?;
+    let keys: &[&str] = match flavour {
+        Flavour::Gateway => &gateway::KEYS,
+        Flavour::Controller => &controller::KEYS,
+    };
+    let root = Reader::root(&document, keys)?;
+    Ok(recipes::read_all(&root, flavour)?.iter().map(recipes::FileRecipe::to_sim).collect())
+}
+
+fn with_text<T>(path: &Path, read: impl FnOnce(Text<'_>) -> Result<T>) -> Result<T> {
+    let name = path.display().to_string();
+    match std::fs::read_to_string(path) {
+        Ok(toml) => read(Text { name: &name, toml: &toml }),
+        Err(error) => Err(FileError {
+            source: Source::WholeFile { file: name },
+            key: String::new(),
+            message: format!("cannot be read: {error}"),
+        }),
+    }
+}
+
+/// Only gateways know a controller elsewhere; a controller file has sections of its own.
+fn kind_of(document: &Document) -> Result<Flavour> {
+    let has = |key: &str| document.root.get(key).is_some();
+    match (has("controller"), has("listen") || has("robot") || has("initial") || has("program")) {
+        (true, false) => Ok(Flavour::Gateway),
+        (false, true) => Ok(Flavour::Controller),
+        (true, true) => Err(document.whole_file_error(
+            "both a gateway's section ([controller]) and a controller's ([listen], [robot], [initial], [[program]]); \
+             these are two files",
+        )),
+        (false, false) => Err(document.whole_file_error(
+            "neither a gateway file, which has [controller], nor a controller file, which has [listen] or [robot]",
+        )),
+    }
+}
+
+fn known_dialect<'a>(item: &Item<'_>, name: &'a str) -> Result<&'a str> {
+    match Dialect::named(name) {
+        Some(_) => Ok(name),
+        None => {
+            let names: Vec<_> = Dialect::NAMES.iter().map(|name| format!("{name:?}")).collect();
+            Err(item.error(format!("no dialect {name:?}; there are {}", names.join(", "))))
+        }
+    }
+}
