@@ -359,3 +359,6 @@ impl core::fmt::Display for CanReject {
 }
 
 impl core::error::Error for CanReject {}
+
+#[cfg(test)]
+mod tests;

@@ -166,3 +166,6 @@ impl StreamLayout {
 fn place(nth: usize) -> FieldPlace {
     FieldPlace { frame: None, field: nth as u8 }
 }
+
+#[cfg(test)]
+mod tests;
