@@ -124,6 +124,20 @@ codes! {
     }
 }
 
+/// The four state machines together.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub struct States {
+    /// Operation mode.
+    pub mode: OperationMode,
+    /// Robot state.
+    pub robot: RobotState,
+    /// Program state.
+    pub program: ProgramState,
+    /// Safety state.
+    pub safety: SafetyState,
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -1,0 +1,108 @@
+//! Packets out of a connection's bytes (docs/wire/state.md section 3, D8).
+//!
+//! In: bytes in pieces of any size, from the connection's first one on. Out: packets, each checked
+//! for alignment. Does not search for a packet's beginning: the stream has no mark. Whoever owns
+//! the connection reopens it when [`StateStream::is_lost`].
+
+use super::{LEN, Misaligned, StateView};
+
+/// After this many misaligned packets in a row the connection is to be reopened.
+pub const MAX_MISALIGNED: u32 = 3;
+
+/// One connection to port 2001.
+#[derive(Debug, Clone)]
+pub struct StateStream {
+    buffer: [u8; LEN],
+    /// Bytes of an incomplete packet in the buffer; [`LEN`] when it was completed and handed out.
+    len: usize,
+    packets: u32,
+    misaligned: u32,
+    in_a_row: u32,
+}
+
+impl StateStream {
+    /// A stream at the beginning of a connection.
+    pub const fn new() -> Self {
+        Self { buffer: [0; LEN], len: 0, packets: 0, misaligned: 0, in_a_row: 0 }
+    }
+
+    /// Takes bytes off the front of `chunk` until a packet is complete. `None` means that all of
+    /// them were taken and none is.
+    ///
+    /// A packet that lies whole in `chunk` is not copied.
+    pub fn next_packet<'s, 'c: 's>(
+        &'s mut self,
+        chunk: &mut &'c [u8],
+    ) -> Option<Result<StateView<'s>, Misaligned>> {
+        if self.len >= LEN {
+            self.len = 0;
+        }
+        let view = match chunk.split_first_chunk() {
+            Some((whole, rest)) if self.len == 0 => {
+                *chunk = rest;
+                StateView::from_array(whole)
+            }
+            _ => {
+                let room = self.buffer.get_mut(self.len..).unwrap_or(&mut []);
+                let count = room.len().min(chunk.len());
+                let (taken, rest) = chunk.split_at_checked(count)?;
+                room.get_mut(..count)?.copy_from_slice(taken);
+                *chunk = rest;
+                self.len = self.len.saturating_add(count);
+                if self.len < LEN {
+                    return None;
+                }
+                StateView::from_array(&self.buffer)
+            }
+        };
+        match view.check_alignment() {
+            Ok(()) => {
+                self.packets = self.packets.wrapping_add(1);
+                self.in_a_row = 0;
+                Some(Ok(view))
+            }
+            Err(misaligned) => {
+                self.misaligned = self.misaligned.wrapping_add(1);
+                self.in_a_row = self.in_a_row.saturating_add(1);
+                Some(Err(misaligned))
+            }
+        }
+    }
+
+    /// Misaligned packets since the last good one.
+    pub const fn misaligned_in_a_row(&self) -> u32 {
+        self.in_a_row
+    }
+
+    /// Whether the connection is to be dropped and reopened.
+    pub const fn is_lost(&self) -> bool {
+        self.in_a_row >= MAX_MISALIGNED
+    }
+
+    /// Good packets so far, over all connections, wrapping.
+    pub const fn packets(&self) -> u32 {
+        self.packets
+    }
+
+    /// Misaligned packets so far, over all connections, wrapping.
+    pub const fn misaligned(&self) -> u32 {
+        self.misaligned
+    }
+
+    /// Bytes of an incomplete packet.
+    pub const fn pending(&self) -> usize {
+        if self.len < LEN { self.len } else { 0 }
+    }
+
+    /// Forgets an incomplete packet, for a new connection; the counters stay.
+    pub const fn reset(&mut self) {
+        self.len = 0;
+        self.in_a_row = 0;
+    }
+}
+
+impl Default for StateStream {
+    fn default() -> Self {
+        Self::new()
+    }
+}

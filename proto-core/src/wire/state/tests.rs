@@ -1,0 +1,276 @@
+extern crate std;
+
+use std::prelude::rust_2024::*;
+use std::{format, vec};
+
+use proptest::prelude::*;
+
+use super::copy::pack;
+use super::{
+    Content, FIELDS, LEN, MAX_MISALIGNED, Misaligned, StateError, StatePacket, StateStream, StateView,
+};
+use crate::sysvar::{Direction, IMAGE_BYTES, SysVar};
+use crate::wire::dialect::Dialect;
+use crate::wire::scalar::Scalar;
+
+/// A packet told apart from others by its error code.
+fn numbered(number: u32) -> [u8; LEN] {
+    StatePacket { error_code: number, joint_position: [0.5; 7], ..StatePacket::ZERO }.to_bytes()
+}
+
+#[test]
+fn the_table_covers_the_packet() {
+    assert_eq!(FIELDS.iter().map(|field| field.size()).sum::<usize>(), LEN);
+    let bools: usize = FIELDS
+        .iter()
+        .map(|f| if let Content::Bools { real } = f.content { real } else { 0 })
+        .map(usize::from)
+        .sum();
+    assert_eq!(bools, 214);
+    // Every variable's place lies in one field of its own type, at an item's beginning.
+    for var in SysVar::all() {
+        let Some(place) = var.stream() else { continue };
+        let field = FIELDS.iter().rfind(|field| field.offset <= place.offset).unwrap();
+        assert_eq!(field.ty, var.ty(), "{var}");
+        assert!(usize::from(place.offset + place.len) <= usize::from(field.offset) + field.size(), "{var}");
+        assert_eq!(usize::from(place.offset - field.offset) % field.ty.size(), 0, "{var}");
+        assert_ne!(field.content, Content::Reserved, "{var}");
+    }
+}
+
+#[test]
+fn only_packets_of_the_right_length_are_looked_at() {
+    for len in [0, 1, LEN - 1, LEN + 1, 2 * LEN] {
+        let bytes = vec![0; len];
+        let wrong = StateError::WrongLength { expected: LEN, actual: len };
+        assert_eq!(StateView::new(&bytes).map(|_| ()), Err(wrong));
+        assert_eq!(StatePacket::parse(&bytes), Err(wrong));
+    }
+    let mut short = [0xA5; LEN - 1];
+    let wrong = StateError::WrongLength { expected: LEN, actual: LEN - 1 };
+    assert_eq!(StatePacket::ZERO.encode(&mut short), Err(wrong));
+    assert!(short.iter().all(|&byte| byte == 0xA5));
+}
+
+#[test]
+fn bools_are_packed_lowest_first() {
+    for bits in 0..=u8::MAX {
+        for one in [1, 2, 0x80, 0xFF] {
+            let bools = core::array::from_fn(|nth| if bits >> nth & 1 == 1 { one } else { 0 });
+            assert_eq!(pack(&bools), bits, "{bools:?}");
+        }
+    }
+}
+
+#[test]
+fn a_misaligned_packet_is_told_by_its_joints_or_its_bools() {
+    let judge = |packet: &StatePacket| StateView::from_array(&packet.to_bytes()).check_alignment();
+    assert_eq!(judge(&StatePacket::ZERO), Ok(()));
+    for joint in 0..6 {
+        for (position, good) in
+            [(1000.0, true), (-1000.0, true), (1000.1, false), (f32::INFINITY, false), (f32::NAN, false)]
+        {
+            let mut packet = StatePacket::ZERO;
+            packet.joint_position[joint] = position;
+            match judge(&packet) {
+                Ok(()) => assert!(good, "joint {joint} at {position}"),
+                Err(Misaligned::JointPosition { joint: named, .. }) => {
+                    assert!(!good, "joint {joint} at {position}");
+                    assert_eq!(usize::from(named), joint + 1);
+                }
+                other => assert_eq!(other, Ok(())),
+            }
+        }
+    }
+    let reserved_joint =
+        StatePacket { joint_position: [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, f32::NAN], ..StatePacket::ZERO };
+    assert_eq!(judge(&reserved_joint), Ok(()));
+
+    let mut bytes = StatePacket::ZERO.to_bytes();
+    for field in FIELDS {
+        let Content::Bools { real } = field.content else { continue };
+        let (first, real) = (usize::from(field.offset), usize::from(real));
+        bytes[first + real..first + field.size()].fill(0xFF);
+    }
+    assert_eq!(StateView::from_array(&bytes).check_alignment(), Ok(()), "reserved bools are not looked at");
+    let places = [720, 735, 767, 1088, 1247, 1408, 1417, 1441];
+    for place in places {
+        bytes[place] = 2;
+    }
+    assert_eq!(StateView::from_array(&bytes).check_alignment(), Ok(()), "8 are allowed");
+    bytes[1184] = 0xFF;
+    let wrong = Misaligned::Bools { wrong: 9, allowed: 8 };
+    assert_eq!(StateView::from_array(&bytes).check_alignment(), Err(wrong));
+    assert_eq!(format!("{wrong}"), "9 bool bytes are neither 0 nor 1; at most 8");
+}
+
+#[test]
+fn most_shifts_of_a_live_packet_are_seen() {
+    // A moving robot with registers in use. A shifted packet begins inside other fields; where
+    // those are small floats or zeros and the bools fall on zeros too, no check can tell.
+    let mut packet = StatePacket { digital_inputs: [1; 16], functional_inputs: [1; 8], ..StatePacket::ZERO };
+    let joints = [0.3, -1.2, 1.9, 0.7, 1.5, -0.1, 0.0];
+    packet.joint_position = joints;
+    packet.target_joint_position = joints;
+    packet.joint_torque = joints.map(|joint| joint * 21.0);
+    packet.target_joint_torque = joints.map(|joint| joint * 20.9);
+    packet.joint_velocity = joints.map(|joint| joint * 0.11);
+    packet.target_joint_velocity = joints.map(|joint| joint * 0.12);
+    packet.joint_temperature = joints.map(|joint| 35.5 + joint);
+    packet.joint_current = joints.map(|joint| joint * 312.7);
+    packet.drive_status = [0x1237; 7];
+    let pose = [0.41, -0.2, 0.63, 3.1, 0.02, -1.57];
+    packet.tcp_pose = pose;
+    packet.target_tcp_pose = pose;
+    packet.flange_force = pose.map(|item| item * 9.81);
+    packet.base_force = pose.map(|item| item * 99.1);
+    packet.tool_frame = pose.map(|item| item * 0.1);
+    packet.float_outputs = core::array::from_fn(|nth| nth as f32 * 1.7);
+    packet.float_inputs = core::array::from_fn(|nth| nth as f32 * -0.3);
+    packet.word_outputs = core::array::from_fn(|nth| nth as u16 * 517);
+    let stream = [packet.to_bytes(), packet.to_bytes()].concat();
+    let shifted = |shift: usize| StateView::new(&stream[shift..shift + LEN]).unwrap();
+    let unseen = (1..LEN).filter(|&shift| shifted(shift).check_alignment().is_ok()).count();
+    assert!(unseen < LEN / 10, "{unseen} of {} shifts pass", LEN - 1);
+}
+
+#[test]
+fn states_and_global_speed_follow_the_dialect() {
+    let mut packet = StatePacket { safety_state: 99, robot_state: 7, ..StatePacket::ZERO };
+    packet.reserved_656[4] = 55;
+    let bytes = packet.to_bytes();
+    let view = StateView::from_array(&bytes);
+    assert_eq!(format!("{:?}", view.states(&Dialect::V2_3).safety), "Unknown(99)");
+    assert_eq!(format!("{:?}", view.states(&Dialect::V2_6).safety), "Update");
+    assert_eq!(format!("{:?}", view.states(&Dialect::V2_6).robot), "Update");
+    assert_eq!(view.global_speed(&Dialect::V2_3), None);
+    assert_eq!(view.global_speed(&Dialect::V2_6), Some(55));
+}
+
+#[test]
+fn the_stream_is_cut_at_every_byte() {
+    let stream = [numbered(1), numbered(2)].concat();
+    for cut in 0..=stream.len() {
+        let mut packets = StateStream::new();
+        let mut seen = vec![];
+        for mut piece in [&stream[..cut], &stream[cut..]] {
+            while let Some(packet) = packets.next_packet(&mut piece) {
+                seen.push(packet.unwrap().error_code());
+            }
+            assert!(piece.is_empty());
+            assert_eq!(packets.pending(), if seen.len() == 2 { 0 } else { cut % LEN });
+        }
+        assert_eq!(seen, [1, 2], "cut at {cut}");
+    }
+}
+
+#[test]
+fn whole_packets_are_not_copied() {
+    let stream = [numbered(1), numbered(2)].concat();
+    let mut chunk = &stream[..];
+    let mut packets = StateStream::new();
+    for nth in 0..2 {
+        let view = packets.next_packet(&mut chunk).unwrap().unwrap();
+        assert!(core::ptr::eq(view.as_bytes().as_slice(), &stream[nth * LEN..(nth + 1) * LEN]));
+    }
+}
+
+#[test]
+fn three_misaligned_packets_in_a_row_lose_the_connection() {
+    let mut packets = StateStream::new();
+    let bad = [0xFF; LEN];
+    let feed = |packets: &mut StateStream, bytes: &[u8; LEN]| {
+        let mut chunk = &bytes[..];
+        let good = packets.next_packet(&mut chunk).unwrap().is_ok();
+        assert!(packets.next_packet(&mut chunk).is_none());
+        good
+    };
+    for _ in 0..MAX_MISALIGNED - 1 {
+        assert!(!feed(&mut packets, &bad));
+        assert!(!packets.is_lost());
+    }
+    assert!(feed(&mut packets, &numbered(7)));
+    assert_eq!(packets.misaligned_in_a_row(), 0);
+    for nth in 1..=MAX_MISALIGNED {
+        assert!(!feed(&mut packets, &bad));
+        assert_eq!(packets.misaligned_in_a_row(), nth);
+    }
+    assert!(packets.is_lost());
+    assert!(packets.next_packet(&mut &bad[..100]).is_none());
+    packets.reset();
+    assert_eq!((packets.is_lost(), packets.pending()), (false, 0));
+    assert!(feed(&mut packets, &numbered(8)));
+    assert_eq!((packets.packets(), packets.misaligned()), (2, 5));
+}
+
+proptest! {
+    #[test]
+    fn every_packet_survives(bytes in prop::collection::vec(any::<u8>(), LEN)) {
+        let packet = StatePacket::parse(&bytes).unwrap();
+        prop_assert_eq!(&packet.to_bytes()[..], &bytes[..]);
+        let _ = StateView::new(&bytes).unwrap().check_alignment();
+    }
+
+    #[test]
+    fn the_image_gets_every_output_and_nothing_else(bytes in prop::collection::vec(any::<u8>(), LEN), old: u8) {
+        let view = StateView::new(&bytes).unwrap();
+        let mut image = [old; IMAGE_BYTES];
+        view.copy_to_image(&mut image);
+        let mut expected = [old; IMAGE_BYTES];
+        for var in SysVar::all().filter(|var| var.direction() == Direction::Output) {
+            if let Some(value) = view.read_var(var) {
+                value.encode(&mut expected[var.image_offset()..]).unwrap();
+            }
+        }
+        prop_assert_eq!(&image[..], &expected[..]);
+    }
+
+    #[test]
+    fn a_variable_reads_its_own_items(bytes in prop::collection::vec(any::<u8>(), LEN)) {
+        let view = StateView::new(&bytes).unwrap();
+        for var in SysVar::all() {
+            let Some(place) = var.stream() else {
+                prop_assert!(view.read_var(var).is_none());
+                continue;
+            };
+            let items = &bytes[usize::from(place.offset)..usize::from(place.offset + place.len)];
+            let expected = if var.is_bits() {
+                let bits = items.iter().rev().fold(0, |bits, &item| bits << 1 | u8::from(item != 0));
+                Scalar::Byte(bits & var.valid_bits())
+            } else {
+                Scalar::decode(var.ty(), items).unwrap()
+            };
+            let mut ours = [0; 4];
+            let mut theirs = [0; 4];
+            view.read_var(var).unwrap().encode(&mut ours);
+            expected.encode(&mut theirs);
+            prop_assert_eq!(ours, theirs, "{}", var);
+        }
+    }
+
+    #[test]
+    fn pieces_of_any_size_give_the_same_packets(sizes in prop::collection::vec(1usize..3000, 1..40), garbage: u8) {
+        let stream = [numbered(1), [garbage; LEN], numbered(3), numbered(4), numbered(5)].concat();
+        let mut one = StateStream::new();
+        let mut expected = vec![];
+        let mut chunk = &stream[..];
+        while let Some(packet) = one.next_packet(&mut chunk) {
+            expected.push(packet.ok().map(|view| view.error_code()));
+        }
+        let mut packets = StateStream::new();
+        let mut seen = vec![];
+        let mut rest = &stream[..];
+        for size in sizes.into_iter().cycle() {
+            let (mut piece, behind) = rest.split_at(size.min(rest.len()));
+            rest = behind;
+            while let Some(packet) = packets.next_packet(&mut piece) {
+                seen.push(packet.ok().map(|view| view.error_code()));
+            }
+            if rest.is_empty() {
+                break;
+            }
+        }
+        prop_assert_eq!(seen, expected);
+        prop_assert_eq!(packets.misaligned(), one.misaligned());
+    }
+}
