@@ -417,6 +417,19 @@ fn coils_are_packed_from_the_least_significant_bit() {
 }
 
 #[test]
+fn a_byte_variable_is_read_from_any_coil_on() {
+    let coils = Coils::new(&[0b1010_0101, 0b1111_0011, 0xFF], 18).unwrap();
+    assert_eq!((coils.byte(0), coils.byte(8)), (Some(0b1010_0101), Some(0b1111_0011)));
+    assert_eq!((coils.byte(3), coils.byte(16)), (Some(0b0111_0100), Some(0b11)));
+    assert_eq!((coils.byte(17), coils.byte(18), coils.byte(0xFFFF)), (Some(1), None, None));
+    for first in 0..18 {
+        let slow = (first..18).take(8).enumerate();
+        let slow = slow.map(|(bit, nth)| u8::from(coils.coil(nth).unwrap()) << bit).sum();
+        assert_eq!(coils.byte(first), Some(slow), "from {first}");
+    }
+}
+
+#[test]
 fn registers_are_big_endian() {
     let mut buffer = [0xA5; 5];
     let registers = Registers::pack([0x0102, 0xFFFE], &mut buffer).unwrap();

@@ -60,6 +60,17 @@ impl<'a> Coils<'a> {
         (0..self.count).map_while(move |nth| self.coil(nth))
     }
 
+    /// Up to eight coils from `first` on as one byte, the first in the least significant bit: a
+    /// byte variable of the map. `None` when `first` is past the last coil.
+    pub fn byte(self, first: u16) -> Option<u8> {
+        let left = self.count.checked_sub(first).filter(|left| *left != 0)?;
+        let at = usize::from(first >> 3);
+        let low = *self.packed.get(at)?;
+        let high = self.packed.get(at.saturating_add(1)).copied().unwrap_or_default();
+        let byte = (u16::from_le_bytes([low, high]) >> (first & 7)) as u8;
+        Some(if left < 8 { byte & last_mask(left) } else { byte })
+    }
+
     /// The packed bytes; bits beyond the last coil may have any value, see [`Coils::last_mask`].
     pub const fn packed(self) -> &'a [u8] {
         self.packed
