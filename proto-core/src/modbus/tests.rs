@@ -162,7 +162,10 @@ fn values_and_byte_counts_that_disagree_are_refused() {
     refused(&[5, 0, 0, 0xFF, 0x01], Exception::IllegalDataValue);
     refused(&[5, 0, 0, 0, 1], Exception::IllegalDataValue);
     refused(&[15, 0, 0, 0, 8, 2, 0xFF, 0xFF], Exception::IllegalDataValue);
+    refused(&[15, 0, 0, 0, 16, 1, 0xFF, 0xFF], Exception::IllegalDataValue);
     refused(&[16, 0, 0, 0, 2, 2, 1, 2, 3, 4], Exception::IllegalDataValue);
+    refused(&[16, 0, 0, 0, 2, 3, 1, 2, 3], Exception::IllegalDataValue);
+    refused(&[16, 0, 0, 0, 1, 4, 1, 2, 3, 4], Exception::IllegalDataValue);
     for whole in [
         &[1, 0, 0, 0, 1][..],
         &[3, 0, 0, 0, 1],
@@ -195,6 +198,33 @@ fn addresses_past_the_map_or_read_only_change_nothing() {
         &[16, 0xFF, 0xFF, 0, 2, 4, 0, 0, 0, 0],
     ] {
         refused(pdu, Exception::IllegalDataAddress);
+    }
+}
+
+#[test]
+fn no_bank_is_asked_for_a_run_that_passes_the_last_address() {
+    struct Everything;
+    impl RegisterBank for Everything {
+        fn read_coils(&self, _: u16, _: u16, _: &mut [u8]) -> Result<(), Exception> {
+            Ok(())
+        }
+        fn write_coils(&mut self, _: u16, _: Coils<'_>) -> Result<(), Exception> {
+            Ok(())
+        }
+        fn read_holding(&self, _: u16, _: &mut [[u8; 2]]) -> Result<(), Exception> {
+            Ok(())
+        }
+        fn write_holding(&mut self, _: u16, _: Registers<'_>) -> Result<(), Exception> {
+            Ok(())
+        }
+    }
+    let mut out = [0; MAX_PDU];
+    for (function, data) in [(1, &[][..]), (3, &[]), (15, &[1, 3]), (16, &[4, 1, 2, 3, 4])] {
+        for (first, fits) in [(0xFE, true), (0xFF, false)] {
+            let pdu = [&[function, 0xFF, first, 0, 2], data].concat();
+            let len = answer(&pdu, &mut Everything, &mut out);
+            assert_eq!(out[..len] != [function | 0x80, 2], fits, "{pdu:02x?}");
+        }
     }
 }
 
@@ -336,6 +366,17 @@ fn transaction_ids_wrap() {
     let mut late = &frame(0xFFFF, 1, &[3, 2, 0, 0])[..];
     assert_eq!(client.receive(&mut late), None);
     assert_eq!(client.stale_answers(), 1);
+}
+
+#[test]
+fn half_the_circle_of_transaction_ids_is_the_past() {
+    let answer = |id| frame(id, 1, &[3, 4, 0, 0, 0, 0]);
+    let mut client = Client::new(1);
+    started(&mut client, READ_TWO);
+    assert_eq!(client.receive(&mut &answer(0x8002)[..]), None);
+    assert!(client.busy() && client.stale_answers() == 1);
+    let violation = Violation::Transaction { newest: 1, received: 0x8001 };
+    assert_eq!(client.receive(&mut &answer(0x8001)[..]), Some(ClientEvent::Violation(violation)));
 }
 
 #[test]
