@@ -16,7 +16,9 @@ pub struct Client {
     reader: AduReader,
     unit: u8,
     transaction: u16,
-    pending: Option<RequestHead>,
+    in_flight: bool,
+    /// The newest request, in flight or not.
+    request: RequestHead,
     stale: u32,
 }
 
@@ -98,17 +100,18 @@ impl core::error::Error for StartError {}
 impl Client {
     /// A client at the start of a connection, for the server's unit id `unit`.
     pub const fn new(unit: u8) -> Self {
-        Self { reader: AduReader::new(), unit, transaction: 0, pending: None, stale: 0 }
+        let request = RequestHead { function: 0, address: 0, count_or_value: 0 };
+        Self { reader: AduReader::new(), unit, transaction: 0, in_flight: false, request, stale: 0 }
     }
 
     /// Whether a request is in flight.
     pub const fn busy(&self) -> bool {
-        self.pending.is_some()
+        self.in_flight
     }
 
     /// Function code, address and count or value of the request in flight.
     pub const fn in_flight(&self) -> Option<RequestHead> {
-        self.pending
+        if self.in_flight { Some(self.request) } else { None }
     }
 
     /// Answers that came after their request had been given up, ever.
@@ -124,22 +127,24 @@ impl Client {
     /// function's limits, or `out` is too short (260 bytes are always enough).
     #[inline]
     pub fn start(&mut self, request: Request<'_>, out: &mut [u8]) -> Result<usize, StartError> {
-        if self.pending.is_some() {
+        if self.in_flight {
             return Err(StartError::Busy);
         }
+        let parts = request.parts();
         let available = out.len();
         let no_space = || {
-            let needed = request.encoded_len().saturating_add(HEADER_LEN);
+            let needed = parts.encoded_len().saturating_add(HEADER_LEN);
             StartError::Encode(EncodeError::NoSpace { needed, available })
         };
         let (header, body) = out.split_first_chunk_mut().ok_or_else(no_space)?;
-        let pdu_len = request.encode(body).map_err(|error| match error {
+        let pdu_len = parts.encode(body).map_err(|error| match error {
             EncodeError::NoSpace { .. } => no_space(),
             other => StartError::Encode(other),
         })?;
         self.transaction = self.transaction.wrapping_add(1);
         *header = adu::header(self.transaction, self.unit, pdu_len);
-        self.pending = Some(request.head());
+        self.in_flight = true;
+        self.request = parts.head;
         Ok(pdu_len.saturating_add(HEADER_LEN))
     }
 
@@ -147,18 +152,26 @@ impl Client {
     /// says; `None` once all of `bytes` is taken. To be called until then.
     #[inline]
     pub fn receive<'s, 'c: 's>(&'s mut self, bytes: &mut &'c [u8]) -> Option<ClientEvent<'s>> {
-        let place = loop {
+        loop {
             let place = match self.reader.advance(bytes)? {
                 Ok(place) => place,
                 Err(error) => return Some(self.violated(bytes, Violation::Header(error))),
             };
             let Adu { transaction, unit, .. } = self.reader.adu(place);
-            if transaction == self.transaction && self.pending.is_some() {
-                if unit == self.unit {
-                    break place;
+            if self.in_flight && transaction == self.transaction {
+                if unit != self.unit {
+                    let violation = Violation::Unit { expected: self.unit, received: unit };
+                    return Some(self.violated(bytes, violation));
                 }
-                let violation = Violation::Unit { expected: self.unit, received: unit };
-                return Some(self.violated(bytes, violation));
+                self.in_flight = false;
+                return Some(match Response::parse(self.request, self.reader.adu(place).pdu) {
+                    Ok(Ok(response)) => ClientEvent::Response(response),
+                    Ok(Err(exception)) => ClientEvent::Exception(exception),
+                    Err(error) => {
+                        *bytes = &[];
+                        ClientEvent::Violation(Violation::Response(error))
+                    }
+                });
             }
             // Ids count up, so the half of their circle behind the newest one is the past.
             if self.transaction.wrapping_sub(transaction) >= 0x8000 {
@@ -166,26 +179,17 @@ impl Client {
                 return Some(self.violated(bytes, violation));
             }
             self.stale = self.stale.saturating_add(1);
-        };
-        let request = self.pending.take()?;
-        match Response::parse(request, self.reader.adu(place).pdu) {
-            Ok(Ok(response)) => Some(ClientEvent::Response(response)),
-            Ok(Err(exception)) => Some(ClientEvent::Exception(exception)),
-            Err(error) => {
-                *bytes = &[];
-                Some(ClientEvent::Violation(Violation::Response(error)))
-            }
         }
     }
 
     /// Gives the request in flight up, on the same connection: its answer will be skipped.
     pub const fn abort(&mut self) {
-        self.pending = None;
+        self.in_flight = false;
     }
 
     /// The connection is a new one: gives up the request in flight and forgets a partial answer.
     pub const fn reset(&mut self) {
-        self.pending = None;
+        self.in_flight = false;
         self.reader.reset();
     }
 

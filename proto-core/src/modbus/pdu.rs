@@ -234,20 +234,7 @@ impl<'a> Request<'a> {
     /// function or byte count.
     #[inline]
     pub fn parse(pdu: &'a [u8]) -> Result<Self, Exception> {
-        let known = pdu.first().is_some_and(|function| {
-            matches!(
-                *function,
-                function::READ_COILS
-                    | function::READ_HOLDING
-                    | function::WRITE_COIL
-                    | function::WRITE_REGISTER
-                    | function::WRITE_COILS
-                    | function::WRITE_REGISTERS
-            )
-        });
-        let Some((head, rest)) = pdu.split_first_chunk() else {
-            return Err(if known { Exception::IllegalDataValue } else { Exception::IllegalFunction });
-        };
+        let Some((head, rest)) = pdu.split_first_chunk() else { return Err(refusal(pdu)) };
         let RequestHead { function, address, count_or_value } = RequestHead::from_bytes(head);
         let request = match (function, rest) {
             (function::READ_COILS, []) if in_limit(count_or_value, MAX_READ_COILS) => {
@@ -261,73 +248,36 @@ impl<'a> Request<'a> {
             }
             (function::WRITE_REGISTER, []) => Self::WriteRegister { address, value: count_or_value },
             (function::WRITE_COILS, [byte_count, packed @ ..])
-                if in_limit(count_or_value, MAX_WRITE_COILS) =>
+                if count_or_value <= MAX_WRITE_COILS && usize::from(*byte_count) == packed.len() =>
             {
-                let len = packed_len(count_or_value);
-                if usize::from(*byte_count) != len || packed.len() != len {
-                    return Err(Exception::IllegalDataValue);
+                match Coils::exact(packed, count_or_value) {
+                    Some(coils) => Self::WriteCoils { address, coils },
+                    None => return Err(refusal(pdu)),
                 }
-                let coils = Coils::new(packed, count_or_value).ok_or(Exception::IllegalDataValue)?;
-                Self::WriteCoils { address, coils }
             }
             (function::WRITE_REGISTERS, [byte_count, bytes @ ..])
-                if in_limit(count_or_value, MAX_WRITE_REGISTERS) =>
+                if count_or_value <= MAX_WRITE_REGISTERS && usize::from(*byte_count) == bytes.len() =>
             {
-                let len = usize::from(count_or_value).saturating_mul(2);
-                if usize::from(*byte_count) != len || bytes.len() != len {
-                    return Err(Exception::IllegalDataValue);
+                match Registers::exact(bytes, count_or_value) {
+                    Some(registers) => Self::WriteRegisters { address, registers },
+                    None => return Err(refusal(pdu)),
                 }
-                let registers = Registers::new(bytes).ok_or(Exception::IllegalDataValue)?;
-                Self::WriteRegisters { address, registers }
             }
-            _ if known => return Err(Exception::IllegalDataValue),
-            _ => return Err(Exception::IllegalFunction),
+            _ => return Err(refusal(pdu)),
         };
         Ok(request)
     }
 
     /// Function code, address, and count or value.
     #[inline]
-    pub const fn head(&self) -> RequestHead {
-        let (function, address, count_or_value) = match *self {
-            Self::ReadCoils { address, count } => (function::READ_COILS, address, count),
-            Self::ReadHolding { address, count } => (function::READ_HOLDING, address, count),
-            Self::WriteCoil { address, value } => (function::WRITE_COIL, address, coil_value(value)),
-            Self::WriteRegister { address, value } => (function::WRITE_REGISTER, address, value),
-            Self::WriteCoils { address, coils } => (function::WRITE_COILS, address, coils.count()),
-            Self::WriteRegisters { address, registers } => {
-                (function::WRITE_REGISTERS, address, registers.count())
-            }
-        };
-        RequestHead { function, address, count_or_value }
+    pub fn head(&self) -> RequestHead {
+        self.parts().head
     }
 
-    /// Length of the request's PDU, 5..=252.
+    /// Length of the request's PDU, 5..=252 for a request that can be sent.
     #[inline]
-    pub const fn encoded_len(&self) -> usize {
-        match self {
-            Self::WriteCoils { coils, .. } => coils.packed().len().saturating_add(MULTIPLE_HEAD_LEN),
-            Self::WriteRegisters { registers, .. } => {
-                registers.as_be_bytes().len().saturating_add(MULTIPLE_HEAD_LEN)
-            }
-            _ => HEAD_LEN,
-        }
-    }
-
-    /// Whether the count is one the function allows.
-    ///
-    /// # Errors
-    /// [`EncodeError::Count`] with the function's limit.
-    #[inline]
-    pub const fn check(&self) -> Result<(), EncodeError> {
-        let (count, max) = match *self {
-            Self::ReadCoils { count, .. } => (count, MAX_READ_COILS),
-            Self::ReadHolding { count, .. } => (count, MAX_READ_REGISTERS),
-            Self::WriteCoils { coils, .. } => (coils.count(), MAX_WRITE_COILS),
-            Self::WriteRegisters { registers, .. } => (registers.count(), MAX_WRITE_REGISTERS),
-            Self::WriteCoil { .. } | Self::WriteRegister { .. } => return Ok(()),
-        };
-        if in_limit(count, max) { Ok(()) } else { Err(EncodeError::Count { count, max }) }
+    pub fn encoded_len(&self) -> usize {
+        self.parts().encoded_len()
     }
 
     /// Writes the request's PDU to the front of `out` and returns its length.
@@ -336,20 +286,74 @@ impl<'a> Request<'a> {
     /// A count the function does not allow, or too little space; nothing is written then.
     #[inline]
     pub fn encode(&self, out: &mut [u8]) -> Result<usize, EncodeError> {
-        self.check()?;
+        self.parts().encode(out)
+    }
+
+    #[inline]
+    pub(super) fn parts(&self) -> Parts<'a> {
+        let single = |function, address, count_or_value, max| Parts {
+            head: RequestHead { function, address, count_or_value },
+            max,
+            data: None,
+        };
+        match *self {
+            Self::ReadCoils { address, count } => {
+                single(function::READ_COILS, address, count, MAX_READ_COILS)
+            }
+            Self::ReadHolding { address, count } => {
+                single(function::READ_HOLDING, address, count, MAX_READ_REGISTERS)
+            }
+            Self::WriteCoil { address, value } => {
+                single(function::WRITE_COIL, address, coil_value(value), NO_COUNT)
+            }
+            Self::WriteRegister { address, value } => {
+                single(function::WRITE_REGISTER, address, value, NO_COUNT)
+            }
+            Self::WriteCoils { address, coils } => Parts {
+                data: Some((coils.packed(), coils.last_mask())),
+                ..single(function::WRITE_COILS, address, coils.count(), MAX_WRITE_COILS)
+            },
+            Self::WriteRegisters { address, registers } => Parts {
+                data: Some((registers.as_be_bytes(), 0xFF)),
+                ..single(function::WRITE_REGISTERS, address, registers.count(), MAX_WRITE_REGISTERS)
+            },
+        }
+    }
+}
+
+/// What a request's PDU is made of.
+#[derive(Clone, Copy)]
+pub(super) struct Parts<'a> {
+    pub(super) head: RequestHead,
+    /// Limit of the count, or [`NO_COUNT`].
+    max: u16,
+    /// The data of a multiple write, and the bits of its last byte that are sent.
+    data: Option<(&'a [u8], u8)>,
+}
+
+impl Parts<'_> {
+    #[inline]
+    pub(super) fn encoded_len(&self) -> usize {
+        self.data.map_or(HEAD_LEN, |(data, _)| data.len().saturating_add(MULTIPLE_HEAD_LEN))
+    }
+
+    #[inline]
+    pub(super) fn encode(&self, out: &mut [u8]) -> Result<usize, EncodeError> {
+        let (count, max) = (self.head.count_or_value, self.max);
+        if max != NO_COUNT && !in_limit(count, max) {
+            return Err(EncodeError::Count { count, max });
+        }
         let (needed, available) = (self.encoded_len(), out.len());
         let no_space = EncodeError::NoSpace { needed, available };
         let out = out.get_mut(..needed).ok_or(no_space)?;
         let (head, rest) = out.split_first_chunk_mut().ok_or(no_space)?;
-        *head = self.head().to_bytes();
-        if let Some((byte_count, data)) = rest.split_first_mut() {
+        *head = self.head.to_bytes();
+        if let Some((data, last_mask)) = self.data
+            && let Some((byte_count, target)) = rest.split_first_mut()
+        {
             // At most 246 bytes by the check above.
             *byte_count = data.len() as u8;
-            match self {
-                Self::WriteCoils { coils, .. } => copy_coils(*coils, data),
-                Self::WriteRegisters { registers, .. } => data.copy_from_slice(registers.as_be_bytes()),
-                _ => {}
-            }
+            copy_masked(data, last_mask, target);
         }
         Ok(needed)
     }
@@ -363,21 +367,26 @@ impl<'a> Response<'a> {
     #[inline]
     pub fn parse(request: RequestHead, pdu: &'a [u8]) -> Result<Result<Self, Exception>, ResponseError> {
         let RequestHead { function, address, count_or_value } = request;
-        let (received, data) = match pdu.split_first() {
-            Some((received, data)) => (*received, data),
-            None => return Err(ResponseError::Length { expected: HEAD_LEN, received: 0 }),
+        let Some((received, data)) = pdu.split_first() else {
+            return Err(ResponseError::Length { expected: HEAD_LEN, received: 0 });
         };
-        if received != function {
-            return parse_exception(function, received, data).map(Err);
+        if *received != function {
+            return parse_exception(function, *received, data).map(Err);
         }
-        let response = match function {
+        match function {
             function::READ_COILS => {
                 let packed = counted(data, packed_len(count_or_value))?;
-                Coils::new(packed, count_or_value).map(Self::Coils)
+                match Coils::exact(packed, count_or_value) {
+                    Some(coils) => Ok(Ok(Self::Coils(coils))),
+                    None => Err(unanswerable(pdu)),
+                }
             }
             function::READ_HOLDING => {
-                Registers::new(counted(data, usize::from(count_or_value).saturating_mul(2))?)
-                    .map(Self::Registers)
+                let bytes = counted(data, usize::from(count_or_value).saturating_mul(2))?;
+                match Registers::new(bytes) {
+                    Some(registers) => Ok(Ok(Self::Registers(registers))),
+                    None => Err(unanswerable(pdu)),
+                }
             }
             _ => {
                 let echo = <&[u8; HEAD_LEN]>::try_from(pdu)
@@ -386,16 +395,14 @@ impl<'a> Response<'a> {
                 if echo != request {
                     return Err(ResponseError::Echo { expected: request, received: echo });
                 }
-                Some(match function {
+                Ok(Ok(match function {
                     function::WRITE_COIL => Self::WroteCoil { address, value: count_or_value != COIL_OFF },
                     function::WRITE_REGISTER => Self::WroteRegister { address, value: count_or_value },
                     function::WRITE_COILS => Self::WroteCoils { address, count: count_or_value },
                     _ => Self::WroteRegisters { address, count: count_or_value },
-                })
+                }))
             }
-        };
-        // Only a read of nothing, which no request asks for, has no answer.
-        response.map(Ok).ok_or(ResponseError::Length { expected: HEAD_LEN, received: pdu.len() })
+        }
     }
 
     /// Length of the response's PDU, 3..=252.
@@ -419,7 +426,7 @@ impl<'a> Response<'a> {
             Self::Coils(coils) => {
                 if let [function, byte_count, data @ ..] = out {
                     (*function, *byte_count) = (function::READ_COILS, data.len() as u8);
-                    copy_coils(coils, data);
+                    copy_masked(coils.packed(), coils.last_mask(), data);
                 }
                 return Ok(needed);
             }
@@ -459,6 +466,12 @@ pub fn exception_pdu(function: u8, exception: Exception) -> [u8; 2] {
     [function | function::EXCEPTION_FLAG, exception.code()]
 }
 
+/// A read of nothing or of too much, which no request asks for, has no answer.
+#[cold]
+fn unanswerable(pdu: &[u8]) -> ResponseError {
+    ResponseError::Length { expected: HEAD_LEN, received: pdu.len() }
+}
+
 #[cold]
 fn parse_exception(function: u8, received: u8, data: &[u8]) -> Result<Exception, ResponseError> {
     match data {
@@ -485,12 +498,28 @@ fn counted(data: &[u8], expected: usize) -> Result<&[u8], ResponseError> {
     }
 }
 
-/// `data` has the length of the packed coils.
+/// Copies `data` to `target`, which is as long, and keeps only some bits of its last byte.
 #[inline]
-fn copy_coils(coils: Coils<'_>, data: &mut [u8]) {
-    data.copy_from_slice(coils.packed());
-    if let Some(last) = data.last_mut() {
-        *last &= coils.last_mask();
+fn copy_masked(data: &[u8], last_mask: u8, target: &mut [u8]) {
+    target.copy_from_slice(data);
+    if let Some(last) = target.last_mut() {
+        *last &= last_mask;
+    }
+}
+
+/// What a server answers to a request that cannot be parsed: 03 when it knows the function.
+#[cold]
+fn refusal(pdu: &[u8]) -> Exception {
+    match pdu.first() {
+        Some(
+            &(function::READ_COILS
+            | function::READ_HOLDING
+            | function::WRITE_COIL
+            | function::WRITE_REGISTER
+            | function::WRITE_COILS
+            | function::WRITE_REGISTERS),
+        ) => Exception::IllegalDataValue,
+        _ => Exception::IllegalFunction,
     }
 }
 
@@ -510,6 +539,9 @@ pub(super) const HEAD_LEN: usize = 5;
 const MULTIPLE_HEAD_LEN: usize = 6;
 /// Function code and byte count of a read's answer.
 pub(super) const READ_HEAD_LEN: usize = 2;
+
+/// In place of a limit, where the head carries a value.
+const NO_COUNT: u16 = u16::MAX;
 
 const COIL_OFF: u16 = 0x0000;
 const COIL_ON: u16 = 0xFF00;

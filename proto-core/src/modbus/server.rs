@@ -67,8 +67,8 @@ impl Server {
         bank: &mut B,
         out: &mut [u8; MAX_ADU],
     ) -> Option<Result<usize, AduError>> {
-        let request = match self.reader.next_adu(bytes)? {
-            Ok(request) => request,
+        let request = match self.reader.advance(bytes)? {
+            Ok(place) => self.reader.adu(place),
             Err(error) => return Some(Err(error)),
         };
         let (header, body) = split_frame(out)?;
@@ -167,8 +167,8 @@ fn split_frame(out: &mut [u8; MAX_ADU]) -> Option<(&mut [u8; HEADER_LEN], &mut [
 /// Addresses are 16 bits: a run that passes the last one is outside every map.
 #[inline]
 fn check_end(address: u16, count: u16) -> Result<(), Exception> {
-    match address.checked_add(count.saturating_sub(1)) {
-        Some(_) => Ok(()),
-        None => Err(Exception::IllegalDataAddress),
-    }
+    let end = u32::from(address).wrapping_add(u32::from(count));
+    if end <= ADDRESSES { Ok(()) } else { Err(Exception::IllegalDataAddress) }
 }
+
+const ADDRESSES: u32 = 0x1_0000;

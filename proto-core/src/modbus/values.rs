@@ -24,6 +24,13 @@ impl<'a> Coils<'a> {
         packed.get(..packed_len(count)).map(|packed| Self { packed, count })
     }
 
+    /// The `count` coils that `packed` holds, in exactly as many bytes as they take.
+    #[inline]
+    pub(super) fn exact(packed: &'a [u8], count: u16) -> Option<Self> {
+        let fits = count != 0 && count <= MAX_READ_COILS && packed.len() == packed_len(count);
+        fits.then_some(Self { packed, count })
+    }
+
     /// Packs `coils` into the front of `buffer`; `None` when there are none, or more than 2000, or
     /// `buffer` is too short.
     pub fn pack(coils: impl IntoIterator<Item = bool>, buffer: &'a mut [u8]) -> Option<Self> {
@@ -43,6 +50,7 @@ impl<'a> Coils<'a> {
     }
 
     /// How many coils there are, at least 1.
+    #[inline]
     pub const fn count(self) -> u16 {
         self.count
     }
@@ -77,6 +85,7 @@ impl<'a> Coils<'a> {
     }
 
     /// The bits of the last packed byte that are coils.
+    #[inline]
     pub const fn last_mask(self) -> u8 {
         last_mask(self.count)
     }
@@ -106,12 +115,20 @@ pub struct Registers<'a> {
 impl<'a> Registers<'a> {
     /// The registers in `bytes`, two big-endian bytes each; `None` when there are none, an odd
     /// number of bytes, or more than 125 registers.
+    #[inline]
     pub const fn new(bytes: &'a [u8]) -> Option<Self> {
         let len = bytes.len();
         if len == 0 || len > MAX_REGISTER_BYTES || !len.is_multiple_of(2) {
             return None;
         }
         Some(Self { bytes })
+    }
+
+    /// The `count` registers that `bytes` holds, in exactly as many bytes as they take.
+    #[inline]
+    pub(super) fn exact(bytes: &'a [u8], count: u16) -> Option<Self> {
+        let len = usize::from(count).saturating_mul(2);
+        (len != 0 && len <= MAX_REGISTER_BYTES && bytes.len() == len).then_some(Self { bytes })
     }
 
     /// Writes `values` big-endian into the front of `buffer`; `None` when there are none, or more
@@ -159,17 +176,16 @@ impl<'a> Registers<'a> {
 }
 
 /// Bytes that `count` packed coils take.
+#[inline]
 pub(super) const fn packed_len(count: u16) -> usize {
     count.div_ceil(8) as usize
 }
 
 /// The bits of the last packed byte of `count` coils that are coils.
+#[inline]
 pub(super) const fn last_mask(count: u16) -> u8 {
-    match count & 7 {
-        0 => 0xFF,
-        // 1..=7 bits: the shift is 1..=7.
-        rest => 0xFF_u8 >> (8_u16.wrapping_sub(rest) & 7),
-    }
+    // The unused bits are as many as are missing to the next multiple of 8.
+    0xFF_u8 >> (count.wrapping_neg() & 7)
 }
 
 const MAX_REGISTER_BYTES: usize = 250;
