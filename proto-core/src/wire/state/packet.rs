@@ -83,7 +83,7 @@ trait Field: Sized {
     const TYPE: ScalarType;
     const COUNT: u16;
     const ZERO: Self;
-    fn read(bytes: &[u8]) -> Self;
+    fn fill(&mut self, bytes: &[u8]);
     fn write(&self, out: &mut [u8]);
 }
 
@@ -93,11 +93,8 @@ impl<T: Item> Field for T {
     const ZERO: Self = T::ZERO;
 
     #[inline]
-    fn read(bytes: &[u8]) -> Self {
-        let mut item = [T::ZERO];
-        T::read_all(&mut item, bytes);
-        let [item] = item;
-        item
+    fn fill(&mut self, bytes: &[u8]) {
+        T::read_all(core::slice::from_mut(self), bytes);
     }
 
     #[inline]
@@ -112,10 +109,8 @@ impl<T: Item, const N: usize> Field for [T; N] {
     const ZERO: Self = [T::ZERO; N];
 
     #[inline]
-    fn read(bytes: &[u8]) -> Self {
-        let mut items = Self::ZERO;
-        T::read_all(&mut items, bytes);
-        items
+    fn fill(&mut self, bytes: &[u8]) {
+        T::read_all(self, bytes);
     }
 
     #[inline]
@@ -152,9 +147,8 @@ macro_rules! packet {
             /// All zero.
             pub const ZERO: Self = Self { $($name: <$ty as Field>::ZERO,)* };
 
-            #[inline]
-            pub(super) fn from_bytes(bytes: &[u8; LEN]) -> Self {
-                Self { $($name: Field::read(bytes.get($offset..).unwrap_or(&[])),)* }
+            pub(super) fn fill(&mut self, bytes: &[u8; LEN]) {
+                $(self.$name.fill(bytes.get($offset..).unwrap_or(&[]));)*
             }
 
             pub(super) fn write(&self, out: &mut [u8; LEN]) {
@@ -166,7 +160,9 @@ macro_rules! packet {
             $(
                 $(#[$doc])*
                 pub fn $name(&self) -> $ty {
-                    Field::read(self.as_bytes().get($offset..).unwrap_or(&[]))
+                    let mut field = <$ty as Field>::ZERO;
+                    field.fill(self.as_bytes().get($offset..).unwrap_or(&[]));
+                    field
                 }
             )*
         }
@@ -297,6 +293,7 @@ impl StatePacket {
     /// # Errors
     /// [`StateError`] when `bytes` are not as many as a packet has. What they mean is not judged;
     /// see [`StateView::check_alignment`].
+    #[inline]
     pub fn parse(bytes: &[u8]) -> Result<Self, StateError> {
         Ok(StateView::new(bytes)?.to_packet())
     }

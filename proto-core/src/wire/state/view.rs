@@ -81,6 +81,7 @@ impl<'a> StateView<'a> {
     ///
     /// # Errors
     /// [`StateError`] when `bytes` are more or fewer.
+    #[inline]
     pub fn new(bytes: &'a [u8]) -> Result<Self, StateError> {
         match bytes.try_into() {
             Ok(bytes) => Ok(Self { bytes }),
@@ -125,7 +126,15 @@ impl<'a> StateView<'a> {
     /// The packet as a plain value.
     #[inline]
     pub fn to_packet(&self) -> StatePacket {
-        StatePacket::from_bytes(self.bytes)
+        let mut packet = StatePacket::ZERO;
+        packet.fill(self.bytes);
+        packet
+    }
+
+    /// Every field into a packet that exists: as [`Self::to_packet`], without a second packet on
+    /// the stack.
+    pub fn read_into(&self, packet: &mut StatePacket) {
+        packet.fill(self.bytes);
     }
 
     /// The four state machines, as `dialect` numbers them.
