@@ -4,3 +4,7 @@
 //! Bytes and frames go in and out; no recipe, no controller and no engine is known here.
 
 pub mod bind;
+pub mod pty;
+mod reactor;
+pub mod realtime;
+pub mod timer;
