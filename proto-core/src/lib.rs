@@ -1,4 +1,4 @@
-#![cfg_attr(not(feature = "std"), no_std)]
+#![no_std]
 #![forbid(unsafe_code)]
 #![cfg_attr(
     not(test),
@@ -11,6 +11,9 @@
     )
 )]
 //! Wire formats, recipes and the gateway engine for the DUCO CORE controller.
+
+#[cfg(any(test, feature = "std"))]
+extern crate std;
 
 pub mod command;
 pub mod config;

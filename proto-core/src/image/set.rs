@@ -12,6 +12,9 @@ impl InputSet {
     /// The empty set.
     pub const EMPTY: Self = Self([0; WORDS]);
 
+    /// The byte variables: they come first in the table of inputs.
+    pub const BYTES: Self = Self([0x1FFF, 0, 0]);
+
     /// Adds an input variable; an output variable is ignored.
     pub fn insert(&mut self, var: SysVar) {
         if let Some((word, bit)) = self.slot(var) {
@@ -116,6 +119,7 @@ mod tests {
         assert!(!some.contains(force) && all.contains(force));
         assert!(all.minus(&some).iter().eq([force]));
         assert!(!all.contains(SysVar::parse("RobotState[1]").unwrap()));
+        assert_eq!(InputSet::BYTES, all.iter().filter(|v| v.is_bits()).collect());
         assert!(InputSet::EMPTY.is_empty() && InputSet::EMPTY.or(&some).and(&all) == some);
     }
 }

@@ -49,7 +49,6 @@ fn places_are_those_of_the_specification() {
 
 #[test]
 fn every_name_means_the_variable_that_prints_it() {
-    extern crate std;
     use std::string::ToString;
     let mut offset = 0;
     for v in SysVar::all() {

@@ -1,7 +1,5 @@
 //! The server's timelines: docs/wire/command.md section 5.
 
-extern crate std;
-
 use std::prelude::rust_2024::*;
 use std::{format, vec};
 

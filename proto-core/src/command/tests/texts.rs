@@ -1,7 +1,5 @@
 //! Requests and replies as texts: docs/wire/command.md sections 2 to 4.
 
-extern crate std;
-
 use std::prelude::rust_2024::*;
 
 use proptest::prelude::*;

@@ -1,5 +1,3 @@
-extern crate std;
-
 use std::prelude::rust_2024::*;
 use std::{format, vec};
 

@@ -1,0 +1,408 @@
+//! From a configuration to an engine that is ready to run.
+
+use core::fmt;
+
+use heapless::Vec;
+
+use super::command_link::{CommandLink, MAX_COMMAND_BYTES, MAX_COMMAND_FIELDS};
+use super::counters::PortCounters;
+use super::field_port::{Codec, FieldPort, Line, ReplyCode};
+use super::io::{BusState, LinkId, LinkKind, PortId};
+use super::modbus_link::{MAX_POLL_BLOCKS, ModbusLink};
+use super::outbox::EdgeQueue;
+use super::plan::{Plan, PlanError, Source, WayUp, shown_by, uplinks};
+use super::sender::Sender;
+use super::state_link::StateLink;
+use super::store::{InputFrame, MAX_INPUT_FRAMES, SafeBytes, Store};
+use super::uplink::Uplink;
+use super::user::{Bindings, InputBind};
+use super::{Engine, Links};
+use crate::config::{
+    Bus, ConfigError, FieldSpec, GatewayConfig, InputBinding, Parts, Port, Recipe, Rs485, Span, StreamPart,
+};
+use crate::image::{GroupId, InputSet, MAX_GROUPS};
+use crate::link::{LinkTimings, Supervisor};
+use crate::recipe::deframer::Deframer;
+use crate::recipe::model::{Field, Framing, Rules};
+use crate::recipe::{CanLayout, PartError, StreamLayout};
+use crate::sysvar::{Direction, SysVar};
+use crate::time::{Duration, Instant};
+use crate::wire::dialect::Dialect;
+
+/// Why an engine cannot run a configuration.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
+pub enum BuildError {
+    /// The configuration is wrong.
+    Config(ConfigError),
+    /// A variable has no way.
+    Plan(PlanError),
+    /// A recipe's part is wrong.
+    Part {
+        /// Index of the recipe.
+        recipe: u8,
+        /// Which part.
+        part: Direction,
+        /// What is wrong.
+        error: PartError,
+    },
+    /// No dialect has the configured name.
+    UnknownDialect,
+    /// More of something than this engine has room for.
+    TooMany {
+        /// Of what.
+        what: &'static str,
+        /// How many there is room for.
+        room: usize,
+    },
+}
+
+impl fmt::Display for BuildError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Config(error) => error.fmt(f),
+            Self::Plan(error) => error.fmt(f),
+            Self::Part { recipe, part, error } => {
+                let part = if *part == Direction::Input { "input" } else { "output" };
+                write!(f, "recipe {}, {part} part: {error}", recipe.saturating_add(1))
+            }
+            Self::UnknownDialect => write!(f, "unknown dialect; there are {:?}", Dialect::NAMES),
+            Self::TooMany { what, room } => write!(f, "too many {what}: this gateway has room for {room}"),
+        }
+    }
+}
+
+impl core::error::Error for BuildError {}
+
+fn too_many(what: &'static str, room: usize) -> BuildError {
+    BuildError::TooMany { what, room }
+}
+
+impl Rs485 {
+    /// The time that `n` characters and a half take on the line.
+    pub(super) fn characters_and_a_half(&self, n: u64) -> Duration {
+        let half_bits = n.saturating_mul(2).saturating_add(1).saturating_mul(self.bits_per_character());
+        let micros = half_bits.saturating_mul(500_000).checked_div(u64::from(self.baud)).unwrap_or(0);
+        Duration::from_micros(micros)
+    }
+
+    /// Start bit, data bits, parity and stop bits.
+    pub fn bits_per_character(&self) -> u64 {
+        let parity = u64::from(self.parity != crate::config::Parity::None);
+        9_u64.saturating_add(parity).saturating_add(u64::from(self.stop_bits))
+    }
+
+    /// The time that `len` bytes take on the line, rounded up.
+    pub fn time_on_line(&self, len: usize) -> Duration {
+        let bits = (len as u64).saturating_mul(self.bits_per_character());
+        let micros = bits.saturating_mul(1_000_000).checked_next_multiple_of(u64::from(self.baud.max(1)));
+        Duration::from_micros(micros.and_then(|m| m.checked_div(u64::from(self.baud.max(1)))).unwrap_or(0))
+    }
+}
+
+/// Groups are handed out in order: field frames first.
+struct Groups(u8);
+
+impl Groups {
+    fn next(&mut self) -> Option<GroupId> {
+        let group = GroupId(self.0);
+        (usize::from(self.0) < MAX_GROUPS).then(|| self.0 = self.0.saturating_add(1))?;
+        Some(group)
+    }
+}
+
+impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS, UPLINKS, FIELDS> {
+    /// An engine that runs this configuration; everything is down until its driver says otherwise.
+    ///
+    /// # Errors
+    /// [`BuildError`] says what is wrong with the configuration, or what there is no room for.
+    pub fn new(config: &GatewayConfig) -> Result<Self, BuildError> {
+        config.validate().map_err(BuildError::Config)?;
+        let plan = Plan::new(config).map_err(BuildError::Plan)?;
+        let dialect = Dialect::named(&config.controller.dialect).ok_or(BuildError::UnknownDialect)?;
+        let mut engine = Self {
+            store: Store::new(),
+            ports: Vec::new(),
+            bindings: Bindings { inputs: Vec::new(), outputs: Vec::new() },
+            safe_values: config.safe_values.iter().map(SafeBytes::new).collect(),
+            links: Links { command: None, state: None, modbus: None, recipes: Vec::new() },
+            timer_at: Instant::ZERO,
+        };
+        for (index, port, recipe) in config.field_ports() {
+            engine.add_port(config, index, port, recipe, dialect)?;
+        }
+        let mut groups = Groups(engine.store.frames.len() as u8);
+        for (id, recipe) in uplinks(config) {
+            engine.add_uplink(config, id, recipe, &mut groups)?;
+        }
+        if plan.needs_state() {
+            let group = groups.next().ok_or(too_many("groups", MAX_GROUPS))?;
+            engine.links.state = Some(StateLink::new(group, plan.read_back()));
+        }
+        if plan.needs_modbus() {
+            let writes = SysVar::all().filter(|&var| plan.way_up(var) == Some(WayUp::Modbus)).collect();
+            engine.links.modbus = Some(ModbusLink::new(dialect.modbus_unit, writes));
+        }
+        engine.assign_read_back(&plan);
+        engine.assign_sources(config, &plan, &mut groups)?;
+        Ok(engine)
+    }
+
+    fn add_port(
+        &mut self,
+        config: &GatewayConfig,
+        index: u8,
+        port: &Port,
+        recipe: &Recipe,
+        dialect: Dialect,
+    ) -> Result<(), BuildError> {
+        let (codec, line) = match &port.bus {
+            Bus::Rs485(settings) => (stream_codec(config, port.recipe, recipe)?, Line::new(settings)),
+            _ => (can_codec(config, port.recipe, recipe)?, Line::none()),
+        };
+        let first_frame = self.store.frames.len() as u8;
+        for (frame, _) in recipe.frames(Direction::Input) {
+            let set = config
+                .fields_of(recipe, Direction::Input)
+                .filter(|&(of, ..)| of == frame)
+                .filter_map(|(_, _, field)| field.variable())
+                .collect();
+            let frame = InputFrame {
+                set,
+                port: self.ports.len() as u8,
+                overdue_at: Instant::NEVER,
+                timeout: port.timeout,
+            };
+            let group = GroupId(self.store.frames.len() as u8);
+            self.store.frames.push(frame).map_err(|_| too_many("input frames", MAX_INPUT_FRAMES))?;
+            frame.set.iter().for_each(|var| self.store.image.assign(var, group));
+        }
+        let full = || too_many("user-defined fields in one direction", FIELDS);
+        let mut inputs = Span { start: self.bindings.inputs.len() as u16, len: 0 };
+        for (_, _, field) in config.fields_of(recipe, Direction::Input) {
+            let bind = match *field {
+                FieldSpec::UserInput { to: InputBinding::Variable { var, scale, offset }, .. } => {
+                    InputBind::Variable { var, scale, offset }
+                }
+                FieldSpec::UserInput { to: InputBinding::Commands { table, when }, .. } => {
+                    if self.links.command.is_none() {
+                        let link = CommandLink::new(dialect, &config.commands);
+                        self.links.command =
+                            Some(link.ok_or(too_many("bytes of command texts", MAX_COMMAND_BYTES))?);
+                    }
+                    let Some(link) = &mut self.links.command else { continue };
+                    let field = link.add_field(table, when);
+                    InputBind::Command(field.ok_or(too_many("command fields", MAX_COMMAND_FIELDS))?)
+                }
+                FieldSpec::UserInput { .. } => InputBind::Unused,
+                _ => continue,
+            };
+            self.bindings.inputs.push(bind).map_err(|_| full())?;
+            inputs.len = inputs.len.saturating_add(1);
+        }
+        let mut outputs = Span { start: self.bindings.outputs.len() as u16, len: 0 };
+        for (_, _, field) in config.fields_of(recipe, Direction::Output) {
+            if let FieldSpec::UserOutput { ty, from } = *field {
+                self.bindings.outputs.push((ty, from)).map_err(|_| full())?;
+                outputs.len = outputs.len.saturating_add(1);
+            }
+        }
+        let has_output = recipe.has(Direction::Output);
+        let sender = Sender::new(recipe.send, recipe.on_stale, port.stale_after, port.cycle, has_output);
+        let port = FieldPort {
+            id: PortId(index),
+            codec,
+            mode: recipe.mode,
+            line,
+            sender,
+            inputs,
+            outputs,
+            first_frame,
+            is_up: false,
+            bus: BusState::Active,
+            reply: ReplyCode::None,
+            counters: PortCounters::default(),
+        };
+        self.ports.push(port).map_err(|_| too_many("field ports", PORTS))?;
+        self.store.edges.push(EdgeQueue::default()).map_err(|_| too_many("field ports", PORTS))
+    }
+
+    fn add_uplink(
+        &mut self,
+        config: &GatewayConfig,
+        id: LinkId,
+        recipe: &Recipe,
+        groups: &mut Groups,
+    ) -> Result<(), BuildError> {
+        let port = id.port();
+        let bus = port.and_then(|port| config.ports.get(usize::from(port.0))).map(|port| &port.bus);
+        let kind = match (bus, port) {
+            (Some(Bus::TcpListen { .. }), Some(port)) => LinkKind::RecipeTcpListen { port },
+            (Some(_), Some(port)) => LinkKind::RecipeUdpListen { port },
+            _ => LinkKind::RecipeUdp,
+        };
+        let framing = match kind {
+            LinkKind::RecipeTcpListen { .. } => Framing::Bytes,
+            _ => Framing::Datagram,
+        };
+        let index = recipe_index(config, recipe);
+        let Parts::Stream { input, output } = &recipe.parts else { return Ok(()) };
+        let input = stream_layout(config, index, recipe, input.as_ref(), Direction::Input, framing)?;
+        let output = stream_layout(config, index, recipe, output.as_ref(), Direction::Output, framing)?;
+        let group = match output {
+            Some(_) => Some(groups.next().ok_or(too_many("groups", MAX_GROUPS))?),
+            None => None,
+        };
+        let timings = match kind {
+            // Nobody may connect for days: that is no failure.
+            LinkKind::RecipeTcpListen { .. } | LinkKind::RecipeUdpListen { .. } => LinkTimings {
+                connect_timeout: Duration::MAX,
+                backoff_max: LinkTimings::TCP.backoff_min,
+                ..LinkTimings::TCP
+            },
+            _ => LinkTimings::TCP,
+        };
+        let timings = match kind {
+            LinkKind::RecipeTcpListen { .. } if output.is_some() => {
+                timings.with_silence(Duration::from_secs(2))
+            }
+            _ => timings,
+        };
+        let set: InputSet = config.written_by(recipe).collect();
+        let uplink = Uplink::new(id, kind, Supervisor::new(timings), input, output, set, group);
+        self.links.recipes.push(uplink).map_err(|_| too_many("recipe links", UPLINKS))
+    }
+
+    /// Variables of recipe links that no port sends come from the state stream.
+    fn assign_read_back(&mut self, plan: &Plan) {
+        let Some(state) = &self.links.state else { return };
+        for var in plan.read_back().iter().filter(|&var| plan.owner(var).is_none()) {
+            self.store.image.assign(var, state.group);
+        }
+    }
+
+    fn assign_sources(
+        &mut self,
+        config: &GatewayConfig,
+        plan: &Plan,
+        groups: &mut Groups,
+    ) -> Result<(), BuildError> {
+        let mut periods = [None; crate::sysvar::COUNT];
+        for (_, port, recipe) in config.field_ports() {
+            for var in shown_by(config, recipe) {
+                if let Some(period) = periods.get_mut(var.ordinal()) {
+                    *period = Some(period.map_or(port.cycle, |before: Duration| before.min(port.cycle)));
+                }
+            }
+        }
+        // By Modbus address, so that neighbours join into one block.
+        let mut polled: Vec<SysVar, { crate::sysvar::COUNT }> = Vec::new();
+        for var in SysVar::all() {
+            if plan.source(var) == Some(Source::Modbus) {
+                let _ = polled.push(var);
+            }
+        }
+        polled.sort_unstable_by_key(|var| modbus_address(*var));
+        for &var in &polled {
+            let period = periods.get(var.ordinal()).copied().flatten().unwrap_or(port_cycle_floor());
+            let Some(modbus) = &mut self.links.modbus else { break };
+            let group = modbus.poll_var(var, period, || groups.next());
+            let group = group.ok_or(too_many("Modbus poll blocks", MAX_POLL_BLOCKS))?;
+            self.store.image.assign(var, group);
+        }
+        for var in SysVar::all() {
+            let group = match plan.source(var) {
+                Some(Source::Recipe(id)) => {
+                    self.links.recipes.iter().find(|link| link.id == id).and_then(|link| link.group)
+                }
+                Some(Source::State) => self.links.state.as_mut().map(|state| {
+                    if var.direction() == Direction::Output {
+                        // As many places as there are output variables.
+                        let _ = state.shown.push(var);
+                    }
+                    state.group
+                }),
+                _ => None,
+            };
+            if let Some(group) = group {
+                self.store.image.assign(var, group);
+            }
+        }
+        for ((_, _, recipe), port) in config.field_ports().zip(&mut self.ports) {
+            for var in shown_by(config, recipe) {
+                let Some(group) = self.store.image.group(var) else { continue };
+                match plan.source(var) {
+                    Some(Source::Field(_)) => port.sender.shown_fields.insert(group),
+                    _ => port.sender.sources.insert(group),
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+const fn port_cycle_floor() -> Duration {
+    crate::config::MIN_CYCLE
+}
+
+fn modbus_address(var: SysVar) -> (u8, u16) {
+    use crate::sysvar::ModbusPlace;
+    match var.modbus() {
+        Some(ModbusPlace::Coils { first, .. }) => (0, first),
+        Some(ModbusPlace::Register { address } | ModbusPlace::Scaled { address, .. }) => (1, address),
+        None => (2, 0),
+    }
+}
+
+fn recipe_index(config: &GatewayConfig, recipe: &Recipe) -> u8 {
+    (0..).zip(&config.recipes).find(|(_, other)| other.name == recipe.name).map_or(0, |(index, _)| index)
+}
+
+fn stream_codec(config: &GatewayConfig, index: u8, recipe: &Recipe) -> Result<Codec, BuildError> {
+    let Parts::Stream { input, output } = &recipe.parts else {
+        return Err(too_many("stream parts in a CAN recipe", 0));
+    };
+    let layout = |part: &Option<StreamPart>, direction| {
+        stream_layout(config, index, recipe, part.as_ref(), direction, Framing::Bytes)
+    };
+    Ok(Codec::Stream {
+        input: layout(input, Direction::Input)?,
+        output: layout(output, Direction::Output)?,
+        deframer: Deframer::new(),
+    })
+}
+
+fn stream_layout(
+    config: &GatewayConfig,
+    index: u8,
+    recipe: &Recipe,
+    part: Option<&StreamPart>,
+    direction: Direction,
+    framing: Framing,
+) -> Result<Option<StreamLayout>, BuildError> {
+    let Some(part) = part else { return Ok(None) };
+    let rules = Rules { mode: recipe.mode, direction };
+    let fields = part.fields.of(&config.fields).iter().map(FieldSpec::field);
+    StreamLayout::new(rules, &part.head, &part.tail, fields, framing)
+        .map(Some)
+        .map_err(|error| BuildError::Part { recipe: index, part: direction, error })
+}
+
+fn can_codec(config: &GatewayConfig, index: u8, recipe: &Recipe) -> Result<Codec, BuildError> {
+    let Parts::Can { input, output } = &recipe.parts else {
+        return Err(too_many("CAN parts in a stream recipe", 0));
+    };
+    let layout = |frames: &[crate::config::CanFramePart], direction| {
+        if frames.is_empty() {
+            return Ok(None);
+        }
+        let frames = frames.iter().map(|frame| {
+            let fields = frame.fields.of(&config.fields).iter().map(FieldSpec::field);
+            (frame.id, fields.collect::<Vec<Field, { crate::recipe::model::MAX_CAN_DATA }>>())
+        });
+        CanLayout::new(Rules { mode: recipe.mode, direction }, frames)
+            .map(Some)
+            .map_err(|error| BuildError::Part { recipe: index, part: direction, error })
+    };
+    Ok(Codec::Can { input: layout(input, Direction::Input)?, output: layout(output, Direction::Output)? })
+}

@@ -1,0 +1,341 @@
+//! One port on the field side: frames in, frames out, and the timing of a shared line.
+//!
+//! In: bytes and CAN frames. Out: values in the store, and frames when they are due. Refuses to
+//! know how values reach the controller.
+
+use super::command_link::CommandLink;
+use super::counters::{PortCounters, add, bump};
+use super::io::{BusState, PortId};
+use super::sender::Sender;
+use super::store::Store;
+use super::user::{InputBind, fit, forget_commands};
+use crate::config::{Rs485, Span};
+use crate::image::ImageBytes;
+use crate::recipe::can::{CanFrame, CanLayout, CanReject};
+use crate::recipe::deframer::Deframer;
+
+use crate::recipe::model::Mode;
+use crate::recipe::stream::StreamLayout;
+use crate::recipe::{Applied, ValueError, Values};
+use crate::time::{Duration, Instant};
+use crate::wire::scalar::Scalar;
+
+/// How the newest command that a port's values picked went.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[repr(u8)]
+pub enum ReplyCode {
+    /// No value has picked a command yet.
+    #[default]
+    None = 0,
+    /// Waiting to be sent, or for the reply.
+    Pending = 1,
+    /// The controller replied that it succeeded.
+    Success = 2,
+    /// The controller replied that it failed.
+    Fail = 3,
+    /// The controller replied something else.
+    Other = 4,
+    /// No reply came in time, or the link was lost meanwhile.
+    NoReply = 5,
+    /// It was not sent: the link was down, or too many were waiting.
+    NotSent = 6,
+}
+
+/// The layouts of the port's recipe.
+#[derive(Debug, Clone)]
+#[allow(clippy::large_enum_variant, reason = "without an allocator there is no box to put the larger one in")]
+pub(super) enum Codec {
+    Stream { input: Option<StreamLayout>, output: Option<StreamLayout>, deframer: Deframer },
+    Can { input: Option<CanLayout>, output: Option<CanLayout> },
+}
+
+/// Timing of a half-duplex line.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Line {
+    pub idle_gap: Duration,
+    pub turnaround: Duration,
+    heard: Instant,
+}
+
+impl Line {
+    pub(super) fn new(settings: &Rs485) -> Self {
+        let idle_gap = settings.idle_gap.max(settings.characters_and_a_half(3));
+        Self { idle_gap, turnaround: settings.turnaround, heard: Instant::ZERO }
+    }
+
+    /// For a bus that arbitrates by itself.
+    pub(super) const fn none() -> Self {
+        Self { idle_gap: Duration::MAX, turnaround: Duration::ZERO, heard: Instant::ZERO }
+    }
+
+    /// When the line is ours.
+    fn quiet_at(&self) -> Instant {
+        self.heard + self.turnaround
+    }
+}
+
+#[derive(Debug, Clone)]
+pub(super) struct FieldPort {
+    pub id: PortId,
+    pub codec: Codec,
+    pub mode: Mode,
+    pub line: Line,
+    pub sender: Sender,
+    /// The port's range of the input bindings, those of all CAN frames in one row.
+    pub inputs: Span,
+    /// The port's range of the output bindings.
+    pub outputs: Span,
+    /// Index of the first of the port's frames in the store.
+    pub first_frame: u8,
+    pub is_up: bool,
+    pub bus: BusState,
+    pub reply: ReplyCode,
+    pub counters: PortCounters,
+}
+
+/// What a frame's layout offers, stream or CAN.
+trait InputLayout {
+    fn apply(&self, payload: &[u8], image: &mut ImageBytes) -> Result<Applied, ValueError>;
+    fn check(&self, payload: &[u8]) -> Result<(), ValueError>;
+    fn values<'v>(&'v self, payload: &'v [u8]) -> Values<'v>;
+}
+
+impl InputLayout for StreamLayout {
+    fn apply(&self, payload: &[u8], image: &mut ImageBytes) -> Result<Applied, ValueError> {
+        Self::apply(self, payload, image)
+    }
+    fn check(&self, payload: &[u8]) -> Result<(), ValueError> {
+        Self::check(self, payload)
+    }
+    fn values<'v>(&'v self, payload: &'v [u8]) -> Values<'v> {
+        Self::values(self, payload)
+    }
+}
+
+impl InputLayout for crate::recipe::can::CanFrameLayout<'_> {
+    fn apply(&self, payload: &[u8], image: &mut ImageBytes) -> Result<Applied, ValueError> {
+        Self::apply(self, payload, image)
+    }
+    fn check(&self, payload: &[u8]) -> Result<(), ValueError> {
+        Self::check(self, payload)
+    }
+    fn values<'v>(&'v self, payload: &'v [u8]) -> Values<'v> {
+        Self::values(self, payload)
+    }
+}
+
+impl FieldPort {
+    /// The device is there.
+    pub(super) fn up(&mut self) {
+        self.is_up = true;
+    }
+
+    /// The device is gone: nothing of what was under way is continued later.
+    pub(super) fn down(&mut self, bindings: &[InputBind], commands: &mut Option<CommandLink>) {
+        if self.is_up {
+            bump(&mut self.counters.downs);
+        }
+        self.is_up = false;
+        self.sender.reset();
+        self.discard_partial();
+        forget_commands(self.inputs.of(bindings), commands);
+    }
+
+    /// The CAN controller reports its error state.
+    pub(super) fn bus_state(&mut self, state: BusState) {
+        if state == BusState::BusOff && self.bus != BusState::BusOff {
+            bump(&mut self.counters.bus_offs);
+            self.sender.reset();
+        }
+        self.bus = state;
+    }
+
+    /// Bytes from the line.
+    pub(super) fn bytes<const PORTS: usize>(
+        &mut self,
+        bytes: &[u8],
+        bindings: &[InputBind],
+        store: &mut Store<PORTS>,
+        commands: &mut Option<CommandLink>,
+        now: Instant,
+    ) {
+        add(&mut self.counters.bytes_in, bytes.len());
+        if now >= self.line.heard + self.line.idle_gap {
+            self.discard_partial();
+        }
+        self.line.heard = now;
+        let Codec::Stream { input, deframer, .. } = &mut self.codec else { return };
+        let Some(layout) = input else {
+            bump(&mut self.counters.rejected_no_input);
+            return;
+        };
+        let mut frames = Frames {
+            mode: self.mode,
+            bindings: self.inputs.of(bindings),
+            reply: &mut self.reply,
+            counters: &mut self.counters,
+            port: self.id,
+            store,
+            commands,
+            now,
+        };
+        let mut rest = bytes;
+        let mut accepted = 0_u32;
+        while let Some(payload) = deframer.next_frame(layout, &mut rest) {
+            if frames.take(layout, payload, usize::from(self.first_frame), 0) {
+                accepted = accepted.wrapping_add(1);
+            }
+        }
+        let stats = deframer.stats();
+        self.counters.tail_mismatches = stats.tail_mismatches as u32;
+        self.counters.resync_bytes = stats.skipped_bytes as u32;
+        for _ in 0..accepted.min(2) {
+            self.sender.frame_accepted(&mut self.counters);
+        }
+    }
+
+    /// A frame from the bus.
+    pub(super) fn can<const PORTS: usize>(
+        &mut self,
+        frame: &CanFrame,
+        bindings: &[InputBind],
+        store: &mut Store<PORTS>,
+        commands: &mut Option<CommandLink>,
+        now: Instant,
+    ) {
+        add(&mut self.counters.bytes_in, frame.data().len());
+        let Codec::Can { input, .. } = &self.codec else { return };
+        let Some(layout) = input else {
+            bump(&mut self.counters.rejected_no_input);
+            return;
+        };
+        let index = match layout.accept(frame) {
+            Ok(index) => index,
+            Err(CanReject::Remote { .. }) => return bump(&mut self.counters.rejected_remote),
+            Err(CanReject::WrongLength { .. }) => return bump(&mut self.counters.rejected_length),
+            Err(_) => return bump(&mut self.counters.rejected_id),
+        };
+        let Some(frame_layout) = layout.frame(index) else { return };
+        let skip = if self.mode == Mode::User { fields_before(layout, index) } else { 0 };
+        let mut frames = Frames {
+            mode: self.mode,
+            bindings: self.inputs.of(bindings),
+            reply: &mut self.reply,
+            counters: &mut self.counters,
+            port: self.id,
+            store,
+            commands,
+            now,
+        };
+        let slot = usize::from(self.first_frame).saturating_add(index);
+        if frames.take(&frame_layout, frame.data(), slot, skip) {
+            self.sender.frame_accepted(&mut self.counters);
+        }
+    }
+
+    /// Looks at the clock: cycles and silence.
+    pub(super) fn advance(&mut self, now: Instant) {
+        if now >= self.partial_until() {
+            self.discard_partial();
+        }
+        let usable = self.is_up && self.bus != BusState::BusOff;
+        self.sender.advance(usable, &mut self.counters, now);
+    }
+
+    /// When the port has something to do by itself.
+    pub(super) fn deadline(&self) -> Instant {
+        self.partial_until().min(self.sender.deadline(self.line.quiet_at()))
+    }
+
+    /// Whether a frame may be handed over now.
+    pub(super) fn may_send(&self, now: Instant) -> bool {
+        self.is_up && self.bus != BusState::BusOff && self.sender.is_due() && now >= self.line.quiet_at()
+    }
+
+    fn partial_until(&self) -> Instant {
+        match &self.codec {
+            Codec::Stream { deframer, .. } if deframer.pending() > 0 => self.line.heard + self.line.idle_gap,
+            _ => Instant::NEVER,
+        }
+    }
+
+    fn discard_partial(&mut self) {
+        if let Codec::Stream { deframer, .. } = &mut self.codec {
+            let dropped = deframer.discard();
+            add(&mut self.counters.discarded_bytes, dropped);
+        }
+    }
+}
+
+/// What taking a frame needs.
+struct Frames<'a, const PORTS: usize> {
+    mode: Mode,
+    bindings: &'a [InputBind],
+    reply: &'a mut ReplyCode,
+    counters: &'a mut PortCounters,
+    port: PortId,
+    store: &'a mut Store<PORTS>,
+    commands: &'a mut Option<CommandLink>,
+    now: Instant,
+}
+
+impl<const PORTS: usize> Frames<'_, PORTS> {
+    /// Takes a frame whole or not at all; false when it was rejected.
+    fn take(&mut self, layout: &impl InputLayout, payload: &[u8], slot: usize, skip: usize) -> bool {
+        match self.mode {
+            Mode::Realtime => match layout.apply(payload, self.store.image.bytes_mut()) {
+                Ok(applied) => {
+                    if applied.masked > 0 {
+                        bump(&mut self.counters.masked);
+                    }
+                }
+                Err(_) => {
+                    bump(&mut self.counters.rejected_not_finite);
+                    return false;
+                }
+            },
+            Mode::User => {
+                if layout.check(payload).is_err() {
+                    bump(&mut self.counters.rejected_not_finite);
+                    return false;
+                }
+                let bindings = self.bindings.get(skip..).unwrap_or(&[]);
+                if !fit(bindings, layout.values(payload)) {
+                    bump(&mut self.counters.rejected_out_of_range);
+                    return false;
+                }
+                for (binding, value) in bindings.iter().zip(layout.values(payload)) {
+                    self.apply_user(binding, value);
+                }
+            }
+        }
+        bump(&mut self.counters.frames_in);
+        self.store.accepted(slot, self.counters, self.now);
+        true
+    }
+
+    fn apply_user(&mut self, binding: &InputBind, value: Scalar) {
+        match *binding {
+            InputBind::Unused => {}
+            InputBind::Variable { .. } => {
+                if let Some((var, value)) = binding.bound(value) {
+                    // It fits: all of them were tried before the first was applied.
+                    let _ = self.store.image.set(var, value);
+                }
+            }
+            InputBind::Command(field) => {
+                if let Some(link) = self.commands {
+                    link.value(field, value, self.port, self.reply, self.counters, self.now);
+                }
+            }
+        }
+    }
+}
+
+/// How many fields the part's frames before the `index`-th have: the bindings of all of them stand
+/// in one row.
+pub(super) fn fields_before(layout: &CanLayout, index: usize) -> usize {
+    let before = layout.frames().take(index);
+    before.fold(0, |sum, frame| sum.saturating_add(frame.fields().count()))
+}

@@ -1,0 +1,199 @@
+//! What goes into the engine and what comes out of it.
+
+use crate::recipe::can::CanFrame;
+use crate::time::Instant;
+
+/// A port, by its place in [`crate::config::GatewayConfig::ports`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub struct PortId(pub u8);
+
+/// A link to the controller; [`super::Engine::links`] lists them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub struct LinkId(pub u8);
+
+impl LinkId {
+    /// Port 2000.
+    pub const COMMAND: Self = Self(0);
+    /// Port 2001.
+    pub const STATE: Self = Self(1);
+    /// Modbus TCP.
+    pub const MODBUS: Self = Self(2);
+    /// The controller's UDP recipe server.
+    pub const RECIPE_UDP: Self = Self(3);
+
+    /// The link of a listening port.
+    pub const fn of_port(port: PortId) -> Self {
+        Self(port.0.saturating_add(4))
+    }
+}
+
+/// What a link is, and so what the driver opens for it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum LinkKind {
+    /// TCP to the controller's command port.
+    Command,
+    /// TCP to the controller's state port.
+    State,
+    /// TCP to the controller's Modbus port.
+    Modbus,
+    /// UDP to the controller's recipe port.
+    RecipeUdp,
+    /// TCP: listen where this port says, take one connection.
+    RecipeTcpListen {
+        /// The port.
+        port: PortId,
+    },
+    /// UDP: listen where this port says, answer whoever sent last.
+    RecipeUdpListen {
+        /// The port.
+        port: PortId,
+    },
+}
+
+impl LinkKind {
+    /// A short name for people and statistics.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Command => "command",
+            Self::State => "state",
+            Self::Modbus => "modbus",
+            Self::RecipeUdp => "udp2011",
+            Self::RecipeTcpListen { .. } => "tcp-listen",
+            Self::RecipeUdpListen { .. } => "udp-listen",
+        }
+    }
+}
+
+/// A CAN controller's error state.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum BusState {
+    /// Error-active: all is well.
+    Active,
+    /// An error counter passed 96.
+    Warning,
+    /// Error-passive.
+    Passive,
+    /// Bus-off: nothing can be sent until the driver recovers it and reports another state.
+    BusOff,
+}
+
+/// What happened outside.
+#[derive(Debug, Clone, Copy)]
+pub enum Input<'a> {
+    /// A port's device is there.
+    PortUp {
+        /// The port.
+        port: PortId,
+    },
+    /// A port's device is gone; what was handed over for sending is lost.
+    PortDown {
+        /// The port.
+        port: PortId,
+    },
+    /// Bytes from a serial line, in chunks of any size.
+    PortBytes {
+        /// The port.
+        port: PortId,
+        /// The bytes.
+        bytes: &'a [u8],
+    },
+    /// A frame from a CAN bus.
+    PortCan {
+        /// The port.
+        port: PortId,
+        /// The frame.
+        frame: CanFrame,
+    },
+    /// Everything that was handed over for sending has left the port.
+    PortSent {
+        /// The port.
+        port: PortId,
+    },
+    /// A CAN controller's error state changed.
+    PortBus {
+        /// The port.
+        port: PortId,
+        /// The new state.
+        state: BusState,
+    },
+    /// A link that was to be opened is usable.
+    LinkUp {
+        /// The link.
+        link: LinkId,
+    },
+    /// A link could not be opened, or was lost.
+    LinkDown {
+        /// The link.
+        link: LinkId,
+    },
+    /// Bytes from a link; of a datagram link one whole datagram a call.
+    LinkBytes {
+        /// The link.
+        link: LinkId,
+        /// The bytes.
+        bytes: &'a [u8],
+    },
+    /// Everything that was handed over for sending was taken by the transport.
+    LinkSent {
+        /// The link.
+        link: LinkId,
+    },
+    /// Nothing but the passing of time.
+    Tick,
+}
+
+/// What the driver has to do.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Output<'a> {
+    /// Send on a serial line, then report [`Input::PortSent`].
+    PortSend {
+        /// The port.
+        port: PortId,
+        /// One whole frame.
+        bytes: &'a [u8],
+    },
+    /// Queue a CAN frame behind those before it; report [`Input::PortSent`] when the queue has
+    /// become empty. At most [`crate::recipe::model::MAX_CAN_IDS`] are handed over before that.
+    PortSendCan {
+        /// The port.
+        port: PortId,
+        /// The frame.
+        frame: CanFrame,
+    },
+    /// Open a link, then report [`Input::LinkUp`] or [`Input::LinkDown`].
+    LinkOpen {
+        /// The link.
+        link: LinkId,
+    },
+    /// Close a link and report nothing more of it.
+    LinkClose {
+        /// The link.
+        link: LinkId,
+    },
+    /// Send on a link (of a datagram link: one datagram), then report [`Input::LinkSent`].
+    LinkSend {
+        /// The link.
+        link: LinkId,
+        /// The bytes.
+        bytes: &'a [u8],
+    },
+    /// Nothing more to do before this instant; [`Instant::NEVER`] when only an input can change that.
+    Sleep {
+        /// When to call again at the latest.
+        until: Instant,
+    },
+}
+
+impl LinkId {
+    /// The listening port that the link belongs to.
+    pub const fn port(self) -> Option<PortId> {
+        match self.0.checked_sub(4) {
+            Some(port) => Some(PortId(port)),
+            None => None,
+        }
+    }
+}

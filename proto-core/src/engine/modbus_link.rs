@@ -1,0 +1,359 @@
+//! The Modbus link: coalesced writes of what fields brought, polls of what ports show, one
+//! transaction in flight (docs/architecture.md section 7).
+
+use heapless::Vec;
+
+use super::counters::{LinkCounters, add, bump};
+use super::store::Store;
+use crate::image::{GroupId, InputSet};
+use crate::link::{LinkTimings, Supervisor};
+use crate::modbus::client::{Client, ClientEvent};
+use crate::modbus::pdu::{MAX_WRITE_COILS, MAX_WRITE_REGISTERS, Request, Response};
+use crate::modbus::{Coils, Registers};
+use crate::schedule::Grid;
+use crate::sysvar::{INPUT_BYTES, ModbusPlace, SysVar};
+use crate::time::{Duration, Instant};
+use crate::wire::scalar::Scalar;
+
+/// Blocks of neighbouring coils or registers that are polled together.
+pub const MAX_POLL_BLOCKS: usize = 16;
+/// Variables polled by Modbus.
+const MAX_POLLED: usize = 64;
+/// Coils or registers that nobody asked for but that are read to join two blocks.
+const JOIN_GAP: u16 = 16;
+/// A request without an answer is given up after this.
+const ANSWER_TIMEOUT: Duration = Duration::from_millis(500);
+/// After this many in a row the connection is reopened.
+const TIMEOUTS_IN_A_ROW: u8 = 3;
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Kind {
+    Coils,
+    Registers,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Block {
+    kind: Kind,
+    first: u16,
+    count: u16,
+    group: GroupId,
+    grid: Grid,
+}
+
+#[derive(Debug, Clone, Copy)]
+enum Asked {
+    Write { safe: InputSet },
+    Poll { block: usize },
+}
+
+#[derive(Debug, Clone, Copy)]
+struct InFlight {
+    asked: Asked,
+    since: Instant,
+}
+
+/// Whose turn it is when both a write and a poll could be sent.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Turn {
+    Write,
+    Poll,
+}
+
+#[derive(Debug, Clone)]
+pub(super) struct ModbusLink {
+    pub supervisor: Supervisor,
+    pub counters: LinkCounters,
+    client: Client,
+    /// Variables that are written here.
+    pub writes: InputSet,
+    polled: Vec<SysVar, MAX_POLLED>,
+    blocks: Vec<Block, MAX_POLL_BLOCKS>,
+    in_flight: Option<InFlight>,
+    timeouts_in_a_row: u8,
+    turn: Turn,
+    /// The next write starts at this variable, so that none waits for ever.
+    cursor: usize,
+}
+
+impl ModbusLink {
+    pub(super) fn new(unit: u8, writes: InputSet) -> Self {
+        Self {
+            supervisor: Supervisor::new(LinkTimings::TCP),
+            counters: LinkCounters::default(),
+            client: Client::new(unit),
+            writes,
+            polled: Vec::new(),
+            blocks: Vec::new(),
+            in_flight: None,
+            timeouts_in_a_row: 0,
+            turn: Turn::Write,
+            cursor: 0,
+        }
+    }
+
+    /// Polls a variable every `period`; false when there are too many. Variables must come in the
+    /// order of their Modbus places for blocks to join.
+    pub(super) fn poll_var(
+        &mut self,
+        var: SysVar,
+        period: Duration,
+        new_group: impl FnOnce() -> Option<GroupId>,
+    ) -> Option<GroupId> {
+        let (kind, first, count) = match var.modbus()? {
+            ModbusPlace::Coils { first, count } => (Kind::Coils, first, count),
+            ModbusPlace::Register { address } => (Kind::Registers, address, 1),
+            ModbusPlace::Scaled { .. } => return None,
+        };
+        self.polled.push(var).ok()?;
+        let end = first.saturating_add(count);
+        let near = self.blocks.iter_mut().find(|block| {
+            let block_end = block.first.saturating_add(block.count);
+            block.kind == kind && first >= block.first && first <= block_end.saturating_add(JOIN_GAP)
+        });
+        if let Some(block) = near {
+            let block_end = block.first.saturating_add(block.count);
+            block.count = block_end.max(end).saturating_sub(block.first);
+            if period < block.grid.period() {
+                block.grid = Grid::starting_at(Instant::ZERO, period);
+            }
+            return Some(block.group);
+        }
+        let group = new_group()?;
+        let grid = Grid::starting_at(Instant::ZERO, period);
+        self.blocks.push(Block { kind, first, count, group, grid }).ok()?;
+        Some(group)
+    }
+
+    /// The connection is up.
+    pub(super) fn up<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
+        self.timeouts_in_a_row = 0;
+        store.link_up(&self.writes);
+    }
+
+    /// The connection is gone, and with it what was under way.
+    pub(super) fn lost<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
+        self.abort(store);
+        self.client.reset();
+        store.link_lost(&self.writes);
+    }
+
+    /// Bytes from the controller.
+    pub(super) fn bytes<const PORTS: usize>(&mut self, bytes: &[u8], store: &mut Store<PORTS>, now: Instant) {
+        self.supervisor.heard(now);
+        add(&mut self.counters.bytes_in, bytes.len());
+        let mut rest = bytes;
+        while let Some(event) = self.client.receive(&mut rest) {
+            let answered = self.in_flight.take();
+            match (event, answered) {
+                (ClientEvent::Violation(_), answered) => {
+                    bump(&mut self.counters.malformed);
+                    self.in_flight = answered;
+                    self.supervisor.give_up(now);
+                    self.lost(store);
+                    return;
+                }
+                (_, None) => bump(&mut self.counters.malformed),
+                (ClientEvent::Exception(_), Some(asked)) => {
+                    bump(&mut self.counters.refused);
+                    self.counters.answered(now.saturating_since(asked.since).as_micros());
+                    self.timeouts_in_a_row = 0;
+                }
+                (ClientEvent::Response(response), Some(asked)) => {
+                    self.counters.answered(now.saturating_since(asked.since).as_micros());
+                    self.timeouts_in_a_row = 0;
+                    if let Asked::Poll { block } = asked.asked
+                        && let Some(block) = self.blocks.get(block)
+                    {
+                        take_poll(block, &self.polled, response, store, now);
+                    }
+                }
+            }
+        }
+    }
+
+    /// Looks at the clock: answers that did not come.
+    pub(super) fn advance<const PORTS: usize>(&mut self, store: &mut Store<PORTS>, now: Instant) {
+        if now < self.answer_deadline() {
+            return;
+        }
+        bump(&mut self.counters.timeouts);
+        self.abort(store);
+        self.timeouts_in_a_row = self.timeouts_in_a_row.saturating_add(1);
+        if self.timeouts_in_a_row >= TIMEOUTS_IN_A_ROW {
+            self.supervisor.give_up(now);
+            self.lost(store);
+        }
+    }
+
+    /// The next request, when one may be sent.
+    pub(super) fn next_request<const PORTS: usize>(
+        &mut self,
+        store: &mut Store<PORTS>,
+        out: &mut [u8],
+        now: Instant,
+    ) -> Option<usize> {
+        if !self.supervisor.is_up() || self.in_flight.is_some() {
+            return None;
+        }
+        let poll = self.due_block(now);
+        let pending = store.outbox.dirty().and(&self.writes);
+        let asked = match (pending.is_empty(), poll) {
+            (true, None) => return None,
+            (false, Some(_)) if self.turn == Turn::Write => self.write(&pending, store, out),
+            (false, None) => self.write(&pending, store, out),
+            (_, Some(block)) => self.poll(block, out, now),
+        };
+        let (len, asked) = asked?;
+        self.turn = match asked {
+            Asked::Write { .. } => Turn::Poll,
+            Asked::Poll { .. } => Turn::Write,
+        };
+        bump(&mut self.counters.sent);
+        self.in_flight = Some(InFlight { asked, since: now });
+        Some(len)
+    }
+
+    /// When something happens by itself.
+    pub(super) fn deadline(&self) -> Instant {
+        if self.in_flight.is_some() {
+            return self.answer_deadline();
+        }
+        if !self.supervisor.is_up() {
+            return Instant::NEVER;
+        }
+        self.blocks.iter().map(|block| block.grid.next()).min().unwrap_or(Instant::NEVER)
+    }
+
+    fn answer_deadline(&self) -> Instant {
+        self.in_flight.map_or(Instant::NEVER, |asked| asked.since + ANSWER_TIMEOUT)
+    }
+
+    /// Gives up the transaction in flight. Whether a write was carried out is not known; only safe
+    /// values are written again.
+    fn abort<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
+        self.client.abort();
+        if let Some(InFlight { asked: Asked::Write { safe }, .. }) = self.in_flight.take() {
+            store.outbox.again(&safe);
+        }
+    }
+
+    /// The block whose poll has waited longest.
+    fn due_block(&self, now: Instant) -> Option<usize> {
+        let due = self.blocks.iter().enumerate().filter(|(_, block)| block.grid.next() <= now);
+        due.min_by_key(|(_, block)| block.grid.next()).map(|(nth, _)| nth)
+    }
+
+    fn poll(&mut self, nth: usize, out: &mut [u8], now: Instant) -> Option<(usize, Asked)> {
+        let block = self.blocks.get_mut(nth)?;
+        // What was missed while a transaction was in flight is not made up for.
+        block.grid.due(now);
+        let (address, count) = (block.first, block.count);
+        let request = match block.kind {
+            Kind::Coils => Request::ReadCoils { address, count },
+            Kind::Registers => Request::ReadHolding { address, count },
+        };
+        let len = self.client.start(request, out).ok()?;
+        Some((len, Asked::Poll { block: nth }))
+    }
+
+    /// One request for the first pending variable and those that follow it without a gap.
+    fn write<const PORTS: usize>(
+        &mut self,
+        pending: &InputSet,
+        store: &mut Store<PORTS>,
+        out: &mut [u8],
+    ) -> Option<(usize, Asked)> {
+        let first = pending.iter().find(|var| var.ordinal() >= self.cursor).or(pending.iter().next())?;
+        let mut payload = [0; INPUT_BYTES];
+        let mut vars = InputSet::EMPTY;
+        let mut len = 0_usize;
+        let mut next = Some(first);
+        let (address, kind) = place_of(first)?;
+        let mut end = address;
+        while let Some(var) = next {
+            let Some((at, var_kind)) = place_of(var) else { break };
+            let full = match kind {
+                Kind::Coils => end.saturating_sub(address) >= MAX_WRITE_COILS.saturating_sub(8),
+                Kind::Registers => end.saturating_sub(address) >= MAX_WRITE_REGISTERS,
+            };
+            if !pending.contains(var) || var_kind != kind || at != end || full {
+                break;
+            }
+            let room = payload.get_mut(len..)?;
+            end = end.saturating_add(match (kind, var.modbus()) {
+                (Kind::Coils, Some(ModbusPlace::Coils { count, .. })) => {
+                    *room.first_mut()? = store.outbox.bit_value(var);
+                    count
+                }
+                _ => {
+                    store.image.value(var).encode(room)?;
+                    1
+                }
+            });
+            len = len.saturating_add(var.size());
+            vars.insert(var);
+            self.cursor = var.ordinal().saturating_add(1);
+            next = SysVar::from_ordinal(self.cursor);
+        }
+        let values = payload.get(..len)?;
+        let mut registers = [0; INPUT_BYTES];
+        let request = match kind {
+            Kind::Coils => {
+                Request::WriteCoils { address, coils: Coils::new(values, end.saturating_sub(address))? }
+            }
+            Kind::Registers => {
+                let registers = Registers::from_little_endian(values, &mut registers)?;
+                Request::WriteRegisters { address, registers }
+            }
+        };
+        let len = self.client.start(request, out).ok()?;
+        let safe = store.outbox.safe().and(&vars);
+        store.taken(&vars);
+        Some((len, Asked::Write { safe }))
+    }
+}
+
+fn place_of(var: SysVar) -> Option<(u16, Kind)> {
+    match var.modbus()? {
+        ModbusPlace::Coils { first, .. } => Some((first, Kind::Coils)),
+        ModbusPlace::Register { address } => Some((address, Kind::Registers)),
+        ModbusPlace::Scaled { .. } => None,
+    }
+}
+
+/// Puts the answer to a poll into the image.
+fn take_poll<const PORTS: usize>(
+    block: &Block,
+    polled: &[SysVar],
+    response: Response<'_>,
+    store: &mut Store<PORTS>,
+    now: Instant,
+) {
+    for &var in polled {
+        let value = match (var.modbus(), response) {
+            (Some(ModbusPlace::Coils { first, count }), Response::Coils(coils)) => {
+                (block.kind == Kind::Coils).then(|| bits_at(coils, first, count, block)).flatten()
+            }
+            (Some(ModbusPlace::Register { address }), Response::Registers(registers)) => {
+                let nth = address.checked_sub(block.first).filter(|_| block.kind == Kind::Registers);
+                nth.and_then(|nth| registers.register(nth)).map(Scalar::Word)
+            }
+            _ => None,
+        };
+        if let Some(value) = value {
+            // The table gives the variable's type, and bits beyond it were not read.
+            let _ = store.image.set(var, value);
+        }
+    }
+    store.image.stamp(block.group, now);
+}
+
+fn bits_at(coils: Coils<'_>, first: u16, count: u16, block: &Block) -> Option<Scalar> {
+    let start = first.checked_sub(block.first)?;
+    let mut bits = 0_u8;
+    for nth in 0..count.min(8) {
+        bits |= u8::from(coils.coil(start.saturating_add(nth))?).checked_shl(u32::from(nth))?;
+    }
+    Some(Scalar::Byte(bits))
+}

@@ -1,0 +1,300 @@
+//! What is still to be written to the controller.
+//!
+//! Analog values: the newest wins. Bits: every value that differs from the one before is written,
+//! in order, through a bounded queue a port (docs/architecture.md section 7). The outbox knows
+//! nothing of links; it is told which variables can be delivered at all.
+
+use heapless::Vec;
+
+use super::counters::{PortCounters, bump};
+use crate::image::InputSet;
+use crate::sysvar::SysVar;
+use crate::time::{Duration, Instant};
+
+/// Bit values that can wait behind the one that is written next, a port.
+pub const EDGE_QUEUE: usize = 16;
+
+/// Byte variables come first in the table of inputs, so their ordinals count from 0.
+pub(super) const BIT_VARS: usize = 13;
+
+#[derive(Debug, Clone, Copy)]
+struct Edge {
+    var: SysVar,
+    value: u8,
+    at: Instant,
+}
+
+/// The value of a byte variable that is written next, or was written last.
+#[derive(Debug, Clone, Copy)]
+struct BitSlot {
+    value: u8,
+    at: Instant,
+}
+
+/// The values of one port that wait behind the next ones.
+#[derive(Debug, Clone, Default)]
+pub(super) struct EdgeQueue(Vec<Edge, EDGE_QUEUE>);
+
+#[derive(Debug, Clone)]
+pub(super) struct Outbox {
+    /// Variables with a value to write.
+    dirty: InputSet,
+    /// Those of them whose value is a configured safe value: it survives a reconnect.
+    safe: InputSet,
+    bits: [BitSlot; BIT_VARS],
+}
+
+impl Outbox {
+    pub(super) const fn new() -> Self {
+        Self {
+            dirty: InputSet::EMPTY,
+            safe: InputSet::EMPTY,
+            bits: [BitSlot { value: 0, at: Instant::ZERO }; BIT_VARS],
+        }
+    }
+
+    /// Variables with a value to write.
+    pub(super) fn dirty(&self) -> InputSet {
+        self.dirty
+    }
+
+    /// Those of them whose value is a safe value.
+    pub(super) fn safe(&self) -> InputSet {
+        self.safe
+    }
+
+    /// The byte variables as they are to be written next, in table order.
+    pub(super) fn bits(&self) -> [u8; BIT_VARS] {
+        self.bits.map(|slot| slot.value)
+    }
+
+    /// The value of a byte variable that is to be written next.
+    pub(super) fn bit_value(&self, var: SysVar) -> u8 {
+        self.bits.get(var.ordinal()).map_or(0, |slot| slot.value)
+    }
+
+    /// An accepted frame brought a byte variable.
+    pub(super) fn offer_bits(
+        &mut self,
+        queue: &mut EdgeQueue,
+        counters: &mut PortCounters,
+        var: SysVar,
+        value: u8,
+        now: Instant,
+    ) {
+        let Some(slot) = self.bits.get_mut(var.ordinal()) else { return };
+        if !self.dirty.contains(var) {
+            *slot = BitSlot { value, at: now };
+            self.dirty.insert(var);
+            return;
+        }
+        // Something for this variable is already waiting: only a value that differs is an edge.
+        let full = queue.0.is_full();
+        match queue.0.iter_mut().rev().find(|edge| edge.var == var) {
+            Some(newest) if newest.value == value => newest.at = now,
+            Some(newest) if full => {
+                *newest = Edge { var, value, at: now };
+                bump(&mut counters.edges_lost);
+            }
+            None if slot.value == value => slot.at = now,
+            None if full => {
+                *slot = BitSlot { value, at: now };
+                bump(&mut counters.edges_lost);
+            }
+            _ => {
+                // Cannot fail: it is not full.
+                let _ = queue.0.push(Edge { var, value, at: now });
+            }
+        }
+        // A safe value that has not been written yet goes first and the new one follows.
+    }
+
+    /// An accepted frame brought variables that are not bits.
+    pub(super) fn offer_analog(&mut self, vars: &InputSet) {
+        self.dirty = self.dirty.or(vars);
+        self.safe = self.safe.minus(vars);
+    }
+
+    /// The owner is silent: the variable takes its safe value, in place of everything that waits.
+    /// `bits` is that value of a byte variable.
+    pub(super) fn offer_safe(&mut self, queue: &mut EdgeQueue, var: SysVar, bits: u8, now: Instant) {
+        queue.0.retain(|edge| edge.var != var);
+        if let Some(slot) = self.bits.get_mut(var.ordinal()) {
+            *slot = BitSlot { value: bits, at: now };
+        }
+        self.dirty.insert(var);
+        self.safe.insert(var);
+    }
+
+    /// A safe value whose write came to nothing is to be written again.
+    pub(super) fn again(&mut self, safe: &InputSet) {
+        self.dirty = self.dirty.or(safe);
+        self.safe = self.safe.or(safe);
+    }
+
+    /// Nothing of these variables is to be written any more, safe values excepted.
+    pub(super) fn drop_unsafe(&mut self, vars: &InputSet) {
+        self.dirty = self.dirty.minus(&vars.minus(&self.safe));
+    }
+
+    /// Nothing of the variable is to be written any more.
+    pub(super) fn drop_all(&mut self, queue: &mut EdgeQueue, var: SysVar) {
+        queue.0.retain(|edge| edge.var != var);
+        self.dirty.remove(var);
+        self.safe.remove(var);
+    }
+
+    /// Drops what has waited for longer than `timeout`; returns how many values that were.
+    pub(super) fn expire(
+        &mut self,
+        queue: &mut EdgeQueue,
+        vars: &InputSet,
+        timeout: Duration,
+        now: Instant,
+    ) -> usize {
+        let before = queue.0.len();
+        queue.0.retain(|edge| now.saturating_since(edge.at) <= timeout);
+        let mut dropped = before.saturating_sub(queue.0.len());
+        for var in self.dirty.and(vars).minus(&self.safe).iter() {
+            let Some(slot) = self.bits.get(var.ordinal()) else { break };
+            if now.saturating_since(slot.at) > timeout {
+                dropped = dropped.saturating_add(1);
+                self.taken(queue, var);
+            }
+        }
+        dropped
+    }
+
+    /// The variable's value has been handed to its link: the next one, if any, takes its place.
+    pub(super) fn taken(&mut self, queue: &mut EdgeQueue, var: SysVar) {
+        self.safe.remove(var);
+        self.dirty.remove(var);
+        let next = queue.0.iter().position(|edge| edge.var == var);
+        if let (Some(at), Some(slot)) = (next, self.bits.get_mut(var.ordinal())) {
+            let edge = queue.0.remove(at);
+            *slot = BitSlot { value: edge.value, at: edge.at };
+            self.dirty.insert(var);
+        }
+    }
+}
+
+impl EdgeQueue {
+    /// Forgets what waits for these variables.
+    pub(super) fn clear_vars(&mut self, vars: &InputSet) {
+        self.0.retain(|edge| !vars.contains(edge.var));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::sysvar::Direction;
+
+    fn var(name: &str) -> SysVar {
+        SysVar::parse(name).unwrap()
+    }
+
+    struct Bench {
+        outbox: Outbox,
+        queue: EdgeQueue,
+        counters: PortCounters,
+        now: Instant,
+    }
+
+    impl Bench {
+        fn new() -> Self {
+            let (outbox, queue) = (Outbox::new(), EdgeQueue::default());
+            Self { outbox, queue, counters: PortCounters::default(), now: Instant::ZERO }
+        }
+
+        fn offer(&mut self, var: SysVar, value: u8) {
+            self.now += Duration::from_millis(1);
+            self.outbox.offer_bits(&mut self.queue, &mut self.counters, var, value, self.now);
+        }
+
+        /// What is written, one value after the other, until nothing is left.
+        fn drain(&mut self, var: SysVar) -> std::vec::Vec<u8> {
+            let mut written = std::vec::Vec::new();
+            while self.outbox.dirty().contains(var) {
+                written.push(self.outbox.bit_value(var));
+                self.outbox.taken(&mut self.queue, var);
+            }
+            written
+        }
+    }
+
+    #[test]
+    fn the_byte_inputs_are_the_first_of_the_table() {
+        let bytes = SysVar::all().filter(|v| v.direction() == Direction::Input && v.is_bits());
+        assert!(bytes.map(|v| v.ordinal()).eq(0..BIT_VARS));
+    }
+
+    #[test]
+    fn edges_are_written_in_order_and_repeats_once() {
+        let mut bench = Bench::new();
+        let (a, b) = (var("DigitalOutputCommand[1]"), var("BitInputReg[3]"));
+        for value in [0, 1, 1, 0, 0, 1] {
+            bench.offer(a, value);
+        }
+        bench.offer(b, 7);
+        assert_eq!(bench.drain(a), [0, 1, 0, 1]);
+        assert_eq!(bench.drain(b), [7]);
+        bench.offer(a, 1);
+        assert_eq!(bench.drain(a), [1], "an unchanged value is written all the same, once");
+    }
+
+    #[test]
+    fn a_full_queue_keeps_the_newest_and_counts() {
+        let mut bench = Bench::new();
+        let a = var("DigitalOutputCommand[1]");
+        for value in 0..=30 {
+            bench.offer(a, value);
+        }
+        let written = bench.drain(a);
+        assert_eq!(written.len(), 1 + EDGE_QUEUE);
+        assert!(written.iter().copied().eq((0..=15).chain([30])));
+        assert_eq!(bench.counters.edges_lost, 14);
+    }
+
+    #[test]
+    fn a_full_queue_of_others_keeps_the_newest_too() {
+        let mut bench = Bench::new();
+        let (a, b) = (var("DigitalOutputCommand[1]"), var("BitInputReg[3]"));
+        bench.offer(b, 1);
+        for value in 0..=16 {
+            bench.offer(a, value);
+        }
+        bench.offer(b, 2);
+        assert_eq!(bench.drain(b), [2]);
+        assert_eq!(bench.counters.edges_lost, 1);
+    }
+
+    #[test]
+    fn a_safe_value_replaces_what_waits_and_survives_the_loss_of_the_link() {
+        let mut bench = Bench::new();
+        let a = var("DigitalOutputCommand[1]");
+        for value in [1, 0, 1] {
+            bench.offer(a, value);
+        }
+        bench.outbox.offer_safe(&mut bench.queue, a, 4, bench.now);
+        bench.outbox.drop_unsafe(&InputSet::from_iter([a]));
+        assert_eq!(bench.drain(a), [4]);
+        bench.offer(a, 1);
+        bench.outbox.drop_unsafe(&InputSet::from_iter([a]));
+        assert!(bench.outbox.dirty().is_empty(), "a field value does not");
+    }
+
+    #[test]
+    fn what_waited_too_long_is_dropped_and_counted() {
+        let mut bench = Bench::new();
+        let a = var("DigitalOutputCommand[1]");
+        for value in [0, 1, 0] {
+            bench.offer(a, value);
+        }
+        let set = InputSet::from_iter([a]);
+        let now = Instant::from_millis(12);
+        let dropped = bench.outbox.expire(&mut bench.queue, &set, Duration::from_millis(9), now);
+        assert_eq!(dropped, 2, "the values of 1 and 2 ms");
+        assert_eq!(bench.drain(a), [0]);
+    }
+}

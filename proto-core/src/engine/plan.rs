@@ -1,0 +1,242 @@
+//! Which way each variable goes (docs/architecture.md section 6).
+//!
+//! In: a configuration. Out: for every input variable its owner and its way up, for every variable
+//! that a port shows its source. Decided once; nothing of it changes while the engine runs.
+
+use core::fmt;
+
+use super::io::{LinkId, PortId};
+use crate::config::{GatewayConfig, Recipe, SendOn};
+use crate::image::InputSet;
+use crate::sysvar::{COUNT, Direction, INPUT_COUNT, ModbusPlace, SysVar};
+
+/// How an input variable reaches the controller.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum WayUp {
+    /// In frames of a recipe link.
+    Recipe(LinkId),
+    /// By Modbus writes.
+    Modbus,
+}
+
+/// Where a variable that a port shows comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Source {
+    /// Frames of a recipe link, each cycle.
+    Recipe(LinkId),
+    /// Modbus polls.
+    Modbus,
+    /// The 10 Hz state stream.
+    State,
+    /// An input variable as its owner last sent it.
+    Field(PortId),
+}
+
+/// The ways of all variables.
+#[derive(Debug, Clone)]
+pub struct Plan {
+    owners: [Option<PortId>; INPUT_COUNT],
+    ways: [Option<WayUp>; INPUT_COUNT],
+    sources: [Option<Source>; COUNT],
+    read_back: InputSet,
+}
+
+/// Why there is no way for a variable.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum PlanError {
+    /// Two ports claim one input variable.
+    TwoOwners {
+        /// The variable.
+        var: SysVar,
+        /// The port that claims it first.
+        first: PortId,
+        /// The other.
+        second: PortId,
+    },
+    /// Nothing that is configured can carry an input variable to the controller (D15).
+    NoWayUp {
+        /// The variable.
+        var: SysVar,
+        /// The port that claims it.
+        port: PortId,
+    },
+    /// Nothing that is configured can read a variable that a port wants to show (D15).
+    NoSource {
+        /// The variable.
+        var: SysVar,
+        /// The port that shows it.
+        port: PortId,
+    },
+    /// A recipe link's frame carries a variable that no port sends and that cannot be read back:
+    /// its value would have to be made up.
+    NobodySends {
+        /// The variable.
+        var: SysVar,
+        /// The recipe link.
+        link: LinkId,
+    },
+}
+
+impl fmt::Display for PlanError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::TwoOwners { var, first, second } => {
+                write!(f, "{var} is claimed by port {} and by port {}", first.0, second.0)
+            }
+            Self::NoWayUp { var, .. } => {
+                write!(f, "{var} can be written only through a recipe link whose input part carries it")
+            }
+            Self::NoSource { var, .. } => {
+                write!(f, "{var} can be read only through a recipe link whose output part carries it")
+            }
+            Self::NobodySends { var, .. } => {
+                write!(
+                    f,
+                    "{var} is in the recipe link's frame, but no port sends it and it cannot be read back"
+                )
+            }
+        }
+    }
+}
+
+impl core::error::Error for PlanError {}
+
+impl Plan {
+    /// The ways of all variables of a configuration.
+    ///
+    /// # Errors
+    /// [`PlanError`] names the first variable without a way.
+    pub fn new(config: &GatewayConfig) -> Result<Self, PlanError> {
+        let mut plan = Self {
+            owners: [None; INPUT_COUNT],
+            ways: [None; INPUT_COUNT],
+            sources: [None; COUNT],
+            read_back: InputSet::EMPTY,
+        };
+        for (port, recipe) in field_ports(config) {
+            for var in inputs_of(config, recipe) {
+                plan.claim(config, var, port)?;
+            }
+        }
+        for (port, recipe) in field_ports(config) {
+            for var in shown_by(config, recipe) {
+                let source = plan.find_source(config, var).ok_or(PlanError::NoSource { var, port })?;
+                if let Some(slot) = plan.sources.get_mut(var.ordinal()) {
+                    *slot = Some(source);
+                }
+            }
+        }
+        for (link, recipe) in uplinks(config) {
+            for var in inputs_of(config, recipe) {
+                if var.stream().is_some() {
+                    plan.read_back.insert(var);
+                } else if plan.owner(var).is_none() {
+                    return Err(PlanError::NobodySends { var, link });
+                }
+            }
+        }
+        Ok(plan)
+    }
+
+    /// The field port whose frames bring the variable.
+    pub fn owner(&self, var: SysVar) -> Option<PortId> {
+        self.owners.get(var.ordinal()).copied().flatten()
+    }
+
+    /// How an owned input variable reaches the controller.
+    pub fn way_up(&self, var: SysVar) -> Option<WayUp> {
+        self.ways.get(var.ordinal()).copied().flatten()
+    }
+
+    /// Where a variable that some port shows comes from.
+    pub fn source(&self, var: SysVar) -> Option<Source> {
+        self.sources.get(var.ordinal()).copied().flatten()
+    }
+
+    /// Input variables that share a recipe link's frame: their present value is read back from the
+    /// state stream for as long as no port sends them.
+    pub fn read_back(&self) -> InputSet {
+        self.read_back
+    }
+
+    /// Whether the 2001 stream is needed.
+    pub fn needs_state(&self) -> bool {
+        !self.read_back.is_empty() || self.sources.contains(&Some(Source::State))
+    }
+
+    /// Whether Modbus is needed.
+    pub fn needs_modbus(&self) -> bool {
+        self.ways.contains(&Some(WayUp::Modbus)) || self.sources.contains(&Some(Source::Modbus))
+    }
+
+    fn claim(&mut self, config: &GatewayConfig, var: SysVar, port: PortId) -> Result<(), PlanError> {
+        let Some(owner) = self.owners.get_mut(var.ordinal()) else { return Ok(()) };
+        match *owner {
+            Some(first) if first != port => return Err(PlanError::TwoOwners { var, first, second: port }),
+            _ => *owner = Some(port),
+        }
+        let way = uplinks(config)
+            .find(|&(_, recipe)| inputs_of(config, recipe).any(|v| v == var))
+            .map(|(link, _)| WayUp::Recipe(link))
+            .or_else(|| is_exact_modbus(var).then_some(WayUp::Modbus))
+            .ok_or(PlanError::NoWayUp { var, port })?;
+        if let Some(slot) = self.ways.get_mut(var.ordinal()) {
+            *slot = Some(way);
+        }
+        Ok(())
+    }
+
+    fn find_source(&self, config: &GatewayConfig, var: SysVar) -> Option<Source> {
+        if var.direction() == Direction::Input
+            && let Some(owner) = self.owner(var)
+        {
+            return Some(Source::Field(owner));
+        }
+        uplinks(config)
+            .find(|(_, recipe)| {
+                config.fields_of(recipe, Direction::Output).any(|(_, _, field)| field.variable() == Some(var))
+            })
+            .map(|(link, _)| Source::Recipe(link))
+            .or_else(|| is_exact_modbus(var).then_some(Source::Modbus))
+            .or_else(|| var.stream().map(|_| Source::State))
+    }
+}
+
+/// Whether Modbus carries the variable without loss: bits and words, not scaled floats.
+fn is_exact_modbus(var: SysVar) -> bool {
+    matches!(var.modbus(), Some(ModbusPlace::Coils { .. } | ModbusPlace::Register { .. }))
+}
+
+/// The recipe links in order of preference, each with its recipe.
+pub(super) fn uplinks(config: &GatewayConfig) -> impl Iterator<Item = (LinkId, &Recipe)> {
+    let own = config.controller.recipe_link.map(|link| (LinkId::RECIPE_UDP, link.recipe));
+    let listening = (0..)
+        .zip(&config.ports)
+        .filter(|(_, port)| !port.bus.is_field())
+        .map(|(id, port)| (LinkId::of_port(PortId(id)), port.recipe));
+    own.into_iter()
+        .chain(listening)
+        .filter_map(|(link, recipe)| Some((link, config.recipes.get(usize::from(recipe))?)))
+}
+
+fn field_ports(config: &GatewayConfig) -> impl Iterator<Item = (PortId, &Recipe)> {
+    config.field_ports().map(|(port, _, recipe)| (PortId(port), recipe))
+}
+
+/// The input variables that a recipe's input part sets.
+fn inputs_of<'a>(config: &'a GatewayConfig, recipe: &'a Recipe) -> impl Iterator<Item = SysVar> + 'a {
+    config.written_by(recipe)
+}
+
+/// The variables that a recipe's output part shows, and the one whose bit triggers it.
+pub(super) fn shown_by<'a>(
+    config: &'a GatewayConfig,
+    recipe: &'a Recipe,
+) -> impl Iterator<Item = SysVar> + 'a {
+    let trigger = match recipe.send {
+        SendOn::Rising { var, .. } => Some(var),
+        _ => None,
+    };
+    config.fields_of(recipe, Direction::Output).filter_map(|(_, _, field)| field.variable()).chain(trigger)
+}

@@ -1,0 +1,195 @@
+//! When a port sends its output part: by its cycle, on a change, by each frame, by a rising bit.
+//!
+//! The cycle keeps its phase and never bursts; cycles that could not be served are counted.
+
+use super::counters::{PortCounters, add, bump};
+use crate::config::{OnStale, SendOn};
+use crate::image::{GroupId, Image, MAX_GROUPS};
+use crate::schedule::Grid;
+use crate::sysvar::SysVar;
+use crate::time::{Duration, Instant};
+use crate::wire::scalar::Scalar;
+
+/// Some of the image's groups.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct GroupSet(u128);
+
+const _: () = assert!(MAX_GROUPS <= 128);
+
+impl GroupSet {
+    pub(super) fn insert(&mut self, group: GroupId) {
+        self.0 |= 1_u128.checked_shl(u32::from(group.0)).unwrap_or(0);
+    }
+
+    fn iter(self) -> impl Iterator<Item = GroupId> {
+        let mut left = self.0;
+        core::iter::from_fn(move || {
+            let next = left.trailing_zeros();
+            left &= left.wrapping_sub(1);
+            (next < 128).then_some(GroupId(next as u8))
+        })
+    }
+}
+
+#[derive(Debug, Clone)]
+pub(super) struct Sender {
+    on: SendOn,
+    on_stale: OnStale,
+    stale_after: Duration,
+    grid: Option<Grid>,
+    /// Where the values come from: all must be known, and fresh unless the recipe holds.
+    pub sources: GroupSet,
+    /// Frames of our own ports whose values are shown: they must be known.
+    pub shown_fields: GroupSet,
+    due: bool,
+    in_flight: bool,
+    /// The next CAN frame of a cycle that is being handed over.
+    pub next_can: usize,
+    digest: Option<u64>,
+    last_bit: Option<bool>,
+    pub frames_sent: u32,
+}
+
+impl Sender {
+    /// `has_output` is false for a recipe without an output part: nothing is ever due.
+    pub(super) fn new(
+        on: SendOn,
+        on_stale: OnStale,
+        stale_after: Duration,
+        cycle: Duration,
+        has_output: bool,
+    ) -> Self {
+        let periodic = has_output && matches!(on, SendOn::Period | SendOn::Change);
+        Self {
+            on,
+            on_stale,
+            stale_after,
+            grid: periodic.then(|| Grid::starting_at(Instant::ZERO, cycle)),
+            sources: GroupSet::default(),
+            shown_fields: GroupSet::default(),
+            due: false,
+            in_flight: false,
+            next_can: 0,
+            digest: None,
+            last_bit: None,
+            frames_sent: 0,
+        }
+    }
+
+    /// Whether a frame waits to be handed over.
+    pub(super) fn is_due(&self) -> bool {
+        self.due && !self.in_flight
+    }
+
+    /// Whether only changes are sent.
+    pub(super) fn sends_changes(&self) -> bool {
+        self.on == SendOn::Change
+    }
+
+    /// The port is gone or bus-off: what was due is not sent later.
+    pub(super) fn reset(&mut self) {
+        self.due = false;
+        self.in_flight = false;
+        self.next_can = 0;
+        self.digest = None;
+    }
+
+    /// All that was handed over has left.
+    pub(super) fn sent(&mut self) {
+        self.in_flight = false;
+    }
+
+    /// The frame, or the last CAN frame of the cycle, was handed over.
+    pub(super) fn handed_over(&mut self) {
+        self.due = false;
+        self.in_flight = true;
+        self.next_can = 0;
+        self.frames_sent = self.frames_sent.wrapping_add(1);
+    }
+
+    /// Nothing is sent this time.
+    pub(super) fn dismiss(&mut self) {
+        self.due = false;
+        self.next_can = 0;
+    }
+
+    pub(super) fn advance(&mut self, usable: bool, counters: &mut PortCounters, now: Instant) {
+        let Some(grid) = &mut self.grid else { return };
+        let Some(missed) = grid.due(now) else { return };
+        if !usable {
+            return;
+        }
+        if self.frames_sent > 0 {
+            add(&mut counters.skipped_cycles, usize::try_from(missed).unwrap_or(usize::MAX));
+        }
+        self.raise(counters);
+    }
+
+    /// An input frame was accepted.
+    pub(super) fn frame_accepted(&mut self, counters: &mut PortCounters) {
+        if self.on == SendOn::Frame {
+            self.raise(counters);
+        }
+    }
+
+    /// Values in the image changed: looks at the bit that triggers.
+    pub(super) fn image_changed(&mut self, image: &Image, counters: &mut PortCounters) {
+        let SendOn::Rising { var, bit } = self.on else { return };
+        if !image.is_known(var) {
+            return;
+        }
+        let on = bit_of(image, var, bit);
+        if on && self.last_bit == Some(false) {
+            self.raise(counters);
+        }
+        self.last_bit = Some(on);
+    }
+
+    /// Whether the values may be sent at `now`: all known, and fresh unless the recipe holds.
+    pub(super) fn may_show(&self, image: &Image, now: Instant) -> bool {
+        self.shown_fields.iter().all(|group| image.stamp_of(group).is_some())
+            && self.sources.iter().all(|group| match image.stamp_of(group) {
+                Some(at) => self.on_stale == OnStale::Hold || now.saturating_since(at) <= self.stale_after,
+                None => false,
+            })
+    }
+
+    /// Whether a frame with this digest is news to a port that sends changes only.
+    pub(super) fn is_news(&mut self, digest: u64) -> bool {
+        if self.on != SendOn::Change {
+            return true;
+        }
+        let news = self.digest != Some(digest);
+        self.digest = Some(digest);
+        news
+    }
+
+    /// When something happens by itself; `quiet_at` is when the line is ours.
+    pub(super) fn deadline(&self, quiet_at: Instant) -> Instant {
+        let cycle = self.grid.as_ref().map_or(Instant::NEVER, Grid::next);
+        if self.is_due() { cycle.min(quiet_at) } else { cycle }
+    }
+
+    fn raise(&mut self, counters: &mut PortCounters) {
+        if self.due {
+            // The frame that was due is overtaken by this one.
+            bump(&mut counters.skipped_cycles);
+        }
+        self.due = true;
+    }
+}
+
+/// FNV-1a: tells frames apart without keeping them.
+pub(super) fn digest(seed: u64, bytes: &[u8]) -> u64 {
+    bytes.iter().fold(seed, |hash, &byte| (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01B3))
+}
+
+/// Where a digest starts.
+pub(super) const DIGEST_SEED: u64 = 0xCBF2_9CE4_8422_2325;
+
+fn bit_of(image: &Image, var: SysVar, bit: u8) -> bool {
+    match image.value(var) {
+        Scalar::Byte(bits) => bits.checked_shr(u32::from(bit)).is_some_and(|bits| bits & 1 == 1),
+        _ => false,
+    }
+}

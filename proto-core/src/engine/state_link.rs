@@ -1,0 +1,78 @@
+//! The state link: the 10 Hz stream of port 2001, for what nothing faster shows.
+
+use heapless::Vec;
+
+use super::counters::{LinkCounters, add, bump};
+use super::store::Store;
+use crate::image::{GroupId, InputSet};
+use crate::link::{LinkTimings, Supervisor};
+use crate::sysvar::{COUNT, INPUT_COUNT, SysVar};
+use crate::time::{Duration, Instant};
+use crate::wire::state::{StateStream, StateView};
+
+/// A stream that is silent for this long is reopened: twenty packets are missing.
+const SILENCE: Duration = Duration::from_secs(2);
+/// Misaligned packets in a row that end the connection (D8).
+const MISALIGNED_IN_A_ROW: u32 = 3;
+
+#[derive(Debug, Clone)]
+pub(super) struct StateLink {
+    pub supervisor: Supervisor,
+    pub counters: LinkCounters,
+    pub group: GroupId,
+    stream: StateStream,
+    /// Output variables that come from here.
+    pub shown: Vec<SysVar, { COUNT - INPUT_COUNT }>,
+    /// Input variables whose present value is read back while no port sends them.
+    pub read_back: InputSet,
+}
+
+impl StateLink {
+    pub(super) fn new(group: GroupId, read_back: InputSet) -> Self {
+        Self {
+            supervisor: Supervisor::new(LinkTimings::TCP.with_silence(SILENCE)),
+            counters: LinkCounters::default(),
+            group,
+            stream: StateStream::new(),
+            shown: Vec::new(),
+            read_back,
+        }
+    }
+
+    /// The connection is gone; half a packet of it is worth nothing.
+    pub(super) fn lost(&mut self) {
+        self.stream.reset();
+    }
+
+    /// Bytes from the controller.
+    pub(super) fn bytes<const PORTS: usize>(&mut self, bytes: &[u8], store: &mut Store<PORTS>, now: Instant) {
+        self.supervisor.heard(now);
+        add(&mut self.counters.bytes_in, bytes.len());
+        let mut rest = bytes;
+        while let Some(packet) = self.stream.next_packet(&mut rest) {
+            match packet {
+                Ok(view) => {
+                    bump(&mut self.counters.received);
+                    let not_live = self.read_back.minus(&store.live);
+                    for var in self.shown.iter().copied().chain(not_live.iter()) {
+                        take(&view, var, store);
+                    }
+                    store.image.stamp(self.group, now);
+                }
+                Err(_) => bump(&mut self.counters.malformed),
+            }
+            if self.stream.misaligned_in_a_row() >= MISALIGNED_IN_A_ROW {
+                self.supervisor.give_up(now);
+                self.lost();
+                return;
+            }
+        }
+    }
+}
+
+fn take<const PORTS: usize>(view: &StateView<'_>, var: SysVar, store: &mut Store<PORTS>) {
+    if let Some(value) = view.read_var(var) {
+        // A float that is not finite keeps the value before.
+        let _ = store.image.set(var, value);
+    }
+}

@@ -1,0 +1,219 @@
+//! A recipe link: the controller's own recipe port, the fast way up and down.
+//!
+//! What goes up is whole frames, so every variable in them needs a value that somebody sent or
+//! that was read back (docs/architecture.md section 7). What comes down goes into the image.
+
+use super::counters::{LinkCounters, add, bump};
+use super::io::{LinkId, LinkKind};
+use super::outbox::BIT_VARS;
+use super::store::Store;
+use crate::image::{GroupId, InputSet};
+use crate::link::Supervisor;
+use crate::recipe::deframer::{Deframer, datagram};
+use crate::recipe::model::Framing;
+use crate::recipe::stream::StreamLayout;
+use crate::time::{Duration, Instant};
+
+/// How old a read-back value may be and still go into a frame.
+const READ_BACK_MAX_AGE: Duration = Duration::from_millis(500);
+/// The UDP server streams to whoever sent it something (D24); asked again when nothing comes.
+const GREET_EVERY: Duration = Duration::from_millis(500);
+
+#[derive(Debug, Clone)]
+pub(super) struct Uplink {
+    pub id: LinkId,
+    pub kind: LinkKind,
+    pub supervisor: Supervisor,
+    pub counters: LinkCounters,
+    framing: Framing,
+    input: Option<StreamLayout>,
+    output: Option<StreamLayout>,
+    deframer: Deframer,
+    /// Variables in the frames up.
+    pub set: InputSet,
+    /// What the frames down bring.
+    pub group: Option<GroupId>,
+    busy: bool,
+    greet_at: Instant,
+}
+
+impl Uplink {
+    pub(super) fn new(
+        id: LinkId,
+        kind: LinkKind,
+        supervisor: Supervisor,
+        input: Option<StreamLayout>,
+        output: Option<StreamLayout>,
+        set: InputSet,
+        group: Option<GroupId>,
+    ) -> Self {
+        let framing = match kind {
+            LinkKind::RecipeTcpListen { .. } => Framing::Bytes,
+            _ => Framing::Datagram,
+        };
+        Self {
+            id,
+            kind,
+            supervisor,
+            counters: LinkCounters::default(),
+            framing,
+            input,
+            output,
+            deframer: Deframer::new(),
+            set,
+            group,
+            busy: false,
+            greet_at: Instant::NEVER,
+        }
+    }
+
+    pub(super) fn up<const PORTS: usize>(&mut self, store: &mut Store<PORTS>, now: Instant) {
+        self.busy = false;
+        store.link_up(&self.set);
+        self.greet_at = if self.greets() { now } else { Instant::NEVER };
+    }
+
+    pub(super) fn lost<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
+        self.busy = false;
+        self.greet_at = Instant::NEVER;
+        self.deframer.discard();
+        store.link_lost(&self.set);
+    }
+
+    /// The transport took everything.
+    pub(super) fn sent(&mut self) {
+        self.busy = false;
+    }
+
+    /// Bytes, or one datagram, from the controller.
+    pub(super) fn bytes<const PORTS: usize>(&mut self, bytes: &[u8], store: &mut Store<PORTS>, now: Instant) {
+        add(&mut self.counters.bytes_in, bytes.len());
+        self.supervisor.heard(now);
+        let (Some(layout), Some(group)) = (&self.output, self.group) else { return };
+        let mut newest = false;
+        let mut take = |payload: &[u8]| {
+            newest = layout.apply(payload, store.image.bytes_mut()).is_ok();
+            newest
+        };
+        match self.framing {
+            Framing::Datagram => {
+                if datagram(layout, bytes).is_ok_and(&mut take) {
+                    bump(&mut self.counters.received);
+                } else {
+                    bump(&mut self.counters.malformed);
+                }
+            }
+            Framing::Bytes => {
+                let mut rest = bytes;
+                while let Some(payload) = self.deframer.next_frame(layout, &mut rest) {
+                    let counter = if take(payload) {
+                        &mut self.counters.received
+                    } else {
+                        &mut self.counters.malformed
+                    };
+                    bump(counter);
+                }
+                self.counters.resync_bytes = self.deframer.stats().skipped_bytes as u32;
+            }
+        }
+        if newest {
+            store.image.stamp(group, now);
+            if self.greets() {
+                self.greet_at = now + GREET_EVERY;
+            }
+        }
+    }
+
+    /// What can be sent now: a frame with new values, or a greeting.
+    pub(super) fn next_frame<const PORTS: usize>(
+        &mut self,
+        store: &mut Store<PORTS>,
+        state: Option<GroupId>,
+        out: &mut [u8],
+        now: Instant,
+    ) -> Option<usize> {
+        if !self.supervisor.is_up() || self.busy {
+            return None;
+        }
+        let wanted = !store.outbox.dirty().and(&self.set).is_empty();
+        let len = match &self.input {
+            Some(layout) if wanted && self.is_ready(store, state, now) => {
+                let len = encode(layout, store, out)?;
+                store.taken(&self.set);
+                bump(&mut self.counters.sent);
+                if self.greets() {
+                    self.greet_at = self.greet_at.max(now + GREET_EVERY);
+                }
+                len
+            }
+            _ if now >= self.greet_at => {
+                self.greet_at = now + GREET_EVERY;
+                self.greeting(out)?
+            }
+            _ => return None,
+        };
+        self.busy = true;
+        Some(len)
+    }
+
+    /// When the link wants to send by itself.
+    pub(super) fn deadline(&self) -> Instant {
+        if self.busy { Instant::NEVER } else { self.greet_at }
+    }
+
+    /// Whether every variable of the frame has a value that somebody sent or that was just read.
+    pub(super) fn is_ready<const PORTS: usize>(
+        &self,
+        store: &Store<PORTS>,
+        state: Option<GroupId>,
+        now: Instant,
+    ) -> bool {
+        let others = self.set.minus(&store.live);
+        if others.is_empty() {
+            return true;
+        }
+        let read_back = state
+            .and_then(|group| store.image.stamp_of(group))
+            .is_some_and(|at| now.saturating_since(at) <= READ_BACK_MAX_AGE);
+        others.iter().all(|var| match var.stream() {
+            Some(_) => read_back,
+            // Never read back: only held values of an owner that has fallen silent may be repeated.
+            None => store.image.is_known(var),
+        })
+    }
+
+    /// Whether the controller has to be asked for its frames.
+    fn greets(&self) -> bool {
+        self.kind == LinkKind::RecipeUdp && self.output.is_some()
+    }
+
+    /// A datagram that cannot be a frame.
+    fn greeting(&self, out: &mut [u8]) -> Option<usize> {
+        let is_frame = |len| self.input.as_ref().is_some_and(|layout| layout.frame_len() == len);
+        let len = if is_frame(1) { 2 } else { 1 };
+        out.get_mut(..len)?.fill(0);
+        Some(len)
+    }
+}
+
+/// The frame with byte variables as they are to be written next, not as they were received last.
+fn encode<const PORTS: usize>(
+    layout: &StreamLayout,
+    store: &mut Store<PORTS>,
+    out: &mut [u8],
+) -> Option<usize> {
+    let newest: [u8; BIT_VARS] = *store.image.bytes().first_chunk()?;
+    let dirty = store.outbox.dirty();
+    let mut next = newest;
+    for (slot, (value, var)) in
+        next.iter_mut().zip(store.outbox.bits().into_iter().zip(InputSet::BYTES.iter()))
+    {
+        if dirty.contains(var) {
+            *slot = value;
+        }
+    }
+    *store.image.bytes_mut().first_chunk_mut()? = next;
+    let encoded = layout.encode(store.image.bytes(), out);
+    *store.image.bytes_mut().first_chunk_mut()? = newest;
+    encoded.ok()
+}

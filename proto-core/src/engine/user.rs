@@ -1,0 +1,111 @@
+//! What the gateway does with the fields of user-defined recipes: the bindings, compiled.
+
+use heapless::Vec;
+
+use super::command_link::CommandLink;
+use super::field_port::ReplyCode;
+use crate::config::OutputBinding;
+use crate::image::{Image, bind_to_variable, saturate_to_field};
+use crate::recipe::model::MAX_FIELDS;
+use crate::sysvar::SysVar;
+use crate::wire::scalar::{Scalar, ScalarType};
+
+/// What a received value does.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum InputBind {
+    Unused,
+    Variable {
+        var: SysVar,
+        scale: f32,
+        offset: f32,
+    },
+    /// Index of a command field of the command link.
+    Command(u8),
+}
+
+impl InputBind {
+    /// The variable and what the received value makes of it; `None` when it does not fit or the
+    /// binding is to no variable.
+    pub(super) fn bound(&self, value: Scalar) -> Option<(SysVar, Scalar)> {
+        match *self {
+            Self::Variable { var, scale, offset } => {
+                bind_to_variable(var, value, scale, offset).map(|bound| (var, bound))
+            }
+            _ => None,
+        }
+    }
+}
+
+/// Whether every value fits the variable it is bound to (D22).
+pub(super) fn fit(bindings: &[InputBind], values: impl Iterator<Item = Scalar>) -> bool {
+    bindings.iter().zip(values).all(|(binding, value)| match binding {
+        InputBind::Variable { .. } => binding.bound(value).is_some(),
+        _ => true,
+    })
+}
+
+/// After silence the next values pick no commands: they only set the base.
+pub(super) fn forget_commands(bindings: &[InputBind], commands: &mut Option<CommandLink>) {
+    let Some(link) = commands else { return };
+    for binding in bindings {
+        if let InputBind::Command(field) = binding {
+            link.forget(*field);
+        }
+    }
+}
+
+/// A field of an output part: its type, and where its value comes from.
+pub(super) type OutputBind = (ScalarType, OutputBinding);
+
+/// The values of the fields.
+pub(super) fn values(
+    bindings: &[OutputBind],
+    image: &Image,
+    frames_sent: u32,
+    reply: ReplyCode,
+) -> Vec<Scalar, MAX_FIELDS> {
+    let values = bindings.iter().map(|&(ty, from)| match from {
+        OutputBinding::Variable { var, scale, offset } => {
+            saturate_to_field(ty, image.value(var).as_f64(), scale, offset)
+        }
+        OutputBinding::Constant(value) => saturate_to_field(ty, value, 1.0, 0.0),
+        OutputBinding::Counter => wrapping_count(ty, frames_sent),
+        OutputBinding::Reply => saturate_to_field(ty, f64::from(reply as u8), 1.0, 0.0),
+    });
+    // A part has no more fields than there is room for.
+    values.take(MAX_FIELDS).collect()
+}
+
+/// The bindings of all ports; ports name ranges of it.
+#[derive(Debug, Clone)]
+pub(super) struct Bindings<const FIELDS: usize> {
+    pub inputs: Vec<InputBind, FIELDS>,
+    pub outputs: Vec<OutputBind, FIELDS>,
+}
+
+/// The count as a field counts: it wraps where the type does.
+fn wrapping_count(ty: ScalarType, count: u32) -> Scalar {
+    match ty {
+        ScalarType::Byte => Scalar::Byte(count as u8),
+        ScalarType::Char => Scalar::Char((count & 0x7F) as i8),
+        ScalarType::Word => Scalar::Word(count as u16),
+        ScalarType::Short => Scalar::Short((count & 0x7FFF) as i16),
+        ScalarType::Dword => Scalar::Dword(count),
+        ScalarType::Int => Scalar::Int((count & 0x7FFF_FFFF) as i32),
+        ScalarType::Float => Scalar::Float((count & 0x00FF_FFFF) as f32),
+        ScalarType::Double => Scalar::Double(f64::from(count)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_counter_wraps_in_its_field_and_never_turns_negative() {
+        assert_eq!(wrapping_count(ScalarType::Byte, 256), Scalar::Byte(0));
+        assert_eq!(wrapping_count(ScalarType::Char, 128), Scalar::Char(0));
+        assert_eq!(wrapping_count(ScalarType::Short, 0x8001), Scalar::Short(1));
+        assert_eq!(wrapping_count(ScalarType::Float, 0x0100_0001), Scalar::Float(1.0));
+    }
+}

@@ -1,0 +1,395 @@
+//! One engine in virtual time, with a controller and devices that do what a test says.
+#![allow(dead_code, unreachable_pub, reason = "each test binary uses its own part of the rig")]
+
+use std::collections::BTreeSet;
+
+use heapless::{String, Vec as Bounded};
+use proto_core::config::*;
+use proto_core::engine::{Engine, Input, LinkId, OUTPUT_BUFFER, Output, PortCounters, PortId};
+use proto_core::modbus::adu::MAX_ADU;
+use proto_core::modbus::server::{RegisterBank, Server};
+use proto_core::modbus::{Coils, Exception, Registers};
+use proto_core::recipe::CanFrame;
+use proto_core::recipe::model::{CanId, Mode};
+use proto_core::sysvar::{SysVar, VarRange};
+use proto_core::time::{Duration, Instant};
+use proto_core::wire::scalar::ScalarType;
+
+pub fn var(name: &str) -> SysVar {
+    SysVar::parse(name).unwrap()
+}
+
+pub const MS: fn(u64) -> Duration = Duration::from_millis;
+
+/// Builds configurations in a few words.
+pub struct Cell(pub GatewayConfig);
+
+impl Cell {
+    pub fn new() -> Self {
+        Self(GatewayConfig {
+            controller: ControllerLink {
+                address: String::new(),
+                dialect: String::try_from("v2.3").unwrap(),
+                command_port: 2000,
+                state_port: 2001,
+                modbus_port: 502,
+                recipe_link: None,
+            },
+            recipes: Bounded::new(),
+            ports: Bounded::new(),
+            fields: Bounded::new(),
+            commands: Bounded::new(),
+            safe_values: Bounded::new(),
+        })
+    }
+
+    pub fn fields(&mut self, fields: impl IntoIterator<Item = FieldSpec>) -> Span {
+        let start = self.0.fields.len() as u16;
+        self.0.fields.extend(fields);
+        Span { start, len: self.0.fields.len() as u16 - start }
+    }
+
+    pub fn system(&mut self, names: &[&str]) -> Span {
+        let vars = names.iter().flat_map(|name| VarRange::parse(name).unwrap().iter());
+        let fields: Vec<_> = vars.map(FieldSpec::System).collect();
+        self.fields(fields)
+    }
+
+    pub fn part(&mut self, head: &[u8], tail: &[u8], fields: Span) -> Option<StreamPart> {
+        let bytes = |bytes| Delimiter::from_slice(bytes).unwrap();
+        Some(StreamPart { head: bytes(head), tail: bytes(tail), fields })
+    }
+
+    pub fn recipe(&mut self, mode: Mode, parts: Parts) -> u8 {
+        let index = self.0.recipes.len() as u8;
+        let name = Name::try_from(format!("recipe{index}").as_str()).unwrap();
+        let recipe = Recipe { name, mode, parts, on_stale: OnStale::Hold, send: SendOn::Period };
+        self.0.recipes.push(recipe).unwrap();
+        index
+    }
+
+    /// A realtime stream recipe with the specification's heads and tails.
+    pub fn stream(&mut self, input: &[&str], output: &[&str]) -> u8 {
+        let input = match input {
+            [] => None,
+            names => {
+                let fields = self.system(names);
+                self.part(&[255, 255], &[238, 238], fields)
+            }
+        };
+        let output = match output {
+            [] => None,
+            names => {
+                let fields = self.system(names);
+                self.part(&[255, 255], &[254, 254], fields)
+            }
+        };
+        self.recipe(Mode::Realtime, Parts::Stream { input, output })
+    }
+
+    pub fn can(&mut self, input: &[(u16, &[&str])], output: &[(u16, &[&str])]) -> u8 {
+        let mut frames = |frames: &[(u16, &[&str])]| {
+            let frames = frames
+                .iter()
+                .map(|&(id, names)| CanFramePart { id: CanId::Standard(id), fields: self.system(names) });
+            frames.collect()
+        };
+        let (input, output) = (frames(input), frames(output));
+        self.recipe(Mode::Realtime, Parts::Can { input, output })
+    }
+
+    pub fn last_recipe(&mut self) -> &mut Recipe {
+        self.0.recipes.last_mut().unwrap()
+    }
+
+    pub fn last_port(&mut self) -> &mut Port {
+        self.0.ports.last_mut().unwrap()
+    }
+
+    pub fn port(&mut self, bus: Bus, recipe: u8) -> PortId {
+        let index = self.0.ports.len() as u8;
+        let name = Name::try_from(format!("port{index}").as_str()).unwrap();
+        let on_timeout = Span { start: self.0.safe_values.len() as u16, len: 0 };
+        let (cycle, timeout, stale_after) = (MS(4), MS(100), MS(500));
+        let port = Port { name, bus, recipe, cycle, timeout, on_timeout, stale_after };
+        self.0.ports.push(port).unwrap();
+        PortId(index)
+    }
+
+    pub fn rs485(&mut self, recipe: u8) -> PortId {
+        let line = Rs485 {
+            baud: 115_200,
+            parity: Parity::None,
+            stop_bits: 1,
+            idle_gap: MS(50),
+            turnaround: Duration::ZERO,
+        };
+        self.port(Bus::Rs485(line), recipe)
+    }
+
+    pub fn can_port(&mut self, recipe: u8) -> PortId {
+        self.port(Bus::Can { bitrate: 500_000 }, recipe)
+    }
+
+    pub fn recipe_link(&mut self, recipe: u8) {
+        self.0.controller.recipe_link = Some(RecipeLink { udp_port: 2011, recipe });
+    }
+
+    pub fn safe(&mut self, name: &str, value: f64) {
+        let var = var(name);
+        let value = proto_core::wire::scalar::Scalar::from_f64(var.ty(), value).unwrap();
+        self.0.safe_values.push(SafeValue { var, value }).unwrap();
+        self.last_port().on_timeout.len += 1;
+    }
+
+    pub fn commands(&mut self, entries: &[(i64, &str)]) -> Span {
+        let start = self.0.commands.len() as u16;
+        for &(value, text) in entries {
+            let text = String::try_from(text).unwrap();
+            self.0.commands.push(CommandEntry { value, text }).unwrap();
+        }
+        Span { start, len: entries.len() as u16 }
+    }
+
+    pub fn rig(&self) -> Rig {
+        Rig::new(&self.0)
+    }
+}
+
+pub fn user_in(ty: ScalarType, to: InputBinding) -> FieldSpec {
+    FieldSpec::UserInput { ty, to }
+}
+
+pub fn user_out(ty: ScalarType, from: OutputBinding) -> FieldSpec {
+    FieldSpec::UserOutput { ty, from }
+}
+
+/// What the controller's Modbus server was told.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Written {
+    Coils(u16, Vec<bool>),
+    Registers(u16, Vec<u16>),
+}
+
+/// The controller's Modbus map, as far as a test needs it.
+pub struct Map {
+    pub coils: [bool; 232],
+    pub registers: [u16; 118],
+    pub written: Vec<Written>,
+    pub exception: Option<Exception>,
+}
+
+impl RegisterBank for Map {
+    fn read_coils(&self, address: u16, count: u16, packed: &mut [u8]) -> Result<(), Exception> {
+        let wanted = self.coils.get(usize::from(address)..usize::from(address + count));
+        let coils = wanted.ok_or(Exception::IllegalDataAddress)?;
+        for (nth, &on) in coils.iter().enumerate() {
+            packed[nth / 8] |= u8::from(on) << (nth % 8);
+        }
+        Ok(())
+    }
+
+    fn write_coils(&mut self, address: u16, coils: Coils<'_>) -> Result<(), Exception> {
+        if let Some(exception) = self.exception {
+            return Err(exception);
+        }
+        let values: Vec<bool> = coils.iter().collect();
+        self.coils[usize::from(address)..][..values.len()].copy_from_slice(&values);
+        self.written.push(Written::Coils(address, values));
+        Ok(())
+    }
+
+    fn read_holding(&self, address: u16, words: &mut [[u8; 2]]) -> Result<(), Exception> {
+        for (word, value) in words.iter_mut().zip(&self.registers[usize::from(address)..]) {
+            *word = value.to_be_bytes();
+        }
+        Ok(())
+    }
+
+    fn write_holding(&mut self, address: u16, registers: Registers<'_>) -> Result<(), Exception> {
+        if let Some(exception) = self.exception {
+            return Err(exception);
+        }
+        let values: Vec<u16> = registers.iter().collect();
+        self.registers[usize::from(address)..][..values.len()].copy_from_slice(&values);
+        self.written.push(Written::Registers(address, values));
+        Ok(())
+    }
+}
+
+/// What the engine handed over.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Out {
+    Port(PortId, Vec<u8>),
+    Can(PortId, CanFrame),
+    Open(LinkId),
+    Close(LinkId),
+    Link(LinkId, Vec<u8>),
+}
+
+pub struct Rig {
+    pub engine: Box<Engine>,
+    pub now: Instant,
+    pub wake: Instant,
+    pub map: Map,
+    server: Server,
+    /// Links that come up as soon as they are opened.
+    pub reachable: BTreeSet<u8>,
+    /// Whether Modbus requests are answered at once.
+    pub modbus_answers: bool,
+    /// Whether ports and links report at once that everything was sent.
+    pub reports_sent: bool,
+    /// Everything handed over since the last look.
+    pub log: Vec<(Instant, Out)>,
+}
+
+impl Rig {
+    pub fn new(config: &GatewayConfig) -> Self {
+        let engine = Engine::new(config).unwrap_or_else(|error| panic!("{error}: {error:?}"));
+        let map = Map { coils: [false; 232], registers: [0; 118], written: Vec::new(), exception: None };
+        let mut rig = Self {
+            engine: Box::new(engine),
+            now: Instant::from_millis(1_000_001),
+            wake: Instant::ZERO,
+            map,
+            server: Server::new(),
+            reachable: (0..16).collect(),
+            modbus_answers: true,
+            reports_sent: true,
+            log: Vec::new(),
+        };
+        let ports: Vec<_> = rig.engine.field_ports().collect();
+        for port in ports {
+            rig.input(Input::PortUp { port });
+        }
+        rig
+    }
+
+    /// One input, and everything that follows from it at this instant.
+    pub fn input(&mut self, input: Input<'_>) {
+        self.engine.handle(self.now, input);
+        self.drain();
+    }
+
+    pub fn bytes(&mut self, port: PortId, bytes: &[u8]) {
+        self.input(Input::PortBytes { port, bytes });
+    }
+
+    pub fn can(&mut self, port: PortId, id: u16, data: &[u8]) {
+        let frame = CanFrame::new(CanId::Standard(id), data).unwrap();
+        self.input(Input::PortCan { port, frame });
+    }
+
+    pub fn link_bytes(&mut self, link: LinkId, bytes: &[u8]) {
+        self.input(Input::LinkBytes { link, bytes });
+    }
+
+    /// Time passes; the engine is called whenever it asked to be.
+    pub fn run(&mut self, span: Duration) {
+        let end = self.now + span;
+        while self.wake <= end {
+            self.now = self.wake.max(self.now);
+            let before = self.wake;
+            self.input(Input::Tick);
+            assert!(self.wake > self.now, "asked to be called at once again: {before:?} {:?}", self.wake);
+        }
+        self.now = end;
+    }
+
+    #[track_caller]
+    pub fn counters(&self, port: PortId) -> PortCounters {
+        *self.engine.port_counters(port).unwrap()
+    }
+
+    #[track_caller]
+    pub fn link(&self, id: LinkId) -> proto_core::engine::LinkInfo<'_> {
+        self.engine.links().find(|link| link.id == id).expect("the plan needs this link")
+    }
+
+    /// What was handed over to one port since the last call of this kind.
+    pub fn sent_to(&mut self, port: PortId) -> Vec<Vec<u8>> {
+        self.take(|out| match out {
+            Out::Port(to, bytes) if *to == port => Some(bytes.clone()),
+            _ => None,
+        })
+    }
+
+    pub fn can_sent_to(&mut self, port: PortId) -> Vec<CanFrame> {
+        self.take(|out| match out {
+            Out::Can(to, frame) if *to == port => Some(*frame),
+            _ => None,
+        })
+    }
+
+    pub fn sent_on(&mut self, link: LinkId) -> Vec<Vec<u8>> {
+        self.take(|out| match out {
+            Out::Link(to, bytes) if *to == link => Some(bytes.clone()),
+            _ => None,
+        })
+    }
+
+    pub fn take<T>(&mut self, pick: impl Fn(&Out) -> Option<T>) -> Vec<T> {
+        let picked = self.log.iter().filter_map(|(_, out)| pick(out)).collect();
+        self.log.retain(|(_, out)| pick(out).is_none());
+        picked
+    }
+
+    pub fn take_written(&mut self) -> Vec<Written> {
+        std::mem::take(&mut self.map.written)
+    }
+
+    fn drain(&mut self) {
+        let mut buf = [0xA5; OUTPUT_BUFFER];
+        // Far more than one input can lead to: what never ends is a bug.
+        for _ in 0..10_000 {
+            let out = match self.engine.poll_output(self.now, &mut buf) {
+                Output::Sleep { until } => {
+                    self.wake = until;
+                    return;
+                }
+                Output::PortSend { port, bytes } => Out::Port(port, bytes.to_vec()),
+                Output::PortSendCan { port, frame } => Out::Can(port, frame),
+                Output::LinkOpen { link } => Out::Open(link),
+                Output::LinkClose { link } => Out::Close(link),
+                Output::LinkSend { link, bytes } => Out::Link(link, bytes.to_vec()),
+            };
+            self.log.push((self.now, out.clone()));
+            self.react(out);
+        }
+        panic!("the engine does not come to rest");
+    }
+
+    fn react(&mut self, out: Out) {
+        match out {
+            Out::Open(link) if self.reachable.contains(&link.0) => {
+                self.engine.handle(self.now, Input::LinkUp { link });
+            }
+            Out::Open(link) => self.engine.handle(self.now, Input::LinkDown { link }),
+            Out::Close(_) => {}
+            Out::Port(port, _) | Out::Can(port, _) if self.reports_sent => {
+                self.engine.handle(self.now, Input::PortSent { port });
+            }
+            Out::Link(link, bytes) => {
+                if link == LinkId::MODBUS && self.modbus_answers {
+                    let answer = self.answer(&bytes);
+                    self.engine.handle(self.now, Input::LinkBytes { link, bytes: &answer });
+                }
+                if self.reports_sent {
+                    self.engine.handle(self.now, Input::LinkSent { link });
+                }
+            }
+            _ => {}
+        }
+    }
+
+    /// What the controller's Modbus server answers.
+    pub fn answer(&mut self, request: &[u8]) -> Vec<u8> {
+        let mut rest = request;
+        let mut answers = Vec::new();
+        let mut out = [0; MAX_ADU];
+        while let Some(answer) = self.server.receive(&mut rest, &mut self.map, &mut out) {
+            answers.extend_from_slice(&out[..answer.unwrap()]);
+        }
+        answers
+    }
+}
