@@ -4,9 +4,11 @@
 //! Bounded and plain: names are kept for messages, everything else is numbers. Nothing here has
 //! been checked until [`GatewayConfig::validate`] said so.
 
+mod budget;
 mod error;
 mod validate;
 
+pub use budget::{PartBudget, Warning, can_frame_time};
 pub use error::{ConfigError, ConfigErrorKind, ControllerKey, Place, PortKey, RecipeKey};
 pub use validate::{MAX_LINE_TIME, MAX_TIME, MIN_CYCLE, check_bitrate, check_cycle};
 

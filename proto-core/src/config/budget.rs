@@ -1,0 +1,220 @@
+//! How long frames take on a line, and what that says about a configuration that is valid but may
+//! not do what was meant.
+//!
+//! In: a configuration. Out: times, and [`Warning`]s. Nothing here refuses anything.
+
+use core::fmt;
+
+use super::{Bus, GatewayConfig, Parity, Parts, Port, Recipe, Rs485, Span};
+use crate::recipe::model::CanId;
+use crate::sysvar::{Direction, SysVar};
+use crate::time::Duration;
+
+impl Rs485 {
+    /// Bits of one byte on the line: start, data, parity, stop.
+    pub fn bits_per_byte(&self) -> u32 {
+        let parity = if self.parity == Parity::None { 0 } else { 1 };
+        9_u32.saturating_add(parity).saturating_add(u32::from(self.stop_bits))
+    }
+
+    /// How long `bytes` take on the line, rounded up to the microsecond.
+    pub fn line_time(&self, bytes: usize) -> Duration {
+        let bits = (bytes as u64).saturating_mul(u64::from(self.bits_per_byte()));
+        bits_time(bits, self.baud)
+    }
+}
+
+/// How long a data frame of `len` bytes takes on a CAN bus in the worst case of bit stuffing, with
+/// the space between frames.
+pub fn can_frame_time(id: CanId, len: usize, bitrate: u32) -> Duration {
+    let data = (len as u64).saturating_mul(8);
+    // Of the frame's bits these can be stuffed, and those cannot (delimiters, end, space).
+    let (stuffed, fixed) = match id {
+        CanId::Standard(_) => (data.saturating_add(34), 13_u64),
+        CanId::Extended(_) => (data.saturating_add(54), 13_u64),
+    };
+    let stuff = stuffed.saturating_sub(1) / 4;
+    bits_time(stuffed.saturating_add(fixed).saturating_add(stuff), bitrate)
+}
+
+fn bits_time(bits: u64, per_second: u32) -> Duration {
+    Duration::from_micros(bits.saturating_mul(1_000_000).div_ceil(u64::from(per_second.max(1))))
+}
+
+/// What a recipe's part takes on a port's line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct PartBudget {
+    /// Frames: 1 in a stream part.
+    pub frames: usize,
+    /// Bytes of all frames, with heads and tails; on CAN, of their data.
+    pub bytes: usize,
+    /// Time of all frames on the line; zero where there is no line.
+    pub time: Duration,
+}
+
+impl GatewayConfig {
+    /// What a part of the port's recipe takes on its line; `None` when there is no such part.
+    pub fn budget(&self, port: &Port, part: Direction) -> Option<PartBudget> {
+        let recipe = self.recipes.get(usize::from(port.recipe))?;
+        let bytes_of = |span: Span| {
+            span.of(&self.fields).iter().map(|field| field.field().ty().size()).fold(0, usize::saturating_add)
+        };
+        match &recipe.parts {
+            Parts::Stream { input, output } => {
+                let part = if part == Direction::Input { input } else { output }.as_ref()?;
+                let bytes =
+                    bytes_of(part.fields).saturating_add(part.head.len()).saturating_add(part.tail.len());
+                let time = match &port.bus {
+                    Bus::Rs485(line) => line.line_time(bytes),
+                    _ => Duration::ZERO,
+                };
+                Some(PartBudget { frames: 1, bytes, time })
+            }
+            Parts::Can { input, output } => {
+                let frames = if part == Direction::Input { input } else { output };
+                let mut budget = PartBudget { frames: frames.len(), ..PartBudget::default() };
+                for frame in frames {
+                    let bytes = bytes_of(frame.fields);
+                    budget.bytes = budget.bytes.saturating_add(bytes);
+                    if let Bus::Can { bitrate } = port.bus {
+                        budget.time = budget.time + can_frame_time(frame.id, bytes, bitrate);
+                    }
+                }
+                (budget.frames > 0).then_some(budget)
+            }
+        }
+    }
+
+    /// The shortest cycle in which the port's output fits its line (D20); on RS-485 with the
+    /// silence before it.
+    pub fn shortest_cycle(&self, port: &Port) -> Duration {
+        let time = self.budget(port, Direction::Output).map_or(Duration::ZERO, |budget| budget.time);
+        match &port.bus {
+            Bus::Rs485(line) if time > Duration::ZERO => time + line.turnaround,
+            _ => time,
+        }
+    }
+
+    /// What is allowed but may not do what was meant.
+    pub fn warnings(&self) -> impl Iterator<Item = Warning> + '_ {
+        self.slow_ports().chain(self.read_back()).chain(self.unused_recipes())
+    }
+
+    fn slow_ports(&self) -> impl Iterator<Item = Warning> + '_ {
+        (0..).zip(&self.ports).filter_map(|(port, config)| {
+            let shortest = self.shortest_cycle(config);
+            (shortest > config.cycle).then_some(Warning::DoesNotFit { port, cycle: config.cycle, shortest })
+        })
+    }
+
+    fn read_back(&self) -> impl Iterator<Item = Warning> + '_ {
+        self.upstream_recipes().flat_map(move |(index, recipe)| {
+            self.written_by(recipe)
+                .filter(|&var| !self.is_owned(var))
+                .map(move |var| Warning::ReadBack { recipe: index, var })
+        })
+    }
+
+    fn is_owned(&self, var: SysVar) -> bool {
+        self.field_ports().any(|(_, _, recipe)| self.written_by(recipe).any(|owned| owned == var))
+    }
+
+    fn unused_recipes(&self) -> impl Iterator<Item = Warning> + '_ {
+        let is_used = |index: u8| {
+            self.ports.iter().any(|port| port.recipe == index)
+                || self.controller.recipe_link.is_some_and(|link| link.recipe == index)
+        };
+        (0..)
+            .zip(&self.recipes)
+            .filter_map(move |(recipe, _)| (!is_used(recipe)).then_some(Warning::Unused { recipe }))
+    }
+
+    /// `warning` with the names of its recipes and ports.
+    pub fn describe_warning(&self, warning: Warning) -> impl fmt::Display + '_ {
+        DescribedWarning { config: self, warning }
+    }
+}
+
+/// Something that is allowed but may not do what was meant. Numbers are indices, from 0.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Warning {
+    /// A port's output does not fit its cycle on its line (D20): it is sent back to back, and
+    /// cycles are skipped.
+    DoesNotFit {
+        /// The port.
+        port: u8,
+        /// Its cycle.
+        cycle: Duration,
+        /// The shortest in which the output fits.
+        shortest: Duration,
+    },
+    /// A way up carries a variable that no port writes: it is read back from the state stream and
+    /// sent on, so that what others write to it may be undone for as long as that takes.
+    ReadBack {
+        /// The recipe of the way up.
+        recipe: u8,
+        /// The variable.
+        var: SysVar,
+    },
+    /// Nothing uses a recipe.
+    Unused {
+        /// The recipe.
+        recipe: u8,
+    },
+}
+
+struct DescribedWarning<'a> {
+    config: &'a GatewayConfig,
+    warning: Warning,
+}
+
+impl fmt::Display for DescribedWarning<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let recipe_name =
+            |index| self.config.recipes.get(usize::from(index)).map_or("", |recipe: &Recipe| &recipe.name);
+        match self.warning {
+            Warning::DoesNotFit { port, cycle, shortest } => {
+                let name = self.config.ports.get(usize::from(port)).map_or("", |port| &port.name);
+                write!(
+                    f,
+                    "port {name:?}: the output does not fit a cycle of {cycle}; the shortest possible is {shortest}, \
+                     so it is sent back to back and cycles are skipped"
+                )
+            }
+            Warning::ReadBack { recipe, var } => write!(
+                f,
+                "recipe {:?} carries {var}, which no port writes: it is read back from the controller and sent on, \
+                 and a change that somebody else makes can be undone for 100 ms",
+                recipe_name(recipe)
+            ),
+            Warning::Unused { recipe } => write!(f, "recipe {:?} is used by nothing", recipe_name(recipe)),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn line(baud: u32, parity: Parity, stop_bits: u8) -> Rs485 {
+        let (idle_gap, turnaround) = (Duration::from_millis(50), Duration::ZERO);
+        Rs485 { baud, parity, stop_bits, idle_gap, turnaround }
+    }
+
+    #[test]
+    fn line_times_are_those_of_the_wire() {
+        assert_eq!(line(115_200, Parity::None, 1).line_time(28), Duration::from_micros(2_431));
+        assert_eq!(line(460_800, Parity::None, 1).line_time(28), Duration::from_micros(608));
+        assert_eq!(line(9_600, Parity::Even, 2).line_time(1), Duration::from_micros(1_250));
+        assert_eq!(line(9_600, Parity::None, 1).line_time(0), Duration::ZERO);
+    }
+
+    #[test]
+    fn can_times_are_the_worst_case_of_stuffing() {
+        // 135 and 160 bits: the known maxima for eight data bytes with the space between frames.
+        assert_eq!(can_frame_time(CanId::Standard(1), 8, 1_000_000), Duration::from_micros(135));
+        assert_eq!(can_frame_time(CanId::Extended(1), 8, 1_000_000), Duration::from_micros(160));
+        assert_eq!(can_frame_time(CanId::Standard(1), 0, 500_000), Duration::from_micros(110));
+    }
+}
