@@ -1,3 +1,5 @@
 //! The `host-sim` binary: see the library for what it does.
 
-fn main() {}
+fn main() -> std::process::ExitCode {
+    host_sim::cli::main()
+}

@@ -1,0 +1,184 @@
+//! One part of a recipe, compiled, with the names and units of its fields.
+//!
+//! In: recipes as a file has them. Out: frames from values and values from frames.
+
+use proto_core::recipe::model::{CanId, Field, Framing, Rules};
+use proto_core::recipe::{CanFrame, CanLayout, StreamLayout};
+use proto_core::sysvar::{Direction, SysVar};
+use proto_core::wire::scalar::{Scalar, ScalarType};
+
+use crate::config::{SimField, SimParts, SimRecipe};
+
+/// A compiled part.
+#[derive(Debug)]
+pub(super) struct Part {
+    pub(super) layout: Layout,
+    /// One in a stream part, one for each id in a CAN part.
+    pub(super) frames: Vec<FrameFields>,
+}
+
+#[derive(Debug)]
+pub(super) enum Layout {
+    /// Frames in a stream of bytes.
+    Stream(Box<StreamLayout>),
+    /// One frame a datagram, with neither head nor tail.
+    Datagram(Box<StreamLayout>),
+    Can(Box<CanLayout>),
+}
+
+/// The fields of one frame.
+#[derive(Debug)]
+pub(super) struct FrameFields {
+    pub(super) id: Option<CanId>,
+    pub(super) fields: Vec<NamedField>,
+}
+
+#[derive(Debug)]
+pub(super) struct NamedField {
+    pub(super) name: String,
+    pub(super) ty: ScalarType,
+    pub(super) unit: &'static str,
+}
+
+impl Part {
+    /// The recipe called `name` (or the only one), and its part (or the only one).
+    pub(super) fn choose(
+        recipes: &[SimRecipe],
+        name: Option<&str>,
+        part: Option<Direction>,
+    ) -> Result<Self, String> {
+        let names =
+            || recipes.iter().map(|recipe| format!("{:?}", recipe.name)).collect::<Vec<_>>().join(", ");
+        let recipe = match (name, recipes) {
+            (_, []) => return Err("there is no recipe in this file".into()),
+            (None, [only]) => only,
+            (None, _) => return Err(format!("which recipe? --recipe NAME; there are {}", names())),
+            (Some(name), _) => recipes
+                .iter()
+                .find(|recipe| recipe.name == name)
+                .ok_or_else(|| format!("there is no recipe {name:?}; there are {}", names()))?,
+        };
+        let has = |part| match (&recipe.parts, part) {
+            (SimParts::Stream { input, .. }, Direction::Input) => input.is_some(),
+            (SimParts::Stream { output, .. }, Direction::Output) => output.is_some(),
+            (SimParts::Can { input, .. }, Direction::Input) => !input.is_empty(),
+            (SimParts::Can { output, .. }, Direction::Output) => !output.is_empty(),
+        };
+        let part = match (part, has(Direction::Input), has(Direction::Output)) {
+            (Some(Direction::Input), false, _) => {
+                return Err(format!("recipe {:?} has no input part", recipe.name));
+            }
+            (Some(Direction::Output), _, false) => {
+                return Err(format!("recipe {:?} has no output part", recipe.name));
+            }
+            (Some(part), _, _) => part,
+            (None, true, false) => Direction::Input,
+            (None, false, _) => Direction::Output,
+            (None, true, true) => {
+                return Err(format!(
+                    "recipe {:?} has both parts; --part input (user to robot) or --part output (robot to user)",
+                    recipe.name
+                ));
+            }
+        };
+        Self::compile(recipe, part)
+    }
+
+    fn compile(recipe: &SimRecipe, direction: Direction) -> Result<Self, String> {
+        let rules = Rules { mode: recipe.mode, direction };
+        // The file's reader has compiled the same parts before.
+        let refused = |error| format!("recipe {:?}: {error}", recipe.name);
+        let fields = |fields: &[SimField]| fields.iter().map(|field| field.field).collect::<Vec<_>>();
+        match &recipe.parts {
+            SimParts::Stream { input, output } => {
+                let part = if direction == Direction::Input { input } else { output };
+                let Some(part) = part else { return Err("no such part".into()) };
+                let compile =
+                    |framing| StreamLayout::new(rules, &part.head, &part.tail, fields(&part.fields), framing);
+                let layout = if part.head.is_empty() && part.tail.is_empty() {
+                    Layout::Datagram(Box::new(compile(Framing::Datagram).map_err(refused)?))
+                } else {
+                    Layout::Stream(Box::new(compile(Framing::Bytes).map_err(refused)?))
+                };
+                Ok(Self { layout, frames: vec![FrameFields::new(None, &part.fields)] })
+            }
+            SimParts::Can { input, output } => {
+                let frames = if direction == Direction::Input { input } else { output };
+                let entries = frames.iter().map(|frame| (frame.id, fields(&frame.fields)));
+                let layout = CanLayout::new(rules, entries).map_err(refused)?;
+                let frames = frames.iter().map(|frame| FrameFields::new(Some(frame.id), &frame.fields));
+                Ok(Self { layout: Layout::Can(Box::new(layout)), frames: frames.collect() })
+            }
+        }
+    }
+
+    /// Whether frames are CAN frames.
+    pub(super) fn is_can(&self) -> bool {
+        matches!(self.layout, Layout::Can(_))
+    }
+
+    /// The bytes of a stream frame or datagram.
+    pub(super) fn encode_stream(&self, layout: &StreamLayout, values: &[Scalar]) -> Result<Vec<u8>, String> {
+        let mut bytes = vec![0; layout.frame_len()];
+        match layout.encode_values(values, &mut bytes) {
+            Ok(_) => Ok(bytes),
+            Err(error) => Err(error.to_string()),
+        }
+    }
+
+    /// The CAN frame with this index.
+    pub(super) fn encode_can(
+        &self,
+        layout: &CanLayout,
+        index: usize,
+        values: &[Scalar],
+    ) -> Result<CanFrame, String> {
+        let frame = layout.frame(index).ok_or("no such frame")?;
+        frame.encode_values(values).map_err(|error| error.to_string())
+    }
+}
+
+impl FrameFields {
+    fn new(id: Option<CanId>, fields: &[SimField]) -> Self {
+        let named = |field: &SimField| NamedField {
+            name: field.name.clone(),
+            ty: field.field.ty(),
+            unit: match field.field {
+                Field::System(var) => unit_of(var),
+                Field::User(_) => "",
+            },
+        };
+        Self { id, fields: fields.iter().map(named).collect() }
+    }
+}
+
+/// The unit of one variable. Poses and forces have two units in their row of the table: the first
+/// for X, Y, Z and the second for the rotations.
+fn unit_of(var: SysVar) -> &'static str {
+    match var.unit().split_once(", ") {
+        None => var.unit(),
+        Some((linear, angular)) => {
+            if var.index().saturating_sub(var.span().first) < 3 {
+                linear
+            } else {
+                angular
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn poses_and_forces_have_two_units() {
+        let unit = |name| unit_of(SysVar::parse(name).unwrap());
+        assert_eq!((unit("RobotState[10]"), unit("RobotState[11]")), ("m", "rad"));
+        assert_eq!((unit("ForceEnd[3]"), unit("ForceEnd[4]")), ("N", "Nm"));
+        assert_eq!(
+            (unit("RobotState[1]"), unit("RobotState[26]"), unit("WordInputReg[1]")),
+            ("rad", "kg", "")
+        );
+    }
+}

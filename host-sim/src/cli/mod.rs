@@ -1,0 +1,341 @@
+//! The command line: what a person types, turned into calls.
+//!
+//! In: arguments. Out: text and an exit code: 0 when everything went well, 1 when a run failed, 2
+//! for a file or an argument that cannot be used (nothing was started then).
+
+mod check;
+mod codec;
+mod convert;
+mod log;
+mod text;
+
+use std::io::{self, Write};
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::time::Duration;
+
+use clap::{Args, Parser, Subcommand, ValueEnum};
+use proto_core::sysvar::Direction;
+
+use crate::bus::bind::Bind;
+use crate::config::file;
+use crate::shell::{self, RunOptions};
+
+/// Everything that can be typed.
+#[derive(Debug, Parser)]
+#[command(
+    name = "host-sim",
+    version,
+    about = "A simulated DUCO CORE controller and the recipe gateway, on this host",
+    long_about = "A simulated DUCO CORE controller and the recipe gateway, on this host.\n\n\
+                  Without a command it runs the demo: a whole cell in one process, no hardware needed.",
+    after_help = TOP_EXAMPLES,
+    propagate_version = true
+)]
+pub struct Cli {
+    #[command(subcommand)]
+    command: Option<Command>,
+    /// Say more on stderr: once for what happens, twice for every frame
+    #[arg(short, long, action = clap::ArgAction::Count, global = true)]
+    verbose: u8,
+}
+
+const TOP_EXAMPLES: &str = "\
+Examples:
+  host-sim                                       the demo
+  host-sim check cell.toml                       is it right, what goes on the pendant?
+  host-sim controller -c robot.toml --bind rs485=pty:run/rs485
+  host-sim gateway -c cell.toml --bind rs485-1=serial:/dev/ttyUSB0
+  host-sim encode cell.toml --part input 1       the frame that switches DO1 on
+  host-sim decode cell.toml --part input FF FF 01 EE EE
+
+Exit codes: 0 done, 1 a run failed, 2 a file or an argument is wrong and nothing
+was started.";
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Run a whole cell in one process and check the six worked examples
+    #[command(after_help = DEMO_EXAMPLES)]
+    Demo,
+    /// Run the simulated controller
+    #[command(after_help = CONTROLLER_EXAMPLES)]
+    Controller(Run),
+    /// Run the gateway
+    #[command(after_help = GATEWAY_EXAMPLES)]
+    Gateway(Run),
+    /// Check a file; print the bus budget, the ways up and what to set on the pendant
+    #[command(after_help = CHECK_EXAMPLES)]
+    Check(check::CheckArgs),
+    /// Make a frame from values
+    #[command(after_help = ENCODE_EXAMPLES)]
+    Encode(EncodeArgs),
+    /// Show the values in frames
+    #[command(after_help = DECODE_EXAMPLES)]
+    Decode(DecodeArgs),
+}
+
+const DEMO_EXAMPLES: &str = "\
+Prints one line for each example, PASS or FAIL. Exit code 0 only when all pass.";
+
+const CONTROLLER_EXAMPLES: &str = "\
+Examples:
+  host-sim controller -c robot.toml
+  host-sim controller -c robot.toml --bind rs485=pty:run/rs485 --bind can=slcan-tcp:127.0.0.1:3333
+  host-sim controller -c robot.toml --set listen.modbus=1502 --ready run/ready.json --stats 1s
+
+Once everything listens, a line `ready {json}` on stdout tells the actual addresses.";
+
+const GATEWAY_EXAMPLES: &str = "\
+Examples:
+  host-sim gateway -c cell.toml --bind rs485-1=serial:/dev/ttyUSB0
+  host-sim gateway -c cell.toml --bind rs485-1=pty:run/rs485-1 --set controller.address=127.0.0.1
+  host-sim gateway -c cell.toml --set port.rs485-1.baud=9600 --stats 1s";
+
+const CHECK_EXAMPLES: &str = "\
+Examples:
+  host-sim check cell.toml
+  host-sim check cell.toml --set port.rs485-1.baud=9600
+
+Exit code 2 and one message with file, line, column and key when something is wrong.";
+
+const ENCODE_EXAMPLES: &str = "\
+Values stand in field order or as NAME=VALUE; decimal, 0x1F or 0.5.
+Without values, lines as `decode` prints them are read from stdin.
+
+Examples:
+  host-sim encode cell.toml --part input 1
+      FF FF 01 EE EE
+  host-sim encode can.toml --part output --id 2 0.46744487 0.4099705
+      002#EF54EF3EA7E7D13E
+  host-sim decode can.toml --part output --log bus.log |
+      host-sim encode can.toml --part output";
+
+const DECODE_EXAMPLES: &str = "\
+Frames are hex bytes (FF FF 01 EE EE, FFFF01EEEE), or of a CAN recipe what
+candump prints:
+  (1436509052.249713) can0 123#AABB
+    can0  123   [2]  AA BB
+Without frames, --log or stdin is read. What is no frame of the recipe is counted
+on stderr.
+
+Examples:
+  host-sim decode cell.toml --part input FF FF 01 EE EE
+  candump -L can0 | host-sim decode can.toml --part output";
+
+/// What `controller` and `gateway` are told.
+#[derive(Debug, Args)]
+struct Run {
+    /// The file
+    #[arg(short, long, value_name = "FILE")]
+    config: PathBuf,
+    #[command(flatten)]
+    overrides: Overrides,
+    /// Tie a port to a device: pty:PATH, serial:/dev/ttyUSB0, socketcan:vcan0, slcan-pty:PATH,
+    /// slcan-tcp:HOST:PORT, tcp:HOST:PORT
+    #[arg(long, value_name = "NAME=DEVICE")]
+    bind: Vec<Bind>,
+    /// Write the actual addresses to this file, once everything listens
+    #[arg(long, value_name = "FILE")]
+    ready: Option<PathBuf>,
+    /// Print a line of counters this often, such as 1s or 200ms
+    #[arg(long, value_name = "TIME", value_parser = parse_time)]
+    stats: Option<Duration>,
+}
+
+/// `--set`, wherever a file is read.
+#[derive(Debug, Args)]
+struct Overrides {
+    /// Override one key of the file, such as port.rs485-1.baud=9600
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    set: Vec<String>,
+}
+
+/// Which recipe of which file.
+#[derive(Debug, Args)]
+struct Which {
+    /// A gateway's or a controller's file
+    file: PathBuf,
+    /// The recipe's name; not needed when there is only one
+    #[arg(long, value_name = "NAME")]
+    recipe: Option<String>,
+    /// The part: input (user to robot) or output (robot to user); not needed when there is only one
+    #[arg(long)]
+    part: Option<PartName>,
+    #[command(flatten)]
+    overrides: Overrides,
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum PartName {
+    Input,
+    Output,
+}
+
+impl From<PartName> for Direction {
+    fn from(part: PartName) -> Self {
+        match part {
+            PartName::Input => Self::Input,
+            PartName::Output => Self::Output,
+        }
+    }
+}
+
+#[derive(Debug, Args)]
+struct EncodeArgs {
+    #[command(flatten)]
+    which: Which,
+    /// Which frame of a CAN recipe, by its id; not needed when there is only one
+    #[arg(long, value_name = "ID", value_parser = convert::parse_id)]
+    id: Option<u32>,
+    /// The values
+    #[arg(allow_negative_numbers = true)]
+    values: Vec<String>,
+}
+
+#[derive(Debug, Args)]
+struct DecodeArgs {
+    #[command(flatten)]
+    which: Which,
+    /// Read frames from this file
+    #[arg(long, value_name = "FILE", conflicts_with = "frames")]
+    log: Option<PathBuf>,
+    /// Frames as hex bytes
+    frames: Vec<String>,
+}
+
+/// Runs what was typed.
+pub fn main() -> ExitCode {
+    let cli = Cli::parse();
+    log::start(cli.verbose);
+    let mut out = io::stdout().lock();
+    let done = match cli.command.unwrap_or(Command::Demo) {
+        Command::Demo => {
+            drop(out);
+            return crate::demo::run();
+        }
+        Command::Controller(run) => {
+            drop(out);
+            return run.controller();
+        }
+        Command::Gateway(run) => {
+            drop(out);
+            return run.gateway();
+        }
+        Command::Check(args) => check::run(&args, &mut out),
+        Command::Encode(args) => encode(&args, &mut out),
+        Command::Decode(args) => decode(&args, &mut out),
+    };
+    // A reader that had enough, such as `head`, is no failure of ours.
+    let _ = out.flush();
+    match done {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(message) => wrong(message),
+    }
+}
+
+/// A message for a person; exit code 2.
+type Outcome = Result<(), String>;
+
+fn wrong(message: impl std::fmt::Display) -> ExitCode {
+    eprintln!("{message}");
+    ExitCode::from(2)
+}
+
+impl Run {
+    fn controller(self) -> ExitCode {
+        match file::load_controller(&self.config, &self.overrides.set) {
+            Ok(config) => finished(shell::controller::run(config, self.options())),
+            Err(error) => wrong(error),
+        }
+    }
+
+    fn gateway(self) -> ExitCode {
+        match file::load_gateway(&self.config, &self.overrides.set) {
+            Ok(config) => finished(shell::gateway::run(*config, self.options())),
+            Err(error) => wrong(error),
+        }
+    }
+
+    fn options(self) -> RunOptions {
+        RunOptions { binds: self.bind, ready: self.ready, stats: self.stats }
+    }
+}
+
+fn finished(result: Result<(), shell::StartError>) -> ExitCode {
+    match result {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => wrong(error),
+    }
+}
+
+fn encode(args: &EncodeArgs, out: &mut dyn Write) -> Outcome {
+    let part = args.which.part()?;
+    if args.values.is_empty() {
+        convert::encode_lines(&part, args.id, io::stdin().lock(), out)
+    } else {
+        convert::encode_values(&part, args.id, &args.values, out)
+    }
+}
+
+fn decode(args: &DecodeArgs, out: &mut dyn Write) -> Outcome {
+    let part = args.which.part()?;
+    let mut notes = io::stderr().lock();
+    if !args.frames.is_empty() {
+        return convert::decode_lines(&part, args.frames.join(" ").as_bytes(), out, &mut notes);
+    }
+    match &args.log {
+        Some(path) => {
+            let file = std::fs::File::open(path).map_err(|error| format!("{}: {error}", path.display()))?;
+            convert::decode_lines(&part, io::BufReader::new(file), out, &mut notes)
+        }
+        None => convert::decode_lines(&part, io::stdin().lock(), out, &mut notes),
+    }
+}
+
+impl Which {
+    fn part(&self) -> Result<codec::Part, String> {
+        let recipes =
+            file::load_recipes(&self.file, &self.overrides.set).map_err(|error| error.to_string())?;
+        codec::Part::choose(&recipes, self.recipe.as_deref(), self.part.map(Direction::from))
+            .map_err(|message| format!("{}: {message}", self.file.display()))
+    }
+}
+
+/// A time such as `1s`, `200ms` or `2m`.
+fn parse_time(text: &str) -> Result<Duration, String> {
+    let refused = || format!("{text:?} is not a time; write 1s, 200ms or 2m");
+    let digits = text.len() - text.trim_start_matches(|c: char| c.is_ascii_digit() || c == '.').len();
+    let (number, unit) = text.split_at(digits);
+    let number: f64 = number.parse().map_err(|_| refused())?;
+    let seconds = match unit {
+        "ms" => number / 1e3,
+        "s" => number,
+        "m" => number * 60.0,
+        _ => return Err(refused()),
+    };
+    match Duration::try_from_secs_f64(seconds) {
+        Ok(time) if time >= Duration::from_millis(1) => Ok(time),
+        _ => Err(refused()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_command_line_is_consistent() {
+        use clap::CommandFactory;
+        Cli::command().debug_assert();
+    }
+
+    #[test]
+    fn times_need_a_unit() {
+        assert_eq!(parse_time("200ms"), Ok(Duration::from_millis(200)));
+        assert_eq!(parse_time("1.5s"), Ok(Duration::from_millis(1500)));
+        assert_eq!(parse_time("2m"), Ok(Duration::from_secs(120)));
+        for wrong in ["", "1", "s", "1h", "0s", "-1s", "1e9s"] {
+            assert!(parse_time(wrong).is_err(), "{wrong:?}");
+        }
+    }
+}
