@@ -7,4 +7,5 @@ pub mod bind;
 pub mod pty;
 mod reactor;
 pub mod realtime;
+pub mod slcan;
 pub mod timer;
