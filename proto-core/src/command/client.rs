@@ -167,13 +167,15 @@ impl CommandClient {
     /// them were taken and nothing is.
     pub fn receive(&mut self, now: Instant, bytes: &mut &[u8]) -> Option<ClientEvent<'_>> {
         self.drop_handed_out();
+        let mut silent = self.gap().is_some_and(|gap| now >= self.newest + gap);
         let found = loop {
-            if let Some(found) = self.scan(now) {
+            if let Some(found) = self.scan(silent) {
                 break Some(found);
             }
             let Some((&byte, rest)) = bytes.split_first() else { break None };
             *bytes = rest;
             self.newest = now;
+            silent = false;
             self.push(byte);
         };
         match found {
@@ -209,11 +211,10 @@ impl CommandClient {
         self.dropping = false;
     }
 
-    /// Looks at the front of the buffer.
-    fn scan(&mut self, now: Instant) -> Option<Found> {
+    /// Looks at the front of the buffer, behind which there was enough silence or not.
+    fn scan(&mut self, silent: bool) -> Option<Found> {
         let blanks = self.received().iter().take_while(|&&byte| is_blank(byte)).count();
         self.drop_front(blanks);
-        let silent = self.gap().is_some_and(|gap| now >= self.newest + gap);
         if self.dropping {
             self.dropping = !silent;
             return None;
