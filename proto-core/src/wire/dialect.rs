@@ -283,6 +283,7 @@ mod tests {
         assert_eq!(new.mode_to_register(OperationMode::Remote, Motion::Simulated), 102);
         assert_eq!(new.mode_to_register(OperationMode::Auto, Motion::Real), 1);
         assert_eq!(new.mode_from_register(102), (OperationMode::Remote, Motion::Simulated));
+        assert_eq!(new.mode_from_register(1102), (OperationMode::Remote, Motion::Simulated));
         assert_eq!(new.mode_from_register(1), (OperationMode::Auto, Motion::Real));
         assert_eq!(new.mode_from_register(65535).0, OperationMode::Unknown(5));
         assert_eq!(old.mode_from_register(2), (OperationMode::Remote, Motion::Real));

@@ -131,7 +131,7 @@ fn what_is_no_command_is_unknown() {
     assert_eq!(whole(b"speed\n"), ["?speed"]);
     assert_eq!(whole(b"state(5)"), ["?state(5)"]);
     assert_eq!(whole(b"run(a.jspf\n"), ["?run(a.jspf"]);
-    assert_eq!(whole(b"stop)\n"), ["?stop)"]);
+    assert_eq!(whole(b"stop)state\n"), ["?stop)state"], "nothing was open, so nothing closes");
     assert_eq!(whole(b"run(\xFF)"), ["?run(\u{FFFD})"]);
     assert_eq!(whole(b"power\n"), ["?power"]);
 }
@@ -149,6 +149,9 @@ fn a_text_that_cannot_become_a_command_is_given_up_after_100_ms() {
     assert_eq!(poll(&mut server, at(319)), ["?statestop"]);
     assert!(receive(&mut server, at(400), b"stop").is_empty());
     assert_eq!(poll(&mut server, at(420)), ["stop"]);
+    let mut server = CommandServer::new();
+    assert!(receive(&mut server, at(0), b"(").is_empty());
+    assert_eq!(poll(&mut server, at(100)), ["?("]);
 }
 
 #[test]
