@@ -3,5 +3,6 @@
 pub mod bus;
 pub mod cli;
 pub mod config;
+pub mod controller;
 pub mod demo;
 pub mod shell;

@@ -1,0 +1,205 @@
+//! What a test, or somebody at the teach pendant, can do to the controller.
+//!
+//! Plain methods; none of them is reachable from outside the process.
+
+use proto_core::modbus::Exception;
+use proto_core::time::{Duration, Instant};
+use proto_core::wire::state::OperationMode;
+
+use super::machine::Machine;
+use super::registers::SetError;
+use super::{Controller, ControllerOutput, mode, start_values};
+use crate::config::InitialTarget;
+
+/// One of the controller's TCP servers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Link {
+    /// Port 2000.
+    Command,
+    /// Port 2001.
+    State,
+    /// Modbus.
+    Modbus,
+}
+
+/// What is broken at present.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Faults {
+    muted: [bool; 3],
+    refused: [bool; 3],
+    delay: [Duration; 3],
+    muted_ports: Vec<usize>,
+    exception: Option<Exception>,
+    state_cut: Option<usize>,
+}
+
+impl Faults {
+    pub(super) fn mutes(&self, link: Link) -> bool {
+        self.muted[link as usize]
+    }
+
+    pub(super) fn refuses(&self, link: Link) -> bool {
+        self.refused[link as usize]
+    }
+
+    pub(super) fn delay(&self, link: Link) -> Duration {
+        self.delay[link as usize]
+    }
+
+    pub(super) fn mutes_port(&self, port: usize) -> bool {
+        self.muted_ports.contains(&port)
+    }
+
+    pub(super) fn exception(&self) -> Option<Exception> {
+        self.exception
+    }
+
+    pub(super) fn take_state_cut(&mut self) -> Option<usize> {
+        self.state_cut.take()
+    }
+}
+
+/// Faults of the connection to the controller.
+impl Controller {
+    /// The server takes requests and carries them out, but its answers get lost.
+    pub fn mute(&mut self, link: Link) {
+        self.faults.muted[link as usize] = true;
+    }
+
+    /// The server's answers arrive again.
+    pub fn unmute(&mut self, link: Link) {
+        self.faults.muted[link as usize] = false;
+    }
+
+    /// The server closes new connections at once.
+    pub fn refuse(&mut self, link: Link) {
+        self.faults.refused[link as usize] = true;
+    }
+
+    /// The server takes connections again.
+    pub fn accept(&mut self, link: Link) {
+        self.faults.refused[link as usize] = false;
+    }
+
+    /// The server closes every connection it has.
+    pub fn disconnect(&mut self, link: Link) {
+        self.server.close_link(link, &mut self.outputs);
+    }
+
+    /// Every answer of the server is late by this much from now on. The state stream, which is
+    /// not asked for, knows no delay.
+    pub fn delay_answers(&mut self, link: Link, delay: Duration) {
+        self.faults.delay[link as usize] = delay;
+    }
+
+    /// Every Modbus request is answered with this exception and not carried out; `None` ends it.
+    pub fn answer_modbus_with(&mut self, exception: Option<Exception>) {
+        self.faults.exception = exception;
+    }
+
+    /// Of the next state packet only the first `len` bytes are sent, then every connection of port
+    /// 2001 is closed.
+    pub fn cut_next_state_packet(&mut self, len: usize) {
+        self.faults.state_cut = Some(len);
+    }
+
+    /// What the port sends gets lost.
+    pub fn mute_port(&mut self, port: usize) {
+        if !self.faults.mutes_port(port) {
+            self.faults.muted_ports.push(port);
+        }
+    }
+
+    /// What the port sends arrives again.
+    pub fn unmute_port(&mut self, port: usize) {
+        self.faults.muted_ports.retain(|&muted| muted != port);
+    }
+
+    /// A TCP client's connection is lost.
+    pub fn close_port(&mut self, port: usize) {
+        if let Some(own) = self.ports.get_mut(port).filter(|own| own.is_tcp_client() && own.is_up()) {
+            own.went_down();
+            self.outputs.push_back(ControllerOutput::PortClose { port });
+        }
+    }
+
+    /// Switched off and on again: everything is closed, the registers start afresh, and the robot
+    /// goes through its start to power off. Faults stay as they are.
+    pub fn restart(&mut self, now: Instant) {
+        self.server.close_all(&mut self.outputs);
+        self.running = None;
+        self.variables.clear();
+        for port in 0..self.ports.len() {
+            self.close_port(port);
+        }
+        let epoch = self.epoch.unwrap_or(now);
+        for port in &mut self.ports {
+            // A serial line or bus is still there, and so is the address of the UDP server.
+            if port.is_up() {
+                port.went_down();
+                port.came_up(now, epoch);
+            }
+        }
+        // The same configuration made the values that there were at the start.
+        if let Ok((registers, arm)) = start_values(&self.config) {
+            self.registers = registers;
+            self.arm = arm;
+            self.arm_shown = None;
+        }
+        self.machine = Machine::booting(now, mode(&self.config));
+    }
+}
+
+/// What happens in the cell.
+impl Controller {
+    /// Gives an input, or any other item, a value.
+    ///
+    /// # Errors
+    /// [`SetError::Value`]; nothing changed.
+    pub fn force(&mut self, target: InitialTarget, value: f64) -> Result<(), SetError> {
+        self.registers.force(target, value)?;
+        // The tool's frame decides where the TCP is.
+        self.arm_shown = None;
+        Ok(())
+    }
+
+    /// The key switch is turned.
+    pub fn set_mode(&mut self, mode: OperationMode) {
+        self.machine.set_mode(mode);
+    }
+
+    /// The emergency stop is pressed.
+    pub fn emergency_stop(&mut self, now: Instant) {
+        let effect = self.machine.emergency_stop(now);
+        self.apply(now, effect);
+    }
+
+    /// A protective stop, such as an open door.
+    pub fn protective_stop(&mut self, now: Instant) {
+        let effect = self.machine.protective_stop(now);
+        self.apply(now, effect);
+    }
+
+    /// The arm has hit something on this axis (see docs/wire/state.md).
+    pub fn collide(&mut self, now: Instant, axis: u8) {
+        let effect = self.machine.collide(now, axis);
+        self.apply(now, effect);
+    }
+
+    /// The cause of a stop is gone and was acknowledged.
+    pub fn clear_stop(&mut self, now: Instant) {
+        self.machine.clear_stop(now);
+    }
+
+    /// Somebody enters the zone of reduced speed.
+    pub fn enter_reduced(&mut self, now: Instant) {
+        self.machine.set_reduced(true);
+        self.speed_changed(now);
+    }
+
+    /// Nobody is in the zone of reduced speed any more.
+    pub fn leave_reduced(&mut self, now: Instant) {
+        self.machine.set_reduced(false);
+        self.speed_changed(now);
+    }
+}

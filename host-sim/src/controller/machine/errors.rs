@@ -1,0 +1,51 @@
+//! The error numbers that `getlasterror` and the state stream show.
+//!
+//! The interface description lists none; these are the simulated controller's own.
+
+/// An error's number.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum ErrorId {
+    /// No program has this name.
+    NoSuchProgram,
+    /// A program ended with an error.
+    ProgramFailed,
+    /// A command came in a state that does not allow it.
+    WrongState,
+    /// A command's argument is out of range.
+    BadArgument,
+    /// The emergency stop was pressed.
+    EmergencyStop,
+    /// A protective stop.
+    ProtectiveStop,
+    /// The arm has hit something.
+    Collision,
+}
+
+impl ErrorId {
+    /// The number as clients see it.
+    pub const fn code(self) -> u32 {
+        match self {
+            Self::NoSuchProgram => 0x1001,
+            Self::ProgramFailed => 0x1002,
+            Self::WrongState => 0x2001,
+            Self::BadArgument => 0x2002,
+            Self::EmergencyStop => 0x3001,
+            Self::ProtectiveStop => 0x3002,
+            Self::Collision => 0x3003,
+        }
+    }
+
+    /// Whether it only says that a command was refused.
+    pub const fn is_refusal(self) -> bool {
+        matches!(self, Self::NoSuchProgram | Self::WrongState | Self::BadArgument)
+    }
+}
+
+/// The newest error.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ErrorEntry {
+    /// Its number.
+    pub id: ErrorId,
+    /// What happened, one line.
+    pub message: String,
+}

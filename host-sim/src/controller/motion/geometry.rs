@@ -1,0 +1,125 @@
+//! Forward kinematics: joints to frames, poses and twists.
+
+/// How many joints the arm has.
+pub(super) const JOINTS: usize = 6;
+
+/// A place and an orientation.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Frame {
+    rotation: [[f64; 3]; 3],
+    origin: [f64; 3],
+}
+
+impl Frame {
+    /// No offset, no turn.
+    pub const IDENTITY: Self =
+        Self { rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], origin: [0.0; 3] };
+
+    /// The frame with this pose: X, Y, Z in m, then turns about the fixed X, Y and Z axes, rad.
+    pub fn from_pose(pose: &[f64; 6]) -> Self {
+        let [x, y, z, rx, ry, rz] = *pose;
+        let ((sx, cx), (sy, cy), (sz, cz)) = (rx.sin_cos(), ry.sin_cos(), rz.sin_cos());
+        let rotation = [
+            [cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx],
+            [sz * cy, sz * sy * sx + cz * cx, sz * sy * cx - cz * sx],
+            [-sy, cy * sx, cy * cx],
+        ];
+        Self { rotation, origin: [x, y, z] }
+    }
+
+    /// The frame's pose, as [`Self::from_pose`] takes it.
+    pub fn pose(&self) -> [f64; 6] {
+        let r = &self.rotation;
+        let ry = (-r[2][0]).clamp(-1.0, 1.0).asin();
+        let rx = r[2][1].atan2(r[2][2]);
+        let rz = r[1][0].atan2(r[0][0]);
+        let [x, y, z] = self.origin;
+        [x, y, z, rx, ry, rz]
+    }
+
+    /// `other`, given in this frame, in this frame's parent.
+    pub fn then(&self, other: &Self) -> Self {
+        let [x, y, z] = self.turned(&other.origin);
+        let [ox, oy, oz] = self.origin;
+        let column = |nth: usize| self.turned(&other.rotation.map(|row| row[nth]));
+        let (a, b, c) = (column(0), column(1), column(2));
+        Self { rotation: [0, 1, 2].map(|row| [a[row], b[row], c[row]]), origin: [ox + x, oy + y, oz + z] }
+    }
+
+    /// A force and torque given in this frame, as they act in the parent's origin and axes.
+    pub fn wrench_in_parent(&self, wrench: [f64; 6]) -> [f64; 6] {
+        let [fx, fy, fz, tx, ty, tz] = wrench;
+        let (force, torque) = (self.turned(&[fx, fy, fz]), self.turned(&[tx, ty, tz]));
+        let lever = cross(&self.origin, &force);
+        let [fx, fy, fz] = force;
+        [fx, fy, fz, torque[0] + lever[0], torque[1] + lever[1], torque[2] + lever[2]]
+    }
+
+    /// A vector given in this frame's axes, in the parent's.
+    fn turned(&self, vector: &[f64; 3]) -> [f64; 3] {
+        self.rotation.map(|row| row.iter().zip(vector).map(|(a, b)| a * b).sum())
+    }
+
+    /// The flange with the joints at `q`.
+    pub(super) fn of_joints(q: &[f64; JOINTS]) -> Self {
+        q.iter().zip(&LINKS).fold(Self::IDENTITY, |frame, (&angle, link)| frame.then(&link.at(angle)))
+    }
+}
+
+/// The TCP's linear and angular velocity in the base frame.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Twist(pub(super) [f64; 6]);
+
+impl Twist {
+    pub(super) fn of(q: &[f64; JOINTS], qd: &[f64; JOINTS], tool: &Frame) -> Self {
+        let tip = Frame::of_joints(q).then(tool).origin;
+        let mut twist = [0.0; 6];
+        let mut frame = Frame::IDENTITY;
+        for ((&angle, &speed), link) in q.iter().zip(qd).zip(&LINKS) {
+            let axis = frame.rotation.map(|row| row[2]);
+            let arm = [0, 1, 2].map(|nth| tip[nth] - frame.origin[nth]);
+            for (sum, part) in twist.iter_mut().zip(cross(&axis, &arm).iter().chain(&axis)) {
+                *sum += speed * part;
+            }
+            frame = frame.then(&link.at(angle));
+        }
+        Self(twist)
+    }
+}
+
+fn cross(a: &[f64; 3], b: &[f64; 3]) -> [f64; 3] {
+    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+}
+
+/// One link in Denavit-Hartenberg terms: turn about Z, go `d_m` along Z and `a_m` along X, twist
+/// about X.
+struct Link {
+    d_m: f64,
+    a_m: f64,
+    /// Sine and cosine of the twist, which is 0 or ±90°.
+    twist: (f64, f64),
+}
+
+impl Link {
+    fn at(&self, angle: f64) -> Frame {
+        let (s, c) = angle.sin_cos();
+        let (st, ct) = self.twist;
+        Frame {
+            rotation: [[c, -s * ct, s * st], [s, c * ct, -c * st], [0.0, st, ct]],
+            origin: [self.a_m * c, self.a_m * s, self.d_m],
+        }
+    }
+}
+
+const UP: (f64, f64) = (1.0, 0.0);
+const STRAIGHT: (f64, f64) = (0.0, 1.0);
+const DOWN: (f64, f64) = (-1.0, 0.0);
+
+const LINKS: [Link; JOINTS] = [
+    Link { d_m: 0.145, a_m: 0.0, twist: UP },
+    Link { d_m: 0.0, a_m: -0.43, twist: STRAIGHT },
+    Link { d_m: 0.0, a_m: -0.365, twist: STRAIGHT },
+    Link { d_m: 0.125, a_m: 0.0, twist: UP },
+    Link { d_m: 0.11, a_m: 0.0, twist: DOWN },
+    Link { d_m: 0.1, a_m: 0.0, twist: STRAIGHT },
+];

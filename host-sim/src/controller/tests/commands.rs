@@ -1,0 +1,223 @@
+//! Port 2000: replies, states, and the right failure in each wrong state.
+
+use super::*;
+
+const LOOP: &str = "loop { wait_ms(10); }";
+
+fn config() -> SimConfig {
+    with_program(SimConfig::default(), "loop.jspf", LOOP)
+}
+
+#[test]
+fn a_robot_is_powered_enabled_run_and_shut_down() {
+    let mut cell = Cell::new(&with_power(config(), Power::Off));
+    let c = cell.command_client();
+    assert_eq!(cell.ask(c, "state"), "4:0:4:2");
+    assert_eq!(cell.ask(c, "poweron"), "poweron success");
+    assert_eq!(cell.ask(c, "state"), "4:0:4:2", "it takes its time");
+    assert_eq!(cell.ask(c, "poweron"), "poweron fail", "it is on its way already");
+    cell.run_ms(300);
+    assert_eq!(cell.ask(c, "state"), "5:0:5:2");
+    assert_eq!(cell.ask(c, "run(loop.jspf)"), "run fail");
+    assert_eq!(cell.ask(c, "getlasterror"), "2001:run: the robot is not enabled\n");
+    assert_eq!(cell.ask(c, "enable"), "enable success");
+    cell.run_ms(200);
+    assert_eq!(cell.ask(c, "state"), "6:0:5:2");
+    assert_eq!(cell.ask(c, "isprogfinish"), "1");
+    assert_eq!(cell.ask(c, "run(loop.jspf)"), "run start");
+    assert_eq!(cell.ask(c, "state"), "6:2:5:2");
+    assert_eq!(cell.ask(c, "isprogfinish"), "0");
+    assert_eq!(cell.ask(c, "pause"), "pause success");
+    assert_eq!(cell.ask(c, "state"), "6:4:5:2");
+    cell.run_ms(20);
+    assert_eq!(cell.ask(c, "state"), "6:3:5:2");
+    assert_eq!(cell.ask(c, "resume"), "resume success");
+    assert_eq!(cell.ask(c, "state"), "6:2:5:2");
+    assert_eq!(cell.ask(c, "stop"), "stop success");
+    assert_eq!(cell.ask(c, "state"), "6:1:5:2");
+    cell.run_ms(20);
+    assert_eq!(cell.ask(c, "state"), "6:0:5:2");
+    assert_eq!(cell.ask(c, "shutdown"), "shutdown fail");
+    assert_eq!(cell.ask(c, "disable"), "disable success");
+    cell.run_ms(100);
+    assert_eq!(cell.ask(c, "poweroff"), "poweroff success");
+    cell.run_ms(200);
+    assert_eq!(cell.ask(c, "state"), "4:0:4:2");
+    assert_eq!(cell.ask(c, "shutdown"), "shutdown success");
+    assert!(!cell.shut_down, "the reply goes first");
+    cell.run_ms(100);
+    assert!(cell.shut_down);
+    assert_eq!(cell.closed, [c]);
+    assert_eq!(cell.drain(), Instant::NEVER);
+    assert_eq!(cell.ask(c, "state"), "", "nobody is there any more");
+}
+
+/// Which of the commands succeed in which state.
+#[test]
+fn every_command_fails_in_every_wrong_state() {
+    #[rustfmt::skip]
+    let table: [(&str, &[&str], &str); 9] = [
+        // how to get there, and what succeeds there
+        ("off",      &[],                                             "poweron shutdown"),
+        ("powering", &["poweron"],                                    ""),
+        ("on",       &["poweron", "", ""],                            "poweroff enable"),
+        ("enabling", &["poweron", "", "", "enable"],                  ""),
+        ("enabled",  &["poweron", "", "", "enable", "", ""],          "poweroff disable run"),
+        ("running",  &["poweron", "", "", "enable", "", "", "run(loop.jspf)"], "poweroff disable stop pause"),
+        ("pausing",  &["poweron", "", "", "enable", "", "", "run(loop.jspf)", "pause"], "poweroff disable stop"),
+        ("paused",   &["poweron", "", "", "enable", "", "", "run(loop.jspf)", "pause", ""], "poweroff disable stop resume"),
+        ("stopping", &["poweron", "", "", "enable", "", "", "run(loop.jspf)", "stop"], "poweroff disable"),
+    ];
+    let commands = ["poweron", "poweroff", "enable", "disable", "run", "stop", "pause", "resume", "shutdown"];
+    for (state, way, succeeding) in table {
+        for command in commands {
+            let mut cell = Cell::new(&with_power(config(), Power::Off));
+            let c = cell.command_client();
+            for step in way {
+                match *step {
+                    "" => cell.run_ms(150),
+                    step => assert!(!cell.ask(c, step).contains("fail"), "{state}: {step}"),
+                }
+            }
+            let before = cell.ask(c, "state");
+            let text = if command == "run" { "run(loop.jspf)" } else { command };
+            let reply = cell.ask(c, text);
+            let good = succeeding.split(' ').any(|word| word == command);
+            let expected = match (command, good) {
+                ("run", true) => "run start".to_owned(),
+                (_, true) => format!("{command} success"),
+                (_, false) => format!("{command} fail"),
+            };
+            assert_eq!(reply, expected, "{command} while {state}");
+            if !good {
+                assert_eq!(cell.ask(c, "state"), before, "{command} while {state} changed something");
+                let error = cell.ask(c, "getlasterror");
+                assert!(error.starts_with(&format!("2001:{command}: ")), "{error}");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_fault_stops_and_locks_until_it_is_cleared() {
+    let mut cell = Cell::new(&config());
+    let c = cell.command_client();
+    cell.ask(c, "run(loop.jspf)");
+    cell.controller.emergency_stop(cell.now);
+    assert_eq!(cell.ask(c, "state"), "6:1:9:2");
+    assert_eq!(cell.ask(c, "getlasterror"), "3001:emergency stop\n");
+    cell.run_ms(100);
+    assert_eq!(cell.ask(c, "state"), "5:0:9:2");
+    assert_eq!(cell.ask(c, "enable"), "enable fail");
+    cell.controller.clear_stop(cell.now);
+    assert_eq!(cell.ask(c, "state"), "5:0:6:2");
+    assert_eq!(cell.ask(c, "enable"), "enable fail", "not while it recovers");
+    cell.run_ms(200);
+    assert_eq!(cell.ask(c, "enable"), "enable success");
+    cell.run_ms(200);
+    assert_eq!(cell.ask(c, "state"), "6:0:5:2");
+
+    cell.ask(c, "run(loop.jspf)");
+    let collision_axis = 3;
+    cell.controller.collide(cell.now, collision_axis);
+    cell.run_ms(20);
+    assert_eq!(cell.ask(c, "state"), "6:3:7:2");
+    assert_eq!(cell.ask(c, "resume"), "resume fail");
+    let s = cell.state_client();
+    cell.run_ms(100);
+    let packet = cell.packets.last().unwrap().1;
+    assert_eq!((packet.collision, packet.collision_axis, packet.error_code), (1, 3, 0x3003));
+    cell.input(ControllerInput::StateClosed { conn: s });
+    cell.controller.clear_stop(cell.now);
+    cell.run_ms(200);
+    assert_eq!(cell.ask(c, "resume"), "resume success");
+    assert_eq!(cell.ask(c, "state"), "6:2:5:2");
+
+    cell.controller.protective_stop(cell.now);
+    cell.run_ms(100);
+    assert_eq!(cell.ask(c, "state"), "5:0:8:2");
+}
+
+#[test]
+fn run_finds_programs_by_name_and_sets_the_speed() {
+    let mut cell = Cell::new(&with_program(config(), "done.jspf", "log(\"x\");"));
+    let c = cell.command_client();
+    assert_eq!(cell.ask(c, "run(nothing.jspf)"), "run fail");
+    assert_eq!(cell.ask(c, "getlasterror"), "1001:run: there is no program nothing.jspf\n");
+    assert_eq!(cell.ask(c, "run(\"program/done.jspf\",70)"), "run start");
+    assert_eq!(cell.controller.machine().speed_percent(), 70.0);
+    assert_eq!(cell.ask(c, "isprogfinish"), "1");
+    assert_eq!(cell.controller.program_log().collect::<Vec<_>>(), ["x"]);
+    assert_eq!(cell.ask(c, "run(done.jspf,0)"), "run start", "an invalid speed is as good as none");
+    assert_eq!(cell.controller.machine().speed_percent(), 70.0);
+    assert_eq!(cell.ask(c, "speed(100)"), "set success");
+    for wrong in ["speed(0)", "speed(100.1)", "speed(x)", "speed(-1)", "speed(nan)"] {
+        assert_eq!(cell.ask(c, wrong), "set fail", "{wrong}");
+    }
+    assert_eq!(cell.controller.machine().speed_percent(), 100.0);
+    cell.controller.set_mode(OperationMode::Manual);
+    assert_eq!(cell.ask(c, "run(done.jspf)"), "run fail");
+    assert_eq!(cell.ask(c, "getlasterror"), "2001:run: the robot is in manual mode\n");
+    assert_eq!(cell.ask(c, "state"), "6:0:5:0");
+}
+
+#[test]
+fn nothing_marks_the_end_of_a_command_and_pieces_are_joined() {
+    let mut cell = Cell::new(&config());
+    let c = cell.command_client();
+    for byte in b"state" {
+        cell.input(ControllerInput::CommandBytes { conn: c, bytes: &[*byte] });
+        cell.run_ms(1);
+    }
+    cell.run_ms(18);
+    assert_eq!(cell.take(c), b"");
+    cell.run_ms(2);
+    assert_eq!(cell.take(c), b"6:0:5:2");
+    // Two at once, the second without an end.
+    cell.input(ControllerInput::CommandBytes { conn: c, bytes: b"isprogfinish()state" });
+    assert_eq!(cell.take(c), b"1");
+    cell.run_ms(20);
+    assert_eq!(cell.take(c), b"6:0:5:2");
+    // Other connections have their own.
+    let d = cell.command_client();
+    cell.input(ControllerInput::CommandBytes { conn: c, bytes: b"sta" });
+    assert_eq!(cell.ask(d, "te"), "unknown command");
+    assert_eq!(cell.ask(c, "te"), "6:0:5:2");
+    let long = "x".repeat(300);
+    assert_eq!(cell.ask(c, &long), "unknown command");
+    assert_eq!(cell.ask(c, "STATE"), "unknown command");
+    assert_eq!(cell.ask(c, "state"), "6:0:5:2");
+    assert_eq!(cell.controller.counters().command.refusals, 3);
+}
+
+#[test]
+fn a_later_dialect_speaks_otherwise() {
+    let config = with_program(with_dialect(config(), "v2.6"), "done.jspf", "wait_ms(30);");
+    let mut cell = Cell::new(&config);
+    let (c, other) = (cell.command_client(), cell.command_client());
+    assert_eq!(cell.ask(c, "run(done.jspf)"), "run success\r\n");
+    assert_eq!(cell.ask(c, "speed(50)"), "set speed 50%\r\n");
+    cell.run_ms(29);
+    assert_eq!(cell.take(c), b"");
+    cell.run_ms(1);
+    assert_eq!(cell.take(c), b"script finish\r\n");
+    assert_eq!(cell.take(other), b"", "only the one who started it is told");
+    cell.state_client();
+    cell.run_ms(100);
+    assert_eq!(cell.packets[0].1.reserved_656[4], 50, "global speed at byte 660");
+}
+
+#[test]
+fn connections_are_bounded() {
+    let mut cell = Cell::new(&config());
+    let conns: Vec<_> = (0..MAX_COMMAND_CONNECTIONS).map(|_| cell.command_client()).collect();
+    assert_eq!(cell.closed, []);
+    let refused = cell.command_client();
+    assert_eq!(cell.closed, [refused]);
+    assert_eq!(cell.ask(refused, "state"), "");
+    cell.input(ControllerInput::CommandClosed { conn: conns[0] });
+    let taken = cell.command_client();
+    assert_eq!(cell.ask(taken, "state"), "6:0:5:2");
+    let counters = cell.controller.counters().command;
+    assert_eq!((counters.opened, counters.refused, counters.open), (33, 1, 32));
+}
