@@ -156,17 +156,7 @@ fn read_part(item: &Item<'_>, rules: Rules, is_can: bool, flavour: Flavour) -> R
         let keys = ["id", "extended", "fields"];
         for frame in table.tables("frame", &keys)? {
             let item = frame.required("id", "the frame's CAN id")?;
-            let is_extended = frame.optional("extended").map_or(Ok(false), |item| item.bool())?;
-            let id = if is_extended {
-                CanId::Extended(item.integer(0..=0x1FFF_FFFF)?)
-            } else {
-                CanId::Standard(item.integer(0..=0x7FF).map_err(|mut error| {
-                    if item.integer::<u32>(0..=0x1FFF_FFFF).is_ok() {
-                        error.message.push_str(" (0..=536870911 with extended = true)");
-                    }
-                    error
-                })?)
-            };
+            let id = read_id(&frame, &item)?;
             let fields = read_fields(&frame, rules, flavour)?;
             part.frames.push(FileFrame { spot: frame.spot.clone(), id, id_spot: item.spot, fields });
         }
@@ -183,6 +173,25 @@ fn read_part(item: &Item<'_>, rules: Rules, is_can: bool, flavour: Flavour) -> R
         Ok(()) => Ok(part),
         Err(error) => Err(part.spot_of(error).error(table.document, error)),
     }
+}
+
+/// 11 bits, or 29 with `extended = true`.
+fn read_id(frame: &Reader<'_>, item: &Item<'_>) -> Result<CanId> {
+    let is_extended = frame.optional("extended").map_or(Ok(false), |item| item.bool())?;
+    let number: i64 = item.integer(i64::MIN..=i64::MAX)?;
+    let standard = || u16::try_from(number).ok().map(CanId::Standard);
+    let extended = || u32::try_from(number).ok().map(CanId::Extended);
+    let id = if is_extended { extended() } else { standard() };
+    id.filter(|id| id.is_valid()).ok_or_else(|| {
+        let hint = if extended().is_some_and(CanId::is_valid) {
+            "; with extended = true, 0..=0x1FFFFFFF"
+        } else {
+            ""
+        };
+        let limit = if is_extended { "0x1FFFFFFF" } else { "0x7FF" };
+        let shown = if number < 0 { number.to_string() } else { format!("{number:#X}") };
+        item.error(format!("{shown} is out of range; 0..={limit}{hint}"))
+    })
 }
 
 fn read_bytes(table: &Reader<'_>, key: &str) -> Result<(Vec<u8>, Option<Spot>)> {

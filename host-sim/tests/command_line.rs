@@ -1,0 +1,108 @@
+//! The binary as a person or a script meets it: texts, exit codes, pipes.
+
+use std::io::Write;
+use std::path::PathBuf;
+use std::process::{Command, Output, Stdio};
+
+fn config(name: &str) -> PathBuf {
+    PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("configs").join(name)
+}
+
+fn host_sim(args: &[&str], stdin: &str) -> Output {
+    let mut child = Command::new(env!("CARGO_BIN_EXE_host-sim"))
+        .args(args)
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    // Refused arguments leave nobody to read this; that is the test's business, not a failure here.
+    let _ = child.stdin.take().unwrap().write_all(stdin.as_bytes());
+    child.wait_with_output().unwrap()
+}
+
+#[track_caller]
+fn ok(args: &[&str], stdin: &str) -> String {
+    let output = host_sim(args, stdin);
+    assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
+    String::from_utf8(output.stdout).unwrap()
+}
+
+/// Exit code 2, nothing on stdout; what stderr says.
+#[track_caller]
+fn refused(args: &[&str]) -> String {
+    let output = host_sim(args, "");
+    let message = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(2), "{message}");
+    assert!(output.stdout.is_empty(), "{}", String::from_utf8_lossy(&output.stdout));
+    message
+}
+
+fn path(name: &str) -> String {
+    config(name).to_str().unwrap().to_owned()
+}
+
+#[test]
+fn check_says_what_goes_on_the_pendant() {
+    let report = ok(&["check", &path("force-sensor.toml")], "");
+    for line in [
+        "a valid gateway file",
+        "port force: rs485, 460800 baud 8N1, recipe force-sensor",
+        "input   28 bytes, 0.608 ms on the line, at most 1644 a second",
+        "UDP server 2011: recipe up",
+        "input   head 255 255, tail 238 238",
+        "__ForceEnd_1, __ForceEnd_2",
+    ] {
+        assert!(report.contains(line), "no {line:?} in\n{report}");
+    }
+    let report = ok(&["check", &path("rs485-system.toml"), "--set", "port.rs485-1.baud=9600"], "");
+    assert!(report.contains("the shortest possible is 20934 µs"), "{report}");
+    let report = ok(&["check", &path("can-system-controller.toml")], "");
+    assert!(report.contains("output  id 3 (0x003): __RobotState_10, __RobotState_11"), "{report}");
+}
+
+#[test]
+fn wrong_files_and_arguments_start_nothing() {
+    let file = path("rs485-system.toml");
+    let baud = "port.rs485-1.baud=1";
+    let expected = "--set port.rs485-1.baud=1: port.rs485-1.baud: 1 is out of range; 1200..=4000000\n";
+    assert_eq!(refused(&["check", &file, "--set", baud]), expected);
+    assert_eq!(refused(&["gateway", "-c", &file, "--set", baud]), expected);
+    assert!(refused(&["controller", "-c", &file]).contains("this is a gateway file"));
+    assert!(
+        refused(&["gateway", "-c", "no-such-file.toml"]).starts_with("no-such-file.toml: cannot be read")
+    );
+    assert!(refused(&["gateway", "-c", &file, "--bind", "rs485-1"]).contains("NAME=DEVICE"));
+    assert!(refused(&["gateway", "-c", &file, "--stats", "1"]).contains("write 1s, 200ms or 2m"));
+    assert!(refused(&["gateway"]).contains("--config"));
+    assert!(refused(&["nonsense"]).contains("nonsense"));
+    let which = refused(&["encode", &file, "1"]);
+    assert!(which.contains("has both parts; --part input (user to robot) or --part output"), "{which}");
+}
+
+#[test]
+fn frames_and_values_convert_both_ways() {
+    let stream = path("rs485-system.toml");
+    assert_eq!(ok(&["encode", &stream, "--part", "input", "1"], ""), "FF FF 01 EE EE\n");
+    let decoded = ok(&["decode", &stream, "--part", "input", "FFFF01EEEE"], "");
+    assert_eq!(decoded, "DigitalOutputCommand[1]=1\n");
+
+    let can = path("can-system.toml");
+    let log =
+        "(1436509052.249713) can0 002#EF54EF3EA7E7D13E\n(1436509052.250100) can0 003#0000803F000000C0\n";
+    let decoded = ok(&["decode", &can, "--part", "output"], log);
+    assert_eq!(
+        decoded.lines().next(),
+        Some("(1436509052.249713) can0 id=0x002 RobotState[8]=0.46744487 m RobotState[9]=0.4099705 m")
+    );
+    assert_eq!(ok(&["encode", &can, "--part", "output"], &decoded), log);
+}
+
+#[test]
+fn the_help_teaches() {
+    for command in ["controller", "gateway", "check", "encode", "decode"] {
+        let help = ok(&[command, "--help"], "");
+        assert!(help.contains("Examples:") && help.contains(&format!("host-sim {command}")), "{help}");
+    }
+    assert!(ok(&["--help"], "").contains("Exit codes:"));
+}
