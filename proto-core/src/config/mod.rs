@@ -370,3 +370,6 @@ pub struct SafeValue {
     /// Its safe value.
     pub value: crate::wire::scalar::Scalar,
 }
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,328 @@
+//! What a file cannot say but a stored or hand-made configuration can, and where each mistake is
+//! found. The messages for files are tested with the files.
+
+use std::string::ToString;
+
+use super::*;
+use crate::command::ParseError;
+use crate::recipe::PartError;
+use crate::sysvar::Direction;
+use crate::wire::scalar::Scalar;
+
+fn var(name: &str) -> SysVar {
+    SysVar::parse(name).unwrap()
+}
+
+fn text<const N: usize>(text: &str) -> String<N> {
+    String::try_from(text).unwrap()
+}
+
+/// A configuration under construction.
+struct Builder(GatewayConfig);
+
+impl Builder {
+    /// A controller and nothing else.
+    fn new() -> Self {
+        Self(GatewayConfig {
+            controller: ControllerLink {
+                address: text("192.168.12.138"),
+                dialect: text("v2.3"),
+                command_port: 2000,
+                state_port: 2001,
+                modbus_port: 502,
+                recipe_link: None,
+            },
+            recipes: Vec::new(),
+            ports: Vec::new(),
+            fields: Vec::new(),
+            commands: Vec::new(),
+            safe_values: Vec::new(),
+        })
+    }
+
+    /// One RS-485 port that switches outputs and shows the pose.
+    fn one_port() -> Self {
+        Self::new().stream(&["DigitalOutputCommand[1]"], &["RobotState[8]", "RobotState[9]"]).rs485(0)
+    }
+
+    fn span(&mut self, fields: impl IntoIterator<Item = FieldSpec>) -> Span {
+        let start = self.0.fields.len() as u16;
+        for field in fields {
+            self.0.fields.push(field).unwrap();
+        }
+        Span { start, len: self.0.fields.len() as u16 - start }
+    }
+
+    fn part(&mut self, fields: impl IntoIterator<Item = FieldSpec>) -> Option<StreamPart> {
+        let fields = self.span(fields);
+        let head = Delimiter::from_slice(&[0xFF, 0xFF]).unwrap();
+        (fields.len > 0).then_some(StreamPart { head, tail: Delimiter::new(), fields })
+    }
+
+    fn recipe(&mut self, mode: Mode, parts: Parts) {
+        let name = text(&std::format!("recipe-{}", self.0.recipes.len()));
+        let recipe = Recipe { name, mode, parts, on_stale: OnStale::Hold, send: SendOn::Period };
+        self.0.recipes.push(recipe).unwrap();
+    }
+
+    fn stream(mut self, input: &[&str], output: &[&str]) -> Self {
+        let input = self.part(input.iter().map(|name| FieldSpec::System(var(name))));
+        let output = self.part(output.iter().map(|name| FieldSpec::System(var(name))));
+        self.recipe(Mode::Realtime, Parts::Stream { input, output });
+        self
+    }
+
+    fn user(mut self, input: &[FieldSpec], output: &[FieldSpec]) -> Self {
+        let input = self.part(input.iter().copied());
+        let output = self.part(output.iter().copied());
+        self.recipe(Mode::User, Parts::Stream { input, output });
+        self
+    }
+
+    fn port(mut self, recipe: u8, bus: Bus) -> Self {
+        let port = Port {
+            name: text(&std::format!("port-{}", self.0.ports.len())),
+            bus,
+            recipe,
+            cycle: MIN_CYCLE,
+            timeout: Duration::from_millis(100),
+            on_timeout: Span::default(),
+            stale_after: Duration::from_millis(500),
+        };
+        self.0.ports.push(port).unwrap();
+        self
+    }
+
+    fn rs485(self, recipe: u8) -> Self {
+        let (idle_gap, turnaround) = (Duration::from_millis(50), Duration::from_micros(100));
+        let line = Rs485 { baud: 115_200, parity: Parity::None, stop_bits: 1, idle_gap, turnaround };
+        self.port(recipe, Bus::Rs485(line))
+    }
+
+    fn link(mut self, recipe: u8) -> Self {
+        self.0.controller.recipe_link = Some(RecipeLink { udp_port: 2011, recipe });
+        self
+    }
+
+    fn with(mut self, change: impl FnOnce(&mut GatewayConfig)) -> Self {
+        change(&mut self.0);
+        self
+    }
+
+    #[track_caller]
+    fn valid(self) -> GatewayConfig {
+        self.0.validate().unwrap_or_else(|error| panic!("{error}"));
+        self.0
+    }
+
+    #[track_caller]
+    fn refused(self, place: Place, kind: ConfigErrorKind) {
+        assert_eq!(self.0.validate(), Err(ConfigError { place, kind }));
+    }
+}
+
+fn field(recipe: u8, part: Direction, field: u8) -> Place {
+    Place::Field { recipe, part, frame: 0, field }
+}
+
+fn user_input(to: InputBinding) -> FieldSpec {
+    FieldSpec::UserInput { ty: ScalarType::Byte, to }
+}
+
+fn constant() -> FieldSpec {
+    FieldSpec::UserOutput { ty: ScalarType::Byte, from: OutputBinding::Constant(1.0) }
+}
+
+#[test]
+fn good_configurations_pass() {
+    Builder::one_port().valid();
+    Builder::one_port().stream(&["DigitalOutputCommand[1]"], &["RobotState[26]"]).link(1).valid();
+    let listen = Bus::TcpListen { listen: text("[::]:50000") };
+    Builder::one_port().port(0, listen).valid();
+    // Nothing to do is no mistake.
+    Builder::new().valid();
+}
+
+#[test]
+fn ranges_that_leave_their_pools_are_refused() {
+    let outside = ConfigErrorKind::OutsidePool { end: 3, len: 2 };
+    let span = Span { start: 1, len: 2 };
+    Builder::one_port().with(|config| config.fields.truncate(2)).refused(
+        Place::Frame { recipe: 0, part: Direction::Output, frame: 0 },
+        ConfigErrorKind::OutsidePool { end: 3, len: 2 },
+    );
+    Builder::one_port()
+        .with(|config| {
+            let safe = SafeValue { var: var("DigitalOutputCommand[1]"), value: Scalar::Byte(0) };
+            config.safe_values.extend([safe, safe]);
+            config.ports[0].on_timeout = span;
+        })
+        .refused(Place::Port { port: 0, key: PortKey::OnTimeout }, outside);
+    let table = InputBinding::Commands { table: span, when: CommandWhen::Change };
+    Builder::new()
+        .user(&[user_input(table)], &[])
+        .refused(field(0, Direction::Input, 0), ConfigErrorKind::OutsidePool { end: 3, len: 0 });
+    let far = Span { start: u16::MAX, len: u16::MAX };
+    Builder::one_port().with(|config| config.ports[0].on_timeout = far).refused(
+        Place::Port { port: 0, key: PortKey::OnTimeout },
+        ConfigErrorKind::OutsidePool { end: 131_070, len: 0 },
+    );
+}
+
+#[test]
+fn indices_that_name_nothing_are_refused() {
+    let missing = ConfigErrorKind::NoSuchRecipe { recipe: 7, recipes: 1 };
+    Builder::one_port()
+        .with(|config| config.ports[0].recipe = 7)
+        .refused(Place::Port { port: 0, key: PortKey::Recipe }, missing);
+    Builder::one_port().link(7).refused(Place::Controller(ControllerKey::RecipeLink), missing);
+}
+
+#[test]
+fn fields_of_the_wrong_kind_are_refused() {
+    // The layout knows a realtime recipe's fields; what a user field does, only the recipe's part.
+    Builder::new().user(&[constant()], &[]).refused(
+        field(0, Direction::Input, 0),
+        ConfigErrorKind::WrongField { mode: Mode::User, part: Direction::Input },
+    );
+    Builder::new().user(&[FieldSpec::System(var("ForceEnd[1]"))], &[]).refused(
+        field(0, Direction::Input, 0),
+        ConfigErrorKind::Part(PartError::WrongMode {
+            at: crate::recipe::FieldPlace { frame: None, field: 0 },
+            mode: Mode::User,
+        }),
+    );
+}
+
+#[test]
+fn numbers_that_no_file_can_hold_are_refused() {
+    for (scale, offset) in [(f32::NAN, 0.0), (1.0, f32::INFINITY), (0.0, 1.0)] {
+        let to = InputBinding::Variable { var: var("WordInputReg[1]"), scale, offset };
+        let refused = Builder::new().user(&[user_input(to)], &[]).0.validate().unwrap_err();
+        assert!(matches!(refused.kind, ConfigErrorKind::BadScale { .. }), "{refused}");
+    }
+    let from = OutputBinding::Constant(f64::NAN);
+    let refused = Builder::new().user(&[], &[FieldSpec::UserOutput { ty: ScalarType::Float, from }]);
+    assert!(matches!(refused.0.validate().unwrap_err().kind, ConfigErrorKind::Constant(_)));
+    let table = Span { start: 0, len: 1 };
+    let to = InputBinding::Commands { table, when: CommandWhen::Frame };
+    for (value, text, kind) in [
+        (i64::MAX, "stop", ConfigErrorKind::CommandValue { value: i64::MAX, ty: ScalarType::Byte }),
+        (1, "", ConfigErrorKind::Command(ParseError::Empty)),
+    ] {
+        let entry = CommandEntry { value, text: self::text(text) };
+        Builder::new()
+            .user(&[user_input(to)], &[])
+            .with(|config| config.commands.push(entry).unwrap())
+            .refused(Place::Command { entry: 0 }, kind);
+    }
+}
+
+#[test]
+fn safe_values_fit_their_variables() {
+    let digital = var("DigitalOutputCommand[3]");
+    for (value, kind) in [
+        (Scalar::Word(0), ConfigErrorKind::SafeType { var: digital, ty: ScalarType::Word }),
+        (Scalar::Byte(4), ConfigErrorKind::SafeValue { var: digital }),
+    ] {
+        Builder::new()
+            .stream(&["DigitalOutputCommand[3]"], &[])
+            .rs485(0)
+            .with(|config| {
+                config.safe_values.push(SafeValue { var: digital, value }).unwrap();
+                config.ports[0].on_timeout = Span { start: 0, len: 1 };
+            })
+            .refused(Place::SafeValue { entry: 0 }, kind);
+    }
+    let force = SafeValue { var: var("ForceEnd[1]"), value: Scalar::Float(f32::NAN) };
+    Builder::new()
+        .stream(&["ForceEnd[1]"], &[])
+        .rs485(0)
+        .link(0)
+        .with(|config| {
+            config.safe_values.push(force).unwrap();
+            config.ports[0].on_timeout = Span { start: 0, len: 1 };
+        })
+        .refused(Place::SafeValue { entry: 0 }, ConfigErrorKind::SafeValue { var: force.var });
+}
+
+#[test]
+fn a_variable_has_one_owner() {
+    let var = var("DigitalOutputCommand[1]");
+    Builder::one_port().rs485(0).refused(
+        Place::Port { port: 1, key: PortKey::Recipe },
+        ConfigErrorKind::OwnedTwice { var, other: 0 },
+    );
+    // A way up carries what a port owns; it owns nothing itself.
+    Builder::one_port().port(0, Bus::UdpListen { listen: text("0.0.0.0:0") }).valid();
+}
+
+#[test]
+fn what_only_recipe_ports_carry_needs_one() {
+    let force = var("ForceEnd[1]");
+    Builder::new()
+        .stream(&["ForceEnd[1]"], &[])
+        .rs485(0)
+        .refused(field(0, Direction::Input, 0), ConfigErrorKind::NoWayUp { var: force, port: 0 });
+    Builder::new().stream(&["ForceEnd[1]"], &[]).rs485(0).link(0).valid();
+    Builder::new()
+        .stream(&["ForceEnd[1]"], &[])
+        .link(0)
+        .refused(field(0, Direction::Input, 0), ConfigErrorKind::Unowned { var: force });
+    // What the state stream shows can be read back instead.
+    Builder::new().stream(&["FloatInputReg[1]"], &[]).link(0).valid();
+
+    let mass = var("RobotState[26]");
+    Builder::new()
+        .stream(&[], &["RobotState[26]"])
+        .rs485(0)
+        .refused(field(0, Direction::Output, 0), ConfigErrorKind::NoSource { var: mass, port: 0 });
+    Builder::new().stream(&[], &["RobotState[26]"]).rs485(0).link(0).valid();
+}
+
+#[test]
+fn errors_name_things_when_the_configuration_is_at_hand() {
+    let config = Builder::one_port().rs485(0).0;
+    let error = config.validate().unwrap_err();
+    let unnamed = "port 2, recipe: this port writes DigitalOutputCommand[1], and so does port 1; a variable has one owner";
+    assert_eq!(error.to_string(), unnamed);
+    let named = unnamed.replace("port 2", "port \"port-1\"").replace("port 1;", "port \"port-0\";");
+    assert_eq!(config.describe(error).to_string(), named);
+}
+
+#[test]
+fn warnings_are_not_errors() {
+    let config = Builder::one_port()
+        .stream(&["DigitalOutputCommand[1]", "WordInputReg[1]"], &[])
+        .link(1)
+        .stream(&["BitInputReg[1]"], &[])
+        .with(|config| {
+            let Bus::Rs485(line) = &mut config.ports[0].bus else { return };
+            line.baud = 9_600;
+        })
+        .valid();
+    let shortest = Duration::from_micros(10_417 + 100);
+    let expected = [
+        Warning::DoesNotFit { port: 0, cycle: MIN_CYCLE, shortest },
+        Warning::ReadBack { recipe: 1, var: var("WordInputReg[1]") },
+        Warning::Unused { recipe: 2 },
+    ];
+    assert!(config.warnings().eq(expected), "{:?}", config.warnings().collect::<std::vec::Vec<_>>());
+    let said = config.describe_warning(expected[0]).to_string();
+    assert!(said.contains("port \"port-0\"") && said.contains("10517 µs"), "{said}");
+    assert_eq!(Builder::one_port().valid().warnings().count(), 0);
+}
+
+#[cfg(feature = "serde")]
+#[test]
+fn a_configuration_survives_storage() {
+    let config = Builder::one_port().stream(&["ForceEnd[1]"], &[]).link(1).0;
+    let mut bytes = [0; 512];
+    let stored = postcard::to_slice(&config, &mut bytes).unwrap();
+    assert!(stored.len() < 128, "{} bytes", stored.len());
+    let back: GatewayConfig = postcard::from_bytes(stored).unwrap();
+    assert_eq!(back, config);
+    for cut in 0..stored.len() {
+        assert!(postcard::from_bytes::<GatewayConfig>(&stored[..cut]).is_err(), "cut at {cut}");
+    }
+}
