@@ -4,10 +4,12 @@ use core::fmt;
 
 use heapless::Vec;
 
+use super::Engine;
 use super::command_link::{CommandLink, MAX_COMMAND_BYTES, MAX_COMMAND_FIELDS};
 use super::counters::PortCounters;
 use super::field_port::{Codec, FieldPort, Line, ReplyCode};
 use super::io::{BusState, LinkId, LinkKind, PortId};
+use super::links::Links;
 use super::modbus_link::{MAX_POLL_BLOCKS, ModbusLink};
 use super::outbox::EdgeQueue;
 use super::plan::{Plan, PlanError, Source, WayUp, shown_by, uplinks};
@@ -16,7 +18,6 @@ use super::state_link::StateLink;
 use super::store::{InputFrame, MAX_INPUT_FRAMES, SafeBytes, Store};
 use super::uplink::Uplink;
 use super::user::{Bindings, InputBind};
-use super::{Engine, Links};
 use crate::config::{
     Bus, ConfigError, FieldSpec, GatewayConfig, InputBinding, Parts, Port, Recipe, Rs485, Span, StreamPart,
 };
@@ -125,7 +126,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             ports: Vec::new(),
             bindings: Bindings { inputs: Vec::new(), outputs: Vec::new() },
             safe_values: config.safe_values.iter().map(SafeBytes::new).collect(),
-            links: Links { command: None, state: None, modbus: None, recipes: Vec::new() },
+            links: Links::new(),
             timer_at: Instant::ZERO,
         };
         for (index, port, recipe) in config.field_ports() {

@@ -12,8 +12,10 @@
 mod build;
 mod command_link;
 mod counters;
+mod field_output;
 mod field_port;
 mod io;
+mod links;
 mod modbus_link;
 mod outbox;
 mod plan;
@@ -28,6 +30,7 @@ pub use command_link::{COMMAND_QUEUE, MAX_COMMAND_BYTES, MAX_COMMAND_FIELDS};
 pub use counters::{LinkCounters, PortCounters};
 pub use field_port::ReplyCode;
 pub use io::{BusState, Input, LinkId, LinkKind, Output, PortId};
+pub use links::LinkInfo;
 pub use modbus_link::MAX_POLL_BLOCKS;
 pub use outbox::EDGE_QUEUE;
 pub use plan::{Plan, PlanError, Source, WayUp};
@@ -35,21 +38,17 @@ pub use store::MAX_INPUT_FRAMES;
 
 use heapless::Vec;
 
-use command_link::CommandLink;
 use counters::{add, bump};
-use field_port::{Codec, FieldPort, fields_before};
-use modbus_link::ModbusLink;
-use sender::{DIGEST_SEED, digest};
-use state_link::StateLink;
+use field_output::Downward;
+use field_port::FieldPort;
+use links::Links;
 use store::{SafeBytes, Store};
-use uplink::Uplink;
-use user::{Bindings, OutputBind, forget_commands, values};
+use user::{Bindings, forget_commands};
 
 use crate::config::MAX_SAFE_VALUES;
 use crate::image::Image;
-use crate::link::{LinkAction, LinkHistory, LinkState, Supervisor};
-use crate::recipe::can::CanFrame;
-use crate::recipe::model::{MAX_STREAM_FRAME, Mode};
+use crate::link::LinkAction;
+use crate::recipe::model::MAX_STREAM_FRAME;
 use crate::time::{Duration, Instant};
 
 /// Size of the buffer for [`Engine::poll_output`]: the longest stream frame; every request to the
@@ -69,29 +68,6 @@ pub struct Engine<const PORTS: usize = 8, const UPLINKS: usize = 4, const FIELDS
     links: Links<UPLINKS>,
     /// Nothing depends on the clock before this.
     timer_at: Instant,
-}
-
-#[derive(Debug, Clone)]
-struct Links<const UPLINKS: usize> {
-    command: Option<CommandLink>,
-    state: Option<StateLink>,
-    modbus: Option<ModbusLink>,
-    recipes: Vec<Uplink, UPLINKS>,
-}
-
-/// How one link does.
-#[derive(Debug, Clone, Copy)]
-pub struct LinkInfo<'a> {
-    /// The link.
-    pub id: LinkId,
-    /// What it is.
-    pub kind: LinkKind,
-    /// Where it stands.
-    pub state: LinkState,
-    /// How often it came and went.
-    pub history: &'a LinkHistory,
-    /// What went over it.
-    pub counters: &'a LinkCounters,
 }
 
 impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS, UPLINKS, FIELDS> {
@@ -137,14 +113,13 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
                     port.bus_state(state);
                 }
             }
-            Input::LinkUp { link } => self.link_up(link, now),
-            Input::LinkDown { link } => self.link_down(link, now),
-            Input::LinkBytes { link, bytes } => self.link_bytes(link, bytes, now),
-            Input::LinkSent { link } => {
-                if let Some(uplink) = self.links.recipes.iter_mut().find(|uplink| uplink.id == link) {
-                    uplink.sent();
-                }
+            Input::LinkUp { link } => self.links.up(link, &mut self.store, now),
+            Input::LinkDown { link } => self.links.down(link, &mut self.store, &mut self.ports, now),
+            Input::LinkBytes { link, bytes } => {
+                self.links.bytes(link, bytes, &mut self.store, &mut self.ports, now);
+                self.image_changed();
             }
+            Input::LinkSent { link } => self.links.sent(link),
             Input::Tick => {}
         }
         // Whatever happened may have set an earlier deadline: the next poll looks at all of them.
@@ -159,10 +134,11 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         if now >= self.timer_at {
             self.advance(now);
         }
-        if let Some((link, len)) = self.next_upward(&mut buf[..], now) {
+        if let Some((link, len)) = self.links.next_upward(&mut self.store, &mut self.ports, &mut buf[..], now)
+        {
             return Output::LinkSend { link, bytes: buf.get(..len).unwrap_or(&[]) };
         }
-        if let Some((link, action)) = self.next_action() {
+        if let Some((link, action)) = self.links.next_action() {
             return match action {
                 LinkAction::Open => Output::LinkOpen { link },
                 LinkAction::Close => Output::LinkClose { link },
@@ -202,24 +178,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
 
     /// The links that the configuration needs.
     pub fn links(&self) -> impl Iterator<Item = LinkInfo<'_>> + '_ {
-        let command = self
-            .links
-            .command
-            .as_ref()
-            .map(|link| info(LinkId::COMMAND, LinkKind::Command, &link.supervisor, &link.counters));
-        let state = self
-            .links
-            .state
-            .as_ref()
-            .map(|link| info(LinkId::STATE, LinkKind::State, &link.supervisor, &link.counters));
-        let modbus = self
-            .links
-            .modbus
-            .as_ref()
-            .map(|link| info(LinkId::MODBUS, LinkKind::Modbus, &link.supervisor, &link.counters));
-        let recipes = self.links.recipes.iter();
-        let recipes = recipes.map(|link| info(link.id, link.kind, &link.supervisor, &link.counters));
-        command.into_iter().chain(state).chain(modbus).chain(recipes)
+        self.links.infos()
     }
 
     /// Everything that depends on the clock.
@@ -232,28 +191,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
                 port.advance(now);
             }
         }
-        if let Some(link) = &mut self.links.command {
-            link.advance(&mut self.ports, now);
-            if link.supervisor.advance(now) {
-                link.lost(&mut self.ports);
-            }
-        }
-        if let Some(link) = &mut self.links.state
-            && link.supervisor.advance(now)
-        {
-            link.lost();
-        }
-        if let Some(link) = &mut self.links.modbus {
-            link.advance(&mut self.store, now);
-            if link.supervisor.advance(now) {
-                link.lost(&mut self.store);
-            }
-        }
-        for link in &mut self.links.recipes {
-            if link.supervisor.advance(now) {
-                link.lost(&mut self.store);
-            }
-        }
+        self.links.advance(&mut self.store, &mut self.ports, now);
     }
 
     fn expire_frames(&mut self, now: Instant) {
@@ -295,128 +233,6 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         }
     }
 
-    fn link_up(&mut self, id: LinkId, now: Instant) {
-        match id {
-            LinkId::COMMAND => {
-                if let Some(link) = &mut self.links.command {
-                    link.supervisor.up(now);
-                }
-            }
-            LinkId::STATE => {
-                if let Some(link) = &mut self.links.state {
-                    link.supervisor.up(now);
-                }
-            }
-            LinkId::MODBUS => {
-                if let Some(link) = &mut self.links.modbus
-                    && link.supervisor.up(now)
-                {
-                    link.up(&mut self.store);
-                }
-            }
-            _ => {
-                if let Some(link) = self.links.recipes.iter_mut().find(|link| link.id == id)
-                    && link.supervisor.up(now)
-                {
-                    link.up(&mut self.store, now);
-                }
-            }
-        }
-    }
-
-    fn link_down(&mut self, id: LinkId, now: Instant) {
-        match id {
-            LinkId::COMMAND => {
-                if let Some(link) = &mut self.links.command
-                    && link.supervisor.down(now)
-                {
-                    link.lost(&mut self.ports);
-                }
-            }
-            LinkId::STATE => {
-                if let Some(link) = &mut self.links.state
-                    && link.supervisor.down(now)
-                {
-                    link.lost();
-                }
-            }
-            LinkId::MODBUS => {
-                if let Some(link) = &mut self.links.modbus
-                    && link.supervisor.down(now)
-                {
-                    link.lost(&mut self.store);
-                }
-            }
-            _ => {
-                if let Some(link) = self.links.recipes.iter_mut().find(|link| link.id == id)
-                    && link.supervisor.down(now)
-                {
-                    link.lost(&mut self.store);
-                }
-            }
-        }
-    }
-
-    /// Bytes of a link that is not up, as the engine sees it, are of a connection it gave up.
-    fn link_bytes(&mut self, id: LinkId, bytes: &[u8], now: Instant) {
-        match id {
-            LinkId::COMMAND => {
-                if let Some(link) = self.links.command.as_mut().filter(|link| link.supervisor.is_up()) {
-                    link.bytes(bytes, &mut self.ports, now);
-                }
-            }
-            LinkId::STATE => {
-                if let Some(link) = self.links.state.as_mut().filter(|link| link.supervisor.is_up()) {
-                    link.bytes(bytes, &mut self.store, now);
-                }
-            }
-            LinkId::MODBUS => {
-                if let Some(link) = self.links.modbus.as_mut().filter(|link| link.supervisor.is_up()) {
-                    link.bytes(bytes, &mut self.store, now);
-                }
-            }
-            _ => {
-                let link = self.links.recipes.iter_mut().find(|link| link.id == id);
-                if let Some(link) = link.filter(|link| link.supervisor.is_up()) {
-                    link.bytes(bytes, &mut self.store, now);
-                }
-            }
-        }
-        self.image_changed();
-    }
-
-    /// What goes to the controller.
-    fn next_upward(&mut self, out: &mut [u8], now: Instant) -> Option<(LinkId, usize)> {
-        let state = self.links.state.as_ref().map(|state| state.group);
-        for link in &mut self.links.recipes {
-            if let Some(len) = link.next_frame(&mut self.store, state, out, now) {
-                return Some((link.id, len));
-            }
-        }
-        if let Some(link) = &mut self.links.modbus
-            && let Some(len) = link.next_request(&mut self.store, out, now)
-        {
-            return Some((LinkId::MODBUS, len));
-        }
-        let link = self.links.command.as_mut()?;
-        link.next_command(&mut self.ports, out, now).map(|len| (LinkId::COMMAND, len))
-    }
-
-    /// Links to be opened and closed.
-    fn next_action(&mut self) -> Option<(LinkId, LinkAction)> {
-        let Links { command, state, modbus, recipes } = &mut self.links;
-        let command = command.as_mut().map(|link| (LinkId::COMMAND, &mut link.supervisor));
-        let state = state.as_mut().map(|link| (LinkId::STATE, &mut link.supervisor));
-        let modbus = modbus.as_mut().map(|link| (LinkId::MODBUS, &mut link.supervisor));
-        let recipes = recipes.iter_mut().map(|link| (link.id, &mut link.supervisor));
-        command
-            .into_iter()
-            .chain(state)
-            .chain(modbus)
-            .chain(recipes)
-            .find_map(|(id, supervisor)| supervisor.take_action().map(|action| (id, action)))
-    }
-
     /// What goes to the field.
     fn next_downward(&mut self, out: &mut [u8], now: Instant) -> Option<(PortId, Downward)> {
         let (image, bindings) = (&self.store.image, &self.bindings.outputs);
@@ -431,129 +247,10 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     }
 
     fn next_deadline(&self) -> Instant {
-        let links = &self.links;
-        let command = links.command.iter().map(|link| link.deadline().min(link.supervisor.deadline()));
-        let state = links.state.iter().map(|link| link.supervisor.deadline());
-        let modbus = links.modbus.iter().map(|link| link.deadline().min(link.supervisor.deadline()));
-        let recipes = links.recipes.iter().map(|link| link.deadline().min(link.supervisor.deadline()));
         let ports = self.ports.iter().map(FieldPort::deadline);
-        let all = command.chain(state).chain(modbus).chain(recipes).chain(ports);
-        all.min().unwrap_or(Instant::NEVER).min(self.store.next_overdue)
+        let ports = ports.min().unwrap_or(Instant::NEVER);
+        ports.min(self.links.deadline()).min(self.store.next_overdue)
     }
-}
-
-/// One thing for the field.
-enum Downward {
-    Bytes(usize),
-    Can(CanFrame),
-}
-
-impl FieldPort {
-    /// The frame that is due, if its values may be shown.
-    fn next_output(
-        &mut self,
-        image: &Image,
-        bindings: &[OutputBind],
-        out: &mut [u8],
-        now: Instant,
-    ) -> Option<Downward> {
-        if !self.sender.may_show(image, now) {
-            bump(&mut self.counters.stale_cycles);
-            self.sender.dismiss();
-            return None;
-        }
-        match self.codec {
-            Codec::Stream { .. } => self.next_stream(image, self.outputs.of(bindings), out),
-            Codec::Can { .. } => self.next_can(image, self.outputs.of(bindings)),
-        }
-    }
-
-    fn next_stream(&mut self, image: &Image, bindings: &[OutputBind], out: &mut [u8]) -> Option<Downward> {
-        let Codec::Stream { output: Some(layout), .. } = &self.codec else {
-            self.sender.dismiss();
-            return None;
-        };
-        let encoded = match self.mode {
-            Mode::Realtime => layout.encode(image.bytes(), out).ok(),
-            Mode::User => {
-                let values = values(bindings, image, self.sender.frames_sent, self.reply);
-                layout.encode_values(&values, out).ok()
-            }
-        };
-        let frame = encoded.and_then(|len| out.get(..len));
-        match frame {
-            Some(frame) if self.sender.is_news(digest(DIGEST_SEED, frame)) => {
-                let len = frame.len();
-                bump(&mut self.counters.frames_out);
-                add(&mut self.counters.bytes_out, len);
-                self.sender.handed_over();
-                Some(Downward::Bytes(len))
-            }
-            _ => {
-                self.sender.dismiss();
-                None
-            }
-        }
-    }
-
-    fn next_can(&mut self, image: &Image, bindings: &[OutputBind]) -> Option<Downward> {
-        if self.sender.next_can == 0 && !self.can_is_news(image, bindings) {
-            self.sender.dismiss();
-            return None;
-        }
-        let nth = self.sender.next_can;
-        let Some((frame, is_last)) = self.can_frame(nth, image, bindings) else {
-            self.sender.dismiss();
-            return None;
-        };
-        bump(&mut self.counters.frames_out);
-        add(&mut self.counters.bytes_out, frame.data().len());
-        if is_last {
-            self.sender.handed_over();
-        } else {
-            self.sender.next_can = nth.saturating_add(1);
-        }
-        Some(Downward::Can(frame))
-    }
-
-    /// The `nth` frame of the cycle, and whether it is the last.
-    fn can_frame(&self, nth: usize, image: &Image, bindings: &[OutputBind]) -> Option<(CanFrame, bool)> {
-        let Codec::Can { output: Some(layout), .. } = &self.codec else { return None };
-        let frame = layout.frame(nth)?;
-        let is_last = nth.saturating_add(1) >= layout.frame_count();
-        let frame = match self.mode {
-            Mode::Realtime => frame.encode(image.bytes()),
-            Mode::User => {
-                let row = bindings.get(fields_before(layout, nth)..).unwrap_or(&[]);
-                let row = row.get(..frame.fields().count()).unwrap_or(&[]);
-                let values = values(row, image, self.sender.frames_sent, self.reply);
-                frame.encode_values(&values).ok()?
-            }
-        };
-        Some((frame, is_last))
-    }
-
-    fn can_is_news(&mut self, image: &Image, bindings: &[OutputBind]) -> bool {
-        if !self.sender.sends_changes() {
-            return true;
-        }
-        let mut hash = DIGEST_SEED;
-        let mut nth = 0_usize;
-        while let Some((frame, _)) = self.can_frame(nth, image, bindings) {
-            hash = digest(hash, frame.data());
-            nth = nth.saturating_add(1);
-        }
-        self.sender.is_news(hash)
-    }
-}
-
-fn info<'a>(
-    id: LinkId,
-    kind: LinkKind,
-    supervisor: &'a Supervisor,
-    counters: &'a LinkCounters,
-) -> LinkInfo<'a> {
-    LinkInfo { id, kind, state: supervisor.state(), history: supervisor.history(), counters }
 }
 
 fn find_port(ports: &mut [FieldPort], id: PortId) -> Option<&mut FieldPort> {

@@ -1,0 +1,255 @@
+//! The links to the controller together: whom a report is for, and in what order they speak.
+
+use heapless::Vec;
+
+use super::command_link::CommandLink;
+use super::counters::LinkCounters;
+use super::field_port::FieldPort;
+use super::io::{LinkId, LinkKind};
+use super::modbus_link::ModbusLink;
+use super::state_link::StateLink;
+use super::store::Store;
+use super::uplink::Uplink;
+use crate::link::{LinkAction, LinkHistory, LinkState, Supervisor};
+use crate::time::Instant;
+
+/// How one link does.
+#[derive(Debug, Clone, Copy)]
+pub struct LinkInfo<'a> {
+    /// The link.
+    pub id: LinkId,
+    /// What it is.
+    pub kind: LinkKind,
+    /// Where it stands.
+    pub state: LinkState,
+    /// How often it came and went.
+    pub history: &'a LinkHistory,
+    /// What went over it.
+    pub counters: &'a LinkCounters,
+}
+
+/// The links that the configuration needs.
+#[derive(Debug, Clone)]
+pub(super) struct Links<const UPLINKS: usize> {
+    pub command: Option<CommandLink>,
+    pub state: Option<StateLink>,
+    pub modbus: Option<ModbusLink>,
+    pub recipes: Vec<Uplink, UPLINKS>,
+}
+
+impl<const UPLINKS: usize> Links<UPLINKS> {
+    pub(super) const fn new() -> Self {
+        Self { command: None, state: None, modbus: None, recipes: Vec::new() }
+    }
+
+    pub(super) fn infos(&self) -> impl Iterator<Item = LinkInfo<'_>> + '_ {
+        let command = self.command.iter();
+        let command =
+            command.map(|link| info(LinkId::COMMAND, LinkKind::Command, &link.supervisor, &link.counters));
+        let state = self.state.iter();
+        let state = state.map(|link| info(LinkId::STATE, LinkKind::State, &link.supervisor, &link.counters));
+        let modbus = self.modbus.iter();
+        let modbus =
+            modbus.map(|link| info(LinkId::MODBUS, LinkKind::Modbus, &link.supervisor, &link.counters));
+        let recipes = self.recipes.iter();
+        let recipes = recipes.map(|link| info(link.id, link.kind, &link.supervisor, &link.counters));
+        command.chain(state).chain(modbus).chain(recipes)
+    }
+
+    /// Everything that depends on the clock.
+    pub(super) fn advance<const PORTS: usize>(
+        &mut self,
+        store: &mut Store<PORTS>,
+        ports: &mut [FieldPort],
+        now: Instant,
+    ) {
+        if let Some(link) = &mut self.command {
+            link.advance(ports, now);
+            if link.supervisor.advance(now) {
+                link.lost(ports);
+            }
+        }
+        if let Some(link) = &mut self.state
+            && link.supervisor.advance(now)
+        {
+            link.lost();
+        }
+        if let Some(link) = &mut self.modbus {
+            link.advance(store, now);
+            if link.supervisor.advance(now) {
+                link.lost(store);
+            }
+        }
+        for link in &mut self.recipes {
+            if link.supervisor.advance(now) {
+                link.lost(store);
+            }
+        }
+    }
+
+    /// The driver reports that a link is usable.
+    pub(super) fn up<const PORTS: usize>(&mut self, id: LinkId, store: &mut Store<PORTS>, now: Instant) {
+        match id {
+            LinkId::COMMAND => {
+                if let Some(link) = &mut self.command {
+                    link.supervisor.up(now);
+                }
+            }
+            LinkId::STATE => {
+                if let Some(link) = &mut self.state {
+                    link.supervisor.up(now);
+                }
+            }
+            LinkId::MODBUS => {
+                if let Some(link) = &mut self.modbus
+                    && link.supervisor.up(now)
+                {
+                    link.up(store);
+                }
+            }
+            _ => {
+                if let Some(link) = self.recipe(id)
+                    && link.supervisor.up(now)
+                {
+                    link.up(store, now);
+                }
+            }
+        }
+    }
+
+    /// The driver reports that a link is lost or could not be opened.
+    pub(super) fn down<const PORTS: usize>(
+        &mut self,
+        id: LinkId,
+        store: &mut Store<PORTS>,
+        ports: &mut [FieldPort],
+        now: Instant,
+    ) {
+        match id {
+            LinkId::COMMAND => {
+                if let Some(link) = &mut self.command
+                    && link.supervisor.down(now)
+                {
+                    link.lost(ports);
+                }
+            }
+            LinkId::STATE => {
+                if let Some(link) = &mut self.state
+                    && link.supervisor.down(now)
+                {
+                    link.lost();
+                }
+            }
+            LinkId::MODBUS => {
+                if let Some(link) = &mut self.modbus
+                    && link.supervisor.down(now)
+                {
+                    link.lost(store);
+                }
+            }
+            _ => {
+                if let Some(link) = self.recipe(id)
+                    && link.supervisor.down(now)
+                {
+                    link.lost(store);
+                }
+            }
+        }
+    }
+
+    /// Bytes from a link. Those of a link that is not up, as the engine sees it, are of a
+    /// connection that it gave up.
+    pub(super) fn bytes<const PORTS: usize>(
+        &mut self,
+        id: LinkId,
+        bytes: &[u8],
+        store: &mut Store<PORTS>,
+        ports: &mut [FieldPort],
+        now: Instant,
+    ) {
+        match id {
+            LinkId::COMMAND => {
+                if let Some(link) = self.command.as_mut().filter(|link| link.supervisor.is_up()) {
+                    link.bytes(bytes, ports, now);
+                }
+            }
+            LinkId::STATE => {
+                if let Some(link) = self.state.as_mut().filter(|link| link.supervisor.is_up()) {
+                    link.bytes(bytes, store, now);
+                }
+            }
+            LinkId::MODBUS => {
+                if let Some(link) = self.modbus.as_mut().filter(|link| link.supervisor.is_up()) {
+                    link.bytes(bytes, store, now);
+                }
+            }
+            _ => {
+                if let Some(link) = self.recipe(id).filter(|link| link.supervisor.is_up()) {
+                    link.bytes(bytes, store, now);
+                }
+            }
+        }
+    }
+
+    /// The transport took everything.
+    pub(super) fn sent(&mut self, id: LinkId) {
+        if let Some(link) = self.recipe(id) {
+            link.sent();
+        }
+    }
+
+    /// What goes to the controller: field values first, commands last.
+    pub(super) fn next_upward<const PORTS: usize>(
+        &mut self,
+        store: &mut Store<PORTS>,
+        ports: &mut [FieldPort],
+        out: &mut [u8],
+        now: Instant,
+    ) -> Option<(LinkId, usize)> {
+        let state = self.state.as_ref().map(|state| state.group);
+        for link in &mut self.recipes {
+            if let Some(len) = link.next_frame(store, state, out, now) {
+                return Some((link.id, len));
+            }
+        }
+        if let Some(link) = &mut self.modbus
+            && let Some(len) = link.next_request(store, out, now)
+        {
+            return Some((LinkId::MODBUS, len));
+        }
+        let link = self.command.as_mut()?;
+        link.next_command(ports, out, now).map(|len| (LinkId::COMMAND, len))
+    }
+
+    /// Links to be opened and closed.
+    pub(super) fn next_action(&mut self) -> Option<(LinkId, LinkAction)> {
+        let command = self.command.iter_mut().map(|link| (LinkId::COMMAND, &mut link.supervisor));
+        let state = self.state.iter_mut().map(|link| (LinkId::STATE, &mut link.supervisor));
+        let modbus = self.modbus.iter_mut().map(|link| (LinkId::MODBUS, &mut link.supervisor));
+        let recipes = self.recipes.iter_mut().map(|link| (link.id, &mut link.supervisor));
+        let mut all = command.chain(state).chain(modbus).chain(recipes);
+        all.find_map(|(id, supervisor)| supervisor.take_action().map(|action| (id, action)))
+    }
+
+    /// When something happens by itself.
+    pub(super) fn deadline(&self) -> Instant {
+        let command = self.command.iter().map(|link| link.deadline().min(link.supervisor.deadline()));
+        let state = self.state.iter().map(|link| link.supervisor.deadline());
+        let modbus = self.modbus.iter().map(|link| link.deadline().min(link.supervisor.deadline()));
+        let recipes = self.recipes.iter().map(|link| link.deadline().min(link.supervisor.deadline()));
+        command.chain(state).chain(modbus).chain(recipes).min().unwrap_or(Instant::NEVER)
+    }
+
+    fn recipe(&mut self, id: LinkId) -> Option<&mut Uplink> {
+        self.recipes.iter_mut().find(|link| link.id == id)
+    }
+}
+
+fn info<'a>(
+    id: LinkId,
+    kind: LinkKind,
+    supervisor: &'a Supervisor,
+    counters: &'a LinkCounters,
+) -> LinkInfo<'a> {
+    LinkInfo { id, kind, state: supervisor.state(), history: supervisor.history(), counters }
+}
