@@ -107,6 +107,7 @@ impl Controller {
             }
             Effect::ProgramEnded => {
                 self.arm.settle(now);
+                self.arm_shown = None;
                 self.program_is_over(now);
             }
             Effect::ShutDown => {

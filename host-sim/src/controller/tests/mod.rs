@@ -2,6 +2,11 @@
 
 mod commands;
 mod examples;
+mod faults;
+mod modbus;
+mod ports;
+mod programs;
+mod stream;
 
 use std::collections::BTreeMap;
 use std::net::{Ipv4Addr, SocketAddr};
@@ -268,4 +273,13 @@ pub(super) fn with_power(mut config: SimConfig, power: Power) -> SimConfig {
 pub(super) fn with_dialect(mut config: SimConfig, name: &str) -> SimConfig {
     config.robot.dialect = name.to_owned();
     config
+}
+
+pub(super) fn target(name: &str) -> InitialTarget {
+    registers::parse_target(name).unwrap()
+}
+
+/// The item's value now.
+pub(super) fn value(cell: &Cell, name: &str) -> f64 {
+    cell.controller.registers().value(target(name))
 }
