@@ -81,6 +81,20 @@ fn wrong_files_and_arguments_start_nothing() {
 }
 
 #[test]
+fn what_only_the_controller_can_refuse_has_its_place_too() {
+    let file = path("rs485-user-controller.toml");
+    let script = "program.\"echo.jspf\".script=let = 1;";
+    for command in [&["check", &file][..], &["controller", "-c", &file]] {
+        let message = refused(&[command, &["--set", script]].concat());
+        let place = format!("--set {script}: program.echo.jspf.script: ");
+        assert!(message.starts_with(&place) && message.contains("line 1"), "{message}");
+        assert_eq!(message.lines().count(), 1);
+    }
+    let joint = refused(&["check", &file, "--set", "initial.RobotState[1]=100"]);
+    assert!(joint.contains("initial.RobotState[1]: a joint position is within"), "{joint}");
+}
+
+#[test]
 fn frames_and_values_convert_both_ways() {
     let stream = path("rs485-system.toml");
     assert_eq!(ok(&["encode", &stream, "--part", "input", "1"], ""), "FF FF 01 EE EE\n");

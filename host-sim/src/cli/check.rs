@@ -1,7 +1,7 @@
 //! `check`: is a file right, how full are its lines, and what must be set on the pendant.
 
 use std::io::Write;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 use proto_core::config::{Bus, GatewayConfig, Parity, PartBudget, Rs485, can_frame_time};
@@ -10,8 +10,9 @@ use proto_core::sysvar::{Direction, SysVar};
 use proto_core::time::Duration;
 
 use super::{Overrides, text};
-use crate::config::file::{self, Config};
+use crate::config::file::{self, Config, FileError};
 use crate::config::{SimBus, SimConfig, SimField, SimParts, SimPort, SimRecipe, SimStreamPart};
+use crate::controller::{BuildError, Controller};
 
 /// What `check` is told.
 #[derive(Debug, Args)]
@@ -26,12 +27,35 @@ pub(super) fn run(args: &CheckArgs, out: &mut dyn Write) -> Result<(), String> {
     let overrides = &args.overrides.set;
     let config = file::load(&args.file, overrides).map_err(|error| error.to_string())?;
     let recipes = file::load_recipes(&args.file, overrides).map_err(|error| error.to_string())?;
+    if let Config::Controller(config) = &config {
+        check_build(&args.file, overrides, config).map_err(|error| error.to_string())?;
+    }
     let name = args.file.display();
     let report = match &config {
         Config::Gateway(config) => format!("{name}: a valid gateway file\n\n{}", gateway(config, &recipes)),
         Config::Controller(config) => format!("{name}: a valid controller file\n\n{}", controller(config)),
     };
     write!(out, "{report}").map_err(|error| error.to_string())
+}
+
+/// A controller file whose programs compile and whose values fit.
+pub(super) fn load_controller(path: &Path, overrides: &[String]) -> Result<SimConfig, FileError> {
+    let config = file::load_controller(path, overrides)?;
+    check_build(path, overrides, &config)?;
+    Ok(config)
+}
+
+/// What only the controller itself can refuse.
+fn check_build(path: &Path, overrides: &[String], config: &SimConfig) -> Result<(), FileError> {
+    let Err(error) = Controller::new(config) else { return Ok(()) };
+    let at = |key: &[&str], message: &dyn std::fmt::Display| file::error_at(path, overrides, key, message);
+    Err(match &error {
+        BuildError::Program { program, error } => at(&["program", program, "script"], error),
+        BuildError::Initial { target, reason } => at(&["initial", &target.to_string()], reason),
+        BuildError::Port { port, error } => at(&["port", port, "recipe"], error),
+        BuildError::Dialect(_) => at(&["robot", "dialect"], &error),
+        BuildError::SecondUdpServer { port } => at(&["port", port], &error),
+    })
 }
 
 /// Everything about a gateway file.

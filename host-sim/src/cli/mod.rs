@@ -243,7 +243,7 @@ fn wrong(message: impl std::fmt::Display) -> ExitCode {
 
 impl Run {
     fn controller(self) -> ExitCode {
-        match file::load_controller(&self.config, &self.overrides.set) {
+        match check::load_controller(&self.config, &self.overrides.set) {
             Ok(config) => finished(shell::controller::run(config, self.options())),
             Err(error) => wrong(error),
         }

@@ -120,6 +120,26 @@ impl Document {
         FileError { source, key: String::new(), message: message.into() }
     }
 
+    /// Where the value of `path` was written, or the nearest table around it.
+    pub(super) fn find(&self, path: &[&str]) -> Option<At> {
+        let (first, mut rest) = path.split_first()?;
+        let mut node = &self.root.get(first)?.node;
+        while let Some((key, after)) = rest.split_first() {
+            let next = match &node.value {
+                Value::Table(table) => table.get(key).map(|entry| &entry.node),
+                Value::Array(items) => {
+                    items.iter().find(|item| name_of(item).is_some_and(|name| name == *key))
+                }
+                _ => None,
+            };
+            match next {
+                Some(next) => (node, rest) = (next, after),
+                None => break,
+            }
+        }
+        Some(node.at)
+    }
+
     /// Puts one `KEY=VALUE` into the tree.
     fn put(&mut self, number: usize, text: &str) -> Result<(), FileError> {
         let at = At::Override(number);
@@ -228,14 +248,7 @@ fn insert_into_item(
     at: At,
 ) -> Result<(), String> {
     let Some((wanted, rest)) = path.split_first() else { return Ok(()) };
-    let name_of = |item: &Node| match &item.value {
-        Value::Table(table) => match table.get("name").map(|entry| &entry.node.value) {
-            Some(Value::Str(name)) => Some(name.clone()),
-            _ => None,
-        },
-        _ => None,
-    };
-    let names: Vec<_> = items.iter().map(name_of).collect();
+    let names: Vec<_> = items.iter().map(|item| name_of(item).map(str::to_owned)).collect();
     let by_number = || wanted.parse::<usize>().ok().filter(|number| (1..=items.len()).contains(number));
     let place = names
         .iter()
@@ -257,6 +270,16 @@ fn insert_into_item(
         (Node { value, .. }, _) => {
             Err(format!("{key} {wanted} is {}, and has no keys of its own", value.kind()))
         }
+    }
+}
+
+fn name_of(item: &Node) -> Option<&str> {
+    match &item.value {
+        Value::Table(table) => match &table.get("name")?.node.value {
+            Value::Str(name) => Some(name),
+            _ => None,
+        },
+        _ => None,
     }
 }
 

@@ -129,6 +129,20 @@ pub fn parse_recipes(text: Text<'_>, overrides: &[String]) -> Result<Vec<SimReci
     Ok(recipes::read_all(&root, flavour)?.iter().map(recipes::FileRecipe::to_sim).collect())
 }
 
+/// A mistake that was only found after the file had been read, at the place of `key` (names, and
+/// for an item of an array its `name`), or as near to it as there is something.
+pub fn error_at(path: &Path, overrides: &[String], key: &[&str], message: impl ToString) -> FileError {
+    let message = message.to_string();
+    let located = with_text(path, |text| {
+        let document = Document::parse(text.name, text.toml, overrides)?;
+        Ok(match document.find(key) {
+            Some(at) => document.error(at, &key.join("."), message.as_str()),
+            None => document.whole_file_error(format!("{}: {message}", key.join("."))),
+        })
+    });
+    located.unwrap_or_else(|error| error)
+}
+
 fn with_text<T>(path: &Path, read: impl FnOnce(Text<'_>) -> Result<T>) -> Result<T> {
     let name = path.display().to_string();
     match std::fs::read_to_string(path) {
