@@ -5,8 +5,10 @@
 
 pub mod file;
 mod sim;
+mod target;
 
 pub use sim::{
     AnalogInput, BitGroup, Initial, InitialTarget, Listen, Power, Robot, RobotMode, SimBus, SimCanFrame,
     SimConfig, SimField, SimParts, SimPort, SimProgram, SimRecipe, SimStreamPart,
 };
+pub use target::TargetError;

@@ -180,7 +180,7 @@ impl Controller {
         self.apply(now, effect);
     }
 
-    /// The arm has hit something on this axis (see docs/wire/state.md).
+    /// The arm has hit something on this axis (see docs/wire/state.md section 2).
     pub fn collide(&mut self, now: Instant, axis: u8) {
         let effect = self.machine.collide(now, axis);
         self.apply(now, effect);

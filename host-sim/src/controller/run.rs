@@ -9,7 +9,7 @@ use super::machine::{Effect, ErrorId};
 use super::motion::Braking;
 use super::ports::{Listening, Outgoing};
 use super::program::{Answer, Call, End, Program, Progress, Script, Variables};
-use super::registers::{Status, parse_target};
+use super::registers::Status;
 use super::{ConnId, Controller, ControllerOutput, MAX_LOG};
 use crate::config::InitialTarget;
 
@@ -265,13 +265,13 @@ impl Controller {
                     Err(message) => Some(Answer::Error(message)),
                 }
             }
-            Call::Get { name } => Some(match parse_target(name) {
+            Call::Get { name } => Some(match name.parse() {
                 Ok(InitialTarget::Var(var)) => Answer::Value(self.registers.var(var)),
                 Ok(InitialTarget::Bit { group, index }) => Answer::Bit(self.registers.bit(group, index)),
                 Ok(target) => Answer::Value(Scalar::Double(self.registers.value(target))),
                 Err(error) => Answer::Error(format!("{name}: {error}")),
             }),
-            Call::Set { name, value } => Some(match parse_target(name) {
+            Call::Set { name, value } => Some(match name.parse() {
                 Ok(target) => match self.registers.set_by_program(target, *value) {
                     Ok(()) => Answer::Done,
                     Err(error) => Answer::Error(error.to_string()),

@@ -3,16 +3,15 @@
 use std::net::IpAddr;
 
 use proto_core::recipe::model::{Framing, Mode};
-use proto_core::sysvar::SysVar;
 use proto_core::wire::scalar::Scalar;
 
 use super::document::Document;
 use super::lines::{LINE_KEYS, read_bitrate, read_cycle, read_line};
 use super::reader::{Item, Reader, Result, Spot};
 use super::recipes::{self, FileRecipe, Flavour};
+use crate::config::TargetError;
 use crate::config::sim::{
-    AnalogInput, BitGroup, Initial, InitialTarget, Listen, Power, Robot, RobotMode, SimBus, SimConfig,
-    SimPort, SimProgram,
+    Initial, InitialTarget, Listen, Power, Robot, RobotMode, SimBus, SimConfig, SimPort, SimProgram,
 };
 
 /// The top-level keys of a controller file.
@@ -86,37 +85,14 @@ fn read_initial(root: &Reader<'_>) -> Result<Vec<Initial>> {
     let mut initial: Vec<Initial> = Vec::new();
     let Some(item) = root.optional("initial") else { return Ok(initial) };
     for (name, key_spot, item) in item.any_table()?.entries() {
-        let target = parse_target(name).map_err(|message| key_spot.error(root.document, message))?;
+        let target: InitialTarget =
+            name.parse().map_err(|error: TargetError| key_spot.error(root.document, error.to_string()))?;
         if initial.iter().any(|before| before.target == target) {
             return Err(key_spot.error(root.document, format!("{target} has an initial value already")));
         }
         initial.push(Initial { target, value: read_value(target, &item)? });
     }
     Ok(initial)
-}
-
-/// `DI[3]`, `AI_C[1]`, or a system variable.
-fn parse_target(name: &str) -> std::result::Result<InitialTarget, String> {
-    let (group_name, index) = match name.strip_suffix(']').and_then(|name| name.split_once('[')) {
-        Some((group, index)) => (group, index.parse::<u8>().ok()),
-        None => (name, None),
-    };
-    let bits = BitGroup::ALL.into_iter().find(|group| group.name() == group_name);
-    let analog = AnalogInput::ALL.into_iter().find(|group| group.name() == group_name);
-    let in_range = |count: u8| {
-        index
-            .filter(|index| (1..=count).contains(index))
-            .ok_or_else(|| format!("{group_name} has only [1..{count}]"))
-    };
-    match (bits, analog) {
-        (Some(group), _) => Ok(InitialTarget::Bit { group, index: in_range(group.count())? }),
-        (_, Some(group)) => Ok(InitialTarget::Analog { group, index: in_range(group.count())? }),
-        (None, None) => SysVar::parse(name).map(InitialTarget::Var).map_err(|error| {
-            let bits: Vec<_> = BitGroup::ALL.into_iter().map(BitGroup::name).collect();
-            let analog: Vec<_> = AnalogInput::ALL.into_iter().map(AnalogInput::name).collect();
-            format!("{error}; and {}, {} with an index", bits.join(", "), analog.join(", "))
-        }),
-    }
 }
 
 fn read_value(target: InitialTarget, item: &Item<'_>) -> Result<f64> {

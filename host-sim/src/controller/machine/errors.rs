@@ -1,4 +1,5 @@
-//! The error numbers that `getlasterror` and the state stream show.
+//! The error numbers that `getlasterror` and the state stream show
+//! (docs/simulated-controller.md section 2).
 //!
 //! The interface description lists none; these are the simulated controller's own.
 

@@ -1,4 +1,5 @@
-//! The arm: where its joints are at any instant, and what follows from that.
+//! The arm: where its joints are at any instant, and what follows from that
+//! (docs/simulated-controller.md section 3).
 //!
 //! In: moves, the rate at which they are run through, an instant. Out: positions, speeds,
 //! torques and the TCP's pose. Everything is a closed formula of time, so nothing has to be

@@ -1,4 +1,4 @@
-//! Who gets the UDP server's frames (docs/wire/recipes.md, D24).
+//! Who gets the UDP server's frames (docs/simulated-controller.md section 5, D24).
 
 use std::net::SocketAddr;
 

@@ -1,7 +1,7 @@
 //! Every register and every input and output of the controller, in one place.
 //!
 //! In: recipe frames, Modbus writes, programs, and what the arm and the state machines do. Out:
-//! the same values through port 2001, Modbus (docs/wire/modbus.md), recipes and programs. Knows
+//! the same values through port 2001, Modbus, recipes and programs. Knows
 //! neither connections nor time.
 //!
 //! The system variables stand in one process image, as everywhere in `proto_core`; the few items
@@ -10,7 +10,6 @@
 //! follows the first.
 
 mod bank;
-mod names;
 mod packet;
 
 use std::sync::LazyLock;
@@ -20,7 +19,6 @@ use proto_core::wire::scalar::Scalar;
 
 use super::motion::{ArmState, Frame};
 use crate::config::{AnalogInput, BitGroup, InitialTarget};
-pub use names::{NameError, parse_target};
 
 /// What the state machines show.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -35,7 +33,7 @@ pub struct Status {
     pub program: u8,
     /// Safety state.
     pub safety: u8,
-    /// The collision axis while a collision is reported, see docs/wire/state.md.
+    /// The collision axis while a collision is reported, see docs/wire/state.md section 2.
     pub collision_axis: Option<u8>,
     /// The newest error's code, 0 when there is none.
     pub error: u32,

@@ -1,5 +1,5 @@
 //! The specification's six worked examples against the controller's own ports, byte for byte
-//! (docs/wire/recipes.md).
+//! (docs/wire/recipes.md section 8).
 
 use super::*;
 use ScalarType::Byte;
@@ -172,4 +172,26 @@ fn example_6_tcp_and_udp_client() {
         assert_eq!(cell.sent.len(), 1);
         assert_eq!(cell.sent[0].0.as_micros() % 4_000, 0, "the grid is the old one");
     }
+}
+
+#[test]
+fn every_example_file_makes_a_controller_whose_programs_run() {
+    let mut controllers = 0;
+    for entry in std::fs::read_dir(concat!(env!("CARGO_MANIFEST_DIR"), "/configs")).unwrap() {
+        let path = entry.unwrap().path();
+        if !path.to_string_lossy().ends_with("-controller.toml") {
+            continue;
+        }
+        let config =
+            crate::config::file::load_controller(&path, &[]).unwrap_or_else(|error| panic!("{error}"));
+        controllers += 1;
+        for program in &config.programs {
+            let mut cell = Cell::new(&config);
+            let c = cell.command_client();
+            assert_eq!(cell.ask(c, &format!("run({})", program.name)), "run start", "{}", path.display());
+            cell.run_ms(1_000);
+            assert_eq!(cell.controller.machine().error(), None, "{}: {}", path.display(), program.name);
+        }
+    }
+    assert!(controllers >= 8, "{controllers}");
 }

@@ -259,7 +259,7 @@ pub(super) fn with_program(mut config: SimConfig, name: &str, script: &str) -> S
 
 pub(super) fn with_initial(mut config: SimConfig, values: &[(&str, f64)]) -> SimConfig {
     for (name, value) in values {
-        let target = registers::parse_target(name).unwrap();
+        let target = target(name);
         config.initial.push(Initial { target, value: *value });
     }
     config
@@ -276,7 +276,7 @@ pub(super) fn with_dialect(mut config: SimConfig, name: &str) -> SimConfig {
 }
 
 pub(super) fn target(name: &str) -> InitialTarget {
-    registers::parse_target(name).unwrap()
+    name.parse().unwrap()
 }
 
 /// The item's value now.

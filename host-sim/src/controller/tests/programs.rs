@@ -63,7 +63,7 @@ fn registers_and_io_are_read_and_outputs_written() {
     let log: Vec<_> = cell.controller.program_log().collect();
     assert_eq!(log[0], "a program cannot write WordInputReg[1]");
     assert_eq!(log[1], "a program cannot write DI[1]");
-    assert_eq!(log[5], "DI[17]: DI has indices 1..16");
+    assert_eq!(log[5], "DI[17]: DI has only [1..16]");
     assert!(log[6].starts_with("Nothing[1]: no such system variable"), "{}", log[6]);
     assert_eq!(log[8], "WordOutputReg[1] cannot be 65536");
     assert_eq!(log[9], "DO[1] cannot be 2");

@@ -1,0 +1,59 @@
+//! Items as files and programs name them: `WordOutputReg[1]`, `DI[3]`, `AI_V[2]`.
+
+use std::fmt;
+use std::str::FromStr;
+
+use proto_core::sysvar::{ParseError, SysVar};
+
+use super::{AnalogInput, BitGroup, InitialTarget};
+
+/// Why a name means no item.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum TargetError {
+    /// The group has no such index.
+    Index {
+        /// The group's name.
+        group: &'static str,
+        /// Its last index; the first is 1.
+        last: u8,
+    },
+    /// No group of bits or analog inputs, and no system variable either.
+    Variable(ParseError),
+}
+
+impl fmt::Display for TargetError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Index { group, last } => write!(f, "{group} has only [1..{last}]"),
+            Self::Variable(error) => {
+                let bits: Vec<_> = BitGroup::ALL.into_iter().map(BitGroup::name).collect();
+                let analog: Vec<_> = AnalogInput::ALL.into_iter().map(AnalogInput::name).collect();
+                write!(f, "{error}; and {}, {} with an index", bits.join(", "), analog.join(", "))
+            }
+        }
+    }
+}
+
+impl std::error::Error for TargetError {}
+
+impl FromStr for InitialTarget {
+    type Err = TargetError;
+
+    fn from_str(name: &str) -> Result<Self, TargetError> {
+        let (word, index) = match name.strip_suffix(']').and_then(|name| name.split_once('[')) {
+            Some((word, index)) => (word, index.parse::<u8>().ok()),
+            None => (name, None),
+        };
+        let within = |group: &'static str, last: u8| {
+            index.filter(|index| (1..=last).contains(index)).ok_or(TargetError::Index { group, last })
+        };
+        if let Some(group) = BitGroup::ALL.into_iter().find(|group| group.name() == word) {
+            return Ok(Self::Bit { group, index: within(group.name(), group.count())? });
+        }
+        if let Some(group) = AnalogInput::ALL.into_iter().find(|group| group.name() == word) {
+            return Ok(Self::Analog { group, index: within(group.name(), group.count())? });
+        }
+        SysVar::parse(name).map(Self::Var).map_err(TargetError::Variable)
+    }
+}
