@@ -203,7 +203,7 @@ fn sim_budget(port: &SimPort, recipe: &SimRecipe, part: Direction) -> Option<Par
             let part = if part == Direction::Input { input } else { output }.as_ref()?;
             let bytes = bytes_of(&part.fields) + part.head.len() + part.tail.len();
             let time = match &port.bus {
-                SimBus::Rs485(line) => line.line_time(bytes),
+                SimBus::Rs485(line) => line.time_on_line(bytes),
                 _ => Duration::ZERO,
             };
             Some(PartBudget { frames: 1, bytes, time })

@@ -11,16 +11,21 @@ use crate::sysvar::{Direction, SysVar};
 use crate::time::Duration;
 
 impl Rs485 {
-    /// Bits of one byte on the line: start, data, parity, stop.
-    pub fn bits_per_byte(&self) -> u32 {
-        let parity = if self.parity == Parity::None { 0 } else { 1 };
-        9_u32.saturating_add(parity).saturating_add(u32::from(self.stop_bits))
+    /// Start bit, data bits, parity and stop bits.
+    pub fn bits_per_character(&self) -> u64 {
+        let parity = u64::from(self.parity != Parity::None);
+        9_u64.saturating_add(parity).saturating_add(u64::from(self.stop_bits))
     }
 
-    /// How long `bytes` take on the line, rounded up to the microsecond.
-    pub fn line_time(&self, bytes: usize) -> Duration {
-        let bits = (bytes as u64).saturating_mul(u64::from(self.bits_per_byte()));
-        bits_time(bits, self.baud)
+    /// The time that `len` bytes take on the line, rounded up to the microsecond.
+    pub fn time_on_line(&self, len: usize) -> Duration {
+        bits_time((len as u64).saturating_mul(self.bits_per_character()), self.baud)
+    }
+
+    /// The time that `n` characters and a half take on the line.
+    pub(crate) fn characters_and_a_half(&self, n: u64) -> Duration {
+        let half_bits = n.saturating_mul(2).saturating_add(1).saturating_mul(self.bits_per_character());
+        bits_time(half_bits, self.baud.saturating_mul(2))
     }
 }
 
@@ -65,7 +70,7 @@ impl GatewayConfig {
                 let bytes =
                     bytes_of(part.fields).saturating_add(part.head.len()).saturating_add(part.tail.len());
                 let time = match &port.bus {
-                    Bus::Rs485(line) => line.line_time(bytes),
+                    Bus::Rs485(line) => line.time_on_line(bytes),
                     _ => Duration::ZERO,
                 };
                 Some(PartBudget { frames: 1, bytes, time })
@@ -113,10 +118,6 @@ impl GatewayConfig {
                 .filter(|&var| !self.is_owned(var))
                 .map(move |var| Warning::ReadBack { recipe: index, var })
         })
-    }
-
-    fn is_owned(&self, var: SysVar) -> bool {
-        self.field_ports().any(|(_, _, recipe)| self.written_by(recipe).any(|owned| owned == var))
     }
 
     fn unused_recipes(&self) -> impl Iterator<Item = Warning> + '_ {
@@ -204,10 +205,12 @@ mod tests {
 
     #[test]
     fn line_times_are_those_of_the_wire() {
-        assert_eq!(line(115_200, Parity::None, 1).line_time(28), Duration::from_micros(2_431));
-        assert_eq!(line(460_800, Parity::None, 1).line_time(28), Duration::from_micros(608));
-        assert_eq!(line(9_600, Parity::Even, 2).line_time(1), Duration::from_micros(1_250));
-        assert_eq!(line(9_600, Parity::None, 1).line_time(0), Duration::ZERO);
+        assert_eq!(line(115_200, Parity::None, 1).time_on_line(28), Duration::from_micros(2_431));
+        assert_eq!(line(460_800, Parity::None, 1).time_on_line(28), Duration::from_micros(608));
+        assert_eq!(line(9_600, Parity::Even, 2).time_on_line(1), Duration::from_micros(1_250));
+        assert_eq!(line(9_600, Parity::None, 1).time_on_line(0), Duration::ZERO);
+        let gap = line(9_600, Parity::None, 1).characters_and_a_half(3);
+        assert_eq!(gap, Duration::from_micros(3_646));
     }
 
     #[test]

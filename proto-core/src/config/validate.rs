@@ -78,6 +78,11 @@ impl GatewayConfig {
         self.fields_of(recipe, Direction::Input).filter_map(|(_, _, field)| field.variable())
     }
 
+    /// Whether a field port writes the variable.
+    pub(super) fn is_owned(&self, var: SysVar) -> bool {
+        self.field_ports().any(|(_, _, recipe)| self.written_by(recipe).any(|owned| owned == var))
+    }
+
     fn check_controller(&self) -> Check {
         let controller = &self.controller;
         if Dialect::named(&controller.dialect).is_none() {
@@ -221,11 +226,9 @@ impl GatewayConfig {
 
     /// Every variable a port writes can be carried, and everything that is carried has a value.
     fn check_ways_up(&self) -> Check {
-        let mut owned = [false; COUNT];
         for (port, port_config, recipe) in self.field_ports() {
             for (frame, field, spec) in self.fields_of(recipe, Direction::Input) {
                 let Some(var) = spec.variable() else { continue };
-                mark(&mut owned, var);
                 if var.modbus().is_none() && !self.carried(Direction::Input, var) {
                     let recipe = port_config.recipe;
                     let place = Place::Field { recipe, part: Direction::Input, frame, field };
@@ -236,7 +239,7 @@ impl GatewayConfig {
         for (index, recipe) in self.upstream_recipes() {
             for (frame, field, spec) in self.fields_of(recipe, Direction::Input) {
                 let Some(var) = spec.variable() else { continue };
-                if var.stream().is_none() && var.modbus().is_none() && !is_marked(&owned, var) {
+                if var.stream().is_none() && var.modbus().is_none() && !self.is_owned(var) {
                     let place = Place::Field { recipe: index, part: Direction::Input, frame, field };
                     return fail(place, Kind::Unowned { var });
                 }
@@ -249,8 +252,12 @@ impl GatewayConfig {
     fn check_sources(&self) -> Check {
         for (port, port_config, recipe) in self.field_ports() {
             let index = port_config.recipe;
+            // An input variable can be shown as its owner last sent it.
             let is_shown = |var: SysVar| {
-                var.stream().is_some() || var.modbus().is_some() || self.carried(Direction::Output, var)
+                var.stream().is_some()
+                    || var.modbus().is_some()
+                    || self.carried(Direction::Output, var)
+                    || self.is_owned(var)
             };
             for (frame, field, spec) in self.fields_of(recipe, Direction::Output) {
                 if let Some(var) = spec.variable().filter(|&var| !is_shown(var)) {

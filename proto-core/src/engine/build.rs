@@ -19,7 +19,7 @@ use super::store::{InputFrame, MAX_INPUT_FRAMES, SafeBytes, Store};
 use super::uplink::Uplink;
 use super::user::{Bindings, InputBind};
 use crate::config::{
-    Bus, ConfigError, FieldSpec, GatewayConfig, InputBinding, Parts, Port, Recipe, Rs485, Span, StreamPart,
+    Bus, ConfigError, FieldSpec, GatewayConfig, InputBinding, Parts, Port, Recipe, Span, StreamPart,
 };
 use crate::image::{GroupId, InputSet, MAX_GROUPS};
 use crate::link::{LinkTimings, Supervisor};
@@ -77,28 +77,6 @@ impl core::error::Error for BuildError {}
 
 fn too_many(what: &'static str, room: usize) -> BuildError {
     BuildError::TooMany { what, room }
-}
-
-impl Rs485 {
-    /// The time that `n` characters and a half take on the line.
-    pub(super) fn characters_and_a_half(&self, n: u64) -> Duration {
-        let half_bits = n.saturating_mul(2).saturating_add(1).saturating_mul(self.bits_per_character());
-        let micros = half_bits.saturating_mul(500_000).checked_div(u64::from(self.baud)).unwrap_or(0);
-        Duration::from_micros(micros)
-    }
-
-    /// Start bit, data bits, parity and stop bits.
-    pub fn bits_per_character(&self) -> u64 {
-        let parity = u64::from(self.parity != crate::config::Parity::None);
-        9_u64.saturating_add(parity).saturating_add(u64::from(self.stop_bits))
-    }
-
-    /// The time that `len` bytes take on the line, rounded up.
-    pub fn time_on_line(&self, len: usize) -> Duration {
-        let bits = (len as u64).saturating_mul(self.bits_per_character());
-        let micros = bits.saturating_mul(1_000_000).checked_next_multiple_of(u64::from(self.baud.max(1)));
-        Duration::from_micros(micros.and_then(|m| m.checked_div(u64::from(self.baud.max(1)))).unwrap_or(0))
-    }
 }
 
 /// Groups are handed out in order: field frames first.
