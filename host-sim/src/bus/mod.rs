@@ -3,9 +3,15 @@
 //!
 //! Bytes and frames go in and out; no recipe, no controller and no engine is known here.
 
+pub mod backoff;
 pub mod bind;
+pub mod can_bus;
+mod line;
+pub mod port;
 pub mod pty;
 mod reactor;
 pub mod realtime;
 pub mod slcan;
+#[cfg(test)]
+mod test_kit;
 pub mod timer;

@@ -1,0 +1,167 @@
+//! One port's device, whatever it is: opened from a `--bind`, driven by one task, fed through a handle.
+//!
+//! The task reports what the device does as [`PortEvent`]s; whoever owns the port sends through
+//! [`PortTx`], which takes what it is given at once and never more than a fixed amount.
+
+use std::cell::{Cell, RefCell};
+use std::collections::VecDeque;
+use std::io;
+use std::rc::Rc;
+
+use proto_core::config::Rs485;
+use proto_core::recipe::can::CanFrame;
+use serde::Serialize;
+use tokio::sync::Notify;
+
+use super::bind::Device;
+use super::can_bus::CanPort;
+use super::line::Line;
+
+/// What a device did.
+#[derive(Debug, PartialEq)]
+pub enum PortEvent<'a> {
+    /// It can be used from now on.
+    Up,
+    /// It cannot any more.
+    Down,
+    /// Bytes arrived.
+    Bytes(&'a [u8]),
+    /// A CAN frame arrived.
+    Frame(CanFrame),
+    /// Everything handed over has left.
+    Sent,
+}
+
+/// What the configuration says of a port's bus.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum PortBus {
+    /// A serial line.
+    Serial(Rs485),
+    /// A CAN bus of this bit rate.
+    Can {
+        /// Bit/s.
+        bitrate: u32,
+    },
+}
+
+/// A port whose device is open.
+#[derive(Debug)]
+pub struct Port {
+    driver: Driver,
+    tx: Rc<PortTx>,
+}
+
+#[derive(Debug)]
+enum Driver {
+    Line(Line),
+    Can(CanPort),
+}
+
+impl Port {
+    /// Opens the device in the current tokio runtime, which must be a current-thread one.
+    ///
+    /// # Errors
+    /// When the device does not suit the bus, does not exist, or cannot be opened.
+    pub async fn open(device: &Device, bus: PortBus) -> io::Result<Self> {
+        let tx = Rc::new(PortTx::default());
+        let driver = match bus {
+            PortBus::Serial(settings) => Driver::Line(Line::open(device, settings, Rc::clone(&tx)).await?),
+            PortBus::Can { bitrate } => Driver::Can(CanPort::open(device, bitrate, Rc::clone(&tx)).await?),
+        };
+        Ok(Self { driver, tx })
+    }
+
+    /// Where others find the port: the link of a pseudoterminal, the address of a socket.
+    pub fn place(&self) -> String {
+        match &self.driver {
+            Driver::Line(line) => line.place(),
+            Driver::Can(can) => can.place(),
+        }
+    }
+
+    /// The handle to send with.
+    pub fn tx(&self) -> Rc<PortTx> {
+        Rc::clone(&self.tx)
+    }
+
+    /// Drives the device until the future is dropped, which closes it.
+    ///
+    /// # Errors
+    /// Only what makes the device unusable for good; what can come back is waited for.
+    pub async fn run(self, events: impl FnMut(PortEvent<'_>)) -> io::Result<()> {
+        match self.driver {
+            Driver::Line(line) => line.run(events).await,
+            Driver::Can(can) => can.run(events).await,
+        }
+    }
+}
+
+/// The sending side of a port. What does not fit is dropped and counted.
+#[derive(Debug, Default)]
+pub struct PortTx {
+    pub(super) bytes: RefCell<Vec<u8>>,
+    pub(super) frames: RefCell<VecDeque<CanFrame>>,
+    pub(super) wake: Notify,
+    pub(super) counters: Cell<DeviceCounters>,
+}
+
+impl PortTx {
+    /// Hands bytes over to a serial port.
+    pub fn send(&self, bytes: &[u8]) {
+        let mut queue = self.bytes.borrow_mut();
+        if queue.len() + bytes.len() > MAX_QUEUED_BYTES {
+            self.count(|counters| counters.dropped += 1);
+        } else {
+            queue.extend_from_slice(bytes);
+        }
+        self.wake.notify_one();
+    }
+
+    /// Hands a frame over to a CAN port.
+    pub fn send_frame(&self, frame: CanFrame) {
+        let mut queue = self.frames.borrow_mut();
+        if queue.len() == MAX_QUEUED_FRAMES {
+            self.count(|counters| counters.dropped += 1);
+        } else {
+            queue.push_back(frame);
+        }
+        self.wake.notify_one();
+    }
+
+    /// What the device did so far.
+    pub fn counters(&self) -> DeviceCounters {
+        self.counters.get()
+    }
+
+    pub(super) fn count(&self, change: impl FnOnce(&mut DeviceCounters)) {
+        let mut counters = self.counters.get();
+        change(&mut counters);
+        self.counters.set(counters);
+    }
+}
+
+/// What a port's device did so far.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+pub struct DeviceCounters {
+    /// Bytes received; of a CAN port, data bytes.
+    pub bytes_in: u64,
+    /// Bytes sent; of a CAN port, data bytes.
+    pub bytes_out: u64,
+    /// CAN frames received.
+    pub frames_in: u64,
+    /// CAN frames sent.
+    pub frames_out: u64,
+    /// Bytes sent while nobody listened.
+    pub unheard: u64,
+    /// Bytes a listener left unread for too long, and whole frames given while the queue was full.
+    pub dropped: u64,
+    /// Clients turned away because there was one already, or too many.
+    pub refused: u64,
+    /// Times the device became usable.
+    pub ups: u64,
+}
+
+/// A frame of every port's recipe fits several times over; a port waits for one to leave.
+const MAX_QUEUED_BYTES: usize = 4_096;
+/// Twice the most ids of a recipe's part.
+const MAX_QUEUED_FRAMES: usize = 64;
