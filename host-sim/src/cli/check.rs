@@ -4,12 +4,13 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use proto_core::config::{Bus, GatewayConfig, Parity, PartBudget, Rs485, can_frame_time};
+use proto_core::config::{Bus, GatewayConfig, MAX_PORTS, Parity, PartBudget, Rs485, can_frame_time};
+use proto_core::engine::Engine;
 use proto_core::recipe::model::{CanId, Mode};
 use proto_core::sysvar::{Direction, SysVar};
 use proto_core::time::Duration;
 
-use super::{Overrides, text};
+use super::{Overrides, plan, text};
 use crate::config::file::{self, Config, FileError};
 use crate::config::{SimBus, SimConfig, SimField, SimParts, SimPort, SimRecipe, SimStreamPart};
 use crate::controller::{BuildError, Controller};
@@ -27,9 +28,11 @@ pub(super) fn run(args: &CheckArgs, out: &mut dyn Write) -> Result<(), String> {
     let overrides = &args.overrides.set;
     let config = file::load(&args.file, overrides).map_err(|error| error.to_string())?;
     let recipes = file::load_recipes(&args.file, overrides).map_err(|error| error.to_string())?;
-    if let Config::Controller(config) = &config {
-        check_build(&args.file, overrides, config).map_err(|error| error.to_string())?;
+    match &config {
+        Config::Gateway(config) => check_room(&args.file, overrides, config),
+        Config::Controller(config) => check_build(&args.file, overrides, config),
     }
+    .map_err(|error| error.to_string())?;
     let name = args.file.display();
     let report = match &config {
         Config::Gateway(config) => format!("{name}: a valid gateway file\n\n{}", gateway(config, &recipes)),
@@ -43,6 +46,21 @@ pub(super) fn load_controller(path: &Path, overrides: &[String]) -> Result<SimCo
     let config = file::load_controller(path, overrides)?;
     check_build(path, overrides, &config)?;
     Ok(config)
+}
+
+/// A gateway file that the engine of this host has room for.
+pub(super) fn load_gateway(path: &Path, overrides: &[String]) -> Result<Box<GatewayConfig>, FileError> {
+    let config = file::load_gateway(path, overrides)?;
+    check_room(path, overrides, &config)?;
+    Ok(config)
+}
+
+/// What only the engine itself can refuse.
+fn check_room(path: &Path, overrides: &[String], config: &GatewayConfig) -> Result<(), FileError> {
+    match Engine::<MAX_PORTS>::new(config) {
+        Ok(_) => Ok(()),
+        Err(error) => Err(file::error_at(path, overrides, &["port"], error)),
+    }
 }
 
 /// What only the controller itself can refuse.
@@ -81,6 +99,7 @@ fn gateway(config: &GatewayConfig, recipes: &[SimRecipe]) -> String {
             }
         }
     }
+    report += &plan::show(config);
     report += &pendant_of_gateway(config, recipes);
     let warnings: Vec<_> =
         config.warnings().map(|warning| format!("  {}\n", config.describe_warning(warning))).collect();

@@ -7,6 +7,7 @@ mod check;
 mod codec;
 mod convert;
 mod log;
+mod plan;
 mod text;
 
 use std::io::{self, Write};
@@ -250,7 +251,7 @@ impl Run {
     }
 
     fn gateway(self) -> ExitCode {
-        match file::load_gateway(&self.config, &self.overrides.set) {
+        match check::load_gateway(&self.config, &self.overrides.set) {
             Ok(config) => finished(shell::gateway::run(*config, self.options())),
             Err(error) => wrong(error),
         }

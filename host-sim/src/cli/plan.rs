@@ -1,0 +1,113 @@
+//! Which way each variable goes, as `check` prints it.
+
+use proto_core::config::{Bus, FieldSpec, GatewayConfig, InputBinding, SendOn};
+use proto_core::engine::{LinkId, Plan, PortId, Source, WayUp};
+use proto_core::sysvar::{Direction, ModbusPlace, SysVar};
+
+/// The ways of every field port's variables, one line a run of neighbours.
+pub(super) fn show(config: &GatewayConfig) -> String {
+    // A valid configuration has a way for everything.
+    let Ok(plan) = Plan::new(config) else { return String::new() };
+    let mut report = String::from("\nways\n");
+    let mut lines: Vec<(String, String, String)> = Vec::new();
+    for (_, port, recipe) in config.field_ports() {
+        let up = config.written_by(recipe).map(|var| (var, way_up(config, &plan, var)));
+        add(&mut lines, &port.name, up);
+        let commands: u16 = config
+            .fields_of(recipe, Direction::Input)
+            .filter_map(|(_, _, field)| match field {
+                FieldSpec::UserInput { to: InputBinding::Commands { table, .. }, .. } => Some(table.len),
+                _ => None,
+            })
+            .sum();
+        if commands > 0 {
+            let way = "-> controller: command port".into();
+            lines.push((port.name.to_string(), format!("{commands} commands"), way));
+        }
+        let trigger = match recipe.send {
+            SendOn::Rising { var, .. } => Some(var),
+            _ => None,
+        };
+        let shown = config
+            .fields_of(recipe, Direction::Output)
+            .filter_map(|(_, _, field)| field.variable())
+            .chain(trigger);
+        add(&mut lines, &port.name, shown.map(|var| (var, source(config, &plan, var))));
+    }
+    let width = |column: fn(&(String, String, String)) -> &String| {
+        lines.iter().map(|line| column(line).chars().count()).max().unwrap_or(0)
+    };
+    let (ports, variables) = (width(|line| &line.0), width(|line| &line.1));
+    for (port, variable, way) in &lines {
+        report += &format!("  {port:ports$}  {variable:variables$}  {way}\n");
+    }
+    if lines.is_empty() {
+        report += "  no port writes or shows a variable\n";
+    }
+    report
+}
+
+/// Adds one line for each run of neighbours that go the same way.
+fn add(lines: &mut Vec<(String, String, String)>, port: &str, ways: impl Iterator<Item = (SysVar, String)>) {
+    let mut runs: Vec<(SysVar, SysVar, String)> = Vec::new();
+    for (var, way) in ways {
+        match runs.last_mut() {
+            Some((_, last, same))
+                if *same == way && last.group() == var.group() && last.ordinal() + 1 == var.ordinal() =>
+            {
+                *last = var;
+            }
+            _ => runs.push((var, var, way)),
+        }
+    }
+    for (first, last, way) in runs {
+        let name = if first == last {
+            first.to_string()
+        } else {
+            format!("{}[{}..{}]", first.group(), first.index(), last.index())
+        };
+        lines.push((port.to_owned(), name, way));
+    }
+}
+
+fn way_up(config: &GatewayConfig, plan: &Plan, var: SysVar) -> String {
+    match plan.way_up(var) {
+        Some(WayUp::Recipe(link)) => format!("-> controller: {}", link_name(config, link)),
+        Some(WayUp::Modbus) => format!("-> controller: Modbus {}", modbus_kind(var)),
+        None => "-> nowhere".into(),
+    }
+}
+
+fn source(config: &GatewayConfig, plan: &Plan, var: SysVar) -> String {
+    match plan.source(var) {
+        Some(Source::Recipe(link)) => format!("<- controller: {}", link_name(config, link)),
+        Some(Source::Modbus) => format!("<- controller: Modbus {}", modbus_kind(var)),
+        Some(Source::State) => "<- controller: state stream, 10 a second".into(),
+        Some(Source::Field(port)) => format!("<- port {}", port_name(config, port)),
+        None => "<- nowhere".into(),
+    }
+}
+
+fn modbus_kind(var: SysVar) -> &'static str {
+    match var.modbus() {
+        Some(ModbusPlace::Coils { .. }) => "coils",
+        _ => "registers",
+    }
+}
+
+fn link_name(config: &GatewayConfig, link: LinkId) -> String {
+    if link == LinkId::RECIPE_UDP {
+        let port = config.controller.recipe_link.map_or(0, |link| link.udp_port);
+        return format!("recipe link, UDP {port}");
+    }
+    let listening = (0..).zip(&config.ports).find(|&(index, _)| LinkId::of_port(PortId(index)) == link);
+    match listening.map(|(_, port)| (&port.bus, &port.name)) {
+        Some((Bus::TcpListen { .. }, name)) => format!("its TCP client, port {name}"),
+        Some((_, name)) => format!("its UDP client, port {name}"),
+        None => "a link".into(),
+    }
+}
+
+fn port_name(config: &GatewayConfig, port: PortId) -> &str {
+    config.ports.get(usize::from(port.0)).map_or("", |port| &port.name)
+}
