@@ -140,15 +140,18 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             _ => (can_codec(config, port.recipe, recipe)?, Line::none()),
         };
         let first_frame = self.store.frames.len() as u8;
-        for (frame, _) in recipe.frames(Direction::Input) {
-            let set = config
-                .fields_of(recipe, Direction::Input)
-                .filter(|&(of, ..)| of == frame)
-                .filter_map(|(_, _, field)| field.variable())
-                .collect();
+        let mut next_binding = self.bindings.inputs.len() as u16;
+        for (_, fields) in recipe.frames(Direction::Input) {
+            let fields = fields.of(&config.fields);
+            let set = fields.iter().filter_map(FieldSpec::variable).collect();
+            let is_bound = |field: &&FieldSpec| matches!(field, FieldSpec::UserInput { .. });
+            let bound = fields.iter().filter(is_bound).count() as u16;
+            let bindings = Span { start: next_binding, len: bound };
+            next_binding = next_binding.saturating_add(bound);
             let frame = InputFrame {
                 set,
                 port: self.ports.len() as u8,
+                bindings,
                 overdue_at: Instant::NEVER,
                 timeout: port.timeout,
             };

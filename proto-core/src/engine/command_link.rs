@@ -21,7 +21,7 @@ pub const MAX_COMMAND_FIELDS: usize = 16;
 pub const MAX_COMMAND_BYTES: usize = 1024;
 /// Commands that can wait for the one before them.
 pub const COMMAND_QUEUE: usize = 8;
-/// A command that could not be sent for this long is dropped.
+/// A command that could not be sent within this time is dropped.
 const COMMAND_TTL: Duration = Duration::from_secs(1);
 
 /// A field whose values pick commands.
@@ -54,6 +54,8 @@ struct Waiting {
     port: PortId,
     entry: u16,
     since: Instant,
+    /// How many commands the port had picked with it: only the newest one's outcome is shown.
+    nth: u32,
 }
 
 #[derive(Debug, Clone)]
@@ -131,7 +133,7 @@ impl CommandLink {
         let picked = (table.start..).zip(entries).find(|(_, entry)| entry.value == value);
         let (true, Some((entry, _))) = (acts, picked) else { return };
         bump(&mut counters.commands);
-        let waiting = Waiting { port, entry, since: now };
+        let waiting = Waiting { port, entry, since: now, nth: counters.commands };
         if self.supervisor.is_up() && self.queue.push_back(waiting).is_ok() {
             *reply = ReplyCode::Pending;
         } else {
@@ -151,7 +153,7 @@ impl CommandLink {
     pub(super) fn lost(&mut self, ports: &mut [FieldPort]) {
         self.client.abort();
         if let Some(sent) = self.in_flight.take() {
-            settle(ports, sent.port, ReplyCode::NoReply);
+            settle(ports, sent, ReplyCode::NoReply);
         }
         while let Some(waiting) = self.queue.pop_front() {
             drop_one(ports, waiting);
@@ -173,7 +175,7 @@ impl CommandLink {
             while self.step(&mut rest, ports, now) {}
         }
         while let Some(&waiting) = self.queue.front()
-            && now.saturating_since(waiting.since) > COMMAND_TTL
+            && now >= waiting.since + COMMAND_TTL
         {
             self.queue.pop_front();
             drop_one(ports, waiting);
@@ -238,25 +240,24 @@ impl CommandLink {
             if code == ReplyCode::Fail {
                 bump(&mut self.counters.refused);
             }
-            settle(ports, sent.port, code);
+            settle(ports, sent, code);
         }
         true
     }
 }
 
-fn port_of(ports: &mut [FieldPort], id: PortId) -> Option<&mut FieldPort> {
-    ports.iter_mut().find(|port| port.id == id)
-}
-
-fn settle(ports: &mut [FieldPort], id: PortId, code: ReplyCode) {
-    if let Some(port) = port_of(ports, id) {
+/// A command came to its end.
+fn settle(ports: &mut [FieldPort], command: Waiting, code: ReplyCode) {
+    if let Some(port) = ports.iter_mut().find(|port| port.id == command.port)
+        && port.counters.commands == command.nth
+    {
         port.reply = code;
     }
 }
 
-fn drop_one(ports: &mut [FieldPort], waiting: Waiting) {
-    if let Some(port) = port_of(ports, waiting.port) {
+fn drop_one(ports: &mut [FieldPort], command: Waiting) {
+    if let Some(port) = ports.iter_mut().find(|port| port.id == command.port) {
         bump(&mut port.counters.commands_dropped);
-        port.reply = ReplyCode::NotSent;
     }
+    settle(ports, command, ReplyCode::NotSent);
 }

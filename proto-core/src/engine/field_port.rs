@@ -10,10 +10,9 @@ use super::sender::Sender;
 use super::store::Store;
 use super::user::{InputBind, fit, forget_commands};
 use crate::config::{Rs485, Span};
-use crate::image::ImageBytes;
+use crate::image::{ImageBytes, InputSet};
 use crate::recipe::can::{CanFrame, CanLayout, CanReject};
 use crate::recipe::deframer::Deframer;
-
 use crate::recipe::model::Mode;
 use crate::recipe::stream::StreamLayout;
 use crate::recipe::{Applied, ValueError, Values};
@@ -94,6 +93,14 @@ pub(super) struct FieldPort {
     pub counters: PortCounters,
 }
 
+/// The frames that were accepted in one call.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Accepted {
+    pub frames: u32,
+    /// Their variables whose link is up.
+    pub set: InputSet,
+}
+
 /// What a frame's layout offers, stream or CAN.
 trait InputLayout {
     fn apply(&self, payload: &[u8], image: &mut ImageBytes) -> Result<Applied, ValueError>;
@@ -159,20 +166,22 @@ impl FieldPort {
         store: &mut Store<PORTS>,
         commands: &mut Option<CommandLink>,
         now: Instant,
-    ) {
+    ) -> Accepted {
+        let mut accepted = Accepted::default();
         add(&mut self.counters.bytes_in, bytes.len());
         if now >= self.line.heard + self.line.idle_gap {
             self.discard_partial();
         }
         self.line.heard = now;
-        let Codec::Stream { input, deframer, .. } = &mut self.codec else { return };
+        let usable = self.is_usable();
+        let Codec::Stream { input, deframer, .. } = &mut self.codec else { return accepted };
         let Some(layout) = input else {
             bump(&mut self.counters.rejected_no_input);
-            return;
+            return accepted;
         };
         let mut frames = Frames {
             mode: self.mode,
-            bindings: self.inputs.of(bindings),
+            bindings,
             reply: &mut self.reply,
             counters: &mut self.counters,
             port: self.id,
@@ -181,18 +190,16 @@ impl FieldPort {
             now,
         };
         let mut rest = bytes;
-        let mut accepted = 0_u32;
         while let Some(payload) = deframer.next_frame(layout, &mut rest) {
-            if frames.take(layout, payload, usize::from(self.first_frame), 0) {
-                accepted = accepted.wrapping_add(1);
+            if let Some(set) = frames.take(layout, payload, usize::from(self.first_frame)) {
+                accepted = Accepted { frames: accepted.frames.wrapping_add(1), set };
             }
         }
         let stats = deframer.stats();
         self.counters.tail_mismatches = stats.tail_mismatches as u32;
         self.counters.resync_bytes = stats.skipped_bytes as u32;
-        for _ in 0..accepted.min(2) {
-            self.sender.frame_accepted(&mut self.counters);
-        }
+        self.sender.frames_accepted(accepted.frames, usable, &mut self.counters);
+        accepted
     }
 
     /// A frame from the bus.
@@ -203,24 +210,27 @@ impl FieldPort {
         store: &mut Store<PORTS>,
         commands: &mut Option<CommandLink>,
         now: Instant,
-    ) {
+    ) -> Accepted {
         add(&mut self.counters.bytes_in, frame.data().len());
-        let Codec::Can { input, .. } = &self.codec else { return };
+        let usable = self.is_usable();
+        let Codec::Can { input, .. } = &self.codec else { return Accepted::default() };
         let Some(layout) = input else {
             bump(&mut self.counters.rejected_no_input);
-            return;
+            return Accepted::default();
         };
-        let index = match layout.accept(frame) {
-            Ok(index) => index,
-            Err(CanReject::Remote { .. }) => return bump(&mut self.counters.rejected_remote),
-            Err(CanReject::WrongLength { .. }) => return bump(&mut self.counters.rejected_length),
-            Err(_) => return bump(&mut self.counters.rejected_id),
+        let accepted = layout.accept(frame);
+        let (Ok(index), Some(frame_layout)) = (accepted, accepted.ok().and_then(|nth| layout.frame(nth)))
+        else {
+            bump(match accepted {
+                Err(CanReject::Remote { .. }) => &mut self.counters.rejected_remote,
+                Err(CanReject::WrongLength { .. }) => &mut self.counters.rejected_length,
+                _ => &mut self.counters.rejected_id,
+            });
+            return Accepted::default();
         };
-        let Some(frame_layout) = layout.frame(index) else { return };
-        let skip = if self.mode == Mode::User { fields_before(layout, index) } else { 0 };
         let mut frames = Frames {
             mode: self.mode,
-            bindings: self.inputs.of(bindings),
+            bindings,
             reply: &mut self.reply,
             counters: &mut self.counters,
             port: self.id,
@@ -229,9 +239,9 @@ impl FieldPort {
             now,
         };
         let slot = usize::from(self.first_frame).saturating_add(index);
-        if frames.take(&frame_layout, frame.data(), slot, skip) {
-            self.sender.frame_accepted(&mut self.counters);
-        }
+        let Some(set) = frames.take(&frame_layout, frame.data(), slot) else { return Accepted::default() };
+        self.sender.frames_accepted(1, usable, &mut self.counters);
+        Accepted { frames: 1, set }
     }
 
     /// Looks at the clock: cycles and silence.
@@ -239,8 +249,7 @@ impl FieldPort {
         if now >= self.partial_until() {
             self.discard_partial();
         }
-        let usable = self.is_up && self.bus != BusState::BusOff;
-        self.sender.advance(usable, &mut self.counters, now);
+        self.sender.advance(self.is_usable(), &mut self.counters, now);
     }
 
     /// When the port has something to do by itself.
@@ -250,7 +259,12 @@ impl FieldPort {
 
     /// Whether a frame may be handed over now.
     pub(super) fn may_send(&self, now: Instant) -> bool {
-        self.is_up && self.bus != BusState::BusOff && self.sender.is_due() && now >= self.line.quiet_at()
+        self.is_usable() && self.sender.is_due() && now >= self.line.quiet_at()
+    }
+
+    /// Whether what is handed over now can leave.
+    pub(super) fn is_usable(&self) -> bool {
+        self.is_up && self.bus != BusState::BusOff
     }
 
     fn partial_until(&self) -> Instant {
@@ -281,8 +295,9 @@ struct Frames<'a, const PORTS: usize> {
 }
 
 impl<const PORTS: usize> Frames<'_, PORTS> {
-    /// Takes a frame whole or not at all; false when it was rejected.
-    fn take(&mut self, layout: &impl InputLayout, payload: &[u8], slot: usize, skip: usize) -> bool {
+    /// Takes a frame whole or not at all: its variables whose link is up, or `None` when it was
+    /// rejected.
+    fn take(&mut self, layout: &impl InputLayout, payload: &[u8], slot: usize) -> Option<InputSet> {
         match self.mode {
             Mode::Realtime => match layout.apply(payload, self.store.image.bytes_mut()) {
                 Ok(applied) => {
@@ -292,18 +307,18 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
                 }
                 Err(_) => {
                     bump(&mut self.counters.rejected_not_finite);
-                    return false;
+                    return None;
                 }
             },
             Mode::User => {
                 if layout.check(payload).is_err() {
                     bump(&mut self.counters.rejected_not_finite);
-                    return false;
+                    return None;
                 }
-                let bindings = self.bindings.get(skip..).unwrap_or(&[]);
+                let bindings = self.store.frames.get(slot)?.bindings.of(self.bindings);
                 if !fit(bindings, layout.values(payload)) {
                     bump(&mut self.counters.rejected_out_of_range);
-                    return false;
+                    return None;
                 }
                 for (binding, value) in bindings.iter().zip(layout.values(payload)) {
                     self.apply_user(binding, value);
@@ -311,8 +326,7 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
             }
         }
         bump(&mut self.counters.frames_in);
-        self.store.accepted(slot, self.counters, self.now);
-        true
+        Some(self.store.accepted(slot, self.counters, self.now))
     }
 
     fn apply_user(&mut self, binding: &InputBind, value: Scalar) {

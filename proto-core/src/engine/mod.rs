@@ -40,7 +40,7 @@ use heapless::Vec;
 
 use counters::{add, bump};
 use field_output::Downward;
-use field_port::FieldPort;
+use field_port::{Accepted, FieldPort};
 use links::Links;
 use store::{SafeBytes, Store};
 use user::{Bindings, forget_commands};
@@ -54,6 +54,9 @@ use crate::time::{Duration, Instant};
 /// Size of the buffer for [`Engine::poll_output`]: the longest stream frame; every request to the
 /// controller is shorter.
 pub const OUTPUT_BUFFER: usize = MAX_STREAM_FRAME;
+
+/// The clock's last instant. [`Instant::NEVER`] is behind it, so that "no deadline" never comes.
+const LAST: Instant = Instant::from_micros(u64::MAX - 1);
 
 /// The gateway engine for up to `PORTS` field ports, `UPLINKS` recipe links and, over all ports,
 /// `FIELDS` user-defined input fields and as many output fields.
@@ -75,23 +78,25 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     ///
     /// Inputs for a port or link that the configuration does not have are ignored.
     pub fn handle(&mut self, now: Instant, input: Input<'_>) {
+        let now = now.min(LAST);
         if now >= self.timer_at {
             self.advance(now);
         }
+        let mut accepted = Accepted::default();
         match input {
             Input::PortBytes { port, bytes } => {
                 let (store, command) = (&mut self.store, &mut self.links.command);
                 if let Some(port) = find_port(&mut self.ports, port) {
-                    port.bytes(bytes, &self.bindings.inputs, store, command, now);
+                    accepted = port.bytes(bytes, &self.bindings.inputs, store, command, now);
                 }
-                self.after_field(port, now);
+                self.after_field(port, &accepted, now);
             }
             Input::PortCan { port, frame } => {
                 let (store, command) = (&mut self.store, &mut self.links.command);
                 if let Some(port) = find_port(&mut self.ports, port) {
-                    port.can(&frame, &self.bindings.inputs, store, command, now);
+                    accepted = port.can(&frame, &self.bindings.inputs, store, command, now);
                 }
-                self.after_field(port, now);
+                self.after_field(port, &accepted, now);
             }
             Input::PortSent { port } => {
                 if let Some(port) = find_port(&mut self.ports, port) {
@@ -131,6 +136,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     /// What brings field values to the controller comes first, then what keeps links up, then what
     /// goes to the field.
     pub fn poll_output<'b>(&mut self, now: Instant, buf: &'b mut [u8; OUTPUT_BUFFER]) -> Output<'b> {
+        let now = now.min(LAST);
         if now >= self.timer_at {
             self.advance(now);
         }
@@ -195,11 +201,16 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     }
 
     fn expire_frames(&mut self, now: Instant) {
+        let mut timed_out = false;
         while let Some(frame) = self.store.next_timeout(&self.safe_values, now) {
+            timed_out = true;
             if let Some(port) = self.ports.get_mut(usize::from(frame.port)) {
                 bump(&mut port.counters.timeouts);
-                forget_commands(port.inputs.of(&self.bindings.inputs), &mut self.links.command);
             }
+            forget_commands(frame.bindings.of(&self.bindings.inputs), &mut self.links.command);
+        }
+        if timed_out {
+            self.image_changed();
         }
         let ports = &mut self.ports;
         self.store.expire_waiting(
@@ -213,9 +224,12 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     }
 
     /// After a field frame: bits that trigger, and frames that have to wait for their neighbours.
-    fn after_field(&mut self, port: PortId, now: Instant) {
+    fn after_field(&mut self, port: PortId, accepted: &Accepted, now: Instant) {
+        if accepted.frames == 0 {
+            return;
+        }
         self.image_changed();
-        let dirty = self.store.outbox.dirty();
+        let dirty = self.store.outbox.dirty().and(&accepted.set);
         let state = self.links.state.as_ref().map(|state| state.group);
         let waits = self.links.recipes.iter().any(|link| {
             link.supervisor.is_up()
@@ -223,13 +237,14 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
                 && !link.is_ready(&self.store, state, now)
         });
         if waits && let Some(port) = find_port(&mut self.ports, port) {
-            bump(&mut port.counters.withheld);
+            add(&mut port.counters.withheld, accepted.frames as usize);
         }
     }
 
     fn image_changed(&mut self) {
         for port in &mut self.ports {
-            port.sender.image_changed(&self.store.image, &mut port.counters);
+            let usable = port.is_usable();
+            port.sender.image_changed(&self.store.image, usable, &mut port.counters);
         }
     }
 

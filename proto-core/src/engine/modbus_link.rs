@@ -23,6 +23,8 @@ const MAX_POLLED: usize = 64;
 const JOIN_GAP: u16 = 16;
 /// A request without an answer is given up after this.
 const ANSWER_TIMEOUT: Duration = Duration::from_millis(500);
+/// A safe value that the controller refused is written again after this.
+const REFUSED_PAUSE: Duration = Duration::from_millis(500);
 /// After this many in a row the connection is reopened.
 const TIMEOUTS_IN_A_ROW: u8 = 3;
 
@@ -74,6 +76,9 @@ pub(super) struct ModbusLink {
     turn: Turn,
     /// The next write starts at this variable, so that none waits for ever.
     cursor: usize,
+    /// Safe values that the controller refused; they are written again at `ask_again_at`.
+    refused: InputSet,
+    ask_again_at: Instant,
 }
 
 impl ModbusLink {
@@ -89,6 +94,8 @@ impl ModbusLink {
             timeouts_in_a_row: 0,
             turn: Turn::Write,
             cursor: 0,
+            refused: InputSet::EMPTY,
+            ask_again_at: Instant::NEVER,
         }
     }
 
@@ -134,6 +141,7 @@ impl ModbusLink {
     /// The connection is gone, and with it what was under way.
     pub(super) fn lost<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
         self.abort(store);
+        self.write_refused_again(store);
         self.client.reset();
         store.link_lost(&self.writes);
     }
@@ -156,6 +164,12 @@ impl ModbusLink {
                 (_, None) => bump(&mut self.counters.malformed),
                 (ClientEvent::Exception(_), Some(asked)) => {
                     bump(&mut self.counters.refused);
+                    if let Asked::Write { safe } = asked.asked
+                        && !safe.is_empty()
+                    {
+                        self.refused = self.refused.or(&safe);
+                        self.ask_again_at = self.ask_again_at.min(now + REFUSED_PAUSE);
+                    }
                     self.counters.answered(now.saturating_since(asked.since).as_micros());
                     self.timeouts_in_a_row = 0;
                 }
@@ -172,8 +186,11 @@ impl ModbusLink {
         }
     }
 
-    /// Looks at the clock: answers that did not come.
+    /// Looks at the clock: answers that did not come, safe values that were refused.
     pub(super) fn advance<const PORTS: usize>(&mut self, store: &mut Store<PORTS>, now: Instant) {
+        if now >= self.ask_again_at {
+            self.write_refused_again(store);
+        }
         if now < self.answer_deadline() {
             return;
         }
@@ -217,12 +234,13 @@ impl ModbusLink {
     /// When something happens by itself.
     pub(super) fn deadline(&self) -> Instant {
         if self.in_flight.is_some() {
-            return self.answer_deadline();
+            return self.answer_deadline().min(self.ask_again_at);
         }
         if !self.supervisor.is_up() {
             return Instant::NEVER;
         }
-        self.blocks.iter().map(|block| block.grid.next()).min().unwrap_or(Instant::NEVER)
+        let polls = self.blocks.iter().map(|block| block.grid.next()).min().unwrap_or(Instant::NEVER);
+        polls.min(self.ask_again_at)
     }
 
     fn answer_deadline(&self) -> Instant {
@@ -234,8 +252,14 @@ impl ModbusLink {
     fn abort<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
         self.client.abort();
         if let Some(InFlight { asked: Asked::Write { safe }, .. }) = self.in_flight.take() {
-            store.outbox.again(&safe);
+            store.again(&safe);
         }
+    }
+
+    fn write_refused_again<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
+        store.again(&self.refused);
+        self.refused = InputSet::EMPTY;
+        self.ask_again_at = Instant::NEVER;
     }
 
     /// The block whose poll has waited longest.
@@ -308,7 +332,7 @@ impl ModbusLink {
             }
         };
         let len = self.client.start(request, out).ok()?;
-        let safe = store.outbox.safe().and(&vars);
+        let safe = store.safe.and(&vars);
         store.taken(&vars);
         Some((len, Asked::Write { safe }))
     }

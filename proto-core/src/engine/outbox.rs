@@ -39,28 +39,17 @@ pub(super) struct EdgeQueue(Vec<Edge, EDGE_QUEUE>);
 pub(super) struct Outbox {
     /// Variables with a value to write.
     dirty: InputSet,
-    /// Those of them whose value is a configured safe value: it survives a reconnect.
-    safe: InputSet,
     bits: [BitSlot; BIT_VARS],
 }
 
 impl Outbox {
     pub(super) const fn new() -> Self {
-        Self {
-            dirty: InputSet::EMPTY,
-            safe: InputSet::EMPTY,
-            bits: [BitSlot { value: 0, at: Instant::ZERO }; BIT_VARS],
-        }
+        Self { dirty: InputSet::EMPTY, bits: [BitSlot { value: 0, at: Instant::ZERO }; BIT_VARS] }
     }
 
     /// Variables with a value to write.
     pub(super) fn dirty(&self) -> InputSet {
         self.dirty
-    }
-
-    /// Those of them whose value is a safe value.
-    pub(super) fn safe(&self) -> InputSet {
-        self.safe
     }
 
     /// The byte variables as they are to be written next, in table order.
@@ -106,13 +95,11 @@ impl Outbox {
                 let _ = queue.0.push(Edge { var, value, at: now });
             }
         }
-        // A safe value that has not been written yet goes first and the new one follows.
     }
 
     /// An accepted frame brought variables that are not bits.
     pub(super) fn offer_analog(&mut self, vars: &InputSet) {
         self.dirty = self.dirty.or(vars);
-        self.safe = self.safe.minus(vars);
     }
 
     /// The owner is silent: the variable takes its safe value, in place of everything that waits.
@@ -123,25 +110,17 @@ impl Outbox {
             *slot = BitSlot { value: bits, at: now };
         }
         self.dirty.insert(var);
-        self.safe.insert(var);
     }
 
-    /// A safe value whose write came to nothing is to be written again.
-    pub(super) fn again(&mut self, safe: &InputSet) {
-        self.dirty = self.dirty.or(safe);
-        self.safe = self.safe.or(safe);
+    /// Values that were written last, and came to nothing, are to be written again.
+    pub(super) fn again(&mut self, vars: &InputSet) {
+        self.dirty = self.dirty.or(vars);
     }
 
-    /// Nothing of these variables is to be written any more, safe values excepted.
-    pub(super) fn drop_unsafe(&mut self, vars: &InputSet) {
-        self.dirty = self.dirty.minus(&vars.minus(&self.safe));
-    }
-
-    /// Nothing of the variable is to be written any more.
-    pub(super) fn drop_all(&mut self, queue: &mut EdgeQueue, var: SysVar) {
-        queue.0.retain(|edge| edge.var != var);
-        self.dirty.remove(var);
-        self.safe.remove(var);
+    /// Nothing of these variables is to be written any more.
+    pub(super) fn forget(&mut self, queue: &mut EdgeQueue, vars: &InputSet) {
+        queue.0.retain(|edge| !vars.contains(edge.var));
+        self.dirty = self.dirty.minus(vars);
     }
 
     /// Drops what has waited for longer than `timeout`; returns how many values that were.
@@ -155,7 +134,7 @@ impl Outbox {
         let before = queue.0.len();
         queue.0.retain(|edge| now.saturating_since(edge.at) <= timeout);
         let mut dropped = before.saturating_sub(queue.0.len());
-        for var in self.dirty.and(vars).minus(&self.safe).iter() {
+        for var in self.dirty.and(vars).iter() {
             let Some(slot) = self.bits.get(var.ordinal()) else { break };
             if now.saturating_since(slot.at) > timeout {
                 dropped = dropped.saturating_add(1);
@@ -167,7 +146,6 @@ impl Outbox {
 
     /// The variable's value has been handed to its link: the next one, if any, takes its place.
     pub(super) fn taken(&mut self, queue: &mut EdgeQueue, var: SysVar) {
-        self.safe.remove(var);
         self.dirty.remove(var);
         let next = queue.0.iter().position(|edge| edge.var == var);
         if let (Some(at), Some(slot)) = (next, self.bits.get_mut(var.ordinal())) {
@@ -175,13 +153,6 @@ impl Outbox {
             *slot = BitSlot { value: edge.value, at: edge.at };
             self.dirty.insert(var);
         }
-    }
-}
-
-impl EdgeQueue {
-    /// Forgets what waits for these variables.
-    pub(super) fn clear_vars(&mut self, vars: &InputSet) {
-        self.0.retain(|edge| !vars.contains(edge.var));
     }
 }
 
@@ -270,18 +241,28 @@ mod tests {
     }
 
     #[test]
-    fn a_safe_value_replaces_what_waits_and_survives_the_loss_of_the_link() {
+    fn a_safe_value_replaces_what_waits_and_a_new_value_follows_it() {
         let mut bench = Bench::new();
         let a = var("DigitalOutputCommand[1]");
         for value in [1, 0, 1] {
             bench.offer(a, value);
         }
         bench.outbox.offer_safe(&mut bench.queue, a, 4, bench.now);
-        bench.outbox.drop_unsafe(&InputSet::from_iter([a]));
-        assert_eq!(bench.drain(a), [4]);
         bench.offer(a, 1);
-        bench.outbox.drop_unsafe(&InputSet::from_iter([a]));
-        assert!(bench.outbox.dirty().is_empty(), "a field value does not");
+        assert_eq!(bench.drain(a), [4, 1]);
+    }
+
+    #[test]
+    fn what_is_forgotten_is_forgotten_whole() {
+        let mut bench = Bench::new();
+        let (a, b) = (var("DigitalOutputCommand[1]"), var("BitInputReg[3]"));
+        for value in [1, 0, 1] {
+            bench.offer(a, value);
+            bench.offer(b, value);
+        }
+        bench.outbox.forget(&mut bench.queue, &InputSet::from_iter([a]));
+        assert_eq!(bench.drain(a), []);
+        assert_eq!(bench.drain(b), [1, 0, 1]);
     }
 
     #[test]

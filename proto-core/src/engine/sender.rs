@@ -125,21 +125,22 @@ impl Sender {
         self.raise(counters);
     }
 
-    /// An input frame was accepted.
-    pub(super) fn frame_accepted(&mut self, counters: &mut PortCounters) {
-        if self.on == SendOn::Frame {
+    /// So many input frames were accepted at once: the newest is answered.
+    pub(super) fn frames_accepted(&mut self, count: u32, usable: bool, counters: &mut PortCounters) {
+        if self.on == SendOn::Frame && usable && count > 0 {
+            counters.skipped_cycles = counters.skipped_cycles.wrapping_add(count.wrapping_sub(1));
             self.raise(counters);
         }
     }
 
     /// Values in the image changed: looks at the bit that triggers.
-    pub(super) fn image_changed(&mut self, image: &Image, counters: &mut PortCounters) {
+    pub(super) fn image_changed(&mut self, image: &Image, usable: bool, counters: &mut PortCounters) {
         let SendOn::Rising { var, bit } = self.on else { return };
         if !image.is_known(var) {
             return;
         }
         let on = bit_of(image, var, bit);
-        if on && self.last_bit == Some(false) {
+        if on && self.last_bit == Some(false) && usable {
             self.raise(counters);
         }
         self.last_bit = Some(on);

@@ -54,8 +54,13 @@ impl StateLink {
                 Ok(view) => {
                     bump(&mut self.counters.received);
                     let not_live = self.read_back.minus(&store.live);
-                    for var in self.shown.iter().copied().chain(not_live.iter()) {
+                    for &var in &self.shown {
                         take(&view, var, store);
+                    }
+                    for var in not_live.iter() {
+                        if take(&view, var, store) {
+                            store.read_back.insert(var);
+                        }
                     }
                     store.image.stamp(self.group, now);
                 }
@@ -70,9 +75,7 @@ impl StateLink {
     }
 }
 
-fn take<const PORTS: usize>(view: &StateView<'_>, var: SysVar, store: &mut Store<PORTS>) {
-    if let Some(value) = view.read_var(var) {
-        // A float that is not finite keeps the value before.
-        let _ = store.image.set(var, value);
-    }
+/// Takes a value into the image. A float that is not finite keeps the value before.
+fn take<const PORTS: usize>(view: &StateView<'_>, var: SysVar, store: &mut Store<PORTS>) -> bool {
+    view.read_var(var).is_some_and(|value| store.image.set(var, value).is_ok())
 }

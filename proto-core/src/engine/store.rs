@@ -5,7 +5,7 @@ use heapless::Vec;
 
 use super::counters::{PortCounters, bump};
 use super::outbox::{EdgeQueue, Outbox};
-use crate::config::SafeValue;
+use crate::config::{SafeValue, Span};
 use crate::image::{GroupId, Image, InputSet};
 use crate::sysvar::SysVar;
 use crate::time::{Duration, Instant};
@@ -20,6 +20,8 @@ pub(super) struct InputFrame {
     pub set: InputSet,
     /// The port's place in the engine.
     pub port: u8,
+    /// Its range of the user-defined bindings.
+    pub bindings: Span,
     /// When it is overdue; [`Instant::NEVER`] before the first one and after it was.
     pub overdue_at: Instant,
     /// How long it may take.
@@ -52,6 +54,10 @@ pub(super) struct Store<const PORTS: usize> {
     pub frames: Vec<InputFrame, MAX_INPUT_FRAMES>,
     /// Variables whose value is their owner's: received in time, or configured as safe.
     pub live: InputSet,
+    /// Variables that have stood at their safe value since their owner fell silent.
+    pub safe: InputSet,
+    /// Variables that the state stream has brought since their owner fell silent, or ever.
+    pub read_back: InputSet,
     /// Variables whose link is up.
     pub reachable: InputSet,
     /// No frame is overdue before this.
@@ -66,29 +72,36 @@ impl<const PORTS: usize> Store<PORTS> {
             edges: Vec::new(),
             frames: Vec::new(),
             live: InputSet::EMPTY,
+            safe: InputSet::EMPTY,
+            read_back: InputSet::EMPTY,
             reachable: InputSet::EMPTY,
             next_overdue: Instant::NEVER,
         }
     }
 
-    /// The values of an accepted frame stand in the image: they are to be written.
-    pub(super) fn accepted(&mut self, nth: usize, counters: &mut PortCounters, now: Instant) {
-        let Some(frame) = self.frames.get_mut(nth) else { return };
+    /// The values of an accepted frame stand in the image: they are to be written. Returns those
+    /// whose link is up.
+    pub(super) fn accepted(&mut self, nth: usize, counters: &mut PortCounters, now: Instant) -> InputSet {
+        let Some(frame) = self.frames.get_mut(nth) else { return InputSet::EMPTY };
         frame.overdue_at = now + frame.timeout;
         self.next_overdue = self.next_overdue.min(frame.overdue_at);
         let (set, port) = (frame.set, usize::from(frame.port));
         self.image.stamp(GroupId(nth as u8), now);
         self.live = self.live.or(&set);
+        self.safe = self.safe.minus(&set);
         let reachable = set.and(&self.reachable);
+        let Some(queue) = self.edges.get_mut(port) else { return InputSet::EMPTY };
         if reachable != set {
             bump(&mut counters.undelivered);
+            // A safe value that waits for the link is overtaken: its owner is back.
+            self.outbox.forget(queue, &set.minus(&reachable));
         }
         self.outbox.offer_analog(&reachable.minus(&InputSet::BYTES));
-        let Some(queue) = self.edges.get_mut(port) else { return };
         for var in reachable.and(&InputSet::BYTES).iter() {
             let value = self.image.bytes().get(var.image_offset()).copied().unwrap_or(0);
             self.outbox.offer_bits(queue, counters, var, value, now);
         }
+        reachable
     }
 
     /// The first frame that is overdue at `now`, with its variables set to their safe values; call
@@ -107,8 +120,9 @@ impl<const PORTS: usize> Store<PORTS> {
         let queue = self.edges.get_mut(usize::from(frame.port))?;
         for var in frame.set.iter() {
             let Some(value) = safe.iter().find(|safe| safe.var == var) else {
-                self.outbox.drop_all(queue, var);
+                self.outbox.forget(queue, &InputSet::from_iter([var]));
                 self.live.remove(var);
+                self.read_back.remove(var);
                 continue;
             };
             let place = self.image.bytes_mut().get_mut(var.image_offset()..);
@@ -116,6 +130,7 @@ impl<const PORTS: usize> Store<PORTS> {
                 *target = byte;
             }
             self.outbox.offer_safe(queue, var, value.bytes[0], now);
+            self.safe.insert(var);
         }
         Some(frame)
     }
@@ -123,7 +138,7 @@ impl<const PORTS: usize> Store<PORTS> {
     /// Drops what has waited for longer than its port's timeout and counts it there.
     pub(super) fn expire_waiting(&mut self, mut count: impl FnMut(usize, usize), now: Instant) {
         for frame in &self.frames {
-            let waiting = frame.set.and(&InputSet::BYTES).and(&self.outbox.dirty());
+            let waiting = frame.set.and(&InputSet::BYTES).and(&self.outbox.dirty()).minus(&self.safe);
             if waiting.is_empty() {
                 continue;
             }
@@ -156,9 +171,14 @@ impl<const PORTS: usize> Store<PORTS> {
     /// A link was lost: nothing that waited for it is written later, safe values excepted.
     pub(super) fn link_lost(&mut self, vars: &InputSet) {
         self.reachable = self.reachable.minus(vars);
-        self.outbox.drop_unsafe(vars);
+        let dropped = vars.minus(&self.safe);
         for queue in &mut self.edges {
-            queue.clear_vars(vars);
+            self.outbox.forget(queue, &dropped);
         }
+    }
+
+    /// A write of safe values came to nothing: they are written again, if they still stand.
+    pub(super) fn again(&mut self, safe: &InputSet) {
+        self.outbox.again(&safe.and(&self.safe));
     }
 }

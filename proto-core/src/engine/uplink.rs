@@ -90,10 +90,11 @@ impl Uplink {
         add(&mut self.counters.bytes_in, bytes.len());
         self.supervisor.heard(now);
         let (Some(layout), Some(group)) = (&self.output, self.group) else { return };
-        let mut newest = false;
+        let mut fresh = false;
         let mut take = |payload: &[u8]| {
-            newest = layout.apply(payload, store.image.bytes_mut()).is_ok();
-            newest
+            let applied = layout.apply(payload, store.image.bytes_mut()).is_ok();
+            fresh |= applied;
+            applied
         };
         match self.framing {
             Framing::Datagram => {
@@ -116,7 +117,7 @@ impl Uplink {
                 self.counters.resync_bytes = self.deframer.stats().skipped_bytes as u32;
             }
         }
-        if newest {
+        if fresh {
             store.image.stamp(group, now);
             if self.greets() {
                 self.greet_at = now + GREET_EVERY;
@@ -176,7 +177,7 @@ impl Uplink {
             .and_then(|group| store.image.stamp_of(group))
             .is_some_and(|at| now.saturating_since(at) <= READ_BACK_MAX_AGE);
         others.iter().all(|var| match var.stream() {
-            Some(_) => read_back,
+            Some(_) => read_back && store.read_back.contains(var),
             // Never read back: only held values of an owner that has fallen silent may be repeated.
             None => store.image.is_known(var),
         })
