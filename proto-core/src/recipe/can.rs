@@ -8,7 +8,7 @@ use embedded_can::Frame;
 use heapless::Vec;
 
 use super::error::{EncodeError, FieldPlace, PartError, ValueError};
-use super::fields::{Applied, FrameFields, PlacedField, Pool, Values};
+use super::fields::{Applied, FrameFields, PlacedField, Pool, Share, Values};
 use super::model::{CanId, Field, MAX_CAN_DATA, MAX_CAN_IDS, Rules};
 use crate::sysvar::IMAGE_BYTES;
 use crate::wire::scalar::Scalar;
@@ -49,13 +49,16 @@ pub enum CanReject {
     },
 }
 
-/// One part of a CAN recipe, checked and ready to decode and encode; about 1.3 KiB.
+/// One part of a CAN recipe, checked and ready to decode and encode; about 1.4 KiB.
 #[derive(Debug, Clone)]
 pub struct CanLayout {
     rules: Rules,
-    /// The frames' ids, in one word each, to be searched fast.
+    /// The frames' ids, in one word each.
     keys: Vec<u32, MAX_CAN_IDS>,
-    frames: Vec<FrameEntry, MAX_CAN_IDS>,
+    shares: Vec<Share, MAX_CAN_IDS>,
+    /// Where to look for an id: indices of frames, or [`EMPTY`]. See
+    /// [`CanLayout::search_order`].
+    places: [u8; PLACES],
     pool: Pool,
 }
 
@@ -63,17 +66,8 @@ pub struct CanLayout {
 #[derive(Debug, Clone, Copy)]
 pub struct CanFrameLayout<'a> {
     id: CanId,
-    len: u8,
-    fields: FrameFields<'a>,
-}
-
-#[derive(Debug, Clone, Copy)]
-struct FrameEntry {
-    first_field: u8,
-    last_field_end: u8,
-    first_step: u8,
-    last_step_end: u8,
-    len: u8,
+    share: &'a Share,
+    pool: &'a Pool,
 }
 
 impl CanFrame {
@@ -155,11 +149,12 @@ impl CanLayout {
     where
         F: IntoIterator<Item = Field>,
     {
-        let mut layout = Self { rules, keys: Vec::new(), frames: Vec::new(), pool: Pool::new() };
+        let mut layout =
+            Self { rules, keys: Vec::new(), shares: Vec::new(), places: [EMPTY; PLACES], pool: Pool::new() };
         for (id, fields) in frames {
             layout.push(id, fields)?;
         }
-        if layout.frames.is_empty() { Err(PartError::NoFrames) } else { Ok(layout) }
+        if layout.shares.is_empty() { Err(PartError::NoFrames) } else { Ok(layout) }
     }
 
     /// What the fields are and which way they go.
@@ -174,7 +169,7 @@ impl CanLayout {
 
     /// How many frames the part has, 1..=32.
     pub fn frame_count(&self) -> usize {
-        self.frames.len()
+        self.shares.len()
     }
 
     /// Which frame of the part a received frame is.
@@ -186,9 +181,8 @@ impl CanLayout {
         if frame.is_remote_frame() {
             return Err(CanReject::Remote { id });
         }
-        let key = key_of(id);
-        let index = self.keys.iter().position(|&other| other == key).ok_or(CanReject::UnknownId { id })?;
-        let expected = self.frames.get(index).map_or(0, |entry| entry.len);
+        let index = self.index_of(key_of(id)).ok_or(CanReject::UnknownId { id })?;
+        let expected = self.shares.get(index).map_or(0, |share| share.len as u8);
         let got = frame.data().len();
         if got != usize::from(expected) {
             return Err(CanReject::WrongLength { frame: index as u8, expected, got: got as u8 });
@@ -199,15 +193,8 @@ impl CanLayout {
     /// The frame with this index in the part.
     #[inline]
     pub fn frame(&self, index: usize) -> Option<CanFrameLayout<'_>> {
-        let entry = self.frames.get(index)?;
         let id = id_of(*self.keys.get(index)?);
-        let fields = usize::from(entry.first_field)..usize::from(entry.last_field_end);
-        let steps = usize::from(entry.first_step)..usize::from(entry.last_step_end);
-        Some(CanFrameLayout {
-            id,
-            len: entry.len,
-            fields: self.pool.frame(fields, steps, usize::from(entry.len)),
-        })
+        Some(CanFrameLayout { id, share: self.shares.get(index)?, pool: &self.pool })
     }
 
     /// The frames in declared order.
@@ -216,7 +203,7 @@ impl CanLayout {
     }
 
     fn push(&mut self, id: CanId, fields: impl IntoIterator<Item = Field>) -> Result<(), PartError> {
-        let nth = self.frames.len();
+        let nth = self.shares.len();
         if nth >= MAX_CAN_IDS {
             return Err(PartError::TooManyFrames);
         }
@@ -231,8 +218,8 @@ impl CanLayout {
         let mut len = 0_usize;
         for (nth, field) in fields.into_iter().enumerate() {
             let at = FieldPlace { frame: Some(frame), field: nth.min(usize::from(u8::MAX)) as u8 };
-            let entries = &self.frames;
-            let place_of = |nth| place_among(entries, frame, nth);
+            let shares = &self.shares;
+            let place_of = |nth| place_among(shares, frame, nth);
             self.pool.push(self.rules, field, at, first_step, place_of)?;
             len = len.saturating_add(field.ty().size());
         }
@@ -242,20 +229,41 @@ impl CanLayout {
         if len > MAX_CAN_DATA {
             return Err(PartError::CanFrameTooLong { frame, len });
         }
-        let entry = FrameEntry {
-            first_field: first_field as u8,
-            last_field_end: self.pool.field_count() as u8,
-            first_step: first_step as u8,
-            last_step_end: self.pool.step_count() as u8,
-            len: len as u8,
-        };
+        let key = key_of(id);
+        if let Some(free) = self.search_order(key).find(|&at| self.places.get(at) == Some(&EMPTY))
+            && let Some(place) = self.places.get_mut(free)
+        {
+            *place = frame;
+        }
         // There is space: the count was looked at above.
-        self.frames.push(entry).map_err(|_| PartError::TooManyFrames)?;
-        self.keys.push(key_of(id)).map_err(|_| PartError::TooManyFrames)
+        let share = self.pool.share_since(first_field, first_step, len);
+        self.shares.push(share).map_err(|_| PartError::TooManyFrames)?;
+        self.keys.push(key).map_err(|_| PartError::TooManyFrames)
+    }
+
+    /// The index of the frame with this id. At least half of the places are empty, so the search
+    /// is short.
+    #[inline]
+    fn index_of(&self, key: u32) -> Option<usize> {
+        for at in self.search_order(key) {
+            let index = usize::from(*self.places.get(at)?);
+            // An empty place is no index.
+            if *self.keys.get(index)? == key {
+                return Some(index);
+            }
+        }
+        None
+    }
+
+    /// The places of a key, first choice first.
+    #[inline]
+    fn search_order(&self, key: u32) -> impl Iterator<Item = usize> + use<> {
+        let first = (key.wrapping_mul(SPREAD) >> PLACE_SHIFT) as usize;
+        (0..PLACES).map(move |further| first.wrapping_add(further) % PLACES)
     }
 }
 
-impl CanFrameLayout<'_> {
+impl<'a> CanFrameLayout<'a> {
     /// The frame's id.
     pub const fn id(&self) -> CanId {
         self.id
@@ -264,17 +272,17 @@ impl CanFrameLayout<'_> {
     /// Its data's length in bytes, 1..=8.
     #[allow(clippy::len_without_is_empty, reason = "no frame of a recipe is empty")]
     pub const fn len(&self) -> usize {
-        self.len as usize
+        self.share.len as usize
     }
 
     /// Its fields in order, each with its place in the data.
-    pub fn fields(&self) -> impl Iterator<Item = PlacedField> + Clone + '_ {
-        self.fields.placed()
+    pub fn fields(&self) -> impl Iterator<Item = PlacedField> + Clone + 'a {
+        self.frame_fields().placed()
     }
 
     /// The data's values, in field order; fewer when the data is too short.
     pub fn values<'b>(&'b self, data: &'b [u8]) -> Values<'b> {
-        self.fields.values(data)
+        self.frame_fields().values(data)
     }
 
     /// Whether every value of the data may be used (D22).
@@ -282,7 +290,7 @@ impl CanFrameLayout<'_> {
     /// # Errors
     /// [`ValueError`]: a float or double that is not finite, or data of another length.
     pub fn check(&self, data: &[u8]) -> Result<(), ValueError> {
-        self.fields.check(data)
+        self.frame_fields().check(data)
     }
 
     /// Writes the data's values into the process image: all of them, or none. User-defined fields
@@ -292,12 +300,19 @@ impl CanFrameLayout<'_> {
     /// [`ValueError`]: a float that is not finite, or data of another length.
     #[inline]
     pub fn apply(&self, data: &[u8], image: &mut [u8; IMAGE_BYTES]) -> Result<Applied, ValueError> {
-        self.fields.apply(data, image)
+        match self.pool.runs(self.share).and_then(|runs| runs.apply(data, image)) {
+            Some(applied) => Ok(applied),
+            None => self.check(data).map(|()| Applied::default()),
+        }
     }
 
     /// The frame with the image's values. User-defined fields have no place there and are zero.
     pub fn encode(&self, image: &[u8; IMAGE_BYTES]) -> CanFrame {
-        self.filled(|data| self.fields.encode(image, data))
+        self.filled(|data| {
+            if let Some(runs) = self.pool.runs(self.share) {
+                runs.encode(image, data);
+            }
+        })
     }
 
     /// The frame with these values, one a field.
@@ -305,8 +320,12 @@ impl CanFrameLayout<'_> {
     /// # Errors
     /// [`EncodeError`]: too few or too many values, or a value of another type.
     pub fn encode_values(&self, values: &[Scalar]) -> Result<CanFrame, EncodeError> {
-        self.fields.accepts(values)?;
-        Ok(self.filled(|data| self.fields.encode_values(values, data)))
+        self.frame_fields().accepts(values)?;
+        Ok(self.filled(|data| self.frame_fields().encode_values(values, data)))
+    }
+
+    fn frame_fields(&self) -> FrameFields<'a> {
+        self.pool.fields(self.share)
     }
 
     #[inline]
@@ -315,21 +334,30 @@ impl CanFrameLayout<'_> {
         if let Some(used) = data.get_mut(..self.len()) {
             fill(used);
         }
-        CanFrame { id: self.id, remote: false, len: self.len, data }
+        CanFrame { id: self.id, remote: false, len: self.share.len as u8, data }
     }
 }
 
 /// Where the n-th field of the part stands; fields past the finished frames are those of `frame`.
-fn place_among(finished: &[FrameEntry], frame: u8, nth: usize) -> FieldPlace {
-    let holds = |entry: &FrameEntry| nth < usize::from(entry.last_field_end);
+fn place_among(finished: &[Share], frame: u8, nth: usize) -> FieldPlace {
+    let holds = |share: &Share| nth < usize::from(share.field_end);
     let index = finished.iter().position(holds);
     let first = match index.and_then(|index| finished.get(index)) {
-        Some(entry) => entry.first_field,
-        None => finished.last().map_or(0, |entry| entry.last_field_end),
+        Some(share) => share.first_field,
+        None => finished.last().map_or(0, |share| share.field_end),
     };
     let frame = index.map_or(frame, |index| index as u8);
     FieldPlace { frame: Some(frame), field: nth.saturating_sub(usize::from(first)) as u8 }
 }
+
+/// Twice the ids there can be, so that the search for one that is not there ends soon.
+const PLACES: usize = 2 * MAX_CAN_IDS;
+const PLACE_SHIFT: u32 = u32::BITS - PLACES.ilog2();
+const _: () = assert!(PLACES.is_power_of_two());
+/// 2^32 divided by the golden ratio: neighbouring ids get places far apart.
+const SPREAD: u32 = 0x9E37_79B1;
+/// No frame has this index.
+const EMPTY: u8 = u8::MAX;
 
 /// Marks an extended id in a key.
 const EXTENDED: u32 = 1 << 31;

@@ -4,11 +4,12 @@
 //! In: chunks of any size. Out: the payload of each frame, and counts of everything else. Whether
 //! the line was silent too long is the caller's knowledge: it calls [`Deframer::discard`].
 //!
-//! Work is linear in the bytes received, whatever they are: each is copied at most twice, compared
-//! with the head for at most eight positions and with the tail for at most eight.
+//! Work is linear in the bytes received, whatever they are: each costs at most a few comparisons
+//! with the up to eight bytes of head and tail and a few copies, which a test counts.
 
 use super::error::DatagramError;
 use super::model::MAX_STREAM_FRAME;
+use super::runs;
 use super::stream::StreamLayout;
 
 /// What a [`Deframer`] did since it was made.
@@ -44,7 +45,7 @@ const _: () = assert!(RING.is_power_of_two());
 
 /// How completing a partial frame ended.
 enum Held {
-    /// The ring holds a whole frame.
+    /// A whole frame stands at the ring's start, and nothing is held any more.
     Frame,
     /// The chunk is used up.
     Partial,
@@ -69,6 +70,7 @@ impl Deframer {
     /// with what is left until it returns `None`, which means that the chunk is used up.
     ///
     /// All calls between two [`Self::discard`]s must be given the same layout.
+    #[inline]
     pub fn next_frame<'s, 'c: 's>(
         &'s mut self,
         layout: &StreamLayout,
@@ -76,7 +78,7 @@ impl Deframer {
     ) -> Option<&'s [u8]> {
         if self.len != 0 {
             match self.complete(layout, chunk) {
-                Held::Frame => return Some(self.take(layout)),
+                Held::Frame => return layout.payload_of(&self.ring),
                 Held::Partial => return None,
                 Held::Nothing => {}
             }
@@ -105,32 +107,86 @@ impl Deframer {
     }
 
     /// Looks for a frame in the chunk itself, with nothing held. What may become one is held.
+    #[inline]
     fn search<'c>(&mut self, layout: &StreamLayout, chunk: &mut &'c [u8]) -> Option<&'c [u8]> {
-        let mut rest = *chunk;
-        loop {
-            let skip = layout.head_word().find(rest);
-            count_visits(skip.saturating_add(1).saturating_mul(layout.head().len().max(1)));
+        let skip = layout.head_word().find(chunk);
+        count_visits(layout.head_word().len().saturating_mul(skip.saturating_add(1).min(chunk.len())));
+        if skip > 0 {
             self.skip(skip);
-            rest = rest.get(skip..).unwrap_or(&[]);
-            let Some((frame, after)) = rest.split_at_checked(layout.frame_len()) else {
-                *chunk = &[];
-                self.append(rest);
-                return None;
-            };
-            count_visits(layout.tail().len());
-            if layout.tail_word().ends(frame) {
-                self.stats.frames = self.stats.frames.wrapping_add(1);
-                *chunk = after;
-                return Some(layout.payload_of(frame));
-            }
+            *chunk = chunk.get(skip..).unwrap_or(&[]);
+        }
+        let Some((frame, after)) = chunk.split_at_checked(layout.frame_len()) else {
+            self.put(0, chunk);
+            self.len = chunk.len() as u16;
+            *chunk = &[];
+            return None;
+        };
+        count_visits(layout.tail_word().len());
+        if !layout.tail_word().ends(frame) {
+            // A copy, so that the caller's chunk can stay in registers on the way above.
+            let mut rest = *chunk;
+            let found = self.search_behind(layout, &mut rest);
+            *chunk = rest;
+            return found;
+        }
+        self.stats.frames = self.stats.frames.wrapping_add(1);
+        *chunk = after;
+        layout.payload_of(frame)
+    }
+
+    /// The same behind a head whose tail is wrong.
+    #[inline(never)]
+    fn search_behind<'c>(&mut self, layout: &StreamLayout, chunk: &mut &'c [u8]) -> Option<&'c [u8]> {
+        loop {
             self.stats.tail_mismatches = self.stats.tail_mismatches.wrapping_add(1);
             self.skip(1);
-            rest = rest.get(1..).unwrap_or(&[]);
+            let rest = chunk.get(1..).unwrap_or(&[]);
+            let skip = layout.head_word().find(rest);
+            count_visits(layout.head_word().len().saturating_mul(skip.saturating_add(1).min(rest.len())));
+            self.skip(skip);
+            *chunk = rest.get(skip..).unwrap_or(&[]);
+            match chunk.get(..layout.frame_len()) {
+                Some(frame) if !layout.tail_word().ends(frame) => count_visits(layout.tail_word().len()),
+                _ => return self.search(layout, chunk),
+            }
         }
     }
 
     /// Takes what the held bytes need to become a frame.
+    #[inline]
     fn complete(&mut self, layout: &StreamLayout, chunk: &mut &[u8]) -> Held {
+        let held = self.pending();
+        // The ring is not wrapped and the head is known to be right: all that undisturbed traffic
+        // needs.
+        if self.start == 0
+            && held >= layout.head_word().len()
+            && let Some(missing) = layout.frame_len().checked_sub(held)
+        {
+            let Some((more, after)) = chunk.split_at_checked(missing) else {
+                self.put(held, chunk);
+                self.len = self.len.wrapping_add(chunk.len() as u16);
+                *chunk = &[];
+                return Held::Partial;
+            };
+            self.put(held, more);
+            count_visits(layout.tail_word().len());
+            if self.ring.get(..layout.frame_len()).is_some_and(|frame| layout.tail_word().ends(frame)) {
+                self.stats.frames = self.stats.frames.wrapping_add(1);
+                self.len = 0;
+                *chunk = after;
+                return Held::Frame;
+            }
+            // Nothing was taken yet: the bytes behind those held do not count.
+        }
+        let mut rest = *chunk;
+        let held = self.complete_carefully(layout, &mut rest);
+        *chunk = rest;
+        held
+    }
+
+    /// The same, whatever is held and whatever comes.
+    #[inline(never)]
+    fn complete_carefully(&mut self, layout: &StreamLayout, chunk: &mut &[u8]) -> Held {
         loop {
             let held = self.pending();
             // Nothing is missing only when the layout was changed without a discard.
@@ -146,6 +202,7 @@ impl Deframer {
                     return Held::Partial;
                 }
                 if self.tail_agrees(layout) {
+                    self.settle(layout);
                     return Held::Frame;
                 }
                 self.stats.tail_mismatches = self.stats.tail_mismatches.wrapping_add(1);
@@ -156,21 +213,20 @@ impl Deframer {
         }
     }
 
-    /// The held frame's payload; the ring is empty afterwards.
-    fn take(&mut self, layout: &StreamLayout) -> &[u8] {
+    /// Moves the held frame to the ring's start; nothing is held afterwards.
+    fn settle(&mut self, layout: &StreamLayout) {
         self.stats.frames = self.stats.frames.wrapping_add(1);
-        let start = usize::from(self.start);
+        let start = usize::from(self.start) & WRAP;
+        let frame = start..start.saturating_add(layout.frame_len());
+        if frame.end > RING {
+            count_visits(RING);
+            self.ring.rotate_left(start);
+        } else if start > 0 {
+            count_visits(frame.len());
+            self.ring.copy_within(frame, 0);
+        }
         self.start = 0;
         self.len = 0;
-        let end = start.saturating_add(layout.frame_len());
-        let frame = if end <= RING {
-            self.ring.get(start..end)
-        } else {
-            count_visits(RING);
-            self.ring.rotate_left(start & WRAP);
-            self.ring.get(..layout.frame_len())
-        };
-        layout.payload_of(frame.unwrap_or(&[]))
     }
 
     /// Whether the held bytes from `from` on agree with the head; those before are known to.
@@ -212,20 +268,40 @@ impl Deframer {
     /// Holds more bytes; there is always space, since what is held stays below a frame's length.
     fn append(&mut self, bytes: &[u8]) {
         count_visits(bytes.len());
-        let end = usize::from(self.start).wrapping_add(self.pending()) & WRAP;
+        let end = usize::from(self.start).wrapping_add(self.pending());
+        self.len = self.len.wrapping_add(bytes.len() as u16);
         let straight = RING.saturating_sub(end).min(bytes.len());
         let (first, second) = bytes.split_at_checked(straight).unwrap_or((bytes, &[]));
+        let around = end.saturating_sub(RING);
         if let Some(target) = self.ring.get_mut(end..end.saturating_add(first.len())) {
             target.copy_from_slice(first);
         }
-        if let Some(target) = self.ring.get_mut(..second.len()) {
+        if let Some(target) = self.ring.get_mut(around..around.saturating_add(second.len())) {
             target.copy_from_slice(second);
         }
-        self.len = self.len.saturating_add(bytes.len() as u16);
+    }
+
+    /// Writes to the ring without counting it as held.
+    #[inline]
+    fn put(&mut self, at: usize, bytes: &[u8]) {
+        count_visits(bytes.len());
+        match self.ring.get_mut(at..at.saturating_add(bytes.len())) {
+            Some(target) if bytes.len() <= runs::MAX_RUN => runs::copy(target, bytes),
+            Some(target) => copy_long(target, bytes),
+            None => {}
+        }
     }
 
     fn skip(&mut self, bytes: usize) {
         self.stats.skipped_bytes = self.stats.skipped_bytes.wrapping_add(bytes as u64);
+    }
+}
+
+/// A call of its own, so that short copies do without one.
+#[inline(never)]
+fn copy_long(to: &mut [u8], from: &[u8]) {
+    if to.len() == from.len() {
+        to.copy_from_slice(from);
     }
 }
 
@@ -234,8 +310,9 @@ impl Deframer {
 /// # Errors
 /// [`DatagramError`] says whether length, head or tail is wrong.
 pub fn datagram<'d>(layout: &StreamLayout, bytes: &'d [u8]) -> Result<&'d [u8], DatagramError> {
+    let length = DatagramError::Length { expected: layout.frame_len(), got: bytes.len() };
     if bytes.len() != layout.frame_len() {
-        return Err(DatagramError::Length { expected: layout.frame_len(), got: bytes.len() });
+        return Err(length);
     }
     if !layout.head_word().agrees(bytes) {
         return Err(DatagramError::Head);
@@ -243,7 +320,7 @@ pub fn datagram<'d>(layout: &StreamLayout, bytes: &'d [u8]) -> Result<&'d [u8], 
     if !layout.tail_word().ends(bytes) {
         return Err(DatagramError::Tail);
     }
-    Ok(layout.payload_of(bytes))
+    layout.payload_of(bytes).ok_or(length)
 }
 
 #[cfg(not(test))]

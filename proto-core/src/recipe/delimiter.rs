@@ -18,8 +18,9 @@ pub(super) struct Tail {
     len: u8,
 }
 
-fn same(a: [u8; 8], b: [u8; 8], mask: [u8; 8]) -> bool {
-    (u64::from_ne_bytes(a) ^ u64::from_ne_bytes(b)) & u64::from_ne_bytes(mask) == 0
+#[inline(always)]
+fn same(a: &[u8; 8], b: &[u8; 8], mask: &[u8; 8]) -> bool {
+    (u64::from_ne_bytes(*a) ^ u64::from_ne_bytes(*b)) & u64::from_ne_bytes(*mask) == 0
 }
 
 impl Head {
@@ -39,11 +40,22 @@ impl Head {
         self.len as usize
     }
 
+    /// The head in eight bytes, zeros behind it.
+    pub(super) const fn padded(&self) -> [u8; MAX_DELIMITER] {
+        self.bytes
+    }
+
+    /// Whether eight bytes begin with the head.
+    #[inline]
+    pub(super) fn is(&self, front: &[u8; MAX_DELIMITER]) -> bool {
+        same(front, &self.bytes, &self.mask)
+    }
+
     /// Whether `data` begins with the head, or is the beginning of it.
     #[inline]
     pub(super) fn agrees(&self, data: &[u8]) -> bool {
         match data.first_chunk() {
-            Some(&front) => same(front, self.bytes, self.mask),
+            Some(front) => self.is(front),
             None => self.bytes().iter().zip(data).all(|(a, b)| a == b),
         }
     }
@@ -51,24 +63,24 @@ impl Head {
     /// How many bytes at the front of `data` cannot begin a frame.
     #[inline]
     pub(super) fn find(&self, data: &[u8]) -> usize {
-        if self.agrees(data) {
-            return 0;
+        match data.first_chunk() {
+            Some(front) if self.is(front) => 0,
+            _ => self.find_further(data),
         }
-        self.find_further(data)
     }
 
+    #[inline(never)]
     fn find_further(&self, data: &[u8]) -> usize {
-        let [first, ..] = self.bytes;
-        let mut at = 1_usize;
-        while let Some(rest) = data.get(at..) {
-            let Some(ahead) = rest.iter().position(|&byte| byte == first) else { break };
-            at = at.saturating_add(ahead);
-            if self.agrees(rest.get(ahead..).unwrap_or(&[])) {
-                return at;
-            }
-            at = at.saturating_add(1);
+        let mut skip = 0_usize;
+        let mut rest = data;
+        while !self.agrees(rest) {
+            let [first, ..] = self.bytes;
+            let behind = rest.get(1..).unwrap_or(&[]);
+            let ahead = behind.iter().position(|&byte| byte == first).unwrap_or(behind.len());
+            skip = skip.saturating_add(ahead).saturating_add(1);
+            rest = behind.get(ahead..).unwrap_or(&[]);
         }
-        data.len()
+        skip
     }
 }
 
@@ -90,11 +102,22 @@ impl Tail {
         self.len as usize
     }
 
+    /// The tail in eight bytes, zeros before it.
+    pub(super) const fn padded(&self) -> [u8; MAX_DELIMITER] {
+        self.bytes
+    }
+
+    /// Whether eight bytes end with the tail.
+    #[inline]
+    pub(super) fn is(&self, back: &[u8; MAX_DELIMITER]) -> bool {
+        same(back, &self.bytes, &self.mask)
+    }
+
     /// Whether `frame` ends with the tail.
     #[inline]
     pub(super) fn ends(&self, frame: &[u8]) -> bool {
         match frame.last_chunk() {
-            Some(&back) => same(back, self.bytes, self.mask),
+            Some(back) => self.is(back),
             None => frame.ends_with(self.bytes()),
         }
     }

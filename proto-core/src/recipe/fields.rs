@@ -5,6 +5,7 @@ use heapless::Vec;
 
 use super::error::{EncodeError, FieldPlace, PartError, ValueError};
 use super::model::{Field, MAX_FIELDS, Mode, Rules};
+use super::runs;
 use crate::sysvar::{Direction, IMAGE_BYTES, SysVar};
 use crate::wire::scalar::{Scalar, ScalarType};
 
@@ -54,10 +55,10 @@ pub(super) struct Pool {
     steps: Vec<Step, MAX_FIELDS>,
 }
 
-/// Consecutive payload bytes that are consecutive in the image too. The runs of a frame cover its
+/// At most [`runs::MAX_RUN`] consecutive payload bytes that are consecutive in the image too. The runs of a frame cover its
 /// payload in order, without gaps.
 #[derive(Debug, Clone, Copy)]
-struct Step {
+pub(super) struct Step {
     image: u16,
     len: u16,
     kind: Kind,
@@ -74,12 +75,31 @@ enum Kind {
     Bits(u8),
 }
 
-/// One frame's share of a [`Pool`].
+/// One frame's fields.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct FrameFields<'a> {
     fields: &'a [Field],
-    steps: &'a [Step],
+    /// Bytes of the payload.
     len: usize,
+}
+
+/// One frame's runs.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Runs<'a> {
+    steps: &'a [Step],
+    /// Bytes of the payload.
+    len: usize,
+}
+
+/// Which fields and runs of a [`Pool`] are a frame's, and how long they are on the wire.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Share {
+    pub(super) first_field: u8,
+    pub(super) field_end: u8,
+    pub(super) first_step: u8,
+    pub(super) step_end: u8,
+    /// Bytes.
+    pub(super) len: u16,
 }
 
 impl Pool {
@@ -130,25 +150,39 @@ impl Pool {
         Ok(())
     }
 
-    /// The share of a frame whose fields and runs are these ranges; `len` is its payload's length.
-    #[inline]
-    pub(super) fn frame(
-        &self,
-        fields: core::ops::Range<usize>,
-        steps: core::ops::Range<usize>,
-        len: usize,
-    ) -> FrameFields<'_> {
-        FrameFields {
-            fields: self.fields.get(fields).unwrap_or(&[]),
-            steps: self.steps.get(steps).unwrap_or(&[]),
-            len,
+    /// What was added since `first_field` and `first_step` were the next ones.
+    pub(super) fn share_since(&self, first_field: usize, first_step: usize, len: usize) -> Share {
+        Share {
+            first_field: first_field as u8,
+            field_end: self.field_count() as u8,
+            first_step: first_step as u8,
+            step_end: self.step_count() as u8,
+            len: len as u16,
         }
     }
 
-    /// The share of a part that is one frame.
+    /// The fields of one of several frames.
+    pub(super) fn fields(&self, share: &Share) -> FrameFields<'_> {
+        let range = usize::from(share.first_field)..usize::from(share.field_end);
+        FrameFields { fields: self.fields.get(range).unwrap_or(&[]), len: usize::from(share.len) }
+    }
+
+    /// The runs of one of several frames.
     #[inline]
-    pub(super) fn whole(&self, len: usize) -> FrameFields<'_> {
-        FrameFields { fields: &self.fields, steps: &self.steps, len }
+    pub(super) fn runs(&self, share: &Share) -> Option<Runs<'_>> {
+        let range = usize::from(share.first_step)..usize::from(share.step_end);
+        Some(Runs { steps: self.steps.get(range)?, len: usize::from(share.len) })
+    }
+
+    /// The fields of a part that is one frame.
+    pub(super) fn all_fields(&self, len: usize) -> FrameFields<'_> {
+        FrameFields { fields: &self.fields, len }
+    }
+
+    /// The runs of a part that is one frame.
+    #[inline]
+    pub(super) fn all_runs(&self, len: usize) -> Runs<'_> {
+        Runs { steps: &self.steps, len }
     }
 }
 
@@ -166,6 +200,66 @@ impl Step {
         self.kind == next.kind
             && !matches!(self.kind, Kind::Bits(_))
             && self.image.saturating_add(self.len) == next.image
+            && usize::from(self.len.saturating_add(next.len)) <= runs::MAX_RUN
+    }
+}
+
+impl Runs<'_> {
+    /// Writes a payload into the image; `None`, with nothing written, when that needs a closer
+    /// look: [`FrameFields::check`] knows.
+    #[inline(always)]
+    pub(super) fn apply(self, payload: &[u8], image: &mut [u8; IMAGE_BYTES]) -> Option<Applied> {
+        // Most parts are one run.
+        let [step] = self.steps else { return self.apply_many(payload, image) };
+        (payload.len() == usize::from(step.len) && step.accepts(payload))
+            .then(|| Applied { masked: step.write(payload, image) })
+    }
+
+    #[inline(never)]
+    fn apply_many(self, payload: &[u8], image: &mut [u8; IMAGE_BYTES]) -> Option<Applied> {
+        if payload.len() != self.len {
+            return None;
+        }
+        let mut rest = payload;
+        let mut accepted = !self.steps.is_empty();
+        for step in self.steps {
+            let (run, after) = rest.split_at_checked(usize::from(step.len))?;
+            accepted &= step.accepts(run);
+            rest = after;
+        }
+        if !accepted {
+            return None;
+        }
+        let mut applied = Applied::default();
+        let mut rest = payload;
+        for step in self.steps {
+            let (run, after) = rest.split_at_checked(usize::from(step.len))?;
+            applied.masked = applied.masked.saturating_add(step.write(run, image));
+            rest = after;
+        }
+        Some(applied)
+    }
+
+    /// Fills a payload from the image; user-defined fields have no place there and become zero.
+    #[inline]
+    pub(super) fn encode(self, image: &[u8; IMAGE_BYTES], payload: &mut [u8]) {
+        match self.steps {
+            [step] => step.read(image, payload),
+            _ => self.encode_many(image, payload),
+        }
+    }
+
+    #[inline(never)]
+    fn encode_many(self, image: &[u8; IMAGE_BYTES], payload: &mut [u8]) {
+        let mut rest = payload;
+        for step in self.steps {
+            let Some((run, after)) = rest.split_at_mut_checked(usize::from(step.len)) else { return };
+            step.read(image, run);
+            rest = after;
+        }
+        if self.steps.is_empty() {
+            rest.fill(0);
+        }
     }
 }
 
@@ -186,65 +280,15 @@ impl<'a> FrameFields<'a> {
     }
 
     /// Refuses a payload of another length, or with a float or double that is not finite.
-    #[inline]
+    #[inline(never)]
     pub(super) fn check(self, payload: &[u8]) -> Result<(), ValueError> {
         if payload.len() != self.len {
             return Err(ValueError::Length { expected: self.len, got: payload.len() });
         }
-        let mut rest = payload;
-        let mut finite = true;
-        for step in self.steps {
-            let Some((run, after)) = rest.split_at_checked(usize::from(step.len)) else { break };
-            if step.kind == Kind::Floats {
-                finite &= all_finite(run);
-            }
-            rest = after;
-        }
-        if finite && !self.steps.is_empty() { Ok(()) } else { self.check_each(payload) }
-    }
-
-    /// For user-defined fields, and to find out which field it is.
-    #[cold]
-    fn check_each(self, payload: &[u8]) -> Result<(), ValueError> {
         match self.values(payload).position(|value| !value.is_finite()) {
             Some(field) => Err(ValueError::NotFinite { field: field as u8 }),
             None => Ok(()),
         }
-    }
-
-    #[inline]
-    pub(super) fn apply(self, payload: &[u8], image: &mut [u8; IMAGE_BYTES]) -> Result<Applied, ValueError> {
-        self.check(payload)?;
-        let mut applied = Applied::default();
-        let mut rest = payload;
-        for step in self.steps {
-            let Some((run, after)) = rest.split_at_checked(usize::from(step.len)) else { break };
-            let Some(target) = image.get_mut(step.range()) else { break };
-            match step.kind {
-                Kind::Bits(valid) => {
-                    for (bits, &received) in target.iter_mut().zip(run) {
-                        *bits = received & valid;
-                        applied.masked = applied.masked.saturating_add(u16::from(received & !valid != 0));
-                    }
-                }
-                Kind::Plain | Kind::Floats => target.copy_from_slice(run),
-            }
-            rest = after;
-        }
-        Ok(applied)
-    }
-
-    /// Fills a payload from the image; user-defined fields have no place there and become zero.
-    #[inline]
-    pub(super) fn encode(self, image: &[u8; IMAGE_BYTES], payload: &mut [u8]) {
-        let mut rest = payload;
-        for step in self.steps {
-            let Some((run, after)) = rest.split_at_mut_checked(usize::from(step.len)) else { return };
-            let Some(source) = image.get(step.range()) else { return };
-            run.copy_from_slice(source);
-            rest = after;
-        }
-        rest.fill(0);
     }
 
     /// Whether `values` are one a field, each of its field's type.
@@ -252,12 +296,9 @@ impl<'a> FrameFields<'a> {
         if values.len() != self.fields.len() {
             return Err(EncodeError::Count { expected: self.fields.len(), got: values.len() });
         }
-        match self.fields.iter().zip(values).position(|(field, value)| field.ty() != value.ty()) {
-            Some(field) => {
-                let expected = self.fields.get(field).map_or(ScalarType::Byte, |field| field.ty());
-                let got = values.get(field).map_or(ScalarType::Byte, |value| value.ty());
-                Err(EncodeError::Type { field: field as u8, expected, got })
-            }
+        let pairs = self.fields.iter().map(|field| field.ty()).zip(values.iter().map(|value| value.ty()));
+        match pairs.enumerate().find(|(_, (expected, got))| expected != got) {
+            Some((field, (expected, got))) => Err(EncodeError::Type { field: field as u8, expected, got }),
             None => Ok(()),
         }
     }
@@ -274,17 +315,40 @@ impl<'a> FrameFields<'a> {
 }
 
 impl Step {
+    /// Whether the values of a run may be used.
     #[inline]
-    fn range(self) -> core::ops::Range<usize> {
+    fn accepts(&self, run: &[u8]) -> bool {
+        self.kind != Kind::Floats || runs::all_finite(run)
+    }
+
+    /// Writes a run to its place in the image; returns how many of its fields had reserved bits set.
+    #[inline]
+    fn write(&self, run: &[u8], image: &mut [u8; IMAGE_BYTES]) -> u16 {
+        let Some(target) = image.get_mut(self.range()) else { return 0 };
+        match self.kind {
+            Kind::Plain | Kind::Floats => {
+                runs::copy(target, run);
+                0
+            }
+            Kind::Bits(valid) => {
+                let (Some(bits), Some(&received)) = (target.first_mut(), run.first()) else { return 0 };
+                *bits = received & valid;
+                u16::from(received & !valid != 0)
+            }
+        }
+    }
+
+    /// Reads a run from its place in the image.
+    #[inline]
+    fn read(&self, image: &[u8; IMAGE_BYTES], run: &mut [u8]) {
+        if let Some(source) = image.get(self.range()) {
+            runs::copy(run, source);
+        }
+    }
+
+    #[inline]
+    fn range(&self) -> core::ops::Range<usize> {
         let start = usize::from(self.image);
         start..start.saturating_add(usize::from(self.len))
     }
-}
-
-/// Whether none of the binary32 numbers in `run` is infinite or not a number.
-#[inline]
-fn all_finite(run: &[u8]) -> bool {
-    const EXPONENT: u32 = 0x7F80_0000;
-    let (floats, _) = run.as_chunks();
-    floats.iter().all(|&float| u32::from_le_bytes(float) & EXPONENT != EXPONENT)
 }

@@ -15,6 +15,7 @@ mod delimiter;
 mod error;
 mod fields;
 pub mod model;
+mod runs;
 pub mod stream;
 
 pub use can::{CanFrame, CanFrameLayout, CanLayout, CanReject};

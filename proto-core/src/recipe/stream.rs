@@ -5,8 +5,8 @@
 
 use super::delimiter::{Head, Tail};
 use super::error::{EncodeError, FieldPlace, NoSpace, PartError, ValueError};
-use super::fields::{Applied, PlacedField, Pool, Values};
-use super::model::{Field, Framing, MAX_STREAM_FRAME, Mode, Rules};
+use super::fields::{Applied, FrameFields, PlacedField, Pool, Values};
+use super::model::{Field, Framing, MAX_DELIMITER, MAX_STREAM_FRAME, Mode, Rules};
 use crate::sysvar::IMAGE_BYTES;
 use crate::wire::scalar::Scalar;
 
@@ -16,8 +16,8 @@ pub struct StreamLayout {
     rules: Rules,
     head: Head,
     tail: Tail,
-    payload_len: u16,
     frame_len: u16,
+    payload_len: u16,
     pool: Pool,
 }
 
@@ -53,8 +53,8 @@ impl StreamLayout {
         if frame_len > MAX_STREAM_FRAME {
             return Err(PartError::StreamFrameTooLong { len: frame_len });
         }
-        let (payload_len, frame_len) = (payload_len as u16, frame_len as u16);
-        Ok(Self { rules, head, tail, payload_len, frame_len, pool })
+        let (frame_len, payload_len) = (frame_len as u16, payload_len as u16);
+        Ok(Self { rules, head, tail, frame_len, payload_len, pool })
     }
 
     /// What the fields are and which way they go.
@@ -84,12 +84,12 @@ impl StreamLayout {
 
     /// The fields in order, each with its place in the payload.
     pub fn fields(&self) -> impl Iterator<Item = PlacedField> + Clone + '_ {
-        self.pool.whole(self.payload_len()).placed()
+        self.all_fields().placed()
     }
 
     /// The payload's values, in field order; fewer when the payload is too short.
     pub fn values<'a>(&'a self, payload: &'a [u8]) -> Values<'a> {
-        self.pool.whole(self.payload_len()).values(payload)
+        self.all_fields().values(payload)
     }
 
     /// Whether every value of the payload may be used (D22).
@@ -97,7 +97,7 @@ impl StreamLayout {
     /// # Errors
     /// [`ValueError`]: a float or double that is not finite, or a payload of another length.
     pub fn check(&self, payload: &[u8]) -> Result<(), ValueError> {
-        self.pool.whole(self.payload_len()).check(payload)
+        self.all_fields().check(payload)
     }
 
     /// Writes the payload's values into the process image: all of them, or none. User-defined
@@ -105,8 +105,12 @@ impl StreamLayout {
     ///
     /// # Errors
     /// [`ValueError`]: a float that is not finite, or a payload of another length.
+    #[inline]
     pub fn apply(&self, payload: &[u8], image: &mut [u8; IMAGE_BYTES]) -> Result<Applied, ValueError> {
-        self.pool.whole(self.payload_len()).apply(payload, image)
+        match self.pool.all_runs(self.payload_len()).apply(payload, image) {
+            Some(applied) => Ok(applied),
+            None => self.check(payload).map(|()| Applied::default()),
+        }
     }
 
     /// Writes a frame with the image's values to the front of `out` and returns its length.
@@ -114,9 +118,10 @@ impl StreamLayout {
     ///
     /// # Errors
     /// [`NoSpace`], with nothing written, when `out` is shorter than a frame.
+    #[inline]
     pub fn encode(&self, image: &[u8; IMAGE_BYTES], out: &mut [u8]) -> Result<usize, NoSpace> {
         let payload = self.delimited(out)?;
-        self.pool.whole(self.payload_len()).encode(image, payload);
+        self.pool.all_runs(self.payload_len()).encode(image, payload);
         Ok(self.frame_len())
     }
 
@@ -127,10 +132,14 @@ impl StreamLayout {
     /// [`EncodeError`], with nothing written: too few or too many values, a value of another type,
     /// or not enough space.
     pub fn encode_values(&self, values: &[Scalar], out: &mut [u8]) -> Result<usize, EncodeError> {
-        let fields = self.pool.whole(self.payload_len());
+        let fields = self.all_fields();
         fields.accepts(values)?;
         fields.encode_values(values, self.delimited(out)?);
         Ok(self.frame_len())
+    }
+
+    fn all_fields(&self) -> FrameFields<'_> {
+        self.pool.all_fields(self.payload_len())
     }
 
     pub(super) const fn head_word(&self) -> &Head {
@@ -141,25 +150,33 @@ impl StreamLayout {
         &self.tail
     }
 
-    /// The fields' bytes of a whole frame.
+    /// The fields' bytes of a whole frame; `None` only if it is shorter than one.
     #[inline]
-    pub(super) fn payload_of<'f>(&self, frame: &'f [u8]) -> &'f [u8] {
-        let start = self.head.len();
-        frame.get(start..start.saturating_add(self.payload_len())).unwrap_or(&[])
+    pub(super) fn payload_of<'f>(&self, frame: &'f [u8]) -> Option<&'f [u8]> {
+        frame.get(self.head.len()..)?.get(..self.payload_len())
     }
 
     /// Writes head and tail; the payload's place is returned and must be filled.
     #[inline]
     fn delimited<'o>(&self, out: &'o mut [u8]) -> Result<&'o mut [u8], NoSpace> {
-        let available = out.len();
-        let needed = self.frame_len();
-        let no_space = NoSpace { needed, available };
-        let frame = out.get_mut(..needed).ok_or(no_space)?;
-        let (head, rest) = frame.split_at_mut_checked(self.head.len()).ok_or(no_space)?;
-        let (payload, tail) = rest.split_at_mut_checked(self.payload_len()).ok_or(no_space)?;
-        head.copy_from_slice(self.head.bytes());
-        tail.copy_from_slice(self.tail.bytes());
-        Ok(payload)
+        let no_space = NoSpace { needed: self.frame_len(), available: out.len() };
+        let frame = out.get_mut(..self.frame_len()).ok_or(no_space)?;
+        let start = self.head.len();
+        if frame.len() >= 2 * MAX_DELIMITER {
+            // Whole words, whose unused bytes fall into the payload.
+            if let Some(front) = frame.first_chunk_mut() {
+                *front = self.head.padded();
+            }
+            if let Some(back) = frame.last_chunk_mut() {
+                *back = self.tail.padded();
+            }
+        } else if let Some((head, rest)) = frame.split_at_mut_checked(start)
+            && let Some((_, tail)) = rest.split_at_mut_checked(self.payload_len())
+        {
+            head.copy_from_slice(self.head.bytes());
+            tail.copy_from_slice(self.tail.bytes());
+        }
+        frame.get_mut(start..start.saturating_add(self.payload_len())).ok_or(no_space)
     }
 }
 

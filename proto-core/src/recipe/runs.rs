@@ -1,0 +1,106 @@
+//! Copies and checks of a few bytes whose number is known only at run time.
+//!
+//! Both take words from either end that overlap in the middle. For the short runs of recipes that
+//! is several times less work than a call of `memcpy` or a loop over bytes, here and on a
+//! Cortex-M.
+
+/// The longest run.
+pub(super) const MAX_RUN: usize = 32;
+
+/// Copies `from`, at most [`MAX_RUN`] bytes, into `to`, which has the same length.
+#[inline]
+pub(super) fn copy(to: &mut [u8], from: &[u8]) {
+    debug_assert!(to.len() == from.len() && from.len() <= MAX_RUN);
+    match from.len() {
+        16.. => both_ends::<16>(to, from),
+        8.. => both_ends::<8>(to, from),
+        4.. => both_ends::<4>(to, from),
+        2.. => both_ends::<2>(to, from),
+        _ => both_ends::<1>(to, from),
+    }
+}
+
+#[inline(always)]
+fn both_ends<const N: usize>(to: &mut [u8], from: &[u8]) {
+    if let (Some(&front), Some(&back)) = (from.first_chunk::<N>(), from.last_chunk::<N>()) {
+        if let Some(target) = to.first_chunk_mut() {
+            *target = front;
+        }
+        if let Some(target) = to.last_chunk_mut() {
+            *target = back;
+        }
+    }
+}
+
+/// Whether none of the binary32 numbers in `run`, at most [`MAX_RUN`] bytes, is infinite or not a
+/// number.
+#[inline]
+pub(super) fn all_finite(run: &[u8]) -> bool {
+    debug_assert!(run.len() <= MAX_RUN && run.len().is_multiple_of(4));
+    let marks = match run.len() {
+        16.. => marks_at_both_ends::<16>(run),
+        8.. => marks_at_both_ends::<8>(run),
+        _ => marks_at_both_ends::<4>(run),
+    };
+    marks & MARK == 0
+}
+
+#[inline(always)]
+fn marks_at_both_ends<const N: usize>(run: &[u8]) -> u32 {
+    match (run.first_chunk::<N>(), run.last_chunk::<N>()) {
+        (Some(front), Some(back)) => marks(front) | marks(back),
+        _ => 0,
+    }
+}
+
+#[inline(always)]
+fn marks(floats: &[u8]) -> u32 {
+    floats.as_chunks().0.iter().fold(0, |sum, &float| sum | marked(float))
+}
+
+/// Has the bit of [`MARK`] set if all bits of the number's exponent are.
+#[inline(always)]
+fn marked(float: [u8; 4]) -> u32 {
+    (u32::from_le_bytes(float) & EXPONENT).wrapping_add(EXPONENT_UNIT)
+}
+
+const EXPONENT: u32 = 0x7F80_0000;
+const EXPONENT_UNIT: u32 = 0x0080_0000;
+const MARK: u32 = 0x8000_0000;
+
+#[cfg(test)]
+mod tests {
+    use std::vec;
+    use std::vec::Vec;
+
+    use super::*;
+
+    #[test]
+    fn a_copy_of_any_length_is_whole_and_stays_inside() {
+        for len in 0..=MAX_RUN {
+            let from: Vec<u8> = (1..=len as u8).collect();
+            let mut to = vec![0xA5; len + 2];
+            copy(&mut to[1..=len], &from);
+            assert_eq!(to[1..=len], from);
+            assert_eq!((to[0], to[len + 1]), (0xA5, 0xA5));
+        }
+    }
+
+    #[test]
+    fn a_special_number_is_seen_wherever_it_stands() {
+        let ordinary = [0.0, -0.0, 1.5, -2.5, f32::MAX, f32::MIN, f32::MIN_POSITIVE, 1e-45];
+        let specials = [f32::INFINITY, f32::NEG_INFINITY, f32::NAN, -f32::NAN, f32::from_bits(0x7F80_0001)];
+        for count in 0..=MAX_RUN / 4 {
+            let floats: Vec<f32> = ordinary.into_iter().cycle().take(count).collect();
+            let bytes = |floats: &[f32]| -> Vec<u8> { floats.iter().flat_map(|f| f.to_le_bytes()).collect() };
+            assert!(all_finite(&bytes(&floats)), "{count} ordinary numbers");
+            for at in 0..count {
+                for special in specials {
+                    let mut floats = floats.clone();
+                    floats[at] = special;
+                    assert!(!all_finite(&bytes(&floats)), "{special} at {at} of {count}");
+                }
+            }
+        }
+    }
+}
