@@ -8,7 +8,7 @@ use proto_core::wire::state::OperationMode;
 
 use super::machine::Machine;
 use super::registers::SetError;
-use super::{Controller, ControllerOutput, mode, start_values};
+use super::{Controller, ControllerOutput, RecipeError, mode, start_values};
 use crate::config::InitialTarget;
 
 /// One of the controller's TCP servers.
@@ -161,6 +161,29 @@ impl Controller {
         // The tool's frame decides where the TCP is.
         self.arm_shown = None;
         Ok(())
+    }
+
+    /// Another recipe is assigned to a port at the teach pendant, by its index in
+    /// [`crate::config::SimConfig::recipes`]; `None` leaves the port idle.
+    ///
+    /// # Errors
+    /// [`RecipeError`] when the port cannot have it; nothing changed.
+    pub fn assign_recipe(
+        &mut self,
+        now: Instant,
+        port: usize,
+        recipe: Option<usize>,
+    ) -> Result<(), RecipeError> {
+        let epoch = self.epoch.unwrap_or(now);
+        let (Some(own), Some(place)) = (self.ports.get_mut(port), self.config.ports.get_mut(port)) else {
+            return Ok(());
+        };
+        let before = std::mem::replace(&mut place.recipe, recipe);
+        let result = own.assign(now, epoch, &self.config, &self.config.ports[port]);
+        if result.is_err() {
+            self.config.ports[port].recipe = before;
+        }
+        result
     }
 
     /// The key switch is turned.

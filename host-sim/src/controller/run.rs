@@ -260,7 +260,12 @@ impl Controller {
                     Ok(nth) => nth,
                     Err(message) => return Some(Answer::Error(message)),
                 };
-                match self.ports.get_mut(nth)?.send(*id, values) {
+                let port = self.ports.get_mut(nth)?;
+                if port.is_busy() {
+                    // What a program before this one has sent is still leaving.
+                    return None;
+                }
+                match port.send(*id, values) {
                     Ok(()) => self.begin_activity(Activity::Sending { port: nth }),
                     Err(message) => Some(Answer::Error(message)),
                 }

@@ -10,7 +10,7 @@ use proto_core::command::{CommandServer, Outcome, Reply, Request, ServerEvent, S
 use proto_core::modbus::adu::MAX_ADU;
 use proto_core::modbus::server::{RegisterBank, Server as ModbusServer};
 use proto_core::modbus::{Coils, Exception, Registers as Words};
-use proto_core::time::{Duration, Instant};
+use proto_core::time::Instant;
 use proto_core::wire::state::ProgramState;
 
 use super::faults::Link;
@@ -307,11 +307,13 @@ impl Controller {
             return;
         }
         counters.bytes_out += bytes.len() as u64;
-        let delay = self.faults.delay(link);
-        if delay == Duration::ZERO {
+        // An answer never overtakes an earlier one of its connection.
+        let earlier = self.server.delayed.iter().rev().find(|delayed| delayed.1 == conn);
+        let due = (now + self.faults.delay(link)).max(earlier.map_or(now, |delayed| delayed.0));
+        if due <= now && earlier.is_none() {
             self.outputs.push_back(ControllerOutput::Send { conn, bytes });
         } else if self.server.delayed.len() < MAX_DELAYED {
-            self.server.delayed.push_back((now + delay, conn, bytes));
+            self.server.delayed.push_back((due, conn, bytes));
         } else {
             counters.muted += 1;
         }

@@ -84,13 +84,7 @@ enum Transmitter {
 
 impl Port {
     pub(super) fn new(config: &SimConfig, port: &SimPort) -> Result<Self, RecipeError> {
-        let recipe = match port.recipe {
-            Some(index) => {
-                let recipe = config.recipes.get(index).ok_or(RecipeError::NoSuchRecipe)?;
-                Some((recipe.mode, Parts::new(recipe, &port.bus)?))
-            }
-            None => None,
-        };
+        let recipe = compile(config, port)?;
         let medium = match &port.bus {
             SimBus::Rs485(line) => {
                 // 3.5 characters of at most 12 bits, when that is the longer of the two (D19).
@@ -115,6 +109,24 @@ impl Port {
             inbox: VecDeque::new(),
             counters: PortCounters::default(),
         })
+    }
+
+    /// Gives the port the recipe that `port` has now. Partial frames, frames that wait for a
+    /// program and UDP clients belong to the old one (D24).
+    pub(super) fn assign(
+        &mut self,
+        now: Instant,
+        epoch: Instant,
+        config: &SimConfig,
+        port: &SimPort,
+    ) -> Result<(), RecipeError> {
+        self.recipe = compile(config, port)?;
+        self.inbox.clear();
+        if self.up {
+            self.went_down();
+            self.came_up(now, epoch);
+        }
+        Ok(())
     }
 
     pub(super) fn name(&self) -> &str {
@@ -422,6 +434,12 @@ impl Port {
             _ => Instant::ZERO,
         }
     }
+}
+
+fn compile(config: &SimConfig, port: &SimPort) -> Result<Option<(Mode, Parts)>, RecipeError> {
+    let Some(index) = port.recipe else { return Ok(None) };
+    let recipe = config.recipes.get(index).ok_or(RecipeError::NoSuchRecipe)?;
+    Ok(Some((recipe.mode, Parts::new(recipe, &port.bus)?)))
 }
 
 /// Whether a program is there that may want received frames.

@@ -33,6 +33,9 @@ pub(super) struct Link {
     weighed: AtomicU64,
     /// A call has returned since the variables were looked at.
     stale: AtomicBool,
+    /// The program must end, or the model is gone. Functions that cannot fail, such as `print`,
+    /// leave it to the next operation to end the script.
+    over: AtomicBool,
 }
 
 type Outcome<T> = Result<T, Box<EvalAltResult>>;
@@ -74,23 +77,37 @@ impl Link {
             operations_before: AtomicU64::new(0),
             weighed: AtomicU64::new(0),
             stale: AtomicBool::new(false),
+            over: AtomicBool::new(false),
         }
     }
 
     /// Hands control to the model until it answers.
     fn call(&self, call: Call) -> Outcome<Answer> {
-        self.events.send(Progress::Calling(call)).map_err(|_| terminated())?;
-        let answers = self.answers.lock().unwrap_or_else(PoisonError::into_inner);
-        let Stamped { now, answer } = answers.recv().map_err(|_| terminated())?;
+        if self.over.load(Relaxed) {
+            return Err(terminated());
+        }
+        let Some(Stamped { now, answer }) = self.exchange(call) else {
+            self.over.store(true, Relaxed);
+            return Err(terminated());
+        };
         if self.now.swap(now.as_micros(), Relaxed) != now.as_micros() {
             self.operations_before.store(self.operations.load(Relaxed), Relaxed);
         }
         self.stale.store(true, Relaxed);
         match answer {
-            Answer::Abort => Err(terminated()),
+            Answer::Abort => {
+                self.over.store(true, Relaxed);
+                Err(terminated())
+            }
             Answer::Error(message) => Err(message.into()),
             answer => Ok(answer),
         }
+    }
+
+    /// `None` when the model is gone.
+    fn exchange(&self, call: Call) -> Option<Stamped> {
+        self.events.send(Progress::Calling(call)).ok()?;
+        self.answers.lock().unwrap_or_else(PoisonError::into_inner).recv().ok()
     }
 
     /// Ends a script whose variables have grown too large. The interpreter's own limits are for
@@ -130,6 +147,9 @@ fn equip(mut engine: Engine, link: &Arc<Link>) -> Engine {
 
     let l = with();
     engine.on_progress(move |operations| {
+        if l.over.load(Relaxed) {
+            return Some(Dynamic::UNIT);
+        }
         l.operations.store(operations, Relaxed);
         let spent = operations.saturating_sub(l.operations_before.load(Relaxed));
         let token = || Dynamic::from(format!("more than {MAX_OPERATIONS} operations without waiting"));
@@ -220,7 +240,7 @@ fn equip(mut engine: Engine, link: &Arc<Link>) -> Engine {
     engine.register_fn("log", move |value: Dynamic| -> Outcome<()> {
         l.call(Call::Log(one_line(&value.to_string()))).map(|_| ())
     });
-    // `print` and `debug` cannot fail; a lost line is noticed at the next call.
+    // `print` and `debug` cannot fail: see `Link::over`.
     let l = with();
     engine.on_print(move |text| {
         let _ = l.call(Call::Log(one_line(text)));

@@ -162,6 +162,15 @@ fn an_abort_cannot_be_caught() {
 }
 
 #[test]
+fn an_abort_during_a_print_ends_the_script_too() {
+    let mut program = start("loop { print(\"x\"); }");
+    assert_eq!(call(&program), Call::Log("x".to_owned()));
+    program.answer(NOW, Answer::Abort);
+    assert_eq!(program.progress(), &Progress::Ended(End::Aborted));
+    drop(start("loop { print(\"x\"); }"));
+}
+
+#[test]
 fn a_dropped_program_leaves_no_thread() {
     let program = start("loop { try { wait_ms(10); } catch { } }");
     // Joins: a thread that does not end would hang the test.

@@ -74,7 +74,11 @@ fn delayed_answers_keep_their_order_and_die_with_their_connection() {
     cell.run_ms(100);
     assert_eq!(cell.take(c), b"1");
     assert_eq!(cell.take(d), b"");
+    assert_eq!(cell.ask(c, "state"), "");
     cell.controller.delay_answers(Link::Command, Duration::ZERO);
+    assert_eq!(cell.ask(c, "isprogfinish"), "", "it does not overtake");
+    cell.run_ms(250);
+    assert_eq!(cell.take(c), b"6:0:5:21");
     assert_eq!(cell.ask(c, "isprogfinish"), "1");
 }
 

@@ -1,5 +1,6 @@
 //! The whole controller in virtual time.
 
+mod any_order;
 mod commands;
 mod examples;
 mod faults;
@@ -22,6 +23,12 @@ use proto_core::wire::state::StatePacket;
 use super::*;
 use crate::config::{
     Initial, Power, SimBus, SimCanFrame, SimField, SimParts, SimPort, SimProgram, SimRecipe, SimStreamPart,
+};
+
+/// The shell may keep it in a task of any runtime.
+const _: fn() = || {
+    fn is_send<T: Send>() {}
+    is_send::<Controller>();
 };
 
 /// Something a port sent.

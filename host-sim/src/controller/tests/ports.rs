@@ -225,3 +225,38 @@ fn what_no_port_can_have_is_refused_with_its_name() {
     let error = Controller::new(&with_dialect(SimConfig::default(), "v9")).unwrap_err();
     assert_eq!(error.to_string(), "no dialect is called v9; there are v2.3, v2.6");
 }
+
+#[test]
+fn another_recipe_takes_over_at_once_and_forgets_the_old_ones_bytes() {
+    let mut config = system_port(SimBus::UdpServer);
+    config.recipes.push(stream_recipe(
+        Mode::Realtime,
+        system(&["BitInputReg[1]"]),
+        system(&["BitOutputReg[1]"]),
+    ));
+    config.recipes.push(stream_recipe(Mode::User, user(&[Byte]), user(&[Byte])));
+    config.ports.push(SimPort { name: "q".to_owned(), bus: rs485(), ..config.ports[0].clone() });
+    let mut cell = Cell::new(&config);
+    cell.input(ControllerInput::Udp2011 { peer: peer(1), bytes: &[] });
+    cell.port_bytes(1, &ON[..3]);
+    for port in [0, 1] {
+        cell.controller.assign_recipe(cell.now, port, Some(1)).unwrap();
+    }
+    cell.sent.clear();
+    cell.port_bytes(1, &ON[3..]);
+    cell.port_bytes(1, &ON);
+    assert_eq!((do1(&cell), value(&cell, "BitInputReg[1]")), (false, 1.0));
+    cell.run_ms(4);
+    let sent: Vec<_> = cell.sent.iter().map(|sent| (sent.1, sent.2.clone())).collect();
+    assert_eq!(sent, [(1, Out::Bytes(vec![0xFF, 0xFF, 0, 0xFE, 0xFE]))], "UDP clients have to ask again");
+    let refused = cell.controller.assign_recipe(cell.now, 0, Some(2));
+    assert_eq!(refused, Err(RecipeError::UserOnNetwork));
+    cell.input(ControllerInput::Udp2011 { peer: peer(1), bytes: &OFF });
+    assert_eq!(value(&cell, "BitInputReg[1]"), 0.0, "it still has the one before");
+    cell.controller.assign_recipe(cell.now, 1, None).unwrap();
+    cell.sent.clear();
+    cell.port_bytes(1, &ON);
+    cell.run_ms(8);
+    assert!(cell.sent.iter().all(|sent| sent.1 != 1));
+    assert_eq!(value(&cell, "BitInputReg[1]"), 0.0);
+}

@@ -289,3 +289,21 @@ fn a_program_is_the_same_however_often_the_model_is_called() {
     assert_eq!(run(false), run(true));
     assert_eq!(run(false), run(false));
 }
+
+#[test]
+fn a_new_program_waits_until_the_old_ones_frame_has_left() {
+    let (mut cell, c) = runs(user_port(), "comm_send(\"p\", [0, 1]);");
+    cell.line_time = Duration::from_millis(30);
+    cell.sent.clear();
+    cell.run_ms(30);
+    cell.ask(c, "run(t)");
+    assert_eq!(cell.sent.len(), 1);
+    cell.ask(c, "stop");
+    cell.run_ms(20);
+    assert_eq!(cell.ask(c, "run(t)"), "run start");
+    assert_eq!(cell.sent.len(), 1, "the line is still busy");
+    cell.run_ms(10);
+    assert_eq!(cell.sent.len(), 2);
+    cell.run_ms(30);
+    assert_eq!(cell.ask(c, "isprogfinish"), "1");
+}
