@@ -265,7 +265,10 @@ impl Run {
 fn finished(result: Result<(), shell::StartError>) -> ExitCode {
     match result {
         Ok(()) => ExitCode::SUCCESS,
-        Err(error) => wrong(error),
+        Err(error) => {
+            eprintln!("{error}");
+            ExitCode::from(error.exit_code())
+        }
     }
 }
 

@@ -5,10 +5,14 @@
 
 pub mod controller;
 pub mod gateway;
+mod host;
+mod link;
 
 use std::fmt;
 use std::path::PathBuf;
 use std::time::Duration;
+
+pub use host::Handle;
 
 use crate::bus::bind::Bind;
 
@@ -23,16 +27,28 @@ pub struct RunOptions {
     pub stats: Option<Duration>,
 }
 
-/// Why a run could not start: one message, nothing was left behind.
+/// Why a run could not start, or could not go on: one message, nothing was left behind.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct StartError {
     message: String,
+    had_started: bool,
 }
 
 impl StartError {
-    /// An error with this message.
+    /// The run could not start.
     pub fn new(message: impl Into<String>) -> Self {
-        Self { message: message.into() }
+        Self { message: message.into(), had_started: false }
+    }
+
+    /// The same, of a run that had started.
+    #[must_use]
+    pub fn after_start(self) -> Self {
+        Self { had_started: true, ..self }
+    }
+
+    /// 2 when nothing was started, 1 when the run failed later.
+    pub const fn exit_code(&self) -> u8 {
+        if self.had_started { 1 } else { 2 }
     }
 }
 

@@ -1,0 +1,208 @@
+//! What every shell needs around it: a thread with a runtime, a handle, and in the foreground the
+//! `ready` line, statistics and a clean end.
+
+use std::io::{self, Write};
+use std::path::Path;
+use std::sync::mpsc as blocking;
+use std::thread::JoinHandle;
+
+use serde_json::Value;
+use tokio::signal::unix::{SignalKind, signal};
+use tokio::sync::mpsc;
+use tokio::task::LocalSet;
+
+use super::{RunOptions, StartError};
+
+/// An engine is built by value, and unoptimised code copies it on the stack several times over.
+const STACK: usize = 16 << 20;
+
+/// Something that runs on one thread until it is dropped.
+pub(super) trait Shell {
+    /// What `ready` says: addresses and paths by name.
+    fn ready(&self) -> Value;
+    /// How to take one line of statistics while the shell runs.
+    fn stats(&self) -> impl Fn() -> Value + 'static;
+    /// Runs inside a [`LocalSet`]; ends by itself only when something is gone for good.
+    fn run(self) -> impl Future<Output = Result<(), StartError>>;
+}
+
+/// A shell that runs on a thread of its own. Dropping it ends the shell and waits until its sockets
+/// are closed and its links removed.
+#[derive(Debug)]
+pub struct Handle {
+    ready: Value,
+    requests: mpsc::UnboundedSender<Request>,
+    thread: Option<JoinHandle<Result<(), StartError>>>,
+}
+
+#[derive(Debug)]
+enum Request {
+    Stats(blocking::Sender<Value>),
+    Shutdown,
+}
+
+/// Opens a shell on a thread of its own and waits until everything listens.
+pub(super) fn start<S: Shell>(
+    name: &str,
+    open: impl AsyncFnOnce() -> Result<S, StartError> + Send + 'static,
+) -> Result<Handle, StartError> {
+    let (requests, inbox) = mpsc::unbounded_channel();
+    let (opened, outcome) = blocking::channel();
+    let thread = std::thread::Builder::new().name(name.to_owned()).stack_size(STACK).spawn(move || {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
+        let runtime = runtime.map_err(|error| StartError::new(format!("no runtime: {error}")))?;
+        let local = LocalSet::new();
+        local.block_on(&runtime, async move {
+            let shell = match open().await {
+                Ok(shell) => shell,
+                Err(error) => {
+                    let _ = opened.send(Err(error));
+                    return Ok(());
+                }
+            };
+            let stats = shell.stats();
+            let _ = opened.send(Ok(shell.ready()));
+            tokio::select! {
+                ended = shell.run() => ended.map_err(StartError::after_start),
+                () = serve(inbox, stats) => Ok(()),
+            }
+        })
+    });
+    let thread = thread.map_err(|error| StartError::new(format!("no thread: {error}")))?;
+    match outcome.recv() {
+        Ok(Ok(ready)) => Ok(Handle { ready, requests, thread: Some(thread) }),
+        Ok(Err(error)) => Err(error),
+        // The thread ended before it said anything: its result says why.
+        Err(_) => Err(joined(thread).err().unwrap_or_else(|| StartError::new(format!("{name} ended")))),
+    }
+}
+
+/// Answers requests until it is told to end.
+async fn serve(mut inbox: mpsc::UnboundedReceiver<Request>, stats: impl Fn() -> Value) {
+    while let Some(request) = inbox.recv().await {
+        match request {
+            Request::Stats(answer) => {
+                let _ = answer.send(stats());
+            }
+            Request::Shutdown => return,
+        }
+    }
+}
+
+impl Handle {
+    /// The actual addresses and paths.
+    pub fn ready(&self) -> &Value {
+        &self.ready
+    }
+
+    /// The address or path called `name` (`"command"`, `"ports/rs485"`); empty when there is none.
+    pub fn place(&self, name: &str) -> &str {
+        self.ready.pointer(&format!("/{name}")).and_then(Value::as_str).unwrap_or("")
+    }
+
+    /// One line of statistics; `None` when the shell has ended.
+    pub fn stats(&self) -> Option<Value> {
+        let (answer, stats) = blocking::channel();
+        self.requests.send(Request::Stats(answer)).ok()?;
+        stats.recv().ok()
+    }
+
+    /// Whether the shell has ended by itself.
+    pub fn has_ended(&self) -> bool {
+        self.thread.as_ref().is_none_or(JoinHandle::is_finished)
+    }
+
+    /// Ends the shell and waits for it.
+    ///
+    /// # Errors
+    /// What made it end by itself before.
+    pub fn shutdown(mut self) -> Result<(), StartError> {
+        self.end()
+    }
+
+    fn end(&mut self) -> Result<(), StartError> {
+        let _ = self.requests.send(Request::Shutdown);
+        self.thread.take().map_or(Ok(()), joined)
+    }
+}
+
+impl Drop for Handle {
+    fn drop(&mut self) {
+        let _ = self.end();
+    }
+}
+
+fn joined(thread: JoinHandle<Result<(), StartError>>) -> Result<(), StartError> {
+    thread.join().unwrap_or_else(|_| Err(StartError::new("a thread panicked").after_start()))
+}
+
+/// Says `ready`, prints statistics, and ends on Ctrl-C or SIGTERM.
+pub(super) fn foreground(handle: Handle, options: &RunOptions) -> Result<(), StartError> {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
+    let runtime = runtime.map_err(|error| StartError::new(format!("no runtime: {error}")))?;
+    runtime.block_on(async {
+        // Signals are caught before anybody can know that we are ready.
+        let refused = |error: io::Error| StartError::new(format!("signals: {error}"));
+        let mut interrupt = signal(SignalKind::interrupt()).map_err(refused)?;
+        let mut terminate = signal(SignalKind::terminate()).map_err(refused)?;
+        if let Some(path) = &options.ready {
+            write_ready(path, handle.ready())
+                .map_err(|error| StartError::new(format!("--ready {}: {error}", path.display())))?;
+        }
+        print_line(&format!("ready {}", handle.ready()));
+        let mut ticks = options.stats.map(tokio::time::interval);
+        let mut watch = tokio::time::interval(WATCH);
+        let result = loop {
+            tokio::select! {
+                _ = interrupt.recv() => break Ok(()),
+                _ = terminate.recv() => break Ok(()),
+                () = tick(&mut ticks) => {
+                    if let Some(stats) = handle.stats() {
+                        print_line(&stats.to_string());
+                    }
+                }
+                _ = watch.tick() => {
+                    if handle.has_ended() {
+                        break Ok(());
+                    }
+                }
+            }
+        };
+        let ended = handle.shutdown();
+        if let Some(path) = &options.ready {
+            let _ = std::fs::remove_file(path);
+        }
+        result.and(ended)
+    })
+}
+
+/// How often the foreground looks whether the shell still runs.
+const WATCH: std::time::Duration = std::time::Duration::from_millis(100);
+
+async fn tick(ticks: &mut Option<tokio::time::Interval>) {
+    match ticks {
+        Some(ticks) => {
+            ticks.tick().await;
+        }
+        None => std::future::pending().await,
+    }
+}
+
+/// A reader that had enough, such as `head`, is no failure of ours.
+fn print_line(line: &str) {
+    let mut out = io::stdout().lock();
+    let _ = writeln!(out, "{line}");
+    let _ = out.flush();
+}
+
+/// Whoever sees the file sees all of it.
+fn write_ready(path: &Path, ready: &Value) -> io::Result<()> {
+    let mut partial = path.as_os_str().to_owned();
+    partial.push(format!(".{}", std::process::id()));
+    let partial = Path::new(&partial);
+    if let Some(folder) = path.parent() {
+        std::fs::create_dir_all(folder)?;
+    }
+    std::fs::write(partial, format!("{ready}\n"))?;
+    std::fs::rename(partial, path)
+}

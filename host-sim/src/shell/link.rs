@@ -1,0 +1,296 @@
+//! One link of the gateway to the controller: opened, closed and fed as the engine says.
+//!
+//! A link is one task. It owns its socket, hands what arrives to the gateway and sends what is in
+//! its outbox; it knows no protocol and makes no decision. Supervision is the engine's: a link that
+//! fails says so once and waits to be opened again.
+
+use std::cell::{Cell, RefCell};
+use std::collections::VecDeque;
+use std::io;
+use std::net::SocketAddr;
+
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::{TcpListener, TcpStream, UdpSocket};
+use tokio::sync::Notify;
+use tracing::{debug, info};
+
+/// What a link connects to.
+#[derive(Debug)]
+pub(super) enum Endpoint {
+    /// The controller's TCP server.
+    Tcp { host: String, port: u16 },
+    /// The controller's UDP server.
+    Udp { host: String, port: u16 },
+    /// Where the controller's TCP client connects to.
+    TcpListen(TcpListener),
+    /// Where the controller's UDP client sends to.
+    UdpListen(UdpSocket),
+}
+
+/// What a link tells the gateway.
+#[derive(Debug)]
+pub(super) enum LinkEvent<'a> {
+    Up,
+    Down,
+    Bytes(&'a [u8]),
+    Sent,
+}
+
+/// The engine's side of a link: never waits.
+#[derive(Debug, Default)]
+pub(super) struct LinkControl {
+    /// Odd while the link is to be open; one more for each opening and closing.
+    turn: Cell<u64>,
+    outbox: RefCell<VecDeque<Vec<u8>>>,
+    changed: Notify,
+}
+
+/// One transmission is in flight at a time, so this is never reached by a living link.
+const MAX_QUEUED: usize = 8;
+
+impl LinkControl {
+    pub(super) fn open(&self) {
+        if self.turn.get().is_multiple_of(2) {
+            self.turn_over();
+        }
+    }
+
+    pub(super) fn close(&self) {
+        if !self.turn.get().is_multiple_of(2) {
+            self.turn_over();
+        }
+    }
+
+    pub(super) fn send(&self, bytes: &[u8]) {
+        let mut outbox = self.outbox.borrow_mut();
+        if outbox.len() < MAX_QUEUED {
+            outbox.push_back(bytes.to_vec());
+        }
+        self.changed.notify_one();
+    }
+
+    fn turn_over(&self) {
+        self.turn.set(self.turn.get() + 1);
+        self.outbox.borrow_mut().clear();
+        self.changed.notify_one();
+    }
+
+    /// Waits until the link is to be open; the turn it is.
+    async fn opened(&self) -> u64 {
+        loop {
+            let turn = self.turn.get();
+            if !turn.is_multiple_of(2) {
+                return turn;
+            }
+            self.changed.notified().await;
+        }
+    }
+
+    /// Waits until this turn is over. Eats notifications, so nothing else may wait for them.
+    async fn over(&self, turn: u64) {
+        while self.turn.get() == turn {
+            self.changed.notified().await;
+        }
+    }
+
+    /// The next transmission; `None` when this turn is over.
+    async fn next(&self, turn: u64) -> Option<Vec<u8>> {
+        loop {
+            if self.turn.get() != turn {
+                return None;
+            }
+            if let Some(bytes) = self.outbox.borrow_mut().pop_front() {
+                return Some(bytes);
+            }
+            self.changed.notified().await;
+        }
+    }
+}
+
+/// Drives the link until the future is dropped.
+pub(super) async fn run(
+    name: &str,
+    endpoint: &Endpoint,
+    control: &LinkControl,
+    mut events: impl FnMut(LinkEvent<'_>),
+) {
+    loop {
+        let turn = control.opened().await;
+        let result = match endpoint {
+            Endpoint::Tcp { host, port } => {
+                let connected = tokio::select! {
+                    connected = TcpStream::connect((host.as_str(), *port)) => connected,
+                    () = control.over(turn) => continue,
+                };
+                match connected {
+                    Ok(stream) => pump_tcp(name, stream, None, control, turn, &mut events).await,
+                    Err(error) => Err(error),
+                }
+            }
+            Endpoint::TcpListen(listener) => {
+                let accepted = tokio::select! {
+                    accepted = listener.accept() => accepted,
+                    () = control.over(turn) => continue,
+                };
+                match accepted {
+                    Ok((stream, peer)) => {
+                        info!(link = name, %peer, "the controller connected");
+                        pump_tcp(name, stream, Some(listener), control, turn, &mut events).await
+                    }
+                    Err(error) => Err(error),
+                }
+            }
+            Endpoint::Udp { host, port } => match connect_udp(host, *port).await {
+                Ok(socket) => {
+                    events(LinkEvent::Up);
+                    pump_udp(&socket, None, control, turn, &mut events).await
+                }
+                Err(error) => Err(error),
+            },
+            Endpoint::UdpListen(socket) => match first_datagram(socket, control, turn).await {
+                Some(Ok((peer, datagram))) => {
+                    info!(link = name, %peer, "the controller sends");
+                    events(LinkEvent::Up);
+                    events(LinkEvent::Bytes(&datagram));
+                    pump_udp(socket, Some(peer), control, turn, &mut events).await
+                }
+                Some(Err(error)) => Err(error),
+                None => continue,
+            },
+        };
+        // A turn that is over was ended by the engine: it expects no report.
+        if control.turn.get() == turn {
+            match result {
+                Ok(()) => info!(link = name, "closed by the controller"),
+                Err(error) => debug!(link = name, %error, "not connected"),
+            }
+            control.close();
+            events(LinkEvent::Down);
+        }
+    }
+}
+
+/// Moves bytes both ways until the peer closes, an error, or the turn is over.
+async fn pump_tcp(
+    name: &str,
+    stream: TcpStream,
+    listener: Option<&TcpListener>,
+    control: &LinkControl,
+    turn: u64,
+    events: &mut impl FnMut(LinkEvent<'_>),
+) -> io::Result<()> {
+    stream.set_nodelay(true)?;
+    events(LinkEvent::Up);
+    let (mut reader, mut writer) = stream.into_split();
+    let events = RefCell::new(events);
+    let reading = async {
+        let mut chunk = vec![0; 4096];
+        loop {
+            match reader.read(&mut chunk).await? {
+                0 => return Ok(()),
+                len if control.turn.get() == turn => {
+                    (events.borrow_mut())(LinkEvent::Bytes(&chunk[..len]));
+                }
+                _ => return Ok(()),
+            }
+        }
+    };
+    let writing = async {
+        while let Some(bytes) = control.next(turn).await {
+            writer.write_all(&bytes).await?;
+            if control.turn.get() == turn {
+                (events.borrow_mut())(LinkEvent::Sent);
+            }
+        }
+        Ok(())
+    };
+    tokio::select! {
+        done = reading => done,
+        done = writing => done,
+        () = refuse_others(name, listener) => Ok(()),
+    }
+}
+
+/// A second client of a listening link is turned away: one connection carries one recipe.
+async fn refuse_others(name: &str, listener: Option<&TcpListener>) {
+    let Some(listener) = listener else { return std::future::pending().await };
+    loop {
+        match listener.accept().await {
+            Ok((_, peer)) => info!(link = name, %peer, "refused: there is a connection already"),
+            // Out of descriptors, most likely: they come back when connections end.
+            Err(_) => tokio::time::sleep(std::time::Duration::from_millis(100)).await,
+        }
+    }
+}
+
+async fn connect_udp(host: &str, port: u16) -> io::Result<UdpSocket> {
+    let peer = tokio::net::lookup_host((host, port)).await?.next();
+    let peer = peer.ok_or_else(|| io::Error::new(io::ErrorKind::NotFound, "no such host"))?;
+    let any: SocketAddr = if peer.is_ipv4() { ([0, 0, 0, 0], 0).into() } else { ([0_u16; 8], 0).into() };
+    let socket = UdpSocket::bind(any).await?;
+    socket.connect(peer).await?;
+    Ok(socket)
+}
+
+async fn first_datagram(
+    socket: &UdpSocket,
+    control: &LinkControl,
+    turn: u64,
+) -> Option<io::Result<(SocketAddr, Vec<u8>)>> {
+    let mut datagram = vec![0; MAX_DATAGRAM];
+    tokio::select! {
+        received = socket.recv_from(&mut datagram) => Some(received.map(|(len, peer)| {
+            datagram.truncate(len);
+            (peer, datagram)
+        })),
+        () = control.over(turn) => None,
+    }
+}
+
+/// Moves datagrams both ways; of a listening socket, answers whoever sent last.
+async fn pump_udp(
+    socket: &UdpSocket,
+    peer: Option<SocketAddr>,
+    control: &LinkControl,
+    turn: u64,
+    events: &mut impl FnMut(LinkEvent<'_>),
+) -> io::Result<()> {
+    let peer = Cell::new(peer);
+    let events = RefCell::new(events);
+    let reading = async {
+        let mut datagram = vec![0; MAX_DATAGRAM];
+        loop {
+            let len = match peer.get() {
+                None => socket.recv(&mut datagram).await?,
+                Some(_) => {
+                    let (len, from) = socket.recv_from(&mut datagram).await?;
+                    peer.set(Some(from));
+                    len
+                }
+            };
+            if control.turn.get() != turn {
+                return Ok(());
+            }
+            (events.borrow_mut())(LinkEvent::Bytes(&datagram[..len]));
+        }
+    };
+    let writing = async {
+        while let Some(bytes) = control.next(turn).await {
+            match peer.get() {
+                None => socket.send(&bytes).await?,
+                Some(peer) => socket.send_to(&bytes, peer).await?,
+            };
+            if control.turn.get() == turn {
+                (events.borrow_mut())(LinkEvent::Sent);
+            }
+        }
+        Ok(())
+    };
+    tokio::select! {
+        done = reading => done,
+        done = writing => done,
+    }
+}
+
+/// Longer than any frame, so that a datagram that is too long is seen to be.
+const MAX_DATAGRAM: usize = 2048;
