@@ -5,6 +5,8 @@
 //! been checked until [`GatewayConfig::validate`] said so.
 
 mod budget;
+mod check_recipe;
+mod describe;
 mod error;
 mod validate;
 

@@ -1,6 +1,8 @@
 //! What a file cannot say but a stored or hand-made configuration can, and where each mistake is
 //! found. The messages for files are tested with the files.
 
+#[cfg(feature = "serde")]
+use proptest::prelude::*;
 use std::string::ToString;
 
 use super::*;
@@ -311,6 +313,57 @@ fn warnings_are_not_errors() {
     let said = config.describe_warning(expected[0]).to_string();
     assert!(said.contains("port \"port-0\"") && said.contains("10517 µs"), "{said}");
     assert_eq!(Builder::one_port().valid().warnings().count(), 0);
+}
+
+/// A field of each kind, on a stream port and behind a command table.
+#[cfg(feature = "serde")]
+fn every_kind() -> GatewayConfig {
+    let table = InputBinding::Commands { table: Span { start: 0, len: 1 }, when: CommandWhen::Frame };
+    let word = InputBinding::Variable { var: var("WordInputReg[1]"), scale: 2.0, offset: 1.0 };
+    let shown = OutputBinding::Variable { var: var("BitOutputReg[3]"), scale: 1.0, offset: 0.0 };
+    Builder::new()
+        .user(
+            &[user_input(table), user_input(word), user_input(InputBinding::Unused)],
+            &[constant(), FieldSpec::UserOutput { ty: ScalarType::Int, from: shown }],
+        )
+        .stream(&["ForceEnd[1]"], &["RobotState[26]"])
+        .rs485(0)
+        .link(1)
+        .stream(&["ForceEnd[1]"], &["RobotState[26]"])
+        .rs485(2)
+        .with(|config| {
+            config.commands.push(CommandEntry { value: 1, text: text("stop") }).unwrap();
+            config
+                .safe_values
+                .push(SafeValue { var: var("ForceEnd[1]"), value: Scalar::Float(0.0) })
+                .unwrap();
+            config.ports[1].on_timeout = Span { start: 0, len: 1 };
+            config.recipes[0].send = SendOn::Rising { var: var("BitOutputReg[3]"), bit: 7 };
+        })
+        .valid()
+}
+
+#[cfg(feature = "serde")]
+proptest! {
+    #[test]
+    fn a_damaged_stored_configuration_is_refused_or_usable(
+        damage in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 1..4),
+    ) {
+        let mut bytes = [0; 1024];
+        let len = postcard::to_slice(&every_kind(), &mut bytes).unwrap().len();
+        for (place, value) in damage {
+            bytes[place.index(len)] = value;
+        }
+        let Ok(config) = postcard::from_bytes::<GatewayConfig>(&bytes[..len]) else { return Ok(()) };
+        match config.validate() {
+            // What passes must not surprise anybody who runs on it.
+            Ok(()) => {
+                prop_assert!(config.warnings().count() < 1_000);
+                prop_assert!(crate::engine::Plan::new(&config).is_ok());
+            }
+            Err(error) => prop_assert!(!config.describe(error).to_string().is_empty()),
+        }
+    }
 }
 
 #[cfg(feature = "serde")]

@@ -45,10 +45,19 @@ impl fmt::Display for FileError {
             Source::Override { text } => write!(f, "--set {text}: ")?,
         }
         if !self.key.is_empty() {
-            write!(f, "{}: ", self.key)?;
+            write_line(f, &self.key)?;
+            f.write_str(": ")?;
         }
-        f.write_str(&self.message)
+        write_line(f, &self.message)
     }
 }
 
 impl std::error::Error for FileError {}
+
+/// One line stays one line, whatever a key or a value has in it.
+fn write_line(f: &mut fmt::Formatter<'_>, text: &str) -> fmt::Result {
+    for c in text.chars() {
+        if c.is_control() { write!(f, "{}", c.escape_default())? } else { write!(f, "{c}")? }
+    }
+    Ok(())
+}

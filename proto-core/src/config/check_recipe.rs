@@ -1,0 +1,179 @@
+//! The checks that concern one recipe alone: its parts, what its user fields do, what sends it.
+
+use super::error::{ConfigErrorKind as Kind, Place, RecipeKey};
+use super::validate::{Check, check_name, check_pool, fail, is_marked, mark};
+use super::{FieldSpec, GatewayConfig, InputBinding, OutputBinding, Recipe, SendOn, Span};
+use crate::command::Request;
+use crate::recipe::PartError;
+use crate::recipe::model::{Framing, Mode};
+use crate::sysvar::{COUNT, Direction};
+use crate::wire::scalar::{Scalar, ScalarType};
+
+/// One recipe under check.
+pub(super) struct RecipeCheck<'a> {
+    config: &'a GatewayConfig,
+    index: u8,
+    recipe: &'a Recipe,
+}
+
+impl<'a> RecipeCheck<'a> {
+    pub(super) fn new(config: &'a GatewayConfig, index: u8, recipe: &'a Recipe) -> Self {
+        Self { config, index, recipe }
+    }
+
+    pub(super) fn check(&self) -> Check {
+        let names = self.config.recipes.iter().map(|recipe| &recipe.name);
+        check_name(self.at(RecipeKey::Name), &self.recipe.name, self.index, names)?;
+        if !self.recipe.has(Direction::Input) && !self.recipe.has(Direction::Output) {
+            return fail(self.at(RecipeKey::Whole), Kind::NoParts);
+        }
+        // UDP asks for the least of a stream, and takes no user-defined recipes (D16).
+        let framing = if self.recipe.mode == Mode::User { Framing::Bytes } else { Framing::Datagram };
+        for part in [Direction::Input, Direction::Output] {
+            for (frame, span) in self.recipe.frames(part) {
+                let place = Place::Frame { recipe: self.index, part, frame };
+                check_pool(place, span, self.config.fields.len())?;
+            }
+            if let Err(error) = self.config.check_layout(self.recipe, part, framing) {
+                return fail(self.place_of(part, error), Kind::Part(error));
+            }
+            for (frame, field, spec) in self.config.fields_of(self.recipe, part) {
+                let place = Place::Field { recipe: self.index, part, frame, field };
+                self.check_field(place, part, spec)?;
+            }
+        }
+        if self.recipe.mode == Mode::User {
+            self.check_written_once()?;
+        }
+        self.check_send()
+    }
+
+    fn at(&self, key: RecipeKey) -> Place {
+        Place::Recipe { recipe: self.index, key }
+    }
+
+    fn place_of(&self, part: Direction, error: PartError) -> Place {
+        let recipe = self.index;
+        match (error.field(), error.frame()) {
+            (Some(at), _) => Place::Field { recipe, part, frame: at.frame.unwrap_or(0), field: at.field },
+            (None, Some(frame)) => Place::Frame { recipe, part, frame },
+            (None, None) => Place::Part { recipe, part },
+        }
+    }
+
+    fn check_field(&self, place: Place, part: Direction, spec: &FieldSpec) -> Check {
+        match (self.recipe.mode, part, *spec) {
+            (Mode::Realtime, _, FieldSpec::System(_)) => Ok(()),
+            (Mode::User, Direction::Input, FieldSpec::UserInput { ty, to }) => {
+                self.check_input(place, ty, to)
+            }
+            (Mode::User, Direction::Output, FieldSpec::UserOutput { ty, from }) => {
+                check_output(place, ty, from)
+            }
+            (mode, part, _) => fail(place, Kind::WrongField { mode, part }),
+        }
+    }
+
+    fn check_input(&self, place: Place, ty: ScalarType, to: InputBinding) -> Check {
+        match to {
+            InputBinding::Unused => Ok(()),
+            InputBinding::Variable { var, scale, offset } => {
+                if var.direction() != Direction::Input {
+                    return fail(place, Kind::NotAnInput { var });
+                }
+                check_scale(place, scale, offset)
+            }
+            InputBinding::Commands { table, .. } => {
+                if matches!(ty, ScalarType::Float | ScalarType::Double) {
+                    return fail(place, Kind::NeedsInteger { ty });
+                }
+                self.check_commands(place, ty, table)
+            }
+        }
+    }
+
+    fn check_commands(&self, place: Place, ty: ScalarType, table: Span) -> Check {
+        let commands = &self.config.commands;
+        check_pool(place, table, commands.len())?;
+        if table.len == 0 {
+            return fail(place, Kind::EmptyTable);
+        }
+        let entries = || (table.start..).zip(table.of(commands));
+        for (entry, command) in entries() {
+            let place = Place::Command { entry };
+            if let Err(error) = Request::parse_strict(command.text.as_bytes()) {
+                return fail(place, Kind::Command(error));
+            }
+            let (low, high) = ty.range();
+            if !(low..=high).contains(&(command.value as f64)) {
+                return fail(place, Kind::CommandValue { value: command.value, ty });
+            }
+            if entries().any(|(other, before)| other < entry && before.value == command.value) {
+                return fail(place, Kind::DuplicateCommand { value: command.value });
+            }
+        }
+        Ok(())
+    }
+
+    /// In a realtime recipe the layout sees to this.
+    fn check_written_once(&self) -> Check {
+        let mut seen = [false; COUNT];
+        for (frame, field, spec) in self.config.fields_of(self.recipe, Direction::Input) {
+            let Some(var) = spec.variable() else { continue };
+            if is_marked(&seen, var) {
+                let place = Place::Field { recipe: self.index, part: Direction::Input, frame, field };
+                return fail(place, Kind::WrittenTwice { var });
+            }
+            mark(&mut seen, var);
+        }
+        Ok(())
+    }
+
+    fn check_send(&self) -> Check {
+        let place = self.at(RecipeKey::Send);
+        let recipe = self.recipe;
+        if recipe.send == SendOn::Period {
+            return Ok(());
+        }
+        if recipe.mode == Mode::Realtime {
+            return fail(place, Kind::RealtimeSendsByPeriod);
+        }
+        if !recipe.has(Direction::Output) {
+            return fail(place, Kind::NothingToSend);
+        }
+        match recipe.send {
+            SendOn::Period | SendOn::Change => Ok(()),
+            SendOn::Frame if recipe.has(Direction::Input) => Ok(()),
+            SendOn::Frame => fail(place, Kind::NoInputToAnswer),
+            SendOn::Rising { var, bit } => {
+                if !var.is_bits() {
+                    return fail(place, Kind::NotBits { var });
+                }
+                let is_there = 1_u8.checked_shl(bit.into()).is_some_and(|mask| var.valid_bits() & mask != 0);
+                if is_there { Ok(()) } else { fail(place, Kind::NoSuchBit { var, bit }) }
+            }
+        }
+    }
+}
+
+fn check_scale(place: Place, scale: f32, offset: f32) -> Check {
+    if scale.is_finite() && scale != 0.0 && offset.is_finite() {
+        Ok(())
+    } else {
+        fail(place, Kind::BadScale { scale, offset })
+    }
+}
+
+fn check_output(place: Place, ty: ScalarType, from: OutputBinding) -> Check {
+    match from {
+        OutputBinding::Variable { scale, offset, .. } => check_scale(place, scale, offset),
+        OutputBinding::Constant(value) => match Scalar::from_f64(ty, value) {
+            Ok(_) => Ok(()),
+            Err(error) => fail(place, Kind::Constant(error)),
+        },
+        OutputBinding::Counter if matches!(ty, ScalarType::Float | ScalarType::Double) => {
+            fail(place, Kind::NeedsInteger { ty })
+        }
+        OutputBinding::Counter | OutputBinding::Reply => Ok(()),
+    }
+}

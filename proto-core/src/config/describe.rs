@@ -1,0 +1,279 @@
+//! What is wrong with a configuration, in words.
+//!
+//! In: an error, and the configuration where it is at hand. Out: one sentence that says what is
+//! wrong and what is allowed. Recipes and ports are named, or counted from 1.
+
+use core::fmt;
+
+use super::error::{ConfigError, ConfigErrorKind, ControllerKey, Place, PortKey, RecipeKey};
+use super::{GatewayConfig, Name};
+use crate::recipe::model::Mode;
+use crate::sysvar::Direction;
+use crate::wire::dialect::Dialect;
+
+impl core::error::Error for ConfigError {}
+
+impl fmt::Display for ConfigError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        Described { config: None, error: *self }.fmt(f)
+    }
+}
+
+impl fmt::Display for ConfigErrorKind {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        DescribedKind { config: None, kind: *self }.fmt(f)
+    }
+}
+
+impl GatewayConfig {
+    /// `error` with the names of its recipes and ports.
+    pub fn describe(&self, error: ConfigError) -> impl fmt::Display + '_ {
+        Described { config: Some(self), error }
+    }
+
+    /// What is wrong, with the names of recipes and ports and without the place.
+    pub fn describe_kind(&self, kind: ConfigErrorKind) -> impl fmt::Display + '_ {
+        DescribedKind { config: Some(self), kind }
+    }
+}
+
+struct Described<'a> {
+    config: Option<&'a GatewayConfig>,
+    error: ConfigError,
+}
+
+impl fmt::Display for Described<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { config, error } = self;
+        match error.place {
+            Place::Controller(key) => write!(f, "controller, {}", key.name())?,
+            Place::Recipe { recipe, key } => {
+                RecipeName(*config, recipe).fmt(f)?;
+                f.write_str(match key {
+                    RecipeKey::Whole => "",
+                    RecipeKey::Name => ", name",
+                    RecipeKey::Send => ", send",
+                })?;
+            }
+            Place::Part { recipe, part } => {
+                write!(f, "{}, {}", RecipeName(*config, recipe), part_name(part))?
+            }
+            Place::Frame { recipe, part, frame } => {
+                write!(
+                    f,
+                    "{}, {}, frame {}",
+                    RecipeName(*config, recipe),
+                    part_name(part),
+                    one_based(frame)
+                )?;
+            }
+            Place::Field { recipe, part, frame, field } => {
+                write!(f, "{}, {}, ", RecipeName(*config, recipe), part_name(part))?;
+                if frame != 0 {
+                    write!(f, "frame {}, ", one_based(frame))?;
+                }
+                write!(f, "field {}", one_based(field))?;
+            }
+            Place::Command { entry } => write!(f, "command {}", u32::from(entry).saturating_add(1))?,
+            Place::Port { port, key } => write!(f, "{}, {}", PortName(*config, port), key.name())?,
+            Place::SafeValue { entry } => write!(f, "safe value {}", u32::from(entry).saturating_add(1))?,
+        }
+        write!(f, ": {}", DescribedKind { config: *config, kind: error.kind })
+    }
+}
+
+impl ControllerKey {
+    fn name(self) -> &'static str {
+        match self {
+            Self::Dialect => "dialect",
+            Self::Ports => "ports",
+            Self::RecipeLink => "recipe link",
+        }
+    }
+}
+
+impl PortKey {
+    fn name(self) -> &'static str {
+        match self {
+            Self::Name => "name",
+            Self::Recipe => "recipe",
+            Self::Cycle => "cycle",
+            Self::Timeout => "timeout",
+            Self::OnTimeout => "safe values",
+            Self::StaleAfter => "stale after",
+            Self::Baud => "baud",
+            Self::StopBits => "stop bits",
+            Self::IdleGap => "idle gap",
+            Self::Turnaround => "turnaround",
+            Self::Bitrate => "bitrate",
+            Self::Listen => "listen",
+        }
+    }
+}
+
+fn part_name(part: Direction) -> &'static str {
+    match part {
+        Direction::Input => "input part",
+        Direction::Output => "output part",
+    }
+}
+
+fn one_based(index: u8) -> u16 {
+    u16::from(index).saturating_add(1)
+}
+
+struct RecipeName<'a>(Option<&'a GatewayConfig>, u8);
+
+impl fmt::Display for RecipeName<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let recipe = self.0.and_then(|config| config.recipes.get(usize::from(self.1)));
+        named(f, "recipe", recipe.map(|recipe| &recipe.name), self.1)
+    }
+}
+
+struct PortName<'a>(Option<&'a GatewayConfig>, u8);
+
+impl fmt::Display for PortName<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let port = self.0.and_then(|config| config.ports.get(usize::from(self.1)));
+        named(f, "port", port.map(|port| &port.name), self.1)
+    }
+}
+
+fn named(f: &mut fmt::Formatter<'_>, what: &str, name: Option<&Name>, index: u8) -> fmt::Result {
+    match name {
+        Some(name) if !name.is_empty() => write!(f, "{what} {name:?}"),
+        _ => write!(f, "{what} {}", one_based(index)),
+    }
+}
+
+struct DescribedKind<'a> {
+    config: Option<&'a GatewayConfig>,
+    kind: ConfigErrorKind,
+}
+
+impl fmt::Display for DescribedKind<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        use ConfigErrorKind as Kind;
+        let recipe_name = |recipe| RecipeName(self.config, recipe);
+        let port_name = |port| PortName(self.config, port);
+        match self.kind {
+            Kind::UnknownDialect => {
+                f.write_str("no such dialect; there are")?;
+                for (nth, name) in Dialect::NAMES.iter().enumerate() {
+                    write!(f, "{} {name:?}", if nth == 0 { "" } else { "," })?;
+                }
+                Ok(())
+            }
+            Kind::ZeroPort => f.write_str("0 is no port of the controller; 1..=65535"),
+            Kind::NoSuchRecipe { recipe, recipes } => {
+                write!(f, "there is no recipe {}; there are {recipes}", one_based(recipe))
+            }
+            Kind::OutsidePool { end, len } => {
+                write!(f, "a range ends at {end}, but there are only {len} entries")
+            }
+            Kind::EmptyName => f.write_str("a name is needed"),
+            Kind::DuplicateName { other } => {
+                write!(f, "number {} has this name already; names must differ", one_based(other))
+            }
+            Kind::NoParts => f.write_str("a recipe needs an input part, an output part, or both"),
+            Kind::WrongField { mode: Mode::Realtime, .. } => {
+                f.write_str("fields of a realtime recipe are system variables")
+            }
+            Kind::WrongField { mode: Mode::User, part } => {
+                write!(f, "the {} of a user recipe takes user fields with its own bindings", part_name(part))
+            }
+            Kind::RealtimeSendsByPeriod => {
+                f.write_str("a realtime recipe is sent by period; other triggers need mode = \"user\"")
+            }
+            Kind::NothingToSend => f.write_str("the recipe has no output part to send"),
+            Kind::NoInputToAnswer => {
+                f.write_str("sent with each input frame, but the recipe has no input part")
+            }
+            Kind::BadScale { scale, offset } => write!(
+                f,
+                "scale {scale} and offset {offset} must be finite numbers, and scale not 0: the value would be lost"
+            ),
+            Kind::Constant(error) => error.fmt(f),
+            Kind::NeedsInteger { ty } => write!(
+                f,
+                "needs an integer field (byte, char, word, short, dword, int), and this one is a {ty}"
+            ),
+            Kind::EmptyTable => f.write_str("a command table needs at least one command"),
+            Kind::CommandValue { value, ty } => {
+                let (low, high) = ty.range();
+                write!(f, "a {ty} is never {value}, only {low}..={high}")
+            }
+            Kind::DuplicateCommand { value } => write!(f, "{value} picks a command before this one already"),
+            Kind::Command(error) => error.fmt(f),
+            Kind::Part(error) => error.fmt(f),
+            Kind::Framing { recipe, error } => write!(f, "{} does not fit: {error}", recipe_name(recipe)),
+            Kind::NotAnInput { var } => write!(
+                f,
+                "{var} is shown by the robot and cannot be written; inputs are DigitalOutputCommand, BitInputReg, \
+                 WordInputReg, FloatInputReg, ForceEnd, ForceBase"
+            ),
+            Kind::WrittenTwice { var } => {
+                write!(f, "{var} is written by another field of this recipe already")
+            }
+            Kind::NotBits { var } => {
+                write!(f, "{var} is a {}, and a trigger needs one of the variables made of bits", var.ty())
+            }
+            Kind::NoSuchBit { var, bit } => {
+                let bits = var.valid_bits().count_ones();
+                write!(f, "{var} has no bit {bit}, only 0..={}", bits.saturating_sub(1))
+            }
+            Kind::BaudOutOfRange { baud } => write!(f, "{baud} baud is out of range; 1200..=4000000"),
+            Kind::StopBits { stop_bits } => write!(f, "{stop_bits} stop bits; 1 or 2"),
+            Kind::BitrateOutOfRange { bitrate } => {
+                write!(f, "{bitrate} bit/s is out of range; 10000..=1000000")
+            }
+            Kind::CycleTooShort { cycle } => write!(f, "a cycle of {cycle} is too short; at least 4 ms"),
+            Kind::ZeroTime => f.write_str("must be longer than 0"),
+            Kind::TimeTooLong { time, longest } => write!(f, "{time} is too long; at most {longest}"),
+            Kind::NeedsStreamRecipe { recipe } => {
+                write!(f, "{} is a CAN recipe, and only CAN ports take those", recipe_name(recipe))
+            }
+            Kind::NeedsCanRecipe { recipe } => {
+                write!(f, "{} is a stream recipe, and a CAN port takes CAN recipes only", recipe_name(recipe))
+            }
+            Kind::NeedsRealtimeRecipe { recipe } => write!(
+                f,
+                "{} is user-defined, and the controller's TCP and UDP ports take realtime recipes only",
+                recipe_name(recipe)
+            ),
+            Kind::ListenAddress => f.write_str(
+                "not an address to listen on; an IP address and a port, such as \"0.0.0.0:50000\"",
+            ),
+            Kind::ListenTwice { other } => write!(f, "{} listens here already", port_name(other)),
+            Kind::OwnedTwice { var, other } => write!(
+                f,
+                "this port writes {var}, and so does {}; a variable has one owner",
+                port_name(other)
+            ),
+            Kind::NoWayUp { var, port } => write!(
+                f,
+                "{} writes {var}, which only the controller's own recipe ports can carry; add it to the input of \
+                 the recipe of controller.recipe_link or of a tcp-listen or udp-listen port",
+                port_name(port)
+            ),
+            Kind::NoSource { var, port } => write!(
+                f,
+                "{} sends {var}, which only the controller's own recipe ports show; add it to the output of the \
+                 recipe of controller.recipe_link or of a tcp-listen or udp-listen port",
+                port_name(port)
+            ),
+            Kind::Unowned { var } => write!(
+                f,
+                "{var} goes to the controller with this recipe, but no port writes it and it cannot be read back, so \
+                 its value would be made up; let a port write it, or take it out here and on the controller"
+            ),
+            Kind::NotOwned { var } => write!(f, "this port does not write {var}"),
+            Kind::SafeType { var, ty } => write!(f, "{var} is a {}, and its safe value a {ty}", var.ty()),
+            Kind::SafeValue { var } => {
+                write!(f, "the value does not fit {var}: not finite, or reserved bits are set")
+            }
+            Kind::SafeTwice { var } => write!(f, "{var} has a safe value already"),
+        }
+    }
+}
