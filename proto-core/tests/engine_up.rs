@@ -330,6 +330,29 @@ fn a_port_that_falls_silent_on_hold_gives_its_variable_back() {
 }
 
 #[test]
+fn what_a_silent_owner_sent_last_does_not_pass_for_read_back() {
+    let mut cell = Cell::new();
+    let up = cell.stream(&["DigitalOutputCommand[1..2]"], &[]);
+    cell.recipe_link(up);
+    let first = cell.stream(&["DigitalOutputCommand[1]"], &[]);
+    let second = cell.stream(&["DigitalOutputCommand[2]"], &[]);
+    let (a, b) = (cell.rs485(first), cell.rs485(second));
+    let mut rig = cell.rig();
+    rig.run(MS(10));
+    rig.bytes(a, ON);
+    rig.run(MS(50));
+    // The packet is recent, but DO1..8 were a's when it came.
+    rig.link_bytes(LinkId::STATE, &state_packet(0, 0.0, 0xA5));
+    rig.run(MS(51));
+    rig.sent_on(LinkId::RECIPE_UDP);
+    rig.bytes(b, OFF);
+    assert!(rig.sent_on(LinkId::RECIPE_UDP).is_empty());
+    assert_eq!((rig.counters(a).withheld, rig.counters(b).withheld), (1, 1));
+    rig.link_bytes(LinkId::STATE, &state_packet(0, 0.0, 0x5A));
+    assert_eq!(rig.sent_on(LinkId::RECIPE_UDP), [vec![255, 255, 0x5A, 0, 238, 238]]);
+}
+
+#[test]
 fn edges_wait_for_a_transport_that_is_busy() {
     let (mut rig, port) = {
         let mut cell = Cell::new();

@@ -89,7 +89,9 @@ impl Uplink {
     pub(super) fn bytes<const PORTS: usize>(&mut self, bytes: &[u8], store: &mut Store<PORTS>, now: Instant) {
         add(&mut self.counters.bytes_in, bytes.len());
         self.supervisor.heard(now);
-        let (Some(layout), Some(group)) = (&self.output, self.group) else { return };
+        let (Some(layout), Some(group)) = (&self.output, self.group) else {
+            return bump(&mut self.counters.malformed);
+        };
         let mut fresh = false;
         let mut take = |payload: &[u8]| {
             let applied = layout.apply(payload, store.image.bytes_mut()).is_ok();

@@ -235,6 +235,8 @@ pub struct Rig {
     server: Server,
     /// Links that come up as soon as they are opened.
     pub reachable: BTreeSet<u8>,
+    /// Links of which nothing is heard when they are opened.
+    pub unanswered: BTreeSet<u8>,
     /// Whether Modbus requests are answered at once.
     pub modbus_answers: bool,
     /// Whether ports and links report at once that everything was sent.
@@ -254,6 +256,7 @@ impl Rig {
             map,
             server: Server::new(),
             reachable: (0..16).collect(),
+            unanswered: BTreeSet::new(),
             modbus_answers: true,
             reports_sent: true,
             log: Vec::new(),
@@ -361,6 +364,7 @@ impl Rig {
 
     fn react(&mut self, out: Out) {
         match out {
+            Out::Open(link) if self.unanswered.contains(&link.0) => {}
             Out::Open(link) if self.reachable.contains(&link.0) => {
                 self.engine.handle(self.now, Input::LinkUp { link });
             }
