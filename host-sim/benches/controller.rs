@@ -51,7 +51,9 @@ fn drain(controller: &mut Controller, now: Instant) -> usize {
     let mut sent = 0;
     loop {
         match controller.poll_output(now) {
-            ControllerOutput::Send { bytes, .. } | ControllerOutput::UdpSend { bytes, .. } => sent += bytes.len(),
+            ControllerOutput::Send { bytes, .. } | ControllerOutput::UdpSend { bytes, .. } => {
+                sent += bytes.len()
+            }
             ControllerOutput::StatePacket { bytes } => sent += bytes.len(),
             ControllerOutput::Sleep { .. } => return sent,
             _ => {}
