@@ -15,8 +15,10 @@ use workload::{Can, Encode, FRAMES, Stream};
 fn main() -> ExitCode {
     let work = |name, run| Work { name, limit: None, run };
     let works = [
-        work("stream decode", |n| repeat(n, Stream::new(), Stream::decode)),
-        work("stream decode, bare", |n| repeat(n, Stream::new(), Stream::decode_bare)),
+        work("stream decode", |n| repeat(n, Stream::frames(), Stream::decode)),
+        work("stream decode, bare", |n| repeat(n, Stream::frames(), Stream::decode_bare)),
+        work("stream decode, 28 bytes of noise", |n| repeat(n, Stream::noise(), Stream::decode)),
+        work("stream decode, 28 bytes of heads", |n| repeat(n, Stream::heads(), Stream::decode)),
         work("stream encode", |n| repeat(n, Encode::new(), Encode::encode)),
         work("stream encode, bare", |n| repeat(n, Encode::new(), Encode::encode_bare)),
         work("CAN decode", |n| repeat(n, Can::new(), Can::decode)),
@@ -46,13 +48,13 @@ mod stream_decode {
 
     #[divan::bench]
     fn layout(bencher: Bencher<'_, '_>) {
-        let mut work = Stream::new();
+        let mut work = Stream::frames();
         bencher.counter(ItemsCount::new(FRAMES)).bench_local(|| work.decode());
     }
 
     #[divan::bench]
     fn bare(bencher: Bencher<'_, '_>) {
-        let mut work = Stream::new();
+        let mut work = Stream::frames();
         bencher.counter(ItemsCount::new(FRAMES)).bench_local(|| work.decode_bare());
     }
 }

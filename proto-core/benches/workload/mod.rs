@@ -18,6 +18,8 @@ const POSE_PLACE: usize = 289;
 /// Frames in one pass over a workload.
 pub(crate) const FRAMES: usize = 1000;
 
+const SEED: u64 = 0x9E37_79B9_7F4A_7C15;
+
 /// Numbers that look random and are the same in every run.
 struct Random(u64);
 
@@ -38,7 +40,7 @@ fn image_offset(name: &str) -> usize {
     SysVar::parse(name).unwrap().image_offset()
 }
 
-/// A line that carries pose frames with 1 % garbage between them, cut into chunks of 1..=64 bytes.
+/// A line in chunks of 1..=64 bytes, and what reads pose frames from it.
 pub(crate) struct Stream {
     line: Vec<u8>,
     chunks: Vec<usize>,
@@ -49,8 +51,9 @@ pub(crate) struct Stream {
 }
 
 impl Stream {
-    pub(crate) fn new() -> Self {
-        let mut random = Random(0x9E37_79B9_7F4A_7C15);
+    /// Pose frames with 1 % garbage between them.
+    pub(crate) fn frames() -> Self {
+        let mut random = Random(SEED);
         let mut line = Vec::new();
         for _ in 0..FRAMES {
             line.extend(HEAD);
@@ -64,6 +67,22 @@ impl Stream {
                 }
             }
         }
+        Self::carrying(line, random).check()
+    }
+
+    /// As many bytes without a frame.
+    pub(crate) fn noise() -> Self {
+        let mut random = Random(SEED);
+        let line = (0..FRAMES * FRAME).map(|_| random.below(256) as u8).collect();
+        Self::carrying(line, random)
+    }
+
+    /// As many bytes each of which begins a head that has no tail.
+    pub(crate) fn heads() -> Self {
+        Self::carrying(vec![HEAD[0]; FRAMES * FRAME], Random(SEED))
+    }
+
+    fn carrying(line: Vec<u8>, mut random: Random) -> Self {
         let mut chunks = Vec::new();
         let mut left = line.len();
         while left > 0 {
@@ -73,15 +92,14 @@ impl Stream {
         }
         let rules = Rules { mode: Mode::Realtime, direction: Direction::Output };
         let layout = StreamLayout::new(rules, &HEAD, &TAIL, system(POSE), Framing::Bytes).unwrap();
-        let stream = Self {
+        Self {
             line,
             chunks,
             layout,
             deframer: Deframer::new(),
             bare: BareDeframer { held: [0; FRAME], len: 0 },
             image: [0; IMAGE_BYTES],
-        };
-        stream.check()
+        }
     }
 
     /// Both ways must have found every frame and the same last values.
@@ -254,7 +272,7 @@ impl Can {
         });
         let rules = Rules { mode: Mode::Realtime, direction: Direction::Output };
         let layout = CanLayout::new(rules, part).unwrap();
-        let mut random = Random(0x9E37_79B9_7F4A_7C15);
+        let mut random = Random(SEED);
         let frames = (0..FRAMES).map(|_| {
             let value = (random.below(1000) as f32).to_le_bytes();
             let data = [value, value].concat();

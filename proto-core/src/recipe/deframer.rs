@@ -184,33 +184,51 @@ impl Deframer {
         held
     }
 
-    /// The same, whatever is held and whatever comes.
+    /// The same, whatever is held and whatever comes. Nothing of the chunk is taken before it is
+    /// known what for.
     #[inline(never)]
     fn complete_carefully(&mut self, layout: &StreamLayout, chunk: &mut &[u8]) -> Held {
-        loop {
-            let held = self.pending();
-            // Nothing is missing only when the layout was changed without a discard.
-            let Some(missing) = layout.frame_len().checked_sub(held).filter(|&missing| missing > 0) else {
-                self.discard();
-                return Held::Nothing;
-            };
-            let (more, after) = chunk.split_at_checked(missing).unwrap_or((chunk, &[]));
-            self.append(more);
-            *chunk = after;
-            if self.head_goes_on(layout, held) {
-                if more.len() < missing {
+        let tail_at = layout.frame_len().saturating_sub(layout.tail().len());
+        // No frame is held, unless the layout was changed without a discard.
+        if self.pending() >= layout.frame_len() {
+            self.discard();
+        }
+        while self.len != 0 {
+            let missing = layout.frame_len().saturating_sub(self.pending());
+            if self.agrees(chunk, 0, layout.head()) {
+                let Some((more, after)) = chunk.split_at_checked(missing) else {
+                    self.append(chunk);
+                    *chunk = &[];
                     return Held::Partial;
-                }
-                if self.tail_agrees(layout) {
+                };
+                if self.agrees(chunk, tail_at, layout.tail()) {
+                    self.append(more);
+                    *chunk = after;
                     self.settle(layout);
                     return Held::Frame;
                 }
                 self.stats.tail_mismatches = self.stats.tail_mismatches.wrapping_add(1);
             }
-            if !self.next_candidate(layout) {
-                return Held::Nothing;
-            }
+            self.skip(1);
+            self.len = self.len.wrapping_sub(1);
+            self.start = (usize::from(self.start).wrapping_add(1) & WRAP) as u16;
         }
+        self.start = 0;
+        Held::Nothing
+    }
+
+    /// Whether the held bytes followed by the chunk agree with `expected` from `at` on, as far as
+    /// they go.
+    fn agrees(&self, chunk: &[u8], at: usize, expected: &[u8]) -> bool {
+        count_visits(expected.len());
+        let held = self.pending();
+        expected.iter().zip(at..).all(|(byte, at)| {
+            let seen = match at.checked_sub(held) {
+                Some(at) => chunk.get(at),
+                None => self.ring.get(usize::from(self.start).wrapping_add(at) & WRAP),
+            };
+            seen.is_none_or(|seen| seen == byte)
+        })
     }
 
     /// Moves the held frame to the ring's start; nothing is held afterwards.
@@ -227,42 +245,6 @@ impl Deframer {
         }
         self.start = 0;
         self.len = 0;
-    }
-
-    /// Whether the held bytes from `from` on agree with the head; those before are known to.
-    fn head_goes_on(&self, layout: &StreamLayout, from: usize) -> bool {
-        let end = self.pending().min(layout.head().len());
-        count_visits(end.saturating_sub(from));
-        (from..end).all(|at| layout.head().get(at) == self.held(at))
-    }
-
-    /// Whether the held bytes, a frame's length of them, end with the tail.
-    fn tail_agrees(&self, layout: &StreamLayout) -> bool {
-        count_visits(layout.tail().len());
-        let back = layout.frame_len().saturating_sub(layout.tail().len());
-        layout.tail().iter().zip(back..).all(|(byte, at)| Some(byte) == self.held(at))
-    }
-
-    /// Drops bytes, at least one, up to the next that may begin a frame.
-    fn next_candidate(&mut self, layout: &StreamLayout) -> bool {
-        let held = self.pending();
-        let mut at = 1_usize;
-        while at < held {
-            count_visits(layout.head().len().max(1));
-            if layout.head().iter().zip(at..held).all(|(byte, at)| Some(byte) == self.held(at)) {
-                break;
-            }
-            at = at.saturating_add(1);
-        }
-        self.skip(at);
-        self.len = held.saturating_sub(at) as u16;
-        self.start = if self.len == 0 { 0 } else { (usize::from(self.start).wrapping_add(at) & WRAP) as u16 };
-        self.len != 0
-    }
-
-    /// The held byte `at` from the front.
-    fn held(&self, at: usize) -> Option<&u8> {
-        self.ring.get(usize::from(self.start).wrapping_add(at) & WRAP)
     }
 
     /// Holds more bytes; there is always space, since what is held stays below a frame's length.
