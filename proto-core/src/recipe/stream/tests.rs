@@ -5,6 +5,7 @@ use std::vec::Vec;
 use proptest::prelude::*;
 
 use super::*;
+use crate::recipe::model::MAX_FIELDS;
 use crate::sysvar::{Direction, SysVar, VarRange};
 use crate::wire::scalar::ScalarType;
 
@@ -158,6 +159,40 @@ fn a_float_that_is_not_finite_rejects_the_whole_frame() {
     assert_eq!(layout.apply(&payload, &mut [0; IMAGE_BYTES]), Ok(Applied::default()));
     let error = ValueError::Length { expected: 26, got: 25 };
     assert_eq!(layout.apply(&payload[..25], &mut [0; IMAGE_BYTES]), Err(error));
+}
+
+#[test]
+fn long_runs_of_neighbours_are_moved_whole() {
+    for (direction, first) in
+        [(Direction::Input, "DigitalOutputCommand[1]"), (Direction::Output, "RobotState[1]")]
+    {
+        // As many neighbours as a part can have, bits, words and floats.
+        let start = var(first).ordinal();
+        let vars = (start..).map_while(SysVar::from_ordinal).take(MAX_FIELDS);
+        let vars: Vec<SysVar> = vars.filter(|var| var.direction() == direction).collect();
+        let layout =
+            part(Rules { mode: Mode::Realtime, direction }, vars.iter().map(|&v| Field::System(v)).collect());
+        let layout = layout.unwrap();
+        let place = vars[0].image_offset()..vars[0].image_offset() + layout.payload_len();
+        let mut image = [0; IMAGE_BYTES];
+        // Bytes below 0x3F make no special float.
+        for (at, byte) in image[place.clone()].iter_mut().enumerate() {
+            *byte = (at % 0x3F) as u8;
+        }
+        let mut out = [0xA5; MAX_STREAM_FRAME];
+        assert_eq!(layout.encode(&image, &mut out), Ok(layout.payload_len() + 2));
+        let payload = &out[1..][..layout.payload_len()];
+        assert_eq!(payload, &image[place.clone()]);
+        let mut target = [0xA5; IMAGE_BYTES];
+        layout.apply(payload, &mut target).unwrap();
+        for &var in &vars {
+            let place = var.image_offset()..var.image_offset() + var.size();
+            if var.valid_bits() == 0xFF {
+                assert_eq!(target[place.clone()], image[place], "{var}");
+            }
+        }
+        assert!(target[..place.start].iter().chain(&target[place.end..]).all(|&byte| byte == 0xA5));
+    }
 }
 
 #[test]
