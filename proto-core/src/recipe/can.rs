@@ -49,7 +49,7 @@ pub enum CanReject {
     },
 }
 
-/// One part of a CAN recipe, checked and ready to decode and encode; about 1.4 KiB.
+/// One part of a CAN recipe, checked and ready to decode and encode; about 1.2 KiB.
 #[derive(Debug, Clone)]
 pub struct CanLayout {
     rules: Rules,
@@ -182,7 +182,7 @@ impl CanLayout {
             return Err(CanReject::Remote { id });
         }
         let index = self.index_of(key_of(id)).ok_or(CanReject::UnknownId { id })?;
-        let expected = self.shares.get(index).map_or(0, |share| share.len as u8);
+        let expected = self.shares.get(index).map_or(0, |share| share.len);
         let got = frame.data().len();
         if got != usize::from(expected) {
             return Err(CanReject::WrongLength { frame: index as u8, expected, got: got as u8 });
@@ -334,7 +334,7 @@ impl<'a> CanFrameLayout<'a> {
         if let Some(used) = data.get_mut(..self.len()) {
             fill(used);
         }
-        CanFrame { id: self.id, remote: false, len: self.share.len as u8, data }
+        CanFrame { id: self.id, remote: false, len: self.share.len, data }
     }
 }
 

@@ -55,24 +55,25 @@ pub(super) struct Pool {
     steps: Vec<Step, MAX_FIELDS>,
 }
 
-/// At most [`runs::MAX_RUN`] consecutive payload bytes that are consecutive in the image too. The runs of a frame cover its
-/// payload in order, without gaps.
+/// At most [`runs::MAX_RUN`] payload bytes that are neighbours in the image too. The runs of a frame
+/// cover its payload in order, without gaps.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Step {
     image: u16,
-    len: u16,
+    len: u8,
     kind: Kind,
 }
 
-/// What a run holds.
+/// What a run holds: the bits that mean something if it is one byte with reserved bits, else
+/// [`Kind::FLOATS`] or [`Kind::PLAIN`]. One byte, because parts have up to 128 runs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Kind {
-    /// Anything that is right whatever its bits are.
-    Plain,
+struct Kind(u8);
+
+impl Kind {
     /// Floats, which must be finite.
-    Floats,
-    /// One byte of which only these bits mean something.
-    Bits(u8),
+    const FLOATS: Self = Self(0);
+    /// Anything that is right whatever its bits are.
+    const PLAIN: Self = Self(0xFF);
 }
 
 /// One frame's fields.
@@ -99,7 +100,7 @@ pub(super) struct Share {
     pub(super) first_step: u8,
     pub(super) step_end: u8,
     /// Bytes.
-    pub(super) len: u16,
+    pub(super) len: u8,
 }
 
 impl Pool {
@@ -157,7 +158,7 @@ impl Pool {
             field_end: self.field_count() as u8,
             first_step: first_step as u8,
             step_end: self.step_count() as u8,
-            len: len as u16,
+            len: len as u8,
         }
     }
 
@@ -189,17 +190,17 @@ impl Pool {
 impl Step {
     fn of(var: SysVar) -> Self {
         let kind = match var.ty() {
-            ScalarType::Float => Kind::Floats,
-            _ if var.valid_bits() != 0xFF => Kind::Bits(var.valid_bits()),
-            _ => Kind::Plain,
+            ScalarType::Float => Kind::FLOATS,
+            ScalarType::Byte => Kind(var.valid_bits()),
+            _ => Kind::PLAIN,
         };
-        Self { image: var.image_offset() as u16, len: var.size() as u16, kind }
+        Self { image: var.image_offset() as u16, len: var.size() as u8, kind }
     }
 
     fn joins(self, next: Self) -> bool {
         self.kind == next.kind
-            && !matches!(self.kind, Kind::Bits(_))
-            && self.image.saturating_add(self.len) == next.image
+            && matches!(self.kind, Kind::FLOATS | Kind::PLAIN)
+            && self.image.saturating_add(u16::from(self.len)) == next.image
             && usize::from(self.len.saturating_add(next.len)) <= runs::MAX_RUN
     }
 }
@@ -318,7 +319,7 @@ impl Step {
     /// Whether the values of a run may be used.
     #[inline]
     fn accepts(&self, run: &[u8]) -> bool {
-        self.kind != Kind::Floats || runs::all_finite(run)
+        self.kind != Kind::FLOATS || runs::all_finite(run)
     }
 
     /// Writes a run to its place in the image; returns how many of its fields had reserved bits set.
@@ -326,11 +327,11 @@ impl Step {
     fn write(&self, run: &[u8], image: &mut [u8; IMAGE_BYTES]) -> u16 {
         let Some(target) = image.get_mut(self.range()) else { return 0 };
         match self.kind {
-            Kind::Plain | Kind::Floats => {
+            Kind::PLAIN | Kind::FLOATS => {
                 runs::copy(target, run);
                 0
             }
-            Kind::Bits(valid) => {
+            Kind(valid) => {
                 let (Some(bits), Some(&received)) = (target.first_mut(), run.first()) else { return 0 };
                 *bits = received & valid;
                 u16::from(received & !valid != 0)

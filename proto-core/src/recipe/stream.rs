@@ -10,7 +10,7 @@ use super::model::{Field, Framing, MAX_DELIMITER, MAX_STREAM_FRAME, Mode, Rules}
 use crate::sysvar::IMAGE_BYTES;
 use crate::wire::scalar::Scalar;
 
-/// One part of a stream recipe, checked and ready to decode and encode; about 1.1 KiB.
+/// One part of a stream recipe, checked and ready to decode and encode; about 0.8 KiB.
 #[derive(Debug, Clone)]
 pub struct StreamLayout {
     rules: Rules,

@@ -131,7 +131,7 @@ fn frames_that_are_not_the_recipes_are_refused() {
     assert_eq!(layout.accept(&remote), Err(CanReject::Remote { id: id(1) }));
     assert!(layout.frame(3).is_none());
     assert_eq!(layout.frames().count(), 3);
-    assert!(size_of::<CanLayout>() <= 1450, "{}", size_of::<CanLayout>());
+    assert!(size_of::<CanLayout>() <= 1200, "{}", size_of::<CanLayout>());
 }
 
 #[test]

@@ -123,7 +123,7 @@ fn a_layout_shows_what_it_was_made_of() {
     assert_eq!((layout.head(), layout.tail(), layout.rules()), (&[1, 2][..], &[3][..], REALTIME_IN));
     assert!(layout.fields().map(|placed| placed.field).eq(fields));
     assert!(layout.fields().map(|placed| placed.offset).eq([0, 1, 3, 5]));
-    assert!(size_of::<StreamLayout>() <= 1300, "{}", size_of::<StreamLayout>());
+    assert!(size_of::<StreamLayout>() <= 840, "{}", size_of::<StreamLayout>());
 }
 
 #[test]
