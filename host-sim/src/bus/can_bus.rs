@@ -182,7 +182,7 @@ async fn port_node(
     tx: &PortTx,
     events: &mut impl FnMut(PortEvent<'_>),
 ) -> io::Result<()> {
-    let mut timer = Timer::new()?;
+    let timer = Timer::new()?;
     let mut under_way = None;
     loop {
         tokio::select! {
@@ -194,7 +194,7 @@ async fn port_node(
                 events(PortEvent::Frame(frame));
             }
             () = tx.wake.notified(), if under_way.is_none() => {
-                under_way = next_frame(tx, bitrate, now(), &mut timer)?;
+                under_way = next_frame(tx, bitrate, now(), &timer)?;
             }
             expired = timer.expired(), if under_way.is_some() => {
                 expired?;
@@ -204,7 +204,7 @@ async fn port_node(
                     counters.bytes_out += frame.data().len() as u64;
                 });
                 node.send(frame);
-                under_way = next_frame(tx, bitrate, end, &mut timer)?;
+                under_way = next_frame(tx, bitrate, end, &timer)?;
                 if under_way.is_none() {
                     events(PortEvent::Sent);
                 }
@@ -218,7 +218,7 @@ fn next_frame(
     tx: &PortTx,
     bitrate: u32,
     start: Instant,
-    timer: &mut Timer,
+    timer: &Timer,
 ) -> io::Result<Option<(CanFrame, Instant)>> {
     let Some(frame) = tx.frames.borrow_mut().pop_front() else { return Ok(None) };
     let end = start + frame_time(&frame, bitrate);

@@ -3,6 +3,7 @@
 //! tokio's own timers have slots of a millisecond and run late by more than one; a `timerfd` in the
 //! same reactor is off by tens of microseconds, which a grid of 4 ms needs.
 
+use std::cell::Cell;
 use std::io;
 use std::os::fd::OwnedFd;
 
@@ -27,7 +28,7 @@ pub fn now() -> Instant {
 #[derive(Debug)]
 pub struct Timer {
     fd: AsyncFd<OwnedFd>,
-    armed: Instant,
+    armed: Cell<Instant>,
 }
 
 impl Timer {
@@ -38,20 +39,20 @@ impl Timer {
     pub fn new() -> io::Result<Self> {
         let flags = TimerfdFlags::NONBLOCK | TimerfdFlags::CLOEXEC;
         let fd = timerfd_create(TimerfdClockId::Monotonic, flags)?;
-        Ok(Self { fd: register(fd)?, armed: Instant::NEVER })
+        Ok(Self { fd: register(fd)?, armed: Cell::new(Instant::NEVER) })
     }
 
     /// The deadline; [`Instant::NEVER`] when there is none.
     pub fn deadline(&self) -> Instant {
-        self.armed
+        self.armed.get()
     }
 
     /// Moves the deadline. One in the past expires at once; [`Instant::NEVER`] takes it away.
     ///
     /// # Errors
     /// Only what `timerfd_settime` refuses, which no instant does.
-    pub fn arm(&mut self, deadline: Instant) -> io::Result<()> {
-        if deadline == self.armed {
+    pub fn arm(&self, deadline: Instant) -> io::Result<()> {
+        if deadline == self.armed.get() {
             return Ok(());
         }
         // A zero time would disarm, hence at least 1 µs after boot.
@@ -61,7 +62,7 @@ impl Timer {
             TimerfdTimerFlags::ABSTIME,
             &Itimerspec { it_interval: timespec(0), it_value: timespec(value) },
         )?;
-        self.armed = deadline;
+        self.armed.set(deadline);
         Ok(())
     }
 
@@ -69,12 +70,12 @@ impl Timer {
     ///
     /// # Errors
     /// When the descriptor cannot be read, which does not happen in a living runtime.
-    pub async fn expired(&mut self) -> io::Result<()> {
+    pub async fn expired(&self) -> io::Result<()> {
         loop {
             let mut ready = self.fd.readable().await?;
             match ready.try_io(|fd| Ok(rustix::io::read(fd.get_ref(), &mut [0; 8])?)) {
                 Ok(Ok(_)) => {
-                    self.armed = Instant::NEVER;
+                    self.armed.set(Instant::NEVER);
                     return Ok(());
                 }
                 Ok(Err(error)) => return Err(error),
@@ -87,7 +88,7 @@ impl Timer {
     ///
     /// # Errors
     /// As [`Timer::arm`] and [`Timer::expired`].
-    pub async fn sleep_until(&mut self, deadline: Instant) -> io::Result<()> {
+    pub async fn sleep_until(&self, deadline: Instant) -> io::Result<()> {
         self.arm(deadline)?;
         self.expired().await
     }
@@ -152,7 +153,7 @@ mod tests {
     #[test]
     fn a_timer_fires_at_its_deadline_and_never_before() {
         run(async {
-            let mut timer = Timer::new().unwrap();
+            let timer = Timer::new().unwrap();
             for micros in [1, 100, 5_000] {
                 let deadline = now() + Duration::from_micros(micros);
                 timer.sleep_until(deadline).await.unwrap();
@@ -165,7 +166,7 @@ mod tests {
     #[test]
     fn a_deadline_in_the_past_fires_at_once_and_one_moved_earlier_counts() {
         run(async {
-            let mut timer = Timer::new().unwrap();
+            let timer = Timer::new().unwrap();
             timer.sleep_until(Instant::ZERO).await.unwrap();
             timer.arm(now() + Duration::from_secs(3_600)).unwrap();
             timer.sleep_until(now() + Duration::from_millis(1)).await.unwrap();
@@ -175,7 +176,7 @@ mod tests {
     #[test]
     fn a_disarmed_timer_stays_silent() {
         run(async {
-            let (mut off, mut other) = (Timer::new().unwrap(), Timer::new().unwrap());
+            let (off, other) = (Timer::new().unwrap(), Timer::new().unwrap());
             off.arm(now() + Duration::from_millis(1)).unwrap();
             off.arm(Instant::NEVER).unwrap();
             tokio::select! {

@@ -132,7 +132,7 @@ impl Core {
     /// Calls the engine whenever it asked to be called.
     async fn keep_time(&self) -> Result<(), StartError> {
         let clock = |error| StartError::new(format!("timerfd: {error}"));
-        let mut timer = Timer::new().map_err(clock)?;
+        let timer = Timer::new().map_err(clock)?;
         loop {
             timer.arm(self.deadline.get()).map_err(clock)?;
             tokio::select! {

@@ -7,6 +7,8 @@ pub mod controller;
 pub mod gateway;
 mod host;
 mod link;
+mod tcp;
+mod udp;
 
 use std::fmt;
 use std::path::PathBuf;
