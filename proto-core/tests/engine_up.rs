@@ -274,6 +274,31 @@ fn shared_frame() -> (Rig, PortId) {
     (cell.rig(), port)
 }
 
+#[test]
+fn nothing_is_read_back_for_a_frame_that_comes_from_one_field_frame() {
+    let mut cell = Cell::new();
+    let up = cell.stream(&["DigitalOutputCommand[1..2]"], &[]);
+    cell.recipe_link(up);
+    let recipe = cell.stream(&["DigitalOutputCommand[1..2]"], &[]);
+    let port = cell.rs485(recipe);
+    let mut rig = cell.rig();
+    assert!(rig.engine.links().all(|link| link.id == LinkId::RECIPE_UDP), "no state stream is needed");
+    rig.run(MS(10));
+    rig.bytes(port, &[255, 255, 1, 2, 238, 238]);
+    assert_eq!(rig.sent_on(LinkId::RECIPE_UDP), [[255, 255, 1, 2, 238, 238]]);
+
+    // A safe value for one of them only: the other is read back when the port falls silent.
+    cell.safe("DigitalOutputCommand[1]", 0.0);
+    let mut rig = cell.rig();
+    rig.run(MS(10));
+    rig.bytes(port, &[255, 255, 1, 2, 238, 238]);
+    rig.sent_on(LinkId::RECIPE_UDP);
+    rig.run(MS(100));
+    assert!(rig.sent_on(LinkId::RECIPE_UDP).is_empty(), "it is not known what the other is now");
+    rig.link_bytes(LinkId::STATE, &state_packet(0, 0.0, 0));
+    assert_eq!(rig.sent_on(LinkId::RECIPE_UDP), [[255, 255, 0, 0, 238, 238]]);
+}
+
 fn state_packet(word: u16, float: f32, outputs: u8) -> Vec<u8> {
     let mut packet = vec![0; 1468];
     for bit in 0..8 {

@@ -128,6 +128,9 @@ impl Plan {
             }
         }
         for (link, recipe) in uplinks(config) {
+            if is_one_frame(config, recipe) {
+                continue;
+            }
             for var in inputs_of(config, recipe) {
                 if var.stream().is_some() {
                     plan.read_back.insert(var);
@@ -227,6 +230,21 @@ fn field_ports(config: &GatewayConfig) -> impl Iterator<Item = (PortId, &Recipe)
 /// The input variables that a recipe's input part sets.
 fn inputs_of<'a>(config: &'a GatewayConfig, recipe: &'a Recipe) -> impl Iterator<Item = SysVar> + 'a {
     config.written_by(recipe)
+}
+
+/// Whether a recipe link's frame carries what one field frame brings and nothing else, all of it with
+/// safe values or none: then all of it is known whenever any of it is written.
+fn is_one_frame(config: &GatewayConfig, link: &Recipe) -> bool {
+    config.field_ports().any(|(_, port, recipe)| {
+        recipe.frames(Direction::Input).any(|(_, fields)| {
+            let fields = fields.of(&config.fields);
+            let brings = |var| fields.iter().any(|field| field.variable() == Some(var));
+            let safe = |var| port.on_timeout.of(&config.safe_values).iter().any(|safe| safe.var == var);
+            let mut vars = inputs_of(config, link).peekable();
+            let first_is_safe = vars.peek().is_some_and(|&var| safe(var));
+            vars.all(|var| brings(var) && safe(var) == first_is_safe)
+        })
+    })
 }
 
 /// The variables that a recipe's output part shows, and the one whose bit triggers it.
