@@ -1,0 +1,190 @@
+//! The cell of the demo: a simulated controller and a gateway on this host, from the example files,
+//! every port number free and every device in a folder that is removed at the end.
+
+use std::io;
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use proto_core::modbus::adu::MAX_ADU;
+use proto_core::modbus::client::{Client, ClientEvent};
+use proto_core::modbus::pdu::{Request, Response};
+use serde_json::Value;
+
+use super::device::{Line, PATIENCE};
+use crate::bus::bind::Bind;
+use crate::config::file::{self, Text};
+use crate::shell::{self, Handle};
+
+/// A folder for pseudoterminals' links, removed with everything in it.
+pub(super) struct Folder(PathBuf);
+
+impl Folder {
+    pub(super) fn new() -> io::Result<Self> {
+        let path = std::env::temp_dir().join(format!("host-sim-demo-{}", std::process::id()));
+        std::fs::create_dir_all(&path)?;
+        Ok(Self(path))
+    }
+
+    pub(super) fn root(&self) -> PathBuf {
+        self.0.clone()
+    }
+
+    pub(super) fn path(&self, name: &str) -> PathBuf {
+        self.0.join(name)
+    }
+}
+
+impl Drop for Folder {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_dir_all(&self.0);
+    }
+}
+
+/// An example file, embedded.
+#[derive(Clone, Copy)]
+pub(super) struct Example {
+    pub(super) name: &'static str,
+    pub(super) toml: &'static str,
+}
+
+/// The simulated controller.
+pub(super) struct Robot(Handle);
+
+/// The gateway.
+pub(super) struct Gateway(Handle);
+
+impl Robot {
+    /// Starts from an example file, all ports free.
+    pub(super) fn start(example: Example, overrides: &[String], binds: &[String]) -> io::Result<Self> {
+        let mut set: Vec<String> =
+            ["command", "state", "modbus", "udp2011"].map(|port| format!("listen.{port}=0")).to_vec();
+        set.extend_from_slice(overrides);
+        let config = file::parse_controller(Text { name: example.name, toml: example.toml }, &set);
+        let config = config.map_err(io::Error::other)?;
+        shell::controller::start(config, parse_binds(binds)?).map(Self).map_err(io::Error::other)
+    }
+
+    /// The address called `name` in the ready line.
+    pub(super) fn address(&self, name: &str) -> io::Result<SocketAddr> {
+        address(&self.0, name)
+    }
+
+    /// Sends a command to port 2000 and waits for this reply.
+    pub(super) fn command(&self, command: &str, reply: &str) -> io::Result<()> {
+        let mut line = Line::connect(self.address("command")?)?;
+        line.send(command.as_bytes())?;
+        line.wait_for(|received| (received == reply.as_bytes()).then_some(((), received.len())))
+    }
+
+    /// Waits until the program's variable has this value.
+    pub(super) fn variable(&self, name: &str, value: &Value) -> io::Result<()> {
+        until(|| Ok(self.0.stats().is_some_and(|stats| stats["variables"][name] == *value)))
+    }
+
+    /// Waits until a Modbus client sees the coil so.
+    pub(super) fn coil(&self, address: u16, on: bool) -> io::Result<()> {
+        let mut modbus = Modbus::connect(self.address("modbus")?)?;
+        until(|| {
+            modbus.ask(Request::ReadCoils { address, count: 1 }, |response| match response {
+                Response::Coils(coils) => coils.coil(0) == Some(on),
+                _ => false,
+            })
+        })
+    }
+
+    /// Waits until a Modbus client sees these holding registers.
+    pub(super) fn registers(&self, address: u16, values: &[u16]) -> io::Result<()> {
+        let mut modbus = Modbus::connect(self.address("modbus")?)?;
+        let count = values.len() as u16;
+        until(|| {
+            modbus.ask(Request::ReadHolding { address, count }, |response| match response {
+                Response::Registers(registers) => registers.iter().eq(values.iter().copied()),
+                _ => false,
+            })
+        })
+    }
+}
+
+impl Gateway {
+    /// Starts from an example file; `robot` is where the controller is, when it is there already.
+    pub(super) fn start(
+        example: Example,
+        robot: Option<&Robot>,
+        overrides: &[String],
+        binds: &[String],
+    ) -> io::Result<Self> {
+        let mut set = overrides.to_vec();
+        for port in robot.map_or(&[][..], |_| &["command", "state", "modbus", "udp2011"]) {
+            let Some(robot) = robot else { break };
+            set.push(format!("controller.ports.{port}={}", robot.address(port)?.port()));
+        }
+        let config = file::parse_gateway(Text { name: example.name, toml: example.toml }, &set);
+        let config = config.map_err(io::Error::other)?;
+        shell::gateway::start(*config, parse_binds(binds)?).map(Self).map_err(io::Error::other)
+    }
+
+    pub(super) fn address(&self, name: &str) -> io::Result<SocketAddr> {
+        address(&self.0, name)
+    }
+
+    /// Waits until every link to the controller is up.
+    pub(super) fn linked(&self) -> io::Result<()> {
+        until(|| {
+            let stats = self.0.stats().ok_or_else(|| io::Error::other("the gateway ended"))?;
+            let links = stats["links"].as_object();
+            Ok(links.is_some_and(|links| links.values().all(|link| link["state"] == "up")))
+        })
+    }
+}
+
+/// Opens the device end of a bound pseudoterminal.
+pub(super) fn serial(path: &Path) -> io::Result<Line<std::fs::File>> {
+    Line::open(path)
+}
+
+/// A Modbus client for looking at the controller from outside.
+struct Modbus {
+    line: Line<std::net::TcpStream>,
+    client: Client,
+}
+
+impl Modbus {
+    fn connect(address: SocketAddr) -> io::Result<Self> {
+        Ok(Self { line: Line::connect(address)?, client: Client::new(1) })
+    }
+
+    fn ask(&mut self, request: Request<'_>, is_so: impl Fn(Response<'_>) -> bool) -> io::Result<bool> {
+        let mut frame = [0; MAX_ADU];
+        let len = self.client.start(request, &mut frame).map_err(io::Error::other)?;
+        self.line.send(&frame[..len])?;
+        let client = &mut self.client;
+        self.line.wait_for(|received| {
+            let mut rest = received;
+            let answer = match client.receive(&mut rest)? {
+                ClientEvent::Response(response) => is_so(response),
+                _ => false,
+            };
+            Some((answer, received.len()))
+        })
+    }
+}
+
+/// Looks again and again until it is so.
+fn until(mut is_so: impl FnMut() -> io::Result<bool>) -> io::Result<()> {
+    let deadline = Instant::now() + PATIENCE;
+    while !is_so()? {
+        if Instant::now() > deadline {
+            return Err(io::Error::new(io::ErrorKind::TimedOut, "it did not happen in time"));
+        }
+    }
+    Ok(())
+}
+
+fn address(handle: &Handle, name: &str) -> io::Result<SocketAddr> {
+    handle.place(name).parse().map_err(|_| io::Error::other(format!("no address called {name}")))
+}
+
+fn parse_binds(binds: &[String]) -> io::Result<Vec<Bind>> {
+    binds.iter().map(|bind| bind.parse().map_err(io::Error::other)).collect()
+}
