@@ -307,14 +307,14 @@ impl ControllerShell {
         }
     }
 
-    /// To every client of port 2001 that has taken the packet before; who has not for [`PATIENCE`] is
+    /// To every client of port 2001 that has taken the packet before; who has not for [`STATE_PATIENCE`] is
     /// dropped (D9).
     fn send_state(&self, packet: &[u8], now: Instant) {
         let mut connections = self.connections.borrow_mut();
         let mut dropped = Vec::new();
         for (&conn, client) in connections.iter().filter(|(_, client)| client.link == Link::State) {
             match client.connection.blocked_since() {
-                Some(since) if now.saturating_since(since) >= PATIENCE => dropped.push(conn),
+                Some(since) if now.saturating_since(since) >= STATE_PATIENCE => dropped.push(conn),
                 Some(_) => self.count(|counters| counters.skipped_state_packets += 1),
                 None => {
                     if client.connection.send(packet) == Taken::Failed {
@@ -449,7 +449,7 @@ fn closed(link: Link, conn: ConnId) -> ControllerInput<'static> {
 }
 
 /// How long a client of port 2001 may take nothing (D9).
-const PATIENCE: Duration = Duration::from_secs(2);
+const STATE_PATIENCE: Duration = Duration::from_secs(2);
 
 #[cfg(test)]
 #[path = "controller_tests.rs"]
