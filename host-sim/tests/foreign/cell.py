@@ -84,7 +84,7 @@ class Program:
         self.folder = tempfile.TemporaryDirectory(prefix="foreign-")
         path = pathlib.Path(self.folder.name)
         ready = path / "ready.json"
-        arguments = [host_sim, command, "-c", str(CONFIGS / config), "--ready", str(ready), "--stats", "50ms"]
+        arguments = [host_sim, "-v", command, "-c", str(CONFIGS / config), "--ready", str(ready), "--stats", "50ms"]
         for override in sets:
             arguments += ["--set", override]
         self.links = []

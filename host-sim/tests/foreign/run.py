@@ -70,7 +70,7 @@ def passes(number, title, function):
         print("      " + reason.strip().replace("\n", "\n      "))
         for log in sorted(cell.log_folder.glob(f"{name}-*.log")):
             lines = log.read_text(errors="replace").splitlines()
-            print("      " + "\n      ".join([f"{log.name}:", *lines[:2], *lines[-8:]]), flush=True)
+            print("      " + "\n      ".join([f"{log}:", *lines[-12:]]), flush=True)
     return outcome == "PASS"
 
 
