@@ -7,9 +7,9 @@ use crate::sysvar::{Direction, SysVar};
 use crate::time::Duration;
 use crate::wire::scalar::{ScalarError, ScalarType};
 
-/// The first mistake that [`GatewayConfig::validate`] met.
+/// The first mistake that [`GatewayConfig::validate`](super::GatewayConfig::validate) met.
 ///
-/// Its `Display` counts recipes and ports from 1; [`GatewayConfig::describe`] names them.
+/// Its `Display` counts recipes and ports from 1; [`GatewayConfig::describe`](super::GatewayConfig::describe) names them.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ConfigError {
     /// Where.
@@ -59,7 +59,7 @@ pub enum Place {
     },
     /// One entry of a command table.
     Command {
-        /// Index into [`GatewayConfig::commands`].
+        /// Index into [`GatewayConfig::commands`](super::GatewayConfig::commands).
         entry: u16,
     },
     /// A port.
@@ -71,7 +71,7 @@ pub enum Place {
     },
     /// One safe value of a port.
     SafeValue {
-        /// Index into [`GatewayConfig::safe_values`].
+        /// Index into [`GatewayConfig::safe_values`](super::GatewayConfig::safe_values).
         entry: u16,
     },
 }
