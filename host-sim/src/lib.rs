@@ -1,6 +1,7 @@
 //! A simulated DUCO CORE controller and the recipe gateway on this host.
 
 pub mod bus;
+pub mod cell;
 pub mod cli;
 pub mod config;
 pub mod controller;

@@ -1,0 +1,202 @@
+//! What a test or a soak run can break in the cell, and mend.
+
+use proto_core::engine::{BusState, Engine, Input, LinkId, LinkKind};
+use proto_core::time::Duration;
+
+use super::drive::Due;
+use super::network::{Connection, Door, Peer, Way};
+use super::{BusId, Cell, LineId, Owner, What};
+
+/// Faults of the network.
+impl Cell {
+    /// New connections are refused; of a datagram link, everything is lost.
+    pub fn refuse(&mut self, link: LinkId) {
+        self.set_door(link, Door::Refuses);
+    }
+
+    /// New connections get no answer at all; of a datagram link, everything is lost.
+    pub fn black_hole(&mut self, link: LinkId) {
+        self.set_door(link, Door::Silent);
+    }
+
+    /// New connections and datagrams get through again.
+    pub fn admit(&mut self, link: LinkId) {
+        self.set_door(link, Door::Open);
+    }
+
+    /// The link's connection is reset: both ends are told, what was under way is lost.
+    pub fn reset(&mut self, link: LinkId) {
+        self.note(link);
+        if let Some(conn) = self.gate(link).conn {
+            self.reset_conn(conn);
+        }
+    }
+
+    /// The connection is reset when so many more bytes have arrived.
+    pub fn reset_after(&mut self, link: LinkId, way: Way, bytes: usize) {
+        self.note(link);
+        if let Some(conn) = self.connection(link) {
+            conn.pipe(way).reset_after = Some(bytes);
+        }
+    }
+
+    /// Nothing arrives any more in this direction, until [`Self::release`]; nothing is lost.
+    pub fn hold(&mut self, link: LinkId, way: Way) {
+        self.note(link);
+        if let Some(conn) = self.connection(link) {
+            conn.pipe(way).held = true;
+        }
+    }
+
+    /// What was held arrives now, in as few pieces as it can.
+    pub fn release(&mut self, link: LinkId, way: Way) {
+        self.note(link);
+        let Some(id) = self.gate(link).conn else { return };
+        if let Some(conn) = self.conns.get_mut(&id) {
+            conn.pipe(way).held = false;
+            self.queue.push(self.now, Due::Arrival { conn: id, way });
+        }
+    }
+
+    /// The connection is gone and neither end is told: what they send is lost for ever. TCP itself
+    /// finds out after [`TCP_TIMEOUT`].
+    pub fn half_open(&mut self, link: LinkId) {
+        self.note(link);
+        let Some(id) = self.gate(link).conn else { return };
+        if let Some(conn) = self.conns.get_mut(&id) {
+            conn.up.dead = true;
+            conn.down.dead = true;
+            self.queue.push(self.now + TCP_TIMEOUT, Due::TimedOut { conn: id });
+        }
+    }
+
+    /// Whether the network has a connection for this link.
+    pub fn is_connected(&self, link: LinkId) -> bool {
+        self.gates.get(&link).is_some_and(|gate| gate.conn.is_some())
+    }
+
+    fn set_door(&mut self, link: LinkId, door: Door) {
+        self.note(link);
+        self.gate(link).door = door;
+    }
+
+    fn note(&mut self, link: LinkId) {
+        self.trace.add(self.now, What::Fault, link.0.into(), &[]);
+    }
+
+    fn connection(&mut self, link: LinkId) -> Option<&mut Connection> {
+        let id = self.gate(link).conn?;
+        self.conns.get_mut(&id)
+    }
+
+    pub(super) fn reset_conn(&mut self, id: u64) {
+        let Some(conn) = self.conns.remove(&id) else { return };
+        let gate = self.gate(conn.link);
+        // The gateway may have closed its end and moved on.
+        if gate.conn == Some(id) {
+            let turn = gate.turn;
+            self.queue.push(self.now, Due::LinkDown { link: conn.link, turn });
+        }
+        self.controller_closed(id, conn.peer);
+    }
+}
+
+/// Faults of the field.
+impl Cell {
+    /// The line is cut: bytes are lost, and nobody is told.
+    pub fn cut(&mut self, line: LineId) {
+        self.lines[line.0].connected = false;
+    }
+
+    /// The line is whole again.
+    pub fn mend(&mut self, line: LineId) {
+        self.lines[line.0].connected = true;
+    }
+
+    /// The port's adapter is pulled out: its owner is told.
+    pub fn unplug(&mut self, line: LineId) {
+        self.cut(line);
+        self.port_input(self.lines[line.0].owner, false);
+    }
+
+    /// The adapter is back.
+    pub fn plug_in(&mut self, line: LineId) {
+        self.mend(line);
+        self.port_input(self.lines[line.0].owner, true);
+    }
+
+    /// The bus is cut: frames are lost, and nobody is told.
+    pub fn cut_bus(&mut self, bus: BusId) {
+        self.buses[bus.0].connected = false;
+    }
+
+    /// The bus is whole again.
+    pub fn mend_bus(&mut self, bus: BusId) {
+        self.buses[bus.0].connected = true;
+    }
+
+    /// The port's CAN controller goes bus-off; its waiting frames are lost.
+    pub fn bus_off(&mut self, bus: BusId) {
+        self.buses[bus.0].drop_port_frames();
+        self.bus_state(bus, BusState::BusOff);
+    }
+
+    /// It has recovered.
+    pub fn bus_on(&mut self, bus: BusId) {
+        self.bus_state(bus, BusState::Active);
+    }
+
+    fn bus_state(&mut self, bus: BusId, state: BusState) {
+        // The simulated controller's own CAN port knows no error states.
+        if let Owner::Gateway(port) = self.buses[bus.0].owner {
+            self.engine_input(Input::PortBus { port, state });
+        }
+    }
+}
+
+/// Switching off and on.
+impl Cell {
+    /// The controller is switched off and on: see [`crate::controller::Controller::restart`].
+    pub fn restart_controller(&mut self) {
+        let now = self.now;
+        self.trace.add(now, What::Fault, u64::MAX, &[]);
+        self.controller_mut().restart(now);
+    }
+
+    /// The gateway loses its power and starts again: its connections are reset, its counters
+    /// begin afresh.
+    pub fn restart_gateway(&mut self) {
+        self.trace.add(self.now, What::Fault, u64::MAX - 1, &[]);
+        let conns: Vec<(u64, Peer)> = self.conns.iter().map(|(&id, conn)| (id, conn.peer)).collect();
+        for gate in self.gates.values_mut() {
+            gate.set_open(false);
+        }
+        self.conns.clear();
+        // The same configuration made the engine that there was.
+        if let Ok(engine) = Engine::new(&self.gateway) {
+            *self.engine = engine;
+        }
+        self.engine_wake = self.now;
+        let ports: Vec<_> = self.engine.field_ports().collect();
+        for port in ports {
+            self.engine_input(Input::PortUp { port });
+        }
+        for (id, peer) in conns {
+            self.controller_closed(id, peer);
+        }
+    }
+
+    /// The links that are TCP connections.
+    pub fn tcp_links(&self) -> impl Iterator<Item = LinkId> + '_ {
+        let is_tcp = |kind| !matches!(kind, LinkKind::RecipeUdp | LinkKind::RecipeUdpListen { .. });
+        self.gates.values().filter(move |gate| is_tcp(gate.kind)).map(|gate| gate.id)
+    }
+
+    /// Every link.
+    pub fn link_ids(&self) -> impl Iterator<Item = LinkId> + '_ {
+        self.gates.keys().copied()
+    }
+}
+
+/// When TCP gives up a connection on which nothing is acknowledged.
+pub const TCP_TIMEOUT: Duration = Duration::from_secs(30);

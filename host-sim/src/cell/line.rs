@@ -1,0 +1,206 @@
+//! An RS-485 line: one port of the gateway or of the controller, and a device.
+
+use std::collections::VecDeque;
+
+use proto_core::config::Rs485;
+use proto_core::time::{Duration, Instant};
+
+use super::device::Device;
+use super::rng::Rng;
+use super::{End, Owner};
+
+/// How the receiver's driver hands bytes over.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Chunking {
+    /// Each transmission in one piece, when its last byte has come.
+    Whole,
+    /// In pieces of so many bytes, each when its last byte has come.
+    Pieces(usize),
+    /// In pieces of 1 to so many bytes.
+    Random(usize),
+}
+
+/// How the two ends are joined.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Wiring {
+    /// Both speak on one pair: what is sent at the same time is garbled for both.
+    TwoWire,
+    /// A pair for each direction, as a pseudoterminal has it.
+    FourWire,
+}
+
+/// What happened on a line, beside what its ends count.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct LineCounters {
+    /// Transmissions of the device.
+    pub device_sent: u64,
+    /// Bytes of them.
+    pub device_bytes: u64,
+    /// Transmissions of the port.
+    pub port_sent: u64,
+    /// Bytes of them.
+    pub port_bytes: u64,
+    /// Transmissions that began while the other end was sending.
+    pub overlaps: u64,
+    /// Bytes that were changed on their way.
+    pub garbled_bytes: u64,
+    /// Bytes that were lost on their way.
+    pub lost_bytes: u64,
+}
+
+/// A line.
+pub struct Line {
+    pub(super) owner: Owner,
+    settings: Rs485,
+    /// How received bytes are handed over, at both ends.
+    pub chunking: Chunking,
+    /// How the ends are joined.
+    pub wiring: Wiring,
+    /// How many bytes of a million have a bit flipped.
+    pub noise_ppm: u32,
+    /// What happened.
+    pub counters: LineCounters,
+    pub(super) connected: bool,
+    pub(super) device: Option<Box<dyn Device<Vec<u8>>>>,
+    busy_until: [Instant; 2],
+    collision: (Instant, Instant),
+    heard: VecDeque<(Instant, Vec<u8>)>,
+    rng: Rng,
+}
+
+/// A piece of a transmission.
+#[derive(Debug)]
+pub(super) struct Chunk {
+    pub from: End,
+    pub began: Instant,
+    pub bytes: Vec<u8>,
+    pub is_first: bool,
+    pub is_last: bool,
+}
+
+impl std::fmt::Debug for Line {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { owner, settings, counters, connected, .. } = self;
+        f.debug_struct("Line")
+            .field("owner", owner)
+            .field("settings", settings)
+            .field("counters", counters)
+            .field("connected", connected)
+            .finish_non_exhaustive()
+    }
+}
+
+impl Line {
+    pub(super) fn new(owner: Owner, settings: Rs485, rng: Rng) -> Self {
+        Self {
+            owner,
+            settings,
+            chunking: Chunking::Whole,
+            wiring: Wiring::FourWire,
+            noise_ppm: 0,
+            counters: LineCounters::default(),
+            connected: true,
+            device: None,
+            busy_until: [Instant::ZERO; 2],
+            collision: (Instant::ZERO, Instant::ZERO),
+            heard: VecDeque::new(),
+            rng,
+        }
+    }
+
+    /// The line's settings.
+    pub fn settings(&self) -> &Rs485 {
+        &self.settings
+    }
+
+    /// When the device's newest transmission ends.
+    pub fn device_done_at(&self) -> Instant {
+        self.busy_until[End::Device as usize]
+    }
+
+    /// What the port has sent since the last look, each transmission with the time of its last
+    /// byte. The newest [`MAX_HEARD`] are kept.
+    pub fn take_heard(&mut self) -> Vec<(Instant, Vec<u8>)> {
+        self.heard.drain(..).collect()
+    }
+
+    /// Puts a transmission on the line; when each of its pieces has come, in order.
+    pub(super) fn send(&mut self, now: Instant, from: End, bytes: &[u8]) -> Vec<(Instant, Chunk)> {
+        let other = self.busy_until[1 - from as usize];
+        let start = now.max(self.busy_until[from as usize]);
+        let end = start + self.settings.time_on_line(bytes.len());
+        self.busy_until[from as usize] = end;
+        match from {
+            End::Port => {
+                self.counters.port_sent += 1;
+                self.counters.port_bytes += bytes.len() as u64;
+            }
+            End::Device => {
+                self.counters.device_sent += 1;
+                self.counters.device_bytes += bytes.len() as u64;
+            }
+        }
+        if start < other {
+            self.counters.overlaps += 1;
+            if self.wiring == Wiring::TwoWire {
+                self.collision = (start, end.min(other));
+            }
+        }
+        let mut chunks = Vec::new();
+        let (mut at, mut began) = (0, start);
+        while at < bytes.len() {
+            let left = bytes.len() - at;
+            let len = match self.chunking {
+                Chunking::Whole => left,
+                Chunking::Pieces(len) => len.clamp(1, left),
+                Chunking::Random(most) => (self.rng.between(1, most.max(1) as u64) as usize).min(left),
+            };
+            let arrival = start + self.settings.time_on_line(at + len);
+            let bytes_of = bytes[at..at + len].to_vec();
+            let is_first = at == 0;
+            at += len;
+            let is_last = at == bytes.len();
+            chunks.push((arrival, Chunk { from, began, bytes: bytes_of, is_first, is_last }));
+            began = arrival;
+        }
+        chunks
+    }
+
+    /// Changes a piece to what arrives of it; false when the line is cut.
+    pub(super) fn deliver(&mut self, now: Instant, chunk: &mut Chunk) -> bool {
+        if !self.connected {
+            self.counters.lost_bytes += chunk.bytes.len() as u64;
+            return false;
+        }
+        let (from, to) = self.collision;
+        let collided = chunk.began < to && now > from;
+        for byte in &mut chunk.bytes {
+            if collided || self.rng.chance(self.noise_ppm) {
+                *byte ^= 1 << self.rng.below(8);
+                self.counters.garbled_bytes += 1;
+            }
+        }
+        true
+    }
+
+    /// Keeps what the port has sent.
+    pub(super) fn hear(&mut self, now: Instant, bytes: &[u8], is_first: bool) {
+        if let Some(newest) = self.heard.back_mut().filter(|_| !is_first) {
+            newest.0 = now;
+            newest.1.extend_from_slice(bytes);
+            return;
+        }
+        if self.heard.len() >= MAX_HEARD {
+            self.heard.pop_front();
+        }
+        self.heard.push_back((now, bytes.to_vec()));
+    }
+
+    /// The time that so many bytes take.
+    pub fn time_of(&self, len: usize) -> Duration {
+        self.settings.time_on_line(len)
+    }
+}
+
+/// Transmissions or frames kept for a look.
+pub const MAX_HEARD: usize = 100_000;

@@ -1,0 +1,101 @@
+//! What happened in the cell, as a digest and, when wanted, in full.
+
+use proto_core::time::Instant;
+
+/// What one entry tells.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[repr(u8)]
+pub enum What {
+    /// The gateway wants a link open.
+    LinkOpen,
+    /// The gateway gives a link up.
+    LinkClose,
+    /// The gateway was told that a link is up.
+    LinkUp,
+    /// The gateway was told that a link is down.
+    LinkDown,
+    /// The gateway sent on a link.
+    LinkSent,
+    /// The gateway received on a link.
+    LinkReceived,
+    /// A connection reached the controller.
+    ControllerOpened,
+    /// The controller was told that a connection is gone.
+    ControllerClosed,
+    /// Bytes reached the controller.
+    ControllerReceived,
+    /// The gateway sent on a field port.
+    PortSent,
+    /// The gateway received on a field port.
+    PortReceived,
+    /// The controller sent on a recipe port.
+    ControllerPortSent,
+    /// The controller received on a recipe port.
+    ControllerPortReceived,
+    /// A fault began or ended.
+    Fault,
+}
+
+/// One entry.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Entry {
+    /// When.
+    pub at: Instant,
+    /// What.
+    pub what: What,
+    /// Of which link, port or connection.
+    pub subject: u64,
+    /// The bytes; a CAN frame's id (4 bytes, big-endian) and data.
+    pub bytes: Vec<u8>,
+}
+
+/// The record of a run.
+#[derive(Debug, Clone)]
+pub struct Trace {
+    digest: u64,
+    count: u64,
+    limit: usize,
+    entries: Vec<Entry>,
+}
+
+impl Trace {
+    pub(super) const fn new() -> Self {
+        Self { digest: FNV_SEED, count: 0, limit: 0, entries: Vec::new() }
+    }
+
+    /// Keeps the next `limit` entries in full.
+    pub fn keep(&mut self, limit: usize) {
+        self.entries.clear();
+        self.limit = limit;
+    }
+
+    /// A number that two runs share when the same happened at the same times.
+    pub fn digest(&self) -> u64 {
+        self.digest
+    }
+
+    /// How many things happened.
+    pub fn count(&self) -> u64 {
+        self.count
+    }
+
+    /// What was kept, see [`Self::keep`].
+    pub fn entries(&self) -> &[Entry] {
+        &self.entries
+    }
+
+    pub(super) fn add(&mut self, at: Instant, what: What, subject: u64, bytes: &[u8]) {
+        self.count += 1;
+        let head = [at.as_micros(), what as u64, subject, bytes.len() as u64];
+        let head = head.iter().flat_map(|word| word.to_le_bytes());
+        for byte in head.chain(bytes.iter().copied()) {
+            self.digest = (self.digest ^ u64::from(byte)).wrapping_mul(FNV_PRIME);
+        }
+        if self.entries.len() < self.limit {
+            self.entries.push(Entry { at, what, subject, bytes: bytes.to_vec() });
+        }
+    }
+}
+
+const FNV_SEED: u64 = 0xCBF2_9CE4_8422_2325;
+const FNV_PRIME: u64 = 0x0000_0100_0000_01B3;

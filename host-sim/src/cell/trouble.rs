@@ -1,0 +1,310 @@
+//! Everything that can go wrong, by chance and seeded: what a soak run is made of.
+//!
+//! A [`Trouble`] breaks something every now and then and mends it again after a while. The cell
+//! stays an ordinary cell: between two faults a caller can look at it, and at the end
+//! [`Trouble::mend`] leaves it whole.
+
+use std::collections::BTreeMap;
+
+use proto_core::engine::LinkId;
+use proto_core::modbus::Exception;
+use proto_core::time::{Duration, Instant};
+
+use super::network::Way;
+use super::rng::Rng;
+use super::{BusId, Cell, LineId};
+use crate::controller::Link;
+
+/// Kinds of faults.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum TroubleKind {
+    /// A server refuses connections, and the present one is reset.
+    Refused,
+    /// The network to a server swallows everything, and the present connection is half open.
+    BlackHole,
+    /// A connection is reset.
+    Reset,
+    /// A connection is reset in the middle of something.
+    ResetMidPacket,
+    /// A connection is half open.
+    HalfOpen,
+    /// One direction of a connection stalls.
+    Stall,
+    /// Datagrams are lost, late and doubled.
+    Datagrams,
+    /// A server carries out and says nothing.
+    Mute,
+    /// A server's answers are late.
+    SlowAnswers,
+    /// Modbus answers with an exception.
+    Exception,
+    /// Half a state packet, then the end.
+    HalfStatePacket,
+    /// A line flips bits.
+    Noise,
+    /// A device sends garbage.
+    Garbage,
+    /// A line or bus is cut.
+    Cut,
+    /// A line's adapter is pulled out.
+    Unplugged,
+    /// A CAN controller is bus-off.
+    BusOff,
+    /// The controller is switched off and on.
+    ControllerRestart,
+    /// The gateway is switched off and on.
+    GatewayRestart,
+}
+
+impl TroubleKind {
+    /// All of them.
+    pub const ALL: [Self; 18] = [
+        Self::Refused,
+        Self::BlackHole,
+        Self::Reset,
+        Self::ResetMidPacket,
+        Self::HalfOpen,
+        Self::Stall,
+        Self::Datagrams,
+        Self::Mute,
+        Self::SlowAnswers,
+        Self::Exception,
+        Self::HalfStatePacket,
+        Self::Noise,
+        Self::Garbage,
+        Self::Cut,
+        Self::Unplugged,
+        Self::BusOff,
+        Self::ControllerRestart,
+        Self::GatewayRestart,
+    ];
+}
+
+/// What ends a fault.
+#[derive(Debug, Clone, Copy)]
+enum Remedy {
+    Admit(LinkId),
+    Release(LinkId),
+    Datagrams(LinkId),
+    Unmute(Link),
+    Answers(Link),
+    NoException,
+    Quiet(LineId),
+    Mend(LineId),
+    PlugIn(LineId),
+    MendBus(BusId),
+    BusOn(BusId),
+}
+
+/// Breaks and mends.
+#[derive(Debug)]
+pub struct Trouble {
+    rng: Rng,
+    kinds: Vec<TroubleKind>,
+    pause: Duration,
+    next: Instant,
+    remedies: Vec<(Instant, Remedy)>,
+    counts: BTreeMap<TroubleKind, u64>,
+}
+
+impl Trouble {
+    /// Faults of these kinds, one each `pause` on average, from now on. A fault that lasts does so
+    /// for up to `pause` as well.
+    pub fn new(cell: &mut Cell, kinds: &[TroubleKind], pause: Duration) -> Self {
+        let mut trouble = Self {
+            rng: cell.fork_rng(),
+            kinds: kinds.to_vec(),
+            pause,
+            next: Instant::ZERO,
+            remedies: Vec::new(),
+            counts: BTreeMap::new(),
+        };
+        trouble.next = cell.now() + trouble.rng.up_to(pause.saturating_mul(2));
+        trouble
+    }
+
+    /// How many faults of each kind there were.
+    pub fn counts(&self) -> &BTreeMap<TroubleKind, u64> {
+        &self.counts
+    }
+
+    /// Lets time go by in the cell, with faults.
+    pub fn run(&mut self, cell: &mut Cell, span: Duration) {
+        let end = cell.now() + span;
+        loop {
+            let remedy = self.remedies.iter().map(|remedy| remedy.0).min().unwrap_or(Instant::NEVER);
+            let next = self.next.min(remedy).min(end);
+            cell.run(next.saturating_since(cell.now()));
+            if next >= end {
+                return;
+            }
+            self.poll(cell);
+        }
+    }
+
+    /// Mends everything that is broken at present.
+    pub fn mend(&mut self, cell: &mut Cell) {
+        for (_, remedy) in std::mem::take(&mut self.remedies) {
+            apply(cell, remedy);
+        }
+    }
+
+    fn poll(&mut self, cell: &mut Cell) {
+        let now = cell.now();
+        while let Some(nth) = self.remedies.iter().position(|remedy| remedy.0 <= now) {
+            let (_, remedy) = self.remedies.remove(nth);
+            apply(cell, remedy);
+        }
+        if now >= self.next {
+            self.next = now + Duration::from_micros(1) + self.rng.up_to(self.pause.saturating_mul(2));
+            if let Some(kind) = pick(&mut self.rng, self.kinds.iter().copied())
+                && self.begin(cell, kind).is_some()
+            {
+                *self.counts.entry(kind).or_default() += 1;
+            }
+        }
+    }
+
+    /// Breaks something; `None` when the cell has nothing of this kind.
+    fn begin(&mut self, cell: &mut Cell, kind: TroubleKind) -> Option<()> {
+        let rng = &mut self.rng;
+        let server = [Link::Command, Link::State, Link::Modbus][rng.below(3) as usize];
+        let way = if rng.below(2) == 0 { Way::Up } else { Way::Down };
+        let tcp: Vec<LinkId> = cell.tcp_links().collect();
+        let mut tcp = || pick(rng, tcp.iter().copied());
+        let remedy = match kind {
+            TroubleKind::Refused => {
+                let link = tcp()?;
+                cell.refuse(link);
+                cell.reset(link);
+                Some(Remedy::Admit(link))
+            }
+            TroubleKind::BlackHole => {
+                let link = tcp()?;
+                cell.black_hole(link);
+                cell.half_open(link);
+                Some(Remedy::Admit(link))
+            }
+            TroubleKind::Reset => {
+                cell.reset(tcp()?);
+                None
+            }
+            TroubleKind::ResetMidPacket => {
+                let link = tcp()?;
+                cell.reset_after(link, way, rng.between(1, 2_000) as usize);
+                None
+            }
+            TroubleKind::HalfOpen => {
+                cell.half_open(tcp()?);
+                None
+            }
+            TroubleKind::Stall => {
+                let link = tcp()?;
+                cell.hold(link, way);
+                Some(Remedy::Release(link))
+            }
+            TroubleKind::Datagrams => {
+                let tcp: Vec<LinkId> = cell.tcp_links().collect();
+                let links: Vec<LinkId> = cell.link_ids().filter(|link| !tcp.contains(link)).collect();
+                let link = pick(rng, links.into_iter())?;
+                let network = cell.network(link);
+                network.loss_ppm = rng.between(0, 500_000) as u32;
+                network.duplicate_ppm = rng.between(0, 200_000) as u32;
+                network.jitter = rng.up_to(Duration::from_millis(20));
+                Some(Remedy::Datagrams(link))
+            }
+            TroubleKind::Mute => {
+                cell.controller_mut().mute(server);
+                Some(Remedy::Unmute(server))
+            }
+            TroubleKind::SlowAnswers => {
+                let delay = rng.up_to(Duration::from_millis(1_500));
+                cell.controller_mut().delay_answers(server, delay);
+                Some(Remedy::Answers(server))
+            }
+            TroubleKind::Exception => {
+                let exceptions =
+                    [Exception::DeviceFailure, Exception::DeviceBusy, Exception::IllegalDataAddress];
+                let exception = pick(rng, exceptions.into_iter());
+                cell.controller_mut().answer_modbus_with(exception);
+                Some(Remedy::NoException)
+            }
+            TroubleKind::HalfStatePacket => {
+                let len = rng.between(0, 1_467) as usize;
+                cell.controller_mut().cut_next_state_packet(len);
+                None
+            }
+            TroubleKind::Noise => {
+                let line = pick(rng, cell.lines())?;
+                cell.line(line).noise_ppm = rng.between(100, 100_000) as u32;
+                Some(Remedy::Quiet(line))
+            }
+            TroubleKind::Garbage => {
+                let line = pick(rng, cell.lines())?;
+                let len = rng.between(1, 300) as usize;
+                let bytes = rng.bytes(len);
+                cell.send(line, &bytes);
+                None
+            }
+            TroubleKind::Cut => match (pick(rng, cell.lines()), pick(rng, cell.buses())) {
+                (Some(line), bus) if bus.is_none() || rng.below(2) == 0 => {
+                    cell.cut(line);
+                    Some(Remedy::Mend(line))
+                }
+                (_, bus) => {
+                    let bus = bus?;
+                    cell.cut_bus(bus);
+                    Some(Remedy::MendBus(bus))
+                }
+            },
+            TroubleKind::Unplugged => {
+                let line = pick(rng, cell.lines())?;
+                cell.unplug(line);
+                Some(Remedy::PlugIn(line))
+            }
+            TroubleKind::BusOff => {
+                let bus = pick(rng, cell.buses())?;
+                cell.bus_off(bus);
+                Some(Remedy::BusOn(bus))
+            }
+            TroubleKind::ControllerRestart => {
+                cell.restart_controller();
+                None
+            }
+            TroubleKind::GatewayRestart => {
+                cell.restart_gateway();
+                None
+            }
+        };
+        if let Some(remedy) = remedy {
+            let until = cell.now() + self.rng.up_to(self.pause);
+            self.remedies.push((until, remedy));
+        }
+        Some(())
+    }
+}
+
+fn apply(cell: &mut Cell, remedy: Remedy) {
+    match remedy {
+        Remedy::Admit(link) => cell.admit(link),
+        Remedy::Release(link) => {
+            cell.release(link, Way::Up);
+            cell.release(link, Way::Down);
+        }
+        Remedy::Datagrams(link) => *cell.network(link) = super::Network::default(),
+        Remedy::Unmute(server) => cell.controller_mut().unmute(server),
+        Remedy::Answers(server) => cell.controller_mut().delay_answers(server, Duration::ZERO),
+        Remedy::NoException => cell.controller_mut().answer_modbus_with(None),
+        Remedy::Quiet(line) => cell.line(line).noise_ppm = 0,
+        Remedy::Mend(line) => cell.mend(line),
+        Remedy::PlugIn(line) => cell.plug_in(line),
+        Remedy::MendBus(bus) => cell.mend_bus(bus),
+        Remedy::BusOn(bus) => cell.bus_on(bus),
+    }
+}
+
+fn pick<T>(rng: &mut Rng, all: impl Iterator<Item = T>) -> Option<T> {
+    let mut all: Vec<T> = all.collect();
+    let nth = rng.below(all.len() as u64) as usize;
+    (nth < all.len()).then(|| all.swap_remove(nth))
+}
