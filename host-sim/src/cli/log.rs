@@ -1,5 +1,7 @@
 //! Logging to stderr: stdout is for results.
 
+use std::io::{IsTerminal, stderr};
+
 use tracing_subscriber::EnvFilter;
 
 /// Warnings always; `-v` what happens, `-vv` everything. `RUST_LOG` decides when it is set.
@@ -11,5 +13,6 @@ pub(super) fn start(verbose: u8) {
     };
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
     // Fails only when somebody has set up logging before, which is as good.
-    let _ = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).try_init();
+    let format = tracing_subscriber::fmt().with_env_filter(filter).with_writer(stderr);
+    let _ = format.with_ansi(stderr().is_terminal()).try_init();
 }
