@@ -169,10 +169,11 @@ struct Link {
 
 impl Link {
     fn place(path: &Path, target: &Path) -> io::Result<Self> {
-        let placed = match symlink(target, path) {
+        let folder = path.parent().map_or(Ok(()), fs::create_dir_all);
+        let placed = folder.and_then(|()| match symlink(target, path) {
             Err(error) if error.kind() == io::ErrorKind::AlreadyExists => Self::replace(path, target),
             other => other,
-        };
+        });
         placed.map_err(|error| io::Error::new(error.kind(), format!("{}: {error}", path.display())))?;
         Ok(Self { path: path.to_owned(), target: target.to_owned() })
     }
@@ -308,6 +309,16 @@ mod tests {
                 }
             });
             quiet.await.unwrap_err();
+        });
+    }
+
+    #[test]
+    fn the_links_folder_is_made() {
+        run(async |link| {
+            let link = link.with_file_name("run").join("line");
+            let pty = Pty::open(&link).unwrap();
+            drop(client(&link));
+            drop(pty);
         });
     }
 

@@ -10,6 +10,7 @@ use std::rc::Rc;
 
 use proto_core::sysvar::SysVar;
 use proto_core::time::{Duration, Instant};
+use proto_core::wire::scalar::Scalar;
 use serde_json::{Value, json};
 use tokio::net::{TcpListener, UdpSocket};
 use tokio::sync::Notify;
@@ -350,9 +351,9 @@ impl ControllerShell {
         let controller = self.controller.borrow();
         let machine = controller.machine();
         let registers: serde_json::Map<_, _> = SysVar::all()
-            .map(|var| (var, controller.registers().var(var).as_f64()))
-            .filter(|&(_, value)| value != 0.0)
-            .map(|(var, value)| (var.to_string(), json!(value)))
+            .map(|var| (var, controller.registers().var(var)))
+            .filter(|(_, value)| value.as_f64() != 0.0)
+            .map(|(var, value)| (var.to_string(), number(value)))
             .collect();
         let mut stats = json!(controller.counters());
         if let Value::Object(stats) = &mut stats {
@@ -374,6 +375,15 @@ impl ControllerShell {
             stats.insert("registers".to_owned(), Value::Object(registers));
         }
         stats
+    }
+}
+
+/// A register as people write it: bits and words without a fraction.
+fn number(value: Scalar) -> Value {
+    match value {
+        Scalar::Byte(bits) => json!(bits),
+        Scalar::Word(word) => json!(word),
+        other => json!(other.as_f64()),
     }
 }
 

@@ -16,13 +16,14 @@ use serde_json::{Value, json};
 use tokio::net::{TcpListener, UdpSocket};
 use tokio::sync::Notify;
 use tokio::task::JoinSet;
-use tracing::{trace, warn};
+use tracing::{info, trace, warn};
 
 use super::host::{self, Handle, Shell};
 use super::link::{self, Endpoint, LinkControl, LinkEvent};
 use super::{RunOptions, StartError};
 use crate::bus::bind::Bind;
 use crate::bus::port::{Port, PortBus, PortEvent, PortTx};
+use crate::bus::realtime::{self, Scheduling};
 use crate::bus::timer::{Timer, now};
 
 /// A gateway whose ports and links are there, before anything moves.
@@ -251,7 +252,7 @@ impl Core {
 /// # Errors
 /// What kept it from starting; nothing is left behind then.
 pub fn run(config: GatewayConfig, options: RunOptions) -> Result<(), StartError> {
-    let handle = start(config, options.binds.clone())?;
+    let handle = spawn(config, options.binds.clone(), Scheduling::FifoIfAllowed)?;
     host::foreground(handle, &options)
 }
 
@@ -260,7 +261,15 @@ pub fn run(config: GatewayConfig, options: RunOptions) -> Result<(), StartError>
 /// # Errors
 /// What kept it from starting; nothing is left behind then.
 pub fn start(config: GatewayConfig, binds: Vec<Bind>) -> Result<Handle, StartError> {
-    host::start("gateway", async move || Gateway::open(&config, &binds).await)
+    spawn(config, binds, Scheduling::Ordinary)
+}
+
+fn spawn(config: GatewayConfig, binds: Vec<Bind>, scheduling: Scheduling) -> Result<Handle, StartError> {
+    host::start("gateway", async move || {
+        let gateway = Gateway::open(&config, &binds).await?;
+        info!(scheduling = %realtime::apply(scheduling), "the gateway runs");
+        Ok(gateway)
+    })
 }
 
 async fn open_port(port: &PortConfig, binds: &[Bind]) -> Result<Port, StartError> {
