@@ -315,14 +315,14 @@ fn what_keeps_it_from_starting_is_one_message_and_nothing_stays() {
     let serial = || example("rs485-system-controller.toml", &[]);
     let message = refused(serial(), &[]);
     assert!(message.starts_with("port rs485 is a serial line without a device: add --bind rs485=DEVICE"));
-    let message = refused(serial(), &["rs485-1=pty:/nowhere/x"]);
+    let message = refused(serial(), &["rs485-1=pty:/dev/null/x"]);
     assert!(message.contains("no port has this name; those that take a device: rs485"), "{message}");
     let message = refused(serial(), &["rs485=slcan-tcp:127.0.0.1:0"]);
     assert!(message.contains("is a CAN device; the port is a serial line"), "{message}");
-    let message = refused(example("udp-server-controller.toml", &[]), &["udp2011=pty:/nowhere/x"]);
+    let message = refused(example("udp-server-controller.toml", &[]), &["udp2011=pty:/dev/null/x"]);
     assert!(message.contains("takes no device"), "{message}");
-    let message = refused(serial(), &["rs485=pty:/nowhere/x"]);
-    assert!(message.starts_with("--bind rs485=pty:/nowhere/x: "), "{message}");
+    let message = refused(serial(), &["rs485=pty:/dev/null/x"]);
+    assert!(message.starts_with("--bind rs485=pty:/dev/null/x: "), "{message}");
 
     let folder = tempfile::tempdir().unwrap();
     let link = folder.path().join("rs485").display().to_string();
