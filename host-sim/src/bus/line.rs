@@ -19,6 +19,7 @@ use tracing::{debug, info, warn};
 
 use super::backoff::Backoff;
 use super::bind::{Device, HostPort, Pace};
+use super::connect::connect;
 use super::port::{PortEvent, PortTx};
 use super::pty::Pty;
 use super::timer::{Timer, now};
@@ -106,7 +107,7 @@ impl Line {
             Source::Connect(to) => {
                 let mut backoff = Backoff::new(StdDuration::from_millis(20), StdDuration::from_secs(2));
                 loop {
-                    match TcpStream::connect((to.host.as_str(), to.port)).await {
+                    match connect((to.host.as_str(), to.port)).await {
                         Ok(stream) => {
                             info!(%to, "connected");
                             backoff.reset();

@@ -158,7 +158,8 @@ fn a_serial_device_is_opened_with_any_rate_and_parity() {
 #[test]
 fn a_tcp_line_connects_when_its_server_appears_and_again_after_a_loss() {
     run(async |_| {
-        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        // An address of its own: no other test is given the port while nobody listens.
+        let listener = TcpListener::bind("127.0.0.78:0").await.unwrap();
         let at = listener.local_addr().unwrap();
         drop(listener);
         let port = Running::start(&format!("tcp:{at}"), line(115_200)).await;

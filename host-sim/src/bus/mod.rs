@@ -6,6 +6,7 @@
 pub mod backoff;
 pub mod bind;
 pub mod can_bus;
+pub(crate) mod connect;
 mod line;
 pub mod port;
 pub mod pty;

@@ -104,6 +104,8 @@ struct ControllerShell {
 struct Client {
     link: Link,
     connection: Rc<Connection>,
+    /// Not before the controller has seen it: it may turn it away.
+    subscribed: bool,
 }
 
 /// What a recipe port sends through.
@@ -313,7 +315,7 @@ impl ControllerShell {
     fn send_state(&self, packet: &[u8], now: Instant) {
         let mut connections = self.connections.borrow_mut();
         let mut dropped = Vec::new();
-        for (&conn, client) in connections.iter().filter(|(_, client)| client.link == Link::State) {
+        for (&conn, client) in connections.iter().filter(|(_, client)| client.subscribed) {
             match client.connection.blocked_since() {
                 Some(since) if now.saturating_since(since) >= STATE_PATIENCE => dropped.push(conn),
                 Some(_) => self.count(|counters| counters.skipped_state_packets += 1),

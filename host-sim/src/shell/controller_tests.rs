@@ -240,7 +240,8 @@ fn a_udp_client_is_streamed_to_until_its_port_is_unreachable() {
 
 #[test]
 fn the_clients_connect_out_when_they_can_and_again() {
-    let listener = StdListener::bind("127.0.0.1:0").unwrap();
+    // An address of its own: no other test is given the port while nobody listens.
+    let listener = StdListener::bind("127.0.0.77:0").unwrap();
     let at = listener.local_addr().unwrap();
     drop(listener);
     let udp = StdUdp::bind("127.0.0.1:0").unwrap();

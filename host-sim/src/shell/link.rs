@@ -14,6 +14,8 @@ use tokio::net::{TcpListener, TcpStream, UdpSocket};
 use tokio::sync::Notify;
 use tracing::{debug, info};
 
+use crate::bus::connect::connect;
+
 /// What a link connects to.
 #[derive(Debug)]
 pub(super) enum Endpoint {
@@ -119,7 +121,7 @@ pub(super) async fn run(
         let result = match endpoint {
             Endpoint::Tcp { host, port } => {
                 let connected = tokio::select! {
-                    connected = TcpStream::connect((host.as_str(), *port)) => connected,
+                    connected = connect((host.as_str(), *port)) => connected,
                     () = control.over(turn) => continue,
                 };
                 match connected {

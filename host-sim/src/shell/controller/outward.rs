@@ -4,11 +4,12 @@ use std::io;
 use std::rc::Rc;
 use std::time::Duration as StdDuration;
 
-use tokio::net::{TcpStream, UdpSocket};
+use tokio::net::UdpSocket;
 use tracing::{debug, info};
 
 use super::{ControllerShell, Outward, Report};
 use crate::bus::backoff::Backoff;
+use crate::bus::connect::connect;
 use crate::controller::ControllerInput;
 use crate::shell::tcp::{Connection, Event, Taken};
 
@@ -42,7 +43,7 @@ impl ControllerShell {
         let Some(Outward::Tcp(slot)) = self.ports.get(port) else { return };
         let mut backoff = Backoff::new(LEAST_PAUSE, MOST_PAUSE);
         loop {
-            match tokio::time::timeout(CONNECT_TIMEOUT, TcpStream::connect(&to)).await {
+            match tokio::time::timeout(CONNECT_TIMEOUT, connect(&to)).await {
                 Ok(Ok(stream)) => {
                     info!(%to, "connected");
                     backoff.reset();

@@ -38,12 +38,16 @@ impl ControllerShell {
         let conn = ConnId(self.next_connection.get());
         self.next_connection.set(conn.0 + 1);
         let (connection, read) = Connection::split(stream);
-        self.connections.borrow_mut().insert(conn, Client { link, connection: Rc::clone(&connection) });
+        let client = Client { link, connection: Rc::clone(&connection), subscribed: false };
+        self.connections.borrow_mut().insert(conn, client);
         self.input(match link {
             Link::Command => ControllerInput::CommandOpened { conn },
             Link::State => ControllerInput::StateOpened { conn },
             Link::Modbus => ControllerInput::ModbusOpened { conn },
         });
+        if let Some(client) = self.connections.borrow_mut().get_mut(&conn) {
+            client.subscribed = link == Link::State;
+        }
         if connection.is_closed() {
             warn!(?link, %peer, "refused");
         } else {
