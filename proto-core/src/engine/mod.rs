@@ -202,10 +202,11 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
 
     fn expire_frames(&mut self, now: Instant) {
         let mut timed_out = false;
-        while let Some(frame) = self.store.next_timeout(&self.safe_values, now) {
+        while let Some((frame, dropped)) = self.store.next_timeout(&self.safe_values, now) {
             timed_out = true;
             if let Some(port) = self.ports.get_mut(usize::from(frame.port)) {
                 bump(&mut port.counters.timeouts);
+                add(&mut port.counters.values_expired, dropped);
             }
             forget_commands(frame.bindings.of(&self.bindings.inputs), &mut self.links.command);
         }

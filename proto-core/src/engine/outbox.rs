@@ -117,10 +117,13 @@ impl Outbox {
         self.dirty = self.dirty.or(vars);
     }
 
-    /// Nothing of these variables is to be written any more.
-    pub(super) fn forget(&mut self, queue: &mut EdgeQueue, vars: &InputSet) {
+    /// Nothing of these variables is to be written any more; returns how many values waited.
+    pub(super) fn forget(&mut self, queue: &mut EdgeQueue, vars: &InputSet) -> usize {
+        let before = queue.0.len();
         queue.0.retain(|edge| !vars.contains(edge.var));
+        let dropped = self.dirty.and(vars).iter().count();
         self.dirty = self.dirty.minus(vars);
+        before.saturating_sub(queue.0.len()).saturating_add(dropped)
     }
 
     /// Drops what has waited for longer than `timeout`; returns how many values that were.

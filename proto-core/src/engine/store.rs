@@ -104,9 +104,9 @@ impl<const PORTS: usize> Store<PORTS> {
         reachable
     }
 
-    /// The first frame that is overdue at `now`, with its variables set to their safe values; call
-    /// again until `None`.
-    pub(super) fn next_timeout(&mut self, safe: &[SafeBytes], now: Instant) -> Option<InputFrame> {
+    /// The first frame that is overdue at `now`, with its variables set to their safe values, and how
+    /// many values that still waited were dropped; call again until `None`.
+    pub(super) fn next_timeout(&mut self, safe: &[SafeBytes], now: Instant) -> Option<(InputFrame, usize)> {
         if now < self.next_overdue {
             return None;
         }
@@ -118,9 +118,10 @@ impl<const PORTS: usize> Store<PORTS> {
         frame.overdue_at = Instant::NEVER;
         let frame = *frame;
         let queue = self.edges.get_mut(usize::from(frame.port))?;
+        let mut dropped = 0_usize;
         for var in frame.set.iter() {
             let Some(value) = safe.iter().find(|safe| safe.var == var) else {
-                self.outbox.forget(queue, &InputSet::from_iter([var]));
+                dropped = dropped.saturating_add(self.outbox.forget(queue, &InputSet::from_iter([var])));
                 self.live.remove(var);
                 self.read_back.remove(var);
                 continue;
@@ -132,7 +133,7 @@ impl<const PORTS: usize> Store<PORTS> {
             self.outbox.offer_safe(queue, var, value.bytes[0], now);
             self.safe.insert(var);
         }
-        Some(frame)
+        Some((frame, dropped))
     }
 
     /// Drops what has waited for longer than its port's timeout and counts it there.
