@@ -34,6 +34,7 @@ mod network;
 mod queue;
 mod rng;
 mod trace;
+mod traffic;
 mod trouble;
 
 use std::collections::BTreeMap;
@@ -54,7 +55,7 @@ pub use trace::{Entry, Trace, What};
 pub use trouble::{Trouble, TroubleKind};
 
 use crate::config::{InitialTarget, SimBus, SimConfig};
-use crate::controller::{BuildError, Controller};
+use crate::controller::{BuildError, ConnId, Controller, ControllerInput};
 use drive::Due;
 use network::{Connection, Gate};
 use queue::Queue;
@@ -131,6 +132,8 @@ pub struct Cell {
     controller_names: BTreeMap<String, Far>,
     rng: Rng,
     trace: Trace,
+    /// What the controller has sent to [`Cell::ask`]'s own connection.
+    asked: Vec<u8>,
 }
 
 /// What is at a port.
@@ -166,6 +169,7 @@ impl Cell {
             controller_names: BTreeMap::new(),
             rng: Rng::new(seed),
             trace: Trace::new(),
+            asked: Vec::new(),
         };
         cell.wire_gateway();
         cell.wire_controller(controller);
@@ -400,6 +404,18 @@ impl Cell {
         self.rng.fork()
     }
 
+    /// What the controller replies to a command of a client beside the gateway, at once or within
+    /// half a second.
+    pub fn ask(&mut self, command: &str) -> String {
+        let line = format!("{command}\r\n");
+        self.asked.clear();
+        self.controller_input(ControllerInput::CommandOpened { conn: DESK });
+        self.controller_input(ControllerInput::CommandBytes { conn: DESK, bytes: line.as_bytes() });
+        self.run_until(Duration::from_millis(500), |cell| !cell.asked.is_empty());
+        self.controller_input(ControllerInput::CommandClosed { conn: DESK });
+        String::from_utf8_lossy(&self.asked).into_owned()
+    }
+
     /// Lets time go by until `done` holds or `limit` has passed; returns whether it held. It is
     /// looked at every millisecond.
     pub fn run_until(&mut self, limit: Duration, mut done: impl FnMut(&Self) -> bool) -> bool {
@@ -443,6 +459,8 @@ fn udp_peer(turn: u64) -> SocketAddr {
     (Ipv4Addr::LOCALHOST, 40_000 + (turn % 10_000) as u16).into()
 }
 
+/// The connection of [`Cell::ask`].
+const DESK: ConnId = ConnId(u64::MAX);
 /// Not zero, so that nothing depends on the clock's origin, and on no grid of the engine.
 const START: Instant = Instant::from_micros(1_000_000_300);
 /// How long the controller's TCP client waits before it connects again.
