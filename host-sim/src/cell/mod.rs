@@ -3,7 +3,7 @@
 //!
 //! In: a gateway configuration, a controller configuration and a seed. Out: whatever happens, the
 //! same for the same seed ([`Cell::trace`] has a digest to compare). Hours of a cell take seconds.
-//! Knows no socket, no device and no clock.
+//! Knows no socket, no device and no clock (docs/cell.md).
 //!
 //! ```
 //! use host_sim::cell::Cell;

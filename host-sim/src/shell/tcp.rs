@@ -2,16 +2,14 @@
 //! where it does not.
 
 use std::cell::{Cell, RefCell};
-use std::future::poll_fn;
 use std::io;
-use std::pin::Pin;
 use std::rc::Rc;
-use std::task::{Context, Poll, Waker};
 
 use proto_core::time::Instant;
-use tokio::io::{AsyncRead, ReadBuf};
+use tokio::io::AsyncReadExt;
 use tokio::net::TcpStream;
 use tokio::net::tcp::{OwnedReadHalf, OwnedWriteHalf};
+use tokio::sync::Notify;
 
 use crate::bus::timer::now;
 
@@ -22,8 +20,7 @@ pub(super) struct Connection {
     out: RefCell<Vec<u8>>,
     blocked_since: Cell<Option<Instant>>,
     end: Cell<End>,
-    /// Of the task that runs it; one task does, so this is cheaper than a [`tokio::sync::Notify`].
-    runner: RefCell<Option<Waker>>,
+    wake: Notify,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -67,7 +64,7 @@ impl Connection {
             out: RefCell::default(),
             blocked_since: Cell::new(None),
             end: Cell::new(End::Open),
-            runner: RefCell::default(),
+            wake: Notify::new(),
         };
         (Rc::new(connection), read)
     }
@@ -98,7 +95,7 @@ impl Connection {
         }
         if out.is_empty() {
             self.blocked_since.set(Some(now()));
-            self.wake();
+            self.wake.notify_one();
         }
         out.extend_from_slice(rest);
         Taken::Later
@@ -113,14 +110,14 @@ impl Connection {
     pub(super) fn close(&self) {
         if self.end.get() == End::Open {
             self.end.set(End::Flush);
-            self.wake();
+            self.wake.notify_one();
         }
     }
 
     /// Closes at once.
     pub(super) fn abort(&self) {
         self.end.set(End::Abort);
-        self.wake();
+        self.wake.notify_one();
     }
 
     /// Whether it was closed from this side.
@@ -142,63 +139,22 @@ impl Connection {
                 End::Abort => return Ok(()),
                 End::Flush => return self.linger().await,
             }
-            if self.out.borrow().is_empty() {
-                match poll_fn(|cx| self.poll_received(cx, &mut read, &mut buf)).await {
-                    None => {}
-                    Some(received) => match received? {
-                        0 => return Ok(()),
-                        count => event(Event::Bytes(&buf[..count])),
-                    },
+            let keeps = !self.out.borrow().is_empty();
+            tokio::select! {
+                biased;
+                received = read.read(&mut buf), if !keeps => match received? {
+                    0 => return Ok(()),
+                    count => event(Event::Bytes(&buf[..count])),
+                },
+                ready = self.write.writable(), if keeps => {
+                    ready?;
+                    self.flush()?;
+                    if self.out.borrow().is_empty() {
+                        event(Event::Drained);
+                    }
                 }
-            } else {
-                poll_fn(|cx| self.poll_room(cx)).await?;
-                self.flush()?;
-                if self.out.borrow().is_empty() {
-                    event(Event::Drained);
-                }
+                () = self.wake.notified() => {}
             }
-        }
-    }
-
-    /// Bytes, or `None` when there is something else to do first.
-    fn poll_received(
-        &self,
-        cx: &mut Context<'_>,
-        read: &mut OwnedReadHalf,
-        buf: &mut [u8],
-    ) -> Poll<Option<io::Result<usize>>> {
-        if self.is_closed() || !self.out.borrow().is_empty() {
-            return Poll::Ready(None);
-        }
-        let mut buf = ReadBuf::new(buf);
-        match Pin::new(read).poll_read(cx, &mut buf) {
-            Poll::Ready(done) => Poll::Ready(Some(done.map(|()| buf.filled().len()))),
-            Poll::Pending => {
-                self.wake_me(cx);
-                Poll::Pending
-            }
-        }
-    }
-
-    /// Room to send in, or a reason to look at the end.
-    fn poll_room(&self, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
-        if self.is_closed() {
-            return Poll::Ready(Ok(()));
-        }
-        self.wake_me(cx);
-        self.write.as_ref().poll_write_ready(cx)
-    }
-
-    fn wake_me(&self, cx: &Context<'_>) {
-        let mut runner = self.runner.borrow_mut();
-        if !runner.as_ref().is_some_and(|runner| runner.will_wake(cx.waker())) {
-            *runner = Some(cx.waker().clone());
-        }
-    }
-
-    fn wake(&self) {
-        if let Some(runner) = self.runner.borrow().as_ref() {
-            runner.wake_by_ref();
         }
     }
 
