@@ -38,8 +38,8 @@ impl Pty {
     /// left it. Anything else is not touched.
     ///
     /// # Errors
-    /// With the path in the message: the link's directory is missing, something else is there, or the
-    /// system has no pseudoterminal left.
+    /// With the path in the message: the link's directory cannot be made, something else is there, or
+    /// the system has no pseudoterminal left.
     pub fn open(link: &Path) -> io::Result<Self> {
         let flags = OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC;
         let master = openpt(flags)?;

@@ -2,14 +2,16 @@
 //! where it does not.
 
 use std::cell::{Cell, RefCell};
+use std::future::poll_fn;
 use std::io;
+use std::pin::Pin;
 use std::rc::Rc;
+use std::task::{Context, Poll, Waker};
 
 use proto_core::time::Instant;
-use tokio::io::AsyncReadExt;
+use tokio::io::{AsyncRead, ReadBuf};
 use tokio::net::TcpStream;
 use tokio::net::tcp::{OwnedReadHalf, OwnedWriteHalf};
-use tokio::sync::Notify;
 
 use crate::bus::timer::now;
 
@@ -20,7 +22,8 @@ pub(super) struct Connection {
     out: RefCell<Vec<u8>>,
     blocked_since: Cell<Option<Instant>>,
     end: Cell<End>,
-    wake: Notify,
+    /// Of the task that runs it; one task does, so this is cheaper than a [`tokio::sync::Notify`].
+    runner: RefCell<Option<Waker>>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -64,7 +67,7 @@ impl Connection {
             out: RefCell::default(),
             blocked_since: Cell::new(None),
             end: Cell::new(End::Open),
-            wake: Notify::new(),
+            runner: RefCell::default(),
         };
         (Rc::new(connection), read)
     }
@@ -95,7 +98,7 @@ impl Connection {
         }
         if out.is_empty() {
             self.blocked_since.set(Some(now()));
-            self.wake.notify_one();
+            self.wake();
         }
         out.extend_from_slice(rest);
         Taken::Later
@@ -110,14 +113,14 @@ impl Connection {
     pub(super) fn close(&self) {
         if self.end.get() == End::Open {
             self.end.set(End::Flush);
-            self.wake.notify_one();
+            self.wake();
         }
     }
 
     /// Closes at once.
     pub(super) fn abort(&self) {
         self.end.set(End::Abort);
-        self.wake.notify_one();
+        self.wake();
     }
 
     /// Whether it was closed from this side.
@@ -139,22 +142,63 @@ impl Connection {
                 End::Abort => return Ok(()),
                 End::Flush => return self.linger().await,
             }
-            let keeps = !self.out.borrow().is_empty();
-            tokio::select! {
-                biased;
-                received = read.read(&mut buf), if !keeps => match received? {
-                    0 => return Ok(()),
-                    count => event(Event::Bytes(&buf[..count])),
-                },
-                ready = self.write.writable(), if keeps => {
-                    ready?;
-                    self.flush()?;
-                    if self.out.borrow().is_empty() {
-                        event(Event::Drained);
-                    }
+            if self.out.borrow().is_empty() {
+                match poll_fn(|cx| self.poll_received(cx, &mut read, &mut buf)).await {
+                    None => {}
+                    Some(received) => match received? {
+                        0 => return Ok(()),
+                        count => event(Event::Bytes(&buf[..count])),
+                    },
                 }
-                () = self.wake.notified() => {}
+            } else {
+                poll_fn(|cx| self.poll_room(cx)).await?;
+                self.flush()?;
+                if self.out.borrow().is_empty() {
+                    event(Event::Drained);
+                }
             }
+        }
+    }
+
+    /// Bytes, or `None` when there is something else to do first.
+    fn poll_received(
+        &self,
+        cx: &mut Context<'_>,
+        read: &mut OwnedReadHalf,
+        buf: &mut [u8],
+    ) -> Poll<Option<io::Result<usize>>> {
+        if self.is_closed() || !self.out.borrow().is_empty() {
+            return Poll::Ready(None);
+        }
+        let mut buf = ReadBuf::new(buf);
+        match Pin::new(read).poll_read(cx, &mut buf) {
+            Poll::Ready(done) => Poll::Ready(Some(done.map(|()| buf.filled().len()))),
+            Poll::Pending => {
+                self.wake_me(cx);
+                Poll::Pending
+            }
+        }
+    }
+
+    /// Room to send in, or a reason to look at the end.
+    fn poll_room(&self, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
+        if self.is_closed() {
+            return Poll::Ready(Ok(()));
+        }
+        self.wake_me(cx);
+        self.write.as_ref().poll_write_ready(cx)
+    }
+
+    fn wake_me(&self, cx: &Context<'_>) {
+        let mut runner = self.runner.borrow_mut();
+        if !runner.as_ref().is_some_and(|runner| runner.will_wake(cx.waker())) {
+            *runner = Some(cx.waker().clone());
+        }
+    }
+
+    fn wake(&self) {
+        if let Some(runner) = self.runner.borrow().as_ref() {
+            runner.wake_by_ref();
         }
     }
 
