@@ -10,7 +10,7 @@
         clippy::arithmetic_side_effects
     )
 )]
-//! Wire formats, recipes and the gateway engine for the DUCO CORE controller.
+#![doc = include_str!("../README.md")]
 
 #[cfg(any(test, feature = "std"))]
 extern crate std;
