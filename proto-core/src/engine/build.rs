@@ -19,7 +19,7 @@ use super::store::{InputFrame, MAX_INPUT_FRAMES, SafeBytes, Store};
 use super::uplink::Uplink;
 use super::user::{Bindings, InputBind};
 use crate::config::{
-    Bus, ConfigError, FieldSpec, GatewayConfig, InputBinding, Parts, Port, Recipe, Span, StreamPart,
+    Bus, ConfigError, FieldSpec, GatewayConfig, InputBinding, Parts, Port, Recipe, SendOn, Span, StreamPart,
 };
 use crate::image::{GroupId, InputSet, MAX_GROUPS};
 use crate::link::{LinkTimings, Supervisor};
@@ -105,7 +105,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             bindings: Bindings { inputs: Vec::new(), outputs: Vec::new() },
             safe_values: config.safe_values.iter().map(SafeBytes::new).collect(),
             links: Links::new(),
+            watches_bits: false,
             timer_at: Instant::ZERO,
+            rearm: true,
         };
         for (index, port, recipe) in config.field_ports() {
             engine.add_port(config, index, port, recipe, dialect)?;
@@ -189,6 +191,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
                 outputs.len = outputs.len.saturating_add(1);
             }
         }
+        self.watches_bits |= matches!(recipe.send, SendOn::Rising { .. });
         let has_output = recipe.has(Direction::Output);
         let sender = Sender::new(recipe.send, recipe.on_stale, port.stale_after, port.cycle, has_output);
         let port = FieldPort {

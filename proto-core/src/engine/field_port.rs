@@ -259,7 +259,7 @@ impl FieldPort {
 
     /// Whether a frame may be handed over now.
     pub(super) fn may_send(&self, now: Instant) -> bool {
-        self.is_usable() && self.sender.is_due() && now >= self.line.quiet_at()
+        self.sender.is_due() && self.is_usable() && now >= self.line.quiet_at()
     }
 
     /// Whether what is handed over now can leave.

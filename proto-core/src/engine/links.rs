@@ -223,21 +223,50 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
 
     /// Links to be opened and closed.
     pub(super) fn next_action(&mut self) -> Option<(LinkId, LinkAction)> {
-        let command = self.command.iter_mut().map(|link| (LinkId::COMMAND, &mut link.supervisor));
-        let state = self.state.iter_mut().map(|link| (LinkId::STATE, &mut link.supervisor));
-        let modbus = self.modbus.iter_mut().map(|link| (LinkId::MODBUS, &mut link.supervisor));
-        let recipes = self.recipes.iter_mut().map(|link| (link.id, &mut link.supervisor));
-        let mut all = command.chain(state).chain(modbus).chain(recipes);
-        all.find_map(|(id, supervisor)| supervisor.take_action().map(|action| (id, action)))
+        if let Some(action) = self.command.as_mut().and_then(|link| link.supervisor.take_action()) {
+            return Some((LinkId::COMMAND, action));
+        }
+        if let Some(action) = self.state.as_mut().and_then(|link| link.supervisor.take_action()) {
+            return Some((LinkId::STATE, action));
+        }
+        if let Some(action) = self.modbus.as_mut().and_then(|link| link.supervisor.take_action()) {
+            return Some((LinkId::MODBUS, action));
+        }
+        let mut recipes = self.recipes.iter_mut();
+        recipes.find_map(|link| link.supervisor.take_action().map(|action| (link.id, action)))
     }
 
     /// When something happens by itself.
     pub(super) fn deadline(&self) -> Instant {
-        let command = self.command.iter().map(|link| link.deadline().min(link.supervisor.deadline()));
-        let state = self.state.iter().map(|link| link.supervisor.deadline());
-        let modbus = self.modbus.iter().map(|link| link.deadline().min(link.supervisor.deadline()));
-        let recipes = self.recipes.iter().map(|link| link.deadline().min(link.supervisor.deadline()));
-        command.chain(state).chain(modbus).chain(recipes).min().unwrap_or(Instant::NEVER)
+        let mut first = self.deadline_of(LinkId::COMMAND);
+        first = first.min(self.deadline_of(LinkId::STATE)).min(self.deadline_of(LinkId::MODBUS));
+        for link in &self.recipes {
+            first = first.min(link.deadline()).min(link.supervisor.deadline());
+        }
+        first
+    }
+
+    /// When something happens by itself on one link.
+    pub(super) fn deadline_of(&self, id: LinkId) -> Instant {
+        let (own, supervisor) = match id {
+            LinkId::COMMAND => match &self.command {
+                Some(link) => (link.deadline(), &link.supervisor),
+                None => return Instant::NEVER,
+            },
+            LinkId::STATE => match &self.state {
+                Some(link) => (Instant::NEVER, &link.supervisor),
+                None => return Instant::NEVER,
+            },
+            LinkId::MODBUS => match &self.modbus {
+                Some(link) => (link.deadline(), &link.supervisor),
+                None => return Instant::NEVER,
+            },
+            _ => match self.recipes.iter().find(|link| link.id == id) {
+                Some(link) => (link.deadline(), &link.supervisor),
+                None => return Instant::NEVER,
+            },
+        };
+        own.min(supervisor.deadline())
     }
 
     fn recipe(&mut self, id: LinkId) -> Option<&mut Uplink> {

@@ -69,8 +69,12 @@ pub struct Engine<const PORTS: usize = 8, const UPLINKS: usize = 4, const FIELDS
     bindings: Bindings<FIELDS>,
     safe_values: Vec<SafeBytes, MAX_SAFE_VALUES>,
     links: Links<UPLINKS>,
-    /// Nothing depends on the clock before this.
+    /// Whether some port sends on a rising bit.
+    watches_bits: bool,
+    /// Nothing depends on the clock before this. It may be earlier than needed, never later.
     timer_at: Instant,
+    /// The clock was looked at since `timer_at` was worked out.
+    rearm: bool,
 }
 
 impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS, UPLINKS, FIELDS> {
@@ -82,53 +86,50 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         if now >= self.timer_at {
             self.advance(now);
         }
-        let mut accepted = Accepted::default();
+        // Whatever happens may set an earlier deadline; what it makes later is found out in time.
         match input {
-            Input::PortBytes { port, bytes } => {
+            Input::PortBytes { port: id, bytes } => {
                 let (store, command) = (&mut self.store, &mut self.links.command);
-                if let Some(port) = find_port(&mut self.ports, port) {
-                    accepted = port.bytes(bytes, &self.bindings.inputs, store, command, now);
-                }
-                self.after_field(port, &accepted, now);
+                let Some(port) = find_port(&mut self.ports, id) else { return };
+                let accepted = port.bytes(bytes, &self.bindings.inputs, store, command, now);
+                let deadline = port.deadline();
+                self.arm(deadline);
+                self.after_field(id, &accepted, now);
             }
-            Input::PortCan { port, frame } => {
+            Input::PortCan { port: id, frame } => {
                 let (store, command) = (&mut self.store, &mut self.links.command);
-                if let Some(port) = find_port(&mut self.ports, port) {
-                    accepted = port.can(&frame, &self.bindings.inputs, store, command, now);
-                }
-                self.after_field(port, &accepted, now);
+                let Some(port) = find_port(&mut self.ports, id) else { return };
+                let accepted = port.can(&frame, &self.bindings.inputs, store, command, now);
+                let deadline = port.deadline();
+                self.arm(deadline);
+                self.after_field(id, &accepted, now);
             }
-            Input::PortSent { port } => {
-                if let Some(port) = find_port(&mut self.ports, port) {
-                    port.sender.sent();
-                }
+            Input::PortSent { port } => self.change_port(port, |port| port.sender.sent()),
+            Input::PortUp { port } => self.change_port(port, FieldPort::up),
+            Input::PortDown { port: id } => {
+                let Some(port) = find_port(&mut self.ports, id) else { return };
+                port.down(&self.bindings.inputs, &mut self.links.command);
             }
-            Input::PortUp { port } => {
-                if let Some(port) = find_port(&mut self.ports, port) {
-                    port.up();
-                }
+            Input::PortBus { port, state } => self.change_port(port, |port| port.bus_state(state)),
+            Input::LinkUp { link } => {
+                self.links.up(link, &mut self.store, now);
+                self.arm(self.links.deadline_of(link));
             }
-            Input::PortDown { port } => {
-                if let Some(port) = find_port(&mut self.ports, port) {
-                    port.down(&self.bindings.inputs, &mut self.links.command);
-                }
+            Input::LinkDown { link } => {
+                self.links.down(link, &mut self.store, &mut self.ports, now);
+                self.arm(self.links.deadline_of(link));
             }
-            Input::PortBus { port, state } => {
-                if let Some(port) = find_port(&mut self.ports, port) {
-                    port.bus_state(state);
-                }
-            }
-            Input::LinkUp { link } => self.links.up(link, &mut self.store, now),
-            Input::LinkDown { link } => self.links.down(link, &mut self.store, &mut self.ports, now),
             Input::LinkBytes { link, bytes } => {
                 self.links.bytes(link, bytes, &mut self.store, &mut self.ports, now);
+                self.arm(self.links.deadline_of(link));
                 self.image_changed();
             }
-            Input::LinkSent { link } => self.links.sent(link),
+            Input::LinkSent { link } => {
+                self.links.sent(link);
+                self.arm(self.links.deadline_of(link));
+            }
             Input::Tick => {}
         }
-        // Whatever happened may have set an earlier deadline: the next poll looks at all of them.
-        self.timer_at = Instant::ZERO;
     }
 
     /// What the driver has to do next; call it again until it is [`Output::Sleep`].
@@ -142,6 +143,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         }
         if let Some((link, len)) = self.links.next_upward(&mut self.store, &mut self.ports, &mut buf[..], now)
         {
+            self.arm(self.links.deadline_of(link));
             return Output::LinkSend { link, bytes: buf.get(..len).unwrap_or(&[]) };
         }
         if let Some((link, action)) = self.links.next_action() {
@@ -156,7 +158,10 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             }
             Some((port, Downward::Can(frame))) => Output::PortSendCan { port, frame },
             None => {
-                self.timer_at = self.next_deadline();
+                if self.rearm {
+                    self.rearm = false;
+                    self.timer_at = self.next_deadline();
+                }
                 Output::Sleep { until: self.timer_at }
             }
         }
@@ -187,10 +192,24 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         self.links.infos()
     }
 
+    /// Something depends on the clock from `at` on.
+    fn arm(&mut self, at: Instant) {
+        self.timer_at = self.timer_at.min(at);
+    }
+
+    fn change_port(&mut self, id: PortId, change: impl FnOnce(&mut FieldPort)) {
+        if let Some(port) = find_port(&mut self.ports, id) {
+            change(port);
+            let deadline = port.deadline();
+            self.arm(deadline);
+        }
+    }
+
     /// Everything that depends on the clock.
     fn advance(&mut self, now: Instant) {
         // At one instant the clock is looked at once: what is done now is due later.
         self.timer_at = now + Duration::from_micros(1);
+        self.rearm = true;
         self.expire_frames(now);
         for index in 0..self.ports.len() {
             if let Some(port) = self.ports.get_mut(index) {
@@ -229,6 +248,11 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         if accepted.frames == 0 {
             return;
         }
+        self.arm(self.store.deadline());
+        if let Some(command) = &self.links.command {
+            let deadline = command.deadline();
+            self.arm(deadline);
+        }
         self.image_changed();
         let dirty = self.store.outbox.dirty().and(&accepted.set);
         let state = self.links.state.as_ref().map(|state| state.group);
@@ -242,10 +266,15 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         }
     }
 
+    /// Values in the image changed: bits that trigger may have risen.
     fn image_changed(&mut self) {
+        if !self.watches_bits {
+            return;
+        }
         for port in &mut self.ports {
             let usable = port.is_usable();
             port.sender.image_changed(&self.store.image, usable, &mut port.counters);
+            self.timer_at = self.timer_at.min(port.deadline());
         }
     }
 
@@ -265,7 +294,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     fn next_deadline(&self) -> Instant {
         let ports = self.ports.iter().map(FieldPort::deadline);
         let ports = ports.min().unwrap_or(Instant::NEVER);
-        ports.min(self.links.deadline()).min(self.store.next_overdue)
+        ports.min(self.links.deadline()).min(self.store.deadline())
     }
 }
 

@@ -4,6 +4,7 @@
 use heapless::Vec;
 
 use super::counters::{LinkCounters, add, bump};
+use super::outbox::BIT_VARS;
 use super::store::Store;
 use crate::image::{GroupId, InputSet};
 use crate::link::{LinkTimings, Supervisor};
@@ -289,45 +290,31 @@ impl ModbusLink {
         out: &mut [u8],
     ) -> Option<(usize, Asked)> {
         let first = pending.iter().find(|var| var.ordinal() >= self.cursor).or(pending.iter().next())?;
-        let mut payload = [0; INPUT_BYTES];
-        let mut vars = InputSet::EMPTY;
-        let mut len = 0_usize;
-        let mut next = Some(first);
         let (address, kind) = place_of(first)?;
-        let mut end = address;
-        while let Some(var) = next {
-            let Some((at, var_kind)) = place_of(var) else { break };
-            let full = match kind {
-                Kind::Coils => end.saturating_sub(address) >= MAX_WRITE_COILS.saturating_sub(8),
-                Kind::Registers => end.saturating_sub(address) >= MAX_WRITE_REGISTERS,
-            };
-            if !pending.contains(var) || var_kind != kind || at != end || full {
-                break;
+        let (each, most) = match (kind, first.modbus()) {
+            (Kind::Coils, Some(ModbusPlace::Coils { count, .. })) => (count.max(1), MAX_WRITE_COILS),
+            _ => (1, MAX_WRITE_REGISTERS),
+        };
+        // Variables of one row of the table follow each other in the map as they do in the image.
+        let left_in_row = first.span().last.saturating_sub(first.index()).saturating_add(1);
+        let most = usize::from(most.checked_div(each).unwrap_or(1).min(u16::from(left_in_row)));
+        let count = pending.run_len(first).min(most);
+        let items = each.saturating_mul(count as u16);
+        let vars = InputSet::run(first, count);
+        self.cursor = first.ordinal().saturating_add(count);
+        let mut bits = [0; BIT_VARS];
+        if kind == Kind::Coils {
+            for (place, var) in bits.iter_mut().zip(vars.iter()) {
+                *place = store.outbox.bit_value(var);
             }
-            let room = payload.get_mut(len..)?;
-            end = end.saturating_add(match (kind, var.modbus()) {
-                (Kind::Coils, Some(ModbusPlace::Coils { count, .. })) => {
-                    *room.first_mut()? = store.outbox.bit_value(var);
-                    count
-                }
-                _ => {
-                    store.image.value(var).encode(room)?;
-                    1
-                }
-            });
-            len = len.saturating_add(var.size());
-            vars.insert(var);
-            self.cursor = var.ordinal().saturating_add(1);
-            next = SysVar::from_ordinal(self.cursor);
         }
-        let values = payload.get(..len)?;
         let mut registers = [0; INPUT_BYTES];
         let request = match kind {
-            Kind::Coils => {
-                Request::WriteCoils { address, coils: Coils::new(values, end.saturating_sub(address))? }
-            }
+            Kind::Coils => Request::WriteCoils { address, coils: Coils::new(bits.get(..count)?, items)? },
             Kind::Registers => {
-                let registers = Registers::from_little_endian(values, &mut registers)?;
+                let start = first.image_offset();
+                let words = store.image.bytes().get(start..start.saturating_add(count.saturating_mul(2)))?;
+                let registers = Registers::from_little_endian(words, &mut registers)?;
                 Request::WriteRegisters { address, registers }
             }
         };

@@ -126,35 +126,51 @@ impl Outbox {
         before.saturating_sub(queue.0.len()).saturating_add(dropped)
     }
 
-    /// Drops what has waited for longer than `timeout`; returns how many values that were.
+    /// Drops what has waited for longer than `timeout`; returns how many values that were, and since
+    /// when the oldest of the others waits.
     pub(super) fn expire(
         &mut self,
         queue: &mut EdgeQueue,
         vars: &InputSet,
         timeout: Duration,
         now: Instant,
-    ) -> usize {
+    ) -> (usize, Instant) {
         let before = queue.0.len();
         queue.0.retain(|edge| now.saturating_since(edge.at) <= timeout);
         let mut dropped = before.saturating_sub(queue.0.len());
+        let mut oldest = queue.0.iter().map(|edge| edge.at).min().unwrap_or(Instant::NEVER);
+        let mut expired = InputSet::EMPTY;
         for var in self.dirty.and(vars).iter() {
             let Some(slot) = self.bits.get(var.ordinal()) else { break };
             if now.saturating_since(slot.at) > timeout {
                 dropped = dropped.saturating_add(1);
-                self.taken(queue, var);
+                expired.insert(var);
+            } else {
+                oldest = oldest.min(slot.at);
             }
         }
-        dropped
+        self.taken(&expired);
+        self.next_edges(queue, &expired);
+        (dropped, oldest)
     }
 
-    /// The variable's value has been handed to its link: the next one, if any, takes its place.
-    pub(super) fn taken(&mut self, queue: &mut EdgeQueue, var: SysVar) {
-        self.dirty.remove(var);
-        let next = queue.0.iter().position(|edge| edge.var == var);
-        if let (Some(at), Some(slot)) = (next, self.bits.get_mut(var.ordinal())) {
-            let edge = queue.0.remove(at);
-            *slot = BitSlot { value: edge.value, at: edge.at };
-            self.dirty.insert(var);
+    /// The variables' values have been handed to their link.
+    pub(super) fn taken(&mut self, vars: &InputSet) {
+        self.dirty = self.dirty.minus(vars);
+    }
+
+    /// For byte variables whose value was taken: the next one in the queue, if any, takes its place.
+    pub(super) fn next_edges(&mut self, queue: &mut EdgeQueue, bits: &InputSet) {
+        if queue.0.is_empty() {
+            return;
+        }
+        for var in bits.iter() {
+            let next = queue.0.iter().position(|edge| edge.var == var);
+            if let (Some(at), Some(slot)) = (next, self.bits.get_mut(var.ordinal())) {
+                let edge = queue.0.remove(at);
+                *slot = BitSlot { value: edge.value, at: edge.at };
+                self.dirty.insert(var);
+            }
         }
     }
 }
@@ -191,7 +207,9 @@ mod tests {
             let mut written = std::vec::Vec::new();
             while self.outbox.dirty().contains(var) {
                 written.push(self.outbox.bit_value(var));
-                self.outbox.taken(&mut self.queue, var);
+                let set = InputSet::from_iter([var]);
+                self.outbox.taken(&set);
+                self.outbox.next_edges(&mut self.queue, &set);
             }
             written
         }
@@ -277,8 +295,9 @@ mod tests {
         }
         let set = InputSet::from_iter([a]);
         let now = Instant::from_millis(12);
-        let dropped = bench.outbox.expire(&mut bench.queue, &set, Duration::from_millis(9), now);
+        let (dropped, oldest) = bench.outbox.expire(&mut bench.queue, &set, Duration::from_millis(9), now);
         assert_eq!(dropped, 2, "the values of 1 and 2 ms");
+        assert_eq!(oldest, Instant::from_millis(3));
         assert_eq!(bench.drain(a), [0]);
     }
 }

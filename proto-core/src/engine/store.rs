@@ -61,7 +61,9 @@ pub(super) struct Store<const PORTS: usize> {
     /// Variables whose link is up.
     pub reachable: InputSet,
     /// No frame is overdue before this.
-    pub next_overdue: Instant,
+    next_overdue: Instant,
+    /// No value has waited too long before this.
+    next_expiry: Instant,
 }
 
 impl<const PORTS: usize> Store<PORTS> {
@@ -76,6 +78,7 @@ impl<const PORTS: usize> Store<PORTS> {
             read_back: InputSet::EMPTY,
             reachable: InputSet::EMPTY,
             next_overdue: Instant::NEVER,
+            next_expiry: Instant::NEVER,
         }
     }
 
@@ -85,6 +88,7 @@ impl<const PORTS: usize> Store<PORTS> {
         let Some(frame) = self.frames.get_mut(nth) else { return InputSet::EMPTY };
         frame.overdue_at = now + frame.timeout;
         self.next_overdue = self.next_overdue.min(frame.overdue_at);
+        self.next_expiry = self.next_expiry.min(too_old_at(now, frame.timeout));
         let (set, port) = (frame.set, usize::from(frame.port));
         self.image.stamp(GroupId(nth as u8), now);
         self.live = self.live.or(&set);
@@ -138,6 +142,10 @@ impl<const PORTS: usize> Store<PORTS> {
 
     /// Drops what has waited for longer than its port's timeout and counts it there.
     pub(super) fn expire_waiting(&mut self, mut count: impl FnMut(usize, usize), now: Instant) {
+        if now < self.next_expiry {
+            return;
+        }
+        self.next_expiry = Instant::NEVER;
         for frame in &self.frames {
             let waiting = frame.set.and(&InputSet::BYTES).and(&self.outbox.dirty()).minus(&self.safe);
             if waiting.is_empty() {
@@ -145,7 +153,8 @@ impl<const PORTS: usize> Store<PORTS> {
             }
             let port = usize::from(frame.port);
             if let Some(queue) = self.edges.get_mut(port) {
-                let dropped = self.outbox.expire(queue, &waiting, frame.timeout, now);
+                let (dropped, oldest) = self.outbox.expire(queue, &waiting, frame.timeout, now);
+                self.next_expiry = self.next_expiry.min(too_old_at(oldest, frame.timeout));
                 if dropped > 0 {
                     count(port, dropped);
                 }
@@ -153,13 +162,18 @@ impl<const PORTS: usize> Store<PORTS> {
         }
     }
 
+    /// When something happens by itself.
+    pub(super) fn deadline(&self) -> Instant {
+        self.next_overdue.min(self.next_expiry)
+    }
+
     /// These values have been handed to their link.
     pub(super) fn taken(&mut self, vars: &InputSet) {
-        for var in vars.iter() {
-            let owner = self.image.group(var).and_then(|group| self.frames.get(usize::from(group.0)));
-            let queue = owner.and_then(|frame| self.edges.get_mut(usize::from(frame.port)));
-            if let Some(queue) = queue {
-                self.outbox.taken(queue, var);
+        self.outbox.taken(vars);
+        let bits = vars.and(&InputSet::BYTES);
+        if !bits.is_empty() {
+            for queue in &mut self.edges {
+                self.outbox.next_edges(queue, &bits);
             }
         }
     }
@@ -182,4 +196,9 @@ impl<const PORTS: usize> Store<PORTS> {
     pub(super) fn again(&mut self, safe: &InputSet) {
         self.outbox.again(&safe.and(&self.safe));
     }
+}
+
+/// When a value that waits since `at` has waited longer than `timeout`.
+fn too_old_at(at: Instant, timeout: Duration) -> Instant {
+    at + timeout + Duration::from_micros(1)
 }

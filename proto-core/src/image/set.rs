@@ -2,7 +2,8 @@
 
 use crate::sysvar::{INPUT_COUNT, SysVar};
 
-const WORDS: usize = INPUT_COUNT.div_ceil(32);
+const WORDS: usize = 3;
+const _: () = assert!(INPUT_COUNT.div_ceil(32) == WORDS);
 
 /// Some of the input variables. Output variables are never in it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -37,7 +38,8 @@ impl InputSet {
 
     /// Whether nothing is in the set.
     pub fn is_empty(&self) -> bool {
-        self.0.iter().all(|&word| word == 0)
+        let [a, b, c] = self.0;
+        a | b | c == 0
     }
 
     /// How many variables are in the set.
@@ -48,19 +50,36 @@ impl InputSet {
     /// What is in both.
     #[must_use]
     pub fn and(&self, other: &Self) -> Self {
-        self.merge(other, |a, b| a & b)
+        let ([a, b, c], [d, e, f]) = (self.0, other.0);
+        Self([a & d, b & e, c & f])
     }
 
     /// What is in either.
     #[must_use]
     pub fn or(&self, other: &Self) -> Self {
-        self.merge(other, |a, b| a | b)
+        let ([a, b, c], [d, e, f]) = (self.0, other.0);
+        Self([a | d, b | e, c | f])
     }
 
     /// What is in this set but not in the other.
     #[must_use]
     pub fn minus(&self, other: &Self) -> Self {
-        self.merge(other, |a, b| a & !b)
+        let ([a, b, c], [d, e, f]) = (self.0, other.0);
+        Self([a & !d, b & !e, c & !f])
+    }
+
+    /// How many variables follow each other in the table from `first` on and are all in the set.
+    pub fn run_len(&self, first: SysVar) -> usize {
+        let ordinal = first.ordinal() as u32;
+        self.bits().checked_shr(ordinal).map_or(0, |bits| bits.trailing_ones() as usize)
+    }
+
+    /// The `len` variables from `first` on, as far as they are inputs.
+    pub fn run(first: SysVar, len: usize) -> Self {
+        let upto = |end: usize| !u128::MAX.checked_shl(end.min(INPUT_COUNT) as u32).unwrap_or(0);
+        let start = first.ordinal();
+        let bits = upto(start.saturating_add(len)) & !upto(start);
+        Self([bits as u32, bits.wrapping_shr(32) as u32, bits.wrapping_shr(64) as u32])
     }
 
     /// The variables, in table order.
@@ -78,12 +97,9 @@ impl InputSet {
         })
     }
 
-    fn merge(&self, other: &Self, op: impl Fn(u32, u32) -> u32) -> Self {
-        let mut merged = *self;
-        for (a, &b) in merged.0.iter_mut().zip(&other.0) {
-            *a = op(*a, b);
-        }
-        merged
+    fn bits(&self) -> u128 {
+        let [a, b, c] = self.0.map(u128::from);
+        a | b.wrapping_shl(32) | c.wrapping_shl(64)
     }
 
     fn slot(&mut self, var: SysVar) -> Option<(&mut u32, u32)> {
@@ -107,6 +123,7 @@ impl FromIterator<SysVar> for InputSet {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::sysvar::COUNT;
 
     #[test]
     fn the_set_holds_every_input_and_no_output() {
@@ -120,6 +137,11 @@ mod tests {
         assert!(all.minus(&some).iter().eq([force]));
         assert!(!all.contains(SysVar::parse("RobotState[1]").unwrap()));
         assert_eq!(InputSet::BYTES, all.iter().filter(|v| v.is_bits()).collect());
+        let run = InputSet::run(force, 5);
+        assert_eq!((run.len(), run.run_len(force), some.run_len(force)), (5, 5, 0));
+        assert!(run.iter().eq((0..5).map(|nth| SysVar::from_ordinal(force.ordinal() + nth).unwrap())));
+        assert_eq!(InputSet::run(SysVar::from_ordinal(0).unwrap(), COUNT), all);
+        assert_eq!(InputSet::run(SysVar::from_ordinal(INPUT_COUNT).unwrap(), 3), InputSet::EMPTY);
         assert!(InputSet::EMPTY.is_empty() && InputSet::EMPTY.or(&some).and(&all) == some);
     }
 }

@@ -1,0 +1,251 @@
+//! Whole engine passes: one input, then everything drained until the engine sleeps, in a cell of
+//! four ports with all links up. Beside the bare limit: finding the head of the same frame and
+//! copying its bytes. `-- instructions` counts instructions instead of measuring time.
+
+mod instructions;
+#[path = "../tests/rig/mod.rs"]
+mod rig;
+
+use std::hint::black_box;
+use std::process::ExitCode;
+
+use divan::Bencher;
+use instructions::Work;
+use proto_core::engine::{Engine, Input, LinkId, OUTPUT_BUFFER, Output, PortId};
+use proto_core::recipe::CanFrame;
+use proto_core::recipe::model::CanId;
+use proto_core::time::{Duration, Instant};
+use rig::{Cell, MS};
+
+/// The whole way of a field frame, design limit.
+const PASS: u64 = 3_000;
+
+type Pass = fn(&mut Bench);
+
+/// Longer than any run: only one work is about the cycle.
+const NO_CYCLE: Duration = Duration::from_secs(3_600);
+
+/// Name, limit and work.
+const WORKS: [(&str, Option<u64>, Pass); 9] = [
+    ("field frame, bare", None, Bench::bare),
+    ("field frame to Modbus request, answer", Some(PASS), Bench::modbus),
+    ("field frame to two requests, answers", None, Bench::modbus_twice),
+    ("field frame to recipe frame over UDP", Some(PASS), Bench::udp),
+    ("field frame byte by byte to UDP", None, Bench::udp_bytes),
+    ("CAN frame applied", None, Bench::can),
+    ("state packet", None, Bench::state),
+    ("idle tick", None, Bench::idle),
+    ("cycle of one port", None, Bench::cycle),
+];
+
+fn main() -> ExitCode {
+    macro_rules! work {
+        ($nth:literal) => {
+            Work {
+                name: WORKS[$nth].0,
+                limit: WORKS[$nth].1,
+                run: |n| repeat(n, WORKS[$nth].0, WORKS[$nth].2),
+            }
+        };
+    }
+    let works = [work!(0), work!(1), work!(2), work!(3), work!(4), work!(5), work!(6), work!(7), work!(8)];
+    instructions::main(&works).unwrap_or_else(|| {
+        divan::main();
+        ExitCode::SUCCESS
+    })
+}
+
+#[divan::bench(args = WORKS.map(|work| work.0))]
+fn pass(bencher: Bencher<'_, '_>, name: &str) {
+    let (_, _, pass) = WORKS.into_iter().find(|work| work.0 == name).expect("one of the works");
+    let mut bench = Bench::for_work(name);
+    bencher.bench_local(|| pass(&mut bench));
+}
+
+fn repeat(iterations: u64, name: &str, pass: Pass) {
+    let mut bench = Bench::for_work(name);
+    for _ in 0..iterations {
+        pass(black_box(&mut bench));
+    }
+}
+
+/// Four ports: a PLC (28-byte frames, to Modbus), a force sensor (28-byte frames, to UDP 2011), a
+/// CAN bus with 14 ids, a display that is shown the pose each cycle. A second cell has a PLC whose
+/// frame needs two Modbus requests, coils and registers.
+struct Bench {
+    engine: Box<Engine<4, 1, 128>>,
+    now: Instant,
+    out: [u8; OUTPUT_BUFFER],
+    plc: Vec<u8>,
+    sensor: Vec<u8>,
+    packet: Vec<u8>,
+    sent: usize,
+    passes: u32,
+}
+
+const PLC: PortId = PortId(0);
+const SENSOR: PortId = PortId(1);
+const BUS: PortId = PortId(2);
+const DISPLAY: PortId = PortId(3);
+const UDP: LinkId = LinkId::RECIPE_UDP;
+
+impl Bench {
+    fn for_work(name: &str) -> Self {
+        let cycle = if name == "cycle of one port" { MS(4) } else { NO_CYCLE };
+        let two = name == "field frame to two requests, answers";
+        let plc: &[&str] = match two {
+            true => &["DigitalOutputCommand[1..2]", "WordInputReg[1..11]"],
+            false => &["WordInputReg[1..12]"],
+        };
+        Self::new(plc, cycle)
+    }
+
+    fn new(plc: &[&str], cycle: Duration) -> Self {
+        let mut cell = Cell::new();
+        let up = cell.stream(&["ForceEnd[1..6]"], &[]);
+        cell.recipe_link(up);
+        let recipe = cell.stream(plc, &[]);
+        assert_eq!(cell.rs485(recipe), PLC);
+        let recipe = cell.stream(&["ForceEnd[1..6]"], &[]);
+        assert_eq!(cell.rs485(recipe), SENSOR);
+        let words: Vec<[String; 1]> = (13..27).map(|nth| [format!("WordInputReg[{nth}]")]).collect();
+        let words: Vec<[&str; 1]> = words.iter().map(|[name]| [name.as_str()]).collect();
+        let frames: Vec<(u16, &[&str])> = (0x500..).zip(words.iter().map(|name| &name[..])).collect();
+        let recipe = cell.can(&frames, &[]);
+        assert_eq!(cell.can_port(recipe), BUS);
+        let recipe = cell.stream(&[], &["RobotState[8..13]"]);
+        assert_eq!(cell.rs485(recipe), DISPLAY);
+        for port in &mut cell.0.ports {
+            port.timeout = NO_CYCLE;
+        }
+        cell.last_port().cycle = cycle;
+        let frame = |fill: u8| [&[255, 255][..], &[fill; 24], &[238, 238]].concat();
+        let mut bench = Self {
+            engine: Box::new(Engine::new(&cell.0).expect("a right configuration")),
+            now: Instant::from_millis(1_000),
+            out: [0; OUTPUT_BUFFER],
+            plc: frame(0x11),
+            sensor: frame(0x22),
+            packet: vec![0; 1468],
+            sent: 0,
+            passes: 0,
+        };
+        for nth in 0..4 {
+            bench.pass(Input::PortUp { port: PortId(nth) });
+        }
+        for link in [LinkId::STATE, LinkId::MODBUS, UDP] {
+            bench.pass(Input::LinkUp { link });
+        }
+        bench.state();
+        bench
+    }
+
+    /// One input and all that comes of it; the length of what went to the controller stands in
+    /// `sent`.
+    #[inline(always)]
+    fn pass(&mut self, input: Input<'_>) {
+        self.now += Duration::from_micros(50);
+        drain(&mut self.engine, self.now, input, &mut self.out, &mut self.sent);
+    }
+
+    fn bare(&mut self) {
+        let frame = black_box(&self.plc[..]);
+        let at = frame.windows(2).position(|two| two == [255, 255]).unwrap_or(0);
+        let mut image = [0; 24];
+        image.copy_from_slice(&frame[at + 2..][..24]);
+        self.out[2..26].copy_from_slice(black_box(&image));
+        black_box(&mut self.out);
+    }
+
+    fn modbus(&mut self) {
+        self.plc_frame(1);
+    }
+
+    fn modbus_twice(&mut self) {
+        self.plc_frame(2);
+    }
+
+    fn plc_frame(&mut self, requests: usize) {
+        let frame = std::mem::take(&mut self.plc);
+        self.sent = 0;
+        self.pass(Input::PortBytes { port: PLC, bytes: black_box(&frame) });
+        self.plc = frame;
+        for _ in 0..requests {
+            assert!(std::mem::take(&mut self.sent) > 12);
+            self.answer();
+        }
+        assert_eq!(self.sent, 0);
+    }
+
+    /// The controller did what it was asked to; written by hand, so that only the engine is counted.
+    fn answer(&mut self) {
+        let mut answer = [0; 12];
+        answer.copy_from_slice(&self.out[..12]);
+        answer[5] = 6;
+        self.pass(Input::LinkBytes { link: LinkId::MODBUS, bytes: black_box(&answer) });
+    }
+
+    fn udp(&mut self) {
+        let frame = std::mem::take(&mut self.sensor);
+        self.sent = 0;
+        self.pass(Input::PortBytes { port: SENSOR, bytes: black_box(&frame) });
+        self.sensor = frame;
+        assert_eq!(self.sent, 28);
+        self.pass(Input::LinkSent { link: UDP });
+    }
+
+    fn udp_bytes(&mut self) {
+        let frame = std::mem::take(&mut self.sensor);
+        self.sent = 0;
+        for byte in frame.chunks(1) {
+            self.pass(Input::PortBytes { port: SENSOR, bytes: black_box(byte) });
+        }
+        self.sensor = frame;
+        assert_eq!(self.sent, 28);
+        self.pass(Input::LinkSent { link: UDP });
+    }
+
+    fn can(&mut self) {
+        let frame = CanFrame::new(CanId::Standard(0x50D), &[1, 2]).expect("a right frame");
+        self.pass(Input::PortCan { port: BUS, frame: black_box(frame) });
+        self.answer();
+    }
+
+    fn state(&mut self) {
+        let packet = std::mem::take(&mut self.packet);
+        self.pass(Input::LinkBytes { link: LinkId::STATE, bytes: black_box(&packet) });
+        self.packet = packet;
+    }
+
+    fn idle(&mut self) {
+        self.pass(black_box(Input::Tick));
+    }
+
+    fn cycle(&mut self) {
+        self.now += Duration::from_micros(3_950);
+        self.pass(Input::PortSent { port: DISPLAY });
+        if self.passes.is_multiple_of(256) {
+            self.state();
+        }
+        self.passes += 1;
+    }
+}
+
+fn drain(
+    engine: &mut Engine<4, 1, 128>,
+    now: Instant,
+    input: Input<'_>,
+    out: &mut [u8; OUTPUT_BUFFER],
+    sent: &mut usize,
+) {
+    engine.handle(now, input);
+    loop {
+        match engine.poll_output(now, out) {
+            Output::Sleep { .. } => return,
+            Output::LinkSend { bytes, .. } => *sent = bytes.len(),
+            other => {
+                black_box(other);
+            }
+        }
+    }
+}
