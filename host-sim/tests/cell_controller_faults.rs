@@ -63,6 +63,29 @@ fn refused_while_frames_go_on_and_nothing_is_replayed() {
 }
 
 #[test]
+fn what_waited_when_the_connection_was_lost_is_not_written_after_it_is_back() {
+    let (mut gateway, controller) = files("rs485-system");
+    gateway.ports[0].timeout = Duration::from_secs(10);
+    let mut cell = Cell::new(&gateway, &controller, 1).unwrap();
+    let line = cell.line_of("rs485-1");
+    cell.run_ms(500);
+    outputs_get_through(&mut cell, line);
+    // One write is under way, two edges wait behind it.
+    cell.hold(LinkId::MODBUS, Way::Up);
+    for byte in [1, 2, 3] {
+        cell.send(line, &outputs(byte));
+        cell.run_ms(5);
+    }
+    let before = cell.controller().counters().modbus.requests;
+    cell.reset(LinkId::MODBUS);
+    cell.run_ms(2_000);
+    assert_eq!(cell.link(LinkId::MODBUS).history.connects, 2);
+    assert_eq!(cell.controller().counters().modbus.requests, before);
+    assert_eq!(cell.value("DigitalOutputCommand[1]"), 0.0);
+    outputs_get_through(&mut cell, line);
+}
+
+#[test]
 fn a_server_that_closes_what_it_takes() {
     let (mut cell, line) = system();
     for server in [Link::Modbus, Link::State] {
