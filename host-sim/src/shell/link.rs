@@ -142,13 +142,19 @@ pub(super) async fn run(
                     Err(error) => Err(error),
                 }
             }
-            Endpoint::Udp { host, port } => match connect_udp(host, *port).await {
-                Ok(socket) => {
-                    events(LinkEvent::Up);
-                    pump_udp(&socket, None, control, turn, &mut events).await
+            Endpoint::Udp { host, port } => {
+                let connected = tokio::select! {
+                    connected = connect_udp(host, *port) => connected,
+                    () = control.over(turn) => continue,
+                };
+                match connected {
+                    Ok(socket) => {
+                        events(LinkEvent::Up);
+                        pump_udp(&socket, None, control, turn, &mut events).await
+                    }
+                    Err(error) => Err(error),
                 }
-                Err(error) => Err(error),
-            },
+            }
             Endpoint::UdpListen(socket) => match first_datagram(socket, control, turn).await {
                 Some(Ok((peer, datagram))) => {
                     info!(link = name, %peer, "the controller sends");
@@ -199,7 +205,11 @@ async fn pump_tcp(
     };
     let writing = async {
         while let Some(bytes) = control.next(turn).await {
-            writer.write_all(&bytes).await?;
+            tokio::select! {
+                written = writer.write_all(&bytes) => written?,
+                // A peer that takes nothing must not keep the link from being closed.
+                () = control.over(turn) => return Ok(()),
+            }
             if control.turn.get() == turn {
                 (events.borrow_mut())(LinkEvent::Sent);
             }
@@ -296,3 +306,7 @@ async fn pump_udp(
 
 /// Longer than any frame, so that a datagram that is too long is seen to be.
 const MAX_DATAGRAM: usize = 2048;
+
+#[cfg(test)]
+#[path = "link_tests.rs"]
+mod tests;

@@ -1,0 +1,247 @@
+//! Links against real sockets that do what controllers do.
+
+use std::rc::Rc;
+use std::time::Duration;
+
+use tokio::net::TcpSocket;
+use tokio::task::{JoinHandle, LocalSet, spawn_local};
+
+use super::*;
+
+/// A link's event, to be kept.
+#[derive(Debug, Clone, PartialEq)]
+enum Seen {
+    Up,
+    Down,
+    Bytes(Vec<u8>),
+    Sent,
+}
+
+/// A link under way, in the place of the engine.
+struct Running {
+    control: Rc<LinkControl>,
+    seen: Rc<Log>,
+    task: JoinHandle<()>,
+}
+
+#[derive(Default)]
+struct Log {
+    events: RefCell<VecDeque<Seen>>,
+    wake: Notify,
+}
+
+impl Running {
+    fn start(endpoint: Endpoint) -> Self {
+        let (control, seen) = (Rc::new(LinkControl::default()), Rc::new(Log::default()));
+        let (own, log) = (Rc::clone(&control), Rc::clone(&seen));
+        let task = spawn_local(async move {
+            run("test", &endpoint, &own, |event| {
+                log.events.borrow_mut().push_back(match event {
+                    LinkEvent::Up => Seen::Up,
+                    LinkEvent::Down => Seen::Down,
+                    LinkEvent::Bytes(bytes) => Seen::Bytes(bytes.to_vec()),
+                    LinkEvent::Sent => Seen::Sent,
+                });
+                log.wake.notify_one();
+            })
+            .await;
+        });
+        Self { control, seen, task }
+    }
+
+    async fn next(&self) -> Seen {
+        loop {
+            if let Some(event) = self.seen.events.borrow_mut().pop_front() {
+                return event;
+            }
+            self.seen.wake.notified().await;
+        }
+    }
+
+    #[track_caller]
+    fn expect(&self, expected: Seen) -> impl Future<Output = ()> {
+        let at = std::panic::Location::caller();
+        async move { assert_eq!(self.next().await, expected, "at {at}") }
+    }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        self.task.abort();
+    }
+}
+
+fn inside(test: impl AsyncFnOnce()) {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    LocalSet::new().block_on(&runtime, async {
+        tokio::time::timeout(Duration::from_secs(20), test()).await.expect("the test hangs");
+    });
+}
+
+async fn server() -> (TcpListener, Endpoint) {
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let at = listener.local_addr().unwrap();
+    (listener, Endpoint::Tcp { host: at.ip().to_string(), port: at.port() })
+}
+
+#[test]
+fn a_tcp_link_opens_carries_and_tells_once_when_it_is_lost() {
+    inside(async || {
+        let (listener, endpoint) = server().await;
+        let link = Running::start(endpoint);
+        for round in 0..3_u8 {
+            link.control.open();
+            let (mut peer, _) = listener.accept().await.unwrap();
+            link.expect(Seen::Up).await;
+            link.control.send(&[round, 1]);
+            link.expect(Seen::Sent).await;
+            let mut got = [0; 2];
+            peer.read_exact(&mut got).await.unwrap();
+            assert_eq!(got, [round, 1]);
+            peer.write_all(&[round, 2]).await.unwrap();
+            link.expect(Seen::Bytes(vec![round, 2])).await;
+            if round == 1 {
+                // A reset instead of an end.
+                rustix::net::sockopt::set_socket_linger(&peer, Some(Duration::ZERO)).unwrap();
+            }
+            drop(peer);
+            link.expect(Seen::Down).await;
+        }
+        assert!(link.seen.events.borrow().is_empty());
+    });
+}
+
+#[test]
+fn a_refused_connection_is_reported_and_tried_again_only_when_asked() {
+    inside(async || {
+        let (listener, endpoint) = server().await;
+        let at = listener.local_addr().unwrap();
+        drop(listener);
+        let link = Running::start(endpoint);
+        link.control.open();
+        link.expect(Seen::Down).await;
+        let listener = TcpListener::bind(at).await.unwrap();
+        link.control.open();
+        link.expect(Seen::Up).await;
+        drop(listener);
+    });
+}
+
+#[test]
+fn after_a_close_nothing_is_reported_and_nothing_old_is_sent() {
+    inside(async || {
+        let (listener, endpoint) = server().await;
+        let link = Running::start(endpoint);
+        link.control.open();
+        let (mut peer, _) = listener.accept().await.unwrap();
+        link.expect(Seen::Up).await;
+        peer.write_all(b"late").await.unwrap();
+        link.control.send(b"old");
+        link.control.close();
+        let mut rest = Vec::new();
+        // Bytes that were under way reset the connection.
+        let _ = peer.read_to_end(&mut rest).await;
+        assert_eq!(rest, b"");
+        link.control.open();
+        let (mut peer, _) = listener.accept().await.unwrap();
+        link.expect(Seen::Up).await;
+        link.control.send(b"new");
+        let mut got = [0; 3];
+        peer.read_exact(&mut got).await.unwrap();
+        assert_eq!(&got, b"new");
+        link.expect(Seen::Sent).await;
+    });
+}
+
+#[test]
+fn a_peer_that_takes_nothing_does_not_keep_the_link_from_being_closed() {
+    inside(async || {
+        let small = TcpSocket::new_v4().unwrap();
+        small.set_recv_buffer_size(4_096).unwrap();
+        small.bind("127.0.0.1:0".parse().unwrap()).unwrap();
+        let listener = small.listen(4).unwrap();
+        let at = listener.local_addr().unwrap();
+        let link = Running::start(Endpoint::Tcp { host: at.ip().to_string(), port: at.port() });
+        link.control.open();
+        let (mut deaf, _) = listener.accept().await.unwrap();
+        link.expect(Seen::Up).await;
+        // More than any buffer takes, so this is never sent.
+        link.control.send(&vec![0; 64 << 20]);
+        deaf.read_exact(&mut [0]).await.unwrap();
+        link.control.close();
+        link.control.open();
+        let (_fresh, _) = listener.accept().await.unwrap();
+        link.expect(Seen::Up).await;
+        assert!(link.seen.events.borrow().is_empty());
+        drop(deaf);
+    });
+}
+
+#[test]
+fn a_listening_link_has_one_connection_and_takes_the_next_after_it() {
+    inside(async || {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let at = listener.local_addr().unwrap();
+        let link = Running::start(Endpoint::TcpListen(listener));
+        link.control.open();
+        let mut first = TcpStream::connect(at).await.unwrap();
+        link.expect(Seen::Up).await;
+        let mut second = TcpStream::connect(at).await.unwrap();
+        assert_eq!(second.read(&mut [0; 4]).await.unwrap(), 0, "turned away");
+        first.write_all(b"here").await.unwrap();
+        link.expect(Seen::Bytes(b"here".to_vec())).await;
+        drop(first);
+        link.expect(Seen::Down).await;
+        let mut third = TcpStream::connect(at).await.unwrap();
+        link.control.open();
+        link.expect(Seen::Up).await;
+        link.control.send(b"hello");
+        let mut got = [0; 5];
+        third.read_exact(&mut got).await.unwrap();
+        assert_eq!(&got, b"hello");
+    });
+}
+
+#[test]
+fn a_udp_link_is_down_when_nobody_is_there() {
+    inside(async || {
+        let peer = UdpSocket::bind("127.0.0.1:0").await.unwrap();
+        let at = peer.local_addr().unwrap();
+        let link = Running::start(Endpoint::Udp { host: at.ip().to_string(), port: at.port() });
+        link.control.open();
+        link.expect(Seen::Up).await;
+        link.control.send(b"frame");
+        link.expect(Seen::Sent).await;
+        let mut got = [0; 16];
+        let (len, gateway) = peer.recv_from(&mut got).await.unwrap();
+        assert_eq!(&got[..len], b"frame");
+        peer.send_to(b"answer", gateway).await.unwrap();
+        link.expect(Seen::Bytes(b"answer".to_vec())).await;
+        drop(peer);
+        link.control.send(b"frame");
+        link.expect(Seen::Sent).await;
+        link.expect(Seen::Down).await;
+    });
+}
+
+#[test]
+fn a_listening_udp_link_answers_whoever_sent_last() {
+    inside(async || {
+        let socket = UdpSocket::bind("127.0.0.1:0").await.unwrap();
+        let at = socket.local_addr().unwrap();
+        let link = Running::start(Endpoint::UdpListen(socket));
+        link.control.open();
+        let (one, two) =
+            (UdpSocket::bind("127.0.0.1:0").await.unwrap(), UdpSocket::bind("127.0.0.1:0").await.unwrap());
+        one.send_to(b"first", at).await.unwrap();
+        link.expect(Seen::Up).await;
+        link.expect(Seen::Bytes(b"first".to_vec())).await;
+        two.send_to(b"second", at).await.unwrap();
+        link.expect(Seen::Bytes(b"second".to_vec())).await;
+        link.control.send(b"to the second");
+        link.expect(Seen::Sent).await;
+        let mut got = [0; 32];
+        let (len, _) = two.recv_from(&mut got).await.unwrap();
+        assert_eq!(&got[..len], b"to the second");
+    });
+}
