@@ -219,6 +219,32 @@ fn the_controllers_own_tcp_client_is_a_recipe_link_too() {
 }
 
 #[test]
+fn the_controllers_own_udp_client_may_fall_silent_and_come_back() {
+    let mut cell = Cell::new();
+    let up = cell.stream(&["DigitalOutputCommand[1]"], &["RobotState[8]"]);
+    let listen = heapless::String::try_from("127.0.0.1:50000").unwrap();
+    let udp = cell.port(Bus::UdpListen { listen }, up);
+    let recipe = cell.stream(&["DigitalOutputCommand[1]"], &["RobotState[8]"]);
+    let port = cell.rs485(recipe);
+    let link = LinkId::of_port(udp);
+    let mut rig = cell.rig();
+    rig.run(MS(10));
+    rig.link_bytes(link, &pose_frame(&[0.75]));
+    rig.run(MS(4));
+    assert_eq!(rig.sent_to(port), [pose_frame(&[0.75])]);
+    rig.reachable.clear();
+    rig.run(MS(2_100));
+    assert_eq!(rig.link(link).history.silences, 1);
+    rig.bytes(port, &[255, 255, 1, 238, 238]);
+    assert!(rig.sent_on(link).is_empty(), "nobody is there");
+    assert_eq!(rig.counters(port).undelivered, 1);
+    rig.reachable.insert(link.0);
+    rig.run(MS(200));
+    rig.bytes(port, &[255, 255, 1, 238, 238]);
+    assert_eq!(rig.sent_on(link), [[255, 255, 1, 238, 238]]);
+}
+
+#[test]
 fn a_frame_waits_for_the_line_and_a_cycle_that_is_lost_is_counted() {
     let mut cell = Cell::new();
     let recipe = cell.stream(&["WordInputReg[1]"], &["RobotState[8..11]"]);

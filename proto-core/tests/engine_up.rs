@@ -423,6 +423,50 @@ fn a_value_received_while_the_link_was_down_goes_up_as_it_is_not_as_zero() {
 }
 
 #[test]
+fn two_links_with_one_variable_each_write_their_own() {
+    let mut cell = Cell::new();
+    let first = cell.stream(&["DigitalOutputCommand[1]"], &[]);
+    cell.recipe_link(first);
+    let second = cell.stream(&["DigitalOutputCommand[1..2]"], &[]);
+    let listen = heapless::String::try_from("127.0.0.1:50000").unwrap();
+    let tcp = LinkId::of_port(cell.port(proto_core::config::Bus::TcpListen { listen }, second));
+    let one = cell.stream(&["DigitalOutputCommand[1]"], &[]);
+    let two = cell.stream(&["DigitalOutputCommand[2]"], &[]);
+    let (a, b) = (cell.rs485(one), cell.rs485(two));
+    let mut rig = cell.rig();
+    rig.run(MS(10));
+    rig.reports_sent = false;
+    for frame in [ON, OFF, ON] {
+        rig.bytes(a, frame);
+    }
+    assert_eq!(rig.sent_on(LinkId::RECIPE_UDP), [ON]);
+    assert!(rig.sent_on(tcp).is_empty(), "steps of one variable do not overtake each other on two links");
+    rig.reports_sent = true;
+    rig.input(Input::LinkSent { link: LinkId::RECIPE_UDP });
+    assert_eq!(rig.sent_on(LinkId::RECIPE_UDP), [OFF, ON]);
+    rig.bytes(b, ON);
+    assert_eq!(rig.sent_on(tcp), [vec![255, 255, 1, 1, 238, 238]]);
+    // The other link's loss is none of the first one's business.
+    rig.reachable.remove(&tcp.0);
+    rig.input(Input::LinkDown { link: tcp });
+    rig.bytes(a, OFF);
+    assert_eq!(rig.sent_on(LinkId::RECIPE_UDP), [OFF]);
+    assert_eq!(rig.counters(a).undelivered, 0);
+}
+
+#[test]
+fn values_that_are_dropped_with_their_link_are_counted() {
+    let (mut rig, port) = digital_output();
+    rig.run(MS(10));
+    rig.modbus_answers = false;
+    for frame in [ON, OFF, ON, OFF] {
+        rig.bytes(port, frame);
+    }
+    rig.input(Input::LinkDown { link: LinkId::MODBUS });
+    assert_eq!(rig.counters(port).values_expired, 3, "all but the one under way");
+}
+
+#[test]
 fn can_frames_are_taken_by_id_and_length() {
     let mut cell = Cell::new();
     let recipe = cell.can(&[(1, &["DigitalOutputCommand[1]"]), (5, &["WordInputReg[1..2]"])], &[]);

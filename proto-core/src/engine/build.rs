@@ -114,7 +114,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         }
         let mut groups = Groups(engine.store.frames.len() as u8);
         for (id, recipe) in uplinks(config) {
-            engine.add_uplink(config, id, recipe, &mut groups)?;
+            engine.add_uplink(config, &plan, id, recipe, &mut groups)?;
         }
         if plan.needs_state() {
             let group = groups.next().ok_or(too_many("groups", MAX_GROUPS))?;
@@ -215,6 +215,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     fn add_uplink(
         &mut self,
         config: &GatewayConfig,
+        plan: &Plan,
         id: LinkId,
         recipe: &Recipe,
         groups: &mut Groups,
@@ -248,13 +249,14 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             _ => LinkTimings::TCP,
         };
         let timings = match kind {
-            LinkKind::RecipeTcpListen { .. } if output.is_some() => {
+            LinkKind::RecipeTcpListen { .. } | LinkKind::RecipeUdpListen { .. } if output.is_some() => {
                 timings.with_silence(Duration::from_secs(2))
             }
             _ => timings,
         };
         let set: InputSet = config.written_by(recipe).collect();
-        let uplink = Uplink::new(id, kind, Supervisor::new(timings), input, output, set, group);
+        let writes = set.iter().filter(|&var| plan.way_up(var) == Some(WayUp::Recipe(id))).collect();
+        let uplink = Uplink::new(id, kind, Supervisor::new(timings), input, output, (set, writes), group);
         self.links.recipes.push(uplink).map_err(|_| too_many("recipe links", UPLINKS))
     }
 

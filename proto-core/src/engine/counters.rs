@@ -35,7 +35,8 @@ pub struct PortCounters {
     pub masked: u32,
     /// Bit values that were replaced by newer ones because the queue of edges was full.
     pub edges_lost: u32,
-    /// Values dropped because they were older than the port's timeout before they could be written.
+    /// Values dropped before they could be written: older than the port's timeout, or waiting for a
+    /// link that was lost.
     pub values_expired: u32,
     /// Accepted frames with a value that could not be passed on: its link was down.
     pub undelivered: u32,

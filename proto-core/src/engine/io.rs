@@ -89,7 +89,8 @@ pub enum Input<'a> {
         /// The port.
         port: PortId,
     },
-    /// A port's device is gone; what was handed over for sending is lost.
+    /// A port's device is gone; what was handed over for sending is lost, and no
+    /// [`Input::PortSent`] follows for it.
     PortDown {
         /// The port.
         port: PortId,
@@ -125,7 +126,8 @@ pub enum Input<'a> {
         /// The link.
         link: LinkId,
     },
-    /// A link could not be opened, or was lost.
+    /// A link could not be opened, or was lost; no [`Input::LinkSent`] follows for what was handed
+    /// over to it.
     LinkDown {
         /// The link.
         link: LinkId,

@@ -117,10 +117,12 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             }
             Input::LinkDown { link } => {
                 self.links.down(link, &mut self.store, &mut self.ports, now);
+                self.count_lost();
                 self.arm(self.links.deadline_of(link));
             }
             Input::LinkBytes { link, bytes } => {
                 self.links.bytes(link, bytes, &mut self.store, &mut self.ports, now);
+                self.count_lost();
                 self.arm(self.links.deadline_of(link));
                 self.image_changed();
             }
@@ -217,6 +219,15 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             }
         }
         self.links.advance(&mut self.store, &mut self.ports, now);
+        self.count_lost();
+    }
+
+    /// Values that were dropped with their link, counted at their ports.
+    fn count_lost(&mut self) {
+        let Some(lost) = self.store.take_lost() else { return };
+        for (port, dropped) in self.ports.iter_mut().zip(lost) {
+            add(&mut port.counters.values_expired, dropped as usize);
+        }
     }
 
     fn expire_frames(&mut self, now: Instant) {
@@ -258,7 +269,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         let state = self.links.state.as_ref().map(|state| state.group);
         let waits = self.links.recipes.iter().any(|link| {
             link.supervisor.is_up()
-                && !dirty.and(&link.set).is_empty()
+                && !dirty.and(&link.writes).is_empty()
                 && !link.is_ready(&self.store, state, now)
         });
         if waits && let Some(port) = find_port(&mut self.ports, port) {

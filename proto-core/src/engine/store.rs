@@ -60,6 +60,9 @@ pub(super) struct Store<const PORTS: usize> {
     pub read_back: InputSet,
     /// Variables whose link is up.
     pub reachable: InputSet,
+    /// Values dropped with a link, a port.
+    lost: [u32; PORTS],
+    has_lost: bool,
     /// No frame is overdue before this.
     next_overdue: Instant,
     /// No value has waited too long before this.
@@ -77,6 +80,8 @@ impl<const PORTS: usize> Store<PORTS> {
             safe: InputSet::EMPTY,
             read_back: InputSet::EMPTY,
             reachable: InputSet::EMPTY,
+            lost: [0; PORTS],
+            has_lost: false,
             next_overdue: Instant::NEVER,
             next_expiry: Instant::NEVER,
         }
@@ -186,10 +191,20 @@ impl<const PORTS: usize> Store<PORTS> {
     /// A link was lost: nothing that waited for it is written later, safe values excepted.
     pub(super) fn link_lost(&mut self, vars: &InputSet) {
         self.reachable = self.reachable.minus(vars);
-        let dropped = vars.minus(&self.safe);
-        for queue in &mut self.edges {
-            self.outbox.forget(queue, &dropped);
+        for frame in &self.frames {
+            let port = usize::from(frame.port);
+            let (Some(queue), Some(count)) = (self.edges.get_mut(port), self.lost.get_mut(port)) else {
+                continue;
+            };
+            let dropped = self.outbox.forget(queue, &frame.set.and(vars).minus(&self.safe));
+            *count = count.saturating_add(dropped as u32);
+            self.has_lost |= dropped > 0;
         }
+    }
+
+    /// How many values of each port were dropped because their link was lost, since the last call.
+    pub(super) fn take_lost(&mut self) -> Option<[u32; PORTS]> {
+        core::mem::take(&mut self.has_lost).then(|| core::mem::replace(&mut self.lost, [0; PORTS]))
     }
 
     /// A write of safe values came to nothing: they are written again, if they still stand.

@@ -30,7 +30,9 @@ pub(super) struct Uplink {
     output: Option<StreamLayout>,
     deframer: Deframer,
     /// Variables in the frames up.
-    pub set: InputSet,
+    set: InputSet,
+    /// Those of them that are to be written here: a frame is sent for their sake.
+    pub writes: InputSet,
     /// What the frames down bring.
     pub group: Option<GroupId>,
     busy: bool,
@@ -44,7 +46,7 @@ impl Uplink {
         supervisor: Supervisor,
         input: Option<StreamLayout>,
         output: Option<StreamLayout>,
-        set: InputSet,
+        (set, writes): (InputSet, InputSet),
         group: Option<GroupId>,
     ) -> Self {
         let framing = match kind {
@@ -61,6 +63,7 @@ impl Uplink {
             output,
             deframer: Deframer::new(),
             set,
+            writes,
             group,
             busy: false,
             greet_at: Instant::NEVER,
@@ -69,7 +72,7 @@ impl Uplink {
 
     pub(super) fn up<const PORTS: usize>(&mut self, store: &mut Store<PORTS>, now: Instant) {
         self.busy = false;
-        store.link_up(&self.set);
+        store.link_up(&self.writes);
         self.greet_at = if self.greets() { now } else { Instant::NEVER };
     }
 
@@ -77,7 +80,7 @@ impl Uplink {
         self.busy = false;
         self.greet_at = Instant::NEVER;
         self.deframer.discard();
-        store.link_lost(&self.set);
+        store.link_lost(&self.writes);
     }
 
     /// The transport took everything.
@@ -138,11 +141,11 @@ impl Uplink {
         if !self.supervisor.is_up() || self.busy {
             return None;
         }
-        let wanted = !store.outbox.dirty().and(&self.set).is_empty();
+        let wanted = !store.outbox.dirty().and(&self.writes).is_empty();
         let len = match &self.input {
             Some(layout) if wanted && self.is_ready(store, state, now) => {
                 let len = encode(layout, store, out)?;
-                store.taken(&self.set);
+                store.taken(&self.writes);
                 bump(&mut self.counters.sent);
                 if self.greets() {
                     self.greet_at = self.greet_at.max(now + GREET_EVERY);
