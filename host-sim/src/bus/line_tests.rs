@@ -156,6 +156,25 @@ fn a_serial_device_is_opened_with_any_rate_and_parity() {
 }
 
 #[test]
+fn a_serial_device_that_vanishes_is_opened_again() {
+    run(async |dir| {
+        let link = dir.join("device").display().to_string();
+        let device = Running::start(&format!("pty:{link}"), line(115_200)).await;
+        let port = Running::start(&format!("serial:{link}"), line(115_200)).await;
+        port.expect(Seen::Up).await;
+        drop(device);
+        port.expect(Seen::Down).await;
+        port.tx.send(b"into the void");
+        let device = Running::start(&format!("pty:{link}"), line(115_200)).await;
+        device.expect(Seen::Up).await;
+        port.expect(Seen::Up).await;
+        port.tx.send(b"back");
+        assert_eq!(device.bytes(4).await, b"back");
+        assert_eq!(port.tx.counters().ups, 2);
+    });
+}
+
+#[test]
 fn a_tcp_line_connects_when_its_server_appears_and_again_after_a_loss() {
     run(async |_| {
         // An address of its own: no other test is given the port while nobody listens.
