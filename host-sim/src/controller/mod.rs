@@ -379,7 +379,7 @@ impl Controller {
             }
             ControllerInput::Tick => {}
         }
-        self.advance(now);
+        // What follows from it happens when the outputs are drained.
     }
 
     /// The next thing to do; [`ControllerOutput::Sleep`] when there is nothing more.
