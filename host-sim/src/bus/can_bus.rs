@@ -131,13 +131,6 @@ impl CanPort {
                     listener.map_err(|error| io::Error::new(error.kind(), format!("{listen}: {error}")))?,
                 )
             }
-            Device::SocketCan { interface } => {
-                let what = format!(
-                    "socketcan:{interface}: kernel CAN interfaces are not supported yet; use slcan-pty:PATH or \
-                     slcan-tcp:HOST:PORT"
-                );
-                return Err(io::Error::new(io::ErrorKind::Unsupported, what));
-            }
             _ => {
                 let what = format!("`{device}` is a serial device; the port is a CAN bus");
                 return Err(io::Error::new(io::ErrorKind::InvalidInput, what));
@@ -191,7 +184,7 @@ async fn port_node(
                     counters.frames_in += 1;
                     counters.bytes_in += frame.data().len() as u64;
                 });
-                events(PortEvent::Frame(frame));
+                events(PortEvent::Frame { frame, at: now() });
             }
             () = tx.wake.notified(), if under_way.is_none() => {
                 under_way = next_frame(tx, bitrate, now(), &timer)?;

@@ -1,7 +1,8 @@
 //! Devices a configured port can be tied to: pseudoterminals, serial lines, byte streams over TCP and
-//! a CAN bus in user space; and the timer that paces them.
+//! a CAN bus in user space, CAN interfaces of the kernel; and the timer that paces them.
 //!
-//! Bytes and frames go in and out; no recipe, no controller and no engine is known here.
+//! Bytes and frames go in and out; no recipe, no controller and no engine is known here, but for the
+//! engine's word for a CAN controller's error state.
 
 pub mod backoff;
 pub mod bind;
@@ -13,6 +14,7 @@ pub mod pty;
 mod reactor;
 pub mod realtime;
 pub mod slcan;
+mod socketcan;
 #[cfg(test)]
 mod test_kit;
 pub mod timer;

@@ -9,13 +9,17 @@ use std::io;
 use std::rc::Rc;
 
 use proto_core::config::Rs485;
+use proto_core::engine::BusState;
 use proto_core::recipe::can::CanFrame;
+use proto_core::recipe::model::CanId;
+use proto_core::time::Instant;
 use serde::Serialize;
 use tokio::sync::Notify;
 
 use super::bind::Device;
 use super::can_bus::CanPort;
 use super::line::Line;
+use super::socketcan::KernelCan;
 
 /// What a device did.
 #[derive(Debug, PartialEq)]
@@ -27,7 +31,14 @@ pub enum PortEvent<'a> {
     /// Bytes arrived.
     Bytes(&'a [u8]),
     /// A CAN frame arrived.
-    Frame(CanFrame),
+    Frame {
+        /// The frame.
+        frame: CanFrame,
+        /// When: a moment ago, or earlier when nobody looked.
+        at: Instant,
+    },
+    /// A CAN controller's error state changed; told after each [`PortEvent::Up`] that knows it.
+    Bus(BusState),
     /// Everything handed over has left.
     Sent,
 }
@@ -55,6 +66,7 @@ pub struct Port {
 enum Driver {
     Line(Line),
     Can(CanPort),
+    Kernel(KernelCan),
 }
 
 impl Port {
@@ -64,9 +76,17 @@ impl Port {
     /// When the device does not suit the bus, does not exist, or cannot be opened.
     pub async fn open(device: &Device, bus: PortBus) -> io::Result<Self> {
         let tx = Rc::new(PortTx::default());
-        let driver = match bus {
-            PortBus::Serial(settings) => Driver::Line(Line::open(device, settings, Rc::clone(&tx)).await?),
-            PortBus::Can { bitrate } => Driver::Can(CanPort::open(device, bitrate, Rc::clone(&tx)).await?),
+        let driver = match (bus, device) {
+            (PortBus::Serial(settings), _) => {
+                Driver::Line(Line::open(device, settings, Rc::clone(&tx)).await?)
+            }
+            // The interface's bit rate is the administrator's business.
+            (PortBus::Can { .. }, Device::SocketCan { interface }) => {
+                Driver::Kernel(KernelCan::open(interface, Rc::clone(&tx))?)
+            }
+            (PortBus::Can { bitrate }, _) => {
+                Driver::Can(CanPort::open(device, bitrate, Rc::clone(&tx)).await?)
+            }
         };
         Ok(Self { driver, tx })
     }
@@ -76,6 +96,15 @@ impl Port {
         match &self.driver {
             Driver::Line(line) => line.place(),
             Driver::Can(can) => can.place(),
+            Driver::Kernel(can) => can.place(),
+        }
+    }
+
+    /// Which ids matter, of both directions: a CAN interface of the kernel then passes on no others.
+    /// Elsewhere, and until it is told, everything comes.
+    pub fn listen_to(&mut self, ids: Vec<CanId>) {
+        if let Driver::Kernel(can) = &mut self.driver {
+            can.listen_to(ids);
         }
     }
 
@@ -92,6 +121,7 @@ impl Port {
         match self.driver {
             Driver::Line(line) => line.run(events).await,
             Driver::Can(can) => can.run(events).await,
+            Driver::Kernel(can) => can.run(events).await,
         }
     }
 }
@@ -159,6 +189,19 @@ pub struct DeviceCounters {
     pub refused: u64,
     /// Times the device became usable.
     pub ups: u64,
+    /// Frames that the kernel dropped because they were not read in time (SO_RXQ_OVFL).
+    pub overruns: u64,
+    /// Times the kernel did not take a CAN frame for the moment; it was tried again.
+    pub refusals: u64,
+    /// Error frames: what a CAN interface told about itself and its bus.
+    pub error_frames: u64,
+    /// Times a CAN controller was started again after bus-off.
+    pub restarts: u64,
+    /// CAN FD frames, which no recipe takes.
+    pub fd_frames: u64,
+    /// A CAN controller's error state, where it is known: active, warning, passive or bus-off.
+    #[serde(skip_serializing_if = "str::is_empty")]
+    pub bus: &'static str,
 }
 
 /// A frame of every port's recipe fits several times over; a port waits for one to leave.

@@ -8,6 +8,7 @@ use std::collections::{BTreeMap, VecDeque};
 use std::net::SocketAddr;
 use std::rc::Rc;
 
+use proto_core::engine::BusState;
 use proto_core::sysvar::SysVar;
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::scalar::Scalar;
@@ -24,7 +25,7 @@ use crate::bus::bind::Bind;
 use crate::bus::port::{Port, PortBus, PortEvent, PortTx};
 use crate::bus::realtime::{self, Scheduling};
 use crate::bus::timer::{Timer, now};
-use crate::config::{SimBus, SimConfig};
+use crate::config::{SimBus, SimConfig, SimParts};
 use crate::controller::{ConnId, Controller, ControllerInput, ControllerOutput, Link};
 
 /// Runs the simulated controller until Ctrl-C or SIGTERM, or until it is shut down over port 2000.
@@ -221,7 +222,10 @@ impl ControllerShell {
                 PortEvent::Up => ControllerInput::PortUp { port },
                 PortEvent::Down => ControllerInput::PortDown { port },
                 PortEvent::Bytes(bytes) => ControllerInput::PortBytes { port, bytes },
-                PortEvent::Frame(frame) => ControllerInput::PortCan { port, frame },
+                PortEvent::Frame { frame, .. } => ControllerInput::PortCan { port, frame },
+                // The simulated controller's port has no error states of its own.
+                PortEvent::Bus(BusState::BusOff) => ControllerInput::PortDown { port },
+                PortEvent::Bus(_) => ControllerInput::PortUp { port },
                 PortEvent::Sent => ControllerInput::PortSent { port },
             });
         });
@@ -407,7 +411,14 @@ async fn open_devices(config: &SimConfig, binds: &[Bind]) -> Result<Vec<Option<P
     let mut devices = Vec::new();
     for port in &config.ports {
         devices.push(match bus_of(&port.bus) {
-            Some(bus) => Some(open_device(&port.name, bus, binds).await?),
+            Some(bus) => {
+                let mut device = open_device(&port.name, bus, binds).await?;
+                let recipe = port.recipe.and_then(|recipe| config.recipes.get(recipe));
+                if let Some(SimParts::Can { input, output }) = recipe.map(|recipe| &recipe.parts) {
+                    device.listen_to(input.iter().chain(output).map(|frame| frame.id).collect());
+                }
+                Some(device)
+            }
             None => None,
         });
     }
@@ -420,7 +431,7 @@ async fn open_device(name: &str, bus: PortBus, binds: &[Bind]) -> Result<Port, S
             PortBus::Serial(_) => {
                 ("serial line", "pty:PATH, serial:PATH, tcp:HOST:PORT or tcp-listen:HOST:PORT")
             }
-            PortBus::Can { .. } => ("CAN bus", "slcan-pty:PATH or slcan-tcp:HOST:PORT"),
+            PortBus::Can { .. } => ("CAN bus", "socketcan:INTERFACE, slcan-pty:PATH or slcan-tcp:HOST:PORT"),
         };
         return Err(StartError::new(format!(
             "port {name} is a {kind} without a device: add --bind {name}=DEVICE, DEVICE being {forms}"

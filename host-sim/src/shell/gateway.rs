@@ -8,7 +8,7 @@ use std::cell::{Cell, RefCell};
 use std::collections::BTreeMap;
 use std::rc::Rc;
 
-use proto_core::config::{Bus, GatewayConfig, Port as PortConfig};
+use proto_core::config::{Bus, GatewayConfig, Parts, Port as PortConfig};
 use proto_core::engine::{Engine, Input, LinkId, LinkKind, OUTPUT_BUFFER, Output, PortId};
 use proto_core::sysvar::SysVar;
 use proto_core::time::Instant;
@@ -41,6 +41,8 @@ struct Core {
     links: BTreeMap<LinkId, Rc<LinkControl>>,
     port_names: Vec<String>,
     deadline: Cell<Instant>,
+    /// The latest time that the engine was told.
+    told: Cell<Instant>,
     deadline_moved: Notify,
 }
 
@@ -56,8 +58,12 @@ impl Gateway {
             return Err(StartError::new(message));
         }
         let mut ports = Vec::new();
-        for (index, port, _) in config.field_ports() {
-            ports.push((PortId(index), open_port(port, binds).await?));
+        for (index, port, recipe) in config.field_ports() {
+            let mut device = open_port(port, binds).await?;
+            if let Parts::Can { input, output } = &recipe.parts {
+                device.listen_to(input.iter().chain(output).map(|frame| frame.id).collect());
+            }
+            ports.push((PortId(index), device));
         }
         let mut links = Vec::new();
         for info in engine.links() {
@@ -79,6 +85,7 @@ impl Gateway {
             port_names: config.ports.iter().map(|port| port.name.as_str().to_owned()).collect(),
             engine: RefCell::new(engine),
             deadline: Cell::new(Instant::ZERO),
+            told: Cell::new(Instant::ZERO),
             deadline_moved: Notify::new(),
         });
         Ok(Self { core, ports, links, ready: json!({ "ports": places }) })
@@ -151,7 +158,8 @@ impl Core {
             PortEvent::Up => self.input(Input::PortUp { port }),
             PortEvent::Down => self.input(Input::PortDown { port }),
             PortEvent::Bytes(bytes) => self.input(Input::PortBytes { port, bytes }),
-            PortEvent::Frame(frame) => self.input(Input::PortCan { port, frame }),
+            PortEvent::Frame { frame, at } => self.input_at(at, Input::PortCan { port, frame }),
+            PortEvent::Bus(state) => self.input(Input::PortBus { port, state }),
             PortEvent::Sent => self.input(Input::PortSent { port }),
         }
     }
@@ -167,7 +175,14 @@ impl Core {
 
     /// One input, and everything that follows from it.
     fn input(&self, input: Input<'_>) {
-        let at = now();
+        self.input_at(now(), input);
+    }
+
+    /// The same, of something that happened at `at`, or a little later when the engine has been told
+    /// a later time already.
+    fn input_at(&self, at: Instant, input: Input<'_>) {
+        let at = at.max(self.told.get());
+        self.told.set(at);
         trace!(?input, "in");
         let mut engine = self.engine.borrow_mut();
         engine.handle(at, input);
@@ -285,7 +300,7 @@ async fn open_port(port: &PortConfig, binds: &[Bind]) -> Result<Port, StartError
     let (Some(bind), None) = (own.next(), own.next()) else {
         let examples = match bus {
             PortBus::Serial(_) => "pty:PATH or serial:/dev/ttyUSB0",
-            PortBus::Can { .. } => "slcan-tcp:127.0.0.1:0 or slcan-pty:PATH",
+            PortBus::Can { .. } => "socketcan:can0, slcan-tcp:127.0.0.1:0 or slcan-pty:PATH",
         };
         return Err(StartError::new(format!(
             "port {name} needs exactly one device: --bind {name}=DEVICE, such as {examples}"

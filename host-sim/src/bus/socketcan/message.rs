@@ -1,0 +1,147 @@
+//! One message of a CAN_RAW socket: a frame, whether it is our own, and when it arrived.
+//!
+//! The `socketcan` crate reads frames and times, but not the flag that marks an echo of our own.
+
+use std::io;
+use std::mem::{size_of, size_of_val, zeroed};
+use std::os::fd::{AsRawFd, BorrowedFd};
+use std::time::{Duration, SystemTime};
+
+use proto_core::recipe::can::CanFrame;
+use proto_core::recipe::model::CanId;
+use socketcan::CanErrorFrame;
+
+/// What a read of the socket gave.
+#[derive(Debug)]
+pub(super) struct Message {
+    pub(super) content: Content,
+    /// The frame is one of ours, which has just left.
+    pub(super) is_own: bool,
+    /// When the kernel got it, by the real-time clock.
+    pub(super) at: Option<SystemTime>,
+}
+
+#[derive(Debug)]
+pub(super) enum Content {
+    /// A data or remote frame.
+    Frame(CanFrame),
+    /// What the interface says about itself and the bus.
+    Error(CanErrorFrame),
+    /// A CAN FD frame.
+    Fd,
+    /// Nothing that the kernel's interface describes.
+    Unknown,
+}
+
+/// Reads the next message.
+///
+/// # Errors
+/// `WouldBlock` when there is none; what is wrong with the interface otherwise.
+pub(super) fn receive(socket: BorrowedFd<'_>) -> io::Result<Message> {
+    let mut bytes = [0_u8; libc::CANFD_MTU];
+    let mut control = Control([0; CONTROL]);
+    let mut part = libc::iovec { iov_base: bytes.as_mut_ptr().cast(), iov_len: size_of_val(&bytes) };
+    // SAFETY: a `msghdr` is pointers and numbers, for which zero is a value.
+    let mut header: libc::msghdr = unsafe { zeroed() };
+    header.msg_iov = &raw mut part;
+    header.msg_iovlen = 1;
+    header.msg_control = control.0.as_mut_ptr().cast();
+    header.msg_controllen = size_of_val(&control.0) as _;
+    // SAFETY: the header leads to `bytes` and `control`, with their lengths; both outlive the call.
+    let count = unsafe { libc::recvmsg(socket.as_raw_fd(), &raw mut header, libc::MSG_DONTWAIT) };
+    let count = usize::try_from(count).map_err(|_| io::Error::last_os_error())?;
+    Ok(Message {
+        content: match count {
+            libc::CAN_MTU => classic(&bytes),
+            libc::CANFD_MTU => Content::Fd,
+            _ => Content::Unknown,
+        },
+        is_own: header.msg_flags & libc::MSG_CONFIRM != 0,
+        at: arrival(&header),
+    })
+}
+
+/// A `struct can_frame`: id and flags, length, three bytes of no interest, data.
+fn classic(bytes: &[u8; libc::CANFD_MTU]) -> Content {
+    let [i0, i1, i2, i3, len, _, _, _, data @ ..] = bytes;
+    let word = u32::from_ne_bytes([*i0, *i1, *i2, *i3]);
+    let len = usize::from(*len).min(libc::CAN_MAX_DLEN);
+    let data = &data[..len];
+    if word & libc::CAN_ERR_FLAG != 0 {
+        return CanErrorFrame::new_error(word, data).map_or(Content::Unknown, Content::Error);
+    }
+    let id = if word & libc::CAN_EFF_FLAG != 0 {
+        CanId::Extended(word & libc::CAN_EFF_MASK)
+    } else {
+        CanId::Standard((word & libc::CAN_SFF_MASK) as u16)
+    };
+    let frame = match word & libc::CAN_RTR_FLAG {
+        0 => CanFrame::new(id, data),
+        _ => CanFrame::remote(id, len),
+    };
+    frame.map_or(Content::Unknown, Content::Frame)
+}
+
+/// The time that SO_TIMESTAMPNS attaches.
+fn arrival(header: &libc::msghdr) -> Option<SystemTime> {
+    // SAFETY: `recvmsg` filled the header; it leads to a control buffer that is alive and aligned.
+    let mut next = unsafe { libc::CMSG_FIRSTHDR(header) };
+    while !next.is_null() {
+        // SAFETY: the macros above and below give only headers that lie whole in the buffer.
+        let message = unsafe { &*next };
+        // SAFETY: reckons a length, whatever the number.
+        let enough = unsafe { libc::CMSG_LEN(size_of::<libc::timespec>() as u32) } as usize;
+        let kind = (message.cmsg_level, message.cmsg_type);
+        if kind == (libc::SOL_SOCKET, libc::SCM_TIMESTAMPNS) && message.cmsg_len as usize >= enough {
+            // SAFETY: the message is long enough for the `timespec` that this kind is, aligned or not.
+            let time: libc::timespec =
+                unsafe { libc::CMSG_DATA(next).cast::<libc::timespec>().read_unaligned() };
+            let seconds = u64::try_from(time.tv_sec).ok()?;
+            let nanos = u32::try_from(time.tv_nsec).ok()?;
+            return SystemTime::UNIX_EPOCH.checked_add(Duration::new(seconds, nanos));
+        }
+        // SAFETY: as with the first header; `next` lies in the same buffer.
+        next = unsafe { libc::CMSG_NXTHDR(header, next) };
+    }
+    None
+}
+
+/// Room for control messages, aligned as their headers are.
+#[repr(C, align(8))]
+struct Control([u8; CONTROL]);
+
+/// A time takes 32 bytes; nothing else is asked for.
+const CONTROL: usize = 64;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn raw(word: u32, len: u8, data: [u8; 8]) -> [u8; libc::CANFD_MTU] {
+        let mut bytes = [0xA5; libc::CANFD_MTU];
+        bytes[..4].copy_from_slice(&word.to_ne_bytes());
+        bytes[4] = len;
+        bytes[8..16].copy_from_slice(&data);
+        bytes
+    }
+
+    #[test]
+    fn frames_keep_id_kind_and_data() {
+        let data = [1, 2, 3, 4, 5, 6, 7, 8];
+        let frame = |word, len| match classic(&raw(word, len, data)) {
+            Content::Frame(frame) => frame,
+            other => panic!("{other:?}"),
+        };
+        assert_eq!(Some(frame(0x7FF, 3)), CanFrame::new(CanId::Standard(0x7FF), &data[..3]));
+        let extended = libc::CAN_EFF_FLAG | 0x1ABC_DEF0;
+        assert_eq!(Some(frame(extended, 8)), CanFrame::new(CanId::Extended(0x1ABC_DEF0), &data));
+        assert_eq!(Some(frame(libc::CAN_RTR_FLAG | 5, 4)), CanFrame::remote(CanId::Standard(5), 4));
+        assert_eq!(frame(1, 255).data().len(), 8, "a length no kernel reports");
+    }
+
+    #[test]
+    fn error_frames_are_told_apart() {
+        let off = libc::CAN_ERR_FLAG | libc::CAN_ERR_BUSOFF;
+        assert!(matches!(classic(&raw(off, 8, [0; 8])), Content::Error(_)));
+    }
+}
