@@ -1,0 +1,97 @@
+//! CAN interfaces of the kernel: the programs as separate processes on a bus of Linux.
+//!
+//! `HOST_SIM_VCAN` chooses where:
+//!
+//! * `HOST_SIM_VCAN=uml cargo test --test socketcan`: on a kernel of its own, which is an ordinary
+//!   process (`tests/uml/run`); no privileges are needed.
+//! * `HOST_SIM_VCAN=vcan0 cargo test --test socketcan`: on this machine's interface of that name. What
+//!   changes interfaces needs root, and is skipped without.
+//! * Without it every test is counted as ignored.
+//!
+//! `HOST_SIM_PYTHON` is a Python that has python-can. `HOST_SIM_LOAD_SECONDS` is how long the run under
+//! full load takes (2).
+
+mod adapter;
+mod cell;
+mod examples;
+mod faults;
+mod load;
+
+use std::os::unix::process::CommandExt;
+use std::path::{Path, PathBuf};
+use std::process::{Command, ExitCode};
+
+use libtest_mimic::{Arguments, Failed, Trial};
+
+/// What a test needs beside the interface.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Needs {
+    Nothing,
+    /// To make interfaces and take them down.
+    Root,
+    /// A Python that has python-can.
+    Python,
+    /// Root, and the kernel's driver for adapters on serial lines.
+    Slcan,
+}
+
+const HOW: &str = "HOST_SIM_VCAN=uml cargo test --test socketcan (Debian: apt-get install user-mode-linux \
+                   busybox-static can-utils iproute2), or HOST_SIM_VCAN=vcan0 on a machine that has one";
+
+fn main() -> ExitCode {
+    let mut arguments = Arguments::from_args();
+    // They share a bus.
+    arguments.test_threads = Some(1);
+    let chosen = std::env::var("HOST_SIM_VCAN").ok().filter(|chosen| !chosen.is_empty());
+    if chosen.as_deref() == Some("uml") && !arguments.list {
+        let runner = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/uml/run");
+        let mut command = Command::new(&runner);
+        command.args(std::env::current_exe()).args(std::env::args_os().skip(1));
+        let error = command.env("HOST_SIM_VCAN", "vcan0").exec();
+        eprintln!("{}: {error}", runner.display());
+        return ExitCode::FAILURE;
+    }
+    if chosen.is_none() {
+        eprintln!("socketcan: skipped, there is no CAN interface; {HOW}");
+    }
+    let interface = chosen.unwrap_or_default();
+    let trials = [examples::trials(&interface), faults::trials(&interface), load::trials(&interface)];
+    let trials = trials.into_iter().flatten().map(|(name, needs, test)| {
+        let missing = missing(&interface, needs);
+        let trial = Trial::test(name, move || {
+            test();
+            Ok::<(), Failed>(())
+        });
+        match missing {
+            Some(missing) => trial.with_kind(missing).with_ignored_flag(true),
+            None => trial,
+        }
+    });
+    libtest_mimic::run(&arguments, trials.collect()).exit_code()
+}
+
+/// A test's name, needs and what it does.
+type Test = (&'static str, Needs, Box<dyn FnOnce() + Send>);
+
+/// What keeps a test from running.
+fn missing(interface: &str, needs: Needs) -> Option<&'static str> {
+    let root = rustix::process::geteuid().is_root();
+    if interface.is_empty() {
+        return Some("needs HOST_SIM_VCAN");
+    }
+    match needs {
+        Needs::Python if python().is_none() => Some("needs HOST_SIM_PYTHON"),
+        Needs::Root if !root => Some("needs root"),
+        Needs::Slcan if !root || !Path::new("/sys/module/slcan").exists() => Some("needs root and slcan.ko"),
+        _ => None,
+    }
+}
+
+/// The Python to run: the named one, or that of the foreign clients when it is there.
+fn python() -> Option<PathBuf> {
+    if let Some(python) = std::env::var_os("HOST_SIM_PYTHON") {
+        return Some(python.into());
+    }
+    let usual = Path::new(env!("CARGO_MANIFEST_DIR")).join("../target/foreign/venv/bin/python");
+    usual.exists().then_some(usual)
+}
