@@ -111,7 +111,8 @@ impl Line {
                         Ok(stream) => {
                             info!(%to, "connected");
                             backoff.reset();
-                            stream.set_nodelay(true)?;
+                            // A peer that is gone already is found by the next read.
+                            let _ = stream.set_nodelay(true);
                             sender.up(&mut events);
                             let error = pump(&stream, &mut sender, &mut events).await;
                             info!(%to, %error, "connection lost");
@@ -125,7 +126,8 @@ impl Line {
             Source::Listen(listener) => loop {
                 let (stream, peer) = accept(&listener).await;
                 info!(%peer, "client");
-                stream.set_nodelay(true)?;
+                // A peer that is gone already is found by the next read.
+                let _ = stream.set_nodelay(true);
                 sender.up(&mut events);
                 tokio::select! {
                     error = pump(&stream, &mut sender, &mut events) => info!(%peer, %error, "client left"),

@@ -293,6 +293,21 @@ mod tests {
     }
 
     #[test]
+    fn what_a_client_wrote_before_it_left_is_not_lost_by_looking_for_it() {
+        run(async |link| {
+            let pty = Pty::open(link).unwrap();
+            for round in 0..20 {
+                let mut peer = client(link);
+                pty.try_write(b"unread").unwrap();
+                peer.write_all(&[round, 0xEE]).unwrap();
+                drop(peer);
+                assert!(!pty.is_heard());
+                assert_eq!(read_from(&pty, 2).await, [round, 0xEE]);
+            }
+        });
+    }
+
+    #[test]
     fn a_quiet_line_without_a_client_does_not_wake_the_reactor() {
         run(async |link| {
             let pty = Pty::open(link).unwrap();
