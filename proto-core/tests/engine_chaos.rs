@@ -184,6 +184,7 @@ proptest! {
                 outputs += 1;
                 prop_assert!(outputs <= MOST_OUTPUTS, "{next:?} leads to no end of outputs");
             };
+            prop_assert!(until <= engine.deadline(), "{next:?} at {now:?}: would sleep through a deadline");
             prop_assert!(until > now || now == Instant::NEVER, "{next:?} at {now:?}: asked for {until:?}");
         }
     }

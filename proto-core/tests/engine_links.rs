@@ -361,6 +361,23 @@ fn three_requests_without_an_answer_reopen_the_link() {
 }
 
 #[test]
+fn two_requests_without_an_answer_and_one_with_one_are_no_three() {
+    let mut full = Full::new();
+    for _ in 0..5 {
+        full.rig.modbus_answers = false;
+        full.rig.run(MS(1_010));
+        full.rig.modbus_answers = true;
+        for request in full.rig.sent_on(LinkId::MODBUS) {
+            let answer = full.rig.answer(&request);
+            full.rig.link_bytes(LinkId::MODBUS, &answer);
+        }
+        full.rig.run(MS(100));
+    }
+    let link = full.rig.link(LinkId::MODBUS);
+    assert_eq!((link.counters.timeouts, link.history.losses), (10, 0));
+}
+
+#[test]
 fn an_answer_that_comes_after_its_time_is_not_taken_for_the_next_one() {
     let mut full = Full::new();
     full.rig.run(MS(100));
@@ -507,22 +524,26 @@ fn a_refused_safe_value_gives_way_to_the_owner() {
 
 #[test]
 fn an_owners_value_is_never_kept_as_if_it_were_safe() {
-    let (mut rig, port) = guarded();
+    let mut cell = Cell::new();
+    let recipe = cell.stream(&["DigitalOutputCommand[1]"], &[]);
+    let port = cell.rs485(recipe);
+    cell.last_port().timeout = MS(1_000);
+    cell.safe("DigitalOutputCommand[1]", 4.0);
+    let mut rig = cell.rig();
+    rig.run(MS(10));
     rig.bytes(port, ON);
     rig.modbus_answers = false;
     rig.take_written();
     // The safe value is under way when its owner comes back and the link breaks.
-    rig.run(MS(101));
+    rig.run(MS(1_001));
     rig.bytes(port, OFF);
     rig.bytes(port, ON);
-    rig.reachable.clear();
     rig.input(Input::LinkDown { link: LinkId::MODBUS });
     rig.modbus_answers = true;
-    rig.bytes(port, OFF);
     rig.sent_on(LinkId::MODBUS);
-    rig.reachable = (0..16).collect();
-    rig.run(MS(99));
-    assert_eq!(rig.take_written(), [], "received before the link was lost, and while it was down");
+    rig.run(MS(900));
+    assert_eq!(rig.link(LinkId::MODBUS).state.name(), "up");
+    assert_eq!(rig.take_written(), [], "received before the link was lost");
     rig.run(MS(5_000));
     assert_eq!(rig.take_written(), [coils(192, 4)], "silent again: safe again");
 }

@@ -162,11 +162,19 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             None => {
                 if self.rearm {
                     self.rearm = false;
-                    self.timer_at = self.next_deadline();
+                    self.timer_at = self.deadline();
                 }
                 Output::Sleep { until: self.timer_at }
             }
         }
+    }
+
+    /// When the engine has something to do by itself, worked out anew. [`Output::Sleep`] may name an
+    /// earlier instant, never a later one.
+    pub fn deadline(&self) -> Instant {
+        let ports = self.ports.iter().map(FieldPort::deadline);
+        let ports = ports.min().unwrap_or(Instant::NEVER);
+        ports.min(self.links.deadline()).min(self.store.deadline())
     }
 
     /// The process image.
@@ -300,12 +308,6 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             }
         }
         None
-    }
-
-    fn next_deadline(&self) -> Instant {
-        let ports = self.ports.iter().map(FieldPort::deadline);
-        let ports = ports.min().unwrap_or(Instant::NEVER);
-        ports.min(self.links.deadline()).min(self.store.deadline())
     }
 }
 

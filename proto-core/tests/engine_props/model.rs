@@ -37,12 +37,12 @@ pub const WORD32: &str = "WordInputReg[32]";
 pub const FORCE: &str = "ForceEnd[1]";
 pub const FLOAT: &str = "FloatInputReg[1]";
 
-/// The ports' timeouts. The first is as long as the shortest wait for a link, the next much longer.
+/// The ports' timeouts: some longer than the shortest wait for a link, some not.
 pub const TIMEOUTS: [Duration; 4] = [
-    Duration::from_millis(100),
     Duration::from_millis(1_500),
+    Duration::from_millis(100),
     Duration::from_millis(700),
-    Duration::from_millis(40),
+    Duration::from_millis(300),
 ];
 
 /// The frames that devices send, each with its variables.

@@ -350,6 +350,8 @@ impl Rig {
                         "asked to be called at once again: {until:?} at {:?}",
                         self.now
                     );
+                    let needed = self.engine.deadline();
+                    assert!(until <= needed, "sleeps until {until:?} and misses {needed:?}");
                     self.wake = until;
                     return;
                 }
