@@ -93,14 +93,14 @@ struct Attached<'a> {
     state: BusState,
     /// Frames that the kernel took and did not give back yet.
     on_their_way: usize,
-    /// When the kernel took one the last time.
-    taken_at: Instant,
-    /// [`Self::lost`] at that time.
+    /// [`Self::lost`] when the kernel took the first of them.
     lost_before: u32,
     /// Since when the kernel has not taken the next frame.
     refused_since: Option<Instant>,
     /// Frames that the kernel dropped on this socket.
     lost: u32,
+    /// When to look after what is waited for, while something is.
+    look_at: Instant,
     /// Pauses between looks at an interface that is bus-off.
     looks: Backoff,
 }
@@ -132,10 +132,10 @@ impl<'a> Attached<'a> {
             timer: Timer::new()?,
             state,
             on_their_way: 0,
-            taken_at: Instant::ZERO,
             lost_before: 0,
             refused_since: None,
             lost: 0,
+            look_at: Instant::ZERO,
             looks: Backoff::new(LEAST_LOOK, MOST_LOOK),
         })
     }
@@ -226,6 +226,7 @@ impl<'a> Attached<'a> {
             BusState::BusOff => {
                 warn!(interface, "bus-off: nothing is sent until it was restarted");
                 self.looks.reset();
+                self.look_at = now() + pause(self.looks.pause());
                 // What was under way will not leave, or would be old when it did.
                 self.on_their_way = 0;
                 self.give_up_queue();
@@ -264,13 +265,14 @@ impl<'a> Attached<'a> {
                         self.lost_before = self.lost;
                     }
                     self.on_their_way += 1;
-                    self.taken_at = now();
+                    self.look_at = now() + ECHO_TIME;
                     self.refused_since = None;
                 }
                 Err(error) if is_full(&error) => {
                     tx.count(|counters| counters.refusals += 1);
                     let since = *self.refused_since.get_or_insert_with(now);
                     if now().saturating_since(since) < PATIENCE {
+                        self.look_at = now() + RETRY;
                         return Ok(());
                     }
                     // A whole cycle or nothing of its rest: the next one is newer.
@@ -302,22 +304,13 @@ impl<'a> Attached<'a> {
     }
 
     fn deadline(&self) -> Instant {
-        if self.is_off() {
-            // Armed once for each pause: other news do not move it.
-            let armed = self.timer.deadline();
-            return if armed == Instant::NEVER { now() + pause(self.looks.clone().pause()) } else { armed };
-        }
-        match self.refused_since {
-            Some(_) => now() + RETRY,
-            None if self.on_their_way > 0 => self.taken_at.max(now()) + ECHO_TIME,
-            None => Instant::NEVER,
-        }
+        if self.is_off() || self.is_sending() { self.look_at } else { Instant::NEVER }
     }
 
     /// Time has passed: what was waited for?
     fn look(&mut self, events: &mut impl FnMut(PortEvent<'_>)) -> io::Result<()> {
         if self.is_off() {
-            let _ = self.looks.pause();
+            self.look_at = now() + pause(self.looks.pause());
             if has_carrier(&self.port.interface) {
                 self.enter(BusState::Active, events);
             }
@@ -326,6 +319,7 @@ impl<'a> Attached<'a> {
         if self.refused_since.is_some() {
             return self.send(events);
         }
+        self.look_at = now() + ECHO_TIME;
         self.note_lost()?;
         if self.on_their_way > 0 && self.lost != self.lost_before {
             // What was to tell that they have left may be among what was lost.

@@ -146,6 +146,8 @@ impl Core {
             tokio::select! {
                 expired = timer.expired() => {
                     expired.map_err(clock)?;
+                    // What arrived before this moment is told first: it may not be overdue.
+                    tokio::task::yield_now().await;
                     self.input(Input::Tick);
                 }
                 () = self.deadline_moved.notified() => {}

@@ -1,6 +1,7 @@
 //! What goes wrong on a bus and with an interface, for real where the kernel has it.
 
 use std::process::Command;
+use std::time::{Duration, Instant};
 
 use super::adapter::Adapter;
 use super::cell::{Candump, Running, Vcan, cansend, example, tool, until};
@@ -20,6 +21,7 @@ pub(crate) fn trials(interface: &str) -> Vec<Test> {
         own("no_room_in_the_interfaces_queue", Needs::Root, no_room),
         own("fd_frames_are_counted_and_ignored", Needs::Root, fd_frames),
         on("what_the_kernel_dropped_is_counted", Needs::Nothing, overrun),
+        on("a_frame_is_as_old_as_the_kernel_says", Needs::Nothing, arrival),
         on("what_is_no_can_interface_is_refused_at_once", Needs::Nothing, no_interface),
     ]
 }
@@ -256,6 +258,26 @@ fn overrun(interface: &str) {
     gateway.end();
     robot.end();
 }
+
+fn arrival(interface: &str) {
+    let robot = Running::controller(&example("can-hand-controller.toml"), &[]);
+    let bind = format!("--bind=can-1=socketcan:{interface}");
+    let gateway = Running::gateway(&example("can-user.toml"), &robot, &[&bind]);
+    gateway.signal("STOP");
+    cansend(interface, "001#010203");
+    std::thread::sleep(WAITED);
+    let begin = Instant::now();
+    gateway.signal("CONT");
+    let stats = gateway.stats("the frame", |stats| stats["ports"]["can-1"]["frames_in"] == 1);
+    let age = Duration::from_millis(stats["age_ms"]["WordInputReg[1]"].as_u64().unwrap());
+    assert!(age >= begin.elapsed() + WAITED / 2, "{age:?}");
+    gateway.stats("overdue", |stats| stats["ports"]["can-1"]["timeouts"] == 1);
+    gateway.end();
+    robot.end();
+}
+
+/// How long a frame waits for a program that stands still.
+const WAITED: Duration = Duration::from_secs(3);
 
 fn no_interface(_: &str) {
     for (interface, message) in [("hsnone0", "no such CAN interface"), ("lo", "no such CAN interface")] {
