@@ -37,15 +37,23 @@ pub enum Device {
         /// The interface, such as `vcan0`.
         interface: String,
     },
-    /// `slcan-pty:PATH`: a CAN bus of our own with a first client on a new pseudoterminal.
+    /// `slcan-pty:PATH` or `slcan-pty-unpaced:PATH`: a CAN bus of our own with a client on a new
+    /// pseudoterminal.
     SlcanPty {
         /// Where the link to the pseudoterminal appears.
         link: PathBuf,
+        /// Whether frames take their time on the bus.
+        pace: Pace,
     },
-    /// `slcan-tcp:HOST:PORT`: a CAN bus of our own whose clients connect here.
+    /// `slcan-tcp:HOST:PORT[,PATH]` or `slcan-tcp-unpaced:HOST:PORT[,PATH]`: a CAN bus of our own whose
+    /// clients connect here.
     SlcanTcp {
         /// Where to listen; port 0 is any free one.
         listen: HostPort,
+        /// Where the link to a pseudoterminal for one client more appears.
+        link: Option<PathBuf>,
+        /// Whether frames take their time on the bus.
+        pace: Pace,
     },
     /// `tcp:HOST:PORT`: a raw byte stream to somebody who listens there.
     Tcp {
@@ -59,13 +67,13 @@ pub enum Device {
     },
 }
 
-/// Whether bytes sent on a pseudoterminal appear all at once or at the line's speed.
+/// Whether what is sent appears all at once or at the speed of the line or bus.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Pace {
-    /// At once. Only the time until the next frame may be sent follows the line's speed.
+    /// At once. On a serial line the time until the next frame may be sent still follows its speed.
     #[default]
     AtOnce,
-    /// Byte by byte, as a UART at the line's speed would deliver them.
+    /// Byte by byte as a UART at the line's speed would deliver them, frame by frame on a CAN bus.
     Line,
 }
 
@@ -83,7 +91,8 @@ impl Device {
 
 /// The forms `DEVICE` takes, for messages.
 pub const DEVICE_FORMS: &str = "pty:PATH, pty-paced:PATH, serial:PATH, socketcan:INTERFACE, slcan-pty:PATH, \
-                                slcan-tcp:HOST:PORT, tcp:HOST:PORT or tcp-listen:HOST:PORT";
+                                slcan-pty-unpaced:PATH, slcan-tcp:HOST:PORT[,PATH], \
+                                slcan-tcp-unpaced:HOST:PORT[,PATH], tcp:HOST:PORT or tcp-listen:HOST:PORT";
 
 impl FromStr for Bind {
     type Err = BindError;
@@ -107,8 +116,17 @@ impl FromStr for Device {
         let path = || -> Result<PathBuf, BindError> {
             if rest.is_empty() { Err(BindError::Empty { kind: kind.to_owned() }) } else { Ok(rest.into()) }
         };
-        let address = || -> Result<HostPort, BindError> {
-            rest.parse().map_err(|why| BindError::Address { kind: kind.to_owned(), why })
+        let address_in = |text: &str| -> Result<HostPort, BindError> {
+            text.parse().map_err(|why| BindError::Address { kind: kind.to_owned(), why })
+        };
+        let address = || address_in(rest);
+        let slcan_tcp = |pace: Pace| -> Result<Self, BindError> {
+            let (listen, link) = match rest.split_once(',') {
+                Some((_, "")) => return Err(BindError::NoPath { kind: kind.to_owned() }),
+                Some((listen, link)) => (listen, Some(link.into())),
+                None => (rest, None),
+            };
+            Ok(Self::SlcanTcp { listen: address_in(listen)?, link, pace })
         };
         Ok(match kind {
             "pty" => Self::Pty { link: path()?, pace: Pace::AtOnce },
@@ -116,8 +134,10 @@ impl FromStr for Device {
             "serial" => Self::Serial { path: path()? },
             "socketcan" if rest.is_empty() => return Err(BindError::Empty { kind: kind.to_owned() }),
             "socketcan" => Self::SocketCan { interface: rest.to_owned() },
-            "slcan-pty" => Self::SlcanPty { link: path()? },
-            "slcan-tcp" => Self::SlcanTcp { listen: address()? },
+            "slcan-pty" => Self::SlcanPty { link: path()?, pace: Pace::Line },
+            "slcan-pty-unpaced" => Self::SlcanPty { link: path()?, pace: Pace::AtOnce },
+            "slcan-tcp" => slcan_tcp(Pace::Line)?,
+            "slcan-tcp-unpaced" => slcan_tcp(Pace::AtOnce)?,
             "tcp" => match address()? {
                 listen @ HostPort { port: 0, .. } => Self::TcpListen { listen },
                 to => Self::Tcp { to },
@@ -135,11 +155,21 @@ impl fmt::Display for Device {
             Self::Pty { link, pace: Pace::Line } => write!(f, "pty-paced:{}", link.display()),
             Self::Serial { path } => write!(f, "serial:{}", path.display()),
             Self::SocketCan { interface } => write!(f, "socketcan:{interface}"),
-            Self::SlcanPty { link } => write!(f, "slcan-pty:{}", link.display()),
-            Self::SlcanTcp { listen } => write!(f, "slcan-tcp:{listen}"),
+            Self::SlcanPty { link, pace } => write!(f, "slcan-pty{}:{}", unpaced(*pace), link.display()),
+            Self::SlcanTcp { listen, link, pace } => {
+                write!(f, "slcan-tcp{}:{listen}", unpaced(*pace))?;
+                link.as_ref().map_or(Ok(()), |link| write!(f, ",{}", link.display()))
+            }
             Self::Tcp { to } => write!(f, "tcp:{to}"),
             Self::TcpListen { listen } => write!(f, "tcp-listen:{listen}"),
         }
+    }
+}
+
+fn unpaced(pace: Pace) -> &'static str {
+    match pace {
+        Pace::AtOnce => "-unpaced",
+        Pace::Line => "",
     }
 }
 
@@ -210,6 +240,11 @@ pub enum BindError {
         /// The device's kind.
         kind: String,
     },
+    /// Nothing after the comma that follows an address.
+    NoPath {
+        /// The device's kind.
+        kind: String,
+    },
     /// The address is not one.
     Address {
         /// The device's kind.
@@ -228,6 +263,7 @@ impl fmt::Display for BindError {
             Self::NoName { text } => write!(f, "`{text}` names no port before the `=`; write NAME=DEVICE"),
             Self::UnknownDevice { text } => write!(f, "`{text}` is not a device; allowed are {DEVICE_FORMS}"),
             Self::Empty { kind } => write!(f, "`{kind}:` is followed by nothing; allowed are {DEVICE_FORMS}"),
+            Self::NoPath { kind } => write!(f, "`{kind}:` has no PATH after its comma"),
             Self::Address { kind, why } => write!(f, "`{kind}:` needs HOST:PORT, but {why}"),
         }
     }
@@ -274,7 +310,11 @@ mod tests {
             "rs485-1=serial:/dev/ttyUSB0",
             "can=socketcan:vcan0",
             "can=slcan-pty:run/can",
+            "can=slcan-pty-unpaced:run/can",
             "can=slcan-tcp:127.0.0.1:0",
+            "can=slcan-tcp-unpaced:[::1]:0",
+            "can=slcan-tcp:127.0.0.1:0,run/can,1",
+            "can=slcan-tcp-unpaced:127.0.0.1:3333,run/can",
             "a=tcp:sensor.local:4001",
             "a=tcp-listen:[::1]:0",
             "name=pty:with=sign",
@@ -302,6 +342,8 @@ mod tests {
             ("a=usb:x", "`usb:x` is not a device"),
             ("a=pty:", "`pty:` is followed by nothing"),
             ("a=socketcan:", "`socketcan:` is followed by nothing"),
+            ("a=slcan-tcp:h:1,", "`slcan-tcp:` has no PATH"),
+            ("a=slcan-tcp:h,p", "`slcan-tcp:` needs HOST:PORT, but there is no `:PORT`"),
             ("a=tcp:host", "`tcp:` needs HOST:PORT, but there is no `:PORT`"),
             ("a=tcp::5", "`tcp:` needs HOST:PORT, but there is no host"),
             ("a=tcp:h:65536", "`tcp:` needs HOST:PORT, but the port is not a number"),

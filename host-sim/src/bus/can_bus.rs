@@ -2,51 +2,134 @@
 
 use std::cell::{Cell, RefCell};
 use std::collections::VecDeque;
+use std::future::pending;
 use std::io;
+use std::ops::Range;
 use std::rc::Rc;
 use std::time::Duration as StdDuration;
 
-use embedded_can::Frame;
 use proto_core::recipe::can::CanFrame;
-use proto_core::time::{Duration, Instant};
+use proto_core::time::Instant;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Notify;
 use tokio::task::JoinSet;
 use tracing::{info, warn};
 
-use super::bind::Device;
+use super::bind::{Device, Pace};
 use super::line::accept;
 use super::port::{PortEvent, PortTx};
 use super::pty::Pty;
 use super::slcan::{Channel, ChannelState};
 use super::timer::{Timer, now};
+use super::wire::{Crossed, Full, NodeId, Pacing, Wire};
 
 /// The bus itself; clones are the same bus.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone)]
 pub struct CanBus {
-    nodes: Rc<RefCell<Vec<Rc<NodeState>>>>,
+    shared: Rc<Shared>,
+}
+
+#[derive(Debug)]
+struct Shared {
+    wire: RefCell<Wire>,
+    nodes: RefCell<Vec<Rc<NodeState>>>,
+    /// The wire's deadline has moved.
+    moved: Notify,
     /// Where dropped frames are counted.
     tx: Rc<PortTx>,
 }
 
-#[derive(Debug, Default)]
+#[derive(Debug)]
 struct NodeState {
-    queue: RefCell<VecDeque<CanFrame>>,
+    id: NodeId,
+    queue: RefCell<VecDeque<(Instant, CanFrame)>>,
     wake: Notify,
     deaf: Cell<bool>,
     dropped: Cell<u64>,
+    left: Cell<Left>,
+    left_wake: Notify,
+}
+
+/// What a node has sent and not yet been told of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Left {
+    /// Frames.
+    pub frames: u64,
+    /// Their data bytes.
+    pub bytes: u64,
 }
 
 impl CanBus {
+    /// A bus without nodes. What they drop is counted at `tx`.
+    pub fn new(pacing: Pacing, tx: Rc<PortTx>) -> Self {
+        let wire = RefCell::new(Wire::new(pacing));
+        Self { shared: Rc::new(Shared { wire, nodes: RefCell::default(), moved: Notify::new(), tx }) }
+    }
+
     /// Joins the bus with a node that hears everything.
     pub fn join(&self) -> Node {
-        let state = Rc::new(NodeState::default());
-        self.nodes.borrow_mut().push(Rc::clone(&state));
+        let state = Rc::new(NodeState {
+            id: self.shared.wire.borrow_mut().join(),
+            queue: RefCell::default(),
+            wake: Notify::new(),
+            deaf: Cell::new(false),
+            dropped: Cell::new(0),
+            left: Cell::default(),
+            left_wake: Notify::new(),
+        });
+        self.shared.nodes.borrow_mut().push(Rc::clone(&state));
         Node { bus: self.clone(), state }
+    }
+
+    /// Lets time pass on the bus until dropped.
+    ///
+    /// # Errors
+    /// As [`Timer::new`] and [`Timer::expired`].
+    pub async fn run(&self) -> io::Result<()> {
+        let timer = Timer::new()?;
+        loop {
+            let deadline = self.shared.wire.borrow().deadline();
+            timer.arm(deadline)?;
+            tokio::select! {
+                expired = timer.expired() => {
+                    expired?;
+                    self.advance(now());
+                }
+                () = self.shared.moved.notified() => {}
+            }
+        }
+    }
+
+    /// Hands out what has crossed the wire by now: every node but the sender gets it that hears, or
+    /// drops and counts it when [`MAX_WAITING`] frames wait there already.
+    pub fn advance(&self, now: Instant) {
+        loop {
+            let crossed = self.shared.wire.borrow_mut().poll(now);
+            let Some(Crossed { from, frame, at }) = crossed else { return };
+            for node in self.shared.nodes.borrow().iter() {
+                if node.id == from {
+                    let Left { frames, bytes } = node.left.get();
+                    node.left.set(Left { frames: frames + 1, bytes: bytes + frame.data().len() as u64 });
+                    node.left_wake.notify_one();
+                    continue;
+                }
+                if node.deaf.get() {
+                    continue;
+                }
+                let mut queue = node.queue.borrow_mut();
+                if queue.len() == MAX_WAITING {
+                    node.dropped.set(node.dropped.get() + 1);
+                    self.shared.tx.count(|counters| counters.dropped += 1);
+                } else {
+                    queue.push_back((at, frame));
+                    node.wake.notify_one();
+                }
+            }
+        }
     }
 }
 
-/// One member of a bus; leaves it when dropped.
+/// One member of a bus; leaves it when dropped, and what it has not sent by then is given up.
 #[derive(Debug)]
 pub struct Node {
     bus: CanBus,
@@ -54,31 +137,50 @@ pub struct Node {
 }
 
 impl Node {
-    /// Puts a frame on the bus: every other node that hears gets it, or drops and counts it when
-    /// [`MAX_WAITING`] frames wait there already.
-    pub fn send(&self, frame: CanFrame) {
-        for node in self.bus.nodes.borrow().iter() {
-            if Rc::ptr_eq(node, &self.state) || node.deaf.get() {
-                continue;
+    /// Queues a frame for the wire.
+    ///
+    /// # Errors
+    /// When too many wait, see [`Full`].
+    pub fn send(&self, now: Instant, frame: CanFrame) -> Result<(), Full> {
+        let wire = &self.bus.shared.wire;
+        self.bus.advance(now);
+        let before = wire.borrow().deadline();
+        wire.borrow_mut().send(now, self.state.id, frame)?;
+        self.bus.advance(now);
+        if wire.borrow().deadline() != before {
+            self.bus.shared.moved.notify_one();
+        }
+        Ok(())
+    }
+
+    /// Whether the next frame would be refused.
+    pub fn is_full(&self) -> bool {
+        self.bus.shared.wire.borrow().is_full(self.state.id)
+    }
+
+    /// Frames of this node that have not left.
+    pub fn waiting(&self) -> usize {
+        self.bus.shared.wire.borrow().waiting(self.state.id)
+    }
+
+    /// Waits until frames of this node have left. Cancel safe.
+    pub async fn left(&self) -> Left {
+        loop {
+            let left = self.state.left.take();
+            if left.frames > 0 {
+                return left;
             }
-            let mut queue = node.queue.borrow_mut();
-            if queue.len() == MAX_WAITING {
-                node.dropped.set(node.dropped.get() + 1);
-                self.bus.tx.count(|counters| counters.dropped += 1);
-            } else {
-                queue.push_back(frame);
-                node.wake.notify_one();
-            }
+            self.state.left_wake.notified().await;
         }
     }
 
-    /// The next frame that others sent.
-    pub fn try_recv(&self) -> Option<CanFrame> {
+    /// The next frame that others sent, with the time of its end.
+    pub fn try_recv(&self) -> Option<(Instant, CanFrame)> {
         self.state.queue.borrow_mut().pop_front()
     }
 
     /// Waits for the next frame. Cancel safe.
-    pub async fn recv(&self) -> CanFrame {
+    pub async fn recv(&self) -> (Instant, CanFrame) {
         loop {
             if let Some(frame) = self.try_recv() {
                 return frame;
@@ -103,102 +205,101 @@ impl Node {
 
 impl Drop for Node {
     fn drop(&mut self) {
-        self.bus.nodes.borrow_mut().retain(|node| !Rc::ptr_eq(node, &self.state));
+        self.bus.shared.wire.borrow_mut().leave(self.state.id);
+        self.bus.shared.nodes.borrow_mut().retain(|node| !Rc::ptr_eq(node, &self.state));
     }
 }
 
 /// A CAN port of the configuration, on a bus of its own that slcan clients join.
 #[derive(Debug)]
 pub(super) struct CanPort {
-    source: Source,
+    pty: Option<Pty>,
+    listener: Option<TcpListener>,
     bitrate: u32,
+    pacing: Pacing,
     tx: Rc<PortTx>,
-}
-
-#[derive(Debug)]
-enum Source {
-    Pty(Pty),
-    Tcp(TcpListener),
 }
 
 impl CanPort {
     pub(super) async fn open(device: &Device, bitrate: u32, tx: Rc<PortTx>) -> io::Result<Self> {
-        let source = match device {
-            Device::SlcanPty { link } => Source::Pty(Pty::open(link)?),
-            Device::SlcanTcp { listen } => {
-                let listener = TcpListener::bind((listen.host.as_str(), listen.port)).await;
-                Source::Tcp(
-                    listener.map_err(|error| io::Error::new(error.kind(), format!("{listen}: {error}")))?,
-                )
-            }
+        let (link, listen, pace) = match device {
+            Device::SlcanPty { link, pace } => (Some(link), None, *pace),
+            Device::SlcanTcp { listen, link, pace } => (link.as_ref(), Some(listen), *pace),
             _ => {
                 let what = format!("`{device}` is a serial device; the port is a CAN bus");
                 return Err(io::Error::new(io::ErrorKind::InvalidInput, what));
             }
         };
-        Ok(Self { source, bitrate, tx })
+        let listener = match listen {
+            Some(listen) => {
+                let listener = TcpListener::bind((listen.host.as_str(), listen.port)).await;
+                Some(listener.map_err(|error| io::Error::new(error.kind(), format!("{listen}: {error}")))?)
+            }
+            None => None,
+        };
+        let pty = link.map(|link| Pty::open(link)).transpose()?;
+        let pacing = match pace {
+            Pace::AtOnce => Pacing::AtOnce,
+            Pace::Line => Pacing::Bitrate(bitrate),
+        };
+        Ok(Self { pty, listener, bitrate, pacing, tx })
     }
 
+    /// Of a bus with both, where it listens: the terminal's link is in the configuration anyway.
     pub(super) fn place(&self) -> String {
-        match &self.source {
-            Source::Pty(pty) => pty.link().display().to_string(),
-            Source::Tcp(listener) => {
-                listener.local_addr().map_or_else(|_| String::new(), |at| at.to_string())
-            }
+        match (&self.listener, &self.pty) {
+            (Some(listener), _) => listener.local_addr().map_or_else(|_| String::new(), |at| at.to_string()),
+            (None, Some(pty)) => pty.link().display().to_string(),
+            (None, None) => String::new(),
         }
     }
 
     pub(super) async fn run(self, mut events: impl FnMut(PortEvent<'_>)) -> io::Result<()> {
-        let bus = CanBus { tx: Rc::clone(&self.tx), ..CanBus::default() };
+        let Self { pty, listener, bitrate, pacing, tx } = self;
+        let bus = CanBus::new(pacing, Rc::clone(&tx));
         let node = bus.join();
-        let tx = &self.tx;
         tx.count(|counters| counters.ups += 1);
         events(PortEvent::Up);
-        let port = port_node(&node, self.bitrate, tx, &mut events);
-        match self.source {
-            Source::Pty(pty) => tokio::select! {
-                ended = port => ended,
-                ended = serve(&pty, bus.join(), self.bitrate, tx) => Err(ended),
-            },
-            Source::Tcp(listener) => tokio::select! {
-                ended = port => ended,
-                () = serve_all(listener, &bus, self.bitrate, tx) => Ok(()),
-            },
+        let on_terminal = async {
+            match &pty {
+                Some(pty) => serve(pty, &bus.join(), bitrate, &tx).await,
+                None => pending().await,
+            }
+        };
+        let on_tcp = async {
+            match listener {
+                Some(listener) => serve_all(listener, &bus, bitrate, &tx).await,
+                None => pending().await,
+            }
+        };
+        tokio::select! {
+            () = port_node(&node, &tx, &mut events) => Ok(()),
+            ended = bus.run() => ended,
+            error = on_terminal => Err(error),
+            () = on_tcp => Ok(()),
         }
     }
 }
 
-/// The port's own node: its frames go out one after the other, each in its time.
-async fn port_node(
-    node: &Node,
-    bitrate: u32,
-    tx: &PortTx,
-    events: &mut impl FnMut(PortEvent<'_>),
-) -> io::Result<()> {
-    let timer = Timer::new()?;
-    let mut under_way = None;
+/// The port's own node.
+async fn port_node(node: &Node, tx: &PortTx, events: &mut impl FnMut(PortEvent<'_>)) {
     loop {
         tokio::select! {
-            frame = node.recv() => {
+            (at, frame) = node.recv() => {
                 tx.count(|counters| {
                     counters.frames_in += 1;
                     counters.bytes_in += frame.data().len() as u64;
                 });
-                events(PortEvent::Frame { frame, at: now() });
+                events(PortEvent::Frame { frame, at });
             }
-            () = tx.wake.notified(), if under_way.is_none() => {
-                under_way = next_frame(tx, bitrate, now(), &timer)?;
-            }
-            expired = timer.expired(), if under_way.is_some() => {
-                expired?;
-                let Some((frame, end)) = under_way.take() else { continue };
+            () = tx.wake.notified() => hand_over(node, tx),
+            left = node.left() => {
                 tx.count(|counters| {
-                    counters.frames_out += 1;
-                    counters.bytes_out += frame.data().len() as u64;
+                    counters.frames_out += left.frames;
+                    counters.bytes_out += left.bytes;
                 });
-                node.send(frame);
-                under_way = next_frame(tx, bitrate, end, &timer)?;
-                if under_way.is_none() {
+                hand_over(node, tx);
+                if node.waiting() == 0 {
                     events(PortEvent::Sent);
                 }
             }
@@ -206,24 +307,13 @@ async fn port_node(
     }
 }
 
-/// Takes the next frame of the port's queue, whose transmission begins at `start`.
-fn next_frame(
-    tx: &PortTx,
-    bitrate: u32,
-    start: Instant,
-    timer: &Timer,
-) -> io::Result<Option<(CanFrame, Instant)>> {
-    let Some(frame) = tx.frames.borrow_mut().pop_front() else { return Ok(None) };
-    let end = start + frame_time(&frame, bitrate);
-    timer.arm(end)?;
-    Ok(Some((frame, end)))
-}
-
-/// A frame's time on the bus with the pause after it, without stuffing.
-fn frame_time(frame: &CanFrame, bitrate: u32) -> Duration {
-    let overhead: u64 = if frame.is_extended() { 67 } else { 47 };
-    let bits = overhead + 8 * frame.data().len() as u64;
-    Duration::from_micros((bits * 1_000_000).div_ceil(u64::from(bitrate.max(1))))
+/// Queues as many of the port's frames as its node takes.
+fn hand_over(node: &Node, tx: &PortTx) {
+    while !node.is_full() {
+        let Some(frame) = tx.frames.borrow_mut().pop_front() else { return };
+        // There is room, so it is taken.
+        let _ = node.send(now(), frame);
+    }
 }
 
 async fn serve_all(listener: TcpListener, bus: &CanBus, bitrate: u32, tx: &Rc<PortTx>) {
@@ -242,8 +332,14 @@ async fn serve_all(listener: TcpListener, bus: &CanBus, bitrate: u32, tx: &Rc<Po
                 let _ = rustix::net::sockopt::set_socket_send_buffer_size(&stream, SEND_BUFFER);
                 let (node, tx) = (bus.join(), Rc::clone(tx));
                 clients.spawn_local(async move {
-                    let error = serve(&stream, node, bitrate, &tx).await;
+                    let error = serve(&stream, &node, bitrate, &tx).await;
                     info!(%peer, %error, "slcan client left");
+                    drop(stream);
+                    // What was answered as sent is sent.
+                    node.set_hears(false);
+                    while node.waiting() > 0 {
+                        node.left().await;
+                    }
                 });
             }
             Some(_) = clients.join_next() => {}
@@ -306,43 +402,42 @@ impl ClientIo for TcpStream {
 }
 
 /// Ties one client to the bus until its connection fails.
-async fn serve(io: &impl ClientIo, node: Node, bitrate: u32, tx: &PortTx) -> io::Error {
+async fn serve(io: &impl ClientIo, node: &Node, bitrate: u32, tx: &PortTx) -> io::Error {
     let mut channel = Channel::new(bitrate);
     node.set_hears(false);
     let mut out = Vec::new();
     let mut buf = [0; 1_024];
+    let mut unread = 0..0;
     let mut told_dropped = 0;
     loop {
-        // A frame waits in the bounded queue until the client has taken what is before it.
+        // A frame waits in the bounded queue until the client has taken what is before it, and a
+        // client's line until its frames before it have left.
         let room = out.len() < MAX_PENDING;
         let done = tokio::select! {
-            ready = io.readable(), if room => match ready.and_then(|()| io.try_read(&mut buf)) {
-                Ok(0) => Err(io::ErrorKind::UnexpectedEof.into()),
-                Ok(count) => {
-                    let mut bytes = &buf[..count];
-                    while let Some(frame) = channel.receive(&mut bytes, &mut out) {
-                        node.send(frame);
+            ready = io.readable(), if room && unread.is_empty() => {
+                match ready.and_then(|()| io.try_read(&mut buf)) {
+                    Ok(0) => Err(io::ErrorKind::UnexpectedEof.into()),
+                    Ok(count) => {
+                        unread = 0..count;
+                        Ok(())
                     }
-                    let hears = channel.state() != ChannelState::Closed;
-                    if node.state.deaf.get() == hears {
-                        node.set_hears(hears);
-                    }
-                    flush(io, &mut out, tx)
+                    Err(error) => Err(error),
                 }
-                Err(error) => Err(error),
-            },
-            frame = node.recv(), if room => {
-                let millis = now().as_micros() / 1_000;
-                let mut next = Some(frame);
-                while let Some(frame) = next {
-                    out.extend(channel.deliver(&frame, millis).iter().flatten());
+            }
+            _ = node.left(), if !unread.is_empty() => Ok(()),
+            (at, frame) = node.recv(), if room => {
+                let mut next = Some((at, frame));
+                while let Some((at, frame)) = next {
+                    out.extend(channel.deliver(&frame, at.as_micros() / 1_000).iter().flatten());
                     next = if out.len() < MAX_PENDING { node.try_recv() } else { None };
                 }
-                flush(io, &mut out, tx)
+                Ok(())
             }
-            ready = io.writable(), if !out.is_empty() => ready.and_then(|()| flush(io, &mut out, tx)),
-            () = tokio::time::sleep(STALE_LOOK), if io.may_be_stale() => flush(io, &mut out, tx),
+            ready = io.writable(), if !out.is_empty() => ready,
+            () = tokio::time::sleep(STALE_LOOK), if io.may_be_stale() => Ok(()),
         };
+        take_lines(&mut channel, node, &buf, &mut unread, &mut out);
+        let done = done.and_then(|()| flush(io, &mut out, tx));
         if node.dropped() != told_dropped {
             told_dropped = node.dropped();
             channel.note_overrun();
@@ -351,6 +446,22 @@ async fn serve(io: &impl ClientIo, node: Node, bitrate: u32, tx: &PortTx) -> io:
             Err(error) if error.kind() != io::ErrorKind::WouldBlock => return error,
             _ => {}
         }
+    }
+}
+
+/// Carries out a client's lines as long as the node has room for the frames in them.
+fn take_lines(channel: &mut Channel, node: &Node, buf: &[u8], unread: &mut Range<usize>, out: &mut Vec<u8>) {
+    while !Range::is_empty(unread) && !node.is_full() {
+        let mut bytes = &buf[unread.clone()];
+        if let Some(frame) = channel.receive(&mut bytes, out) {
+            // There is room, so it is taken.
+            let _ = node.send(now(), frame);
+        }
+        unread.start = unread.end - bytes.len();
+    }
+    let hears = channel.state() != ChannelState::Closed;
+    if node.state.deaf.get() == hears {
+        node.set_hears(hears);
     }
 }
 

@@ -18,3 +18,4 @@ mod socketcan;
 #[cfg(test)]
 mod test_kit;
 pub mod timer;
+pub mod wire;

@@ -4,13 +4,13 @@ use std::collections::VecDeque;
 
 use proto_core::config::can_frame_time;
 use proto_core::recipe::CanFrame;
-use proto_core::recipe::model::CanId;
 use proto_core::time::Instant;
 
 use super::device::Device;
 use super::line::MAX_HEARD;
 use super::rng::Rng;
 use super::{End, Owner};
+use crate::bus::wire::arbitration_field;
 
 /// What happened on a bus, beside what its ends count.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -107,12 +107,12 @@ impl CanBus {
         Some(Crossed { from, frame, arrives, was_last: self.waiting[from as usize].is_empty() })
     }
 
-    /// The lowest id wins; when its frame ends, or `None` when the bus is taken or nobody wants it.
+    /// The lowest arbitration field wins; when its frame ends, or `None` when the bus is taken or nobody wants it.
     pub(super) fn arbitrate(&mut self, now: Instant) -> Option<Instant> {
         if self.on_the_bus.is_some() {
             return None;
         }
-        let head = |end: End| self.waiting[end as usize].front().map(|frame| (priority(frame.id()), end));
+        let head = |end: End| self.waiting[end as usize].front().map(|frame| (arbitration_field(frame), end));
         let (_, from) = [head(End::Port), head(End::Device)].into_iter().flatten().min()?;
         let frame = self.waiting[from as usize].pop_front()?;
         self.on_the_bus = Some((from, frame));
@@ -122,13 +122,5 @@ impl CanBus {
     /// What waits at the port is lost.
     pub(super) fn drop_port_frames(&mut self) {
         self.waiting[End::Port as usize].clear();
-    }
-}
-
-/// In the order of arbitration: the 11 leading bits first, and among equal ones a standard frame.
-fn priority(id: CanId) -> (u32, u8, u32) {
-    match id {
-        CanId::Standard(id) => (u32::from(id), 0, 0),
-        CanId::Extended(id) => (id >> 18, 1, id & 0x3_FFFF),
     }
 }

@@ -132,7 +132,8 @@ struct Run {
     #[command(flatten)]
     overrides: Overrides,
     /// Tie a port to a device: pty:PATH, pty-paced:PATH, serial:/dev/ttyUSB0, tcp:HOST:PORT,
-    /// tcp-listen:HOST:PORT; socketcan:vcan0, slcan-pty:PATH, slcan-tcp:HOST:PORT
+    /// tcp-listen:HOST:PORT; socketcan:vcan0, slcan-pty:PATH, slcan-tcp:HOST:PORT[,PATH], the last two
+    /// also as slcan-pty-unpaced and slcan-tcp-unpaced
     #[arg(long, value_name = "NAME=DEVICE")]
     bind: Vec<Bind>,
     /// Write the actual addresses to this file, once everything listens
