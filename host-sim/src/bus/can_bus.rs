@@ -10,6 +10,7 @@ use std::time::Duration as StdDuration;
 
 use proto_core::recipe::can::CanFrame;
 use proto_core::time::Instant;
+use proto_core::wire::slcan::{Channel, ChannelState};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Notify;
 use tokio::task::JoinSet;
@@ -19,7 +20,6 @@ use super::bind::{Device, Pace};
 use super::line::accept;
 use super::port::{PortEvent, PortTx};
 use super::pty::Pty;
-use super::slcan::{Channel, ChannelState};
 use super::timer::{Timer, now};
 use super::wire::{Crossed, Full, NodeId, Pacing, Wire};
 
@@ -453,9 +453,12 @@ async fn serve(io: &impl ClientIo, node: &Node, bitrate: u32, tx: &PortTx) -> io
 fn take_lines(channel: &mut Channel, node: &Node, buf: &[u8], unread: &mut Range<usize>, out: &mut Vec<u8>) {
     while !Range::is_empty(unread) && !node.is_full() {
         let mut bytes = &buf[unread.clone()];
-        if let Some(frame) = channel.receive(&mut bytes, out) {
-            // There is room, so it is taken.
-            let _ = node.send(now(), frame);
+        if let Some(reaction) = channel.receive(&mut bytes) {
+            out.extend_from_slice(reaction.answer);
+            if let Some(frame) = reaction.frame {
+                // There is room, so it is taken.
+                let _ = node.send(now(), frame);
+            }
         }
         unread.start = unread.end - bytes.len();
     }

@@ -13,7 +13,6 @@ pub mod port;
 pub mod pty;
 mod reactor;
 pub mod realtime;
-pub mod slcan;
 mod socketcan;
 #[cfg(test)]
 mod test_kit;

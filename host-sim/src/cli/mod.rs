@@ -6,6 +6,7 @@
 mod check;
 mod codec;
 mod convert;
+mod image;
 mod log;
 mod plan;
 mod text;
@@ -67,6 +68,9 @@ enum Command {
     /// Check a file; print the bus budget, the ways up and what to set on the pendant
     #[command(after_help = CHECK_EXAMPLES)]
     Check(check::CheckArgs),
+    /// Write the configuration image that a board keeps
+    #[command(after_help = IMAGE_EXAMPLES)]
+    Image(image::ImageArgs),
     /// Make a frame from values
     #[command(after_help = ENCODE_EXAMPLES)]
     Encode(EncodeArgs),
@@ -98,6 +102,11 @@ Examples:
   host-sim check cell.toml --set port.rs485-1.baud=9600
 
 Exit code 2 and one message with file, line, column and key when something is wrong.";
+
+const IMAGE_EXAMPLES: &str = "\
+Examples:
+  host-sim image cell.toml -o cell.img
+  host-sim image cell.toml --set controller.address=10.0.2.2 -o cell.img";
 
 const ENCODE_EXAMPLES: &str = "\
 Values stand in field order or as NAME=VALUE; decimal, 0x1F or 0.5.
@@ -224,6 +233,7 @@ pub fn main() -> ExitCode {
             return run.gateway();
         }
         Command::Check(args) => check::run(&args, &mut out),
+        Command::Image(args) => image::run(&args, &mut out),
         Command::Encode(args) => encode(&args, &mut out),
         Command::Decode(args) => decode(&args, &mut out),
     };

@@ -8,6 +8,8 @@ mod budget;
 mod check_recipe;
 mod describe;
 mod error;
+#[cfg(feature = "image")]
+pub mod image;
 mod validate;
 
 pub use budget::{PartBudget, Warning, can_frame_time};

@@ -317,7 +317,7 @@ fn warnings_are_not_errors() {
 
 /// A field of each kind, on a stream port and behind a command table.
 #[cfg(feature = "serde")]
-fn every_kind() -> GatewayConfig {
+pub(super) fn every_kind() -> GatewayConfig {
     let table = InputBinding::Commands { table: Span { start: 0, len: 1 }, when: CommandWhen::Frame };
     let word = InputBinding::Variable { var: var("WordInputReg[1]"), scale: 2.0, offset: 1.0 };
     let shown = OutputBinding::Variable { var: var("BitOutputReg[3]"), scale: 1.0, offset: 0.0 };

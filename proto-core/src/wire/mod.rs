@@ -4,4 +4,5 @@
 
 pub mod dialect;
 pub mod scalar;
+pub mod slcan;
 pub mod state;

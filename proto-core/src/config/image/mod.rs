@@ -1,0 +1,187 @@
+//! The configuration image: what a board keeps instead of the TOML file
+//! (docs/configuration.md section 6).
+//!
+//! In: a checked configuration, or bytes from flash or a file. Out: the other. An image that was cut,
+//! changed in any bit, written for another version or that holds a wrong configuration is refused with
+//! a reason. What follows the image is not looked at: flash is erased in whole sectors.
+
+use core::fmt;
+
+use crc::{CRC_32_ISO_HDLC, Crc};
+
+use super::{ConfigError, GatewayConfig};
+
+/// The first bytes of every image.
+pub const MAGIC: [u8; 4] = *b"RGCI";
+/// The version of what follows the header: one more for every change of a serialized type.
+pub const VERSION: u32 = 1;
+/// Length of the header: magic, version, payload length and CRC-32, four bytes each, little-endian.
+pub const HEADER: usize = 16;
+/// Longest image, header included; twice what the largest configuration takes.
+pub const MAX_IMAGE: usize = 64 * 1024;
+
+/// Why an image is refused.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
+pub enum ImageError {
+    /// Fewer bytes than the header, or than the header says.
+    TooShort {
+        /// Bytes that were needed.
+        needed: usize,
+        /// Bytes that were there.
+        available: usize,
+    },
+    /// It does not begin with [`MAGIC`]: erased flash, or something else.
+    NotAnImage {
+        /// What it begins with.
+        found: [u8; 4],
+    },
+    /// Written for another version.
+    Version {
+        /// The image's.
+        found: u32,
+    },
+    /// Longer than any image.
+    TooLong {
+        /// The payload's length as the header has it.
+        payload: u32,
+    },
+    /// Some bit is not as it was written.
+    Crc {
+        /// The header's CRC.
+        stored: u32,
+        /// That of the bytes.
+        computed: u32,
+    },
+    /// The payload is no configuration; whoever wrote it has other types.
+    Contents,
+    /// The configuration is wrong.
+    Config(ConfigError),
+}
+
+impl fmt::Display for ImageError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::TooShort { needed, available } => {
+                write!(f, "the image is cut: {needed} bytes are needed, {available} are there")
+            }
+            Self::NotAnImage { found } => write!(f, "no configuration image: it begins with {found:02X?}"),
+            Self::Version { found } => {
+                write!(f, "the image has version {found}; this firmware takes version {VERSION}")
+            }
+            Self::TooLong { payload } => {
+                write!(f, "the image says it holds {payload} bytes; at most {MAX_IMAGE} are possible")
+            }
+            Self::Crc { stored, computed } => {
+                write!(f, "the image is damaged: its CRC is {stored:08X}, its bytes have {computed:08X}")
+            }
+            Self::Contents => write!(f, "the image's contents are no configuration"),
+            Self::Config(error) => write!(f, "the image's configuration is wrong: {error}"),
+        }
+    }
+}
+
+impl core::error::Error for ImageError {}
+
+/// There was no room for an image.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct NoSpace {
+    /// Bytes that were there; [`MAX_IMAGE`] are always enough.
+    pub available: usize,
+}
+
+impl fmt::Display for NoSpace {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "the image does not fit in {} bytes", self.available)
+    }
+}
+
+impl core::error::Error for NoSpace {}
+
+/// Writes the image of a configuration; its length.
+///
+/// Whether the configuration is valid is asked when the image is read.
+///
+/// # Errors
+/// [`NoSpace`] when `out` is too short.
+pub fn encode(config: &GatewayConfig, out: &mut [u8]) -> Result<usize, NoSpace> {
+    let no_space = NoSpace { available: out.len() };
+    let (header, room) = out.split_at_mut_checked(HEADER).ok_or(no_space)?;
+    let payload = postcard::to_slice(config, room).map_err(|_| no_space)?;
+    let length = u32::try_from(payload.len()).map_err(|_| no_space)?;
+    let crc = checksum(VERSION, length, payload);
+    let words = [u32::from_le_bytes(MAGIC), VERSION, length, crc];
+    for (bytes, word) in header.chunks_exact_mut(4).zip(words) {
+        bytes.copy_from_slice(&word.to_le_bytes());
+    }
+    Ok(HEADER.saturating_add(payload.len()))
+}
+
+/// Reads an image and checks the configuration in it.
+///
+/// # Errors
+/// [`ImageError`] says what is wrong with it.
+pub fn decode(bytes: &[u8]) -> Result<GatewayConfig, ImageError> {
+    let payload = payload(bytes)?;
+    let (config, rest) =
+        postcard::take_from_bytes::<GatewayConfig>(payload).map_err(|_| ImageError::Contents)?;
+    if !rest.is_empty() {
+        return Err(ImageError::Contents);
+    }
+    config.validate().map_err(ImageError::Config)?;
+    Ok(config)
+}
+
+/// The length of the image whose header `bytes` begin with.
+///
+/// # Errors
+/// [`ImageError`] when it is no header, or the header's image is not possible.
+pub fn image_len(bytes: &[u8]) -> Result<usize, ImageError> {
+    let (_, length, _) = header(bytes)?;
+    Ok(HEADER.saturating_add(length as usize))
+}
+
+/// Version, payload length and CRC.
+fn header(bytes: &[u8]) -> Result<(u32, u32, u32), ImageError> {
+    let too_short = ImageError::TooShort { needed: HEADER, available: bytes.len() };
+    let header: &[u8; HEADER] = bytes.first_chunk().ok_or(too_short)?;
+    let (words, _) = header.as_chunks::<4>();
+    let &[magic, version, length, crc] = words else { return Err(too_short) };
+    if magic != MAGIC {
+        return Err(ImageError::NotAnImage { found: magic });
+    }
+    let version = u32::from_le_bytes(version);
+    if version != VERSION {
+        return Err(ImageError::Version { found: version });
+    }
+    let length = u32::from_le_bytes(length);
+    if length as usize > MAX_IMAGE.saturating_sub(HEADER) {
+        return Err(ImageError::TooLong { payload: length });
+    }
+    Ok((version, length, u32::from_le_bytes(crc)))
+}
+
+fn payload(bytes: &[u8]) -> Result<&[u8], ImageError> {
+    let (version, length, stored) = header(bytes)?;
+    let needed = HEADER.saturating_add(length as usize);
+    let payload = bytes.get(HEADER..needed).ok_or(ImageError::TooShort { needed, available: bytes.len() })?;
+    let computed = checksum(version, length, payload);
+    if computed != stored {
+        return Err(ImageError::Crc { stored, computed });
+    }
+    Ok(payload)
+}
+
+/// Over version, length and payload: the header is as precious as what it describes.
+fn checksum(version: u32, length: u32, payload: &[u8]) -> u32 {
+    let mut digest = CRC.digest();
+    digest.update(&version.to_le_bytes());
+    digest.update(&length.to_le_bytes());
+    digest.update(payload);
+    digest.finalize()
+}
+
+static CRC: Crc<u32> = Crc::<u32>::new(&CRC_32_ISO_HDLC);
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,117 @@
+//! Images that survive, and everything that is refused.
+
+use std::string::ToString;
+use std::vec;
+use std::vec::Vec;
+
+use super::*;
+use crate::config::tests::every_kind;
+
+fn image() -> Vec<u8> {
+    let mut out = vec![0xA5; 1024];
+    let len = encode(&every_kind(), &mut out).unwrap();
+    assert!(out[len..].iter().all(|&byte| byte == 0xA5), "nothing is written behind the image");
+    out.truncate(len);
+    out
+}
+
+#[test]
+fn a_configuration_survives_and_what_follows_does_not_matter() {
+    let mut image = image();
+    assert_eq!(image_len(&image), Ok(image.len()));
+    assert_eq!(decode(&image).as_ref(), Ok(&every_kind()));
+    image.extend([0xFF; 200]);
+    assert_eq!(decode(&image).as_ref(), Ok(&every_kind()));
+}
+
+#[test]
+fn the_header_stands_as_it_always_did() {
+    let image = image();
+    assert_eq!(image[..4], *b"RGCI");
+    assert_eq!(image[4..8], [1, 0, 0, 0]);
+    assert_eq!(image[8..12], ((image.len() - HEADER) as u32).to_le_bytes());
+}
+
+#[test]
+fn every_changed_byte_and_bit_is_refused() {
+    let image = image();
+    for place in 0..image.len() {
+        for change in (0..8).map(|bit| 1_u8 << bit).chain([0xFF]) {
+            let mut damaged = image.clone();
+            damaged[place] ^= change;
+            let refused = decode(&damaged).expect_err("a changed byte");
+            let expected = match place {
+                0..4 => matches!(refused, ImageError::NotAnImage { .. }),
+                4..8 => matches!(refused, ImageError::Version { .. }),
+                // A longer payload is not there, or not possible; a shorter one has another CRC.
+                8..12 => matches!(
+                    refused,
+                    ImageError::TooShort { .. } | ImageError::TooLong { .. } | ImageError::Crc { .. }
+                ),
+                _ => matches!(refused, ImageError::Crc { .. }),
+            };
+            assert!(expected, "byte {place} ^ {change:#04X}: {refused}");
+        }
+    }
+}
+
+#[test]
+fn every_cut_is_refused_with_what_is_missing() {
+    let image = image();
+    for cut in 0..image.len() {
+        let needed = if cut < HEADER { HEADER } else { image.len() };
+        let expected = ImageError::TooShort { needed, available: cut };
+        assert_eq!(decode(&image[..cut]).err(), Some(expected));
+    }
+}
+
+#[test]
+fn erased_flash_is_no_image() {
+    for erased in [0x00, 0xFF] {
+        let refused = decode(&[erased; 256]).unwrap_err();
+        assert_eq!(refused, ImageError::NotAnImage { found: [erased; 4] });
+    }
+    assert_eq!(
+        decode(&[0xFF; 256]).unwrap_err().to_string(),
+        "no configuration image: it begins with [FF, FF, FF, FF]"
+    );
+}
+
+/// An image around any payload, with all its numbers right.
+fn around(payload: &[u8]) -> Vec<u8> {
+    let length = payload.len() as u32;
+    let mut image = MAGIC.to_vec();
+    for word in [VERSION, length, checksum(VERSION, length, payload)] {
+        image.extend(word.to_le_bytes());
+    }
+    image.extend(payload);
+    image
+}
+
+#[test]
+fn contents_that_are_no_configuration_are_refused() {
+    let image = image();
+    assert_eq!(around(&image[HEADER..]), image);
+    for payload in [&[][..], &[0xFF; 40], &[&image[HEADER..], &[0]].concat()] {
+        assert_eq!(decode(&around(payload)).err(), Some(ImageError::Contents));
+    }
+}
+
+#[test]
+fn a_wrong_configuration_is_refused_with_its_own_reason() {
+    let mut config = every_kind();
+    config.ports[0].cycle = crate::time::Duration::from_millis(3);
+    let mut out = [0; 1024];
+    let len = encode(&config, &mut out).unwrap();
+    let expected = config.validate().unwrap_err();
+    assert_eq!(decode(&out[..len]).err(), Some(ImageError::Config(expected)));
+}
+
+#[test]
+fn an_image_needs_room() {
+    let image = image();
+    for room in 0..image.len() {
+        let mut out = vec![0; room];
+        assert_eq!(encode(&every_kind(), &mut out), Err(NoSpace { available: room }));
+    }
+}
