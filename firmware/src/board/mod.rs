@@ -1,0 +1,12 @@
+//! The boards. Each names its pins, clocks and interrupts, and nobody else does.
+//!
+//! A board gives: `Board` with `configuration`, `serial`, `can` and `ethernet`; the devices' types; how
+//! many there are; a seed.
+
+#[cfg(feature = "board-mps2-an500")]
+mod mps2_an500;
+#[cfg(feature = "board-mps2-an500")]
+pub(crate) use mps2_an500::*;
+
+#[cfg(not(feature = "board-mps2-an500"))]
+compile_error!("choose a board: --features board-mps2-an500");

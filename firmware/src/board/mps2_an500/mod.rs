@@ -1,0 +1,189 @@
+//! QEMU's `mps2-an500`: a Cortex-M7 with five UARTs and a LAN9118. RS-485 on UART 0 and 1, CAN as slcan
+//! on UART 2, the log on UART 3; the configuration is a file of the host, named by semihosting.
+//!
+//! There is no such hardware: it exists so that the firmware runs end to end in CI.
+
+mod console;
+mod executor;
+mod log_output;
+mod registers;
+mod storage;
+mod time;
+mod uart;
+
+use cortex_m::interrupt::InterruptNumber;
+use cortex_m::peripheral::{MPU, NVIC};
+use embassy_sync::waitqueue::AtomicWaker;
+use firmware::lan9118::{Lan9118, Registers};
+use firmware::slcan::SlcanPort;
+use proto_core::config::Rs485;
+
+pub(crate) use firmware::lan9118::StartError as EthernetError;
+pub(crate) use storage::StorageError;
+pub(crate) use uart::Uart as SerialDevice;
+
+/// CAN is slcan on a UART here.
+pub(crate) type CanDevice = SlcanPort<uart::Uart>;
+/// The Ethernet controller.
+pub(crate) type Ethernet = Lan9118<LanRegisters>;
+
+/// How many RS-485 lines there are.
+pub(crate) const SERIAL_PORTS: usize = 2;
+/// How many CAN buses there are.
+pub(crate) const CAN_PORTS: usize = 1;
+
+/// The board's devices that nobody has yet.
+pub(crate) struct Board {
+    serial: usize,
+    can: usize,
+}
+
+impl Board {
+    /// The configuration image.
+    pub(crate) fn configuration(&mut self) -> Result<&'static [u8], StorageError> {
+        storage::read()
+    }
+
+    /// The next RS-485 line. The speed is not emulated.
+    pub(crate) fn serial(&mut self, _: &Rs485) -> Option<SerialDevice> {
+        let port = self.serial;
+        (port < SERIAL_PORTS).then(|| {
+            self.serial += 1;
+            uart::Uart::open(port)
+        })
+    }
+
+    /// The next CAN bus.
+    pub(crate) fn can(&mut self, bitrate: u32) -> Option<CanDevice> {
+        let port = self.can;
+        (port < CAN_PORTS).then(|| {
+            self.can += 1;
+            SlcanPort::new(uart::Uart::open(SERIAL_PORTS + port), bitrate)
+        })
+    }
+
+    /// The Ethernet controller.
+    pub(crate) fn ethernet(&mut self) -> Result<Ethernet, EthernetError> {
+        let driver = Lan9118::start(LanRegisters, &LAN_WAKER)?;
+        Irq::LAN9118.enable();
+        Ok(driver)
+    }
+}
+
+/// What local port numbers are drawn from.
+pub(crate) fn seed() -> u64 {
+    storage::host_time()
+}
+
+#[cortex_m_rt::entry]
+fn main() -> ! {
+    guard_stack();
+    console::start();
+    log_output::start();
+    time::start();
+    executor::run(|spawner| crate::start::start(spawner, Board { serial: 0, can: 0 }))
+}
+
+/// Keeps everybody from the MiB below the stack, so that an overflow faults: beneath the RAM, writes
+/// would be ignored.
+fn guard_stack() {
+    unsafe extern "C" {
+        static _stack_guard: u32;
+    }
+    // SAFETY: nobody else uses the MPU, and nothing is kept where the guard is (memory.x).
+    unsafe {
+        let mpu = &*MPU::PTR;
+        mpu.rnr.write(0);
+        mpu.rbar.write(&raw const _stack_guard as u32);
+        // Execute never, no access, 2^20 bytes, on.
+        mpu.rasr.write(1 << 28 | (20 - 1) << 1 | 1);
+        // On, with the ordinary map for everything else.
+        mpu.ctrl.write(1 << 2 | 1);
+    }
+    cortex_m::asm::dsb();
+    cortex_m::asm::isb();
+}
+
+/// Ends the emulation with this exit code.
+fn end(code: i32) -> ! {
+    semihosting::process::exit(code)
+}
+
+#[panic_handler]
+fn panic(info: &core::panic::PanicInfo<'_>) -> ! {
+    cortex_m::interrupt::disable();
+    console::print(format_args!("{info}\r\n"));
+    end(101)
+}
+
+#[cortex_m_rt::exception]
+unsafe fn HardFault(frame: &cortex_m_rt::ExceptionFrame) -> ! {
+    console::print(format_args!("hard fault at {:08X}\r\n", frame.pc()));
+    end(102)
+}
+
+/// The LAN9118's registers.
+#[derive(Debug)]
+pub(crate) struct LanRegisters;
+
+impl Registers for LanRegisters {
+    fn read(&self, offset: u16) -> u32 {
+        registers::read(registers::LAN9118 + u32::from(offset))
+    }
+
+    fn write(&self, offset: u16, value: u32) {
+        registers::write(registers::LAN9118 + u32::from(offset), value);
+    }
+
+    /// QEMU does not look at its host's sockets because the guest sent something; an expired timer makes
+    /// it look. Without this a connection to the host takes a second.
+    fn transmitted(&self) {
+        time::kick();
+    }
+}
+
+static LAN_WAKER: AtomicWaker = AtomicWaker::new();
+
+fn on_lan9118() {
+    Lan9118::interrupt(&LanRegisters, &LAN_WAKER);
+}
+
+/// An interrupt by its number.
+#[derive(Debug, Clone, Copy)]
+struct Irq(u16);
+
+impl Irq {
+    const TIMER0: Self = Self(8);
+    const LAN9118: Self = Self(13);
+
+    fn enable(self) {
+        // SAFETY: its handler is in the vector table, and masks no critical section.
+        unsafe { NVIC::unmask(self) }
+    }
+}
+
+// SAFETY: the numbers above and the UARTs' are those of the vector table.
+unsafe impl InterruptNumber for Irq {
+    fn number(self) -> u16 {
+        self.0
+    }
+}
+
+fn on_unexpected() {
+    panic!("an interrupt that nobody enabled");
+}
+
+#[unsafe(link_section = ".vector_table.interrupts")]
+#[unsafe(no_mangle)]
+static __INTERRUPTS: [fn(); 32] = {
+    let mut table: [fn(); 32] = [on_unexpected; 32];
+    table[0] = uart::on_rx::<0>;
+    table[1] = uart::on_tx::<0>;
+    table[2] = uart::on_rx::<1>;
+    table[3] = uart::on_tx::<1>;
+    table[4] = uart::on_rx::<2>;
+    table[5] = uart::on_tx::<2>;
+    table[8] = time::on_alarm;
+    table[13] = on_lan9118;
+    table
+};

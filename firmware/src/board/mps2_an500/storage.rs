@@ -1,0 +1,57 @@
+//! The configuration image: a file of the host, named by the second semihosting argument
+//! (`-semihosting-config ...,arg=firmware,arg=PATH`).
+
+use core::ffi::CStr;
+use core::fmt;
+
+use proto_core::config::image::MAX_IMAGE;
+use semihosting::experimental::env;
+use semihosting::experimental::time::SystemTime;
+use semihosting::fs::File;
+use semihosting::io::Read;
+use static_cell::ConstStaticCell;
+
+/// Why there is no image.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum StorageError {
+    /// No file was named.
+    NoName,
+    /// It cannot be read.
+    Unreadable,
+}
+
+impl fmt::Display for StorageError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::NoName => "no configuration: its path is the second semihosting argument",
+            Self::Unreadable => "the configuration's file cannot be read",
+        })
+    }
+}
+
+/// Reads the image; once.
+pub(super) fn read() -> Result<&'static [u8], StorageError> {
+    static IMAGE: ConstStaticCell<[u8; MAX_IMAGE]> = ConstStaticCell::new([0; MAX_IMAGE]);
+    let args = env::args::<512>().map_err(|_| StorageError::NoName)?;
+    let path = (&args).nth(1).and_then(Result::ok).ok_or(StorageError::NoName)?;
+    let mut name = [0; 512];
+    let room = name.get_mut(..path.len()).ok_or(StorageError::NoName)?;
+    room.copy_from_slice(path.as_bytes());
+    let name = CStr::from_bytes_until_nul(&name).map_err(|_| StorageError::NoName)?;
+    let mut file = File::open(name).map_err(|_| StorageError::Unreadable)?;
+    let image = IMAGE.take();
+    let mut len = 0;
+    while let Some(room @ [_, ..]) = image.get_mut(len..) {
+        match file.read(room) {
+            Ok(0) => break,
+            Ok(count) => len += count,
+            Err(_) => return Err(StorageError::Unreadable),
+        }
+    }
+    Ok(&image[..len])
+}
+
+/// The host's clock in seconds: another for every start.
+pub(super) fn host_time() -> u64 {
+    SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).map_or(0, |time| time.as_secs())
+}

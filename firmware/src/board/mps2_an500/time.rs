@@ -1,0 +1,107 @@
+//! The clock and its alarm: microseconds since start.
+
+use core::cell::RefCell;
+use core::task::Waker;
+
+use critical_section::{CriticalSection, Mutex};
+use embassy_time_driver::Driver;
+use embassy_time_queue_utils::Queue;
+
+use super::Irq;
+use super::registers::{DUAL_TIMER, FPGAIO, TIMER0, read, write};
+
+/// FPGAIO: a counter that goes up by one each `PRESCALE + 1` cycles of 25 MHz.
+const COUNTER: u32 = FPGAIO + 0x18;
+const PRESCALE: u32 = FPGAIO + 0x1C;
+/// TIMER0.
+const CTRL: u32 = TIMER0;
+const RELOAD: u32 = TIMER0 + 0x8;
+const INTCLEAR: u32 = TIMER0 + 0xC;
+/// Enabled, with interrupt.
+const CTRL_ALARM: u32 = 0b1001;
+const CYCLES_PER_MICRO: u64 = 25;
+/// Longest alarm; a later one is set again then. The counter is also looked at often enough by it.
+const LONGEST: u64 = 60_000_000;
+
+struct Clock {
+    state: Mutex<RefCell<State>>,
+}
+
+struct State {
+    queue: Queue,
+    /// The counter as it was last seen, and how often it went round.
+    last: u32,
+    rounds: u32,
+}
+
+embassy_time_driver::time_driver_impl!(static CLOCK: Clock = Clock {
+    state: Mutex::new(RefCell::new(State { queue: Queue::new(), last: 0, rounds: 0 })),
+});
+
+/// Starts the counter.
+pub(super) fn start() {
+    write(PRESCALE, 24);
+    write(COUNTER, 0);
+    Irq::TIMER0.enable();
+    on_alarm();
+}
+
+impl State {
+    fn now(&mut self) -> u64 {
+        let counter = read(COUNTER);
+        if counter < self.last {
+            self.rounds += 1;
+        }
+        self.last = counter;
+        u64::from(self.rounds) << 32 | u64::from(counter)
+    }
+
+    /// Wakes what is due and sets the alarm for what is next.
+    fn rearm(&mut self) {
+        let now = self.now();
+        let next = self.queue.next_expiration(now);
+        let wait = next.saturating_sub(now).clamp(1, LONGEST);
+        write(CTRL, 0);
+        write(INTCLEAR, 1);
+        write(RELOAD, (wait * CYCLES_PER_MICRO) as u32);
+        write(CTRL, CTRL_ALARM);
+    }
+}
+
+impl Clock {
+    fn with<T>(&self, f: impl FnOnce(&mut State) -> T) -> T {
+        critical_section::with(|cs: CriticalSection<'_>| f(&mut self.state.borrow_ref_mut(cs)))
+    }
+}
+
+impl Driver for Clock {
+    fn now(&self) -> u64 {
+        self.with(State::now)
+    }
+
+    fn schedule_wake(&self, at: u64, waker: &Waker) {
+        self.with(|state| {
+            if state.queue.schedule_wake(at, waker) {
+                state.rearm();
+            }
+        });
+    }
+}
+
+/// The alarm's interrupt.
+pub(super) fn on_alarm() {
+    CLOCK.with(State::rearm);
+}
+
+/// Lets a timer of the emulator expire soon.
+pub(super) fn kick() {
+    const LOAD: u32 = DUAL_TIMER;
+    const CONTROL: u32 = DUAL_TIMER + 0x8;
+    /// Enabled, one shot, 32 bits, no interrupt.
+    const ONE_SHOT: u32 = 0xC3;
+    if read(CONTROL) != ONE_SHOT {
+        write(LOAD, 25);
+        write(CONTROL, ONE_SHOT);
+    }
+    write(LOAD, 25);
+}

@@ -1,0 +1,197 @@
+//! UARTs with interrupts, both ways buffered.
+//!
+//! What arrives while nobody reads is kept in a ring; when it is full the byte stays in the UART, and
+//! QEMU holds the sender back: nothing is lost here that a line at its real speed would lose.
+
+use core::cell::RefCell;
+use core::convert::Infallible;
+use core::future::poll_fn;
+use core::task::Poll;
+
+use critical_section::Mutex;
+use embassy_sync::waitqueue::WakerRegistration;
+use embedded_io_async::{ErrorType, Read, Write};
+use firmware::serial::Line;
+use heapless::Deque;
+
+use super::Irq;
+use super::registers::{UARTS, read, write};
+
+/// UARTs with interrupts.
+const COUNT: usize = 3;
+/// Bytes kept each way.
+const RING: usize = 2048;
+
+const DATA: u32 = 0x0;
+const STATE: u32 = 0x4;
+const CTRL: u32 = 0x8;
+const INTCLEAR: u32 = 0xC;
+const BAUDDIV: u32 = 0x10;
+const STATE_TX_FULL: u32 = 1;
+const STATE_RX_FULL: u32 = 2;
+const CTRL_TX: u32 = 1;
+const CTRL_RX: u32 = 2;
+const CTRL_TX_IRQ: u32 = 4;
+const CTRL_RX_IRQ: u32 = 8;
+const INT_TX: u32 = 1;
+const INT_RX: u32 = 2;
+
+/// One UART; there is one of each.
+#[derive(Debug)]
+pub(crate) struct Uart(usize);
+
+struct State {
+    base: u32,
+    received: Deque<u8, RING>,
+    waiting: Deque<u8, RING>,
+    reader: WakerRegistration,
+    writer: WakerRegistration,
+}
+
+static STATES: [Mutex<RefCell<State>>; COUNT] = [state(0), state(1), state(2)];
+
+const fn state(port: usize) -> Mutex<RefCell<State>> {
+    Mutex::new(RefCell::new(State {
+        base: UARTS[port],
+        received: Deque::new(),
+        waiting: Deque::new(),
+        reader: WakerRegistration::new(),
+        writer: WakerRegistration::new(),
+    }))
+}
+
+fn with<T>(port: usize, f: impl FnOnce(&mut State) -> T) -> T {
+    critical_section::with(|cs| f(&mut STATES[port].borrow_ref_mut(cs)))
+}
+
+impl State {
+    fn set(&self, bit: u32) {
+        write(self.base + CTRL, read(self.base + CTRL) | bit);
+    }
+
+    fn clear(&self, bit: u32) {
+        write(self.base + CTRL, read(self.base + CTRL) & !bit);
+    }
+
+    /// Takes what the UART has, as long as there is room.
+    fn drain(&mut self) {
+        write(self.base + INTCLEAR, INT_RX);
+        while read(self.base + STATE) & STATE_RX_FULL != 0 {
+            if self.received.is_full() {
+                self.clear(CTRL_RX_IRQ);
+                return;
+            }
+            let _ = self.received.push_back(read(self.base + DATA) as u8);
+            self.reader.wake();
+        }
+    }
+
+    /// Gives the UART what it takes.
+    fn fill(&mut self) {
+        write(self.base + INTCLEAR, INT_TX);
+        while !self.waiting.is_empty() {
+            if read(self.base + STATE) & STATE_TX_FULL != 0 {
+                self.set(CTRL_TX_IRQ);
+                if read(self.base + STATE) & STATE_TX_FULL != 0 {
+                    return;
+                }
+            }
+            if let Some(byte) = self.waiting.pop_front() {
+                write(self.base + DATA, u32::from(byte));
+            }
+        }
+        self.clear(CTRL_TX_IRQ);
+        self.writer.wake();
+    }
+}
+
+/// Its receive interrupt.
+pub(super) fn on_rx<const PORT: usize>() {
+    with(PORT, State::drain);
+}
+
+/// Its transmit interrupt.
+pub(super) fn on_tx<const PORT: usize>() {
+    with(PORT, State::fill);
+}
+
+impl Uart {
+    /// Starts the UART.
+    pub(super) fn open(port: usize) -> Self {
+        with(port, |state| {
+            write(state.base + BAUDDIV, 16);
+            write(state.base + CTRL, CTRL_TX | CTRL_RX | CTRL_RX_IRQ);
+            state.drain();
+        });
+        let irq = 2 * port as u16;
+        Irq(irq).enable();
+        Irq(irq + 1).enable();
+        Self(port)
+    }
+}
+
+impl ErrorType for Uart {
+    type Error = Infallible;
+}
+
+impl Read for Uart {
+    async fn read(&mut self, buf: &mut [u8]) -> Result<usize, Infallible> {
+        poll_fn(|cx| {
+            with(self.0, |state| {
+                if state.received.is_empty() {
+                    state.reader.register(cx.waker());
+                    return Poll::Pending;
+                }
+                let mut len = 0;
+                for place in buf.iter_mut() {
+                    let Some(byte) = state.received.pop_front() else { break };
+                    *place = byte;
+                    len += 1;
+                }
+                if read(state.base + CTRL) & CTRL_RX_IRQ == 0 {
+                    state.set(CTRL_RX_IRQ);
+                    state.drain();
+                }
+                Poll::Ready(Ok(len))
+            })
+        })
+        .await
+    }
+}
+
+impl Write for Uart {
+    async fn write(&mut self, buf: &[u8]) -> Result<usize, Infallible> {
+        poll_fn(|cx| {
+            with(self.0, |state| {
+                let room = state.waiting.capacity() - state.waiting.len();
+                if room == 0 && !buf.is_empty() {
+                    state.writer.register(cx.waker());
+                    return Poll::Pending;
+                }
+                let len = room.min(buf.len());
+                for &byte in &buf[..len] {
+                    let _ = state.waiting.push_back(byte);
+                }
+                state.fill();
+                Poll::Ready(Ok(len))
+            })
+        })
+        .await
+    }
+
+    async fn flush(&mut self) -> Result<(), Infallible> {
+        poll_fn(|cx| {
+            with(self.0, |state| {
+                if state.waiting.is_empty() {
+                    return Poll::Ready(Ok(()));
+                }
+                state.writer.register(cx.waker());
+                Poll::Pending
+            })
+        })
+        .await
+    }
+}
+
+/// The emulated line has no driver-enable.
+impl Line for Uart {}

@@ -1,0 +1,284 @@
+//! The engine among its tasks.
+//!
+//! What a driver brings goes into the engine at once, and what the engine answers is handed over
+//! before anything else is read: one engine pass lies between the last byte of a field frame and the
+//! request on its way to the controller. All tasks run on one executor, so nobody is in the engine
+//! twice. What is handed over lies in one outbox for each port and link; a task takes it from there.
+
+use core::cell::{Cell, RefCell};
+
+use embassy_futures::select::{Either, select};
+use embassy_time::Timer;
+use heapless::{Deque, Vec};
+use proto_core::config::GatewayConfig;
+use proto_core::engine::{
+    BuildError, Engine as AnyEngine, Input, LinkId, LinkInfo, LinkKind, OUTPUT_BUFFER, Output, PortCounters,
+    PortId,
+};
+use proto_core::recipe::can::CanFrame;
+use proto_core::recipe::model::MAX_CAN_IDS;
+use proto_core::time::Instant;
+
+use crate::notify::Notify;
+
+/// Field ports a board can have.
+pub const MAX_FIELD_PORTS: usize = 4;
+/// Recipe links a board can have.
+pub const MAX_UPLINKS: usize = 2;
+/// User-defined fields in one direction, over all ports.
+pub const MAX_FIELDS: usize = 128;
+/// Recipe links, and command, state and Modbus.
+const MAX_LINKS: usize = MAX_UPLINKS + 3;
+
+/// The engine in the size of a board.
+pub type Engine = AnyEngine<MAX_FIELD_PORTS, MAX_UPLINKS, MAX_FIELDS>;
+
+/// The engine and what every task shares with it.
+pub struct Gateway {
+    engine: RefCell<Engine>,
+    ports: Vec<(PortId, PortControl), MAX_FIELD_PORTS>,
+    links: Vec<(LinkId, LinkKind, LinkControl), MAX_LINKS>,
+    output: RefCell<[u8; OUTPUT_BUFFER]>,
+    deadline: Cell<Instant>,
+    deadline_moved: Notify,
+}
+
+impl Gateway {
+    /// A gateway whose ports and links are down.
+    ///
+    /// # Errors
+    /// What the engine cannot run.
+    pub fn new(config: &GatewayConfig) -> Result<Self, BuildError> {
+        let engine = Engine::new(config)?;
+        // As many places as the engine has.
+        let ports = engine.field_ports().map(|id| (id, PortControl::new())).collect();
+        let links = engine.links().map(|link| (link.id, link.kind, LinkControl::new())).collect();
+        Ok(Self {
+            engine: RefCell::new(engine),
+            ports,
+            links,
+            output: RefCell::new([0; OUTPUT_BUFFER]),
+            deadline: Cell::new(Instant::ZERO),
+            deadline_moved: Notify::new(),
+        })
+    }
+
+    /// The links that need a task.
+    pub fn links(&self) -> impl Iterator<Item = (LinkId, LinkKind)> + '_ {
+        self.links.iter().map(|(id, kind, _)| (*id, *kind))
+    }
+
+    /// Shows how each link and each port does.
+    pub fn report(&self, mut link: impl FnMut(LinkInfo<'_>), mut port: impl FnMut(PortId, &PortCounters)) {
+        let engine = self.engine.borrow();
+        engine.links().for_each(&mut link);
+        for id in engine.field_ports() {
+            if let Some(counters) = engine.port_counters(id) {
+                port(id, counters);
+            }
+        }
+    }
+
+    /// One input, and everything that follows from it.
+    pub fn input(&self, input: Input<'_>) {
+        let at = now();
+        let mut engine = self.engine.borrow_mut();
+        let mut buf = self.output.borrow_mut();
+        engine.handle(at, input);
+        loop {
+            match engine.poll_output(at, &mut buf) {
+                Output::PortSend { port, bytes } => {
+                    if let Some(port) = self.port(port) {
+                        port.put(bytes);
+                    }
+                }
+                Output::PortSendCan { port, frame } => {
+                    if let Some(port) = self.port(port) {
+                        port.put_frame(frame);
+                    }
+                }
+                Output::LinkOpen { link } => {
+                    if let Some(link) = self.link(link) {
+                        link.open();
+                    }
+                }
+                Output::LinkClose { link } => {
+                    if let Some(link) = self.link(link) {
+                        link.close();
+                    }
+                }
+                Output::LinkSend { link, bytes } => {
+                    if let Some(link) = self.link(link) {
+                        link.put(bytes);
+                    }
+                }
+                Output::Sleep { until } => {
+                    if self.deadline.replace(until) != until {
+                        self.deadline_moved.notify();
+                    }
+                    return;
+                }
+            }
+        }
+    }
+
+    /// Calls the engine whenever it asked to be called. The engine's own task.
+    pub async fn keep_time(&self) -> ! {
+        self.input(Input::Tick);
+        loop {
+            let until = embassy_time::Instant::from_micros(self.deadline.get().as_micros());
+            match select(Timer::at(until), self.deadline_moved.notified()).await {
+                Either::First(()) => self.input(Input::Tick),
+                Either::Second(()) => {}
+            }
+        }
+    }
+
+    pub(crate) fn port(&self, id: PortId) -> Option<&PortControl> {
+        self.ports.iter().find(|(port, _)| *port == id).map(|(_, control)| control)
+    }
+
+    pub(crate) fn link(&self, id: LinkId) -> Option<&LinkControl> {
+        self.links.iter().find(|(link, ..)| *link == id).map(|(.., control)| control)
+    }
+}
+
+/// The engine's clock.
+pub(crate) fn now() -> Instant {
+    Instant::from_micros(embassy_time::Instant::now().as_micros())
+}
+
+/// One transmission: the longest frame or request.
+pub(crate) type Transmission = Vec<u8, OUTPUT_BUFFER>;
+
+/// The engine's side of a field port.
+pub(crate) struct PortControl {
+    bytes: RefCell<Option<Transmission>>,
+    frames: RefCell<Deque<CanFrame, MAX_CAN_IDS>>,
+    changed: Notify,
+}
+
+impl PortControl {
+    const fn new() -> Self {
+        Self { bytes: RefCell::new(None), frames: RefCell::new(Deque::new()), changed: Notify::new() }
+    }
+
+    /// The engine hands over one transmission and waits until it has left.
+    fn put(&self, bytes: &[u8]) {
+        *self.bytes.borrow_mut() = Transmission::from_slice(bytes).ok();
+        self.changed.notify();
+    }
+
+    /// The engine hands over at most as many frames as there is room for.
+    fn put_frame(&self, frame: CanFrame) {
+        let _ = self.frames.borrow_mut().push_back(frame);
+        self.changed.notify();
+    }
+
+    /// The next transmission.
+    pub(crate) async fn next_bytes(&self) -> Transmission {
+        loop {
+            if let Some(bytes) = self.take_bytes() {
+                return bytes;
+            }
+            self.changed.notified().await;
+        }
+    }
+
+    /// The next transmission, if there is one.
+    pub(crate) fn take_bytes(&self) -> Option<Transmission> {
+        self.bytes.borrow_mut().take()
+    }
+
+    /// Waits until there is a frame to send.
+    pub(crate) async fn frame_waits(&self) {
+        while self.frames.borrow().is_empty() {
+            self.changed.notified().await;
+        }
+    }
+
+    /// The next frame to send, if there is one.
+    pub(crate) fn next_frame(&self) -> Option<CanFrame> {
+        self.frames.borrow_mut().pop_front()
+    }
+
+    /// Forgets what waits: the device is gone.
+    pub(crate) fn clear(&self) {
+        self.frames.borrow_mut().clear();
+        *self.bytes.borrow_mut() = None;
+    }
+}
+
+/// The engine's side of a link. A link is open for a *turn*: what belongs to an earlier turn is not
+/// reported and not sent.
+pub(crate) struct LinkControl {
+    /// Odd while the link is to be open; one more for each opening and closing.
+    turn: Cell<u32>,
+    outbox: RefCell<Option<Transmission>>,
+    changed: Notify,
+}
+
+impl LinkControl {
+    const fn new() -> Self {
+        Self { turn: Cell::new(0), outbox: RefCell::new(None), changed: Notify::new() }
+    }
+
+    pub(crate) fn is_turn(&self, turn: u32) -> bool {
+        self.turn.get() == turn
+    }
+
+    fn open(&self) {
+        if self.turn.get().is_multiple_of(2) {
+            self.turn_over();
+        }
+    }
+
+    pub(crate) fn close(&self) {
+        if !self.turn.get().is_multiple_of(2) {
+            self.turn_over();
+        }
+    }
+
+    /// The engine hands over one transmission and waits until it was taken.
+    fn put(&self, bytes: &[u8]) {
+        *self.outbox.borrow_mut() = Transmission::from_slice(bytes).ok();
+        self.changed.notify();
+    }
+
+    fn turn_over(&self) {
+        self.turn.set(self.turn.get().wrapping_add(1));
+        *self.outbox.borrow_mut() = None;
+        self.changed.notify();
+    }
+
+    /// Waits until the link is to be open; the turn it is.
+    pub(crate) async fn opened(&self) -> u32 {
+        loop {
+            let turn = self.turn.get();
+            if !turn.is_multiple_of(2) {
+                return turn;
+            }
+            self.changed.notified().await;
+        }
+    }
+
+    /// Waits until this turn is over. Eats notifications, so nothing else may wait for them.
+    pub(crate) async fn over(&self, turn: u32) {
+        while self.is_turn(turn) {
+            self.changed.notified().await;
+        }
+    }
+
+    /// The next transmission; `None` when this turn is over.
+    pub(crate) async fn next(&self, turn: u32) -> Option<Transmission> {
+        loop {
+            if !self.is_turn(turn) {
+                return None;
+            }
+            if let Some(bytes) = self.outbox.borrow_mut().take() {
+                return Some(bytes);
+            }
+            self.changed.notified().await;
+        }
+    }
+}

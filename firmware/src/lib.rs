@@ -1,0 +1,19 @@
+#![no_std]
+#![forbid(unsafe_code)]
+//! The recipe gateway on a board: tasks that move bytes, frames and events between drivers and the
+//! engine of `proto-core`.
+//!
+//! Nothing here knows a protocol, and nothing here knows a board: every task is generic over
+//! `embedded_io_async`, [`can::CanPort`] or an `embassy_net::Stack`, and is bounded in memory. The
+//! binary beside this library names the board.
+
+pub mod can;
+pub mod gateway;
+pub mod lan9118;
+pub mod link;
+mod notify;
+pub mod serial;
+pub mod slcan;
+
+#[cfg(test)]
+extern crate std;

@@ -1,0 +1,277 @@
+//! One link to the controller: opened, closed and fed as the engine says.
+//!
+//! A link is one task. It owns its socket, hands what arrives to the engine and sends what is in its
+//! outbox; it knows no protocol and makes no decision. Supervision is the engine's: a link that fails
+//! says so once and waits to be opened again.
+
+use core::cell::Cell;
+use core::net::{Ipv4Addr, SocketAddr};
+
+use embassy_futures::select::{Either, select};
+use embassy_net::dns::DnsQueryType;
+use embassy_net::tcp::{TcpReader, TcpSocket, TcpWriter};
+use embassy_net::udp::{PacketMetadata, UdpSocket};
+use embassy_net::{IpAddress, IpEndpoint, Stack};
+use embassy_time::{Duration, with_timeout};
+use heapless::String;
+use proto_core::config::{Bus, GatewayConfig};
+use proto_core::engine::{Input, LinkId, LinkKind};
+
+use crate::gateway::{Gateway, LinkControl};
+
+/// What a link connects to.
+#[derive(Debug, Clone)]
+pub enum Endpoint {
+    /// The controller's TCP server.
+    Tcp {
+        /// Address or name.
+        host: String<64>,
+        /// TCP port.
+        port: u16,
+    },
+    /// The controller's UDP server.
+    Udp {
+        /// Address or name.
+        host: String<64>,
+        /// UDP port.
+        port: u16,
+    },
+    /// Where the controller's TCP client connects to.
+    TcpListen {
+        /// TCP port.
+        port: u16,
+    },
+    /// Where the controller's UDP client sends to.
+    UdpListen {
+        /// UDP port.
+        port: u16,
+    },
+}
+
+impl Endpoint {
+    /// Where a link of the configuration goes. A board has one address, so of `listen` only the port
+    /// counts.
+    pub fn of(config: &GatewayConfig, kind: LinkKind) -> Self {
+        let controller = &config.controller;
+        let host = controller.address.clone();
+        let listen = |port: usize| match config.ports.get(port).map(|port| &port.bus) {
+            Some(Bus::TcpListen { listen } | Bus::UdpListen { listen }) => {
+                listen.parse().map_or(0, |address: SocketAddr| address.port())
+            }
+            _ => 0,
+        };
+        match kind {
+            LinkKind::Command => Self::Tcp { host, port: controller.command_port },
+            LinkKind::State => Self::Tcp { host, port: controller.state_port },
+            LinkKind::Modbus => Self::Tcp { host, port: controller.modbus_port },
+            LinkKind::RecipeUdp => {
+                Self::Udp { host, port: controller.recipe_link.map_or(0, |link| link.udp_port) }
+            }
+            LinkKind::RecipeTcpListen { port } => Self::TcpListen { port: listen(usize::from(port.0)) },
+            LinkKind::RecipeUdpListen { port } => Self::UdpListen { port: listen(usize::from(port.0)) },
+        }
+    }
+}
+
+/// A link's socket buffers.
+#[derive(Debug)]
+pub struct Buffers<const RX: usize, const TX: usize> {
+    rx: [u8; RX],
+    tx: [u8; TX],
+    chunk: [u8; CHUNK],
+    rx_meta: [PacketMetadata; DATAGRAMS],
+    tx_meta: [PacketMetadata; DATAGRAMS],
+}
+
+impl<const RX: usize, const TX: usize> Buffers<RX, TX> {
+    /// Empty buffers.
+    pub const fn new() -> Self {
+        Self {
+            rx: [0; RX],
+            tx: [0; TX],
+            chunk: [0; CHUNK],
+            rx_meta: [PacketMetadata::EMPTY; DATAGRAMS],
+            tx_meta: [PacketMetadata::EMPTY; DATAGRAMS],
+        }
+    }
+}
+
+impl<const RX: usize, const TX: usize> Default for Buffers<RX, TX> {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+/// Drives the link for ever.
+pub async fn run<const RX: usize, const TX: usize>(
+    gateway: &Gateway,
+    link: LinkId,
+    stack: Stack<'_>,
+    endpoint: &Endpoint,
+    buffers: &mut Buffers<RX, TX>,
+) -> ! {
+    let Some(control) = gateway.link(link) else { core::future::pending().await };
+    let driver = Driver { gateway, link, control, stack };
+    loop {
+        let turn = control.opened().await;
+        match endpoint {
+            Endpoint::Tcp { host, port } => driver.tcp(turn, Some((host, *port)), 0, buffers).await,
+            Endpoint::TcpListen { port } => driver.tcp(turn, None, *port, buffers).await,
+            Endpoint::Udp { host, port } => driver.udp(turn, Some((host, *port)), 0, buffers).await,
+            Endpoint::UdpListen { port } => driver.udp(turn, None, *port, buffers).await,
+        }
+        // A turn that is over was ended by the engine: it expects no report.
+        if control.is_turn(turn) {
+            control.close();
+            gateway.input(Input::LinkDown { link });
+        }
+    }
+}
+
+struct Driver<'a> {
+    gateway: &'a Gateway,
+    link: LinkId,
+    control: &'a LinkControl,
+    stack: Stack<'a>,
+}
+
+impl Driver<'_> {
+    fn up(&self) {
+        self.gateway.input(Input::LinkUp { link: self.link });
+    }
+
+    fn bytes(&self, bytes: &[u8]) {
+        self.gateway.input(Input::LinkBytes { link: self.link, bytes });
+    }
+
+    /// One connection, until the peer closes it, an error, or the turn is over.
+    async fn tcp<const RX: usize, const TX: usize>(
+        &self,
+        turn: u32,
+        to: Option<(&str, u16)>,
+        listen: u16,
+        buffers: &mut Buffers<RX, TX>,
+    ) {
+        let mut socket = TcpSocket::new(self.stack, &mut buffers.rx, &mut buffers.tx);
+        socket.set_nagle_enabled(false);
+        let opening = async {
+            match to {
+                Some((host, port)) => match resolve(self.stack, host).await {
+                    Some(address) => socket.connect(IpEndpoint::new(address, port)).await.is_ok(),
+                    None => false,
+                },
+                None => socket.accept(listen).await.is_ok(),
+            }
+        };
+        if let Either::First(true) = select(opening, self.control.over(turn)).await {
+            self.up();
+            let (reader, writer) = socket.split();
+            select(self.read(turn, reader, &mut buffers.chunk), self.write(turn, writer)).await;
+            socket.close();
+            let _ = with_timeout(FAREWELL, socket.flush()).await;
+        }
+        // The peer must not go on believing in a connection whose socket is gone.
+        socket.abort();
+        let _ = with_timeout(FAREWELL, socket.flush()).await;
+    }
+
+    async fn read(&self, turn: u32, mut reader: TcpReader<'_>, chunk: &mut [u8]) {
+        while let Ok(len) = reader.read(chunk).await
+            && let Some(bytes @ [_, ..]) = chunk.get(..len)
+            && self.control.is_turn(turn)
+        {
+            self.bytes(bytes);
+        }
+    }
+
+    async fn write(&self, turn: u32, mut writer: TcpWriter<'_>) {
+        while let Some(transmission) = self.control.next(turn).await {
+            let mut rest = transmission.as_slice();
+            while !rest.is_empty() {
+                match writer.write(rest).await {
+                    Ok(len) if len > 0 => rest = rest.get(len..).unwrap_or(&[]),
+                    _ => return,
+                }
+            }
+            if self.control.is_turn(turn) {
+                self.gateway.input(Input::LinkSent { link: self.link });
+            }
+        }
+    }
+
+    /// Datagrams both ways; of a listening socket, answers whoever sent last.
+    async fn udp<const RX: usize, const TX: usize>(
+        &self,
+        turn: u32,
+        to: Option<(&str, u16)>,
+        listen: u16,
+        buffers: &mut Buffers<RX, TX>,
+    ) {
+        let mut socket = UdpSocket::new(
+            self.stack,
+            &mut buffers.rx_meta,
+            &mut buffers.rx,
+            &mut buffers.tx_meta,
+            &mut buffers.tx,
+        );
+        if socket.bind(listen).is_err() {
+            return;
+        }
+        let fixed = match to {
+            Some((host, port)) => match select(resolve(self.stack, host), self.control.over(turn)).await {
+                Either::First(Some(address)) => Some(IpEndpoint::new(address, port)),
+                _ => return,
+            },
+            None => None,
+        };
+        let peer = Cell::new(fixed);
+        if fixed.is_some() {
+            self.up();
+        }
+        let reading = async {
+            loop {
+                // A datagram that is too long for any frame is none of ours.
+                let Ok((len, from)) = socket.recv_from(&mut buffers.chunk).await else { continue };
+                if !self.control.is_turn(turn) {
+                    return;
+                }
+                match fixed {
+                    Some(fixed) if from.endpoint != fixed => continue,
+                    Some(_) => {}
+                    None if peer.replace(Some(from.endpoint)).is_none() => self.up(),
+                    None => {}
+                }
+                self.bytes(buffers.chunk.get(..len).unwrap_or(&[]));
+            }
+        };
+        let writing = async {
+            while let Some(datagram) = self.control.next(turn).await {
+                if let Some(peer) = peer.get()
+                    && socket.send_to(&datagram, peer).await.is_err()
+                {
+                    return;
+                }
+                if self.control.is_turn(turn) {
+                    self.gateway.input(Input::LinkSent { link: self.link });
+                }
+            }
+        };
+        select(reading, writing).await;
+    }
+}
+
+async fn resolve(stack: Stack<'_>, host: &str) -> Option<IpAddress> {
+    if let Ok(address) = host.parse::<Ipv4Addr>() {
+        return Some(IpAddress::Ipv4(address));
+    }
+    let addresses = stack.dns_query(host, DnsQueryType::A).await.ok()?;
+    addresses.first().copied()
+}
+
+/// Bytes handed to the engine at once: a state packet, and longer than any frame, so that a datagram
+/// that is too long is seen to be.
+const CHUNK: usize = 1536;
+/// Datagrams that wait, each way.
+const DATAGRAMS: usize = 8;
+/// How long a closing socket is waited for.
+const FAREWELL: Duration = Duration::from_millis(100);

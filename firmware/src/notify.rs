@@ -1,0 +1,22 @@
+//! "Something changed", for one waiter on the same executor.
+
+use embassy_sync::blocking_mutex::raw::NoopRawMutex;
+use embassy_sync::signal::Signal;
+
+/// Kept until somebody waits for it; several are one.
+pub(crate) struct Notify(Signal<NoopRawMutex, ()>);
+
+impl Notify {
+    pub(crate) const fn new() -> Self {
+        Self(Signal::new())
+    }
+
+    pub(crate) fn notify(&self) {
+        self.0.signal(());
+    }
+
+    /// Waits for the next notification and eats it.
+    pub(crate) async fn notified(&self) {
+        self.0.wait().await;
+    }
+}

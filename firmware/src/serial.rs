@@ -1,0 +1,79 @@
+//! An RS-485 port's task: one task for a port, which drives the line, sends, waits for the last stop
+//! bit, releases the line and reads again.
+//!
+//! Its device buffers what arrives while the task is elsewhere, and its `read` loses nothing when it is
+//! dropped before it is done.
+
+use embassy_futures::select::{Either, select};
+use embassy_time::{Duration, Timer, with_timeout};
+use embedded_io_async::{Read, Write};
+use proto_core::engine::{Input, PortId};
+
+use crate::gateway::Gateway;
+
+/// A half-duplex line (D20).
+pub trait Line: Read + Write {
+    /// Raises or releases driver-enable; nothing where the hardware does it, or where there is none.
+    fn drive(&mut self, direction: LineDirection) {
+        let _ = direction;
+    }
+}
+
+/// Who drives the line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LineDirection {
+    /// The devices.
+    Receive,
+    /// We.
+    Send,
+}
+
+/// Drives the port for ever.
+pub async fn run(gateway: &Gateway, port: PortId, mut line: impl Line, baud: u32) -> ! {
+    let Some(control) = gateway.port(port) else { core::future::pending().await };
+    let mut chunk = [0; 256];
+    loop {
+        gateway.input(Input::PortUp { port });
+        let failed = loop {
+            let frame = match select(line.read(&mut chunk), control.next_bytes()).await {
+                Either::First(Ok(len)) => {
+                    if let Some(bytes) = chunk.get(..len) {
+                        gateway.input(Input::PortBytes { port, bytes });
+                    }
+                    // A line that never falls silent does not keep us from sending.
+                    match control.take_bytes() {
+                        Some(frame) => frame,
+                        None => continue,
+                    }
+                }
+                Either::First(Err(error)) => break embedded_io_async::Error::kind(&error),
+                Either::Second(frame) => frame,
+            };
+            line.drive(LineDirection::Send);
+            let sent = with_timeout(patience(frame.len(), baud), async {
+                line.write_all(&frame).await?;
+                line.flush().await
+            });
+            let sent = sent.await;
+            line.drive(LineDirection::Receive);
+            match sent {
+                Ok(Ok(())) => gateway.input(Input::PortSent { port }),
+                Ok(Err(error)) => break embedded_io_async::Error::kind(&error),
+                Err(_) => break embedded_io_async::ErrorKind::TimedOut,
+            }
+        };
+        log::warn!("port {}: {failed:?}; again in {RETRY}", port.0);
+        gateway.input(Input::PortDown { port });
+        control.clear();
+        Timer::after(RETRY).await;
+    }
+}
+
+/// Twice what the bytes take on the line (12 bits a byte at most), and a little.
+fn patience(bytes: usize, baud: u32) -> Duration {
+    let bits = (bytes as u64).saturating_mul(24_000_000);
+    Duration::from_micros(bits / u64::from(baud.max(1))) + Duration::from_millis(20)
+}
+
+/// After a failed device.
+const RETRY: Duration = Duration::from_millis(100);
