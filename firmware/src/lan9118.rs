@@ -87,8 +87,7 @@ impl<R: Registers> Lan9118<R> {
         regs.write(RX_CFG, 0);
         regs.write(TX_CFG, 0xC000);
         regs.write(TX_CFG, TX_ON);
-        let mut driver =
-            Self { regs, waker, address: [0; 6], rx: [0; BUFFER], tx: [0; BUFFER], dropped: 0 };
+        let mut driver = Self { regs, waker, address: [0; 6], rx: [0; BUFFER], tx: [0; BUFFER], dropped: 0 };
         let low = driver.mac_read(MAC_ADDRL)?.to_le_bytes();
         let high = driver.mac_read(MAC_ADDRH)?.to_le_bytes();
         driver.address = [low[0], low[1], low[2], low[3], high[0], high[1]];

@@ -79,20 +79,12 @@ pub struct Buffers<const RX: usize, const TX: usize> {
     rx: [u8; RX],
     tx: [u8; TX],
     chunk: [u8; CHUNK],
-    rx_meta: [PacketMetadata; DATAGRAMS],
-    tx_meta: [PacketMetadata; DATAGRAMS],
 }
 
 impl<const RX: usize, const TX: usize> Buffers<RX, TX> {
     /// Empty buffers.
     pub const fn new() -> Self {
-        Self {
-            rx: [0; RX],
-            tx: [0; TX],
-            chunk: [0; CHUNK],
-            rx_meta: [PacketMetadata::EMPTY; DATAGRAMS],
-            tx_meta: [PacketMetadata::EMPTY; DATAGRAMS],
-        }
+        Self { rx: [0; RX], tx: [0; TX], chunk: [0; CHUNK] }
     }
 }
 
@@ -207,13 +199,10 @@ impl Driver<'_> {
         listen: u16,
         buffers: &mut Buffers<RX, TX>,
     ) {
-        let mut socket = UdpSocket::new(
-            self.stack,
-            &mut buffers.rx_meta,
-            &mut buffers.rx,
-            &mut buffers.tx_meta,
-            &mut buffers.tx,
-        );
+        let mut received = [PacketMetadata::EMPTY; DATAGRAMS];
+        let mut waiting = [PacketMetadata::EMPTY; DATAGRAMS];
+        let mut socket =
+            UdpSocket::new(self.stack, &mut received, &mut buffers.rx, &mut waiting, &mut buffers.tx);
         if socket.bind(listen).is_err() {
             return;
         }

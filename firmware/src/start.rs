@@ -77,12 +77,7 @@ fn load(board: &mut Board) -> Result<(&'static Gateway, Wiring), Refused> {
     Ok((gateway, wiring))
 }
 
-fn run(
-    spawner: Spawner,
-    mut board: Board,
-    gateway: &'static Gateway,
-    wiring: Wiring,
-) -> Result<(), Refused> {
+fn run(spawner: Spawner, mut board: Board, gateway: &'static Gateway, wiring: Wiring) -> Result<(), Refused> {
     // All devices are claimed before anything moves.
     let mut serial_ports: heapless::Vec<_, { board::SERIAL_PORTS }> = heapless::Vec::new();
     let mut can_ports: heapless::Vec<_, { board::CAN_PORTS }> = heapless::Vec::new();
@@ -90,8 +85,7 @@ fn run(
         match bus {
             Bus::Rs485(settings) => {
                 let line = board.serial(settings);
-                let missing =
-                    Refused::NoDevice { port: id.0, bus: "RS-485", available: board::SERIAL_PORTS };
+                let missing = Refused::NoDevice { port: id.0, bus: "RS-485", available: board::SERIAL_PORTS };
                 let line = line.ok_or(missing)?;
                 let _ = serial_ports.push((*id, line, settings.baud));
             }
@@ -116,6 +110,7 @@ fn run(
     let resources = RESOURCES.init(StackResources::new());
     let (stack, runner) =
         embassy_net::new(ethernet, Config::dhcpv4(Default::default()), resources, board::seed());
+    log::info!("stack: {} bytes while the engine was made", board::stack_used());
     spawner.spawn(network(runner).expect("the first of its kind"));
     spawner.spawn(address(stack).expect("the first of its kind"));
     static BUFFERS: [ConstStaticCell<Buffers<RX, TX>>; MAX_LINKS] =

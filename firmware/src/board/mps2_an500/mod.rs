@@ -7,18 +7,20 @@ mod console;
 mod executor;
 mod log_output;
 mod registers;
+mod stack;
 mod storage;
 mod time;
 mod uart;
 
 use cortex_m::interrupt::InterruptNumber;
-use cortex_m::peripheral::{MPU, NVIC};
+use cortex_m::peripheral::NVIC;
 use embassy_sync::waitqueue::AtomicWaker;
 use firmware::lan9118::{Lan9118, Registers};
 use firmware::slcan::SlcanPort;
 use proto_core::config::Rs485;
 
 pub(crate) use firmware::lan9118::StartError as EthernetError;
+pub(crate) use stack::used as stack_used;
 pub(crate) use storage::StorageError;
 pub(crate) use uart::Uart as SerialDevice;
 
@@ -77,31 +79,12 @@ pub(crate) fn seed() -> u64 {
 
 #[cortex_m_rt::entry]
 fn main() -> ! {
-    guard_stack();
+    stack::guard();
+    stack::paint();
     console::start();
     log_output::start();
     time::start();
     executor::run(|spawner| crate::start::start(spawner, Board { serial: 0, can: 0 }))
-}
-
-/// Keeps everybody from the MiB below the stack, so that an overflow faults: beneath the RAM, writes
-/// would be ignored.
-fn guard_stack() {
-    unsafe extern "C" {
-        static _stack_guard: u32;
-    }
-    // SAFETY: nobody else uses the MPU, and nothing is kept where the guard is (memory.x).
-    unsafe {
-        let mpu = &*MPU::PTR;
-        mpu.rnr.write(0);
-        mpu.rbar.write(&raw const _stack_guard as u32);
-        // Execute never, no access, 2^20 bytes, on.
-        mpu.rasr.write(1 << 28 | (20 - 1) << 1 | 1);
-        // On, with the ordinary map for everything else.
-        mpu.ctrl.write(1 << 2 | 1);
-    }
-    cortex_m::asm::dsb();
-    cortex_m::asm::isb();
 }
 
 /// Ends the emulation with this exit code.

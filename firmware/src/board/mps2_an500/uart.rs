@@ -41,30 +41,38 @@ const INT_RX: u32 = 2;
 pub(crate) struct Uart(usize);
 
 struct State {
-    base: u32,
     received: Deque<u8, RING>,
     waiting: Deque<u8, RING>,
     reader: WakerRegistration,
     writer: WakerRegistration,
 }
 
-static STATES: [Mutex<RefCell<State>>; COUNT] = [state(0), state(1), state(2)];
+static STATES: [Mutex<RefCell<State>>; COUNT] = [const { Mutex::new(RefCell::new(State::new())) }; COUNT];
 
-const fn state(port: usize) -> Mutex<RefCell<State>> {
-    Mutex::new(RefCell::new(State {
-        base: UARTS[port],
-        received: Deque::new(),
-        waiting: Deque::new(),
-        reader: WakerRegistration::new(),
-        writer: WakerRegistration::new(),
-    }))
-}
-
-fn with<T>(port: usize, f: impl FnOnce(&mut State) -> T) -> T {
-    critical_section::with(|cs| f(&mut STATES[port].borrow_ref_mut(cs)))
+/// Its registers and what is shared with its interrupts, for a moment alone.
+fn with<T>(port: usize, f: impl FnOnce(&mut Access<'_>) -> T) -> T {
+    critical_section::with(|cs| {
+        f(&mut Access { base: UARTS[port], state: &mut STATES[port].borrow_ref_mut(cs) })
+    })
 }
 
 impl State {
+    const fn new() -> Self {
+        Self {
+            received: Deque::new(),
+            waiting: Deque::new(),
+            reader: WakerRegistration::new(),
+            writer: WakerRegistration::new(),
+        }
+    }
+}
+
+struct Access<'a> {
+    base: u32,
+    state: &'a mut State,
+}
+
+impl Access<'_> {
     fn set(&self, bit: u32) {
         write(self.base + CTRL, read(self.base + CTRL) | bit);
     }
@@ -77,51 +85,51 @@ impl State {
     fn drain(&mut self) {
         write(self.base + INTCLEAR, INT_RX);
         while read(self.base + STATE) & STATE_RX_FULL != 0 {
-            if self.received.is_full() {
+            if self.state.received.is_full() {
                 self.clear(CTRL_RX_IRQ);
                 return;
             }
-            let _ = self.received.push_back(read(self.base + DATA) as u8);
-            self.reader.wake();
+            let _ = self.state.received.push_back(read(self.base + DATA) as u8);
+            self.state.reader.wake();
         }
     }
 
     /// Gives the UART what it takes.
     fn fill(&mut self) {
         write(self.base + INTCLEAR, INT_TX);
-        while !self.waiting.is_empty() {
+        while !self.state.waiting.is_empty() {
             if read(self.base + STATE) & STATE_TX_FULL != 0 {
                 self.set(CTRL_TX_IRQ);
                 if read(self.base + STATE) & STATE_TX_FULL != 0 {
                     return;
                 }
             }
-            if let Some(byte) = self.waiting.pop_front() {
+            if let Some(byte) = self.state.waiting.pop_front() {
                 write(self.base + DATA, u32::from(byte));
             }
         }
         self.clear(CTRL_TX_IRQ);
-        self.writer.wake();
+        self.state.writer.wake();
     }
 }
 
 /// Its receive interrupt.
 pub(super) fn on_rx<const PORT: usize>() {
-    with(PORT, State::drain);
+    with(PORT, |uart| uart.drain());
 }
 
 /// Its transmit interrupt.
 pub(super) fn on_tx<const PORT: usize>() {
-    with(PORT, State::fill);
+    with(PORT, |uart| uart.fill());
 }
 
 impl Uart {
     /// Starts the UART.
     pub(super) fn open(port: usize) -> Self {
-        with(port, |state| {
-            write(state.base + BAUDDIV, 16);
-            write(state.base + CTRL, CTRL_TX | CTRL_RX | CTRL_RX_IRQ);
-            state.drain();
+        with(port, |uart| {
+            write(uart.base + BAUDDIV, 16);
+            write(uart.base + CTRL, CTRL_TX | CTRL_RX | CTRL_RX_IRQ);
+            uart.drain();
         });
         let irq = 2 * port as u16;
         Irq(irq).enable();
@@ -137,20 +145,20 @@ impl ErrorType for Uart {
 impl Read for Uart {
     async fn read(&mut self, buf: &mut [u8]) -> Result<usize, Infallible> {
         poll_fn(|cx| {
-            with(self.0, |state| {
-                if state.received.is_empty() {
-                    state.reader.register(cx.waker());
+            with(self.0, |uart| {
+                if uart.state.received.is_empty() {
+                    uart.state.reader.register(cx.waker());
                     return Poll::Pending;
                 }
                 let mut len = 0;
                 for place in buf.iter_mut() {
-                    let Some(byte) = state.received.pop_front() else { break };
+                    let Some(byte) = uart.state.received.pop_front() else { break };
                     *place = byte;
                     len += 1;
                 }
-                if read(state.base + CTRL) & CTRL_RX_IRQ == 0 {
-                    state.set(CTRL_RX_IRQ);
-                    state.drain();
+                if read(uart.base + CTRL) & CTRL_RX_IRQ == 0 {
+                    uart.set(CTRL_RX_IRQ);
+                    uart.drain();
                 }
                 Poll::Ready(Ok(len))
             })
@@ -162,17 +170,17 @@ impl Read for Uart {
 impl Write for Uart {
     async fn write(&mut self, buf: &[u8]) -> Result<usize, Infallible> {
         poll_fn(|cx| {
-            with(self.0, |state| {
-                let room = state.waiting.capacity() - state.waiting.len();
+            with(self.0, |uart| {
+                let room = uart.state.waiting.capacity() - uart.state.waiting.len();
                 if room == 0 && !buf.is_empty() {
-                    state.writer.register(cx.waker());
+                    uart.state.writer.register(cx.waker());
                     return Poll::Pending;
                 }
                 let len = room.min(buf.len());
                 for &byte in &buf[..len] {
-                    let _ = state.waiting.push_back(byte);
+                    let _ = uart.state.waiting.push_back(byte);
                 }
-                state.fill();
+                uart.fill();
                 Poll::Ready(Ok(len))
             })
         })
@@ -181,11 +189,11 @@ impl Write for Uart {
 
     async fn flush(&mut self) -> Result<(), Infallible> {
         poll_fn(|cx| {
-            with(self.0, |state| {
-                if state.waiting.is_empty() {
+            with(self.0, |uart| {
+                if uart.state.waiting.is_empty() {
                     return Poll::Ready(Ok(()));
                 }
-                state.writer.register(cx.waker());
+                uart.state.writer.register(cx.waker());
                 Poll::Pending
             })
         })
