@@ -44,23 +44,31 @@ pub struct Gateway {
 }
 
 impl Gateway {
-    /// A gateway whose ports and links are down.
-    ///
-    /// # Errors
-    /// What the engine cannot run.
-    pub fn new(config: &GatewayConfig) -> Result<Self, BuildError> {
-        let engine = Engine::new(config)?;
-        // As many places as the engine has.
-        let ports = engine.field_ports().map(|id| (id, PortControl::new())).collect();
-        let links = engine.links().map(|link| (link.id, link.kind, LinkControl::new())).collect();
-        Ok(Self {
-            engine: RefCell::new(engine),
-            ports,
-            links,
+    /// A gateway without a configuration.
+    pub const fn idle() -> Self {
+        Self {
+            engine: RefCell::new(Engine::idle()),
+            ports: Vec::new(),
+            links: Vec::new(),
             output: RefCell::new([0; OUTPUT_BUFFER]),
             deadline: Cell::new(Instant::ZERO),
             deadline_moved: Notify::new(),
-        })
+        }
+    }
+
+    /// Takes its configuration, in place; ports and links are down.
+    ///
+    /// # Errors
+    /// What the engine cannot run.
+    pub fn configure(&mut self, config: &GatewayConfig) -> Result<(), BuildError> {
+        let engine = self.engine.get_mut();
+        engine.configure(config)?;
+        // As many places as the engine has.
+        self.ports.clear();
+        self.ports.extend(engine.field_ports().map(|id| (id, PortControl::new())));
+        self.links.clear();
+        self.links.extend(engine.links().map(|link| (link.id, link.kind, LinkControl::new())));
+        Ok(())
     }
 
     /// The links that need a task.

@@ -19,7 +19,8 @@ use crate::board::{self, Board, CanDevice, Ethernet, SerialDevice};
 /// and the log says why.
 pub(crate) fn start(spawner: Spawner, mut board: Board) {
     log::info!("recipe gateway {}", env!("CARGO_PKG_VERSION"));
-    let started = load(&mut board).and_then(|(gateway, plan)| run(spawner, board, gateway, plan));
+    let started =
+        load(&mut board, idle_gateway()).and_then(|(gateway, plan)| run(spawner, board, gateway, plan));
     if let Err(reason) = started {
         spawner.spawn(idle(reason).expect("the first of its kind"));
     }
@@ -55,13 +56,21 @@ struct Wiring {
     links: heapless::Vec<(LinkId, LinkKind, Endpoint), MAX_LINKS>,
 }
 
-/// Not inlined: the configuration and the engine's copies are on the stack here and nowhere else.
+/// Not inlined: an engine may pass over the stack here, and the configuration is not there yet.
 #[inline(never)]
-fn load(board: &mut Board) -> Result<(&'static Gateway, Wiring), Refused> {
+fn idle_gateway() -> &'static mut Gateway {
     static GATEWAY: StaticCell<Gateway> = StaticCell::new();
+    GATEWAY.init_with(Gateway::idle)
+}
+
+/// Not inlined: the configuration is on the stack here, and nowhere else.
+#[inline(never)]
+fn load(board: &mut Board, gateway: &'static mut Gateway) -> Result<(&'static Gateway, Wiring), Refused> {
     let bytes = board.configuration().map_err(Refused::Storage)?;
-    let config: GatewayConfig = image::decode(bytes).map_err(Refused::Image)?;
-    let gateway = GATEWAY.init(Gateway::new(&config).map_err(Refused::Build)?);
+    let mut config = GatewayConfig::empty();
+    image::decode_into(bytes, &mut config).map_err(Refused::Image)?;
+    gateway.configure(&config).map_err(Refused::Build)?;
+    let gateway: &'static Gateway = gateway;
     let wiring = Wiring {
         ports: config.field_ports().map(|(index, port, _)| (PortId(index), port.bus.clone())).collect(),
         links: gateway.links().map(|(id, kind)| (id, kind, Endpoint::of(&config, kind))).collect(),

@@ -59,6 +59,27 @@ pub struct GatewayConfig {
     pub safe_values: Vec<SafeValue, MAX_SAFE_VALUES>,
 }
 
+impl GatewayConfig {
+    /// Nothing at all: no controller, no recipes, no ports.
+    pub const fn empty() -> Self {
+        Self {
+            controller: ControllerLink {
+                address: String::new(),
+                dialect: String::new(),
+                command_port: 0,
+                state_port: 0,
+                modbus_port: 0,
+                recipe_link: None,
+            },
+            recipes: Vec::new(),
+            ports: Vec::new(),
+            fields: Vec::new(),
+            commands: Vec::new(),
+            safe_values: Vec::new(),
+        }
+    }
+}
+
 /// The controller's side of the gateway.
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]

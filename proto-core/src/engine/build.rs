@@ -91,42 +91,83 @@ impl Groups {
 }
 
 impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS, UPLINKS, FIELDS> {
+    /// An engine without a configuration: no ports, no links, nothing to do.
+    pub const fn idle() -> Self {
+        Self {
+            store: Store::new(),
+            ports: Vec::new(),
+            bindings: Bindings { inputs: Vec::new(), outputs: Vec::new() },
+            safe_values: Vec::new(),
+            links: Links::new(),
+            watches_bits: false,
+            timer_at: Instant::ZERO,
+            rearm: true,
+        }
+    }
+
     /// An engine that runs this configuration; everything is down until its driver says otherwise.
     ///
     /// # Errors
     /// [`BuildError`] says what is wrong with the configuration, or what there is no room for.
     pub fn new(config: &GatewayConfig) -> Result<Self, BuildError> {
+        let mut engine = Self::idle();
+        engine.configure(config)?;
+        Ok(engine)
+    }
+
+    /// Runs this configuration from now on, and forgets everything that was. The engine stays where it
+    /// is: for boards whose stack is smaller than a few engines.
+    ///
+    /// # Errors
+    /// As [`Engine::new`]; the engine is idle then.
+    pub fn configure(&mut self, config: &GatewayConfig) -> Result<(), BuildError> {
+        self.clear();
+        let done = self.build(config);
+        if done.is_err() {
+            self.clear();
+        }
+        done
+    }
+
+    fn clear(&mut self) {
+        let Self { store, ports, bindings, safe_values, links, watches_bits, timer_at, rearm } = self;
+        *store = Store::new();
+        ports.clear();
+        bindings.inputs.clear();
+        bindings.outputs.clear();
+        safe_values.clear();
+        let Links { command, state, modbus, recipes } = links;
+        *command = None;
+        *state = None;
+        *modbus = None;
+        recipes.clear();
+        *watches_bits = false;
+        *timer_at = Instant::ZERO;
+        *rearm = true;
+    }
+
+    fn build(&mut self, config: &GatewayConfig) -> Result<(), BuildError> {
         config.validate().map_err(BuildError::Config)?;
         let plan = Plan::new(config).map_err(BuildError::Plan)?;
         let dialect = Dialect::named(&config.controller.dialect).ok_or(BuildError::UnknownDialect)?;
-        let mut engine = Self {
-            store: Store::new(),
-            ports: Vec::new(),
-            bindings: Bindings { inputs: Vec::new(), outputs: Vec::new() },
-            safe_values: config.safe_values.iter().map(SafeBytes::new).collect(),
-            links: Links::new(),
-            watches_bits: false,
-            timer_at: Instant::ZERO,
-            rearm: true,
-        };
+        self.safe_values.extend(config.safe_values.iter().map(SafeBytes::new));
         for (index, port, recipe) in config.field_ports() {
-            engine.add_port(config, index, port, recipe, dialect)?;
+            self.add_port(config, index, port, recipe, dialect)?;
         }
-        let mut groups = Groups(engine.store.frames.len() as u8);
+        let mut groups = Groups(self.store.frames.len() as u8);
         for (id, recipe) in uplinks(config) {
-            engine.add_uplink(config, &plan, id, recipe, &mut groups)?;
+            self.add_uplink(config, &plan, id, recipe, &mut groups)?;
         }
         if plan.needs_state() {
             let group = groups.next().ok_or(too_many("groups", MAX_GROUPS))?;
-            engine.links.state = Some(StateLink::new(group, plan.read_back()));
+            self.links.state = Some(StateLink::new(group, plan.read_back()));
         }
         if plan.needs_modbus() {
             let writes = SysVar::all().filter(|&var| plan.way_up(var) == Some(WayUp::Modbus)).collect();
-            engine.links.modbus = Some(ModbusLink::new(dialect.modbus_unit, writes));
+            self.links.modbus = Some(ModbusLink::new(dialect.modbus_unit, writes));
         }
-        engine.assign_read_back(&plan);
-        engine.assign_sources(config, &plan, &mut groups)?;
-        Ok(engine)
+        self.assign_read_back(&plan);
+        self.assign_sources(config, &plan, &mut groups)
     }
 
     fn add_port(

@@ -8,6 +8,8 @@
 use core::fmt;
 
 use crc::{CRC_32_ISO_HDLC, Crc};
+use heapless::Vec;
+use serde::de::DeserializeOwned;
 
 use super::{ConfigError, GatewayConfig};
 
@@ -122,14 +124,49 @@ pub fn encode(config: &GatewayConfig, out: &mut [u8]) -> Result<usize, NoSpace> 
 /// # Errors
 /// [`ImageError`] says what is wrong with it.
 pub fn decode(bytes: &[u8]) -> Result<GatewayConfig, ImageError> {
-    let payload = payload(bytes)?;
-    let (config, rest) =
-        postcard::take_from_bytes::<GatewayConfig>(payload).map_err(|_| ImageError::Contents)?;
+    let mut config = GatewayConfig::empty();
+    decode_into(bytes, &mut config)?;
+    Ok(config)
+}
+
+/// As [`decode`], in place: for boards whose stack is smaller than a few configurations, of more than
+/// 40 KiB each.
+///
+/// # Errors
+/// As [`decode`]; what `config` is then is of no use.
+pub fn decode_into(bytes: &[u8], config: &mut GatewayConfig) -> Result<(), ImageError> {
+    // Postcard writes a struct as its fields one behind the other.
+    let mut rest = payload(bytes)?;
+    let GatewayConfig { controller, recipes, ports, fields, commands, safe_values } = config;
+    *controller = item(&mut rest)?;
+    items(&mut rest, recipes)?;
+    items(&mut rest, ports)?;
+    items(&mut rest, fields)?;
+    items(&mut rest, commands)?;
+    items(&mut rest, safe_values)?;
     if !rest.is_empty() {
         return Err(ImageError::Contents);
     }
-    config.validate().map_err(ImageError::Config)?;
-    Ok(config)
+    config.validate().map_err(ImageError::Config)
+}
+
+fn item<T: DeserializeOwned>(rest: &mut &[u8]) -> Result<T, ImageError> {
+    let (item, behind) = postcard::take_from_bytes(rest).map_err(|_| ImageError::Contents)?;
+    *rest = behind;
+    Ok(item)
+}
+
+/// How many there are, and they.
+fn items<T: DeserializeOwned, const N: usize>(
+    rest: &mut &[u8],
+    all: &mut Vec<T, N>,
+) -> Result<(), ImageError> {
+    all.clear();
+    let count: usize = item(rest)?;
+    for _ in 0..count {
+        all.push(item(rest)?).map_err(|_| ImageError::Contents)?;
+    }
+    Ok(())
 }
 
 /// The length of the image whose header `bytes` begin with.

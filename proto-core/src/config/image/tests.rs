@@ -66,6 +66,28 @@ fn every_cut_is_refused_with_what_is_missing() {
 }
 
 #[test]
+fn what_was_there_before_does_not_shine_through() {
+    let mut config = every_kind();
+    let mut small = every_kind();
+    small.safe_values.clear();
+    small.commands.truncate(1);
+    for port in &mut small.ports {
+        port.on_timeout = crate::config::Span::default();
+    }
+    let mut out = [0; 1024];
+    let len = encode(&small, &mut out).unwrap();
+    assert_eq!(decode_into(&out[..len], &mut config), Ok(()));
+    assert_eq!(config, small);
+}
+
+/// Reading piece by piece is reading the whole.
+#[test]
+fn the_payload_is_the_configuration_in_postcard() {
+    let image = image();
+    assert_eq!(postcard::from_bytes::<GatewayConfig>(&image[HEADER..]).as_ref(), Ok(&every_kind()));
+}
+
+#[test]
 fn erased_flash_is_no_image() {
     for erased in [0x00, 0xFF] {
         let refused = decode(&[erased; 256]).unwrap_err();
