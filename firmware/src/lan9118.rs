@@ -333,3 +333,6 @@ const PHY_BMSR: u32 = 1;
 const PHY_INT_SOURCE: u32 = 29;
 const PHY_INT_MASK: u32 = 30;
 const BMSR_LINK: u32 = 1 << 2;
+
+#[cfg(test)]
+mod tests;
