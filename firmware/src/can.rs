@@ -82,7 +82,7 @@ pub async fn run(gateway: &Gateway, port: PortId, mut can: impl CanPort) -> ! {
         }
         if is_off {
             control.clear();
-            log::warn!("port {}: bus-off; onto the bus again in {backoff}", port.0);
+            log::warn!("port {}: bus-off; onto the bus again in {} ms", port.0, backoff.as_millis());
             Timer::after(backoff).await;
             backoff = (backoff * 2).min(BACKOFF_MAX);
             can.recover().await;

@@ -32,6 +32,7 @@ pub enum LineDirection {
 pub async fn run(gateway: &Gateway, port: PortId, mut line: impl Line, baud: u32) -> ! {
     let Some(control) = gateway.port(port) else { core::future::pending().await };
     let mut chunk = [0; 256];
+    let mut is_failing = false;
     loop {
         gateway.input(Input::PortUp { port });
         let failed = loop {
@@ -57,12 +58,19 @@ pub async fn run(gateway: &Gateway, port: PortId, mut line: impl Line, baud: u32
             let sent = sent.await;
             line.drive(LineDirection::Receive);
             match sent {
-                Ok(Ok(())) => gateway.input(Input::PortSent { port }),
+                Ok(Ok(())) => {
+                    is_failing = false;
+                    gateway.input(Input::PortSent { port });
+                }
                 Ok(Err(error)) => break embedded_io_async::Error::kind(&error),
                 Err(_) => break embedded_io_async::ErrorKind::TimedOut,
             }
         };
-        log::warn!("port {}: {failed:?}; again in {RETRY}", port.0);
+        // Said once, however often it fails in a row.
+        if !is_failing {
+            log::warn!("port {}: {failed:?}", port.0);
+        }
+        is_failing = true;
         gateway.input(Input::PortDown { port });
         control.clear();
         Timer::after(RETRY).await;

@@ -10,7 +10,8 @@ use firmware::gateway::Gateway;
 use firmware::link::{Buffers, Endpoint};
 use firmware::{can, link, serial};
 use proto_core::config::{Bus, GatewayConfig, image};
-use proto_core::engine::{LinkId, LinkKind, PortId};
+use proto_core::engine::{LinkId, LinkKind, PortCounters, PortId};
+use proto_core::link::LinkState;
 use static_cell::{ConstStaticCell, StaticCell};
 
 use crate::board::{self, Board, CanDevice, Ethernet, SerialDevice};
@@ -175,24 +176,52 @@ async fn address(stack: Stack<'static>) -> ! {
     }
 }
 
-/// Says what came of every link, once for each change.
+/// Says what came of every link, and what went through every port, when it is another than before.
 #[embassy_executor::task]
 async fn status(gateway: &'static Gateway) -> ! {
-    let mut ups = [0; 16];
+    let mut links = [(0, false); MAX_LINKS];
+    let mut ports = [PortCounters::default(); firmware::gateway::MAX_FIELD_PORTS];
     loop {
+        for _ in 0..4 {
+            let mut known = links.iter_mut();
+            gateway.report(
+                |link| {
+                    let Some((connects, was_up)) = known.next() else { return };
+                    let is_up = matches!(link.state, LinkState::Up { .. });
+                    let name = link.kind.name();
+                    if *connects != link.history.connects {
+                        *connects = link.history.connects;
+                        log::info!("link {name}: up ({connects})");
+                    } else if *was_up && !is_up {
+                        log::warn!("link {name}: lost");
+                    }
+                    *was_up = is_up;
+                },
+                |_, _| {},
+            );
+            Timer::after(Duration::from_millis(250)).await;
+        }
+        let mut known = ports.iter_mut();
         gateway.report(
-            |link| {
-                let connects = link.history.connects;
-                if let Some(known) = ups.get_mut(usize::from(link.id.0))
-                    && *known != connects
+            |_| {},
+            |port, now| {
+                if let Some(before) = known.next()
+                    && before != now
                 {
-                    *known = connects;
-                    log::info!("link {}: up ({connects})", link.kind.name());
+                    *before = *now;
+                    log::info!(
+                        "port {}: in {} frames, {} bytes; out {} frames, {} bytes; {} bytes skipped, {} cycles",
+                        port.0,
+                        now.frames_in,
+                        now.bytes_in,
+                        now.frames_out,
+                        now.bytes_out,
+                        now.resync_bytes,
+                        now.skipped_cycles,
+                    );
                 }
             },
-            |_, _| {},
         );
-        Timer::after(Duration::from_millis(250)).await;
     }
 }
 
