@@ -111,6 +111,26 @@ fn frames_and_values_convert_both_ways() {
 }
 
 #[test]
+fn an_image_is_what_a_board_takes() {
+    let folder = tempfile::tempdir().unwrap();
+    let image = folder.path().join("cell.img");
+    let image = image.to_str().unwrap();
+    let file = path("force-sensor.toml");
+    let set = "controller.address=10.0.2.2";
+    let said = ok(&["image", &file, "--set", set, "-o", image], "");
+    let bytes = std::fs::read(image).unwrap();
+    assert_eq!(said, format!("{image}: {} bytes, version 1\n", bytes.len()));
+    let config = proto_core::config::image::decode(&bytes).unwrap();
+    assert_eq!(config.controller.address, "10.0.2.2");
+    assert_eq!(config.ports[0].name, "force");
+    // Of a wrong file there is no image.
+    std::fs::remove_file(image).unwrap();
+    refused(&["image", &file, "--set", "port.force.cycle_ms=3", "-o", image]);
+    refused(&["image", &path("force-sensor-controller.toml"), "-o", image]);
+    assert!(!std::path::Path::new(image).exists());
+}
+
+#[test]
 fn the_help_teaches() {
     for command in ["controller", "gateway", "check", "encode", "decode"] {
         let help = ok(&[command, "--help"], "");
