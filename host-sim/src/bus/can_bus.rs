@@ -419,6 +419,8 @@ async fn serve(io: &impl ClientIo, node: &Node, bitrate: u32, tx: &PortTx) -> io
                     Ok(0) => Err(io::ErrorKind::UnexpectedEof.into()),
                     Ok(count) => {
                         unread = 0..count;
+                        // One read holds fewer frames than a node keeps: others take them in between.
+                        tokio::task::yield_now().await;
                         Ok(())
                     }
                     Err(error) => Err(error),

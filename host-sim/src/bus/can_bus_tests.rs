@@ -236,6 +236,17 @@ fn a_burst_longer_than_the_queue_waits_in_its_connection_and_nothing_is_lost() {
 }
 
 #[test]
+fn a_client_that_reads_loses_nothing_of_an_unpaced_burst() {
+    run(async |_| {
+        let port = Running::start("slcan-tcp-unpaced:127.0.0.1:0", BUS).await;
+        let (mut one, mut two) = (client(&port).await, client(&port).await);
+        one.write_all(&b"t0010\r".repeat(2_000)).await.unwrap();
+        assert_eq!(ids_heard(&mut two, 2_000).await, [1; 2_000]);
+        assert_eq!(port.tx.counters().dropped, 0);
+    });
+}
+
+#[test]
 fn more_clients_than_the_bound_are_turned_away() {
     run(async |_| {
         let port = Running::start("slcan-tcp:127.0.0.1:0", BUS).await;
