@@ -314,7 +314,7 @@ async fn pump(
 /// The transmission under way on a line, and the time it takes.
 struct Sender {
     tx: Rc<PortTx>,
-    line: LineSpeed,
+    line: Rs485,
     timer: Timer,
     paced: bool,
     bytes: Vec<u8>,
@@ -328,7 +328,7 @@ impl Sender {
     fn new(settings: Rs485, tx: Rc<PortTx>) -> io::Result<Self> {
         Ok(Self {
             tx,
-            line: LineSpeed::of(settings),
+            line: settings,
             timer: Timer::new()?,
             paced: false,
             bytes: Vec::new(),
@@ -367,9 +367,9 @@ impl Sender {
     /// Writes what is due and sets the timer to what comes next.
     fn advance(&mut self, device: &impl LineIo, events: &mut impl FnMut(PortEvent<'_>)) -> io::Result<()> {
         let at = now();
-        let end = self.start + self.line.time_of(self.bytes.len());
+        let end = self.start + self.line.time_on_line(self.bytes.len());
         let due = match self.paced {
-            true => self.line.bytes_in(at.saturating_since(self.start)).min(self.bytes.len()),
+            true => bytes_in(&self.line, at.saturating_since(self.start)).min(self.bytes.len()),
             false => self.bytes.len(),
         };
         self.write_up_to(due, device)?;
@@ -377,7 +377,7 @@ impl Sender {
             return Ok(());
         }
         if self.written < self.bytes.len() {
-            let next = self.start + self.line.time_of(self.written + 1);
+            let next = self.start + self.line.time_on_line(self.written + 1);
             return self.timer.arm(next.max(at + CLUMP).min(end));
         }
         if at < end {
@@ -425,32 +425,10 @@ impl Sender {
     }
 }
 
-/// How long bytes take on the wire.
-#[derive(Debug, Clone, Copy)]
-struct LineSpeed {
-    bits_per_byte: u64,
-    baud: u64,
-}
-
-impl LineSpeed {
-    /// Start bit, 8 data bits, parity and stop bits (D20 counts 10 for 8N1).
-    fn of(settings: Rs485) -> Self {
-        let parity = u64::from(settings.parity != Parity::None);
-        let bits_per_byte = 9 + parity + u64::from(settings.stop_bits.max(1));
-        Self { bits_per_byte, baud: u64::from(settings.baud.max(1)) }
-    }
-
-    /// Until the last stop bit of `count` bytes, rounded up.
-    fn time_of(self, count: usize) -> Duration {
-        Duration::from_micros((count as u64 * self.bits_per_byte * 1_000_000).div_ceil(self.baud))
-    }
-
-    /// How many bytes have ended after `time`.
-    fn bytes_in(self, time: Duration) -> usize {
-        let bytes =
-            u128::from(time.as_micros()) * u128::from(self.baud) / 1_000_000 / u128::from(self.bits_per_byte);
-        usize::try_from(bytes).unwrap_or(usize::MAX)
-    }
+/// How many bytes have ended on the line after `time`.
+fn bytes_in(line: &Rs485, time: Duration) -> usize {
+    let bits = u128::from(time.as_micros()) * u128::from(line.baud) / 1_000_000;
+    usize::try_from(bits / u128::from(line.bits_per_character())).unwrap_or(usize::MAX)
 }
 
 /// Paced bytes closer together than this appear together, as out of a UART's FIFO.

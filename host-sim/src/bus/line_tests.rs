@@ -21,15 +21,15 @@ fn line(baud: u32) -> PortBus {
 #[test]
 fn a_byte_takes_its_start_data_parity_and_stop_bits() {
     let PortBus::Serial(mut settings) = line(115_200) else { unreachable!() };
-    let micros = |settings| LineSpeed::of(settings).time_of(28).as_micros();
+    let micros = |settings: Rs485| settings.time_on_line(28).as_micros();
     assert_eq!(micros(settings), 2_431);
     settings.parity = Parity::Even;
     settings.stop_bits = 2;
     assert_eq!(micros(settings), 2_917);
-    let speed = LineSpeed::of(settings);
     for count in 0..600 {
-        assert_eq!(speed.bytes_in(speed.time_of(count)), count);
-        assert!(count == 0 || speed.bytes_in(speed.time_of(count) - Duration::from_micros(1)) < count);
+        let time = settings.time_on_line(count);
+        assert_eq!(bytes_in(&settings, time), count);
+        assert!(count == 0 || bytes_in(&settings, time - Duration::from_micros(1)) < count);
     }
 }
 
