@@ -8,6 +8,7 @@ use proto_core::recipe::can::CanFrame;
 use proto_core::recipe::model::{CanId, MAX_CAN_DATA};
 
 use crate::gateway::Gateway;
+use crate::warn;
 
 /// A CAN controller. Its driver buffers what arrives while nobody receives.
 #[allow(async_fn_in_trait, reason = "all tasks run on one executor: no future is sent anywhere")]
@@ -82,7 +83,7 @@ pub async fn run(gateway: &Gateway, port: PortId, mut can: impl CanPort) -> ! {
         }
         if is_off {
             control.clear();
-            log::warn!("port {}: bus-off; onto the bus again in {} ms", port.0, backoff.as_millis());
+            warn!("port {}: bus-off; onto the bus again in {} ms", port.0, backoff.as_millis());
             Timer::after(backoff).await;
             backoff = (backoff * 2).min(BACKOFF_MAX);
             can.recover().await;

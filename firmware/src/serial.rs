@@ -9,7 +9,9 @@ use embassy_time::{Duration, Timer, with_timeout};
 use embedded_io_async::{Read, Write};
 use proto_core::engine::{Input, PortId};
 
+use crate::fmt::Text;
 use crate::gateway::Gateway;
+use crate::warn;
 
 /// A half-duplex line (D20).
 pub trait Line: Read + Write {
@@ -68,7 +70,7 @@ pub async fn run(gateway: &Gateway, port: PortId, mut line: impl Line, baud: u32
         };
         // Said once, however often it fails in a row.
         if !is_failing {
-            log::warn!("port {}: {failed:?}", port.0);
+            warn!("port {}: {}", port.0, Text(&failed));
         }
         is_failing = true;
         gateway.input(Input::PortDown { port });

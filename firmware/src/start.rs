@@ -6,9 +6,10 @@
 use embassy_executor::Spawner;
 use embassy_net::{Config, Runner, Stack, StackResources};
 use embassy_time::{Duration, Timer};
+use firmware::fmt::Text;
 use firmware::gateway::Gateway;
 use firmware::link::{Buffers, Endpoint};
-use firmware::{can, link, serial};
+use firmware::{can, error, info, link, serial, warn};
 use proto_core::config::{Bus, GatewayConfig, image};
 use proto_core::engine::{LinkId, LinkKind, PortCounters, PortId};
 use proto_core::link::LinkState;
@@ -19,7 +20,7 @@ use crate::board::{self, Board, CanDevice, Ethernet, SerialDevice};
 /// Starts what the configuration asks for. Without a configuration that can run, the buses stay silent
 /// and the log says why.
 pub(crate) fn start(spawner: Spawner, mut board: Board) {
-    log::info!("recipe gateway {}", env!("CARGO_PKG_VERSION"));
+    info!("recipe gateway {}", env!("CARGO_PKG_VERSION"));
     let started =
         load(&mut board, idle_gateway()).and_then(|(gateway, plan)| run(spawner, board, gateway, plan));
     if let Err(reason) = started {
@@ -76,7 +77,7 @@ fn load(board: &mut Board, gateway: &'static mut Gateway) -> Result<(&'static Ga
         ports: config.field_ports().map(|(index, port, _)| (PortId(index), port.bus.clone())).collect(),
         links: gateway.links().map(|(id, kind)| (id, kind, Endpoint::of(&config, kind))).collect(),
     };
-    log::info!(
+    info!(
         "configuration: {} bytes; {} field ports, {} links; the engine takes {} bytes, its configuration {}",
         bytes.len(),
         wiring.ports.len(),
@@ -120,7 +121,7 @@ fn run(spawner: Spawner, mut board: Board, gateway: &'static Gateway, wiring: Wi
     let resources = RESOURCES.init(StackResources::new());
     let (stack, runner) =
         embassy_net::new(ethernet, Config::dhcpv4(Default::default()), resources, board::seed());
-    log::info!("stack: {} bytes while the engine was made", board::stack_used());
+    info!("stack: {} bytes while the engine was made", board::stack_used());
     spawner.spawn(network(runner).expect("the first of its kind"));
     spawner.spawn(address(stack).expect("the first of its kind"));
     static BUFFERS: [ConstStaticCell<Buffers<RX, TX>>; MAX_LINKS] =
@@ -169,10 +170,10 @@ async fn address(stack: Stack<'static>) -> ! {
     loop {
         stack.wait_config_up().await;
         if let Some(config) = stack.config_v4() {
-            log::info!("address {}", config.address);
+            info!("address {}", Text(&config.address));
         }
         stack.wait_config_down().await;
-        log::warn!("no address");
+        warn!("no address");
     }
 }
 
@@ -191,9 +192,9 @@ async fn status(gateway: &'static Gateway) -> ! {
                     let name = link.kind.name();
                     if *connects != link.history.connects {
                         *connects = link.history.connects;
-                        log::info!("link {name}: up ({connects})");
+                        info!("link {}: up ({})", name, connects);
                     } else if *was_up && !is_up {
-                        log::warn!("link {name}: lost");
+                        warn!("link {}: lost", name);
                     }
                     *was_up = is_up;
                 },
@@ -209,7 +210,7 @@ async fn status(gateway: &'static Gateway) -> ! {
                     && before != now
                 {
                     *before = *now;
-                    log::info!(
+                    info!(
                         "port {}: in {} frames, {} bytes; out {} frames, {} bytes; {} bytes skipped, {} cycles",
                         port.0,
                         now.frames_in,
@@ -229,7 +230,7 @@ async fn status(gateway: &'static Gateway) -> ! {
 #[embassy_executor::task]
 async fn idle(reason: Refused) -> ! {
     loop {
-        log::error!("nothing runs: {reason}");
+        error!("nothing runs: {}", Text(&reason));
         Timer::after(Duration::from_secs(10)).await;
     }
 }
