@@ -1,0 +1,117 @@
+//! Targets on stable Rust, in `cargo test`: everything that is kept, then a fixed number of inputs
+//! made of it by chance, always the same ones.
+
+use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
+use std::path::{Path, PathBuf};
+
+use crate::source::Random;
+
+/// One fuzz target.
+#[derive(Debug, Clone, Copy)]
+pub struct Target {
+    /// What it is called.
+    pub name: &'static str,
+    /// Takes one input; panics when something is not as it has to be.
+    pub run: fn(&[u8]),
+    /// Inputs to begin with: the vectors of `docs/wire`, and what once was a bug.
+    pub seeds: fn() -> Vec<Vec<u8>>,
+    /// Inputs by chance in `cargo test`, unless `FUZZ_RUNS` says otherwise.
+    pub runs: usize,
+    /// Longest input made by chance, in bytes.
+    pub longest: usize,
+}
+
+impl Target {
+    /// Seeds, the files in `corpus` and its folder of the target's name, and inputs by chance.
+    ///
+    /// `FUZZ_FILE` names one file to be run instead, `FUZZ_SEEDS` a folder that the seeds are written to
+    /// instead; `FUZZ_RUNS` and `FUZZ_SEED` are numbers.
+    ///
+    /// # Panics
+    /// As the target does. The input is then in a file that the panic names.
+    pub fn check(&self, corpus: &Path) {
+        if let Some(file) = std::env::var_os("FUZZ_FILE") {
+            return (self.run)(&std::fs::read(file).expect("FUZZ_FILE can be read"));
+        }
+        let mut known = (self.seeds)();
+        if let Some(folder) = std::env::var_os("FUZZ_SEEDS") {
+            return keep(&known, Path::new(&folder));
+        }
+        known.extend(files(&corpus.join(self.name)));
+        assert!(!known.is_empty(), "{} has nothing to begin with", self.name);
+        for input in &known {
+            self.run_one(input);
+        }
+        let mut random = Random::new(number("FUZZ_SEED").unwrap_or(1));
+        for _ in 0..number("FUZZ_RUNS").map_or(self.runs, |runs| runs as usize) {
+            self.run_one(&self.vary(&known, &mut random));
+        }
+    }
+
+    fn run_one(&self, input: &[u8]) {
+        if let Err(panic) = catch_unwind(AssertUnwindSafe(|| (self.run)(input))) {
+            let file = std::env::temp_dir().join(format!("fuzz-{}-failed", self.name));
+            match std::fs::write(&file, input) {
+                Ok(()) => eprintln!("the input is in {0}; FUZZ_FILE={0} runs it alone", file.display()),
+                Err(error) => eprintln!("the input {input:02X?} cannot be kept: {error}"),
+            }
+            resume_unwind(panic);
+        }
+    }
+
+    fn vary(&self, known: &[Vec<u8>], random: &mut Random) -> Vec<u8> {
+        let mut input = known[random.below(known.len())].clone();
+        for _ in 0..=random.below(6) {
+            let at = random.below(input.len() + 1);
+            let end = (at + random.below(16)).min(input.len());
+            match random.below(10) {
+                0 if at < input.len() => input[at] ^= 1 << random.below(8),
+                1 if at < input.len() => input[at] = random.number() as u8,
+                2 if at < input.len() => input[at] = TELLING[random.below(TELLING.len())],
+                3 => drop(input.drain(at..end)),
+                4 => drop(input.splice(at..at, (0..random.below(8)).map(|_| 0).collect::<Vec<_>>())),
+                5 => {
+                    let noise: Vec<u8> = (0..random.below(24)).map(|_| random.number() as u8).collect();
+                    drop(input.splice(at..at, noise));
+                }
+                6 => {
+                    let copy = input[at..end].to_vec();
+                    let to = random.below(input.len() + 1);
+                    drop(input.splice(to..to, copy));
+                }
+                7 => input.truncate(at),
+                _ => {
+                    let other = &known[random.below(known.len())];
+                    let from = random.below(other.len() + 1);
+                    let part = &other[from..(from + random.below(200)).min(other.len())];
+                    drop(input.splice(at..end, part.iter().copied()));
+                }
+            }
+        }
+        input.truncate(self.longest);
+        input
+    }
+}
+
+/// Bytes at which things change.
+const TELLING: &[u8] =
+    &[0, 1, 2, 3, 4, 8, 9, 16, 32, 64, 127, 128, 129, 253, 254, 255, b'\r', b'\n', b'(', b')'];
+
+fn number(name: &str) -> Option<u64> {
+    let text = std::env::var(name).ok()?;
+    Some(text.parse().unwrap_or_else(|_| panic!("{name}={text} is no number")))
+}
+
+fn keep(seeds: &[Vec<u8>], folder: &Path) {
+    for (nth, seed) in seeds.iter().enumerate() {
+        std::fs::write(folder.join(format!("seed-{nth:02}")), seed).expect("the folder can be written to");
+    }
+}
+
+fn files(folder: &Path) -> Vec<Vec<u8>> {
+    let Ok(entries) = std::fs::read_dir(folder) else { return Vec::new() };
+    let mut paths: Vec<PathBuf> =
+        entries.map(|entry| entry.expect("a corpus can be listed").path()).collect();
+    paths.sort();
+    paths.iter().map(|path| std::fs::read(path).expect("a corpus can be read")).collect()
+}

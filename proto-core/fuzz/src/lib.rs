@@ -1,0 +1,36 @@
+//! Fuzz targets of `proto-core` (docs/fuzzing.md).
+//!
+//! In: bytes. They are read as a short program: a recipe, operations, received bytes and where they
+//! are cut. Each target runs it on the code and on a slow, obvious reference written from `docs/wire`,
+//! and panics where they differ or where a call did more work than it may. The same functions run in
+//! `cargo test` and, guided by coverage, under libFuzzer.
+
+pub mod harness;
+pub mod source;
+
+mod can;
+mod deframer;
+mod recipes;
+mod slcan;
+mod state;
+
+#[path = "../../tests/reference/mod.rs"]
+mod reference;
+
+use harness::Target;
+
+/// All targets.
+pub const TARGETS: &[Target] = &[
+    Target { name: "deframer", run: deframer::run, seeds: deframer::seeds, runs: 2_000, longest: 2_000 },
+    Target { name: "can", run: can::run, seeds: can::seeds, runs: 4_000, longest: 600 },
+    Target { name: "state", run: state::run, seeds: state::seeds, runs: 400, longest: 6_000 },
+    Target { name: "slcan", run: slcan::run, seeds: slcan::seeds, runs: 4_000, longest: 1_000 },
+];
+
+/// The target of this name.
+///
+/// # Panics
+/// When there is none.
+pub fn target(name: &str) -> &'static Target {
+    TARGETS.iter().find(|target| target.name == name).unwrap_or_else(|| panic!("there is no target {name:?}"))
+}
