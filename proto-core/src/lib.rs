@@ -22,6 +22,8 @@ pub mod image;
 pub mod link;
 pub mod modbus;
 pub mod recipe;
+#[cfg(feature = "record")]
+pub mod record;
 pub mod schedule;
 pub mod sysvar;
 pub mod time;

@@ -1,0 +1,324 @@
+//! Runs of an engine as bytes: every input with its instant and every output, to be replayed by
+//! another engine elsewhere (docs/cortex-m7.md section 1).
+//!
+//! In: what goes into an engine and comes out of it, or a recording. Out: the other. A recording that
+//! is cut or changed is refused; nothing that stands in one can panic. Knows no file and no clock.
+
+mod replay;
+
+pub use replay::{ReplayError, Replayed, replay};
+
+use embedded_can::Frame;
+use heapless::Vec;
+
+use crate::engine::{BusState, Engine, Input, LinkId, Output, PortId};
+use crate::recipe::CanFrame;
+use crate::recipe::model::{CanId, MAX_CAN_DATA};
+use crate::time::Instant;
+
+/// The first bytes of every recording; the last one is the format's version.
+pub const MAGIC: [u8; 4] = *b"RGR\x01";
+
+/// Longest [`Entry::Totals`].
+pub const MAX_TOTALS: usize = 3072;
+
+/// One thing that a recording holds.
+#[derive(Debug, Clone, Copy)]
+pub enum Entry<'a> {
+    /// An engine begins, with this configuration image.
+    Start {
+        /// The image ([`crate::config::image`]).
+        image: &'a [u8],
+    },
+    /// [`Engine::handle`] was called.
+    Input {
+        /// When.
+        at: Instant,
+        /// With what.
+        input: Input<'a>,
+    },
+    /// [`Engine::poll_output`] returned this.
+    Output(Output<'a>),
+    /// What the engine has counted and what its image holds: see [`totals`].
+    Totals(&'a [u8]),
+}
+
+impl<'a> Entry<'a> {
+    /// The entry that `bytes` begin with, and what follows it; `None` when it is none.
+    pub fn parse(bytes: &'a [u8]) -> Option<(Self, &'a [u8])> {
+        let mut body = Reader(bytes);
+        let entry = match body.byte()? {
+            tag::START => Self::Start { image: body.bytes()? },
+            tag::TOTALS => Self::Totals(body.bytes()?),
+            tag @ 0x10..0x20 => {
+                let at = body.instant()?;
+                Self::Input { at, input: body.input(tag)? }
+            }
+            tag => Self::Output(body.output(tag)?),
+        };
+        Some((entry, body.0))
+    }
+
+    /// Writes the entry, in up to two pieces.
+    pub fn encode(&self, mut write: impl FnMut(&[u8])) {
+        let mut head = Head::default();
+        let tail = match *self {
+            Self::Start { image } => head.tag(tag::START).len_of(image),
+            Self::Totals(totals) => head.tag(tag::TOTALS).len_of(totals),
+            Self::Input { at, input } => head.input(at, input),
+            Self::Output(output) => head.output(output),
+        };
+        write(&head.0);
+        if !tail.is_empty() {
+            write(tail);
+        }
+    }
+}
+
+/// The counters of every field port and link and the values of the image: what an engine became by
+/// its inputs, beside what it said.
+///
+/// Of each port and link its number and its counters as postcard has them, then the image.
+pub fn totals<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize>(
+    engine: &Engine<PORTS, UPLINKS, FIELDS>,
+) -> Vec<u8, MAX_TOTALS> {
+    let mut totals = Vec::new();
+    let mut scratch = [0; 256];
+    for port in engine.field_ports() {
+        if let Some(counters) = engine.port_counters(port) {
+            let bytes = postcard::to_slice(&(port.0, counters), &mut scratch);
+            let _ = totals.extend_from_slice(bytes.as_deref().unwrap_or(&[]));
+        }
+    }
+    for link in engine.links() {
+        let bytes = postcard::to_slice(&(link.id.0, link.history, link.counters), &mut scratch);
+        let _ = totals.extend_from_slice(bytes.as_deref().unwrap_or(&[]));
+    }
+    let _ = totals.extend_from_slice(engine.image().bytes());
+    totals
+}
+
+mod tag {
+    pub(super) const START: u8 = 0x01;
+    pub(super) const TOTALS: u8 = 0x02;
+
+    pub(super) const PORT_UP: u8 = 0x10;
+    pub(super) const PORT_DOWN: u8 = 0x11;
+    pub(super) const PORT_BYTES: u8 = 0x12;
+    pub(super) const PORT_CAN: u8 = 0x13;
+    pub(super) const PORT_SENT: u8 = 0x14;
+    pub(super) const PORT_BUS: u8 = 0x15;
+    pub(super) const LINK_UP: u8 = 0x16;
+    pub(super) const LINK_DOWN: u8 = 0x17;
+    pub(super) const LINK_BYTES: u8 = 0x18;
+    pub(super) const LINK_SENT: u8 = 0x19;
+    pub(super) const TICK: u8 = 0x1A;
+
+    pub(super) const SLEEP: u8 = 0x20;
+    pub(super) const PORT_SEND: u8 = 0x21;
+    pub(super) const PORT_SEND_CAN: u8 = 0x22;
+    pub(super) const LINK_OPEN: u8 = 0x23;
+    pub(super) const LINK_CLOSE: u8 = 0x24;
+    pub(super) const LINK_SEND: u8 = 0x25;
+}
+
+/// Bit 31 of a recorded CAN id: 29 bits. Bit 30: a remote frame.
+const EXTENDED: u32 = 1 << 31;
+const REMOTE: u32 = 1 << 30;
+
+/// Everything of an entry but the bytes at its end: tag, two numbers of up to ten bytes, a port and
+/// a CAN frame at most.
+#[derive(Default)]
+struct Head(Vec<u8, 40>);
+
+impl Head {
+    fn tag(&mut self, tag: u8) -> &mut Self {
+        self.byte(tag)
+    }
+
+    fn byte(&mut self, byte: u8) -> &mut Self {
+        let _ = self.0.push(byte);
+        self
+    }
+
+    /// Seven bits a byte, the lowest first; all but the last with bit 7.
+    fn number(&mut self, mut number: u64) -> &mut Self {
+        while number > 0x7F {
+            self.byte(number as u8 | 0x80);
+            number >>= 7;
+        }
+        self.byte(number as u8)
+    }
+
+    fn len_of<'a>(&mut self, bytes: &'a [u8]) -> &'a [u8] {
+        self.number(bytes.len() as u64);
+        bytes
+    }
+
+    fn frame<'a>(&mut self, frame: &CanFrame) -> &'a [u8] {
+        let id = match frame.id() {
+            CanId::Standard(id) => u32::from(id),
+            CanId::Extended(id) => id | EXTENDED,
+        };
+        let id = if frame.is_remote() { id | REMOTE } else { id };
+        let _ = self.0.extend_from_slice(&id.to_le_bytes());
+        let _ = self.byte(frame.dlc() as u8).0.extend_from_slice(frame.data());
+        &[]
+    }
+
+    fn input<'a>(&mut self, at: Instant, input: Input<'a>) -> &'a [u8] {
+        let (tag, subject) = match input {
+            Input::PortUp { port } => (tag::PORT_UP, port.0),
+            Input::PortDown { port } => (tag::PORT_DOWN, port.0),
+            Input::PortBytes { port, .. } => (tag::PORT_BYTES, port.0),
+            Input::PortCan { port, .. } => (tag::PORT_CAN, port.0),
+            Input::PortSent { port } => (tag::PORT_SENT, port.0),
+            Input::PortBus { port, .. } => (tag::PORT_BUS, port.0),
+            Input::LinkUp { link } => (tag::LINK_UP, link.0),
+            Input::LinkDown { link } => (tag::LINK_DOWN, link.0),
+            Input::LinkBytes { link, .. } => (tag::LINK_BYTES, link.0),
+            Input::LinkSent { link } => (tag::LINK_SENT, link.0),
+            Input::Tick => (tag::TICK, 0),
+        };
+        self.tag(tag).number(at.as_micros()).byte(subject);
+        match input {
+            Input::PortBytes { bytes, .. } | Input::LinkBytes { bytes, .. } => self.len_of(bytes),
+            Input::PortCan { frame, .. } => self.frame(&frame),
+            Input::PortBus { state, .. } => {
+                self.byte(match state {
+                    BusState::Active => 0,
+                    BusState::Warning => 1,
+                    BusState::Passive => 2,
+                    BusState::BusOff => 3,
+                });
+                &[]
+            }
+            _ => &[],
+        }
+    }
+
+    fn output<'a>(&mut self, output: Output<'a>) -> &'a [u8] {
+        match output {
+            Output::Sleep { until } => {
+                self.tag(tag::SLEEP).number(until.as_micros());
+                &[]
+            }
+            Output::PortSend { port, bytes } => self.tag(tag::PORT_SEND).byte(port.0).len_of(bytes),
+            Output::PortSendCan { port, frame } => self.tag(tag::PORT_SEND_CAN).byte(port.0).frame(&frame),
+            Output::LinkOpen { link } => {
+                self.tag(tag::LINK_OPEN).byte(link.0);
+                &[]
+            }
+            Output::LinkClose { link } => {
+                self.tag(tag::LINK_CLOSE).byte(link.0);
+                &[]
+            }
+            Output::LinkSend { link, bytes } => self.tag(tag::LINK_SEND).byte(link.0).len_of(bytes),
+        }
+    }
+}
+
+struct Reader<'a>(&'a [u8]);
+
+impl<'a> Reader<'a> {
+    fn byte(&mut self) -> Option<u8> {
+        let (byte, rest) = self.0.split_first()?;
+        self.0 = rest;
+        Some(*byte)
+    }
+
+    fn number(&mut self) -> Option<u64> {
+        let mut number = 0_u64;
+        for shift in (0..64_u32).step_by(7) {
+            let byte = self.byte()?;
+            let bits = u64::from(byte & 0x7F);
+            let placed = bits.checked_shl(shift)?;
+            if placed.checked_shr(shift) != Some(bits) {
+                return None;
+            }
+            number |= placed;
+            if byte & 0x80 == 0 {
+                return Some(number);
+            }
+        }
+        None
+    }
+
+    fn instant(&mut self) -> Option<Instant> {
+        self.number().map(Instant::from_micros)
+    }
+
+    fn take(&mut self, len: usize) -> Option<&'a [u8]> {
+        let (bytes, rest) = self.0.split_at_checked(len)?;
+        self.0 = rest;
+        Some(bytes)
+    }
+
+    fn bytes(&mut self) -> Option<&'a [u8]> {
+        let len = usize::try_from(self.number()?).ok()?;
+        self.take(len)
+    }
+
+    fn port(&mut self) -> Option<PortId> {
+        self.byte().map(PortId)
+    }
+
+    fn link(&mut self) -> Option<LinkId> {
+        self.byte().map(LinkId)
+    }
+
+    fn frame(&mut self) -> Option<CanFrame> {
+        let word = u32::from_le_bytes(*self.take(4)?.first_chunk()?);
+        let id = word & !(EXTENDED | REMOTE);
+        let id =
+            if word & EXTENDED == 0 { CanId::Standard(u16::try_from(id).ok()?) } else { CanId::Extended(id) };
+        let len = usize::from(self.byte()?);
+        if word & REMOTE != 0 {
+            return CanFrame::remote(id, len);
+        }
+        (len <= MAX_CAN_DATA).then_some(())?;
+        CanFrame::new(id, self.take(len)?)
+    }
+
+    fn input(&mut self, tag: u8) -> Option<Input<'a>> {
+        Some(match tag {
+            tag::PORT_UP => Input::PortUp { port: self.port()? },
+            tag::PORT_DOWN => Input::PortDown { port: self.port()? },
+            tag::PORT_BYTES => Input::PortBytes { port: self.port()?, bytes: self.bytes()? },
+            tag::PORT_CAN => Input::PortCan { port: self.port()?, frame: self.frame()? },
+            tag::PORT_SENT => Input::PortSent { port: self.port()? },
+            tag::PORT_BUS => {
+                let port = self.port()?;
+                let state = match self.byte()? {
+                    0 => BusState::Active,
+                    1 => BusState::Warning,
+                    2 => BusState::Passive,
+                    3 => BusState::BusOff,
+                    _ => return None,
+                };
+                Input::PortBus { port, state }
+            }
+            tag::LINK_UP => Input::LinkUp { link: self.link()? },
+            tag::LINK_DOWN => Input::LinkDown { link: self.link()? },
+            tag::LINK_BYTES => Input::LinkBytes { link: self.link()?, bytes: self.bytes()? },
+            tag::LINK_SENT => Input::LinkSent { link: self.link()? },
+            tag::TICK => self.byte().map(|_| Input::Tick)?,
+            _ => return None,
+        })
+    }
+
+    fn output(&mut self, tag: u8) -> Option<Output<'a>> {
+        Some(match tag {
+            tag::SLEEP => Output::Sleep { until: self.instant()? },
+            tag::PORT_SEND => Output::PortSend { port: self.port()?, bytes: self.bytes()? },
+            tag::PORT_SEND_CAN => Output::PortSendCan { port: self.port()?, frame: self.frame()? },
+            tag::LINK_OPEN => Output::LinkOpen { link: self.link()? },
+            tag::LINK_CLOSE => Output::LinkClose { link: self.link()? },
+            tag::LINK_SEND => Output::LinkSend { link: self.link()?, bytes: self.bytes()? },
+            _ => return None,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,113 @@
+//! A recording's inputs for another engine; what that engine says, as a recording.
+
+use core::fmt;
+
+use super::{Entry, MAGIC, totals};
+use crate::config::GatewayConfig;
+use crate::config::image::{self, ImageError};
+use crate::engine::{BuildError, Engine, Input, OUTPUT_BUFFER, Output};
+use crate::time::Instant;
+
+/// Why a recording cannot be replayed.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
+pub enum ReplayError {
+    /// It does not begin with [`MAGIC`].
+    NotARecording,
+    /// What stands there is no entry: cut, or changed.
+    Entry {
+        /// Offset of its first byte.
+        at: usize,
+    },
+    /// There are inputs before an engine began.
+    NoStart,
+    /// The configuration image is refused.
+    Image(ImageError),
+    /// This engine cannot run the configuration.
+    Build(BuildError),
+}
+
+impl fmt::Display for ReplayError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::NotARecording => f.write_str("no recording"),
+            Self::Entry { at } => write!(f, "the recording is damaged at byte {at}"),
+            Self::NoStart => f.write_str("the recording does not begin with a configuration"),
+            Self::Image(error) => error.fmt(f),
+            Self::Build(error) => error.fmt(f),
+        }
+    }
+}
+
+impl core::error::Error for ReplayError {}
+
+/// What a replay was.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Replayed {
+    /// Inputs handed to the engine.
+    pub inputs: usize,
+    /// What it returned for them.
+    pub outputs: usize,
+}
+
+/// Gives the inputs of `recording` to `engine`, at their instants, and writes the recording that comes
+/// of it: the same inputs, and this engine's outputs and totals. It equals `recording` when both
+/// engines behave the same.
+///
+/// `config` is a place to work in; boards have none to spare on the stack.
+///
+/// # Errors
+/// [`ReplayError`]; what was written until then is this engine's.
+pub fn replay<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize>(
+    recording: &[u8],
+    engine: &mut Engine<PORTS, UPLINKS, FIELDS>,
+    config: &mut GatewayConfig,
+    mut write: impl FnMut(&[u8]),
+) -> Result<Replayed, ReplayError> {
+    let mut rest = recording.strip_prefix(&MAGIC).ok_or(ReplayError::NotARecording)?;
+    write(&MAGIC);
+    let mut replayed = Replayed::default();
+    let mut has_started = false;
+    while !rest.is_empty() {
+        let damaged = ReplayError::Entry { at: recording.len().saturating_sub(rest.len()) };
+        let (entry, after) = Entry::parse(rest).ok_or(damaged)?;
+        rest = after;
+        match entry {
+            Entry::Start { image } => {
+                entry.encode(&mut write);
+                image::decode_into(image, config).map_err(ReplayError::Image)?;
+                engine.configure(config).map_err(ReplayError::Build)?;
+                has_started = true;
+            }
+            _ if !has_started => return Err(ReplayError::NoStart),
+            Entry::Input { at, input } => {
+                entry.encode(&mut write);
+                replayed.inputs = replayed.inputs.saturating_add(1);
+                let outputs = pass(engine, at, input, &mut write);
+                replayed.outputs = replayed.outputs.saturating_add(outputs);
+            }
+            Entry::Output(_) => {}
+            Entry::Totals(_) => Entry::Totals(&totals(engine)).encode(&mut write),
+        }
+    }
+    Ok(replayed)
+}
+
+fn pass<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize>(
+    engine: &mut Engine<PORTS, UPLINKS, FIELDS>,
+    at: Instant,
+    input: Input<'_>,
+    mut write: impl FnMut(&[u8]),
+) -> usize {
+    let mut buf = [0; OUTPUT_BUFFER];
+    let mut outputs = 0_usize;
+    engine.handle(at, input);
+    loop {
+        let output = engine.poll_output(at, &mut buf);
+        Entry::Output(output).encode(&mut write);
+        outputs = outputs.saturating_add(1);
+        if let Output::Sleep { .. } = output {
+            return outputs;
+        }
+    }
+}
