@@ -168,10 +168,17 @@ impl Cell {
             }
             _ => {}
         }
+        if let Some(recorder) = &mut self.recorder {
+            recorder.input(now, input);
+        }
         self.engine.handle(now, input);
         let mut buf = [0; OUTPUT_BUFFER];
         loop {
-            match self.engine.poll_output(now, &mut buf) {
+            let output = self.engine.poll_output(now, &mut buf);
+            if let Some(recorder) = &mut self.recorder {
+                recorder.output(output);
+            }
+            match output {
                 Output::Sleep { until } => {
                     self.engine_wake = until;
                     return;

@@ -174,6 +174,10 @@ impl Cell {
         self.conns.clear();
         // The same configuration made the engine that there was.
         if let Ok(engine) = Engine::new(&self.gateway) {
+            if let Some(recorder) = &mut self.recorder {
+                recorder.totals(&self.engine);
+                recorder.start();
+            }
             *self.engine = engine;
         }
         self.engine_wake = self.now;

@@ -32,6 +32,7 @@ mod faults;
 mod line;
 mod network;
 mod queue;
+mod recording;
 mod rng;
 mod trace;
 mod traffic;
@@ -50,6 +51,7 @@ pub use device::{Device, Responder, Talker};
 pub use faults::TCP_TIMEOUT;
 pub use line::{Chunking, Line, LineCounters, MAX_HEARD, Wiring};
 pub use network::{Network, Way};
+pub use recording::recording_difference;
 pub use rng::Rng;
 pub use trace::{Entry, Trace, What};
 pub use trouble::{Trouble, TroubleKind};
@@ -59,6 +61,7 @@ use crate::controller::{BuildError, ConnId, Controller, ControllerInput};
 use drive::Due;
 use network::{Connection, Gate};
 use queue::Queue;
+use recording::Recorder;
 
 /// One of the cell's RS-485 lines.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -132,6 +135,7 @@ pub struct Cell {
     controller_names: BTreeMap<String, Far>,
     rng: Rng,
     trace: Trace,
+    recorder: Option<Recorder>,
     /// What the controller has sent to [`Cell::ask`]'s own connection.
     asked: Vec<u8>,
 }
@@ -150,6 +154,24 @@ impl Cell {
     /// # Errors
     /// [`CellError`] when one of the two cannot run its configuration.
     pub fn new(gateway: &GatewayConfig, controller: &SimConfig, seed: u64) -> Result<Self, CellError> {
+        Self::build(gateway, controller, seed, None)
+    }
+
+    /// The same, and everything that goes into the engine and comes out of it is recorded from the
+    /// start: [`Self::into_recording`].
+    ///
+    /// # Errors
+    /// As [`Self::new`].
+    pub fn recorded(gateway: &GatewayConfig, controller: &SimConfig, seed: u64) -> Result<Self, CellError> {
+        Self::build(gateway, controller, seed, Some(Recorder::new(gateway)))
+    }
+
+    fn build(
+        gateway: &GatewayConfig,
+        controller: &SimConfig,
+        seed: u64,
+        recorder: Option<Recorder>,
+    ) -> Result<Self, CellError> {
         let engine = Engine::new(gateway).map_err(CellError::Gateway)?;
         let mut cell = Self {
             gateway: gateway.clone(),
@@ -169,6 +191,7 @@ impl Cell {
             controller_names: BTreeMap::new(),
             rng: Rng::new(seed),
             trace: Trace::new(),
+            recorder,
             asked: Vec::new(),
         };
         cell.wire_gateway();
@@ -397,6 +420,14 @@ impl Cell {
     /// Keeps the next `limit` things that happen in full.
     pub fn keep_trace(&mut self, limit: usize) {
         self.trace.keep(limit);
+    }
+
+    /// What [`Self::recorded`] recorded, as `proto_core::record` reads it; empty when nothing was.
+    pub fn into_recording(self) -> Vec<u8> {
+        self.recorder.map_or_else(Vec::new, |mut recorder| {
+            recorder.totals(&self.engine);
+            recorder.into_bytes()
+        })
     }
 
     /// A generator that belongs to the cell's seed.

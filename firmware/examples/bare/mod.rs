@@ -1,0 +1,67 @@
+//! What programs on QEMU's `mps2-an500` need when they need nothing of the board: interrupt vectors, an
+//! end after a panic, arguments and files of the host.
+
+use core::ffi::CStr;
+use core::fmt::Display;
+
+use semihosting::experimental::env;
+use semihosting::fs::File;
+use semihosting::io::Read;
+
+/// Ends the emulation and says why.
+pub(crate) fn fail(what: &str, why: &dyn Display) -> ! {
+    semihosting::eprintln!("{what}: {why}");
+    semihosting::process::exit(1)
+}
+
+/// Does something with the path that is the `nth` semihosting argument.
+pub(crate) fn with_path<T>(nth: usize, then: impl FnOnce(&CStr) -> T) -> T {
+    let Ok(args) = env::args::<1024>() else { fail("arguments", &"too long") };
+    let mut name = [0; 1024];
+    let path = (&args).nth(nth).and_then(Result::ok).unwrap_or("");
+    if path.is_empty() {
+        fail("arguments", &"a path is missing");
+    }
+    if let Some(room) = name.get_mut(..path.len()) {
+        room.copy_from_slice(path.as_bytes());
+    }
+    match CStr::from_bytes_until_nul(&name) {
+        Ok(name) => then(name),
+        Err(_) => fail("arguments", &"no path"),
+    }
+}
+
+/// Reads the file that the `nth` argument names.
+#[allow(dead_code, reason = "not every program reads one")]
+pub(crate) fn read_file(nth: usize, room: &'static mut [u8]) -> &'static [u8] {
+    let Ok(mut file) = with_path(nth, |path| File::open(path)) else { fail("file", &"cannot be opened") };
+    let mut len = 0;
+    loop {
+        let Some(free @ [_, ..]) = room.get_mut(len..) else { fail("file", &"longer than the room for it") };
+        match file.read(free) {
+            Ok(0) => return &room[..len],
+            Ok(count) => len += count,
+            Err(_) => fail("file", &"cannot be read"),
+        }
+    }
+}
+
+#[panic_handler]
+fn panic(info: &core::panic::PanicInfo<'_>) -> ! {
+    semihosting::eprintln!("{info}");
+    semihosting::process::exit(101)
+}
+
+#[cortex_m_rt::exception]
+unsafe fn HardFault(frame: &cortex_m_rt::ExceptionFrame) -> ! {
+    semihosting::eprintln!("hard fault at {:08X}", frame.pc());
+    semihosting::process::exit(102)
+}
+
+fn on_interrupt() {
+    panic!("an interrupt that nobody enabled");
+}
+
+#[unsafe(link_section = ".vector_table.interrupts")]
+#[unsafe(no_mangle)]
+static __INTERRUPTS: [fn(); 32] = [on_interrupt; 32];

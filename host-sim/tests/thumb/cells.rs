@@ -1,0 +1,118 @@
+//! The cells whose engine is recorded, and what happens in them.
+
+use host_sim::cell::{Cell, Chunking, Rng, Talker, Trouble, TroubleKind};
+use proto_core::config::GatewayConfig;
+use proto_core::time::Duration;
+
+use crate::arithmetic;
+use crate::cell_kit::{can, files};
+
+/// A cell, and what makes its recording.
+pub(crate) struct Recorded {
+    pub(crate) name: String,
+    pub(crate) record: fn(&str) -> Vec<u8>,
+}
+
+/// What a device of a cell sends.
+enum Frames {
+    /// So many bytes between head and tail.
+    Stream { head: [u8; 2], payload: usize, tail: [u8; 2] },
+    /// So many bytes with this id.
+    Can { id: u16, payload: usize },
+}
+
+const FF: [u8; 2] = [0xFF, 0xFF];
+const EE: [u8; 2] = [0xEE, 0xEE];
+
+/// The example files with a field port, what its device sends, and how often a second.
+const EXAMPLES: [(&str, Frames, u64); 9] = [
+    ("rs485-user", Frames::Stream { head: FF, payload: 3, tail: EE }, 50),
+    ("rs485-system", Frames::Stream { head: FF, payload: 1, tail: EE }, 100),
+    ("can-user", Frames::Can { id: 1, payload: 3 }, 200),
+    ("can-system", Frames::Can { id: 1, payload: 1 }, 200),
+    ("udp-server", Frames::Stream { head: FF, payload: 1, tail: EE }, 100),
+    // The controller's TCP client connects to the gateway.
+    ("client", Frames::Stream { head: FF, payload: 1, tail: EE }, 100),
+    // With payloads that are any bits: some are no finite floats.
+    ("force-sensor", Frames::Stream { head: [0x48, 0xAA], payload: 24, tail: [0x0D, 0x0A] }, 960),
+    ("can-hand", Frames::Can { id: 0x502, payload: 4 }, 50),
+    ("request-response", Frames::Stream { head: FF, payload: 3, tail: EE }, 20),
+];
+
+/// All of them: in peace, in trouble, and one for its arithmetic.
+pub(crate) fn all() -> Vec<Recorded> {
+    let peaceful = EXAMPLES.iter().map(|example| Recorded { name: example.0.to_owned(), record: in_peace });
+    let troubled = EXAMPLES
+        .iter()
+        .map(|example| Recorded { name: format!("{} in trouble", example.0), record: in_trouble });
+    let arithmetic = Recorded { name: "arithmetic".to_owned(), record: |_| arithmetic::record() };
+    peaceful.chain(troubled).chain([arithmetic]).collect()
+}
+
+fn in_peace(name: &str) -> Vec<u8> {
+    let mut cell = talking(name, Chunking::Random(40));
+    cell.run(Duration::from_millis(1_500));
+    // The devices fall silent: their timeouts and safe values.
+    silence(&mut cell);
+    cell.run(Duration::from_millis(700));
+    cell.into_recording()
+}
+
+fn in_trouble(name: &str) -> Vec<u8> {
+    let mut cell = talking(name.trim_end_matches(" in trouble"), Chunking::Random(9));
+    cell.every_network(|network| {
+        network.jitter = Duration::from_millis(1);
+        network.longest_segment = Some(100);
+    });
+    let mut trouble = Trouble::new(&mut cell, &TroubleKind::ALL, Duration::from_millis(60));
+    trouble.run(&mut cell, Duration::from_secs(4));
+    trouble.mend(&mut cell);
+    cell.run(Duration::from_millis(500));
+    assert!(trouble.counts().len() > 8, "{name}: {:?}", trouble.counts());
+    cell.into_recording()
+}
+
+/// The cell of these files, with devices that send.
+fn talking(name: &str, chunking: Chunking) -> Cell {
+    let (gateway, controller) = files(name);
+    let mut cell = recorded(&gateway, &controller);
+    let Some((_, frames, rate)) = EXAMPLES.iter().find(|example| example.0 == name) else {
+        panic!("no example {name}");
+    };
+    let mut rng = Rng::new(rate * 7);
+    let start = cell.now() + Duration::from_millis(20);
+    match *frames {
+        Frames::Stream { head, payload, tail } => {
+            let line = cell.lines().next().expect("a line");
+            cell.line(line).chunking = chunking;
+            let frame = move |_| [&head[..], &rng.bytes(payload), &tail].concat();
+            cell.attach(line, Talker::new(start, *rate, u64::MAX, frame));
+        }
+        Frames::Can { id, payload } => {
+            let bus = cell.buses().next().expect("a bus");
+            // Now and then another id, or another length.
+            let frame = move |nth| match nth % 16 {
+                14 => can(id + 1, &rng.bytes(payload)),
+                15 => can(id, &rng.bytes(payload + 1)),
+                _ => can(id, &rng.bytes(payload)),
+            };
+            cell.attach_can(bus, Talker::new(start, *rate, u64::MAX, frame));
+        }
+    }
+    cell
+}
+
+fn silence(cell: &mut Cell) {
+    let start = cell.now();
+    for line in cell.lines().collect::<Vec<_>>() {
+        cell.attach(line, Talker::new(start, 1, 0, |_| Vec::new()));
+    }
+    for bus in cell.buses().collect::<Vec<_>>() {
+        cell.attach_can(bus, Talker::new(start, 1, 0, |_| can(0, &[])));
+    }
+}
+
+/// A cell that is recorded, switched on just now.
+pub(crate) fn recorded(gateway: &GatewayConfig, controller: &host_sim::config::SimConfig) -> Cell {
+    Cell::recorded(gateway, controller, 42).unwrap_or_else(|error| panic!("{error}"))
+}
