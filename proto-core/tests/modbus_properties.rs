@@ -6,145 +6,13 @@ use proptest::prelude::*;
 use proto_core::modbus::adu::MAX_ADU;
 use proto_core::modbus::client::{Client, ClientEvent};
 use proto_core::modbus::pdu::{EncodeError, Request, RequestHead, Response};
-use proto_core::modbus::server::{RegisterBank, Server};
-use proto_core::modbus::{Coils, Exception, Registers};
+use proto_core::modbus::server::Server;
+use proto_core::modbus::{Coils, Registers};
 
-/// 300 coils and 200 registers, all writable: what the reference and the server work on.
-#[derive(Debug, Clone, PartialEq)]
-struct Bank {
-    coils: Vec<bool>,
-    words: Vec<u16>,
-}
+#[path = "reference/modbus.rs"]
+mod reference;
 
-impl Bank {
-    fn new() -> Self {
-        Self { coils: (0..300).map(|n| n % 7 < 3).collect(), words: (0..200).map(|n| n * 0x0123).collect() }
-    }
-}
-
-fn run<T>(items: &[T], first: u16, count: usize) -> Result<&[T], Exception> {
-    items.get(usize::from(first)..usize::from(first) + count).ok_or(Exception::IllegalDataAddress)
-}
-
-fn run_mut<T>(items: &mut [T], first: u16, count: usize) -> Result<&mut [T], Exception> {
-    items.get_mut(usize::from(first)..usize::from(first) + count).ok_or(Exception::IllegalDataAddress)
-}
-
-impl RegisterBank for Bank {
-    fn read_coils(&self, address: u16, count: u16, packed: &mut [u8]) -> Result<(), Exception> {
-        let coils = run(&self.coils, address, usize::from(count))?;
-        Coils::pack(coils.iter().copied(), packed).map(|_| ()).ok_or(Exception::DeviceFailure)
-    }
-
-    fn write_coils(&mut self, address: u16, coils: Coils<'_>) -> Result<(), Exception> {
-        let target = run_mut(&mut self.coils, address, usize::from(coils.count()))?;
-        target.iter_mut().zip(coils.iter()).for_each(|(coil, on)| *coil = on);
-        Ok(())
-    }
-
-    fn read_holding(&self, address: u16, words: &mut [[u8; 2]]) -> Result<(), Exception> {
-        let source = run(&self.words, address, words.len())?;
-        words.iter_mut().zip(source).for_each(|(word, value)| *word = value.to_be_bytes());
-        Ok(())
-    }
-
-    fn write_holding(&mut self, address: u16, registers: Registers<'_>) -> Result<(), Exception> {
-        let target = run_mut(&mut self.words, address, usize::from(registers.count()))?;
-        target.iter_mut().zip(registers.iter()).for_each(|(word, value)| *word = value);
-        Ok(())
-    }
-}
-
-/// What a server answers to a whole connection's bytes, written down rule by rule: the answers, and
-/// whether the connection is closed at the end.
-fn reference_server(bank: &mut Bank, stream: &[u8]) -> (Vec<u8>, bool) {
-    let (mut sent, mut at) = (Vec::new(), 0);
-    loop {
-        let rest = &stream[at..];
-        if rest.len() < 6 {
-            return (sent, false);
-        }
-        let length = usize::from(rest[4]) * 256 + usize::from(rest[5]);
-        if rest[2] != 0 || rest[3] != 0 || !(2..=254).contains(&length) {
-            return (sent, true);
-        }
-        if rest.len() < 6 + length {
-            return (sent, false);
-        }
-        let pdu = &rest[7..6 + length];
-        let answer = match reference_answer(bank, pdu) {
-            Ok(answer) => answer,
-            Err(code) => vec![pdu[0] | 0x80, code],
-        };
-        sent.extend([rest[0], rest[1], 0, 0, 0, answer.len() as u8 + 1, rest[6]]);
-        sent.extend(answer);
-        at += 6 + length;
-    }
-}
-
-fn reference_answer(bank: &mut Bank, pdu: &[u8]) -> Result<Vec<u8>, u8> {
-    let function = pdu[0];
-    if ![1, 3, 5, 6, 15, 16].contains(&function) {
-        return Err(1);
-    }
-    if pdu.len() < 5 {
-        return Err(3);
-    }
-    let word = |at: usize| usize::from(pdu[at]) * 256 + usize::from(pdu[at + 1]);
-    let (first, count) = (word(1), word(3));
-    let limit = match function {
-        1 => 2000,
-        3 => 125,
-        15 => 1968,
-        16 => 123,
-        _ => usize::MAX,
-    };
-    let data = if function == 15 { count.div_ceil(8) } else { 2 * count };
-    if function == 5 && ![0, 0xFF00].contains(&count) {
-        return Err(3);
-    }
-    if ![5, 6].contains(&function) && (count == 0 || count > limit) {
-        return Err(3);
-    }
-    let expected_len = if function > 6 { 6 + data } else { 5 };
-    if pdu.len() != expected_len || function > 6 && usize::from(pdu[5]) != data {
-        return Err(3);
-    }
-    let touched = if [5, 6].contains(&function) { 1 } else { count };
-    let space = if [1, 5, 15].contains(&function) { bank.coils.len() } else { bank.words.len() };
-    if first + touched > space {
-        return Err(2);
-    }
-    match function {
-        1 => {
-            let mut bytes = vec![0; count.div_ceil(8)];
-            for nth in 0..count {
-                if bank.coils[first + nth] {
-                    bytes[nth / 8] |= 1 << (nth % 8);
-                }
-            }
-            return Ok([vec![1, bytes.len() as u8], bytes].concat());
-        }
-        3 => {
-            let words = bank.words[first..first + count].iter();
-            let bytes: Vec<u8> = words.flat_map(|word| [(word >> 8) as u8, *word as u8]).collect();
-            return Ok([vec![3, bytes.len() as u8], bytes].concat());
-        }
-        5 => bank.coils[first] = count != 0,
-        6 => bank.words[first] = count as u16,
-        15 => {
-            for nth in 0..count {
-                bank.coils[first + nth] = pdu[6 + nth / 8] >> (nth % 8) & 1 == 1;
-            }
-        }
-        _ => {
-            for nth in 0..count {
-                bank.words[first + nth] = word(6 + 2 * nth) as u16;
-            }
-        }
-    }
-    Ok(pdu[..5].to_vec())
-}
+use reference::Bank;
 
 /// Hands `stream` to a server in pieces that end where `cuts` say.
 fn serve(bank: &mut Bank, stream: &[u8], cuts: &[usize]) -> (Vec<u8>, bool) {
@@ -256,7 +124,7 @@ proptest! {
             stream[at] = byte;
         }
         let (mut bank, mut expected) = (Bank::new(), Bank::new());
-        let expected_sent = reference_server(&mut expected, &stream);
+        let expected_sent = reference::server(&mut expected, &stream);
         prop_assert_eq!(serve(&mut bank, &stream, &cuts), expected_sent);
         prop_assert_eq!(bank, expected);
     }
@@ -271,7 +139,7 @@ proptest! {
     ) {
         let stream = [vec![1, 2, 0, 0, 0, pdu.len() as u8 + 1, 3], pdu].concat();
         let (mut bank, mut expected) = (Bank::new(), Bank::new());
-        let expected_sent = reference_server(&mut expected, &stream);
+        let expected_sent = reference::server(&mut expected, &stream);
         prop_assert_eq!(serve(&mut bank, &stream, &[]), expected_sent);
         prop_assert_eq!(bank, expected);
     }
@@ -279,7 +147,7 @@ proptest! {
     #[test]
     fn garbage_never_panics(stream in vec(any::<u8>(), 0..600), cuts in vec(any::<usize>(), 0..8)) {
         let (mut bank, mut expected) = (Bank::new(), Bank::new());
-        let expected_sent = reference_server(&mut expected, &stream);
+        let expected_sent = reference::server(&mut expected, &stream);
         prop_assert_eq!(serve(&mut bank, &stream, &cuts), expected_sent);
         let mut client = Client::new(1);
         client.start(Request::ReadCoils { address: 0, count: 9 }, &mut [0; 260]).unwrap();
@@ -324,7 +192,7 @@ proptest! {
                     sent.extend_from_slice(&answer[..answered.unwrap()]);
                 }
             }
-            let answer = reference_answer(&mut expected, &out[7..len]);
+            let answer = reference::answer(&mut expected, &out[7..len]);
             let mut events = 0;
             for mut piece in sent.chunks(down) {
                 while let Some(event) = client.receive(&mut piece) {

@@ -31,6 +31,8 @@ impl Target {
     /// As the target does. The input is then in a file that the panic names.
     pub fn check(&self, corpus: &Path) {
         if let Some(file) = std::env::var_os("FUZZ_FILE") {
+            // Cargo runs tests in their package's folder; the file is named from the workspace's.
+            let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").join(file);
             return (self.run)(&std::fs::read(file).expect("FUZZ_FILE can be read"));
         }
         let mut known = (self.seeds)();

@@ -10,12 +10,15 @@ pub mod source;
 
 mod can;
 mod deframer;
+mod modbus;
 mod recipes;
 mod slcan;
 mod state;
 
 #[path = "../../tests/reference/mod.rs"]
 mod reference;
+#[path = "../../tests/reference/modbus.rs"]
+mod reference_modbus;
 
 use harness::Target;
 
@@ -25,6 +28,20 @@ pub const TARGETS: &[Target] = &[
     Target { name: "can", run: can::run, seeds: can::seeds, runs: 4_000, longest: 600 },
     Target { name: "state", run: state::run, seeds: state::seeds, runs: 400, longest: 6_000 },
     Target { name: "slcan", run: slcan::run, seeds: slcan::seeds, runs: 4_000, longest: 1_000 },
+    Target {
+        name: "modbus_server",
+        run: modbus::run_server,
+        seeds: modbus::server_seeds,
+        runs: 4_000,
+        longest: 2_000,
+    },
+    Target {
+        name: "modbus_client",
+        run: modbus::run_client,
+        seeds: modbus::client_seeds,
+        runs: 4_000,
+        longest: 1_000,
+    },
 ];
 
 /// The target of this name.

@@ -21,4 +21,4 @@ macro_rules! targets {
     };
 }
 
-targets! { deframer can state slcan }
+targets! { deframer can state slcan modbus_server modbus_client }
