@@ -1,5 +1,7 @@
 //! A CAN port's task, and what it asks of a board's CAN controller.
 
+use core::pin::pin;
+
 use embassy_futures::select::{Either, select};
 use embassy_time::{Duration, Timer};
 use embedded_can::Frame;
@@ -9,6 +11,7 @@ use proto_core::recipe::model::{CanId, MAX_CAN_DATA};
 
 use crate::gateway::Gateway;
 use crate::warn;
+use crate::watchdog::Pulse;
 
 /// A CAN controller. Its driver buffers what arrives while nobody receives.
 #[allow(async_fn_in_trait, reason = "all tasks run on one executor: no future is sent anywhere")]
@@ -50,13 +53,13 @@ pub enum CanEvent<F> {
 pub struct BusOff;
 
 /// Drives the port for ever.
-pub async fn run(gateway: &Gateway, port: PortId, mut can: impl CanPort) -> ! {
+pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, mut can: impl CanPort) -> ! {
     let Some(control) = gateway.port(port) else { core::future::pending().await };
     gateway.input(Input::PortUp { port });
     let mut backoff = BACKOFF_MIN;
     loop {
         let mut is_off = false;
-        match select(can.receive(), control.frame_waits()).await {
+        match pulse.idle(pin!(select(can.receive(), control.frame_waits()))).await {
             Either::First(CanEvent::Frame(frame)) => {
                 if let Some(frame) = own_frame(&frame) {
                     gateway.input(Input::PortCan { port, frame });
@@ -73,7 +76,8 @@ pub async fn run(gateway: &Gateway, port: PortId, mut can: impl CanPort) -> ! {
         let mut sent = false;
         while !is_off && let Some(frame) = control.next_frame() {
             sent = true;
-            is_off = can.send(&frame).await == Err(BusOff);
+            // On a bus with nobody else a frame is never acknowledged and never leaves.
+            is_off = pulse.idle(pin!(can.send(&frame))).await == Err(BusOff);
             if is_off {
                 gateway.input(Input::PortBus { port, state: BusState::BusOff });
             }
@@ -84,7 +88,7 @@ pub async fn run(gateway: &Gateway, port: PortId, mut can: impl CanPort) -> ! {
         if is_off {
             control.clear();
             warn!("port {}: bus-off; onto the bus again in {} ms", port.0, backoff.as_millis());
-            Timer::after(backoff).await;
+            pulse.idle(pin!(Timer::after(backoff))).await;
             backoff = (backoff * 2).min(BACKOFF_MAX);
             can.recover().await;
             gateway.input(Input::PortBus { port, state: BusState::Active });

@@ -6,6 +6,7 @@
 //! twice. What is handed over lies in one outbox for each port and link; a task takes it from there.
 
 use core::cell::{Cell, RefCell};
+use core::pin::pin;
 
 use embassy_futures::select::{Either, select};
 use embassy_time::Timer;
@@ -13,13 +14,16 @@ use heapless::{Deque, Vec};
 use proto_core::config::GatewayConfig;
 use proto_core::engine::{
     BuildError, Engine as AnyEngine, Input, LinkId, LinkInfo, LinkKind, OUTPUT_BUFFER, Output, PortCounters,
-    PortId,
+    PortId, PortState,
 };
+use proto_core::link::LinkState;
 use proto_core::recipe::can::CanFrame;
 use proto_core::recipe::model::MAX_CAN_IDS;
 use proto_core::time::Instant;
 
+use crate::led::Condition;
 use crate::notify::Notify;
+use crate::watchdog::Pulse;
 
 /// Field ports a board can have.
 pub const MAX_FIELD_PORTS: usize = 4;
@@ -87,6 +91,20 @@ impl Gateway {
         }
     }
 
+    /// What the status LED shows.
+    pub fn condition(&self) -> Condition {
+        let engine = self.engine.borrow();
+        let is_up = |link: LinkInfo<'_>| matches!(link.state, LinkState::Up { .. });
+        let works = |id| engine.port_state(id) == Some(PortState::Working);
+        if !engine.links().all(is_up) {
+            Condition::NoController
+        } else if !engine.field_ports().all(works) {
+            Condition::PortSilent
+        } else {
+            Condition::Running
+        }
+    }
+
     /// One input, and everything that follows from it.
     pub fn input(&self, input: Input<'_>) {
         let at = now();
@@ -131,11 +149,11 @@ impl Gateway {
     }
 
     /// Calls the engine whenever it asked to be called. The engine's own task.
-    pub async fn keep_time(&self) -> ! {
+    pub async fn keep_time(&self, pulse: &Pulse) -> ! {
         self.input(Input::Tick);
         loop {
             let until = embassy_time::Instant::from_micros(self.deadline.get().as_micros());
-            match select(Timer::at(until), self.deadline_moved.notified()).await {
+            match pulse.idle(pin!(select(Timer::at(until), self.deadline_moved.notified()))).await {
                 Either::First(()) => self.input(Input::Tick),
                 Either::Second(()) => {}
             }

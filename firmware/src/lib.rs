@@ -11,10 +11,13 @@ pub mod can;
 pub mod fmt;
 pub mod gateway;
 pub mod lan9118;
+pub mod led;
 pub mod link;
 mod notify;
 pub mod serial;
 pub mod slcan;
+pub mod status;
+pub mod watchdog;
 
 #[cfg(test)]
 extern crate std;

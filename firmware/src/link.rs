@@ -6,6 +6,7 @@
 
 use core::cell::Cell;
 use core::net::{Ipv4Addr, SocketAddr};
+use core::pin::pin;
 
 use embassy_futures::select::{Either, select};
 use embassy_net::dns::DnsQueryType;
@@ -18,6 +19,7 @@ use proto_core::config::{Bus, GatewayConfig};
 use proto_core::engine::{Input, LinkId, LinkKind};
 
 use crate::gateway::{Gateway, LinkControl};
+use crate::watchdog::Pulse;
 
 /// What a link connects to.
 #[derive(Debug, Clone)]
@@ -97,15 +99,16 @@ impl<const RX: usize, const TX: usize> Default for Buffers<RX, TX> {
 /// Drives the link for ever.
 pub async fn run<const RX: usize, const TX: usize>(
     gateway: &Gateway,
+    pulse: &Pulse,
     link: LinkId,
     stack: Stack<'_>,
     endpoint: &Endpoint,
     buffers: &mut Buffers<RX, TX>,
 ) -> ! {
     let Some(control) = gateway.link(link) else { core::future::pending().await };
-    let driver = Driver { gateway, link, control, stack };
+    let driver = Driver { gateway, pulse, link, control, stack };
     loop {
-        let turn = control.opened().await;
+        let turn = pulse.idle(pin!(control.opened())).await;
         match endpoint {
             Endpoint::Tcp { host, port } => driver.tcp(turn, Some((host, *port)), 0, buffers).await,
             Endpoint::TcpListen { port } => driver.tcp(turn, None, *port, buffers).await,
@@ -122,6 +125,7 @@ pub async fn run<const RX: usize, const TX: usize>(
 
 struct Driver<'a> {
     gateway: &'a Gateway,
+    pulse: &'a Pulse,
     link: LinkId,
     control: &'a LinkControl,
     stack: Stack<'a>,
@@ -155,10 +159,12 @@ impl Driver<'_> {
                 None => socket.accept(listen).await.is_ok(),
             }
         };
-        if let Either::First(true) = select(opening, self.control.over(turn)).await {
+        let opened = self.pulse.idle(pin!(select(opening, self.control.over(turn)))).await;
+        if let Either::First(true) = opened {
             self.up();
             let (reader, writer) = socket.split();
-            select(self.read(turn, reader, &mut buffers.chunk), self.write(turn, writer)).await;
+            let (reading, writing) = (self.read(turn, reader, &mut buffers.chunk), self.write(turn, writer));
+            self.pulse.idle(pin!(select(reading, writing))).await;
             socket.close();
             let _ = with_timeout(FAREWELL, socket.flush()).await;
         }
@@ -207,10 +213,13 @@ impl Driver<'_> {
             return;
         }
         let fixed = match to {
-            Some((host, port)) => match select(resolve(self.stack, host), self.control.over(turn)).await {
-                Either::First(Some(address)) => Some(IpEndpoint::new(address, port)),
-                _ => return,
-            },
+            Some((host, port)) => {
+                let resolving = select(resolve(self.stack, host), self.control.over(turn));
+                match self.pulse.idle(pin!(resolving)).await {
+                    Either::First(Some(address)) => Some(IpEndpoint::new(address, port)),
+                    _ => return,
+                }
+            }
             None => None,
         };
         let peer = Cell::new(fixed);
@@ -245,7 +254,7 @@ impl Driver<'_> {
                 }
             }
         };
-        select(reading, writing).await;
+        self.pulse.idle(pin!(select(reading, writing))).await;
     }
 }
 

@@ -4,6 +4,8 @@
 //! Its device buffers what arrives while the task is elsewhere, and its `read` loses nothing when it is
 //! dropped before it is done.
 
+use core::pin::pin;
+
 use embassy_futures::select::{Either, select};
 use embassy_time::{Duration, Timer, with_timeout};
 use embedded_io_async::{Read, Write};
@@ -12,6 +14,7 @@ use proto_core::engine::{Input, PortId};
 use crate::fmt::Text;
 use crate::gateway::Gateway;
 use crate::warn;
+use crate::watchdog::Pulse;
 
 /// A half-duplex line (D20).
 pub trait Line: Read + Write {
@@ -31,14 +34,15 @@ pub enum LineDirection {
 }
 
 /// Drives the port for ever.
-pub async fn run(gateway: &Gateway, port: PortId, mut line: impl Line, baud: u32) -> ! {
+pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, mut line: impl Line, baud: u32) -> ! {
     let Some(control) = gateway.port(port) else { core::future::pending().await };
     let mut chunk = [0; 256];
     let mut is_failing = false;
     loop {
         gateway.input(Input::PortUp { port });
         let failed = loop {
-            let frame = match select(line.read(&mut chunk), control.next_bytes()).await {
+            let next = pulse.idle(pin!(select(line.read(&mut chunk), control.next_bytes()))).await;
+            let frame = match next {
                 Either::First(Ok(len)) => {
                     if let Some(bytes) = chunk.get(..len) {
                         gateway.input(Input::PortBytes { port, bytes });
@@ -57,7 +61,8 @@ pub async fn run(gateway: &Gateway, port: PortId, mut line: impl Line, baud: u32
                 line.write_all(&frame).await?;
                 line.flush().await
             });
-            let sent = sent.await;
+            // A long frame on a slow line takes seconds.
+            let sent = pulse.idle(pin!(sent)).await;
             line.drive(LineDirection::Receive);
             match sent {
                 Ok(Ok(())) => {

@@ -3,28 +3,61 @@
 //! Each `#[task]` here is a shim around the library's function of the same name, because a task cannot
 //! be generic.
 
-use embassy_executor::Spawner;
+use core::pin::pin;
+
+use embassy_executor::{SpawnError, SpawnToken, Spawner};
 use embassy_net::{Config, Runner, Stack, StackResources};
 use embassy_time::{Duration, Timer};
 use firmware::fmt::Text;
 use firmware::gateway::Gateway;
+use firmware::led::Condition;
 use firmware::link::{Buffers, Endpoint};
-use firmware::{can, error, info, link, serial, warn};
+use firmware::watchdog::{Pulse, TaskName};
+use firmware::{can, error, info, led, link, serial, warn, watchdog};
 use proto_core::config::{Bus, GatewayConfig, image};
-use proto_core::engine::{LinkId, LinkKind, PortCounters, PortId};
-use proto_core::link::LinkState;
+use proto_core::engine::{LinkId, LinkKind, PortId};
 use static_cell::{ConstStaticCell, StaticCell};
 
 use crate::board::{self, Board, CanDevice, Ethernet, SerialDevice};
 
-/// Starts what the configuration asks for. Without a configuration that can run, the buses stay silent
-/// and the log says why.
-pub(crate) fn start(spawner: Spawner, mut board: Board) {
+/// Starts what the configuration asks for, and gives back what a board may start tasks of its own with.
+/// Without a configuration that can run, the buses stay silent and the log says why.
+pub(crate) fn start(spawner: Spawner, mut board: Board) -> Tasks {
     info!("recipe gateway {}", env!("CARGO_PKG_VERSION"));
-    let started =
-        load(&mut board, idle_gateway()).and_then(|(gateway, plan)| run(spawner, board, gateway, plan));
+    let mut led = board.led();
+    led.set(true);
+    static WATCH: StaticCell<Watch> = StaticCell::new();
+    let tasks = Tasks { spawner, watch: WATCH.init_with(Watch::new) };
+    // The first: what hangs behind it ends in a reset.
+    spawner.spawn(feeder(tasks.watch, board.watchdog()).expect("the first of its kind"));
+    let loaded = load(&mut board, idle_gateway());
+    let gateway = loaded.as_ref().ok().map(|(gateway, _)| *gateway);
+    let started = loaded.and_then(|(gateway, wiring)| run(&tasks, board, gateway, wiring));
+    tasks.spawn(TaskName::Led, |pulse| status_led(pulse, gateway.filter(|_| started.is_ok()), led));
     if let Err(reason) = started {
-        spawner.spawn(idle(reason).expect("the first of its kind"));
+        tasks.spawn(TaskName::Refused, |pulse| refused(pulse, reason));
+    }
+    tasks
+}
+
+/// Starts tasks. Nothing else does, so there is none that the watchdog does not know.
+#[derive(Clone, Copy)]
+pub(crate) struct Tasks {
+    spawner: Spawner,
+    watch: &'static Watch,
+}
+
+type Watch = watchdog::Watch<MAX_TASKS>;
+
+impl Tasks {
+    /// Starts a task, which gets its pulse.
+    pub(crate) fn spawn<S>(
+        &self,
+        name: TaskName,
+        task: impl FnOnce(&'static Pulse) -> Result<SpawnToken<S>, SpawnError>,
+    ) {
+        let pulse = self.watch.register(name).expect("MAX_TASKS counts all");
+        self.spawner.spawn(task(pulse).expect("its pool has as many as there are"));
     }
 }
 
@@ -88,7 +121,7 @@ fn load(board: &mut Board, gateway: &'static mut Gateway) -> Result<(&'static Ga
     Ok((gateway, wiring))
 }
 
-fn run(spawner: Spawner, mut board: Board, gateway: &'static Gateway, wiring: Wiring) -> Result<(), Refused> {
+fn run(tasks: &Tasks, mut board: Board, gateway: &'static Gateway, wiring: Wiring) -> Result<(), Refused> {
     // All devices are claimed before anything moves.
     let mut serial_ports: heapless::Vec<_, { board::SERIAL_PORTS }> = heapless::Vec::new();
     let mut can_ports: heapless::Vec<_, { board::CAN_PORTS }> = heapless::Vec::new();
@@ -107,14 +140,14 @@ fn run(spawner: Spawner, mut board: Board, gateway: &'static Gateway, wiring: Wi
             Bus::TcpListen { .. } | Bus::UdpListen { .. } => {}
         }
     }
-    spawner.spawn(engine(gateway).expect("the first of its kind"));
+    tasks.spawn(TaskName::Engine, |pulse| engine(pulse, gateway));
     for (id, line, baud) in serial_ports {
-        spawner.spawn(serial_port(gateway, id, line, baud).expect("as many as the board has"));
+        tasks.spawn(TaskName::Serial(id), |pulse| serial_port(pulse, gateway, id, line, baud));
     }
     for (id, can) in can_ports {
-        spawner.spawn(can_port(gateway, id, can).expect("as many as the board has"));
+        tasks.spawn(TaskName::Can(id), |pulse| can_port(pulse, gateway, id, can));
     }
-    spawner.spawn(status(gateway).expect("the first of its kind"));
+    tasks.spawn(TaskName::Status, |pulse| status(pulse, gateway));
     // The network is last: a missing PHY does not keep the field buses from running.
     let ethernet = board.ethernet().map_err(Refused::Ethernet)?;
     static RESOURCES: StaticCell<StackResources<SOCKETS>> = StaticCell::new();
@@ -122,117 +155,103 @@ fn run(spawner: Spawner, mut board: Board, gateway: &'static Gateway, wiring: Wi
     let (stack, runner) =
         embassy_net::new(ethernet, Config::dhcpv4(Default::default()), resources, board::seed());
     info!("stack: {} bytes while the engine was made", board::stack_used());
-    spawner.spawn(network(runner).expect("the first of its kind"));
-    spawner.spawn(address(stack).expect("the first of its kind"));
+    tasks.spawn(TaskName::Network, |pulse| network(pulse, runner));
+    tasks.spawn(TaskName::Address, |pulse| address(pulse, stack));
     static BUFFERS: [ConstStaticCell<Buffers<RX, TX>>; MAX_LINKS] =
         [const { ConstStaticCell::new(Buffers::new()) }; MAX_LINKS];
-    for ((id, _, endpoint), buffers) in wiring.links.into_iter().zip(&BUFFERS) {
+    for ((id, kind, endpoint), buffers) in wiring.links.into_iter().zip(&BUFFERS) {
         let buffers = buffers.take();
-        spawner.spawn(controller_link(gateway, id, stack, endpoint, buffers).expect("one for each link"));
+        tasks.spawn(TaskName::Link(kind), |pulse| {
+            controller_link(pulse, gateway, id, stack, endpoint, buffers)
+        });
     }
     Ok(())
 }
 
+/// Not watched: it is the one that feeds.
 #[embassy_executor::task]
-async fn engine(gateway: &'static Gateway) -> ! {
-    gateway.keep_time().await
+async fn feeder(watch: &'static Watch, mut dog: board::Watchdog) -> ! {
+    watchdog::run(watch, board::WATCHDOG_PERIOD, || dog.feed()).await
+}
+
+#[embassy_executor::task]
+async fn engine(pulse: &'static Pulse, gateway: &'static Gateway) -> ! {
+    pulse.run(pin!(gateway.keep_time(pulse))).await
 }
 
 #[embassy_executor::task(pool_size = board::SERIAL_PORTS)]
-async fn serial_port(gateway: &'static Gateway, id: PortId, line: SerialDevice, baud: u32) -> ! {
-    serial::run(gateway, id, line, baud).await
+async fn serial_port(
+    pulse: &'static Pulse,
+    gateway: &'static Gateway,
+    id: PortId,
+    line: SerialDevice,
+    baud: u32,
+) -> ! {
+    pulse.run(pin!(serial::run(gateway, pulse, id, line, baud))).await
 }
 
 #[embassy_executor::task(pool_size = board::CAN_PORTS)]
-async fn can_port(gateway: &'static Gateway, id: PortId, device: CanDevice) -> ! {
-    can::run(gateway, id, device).await
+async fn can_port(pulse: &'static Pulse, gateway: &'static Gateway, id: PortId, device: CanDevice) -> ! {
+    pulse.run(pin!(can::run(gateway, pulse, id, device))).await
 }
 
 #[embassy_executor::task(pool_size = MAX_LINKS)]
 async fn controller_link(
+    pulse: &'static Pulse,
     gateway: &'static Gateway,
     id: LinkId,
     stack: Stack<'static>,
     endpoint: Endpoint,
     buffers: &'static mut Buffers<RX, TX>,
 ) -> ! {
-    link::run(gateway, id, stack, &endpoint, buffers).await
+    pulse.run(pin!(link::run(gateway, pulse, id, stack, &endpoint, buffers))).await
 }
 
 #[embassy_executor::task]
-async fn network(mut runner: Runner<'static, Ethernet>) -> ! {
-    runner.run().await
+async fn network(pulse: &'static Pulse, mut runner: Runner<'static, Ethernet>) -> ! {
+    // Its driver's waits are inside: that it is polled and comes back is all that can be seen.
+    let mut running = pin!(runner.run());
+    pulse.run(pin!(pulse.idle(running.as_mut()))).await
+}
+
+#[embassy_executor::task]
+async fn status_led(pulse: &'static Pulse, gateway: Option<&'static Gateway>, mut led: board::Led) -> ! {
+    let condition = || gateway.map_or(Condition::Refused, Gateway::condition);
+    pulse.run(pin!(led::run(pulse, condition, |is_lit| led.set(is_lit)))).await
 }
 
 /// Tells the board's address whenever it changes.
 #[embassy_executor::task]
-async fn address(stack: Stack<'static>) -> ! {
-    loop {
-        stack.wait_config_up().await;
-        if let Some(config) = stack.config_v4() {
-            info!("address {}", Text(&config.address));
+async fn address(pulse: &'static Pulse, stack: Stack<'static>) -> ! {
+    let telling = async {
+        loop {
+            pulse.idle(pin!(stack.wait_config_up())).await;
+            if let Some(config) = stack.config_v4() {
+                info!("address {}", Text(&config.address));
+            }
+            pulse.idle(pin!(stack.wait_config_down())).await;
+            warn!("no address");
         }
-        stack.wait_config_down().await;
-        warn!("no address");
-    }
+    };
+    pulse.run(pin!(telling)).await
 }
 
-/// Says what came of every link, and what went through every port, when it is another than before.
 #[embassy_executor::task]
-async fn status(gateway: &'static Gateway) -> ! {
-    let mut links = [(0, false); MAX_LINKS];
-    let mut ports = [PortCounters::default(); firmware::gateway::MAX_FIELD_PORTS];
-    loop {
-        for _ in 0..4 {
-            let mut known = links.iter_mut();
-            gateway.report(
-                |link| {
-                    let Some((connects, was_up)) = known.next() else { return };
-                    let is_up = matches!(link.state, LinkState::Up { .. });
-                    let name = link.kind.name();
-                    if *connects != link.history.connects {
-                        *connects = link.history.connects;
-                        info!("link {}: up ({})", name, connects);
-                    } else if *was_up && !is_up {
-                        warn!("link {}: lost", name);
-                    }
-                    *was_up = is_up;
-                },
-                |_, _| {},
-            );
-            Timer::after(Duration::from_millis(250)).await;
-        }
-        let mut known = ports.iter_mut();
-        gateway.report(
-            |_| {},
-            |port, now| {
-                if let Some(before) = known.next()
-                    && before != now
-                {
-                    *before = *now;
-                    info!(
-                        "port {}: in {} frames, {} bytes; out {} frames, {} bytes; {} bytes skipped, {} cycles",
-                        port.0,
-                        now.frames_in,
-                        now.bytes_in,
-                        now.frames_out,
-                        now.bytes_out,
-                        now.resync_bytes,
-                        now.skipped_cycles,
-                    );
-                }
-            },
-        );
-    }
+async fn status(pulse: &'static Pulse, gateway: &'static Gateway) -> ! {
+    pulse.run(pin!(firmware::status::run(gateway, pulse))).await
 }
 
-/// The buses stay silent.
+/// Says again and again why nothing runs: whoever looks later wants to know as well.
 #[embassy_executor::task]
-async fn idle(reason: Refused) -> ! {
-    loop {
-        error!("nothing runs: {}", Text(&reason));
-        Timer::after(Duration::from_secs(10)).await;
-    }
+async fn refused(pulse: &'static Pulse, reason: Refused) -> ! {
+    let what = if matches!(reason, Refused::Ethernet(_)) { "no controller" } else { "nothing runs" };
+    let telling = async {
+        loop {
+            error!("{}: {}", what, Text(&reason));
+            pulse.idle(pin!(Timer::after(REPEAT))).await;
+        }
+    };
+    pulse.run(pin!(telling)).await
 }
 
 /// Command, state, Modbus and the recipe links.
@@ -243,3 +262,7 @@ const SOCKETS: usize = MAX_LINKS + 2;
 const RX: usize = 1536;
 /// The longest frame or request, and another.
 const TX: usize = 1024;
+/// After this long the reason is told again.
+const REPEAT: Duration = Duration::from_secs(10);
+/// A task for each port and link, and: engine, network, address, status, LED, refused, the board's own.
+const MAX_TASKS: usize = board::SERIAL_PORTS + board::CAN_PORTS + MAX_LINKS + 7;

@@ -131,6 +131,31 @@ fn an_image_is_what_a_board_takes() {
 }
 
 #[test]
+fn an_image_that_no_board_takes_is_not_written() {
+    let folder = tempfile::tempdir().unwrap();
+    let (file, image) = (folder.path().join("cell.toml"), folder.path().join("cell.img"));
+    let mut text = String::from("[controller]\naddress = \"192.168.12.138\"\n");
+    for recipe in 0..16 {
+        text += &format!(
+            "[[recipe]]\nname = \"a-recipe-whose-name-is-long-{recipe}\"\nkind = \"can\"\nmode = \"user\"\n"
+        );
+        for (part, value) in [("input", ""), ("output", ", from = \"RobotState[8]\", scale = 0.5")] {
+            for id in 0x1000_0000..0x1000_0020 {
+                text += &format!("[[recipe.{part}.frame]]\nextended = true\nid = {id}\n");
+                text += &format!("fields = [{{ name = \"value\", type = \"byte\"{value} }}]\n");
+            }
+        }
+    }
+    text += "[[port]]\nname = \"bus\"\nbus = \"can\"\nbitrate = 1000000\ncycle_ms = 100\n";
+    text += "recipe = \"a-recipe-whose-name-is-long-0\"\n";
+    std::fs::write(&file, text).unwrap();
+    ok(&["check", file.to_str().unwrap()], "");
+    let said = refused(&["image", file.to_str().unwrap(), "-o", image.to_str().unwrap()]);
+    assert!(said.contains("16384 bytes"), "{said}");
+    assert!(!image.exists());
+}
+
+#[test]
 fn the_help_teaches() {
     for command in ["controller", "gateway", "check", "encode", "decode"] {
         let help = ok(&[command, "--help"], "");

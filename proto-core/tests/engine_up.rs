@@ -2,7 +2,7 @@
 
 mod rig;
 
-use proto_core::engine::{Input, LinkId, PortId};
+use proto_core::engine::{BusState, Input, LinkId, PortId, PortState};
 use proto_core::wire::scalar::Scalar;
 use rig::*;
 
@@ -528,4 +528,34 @@ fn two_ports_never_wait_for_each_other_for_ever() {
         written.extend(rig.take_written());
     }
     assert!(written.contains(&Written::Registers(39, vec![1])), "{written:?}");
+}
+
+#[test]
+fn a_ports_state_tells_silence_from_bus_off_and_from_a_device_that_is_gone() {
+    let mut cell = Cell::new();
+    let recipe = cell.can(&[(1, &["DigitalOutputCommand[1]"]), (2, &["DigitalOutputCommand[2]"])], &[]);
+    let port = cell.can_port(recipe);
+    let recipe = cell.stream(&[], &["RobotState[8..11]"]);
+    let shows = cell.rs485(recipe);
+    let mut rig = cell.rig();
+    rig.run(MS(10));
+    assert_eq!(rig.engine.port_state(shows), Some(PortState::Working), "nothing is expected from it");
+    assert_eq!(rig.engine.port_state(port), Some(PortState::Silent), "before the first frame");
+    rig.can(port, 1, &[1]);
+    assert_eq!(rig.engine.port_state(port), Some(PortState::Silent), "one id of two");
+    rig.can(port, 2, &[1]);
+    assert_eq!(rig.engine.port_state(port), Some(PortState::Working));
+    rig.run(MS(60));
+    rig.can(port, 2, &[1]);
+    rig.run(MS(60));
+    assert_eq!(rig.engine.port_state(port), Some(PortState::Silent), "one id is overdue");
+    rig.can(port, 1, &[1]);
+    rig.can(port, 2, &[1]);
+    rig.input(Input::PortBus { port, state: BusState::BusOff });
+    assert_eq!(rig.engine.port_state(port), Some(PortState::BusOff));
+    rig.input(Input::PortBus { port, state: BusState::Passive });
+    assert_eq!(rig.engine.port_state(port), Some(PortState::Working));
+    rig.input(Input::PortDown { port });
+    assert_eq!(rig.engine.port_state(port), Some(PortState::Gone));
+    assert_eq!(rig.engine.port_state(PortId(7)), None);
 }

@@ -81,6 +81,20 @@ pub enum BusState {
     BusOff,
 }
 
+/// How a field port does.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum PortState {
+    /// What it receives comes in time; a port without an input part only has to be there.
+    Working,
+    /// A frame of its input part is overdue or has never come.
+    Silent,
+    /// The CAN controller has left the bus.
+    BusOff,
+    /// Its device is not there.
+    Gone,
+}
+
 /// What happened outside.
 #[derive(Debug, Clone, Copy)]
 pub enum Input<'a> {

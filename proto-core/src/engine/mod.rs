@@ -29,7 +29,7 @@ pub use build::BuildError;
 pub use command_link::{COMMAND_QUEUE, MAX_COMMAND_BYTES, MAX_COMMAND_FIELDS};
 pub use counters::{LinkCounters, PortCounters};
 pub use field_port::ReplyCode;
-pub use io::{BusState, Input, LinkId, LinkKind, Output, PortId};
+pub use io::{BusState, Input, LinkId, LinkKind, Output, PortId, PortState};
 pub use links::LinkInfo;
 pub use modbus_link::MAX_POLL_BLOCKS;
 pub use outbox::EDGE_QUEUE;
@@ -185,6 +185,21 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     /// What happened on a field port; `None` for a port that is none.
     pub fn port_counters(&self, port: PortId) -> Option<&PortCounters> {
         self.ports.iter().find(|other| other.id == port).map(|port| &port.counters)
+    }
+
+    /// How a field port does; `None` for a port that is none.
+    pub fn port_state(&self, port: PortId) -> Option<PortState> {
+        let (index, port) = self.ports.iter().enumerate().find(|(_, other)| other.id == port)?;
+        let mut frames = self.store.frames.iter().filter(|frame| usize::from(frame.port) == index);
+        Some(if !port.is_up {
+            PortState::Gone
+        } else if port.bus == BusState::BusOff {
+            PortState::BusOff
+        } else if frames.any(|frame| frame.overdue_at == Instant::NEVER) {
+            PortState::Silent
+        } else {
+            PortState::Working
+        })
     }
 
     /// How the newest command that a port's values picked went; `None` for a port that is none.

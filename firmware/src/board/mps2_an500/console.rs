@@ -32,3 +32,11 @@ impl Write for Console {
 pub(super) fn print(text: fmt::Arguments<'_>) {
     let _ = Console.write_fmt(text);
 }
+
+/// Prints which task has the processor.
+pub(super) fn print_running() {
+    match firmware::watchdog::running() {
+        Some(task) => print(format_args!("task {task} was running\r\n")),
+        None => print(format_args!("no task was running\r\n")),
+    }
+}

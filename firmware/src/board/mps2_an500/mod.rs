@@ -10,7 +10,9 @@ mod registers;
 mod stack;
 mod storage;
 mod time;
+mod trouble;
 mod uart;
+mod watchdog;
 
 use cortex_m::interrupt::InterruptNumber;
 use cortex_m::peripheral::NVIC;
@@ -23,6 +25,7 @@ pub(crate) use firmware::lan9118::StartError as EthernetError;
 pub(crate) use stack::used as stack_used;
 pub(crate) use storage::StorageError;
 pub(crate) use uart::Uart as SerialDevice;
+pub(crate) use watchdog::{WATCHDOG_PERIOD, Watchdog};
 
 /// CAN is slcan on a UART here.
 pub(crate) type CanDevice = SlcanPort<uart::Uart>;
@@ -64,11 +67,32 @@ impl Board {
         })
     }
 
+    /// The watchdog, from now on to be fed.
+    pub(crate) fn watchdog(&mut self) -> Watchdog {
+        Watchdog::start()
+    }
+
+    /// The status LED.
+    pub(crate) fn led(&mut self) -> Led {
+        Led
+    }
+
     /// The Ethernet controller.
     pub(crate) fn ethernet(&mut self) -> Result<Ethernet, EthernetError> {
         let driver = Lan9118::start(LanRegisters, &LAN_WAKER)?;
         Irq::LAN9118.enable();
         Ok(driver)
+    }
+}
+
+/// LED 0 of the FPGA's.
+#[derive(Debug)]
+pub(crate) struct Led;
+
+impl Led {
+    /// Lights it, or not.
+    pub(crate) fn set(&mut self, is_lit: bool) {
+        registers::write(registers::FPGAIO, u32::from(is_lit));
     }
 }
 
@@ -84,7 +108,10 @@ fn main() -> ! {
     console::start();
     log_output::start();
     time::start();
-    executor::run(|spawner| crate::start::start(spawner, Board { serial: 0, can: 0 }))
+    executor::run(|spawner| {
+        let tasks = crate::start::start(spawner, Board { serial: 0, can: 0 });
+        trouble::start(&tasks);
+    })
 }
 
 /// Ends the emulation with this exit code.
@@ -96,12 +123,14 @@ fn end(code: i32) -> ! {
 fn panic(info: &core::panic::PanicInfo<'_>) -> ! {
     cortex_m::interrupt::disable();
     console::print(format_args!("{info}\r\n"));
+    console::print_running();
     end(101)
 }
 
 #[cortex_m_rt::exception]
 unsafe fn HardFault(frame: &cortex_m_rt::ExceptionFrame) -> ! {
     console::print(format_args!("hard fault at {:08X}\r\n", frame.pc()));
+    console::print_running();
     end(102)
 }
 

@@ -6,7 +6,9 @@ pub(super) const UARTS: [u32; 5] = [0x4000_4000, 0x4000_5000, 0x4000_6000, 0x400
 pub(super) const TIMER0: u32 = 0x4000_0000;
 /// A timer that nobody waits for.
 pub(super) const DUAL_TIMER: u32 = 0x4000_2000;
-/// A free-running counter, among others.
+/// The watchdog.
+pub(super) const WATCHDOG: u32 = 0x4000_8000;
+/// LEDs, a free-running counter, and others.
 pub(super) const FPGAIO: u32 = 0x4002_8000;
 /// The Ethernet controller.
 pub(super) const LAN9118: u32 = 0xA000_0000;

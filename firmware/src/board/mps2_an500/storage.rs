@@ -32,13 +32,14 @@ impl fmt::Display for StorageError {
 /// Reads the image; once.
 pub(super) fn read() -> Result<&'static [u8], StorageError> {
     static IMAGE: ConstStaticCell<[u8; MAX_IMAGE]> = ConstStaticCell::new([0; MAX_IMAGE]);
-    let args = env::args::<512>().map_err(|_| StorageError::NoName)?;
-    let path = (&args).nth(1).and_then(Result::ok).ok_or(StorageError::NoName)?;
-    let mut name = [0; 512];
-    let room = name.get_mut(..path.len()).ok_or(StorageError::NoName)?;
-    room.copy_from_slice(path.as_bytes());
-    let name = CStr::from_bytes_until_nul(&name).map_err(|_| StorageError::NoName)?;
-    let mut file = File::open(name).map_err(|_| StorageError::Unreadable)?;
+    let opened = argument(1, |path| {
+        let mut name = [0; MAX_ARGUMENTS];
+        let room = name.get_mut(..path.len()).ok_or(StorageError::NoName)?;
+        room.copy_from_slice(path.as_bytes());
+        let name = CStr::from_bytes_until_nul(&name).map_err(|_| StorageError::NoName)?;
+        File::open(name).map_err(|_| StorageError::Unreadable)
+    });
+    let mut file = opened.ok_or(StorageError::NoName)??;
     let image = IMAGE.take();
     let mut len = 0;
     while let Some(room @ [_, ..]) = image.get_mut(len..) {
@@ -50,6 +51,15 @@ pub(super) fn read() -> Result<&'static [u8], StorageError> {
     }
     Ok(&image[..len])
 }
+
+/// Looks at one of the semihosting arguments.
+pub(super) fn argument<T>(nth: usize, look: impl FnOnce(&str) -> T) -> Option<T> {
+    let args = env::args::<MAX_ARGUMENTS>().ok()?;
+    (&args).nth(nth).and_then(Result::ok).map(look)
+}
+
+/// All arguments together, in bytes.
+const MAX_ARGUMENTS: usize = 512;
 
 /// The host's clock in seconds: another for every start.
 pub(super) fn host_time() -> u64 {

@@ -19,8 +19,9 @@ pub const MAGIC: [u8; 4] = *b"RGCI";
 pub const VERSION: u32 = 1;
 /// Length of the header: magic, version, payload length and CRC-32, four bytes each, little-endian.
 pub const HEADER: usize = 16;
-/// Longest image, header included; twice what the largest configuration takes.
-pub const MAX_IMAGE: usize = 64 * 1024;
+/// Longest image, header included. What a board has room for takes less; only a file with hundreds of
+/// fields and CAN ids takes more, and is refused when the image is made.
+pub const MAX_IMAGE: usize = 16 * 1024;
 
 /// Why an image is refused.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -88,7 +89,7 @@ impl core::error::Error for ImageError {}
 /// There was no room for an image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct NoSpace {
-    /// Bytes that were there; [`MAX_IMAGE`] are always enough.
+    /// Bytes that were there; no image has more than [`MAX_IMAGE`].
     pub available: usize,
 }
 

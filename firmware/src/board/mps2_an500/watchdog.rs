@@ -1,0 +1,47 @@
+//! The watchdog: a counter that interrupts at its first zero, which no mask holds up, and resets the
+//! machine at its second. `qemu-system-arm -no-reboot` ends the emulation instead.
+
+use embassy_time::Duration;
+
+use super::console;
+use super::registers::{WATCHDOG, write};
+
+const LOAD: u32 = WATCHDOG;
+const CONTROL: u32 = WATCHDOG + 0x8;
+const INTCLEAR: u32 = WATCHDOG + 0xC;
+const LOCK: u32 = WATCHDOG + 0xC00;
+const UNLOCK: u32 = 0x1ACC_E551;
+/// With interrupt and reset.
+const CONTROL_ON: u32 = 0b11;
+const CYCLES_PER_MICRO: u64 = 25;
+
+/// From the last feed to the reset. Long, because the emulator's host may be busy with something else.
+pub(crate) const WATCHDOG_PERIOD: Duration = Duration::from_secs(8);
+
+/// The watchdog.
+#[derive(Debug)]
+pub(crate) struct Watchdog;
+
+impl Watchdog {
+    pub(super) fn start() -> Self {
+        write(LOCK, UNLOCK);
+        write(LOAD, (WATCHDOG_PERIOD.as_micros() / 2 * CYCLES_PER_MICRO) as u32);
+        write(CONTROL, CONTROL_ON);
+        write(LOCK, 0);
+        Self
+    }
+
+    /// All is well: from the start again.
+    pub(crate) fn feed(&mut self) {
+        write(LOCK, UNLOCK);
+        write(INTCLEAR, 1);
+        write(LOCK, 0);
+    }
+}
+
+/// Half of the time is over.
+#[cortex_m_rt::exception]
+unsafe fn NonMaskableInt() {
+    console::print(format_args!("the watchdog was not fed\r\n"));
+    console::print_running();
+}

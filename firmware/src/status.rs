@@ -1,0 +1,64 @@
+//! What the log says while all is well: what came of every link, and what went through every port.
+
+use core::pin::pin;
+
+use embassy_time::{Duration, Timer};
+use proto_core::link::LinkState;
+
+use crate::gateway::{Gateway, MAX_FIELD_PORTS, MAX_UPLINKS};
+use crate::watchdog::Pulse;
+use crate::{info, warn};
+
+/// Says it when it is another than before, for ever.
+pub async fn run(gateway: &Gateway, pulse: &Pulse) -> ! {
+    let mut links = [(0, false); MAX_LINKS];
+    let mut ports = [[0; 6]; MAX_FIELD_PORTS];
+    loop {
+        for _ in 0..4 {
+            let mut known = links.iter_mut();
+            gateway.report(
+                |link| {
+                    let Some((connects, was_up)) = known.next() else { return };
+                    let is_up = matches!(link.state, LinkState::Up { .. });
+                    let name = link.kind.name();
+                    if *connects != link.history.connects {
+                        *connects = link.history.connects;
+                        info!("link {}: up ({})", name, connects);
+                    } else if *was_up && !is_up {
+                        warn!("link {}: lost", name);
+                    }
+                    *was_up = is_up;
+                },
+                |_, _| {},
+            );
+            pulse.idle(pin!(Timer::after(Duration::from_millis(250)))).await;
+        }
+        let mut known = ports.iter_mut();
+        gateway.report(
+            |_| {},
+            |port, counters| {
+                let now = [
+                    counters.frames_in,
+                    counters.bytes_in,
+                    counters.frames_out,
+                    counters.bytes_out,
+                    counters.resync_bytes,
+                    counters.skipped_cycles,
+                ];
+                if let Some(before) = known.next()
+                    && *before != now
+                {
+                    *before = now;
+                    let [frames_in, bytes_in, frames_out, bytes_out, skipped, cycles] = now;
+                    info!(
+                        "port {}: in {} frames, {} bytes; out {} frames, {} bytes; {} bytes skipped, {} cycles",
+                        port.0, frames_in, bytes_in, frames_out, bytes_out, skipped, cycles,
+                    );
+                }
+            },
+        );
+    }
+}
+
+/// Command, state, Modbus and the recipe links.
+const MAX_LINKS: usize = MAX_UPLINKS + 3;

@@ -1,0 +1,241 @@
+//! Whether every task still runs, and a watchdog that is fed only then.
+//!
+//! A task may wait for a byte for ever, so it is asked: it has a [`Pulse`], and where it waits for
+//! something that may never come it waits through [`Pulse::idle`], which answers. A task that hangs
+//! anywhere else does not answer, is named in the log, and the watchdog starves. One that never gives
+//! the processor back starves it too, since the feeder cannot run; [`running`] names that one to an
+//! interrupt.
+
+use core::cell::{Cell, RefCell};
+use core::fmt;
+use core::future::{Future, poll_fn};
+use core::pin::Pin;
+use core::sync::atomic::{AtomicU16, Ordering};
+
+use embassy_sync::waitqueue::WakerRegistration;
+use embassy_time::{Duration, Timer};
+use proto_core::engine::{LinkKind, PortId};
+
+use crate::fmt::Text;
+use crate::{error, info};
+
+/// A task, as the log names it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum TaskName {
+    /// Calls the engine when it is time.
+    Engine,
+    /// An RS-485 port.
+    Serial(PortId),
+    /// A CAN port.
+    Can(PortId),
+    /// A link to the controller.
+    Link(LinkKind),
+    /// The network stack.
+    Network,
+    /// Tells the address.
+    Address,
+    /// Tells what ports and links do.
+    Status,
+    /// The status LED.
+    Led,
+    /// Says why nothing runs.
+    Refused,
+    /// A task of the board's own.
+    Board(u8),
+}
+
+impl TaskName {
+    /// Never 0.
+    fn code(self) -> u16 {
+        let (kind, number) = match self {
+            Self::Engine => (1, 0),
+            Self::Serial(port) => (2, port.0),
+            Self::Can(port) => (3, port.0),
+            Self::Link(LinkKind::Command) => (4, 0),
+            Self::Link(LinkKind::State) => (5, 0),
+            Self::Link(LinkKind::Modbus) => (6, 0),
+            Self::Link(LinkKind::RecipeUdp) => (7, 0),
+            Self::Link(LinkKind::RecipeTcpListen { port }) => (8, port.0),
+            Self::Link(LinkKind::RecipeUdpListen { port }) => (9, port.0),
+            Self::Network => (10, 0),
+            Self::Address => (11, 0),
+            Self::Status => (12, 0),
+            Self::Led => (13, 0),
+            Self::Refused => (14, 0),
+            Self::Board(number) => (15, number),
+        };
+        u16::from_be_bytes([kind, number])
+    }
+
+    fn from_code(code: u16) -> Option<Self> {
+        let [kind, number] = code.to_be_bytes();
+        let port = PortId(number);
+        Some(match kind {
+            1 => Self::Engine,
+            2 => Self::Serial(port),
+            3 => Self::Can(port),
+            4 => Self::Link(LinkKind::Command),
+            5 => Self::Link(LinkKind::State),
+            6 => Self::Link(LinkKind::Modbus),
+            7 => Self::Link(LinkKind::RecipeUdp),
+            8 => Self::Link(LinkKind::RecipeTcpListen { port }),
+            9 => Self::Link(LinkKind::RecipeUdpListen { port }),
+            10 => Self::Network,
+            11 => Self::Address,
+            12 => Self::Status,
+            13 => Self::Led,
+            14 => Self::Refused,
+            15 => Self::Board(number),
+            _ => return None,
+        })
+    }
+}
+
+impl fmt::Display for TaskName {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Engine => f.write_str("engine"),
+            Self::Serial(port) => write!(f, "RS-485 port {}", port.0),
+            Self::Can(port) => write!(f, "CAN port {}", port.0),
+            Self::Link(kind) => write!(f, "link {}", kind.name()),
+            Self::Network => f.write_str("network"),
+            Self::Address => f.write_str("address"),
+            Self::Status => f.write_str("status"),
+            Self::Led => f.write_str("LED"),
+            Self::Refused => f.write_str("refused"),
+            Self::Board(number) => write!(f, "board {number}"),
+        }
+    }
+}
+
+/// The task that has the processor; `None` between tasks. For interrupts and for the last words of a
+/// panic.
+pub fn running() -> Option<TaskName> {
+    TaskName::from_code(RUNNING.load(Ordering::Relaxed))
+}
+
+/// One task's proof that it runs.
+pub struct Pulse {
+    name: Cell<Option<TaskName>>,
+    has_answered: Cell<bool>,
+    /// It was named in the log and has not answered since.
+    is_suspect: Cell<bool>,
+    waker: RefCell<WakerRegistration>,
+}
+
+impl Pulse {
+    const fn new() -> Self {
+        Self {
+            name: Cell::new(None),
+            has_answered: Cell::new(false),
+            is_suspect: Cell::new(false),
+            waker: RefCell::new(WakerRegistration::new()),
+        }
+    }
+
+    /// Waits for what may never come; the task answers meanwhile.
+    ///
+    /// A wait that ends by itself in less than a quarter of the watchdog's period needs none of this.
+    pub async fn idle<F: Future>(&self, mut wait: Pin<&mut F>) -> F::Output {
+        poll_fn(|cx| {
+            self.has_answered.set(true);
+            self.waker.borrow_mut().register(cx.waker());
+            wait.as_mut().poll(cx)
+        })
+        .await
+    }
+
+    /// The whole of the task: what runs in it is known to be this task.
+    pub async fn run<F: Future>(&self, mut task: Pin<&mut F>) -> F::Output {
+        let code = self.name.get().map_or(0, TaskName::code);
+        poll_fn(|cx| {
+            // A task of an interrupt's executor may have come in between.
+            let before = RUNNING.swap(code, Ordering::Relaxed);
+            let result = task.as_mut().poll(cx);
+            RUNNING.store(before, Ordering::Relaxed);
+            result
+        })
+        .await
+    }
+
+    fn ask(&self) {
+        self.has_answered.set(false);
+        self.waker.borrow_mut().wake();
+    }
+}
+
+/// The pulses of all tasks: at most `N`.
+pub struct Watch<const N: usize> {
+    pulses: [Pulse; N],
+    count: Cell<usize>,
+}
+
+impl<const N: usize> Watch<N> {
+    /// Nobody is watched.
+    pub const fn new() -> Self {
+        Self { pulses: [const { Pulse::new() }; N], count: Cell::new(0) }
+    }
+
+    /// From here on the watchdog is fed only when this task answers. `None` when there are too many.
+    pub fn register(&self, name: TaskName) -> Option<&Pulse> {
+        let pulse = self.pulses.get(self.count.get())?;
+        self.count.set(self.count.get().saturating_add(1));
+        pulse.name.set(Some(name));
+        Some(pulse)
+    }
+
+    /// Whether all have answered since the round before; then they are asked again. Each that has not is
+    /// told once, and once more when it answers after all.
+    fn round(&self, mut tell: impl FnMut(TaskName, Answer)) -> bool {
+        let registered = || self.pulses.iter().take(self.count.get());
+        for pulse in registered() {
+            let has_answered = pulse.has_answered.get();
+            if pulse.is_suspect.replace(!has_answered) == has_answered
+                && let Some(name) = pulse.name.get()
+            {
+                tell(name, if has_answered { Answer::Late } else { Answer::Missing });
+            }
+        }
+        let all = registered().all(|pulse| pulse.has_answered.get());
+        if all {
+            registered().for_each(Pulse::ask);
+        }
+        all
+    }
+}
+
+impl<const N: usize> Default for Watch<N> {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Answer {
+    Missing,
+    Late,
+}
+
+/// Feeds a watchdog that bites after `period`, for ever; four times in a period as long as all is well.
+pub async fn run<const N: usize>(watch: &Watch<N>, period: Duration, mut feed: impl FnMut()) -> ! {
+    let quarter = period / 4;
+    loop {
+        Timer::after(quarter).await;
+        if watch.round(say) {
+            feed();
+        }
+    }
+}
+
+fn say(name: TaskName, answer: Answer) {
+    match answer {
+        Answer::Missing => error!("task {} does not answer: the watchdog is not fed", Text(&name)),
+        Answer::Late => info!("task {} answers again", Text(&name)),
+    }
+}
+
+/// [`TaskName::code`] of the task that has the processor.
+static RUNNING: AtomicU16 = AtomicU16::new(0);
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,220 @@
+//! The firmware's last resorts in QEMU: the watchdog, the exit codes, and what is said before.
+//!
+//! They need QEMU (`apt-get install qemu-system-arm`), the firmware for `mps2-an500` and `host-sim`:
+//! `FIRMWARE_ELF=... HOST_SIM=target/debug/host-sim cargo test -p firmware --test machine -- --ignored`
+
+use std::io::{BufRead, BufReader, Write};
+use std::os::unix::net::UnixStream;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
+use std::time::{Duration, Instant};
+
+/// A running machine; its log comes line by line.
+struct Machine {
+    qemu: Child,
+    lines: Receiver<String>,
+    log: String,
+    /// The folder of QEMU's monitor.
+    monitor: tempfile::TempDir,
+}
+
+impl Machine {
+    /// Starts it with an image (or the name of a file that is not there), a trouble, and more options.
+    fn start(image: &Path, trouble: &str, options: &[&str]) -> Self {
+        let arguments = format!("enable=on,target=native,arg=firmware,arg={},arg={trouble}", image.display());
+        let monitor = tempfile::tempdir().unwrap();
+        let socket = format!("unix:{}/socket,server=on,wait=off", monitor.path().display());
+        let mut qemu = Command::new("qemu-system-arm")
+            .args("-M mps2-an500 -display none -nic user".split(' '))
+            .args(["-monitor", &socket])
+            .args("-serial null -serial null -serial null -serial stdio".split(' '))
+            .args(["-semihosting-config", &arguments, "-kernel"])
+            .arg(variable("FIRMWARE_ELF"))
+            .args(options)
+            .stdin(Stdio::null())
+            .stdout(Stdio::piped())
+            .spawn()
+            .expect("qemu-system-arm runs");
+        let output = BufReader::new(qemu.stdout.take().unwrap());
+        let (sender, lines) = channel();
+        std::thread::spawn(move || {
+            for line in output.lines() {
+                if line.is_err() || sender.send(line.unwrap_or_default()).is_err() {
+                    return;
+                }
+            }
+        });
+        Self { qemu, lines, log: String::new(), monitor }
+    }
+
+    /// Waits for a line with this text.
+    #[track_caller]
+    fn until(&mut self, text: &str) {
+        let limit = Instant::now() + PATIENCE;
+        while let Ok(line) = self.lines.recv_timeout(limit.saturating_duration_since(Instant::now())) {
+            self.log += &line;
+            self.log.push('\n');
+            if line.contains(text) {
+                return;
+            }
+        }
+        panic!("{text:?} was never said:\n{}", self.log);
+    }
+
+    /// Waits until the machine is gone; everything that was said.
+    #[track_caller]
+    fn end(mut self) -> (ExitStatus, String) {
+        let limit = Instant::now() + PATIENCE;
+        loop {
+            match self.lines.recv_timeout(limit.saturating_duration_since(Instant::now())) {
+                Ok(line) => self.log += &(line + "\n"),
+                Err(RecvTimeoutError::Disconnected) => break,
+                Err(RecvTimeoutError::Timeout) => panic!("it does not end:\n{}", self.log),
+            }
+        }
+        let log = std::mem::take(&mut self.log);
+        (self.qemu.wait().unwrap(), log)
+    }
+
+    /// What QEMU's monitor shows of the word at an address, again and again until all these were seen.
+    fn until_seen(&self, address: u32, values: &[u32]) {
+        let mut monitor = UnixStream::connect(self.monitor.path().join("socket")).unwrap();
+        monitor.set_read_timeout(Some(PATIENCE)).unwrap();
+        let mut answers = BufReader::new(monitor.try_clone().unwrap());
+        let mut missing = values.to_vec();
+        let limit = Instant::now() + PATIENCE;
+        while !missing.is_empty() {
+            assert!(Instant::now() < limit, "{missing:08X?} never stood at {address:08X}");
+            writeln!(monitor, "xp /1wx {address}").unwrap();
+            let mut line = String::new();
+            // Its echo and its prompt come in between.
+            while !line.starts_with("00000000") {
+                line.clear();
+                assert_ne!(answers.read_line(&mut line).unwrap(), 0, "QEMU ended");
+            }
+            let value =
+                line.trim().rsplit_once("0x").and_then(|(_, digits)| u32::from_str_radix(digits, 16).ok());
+            missing.retain(|wanted| Some(*wanted) != value);
+        }
+    }
+
+    /// Everything that is said in so long a time.
+    fn listen(&mut self, time: Duration) -> &str {
+        let limit = Instant::now() + time;
+        while let Ok(line) = self.lines.recv_timeout(limit.saturating_duration_since(Instant::now())) {
+            self.log += &(line + "\n");
+        }
+        &self.log
+    }
+}
+
+impl Drop for Machine {
+    fn drop(&mut self) {
+        let _ = self.qemu.kill();
+        let _ = self.qemu.wait();
+    }
+}
+
+fn variable(name: &str) -> PathBuf {
+    let value =
+        std::env::var_os(name).unwrap_or_else(|| panic!("{name} is not set; see the top of this file"));
+    // Cargo runs tests in the package's folder.
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(value)
+}
+
+/// The image of one of the example files.
+fn image(folder: &tempfile::TempDir, example: &str, sets: &[&str]) -> PathBuf {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+    let image = folder.path().join("cell.img");
+    let mut command = Command::new(variable("HOST_SIM"));
+    command.arg("image").arg(root.join("host-sim/configs").join(example)).arg("-o").arg(&image);
+    for set in sets {
+        command.args(["--set", set]);
+    }
+    assert!(command.stdout(Stdio::null()).status().unwrap().success());
+    image
+}
+
+fn nothing() -> &'static Path {
+    Path::new("/nowhere/cell.img")
+}
+
+#[track_caller]
+fn assert_said(log: &str, words: &[&str]) {
+    let mut rest = log;
+    for text in words {
+        let Some(at) = rest.find(text) else { panic!("{text:?} was not said, or too early:\n{log}") };
+        rest = &rest[at + text.len()..];
+    }
+}
+
+#[test]
+#[ignore = "needs QEMU and the firmware"]
+fn a_task_that_hangs_is_named_and_then_the_machine_is_reset() {
+    let (status, log) = Machine::start(nothing(), "stall", &["-no-reboot"]).end();
+    assert_said(
+        &log,
+        &["nothing runs", "task board 0 does not answer", "the watchdog was not fed", "no task was running"],
+    );
+    // QEMU ends in place of a reset.
+    assert_eq!(status.code(), Some(0));
+}
+
+#[test]
+#[ignore = "needs QEMU and the firmware"]
+fn a_task_that_keeps_the_processor_is_named_and_after_the_reset_all_begins_again() {
+    let mut machine = Machine::start(nothing(), "spin", &[]);
+    machine.until("recipe gateway");
+    machine.until("the watchdog was not fed");
+    machine.until("task board 0 was running");
+    machine.until("recipe gateway");
+    machine.until("nothing runs");
+}
+
+#[test]
+#[ignore = "needs QEMU and the firmware"]
+fn the_led_blinks_when_nothing_runs() {
+    let mut machine = Machine::start(nothing(), "none", &[]);
+    machine.until("nothing runs");
+    for _ in 0..3 {
+        machine.until_seen(FPGAIO_LED, &[0, 1]);
+    }
+}
+
+/// Longer than the watchdog's period; the links to a controller that is not there come and go meanwhile.
+#[test]
+#[ignore = "needs QEMU and the firmware"]
+fn a_run_without_trouble_never_starves_the_watchdog() {
+    let folder = tempfile::tempdir().unwrap();
+    let image = image(&folder, "force-sensor.toml", &["controller.address=10.0.2.2"]);
+    let mut machine = Machine::start(&image, "none", &[]);
+    machine.until("address 10.0.2.15");
+    let log = machine.listen(Duration::from_secs(12));
+    assert_eq!(log.matches("recipe gateway").count(), 1, "{log}");
+    assert!(!log.contains("watchdog") && !log.contains("panicked"), "{log}");
+}
+
+#[test]
+#[ignore = "needs QEMU and the firmware"]
+fn a_panic_says_where_and_ends_with_101() {
+    let (status, log) = Machine::start(nothing(), "panic", &[]).end();
+    assert_said(&log, &["panicked at", "as asked", "task board 0 was running"]);
+    assert_eq!(status.code(), Some(101));
+}
+
+#[test]
+#[ignore = "needs QEMU and the firmware"]
+fn a_stack_overflow_and_a_read_of_nothing_fault_and_end_with_102() {
+    for trouble in ["overflow", "fault"] {
+        let (status, log) = Machine::start(nothing(), trouble, &[]).end();
+        assert_said(&log, &["hard fault", "task board 0 was running"]);
+        assert!(!log.contains("panicked"), "{log}");
+        assert_eq!(status.code(), Some(102), "{trouble}");
+    }
+}
+
+/// The machine's LEDs, a bit each.
+const FPGAIO_LED: u32 = 0x4002_8000;
+/// What does not come within this time never comes.
+const PATIENCE: Duration = Duration::from_secs(120);
