@@ -165,8 +165,11 @@ impl Driver<'_> {
             let (reader, writer) = socket.split();
             let (reading, writing) = (self.read(turn, reader, &mut buffers.chunk), self.write(turn, writer));
             self.pulse.idle(pin!(select(reading, writing))).await;
-            socket.close();
-            let _ = with_timeout(FAREWELL, socket.flush()).await;
+            // What the engine has given up must not be delivered later, after newer values.
+            if self.control.is_turn(turn) {
+                socket.close();
+                let _ = with_timeout(FAREWELL, socket.flush()).await;
+            }
         }
         // The peer must not go on believing in a connection whose socket is gone.
         socket.abort();

@@ -216,11 +216,17 @@ async fn pump_tcp(
         }
         Ok(())
     };
-    tokio::select! {
+    let done = tokio::select! {
         done = reading => done,
         done = writing => done,
         () = refuse_others(name, listener) => Ok(()),
+    };
+    if control.turn.get() != turn {
+        // The engine has given the connection up. What the peer has not got yet would otherwise still be
+        // delivered when a pulled cable is plugged in again, after newer values.
+        writer.as_ref().set_zero_linger()?;
     }
+    done
 }
 
 /// A second client of a listening link is turned away: one connection carries one recipe.
