@@ -1,0 +1,94 @@
+//! What breaks between gateway and controller, and what a gateway does with silence.
+
+use std::time::{Duration, Instant};
+
+use super::case::{Case, Scenario, until};
+use super::environment::{Cable, Link};
+use super::examples::{DO1, DO1_OFF, DO1_ON, ROBOT, pose_and_output, pose_frame};
+use super::robot::reserved_ports;
+
+pub(crate) fn all() -> Vec<Scenario> {
+    vec![
+        Scenario::new("the_controller_restarts", restart),
+        Scenario::new("the_cable_is_pulled_and_plugged_in", cable),
+        Scenario::new("a_silent_device_leaves_safe_values", safe_value),
+        Scenario::new("an_idle_gateway_takes_no_time", idle).alone(),
+    ]
+}
+
+fn restart(case: &Case) {
+    let ports = reserved_ports();
+    let robot = case.robot(ROBOT).on(ports).start();
+    let mut gateway = case.cell("rs485-system.toml", &robot);
+    gateway.until_up(Link::Modbus, 1);
+    gateway.until_up(Link::State, 1);
+    let mut device = gateway.line("rs485-1");
+    pose_and_output(&robot, &mut device, &pose_frame(4));
+    robot.end();
+    gateway.until_down(Link::Modbus);
+    let frames = gateway.port("rs485-1").frames_in.max(6);
+    device.send(&DO1_ON);
+    gateway.until_frames_in("rs485-1", frames + 1);
+    let robot = case.robot(ROBOT).on(ports).start();
+    gateway.until_up(Link::Modbus, 2);
+    gateway.until_up(Link::State, 2);
+    // A pose in the controller's own words has gone through the state link since.
+    device.forget();
+    device.until(&pose_frame(4));
+    assert_eq!(robot.variable(DO1), 0.0, "what was sent while the controller was away was written after all");
+    pose_and_output(&robot, &mut device, &pose_frame(4));
+}
+
+fn cable(case: &Case) {
+    let robot = case.robot(ROBOT).start();
+    let mut gateway = case.gateway("rs485-system.toml").robot(&robot).with_cable().start();
+    gateway.until_up(Link::Modbus, 1);
+    gateway.until_up(Link::State, 1);
+    let mut device = gateway.line("rs485-1");
+    pose_and_output(&robot, &mut device, &pose_frame(4));
+    gateway.cable(Cable::Pulled);
+    until("both links are given up", || {
+        device.send(&DO1_ON);
+        let is_up = [Link::Modbus, Link::State].map(|link| gateway.link(link).is_up);
+        (is_up == [false; 2]).then_some(())
+    });
+    gateway.cable(Cable::Plugged);
+    gateway.until_up(Link::Modbus, 2);
+    gateway.until_up(Link::State, 2);
+    // What the connection before still held would be written by now.
+    device.forget();
+    device.until(&pose_frame(4));
+    assert_eq!(robot.variable(DO1), 0.0, "what was sent while the cable was pulled was written after all");
+    pose_and_output(&robot, &mut device, &pose_frame(4));
+}
+
+fn safe_value(case: &Case) {
+    let robot = case.robot(ROBOT).start();
+    let plan = case.gateway("rs485-system.toml").robot(&robot);
+    let mut gateway = plan.set("port.rs485-1.on_timeout", "{ 'DigitalOutputCommand[1]' = 0x80 }").start();
+    gateway.until_up(Link::Modbus, 1);
+    let mut device = gateway.line("rs485-1");
+    for value in [1, 2] {
+        device.send(&[0xFF, 0xFF, value, 0xEE, 0xEE]);
+        // The safe value follows 100 ms later, which may be sooner than anybody looks.
+        robot.until(DO1, 128.0);
+    }
+    // While frames come in time, their value stands.
+    let begin = Instant::now();
+    while begin.elapsed() < Duration::from_millis(500) {
+        device.send(&DO1_ON);
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    device.send(&DO1_OFF);
+    robot.until(DO1, 128.0);
+}
+
+fn idle(case: &Case) {
+    let robot = case.robot(ROBOT).start();
+    let mut gateway = case.cell("rs485-user.toml", &robot);
+    gateway.until_up(Link::Modbus, 1);
+    let before = gateway.processor_time();
+    gateway.line("rs485-1").is_silent(Duration::from_secs(2));
+    let spent = gateway.processor_time() - before;
+    assert!(spent < Duration::from_millis(500), "{spent:?} of processor time in 2 s");
+}

@@ -1,0 +1,192 @@
+//! The gateway on this host: `host-sim gateway`, its field ports on pseudoterminals and slcan by TCP.
+
+use std::collections::BTreeMap;
+use std::net::{SocketAddr, TcpStream};
+use std::time::Duration;
+
+use proto_core::config::Bus;
+use rustix::fs::{Mode, OFlags};
+
+use super::environment::{Cable, Environment, Gateway, Link, LinkStatus, Plan, PortStatus, ports};
+use super::field::{CanClient, Line};
+use super::network::Network;
+use super::program::HostSim;
+use super::refusal::Spoil;
+
+/// This host.
+pub(crate) struct Host;
+
+impl Environment for Host {
+    fn name(&self) -> &'static str {
+        "host"
+    }
+
+    #[track_caller]
+    fn start(&self, plan: &Plan<'_>) -> Box<dyn Gateway> {
+        let mut network = plan.pulls_cable.then(Network::default);
+        let servers = plan.servers.iter().map(|&(name, address)| match &mut network {
+            Some(network) if name == "udp2011" => (name, network.udp(address).port()),
+            Some(network) => (name, network.tcp(address).port()),
+            None => (name, address.port()),
+        });
+        let servers: Vec<_> = servers.collect();
+        let host_sim = HostSim::start(plan.case, "gateway", plan.file(), &arguments(plan, &servers));
+        let place = |name: &str| host_sim.ready["ports"][name].as_str().unwrap().parse().unwrap();
+        let mut listens = BTreeMap::new();
+        for port in &plan.config().ports {
+            let name = port.name.as_str();
+            let reached = match (&port.bus, &mut network) {
+                (Bus::Rs485(_) | Bus::Can { .. }, _) => continue,
+                (Bus::TcpListen { .. }, Some(network)) => network.tcp(place(name)),
+                (Bus::UdpListen { .. }, Some(network)) => network.udp(place(name)),
+                (_, None) => place(name),
+            };
+            listens.insert(name.to_owned(), reached);
+        }
+        Box::new(HostGateway { host_sim, network, listens })
+    }
+
+    #[track_caller]
+    fn refuses(&self, plan: &Plan<'_>, spoil: Spoil) -> String {
+        let all = |plan: &Plan<'_>| arguments(plan, &plan.server_ports());
+        let file = plan.case.folder.path().join("spoilt.toml");
+        let text = std::fs::read_to_string(plan.file()).unwrap();
+        let (text, arguments) = match spoil {
+            Spoil::Damaged => (Some(text.replacen("[[port]]", "[[prot]]", 1)), all(plan)),
+            Spoil::Cut => (Some(text[..text.rfind('=').unwrap()].to_owned()), all(plan)),
+            Spoil::Missing => (None, all(plan)),
+            // One bind less than there are ports.
+            Spoil::NoDevice => {
+                let mut arguments = all(plan);
+                arguments.pop();
+                (Some(text), arguments)
+            }
+        };
+        if let Some(text) = text {
+            std::fs::write(&file, text).unwrap();
+        }
+        let mut program = HostSim::spawn(plan.case, "gateway", &file, &arguments);
+        let status = program.ended();
+        assert_eq!(status.code(), Some(2), "{status}: {}", program.errors());
+        let left: Vec<_> = ports(&plan.config(), |bus| matches!(bus, Bus::Rs485(_)))
+            .into_iter()
+            .map(|port| plan.case.folder.path().join(port))
+            .filter(|link| link.symlink_metadata().is_ok())
+            .collect();
+        assert!(left.is_empty(), "it ended, and {left:?} are there");
+        program.errors()
+    }
+}
+
+/// What `host-sim gateway` is given beside the file; devices come last.
+fn arguments(plan: &Plan<'_>, servers: &[(&'static str, u16)]) -> Vec<String> {
+    let mut arguments = Vec::new();
+    for value in plan.overrides("127.0.0.1", servers) {
+        arguments.push(format!("--set={value}"));
+    }
+    let config = plan.config();
+    for port in &config.ports {
+        let name = port.name.as_str();
+        match port.bus {
+            Bus::TcpListen { .. } | Bus::UdpListen { .. } => {
+                arguments.push(format!("--set=port.{name}.listen=127.0.0.1:0"));
+            }
+            Bus::Rs485(_) | Bus::Can { .. } => {}
+        }
+    }
+    for port in &config.ports {
+        let name = port.name.as_str();
+        let device = match port.bus {
+            Bus::Rs485(_) => format!("pty:{}", plan.case.folder.path().join(name).display()),
+            Bus::Can { .. } => "slcan-tcp:127.0.0.1:0".to_owned(),
+            Bus::TcpListen { .. } | Bus::UdpListen { .. } => continue,
+        };
+        arguments.push(format!("--bind={name}={device}"));
+    }
+    arguments
+}
+
+struct HostGateway {
+    host_sim: HostSim,
+    /// The cable, when the scenario pulls it.
+    network: Option<Network>,
+    /// Listening ports as the controller reaches them.
+    listens: BTreeMap<String, SocketAddr>,
+}
+
+impl HostGateway {
+    #[track_caller]
+    fn place(&self, port: &str) -> &str {
+        self.host_sim.ready["ports"][port].as_str().unwrap_or_else(|| panic!("no port {port}"))
+    }
+}
+
+impl Gateway for HostGateway {
+    #[track_caller]
+    fn line(&self, port: &str) -> Line {
+        let flags = OFlags::RDWR | OFlags::NOCTTY;
+        let line = rustix::fs::open(self.place(port), flags, Mode::empty()).unwrap();
+        Line::new(Box::new(std::fs::File::from(line)))
+    }
+
+    #[track_caller]
+    fn can(&self, port: &str) -> CanClient {
+        let stream = TcpStream::connect(self.place(port)).unwrap();
+        stream.set_nodelay(true).unwrap();
+        CanClient::join(Box::new(stream))
+    }
+
+    #[track_caller]
+    fn listens(&self, port: &str) -> SocketAddr {
+        self.listens[port]
+    }
+
+    fn link(&self, link: Link<'_>) -> LinkStatus {
+        let name = match link {
+            Link::Command => "command",
+            Link::State => "state",
+            Link::Modbus => "modbus",
+            Link::Udp2011 => "udp2011",
+            Link::TcpListen(port) | Link::UdpListen(port) => port,
+        };
+        let stats = &self.host_sim.newest()["links"][name];
+        LinkStatus { is_up: stats["state"] == "up", connects: stats["connects"].as_u64().unwrap_or(0) as u32 }
+    }
+
+    fn port(&self, port: &str) -> PortStatus {
+        let stats = &self.host_sim.newest()["ports"][port];
+        let number = |name: &str| stats[name].as_u64().unwrap_or(0);
+        PortStatus {
+            frames_in: number("frames_in"),
+            bytes_in: number("bytes_in"),
+            frames_out: number("frames_out"),
+            bytes_out: number("bytes_out"),
+            skipped_bytes: number("resync_bytes"),
+            skipped_cycles: number("skipped_cycles"),
+        }
+    }
+
+    #[track_caller]
+    fn cable(&self, cable: Cable) {
+        self.network.as_ref().expect("Plan::with_cable").set(cable);
+    }
+
+    fn processor_time(&self) -> Duration {
+        self.host_sim.program.processor_time()
+    }
+
+    #[track_caller]
+    fn must_run(&mut self) {
+        self.host_sim.program.must_run();
+    }
+}
+
+impl Drop for HostGateway {
+    fn drop(&mut self) {
+        if !std::thread::panicking() {
+            self.host_sim.program.must_run();
+            self.host_sim.program.interrupt();
+            assert!(!self.host_sim.program.errors().contains("panicked"), "the gateway panicked");
+        }
+    }
+}

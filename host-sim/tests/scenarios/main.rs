@@ -1,0 +1,107 @@
+//! The cell's scenarios, written once and run against the gateway on this host and against the
+//! firmware in QEMU.
+//!
+//! Each scenario is counted twice, as `host::NAME` and as `qemu::NAME`. The field devices are on
+//! pseudoterminals and slcan by TCP, or on the emulated UARTs; the controller is `host-sim controller`
+//! in both, reached over loopback or over the emulated Ethernet.
+//!
+//! * `HOST_SIM_FIRMWARE=ELF` names the firmware for QEMU (`qemu-system-arm` has to be there). Without
+//!   it the cases of QEMU are counted as ignored.
+//! * `HOST_SIM_LOAD_SECONDS` is how long the run under full load takes.
+//!
+//! What each program said is under `target/tmp/scenarios/`; it stays there when a case fails.
+
+mod case;
+mod environment;
+mod examples;
+mod faults;
+mod field;
+mod garbage;
+mod host;
+mod network;
+mod program;
+mod qemu;
+mod refusal;
+mod robot;
+
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::sync::{Arc, RwLock};
+
+use libtest_mimic::{Arguments, Trial};
+
+use case::Scenario;
+use environment::Environment;
+
+/// Where the firmware comes from, for who has none.
+const HOW: &str = "HOST_SIM_FIRMWARE=ELF cargo test --test scenarios (Debian: apt-get install \
+                   qemu-system-arm; the ELF: rustup target add thumbv7em-none-eabihf, cargo firmware-qemu, \
+                   then it is target/thumbv7em-none-eabihf/firmware/firmware)";
+/// Cases at a time. Most of a case is waiting.
+const THREADS: usize = 4;
+
+fn main() -> ExitCode {
+    if let Some(code) = program::is_started_to_end_with_us() {
+        return code;
+    }
+    let mut arguments = Arguments::from_args();
+    arguments.test_threads = arguments.test_threads.or(Some(THREADS));
+    let firmware = match firmware() {
+        Ok(firmware) => Some(firmware),
+        Err(Missing::Skip(reason)) => {
+            eprintln!("scenarios: those of the firmware are skipped, {reason}; {HOW}");
+            None
+        }
+        Err(Missing::Fail(reason)) => {
+            eprintln!("scenarios: {reason}");
+            return ExitCode::FAILURE;
+        }
+    };
+    let scenarios = || {
+        let all = [examples::all(), faults::all(), garbage::all(), refusal::all()];
+        all.into_iter().flatten()
+    };
+    // Who measures has the machine for himself.
+    let machine = Arc::new(RwLock::new(()));
+    let mut trials = Vec::new();
+    for scenario in scenarios() {
+        trials.push(trial(scenario, Arc::new(host::Host), &machine));
+    }
+    for scenario in scenarios() {
+        trials.push(match &firmware {
+            Some(elf) => trial(scenario, Arc::new(qemu::Qemu { elf: elf.clone() }), &machine),
+            None => {
+                let name = format!("qemu::{}", scenario.name);
+                Trial::test(name, || Ok(())).with_kind("needs HOST_SIM_FIRMWARE").with_ignored_flag(true)
+            }
+        });
+    }
+    libtest_mimic::run(&arguments, trials).exit_code()
+}
+
+fn trial(scenario: Scenario, environment: Arc<dyn Environment>, machine: &Arc<RwLock<()>>) -> Trial {
+    let name = format!("{}::{}", environment.name(), scenario.name);
+    let machine = Arc::clone(machine);
+    Trial::test(name.clone(), move || case::run(&name, &scenario, environment, &machine))
+}
+
+/// Why there is no firmware to run.
+enum Missing {
+    Skip(String),
+    Fail(String),
+}
+
+fn firmware() -> Result<PathBuf, Missing> {
+    let Some(named) = std::env::var_os("HOST_SIM_FIRMWARE").filter(|named| !named.is_empty()) else {
+        return Err(Missing::Skip("HOST_SIM_FIRMWARE names no firmware".into()));
+    };
+    // Cargo runs tests in the package's folder; what is typed is relative to the workspace's.
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(&named);
+    if !path.is_file() {
+        return Err(Missing::Fail(format!("HOST_SIM_FIRMWARE={}: no such file", named.display())));
+    }
+    if !program::exists("qemu-system-arm") {
+        return Err(Missing::Skip("there is no qemu-system-arm".into()));
+    }
+    Ok(path)
+}

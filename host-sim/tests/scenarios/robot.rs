@@ -1,0 +1,122 @@
+//! The simulated controller of a case, as a process of its own.
+
+use std::io::{Read, Write};
+use std::net::{SocketAddr, TcpListener, TcpStream, UdpSocket};
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicU16, Ordering};
+
+use super::case::{Case, PATIENCE};
+use super::program::HostSim;
+
+/// The controller's servers.
+pub(crate) const SERVERS: [&str; 4] = ["command", "state", "modbus", "udp2011"];
+
+/// How a controller is started.
+pub(crate) struct RobotPlan<'a> {
+    case: &'a Case,
+    file: PathBuf,
+    ports: [u16; 4],
+    extra: Vec<String>,
+}
+
+impl<'a> RobotPlan<'a> {
+    pub(crate) fn new(case: &'a Case, file: PathBuf) -> Self {
+        Self { case, file, ports: [0; 4], extra: Vec::new() }
+    }
+
+    /// Overrides a key of the file.
+    pub(crate) fn set(mut self, key: &str, value: impl std::fmt::Display) -> Self {
+        self.extra.push(format!("--set={key}={value}"));
+        self
+    }
+
+    /// A device for one of its own ports.
+    pub(crate) fn bind(mut self, port: &str, device: &str) -> Self {
+        self.extra.push(format!("--bind={port}={device}"));
+        self
+    }
+
+    /// Where it listens; else on ports that are free.
+    pub(crate) fn on(self, ports: [u16; 4]) -> Self {
+        Self { ports, ..self }
+    }
+
+    #[track_caller]
+    pub(crate) fn start(mut self) -> Robot {
+        for (name, port) in SERVERS.iter().zip(self.ports) {
+            self = self.set(&format!("listen.{name}"), port);
+        }
+        Robot { host_sim: HostSim::start(self.case, "controller", &self.file, &self.extra) }
+    }
+}
+
+/// A running controller.
+#[derive(Debug)]
+pub(crate) struct Robot {
+    host_sim: HostSim,
+}
+
+impl Robot {
+    /// Where one of its servers is.
+    #[track_caller]
+    pub(crate) fn address(&self, server: &str) -> SocketAddr {
+        self.host_sim.ready[server].as_str().unwrap().parse().unwrap()
+    }
+
+    /// The value of a variable, now.
+    #[track_caller]
+    pub(crate) fn variable(&self, name: &str) -> f64 {
+        self.host_sim.fresh()["registers"][name].as_f64().unwrap_or(0.0)
+    }
+
+    /// The value of a variable, as it was last told.
+    pub(crate) fn newest(&self, name: &str) -> f64 {
+        self.host_sim.newest()["registers"][name].as_f64().unwrap_or(0.0)
+    }
+
+    /// Waits until a variable has this value.
+    #[track_caller]
+    pub(crate) fn until(&self, name: &str, value: f64) {
+        self.host_sim.stats(&format!("{name} = {value}"), |stats| {
+            stats["registers"][name].as_f64().unwrap_or(0.0) == value
+        });
+    }
+
+    /// Waits until something its statistics count satisfies `found`.
+    #[track_caller]
+    pub(crate) fn until_stats(&self, what: &str, found: impl Fn(&serde_json::Value) -> bool) {
+        self.host_sim.stats(what, found);
+    }
+
+    /// A command on port 2000, and its reply.
+    #[track_caller]
+    pub(crate) fn command(&self, request: &str, reply: &str) {
+        let mut stream = TcpStream::connect(self.address("command")).unwrap();
+        stream.set_read_timeout(Some(PATIENCE)).unwrap();
+        stream.write_all(request.as_bytes()).unwrap();
+        let mut answer = vec![0; reply.len()];
+        stream.read_exact(&mut answer).unwrap();
+        assert_eq!(String::from_utf8_lossy(&answer), reply);
+    }
+
+    /// Ends it as a person would.
+    #[track_caller]
+    pub(crate) fn end(mut self) {
+        self.host_sim.program.interrupt();
+    }
+}
+
+/// Ports for servers that go and come back. They are below those that systems give to clients, so that
+/// nobody gets them meanwhile.
+#[track_caller]
+pub(crate) fn reserved_ports() -> [u16; 4] {
+    static NEXT: AtomicU16 = AtomicU16::new(0);
+    let first = (std::process::id() % 1000) as u16 * 8;
+    let mut candidates =
+        std::iter::repeat_with(|| 20_000 + first.wrapping_add(NEXT.fetch_add(1, Ordering::Relaxed)) % 12_000);
+    let is_free = |port: &u16| {
+        let place = ("127.0.0.1", *port);
+        TcpListener::bind(place).is_ok() && UdpSocket::bind(place).is_ok()
+    };
+    std::array::from_fn(|_| candidates.by_ref().take(1_000).find(is_free).expect("a free port"))
+}
