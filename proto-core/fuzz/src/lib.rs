@@ -9,6 +9,7 @@ pub mod harness;
 pub mod source;
 
 mod can;
+mod command;
 mod deframer;
 mod modbus;
 mod recipes;
@@ -17,6 +18,8 @@ mod state;
 
 #[path = "../../tests/reference/mod.rs"]
 mod reference;
+#[path = "../../tests/reference/command.rs"]
+mod reference_command;
 #[path = "../../tests/reference/modbus.rs"]
 mod reference_modbus;
 
@@ -39,6 +42,20 @@ pub const TARGETS: &[Target] = &[
         name: "modbus_client",
         run: modbus::run_client,
         seeds: modbus::client_seeds,
+        runs: 4_000,
+        longest: 1_000,
+    },
+    Target {
+        name: "command_server",
+        run: command::run_server,
+        seeds: command::server_seeds,
+        runs: 4_000,
+        longest: 1_000,
+    },
+    Target {
+        name: "command_client",
+        run: command::run_client,
+        seeds: command::client_seeds,
         runs: 4_000,
         longest: 1_000,
     },

@@ -6,7 +6,7 @@
 use core::fmt;
 
 use super::MAX_COMMAND;
-use super::text::{NoSpace, Writer, trim};
+use super::text::{NoSpace, Writer, trim, trim_start, trim_str};
 use crate::wire::dialect::{Dialect, Parentheses, Quotes};
 
 /// One command.
@@ -159,7 +159,7 @@ impl Percent {
 
     /// The speed written as a decimal number, blanks around it ignored.
     pub fn parse(text: &str) -> Option<Self> {
-        text.trim().parse().ok().and_then(Self::new)
+        trim_str(text).parse().ok().and_then(Self::new)
     }
 }
 
@@ -289,13 +289,13 @@ impl<'a> Request<'a> {
                     Some((name, speed)) => (name, Percent::parse(speed)),
                     None => (argument, None),
                 };
-                Ok(Self::Run { program: unquoted(name.trim()), speed })
+                Ok(Self::Run { program: unquoted(trim_str(name)), speed })
             }
             Keyword::Speed => {
                 let argument = argument.ok_or(ParseError::MissingArgument { keyword })?;
                 Ok(Self::Speed(Percent::parse(argument)))
             }
-            _ if argument.is_some_and(|argument| !argument.trim().is_empty()) => {
+            _ if argument.is_some_and(|argument| !trim_str(argument).is_empty()) => {
                 Err(ParseError::UnexpectedArgument { keyword })
             }
             Keyword::Do(action) => Ok(Self::Do(action)),
@@ -378,18 +378,26 @@ impl<'a> Request<'a> {
 
 /// Whether more bytes can still make `text` (no leading blanks) a command.
 pub(super) fn may_become_command(text: &[u8]) -> bool {
+    let room = MAX_COMMAND.saturating_sub(text.len());
     Keyword::ALL.into_iter().any(|keyword| {
         let word = keyword.word().as_bytes();
         match text.strip_prefix(word) {
-            Some(rest) => match trim(rest).split_first() {
-                None => true,
+            Some(rest) => match trim_start(rest).split_first() {
+                None => room >= 2,
                 // The argument of a bare keyword is empty or it is none of ours.
-                Some((b'(', rest)) => !keyword.is_bare() || trim(rest).is_empty(),
+                Some((b'(', argument)) if keyword.is_bare() => room >= 1 && trim(argument).is_empty(),
+                Some((b'(', argument)) => room >= 1 && may_become_argument(argument),
                 Some(_) => false,
             },
             None => word.starts_with(text),
         }
     })
+}
+
+/// No second parenthesis, and UTF-8 whose last letter may be cut.
+fn may_become_argument(argument: &[u8]) -> bool {
+    let readable = core::str::from_utf8(argument).map_or_else(|error| error.error_len().is_none(), |_| true);
+    readable && !argument.contains(&b'(')
 }
 
 fn split(text: &[u8]) -> Result<(Keyword, Option<&str>), ParseError> {
@@ -402,7 +410,7 @@ fn split(text: &[u8]) -> Result<(Keyword, Option<&str>), ParseError> {
         return Err(ParseError::Empty);
     }
     let (word, argument) = match text.split_once('(') {
-        Some((word, rest)) => (word.trim_end(), Some(rest)),
+        Some((word, rest)) => (trim_str(word), Some(rest)),
         None => (text, None),
     };
     let keyword = Keyword::from_word(word).ok_or(ParseError::UnknownWord)?;
@@ -422,7 +430,7 @@ fn unquoted(name: &str) -> &str {
 }
 
 fn check_program(program: &str) -> Result<(), EncodeError> {
-    if program.is_empty() || program.trim().len() != program.len() {
+    if program.is_empty() || trim_str(program).len() != program.len() {
         return Err(EncodeError::ProgramName);
     }
     let bad = |byte: &u8| matches!(byte, b'(' | b')' | b',' | b'"') || byte.is_ascii_control();

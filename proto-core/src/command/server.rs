@@ -105,7 +105,7 @@ impl CommandServer {
     fn step(&mut self, now: Instant, bytes: &mut &[u8]) -> Option<End> {
         if self.deadline().is_some_and(|deadline| now >= deadline) {
             if !self.dropping {
-                self.ended_by_gap = true;
+                self.ended_by_gap = is_bare_keyword(trim(self.text()));
                 return Some(End::Command);
             }
             self.dropping = false;
@@ -157,10 +157,10 @@ impl CommandServer {
         if text.is_empty() {
             return None;
         }
-        if Keyword::ALL.into_iter().any(|k| k.is_bare() && k.word().as_bytes() == text) {
+        if is_bare_keyword(text) {
             return Some(self.keyword_gap);
         }
-        let awaited = may_become_command(text) || (self.ended_by_gap && text == b"(");
+        let awaited = may_become_command(self.text()) || (self.ended_by_gap && text == b"(");
         (!awaited).then_some(self.drop_gap)
     }
 
@@ -181,6 +181,10 @@ enum End {
     Command,
     /// The buffer overflowed.
     TooLong,
+}
+
+fn is_bare_keyword(text: &[u8]) -> bool {
+    Keyword::ALL.into_iter().any(|keyword| keyword.is_bare() && keyword.word().as_bytes() == text)
 }
 
 /// `()`, perhaps with blanks between.

@@ -78,16 +78,27 @@ pub(super) const fn is_blank(byte: u8) -> bool {
 }
 
 /// `text` without blanks and terminators at both ends.
-pub(super) fn trim(mut text: &[u8]) -> &[u8] {
-    while let Some((&first, rest)) = text.split_first()
-        && is_blank(first)
-    {
-        text = rest;
-    }
+pub(super) fn trim(text: &[u8]) -> &[u8] {
+    let mut text = trim_start(text);
     while let Some((&last, rest)) = text.split_last()
         && is_blank(last)
     {
         text = rest;
     }
     text
+}
+
+/// `text` without blanks and terminators before it.
+pub(super) fn trim_start(mut text: &[u8]) -> &[u8] {
+    while let Some((&first, rest)) = text.split_first()
+        && is_blank(first)
+    {
+        text = rest;
+    }
+    text
+}
+
+/// Text without blanks and terminators at both ends; other white space belongs to a name.
+pub(super) fn trim_str(text: &str) -> &str {
+    text.trim_matches(|letter: char| letter.is_ascii() && is_blank(letter as u8))
 }

@@ -174,6 +174,37 @@ fn empty_parentheses_that_come_late_belong_to_the_keyword_before() {
 }
 
 #[test]
+fn beginnings_that_no_byte_can_complete_are_not_waited_for() {
+    let full = [b"run(".as_slice(), &[b'a'; MAX_COMMAND - 4]].concat();
+    for dead in [&b"run(a("[..], b"run(\xFF", b"run(\xE6\x20", b"stat ", b"po wer", &full] {
+        let mut server = CommandServer::new();
+        assert!(receive(&mut server, at(0), dead).is_empty());
+        assert_eq!(poll(&mut server, at(100)).len(), 1, "{}", dead.escape_ascii());
+    }
+    for alive in [&b"run (a, 5"[..], b"run(\xE6\x8A", b"stat", b"state ( ", &full[..MAX_COMMAND - 1]] {
+        let mut server = CommandServer::new();
+        assert!(receive(&mut server, at(0), alive).is_empty());
+        assert_eq!(server.deadline(), None, "{}", alive.escape_ascii());
+    }
+}
+
+#[test]
+fn parentheses_after_a_text_that_was_given_up_are_a_text_of_their_own() {
+    let mut server = CommandServer::new();
+    assert!(receive(&mut server, at(0), b"dance").is_empty());
+    assert_eq!(poll(&mut server, at(100)), ["?dance"]);
+    assert_eq!(receive(&mut server, at(200), b"()"), ["?()"]);
+}
+
+#[test]
+fn only_spaces_and_tabs_are_blanks() {
+    assert_eq!(whole(b"run( \ta\t ,\t5 )"), ["run a at 5"]);
+    assert_eq!(whole(b"run(\x0Ba\x0C)"), ["run \x0Ba\x0C"]);
+    assert_eq!(whole("run(\u{A0}a,\u{A0}5)".as_bytes()), ["run \u{A0}a"]);
+    assert_eq!(whole(b"state\x0B()"), ["?state\x0B()"]);
+}
+
+#[test]
 fn a_command_that_is_too_long_is_answered_once_and_dropped_to_its_end() {
     let exactly = [b"run(".as_slice(), &[b'a'; MAX_COMMAND - 5], b")"].concat();
     assert_eq!(exactly.len(), MAX_COMMAND);
