@@ -9,6 +9,7 @@ use core::cell::{Cell, RefCell};
 use core::pin::pin;
 
 use embassy_futures::select::{Either, select};
+use embassy_futures::yield_now;
 use embassy_time::Timer;
 use heapless::{Deque, Vec};
 use proto_core::config::GatewayConfig;
@@ -43,6 +44,8 @@ pub struct Gateway {
     ports: Vec<(PortId, PortControl), MAX_FIELD_PORTS>,
     links: Vec<(LinkId, LinkKind, LinkControl), MAX_LINKS>,
     output: RefCell<[u8; OUTPUT_BUFFER]>,
+    /// The latest time that the engine was told.
+    told: Cell<Instant>,
     deadline: Cell<Instant>,
     deadline_moved: Notify,
 }
@@ -55,6 +58,7 @@ impl Gateway {
             ports: Vec::new(),
             links: Vec::new(),
             output: RefCell::new([0; OUTPUT_BUFFER]),
+            told: Cell::new(Instant::ZERO),
             deadline: Cell::new(Instant::ZERO),
             deadline_moved: Notify::new(),
         }
@@ -107,7 +111,14 @@ impl Gateway {
 
     /// One input, and everything that follows from it.
     pub fn input(&self, input: Input<'_>) {
-        let at = now();
+        self.input_at(now(), input);
+    }
+
+    /// The same, of something that happened at `at`, or a little later when the engine has been told a
+    /// later time already.
+    pub(crate) fn input_at(&self, at: Instant, input: Input<'_>) {
+        let at = at.max(self.told.get());
+        self.told.set(at);
         let mut engine = self.engine.borrow_mut();
         let mut buf = self.output.borrow_mut();
         engine.handle(at, input);
@@ -154,7 +165,11 @@ impl Gateway {
         loop {
             let until = embassy_time::Instant::from_micros(self.deadline.get().as_micros());
             match pulse.idle(pin!(select(Timer::at(until), self.deadline_moved.notified()))).await {
-                Either::First(()) => self.input(Input::Tick),
+                Either::First(()) => {
+                    // What arrived before this moment is told first: it may not be overdue.
+                    yield_now().await;
+                    self.input(Input::Tick);
+                }
                 Either::Second(()) => {}
             }
         }

@@ -7,9 +7,10 @@
 use core::pin::pin;
 
 use embassy_futures::select::{Either, select};
-use embassy_time::{Duration, Timer, with_timeout};
+use embassy_time::{Duration, Instant, Timer, with_timeout};
 use embedded_io_async::{Read, Write};
 use proto_core::engine::{Input, PortId};
+use proto_core::time::Instant as CoreInstant;
 
 use crate::fmt::Text;
 use crate::gateway::Gateway;
@@ -22,6 +23,20 @@ pub trait Line: Read + Write {
     fn drive(&mut self, direction: LineDirection) {
         let _ = direction;
     }
+
+    /// When the bytes of the newest read arrived, where the device knows.
+    fn arrival(&self) -> Option<Arrival> {
+        None
+    }
+}
+
+/// When bytes arrived that were read later.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Arrival {
+    /// The first of them.
+    pub first: Instant,
+    /// The last of them.
+    pub last: Instant,
 }
 
 /// Who drives the line.
@@ -44,9 +59,7 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, mut line: impl 
             let next = pulse.idle(pin!(select(line.read(&mut chunk), control.next_bytes()))).await;
             let frame = match next {
                 Either::First(Ok(len)) => {
-                    if let Some(bytes) = chunk.get(..len) {
-                        gateway.input(Input::PortBytes { port, bytes });
-                    }
+                    tell(gateway, port, chunk.get(..len).unwrap_or(&[]), line.arrival());
                     // A line that never falls silent does not keep us from sending.
                     match control.take_bytes() {
                         Some(frame) => frame,
@@ -84,11 +97,31 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, mut line: impl 
     }
 }
 
+/// Hands bytes to the engine. Silence on the line is judged by when they arrived, not by when this task
+/// had the time to look.
+fn tell(gateway: &Gateway, port: PortId, bytes: &[u8], arrival: Option<Arrival>) {
+    let input = |at: Instant, bytes| {
+        gateway.input_at(CoreInstant::from_micros(at.as_micros()), Input::PortBytes { port, bytes });
+    };
+    match (arrival, bytes.split_first_chunk::<1>()) {
+        (Some(Arrival { first, last }), Some((head, rest))) if first.elapsed() > PROMPT => {
+            input(first, head);
+            input(last, rest);
+        }
+        _ => gateway.input(Input::PortBytes { port, bytes }),
+    }
+}
+
 /// Twice what the bytes take on the line (12 bits a byte at most), and a little.
 fn patience(bytes: usize, baud: u32) -> Duration {
     let bits = (bytes as u64).saturating_mul(24_000_000);
     Duration::from_micros(bits / u64::from(baud.max(1))) + Duration::from_millis(20)
 }
 
+/// Bytes that were read within this time have just arrived: a fraction of any silence that matters.
+const PROMPT: Duration = Duration::from_micros(100);
 /// After a failed device.
 const RETRY: Duration = Duration::from_millis(100);
+
+#[cfg(test)]
+mod tests;

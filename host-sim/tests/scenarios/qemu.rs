@@ -26,8 +26,8 @@ pub(crate) struct Qemu {
 
 /// The host as the guest sees it.
 const HOST: &str = "10.0.2.2";
-/// QEMU hands a UART one byte at a time, and a busy host may stop it between two for longer than any
-/// silence that ends a frame on a real line: tens of milliseconds were seen.
+/// QEMU hands a UART one byte at a time, and a busy host may stop it between two: by the guest's own clock
+/// tens of milliseconds passed within a frame that was sent at once. No silence ends a frame here.
 const IDLE_GAP_MS: u32 = 1_000;
 /// RS-485, RS-485, CAN.
 const UARTS: usize = 3;
