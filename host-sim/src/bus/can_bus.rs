@@ -18,6 +18,7 @@ use tracing::{info, warn};
 
 use super::bind::{Device, Pace};
 use super::line::accept;
+use super::peer;
 use super::port::{PortEvent, PortTx};
 use super::pty::Pty;
 use super::timer::{Timer, now};
@@ -233,7 +234,11 @@ impl CanPort {
         let listener = match listen {
             Some(listen) => {
                 let listener = TcpListener::bind((listen.host.as_str(), listen.port)).await;
-                Some(listener.map_err(|error| io::Error::new(error.kind(), format!("{listen}: {error}")))?)
+                let listener =
+                    listener.map_err(|error| io::Error::new(error.kind(), format!("{listen}: {error}")))?;
+                // Frames that wait in the kernel are old when they are read, and are not counted.
+                peer::bound(&listener);
+                Some(listener)
             }
             None => None,
         };
@@ -320,16 +325,18 @@ async fn serve_all(listener: TcpListener, bus: &CanBus, bitrate: u32, tx: &Rc<Po
     let mut clients = JoinSet::new();
     loop {
         tokio::select! {
-            (stream, peer) = accept(&listener) => {
+            (stream, peer) = accept(&listener, tx) => {
                 if clients.len() == MAX_CLIENTS {
-                    warn!(%peer, "refused: the bus has {MAX_CLIENTS} slcan clients already");
+                    drop(stream);
                     tx.count(|counters| counters.refused += 1);
+                    if let Some(more) = tx.complaints.take(now()) {
+                        warn!(%peer, more, "refused: the bus has {MAX_CLIENTS} slcan clients already");
+                    }
+                    tokio::task::yield_now().await;
                     continue;
                 }
                 info!(%peer, "slcan client");
-                let _ = stream.set_nodelay(true);
-                // Frames that wait in the kernel are old when they are read, and are not counted.
-                let _ = rustix::net::sockopt::set_socket_send_buffer_size(&stream, SEND_BUFFER);
+                peer::watch(&stream);
                 let (node, tx) = (bus.join(), Rc::clone(tx));
                 clients.spawn_local(async move {
                     let error = serve(&stream, &node, bitrate, &tx).await;
@@ -489,8 +496,6 @@ pub const MAX_WAITING: usize = 256;
 const MAX_CLIENTS: usize = 32;
 /// Bytes made out for a client and not yet taken; beyond it frames wait in the node's queue.
 const MAX_PENDING: usize = 4_096;
-/// The kernel's share of what waits for a client on TCP, in bytes.
-const SEND_BUFFER: usize = 64 * 1_024;
 /// Between two looks for a client that went away and left bytes behind.
 const STALE_LOOK: StdDuration = StdDuration::from_millis(100);
 

@@ -20,6 +20,7 @@ use tracing::{debug, info, warn};
 use super::backoff::Backoff;
 use super::bind::{Device, HostPort, Pace};
 use super::connect::connect;
+use super::peer;
 use super::port::{PortEvent, PortTx};
 use super::pty::Pty;
 use super::timer::{Timer, now};
@@ -53,9 +54,10 @@ impl Line {
             Device::Tcp { to } => Source::Connect(to.clone()),
             Device::TcpListen { listen } => {
                 let listener = TcpListener::bind((listen.host.as_str(), listen.port)).await;
-                Source::Listen(
-                    listener.map_err(|error| io::Error::new(error.kind(), format!("{listen}: {error}")))?,
-                )
+                let listener =
+                    listener.map_err(|error| io::Error::new(error.kind(), format!("{listen}: {error}")))?;
+                peer::bound(&listener);
+                Source::Listen(listener)
             }
             Device::SocketCan { .. } | Device::SlcanPty { .. } | Device::SlcanTcp { .. } => {
                 let what = format!("`{device}` is a CAN device; the port is a serial line");
@@ -111,8 +113,7 @@ impl Line {
                         Ok(stream) => {
                             info!(%to, "connected");
                             backoff.reset();
-                            // A peer that is gone already is found by the next read.
-                            let _ = stream.set_nodelay(true);
+                            peer::watch(&stream);
                             sender.up(&mut events);
                             let error = pump(&stream, &mut sender, &mut events).await;
                             info!(%to, %error, "connection lost");
@@ -124,10 +125,9 @@ impl Line {
                 }
             }
             Source::Listen(listener) => loop {
-                let (stream, peer) = accept(&listener).await;
+                let (stream, peer) = accept(&listener, &tx).await;
                 info!(%peer, "client");
-                // A peer that is gone already is found by the next read.
-                let _ = stream.set_nodelay(true);
+                peer::watch(&stream);
                 sender.up(&mut events);
                 tokio::select! {
                     error = pump(&stream, &mut sender, &mut events) => info!(%peer, %error, "client left"),
@@ -140,12 +140,15 @@ impl Line {
 }
 
 /// Accepts one client, waiting out what is wrong with the system for the moment.
-pub(super) async fn accept(listener: &TcpListener) -> (TcpStream, std::net::SocketAddr) {
+pub(super) async fn accept(listener: &TcpListener, tx: &PortTx) -> (TcpStream, std::net::SocketAddr) {
     loop {
         match listener.accept().await {
             Ok(accepted) => return accepted,
             Err(error) => {
-                warn!(%error, "a client could not be accepted");
+                tx.count(|counters| counters.accept_failures += 1);
+                if let Some(more) = tx.complaints.take(now()) {
+                    warn!(%error, more, "a client could not be accepted");
+                }
                 tokio::time::sleep(StdDuration::from_millis(50)).await;
             }
         }
@@ -154,10 +157,14 @@ pub(super) async fn accept(listener: &TcpListener) -> (TcpStream, std::net::Sock
 
 async fn refuse_all(listener: &TcpListener, tx: &PortTx) {
     loop {
-        let (stream, peer) = accept(listener).await;
-        warn!(%peer, "refused: the line has a client already");
-        tx.count(|counters| counters.refused += 1);
+        let (stream, peer) = accept(listener, tx).await;
         drop(stream);
+        tx.count(|counters| counters.refused += 1);
+        if let Some(more) = tx.complaints.take(now()) {
+            warn!(%peer, more, "refused: the line has a client already");
+        }
+        // However many more there are, the others come first.
+        tokio::task::yield_now().await;
     }
 }
 
@@ -288,6 +295,8 @@ async fn pump(
                 Ok(count) => {
                     sender.tx.count(|counters| counters.bytes_in += count as u64);
                     events(PortEvent::Bytes(&buf[..count]));
+                    // A device that never pauses must not keep everybody else waiting.
+                    tokio::task::yield_now().await;
                     Ok(())
                 }
                 Err(error) if error.kind() == io::ErrorKind::Interrupted => Ok(()),

@@ -19,6 +19,7 @@ use tokio::sync::Notify;
 use super::bind::Device;
 use super::can_bus::CanPort;
 use super::line::Line;
+use super::quota::Quota;
 use super::socketcan::KernelCan;
 
 /// What a device did.
@@ -133,6 +134,8 @@ pub struct PortTx {
     pub(super) frames: RefCell<VecDeque<CanFrame>>,
     pub(super) wake: Notify,
     pub(super) counters: Cell<DeviceCounters>,
+    /// What clients do is worth a few lines of the log.
+    pub(super) complaints: Quota,
 }
 
 impl PortTx {
@@ -187,6 +190,8 @@ pub struct DeviceCounters {
     pub dropped: u64,
     /// Clients turned away because there was one already, or too many.
     pub refused: u64,
+    /// Clients that the system could not hand over, for want of descriptors most likely.
+    pub accept_failures: u64,
     /// Times the device became usable.
     pub ups: u64,
     /// Frames that the kernel dropped because they were not read in time (SO_RXQ_OVFL).

@@ -311,7 +311,15 @@ impl Controller {
         let earlier = self.server.delayed.iter().rev().find(|delayed| delayed.1 == conn);
         let due = (now + self.faults.delay(link)).max(earlier.map_or(now, |delayed| delayed.0));
         if due <= now && earlier.is_none() {
-            self.outputs.push_back(ControllerOutput::Send { conn, bytes });
+            // Answers to requests that came together leave together.
+            match self.outputs.back_mut() {
+                Some(ControllerOutput::Send { conn: last, bytes: waiting })
+                    if *last == conn && waiting.len() < MAX_JOINED =>
+                {
+                    waiting.extend_from_slice(&bytes);
+                }
+                _ => self.outputs.push_back(ControllerOutput::Send { conn, bytes }),
+            }
         } else if self.server.delayed.len() < MAX_DELAYED {
             self.server.delayed.push_back((due, conn, bytes));
         } else {
@@ -354,5 +362,7 @@ impl RegisterBank for Bank<'_> {
     }
 }
 
+/// Answers are joined up to about this many bytes.
+const MAX_JOINED: usize = 4_096;
 /// Longest reply, the error's text included.
 const MAX_REPLY: usize = 1_024;

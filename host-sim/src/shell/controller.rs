@@ -23,6 +23,7 @@ use super::tcp::{Connection, Taken};
 use super::{RunOptions, StartError, udp};
 use crate::bus::bind::Bind;
 use crate::bus::port::{Port, PortBus, PortEvent, PortTx};
+use crate::bus::quota::Quota;
 use crate::bus::realtime::{self, Scheduling};
 use crate::bus::timer::{Timer, now};
 use crate::config::{SimBus, SimConfig, SimParts};
@@ -96,10 +97,14 @@ struct ControllerShell {
     port_names: Vec<String>,
     /// What came of outputs and is told to the controller once it can listen again.
     pending: RefCell<VecDeque<Report>>,
+    /// Closed, and still sending what was kept.
+    lingering: RefCell<VecDeque<Rc<Connection>>>,
     busy: Cell<bool>,
     timer: Timer,
     ended: Notify,
     counters: Cell<ShellCounters>,
+    refusals: Quota,
+    complaints: Quota,
 }
 
 struct Client {
@@ -138,6 +143,10 @@ struct ShellCounters {
     skipped_state_packets: u64,
     /// Datagrams that the system did not take.
     dropped_datagrams: u64,
+    /// Closed connections whose last answers were given up to make room for those of others.
+    cut_answers: u64,
+    /// Connections that the system could not hand over, for want of descriptors most likely.
+    accept_failures: u64,
 }
 
 impl Running {
@@ -189,10 +198,13 @@ impl Running {
             ports,
             port_names: config.ports.iter().map(|port| port.name.clone()).collect(),
             pending: RefCell::default(),
+            lingering: RefCell::default(),
             busy: Cell::new(false),
             timer: Timer::new().map_err(|error| StartError::new(format!("no timer: {error}")))?,
             ended: Notify::new(),
             counters: Cell::default(),
+            refusals: Quota::default(),
+            complaints: Quota::default(),
         });
         let mut tasks = JoinSet::new();
         tasks.spawn_local(Rc::clone(&shell).serve(Link::Command, command));
@@ -283,7 +295,7 @@ impl ControllerShell {
             ControllerOutput::Send { conn, bytes } => self.send(conn, &bytes),
             ControllerOutput::Close { conn } => {
                 if let Some(client) = self.connections.borrow_mut().remove(&conn) {
-                    client.connection.close();
+                    self.close(client.connection);
                 }
             }
             ControllerOutput::StatePacket { bytes } => self.send_state(&bytes[..], now),
@@ -303,6 +315,21 @@ impl ControllerShell {
             }
             ControllerOutput::Shutdown => self.ended.notify_one(),
             ControllerOutput::Sleep { .. } => {}
+        }
+    }
+
+    /// Closes behind what was kept. Of too many such connections the oldest is cut.
+    fn close(&self, connection: Rc<Connection>) {
+        connection.close();
+        if connection.has_kept() {
+            let mut lingering = self.lingering.borrow_mut();
+            lingering.push_back(connection);
+            if lingering.len() > MAX_LINGERING
+                && let Some(oldest) = lingering.pop_front()
+            {
+                oldest.abort();
+                self.count(|counters| counters.cut_answers += 1);
+            }
         }
     }
 
@@ -338,7 +365,9 @@ impl ControllerShell {
     fn give_up(&self, connections: &mut BTreeMap<ConnId, Client>, conn: ConnId) {
         if let Some(client) = connections.remove(&conn) {
             client.connection.abort();
-            warn!(link = ?client.link, conn = conn.0, "dropped: does not take what is sent");
+            if let Some(more) = self.complaints.take(now()) {
+                warn!(link = ?client.link, conn = conn.0, more, "dropped: does not take what is sent");
+            }
             self.count(|counters| counters.slow_clients += 1);
             self.pending.borrow_mut().push_back(Report::Dropped(client.link, conn));
         }
@@ -473,6 +502,8 @@ fn closed(link: Link, conn: ConnId) -> ControllerInput<'static> {
 
 /// How long a client of port 2001 may take nothing (D9).
 const STATE_PATIENCE: Duration = Duration::from_secs(2);
+/// Most closed connections that still send.
+const MAX_LINGERING: usize = 16;
 
 #[cfg(test)]
 #[path = "controller_tests.rs"]

@@ -59,8 +59,6 @@ pub(super) enum Event<'a> {
 impl Connection {
     /// Splits a connected stream into what sends and what [`Connection::run`] reads from.
     pub(super) fn split(stream: TcpStream) -> (Rc<Self>, OwnedReadHalf) {
-        // Requests and answers are small and urgent. A stream that refuses works all the same.
-        let _ = stream.set_nodelay(true);
         let (read, write) = stream.into_split();
         let connection = Self {
             write,
@@ -123,6 +121,11 @@ impl Connection {
         self.wake();
     }
 
+    /// Whether bytes are kept.
+    pub(super) fn has_kept(&self) -> bool {
+        !self.out.borrow().is_empty()
+    }
+
     /// Whether it was closed from this side.
     pub(super) fn is_closed(&self) -> bool {
         self.end.get() != End::Open
@@ -135,7 +138,7 @@ impl Connection {
         mut read: OwnedReadHalf,
         mut event: impl FnMut(Event<'_>),
     ) -> io::Result<()> {
-        let mut buf = [0; 4_096];
+        let mut buf = [0; CHUNK];
         loop {
             match self.end.get() {
                 End::Open => {}
@@ -147,7 +150,13 @@ impl Connection {
                     None => {}
                     Some(received) => match received? {
                         0 => return Ok(()),
-                        count => event(Event::Bytes(&buf[..count])),
+                        count => {
+                            event(Event::Bytes(&buf[..count]));
+                            if count == CHUNK {
+                                // There is more: the others come first.
+                                tokio::task::yield_now().await;
+                            }
+                        }
                     },
                 }
             } else {
@@ -215,6 +224,8 @@ impl Connection {
                 Err(error) => return Err(error),
             }
         }
+        // What was once needed for a slow peer is not held for ever.
+        *out = Vec::new();
         self.blocked_since.set(None);
         Ok(())
     }
@@ -231,7 +242,9 @@ impl Connection {
     }
 }
 
+/// Most bytes read at once: their requests are carried out before anybody else has a turn.
+const CHUNK: usize = 512;
 /// Most bytes kept for a peer that does not take them. More than one read's requests are answered with.
-const MAX_KEPT: usize = 256 * 1_024;
+const MAX_KEPT: usize = 64 * 1_024;
 /// How long a closed connection may take to send what it has.
 const LINGER: std::time::Duration = std::time::Duration::from_secs(2);

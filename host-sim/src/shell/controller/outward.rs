@@ -7,9 +7,11 @@ use std::time::Duration as StdDuration;
 use tokio::net::UdpSocket;
 use tracing::{debug, info};
 
+use super::servers::DATAGRAMS_AT_ONCE;
 use super::{ControllerShell, Outward, Report};
 use crate::bus::backoff::Backoff;
 use crate::bus::connect::connect;
+use crate::bus::peer;
 use crate::controller::ControllerInput;
 use crate::shell::tcp::{Connection, Event, Taken};
 
@@ -47,6 +49,7 @@ impl ControllerShell {
                 Ok(Ok(stream)) => {
                     info!(%to, "connected");
                     backoff.reset();
+                    peer::watch(&stream);
                     let (connection, read) = Connection::split(stream);
                     *slot.borrow_mut() = Some(Rc::clone(&connection));
                     self.input(ControllerInput::PortUp { port });
@@ -80,7 +83,10 @@ impl ControllerShell {
         *slot.borrow_mut() = Some(Rc::clone(&socket));
         self.input(ControllerInput::PortUp { port });
         let mut buf = [0; 2_048];
-        loop {
+        for nth in 1_u64.. {
+            if nth.is_multiple_of(DATAGRAMS_AT_ONCE) {
+                tokio::task::yield_now().await;
+            }
             // An error is of a datagram of ours that came back; the peer may appear yet.
             if let Ok(count) = socket.recv(&mut buf).await {
                 self.input(ControllerInput::PortBytes { port, bytes: &buf[..count] });

@@ -5,11 +5,14 @@ use std::net::SocketAddr;
 use std::rc::Rc;
 use std::time::Duration as StdDuration;
 
+use rustix::net::sockopt;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::task::spawn_local;
 use tracing::{debug, info, warn};
 
 use super::{Client, ControllerShell, Report, closed};
+use crate::bus::peer;
+use crate::bus::timer::now;
 use crate::controller::{ConnId, ControllerInput, Link};
 use crate::shell::tcp::{Connection, Event};
 use crate::shell::udp;
@@ -17,17 +20,19 @@ use crate::shell::udp;
 impl ControllerShell {
     /// Takes the connections of one TCP server.
     pub(super) async fn serve(self: Rc<Self>, link: Link, listener: TcpListener) {
+        peer::bound(&listener);
         loop {
             match listener.accept().await {
                 Ok((stream, peer)) => {
-                    if link == Link::State {
-                        // What waits in the kernel is old when it is read: a second's worth is enough.
-                        let _ = rustix::net::sockopt::set_socket_send_buffer_size(&stream, STATE_BUFFER);
-                    }
                     self.take(link, stream, peer);
+                    // However many more there are, the others come first.
+                    tokio::task::yield_now().await;
                 }
                 Err(error) => {
-                    warn!(?link, %error, "a connection could not be taken");
+                    self.count(|counters| counters.accept_failures += 1);
+                    if let Some(more) = self.complaints.take(now()) {
+                        warn!(?link, %error, more, "a connection could not be taken");
+                    }
                     tokio::time::sleep(StdDuration::from_millis(50)).await;
                 }
             }
@@ -37,6 +42,12 @@ impl ControllerShell {
     fn take(self: &Rc<Self>, link: Link, stream: TcpStream, peer: SocketAddr) {
         let conn = ConnId(self.next_connection.get());
         self.next_connection.set(conn.0 + 1);
+        match link {
+            // What waits in the system is old when it is read: a second's worth is enough.
+            Link::State => drop(sockopt::set_socket_send_buffer_size(&stream, STATE_BUFFER)),
+            Link::Command | Link::Modbus => peer::give_up_after(&stream, ANSWER_PATIENCE),
+        }
+        peer::watch(&stream);
         let (connection, read) = Connection::split(stream);
         let client = Client { link, connection: Rc::clone(&connection), subscribed: false };
         self.connections.borrow_mut().insert(conn, client);
@@ -49,10 +60,12 @@ impl ControllerShell {
             client.subscribed = link == Link::State;
         }
         if connection.is_closed() {
-            warn!(?link, %peer, "refused");
-        } else {
-            info!(?link, %peer, conn = conn.0, "connected");
+            if let Some(more) = self.refusals.take(now()) {
+                warn!(?link, %peer, more, "refused");
+            }
+            return;
         }
+        info!(?link, %peer, conn = conn.0, "connected");
         let shell = Rc::clone(self);
         spawn_local(async move {
             let ended = connection.run(read, |event| {
@@ -69,6 +82,7 @@ impl ControllerShell {
                 }
             });
             let ended = ended.await;
+            shell.lingering.borrow_mut().retain(|other| !Rc::ptr_eq(other, &connection));
             debug!(?link, %peer, conn = conn.0, ?ended, "disconnected");
             let known = shell.connections.borrow_mut().remove(&conn).is_some();
             if known {
@@ -80,7 +94,10 @@ impl ControllerShell {
     /// Takes the datagrams of port 2011, and the errors that ours provoked.
     pub(super) async fn serve_udp(self: Rc<Self>) {
         let mut buf = [0; 2_048];
-        loop {
+        for nth in 1_u64.. {
+            if nth.is_multiple_of(DATAGRAMS_AT_ONCE) {
+                tokio::task::yield_now().await;
+            }
             match self.udp.recv_from(&mut buf).await {
                 Ok((count, peer)) => self.input(ControllerInput::Udp2011 { peer, bytes: &buf[..count] }),
                 Err(_) => {
@@ -115,3 +132,7 @@ impl ControllerShell {
 
 /// About a second of the state stream.
 const STATE_BUFFER: usize = 16 * 1_024;
+/// How long a client of port 2000 or Modbus may leave its answers to us.
+const ANSWER_PATIENCE: StdDuration = StdDuration::from_secs(30);
+/// Most datagrams taken before the others have a turn.
+pub(super) const DATAGRAMS_AT_ONCE: u64 = 16;
