@@ -1,18 +1,186 @@
 //! Logging to stderr: stdout is for results.
+//!
+//! A thread of its own writes. Whoever logs is never kept waiting by a reader that has stopped reading:
+//! beyond [`MOST_WAITING`] bytes lines are lost, and the next line that is not tells how many.
 
-use std::io::{IsTerminal, stderr};
+use std::io::{self, IsTerminal, Write, stderr};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 use tracing_subscriber::EnvFilter;
 
 /// Warnings always; `-v` what happens, `-vv` everything. `RUST_LOG` decides when it is set.
-pub(super) fn start(verbose: u8) {
+pub(super) fn start(verbose: u8) -> Log {
     let level = match verbose {
         0 => "warn",
         1 => "info",
         _ => "trace",
     };
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
+    let log = Log::start(stderr());
+    let lines = Arc::clone(&log.lines);
+    let format = tracing_subscriber::fmt().with_env_filter(filter);
+    let format = format.with_writer(move || Line(Arc::clone(&lines)));
     // Fails only when somebody has set up logging before, which is as good.
-    let format = tracing_subscriber::fmt().with_env_filter(filter).with_writer(stderr);
     let _ = format.with_ansi(stderr().is_terminal()).try_init();
+    log
+}
+
+/// The log; when it is dropped, what waits is written, if that does not take long.
+#[derive(Debug)]
+pub(super) struct Log {
+    lines: Arc<Lines>,
+}
+
+#[derive(Debug, Default)]
+struct Lines {
+    waiting: Mutex<Waiting>,
+    changed: Condvar,
+}
+
+#[derive(Debug, Default)]
+struct Waiting {
+    bytes: Vec<u8>,
+    lost: u64,
+    /// The thread is writing what it took from here.
+    writing: bool,
+}
+
+impl Log {
+    fn start(mut out: impl Write + Send + 'static) -> Self {
+        let lines = Arc::new(Lines::default());
+        let own = Arc::clone(&lines);
+        // Without a thread nothing is written, and nothing else suffers.
+        let _ = std::thread::Builder::new().name("log".to_owned()).spawn(move || {
+            loop {
+                let bytes = own.take();
+                let _ = out.write_all(&bytes);
+                let _ = out.flush();
+                own.lock().writing = false;
+                own.changed.notify_all();
+            }
+        });
+        Self { lines }
+    }
+}
+
+impl Drop for Log {
+    fn drop(&mut self) {
+        let waiting = self.lines.lock();
+        let busy = |waiting: &mut Waiting| waiting.writing || !waiting.bytes.is_empty();
+        drop(self.lines.changed.wait_timeout_while(waiting, FAREWELL, busy));
+    }
+}
+
+impl Lines {
+    fn lock(&self) -> MutexGuard<'_, Waiting> {
+        self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn put(&self, line: &[u8]) {
+        let mut waiting = self.lock();
+        if waiting.bytes.len() + line.len() > MOST_WAITING {
+            waiting.lost += 1;
+            return;
+        }
+        let lost = std::mem::take(&mut waiting.lost);
+        if lost > 0 {
+            waiting.bytes.extend_from_slice(format!("{lost} lines of the log are lost\n").as_bytes());
+        }
+        waiting.bytes.extend_from_slice(line);
+        self.changed.notify_all();
+    }
+
+    /// Waits for lines and takes them.
+    fn take(&self) -> Vec<u8> {
+        let none = |waiting: &mut Waiting| waiting.bytes.is_empty();
+        let waited = self.changed.wait_while(self.lock(), none);
+        let mut waiting = waited.unwrap_or_else(PoisonError::into_inner);
+        waiting.writing = true;
+        std::mem::take(&mut waiting.bytes)
+    }
+}
+
+/// One event's line.
+struct Line(Arc<Lines>);
+
+impl Write for Line {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.0.put(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+const MOST_WAITING: usize = 1 << 20;
+/// How long the end waits for a reader.
+const FAREWELL: Duration = Duration::from_millis(500);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::sync::mpsc::{Receiver, Sender, channel};
+
+    /// Takes a write whenever it is let to, and passes it on.
+    struct Slow(Receiver<()>, Sender<Vec<u8>>);
+
+    impl Write for Slow {
+        fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+            self.0.recv().map_err(io::Error::other)?;
+            self.1.send(bytes.to_vec()).map_err(io::Error::other)?;
+            Ok(bytes.len())
+        }
+
+        fn flush(&mut self) -> io::Result<()> {
+            Ok(())
+        }
+    }
+
+    #[test]
+    fn a_reader_that_stops_costs_lines_and_nothing_else() {
+        let (go, may) = channel();
+        let (written, seen) = channel();
+        let log = Log::start(Slow(may, written));
+        log.lines.put(b"first\n");
+        let line = [b'x'; 1 << 10];
+        // The first may or may not have been taken by then.
+        for _ in 0..3 << 10 {
+            log.lines.put(&line);
+        }
+        assert!(log.lines.lock().bytes.len() <= MOST_WAITING);
+        let lost = log.lines.lock().lost;
+        assert!(lost >= 2 << 10, "{lost}");
+        go.send(()).unwrap();
+        go.send(()).unwrap();
+        let mut all = seen.recv().unwrap();
+        assert!(all.starts_with(b"first\n"));
+        if all.len() < 1 << 10 {
+            all = seen.recv().unwrap();
+        }
+        assert!(all.len() <= MOST_WAITING);
+        while log.lines.lock().bytes.len() > MOST_WAITING / 2 {
+            std::thread::yield_now();
+        }
+        log.lines.put(b"last\n");
+        drop(go);
+        let text = String::from_utf8(log.lines.lock().bytes.clone()).unwrap();
+        assert!(text.is_empty() || text == format!("{lost} lines of the log are lost\nlast\n"), "{text}");
+    }
+
+    #[test]
+    fn the_end_waits_for_what_was_said() {
+        let (go, may) = channel();
+        let (written, seen) = channel();
+        let log = Log::start(Slow(may, written));
+        log.lines.put(b"goodbye\n");
+        let reader = std::thread::spawn(move || {
+            go.send(()).unwrap();
+            seen.recv().unwrap()
+        });
+        drop(log);
+        assert_eq!(reader.join().unwrap(), b"goodbye\n");
+    }
 }

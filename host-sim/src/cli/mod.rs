@@ -217,7 +217,7 @@ struct DecodeArgs {
 /// Runs what was typed.
 pub fn main() -> ExitCode {
     let cli = Cli::parse();
-    log::start(cli.verbose);
+    let _log = log::start(cli.verbose);
     let mut out = io::stdout().lock();
     let done = match cli.command.unwrap_or(Command::Demo) {
         Command::Demo => {

@@ -140,7 +140,9 @@ fn joined(thread: JoinHandle<Result<(), StartError>>) -> Result<(), StartError> 
 pub(super) fn foreground(handle: Handle, options: &RunOptions) -> Result<(), StartError> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
     let runtime = runtime.map_err(|error| StartError::new(format!("no runtime: {error}")))?;
-    runtime.block_on(async {
+    let mut lines =
+        Lines::start().map_err(|error| StartError::new(format!("no thread for statistics: {error}")))?;
+    let result = runtime.block_on(async {
         // Signals are caught before anybody can know that we are ready.
         let refused = |error: io::Error| StartError::new(format!("signals: {error}"));
         let mut interrupt = signal(SignalKind::interrupt()).map_err(refused)?;
@@ -149,7 +151,7 @@ pub(super) fn foreground(handle: Handle, options: &RunOptions) -> Result<(), Sta
             write_ready(path, handle.ready())
                 .map_err(|error| StartError::new(format!("--ready {}: {error}", path.display())))?;
         }
-        print_line(&format!("ready {}", handle.ready()));
+        lines.print(format!("ready {}", handle.ready()));
         let mut ticks = options.stats.map(tokio::time::interval);
         let mut watch = tokio::time::interval(WATCH);
         let result = loop {
@@ -157,8 +159,9 @@ pub(super) fn foreground(handle: Handle, options: &RunOptions) -> Result<(), Sta
                 _ = interrupt.recv() => break Ok(()),
                 _ = terminate.recv() => break Ok(()),
                 () = tick(&mut ticks) => {
-                    if let Some(stats) = handle.stats() {
-                        print_line(&stats.to_string());
+                    if let Some(mut stats) = handle.stats() {
+                        stats["lost_lines"] = lines.lost.into();
+                        lines.print(stats.to_string());
                     }
                 }
                 _ = watch.tick() => {
@@ -173,8 +176,48 @@ pub(super) fn foreground(handle: Handle, options: &RunOptions) -> Result<(), Sta
             let _ = std::fs::remove_file(path);
         }
         result.and(ended)
-    })
+    });
+    lines.finish();
+    result
 }
+
+/// Lines for stdout. A thread of its own writes them: a reader that does not read must not keep signals
+/// from being heard. What it leaves is lost and counted.
+struct Lines {
+    waiting: blocking::SyncSender<String>,
+    /// Closed when everything has been written.
+    written: blocking::Receiver<()>,
+    lost: u64,
+}
+
+impl Lines {
+    fn start() -> io::Result<Self> {
+        let (waiting, inbox) = blocking::sync_channel(MOST_LINES);
+        let (open, written) = blocking::channel();
+        std::thread::Builder::new().name("stdout".to_owned()).spawn(move || {
+            let _open: blocking::Sender<()> = open;
+            inbox.into_iter().for_each(|line: String| print_line(&line));
+        })?;
+        Ok(Self { waiting, written, lost: 0 })
+    }
+
+    fn print(&mut self, line: String) {
+        if self.waiting.try_send(line).is_err() {
+            self.lost += 1;
+        }
+    }
+
+    /// Waits for the reader, but not for long.
+    fn finish(self) {
+        drop(self.waiting);
+        let _ = self.written.recv_timeout(FAREWELL);
+    }
+}
+
+/// Lines that wait for a reader of stdout.
+const MOST_LINES: usize = 16;
+/// How long the end waits for it.
+const FAREWELL: std::time::Duration = std::time::Duration::from_millis(500);
 
 /// How often the foreground looks whether the shell still runs.
 const WATCH: std::time::Duration = std::time::Duration::from_millis(100);
