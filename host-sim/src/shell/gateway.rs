@@ -22,6 +22,7 @@ use super::host::{self, Handle, Shell};
 use super::link::{self, Endpoint, LinkControl, LinkEvent};
 use super::{RunOptions, StartError};
 use crate::bus::bind::Bind;
+use crate::bus::peer;
 use crate::bus::port::{Port, PortBus, PortEvent, PortTx};
 use crate::bus::realtime::{self, Scheduling};
 use crate::bus::timer::{Timer, now};
@@ -246,7 +247,13 @@ impl Core {
                 kind => kind.name(),
             };
             let mut info = json!({ "state": link.state.name() });
-            for part in [json!(link.history), json!(link.counters)] {
+            let turned_away = match link.kind {
+                LinkKind::RecipeTcpListen { .. } | LinkKind::RecipeUdpListen { .. } => {
+                    self.links.get(&link.id).map(|control| control.turned_away())
+                }
+                _ => None,
+            };
+            for part in [json!(link.history), json!(link.counters), json!(turned_away)] {
                 if let (Value::Object(info), Value::Object(part)) = (&mut info, part) {
                     info.extend(part);
                 }
@@ -338,12 +345,15 @@ async fn open_endpoint(config: &GatewayConfig, kind: LinkKind) -> Result<Endpoin
         LinkKind::RecipeTcpListen { port } => {
             let address = listen(port);
             let listener = TcpListener::bind(address).await;
-            Endpoint::TcpListen(listener.map_err(|error| refused(address, error))?)
+            let listener = listener.map_err(|error| refused(address, error))?;
+            peer::bound(&listener);
+            Endpoint::TcpListen { listener, controller: host()? }
         }
         LinkKind::RecipeUdpListen { port } => {
             let address = listen(port);
             let socket = UdpSocket::bind(address).await;
-            Endpoint::UdpListen(socket.map_err(|error| refused(address, error))?)
+            let socket = socket.map_err(|error| refused(address, error))?;
+            Endpoint::UdpListen { socket, controller: host()? }
         }
     })
 }
@@ -352,8 +362,8 @@ impl Endpoint {
     /// Where a listening link listens.
     fn place(&self) -> String {
         let address = match self {
-            Self::TcpListen(listener) => listener.local_addr(),
-            Self::UdpListen(socket) => socket.local_addr(),
+            Self::TcpListen { listener, .. } => listener.local_addr(),
+            Self::UdpListen { socket, .. } => socket.local_addr(),
             Self::Tcp { host, port } | Self::Udp { host, port } => return format!("{host}:{port}"),
         };
         address.map_or_else(|_| String::new(), |address| address.to_string())

@@ -7,14 +7,18 @@
 use std::cell::{Cell, RefCell};
 use std::collections::VecDeque;
 use std::io;
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 
+use serde::Serialize;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream, UdpSocket};
 use tokio::sync::Notify;
-use tracing::{debug, info};
+use tracing::{debug, info, warn};
 
 use crate::bus::connect::connect;
+use crate::bus::peer;
+use crate::bus::quota::Quota;
+use crate::bus::timer::now;
 
 /// What a link connects to.
 #[derive(Debug)]
@@ -23,10 +27,10 @@ pub(super) enum Endpoint {
     Tcp { host: String, port: u16 },
     /// The controller's UDP server.
     Udp { host: String, port: u16 },
-    /// Where the controller's TCP client connects to.
-    TcpListen(TcpListener),
-    /// Where the controller's UDP client sends to.
-    UdpListen(UdpSocket),
+    /// Where the controller's TCP client connects to. Nobody else does.
+    TcpListen { listener: TcpListener, controller: String },
+    /// Where the controller's UDP client sends to. Nobody else does.
+    UdpListen { socket: UdpSocket, controller: String },
 }
 
 /// What a link tells the gateway.
@@ -45,6 +49,17 @@ pub(super) struct LinkControl {
     turn: Cell<u64>,
     outbox: RefCell<VecDeque<Vec<u8>>>,
     changed: Notify,
+    turned_away: Cell<TurnedAway>,
+    complaints: Quota,
+}
+
+/// Who came to a listening link and was not taken.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+pub(super) struct TurnedAway {
+    /// Connections and datagrams from other addresses than the controller's.
+    pub(super) strangers: u64,
+    /// Connections of the controller's address while there was one.
+    pub(super) refused: u64,
 }
 
 /// One transmission is in flight at a time, so this is never reached by a living link.
@@ -69,6 +84,30 @@ impl LinkControl {
             outbox.push_back(bytes.to_vec());
         }
         self.changed.notify_one();
+    }
+
+    /// Who was not taken so far.
+    pub(super) fn turned_away(&self) -> TurnedAway {
+        self.turned_away.get()
+    }
+
+    fn turn_away(&self, name: &str, peer: SocketAddr, why: &str, count: impl FnOnce(&mut TurnedAway)) {
+        let mut turned_away = self.turned_away.get();
+        count(&mut turned_away);
+        self.turned_away.set(turned_away);
+        if let Some(more) = self.complaints.take(now()) {
+            warn!(link = name, %peer, more, "turned away: {why}");
+        }
+    }
+
+    /// Whether it is the controller that came.
+    fn knows(&self, name: &str, controller: &[IpAddr], peer: SocketAddr) -> bool {
+        let known = controller.contains(&peer.ip().to_canonical());
+        if !known {
+            let count = |turned_away: &mut TurnedAway| turned_away.strangers += 1;
+            self.turn_away(name, peer, "not controller.address", count);
+        }
+        known
     }
 
     fn turn_over(&self) {
@@ -129,15 +168,15 @@ pub(super) async fn run(
                     Err(error) => Err(error),
                 }
             }
-            Endpoint::TcpListen(listener) => {
+            Endpoint::TcpListen { listener, controller } => {
                 let accepted = tokio::select! {
-                    accepted = listener.accept() => accepted,
+                    accepted = accept(name, listener, controller, control) => accepted,
                     () = control.over(turn) => continue,
                 };
                 match accepted {
-                    Ok((stream, peer)) => {
-                        info!(link = name, %peer, "the controller connected");
-                        pump_tcp(name, stream, Some(listener), control, turn, &mut events).await
+                    Ok((stream, known)) => {
+                        let others = Some((listener, &known[..]));
+                        pump_tcp(name, stream, others, control, turn, &mut events).await
                     }
                     Err(error) => Err(error),
                 }
@@ -150,21 +189,27 @@ pub(super) async fn run(
                 match connected {
                     Ok(socket) => {
                         events(LinkEvent::Up);
-                        pump_udp(&socket, None, control, turn, &mut events).await
+                        pump_udp(name, &socket, None, control, turn, &mut events).await
                     }
                     Err(error) => Err(error),
                 }
             }
-            Endpoint::UdpListen(socket) => match first_datagram(socket, control, turn).await {
-                Some(Ok((peer, datagram))) => {
-                    info!(link = name, %peer, "the controller sends");
-                    events(LinkEvent::Up);
-                    events(LinkEvent::Bytes(&datagram));
-                    pump_udp(socket, Some(peer), control, turn, &mut events).await
+            Endpoint::UdpListen { socket, controller } => {
+                let received = tokio::select! {
+                    received = first_datagram(name, socket, controller, control) => received,
+                    () = control.over(turn) => continue,
+                };
+                match received {
+                    Ok((peer, known, datagram)) => {
+                        info!(link = name, %peer, "the controller sends");
+                        events(LinkEvent::Up);
+                        events(LinkEvent::Bytes(&datagram));
+                        let from = Some((peer, &known[..]));
+                        pump_udp(name, socket, from, control, turn, &mut events).await
+                    }
+                    Err(error) => Err(error),
                 }
-                Some(Err(error)) => Err(error),
-                None => continue,
-            },
+            }
         };
         // A turn that is over was ended by the engine: it expects no report.
         if control.turn.get() == turn {
@@ -182,22 +227,26 @@ pub(super) async fn run(
 async fn pump_tcp(
     name: &str,
     stream: TcpStream,
-    listener: Option<&TcpListener>,
+    others: Option<(&TcpListener, &[IpAddr])>,
     control: &LinkControl,
     turn: u64,
     events: &mut impl FnMut(LinkEvent<'_>),
 ) -> io::Result<()> {
-    stream.set_nodelay(true)?;
+    peer::watch(&stream);
     events(LinkEvent::Up);
     let (mut reader, mut writer) = stream.into_split();
     let events = RefCell::new(events);
     let reading = async {
-        let mut chunk = vec![0; 4096];
+        let mut chunk = vec![0; CHUNK];
         loop {
             match reader.read(&mut chunk).await? {
                 0 => return Ok(()),
                 len if control.turn.get() == turn => {
                     (events.borrow_mut())(LinkEvent::Bytes(&chunk[..len]));
+                    if len == CHUNK {
+                        // There is more: the others come first.
+                        tokio::task::yield_now().await;
+                    }
                 }
                 _ => return Ok(()),
             }
@@ -219,7 +268,7 @@ async fn pump_tcp(
     let done = tokio::select! {
         done = reading => done,
         done = writing => done,
-        () = refuse_others(name, listener) => Ok(()),
+        () = refuse_others(name, others, control) => Ok(()),
     };
     if control.turn.get() != turn {
         // The engine has given the connection up. What the peer has not got yet would otherwise still be
@@ -229,16 +278,46 @@ async fn pump_tcp(
     done
 }
 
+/// The next connection of the controller, and its addresses.
+async fn accept(
+    name: &str,
+    listener: &TcpListener,
+    controller: &str,
+    control: &LinkControl,
+) -> io::Result<(TcpStream, Vec<IpAddr>)> {
+    let known = addresses_of(controller).await?;
+    loop {
+        let (stream, peer) = listener.accept().await?;
+        if control.knows(name, &known, peer) {
+            info!(link = name, %peer, "the controller connected");
+            return Ok((stream, known));
+        }
+        drop(stream);
+        tokio::task::yield_now().await;
+    }
+}
+
 /// A second client of a listening link is turned away: one connection carries one recipe.
-async fn refuse_others(name: &str, listener: Option<&TcpListener>) {
-    let Some(listener) = listener else { return std::future::pending().await };
+async fn refuse_others(name: &str, others: Option<(&TcpListener, &[IpAddr])>, control: &LinkControl) {
+    let Some((listener, known)) = others else { return std::future::pending().await };
     loop {
         match listener.accept().await {
-            Ok((_, peer)) => info!(link = name, %peer, "refused: there is a connection already"),
+            Ok((stream, peer)) => {
+                drop(stream);
+                if control.knows(name, known, peer) {
+                    let count = |turned_away: &mut TurnedAway| turned_away.refused += 1;
+                    control.turn_away(name, peer, "there is a connection already", count);
+                }
+                tokio::task::yield_now().await;
+            }
             // Out of descriptors, most likely: they come back when connections end.
             Err(_) => tokio::time::sleep(std::time::Duration::from_millis(100)).await,
         }
     }
+}
+
+async fn addresses_of(host: &str) -> io::Result<Vec<IpAddr>> {
+    Ok(tokio::net::lookup_host((host, 0)).await?.map(|address| address.ip().to_canonical()).collect())
 }
 
 async fn connect_udp(host: &str, port: u16) -> io::Result<UdpSocket> {
@@ -250,38 +329,55 @@ async fn connect_udp(host: &str, port: u16) -> io::Result<UdpSocket> {
     Ok(socket)
 }
 
+/// The controller's first datagram, where it came from, and the controller's addresses.
 async fn first_datagram(
+    name: &str,
     socket: &UdpSocket,
+    controller: &str,
     control: &LinkControl,
-    turn: u64,
-) -> Option<io::Result<(SocketAddr, Vec<u8>)>> {
+) -> io::Result<(SocketAddr, Vec<IpAddr>, Vec<u8>)> {
+    let known = addresses_of(controller).await?;
     let mut datagram = vec![0; MAX_DATAGRAM];
-    tokio::select! {
-        received = socket.recv_from(&mut datagram) => Some(received.map(|(len, peer)| {
+    for nth in 1_u64.. {
+        let (len, peer) = socket.recv_from(&mut datagram).await?;
+        if control.knows(name, &known, peer) {
             datagram.truncate(len);
-            (peer, datagram)
-        })),
-        () = control.over(turn) => None,
+            return Ok((peer, known, datagram));
+        }
+        take_turns(nth).await;
+    }
+    Err(io::ErrorKind::Interrupted.into())
+}
+
+/// However many datagrams there are, the others come first now and then.
+async fn take_turns(nth: u64) {
+    if nth.is_multiple_of(DATAGRAMS_AT_ONCE) {
+        tokio::task::yield_now().await;
     }
 }
 
-/// Moves datagrams both ways; of a listening socket, answers whoever sent last.
+/// Moves datagrams both ways; of a listening socket, answers where the controller sent from last.
 async fn pump_udp(
+    name: &str,
     socket: &UdpSocket,
-    peer: Option<SocketAddr>,
+    from: Option<(SocketAddr, &[IpAddr])>,
     control: &LinkControl,
     turn: u64,
     events: &mut impl FnMut(LinkEvent<'_>),
 ) -> io::Result<()> {
-    let peer = Cell::new(peer);
+    let peer = Cell::new(from.map(|(peer, _)| peer));
     let events = RefCell::new(events);
     let reading = async {
         let mut datagram = vec![0; MAX_DATAGRAM];
-        loop {
-            let len = match peer.get() {
+        for nth in 1_u64.. {
+            take_turns(nth).await;
+            let len = match from {
                 None => socket.recv(&mut datagram).await?,
-                Some(_) => {
+                Some((_, known)) => {
                     let (len, from) = socket.recv_from(&mut datagram).await?;
+                    if !control.knows(name, known, from) {
+                        continue;
+                    }
                     peer.set(Some(from));
                     len
                 }
@@ -291,6 +387,7 @@ async fn pump_udp(
             }
             (events.borrow_mut())(LinkEvent::Bytes(&datagram[..len]));
         }
+        Ok(())
     };
     let writing = async {
         while let Some(bytes) = control.next(turn).await {
@@ -310,6 +407,10 @@ async fn pump_udp(
     }
 }
 
+/// Most bytes read at once.
+const CHUNK: usize = 2_048;
+/// Most datagrams taken before the others have a turn.
+const DATAGRAMS_AT_ONCE: u64 = 16;
 /// Longer than any frame, so that a datagram that is too long is seen to be.
 const MAX_DATAGRAM: usize = 2048;
 

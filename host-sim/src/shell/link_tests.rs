@@ -78,6 +78,14 @@ fn inside(test: impl AsyncFnOnce()) {
     });
 }
 
+fn tcp_listen(listener: TcpListener) -> Endpoint {
+    Endpoint::TcpListen { listener, controller: "127.0.0.1".to_owned() }
+}
+
+fn udp_listen(socket: UdpSocket) -> Endpoint {
+    Endpoint::UdpListen { socket, controller: "127.0.0.1".to_owned() }
+}
+
 async fn server() -> (TcpListener, Endpoint) {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let at = listener.local_addr().unwrap();
@@ -184,12 +192,13 @@ fn a_listening_link_has_one_connection_and_takes_the_next_after_it() {
     inside(async || {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let at = listener.local_addr().unwrap();
-        let link = Running::start(Endpoint::TcpListen(listener));
+        let link = Running::start(tcp_listen(listener));
         link.control.open();
         let mut first = TcpStream::connect(at).await.unwrap();
         link.expect(Seen::Up).await;
         let mut second = TcpStream::connect(at).await.unwrap();
         assert_eq!(second.read(&mut [0; 4]).await.unwrap(), 0, "turned away");
+        assert_eq!(link.control.turned_away(), TurnedAway { strangers: 0, refused: 1 });
         first.write_all(b"here").await.unwrap();
         link.expect(Seen::Bytes(b"here".to_vec())).await;
         drop(first);
@@ -231,7 +240,7 @@ fn a_listening_udp_link_answers_whoever_sent_last() {
     inside(async || {
         let socket = UdpSocket::bind("127.0.0.1:0").await.unwrap();
         let at = socket.local_addr().unwrap();
-        let link = Running::start(Endpoint::UdpListen(socket));
+        let link = Running::start(udp_listen(socket));
         link.control.open();
         let (one, two) =
             (UdpSocket::bind("127.0.0.1:0").await.unwrap(), UdpSocket::bind("127.0.0.1:0").await.unwrap());
@@ -245,5 +254,56 @@ fn a_listening_udp_link_answers_whoever_sent_last() {
         let mut got = [0; 32];
         let (len, _) = two.recv_from(&mut got).await.unwrap();
         assert_eq!(&got[..len], b"to the second");
+    });
+}
+
+/// Another host on the same machine.
+const STRANGER: &str = "127.0.0.2:0";
+
+#[test]
+fn only_the_controller_is_taken_and_others_do_it_no_harm() {
+    inside(async || {
+        let listener = TcpListener::bind("0.0.0.0:0").await.unwrap();
+        let at = SocketAddr::from(([127, 0, 0, 1], listener.local_addr().unwrap().port()));
+        let link = Running::start(tcp_listen(listener));
+        link.control.open();
+        let knock = async || {
+            let socket = TcpSocket::new_v4().unwrap();
+            socket.bind(STRANGER.parse().unwrap()).unwrap();
+            let mut stranger = socket.connect(at).await.unwrap();
+            assert_eq!(stranger.read(&mut [0; 4]).await.unwrap(), 0, "turned away");
+        };
+        knock().await;
+        let mut controller = TcpStream::connect(at).await.unwrap();
+        link.expect(Seen::Up).await;
+        knock().await;
+        controller.write_all(b"here").await.unwrap();
+        link.expect(Seen::Bytes(b"here".to_vec())).await;
+        assert_eq!(link.control.turned_away(), TurnedAway { strangers: 2, refused: 0 });
+    });
+}
+
+#[test]
+fn a_strangers_datagrams_are_neither_taken_nor_answered() {
+    inside(async || {
+        let socket = UdpSocket::bind("0.0.0.0:0").await.unwrap();
+        let at = SocketAddr::from(([127, 0, 0, 1], socket.local_addr().unwrap().port()));
+        let link = Running::start(udp_listen(socket));
+        link.control.open();
+        let stranger = UdpSocket::bind(STRANGER).await.unwrap();
+        let controller = UdpSocket::bind("127.0.0.1:0").await.unwrap();
+        stranger.send_to(b"first", at).await.unwrap();
+        controller.send_to(b"here", at).await.unwrap();
+        link.expect(Seen::Up).await;
+        link.expect(Seen::Bytes(b"here".to_vec())).await;
+        stranger.send_to(b"last", at).await.unwrap();
+        controller.send_to(b"again", at).await.unwrap();
+        link.expect(Seen::Bytes(b"again".to_vec())).await;
+        link.control.send(b"to the controller");
+        link.expect(Seen::Sent).await;
+        let mut got = [0; 32];
+        let (len, _) = controller.recv_from(&mut got).await.unwrap();
+        assert_eq!(&got[..len], b"to the controller");
+        assert_eq!(link.control.turned_away().strangers, 2);
     });
 }

@@ -1,0 +1,249 @@
+//! Peers that mean no good. Each attack is a few threads at the lowest priority, so that what it takes
+//! from others is not the processor but what the process under attack gives it.
+
+use std::io::{Read, Write};
+use std::net::{Ipv4Addr, SocketAddr, TcpStream, UdpSocket};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use rustix::net::{AddressFamily, SocketType, sockopt};
+
+/// An attack under way; ends when dropped.
+pub(crate) struct Attack {
+    shared: Arc<Shared>,
+    threads: Vec<JoinHandle<()>>,
+}
+
+/// What an attack's threads see of each other.
+#[derive(Default)]
+pub(crate) struct Shared {
+    stop: AtomicBool,
+    done: AtomicU64,
+}
+
+impl Shared {
+    fn goes_on(&self) -> bool {
+        !self.stop.load(Ordering::Relaxed)
+    }
+
+    fn count(&self, done: u64) {
+        self.done.fetch_add(done, Ordering::Relaxed);
+    }
+}
+
+impl Attack {
+    /// `threads` times the same, each told which it is.
+    fn start(threads: usize, run: impl Fn(usize, &Shared) + Clone + Send + 'static) -> Self {
+        let shared = Arc::new(Shared::default());
+        let begin = |nth| {
+            let (run, shared) = (run.clone(), Arc::clone(&shared));
+            std::thread::spawn(move || {
+                let _ = rustix::process::setpriority_process(Some(rustix::thread::gettid()), 19);
+                run(nth, &shared);
+            })
+        };
+        let threads = (0..threads).map(begin).collect();
+        Self { shared, threads }
+    }
+
+    /// Connections made, bytes or datagrams sent: what the attack counts itself by.
+    pub(crate) fn done(&self) -> u64 {
+        self.shared.done.load(Ordering::Relaxed)
+    }
+}
+
+impl Drop for Attack {
+    fn drop(&mut self) {
+        self.shared.stop.store(true, Ordering::Relaxed);
+        for thread in self.threads.drain(..) {
+            let _ = thread.join();
+        }
+    }
+}
+
+/// Connects and resets, as a port scan does, as fast as it can.
+pub(crate) fn scan(at: SocketAddr) -> Attack {
+    Attack::start(1, move |_, shared| {
+        while shared.goes_on() {
+            if let Ok(stream) = TcpStream::connect(at) {
+                let _ = sockopt::set_socket_linger(&stream, Some(Duration::ZERO));
+                shared.count(1);
+            }
+        }
+    })
+}
+
+/// Opens connections and keeps them, more and more; those that are closed are opened again.
+pub(crate) fn hoard(at: SocketAddr, most: usize) -> Attack {
+    Attack::start(1, move |_, shared| {
+        let mut held: Vec<TcpStream> = Vec::new();
+        while shared.goes_on() {
+            if let Ok(stream) = TcpStream::connect(at) {
+                let _ = stream.set_nonblocking(true);
+                shared.count(1);
+                held.push(stream);
+            }
+            if held.len() > most {
+                held.retain(|mut stream| !matches!(stream.read(&mut [0; 64]), Ok(0)));
+                held.drain(..held.len().saturating_sub(most));
+            }
+        }
+    })
+}
+
+/// `clients` that send as fast as they are read from, and take what they are answered.
+pub(crate) fn pour(at: SocketAddr, clients: usize, bytes: &'static [u8]) -> Attack {
+    let chunk = filled(bytes);
+    Attack::start(clients, move |_, shared| {
+        let mut got = vec![0; 1 << 16];
+        'again: while shared.goes_on() {
+            let Some(mut stream) = small(at) else { continue };
+            let _ = stream.set_nonblocking(true);
+            let mut rest = &chunk[..];
+            while shared.goes_on() {
+                let mut idle = true;
+                match stream.write(rest) {
+                    Ok(count) => {
+                        shared.count(count as u64);
+                        rest = if count == rest.len() { &chunk } else { &rest[count..] };
+                        idle = false;
+                    }
+                    Err(error) if error.kind() == std::io::ErrorKind::WouldBlock => {}
+                    Err(_) => continue 'again,
+                }
+                match stream.read(&mut got) {
+                    Ok(0) => continue 'again,
+                    Ok(_) => idle = false,
+                    Err(error) if error.kind() == std::io::ErrorKind::WouldBlock => {}
+                    Err(_) => continue 'again,
+                }
+                if idle {
+                    std::thread::sleep(Duration::from_micros(200));
+                }
+            }
+        }
+    })
+}
+
+/// `clients` that send as much as is taken and never read; each begins anew when it is closed, and every
+/// `turn` when one is given.
+pub(crate) fn never_read(at: SocketAddr, clients: usize, bytes: &'static [u8]) -> Attack {
+    let chunk = filled(bytes);
+    Attack::start(1, move |_, shared| {
+        let mut streams: Vec<Option<TcpStream>> = (0..clients).map(|_| None).collect();
+        while shared.goes_on() {
+            let mut idle = true;
+            for slot in &mut streams {
+                if slot.is_none() {
+                    *slot = small(at).filter(|stream| stream.set_nonblocking(true).is_ok());
+                    idle = false;
+                }
+                let Some(stream) = slot else { continue };
+                match stream.write(&chunk) {
+                    Ok(count) => {
+                        shared.count(count as u64);
+                        idle = false;
+                    }
+                    Err(error) if error.kind() == std::io::ErrorKind::WouldBlock => {}
+                    Err(_) => *slot = None,
+                }
+            }
+            if idle {
+                std::thread::sleep(Duration::from_millis(1));
+            }
+        }
+    })
+}
+
+/// Connects, asks for much, breaks the protocol in the same breath and takes nothing: what it is answered
+/// waits at a connection that is closed already. Over and over, holding what it has opened.
+pub(crate) fn ask_and_break(at: SocketAddr, bytes: &'static [u8], keep: usize) -> Attack {
+    Attack::start(2, move |_, shared| {
+        let mut held = std::collections::VecDeque::new();
+        while shared.goes_on() {
+            let Some(mut stream) = small(at) else { continue };
+            if stream.write_all(bytes).is_ok() {
+                shared.count(1);
+            }
+            held.push_back(stream);
+            if held.len() > keep {
+                held.pop_front();
+            }
+        }
+    })
+}
+
+/// `clients` that send a byte every `pause`, none of them ever a whole request.
+pub(crate) fn drip(at: SocketAddr, clients: usize, bytes: &'static [u8], pause: Duration) -> Attack {
+    Attack::start(1, move |_, shared| {
+        let mut streams: Vec<TcpStream> = Vec::new();
+        for nth in 0.. {
+            if !shared.goes_on() {
+                return;
+            }
+            while streams.len() < clients {
+                match small(at) {
+                    Some(stream) => streams.push(stream),
+                    None => break,
+                }
+            }
+            let byte = bytes[nth % bytes.len()];
+            streams.retain_mut(|stream| {
+                let sent = stream.write_all(&[byte]).is_ok();
+                shared.count(u64::from(sent));
+                sent
+            });
+            std::thread::sleep(pause);
+        }
+    })
+}
+
+/// Whether datagrams come from ports that stay.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Ports {
+    /// They stay, and nobody reads what comes to them.
+    Kept,
+    /// Each datagram comes from another, which is closed behind it.
+    New,
+}
+
+/// Datagrams from many ports, each of `datagrams` in turn.
+pub(crate) fn datagrams(
+    at: SocketAddr,
+    source: Ipv4Addr,
+    datagrams: &'static [&'static [u8]],
+    ports: Ports,
+) -> Attack {
+    Attack::start(1, move |_, shared| {
+        let bind = || UdpSocket::bind((source, 0)).unwrap();
+        let mut sockets: Vec<_> = (0..64).map(|_| bind()).collect();
+        for nth in 0_usize.. {
+            if !shared.goes_on() {
+                return;
+            }
+            let datagram = datagrams[nth % datagrams.len()];
+            let place = nth % sockets.len();
+            if ports == Ports::New {
+                sockets[place] = bind();
+            }
+            if sockets[place].send_to(datagram, at).is_ok() {
+                shared.count(1);
+            }
+        }
+    })
+}
+
+/// A connection with as little room for answers as the system gives.
+fn small(at: SocketAddr) -> Option<TcpStream> {
+    let socket = rustix::net::socket(AddressFamily::INET, SocketType::STREAM, None).ok()?;
+    sockopt::set_socket_recv_buffer_size(&socket, 2_048).ok()?;
+    rustix::net::connect(&socket, &at).ok()?;
+    Some(TcpStream::from(socket))
+}
+
+/// About 16 KiB of it.
+fn filled(bytes: &[u8]) -> Vec<u8> {
+    bytes.repeat((16 << 10) / bytes.len() + 1)
+}

@@ -1,0 +1,81 @@
+//! What a process does at the limits of what it was given: descriptors, a reader of its output, places for
+//! clients.
+
+use std::io::Read;
+use std::net::TcpStream;
+use std::process::Stdio;
+use std::time::Duration;
+
+use crate::process::{Process, host_sim};
+use crate::witness::{Witnesses, connect};
+use crate::{alone, attack};
+
+const ROBOT: [&str; 2] = ["--bind=rs485=tcp-listen:127.0.0.1:0", "--bind=can=slcan-tcp:127.0.0.1:0"];
+
+/// Whether somebody is served at port 2000.
+fn answers(process: &Process) -> Option<TcpStream> {
+    let mut stream = connect(process.at("command"));
+    let mut answer = [0; 7];
+    std::io::Write::write_all(&mut stream, b"state\n").ok()?;
+    stream.read_exact(&mut answer).ok()?;
+    (&answer == b"6:0:5:2").then_some(stream)
+}
+
+#[test]
+fn out_of_descriptors_those_that_are_in_go_on_and_others_come_when_there_is_room() {
+    let alone = alone();
+    let mut command = std::process::Command::new("sh");
+    let inner = host_sim("controller", "robot.toml");
+    command.args(["-c", "ulimit -n 48; exec \"$0\" \"$@\""]).arg(inner.get_program()).args(inner.get_args());
+    command.args(ROBOT).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+    let mut process = Process::start(&mut command);
+    let mut witnesses = Witnesses::default();
+    witnesses.udp2011(process.at("udp2011"));
+    witnesses.state(process.at("state"));
+    witnesses.lap(Duration::from_millis(100));
+    let quiet = witnesses.lap(Duration::from_millis(500));
+    let hoard = attack::hoard(process.at("modbus"), 100);
+    process.stats_when(|stats| stats["connections"]["accept_failures"].as_u64() > Some(3));
+    let lap = witnesses.lap(Duration::from_millis(800));
+    lap.is_like(&quiet);
+    drop(hoard);
+    process.stats_when(|stats| stats["modbus"]["open"] == 0);
+    assert!(answers(&process).is_some());
+    drop(witnesses);
+    process.signal("TERM");
+    assert!(process.ended().success());
+    let said = process.said();
+    assert!(said.contains("could not be taken"), "{said}");
+    assert!(said.lines().count() < 20, "a line for each:\n{said}");
+    drop(alone);
+}
+
+#[test]
+fn a_reader_that_does_not_read_keeps_nothing_from_going_on() {
+    let _alone = alone();
+    // Everything is logged, and neither stdout nor stderr is read.
+    let mut command = host_sim("controller", "robot.toml");
+    command.args(ROBOT).arg("-vv").stderr(Stdio::piped());
+    let file = tempfile::NamedTempFile::new().unwrap();
+    command.arg("--ready").arg(file.path());
+    let mut process = Process::unread(&mut command, file.path());
+    let mut witnesses = Witnesses::default();
+    witnesses.udp2011(process.at("udp2011"));
+    witnesses.state(process.at("state"));
+    witnesses.asks("command", process.at("command"), b"state\n", b"6:0:5:2");
+    // Two lines of the log for each connection fill pipes and queues soon.
+    let scan = attack::scan(process.at("command"));
+    while scan.done() < 1_000 {
+        witnesses.lap(Duration::from_millis(50));
+    }
+    let lap = witnesses.lap(Duration::from_secs(1));
+    lap.is_like(&lap);
+    let before = process.usage();
+    witnesses.lap(Duration::from_millis(500));
+    let after = process.usage();
+    assert!(after.rss_kib <= before.rss_kib + crate::MOST_GROWTH_KIB, "{before:?} grew to {after:?}");
+    crate::within_bounds(&after);
+    drop(witnesses);
+    process.signal("INT");
+    assert!(process.ended().success());
+}

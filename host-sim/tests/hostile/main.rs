@@ -1,0 +1,83 @@
+//! Hosts that mean no good: floods, peers that never read or never finish, garbage without end, at the
+//! sockets of real processes. The other clients keep what they get; memory and descriptors stay bounded.
+//!
+//! Each attack is compared with the same run's own quiet time.
+
+mod attack;
+mod controller_side;
+mod gateway_side;
+mod limits;
+mod process;
+mod witness;
+
+use std::sync::{Mutex, MutexGuard};
+use std::time::Duration;
+
+use attack::Attack;
+use process::{Process, Usage};
+use witness::{Lap, Witnesses};
+
+/// One attack at a time: they would be each other's disturbance.
+fn alone() -> MutexGuard<'static, ()> {
+    static ONE: Mutex<()> = Mutex::new(());
+    // Who failed before does no harm to who is next.
+    ONE.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
+}
+
+/// A process, those that depend on it, and what they got while nobody did them harm.
+struct Scene {
+    process: Process,
+    witnesses: Witnesses,
+    quiet: Lap,
+    _alone: MutexGuard<'static, ()>,
+}
+
+impl Scene {
+    fn new(alone: MutexGuard<'static, ()>, process: Process, witnesses: Witnesses) -> Self {
+        // What comes first is the beginning's: connections, first answers.
+        witnesses.lap(Duration::from_millis(100));
+        let quiet = witnesses.lap(QUIET);
+        Self { process, witnesses, quiet, _alone: alone }
+    }
+
+    /// Lets attacks go on for a while: the clients get what they got before, and once everything an attack
+    /// can take has been taken, it gets no more.
+    #[track_caller]
+    fn survives(&self, attacks: Vec<Attack>) {
+        let warm = self.witnesses.lap(WARM_UP);
+        let before = self.process.usage();
+        let lap = self.witnesses.lap(ATTACK);
+        let after = self.process.usage();
+        let done: Vec<_> = attacks.iter().map(Attack::done).collect();
+        // Seen when the test fails, or with --nocapture.
+        println!("quiet  {}\nwarm   {warm}\nattack {lap}\n{before:?}\n{after:?}\ndone {done:?}", self.quiet);
+        assert!(done.iter().all(|&done| done > 20), "an attack that did nothing: {done:?}");
+        lap.is_like(&self.quiet);
+        within_bounds(&before);
+        within_bounds(&after);
+        assert!(after.rss_kib <= before.rss_kib + MOST_GROWTH_KIB, "{before:?} grew to {after:?}");
+    }
+
+    /// It still answers and ends as asked while the attack goes on.
+    #[track_caller]
+    fn ends(self) {
+        drop(self.witnesses);
+        self.process.end();
+    }
+}
+
+#[track_caller]
+fn within_bounds(usage: &Usage) {
+    assert!(usage.rss_kib <= MOST_RSS_KIB, "{usage:?}");
+    assert!(usage.descriptors <= MOST_DESCRIPTORS, "{usage:?}");
+    assert!(usage.threads <= 8, "{usage:?}");
+}
+
+const QUIET: Duration = Duration::from_millis(500);
+const WARM_UP: Duration = Duration::from_millis(400);
+const ATTACK: Duration = Duration::from_millis(800);
+/// docs/devices.md section 7.
+const MOST_RSS_KIB: u64 = 64 << 10;
+const MOST_DESCRIPTORS: usize = 400;
+/// The allocator's way with the same amounts again.
+const MOST_GROWTH_KIB: u64 = 2 << 10;

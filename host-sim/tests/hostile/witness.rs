@@ -1,0 +1,238 @@
+//! Well-behaved clients, each on a thread of its own: what they get is what an attack is judged by.
+
+use std::collections::BTreeMap;
+use std::io::{BufRead, Read, Write};
+use std::net::{SocketAddr, TcpStream, UdpSocket};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use crate::process::PATIENCE;
+
+/// What one client got so far.
+#[derive(Default)]
+struct Tally {
+    count: AtomicU64,
+    /// The longest wait for one of them since the newest lap began, in microseconds.
+    worst: AtomicU64,
+    stop: AtomicBool,
+    trouble: Mutex<Option<String>>,
+}
+
+/// The clients.
+#[derive(Default)]
+pub(crate) struct Witnesses {
+    clients: BTreeMap<&'static str, Client>,
+}
+
+struct Client {
+    tally: Arc<Tally>,
+    paced_by: PacedBy,
+    _thread: JoinHandle<()>,
+}
+
+/// Who decides how much a client gets.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum PacedBy {
+    /// The process: a grid of its own, that nothing may keep it from.
+    Process,
+    /// The client, which asks again when it was answered: it shares with whoever else asks, and must not wait
+    /// long.
+    Client,
+}
+
+/// What the clients got in a stretch of time.
+pub(crate) struct Lap {
+    took: f64,
+    clients: BTreeMap<&'static str, (PacedBy, f64, Duration)>,
+}
+
+impl Witnesses {
+    /// A client that gets one thing whenever `next` returns; it ends with its error.
+    fn watch(
+        &mut self,
+        name: &'static str,
+        paced_by: PacedBy,
+        mut next: impl FnMut() -> std::io::Result<()> + Send + 'static,
+    ) {
+        let tally = Arc::new(Tally::default());
+        let own = Arc::clone(&tally);
+        let thread = std::thread::spawn(move || {
+            while !own.stop.load(Ordering::Relaxed) {
+                let begin = Instant::now();
+                if let Err(error) = next() {
+                    *own.trouble.lock().unwrap() = Some(error.to_string());
+                    return;
+                }
+                own.worst.fetch_max(begin.elapsed().as_micros() as u64, Ordering::Relaxed);
+                own.count.fetch_add(1, Ordering::Relaxed);
+            }
+        });
+        self.clients.insert(name, Client { tally, paced_by, _thread: thread });
+    }
+
+    /// Whole chunks of a stream that begin as they should.
+    #[track_caller]
+    pub(crate) fn stream(&mut self, name: &'static str, at: SocketAddr, len: usize, begin: &'static [u8]) {
+        let mut stream = connect(at);
+        let mut chunk = vec![0; len];
+        self.watch(name, PacedBy::Process, move || {
+            stream.read_exact(&mut chunk)?;
+            if chunk.starts_with(begin) { Ok(()) } else { Err(std::io::Error::other("misaligned")) }
+        });
+    }
+
+    /// A field device: sends a frame whenever it got one.
+    #[track_caller]
+    pub(crate) fn field(
+        &mut self,
+        name: &'static str,
+        at: SocketAddr,
+        sends: &'static [u8],
+        len: usize,
+        begin: &'static [u8],
+    ) {
+        let mut stream = connect(at);
+        let mut chunk = vec![0; len];
+        stream.write_all(sends).unwrap();
+        self.watch(name, PacedBy::Process, move || {
+            stream.read_exact(&mut chunk)?;
+            stream.write_all(sends)?;
+            if chunk.starts_with(begin) { Ok(()) } else { Err(std::io::Error::other("misaligned")) }
+        });
+    }
+
+    /// An slcan client that is there for frames that begin so.
+    #[track_caller]
+    pub(crate) fn slcan(&mut self, name: &'static str, at: SocketAddr, begin: &'static [u8]) {
+        let mut stream = connect(at);
+        stream.write_all(b"S6\rO\r").unwrap();
+        let mut lines = std::io::BufReader::new(stream);
+        let mut line = Vec::new();
+        self.watch(name, PacedBy::Process, move || {
+            loop {
+                line.clear();
+                match lines.read_until(b'\r', &mut line)? {
+                    0 => return Err(std::io::ErrorKind::UnexpectedEof.into()),
+                    _ if line.starts_with(begin) => return Ok(()),
+                    _ => {}
+                }
+            }
+        });
+    }
+
+    /// The packets of port 2001.
+    #[track_caller]
+    pub(crate) fn state(&mut self, at: SocketAddr) {
+        self.stream("state", at, 1_468, &[]);
+    }
+
+    /// The frames of UDP 2011.
+    #[track_caller]
+    pub(crate) fn udp2011(&mut self, at: SocketAddr) {
+        let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
+        socket.set_read_timeout(Some(PATIENCE)).unwrap();
+        socket.connect(at).unwrap();
+        socket.send(&[0xFF, 0xFF, 0x01, 0xEE, 0xEE]).unwrap();
+        let mut frame = [0; 64];
+        self.watch("udp2011", PacedBy::Process, move || match socket.recv(&mut frame)? {
+            28 if frame[..2] == [0xFF, 0xFF] => Ok(()),
+            count => Err(std::io::Error::other(format!("a frame of {count} bytes"))),
+        });
+    }
+
+    /// Asks, takes the answer, waits a little.
+    #[track_caller]
+    pub(crate) fn asks(
+        &mut self,
+        name: &'static str,
+        at: SocketAddr,
+        request: &'static [u8],
+        answer: &'static [u8],
+    ) {
+        let mut stream = connect(at);
+        let mut got = vec![0; answer.len()];
+        self.watch(name, PacedBy::Client, move || {
+            stream.write_all(request)?;
+            stream.read_exact(&mut got)?;
+            if got != answer {
+                return Err(std::io::Error::other(format!("{:?}", String::from_utf8_lossy(&got))));
+            }
+            std::thread::sleep(Duration::from_millis(2));
+            Ok(())
+        });
+    }
+
+    /// What the clients get from now on, for as long as `window`.
+    #[track_caller]
+    pub(crate) fn lap(&self, window: Duration) -> Lap {
+        let begin = Instant::now();
+        let before: Vec<_> = self.clients.values().map(|client| client.tally.begin_lap()).collect();
+        std::thread::sleep(window);
+        let took = begin.elapsed().as_secs_f64();
+        let mut clients = BTreeMap::new();
+        for ((name, client), before) in self.clients.iter().zip(before) {
+            let trouble = client.tally.trouble.lock().unwrap().clone();
+            assert_eq!(trouble, None, "{name}");
+            let count = client.tally.count.load(Ordering::Relaxed) - before;
+            let worst = Duration::from_micros(client.tally.worst.load(Ordering::Relaxed));
+            clients.insert(*name, (client.paced_by, count as f64 / took, worst));
+        }
+        Lap { took, clients }
+    }
+}
+
+impl Tally {
+    fn begin_lap(&self) -> u64 {
+        self.worst.store(0, Ordering::Relaxed);
+        self.count.load(Ordering::Relaxed)
+    }
+}
+
+impl Drop for Witnesses {
+    fn drop(&mut self) {
+        for client in self.clients.values() {
+            client.tally.stop.store(true, Ordering::Relaxed);
+        }
+    }
+}
+
+impl Lap {
+    /// Whether nothing much is missing that there was `before`. Machines that run tests are busy: what an
+    /// attack must not do is to take the clients' share, which would leave next to nothing of it.
+    #[track_caller]
+    pub(crate) fn is_like(&self, before: &Self) {
+        for (name, &(paced_by, own, worst)) in &self.clients {
+            let least = match paced_by {
+                // The ends of the two laps cut off or add one each.
+                PacedBy::Process => before.clients[name].1 * LEAST_SHARE - 2.0 / self.took,
+                PacedBy::Client => LEAST_ANSWERS,
+            };
+            assert!(own >= least, "{name}: {own:.1}/s, at least {least:.1}/s expected");
+            assert!(worst <= LONGEST_WAIT, "{name} waited {worst:?}");
+        }
+    }
+}
+
+impl std::fmt::Display for Lap {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        for (name, (_, per_second, worst)) in &self.clients {
+            write!(f, "{name} {per_second:.1}/s, worst {worst:.1?}; ")?;
+        }
+        Ok(())
+    }
+}
+
+#[track_caller]
+pub(crate) fn connect(at: SocketAddr) -> TcpStream {
+    let stream = TcpStream::connect(at).unwrap();
+    stream.set_read_timeout(Some(PATIENCE)).unwrap();
+    stream.set_nodelay(true).unwrap();
+    stream
+}
+
+const LEAST_SHARE: f64 = 0.4;
+/// A second, when a client asks.
+const LEAST_ANSWERS: f64 = 10.0;
+const LONGEST_WAIT: Duration = Duration::from_secs(2);
