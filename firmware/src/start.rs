@@ -6,7 +6,7 @@
 use core::pin::pin;
 
 use embassy_executor::{SpawnError, SpawnToken, Spawner};
-use embassy_net::{Config, Runner, Stack, StackResources};
+use embassy_net::{Config, Ipv4Cidr, Runner, Stack, StackResources, StaticConfigV4};
 use embassy_time::{Duration, Timer};
 use firmware::fmt::Text;
 use firmware::gateway::Gateway;
@@ -14,7 +14,7 @@ use firmware::led::Condition;
 use firmware::link::{Buffers, Endpoint};
 use firmware::watchdog::{Pulse, TaskName};
 use firmware::{can, error, info, led, link, serial, warn, watchdog};
-use proto_core::config::{Bus, GatewayConfig, image};
+use proto_core::config::{Bus, GatewayConfig, Network, image};
 use proto_core::engine::{LinkId, LinkKind, PortId};
 use static_cell::{ConstStaticCell, StaticCell};
 
@@ -89,6 +89,7 @@ impl core::fmt::Display for Refused {
 struct Wiring {
     ports: heapless::Vec<(PortId, Bus), { firmware::gateway::MAX_FIELD_PORTS }>,
     links: heapless::Vec<(LinkId, LinkKind, Endpoint), MAX_LINKS>,
+    network: Option<Network>,
 }
 
 /// Not inlined: an engine may pass over the stack here, and the configuration is not there yet.
@@ -109,6 +110,7 @@ fn load(board: &mut Board, gateway: &'static mut Gateway) -> Result<(&'static Ga
     let wiring = Wiring {
         ports: config.field_ports().map(|(index, port, _)| (PortId(index), port.bus.clone())).collect(),
         links: gateway.links().map(|(id, kind)| (id, kind, Endpoint::of(&config, kind))).collect(),
+        network: config.network,
     };
     info!(
         "configuration: {} bytes; {} field ports, {} links; the engine takes {} bytes, its configuration {}",
@@ -153,7 +155,7 @@ fn run(tasks: &Tasks, mut board: Board, gateway: &'static Gateway, wiring: Wirin
     static RESOURCES: StaticCell<StackResources<SOCKETS>> = StaticCell::new();
     let resources = RESOURCES.init(StackResources::new());
     let (stack, runner) =
-        embassy_net::new(ethernet, Config::dhcpv4(Default::default()), resources, board::seed());
+        embassy_net::new(ethernet, network_config(wiring.network), resources, board::seed());
     info!("stack: {} bytes while the engine was made", board::stack_used());
     tasks.spawn(TaskName::Network, |pulse| network(pulse, runner));
     tasks.spawn(TaskName::Address, |pulse| address(pulse, stack));
@@ -166,6 +168,15 @@ fn run(tasks: &Tasks, mut board: Board, gateway: &'static Gateway, wiring: Wirin
         });
     }
     Ok(())
+}
+
+fn network_config(own: Option<Network>) -> Config {
+    let Some(own) = own else { return Config::dhcpv4(Default::default()) };
+    Config::ipv4_static(StaticConfigV4 {
+        address: Ipv4Cidr::new(own.address, own.prefix),
+        gateway: own.router,
+        dns_servers: own.dns.into_iter().collect(),
+    })
 }
 
 /// Not watched: it is the one that feeds.

@@ -4,6 +4,7 @@
 //! `FIRMWARE_ELF=... HOST_SIM=target/debug/host-sim cargo test -p firmware --test machine -- --ignored`
 
 use std::io::{BufRead, BufReader, Write};
+use std::net::UdpSocket;
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
@@ -26,7 +27,7 @@ impl Machine {
         let monitor = tempfile::tempdir().unwrap();
         let socket = format!("unix:{}/socket,server=on,wait=off", monitor.path().display());
         let mut qemu = Command::new("qemu-system-arm")
-            .args("-M mps2-an500 -display none -nic user".split(' '))
+            .args("-M mps2-an500 -display none".split(' '))
             .args(["-monitor", &socket])
             .args("-serial null -serial null -serial null -serial stdio".split(' '))
             .args(["-semihosting-config", &arguments, "-kernel"])
@@ -136,6 +137,69 @@ fn image(folder: &tempfile::TempDir, example: &str, sets: &[&str]) -> PathBuf {
     image
 }
 
+/// An Ethernet cable to the machine: each datagram is a frame.
+struct Cable {
+    socket: UdpSocket,
+    machine: u16,
+}
+
+impl Cable {
+    /// Two free ports, one for each end.
+    fn new() -> Self {
+        let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
+        socket.set_read_timeout(Some(PATIENCE)).unwrap();
+        let machine = UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+        Self { socket, machine }
+    }
+
+    fn option(&self) -> String {
+        let ours = self.socket.local_addr().unwrap();
+        format!("socket,udp={ours},localaddr=127.0.0.1:{}", self.machine)
+    }
+
+    fn receive(&self) -> Vec<u8> {
+        let mut frame = vec![0; 2048];
+        let len = self.socket.recv(&mut frame).expect("the machine sends something");
+        frame.truncate(len);
+        frame
+    }
+
+    /// To whoever sent `frame`.
+    fn answer(&self, frame: &[u8], kind: [u8; 2], payload: &[u8]) {
+        let whole = [&frame[6..12], &CABLE_END, &kind, payload].concat();
+        self.socket.send_to(&whole, ("127.0.0.1", self.machine)).unwrap();
+    }
+
+    /// Every address of the network is at this end.
+    fn answer_arp(&self, frame: &[u8]) {
+        let (sender, asked) = (&frame[22..32], &frame[38..42]);
+        self.answer(frame, [8, 6], &[&[0, 1, 8, 0, 6, 4, 0, 2][..], &CABLE_END, asked, sender].concat());
+    }
+
+    /// Every name has this address.
+    fn answer_dns(&self, frame: &[u8], address: [u8; 4]) {
+        let (ip, udp) = (&frame[14..34], &frame[34..]);
+        let question = &udp[8..usize::from(u16::from_be_bytes([udp[4], udp[5]]))];
+        let record = [&[0xC0, 12, 0, 1, 0, 1, 0, 0, 0, 60, 0, 4], &address[..]].concat();
+        let dns = [&question[..2], &[0x81, 0x80, 0, 1, 0, 1, 0, 0, 0, 0], &question[12..], &record].concat();
+        let length = (dns.len() as u16 + 8).to_be_bytes();
+        // Without a checksum, as UDP over IPv4 may be.
+        let udp = [&udp[2..4], &udp[..2], &length, &[0, 0], &dns].concat();
+        let mut ip = [
+            &[0x45, 0],
+            &(udp.len() as u16 + 20).to_be_bytes(),
+            &[0, 0, 0, 0, 64, 17, 0, 0][..],
+            &ip[16..20],
+            &ip[12..16],
+        ]
+        .concat();
+        let sum: u32 = ip.chunks(2).map(|word| u32::from(u16::from_be_bytes([word[0], word[1]]))).sum();
+        let sum = !((sum & 0xFFFF) + (sum >> 16)) as u16;
+        ip[10..12].copy_from_slice(&sum.to_be_bytes());
+        self.answer(frame, [8, 0], &[ip, udp].concat());
+    }
+}
+
 fn nothing() -> &'static Path {
     Path::new("/nowhere/cell.img")
 }
@@ -175,11 +239,43 @@ fn a_task_that_keeps_the_processor_is_named_and_after_the_reset_all_begins_again
 #[test]
 #[ignore = "needs QEMU and the firmware"]
 fn the_led_blinks_when_nothing_runs() {
-    let mut machine = Machine::start(nothing(), "none", &[]);
+    let mut machine = Machine::start(nothing(), "none", &["-nic", "user"]);
     machine.until("nothing runs");
     for _ in 0..3 {
         machine.until_seen(FPGAIO_LED, &[0, 1]);
     }
+}
+
+/// The board has the address of its file, asks the file's name server for the controller, and connects
+/// to where that says it is.
+#[test]
+#[ignore = "needs QEMU and the firmware"]
+fn with_an_address_of_its_own_the_board_finds_the_controller_by_name() {
+    let folder = tempfile::tempdir().unwrap();
+    let sets = ["controller.address=robot.cell", "network.address=10.9.0.2/24", "network.dns=10.9.0.1"];
+    let image = image(&folder, "rs485-system.toml", &sets);
+    let cable = Cable::new();
+    let mut machine = Machine::start(&image, "none", &["-nic", &cable.option()]);
+    machine.until("address 10.9.0.2/24");
+    let mut asked = 0;
+    loop {
+        let frame = cable.receive();
+        match frame.get(12..14) {
+            Some([8, 6]) => cable.answer_arp(&frame),
+            Some([8, 0]) if frame[23] == UDP && frame[36..38] == [0, 53] => {
+                assert_eq!((&frame[26..30], &frame[30..34]), (&[10, 9, 0, 2][..], &[10, 9, 0, 1][..]));
+                assert_eq!(&frame[54..66], b"\x05robot\x04cell\0");
+                cable.answer_dns(&frame, [10, 9, 0, 9]);
+                asked += 1;
+            }
+            Some([8, 0]) if frame[23] == TCP => {
+                assert_eq!(frame[30..34], [10, 9, 0, 9], "the address that the name has");
+                break;
+            }
+            _ => {}
+        }
+    }
+    assert!(asked > 0);
 }
 
 /// Longer than the watchdog's period; the links to a controller that is not there come and go meanwhile.
@@ -188,7 +284,7 @@ fn the_led_blinks_when_nothing_runs() {
 fn a_run_without_trouble_never_starves_the_watchdog() {
     let folder = tempfile::tempdir().unwrap();
     let image = image(&folder, "force-sensor.toml", &["controller.address=10.0.2.2"]);
-    let mut machine = Machine::start(&image, "none", &[]);
+    let mut machine = Machine::start(&image, "none", &["-nic", "user"]);
     machine.until("address 10.0.2.15");
     let log = machine.listen(Duration::from_secs(12));
     assert_eq!(log.matches("recipe gateway").count(), 1, "{log}");
@@ -214,6 +310,11 @@ fn a_stack_overflow_and_a_read_of_nothing_fault_and_end_with_102() {
     }
 }
 
+/// IP protocols.
+const TCP: u8 = 6;
+const UDP: u8 = 17;
+/// The Ethernet address at our end.
+const CABLE_END: [u8; 6] = [2, 0x11, 0x22, 0x33, 0x44, 0x66];
 /// The machine's LEDs, a bit each.
 const FPGAIO_LED: u32 = 0x4002_8000;
 /// What does not come within this time never comes.

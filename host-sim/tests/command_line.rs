@@ -119,7 +119,7 @@ fn an_image_is_what_a_board_takes() {
     let set = "controller.address=10.0.2.2";
     let said = ok(&["image", &file, "--set", set, "-o", image], "");
     let bytes = std::fs::read(image).unwrap();
-    assert_eq!(said, format!("{image}: {} bytes, version 1\n", bytes.len()));
+    assert_eq!(said, format!("{image}: {} bytes, version 2\n", bytes.len()));
     let config = proto_core::config::image::decode(&bytes).unwrap();
     assert_eq!(config.controller.address, "10.0.2.2");
     assert_eq!(config.ports[0].name, "force");
@@ -128,6 +128,18 @@ fn an_image_is_what_a_board_takes() {
     refused(&["image", &file, "--set", "port.force.cycle_ms=3", "-o", image]);
     refused(&["image", &path("force-sensor-controller.toml"), "-o", image]);
     assert!(!std::path::Path::new(image).exists());
+}
+
+#[test]
+fn check_shows_a_boards_own_address() {
+    let sets =
+        ["network.address=192.168.12.20/24", "network.router=192.168.12.1", "network.dns=192.168.12.2"];
+    let file = path("rs485-system.toml");
+    let arguments = ["check", &file].into_iter().chain(sets.iter().flat_map(|set| ["--set", *set]));
+    let said = ok(&arguments.collect::<Vec<_>>(), "");
+    let line = "a board's address is 192.168.12.20/24, router 192.168.12.1, name server 192.168.12.2; a host has its own\n";
+    assert!(said.contains(line), "{said}");
+    assert!(!ok(&["check", &file], "").contains("a board's address"));
 }
 
 #[test]

@@ -157,6 +157,18 @@ const CASES: &[Case] = &[
     gateway("an unknown section", "[controller]", "[controler]\n[controller]"),
     gateway("a section that is no table", GATEWAY, "controller = 5\n"),
     gateway("one port instead of several", GATEWAY, "port = 5\n[controller]\naddress = \"a\"\n"),
+    // [network]
+    gateway("a network without an address", "[controller]", "[network]\nrouter = \"192.168.12.1\"\n[controller]"),
+    gateway("an unknown key of the network", "[controller]", "[network]\naddress = \"192.168.12.20/24\"\nmask = 24\n[controller]"),
+    gateway("an address without its network", "[controller]", "[network]\naddress = \"192.168.12.20\"\n[controller]"),
+    gateway("a network of 31 bits", "[controller]", "[network]\naddress = \"192.168.12.20/31\"\n[controller]"),
+    gateway("a network's own address", "[controller]", "[network]\naddress = \"192.168.12.0/24\"\n[controller]"),
+    gateway("a router that is no address", "[controller]", "[network]\naddress = \"192.168.12.20/24\"\nrouter = \"router\"\n[controller]"),
+    gateway("a router in another network", "[controller]", "[network]\naddress = \"192.168.12.20/24\"\nrouter = \"192.168.13.1\"\n[controller]"),
+    gateway("a router that is the board", "[controller]", "[network]\naddress = \"192.168.12.20/24\"\nrouter = \"192.168.12.20\"\n[controller]"),
+    gateway("a controller in another network without a router", "[controller]", "[network]\naddress = \"192.168.13.20/24\"\n[controller]"),
+    gateway("a name server in another network without a router", "[controller]", "[network]\naddress = \"192.168.12.20/24\"\ndns = \"192.168.13.1\"\n[controller]"),
+    gateway("a controller with a name and no name server", "[controller]\naddress = \"192.168.12.138\"", "[network]\naddress = \"192.168.12.20/24\"\n[controller]\naddress = \"robot.cell\""),
     // [controller]
     gateway("no address", "address = \"192.168.12.138\"", ""),
     gateway("an address with a port", "192.168.12.138", "192.168.12.138:2000"),
@@ -355,6 +367,8 @@ fn every_wrong_override_says_what_is_wrong_with_it() {
         "recipe.orders.input.frame.2.id=5",
         "recipe.orders.input.frame.1.id=0x800",
         "nothing=1",
+        "network.address=192.168.12.20",
+        "network.router=192.168.12.1",
     ] {
         let text = Text { name: "cell.toml", toml: GATEWAY };
         let error = parse_gateway(text, &[wrong.to_owned()]).expect_err(wrong).to_string();

@@ -97,6 +97,7 @@ fn configuration() -> Result<GatewayConfig, Failure> {
             modbus_port: 502,
             recipe_link: None,
         },
+        network: None,
         recipes: [recipe].into_iter().collect(),
         ports: [port].into_iter().collect(),
         fields: [field("DigitalOutputCommand[1]")?, field("DigitalSignalStatus[4]")?].into_iter().collect(),

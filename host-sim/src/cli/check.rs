@@ -83,6 +83,12 @@ fn gateway(config: &GatewayConfig, recipes: &[SimRecipe]) -> String {
         "controller {} ({}): command {}, state {}, Modbus {}\n",
         link.address, link.dialect, link.command_port, link.state_port, link.modbus_port
     );
+    if let Some(network) = &config.network {
+        let others = [("router", network.router), ("name server", network.dns)];
+        let others = others.iter().filter_map(|(what, at)| Some(format!(", {what} {}", at.as_ref()?)));
+        report +=
+            &format!("a board's address is {network}{}; a host has its own\n", others.collect::<String>());
+    }
     for port in &config.ports {
         let recipe = recipes.get(usize::from(port.recipe)).map_or("", |recipe| &recipe.name);
         let bus = match &port.bus {

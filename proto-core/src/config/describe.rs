@@ -5,7 +5,7 @@
 
 use core::fmt;
 
-use super::error::{ConfigError, ConfigErrorKind, ControllerKey, Place, PortKey, RecipeKey};
+use super::error::{ConfigError, ConfigErrorKind, ControllerKey, NetworkKey, Place, PortKey, RecipeKey};
 use super::{GatewayConfig, Name};
 use crate::recipe::model::Mode;
 use crate::sysvar::Direction;
@@ -47,6 +47,7 @@ impl fmt::Display for Described<'_> {
         let Self { config, error } = self;
         match error.place {
             Place::Controller(key) => write!(f, "controller, {}", key.name())?,
+            Place::Network(key) => write!(f, "network, {}", key.name())?,
             Place::Recipe { recipe, key } => {
                 RecipeName(*config, recipe).fmt(f)?;
                 f.write_str(match key {
@@ -88,6 +89,16 @@ impl ControllerKey {
             Self::Dialect => "dialect",
             Self::Ports => "ports",
             Self::RecipeLink => "recipe link",
+        }
+    }
+}
+
+impl NetworkKey {
+    fn name(self) -> &'static str {
+        match self {
+            Self::Address => "address",
+            Self::Router => "router",
+            Self::Dns => "dns",
         }
     }
 }
@@ -166,6 +177,15 @@ impl fmt::Display for DescribedKind<'_> {
                 Ok(())
             }
             Kind::ZeroPort => f.write_str("0 is no port of the controller; 1..=65535"),
+            Kind::Prefix { prefix } => write!(f, "a network of {prefix} bits; 1..=30"),
+            Kind::NoHostAddress { address, network } => {
+                write!(f, "{address} is no host's address in the board's network {network}")
+            }
+            Kind::OwnAddress => f.write_str("this is the board's own address"),
+            Kind::NeedsRouter { address, network } => {
+                write!(f, "{address} is not in the board's network {network}; a router is needed")
+            }
+            Kind::NeedsDns => f.write_str("the controller has a name, so dns is needed; or give its address"),
             Kind::NoSuchRecipe { recipe, recipes } => {
                 write!(f, "there is no recipe {}; there are {recipes}", one_based(recipe))
             }

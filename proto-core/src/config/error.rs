@@ -1,5 +1,8 @@
 //! What can be wrong with a configuration, and where.
 
+use core::net::Ipv4Addr;
+
+use super::Network;
 use crate::command::ParseError;
 use crate::recipe::PartError;
 use crate::recipe::model::Mode;
@@ -23,6 +26,8 @@ pub struct ConfigError {
 pub enum Place {
     /// The controller's section.
     Controller(ControllerKey),
+    /// The board's own address.
+    Network(NetworkKey),
     /// A recipe as a whole, or what is said about it once.
     Recipe {
         /// Index of the recipe.
@@ -87,6 +92,17 @@ pub enum ControllerKey {
     RecipeLink,
 }
 
+/// What of the board's own address.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum NetworkKey {
+    /// Address and prefix.
+    Address,
+    /// The router.
+    Router,
+    /// The name server.
+    Dns,
+}
+
 /// What of a recipe.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum RecipeKey {
@@ -135,6 +151,29 @@ pub enum ConfigErrorKind {
     UnknownDialect,
     /// A port number of the controller is 0.
     ZeroPort,
+    /// A network of so many bits has no room for hosts, or is none.
+    Prefix {
+        /// As given.
+        prefix: u8,
+    },
+    /// No host of the board's network can have this address.
+    NoHostAddress {
+        /// As given.
+        address: Ipv4Addr,
+        /// The board's.
+        network: Network,
+    },
+    /// Another host is meant, and this is the board.
+    OwnAddress,
+    /// The address is in another network, and there is no router.
+    NeedsRouter {
+        /// As given.
+        address: Ipv4Addr,
+        /// The board's.
+        network: Network,
+    },
+    /// The controller has a name, and there is no name server.
+    NeedsDns,
     /// There is no recipe with this index.
     NoSuchRecipe {
         /// The index.

@@ -10,10 +10,12 @@ mod describe;
 mod error;
 #[cfg(feature = "image")]
 pub mod image;
+mod network;
 mod validate;
 
 pub use budget::{PartBudget, Warning, can_frame_time};
-pub use error::{ConfigError, ConfigErrorKind, ControllerKey, Place, PortKey, RecipeKey};
+pub use error::{ConfigError, ConfigErrorKind, ControllerKey, NetworkKey, Place, PortKey, RecipeKey};
+pub use network::Network;
 pub use validate::{MAX_LINE_TIME, MAX_TIME, MIN_CYCLE, check_bitrate, check_cycle};
 
 use heapless::{String, Vec};
@@ -47,6 +49,8 @@ pub type Delimiter = Vec<u8, MAX_DELIMITER>;
 pub struct GatewayConfig {
     /// Where the controller is and what it speaks.
     pub controller: ControllerLink,
+    /// A board's own address; without it DHCP is asked.
+    pub network: Option<Network>,
     /// Every recipe, in file order.
     pub recipes: Vec<Recipe, MAX_RECIPES>,
     /// Every port, in file order.
@@ -71,6 +75,7 @@ impl GatewayConfig {
                 modbus_port: 0,
                 recipe_link: None,
             },
+            network: None,
             recipes: Vec::new(),
             ports: Vec::new(),
             fields: Vec::new(),

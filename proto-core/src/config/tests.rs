@@ -3,6 +3,7 @@
 
 #[cfg(feature = "serde")]
 use proptest::prelude::*;
+use std::net::Ipv4Addr;
 use std::string::ToString;
 
 use super::*;
@@ -34,6 +35,7 @@ impl Builder {
                 modbus_port: 502,
                 recipe_link: None,
             },
+            network: None,
             recipes: Vec::new(),
             ports: Vec::new(),
             fields: Vec::new(),
@@ -337,6 +339,7 @@ pub(super) fn every_kind() -> GatewayConfig {
                 .safe_values
                 .push(SafeValue { var: var("ForceEnd[1]"), value: Scalar::Float(0.0) })
                 .unwrap();
+            config.network = Some(network());
             config.ports[1].on_timeout = Span { start: 0, len: 1 };
             config.recipes[0].send = SendOn::Rising { var: var("BitOutputReg[3]"), bit: 7 };
         })
@@ -378,4 +381,73 @@ fn a_configuration_survives_storage() {
     for cut in 0..stored.len() {
         assert!(postcard::from_bytes::<GatewayConfig>(&stored[..cut]).is_err(), "cut at {cut}");
     }
+}
+
+fn network() -> Network {
+    Network {
+        address: Ipv4Addr::new(192, 168, 12, 20),
+        prefix: 24,
+        router: Some(Ipv4Addr::new(192, 168, 12, 1)),
+        dns: Some(Ipv4Addr::new(8, 8, 8, 8)),
+    }
+}
+
+/// What a check says of one port, a controller there, and a network changed so.
+fn checked(controller: &str, change: impl FnOnce(&mut Network)) -> Result<(), (NetworkKey, ConfigErrorKind)> {
+    let mut config = Builder::one_port().0;
+    config.controller.address = text(controller);
+    change(config.network.insert(network()));
+    config.validate().map_err(|error| match error.place {
+        Place::Network(key) => (key, error.kind),
+        place => panic!("{place:?}"),
+    })
+}
+
+#[test]
+fn a_board_reaches_what_it_needs_from_its_own_address() {
+    let alone = |network: &mut Network| (network.router, network.dns) = (None, None);
+    assert_eq!(checked("192.168.12.138", |_| {}), Ok(()));
+    assert_eq!(checked("192.168.12.138", alone), Ok(()));
+    assert_eq!(checked("10.0.0.9", |_| {}), Ok(()), "through the router");
+    assert_eq!(checked("robot.cell", |_| {}), Ok(()));
+    let nameless = checked("robot.cell", |network| network.dns = None);
+    assert_eq!(nameless, Err((NetworkKey::Address, ConfigErrorKind::NeedsDns)));
+    let (address, mut lonely) = (Ipv4Addr::new(10, 0, 0, 9), network());
+    alone(&mut lonely);
+    let refused = checked("10.0.0.9", alone);
+    assert_eq!(
+        refused,
+        Err((NetworkKey::Address, ConfigErrorKind::NeedsRouter { address, network: lonely }))
+    );
+    let refused = checked("192.168.12.138", |network| network.router = None);
+    assert!(matches!(refused, Err((NetworkKey::Dns, ConfigErrorKind::NeedsRouter { .. }))));
+}
+
+#[test]
+fn a_board_its_router_and_its_name_server_have_addresses_of_hosts() {
+    for prefix in [0, 31, 32, 255] {
+        let refused = checked("192.168.12.138", |network| network.prefix = prefix);
+        assert_eq!(refused, Err((NetworkKey::Address, ConfigErrorKind::Prefix { prefix })));
+    }
+    // The network's own address, its broadcast address, and what is no host's anywhere.
+    let nobody = ["192.168.12.0", "192.168.12.255", "0.0.0.1", "127.0.0.1", "224.0.0.1", "255.255.255.255"];
+    for address in nobody.map(|address| address.parse::<Ipv4Addr>().unwrap()) {
+        let is_refused = |refused, wanted| {
+            matches!(refused, Err((key, ConfigErrorKind::NoHostAddress { address: named, .. }))
+                if key == wanted && named == address)
+        };
+        let refused = checked("192.168.12.138", |network| network.address = address);
+        assert!(is_refused(refused, NetworkKey::Address), "{address}: {refused:?}");
+        let refused = checked("192.168.12.138", |network| network.router = Some(address));
+        assert!(is_refused(refused, NetworkKey::Router), "{address}: {refused:?}");
+    }
+    let elsewhere = Some(Ipv4Addr::new(10, 0, 0, 9));
+    let refused = checked("192.168.12.138", |network| network.router = elsewhere);
+    assert!(matches!(refused, Err((NetworkKey::Router, ConfigErrorKind::NoHostAddress { .. }))));
+    let refused = checked("192.168.12.138", |network| network.dns = Some(Ipv4Addr::LOCALHOST));
+    assert!(matches!(refused, Err((NetworkKey::Dns, ConfigErrorKind::NoHostAddress { .. }))));
+    let refused = checked("192.168.12.138", |network| network.router = Some(network.address));
+    assert_eq!(refused, Err((NetworkKey::Router, ConfigErrorKind::OwnAddress)));
+    let refused = checked("192.168.12.138", |network| network.dns = Some(network.address));
+    assert_eq!(refused, Err((NetworkKey::Dns, ConfigErrorKind::OwnAddress)));
 }

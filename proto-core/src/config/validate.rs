@@ -34,6 +34,7 @@ impl GatewayConfig {
     /// The first mistake, with its place and the numbers.
     pub fn validate(&self) -> Result<(), ConfigError> {
         self.check_controller()?;
+        self.check_network()?;
         for (index, recipe) in (0..).zip(&self.recipes) {
             RecipeCheck::new(self, index, recipe).check()?;
         }
@@ -97,6 +98,12 @@ impl GatewayConfig {
             return fail(place, Kind::ZeroPort);
         }
         self.check_upstream_recipe(place, link.recipe)
+    }
+
+    fn check_network(&self) -> Check {
+        let Some(network) = &self.network else { return Ok(()) };
+        let checked = network.check(&self.controller.address);
+        checked.map_err(|(key, kind)| ConfigError { place: Place::Network(key), kind })
     }
 
     /// The controller's TCP and UDP ports take realtime stream recipes only (D16).

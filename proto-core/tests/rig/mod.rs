@@ -35,6 +35,7 @@ impl Cell {
                 modbus_port: 502,
                 recipe_link: None,
             },
+            network: None,
             recipes: Bounded::new(),
             ports: Bounded::new(),
             fields: Bounded::new(),

@@ -7,8 +7,8 @@ use heapless::Vec as Bounded;
 use proto_core::config::{
     Bus, CanFramePart, CommandEntry, ConfigError, ControllerKey, ControllerLink, Delimiter, FieldSpec,
     GatewayConfig, InputBinding, MAX_ALL_FIELDS, MAX_COMMAND_TEXT, MAX_COMMANDS, MAX_PORTS, MAX_RECIPES,
-    MAX_SAFE_VALUES, OutputBinding, Parts, Place, Port, PortKey, Recipe, RecipeKey, RecipeLink, SafeValue,
-    Span, StreamPart,
+    MAX_SAFE_VALUES, NetworkKey, OutputBinding, Parts, Place, Port, PortKey, Recipe, RecipeKey, RecipeLink,
+    SafeValue, Span, StreamPart,
 };
 use proto_core::recipe::model::{Framing, MAX_CAN_IDS};
 use proto_core::sysvar::{Direction, SysVar};
@@ -19,11 +19,12 @@ use proto_core::wire::scalar::Scalar;
 use super::bindings::{FileInput, FileOutput};
 use super::document::Document;
 use super::lines::{LINE_KEYS, key_name, read_bitrate, read_cycle, read_line};
+use super::network;
 use super::reader::{Item, Reader, Result, Spot};
 use super::recipes::{self, FileField, FileFieldKind, FilePart, FileRecipe, Flavour};
 
 /// The top-level keys of a gateway file.
-pub(super) const KEYS: [&str; 3] = ["controller", "recipe", "port"];
+pub(super) const KEYS: [&str; 4] = ["controller", "network", "recipe", "port"];
 
 /// The whole file, valid.
 pub(super) fn read(document: &Document) -> Result<Box<GatewayConfig>> {
@@ -97,8 +98,20 @@ impl<'a> Builder<'a> {
             spots.insert(Place::Controller(key), spot);
         }
         let controller = read_controller(&table, recipes)?;
+        let mut network = None;
+        if let Some(item) = root.optional("network") {
+            let table = item.table(&network::KEYS)?;
+            for (key, name) in
+                [(NetworkKey::Address, "address"), (NetworkKey::Router, "router"), (NetworkKey::Dns, "dns")]
+            {
+                let spot = table.optional(name).map_or(table.spot.clone(), |item| item.spot);
+                spots.insert(Place::Network(key), spot);
+            }
+            network = Some(network::read(&table)?);
+        }
         let config = GatewayConfig {
             controller,
+            network,
             recipes: Bounded::new(),
             ports: Bounded::new(),
             fields: Bounded::new(),

@@ -9,6 +9,7 @@ mod document;
 mod error;
 mod gateway;
 mod lines;
+mod network;
 mod reader;
 mod recipes;
 

@@ -16,7 +16,7 @@ use super::{ConfigError, GatewayConfig};
 /// The first bytes of every image.
 pub const MAGIC: [u8; 4] = *b"RGCI";
 /// The version of what follows the header: one more for every change of a serialized type.
-pub const VERSION: u32 = 1;
+pub const VERSION: u32 = 2;
 /// Length of the header: magic, version, payload length and CRC-32, four bytes each, little-endian.
 pub const HEADER: usize = 16;
 /// Longest image, header included. What a board has room for takes less; only a file with hundreds of
@@ -138,8 +138,9 @@ pub fn decode(bytes: &[u8]) -> Result<GatewayConfig, ImageError> {
 pub fn decode_into(bytes: &[u8], config: &mut GatewayConfig) -> Result<(), ImageError> {
     // Postcard writes a struct as its fields one behind the other.
     let mut rest = payload(bytes)?;
-    let GatewayConfig { controller, recipes, ports, fields, commands, safe_values } = config;
+    let GatewayConfig { controller, network, recipes, ports, fields, commands, safe_values } = config;
     *controller = item(&mut rest)?;
+    *network = item(&mut rest)?;
     items(&mut rest, recipes)?;
     items(&mut rest, ports)?;
     items(&mut rest, fields)?;

@@ -1,0 +1,30 @@
+//! `[network]` of a gateway file: a board's own address. This host has its own and does not look at it.
+
+use std::net::Ipv4Addr;
+
+use proto_core::config::Network;
+
+use super::reader::{Item, Reader, Result};
+
+/// The keys of the section.
+pub(super) const KEYS: [&str; 3] = ["address", "router", "dns"];
+
+pub(super) fn read(table: &Reader<'_>) -> Result<Network> {
+    let item = table
+        .required("address", "the board's IPv4 address and bits of its network: \"192.168.12.20/24\"")?;
+    let text = item.string()?;
+    let parts = text.split_once('/');
+    let parsed = parts.and_then(|(address, prefix)| Some((address.parse().ok()?, prefix.parse().ok()?)));
+    let (address, prefix) = parsed.ok_or_else(|| {
+        item.error(format!(
+            "{text:?} is no IPv4 address with the bits of its network, such as \"192.168.12.20/24\""
+        ))
+    })?;
+    let optional = |key| table.optional(key).map(|item| host(&item)).transpose();
+    Ok(Network { address, prefix, router: optional("router")?, dns: optional("dns")? })
+}
+
+fn host(item: &Item<'_>) -> Result<Ipv4Addr> {
+    let text = item.string()?;
+    text.parse().map_err(|_| item.error(format!("{text:?} is no IPv4 address, such as \"192.168.12.1\"")))
+}

@@ -1,0 +1,91 @@
+//! A board's own address, when it does not get one by DHCP.
+
+use core::net::Ipv4Addr;
+
+use super::error::{ConfigErrorKind as Kind, NetworkKey};
+
+/// A static IPv4 address and what belongs to it. A host has its own and looks at none of this.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct Network {
+    /// The board's address.
+    pub address: Ipv4Addr,
+    /// Bits of the network, 1..=30.
+    pub prefix: u8,
+    /// Where packets to other networks go.
+    pub router: Option<Ipv4Addr>,
+    /// The server that knows the controller's name.
+    pub dns: Option<Ipv4Addr>,
+}
+
+impl Network {
+    /// Whether an address is in the board's own network.
+    pub fn contains(&self, other: Ipv4Addr) -> bool {
+        (self.address.to_bits() ^ other.to_bits()) & self.mask() == 0
+    }
+
+    fn mask(&self) -> u32 {
+        u32::MAX.checked_shl(32_u32.saturating_sub(self.prefix.into())).unwrap_or(0)
+    }
+
+    /// Whether a host of this network can have this address.
+    fn is_host(&self, address: Ipv4Addr) -> bool {
+        let host = address.to_bits() & !self.mask();
+        is_unicast(address) && self.contains(address) && host != 0 && host != !self.mask()
+    }
+
+    /// Everything that can be wrong; `controller` is an address or a name.
+    pub(super) fn check(&self, controller: &str) -> Result<(), (NetworkKey, Kind)> {
+        if !(1..=30).contains(&self.prefix) {
+            return Err((NetworkKey::Address, Kind::Prefix { prefix: self.prefix }));
+        }
+        let network = *self;
+        if !self.is_host(self.address) {
+            return Err((NetworkKey::Address, Kind::NoHostAddress { address: self.address, network }));
+        }
+        if let Some(router) = self.router {
+            if !self.is_host(router) {
+                return Err((NetworkKey::Router, Kind::NoHostAddress { address: router, network }));
+            }
+            self.check_other(NetworkKey::Router, router)?;
+        }
+        let is_reachable = |address| self.contains(address) || self.router.is_some();
+        if let Some(dns) = self.dns {
+            if !is_unicast(dns) {
+                return Err((NetworkKey::Dns, Kind::NoHostAddress { address: dns, network }));
+            }
+            self.check_other(NetworkKey::Dns, dns)?;
+            if !is_reachable(dns) {
+                return Err((NetworkKey::Dns, Kind::NeedsRouter { address: dns, network }));
+            }
+        }
+        match controller.parse::<Ipv4Addr>() {
+            Ok(address) if !is_reachable(address) => {
+                Err((NetworkKey::Address, Kind::NeedsRouter { address, network }))
+            }
+            Err(_) if self.dns.is_none() && !controller.is_empty() => {
+                Err((NetworkKey::Address, Kind::NeedsDns))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    fn check_other(&self, key: NetworkKey, address: Ipv4Addr) -> Result<(), (NetworkKey, Kind)> {
+        if address == self.address { Err((key, Kind::OwnAddress)) } else { Ok(()) }
+    }
+}
+
+impl core::fmt::Display for Network {
+    /// `192.168.12.20/24`
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        write!(f, "{}/{}", self.address, self.prefix)
+    }
+}
+
+fn is_unicast(address: Ipv4Addr) -> bool {
+    !(address.is_unspecified()
+        || address.is_loopback()
+        || address.is_multicast()
+        || address.octets()[0] == 0
+        || address.octets()[0] >= 0xF0)
+}
