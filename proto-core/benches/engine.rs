@@ -182,6 +182,7 @@ impl Bench {
         let mut answer = [0; 12];
         answer.copy_from_slice(&self.out[..12]);
         answer[5] = 6;
+        self.pass(Input::LinkSent { link: LinkId::MODBUS });
         self.pass(Input::LinkBytes { link: LinkId::MODBUS, bytes: black_box(&answer) });
     }
 

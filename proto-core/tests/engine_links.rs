@@ -361,6 +361,35 @@ fn three_requests_without_an_answer_reopen_the_link() {
 }
 
 #[test]
+fn no_request_is_handed_over_before_the_one_before_it_has_left() {
+    let mut full = Full::new();
+    full.rig.run(MS(100));
+    full.rig.log.clear();
+    full.rig.modbus_answers = false;
+    full.rig.reports_sent = false;
+    // A poll is due.
+    full.rig.run(MS(8));
+    let requests = full.rig.sent_on(LinkId::MODBUS);
+    assert_eq!(requests.len(), 1);
+    // The answer overtakes the transport's report.
+    let answer = full.rig.answer(&requests[0]);
+    full.rig.link_bytes(LinkId::MODBUS, &answer);
+    full.plc();
+    assert_eq!(full.rig.sent_on(LinkId::MODBUS).len(), 0);
+    full.rig.input(Input::LinkSent { link: LinkId::MODBUS });
+    assert_eq!(full.rig.sent_on(LinkId::MODBUS).len(), 1);
+    // One that does not leave in time is not left to be carried out later: the connection goes with it.
+    actions(&mut full.rig, LinkId::MODBUS);
+    full.rig.run(MS(500));
+    assert_eq!(full.rig.sent_on(LinkId::MODBUS).len(), 0);
+    assert_eq!(actions(&mut full.rig, LinkId::MODBUS), ["close"]);
+    full.rig.reports_sent = true;
+    full.rig.modbus_answers = true;
+    full.rig.run(MS(200));
+    assert_eq!(actions(&mut full.rig, LinkId::MODBUS), ["open"]);
+}
+
+#[test]
 fn two_requests_without_an_answer_and_one_with_one_are_no_three() {
     let mut full = Full::new();
     for _ in 0..5 {

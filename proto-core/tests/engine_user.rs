@@ -396,6 +396,19 @@ fn a_value_reply_is_a_success_too() {
 }
 
 #[test]
+fn no_command_is_handed_over_before_the_one_before_it_has_left() {
+    let (mut rig, port) = commands(CommandWhen::Frame);
+    rig.reports_sent = false;
+    for value in [1, 2] {
+        rig.bytes(port, &frame(&[value]));
+    }
+    rig.link_bytes(LinkId::COMMAND, b"run start");
+    assert_eq!(sent(&mut rig), ["run(pick.jspf,50)"], "its reply overtakes the transport's report");
+    rig.input(Input::LinkSent { link: LinkId::COMMAND });
+    assert_eq!(sent(&mut rig), ["stop"]);
+}
+
+#[test]
 fn the_reply_code_is_that_of_the_newest_command() {
     let (mut rig, port) = commands(CommandWhen::Frame);
     rig.bytes(port, &frame(&[1]));

@@ -8,13 +8,22 @@
 pub mod harness;
 pub mod source;
 
+mod any_engine;
 mod can;
 mod command;
 mod deframer;
+mod engine;
 mod modbus;
 mod recipes;
 mod slcan;
 mod state;
+
+#[path = "../../tests/engine_props/model.rs"]
+mod model;
+#[path = "../../tests/engine_props/play.rs"]
+mod play;
+#[path = "../../tests/rig/mod.rs"]
+mod rig;
 
 #[path = "../../tests/reference/mod.rs"]
 mod reference;
@@ -57,6 +66,14 @@ pub const TARGETS: &[Target] = &[
         run: command::run_client,
         seeds: command::client_seeds,
         runs: 4_000,
+        longest: 1_000,
+    },
+    Target { name: "engine", run: engine::run, seeds: engine::seeds, runs: 300, longest: 600 },
+    Target {
+        name: "any_engine",
+        run: any_engine::run,
+        seeds: any_engine::seeds,
+        runs: 2_000,
         longest: 1_000,
     },
 ];

@@ -68,6 +68,8 @@ pub(super) struct CommandLink {
     fields: Vec<CommandField, MAX_COMMAND_FIELDS>,
     queue: Deque<Waiting, COMMAND_QUEUE>,
     in_flight: Option<Waiting>,
+    /// The transport has not taken the newest command yet.
+    unsent: bool,
 }
 
 impl Tables {
@@ -100,6 +102,7 @@ impl CommandLink {
             fields: Vec::new(),
             queue: Deque::new(),
             in_flight: None,
+            unsent: false,
         })
     }
 
@@ -152,12 +155,18 @@ impl CommandLink {
     /// The link is gone: nothing that waited is sent later.
     pub(super) fn lost(&mut self, ports: &mut [FieldPort]) {
         self.client.abort();
+        self.unsent = false;
         if let Some(sent) = self.in_flight.take() {
             settle(ports, sent, ReplyCode::NoReply);
         }
         while let Some(waiting) = self.queue.pop_front() {
             drop_one(ports, waiting);
         }
+    }
+
+    /// The transport took everything.
+    pub(super) fn sent(&mut self) {
+        self.unsent = false;
     }
 
     /// Bytes from the controller.
@@ -189,7 +198,7 @@ impl CommandLink {
         out: &mut [u8],
         now: Instant,
     ) -> Option<usize> {
-        if !self.supervisor.is_up() || self.client.busy() {
+        if !self.supervisor.is_up() || self.client.busy() || self.unsent {
             return None;
         }
         let waiting = self.queue.pop_front()?;
@@ -198,6 +207,7 @@ impl CommandLink {
             Ok(len) => {
                 bump(&mut self.counters.sent);
                 self.in_flight = Some(Waiting { since: now, ..waiting });
+                self.unsent = true;
                 Some(len)
             }
             Err(_) => {

@@ -193,8 +193,10 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
 
     /// The transport took everything.
     pub(super) fn sent(&mut self, id: LinkId) {
-        if let Some(link) = self.recipe(id) {
-            link.sent();
+        match id {
+            LinkId::COMMAND => self.command.iter_mut().for_each(CommandLink::sent),
+            LinkId::MODBUS => self.modbus.iter_mut().for_each(ModbusLink::sent),
+            _ => self.recipe(id).into_iter().for_each(Uplink::sent),
         }
     }
 

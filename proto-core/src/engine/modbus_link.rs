@@ -73,6 +73,8 @@ pub(super) struct ModbusLink {
     polled: Vec<SysVar, MAX_POLLED>,
     blocks: Vec<Block, MAX_POLL_BLOCKS>,
     in_flight: Option<InFlight>,
+    /// The transport has not taken the newest request yet.
+    unsent: bool,
     timeouts_in_a_row: u8,
     turn: Turn,
     /// The next write starts at this variable, so that none waits for ever.
@@ -92,6 +94,7 @@ impl ModbusLink {
             polled: Vec::new(),
             blocks: Vec::new(),
             in_flight: None,
+            unsent: false,
             timeouts_in_a_row: 0,
             turn: Turn::Write,
             cursor: 0,
@@ -142,9 +145,15 @@ impl ModbusLink {
     /// The connection is gone, and with it what was under way.
     pub(super) fn lost<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
         self.abort(store);
+        self.unsent = false;
         self.write_refused_again(store);
         self.client.reset();
         store.link_lost(&self.writes);
+    }
+
+    /// The transport took everything.
+    pub(super) fn sent(&mut self) {
+        self.unsent = false;
     }
 
     /// Bytes from the controller.
@@ -198,7 +207,8 @@ impl ModbusLink {
         bump(&mut self.counters.timeouts);
         self.abort(store);
         self.timeouts_in_a_row = self.timeouts_in_a_row.saturating_add(1);
-        if self.timeouts_in_a_row >= TIMEOUTS_IN_A_ROW {
+        // A request that has not left by now would be carried out when nobody waits for it any more.
+        if self.unsent || self.timeouts_in_a_row >= TIMEOUTS_IN_A_ROW {
             self.supervisor.give_up(now);
             self.lost(store);
         }
@@ -211,7 +221,7 @@ impl ModbusLink {
         out: &mut [u8],
         now: Instant,
     ) -> Option<usize> {
-        if !self.supervisor.is_up() || self.in_flight.is_some() {
+        if !self.supervisor.is_up() || self.in_flight.is_some() || self.unsent {
             return None;
         }
         let poll = self.due_block(now);
@@ -229,6 +239,7 @@ impl ModbusLink {
         };
         bump(&mut self.counters.sent);
         self.in_flight = Some(InFlight { asked, since: now });
+        self.unsent = true;
         Some(len)
     }
 
@@ -239,6 +250,9 @@ impl ModbusLink {
         }
         if !self.supervisor.is_up() {
             return Instant::NEVER;
+        }
+        if self.unsent {
+            return self.ask_again_at;
         }
         let polls = self.blocks.iter().map(|block| block.grid.next()).min().unwrap_or(Instant::NEVER);
         polls.min(self.ask_again_at)

@@ -12,7 +12,7 @@ use proto_core::config::GatewayConfig;
 use proto_core::engine::{LinkId, PortId};
 use proto_core::time::{Duration, Instant};
 
-use crate::rig::*;
+use super::rig::*;
 
 pub const IDLE_GAP: Duration = Duration::from_millis(50);
 pub const READ_BACK: Duration = Duration::from_millis(500);

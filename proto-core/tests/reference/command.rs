@@ -261,6 +261,8 @@ impl Client {
         if self.waiting.as_ref().is_some_and(|(_, until)| now >= *until) {
             self.waiting = None;
             told.push(Told::Timeout);
+            // What was the beginning of a reply is now a text that nobody asked for.
+            self.settle(now, &mut told);
         }
         told
     }
