@@ -5,15 +5,24 @@ use std::{env, fs};
 
 fn main() {
     println!("cargo::rerun-if-changed=build.rs");
-    let board = if env::var_os("CARGO_FEATURE_BOARD_MPS2_AN500").is_some() { "mps2-an500" } else { return };
     if env::var("CARGO_CFG_TARGET_OS").as_deref() != Ok("none") {
         return;
     }
+    // Two boards or none are the sources' to refuse, with a better message.
+    let (file, script) = if env::var_os("CARGO_FEATURE_BOARD_MPS2_AN500").is_some() {
+        ("boards/mps2-an500/mps2-an500.x", "mps2-an500.x")
+    } else {
+        // The script of cortex-m-rt, which includes memory.x.
+        ("../memory.x", "link.x")
+    };
     let out = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets OUT_DIR"));
-    for file in ["memory.x", "device.x"] {
-        let from = Path::new("boards").join(board).join(file);
-        println!("cargo::rerun-if-changed={}", from.display());
-        fs::copy(&from, out.join(file)).unwrap_or_else(|error| panic!("{}: {error}", from.display()));
-    }
+    let file = Path::new(file);
+    println!("cargo::rerun-if-changed={}", file.display());
+    let copy = out.join(file.file_name().expect("a file"));
+    fs::copy(file, copy).unwrap_or_else(|error| panic!("{}: {error}", file.display()));
     println!("cargo::rustc-link-search={}", out.display());
+    println!("cargo::rustc-link-arg=-T{script}");
+    if env::var_os("CARGO_FEATURE_DEFMT").is_some() {
+        println!("cargo::rustc-link-arg=-Tdefmt.x");
+    }
 }

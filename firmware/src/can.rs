@@ -1,17 +1,22 @@
 //! A CAN port's task, and what it asks of a board's CAN controller.
+//!
+//! One task drives the controller: it receives, sends what the engine hands over, and brings the
+//! controller back after bus-off. It never waits for one direction only, and after some frames in a row
+//! it lets the other tasks run, however busy the bus is.
 
 use core::pin::pin;
 
-use embassy_futures::select::{Either, select};
-use embassy_time::{Duration, Timer};
+use embassy_futures::select::{Either3, select3};
+use embassy_futures::yield_now;
+use embassy_time::{Duration, Instant, Timer, with_timeout};
 use embedded_can::Frame;
 use proto_core::engine::{BusState, Input, PortId};
 use proto_core::recipe::can::CanFrame;
 use proto_core::recipe::model::{CanId, MAX_CAN_DATA};
 
-use crate::gateway::Gateway;
-use crate::warn;
+use crate::gateway::{Gateway, PortControl};
 use crate::watchdog::Pulse;
+use crate::{info, warn};
 
 /// A CAN controller. Its driver buffers what arrives while nobody receives.
 #[allow(async_fn_in_trait, reason = "all tasks run on one executor: no future is sent anywhere")]
@@ -19,24 +24,32 @@ pub trait CanPort {
     /// The driver's frame.
     type Frame: Frame;
 
-    /// The next frame, or a change of the controller's state. Nothing is lost when the future is
-    /// dropped before it is done.
+    /// The next frame, a change of the controller's state, or the end of what was sent. Nothing is lost
+    /// when the future is dropped before it is done.
     async fn receive(&mut self) -> CanEvent<Self::Frame>;
 
-    /// Sends a frame behind those before it.
+    /// Hands a frame over for sending behind those before it, as soon as there is room for it. When all
+    /// have left, `receive` says so.
     ///
     /// # Errors
-    /// [`BusOff`] when the controller has left the bus.
+    /// [`BusOff`] when the controller has left the bus; `receive` then does not report that again.
     async fn send(&mut self, frame: &CanFrame) -> Result<(), BusOff>;
 
-    /// Lets the controller onto the bus again after bus-off.
-    async fn recover(&mut self);
+    /// Forgets what waits to be sent, and lets the controller onto the bus again after bus-off.
+    /// `receive` reports when it is there, which on a disturbed bus may be never.
+    fn recover(&mut self);
 
-    /// Frames with other ids need not be received. A controller without room for all of them lets
-    /// more pass.
-    fn set_filters(&mut self, ids: &[CanId]) {
-        let _ = ids;
+    /// Goes onto the bus. Frames with other ids need not be received; a controller without room for all
+    /// of the ids lets more pass. Called once, before anything else.
+    fn set_filters(&mut self, ids: &[CanId]);
+
+    /// How the controller does.
+    fn counters(&self) -> CanCounters {
+        CanCounters::default()
     }
+
+    /// The bus' speed, in bit/s.
+    fn bitrate(&self) -> u32;
 }
 
 /// What a CAN controller brings.
@@ -46,52 +59,204 @@ pub enum CanEvent<F> {
     Frame(F),
     /// Its error state changed.
     Bus(BusState),
+    /// All that was handed over has left.
+    Sent,
 }
 
 /// The controller has left the bus.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct BusOff;
 
+/// The counters of a CAN controller.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct CanCounters {
+    /// The transmit error counter of the CAN standard: bus-off beyond 255.
+    pub transmit_errors: u8,
+    /// The receive error counter of the CAN standard.
+    pub receive_errors: u8,
+    /// Times that a frame was lost because nobody took it from the controller in time. Wraps.
+    pub lost: u32,
+}
+
 /// Drives the port for ever.
-pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, mut can: impl CanPort) -> ! {
+pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, can: impl CanPort) -> ! {
     let Some(control) = gateway.port(port) else { core::future::pending().await };
-    gateway.input(Input::PortUp { port });
-    let mut backoff = BACKOFF_MIN;
-    loop {
-        let mut is_off = false;
-        match pulse.idle(pin!(select(can.receive(), control.frame_waits()))).await {
-            Either::First(CanEvent::Frame(frame)) => {
-                if let Some(frame) = own_frame(&frame) {
-                    gateway.input(Input::PortCan { port, frame });
+    let task = Task {
+        gateway,
+        pulse,
+        port,
+        control,
+        can,
+        phase: Phase::Idle,
+        backoff: BACKOFF_MIN,
+        recovered: Instant::MIN,
+        lost: 0,
+        lost_told: Instant::MIN,
+    };
+    task.run().await
+}
+
+/// What the task waits for, beside frames.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Phase {
+    /// Frames to send.
+    Idle,
+    /// What was handed over has to leave the controller until then.
+    Sending { until: Instant },
+    /// Bus-off: nothing is tried until then.
+    Off { until: Instant },
+    /// The controller is on its way back to the bus; if it is not there by then, another try.
+    Recovering { until: Instant },
+}
+
+struct Task<'a, C> {
+    gateway: &'a Gateway,
+    pulse: &'a Pulse,
+    port: PortId,
+    control: &'a PortControl,
+    can: C,
+    phase: Phase,
+    /// How long the next bus-off is waited out.
+    backoff: Duration,
+    /// When the controller was back on the bus.
+    recovered: Instant,
+    /// As many frames were lost when it was told last, and when that was.
+    lost: u32,
+    lost_told: Instant,
+}
+
+impl<C: CanPort> Task<'_, C> {
+    async fn run(mut self) -> ! {
+        self.can.set_filters(self.control.ids());
+        self.gateway.input(Input::PortUp { port: self.port });
+        loop {
+            for _ in 0..IN_A_ROW {
+                let alarm = self.alarm();
+                let next = select3(self.can.receive(), self.control.frame_waits(), Timer::at(alarm));
+                let next = self.pulse.idle(pin!(next)).await;
+                match next {
+                    Either3::First(event) => self.event(event),
+                    Either3::Second(()) => {}
+                    Either3::Third(()) => self.expired(),
                 }
-                backoff = BACKOFF_MIN;
+                // A bus that is never idle does not keep us from sending.
+                self.send_waiting().await;
             }
-            Either::First(CanEvent::Bus(state)) => {
-                gateway.input(Input::PortBus { port, state });
-                is_off = state == BusState::BusOff;
+            self.tell_lost();
+            yield_now().await;
+        }
+    }
+
+    fn alarm(&self) -> Instant {
+        match self.phase {
+            Phase::Idle => Instant::MAX,
+            Phase::Sending { until } | Phase::Off { until } | Phase::Recovering { until } => until,
+        }
+    }
+
+    fn event(&mut self, event: CanEvent<C::Frame>) {
+        match event {
+            CanEvent::Frame(frame) => {
+                if let Some(frame) = own_frame(&frame) {
+                    self.gateway.input(Input::PortCan { port: self.port, frame });
+                }
             }
-            Either::Second(()) => {}
-        }
-        // A bus that is never idle does not keep us from sending.
-        let mut sent = false;
-        while !is_off && let Some(frame) = control.next_frame() {
-            sent = true;
-            // On a bus with nobody else a frame is never acknowledged and never leaves.
-            is_off = pulse.idle(pin!(can.send(&frame))).await == Err(BusOff);
-            if is_off {
-                gateway.input(Input::PortBus { port, state: BusState::BusOff });
+            CanEvent::Bus(BusState::BusOff) => self.bus_off(),
+            CanEvent::Bus(state) => {
+                self.tell_state(state);
+                if matches!(self.phase, Phase::Off { .. } | Phase::Recovering { .. }) {
+                    self.recovered = Instant::now();
+                    self.phase = Phase::Idle;
+                }
+                self.gateway.input(Input::PortBus { port: self.port, state });
+            }
+            CanEvent::Sent => {
+                if let Phase::Sending { .. } = self.phase {
+                    self.phase = Phase::Idle;
+                    self.gateway.input(Input::PortSent { port: self.port });
+                }
             }
         }
-        if sent && !is_off {
-            gateway.input(Input::PortSent { port });
+    }
+
+    /// Sends what the engine handed over.
+    async fn send_waiting(&mut self) {
+        let mut frames = 0_u32;
+        while let Some(frame) = self.control.next_frame() {
+            if matches!(self.phase, Phase::Off { .. } | Phase::Recovering { .. }) {
+                // The engine knows; what it handed over before is lost.
+                continue;
+            }
+            frames = frames.saturating_add(1);
+            let patience = patience(frames, self.can.bitrate());
+            let sent = with_timeout(patience, self.can.send(&frame));
+            let sent = self.pulse.idle(pin!(sent)).await;
+            match sent {
+                Ok(Ok(())) => self.phase = Phase::Sending { until: Instant::now() + patience },
+                Ok(Err(BusOff)) => self.bus_off(),
+                Err(_) => self.give_up(),
+            }
         }
-        if is_off {
-            control.clear();
-            warn!("port {}: bus-off; onto the bus again in {} ms", port.0, backoff.as_millis());
-            pulse.idle(pin!(Timer::after(backoff))).await;
-            backoff = (backoff * 2).min(BACKOFF_MAX);
-            can.recover().await;
-            gateway.input(Input::PortBus { port, state: BusState::Active });
+    }
+
+    fn expired(&mut self) {
+        match self.phase {
+            Phase::Idle => {}
+            Phase::Sending { .. } => self.give_up(),
+            Phase::Off { .. } | Phase::Recovering { .. } => {
+                self.can.recover();
+                self.phase = Phase::Recovering { until: Instant::now() + RECOVERY };
+            }
+        }
+    }
+
+    /// Nobody takes what is sent: another node is missing, or the cable. What waits would be old when
+    /// one comes.
+    fn give_up(&mut self) {
+        let counters = self.can.counters();
+        warn!("port {}: nobody acknowledges; transmit errors {}", self.port.0, counters.transmit_errors);
+        self.can.recover();
+        self.control.clear();
+        self.phase = Phase::Idle;
+        self.gateway.input(Input::PortDown { port: self.port });
+        self.gateway.input(Input::PortUp { port: self.port });
+    }
+
+    fn bus_off(&mut self) {
+        let now = Instant::now();
+        if matches!(self.phase, Phase::Off { .. }) {
+            return;
+        }
+        if now.saturating_duration_since(self.recovered) >= HEALTHY {
+            self.backoff = BACKOFF_MIN;
+        }
+        warn!("port {}: bus-off; onto the bus again in {} ms", self.port.0, self.backoff.as_millis());
+        self.phase = Phase::Off { until: now + self.backoff };
+        self.backoff = (self.backoff * 2).min(BACKOFF_MAX);
+        self.gateway.input(Input::PortBus { port: self.port, state: BusState::BusOff });
+        self.control.clear();
+    }
+
+    fn tell_state(&self, state: BusState) {
+        let CanCounters { transmit_errors, receive_errors, .. } = self.can.counters();
+        let name = match state {
+            BusState::Active => "error-active",
+            BusState::Warning => "error warning",
+            BusState::Passive => "error-passive",
+            BusState::BusOff => "bus-off",
+        };
+        let port = self.port.0;
+        info!("port {}: {}; errors: transmit {}, receive {}", port, name, transmit_errors, receive_errors);
+    }
+
+    /// Says that frames were lost, at most once a second.
+    fn tell_lost(&mut self) {
+        let lost = self.can.counters().lost;
+        let now = Instant::now();
+        if lost != self.lost && now.saturating_duration_since(self.lost_told) >= LOST_PERIOD {
+            warn!("port {}: frames lost {} times", self.port.0, lost);
+            self.lost = lost;
+            self.lost_told = now;
         }
     }
 }
@@ -106,5 +271,23 @@ fn own_frame(frame: &impl Frame) -> Option<CanFrame> {
     }
 }
 
+/// Four times what the frames take on a bus of their own, 160 bits each at most, and a little: others
+/// may be more urgent.
+fn patience(frames: u32, bitrate: u32) -> Duration {
+    let bits = u64::from(frames).saturating_mul(4 * 160);
+    Duration::from_micros(bits.saturating_mul(1_000_000) / u64::from(bitrate.max(1))) + PATIENCE_MIN
+}
+
+/// Events in a row, before the other tasks have their turn.
+const IN_A_ROW: usize = 16;
+const PATIENCE_MIN: Duration = Duration::from_millis(250);
 const BACKOFF_MIN: Duration = Duration::from_millis(100);
 const BACKOFF_MAX: Duration = Duration::from_secs(5);
+/// On the bus for as long, the next bus-off is the first again.
+const HEALTHY: Duration = Duration::from_secs(5);
+/// Back on the bus it needs 129 times 11 bits: 142 ms at 10 kbit/s.
+const RECOVERY: Duration = Duration::from_secs(1);
+const LOST_PERIOD: Duration = Duration::from_secs(1);
+
+#[cfg(test)]
+mod tests;

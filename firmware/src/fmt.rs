@@ -1,8 +1,9 @@
 //! The log: [`trace!`](crate::trace) to [`error!`](crate::error), for the library and the binary.
 //!
-//! With the feature `defmt` they are defmt's macros, otherwise those of the crate `log`. What a level
-//! below the chosen one would say is not in the image at all: defmt's levels are chosen by `DEFMT_LOG`
-//! when it is built, `log`'s by the features `log-off`, `log-error` and `log-warn`.
+//! With the feature `defmt`, and not on a host, they are defmt's macros, otherwise those of the crate
+//! `log`. What a level below the chosen one would say is not in the image at all: defmt's levels are
+//! chosen by `DEFMT_LOG` when it is built, `log`'s by the features `log-off`, `log-error` and
+//! `log-warn`.
 //!
 //! Both take `{}` and arguments behind the text, and nothing else that is the same in both.
 
@@ -40,14 +41,14 @@ macro_rules! error {
 
 #[doc(hidden)]
 #[macro_export]
-#[cfg(feature = "defmt")]
+#[cfg(all(feature = "defmt", target_os = "none"))]
 macro_rules! log_at {
     ($level:ident, $($text_and_values:tt)*) => { ::defmt::$level!($($text_and_values)*) };
 }
 
 #[doc(hidden)]
 #[macro_export]
-#[cfg(not(feature = "defmt"))]
+#[cfg(not(all(feature = "defmt", target_os = "none")))]
 macro_rules! log_at {
     ($level:ident, $($text_and_values:tt)*) => { ::log::$level!($($text_and_values)*) };
 }

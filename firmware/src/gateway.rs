@@ -12,14 +12,14 @@ use embassy_futures::select::{Either, select};
 use embassy_futures::yield_now;
 use embassy_time::Timer;
 use heapless::{Deque, Vec};
-use proto_core::config::GatewayConfig;
+use proto_core::config::{GatewayConfig, Parts};
 use proto_core::engine::{
     BuildError, Engine as AnyEngine, Input, LinkId, LinkInfo, LinkKind, OUTPUT_BUFFER, Output, PortCounters,
     PortId, PortState,
 };
 use proto_core::link::LinkState;
 use proto_core::recipe::can::CanFrame;
-use proto_core::recipe::model::MAX_CAN_IDS;
+use proto_core::recipe::model::{CanId, MAX_CAN_IDS};
 use proto_core::time::Instant;
 
 use crate::led::Condition;
@@ -74,6 +74,11 @@ impl Gateway {
         // As many places as the engine has.
         self.ports.clear();
         self.ports.extend(engine.field_ports().map(|id| (id, PortControl::new())));
+        for ((_, control), (.., recipe)) in self.ports.iter_mut().zip(config.field_ports()) {
+            if let Parts::Can { input, .. } = &recipe.parts {
+                control.ids.extend(input.iter().map(|frame| frame.id));
+            }
+        }
         self.links.clear();
         self.links.extend(engine.links().map(|link| (link.id, link.kind, LinkControl::new())));
         Ok(())
@@ -194,6 +199,7 @@ pub(crate) type Transmission = Vec<u8, OUTPUT_BUFFER>;
 
 /// The engine's side of a field port.
 pub(crate) struct PortControl {
+    ids: Vec<CanId, MAX_CAN_IDS>,
     bytes: RefCell<Option<Transmission>>,
     frames: RefCell<Deque<CanFrame, MAX_CAN_IDS>>,
     changed: Notify,
@@ -201,7 +207,17 @@ pub(crate) struct PortControl {
 
 impl PortControl {
     const fn new() -> Self {
-        Self { bytes: RefCell::new(None), frames: RefCell::new(Deque::new()), changed: Notify::new() }
+        Self {
+            ids: Vec::new(),
+            bytes: RefCell::new(None),
+            frames: RefCell::new(Deque::new()),
+            changed: Notify::new(),
+        }
+    }
+
+    /// Of a CAN port: the ids whose frames its recipe takes.
+    pub(crate) fn ids(&self) -> &[CanId] {
+        &self.ids
     }
 
     /// The engine hands over one transmission and waits until it has left.

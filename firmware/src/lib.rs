@@ -10,14 +10,19 @@
 pub mod can;
 pub mod fmt;
 pub mod gateway;
+pub mod identity;
 pub mod lan9118;
 pub mod led;
 pub mod link;
+pub mod mcan;
 mod notify;
 pub mod serial;
 pub mod slcan;
 pub mod status;
+pub mod usart;
 pub mod watchdog;
 
 #[cfg(test)]
 extern crate std;
+#[cfg(test)]
+mod test_clock;

@@ -8,6 +8,6 @@ mod start;
 
 #[cfg(not(target_os = "none"))]
 fn main() {
-    eprintln!("This is firmware: build it with `cargo firmware-qemu`.");
+    eprintln!("This is firmware: build it with `cargo firmware` or `cargo firmware-qemu`.");
     std::process::exit(2);
 }

@@ -4,6 +4,7 @@
 use embedded_io_async::{Read, Write};
 use heapless::Vec;
 use proto_core::recipe::can::CanFrame;
+use proto_core::recipe::model::CanId;
 use proto_core::wire::slcan::{Channel, MAX_LINE};
 
 use crate::can::{BusOff, CanEvent, CanPort};
@@ -19,14 +20,18 @@ const CHUNK: usize = 64;
 pub struct SlcanPort<D> {
     line: D,
     channel: Channel,
+    bitrate: u32,
     input: Vec<u8, CHUNK>,
     output: Vec<u8, MAX_WAITING>,
+    /// A frame was sent whose end was not reported.
+    is_sending: bool,
 }
 
 impl<D: Read + Write> SlcanPort<D> {
     /// An adapter whose client has not opened it, on a bus of `bitrate` bit/s.
     pub fn new(line: D, bitrate: u32) -> Self {
-        Self { line, channel: Channel::new(bitrate), input: Vec::new(), output: Vec::new() }
+        let channel = Channel::new(bitrate);
+        Self { line, channel, bitrate, input: Vec::new(), output: Vec::new(), is_sending: false }
     }
 
     /// A frame that the bytes so far hold.
@@ -62,6 +67,9 @@ impl<D: Read + Write> CanPort for SlcanPort<D> {
     type Frame = CanFrame;
 
     async fn receive(&mut self) -> CanEvent<CanFrame> {
+        if core::mem::take(&mut self.is_sending) {
+            return CanEvent::Sent;
+        }
         loop {
             let frame = self.take_frame();
             if let Some(frame) = frame {
@@ -85,10 +93,19 @@ impl<D: Read + Write> CanPort for SlcanPort<D> {
             }
             self.write_out().await;
         }
+        self.is_sending = true;
         Ok(())
     }
 
-    async fn recover(&mut self) {}
+    /// There is no bus to be off; what waits is written when the line takes it.
+    fn recover(&mut self) {}
+
+    /// The client hears and is heard as the bus' only other node.
+    fn set_filters(&mut self, _: &[CanId]) {}
+
+    fn bitrate(&self) -> u32 {
+        self.bitrate
+    }
 }
 
 fn remove<const N: usize>(bytes: &mut Vec<u8, N>, count: usize) {
@@ -107,10 +124,8 @@ mod tests {
     use std::collections::VecDeque;
     use std::convert::Infallible;
 
-    use embassy_futures::block_on;
-    use proto_core::recipe::model::CanId;
-
     use super::*;
+    use embassy_futures::block_on;
 
     /// A line that brings what it was given in chunks, and keeps what was written.
     struct Script {

@@ -21,6 +21,7 @@ use proto_core::sysvar::SysVar;
 use proto_core::time::Duration as CoreDuration;
 
 use super::*;
+use crate::test_clock::{Clock, advance};
 use crate::watchdog::{TaskName, Watch};
 
 const FRAME: [u8; 5] = [0xFF, 0xFF, 0x01, 0xEE, 0xEE];
@@ -55,7 +56,7 @@ impl Read for Script {
             }
             // It arrives while something else has the processor.
             let busy = self.busy.max(piece.after);
-            std::thread::sleep(std::time::Duration::from_micros(busy.as_micros()));
+            advance(busy);
             let at = begin + piece.after;
             self.arrival = Some(Arrival { first: at, last: at });
             // Whoever else is due comes first.
@@ -128,6 +129,7 @@ fn config() -> GatewayConfig {
 
 /// What the engine counted of a line on which this happened.
 fn counted(busy: Duration, pieces: impl Into<VecDeque<Piece>>) -> PortCounters {
+    let _clock = Clock::take();
     let mut gateway = Box::new(Gateway::idle());
     gateway.configure(&config()).unwrap();
     let pieces = pieces.into();

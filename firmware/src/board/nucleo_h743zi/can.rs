@@ -1,0 +1,70 @@
+//! CAN: FDCAN1 with classic frames.
+
+use embassy_stm32::gpio::{AfType, Flex, OutputType, Pull, Speed};
+use embassy_stm32::interrupt::typelevel::{self, Handler, Interrupt};
+use embassy_stm32::pac::{FDCAN1, FDCANRAM};
+use embassy_stm32::peripherals::{PD0, PD1};
+use embassy_stm32::{Peri, peripherals, rcc};
+use embassy_sync::waitqueue::AtomicWaker;
+use firmware::mcan::{MESSAGE_RAM_WORDS, Mcan, Registers, StartError};
+
+/// The CAN controller.
+pub(crate) type CanDevice = Mcan<CanRegisters>;
+
+/// The registers and the message RAM of FDCAN1, which has all of the RAM: FDCAN2 is not used.
+pub(crate) struct CanRegisters;
+
+impl Registers for CanRegisters {
+    fn read(&self, offset: u8) -> u32 {
+        // SAFETY: the driver's offsets are registers of the controller, aligned.
+        unsafe { FDCAN1.as_ptr().cast::<u8>().add(usize::from(offset)).cast::<u32>().read_volatile() }
+    }
+
+    fn write(&self, offset: u8, value: u32) {
+        // SAFETY: as above; the controller touches no memory but its own.
+        unsafe { FDCAN1.as_ptr().cast::<u8>().add(usize::from(offset)).cast::<u32>().write_volatile(value) }
+    }
+
+    fn ram_read(&self, word: u16) -> u32 {
+        // SAFETY: the driver's words are within the message RAM, whose size is checked below.
+        unsafe { FDCANRAM.as_ptr().cast::<u32>().add(usize::from(word)).read_volatile() }
+    }
+
+    fn ram_write(&self, word: u16, value: u32) {
+        // SAFETY: as above.
+        unsafe { FDCANRAM.as_ptr().cast::<u32>().add(usize::from(word)).write_volatile(value) }
+    }
+}
+
+/// 10 KiB.
+const _: () = assert!(MESSAGE_RAM_WORDS <= 2_560);
+
+static WAKER: AtomicWaker = AtomicWaker::new();
+
+/// FDCAN1's interrupt.
+pub(super) struct CanInterrupt;
+
+impl Handler<typelevel::FDCAN1_IT0> for CanInterrupt {
+    unsafe fn on_interrupt() {
+        Mcan::interrupt(&CanRegisters, &WAKER);
+    }
+}
+
+/// Receive and transmit.
+pub(super) type Pins = (Peri<'static, PD0>, Peri<'static, PD1>);
+
+/// Starts the controller.
+pub(super) fn start(pins: Pins, bitrate: u32) -> Result<CanDevice, StartError> {
+    const FUNCTION: u8 = 9;
+    let (mut rx, mut tx) = (Flex::new(pins.0), Flex::new(pins.1));
+    rx.set_as_af_unchecked(FUNCTION, AfType::input(Pull::Up));
+    tx.set_as_af_unchecked(FUNCTION, AfType::output(OutputType::PushPull, Speed::High));
+    // Its for ever.
+    core::mem::forget((rx, tx));
+    rcc::enable_and_reset::<peripherals::FDCAN1>();
+    let clock = rcc::frequency::<peripherals::FDCAN1>().0;
+    let started = Mcan::start(CanRegisters, 0, &WAKER, bitrate, clock)?;
+    // SAFETY: its handler is bound, and masks no critical section.
+    unsafe { typelevel::FDCAN1_IT0::enable() };
+    Ok(started)
+}

@@ -1,0 +1,81 @@
+//! Clocks: 400 MHz for the core, 200 MHz for the buses, 100 MHz for the UARTs, 80 MHz for the CAN
+//! controller, all from the 8 MHz that the board's debugger feeds in.
+
+use embassy_stm32::Config;
+use embassy_stm32::pac::{DBGMCU, RCC};
+use embassy_stm32::rcc::{
+    AHBPrescaler, APBPrescaler, HSIPrescaler, Hse, HseMode, Pll, PllDiv, PllMul, PllPreDiv, PllSource,
+    Sysclk, VoltageScale, mux,
+};
+use embassy_stm32::time::Hertz;
+
+/// What the clocks are made from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Source {
+    /// The 8 MHz of the debugger's crystal.
+    External,
+    /// The chip's own 64 MHz, within 1 %: good for everything but CAN.
+    Internal,
+}
+
+/// Looks whether the external clock runs. Without this look a missing one would be waited for for ever.
+pub(super) fn source() -> Source {
+    RCC.cr().modify(|w| w.set_hsebyp(true));
+    RCC.cr().modify(|w| w.set_hseon(true));
+    // Ready after a few of its cycles; this is some ms.
+    for _ in 0..50_000 {
+        if RCC.cr().read().hserdy() {
+            return Source::External;
+        }
+    }
+    RCC.cr().modify(|w| w.set_hseon(false));
+    RCC.cr().modify(|w| w.set_hsebyp(false));
+    Source::Internal
+}
+
+/// How the chip is set up.
+pub(super) fn config(source: Source) -> Config {
+    let mut config = Config::default();
+    let rcc = &mut config.rcc;
+    rcc.hsi = Some(HSIPrescaler::DIV1);
+    // Of the random number generator.
+    rcc.hsi48 = Some(Default::default());
+    // 2 MHz times 400, by 2 and by 10.
+    let (source, prediv) = match source {
+        Source::External => {
+            rcc.hse = Some(Hse { freq: Hertz(8_000_000), mode: HseMode::Bypass });
+            (PllSource::HSE, PllPreDiv::DIV4)
+        }
+        Source::Internal => (PllSource::HSI, PllPreDiv::DIV32),
+    };
+    rcc.pll1 = Some(Pll {
+        source,
+        prediv,
+        mul: PllMul::MUL400,
+        fracn: None,
+        divp: Some(PllDiv::DIV2),
+        divq: Some(PllDiv::DIV10),
+        divr: None,
+    });
+    rcc.sys = Sysclk::PLL1_P;
+    rcc.voltage_scale = VoltageScale::Scale1;
+    rcc.ahb_pre = AHBPrescaler::DIV2;
+    rcc.apb1_pre = APBPrescaler::DIV2;
+    rcc.apb2_pre = APBPrescaler::DIV2;
+    rcc.apb3_pre = APBPrescaler::DIV2;
+    rcc.apb4_pre = APBPrescaler::DIV2;
+    rcc.mux.fdcansel = mux::Fdcansel::PLL1_Q;
+    rcc.mux.rngsel = mux::Rngsel::HSI48;
+    config
+}
+
+/// Before anything moves: chips of revision Y read AXI SRAM wrongly unless they read one thing at a time
+/// (errata ES0392, "reading from AXI SRAM may lead to data read corruption").
+pub(super) fn errata() {
+    const AXI_TARG7_FN_MOD: usize = 0x5100_8108;
+    const REVISION_Y: u16 = 0x1003;
+    if DBGMCU.idc().read().rev_id() <= REVISION_Y {
+        // SAFETY: a register of the AXI interconnect, which nothing else uses.
+        unsafe { core::ptr::with_exposed_provenance_mut::<u32>(AXI_TARG7_FN_MOD).write_volatile(1) }
+    }
+}

@@ -1,0 +1,189 @@
+//! Ethernet: RMII with the board's LAN8742A, 100 Mbit/s full duplex.
+//!
+//! The MAC's reset waits for ever for the PHY's 50 MHz, and the PHY may be missing or dead. Both are
+//! looked for with a limit before the driver is started.
+
+use core::fmt;
+use core::future::Future;
+use core::pin::pin;
+use core::task::Context;
+
+use embassy_stm32::eth::{self, PacketQueue, Phy, Sma, StationManagement};
+use embassy_stm32::gpio::{AfType, Flex, OutputType, Speed};
+use embassy_stm32::pac::syscfg::vals::EthSelPhy;
+use embassy_stm32::pac::{ETH, RCC, SYSCFG};
+use embassy_stm32::peripherals::{self, ETH_SMA, PA1, PA2, PA7, PB13, PC1, PC4, PC5, PG11, PG13};
+use embassy_stm32::{Peri, interrupt};
+use embassy_time::{Duration, Instant, Timer};
+use static_cell::ConstStaticCell;
+
+use super::leds::Led;
+
+/// The Ethernet controller.
+pub(crate) type Ethernet = eth::Ethernet<'static, peripherals::ETH, Lan8742>;
+
+/// Why there is no Ethernet.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum EthernetError {
+    /// The PHY's clock does not arrive.
+    NoClock,
+    /// At the PHY's address nobody answers as one.
+    NoPhy {
+        /// The identifier that was read.
+        found: u16,
+    },
+    /// It was started before.
+    Taken,
+}
+
+impl fmt::Display for EthernetError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::NoClock => f.write_str("no Ethernet: the PHY gives no 50 MHz on PA1"),
+            Self::NoPhy { found } => write!(f, "no Ethernet: the PHY's identifier reads {found:04X}"),
+            Self::Taken => f.write_str("Ethernet was started before"),
+        }
+    }
+}
+
+/// The controller and its pins.
+pub(super) struct Parts {
+    pub(super) mac: Peri<'static, peripherals::ETH>,
+    pub(super) sma: Peri<'static, ETH_SMA>,
+    pub(super) ref_clk: Peri<'static, PA1>,
+    pub(super) mdio: Peri<'static, PA2>,
+    pub(super) crs_dv: Peri<'static, PA7>,
+    pub(super) mdc: Peri<'static, PC1>,
+    pub(super) rxd0: Peri<'static, PC4>,
+    pub(super) rxd1: Peri<'static, PC5>,
+    pub(super) tx_en: Peri<'static, PG11>,
+    pub(super) txd0: Peri<'static, PG13>,
+    pub(super) txd1: Peri<'static, PB13>,
+}
+
+impl Parts {
+    /// Starts the controller; takes 0.2 s at most when something is missing.
+    pub(super) fn start<I>(mut self, irqs: I, address: [u8; 6], led: Led) -> Result<Ethernet, EthernetError>
+    where
+        I: interrupt::typelevel::Binding<interrupt::typelevel::ETH, eth::InterruptHandler> + 'static,
+    {
+        if !has_clock(self.ref_clk.reborrow()) {
+            return Err(EthernetError::NoClock);
+        }
+        let mut sma = Sma::new(self.sma, self.mdio, self.mdc);
+        match sma.smi_read(PHY_ADDRESS, PHY_ID1) {
+            PHY_VENDOR => {}
+            found => return Err(EthernetError::NoPhy { found }),
+        }
+        // In AXI SRAM, as all statics: the DMA reaches it, and the data cache is off.
+        static QUEUE: ConstStaticCell<PacketQueue<TX_FRAMES, RX_FRAMES>> =
+            ConstStaticCell::new(PacketQueue::new());
+        let queue = QUEUE.try_take().ok_or(EthernetError::Taken)?;
+        Ok(eth::Ethernet::new_with_phy(
+            queue,
+            self.mac,
+            irqs,
+            self.ref_clk,
+            self.crs_dv,
+            self.rxd0,
+            self.rxd1,
+            self.txd0,
+            self.txd1,
+            self.tx_en,
+            address,
+            Lan8742 { sma, led },
+        ))
+    }
+}
+
+/// Whether the MAC can be reset, for which it needs the PHY's clock.
+fn has_clock(ref_clk: Peri<'_, PA1>) -> bool {
+    const FUNCTION: u8 = 11;
+    let mut pin = Flex::new(ref_clk);
+    pin.set_as_af_unchecked(FUNCTION, AfType::output(OutputType::PushPull, Speed::VeryHigh));
+    critical_section::with(|_| {
+        RCC.ahb1enr().modify(|w| {
+            w.set_ethen(true);
+            w.set_ethtxen(true);
+            w.set_ethrxen(true);
+        });
+        SYSCFG.pmcr().modify(|w| w.set_eth_sel_phy(EthSelPhy::RMII));
+    });
+    // The choice has to have arrived before the reset.
+    SYSCFG.pmcr().read();
+    let mode = ETH.ethernet_dma().dmamr();
+    mode.modify(|w| w.set_swr(true));
+    let until = Instant::now() + PATIENCE;
+    while mode.read().swr() {
+        if Instant::now() > until {
+            return false;
+        }
+    }
+    true
+}
+
+/// The PHY. It offers 100 Mbit/s full duplex only, because that is what the MAC is set to: with a peer
+/// that cannot do it there is no link, instead of one that loses frames.
+pub(crate) struct Lan8742 {
+    sma: Sma<'static, ETH_SMA>,
+    led: Led,
+}
+
+impl Lan8742 {
+    fn read(&mut self, register: u8) -> u16 {
+        self.sma.smi_read(PHY_ADDRESS, register)
+    }
+
+    fn write(&mut self, register: u8, value: u16) {
+        self.sma.smi_write(PHY_ADDRESS, register, value);
+    }
+}
+
+impl Phy for Lan8742 {
+    fn phy_reset(&mut self) {
+        self.write(PHY_CONTROL, CONTROL_RESET);
+        let until = Instant::now() + PATIENCE;
+        while self.read(PHY_CONTROL) & CONTROL_RESET != 0 && Instant::now() < until {}
+    }
+
+    fn phy_init(&mut self) {
+        self.write(PHY_OFFER, OFFER_100_FULL);
+        self.write(PHY_CONTROL, CONTROL_NEGOTIATE);
+    }
+
+    fn poll_link(&mut self, cx: &mut Context<'_>) -> bool {
+        // Wakes the network's task, which asks again. A timer that is dropped still does.
+        let _ = pin!(Timer::after(LINK_PERIOD)).poll(cx);
+        // A PHY that lost its settings was reset by a disturbance, and gets them again.
+        if self.read(PHY_OFFER) != OFFER_100_FULL {
+            self.phy_init();
+        }
+        let is_up = self.read(PHY_STATUS) & STATUS_UP == STATUS_UP
+            && self.read(PHY_RESULT) & RESULT_MASK == RESULT_100_FULL;
+        self.led.set(is_up);
+        is_up
+    }
+}
+
+const TX_FRAMES: usize = 4;
+const RX_FRAMES: usize = 4;
+const PATIENCE: Duration = Duration::from_millis(100);
+const LINK_PERIOD: Duration = Duration::from_millis(250);
+
+const PHY_ADDRESS: u8 = 0;
+const PHY_CONTROL: u8 = 0;
+const PHY_STATUS: u8 = 1;
+const PHY_ID1: u8 = 2;
+const PHY_OFFER: u8 = 4;
+const PHY_RESULT: u8 = 31;
+/// Microchip's, formerly SMSC's.
+const PHY_VENDOR: u16 = 0x0007;
+const CONTROL_RESET: u16 = 1 << 15;
+/// Negotiate, and begin now.
+const CONTROL_NEGOTIATE: u16 = 1 << 12 | 1 << 9;
+/// 100BASE-TX full duplex, IEEE 802.3.
+const OFFER_100_FULL: u16 = 1 << 8 | 1;
+/// Negotiated, and the link is up.
+const STATUS_UP: u16 = 1 << 5 | 1 << 2;
+const RESULT_MASK: u16 = 0b111 << 2;
+const RESULT_100_FULL: u16 = 0b110 << 2;

@@ -1,0 +1,43 @@
+//! The board's three LEDs: LD1 is the status task's, LD2 is lit while the Ethernet link is up, LD3 is
+//! lit after a panic or a fault, until the watchdog starts the board again.
+
+use embassy_stm32::Peri;
+use embassy_stm32::gpio::{Level, Output, Speed};
+use embassy_stm32::pac::GPIOB;
+use embassy_stm32::peripherals::{PB0, PB14, PE1};
+
+/// An LED.
+pub(crate) struct Led(Output<'static>);
+
+impl Led {
+    /// Lights it or not.
+    pub(crate) fn set(&mut self, is_lit: bool) {
+        self.0.set_level(is_lit.into());
+    }
+}
+
+/// All of them.
+pub(super) struct Leds {
+    pub(super) status: Led,
+    pub(super) link: Led,
+}
+
+impl Leds {
+    pub(super) fn new(
+        green: Peri<'static, PB0>,
+        yellow: Peri<'static, PE1>,
+        red: Peri<'static, PB14>,
+    ) -> Self {
+        // The fault's, which needs no owner.
+        core::mem::forget(Output::new(red, Level::Low, Speed::Low));
+        Self {
+            status: Led(Output::new(green, Level::Low, Speed::Low)),
+            link: Led(Output::new(yellow, Level::Low, Speed::Low)),
+        }
+    }
+}
+
+/// Lights LD3, whatever else is going on.
+pub(super) fn fault() {
+    GPIOB.bsrr().write(|w| w.set_bs(14, true));
+}

@@ -1,0 +1,155 @@
+//! ST's NUCLEO-H743ZI2: an STM32H743ZI with a LAN8742A. RS-485 on USART2 and UART7, CAN on FDCAN1, the
+//! log over the debugger (defmt, RTT); the configuration image is in flash. Pins and wiring are in
+//! firmware/README.md.
+
+mod can;
+mod clocks;
+mod ethernet;
+mod identity;
+mod leds;
+mod serial;
+mod stack;
+mod storage;
+mod watchdog;
+
+use cortex_m::peripheral::Peripherals as Core;
+use defmt_rtt as _;
+use embassy_executor::Executor;
+use embassy_stm32::{bind_interrupts, eth};
+use firmware::fmt::Text;
+use firmware::{error, info, warn};
+use panic_probe as _;
+use proto_core::config::Rs485;
+use static_cell::StaticCell;
+
+pub(crate) use can::CanDevice;
+pub(crate) use ethernet::{Ethernet, EthernetError};
+pub(crate) use identity::seed;
+pub(crate) use leds::Led;
+pub(crate) use serial::SerialDevice;
+pub(crate) use stack::used as stack_used;
+pub(crate) use storage::StorageError;
+pub(crate) use watchdog::{WATCHDOG_PERIOD, Watchdog};
+
+/// How many RS-485 lines there are.
+pub(crate) const SERIAL_PORTS: usize = 2;
+/// How many CAN buses there are.
+pub(crate) const CAN_PORTS: usize = 1;
+
+bind_interrupts!(struct Irqs {
+    USART2 => serial::FirstInterrupt;
+    UART7 => serial::SecondInterrupt;
+    FDCAN1_IT0 => can::CanInterrupt;
+    ETH => eth::InterruptHandler;
+});
+
+defmt::timestamp!("{=u64:us}", embassy_time::Instant::now().as_micros());
+
+/// The board's devices that nobody has yet.
+pub(crate) struct Board {
+    serial: serial::Lines,
+    can: Option<can::Pins>,
+    ethernet: Option<ethernet::Parts>,
+    link: Option<Led>,
+    status: Option<Led>,
+    watchdog: Option<Watchdog>,
+}
+
+impl Board {
+    /// The configuration image.
+    pub(crate) fn configuration(&mut self) -> Result<&'static [u8], StorageError> {
+        storage::read()
+    }
+
+    /// The next RS-485 line.
+    pub(crate) fn serial(&mut self, line: &Rs485) -> Option<SerialDevice> {
+        self.serial.next(line)?.inspect_err(|error| error!("{}", Text(error))).ok()
+    }
+
+    /// The CAN bus.
+    pub(crate) fn can(&mut self, bitrate: u32) -> Option<CanDevice> {
+        can::start(self.can.take()?, bitrate).inspect_err(|error| error!("{}", Text(error))).ok()
+    }
+
+    /// The Ethernet controller.
+    pub(crate) fn ethernet(&mut self) -> Result<Ethernet, EthernetError> {
+        let (parts, led) = self.ethernet.take().zip(self.link.take()).ok_or(EthernetError::Taken)?;
+        parts.start(Irqs, identity::ethernet_address(), led)
+    }
+
+    /// The watchdog, which runs since the reset; once.
+    pub(crate) fn watchdog(&mut self) -> Watchdog {
+        self.watchdog.take().expect("asked for once")
+    }
+
+    /// The status LED; once.
+    pub(crate) fn led(&mut self) -> Led {
+        self.status.take().expect("asked for once")
+    }
+}
+
+#[cortex_m_rt::entry]
+fn main() -> ! {
+    stack::guard();
+    stack::paint();
+    clocks::errata();
+    if let Some(mut core) = Core::take() {
+        // The data cache stays off: the Ethernet DMA and the debugger see memory as it is.
+        core.SCB.enable_icache();
+    }
+    let watchdog = Watchdog::start();
+    let source = clocks::source();
+    let p = embassy_stm32::init(clocks::config(source));
+    let leds = leds::Leds::new(p.PB0, p.PE1, p.PB14);
+    tell_start(source);
+    let board = Board {
+        serial: serial::Lines::new(serial::Pins {
+            first: (p.PD5, p.PD6, p.PD4),
+            second: (p.PE8, p.PE7, p.PE9),
+        }),
+        can: Some((p.PD0, p.PD1)),
+        ethernet: Some(ethernet::Parts {
+            mac: p.ETH,
+            sma: p.ETH_SMA,
+            ref_clk: p.PA1,
+            mdio: p.PA2,
+            crs_dv: p.PA7,
+            mdc: p.PC1,
+            rxd0: p.PC4,
+            rxd1: p.PC5,
+            tx_en: p.PG11,
+            txd0: p.PG13,
+            txd1: p.PB13,
+        }),
+        link: Some(leds.link),
+        status: Some(leds.status),
+        watchdog: Some(watchdog),
+    };
+    static EXECUTOR: StaticCell<Executor> = StaticCell::new();
+    EXECUTOR.init(Executor::new()).run(|spawner| {
+        crate::start::start(spawner, board);
+    })
+}
+
+/// Says why the board starts, and on which clock.
+fn tell_start(source: clocks::Source) {
+    let cause = embassy_stm32::pac::RCC.rsr().read();
+    embassy_stm32::pac::RCC.rsr().modify(|w| w.set_rmvf(true));
+    if cause.iwdg1rstf() {
+        warn!("started again by the watchdog");
+    } else {
+        info!("started");
+    }
+    if source == clocks::Source::Internal {
+        warn!("no 8 MHz from the debugger: on the chip's own clock, too far off for fast CAN");
+    }
+}
+
+/// Also where a panic ends. The watchdog starts the board again; a debugger finds it here.
+#[cortex_m_rt::exception]
+unsafe fn HardFault(_: &cortex_m_rt::ExceptionFrame) -> ! {
+    leds::fault();
+    loop {
+        cortex_m::asm::nop();
+    }
+}

@@ -1,0 +1,84 @@
+//! The configuration image: in the second flash bank, at `_config_start` (memory.x).
+//!
+//! A flash word that was written twice, or whose writing lost its power, has no valid error correction
+//! code, and reading it is a bus fault. So each flash word of the image is read once with bus faults
+//! held back, before anybody looks at it.
+
+use core::arch::asm;
+use core::fmt;
+
+use cortex_m::peripheral::SCB;
+use proto_core::config::image::{HEADER, MAX_IMAGE, image_len};
+
+unsafe extern "C" {
+    static _config_start: u8;
+}
+
+/// What flash is written and checked in.
+const FLASH_WORD: usize = 32;
+
+const _: () = assert!(HEADER <= FLASH_WORD);
+
+/// Why there is no image.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum StorageError {
+    /// A word of it cannot be read.
+    Torn {
+        /// The word's address.
+        address: usize,
+    },
+}
+
+impl fmt::Display for StorageError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Torn { address } => {
+                write!(
+                    f,
+                    "the configuration is damaged: flash at {address:08X} cannot be read; flash it again"
+                )
+            }
+        }
+    }
+}
+
+/// The image, or as much of the flash as shows that there is none.
+pub(super) fn read() -> Result<&'static [u8], StorageError> {
+    let start = &raw const _config_start;
+    check(start.addr(), FLASH_WORD)?;
+    // SAFETY: flash that can be read and that nobody writes.
+    let header = unsafe { core::slice::from_raw_parts(start, FLASH_WORD) };
+    let len = image_len(header).map_or(FLASH_WORD, |len| len.clamp(HEADER, MAX_IMAGE));
+    check(start.addr(), len)?;
+    // SAFETY: as above; an image is shorter than the region.
+    Ok(unsafe { core::slice::from_raw_parts(start, len) })
+}
+
+/// Whether all flash words of a range can be read.
+fn check(start: usize, len: usize) -> Result<(), StorageError> {
+    (start..start + len)
+        .step_by(FLASH_WORD)
+        .try_for_each(|address| if can_read(address) { Ok(()) } else { Err(StorageError::Torn { address }) })
+}
+
+fn can_read(address: usize) -> bool {
+    const CCR_IGNORE_BUS_FAULTS: u32 = 1 << 8;
+    const CFSR_BUS: u32 = 0xFF << 8;
+    // SAFETY: for one load, whose address is flash, all interrupts and faults are masked, and bus faults
+    // then leave only their mark. The mark is taken away; everything else is as it was.
+    unsafe {
+        let scb = &*SCB::PTR;
+        scb.cfsr.write(CFSR_BUS);
+        asm!("cpsid f");
+        scb.ccr.modify(|ccr| ccr | CCR_IGNORE_BUS_FAULTS);
+        cortex_m::asm::dsb();
+        cortex_m::asm::isb();
+        core::ptr::with_exposed_provenance::<u32>(address).read_volatile();
+        cortex_m::asm::dsb();
+        let faults = scb.cfsr.read() & CFSR_BUS;
+        scb.cfsr.write(faults);
+        scb.ccr.modify(|ccr| ccr & !CCR_IGNORE_BUS_FAULTS);
+        asm!("cpsie f");
+        faults == 0
+    }
+}

@@ -1,0 +1,109 @@
+//! How a bit of the bus is made of the controller's clock.
+
+use core::fmt;
+
+/// The nominal bit time.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct BitTiming {
+    /// Clock cycles in a quantum, 1..=512.
+    pub prescaler: u16,
+    /// Quanta between the first, in which an edge is expected, and the sample point; 2..=256.
+    pub before_sample: u16,
+    /// Quanta behind the sample point, 2..=128; as many a bit may be longer or shorter.
+    pub behind_sample: u16,
+}
+
+/// A bit of the bus is not some number of clock cycles.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct BitrateError {
+    /// What was asked for, in bit/s.
+    pub bitrate: u32,
+    /// What drives the controller, in Hz.
+    pub clock: u32,
+}
+
+impl fmt::Display for BitrateError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "no {} bit/s from {} Hz", self.bitrate, self.clock)
+    }
+}
+
+impl core::error::Error for BitrateError {}
+
+impl BitTiming {
+    /// With as fine quanta as can be, and the sample point at 7/8 of the bit, as CiA has it.
+    ///
+    /// # Errors
+    /// [`BitrateError`] when the speed would be off by more than 0.1 %.
+    pub fn of(bitrate: u32, clock: u32) -> Result<Self, BitrateError> {
+        let error = BitrateError { bitrate, clock };
+        let cycles = clock.saturating_add(bitrate / 2).checked_div(bitrate).ok_or(error)?;
+        let made = clock.checked_div(cycles).ok_or(error)?;
+        if made.abs_diff(bitrate) > bitrate / 1_000 {
+            return Err(error);
+        }
+        (1..=512_u16)
+            .filter(|&prescaler| cycles.is_multiple_of(u32::from(prescaler)))
+            .find_map(|prescaler| {
+                let quanta = cycles / u32::from(prescaler);
+                if !(8..=MAX_QUANTA).contains(&quanta) {
+                    return None;
+                }
+                let behind_sample = (quanta.saturating_add(4) / 8).max(2);
+                let before_sample = quanta.saturating_sub(behind_sample).saturating_sub(1);
+                Some(Self {
+                    prescaler,
+                    before_sample: before_sample as u16,
+                    behind_sample: behind_sample as u16,
+                })
+            })
+            .ok_or(error)
+    }
+
+    /// As the register NBTP has it: each less one. The widest jump, for clocks that are off.
+    pub(super) fn register(self) -> u32 {
+        let less_one = |value: u16| u32::from(value.saturating_sub(1));
+        let jump = less_one(self.behind_sample);
+        jump << 25
+            | less_one(self.prescaler) << 16
+            | less_one(self.before_sample) << 8
+            | less_one(self.behind_sample)
+    }
+}
+
+/// 257 up to the sample point are possible; 7/8 of this many.
+const MAX_QUANTA: u32 = 292;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn usual_speeds_of_80_mhz_are_exact_and_sampled_at_seven_eighths() {
+        for bitrate in [10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000] {
+            let timing = BitTiming::of(bitrate, 80_000_000).unwrap();
+            let quanta = 1 + u32::from(timing.before_sample) + u32::from(timing.behind_sample);
+            assert_eq!(quanta * u32::from(timing.prescaler) * bitrate, 80_000_000, "{timing:?}");
+            let sample = (1 + u32::from(timing.before_sample)) * 1000 / quanta;
+            assert!((870..=880).contains(&sample), "{bitrate}: sampled at {sample} per mille");
+            assert!(timing.before_sample <= 256 && (2..=128).contains(&timing.behind_sample), "{timing:?}");
+        }
+    }
+
+    #[test]
+    fn register_of_500_kbit() {
+        // 160 quanta: 1 + 139 + 20, jump 20, prescaler 1.
+        let timing = BitTiming { prescaler: 1, before_sample: 139, behind_sample: 20 };
+        assert_eq!(BitTiming::of(500_000, 80_000_000), Ok(timing));
+        assert_eq!(timing.register(), 19 << 25 | 138 << 8 | 19);
+    }
+
+    #[test]
+    fn a_speed_that_is_off_is_refused() {
+        assert!(BitTiming::of(83_333, 80_000_000).is_ok());
+        let refused = BitTiming::of(990_000, 80_000_000);
+        assert_eq!(refused, Err(BitrateError { bitrate: 990_000, clock: 80_000_000 }));
+        assert!(BitTiming::of(0, 80_000_000).is_err());
+        assert!(BitTiming::of(500_000, 0).is_err());
+    }
+}
