@@ -30,6 +30,11 @@ impl Scenario {
         Self { name, run, limit: LIMIT, is_alone: false }
     }
 
+    /// It takes so long, beside what every scenario takes.
+    pub(crate) fn lasting(self, time: Duration) -> Self {
+        Self { limit: LIMIT + time, ..self }
+    }
+
     /// It measures something, so nothing else runs meanwhile.
     pub(crate) fn alone(self) -> Self {
         Self { is_alone: true, ..self }

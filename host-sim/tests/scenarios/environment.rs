@@ -9,7 +9,7 @@ use proto_core::config::{Bus, GatewayConfig};
 use super::case::{Case, until};
 use super::field::{CanClient, Line};
 use super::refusal::Spoil;
-use super::robot::Robot;
+use super::robot::{Robot, SERVERS};
 
 /// Where gateways run.
 pub(crate) trait Environment: Send + Sync {
@@ -46,6 +46,9 @@ pub(crate) trait Gateway {
 
     /// The processor time that its host spent on it.
     fn processor_time(&self) -> Duration;
+
+    /// The memory that it took so far at most, in bytes.
+    fn memory(&self) -> u64;
 
     /// Fails when it has ended, or said that it panicked.
     fn must_run(&mut self);
@@ -161,8 +164,24 @@ impl<'a> Plan<'a> {
 
     /// The controller that it is to be connected to.
     pub(crate) fn robot(mut self, robot: &Robot) -> Self {
-        self.servers = super::robot::SERVERS.map(|server| (server, robot.address(server))).into();
+        self.servers = SERVERS.map(|server| (server, robot.address(server))).into();
         self
+    }
+
+    /// One of the controller's servers is reached somewhere else.
+    pub(crate) fn server_at(mut self, server: &str, address: SocketAddr) -> Self {
+        for (name, place) in &mut self.servers {
+            if *name == server {
+                *place = address;
+            }
+        }
+        self
+    }
+
+    /// The controller will be on these ports of this host, later.
+    pub(crate) fn set_servers(&mut self, ports: [u16; 4]) {
+        let place = |port| SocketAddr::from(([127, 0, 0, 1], port));
+        self.servers = SERVERS.into_iter().zip(ports.map(place)).collect();
     }
 
     /// The scenario will pull the Ethernet cable.

@@ -4,8 +4,8 @@ use std::time::{Duration, Instant};
 
 use super::case::{Case, Scenario, until};
 use super::environment::{Gateway, Link};
-use super::field::Line;
-use super::robot::Robot;
+use super::field::{CanClient, Line};
+use super::robot::{Robot, RobotPlan};
 
 pub(crate) fn all() -> Vec<Scenario> {
     vec![
@@ -122,9 +122,9 @@ fn example_5(case: &Case) {
     pose_and_output(&robot, &mut gateway.line("rs485-1"), &pose_frame(6));
 }
 
-/// A gateway that is there before the controller, whose client connects to it; `place` is where.
+/// A gateway that is there before the controller, whose client is to connect to it.
 #[track_caller]
-fn listening(case: &Case, bus: &str) -> (Box<dyn Gateway>, Robot) {
+pub(crate) fn listening<'a>(case: &'a Case, bus: &str) -> (Box<dyn Gateway>, RobotPlan<'a>) {
     let gateway = case.gateway("client.toml").set("port.up.bus", bus).start();
     let (used, other) = if bus == "tcp-listen" { ("tcp1", "udp1") } else { ("udp1", "tcp1") };
     // Nobody is there for the other client; it goes on trying.
@@ -132,17 +132,19 @@ fn listening(case: &Case, bus: &str) -> (Box<dyn Gateway>, Robot) {
         .robot("client-controller.toml")
         .set(&format!("port.{used}.to"), gateway.listens("up"))
         .set(&format!("port.{other}.to"), "127.0.0.1:9");
-    (gateway, robot.start())
+    (gateway, robot)
 }
 
 fn example_6_tcp(case: &Case) {
     let (mut gateway, robot) = listening(case, "tcp-listen");
+    let robot = robot.start();
     gateway.until_up(Link::TcpListen("up"), 1);
     pose_and_output(&robot, &mut gateway.line("rs485-1"), &pose_frame(6));
 }
 
 fn example_6_udp(case: &Case) {
     let (mut gateway, robot) = listening(case, "udp-listen");
+    let robot = robot.start();
     gateway.until_up(Link::UdpListen("up"), 1);
     pose_and_output(&robot, &mut gateway.line("rs485-1"), &pose_frame(6));
 }
@@ -190,7 +192,7 @@ fn hand(case: &Case) {
 
 /// The hand reports this until the controller has it.
 #[track_caller]
-fn until_reported(hand: &mut super::field::CanClient, robot: &Robot, report: [u8; 4], values: [f64; 3]) {
+fn until_reported(hand: &mut CanClient, robot: &Robot, report: [u8; 4], values: [f64; 3]) {
     until("the report at the controller", || {
         hand.send(0x502, &report);
         let now = [1, 2, 3].map(|index| robot.newest(&format!("WordInputReg[{index}]")));

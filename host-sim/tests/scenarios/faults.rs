@@ -5,12 +5,14 @@ use std::time::{Duration, Instant};
 use super::case::{Case, Scenario, until};
 use super::environment::{Cable, Link};
 use super::examples::{DO1, DO1_OFF, DO1_ON, ROBOT, pose_and_output, pose_frame};
+use super::network::Network;
 use super::robot::reserved_ports;
 
 pub(crate) fn all() -> Vec<Scenario> {
     vec![
         Scenario::new("the_controller_restarts", restart),
         Scenario::new("the_cable_is_pulled_and_plugged_in", cable),
+        Scenario::new("modbus_alone_stalls_and_comes_back", modbus_stalls),
         Scenario::new("a_silent_device_leaves_safe_values", safe_value),
         Scenario::new("an_idle_gateway_takes_no_time", idle).alone(),
     ]
@@ -62,10 +64,41 @@ fn cable(case: &Case) {
     pose_and_output(&robot, &mut device, &pose_frame(4));
 }
 
+/// The server takes connections and says nothing more; the rest of the controller works.
+fn modbus_stalls(case: &Case) {
+    let robot = case.robot(ROBOT).start();
+    let mut way = Network::default();
+    let modbus = way.tcp(robot.address("modbus"));
+    let plan = case.gateway("rs485-system.toml").robot(&robot).server_at("modbus", modbus);
+    let mut gateway = plan.set("port.rs485-1.on_timeout", SAFE).start();
+    gateway.until_up(Link::Modbus, 1);
+    gateway.until_up(Link::State, 1);
+    let mut device = gateway.line("rs485-1");
+    device.send(&DO1_ON);
+    robot.until(DO1, 128.0);
+    way.set(Cable::Pulled);
+    until("Modbus is given up", || {
+        device.send(&DO1_ON);
+        (!gateway.link(Link::Modbus).is_up).then_some(())
+    });
+    // The pose still comes.
+    device.forget();
+    device.until(&pose_frame(4));
+    assert_eq!(gateway.link(Link::State).connects, 1, "the state link was lost with it");
+    way.set(Cable::Plugged);
+    gateway.until_up(Link::Modbus, 2);
+    // The device has been silent: its safe value is written after the return.
+    robot.until(DO1, 128.0);
+    robot.until_after(DO1, 1.0, || device.send(&DO1_ON));
+}
+
+/// What DO1 to DO8 become when nothing comes any more.
+const SAFE: &str = "{ 'DigitalOutputCommand[1]' = 0x80 }";
+
 fn safe_value(case: &Case) {
     let robot = case.robot(ROBOT).start();
     let plan = case.gateway("rs485-system.toml").robot(&robot);
-    let mut gateway = plan.set("port.rs485-1.on_timeout", "{ 'DigitalOutputCommand[1]' = 0x80 }").start();
+    let mut gateway = plan.set("port.rs485-1.on_timeout", SAFE).start();
     gateway.until_up(Link::Modbus, 1);
     let mut device = gateway.line("rs485-1");
     for value in [1, 2] {

@@ -56,6 +56,17 @@ impl Line {
         self.writer.write_all(bytes).unwrap();
     }
 
+    /// The way to the other end, for somebody else; from here on nothing is sent by this.
+    pub(crate) fn take_writer(&mut self) -> Box<dyn Write + Send> {
+        std::mem::replace(&mut self.writer, Box::new(std::io::sink()))
+    }
+
+    /// Everything that has come so far.
+    pub(crate) fn take_all(&mut self) -> Vec<u8> {
+        self.more(Duration::ZERO);
+        std::mem::take(&mut self.received)
+    }
+
     /// Waits until something has come; `false` when nothing did.
     fn more(&mut self, patience: Duration) -> bool {
         let bytes = self.inbox.bytes.lock().unwrap();
@@ -160,6 +171,11 @@ impl CanClient {
     #[track_caller]
     pub(crate) fn send_raw(&mut self, bytes: &[u8]) {
         self.0.send(bytes);
+    }
+
+    /// The bare line.
+    pub(crate) fn into_line(self) -> Line {
+        self.0
     }
 
     /// What came so far is of no interest.

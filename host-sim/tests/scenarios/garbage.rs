@@ -1,11 +1,19 @@
 //! Bytes that are nobody's frames, on every way into a gateway.
 
-use super::case::{Case, Scenario};
-use super::environment::Link;
-use super::examples::{DO1, DO1_OFF, DO1_ON, ROBOT};
+use std::io::{ErrorKind, Read, Write};
+use std::net::{TcpStream, UdpSocket};
+
+use super::case::{Case, PATIENCE, Scenario};
+use super::environment::{Gateway, Link};
+use super::examples::{DO1, DO1_OFF, DO1_ON, ROBOT, listening, pose_and_output, pose_frame};
 
 pub(crate) fn all() -> Vec<Scenario> {
-    vec![Scenario::new("garbage_on_rs485", rs485), Scenario::new("garbage_on_can", can)]
+    vec![
+        Scenario::new("garbage_on_rs485", rs485),
+        Scenario::new("garbage_on_can", can),
+        Scenario::new("strangers_on_a_listening_tcp_port", tcp),
+        Scenario::new("strangers_on_a_listening_udp_port", udp),
+    ]
 }
 
 fn rs485(case: &Case) {
@@ -45,4 +53,70 @@ fn can(case: &Case) {
     gateway.until_frames_in("can-1", 2);
     bus.forget();
     assert_eq!(bus.frame(2).len(), 8, "the cycle goes on");
+}
+
+/// Nothing of it is a frame, and it ends in the middle of one.
+fn no_frames() -> Vec<u8> {
+    let noise = (0_u32..4_096).map(|number| (number.wrapping_mul(2_654_435_761) >> 24) as u8);
+    noise.chain(pose_frame(6).into_iter().take(9)).collect()
+}
+
+/// Connects to a listening port.
+#[track_caller]
+fn stranger(gateway: &dyn Gateway) -> TcpStream {
+    let stranger = TcpStream::connect(gateway.listens("up")).unwrap();
+    stranger.set_read_timeout(Some(PATIENCE)).unwrap();
+    stranger
+}
+
+fn tcp(case: &Case) {
+    let link = Link::TcpListen("up");
+    let (mut gateway, plan) = listening(case, "tcp-listen");
+    // One who was there first: what he says is no frame, and nothing of it reaches the device.
+    let mut device = gateway.line("rs485-1");
+    let mut first = stranger(&*gateway);
+    gateway.until_up(link, 1);
+    first.write_all(&no_frames()).unwrap();
+    // Then he leaves, and the controller is served.
+    drop(first);
+    gateway.until_down(link);
+    let robot = plan.start();
+    gateway.until_up(link, 2);
+    pose_and_output(&robot, &mut device, &pose_frame(6));
+    // One more is turned away, and the controller's connection goes on.
+    let mut second = stranger(&*gateway);
+    let _ = second.write_all(&no_frames());
+    let is_turned_away = match second.read(&mut [0]) {
+        Ok(len) => len == 0,
+        Err(error) => error.kind() == ErrorKind::ConnectionReset,
+    };
+    assert!(is_turned_away, "a second client was served, or left waiting");
+    pose_and_output(&robot, &mut device, &pose_frame(6));
+    assert_eq!(gateway.link(link).connects, 2, "the controller's connection was disturbed");
+}
+
+fn udp(case: &Case) {
+    let (mut gateway, plan) = listening(case, "udp-listen");
+    let stranger = UdpSocket::bind("127.0.0.1:0").unwrap();
+    let to = gateway.listens("up");
+    let garbage = no_frames();
+    let say = |stranger: &UdpSocket| {
+        for datagram in garbage.chunks(100).chain([&garbage[..1_400], &[], &pose_frame(6)[..27]]) {
+            stranger.send_to(datagram, to).unwrap();
+        }
+    };
+    say(&stranger);
+    let mut device = gateway.line("rs485-1");
+    gateway.until_up(Link::UdpListen("up"), 1);
+    let robot = plan.start();
+    device.until(&pose_frame(6));
+    for _ in 0..3 {
+        say(&stranger);
+        for value in [1, 0] {
+            // Answers go to whoever sent last, and that may be the stranger: a device sends again.
+            robot.until_after(DO1, f64::from(value), || device.send(&[0xFF, 0xFF, value, 0xEE, 0xEE]));
+        }
+    }
+    device.forget();
+    pose_and_output(&robot, &mut device, &pose_frame(6));
 }

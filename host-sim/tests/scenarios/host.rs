@@ -175,6 +175,15 @@ impl Gateway for HostGateway {
         self.host_sim.program.processor_time()
     }
 
+    /// Its resident pages.
+    #[track_caller]
+    fn memory(&self) -> u64 {
+        let path = format!("/proc/{}/status", self.host_sim.program.pid().as_raw_pid());
+        let status = std::fs::read_to_string(path).unwrap();
+        let most = status.lines().find_map(|line| line.strip_prefix("VmHWM:")).unwrap();
+        1024 * most.trim().trim_end_matches(" kB").parse::<u64>().unwrap()
+    }
+
     #[track_caller]
     fn must_run(&mut self) {
         self.host_sim.program.must_run();

@@ -18,6 +18,7 @@ mod faults;
 mod field;
 mod garbage;
 mod host;
+mod load;
 mod network;
 mod program;
 mod qemu;
@@ -58,7 +59,7 @@ fn main() -> ExitCode {
         }
     };
     let scenarios = || {
-        let all = [examples::all(), faults::all(), garbage::all(), refusal::all()];
+        let all = [examples::all(), faults::all(), garbage::all(), refusal::all(), load::all()];
         all.into_iter().flatten()
     };
     // Who measures has the machine for himself.

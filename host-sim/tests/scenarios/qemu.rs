@@ -29,6 +29,10 @@ const HOST: &str = "10.0.2.2";
 /// QEMU hands a UART one byte at a time, and a busy host may stop it between two: by the guest's own clock
 /// tens of milliseconds passed within a frame that was sent at once. No silence ends a frame here.
 const IDLE_GAP_MS: u32 = 1_000;
+/// The board's stack (firmware/boards/mps2-an500/memory.x), and what it is filled with at the start.
+const STACK: u64 = 0x2030_0000;
+const STACK_SIZE: u64 = 1 << 20;
+const PAINT: u8 = 0xC5;
 /// RS-485, RS-485, CAN.
 const UARTS: usize = 3;
 /// The UART of the CAN port.
@@ -45,8 +49,8 @@ impl Environment for Qemu {
         make_image(plan, &image);
         let mut board = Board::start(&self.elf, plan, &image);
         board.until_log("configuration: ");
-        // What is sent before the controller's link is there is not passed on.
-        if ports(&plan.config(), listens).is_empty() {
+        // Others can connect from now on.
+        if !ports(&plan.config(), listens).is_empty() {
             board.until_log("address 10.0.2.15");
         }
         Box::new(board)
@@ -297,6 +301,16 @@ impl Gateway for Board {
 
     fn processor_time(&self) -> Duration {
         self.program.processor_time()
+    }
+
+    /// Its stack, which is painted before it is used; everything else is static.
+    #[track_caller]
+    fn memory(&self) -> u64 {
+        let path = self.folder.join("memory");
+        self.qmp("pmemsave", json!({ "val": STACK, "size": STACK_SIZE, "filename": path }));
+        let unused = std::fs::read(&path).unwrap().iter().take_while(|&&byte| byte == PAINT).count() as u64;
+        assert!(unused > 0, "the stack is where it is not expected");
+        STACK_SIZE - unused
     }
 
     #[track_caller]

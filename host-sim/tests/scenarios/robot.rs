@@ -5,7 +5,7 @@ use std::net::{SocketAddr, TcpListener, TcpStream, UdpSocket};
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU16, Ordering};
 
-use super::case::{Case, PATIENCE};
+use super::case::{Case, PATIENCE, until};
 use super::program::HostSim;
 
 /// The controller's servers.
@@ -82,10 +82,27 @@ impl Robot {
         });
     }
 
+    /// The same, while something is done again and again for it.
+    #[track_caller]
+    pub(crate) fn until_after(&self, name: &str, value: f64, mut act: impl FnMut()) {
+        until(&format!("{name} = {value}"), || {
+            act();
+            (self.newest(name) == value).then_some(())
+        });
+    }
+
     /// Waits until something its statistics count satisfies `found`.
     #[track_caller]
     pub(crate) fn until_stats(&self, what: &str, found: impl Fn(&serde_json::Value) -> bool) {
         self.host_sim.stats(what, found);
+    }
+
+    /// A count of its statistics, now.
+    #[track_caller]
+    pub(crate) fn count(&self, pointer: &str) -> u64 {
+        let stats = self.host_sim.fresh();
+        let count = stats.pointer(pointer).and_then(serde_json::Value::as_u64);
+        count.unwrap_or_else(|| panic!("no {pointer} in {stats}"))
     }
 
     /// A command on port 2000, and its reply.
