@@ -3,16 +3,18 @@
 
 use heapless::Vec;
 
+use super::OUTPUT_BUFFER;
 use super::counters::{LinkCounters, add, bump};
 use super::outbox::BIT_VARS;
 use super::store::Store;
 use crate::image::{GroupId, InputSet};
 use crate::link::{LinkTimings, Supervisor};
+use crate::modbus::adu::MAX_ADU;
 use crate::modbus::client::{Client, ClientEvent};
 use crate::modbus::pdu::{MAX_WRITE_COILS, MAX_WRITE_REGISTERS, Request, Response};
 use crate::modbus::{Coils, Registers};
 use crate::schedule::Grid;
-use crate::sysvar::{INPUT_BYTES, ModbusPlace, SysVar};
+use crate::sysvar::{ModbusPlace, SysVar};
 use crate::time::{Duration, Instant};
 use crate::wire::scalar::Scalar;
 
@@ -322,13 +324,14 @@ impl ModbusLink {
                 *place = store.outbox.bit_value(var);
             }
         }
-        let mut registers = [0; INPUT_BYTES];
+        // Registers are packed behind the longest request, where nothing has to be cleared for them.
+        let (out, room) = out.split_at_mut_checked(MAX_ADU)?;
         let request = match kind {
             Kind::Coils => Request::WriteCoils { address, coils: Coils::new(bits.get(..count)?, items)? },
             Kind::Registers => {
                 let start = first.image_offset();
                 let words = store.image.bytes().get(start..start.saturating_add(count.saturating_mul(2)))?;
-                let registers = Registers::from_little_endian(words, &mut registers)?;
+                let registers = Registers::from_little_endian(words, room)?;
                 Request::WriteRegisters { address, registers }
             }
         };
@@ -338,6 +341,9 @@ impl ModbusLink {
         Some((len, Asked::Write { safe }))
     }
 }
+
+/// The longest request and its registers.
+const _: () = assert!(MAX_ADU + 2 * MAX_WRITE_REGISTERS as usize <= OUTPUT_BUFFER);
 
 fn place_of(var: SysVar) -> Option<(u16, Kind)> {
     match var.modbus()? {

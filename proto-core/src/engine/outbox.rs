@@ -52,11 +52,6 @@ impl Outbox {
         self.dirty
     }
 
-    /// The byte variables as they are to be written next, in table order.
-    pub(super) fn bits(&self) -> [u8; BIT_VARS] {
-        self.bits.map(|slot| slot.value)
-    }
-
     /// The value of a byte variable that is to be written next.
     pub(super) fn bit_value(&self, var: SysVar) -> u8 {
         self.bits.get(var.ordinal()).map_or(0, |slot| slot.value)

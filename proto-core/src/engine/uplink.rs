@@ -208,14 +208,15 @@ fn encode<const PORTS: usize>(
     store: &mut Store<PORTS>,
     out: &mut [u8],
 ) -> Option<usize> {
+    let waiting = store.outbox.dirty().and(&InputSet::BYTES);
+    if waiting.is_empty() {
+        return layout.encode(store.image.bytes(), out).ok();
+    }
     let newest: [u8; BIT_VARS] = *store.image.bytes().first_chunk()?;
-    let dirty = store.outbox.dirty();
     let mut next = newest;
-    for (slot, (value, var)) in
-        next.iter_mut().zip(store.outbox.bits().into_iter().zip(InputSet::BYTES.iter()))
-    {
-        if dirty.contains(var) {
-            *slot = value;
+    for var in waiting.iter() {
+        if let Some(slot) = next.get_mut(var.image_offset()) {
+            *slot = store.outbox.bit_value(var);
         }
     }
     *store.image.bytes_mut().first_chunk_mut()? = next;
