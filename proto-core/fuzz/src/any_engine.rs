@@ -27,10 +27,12 @@ pub(crate) fn run(input: &[u8]) {
     let engine = Engine::<8, 4, 512>::new(&config);
     assert!(valid.is_ok() || engine.is_err(), "{valid:?}");
     let mut bytes = vec![0xA5; image::MAX_IMAGE];
-    let len = image::encode(&config, &mut bytes).expect("there is room for every image");
-    match image::decode(&bytes[..len]) {
-        Ok(read) => assert!(valid.is_ok() && read == *config),
-        Err(error) => assert_eq!(Some(error), valid.err().map(image::ImageError::Config)),
+    // The largest configurations have no image.
+    if let Ok(len) = image::encode(&config, &mut bytes) {
+        match image::decode(&bytes[..len]) {
+            Ok(read) => assert!(valid.is_ok() && read == *config),
+            Err(error) => assert_eq!(Some(error), valid.err().map(image::ImageError::Config)),
+        }
     }
     let Ok(engine) = engine else { return };
     let mut driver = Driver::new(config, engine, input.u8());
@@ -43,7 +45,7 @@ pub(crate) fn run(input: &[u8]) {
 }
 
 /// A configuration; `None` when there is no room for what the input asks.
-fn config(input: &mut Source<'_>) -> Option<Box<GatewayConfig>> {
+pub(crate) fn config(input: &mut Source<'_>) -> Option<Box<GatewayConfig>> {
     let mut cell = Cell::new();
     let recipes = 1 + input.below(5);
     for _ in 0..recipes {

@@ -13,6 +13,7 @@ mod can;
 mod command;
 mod deframer;
 mod engine;
+mod image;
 mod modbus;
 mod recipes;
 mod slcan;
@@ -76,6 +77,7 @@ pub const TARGETS: &[Target] = &[
         runs: 2_000,
         longest: 1_000,
     },
+    Target { name: "image", run: image::run, seeds: image::seeds, runs: 1_500, longest: 3_000 },
 ];
 
 /// The target of this name.
