@@ -92,3 +92,15 @@ proptest! {
         }
     }
 }
+
+#[test]
+fn a_line_break_in_an_override_or_a_name_stays_in_its_line() {
+    let refused =
+        parse(Text { name: "a\nb.toml", toml: "[controller]\n" }, &["x=1\r\n2".to_owned()]).unwrap_err();
+    assert_eq!(
+        refused.to_string(),
+        "--set x=1\\r\\n2: x: unknown key; allowed: controller, network, recipe, port"
+    );
+    let refused = parse(Text { name: "a\nb.toml", toml: "[controller" }, &[]).unwrap_err();
+    assert!(refused.to_string().starts_with("a\\nb.toml:1:"), "{refused}");
+}

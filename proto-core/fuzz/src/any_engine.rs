@@ -218,7 +218,6 @@ struct Driver {
 #[derive(Clone, Copy, Default)]
 struct Port {
     up: bool,
-    off: bool,
     sending: usize,
 }
 
@@ -275,7 +274,7 @@ impl Driver {
                 self.handle(Input::PortUp { port });
             }
             2 => {
-                self.ports[p] = Port { off: self.ports[p].off, ..Port::default() };
+                self.ports[p] = Port::default();
                 self.handle(Input::PortDown { port });
             }
             3 if !self.honest || self.ports[p].sending > 0 => {
@@ -285,6 +284,10 @@ impl Driver {
             4 => {
                 let state = [BusState::Active, BusState::Warning, BusState::Passive, BusState::BusOff]
                     [usize::from(op >> 6)];
+                if state == BusState::BusOff {
+                    // What was handed over is lost with it.
+                    self.ports[p].sending = 0;
+                }
                 self.handle(Input::PortBus { port, state });
             }
             5 | 6 if !self.honest || self.links[l].opening => {

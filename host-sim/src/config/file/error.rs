@@ -40,9 +40,19 @@ pub enum Source {
 impl fmt::Display for FileError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match &self.source {
-            Source::File { file, line, column } => write!(f, "{file}:{line}:{column}: ")?,
-            Source::WholeFile { file } => write!(f, "{file}: ")?,
-            Source::Override { text } => write!(f, "--set {text}: ")?,
+            Source::File { file, line, column } => {
+                write_line(f, file)?;
+                write!(f, ":{line}:{column}: ")?;
+            }
+            Source::WholeFile { file } => {
+                write_line(f, file)?;
+                f.write_str(": ")?;
+            }
+            Source::Override { text } => {
+                f.write_str("--set ")?;
+                write_line(f, text)?;
+                f.write_str(": ")?;
+            }
         }
         if !self.key.is_empty() {
             write_line(f, &self.key)?;

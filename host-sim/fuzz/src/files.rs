@@ -1,0 +1,370 @@
+//! A file, damaged or not, and `--set` overrides: one line says what is wrong, or the configuration
+//! is one that an engine and a board can take (docs/configuration.md).
+
+use host_sim::config::SimConfig;
+use host_sim::config::file::{
+    Config, FileError, Text, parse, parse_controller, parse_gateway, parse_recipes,
+};
+use proto_core::config::GatewayConfig;
+use proto_core::config::image::{MAX_IMAGE, decode, encode};
+use proto_core::engine::{BuildError, Engine};
+use proto_core_fuzz::source::Source;
+use toml::{Table, Value};
+
+const NAME: &str = "fuzz.toml";
+
+/// Pieces that mean something to a configuration file, and some that mean trouble.
+const PIECES: [&str; 48] = [
+    "[",
+    "]",
+    "[[",
+    "{",
+    "}",
+    "=",
+    ",",
+    "\n",
+    "\"",
+    "'''",
+    "0",
+    "-1",
+    "1e308",
+    "nan",
+    "inf",
+    "0x1FFFFFFF",
+    "99999999999999999999",
+    "true",
+    "é",
+    "\u{0}",
+    "..",
+    "RobotState[1..32]",
+    "ForceEnd[1]",
+    "__RobotState_8",
+    "head = [1]",
+    "fields = []",
+    "[[port]]\n",
+    "[[recipe]]\n",
+    "\"rising:BitOutputReg[3].7\"",
+    "1979-05-27",
+    "name = \"\"",
+    "\"a\\nb\" = 1",
+    "name = \"a\\nb\"",
+    "type = \"double\"",
+    "extended = true",
+    "value = 1.5",
+    "{ 1 = \"stop\" }",
+    "bus = \"can\"",
+    "mode = \"user\"",
+    "cycle_ms = 5",
+    "baud = 9600",
+    "\u{7F}",
+    "\u{85}",
+    "on_timeout = { \"DI[1]\" = 1 }",
+    "to = \"WordInputReg[1]\"",
+    "from = \"counter\"",
+    "send = \"frame\"",
+    "#",
+];
+
+/// What overrides say.
+const VALUES: [&str; 24] = [
+    "0",
+    "1",
+    "-1",
+    "4",
+    "65535",
+    "65536",
+    "9600",
+    "500000",
+    "1.5",
+    "nan",
+    "true",
+    "can",
+    "rs485",
+    "stream",
+    "\"user\"",
+    "[]",
+    "[1, 2]",
+    "{}",
+    "{ a = 1 }",
+    "[\"RobotState[8]\"]",
+    "",
+    "a\nb",
+    "\"",
+    "10.0.0.2",
+];
+
+pub(crate) fn run(input: &[u8]) {
+    let mut input = Source::new(input);
+    let kind = input.u8();
+    let text = match kind & 1 {
+        0 => String::from_utf8_lossy(input.run()).into_owned(),
+        _ => damaged(&mut input),
+    };
+    let text = if kind & 2 == 0 { text } else { text + &*String::from_utf8_lossy(input.rest()) };
+    alone(&text);
+    let table = text.parse::<Table>();
+    if let (Ok(_), Err(error)) = (parse_text(&text, &[]), &table) {
+        panic!("taken, and is no TOML: {error}");
+    }
+    let overrides: Vec<Override> =
+        (0..kind >> 6).map(|_| Override::read(&mut input, table.as_ref().ok())).collect();
+    let texts: Vec<String> = overrides.iter().map(|one| one.text.clone()).collect();
+    if let Err(error) = parse_text(&text, &texts) {
+        one_line(&error);
+    }
+    if let Ok(table) = table {
+        against_the_file(&table, &overrides);
+    }
+}
+
+/// One of the example files with pieces put in and taken out.
+fn damaged(input: &mut Source<'_>) -> String {
+    let mut text = input.one_of(&FILES).to_owned();
+    for _ in 0..input.below(5) {
+        let place = usize::from(input.u16()) % (text.len() + 1);
+        let place = (0..=place).rev().find(|&place| text.is_char_boundary(place)).unwrap_or(0);
+        let end = (place + input.below(40)).min(text.len());
+        let end = (end..=text.len()).find(|&end| text.is_char_boundary(end)).unwrap_or(place);
+        text.replace_range(place..end, input.one_of(&PIECES));
+    }
+    text
+}
+
+fn parse_text(text: &str, overrides: &[String]) -> Result<Config, FileError> {
+    parse(Text { name: NAME, toml: text }, overrides)
+}
+
+fn one_line(error: &FileError) {
+    let message = error.to_string();
+    assert!(message.starts_with("fuzz.toml:") || message.starts_with("--set "), "{message}");
+    assert!(!message.chars().any(char::is_control), "{message:?}");
+}
+
+/// The file by itself.
+fn alone(text: &str) {
+    let read = parse_text(text, &[]);
+    let named = Text { name: NAME, toml: text };
+    let (gateway, controller) = (parse_gateway(named, &[]), parse_controller(named, &[]));
+    let recipes = parse_recipes(named, &[]);
+    match &read {
+        Ok(Config::Gateway(config)) => {
+            assert_eq!(gateway.as_ref(), Ok(config));
+            assert!(controller.is_err() && recipes.is_ok());
+            usable(config);
+        }
+        Ok(Config::Controller(config)) => {
+            assert_eq!(controller.as_ref(), Ok(config));
+            assert!(gateway.is_err() && recipes.is_ok());
+        }
+        // What has no section of either kind is what the caller says it is.
+        Err(_) => assert!(gateway.is_err() || controller.is_err()),
+    }
+    for error in [read.err(), gateway.err(), controller.err(), recipes.err()].into_iter().flatten() {
+        one_line(&error);
+    }
+}
+
+/// Whatever a file says that was taken, an engine and a board can take it too.
+fn usable(config: &GatewayConfig) {
+    config.validate().expect("it was checked");
+    let engine = Engine::<8, 4, 512>::new(config);
+    assert!(!matches!(engine, Err(BuildError::Config(_))), "{:?}", engine.map(|_| ()));
+    let mut image = vec![0; MAX_IMAGE];
+    if let Ok(len) = encode(config, &mut image) {
+        assert_eq!(decode(&image[..len]).as_ref(), Ok(config));
+    }
+}
+
+/// One override, and what it means where that is plain.
+struct Override {
+    text: String,
+    means: Option<(Vec<String>, String)>,
+}
+
+impl Override {
+    fn read(input: &mut Source<'_>, table: Option<&Table>) -> Self {
+        let value = match input.u8() {
+            nth if usize::from(nth) < VALUES.len() => VALUES[usize::from(nth)].to_owned(),
+            _ => String::from_utf8_lossy(input.run()).into_owned(),
+        };
+        let Some(path) = table.and_then(|table| path(input, table)) else {
+            let key = String::from_utf8_lossy(input.run()).into_owned();
+            return Self {
+                text: format!("{key}{}{value}", ["=", ""][usize::from(key.ends_with('='))]),
+                means: None,
+            };
+        };
+        let quoted = |name: &String| if name.contains('.') { format!("\"{name}\"") } else { name.clone() };
+        let key = path.iter().map(quoted).collect::<Vec<_>>().join(".");
+        // Quotes in a name, or none of it, have no plain form.
+        let plain = path
+            .iter()
+            .all(|name| !name.is_empty() && !name.contains(['"', '=', '[', ']']) && name.trim() == name);
+        Self { text: format!("{key}={value}"), means: plain.then_some((path, value)) }
+    }
+}
+
+/// The names on the way to some value of the file, or to one that is not there yet.
+fn path(input: &mut Source<'_>, table: &Table) -> Option<Vec<String>> {
+    let mut path = Vec::new();
+    let mut at = &Value::Table(table.clone());
+    loop {
+        let turn = input.u8();
+        match at {
+            Value::Table(table) if turn < 240 => {
+                let (name, inner) = table.iter().nth(usize::from(turn) % table.len().max(1))?;
+                path.push(name.clone());
+                at = inner;
+            }
+            Value::Table(_) => {
+                path.push(
+                    ["cycle_ms", "name", "ports", "input", "timeout_ms", "1"][usize::from(turn) % 6]
+                        .to_owned(),
+                );
+                return Some(path);
+            }
+            Value::Array(items) if turn < 200 && !items.is_empty() => {
+                let nth = usize::from(turn / 2) % items.len();
+                let name = items[nth].get("name").and_then(Value::as_str);
+                path.push(
+                    name.filter(|_| turn.is_multiple_of(2))
+                        .map_or_else(|| (nth + 1).to_string(), str::to_owned),
+                );
+                at = &items[nth];
+            }
+            _ => return (!path.is_empty()).then_some(path),
+        }
+        if turn % 16 == 15 {
+            return Some(path);
+        }
+    }
+}
+
+/// Section 1: an override does what the same words in the file do.
+fn against_the_file(table: &Table, overrides: &[Override]) {
+    // Written anew, so that both ways have their keys in the same order.
+    let text = toml::to_string(table).expect("what was read can be written");
+    assert_eq!(parse_text(&text, &[]).is_ok(), parse_text(&table.to_string(), &[]).is_ok());
+    let mut changed = table.clone();
+    let mut fits = true;
+    for one in overrides {
+        let Some((path, value)) = &one.means else { return };
+        // The order of a table's lines counts here, and a new one would be the last.
+        if path.iter().any(|name| name == "to" || name == "initial" || name == "on_timeout") {
+            return;
+        }
+        let value = match format!("x = {value}").parse::<Table>() {
+            _ if value.contains('\n') => return,
+            Ok(mut table) => table.remove("x").expect("it was just put in"),
+            Err(_) if value.trim().starts_with(['[', '{', '"', '\'']) => {
+                fits = false;
+                break;
+            }
+            Err(_) => Value::String(value.trim().to_owned()),
+        };
+        fits &= put(&mut changed, path, value);
+    }
+    let texts: Vec<String> = overrides.iter().map(|one| one.text.clone()).collect();
+    let by_override = parse_text(&text, &texts);
+    if !fits {
+        return assert!(by_override.is_err(), "{texts:?} cannot be put in: {by_override:?}");
+    }
+    let changed = toml::to_string(&changed).expect("what was read can be written");
+    let in_the_file = parse_text(&changed, &[]);
+    match (&by_override, &in_the_file) {
+        (Ok(one), Ok(other)) => assert_eq!(sorted(one), sorted(other), "{texts:?}"),
+        (Err(_), Err(_)) => {}
+        (one, other) => panic!("{texts:?}: {one:?}\nas a file: {other:?}\n{changed}"),
+    }
+}
+
+fn put(table: &mut Table, path: &[String], value: Value) -> bool {
+    let (name, rest) = path.split_first().expect("no path is empty");
+    if rest.is_empty() {
+        table.insert(name.clone(), value);
+        return true;
+    }
+    let inner = table.entry(name.clone()).or_insert_with(|| Value::Table(Table::new()));
+    put_into(inner, rest, value)
+}
+
+fn put_into(inner: &mut Value, path: &[String], value: Value) -> bool {
+    match inner {
+        Value::Table(table) => put(table, path, value),
+        Value::Array(items) => {
+            let named =
+                items.iter().position(|item| item.get("name").and_then(Value::as_str) == Some(&path[0]));
+            let number = || path[0].parse::<usize>().ok().filter(|nth| (1..=items.len()).contains(nth));
+            let Some(nth) = named.or_else(|| number().map(|number| number - 1)) else { return false };
+            if path.len() == 1 {
+                items[nth] = value;
+                return true;
+            }
+            put_into(&mut items[nth], &path[1..], value)
+        }
+        _ => false,
+    }
+}
+
+/// Without an order of what has none.
+fn sorted(config: &Config) -> Config {
+    match config.clone() {
+        Config::Controller(SimConfig { mut initial, listen, robot, recipes, ports, programs }) => {
+            initial.sort_by_key(|one| format!("{one:?}"));
+            Config::Controller(SimConfig { initial, listen, robot, recipes, ports, programs })
+        }
+        gateway => gateway,
+    }
+}
+
+macro_rules! files {
+    ($($name:literal)*) => {
+        const FILES: [&str; [$($name),*].len()] = [$(include_str!(concat!("../../configs/", $name, ".toml"))),*];
+    };
+}
+
+files! {
+    "can-hand" "can-hand-controller" "can-system" "can-system-controller" "can-user" "can-user-controller"
+    "client" "client-controller" "force-sensor" "force-sensor-controller" "request-response"
+    "request-response-controller" "rs485-system" "rs485-system-controller" "rs485-user" "rs485-user-controller"
+    "udp-server" "udp-server-controller"
+}
+
+pub(crate) fn seeds() -> Vec<Vec<u8>> {
+    let mut seeds = Vec::new();
+    for nth in 0..FILES.len() as u8 {
+        // As it is; with overrides of what is there, by name and by number, and of what is not.
+        seeds.push(vec![1, nth, 0]);
+        for turns in
+            [[0, 0, 0, 0], [1, 1, 1, 1], [2, 0, 5, 0], [2, 1, 7, 250], [3, 2, 240, 250], [31, 0, 0, 0]]
+        {
+            for value in [0, 4, 9, 11, 15, 17, 22] {
+                seeds.push([&[0x41, nth, 0, value], &turns[..]].concat());
+            }
+        }
+        seeds.push([&[0xC1, nth, 1, 50, 1, 7, 21], &[5, 1, 0, 2, 3, 6, 2, 0, 2, 5, 21, 0, 15][..]].concat());
+    }
+    // Section 1's own examples, on a file that has the items.
+    for text in [
+        "controller.address",
+        "controller.ports.modbus",
+        "port.rs485-1.baud",
+        "recipe.hand.input.frame.1.id",
+        "program.\"echo.jspf\".script",
+    ] {
+        seeds.push([&[0x40, 0, 2, text.len() as u8], text.as_bytes()].concat());
+    }
+    // Texts alone.
+    for text in [
+        "",
+        "[controller]\naddress = 1",
+        "[listen]\n[robot]\n",
+        "a = \"\\u0000\"",
+        "[[recipe]]\n",
+        "[controller]\n[robot]",
+    ] {
+        seeds.push([&[0, text.len() as u8], text.as_bytes()].concat());
+        seeds.push([&[2, 0], text.as_bytes()].concat());
+    }
+    seeds
+}
