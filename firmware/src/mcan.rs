@@ -420,3 +420,6 @@ const TO_FIFO_1: u32 = 2;
 const HEAD_REMOTE: u32 = 1 << 29;
 const HEAD_EXTENDED: u32 = 1 << 30;
 const CONTROL_FD: u32 = 1 << 21;
+
+#[cfg(test)]
+mod tests;

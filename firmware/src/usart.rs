@@ -384,3 +384,6 @@ const RX_NOT_EMPTY: u32 = 1 << 5;
 const TX_NOT_FULL: u32 = 1 << 7;
 /// Noise is only told: the samples of the bit disagreed, its majority was taken.
 const CHARACTER_ERRORS: u32 = PARITY_ERROR | FRAMING_ERROR | NOISE;
+
+#[cfg(test)]
+mod tests;
