@@ -1,6 +1,9 @@
 //! The cells whose engine is recorded, and what happens in them.
 
+use std::path::Path;
+
 use host_sim::cell::{Cell, Chunking, Rng, Talker, Trouble, TroubleKind};
+use host_sim::config::file::{self, Text};
 use proto_core::config::GatewayConfig;
 use proto_core::time::Duration;
 
@@ -39,12 +42,14 @@ const EXAMPLES: [(&str, Frames, u64); 9] = [
     ("request-response", Frames::Stream { head: FF, payload: 3, tail: EE }, 20),
 ];
 
+/// Not an example: the cell whose instructions are counted.
+const FOUR_PORTS: &str = "four ports";
+
 /// All of them: in peace, in trouble, and one for its arithmetic.
 pub(crate) fn all() -> Vec<Recorded> {
-    let peaceful = EXAMPLES.iter().map(|example| Recorded { name: example.0.to_owned(), record: in_peace });
-    let troubled = EXAMPLES
-        .iter()
-        .map(|example| Recorded { name: format!("{} in trouble", example.0), record: in_trouble });
+    let names = || EXAMPLES.iter().map(|example| example.0).chain([FOUR_PORTS]);
+    let peaceful = names().map(|name| Recorded { name: name.to_owned(), record: in_peace });
+    let troubled = names().map(|name| Recorded { name: format!("{name} in trouble"), record: in_trouble });
     let arithmetic = Recorded { name: "arithmetic".to_owned(), record: |_| arithmetic::record() };
     peaceful.chain(troubled).chain([arithmetic]).collect()
 }
@@ -74,6 +79,9 @@ fn in_trouble(name: &str) -> Vec<u8> {
 
 /// The cell of these files, with devices that send.
 fn talking(name: &str, chunking: Chunking) -> Cell {
+    if name == FOUR_PORTS {
+        return four_ports(chunking);
+    }
     let (gateway, controller) = files(name);
     let mut cell = recorded(&gateway, &controller);
     let Some((_, frames, rate)) = EXAMPLES.iter().find(|example| example.0 == name) else {
@@ -101,6 +109,49 @@ fn talking(name: &str, chunking: Chunking) -> Cell {
     }
     cell
 }
+
+/// Everything at once: a PLC to Modbus, a force sensor to UDP, CAN both ways, a display.
+fn four_ports(chunking: Chunking) -> Cell {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../firmware/examples/counts.toml");
+    let set = ["plc.timeout_ms=50", "sensor.timeout_ms=20", "devices.timeout_ms=100", "devices.cycle_ms=4"];
+    let set = set.into_iter().chain(["display.cycle_ms=4"]).map(|set| format!("port.{set}"));
+    let gateway = file::load_gateway(&path, &set.collect::<Vec<_>>());
+    let controller = file::parse_controller(Text { name: "controller.toml", toml: FORCES }, &[]);
+    let mut cell = match (gateway, controller) {
+        (Ok(gateway), Ok(controller)) => recorded(&gateway, &controller),
+        (gateway, controller) => panic!("{:?} {:?}", gateway.err(), controller.err()),
+    };
+    let start = cell.now() + Duration::from_millis(20);
+    let mut rng = Rng::new(4);
+    for (port, rate, head, tail) in [("plc", 150, FF, EE), ("sensor", 960, [0x48, 0xAA], [0x0D, 0x0A])] {
+        let line = cell.line_of(port);
+        cell.line(line).chunking = chunking;
+        let mut rng = rng.fork();
+        let frame = move |_| [&head[..], &rng.bytes(24), &tail].concat();
+        cell.attach(line, Talker::new(start, rate, u64::MAX, frame));
+    }
+    let bus = cell.bus_of("devices");
+    let frame = move |_| can(0x500 + rng.below(14) as u16, &rng.bytes(2));
+    cell.attach_can(bus, Talker::new(start, 500, u64::MAX, frame));
+    cell
+}
+
+/// The controller of the four ports: its UDP server takes forces.
+const FORCES: &str = r#"
+[[recipe]]
+name = "up"
+kind = "stream"
+mode = "realtime"
+[recipe.input]
+head = [255, 255]
+tail = [238, 238]
+fields = ["ForceEnd[1..6]"]
+
+[[port]]
+name = "udp2011"
+bus = "udp-server"
+recipe = "up"
+"#;
 
 fn silence(cell: &mut Cell) {
     let start = cell.now();
