@@ -559,3 +559,29 @@ fn a_ports_state_tells_silence_from_bus_off_and_from_a_device_that_is_gone() {
     assert_eq!(rig.engine.port_state(port), Some(PortState::Gone));
     assert_eq!(rig.engine.port_state(PortId(7)), None);
 }
+
+#[test]
+fn a_safe_value_that_its_owner_overtakes_grows_old_as_any_other() {
+    let mut cell = Cell::new();
+    let recipe = cell.stream(&["DigitalOutputCommand[1]"], &[]);
+    let port = cell.rs485(recipe);
+    cell.safe("DigitalOutputCommand[1]", 4.0);
+    let mut rig = cell.rig();
+    rig.run(MS(10));
+    rig.modbus_answers = false;
+    rig.bytes(port, ON);
+    assert_eq!(rig.sent_on(LinkId::MODBUS).len(), 1, "and no answer for 500 ms");
+    // Overdue after 100 ms: the safe value waits. 50 ms later the owner is back.
+    rig.run(MS(150));
+    for _ in 0..4 {
+        rig.bytes(port, ON);
+        rig.run(MS(20));
+    }
+    assert_eq!(rig.counters(port).values_expired, 1, "the safe value of 100 ms, at 230 ms");
+    rig.modbus_answers = true;
+    for _ in 0..20 {
+        rig.bytes(port, ON);
+        rig.run(MS(20));
+    }
+    assert!(!rig.take_written().contains(&coils(192, 4)), "the owner is back");
+}

@@ -97,6 +97,10 @@ impl<const PORTS: usize> Store<PORTS> {
         let (set, port) = (frame.set, usize::from(frame.port));
         self.image.stamp(GroupId(nth as u8), now);
         self.live = self.live.or(&set);
+        if !self.safe.and(&set).is_empty() {
+            // Safe values that still wait grow old from now on, and may be too old already.
+            self.next_expiry = now;
+        }
         self.safe = self.safe.minus(&set);
         let reachable = set.and(&self.reachable);
         let Some(queue) = self.edges.get_mut(port) else { return InputSet::EMPTY };
