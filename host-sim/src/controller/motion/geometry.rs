@@ -1,4 +1,7 @@
 //! Forward kinematics: joints to frames, poses and twists.
+//!
+//! The trigonometry is libm's, not the system's: a pose is the same to the last bit on every machine,
+//! and with it the trace of a soak run.
 
 /// How many joints the arm has.
 pub(super) const JOINTS: usize = 6;
@@ -18,7 +21,7 @@ impl Frame {
     /// The frame with this pose: X, Y, Z in m, then turns about the fixed X, Y and Z axes, rad.
     pub fn from_pose(pose: &[f64; 6]) -> Self {
         let [x, y, z, rx, ry, rz] = *pose;
-        let ((sx, cx), (sy, cy), (sz, cz)) = (rx.sin_cos(), ry.sin_cos(), rz.sin_cos());
+        let ((sx, cx), (sy, cy), (sz, cz)) = (libm::sincos(rx), libm::sincos(ry), libm::sincos(rz));
         let rotation = [
             [cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx],
             [sz * cy, sz * sy * sx + cz * cx, sz * sy * cx - cz * sx],
@@ -30,9 +33,9 @@ impl Frame {
     /// The frame's pose, as [`Self::from_pose`] takes it.
     pub fn pose(&self) -> [f64; 6] {
         let r = &self.rotation;
-        let ry = (-r[2][0]).clamp(-1.0, 1.0).asin();
-        let rx = r[2][1].atan2(r[2][2]);
-        let rz = r[1][0].atan2(r[0][0]);
+        let ry = libm::asin((-r[2][0]).clamp(-1.0, 1.0));
+        let rx = libm::atan2(r[2][1], r[2][2]);
+        let rz = libm::atan2(r[1][0], r[0][0]);
         let [x, y, z] = self.origin;
         [x, y, z, rx, ry, rz]
     }
@@ -102,7 +105,7 @@ struct Link {
 
 impl Link {
     fn at(&self, angle: f64) -> Frame {
-        let (s, c) = angle.sin_cos();
+        let (s, c) = libm::sincos(angle);
         let (st, ct) = self.twist;
         Frame {
             rotation: [[c, -s * ct, s * st], [s, c * ct, -c * st], [0.0, st, ct]],

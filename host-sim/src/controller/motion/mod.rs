@@ -242,7 +242,7 @@ impl Arm {
 /// A plausible torque: gravity on the three pitching joints, inertia and viscous friction.
 fn torque(nth: usize, q: &[f64], qd: &[f64], qdd: &[f64], payload_kg: f64) -> f64 {
     let load = payload_kg * 9.81;
-    let (upper, fore, wrist) = (q[1].cos(), (q[1] + q[2]).cos(), (q[1] + q[2] + q[3]).cos());
+    let (upper, fore, wrist) = (libm::cos(q[1]), libm::cos(q[1] + q[2]), libm::cos(q[1] + q[2] + q[3]));
     let at_wrist = (1.2 + 0.1 * load) * wrist;
     let at_elbow = (11.0 + 0.37 * load) * fore + at_wrist;
     let gravity = match nth {
