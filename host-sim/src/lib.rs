@@ -7,3 +7,4 @@ pub mod config;
 pub mod controller;
 pub mod demo;
 pub mod shell;
+pub mod soak;

@@ -36,6 +36,7 @@ pub struct CanBus {
     waiting: [VecDeque<CanFrame>; 2],
     on_the_bus: Option<(End, CanFrame)>,
     heard: VecDeque<(Instant, CanFrame)>,
+    pub(super) keep_heard: usize,
     rng: Rng,
 }
 
@@ -73,6 +74,7 @@ impl CanBus {
             waiting: [VecDeque::new(), VecDeque::new()],
             on_the_bus: None,
             heard: VecDeque::new(),
+            keep_heard: MAX_HEARD,
             rng,
         }
     }
@@ -98,8 +100,8 @@ impl CanBus {
         let (from, frame) = self.on_the_bus.take()?;
         let arrives = self.connected && !self.rng.chance(self.loss_ppm);
         self.counters.lost += u64::from(!arrives);
-        if arrives && from == End::Port {
-            if self.heard.len() >= MAX_HEARD {
+        if arrives && from == End::Port && self.keep_heard > 0 {
+            if self.heard.len() >= self.keep_heard {
                 self.heard.pop_front();
             }
             self.heard.push_back((now, frame));

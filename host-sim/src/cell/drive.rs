@@ -78,6 +78,9 @@ impl Cell {
         let mut turns_at_once = 0_u32;
         loop {
             let next = self.next_deadline();
+            if self.violation().is_some() {
+                return;
+            }
             if next > end {
                 self.now = end;
                 return;
@@ -172,11 +175,22 @@ impl Cell {
             recorder.input(now, input);
         }
         self.engine.handle(now, input);
+        if let Some(oracle) = &mut self.oracle {
+            oracle.input(now, &input, &self.engine);
+        }
         let mut buf = [0; OUTPUT_BUFFER];
         loop {
             let output = self.engine.poll_output(now, &mut buf);
             if let Some(recorder) = &mut self.recorder {
                 recorder.output(output);
+            }
+            if let Some(oracle) = &mut self.oracle {
+                match output {
+                    Output::Sleep { .. } => {
+                        oracle.rest(now, &self.engine, self.queue.len() + self.conns.len());
+                    }
+                    _ => oracle.output(now, &output),
+                }
             }
             match output {
                 Output::Sleep { until } => {
@@ -299,7 +313,9 @@ impl Cell {
             Due::Arrival { conn, way } => self.arrive(conn, way),
             Due::DatagramUp { link, peer, bytes } => {
                 self.trace.add(self.now, What::ControllerReceived, link.0.into(), &bytes);
+                let before = self.inputs_before();
                 self.controller_input(ControllerInput::Udp2011 { peer, bytes: &bytes });
+                self.datagram_arrived(link, &bytes, before);
             }
             Due::DatagramDown { link, peer, bytes } => {
                 let gate = self.gate(link);
@@ -311,7 +327,11 @@ impl Cell {
                 }
             }
             Due::ClientDatagramUp { port, bytes } => {
+                let before = self.inputs_before();
                 self.controller_input(ControllerInput::PortBytes { port, bytes: &bytes });
+                if let Some(link) = self.clients.get(&port).and_then(|client| client.link) {
+                    self.datagram_arrived(link, &bytes, before);
+                }
             }
             Due::ClientDatagramDown { link, bytes } => {
                 let gate = self.gate(link);
@@ -329,6 +349,22 @@ impl Cell {
             Due::CanDone { bus } => self.can_done(bus),
             Due::DeviceSends { line, bytes } => self.send(line, &bytes),
             Due::TimedOut { conn } => self.reset_conn(conn),
+        }
+    }
+
+    /// The controller's inputs, when somebody is to compare them.
+    pub(super) fn inputs_before(&self) -> Option<Vec<u8>> {
+        self.oracle.as_ref().map(|_| self.inputs())
+    }
+
+    pub(super) fn inputs(&self) -> Vec<u8> {
+        super::oracle::inputs_of(self.controller.registers().image())
+    }
+
+    fn datagram_arrived(&mut self, link: LinkId, bytes: &[u8], before: Option<Vec<u8>>) {
+        let after = self.inputs_before();
+        if let (Some(oracle), Some(before), Some(after)) = (&mut self.oracle, before, after) {
+            oracle.arrived_datagram(link, bytes, &before, &after, self.now);
         }
     }
 

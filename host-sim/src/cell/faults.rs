@@ -180,6 +180,9 @@ impl Cell {
             }
             *self.engine = engine;
         }
+        if let Some(oracle) = &mut self.oracle {
+            oracle.restarted();
+        }
         self.engine_wake = self.now;
         let ports: Vec<_> = self.engine.field_ports().collect();
         for port in ports {

@@ -65,6 +65,7 @@ pub struct Line {
     busy_until: [Instant; 2],
     collision: (Instant, Instant),
     heard: VecDeque<(Instant, Vec<u8>)>,
+    pub(super) keep_heard: usize,
     rng: Rng,
 }
 
@@ -104,6 +105,7 @@ impl Line {
             busy_until: [Instant::ZERO; 2],
             collision: (Instant::ZERO, Instant::ZERO),
             heard: VecDeque::new(),
+            keep_heard: MAX_HEARD,
             rng,
         }
     }
@@ -190,7 +192,10 @@ impl Line {
             newest.1.extend_from_slice(bytes);
             return;
         }
-        if self.heard.len() >= MAX_HEARD {
+        if self.keep_heard == 0 {
+            return;
+        }
+        if self.heard.len() >= self.keep_heard {
             self.heard.pop_front();
         }
         self.heard.push_back((now, bytes.to_vec()));

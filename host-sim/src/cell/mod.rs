@@ -31,6 +31,7 @@ mod drive;
 mod faults;
 mod line;
 mod network;
+mod oracle;
 mod queue;
 mod recording;
 mod rng;
@@ -51,6 +52,7 @@ pub use device::{Device, Responder, Talker};
 pub use faults::TCP_TIMEOUT;
 pub use line::{Chunking, Line, LineCounters, MAX_HEARD, Wiring};
 pub use network::{Network, Way};
+pub use oracle::{Invariant, Violation};
 pub use recording::recording_difference;
 pub use rng::Rng;
 pub use trace::{Entry, Trace, What};
@@ -60,6 +62,7 @@ use crate::config::{InitialTarget, SimBus, SimConfig};
 use crate::controller::{BuildError, ConnId, Controller, ControllerInput};
 use drive::Due;
 use network::{Connection, Gate};
+use oracle::Oracle;
 use queue::Queue;
 use recording::Recorder;
 
@@ -136,6 +139,8 @@ pub struct Cell {
     rng: Rng,
     trace: Trace,
     recorder: Option<Recorder>,
+    /// Checks everything, when it was asked to.
+    oracle: Option<Box<Oracle>>,
     /// What the controller has sent to [`Cell::ask`]'s own connection.
     asked: Vec<u8>,
 }
@@ -192,12 +197,49 @@ impl Cell {
             rng: Rng::new(seed),
             trace: Trace::new(),
             recorder,
+            oracle: None,
             asked: Vec::new(),
         };
         cell.wire_gateway();
         cell.wire_controller(controller);
         cell.switch_on();
         Ok(cell)
+    }
+
+    /// From now on everything that the gateway does is checked against a model of its own
+    /// (docs/cell.md section 4); time stands still after the first violation. To be called before
+    /// time has passed.
+    pub fn watch(&mut self) {
+        let mut oracle = Box::new(Oracle::new(&self.gateway));
+        oracle.begin(&self.engine, self.now);
+        self.oracle = Some(oracle);
+    }
+
+    /// The first invariant that did not hold.
+    pub fn violation(&self) -> Option<&Violation> {
+        self.oracle.as_ref().and_then(|oracle| oracle.violation())
+    }
+
+    /// How often each invariant was looked at.
+    pub fn checks(&self) -> BTreeMap<Invariant, u64> {
+        self.oracle.as_ref().map(|oracle| oracle.checks()).unwrap_or_default()
+    }
+
+    /// How many values written to the controller were judged.
+    pub fn watched_writes(&self) -> u64 {
+        self.oracle.as_ref().map_or(0, |oracle| oracle.writes)
+    }
+
+    /// Frames in and out of a field port, restarts of the gateway notwithstanding.
+    pub fn watched_frames(&self, port: PortId) -> (u64, u64) {
+        let frames = self.oracle.as_ref().and_then(|oracle| oracle.frames.get(usize::from(port.0)));
+        frames.copied().unwrap_or_default()
+    }
+
+    /// What was sent and what was received on a link, in calls.
+    pub fn watched_link(&self, link: LinkId) -> (u64, u64) {
+        let traffic = self.oracle.as_ref().and_then(|oracle| oracle.traffic.get(&link));
+        traffic.copied().unwrap_or_default()
     }
 
     fn wire_gateway(&mut self) {
@@ -263,6 +305,17 @@ impl Cell {
     /// The present instant.
     pub fn now(&self) -> Instant {
         self.now
+    }
+
+    /// The gateway's configuration.
+    pub fn gateway(&self) -> &GatewayConfig {
+        &self.gateway
+    }
+
+    /// How many transmissions each line and bus keeps for a look; [`MAX_HEARD`] at first.
+    pub fn keep_heard(&mut self, limit: usize) {
+        self.lines.iter_mut().for_each(|line| line.keep_heard = limit);
+        self.buses.iter_mut().for_each(|bus| bus.keep_heard = limit);
     }
 
     /// The gateway.
@@ -378,6 +431,11 @@ impl Cell {
     #[track_caller]
     pub fn network(&mut self, link: LinkId) -> &mut Network {
         &mut self.gate(link).network
+    }
+
+    /// How the network of each link behaves.
+    pub fn networks(&self) -> BTreeMap<LinkId, Network> {
+        self.gates.iter().map(|(&link, gate)| (link, gate.network)).collect()
     }
 
     /// Changes the network of every link.

@@ -21,6 +21,10 @@ impl<T> Queue<T> {
         self.pushed += 1;
     }
 
+    pub(super) fn len(&self) -> usize {
+        self.entries.len()
+    }
+
     pub(super) fn next(&self) -> Instant {
         self.entries.first_key_value().map_or(Instant::NEVER, |(key, _)| key.0)
     }

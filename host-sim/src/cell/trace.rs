@@ -60,7 +60,7 @@ pub struct Trace {
 
 impl Trace {
     pub(super) const fn new() -> Self {
-        Self { digest: FNV_SEED, count: 0, limit: 0, entries: Vec::new() }
+        Self { digest: SEED, count: 0, limit: 0, entries: Vec::new() }
     }
 
     /// Keeps the next `limit` entries in full.
@@ -86,16 +86,26 @@ impl Trace {
 
     pub(super) fn add(&mut self, at: Instant, what: What, subject: u64, bytes: &[u8]) {
         self.count += 1;
-        let head = [at.as_micros(), what as u64, subject, bytes.len() as u64];
-        let head = head.iter().flat_map(|word| word.to_le_bytes());
-        for byte in head.chain(bytes.iter().copied()) {
-            self.digest = (self.digest ^ u64::from(byte)).wrapping_mul(FNV_PRIME);
+        self.mix(at.as_micros());
+        self.mix(subject << 32 | bytes.len() as u64 ^ (what as u64) << 24);
+        let (words, rest) = bytes.as_chunks();
+        for word in words {
+            self.mix(u64::from_le_bytes(*word));
         }
+        let mut last = [0; 8];
+        last[..rest.len()].copy_from_slice(rest);
+        self.mix(u64::from_le_bytes(last));
         if self.entries.len() < self.limit {
             self.entries.push(Entry { at, what, subject, bytes: bytes.to_vec() });
         }
     }
+
+    /// The same on every machine: whole words, in little-endian order.
+    fn mix(&mut self, word: u64) {
+        self.digest = (self.digest.rotate_left(23) ^ word).wrapping_mul(ODD);
+    }
 }
 
-const FNV_SEED: u64 = 0xCBF2_9CE4_8422_2325;
-const FNV_PRIME: u64 = 0x0000_0100_0000_01B3;
+const SEED: u64 = 0xCBF2_9CE4_8422_2325;
+/// 2^64 divided by the golden ratio.
+const ODD: u64 = 0x9E37_79B9_7F4A_7C15;

@@ -86,6 +86,15 @@ impl Cell {
     pub(super) fn send_up(&mut self, link: LinkId, bytes: Vec<u8>) {
         let now = self.now;
         let client = self.clients.iter().find(|(_, client)| client.link == Some(link)).map(|(&port, _)| port);
+        if let (Some(oracle), Some(gate)) = (&mut self.oracle, self.gates.get(&link)) {
+            match (gate.kind, gate.conn) {
+                (LinkKind::RecipeUdp | LinkKind::RecipeUdpListen { .. }, _) => {
+                    oracle.sent_datagram(link, &bytes)
+                }
+                (_, Some(conn)) => oracle.sent(conn, &bytes),
+                (_, None) => {}
+            }
+        }
         let gate = self.gate(link);
         let turn = gate.turn;
         match gate.kind {
@@ -226,6 +235,9 @@ impl Cell {
 
     pub(super) fn controller_closed(&mut self, id: u64, peer: Peer) {
         let conn = ConnId(id);
+        if let Some(oracle) = &mut self.oracle {
+            oracle.conn_gone(id);
+        }
         self.trace.add(self.now, What::ControllerClosed, id, &[]);
         if let Peer::Client(port) = peer {
             self.client_lost(port);
@@ -241,6 +253,7 @@ impl Cell {
     fn controller_bytes(&mut self, id: u64, peer: Peer, bytes: &[u8]) {
         let conn = ConnId(id);
         self.trace.add(self.now, What::ControllerReceived, id, bytes);
+        let before = self.inputs_before();
         self.controller_input(match peer {
             Peer::Server(Link::Command) => ControllerInput::CommandBytes { conn, bytes },
             Peer::Server(Link::Modbus) => ControllerInput::ModbusBytes { conn, bytes },
@@ -248,5 +261,18 @@ impl Cell {
             Peer::Server(Link::State) => return,
             Peer::Client(port) => ControllerInput::PortBytes { port, bytes },
         });
+        let link = match peer {
+            Peer::Server(Link::Command) => LinkId::COMMAND,
+            Peer::Server(Link::Modbus) => LinkId::MODBUS,
+            Peer::Server(Link::State) => LinkId::STATE,
+            Peer::Client(port) => match self.clients.get(&port).and_then(|client| client.link) {
+                Some(link) => link,
+                None => return,
+            },
+        };
+        let after = self.inputs_before();
+        if let (Some(oracle), Some(before), Some(after)) = (&mut self.oracle, before, after) {
+            oracle.arrived(id, link, bytes, &before, &after, self.now);
+        }
     }
 }

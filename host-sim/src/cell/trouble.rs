@@ -10,7 +10,7 @@ use proto_core::engine::LinkId;
 use proto_core::modbus::Exception;
 use proto_core::time::{Duration, Instant};
 
-use super::network::Way;
+use super::network::{Network, Way};
 use super::rng::Rng;
 use super::{BusId, Cell, LineId};
 use crate::controller::Link;
@@ -80,6 +80,32 @@ impl TroubleKind {
     ];
 }
 
+impl TroubleKind {
+    /// A name for people.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Refused => "connections refused",
+            Self::BlackHole => "network swallows",
+            Self::Reset => "connection reset",
+            Self::ResetMidPacket => "reset in the middle",
+            Self::HalfOpen => "half-open connection",
+            Self::Stall => "one direction stalls",
+            Self::Datagrams => "datagrams lost and doubled",
+            Self::Mute => "server says nothing",
+            Self::SlowAnswers => "slow answers",
+            Self::Exception => "Modbus exceptions",
+            Self::HalfStatePacket => "half a state packet",
+            Self::Noise => "noise on a line",
+            Self::Garbage => "garbage from a device",
+            Self::Cut => "line or bus cut",
+            Self::Unplugged => "adapter pulled out",
+            Self::BusOff => "bus-off",
+            Self::ControllerRestart => "controller restart",
+            Self::GatewayRestart => "gateway restart",
+        }
+    }
+}
+
 /// What ends a fault.
 #[derive(Debug, Clone, Copy)]
 enum Remedy {
@@ -105,6 +131,8 @@ pub struct Trouble {
     next: Instant,
     remedies: Vec<(Instant, Remedy)>,
     counts: BTreeMap<TroubleKind, u64>,
+    /// What the networks are like without faults.
+    networks: BTreeMap<LinkId, Network>,
 }
 
 impl Trouble {
@@ -118,6 +146,7 @@ impl Trouble {
             next: Instant::ZERO,
             remedies: Vec::new(),
             counts: BTreeMap::new(),
+            networks: cell.networks(),
         };
         trouble.next = cell.now() + trouble.rng.up_to(pause.saturating_mul(2));
         trouble
@@ -145,7 +174,7 @@ impl Trouble {
     /// Mends everything that is broken at present.
     pub fn mend(&mut self, cell: &mut Cell) {
         for (_, remedy) in std::mem::take(&mut self.remedies) {
-            apply(cell, remedy);
+            apply(cell, remedy, &self.networks);
         }
     }
 
@@ -153,7 +182,7 @@ impl Trouble {
         let now = cell.now();
         while let Some(nth) = self.remedies.iter().position(|remedy| remedy.0 <= now) {
             let (_, remedy) = self.remedies.remove(nth);
-            apply(cell, remedy);
+            apply(cell, remedy, &self.networks);
         }
         if now >= self.next {
             self.next = now + Duration::from_micros(1) + self.rng.up_to(self.pause.saturating_mul(2));
@@ -284,14 +313,14 @@ impl Trouble {
     }
 }
 
-fn apply(cell: &mut Cell, remedy: Remedy) {
+fn apply(cell: &mut Cell, remedy: Remedy, networks: &BTreeMap<LinkId, Network>) {
     match remedy {
         Remedy::Admit(link) => cell.admit(link),
         Remedy::Release(link) => {
             cell.release(link, Way::Up);
             cell.release(link, Way::Down);
         }
-        Remedy::Datagrams(link) => *cell.network(link) = super::Network::default(),
+        Remedy::Datagrams(link) => *cell.network(link) = networks.get(&link).copied().unwrap_or_default(),
         Remedy::Unmute(server) => cell.controller_mut().unmute(server),
         Remedy::Answers(server) => cell.controller_mut().delay_answers(server, Duration::ZERO),
         Remedy::NoException => cell.controller_mut().answer_modbus_with(None),

@@ -9,6 +9,7 @@ mod convert;
 mod image;
 mod log;
 mod plan;
+mod soak;
 mod text;
 
 use std::io::{self, Write};
@@ -71,6 +72,9 @@ enum Command {
     /// Write the configuration image that a board keeps
     #[command(after_help = IMAGE_EXAMPLES)]
     Image(image::ImageArgs),
+    /// Run cells in virtual time, under faults, and check everything that the gateway does
+    #[command(after_help = soak::EXAMPLES)]
+    Soak(soak::SoakArgs),
     /// Make a frame from values
     #[command(after_help = ENCODE_EXAMPLES)]
     Encode(EncodeArgs),
@@ -231,6 +235,10 @@ pub fn main() -> ExitCode {
         Command::Gateway(run) => {
             drop(out);
             return run.gateway();
+        }
+        Command::Soak(args) => {
+            drop(out);
+            return soak::run(&args, &mut io::stdout());
         }
         Command::Check(args) => check::run(&args, &mut out),
         Command::Image(args) => image::run(&args, &mut out),

@@ -1,0 +1,328 @@
+//! What is still to be written to the controller, and what each write has to be
+//! (docs/architecture.md section 7).
+
+use std::collections::VecDeque;
+
+use proto_core::engine::LinkId;
+use proto_core::sysvar::{COUNT, SysVar};
+use proto_core::time::{Duration, Instant};
+
+use super::Invariant;
+use super::field::{Accepted, show};
+use super::sheet::{Origin, Owned, Raw, Sheet};
+
+/// Values that wait behind the next ones, a port.
+const EDGES: usize = 16;
+/// How old a read-back value may be.
+const READ_BACK: Duration = Duration::from_millis(500);
+
+/// What is known of one variable.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Known {
+    /// What a port would show now, and since when.
+    pub value: Option<(Raw, Instant)>,
+    /// Values to be written, the next one first, each with the time of its frame.
+    pub waiting: VecDeque<(Raw, Instant)>,
+    /// When the newest frame that brought it was accepted.
+    pub accepted: Option<Instant>,
+    /// Its owner sent it in time, or it stands at its safe value.
+    pub live: bool,
+    /// It stands at its safe value.
+    pub safe: bool,
+    /// The state stream has shown it since its owner fell silent, or ever.
+    pub read_back: bool,
+}
+
+/// What a port must have counted.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Counted {
+    pub edges_lost: u32,
+    pub values_expired: u32,
+    pub undelivered: u32,
+    pub timeouts: u32,
+}
+
+/// What is wrong with a write.
+pub(super) type Wrong = (Invariant, String);
+
+/// The values of all variables and what became of them.
+#[derive(Debug, Clone)]
+pub(super) struct Upward {
+    pub known: Vec<Known>,
+    /// When each input frame of each port is overdue.
+    overdue: Vec<Vec<Option<Instant>>>,
+    pub counted: Vec<Counted>,
+    /// When the links that carry values came up; `None` while they are down.
+    pub up: [Option<Instant>; 16],
+    pub state_at: Option<Instant>,
+    /// No frame is overdue and no value too old before this.
+    next: Instant,
+}
+
+impl Upward {
+    pub(super) fn new(sheet: &Sheet) -> Self {
+        Self {
+            known: vec![Known::default(); COUNT],
+            overdue: sheet.ports.iter().map(|port| vec![None; port.inputs.len()]).collect(),
+            counted: vec![Counted::default(); sheet.ports.len()],
+            up: [None; 16],
+            state_at: None,
+            next: Instant::NEVER,
+        }
+    }
+
+    pub(super) fn known(&self, var: SysVar) -> &Known {
+        &self.known[var.ordinal()]
+    }
+
+    fn known_mut(&mut self, var: SysVar) -> &mut Known {
+        &mut self.known[var.ordinal()]
+    }
+
+    pub(super) fn is_up(&self, link: LinkId) -> bool {
+        self.up[usize::from(link.0)].is_some()
+    }
+
+    /// Frames that are overdue, values that waited too long; the ports and frames that timed out.
+    pub(super) fn tick(&mut self, sheet: &Sheet, now: Instant) -> Vec<(usize, usize)> {
+        let mut overdue = Vec::new();
+        if now < self.next {
+            return overdue;
+        }
+        self.next = Instant::NEVER;
+        for (nth, port) in sheet.ports.iter().enumerate().filter(|(_, port)| port.is_field) {
+            for (frame, part) in port.inputs.iter().enumerate() {
+                match self.overdue[nth][frame] {
+                    Some(at) if now >= at => {}
+                    Some(at) => {
+                        self.next = self.next.min(at);
+                        continue;
+                    }
+                    None => continue,
+                }
+                self.overdue[nth][frame] = None;
+                self.counted[nth].timeouts += 1;
+                overdue.push((nth, frame));
+                for var in part.fields.iter().filter_map(super::sheet::written) {
+                    self.fell_silent(sheet, var, now);
+                }
+            }
+            for var in port.inputs.iter().flat_map(|part| &part.fields).filter_map(super::sheet::written) {
+                let known = &mut self.known[var.ordinal()];
+                if !var.is_bits() || known.safe {
+                    continue;
+                }
+                let before = known.waiting.len();
+                known.waiting.retain(|(_, at)| now.saturating_since(*at) <= port.timeout);
+                self.counted[nth].values_expired += (before - known.waiting.len()) as u32;
+                for (_, at) in &known.waiting {
+                    self.next = self.next.min(*at + port.timeout + Duration::from_micros(1));
+                }
+            }
+        }
+        overdue
+    }
+
+    fn fell_silent(&mut self, sheet: &Sheet, var: SysVar, now: Instant) {
+        let Some(Owned { port, safe, .. }) = sheet.owned[var.ordinal()] else { return };
+        let known = self.known_mut(var);
+        if let Some(safe) = safe {
+            known.waiting.clear();
+            known.waiting.push_back((safe, now));
+            known.value = Some((safe, known.value.map_or(now, |value| value.1)));
+            known.safe = true;
+        } else {
+            let waited = known.waiting.len() as u32;
+            known.waiting.clear();
+            known.live = false;
+            known.read_back = false;
+            self.counted[port].values_expired += waited;
+        }
+    }
+
+    /// A frame is applied.
+    pub(super) fn accepted(&mut self, sheet: &Sheet, nth: usize, frame: &Accepted, now: Instant) {
+        let timeout = sheet.ports[nth].timeout;
+        self.overdue[nth][frame.frame] = Some(now + timeout);
+        self.next = self.next.min(now + timeout);
+        let mut undelivered = false;
+        for &(var, raw) in &frame.values {
+            let Some(Owned { way, .. }) = sheet.owned[var.ordinal()] else { continue };
+            let is_up = self.is_up(way);
+            let queued: usize = if var.is_bits() { self.queued(sheet, nth) } else { 0 };
+            let known = self.known_mut(var);
+            known.value = Some((raw, now));
+            known.accepted = Some(now);
+            known.live = true;
+            if std::mem::take(&mut known.safe) {
+                // A safe value that still waits may be too old by now.
+                self.next = now;
+            }
+            let known = &mut self.known[var.ordinal()];
+            if !is_up {
+                undelivered = true;
+                known.waiting.clear();
+                continue;
+            }
+            if !var.is_bits() {
+                known.waiting.clear();
+                known.waiting.push_back((raw, now));
+                continue;
+            }
+            match known.waiting.back_mut() {
+                None => known.waiting.push_back((raw, now)),
+                Some(newest) if newest.0 == raw => newest.1 = now,
+                Some(newest) if queued >= EDGES => {
+                    *newest = (raw, now);
+                    self.counted[nth].edges_lost += 1;
+                }
+                Some(_) => known.waiting.push_back((raw, now)),
+            }
+        }
+        self.counted[nth].undelivered += u32::from(undelivered);
+    }
+
+    /// How many values of the port wait behind others.
+    fn queued(&self, sheet: &Sheet, nth: usize) -> usize {
+        let vars = sheet.ports[nth].inputs.iter().flat_map(|part| &part.fields);
+        let waiting = vars.filter_map(super::sheet::written).filter(|var| var.is_bits());
+        waiting.map(|var| self.known(var).waiting.len().saturating_sub(1)).sum()
+    }
+
+    /// A link came up.
+    pub(super) fn link_up(&mut self, link: LinkId, now: Instant) {
+        self.up[usize::from(link.0)] = Some(now);
+    }
+
+    /// A link was lost: what waits for it is dropped, safe values excepted.
+    pub(super) fn link_lost(&mut self, sheet: &Sheet, link: LinkId) {
+        if self.up[usize::from(link.0)].take().is_none() {
+            return;
+        }
+        for (known, owned) in self.known.iter_mut().zip(&sheet.owned) {
+            if let Some(owned) = owned
+                && owned.way == link
+                && !known.safe
+            {
+                self.counted[owned.port].values_expired += known.waiting.len() as u32;
+                known.waiting.clear();
+            }
+        }
+    }
+
+    /// A packet of the state stream was taken.
+    pub(super) fn state_packet(&mut self, sheet: &Sheet, packet: &[u8], now: Instant) {
+        self.state_at = Some(now);
+        for var in SysVar::all() {
+            let nth = var.ordinal();
+            let is_shown = sheet.origin[nth] == Some(Origin::State);
+            let is_read_back = sheet.read_back[nth] && !self.known[nth].live;
+            if let (true, Some(raw)) = (is_shown || is_read_back, in_packet(var, packet)) {
+                self.known[nth].value = Some((raw, now));
+                self.known[nth].read_back |= is_read_back;
+            } else if is_shown && let Some(value) = &mut self.known[nth].value {
+                // Not finite: the value before stays, and is as old as the packet.
+                value.1 = now;
+            }
+        }
+    }
+
+    /// A variable was written on the link that is its way up.
+    pub(super) fn wrote(
+        &mut self,
+        sheet: &Sheet,
+        link: LinkId,
+        var: SysVar,
+        raw: Raw,
+        now: Instant,
+    ) -> Result<(), Wrong> {
+        let Some(owned) = sheet.owned[var.ordinal()].filter(|owned| owned.way == link) else {
+            return Err((Invariant::Ownership, format!("{var} was written, but no port writes it there")));
+        };
+        let timeout = sheet.ports[owned.port].timeout;
+        let up = self.up[usize::from(link.0)];
+        let known = &mut self.known[var.ordinal()];
+        let Some(accepted) = known.accepted else {
+            let what = format!("{var} = {} was written before any frame brought it", show(var, raw));
+            return Err((Invariant::FirstFrame, what));
+        };
+        let Some(&(next, at)) = known.waiting.front() else {
+            let value = show(var, raw);
+            return Err(if up.is_some_and(|up| accepted < up) {
+                (Invariant::NoReplay, format!("{var} = {value} is from before the link came up"))
+            } else if now.saturating_since(accepted) > timeout {
+                (Invariant::InTime, format!("{var} = {value} was written after its owner fell silent"))
+            } else {
+                (Invariant::Sent, format!("{var} = {value} was written once more than its owner sent it"))
+            });
+        };
+        if next != raw {
+            let later = known.waiting.iter().any(|(value, _)| *value == raw);
+            let what = format!("{var} = {} was written, {} was next", show(var, raw), show(var, next));
+            return Err((if later { Invariant::Edges } else { Invariant::Sent }, what));
+        }
+        if !known.safe && now.saturating_since(at) > timeout {
+            return Err((
+                Invariant::InTime,
+                format!("{var} = {} had waited longer than {timeout}", show(var, raw)),
+            ));
+        }
+        known.waiting.pop_front();
+        Ok(())
+    }
+
+    /// A variable was in a frame that was sent for the sake of others.
+    pub(super) fn carried(&self, sheet: &Sheet, var: SysVar, raw: Raw, now: Instant) -> Result<(), Wrong> {
+        let known = &self.known[var.ordinal()];
+        let value = || show(var, raw);
+        let Some((held, _)) = known.value else {
+            return Err((
+                Invariant::Sent,
+                format!("{var} = {} was sent along, and nobody ever knew it", value()),
+            ));
+        };
+        let expected = known.waiting.front().map_or(held, |next| next.0);
+        if expected != raw {
+            let what = format!("{var} = {} was sent along, it is {}", value(), show(var, expected));
+            return Err((Invariant::Sent, what));
+        }
+        if known.live || var.stream().is_none() {
+            return Ok(());
+        }
+        let is_fresh = self.state_at.is_some_and(|at| now.saturating_since(at) <= READ_BACK);
+        if sheet.read_back[var.ordinal()] && known.read_back && is_fresh {
+            return Ok(());
+        }
+        Err((Invariant::InTime, format!("{var} = {} was sent along, read back too long ago", value())))
+    }
+
+    /// Whether a recipe link's frame may be sent: each of its variables has a value.
+    pub(super) fn is_ready(&self, link: &super::sheet::LinkSheet, now: Instant) -> bool {
+        let is_fresh = self.state_at.is_some_and(|at| now.saturating_since(at) <= READ_BACK);
+        let mut vars = link.input.iter().flat_map(|up| up.fields.iter().filter_map(super::sheet::written));
+        vars.all(|var| {
+            let known = self.known(var);
+            match var.stream() {
+                _ if known.live => true,
+                Some(_) => known.read_back && is_fresh,
+                None => known.accepted.is_some(),
+            }
+        })
+    }
+}
+
+/// A variable's value in a state packet; `None` when it is not there or not finite.
+fn in_packet(var: SysVar, packet: &[u8]) -> Option<Raw> {
+    let place = var.stream()?;
+    let bytes = packet.get(usize::from(place.offset)..)?.get(..usize::from(place.len))?;
+    let mut raw = Raw::default();
+    if var.is_bits() {
+        raw[0] = bytes.iter().rev().fold(0, |bits, &bit| bits << 1 | u8::from(bit != 0)) & var.valid_bits();
+    } else {
+        raw[..bytes.len()].copy_from_slice(bytes);
+        if var.ty() == proto_core::wire::scalar::ScalarType::Float && !f32::from_le_bytes(raw).is_finite() {
+            return None;
+        }
+    }
+    Some(raw)
+}

@@ -1,0 +1,366 @@
+//! `soak`: cells in virtual time, under faults, with everything that the gateway does checked; and
+//! the replay of a run that failed.
+//!
+//! Progress goes to stderr, the table to stdout.
+
+use std::io::{IsTerminal, Write};
+use std::path::Path;
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::time::{Duration as WallTime, Instant as WallInstant};
+
+use clap::{Args, ValueEnum};
+use proto_core::time::Duration;
+
+use super::wrong;
+use crate::cell::Cell;
+use crate::soak::{Batch, Level, Progress, Scenario, Soak, Total, show_trace};
+
+pub(super) const EXAMPLES: &str = "\
+Runs the gateway's engine against the simulated controller in virtual time: devices
+send what they should and what they should not, networks and lines break, both
+programs restart. At every step a model of its own checks what the gateway does:
+that no value is written that nobody sent, none too late, none twice, no edge lost
+without being counted, nothing shown that is old, and so on (docs/cell.md).
+
+The same seed gives the same trace hash on every machine, whatever --jobs is. A
+violation is printed with the command that repeats it.
+
+Examples:
+  host-sim soak                                  an hour
+  host-sim soak --hours 24 --seed 42 --faults harsh
+  host-sim soak --hours 2 --cell force-sensor --cell can-hand
+  host-sim soak --cell cell.toml,robot.toml      your own gateway and controller
+  host-sim soak --replay 93570312@41.250300 --trace
+
+Exit codes: 0 all invariants held, 1 one did not, 2 an argument is wrong.";
+
+/// What `soak` is told.
+#[derive(Debug, Args)]
+pub(super) struct SoakArgs {
+    /// Virtual hours, over all runs together
+    #[arg(long, value_name = "HOURS", default_value = "1", value_parser = parse_hours)]
+    hours: Duration,
+    /// The seed that all others are derived from
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// How much goes wrong
+    #[arg(long, value_name = "LEVEL", default_value = "harsh")]
+    faults: LevelName,
+    /// An embedded cell by name, or GATEWAY.toml,CONTROLLER.toml; again for more, all embedded ones
+    /// when there is none
+    #[arg(long, value_name = "CELL")]
+    cell: Vec<String>,
+    /// How many threads [default: one for each processor]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    jobs: Option<u16>,
+    /// Repeat one run up to this instant, with the same --cell and --faults
+    #[arg(long, value_name = "SEED@SECONDS", value_parser = parse_replay)]
+    replay: Option<(u64, Duration)>,
+    /// With --replay: show what happened in the last seconds
+    #[arg(long, requires = "replay")]
+    trace: bool,
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum LevelName {
+    /// Devices are careless, nothing else
+    None,
+    /// A fault each half minute
+    Mild,
+    /// A fault each second, on a network that delays, splits and joins
+    Harsh,
+}
+
+impl From<LevelName> for Level {
+    fn from(name: LevelName) -> Self {
+        match name {
+            LevelName::None => Self::None,
+            LevelName::Mild => Self::Mild,
+            LevelName::Harsh => Self::Harsh,
+        }
+    }
+}
+
+/// Runs what was asked for.
+pub(super) fn run(args: &SoakArgs, out: &mut dyn Write) -> ExitCode {
+    let scenarios = match scenarios(&args.cell) {
+        Ok(scenarios) => scenarios,
+        Err(message) => return wrong(message),
+    };
+    match args.replay {
+        Some((seed, at)) => replay(args, &scenarios, seed, at, out),
+        None => batch(args, scenarios, out),
+    }
+}
+
+fn scenarios(cells: &[String]) -> Result<Vec<Scenario>, String> {
+    let mut scenarios = Vec::new();
+    for cell in cells {
+        scenarios.push(match cell.split_once(',') {
+            Some((gateway, controller)) => Scenario::load(Path::new(gateway), Path::new(controller))
+                .map_err(|error| error.to_string())?,
+            None => Scenario::named(cell).map_err(|error| error.to_string())?.ok_or_else(|| {
+                let names: Vec<_> = Scenario::names().collect();
+                format!(
+                    "--cell {cell}: no cell is called so; there are {}, or give GATEWAY.toml,CONTROLLER.toml",
+                    names.join(", ")
+                )
+            })?,
+        });
+    }
+    if scenarios.is_empty() {
+        scenarios = Scenario::all().map_err(|error| error.to_string())?;
+    }
+    for scenario in &scenarios {
+        Cell::new(&scenario.gateway, &scenario.controller, 0)
+            .map_err(|error| format!("--cell {}: {error}", scenario.name))?;
+    }
+    Ok(scenarios)
+}
+
+fn batch(args: &SoakArgs, scenarios: Vec<Scenario>, out: &mut dyn Write) -> ExitCode {
+    let batch = Arc::new(Batch::new(scenarios, args.faults.into(), args.seed, args.hours));
+    let jobs =
+        args.jobs.map_or_else(|| std::thread::available_parallelism().map_or(1, usize::from), usize::from);
+    let began = WallInstant::now();
+    let runtime = match tokio::runtime::Builder::new_current_thread().enable_all().build() {
+        Ok(runtime) => runtime,
+        Err(error) => return wrong(error),
+    };
+    let workers: Vec<_> = (0..jobs.min(batch.runs()))
+        .map(|_| {
+            let batch = Arc::clone(&batch);
+            std::thread::spawn(move || batch.work())
+        })
+        .collect();
+    let interrupted = runtime.block_on(watch(&batch, &workers, args.hours, began));
+    batch.stop();
+    for worker in workers {
+        // It catches its own panics.
+        let _ = worker.join();
+    }
+    let total = batch.total();
+    let _ = write!(out, "{}", table(&total, args, began.elapsed()));
+    if let Some(failure) = batch.failure() {
+        let at = show_seconds(failure.after);
+        let _ = writeln!(
+            out,
+            "\nFAIL  {}\n      cell {}, seed {}, {at} s after its start; repeat it with\n\
+             \n      host-sim soak{}{} --replay {}@{at} --trace",
+            failure.what,
+            failure.cell,
+            failure.seed,
+            shown_cells(&args.cell),
+            shown_level(args.faults),
+            failure.seed,
+        );
+        return ExitCode::FAILURE;
+    }
+    if interrupted {
+        let _ = writeln!(out, "\ninterrupted: {} of {} runs were finished", total.runs, total.of);
+    } else {
+        let _ = writeln!(out, "\nPASS  all invariants held");
+    }
+    ExitCode::SUCCESS
+}
+
+/// Shows progress until all workers are done; true when somebody interrupted it.
+async fn watch(
+    batch: &Batch,
+    workers: &[std::thread::JoinHandle<()>],
+    hours: Duration,
+    began: WallInstant,
+) -> bool {
+    let is_terminal = std::io::stderr().is_terminal();
+    let mut shown = WallInstant::now();
+    loop {
+        let wait = if is_terminal { TERMINAL_EVERY } else { LINE_EVERY };
+        if shown.elapsed() >= wait {
+            shown = WallInstant::now();
+            let line = progress_line(batch.progress(), hours, began.elapsed());
+            if is_terminal {
+                eprint!("\r{line}\x1B[K");
+            } else {
+                eprintln!("{line}");
+            }
+        }
+        if workers.iter().all(std::thread::JoinHandle::is_finished) {
+            break;
+        }
+        tokio::select! {
+            _ = tokio::signal::ctrl_c() => {
+                if is_terminal {
+                    eprintln!();
+                }
+                return true;
+            }
+            () = tokio::time::sleep(LOOK_EVERY) => {}
+        }
+    }
+    if is_terminal {
+        eprint!("\r\x1B[K");
+    }
+    false
+}
+
+fn progress_line(progress: Progress, hours: Duration, wall: WallTime) -> String {
+    format!(
+        "{:.2} of {:.2} virtual hours, {} runs, {:.0} virtual hours a minute",
+        in_hours(progress.elapsed),
+        in_hours(hours),
+        progress.runs,
+        per_minute(progress.elapsed, wall)
+    )
+}
+
+/// The table. Only the two lines about this machine's time differ between runs of one seed.
+fn table(total: &Total, args: &SoakArgs, wall: WallTime) -> String {
+    let mut lines = vec![
+        format!("virtual hours       {:.3}", in_hours(total.span)),
+        format!("wall time           {:.1} s", wall.as_secs_f64()),
+        format!("hours a minute      {:.1}", per_minute(total.span, wall)),
+        format!("runs                {}", total.runs),
+        format!("seed, faults        {}, {}", args.seed, Level::from(args.faults).name()),
+        format!("events              {}", total.events),
+        format!("writes checked      {}", total.writes),
+        String::new(),
+        "cell                 runs   hours".to_owned(),
+    ];
+    for (cell, (runs, span)) in &total.cells {
+        lines.push(format!("  {cell:<18} {runs:>4} {:>7.3}", in_hours(*span)));
+    }
+    lines.push(String::new());
+    lines.push("port                                    frames in  frames out".to_owned());
+    for ((cell, port), (received, sent)) in &total.ports {
+        lines.push(format!("  {:<34} {received:>12} {sent:>11}", format!("{cell}: {port}")));
+    }
+    lines.push(String::new());
+    lines.push("link                                         sent    received".to_owned());
+    for (link, (sent, received)) in &total.links {
+        lines.push(format!("  {link:<34} {sent:>12} {received:>11}"));
+    }
+    lines.push(String::new());
+    lines.push("fault                                       times".to_owned());
+    if total.faults.is_empty() {
+        lines.push("  none".to_owned());
+    }
+    for (kind, times) in &total.faults {
+        lines.push(format!("  {:<34} {times:>12}", kind.name()));
+    }
+    lines.push(String::new());
+    lines.push("invariant                                  checks".to_owned());
+    for (invariant, checks) in &total.checks {
+        lines.push(format!("  {:<34} {checks:>12}", invariant.name()));
+    }
+    lines.push(String::new());
+    lines.push(format!("trace hash          {:016x}\n", total.hash));
+    lines.join("\n")
+}
+
+fn replay(args: &SoakArgs, scenarios: &[Scenario], seed: u64, at: Duration, out: &mut dyn Write) -> ExitCode {
+    let Some(scenario) = Batch::scenario_of(scenarios, seed) else { return wrong("there are no cells") };
+    let mut soak = match Soak::new(scenario, seed, args.faults.into()) {
+        Ok(soak) => soak,
+        Err(error) => return wrong(error),
+    };
+    let _ = writeln!(out, "cell {}, seed {seed}, faults {}", scenario.name, Level::from(args.faults).name());
+    let shown = Duration::from_micros(at.as_micros().saturating_sub(SHOWN.as_micros()));
+    soak.run_to(shown);
+    if args.trace {
+        soak.cell_mut().keep_trace(MOST_SHOWN);
+    }
+    // Just after the instant, so that what happens at it is seen.
+    soak.run_to(at + Duration::from_millis(1));
+    if args.trace {
+        let _ = write!(out, "{}", show_trace(&soak));
+    }
+    match soak.report().violation {
+        Some((what, after)) => {
+            let _ = writeln!(out, "\nFAIL  {} s: {what}", show_seconds(after));
+            ExitCode::FAILURE
+        }
+        None => {
+            let _ = writeln!(out, "\nall invariants held up to {} s", show_seconds(soak.elapsed()));
+            ExitCode::SUCCESS
+        }
+    }
+}
+
+fn in_hours(span: Duration) -> f64 {
+    span.as_micros() as f64 / 3.6e9
+}
+
+fn per_minute(span: Duration, wall: WallTime) -> f64 {
+    in_hours(span) * 60.0 / wall.as_secs_f64().max(1e-3)
+}
+
+fn show_seconds(span: Duration) -> String {
+    format!("{}.{:06}", span.as_micros() / 1_000_000, span.as_micros() % 1_000_000)
+}
+
+fn shown_cells(cells: &[String]) -> String {
+    cells.iter().map(|cell| format!(" --cell {cell}")).collect()
+}
+
+fn shown_level(level: LevelName) -> String {
+    match level {
+        LevelName::Harsh => String::new(),
+        other => format!(" --faults {}", Level::from(other).name()),
+    }
+}
+
+fn parse_hours(text: &str) -> Result<Duration, String> {
+    let refused =
+        || format!("{text:?} is not a number of hours above 0 and at most 100000, such as 24 or 0.5");
+    let hours: f64 = text.parse().map_err(|_| refused())?;
+    let micros = (hours * 3.6e9).round();
+    if hours <= 100_000.0 && micros >= 1.0 {
+        Ok(Duration::from_micros(micros as u64))
+    } else {
+        Err(refused())
+    }
+}
+
+fn parse_replay(text: &str) -> Result<(u64, Duration), String> {
+    let refused = || format!("{text:?} is not SEED@SECONDS, such as 93570312@41.250300");
+    let (seed, at) = text.split_once('@').ok_or_else(refused)?;
+    let (whole, fraction) = at.split_once('.').unwrap_or((at, ""));
+    let digits = |text: &str| text.len() <= 6 && text.bytes().all(|byte| byte.is_ascii_digit());
+    if whole.is_empty() || !digits(whole) || !digits(fraction) {
+        return Err(refused());
+    }
+    let micros = format!("{fraction:0<6}").parse::<u64>().map_err(|_| refused())?;
+    let seconds = whole.parse::<u64>().map_err(|_| refused())?;
+    Ok((seed.parse().map_err(|_| refused())?, Duration::from_micros(seconds * 1_000_000 + micros)))
+}
+
+/// How much of a replay is shown.
+const SHOWN: Duration = Duration::from_secs(2);
+const MOST_SHOWN: usize = 100_000;
+const TERMINAL_EVERY: WallTime = WallTime::from_millis(500);
+const LINE_EVERY: WallTime = WallTime::from_secs(15);
+const LOOK_EVERY: WallTime = WallTime::from_millis(20);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_instant_of_a_run_is_read_back_as_it_was_printed() {
+        let at = Duration::from_micros(41_250_300);
+        assert_eq!(parse_replay(&format!("7@{}", show_seconds(at))), Ok((7, at)));
+        assert_eq!(parse_replay("7@5"), Ok((7, Duration::from_secs(5))));
+        for wrong in ["", "7", "@", "7@", "7@.", "x@1", "7@1.1234567", "7@-1", "7@1s"] {
+            assert!(parse_replay(wrong).is_err(), "{wrong:?}");
+        }
+    }
+
+    #[test]
+    fn hours_are_some() {
+        assert_eq!(parse_hours("0.5"), Ok(Duration::from_secs(1_800)));
+        for wrong in ["", "0", "-1", "nan", "inf", "1h", "100001"] {
+            assert!(parse_hours(wrong).is_err(), "{wrong:?}");
+        }
+    }
+}
