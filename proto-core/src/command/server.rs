@@ -21,6 +21,8 @@ pub struct CommandServer {
     /// Dropping a command that was too long ends after this much silence, and a text that no
     /// further byte can make a command is given up after it: 100 ms (D5).
     pub drop_gap: Duration,
+    /// The beginning of a command is given up after this much silence: 10 s.
+    pub beginning_gap: Duration,
     buffer: [u8; MAX_COMMAND],
     len: usize,
     /// The buffer holds a command that was handed out; it goes at the next call.
@@ -57,6 +59,7 @@ impl CommandServer {
         Self {
             keyword_gap: Duration::from_millis(20),
             drop_gap: Duration::from_millis(100),
+            beginning_gap: Duration::from_secs(10),
             buffer: [0; MAX_COMMAND],
             len: 0,
             handed_out: false,
@@ -98,8 +101,8 @@ impl CommandServer {
 
     /// Forgets everything received, for a new connection.
     pub fn reset(&mut self) {
-        let (keyword_gap, drop_gap) = (self.keyword_gap, self.drop_gap);
-        *self = Self { keyword_gap, drop_gap, ..Self::new() };
+        let Self { keyword_gap, drop_gap, beginning_gap, .. } = *self;
+        *self = Self { keyword_gap, drop_gap, beginning_gap, ..Self::new() };
     }
 
     fn step(&mut self, now: Instant, bytes: &mut &[u8]) -> Option<End> {
@@ -161,7 +164,7 @@ impl CommandServer {
             return Some(self.keyword_gap);
         }
         let awaited = may_become_command(self.text()) || (self.ended_by_gap && text == b"(");
-        (!awaited).then_some(self.drop_gap)
+        Some(if awaited { self.beginning_gap } else { self.drop_gap })
     }
 
     fn text(&self) -> &[u8] {

@@ -129,7 +129,7 @@ impl Server {
         } else if BARE.iter().any(|word| word.as_bytes() == text) {
             20_000
         } else if can_become_command(&self.text) || self.pair_may_come && text == b"(" {
-            return None;
+            10_000_000
         } else {
             100_000
         };

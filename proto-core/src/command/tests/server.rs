@@ -65,17 +65,18 @@ fn every_bare_keyword_ends_by_silence_and_no_other_beginning_does() {
         for cut in 1..word.len() {
             let mut server = CommandServer::new();
             assert!(receive(&mut server, at(0), &word[..cut]).is_empty());
-            assert_eq!(server.deadline(), None, "{:?} is only a beginning", &keyword.word()[..cut]);
-            assert!(poll(&mut server, at(10_000)).is_empty());
-            assert!(receive(&mut server, at(10_000), &word[cut..]).is_empty());
-            assert_eq!(server.deadline(), Some(at(10_020)));
-            assert_eq!(poll(&mut server, at(10_020)), [keyword.word()]);
+            let beginning = &keyword.word()[..cut];
+            assert_eq!(server.deadline(), Some(at(10_000)), "{beginning:?} is only a beginning");
+            assert!(poll(&mut server, at(9_999)).is_empty());
+            assert!(receive(&mut server, at(9_999), &word[cut..]).is_empty());
+            assert_eq!(server.deadline(), Some(at(10_019)));
+            assert_eq!(poll(&mut server, at(10_019)), [keyword.word()]);
         }
     }
     for beginning in ["power", "run", "speed", "run(", "run(a.jspf", "speed(50", "poweron(", "st"] {
         let mut server = CommandServer::new();
         assert!(receive(&mut server, at(0), beginning.as_bytes()).is_empty());
-        assert_eq!(server.deadline(), None, "{beginning}");
+        assert_eq!(server.deadline(), Some(at(10_000)), "{beginning}");
     }
 }
 
@@ -168,7 +169,7 @@ fn empty_parentheses_that_come_late_belong_to_the_keyword_before() {
     assert!(receive(&mut server, at(0), b"poweron").is_empty());
     assert_eq!(poll(&mut server, at(20)), ["poweron"]);
     assert!(receive(&mut server, at(40), b"(").is_empty());
-    assert_eq!(server.deadline(), None);
+    assert_eq!(server.deadline(), Some(at(10_040)));
     assert!(receive(&mut server, at(900), b")\r\n").is_empty());
     assert_eq!(receive(&mut server, at(901), b"()"), ["?()"]);
 }
@@ -184,8 +185,27 @@ fn beginnings_that_no_byte_can_complete_are_not_waited_for() {
     for alive in [&b"run (a, 5"[..], b"run(\xE6\x8A", b"stat", b"state ( ", &full[..MAX_COMMAND - 1]] {
         let mut server = CommandServer::new();
         assert!(receive(&mut server, at(0), alive).is_empty());
-        assert_eq!(server.deadline(), None, "{}", alive.escape_ascii());
+        assert_eq!(server.deadline(), Some(at(10_000)), "{}", alive.escape_ascii());
     }
+}
+
+#[test]
+fn a_beginning_is_given_up_after_ten_seconds_of_silence() {
+    let mut server = CommandServer::new();
+    // A byte a second is a command that takes its time.
+    let mut time = 0;
+    for byte in b"run(a.jspf,50" {
+        assert!(receive(&mut server, at(time), &[*byte]).is_empty());
+        time += 1_000;
+    }
+    assert_eq!(receive(&mut server, at(time), b")"), ["run a.jspf at 50"]);
+    assert!(receive(&mut server, at(20_000), b"run(a.jspf").is_empty());
+    assert!(poll(&mut server, at(29_999)).is_empty());
+    assert_eq!(poll(&mut server, at(30_000)), ["?run(a.jspf"]);
+    assert_eq!(receive(&mut server, at(30_001), b"stop\n"), ["stop"]);
+    // Nobody looked in between.
+    assert!(receive(&mut server, at(40_000), b"run(a.jspf").is_empty());
+    assert_eq!(receive(&mut server, at(50_000), b"stop\n"), ["?run(a.jspf", "stop"]);
 }
 
 #[test]
