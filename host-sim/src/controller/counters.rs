@@ -11,6 +11,9 @@ pub struct ServerCounters {
     pub opened: u64,
     /// Connections closed at once: too many, or a test wanted it.
     pub refused: u64,
+    /// Connections closed because they had never asked for anything while another one came, and there were
+    /// too many.
+    pub displaced: u64,
     /// Connections that are open.
     pub open: usize,
     /// Bytes received.

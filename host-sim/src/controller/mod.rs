@@ -335,9 +335,9 @@ impl Controller {
         }
         self.advance(now);
         match input {
-            ControllerInput::CommandOpened { conn } => self.opened(Link::Command, conn),
-            ControllerInput::StateOpened { conn } => self.opened(Link::State, conn),
-            ControllerInput::ModbusOpened { conn } => self.opened(Link::Modbus, conn),
+            ControllerInput::CommandOpened { conn } => self.opened(now, Link::Command, conn),
+            ControllerInput::StateOpened { conn } => self.opened(now, Link::State, conn),
+            ControllerInput::ModbusOpened { conn } => self.opened(now, Link::Modbus, conn),
             ControllerInput::CommandClosed { conn } => self.closed(Link::Command, conn),
             ControllerInput::StateClosed { conn } => self.closed(Link::State, conn),
             ControllerInput::ModbusClosed { conn } => self.closed(Link::Modbus, conn),

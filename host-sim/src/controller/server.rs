@@ -10,7 +10,7 @@ use proto_core::command::{CommandServer, Outcome, Reply, Request, ServerEvent, S
 use proto_core::modbus::adu::MAX_ADU;
 use proto_core::modbus::server::{RegisterBank, Server as ModbusServer};
 use proto_core::modbus::{Coils, Exception, Registers as Words};
-use proto_core::time::Instant;
+use proto_core::time::{Duration, Instant};
 use proto_core::wire::state::ProgramState;
 
 use super::faults::Link;
@@ -25,6 +25,8 @@ pub const MAX_COMMAND_CONNECTIONS: usize = 32;
 pub const MAX_STATE_CONNECTIONS: usize = 32;
 /// Most Modbus clients at a time.
 pub const MAX_MODBUS_CONNECTIONS: usize = 128;
+/// A connection that has asked for nothing for this long makes room when there are too many.
+const NOVICE: Duration = Duration::from_secs(5);
 /// Most delayed answers at a time, when a test asked for delays; further ones get lost.
 const MAX_DELAYED: usize = 1_024;
 
@@ -35,6 +37,9 @@ pub(super) struct Server {
     state: BTreeSet<ConnId>,
     modbus: BTreeMap<ConnId, Box<ModbusServer>>,
     delayed: VecDeque<(Instant, ConnId, Vec<u8>)>,
+    /// Connections of port 2000 and Modbus that have never asked for anything whole, and since when they are
+    /// there: a host that only holds them must not keep out those that have something to ask.
+    novices: BTreeMap<ConnId, (Link, Instant)>,
 }
 
 impl Server {
@@ -54,6 +59,7 @@ impl Server {
             Link::Modbus => std::mem::take(&mut self.modbus).into_keys().collect(),
         };
         self.delayed.retain(|delayed| !conns.contains(&delayed.1));
+        self.novices.retain(|_, novice| novice.0 != link);
         outputs.extend(conns.into_iter().map(|conn| ControllerOutput::Close { conn }));
     }
 
@@ -61,6 +67,13 @@ impl Server {
         for link in [Link::Command, Link::State, Link::Modbus] {
             self.close_link(link, outputs);
         }
+    }
+
+    /// The connection that has been there longest without ever asking for anything.
+    fn oldest_novice(&self, link: Link, now: Instant) -> Option<ConnId> {
+        let novices = self.novices.iter().filter(|(_, novice)| novice.0 == link);
+        let (&conn, &(_, since)) = novices.min_by_key(|(_, novice)| novice.1)?;
+        (now.saturating_since(since) >= NOVICE).then_some(conn)
     }
 
     /// How many connections a server has.
@@ -84,16 +97,26 @@ impl Counters {
 }
 
 impl Controller {
-    pub(super) fn opened(&mut self, link: Link, conn: ConnId) {
+    pub(super) fn opened(&mut self, now: Instant, link: Link, conn: ConnId) {
         let most = match link {
             Link::Command => MAX_COMMAND_CONNECTIONS,
             Link::State => MAX_STATE_CONNECTIONS,
             Link::Modbus => MAX_MODBUS_CONNECTIONS,
         };
-        if self.faults.refuses(link) || self.server.open(link) >= most {
+        let full = self.server.open(link) >= most;
+        let gives = self.server.oldest_novice(link, now).filter(|_| full);
+        if self.faults.refuses(link) || full && gives.is_none() {
             self.counters.of(link).refused += 1;
             self.outputs.push_back(ControllerOutput::Close { conn });
             return;
+        }
+        if let Some(novice) = gives {
+            self.counters.of(link).displaced += 1;
+            self.closed(link, novice);
+            self.outputs.push_back(ControllerOutput::Close { conn: novice });
+        }
+        if link != Link::State {
+            self.server.novices.insert(conn, (link, now));
         }
         match link {
             Link::Command => {
@@ -122,6 +145,7 @@ impl Controller {
             }
         }
         self.server.delayed.retain(|delayed| delayed.1 != conn);
+        self.server.novices.remove(&conn);
     }
 
     pub(super) fn command_bytes(&mut self, now: Instant, conn: ConnId, bytes: &[u8]) {
@@ -149,6 +173,7 @@ impl Controller {
                 violated = true;
                 break;
             };
+            self.server.novices.remove(&conn);
             counters.requests += 1;
             // The function code follows the seven bytes of the header.
             counters.refusals += u64::from(answer[7] & 0x80 != 0);
@@ -212,7 +237,10 @@ impl Controller {
     fn command_event(&mut self, now: Instant, conn: ConnId, event: ServerEvent<'_>) {
         self.counters.command.requests += 1;
         match event {
-            ServerEvent::Request(request) => self.carry_out(now, conn, request),
+            ServerEvent::Request(request) => {
+                self.server.novices.remove(&conn);
+                self.carry_out(now, conn, request);
+            }
             ServerEvent::Unknown(_) => self.reply(now, conn, &Reply::UnknownCommand),
         }
     }

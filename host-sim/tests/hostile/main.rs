@@ -73,9 +73,9 @@ fn within_bounds(usage: &Usage) {
     assert!(usage.threads <= 8, "{usage:?}");
 }
 
-const QUIET: Duration = Duration::from_millis(500);
-const WARM_UP: Duration = Duration::from_millis(400);
-const ATTACK: Duration = Duration::from_millis(800);
+const QUIET: Duration = Duration::from_millis(400);
+const WARM_UP: Duration = Duration::from_millis(300);
+const ATTACK: Duration = Duration::from_millis(600);
 /// docs/devices.md section 7.
 const MOST_RSS_KIB: u64 = 64 << 10;
 const MOST_DESCRIPTORS: usize = 400;

@@ -221,3 +221,30 @@ fn connections_are_bounded() {
     let counters = cell.controller.counters().command;
     assert_eq!((counters.opened, counters.refused, counters.open), (33, 1, 32));
 }
+
+#[test]
+fn who_only_holds_a_connection_makes_room_for_who_has_something_to_ask() {
+    let mut cell = Cell::new(&config());
+    let good = cell.command_client();
+    assert_eq!(cell.ask(good, "state"), "6:0:5:2");
+    let idle: Vec<_> = (1..MAX_COMMAND_CONNECTIONS).map(|_| cell.command_client()).collect();
+    // A byte now and then is nothing whole.
+    cell.input(ControllerInput::CommandBytes { conn: idle[0], bytes: b"run(" });
+    cell.run_ms(4_999);
+    let early = cell.command_client();
+    assert_eq!(cell.closed, [early], "they may be about to ask");
+    cell.run_ms(1);
+    let new = cell.command_client();
+    assert_eq!(cell.closed, [early, idle[0]]);
+    assert_eq!(cell.ask(new, "state"), "6:0:5:2");
+    assert_eq!(cell.ask(good, "state"), "6:0:5:2");
+    let counters = cell.controller.counters().command;
+    assert_eq!((counters.displaced, counters.refused, counters.open), (1, 1, MAX_COMMAND_CONNECTIONS));
+    // Who has asked stays, however long ago.
+    for &conn in &idle[1..] {
+        assert_eq!(cell.ask(conn, "isprogfinish"), "1");
+    }
+    cell.run_ms(60_000);
+    let late = cell.command_client();
+    assert_eq!(cell.closed, [early, idle[0], late]);
+}
