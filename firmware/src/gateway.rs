@@ -114,6 +114,11 @@ impl Gateway {
         }
     }
 
+    /// How many connections and datagrams of others than the controller each link has turned away.
+    pub fn strangers(&self) -> impl Iterator<Item = (LinkKind, u32)> + '_ {
+        self.links.iter().map(|(_, kind, control)| (*kind, control.strangers.get()))
+    }
+
     /// One input, and everything that follows from it.
     pub fn input(&self, input: Input<'_>) {
         self.input_at(now(), input);
@@ -273,11 +278,22 @@ pub(crate) struct LinkControl {
     turn: Cell<u32>,
     outbox: RefCell<Option<Transmission>>,
     changed: Notify,
+    strangers: Cell<u32>,
 }
 
 impl LinkControl {
     const fn new() -> Self {
-        Self { turn: Cell::new(0), outbox: RefCell::new(None), changed: Notify::new() }
+        Self {
+            turn: Cell::new(0),
+            outbox: RefCell::new(None),
+            changed: Notify::new(),
+            strangers: Cell::new(0),
+        }
+    }
+
+    /// Somebody else than the controller came to where the controller is awaited.
+    pub(crate) fn turn_away(&self) {
+        self.strangers.set(self.strangers.get().saturating_add(1));
     }
 
     pub(crate) fn is_turn(&self, turn: u32) -> bool {

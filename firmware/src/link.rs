@@ -38,15 +38,19 @@ pub enum Endpoint {
         /// UDP port.
         port: u16,
     },
-    /// Where the controller's TCP client connects to.
+    /// Where the controller's TCP client connects to. Nobody else does.
     TcpListen {
         /// TCP port.
         port: u16,
+        /// The controller's address or name.
+        host: String<64>,
     },
-    /// Where the controller's UDP client sends to.
+    /// Where the controller's UDP client sends to. Nobody else does.
     UdpListen {
         /// UDP port.
         port: u16,
+        /// The controller's address or name.
+        host: String<64>,
     },
 }
 
@@ -69,8 +73,8 @@ impl Endpoint {
             LinkKind::RecipeUdp => {
                 Self::Udp { host, port: controller.recipe_link.map_or(0, |link| link.udp_port) }
             }
-            LinkKind::RecipeTcpListen { port } => Self::TcpListen { port: listen(usize::from(port.0)) },
-            LinkKind::RecipeUdpListen { port } => Self::UdpListen { port: listen(usize::from(port.0)) },
+            LinkKind::RecipeTcpListen { port } => Self::TcpListen { port: listen(usize::from(port.0)), host },
+            LinkKind::RecipeUdpListen { port } => Self::UdpListen { port: listen(usize::from(port.0)), host },
         }
     }
 }
@@ -110,10 +114,10 @@ pub async fn run<const RX: usize, const TX: usize>(
     loop {
         let turn = pulse.idle(pin!(control.opened())).await;
         match endpoint {
-            Endpoint::Tcp { host, port } => driver.tcp(turn, Some((host, *port)), 0, buffers).await,
-            Endpoint::TcpListen { port } => driver.tcp(turn, None, *port, buffers).await,
-            Endpoint::Udp { host, port } => driver.udp(turn, Some((host, *port)), 0, buffers).await,
-            Endpoint::UdpListen { port } => driver.udp(turn, None, *port, buffers).await,
+            Endpoint::Tcp { host, port } => driver.tcp(turn, host, Way::To(*port), buffers).await,
+            Endpoint::TcpListen { port, host } => driver.tcp(turn, host, Way::At(*port), buffers).await,
+            Endpoint::Udp { host, port } => driver.udp(turn, host, Way::To(*port), buffers).await,
+            Endpoint::UdpListen { port, host } => driver.udp(turn, host, Way::At(*port), buffers).await,
         }
         // A turn that is over was ended by the engine: it expects no report.
         if control.is_turn(turn) {
@@ -121,6 +125,15 @@ pub async fn run<const RX: usize, const TX: usize>(
             gateway.input(Input::LinkDown { link });
         }
     }
+}
+
+/// Who begins.
+#[derive(Clone, Copy)]
+enum Way {
+    /// We do, to this port of the controller.
+    To(u16),
+    /// The controller does, at this port of ours.
+    At(u16),
 }
 
 struct Driver<'a> {
@@ -144,19 +157,17 @@ impl Driver<'_> {
     async fn tcp<const RX: usize, const TX: usize>(
         &self,
         turn: u32,
-        to: Option<(&str, u16)>,
-        listen: u16,
+        controller: &str,
+        way: Way,
         buffers: &mut Buffers<RX, TX>,
     ) {
         let mut socket = TcpSocket::new(self.stack, &mut buffers.rx, &mut buffers.tx);
         socket.set_nagle_enabled(false);
         let opening = async {
-            match to {
-                Some((host, port)) => match resolve(self.stack, host).await {
-                    Some(address) => socket.connect(IpEndpoint::new(address, port)).await.is_ok(),
-                    None => false,
-                },
-                None => socket.accept(listen).await.is_ok(),
+            let Some(address) = resolve(self.stack, controller).await else { return false };
+            match way {
+                Way::To(port) => socket.connect(IpEndpoint::new(address, port)).await.is_ok(),
+                Way::At(port) => self.accept(&mut socket, port, address).await,
             }
         };
         let opened = self.pulse.idle(pin!(select(opening, self.control.over(turn)))).await;
@@ -174,6 +185,30 @@ impl Driver<'_> {
         // The peer must not go on believing in a connection whose socket is gone.
         socket.abort();
         let _ = with_timeout(FAREWELL, socket.flush()).await;
+    }
+
+    /// Waits for a connection of the controller. All others are turned away: what comes here is believed.
+    async fn accept(&self, socket: &mut TcpSocket<'_>, port: u16, controller: IpAddress) -> bool {
+        loop {
+            // Who begins a connection and never completes it must not keep the only socket.
+            socket.set_keep_alive(None);
+            socket.set_timeout(Some(HANDSHAKE));
+            if socket.accept(port).await.is_err() {
+                return false;
+            }
+            match socket.remote_endpoint() {
+                Some(peer) if peer.addr == controller && socket.may_send() => {
+                    // A controller that was switched off has to find the socket free.
+                    socket.set_keep_alive(Some(PROBE));
+                    socket.set_timeout(Some(VANISHED));
+                    return true;
+                }
+                Some(peer) if peer.addr != controller => self.control.turn_away(),
+                _ => {}
+            }
+            socket.abort();
+            let _ = with_timeout(FAREWELL, socket.flush()).await;
+        }
     }
 
     async fn read(&self, turn: u32, mut reader: TcpReader<'_>, chunk: &mut [u8]) {
@@ -200,30 +235,30 @@ impl Driver<'_> {
         }
     }
 
-    /// Datagrams both ways; of a listening socket, answers whoever sent last.
+    /// Datagrams both ways; of a listening socket, answers where the controller sent from last.
     async fn udp<const RX: usize, const TX: usize>(
         &self,
         turn: u32,
-        to: Option<(&str, u16)>,
-        listen: u16,
+        controller: &str,
+        way: Way,
         buffers: &mut Buffers<RX, TX>,
     ) {
         let mut received = [PacketMetadata::EMPTY; DATAGRAMS];
         let mut waiting = [PacketMetadata::EMPTY; DATAGRAMS];
         let mut socket =
             UdpSocket::new(self.stack, &mut received, &mut buffers.rx, &mut waiting, &mut buffers.tx);
-        if socket.bind(listen).is_err() {
+        let own = match way {
+            Way::To(_) => 0,
+            Way::At(port) => port,
+        };
+        if socket.bind(own).is_err() {
             return;
         }
-        let fixed = match to {
-            Some((host, port)) => {
-                let resolving = select(resolve(self.stack, host), self.control.over(turn));
-                match self.pulse.idle(pin!(resolving)).await {
-                    Either::First(Some(address)) => Some(IpEndpoint::new(address, port)),
-                    _ => return,
-                }
-            }
-            None => None,
+        let resolving = select(resolve(self.stack, controller), self.control.over(turn));
+        let Either::First(Some(address)) = self.pulse.idle(pin!(resolving)).await else { return };
+        let fixed = match way {
+            Way::To(port) => Some(IpEndpoint::new(address, port)),
+            Way::At(_) => None,
         };
         let peer = Cell::new(fixed);
         if fixed.is_some() {
@@ -239,6 +274,10 @@ impl Driver<'_> {
                 match fixed {
                     Some(fixed) if from.endpoint != fixed => continue,
                     Some(_) => {}
+                    None if from.endpoint.addr != address => {
+                        self.control.turn_away();
+                        continue;
+                    }
                     None if peer.replace(Some(from.endpoint)).is_none() => self.up(),
                     None => {}
                 }
@@ -274,5 +313,14 @@ async fn resolve(stack: Stack<'_>, host: &str) -> Option<IpAddress> {
 const CHUNK: usize = 1536;
 /// Datagrams that wait, each way.
 const DATAGRAMS: usize = 8;
+/// How long a connection may take to come about at a listening socket.
+const HANDSHAKE: Duration = Duration::from_secs(2);
+/// Between two questions whether the controller's client is still there.
+const PROBE: Duration = Duration::from_secs(5);
+/// How long it may leave them without an answer.
+const VANISHED: Duration = Duration::from_secs(20);
 /// How long a closing socket is waited for.
 const FAREWELL: Duration = Duration::from_millis(100);
+
+#[cfg(test)]
+mod tests;

@@ -13,6 +13,7 @@ use crate::{info, warn};
 pub async fn run(gateway: &Gateway, pulse: &Pulse) -> ! {
     let mut links = [(0, false); MAX_LINKS];
     let mut ports = [[0; 6]; MAX_FIELD_PORTS];
+    let mut strangers = [0; MAX_LINKS];
     loop {
         for _ in 0..4 {
             let mut known = links.iter_mut();
@@ -32,6 +33,12 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse) -> ! {
                 |_, _| {},
             );
             pulse.idle(pin!(Timer::after(Duration::from_millis(250)))).await;
+        }
+        for ((kind, now), before) in gateway.strangers().zip(&mut strangers) {
+            if *before != now {
+                *before = now;
+                warn!("link {}: {} turned away that were not the controller", kind.name(), now);
+            }
         }
         let mut known = ports.iter_mut();
         gateway.report(
