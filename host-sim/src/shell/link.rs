@@ -7,7 +7,7 @@
 use std::cell::{Cell, RefCell};
 use std::collections::VecDeque;
 use std::io;
-use std::net::{IpAddr, SocketAddr};
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 
 use serde::Serialize;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
@@ -100,9 +100,11 @@ impl LinkControl {
         }
     }
 
-    /// Whether it is the controller that came.
+    /// Whether it is the controller that came, or somebody on this host, who could speak to the controller as
+    /// well.
     fn knows(&self, name: &str, controller: &[IpAddr], peer: SocketAddr) -> bool {
-        let known = controller.contains(&peer.ip().to_canonical());
+        let address = peer.ip().to_canonical();
+        let known = controller.contains(&address) || THIS_HOST.contains(&address);
         if !known {
             let count = |turned_away: &mut TurnedAway| turned_away.strangers += 1;
             self.turn_away(name, peer, "not controller.address", count);
@@ -407,6 +409,8 @@ async fn pump_udp(
     }
 }
 
+/// Where a process of this host comes from when it does not choose.
+const THIS_HOST: [IpAddr; 2] = [IpAddr::V4(Ipv4Addr::LOCALHOST), IpAddr::V6(Ipv6Addr::LOCALHOST)];
 /// Most bytes read at once.
 const CHUNK: usize = 2_048;
 /// Most datagrams taken before the others have a turn.

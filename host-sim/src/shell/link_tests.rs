@@ -307,3 +307,27 @@ fn a_strangers_datagrams_are_neither_taken_nor_answered() {
         assert_eq!(link.control.turned_away().strangers, 2);
     });
 }
+
+#[test]
+fn who_is_on_this_host_may_stand_for_the_controller() {
+    inside(async || {
+        let elsewhere = || "192.0.2.1".to_owned();
+        for address in ["127.0.0.1:0", "[::1]:0"] {
+            let Ok(listener) = TcpListener::bind(address).await else { continue };
+            let at = listener.local_addr().unwrap();
+            let link = Running::start(Endpoint::TcpListen { listener, controller: elsewhere() });
+            link.control.open();
+            let _peer = TcpStream::connect(at).await.unwrap();
+            link.expect(Seen::Up).await;
+        }
+        let socket = UdpSocket::bind("127.0.0.1:0").await.unwrap();
+        let at = socket.local_addr().unwrap();
+        let link = Running::start(Endpoint::UdpListen { socket, controller: elsewhere() });
+        link.control.open();
+        let peer = UdpSocket::bind("127.0.0.1:0").await.unwrap();
+        peer.send_to(b"here", at).await.unwrap();
+        link.expect(Seen::Up).await;
+        link.expect(Seen::Bytes(b"here".to_vec())).await;
+        assert_eq!(link.control.turned_away(), TurnedAway::default());
+    });
+}
