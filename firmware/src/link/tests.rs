@@ -13,6 +13,7 @@ use embassy_futures::block_on;
 use embassy_futures::join::{join, join3};
 use embassy_net::driver::{Capabilities, Driver as Device, HardwareAddress, LinkState};
 use embassy_net::{Config, Ipv4Cidr, StackResources, StaticConfigV4};
+use embassy_time::Timer;
 use proto_core::config::{
     Bus, Delimiter, FieldSpec, Name, OnStale, Parity, Parts, Port, Recipe, Rs485, SendOn, Span, StreamPart,
 };
@@ -21,6 +22,7 @@ use proto_core::sysvar::SysVar;
 use proto_core::time::Duration as CoreDuration;
 
 use super::*;
+use crate::test_clock::{Clock, advance};
 use crate::watchdog::{TaskName, Watch};
 
 const GATEWAY: u8 = 1;
@@ -29,13 +31,13 @@ const STRANGER: u8 = 3;
 const PORT: u16 = 50_000;
 const FRAME: [u8; 5] = [0xFF, 0xFF, 0x01, 0xEE, 0xEE];
 
-/// What waits for each host, and whether the stranger still hears and speaks.
+/// What waits for each host, and which one does not hear or speak any more.
 #[derive(Default)]
 struct Wire {
     waiting: RefCell<[VecDeque<Vec<u8>>; 3]>,
-    deaf: Cell<bool>,
-    mute: Cell<bool>,
-    /// Frames of the stranger so far.
+    deaf: Cell<u8>,
+    mute: Cell<u8>,
+    /// Frames of all so far.
     spoken: Cell<usize>,
 }
 
@@ -60,14 +62,12 @@ impl embassy_net::driver::TxToken for Sends<'_> {
         let mut frame = vec![0; len];
         let result = fill(&mut frame);
         let End { wire, host: own } = self.0;
-        if *own == STRANGER {
-            if wire.mute.get() {
-                return result;
-            }
-            wire.spoken.set(wire.spoken.get() + 1);
+        if wire.mute.get() == *own {
+            return result;
         }
+        wire.spoken.set(wire.spoken.get() + 1);
         for (host, queue) in (GATEWAY..).zip(wire.waiting.borrow_mut().iter_mut()) {
-            if host != *own && !(host == STRANGER && wire.deaf.get()) {
+            if host != *own && host != wire.deaf.get() {
                 queue.push_back(frame.clone());
             }
         }
@@ -142,6 +142,7 @@ fn config(bus: Bus) -> GatewayConfig {
 
 /// Runs what the controller and the stranger do beside the gateway, until they are done.
 fn among(bus: Bus, act: impl AsyncFnOnce(&Gateway, Stack<'_>, Stack<'_>, &Wire)) {
+    let _clock = Clock::take();
     let config = config(bus);
     let mut gateway = Box::new(Gateway::idle());
     gateway.configure(&config).unwrap();
@@ -169,11 +170,15 @@ fn among(bus: Bus, act: impl AsyncFnOnce(&Gateway, Stack<'_>, Stack<'_>, &Wire))
     let driven =
         join(gateway.keep_time(pulses[0]), run(&gateway, pulses[1], link, own, &endpoint, &mut buffers));
     let act = async {
-        with_timeout(Duration::from_secs(20), act(&gateway, controller, stranger, &wire))
+        with_timeout(Duration::from_secs(60), act(&gateway, controller, stranger, &wire))
             .await
             .expect("it hangs");
     };
-    block_on(select(pin!(act), pin!(join(network, driven))));
+    let time = poll_fn(|_| {
+        advance(Duration::from_micros(200));
+        Poll::<()>::Pending
+    });
+    block_on(select(pin!(act), pin!(join3(network, driven, time))));
 }
 
 /// Waits until the link was up so often and so many were turned away.
@@ -220,6 +225,9 @@ fn a_tcp_listener_takes_the_controller_only() {
             own.abort();
         }
         seen(gateway, 1, 3).await;
+        // A controller that has nothing to say is no less there.
+        Timer::after(VANISHED * 2).await;
+        seen(gateway, 1, 3).await;
         // There is one socket, and it is taken.
         assert!(other.connect(at).await.is_err());
         own.abort();
@@ -240,13 +248,11 @@ fn a_connection_that_never_comes_about_does_not_keep_the_listener() {
         other.abort();
         other.flush().await.unwrap();
         // Now the hosts know each other. It asks for a connection and is gone before it is answered.
-        wire.deaf.set(true);
+        wire.deaf.set(STRANGER);
         let before = wire.spoken.get();
-        let asked = poll_fn(|_| match wire.spoken.get() == before {
-            true => Poll::Pending,
-            false => Poll::Ready(wire.mute.set(true)),
-        });
+        let asked = poll_fn(|_| if wire.spoken.get() == before { Poll::Pending } else { Poll::Ready(()) });
         assert!(matches!(select(other.connect(at), asked).await, Either::Second(())));
+        wire.mute.set(STRANGER);
         let mut own = TcpSocket::new(controller, rx, tx);
         let mut refused = 0;
         while own.connect(at).await.is_err() {
@@ -255,6 +261,31 @@ fn a_connection_that_never_comes_about_does_not_keep_the_listener() {
         }
         assert!(refused > 0, "nothing was in its way");
         seen(gateway, 1, 1).await;
+    });
+}
+
+#[test]
+fn a_controller_that_was_switched_off_finds_the_listener_free_again() {
+    let listen = String::try_from("0.0.0.0:50000").unwrap();
+    among(Bus::TcpListen { listen }, async |gateway, controller, _, wire| {
+        let at = IpEndpoint::new(address(GATEWAY).into(), PORT);
+        let mut buffers = [[0; 256]; 2];
+        let [rx, tx] = &mut buffers;
+        let mut own = TcpSocket::new(controller, rx, tx);
+        own.connect(at).await.unwrap();
+        seen(gateway, 1, 0).await;
+        // Nobody hears that it goes.
+        wire.mute.set(CONTROLLER);
+        own.abort();
+        own.flush().await.unwrap();
+        wire.mute.set(0);
+        let mut refused = 0;
+        while own.connect(at).await.is_err() {
+            own.abort();
+            refused += 1;
+        }
+        assert!(refused > 0, "nothing was in its way");
+        seen(gateway, 2, 0).await;
     });
 }
 
