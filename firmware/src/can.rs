@@ -88,6 +88,7 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, can: impl CanPo
         control,
         can,
         phase: Phase::Idle,
+        is_failing: false,
         backoff: BACKOFF_MIN,
         recovered: Instant::MIN,
         lost: 0,
@@ -116,6 +117,8 @@ struct Task<'a, C> {
     control: &'a PortControl,
     can: C,
     phase: Phase,
+    /// What was handed over last did not leave.
+    is_failing: bool,
     /// How long the next bus-off is waited out.
     backoff: Duration,
     /// When the controller was back on the bus.
@@ -173,6 +176,7 @@ impl<C: CanPort> Task<'_, C> {
             CanEvent::Sent => {
                 if let Phase::Sending { .. } = self.phase {
                     self.phase = Phase::Idle;
+                    self.is_failing = false;
                     self.gateway.input(Input::PortSent { port: self.port });
                 }
             }
@@ -213,8 +217,12 @@ impl<C: CanPort> Task<'_, C> {
     /// Nobody takes what is sent: another node is missing, or the cable. What waits would be old when
     /// one comes.
     fn give_up(&mut self) {
-        let counters = self.can.counters();
-        warn!("port {}: nobody acknowledges; transmit errors {}", self.port.0, counters.transmit_errors);
+        // Said once, however often it happens in a row.
+        if !self.is_failing {
+            let errors = self.can.counters().transmit_errors;
+            warn!("port {}: nothing leaves, nobody acknowledges; transmit errors {}", self.port.0, errors);
+        }
+        self.is_failing = true;
         self.can.recover();
         self.control.clear();
         self.phase = Phase::Idle;

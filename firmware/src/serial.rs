@@ -7,6 +7,7 @@
 use core::pin::pin;
 
 use embassy_futures::select::{Either, select};
+use embassy_futures::yield_now;
 use embassy_time::{Duration, Instant, Timer, with_timeout};
 use embedded_io_async::{Read, Write};
 use proto_core::engine::{Input, PortId};
@@ -28,6 +29,28 @@ pub trait Line: Read + Write {
     fn arrival(&self) -> Option<Arrival> {
         None
     }
+
+    /// What the device could not take.
+    fn errors(&self) -> LineErrors {
+        LineErrors::NONE
+    }
+}
+
+/// What a line's device could not take since it was started. Counters wrap.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct LineErrors {
+    /// Characters left out for their parity.
+    pub parity: u32,
+    /// Characters left out for a stop bit that was none.
+    pub framing: u32,
+    /// Times that the receive FIFO was full, with one character or more lost.
+    pub overruns: u32,
+    /// Characters lost because nobody read.
+    pub unread: u32,
+}
+
+impl LineErrors {
+    pub(crate) const NONE: Self = Self { parity: 0, framing: 0, overruns: 0, unread: 0 };
 }
 
 /// When bytes arrived that were read later.
@@ -53,6 +76,7 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, mut line: impl 
     let Some(control) = gateway.port(port) else { core::future::pending().await };
     let mut chunk = [0; 256];
     let mut is_failing = false;
+    let mut errors = Told { errors: LineErrors::NONE, next: Instant::MIN };
     loop {
         gateway.input(Input::PortUp { port });
         let failed = loop {
@@ -60,6 +84,9 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, mut line: impl 
             let frame = match next {
                 Either::First(Ok(len)) => {
                     tell(gateway, port, chunk.get(..len).unwrap_or(&[]), line.arrival());
+                    errors.tell(port, line.errors());
+                    // A line that is never silent does not keep the other tasks from running.
+                    yield_now().await;
                     // A line that never falls silent does not keep us from sending.
                     match control.take_bytes() {
                         Some(frame) => frame,
@@ -112,6 +139,28 @@ fn tell(gateway: &Gateway, port: PortId, bytes: &[u8], arrival: Option<Arrival>)
     }
 }
 
+/// The errors that were told of, and when others may be: at most once a second.
+struct Told {
+    errors: LineErrors,
+    next: Instant,
+}
+
+impl Told {
+    fn tell(&mut self, port: PortId, errors: LineErrors) {
+        let now = Instant::now();
+        if errors == self.errors || now < self.next {
+            return;
+        }
+        self.errors = errors;
+        self.next = now + ERROR_PERIOD;
+        let LineErrors { parity, framing, overruns, unread } = errors;
+        warn!(
+            "port {}: characters left out for parity {}, framing {}; overruns {}, unread {}",
+            port.0, parity, framing, overruns, unread
+        );
+    }
+}
+
 /// Twice what the bytes take on the line (12 bits a byte at most), and a little.
 fn patience(bytes: usize, baud: u32) -> Duration {
     let bits = (bytes as u64).saturating_mul(24_000_000);
@@ -120,6 +169,7 @@ fn patience(bytes: usize, baud: u32) -> Duration {
 
 /// Bytes that were read within this time have just arrived: a fraction of any silence that matters.
 const PROMPT: Duration = Duration::from_micros(100);
+const ERROR_PERIOD: Duration = Duration::from_secs(1);
 /// After a failed device.
 const RETRY: Duration = Duration::from_millis(100);
 

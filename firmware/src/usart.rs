@@ -22,7 +22,7 @@ use embedded_io_async::{ErrorType, Read, Write};
 use heapless::Deque;
 use proto_core::config::{Parity, Rs485};
 
-use crate::serial::{Arrival, Line};
+use crate::serial::{Arrival, Line, LineErrors};
 
 /// The registers of one USART, 32 bits each.
 pub trait Registers {
@@ -54,23 +54,6 @@ impl Default for Shared {
     fn default() -> Self {
         Self::new()
     }
-}
-
-/// What went wrong on a line since it was started. Counters wrap.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct LineErrors {
-    /// Characters left out for their parity.
-    pub parity: u32,
-    /// Characters left out for a stop bit that was none.
-    pub framing: u32,
-    /// Times that the receive FIFO was full, with one character or more lost.
-    pub overruns: u32,
-    /// Characters lost because nobody read.
-    pub unread: u32,
-}
-
-impl LineErrors {
-    const NONE: Self = Self { parity: 0, framing: 0, overruns: 0, unread: 0 };
 }
 
 /// The USART cannot run at that speed.
@@ -127,11 +110,6 @@ impl<R: Registers> Usart<R> {
             line.receive();
             line.transmit();
         });
-    }
-
-    /// What went wrong so far.
-    pub fn errors(&self) -> LineErrors {
-        self.with(|line| line.state.errors)
     }
 
     fn with<T>(&self, f: impl FnOnce(&mut Access<'_, R>) -> T) -> T {
@@ -299,6 +277,10 @@ impl<R: Registers> Line for Usart<R> {
     /// As the interrupt found them: a quarter of the FIFO or one character of silence late.
     fn arrival(&self) -> Option<Arrival> {
         Some(self.with(|line| line.state.read))
+    }
+
+    fn errors(&self) -> LineErrors {
+        self.with(|line| line.state.errors)
     }
 }
 

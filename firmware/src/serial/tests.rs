@@ -1,9 +1,10 @@
 //! A line whose bytes wait, because the processor is busy with something else.
 
+use core::cell::Cell;
 use core::convert::Infallible;
-use core::future::pending;
+use core::future::{Future, pending};
 use core::pin::pin;
-use core::task::Poll;
+use core::task::{Context, Poll, Waker};
 use std::boxed::Box;
 use std::collections::VecDeque;
 
@@ -168,4 +169,50 @@ fn a_silence_ends_a_frame_even_when_nobody_looked() {
     let pieces = frame.map(|(after, part)| Piece { after, bytes: &FRAME[part] });
     let counters = counted(IDLE_GAP * 3, pieces);
     assert_eq!((counters.frames_in, counters.discarded_bytes, counters.resync_bytes), (1, 3, 2));
+}
+
+/// A line that never falls silent.
+struct Flood<'a>(&'a Cell<u32>);
+
+impl ErrorType for Flood<'_> {
+    type Error = Infallible;
+}
+
+impl Read for Flood<'_> {
+    async fn read(&mut self, buf: &mut [u8]) -> Result<usize, Infallible> {
+        if self.0.get() == 0 {
+            return pending().await;
+        }
+        self.0.set(self.0.get() - 1);
+        buf.fill(0xA5);
+        Ok(buf.len())
+    }
+}
+
+impl Write for Flood<'_> {
+    async fn write(&mut self, buf: &[u8]) -> Result<usize, Infallible> {
+        Ok(buf.len())
+    }
+
+    async fn flush(&mut self) -> Result<(), Infallible> {
+        Ok(())
+    }
+}
+
+impl Line for Flood<'_> {}
+
+#[test]
+fn a_line_that_never_falls_silent_does_not_starve_the_other_tasks() {
+    let _clock = Clock::take();
+    let mut gateway = Box::new(Gateway::idle());
+    gateway.configure(&config()).unwrap();
+    let watch = Watch::<1>::new();
+    let pulse = watch.register(TaskName::Serial(PortId(0))).unwrap();
+    let reads = Cell::new(100);
+    let mut task = pin!(run(&gateway, pulse, PortId(0), Flood(&reads), 115_200));
+    let mut cx = Context::from_waker(Waker::noop());
+    for turn in 1..=50 {
+        assert!(task.as_mut().poll(&mut cx).is_pending());
+        assert_eq!(reads.get(), 100 - turn, "one read in a turn");
+    }
 }

@@ -71,25 +71,26 @@ impl Lines {
     /// Starts the next line.
     pub(super) fn next(&mut self, line: &Rs485) -> Option<Result<SerialDevice, BaudError>> {
         if let Some(pins) = self.first.take() {
-            connect(pins);
             rcc::enable_and_reset::<peripherals::USART2>();
             let clock = rcc::frequency::<peripherals::USART2>().0;
             let started = Usart::start(UsartRegisters(USART2), &FIRST, line, clock);
+            connect(pins);
             enable::<typelevel::USART2>();
             return Some(started);
         }
         let pins = self.second.take()?;
-        connect(pins);
         rcc::enable_and_reset::<peripherals::UART7>();
         let clock = rcc::frequency::<peripherals::UART7>().0;
         let started = Usart::start(UsartRegisters(UART7), &SECOND, line, clock);
+        connect(pins);
         enable::<typelevel::UART7>();
         Some(started)
     }
 }
 
-/// Hands transmit, receive and driver-enable over to the USART, for ever. The transceiver lets its
-/// output float while it sends: that must not be taken for a start bit.
+/// Hands transmit, receive and driver-enable over to the USART, for ever; it has to run, because before
+/// that its driver-enable is raised. The transceiver lets its output float while it sends: that must not
+/// be taken for a start bit.
 fn connect(pins: [Flex<'static>; 3]) {
     const FUNCTION: u8 = 7;
     let output = AfType::output(OutputType::PushPull, Speed::High);

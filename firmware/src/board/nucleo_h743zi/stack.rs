@@ -1,9 +1,11 @@
-//! The stack: it has the DTCM for itself. Below it nothing is, and the MPU says so as well.
+//! The stack: it has the DTCM for itself, and a guard at its end.
 
 use cortex_m::peripheral::MPU;
 
 unsafe extern "C" {
-    /// From memory.x: the stack's lowest address.
+    /// From memory.x: the lowest address of the guard, which ends where the stack may begin.
+    static _stack_guard: u32;
+    /// The stack's lowest address.
     static _stack_end: u32;
     /// Its upper end.
     static _stack_start: u32;
@@ -11,20 +13,20 @@ unsafe extern "C" {
 
 const PAINT: u32 = 0xC5C5_C5C5;
 /// log2 of the guard's size.
-const GUARD_BITS: u32 = 16;
+const GUARD_BITS: u32 = 12;
 
 fn bottom() -> usize {
     &raw const _stack_end as usize
 }
 
-/// Keeps everybody from the 64 KiB below the stack. There is no memory; with the MPU an overflow faults
-/// where it happens, and not some stores later.
+/// Keeps everybody from the 4 KiB below the stack, so that an overflow faults. The handler of the fault
+/// is not kept from them: it has to have a stack.
 pub(super) fn guard() {
-    // SAFETY: nobody else uses the MPU, and nothing is where the guard is.
+    // SAFETY: nobody else uses the MPU, and nothing is kept where the guard is (memory.x).
     unsafe {
         let mpu = &*MPU::PTR;
         mpu.rnr.write(0);
-        mpu.rbar.write((bottom() - (1 << GUARD_BITS)) as u32);
+        mpu.rbar.write(&raw const _stack_guard as u32);
         // Execute never, no access, its size, on.
         mpu.rasr.write(1 << 28 | (GUARD_BITS - 1) << 1 | 1);
         // On, with the ordinary map for everything else.
