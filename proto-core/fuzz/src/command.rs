@@ -343,6 +343,8 @@ pub(crate) fn client_seeds() -> Vec<Vec<u8>> {
     }
     // The beginning of a reply when the time is up.
     seeds.push([&[0, ask(7)][..], &bytes(b"10"), &[5, 255, 7]].concat());
+    // A number that was held behind an unknown text.
+    seeds.push([&[0, ask(8)][..], &bytes(b"xset speed 5%06:0:5:2"), &[5, 97, 7]].concat());
     let long = bytes(&[b'a'; 32]);
     seeds.push(
         [

@@ -323,9 +323,7 @@ impl Client {
         let word = self.waiting.as_ref().map_or("", |(word, _)| word);
         let value = match word {
             "state" => state(bytes),
-            "isprogfinish" if [b"0", b"1"].contains(&bytes.first_chunk().unwrap_or(b" ")) => {
-                Front::Complete(1)
-            }
+            "isprogfinish" if is_flag(bytes) => Front::Complete(1),
             "getlasterror" => last_error(bytes),
             _ => Front::Other,
         };
@@ -374,6 +372,12 @@ fn is_beginning(bytes: &[u8]) -> bool {
         number.len() <= 16 && number.iter().all(|byte| byte.is_ascii_digit() || [b'.', b' '].contains(byte))
     };
     TEXTS.iter().any(|text| text.as_bytes().starts_with(bytes)) || b"set speed ".starts_with(bytes) || speed()
+}
+
+/// `0` or `1`, and not a longer number.
+fn is_flag(bytes: &[u8]) -> bool {
+    let more = bytes.get(1).is_some_and(|byte| byte.is_ascii_digit() || *byte == b':');
+    matches!(bytes.first(), Some(b'0' | b'1')) && !more
 }
 
 /// `6:0:5:2`, each number a byte.
