@@ -98,7 +98,7 @@ fn count_all(works: &[Work], beside: &[Beside]) -> ExitCode {
 }
 
 /// Instructions of a whole process that does the work `iterations` times.
-fn count(name: &str, iterations: u64) -> Option<u64> {
+pub(crate) fn count(name: &str, iterations: u64) -> Option<u64> {
     let output = Command::new("valgrind")
         .args(["--tool=callgrind", "--callgrind-out-file=/dev/null"])
         .arg(std::env::current_exe().ok()?)
