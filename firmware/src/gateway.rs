@@ -40,7 +40,9 @@ pub type Engine = AnyEngine<MAX_FIELD_PORTS, MAX_UPLINKS, MAX_FIELDS>;
 
 /// The engine and what every task shares with it.
 pub struct Gateway {
-    engine: RefCell<Engine>,
+    /// None or one. Without one it is all zeros: an engine as an initial value would be 30 KB of flash,
+    /// and one that is moved here with everything else as much of the stack.
+    engine: RefCell<Vec<Engine, 1>>,
     ports: Vec<(PortId, PortControl), MAX_FIELD_PORTS>,
     links: Vec<(LinkId, LinkKind, LinkControl), MAX_LINKS>,
     output: RefCell<[u8; OUTPUT_BUFFER]>,
@@ -54,7 +56,7 @@ impl Gateway {
     /// A gateway without a configuration.
     pub const fn idle() -> Self {
         Self {
-            engine: RefCell::new(Engine::idle()),
+            engine: RefCell::new(Vec::new()),
             ports: Vec::new(),
             links: Vec::new(),
             output: RefCell::new([0; OUTPUT_BUFFER]),
@@ -69,7 +71,14 @@ impl Gateway {
     /// # Errors
     /// What the engine cannot run.
     pub fn configure(&mut self, config: &GatewayConfig) -> Result<(), BuildError> {
-        let engine = self.engine.get_mut();
+        put_idle(self.engine.get_mut());
+        self.configure_in_place(config)
+    }
+
+    /// Not inlined: what this needs of the stack and what `put_idle` needs do not add up.
+    #[inline(never)]
+    fn configure_in_place(&mut self, config: &GatewayConfig) -> Result<(), BuildError> {
+        let Some(engine) = self.engine.get_mut().first_mut() else { return Ok(()) };
         engine.configure(config)?;
         // As many places as the engine has.
         self.ports.clear();
@@ -92,6 +101,7 @@ impl Gateway {
     /// Shows how each link and each port does.
     pub fn report(&self, mut link: impl FnMut(LinkInfo<'_>), mut port: impl FnMut(PortId, &PortCounters)) {
         let engine = self.engine.borrow();
+        let Some(engine) = engine.first() else { return };
         engine.links().for_each(&mut link);
         for id in engine.field_ports() {
             if let Some(counters) = engine.port_counters(id) {
@@ -103,6 +113,7 @@ impl Gateway {
     /// What the status LED shows.
     pub fn condition(&self) -> Condition {
         let engine = self.engine.borrow();
+        let Some(engine) = engine.first() else { return Condition::Refused };
         let is_up = |link: LinkInfo<'_>| matches!(link.state, LinkState::Up { .. });
         let works = |id| engine.port_state(id) == Some(PortState::Working);
         if !engine.links().all(is_up) {
@@ -130,6 +141,7 @@ impl Gateway {
         let at = at.max(self.told.get());
         self.told.set(at);
         let mut engine = self.engine.borrow_mut();
+        let Some(engine) = engine.first_mut() else { return };
         let mut buf = self.output.borrow_mut();
         engine.handle(at, input);
         loop {
@@ -192,6 +204,13 @@ impl Gateway {
     pub(crate) fn link(&self, id: LinkId) -> Option<&LinkControl> {
         self.links.iter().find(|(link, ..)| *link == id).map(|(.., control)| control)
     }
+}
+
+/// Not inlined: an engine passes over the stack here.
+#[inline(never)]
+fn put_idle(place: &mut Vec<Engine, 1>) {
+    place.clear();
+    let _ = place.push(Engine::idle());
 }
 
 /// The engine's clock.

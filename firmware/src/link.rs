@@ -81,34 +81,36 @@ impl Endpoint {
 
 /// A link's socket buffers.
 #[derive(Debug)]
-pub struct Buffers<const RX: usize, const TX: usize> {
-    rx: [u8; RX],
-    tx: [u8; TX],
-    chunk: [u8; CHUNK],
+pub struct Buffers<'a> {
+    rx: &'a mut [u8],
+    tx: &'a mut [u8],
+    chunk: &'a mut [u8],
 }
 
-impl<const RX: usize, const TX: usize> Buffers<RX, TX> {
-    /// Empty buffers.
-    pub const fn new() -> Self {
-        Self { rx: [0; RX], tx: [0; TX], chunk: [0; CHUNK] }
-    }
-}
+impl<'a> Buffers<'a> {
+    /// Bytes that a link needs.
+    pub const SIZE: usize = RX + TX + CHUNK;
 
-impl<const RX: usize, const TX: usize> Default for Buffers<RX, TX> {
-    fn default() -> Self {
-        Self::new()
+    /// Takes [`Buffers::SIZE`] bytes from the front of `memory`; `None` when there are fewer.
+    pub fn take(memory: &mut &'a mut [u8]) -> Option<Self> {
+        Some(Self {
+            rx: memory.split_off_mut(..RX)?,
+            tx: memory.split_off_mut(..TX)?,
+            chunk: memory.split_off_mut(..CHUNK)?,
+        })
     }
 }
 
 /// Drives the link for ever.
-pub async fn run<const RX: usize, const TX: usize>(
+pub async fn run(
     gateway: &Gateway,
     pulse: &Pulse,
     link: LinkId,
     stack: Stack<'_>,
     endpoint: &Endpoint,
-    buffers: &mut Buffers<RX, TX>,
+    mut buffers: Buffers<'_>,
 ) -> ! {
+    let buffers = &mut buffers;
     let Some(control) = gateway.link(link) else { core::future::pending().await };
     let driver = Driver { gateway, pulse, link, control, stack };
     loop {
@@ -154,14 +156,8 @@ impl Driver<'_> {
     }
 
     /// One connection, until the peer closes it, an error, or the turn is over.
-    async fn tcp<const RX: usize, const TX: usize>(
-        &self,
-        turn: u32,
-        controller: &str,
-        way: Way,
-        buffers: &mut Buffers<RX, TX>,
-    ) {
-        let mut socket = TcpSocket::new(self.stack, &mut buffers.rx, &mut buffers.tx);
+    async fn tcp(&self, turn: u32, controller: &str, way: Way, buffers: &mut Buffers<'_>) {
+        let mut socket = TcpSocket::new(self.stack, buffers.rx, buffers.tx);
         socket.set_nagle_enabled(false);
         let opening = async {
             let Some(address) = resolve(self.stack, controller).await else { return false };
@@ -174,7 +170,7 @@ impl Driver<'_> {
         if let Either::First(true) = opened {
             self.up();
             let (reader, writer) = socket.split();
-            let (reading, writing) = (self.read(turn, reader, &mut buffers.chunk), self.write(turn, writer));
+            let (reading, writing) = (self.read(turn, reader, buffers.chunk), self.write(turn, writer));
             self.pulse.idle(pin!(select(reading, writing))).await;
             // What the engine has given up must not be delivered later, after newer values.
             if self.control.is_turn(turn) {
@@ -236,17 +232,10 @@ impl Driver<'_> {
     }
 
     /// Datagrams both ways; of a listening socket, answers where the controller sent from last.
-    async fn udp<const RX: usize, const TX: usize>(
-        &self,
-        turn: u32,
-        controller: &str,
-        way: Way,
-        buffers: &mut Buffers<RX, TX>,
-    ) {
+    async fn udp(&self, turn: u32, controller: &str, way: Way, buffers: &mut Buffers<'_>) {
         let mut received = [PacketMetadata::EMPTY; DATAGRAMS];
         let mut waiting = [PacketMetadata::EMPTY; DATAGRAMS];
-        let mut socket =
-            UdpSocket::new(self.stack, &mut received, &mut buffers.rx, &mut waiting, &mut buffers.tx);
+        let mut socket = UdpSocket::new(self.stack, &mut received, buffers.rx, &mut waiting, buffers.tx);
         let own = match way {
             Way::To(_) => 0,
             Way::At(port) => port,
@@ -267,7 +256,7 @@ impl Driver<'_> {
         let reading = async {
             loop {
                 // A datagram that is too long for any frame is none of ours.
-                let Ok((len, from)) = socket.recv_from(&mut buffers.chunk).await else { continue };
+                let Ok((len, from)) = socket.recv_from(buffers.chunk).await else { continue };
                 if !self.control.is_turn(turn) {
                     return;
                 }
@@ -308,6 +297,10 @@ async fn resolve(stack: Stack<'_>, host: &str) -> Option<IpAddress> {
     addresses.first().copied()
 }
 
+/// A state packet, and a receive window that a burst cannot overrun the Ethernet controller with.
+const RX: usize = 1536;
+/// The longest frame or request, and another.
+const TX: usize = 1024;
 /// Bytes handed to the engine at once: a state packet, and longer than any frame, so that a datagram
 /// that is too long is seen to be.
 const CHUNK: usize = 1536;

@@ -3,6 +3,7 @@
 //! Each `#[task]` here is a shim around the library's function of the same name, because a task cannot
 //! be generic.
 
+use core::net::Ipv4Addr;
 use core::pin::pin;
 
 use embassy_executor::{SpawnError, SpawnToken, Spawner};
@@ -30,9 +31,13 @@ pub(crate) fn start(spawner: Spawner, mut board: Board) -> Tasks {
     let tasks = Tasks { spawner, watch: WATCH.init_with(Watch::new) };
     // The first: what hangs behind it ends in a reset.
     spawner.spawn(feeder(tasks.watch, board.watchdog()).expect("the first of its kind"));
-    let loaded = load(&mut board, idle_gateway());
+    // Both are all zeros: nothing of them is in flash or passes over the stack.
+    static GATEWAY: ConstStaticCell<Gateway> = ConstStaticCell::new(Gateway::idle());
+    static ROOM: ConstStaticCell<Room> = ConstStaticCell::new(Room::BLANK);
+    let room = ROOM.take();
+    let loaded = load(&mut board, GATEWAY.take(), room.configuration());
     let gateway = loaded.as_ref().ok().map(|(gateway, _)| *gateway);
-    let started = loaded.and_then(|(gateway, wiring)| run(&tasks, board, gateway, wiring));
+    let started = loaded.and_then(|(gateway, wiring)| run(&tasks, board, gateway, wiring, room.links()));
     tasks.spawn(TaskName::Led, |pulse| status_led(pulse, gateway.filter(|_| started.is_ok()), led));
     if let Err(reason) = started {
         tasks.spawn(TaskName::Refused, |pulse| refused(pulse, reason));
@@ -92,24 +97,52 @@ struct Wiring {
     network: Option<Network>,
 }
 
-/// Not inlined: an engine may pass over the stack here, and the configuration is not there yet.
-#[inline(never)]
-fn idle_gateway() -> &'static mut Gateway {
-    static GATEWAY: StaticCell<Gateway> = StaticCell::new();
-    GATEWAY.init_with(Gateway::idle)
+/// What takes room only until everything is started, and what takes the room then.
+#[allow(clippy::large_enum_variant, reason = "that is what it is for")]
+#[repr(u8)]
+enum Room {
+    Configuration(GatewayConfig),
+    Links(heapless::Vec<u8, { MAX_LINKS * Buffers::SIZE }>),
 }
 
-/// Not inlined: the configuration is on the stack here, and nowhere else.
+impl Room {
+    /// All zeros, so that it takes no flash: what it says is written over before anybody looks.
+    const BLANK: Self = {
+        let mut config = GatewayConfig::empty();
+        config.network = Some(Network { address: Ipv4Addr::UNSPECIFIED, prefix: 0, router: None, dns: None });
+        Self::Configuration(config)
+    };
+
+    fn configuration(&mut self) -> &mut GatewayConfig {
+        match self {
+            Self::Configuration(config) => config,
+            Self::Links(_) => unreachable!("the links come last"),
+        }
+    }
+
+    /// The links' buffers, in the place of the configuration.
+    fn links(&mut self) -> &mut [u8] {
+        *self = Self::Links(heapless::Vec::new());
+        let Self::Links(buffers) = self else { return &mut [] };
+        let _ = buffers.resize_default(buffers.capacity());
+        buffers
+    }
+}
+
+/// Not inlined: what is on the stack here is not there when the tasks run.
 #[inline(never)]
-fn load(board: &mut Board, gateway: &'static mut Gateway) -> Result<(&'static Gateway, Wiring), Refused> {
+fn load(
+    board: &mut Board,
+    gateway: &'static mut Gateway,
+    config: &mut GatewayConfig,
+) -> Result<(&'static Gateway, Wiring), Refused> {
     let bytes = board.configuration().map_err(Refused::Storage)?;
-    let mut config = GatewayConfig::empty();
-    image::decode_into(bytes, &mut config).map_err(Refused::Image)?;
-    gateway.configure(&config).map_err(Refused::Build)?;
+    image::decode_into(bytes, config).map_err(Refused::Image)?;
+    gateway.configure(config).map_err(Refused::Build)?;
     let gateway: &'static Gateway = gateway;
     let wiring = Wiring {
         ports: config.field_ports().map(|(index, port, _)| (PortId(index), port.bus.clone())).collect(),
-        links: gateway.links().map(|(id, kind)| (id, kind, Endpoint::of(&config, kind))).collect(),
+        links: gateway.links().map(|(id, kind)| (id, kind, Endpoint::of(config, kind))).collect(),
         network: config.network,
     };
     info!(
@@ -123,7 +156,14 @@ fn load(board: &mut Board, gateway: &'static mut Gateway) -> Result<(&'static Ga
     Ok((gateway, wiring))
 }
 
-fn run(tasks: &Tasks, mut board: Board, gateway: &'static Gateway, wiring: Wiring) -> Result<(), Refused> {
+#[inline(never)]
+fn run(
+    tasks: &Tasks,
+    mut board: Board,
+    gateway: &'static Gateway,
+    wiring: Wiring,
+    mut memory: &'static mut [u8],
+) -> Result<(), Refused> {
     // All devices are claimed before anything moves.
     let mut serial_ports: heapless::Vec<_, { board::SERIAL_PORTS }> = heapless::Vec::new();
     let mut can_ports: heapless::Vec<_, { board::CAN_PORTS }> = heapless::Vec::new();
@@ -159,10 +199,8 @@ fn run(tasks: &Tasks, mut board: Board, gateway: &'static Gateway, wiring: Wirin
     info!("stack: {} bytes while the engine was made", board::stack_used());
     tasks.spawn(TaskName::Network, |pulse| network(pulse, runner));
     tasks.spawn(TaskName::Address, |pulse| address(pulse, stack));
-    static BUFFERS: [ConstStaticCell<Buffers<RX, TX>>; MAX_LINKS] =
-        [const { ConstStaticCell::new(Buffers::new()) }; MAX_LINKS];
-    for ((id, kind, endpoint), buffers) in wiring.links.into_iter().zip(&BUFFERS) {
-        let buffers = buffers.take();
+    for (id, kind, endpoint) in wiring.links {
+        let buffers = Buffers::take(&mut memory).expect("there is room for MAX_LINKS");
         tasks.spawn(TaskName::Link(kind), |pulse| {
             controller_link(pulse, gateway, id, stack, endpoint, buffers)
         });
@@ -213,7 +251,7 @@ async fn controller_link(
     id: LinkId,
     stack: Stack<'static>,
     endpoint: Endpoint,
-    buffers: &'static mut Buffers<RX, TX>,
+    buffers: Buffers<'static>,
 ) -> ! {
     pulse.run(pin!(link::run(gateway, pulse, id, stack, &endpoint, buffers))).await
 }
@@ -269,10 +307,6 @@ async fn refused(pulse: &'static Pulse, reason: Refused) -> ! {
 const MAX_LINKS: usize = firmware::gateway::MAX_UPLINKS + 3;
 /// One for each link, DHCP and DNS.
 const SOCKETS: usize = MAX_LINKS + 2;
-/// A state packet, and a receive window that a burst cannot overrun the Ethernet controller with.
-const RX: usize = 1536;
-/// The longest frame or request, and another.
-const TX: usize = 1024;
 /// After this long the reason is told again.
 const REPEAT: Duration = Duration::from_secs(10);
 /// A task for each port and link, and: engine, network, address, status, LED, refused, the board's own.

@@ -289,6 +289,11 @@ fn a_run_without_trouble_never_starves_the_watchdog() {
     let log = machine.listen(Duration::from_secs(12));
     assert_eq!(log.matches("recipe gateway").count(), 1, "{log}");
     assert!(!log.contains("watchdog") && !log.contains("panicked"), "{log}");
+    // What the machine code says that the stack can take, where somebody looked (.ci/stack).
+    if let Ok(bound) = std::env::var("FIRMWARE_STACK") {
+        let used = log.split_once("stack: ").and_then(|(_, rest)| rest.split_once(' ')).unwrap().0;
+        assert!(used.parse::<u32>().unwrap() <= bound.parse().unwrap(), "{used} of {bound} bytes");
+    }
 }
 
 #[test]

@@ -165,10 +165,10 @@ fn among(bus: Bus, act: impl AsyncFnOnce(&Gateway, Stack<'_>, Stack<'_>, &Wire))
     let (own, mut own_runner) = host(GATEWAY, of_gateway);
     let (controller, mut controller_runner) = host(CONTROLLER, of_controller);
     let (stranger, mut stranger_runner) = host(STRANGER, of_stranger);
-    let mut buffers = Buffers::<1024, 1024>::new();
+    let mut memory = [0; Buffers::SIZE];
+    let buffers = Buffers::take(&mut memory.as_mut_slice()).unwrap();
     let network = join3(own_runner.run(), controller_runner.run(), stranger_runner.run());
-    let driven =
-        join(gateway.keep_time(pulses[0]), run(&gateway, pulses[1], link, own, &endpoint, &mut buffers));
+    let driven = join(gateway.keep_time(pulses[0]), run(&gateway, pulses[1], link, own, &endpoint, buffers));
     let act = async {
         with_timeout(Duration::from_secs(60), act(&gateway, controller, stranger, &wire))
             .await
