@@ -44,6 +44,9 @@ pub(crate) trait Gateway {
     /// Pulls the Ethernet cable, or plugs it in.
     fn cable(&self, cable: Cable);
 
+    /// The address that it says it has; a host's gateway says none.
+    fn own_address(&self) -> Option<String>;
+
     /// The processor time that its host spent on it.
     fn processor_time(&self) -> Duration;
 

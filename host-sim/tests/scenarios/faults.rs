@@ -10,12 +10,27 @@ use super::robot::reserved_ports;
 
 pub(crate) fn all() -> Vec<Scenario> {
     vec![
+        Scenario::new("an_address_of_its_own", own_address),
         Scenario::new("the_controller_restarts", restart),
         Scenario::new("the_cable_is_pulled_and_plugged_in", cable),
         Scenario::new("modbus_alone_stalls_and_comes_back", modbus_stalls),
         Scenario::new("a_silent_device_leaves_safe_values", safe_value),
         Scenario::new("an_idle_gateway_takes_no_time", idle).alone(),
     ]
+}
+
+/// A board has the address of the file; a host keeps its own and works all the same.
+fn own_address(case: &Case) {
+    let robot = case.robot(ROBOT).start();
+    let plan = case.gateway("rs485-system.toml").robot(&robot);
+    let network = "{ address = '10.0.2.77/24', router = '10.0.2.2' }";
+    let mut gateway = plan.set("network", network).start();
+    gateway.until_up(Link::Modbus, 1);
+    gateway.until_up(Link::State, 1);
+    if let Some(address) = gateway.own_address() {
+        assert_eq!(address, "10.0.2.77/24");
+    }
+    pose_and_output(&robot, &mut gateway.line("rs485-1"), &pose_frame(4));
 }
 
 fn restart(case: &Case) {

@@ -1,7 +1,10 @@
 //! Bytes that are nobody's frames, on every way into a gateway.
 
 use std::io::{ErrorKind, Read, Write};
-use std::net::{TcpStream, UdpSocket};
+use std::net::{Ipv4Addr, SocketAddr, TcpStream, UdpSocket};
+use std::time::Duration;
+
+use rustix::net::{self, AddressFamily, SocketType};
 
 use super::case::{Case, PATIENCE, Scenario};
 use super::environment::{Gateway, Link};
@@ -13,6 +16,7 @@ pub(crate) fn all() -> Vec<Scenario> {
         Scenario::new("garbage_on_can", can),
         Scenario::new("strangers_on_a_listening_tcp_port", tcp),
         Scenario::new("strangers_on_a_listening_udp_port", udp),
+        Scenario::new("listening_ports_take_the_controllers_address_only", other_addresses),
     ]
 }
 
@@ -63,18 +67,26 @@ fn no_frames() -> Vec<u8> {
 
 /// Connects to a listening port.
 #[track_caller]
-fn stranger(gateway: &dyn Gateway) -> TcpStream {
-    let stranger = TcpStream::connect(gateway.listens("up")).unwrap();
+fn stranger(gateway: &dyn Gateway, from: Ipv4Addr) -> TcpStream {
+    let socket = net::socket(AddressFamily::INET, SocketType::STREAM, None).unwrap();
+    net::bind(&socket, &SocketAddr::from((from, 0))).unwrap();
+    net::connect(&socket, &gateway.listens("up")).unwrap();
+    let stranger = TcpStream::from(socket);
     stranger.set_read_timeout(Some(PATIENCE)).unwrap();
     stranger
 }
+
+/// Where the controller is, as far as the gateway knows.
+const HERE: Ipv4Addr = Ipv4Addr::LOCALHOST;
+/// A process of this host may stand for the controller, from its usual address only.
+const ELSEWHERE: Ipv4Addr = Ipv4Addr::new(127, 0, 0, 2);
 
 fn tcp(case: &Case) {
     let link = Link::TcpListen("up");
     let (mut gateway, plan) = listening(case, "tcp-listen");
     // One who was there first: what he says is no frame, and nothing of it reaches the device.
     let mut device = gateway.line("rs485-1");
-    let mut first = stranger(&*gateway);
+    let mut first = stranger(&*gateway, HERE);
     gateway.until_up(link, 1);
     first.write_all(&no_frames()).unwrap();
     // Then he leaves, and the controller is served.
@@ -84,15 +96,41 @@ fn tcp(case: &Case) {
     gateway.until_up(link, 2);
     pose_and_output(&robot, &mut device, &pose_frame(6));
     // One more is turned away, and the controller's connection goes on.
-    let mut second = stranger(&*gateway);
+    let mut second = stranger(&*gateway, HERE);
     let _ = second.write_all(&no_frames());
-    let is_turned_away = match second.read(&mut [0]) {
-        Ok(len) => len == 0,
-        Err(error) => error.kind() == ErrorKind::ConnectionReset,
-    };
-    assert!(is_turned_away, "a second client was served, or left waiting");
+    assert!(is_turned_away(&mut second), "a second client was served, or left waiting");
     pose_and_output(&robot, &mut device, &pose_frame(6));
     assert_eq!(gateway.link(link).connects, 2, "the controller's connection was disturbed");
+}
+
+/// Whoever comes is a stranger, since the controller is said to be far away.
+fn other_addresses(case: &Case) {
+    for bus in ["tcp-listen", "udp-listen"] {
+        let plan = case.gateway("client.toml").set("controller.address", "192.0.2.1");
+        let mut gateway = plan.set("port.up.bus", bus).start();
+        let mut device = gateway.line("rs485-1");
+        // What the controller would say: the device would be sent it within a cycle.
+        if bus == "tcp-listen" {
+            let mut stranger = stranger(&*gateway, ELSEWHERE);
+            let _ = stranger.write_all(&pose_frame(6));
+            assert!(is_turned_away(&mut stranger), "a stranger was served, or left waiting");
+        } else {
+            let stranger = UdpSocket::bind((ELSEWHERE, 0)).unwrap();
+            for _ in 0..10 {
+                stranger.send_to(&pose_frame(6), gateway.listens("up")).unwrap();
+            }
+        }
+        device.is_silent(Duration::from_millis(500));
+        gateway.must_run();
+    }
+}
+
+/// Whether the connection has ended without a word.
+fn is_turned_away(stranger: &mut TcpStream) -> bool {
+    match stranger.read(&mut [0]) {
+        Ok(len) => len == 0,
+        Err(error) => error.kind() == ErrorKind::ConnectionReset,
+    }
 }
 
 fn udp(case: &Case) {

@@ -171,6 +171,10 @@ impl Gateway for HostGateway {
         self.network.as_ref().expect("Plan::with_cable").set(cable);
     }
 
+    fn own_address(&self) -> Option<String> {
+        None
+    }
+
     fn processor_time(&self) -> Duration {
         self.host_sim.program.processor_time()
     }

@@ -121,7 +121,8 @@ struct Board {
 impl Board {
     #[track_caller]
     fn start(elf: &Path, plan: &Plan<'_>, image: &Path) -> Self {
-        let folder = plan.case.folder.path().to_owned();
+        // Each board has sockets of its own: those of one that was ended stay behind.
+        let folder = tempfile::Builder::new().tempdir_in(plan.case.folder.path()).unwrap().keep();
         let log = plan.case.logs.join("board.log");
         let config = plan.config();
         let mut ports = BTreeMap::new();
@@ -164,9 +165,10 @@ impl Board {
         arguments.extend(["-kernel".into(), elf.into()]);
         let program = Program::start(plan.case, "qemu", Path::new("qemu-system-arm"), &arguments);
         let mut board = Self { program, folder, log, ports, listens: BTreeMap::new() };
+        // The last of its sockets. That its file is there does not mean that it listens.
         until("QEMU's sockets", || {
             board.must_run();
-            board.folder.join("qmp").exists().then_some(())
+            UnixStream::connect(board.folder.join("qmp")).ok()
         });
         if !inside.is_empty() {
             let table = board.qmp("human-monitor-command", json!({ "command-line": "info usernet" }));
@@ -297,6 +299,12 @@ impl Gateway for Board {
     #[track_caller]
     fn cable(&self, cable: Cable) {
         self.qmp("set_link", json!({ "name": "lan9118.0", "up": cable == Cable::Plugged }));
+    }
+
+    fn own_address(&self) -> Option<String> {
+        let log = self.log();
+        let (_, said) = log.rsplit_once(" address ")?;
+        said.split_whitespace().next().map(str::to_owned)
     }
 
     fn processor_time(&self) -> Duration {
