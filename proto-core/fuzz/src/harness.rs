@@ -1,6 +1,7 @@
 //! Targets on stable Rust, in `cargo test`: everything that is kept, then a fixed number of inputs
 //! made of it by chance, always the same ones.
 
+use std::ffi::OsString;
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::path::{Path, PathBuf};
 
@@ -22,24 +23,27 @@ pub struct Target {
 }
 
 impl Target {
-    /// Seeds, the files in `corpus` and its folder of the target's name, and inputs by chance.
+    /// Seeds, what `corpus` keeps of the inputs that coverage led to, and inputs by chance.
     ///
-    /// `FUZZ_FILE` names one file to be run instead, `FUZZ_SEEDS` a folder that the seeds are written to
-    /// instead; `FUZZ_RUNS` and `FUZZ_SEED` are numbers.
+    /// `FUZZ_FILE` names one file to be run instead. `FUZZ_SEEDS` names a folder that all that is kept
+    /// is written to, `FUZZ_KEEP` one whose files are kept from now on. `FUZZ_RUNS` and `FUZZ_SEED` are
+    /// numbers.
     ///
     /// # Panics
     /// As the target does. The input is then in a file that the panic names.
     pub fn check(&self, corpus: &Path) {
         if let Some(file) = std::env::var_os("FUZZ_FILE") {
-            // Cargo runs tests in their package's folder; the file is named from the workspace's.
-            let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").join(file);
-            return (self.run)(&std::fs::read(file).expect("FUZZ_FILE can be read"));
+            return (self.run)(&std::fs::read(at_root(file)).expect("FUZZ_FILE can be read"));
+        }
+        let kept = corpus.join(self.name);
+        if let Some(folder) = std::env::var_os("FUZZ_KEEP") {
+            return keep(&at_root(folder), &kept);
         }
         let mut known = (self.seeds)();
+        known.extend(unpack(&kept));
         if let Some(folder) = std::env::var_os("FUZZ_SEEDS") {
-            return keep(&known, Path::new(&folder));
+            return write_out(&known, &at_root(folder));
         }
-        known.extend(files(&corpus.join(self.name)));
         assert!(!known.is_empty(), "{} has nothing to begin with", self.name);
         for input in &known {
             self.run_one(input);
@@ -104,16 +108,41 @@ fn number(name: &str) -> Option<u64> {
     Some(text.parse().unwrap_or_else(|_| panic!("{name}={text} is no number")))
 }
 
-fn keep(seeds: &[Vec<u8>], folder: &Path) {
-    for (nth, seed) in seeds.iter().enumerate() {
-        std::fs::write(folder.join(format!("seed-{nth:02}")), seed).expect("the folder can be written to");
+/// Cargo runs tests in their package's folder; people name files from the workspace's.
+fn at_root(name: OsString) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").join(name)
+}
+
+fn write_out(inputs: &[Vec<u8>], folder: &Path) {
+    for (nth, input) in inputs.iter().enumerate() {
+        std::fs::write(folder.join(format!("kept-{nth:04}")), input).expect("the folder can be written to");
     }
 }
 
-fn files(folder: &Path) -> Vec<Vec<u8>> {
-    let Ok(entries) = std::fs::read_dir(folder) else { return Vec::new() };
-    let mut paths: Vec<PathBuf> =
-        entries.map(|entry| entry.expect("a corpus can be listed").path()).collect();
-    paths.sort();
-    paths.iter().map(|path| std::fs::read(path).expect("a corpus can be read")).collect()
+/// Puts the files of a folder into one: each as its length, two bytes, and its bytes.
+fn keep(folder: &Path, kept: &Path) {
+    let entries = std::fs::read_dir(folder).expect("FUZZ_KEEP can be listed");
+    let read = |entry: std::io::Result<std::fs::DirEntry>| {
+        std::fs::read(entry.expect("FUZZ_KEEP can be listed").path()).expect("its files can be read")
+    };
+    let mut inputs: Vec<Vec<u8>> = entries.map(read).collect();
+    inputs.sort();
+    let pack = |input: &Vec<u8>| {
+        let len = u16::try_from(input.len()).expect("no input is that long");
+        [&len.to_le_bytes()[..], input].concat()
+    };
+    std::fs::write(kept, inputs.iter().flat_map(pack).collect::<Vec<u8>>())
+        .expect("the corpus can be written to");
+}
+
+fn unpack(kept: &Path) -> Vec<Vec<u8>> {
+    let packed = std::fs::read(kept).unwrap_or_default();
+    let mut inputs = Vec::new();
+    let mut rest = &packed[..];
+    while let Some((len, behind)) = rest.split_first_chunk() {
+        let (input, next) = behind.split_at(usize::from(u16::from_le_bytes(*len)));
+        inputs.push(input.to_vec());
+        rest = next;
+    }
+    inputs
 }

@@ -37,36 +37,36 @@ use harness::Target;
 
 /// All targets.
 pub const TARGETS: &[Target] = &[
-    Target { name: "deframer", run: deframer::run, seeds: deframer::seeds, runs: 2_000, longest: 2_000 },
-    Target { name: "can", run: can::run, seeds: can::seeds, runs: 4_000, longest: 600 },
-    Target { name: "state", run: state::run, seeds: state::seeds, runs: 400, longest: 6_000 },
-    Target { name: "slcan", run: slcan::run, seeds: slcan::seeds, runs: 4_000, longest: 1_000 },
+    Target { name: "deframer", run: deframer::run, seeds: deframer::seeds, runs: 6_000, longest: 2_000 },
+    Target { name: "can", run: can::run, seeds: can::seeds, runs: 10_000, longest: 600 },
+    Target { name: "state", run: state::run, seeds: state::seeds, runs: 1_000, longest: 6_000 },
+    Target { name: "slcan", run: slcan::run, seeds: slcan::seeds, runs: 10_000, longest: 1_000 },
     Target {
         name: "modbus_server",
         run: modbus::run_server,
         seeds: modbus::server_seeds,
-        runs: 4_000,
+        runs: 8_000,
         longest: 2_000,
     },
     Target {
         name: "modbus_client",
         run: modbus::run_client,
         seeds: modbus::client_seeds,
-        runs: 4_000,
+        runs: 8_000,
         longest: 1_000,
     },
     Target {
         name: "command_server",
         run: command::run_server,
         seeds: command::server_seeds,
-        runs: 4_000,
+        runs: 8_000,
         longest: 1_000,
     },
     Target {
         name: "command_client",
         run: command::run_client,
         seeds: command::client_seeds,
-        runs: 4_000,
+        runs: 3_000,
         longest: 1_000,
     },
     Target { name: "engine", run: engine::run, seeds: engine::seeds, runs: 300, longest: 600 },
@@ -74,10 +74,10 @@ pub const TARGETS: &[Target] = &[
         name: "any_engine",
         run: any_engine::run,
         seeds: any_engine::seeds,
-        runs: 2_000,
+        runs: 4_000,
         longest: 1_000,
     },
-    Target { name: "image", run: image::run, seeds: image::seeds, runs: 1_500, longest: 3_000 },
+    Target { name: "image", run: image::run, seeds: image::seeds, runs: 3_000, longest: 3_000 },
 ];
 
 /// The target of this name.
