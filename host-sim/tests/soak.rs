@@ -47,7 +47,7 @@ fn soaked(level: Level, seed: u64, span: Duration, jobs: usize) -> Total {
 /// What these seeds mean, on every machine. A change of what the engine, the controller or the cell
 /// does, or when, changes them: then the new ones belong here. Nothing else may.
 const HASHES: [(Level, u64); 2] =
-    [(Level::None, 0x28D5_CEF9_A9B2_21E8), (Level::Harsh, 0xBA7A_8D49_BB04_56D9)];
+    [(Level::None, 0xEE56_BB30_2D80_5ABC), (Level::Harsh, 0x55AC_156B_5427_BA34)];
 
 #[test]
 fn a_seed_means_the_same_trace_on_every_machine() {

@@ -174,57 +174,79 @@ impl Cell {
         if let Some(recorder) = &mut self.recorder {
             recorder.input(now, input);
         }
-        self.engine.handle(now, input);
+        #[cfg(test)]
+        let forged = self.forged_input(&input);
+        #[cfg(test)]
+        let given = super::tamper::instead(&input, forged.as_deref());
+        #[cfg(not(test))]
+        let given = input;
+        self.engine.handle(now, given);
         if let Some(oracle) = &mut self.oracle {
             oracle.input(now, &input, &self.engine);
         }
         let mut buf = [0; OUTPUT_BUFFER];
         loop {
             let output = self.engine.poll_output(now, &mut buf);
-            if let Some(recorder) = &mut self.recorder {
-                recorder.output(output);
-            }
-            if let Some(oracle) = &mut self.oracle {
-                match output {
-                    Output::Sleep { .. } => {
-                        oracle.rest(now, &self.engine, self.queue.len() + self.conns.len());
-                    }
-                    _ => oracle.output(now, &output),
+            #[cfg(test)]
+            if let Some(forged) = self.forged_outputs(&input, &output) {
+                for forged in &forged {
+                    self.hand_over(forged.as_output());
+                }
+                if !matches!(output, Output::Sleep { .. }) {
+                    continue;
                 }
             }
-            match output {
-                Output::Sleep { until } => {
-                    self.engine_wake = until;
-                    return;
-                }
-                Output::PortSend { port, bytes } => {
-                    self.trace.add(now, What::PortSent, port.0.into(), bytes);
-                    if let Some(line) = self.line_at(Owner::Gateway(port)) {
-                        let bytes = bytes.to_vec();
-                        self.transmit(line, End::Port, &bytes);
-                    }
-                }
-                Output::PortSendCan { port, frame } => {
-                    self.trace.add(now, What::PortSent, port.0.into(), &can_bytes(&frame));
-                    if let Some(bus) = self.bus_at(Owner::Gateway(port)) {
-                        self.transmit_can(bus, End::Port, frame);
-                    }
-                }
-                Output::LinkOpen { link } => {
-                    self.trace.add(now, What::LinkOpen, link.0.into(), &[]);
-                    self.open(link);
-                }
-                Output::LinkClose { link } => {
-                    self.trace.add(now, What::LinkClose, link.0.into(), &[]);
-                    self.close(link);
-                }
-                Output::LinkSend { link, bytes } => {
-                    self.trace.add(now, What::LinkSent, link.0.into(), bytes);
-                    let bytes = bytes.to_vec();
-                    self.send_up(link, bytes);
-                }
+            if !self.hand_over(output) {
+                return;
             }
         }
+    }
+
+    /// Carries out what the engine wants; false when that is nothing more.
+    fn hand_over(&mut self, output: Output<'_>) -> bool {
+        let now = self.now;
+        if let Some(recorder) = &mut self.recorder {
+            recorder.output(output);
+        }
+        if let Some(oracle) = &mut self.oracle {
+            match output {
+                Output::Sleep { .. } => {
+                    oracle.rest(now, &self.engine, self.queue.len() + self.conns.len());
+                }
+                _ => oracle.output(now, &output),
+            }
+        }
+        match output {
+            Output::Sleep { until } => {
+                self.engine_wake = until;
+                return false;
+            }
+            Output::PortSend { port, bytes } => {
+                self.trace.add(now, What::PortSent, port.0.into(), bytes);
+                if let Some(line) = self.line_at(Owner::Gateway(port)) {
+                    self.transmit(line, End::Port, bytes);
+                }
+            }
+            Output::PortSendCan { port, frame } => {
+                self.trace.add(now, What::PortSent, port.0.into(), &can_bytes(&frame));
+                if let Some(bus) = self.bus_at(Owner::Gateway(port)) {
+                    self.transmit_can(bus, End::Port, frame);
+                }
+            }
+            Output::LinkOpen { link } => {
+                self.trace.add(now, What::LinkOpen, link.0.into(), &[]);
+                self.open(link);
+            }
+            Output::LinkClose { link } => {
+                self.trace.add(now, What::LinkClose, link.0.into(), &[]);
+                self.close(link);
+            }
+            Output::LinkSend { link, bytes } => {
+                self.trace.add(now, What::LinkSent, link.0.into(), bytes);
+                self.send_up(link, bytes.to_vec());
+            }
+        }
+        true
     }
 
     pub(super) fn controller_input(&mut self, input: ControllerInput<'_>) {
@@ -373,9 +395,9 @@ impl Cell {
     }
 
     pub(super) fn transmit(&mut self, line: LineId, from: End, bytes: &[u8]) {
-        for (at, chunk) in self.lines[line.0].send(self.now, from, bytes) {
-            self.queue.push(at, Due::Chunk { line, chunk });
-        }
+        let queue = &mut self.queue;
+        let each = |at, chunk| queue.push(at, Due::Chunk { line, chunk });
+        self.lines[line.0].send(self.now, from, bytes, each);
     }
 
     fn chunk_arrives(&mut self, id: LineId, mut chunk: Chunk) {

@@ -126,8 +126,15 @@ impl Line {
         self.heard.drain(..).collect()
     }
 
-    /// Puts a transmission on the line; when each of its pieces has come, in order.
-    pub(super) fn send(&mut self, now: Instant, from: End, bytes: &[u8]) -> Vec<(Instant, Chunk)> {
+    /// Puts a transmission on the line; `each` is told when each of its pieces will have come, in
+    /// order.
+    pub(super) fn send(
+        &mut self,
+        now: Instant,
+        from: End,
+        bytes: &[u8],
+        mut each: impl FnMut(Instant, Chunk),
+    ) {
         let other = self.busy_until[1 - from as usize];
         let start = now.max(self.busy_until[from as usize]);
         let end = start + self.settings.time_on_line(bytes.len());
@@ -148,7 +155,6 @@ impl Line {
                 self.collision = (start, end.min(other));
             }
         }
-        let mut chunks = Vec::new();
         let (mut at, mut began) = (0, start);
         while at < bytes.len() {
             let left = bytes.len() - at;
@@ -162,10 +168,9 @@ impl Line {
             let is_first = at == 0;
             at += len;
             let is_last = at == bytes.len();
-            chunks.push((arrival, Chunk { from, began, bytes: bytes_of, is_first, is_last }));
+            each(arrival, Chunk { from, began, bytes: bytes_of, is_first, is_last });
             began = arrival;
         }
-        chunks
     }
 
     /// Changes a piece to what arrives of it; false when the line is cut.

@@ -35,6 +35,8 @@ mod oracle;
 mod queue;
 mod recording;
 mod rng;
+#[cfg(test)]
+mod tamper;
 mod trace;
 mod traffic;
 mod trouble;
@@ -141,6 +143,9 @@ pub struct Cell {
     recorder: Option<Recorder>,
     /// Checks everything, when it was asked to.
     oracle: Option<Box<Oracle>>,
+    /// Makes a bad gateway of a good one.
+    #[cfg(test)]
+    tamper: Option<tamper::Tamper>,
     /// What the controller has sent to [`Cell::ask`]'s own connection.
     asked: Vec<u8>,
 }
@@ -198,6 +203,8 @@ impl Cell {
             trace: Trace::new(),
             recorder,
             oracle: None,
+            #[cfg(test)]
+            tamper: None,
             asked: Vec::new(),
         };
         cell.wire_gateway();
@@ -238,8 +245,7 @@ impl Cell {
 
     /// What was sent and what was received on a link, in calls.
     pub fn watched_link(&self, link: LinkId) -> (u64, u64) {
-        let traffic = self.oracle.as_ref().and_then(|oracle| oracle.traffic.get(&link));
-        traffic.copied().unwrap_or_default()
+        self.oracle.as_ref().map(|oracle| oracle.traffic[oracle::place(link)]).unwrap_or_default()
     }
 
     fn wire_gateway(&mut self) {

@@ -1,23 +1,31 @@
 //! What is due when, in the order of time and, at one instant, of arrival.
 
-use std::collections::BTreeMap;
+use std::cmp::Ordering;
+use std::collections::BinaryHeap;
 
 use proto_core::time::Instant;
 
 /// Things to be done later.
 #[derive(Debug)]
 pub(super) struct Queue<T> {
-    entries: BTreeMap<(Instant, u64), T>,
+    entries: BinaryHeap<Entry<T>>,
     pushed: u64,
+}
+
+#[derive(Debug)]
+struct Entry<T> {
+    at: Instant,
+    nth: u64,
+    thing: T,
 }
 
 impl<T> Queue<T> {
     pub(super) const fn new() -> Self {
-        Self { entries: BTreeMap::new(), pushed: 0 }
+        Self { entries: BinaryHeap::new(), pushed: 0 }
     }
 
-    pub(super) fn push(&mut self, at: Instant, entry: T) {
-        self.entries.insert((at, self.pushed), entry);
+    pub(super) fn push(&mut self, at: Instant, thing: T) {
+        self.entries.push(Entry { at, nth: self.pushed, thing });
         self.pushed += 1;
     }
 
@@ -26,11 +34,34 @@ impl<T> Queue<T> {
     }
 
     pub(super) fn next(&self) -> Instant {
-        self.entries.first_key_value().map_or(Instant::NEVER, |(key, _)| key.0)
+        self.entries.peek().map_or(Instant::NEVER, |entry| entry.at)
     }
 
     pub(super) fn pop_due(&mut self, now: Instant) -> Option<T> {
-        let first = self.entries.first_entry()?;
-        (first.key().0 <= now).then(|| first.remove())
+        if self.next() > now {
+            return None;
+        }
+        self.entries.pop().map(|entry| entry.thing)
     }
 }
+
+/// The earliest is the greatest: that is the one a heap gives back first.
+impl<T> Ord for Entry<T> {
+    fn cmp(&self, other: &Self) -> Ordering {
+        (other.at, other.nth).cmp(&(self.at, self.nth))
+    }
+}
+
+impl<T> PartialOrd for Entry<T> {
+    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
+        Some(self.cmp(other))
+    }
+}
+
+impl<T> PartialEq for Entry<T> {
+    fn eq(&self, other: &Self) -> bool {
+        self.nth == other.nth
+    }
+}
+
+impl<T> Eq for Entry<T> {}

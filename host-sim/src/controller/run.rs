@@ -56,8 +56,10 @@ impl Controller {
             self.apply(now, effect);
         }
         self.refresh(now);
-        self.drive_program(now);
-        self.refresh(now);
+        if self.running.is_some() {
+            self.drive_program(now);
+            self.refresh(now);
+        }
         self.poll_ports(now);
         self.poll_state_stream(now);
         self.poll_server(now);
@@ -179,8 +181,9 @@ impl Controller {
         let stale = match self.arm_shown {
             None => true,
             Some(shown) => {
-                let at_rest = self.arm.rest().is_some_and(|rest| rest <= shown);
-                let just_stopped = self.arm.rest().is_some_and(|rest| rest <= now);
+                let rest = self.arm.rest();
+                let at_rest = rest.is_some_and(|rest| rest <= shown);
+                let just_stopped = rest.is_some_and(|rest| rest <= now);
                 !at_rest && (just_stopped || now >= shown + SERVO_CYCLE)
             }
         };

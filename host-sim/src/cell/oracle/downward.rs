@@ -22,6 +22,7 @@ pub(super) struct Downward {
     next_can: usize,
     /// The newest point of the grid that was seen.
     slot: Option<u64>,
+    next_slot_at: Instant,
     /// The newest cycle's bytes, for a port that sends changes.
     newest: Option<Vec<u8>>,
     /// The bytes of the cycle that has begun.
@@ -58,7 +59,11 @@ impl Downward {
         if port.outputs.is_empty() || !matches!(port.send, SendOn::Period | SendOn::Change) {
             return;
         }
+        if now < self.next_slot_at {
+            return;
+        }
         let slot = now.as_micros() / port.cycle.as_micros();
+        self.next_slot_at = Instant::from_micros((slot + 1) * port.cycle.as_micros());
         let Some(before) = self.slot.replace(slot) else { return };
         if slot == before || !self.is_usable() {
             return;

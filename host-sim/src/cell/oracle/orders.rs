@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, VecDeque};
 
-use proto_core::config::CommandWhen;
+use proto_core::config::{CommandWhen, MAX_PORTS};
 use proto_core::time::{Duration, Instant};
 
 use super::Invariant;
@@ -22,7 +22,7 @@ pub(super) struct Orders {
     /// The value of the frame before, by port, frame and field.
     base: BTreeMap<(usize, usize, usize), i64>,
     /// Picked and dropped, by port.
-    pub counted: BTreeMap<usize, (u32, u32)>,
+    pub counted: [(u32, u32); MAX_PORTS],
     /// Text of the newest command sent, with when it was picked.
     newest: Option<(String, Instant)>,
 }
@@ -46,7 +46,7 @@ impl Orders {
             if !acts {
                 continue;
             }
-            let counted = self.counted.entry(nth).or_default();
+            let counted = &mut self.counted[nth];
             counted.0 += 1;
             if is_up && self.queue.len() < QUEUE {
                 self.queue.push_back((nth, plain(text.as_bytes()), now));
@@ -77,7 +77,7 @@ impl Orders {
 
     fn drop_first(&mut self) {
         if let Some((port, ..)) = self.queue.pop_front() {
-            self.counted.entry(port).or_default().1 += 1;
+            self.counted[port].1 += 1;
         }
     }
 

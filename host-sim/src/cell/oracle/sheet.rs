@@ -79,6 +79,10 @@ pub(super) struct Sheet {
     pub owned: [Option<Owned>; COUNT],
     pub origin: [Option<Origin>; COUNT],
     pub read_back: [bool; COUNT],
+    /// Variables that the state stream may bring.
+    pub in_packet: Vec<SysVar>,
+    /// Some port sends for a rising bit.
+    pub has_triggers: bool,
     /// The texts and values of all command tables.
     pub commands: Vec<(i64, String)>,
 }
@@ -145,7 +149,11 @@ impl Sheet {
             }
         }
         let commands = config.commands.iter().map(|c| (c.value, c.text.as_str().to_owned())).collect();
-        Self { ports, links, owned, origin, read_back, commands }
+        let may_bring =
+            |var: &SysVar| origin[var.ordinal()] == Some(Origin::State) || read_back[var.ordinal()];
+        let in_packet = SysVar::all().filter(may_bring).collect();
+        let has_triggers = ports.iter().any(|port| matches!(port.send, SendOn::Rising { .. }));
+        Self { ports, links, owned, origin, read_back, in_packet, has_triggers, commands }
     }
 
     pub(super) fn link(&self, id: LinkId) -> Option<&LinkSheet> {

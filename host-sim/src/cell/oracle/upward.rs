@@ -57,6 +57,8 @@ pub(super) struct Upward {
     pub state_at: Option<Instant>,
     /// No frame is overdue and no value too old before this.
     next: Instant,
+    /// Variables that may have something waiting, by ordinal: inputs come first.
+    pub waits: u128,
 }
 
 impl Upward {
@@ -68,6 +70,7 @@ impl Upward {
             up: [None; 16],
             state_at: None,
             next: Instant::NEVER,
+            waits: 0,
         }
     }
 
@@ -125,6 +128,7 @@ impl Upward {
 
     fn fell_silent(&mut self, sheet: &Sheet, var: SysVar, now: Instant) {
         let Some(Owned { port, safe, .. }) = sheet.owned[var.ordinal()] else { return };
+        self.waits |= 1 << var.ordinal();
         let known = self.known_mut(var);
         if let Some(safe) = safe {
             known.waiting.clear();
@@ -148,6 +152,7 @@ impl Upward {
         let mut undelivered = false;
         for &(var, raw) in &frame.values {
             let Some(Owned { way, .. }) = sheet.owned[var.ordinal()] else { continue };
+            self.waits |= 1 << var.ordinal();
             let is_up = self.is_up(way);
             let queued: usize = if var.is_bits() { self.queued(sheet, nth) } else { 0 };
             let known = self.known_mut(var);
@@ -213,14 +218,18 @@ impl Upward {
     /// A packet of the state stream was taken.
     pub(super) fn state_packet(&mut self, sheet: &Sheet, packet: &[u8], now: Instant) {
         self.state_at = Some(now);
-        for var in SysVar::all() {
+        for &var in &sheet.in_packet {
             let nth = var.ordinal();
             let is_shown = sheet.origin[nth] == Some(Origin::State);
             let is_read_back = sheet.read_back[nth] && !self.known[nth].live;
-            if let (true, Some(raw)) = (is_shown || is_read_back, in_packet(var, packet)) {
-                self.known[nth].value = Some((raw, now));
-                self.known[nth].read_back |= is_read_back;
-            } else if is_shown && let Some(value) = &mut self.known[nth].value {
+            if !is_shown && !is_read_back {
+                continue;
+            }
+            let known = &mut self.known[nth];
+            if let Some(raw) = in_packet(var, packet) {
+                known.value = Some((raw, now));
+                known.read_back |= is_read_back;
+            } else if let Some(value) = &mut known.value {
                 // Not finite: the value before stays, and is as old as the packet.
                 value.1 = now;
             }

@@ -271,11 +271,10 @@ impl Controller {
 
 /// The controller's input variables, as its image has them.
 pub(in crate::cell) fn inputs_of(image: &[u8]) -> Vec<u8> {
-    let end = SysVar::all()
-        .filter(|var| var.direction() == Direction::Input)
-        .map(|var| var.image_offset() + var.size())
-        .max();
-    image[..end.unwrap_or(0)].to_vec()
+    image[..INPUT_BYTES].to_vec()
 }
+
+/// Inputs come first in the image (docs/wire/sysvars.md section 1).
+const INPUT_BYTES: usize = 253;
 
 const _: () = assert!(COUNT < 512);

@@ -1,0 +1,395 @@
+//! The gateway's side: what each input must lead to, and whether it did.
+
+use proto_core::engine::{Engine, LinkId, PortCounters, PortId};
+use proto_core::link::LinkState;
+use proto_core::recipe::CanFrame;
+use proto_core::sysvar::SysVar;
+use proto_core::time::{Duration, Instant};
+
+use super::field::{self, Accepted, Line, Refused, Verdict};
+use super::sheet::{Origin, Owned, Raw, shown, written};
+use super::upward::Wrong;
+use super::wire::Asked;
+use super::{Invariant, LinkWatch, Oracle, PortWatch, place};
+
+impl Oracle {
+    /// What time does before anything else.
+    pub(super) fn tick(&mut self, now: Instant) {
+        let overdue = self.up.tick(&self.sheet, now);
+        for &(nth, frame) in &overdue {
+            self.orders.forget(nth, Some(frame));
+        }
+        if !overdue.is_empty() {
+            self.values_changed();
+        }
+        for (watch, port) in self.ports.iter_mut().zip(&self.sheet.ports) {
+            watch.line.tick(port, now);
+            watch.down.tick(port, now);
+        }
+        if now >= self.again_at {
+            self.write_refused_again();
+        }
+        let given_up = self.modbus.tick(now);
+        self.write_again(given_up, now);
+        self.orders.tick(now);
+    }
+
+    /// Links that the engine has given up by itself; those in `told` are its input's business.
+    pub(super) fn look_at_links(&mut self, engine: &Engine, told: Option<LinkId>) {
+        for link in engine.links() {
+            let is_lost = !matches!(link.state, LinkState::Up { .. });
+            if is_lost && Some(link.id) != told && self.up.is_up(link.id) {
+                self.link_lost(link.id);
+            }
+        }
+    }
+
+    pub(super) fn link_lost(&mut self, link: LinkId) {
+        if !self.up.is_up(link) {
+            return;
+        }
+        match link {
+            LinkId::MODBUS => {
+                let given_up = self.modbus.lost();
+                self.write_again(given_up, Instant::ZERO);
+                self.write_refused_again();
+            }
+            LinkId::COMMAND => self.orders.lost(),
+            _ => {}
+        }
+        self.links[place(link)] = LinkWatch::default();
+        self.up.link_lost(&self.sheet, link);
+    }
+
+    /// Safe values whose write came to nothing wait again, if they still stand.
+    pub(super) fn write_again(&mut self, vars: Vec<SysVar>, now: Instant) {
+        for var in vars {
+            let safe = self.sheet.owned[var.ordinal()].and_then(|owned| owned.safe);
+            let known = &mut self.up.known[var.ordinal()];
+            if let (true, true, Some(safe)) = (known.safe, known.waiting.is_empty(), safe) {
+                known.waiting.push_back((safe, now));
+                self.up.waits |= 1 << var.ordinal();
+            }
+        }
+    }
+
+    pub(super) fn write_refused_again(&mut self) {
+        let refused = std::mem::take(&mut self.refused);
+        self.write_again(refused, Instant::ZERO);
+        self.again_at = Instant::NEVER;
+    }
+
+    /// A value that a port shows may have changed: bits may have risen.
+    pub(super) fn values_changed(&mut self) {
+        if !self.sheet.has_triggers {
+            return;
+        }
+        for (watch, port) in self.ports.iter_mut().zip(&self.sheet.ports) {
+            watch.down.watch(port, &self.up);
+        }
+    }
+
+    pub(super) fn port_bytes(&mut self, nth: usize, bytes: &[u8], now: Instant) {
+        let port = &self.sheet.ports[nth];
+        let watch = &mut self.ports[nth];
+        watch.counters.bytes_in = watch.counters.bytes_in.wrapping_add(bytes.len() as u32);
+        watch.down.heard = now;
+        if port.inputs.is_empty() {
+            watch.counters.rejected_no_input += 1;
+            return;
+        }
+        let verdicts = watch.line.bytes(port, bytes, now);
+        self.take(nth, verdicts, now);
+    }
+
+    pub(super) fn port_can(&mut self, nth: usize, frame: &CanFrame, now: Instant) {
+        let port = &self.sheet.ports[nth];
+        let counters = &mut self.ports[nth].counters;
+        counters.bytes_in = counters.bytes_in.wrapping_add(frame.data().len() as u32);
+        if port.inputs.is_empty() {
+            counters.rejected_no_input += 1;
+            return;
+        }
+        match field::can(port, frame) {
+            Ok(verdict) => self.take(nth, vec![verdict], now),
+            Err(Refused::Remote) => counters.rejected_remote += 1,
+            Err(Refused::Id) => counters.rejected_id += 1,
+            Err(Refused::Length) => counters.rejected_length += 1,
+        }
+    }
+
+    /// Frames that came in one piece.
+    pub(super) fn take(&mut self, nth: usize, verdicts: Vec<Verdict>, now: Instant) {
+        let mut frames = 0;
+        let mut newest: Option<Accepted> = None;
+        for verdict in verdicts {
+            let counters = &mut self.ports[nth].counters;
+            let frame = match verdict {
+                Verdict::NotFinite => {
+                    counters.rejected_not_finite += 1;
+                    continue;
+                }
+                Verdict::OutOfRange => {
+                    counters.rejected_out_of_range += 1;
+                    continue;
+                }
+                Verdict::Accepted(frame) => frame,
+            };
+            counters.frames_in += 1;
+            counters.masked += u32::from(frame.masked);
+            self.frames[nth].0 += 1;
+            frames += 1;
+            let commands_up = self.up.is_up(LinkId::COMMAND);
+            self.orders.accepted(&self.sheet, nth, &frame, commands_up, now);
+            self.up.accepted(&self.sheet, nth, &frame, now);
+            self.values_changed();
+            newest = Some(frame);
+        }
+        // Nothing is overdue right after a frame, but something may have waited too long.
+        self.up.tick(&self.sheet, now);
+        let Some(newest) = newest else { return };
+        self.ports[nth].down.answered(&self.sheet.ports[nth], frames);
+        let waits = self.sheet.links.iter().any(|link| {
+            let wants = newest.values.iter().any(|(var, _)| {
+                let way = self.sheet.owned[var.ordinal()].map(|owned| owned.way);
+                way == Some(link.id) && !self.up.known(*var).waiting.is_empty()
+            });
+            wants && self.up.is_up(link.id) && !self.up.is_ready(link, now)
+        });
+        if waits {
+            self.ports[nth].counters.withheld += frames;
+        }
+    }
+
+    pub(super) fn port_send(
+        &mut self,
+        port: PortId,
+        id: Option<proto_core::recipe::model::CanId>,
+        bytes: &[u8],
+        now: Instant,
+    ) {
+        let nth = usize::from(port.0);
+        self.frames[nth].1 += 1;
+        let result = self.ports[nth].down.check(&self.sheet, nth, &self.up, id, bytes, now);
+        self.judge(now, &[Invariant::Known, Invariant::Age, Invariant::Shown, Invariant::Line], result);
+    }
+
+    pub(super) fn link_bytes(&mut self, link: LinkId, bytes: &[u8], now: Instant) {
+        self.traffic[place(link)].1 += 1;
+        match link {
+            LinkId::MODBUS => {
+                let (read, refused) = self.modbus.received(&self.map, bytes);
+                for (var, raw) in read {
+                    if self.sheet.origin[var.ordinal()] == Some(Origin::Modbus) {
+                        self.up.known[var.ordinal()].value = Some((raw, now));
+                    }
+                }
+                if !refused.is_empty() {
+                    self.refused.extend(refused);
+                    self.again_at = self.again_at.min(now + REFUSED_PAUSE);
+                }
+                self.values_changed();
+            }
+            LinkId::STATE => {
+                self.links[place(link)].line.held.extend_from_slice(bytes);
+                while let Some(packet) = first_packet(&mut self.links[place(link)].line) {
+                    if is_packet(&packet) {
+                        self.up.state_packet(&self.sheet, &packet, now);
+                        self.values_changed();
+                    }
+                }
+            }
+            LinkId::COMMAND => {}
+            _ => self.recipe_bytes(link, bytes, now),
+        }
+    }
+
+    pub(super) fn recipe_bytes(&mut self, link: LinkId, bytes: &[u8], now: Instant) {
+        let Some(sheet) = self.sheet.link(link) else { return };
+        let Some(frame) = sheet.output.clone() else { return };
+        let found = if sheet.is_datagram {
+            frame.payload_of(bytes).map(<[u8]>::to_vec).into_iter().collect()
+        } else {
+            let line = &mut self.links[place(link)].line;
+            line.held.extend_from_slice(bytes);
+            line.cut(&frame)
+        };
+        for payload in found {
+            let mut values: Vec<(SysVar, Raw)> = Vec::new();
+            let mut rest = payload.as_slice();
+            for var in frame.fields.iter().filter_map(shown) {
+                let (bytes, after) = rest.split_at(var.size());
+                rest = after;
+                let mut raw = Raw::default();
+                raw[..bytes.len()].copy_from_slice(bytes);
+                if var.is_bits() {
+                    raw[0] &= var.valid_bits();
+                }
+                values.push((var, raw));
+            }
+            if values.iter().all(|(var, raw)| field::as_number(*var, *raw).is_finite()) {
+                for (var, raw) in values {
+                    self.up.known[var.ordinal()].value = Some((raw, now));
+                }
+                self.values_changed();
+            }
+        }
+    }
+
+    pub(super) fn link_send(&mut self, link: LinkId, bytes: &[u8], now: Instant) -> Result<(), Wrong> {
+        if !self.up.is_up(link) {
+            return Err((Invariant::Line, "sent on a link that is not up".to_owned()));
+        }
+        match link {
+            LinkId::COMMAND => {
+                self.checks[Invariant::Once as usize] += 1;
+                self.orders.sent(bytes, now)
+            }
+            LinkId::STATE => Err((Invariant::Ownership, "sent on the state link".to_owned())),
+            LinkId::MODBUS => {
+                let asked = self.modbus.sent(&self.map, bytes, now)?;
+                let Asked::Write(values) = asked else { return Ok(()) };
+                let mut safe = Vec::new();
+                for (var, raw) in values {
+                    if self.up.known(var).safe {
+                        safe.push(var);
+                    }
+                    self.wrote(link, var, raw, now)?;
+                }
+                self.modbus.carries_safe(safe);
+                Ok(())
+            }
+            _ => self.recipe_send(link, bytes, now),
+        }
+    }
+
+    pub(super) fn wrote(&mut self, link: LinkId, var: SysVar, raw: Raw, now: Instant) -> Result<(), Wrong> {
+        self.writes += 1;
+        let looked_at = [
+            Invariant::Sent,
+            Invariant::InTime,
+            Invariant::FirstFrame,
+            Invariant::Ownership,
+            Invariant::NoReplay,
+        ];
+        for invariant in looked_at {
+            self.checks[invariant as usize] += 1;
+        }
+        self.checks[Invariant::Edges as usize] += u64::from(var.is_bits());
+        self.up.wrote(&self.sheet, link, var, raw, now)
+    }
+
+    pub(super) fn recipe_send(&mut self, link: LinkId, bytes: &[u8], now: Instant) -> Result<(), Wrong> {
+        if std::mem::replace(&mut self.links[place(link)].busy, true) {
+            return Err((Invariant::Line, "sent before the transport had taken the frame before".to_owned()));
+        }
+        let sheet = self.sheet.link(link).cloned();
+        let frame = sheet.as_ref().and_then(|sheet| sheet.input.as_ref());
+        let Some((frame, payload)) = frame.and_then(|frame| Some((frame, frame.payload_of(bytes)?))) else {
+            // The greeting of the UDP server.
+            let is_greeting = link == LinkId::RECIPE_UDP && bytes.len() <= 2 && bytes.iter().all(|&b| b == 0);
+            let wrong = (Invariant::Sent, "sent what is neither a frame nor a greeting".to_owned());
+            return if is_greeting { Ok(()) } else { Err(wrong) };
+        };
+        let mut rest = payload;
+        let mut wanted = false;
+        for var in frame.fields.iter().filter_map(written) {
+            let (bytes, after) = rest.split_at(var.size());
+            rest = after;
+            let mut raw = Raw::default();
+            raw[..bytes.len()].copy_from_slice(bytes);
+            let is_ours = self.sheet.owned[var.ordinal()].is_some_and(|owned| owned.way == link);
+            if is_ours && !self.up.known(var).waiting.is_empty() {
+                wanted = true;
+                self.wrote(link, var, raw, now)?;
+            } else {
+                self.writes += 1;
+                self.checks[Invariant::Sent as usize] += 1;
+                self.checks[Invariant::InTime as usize] += 1;
+                self.up.carried(&self.sheet, var, raw, now)?;
+            }
+        }
+        if wanted {
+            Ok(())
+        } else {
+            Err((Invariant::Sent, "a frame that nobody's value waited for".to_owned()))
+        }
+    }
+
+    /// What could go to the controller now and does not.
+    pub(super) fn nothing_waits(&mut self, now: Instant) -> Result<(), Wrong> {
+        let mut left = self.up.waits;
+        while left != 0 {
+            let nth = left.trailing_zeros() as usize;
+            left &= left - 1;
+            let Some(Owned { way, .. }) = self.sheet.owned[nth] else { continue };
+            if self.up.known[nth].waiting.is_empty() {
+                self.up.waits &= !(1 << nth);
+                continue;
+            }
+            if !self.up.is_up(way) {
+                continue;
+            }
+            let is_free = match self.sheet.link(way) {
+                None => self.modbus.is_free(),
+                Some(link) => !self.links[place(way)].busy && self.up.is_ready(link, now),
+            };
+            if is_free {
+                let var = SysVar::from_ordinal(nth).map_or_else(String::new, |var| var.to_string());
+                return Err((Invariant::Delivered, format!("{var} waits, and its link is free")));
+            }
+        }
+        Ok(())
+    }
+
+    /// Whether the engine's counters are the model's.
+    pub(super) fn count(&mut self, nth: usize, engine: &Engine) -> Result<(), Wrong> {
+        let Some(actual) = engine.port_counters(PortId(nth as u8)) else { return Ok(()) };
+        let PortWatch { line, down, counters } = &self.ports[nth];
+        let up = self.up.counted[nth];
+        let orders = self.orders.counted[nth];
+        let expected = PortCounters {
+            tail_mismatches: line.mismatches as u32,
+            resync_bytes: line.dropped as u32,
+            discarded_bytes: line.discarded as u32,
+            frames_out: down.frames_out,
+            bytes_out: down.bytes_out,
+            skipped_cycles: down.skipped,
+            stale_cycles: down.stale,
+            edges_lost: up.edges_lost,
+            values_expired: up.values_expired,
+            undelivered: up.undelivered,
+            timeouts: up.timeouts,
+            commands: orders.0,
+            commands_dropped: orders.1,
+            ..*counters
+        };
+        if *actual != expected {
+            return Err((Invariant::Counted, format!("port {nth} counted {actual:?}, not {expected:?}")));
+        }
+        let accounted = line.frame_bytes + line.dropped + line.discarded + line.held.len() as u64;
+        let sheet = &self.sheet.ports[nth];
+        if !sheet.is_can && !sheet.inputs.is_empty() && accounted as u32 != actual.bytes_in {
+            let what =
+                format!("port {nth} received {} bytes, {accounted} are accounted for", actual.bytes_in);
+            return Err((Invariant::Bytes, what));
+        }
+        Ok(())
+    }
+}
+
+fn first_packet(line: &mut Line) -> Option<Vec<u8>> {
+    (line.held.len() >= PACKET).then(|| line.held.drain(..PACKET).collect())
+}
+
+/// Whether the first six joints are where joints can be (D8).
+fn is_packet(packet: &[u8]) -> bool {
+    packet.chunks_exact(4).take(6).all(|joint| {
+        let joint = f32::from_le_bytes([joint[0], joint[1], joint[2], joint[3]]);
+        joint.is_finite() && joint.abs() <= 1_000.0
+    })
+}
+
+const PACKET: usize = 1_468;
+/// A safe value that the controller refused is written again after this.
+const REFUSED_PAUSE: Duration = Duration::from_millis(500);

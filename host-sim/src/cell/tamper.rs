@@ -1,0 +1,71 @@
+//! Gateways that break their promises: what goes into the engine and what comes out of it is changed
+//! on the way, and the model that watches has to notice.
+
+use proto_core::engine::{Input, LinkId, Output, PortId};
+use proto_core::time::Instant;
+
+use super::Cell;
+
+/// Something that the engine did not want.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) enum Forged {
+    Link(LinkId, Vec<u8>),
+    Port(PortId, Vec<u8>),
+    Open(LinkId),
+}
+
+/// Bytes that the engine is given instead of these, if any.
+pub(super) type Inward = Box<dyn FnMut(Instant, &Input<'_>) -> Option<Vec<u8>>>;
+/// What is handed over instead of an output, if anything; before a `Sleep`, in addition.
+pub(super) type Outward = Box<dyn FnMut(Instant, &Input<'_>, &Output<'_>) -> Option<Vec<Forged>>>;
+
+/// What is changed.
+pub(super) struct Tamper {
+    pub inward: Inward,
+    pub outward: Outward,
+}
+
+impl std::fmt::Debug for Tamper {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str("Tamper")
+    }
+}
+
+impl Forged {
+    pub(super) fn as_output(&self) -> Output<'_> {
+        match self {
+            Self::Link(link, bytes) => Output::LinkSend { link: *link, bytes },
+            Self::Port(port, bytes) => Output::PortSend { port: *port, bytes },
+            Self::Open(link) => Output::LinkOpen { link: *link },
+        }
+    }
+}
+
+impl Cell {
+    /// From now on.
+    pub(super) fn tamper(&mut self, inward: Option<Inward>, outward: Option<Outward>) {
+        self.tamper = Some(Tamper {
+            inward: inward.unwrap_or_else(|| Box::new(|_, _| None)),
+            outward: outward.unwrap_or_else(|| Box::new(|_, _, _| None)),
+        });
+    }
+
+    pub(super) fn forged_input(&mut self, input: &Input<'_>) -> Option<Vec<u8>> {
+        let now = self.now;
+        self.tamper.as_mut().and_then(|tamper| (tamper.inward)(now, input))
+    }
+
+    pub(super) fn forged_outputs(&mut self, input: &Input<'_>, output: &Output<'_>) -> Option<Vec<Forged>> {
+        let now = self.now;
+        self.tamper.as_mut().and_then(|tamper| (tamper.outward)(now, input, output))
+    }
+}
+
+/// The same input with other bytes.
+pub(super) fn instead<'a>(input: &Input<'a>, bytes: Option<&'a [u8]>) -> Input<'a> {
+    match (*input, bytes) {
+        (Input::PortBytes { port, .. }, Some(bytes)) => Input::PortBytes { port, bytes },
+        (Input::LinkBytes { link, .. }, Some(bytes)) => Input::LinkBytes { link, bytes },
+        (input, _) => input,
+    }
+}
