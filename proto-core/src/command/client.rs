@@ -4,6 +4,7 @@
 //! In: a command to send, received bytes and the time. Out: the bytes to send, replies, texts
 //! that nobody asked for, and a timeout. Decides nothing about what to send or to send again.
 
+use core::cell::Cell;
 use core::fmt;
 
 use super::reply::{Match, Reply, ReplyKind, SCRIPT_FINISH, match_fixed, match_value};
@@ -329,8 +330,15 @@ impl CommandClient {
     }
 
     fn drop_front(&mut self, count: usize) {
-        if count > 0 && count <= self.len {
-            self.buffer.copy_within(count..self.len, 0);
+        if count > 0
+            && let Some(held) = self.buffer.get_mut(..self.len)
+            && count <= held.len()
+        {
+            // As `copy_within`, without a range to be checked.
+            let held = Cell::from_mut(held).as_slice_of_cells();
+            for (to, from) in held.iter().zip(held.iter().skip(count)) {
+                to.set(from.get());
+            }
             self.len = self.len.saturating_sub(count);
         }
     }

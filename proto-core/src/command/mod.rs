@@ -5,14 +5,16 @@
 //! never decides whether a command is allowed.
 
 mod client;
+mod percent;
 mod reply;
 mod request;
 mod server;
 mod text;
 
 pub use client::{ClientEvent, CommandClient, MAX_REPLY, StartError};
+pub use percent::Percent;
 pub use reply::{Outcome, Reply, ReplyKind, StateCodes};
-pub use request::{Action, EncodeError, Keyword, ParseError, Percent, Request};
+pub use request::{Action, EncodeError, Keyword, ParseError, Request};
 pub use server::{CommandServer, ServerEvent, UnknownCommand};
 pub use text::NoSpace;
 

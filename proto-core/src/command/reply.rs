@@ -5,7 +5,8 @@
 
 use core::fmt;
 
-use super::request::{Action, Keyword, Percent};
+use super::percent::Percent;
+use super::request::{Action, Keyword};
 use super::text::{NoSpace, Writer, is_terminator, trim};
 use crate::wire::dialect::{Dialect, RunReply, SpeedReply, Terminator};
 use crate::wire::state::{OperationMode, ProgramState, RobotState, SafetyState};
@@ -150,7 +151,7 @@ impl<'a> Reply<'a> {
             Self::Run(Outcome::Fail) => writer.push_str(RUN_FAIL),
             Self::SpeedSet(Some(percent)) if dialect.speed_reply == SpeedReply::Percent => {
                 writer.push_str(SET_SPEED);
-                writer.push_display(percent);
+                percent.write(&mut writer);
                 writer.push_str("%");
             }
             Self::SpeedSet(_) => writer.push_str(SET_SUCCESS),
@@ -160,10 +161,17 @@ impl<'a> Reply<'a> {
                 writer.push_str(" ");
                 writer.push_str(outcome.word());
             }
-            Self::State(codes) => writer.push_display(codes),
+            Self::State(StateCodes { robot, program, safety, mode }) => {
+                writer.push_number::<10>(robot.into());
+                for code in [program, safety, mode] {
+                    writer.push_str(":");
+                    writer.push_number::<10>(code.into());
+                }
+            }
             Self::ProgramFinished(finished) => writer.push_str(if finished { "1" } else { "0" }),
             Self::LastError { id, message } => {
-                writer.push_display(format_args!("{id:X}:"));
+                writer.push_number::<16>(id);
+                writer.push_str(":");
                 for &byte in message {
                     writer.push(&[if byte.is_ascii_control() { b' ' } else { byte }]);
                 }

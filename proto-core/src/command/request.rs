@@ -6,7 +6,9 @@
 use core::fmt;
 
 use super::MAX_COMMAND;
+use super::percent::Percent;
 use super::text::{NoSpace, Writer, trim, trim_start, trim_str};
+use crate::wire::ascii::split_once;
 use crate::wire::dialect::{Dialect, Parentheses, Quotes};
 
 /// One command.
@@ -141,34 +143,6 @@ impl Keyword {
     }
 }
 
-/// A speed in percent, above 0 and at most 100.
-#[derive(Debug, Clone, Copy, PartialEq, PartialOrd)]
-#[cfg_attr(feature = "defmt", derive(defmt::Format))]
-pub struct Percent(f32);
-
-impl Percent {
-    /// `percent` if it is in (0, 100].
-    pub fn new(percent: f32) -> Option<Self> {
-        (percent > 0.0 && percent <= 100.0).then_some(Self(percent))
-    }
-
-    /// The number, such as 50.0.
-    pub const fn value(self) -> f32 {
-        self.0
-    }
-
-    /// The speed written as a decimal number, blanks around it ignored.
-    pub fn parse(text: &str) -> Option<Self> {
-        trim_str(text).parse().ok().and_then(Self::new)
-    }
-}
-
-impl fmt::Display for Percent {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        self.0.fmt(f)
-    }
-}
-
 /// Why a text is not a command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
@@ -285,7 +259,7 @@ impl<'a> Request<'a> {
         match keyword {
             Keyword::Run => {
                 let argument = argument.ok_or(ParseError::MissingArgument { keyword })?;
-                let (name, speed) = match argument.split_once(',') {
+                let (name, speed) = match split_once(argument, b',') {
                     Some((name, speed)) => (name, Percent::parse(speed)),
                     None => (argument, None),
                 };
@@ -353,13 +327,13 @@ impl<'a> Request<'a> {
                 }
                 if let Some(speed) = speed {
                     writer.push_str(",");
-                    writer.push_display(speed);
+                    speed.write(&mut writer);
                 }
                 writer.push_str(")");
             }
             Self::Speed(speed) => {
                 writer.push_str("(");
-                writer.push_display(speed.ok_or(EncodeError::NoSpeed)?);
+                speed.ok_or(EncodeError::NoSpeed)?.write(&mut writer);
                 writer.push_str(")");
             }
             Self::Do(_) | Self::State | Self::IsProgFinish | Self::GetLastError => {
@@ -409,7 +383,7 @@ fn split(text: &[u8]) -> Result<(Keyword, Option<&str>), ParseError> {
     if text.is_empty() {
         return Err(ParseError::Empty);
     }
-    let (word, argument) = match text.split_once('(') {
+    let (word, argument) = match split_once(text, b'(') {
         Some((word, rest)) => (trim_str(word), Some(rest)),
         None => (text, None),
     };

@@ -33,21 +33,31 @@ impl<'a> Writer<'a> {
     }
 
     pub(super) fn push(&mut self, bytes: &[u8]) {
-        let end = self.len.saturating_add(bytes.len());
-        if let Some(target) = self.out.get_mut(self.len..end) {
+        let room = self.out.get_mut(self.len..).and_then(|room| room.get_mut(..bytes.len()));
+        if let Some(target) = room {
             target.copy_from_slice(bytes);
         }
-        self.len = end;
+        self.len = self.len.saturating_add(bytes.len());
     }
 
     pub(super) fn push_str(&mut self, text: &str) {
         self.push(text.as_bytes());
     }
 
-    /// Appends what `value` displays as.
-    pub(super) fn push_display(&mut self, value: impl fmt::Display) {
-        // Writing cannot fail: what does not fit is counted.
-        let _ = fmt::Write::write_fmt(self, format_args!("{value}"));
+    /// Appends a number in base 10 or 16.
+    pub(super) fn push_number<const BASE: u32>(&mut self, number: u32) {
+        let mut text = [0; u32::MAX.ilog10() as usize + 1];
+        let (mut rest, mut first) = (number, text.len());
+        for place in text.iter_mut().rev() {
+            let digit = rest.checked_rem(BASE).and_then(|digit| char::from_digit(digit, BASE));
+            *place = digit.map_or(b'0', |digit| digit.to_ascii_uppercase() as u8);
+            first = first.saturating_sub(1);
+            rest = rest.checked_div(BASE).unwrap_or(0);
+            if rest == 0 {
+                break;
+            }
+        }
+        self.push(text.get(first..).unwrap_or(&[]));
     }
 
     pub(super) fn len(&self) -> usize {
@@ -57,13 +67,6 @@ impl<'a> Writer<'a> {
     pub(super) fn finish(self) -> Result<usize, NoSpace> {
         let available = self.out.len();
         if self.len <= available { Ok(self.len) } else { Err(NoSpace { needed: self.len, available }) }
-    }
-}
-
-impl fmt::Write for Writer<'_> {
-    fn write_str(&mut self, text: &str) -> fmt::Result {
-        self.push_str(text);
-        Ok(())
     }
 }
 

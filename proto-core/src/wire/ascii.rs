@@ -1,0 +1,32 @@
+//! Text cut at ASCII characters.
+//!
+//! As the methods of `str`, which cannot be shown not to panic: a `char` is searched for by its
+//! encoding there, whose length the compiler loses sight of.
+
+/// What stands before and behind the first `separator`, an ASCII character.
+pub(crate) fn split_once(text: &str, separator: u8) -> Option<(&str, &str)> {
+    split_at(text, text.bytes().position(|byte| byte == separator)?)
+}
+
+/// What stands before and behind the last `separator`, an ASCII character.
+pub(crate) fn rsplit_once(text: &str, separator: u8) -> Option<(&str, &str)> {
+    split_at(text, text.bytes().rposition(|byte| byte == separator)?)
+}
+
+fn split_at(text: &str, separator: usize) -> Option<(&str, &str)> {
+    let (before, rest) = text.split_at_checked(separator)?;
+    Some((before, rest.get(1..)?))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn texts_are_cut_as_the_methods_of_str_cut_them() {
+        for text in ["", ".", "a.b", "a.b.c", "..", "é.ü", "abc", "a.", ".b"] {
+            assert_eq!(split_once(text, b'.'), text.split_once('.'));
+            assert_eq!(rsplit_once(text, b'.'), text.rsplit_once('.'));
+        }
+    }
+}
