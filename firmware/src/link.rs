@@ -5,7 +5,7 @@
 //! says so once and waits to be opened again.
 
 use core::cell::Cell;
-use core::net::{Ipv4Addr, SocketAddr};
+use core::net::Ipv4Addr;
 use core::pin::pin;
 
 use embassy_futures::select::{Either, select};
@@ -15,7 +15,7 @@ use embassy_net::udp::{PacketMetadata, UdpSocket};
 use embassy_net::{IpAddress, IpEndpoint, Stack};
 use embassy_time::{Duration, with_timeout};
 use heapless::String;
-use proto_core::config::{Bus, GatewayConfig};
+use proto_core::config::{Bus, GatewayConfig, listen_address};
 use proto_core::engine::{Input, LinkId, LinkKind};
 
 use crate::gateway::{Gateway, LinkControl};
@@ -62,7 +62,7 @@ impl Endpoint {
         let host = controller.address.clone();
         let listen = |port: usize| match config.ports.get(port).map(|port| &port.bus) {
             Some(Bus::TcpListen { listen } | Bus::UdpListen { listen }) => {
-                listen.parse().map_or(0, |address: SocketAddr| address.port())
+                listen_address(listen).map_or(0, |address| address.port())
             }
             _ => 0,
         };

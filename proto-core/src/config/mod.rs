@@ -10,11 +10,13 @@ mod describe;
 mod error;
 #[cfg(feature = "image")]
 pub mod image;
+mod listen;
 mod network;
 mod validate;
 
 pub use budget::{PartBudget, Warning, can_frame_time};
 pub use error::{ConfigError, ConfigErrorKind, ControllerKey, NetworkKey, Place, PortKey, RecipeKey};
+pub use listen::listen_address;
 pub use network::Network;
 pub use validate::{MAX_LINE_TIME, MAX_TIME, MIN_CYCLE, check_bitrate, check_cycle};
 

@@ -4,10 +4,9 @@
 //! place. Order: controller, recipes, ports, then what concerns several of them (ownership and
 //! ways up and down).
 
-use core::net::SocketAddr;
-
 use super::check_recipe::RecipeCheck;
 use super::error::{ConfigError, ConfigErrorKind as Kind, ControllerKey, Place, PortKey, RecipeKey};
+use super::listen::listen_address;
 use super::{
     Bus, FieldSpec, GatewayConfig, InputBinding, OutputBinding, Parts, Port, Recipe, Rs485, SendOn, Span,
 };
@@ -198,7 +197,7 @@ impl GatewayConfig {
 
     fn check_listen(&self, index: u8, port: &Port, listen: &str) -> Check {
         let place = Place::Port { port: index, key: PortKey::Listen };
-        let Ok(address) = listen.parse::<SocketAddr>() else {
+        let Some(address) = listen_address(listen) else {
             return fail(place, Kind::ListenAddress);
         };
         if address.port() == 0 {
@@ -207,7 +206,7 @@ impl GatewayConfig {
         let same = |before: &Port| match (&before.bus, &port.bus) {
             (Bus::TcpListen { listen: theirs }, Bus::TcpListen { .. })
             | (Bus::UdpListen { listen: theirs }, Bus::UdpListen { .. }) => {
-                theirs.parse::<SocketAddr>().is_ok_and(|theirs| theirs == address)
+                listen_address(theirs) == Some(address)
             }
             _ => false,
         };
