@@ -19,12 +19,13 @@ use super::store::{InputFrame, MAX_INPUT_FRAMES, SafeBytes, Store};
 use super::uplink::Uplink;
 use super::user::{Bindings, InputBind};
 use crate::config::{
-    Bus, ConfigError, FieldSpec, GatewayConfig, InputBinding, Parts, Port, Recipe, SendOn, Span, StreamPart,
+    Bus, ConfigError, FieldSpec, GatewayConfig, InputBinding, MAX_SAFE_VALUES, Parts, Port, Recipe, SendOn,
+    Span, StreamPart,
 };
 use crate::image::{GroupId, InputSet, MAX_GROUPS};
 use crate::link::{LinkTimings, Supervisor};
 use crate::recipe::deframer::Deframer;
-use crate::recipe::model::{Field, Framing, Rules};
+use crate::recipe::model::{Framing, Rules};
 use crate::recipe::{CanLayout, PartError, StreamLayout};
 use crate::sysvar::{Direction, SysVar};
 use crate::time::{Duration, Instant};
@@ -150,7 +151,10 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         config.validate().map_err(BuildError::Config)?;
         let plan = Plan::new(config).map_err(BuildError::Plan)?;
         let dialect = Dialect::named(&config.controller.dialect).ok_or(BuildError::UnknownDialect)?;
-        self.safe_values.extend(config.safe_values.iter().map(SafeBytes::new));
+        for value in &config.safe_values {
+            let full = |_| too_many("safe values", MAX_SAFE_VALUES);
+            self.safe_values.push(SafeBytes::new(value)).map_err(full)?;
+        }
         for (index, port, recipe) in config.field_ports() {
             self.add_port(config, index, port, recipe, dialect)?;
         }
@@ -325,12 +329,12 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         }
         // By Modbus address, so that neighbours join into one block.
         let mut polled: Vec<SysVar, { crate::sysvar::COUNT }> = Vec::new();
-        for var in SysVar::all() {
-            if plan.source(var) == Some(Source::Modbus) {
-                let _ = polled.push(var);
-            }
+        for var in SysVar::all().filter(|&var| plan.source(var) == Some(Source::Modbus)) {
+            let before = |other: &SysVar| modbus_address(*other) <= modbus_address(var);
+            let place = polled.iter().rposition(before).map_or(0, |last| last.saturating_add(1));
+            // There are as many places as variables.
+            let _ = polled.insert(place.min(polled.len()), var);
         }
-        polled.sort_unstable_by_key(|var| modbus_address(*var));
         for &var in &polled {
             let period = periods.get(var.ordinal()).copied().flatten().unwrap_or(port_cycle_floor());
             let Some(modbus) = &mut self.links.modbus else { break };
@@ -426,7 +430,7 @@ fn can_codec(config: &GatewayConfig, index: u8, recipe: &Recipe) -> Result<Codec
         }
         let frames = frames.iter().map(|frame| {
             let fields = frame.fields.of(&config.fields).iter().map(FieldSpec::field);
-            (frame.id, fields.collect::<Vec<Field, { crate::recipe::model::MAX_CAN_DATA }>>())
+            (frame.id, fields)
         });
         CanLayout::new(Rules { mode: recipe.mode, direction }, frames)
             .map(Some)

@@ -64,16 +64,20 @@ pub(super) fn values(
     frames_sent: u32,
     reply: ReplyCode,
 ) -> Vec<Scalar, MAX_FIELDS> {
-    let values = bindings.iter().map(|&(ty, from)| match from {
-        OutputBinding::Variable { var, scale, offset } => {
-            saturate_to_field(ty, image.value(var).as_f64(), scale, offset)
-        }
-        OutputBinding::Constant(value) => saturate_to_field(ty, value, 1.0, 0.0),
-        OutputBinding::Counter => wrapping_count(ty, frames_sent),
-        OutputBinding::Reply => saturate_to_field(ty, f64::from(reply as u8), 1.0, 0.0),
-    });
-    // A part has no more fields than there is room for.
-    values.take(MAX_FIELDS).collect()
+    let mut values = Vec::new();
+    for &(ty, from) in bindings {
+        let value = match from {
+            OutputBinding::Variable { var, scale, offset } => {
+                saturate_to_field(ty, image.value(var).as_f64(), scale, offset)
+            }
+            OutputBinding::Constant(value) => saturate_to_field(ty, value, 1.0, 0.0),
+            OutputBinding::Counter => wrapping_count(ty, frames_sent),
+            OutputBinding::Reply => saturate_to_field(ty, f64::from(reply as u8), 1.0, 0.0),
+        };
+        // A part has no more fields than there is room for.
+        let _ = values.push(value);
+    }
+    values
 }
 
 /// The bindings of all ports; ports name ranges of it.

@@ -163,7 +163,13 @@ pub fn saturate_to_field(ty: ScalarType, value: f64, scale: f32, offset: f32) ->
         _ => round(value),
     };
     let (low, high) = ty.range();
-    let value = if value.is_nan() { 0.0 } else { value.clamp(low, high) };
+    // `clamp` asks whether `low` is above `high`, and panics then.
+    let value = match value {
+        _ if value.is_nan() => 0.0,
+        _ if value < low => low,
+        _ if value > high => high,
+        _ => value,
+    };
     Scalar::from_f64(ty, value).unwrap_or(Scalar::Byte(0))
 }
 

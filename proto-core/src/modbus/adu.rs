@@ -167,13 +167,13 @@ impl AduReader {
     fn fill_to(&mut self, target: usize, chunk: &mut &[u8]) -> bool {
         let missing = target.saturating_sub(self.filled);
         let (moved, rest) = chunk.split_at_checked(missing).unwrap_or((*chunk, &[]));
-        let end = self.filled.saturating_add(moved.len());
-        if let Some(space) = self.buffer.get_mut(self.filled..end) {
+        let space = self.buffer.get_mut(self.filled..).and_then(|space| space.get_mut(..moved.len()));
+        if let Some(space) = space {
             space.copy_from_slice(moved);
         }
-        self.filled = end;
+        self.filled = self.filled.saturating_add(moved.len());
         *chunk = rest;
-        end >= target
+        self.filled >= target
     }
 
     #[cold]

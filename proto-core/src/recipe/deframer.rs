@@ -45,8 +45,8 @@ const _: () = assert!(RING.is_power_of_two());
 
 /// How completing a partial frame ended.
 enum Held {
-    /// A whole frame stands at the ring's start, and nothing is held any more.
-    Frame,
+    /// A whole frame stands in the ring from here on, and nothing is held any more.
+    Frame { at: usize },
     /// The chunk is used up.
     Partial,
     /// No frame began in the held bytes.
@@ -78,7 +78,7 @@ impl Deframer {
     ) -> Option<&'s [u8]> {
         if self.len != 0 {
             match self.complete(layout, chunk) {
-                Held::Frame => return layout.payload_of(&self.ring),
+                Held::Frame { at } => return layout.payload_of(self.ring.get(at..)?),
                 Held::Partial => return None,
                 Held::Nothing => {}
             }
@@ -174,7 +174,7 @@ impl Deframer {
                 self.stats.frames = self.stats.frames.wrapping_add(1);
                 self.len = 0;
                 *chunk = after;
-                return Held::Frame;
+                return Held::Frame { at: 0 };
             }
             // Nothing was taken yet: the bytes behind those held do not count.
         }
@@ -204,8 +204,7 @@ impl Deframer {
                 if self.agrees(chunk, tail_at, layout.tail()) {
                     self.append(more);
                     *chunk = after;
-                    self.settle(layout);
-                    return Held::Frame;
+                    return Held::Frame { at: self.settle(layout) };
                 }
                 self.stats.tail_mismatches = self.stats.tail_mismatches.wrapping_add(1);
             }
@@ -231,20 +230,18 @@ impl Deframer {
         })
     }
 
-    /// Moves the held frame to the ring's start; nothing is held afterwards.
-    fn settle(&mut self, layout: &StreamLayout) {
+    /// Where the held frame stands, in one piece; nothing is held afterwards.
+    fn settle(&mut self, layout: &StreamLayout) -> usize {
         self.stats.frames = self.stats.frames.wrapping_add(1);
         let start = usize::from(self.start) & WRAP;
-        let frame = start..start.saturating_add(layout.frame_len());
-        if frame.end > RING {
-            count_visits(RING);
-            self.ring.rotate_left(start);
-        } else if start > 0 {
-            count_visits(frame.len());
-            self.ring.copy_within(frame, 0);
-        }
         self.start = 0;
         self.len = 0;
+        if start.saturating_add(layout.frame_len()) <= RING {
+            return start;
+        }
+        count_visits(RING);
+        turn(&mut self.ring, start);
+        0
     }
 
     /// Holds more bytes; there is always space, since what is held stays below a frame's length.
@@ -277,6 +274,18 @@ impl Deframer {
     fn skip(&mut self, bytes: usize) {
         self.stats.skipped_bytes = self.stats.skipped_bytes.wrapping_add(bytes as u64);
     }
+}
+
+/// Turns the ring until what stood at `start` is at its front, by three reversals: none of them has a
+/// length to be checked, as `rotate_left` has.
+#[cold]
+#[inline(never)]
+fn turn(ring: &mut [u8; RING], start: usize) {
+    if let Some((before, from)) = ring.split_at_mut_checked(start) {
+        before.reverse();
+        from.reverse();
+    }
+    ring.reverse();
 }
 
 /// A call of its own, so that short copies do without one.

@@ -7,6 +7,7 @@ use super::delimiter::{Head, Tail};
 use super::error::{EncodeError, FieldPlace, NoSpace, PartError, ValueError};
 use super::fields::{Applied, FrameFields, PlacedField, Pool, Values};
 use super::model::{Field, Framing, MAX_DELIMITER, MAX_STREAM_FRAME, Mode, Rules};
+use super::runs;
 use crate::sysvar::IMAGE_BYTES;
 use crate::wire::scalar::Scalar;
 
@@ -173,8 +174,8 @@ impl StreamLayout {
         } else if let Some((head, rest)) = frame.split_at_mut_checked(start)
             && let Some((_, tail)) = rest.split_at_mut_checked(self.payload_len())
         {
-            head.copy_from_slice(self.head.bytes());
-            tail.copy_from_slice(self.tail.bytes());
+            runs::copy(head, self.head.bytes());
+            runs::copy(tail, self.tail.bytes());
         }
         frame.get_mut(start..start.saturating_add(self.payload_len())).ok_or(no_space)
     }

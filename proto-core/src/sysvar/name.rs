@@ -3,6 +3,7 @@
 use core::fmt;
 
 use super::{SPANS, SysVar};
+use crate::wire::ascii::{rsplit_once, split_once};
 
 /// Consecutive variables of one group, as `RobotState[8..13]` names them; at least one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -119,14 +120,16 @@ impl VarRange {
     /// [`ParseError`] says what is wrong and what there is.
     pub fn parse(name: &str) -> Result<Self, ParseError> {
         if let Some(pendant) = name.strip_prefix("__") {
-            let (group, index) = pendant.rsplit_once('_').ok_or(ParseError::Syntax)?;
+            let (group, index) = rsplit_once(pendant, b'_').ok_or(ParseError::Syntax)?;
             let var = SysVar::named(group, number(index)?)?;
             return Ok(Self { first: var, last: var });
         }
-        let (group, rest) = name.split_once('[').ok_or(ParseError::Syntax)?;
+        let (group, rest) = split_once(name, b'[').ok_or(ParseError::Syntax)?;
         let inside = rest.strip_suffix(']').ok_or(ParseError::Syntax)?;
-        let (first, last) = match inside.split_once("..") {
-            Some((first, last)) => (number(first)?, number(last)?),
+        let (first, last) = match split_once(inside, b'.') {
+            Some((first, last)) => {
+                (number(first)?, number(last.strip_prefix('.').ok_or(ParseError::Syntax)?)?)
+            }
             None => (number(inside)?, number(inside)?),
         };
         if last < first {

@@ -157,19 +157,17 @@ impl Scalar {
     /// Writes the value to the front of `out` and returns its size; `None`, with nothing written,
     /// when `out` is too short.
     pub fn encode(self, out: &mut [u8]) -> Option<usize> {
-        let size = self.ty().size();
-        let target = out.get_mut(..size)?;
         match self {
-            Self::Byte(v) => target.copy_from_slice(&v.to_le_bytes()),
-            Self::Char(v) => target.copy_from_slice(&v.to_le_bytes()),
-            Self::Word(v) => target.copy_from_slice(&v.to_le_bytes()),
-            Self::Short(v) => target.copy_from_slice(&v.to_le_bytes()),
-            Self::Dword(v) => target.copy_from_slice(&v.to_le_bytes()),
-            Self::Int(v) => target.copy_from_slice(&v.to_le_bytes()),
-            Self::Float(v) => target.copy_from_slice(&v.to_le_bytes()),
-            Self::Double(v) => target.copy_from_slice(&v.to_le_bytes()),
+            Self::Byte(v) => *out.first_chunk_mut()? = v.to_le_bytes(),
+            Self::Char(v) => *out.first_chunk_mut()? = v.to_le_bytes(),
+            Self::Word(v) => *out.first_chunk_mut()? = v.to_le_bytes(),
+            Self::Short(v) => *out.first_chunk_mut()? = v.to_le_bytes(),
+            Self::Dword(v) => *out.first_chunk_mut()? = v.to_le_bytes(),
+            Self::Int(v) => *out.first_chunk_mut()? = v.to_le_bytes(),
+            Self::Float(v) => *out.first_chunk_mut()? = v.to_le_bytes(),
+            Self::Double(v) => *out.first_chunk_mut()? = v.to_le_bytes(),
         }
-        Some(size)
+        Some(self.ty().size())
     }
 
     /// The value's type.
