@@ -1,0 +1,103 @@
+//! The gateway engine, as large as the firmware's, and the supervisors and periods it is made of.
+
+use core::hint::black_box;
+
+use firmware::gateway::Engine;
+use proto_core::config::GatewayConfig;
+use proto_core::engine::{Input, OUTPUT_BUFFER, PortId};
+use proto_core::image::{GroupId, Image, InputSet, bind_to_variable, saturate_to_field};
+use proto_core::link::{LinkTimings, Supervisor};
+use proto_core::schedule::Grid;
+use proto_core::sysvar::SysVar;
+use proto_core::time::{Duration, Instant};
+use proto_core::wire::scalar::{Scalar, ScalarType};
+
+use crate::any;
+
+pub(crate) fn all() {
+    static CONFIG: GatewayConfig = GatewayConfig::empty();
+    let mut gateway = Engine::idle();
+    let mut out = [0; OUTPUT_BUFFER];
+    engine_configure(black_box(&mut gateway), black_box(&CONFIG));
+    engine_new(black_box(&CONFIG));
+    engine_handle(black_box(&mut gateway), any(Instant::ZERO), any(Input::Tick));
+    engine_poll_output(black_box(&mut gateway), any(Instant::ZERO), black_box(&mut out));
+    engine_questions(black_box(&gateway));
+    process_image();
+    supervisor();
+    grid();
+}
+
+#[inline(never)]
+fn engine_configure(gateway: &mut Engine, config: &GatewayConfig) {
+    let _ = black_box(gateway.configure(config));
+}
+
+#[inline(never)]
+fn engine_new(config: &GatewayConfig) {
+    if let Ok(gateway) = Engine::new(config) {
+        black_box(&gateway);
+    }
+}
+
+#[inline(never)]
+fn engine_handle(gateway: &mut Engine, now: Instant, input: Input<'_>) {
+    gateway.handle(now, input);
+}
+
+#[inline(never)]
+fn engine_poll_output(gateway: &mut Engine, now: Instant, out: &mut [u8; OUTPUT_BUFFER]) {
+    black_box(gateway.poll_output(now, out));
+}
+
+#[inline(never)]
+fn engine_questions(gateway: &Engine) {
+    let port = any(PortId(0));
+    black_box((gateway.deadline(), gateway.port_counters(port), gateway.reply_code(port), gateway.image()));
+    gateway.field_ports().for_each(|port| _ = black_box(port));
+    for link in gateway.links() {
+        black_box((link, link.kind.name(), link.state.name(), link.id.port()));
+    }
+}
+
+#[inline(never)]
+fn process_image() {
+    let mut image = Image::new();
+    let image = black_box(&mut image);
+    let Some(var) = any(SysVar::from_ordinal(any(3))) else { return };
+    let value = any(Scalar::Byte(0));
+    let _ = black_box(image.set(var, value));
+    black_box((image.value(var), image.is_known(var), image.age(var, any(Instant::ZERO))));
+    if let Some(group) = any::<Option<GroupId>>(image.group(var)) {
+        image.assign(var, group);
+        image.stamp(group, any(Instant::ZERO));
+        image.forget(group);
+        black_box(image.stamp_of(group));
+    }
+    black_box(bind_to_variable(var, value, any(1.0), any(0.0)));
+    black_box(saturate_to_field(any(ScalarType::Byte), any(1.0), any(1.0), any(0.0)));
+    let mut set = any(InputSet::EMPTY);
+    set.insert(var);
+    set.remove(any(var));
+    let other = InputSet::run(var, any(4));
+    black_box((set.and(&other), set.or(&other), set.minus(&other), set.run_len(var), set.contains(var)));
+    set.iter().for_each(|var| _ = black_box(var));
+}
+
+#[inline(never)]
+fn supervisor() {
+    let mut link = Supervisor::new(any(LinkTimings::TCP.with_silence(Duration::from_secs(2))));
+    let (link, now) = (black_box(&mut link), any(Instant::ZERO));
+    black_box((link.up(now), link.down(now), link.advance(now)));
+    link.heard(now);
+    link.give_up(now);
+    black_box((link.take_action(), link.deadline(), link.is_up(), link.history()));
+}
+
+#[inline(never)]
+fn grid() {
+    let mut grid = Grid::starting_at(any(Instant::ZERO), any(Duration::ZERO));
+    black_box(black_box(&mut grid).due(any(Instant::NEVER)));
+    let time = any(Instant::ZERO) + any(Duration::MAX);
+    black_box((time - any(Duration::MAX), time.saturating_since(any(time)), any(Duration::MAX).as_millis()));
+}

@@ -1,0 +1,100 @@
+//! The proof that nothing in proto-core panics: an image in which every entry of it that sees what a
+//! device, a peer or a file sent is called with values that the compiler knows nothing about, and
+//! whose panic handler needs a symbol that does not exist. It links only when the optimiser has removed
+//! every panic. `.ci/run` builds it as the firmware is built, and prints how much stack each of these
+//! functions takes (docs/architecture.md section 11).
+//!
+//! It is never run on a board. On a host the same calls are made once, which shows little.
+#![cfg_attr(target_os = "none", no_std, no_main)]
+
+mod configuration;
+mod engine;
+mod protocols;
+mod recipes;
+mod state;
+mod words;
+
+use core::hint::black_box;
+
+/// What a peer may send: neither the bytes nor how many there are is known to the compiler.
+fn bytes() -> &'static [u8] {
+    static BYTES: [u8; 2048] = [0; 2048];
+    black_box(&BYTES[..])
+}
+
+/// A value of which only the type is known.
+fn any<T>(value: T) -> T {
+    black_box(value)
+}
+
+/// Room of a length that is not known.
+fn room(buffer: &mut [u8]) -> &mut [u8] {
+    black_box(buffer)
+}
+
+fn exercise() {
+    configuration::all();
+    engine::all();
+    recipes::all();
+    protocols::all();
+    state::all();
+    match VARIANT {
+        Variant::Proof | Variant::Shown => {}
+        Variant::Provoked => _ = black_box(bytes()[any(7_usize)]),
+        Variant::Words => words::all(),
+    }
+}
+
+/// What is built: the environment variable `NO_PANIC` says it.
+#[derive(Clone, Copy)]
+enum Variant {
+    /// The proof: a panic does not link.
+    Proof,
+    /// The same with an index that nobody checked, to see that the check can fail.
+    Provoked,
+    /// Panics link, so that it can be shown where they are.
+    Shown,
+    /// The same, with what errors say of themselves: `core` prints it, and has panics of its own.
+    Words,
+}
+
+const VARIANT: Variant = match option_env!("NO_PANIC") {
+    Some(name) => match name.as_bytes() {
+        b"provoked" => Variant::Provoked,
+        b"shown" => Variant::Shown,
+        b"words" => Variant::Words,
+        _ => Variant::Proof,
+    },
+    None => Variant::Proof,
+};
+
+#[cfg(not(target_os = "none"))]
+fn main() {
+    exercise();
+}
+
+#[cfg(target_os = "none")]
+mod image {
+    #[cortex_m_rt::entry]
+    fn main() -> ! {
+        super::exercise();
+        loop {}
+    }
+
+    #[panic_handler]
+    fn panic(_: &core::panic::PanicInfo<'_>) -> ! {
+        unsafe extern "C" {
+            safe fn proto_core_can_panic() -> !;
+        }
+        match super::VARIANT {
+            super::Variant::Proof | super::Variant::Provoked => proto_core_can_panic(),
+            super::Variant::Shown | super::Variant::Words => loop {},
+        }
+    }
+
+    fn on_any_interrupt() {}
+
+    #[unsafe(link_section = ".vector_table.interrupts")]
+    #[unsafe(no_mangle)]
+    static __INTERRUPTS: [fn(); 32] = [on_any_interrupt; 32];
+}
