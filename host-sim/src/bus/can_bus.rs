@@ -22,6 +22,7 @@ use super::peer;
 use super::port::{PortEvent, PortTx};
 use super::pty::Pty;
 use super::timer::{Timer, now};
+use super::turns::give_way;
 use super::wire::{Crossed, Full, NodeId, Pacing, Wire};
 
 /// The bus itself; clones are the same bus.
@@ -332,7 +333,7 @@ async fn serve_all(listener: TcpListener, bus: &CanBus, bitrate: u32, tx: &Rc<Po
                     if let Some(more) = tx.complaints.take(now()) {
                         warn!(%peer, more, "refused: the bus has {MAX_CLIENTS} slcan clients already");
                     }
-                    tokio::task::yield_now().await;
+                    give_way().await;
                     continue;
                 }
                 info!(%peer, "slcan client");
@@ -413,7 +414,7 @@ async fn serve(io: &impl ClientIo, node: &Node, bitrate: u32, tx: &PortTx) -> io
     let mut channel = Channel::new(bitrate);
     node.set_hears(false);
     let mut out = Vec::new();
-    let mut buf = [0; 1_024];
+    let mut buf = [0; CHUNK];
     let mut unread = 0..0;
     let mut told_dropped = 0;
     loop {
@@ -427,7 +428,7 @@ async fn serve(io: &impl ClientIo, node: &Node, bitrate: u32, tx: &PortTx) -> io
                     Ok(count) => {
                         unread = 0..count;
                         // One read holds fewer frames than a node keeps: others take them in between.
-                        tokio::task::yield_now().await;
+                        if count == CHUNK { give_way().await } else { tokio::task::yield_now().await }
                         Ok(())
                     }
                     Err(error) => Err(error),
@@ -494,6 +495,8 @@ fn flush(io: &impl ClientIo, out: &mut Vec<u8>, tx: &PortTx) -> io::Result<()> {
 pub const MAX_WAITING: usize = 256;
 /// Most slcan clients on TCP.
 const MAX_CLIENTS: usize = 32;
+/// Most bytes read from a client at once.
+const CHUNK: usize = 256;
 /// Bytes made out for a client and not yet taken; beyond it frames wait in the node's queue.
 const MAX_PENDING: usize = 4_096;
 /// Between two looks for a client that went away and left bytes behind.

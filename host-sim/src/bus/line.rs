@@ -24,6 +24,7 @@ use super::peer;
 use super::port::{PortEvent, PortTx};
 use super::pty::Pty;
 use super::timer::{Timer, now};
+use super::turns::give_way;
 
 /// A serial port's device.
 #[derive(Debug)]
@@ -163,8 +164,7 @@ async fn refuse_all(listener: &TcpListener, tx: &PortTx) {
         if let Some(more) = tx.complaints.take(now()) {
             warn!(%peer, more, "refused: the line has a client already");
         }
-        // However many more there are, the others come first.
-        tokio::task::yield_now().await;
+        give_way().await;
     }
 }
 
@@ -287,7 +287,7 @@ async fn pump(
     sender: &mut Sender,
     events: &mut impl FnMut(PortEvent<'_>),
 ) -> io::Error {
-    let mut buf = [0; 2_048];
+    let mut buf = [0; CHUNK];
     loop {
         let done = tokio::select! {
             read = device.receive(&mut buf) => match read {
@@ -296,7 +296,7 @@ async fn pump(
                     sender.tx.count(|counters| counters.bytes_in += count as u64);
                     events(PortEvent::Bytes(&buf[..count]));
                     // A device that never pauses must not keep everybody else waiting.
-                    tokio::task::yield_now().await;
+                    if count == CHUNK { give_way().await } else { tokio::task::yield_now().await }
                     Ok(())
                 }
                 Err(error) if error.kind() == io::ErrorKind::Interrupted => Ok(()),
@@ -440,6 +440,8 @@ fn bytes_in(line: &Rs485, time: Duration) -> usize {
     usize::try_from(bits / u128::from(line.bits_per_character())).unwrap_or(usize::MAX)
 }
 
+/// Most bytes read at once: the frames in them go through the engine before anybody else has a turn.
+const CHUNK: usize = 512;
 /// Paced bytes closer together than this appear together, as out of a UART's FIFO.
 const CLUMP: Duration = Duration::from_micros(500);
 /// Between two looks at what a serial device still holds.

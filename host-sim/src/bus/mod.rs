@@ -19,4 +19,5 @@ mod socketcan;
 #[cfg(test)]
 mod test_kit;
 pub mod timer;
+pub(crate) mod turns;
 pub mod wire;

@@ -185,6 +185,37 @@ fn who_asks_without_taking_answers_is_not_read_further_and_loses_nothing() {
 }
 
 #[test]
+fn of_too_many_closed_connections_that_still_send_the_oldest_is_cut() {
+    inside(example("udp-server-controller.toml", &[]), async |shell, ready| {
+        let at: SocketAddr = ready["modbus"].as_str().unwrap().parse().unwrap();
+        let mut peers = Vec::new();
+        for _ in 0..MAX_LINGERING + 3 {
+            let peer = TcpSocket::new_v4().unwrap();
+            peer.set_recv_buffer_size(4_096).unwrap();
+            peers.push(peer.connect(at).await.unwrap());
+        }
+        while shell.connections.borrow().len() < peers.len() {
+            tokio::task::yield_now().await;
+        }
+        let conns: Vec<_> = shell.connections.borrow().keys().copied().collect();
+        for &conn in &conns {
+            // Answers that nobody takes, until they are kept.
+            let connection = Rc::clone(&shell.connections.borrow()[&conn].connection);
+            while connection.send(&[0; 4_096]) == Taken::All {}
+            shell.carry_out(ControllerOutput::Close { conn }, now());
+        }
+        assert_eq!(shell.lingering.borrow().len(), MAX_LINGERING);
+        assert_eq!(shell.counters.get().cut_answers, 3);
+        assert!(shell.connections.borrow().is_empty());
+        // Those that are left go when their peers have gone.
+        drop(peers);
+        while !shell.lingering.borrow().is_empty() {
+            tokio::task::yield_now().await;
+        }
+    });
+}
+
+#[test]
 fn one_client_too_many_is_turned_away() {
     let handle = start(example("udp-server-controller.toml", &[]), Vec::new()).unwrap();
     for (name, most) in [("command", MAX_COMMAND_CONNECTIONS), ("state", MAX_STATE_CONNECTIONS)] {

@@ -19,6 +19,7 @@ use crate::bus::connect::connect;
 use crate::bus::peer;
 use crate::bus::quota::Quota;
 use crate::bus::timer::now;
+use crate::bus::turns::give_way;
 
 /// What a link connects to.
 #[derive(Debug)]
@@ -246,8 +247,7 @@ async fn pump_tcp(
                 len if control.turn.get() == turn => {
                     (events.borrow_mut())(LinkEvent::Bytes(&chunk[..len]));
                     if len == CHUNK {
-                        // There is more: the others come first.
-                        tokio::task::yield_now().await;
+                        give_way().await;
                     }
                 }
                 _ => return Ok(()),
@@ -295,7 +295,7 @@ async fn accept(
             return Ok((stream, known));
         }
         drop(stream);
-        tokio::task::yield_now().await;
+        give_way().await;
     }
 }
 
@@ -310,7 +310,7 @@ async fn refuse_others(name: &str, others: Option<(&TcpListener, &[IpAddr])>, co
                     let count = |turned_away: &mut TurnedAway| turned_away.refused += 1;
                     control.turn_away(name, peer, "there is a connection already", count);
                 }
-                tokio::task::yield_now().await;
+                give_way().await;
             }
             // Out of descriptors, most likely: they come back when connections end.
             Err(_) => tokio::time::sleep(std::time::Duration::from_millis(100)).await,
@@ -354,7 +354,7 @@ async fn first_datagram(
 /// However many datagrams there are, the others come first now and then.
 async fn take_turns(nth: u64) {
     if nth.is_multiple_of(DATAGRAMS_AT_ONCE) {
-        tokio::task::yield_now().await;
+        give_way().await;
     }
 }
 

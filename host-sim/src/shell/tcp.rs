@@ -14,6 +14,7 @@ use tokio::net::TcpStream;
 use tokio::net::tcp::{OwnedReadHalf, OwnedWriteHalf};
 
 use crate::bus::timer::now;
+use crate::bus::turns::give_way;
 
 /// The sending side of a connection.
 #[derive(Debug)]
@@ -153,8 +154,7 @@ impl Connection {
                         count => {
                             event(Event::Bytes(&buf[..count]));
                             if count == CHUNK {
-                                // There is more: the others come first.
-                                tokio::task::yield_now().await;
+                                give_way().await;
                             }
                         }
                     },
@@ -242,8 +242,9 @@ impl Connection {
     }
 }
 
-/// Most bytes read at once: their requests are carried out before anybody else has a turn.
-const CHUNK: usize = 512;
+/// Most bytes read at once: their requests are carried out before anybody else has a turn. The longest
+/// Modbus request.
+const CHUNK: usize = 260;
 /// Most bytes kept for a peer that does not take them. More than one read's requests are answered with.
 const MAX_KEPT: usize = 64 * 1_024;
 /// How long a closed connection may take to send what it has.

@@ -2,7 +2,9 @@
 //! from others is not the processor but what the process under attack gives it.
 
 use std::io::{Read, Write};
-use std::net::{Ipv4Addr, SocketAddr, TcpStream, UdpSocket};
+use std::net::{Ipv4Addr, SocketAddr, TcpListener, TcpStream, UdpSocket};
+use std::os::unix::fs::OpenOptionsExt;
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::thread::JoinHandle;
@@ -97,38 +99,88 @@ pub(crate) fn hoard(at: SocketAddr, most: usize) -> Attack {
 pub(crate) fn pour(at: SocketAddr, clients: usize, bytes: &'static [u8]) -> Attack {
     let chunk = filled(bytes);
     Attack::start(clients, move |_, shared| {
-        let mut got = vec![0; 1 << 16];
-        'again: while shared.goes_on() {
-            let Some(mut stream) = small(at) else { continue };
-            let _ = stream.set_nonblocking(true);
-            let mut rest = &chunk[..];
-            while shared.goes_on() {
-                let mut idle = true;
-                match stream.write(rest) {
-                    Ok(count) => {
-                        shared.count(count as u64);
-                        rest = if count == rest.len() { &chunk } else { &rest[count..] };
-                        idle = false;
-                    }
-                    Err(error) if error.kind() == std::io::ErrorKind::WouldBlock => {}
-                    Err(_) => continue 'again,
-                }
-                match stream.read(&mut got) {
-                    Ok(0) => continue 'again,
-                    Ok(_) => idle = false,
-                    Err(error) if error.kind() == std::io::ErrorKind::WouldBlock => {}
-                    Err(_) => continue 'again,
-                }
-                if idle {
-                    std::thread::sleep(Duration::from_micros(200));
-                }
+        while shared.goes_on() {
+            if let Some(stream) = small(at) {
+                let _ = stream.set_nonblocking(true);
+                pour_into(stream, &chunk, shared);
             }
         }
     })
 }
 
-/// `clients` that send as much as is taken and never read; each begins anew when it is closed, and every
-/// `turn` when one is given.
+/// The same through a device.
+pub(crate) fn pour_device(path: PathBuf, bytes: &'static [u8]) -> Attack {
+    let chunk = filled(bytes);
+    Attack::start(1, move |_, shared| {
+        let flags = libc::O_NOCTTY | libc::O_NONBLOCK;
+        let device = std::fs::OpenOptions::new().read(true).write(true).custom_flags(flags).open(&path);
+        pour_into(device.unwrap(), &chunk, shared);
+    })
+}
+
+/// What a server does with those that it has answered.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Hold {
+    /// It goes on.
+    Open,
+    /// It closes.
+    Close,
+}
+
+/// A server that pours into everybody who connects, and where it is.
+pub(crate) fn server(bytes: &'static [u8], hold: Hold) -> (SocketAddr, Attack) {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let at = listener.local_addr().unwrap();
+    listener.set_nonblocking(true).unwrap();
+    let listener = Arc::new(listener);
+    let chunk = filled(bytes);
+    let attack = Attack::start(2, move |_, shared| {
+        while shared.goes_on() {
+            match listener.accept() {
+                Ok((mut stream, _)) if hold == Hold::Close => {
+                    // Counts as much as many bytes: each makes the other side begin anew.
+                    shared.count(10);
+                    let _ = stream.write_all(&chunk);
+                }
+                Ok((stream, _)) => {
+                    let _ = stream.set_nonblocking(true);
+                    pour_into(stream, &chunk, shared);
+                }
+                Err(_) => std::thread::sleep(Duration::from_millis(1)),
+            }
+        }
+    });
+    (at, attack)
+}
+
+/// Sends as fast as is taken, and takes what comes, until the other side closes.
+fn pour_into(mut to: impl Read + Write, chunk: &[u8], shared: &Shared) {
+    let mut got = vec![0; 1 << 16];
+    let mut rest = chunk;
+    while shared.goes_on() {
+        let mut idle = true;
+        match to.write(rest) {
+            Ok(count) => {
+                shared.count(count as u64);
+                rest = if count == rest.len() { chunk } else { &rest[count..] };
+                idle = false;
+            }
+            Err(error) if error.kind() == std::io::ErrorKind::WouldBlock => {}
+            Err(_) => return,
+        }
+        match to.read(&mut got) {
+            Ok(0) => return,
+            Ok(_) => idle = false,
+            Err(error) if error.kind() == std::io::ErrorKind::WouldBlock => {}
+            Err(_) => return,
+        }
+        if idle {
+            std::thread::sleep(Duration::from_micros(200));
+        }
+    }
+}
+
+/// `clients` that send as much as is taken and never read; each begins anew when it is closed.
 pub(crate) fn never_read(at: SocketAddr, clients: usize, bytes: &'static [u8]) -> Attack {
     let chunk = filled(bytes);
     Attack::start(1, move |_, shared| {

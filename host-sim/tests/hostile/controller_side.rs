@@ -1,9 +1,9 @@
 //! The simulated controller's servers and ports under attack.
 
-use std::net::Ipv4Addr;
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::time::Duration;
 
-use crate::attack;
+use crate::attack::{self, Attack, Ports};
 use crate::process::{Process, host_sim};
 use crate::witness::Witnesses;
 use crate::{Scene, alone};
@@ -12,99 +12,134 @@ const READ_WORDS: &[u8] = &[9, 9, 0, 0, 0, 6, 1, 3, 0, 0, 0, 118];
 const READ_ONE: &[u8] = &[9, 9, 0, 0, 0, 6, 1, 3, 0, 1, 0, 1];
 const READ_ONE_ANSWER: &[u8] = &[9, 9, 0, 0, 0, 5, 1, 3, 2, 0, 6];
 
-/// A controller with somebody at each of its servers.
-fn robot() -> Scene {
-    let alone = alone();
-    let process = Process::start(
+/// A controller with servers and ports of every kind.
+pub(crate) fn controller(to: SocketAddr) -> Process {
+    Process::start(
         host_sim("controller", "robot.toml")
-            .args(["--bind=rs485=tcp-listen:127.0.0.1:0", "--bind=can=slcan-tcp:127.0.0.1:0"]),
-    );
-    let mut witnesses = Witnesses::default();
+            .args(["--bind=rs485=tcp-listen:127.0.0.1:0", "--bind=can=slcan-tcp:127.0.0.1:0"])
+            .arg(format!("--set=port.tcp1.to={to}")),
+    )
+}
+
+/// Somebody at each of its servers.
+pub(crate) fn clients(process: &Process, witnesses: &mut Witnesses) {
     witnesses.udp2011(process.at("udp2011"));
     witnesses.state(process.at("state"));
     witnesses.asks("command", process.at("command"), b"state\n", b"6:0:5:2");
     witnesses.asks("modbus", process.at("modbus"), READ_ONE, READ_ONE_ANSWER);
+}
+
+/// A bit of everything.
+pub(crate) fn everything(process: &Process) -> Vec<Attack> {
+    vec![
+        attack::scan(process.at("command")),
+        attack::hoard(process.at("state"), 10),
+        attack::pour(process.at("command"), 1, b"getlasterror\n"),
+        attack::pour(process.at("modbus"), 1, READ_WORDS),
+        attack::never_read(process.at("modbus"), 20, READ_WORDS),
+        attack::never_read(process.at("command"), 10, b"state\n"),
+        attack::drip(process.at("command"), 5, b"run(a", Duration::from_secs(1)),
+        attack::pour(process.at("ports/rs485"), 1, &[1, 2, 3, 1, 2, 0, 0, 3]),
+        attack::pour(process.at("ports/can"), 1, b"O\rt00120102\rgarbage\r"),
+        attack::datagrams(process.at("udp2011"), Ipv4Addr::new(127, 0, 0, 2), DATAGRAMS, Ports::New),
+    ]
+}
+
+/// As the controller takes it, and not.
+const DATAGRAMS: &[&[u8]] = &[&[0xFF, 0xFF, 0x02, 0xEE, 0xEE], b"", b"?", &[0; 4_000]];
+
+fn robot_with(to: SocketAddr) -> Scene {
+    let alone = alone();
+    let process = controller(to);
+    let mut witnesses = Witnesses::default();
+    clients(&process, &mut witnesses);
     Scene::new(alone, process, witnesses)
 }
+
+fn robot() -> Scene {
+    robot_with(NOBODY)
+}
+
+pub(crate) const NOBODY: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 9);
 
 #[test]
 fn a_port_scan_of_every_server() {
     let scene = robot();
     let servers = ["command", "state", "modbus", "ports/rs485", "ports/can"];
-    scene.survives(servers.map(|server| attack::scan(scene.process.at(server))).into());
-    scene.ends();
+    let attacks = servers.map(|server| attack::scan(scene.process.at(server))).into();
+    scene.survives(attacks);
 }
 
 #[test]
 fn connections_that_are_kept_and_say_nothing() {
     let scene = robot();
     let servers = ["command", "state", "modbus", "ports/can"];
-    scene.survives(servers.map(|server| attack::hoard(scene.process.at(server), 200)).into());
-    scene.ends();
+    let attacks = servers.map(|server| attack::hoard(scene.process.at(server), 200)).into();
+    scene.survives(attacks);
 }
 
 #[test]
 fn requests_without_end() {
     let scene = robot();
-    scene.survives(vec![
+    let attacks = vec![
         attack::pour(scene.process.at("command"), 2, b"getlasterror\n"),
         attack::pour(scene.process.at("modbus"), 2, READ_WORDS),
-    ]);
-    scene.ends();
+    ];
+    scene.survives(attacks);
 }
 
 #[test]
 fn short_unknown_commands_without_end() {
     let scene = robot();
-    scene.survives(vec![attack::pour(scene.process.at("command"), 4, b"x\n")]);
-    scene.ends();
+    let attacks = vec![attack::pour(scene.process.at("command"), 4, b"x\n")];
+    scene.survives(attacks);
 }
 
 #[test]
 fn garbage_without_end() {
     let scene = robot();
-    scene.survives(vec![
+    let attacks = vec![
         attack::pour(scene.process.at("command"), 1, b"run(\x80garbage without an end "),
         attack::pour(scene.process.at("state"), 1, b"nobody reads this"),
         attack::pour(scene.process.at("modbus"), 1, b"\x00\x01\x00\x00\x00\x06\x01\x63garbage"),
         attack::pour(scene.process.at("ports/rs485"), 1, &[1, 2, 3, 1, 2, 0, 0, 3]),
         attack::pour(scene.process.at("ports/can"), 1, b"t001zz\rgarbage"),
-    ]);
-    scene.ends();
+    ];
+    scene.survives(attacks);
 }
 
 #[test]
 fn peers_that_ask_and_never_read() {
     let scene = robot();
-    scene.survives(vec![
+    let attacks = vec![
         attack::never_read(scene.process.at("command"), 31, b"getlasterror\n"),
         attack::never_read(scene.process.at("modbus"), 100, READ_WORDS),
         attack::never_read(scene.process.at("state"), 31, b"?"),
         attack::never_read(scene.process.at("ports/can"), 32, b"O\rt00180102030405060708\r"),
-    ]);
-    scene.ends();
+    ];
+    scene.survives(attacks);
 }
 
 #[test]
-fn answers_that_wait_at_connections_closed_for_a_violation() {
+fn connections_that_break_the_protocol_one_after_the_other() {
     let scene = robot();
     let mut bytes = READ_WORDS.repeat(80);
     bytes.extend_from_slice(&[0, 0, 9, 9, 0, 6, 1, 3, 0, 0, 0, 1]);
-    scene.survives(vec![attack::ask_and_break(scene.process.at("modbus"), bytes.leak(), 2_000)]);
-    scene.ends();
+    let attacks = vec![attack::ask_and_break(scene.process.at("modbus"), bytes.leak(), 2_000)];
+    scene.survives(attacks);
 }
 
 #[test]
 fn a_byte_now_and_then() {
     let scene = robot();
     let pause = Duration::from_millis(20);
-    scene.survives(vec![
+    let attacks = vec![
         attack::drip(scene.process.at("command"), 31, b"run(a", pause),
         attack::drip(scene.process.at("modbus"), 127, &[0, 1, 0, 0, 0, 6, 1, 3, 0, 0, 0], pause),
         attack::drip(scene.process.at("ports/rs485"), 1, &[1, 2, 0], pause),
         attack::drip(scene.process.at("ports/can"), 31, b"t0018", pause),
-    ]);
-    scene.ends();
+    ];
+    scene.survives(attacks);
 }
 
 #[test]
@@ -113,11 +148,20 @@ fn datagrams_from_everywhere() {
     // One host with many ports; another with ports that nobody listens on any more when they are answered.
     let many = Ipv4Addr::new(127, 0, 0, 2);
     let gone = Ipv4Addr::new(127, 0, 0, 3);
-    let kinds: &[&[u8]] = &[&[0xFF, 0xFF, 0x02, 0xEE, 0xEE], b"", b"?", &[0; 4_000]];
     let server = scene.process.at("udp2011");
-    scene.survives(vec![
-        attack::datagrams(server, many, kinds, attack::Ports::Kept),
-        attack::datagrams(server, gone, kinds, attack::Ports::New),
-    ]);
-    scene.ends();
+    let attacks = vec![
+        attack::datagrams(server, many, DATAGRAMS, Ports::Kept),
+        attack::datagrams(server, gone, DATAGRAMS, Ports::New),
+    ];
+    scene.survives(attacks);
+}
+
+#[test]
+fn a_host_that_the_controller_connects_to() {
+    let (to, pours) = attack::server(b"\xFF\xFF\x02\xEE\xEE\xFF", attack::Hold::Open);
+    let scene = robot_with(to);
+    scene.survives(vec![pours]);
+    let (to, closes) = attack::server(b"\xFF\xFF\x02\xEE\xEE\xFF", attack::Hold::Close);
+    let scene = robot_with(to);
+    scene.survives(vec![closes]);
 }

@@ -232,7 +232,7 @@ pub(crate) fn connect(at: SocketAddr) -> TcpStream {
     stream
 }
 
-const LEAST_SHARE: f64 = 0.4;
+const LEAST_SHARE: f64 = 0.3;
 /// A second, when a client asks.
-const LEAST_ANSWERS: f64 = 10.0;
+const LEAST_ANSWERS: f64 = 5.0;
 const LONGEST_WAIT: Duration = Duration::from_secs(2);

@@ -12,6 +12,7 @@ use super::{ControllerShell, Outward, Report};
 use crate::bus::backoff::Backoff;
 use crate::bus::connect::connect;
 use crate::bus::peer;
+use crate::bus::turns::give_way;
 use crate::controller::ControllerInput;
 use crate::shell::tcp::{Connection, Event, Taken};
 
@@ -85,7 +86,7 @@ impl ControllerShell {
         let mut buf = [0; 2_048];
         for nth in 1_u64.. {
             if nth.is_multiple_of(DATAGRAMS_AT_ONCE) {
-                tokio::task::yield_now().await;
+                give_way().await;
             }
             // An error is of a datagram of ours that came back; the peer may appear yet.
             if let Ok(count) = socket.recv(&mut buf).await {

@@ -13,6 +13,7 @@ use tracing::{debug, info, warn};
 use super::{Client, ControllerShell, Report, closed};
 use crate::bus::peer;
 use crate::bus::timer::now;
+use crate::bus::turns::give_way;
 use crate::controller::{ConnId, ControllerInput, Link};
 use crate::shell::tcp::{Connection, Event};
 use crate::shell::udp;
@@ -25,8 +26,7 @@ impl ControllerShell {
             match listener.accept().await {
                 Ok((stream, peer)) => {
                     self.take(link, stream, peer);
-                    // However many more there are, the others come first.
-                    tokio::task::yield_now().await;
+                    give_way().await;
                 }
                 Err(error) => {
                     self.count(|counters| counters.accept_failures += 1);
@@ -96,7 +96,7 @@ impl ControllerShell {
         let mut buf = [0; 2_048];
         for nth in 1_u64.. {
             if nth.is_multiple_of(DATAGRAMS_AT_ONCE) {
-                tokio::task::yield_now().await;
+                give_way().await;
             }
             match self.udp.recv_from(&mut buf).await {
                 Ok((count, peer)) => self.input(ControllerInput::Udp2011 { peer, bytes: &buf[..count] }),
