@@ -6,6 +6,7 @@ mod can;
 mod clocks;
 mod ethernet;
 mod identity;
+mod last_words;
 mod leds;
 mod serial;
 mod stack;
@@ -140,6 +141,7 @@ fn tell_start(source: clocks::Source) {
     } else {
         info!("started");
     }
+    last_words::tell();
     if source == clocks::Source::Internal {
         warn!("no 8 MHz from the debugger: on the chip's own clock, too far off for fast CAN");
     }
@@ -147,8 +149,9 @@ fn tell_start(source: clocks::Source) {
 
 /// Also where a panic ends. The watchdog starts the board again; a debugger finds it here.
 #[cortex_m_rt::exception]
-unsafe fn HardFault(_: &cortex_m_rt::ExceptionFrame) -> ! {
+unsafe fn HardFault(frame: &cortex_m_rt::ExceptionFrame) -> ! {
     leds::fault();
+    last_words::keep(frame);
     loop {
         cortex_m::asm::nop();
     }
