@@ -13,13 +13,13 @@ unsafe extern "C" {
 
 const PAINT: u32 = 0xC5C5_C5C5;
 /// log2 of the guard's size.
-const GUARD_BITS: u32 = 12;
+const GUARD_BITS: u32 = 14;
 
 fn bottom() -> usize {
     &raw const _stack_end as usize
 }
 
-/// Keeps everybody from the 4 KiB below the stack, so that an overflow faults. The handler of the fault
+/// Keeps everybody from the 16 KiB below the stack, so that an overflow faults. The handler of the fault
 /// is not kept from them: it has to have a stack.
 pub(super) fn guard() {
     // SAFETY: nobody else uses the MPU, and nothing is kept where the guard is (memory.x).
