@@ -79,7 +79,8 @@ impl<D: Read + Write> CanPort for SlcanPort<D> {
             if self.input.is_empty() {
                 let mut chunk = [0; CHUNK];
                 if let Ok(len) = self.line.read(&mut chunk).await {
-                    self.input.extend(chunk.iter().copied().take(len));
+                    // As much as was asked for at most, and nothing is in it.
+                    let _ = self.input.extend_from_slice(chunk.get(..len).unwrap_or(&[]));
                 }
             }
         }

@@ -182,9 +182,14 @@ def stack(image, names):
     callees = collections.defaultdict(set)
     for caller, callee, _ in image.calls():
         callees[caller].add(callee)
-    for where, _ in image.addresses_taken():
+    problems = []
+    for where, target in image.addresses_taken():
         # Whoever holds the address may call it: that cannot be followed.
-        callees[image.function_at(where)].add(None)
+        holder = image.function_at(where)
+        if holder is None:
+            problems.append(f"an address in data: {image.names[target]} could be called through a pointer")
+        else:
+            callees[holder].add(None)
     deepest = {}
 
     def depth(function, path):
@@ -200,7 +205,7 @@ def stack(image, names):
             deepest[function] = (own + total, ((image.names[function], own), *chain))
         return deepest[function]
 
-    problems, rows = [], []
+    rows = []
     for start in image.starts:
         name = image.names[start]
         if re.match(names, name):
@@ -211,7 +216,7 @@ def stack(image, names):
     for total, chain, name in sorted(rows, reverse=True):
         path = ", ".join(f"{short(step)} {own}" for step, own in chain[1:] if own >= 64)
         print(f"{total:7}  {name}" + (f"  ({path})" if path else ""))
-    if not rows:
+    if not rows and not problems:
         problems.append(f"no function begins with {names}")
     return problems
 
