@@ -109,7 +109,18 @@ fn garbage_without_end() {
 }
 
 #[test]
-fn peers_that_ask_and_never_read() {
+fn a_few_peers_that_ask_and_never_read() {
+    // Few enough to fill what the system holds for them at once: what comes then is ours to hold or not.
+    let scene = robot();
+    let attacks = vec![
+        attack::never_read(scene.process.at("command"), 2, b"getlasterror\n"),
+        attack::never_read(scene.process.at("modbus"), 3, READ_WORDS),
+    ];
+    scene.survives(attacks);
+}
+
+#[test]
+fn many_peers_that_ask_and_never_read() {
     let scene = robot();
     let attacks = vec![
         attack::never_read(scene.process.at("command"), 31, b"getlasterror\n"),

@@ -37,7 +37,7 @@ struct Scene {
 impl Scene {
     fn new(alone: MutexGuard<'static, ()>, process: Process, witnesses: Witnesses) -> Self {
         // What comes first is the beginning's: connections, first answers.
-        witnesses.lap(Duration::from_millis(100));
+        witnesses.lap(Duration::from_millis(50));
         let quiet = witnesses.lap(QUIET);
         Self { process, witnesses, quiet, _alone: alone }
     }
@@ -115,7 +115,7 @@ fn within_bounds(usage: &Usage) {
 }
 
 const QUIET: Duration = Duration::from_millis(300);
-const WARM_UP: Duration = Duration::from_millis(300);
+const WARM_UP: Duration = Duration::from_millis(200);
 const ATTACK: Duration = Duration::from_millis(500);
 /// docs/devices.md section 7.
 const MOST_RSS_KIB: u64 = 64 << 10;

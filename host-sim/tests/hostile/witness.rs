@@ -205,8 +205,8 @@ impl Lap {
     pub(crate) fn is_like(&self, before: &Self) {
         for (name, &(paced_by, own, worst)) in &self.clients {
             let least = match paced_by {
-                // The ends of the two laps cut off or add one each.
-                PacedBy::Process => before.clients[name].1 * LEAST_SHARE - 2.0 / self.took,
+                // The end of a lap may cut one off.
+                PacedBy::Process => before.clients[name].1 * LEAST_SHARE - 1.0 / self.took,
                 PacedBy::Client => LEAST_ANSWERS,
             };
             assert!(own >= least, "{name}: {own:.1}/s, at least {least:.1}/s expected");
