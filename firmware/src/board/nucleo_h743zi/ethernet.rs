@@ -62,7 +62,7 @@ pub(super) struct Parts {
 }
 
 impl Parts {
-    /// Starts the controller; takes half a second at most when something is missing.
+    /// Starts the controller; takes a quarter of a second at most, when the PHY's clock is missing.
     pub(super) fn start<I>(mut self, irqs: I, address: [u8; 6], led: Led) -> Result<Ethernet, EthernetError>
     where
         I: interrupt::typelevel::Binding<interrupt::typelevel::ETH, eth::InterruptHandler> + 'static,
@@ -144,13 +144,16 @@ impl Lan8742 {
 }
 
 impl Phy for Lan8742 {
+    /// Takes up to half a second, which is not waited for here: `poll_link` sees the end of it.
     fn phy_reset(&mut self) {
         self.write(PHY_CONTROL, CONTROL_RESET);
-        let until = Instant::now() + PATIENCE;
-        while self.read(PHY_CONTROL) & CONTROL_RESET != 0 && Instant::now() < until {}
+        self.look = Instant::now() + LINK_PERIOD;
     }
 
     fn phy_init(&mut self) {
+        if self.read(PHY_CONTROL) & CONTROL_RESET != 0 {
+            return;
+        }
         self.write(PHY_OFFER, OFFER_100_FULL);
         self.write(PHY_CONTROL, CONTROL_NEGOTIATE);
     }
@@ -159,7 +162,7 @@ impl Phy for Lan8742 {
         let now = Instant::now();
         if now >= self.look {
             self.look = now + LINK_PERIOD;
-            // A PHY that lost its settings was reset by a disturbance, and gets them again.
+            // After its reset the PHY has no settings; after one by a disturbance neither.
             if self.read(PHY_OFFER) != OFFER_100_FULL {
                 self.phy_init();
             }
