@@ -64,7 +64,9 @@ pub(crate) const NOBODY: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCAL
 
 #[test]
 fn a_port_scan_of_every_server() {
-    let scene = robot();
+    let mut scene = robot();
+    let at = scene.process.at("command");
+    scene.joined_by(|witnesses| witnesses.newcomers("newcomers", at, b"state\n", b"6:0:5:2"));
     let servers = ["command", "state", "modbus", "ports/rs485", "ports/can"];
     let attacks = servers.map(|server| attack::scan(scene.process.at(server))).into();
     scene.survives(attacks);

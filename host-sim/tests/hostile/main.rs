@@ -42,6 +42,12 @@ impl Scene {
         Self { process, witnesses, quiet, _alone: alone }
     }
 
+    /// More clients, before any attack.
+    fn joined_by(&mut self, join: impl FnOnce(&mut Witnesses)) {
+        join(&mut self.witnesses);
+        self.quiet = self.witnesses.lap(QUIET);
+    }
+
     /// Lets attacks go on for a while: the clients get what they got before, and once everything an attack
     /// can take has been taken, it gets no more. Then the process is told to end, and does, while they go on.
     /// What it counted until then comes back.

@@ -164,6 +164,25 @@ impl Witnesses {
         });
     }
 
+    /// One client after the other: connects, asks, is answered, goes.
+    pub(crate) fn newcomers(
+        &mut self,
+        name: &'static str,
+        at: SocketAddr,
+        request: &'static [u8],
+        answer: &'static [u8],
+    ) {
+        let mut got = vec![0; answer.len()];
+        self.watch(name, PacedBy::Client, move || {
+            let mut stream = TcpStream::connect(at)?;
+            stream.set_read_timeout(Some(PATIENCE))?;
+            stream.write_all(request)?;
+            stream.read_exact(&mut got)?;
+            std::thread::sleep(Duration::from_millis(2));
+            if got == answer { Ok(()) } else { Err(std::io::Error::other("another answer")) }
+        });
+    }
+
     /// What the clients get from now on, for as long as `window`.
     #[track_caller]
     pub(crate) fn lap(&self, window: Duration) -> Lap {
