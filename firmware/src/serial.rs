@@ -6,7 +6,7 @@
 
 use core::pin::pin;
 
-use embassy_futures::select::{Either, select};
+use embassy_futures::select::{Either3, select3};
 use embassy_futures::yield_now;
 use embassy_time::{Duration, Instant, Timer, with_timeout};
 use embedded_io_async::{Read, Write};
@@ -76,15 +76,18 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, mut line: impl 
     let Some(control) = gateway.port(port) else { core::future::pending().await };
     let mut chunk = [0; 256];
     let mut is_failing = false;
-    let mut errors = Told { errors: LineErrors::NONE, next: Instant::MIN };
+    let mut errors = Told { errors: LineErrors::NONE, look: Instant::MIN };
     loop {
         gateway.input(Input::PortUp { port });
         let failed = loop {
-            let next = pulse.idle(pin!(select(line.read(&mut chunk), control.next_bytes()))).await;
+            let next = select3(line.read(&mut chunk), control.next_bytes(), Timer::at(errors.look));
+            let next = pulse.idle(pin!(next)).await;
             let frame = match next {
-                Either::First(Ok(len)) => {
+                Either3::First(Ok(len)) => {
                     tell(gateway, port, chunk.get(..len).unwrap_or(&[]), line.arrival());
-                    errors.tell(port, line.errors());
+                    if Instant::now() >= errors.look {
+                        errors.tell(port, line.errors());
+                    }
                     // A line that is never silent does not keep the other tasks from running.
                     yield_now().await;
                     // A line that never falls silent does not keep us from sending.
@@ -93,8 +96,13 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, mut line: impl 
                         None => continue,
                     }
                 }
-                Either::First(Err(error)) => break embedded_io_async::Error::kind(&error),
-                Either::Second(frame) => frame,
+                Either3::First(Err(error)) => break embedded_io_async::Error::kind(&error),
+                Either3::Second(frame) => frame,
+                Either3::Third(()) => {
+                    // At the wrong speed nothing else is ever heard of a line.
+                    errors.tell(port, line.errors());
+                    continue;
+                }
             };
             line.drive(LineDirection::Send);
             let sent = with_timeout(patience(frame.len(), baud), async {
@@ -141,20 +149,19 @@ fn tell(gateway: &Gateway, port: PortId, bytes: &[u8], arrival: Option<Arrival>)
     }
 }
 
-/// The errors that were told of, and when others may be: at most once a second.
+/// The errors that were told of, and when they are looked at again.
 struct Told {
     errors: LineErrors,
-    next: Instant,
+    look: Instant,
 }
 
 impl Told {
     fn tell(&mut self, port: PortId, errors: LineErrors) {
-        let now = Instant::now();
-        if errors == self.errors || now < self.next {
+        self.look = Instant::now() + ERROR_PERIOD;
+        if errors == self.errors {
             return;
         }
         self.errors = errors;
-        self.next = now + ERROR_PERIOD;
         let LineErrors { parity, framing, overruns, unread } = errors;
         warn!(
             "port {}: characters left out for parity {}, framing {}; overruns {}, unread {}",

@@ -216,3 +216,52 @@ fn a_line_that_never_falls_silent_does_not_starve_the_other_tasks() {
         assert_eq!(reads.get(), 100 - turn, "one read in a turn");
     }
 }
+
+/// A line of which nothing is heard but errors.
+struct Wrong<'a>(&'a Cell<u32>);
+
+impl ErrorType for Wrong<'_> {
+    type Error = Infallible;
+}
+
+impl Read for Wrong<'_> {
+    async fn read(&mut self, _: &mut [u8]) -> Result<usize, Infallible> {
+        pending().await
+    }
+}
+
+impl Write for Wrong<'_> {
+    async fn write(&mut self, buf: &[u8]) -> Result<usize, Infallible> {
+        Ok(buf.len())
+    }
+
+    async fn flush(&mut self) -> Result<(), Infallible> {
+        Ok(())
+    }
+}
+
+impl Line for Wrong<'_> {
+    fn errors(&self) -> LineErrors {
+        self.0.set(self.0.get() + 1);
+        LineErrors { framing: 1_000 * self.0.get(), ..LineErrors::NONE }
+    }
+}
+
+#[test]
+fn errors_are_looked_at_once_a_second_on_a_line_where_nothing_else_is_heard() {
+    let _clock = Clock::take();
+    let mut gateway = Box::new(Gateway::idle());
+    gateway.configure(&config()).unwrap();
+    let watch = Watch::<1>::new();
+    let pulse = watch.register(TaskName::Serial(PortId(0))).unwrap();
+    let looks = Cell::new(0);
+    let mut task = pin!(run(&gateway, pulse, PortId(0), Wrong(&looks), 115_200));
+    let mut cx = Context::from_waker(Waker::noop());
+    for second in 1..=5 {
+        for _ in 0..10 {
+            assert!(task.as_mut().poll(&mut cx).is_pending());
+            advance(Duration::from_millis(100));
+        }
+        assert_eq!(looks.get(), second);
+    }
+}
