@@ -99,6 +99,9 @@ impl Target {
     }
 }
 
+/// Bytes of inputs that are kept in the repository for a target.
+const KEPT: usize = 32 * 1024;
+
 /// Bytes at which things change.
 const TELLING: &[u8] =
     &[0, 1, 2, 3, 4, 8, 9, 16, 32, 64, 127, 128, 129, 253, 254, 255, b'\r', b'\n', b'(', b')'];
@@ -119,19 +122,22 @@ fn write_out(inputs: &[Vec<u8>], folder: &Path) {
     }
 }
 
-/// Puts the files of a folder into one: each as its length, two bytes, and its bytes.
+/// Puts files of a folder into one: each as its length, two bytes, and its bytes. When they are more
+/// than [`KEPT`] bytes, only every so many-th is taken, of short ones and long ones alike.
 fn keep(folder: &Path, kept: &Path) {
     let entries = std::fs::read_dir(folder).expect("FUZZ_KEEP can be listed");
     let read = |entry: std::io::Result<std::fs::DirEntry>| {
         std::fs::read(entry.expect("FUZZ_KEEP can be listed").path()).expect("its files can be read")
     };
     let mut inputs: Vec<Vec<u8>> = entries.map(read).collect();
-    inputs.sort();
+    inputs.sort_by_key(|input| (input.len(), input.clone()));
+    let every = inputs.iter().map(Vec::len).sum::<usize>().div_ceil(KEPT).max(1);
     let pack = |input: &Vec<u8>| {
         let len = u16::try_from(input.len()).expect("no input is that long");
         [&len.to_le_bytes()[..], input].concat()
     };
-    std::fs::write(kept, inputs.iter().flat_map(pack).collect::<Vec<u8>>())
+    std::fs::create_dir_all(kept.parent().expect("a folder")).expect("the corpus has a folder");
+    std::fs::write(kept, inputs.iter().step_by(every).flat_map(pack).collect::<Vec<u8>>())
         .expect("the corpus can be written to");
 }
 
