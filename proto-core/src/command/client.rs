@@ -9,7 +9,7 @@ use core::fmt;
 
 use super::reply::{Match, Reply, ReplyKind, SCRIPT_FINISH, match_fixed, match_value};
 use super::request::{EncodeError, Keyword, ParseError, Request};
-use super::text::{is_blank, is_terminator};
+use super::text::{is_blank, is_terminator, trim_start};
 use crate::time::{Duration, Instant};
 use crate::wire::dialect::Dialect;
 
@@ -274,7 +274,7 @@ impl CommandClient {
         if self.dropping {
             return Some(self.message_gap);
         }
-        let bytes = self.buffer.get(self.handed_out..self.len).unwrap_or(&[]);
+        let bytes = trim_start(self.buffer.get(self.handed_out..self.len).unwrap_or(&[]));
         if bytes.is_empty() {
             return None;
         }

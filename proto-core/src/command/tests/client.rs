@@ -131,6 +131,16 @@ fn an_error_without_its_terminator_is_complete_after_100_ms() {
 }
 
 #[test]
+fn a_blank_before_a_message_does_not_end_it_early() {
+    let mut client = asking("getlasterror");
+    assert!(receive(&mut client, at(1), b"hellorun start 1F:joint").is_empty());
+    assert_eq!(receive(&mut client, at(21), b""), ["?hello", "?run start"]);
+    assert_eq!(client.deadline(), Some(at(101)));
+    assert!(receive(&mut client, at(100), b"").is_empty());
+    assert_eq!(receive(&mut client, at(101), b""), ["Value 1F:joint"]);
+}
+
+#[test]
 fn a_message_that_is_too_long_is_cut_and_its_rest_dropped() {
     let mut client = asking("getlasterror");
     let long = [b"1:".as_slice(), &[b'm'; 1000], b"\nscript finish"].concat();
