@@ -1,4 +1,4 @@
-//! What a fault leaves behind for the next start: RAM keeps its contents when the watchdog starts the
+//! What a fault or a hang leaves behind for the next start: RAM keeps its contents when the watchdog starts the
 //! board again, and the program then has a log that somebody may read.
 
 use core::fmt::{self, Write};
@@ -52,6 +52,20 @@ impl Write for Words {
     }
 }
 
+impl Words {
+    /// The task that was running, and all is kept.
+    fn end(mut self) {
+        let _ = match running() {
+            Some(task) => write!(self, ", task {task}"),
+            None => self.write_str(", no task"),
+        };
+        kept().len.store(self.0 as u32, Ordering::Relaxed);
+        kept().sum.store(sum(&text(self.0)), Ordering::Relaxed);
+        kept().after.store(0, Ordering::Relaxed);
+        cortex_m::asm::dsb();
+    }
+}
+
 /// Keeps what is known of a fault. After a stack overflow its place is not.
 pub(super) fn keep(frame: &ExceptionFrame) {
     // SAFETY: reads of the core's fault registers, which have no effect.
@@ -69,14 +83,19 @@ pub(super) fn keep(frame: &ExceptionFrame) {
     if cause & BUS_ADDRESS_VALID != 0 {
         let _ = write!(words, ", address {bus:08X}");
     }
-    match running() {
-        Some(task) => drop(write!(words, ", task {task}")),
-        None => drop(write!(words, ", no task")),
-    }
-    kept().len.store(words.0 as u32, Ordering::Relaxed);
-    kept().sum.store(sum(&text(words.0)), Ordering::Relaxed);
-    kept().after.store(0, Ordering::Relaxed);
-    cortex_m::asm::dsb();
+    words.end();
+}
+
+/// Keeps which task has the processor while the watchdog starves.
+pub(super) fn keep_hang() {
+    let mut words = Words(0);
+    let _ = words.write_str("the watchdog was not fed");
+    words.end();
+}
+
+/// It was none after all.
+pub(super) fn forget() {
+    kept().len.store(0, Ordering::Relaxed);
 }
 
 /// Tells what was kept, once.

@@ -94,7 +94,8 @@ fn main() -> ! {
     stack::guard();
     stack::paint();
     clocks::errata();
-    if let Some(mut core) = Core::take() {
+    let mut core = Core::take();
+    if let Some(core) = &mut core {
         // The data cache stays off: the Ethernet DMA and the debugger see memory as it is.
         core.SCB.enable_icache();
     }
@@ -103,6 +104,9 @@ fn main() -> ! {
     let p = embassy_stm32::init(clocks::config(source));
     let leds = leds::Leds::new(p.PB0, p.PE1, p.PB14);
     tell_start(source);
+    if let Some(core) = &mut core {
+        watchdog::look_after(&mut core.SYST);
+    }
     let board = Board {
         serial: serial::Lines::new(serial::Pins {
             first: (p.PD5, p.PD6, p.PD4),

@@ -1,9 +1,18 @@
 //! The independent watchdog: it has its own clock, so it also restarts a board whose clock stopped.
+//!
+//! It gives no warning. The system timer looks after it instead, and keeps the name of the task that has
+//! the processor for the next start when half of the period has gone by without a feed.
 
+use core::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+
+use cortex_m::peripheral::SYST;
+use cortex_m::peripheral::syst::SystClkSource;
 use embassy_stm32::pac::DBGMCU;
 use embassy_stm32::peripherals::IWDG1;
 use embassy_stm32::wdg::IndependentWatchdog;
-use embassy_time::Duration;
+use embassy_time::{Duration, Instant};
+
+use super::last_words;
 
 /// Without being fed for so long, the board starts again.
 pub(crate) const WATCHDOG_PERIOD: Duration = Duration::from_secs(4);
@@ -26,5 +35,41 @@ impl Watchdog {
     /// Another period.
     pub(crate) fn feed(&mut self) {
         self.0.pet();
+        FED.store(millis(), Ordering::Relaxed);
+        if IS_LATE.swap(false, Ordering::Relaxed) {
+            last_words::forget();
+        }
     }
 }
+
+/// Looks after it from now on: at 400 MHz twelve times a second, on the chip's own clock twice. Only once
+/// there is a time.
+pub(super) fn look_after(timer: &mut SYST) {
+    FED.store(millis(), Ordering::Relaxed);
+    timer.set_clock_source(SystClkSource::External);
+    timer.set_reload(EIGHTHS);
+    timer.clear_current();
+    timer.enable_interrupt();
+    timer.enable_counter();
+}
+
+#[cortex_m_rt::exception]
+fn SysTick() {
+    let unfed = millis().wrapping_sub(FED.load(Ordering::Relaxed));
+    let is_late = u64::from(unfed) >= WATCHDOG_PERIOD.as_millis() / 2;
+    // Once: a reset in the middle of it would leave nothing.
+    if is_late && !IS_LATE.swap(true, Ordering::Relaxed) {
+        last_words::keep_hang();
+    }
+}
+
+fn millis() -> u32 {
+    Instant::now().as_millis() as u32
+}
+
+/// When it was fed last, in milliseconds.
+static FED: AtomicU32 = AtomicU32::new(0);
+/// A hang is kept that may not be one.
+static IS_LATE: AtomicBool = AtomicBool::new(false);
+/// Cycles of an eighth of the core's clock, from one look to the next.
+const EIGHTHS: u32 = 4_000_000;
