@@ -8,6 +8,7 @@
 //! whole cycle of 32. A frame's id chooses its receive FIFO, so frames of one id stay in order. The
 //! interrupt only wakes the task.
 
+mod registers;
 mod timing;
 
 use core::cell::Cell;
@@ -22,6 +23,9 @@ use proto_core::recipe::model::{CanId, MAX_CAN_DATA, MAX_CAN_IDS};
 
 use crate::can::{BusOff, CanCounters, CanEvent, CanPort};
 
+use registers::*;
+
+pub use registers::MESSAGE_RAM_WORDS;
 pub use timing::{BitTiming, BitrateError};
 
 /// One M_CAN: its registers, and its share of the message RAM, 32 bits each.
@@ -355,71 +359,6 @@ fn element(start: u16, index: u32) -> u16 {
 
 /// How often a bit is looked at that changes after some cycles of the bus' clock.
 const PATIENCE: usize = 10_000;
-
-/// What the driver uses of the message RAM.
-pub const MESSAGE_RAM_WORDS: u16 = TX_FIFO + ELEMENT_WORDS * TX_ELEMENTS;
-const FILTERS: u16 = MAX_CAN_IDS as u16;
-const STANDARD_FILTERS: u16 = 0;
-const EXTENDED_FILTERS: u16 = STANDARD_FILTERS + FILTERS;
-const RX_ELEMENTS: u16 = 64;
-const RX_FIFOS: [u16; 2] =
-    [EXTENDED_FILTERS + 2 * FILTERS, EXTENDED_FILTERS + 2 * FILTERS + ELEMENT_WORDS * RX_ELEMENTS];
-/// As many as a port sends in one cycle.
-const TX_ELEMENTS: u16 = 32;
-const TX_FIFO: u16 = RX_FIFOS[1] + ELEMENT_WORDS * RX_ELEMENTS;
-/// Two of head, and 8 bytes.
-const ELEMENT_WORDS: u16 = 4;
-
-const _: () = assert!(MAX_CAN_IDS <= TX_ELEMENTS as usize);
-
-const ENDN: u8 = 0x04;
-const CCCR: u8 = 0x18;
-const NBTP: u8 = 0x1C;
-const ECR: u8 = 0x40;
-const PSR: u8 = 0x44;
-const IR: u8 = 0x50;
-const IE: u8 = 0x54;
-const ILS: u8 = 0x58;
-const ILE: u8 = 0x5C;
-const GFC: u8 = 0x80;
-const SIDFC: u8 = 0x84;
-const XIDFC: u8 = 0x88;
-const XIDAM: u8 = 0x90;
-const RXF0C: u8 = 0xA0;
-const RXF1C: u8 = 0xB0;
-const RXESC: u8 = 0xBC;
-const TXBC: u8 = 0xC0;
-const TXFQS: u8 = 0xC4;
-const TXESC: u8 = 0xC8;
-const TXBRP: u8 = 0xCC;
-const TXBAR: u8 = 0xD0;
-const TXBTIE: u8 = 0xE0;
-const TXEFC: u8 = 0xF0;
-/// Status and acknowledge of the two receive FIFOs.
-const RX_REGISTERS: [(u8, u8); 2] = [(0xA4, 0xA8), (0xB4, 0xB8)];
-
-const CCCR_INIT: u32 = 1;
-const CCCR_CONFIGURE: u32 = 1 << 1;
-const CCCR_RESTRICTED: u32 = 1 << 2;
-/// Neither of the three above, nor what sets the controller asleep or to test.
-const CCCR_KEPT: u32 = 0xF340;
-const PSR_PASSIVE: u32 = 1 << 5;
-const PSR_WARNING: u32 = 1 << 6;
-const PSR_BUS_OFF: u32 = 1 << 7;
-const TXFQS_FULL: u32 = 1 << 21;
-/// A frame was lost, in either FIFO.
-const LOST: u32 = 1 << 3 | 1 << 7;
-/// New frames, transmitted, message RAM too late, and each change of the error state.
-const INTERRUPTS: u32 = 1 | 1 << 4 | 1 << 9 | 1 << 17 | 1 << 23 | 1 << 24 | 1 << 25;
-/// What matches no filter, of both lengths of id.
-const GFC_REJECT_OTHERS: u32 = 2 << 2 | 2 << 4;
-/// A filter's type, at the same place for both lengths of id.
-const TWO_IDS: u32 = 1 << 30;
-const TO_FIFO_0: u32 = 1;
-const TO_FIFO_1: u32 = 2;
-const HEAD_REMOTE: u32 = 1 << 29;
-const HEAD_EXTENDED: u32 = 1 << 30;
-const CONTROL_FD: u32 = 1 << 21;
 
 #[cfg(test)]
 mod tests;
