@@ -93,6 +93,13 @@ pub(super) struct FieldPort {
     pub counters: PortCounters,
 }
 
+/// Whether somebody looks at the image between two frames: a bit may rise and fall within one chunk.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Look {
+    AtEach,
+    AfterAll,
+}
+
 /// The frames that were accepted in one call.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Accepted {
@@ -158,21 +165,27 @@ impl FieldPort {
         self.bus = state;
     }
 
-    /// Bytes from the line.
-    pub(super) fn bytes<const PORTS: usize>(
+    /// Bytes came from the line; [`Self::frames`] takes them.
+    pub(super) fn heard(&mut self, bytes: &[u8], now: Instant) {
+        add(&mut self.counters.bytes_in, bytes.len());
+        if now >= self.line.heard + self.line.idle_gap {
+            self.discard_partial();
+        }
+        self.line.heard = now;
+    }
+
+    /// Takes the frames in `rest`, or up to the first accepted one when somebody looks at each.
+    pub(super) fn frames<const PORTS: usize>(
         &mut self,
-        bytes: &[u8],
+        rest: &mut &[u8],
+        look: Look,
         bindings: &[InputBind],
         store: &mut Store<PORTS>,
         commands: &mut Option<CommandLink>,
         now: Instant,
     ) -> Accepted {
         let mut accepted = Accepted::default();
-        add(&mut self.counters.bytes_in, bytes.len());
-        if now >= self.line.heard + self.line.idle_gap {
-            self.discard_partial();
-        }
-        self.line.heard = now;
+        let bytes = core::mem::take(rest);
         let usable = self.is_usable();
         let Codec::Stream { input, deframer, .. } = &mut self.codec else { return accepted };
         let Some(layout) = input else {
@@ -189,12 +202,16 @@ impl FieldPort {
             commands,
             now,
         };
-        let mut rest = bytes;
-        while let Some(payload) = deframer.next_frame(layout, &mut rest) {
+        let mut left = bytes;
+        while let Some(payload) = deframer.next_frame(layout, &mut left) {
             if let Some(set) = frames.take(layout, payload, usize::from(self.first_frame)) {
                 accepted = Accepted { frames: accepted.frames.wrapping_add(1), set };
+                if look == Look::AtEach {
+                    break;
+                }
             }
         }
+        *rest = left;
         let stats = deframer.stats();
         self.counters.tail_mismatches = stats.tail_mismatches as u32;
         self.counters.resync_bytes = stats.skipped_bytes as u32;

@@ -4,7 +4,7 @@ use heapless::Vec;
 
 use super::command_link::CommandLink;
 use super::counters::LinkCounters;
-use super::field_port::FieldPort;
+use super::field_port::{FieldPort, Look};
 use super::io::{LinkId, LinkKind};
 use super::modbus_link::ModbusLink;
 use super::state_link::StateLink;
@@ -157,16 +157,18 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
         }
     }
 
-    /// Bytes from a link. Those of a link that is not up, as the engine sees it, are of a
-    /// connection that it gave up.
+    /// Bytes from a link; when somebody looks at each frame, up to the first. Those of a link that is
+    /// not up, as the engine sees it, are of a connection that it gave up.
     pub(super) fn bytes<const PORTS: usize>(
         &mut self,
         id: LinkId,
-        bytes: &[u8],
+        rest: &mut &[u8],
+        look: Look,
         store: &mut Store<PORTS>,
         ports: &mut [FieldPort],
         now: Instant,
     ) {
+        let bytes = core::mem::take(rest);
         match id {
             LinkId::COMMAND => {
                 if let Some(link) = self.command.as_mut().filter(|link| link.supervisor.is_up()) {
@@ -175,7 +177,7 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
             }
             LinkId::STATE => {
                 if let Some(link) = self.state.as_mut().filter(|link| link.supervisor.is_up()) {
-                    link.bytes(bytes, store, now);
+                    *rest = link.bytes(bytes, look, store, now);
                 }
             }
             LinkId::MODBUS => {
@@ -185,7 +187,7 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
             }
             _ => {
                 if let Some(link) = self.recipe(id).filter(|link| link.supervisor.is_up()) {
-                    link.bytes(bytes, store, now);
+                    *rest = link.bytes(bytes, look, store, now);
                 }
             }
         }

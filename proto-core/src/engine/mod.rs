@@ -40,7 +40,7 @@ use heapless::Vec;
 
 use counters::{add, bump};
 use field_output::Downward;
-use field_port::{Accepted, FieldPort};
+use field_port::{Accepted, FieldPort, Look};
 use links::Links;
 use store::{SafeBytes, Store};
 use user::{Bindings, forget_commands};
@@ -89,12 +89,22 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         // Whatever happens may set an earlier deadline; what it makes later is found out in time.
         match input {
             Input::PortBytes { port: id, bytes } => {
-                let (store, command) = (&mut self.store, &mut self.links.command);
-                let Some(port) = find_port(&mut self.ports, id) else { return };
-                let accepted = port.bytes(bytes, &self.bindings.inputs, store, command, now);
-                let deadline = port.deadline();
-                self.arm(deadline);
-                self.after_field(id, &accepted, now);
+                let look = self.look();
+                if let Some(port) = find_port(&mut self.ports, id) {
+                    port.heard(bytes, now);
+                }
+                let mut rest = bytes;
+                loop {
+                    let (store, command) = (&mut self.store, &mut self.links.command);
+                    let Some(port) = find_port(&mut self.ports, id) else { return };
+                    let accepted = port.frames(&mut rest, look, &self.bindings.inputs, store, command, now);
+                    let deadline = port.deadline();
+                    self.arm(deadline);
+                    self.after_field(id, &accepted, now);
+                    if rest.is_empty() {
+                        return;
+                    }
+                }
             }
             Input::PortCan { port: id, frame } => {
                 let (store, command) = (&mut self.store, &mut self.links.command);
@@ -121,10 +131,17 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
                 self.arm(self.links.deadline_of(link));
             }
             Input::LinkBytes { link, bytes } => {
-                self.links.bytes(link, bytes, &mut self.store, &mut self.ports, now);
-                self.count_lost();
-                self.arm(self.links.deadline_of(link));
-                self.image_changed();
+                let look = self.look();
+                let mut rest = bytes;
+                loop {
+                    self.links.bytes(link, &mut rest, look, &mut self.store, &mut self.ports, now);
+                    self.count_lost();
+                    self.arm(self.links.deadline_of(link));
+                    self.image_changed();
+                    if rest.is_empty() {
+                        return;
+                    }
+                }
             }
             Input::LinkSent { link } => {
                 self.links.sent(link);
@@ -298,6 +315,11 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         if waits && let Some(port) = find_port(&mut self.ports, port) {
             add(&mut port.counters.withheld, accepted.frames as usize);
         }
+    }
+
+    /// Bits that trigger are looked at after each frame, however many come at once.
+    fn look(&self) -> Look {
+        if self.watches_bits { Look::AtEach } else { Look::AfterAll }
     }
 
     /// Values in the image changed: bits that trigger may have risen.

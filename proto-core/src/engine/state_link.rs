@@ -3,6 +3,7 @@
 use heapless::Vec;
 
 use super::counters::{LinkCounters, add, bump};
+use super::field_port::Look;
 use super::store::Store;
 use crate::image::{GroupId, InputSet};
 use crate::link::{LinkTimings, Supervisor};
@@ -44,8 +45,14 @@ impl StateLink {
         self.stream.reset();
     }
 
-    /// Bytes from the controller.
-    pub(super) fn bytes<const PORTS: usize>(&mut self, bytes: &[u8], store: &mut Store<PORTS>, now: Instant) {
+    /// Bytes from the controller; those that are left when somebody looks at each packet.
+    pub(super) fn bytes<'b, const PORTS: usize>(
+        &mut self,
+        bytes: &'b [u8],
+        look: Look,
+        store: &mut Store<PORTS>,
+        now: Instant,
+    ) -> &'b [u8] {
         self.supervisor.heard(now);
         add(&mut self.counters.bytes_in, bytes.len());
         let mut rest = bytes;
@@ -63,15 +70,21 @@ impl StateLink {
                         }
                     }
                     store.image.stamp(self.group, now);
+                    if look == Look::AtEach {
+                        // They are counted when they are taken.
+                        self.counters.bytes_in = self.counters.bytes_in.wrapping_sub(rest.len() as u32);
+                        return rest;
+                    }
                 }
                 Err(_) => bump(&mut self.counters.malformed),
             }
             if self.stream.misaligned_in_a_row() >= MISALIGNED_IN_A_ROW {
                 self.supervisor.give_up(now);
                 self.lost();
-                return;
+                return &[];
             }
         }
+        &[]
     }
 }
 

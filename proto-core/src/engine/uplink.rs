@@ -4,6 +4,7 @@
 //! that was read back (docs/architecture.md section 7). What comes down goes into the image.
 
 use super::counters::{LinkCounters, add, bump};
+use super::field_port::Look;
 use super::io::{LinkId, LinkKind};
 use super::outbox::BIT_VARS;
 use super::store::Store;
@@ -88,14 +89,22 @@ impl Uplink {
         self.busy = false;
     }
 
-    /// Bytes, or one datagram, from the controller.
-    pub(super) fn bytes<const PORTS: usize>(&mut self, bytes: &[u8], store: &mut Store<PORTS>, now: Instant) {
+    /// Bytes, or one datagram, from the controller; those that are left when somebody looks at each
+    /// frame.
+    pub(super) fn bytes<'b, const PORTS: usize>(
+        &mut self,
+        bytes: &'b [u8],
+        look: Look,
+        store: &mut Store<PORTS>,
+        now: Instant,
+    ) -> &'b [u8] {
         add(&mut self.counters.bytes_in, bytes.len());
         self.supervisor.heard(now);
         let (Some(layout), Some(group)) = (&self.output, self.group) else {
-            return bump(&mut self.counters.malformed);
+            bump(&mut self.counters.malformed);
+            return &[];
         };
-        let mut fresh = false;
+        let (mut fresh, mut left): (bool, &[u8]) = (false, &[]);
         let mut take = |payload: &[u8]| {
             let applied = layout.apply(payload, store.image.bytes_mut()).is_ok();
             fresh |= applied;
@@ -112,12 +121,14 @@ impl Uplink {
             Framing::Bytes => {
                 let mut rest = bytes;
                 while let Some(payload) = self.deframer.next_frame(layout, &mut rest) {
-                    let counter = if take(payload) {
-                        &mut self.counters.received
-                    } else {
-                        &mut self.counters.malformed
-                    };
-                    bump(counter);
+                    let is_taken = take(payload);
+                    bump(if is_taken { &mut self.counters.received } else { &mut self.counters.malformed });
+                    if is_taken && look == Look::AtEach {
+                        // They are counted when they are taken.
+                        self.counters.bytes_in = self.counters.bytes_in.wrapping_sub(rest.len() as u32);
+                        left = rest;
+                        break;
+                    }
                 }
                 self.counters.resync_bytes = self.deframer.stats().skipped_bytes as u32;
             }
@@ -128,6 +139,7 @@ impl Uplink {
                 self.greet_at = now + GREET_EVERY;
             }
         }
+        left
     }
 
     /// What can be sent now: a frame with new values, or a greeting.
