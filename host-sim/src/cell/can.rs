@@ -32,6 +32,8 @@ pub struct CanBus {
     /// What happened.
     pub counters: BusCounters,
     pub(super) connected: bool,
+    /// The port's CAN controller is bus-off: it neither sends nor hears.
+    pub(super) is_off: bool,
     pub(super) device: Option<Box<dyn Device<CanFrame>>>,
     waiting: [VecDeque<CanFrame>; 2],
     on_the_bus: Option<(End, CanFrame)>,
@@ -70,6 +72,7 @@ impl CanBus {
             loss_ppm: 0,
             counters: BusCounters::default(),
             connected: true,
+            is_off: false,
             device: None,
             waiting: [VecDeque::new(), VecDeque::new()],
             on_the_bus: None,
@@ -98,7 +101,7 @@ impl CanBus {
     /// The frame on the bus has ended.
     pub(super) fn finish(&mut self, now: Instant) -> Option<Crossed> {
         let (from, frame) = self.on_the_bus.take()?;
-        let arrives = self.connected && !self.rng.chance(self.loss_ppm);
+        let arrives = self.connected && !self.is_off && !self.rng.chance(self.loss_ppm);
         self.counters.lost += u64::from(!arrives);
         if arrives && from == End::Port && self.keep_heard > 0 {
             if self.heard.len() >= self.keep_heard {

@@ -6,7 +6,7 @@ use proto_core::recipe::model::CanId;
 use proto_core::time::{Duration, Instant};
 use std::net::SocketAddr;
 
-use super::line::Chunk;
+use super::line::{Chunk, Chunking};
 use super::network::{Connection, Door, Item, Peer, Way};
 use super::{BusId, Cell, DESK, End, LineId, Owner, What, udp_peer};
 use crate::controller::{ControllerInput, ControllerOutput, Link};
@@ -57,6 +57,10 @@ pub(super) enum Due {
     Chunk {
         line: LineId,
         chunk: Chunk,
+    },
+    /// What the line has gathered is handed over.
+    Gathered {
+        line: LineId,
     },
     CanDone {
         bus: BusId,
@@ -368,6 +372,12 @@ impl Cell {
             Due::Unreachable { peer } => self.controller_input(ControllerInput::Udp2011Unreachable { peer }),
             Due::ClientTries { port } => self.client_tries(port),
             Due::Chunk { line, chunk } => self.chunk_arrives(line, chunk),
+            Due::Gathered { line } => {
+                let bytes = std::mem::take(&mut self.lines[line.0].gathered);
+                if !bytes.is_empty() {
+                    self.port_receives(self.lines[line.0].owner, &bytes);
+                }
+            }
             Due::CanDone { bus } => self.can_done(bus),
             Due::DeviceSends { line, bytes } => self.send(line, &bytes),
             Due::TimedOut { conn } => self.reset_conn(conn),
@@ -406,13 +416,15 @@ impl Cell {
         let owner = line.owner;
         let arrives = line.deliver(now, &mut chunk);
         match chunk.from {
-            End::Device => match owner {
-                _ if !arrives => {}
-                Owner::Gateway(port) => self.engine_input(Input::PortBytes { port, bytes: &chunk.bytes }),
-                Owner::Controller(port) => {
-                    self.controller_input(ControllerInput::PortBytes { port, bytes: &chunk.bytes });
+            End::Device if !arrives => {}
+            End::Device if matches!(line.chunking, Chunking::Gathered(_)) => {
+                if line.gathered.is_empty() {
+                    // Behind everything else that arrives at this instant.
+                    self.queue.push(now, Due::Gathered { line: id });
                 }
-            },
+                line.gathered.append(&mut chunk.bytes);
+            }
+            End::Device => self.port_receives(owner, &chunk.bytes),
             End::Port => {
                 let mut answers = Vec::new();
                 if arrives {
@@ -426,6 +438,13 @@ impl Cell {
                     self.transmit(id, End::Device, &answer);
                 }
             }
+        }
+    }
+
+    fn port_receives(&mut self, owner: Owner, bytes: &[u8]) {
+        match owner {
+            Owner::Gateway(port) => self.engine_input(Input::PortBytes { port, bytes }),
+            Owner::Controller(port) => self.controller_input(ControllerInput::PortBytes { port, bytes }),
         }
     }
 

@@ -116,6 +116,7 @@ impl Cell {
     /// The port's adapter is pulled out: its owner is told.
     pub fn unplug(&mut self, line: LineId) {
         self.cut(line);
+        self.lines[line.0].gathered.clear();
         self.port_input(self.lines[line.0].owner, false);
     }
 
@@ -135,14 +136,16 @@ impl Cell {
         self.buses[bus.0].connected = true;
     }
 
-    /// The port's CAN controller goes bus-off; its waiting frames are lost.
+    /// The port's CAN controller goes bus-off: its waiting frames are lost, and it hears nothing.
     pub fn bus_off(&mut self, bus: BusId) {
         self.buses[bus.0].drop_port_frames();
+        self.buses[bus.0].is_off = true;
         self.bus_state(bus, BusState::BusOff);
     }
 
     /// It has recovered.
     pub fn bus_on(&mut self, bus: BusId) {
+        self.buses[bus.0].is_off = false;
         self.bus_state(bus, BusState::Active);
     }
 

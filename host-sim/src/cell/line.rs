@@ -18,6 +18,9 @@ pub enum Chunking {
     Pieces(usize),
     /// In pieces of 1 to so many bytes.
     Random(usize),
+    /// As a USB adapter does: what the device has sent lies in a buffer, which is handed over at each
+    /// multiple of this time.
+    Gathered(Duration),
 }
 
 /// How the two ends are joined.
@@ -66,6 +69,8 @@ pub struct Line {
     collision: (Instant, Instant),
     heard: VecDeque<(Instant, Vec<u8>)>,
     pub(super) keep_heard: usize,
+    /// What has been gathered and not been handed over.
+    pub(super) gathered: Vec<u8>,
     rng: Rng,
 }
 
@@ -106,6 +111,7 @@ impl Line {
             collision: (Instant::ZERO, Instant::ZERO),
             heard: VecDeque::new(),
             keep_heard: MAX_HEARD,
+            gathered: Vec::new(),
             rng,
         }
     }
@@ -159,11 +165,15 @@ impl Line {
         while at < bytes.len() {
             let left = bytes.len() - at;
             let len = match self.chunking {
-                Chunking::Whole => left,
+                Chunking::Whole | Chunking::Gathered(_) => left,
                 Chunking::Pieces(len) => len.clamp(1, left),
                 Chunking::Random(most) => (self.rng.between(1, most.max(1) as u64) as usize).min(left),
             };
-            let arrival = start + self.settings.time_on_line(at + len);
+            let mut arrival = start + self.settings.time_on_line(at + len);
+            if let (Chunking::Gathered(every), End::Device) = (self.chunking, from) {
+                let every = every.as_micros().max(1);
+                arrival = Instant::from_micros(arrival.as_micros().div_ceil(every) * every);
+            }
             let bytes_of = bytes[at..at + len].to_vec();
             let is_first = at == 0;
             at += len;

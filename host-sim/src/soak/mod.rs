@@ -185,7 +185,8 @@ fn attach_stations(cell: &mut Cell, config: &GatewayConfig, level: Level, rng: &
         match port.bus {
             Bus::Rs485(_) => {
                 let line = cell.line_of(&port.name);
-                cell.line(line).chunking = match rng.below(4) {
+                cell.line(line).chunking = match rng.below(5) {
+                    2 => Chunking::Gathered(Duration::from_millis(rng.between(1, 16))),
                     0 => Chunking::Pieces(rng.between(1, 16) as usize),
                     1 => Chunking::Random(rng.between(1, 40) as usize),
                     _ => Chunking::Whole,
