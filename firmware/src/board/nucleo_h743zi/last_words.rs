@@ -1,5 +1,5 @@
-//! What a fault or a hang leaves behind for the next start: RAM keeps its contents when the watchdog starts the
-//! board again, and the program then has a log that somebody may read.
+//! What a fault or a hang leaves behind for the next start: RAM keeps its contents when the watchdog
+//! starts the board again, and the program then has a log that somebody may read.
 
 use core::fmt::{self, Write};
 use core::sync::atomic::{AtomicU8, AtomicU32, Ordering};

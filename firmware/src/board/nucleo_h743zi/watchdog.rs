@@ -42,8 +42,7 @@ impl Watchdog {
     }
 }
 
-/// Looks after it from now on: at 400 MHz twelve times a second, on the chip's own clock twice. Only once
-/// there is a time.
+/// Looks after it from now on, twelve times a second. Only once there is a time.
 pub(super) fn look_after(timer: &mut SYST) {
     FED.store(millis(), Ordering::Relaxed);
     timer.set_clock_source(SystClkSource::External);
