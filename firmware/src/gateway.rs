@@ -61,7 +61,7 @@ impl Gateway {
             links: Vec::new(),
             output: RefCell::new([0; OUTPUT_BUFFER]),
             told: Cell::new(Instant::ZERO),
-            deadline: Cell::new(Instant::ZERO),
+            deadline: Cell::new(Instant::NEVER),
             deadline_moved: Notify::new(),
         }
     }
@@ -131,8 +131,12 @@ impl Gateway {
     }
 
     /// One input, and everything that follows from it.
+    ///
+    /// Only a tick takes the engine past a deadline: when nobody had the time to look, what is heard late
+    /// was not silent, and what else arrived before the tick has not been told yet.
     pub fn input(&self, input: Input<'_>) {
-        self.input_at(now(), input);
+        let deadline = self.deadline.get().as_micros();
+        self.input_at(now().min(Instant::from_micros(deadline.saturating_sub(1))), input);
     }
 
     /// The same, of something that happened at `at`, or a little later when the engine has been told a
@@ -183,14 +187,14 @@ impl Gateway {
 
     /// Calls the engine whenever it asked to be called. The engine's own task.
     pub async fn keep_time(&self, pulse: &Pulse) -> ! {
-        self.input(Input::Tick);
+        self.input_at(now(), Input::Tick);
         loop {
             let until = embassy_time::Instant::from_micros(self.deadline.get().as_micros());
             match pulse.idle(pin!(select(Timer::at(until), self.deadline_moved.notified()))).await {
                 Either::First(()) => {
                     // What arrived before this moment is told first: it may not be overdue.
                     yield_now().await;
-                    self.input(Input::Tick);
+                    self.input_at(now(), Input::Tick);
                 }
                 Either::Second(()) => {}
             }

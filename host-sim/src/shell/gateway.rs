@@ -85,7 +85,7 @@ impl Gateway {
             links: links.iter().map(|(id, ..)| (*id, Rc::default())).collect(),
             port_names: config.ports.iter().map(|port| port.name.as_str().to_owned()).collect(),
             engine: RefCell::new(engine),
-            deadline: Cell::new(Instant::ZERO),
+            deadline: Cell::new(Instant::NEVER),
             told: Cell::new(Instant::ZERO),
             deadline_moved: Notify::new(),
         });
@@ -142,6 +142,7 @@ impl Core {
     async fn keep_time(&self) -> Result<(), StartError> {
         let clock = |error| StartError::new(format!("timerfd: {error}"));
         let timer = Timer::new().map_err(clock)?;
+        self.tell(now(), Input::Tick);
         loop {
             timer.arm(self.deadline.get()).map_err(clock)?;
             tokio::select! {
@@ -149,7 +150,7 @@ impl Core {
                     expired.map_err(clock)?;
                     // What arrived before this moment is told first: it may not be overdue.
                     tokio::task::yield_now().await;
-                    self.input(Input::Tick);
+                    self.tell(now(), Input::Tick);
                 }
                 () = self.deadline_moved.notified() => {}
             }
@@ -181,9 +182,17 @@ impl Core {
         self.input_at(now(), input);
     }
 
-    /// The same, of something that happened at `at`, or a little later when the engine has been told
-    /// a later time already.
+    /// The same, of something that happened at `at`.
+    ///
+    /// Only a tick takes the engine past a deadline: when nobody had the time to look, what is heard late
+    /// was not silent, and what else arrived before the tick has not been told yet.
     fn input_at(&self, at: Instant, input: Input<'_>) {
+        let deadline = self.deadline.get().as_micros();
+        self.tell(at.min(Instant::from_micros(deadline.saturating_sub(1))), input);
+    }
+
+    /// At `at`, or a little later when the engine has been told a later time already.
+    fn tell(&self, at: Instant, input: Input<'_>) {
         let at = at.max(self.told.get());
         self.told.set(at);
         trace!(?input, "in");
@@ -367,5 +376,52 @@ impl Endpoint {
             Self::Tcp { host, port } | Self::Udp { host, port } => return format!("{host}:{port}"),
         };
         address.map_or_else(|_| String::new(), |address| address.to_string())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tokio::task::LocalSet;
+
+    use super::*;
+    use crate::config::file::{Text, parse_gateway};
+    use proto_core::engine::PortCounters;
+    use proto_core::time::Duration;
+
+    const IDLE_GAP: Duration = Duration::from_millis(5);
+    const PORT: PortId = PortId(0);
+
+    /// A gateway whose timer never gets a turn, and its port's counters after these pieces, each told late.
+    fn told_late(pieces: &[&[u8]]) -> PortCounters {
+        let folder = tempfile::tempdir().unwrap();
+        let toml = include_str!("../../configs/rs485-system.toml");
+        let overrides = ["port.rs485-1.idle_gap_ms=5".to_owned()];
+        let config = parse_gateway(Text { name: "rs485-system.toml", toml }, &overrides).unwrap();
+        let bind = format!("rs485-1=pty:{}", folder.path().join("line").display()).parse().unwrap();
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        LocalSet::new().block_on(&runtime, async move {
+            let gateway = Gateway::open(&config, &[bind]).await.unwrap();
+            let core = gateway.core;
+            core.tell(now(), Input::Tick);
+            core.port_event(PORT, PortEvent::Up);
+            for piece in pieces {
+                core.port_event(PORT, PortEvent::Bytes(piece));
+                std::thread::sleep(std::time::Duration::from_micros(2 * IDLE_GAP.as_micros()));
+            }
+            let engine = core.engine.borrow();
+            *engine.port_counters(PORT).unwrap()
+        })
+    }
+
+    #[test]
+    fn bytes_that_are_told_late_do_not_make_a_silence() {
+        let counters = told_late(&[&[0xFF, 0xFF, 1], &[0xEE, 0xEE]]);
+        assert_eq!((counters.frames_in, counters.discarded_bytes, counters.resync_bytes), (1, 0, 0));
+    }
+
+    #[test]
+    fn a_frame_behind_a_part_of_one_is_found() {
+        let counters = told_late(&[&[0xFF, 0xFF, 1], &[0xFF, 0xFF, 1, 0xEE, 0xEE]]);
+        assert_eq!((counters.frames_in, counters.resync_bytes), (1, 3));
     }
 }

@@ -142,6 +142,12 @@ pub(crate) enum Cable {
     Plugged,
 }
 
+/// No silence ends a frame here, since a busy machine makes silences that no line has. QEMU hands a UART
+/// one byte at a time, and may be stopped between two: by the guest's own clock tens of milliseconds passed
+/// within a frame that was sent at once. A pseudoterminal's bytes are moved by a worker of the kernel, which
+/// the gateway preempts in the middle of a frame.
+const IDLE_GAP_MS: u32 = 1_000;
+
 /// How a gateway is started.
 pub(crate) struct Plan<'a> {
     pub(crate) case: &'a Case,
@@ -216,6 +222,9 @@ impl<'a> Plan<'a> {
                 "udp2011" => {}
                 name => overrides.push(format!("controller.ports.{name}={port}")),
             }
+        }
+        for port in ports(&config, |bus| matches!(bus, Bus::Rs485(_))) {
+            overrides.push(format!("port.{port}.idle_gap_ms={IDLE_GAP_MS}"));
         }
         overrides.extend(self.sets.iter().cloned());
         overrides

@@ -163,13 +163,13 @@ impl Shared {
                 result => result,
             };
             // What was on its way when the sender gave the connection up is lost with it.
-            let mut was_reset = false;
             let mut state = self.lock();
+            let was_held = state.is_pulled;
             while state.is_pulled && !state.has_ended {
-                was_reset |= matches!(from.take_error(), Ok(Some(_)));
-                state = self.changed.wait_timeout(state, TURN).unwrap().0;
+                state = self.changed.wait(state).unwrap();
             }
             drop(state);
+            let was_reset = was_held && matches!(from.take_error(), Ok(Some(_)));
             match len {
                 Ok(len @ 1..) if !was_reset => {
                     if to.write_all(&piece[..len]).is_err() {

@@ -26,9 +26,6 @@ pub(crate) struct Qemu {
 
 /// The host as the guest sees it.
 const HOST: &str = "10.0.2.2";
-/// QEMU hands a UART one byte at a time, and a busy host may stop it between two: by the guest's own clock
-/// tens of milliseconds passed within a frame that was sent at once. No silence ends a frame here.
-const IDLE_GAP_MS: u32 = 1_000;
 /// The board's stack (firmware/boards/mps2-an500/memory.x), and what it is filled with at the start.
 const STACK: u64 = 0x2030_0000;
 const STACK_SIZE: u64 = 1 << 20;
@@ -96,11 +93,7 @@ fn listens(bus: &Bus) -> bool {
 fn make_image(plan: &Plan<'_>, image: &Path) {
     let mut command = Command::new(env!("CARGO_BIN_EXE_host-sim"));
     command.arg("image").arg(plan.file()).arg("-o").arg(image);
-    let mut overrides = plan.overrides(HOST, &plan.server_ports());
-    for port in ports(&plan.config(), |bus| matches!(bus, Bus::Rs485(_))) {
-        overrides.push(format!("port.{port}.idle_gap_ms={IDLE_GAP_MS}"));
-    }
-    for value in overrides {
+    for value in plan.overrides(HOST, &plan.server_ports()) {
         command.arg("--set").arg(value);
     }
     let output = command.output().unwrap();
