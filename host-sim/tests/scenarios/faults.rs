@@ -64,11 +64,15 @@ fn cable(case: &Case) {
     let mut device = gateway.line("rs485-1");
     pose_and_output(&robot, &mut device, &pose_frame(4));
     gateway.cable(Cable::Pulled);
+    let mut frames = 6;
     until("both links are given up", || {
         device.send(&DO1_ON);
+        frames += 1;
         let is_up = [Link::Modbus, Link::State].map(|link| gateway.link(link).is_up);
         (is_up == [false; 2]).then_some(())
     });
+    // None of them is still on the line.
+    gateway.until_frames_in("rs485-1", frames);
     gateway.cable(Cable::Plugged);
     gateway.until_up(Link::Modbus, 2);
     gateway.until_up(Link::State, 2);
