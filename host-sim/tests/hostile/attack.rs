@@ -22,11 +22,15 @@ pub(crate) struct Attack {
 #[derive(Default)]
 pub(crate) struct Shared {
     stop: AtomicBool,
+    pause: AtomicBool,
     done: AtomicU64,
 }
 
 impl Shared {
     fn goes_on(&self) -> bool {
+        while self.pause.load(Ordering::Relaxed) && !self.stop.load(Ordering::Relaxed) {
+            std::thread::sleep(Duration::from_millis(1));
+        }
         !self.stop.load(Ordering::Relaxed)
     }
 
@@ -48,6 +52,16 @@ impl Attack {
         };
         let threads = (0..threads).map(begin).collect();
         Self { shared, threads }
+    }
+
+    /// It holds what it has and does nothing for a while.
+    pub(crate) fn pause(&self) {
+        self.shared.pause.store(true, Ordering::Relaxed);
+    }
+
+    /// It goes on.
+    pub(crate) fn resume(&self) {
+        self.shared.pause.store(false, Ordering::Relaxed);
     }
 
     /// Connections made, bytes or datagrams sent: what the attack counts itself by.

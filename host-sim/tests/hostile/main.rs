@@ -48,29 +48,54 @@ impl Scene {
         self.quiet = self.witnesses.lap(QUIET);
     }
 
-    /// Lets attacks go on for a while: the clients get what they got before, and once everything an attack
-    /// can take has been taken, it gets no more. Then the process is told to end, and does, while they go on.
-    /// What it counted until then comes back.
+    /// Lets attacks go on until there was a stretch of time in which the clients got what they got before, and
+    /// the attacks got no memory. Then the process is told to end, and does, while they go on. What it counted
+    /// until then comes back.
     #[track_caller]
     fn survives(self, attacks: Vec<Attack>) -> Value {
-        let warm = self.witnesses.lap(WARM_UP);
-        let before = self.process.usage();
-        let lap = self.witnesses.lap(ATTACK);
-        let after = self.process.usage();
-        let done: Vec<_> = attacks.iter().map(Attack::done).collect();
-        // Seen when the test fails, or with --nocapture.
-        println!("quiet  {}\nwarm   {warm}\nattack {lap}\n{before:?}\n{after:?}\ndone {done:?}", self.quiet);
-        assert!(done.iter().all(|&done| done > 5), "an attack that did nothing: {done:?}");
-        lap.is_like(&self.quiet);
-        within_bounds(&before);
-        within_bounds(&after);
-        assert!(after.rss_kib <= before.rss_kib + MOST_GROWTH_KIB, "{before:?} grew to {after:?}");
+        self.witnesses.lap(WARM_UP);
+        let mut quiet = None;
+        in_some_stretch(|| {
+            let before = self.process.usage();
+            let lap = self.witnesses.lap(ATTACK);
+            let after = self.process.usage();
+            let done: Vec<_> = attacks.iter().map(Attack::done).collect();
+            // Seen when the test fails, or with --nocapture.
+            println!("quiet  {}\nattack {lap}\n{before:?}\n{after:?}\ndone {done:?}", self.quiet);
+            within_bounds(&after);
+            if done.iter().any(|&done| done <= 5) {
+                return Err(format!("an attack that did nothing: {done:?}"));
+            }
+            if after.rss_kib > before.rss_kib + MOST_GROWTH_KIB {
+                return Err(format!("{before:?} grew to {after:?}"));
+            }
+            lap.is_like(quiet.as_ref().unwrap_or(&self.quiet)).inspect_err(|_| {
+                // Perhaps the machine has more to do than before.
+                attacks.iter().for_each(Attack::pause);
+                quiet = Some(self.witnesses.lap(QUIET).at_least(&self.quiet));
+                attacks.iter().for_each(Attack::resume);
+                self.witnesses.lap(WARM_UP);
+            })
+        });
         let stats = self.process.stats();
         drop(self.witnesses);
         self.process.end();
         drop(attacks);
         stats
     }
+}
+
+/// Other load of the machine comes and goes. What an attack takes it takes all the time.
+#[track_caller]
+fn in_some_stretch(mut look: impl FnMut() -> Result<(), String>) {
+    let mut found = Ok(());
+    for _ in 0..MOST_STRETCHES {
+        found = look();
+        if found.is_ok() {
+            return;
+        }
+    }
+    found.unwrap();
 }
 
 /// For a quiet machine: `HOST_SIM_MINUTES=10 cargo test --test hostile -- --ignored --nocapture`.
@@ -95,10 +120,10 @@ fn everything_at_once_for_a_long_time() {
         let lap = witnesses.lap(Duration::from_secs(60));
         let now = usage();
         println!("minute {minute}: {lap}\n{now:?}");
-        lap.is_like(&quiet);
+        lap.is_like(&quiet).unwrap();
         for (before, now) in first.get_or_insert(now).iter().zip(&now) {
             within_bounds(now);
-            assert!(now.rss_kib <= before.rss_kib + MOST_GROWTH_KIB, "{before:?} grew to {now:?}");
+            assert!(now.rss_kib <= before.rss_kib + 4 * MOST_GROWTH_KIB, "{before:?} grew to {now:?}");
         }
     }
     println!(
@@ -126,5 +151,6 @@ const ATTACK: Duration = Duration::from_millis(500);
 /// docs/devices.md section 7.
 const MOST_RSS_KIB: u64 = 64 << 10;
 const MOST_DESCRIPTORS: usize = 400;
-/// The allocator's way with the same amounts again.
-const MOST_GROWTH_KIB: u64 = 2 << 10;
+/// In a stretch: the allocator's way with the same amounts again.
+const MOST_GROWTH_KIB: u64 = 512;
+const MOST_STRETCHES: usize = 12;
