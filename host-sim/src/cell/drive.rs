@@ -417,10 +417,11 @@ impl Cell {
         let arrives = line.deliver(now, &mut chunk);
         match chunk.from {
             End::Device if !arrives => {}
-            End::Device if matches!(line.chunking, Chunking::Gathered(_)) => {
+            End::Device if let Chunking::Gathered(every) = line.chunking => {
                 if line.gathered.is_empty() {
-                    // Behind everything else that arrives at this instant.
-                    self.queue.push(now, Due::Gathered { line: id });
+                    let every = every.as_micros().max(1);
+                    let at = Instant::from_micros(now.as_micros().div_ceil(every) * every);
+                    self.queue.push(at, Due::Gathered { line: id });
                 }
                 line.gathered.append(&mut chunk.bytes);
             }

@@ -166,6 +166,13 @@ impl Cell {
         self.controller_mut().restart(now);
     }
 
+    /// The controller comes back with software that speaks this dialect.
+    pub fn replace_controller(&mut self, dialect: &str) {
+        let now = self.now;
+        self.trace.add(now, What::Fault, u64::MAX, dialect.as_bytes());
+        self.controller_mut().replace_software(now, dialect);
+    }
+
     /// The gateway loses its power and starts again: its connections are reset, its counters
     /// begin afresh.
     pub fn restart_gateway(&mut self) {

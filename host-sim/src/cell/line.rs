@@ -169,11 +169,7 @@ impl Line {
                 Chunking::Pieces(len) => len.clamp(1, left),
                 Chunking::Random(most) => (self.rng.between(1, most.max(1) as u64) as usize).min(left),
             };
-            let mut arrival = start + self.settings.time_on_line(at + len);
-            if let (Chunking::Gathered(every), End::Device) = (self.chunking, from) {
-                let every = every.as_micros().max(1);
-                arrival = Instant::from_micros(arrival.as_micros().div_ceil(every) * every);
-            }
+            let arrival = start + self.settings.time_on_line(at + len);
             let bytes_of = bytes[at..at + len].to_vec();
             let is_first = at == 0;
             at += len;

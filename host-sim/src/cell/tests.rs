@@ -185,3 +185,60 @@ fn every_kind_of_trouble_and_the_cell_is_whole_again() {
     }
     assert_eq!(kinds.into_iter().collect::<Vec<_>>(), TroubleKind::ALL);
 }
+
+#[test]
+fn an_adapter_gathers_what_the_device_sends_and_hands_it_over_at_once() {
+    let mut cell = cell("rs485-system", 1);
+    cell.run_ms(500);
+    let line = cell.line_of("rs485-1");
+    cell.line(line).chunking = Chunking::Gathered(Duration::from_millis(16));
+    let begin = cell.now();
+    let past = Duration::from_micros(begin.as_micros() % 16_000);
+    cell.run(Duration::from_micros(16_000 - past.as_micros()));
+    cell.send(line, &DO1);
+    cell.send(line, &DO1);
+    cell.run(Duration::from_micros(15_999));
+    assert_eq!(cell.port("rs485-1").bytes_in, 0, "it lies in the adapter");
+    cell.keep_trace(100);
+    cell.run(Duration::from_micros(1));
+    let received: Vec<usize> = {
+        let entries = cell.trace().entries().iter();
+        entries.filter(|entry| entry.what == What::PortReceived).map(|entry| entry.bytes.len()).collect()
+    };
+    assert_eq!(received, [10]);
+    cell.send(line, &DO1);
+    cell.run_ms(1);
+    cell.unplug(line);
+    cell.plug_in(line);
+    cell.run_ms(50);
+    assert_eq!(cell.port("rs485-1").frames_in, 2, "what was in the adapter went with it");
+}
+
+#[test]
+fn a_bus_off_controller_hears_nothing() {
+    let mut cell = cell("can-system", 1);
+    cell.run_ms(500);
+    let bus = cell.bus_of("can-1");
+    let frame = CanFrame::new(CanId::Standard(1), &[3]).unwrap();
+    cell.bus_off(bus);
+    cell.send_can(bus, frame);
+    cell.run_ms(10);
+    assert_eq!(cell.port("can-1").frames_in, 0);
+    cell.bus_on(bus);
+    cell.send_can(bus, frame);
+    cell.run_ms(10);
+    assert_eq!(cell.port("can-1").frames_in, 1);
+}
+
+#[test]
+fn a_controller_of_another_dialect_takes_the_place_of_the_one_before() {
+    let mut cell = cell("rs485-system", 1);
+    cell.run_ms(500);
+    cell.replace_controller("v2.6");
+    assert_eq!(cell.controller().dialect(), "v2.6");
+    cell.run(Duration::from_secs(30));
+    let line = cell.line_of("rs485-1");
+    cell.send(line, &DO1);
+    cell.run_ms(50);
+    assert_eq!(cell.value("DO[1]"), 1.0, "values go through all the same");
+}

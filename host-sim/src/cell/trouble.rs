@@ -9,6 +9,7 @@ use std::collections::BTreeMap;
 use proto_core::engine::LinkId;
 use proto_core::modbus::Exception;
 use proto_core::time::{Duration, Instant};
+use proto_core::wire::dialect::Dialect;
 
 use super::network::{Network, Way};
 use super::rng::Rng;
@@ -52,13 +53,15 @@ pub enum TroubleKind {
     BusOff,
     /// The controller is switched off and on.
     ControllerRestart,
+    /// The controller comes back with software that speaks another dialect.
+    Dialect,
     /// The gateway is switched off and on.
     GatewayRestart,
 }
 
 impl TroubleKind {
     /// All of them.
-    pub const ALL: [Self; 18] = [
+    pub const ALL: [Self; 19] = [
         Self::Refused,
         Self::BlackHole,
         Self::Reset,
@@ -76,6 +79,7 @@ impl TroubleKind {
         Self::Unplugged,
         Self::BusOff,
         Self::ControllerRestart,
+        Self::Dialect,
         Self::GatewayRestart,
     ];
 }
@@ -101,6 +105,7 @@ impl TroubleKind {
             Self::Unplugged => "adapter pulled out",
             Self::BusOff => "bus-off",
             Self::ControllerRestart => "controller restart",
+            Self::Dialect => "controller of another dialect",
             Self::GatewayRestart => "gateway restart",
         }
     }
@@ -120,6 +125,7 @@ enum Remedy {
     PlugIn(LineId),
     MendBus(BusId),
     BusOn(BusId),
+    Dialect(&'static str),
 }
 
 /// Breaks and mends.
@@ -300,6 +306,16 @@ impl Trouble {
                 cell.restart_controller();
                 None
             }
+            TroubleKind::Dialect => {
+                let before = cell.controller().dialect();
+                // One at a time, or the remedies would bring back the wrong one.
+                if self.remedies.iter().any(|(_, remedy)| matches!(remedy, Remedy::Dialect(_))) {
+                    return None;
+                }
+                let others = Dialect::NAMES.into_iter().filter(|name| *name != before);
+                cell.replace_controller(pick(rng, others)?);
+                Some(Remedy::Dialect(before))
+            }
             TroubleKind::GatewayRestart => {
                 cell.restart_gateway();
                 None
@@ -329,6 +345,7 @@ fn apply(cell: &mut Cell, remedy: Remedy, networks: &BTreeMap<LinkId, Network>) 
         Remedy::PlugIn(line) => cell.plug_in(line),
         Remedy::MendBus(bus) => cell.mend_bus(bus),
         Remedy::BusOn(bus) => cell.bus_on(bus),
+        Remedy::Dialect(name) => cell.replace_controller(name),
     }
 }
 

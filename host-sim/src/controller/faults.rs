@@ -4,6 +4,7 @@
 
 use proto_core::modbus::Exception;
 use proto_core::time::{Duration, Instant};
+use proto_core::wire::dialect::Dialect;
 use proto_core::wire::state::OperationMode;
 
 use super::machine::Machine;
@@ -147,6 +148,23 @@ impl Controller {
             self.arm_shown = None;
         }
         self.machine = Machine::booting(now, mode(&self.config));
+    }
+}
+
+/// Another version of the controller's software.
+impl Controller {
+    /// The name of the dialect that it speaks.
+    pub fn dialect(&self) -> &'static str {
+        self.dialect.name
+    }
+
+    /// Its software is replaced by one that speaks this dialect: it restarts. Nothing happens when
+    /// no dialect has this name.
+    pub fn replace_software(&mut self, now: Instant, dialect: &str) {
+        if let Some(dialect) = Dialect::named(dialect) {
+            self.dialect = dialect;
+            self.restart(now);
+        }
     }
 }
 
