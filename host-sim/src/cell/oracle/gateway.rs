@@ -30,7 +30,7 @@ impl Oracle {
             self.write_refused_again();
         }
         let given_up = self.modbus.tick(now);
-        self.write_again(given_up, now);
+        self.write_again(given_up);
         self.orders.tick(now);
     }
 
@@ -51,7 +51,7 @@ impl Oracle {
         match link {
             LinkId::MODBUS => {
                 let given_up = self.modbus.lost();
-                self.write_again(given_up, Instant::ZERO);
+                self.write_again(given_up);
                 self.write_refused_again();
             }
             LinkId::COMMAND => self.orders.lost(),
@@ -62,12 +62,12 @@ impl Oracle {
     }
 
     /// Safe values whose write came to nothing wait again, if they still stand.
-    pub(super) fn write_again(&mut self, vars: Vec<SysVar>, now: Instant) {
+    pub(super) fn write_again(&mut self, vars: Vec<SysVar>) {
         for var in vars {
             let safe = self.sheet.owned[var.ordinal()].and_then(|owned| owned.safe);
             let known = &mut self.up.known[var.ordinal()];
             if let (true, true, Some(safe)) = (known.safe, known.waiting.is_empty(), safe) {
-                known.waiting.push_back((safe, now));
+                known.waiting.push_back((safe, known.safe_at));
                 self.up.waits |= 1 << var.ordinal();
             }
         }
@@ -75,7 +75,7 @@ impl Oracle {
 
     pub(super) fn write_refused_again(&mut self) {
         let refused = std::mem::take(&mut self.refused);
-        self.write_again(refused, Instant::ZERO);
+        self.write_again(refused);
         self.again_at = Instant::NEVER;
     }
 

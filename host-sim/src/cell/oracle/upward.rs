@@ -29,6 +29,8 @@ pub(super) struct Known {
     pub live: bool,
     /// It stands at its safe value.
     pub safe: bool,
+    /// Since when: a safe value that is written again is as old as it was.
+    pub safe_at: Instant,
     /// The state stream has shown it since its owner fell silent, or ever.
     pub read_back: bool,
 }
@@ -135,6 +137,7 @@ impl Upward {
             known.waiting.push_back((safe, now));
             known.value = Some((safe, known.value.map_or(now, |value| value.1)));
             known.safe = true;
+            known.safe_at = now;
         } else {
             let waited = known.waiting.len() as u32;
             known.waiting.clear();
