@@ -96,6 +96,9 @@ fn a_replay_shows_what_happened() {
     let replay = text(&host_sim(&["--cell", "rs485-system", "--replay", "9@2.5", "--trace"]), 0);
     assert!(replay.contains("port receives") && replay.contains("gateway sends up"), "{replay}");
     assert!(replay.ends_with("all invariants held up to 2.501000 s\n"), "{replay}");
+    assert!(replay.contains("coils from 192 = ") && replay.contains("a state packet"), "{replay}");
+    let begins = |line: &str| line.contains("fault") && line.contains("begins: ");
+    assert!(replay.lines().any(begins), "{replay}");
     let quiet = text(&host_sim(&["--cell", "rs485-system", "--replay", "9@2.5"]), 0);
     assert_eq!(quiet.lines().count(), 3, "{quiet}");
 }

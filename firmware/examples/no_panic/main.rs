@@ -78,7 +78,9 @@ mod image {
     #[cortex_m_rt::entry]
     fn main() -> ! {
         super::exercise();
-        loop {}
+        loop {
+            cortex_m::asm::nop();
+        }
     }
 
     #[panic_handler]

@@ -5,7 +5,7 @@ use proto_core::time::Duration;
 
 use super::drive::Due;
 use super::network::{Connection, Door, Peer, Way};
-use super::{BusId, Cell, LineId, Owner, What};
+use super::{BusId, Cell, Entry, LineId, Owner, What};
 
 /// Faults of the network.
 impl Cell {
@@ -78,6 +78,11 @@ impl Cell {
     fn set_door(&mut self, link: LinkId, door: Door) {
         self.note(link);
         self.gate(link).door = door;
+    }
+
+    /// Words for whoever reads the trace.
+    pub(super) fn remark(&mut self, words: std::fmt::Arguments<'_>) {
+        self.trace.remark(self.now, words);
     }
 
     fn note(&mut self, link: LinkId) {
@@ -162,21 +167,21 @@ impl Cell {
     /// The controller is switched off and on: see [`crate::controller::Controller::restart`].
     pub fn restart_controller(&mut self) {
         let now = self.now;
-        self.trace.add(now, What::Fault, u64::MAX, &[]);
+        self.trace.add(now, What::Fault, Entry::CONTROLLER, &[]);
         self.controller_mut().restart(now);
     }
 
     /// The controller comes back with software that speaks this dialect.
     pub fn replace_controller(&mut self, dialect: &str) {
         let now = self.now;
-        self.trace.add(now, What::Fault, u64::MAX, dialect.as_bytes());
+        self.trace.add(now, What::Fault, Entry::CONTROLLER, dialect.as_bytes());
         self.controller_mut().replace_software(now, dialect);
     }
 
     /// The gateway loses its power and starts again: its connections are reset, its counters
     /// begin afresh.
     pub fn restart_gateway(&mut self) {
-        self.trace.add(self.now, What::Fault, u64::MAX - 1, &[]);
+        self.trace.add(self.now, What::Fault, Entry::GATEWAY, &[]);
         let conns: Vec<(u64, Peer)> = self.conns.iter().map(|(&id, conn)| (id, conn.peer)).collect();
         for gate in self.gates.values_mut() {
             gate.set_open(false);

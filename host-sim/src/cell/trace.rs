@@ -34,6 +34,8 @@ pub enum What {
     ControllerPortReceived,
     /// A fault began or ended.
     Fault,
+    /// What a fault is, in words; no part of the digest.
+    Remark,
 }
 
 /// One entry.
@@ -45,8 +47,15 @@ pub struct Entry {
     pub what: What,
     /// Of which link, port or connection.
     pub subject: u64,
-    /// The bytes; a CAN frame's id (4 bytes, big-endian) and data.
+    /// The bytes; a CAN frame's id (4 bytes, big-endian) and data; a remark's words.
     pub bytes: Vec<u8>,
+}
+
+impl Entry {
+    /// The subject of a fault of the controller.
+    pub const CONTROLLER: u64 = u64::MAX;
+    /// The subject of a fault of the gateway.
+    pub const GATEWAY: u64 = u64::MAX - 1;
 }
 
 /// The record of a run.
@@ -97,6 +106,14 @@ impl Trace {
         self.mix(u64::from_le_bytes(last));
         if self.entries.len() < self.limit {
             self.entries.push(Entry { at, what, subject, bytes: bytes.to_vec() });
+        }
+    }
+
+    /// Words beside what happened. The digest does not know of them.
+    pub(super) fn remark(&mut self, at: Instant, words: std::fmt::Arguments<'_>) {
+        if self.entries.len() < self.limit {
+            let bytes = words.to_string().into_bytes();
+            self.entries.push(Entry { at, what: What::Remark, subject: 0, bytes });
         }
     }
 

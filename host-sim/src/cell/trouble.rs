@@ -135,7 +135,7 @@ pub struct Trouble {
     kinds: Vec<TroubleKind>,
     pause: Duration,
     next: Instant,
-    remedies: Vec<(Instant, Remedy)>,
+    remedies: Vec<(Instant, TroubleKind, Remedy)>,
     counts: BTreeMap<TroubleKind, u64>,
     /// What the networks are like without faults.
     networks: BTreeMap<LinkId, Network>,
@@ -179,7 +179,8 @@ impl Trouble {
 
     /// Mends everything that is broken at present.
     pub fn mend(&mut self, cell: &mut Cell) {
-        for (_, remedy) in std::mem::take(&mut self.remedies) {
+        for (_, kind, remedy) in std::mem::take(&mut self.remedies) {
+            cell.remark(format_args!("ends: {}", kind.name()));
             apply(cell, remedy, &self.networks);
         }
     }
@@ -187,7 +188,8 @@ impl Trouble {
     fn poll(&mut self, cell: &mut Cell) {
         let now = cell.now();
         while let Some(nth) = self.remedies.iter().position(|remedy| remedy.0 <= now) {
-            let (_, remedy) = self.remedies.remove(nth);
+            let (_, kind, remedy) = self.remedies.remove(nth);
+            cell.remark(format_args!("ends: {}", kind.name()));
             apply(cell, remedy, &self.networks);
         }
         if now >= self.next {
@@ -196,6 +198,7 @@ impl Trouble {
                 && self.begin(cell, kind).is_some()
             {
                 *self.counts.entry(kind).or_default() += 1;
+                cell.remark(format_args!("begins: {}", kind.name()));
             }
         }
     }
@@ -309,7 +312,7 @@ impl Trouble {
             TroubleKind::Dialect => {
                 let before = cell.controller().dialect();
                 // One at a time, or the remedies would bring back the wrong one.
-                if self.remedies.iter().any(|(_, remedy)| matches!(remedy, Remedy::Dialect(_))) {
+                if self.remedies.iter().any(|(.., remedy)| matches!(remedy, Remedy::Dialect(_))) {
                     return None;
                 }
                 let others = Dialect::NAMES.into_iter().filter(|name| *name != before);
@@ -323,7 +326,7 @@ impl Trouble {
         };
         if let Some(remedy) = remedy {
             let until = cell.now() + self.rng.up_to(self.pause);
-            self.remedies.push((until, remedy));
+            self.remedies.push((until, kind, remedy));
         }
         Some(())
     }
