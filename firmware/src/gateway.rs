@@ -61,7 +61,7 @@ impl Gateway {
             links: Vec::new(),
             output: RefCell::new([0; OUTPUT_BUFFER]),
             told: Cell::new(Instant::ZERO),
-            deadline: Cell::new(Instant::NEVER),
+            deadline: Cell::new(Instant::ZERO),
             deadline_moved: Notify::new(),
         }
     }
@@ -71,6 +71,8 @@ impl Gateway {
     /// # Errors
     /// What the engine cannot run.
     pub fn configure(&mut self, config: &GatewayConfig) -> Result<(), BuildError> {
+        // Not so in `idle`, which is all zeros and takes no flash.
+        self.deadline.set(Instant::NEVER);
         put_idle(self.engine.get_mut());
         self.configure_in_place(config)
     }
