@@ -103,6 +103,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             watches_bits: false,
             timer_at: Instant::ZERO,
             rearm: true,
+            sleeps: 0,
         }
     }
 
@@ -131,7 +132,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     }
 
     fn clear(&mut self) {
-        let Self { store, ports, bindings, safe_values, links, watches_bits, timer_at, rearm } = self;
+        let Self { store, ports, bindings, safe_values, links, watches_bits, timer_at, rearm, sleeps } = self;
         *store = Store::new();
         ports.clear();
         bindings.inputs.clear();
@@ -145,6 +146,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         *watches_bits = false;
         *timer_at = Instant::ZERO;
         *rearm = true;
+        *sleeps = 0;
     }
 
     fn build(&mut self, config: &GatewayConfig) -> Result<(), BuildError> {

@@ -29,8 +29,11 @@ pub struct PortCounters {
     pub tail_mismatches: u32,
     /// Bytes dropped while looking for a frame (D19).
     pub resync_bytes: u32,
-    /// Bytes of partial frames discarded after silence (D19).
+    /// Bytes of partial frames discarded after silence (D19), and bytes that waited while the gateway
+    /// itself slept.
     pub discarded_bytes: u32,
+    /// Chunks of bytes, or CAN frames, discarded because they waited while the gateway itself slept.
+    pub asleep: u32,
     /// Accepted frames in which reserved bits were masked (D22).
     pub masked: u32,
     /// Bit values that were replaced by newer ones because the queue of edges was full.
@@ -75,6 +78,11 @@ pub struct LinkCounters {
     pub refused: u32,
     /// Answers, frames and packets that made no sense.
     pub malformed: u32,
+    /// Values received that were not finite: they are unknown until a readable one comes.
+    pub unreadable: u32,
+    /// Connections reset because the peer's transport had not acknowledged what was handed over by
+    /// the time after which it must not be delivered.
+    pub unacknowledged: u32,
     /// Bytes dropped while looking for a frame.
     pub resync_bytes: u32,
     /// Microseconds from the newest request to its answer.

@@ -1,5 +1,6 @@
 //! What goes into the engine and what comes out of it.
 
+use crate::config::MAX_PORTS;
 use crate::recipe::can::CanFrame;
 use crate::time::Instant;
 
@@ -22,12 +23,25 @@ impl LinkId {
     pub const MODBUS: Self = Self(2);
     /// The controller's UDP recipe server.
     pub const RECIPE_UDP: Self = Self(3);
+    /// Port 2000 once more, for commands that stop the robot (D26).
+    pub const URGENT: Self = Self(FIRST_PORT + MAX_PORTS as u8);
 
     /// The link of a listening port.
     pub const fn of_port(port: PortId) -> Self {
-        Self(port.0.saturating_add(4))
+        Self(port.0.saturating_add(FIRST_PORT))
+    }
+
+    /// The listening port that the link belongs to.
+    pub const fn port(self) -> Option<PortId> {
+        match self.0.checked_sub(FIRST_PORT) {
+            Some(port) if self.0 < Self::URGENT.0 => Some(PortId(port)),
+            _ => None,
+        }
     }
 }
+
+/// Links of listening ports are numbered from here on.
+const FIRST_PORT: u8 = 4;
 
 /// What a link is, and so what the driver opens for it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -35,6 +49,8 @@ impl LinkId {
 pub enum LinkKind {
     /// TCP to the controller's command port.
     Command,
+    /// A second connection to the controller's command port, for commands that stop the robot.
+    Urgent,
     /// TCP to the controller's state port.
     State,
     /// TCP to the controller's Modbus port.
@@ -58,6 +74,7 @@ impl LinkKind {
     pub const fn name(self) -> &'static str {
         match self {
             Self::Command => "command",
+            Self::Urgent => "urgent",
             Self::State => "state",
             Self::Modbus => "modbus",
             Self::RecipeUdp => "udp2011",
@@ -153,12 +170,23 @@ pub enum Input<'a> {
         /// The bytes.
         bytes: &'a [u8],
     },
-    /// Everything that was handed over for sending was taken by the transport.
+    /// Everything that was handed over for sending was taken by the transport, which has room for
+    /// more. It says nothing about delivery.
     LinkSent {
         /// The link.
         link: LinkId,
     },
-    /// Nothing but the passing of time.
+    /// How much of what was handed over to a TCP link, since it came up, the peer's transport has not
+    /// acknowledged. To be reported before bytes that arrived, and at least every 20 ms while the
+    /// number changes; never of a datagram link.
+    LinkAcked {
+        /// The link.
+        link: LinkId,
+        /// Bytes, those that the driver itself still holds included.
+        left: u32,
+    },
+    /// Time has passed, and everything that arrived before has been told: the only input that lets
+    /// deadlines pass.
     Tick,
 }
 
@@ -185,7 +213,8 @@ pub enum Output<'a> {
         /// The link.
         link: LinkId,
     },
-    /// Close a link and report nothing more of it.
+    /// Close a link at once and report nothing more of it. Of TCP, with a reset: what the peer has not
+    /// acknowledged must not be delivered later.
     LinkClose {
         /// The link.
         link: LinkId,
@@ -197,19 +226,9 @@ pub enum Output<'a> {
         /// The bytes.
         bytes: &'a [u8],
     },
-    /// Nothing more to do before this instant; [`Instant::NEVER`] when only an input can change that.
+    /// Nothing more to do before this instant.
     Sleep {
-        /// When to call again at the latest.
+        /// When to tell [`Input::Tick`] at the latest; [`Instant::NEVER`] without a configuration.
         until: Instant,
     },
-}
-
-impl LinkId {
-    /// The listening port that the link belongs to.
-    pub const fn port(self) -> Option<PortId> {
-        match self.0.checked_sub(4) {
-            Some(port) => Some(PortId(port)),
-            None => None,
-        }
-    }
 }

@@ -75,6 +75,8 @@ pub struct Engine<const PORTS: usize = 8, const UPLINKS: usize = 4, const FIELDS
     timer_at: Instant,
     /// The clock was looked at since `timer_at` was worked out.
     rearm: bool,
+    /// Times the gateway slept.
+    sleeps: u32,
 }
 
 impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS, UPLINKS, FIELDS> {
@@ -147,7 +149,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
                 self.links.sent(link);
                 self.arm(self.links.deadline_of(link));
             }
-            Input::Tick => {}
+            Input::LinkAcked { .. } | Input::Tick => {}
         }
     }
 
@@ -232,6 +234,18 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     /// The links that the configuration needs.
     pub fn links(&self) -> impl Iterator<Item = LinkInfo<'_>> + '_ {
         self.links.infos()
+    }
+
+    /// Whether a datagram is a frame of the link's output part: what a listening UDP link's driver
+    /// asks before it answers another sender than so far.
+    pub fn is_frame(&self, link: LinkId, datagram: &[u8]) -> bool {
+        self.links.recipes.iter().any(|other| other.id == link && other.is_frame(datagram))
+    }
+
+    /// How often the gateway itself slept: it was not called for so long that nothing of what waited
+    /// for it could be believed any more. Wraps.
+    pub fn sleeps(&self) -> u32 {
+        self.sleeps
     }
 
     /// Something depends on the clock from `at` on.

@@ -174,6 +174,11 @@ impl Uplink {
         Some(len)
     }
 
+    /// Whether a datagram is a frame of the output part.
+    pub(super) fn is_frame(&self, bytes: &[u8]) -> bool {
+        self.output.as_ref().is_some_and(|layout| datagram(layout, bytes).is_ok())
+    }
+
     /// When the link wants to send by itself.
     pub(super) fn deadline(&self) -> Instant {
         if self.busy { Instant::NEVER } else { self.greet_at }

@@ -56,6 +56,8 @@ pub enum LinkState {
         /// Since when.
         since: Instant,
     },
+    /// Not opened: the peer takes no second connection, and another link does its work.
+    Shared,
 }
 
 impl LinkState {
@@ -65,6 +67,7 @@ impl LinkState {
             Self::Down { .. } => "down",
             Self::Opening { .. } => "opening",
             Self::Up { .. } => "up",
+            Self::Shared => "shared",
         }
     }
 }
@@ -146,7 +149,7 @@ impl Supervisor {
     /// The driver reports that the link is gone or could not be opened. True when it was up.
     pub fn down(&mut self, now: Instant) -> bool {
         let was = self.state;
-        if !matches!(was, LinkState::Down { .. }) {
+        if !matches!(was, LinkState::Down { .. } | LinkState::Shared) {
             self.fall(now);
         }
         matches!(was, LinkState::Up { .. })
@@ -159,9 +162,23 @@ impl Supervisor {
 
     /// The engine gives the link up: what the peer sends makes no sense, or nothing.
     pub fn give_up(&mut self, now: Instant) {
-        if !matches!(self.state, LinkState::Down { .. }) {
+        if !matches!(self.state, LinkState::Down { .. } | LinkState::Shared) {
             self.fall(now);
             self.action = Some(LinkAction::Close);
+        }
+    }
+
+    /// Another link does this one's work from now on.
+    pub fn share(&mut self, now: Instant) {
+        self.give_up(now);
+        self.state = LinkState::Shared;
+    }
+
+    /// The link does its own work again; it is opened at once.
+    pub fn unshare(&mut self, now: Instant) {
+        if self.state == LinkState::Shared {
+            self.state = LinkState::Down { retry_at: now };
+            self.backoff = self.timings.backoff_min;
         }
     }
 
@@ -195,6 +212,7 @@ impl Supervisor {
             LinkState::Down { retry_at } => retry_at,
             LinkState::Opening { until } => until,
             LinkState::Up { .. } => self.silent_at(),
+            LinkState::Shared => Instant::NEVER,
         }
     }
 

@@ -17,7 +17,7 @@ use crate::recipe::model::{CanId, MAX_CAN_DATA};
 use crate::time::Instant;
 
 /// The first bytes of every recording; the last one is the format's version.
-pub const MAGIC: [u8; 4] = *b"RGR\x01";
+pub const MAGIC: [u8; 4] = *b"RGR\x02";
 
 /// Longest [`Entry::Totals`].
 pub const MAX_TOTALS: usize = 3072;
@@ -113,6 +113,7 @@ mod tag {
     pub(super) const LINK_BYTES: u8 = 0x18;
     pub(super) const LINK_SENT: u8 = 0x19;
     pub(super) const TICK: u8 = 0x1A;
+    pub(super) const LINK_ACKED: u8 = 0x1B;
 
     pub(super) const SLEEP: u8 = 0x20;
     pub(super) const PORT_SEND: u8 = 0x21;
@@ -178,6 +179,7 @@ impl Head {
             Input::LinkDown { link } => (tag::LINK_DOWN, link.0),
             Input::LinkBytes { link, .. } => (tag::LINK_BYTES, link.0),
             Input::LinkSent { link } => (tag::LINK_SENT, link.0),
+            Input::LinkAcked { link, .. } => (tag::LINK_ACKED, link.0),
             Input::Tick => (tag::TICK, 0),
         };
         self.tag(tag).number(at.as_micros()).byte(subject);
@@ -191,6 +193,10 @@ impl Head {
                     BusState::Passive => 2,
                     BusState::BusOff => 3,
                 });
+                &[]
+            }
+            Input::LinkAcked { left, .. } => {
+                self.number(left.into());
                 &[]
             }
             _ => &[],
@@ -302,6 +308,9 @@ impl<'a> Reader<'a> {
             tag::LINK_DOWN => Input::LinkDown { link: self.link()? },
             tag::LINK_BYTES => Input::LinkBytes { link: self.link()?, bytes: self.bytes()? },
             tag::LINK_SENT => Input::LinkSent { link: self.link()? },
+            tag::LINK_ACKED => {
+                Input::LinkAcked { link: self.link()?, left: u32::try_from(self.number()?).ok()? }
+            }
             tag::TICK => self.byte().map(|_| Input::Tick)?,
             _ => return None,
         })

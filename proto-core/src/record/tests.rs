@@ -29,6 +29,7 @@ fn entries() -> Vec<Entry<'static>> {
         Input::LinkDown { link: LINK },
         Input::LinkBytes { link: LINK, bytes: &[0; 1468] },
         Input::LinkSent { link: LINK },
+        Input::LinkAcked { link: LINK, left: u32::MAX },
         Input::Tick,
     ];
     let outputs = [
