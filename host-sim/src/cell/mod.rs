@@ -35,8 +35,10 @@ mod oracle;
 mod queue;
 mod recording;
 mod rng;
+mod sleep;
 #[cfg(test)]
 mod tamper;
+mod tcp;
 mod trace;
 mod traffic;
 mod trouble;
@@ -118,6 +120,8 @@ struct Client {
     link: Option<LinkId>,
     is_tcp: bool,
     conn: Option<u64>,
+    /// Which socket it sends datagrams from.
+    socket: u64,
 }
 
 /// The cell.
@@ -138,6 +142,10 @@ pub struct Cell {
     buses: Vec<CanBus>,
     names: BTreeMap<String, Far>,
     controller_names: BTreeMap<String, Far>,
+    /// What waits for the gateway while it is not called.
+    asleep: Option<sleep::Waiting>,
+    wakes_at: Instant,
+    stalls: u64,
     rng: Rng,
     trace: Trace,
     recorder: Option<Recorder>,
@@ -199,6 +207,9 @@ impl Cell {
             buses: Vec::new(),
             names: BTreeMap::new(),
             controller_names: BTreeMap::new(),
+            asleep: None,
+            wakes_at: START,
+            stalls: 0,
             rng: Rng::new(seed),
             trace: Trace::new(),
             recorder,
@@ -274,12 +285,12 @@ impl Cell {
                 SimBus::UdpServer => continue,
                 SimBus::TcpClient { to } => {
                     let link = self.listener(to, true);
-                    self.clients.insert(nth, Client { link, is_tcp: true, conn: None });
+                    self.clients.insert(nth, Client { link, is_tcp: true, conn: None, socket: 0 });
                     continue;
                 }
                 SimBus::UdpClient { to } => {
                     let link = self.listener(to, false);
-                    self.clients.insert(nth, Client { link, is_tcp: false, conn: None });
+                    self.clients.insert(nth, Client { link, is_tcp: false, conn: None, socket: 0 });
                     continue;
                 }
             };

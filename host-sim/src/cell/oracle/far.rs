@@ -10,12 +10,13 @@ use super::wire::Asked;
 use super::{Invariant, Oracle};
 
 impl Oracle {
-    pub(in crate::cell) fn sent(&mut self, conn: u64, bytes: &[u8]) {
+    pub(in crate::cell) fn sent(&mut self, conn: u64, _link: LinkId, bytes: &[u8]) {
         self.controller.sent(conn, bytes);
     }
 
-    pub(in crate::cell) fn sent_datagram(&mut self, link: LinkId, bytes: &[u8]) {
+    pub(in crate::cell) fn sent_datagram(&mut self, link: LinkId, bytes: &[u8]) -> u64 {
         self.controller.sent_datagram(u64::from(link.0), bytes);
+        0
     }
 
     pub(in crate::cell) fn conn_gone(&mut self, conn: u64) {
@@ -43,7 +44,7 @@ impl Oracle {
                     }
                 }
             }
-            LinkId::COMMAND | LinkId::STATE => {}
+            LinkId::COMMAND | LinkId::URGENT | LinkId::STATE => {}
             _ => {
                 let Some(frame) = self.sheet.link(link).and_then(|link| link.input.clone()) else { return };
                 let mut held = std::mem::take(self.controller.held(conn));
@@ -62,6 +63,7 @@ impl Oracle {
     pub(in crate::cell) fn arrived_datagram(
         &mut self,
         link: LinkId,
+        _tag: u64,
         bytes: &[u8],
         before: &[u8],
         after: &[u8],

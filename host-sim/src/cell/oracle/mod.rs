@@ -277,7 +277,7 @@ impl Oracle {
             Input::LinkDown { link } => self.link_lost(link),
             Input::LinkBytes { link, bytes } if self.up.is_up(link) => self.link_bytes(link, bytes, now),
             Input::LinkSent { link } => self.links[place(link)].busy = false,
-            Input::LinkBytes { .. } | Input::Tick => {}
+            Input::LinkBytes { .. } | Input::LinkAcked { .. } | Input::Tick => {}
         }
         if told.is_some() {
             self.look_at_links(engine, None);
