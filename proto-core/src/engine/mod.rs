@@ -225,7 +225,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
                     self.rearm = false;
                     self.timer_at = self.deadline();
                 }
-                Output::Sleep { until: self.timer_at.min(self.beat_at) }
+                let beat_at = if self.ports.is_empty() { Instant::NEVER } else { self.beat_at };
+                Output::Sleep { until: self.timer_at.min(beat_at) }
             }
         }
     }
@@ -247,8 +248,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             if self.now != Instant::ZERO && now.saturating_since(self.now) > ASLEEP {
                 self.wake(now);
             }
-            let is_idle = self.ports.is_empty();
-            self.beat_at = if is_idle { Instant::NEVER } else { now + HEARTBEAT };
+            self.beat_at = now + HEARTBEAT;
         }
         self.now = now;
         now
