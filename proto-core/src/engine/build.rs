@@ -104,6 +104,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             timer_at: Instant::ZERO,
             rearm: true,
             now: Instant::ZERO,
+            is_late: false,
             beat_at: Instant::ZERO,
             sleeps: 0,
             is_deaf: false,
@@ -146,6 +147,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             timer_at,
             rearm,
             now,
+            is_late,
             beat_at,
             sleeps,
             is_deaf,
@@ -165,6 +167,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         *timer_at = Instant::ZERO;
         *rearm = true;
         *now = Instant::ZERO;
+        *is_late = false;
         *beat_at = Instant::ZERO;
         *sleeps = 0;
         *is_deaf = false;

@@ -95,6 +95,9 @@ pub struct Engine<const PORTS: usize = 8, const UPLINKS: usize = 4, const FIELDS
     rearm: bool,
     /// The newest instant that was told.
     now: Instant,
+    /// A deadline has come and its tick has not been told: what is too old may still wait, so nothing
+    /// is sent before that.
+    is_late: bool,
     /// Whoever is not called until [`ASLEEP`] after the call before was asleep; this sees to a call.
     beat_at: Instant,
     /// Times the gateway slept.
@@ -111,6 +114,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     /// Inputs for a port or link that the configuration does not have are ignored.
     pub fn handle(&mut self, now: Instant, input: Input<'_>) {
         let now = self.present(now);
+        self.is_late = now >= self.timer_at && !matches!(input, Input::Tick);
         // Whatever happens may set an earlier deadline; what it makes later is found out in time.
         match input {
             Input::PortBytes { port: id, bytes } => {
@@ -198,13 +202,16 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         }
     }
 
-    /// What the driver has to do next; call it again until it is [`Output::Sleep`].
+    /// What the driver has to do next; call it again until it is [`Output::Sleep`]. Nothing is sent
+    /// between a deadline and the [`Input::Tick`] that lets it pass.
     ///
-    /// What brings field values to the controller comes first, then what keeps links up, then what
-    /// goes to the field.
+    /// What stops the robot comes first, then what brings field values to the controller, then what
+    /// keeps links up, then what goes to the field.
     pub fn poll_output<'b>(&mut self, now: Instant, buf: &'b mut [u8; OUTPUT_BUFFER]) -> Output<'b> {
         let now = now.min(LAST).max(self.now);
-        if let Some((link, len)) = self.links.next_upward(&mut self.store, &mut self.ports, &mut buf[..], now)
+        if !self.is_late
+            && let Some((link, len)) =
+                self.links.next_upward(&mut self.store, &mut self.ports, &mut buf[..], now)
         {
             self.arm(self.links.deadline_of(link));
             return Output::LinkSend { link, bytes: buf.get(..len).unwrap_or(&[]) };
@@ -215,7 +222,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
                 LinkAction::Close => Output::LinkClose { link },
             };
         }
-        match self.next_downward(&mut buf[..], now) {
+        let downward = if self.is_late { None } else { self.next_downward(&mut buf[..], now) };
+        match downward {
             Some((port, Downward::Bytes(len))) => {
                 Output::PortSend { port, bytes: buf.get(..len).unwrap_or(&[]) }
             }
@@ -378,6 +386,11 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             self.drop_forgotten();
             self.image_changed();
         }
+        self.expire_waiting(now);
+    }
+
+    /// Values that have waited too long are dropped.
+    fn expire_waiting(&mut self, now: Instant) {
         let ports = &mut self.ports;
         self.store.expire_waiting(
             |port, dropped| {
@@ -394,6 +407,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         if accepted.frames == 0 {
             return;
         }
+        self.expire_waiting(now);
         self.arm(self.store.deadline());
         if let Some(command) = &mut self.links.command {
             command.drop_overtaken(&mut self.ports);
