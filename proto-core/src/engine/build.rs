@@ -105,6 +105,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             rearm: true,
             now: Instant::ZERO,
             is_late: false,
+            announced: Instant::ZERO,
             beat_at: Instant::ZERO,
             sleeps: 0,
             is_deaf: false,
@@ -148,6 +149,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             rearm,
             now,
             is_late,
+            announced,
             beat_at,
             sleeps,
             is_deaf,
@@ -168,6 +170,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         *rearm = true;
         *now = Instant::ZERO;
         *is_late = false;
+        *announced = Instant::ZERO;
         *beat_at = Instant::ZERO;
         *sleeps = 0;
         *is_deaf = false;

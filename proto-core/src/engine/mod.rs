@@ -98,6 +98,8 @@ pub struct Engine<const PORTS: usize = 8, const UPLINKS: usize = 4, const FIELDS
     /// A deadline has come and its tick has not been told: what is too old may still wait, so nothing
     /// is sent before that.
     is_late: bool,
+    /// The instant of the newest [`Output::Sleep`]; that of a tick that was not told stands until then.
+    announced: Instant,
     /// Whoever is not called until [`ASLEEP`] after the call before was asleep; this sees to a call.
     beat_at: Instant,
     /// Times the gateway slept.
@@ -114,7 +116,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     /// Inputs for a port or link that the configuration does not have are ignored.
     pub fn handle(&mut self, now: Instant, input: Input<'_>) {
         let now = self.present(now);
-        self.is_late = now >= self.timer_at && !matches!(input, Input::Tick);
+        self.is_late = now >= self.announced;
         // Whatever happens may set an earlier deadline; what it makes later is found out in time.
         match input {
             Input::PortBytes { port: id, bytes } => {
@@ -194,6 +196,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
                 self.arm(self.links.deadline_of(link));
             }
             Input::Tick => {
+                (self.is_late, self.announced) = (false, Instant::NEVER);
                 self.is_deaf &= now < self.deaf_until;
                 if now >= self.timer_at {
                     self.advance(now);
@@ -233,8 +236,11 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
                     self.rearm = false;
                     self.timer_at = self.deadline();
                 }
-                let beat_at = if self.ports.is_empty() { Instant::NEVER } else { self.beat_at };
-                Output::Sleep { until: self.timer_at.min(beat_at) }
+                if self.ports.is_empty() {
+                    return Output::Sleep { until: Instant::NEVER };
+                }
+                self.announced = self.announced.min(self.timer_at).min(self.beat_at);
+                Output::Sleep { until: self.announced }
             }
         }
     }
@@ -336,9 +342,12 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         self.sleeps
     }
 
-    /// Something depends on the clock from `at` on.
+    /// Something depends on the clock from `at` on. What is due already is served before the engine
+    /// sleeps, or at the tick that is late.
     fn arm(&mut self, at: Instant) {
-        self.timer_at = self.timer_at.min(at);
+        if at > self.now {
+            self.timer_at = self.timer_at.min(at);
+        }
     }
 
     fn change_port(&mut self, id: PortId, change: impl FnOnce(&mut FieldPort)) {
@@ -437,11 +446,13 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         if !self.watches_bits {
             return;
         }
+        let mut first = Instant::NEVER;
         for port in &mut self.ports {
             let usable = port.is_usable();
             port.sender.image_changed(&self.store.image, usable, &mut port.counters);
-            self.timer_at = self.timer_at.min(port.deadline());
+            first = first.min(port.deadline());
         }
+        self.arm(first);
     }
 
     /// What goes to the field.
