@@ -114,6 +114,8 @@ pub(super) enum Due {
     Wake {
         turn: u64,
     },
+    /// The model that watches looks at how everything is.
+    Survey,
 }
 
 impl Cell {
@@ -256,8 +258,8 @@ impl Cell {
         }
         if let Some(oracle) = &mut self.oracle {
             match output {
-                Output::Sleep { .. } => {
-                    oracle.rest(now, &self.engine, self.queue.len() + self.conns.len());
+                Output::Sleep { until } => {
+                    oracle.rest(now, &self.engine, until, self.queue.len() + self.conns.len());
                 }
                 _ => oracle.output(now, &output),
             }
@@ -435,6 +437,7 @@ impl Cell {
                 }
             }
             Due::Wake { turn } => self.wake(turn),
+            Due::Survey => self.survey(),
         }
     }
 
@@ -452,6 +455,9 @@ impl Cell {
         } else if gate.partner != Some(from) && self.engine.is_frame(link, bytes) {
             self.gate(link).partner = Some(from);
         }
+        if let Some(oracle) = &mut self.oracle {
+            oracle.spoke(link, from, bytes);
+        }
         if self.gate(link).is_up {
             self.engine_input(Input::LinkBytes { link, bytes });
         }
@@ -467,9 +473,9 @@ impl Cell {
     }
 
     fn datagram_arrived(&mut self, link: LinkId, tag: u64, bytes: &[u8], before: Option<Vec<u8>>) {
-        let after = self.inputs_before();
+        let (after, slowest) = (self.inputs_before(), self.gate(link).network.slowest());
         if let (Some(oracle), Some(before), Some(after)) = (&mut self.oracle, before, after) {
-            oracle.arrived_datagram(link, tag, bytes, &before, &after, self.now);
+            oracle.arrived_datagram(link, tag, bytes, (&before, &after), slowest, self.now);
         }
     }
 

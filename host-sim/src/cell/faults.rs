@@ -123,6 +123,7 @@ impl Cell {
 
     fn note(&mut self, link: LinkId) {
         self.trace.add(self.now, What::Fault, link.0.into(), &[]);
+        self.disturb(Some(link));
     }
 
     fn connection(&mut self, link: LinkId) -> Option<&mut Connection> {
@@ -208,7 +209,7 @@ impl Cell {
         let now = self.now;
         self.trace.add(now, What::Fault, Entry::CONTROLLER, &[]);
         self.controller_mut().restart(now);
-        self.new_sockets();
+        self.begun_anew();
     }
 
     /// The controller loses its power: its ends of all connections are gone without a word, and nobody
@@ -245,8 +246,11 @@ impl Cell {
         self.restart_controller();
     }
 
-    fn new_sockets(&mut self) {
+    fn begun_anew(&mut self) {
         self.clients.values_mut().for_each(|client| client.socket += 1);
+        if let Some(oracle) = &mut self.oracle {
+            oracle.controller_began(self.now);
+        }
     }
 
     /// The controller comes back with software that speaks this dialect.
@@ -254,7 +258,7 @@ impl Cell {
         let now = self.now;
         self.trace.add(now, What::Fault, Entry::CONTROLLER, dialect.as_bytes());
         self.controller_mut().replace_software(now, dialect);
-        self.new_sockets();
+        self.begun_anew();
     }
 
     /// The gateway loses its power and starts again: its connections are reset, its counters
@@ -277,7 +281,7 @@ impl Cell {
             *self.engine = engine;
         }
         if let Some(oracle) = &mut self.oracle {
-            oracle.restarted();
+            oracle.restarted(self.now);
         }
         self.engine_wake = self.now;
         let ports: Vec<_> = self.engine.field_ports().collect();

@@ -36,6 +36,7 @@ mod queue;
 mod recording;
 mod rng;
 mod sleep;
+mod survey;
 #[cfg(test)]
 mod tamper;
 mod tcp;
@@ -146,6 +147,8 @@ pub struct Cell {
     asleep: Option<sleep::Waiting>,
     wakes_at: Instant,
     stalls: u64,
+    /// How many faults each of the controller's servers has at present.
+    ailments: [u32; 3],
     rng: Rng,
     trace: Trace,
     recorder: Option<Recorder>,
@@ -210,6 +213,7 @@ impl Cell {
             asleep: None,
             wakes_at: START,
             stalls: 0,
+            ailments: [0; 3],
             rng: Rng::new(seed),
             trace: Trace::new(),
             recorder,
@@ -229,8 +233,9 @@ impl Cell {
     /// time has passed.
     pub fn watch(&mut self) {
         let mut oracle = Box::new(Oracle::new(&self.gateway));
-        oracle.begin(&self.engine, self.now);
+        oracle.begin(&self.engine, self.engine_wake, self.now);
         self.oracle = Some(oracle);
+        self.queue.push(self.now, Due::Survey);
     }
 
     /// The first invariant that did not hold.

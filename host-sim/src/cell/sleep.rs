@@ -43,6 +43,9 @@ impl Cell {
         self.asleep.get_or_insert_default().turn = turn;
         self.wakes_at = self.wakes_at.max(self.now + span);
         self.queue.push(self.wakes_at, Due::Wake { turn });
+        if let Some(oracle) = &mut self.oracle {
+            oracle.stalled(self.wakes_at, self.now);
+        }
     }
 
     /// Whether the gateway is not called at present.
@@ -56,6 +59,7 @@ impl Cell {
             return;
         }
         let Some(Waiting { ports, links, .. }) = self.asleep.take() else { return };
+        self.disturb(None);
         // A driver looks at its sources in one order or another.
         if self.rng.below(2) == 0 {
             self.tell_ports(ports);

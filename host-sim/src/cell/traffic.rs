@@ -167,19 +167,26 @@ impl Cell {
         let turn = gate.turn;
         match gate.kind {
             LinkKind::RecipeUdp => {
-                let tag = self.oracle.as_mut().map_or(0, |oracle| oracle.sent_datagram(link, &bytes));
+                let slowest = gate.network.slowest();
+                let oracle = self.oracle.as_mut();
+                let tag = oracle.map_or(0, |oracle| oracle.sent_datagram(link, &bytes, slowest, now));
                 let peer = udp_peer(turn);
                 for at in gate.datagram_arrivals(now, Way::Up) {
                     self.queue.push(at, Due::DatagramUp { link, peer, tag, bytes: bytes.clone() });
                 }
             }
             LinkKind::RecipeUdpListen { .. } => {
-                let tag = self.oracle.as_mut().map_or(0, |oracle| oracle.sent_datagram(link, &bytes));
+                let (slowest, partner) = (gate.network.slowest(), gate.partner);
+                let mut tag = 0;
+                if let Some(oracle) = &mut self.oracle {
+                    oracle.answers(link, partner, now);
+                    tag = oracle.sent_datagram(link, &bytes, slowest, now);
+                }
                 let client = self.clients.iter().find(|(_, client)| client.link == Some(link));
                 let arrivals = gate.datagram_arrivals(now, Way::Up);
                 // To somebody else, or to a socket that is gone, it is lost.
                 if let Some((&port, client)) = client
-                    && gate.partner == Some(Speaker::Client { socket: client.socket })
+                    && partner == Some(Speaker::Client { socket: client.socket })
                 {
                     for at in arrivals {
                         self.queue.push(at, Due::ClientDatagramUp { port, tag, bytes: bytes.clone() });
@@ -188,8 +195,9 @@ impl Cell {
             }
             _ => {
                 let Some(id) = gate.conn else { return };
+                let slowest = gate.network.slowest();
                 if let Some(oracle) = &mut self.oracle {
-                    oracle.sent(id, link, &bytes);
+                    oracle.sent(id, link, &bytes, slowest, now);
                 }
                 self.send_item(id, Way::Up, Item::Bytes(bytes));
                 let unacked = self.conns.get(&id).map_or(0, |conn| conn.up.unacked());
@@ -475,9 +483,9 @@ impl Cell {
             Peer::Server(Link::State) => return,
             Peer::Client(port) => ControllerInput::PortBytes { port, bytes },
         });
-        let after = self.inputs_before();
+        let (after, slowest) = (self.inputs_before(), self.gate(link).network.slowest());
         if let (Some(oracle), Some(before), Some(after)) = (&mut self.oracle, before, after) {
-            oracle.arrived(id, link, bytes, &before, &after, self.now);
+            oracle.arrived(id, link, bytes, (&before, &after), slowest, self.now);
         }
     }
 }
