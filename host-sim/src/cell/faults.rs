@@ -299,6 +299,20 @@ impl Cell {
         self.gates.values().filter(move |gate| is_tcp(gate.kind)).map(|gate| gate.id)
     }
 
+    /// The others.
+    pub fn datagram_links(&self) -> impl Iterator<Item = LinkId> + use<> {
+        let is_udp = |kind| matches!(kind, LinkKind::RecipeUdp | LinkKind::RecipeUdpListen { .. });
+        let links: Vec<LinkId> =
+            self.gates.values().filter(|gate| is_udp(gate.kind)).map(|gate| gate.id).collect();
+        links.into_iter()
+    }
+
+    /// The links where the gateway listens for datagrams, and how long the controller's frames are.
+    pub(super) fn listening_for_datagrams(&self) -> Vec<(LinkId, Option<usize>)> {
+        let listen = self.gates.values().filter(|gate| matches!(gate.kind, LinkKind::RecipeUdpListen { .. }));
+        listen.map(|gate| (gate.id, self.frame_len(gate.id))).collect()
+    }
+
     /// Every link.
     pub fn link_ids(&self) -> impl Iterator<Item = LinkId> + '_ {
         self.gates.keys().copied()

@@ -48,6 +48,14 @@ impl Cell {
         }
     }
 
+    /// It is called again now.
+    pub fn wake_gateway(&mut self) {
+        if let Some(turn) = self.asleep.as_ref().map(|waiting| waiting.turn) {
+            self.wakes_at = self.now;
+            self.queue.push(self.now, Due::Wake { turn });
+        }
+    }
+
     /// Whether the gateway is not called at present.
     pub fn is_asleep(&self) -> bool {
         self.asleep.is_some()

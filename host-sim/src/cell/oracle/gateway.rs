@@ -181,14 +181,13 @@ impl Oracle {
             self.up.accepted(&self.sheet, nth, &frame, now);
             self.values_changed();
             newest = Some(frame);
+            // Somebody looks at each frame, or nobody before all are taken.
             if self.sheet.has_triggers {
-                self.orders.drop_overtaken();
+                self.after_frames(now);
             }
         }
         let Some(newest) = newest else { return };
-        self.orders.drop_overtaken();
-        // A safe value that waited when its owner came back may have waited too long.
-        self.up.expire(&self.sheet, now);
+        self.after_frames(now);
         self.ports[nth].down.answered(&self.sheet.ports[nth], frames);
         let waits = self.sheet.links.iter().any(|link| {
             let wants = newest.values.iter().any(|(var, _)| {
@@ -200,6 +199,12 @@ impl Oracle {
         if waits {
             self.ports[nth].counters.withheld += frames;
         }
+    }
+
+    /// What was overtaken is dropped, and what has waited too long.
+    fn after_frames(&mut self, now: Instant) {
+        self.orders.drop_overtaken();
+        self.up.expire(&self.sheet, now);
     }
 
     pub(super) fn port_send(
