@@ -343,7 +343,6 @@ impl Oracle {
             self.checks[invariant as usize] += 1;
         }
         self.checks[Invariant::Edges as usize] += u64::from(var.is_bits());
-        self.checks[Invariant::FalseTimeout as usize] += u64::from(self.after_stall);
         let carried = self.up.wrote(&self.sheet, link, var, raw, now)?;
         self.robot.hands_over(var, raw, carried);
         Ok(())
@@ -436,6 +435,10 @@ impl Oracle {
             commands_dropped: orders.1,
             ..*counters
         };
+        if actual.timeouts > expected.timeouts {
+            let what = format!("port {nth} counted a timeout, and its device was not silent");
+            return Err((Invariant::FalseTimeout, what));
+        }
         if *actual != expected {
             return Err((Invariant::Counted, format!("port {nth} counted {actual:?}, not {expected:?}")));
         }

@@ -220,7 +220,7 @@ pub(super) struct Oracle {
     is_late: bool,
     /// What comes from the field until then waited while the gateway slept.
     deaf_until: Option<Instant>,
-    /// The gateway was not called for a while, but did not sleep.
+    /// The gateway was just not called for a while, but did not sleep.
     after_stall: bool,
     /// Outputs since the newest input, and how many there may be.
     outputs: u32,
@@ -317,6 +317,7 @@ impl Oracle {
         let idle = self.called_at.replace(now).map_or(Duration::ZERO, |at| now.saturating_since(at));
         let has_slept = idle > ASLEEP;
         let is_tick = matches!(input, Input::Tick);
+        self.after_stall = is_tick && !has_slept && self.robot.has_stalled(now);
         self.is_late = !is_tick && now >= self.announced;
         if is_tick {
             self.announced = Instant::NEVER;
@@ -328,6 +329,8 @@ impl Oracle {
             self.slept(now);
         }
         let told = match input {
+            // After sleep, links have been given up before anything is taken.
+            _ if has_slept => None,
             Input::LinkDown { link } | Input::LinkBytes { link, .. } => Some(*link),
             _ => None,
         };
@@ -425,8 +428,10 @@ impl Oracle {
                 }
                 let result = self.count(nth, engine);
                 self.judge(now, &[Invariant::Counted, Invariant::Bytes], result);
+                self.checks[Invariant::FalseTimeout as usize] += u64::from(self.after_stall);
             }
         }
+        self.after_stall = false;
         if !self.is_late {
             let result = self.nothing_waits(now);
             self.judge(now, &[Invariant::Delivered], result);

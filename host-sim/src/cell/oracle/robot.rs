@@ -143,6 +143,11 @@ impl Robot {
         }
     }
 
+    /// Whether the gateway was not called until now.
+    pub(super) fn has_stalled(&self, now: Instant) -> bool {
+        self.stalls.back().is_some_and(|(_, to)| *to == now)
+    }
+
     /// How long the gateway was not called since then.
     fn stalled_since(&self, since: Instant, now: Instant) -> Duration {
         let part = |&(from, to): &(Instant, Instant)| to.min(now).saturating_since(from.max(since));
