@@ -220,12 +220,21 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
         }
     }
 
-    /// The transport took everything.
-    pub(super) fn sent(&mut self, id: LinkId) {
+    /// The transport took everything; when something happens there by itself.
+    pub(super) fn sent(&mut self, id: LinkId) -> Instant {
         match id {
-            LinkId::COMMAND | LinkId::URGENT => self.command.iter_mut().for_each(|link| link.sent(id)),
-            LinkId::MODBUS => self.modbus.iter_mut().for_each(ModbusLink::sent),
-            _ => self.recipe(id).into_iter().for_each(Uplink::sent),
+            LinkId::COMMAND | LinkId::URGENT => {
+                self.command.iter_mut().for_each(|link| link.sent(id));
+                self.deadline_of(id)
+            }
+            LinkId::MODBUS => self.modbus.as_mut().map_or(Instant::NEVER, |link| {
+                link.sent();
+                link.deadline()
+            }),
+            _ => self.recipe(id).map_or(Instant::NEVER, |link| {
+                link.sent();
+                link.deadline()
+            }),
         }
     }
 

@@ -188,8 +188,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
                 }
             }
             Input::LinkSent { link } => {
-                self.links.sent(link);
-                self.arm(self.links.deadline_of(link));
+                let deadline = self.links.sent(link);
+                self.arm(deadline);
             }
             Input::LinkAcked { link, left } => {
                 self.links.acked(link, left);
@@ -416,7 +416,10 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         if accepted.frames == 0 {
             return;
         }
-        self.expire_waiting(now);
+        let deadline = self.store.deadline();
+        if deadline <= now {
+            self.expire_waiting(now);
+        }
         self.arm(self.store.deadline());
         if let Some(command) = &mut self.links.command {
             command.drop_overtaken(&mut self.ports);
