@@ -214,12 +214,12 @@ impl Uplink {
         out: &mut [u8],
         now: Instant,
     ) -> Option<usize> {
-        if !self.supervisor.is_up() || self.busy {
+        if !self.supervisor.is_up() || self.busy || self.flight.is_full() {
             return None;
         }
         let wanted = !store.outbox.dirty().and(&self.writes).is_empty();
         let len = match &self.input {
-            Some(layout) if wanted && !self.flight.is_full() && self.is_ready(store, state, now) => {
+            Some(layout) if wanted && self.is_ready(store, state, now) => {
                 let len = encode(layout, store, out)?;
                 store.taken(&self.writes);
                 if self.repeat_at == Instant::NEVER && !store.unconfirmed.and(&self.writes).is_empty() {
