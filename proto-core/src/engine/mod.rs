@@ -285,7 +285,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     fn drop_forgotten(&mut self) {
         if let Some(command) = &mut self.links.command {
             command.drop_forgotten(&mut self.ports);
-            let deadline = command.deadline_of(LinkId::COMMAND);
+            let deadline = command.deadline();
             self.arm(deadline);
         }
     }
@@ -423,7 +423,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         self.arm(self.store.deadline());
         if let Some(command) = &mut self.links.command {
             command.drop_overtaken(&mut self.ports);
-            let deadline = command.deadline_of(LinkId::COMMAND);
+            let deadline = command.deadline();
             self.arm(deadline);
         }
         self.image_changed();
