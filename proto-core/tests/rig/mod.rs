@@ -236,6 +236,8 @@ pub struct Rig {
     pub engine: Box<Engine>,
     pub now: Instant,
     pub wake: Instant,
+    /// When the engine was called last.
+    pub called: Instant,
     pub map: Map,
     server: Server,
     /// Links that come up as soon as they are opened.
@@ -262,6 +264,7 @@ impl Rig {
             engine: Box::new(engine),
             now: Instant::from_millis(1_000_001),
             wake: Instant::ZERO,
+            called: Instant::ZERO,
             map,
             server: Server::new(),
             reachable: (0..16).collect(),
@@ -282,6 +285,7 @@ impl Rig {
     /// One input, and everything that follows from it at this instant.
     pub fn input(&mut self, input: Input<'_>) {
         self.engine.handle(self.now, input);
+        self.called = self.now;
         if self.logs_ticks && matches!(input, Input::Tick) {
             self.log.push((self.now, Out::Tick));
         }
