@@ -311,6 +311,9 @@ impl CommandLink {
                 session.supervisor.give_up(now);
                 self.lost(link, ports, now);
             }
+        }
+        // What becomes of the first may open the second at once.
+        for link in [LinkId::COMMAND, LinkId::URGENT] {
             self.supervise(link, ports, now);
         }
         while let Some(&waiting) = self.queue.front()
