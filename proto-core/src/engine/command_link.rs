@@ -204,7 +204,11 @@ impl CommandLink {
             self.lost(link, ports, now);
         }
         match (link, ordinary, urgent) {
-            (LinkId::URGENT, LinkState::Up { .. }, Some(LinkState::Opening { .. } | LinkState::Up { .. })) => {
+            (
+                LinkId::URGENT,
+                LinkState::Up { .. },
+                Some(LinkState::Opening { .. } | LinkState::Up { .. }),
+            ) => {
                 self.strike(ports, now);
             }
             (LinkId::COMMAND, LinkState::Up { .. }, Some(LinkState::Up { since }))
@@ -307,6 +311,9 @@ impl CommandLink {
                 session.supervisor.give_up(now);
                 self.lost(link, ports, now);
             }
+        }
+        // What becomes of the first may open the second at once.
+        for link in [LinkId::COMMAND, LinkId::URGENT] {
             self.supervise(link, ports, now);
         }
         while let Some(&waiting) = self.queue.front()

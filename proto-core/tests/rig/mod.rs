@@ -5,7 +5,9 @@ use std::collections::BTreeSet;
 
 use heapless::{String, Vec as Bounded};
 use proto_core::config::*;
-use proto_core::engine::{Engine, Input, LinkId, OUTPUT_BUFFER, Output, PortCounters, PortId};
+use proto_core::engine::{
+    Engine, Input, LinkId, LinkInfo, LinkKind, OUTPUT_BUFFER, Output, PortCounters, PortId,
+};
 use proto_core::modbus::adu::MAX_ADU;
 use proto_core::modbus::server::{RegisterBank, Server};
 use proto_core::modbus::{Coils, Exception, Registers};
@@ -226,12 +228,16 @@ pub enum Out {
     Open(LinkId),
     Close(LinkId),
     Link(LinkId, Vec<u8>),
+    /// Nothing: a tick was told, and deadlines passed. Only where a test asks for it.
+    Tick,
 }
 
 pub struct Rig {
     pub engine: Box<Engine>,
     pub now: Instant,
     pub wake: Instant,
+    /// When the engine was called last.
+    pub called: Instant,
     pub map: Map,
     server: Server,
     /// Links that come up as soon as they are opened.
@@ -242,8 +248,10 @@ pub struct Rig {
     pub modbus_answers: bool,
     /// Whether ports and links report at once that everything was sent.
     pub reports_sent: bool,
-    /// Whether the controller's TCP acknowledges at once.
+    /// Whether the controller's TCP acknowledges at once what has left.
     pub acknowledges: bool,
+    /// Whether ticks stand in the log.
+    pub logs_ticks: bool,
     /// Everything handed over since the last look.
     pub log: Vec<(Instant, Out)>,
 }
@@ -256,6 +264,7 @@ impl Rig {
             engine: Box::new(engine),
             now: Instant::from_millis(1_000_001),
             wake: Instant::ZERO,
+            called: Instant::ZERO,
             map,
             server: Server::new(),
             reachable: (0..16).collect(),
@@ -263,6 +272,7 @@ impl Rig {
             modbus_answers: true,
             reports_sent: true,
             acknowledges: true,
+            logs_ticks: false,
             log: Vec::new(),
         };
         let ports: Vec<_> = rig.engine.field_ports().collect();
@@ -275,6 +285,10 @@ impl Rig {
     /// One input, and everything that follows from it at this instant.
     pub fn input(&mut self, input: Input<'_>) {
         self.engine.handle(self.now, input);
+        self.called = self.now;
+        if self.logs_ticks && matches!(input, Input::Tick) {
+            self.log.push((self.now, Out::Tick));
+        }
         self.drain();
         if matches!(input, Input::Tick) {
             assert!(self.wake > self.now, "asked to be called at once again: {:?}", self.wake);
@@ -310,7 +324,7 @@ impl Rig {
     }
 
     #[track_caller]
-    pub fn link(&self, id: LinkId) -> proto_core::engine::LinkInfo<'_> {
+    pub fn link(&self, id: LinkId) -> LinkInfo<'_> {
         self.engine.links().find(|link| link.id == id).expect("the plan needs this link")
     }
 
@@ -376,20 +390,22 @@ impl Rig {
                 self.engine.handle(self.now, Input::LinkUp { link });
             }
             Out::Open(link) => self.engine.handle(self.now, Input::LinkDown { link }),
-            Out::Close(_) => {}
             Out::Port(port, _) | Out::Can(port, _) if self.reports_sent => {
                 self.engine.handle(self.now, Input::PortSent { port });
             }
             Out::Link(link, bytes) => {
-                if link == LinkId::MODBUS && self.modbus_answers {
-                    let answer = self.answer(&bytes);
-                    self.engine.handle(self.now, Input::LinkBytes { link, bytes: &answer });
-                }
                 if self.reports_sent {
                     self.engine.handle(self.now, Input::LinkSent { link });
                 }
-                if self.acknowledges {
+                let is_tcp = |info: &LinkInfo<'_>| {
+                    !matches!(info.kind, LinkKind::RecipeUdp | LinkKind::RecipeUdpListen { .. })
+                };
+                if self.reports_sent && self.acknowledges && is_tcp(&self.link(link)) {
                     self.engine.handle(self.now, Input::LinkAcked { link, left: 0 });
+                }
+                if link == LinkId::MODBUS && self.modbus_answers {
+                    let answer = self.answer(&bytes);
+                    self.engine.handle(self.now, Input::LinkBytes { link, bytes: &answer });
                 }
             }
             _ => {}
