@@ -350,6 +350,18 @@ impl Rig {
         })
     }
 
+    /// What was handed over to one link since the last call of this kind, and how many milliseconds
+    /// after `since`.
+    pub fn sent_after(&mut self, link: LinkId, since: Instant) -> Vec<(u64, Vec<u8>)> {
+        let sent = |entry: &(Instant, Out)| match entry {
+            (at, Out::Link(to, bytes)) if *to == link => Some((*at, bytes.clone())),
+            _ => None,
+        };
+        let all: Vec<_> = self.log.iter().filter_map(sent).collect();
+        self.log.retain(|entry| sent(entry).is_none());
+        all.into_iter().map(|(at, bytes)| (at.saturating_since(since).as_millis(), bytes)).collect()
+    }
+
     /// When links were closed since the last call of this kind.
     pub fn closed(&mut self) -> Vec<(Instant, LinkId)> {
         let closed = |&(at, ref out): &(Instant, Out)| match out {
