@@ -350,6 +350,34 @@ impl Rig {
         })
     }
 
+    /// What was handed over to one link since the last call of this kind, and how many milliseconds
+    /// after `since`.
+    pub fn sent_after(&mut self, link: LinkId, since: Instant) -> Vec<(u64, Vec<u8>)> {
+        let sent = |entry: &(Instant, Out)| match entry {
+            (at, Out::Link(to, bytes)) if *to == link => Some((*at, bytes.clone())),
+            _ => None,
+        };
+        let all: Vec<_> = self.log.iter().filter_map(sent).collect();
+        self.log.retain(|entry| sent(entry).is_none());
+        all.into_iter().map(|(at, bytes)| (at.saturating_since(since).as_millis(), bytes)).collect()
+    }
+
+    /// When links were closed since the last call of this kind.
+    pub fn closed(&mut self) -> Vec<(Instant, LinkId)> {
+        let closed = |&(at, ref out): &(Instant, Out)| match out {
+            Out::Close(link) => Some((at, *link)),
+            _ => None,
+        };
+        let closings = self.log.iter().filter_map(closed).collect();
+        self.log.retain(|entry| closed(entry).is_none());
+        closings
+    }
+
+    /// The peer's transport has acknowledged all but so many bytes.
+    pub fn acked(&mut self, link: LinkId, left: usize) {
+        self.input(Input::LinkAcked { link, left: left as u32 });
+    }
+
     pub fn take<T>(&mut self, pick: impl Fn(&Out) -> Option<T>) -> Vec<T> {
         let picked = self.log.iter().filter_map(|(_, out)| pick(out)).collect();
         self.log.retain(|(_, out)| pick(out).is_none());
