@@ -32,6 +32,8 @@ pub(super) struct Faults {
     muted_ports: Vec<usize>,
     exception: Option<Exception>,
     state_cut: Option<usize>,
+    /// What commands begin takes this much longer.
+    transitions: Duration,
 }
 
 impl Faults {
@@ -93,6 +95,13 @@ impl Controller {
         self.faults.delay[link as usize] = delay;
     }
 
+    /// What `poweron`, `poweroff`, `enable`, `disable`, `stop` and `pause` begin takes this much
+    /// longer from now on.
+    pub fn delay_transitions(&mut self, by: Duration) {
+        self.faults.transitions = by;
+        self.machine.delay_transitions(by);
+    }
+
     /// Every Modbus request is answered with this exception and not carried out; `None` ends it.
     pub fn answer_modbus_with(&mut self, exception: Option<Exception>) {
         self.faults.exception = exception;
@@ -148,6 +157,7 @@ impl Controller {
             self.arm_shown = None;
         }
         self.machine = Machine::booting(now, mode(&self.config));
+        self.machine.delay_transitions(self.faults.transitions);
     }
 }
 

@@ -54,7 +54,9 @@ impl Controller {
     pub(super) fn advance(&mut self, now: Instant) {
         while let Some(effect) = self.machine.poll(now) {
             self.apply(now, effect);
+            self.settle(now);
         }
+        self.settle(now);
         self.refresh(now);
         if self.running.is_some() {
             self.drive_program(now);

@@ -116,6 +116,7 @@ fn everything() -> SimConfig {
 }
 
 fn apply(cell: &mut Cell, step: Step) {
+    let address = |nth: u8| Ipv4Addr::new(10, 0, 0, nth % 3).into();
     let conn = |kind: u8, nth: u8| ConnId(u64::from(kind) * 100 + u64::from(nth));
     let now = cell.now;
     match step {
@@ -127,9 +128,9 @@ fn apply(cell: &mut Cell, step: Step) {
             cell.input(ControllerInput::ModbusBytes { conn: conn(1, nth), bytes: &bytes });
         }
         Step::Open(kind, nth) => cell.input(match kind {
-            0 => ControllerInput::CommandOpened { conn: conn(0, nth) },
-            1 => ControllerInput::ModbusOpened { conn: conn(1, nth) },
-            _ => ControllerInput::StateOpened { conn: conn(2, nth) },
+            0 => ControllerInput::CommandOpened { conn: conn(0, nth), from: address(nth) },
+            1 => ControllerInput::ModbusOpened { conn: conn(1, nth), from: address(nth) },
+            _ => ControllerInput::StateOpened { conn: conn(2, nth), from: address(nth) },
         }),
         Step::Close(kind, nth) => cell.input(match kind {
             0 => ControllerInput::CommandClosed { conn: conn(0, nth) },

@@ -126,7 +126,7 @@ fn a_restart_closes_everything_and_boots_to_power_off() {
         cell.run_ms(10);
     }
     assert_eq!(states, ["0:0:13:2", "1:0:0:2", "2:0:0:2", "3:0:0:2", "4:0:4:2"]);
-    assert_eq!(cell.ask(c, "poweron"), "poweron success");
+    assert_eq!(cell.order(c, "poweron"), "poweron success");
     // The serial line goes on, the TCP client waits for its connection.
     cell.sent.clear();
     cell.run_ms(4);
