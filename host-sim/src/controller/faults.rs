@@ -10,6 +10,7 @@ use proto_core::wire::state::OperationMode;
 use super::machine::Machine;
 use super::registers::SetError;
 use super::{Controller, ControllerOutput, RecipeError, mode, start_values};
+pub use crate::config::CommandClients;
 use crate::config::InitialTarget;
 
 /// One of the controller's TCP servers.
@@ -28,6 +29,7 @@ pub enum Link {
 pub(super) struct Faults {
     muted: [bool; 3],
     refused: [bool; 3],
+    command_clients: CommandClients,
     delay: [Duration; 3],
     muted_ports: Vec<usize>,
     exception: Option<Exception>,
@@ -37,6 +39,15 @@ pub(super) struct Faults {
 }
 
 impl Faults {
+    /// None but what the configuration asks for.
+    pub(super) fn new(command_clients: CommandClients) -> Self {
+        Self { command_clients, ..Self::default() }
+    }
+
+    pub(super) fn command_clients(&self) -> CommandClients {
+        self.command_clients
+    }
+
     pub(super) fn mutes(&self, link: Link) -> bool {
         self.muted[link as usize]
     }
@@ -82,6 +93,12 @@ impl Controller {
     /// The server takes connections again.
     pub fn accept(&mut self, link: Link) {
         self.faults.refused[link as usize] = false;
+    }
+
+    /// How many clients port 2000 takes from now on. Those that are there stay until the next one
+    /// comes.
+    pub fn command_clients(&mut self, clients: CommandClients) {
+        self.faults.command_clients = clients;
     }
 
     /// The server closes every connection it has.

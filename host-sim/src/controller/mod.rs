@@ -35,7 +35,7 @@ use proto_core::wire::state::{self, OperationMode};
 use crate::config::{InitialTarget, RobotMode, SimConfig};
 pub use counters::{Counters, ServerCounters};
 use faults::Faults;
-pub use faults::Link;
+pub use faults::{CommandClients, Link};
 use machine::Machine;
 use motion::Arm;
 use ports::Port;
@@ -326,7 +326,7 @@ impl Controller {
             server: Server::default(),
             state_grid: Grid::starting_at(Instant::ZERO, STATE_PERIOD),
             epoch: None,
-            faults: Faults::default(),
+            faults: Faults::new(config.robot.command_clients),
             counters: Counters::default(),
             outputs: VecDeque::new(),
             gone: false,

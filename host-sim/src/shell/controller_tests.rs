@@ -258,6 +258,21 @@ fn clients_that_asked_once_make_room_for_the_next_one() {
 }
 
 #[test]
+fn port_2000_takes_as_many_clients_as_the_file_says() {
+    let config = |clients| example("udp-server-controller.toml", &[clients]);
+    let handle = start(config("robot.command_clients=one"), Vec::new()).unwrap();
+    let mut first = connect(&handle, "command");
+    ask(&mut first, b"isprogfinish\n", b"1");
+    assert!(is_closed(&mut connect(&handle, "command")));
+    ask(&mut first, b"isprogfinish\n", b"1");
+    let handle = start(config("robot.command_clients=newest"), Vec::new()).unwrap();
+    let mut first = connect(&handle, "command");
+    ask(&mut first, b"isprogfinish\n", b"1");
+    ask(&mut connect(&handle, "command"), b"isprogfinish\n", b"1");
+    assert!(is_closed(&mut first));
+}
+
+#[test]
 fn shutting_down_over_port_2000_answers_and_ends() {
     let handle = start(example("udp-server-controller.toml", &["robot.power=off"]), Vec::new()).unwrap();
     let mut command = connect(&handle, "command");

@@ -14,7 +14,7 @@ use proto_core::modbus::server::{RegisterBank, Server as ModbusServer};
 use proto_core::modbus::{Coils, Exception, Registers as Words};
 use proto_core::time::Instant;
 
-use super::faults::Link;
+use super::faults::{CommandClients, Link};
 use super::registers::Registers;
 use super::{ConnId, Controller, ControllerOutput, Counters, ServerCounters};
 pub use commands::MAX_ORDERS;
@@ -89,20 +89,10 @@ impl Counters {
 
 impl Controller {
     pub(super) fn opened(&mut self, now: Instant, link: Link, conn: ConnId, from: IpAddr) {
-        let most = match link {
-            Link::Command => MAX_COMMAND_CONNECTIONS,
-            Link::State => MAX_STATE_CONNECTIONS,
-            Link::Modbus => MAX_MODBUS_CONNECTIONS,
-        };
-        let full = self.server.open(link) >= most;
-        let gives = if full { self.server.places.gives(now, link, from, most) } else { None };
-        if self.faults.refuses(link) || full && gives.is_none() {
+        if self.faults.refuses(link) || !self.make_room(now, link, from) {
             self.counters.of(link).refused += 1;
             self.outputs.push_back(ControllerOutput::Close { conn });
             return;
-        }
-        if let Some(idle) = gives {
-            self.displace(link, idle);
         }
         self.server.places.opened(now, link, conn, from);
         match link {
@@ -119,10 +109,31 @@ impl Controller {
         self.counters.of(link).opened += 1;
     }
 
-    fn displace(&mut self, link: Link, conn: ConnId) {
+    /// Whether there is a place for one more. Somebody may have to go for it.
+    fn make_room(&mut self, now: Instant, link: Link, from: IpAddr) -> bool {
+        let open = self.server.open(link);
+        match (link, self.faults.command_clients()) {
+            (Link::Command, CommandClients::RefuseSecond) => return open == 0,
+            (Link::Command, CommandClients::DropFirst) => {
+                self.counters.command.displaced += open as u64;
+                self.server.close_link(link, &mut self.outputs);
+                return true;
+            }
+            _ => {}
+        }
+        let most = match link {
+            Link::Command => MAX_COMMAND_CONNECTIONS,
+            Link::State => MAX_STATE_CONNECTIONS,
+            Link::Modbus => MAX_MODBUS_CONNECTIONS,
+        };
+        if open < most {
+            return true;
+        }
+        let Some(gives) = self.server.places.gives(now, link, from, most) else { return false };
         self.counters.of(link).displaced += 1;
-        self.closed(link, conn);
-        self.outputs.push_back(ControllerOutput::Close { conn });
+        self.closed(link, gives);
+        self.outputs.push_back(ControllerOutput::Close { conn: gives });
+        true
     }
 
     pub(super) fn closed(&mut self, link: Link, conn: ConnId) {

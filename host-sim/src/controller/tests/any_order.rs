@@ -158,7 +158,7 @@ fn apply(cell: &mut Cell, step: Step) {
         Step::Knob(nth) => {
             let link = [Link::Command, Link::State, Link::Modbus][usize::from(nth) % 3];
             let c = &mut cell.controller;
-            match nth % 16 {
+            match nth % 18 {
                 0 => c.mute(link),
                 1 => c.unmute(link),
                 2 => c.refuse(link),
@@ -173,6 +173,12 @@ fn apply(cell: &mut Cell, step: Step) {
                 11 => c.protective_stop(now),
                 12 => c.collide(now, nth),
                 13 | 14 => c.clear_stop(now),
+                15 => c.command_clients(match nth % 3 {
+                    0 => CommandClients::Many,
+                    1 => CommandClients::RefuseSecond,
+                    _ => CommandClients::DropFirst,
+                }),
+                16 => c.delay_transitions(Duration::from_millis(u64::from(nth) * 30)),
                 _ => {
                     let _ = c.assign_recipe(now, 5, (nth > 128).then_some(1));
                 }

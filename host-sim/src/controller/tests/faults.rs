@@ -44,6 +44,52 @@ fn a_refusing_server_closes_what_comes() {
 }
 
 #[test]
+fn port_2000_may_take_one_client_only() {
+    let mut config = with_power(SimConfig::default(), Power::Off);
+    config.robot.command_clients = CommandClients::RefuseSecond;
+    let mut cell = Cell::new(&config);
+    let first = cell.command_client();
+    let second = cell.command_client();
+    assert_eq!(cell.closed, [second]);
+    assert_eq!(cell.ask(second, "state"), "");
+    assert_eq!(cell.order(first, "poweron"), "poweron success");
+    let (m, s) = (cell.modbus_client(), cell.state_client());
+    assert_eq!(cell.modbus(m, &[3, 0, 1, 0, 1]), [3, 2, 0, 5], "the other servers are as they were");
+    cell.modbus_client();
+    cell.input(ControllerInput::CommandClosed { conn: first });
+    let third = cell.command_client();
+    assert_eq!(cell.ask(third, "state"), "5:0:5:2");
+    cell.run_ms(60_000);
+    let fourth = cell.command_client();
+    assert_eq!(cell.closed, [second, fourth], "nor does an idle one make room");
+
+    // Or the newest only: what the first one waits for gets lost with it.
+    cell.controller.command_clients(CommandClients::DropFirst);
+    cell.ask(third, "enable");
+    let fifth = cell.command_client();
+    assert_eq!(cell.closed, [second, fourth, third]);
+    cell.run_ms(200);
+    assert_eq!(cell.ask(fifth, "state"), "6:0:5:2");
+    assert_eq!(cell.take(third), b"");
+    let counters = cell.controller.counters().command;
+    assert_eq!((counters.refused, counters.displaced, counters.open), (2, 1, 1));
+    cell.controller.refuse(Link::Command);
+    let refused = cell.command_client();
+    assert_eq!(cell.closed.last(), Some(&refused), "refused before it could displace anybody");
+    cell.controller.accept(Link::Command);
+
+    // It outlives a restart.
+    cell.controller.restart(cell.now);
+    cell.drain();
+    assert!(cell.closed.ends_with(&[fifth, s, m, ConnId(6)]), "{:?}", cell.closed);
+    let (a, b) = (cell.command_client(), cell.command_client());
+    assert_eq!((cell.ask(a, "isprogfinish").as_str(), cell.ask(b, "isprogfinish").as_str()), ("", "1"));
+    cell.controller.command_clients(CommandClients::Many);
+    let c = cell.command_client();
+    assert_eq!((cell.ask(b, "isprogfinish").as_str(), cell.ask(c, "isprogfinish").as_str()), ("1", "1"));
+}
+
+#[test]
 fn modbus_answers_with_an_exception_and_changes_nothing() {
     let mut cell = Cell::new(&SimConfig::default());
     let m = cell.modbus_client();
