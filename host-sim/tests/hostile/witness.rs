@@ -136,9 +136,17 @@ impl Witnesses {
         socket.connect(at).unwrap();
         socket.send(&[0xFF, 0xFF, 0x01, 0xEE, 0xEE]).unwrap();
         let mut frame = [0; 64];
-        self.watch("udp2011", PacedBy::Process, move || match socket.recv(&mut frame)? {
-            28 if frame[..2] == [0xFF, 0xFF] => Ok(()),
-            count => Err(std::io::Error::other(format!("a frame of {count} bytes"))),
+        let mut count = 0_u32;
+        self.watch("udp2011", PacedBy::Process, move || {
+            // Who is silent for a minute is forgotten.
+            count += 1;
+            if count.is_multiple_of(1_000) {
+                socket.send(&[0xFF, 0xFF, 0x01, 0xEE, 0xEE])?;
+            }
+            match socket.recv(&mut frame)? {
+                28 if frame[..2] == [0xFF, 0xFF] => Ok(()),
+                count => Err(std::io::Error::other(format!("a frame of {count} bytes"))),
+            }
         });
     }
 
