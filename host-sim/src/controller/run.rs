@@ -37,6 +37,10 @@ enum Activity {
     Sending {
         port: usize,
     },
+    /// It has done enough for now.
+    GivingWay {
+        until: Instant,
+    },
 }
 
 impl Running {
@@ -71,7 +75,7 @@ impl Controller {
     pub(super) fn deadline(&self) -> Instant {
         let program = self.running.as_ref().filter(|_| self.machine.program_runs()).and_then(|running| {
             match running.activity {
-                Activity::Waiting { until } => Some(until),
+                Activity::Waiting { until } | Activity::GivingWay { until } => Some(until),
                 Activity::Moving => self.arm.arrival(),
                 Activity::Fresh | Activity::Held { .. } | Activity::Sending { .. } => None,
             }
@@ -312,6 +316,13 @@ impl Controller {
                     Some(Answer::Done)
                 } else {
                     self.begin_activity(Activity::Waiting { until })
+                }
+            }
+            Call::GiveWay { until } => {
+                if now >= *until {
+                    Some(Answer::Done)
+                } else {
+                    self.begin_activity(Activity::GivingWay { until: *until })
                 }
             }
             Call::Log(line) => {

@@ -235,6 +235,12 @@ impl Lap {
         self
     }
 
+    /// Whether nobody waited longer for anything; who did, if somebody did.
+    pub(crate) fn waits_at_most(&self, limit: Duration) -> Result<(), String> {
+        let late = self.clients.iter().find(|(_, (_, _, worst))| *worst > limit);
+        late.map_or(Ok(()), |(name, (_, _, worst))| Err(format!("{name} waited {worst:?}")))
+    }
+
     /// Whether nothing much is missing that there was `before`; what is, if something is. What an attack must
     /// not do is to take the clients' share, which would leave next to nothing of it.
     pub(crate) fn is_like(&self, before: &Self) -> Result<(), String> {

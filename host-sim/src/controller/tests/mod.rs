@@ -8,6 +8,7 @@ mod modbus;
 mod ports;
 mod programs;
 mod room;
+mod slices;
 mod stream;
 mod when_done;
 
