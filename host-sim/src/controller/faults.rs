@@ -9,6 +9,7 @@ use proto_core::wire::state::OperationMode;
 
 use super::machine::Machine;
 use super::registers::SetError;
+use super::spoiled::{NoSuchFloat, Spoiled};
 use super::{Controller, ControllerOutput, RecipeError, mode, start_values};
 pub use crate::config::CommandClients;
 use crate::config::InitialTarget;
@@ -36,6 +37,7 @@ pub(super) struct Faults {
     state_cut: Option<usize>,
     /// What commands begin takes this much longer.
     transitions: Duration,
+    spoiled: Spoiled,
 }
 
 impl Faults {
@@ -66,6 +68,10 @@ impl Faults {
 
     pub(super) fn exception(&self) -> Option<Exception> {
         self.exception
+    }
+
+    pub(super) fn spoiled(&self) -> &Spoiled {
+        &self.spoiled
     }
 
     pub(super) fn take_state_cut(&mut self) -> Option<usize> {
@@ -130,6 +136,26 @@ impl Controller {
         self.faults.state_cut = Some(len);
     }
 
+    /// State packets and the frames of recipes' output parts show this instead of the item's value,
+    /// such as NaN. Modbus and programs go on seeing the value.
+    ///
+    /// An item is a system variable such as `RobotState[8]`, an analog input such as `AI_V[1]`, or any
+    /// other float of the state packet, such as `joint_torque[1]` (docs/wire/state.md section 2).
+    ///
+    /// # Errors
+    /// [`NoSuchFloat`]; nothing changed.
+    pub fn spoil(&mut self, name: &str, instead: f32) -> Result<(), NoSuchFloat> {
+        self.faults.spoiled.spoil(name, instead)
+    }
+
+    /// They show its value again.
+    ///
+    /// # Errors
+    /// [`NoSuchFloat`].
+    pub fn heal(&mut self, name: &str) -> Result<(), NoSuchFloat> {
+        self.faults.spoiled.heal(name)
+    }
+
     /// What the port sends gets lost.
     pub fn mute_port(&mut self, port: usize) {
         if !self.faults.mutes_port(port) {
@@ -150,8 +176,9 @@ impl Controller {
         }
     }
 
-    /// Switched off and on again: everything is closed, the registers start afresh, and the robot
-    /// goes through its start to power off. Faults stay as they are.
+    /// Switched off and on again: everything is closed, the registers start afresh with the
+    /// configuration's initial values and 0 everywhere else, and the robot goes through its start to
+    /// power off. Faults stay as they are.
     pub fn restart(&mut self, now: Instant) {
         self.server.close_all(&mut self.outputs);
         self.running = None;
@@ -175,6 +202,16 @@ impl Controller {
         }
         self.machine = Machine::booting(now, mode(&self.config));
         self.machine.delay_transitions(self.faults.transitions);
+    }
+}
+
+/// A controller that has lost its memory.
+impl Controller {
+    /// [`Self::restart`], and registers and outputs are 0 whatever the configuration's initial values
+    /// are. Only what is wired to it or belongs to the arm is as it was at the start.
+    pub fn restart_cleared(&mut self, now: Instant) {
+        self.restart(now);
+        self.registers.clear();
     }
 }
 

@@ -22,6 +22,7 @@ pub mod program;
 pub mod registers;
 mod run;
 mod server;
+mod spoiled;
 
 use std::collections::VecDeque;
 use std::net::{IpAddr, SocketAddr};
@@ -45,6 +46,8 @@ use registers::Registers;
 use run::Running;
 use server::Server;
 pub use server::{MAX_COMMAND_CONNECTIONS, MAX_MODBUS_CONNECTIONS, MAX_ORDERS, MAX_STATE_CONNECTIONS};
+
+pub use spoiled::NoSuchFloat;
 
 /// A connection, as the shell numbers it; no two at a time have the same number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]

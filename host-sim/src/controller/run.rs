@@ -352,8 +352,10 @@ impl Controller {
     }
 
     fn poll_ports(&mut self, now: Instant) {
+        let spoiled = self.faults.spoiled().image(self.registers.image());
+        let image = spoiled.as_ref().unwrap_or(self.registers.image());
         for (nth, port) in self.ports.iter_mut().enumerate() {
-            let outgoing = port.poll(now, self.registers.image());
+            let outgoing = port.poll(now, image);
             if self.faults.mutes_port(nth) {
                 if !outgoing.is_empty() {
                     port.sent();
@@ -374,7 +376,8 @@ impl Controller {
             return;
         }
         self.counters.missed_state_packets += missed;
-        let bytes = self.registers.packet(self.dialect.global_speed);
+        let mut bytes = self.registers.packet(self.dialect.global_speed);
+        self.faults.spoiled().put_in_packet(&mut bytes);
         if self.faults.mutes(Link::State) {
             self.counters.state.muted += 1;
             return;

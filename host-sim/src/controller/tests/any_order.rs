@@ -158,7 +158,7 @@ fn apply(cell: &mut Cell, step: Step) {
         Step::Knob(nth) => {
             let link = [Link::Command, Link::State, Link::Modbus][usize::from(nth) % 3];
             let c = &mut cell.controller;
-            match nth % 18 {
+            match nth % 20 {
                 0 => c.mute(link),
                 1 => c.unmute(link),
                 2 => c.refuse(link),
@@ -179,6 +179,9 @@ fn apply(cell: &mut Cell, step: Step) {
                     _ => CommandClients::DropFirst,
                 }),
                 16 => c.delay_transitions(Duration::from_millis(u64::from(nth) * 30)),
+                17 if nth > 128 => drop(c.spoil("RobotState[8]", f32::NAN)),
+                17 => drop(c.heal("RobotState[8]")),
+                18 => c.restart_cleared(now),
                 _ => {
                     let _ = c.assign_recipe(now, 5, (nth > 128).then_some(1));
                 }
