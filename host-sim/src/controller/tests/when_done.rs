@@ -147,18 +147,23 @@ fn a_safety_stop_fails_what_it_undoes_and_not_what_it_does_itself() {
 
 #[test]
 fn a_disabled_robot_has_no_program_any_more_either() {
-    let (mut cell, a, b) =
-        clients(&with_program(SimConfig::default(), "t", "movej([1.0, 0, 0, 0, 0, 0], 1.0);"));
-    cell.ask(a, "run(t)");
-    cell.run_ms(1_000);
-    // The stop slows the arm down for 100 ms, the disable begins 10 ms later.
-    cell.ask(a, "stop");
-    cell.run_ms(10);
-    cell.ask(b, "disable");
-    cell.run_ms(90);
-    assert_eq!(got(&mut cell, a), "stop success");
-    cell.run_ms(10);
-    assert_eq!((got(&mut cell, b).as_str(), cell.ask(a, "state").as_str()), ("disable success", "5:0:5:2"));
+    for (command, state) in [("disable", "5:0:5:2"), ("poweroff", "4:0:4:2")] {
+        let (mut cell, a, b) = enabled();
+        cell.ask(a, "run(t)");
+        // A program that takes long to stop.
+        cell.controller.delay_transitions(Duration::from_secs(1));
+        cell.ask(a, "stop");
+        cell.controller.delay_transitions(Duration::ZERO);
+        cell.ask(b, command);
+        cell.run_ms(1_019);
+        assert_eq!((got(&mut cell, a), got(&mut cell, b)), (String::new(), String::new()));
+        cell.run_ms(1);
+        assert_eq!(got(&mut cell, a), "stop success");
+        assert_eq!(
+            (got(&mut cell, b), cell.ask(b, "state")),
+            (format!("{command} success"), state.to_owned())
+        );
+    }
 }
 
 #[test]
