@@ -10,7 +10,7 @@ use super::drive::Due;
 use super::faults::TCP_TIMEOUT;
 use super::network::{Connection, Door, Item, Peer, Speaker, Way};
 use super::tcp::{Again, Arrived};
-use super::{CLIENT_RETRY, Cell, End, Owner, What, udp_peer};
+use super::{CLIENT_RETRY, Cell, End, HERE, Owner, What, udp_peer};
 use crate::controller::{ConnId, ControllerInput, Link};
 
 impl Cell {
@@ -448,9 +448,9 @@ impl Cell {
             self.send_item(id, Way::Down, Item::Opened);
         }
         self.controller_input(match peer {
-            Peer::Server(Link::Command) => ControllerInput::CommandOpened { conn },
-            Peer::Server(Link::State) => ControllerInput::StateOpened { conn },
-            Peer::Server(Link::Modbus) => ControllerInput::ModbusOpened { conn },
+            Peer::Server(Link::Command) => ControllerInput::CommandOpened { conn, from: HERE },
+            Peer::Server(Link::State) => ControllerInput::StateOpened { conn, from: HERE },
+            Peer::Server(Link::Modbus) => ControllerInput::ModbusOpened { conn, from: HERE },
             Peer::Client(port) => ControllerInput::PortUp { port },
         });
     }
