@@ -288,7 +288,7 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
 
     /// When something happens by itself.
     pub(super) fn deadline(&self) -> Instant {
-        let mut first = self.deadline_of(LinkId::COMMAND).min(self.deadline_of(LinkId::URGENT));
+        let mut first = self.deadline_of(LinkId::COMMAND);
         first = first.min(self.deadline_of(LinkId::STATE)).min(self.deadline_of(LinkId::MODBUS));
         for link in &self.recipes {
             first = first.min(link.deadline()).min(link.supervisor.deadline());
@@ -300,7 +300,11 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
     pub(super) fn deadline_of(&self, id: LinkId) -> Instant {
         let (own, supervisor) = match id {
             LinkId::COMMAND | LinkId::URGENT => {
-                return self.command.as_ref().map_or(Instant::NEVER, |link| link.deadline_of(id));
+                // What happens to one may open or close the other.
+                let both = |link: &CommandLink| {
+                    link.deadline_of(LinkId::COMMAND).min(link.deadline_of(LinkId::URGENT))
+                };
+                return self.command.as_ref().map_or(Instant::NEVER, both);
             }
             LinkId::STATE => match &self.state {
                 Some(link) => (Instant::NEVER, &link.supervisor),
