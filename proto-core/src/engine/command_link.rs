@@ -406,7 +406,11 @@ impl CommandLink {
         out: &mut [u8],
         times: (Instant, Instant),
     ) -> Option<usize> {
-        if link == LinkId::URGENT && self.ordinary.is_unacknowledged() {
+        let is_ordinary = |sent: Sent| !sent.keyword.is_urgent();
+        if link == LinkId::URGENT
+            && self.ordinary.is_unacknowledged()
+            && self.ordinary.in_flight.is_some_and(is_ordinary)
+        {
             // What is under way there could arrive after this and start the robot again.
             self.ordinary.supervisor.give_up(times.0);
             self.lost(LinkId::COMMAND, ports, times.0);
