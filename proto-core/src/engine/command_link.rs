@@ -217,7 +217,7 @@ impl CommandLink {
                 self.strike(ports, now);
             }
             // Both were lost together: that was no verdict on the second one.
-            (LinkId::COMMAND, LinkState::Up { .. }, _) => {
+            (LinkId::COMMAND, LinkState::Up { .. }, _) | (LinkId::URGENT, _, Some(LinkState::Up { .. })) => {
                 self.struck_at = self.struck_at.filter(|&at| now.saturating_since(at) > TOGETHER);
             }
             (LinkId::COMMAND, LinkState::Opening { .. }, _) => self.was_away(now),
