@@ -107,7 +107,9 @@ impl Gateway {
             let core = Rc::clone(&shared);
             let Some(control) = core.links.get(&id).cloned() else { continue };
             tasks.spawn_local(async move {
-                link::run(kind.name(), &endpoint, &control, |event| core.link_event(id, event)).await;
+                let is_frame = |datagram: &[u8]| core.engine.borrow().is_frame(id, datagram);
+                let events = |event: LinkEvent<'_>| core.link_event(id, event);
+                link::run(kind.name(), &endpoint, &control, is_frame, events).await;
                 Ok(())
             });
         }
@@ -174,6 +176,7 @@ impl Core {
             LinkEvent::Down => self.input(Input::LinkDown { link }),
             LinkEvent::Bytes(bytes) => self.input(Input::LinkBytes { link, bytes }),
             LinkEvent::Sent => self.input(Input::LinkSent { link }),
+            LinkEvent::Acked(left) => self.input(Input::LinkAcked { link, left }),
         }
     }
 
@@ -276,7 +279,7 @@ impl Core {
                 ages.insert(var.to_string(), json!(age.as_millis()));
             }
         }
-        json!({ "ports": ports, "links": links, "age_ms": ages })
+        json!({ "ports": ports, "links": links, "age_ms": ages, "sleeps": engine.sleeps() })
     }
 }
 
@@ -344,7 +347,7 @@ async fn open_endpoint(config: &GatewayConfig, kind: LinkKind) -> Result<Endpoin
     };
     let refused = |address: &str, error| StartError::new(format!("listening on {address}: {error}"));
     Ok(match kind {
-        LinkKind::Command => Endpoint::Tcp { host: host()?, port: controller.command_port },
+        LinkKind::Command | LinkKind::Urgent => Endpoint::Tcp { host: host()?, port: controller.command_port },
         LinkKind::State => Endpoint::Tcp { host: host()?, port: controller.state_port },
         LinkKind::Modbus => Endpoint::Tcp { host: host()?, port: controller.modbus_port },
         LinkKind::RecipeUdp => {
