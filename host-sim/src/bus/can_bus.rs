@@ -13,7 +13,7 @@ use proto_core::time::Instant;
 use proto_core::wire::slcan::{Channel, ChannelState};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Notify;
-use tokio::task::JoinSet;
+use tokio::task::{JoinSet, yield_now};
 use tracing::{info, warn};
 
 use super::bind::{Device, Pace};
@@ -22,7 +22,7 @@ use super::peer;
 use super::port::{PortEvent, PortTx};
 use super::pty::Pty;
 use super::timer::{Timer, now};
-use super::turns::give_way;
+use super::turns::{arrival, give_way};
 use super::wire::{Crossed, Full, NodeId, Pacing, Wire};
 
 /// The bus itself; clones are the same bus.
@@ -291,12 +291,12 @@ impl CanPort {
 async fn port_node(node: &Node, tx: &PortTx, events: &mut impl FnMut(PortEvent<'_>)) {
     loop {
         tokio::select! {
-            (at, frame) = node.recv() => {
+            (_, frame) = node.recv() => {
                 tx.count(|counters| {
                     counters.frames_in += 1;
                     counters.bytes_in += frame.data().len() as u64;
                 });
-                events(PortEvent::Frame { frame, at });
+                events(PortEvent::Frame { frame });
             }
             () = tx.wake.notified() => hand_over(node, tx),
             left = node.left() => {
@@ -421,14 +421,14 @@ async fn serve(io: &impl ClientIo, node: &Node, bitrate: u32, tx: &PortTx) -> io
         // A frame waits in the bounded queue until the client has taken what is before it, and a
         // client's line until its frames before it have left.
         let room = out.len() < MAX_PENDING;
+        let mut read = None;
         let done = tokio::select! {
             ready = io.readable(), if room && unread.is_empty() => {
                 match ready.and_then(|()| io.try_read(&mut buf)) {
                     Ok(0) => Err(io::ErrorKind::UnexpectedEof.into()),
                     Ok(count) => {
                         unread = 0..count;
-                        // One read holds fewer frames than a node keeps: others take them in between.
-                        if count == CHUNK { give_way().await } else { tokio::task::yield_now().await }
+                        read = Some(count);
                         Ok(())
                     }
                     Err(error) => Err(error),
@@ -446,7 +446,7 @@ async fn serve(io: &impl ClientIo, node: &Node, bitrate: u32, tx: &PortTx) -> io
             ready = io.writable(), if !out.is_empty() => ready,
             () = tokio::time::sleep(STALE_LOOK), if io.may_be_stale() => Ok(()),
         };
-        take_lines(&mut channel, node, &buf, &mut unread, &mut out);
+        take_lines(&mut channel, node, tx, &buf, &mut unread, &mut out);
         let done = done.and_then(|()| flush(io, &mut out, tx));
         if node.dropped() != told_dropped {
             told_dropped = node.dropped();
@@ -456,22 +456,40 @@ async fn serve(io: &impl ClientIo, node: &Node, bitrate: u32, tx: &PortTx) -> io
             Err(error) if error.kind() != io::ErrorKind::WouldBlock => return error,
             _ => {}
         }
+        // One read holds fewer frames than a node keeps: others take them in between.
+        match read {
+            Some(CHUNK) if !tx.is_stale() => give_way().await,
+            Some(_) => yield_now().await,
+            None => {}
+        }
     }
 }
 
 /// Carries out a client's lines as long as the node has room for the frames in them.
-fn take_lines(channel: &mut Channel, node: &Node, buf: &[u8], unread: &mut Range<usize>, out: &mut Vec<u8>) {
+fn take_lines(
+    channel: &mut Channel,
+    node: &Node,
+    tx: &PortTx,
+    buf: &[u8],
+    unread: &mut Range<usize>,
+    out: &mut Vec<u8>,
+) {
     while !Range::is_empty(unread) && !node.is_full() {
         let mut bytes = &buf[unread.clone()];
         if let Some(reaction) = channel.receive(&mut bytes) {
             out.extend_from_slice(reaction.answer);
-            if let Some(frame) = reaction.frame {
+            match reaction.frame {
+                // Taking its time on the bus it would be believed when it is over.
+                Some(_) if tx.is_stale() => tx.count(|counters| counters.dropped += 1),
                 // There is room, so it is taken.
-                let _ = node.send(now(), frame);
+                Some(frame) => drop(node.send(arrival(), frame)),
+                None => {}
             }
         }
         unread.start = unread.end - bytes.len();
     }
+    // Frames that nobody could look at when they came have crossed the bus meanwhile.
+    node.bus.advance(now());
     let hears = channel.state() != ChannelState::Closed;
     if node.state.deaf.get() == hears {
         node.set_hears(hears);

@@ -295,8 +295,10 @@ async fn pump(
                 Ok(count) => {
                     sender.tx.count(|counters| counters.bytes_in += count as u64);
                     events(PortEvent::Bytes(&buf[..count]));
-                    // A device that never pauses must not keep everybody else waiting.
-                    if count == CHUNK { give_way().await } else { tokio::task::yield_now().await }
+                    // A device that never pauses must not keep everybody else waiting. What is refused
+                    // anyway costs them little, and has to be gone soon.
+                    let is_much = count == CHUNK && !sender.tx.is_stale();
+                    if is_much { give_way().await } else { tokio::task::yield_now().await }
                     Ok(())
                 }
                 Err(error) if error.kind() == io::ErrorKind::Interrupted => Ok(()),

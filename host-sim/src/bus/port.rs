@@ -12,7 +12,7 @@ use proto_core::config::Rs485;
 use proto_core::engine::BusState;
 use proto_core::recipe::can::CanFrame;
 use proto_core::recipe::model::CanId;
-use proto_core::time::Instant;
+use proto_core::time::{Duration, Instant};
 use serde::Serialize;
 use tokio::sync::Notify;
 
@@ -21,6 +21,7 @@ use super::can_bus::CanPort;
 use super::line::Line;
 use super::quota::Quota;
 use super::socketcan::KernelCan;
+use super::timer::now;
 
 /// What a device did.
 #[derive(Debug, PartialEq)]
@@ -35,8 +36,6 @@ pub enum PortEvent<'a> {
     Frame {
         /// The frame.
         frame: CanFrame,
-        /// When: a moment ago, or earlier when nobody looked.
-        at: Instant,
     },
     /// A CAN controller's error state changed; told after each [`PortEvent::Up`] that knows it.
     Bus(BusState),
@@ -136,9 +135,22 @@ pub struct PortTx {
     pub(super) counters: Cell<DeviceCounters>,
     /// What clients do is worth a few lines of the log.
     pub(super) complaints: Quota,
+    /// What is read before this may have waited while the process slept.
+    stale_until: Cell<Instant>,
 }
 
 impl PortTx {
+    /// This process slept until a moment ago: what waits in the device is as old as that. The port's owner
+    /// refuses everything for [`STALE`]; by then nothing old may be left behind.
+    pub fn note_sleep(&self, now: Instant) {
+        self.stale_until.set(now + STALE);
+    }
+
+    /// Whether what is read now may have waited while this process slept.
+    pub(super) fn is_stale(&self) -> bool {
+        self.stale_until.get() != Instant::ZERO && now() < self.stale_until.get()
+    }
+
     /// Hands bytes over to a serial port.
     pub fn send(&self, bytes: &[u8]) {
         let mut queue = self.bytes.borrow_mut();
@@ -209,6 +221,8 @@ pub struct DeviceCounters {
     pub bus: &'static str,
 }
 
+/// For how long the engine refuses what arrives after a sleep, at least.
+pub const STALE: Duration = Duration::from_millis(50);
 /// A frame of every port's recipe fits several times over; a port waits for one to leave.
 const MAX_QUEUED_BYTES: usize = 4_096;
 /// Twice the most ids of a recipe's part.

@@ -1,27 +1,92 @@
 //! Who has a turn when on a shell's thread, where everybody who has something to do is served in order.
 
+use std::cell::Cell;
 use std::rc::Rc;
 
+use proto_core::time::{Duration, Instant};
 use tokio::sync::Semaphore;
+use tokio::task::yield_now;
+
+use super::timer::now;
 
 thread_local! {
     static TURN: Rc<Semaphore> = Rc::new(Semaphore::new(1));
+    /// How many have more to do than their turn allowed.
+    static UNFINISHED: Cell<usize> = const { Cell::new(0) };
+    /// The next deadline of this thread's engine, until it has been told that it has passed.
+    static DEADLINE: Cell<Instant> = const { Cell::new(Instant::NEVER) };
 }
 
 /// For those who come back at once: sockets and timers are looked at and all others served before this
 /// returns, and of those that wait here only one goes on each time. So however many send without end, no
 /// deadline waits for more than one of them.
 pub(crate) async fn give_way() {
+    let _unfinished = Unfinished::new();
     let turn = TURN.with(Rc::clone);
     let _mine = turn.acquire().await;
-    tokio::task::yield_now().await;
+    yield_now().await;
 }
+
+struct Unfinished;
+
+impl Unfinished {
+    fn new() -> Self {
+        UNFINISHED.set(UNFINISHED.get() + 1);
+        Self
+    }
+}
+
+impl Drop for Unfinished {
+    fn drop(&mut self) {
+        UNFINISHED.set(UNFINISHED.get() - 1);
+    }
+}
+
+/// The engine of this thread wants to be told when `deadline` has passed.
+pub(crate) fn expect(deadline: Instant) {
+    DEADLINE.set(deadline);
+}
+
+/// For who is to tell that the deadline has passed: first everybody takes what had come by then.
+///
+/// tokio looks at the sockets before it lets go on who has yielded, and everybody who has something is
+/// served once. That is enough on time. When the thread was kept from looking, more may wait than one turn
+/// takes: then until all of it is taken, but not for long, since it may have no end.
+pub(crate) async fn all_others() {
+    yield_now().await;
+    let begin = now();
+    if held_up_at(begin).is_none() {
+        return;
+    }
+    // One round more than anybody needs: what one took he may have passed on to another.
+    let mut quiet_rounds = 0;
+    while quiet_rounds < 2 && now().saturating_since(begin) < CATCHING_UP {
+        yield_now().await;
+        quiet_rounds = if UNFINISHED.get() == 0 { quiet_rounds + 1 } else { 0 };
+    }
+}
+
+/// When what is read now arrived: now, but by the deadline that this thread should have kept if it was kept
+/// from looking.
+pub(crate) fn arrival() -> Instant {
+    let now = now();
+    held_up_at(now).unwrap_or(now)
+}
+
+fn held_up_at(now: Instant) -> Option<Instant> {
+    let deadline = DEADLINE.get();
+    (now.saturating_since(deadline) >= HELD_UP).then_some(deadline)
+}
+
+/// What others do takes less, so being this late has another reason.
+const HELD_UP: Duration = Duration::from_millis(5);
+/// How much later a deadline is told so that more of what came before it is told first.
+const CATCHING_UP: Duration = Duration::from_millis(20);
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::cell::Cell;
-    use tokio::task::{JoinSet, LocalSet, yield_now};
+    use tokio::task::{JoinSet, LocalSet};
 
     #[test]
     fn of_many_that_never_stop_one_goes_on_at_a_time() {
