@@ -46,7 +46,7 @@ impl Full {
         let plc = cell.rs485(recipe);
         let recipe = cell.stream(&["ForceEnd[1..2]"], &[]);
         let sensor = cell.rs485(recipe);
-        let table = cell.commands(&[(1, "run(pick.jspf,50)"), (2, "stop")]);
+        let table = cell.commands(&[(1, "run(pick.jspf,50)"), (2, "resume")]);
         let to = InputBinding::Commands { table, when: CommandWhen::Frame };
         let fields = cell.fields([user_in(ScalarType::Byte, to)]);
         let input = cell.part(&[255, 255], &[238, 238], fields);
@@ -140,8 +140,8 @@ impl Full {
         let frame = self.hand();
         assert_eq!(self.rig.sent_on(self.tcp), [frame], "by TCP");
         self.panel(2);
-        assert_eq!(self.rig.sent_on(LinkId::COMMAND), [b"stop"], "by the command port");
-        self.rig.link_bytes(LinkId::COMMAND, b"stop success");
+        assert_eq!(self.rig.sent_on(LinkId::COMMAND), [b"resume"], "by the command port");
+        self.rig.link_bytes(LinkId::COMMAND, b"resume success");
         assert_eq!(self.rig.engine.reply_code(self.panel), Some(ReplyCode::Success));
         self.rig.map.coils[176] = true;
         self.rig.run(MS(8));

@@ -251,7 +251,7 @@ fn what_fell_due_while_the_port_was_gone_is_not_sent_later() {
 /// One byte that picks a command, and the reply code with each frame's answer.
 fn commands(when: CommandWhen) -> (Rig, PortId) {
     let mut cell = Cell::new();
-    let table = cell.commands(&[(1, "run(pick.jspf,50)"), (2, "stop"), (3, "state"), (-1, "pause")]);
+    let table = cell.commands(&[(1, "run(pick.jspf,50)"), (2, "resume"), (3, "state"), (-1, "pause")]);
     let input = [(T::Char, InputBinding::Commands { table, when })];
     let port = user(&mut cell, &input, &[(T::Byte, OutputBinding::Reply)], SendOn::Frame);
     let mut rig = cell.rig();
@@ -278,11 +278,11 @@ fn a_changed_value_picks_a_command_and_the_first_is_only_a_base() {
     assert!(sent(&mut rig).is_empty(), "a value that was there before we were is no order");
     assert_eq!(reply(&rig, port), ReplyCode::None);
     rig.bytes(port, &frame(&[2]));
-    assert_eq!(sent(&mut rig), ["stop"]);
+    assert_eq!(sent(&mut rig), ["resume"]);
     assert_eq!(reply(&rig, port), ReplyCode::Pending);
     rig.bytes(port, &frame(&[2]));
     assert!(sent(&mut rig).is_empty());
-    rig.link_bytes(LinkId::COMMAND, b"stop success");
+    rig.link_bytes(LinkId::COMMAND, b"resume success");
     assert_eq!(reply(&rig, port), ReplyCode::Success);
     rig.sent_to(port);
     rig.bytes(port, &frame(&[2]));
@@ -327,7 +327,7 @@ fn after_silence_the_first_value_is_a_base_again() {
 #[test]
 fn a_rejected_frame_moves_no_base() {
     let mut cell = Cell::new();
-    let table = cell.commands(&[(1, "stop")]);
+    let table = cell.commands(&[(1, "resume")]);
     let when = CommandWhen::Change;
     let input = [(T::Byte, InputBinding::Commands { table, when }), (T::Float, InputBinding::Unused)];
     let port = user(&mut cell, &input, &[], SendOn::Period);
@@ -338,7 +338,7 @@ fn a_rejected_frame_moves_no_base() {
     rig.bytes(port, &fields(1, f32::NAN));
     assert!(sent(&mut rig).is_empty());
     rig.bytes(port, &fields(1, 0.0));
-    assert_eq!(sent(&mut rig), ["stop"], "the rejected 1 was no value");
+    assert_eq!(sent(&mut rig), ["resume"], "the rejected 1 was no value");
 }
 
 #[test]
@@ -359,7 +359,7 @@ fn replies_are_understood_however_they_arrive() {
                 rig.run(MS(150));
                 assert_eq!(reply(&rig, port), code, "{:?} cut at {cut}", String::from_utf8_lossy(&text));
                 rig.bytes(port, &frame(&[2]));
-                assert_eq!(sent(&mut rig), ["stop"], "the next one goes out");
+                assert_eq!(sent(&mut rig), ["resume"], "the next one goes out");
             }
         }
     }
@@ -371,11 +371,11 @@ fn two_replies_in_one_segment_answer_one_command() {
     rig.bytes(port, &frame(&[1]));
     rig.bytes(port, &frame(&[2]));
     assert_eq!(sent(&mut rig), ["run(pick.jspf,50)"]);
-    rig.link_bytes(LinkId::COMMAND, b"run startstop fail");
+    rig.link_bytes(LinkId::COMMAND, b"run startresume fail");
     // The second text came before its command was sent: it cannot be its answer.
-    assert_eq!(sent(&mut rig), ["stop"]);
+    assert_eq!(sent(&mut rig), ["resume"]);
     assert_eq!(reply(&rig, port), ReplyCode::Pending);
-    rig.link_bytes(LinkId::COMMAND, b"stop success\r\n");
+    rig.link_bytes(LinkId::COMMAND, b"resume success\r\n");
     assert_eq!(reply(&rig, port), ReplyCode::Success);
     assert_eq!(rig.link(LinkId::COMMAND).counters.malformed, 1);
     assert_eq!(rig.link(LinkId::COMMAND).counters.received, 2);
@@ -405,7 +405,7 @@ fn no_command_is_handed_over_before_the_one_before_it_has_left() {
     rig.link_bytes(LinkId::COMMAND, b"run start");
     assert_eq!(sent(&mut rig), ["run(pick.jspf,50)"], "its reply overtakes the transport's report");
     rig.input(Input::LinkSent { link: LinkId::COMMAND });
-    assert_eq!(sent(&mut rig), ["stop"]);
+    assert_eq!(sent(&mut rig), ["resume"]);
 }
 
 #[test]
@@ -416,7 +416,7 @@ fn the_reply_code_is_that_of_the_newest_command() {
     assert_eq!(sent(&mut rig), ["run(pick.jspf,50)"]);
     rig.link_bytes(LinkId::COMMAND, b"run start");
     assert_eq!(reply(&rig, port), ReplyCode::Pending, "the newest one has not been answered");
-    rig.link_bytes(LinkId::COMMAND, b"stop fail");
+    rig.link_bytes(LinkId::COMMAND, b"resume fail");
     assert_eq!(reply(&rig, port), ReplyCode::Fail);
 }
 
@@ -433,7 +433,7 @@ fn a_command_for_a_link_that_is_down_is_never_sent() {
     assert!(sent(&mut rig).is_empty(), "a robot must not start later");
     assert_eq!(rig.counters(port).commands_dropped, 1);
     rig.bytes(port, &frame(&[2]));
-    assert_eq!(sent(&mut rig), ["stop"]);
+    assert_eq!(sent(&mut rig), ["resume"]);
 }
 
 #[test]
@@ -470,8 +470,8 @@ fn a_command_without_a_reply_reconnects() {
     assert!(sent(&mut rig).is_empty(), "and is not repeated");
     // The late reply is of a connection that is gone; the next command gets its own.
     rig.bytes(port, &frame(&[2]));
-    assert_eq!(sent(&mut rig), ["stop"]);
-    rig.link_bytes(LinkId::COMMAND, b"stop success");
+    assert_eq!(sent(&mut rig), ["resume"]);
+    rig.link_bytes(LinkId::COMMAND, b"resume success");
     assert_eq!(reply(&rig, port), ReplyCode::Success);
 }
 
@@ -518,14 +518,14 @@ fn a_finished_script_answers_nothing() {
     rig.link_bytes(LinkId::COMMAND, b"script finish");
     rig.run(MS(100));
     assert_eq!(reply(&rig, port), ReplyCode::Pending);
-    rig.link_bytes(LinkId::COMMAND, b"script finishstop success");
+    rig.link_bytes(LinkId::COMMAND, b"script finishresume success");
     assert_eq!(reply(&rig, port), ReplyCode::Success);
 }
 
 /// Worked example 3's shape with two ids each way, on the gateway.
 fn can_cell() -> (Cell, PortId) {
     let mut cell = Cell::new();
-    let table = cell.commands(&[(7, "stop")]);
+    let table = cell.commands(&[(7, "resume")]);
     let command = InputBinding::Commands { table, when: CommandWhen::Change };
     let parts = [
         (1, vec![user_in(T::Byte, to("WordInputReg[1]", 1.0, 0.0)), user_in(T::Byte, InputBinding::Unused)]),
@@ -572,7 +572,7 @@ fn can_ids_have_their_own_fields() {
     assert!(sent(&mut rig).is_empty(), "7 stood in the other id's field");
 
     rig.can(port, 5, &[7, 1, 0]);
-    assert_eq!(sent(&mut rig), ["stop"]);
+    assert_eq!(sent(&mut rig), ["resume"]);
     let frames: Vec<_> = rig.can_sent_to(port).iter().map(|f| f.data().to_vec()).collect();
     assert_eq!(frames, [vec![125, ReplyCode::Pending as u8], vec![1, 0, 9]]);
     let counters = rig.counters(port);
@@ -592,7 +592,7 @@ fn one_can_id_that_falls_silent_leaves_the_others_commands_alone() {
     rig.run(MS(60));
     assert_eq!(rig.counters(port).timeouts, 1, "id 1 is overdue");
     rig.can(port, 5, &[7, 0, 0]);
-    assert_eq!(sent(&mut rig), ["stop"], "id 5 is not");
+    assert_eq!(sent(&mut rig), ["resume"], "id 5 is not");
 }
 
 #[test]

@@ -1,5 +1,5 @@
-//! The gateway's side of a port-2000 connection: one request in flight, and where its reply ends
-//! (docs/wire/command.md section 6).
+//! The gateway's side of a port-2000 connection: one request in flight, one urgent one beside it,
+//! and where their replies end (docs/wire/command.md section 6).
 //!
 //! In: a command to send, received bytes and the time. Out: the bytes to send, replies, texts
 //! that nobody asked for, and a timeout. Decides nothing about what to send or to send again.
@@ -31,6 +31,8 @@ pub struct CommandClient {
     /// and its reply comes at its end.
     pub timeout: Duration,
     waiting: Option<Waiting>,
+    /// The request that was sent without waiting for the reply to the other one.
+    beside: Option<Waiting>,
     buffer: [u8; MAX_REPLY],
     len: usize,
     /// Bytes at the front that were handed out; they go at the next call.
@@ -53,6 +55,8 @@ struct Waiting {
 pub enum ClientEvent<'a> {
     /// The reply to the request in flight, which is over.
     Reply {
+        /// Whether it is the one that [`CommandClient::start_beside`] sent.
+        beside: bool,
         /// What kind of answer it is.
         kind: ReplyKind,
         /// The answer.
@@ -67,8 +71,8 @@ pub enum ClientEvent<'a> {
         /// The text, without a terminator.
         text: &'a [u8],
     },
-    /// The request in flight is given up. Its reply may still come, as an unsolicited text; a
-    /// value would be taken for the next reply of its kind, so reconnect before asking again.
+    /// What is in flight is given up. A reply may still come, as an unsolicited text; a value would
+    /// be taken for the next reply of its kind, so reconnect before asking again.
     Timeout,
 }
 
@@ -105,6 +109,7 @@ impl CommandClient {
             message_gap: Duration::from_millis(100),
             timeout: Duration::from_secs(10),
             waiting: None,
+            beside: None,
             buffer: [0; MAX_REPLY],
             len: 0,
             handed_out: 0,
@@ -114,9 +119,14 @@ impl CommandClient {
         }
     }
 
-    /// Whether a request is in flight.
+    /// Whether a request is in flight, an urgent one beside it apart.
     pub const fn busy(&self) -> bool {
         self.waiting.is_some()
+    }
+
+    /// Whether an urgent request is in flight beside the other one.
+    pub const fn busy_beside(&self) -> bool {
+        self.beside.is_some()
     }
 
     /// Bytes of texts longer than [`MAX_REPLY`] that were dropped, wrapping.
@@ -157,10 +167,32 @@ impl CommandClient {
         let len = request.encode(dialect, out).map_err(StartError::Encode)?;
         self.drop_handed_out();
         // What came before the request cannot be the beginning of its reply.
-        if !SCRIPT_FINISH.as_bytes().starts_with(self.received()) {
+        if self.beside.is_none() && !SCRIPT_FINISH.as_bytes().starts_with(self.received()) {
             self.len = 0;
         }
         self.waiting = Some(Waiting { keyword: request.keyword(), until: now + self.timeout });
+        Ok(len)
+    }
+
+    /// Writes an urgent command without waiting for the reply to the one in flight. Replies are told
+    /// apart by their keywords (D26); one that both could get is the older request's.
+    ///
+    /// # Errors
+    /// [`StartError`]; nothing has begun then. [`StartError::Busy`] when there is such a command
+    /// already.
+    pub fn start_beside(
+        &mut self,
+        now: Instant,
+        text: &[u8],
+        dialect: &Dialect,
+        out: &mut [u8],
+    ) -> Result<usize, StartError> {
+        if self.beside.is_some() {
+            return Err(StartError::Busy);
+        }
+        let request = Request::parse_strict(text).map_err(StartError::Command)?;
+        let len = request.encode(dialect, out).map_err(StartError::Encode)?;
+        self.beside = Some(Waiting { keyword: request.keyword(), until: now + self.timeout });
         Ok(len)
     }
 
@@ -181,8 +213,9 @@ impl CommandClient {
         };
         match found {
             Some(found) => Some(self.hand_out(found)),
-            None if self.waiting.is_some_and(|waiting| now >= waiting.until) => {
+            None if self.timeout_at().is_some_and(|until| now >= until) => {
                 self.waiting = None;
+                self.beside = None;
                 Some(ClientEvent::Timeout)
             }
             None => None,
@@ -197,16 +230,16 @@ impl CommandClient {
     /// When [`poll`](Self::poll) has something to say if nothing more is received.
     pub fn deadline(&self) -> Option<Instant> {
         let gap = self.gap().map(|gap| self.newest + gap);
-        let timeout = self.waiting.map(|waiting| waiting.until);
-        match (gap, timeout) {
+        match (gap, self.timeout_at()) {
             (Some(gap), Some(timeout)) => Some(gap.min(timeout)),
             (gap, timeout) => gap.or(timeout),
         }
     }
 
-    /// Forgets the request in flight and everything received, for a new connection.
+    /// Forgets what is in flight and everything received, for a new connection.
     pub fn abort(&mut self) {
         self.waiting = None;
+        self.beside = None;
         self.len = 0;
         self.handed_out = 0;
         self.dropping = false;
@@ -262,11 +295,19 @@ impl CommandClient {
     }
 
     fn judge(&self, len: usize, reply: &Reply<'_>) -> Found {
-        match (reply, self.waiting) {
-            (Reply::ScriptFinish, _) => Found::ScriptFinish { len },
-            (reply, Some(waiting)) if reply.answers(waiting.keyword) => Found::Reply { len },
+        let answers = |waiting: Option<Waiting>| waiting.is_some_and(|w| reply.answers(w.keyword));
+        match reply {
+            Reply::ScriptFinish => Found::ScriptFinish { len },
+            _ if answers(self.waiting) => Found::Reply { len, beside: false },
+            _ if answers(self.beside) => Found::Reply { len, beside: true },
             _ => Found::Unsolicited { len },
         }
+    }
+
+    /// When the older request is given up.
+    fn timeout_at(&self) -> Option<Instant> {
+        let waiting = self.waiting.iter().chain(&self.beside);
+        waiting.map(|waiting| waiting.until).min()
     }
 
     /// How much silence would end what is in the buffer.
@@ -302,21 +343,24 @@ impl CommandClient {
     }
 
     fn hand_out(&mut self, found: Found) -> ClientEvent<'_> {
-        let (Found::Reply { len } | Found::ScriptFinish { len } | Found::Unsolicited { len }) = found;
+        let (Found::Reply { len, .. } | Found::ScriptFinish { len } | Found::Unsolicited { len }) = found;
         self.handed_out = len;
-        let waiting = self.waiting;
-        if matches!(found, Found::Reply { .. }) {
-            self.waiting = None;
-        }
+        let waiting = match found {
+            Found::Reply { beside: false, .. } => self.waiting.take(),
+            Found::Reply { beside: true, .. } => self.beside.take(),
+            _ => None,
+        };
         let bytes = self.buffer.get(..self.len).unwrap_or(&[]);
         let text = bytes.get(..len).unwrap_or(&[]);
         match found {
             Found::ScriptFinish { .. } => ClientEvent::ScriptFinish,
             Found::Unsolicited { .. } => ClientEvent::Unsolicited { text },
-            Found::Reply { .. } => match waiting.and_then(|waiting| Reply::parse(waiting.keyword, text)) {
-                Some(reply) => ClientEvent::Reply { kind: reply.kind(), reply, text },
-                None => ClientEvent::Unsolicited { text },
-            },
+            Found::Reply { beside, .. } => {
+                match waiting.and_then(|waiting| Reply::parse(waiting.keyword, text)) {
+                    Some(reply) => ClientEvent::Reply { beside, kind: reply.kind(), reply, text },
+                    None => ClientEvent::Unsolicited { text },
+                }
+            }
         }
     }
 
@@ -352,7 +396,7 @@ impl Default for CommandClient {
 
 /// What [`CommandClient::scan`] found at the front of the buffer.
 enum Found {
-    Reply { len: usize },
+    Reply { len: usize, beside: bool },
     ScriptFinish { len: usize },
     Unsolicited { len: usize },
 }

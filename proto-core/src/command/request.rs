@@ -132,6 +132,11 @@ impl Keyword {
         }
     }
 
+    /// Whether the command stops or switches off: it goes ahead of all others (D26).
+    pub const fn is_urgent(self) -> bool {
+        matches!(self, Self::Do(Action::Stop | Action::Pause | Action::Disable | Action::PowerOff))
+    }
+
     /// Whether the command is the keyword alone.
     pub const fn is_bare(self) -> bool {
         !matches!(self, Self::Run | Self::Speed)

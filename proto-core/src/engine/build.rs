@@ -103,7 +103,13 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             watches_bits: false,
             timer_at: Instant::ZERO,
             rearm: true,
+            now: Instant::ZERO,
+            is_late: false,
+            announced: Instant::ZERO,
+            beat_at: Instant::ZERO,
             sleeps: 0,
+            is_deaf: false,
+            deaf_until: Instant::ZERO,
         }
     }
 
@@ -132,7 +138,23 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     }
 
     fn clear(&mut self) {
-        let Self { store, ports, bindings, safe_values, links, watches_bits, timer_at, rearm, sleeps } = self;
+        let Self {
+            store,
+            ports,
+            bindings,
+            safe_values,
+            links,
+            watches_bits,
+            timer_at,
+            rearm,
+            now,
+            is_late,
+            announced,
+            beat_at,
+            sleeps,
+            is_deaf,
+            deaf_until,
+        } = self;
         *store = Store::new();
         ports.clear();
         bindings.inputs.clear();
@@ -146,7 +168,13 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         *watches_bits = false;
         *timer_at = Instant::ZERO;
         *rearm = true;
+        *now = Instant::ZERO;
+        *is_late = false;
+        *announced = Instant::ZERO;
+        *beat_at = Instant::ZERO;
         *sleeps = 0;
+        *is_deaf = false;
+        *deaf_until = Instant::ZERO;
     }
 
     fn build(&mut self, config: &GatewayConfig) -> Result<(), BuildError> {
@@ -173,7 +201,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             self.links.modbus = Some(ModbusLink::new(dialect.modbus_unit, writes));
         }
         self.assign_read_back(&plan);
-        self.assign_sources(config, &plan, &mut groups)
+        self.assign_sources(config, &plan, &mut groups)?;
+        self.assign_witnesses();
+        Ok(())
     }
 
     fn add_port(
@@ -302,8 +332,13 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             _ => timings,
         };
         let set: InputSet = config.written_by(recipe).collect();
-        let writes = set.iter().filter(|&var| plan.way_up(var) == Some(WayUp::Recipe(id))).collect();
-        let uplink = Uplink::new(id, kind, Supervisor::new(timings), input, output, (set, writes), group);
+        let writes: InputSet =
+            set.iter().filter(|&var| plan.way_up(var) == Some(WayUp::Recipe(id))).collect();
+        let owners = writes.iter().filter_map(|var| plan.owner(var));
+        let timeouts = owners.filter_map(|port| config.ports.get(usize::from(port.0))).map(|port| port.timeout);
+        let patience = timeouts.min().unwrap_or(PATIENCE).max(PATIENCE);
+        let supervisor = Supervisor::new(timings);
+        let uplink = Uplink::new(id, kind, supervisor, input, output, (set, writes), group, patience);
         self.links.recipes.push(uplink).map_err(|_| too_many("recipe links", UPLINKS))
     }
 
@@ -350,10 +385,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
                     self.links.recipes.iter().find(|link| link.id == id).and_then(|link| link.group)
                 }
                 Some(Source::State) => self.links.state.as_mut().map(|state| {
-                    if var.direction() == Direction::Output {
-                        // As many places as there are output variables.
-                        let _ = state.shown.push(var);
-                    }
+                    // As many places as there are variables.
+                    let _ = state.shown.push(var);
                     state.group
                 }),
                 _ => None,
@@ -365,15 +398,31 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         for ((_, _, recipe), port) in config.field_ports().zip(&mut self.ports) {
             for var in shown_by(config, recipe) {
                 let Some(group) = self.store.image.group(var) else { continue };
-                match plan.source(var) {
-                    Some(Source::Field(_)) => port.sender.shown_fields.insert(group),
-                    _ => port.sender.sources.insert(group),
-                }
+                port.sender.sources.insert(group);
+                port.sender.shown.insert(var);
             }
         }
         Ok(())
     }
+
+    /// What of the recipe links' variables shows when the controller has a safe value: the state
+    /// packet, or an output that some link brings.
+    fn assign_witnesses(&mut self) {
+        let has_state = self.links.state.is_some();
+        let image = &self.store.image;
+        for link in &mut self.links.recipes {
+            let is_shown = |var: &SysVar| {
+                has_state && var.stream().is_some()
+                    || var.shown_by().is_some_and(|witness| image.group(witness).is_some())
+            };
+            link.shown = link.writes.iter().filter(is_shown).collect();
+        }
+    }
 }
+
+/// However short the owners' timeouts are, a recipe frame has so long to be acknowledged: peers
+/// acknowledge up to 200 ms late.
+const PATIENCE: Duration = Duration::from_millis(250);
 
 const fn port_cycle_floor() -> Duration {
     crate::config::MIN_CYCLE

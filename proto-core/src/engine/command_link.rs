@@ -1,16 +1,20 @@
-//! The link to port 2000: commands that field values pick, one after the other.
+//! The links to port 2000: commands that field values pick (docs/architecture.md section 7).
 //!
 //! A command is sent once or not at all. What cannot be sent soon is dropped and said so in the
-//! port's reply code: a robot must not start later because of a button pressed earlier.
+//! port's reply code: a robot must not start later because of a button pressed earlier. What stops
+//! the robot has a connection of its own, goes ahead of everything and is not dropped while its
+//! device asks for it.
 
 use heapless::{Deque, String, Vec};
 
-use super::counters::{LinkCounters, PortCounters, add, bump};
+use super::counters::{PortCounters, bump};
 use super::field_port::{FieldPort, ReplyCode};
-use super::io::PortId;
-use crate::command::{ClientEvent, CommandClient, ReplyKind};
+use super::io::{LinkId, PortId};
+use super::session::{Event, Sent, Session};
+use super::stops::{STOP_TTL, Stops, Waiting};
+use crate::command::{Keyword, Request};
 use crate::config::{CommandEntry, CommandWhen, MAX_COMMANDS, Span};
-use crate::link::{LinkTimings, Supervisor};
+use crate::link::LinkState;
 use crate::time::{Duration, Instant};
 use crate::wire::dialect::Dialect;
 use crate::wire::scalar::Scalar;
@@ -21,8 +25,12 @@ pub const MAX_COMMAND_FIELDS: usize = 16;
 pub const MAX_COMMAND_BYTES: usize = 1024;
 /// Commands that can wait for the one before them.
 pub const COMMAND_QUEUE: usize = 8;
-/// A command that could not be sent within this time is dropped.
+/// A command that has not been acknowledged this long after it was picked is dropped.
 const COMMAND_TTL: Duration = Duration::from_secs(1);
+/// Two losses of the second connection within this time: the controller takes only one (D26).
+const STRIKES_WITHIN: Duration = Duration::from_secs(10);
+/// What is lost this soon after something else is lost for the same reason.
+const TOGETHER: Duration = Duration::from_secs(1);
 
 /// A field whose values pick commands.
 #[derive(Debug, Clone, Copy)]
@@ -47,29 +55,23 @@ struct Entry {
     value: i64,
     start: u16,
     len: u16,
-}
-
-#[derive(Debug, Clone, Copy)]
-struct Waiting {
-    port: PortId,
-    entry: u16,
-    since: Instant,
-    /// How many commands the port had picked with it: only the newest one's outcome is shown.
-    nth: u32,
+    keyword: Keyword,
 }
 
 #[derive(Debug, Clone)]
 pub(super) struct CommandLink {
-    pub supervisor: Supervisor,
-    pub counters: LinkCounters,
-    client: CommandClient,
+    /// The connection for everything, and the one for urgent commands alone.
+    pub ordinary: Session,
+    pub urgent: Option<Session>,
     dialect: Dialect,
     tables: Tables,
     fields: Vec<CommandField, MAX_COMMAND_FIELDS>,
     queue: Deque<Waiting, COMMAND_QUEUE>,
-    in_flight: Option<Waiting>,
-    /// The transport has not taken the newest command yet.
-    unsent: bool,
+    stops: Stops,
+    /// The first so many of the queue were overtaken by an urgent command.
+    overtaken: usize,
+    /// When the second connection, or the first because of it, was lost last.
+    struck_at: Option<Instant>,
 }
 
 impl Tables {
@@ -78,31 +80,37 @@ impl Tables {
         for entry in entries {
             let start = tables.texts.len() as u16;
             tables.texts.push_str(&entry.text).ok()?;
-            tables.entries.push(Entry { value: entry.value, start, len: entry.text.len() as u16 }).ok()?;
+            // Validation has refused what is no command.
+            let keyword = Request::parse(entry.text.as_bytes()).map_or(Keyword::State, |r| r.keyword());
+            let entry = Entry { value: entry.value, start, len: entry.text.len() as u16, keyword };
+            tables.entries.push(entry).ok()?;
         }
         Some(tables)
     }
 
-    fn text(&self, entry: u16) -> Option<&str> {
+    fn entry(&self, entry: u16) -> Option<(Entry, &str)> {
         let entry = self.entries.get(usize::from(entry))?;
         let start = usize::from(entry.start);
-        self.texts.get(start..start.saturating_add(usize::from(entry.len)))
+        let text = self.texts.get(start..start.saturating_add(usize::from(entry.len)))?;
+        Some((*entry, text))
     }
 }
 
 impl CommandLink {
-    /// A link with these command tables; `None` when their texts are too long together.
+    /// Links with these command tables; `None` when their texts are too long together.
     pub(super) fn new(dialect: Dialect, entries: &[CommandEntry]) -> Option<Self> {
+        let tables = Tables::new(entries)?;
+        let stops = tables.entries.iter().any(|entry| entry.keyword.is_urgent());
         Some(Self {
-            supervisor: Supervisor::new(LinkTimings::TCP),
-            counters: LinkCounters::default(),
-            client: CommandClient::new(),
+            ordinary: Session::new(),
+            urgent: stops.then(Session::new),
             dialect,
-            tables: Tables::new(entries)?,
+            tables,
             fields: Vec::new(),
             queue: Deque::new(),
-            in_flight: None,
-            unsent: false,
+            stops: Stops::new(),
+            overtaken: 0,
+            struck_at: None,
         })
     }
 
@@ -113,7 +121,7 @@ impl CommandLink {
         Some(index)
     }
 
-    /// An accepted frame brought a value of a command field.
+    /// An accepted frame brought a value of a command field. [`Self::drop_overtaken`] follows.
     pub(super) fn value(
         &mut self,
         field: u8,
@@ -123,21 +131,26 @@ impl CommandLink {
         counters: &mut PortCounters,
         now: Instant,
     ) {
-        let Some(field) = self.fields.get_mut(usize::from(field)) else { return };
+        let Some(place) = self.fields.get_mut(usize::from(field)) else { return };
         // Only integer fields can be bound to a table.
         let value = value.as_f64() as i64;
-        let before = field.last.replace(value);
-        let acts = match field.when {
-            CommandWhen::Frame => true,
-            CommandWhen::Change => before.is_some_and(|before| before != value),
-        };
-        let table = field.table;
+        let before = place.last.replace(value);
+        let (table, when) = (place.table, place.when);
+        let changed = before.is_some_and(|before| before != value);
+        if changed {
+            self.stops.no_longer_asked(field, now);
+        }
+        let acts = when == CommandWhen::Frame || changed;
         let entries = table.of(&self.tables.entries);
         let picked = (table.start..).zip(entries).find(|(_, entry)| entry.value == value);
-        let (true, Some((entry, _))) = (acts, picked) else { return };
+        let (true, Some((entry, Entry { keyword, .. }))) = (acts, picked) else { return };
         bump(&mut counters.commands);
-        let waiting = Waiting { port, entry, since: now, nth: counters.commands };
-        if self.supervisor.is_up() && self.queue.push_back(waiting).is_ok() {
+        let waiting = Waiting { port, entry, field, since: now, nth: counters.commands };
+        if keyword.is_urgent() {
+            self.overtaken = self.queue.len();
+            self.stops.push(*keyword, waiting);
+            *reply = ReplyCode::Pending;
+        } else if self.ordinary.supervisor.is_up() && self.queue.push_back(waiting).is_ok() {
             *reply = ReplyCode::Pending;
         } else {
             bump(&mut counters.commands_dropped);
@@ -145,43 +158,156 @@ impl CommandLink {
         }
     }
 
-    /// After silence the next value of the field only sets the base.
-    pub(super) fn forget(&mut self, field: u8) {
-        if let Some(field) = self.fields.get_mut(usize::from(field)) {
-            field.last = None;
+    /// What an urgent command has overtaken is not sent any more.
+    pub(super) fn drop_overtaken(&mut self, ports: &mut [FieldPort]) {
+        for _ in 0..core::mem::take(&mut self.overtaken) {
+            if let Some(waiting) = self.queue.pop_front() {
+                drop_one(ports, waiting);
+            }
         }
     }
 
-    /// The link is gone: nothing that waited is sent later.
-    pub(super) fn lost(&mut self, ports: &mut [FieldPort]) {
-        self.client.abort();
-        self.unsent = false;
-        if let Some(sent) = self.in_flight.take() {
-            settle(ports, sent, ReplyCode::NoReply);
+    /// After silence the next value of the field only sets the base. [`Self::drop_forgotten`] follows.
+    pub(super) fn forget(&mut self, field: u8, now: Instant) {
+        if let Some(place) = self.fields.get_mut(usize::from(field))
+            && place.last.take().is_some()
+        {
+            self.stops.no_longer_asked(field, now);
         }
-        while let Some(waiting) = self.queue.pop_front() {
+    }
+
+    /// A device that is gone takes what it asked for with it.
+    pub(super) fn drop_forgotten(&mut self, ports: &mut [FieldPort]) {
+        for _ in 0..self.queue.len() {
+            let Some(waiting) = self.queue.pop_front() else { return };
+            let is_there = self.fields.get(usize::from(waiting.field)).is_some_and(|f| f.last.is_some());
+            // The one that was taken out left its place.
+            if !is_there || self.queue.push_back(waiting).is_err() {
+                drop_one(ports, waiting);
+            }
+        }
+    }
+
+    /// A connection came up.
+    pub(super) fn up(&mut self, link: LinkId, now: Instant) {
+        if let Some(session) = self.session(link) {
+            session.supervisor.up(now);
+        }
+    }
+
+    /// The driver reports that a connection is lost or could not be opened.
+    pub(super) fn down(&mut self, link: LinkId, ports: &mut [FieldPort], now: Instant) {
+        let ordinary = self.ordinary.supervisor.state();
+        let urgent = self.urgent.as_ref().map(|session| session.supervisor.state());
+        let Some(session) = self.session(link) else { return };
+        if session.supervisor.down(now) {
+            self.lost(link, ports, now);
+        }
+        match (link, ordinary, urgent) {
+            (LinkId::URGENT, LinkState::Up { .. }, Some(LinkState::Opening { .. } | LinkState::Up { .. })) => {
+                self.strike(ports, now);
+            }
+            (LinkId::COMMAND, LinkState::Up { .. }, Some(LinkState::Up { since }))
+                if now.saturating_since(since) <= TOGETHER =>
+            {
+                self.strike(ports, now);
+            }
+            // Both were lost together: that was no verdict on the second one.
+            (LinkId::COMMAND, LinkState::Up { .. }, _) => {
+                self.struck_at = self.struck_at.filter(|&at| now.saturating_since(at) > TOGETHER);
+            }
+            (LinkId::COMMAND, LinkState::Opening { .. }, _) => self.was_away(now),
+            _ => {}
+        }
+    }
+
+    /// The second connection was lost, or the first because of it.
+    fn strike(&mut self, ports: &mut [FieldPort], now: Instant) {
+        let Some(urgent) = &mut self.urgent else { return };
+        let again = self.struck_at.is_some_and(|at| now.saturating_since(at) <= STRIKES_WITHIN);
+        self.struck_at = Some(now);
+        if again {
+            urgent.supervisor.share(now);
+            self.lost(LinkId::URGENT, ports, now);
+        }
+    }
+
+    /// The controller was away: another may have come back.
+    fn was_away(&mut self, now: Instant) {
+        self.struck_at = None;
+        if let Some(urgent) = &mut self.urgent {
+            urgent.supervisor.unshare(now);
+        }
+    }
+
+    /// A connection is gone: nothing that waited for it is sent later, what its device still asks to
+    /// stop excepted.
+    fn lost(&mut self, link: LinkId, ports: &mut [FieldPort], now: Instant) {
+        let Some(session) = self.session(link) else { return };
+        let [first, beside] = session.lost();
+        for sent in [beside, first].into_iter().flatten() {
+            if sent.keyword.is_urgent() && self.is_asked(&sent.command) {
+                self.stops.push_again(sent.keyword, Waiting { since: now, ..sent.command });
+            } else {
+                settle(ports, sent.command, ReplyCode::NoReply);
+            }
+        }
+        if link == LinkId::COMMAND {
+            while let Some(waiting) = self.queue.pop_front() {
+                drop_one(ports, waiting);
+            }
+        }
+    }
+
+    /// The gateway itself slept: nothing is commanded from what was asked before.
+    pub(super) fn slept(&mut self, ports: &mut [FieldPort], now: Instant) {
+        self.fields.iter_mut().for_each(|field| field.last = None);
+        for link in [LinkId::COMMAND, LinkId::URGENT] {
+            if let Some(session) = self.session(link) {
+                session.supervisor.give_up(now);
+            }
+            self.lost(link, ports, now);
+        }
+        while let Some((_, waiting)) = self.stops.pop(|_| true) {
             drop_one(ports, waiting);
         }
     }
 
     /// The transport took everything.
-    pub(super) fn sent(&mut self) {
-        self.unsent = false;
+    pub(super) fn sent(&mut self, link: LinkId) {
+        if let Some(session) = self.session(link) {
+            session.taken();
+        }
+    }
+
+    /// The peer's transport has acknowledged all but `left` bytes.
+    pub(super) fn acked(&mut self, link: LinkId, left: u32) {
+        if let Some(session) = self.session(link) {
+            session.acked(left);
+        }
     }
 
     /// Bytes from the controller.
-    pub(super) fn bytes(&mut self, bytes: &[u8], ports: &mut [FieldPort], now: Instant) {
-        self.supervisor.heard(now);
-        add(&mut self.counters.bytes_in, bytes.len());
-        let mut rest = bytes;
-        while self.step(&mut rest, ports, now) {}
+    pub(super) fn bytes(&mut self, link: LinkId, bytes: &[u8], ports: &mut [FieldPort], now: Instant) {
+        let Some(session) = self.session(link).filter(|session| session.supervisor.is_up()) else { return };
+        session.heard(bytes.len(), now);
+        let in_time = session.in_time(now);
+        self.take(link, bytes, ports, in_time);
     }
 
-    /// Looks at the clock: replies that silence completes, timeouts, commands that waited too long.
+    /// Looks at the clock: replies that silence completes, timeouts, what waited too long.
     pub(super) fn advance(&mut self, ports: &mut [FieldPort], now: Instant) {
-        if self.client.deadline().is_some_and(|at| now >= at) {
-            let mut rest: &[u8] = &[];
-            while self.step(&mut rest, ports, now) {}
+        for link in [LinkId::URGENT, LinkId::COMMAND] {
+            let Some(session) = self.session(link) else { continue };
+            if session.is_due(now) {
+                self.take(link, &[], ports, now);
+            }
+            let Some(session) = self.session(link) else { continue };
+            if session.is_overdue(now) {
+                session.supervisor.give_up(now);
+                self.lost(link, ports, now);
+            }
+            self.supervise(link, ports, now);
         }
         while let Some(&waiting) = self.queue.front()
             && now >= waiting.since + COMMAND_TTL
@@ -189,71 +315,170 @@ impl CommandLink {
             self.queue.pop_front();
             drop_one(ports, waiting);
         }
+        let fields = &self.fields;
+        while let Some(old) = self.stops.pop_old(now, |waiting| is_asked(fields, &self.tables, waiting)) {
+            drop_one(ports, old);
+        }
     }
 
-    /// The next command, when one may be sent.
+    /// Opens a connection again when it is time; one that did not come about in time says something.
+    fn supervise(&mut self, link: LinkId, ports: &mut [FieldPort], now: Instant) {
+        let ordinary_is_up = self.ordinary.supervisor.is_up();
+        let Some(session) = self.session(link) else { return };
+        let was_opening = matches!(session.supervisor.state(), LinkState::Opening { .. });
+        // Silence is normal here, so nothing that is up is given up.
+        session.supervisor.advance(now);
+        if was_opening && matches!(session.supervisor.state(), LinkState::Down { .. }) {
+            match link {
+                LinkId::COMMAND => self.was_away(now),
+                _ if ordinary_is_up => self.strike(ports, now),
+                _ => {}
+            }
+        }
+    }
+
+    /// The next urgent command, when one may be sent, and where.
+    pub(super) fn next_stop(
+        &mut self,
+        ports: &mut [FieldPort],
+        out: &mut [u8],
+        now: Instant,
+    ) -> Option<(LinkId, usize)> {
+        while let Some(link) = self.way_of_stops()
+            && let Some(command) = self.pop_stop()
+        {
+            if let Some(len) = self.send(link, command, ports, out, (now, now + STOP_TTL)) {
+                return Some((link, len));
+            }
+        }
+        None
+    }
+
+    /// The next other command, when one may be sent.
     pub(super) fn next_command(
         &mut self,
         ports: &mut [FieldPort],
         out: &mut [u8],
         now: Instant,
     ) -> Option<usize> {
-        if !self.supervisor.is_up() || self.client.busy() || self.unsent {
+        if self.queue.is_empty() || !self.ordinary.is_free() || self.is_stopping() {
             return None;
         }
         let waiting = self.queue.pop_front()?;
-        let text = self.tables.text(waiting.entry).unwrap_or("");
-        match self.client.start(now, text.as_bytes(), &self.dialect, out) {
-            Ok(len) => {
-                bump(&mut self.counters.sent);
-                self.in_flight = Some(Waiting { since: now, ..waiting });
-                self.unsent = true;
-                Some(len)
-            }
-            Err(_) => {
-                drop_one(ports, waiting);
-                None
-            }
+        let keyword = self.tables.entry(waiting.entry)?.0.keyword;
+        let until = waiting.since + COMMAND_TTL;
+        self.send(LinkId::COMMAND, (keyword, waiting), ports, out, (now, until))
+    }
+
+    /// Where an urgent command can go now.
+    fn way_of_stops(&self) -> Option<LinkId> {
+        if self.stops.is_empty() {
+            return None;
         }
+        if self.urgent.as_ref().is_some_and(Session::is_free) {
+            return Some(LinkId::URGENT);
+        }
+        self.ordinary.is_free_beside().then_some(LinkId::COMMAND)
     }
 
-    /// When [`Self::advance`] has something to do.
-    pub(super) fn deadline(&self) -> Instant {
-        let waiting = self.queue.front().map_or(Instant::NEVER, |waiting| waiting.since + COMMAND_TTL);
-        self.client.deadline().unwrap_or(Instant::NEVER).min(waiting)
-    }
-
-    /// One event of the client; false when there is none.
-    fn step(&mut self, rest: &mut &[u8], ports: &mut [FieldPort], now: Instant) -> bool {
-        let code = match self.client.receive(now, rest) {
-            None => return false,
-            Some(ClientEvent::Reply { kind, .. }) => match kind {
-                ReplyKind::Success | ReplyKind::Value => ReplyCode::Success,
-                ReplyKind::Fail => ReplyCode::Fail,
-                _ => ReplyCode::Other,
-            },
-            Some(ClientEvent::Timeout) => {
-                // A late reply would be taken for that of the next command.
-                bump(&mut self.counters.timeouts);
-                self.supervisor.give_up(now);
-                self.lost(ports);
-                return false;
-            }
-            Some(ClientEvent::ScriptFinish) => return true,
-            Some(_) => {
-                bump(&mut self.counters.malformed);
-                return true;
-            }
+    /// The next urgent command, of a kind that is not under way.
+    fn pop_stop(&mut self) -> Option<(Keyword, Waiting)> {
+        let sessions = [Some(&self.ordinary), self.urgent.as_ref()];
+        let under_way = |keyword| {
+            let same = |sent: &Option<Sent>| sent.is_some_and(|sent| sent.keyword == keyword);
+            sessions.into_iter().flatten().any(|session| same(&session.in_flight) || same(&session.beside))
         };
-        if let Some(sent) = self.in_flight.take() {
-            self.counters.answered(now.saturating_since(sent.since).as_micros());
-            if code == ReplyCode::Fail {
-                bump(&mut self.counters.refused);
-            }
-            settle(ports, sent, code);
-        }
-        true
+        self.stops.pop(|keyword| !under_way(keyword))
     }
+
+    fn send(
+        &mut self,
+        link: LinkId,
+        command: (Keyword, Waiting),
+        ports: &mut [FieldPort],
+        out: &mut [u8],
+        times: (Instant, Instant),
+    ) -> Option<usize> {
+        if link == LinkId::URGENT && self.ordinary.is_unacknowledged() {
+            // What is under way there could arrive after this and start the robot again.
+            self.ordinary.supervisor.give_up(times.0);
+            self.lost(LinkId::COMMAND, ports, times.0);
+        }
+        let session = match link {
+            LinkId::URGENT => self.urgent.as_mut()?,
+            _ => &mut self.ordinary,
+        };
+        let (_, text) = self.tables.entry(command.1.entry)?;
+        let sent = session.send(command, text, &self.dialect, out, times);
+        if sent.is_err() {
+            drop_one(ports, command.1);
+        }
+        sent.ok()
+    }
+
+    /// Whether an urgent command waits or is unanswered.
+    fn is_stopping(&self) -> bool {
+        let urgent = |sent: &Option<Sent>| sent.is_some_and(|sent| sent.keyword.is_urgent());
+        let session = self.urgent.as_ref();
+        !self.stops.is_empty()
+            || session.is_some_and(|session| session.in_flight.is_some() || session.beside.is_some())
+            || urgent(&self.ordinary.in_flight)
+            || self.ordinary.beside.is_some()
+    }
+
+    /// When something happens by itself, on one connection or, of the command link, at all.
+    pub(super) fn deadline_of(&self, link: LinkId) -> Instant {
+        let session = match link {
+            LinkId::URGENT => match &self.urgent {
+                Some(session) => session,
+                None => return Instant::NEVER,
+            },
+            _ => &self.ordinary,
+        };
+        let own = session.deadline().min(session.supervisor.deadline());
+        if link == LinkId::URGENT {
+            return own;
+        }
+        let waiting = self.queue.front().map_or(Instant::NEVER, |waiting| waiting.since + COMMAND_TTL);
+        own.min(waiting).min(self.stops.deadline(|waiting| self.is_asked(waiting)))
+    }
+
+    fn session(&mut self, link: LinkId) -> Option<&mut Session> {
+        match link {
+            LinkId::URGENT => self.urgent.as_mut(),
+            _ => Some(&mut self.ordinary),
+        }
+    }
+
+    /// Whether the field still has the value that picked the command.
+    fn is_asked(&self, waiting: &Waiting) -> bool {
+        is_asked(&self.fields, &self.tables, waiting)
+    }
+
+    /// Takes what is in `rest`, or what the clock has completed.
+    fn take(&mut self, link: LinkId, bytes: &[u8], ports: &mut [FieldPort], now: Instant) {
+        let mut rest = bytes;
+        loop {
+            let Some(session) = self.session(link) else { return };
+            match session.step(&mut rest, now) {
+                None => return,
+                Some(Event::Other) => {}
+                Some(Event::Answered(sent, code)) => settle(ports, sent.command, code),
+                Some(Event::TimedOut) => {
+                    // A late reply would be taken for that of the next command.
+                    session.supervisor.give_up(now);
+                    self.lost(link, ports, now);
+                    return;
+                }
+            }
+        }
+    }
+}
+
+fn is_asked(fields: &[CommandField], tables: &Tables, waiting: &Waiting) -> bool {
+    let last = fields.get(usize::from(waiting.field)).and_then(|field| field.last);
+    let value = tables.entries.get(usize::from(waiting.entry)).map(|entry| entry.value);
+    last.is_some() && last == value
 }
 
 /// A command came to its end.

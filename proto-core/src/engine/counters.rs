@@ -92,6 +92,21 @@ pub struct LinkCounters {
 }
 
 impl LinkCounters {
+    /// Nothing happened yet.
+    pub(super) const ZERO: Self = Self {
+        sent: 0,
+        received: 0,
+        bytes_in: 0,
+        timeouts: 0,
+        refused: 0,
+        malformed: 0,
+        unreadable: 0,
+        unacknowledged: 0,
+        resync_bytes: 0,
+        round_trip_us: 0,
+        round_trip_max_us: 0,
+    };
+
     /// An answer came `micros` after its request.
     pub(super) fn answered(&mut self, micros: u64) {
         bump(&mut self.received);

@@ -146,31 +146,51 @@ impl FieldPort {
     }
 
     /// The device is gone: nothing of what was under way is continued later.
-    pub(super) fn down(&mut self, bindings: &[InputBind], commands: &mut Option<CommandLink>) {
+    pub(super) fn down(&mut self, bindings: &[InputBind], commands: &mut Option<CommandLink>, now: Instant) {
         if self.is_up {
             bump(&mut self.counters.downs);
         }
         self.is_up = false;
         self.sender.reset();
         self.discard_partial();
-        forget_commands(self.inputs.of(bindings), commands);
+        forget_commands(self.inputs.of(bindings), commands, now);
     }
 
-    /// The CAN controller reports its error state.
-    pub(super) fn bus_state(&mut self, state: BusState) {
+    /// The CAN controller reports its error state. One that has left the bus is as good as gone.
+    pub(super) fn bus_state(
+        &mut self,
+        state: BusState,
+        bindings: &[InputBind],
+        commands: &mut Option<CommandLink>,
+        now: Instant,
+    ) {
         if state == BusState::BusOff && self.bus != BusState::BusOff {
             bump(&mut self.counters.bus_offs);
             self.sender.reset();
+            forget_commands(self.inputs.of(bindings), commands, now);
         }
         self.bus = state;
+    }
+
+    /// The gateway itself slept: nothing of what had begun is continued.
+    pub(super) fn slept(&mut self) {
+        self.sender.skip();
+        self.discard_partial();
+    }
+
+    /// What waited while the gateway itself slept is as old as that, and counts for nothing.
+    pub(super) fn discard(&mut self, bytes: &[u8], now: Instant) {
+        add(&mut self.counters.bytes_in, bytes.len());
+        bump(&mut self.counters.asleep);
+        if let Codec::Stream { input: Some(_), .. } = &self.codec {
+            add(&mut self.counters.discarded_bytes, bytes.len());
+        }
+        self.line.heard = now;
     }
 
     /// Bytes came from the line; [`Self::frames`] takes them.
     pub(super) fn heard(&mut self, bytes: &[u8], now: Instant) {
         add(&mut self.counters.bytes_in, bytes.len());
-        if now >= self.line.heard + self.line.idle_gap {
-            self.discard_partial();
-        }
         self.line.heard = now;
     }
 

@@ -43,9 +43,12 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
     }
 
     pub(super) fn infos(&self) -> impl Iterator<Item = LinkInfo<'_>> + '_ {
-        let command = self.command.iter();
+        let command = self.command.iter().map(|link| &link.ordinary);
         let command =
             command.map(|link| info(LinkId::COMMAND, LinkKind::Command, &link.supervisor, &link.counters));
+        let urgent = self.command.iter().filter_map(|link| link.urgent.as_ref());
+        let urgent =
+            urgent.map(|link| info(LinkId::URGENT, LinkKind::Urgent, &link.supervisor, &link.counters));
         let state = self.state.iter();
         let state = state.map(|link| info(LinkId::STATE, LinkKind::State, &link.supervisor, &link.counters));
         let modbus = self.modbus.iter();
@@ -53,7 +56,7 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
             modbus.map(|link| info(LinkId::MODBUS, LinkKind::Modbus, &link.supervisor, &link.counters));
         let recipes = self.recipes.iter();
         let recipes = recipes.map(|link| info(link.id, link.kind, &link.supervisor, &link.counters));
-        command.chain(state).chain(modbus).chain(recipes)
+        command.chain(urgent).chain(state).chain(modbus).chain(recipes)
     }
 
     /// Everything that depends on the clock.
@@ -65,9 +68,6 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
     ) {
         if let Some(link) = &mut self.command {
             link.advance(ports, now);
-            if link.supervisor.advance(now) {
-                link.lost(ports);
-            }
         }
         if let Some(link) = &mut self.state
             && link.supervisor.advance(now)
@@ -81,18 +81,47 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
             }
         }
         for link in &mut self.recipes {
+            link.advance(store, now);
             if link.supervisor.advance(now) {
                 link.lost(store);
             }
         }
     }
 
+    /// The gateway itself slept: what waits on its connections is as old as that, so all of them begin
+    /// anew.
+    pub(super) fn slept<const PORTS: usize>(
+        &mut self,
+        store: &mut Store<PORTS>,
+        ports: &mut [FieldPort],
+        now: Instant,
+    ) {
+        if let Some(link) = &mut self.command {
+            link.slept(ports, now);
+        }
+        if let Some(link) = &mut self.state {
+            link.supervisor.give_up(now);
+            link.lost();
+        }
+        if let Some(link) = &mut self.modbus {
+            link.supervisor.give_up(now);
+            link.lost(store);
+        }
+        for link in &mut self.recipes {
+            link.supervisor.give_up(now);
+            link.lost(store);
+        }
+    }
+
     /// The driver reports that a link is usable.
     pub(super) fn up<const PORTS: usize>(&mut self, id: LinkId, store: &mut Store<PORTS>, now: Instant) {
+        if !store.safe.is_empty() {
+            store.controller_was_away(now);
+        }
         match id {
-            LinkId::COMMAND => {
+            LinkId::COMMAND | LinkId::URGENT => {
                 if let Some(link) = &mut self.command {
-                    link.supervisor.up(now);
+                    link.up(id, now);
                 }
             }
             LinkId::STATE => {
@@ -126,11 +155,9 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
         now: Instant,
     ) {
         match id {
-            LinkId::COMMAND => {
-                if let Some(link) = &mut self.command
-                    && link.supervisor.down(now)
-                {
-                    link.lost(ports);
+            LinkId::COMMAND | LinkId::URGENT => {
+                if let Some(link) = &mut self.command {
+                    link.down(id, ports, now);
                 }
             }
             LinkId::STATE => {
@@ -170,9 +197,9 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
     ) {
         let bytes = core::mem::take(rest);
         match id {
-            LinkId::COMMAND => {
-                if let Some(link) = self.command.as_mut().filter(|link| link.supervisor.is_up()) {
-                    link.bytes(bytes, ports, now);
+            LinkId::COMMAND | LinkId::URGENT => {
+                if let Some(link) = &mut self.command {
+                    link.bytes(id, bytes, ports, now);
                 }
             }
             LinkId::STATE => {
@@ -193,16 +220,34 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
         }
     }
 
-    /// The transport took everything.
-    pub(super) fn sent(&mut self, id: LinkId) {
+    /// The transport took everything; when something happens there by itself.
+    pub(super) fn sent(&mut self, id: LinkId) -> Instant {
         match id {
-            LinkId::COMMAND => self.command.iter_mut().for_each(CommandLink::sent),
-            LinkId::MODBUS => self.modbus.iter_mut().for_each(ModbusLink::sent),
-            _ => self.recipe(id).into_iter().for_each(Uplink::sent),
+            LinkId::COMMAND | LinkId::URGENT => {
+                self.command.iter_mut().for_each(|link| link.sent(id));
+                self.deadline_of(id)
+            }
+            LinkId::MODBUS => self.modbus.as_mut().map_or(Instant::NEVER, |link| {
+                link.sent();
+                link.deadline()
+            }),
+            _ => self.recipe(id).map_or(Instant::NEVER, |link| {
+                link.sent();
+                link.deadline()
+            }),
         }
     }
 
-    /// What goes to the controller: field values first, commands last.
+    /// The peer's transport has acknowledged all but `left` bytes.
+    pub(super) fn acked(&mut self, id: LinkId, left: u32) {
+        match id {
+            LinkId::COMMAND | LinkId::URGENT => self.command.iter_mut().for_each(|link| link.acked(id, left)),
+            LinkId::MODBUS => self.modbus.iter_mut().for_each(|link| link.acked(left)),
+            _ => self.recipe(id).into_iter().for_each(|link| link.acked(left)),
+        }
+    }
+
+    /// What goes to the controller: what stops the robot, then field values, commands last.
     pub(super) fn next_upward<const PORTS: usize>(
         &mut self,
         store: &mut Store<PORTS>,
@@ -210,6 +255,11 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
         out: &mut [u8],
         now: Instant,
     ) -> Option<(LinkId, usize)> {
+        if let Some(link) = &mut self.command
+            && let Some(sent) = link.next_stop(ports, out, now)
+        {
+            return Some(sent);
+        }
         let state = self.state.as_ref().map(|state| state.group);
         for link in &mut self.recipes {
             if let Some(len) = link.next_frame(store, state, out, now) {
@@ -227,8 +277,13 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
 
     /// Links to be opened and closed.
     pub(super) fn next_action(&mut self) -> Option<(LinkId, LinkAction)> {
-        if let Some(action) = self.command.as_mut().and_then(|link| link.supervisor.take_action()) {
-            return Some((LinkId::COMMAND, action));
+        if let Some(link) = &mut self.command {
+            if let Some(action) = link.ordinary.supervisor.take_action() {
+                return Some((LinkId::COMMAND, action));
+            }
+            if let Some(action) = link.urgent.as_mut().and_then(|link| link.supervisor.take_action()) {
+                return Some((LinkId::URGENT, action));
+            }
         }
         if let Some(action) = self.state.as_mut().and_then(|link| link.supervisor.take_action()) {
             return Some((LinkId::STATE, action));
@@ -242,7 +297,7 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
 
     /// When something happens by itself.
     pub(super) fn deadline(&self) -> Instant {
-        let mut first = self.deadline_of(LinkId::COMMAND);
+        let mut first = self.deadline_of(LinkId::COMMAND).min(self.deadline_of(LinkId::URGENT));
         first = first.min(self.deadline_of(LinkId::STATE)).min(self.deadline_of(LinkId::MODBUS));
         for link in &self.recipes {
             first = first.min(link.deadline()).min(link.supervisor.deadline());
@@ -253,10 +308,9 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
     /// When something happens by itself on one link.
     pub(super) fn deadline_of(&self, id: LinkId) -> Instant {
         let (own, supervisor) = match id {
-            LinkId::COMMAND => match &self.command {
-                Some(link) => (link.deadline(), &link.supervisor),
-                None => return Instant::NEVER,
-            },
+            LinkId::COMMAND | LinkId::URGENT => {
+                return self.command.as_ref().map_or(Instant::NEVER, |link| link.deadline_of(id));
+            }
             LinkId::STATE => match &self.state {
                 Some(link) => (Instant::NEVER, &link.supervisor),
                 None => return Instant::NEVER,

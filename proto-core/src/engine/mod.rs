@@ -6,6 +6,10 @@
 //! never sleeps, never does I/O and never allocates; the work of a call is bounded by the size of
 //! the configuration and of what it was given.
 //!
+//! Late is judged by arrival: only [`Input::Tick`] lets a deadline pass, so that what waited while
+//! the driver was busy still counts. A driver that was away for more than [`ASLEEP`] has nothing to
+//! tell that could be believed: it is discarded.
+//!
 //! What a device or the controller sends wrong is counted and skipped; it is never an error of the
 //! run loop, and never applied in part.
 
@@ -14,13 +18,16 @@ mod command_link;
 mod counters;
 mod field_output;
 mod field_port;
+mod flight;
 mod io;
 mod links;
 mod modbus_link;
 mod outbox;
 mod plan;
 mod sender;
+mod session;
 mod state_link;
+mod stops;
 mod store;
 mod uplink;
 mod user;
@@ -55,6 +62,17 @@ use crate::time::{Duration, Instant};
 /// controller is shorter.
 pub const OUTPUT_BUFFER: usize = MAX_STREAM_FRAME;
 
+/// A driver that calls the engine later than this after the call before was asleep: stopped, suspended,
+/// or in a debugger.
+pub const ASLEEP: Duration = Duration::from_millis(500);
+
+/// The engine asks to be called so often even when it has nothing to do, so that it notices.
+const HEARTBEAT: Duration = Duration::from_millis(250);
+
+/// After it slept, the gateway takes nothing from the field for so long, and until the next tick:
+/// drivers read what waits in devices in pieces.
+const DEAF: Duration = Duration::from_millis(50);
+
 /// The clock's last instant. [`Instant::NEVER`] is behind it, so that "no deadline" never comes.
 const LAST: Instant = Instant::from_micros(u64::MAX - 1);
 
@@ -75,24 +93,38 @@ pub struct Engine<const PORTS: usize = 8, const UPLINKS: usize = 4, const FIELDS
     timer_at: Instant,
     /// The clock was looked at since `timer_at` was worked out.
     rearm: bool,
+    /// The newest instant that was told.
+    now: Instant,
+    /// A deadline has come and its tick has not been told: what is too old may still wait, so nothing
+    /// is sent before that.
+    is_late: bool,
+    /// The instant of the newest [`Output::Sleep`]; that of a tick that was not told stands until then.
+    announced: Instant,
+    /// Whoever is not called until [`ASLEEP`] after the call before was asleep; this sees to a call.
+    beat_at: Instant,
     /// Times the gateway slept.
     sleeps: u32,
+    /// What arrives on field ports waited while the gateway slept.
+    is_deaf: bool,
+    deaf_until: Instant,
 }
 
 impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS, UPLINKS, FIELDS> {
-    /// Something happened, or time passed. `now` must not be earlier than in the call before.
+    /// Something happened, or time passed. `now` is the present; an instant earlier than in the call
+    /// before counts as that.
     ///
     /// Inputs for a port or link that the configuration does not have are ignored.
     pub fn handle(&mut self, now: Instant, input: Input<'_>) {
-        let now = now.min(LAST);
-        if now >= self.timer_at {
-            self.advance(now);
-        }
+        let now = self.present(now);
+        self.is_late = now >= self.announced;
         // Whatever happens may set an earlier deadline; what it makes later is found out in time.
         match input {
             Input::PortBytes { port: id, bytes } => {
                 let look = self.look();
                 if let Some(port) = find_port(&mut self.ports, id) {
+                    if self.is_deaf {
+                        return port.discard(bytes, now);
+                    }
                     port.heard(bytes, now);
                 }
                 let mut rest = bytes;
@@ -111,6 +143,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             Input::PortCan { port: id, frame } => {
                 let (store, command) = (&mut self.store, &mut self.links.command);
                 let Some(port) = find_port(&mut self.ports, id) else { return };
+                if self.is_deaf {
+                    return port.discard(frame.data(), now);
+                }
                 let accepted = port.can(&frame, &self.bindings.inputs, store, command, now);
                 let deadline = port.deadline();
                 self.arm(deadline);
@@ -120,9 +155,16 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             Input::PortUp { port } => self.change_port(port, FieldPort::up),
             Input::PortDown { port: id } => {
                 let Some(port) = find_port(&mut self.ports, id) else { return };
-                port.down(&self.bindings.inputs, &mut self.links.command);
+                port.down(&self.bindings.inputs, &mut self.links.command, now);
+                self.drop_forgotten();
             }
-            Input::PortBus { port, state } => self.change_port(port, |port| port.bus_state(state)),
+            Input::PortBus { port: id, state } => {
+                let Some(port) = find_port(&mut self.ports, id) else { return };
+                port.bus_state(state, &self.bindings.inputs, &mut self.links.command, now);
+                let deadline = port.deadline();
+                self.arm(deadline);
+                self.drop_forgotten();
+            }
             Input::LinkUp { link } => {
                 self.links.up(link, &mut self.store, now);
                 self.arm(self.links.deadline_of(link));
@@ -146,23 +188,33 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
                 }
             }
             Input::LinkSent { link } => {
-                self.links.sent(link);
+                let deadline = self.links.sent(link);
+                self.arm(deadline);
+            }
+            Input::LinkAcked { link, left } => {
+                self.links.acked(link, left);
                 self.arm(self.links.deadline_of(link));
             }
-            Input::LinkAcked { .. } | Input::Tick => {}
+            Input::Tick => {
+                (self.is_late, self.announced) = (false, Instant::NEVER);
+                self.is_deaf &= now < self.deaf_until;
+                if now >= self.timer_at {
+                    self.advance(now);
+                }
+            }
         }
     }
 
-    /// What the driver has to do next; call it again until it is [`Output::Sleep`].
+    /// What the driver has to do next; call it again until it is [`Output::Sleep`]. Nothing is sent
+    /// between a deadline and the [`Input::Tick`] that lets it pass.
     ///
-    /// What brings field values to the controller comes first, then what keeps links up, then what
-    /// goes to the field.
+    /// What stops the robot comes first, then what brings field values to the controller, then what
+    /// keeps links up, then what goes to the field.
     pub fn poll_output<'b>(&mut self, now: Instant, buf: &'b mut [u8; OUTPUT_BUFFER]) -> Output<'b> {
-        let now = now.min(LAST);
-        if now >= self.timer_at {
-            self.advance(now);
-        }
-        if let Some((link, len)) = self.links.next_upward(&mut self.store, &mut self.ports, &mut buf[..], now)
+        let now = now.min(LAST).max(self.now);
+        if !self.is_late
+            && let Some((link, len)) =
+                self.links.next_upward(&mut self.store, &mut self.ports, &mut buf[..], now)
         {
             self.arm(self.links.deadline_of(link));
             return Output::LinkSend { link, bytes: buf.get(..len).unwrap_or(&[]) };
@@ -173,7 +225,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
                 LinkAction::Close => Output::LinkClose { link },
             };
         }
-        match self.next_downward(&mut buf[..], now) {
+        let downward = if self.is_late { None } else { self.next_downward(&mut buf[..], now) };
+        match downward {
             Some((port, Downward::Bytes(len))) => {
                 Output::PortSend { port, bytes: buf.get(..len).unwrap_or(&[]) }
             }
@@ -183,7 +236,11 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
                     self.rearm = false;
                     self.timer_at = self.deadline();
                 }
-                Output::Sleep { until: self.timer_at }
+                if self.ports.is_empty() {
+                    return Output::Sleep { until: Instant::NEVER };
+                }
+                self.announced = self.announced.min(self.timer_at).min(self.beat_at);
+                Output::Sleep { until: self.announced }
             }
         }
     }
@@ -193,7 +250,44 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     pub fn deadline(&self) -> Instant {
         let ports = self.ports.iter().map(FieldPort::deadline);
         let ports = ports.min().unwrap_or(Instant::NEVER);
-        ports.min(self.links.deadline()).min(self.store.deadline())
+        let hears_at = if self.is_deaf { self.deaf_until } else { Instant::NEVER };
+        ports.min(self.links.deadline()).min(self.store.deadline()).min(hears_at)
+    }
+
+    /// The present, and whether the gateway has slept until now.
+    fn present(&mut self, now: Instant) -> Instant {
+        let now = now.min(LAST).max(self.now);
+        if now >= self.beat_at {
+            // A configured engine is called at every beat; before the first call nothing was late.
+            if self.now != Instant::ZERO && now.saturating_since(self.now) > ASLEEP {
+                self.wake(now);
+            }
+            self.beat_at = now + HEARTBEAT;
+        }
+        self.now = now;
+        now
+    }
+
+    /// The gateway itself slept: what waits for it is as old as that. Overdue safe values go first,
+    /// nothing is commanded, and every connection begins anew.
+    fn wake(&mut self, now: Instant) {
+        self.sleeps = self.sleeps.wrapping_add(1);
+        self.advance(now);
+        self.ports.iter_mut().for_each(FieldPort::slept);
+        self.links.slept(&mut self.store, &mut self.ports, now);
+        self.count_lost();
+        self.is_deaf = true;
+        self.deaf_until = now + DEAF;
+        self.arm(self.deaf_until);
+    }
+
+    /// Commands whose device is gone.
+    fn drop_forgotten(&mut self) {
+        if let Some(command) = &mut self.links.command {
+            command.drop_forgotten(&mut self.ports);
+            let deadline = command.deadline_of(LinkId::COMMAND);
+            self.arm(deadline);
+        }
     }
 
     /// The process image.
@@ -248,9 +342,12 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         self.sleeps
     }
 
-    /// Something depends on the clock from `at` on.
+    /// Something depends on the clock from `at` on. What is due already is served before the engine
+    /// sleeps, or at the tick that is late.
     fn arm(&mut self, at: Instant) {
-        self.timer_at = self.timer_at.min(at);
+        if at > self.now {
+            self.timer_at = self.timer_at.min(at);
+        }
     }
 
     fn change_port(&mut self, id: PortId, change: impl FnOnce(&mut FieldPort)) {
@@ -292,11 +389,17 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
                 bump(&mut port.counters.timeouts);
                 add(&mut port.counters.values_expired, dropped);
             }
-            forget_commands(frame.bindings.of(&self.bindings.inputs), &mut self.links.command);
+            forget_commands(frame.bindings.of(&self.bindings.inputs), &mut self.links.command, now);
         }
         if timed_out {
+            self.drop_forgotten();
             self.image_changed();
         }
+        self.expire_waiting(now);
+    }
+
+    /// Values that have waited too long are dropped.
+    fn expire_waiting(&mut self, now: Instant) {
         let ports = &mut self.ports;
         self.store.expire_waiting(
             |port, dropped| {
@@ -313,9 +416,14 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         if accepted.frames == 0 {
             return;
         }
+        let deadline = self.store.deadline();
+        if deadline <= now {
+            self.expire_waiting(now);
+        }
         self.arm(self.store.deadline());
-        if let Some(command) = &self.links.command {
-            let deadline = command.deadline();
+        if let Some(command) = &mut self.links.command {
+            command.drop_overtaken(&mut self.ports);
+            let deadline = command.deadline_of(LinkId::COMMAND);
             self.arm(deadline);
         }
         self.image_changed();
@@ -341,11 +449,13 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         if !self.watches_bits {
             return;
         }
+        let mut first = Instant::NEVER;
         for port in &mut self.ports {
             let usable = port.is_usable();
             port.sender.image_changed(&self.store.image, usable, &mut port.counters);
-            self.timer_at = self.timer_at.min(port.deadline());
+            first = first.min(port.deadline());
         }
+        self.arm(first);
     }
 
     /// What goes to the field.

@@ -5,6 +5,7 @@ use heapless::Vec;
 
 use super::OUTPUT_BUFFER;
 use super::counters::{LinkCounters, add, bump};
+use super::flight::Flight;
 use super::outbox::BIT_VARS;
 use super::store::Store;
 use crate::image::{GroupId, InputSet};
@@ -77,6 +78,7 @@ pub(super) struct ModbusLink {
     in_flight: Option<InFlight>,
     /// The transport has not taken the newest request yet.
     unsent: bool,
+    flight: Flight<2>,
     timeouts_in_a_row: u8,
     turn: Turn,
     /// The next write starts at this variable, so that none waits for ever.
@@ -97,6 +99,7 @@ impl ModbusLink {
             blocks: Vec::new(),
             in_flight: None,
             unsent: false,
+            flight: Flight::new(),
             timeouts_in_a_row: 0,
             turn: Turn::Write,
             cursor: 0,
@@ -141,6 +144,7 @@ impl ModbusLink {
     /// The connection is up.
     pub(super) fn up<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
         self.timeouts_in_a_row = 0;
+        self.flight.clear();
         store.link_up(&self.writes);
     }
 
@@ -148,6 +152,7 @@ impl ModbusLink {
     pub(super) fn lost<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
         self.abort(store);
         self.unsent = false;
+        self.flight.clear();
         self.write_refused_again(store);
         self.client.reset();
         store.link_lost(&self.writes);
@@ -156,6 +161,11 @@ impl ModbusLink {
     /// The transport took everything.
     pub(super) fn sent(&mut self) {
         self.unsent = false;
+    }
+
+    /// The peer's transport has acknowledged all but `left` bytes.
+    pub(super) fn acked(&mut self, left: u32) {
+        self.flight.acked(left);
     }
 
     /// Bytes from the controller.
@@ -175,6 +185,7 @@ impl ModbusLink {
                 }
                 (_, None) => bump(&mut self.counters.malformed),
                 (ClientEvent::Exception(_), Some(asked)) => {
+                    self.flight.answered();
                     bump(&mut self.counters.refused);
                     if let Asked::Write { safe } = asked.asked
                         && !safe.is_empty()
@@ -188,10 +199,14 @@ impl ModbusLink {
                 (ClientEvent::Response(response), Some(asked)) => {
                     self.counters.answered(now.saturating_since(asked.since).as_micros());
                     self.timeouts_in_a_row = 0;
-                    if let Asked::Poll { block } = asked.asked
-                        && let Some(block) = self.blocks.get(block)
-                    {
-                        take_poll(block, &self.polled, response, store, now);
+                    self.flight.answered();
+                    match asked.asked {
+                        Asked::Write { safe } => store.confirm(&safe),
+                        Asked::Poll { block } => {
+                            if let Some(block) = self.blocks.get(block) {
+                                take_poll(block, &self.polled, response, store, now);
+                            }
+                        }
                     }
                 }
             }
@@ -209,8 +224,12 @@ impl ModbusLink {
         bump(&mut self.counters.timeouts);
         self.abort(store);
         self.timeouts_in_a_row = self.timeouts_in_a_row.saturating_add(1);
-        // A request that has not left by now would be carried out when nobody waits for it any more.
-        if self.unsent || self.timeouts_in_a_row >= TIMEOUTS_IN_A_ROW {
+        // A request that has not arrived by now would be carried out when nobody waits for it any more.
+        let is_under_way = self.unsent || !self.flight.is_empty();
+        if is_under_way {
+            bump(&mut self.counters.unacknowledged);
+        }
+        if is_under_way || self.timeouts_in_a_row >= TIMEOUTS_IN_A_ROW {
             self.supervisor.give_up(now);
             self.lost(store);
         }
@@ -242,6 +261,7 @@ impl ModbusLink {
         bump(&mut self.counters.sent);
         self.in_flight = Some(InFlight { asked, since: now });
         self.unsent = true;
+        self.flight.sent(len, now + ANSWER_TIMEOUT);
         Some(len)
     }
 

@@ -4,7 +4,7 @@
 
 use super::counters::{PortCounters, add, bump};
 use crate::config::{OnStale, SendOn};
-use crate::image::{GroupId, Image, MAX_GROUPS};
+use crate::image::{GroupId, Image, MAX_GROUPS, VarSet};
 use crate::schedule::Grid;
 use crate::sysvar::SysVar;
 use crate::time::{Duration, Instant};
@@ -39,8 +39,8 @@ pub(super) struct Sender {
     grid: Option<Grid>,
     /// Where the values come from: all must be known, and fresh unless the recipe holds.
     pub sources: GroupSet,
-    /// Frames of our own ports whose values are shown: they must be known.
-    pub shown_fields: GroupSet,
+    /// The variables: all must be readable.
+    pub shown: VarSet,
     due: bool,
     in_flight: bool,
     /// The next CAN frame of a cycle that is being handed over.
@@ -66,7 +66,7 @@ impl Sender {
             stale_after,
             grid: periodic.then(|| Grid::starting_at(Instant::ZERO, cycle)),
             sources: GroupSet::default(),
-            shown_fields: GroupSet::default(),
+            shown: VarSet::EMPTY,
             due: false,
             in_flight: false,
             next_can: 0,
@@ -90,6 +90,13 @@ impl Sender {
     pub(super) fn reset(&mut self) {
         self.due = false;
         self.in_flight = false;
+        self.next_can = 0;
+        self.digest = None;
+    }
+
+    /// The gateway slept: what was due then is not sent now. What was handed over is still reported.
+    pub(super) fn skip(&mut self) {
+        self.due = false;
         self.next_can = 0;
         self.digest = None;
     }
@@ -148,7 +155,7 @@ impl Sender {
 
     /// Whether the values may be sent at `now`: all known, and fresh unless the recipe holds.
     pub(super) fn may_show(&self, image: &Image, now: Instant) -> bool {
-        self.shown_fields.iter().all(|group| image.stamp_of(group).is_some())
+        image.can_read(&self.shown)
             && self.sources.iter().all(|group| match image.stamp_of(group) {
                 Some(at) => self.on_stale == OnStale::Hold || now.saturating_since(at) <= self.stale_after,
                 None => false,

@@ -7,7 +7,7 @@ use super::field_port::Look;
 use super::store::Store;
 use crate::image::{GroupId, InputSet};
 use crate::link::{LinkTimings, Supervisor};
-use crate::sysvar::{COUNT, INPUT_COUNT, SysVar};
+use crate::sysvar::{COUNT, SysVar};
 use crate::time::{Duration, Instant};
 use crate::wire::state::{StateStream, StateView};
 
@@ -22,8 +22,8 @@ pub(super) struct StateLink {
     pub counters: LinkCounters,
     pub group: GroupId,
     stream: StateStream,
-    /// Output variables that come from here.
-    pub shown: Vec<SysVar, { COUNT - INPUT_COUNT }>,
+    /// Variables that come from here.
+    pub shown: Vec<SysVar, COUNT>,
     /// Input variables whose present value is read back while no port sends them.
     pub read_back: InputSet,
 }
@@ -62,12 +62,21 @@ impl StateLink {
                     bump(&mut self.counters.received);
                     let not_live = self.read_back.minus(&store.live);
                     for &var in &self.shown {
-                        take(&view, var, store);
+                        if !view.read_var(var).is_some_and(|value| store.image.receive(var, value)) {
+                            bump(&mut self.counters.unreadable);
+                        }
                     }
                     for var in not_live.iter() {
-                        if take(&view, var, store) {
+                        if view.read_var(var).is_some_and(|value| store.image.set(var, value).is_ok()) {
                             store.read_back.insert(var);
+                        } else {
+                            // Nobody knows it: it must not be written back.
+                            store.read_back.remove(var);
+                            bump(&mut self.counters.unreadable);
                         }
+                    }
+                    if store.may_confirm(now) {
+                        confirm(&view, store);
                     }
                     store.image.stamp(self.group, now);
                     if look == Look::AtEach {
@@ -88,7 +97,11 @@ impl StateLink {
     }
 }
 
-/// Takes a value into the image. A float that is not finite keeps the value before.
-fn take<const PORTS: usize>(view: &StateView<'_>, var: SysVar, store: &mut Store<PORTS>) -> bool {
-    view.read_var(var).is_some_and(|value| store.image.set(var, value).is_ok())
+/// Safe values that the controller shows, it has.
+fn confirm<const PORTS: usize>(view: &StateView<'_>, store: &mut Store<PORTS>) {
+    for var in store.unconfirmed.iter() {
+        if view.read_var(var) == Some(store.image.value(var)) {
+            store.unconfirmed.remove(var);
+        }
+    }
 }

@@ -56,6 +56,10 @@ pub(super) struct Store<const PORTS: usize> {
     pub live: InputSet,
     /// Variables that have stood at their safe value since their owner fell silent.
     pub safe: InputSet,
+    /// Those of them that the controller is not known to have.
+    pub unconfirmed: InputSet,
+    /// When one of them became so last.
+    pub unconfirmed_since: Instant,
     /// Variables that the state stream has brought since their owner fell silent, or ever.
     pub read_back: InputSet,
     /// Variables whose link is up.
@@ -78,6 +82,8 @@ impl<const PORTS: usize> Store<PORTS> {
             frames: Vec::new(),
             live: InputSet::EMPTY,
             safe: InputSet::EMPTY,
+            unconfirmed: InputSet::EMPTY,
+            unconfirmed_since: Instant::ZERO,
             read_back: InputSet::EMPTY,
             reachable: InputSet::EMPTY,
             lost: [0; PORTS],
@@ -100,8 +106,9 @@ impl<const PORTS: usize> Store<PORTS> {
         if !self.safe.and(&set).is_empty() {
             // Safe values that still wait grow old from now on, and may be too old already.
             self.next_expiry = now;
+            self.safe = self.safe.minus(&set);
+            self.unconfirmed = self.unconfirmed.minus(&set);
         }
-        self.safe = self.safe.minus(&set);
         let reachable = set.and(&self.reachable);
         let Some(queue) = self.edges.get_mut(port) else { return InputSet::EMPTY };
         if reachable != set {
@@ -145,6 +152,8 @@ impl<const PORTS: usize> Store<PORTS> {
             }
             self.outbox.offer_safe(queue, var, value.bytes[0], now);
             self.safe.insert(var);
+            self.unconfirmed.insert(var);
+            self.unconfirmed_since = now;
         }
         Some((frame, dropped))
     }
@@ -215,7 +224,43 @@ impl<const PORTS: usize> Store<PORTS> {
     pub(super) fn again(&mut self, safe: &InputSet) {
         self.outbox.again(&safe.and(&self.safe));
     }
+
+    /// The controller has these safe values, as far as they still stand.
+    pub(super) fn confirm(&mut self, safe: &InputSet) {
+        self.unconfirmed = self.unconfirmed.minus(safe);
+    }
+
+    /// The controller may have started anew: safe values are written once more.
+    pub(super) fn controller_was_away(&mut self, now: Instant) {
+        self.unconfirmed = self.safe;
+        self.unconfirmed_since = now;
+        self.outbox.again(&self.safe);
+    }
+
+    /// Whether what the controller shows now can be what it made of the safe values, and not older.
+    pub(super) fn may_confirm(&self, now: Instant) -> bool {
+        !self.unconfirmed.is_empty() && now >= self.unconfirmed_since + SHOWN_AFTER
+    }
+
+    /// Outputs that show what an input was set to have come: they may confirm safe values.
+    pub(super) fn look_at_witnesses(&mut self, now: Instant) {
+        if !self.may_confirm(now) {
+            return;
+        }
+        let since = self.unconfirmed_since + SHOWN_AFTER;
+        for var in self.unconfirmed.and(&InputSet::BYTES).iter() {
+            if let Some(witness) = var.shown_by()
+                && self.image.known_since(witness).is_some_and(|at| at >= since)
+                && self.image.value(witness) == self.image.value(var)
+            {
+                self.unconfirmed.remove(var);
+            }
+        }
+    }
 }
+
+/// What the controller shows this soon may be older than the safe value.
+const SHOWN_AFTER: Duration = Duration::from_millis(200);
 
 /// When a value that waits since `at` has waited longer than `timeout`.
 fn too_old_at(at: Instant, timeout: Duration) -> Instant {

@@ -5,20 +5,33 @@
 
 use super::counters::{LinkCounters, add, bump};
 use super::field_port::Look;
+use super::flight::Flight;
 use super::io::{LinkId, LinkKind};
 use super::outbox::BIT_VARS;
 use super::store::Store;
-use crate::image::{GroupId, InputSet};
+use crate::image::{GroupId, Image, InputSet};
 use crate::link::Supervisor;
+use crate::recipe::PlacedField;
 use crate::recipe::deframer::{Deframer, datagram};
-use crate::recipe::model::Framing;
+use crate::recipe::model::{Field, Framing};
 use crate::recipe::stream::StreamLayout;
 use crate::time::{Duration, Instant};
 
 /// How old a read-back value may be and still go into a frame.
 const READ_BACK_MAX_AGE: Duration = Duration::from_millis(500);
+/// A safe value is sent again after this, until the controller shows it.
+const REPEAT_EVERY: Duration = Duration::from_millis(4);
+/// The same where nothing can show it, after [`REPEAT_FAST`].
+const REPEAT_SLOWLY: Duration = Duration::from_millis(100);
+const REPEAT_FAST: Duration = Duration::from_secs(1);
+/// Frames that the peer's transport has not acknowledged: what is sent in 250 ms, every 4 ms.
+const MOST_UNACKNOWLEDGED: usize = 64;
+/// A stream of frames that was silent for so long comes from a controller that was away.
+const AWAY_AFTER: Duration = Duration::from_millis(500);
 /// The UDP server streams to whoever sent it something (D24); asked again when nothing comes.
 const GREET_EVERY: Duration = Duration::from_millis(500);
+/// The server may forget whom it has not heard for 60 s (D30).
+const SPEAK_EVERY: Duration = Duration::from_secs(20);
 
 #[derive(Debug, Clone)]
 pub(super) struct Uplink {
@@ -36,8 +49,17 @@ pub(super) struct Uplink {
     pub writes: InputSet,
     /// What the frames down bring.
     pub group: Option<GroupId>,
+    /// Of those that are written here, variables that something would show if the controller had them.
+    pub shown: InputSet,
+    /// How long a frame may take to be acknowledged.
+    patience: Duration,
     busy: bool,
+    flight: Flight<MOST_UNACKNOWLEDGED>,
     greet_at: Instant,
+    /// When the controller would forget who it streams to (D30).
+    speak_at: Instant,
+    /// When safe values are sent again.
+    repeat_at: Instant,
 }
 
 impl Uplink {
@@ -49,6 +71,7 @@ impl Uplink {
         output: Option<StreamLayout>,
         (set, writes): (InputSet, InputSet),
         group: Option<GroupId>,
+        patience: Duration,
     ) -> Self {
         let framing = match kind {
             LinkKind::RecipeTcpListen { .. } => Framing::Bytes,
@@ -66,20 +89,30 @@ impl Uplink {
             set,
             writes,
             group,
+            shown: InputSet::EMPTY,
+            patience,
             busy: false,
+            flight: Flight::new(),
             greet_at: Instant::NEVER,
+            speak_at: Instant::NEVER,
+            repeat_at: Instant::NEVER,
         }
     }
 
     pub(super) fn up<const PORTS: usize>(&mut self, store: &mut Store<PORTS>, now: Instant) {
         self.busy = false;
+        self.flight.clear();
         store.link_up(&self.writes);
         self.greet_at = if self.greets() { now } else { Instant::NEVER };
+        self.speak_at = self.greet_at;
     }
 
     pub(super) fn lost<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
         self.busy = false;
+        self.flight.clear();
         self.greet_at = Instant::NEVER;
+        self.speak_at = Instant::NEVER;
+        self.repeat_at = Instant::NEVER;
         self.deframer.discard();
         store.link_lost(&self.writes);
     }
@@ -87,6 +120,33 @@ impl Uplink {
     /// The transport took everything.
     pub(super) fn sent(&mut self) {
         self.busy = false;
+    }
+
+    /// The peer's transport has acknowledged all but `left` bytes.
+    pub(super) fn acked(&mut self, left: u32) {
+        self.flight.acked(left);
+    }
+
+    /// Looks at the clock: frames that were not acknowledged, safe values that are sent again.
+    pub(super) fn advance<const PORTS: usize>(&mut self, store: &mut Store<PORTS>, now: Instant) {
+        if now >= self.flight.deadline() {
+            bump(&mut self.counters.unacknowledged);
+            self.supervisor.give_up(now);
+            self.lost(store);
+        }
+        if now < self.repeat_at {
+            return;
+        }
+        self.repeat_at = Instant::NEVER;
+        store.look_at_witnesses(now);
+        let wanted = store.unconfirmed.and(&self.writes);
+        if wanted.is_empty() || !self.supervisor.is_up() {
+            return;
+        }
+        store.again(&wanted);
+        let is_new = now.saturating_since(store.unconfirmed_since) < REPEAT_FAST;
+        let fast = is_new || !wanted.and(&self.shown).is_empty();
+        self.repeat_at = now + if fast { REPEAT_EVERY } else { REPEAT_SLOWLY };
     }
 
     /// Bytes, or one datagram, from the controller; those that are left when somebody looks at each
@@ -105,25 +165,25 @@ impl Uplink {
             return &[];
         };
         let (mut fresh, mut left): (bool, &[u8]) = (false, &[]);
+        let unreadable = &mut self.counters.unreadable;
         let mut take = |payload: &[u8]| {
-            let applied = layout.apply(payload, store.image.bytes_mut()).is_ok();
-            fresh |= applied;
-            applied
+            fresh = true;
+            add(unreadable, take_frame(layout, payload, &mut store.image));
         };
         match self.framing {
-            Framing::Datagram => {
-                if datagram(layout, bytes).is_ok_and(&mut take) {
+            Framing::Datagram => match datagram(layout, bytes) {
+                Ok(payload) => {
+                    take(payload);
                     bump(&mut self.counters.received);
-                } else {
-                    bump(&mut self.counters.malformed);
                 }
-            }
+                Err(_) => bump(&mut self.counters.malformed),
+            },
             Framing::Bytes => {
                 let mut rest = bytes;
                 while let Some(payload) = self.deframer.next_frame(layout, &mut rest) {
-                    let is_taken = take(payload);
-                    bump(if is_taken { &mut self.counters.received } else { &mut self.counters.malformed });
-                    if is_taken && look == Look::AtEach {
+                    take(payload);
+                    bump(&mut self.counters.received);
+                    if look == Look::AtEach {
                         // They are counted when they are taken.
                         self.counters.bytes_in = self.counters.bytes_in.wrapping_sub(rest.len() as u32);
                         left = rest;
@@ -134,6 +194,10 @@ impl Uplink {
             }
         }
         if fresh {
+            let before = store.image.stamp_of(group);
+            if !store.safe.is_empty() && before.is_some_and(|at| now.saturating_since(at) > AWAY_AFTER) {
+                store.controller_was_away(now);
+            }
             store.image.stamp(group, now);
             if self.greets() {
                 self.greet_at = now + GREET_EVERY;
@@ -155,22 +219,30 @@ impl Uplink {
         }
         let wanted = !store.outbox.dirty().and(&self.writes).is_empty();
         let len = match &self.input {
-            Some(layout) if wanted && self.is_ready(store, state, now) => {
+            Some(layout) if wanted && !self.flight.is_full() && self.is_ready(store, state, now) => {
                 let len = encode(layout, store, out)?;
                 store.taken(&self.writes);
+                if self.repeat_at == Instant::NEVER && !store.unconfirmed.and(&self.writes).is_empty() {
+                    self.repeat_at = now + REPEAT_EVERY;
+                }
                 bump(&mut self.counters.sent);
                 if self.greets() {
                     self.greet_at = self.greet_at.max(now + GREET_EVERY);
                 }
                 len
             }
-            _ if now >= self.greet_at => {
+            _ if now >= self.greet_at.min(self.speak_at) => {
                 self.greet_at = now + GREET_EVERY;
                 self.greeting(out)?
             }
             _ => return None,
         };
         self.busy = true;
+        match self.framing {
+            Framing::Bytes => self.flight.sent(len, now + self.patience),
+            Framing::Datagram if self.speak_at != Instant::NEVER => self.speak_at = now + SPEAK_EVERY,
+            Framing::Datagram => {}
+        }
         Some(len)
     }
 
@@ -181,7 +253,8 @@ impl Uplink {
 
     /// When the link wants to send by itself.
     pub(super) fn deadline(&self) -> Instant {
-        if self.busy { Instant::NEVER } else { self.greet_at }
+        let speaks_at = if self.busy { Instant::NEVER } else { self.greet_at.min(self.speak_at) };
+        speaks_at.min(self.flight.deadline()).min(self.repeat_at)
     }
 
     /// Whether every variable of the frame has a value that somebody sent or that was just read.
@@ -217,6 +290,23 @@ impl Uplink {
         out.get_mut(..len)?.fill(0);
         Some(len)
     }
+}
+
+/// Puts a frame into the image. What is not finite makes its variable unknown, the rest counts;
+/// returns how many were not.
+#[inline(never)]
+fn take_frame(layout: &StreamLayout, payload: &[u8], image: &mut Image) -> usize {
+    let system = |field: PlacedField| match field.field {
+        Field::System(var) => Some(var),
+        Field::User(_) => None,
+    };
+    if layout.apply(payload, image.bytes_mut()).is_ok() {
+        image.all_readable(layout.fields().filter_map(system));
+        return 0;
+    }
+    let fields = layout.fields().zip(layout.values(payload));
+    let values = fields.filter_map(|(field, value)| Some((system(field)?, value)));
+    values.fold(0, |sum: usize, (var, value)| sum.saturating_add(usize::from(!image.receive(var, value))))
 }
 
 /// The frame with byte variables as they are to be written next, not as they were received last.

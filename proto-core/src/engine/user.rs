@@ -8,6 +8,7 @@ use crate::config::OutputBinding;
 use crate::image::{Image, bind_to_variable, saturate_to_field};
 use crate::recipe::model::MAX_FIELDS;
 use crate::sysvar::SysVar;
+use crate::time::Instant;
 use crate::wire::scalar::{Scalar, ScalarType};
 
 /// What a received value does.
@@ -45,11 +46,11 @@ pub(super) fn fit(bindings: &[InputBind], values: impl Iterator<Item = Scalar>) 
 }
 
 /// After silence the next values pick no commands: they only set the base.
-pub(super) fn forget_commands(bindings: &[InputBind], commands: &mut Option<CommandLink>) {
+pub(super) fn forget_commands(bindings: &[InputBind], commands: &mut Option<CommandLink>, now: Instant) {
     let Some(link) = commands else { return };
     for binding in bindings {
         if let InputBind::Command(field) = binding {
-            link.forget(*field);
+            link.forget(*field, now);
         }
     }
 }

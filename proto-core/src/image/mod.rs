@@ -7,7 +7,7 @@
 
 mod set;
 
-pub use set::InputSet;
+pub use set::{InputSet, VarSet};
 
 use crate::sysvar::{COUNT, IMAGE_BYTES, SysVar};
 use crate::time::{Duration, Instant};
@@ -33,6 +33,10 @@ pub struct Image {
     group: [u8; COUNT],
     /// When each group last arrived; [`Instant::NEVER`] before the first time.
     stamps: [Instant; MAX_GROUPS],
+    /// Variables whose newest value could not be read, whatever else their group brought.
+    unreadable: VarSet,
+    /// Whether there are any.
+    any_unreadable: bool,
 }
 
 impl Default for Image {
@@ -44,7 +48,13 @@ impl Default for Image {
 impl Image {
     /// All zero, and nothing known.
     pub const fn new() -> Self {
-        Self { bytes: [0; IMAGE_BYTES], group: [NO_GROUP; COUNT], stamps: [Instant::NEVER; MAX_GROUPS] }
+        Self {
+            bytes: [0; IMAGE_BYTES],
+            group: [NO_GROUP; COUNT],
+            stamps: [Instant::NEVER; MAX_GROUPS],
+            unreadable: VarSet::EMPTY,
+            any_unreadable: false,
+        }
     }
 
     /// The packed values.
@@ -111,14 +121,53 @@ impl Image {
         self.stamps.get(usize::from(group.0)).copied().filter(|&at| at != Instant::NEVER)
     }
 
-    /// How long ago the variable's value arrived; `None` when it never did.
-    pub fn age(&self, var: SysVar, now: Instant) -> Option<Duration> {
-        self.stamp_of(self.group(var)?).map(|at| now.saturating_since(at))
+    /// Gives the variable the value that its source just sent; one that cannot be read makes the
+    /// variable unknown until a readable one comes. Whether it could be read.
+    #[inline]
+    pub fn receive(&mut self, var: SysVar, value: Scalar) -> bool {
+        let readable = self.set(var, value).is_ok();
+        if !readable || self.any_unreadable {
+            self.note_readable(var, readable);
+        }
+        readable
     }
 
-    /// Whether the variable's value ever arrived.
+    #[cold]
+    fn note_readable(&mut self, var: SysVar, readable: bool) {
+        if readable {
+            self.all_readable(core::iter::once(var));
+        } else {
+            self.unreadable.insert(var);
+            self.any_unreadable = true;
+        }
+    }
+
+    /// Everything that these variables' sources just sent could be read.
+    pub fn all_readable(&mut self, vars: impl Iterator<Item = SysVar>) {
+        if self.any_unreadable {
+            vars.for_each(|var| self.unreadable.remove(var));
+            self.any_unreadable = !self.unreadable.is_empty();
+        }
+    }
+
+    /// Whether the newest values of all these could be read.
+    pub fn can_read(&self, vars: &VarSet) -> bool {
+        !self.any_unreadable || !self.unreadable.meets(vars)
+    }
+
+    /// How long ago the variable's value arrived; `None` when it never did, or could not be read.
+    pub fn age(&self, var: SysVar, now: Instant) -> Option<Duration> {
+        self.known_since(var).map(|at| now.saturating_since(at))
+    }
+
+    /// Whether the variable's value ever arrived, and the newest one could be read.
     pub fn is_known(&self, var: SysVar) -> bool {
-        self.group(var).and_then(|group| self.stamp_of(group)).is_some()
+        self.known_since(var).is_some()
+    }
+
+    /// When the variable's value arrived; `None` when it never did, or could not be read.
+    pub fn known_since(&self, var: SysVar) -> Option<Instant> {
+        self.group(var).and_then(|group| self.stamp_of(group)).filter(|_| !self.unreadable.contains(var))
     }
 }
 
@@ -219,6 +268,18 @@ mod tests {
         assert!(image.set(force, Scalar::Float(f32::NAN)).is_err());
         assert!(image.set(force, Scalar::Word(1)).is_err());
         assert_eq!(image.value(force), Scalar::Float(2.0));
+    }
+
+    #[test]
+    fn what_cannot_be_read_is_unknown_until_it_can() {
+        let mut image = Image::new();
+        let pose = var("RobotState[8]");
+        image.assign(pose, GroupId(1));
+        image.stamp(GroupId(1), Instant::from_millis(5));
+        assert!(image.receive(pose, Scalar::Float(1.5)) && image.is_known(pose));
+        assert!(!image.receive(pose, Scalar::Float(f32::INFINITY)));
+        assert_eq!((image.is_known(pose), image.age(pose, Instant::from_millis(6))), (false, None));
+        assert!(image.receive(pose, Scalar::Float(2.5)) && image.is_known(pose));
     }
 
     #[test]

@@ -1,6 +1,6 @@
-//! A set of input variables, as bits: what a frame carries, what is still to be written.
+//! Sets of variables, as bits: what a frame carries, what is still to be written, what is unknown.
 
-use crate::sysvar::{INPUT_COUNT, SysVar};
+use crate::sysvar::{COUNT, INPUT_COUNT, SysVar};
 
 const WORDS: usize = 3;
 const _: () = assert!(INPUT_COUNT.div_ceil(32) == WORDS);
@@ -107,9 +107,50 @@ impl InputSet {
         if ordinal >= INPUT_COUNT {
             return None;
         }
-        let bit = 1_u32.checked_shl((ordinal % 32) as u32)?;
-        self.0.get_mut(ordinal / 32).map(|word| (word, bit))
+        self.0.get_mut(ordinal / 32).map(|word| (word, bit_of(var)))
     }
+}
+
+/// Some of all variables.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct VarSet([u32; COUNT.div_ceil(32)]);
+
+impl VarSet {
+    /// The empty set.
+    pub const EMPTY: Self = Self([0; COUNT.div_ceil(32)]);
+
+    /// Adds a variable.
+    pub fn insert(&mut self, var: SysVar) {
+        if let Some(word) = self.0.get_mut(var.ordinal() / 32) {
+            *word |= bit_of(var);
+        }
+    }
+
+    /// Removes a variable.
+    pub fn remove(&mut self, var: SysVar) {
+        if let Some(word) = self.0.get_mut(var.ordinal() / 32) {
+            *word &= !bit_of(var);
+        }
+    }
+
+    /// Whether the variable is in the set.
+    pub fn contains(&self, var: SysVar) -> bool {
+        self.0.get(var.ordinal() / 32).is_some_and(|word| word & bit_of(var) != 0)
+    }
+
+    /// Whether nothing is in the set.
+    pub fn is_empty(&self) -> bool {
+        self.0.iter().all(|word| *word == 0)
+    }
+
+    /// Whether some variable is in both.
+    pub fn meets(&self, other: &Self) -> bool {
+        self.0.iter().zip(&other.0).any(|(one, other)| one & other != 0)
+    }
+}
+
+fn bit_of(var: SysVar) -> u32 {
+    1_u32.wrapping_shl((var.ordinal() % 32) as u32)
 }
 
 impl FromIterator<SysVar> for InputSet {
@@ -123,7 +164,18 @@ impl FromIterator<SysVar> for InputSet {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::sysvar::COUNT;
+
+    #[test]
+    fn a_set_of_all_variables_tells_each_apart() {
+        for var in SysVar::all() {
+            let mut set = VarSet::EMPTY;
+            set.insert(var);
+            assert!(SysVar::all().filter(|&other| set.contains(other)).eq([var]));
+            assert!(set.meets(&set) && !set.meets(&VarSet::EMPTY));
+            set.remove(var);
+            assert!(set.is_empty());
+        }
+    }
 
     #[test]
     fn the_set_holds_every_input_and_no_output() {

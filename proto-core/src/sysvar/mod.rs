@@ -150,6 +150,13 @@ impl SysVar {
         Some(StreamPlace { offset: first.saturating_add(self.place_in_span().saturating_mul(len)), len })
     }
 
+    /// The output that shows what this input was set to: the one that stands at the same place of the
+    /// state packet.
+    pub fn shown_by(self) -> Option<Self> {
+        let place = self.stream().filter(|_| self.direction() == Direction::Input)?;
+        Self::all().find(|var| var.direction() == Direction::Output && var.stream() == Some(place))
+    }
+
     /// Where the Modbus map shows the variable; inputs can be written and read back there.
     pub fn modbus(self) -> Option<ModbusPlace> {
         let nth = self.place_in_span();

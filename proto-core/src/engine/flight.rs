@@ -1,0 +1,109 @@
+//! What was handed over to a TCP link and is not known to have arrived: how much of it the peer's
+//! transport still has to acknowledge, and until when it may be delivered
+//! (docs/architecture.md section 9).
+
+use heapless::Deque;
+
+use crate::time::Instant;
+
+/// Transmissions in order, at most `N` of them unacknowledged.
+#[derive(Debug, Clone)]
+pub(super) struct Flight<const N: usize> {
+    /// Bytes handed over since the link came up, wrapping.
+    total: u32,
+    transmissions: Deque<Transmission, N>,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Transmission {
+    /// The total when it had been handed over.
+    end: u32,
+    /// It must not be delivered after this.
+    until: Instant,
+}
+
+impl<const N: usize> Flight<N> {
+    pub(super) const fn new() -> Self {
+        Self { total: 0, transmissions: Deque::new() }
+    }
+
+    /// A connection begins or ends: nothing is under way.
+    pub(super) fn clear(&mut self) {
+        self.total = 0;
+        self.transmissions.clear();
+    }
+
+    /// `len` bytes were handed over, not to be delivered after `until`, which is not earlier than that
+    /// of the transmission before. Whoever hands over asks [`Self::is_full`] first.
+    pub(super) fn sent(&mut self, len: usize, until: Instant) {
+        self.total = self.total.wrapping_add(len as u32);
+        let _ = self.transmissions.push_back(Transmission { end: self.total, until });
+    }
+
+    /// So many bytes of all that was handed over are not acknowledged.
+    pub(super) fn acked(&mut self, left: u32) {
+        let acked = self.total.wrapping_sub(left);
+        while let Some(first) = self.transmissions.front()
+            && acked.wrapping_sub(first.end) as i32 >= 0
+        {
+            self.transmissions.pop_front();
+        }
+    }
+
+    /// The peer answered everything: it has arrived, whatever its transport says.
+    pub(super) fn answered(&mut self) {
+        self.transmissions.clear();
+    }
+
+    /// Whether all is acknowledged.
+    pub(super) fn is_empty(&self) -> bool {
+        self.transmissions.is_empty()
+    }
+
+    /// Whether nothing more may be handed over for now.
+    pub(super) fn is_full(&self) -> bool {
+        self.transmissions.is_full()
+    }
+
+    /// When what was handed over first must have been acknowledged.
+    pub(super) fn deadline(&self) -> Instant {
+        self.transmissions.front().map_or(Instant::NEVER, |first| first.until)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MS: fn(u64) -> Instant = Instant::from_millis;
+
+    #[test]
+    fn what_is_acknowledged_leaves_in_order_and_the_oldest_names_the_deadline() {
+        let mut flight = Flight::<3>::new();
+        assert!(flight.is_empty() && flight.deadline() == Instant::NEVER);
+        for (len, until) in [(10, 1), (20, 2), (30, 3)] {
+            flight.sent(len, MS(until));
+        }
+        assert!(flight.is_full());
+        flight.acked(55);
+        assert_eq!(flight.deadline(), MS(1), "half a transmission is none");
+        flight.acked(49);
+        assert_eq!(flight.deadline(), MS(2));
+        flight.acked(0);
+        assert!(flight.is_empty());
+    }
+
+    #[test]
+    fn the_count_of_bytes_may_wrap() {
+        let mut flight = Flight::<2>::new();
+        for _ in 0..70_000 {
+            flight.sent(65_536, MS(5));
+            flight.acked(0);
+        }
+        flight.sent(100, MS(7));
+        flight.acked(100);
+        assert_eq!(flight.deadline(), MS(7));
+        flight.acked(0);
+        assert!(flight.is_empty());
+    }
+}

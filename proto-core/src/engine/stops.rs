@@ -1,0 +1,87 @@
+//! Urgent commands that wait: what stops the robot goes ahead of everything and does not grow old
+//! while its device still asks for it (docs/architecture.md section 7).
+
+use heapless::Vec;
+
+use super::io::PortId;
+use crate::command::Keyword;
+use crate::config::MAX_PORTS;
+use crate::time::{Duration, Instant};
+
+/// Four urgent commands, each once for every port.
+const MOST: usize = 4 * MAX_PORTS;
+/// How long one waits that nobody asks for any more, and how long it may take to be acknowledged.
+pub(super) const STOP_TTL: Duration = Duration::from_secs(1);
+
+/// A command that a value picked.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Waiting {
+    /// Since when; of an urgent one, since when nobody has asked for it any more.
+    pub since: Instant,
+    /// How many commands the port had picked with it: only the newest one's outcome is shown.
+    pub nth: u32,
+    pub entry: u16,
+    pub port: PortId,
+    /// The command field that picked it.
+    pub field: u8,
+}
+
+/// The urgent commands that wait, in the order in which they were picked.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Stops(Vec<(Keyword, Waiting), MOST>);
+
+impl Stops {
+    pub(super) const fn new() -> Self {
+        Self(Vec::new())
+    }
+
+    pub(super) fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+
+    /// A value picked an urgent command; of one kind and port, one waits.
+    pub(super) fn push(&mut self, keyword: Keyword, command: Waiting) {
+        let same = |other: &&mut (Keyword, Waiting)| other.0 == keyword && other.1.port == command.port;
+        match self.0.iter_mut().find(same) {
+            Some(other) => other.1 = command,
+            None => {
+                // As many places as there are kinds and ports.
+                let _ = self.0.push((keyword, command));
+            }
+        }
+    }
+
+    /// One that was under way is to be sent again, before the others.
+    pub(super) fn push_again(&mut self, keyword: Keyword, command: Waiting) {
+        if !self.0.iter().any(|other| other.0 == keyword && other.1.port == command.port) {
+            let _ = self.0.insert(0, (keyword, command));
+        }
+    }
+
+    /// Takes out the first of a kind that may go now.
+    pub(super) fn pop(&mut self, may_go: impl Fn(Keyword) -> bool) -> Option<(Keyword, Waiting)> {
+        let nth = self.0.iter().position(|(keyword, _)| may_go(*keyword))?;
+        Some(self.0.remove(nth))
+    }
+
+    /// The field does not ask any more.
+    pub(super) fn no_longer_asked(&mut self, field: u8, now: Instant) {
+        for (_, command) in self.0.iter_mut().filter(|(_, command)| command.field == field) {
+            command.since = now;
+        }
+    }
+
+    /// Takes out the first that nobody asks for any more, and that has waited too long since.
+    pub(super) fn pop_old(&mut self, now: Instant, is_asked: impl Fn(&Waiting) -> bool) -> Option<Waiting> {
+        let is_old = |command: &Waiting| now >= command.since + STOP_TTL && !is_asked(command);
+        let old = self.0.iter().map(|(_, command)| *command).find(is_old)?;
+        self.0.retain(|(_, command)| (command.port, command.nth) != (old.port, old.nth));
+        Some(old)
+    }
+
+    /// When the next one has waited too long.
+    pub(super) fn deadline(&self, is_asked: impl Fn(&Waiting) -> bool) -> Instant {
+        let waiting = self.0.iter().map(|(_, command)| command).filter(|command| !is_asked(command));
+        waiting.map(|command| command.since + STOP_TTL).min().unwrap_or(Instant::NEVER)
+    }
+}
