@@ -19,7 +19,7 @@ use tracing::{info, warn};
 use super::bind::{Device, Pace};
 use super::line::accept;
 use super::peer;
-use super::port::{PortEvent, PortTx};
+use super::port::{Backlog, PortEvent, PortTx};
 use super::pty::Pty;
 use super::timer::{Timer, now};
 use super::turns::{arrival, give_way};
@@ -414,21 +414,25 @@ async fn serve(io: &impl ClientIo, node: &Node, bitrate: u32, tx: &PortTx) -> io
     let mut channel = Channel::new(bitrate);
     node.set_hears(false);
     let mut out = Vec::new();
-    let mut buf = [0; CHUNK];
+    let mut buf = [0; OLD_CHUNK];
     let mut unread = 0..0;
     let mut told_dropped = 0;
+    let (mut backlog, mut is_old) = (Backlog::default(), false);
     loop {
         // A frame waits in the bounded queue until the client has taken what is before it, and a
         // client's line until its frames before it have left.
         let room = out.len() < MAX_PENDING;
+        let most = if backlog.is_open(tx) { OLD_CHUNK } else { CHUNK };
         let mut read = None;
         let done = tokio::select! {
             ready = io.readable(), if room && unread.is_empty() => {
-                match ready.and_then(|()| io.try_read(&mut buf)) {
+                match ready.and_then(|()| io.try_read(&mut buf[..most])) {
                     Ok(0) => Err(io::ErrorKind::UnexpectedEof.into()),
                     Ok(count) => {
                         unread = 0..count;
                         read = Some(count);
+                        // Taking its time on the bus a frame would be believed when it is over.
+                        is_old = backlog.has(tx, count == most) || tx.is_stale();
                         Ok(())
                     }
                     Err(error) => Err(error),
@@ -446,7 +450,7 @@ async fn serve(io: &impl ClientIo, node: &Node, bitrate: u32, tx: &PortTx) -> io
             ready = io.writable(), if !out.is_empty() => ready,
             () = tokio::time::sleep(STALE_LOOK), if io.may_be_stale() => Ok(()),
         };
-        take_lines(&mut channel, node, tx, &buf, &mut unread, &mut out);
+        take_lines(&mut channel, node, is_old.then_some(tx), &buf, &mut unread, &mut out);
         let done = done.and_then(|()| flush(io, &mut out, tx));
         if node.dropped() != told_dropped {
             told_dropped = node.dropped();
@@ -458,18 +462,19 @@ async fn serve(io: &impl ClientIo, node: &Node, bitrate: u32, tx: &PortTx) -> io
         }
         // One read holds fewer frames than a node keeps: others take them in between.
         match read {
-            Some(CHUNK) if !tx.is_stale() => give_way().await,
+            Some(count) if count == most && !tx.is_stale() => give_way().await,
             Some(_) => yield_now().await,
             None => {}
         }
     }
 }
 
-/// Carries out a client's lines as long as the node has room for the frames in them.
+/// Carries out a client's lines as long as the node has room for the frames in them. Old frames are dropped
+/// and counted.
 fn take_lines(
     channel: &mut Channel,
     node: &Node,
-    tx: &PortTx,
+    old: Option<&PortTx>,
     buf: &[u8],
     unread: &mut Range<usize>,
     out: &mut Vec<u8>,
@@ -478,12 +483,11 @@ fn take_lines(
         let mut bytes = &buf[unread.clone()];
         if let Some(reaction) = channel.receive(&mut bytes) {
             out.extend_from_slice(reaction.answer);
-            match reaction.frame {
-                // Taking its time on the bus it would be believed when it is over.
-                Some(_) if tx.is_stale() => tx.count(|counters| counters.dropped += 1),
+            match (reaction.frame, old) {
+                (Some(_), Some(tx)) => tx.count(|counters| counters.dropped += 1),
                 // There is room, so it is taken.
-                Some(frame) => drop(node.send(arrival(), frame)),
-                None => {}
+                (Some(frame), None) => drop(node.send(arrival(), frame)),
+                (None, _) => {}
             }
         }
         unread.start = unread.end - bytes.len();
@@ -515,6 +519,8 @@ pub const MAX_WAITING: usize = 256;
 const MAX_CLIENTS: usize = 32;
 /// Most bytes read from a client at once.
 const CHUNK: usize = 256;
+/// The same of what waited while the process slept: of that no frames come.
+const OLD_CHUNK: usize = 4_096;
 /// Bytes made out for a client and not yet taken; beyond it frames wait in the node's queue.
 const MAX_PENDING: usize = 4_096;
 /// Between two looks for a client that went away and left bytes behind.

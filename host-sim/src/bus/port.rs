@@ -146,7 +146,7 @@ impl PortTx {
         self.stale_until.set(now + STALE);
     }
 
-    /// Whether what is read now may have waited while this process slept.
+    /// Whether the port's owner refuses what is read now, since it may have waited while this process slept.
     pub(super) fn is_stale(&self) -> bool {
         self.stale_until.get() != Instant::ZERO && now() < self.stale_until.get()
     }
@@ -185,6 +185,45 @@ impl PortTx {
     }
 }
 
+/// What waited while the process slept. A peer's system may hold megabytes for a connection, more than can be
+/// read in the time in which the port's owner refuses it.
+#[derive(Debug, Default)]
+pub(super) struct Backlog {
+    /// More was there than could be read in that time.
+    is_behind: bool,
+    /// Since when no more was there than could be read at once.
+    small_since: Option<Instant>,
+}
+
+impl Backlog {
+    /// Whether what is read now may be part of it: then it may be read in greater pieces.
+    pub(super) fn is_open(&self, tx: &PortTx) -> bool {
+        self.is_behind || tx.is_stale()
+    }
+
+    /// Whether what was just read is part of it and not refused by the port's owner. `is_more` if there was
+    /// more than was read.
+    pub(super) fn has(&mut self, tx: &PortTx, is_more: bool) -> bool {
+        if tx.is_stale() {
+            self.is_behind = is_more;
+            return false;
+        }
+        if !self.is_behind {
+            return false;
+        }
+        let now = now();
+        // A peer's system may pause before it sends more of it.
+        let since = *self.small_since.get_or_insert(now);
+        if is_more {
+            self.small_since = None;
+        }
+        let is_over = !is_more && now.saturating_since(since) >= PAUSE;
+        // Who never pauses is heard again some time.
+        self.is_behind = !is_over && now.saturating_since(tx.stale_until.get()) < MOST_BACKLOG;
+        self.is_behind
+    }
+}
+
 /// What a port's device did so far.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
 pub struct DeviceCounters {
@@ -198,7 +237,8 @@ pub struct DeviceCounters {
     pub frames_out: u64,
     /// Bytes sent while nobody listened.
     pub unheard: u64,
-    /// Bytes a listener left unread for too long, and whole frames given while the queue was full.
+    /// Bytes a listener left unread for too long, whole frames given while the queue was full, and what waited
+    /// while the process slept and was read too late for the engine to refuse it.
     pub dropped: u64,
     /// Clients turned away because there was one already, or too many.
     pub refused: u64,
@@ -223,6 +263,10 @@ pub struct DeviceCounters {
 
 /// For how long the engine refuses what arrives after a sleep, at least.
 pub const STALE: Duration = Duration::from_millis(50);
+/// A pause after which what comes is no part of a backlog. A peer's system may need a while to send more.
+const PAUSE: Duration = Duration::from_millis(20);
+/// However long a backlog is, after this it counts as new.
+const MOST_BACKLOG: Duration = Duration::from_secs(10);
 /// A frame of every port's recipe fits several times over; a port waits for one to leave.
 const MAX_QUEUED_BYTES: usize = 4_096;
 /// Twice the most ids of a recipe's part.

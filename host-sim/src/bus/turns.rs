@@ -54,15 +54,20 @@ pub(crate) fn expect(deadline: Instant) {
 /// takes: then until all of it is taken, but not for long, since it may have no end.
 pub(crate) async fn all_others() {
     yield_now().await;
-    let begin = now();
-    if held_up_at(begin).is_none() {
+    let mut before = now();
+    if held_up_at(before).is_none() {
         return;
     }
+    let (mut spent, mut quiet_rounds) = (Duration::ZERO, 0);
     // One round more than anybody needs: what one took he may have passed on to another.
-    let mut quiet_rounds = 0;
-    while quiet_rounds < 2 && now().saturating_since(begin) < CATCHING_UP {
+    while quiet_rounds < 2 && spent < CATCHING_UP {
         yield_now().await;
-        quiet_rounds = if UNFINISHED.get() == 0 { quiet_rounds + 1 } else { 0 };
+        let round = now().saturating_since(before);
+        before += round;
+        // The thread may be held up once more.
+        let is_quiet = UNFINISHED.get() == 0 && round < HELD_UP;
+        quiet_rounds = if is_quiet { quiet_rounds + 1 } else { 0 };
+        spent = spent + round.min(HELD_UP);
     }
 }
 
@@ -110,6 +115,28 @@ mod tests {
             }
             let taken = turns.get() - begun;
             assert!((50..=101).contains(&taken), "{taken} in 100 rounds");
+        });
+    }
+
+    #[test]
+    fn who_never_ends_does_not_keep_a_late_deadline_from_being_told() {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        LocalSet::new().block_on(&runtime, async {
+            let turns = Rc::new(Cell::new(0));
+            let own = Rc::clone(&turns);
+            tokio::task::spawn_local(async move {
+                loop {
+                    own.set(own.get() + 1);
+                    give_way().await;
+                }
+            });
+            expect(now() + Duration::from_secs(3_600));
+            all_others().await;
+            let on_time = turns.get();
+            expect(now() - HELD_UP);
+            all_others().await;
+            assert!((1..5).contains(&on_time), "{on_time}");
+            assert!(turns.get() > 2 * on_time, "it had time to catch up");
         });
     }
 }

@@ -379,48 +379,5 @@ impl Endpoint {
 }
 
 #[cfg(test)]
-mod tests {
-    use tokio::task::LocalSet;
-
-    use super::*;
-    use crate::config::file::{Text, parse_gateway};
-    use proto_core::engine::PortCounters;
-    use proto_core::time::Duration;
-
-    const IDLE_GAP: Duration = Duration::from_millis(5);
-    const PORT: PortId = PortId(0);
-
-    /// A gateway whose timer never gets a turn, and its port's counters after these pieces, each told late.
-    fn told_late(pieces: &[&[u8]]) -> PortCounters {
-        let folder = tempfile::tempdir().unwrap();
-        let toml = include_str!("../../configs/rs485-system.toml");
-        let overrides = ["port.rs485-1.idle_gap_ms=5".to_owned()];
-        let config = parse_gateway(Text { name: "rs485-system.toml", toml }, &overrides).unwrap();
-        let bind = format!("rs485-1=pty:{}", folder.path().join("line").display()).parse().unwrap();
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
-        LocalSet::new().block_on(&runtime, async move {
-            let gateway = Gateway::open(&config, &[bind]).await.unwrap();
-            let core = gateway.core;
-            core.input(Input::Tick);
-            core.port_event(PORT, PortEvent::Up);
-            for piece in pieces {
-                core.port_event(PORT, PortEvent::Bytes(piece));
-                std::thread::sleep(std::time::Duration::from_micros(2 * IDLE_GAP.as_micros()));
-            }
-            let engine = core.engine.borrow();
-            *engine.port_counters(PORT).unwrap()
-        })
-    }
-
-    #[test]
-    fn bytes_that_are_told_late_do_not_make_a_silence() {
-        let counters = told_late(&[&[0xFF, 0xFF, 1], &[0xEE, 0xEE]]);
-        assert_eq!((counters.frames_in, counters.discarded_bytes, counters.resync_bytes), (1, 0, 0));
-    }
-
-    #[test]
-    fn a_frame_behind_a_part_of_one_is_found() {
-        let counters = told_late(&[&[0xFF, 0xFF, 1], &[0xFF, 0xFF, 1, 0xEE, 0xEE]]);
-        assert_eq!((counters.frames_in, counters.resync_bytes), (1, 3));
-    }
-}
+#[path = "gateway_tests.rs"]
+mod tests;
