@@ -32,8 +32,8 @@ pub const MAX_FIELD_PORTS: usize = 4;
 pub const MAX_UPLINKS: usize = 2;
 /// User-defined fields in one direction, over all ports.
 pub const MAX_FIELDS: usize = 128;
-/// Recipe links, and command, state and Modbus.
-const MAX_LINKS: usize = MAX_UPLINKS + 3;
+/// Recipe links, and command, urgent commands, state and Modbus.
+pub const MAX_LINKS: usize = MAX_UPLINKS + 4;
 
 /// The engine in the size of a board.
 pub type Engine = AnyEngine<MAX_FIELD_PORTS, MAX_UPLINKS, MAX_FIELDS>;
@@ -116,7 +116,8 @@ impl Gateway {
     pub fn condition(&self) -> Condition {
         let engine = self.engine.borrow();
         let Some(engine) = engine.first() else { return Condition::Refused };
-        let is_up = |link: LinkInfo<'_>| matches!(link.state, LinkState::Up { .. });
+        // The work of a link that is shared is done by another.
+        let is_up = |link: LinkInfo<'_>| matches!(link.state, LinkState::Up { .. } | LinkState::Shared);
         let works = |id| engine.port_state(id) == Some(PortState::Working);
         if !engine.links().all(is_up) {
             Condition::NoController

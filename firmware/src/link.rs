@@ -67,7 +67,7 @@ impl Endpoint {
             _ => 0,
         };
         match kind {
-            LinkKind::Command => Self::Tcp { host, port: controller.command_port },
+            LinkKind::Command | LinkKind::Urgent => Self::Tcp { host, port: controller.command_port },
             LinkKind::State => Self::Tcp { host, port: controller.state_port },
             LinkKind::Modbus => Self::Tcp { host, port: controller.modbus_port },
             LinkKind::RecipeUdp => {

@@ -10,7 +10,7 @@ use embassy_executor::{SpawnError, SpawnToken, Spawner};
 use embassy_net::{Config, Ipv4Cidr, Runner, Stack, StackResources, StaticConfigV4};
 use embassy_time::{Duration, Timer};
 use firmware::fmt::Text;
-use firmware::gateway::Gateway;
+use firmware::gateway::{Gateway, MAX_LINKS};
 use firmware::led::Condition;
 use firmware::link::{Buffers, Endpoint};
 use firmware::watchdog::{Pulse, TaskName};
@@ -303,8 +303,6 @@ async fn refused(pulse: &'static Pulse, reason: Refused) -> ! {
     pulse.run(pin!(telling)).await
 }
 
-/// Command, state, Modbus and the recipe links.
-const MAX_LINKS: usize = firmware::gateway::MAX_UPLINKS + 3;
 /// One for each link, DHCP and DNS.
 const SOCKETS: usize = MAX_LINKS + 2;
 /// After this long the reason is told again.
