@@ -46,10 +46,12 @@ pub struct Gateway {
     ports: Vec<(PortId, PortControl), MAX_FIELD_PORTS>,
     links: Vec<(LinkId, LinkKind, LinkControl), MAX_LINKS>,
     output: RefCell<[u8; OUTPUT_BUFFER]>,
-    /// The latest time that the engine was told.
-    told: Cell<Instant>,
     deadline: Cell<Instant>,
     deadline_moved: Notify,
+    /// Some task gave the processor back before it had told all that waits.
+    more_waits: Cell<bool>,
+    /// As often the gateway slept, as the ports' tasks know.
+    sleeps: Cell<u32>,
 }
 
 impl Gateway {
@@ -60,9 +62,10 @@ impl Gateway {
             ports: Vec::new(),
             links: Vec::new(),
             output: RefCell::new([0; OUTPUT_BUFFER]),
-            told: Cell::new(Instant::ZERO),
             deadline: Cell::new(Instant::ZERO),
             deadline_moved: Notify::new(),
+            more_waits: Cell::new(false),
+            sleeps: Cell::new(0),
         }
     }
 
@@ -133,26 +136,18 @@ impl Gateway {
         self.links.iter().map(|(_, kind, control)| (*kind, control.strangers.get()))
     }
 
-    /// One input, and everything that follows from it.
-    ///
-    /// Only a tick takes the engine past a deadline: when nobody had the time to look, what is heard late
-    /// was not silent, and what else arrived before the tick has not been told yet.
+    /// One input, now, and everything that follows from it.
     pub fn input(&self, input: Input<'_>) {
-        let deadline = self.deadline.get().as_micros();
-        self.input_at(now().min(Instant::from_micros(deadline.saturating_sub(1))), input);
-    }
-
-    /// The same, of something that happened at `at`, or a little later when the engine has been told a
-    /// later time already.
-    pub(crate) fn input_at(&self, at: Instant, input: Input<'_>) {
-        let at = at.max(self.told.get());
-        self.told.set(at);
+        let now = now();
         let mut engine = self.engine.borrow_mut();
         let Some(engine) = engine.first_mut() else { return };
         let mut buf = self.output.borrow_mut();
-        engine.handle(at, input);
+        engine.handle(now, input);
+        if self.sleeps.replace(engine.sleeps()) != engine.sleeps() {
+            self.ports.iter().for_each(|(_, control)| control.slept());
+        }
         loop {
-            match engine.poll_output(at, &mut buf) {
+            match engine.poll_output(now, &mut buf) {
                 Output::PortSend { port, bytes } => {
                     if let Some(port) = self.port(port) {
                         port.put(bytes);
@@ -188,20 +183,43 @@ impl Gateway {
         }
     }
 
-    /// Calls the engine whenever it asked to be called. The engine's own task.
+    /// Lets deadlines pass whenever the engine asked for it. The engine's own task.
     pub async fn keep_time(&self, pulse: &Pulse) -> ! {
-        self.input_at(now(), Input::Tick);
+        self.input(Input::Tick);
         loop {
             let until = embassy_time::Instant::from_micros(self.deadline.get().as_micros());
             match pulse.idle(pin!(select(Timer::at(until), self.deadline_moved.notified()))).await {
                 Either::First(()) => {
-                    // What arrived before this moment is told first: it may not be overdue.
-                    yield_now().await;
-                    self.input_at(now(), Input::Tick);
+                    self.all_told().await;
+                    self.input(Input::Tick);
                 }
                 Either::Second(()) => {}
             }
         }
+    }
+
+    /// Waits until the engine has heard of all that arrived before this moment: it was not late,
+    /// whatever kept the processor meanwhile. Who always has more is not waited for without an end.
+    ///
+    /// In a round of the executor each task that was woken runs once, in no particular order. What the
+    /// Ethernet controller has goes to the network's task in one round and to a link's in the next.
+    async fn all_told(&self) {
+        // A device may have what it has woken nobody for.
+        self.ports.iter().for_each(|(_, control)| control.changed.notify());
+        let mut quiet = 0_u8;
+        for _ in 0..MAX_ROUNDS {
+            self.more_waits.set(false);
+            yield_now().await;
+            quiet = if self.more_waits.get() { 0 } else { quiet.saturating_add(1) };
+            if quiet >= QUIET_ROUNDS {
+                return;
+            }
+        }
+    }
+
+    /// A task gives the processor back and may have left something that waits to be told.
+    pub(crate) fn more_waits(&self) {
+        self.more_waits.set(true);
     }
 
     pub(crate) fn port(&self, id: PortId) -> Option<&PortControl> {
@@ -225,6 +243,12 @@ pub(crate) fn now() -> Instant {
     Instant::from_micros(embassy_time::Instant::now().as_micros())
 }
 
+/// One for a task whose interrupt comes while the time is looked at, one for that of the network, and one
+/// for a link's behind it.
+const QUIET_ROUNDS: u8 = 3;
+/// What a port's task tells in as many is more than any device keeps.
+const MAX_ROUNDS: u8 = 20;
+
 /// One transmission: the longest frame or request.
 pub(crate) type Transmission = Vec<u8, OUTPUT_BUFFER>;
 
@@ -233,6 +257,7 @@ pub(crate) struct PortControl {
     ids: Vec<CanId, MAX_CAN_IDS>,
     bytes: RefCell<Option<Transmission>>,
     frames: RefCell<Deque<CanFrame, MAX_CAN_IDS>>,
+    has_slept: Cell<bool>,
     changed: Notify,
 }
 
@@ -242,6 +267,7 @@ impl PortControl {
             ids: Vec::new(),
             bytes: RefCell::new(None),
             frames: RefCell::new(Deque::new()),
+            has_slept: Cell::new(false),
             changed: Notify::new(),
         }
     }
@@ -263,6 +289,24 @@ impl PortControl {
         self.changed.notify();
     }
 
+    fn slept(&self) {
+        self.has_slept.set(true);
+        self.changed.notify();
+    }
+
+    /// Waits until the gateway has slept: what waits in the device has to be told at once, as long as
+    /// the engine discards it. Eats notifications, so nothing else may wait for them.
+    pub(crate) async fn has_slept(&self) {
+        while !self.has_slept.take() {
+            self.changed.notified().await;
+        }
+    }
+
+    /// From here on only a sleep to come counts.
+    pub(crate) fn forget_sleep(&self) {
+        self.has_slept.set(false);
+    }
+
     /// The next transmission.
     pub(crate) async fn next_bytes(&self) -> Transmission {
         loop {
@@ -273,9 +317,13 @@ impl PortControl {
         }
     }
 
-    /// The next transmission, if there is one.
-    pub(crate) fn take_bytes(&self) -> Option<Transmission> {
+    fn take_bytes(&self) -> Option<Transmission> {
         self.bytes.borrow_mut().take()
+    }
+
+    /// The next transmission, if there is one and it may be sent now.
+    pub(crate) fn take_bytes_if(&self, may_send: bool) -> Option<Transmission> {
+        if may_send { self.take_bytes() } else { None }
     }
 
     /// Waits until there is a frame to send.

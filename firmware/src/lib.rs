@@ -26,3 +26,5 @@ pub mod watchdog;
 extern crate std;
 #[cfg(test)]
 mod test_clock;
+#[cfg(test)]
+mod test_executor;
