@@ -8,6 +8,7 @@
 //! binary beside this library names the board.
 
 pub mod can;
+pub mod fair;
 pub mod fmt;
 pub mod gateway;
 pub mod identity;
