@@ -222,6 +222,11 @@ impl Gateway {
         self.more_waits.set(true);
     }
 
+    /// Whether a datagram is a frame of the link's.
+    pub(crate) fn is_frame(&self, link: LinkId, datagram: &[u8]) -> bool {
+        self.engine.borrow().first().is_some_and(|engine| engine.is_frame(link, datagram))
+    }
+
     pub(crate) fn port(&self, id: PortId) -> Option<&PortControl> {
         self.ports.iter().find(|(port, _)| *port == id).map(|(_, control)| control)
     }
@@ -351,6 +356,8 @@ pub(crate) struct LinkControl {
     /// Odd while the link is to be open; one more for each opening and closing.
     turn: Cell<u32>,
     outbox: RefCell<Option<Transmission>>,
+    /// Bytes of this turn that are not acknowledged, as the engine knows.
+    unacknowledged: Cell<u32>,
     changed: Notify,
     strangers: Cell<u32>,
 }
@@ -360,6 +367,7 @@ impl LinkControl {
         Self {
             turn: Cell::new(0),
             outbox: RefCell::new(None),
+            unacknowledged: Cell::new(0),
             changed: Notify::new(),
             strangers: Cell::new(0),
         }
@@ -388,14 +396,28 @@ impl LinkControl {
 
     /// The engine hands over one transmission and waits until it was taken.
     fn put(&self, bytes: &[u8]) {
+        self.unacknowledged.set(self.unacknowledged.get().saturating_add(bytes.len() as u32));
         *self.outbox.borrow_mut() = Transmission::from_slice(bytes).ok();
         self.changed.notify();
     }
 
     fn turn_over(&self) {
         self.turn.set(self.turn.get().wrapping_add(1));
+        self.unacknowledged.set(0);
         *self.outbox.borrow_mut() = None;
         self.changed.notify();
+    }
+
+    /// Of what was handed over in this turn, as much as the engine believes to be unacknowledged.
+    pub(crate) fn unacknowledged(&self) -> u32 {
+        self.unacknowledged.get()
+    }
+
+    /// The task has left `left` bytes beside what waits here. The number for the engine, if it is news.
+    pub(crate) fn acknowledged(&self, left: usize) -> Option<u32> {
+        let waiting = self.outbox.borrow().as_ref().map_or(0, |bytes| bytes.len());
+        let left = left.saturating_add(waiting) as u32;
+        (self.unacknowledged.replace(left) != left).then_some(left)
     }
 
     /// Waits until the link is to be open; the turn it is.
@@ -427,5 +449,35 @@ impl LinkControl {
             }
             self.changed.notified().await;
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_nobody_has_taken_yet_is_not_acknowledged() {
+        let link = LinkControl::new();
+        link.open();
+        link.put(&[0; 69]);
+        assert_eq!((link.unacknowledged(), link.acknowledged(0)), (69, None));
+        // The task takes it, and has room for half.
+        assert!(link.outbox.take().is_some());
+        assert_eq!((link.acknowledged(69), link.acknowledged(35)), (None, Some(35)));
+        link.put(&[0; 100]);
+        assert_eq!((link.unacknowledged(), link.acknowledged(0)), (135, Some(100)));
+        assert!(link.outbox.take().is_some());
+        assert_eq!((link.acknowledged(0), link.acknowledged(0)), (Some(0), None));
+    }
+
+    #[test]
+    fn what_an_earlier_turn_has_left_is_nobodys() {
+        let link = LinkControl::new();
+        link.open();
+        link.put(&[0; 69]);
+        link.close();
+        link.open();
+        assert_eq!((link.unacknowledged(), link.acknowledged(0)), (0, None));
     }
 }

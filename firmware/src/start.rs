@@ -205,7 +205,7 @@ fn run(
     tasks.spawn(TaskName::Network, |pulse| network(pulse, runner));
     tasks.spawn(TaskName::Address, |pulse| address(pulse, stack));
     for (id, kind, endpoint) in wiring.links {
-        let buffers = Buffers::take(&mut memory).expect("there is room for MAX_LINKS");
+        let buffers = Buffers::take(&mut memory, &endpoint).expect("there is room for MAX_LINKS");
         tasks.spawn(TaskName::Link(kind), |pulse| {
             controller_link(pulse, gateway, id, stack, endpoint, buffers)
         });
