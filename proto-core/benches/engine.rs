@@ -130,6 +130,7 @@ impl Bench {
             sent: 0,
             passes: 0,
         };
+        bench.pass(Input::Tick);
         for nth in 0..4 {
             bench.pass(Input::PortUp { port: PortId(nth) });
         }
@@ -223,7 +224,8 @@ impl Bench {
     }
 
     fn cycle(&mut self) {
-        self.now += Duration::from_micros(3_950);
+        self.now += Duration::from_micros(3_900);
+        self.pass(Input::Tick);
         self.pass(Input::PortSent { port: DISPLAY });
         if self.passes.is_multiple_of(256) {
             self.state();
@@ -242,6 +244,8 @@ fn drain(
     engine.handle(now, input);
     loop {
         match engine.poll_output(now, out) {
+            // As a driver does: the tick that is due comes behind what has arrived.
+            Output::Sleep { until } if until <= now => engine.handle(now, Input::Tick),
             Output::Sleep { .. } => return,
             Output::LinkSend { bytes, .. } => *sent = bytes.len(),
             other => {

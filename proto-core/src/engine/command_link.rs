@@ -204,7 +204,11 @@ impl CommandLink {
             self.lost(link, ports, now);
         }
         match (link, ordinary, urgent) {
-            (LinkId::URGENT, LinkState::Up { .. }, Some(LinkState::Opening { .. } | LinkState::Up { .. })) => {
+            (
+                LinkId::URGENT,
+                LinkState::Up { .. },
+                Some(LinkState::Opening { .. } | LinkState::Up { .. }),
+            ) => {
                 self.strike(ports, now);
             }
             (LinkId::COMMAND, LinkState::Up { .. }, Some(LinkState::Up { since }))
@@ -307,6 +311,9 @@ impl CommandLink {
                 session.supervisor.give_up(now);
                 self.lost(link, ports, now);
             }
+        }
+        // What becomes of the first may open the second at once.
+        for link in [LinkId::COMMAND, LinkId::URGENT] {
             self.supervise(link, ports, now);
         }
         while let Some(&waiting) = self.queue.front()
@@ -426,21 +433,13 @@ impl CommandLink {
             || self.ordinary.beside.is_some()
     }
 
-    /// When something happens by itself, on one connection or, of the command link, at all.
-    pub(super) fn deadline_of(&self, link: LinkId) -> Instant {
-        let session = match link {
-            LinkId::URGENT => match &self.urgent {
-                Some(session) => session,
-                None => return Instant::NEVER,
-            },
-            _ => &self.ordinary,
-        };
-        let own = session.deadline().min(session.supervisor.deadline());
-        if link == LinkId::URGENT {
-            return own;
-        }
+    /// When something happens by itself: what happens on one connection may concern the other.
+    pub(super) fn deadline(&self) -> Instant {
+        let sessions = [Some(&self.ordinary), self.urgent.as_ref()].into_iter().flatten();
+        let own = sessions.map(|session| session.deadline().min(session.supervisor.deadline()));
         let waiting = self.queue.front().map_or(Instant::NEVER, |waiting| waiting.since + COMMAND_TTL);
-        own.min(waiting).min(self.stops.deadline(|waiting| self.is_asked(waiting)))
+        let stops = self.stops.deadline(|waiting| self.is_asked(waiting));
+        own.min().unwrap_or(Instant::NEVER).min(waiting).min(stops)
     }
 
     fn session(&mut self, link: LinkId) -> Option<&mut Session> {

@@ -220,12 +220,21 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
         }
     }
 
-    /// The transport took everything.
-    pub(super) fn sent(&mut self, id: LinkId) {
+    /// The transport took everything; when something happens there by itself.
+    pub(super) fn sent(&mut self, id: LinkId) -> Instant {
         match id {
-            LinkId::COMMAND | LinkId::URGENT => self.command.iter_mut().for_each(|link| link.sent(id)),
-            LinkId::MODBUS => self.modbus.iter_mut().for_each(ModbusLink::sent),
-            _ => self.recipe(id).into_iter().for_each(Uplink::sent),
+            LinkId::COMMAND | LinkId::URGENT => {
+                self.command.iter_mut().for_each(|link| link.sent(id));
+                self.deadline_of(id)
+            }
+            LinkId::MODBUS => self.modbus.as_mut().map_or(Instant::NEVER, |link| {
+                link.sent();
+                link.deadline()
+            }),
+            _ => self.recipe(id).map_or(Instant::NEVER, |link| {
+                link.sent();
+                link.deadline()
+            }),
         }
     }
 
@@ -288,7 +297,7 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
 
     /// When something happens by itself.
     pub(super) fn deadline(&self) -> Instant {
-        let mut first = self.deadline_of(LinkId::COMMAND).min(self.deadline_of(LinkId::URGENT));
+        let mut first = self.deadline_of(LinkId::COMMAND);
         first = first.min(self.deadline_of(LinkId::STATE)).min(self.deadline_of(LinkId::MODBUS));
         for link in &self.recipes {
             first = first.min(link.deadline()).min(link.supervisor.deadline());
@@ -300,7 +309,7 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
     pub(super) fn deadline_of(&self, id: LinkId) -> Instant {
         let (own, supervisor) = match id {
             LinkId::COMMAND | LinkId::URGENT => {
-                return self.command.as_ref().map_or(Instant::NEVER, |link| link.deadline_of(id));
+                return self.command.as_ref().map_or(Instant::NEVER, CommandLink::deadline);
             }
             LinkId::STATE => match &self.state {
                 Some(link) => (Instant::NEVER, &link.supervisor),

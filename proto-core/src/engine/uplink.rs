@@ -104,6 +104,7 @@ impl Uplink {
         self.flight.clear();
         store.link_up(&self.writes);
         self.greet_at = if self.greets() { now } else { Instant::NEVER };
+        self.speak_at = self.greet_at;
     }
 
     pub(super) fn lost<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
@@ -143,8 +144,7 @@ impl Uplink {
             return;
         }
         store.again(&wanted);
-        let is_new = now.saturating_since(store.unconfirmed_since) < REPEAT_FAST;
-        let fast = is_new || !wanted.and(&self.shown).is_empty();
+        let fast = is_new(store, now) || !wanted.and(&self.shown).is_empty();
         self.repeat_at = now + if fast { REPEAT_EVERY } else { REPEAT_SLOWLY };
     }
 
@@ -221,8 +221,9 @@ impl Uplink {
             Some(layout) if wanted && self.is_ready(store, state, now) => {
                 let len = encode(layout, store, out)?;
                 store.taken(&self.writes);
-                if self.repeat_at == Instant::NEVER && !store.unconfirmed.and(&self.writes).is_empty() {
-                    self.repeat_at = now + REPEAT_EVERY;
+                let repeats = self.repeat_at == Instant::NEVER || is_new(store, now);
+                if repeats && !store.unconfirmed.and(&self.writes).is_empty() {
+                    self.repeat_at = self.repeat_at.min(now + REPEAT_EVERY);
                 }
                 bump(&mut self.counters.sent);
                 if self.greets() {
@@ -237,11 +238,10 @@ impl Uplink {
             _ => return None,
         };
         self.busy = true;
-        if self.greets() {
-            self.speak_at = now + SPEAK_EVERY;
-        }
-        if self.framing == Framing::Bytes {
-            self.flight.sent(len, now + self.patience);
+        match self.framing {
+            Framing::Bytes => self.flight.sent(len, now + self.patience),
+            Framing::Datagram if self.speak_at != Instant::NEVER => self.speak_at = now + SPEAK_EVERY,
+            Framing::Datagram => {}
         }
         Some(len)
     }
@@ -292,8 +292,14 @@ impl Uplink {
     }
 }
 
+/// Whether a safe value has only just become one that the controller is not known to have.
+fn is_new<const PORTS: usize>(store: &Store<PORTS>, now: Instant) -> bool {
+    now.saturating_since(store.unconfirmed_since) < REPEAT_FAST
+}
+
 /// Puts a frame into the image. What is not finite makes its variable unknown, the rest counts;
 /// returns how many were not.
+#[inline(never)]
 fn take_frame(layout: &StreamLayout, payload: &[u8], image: &mut Image) -> usize {
     let system = |field: PlacedField| match field.field {
         Field::System(var) => Some(var),
