@@ -320,7 +320,7 @@ impl Driver {
                 let left = match pass {
                     0..8 => 0,
                     8 if !self.honest => u32::MAX,
-                    _ => self.links[l].unacknowledged * (pass as u32 - 7) / 8,
+                    _ => self.links[l].unacknowledged / 8 * (pass as u32 - 7),
                 };
                 self.links[l].unacknowledged = left;
                 self.handle(Input::LinkAcked { link, left });

@@ -217,7 +217,7 @@ impl CommandLink {
                 self.strike(ports, now);
             }
             // Both were lost together: that was no verdict on the second one.
-            (LinkId::COMMAND, LinkState::Up { .. }, _) => {
+            (LinkId::COMMAND, LinkState::Up { .. }, _) | (LinkId::URGENT, _, Some(LinkState::Up { .. })) => {
                 self.struck_at = self.struck_at.filter(|&at| now.saturating_since(at) > TOGETHER);
             }
             (LinkId::COMMAND, LinkState::Opening { .. }, _) => self.was_away(now),
@@ -406,7 +406,11 @@ impl CommandLink {
         out: &mut [u8],
         times: (Instant, Instant),
     ) -> Option<usize> {
-        if link == LinkId::URGENT && self.ordinary.is_unacknowledged() {
+        let is_ordinary = |sent: Sent| !sent.keyword.is_urgent();
+        if link == LinkId::URGENT
+            && self.ordinary.is_unacknowledged()
+            && self.ordinary.in_flight.is_some_and(is_ordinary)
+        {
             // What is under way there could arrive after this and start the robot again.
             self.ordinary.supervisor.give_up(times.0);
             self.lost(LinkId::COMMAND, ports, times.0);

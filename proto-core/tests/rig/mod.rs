@@ -240,6 +240,8 @@ pub struct Rig {
     pub called: Instant,
     pub map: Map,
     server: Server,
+    /// A link was refused while outputs were drained.
+    reacted: bool,
     /// Links that come up as soon as they are opened.
     pub reachable: BTreeSet<u8>,
     /// Links of which nothing is heard when they are opened.
@@ -267,6 +269,7 @@ impl Rig {
             called: Instant::ZERO,
             map,
             server: Server::new(),
+            reacted: false,
             reachable: (0..16).collect(),
             unanswered: BTreeSet::new(),
             modbus_answers: true,
@@ -291,6 +294,11 @@ impl Rig {
         }
         self.drain();
         if matches!(input, Input::Tick) {
+            if self.reacted && self.wake <= self.now {
+                // What the controller did meanwhile is due at once.
+                self.engine.handle(self.now, input);
+                self.drain();
+            }
             assert!(self.wake > self.now, "asked to be called at once again: {:?}", self.wake);
         }
     }
@@ -389,6 +397,7 @@ impl Rig {
     }
 
     fn drain(&mut self) {
+        self.reacted = false;
         let mut buf = [0xA5; OUTPUT_BUFFER];
         // Far more than one input can lead to: what never ends is a bug.
         for _ in 0..10_000 {
@@ -418,7 +427,10 @@ impl Rig {
             Out::Open(link) if self.reachable.contains(&link.0) => {
                 self.engine.handle(self.now, Input::LinkUp { link });
             }
-            Out::Open(link) => self.engine.handle(self.now, Input::LinkDown { link }),
+            Out::Open(link) => {
+                self.reacted = true;
+                self.engine.handle(self.now, Input::LinkDown { link });
+            }
             Out::Port(port, _) | Out::Can(port, _) if self.reports_sent => {
                 self.engine.handle(self.now, Input::PortSent { port });
             }
