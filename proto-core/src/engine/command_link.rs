@@ -371,9 +371,13 @@ impl CommandLink {
         if self.queue.is_empty() || !self.ordinary.is_free() || self.is_stopping() {
             return None;
         }
+        let until = self.queue.front()?.since + COMMAND_TTL;
+        if now >= until {
+            // The next tick drops it.
+            return None;
+        }
         let waiting = self.queue.pop_front()?;
         let keyword = self.tables.entry(waiting.entry)?.0.keyword;
-        let until = waiting.since + COMMAND_TTL;
         self.send(LinkId::COMMAND, (keyword, waiting), ports, out, (now, until))
     }
 

@@ -251,6 +251,10 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
         {
             return Some(sent);
         }
+        // What is too old by now is not sent because the tick that drops it was not told yet.
+        if store.deadline() < now {
+            return None;
+        }
         let state = self.state.as_ref().map(|state| state.group);
         for link in &mut self.recipes {
             if let Some(len) = link.next_frame(store, state, out, now) {
