@@ -94,8 +94,20 @@ fn text(output: &Output) -> (String, String) {
 
 #[test]
 fn without_arguments_the_demo_passes() {
-    let output = host_sim().output().unwrap();
-    let (out, err) = text(&output);
+    shows_all_examples(&host_sim().output().unwrap());
+}
+
+#[test]
+fn demos_do_not_disturb_each_other() {
+    let demos: Vec<Child> = (0..4).map(|_| host_sim().arg("demo").spawn().unwrap()).collect();
+    for demo in demos {
+        shows_all_examples(&demo.wait_with_output().unwrap());
+    }
+}
+
+#[track_caller]
+fn shows_all_examples(output: &Output) {
+    let (out, err) = text(output);
     assert_eq!(output.status.code(), Some(0), "{out}\n{err}");
     let verdicts = |word: &str| out.lines().filter(|line| line.trim_start().starts_with(word)).count();
     assert_eq!((verdicts("PASS"), verdicts("FAIL")), (13, 0), "six examples twice, and the sum:\n{out}");

@@ -4,7 +4,7 @@
 use std::io;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use proto_core::modbus::adu::MAX_ADU;
 use proto_core::modbus::client::{Client, ClientEvent};
@@ -177,9 +177,14 @@ fn until(mut is_so: impl FnMut() -> io::Result<bool>) -> io::Result<()> {
         if Instant::now() > deadline {
             return Err(io::Error::new(io::ErrorKind::TimedOut, "it did not happen in time"));
         }
+        std::thread::sleep(BETWEEN_LOOKS);
     }
     Ok(())
 }
+
+/// Whoever asks without a pause keeps the processor from what he waits for: what is written into a
+/// pseudoterminal, and at times what crosses a socket, is carried on by threads of the kernel.
+const BETWEEN_LOOKS: Duration = Duration::from_millis(2);
 
 fn address(handle: &Handle, name: &str) -> io::Result<SocketAddr> {
     handle.place(name).parse().map_err(|_| io::Error::other(format!("no address called {name}")))
@@ -187,4 +192,22 @@ fn address(handle: &Handle, name: &str) -> io::Result<SocketAddr> {
 
 fn parse_binds(binds: &[String]) -> io::Result<Vec<Bind>> {
     binds.iter().map(|bind| bind.parse().map_err(io::Error::other)).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn whoever_waits_leaves_the_processor_alone() {
+        let begun = Instant::now();
+        let mut looks = 0;
+        until(|| {
+            looks += 1;
+            Ok(begun.elapsed() >= 25 * BETWEEN_LOOKS)
+        })
+        .unwrap();
+        let most = begun.elapsed().as_micros() / BETWEEN_LOOKS.as_micros() + 1;
+        assert!(looks <= most, "{looks} looks in {:?}", begun.elapsed());
+    }
 }
