@@ -6,5 +6,6 @@ pub mod cli;
 pub mod config;
 pub mod controller;
 pub mod demo;
+mod files;
 pub mod shell;
 pub mod soak;

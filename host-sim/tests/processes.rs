@@ -179,6 +179,65 @@ fn a_gateway_and_a_controller_find_each_other_and_end_cleanly() {
     robot.end("INT");
 }
 
+/// `gateway` with a pseudoterminal at `line`; its controller is nowhere.
+fn gateway(line: &Path) -> Command {
+    gateway_of(&example("rs485-system.toml"), line)
+}
+
+fn gateway_of(file: &Path, line: &Path) -> Command {
+    let mut command = host_sim();
+    command.args(["gateway", "-c"]).arg(file);
+    command.arg(format!("--bind=rs485-1=pty:{}", line.display()));
+    command
+}
+
+/// Exit code 2 and one line on stderr, which is returned.
+#[track_caller]
+fn refused(command: &mut Command) -> String {
+    let output = command.output().unwrap();
+    let (out, err) = text(&output);
+    assert_eq!((output.status.code(), out.as_str(), err.lines().count()), (Some(2), "", 1), "{err}");
+    err
+}
+
+fn names(folder: &Path) -> Vec<String> {
+    let names = std::fs::read_dir(folder).unwrap();
+    let mut names: Vec<_> = names.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
+    names.sort();
+    names
+}
+
+#[test]
+fn a_ready_file_costs_nobody_anything() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let (line, file, ready) = (at("line"), at("cell.toml"), at("ready.json"));
+    std::fs::copy(example("rs485-system.toml"), &file).unwrap();
+    let toml = std::fs::read(&file).unwrap();
+    std::fs::create_dir(at("folder")).unwrap();
+    for (place, why) in
+        [(&file, "there is a file already, and it is none that a run left"), (&at("folder"), "a folder")]
+    {
+        let message = refused(gateway_of(&file, &line).arg("--ready").arg(place));
+        assert!(message.starts_with(&format!("--ready {}: {why}; give ", place.display())), "{message}");
+    }
+    assert_eq!(std::fs::read(&file).unwrap(), toml);
+    assert_eq!(names(folder.path()), ["cell.toml", "folder"], "nothing was started");
+
+    // What a killed run left is replaced; what somebody put there since is not removed.
+    let mut first = Running::start(gateway(&line).arg("--ready").arg(&ready));
+    first.child.kill().unwrap();
+    first.child.wait().unwrap();
+    assert!(ready.exists());
+    let second = Running::start(gateway(&line).arg("--ready").arg(&ready));
+    let said: Value = serde_json::from_str(&std::fs::read_to_string(&ready).unwrap()).unwrap();
+    assert_eq!(said, second.ready);
+    std::fs::write(&ready, "somebody's").unwrap();
+    second.end("TERM");
+    assert_eq!(std::fs::read_to_string(&ready).unwrap(), "somebody's");
+    assert_eq!(names(folder.path()), ["cell.toml", "folder", "ready.json"]);
+}
+
 #[test]
 fn what_cannot_start_says_why_and_exits_with_2() {
     let file = example("rs485-system.toml");

@@ -22,7 +22,7 @@ use proto_core::sysvar::Direction;
 
 use crate::bus::bind::Bind;
 use crate::config::file;
-use crate::shell::{self, RunOptions};
+use crate::shell::{self, ReadyFile, RunOptions, StartError};
 
 /// Everything that can be typed.
 #[derive(Debug, Parser)]
@@ -149,7 +149,7 @@ struct Run {
     /// also as slcan-pty-unpaced and slcan-tcp-unpaced
     #[arg(long, value_name = "NAME=DEVICE")]
     bind: Vec<Bind>,
-    /// Write the actual addresses to this file, once everything listens
+    /// Write the actual addresses to this file, once everything listens; it is removed at the end
     #[arg(long, value_name = "FILE")]
     ready: Option<PathBuf>,
     /// Print a line of counters this often, such as 1s or 200ms
@@ -264,24 +264,27 @@ fn wrong(message: impl std::fmt::Display) -> ExitCode {
 impl Run {
     fn controller(self) -> ExitCode {
         match check::load_controller(&self.config, &self.overrides.set) {
-            Ok(config) => finished(shell::controller::run(config, self.options())),
+            Ok(config) => {
+                finished(self.options().and_then(|options| shell::controller::run(config, options)))
+            }
             Err(error) => wrong(error),
         }
     }
 
     fn gateway(self) -> ExitCode {
         match check::load_gateway(&self.config, &self.overrides.set) {
-            Ok(config) => finished(shell::gateway::run(*config, self.options())),
+            Ok(config) => finished(self.options().and_then(|options| shell::gateway::run(*config, options))),
             Err(error) => wrong(error),
         }
     }
 
-    fn options(self) -> RunOptions {
-        RunOptions { binds: self.bind, ready: self.ready, stats: self.stats }
+    fn options(self) -> Result<RunOptions, StartError> {
+        let ready = self.ready.map(ReadyFile::at).transpose()?;
+        Ok(RunOptions { binds: self.bind, ready, stats: self.stats })
     }
 }
 
-fn finished(result: Result<(), shell::StartError>) -> ExitCode {
+fn finished(result: Result<(), StartError>) -> ExitCode {
     match result {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {

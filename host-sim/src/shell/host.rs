@@ -2,7 +2,6 @@
 //! `ready` line, statistics and a clean end.
 
 use std::io::{self, Write};
-use std::path::Path;
 use std::sync::mpsc as blocking;
 use std::thread::JoinHandle;
 
@@ -147,10 +146,7 @@ pub(super) fn foreground(handle: Handle, options: &RunOptions) -> Result<(), Sta
         let refused = |error: io::Error| StartError::new(format!("signals: {error}"));
         let mut interrupt = signal(SignalKind::interrupt()).map_err(refused)?;
         let mut terminate = signal(SignalKind::terminate()).map_err(refused)?;
-        if let Some(path) = &options.ready {
-            write_ready(path, handle.ready())
-                .map_err(|error| StartError::new(format!("--ready {}: {error}", path.display())))?;
-        }
+        let ready = options.ready.as_ref().map(|file| file.write(handle.ready())).transpose()?;
         lines.print(format!("ready {}", handle.ready()));
         let mut ticks = options.stats.map(tokio::time::interval);
         let mut watch = tokio::time::interval(WATCH);
@@ -171,11 +167,8 @@ pub(super) fn foreground(handle: Handle, options: &RunOptions) -> Result<(), Sta
                 }
             }
         };
-        let ended = handle.shutdown();
-        if let Some(path) = &options.ready {
-            let _ = std::fs::remove_file(path);
-        }
-        result.and(ended)
+        drop(ready);
+        result.and(handle.shutdown())
     });
     lines.finish();
     result
@@ -236,16 +229,4 @@ fn print_line(line: &str) {
     let mut out = io::stdout().lock();
     let _ = writeln!(out, "{line}");
     let _ = out.flush();
-}
-
-/// Whoever sees the file sees all of it.
-fn write_ready(path: &Path, ready: &Value) -> io::Result<()> {
-    let mut partial = path.as_os_str().to_owned();
-    partial.push(format!(".{}", std::process::id()));
-    let partial = Path::new(&partial);
-    if let Some(folder) = path.parent() {
-        std::fs::create_dir_all(folder)?;
-    }
-    std::fs::write(partial, format!("{ready}\n"))?;
-    std::fs::rename(partial, path)
 }
