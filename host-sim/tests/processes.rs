@@ -73,8 +73,7 @@ impl Running {
 
     #[track_caller]
     fn end(mut self, signal: &str) {
-        let pid = self.child.id().to_string();
-        assert!(Command::new("kill").args(["-s", signal, &pid]).status().unwrap().success());
+        send(signal, &self.child);
         let status = self.child.wait().unwrap();
         assert_eq!((status.code(), status.signal()), (Some(0), None), "{signal}");
     }
@@ -236,6 +235,107 @@ fn a_ready_file_costs_nobody_anything() {
     second.end("TERM");
     assert_eq!(std::fs::read_to_string(&ready).unwrap(), "somebody's");
     assert_eq!(names(folder.path()), ["cell.toml", "folder", "ready.json"]);
+}
+
+/// The same program, started with or without hearing SIGHUP, whatever the tests were started with.
+fn under(hang_up: &str, command: &Command) -> Command {
+    let mut env = Command::new("env");
+    env.args(["--default-signal=INT", &format!("--{hang_up}-signal=HUP")]).arg(command.get_program());
+    env.args(command.get_args()).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+    env
+}
+
+fn send(name: &str, child: &Child) {
+    let pid = child.id().to_string();
+    assert!(Command::new("kill").args(["-s", name, &pid]).status().unwrap().success());
+}
+
+#[test]
+fn a_terminal_that_is_closed_ends_a_run_cleanly_unless_it_is_to_outlive_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let (line, ready) = (folder.path().join("line"), folder.path().join("ready.json"));
+    let mut robot = host_sim();
+    robot.args(["controller", "-c"]).arg(example("rs485-system-controller.toml"));
+    robot.args(["command", "state", "modbus", "udp2011"].map(|port| format!("--set=listen.{port}=0")));
+    robot.arg(format!("--bind=rs485=pty:{}", line.display()));
+    for mut command in [gateway(&line), robot] {
+        command.args(["--stats", "20ms", "--ready"]).arg(&ready);
+        Running::start(&mut under("default", &command)).end("HUP");
+        assert_eq!(names(folder.path()), [""; 0], "{command:?}");
+        let mut under_nohup = Running::start(&mut under("ignore", &command));
+        send("HUP", &under_nohup.child);
+        while under_nohup.lines.try_recv().is_ok() {}
+        // More than it could say while it ended.
+        (0..20).for_each(|_| drop(under_nohup.line()));
+        assert!(line.exists() && ready.exists(), "{command:?}");
+        under_nohup.end("TERM");
+        assert_eq!(names(folder.path()), [""; 0], "{command:?}");
+    }
+}
+
+#[test]
+fn a_demo_that_is_interrupted_leaves_nothing_behind() {
+    for (name, code) in [("HUP", 129), ("INT", 130), ("TERM", 143)] {
+        let folder = tempfile::tempdir().unwrap();
+        let deadline = Instant::now() + PATIENCE;
+        // It may be over before anybody looks; then another one is.
+        while interrupted_demo(folder.path(), name) != Some(code) {
+            assert!(Instant::now() < deadline, "{name}");
+        }
+        assert_eq!(names(folder.path()), [""; 0], "{name}");
+    }
+}
+
+/// Sends a demo the signal as soon as its first device is there; how it ended.
+fn interrupted_demo(folder: &Path, name: &str) -> Option<i32> {
+    let mut command = host_sim();
+    command.arg("demo");
+    let mut demo = under("default", &command).env("TMPDIR", folder).spawn().unwrap();
+    let has_device = || {
+        let folders = std::fs::read_dir(folder).unwrap().flatten();
+        folders.filter_map(|folder| std::fs::read_dir(folder.path()).ok()).flatten().count() > 0
+    };
+    while !has_device() {
+        if let Some(status) = demo.try_wait().unwrap() {
+            return status.code();
+        }
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    send(name, &demo);
+    let code = demo.wait().unwrap().code();
+    assert!(code.is_some_and(|code| code == 0 || code > 128), "{name}: {code:?}");
+    code
+}
+
+#[test]
+fn what_runs_long_and_leaves_nothing_ends_when_it_is_interrupted() {
+    let mut command = host_sim();
+    command.args(["soak", "--hours", "1000", "--cell", "rs485-system"]);
+    let soak = under("default", &command).spawn().unwrap();
+    // Before it listens for the signal, the signal ends it without a word.
+    let deadline = Instant::now() + PATIENCE;
+    while !catches(&soak, 2) {
+        assert!(Instant::now() < deadline, "it never listens");
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    send("INT", &soak);
+    let output = soak.wait_with_output().unwrap();
+    let (out, err) = text(&output);
+    assert_eq!(output.status.code(), Some(0), "{err}");
+    assert!(out.contains("virtual hours") && out.contains("\ninterrupted: "), "{out}");
+
+    let mut command = host_sim();
+    command.args(["decode", "--part", "input"]).arg(example("rs485-system.toml"));
+    let mut decode = under("default", &command).stdin(Stdio::piped()).spawn().unwrap();
+    send("INT", &decode);
+    assert_eq!(decode.wait().unwrap().signal(), Some(2));
+}
+
+/// Whether a process has a handler for the signal of this number.
+fn catches(child: &Child, signal: u32) -> bool {
+    let status = std::fs::read_to_string(format!("/proc/{}/status", child.id())).unwrap();
+    let set = status.lines().find_map(|line| line.strip_prefix("SigCgt:")).unwrap();
+    u64::from_str_radix(set.trim(), 16).unwrap() & 1 << (signal - 1) != 0
 }
 
 #[test]

@@ -84,7 +84,8 @@ enum Command {
 }
 
 const DEMO_EXAMPLES: &str = "\
-Prints one line for each example, PASS or FAIL. Exit code 0 only when all pass.";
+Prints one line for each example, PASS or FAIL. Exit code 0 only when all pass.
+Ctrl-C ends it; nothing stays behind.";
 
 const CONTROLLER_EXAMPLES: &str = "\
 Examples:

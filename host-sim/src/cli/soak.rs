@@ -11,6 +11,7 @@ use std::time::{Duration as WallTime, Instant as WallInstant};
 
 use clap::{Args, ValueEnum};
 use proto_core::time::Duration;
+use tokio::signal::unix::{Signal, SignalKind, signal};
 
 use super::wrong;
 use crate::cell::Cell;
@@ -128,13 +129,22 @@ fn batch(args: &SoakArgs, scenarios: Vec<Scenario>, out: &mut dyn Write) -> Exit
         Ok(runtime) => runtime,
         Err(error) => return wrong(error),
     };
+    // Listened for once: a signal between two looks is heard by the next one.
+    let interrupt = {
+        let _inside = runtime.enter();
+        signal(SignalKind::interrupt())
+    };
+    let interrupt = match interrupt {
+        Ok(interrupt) => interrupt,
+        Err(error) => return wrong(error),
+    };
     let workers: Vec<_> = (0..jobs.min(batch.runs()))
         .map(|_| {
             let batch = Arc::clone(&batch);
             std::thread::spawn(move || batch.work())
         })
         .collect();
-    let interrupted = runtime.block_on(watch(&batch, &workers, args.hours, began));
+    let interrupted = runtime.block_on(watch(&batch, &workers, interrupt, args.hours, began));
     batch.stop();
     for worker in workers {
         // It catches its own panics.
@@ -169,6 +179,7 @@ fn batch(args: &SoakArgs, scenarios: Vec<Scenario>, out: &mut dyn Write) -> Exit
 async fn watch(
     batch: &Batch,
     workers: &[std::thread::JoinHandle<()>],
+    mut interrupt: Signal,
     hours: Duration,
     began: WallInstant,
 ) -> bool {
@@ -189,7 +200,7 @@ async fn watch(
             break;
         }
         tokio::select! {
-            _ = tokio::signal::ctrl_c() => {
+            _ = interrupt.recv() => {
                 if is_terminal {
                     eprintln!();
                 }

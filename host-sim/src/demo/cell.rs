@@ -1,9 +1,9 @@
 //! The cell of the demo: a simulated controller and a gateway on this host, from the example files,
-//! every port number free and every device in a folder that is removed at the end.
+//! every port number free.
 
 use std::io;
 use std::net::SocketAddr;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::time::{Duration, Instant};
 
 use proto_core::modbus::adu::MAX_ADU;
@@ -15,31 +15,6 @@ use super::device::{Line, PATIENCE};
 use crate::bus::bind::Bind;
 use crate::config::file::{self, Text};
 use crate::shell::{self, Handle};
-
-/// A folder for pseudoterminals' links, removed with everything in it.
-pub(super) struct Folder(PathBuf);
-
-impl Folder {
-    pub(super) fn new() -> io::Result<Self> {
-        let path = std::env::temp_dir().join(format!("host-sim-demo-{}", std::process::id()));
-        std::fs::create_dir_all(&path)?;
-        Ok(Self(path))
-    }
-
-    pub(super) fn root(&self) -> PathBuf {
-        self.0.clone()
-    }
-
-    pub(super) fn path(&self, name: &str) -> PathBuf {
-        self.0.join(name)
-    }
-}
-
-impl Drop for Folder {
-    fn drop(&mut self) {
-        let _ = std::fs::remove_dir_all(&self.0);
-    }
-}
 
 /// An example file, embedded.
 #[derive(Clone, Copy)]

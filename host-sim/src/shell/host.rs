@@ -6,11 +6,10 @@ use std::sync::mpsc as blocking;
 use std::thread::JoinHandle;
 
 use serde_json::Value;
-use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
 use tokio::task::LocalSet;
 
-use super::{RunOptions, StartError};
+use super::{RunOptions, Signals, StartError};
 
 /// An engine is built by value, and unoptimised code copies it on the stack several times over.
 const STACK: usize = 16 << 20;
@@ -135,7 +134,7 @@ fn joined(thread: JoinHandle<Result<(), StartError>>) -> Result<(), StartError> 
     thread.join().unwrap_or_else(|_| Err(StartError::new("a thread panicked").after_start()))
 }
 
-/// Says `ready`, prints statistics, and ends on Ctrl-C or SIGTERM.
+/// Says `ready`, prints statistics, and ends when a signal says so.
 pub(super) fn foreground(handle: Handle, options: &RunOptions) -> Result<(), StartError> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
     let runtime = runtime.map_err(|error| StartError::new(format!("no runtime: {error}")))?;
@@ -144,16 +143,14 @@ pub(super) fn foreground(handle: Handle, options: &RunOptions) -> Result<(), Sta
     let result = runtime.block_on(async {
         // Signals are caught before anybody can know that we are ready.
         let refused = |error: io::Error| StartError::new(format!("signals: {error}"));
-        let mut interrupt = signal(SignalKind::interrupt()).map_err(refused)?;
-        let mut terminate = signal(SignalKind::terminate()).map_err(refused)?;
+        let mut signals = Signals::catch().map_err(refused)?;
         let ready = options.ready.as_ref().map(|file| file.write(handle.ready())).transpose()?;
         lines.print(format!("ready {}", handle.ready()));
         let mut ticks = options.stats.map(tokio::time::interval);
         let mut watch = tokio::time::interval(WATCH);
         let result = loop {
             tokio::select! {
-                _ = interrupt.recv() => break Ok(()),
-                _ = terminate.recv() => break Ok(()),
+                _ = signals.next() => break Ok(()),
                 () = tick(&mut ticks) => {
                     if let Some(mut stats) = handle.stats() {
                         stats["lost_lines"] = lines.lost.into();

@@ -8,6 +8,7 @@ pub mod gateway;
 mod host;
 mod link;
 mod ready;
+mod signals;
 mod tcp;
 mod udp;
 
@@ -16,6 +17,7 @@ use std::time::Duration;
 
 pub use host::Handle;
 pub use ready::ReadyFile;
+pub(crate) use signals::Signals;
 
 use crate::bus::bind::Bind;
 
