@@ -7,5 +7,6 @@ pub mod config;
 pub mod controller;
 pub mod demo;
 mod files;
+mod out;
 pub mod shell;
 pub mod soak;

@@ -1,7 +1,8 @@
 //! The command line: what a person types, turned into calls.
 //!
-//! In: arguments. Out: text and an exit code: 0 when everything went well, 1 when a run failed, 2
-//! for a file or an argument that cannot be used (nothing was started then).
+//! In: arguments. Out: text and an exit code: 0 when everything went well, 1 when a run failed or what
+//! it said could not be written, 2 for a file or an argument that cannot be used (nothing was started
+//! then). A reader that had enough is no failure.
 
 mod check;
 mod codec;
@@ -22,6 +23,7 @@ use proto_core::sysvar::Direction;
 
 use crate::bus::bind::Bind;
 use crate::config::file;
+use crate::out::{Out, Printed, tell};
 use crate::shell::{self, ReadyFile, RunOptions, StartError};
 
 /// Everything that can be typed.
@@ -52,8 +54,8 @@ Examples:
   host-sim encode cell.toml --part input 1       the frame that switches DO1 on
   host-sim decode cell.toml --part input FF FF 01 EE EE
 
-Exit codes: 0 done, 1 a run failed, 2 a file or an argument is wrong and nothing
-was started.";
+Exit codes: 0 done, 1 a run failed or its output could not be written, 2 a file or
+an argument is wrong and nothing was started.";
 
 #[derive(Debug, Subcommand)]
 enum Command {
@@ -221,44 +223,47 @@ struct DecodeArgs {
 
 /// Runs what was typed.
 pub fn main() -> ExitCode {
-    let cli = Cli::parse();
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        Err(error) => return not_run(&error),
+    };
     let _log = log::start(cli.verbose);
-    let mut out = io::stdout().lock();
+    let mut out = Out::new(io::stdout());
     let done = match cli.command.unwrap_or(Command::Demo) {
-        Command::Demo => {
-            drop(out);
-            return crate::demo::run();
-        }
-        Command::Controller(run) => {
-            drop(out);
-            return run.controller();
-        }
-        Command::Gateway(run) => {
-            drop(out);
-            return run.gateway();
-        }
+        Command::Demo => return crate::demo::run(),
+        Command::Controller(run) => return run.controller(),
+        Command::Gateway(run) => return run.gateway(),
         Command::Soak(args) => {
-            drop(out);
-            return soak::run(&args, &mut io::stdout());
+            let code = soak::run(&args, &mut out);
+            return out.finish(|_| code);
         }
         Command::Check(args) => check::run(&args, &mut out),
         Command::Image(args) => image::run(&args, &mut out),
         Command::Encode(args) => encode(&args, &mut out),
         Command::Decode(args) => decode(&args, &mut out),
     };
-    // A reader that had enough, such as `head`, is no failure of ours.
-    let _ = out.flush();
-    match done {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(message) => wrong(message),
+    out.finish(|printed| match (printed, done) {
+        (Printed::Whole, Err(message)) => wrong(message),
+        _ => ExitCode::SUCCESS,
+    })
+}
+
+/// Shows help, the version, or what is wrong with the arguments.
+fn not_run(error: &clap::Error) -> ExitCode {
+    if error.use_stderr() {
+        let _ = error.print();
+        return ExitCode::from(2);
     }
+    let mut out = Out::new(anstream::stdout());
+    let _ = write!(out, "{}", error.render().ansi());
+    out.finish(|_| ExitCode::SUCCESS)
 }
 
 /// A message for a person; exit code 2.
 type Outcome = Result<(), String>;
 
 fn wrong(message: impl std::fmt::Display) -> ExitCode {
-    eprintln!("{message}");
+    tell(message);
     ExitCode::from(2)
 }
 
@@ -289,7 +294,7 @@ fn finished(result: Result<(), StartError>) -> ExitCode {
     match result {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("{error}");
+            tell(&error);
             ExitCode::from(error.exit_code())
         }
     }

@@ -15,6 +15,7 @@ use tokio::signal::unix::{Signal, SignalKind, signal};
 
 use super::wrong;
 use crate::cell::Cell;
+use crate::out::tell;
 use crate::soak::{Batch, Level, Progress, Scenario, Soak, Total, show_trace};
 
 pub(super) const EXAMPLES: &str = "\
@@ -191,9 +192,9 @@ async fn watch(
             shown = WallInstant::now();
             let line = progress_line(batch.progress(), hours, began.elapsed());
             if is_terminal {
-                eprint!("\r{line}\x1B[K");
+                show(format_args!("\r{line}\x1B[K"));
             } else {
-                eprintln!("{line}");
+                tell(line);
             }
         }
         if workers.iter().all(std::thread::JoinHandle::is_finished) {
@@ -202,7 +203,7 @@ async fn watch(
         tokio::select! {
             _ = interrupt.recv() => {
                 if is_terminal {
-                    eprintln!();
+                    tell("");
                 }
                 return true;
             }
@@ -210,9 +211,14 @@ async fn watch(
         }
     }
     if is_terminal {
-        eprint!("\r\x1B[K");
+        show("\r\x1B[K");
     }
     false
+}
+
+/// Progress is for people; nothing is lost when nobody can see it.
+fn show(text: impl std::fmt::Display) {
+    let _ = write!(std::io::stderr(), "{text}");
 }
 
 fn progress_line(progress: Progress, hours: Duration, wall: WallTime) -> String {

@@ -13,24 +13,26 @@ use std::io;
 use std::process::ExitCode;
 use std::time::Instant;
 
+use crate::out::tell;
 use crate::shell::Signals;
 use folder::Folder;
 use show::Show;
 
-/// Runs the cell and prints what it does; success only when every example passes.
+/// Runs the cell and prints what it does, until nobody reads it; success only when every example passes
+/// that was run.
 pub fn run() -> ExitCode {
     let started = Instant::now();
     let folder = match prepare() {
         Ok(folder) => folder,
         Err(error) => {
-            eprintln!("no folder for the devices: {error}");
+            tell(format_args!("no folder for the devices: {error}"));
             return ExitCode::FAILURE;
         }
     };
-    anstream::println!("{INTRODUCTION}");
-    let mut show = Show::default();
+    let mut show = Show::new();
+    show.introduce(INTRODUCTION);
     examples::run_all(&mut show, &folder);
-    if show.verdict(started.elapsed().as_secs_f64()) { ExitCode::SUCCESS } else { ExitCode::FAILURE }
+    show.verdict(started.elapsed().as_secs_f64())
 }
 
 /// The folder for the devices. Ctrl-C and its like remove it; everything else ends with the process.
@@ -44,7 +46,7 @@ fn prepare() -> io::Result<Folder> {
     let remover = folder.remover();
     std::thread::Builder::new().name("signals".to_owned()).spawn(move || {
         let signal = runtime.block_on(signals.next());
-        eprintln!("interrupted");
+        tell("interrupted");
         // The exit code as shells have it.
         remover.remove_and_exit(128 + signal)
     })?;
