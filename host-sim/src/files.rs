@@ -47,6 +47,11 @@ impl Beside {
         Ok((beside, file))
     }
 
+    /// What it is called until then.
+    pub(crate) fn name(&self) -> &Path {
+        &self.name
+    }
+
     /// Moves it to `place`, where nothing may be.
     ///
     /// # Errors

@@ -1,11 +1,14 @@
 //! The program as a person or a script runs it: real processes, real signals.
 
 use std::io::{BufRead, BufReader, Read};
+use std::os::fd::OwnedFd;
+use std::os::unix::ffi::OsStrExt;
 use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
+use rustix::pty::OpenptFlags;
 use serde_json::Value;
 
 fn host_sim() -> Command {
@@ -248,6 +251,64 @@ fn under(hang_up: &str, command: &Command) -> Command {
 fn send(name: &str, child: &Child) {
     let pid = child.id().to_string();
     assert!(Command::new("kill").args(["-s", name, &pid]).status().unwrap().success());
+}
+
+#[test]
+fn a_line_that_another_program_uses_is_not_taken_away() {
+    let folder = tempfile::tempdir().unwrap();
+    let line = folder.path().join("line");
+    let mut first = Running::start(&mut gateway(&line));
+    let leads_to = std::fs::read_link(&line).unwrap();
+    let message = refused(&mut gateway(&line));
+    let holder =
+        format!("line: another run of host-sim has it, process {}; end that one or give", first.child.id());
+    assert!(message.starts_with(&format!("--bind rs485-1=pty:{}: ", line.display())), "{message}");
+    assert!(message.contains(&holder), "{message}");
+    assert_eq!(std::fs::read_link(&line).unwrap(), leads_to);
+
+    // Killed, it leaves a link to a terminal whose number the next program may get, here this test.
+    first.child.kill().unwrap();
+    first.child.wait().unwrap();
+    assert_eq!(std::fs::read_link(&line).unwrap(), leads_to);
+    let (number, foreign) = terminal_called(&leads_to);
+    assert!(leads_to.exists());
+    Running::start(&mut gateway(&line)).end("TERM");
+    assert_eq!(names(folder.path()), [""; 0]);
+
+    // The same link made by that program is in use.
+    std::os::unix::fs::symlink(&leads_to, &line).unwrap();
+    let message = refused(&mut gateway(&line));
+    assert!(
+        message.contains(&format!("a link to {}, which a program has open", leads_to.display())),
+        "{message}"
+    );
+    assert_eq!(std::fs::read_link(&line).unwrap(), leads_to);
+    drop((number, foreign));
+    std::fs::remove_file(&line).unwrap();
+    std::os::unix::fs::symlink("/dev/pts/4000000", &line).unwrap();
+    Running::start(&mut gateway(&line)).end("TERM");
+    assert_eq!(names(folder.path()), [""; 0]);
+}
+
+/// A pseudoterminal that is called so, and others that were in its way.
+fn terminal_called(name: &Path) -> (OwnedFd, Vec<OwnedFd>) {
+    let deadline = Instant::now() + PATIENCE;
+    loop {
+        let mut others = Vec::new();
+        // The system gives away the lowest number that is free. Another test may have this one for a while.
+        for _ in 0..64 {
+            let master = rustix::pty::openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC);
+            let master = master.unwrap();
+            let own = rustix::pty::ptsname(&master, Vec::new()).unwrap();
+            if own.as_bytes() == name.as_os_str().as_bytes() {
+                return (master, others);
+            }
+            others.push(master);
+        }
+        assert!(Instant::now() < deadline, "{}", name.display());
+        drop(others);
+        std::thread::sleep(Duration::from_millis(10));
+    }
 }
 
 #[test]

@@ -155,7 +155,7 @@ struct Run {
     /// Write the actual addresses to this file, once everything listens; it is removed at the end
     #[arg(long, value_name = "FILE")]
     ready: Option<PathBuf>,
-    /// Print a line of counters this often, such as 1s or 200ms
+    /// Print a line of counters this often, such as 1s or 200ms, until nobody reads them
     #[arg(long, value_name = "TIME", value_parser = parse_time)]
     stats: Option<Duration>,
 }
