@@ -196,7 +196,16 @@ fn gateway_of(file: &Path, line: &Path) -> Command {
 /// Exit code 2 and one line on stderr, which is returned.
 #[track_caller]
 fn refused(command: &mut Command) -> String {
-    let output = command.output().unwrap();
+    let mut child = command.spawn().unwrap();
+    let deadline = Instant::now() + PATIENCE;
+    while child.try_wait().unwrap().is_none() {
+        if Instant::now() > deadline {
+            child.kill().unwrap();
+            panic!("{command:?} was started");
+        }
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    let output = child.wait_with_output().unwrap();
     let (out, err) = text(&output);
     assert_eq!((output.status.code(), out.as_str(), err.lines().count()), (Some(2), "", 1), "{err}");
     err
