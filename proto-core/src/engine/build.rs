@@ -316,6 +316,14 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             Some(_) => Some(groups.next().ok_or(too_many("groups", MAX_GROUPS))?),
             None => None,
         };
+        for (_, _, field) in config.fields_of(recipe, Direction::Output) {
+            // Shown by a port or not: it may tell whether the controller has a safe value.
+            if let (Some(var), Some(group)) = (field.variable(), group)
+                && self.store.image.group(var).is_none()
+            {
+                self.store.image.assign(var, group);
+            }
+        }
         let timings = match kind {
             // Nobody may connect for days: that is no failure.
             LinkKind::RecipeTcpListen { .. } | LinkKind::RecipeUdpListen { .. } => LinkTimings {
@@ -335,7 +343,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         let writes: InputSet =
             set.iter().filter(|&var| plan.way_up(var) == Some(WayUp::Recipe(id))).collect();
         let owners = writes.iter().filter_map(|var| plan.owner(var));
-        let timeouts = owners.filter_map(|port| config.ports.get(usize::from(port.0))).map(|port| port.timeout);
+        let timeouts =
+            owners.filter_map(|port| config.ports.get(usize::from(port.0))).map(|port| port.timeout);
         let patience = timeouts.min().unwrap_or(PATIENCE).max(PATIENCE);
         let supervisor = Supervisor::new(timings);
         let uplink = Uplink::new(id, kind, supervisor, input, output, (set, writes), group, patience);
