@@ -331,20 +331,12 @@ impl Cell {
                     };
                     let conns = self.conns.iter().filter(|(_, conn)| subscribed(conn));
                     let conns: Vec<u64> = conns.map(|(&id, _)| id).collect();
-                    let mut packet = bytes.to_vec();
-                    self.spoil_packet(&mut packet);
                     for conn in conns {
-                        self.send_item(conn, Way::Down, Item::Bytes(packet.clone()));
+                        self.send_item(conn, Way::Down, Item::Bytes(bytes.to_vec()));
                     }
                 }
-                ControllerOutput::UdpSend { peer, mut bytes } => {
-                    self.spoil_frame(LinkId::RECIPE_UDP, &mut bytes);
-                    self.udp_down(peer, &bytes);
-                }
-                ControllerOutput::PortSend { port, mut bytes } => {
-                    if let Some(link) = self.clients.get(&port).and_then(|client| client.link) {
-                        self.spoil_frame(link, &mut bytes);
-                    }
+                ControllerOutput::UdpSend { peer, bytes } => self.udp_down(peer, &bytes),
+                ControllerOutput::PortSend { port, bytes } => {
                     self.trace.add(now, What::ControllerPortSent, port as u64, &bytes);
                     self.controller_port_sends(port, bytes);
                 }

@@ -35,14 +35,12 @@ impl Oracle {
         self.orders.tick(now);
     }
 
-    /// The gateway itself slept: nothing of what had begun is continued, and nothing is commanded.
+    /// The gateway itself slept: nothing of what had begun is continued.
     pub(super) fn slept(&mut self, now: Instant) {
         for watch in &mut self.ports {
             watch.down.slept();
             watch.line.discard();
         }
-        self.orders.slept(now);
-        self.robot.forget_all(now);
         self.deaf_until = Some(now + DEAF);
     }
 

@@ -322,6 +322,11 @@ impl Oracle {
         if is_tick {
             self.announced = Instant::NEVER;
         }
+        if has_slept {
+            self.orders.slept(now);
+            self.robot.forget_all(now);
+            self.look_at_links(engine, None, now);
+        }
         if is_tick || has_slept {
             self.pass(now);
         }
