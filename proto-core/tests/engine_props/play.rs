@@ -278,7 +278,7 @@ impl Test {
     fn state(&mut self, outputs: u8, word: u16, float: f32, good: bool) {
         let mut packet = vec![0; 1468];
         if !good {
-            packet[..4].copy_from_slice(&f32::NAN.to_le_bytes());
+            packet[..12].copy_from_slice(&[f32::NAN.to_le_bytes(); 3].concat());
         }
         for bit in 0..8 {
             packet[760 + bit] = outputs >> bit & 1;
