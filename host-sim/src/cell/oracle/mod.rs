@@ -15,6 +15,7 @@ mod field;
 mod gateway;
 mod orders;
 mod sheet;
+mod stream;
 mod upward;
 mod wire;
 
@@ -143,6 +144,7 @@ struct PortWatch {
 #[derive(Debug, Clone, Default)]
 struct LinkWatch {
     line: Line,
+    stream: stream::Stream,
     busy: bool,
 }
 
