@@ -26,7 +26,7 @@ type Pass = fn(&mut Bench);
 const NO_CYCLE: Duration = Duration::from_secs(3_600);
 
 /// Name, limit and work.
-const WORKS: [(&str, Option<u64>, Pass); 9] = [
+const WORKS: [(&str, Option<u64>, Pass); 10] = [
     ("field frame, bare", None, Bench::bare),
     ("field frame to Modbus request, answer", Some(PASS), Bench::modbus),
     ("field frame to two requests, answers", None, Bench::modbus_twice),
@@ -34,6 +34,7 @@ const WORKS: [(&str, Option<u64>, Pass); 9] = [
     ("field frame byte by byte to UDP", None, Bench::udp_bytes),
     ("CAN frame applied", None, Bench::can),
     ("state packet", None, Bench::state),
+    ("state packet of a starting controller", None, Bench::state_of_starting),
     ("idle tick", None, Bench::idle),
     ("cycle of one port", None, Bench::cycle),
 ];
@@ -48,7 +49,8 @@ fn main() -> ExitCode {
             }
         };
     }
-    let works = [work!(0), work!(1), work!(2), work!(3), work!(4), work!(5), work!(6), work!(7), work!(8)];
+    let works =
+        [work!(0), work!(1), work!(2), work!(3), work!(4), work!(5), work!(6), work!(7), work!(8), work!(9)];
     instructions::main(&works).unwrap_or_else(|| {
         divan::main();
         ExitCode::SUCCESS
@@ -126,7 +128,7 @@ impl Bench {
             out: [0; OUTPUT_BUFFER],
             plc: frame(0x11),
             sensor: frame(0x22),
-            packet: vec![0; 1468],
+            packet: started_packet(),
             sent: 0,
             passes: 0,
         };
@@ -219,6 +221,10 @@ impl Bench {
         self.packet = packet;
     }
 
+    fn state_of_starting(&mut self) {
+        self.pass(Input::LinkBytes { link: LinkId::STATE, bytes: black_box(&[0; 1468]) });
+    }
+
     fn idle(&mut self) {
         self.pass(black_box(Input::Tick));
     }
@@ -232,6 +238,13 @@ impl Bench {
         }
         self.passes += 1;
     }
+}
+
+/// All zeros but the state codes: remote, enabled, stopped, running.
+fn started_packet() -> Vec<u8> {
+    let mut packet = vec![0; 1468];
+    packet[1448..1452].copy_from_slice(&[2, 6, 0, 5]);
+    packet
 }
 
 fn drain(
