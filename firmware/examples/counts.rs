@@ -128,6 +128,7 @@ impl Bench {
 
     /// Everything is there and was heard of.
     fn connect(&mut self) {
+        self.pass(Input::Tick);
         for nth in 0..4 {
             self.pass(Input::PortUp { port: PortId(nth) });
         }
@@ -252,6 +253,8 @@ fn pass(
     engine.handle(now, input);
     loop {
         match engine.poll_output(now, out) {
+            // As the firmware does it: the tick that is due comes behind what has arrived.
+            Output::Sleep { until } if until <= now => engine.handle(now, Input::Tick),
             Output::Sleep { .. } => return,
             Output::LinkSend { bytes, .. } | Output::PortSend { bytes, .. } => *sent += bytes.len(),
             Output::PortSendCan { frame, .. } => *sent += frame.data().len(),

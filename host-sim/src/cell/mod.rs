@@ -35,18 +35,23 @@ mod oracle;
 mod queue;
 mod recording;
 mod rng;
+mod sleep;
+mod spoil;
+mod survey;
 #[cfg(test)]
 mod tamper;
+mod tcp;
 mod trace;
 mod traffic;
 mod trouble;
 
 use std::collections::BTreeMap;
-use std::net::{Ipv4Addr, SocketAddr};
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 
 use proto_core::config::{Bus, GatewayConfig};
 use proto_core::engine::{BuildError as EngineError, Engine, LinkId, LinkInfo, PortCounters, PortId};
 use proto_core::recipe::CanFrame;
+use proto_core::sysvar::SysVar;
 use proto_core::time::{Duration, Instant};
 
 pub use can::{BusCounters, CanBus};
@@ -118,6 +123,8 @@ struct Client {
     link: Option<LinkId>,
     is_tcp: bool,
     conn: Option<u64>,
+    /// Which socket it sends datagrams from.
+    socket: u64,
 }
 
 /// The cell.
@@ -138,6 +145,14 @@ pub struct Cell {
     buses: Vec<CanBus>,
     names: BTreeMap<String, Far>,
     controller_names: BTreeMap<String, Far>,
+    /// What waits for the gateway while it is not called.
+    asleep: Option<sleep::Waiting>,
+    wakes_at: Instant,
+    stalls: u64,
+    /// How many faults each of the controller's servers has at present.
+    ailments: [u32; 3],
+    /// What the controller sends of these variables is this.
+    spoilt: BTreeMap<SysVar, f32>,
     rng: Rng,
     trace: Trace,
     recorder: Option<Recorder>,
@@ -199,6 +214,11 @@ impl Cell {
             buses: Vec::new(),
             names: BTreeMap::new(),
             controller_names: BTreeMap::new(),
+            asleep: None,
+            wakes_at: START,
+            stalls: 0,
+            ailments: [0; 3],
+            spoilt: BTreeMap::new(),
             rng: Rng::new(seed),
             trace: Trace::new(),
             recorder,
@@ -218,8 +238,9 @@ impl Cell {
     /// time has passed.
     pub fn watch(&mut self) {
         let mut oracle = Box::new(Oracle::new(&self.gateway));
-        oracle.begin(&self.engine, self.now);
+        oracle.begin(&self.engine, self.engine_wake, self.now);
         self.oracle = Some(oracle);
+        self.queue.push(self.now, Due::Survey);
     }
 
     /// The first invariant that did not hold.
@@ -274,12 +295,12 @@ impl Cell {
                 SimBus::UdpServer => continue,
                 SimBus::TcpClient { to } => {
                     let link = self.listener(to, true);
-                    self.clients.insert(nth, Client { link, is_tcp: true, conn: None });
+                    self.clients.insert(nth, Client { link, is_tcp: true, conn: None, socket: 0 });
                     continue;
                 }
                 SimBus::UdpClient { to } => {
                     let link = self.listener(to, false);
-                    self.clients.insert(nth, Client { link, is_tcp: false, conn: None });
+                    self.clients.insert(nth, Client { link, is_tcp: false, conn: None, socket: 0 });
                     continue;
                 }
             };
@@ -504,7 +525,7 @@ impl Cell {
     pub fn ask(&mut self, command: &str) -> String {
         let line = format!("{command}\r\n");
         self.asked.clear();
-        self.controller_input(ControllerInput::CommandOpened { conn: DESK });
+        self.controller_input(ControllerInput::CommandOpened { conn: DESK, from: HERE });
         self.controller_input(ControllerInput::CommandBytes { conn: DESK, bytes: line.as_bytes() });
         self.run_until(Duration::from_millis(500), |cell| !cell.asked.is_empty());
         self.controller_input(ControllerInput::CommandClosed { conn: DESK });
@@ -551,9 +572,11 @@ fn target(name: &str) -> InitialTarget {
 /// The gateway's address for the controller's UDP server: a new one with each opening, as a new
 /// socket has.
 fn udp_peer(turn: u64) -> SocketAddr {
-    (Ipv4Addr::LOCALHOST, 40_000 + (turn % 10_000) as u16).into()
+    (HERE, 40_000 + (turn % 10_000) as u16).into()
 }
 
+/// Where every client of the controller is.
+const HERE: IpAddr = IpAddr::V4(Ipv4Addr::LOCALHOST);
 /// The connection of [`Cell::ask`].
 const DESK: ConnId = ConnId(u64::MAX);
 /// Not zero, so that nothing depends on the clock's origin, and on no grid of the engine.

@@ -104,6 +104,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             timer_at: Instant::ZERO,
             rearm: true,
             now: Instant::ZERO,
+            is_late: false,
+            announced: Instant::ZERO,
             beat_at: Instant::ZERO,
             sleeps: 0,
             is_deaf: false,
@@ -146,6 +148,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             timer_at,
             rearm,
             now,
+            is_late,
+            announced,
             beat_at,
             sleeps,
             is_deaf,
@@ -165,6 +169,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         *timer_at = Instant::ZERO;
         *rearm = true;
         *now = Instant::ZERO;
+        *is_late = false;
+        *announced = Instant::ZERO;
         *beat_at = Instant::ZERO;
         *sleeps = 0;
         *is_deaf = false;

@@ -371,13 +371,9 @@ impl CommandLink {
         if self.queue.is_empty() || !self.ordinary.is_free() || self.is_stopping() {
             return None;
         }
-        let until = self.queue.front()?.since + COMMAND_TTL;
-        if now >= until {
-            // The next tick drops it.
-            return None;
-        }
         let waiting = self.queue.pop_front()?;
         let keyword = self.tables.entry(waiting.entry)?.0.keyword;
+        let until = waiting.since + COMMAND_TTL;
         self.send(LinkId::COMMAND, (keyword, waiting), ports, out, (now, until))
     }
 
@@ -441,21 +437,13 @@ impl CommandLink {
             || self.ordinary.beside.is_some()
     }
 
-    /// When something happens by itself, on one connection or, of the command link, at all.
-    pub(super) fn deadline_of(&self, link: LinkId) -> Instant {
-        let session = match link {
-            LinkId::URGENT => match &self.urgent {
-                Some(session) => session,
-                None => return Instant::NEVER,
-            },
-            _ => &self.ordinary,
-        };
-        let own = session.deadline().min(session.supervisor.deadline());
-        if link == LinkId::URGENT {
-            return own;
-        }
+    /// When something happens by itself: what happens on one connection may concern the other.
+    pub(super) fn deadline(&self) -> Instant {
+        let sessions = [Some(&self.ordinary), self.urgent.as_ref()].into_iter().flatten();
+        let own = sessions.map(|session| session.deadline().min(session.supervisor.deadline()));
         let waiting = self.queue.front().map_or(Instant::NEVER, |waiting| waiting.since + COMMAND_TTL);
-        own.min(waiting).min(self.stops.deadline(|waiting| self.is_asked(waiting)))
+        let stops = self.stops.deadline(|waiting| self.is_asked(waiting));
+        own.min().unwrap_or(Instant::NEVER).min(waiting).min(stops)
     }
 
     fn session(&mut self, link: LinkId) -> Option<&mut Session> {

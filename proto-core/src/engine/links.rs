@@ -220,12 +220,21 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
         }
     }
 
-    /// The transport took everything.
-    pub(super) fn sent(&mut self, id: LinkId) {
+    /// The transport took everything; when something happens there by itself.
+    pub(super) fn sent(&mut self, id: LinkId) -> Instant {
         match id {
-            LinkId::COMMAND | LinkId::URGENT => self.command.iter_mut().for_each(|link| link.sent(id)),
-            LinkId::MODBUS => self.modbus.iter_mut().for_each(ModbusLink::sent),
-            _ => self.recipe(id).into_iter().for_each(Uplink::sent),
+            LinkId::COMMAND | LinkId::URGENT => {
+                self.command.iter_mut().for_each(|link| link.sent(id));
+                self.deadline_of(id)
+            }
+            LinkId::MODBUS => self.modbus.as_mut().map_or(Instant::NEVER, |link| {
+                link.sent();
+                link.deadline()
+            }),
+            _ => self.recipe(id).map_or(Instant::NEVER, |link| {
+                link.sent();
+                link.deadline()
+            }),
         }
     }
 
@@ -250,10 +259,6 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
             && let Some(sent) = link.next_stop(ports, out, now)
         {
             return Some(sent);
-        }
-        // What is too old by now is not sent because the tick that drops it was not told yet.
-        if store.deadline() < now {
-            return None;
         }
         let state = self.state.as_ref().map(|state| state.group);
         for link in &mut self.recipes {
@@ -304,11 +309,7 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
     pub(super) fn deadline_of(&self, id: LinkId) -> Instant {
         let (own, supervisor) = match id {
             LinkId::COMMAND | LinkId::URGENT => {
-                // What happens to one may open or close the other.
-                let both = |link: &CommandLink| {
-                    link.deadline_of(LinkId::COMMAND).min(link.deadline_of(LinkId::URGENT))
-                };
-                return self.command.as_ref().map_or(Instant::NEVER, both);
+                return self.command.as_ref().map_or(Instant::NEVER, CommandLink::deadline);
             }
             LinkId::STATE => match &self.state {
                 Some(link) => (Instant::NEVER, &link.supervisor),

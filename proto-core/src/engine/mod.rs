@@ -95,6 +95,11 @@ pub struct Engine<const PORTS: usize = 8, const UPLINKS: usize = 4, const FIELDS
     rearm: bool,
     /// The newest instant that was told.
     now: Instant,
+    /// A deadline has come and its tick has not been told: what is too old may still wait, so nothing
+    /// is sent before that.
+    is_late: bool,
+    /// The instant of the newest [`Output::Sleep`]; that of a tick that was not told stands until then.
+    announced: Instant,
     /// Whoever is not called until [`ASLEEP`] after the call before was asleep; this sees to a call.
     beat_at: Instant,
     /// Times the gateway slept.
@@ -111,6 +116,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     /// Inputs for a port or link that the configuration does not have are ignored.
     pub fn handle(&mut self, now: Instant, input: Input<'_>) {
         let now = self.present(now);
+        self.is_late = now >= self.announced;
         // Whatever happens may set an earlier deadline; what it makes later is found out in time.
         match input {
             Input::PortBytes { port: id, bytes } => {
@@ -182,14 +188,15 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
                 }
             }
             Input::LinkSent { link } => {
-                self.links.sent(link);
-                self.arm(self.links.deadline_of(link));
+                let deadline = self.links.sent(link);
+                self.arm(deadline);
             }
             Input::LinkAcked { link, left } => {
                 self.links.acked(link, left);
                 self.arm(self.links.deadline_of(link));
             }
             Input::Tick => {
+                (self.is_late, self.announced) = (false, Instant::NEVER);
                 self.is_deaf &= now < self.deaf_until;
                 if now >= self.timer_at {
                     self.advance(now);
@@ -198,13 +205,16 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         }
     }
 
-    /// What the driver has to do next; call it again until it is [`Output::Sleep`].
+    /// What the driver has to do next; call it again until it is [`Output::Sleep`]. Nothing is sent
+    /// between a deadline and the [`Input::Tick`] that lets it pass.
     ///
-    /// What brings field values to the controller comes first, then what keeps links up, then what
-    /// goes to the field.
+    /// What stops the robot comes first, then what brings field values to the controller, then what
+    /// keeps links up, then what goes to the field.
     pub fn poll_output<'b>(&mut self, now: Instant, buf: &'b mut [u8; OUTPUT_BUFFER]) -> Output<'b> {
         let now = now.min(LAST).max(self.now);
-        if let Some((link, len)) = self.links.next_upward(&mut self.store, &mut self.ports, &mut buf[..], now)
+        if !self.is_late
+            && let Some((link, len)) =
+                self.links.next_upward(&mut self.store, &mut self.ports, &mut buf[..], now)
         {
             self.arm(self.links.deadline_of(link));
             return Output::LinkSend { link, bytes: buf.get(..len).unwrap_or(&[]) };
@@ -215,7 +225,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
                 LinkAction::Close => Output::LinkClose { link },
             };
         }
-        match self.next_downward(&mut buf[..], now) {
+        let downward = if self.is_late { None } else { self.next_downward(&mut buf[..], now) };
+        match downward {
             Some((port, Downward::Bytes(len))) => {
                 Output::PortSend { port, bytes: buf.get(..len).unwrap_or(&[]) }
             }
@@ -225,8 +236,11 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
                     self.rearm = false;
                     self.timer_at = self.deadline();
                 }
-                let beat_at = if self.ports.is_empty() { Instant::NEVER } else { self.beat_at };
-                Output::Sleep { until: self.timer_at.min(beat_at) }
+                if self.ports.is_empty() {
+                    return Output::Sleep { until: Instant::NEVER };
+                }
+                self.announced = self.announced.min(self.timer_at).min(self.beat_at);
+                Output::Sleep { until: self.announced }
             }
         }
     }
@@ -258,10 +272,10 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     /// nothing is commanded, and every connection begins anew.
     fn wake(&mut self, now: Instant) {
         self.sleeps = self.sleeps.wrapping_add(1);
+        // Before deadlines pass: one of them may be to open a link that has been down.
+        self.links.slept(&mut self.store, &mut self.ports, now);
         self.advance(now);
         self.ports.iter_mut().for_each(FieldPort::slept);
-        self.links.slept(&mut self.store, &mut self.ports, now);
-        self.count_lost();
         self.is_deaf = true;
         self.deaf_until = now + DEAF;
         self.arm(self.deaf_until);
@@ -271,7 +285,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     fn drop_forgotten(&mut self) {
         if let Some(command) = &mut self.links.command {
             command.drop_forgotten(&mut self.ports);
-            let deadline = command.deadline_of(LinkId::COMMAND);
+            let deadline = command.deadline();
             self.arm(deadline);
         }
     }
@@ -328,9 +342,12 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         self.sleeps
     }
 
-    /// Something depends on the clock from `at` on.
+    /// Something depends on the clock from `at` on. What is due already is served before the engine
+    /// sleeps, or at the tick that is late.
     fn arm(&mut self, at: Instant) {
-        self.timer_at = self.timer_at.min(at);
+        if at > self.now {
+            self.timer_at = self.timer_at.min(at);
+        }
     }
 
     fn change_port(&mut self, id: PortId, change: impl FnOnce(&mut FieldPort)) {
@@ -378,6 +395,11 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             self.drop_forgotten();
             self.image_changed();
         }
+        self.expire_waiting(now);
+    }
+
+    /// Values that have waited too long are dropped.
+    fn expire_waiting(&mut self, now: Instant) {
         let ports = &mut self.ports;
         self.store.expire_waiting(
             |port, dropped| {
@@ -394,10 +416,14 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         if accepted.frames == 0 {
             return;
         }
+        let deadline = self.store.deadline();
+        if deadline <= now {
+            self.expire_waiting(now);
+        }
         self.arm(self.store.deadline());
         if let Some(command) = &mut self.links.command {
             command.drop_overtaken(&mut self.ports);
-            let deadline = command.deadline_of(LinkId::COMMAND);
+            let deadline = command.deadline();
             self.arm(deadline);
         }
         self.image_changed();
@@ -423,11 +449,13 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         if !self.watches_bits {
             return;
         }
+        let mut first = Instant::NEVER;
         for port in &mut self.ports {
             let usable = port.is_usable();
             port.sender.image_changed(&self.store.image, usable, &mut port.counters);
-            self.timer_at = self.timer_at.min(port.deadline());
+            first = first.min(port.deadline());
         }
+        self.arm(first);
     }
 
     /// What goes to the field.

@@ -155,7 +155,7 @@ impl Sender {
 
     /// Whether the values may be sent at `now`: all known, and fresh unless the recipe holds.
     pub(super) fn may_show(&self, image: &Image, now: Instant) -> bool {
-        !self.shown.meets(image.unreadable())
+        image.can_read(&self.shown)
             && self.sources.iter().all(|group| match image.stamp_of(group) {
                 Some(at) => self.on_stale == OnStale::Hold || now.saturating_since(at) <= self.stale_after,
                 None => false,

@@ -72,7 +72,7 @@ impl StateLink {
                         } else {
                             // Nobody knows it: it must not be written back.
                             store.read_back.remove(var);
-                            if !store.image.unreadable().contains(var) {
+                            if store.image.is_readable(var) {
                                 bump(&mut self.counters.unreadable);
                             }
                         }

@@ -106,9 +106,9 @@ impl<const PORTS: usize> Store<PORTS> {
         if !self.safe.and(&set).is_empty() {
             // Safe values that still wait grow old from now on, and may be too old already.
             self.next_expiry = now;
+            self.safe = self.safe.minus(&set);
+            self.unconfirmed = self.unconfirmed.minus(&set);
         }
-        self.safe = self.safe.minus(&set);
-        self.unconfirmed = self.unconfirmed.minus(&set);
         let reachable = set.and(&self.reachable);
         let Some(queue) = self.edges.get_mut(port) else { return InputSet::EMPTY };
         if reachable != set {

@@ -104,6 +104,7 @@ impl Uplink {
         self.flight.clear();
         store.link_up(&self.writes);
         self.greet_at = if self.greets() { now } else { Instant::NEVER };
+        self.speak_at = self.greet_at;
     }
 
     pub(super) fn lost<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
@@ -237,11 +238,10 @@ impl Uplink {
             _ => return None,
         };
         self.busy = true;
-        if self.greets() {
-            self.speak_at = now + SPEAK_EVERY;
-        }
-        if self.framing == Framing::Bytes {
-            self.flight.sent(len, now + self.patience);
+        match self.framing {
+            Framing::Bytes => self.flight.sent(len, now + self.patience),
+            Framing::Datagram if self.speak_at != Instant::NEVER => self.speak_at = now + SPEAK_EVERY,
+            Framing::Datagram => {}
         }
         Some(len)
     }
@@ -299,6 +299,7 @@ fn is_new<const PORTS: usize>(store: &Store<PORTS>, now: Instant) -> bool {
 
 /// Puts a frame into the image. What is not finite makes its variable unknown, the rest counts;
 /// returns how many were not.
+#[inline(never)]
 fn take_frame(layout: &StreamLayout, payload: &[u8], image: &mut Image) -> usize {
     let system = |field: PlacedField| match field.field {
         Field::System(var) => Some(var),

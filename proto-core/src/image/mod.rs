@@ -35,6 +35,8 @@ pub struct Image {
     stamps: [Instant; MAX_GROUPS],
     /// Variables whose newest value could not be read, whatever else their group brought.
     unreadable: VarSet,
+    /// Whether there are any.
+    any_unreadable: bool,
 }
 
 impl Default for Image {
@@ -51,6 +53,7 @@ impl Image {
             group: [NO_GROUP; COUNT],
             stamps: [Instant::NEVER; MAX_GROUPS],
             unreadable: VarSet::EMPTY,
+            any_unreadable: false,
         }
     }
 
@@ -120,26 +123,41 @@ impl Image {
 
     /// Gives the variable the value that its source just sent; one that cannot be read makes the
     /// variable unknown until a readable one comes. Whether it could be read.
+    #[inline]
     pub fn receive(&mut self, var: SysVar, value: Scalar) -> bool {
         let readable = self.set(var, value).is_ok();
-        if readable {
-            self.unreadable.remove(var);
-        } else {
-            self.unreadable.insert(var);
+        if !readable || self.any_unreadable {
+            self.note_readable(var, readable);
         }
         readable
     }
 
-    /// Everything that these variables' sources just sent could be read.
-    pub fn all_readable(&mut self, vars: impl Iterator<Item = SysVar>) {
-        if !self.unreadable.is_empty() {
-            vars.for_each(|var| self.unreadable.remove(var));
+    #[cold]
+    fn note_readable(&mut self, var: SysVar, readable: bool) {
+        if readable {
+            self.all_readable(core::iter::once(var));
+        } else {
+            self.unreadable.insert(var);
+            self.any_unreadable = true;
         }
     }
 
-    /// Variables whose newest value was not finite: they are unknown.
-    pub fn unreadable(&self) -> &VarSet {
-        &self.unreadable
+    /// Everything that these variables' sources just sent could be read.
+    pub fn all_readable(&mut self, vars: impl Iterator<Item = SysVar>) {
+        if self.any_unreadable {
+            vars.for_each(|var| self.unreadable.remove(var));
+            self.any_unreadable = !self.unreadable.is_empty();
+        }
+    }
+
+    /// Whether the variable's newest value could be read, if there was one.
+    pub fn is_readable(&self, var: SysVar) -> bool {
+        !self.unreadable.contains(var)
+    }
+
+    /// Whether the newest values of all these could be read.
+    pub fn can_read(&self, vars: &VarSet) -> bool {
+        !self.any_unreadable || !self.unreadable.meets(vars)
     }
 
     /// How long ago the variable's value arrived; `None` when it never did, or could not be read.

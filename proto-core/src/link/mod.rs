@@ -174,11 +174,11 @@ impl Supervisor {
         self.state = LinkState::Shared;
     }
 
-    /// The link does its own work again; it is opened at once.
+    /// The link does its own work again; it is opened after the shortest wait.
     pub fn unshare(&mut self, now: Instant) {
         if self.state == LinkState::Shared {
-            self.state = LinkState::Down { retry_at: now };
             self.backoff = self.timings.backoff_min;
+            self.state = LinkState::Down { retry_at: now + self.backoff };
         }
     }
 
@@ -205,10 +205,9 @@ impl Supervisor {
         self.action.take()
     }
 
-    /// When [`Self::advance`] has something to do.
+    /// When [`Self::advance`] has something to do, once [`Self::take_action`] has been asked.
     pub fn deadline(&self) -> Instant {
         match self.state {
-            _ if self.action.is_some() => Instant::ZERO,
             LinkState::Down { retry_at } => retry_at,
             LinkState::Opening { until } => until,
             LinkState::Up { .. } => self.silent_at(),
