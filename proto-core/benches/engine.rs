@@ -37,6 +37,7 @@ const WORKS: [(&str, Option<u64>, Pass); 10] = [
     ("state packet of a starting controller", None, Bench::state_of_starting),
     ("idle tick", None, Bench::idle),
     ("cycle of one port", None, Bench::cycle),
+    ("field frame to request, acknowledged", None, Bench::modbus_acknowledged),
 ];
 
 fn main() -> ExitCode {
@@ -187,6 +188,20 @@ impl Bench {
         answer[5] = 6;
         self.pass(Input::LinkSent { link: LinkId::MODBUS });
         self.pass(Input::LinkBytes { link: LinkId::MODBUS, bytes: black_box(&answer) });
+    }
+
+    /// The same with a driver that tells what the controller's transport has acknowledged.
+    fn modbus_acknowledged(&mut self) {
+        let frame = std::mem::take(&mut self.plc);
+        self.pass(Input::PortBytes { port: PLC, bytes: black_box(&frame) });
+        self.plc = frame;
+        let answer = self.out[..12].first_chunk::<12>().copied();
+        let mut answer = answer.expect("a request is longer");
+        answer[5] = 6;
+        self.pass(Input::LinkSent { link: LinkId::MODBUS });
+        self.pass(Input::LinkAcked { link: LinkId::MODBUS, left: 0 });
+        self.pass(Input::LinkBytes { link: LinkId::MODBUS, bytes: black_box(&answer) });
+        assert!(std::mem::take(&mut self.sent) > 12);
     }
 
     fn udp(&mut self) {
