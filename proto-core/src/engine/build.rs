@@ -335,7 +335,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         let writes: InputSet =
             set.iter().filter(|&var| plan.way_up(var) == Some(WayUp::Recipe(id))).collect();
         let owners = writes.iter().filter_map(|var| plan.owner(var));
-        let timeouts = owners.filter_map(|port| config.ports.get(usize::from(port.0))).map(|port| port.timeout);
+        let timeouts =
+            owners.filter_map(|port| config.ports.get(usize::from(port.0))).map(|port| port.timeout);
         let patience = timeouts.min().unwrap_or(PATIENCE).max(PATIENCE);
         let supervisor = Supervisor::new(timings);
         let uplink = Uplink::new(id, kind, supervisor, input, output, (set, writes), group, patience);

@@ -204,7 +204,11 @@ impl CommandLink {
             self.lost(link, ports, now);
         }
         match (link, ordinary, urgent) {
-            (LinkId::URGENT, LinkState::Up { .. }, Some(LinkState::Opening { .. } | LinkState::Up { .. })) => {
+            (
+                LinkId::URGENT,
+                LinkState::Up { .. },
+                Some(LinkState::Opening { .. } | LinkState::Up { .. }),
+            ) => {
                 self.strike(ports, now);
             }
             (LinkId::COMMAND, LinkState::Up { .. }, Some(LinkState::Up { since }))

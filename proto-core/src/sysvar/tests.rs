@@ -95,7 +95,9 @@ fn wrong_names_say_what_there_is() {
 #[test]
 fn only_digital_outputs_are_shown_by_another_variable() {
     let shown: std::vec::Vec<_> = SysVar::all().filter_map(|var| Some((var, var.shown_by()?))).collect();
-    let named: std::vec::Vec<_> = shown.iter().map(|(var, by)| (std::format!("{var}"), std::format!("{by}"))).collect();
-    let expected = [1, 2, 3].map(|n| (std::format!("DigitalOutputCommand[{n}]"), std::format!("DigitalSignalStatus[{}]", n + 3)));
+    let named: std::vec::Vec<_> =
+        shown.iter().map(|(var, by)| (std::format!("{var}"), std::format!("{by}"))).collect();
+    let expected = [1, 2, 3]
+        .map(|n| (std::format!("DigitalOutputCommand[{n}]"), std::format!("DigitalSignalStatus[{}]", n + 3)));
     assert_eq!(named, expected);
 }
