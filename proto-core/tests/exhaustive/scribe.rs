@@ -244,10 +244,11 @@ impl Scribe {
     }
 
     fn word(&mut self, text: &[u8]) {
-        match (self.field, text) {
-            (Field::Silence, _) => self.silence_is_normal = text == b"None",
-            (Field::IsDeaf, _) => self.is_deaf = text == b"true",
-            _ => {}
+        // The next word is the name of the next field.
+        match std::mem::replace(&mut self.field, Field::Other) {
+            Field::Silence => self.silence_is_normal = text == b"None",
+            Field::IsDeaf => self.is_deaf = text == b"true",
+            field => self.field = field,
         }
         self.bytes(text);
         self.word = match text {
@@ -262,7 +263,7 @@ impl Scribe {
             b"Deframer" | b"StateStream" | b"AduReader" => Word::Struct(Kind::Gatherer),
             _ if text[0].is_ascii_uppercase() => Word::Struct(Kind::Other),
             b"transaction" | b"stale" | b"sleeps" | b"frames_sent" | b"packets" | b"misaligned"
-            | b"dropped" => Word::Field(Field::Counter),
+            | b"dropped" | b"counted" => Word::Field(Field::Counter),
             b"bytes" | b"group" | b"ring" | b"buffer" | b"mask" => Word::Field(Field::Buffer),
             b"stamps" => Word::Field(Field::Stamps),
             b"unconfirmed_since" => Word::Field(Field::Unconfirmed),
