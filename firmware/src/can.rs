@@ -6,7 +6,7 @@
 
 use core::pin::pin;
 
-use embassy_futures::select::{Either3, select3};
+use embassy_futures::select::{Either, Either3, select, select3};
 use embassy_futures::yield_now;
 use embassy_time::{Duration, Instant, Timer, with_timeout};
 use embedded_can::Frame;
@@ -146,6 +146,7 @@ impl<C: CanPort> Task<'_, C> {
                 self.send_waiting().await;
             }
             self.tell_lost();
+            self.gateway.more_waits();
             yield_now().await;
         }
     }
@@ -193,11 +194,17 @@ impl<C: CanPort> Task<'_, C> {
             }
             frames = frames.saturating_add(1);
             let patience = patience(frames, self.can.bitrate());
-            let sent = with_timeout(patience, self.can.send(&frame));
-            let sent = self.pulse.idle(pin!(sent)).await;
+            self.control.forget_sleep();
+            // When the gateway has slept meanwhile, what waits in the controller is old and must not be
+            // heard of only when the frame has left.
+            let sending = select(self.can.send(&frame), self.control.has_slept());
+            let sent = self.pulse.idle(pin!(with_timeout(patience, sending))).await;
             match sent {
-                Ok(Ok(())) => self.phase = Phase::Sending { until: Instant::now() + patience },
-                Ok(Err(BusOff)) => self.bus_off(),
+                Ok(Either::First(Ok(()))) => {
+                    self.phase = Phase::Sending { until: Instant::now() + patience };
+                }
+                Ok(Either::First(Err(BusOff))) => self.bus_off(),
+                Ok(Either::Second(())) => self.forget_waiting(),
                 Err(_) => self.give_up(),
             }
         }
@@ -223,6 +230,10 @@ impl<C: CanPort> Task<'_, C> {
             warn!("port {}: nothing leaves, nobody acknowledges; transmit errors {}", self.port.0, errors);
         }
         self.is_failing = true;
+        self.forget_waiting();
+    }
+
+    fn forget_waiting(&mut self) {
         self.can.recover();
         self.control.clear();
         self.phase = Phase::Idle;

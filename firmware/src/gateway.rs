@@ -32,8 +32,8 @@ pub const MAX_FIELD_PORTS: usize = 4;
 pub const MAX_UPLINKS: usize = 2;
 /// User-defined fields in one direction, over all ports.
 pub const MAX_FIELDS: usize = 128;
-/// Recipe links, and command, state and Modbus.
-const MAX_LINKS: usize = MAX_UPLINKS + 3;
+/// Recipe links, and command, urgent commands, state and Modbus.
+pub const MAX_LINKS: usize = MAX_UPLINKS + 4;
 
 /// The engine in the size of a board.
 pub type Engine = AnyEngine<MAX_FIELD_PORTS, MAX_UPLINKS, MAX_FIELDS>;
@@ -46,10 +46,12 @@ pub struct Gateway {
     ports: Vec<(PortId, PortControl), MAX_FIELD_PORTS>,
     links: Vec<(LinkId, LinkKind, LinkControl), MAX_LINKS>,
     output: RefCell<[u8; OUTPUT_BUFFER]>,
-    /// The latest time that the engine was told.
-    told: Cell<Instant>,
     deadline: Cell<Instant>,
     deadline_moved: Notify,
+    /// Some task gave the processor back before it had told all that waits.
+    more_waits: Cell<bool>,
+    /// As often the gateway slept, as the ports' tasks know.
+    sleeps: Cell<u32>,
 }
 
 impl Gateway {
@@ -60,9 +62,10 @@ impl Gateway {
             ports: Vec::new(),
             links: Vec::new(),
             output: RefCell::new([0; OUTPUT_BUFFER]),
-            told: Cell::new(Instant::ZERO),
             deadline: Cell::new(Instant::ZERO),
             deadline_moved: Notify::new(),
+            more_waits: Cell::new(false),
+            sleeps: Cell::new(0),
         }
     }
 
@@ -116,7 +119,8 @@ impl Gateway {
     pub fn condition(&self) -> Condition {
         let engine = self.engine.borrow();
         let Some(engine) = engine.first() else { return Condition::Refused };
-        let is_up = |link: LinkInfo<'_>| matches!(link.state, LinkState::Up { .. });
+        // The work of a link that is shared is done by another.
+        let is_up = |link: LinkInfo<'_>| matches!(link.state, LinkState::Up { .. } | LinkState::Shared);
         let works = |id| engine.port_state(id) == Some(PortState::Working);
         if !engine.links().all(is_up) {
             Condition::NoController
@@ -132,26 +136,18 @@ impl Gateway {
         self.links.iter().map(|(_, kind, control)| (*kind, control.strangers.get()))
     }
 
-    /// One input, and everything that follows from it.
-    ///
-    /// Only a tick takes the engine past a deadline: when nobody had the time to look, what is heard late
-    /// was not silent, and what else arrived before the tick has not been told yet.
+    /// One input, now, and everything that follows from it.
     pub fn input(&self, input: Input<'_>) {
-        let deadline = self.deadline.get().as_micros();
-        self.input_at(now().min(Instant::from_micros(deadline.saturating_sub(1))), input);
-    }
-
-    /// The same, of something that happened at `at`, or a little later when the engine has been told a
-    /// later time already.
-    pub(crate) fn input_at(&self, at: Instant, input: Input<'_>) {
-        let at = at.max(self.told.get());
-        self.told.set(at);
+        let now = now();
         let mut engine = self.engine.borrow_mut();
         let Some(engine) = engine.first_mut() else { return };
         let mut buf = self.output.borrow_mut();
-        engine.handle(at, input);
+        engine.handle(now, input);
+        if self.sleeps.replace(engine.sleeps()) != engine.sleeps() {
+            self.ports.iter().for_each(|(_, control)| control.slept());
+        }
         loop {
-            match engine.poll_output(at, &mut buf) {
+            match engine.poll_output(now, &mut buf) {
                 Output::PortSend { port, bytes } => {
                     if let Some(port) = self.port(port) {
                         port.put(bytes);
@@ -187,20 +183,48 @@ impl Gateway {
         }
     }
 
-    /// Calls the engine whenever it asked to be called. The engine's own task.
+    /// Lets deadlines pass whenever the engine asked for it. The engine's own task.
     pub async fn keep_time(&self, pulse: &Pulse) -> ! {
-        self.input_at(now(), Input::Tick);
+        self.input(Input::Tick);
         loop {
             let until = embassy_time::Instant::from_micros(self.deadline.get().as_micros());
             match pulse.idle(pin!(select(Timer::at(until), self.deadline_moved.notified()))).await {
                 Either::First(()) => {
-                    // What arrived before this moment is told first: it may not be overdue.
-                    yield_now().await;
-                    self.input_at(now(), Input::Tick);
+                    self.all_told().await;
+                    self.input(Input::Tick);
                 }
                 Either::Second(()) => {}
             }
         }
+    }
+
+    /// Waits until the engine has heard of all that arrived before this moment: it was not late,
+    /// whatever kept the processor meanwhile. Who always has more is not waited for without an end.
+    ///
+    /// In a round of the executor each task that was woken runs once, in no particular order. What the
+    /// Ethernet controller has goes to the network's task in one round and to a link's in the next.
+    async fn all_told(&self) {
+        // A device may have what it has woken nobody for.
+        self.ports.iter().for_each(|(_, control)| control.changed.notify());
+        let mut quiet = 0_u8;
+        for _ in 0..MAX_ROUNDS {
+            self.more_waits.set(false);
+            yield_now().await;
+            quiet = if self.more_waits.get() { 0 } else { quiet.saturating_add(1) };
+            if quiet >= QUIET_ROUNDS {
+                return;
+            }
+        }
+    }
+
+    /// A task gives the processor back and may have left something that waits to be told.
+    pub(crate) fn more_waits(&self) {
+        self.more_waits.set(true);
+    }
+
+    /// Whether a datagram is a frame of the link's.
+    pub(crate) fn is_frame(&self, link: LinkId, datagram: &[u8]) -> bool {
+        self.engine.borrow().first().is_some_and(|engine| engine.is_frame(link, datagram))
     }
 
     pub(crate) fn port(&self, id: PortId) -> Option<&PortControl> {
@@ -224,6 +248,12 @@ pub(crate) fn now() -> Instant {
     Instant::from_micros(embassy_time::Instant::now().as_micros())
 }
 
+/// One for a task whose interrupt comes while the time is looked at, one for that of the network, and one
+/// for a link's behind it.
+const QUIET_ROUNDS: u8 = 3;
+/// What a port's task tells in as many is more than any device keeps.
+const MAX_ROUNDS: u8 = 20;
+
 /// One transmission: the longest frame or request.
 pub(crate) type Transmission = Vec<u8, OUTPUT_BUFFER>;
 
@@ -232,6 +262,7 @@ pub(crate) struct PortControl {
     ids: Vec<CanId, MAX_CAN_IDS>,
     bytes: RefCell<Option<Transmission>>,
     frames: RefCell<Deque<CanFrame, MAX_CAN_IDS>>,
+    has_slept: Cell<bool>,
     changed: Notify,
 }
 
@@ -241,6 +272,7 @@ impl PortControl {
             ids: Vec::new(),
             bytes: RefCell::new(None),
             frames: RefCell::new(Deque::new()),
+            has_slept: Cell::new(false),
             changed: Notify::new(),
         }
     }
@@ -262,6 +294,24 @@ impl PortControl {
         self.changed.notify();
     }
 
+    fn slept(&self) {
+        self.has_slept.set(true);
+        self.changed.notify();
+    }
+
+    /// Waits until the gateway has slept: what waits in the device has to be told at once, as long as
+    /// the engine discards it. Eats notifications, so nothing else may wait for them.
+    pub(crate) async fn has_slept(&self) {
+        while !self.has_slept.take() {
+            self.changed.notified().await;
+        }
+    }
+
+    /// From here on only a sleep to come counts.
+    pub(crate) fn forget_sleep(&self) {
+        self.has_slept.set(false);
+    }
+
     /// The next transmission.
     pub(crate) async fn next_bytes(&self) -> Transmission {
         loop {
@@ -272,9 +322,13 @@ impl PortControl {
         }
     }
 
-    /// The next transmission, if there is one.
-    pub(crate) fn take_bytes(&self) -> Option<Transmission> {
+    fn take_bytes(&self) -> Option<Transmission> {
         self.bytes.borrow_mut().take()
+    }
+
+    /// The next transmission, if there is one and it may be sent now.
+    pub(crate) fn take_bytes_if(&self, may_send: bool) -> Option<Transmission> {
+        if may_send { self.take_bytes() } else { None }
     }
 
     /// Waits until there is a frame to send.
@@ -302,6 +356,8 @@ pub(crate) struct LinkControl {
     /// Odd while the link is to be open; one more for each opening and closing.
     turn: Cell<u32>,
     outbox: RefCell<Option<Transmission>>,
+    /// Bytes of this turn that are not acknowledged, as the engine knows.
+    unacknowledged: Cell<u32>,
     changed: Notify,
     strangers: Cell<u32>,
 }
@@ -311,6 +367,7 @@ impl LinkControl {
         Self {
             turn: Cell::new(0),
             outbox: RefCell::new(None),
+            unacknowledged: Cell::new(0),
             changed: Notify::new(),
             strangers: Cell::new(0),
         }
@@ -339,14 +396,28 @@ impl LinkControl {
 
     /// The engine hands over one transmission and waits until it was taken.
     fn put(&self, bytes: &[u8]) {
+        self.unacknowledged.set(self.unacknowledged.get().saturating_add(bytes.len() as u32));
         *self.outbox.borrow_mut() = Transmission::from_slice(bytes).ok();
         self.changed.notify();
     }
 
     fn turn_over(&self) {
         self.turn.set(self.turn.get().wrapping_add(1));
+        self.unacknowledged.set(0);
         *self.outbox.borrow_mut() = None;
         self.changed.notify();
+    }
+
+    /// Of what was handed over in this turn, as much as the engine believes to be unacknowledged.
+    pub(crate) fn unacknowledged(&self) -> u32 {
+        self.unacknowledged.get()
+    }
+
+    /// The task has left `left` bytes beside what waits here. The number for the engine, if it is news.
+    pub(crate) fn acknowledged(&self, left: usize) -> Option<u32> {
+        let waiting = self.outbox.borrow().as_ref().map_or(0, |bytes| bytes.len());
+        let left = left.saturating_add(waiting) as u32;
+        (self.unacknowledged.replace(left) != left).then_some(left)
     }
 
     /// Waits until the link is to be open; the turn it is.
@@ -378,5 +449,35 @@ impl LinkControl {
             }
             self.changed.notified().await;
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_nobody_has_taken_yet_is_not_acknowledged() {
+        let link = LinkControl::new();
+        link.open();
+        link.put(&[0; 69]);
+        assert_eq!((link.unacknowledged(), link.acknowledged(0)), (69, None));
+        // The task takes it, and has room for half.
+        assert!(link.outbox.take().is_some());
+        assert_eq!((link.acknowledged(69), link.acknowledged(35)), (None, Some(35)));
+        link.put(&[0; 100]);
+        assert_eq!((link.unacknowledged(), link.acknowledged(0)), (135, Some(100)));
+        assert!(link.outbox.take().is_some());
+        assert_eq!((link.acknowledged(0), link.acknowledged(0)), (Some(0), None));
+    }
+
+    #[test]
+    fn what_an_earlier_turn_has_left_is_nobodys() {
+        let link = LinkControl::new();
+        link.open();
+        link.put(&[0; 69]);
+        link.close();
+        link.open();
+        assert_eq!((link.unacknowledged(), link.acknowledged(0)), (0, None));
     }
 }

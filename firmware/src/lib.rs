@@ -8,6 +8,7 @@
 //! binary beside this library names the board.
 
 pub mod can;
+pub mod fair;
 pub mod fmt;
 pub mod gateway;
 pub mod identity;
@@ -26,3 +27,5 @@ pub mod watchdog;
 extern crate std;
 #[cfg(test)]
 mod test_clock;
+#[cfg(test)]
+mod test_executor;

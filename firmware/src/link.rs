@@ -3,17 +3,19 @@
 //! A link is one task. It owns its socket, hands what arrives to the engine and sends what is in its
 //! outbox; it knows no protocol and makes no decision. Supervision is the engine's: a link that fails
 //! says so once and waits to be opened again.
+//!
+//! Handed over is not delivered. Of a TCP link the engine hears two things: that the socket has taken what
+//! was handed over and has room for more, and how much the peer has not acknowledged. What it gives up it
+//! closes, whatever the task waits for, and then nothing but a reset leaves any more.
 
-use core::cell::Cell;
+mod tcp;
+mod udp;
+
 use core::net::Ipv4Addr;
 use core::pin::pin;
 
-use embassy_futures::select::{Either, select};
 use embassy_net::dns::DnsQueryType;
-use embassy_net::tcp::{TcpReader, TcpSocket, TcpWriter};
-use embassy_net::udp::{PacketMetadata, UdpSocket};
-use embassy_net::{IpAddress, IpEndpoint, Stack};
-use embassy_time::{Duration, with_timeout};
+use embassy_net::{IpAddress, Stack};
 use heapless::String;
 use proto_core::config::{Bus, GatewayConfig, listen_address};
 use proto_core::engine::{Input, LinkId, LinkKind};
@@ -67,7 +69,7 @@ impl Endpoint {
             _ => 0,
         };
         match kind {
-            LinkKind::Command => Self::Tcp { host, port: controller.command_port },
+            LinkKind::Command | LinkKind::Urgent => Self::Tcp { host, port: controller.command_port },
             LinkKind::State => Self::Tcp { host, port: controller.state_port },
             LinkKind::Modbus => Self::Tcp { host, port: controller.modbus_port },
             LinkKind::RecipeUdp => {
@@ -89,15 +91,18 @@ pub struct Buffers<'a> {
 
 impl<'a> Buffers<'a> {
     /// Bytes that a link needs.
-    pub const SIZE: usize = RX + TX + CHUNK;
+    pub const SIZE: usize = 6 * 1024;
 
     /// Takes [`Buffers::SIZE`] bytes from the front of `memory`; `None` when there are fewer.
-    pub fn take(memory: &mut &'a mut [u8]) -> Option<Self> {
-        Some(Self {
-            rx: memory.split_off_mut(..RX)?,
-            tx: memory.split_off_mut(..TX)?,
-            chunk: memory.split_off_mut(..CHUNK)?,
-        })
+    pub fn take(memory: &mut &'a mut [u8], endpoint: &Endpoint) -> Option<Self> {
+        let memory = memory.split_off_mut(..Self::SIZE)?;
+        let (rx, chunk) = match endpoint {
+            Endpoint::TcpListen { .. } => (RX_FRAMES, CHUNK_FRAMES),
+            Endpoint::Tcp { .. } | Endpoint::Udp { .. } | Endpoint::UdpListen { .. } => (RX, CHUNK),
+        };
+        let (rx, rest) = memory.split_at_mut_checked(rx)?;
+        let (chunk, tx) = rest.split_at_mut_checked(chunk)?;
+        Some(Self { rx, tx, chunk })
     }
 }
 
@@ -147,145 +152,12 @@ struct Driver<'a> {
 }
 
 impl Driver<'_> {
-    fn up(&self) {
-        self.gateway.input(Input::LinkUp { link: self.link });
-    }
-
-    fn bytes(&self, bytes: &[u8]) {
-        self.gateway.input(Input::LinkBytes { link: self.link, bytes });
-    }
-
-    /// One connection, until the peer closes it, an error, or the turn is over.
-    async fn tcp(&self, turn: u32, controller: &str, way: Way, buffers: &mut Buffers<'_>) {
-        let mut socket = TcpSocket::new(self.stack, buffers.rx, buffers.tx);
-        socket.set_nagle_enabled(false);
-        let opening = async {
-            let Some(address) = resolve(self.stack, controller).await else { return false };
-            match way {
-                Way::To(port) => socket.connect(IpEndpoint::new(address, port)).await.is_ok(),
-                Way::At(port) => self.accept(&mut socket, port, address).await,
-            }
-        };
-        let opened = self.pulse.idle(pin!(select(opening, self.control.over(turn)))).await;
-        if let Either::First(true) = opened {
-            self.up();
-            let (reader, writer) = socket.split();
-            let (reading, writing) = (self.read(turn, reader, buffers.chunk), self.write(turn, writer));
-            self.pulse.idle(pin!(select(reading, writing))).await;
-            // What the engine has given up must not be delivered later, after newer values.
-            if self.control.is_turn(turn) {
-                socket.close();
-                let _ = with_timeout(FAREWELL, socket.flush()).await;
-            }
+    /// Tells the engine, as long as it is this turn; whether it still is then.
+    fn tell(&self, turn: u32, input: Input<'_>) -> bool {
+        if self.control.is_turn(turn) {
+            self.gateway.input(input);
         }
-        // The peer must not go on believing in a connection whose socket is gone.
-        socket.abort();
-        let _ = with_timeout(FAREWELL, socket.flush()).await;
-    }
-
-    /// Waits for a connection of the controller. All others are turned away: what comes here is believed.
-    async fn accept(&self, socket: &mut TcpSocket<'_>, port: u16, controller: IpAddress) -> bool {
-        loop {
-            // Who begins a connection and never completes it must not keep the only socket.
-            socket.set_keep_alive(None);
-            socket.set_timeout(Some(HANDSHAKE));
-            if socket.accept(port).await.is_err() {
-                return false;
-            }
-            match socket.remote_endpoint() {
-                Some(peer) if peer.addr == controller && socket.may_send() => {
-                    // A controller that was switched off has to find the socket free.
-                    socket.set_keep_alive(Some(PROBE));
-                    socket.set_timeout(Some(VANISHED));
-                    return true;
-                }
-                Some(peer) if peer.addr != controller => self.control.turn_away(),
-                _ => {}
-            }
-            socket.abort();
-            let _ = with_timeout(FAREWELL, socket.flush()).await;
-        }
-    }
-
-    async fn read(&self, turn: u32, mut reader: TcpReader<'_>, chunk: &mut [u8]) {
-        while let Ok(len) = reader.read(chunk).await
-            && let Some(bytes @ [_, ..]) = chunk.get(..len)
-            && self.control.is_turn(turn)
-        {
-            self.bytes(bytes);
-        }
-    }
-
-    async fn write(&self, turn: u32, mut writer: TcpWriter<'_>) {
-        while let Some(transmission) = self.control.next(turn).await {
-            let mut rest = transmission.as_slice();
-            while !rest.is_empty() {
-                match writer.write(rest).await {
-                    Ok(len) if len > 0 => rest = rest.get(len..).unwrap_or(&[]),
-                    _ => return,
-                }
-            }
-            if self.control.is_turn(turn) {
-                self.gateway.input(Input::LinkSent { link: self.link });
-            }
-        }
-    }
-
-    /// Datagrams both ways; of a listening socket, answers where the controller sent from last.
-    async fn udp(&self, turn: u32, controller: &str, way: Way, buffers: &mut Buffers<'_>) {
-        let mut received = [PacketMetadata::EMPTY; DATAGRAMS];
-        let mut waiting = [PacketMetadata::EMPTY; DATAGRAMS];
-        let mut socket = UdpSocket::new(self.stack, &mut received, buffers.rx, &mut waiting, buffers.tx);
-        let own = match way {
-            Way::To(_) => 0,
-            Way::At(port) => port,
-        };
-        if socket.bind(own).is_err() {
-            return;
-        }
-        let resolving = select(resolve(self.stack, controller), self.control.over(turn));
-        let Either::First(Some(address)) = self.pulse.idle(pin!(resolving)).await else { return };
-        let fixed = match way {
-            Way::To(port) => Some(IpEndpoint::new(address, port)),
-            Way::At(_) => None,
-        };
-        let peer = Cell::new(fixed);
-        if fixed.is_some() {
-            self.up();
-        }
-        let reading = async {
-            loop {
-                // A datagram that is too long for any frame is none of ours.
-                let Ok((len, from)) = socket.recv_from(buffers.chunk).await else { continue };
-                if !self.control.is_turn(turn) {
-                    return;
-                }
-                match fixed {
-                    Some(fixed) if from.endpoint != fixed => continue,
-                    Some(_) => {}
-                    None if from.endpoint.addr != address => {
-                        self.control.turn_away();
-                        continue;
-                    }
-                    None if peer.replace(Some(from.endpoint)).is_none() => self.up(),
-                    None => {}
-                }
-                self.bytes(buffers.chunk.get(..len).unwrap_or(&[]));
-            }
-        };
-        let writing = async {
-            while let Some(datagram) = self.control.next(turn).await {
-                if let Some(peer) = peer.get()
-                    && socket.send_to(&datagram, peer).await.is_err()
-                {
-                    return;
-                }
-                if self.control.is_turn(turn) {
-                    self.gateway.input(Input::LinkSent { link: self.link });
-                }
-            }
-        };
-        self.pulse.idle(pin!(select(reading, writing))).await;
+        self.control.is_turn(turn)
     }
 }
 
@@ -299,21 +171,14 @@ async fn resolve(stack: Stack<'_>, host: &str) -> Option<IpAddress> {
 
 /// A state packet, and a receive window that a burst cannot overrun the Ethernet controller with.
 const RX: usize = 1536;
-/// The longest frame or request, and another.
-const TX: usize = 1024;
 /// Bytes handed to the engine at once: a state packet, and longer than any frame, so that a datagram
 /// that is too long is seen to be.
 const CHUNK: usize = 1536;
-/// Datagrams that wait, each way.
-const DATAGRAMS: usize = 8;
-/// How long a connection may take to come about at a listening socket.
-const HANDSHAKE: Duration = Duration::from_secs(2);
-/// Between two questions whether the controller's client is still there.
-const PROBE: Duration = Duration::from_secs(5);
-/// How long it may leave them without an answer.
-const VANISHED: Duration = Duration::from_secs(20);
-/// How long a closing socket is waited for.
-const FAREWELL: Duration = Duration::from_millis(100);
+/// Of a connection for frames of a recipe, two of the longest. What is left is for those that the
+/// controller has not acknowledged: a peer that acknowledges late must not slow them down. It has room
+/// for 64 of 72 bytes, as many as the engine hands over; those of 256 bytes may wait for 70 ms.
+const RX_FRAMES: usize = 1024;
+const CHUNK_FRAMES: usize = 512;
 
 #[cfg(test)]
 mod tests;

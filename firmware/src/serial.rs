@@ -1,20 +1,21 @@
 //! An RS-485 port's task: one task for a port, which drives the line, sends, waits for the last stop
 //! bit, releases the line and reads again.
 //!
-//! Its device buffers what arrives while the task is elsewhere, and its `read` loses nothing when it is
-//! dropped before it is done.
+//! Its device buffers what arrives while the task is elsewhere, and its `read` and `write` lose nothing and
+//! do nothing twice when they are dropped before they are done. What waits in the device is told at once
+//! and before anything is sent: the engine judges what is late by when it heard of it.
 
 use core::pin::pin;
+use core::task::Poll;
 
-use embassy_futures::select::{Either3, select3};
-use embassy_futures::yield_now;
+use embassy_futures::select::{Either, Either3, select, select3};
+use embassy_futures::{poll_once, yield_now};
 use embassy_time::{Duration, Instant, Timer, with_timeout};
-use embedded_io_async::{Read, Write};
+use embedded_io_async::{Error, ErrorKind, Read, Write};
 use proto_core::engine::{Input, PortId};
-use proto_core::time::Instant as CoreInstant;
 
 use crate::fmt::Text;
-use crate::gateway::Gateway;
+use crate::gateway::{Gateway, PortControl};
 use crate::warn;
 use crate::watchdog::Pulse;
 
@@ -23,11 +24,6 @@ pub trait Line: Read + Write {
     /// Raises or releases driver-enable; nothing where the hardware does it, or where there is none.
     fn drive(&mut self, direction: LineDirection) {
         let _ = direction;
-    }
-
-    /// When the bytes of the newest read arrived, where the device knows.
-    fn arrival(&self) -> Option<Arrival> {
-        None
     }
 
     /// What the device could not take.
@@ -53,15 +49,6 @@ impl LineErrors {
     pub(crate) const NONE: Self = Self { parity: 0, framing: 0, overruns: 0, unread: 0 };
 }
 
-/// When bytes arrived that were read later.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Arrival {
-    /// The first of them.
-    pub first: Instant,
-    /// The last of them.
-    pub last: Instant,
-}
-
 /// Who drives the line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LineDirection {
@@ -72,53 +59,59 @@ pub enum LineDirection {
 }
 
 /// Drives the port for ever.
-pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, mut line: impl Line, baud: u32) -> ! {
+pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, line: impl Line, baud: u32) -> ! {
     let Some(control) = gateway.port(port) else { core::future::pending().await };
-    let mut chunk = [0; 256];
+    let mut task = Task { gateway, port, control, line, chunk: [0; CHUNK] };
     let mut is_failing = false;
     let mut errors = Told { errors: LineErrors::NONE, look: Instant::MIN };
     loop {
         gateway.input(Input::PortUp { port });
+        let mut full_chunks = 0_usize;
         let failed = loop {
-            let next = select3(line.read(&mut chunk), control.next_bytes(), Timer::at(errors.look));
+            let Task { line, chunk, .. } = &mut task;
+            let next = select3(line.read(chunk), control.next_bytes(), Timer::at(errors.look));
             let next = pulse.idle(pin!(next)).await;
             let frame = match next {
                 Either3::First(Ok(len)) => {
-                    tell(gateway, port, chunk.get(..len).unwrap_or(&[]), line.arrival());
+                    task.tell(len);
                     if Instant::now() >= errors.look {
-                        errors.tell(port, line.errors());
+                        errors.tell(port, task.line.errors());
+                    }
+                    // What is not yet read came before what is to be sent. But a line that never falls
+                    // silent does not keep us from sending.
+                    full_chunks = if len < CHUNK { 0 } else { full_chunks.saturating_add(1) };
+                    let may_send = full_chunks == 0 || full_chunks >= FULL_CHUNKS;
+                    if full_chunks > 0 {
+                        gateway.more_waits();
                     }
                     // A line that is never silent does not keep the other tasks from running.
                     yield_now().await;
-                    // A line that never falls silent does not keep us from sending.
-                    match control.take_bytes() {
+                    match control.take_bytes_if(may_send) {
                         Some(frame) => frame,
                         None => continue,
                     }
                 }
-                Either3::First(Err(error)) => break embedded_io_async::Error::kind(&error),
+                Either3::First(Err(error)) => break error.kind(),
                 Either3::Second(frame) => frame,
                 Either3::Third(()) => {
                     // At the wrong speed nothing else is ever heard of a line.
-                    errors.tell(port, line.errors());
+                    errors.tell(port, task.line.errors());
                     continue;
                 }
             };
-            line.drive(LineDirection::Send);
-            let sent = with_timeout(patience(frame.len(), baud), async {
-                line.write_all(&frame).await?;
-                line.flush().await
-            });
+            full_chunks = 0;
+            task.line.drive(LineDirection::Send);
+            let sent = with_timeout(patience(frame.len(), baud), task.send(&frame));
             // A long frame on a slow line takes seconds.
             let sent = pulse.idle(pin!(sent)).await;
-            line.drive(LineDirection::Receive);
+            task.line.drive(LineDirection::Receive);
             match sent {
                 Ok(Ok(())) => {
                     is_failing = false;
                     gateway.input(Input::PortSent { port });
                 }
-                Ok(Err(error)) => break embedded_io_async::Error::kind(&error),
-                Err(_) => break embedded_io_async::ErrorKind::TimedOut,
+                Ok(Err(error)) => break error,
+                Err(_) => break ErrorKind::TimedOut,
             }
         };
         // Said once, however often it fails in a row.
@@ -126,26 +119,60 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, mut line: impl 
             warn!("port {}: {}", port.0, Text(&failed));
         }
         is_failing = true;
+        task.tell_waiting();
         gateway.input(Input::PortDown { port });
         control.clear();
-        Timer::after(RETRY).await;
+        // A line that does not take its bytes is heard all the same.
+        if failed != ErrorKind::TimedOut {
+            Timer::after(RETRY).await;
+        }
     }
 }
 
-/// Hands bytes to the engine. Silence on the line is judged by when they arrived, not by when this task
-/// had the time to look.
-fn tell(gateway: &Gateway, port: PortId, bytes: &[u8], arrival: Option<Arrival>) {
-    let input = |at: Instant, bytes| {
-        gateway.input_at(CoreInstant::from_micros(at.as_micros()), Input::PortBytes { port, bytes });
-    };
-    // Saturating: a driver's clock that is ahead of ours is no reason to panic.
-    let waited = |first| Instant::now().saturating_duration_since(first);
-    match (arrival, bytes.split_first_chunk::<1>()) {
-        (Some(Arrival { first, last }), Some((head, rest))) if waited(first) > PROMPT => {
-            input(first, head);
-            input(last, rest);
+struct Task<'a, L> {
+    gateway: &'a Gateway,
+    port: PortId,
+    control: &'a PortControl,
+    line: L,
+    chunk: [u8; CHUNK],
+}
+
+impl<L: Line> Task<'_, L> {
+    /// Tells the engine of the first `len` bytes of the chunk.
+    fn tell(&self, len: usize) {
+        let bytes = self.chunk.get(..len).unwrap_or(&[]);
+        self.gateway.input(Input::PortBytes { port: self.port, bytes });
+    }
+
+    /// Tells the engine of all that waits in the device.
+    fn tell_waiting(&mut self) {
+        for _ in 0..FULL_CHUNKS {
+            match poll_once(self.line.read(&mut self.chunk)) {
+                Poll::Ready(Ok(len @ 1..)) => self.tell(len),
+                _ => return,
+            }
         }
-        _ => gateway.input(Input::PortBytes { port, bytes }),
+    }
+
+    /// Sends a frame, to the end of its last stop bit. When the gateway has slept meanwhile, what waits
+    /// in the device is old and must not be heard of only when the frame has left.
+    async fn send(&mut self, frame: &[u8]) -> Result<(), ErrorKind> {
+        self.control.forget_sleep();
+        let mut rest = frame;
+        while !rest.is_empty() {
+            match select(self.line.write(rest), self.control.has_slept()).await {
+                Either::First(Ok(len @ 1..)) => rest = rest.get(len..).unwrap_or(&[]),
+                Either::First(Ok(0)) => return Err(ErrorKind::WriteZero),
+                Either::First(Err(error)) => return Err(error.kind()),
+                Either::Second(()) => self.tell_waiting(),
+            }
+        }
+        loop {
+            match select(self.line.flush(), self.control.has_slept()).await {
+                Either::First(flushed) => return flushed.map_err(|error| error.kind()),
+                Either::Second(()) => self.tell_waiting(),
+            }
+        }
     }
 }
 
@@ -176,8 +203,10 @@ fn patience(bytes: usize, baud: u32) -> Duration {
     Duration::from_micros(bits / u64::from(baud.max(1))) + Duration::from_millis(20)
 }
 
-/// Bytes that were read within this time have just arrived: a fraction of any silence that matters.
-const PROMPT: Duration = Duration::from_micros(100);
+/// Bytes read at once.
+const CHUNK: usize = 256;
+/// More than any device keeps.
+const FULL_CHUNKS: usize = 9;
 const ERROR_PERIOD: Duration = Duration::from_secs(1);
 /// After a failed device.
 const RETRY: Duration = Duration::from_millis(100);

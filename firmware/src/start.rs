@@ -9,8 +9,9 @@ use core::pin::pin;
 use embassy_executor::{SpawnError, SpawnToken, Spawner};
 use embassy_net::{Config, Ipv4Cidr, Runner, Stack, StackResources, StaticConfigV4};
 use embassy_time::{Duration, Timer};
+use firmware::fair::Fair;
 use firmware::fmt::Text;
-use firmware::gateway::Gateway;
+use firmware::gateway::{Gateway, MAX_LINKS};
 use firmware::led::Condition;
 use firmware::link::{Buffers, Endpoint};
 use firmware::watchdog::{Pulse, TaskName};
@@ -194,13 +195,17 @@ fn run(
     let ethernet = board.ethernet().map_err(Refused::Ethernet)?;
     static RESOURCES: StaticCell<StackResources<SOCKETS>> = StaticCell::new();
     let resources = RESOURCES.init(StackResources::new());
-    let (stack, runner) =
-        embassy_net::new(ethernet, network_config(wiring.network), resources, board::seed());
+    let (stack, runner) = embassy_net::new(
+        Fair::new(ethernet, gateway),
+        network_config(wiring.network),
+        resources,
+        board::seed(),
+    );
     info!("stack: {} bytes while the engine was made", board::stack_used());
     tasks.spawn(TaskName::Network, |pulse| network(pulse, runner));
     tasks.spawn(TaskName::Address, |pulse| address(pulse, stack));
     for (id, kind, endpoint) in wiring.links {
-        let buffers = Buffers::take(&mut memory).expect("there is room for MAX_LINKS");
+        let buffers = Buffers::take(&mut memory, &endpoint).expect("there is room for MAX_LINKS");
         tasks.spawn(TaskName::Link(kind), |pulse| {
             controller_link(pulse, gateway, id, stack, endpoint, buffers)
         });
@@ -257,7 +262,7 @@ async fn controller_link(
 }
 
 #[embassy_executor::task]
-async fn network(pulse: &'static Pulse, mut runner: Runner<'static, Ethernet>) -> ! {
+async fn network(pulse: &'static Pulse, mut runner: Runner<'static, Fair<'static, Ethernet>>) -> ! {
     // Its driver's waits are inside: that it is polled and comes back is all that can be seen.
     let mut running = pin!(runner.run());
     pulse.run(pin!(pulse.idle(running.as_mut()))).await
@@ -303,8 +308,6 @@ async fn refused(pulse: &'static Pulse, reason: Refused) -> ! {
     pulse.run(pin!(telling)).await
 }
 
-/// Command, state, Modbus and the recipe links.
-const MAX_LINKS: usize = firmware::gateway::MAX_UPLINKS + 3;
 /// One for each link, DHCP and DNS.
 const SOCKETS: usize = MAX_LINKS + 2;
 /// After this long the reason is told again.

@@ -5,13 +5,13 @@ use core::pin::pin;
 use embassy_time::{Duration, Timer};
 use proto_core::link::LinkState;
 
-use crate::gateway::{Gateway, MAX_FIELD_PORTS, MAX_UPLINKS};
+use crate::gateway::{Gateway, MAX_FIELD_PORTS, MAX_LINKS};
 use crate::watchdog::Pulse;
 use crate::{info, warn};
 
 /// Says it when it is another than before, for ever.
 pub async fn run(gateway: &Gateway, pulse: &Pulse) -> ! {
-    let mut links = [(0, false); MAX_LINKS];
+    let mut links = [(0, Shown::Down); MAX_LINKS];
     let mut ports = [[0; 6]; MAX_FIELD_PORTS];
     let mut strangers = [0; MAX_LINKS];
     loop {
@@ -19,16 +19,26 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse) -> ! {
             let mut known = links.iter_mut();
             gateway.report(
                 |link| {
-                    let Some((connects, was_up)) = known.next() else { return };
-                    let is_up = matches!(link.state, LinkState::Up { .. });
+                    let Some((connects, before)) = known.next() else { return };
+                    let shown = match link.state {
+                        LinkState::Up { .. } => Shown::Up,
+                        LinkState::Shared => Shown::Shared,
+                        LinkState::Down { .. } | LinkState::Opening { .. } => Shown::Down,
+                    };
                     let name = link.kind.name();
                     if *connects != link.history.connects {
                         *connects = link.history.connects;
                         info!("link {}: up ({})", name, connects);
-                    } else if *was_up && !is_up {
+                    } else if *before == Shown::Up && shown == Shown::Down {
                         warn!("link {}: lost", name);
                     }
-                    *was_up = is_up;
+                    if *before != Shown::Shared && shown == Shown::Shared {
+                        info!(
+                            "link {}: the controller takes one connection; the command link does its work",
+                            name
+                        );
+                    }
+                    *before = shown;
                 },
                 |_, _| {},
             );
@@ -67,5 +77,10 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse) -> ! {
     }
 }
 
-/// Command, state, Modbus and the recipe links.
-const MAX_LINKS: usize = MAX_UPLINKS + 3;
+/// How a link is, as the log tells it.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Shown {
+    Down,
+    Up,
+    Shared,
+}

@@ -17,12 +17,11 @@ use core::task::Poll;
 
 use critical_section::Mutex;
 use embassy_sync::waitqueue::WakerRegistration;
-use embassy_time::Instant;
 use embedded_io_async::{ErrorType, Read, Write};
 use heapless::Deque;
 use proto_core::config::{Parity, Rs485};
 
-use crate::serial::{Arrival, Line, LineErrors};
+use crate::serial::{Line, LineErrors};
 
 /// The registers of one USART, 32 bits each.
 pub trait Registers {
@@ -40,8 +39,6 @@ impl Shared {
     pub const fn new() -> Self {
         Self(Mutex::new(RefCell::new(State {
             received: Deque::new(),
-            arrival: NEVER,
-            read: NEVER,
             waiting: Deque::new(),
             reader: WakerRegistration::new(),
             writer: WakerRegistration::new(),
@@ -108,6 +105,9 @@ impl<R: Registers> Usart<R> {
     pub fn interrupt(regs: &R, shared: &Shared) {
         with(regs, shared, |line| {
             line.receive();
+            if !line.state.received.is_empty() {
+                line.state.reader.wake();
+            }
             line.transmit();
         });
     }
@@ -124,10 +124,6 @@ fn with<R, T>(regs: &R, shared: &Shared, f: impl FnOnce(&mut Access<'_, R>) -> T
 
 struct State {
     received: Deque<u8, RX_RING>,
-    /// Of what is in `received`.
-    arrival: Arrival,
-    /// Of what was read last.
-    read: Arrival,
     waiting: Deque<u8, TX_RING>,
     reader: WakerRegistration,
     writer: WakerRegistration,
@@ -152,7 +148,6 @@ impl<R: Registers> Access<'_, R> {
     fn receive(&mut self) {
         // What is pending here is for what arrived before; the FIFO is emptied behind it.
         self.regs.write(ICR, IDLE);
-        let now = Instant::now();
         let errors = &mut self.state.errors;
         // Each character is there with its own error flags. They are cleared before the character is
         // taken, because the flags behind it are those of the next.
@@ -176,15 +171,8 @@ impl<R: Registers> Access<'_, R> {
             } else if self.state.received.is_full() {
                 errors.unread = errors.unread.wrapping_add(1);
             } else {
-                if self.state.received.is_empty() {
-                    self.state.arrival.first = now;
-                }
-                self.state.arrival.last = now;
                 let _ = self.state.received.push_back(byte);
             }
-        }
-        if !self.state.received.is_empty() {
-            self.state.reader.wake();
         }
     }
 
@@ -216,6 +204,8 @@ impl<R: Registers> Read for Usart<R> {
     async fn read(&mut self, buf: &mut [u8]) -> Result<usize, Infallible> {
         poll_fn(|cx| {
             self.with(|line| {
+                // Less than a quarter of the FIFO interrupts nobody until the line falls silent.
+                line.receive();
                 if line.state.received.is_empty() && !buf.is_empty() {
                     line.state.reader.register(cx.waker());
                     return Poll::Pending;
@@ -226,9 +216,6 @@ impl<R: Registers> Read for Usart<R> {
                     *place = byte;
                     len += 1;
                 }
-                line.state.read = line.state.arrival;
-                // What is left came behind what was read, and not after the last.
-                line.state.arrival.first = line.state.arrival.last;
                 Poll::Ready(Ok(len))
             })
         })
@@ -274,11 +261,6 @@ impl<R: Registers> Write for Usart<R> {
 }
 
 impl<R: Registers> Line for Usart<R> {
-    /// As the interrupt found them: a quarter of the FIFO or one character of silence late.
-    fn arrival(&self) -> Option<Arrival> {
-        Some(self.with(|line| line.state.read))
-    }
-
     fn errors(&self) -> LineErrors {
         self.with(|line| line.state.errors)
     }
@@ -311,8 +293,6 @@ impl Speed {
         Ok(Self { prescaler, divider })
     }
 }
-
-const NEVER: Arrival = Arrival { first: Instant::MIN, last: Instant::MIN };
 
 /// Characters kept for the task: 22 ms at 460800 baud.
 const RX_RING: usize = 1024;

@@ -63,6 +63,7 @@ impl TaskName {
             Self::Led => (13, 0),
             Self::Refused => (14, 0),
             Self::Board(number) => (15, number),
+            Self::Link(LinkKind::Urgent) => (16, 0),
         };
         u16::from_be_bytes([kind, number])
     }
@@ -86,6 +87,7 @@ impl TaskName {
             13 => Self::Led,
             14 => Self::Refused,
             15 => Self::Board(number),
+            16 => Self::Link(LinkKind::Urgent),
             _ => return None,
         })
     }

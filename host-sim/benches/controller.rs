@@ -1,6 +1,8 @@
 //! The simulated controller's own work, without sockets: what it adds to a request beside the
 //! system calls, and what a cycle costs.
 
+use std::net::Ipv4Addr;
+
 use host_sim::config::{SimBus, SimConfig, SimField, SimParts, SimPort, SimRecipe, SimStreamPart};
 use host_sim::controller::{ConnId, Controller, ControllerInput, ControllerOutput};
 use proto_core::recipe::model::{Field, Mode};
@@ -40,7 +42,10 @@ fn controller() -> Controller {
     };
     let mut controller = Controller::new(&config).unwrap();
     for conn in 1..=64 {
-        controller.handle(START, ControllerInput::ModbusOpened { conn: ConnId(conn) });
+        controller.handle(
+            START,
+            ControllerInput::ModbusOpened { conn: ConnId(conn), from: Ipv4Addr::LOCALHOST.into() },
+        );
     }
     drain(&mut controller, START);
     controller

@@ -72,9 +72,29 @@ impl Running {
     }
 
     #[track_caller]
-    fn end(mut self, signal: &str) {
+    fn signal(&self, signal: &str) {
         let pid = self.child.id().to_string();
         assert!(Command::new("kill").args(["-s", signal, &pid]).status().unwrap().success());
+    }
+
+    /// Stops the process, and returns once none of its threads runs.
+    fn stop(&self) {
+        self.signal("STOP");
+        let tasks = format!("/proc/{}/task", self.child.id());
+        let is_stopped = |task: std::io::Result<std::fs::DirEntry>| {
+            let stat = std::fs::read_to_string(task.unwrap().path().join("stat")).unwrap();
+            stat.rsplit_once(") ").unwrap().1.starts_with('T')
+        };
+        let deadline = Instant::now() + PATIENCE;
+        while !std::fs::read_dir(&tasks).unwrap().all(is_stopped) {
+            assert!(Instant::now() < deadline, "it does not stop");
+            std::thread::yield_now();
+        }
+    }
+
+    #[track_caller]
+    fn end(mut self, signal: &str) {
+        self.signal(signal);
         let status = self.child.wait().unwrap();
         assert_eq!((status.code(), status.signal()), (Some(0), None), "{signal}");
     }
@@ -166,6 +186,56 @@ fn a_gateway_and_a_controller_find_each_other_and_end_cleanly() {
     assert!(line.symlink_metadata().is_err(), "the link is removed");
     robot.end("INT");
 }
+
+#[test]
+fn what_a_device_said_while_the_gateway_was_stopped_never_reaches_the_controller() {
+    let folder = tempfile::tempdir().unwrap();
+    let line = folder.path().join("rs485-1");
+    let mut robot = Running::start(
+        host_sim()
+            .args(["controller", "--stats", "10ms", "-c"])
+            .arg(example("udp-server-controller.toml"))
+            .args(["command", "state", "modbus", "udp2011"].map(|port| format!("--set=listen.{port}=0"))),
+    );
+    let ready = robot.ready.clone();
+    let port = |name: &str| ready[name].as_str().unwrap().rsplit_once(':').unwrap().1.to_owned();
+    let mut gateway = Running::start(
+        host_sim()
+            .args(["gateway", "--stats", "50ms", "-c"])
+            .arg(example("rs485-system.toml"))
+            .args(["state", "modbus"].map(|name| format!("--set=controller.ports.{name}={}", port(name))))
+            .arg(format!("--bind=rs485-1=pty:{}", line.display())),
+    );
+    let is_up = |stats: &Value| stats["links"]["modbus"]["state"] == "up";
+    let output = |stats: &Value| stats["registers"]["DigitalOutputCommand[1]"].as_f64();
+    gateway.stats(is_up);
+    let mut device = std::fs::File::options().read(true).write(true).open(&line).unwrap();
+    let mut say = |value: u8| {
+        std::io::Write::write_all(&mut device, &[0xFF, 0xFF, value, 0xEE, 0xEE]).unwrap();
+    };
+    say(1);
+    robot.stats(|stats| output(stats) == Some(1.0));
+    gateway.stop();
+    for _ in 0..100 {
+        say(2);
+    }
+    std::thread::sleep(STOPPED);
+    gateway.signal("CONT");
+    let woken = gateway.stats(|stats| stats["sleeps"] == 1);
+    assert_eq!(woken["ports"]["rs485-1"]["frames_in"], 1, "{woken}");
+    assert_ne!(woken["ports"]["rs485-1"]["asleep"], 0, "{woken}");
+    gateway.stats(|stats| is_up(stats) && stats["links"]["modbus"]["reconnects"] != 0);
+    say(4);
+    robot.stats(|stats| {
+        assert_ne!(output(stats), Some(2.0));
+        output(stats) == Some(4.0)
+    });
+    gateway.end("TERM");
+    robot.end("TERM");
+}
+
+/// Longer than a gateway may be away without having slept.
+const STOPPED: Duration = Duration::from_millis(800);
 
 #[test]
 fn what_cannot_start_says_why_and_exits_with_2() {

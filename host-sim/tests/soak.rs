@@ -47,7 +47,7 @@ fn soaked(level: Level, seed: u64, span: Duration, jobs: usize) -> Total {
 /// What these seeds mean, on every machine. A change of what the engine, the controller or the cell
 /// does, or when, changes them: then the new ones belong here. Nothing else may.
 const HASHES: [(Level, u64); 2] =
-    [(Level::None, 0xBB7D_0E30_565A_46C9), (Level::Harsh, 0xF0B0_2430_F49A_7CED)];
+    [(Level::None, 0x5A1C_0D0E_48B8_6E48), (Level::Harsh, 0xF0B0_2430_F49A_7CED)];
 
 #[test]
 fn a_seed_means_the_same_trace_on_every_machine() {

@@ -303,6 +303,8 @@ const CASES: &[Case] = &[
     controller("an unknown server", "command = 2000", "comand = 2000"),
     controller("an unknown state of power", "power = \"enabled\"", "power = \"standby\""),
     controller("an unknown operation mode", "mode = \"remote\"", "mode = \"automatic\""),
+    controller("an unknown number of clients of port 2000", "mode = \"remote\"", "command_clients = \"two\""),
+    controller("a number of clients of port 2000", "mode = \"remote\"", "command_clients = 1"),
     controller("an unknown dialect of the controller", "dialect = \"v2.3\"", "dialect = \"2.3\""),
     controller("an initial value of nothing known", "\"DI[3]\"", "\"DX[3]\""),
     controller("an initial bit that is not there", "\"DI[3]\"", "\"DI[17]\""),

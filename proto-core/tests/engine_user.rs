@@ -129,6 +129,9 @@ fn changes_are_sent_on_the_cycle_and_only_they() {
     let port = user(&mut cell, &[], &fields, SendOn::Change);
     let mut rig = cell.rig();
     rig.map.registers[42] = 7;
+    // Of the cycle before the start, whatever stands there is told at once; then the grid begins.
+    rig.run(MS(1));
+    assert_eq!(rig.sent_to(port).len(), 1);
     rig.run(MS(2_000));
     assert_eq!(rig.sent_to(port).len(), 500, "a counter is news each cycle");
 
@@ -265,6 +268,22 @@ fn sent(rig: &mut Rig) -> Vec<String> {
     texts.into_iter().map(|text| String::from_utf8(text).unwrap()).collect()
 }
 
+/// The same, of those that have a connection of their own.
+fn urgent(rig: &mut Rig) -> Vec<String> {
+    let texts = rig.sent_on(LinkId::URGENT);
+    texts.into_iter().map(|text| String::from_utf8(text).unwrap()).collect()
+}
+
+/// The device goes on sending, and picks nothing.
+fn idle(rig: &mut Rig, port: PortId, millis: u64) {
+    for _ in 0..millis / 50 {
+        rig.bytes(port, &frame(&[0]));
+        rig.run(MS(50));
+    }
+    rig.bytes(port, &frame(&[0]));
+    rig.run(MS(millis % 50));
+}
+
 #[track_caller]
 fn reply(rig: &Rig, port: PortId) -> ReplyCode {
     rig.engine.reply_code(port).unwrap()
@@ -288,7 +307,8 @@ fn a_changed_value_picks_a_command_and_the_first_is_only_a_base() {
     rig.bytes(port, &frame(&[2]));
     assert_eq!(rig.sent_to(port), [answer(&[ReplyCode::Success as u8])]);
     rig.bytes(port, &frame(&[0xFF]));
-    assert_eq!(sent(&mut rig), ["pause"]);
+    assert_eq!(urgent(&mut rig), ["pause"]);
+    assert!(sent(&mut rig).is_empty(), "it has a connection of its own");
     let counters = rig.counters(port);
     assert_eq!((counters.commands, counters.commands_dropped), (2, 0));
 }
@@ -479,9 +499,9 @@ fn a_command_without_a_reply_reconnects() {
 fn a_command_that_cannot_be_sent_soon_is_dropped() {
     let (mut rig, port) = commands(CommandWhen::Frame);
     rig.bytes(port, &frame(&[1]));
-    rig.run(MS(500));
+    idle(&mut rig, port, 500);
     rig.bytes(port, &frame(&[2]));
-    rig.run(MS(999));
+    idle(&mut rig, port, 999);
     assert_eq!(reply(&rig, port), ReplyCode::Pending);
     rig.run(MS(1));
     assert_eq!(reply(&rig, port), ReplyCode::NotSent);

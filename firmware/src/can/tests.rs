@@ -40,6 +40,9 @@ struct Controller {
     /// A frame that was handed over leaves at once.
     is_acknowledged: bool,
     is_off: bool,
+    /// Has no room for a frame.
+    is_full: bool,
+    bitrate: u32,
     waiting: Vec<CanFrame>,
     sent: Vec<CanFrame>,
     filters: Option<Vec<CanId>>,
@@ -99,6 +102,8 @@ impl CanPort for Fake {
     }
 
     async fn send(&mut self, frame: &CanFrame) -> Result<(), BusOff> {
+        core::future::poll_fn(|_| if self.0.borrow().is_full { Poll::Pending } else { Poll::Ready(()) })
+            .await;
         let mut controller = self.0.borrow_mut();
         if controller.is_off {
             return Err(BusOff);
@@ -123,7 +128,7 @@ impl CanPort for Fake {
     }
 
     fn bitrate(&self) -> u32 {
-        BITRATE
+        self.0.borrow().bitrate
     }
 }
 
@@ -175,7 +180,11 @@ impl Cell {
         let gateway: &'static Gateway = gateway;
         let watch: &'static Watch<2> = Box::leak(Box::new(Watch::new()));
         let pulses = [TaskName::Engine, TaskName::Can(PORT)].map(|name| watch.register(name).unwrap());
-        let controller = Rc::new(RefCell::new(Controller { is_acknowledged: true, ..Controller::default() }));
+        let controller = Rc::new(RefCell::new(Controller {
+            is_acknowledged: true,
+            bitrate: BITRATE,
+            ..Controller::default()
+        }));
         let fake = Fake(Rc::clone(&controller));
         let mut cell = Self {
             gateway,
@@ -409,4 +418,21 @@ fn a_flood_starves_neither_the_other_tasks_nor_what_is_to_be_sent() {
     cell.task.poll();
     assert!(cell.controller.borrow().waiting.len() > before);
     assert!(cell.controller.borrow().flood > 0);
+}
+
+#[test]
+fn what_waited_while_the_processor_was_stopped_is_not_heard_of_only_when_a_frame_has_left() {
+    let mut cell = Cell::new();
+    // A frame is waited for for seconds.
+    cell.controller(|can| (can.is_full, can.bitrate) = (true, 100));
+    cell.millis(2 * CYCLE);
+    cell.controller.borrow_mut().bring(CanEvent::Frame(input_frame()));
+    advance(Duration::from_secs(2));
+    cell.settle();
+    let counters = cell.counters();
+    assert_eq!((counters.asleep, counters.frames_in, counters.downs), (1, 0, 1));
+    cell.controller(|can| can.is_full = false);
+    cell.millis(60);
+    cell.controller(|can| can.bring(CanEvent::Frame(input_frame())));
+    assert_eq!(cell.counters().frames_in, 1);
 }

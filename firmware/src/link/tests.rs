@@ -1,9 +1,14 @@
-//! Listening links among three hosts on one Ethernet: the gateway, its controller and a stranger.
+//! A link among three hosts on one Ethernet: the gateway, its controller and a stranger.
 
+mod datagrams;
+mod delivery;
+mod listening;
+mod order;
+
+use core::cell::{Cell, RefCell};
 use core::future::poll_fn;
-use core::task::{Context, Poll};
+use core::task::{Context, Poll, Waker};
 use std::boxed::Box;
-use std::cell::RefCell;
 use std::collections::VecDeque;
 use std::rc::Rc;
 use std::vec;
@@ -11,12 +16,14 @@ use std::vec::Vec;
 
 use embassy_futures::block_on;
 use embassy_futures::join::{join, join3};
+use embassy_futures::select::select;
 use embassy_net::driver::{Capabilities, Driver as Device, HardwareAddress, LinkState};
-use embassy_net::{Config, Ipv4Cidr, StackResources, StaticConfigV4};
-use embassy_time::Timer;
+use embassy_net::{Config, IpEndpoint, Ipv4Cidr, Runner, StackResources, StaticConfigV4};
+use embassy_time::{Duration, with_timeout};
 use proto_core::config::{
     Bus, Delimiter, FieldSpec, Name, OnStale, Parity, Parts, Port, Recipe, Rs485, SendOn, Span, StreamPart,
 };
+use proto_core::engine::{LinkCounters, LinkInfo, PortId};
 use proto_core::recipe::model::Mode;
 use proto_core::sysvar::SysVar;
 use proto_core::time::Duration as CoreDuration;
@@ -29,19 +36,78 @@ const GATEWAY: u8 = 1;
 const CONTROLLER: u8 = 2;
 const STRANGER: u8 = 3;
 const PORT: u16 = 50_000;
+const FIELD: PortId = PortId(0);
+/// How old a frame may be delivered.
+const TIMEOUT: Duration = Duration::from_secs(1);
+/// Of the controller.
 const FRAME: [u8; 5] = [0xFF, 0xFF, 0x01, 0xEE, 0xEE];
 
 /// What waits for each host, and which one does not hear or speak any more.
-#[derive(Default)]
 struct Wire {
     waiting: RefCell<[VecDeque<Vec<u8>>; 3]>,
+    wakers: RefCell<[Option<Waker>; 3]>,
     deaf: Cell<u8>,
     mute: Cell<u8>,
-    /// Frames of all so far.
+    /// Frames of all that somebody heard.
     spoken: Cell<usize>,
+    /// Each frame's host, and the frame, also when nobody heard it.
+    log: RefCell<Vec<(u8, Vec<u8>)>>,
+    /// How fast time passes.
+    step: Cell<Duration>,
 }
 
-/// A host's end of the wire. All hosts are polled all the time, so nobody has to be woken.
+impl Wire {
+    fn new() -> Self {
+        Self {
+            waiting: RefCell::default(),
+            wakers: RefCell::default(),
+            deaf: Cell::new(0),
+            mute: Cell::new(0),
+            spoken: Cell::new(0),
+            log: RefCell::default(),
+            step: Cell::new(Duration::from_micros(200)),
+        }
+    }
+
+    /// One host does not hear any more and one does not speak; 0 is none.
+    fn silence(&self, deaf: u8, mute: u8) {
+        self.deaf.set(deaf);
+        self.mute.set(mute);
+    }
+
+    /// The TCP segments of the gateway since the log was cleared.
+    fn segments(&self) -> Vec<Segment> {
+        let log = self.log.borrow();
+        log.iter().filter(|(host, _)| *host == GATEWAY).filter_map(|(_, frame)| Segment::of(frame)).collect()
+    }
+
+    fn has(&self, flag: u8) -> bool {
+        self.segments().iter().any(|segment| segment.flags & flag != 0)
+    }
+}
+
+/// Of TCP.
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct Segment {
+    from: u16,
+    flags: u8,
+    payload: Vec<u8>,
+}
+
+const FIN: u8 = 1;
+const SYN: u8 = 2;
+const RST: u8 = 4;
+
+impl Segment {
+    fn of(frame: &[u8]) -> Option<Self> {
+        let ip = frame.get(14..).filter(|ip| frame[12..14] == [8, 0] && ip[9] == 6)?;
+        let tcp = &ip[usize::from(ip[0] & 0xF) * 4..usize::from(u16::from_be_bytes([ip[2], ip[3]]))];
+        let payload = tcp[usize::from(tcp[12] >> 4) * 4..].to_vec();
+        Some(Self { from: u16::from_be_bytes([tcp[0], tcp[1]]), flags: tcp[13], payload })
+    }
+}
+
+/// A host's end of the wire.
 struct End {
     wire: Rc<Wire>,
     host: u8,
@@ -62,13 +128,19 @@ impl embassy_net::driver::TxToken for Sends<'_> {
         let mut frame = vec![0; len];
         let result = fill(&mut frame);
         let End { wire, host: own } = self.0;
+        wire.log.borrow_mut().push((*own, frame.clone()));
         if wire.mute.get() == *own {
             return result;
         }
         wire.spoken.set(wire.spoken.get() + 1);
-        for (host, queue) in (GATEWAY..).zip(wire.waiting.borrow_mut().iter_mut()) {
+        let mut wakers = wire.wakers.borrow_mut();
+        for ((host, queue), waker) in (GATEWAY..).zip(wire.waiting.borrow_mut().iter_mut()).zip(&mut *wakers)
+        {
             if host != *own && host != wire.deaf.get() {
                 queue.push_back(frame.clone());
+                if let Some(waker) = waker.take() {
+                    waker.wake();
+                }
             }
         }
         result
@@ -79,8 +151,10 @@ impl Device for End {
     type RxToken<'a> = Received;
     type TxToken<'a> = Sends<'a>;
 
-    fn receive(&mut self, _: &mut Context<'_>) -> Option<(Received, Sends<'_>)> {
-        let frame = self.wire.waiting.borrow_mut()[usize::from(self.host - GATEWAY)].pop_front()?;
+    fn receive(&mut self, cx: &mut Context<'_>) -> Option<(Received, Sends<'_>)> {
+        let place = usize::from(self.host - GATEWAY);
+        self.wire.wakers.borrow_mut()[place] = Some(cx.waker().clone());
+        let frame = self.wire.waiting.borrow_mut()[place].pop_front()?;
         Some((Received(frame), Sends(self)))
     }
 
@@ -107,208 +181,180 @@ fn address(host: u8) -> Ipv4Addr {
     Ipv4Addr::new(10, 0, 0, host)
 }
 
-/// A field port, and a listening port that its frames go out by.
-fn config(bus: Bus) -> GatewayConfig {
+type Resources = StackResources<3>;
+
+fn host<'d>(wire: &Rc<Wire>, host: u8, resources: &'d mut Resources) -> (Stack<'d>, Runner<'d, End>) {
+    let cidr = Ipv4Cidr::new(address(host), 24);
+    let config = StaticConfigV4 { address: cidr, gateway: None, dns_servers: Default::default() };
+    let end = End { wire: Rc::clone(wire), host };
+    embassy_net::new(end, Config::ipv4_static(config), resources, u64::from(host))
+}
+
+/// A controller, and nothing else.
+fn controller_only() -> GatewayConfig {
     let mut config = GatewayConfig::empty();
     let controller = &mut config.controller;
-    controller.address = String::try_from("10.0.0.2").unwrap();
-    controller.dialect = String::try_from("v2.3").unwrap();
+    controller.address = "10.0.0.2".try_into().unwrap();
+    controller.dialect = "v2.3".try_into().unwrap();
     (controller.command_port, controller.state_port, controller.modbus_port) = (2000, 2001, 502);
-    let var = SysVar::parse("DigitalOutputCommand[1]").unwrap();
-    config.fields.push(FieldSpec::System(var)).unwrap();
+    config
+}
+
+fn add_port(config: &mut GatewayConfig, name: &str, bus: Bus, recipe: u8) {
+    let timeout = CoreDuration::from_micros(TIMEOUT.as_micros());
+    let (cycle, stale_after) = (CoreDuration::from_secs(1), CoreDuration::from_secs(1));
+    let (name, on_timeout) = (Name::try_from(name).unwrap(), Span::default());
+    config.ports.push(Port { name, bus, recipe, cycle, timeout, on_timeout, stale_after }).unwrap();
+}
+
+fn add_recipe(config: &mut GatewayConfig, mode: Mode, input: Option<Span>, output: Option<Span>) {
     let delimiter = |bytes: &[u8]| Delimiter::from_slice(bytes).unwrap();
-    let fields = Span { start: 0, len: 1 };
-    let input = StreamPart { head: delimiter(&FRAME[..2]), tail: delimiter(&FRAME[3..]), fields };
-    let parts = Parts::Stream { input: Some(input), output: None };
-    let name = |name| Name::try_from(name).unwrap();
+    let part = |fields| StreamPart { head: delimiter(&FRAME[..2]), tail: delimiter(&FRAME[3..]), fields };
+    let parts = Parts::Stream { input: input.map(part), output: output.map(part) };
+    let name = Name::try_from(["a", "b"][config.recipes.len()]).unwrap();
     let (on_stale, send) = (OnStale::Hold, SendOn::Period);
-    config.recipes.push(Recipe { name: name("a"), mode: Mode::Realtime, parts, on_stale, send }).unwrap();
-    let line = Rs485 {
+    config.recipes.push(Recipe { name, mode, parts, on_stale, send }).unwrap();
+}
+
+fn rs485() -> Bus {
+    Bus::Rs485(Rs485 {
         baud: 115_200,
         parity: Parity::None,
         stop_bits: 1,
         idle_gap: CoreDuration::from_millis(50),
         turnaround: CoreDuration::ZERO,
+    })
+}
+
+/// A field port, and a listening port that its frames go out by.
+fn config(bus: Bus, controller: Speaks) -> GatewayConfig {
+    let mut config = controller_only();
+    let mut field = |name: &str| {
+        config.fields.push(FieldSpec::System(SysVar::parse(name).unwrap())).unwrap();
     };
-    let second = CoreDuration::from_secs(1);
-    let (cycle, timeout, stale_after) = (second, second, second);
-    let on_timeout = Span { start: 0, len: 0 };
-    for (name, bus) in [(name("field"), Bus::Rs485(line)), (name("up"), bus)] {
-        let port = Port { name, bus, recipe: 0, cycle, timeout, on_timeout, stale_after };
-        config.ports.push(port).unwrap();
+    field("DigitalOutputCommand[1]");
+    for number in 1..=32 {
+        field(&std::format!("WordInputReg[{number}]"));
     }
+    for number in 1..=16 {
+        field(&std::format!("FloatInputReg[{number}]"));
+    }
+    field("DigitalSignalStatus[1]");
+    let (up, down) = (Span { start: 0, len: 49 }, Span { start: 49, len: 1 });
+    add_recipe(&mut config, Mode::Realtime, Some(up), None);
+    add_recipe(&mut config, Mode::Realtime, Some(up), (controller == Speaks::Frames).then_some(down));
+    add_port(&mut config, "field", rs485(), 0);
+    add_port(&mut config, "up", bus, 1);
+    config.validate().unwrap();
     config
 }
 
-/// Runs what the controller and the stranger do beside the gateway, until they are done.
-fn among(bus: Bus, act: impl AsyncFnOnce(&Gateway, Stack<'_>, Stack<'_>, &Wire)) {
+/// Whether the controller's client sends frames of its own.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Speaks {
+    Nothing,
+    Frames,
+}
+
+fn tcp_listen() -> Bus {
+    Bus::TcpListen { listen: "0.0.0.0:50000".try_into().unwrap() }
+}
+
+fn udp_listen() -> Bus {
+    Bus::UdpListen { listen: "0.0.0.0:50000".try_into().unwrap() }
+}
+
+fn listens(kind: LinkKind) -> bool {
+    matches!(kind, LinkKind::RecipeTcpListen { .. } | LinkKind::RecipeUdpListen { .. })
+}
+
+/// Of a frame of the field.
+const LEN: usize = 2 + 1 + 32 * 2 + 16 * 4 + 2;
+
+/// A frame of the field that switches these outputs; the same goes on to the controller.
+fn switching(outputs: u8) -> [u8; LEN] {
+    let mut frame = [0; LEN];
+    (frame[0], frame[1], frame[2]) = (0xFF, 0xFF, outputs);
+    (frame[LEN - 2], frame[LEN - 1]) = (0xEE, 0xEE);
+    frame
+}
+
+/// What a test has to do with.
+#[derive(Clone, Copy)]
+struct Net<'a> {
+    gateway: &'a Gateway,
+    link: LinkId,
+    controller: Stack<'a>,
+    stranger: Stack<'a>,
+    wire: &'a Wire,
+}
+
+impl Net<'_> {
+    fn control(&self) -> &LinkControl {
+        self.gateway.link(self.link).unwrap()
+    }
+
+    fn hear(&self, bytes: &[u8]) {
+        self.gateway.input(Input::PortBytes { port: FIELD, bytes });
+    }
+
+    /// How often the link was up, whether it is, and what was counted.
+    fn link(&self) -> (u32, bool, LinkCounters) {
+        let mut found = None;
+        let look = |link: LinkInfo<'_>| {
+            if link.id == self.link {
+                let is_up = matches!(link.state, proto_core::link::LinkState::Up { .. });
+                found = Some((link.history.connects, is_up, *link.counters));
+            }
+        };
+        self.gateway.report(look, |_, _| {});
+        found.unwrap()
+    }
+
+    /// Waits until the link was up so often and so many were turned away.
+    async fn seen(&self, connects: u32, strangers: u32) {
+        let turned_away = || self.gateway.strangers().map(|(_, count)| count).max();
+        until(|| (self.link().0, turned_away()) == (connects, Some(strangers))).await;
+    }
+}
+
+/// Waits. All are polled all the time, so nobody has to be woken.
+async fn until(mut is_so: impl FnMut() -> bool) {
+    poll_fn(|_| if is_so() { Poll::Ready(()) } else { Poll::Pending }).await;
+}
+
+/// Where the gateway listens.
+fn gateway_port() -> IpEndpoint {
+    IpEndpoint::new(address(GATEWAY).into(), PORT)
+}
+
+/// Runs what the controller and the stranger do beside the gateway's link, until they are done.
+fn among(config: &GatewayConfig, which: impl Fn(LinkKind) -> bool, act: impl AsyncFnOnce(Net<'_>)) {
     let _clock = Clock::take();
-    let config = config(bus);
     let mut gateway = Box::new(Gateway::idle());
-    gateway.configure(&config).unwrap();
-    let (link, kind) = gateway
-        .links()
-        .find(|(_, kind)| matches!(kind, LinkKind::RecipeTcpListen { .. } | LinkKind::RecipeUdpListen { .. }))
-        .unwrap();
-    let endpoint = Endpoint::of(&config, kind);
+    gateway.configure(config).unwrap();
+    let (link, kind) = gateway.links().find(|(_, kind)| which(*kind)).unwrap();
+    let endpoint = Endpoint::of(config, kind);
     let watch = Watch::<2>::new();
     let pulses = [TaskName::Engine, TaskName::Link(kind)].map(|name| watch.register(name).unwrap());
-    let wire = Rc::new(Wire::default());
-    let mut resources: [StackResources<3>; 3] = core::array::from_fn(|_| StackResources::new());
+    let wire = Rc::new(Wire::new());
+    let mut resources: [Resources; 3] = core::array::from_fn(|_| StackResources::new());
     let [of_gateway, of_controller, of_stranger] = &mut resources;
-    let host = |host, resources| {
-        let cidr = Ipv4Cidr::new(address(host), 24);
-        let config = StaticConfigV4 { address: cidr, gateway: None, dns_servers: Default::default() };
-        let end = End { wire: Rc::clone(&wire), host };
-        embassy_net::new(end, Config::ipv4_static(config), resources, u64::from(host))
-    };
-    let (own, mut own_runner) = host(GATEWAY, of_gateway);
-    let (controller, mut controller_runner) = host(CONTROLLER, of_controller);
-    let (stranger, mut stranger_runner) = host(STRANGER, of_stranger);
+    let (own, mut own_runner) = host(&wire, GATEWAY, of_gateway);
+    let (controller, mut controller_runner) = host(&wire, CONTROLLER, of_controller);
+    let (stranger, mut stranger_runner) = host(&wire, STRANGER, of_stranger);
     let mut memory = [0; Buffers::SIZE];
-    let buffers = Buffers::take(&mut memory.as_mut_slice()).unwrap();
+    let buffers = Buffers::take(&mut memory.as_mut_slice(), &endpoint).unwrap();
     let network = join3(own_runner.run(), controller_runner.run(), stranger_runner.run());
     let driven = join(gateway.keep_time(pulses[0]), run(&gateway, pulses[1], link, own, &endpoint, buffers));
+    let net = Net { gateway: &gateway, link, controller, stranger, wire: &wire };
     let act = async {
-        with_timeout(Duration::from_secs(60), act(&gateway, controller, stranger, &wire))
-            .await
-            .expect("it hangs");
+        gateway.input(Input::PortUp { port: FIELD });
+        with_timeout(Duration::from_secs(200), act(net)).await.expect("it hangs");
     };
     let time = poll_fn(|_| {
-        advance(Duration::from_micros(200));
+        advance(wire.step.get());
         Poll::<()>::Pending
     });
     block_on(select(pin!(act), pin!(join3(network, driven, time))));
-}
-
-/// Waits until the link was up so often and so many were turned away.
-async fn seen(gateway: &Gateway, connects: u32, strangers: u32) {
-    poll_fn(|_| {
-        let mut ups = 0;
-        gateway.report(
-            |link| {
-                if link.kind.name().ends_with("-listen") {
-                    ups = link.history.connects;
-                }
-            },
-            |_, _| {},
-        );
-        let turned_away = gateway.strangers().map(|(_, count)| count).max();
-        if (u64::from(ups), turned_away) == (u64::from(connects), Some(strangers)) {
-            Poll::Ready(())
-        } else {
-            Poll::Pending
-        }
-    })
-    .await;
-}
-
-#[test]
-fn a_tcp_listener_takes_the_controller_only() {
-    let listen = String::try_from("0.0.0.0:50000").unwrap();
-    among(Bus::TcpListen { listen }, async |gateway, controller, stranger, _| {
-        let at = IpEndpoint::new(address(GATEWAY).into(), PORT);
-        let mut buffers = [[0; 256]; 4];
-        let [rx, tx, other_rx, other_tx] = &mut buffers;
-        let mut other = TcpSocket::new(stranger, other_rx, other_tx);
-        for round in 1..=3 {
-            // The listener may be busy with turning the one before away.
-            while other.connect(at).await.is_err() {
-                other.abort();
-            }
-            assert!(!matches!(other.read(&mut [0; 8]).await, Ok(1..)));
-            other.abort();
-            seen(gateway, 0, round).await;
-        }
-        let mut own = TcpSocket::new(controller, rx, tx);
-        while own.connect(at).await.is_err() {
-            own.abort();
-        }
-        seen(gateway, 1, 3).await;
-        // A controller that has nothing to say is no less there.
-        Timer::after(VANISHED * 2).await;
-        seen(gateway, 1, 3).await;
-        // There is one socket, and it is taken.
-        assert!(other.connect(at).await.is_err());
-        own.abort();
-        let _ = own.flush().await;
-    });
-}
-
-#[test]
-fn a_connection_that_never_comes_about_does_not_keep_the_listener() {
-    let listen = String::try_from("0.0.0.0:50000").unwrap();
-    among(Bus::TcpListen { listen }, async |gateway, controller, stranger, wire| {
-        let at = IpEndpoint::new(address(GATEWAY).into(), PORT);
-        let mut buffers = [[0; 256]; 4];
-        let [rx, tx, other_rx, other_tx] = &mut buffers;
-        let mut other = TcpSocket::new(stranger, other_rx, other_tx);
-        other.connect(at).await.unwrap();
-        seen(gateway, 0, 1).await;
-        other.abort();
-        other.flush().await.unwrap();
-        // Now the hosts know each other. It asks for a connection and is gone before it is answered.
-        wire.deaf.set(STRANGER);
-        let before = wire.spoken.get();
-        let asked = poll_fn(|_| if wire.spoken.get() == before { Poll::Pending } else { Poll::Ready(()) });
-        assert!(matches!(select(other.connect(at), asked).await, Either::Second(())));
-        wire.mute.set(STRANGER);
-        let mut own = TcpSocket::new(controller, rx, tx);
-        let mut refused = 0;
-        while own.connect(at).await.is_err() {
-            own.abort();
-            refused += 1;
-        }
-        assert!(refused > 0, "nothing was in its way");
-        seen(gateway, 1, 1).await;
-    });
-}
-
-#[test]
-fn a_controller_that_was_switched_off_finds_the_listener_free_again() {
-    let listen = String::try_from("0.0.0.0:50000").unwrap();
-    among(Bus::TcpListen { listen }, async |gateway, controller, _, wire| {
-        let at = IpEndpoint::new(address(GATEWAY).into(), PORT);
-        let mut buffers = [[0; 256]; 2];
-        let [rx, tx] = &mut buffers;
-        let mut own = TcpSocket::new(controller, rx, tx);
-        own.connect(at).await.unwrap();
-        seen(gateway, 1, 0).await;
-        // Nobody hears that it goes.
-        wire.mute.set(CONTROLLER);
-        own.abort();
-        own.flush().await.unwrap();
-        wire.mute.set(0);
-        let mut refused = 0;
-        while own.connect(at).await.is_err() {
-            own.abort();
-            refused += 1;
-        }
-        assert!(refused > 0, "nothing was in its way");
-        seen(gateway, 2, 0).await;
-    });
-}
-
-#[test]
-fn a_udp_listener_takes_the_controller_only() {
-    let listen = String::try_from("0.0.0.0:50000").unwrap();
-    among(Bus::UdpListen { listen }, async |gateway, controller, stranger, _| {
-        let at = IpEndpoint::new(address(GATEWAY).into(), PORT);
-        let mut buffers = [[0; 256]; 4];
-        let mut metadata = [[PacketMetadata::EMPTY; 4]; 4];
-        let [rx, tx, other_rx, other_tx] = &mut buffers;
-        let [rx_meta, tx_meta, other_rx_meta, other_tx_meta] = &mut metadata;
-        let mut other = UdpSocket::new(stranger, other_rx_meta, other_rx, other_tx_meta, other_tx);
-        other.bind(1).unwrap();
-        for round in 1..=3 {
-            other.send_to(&FRAME, at).await.unwrap();
-            seen(gateway, 0, round).await;
-        }
-        let mut own = UdpSocket::new(controller, rx_meta, rx, tx_meta, tx);
-        own.bind(1).unwrap();
-        own.send_to(&FRAME, at).await.unwrap();
-        seen(gateway, 1, 3).await;
-        other.send_to(&FRAME, at).await.unwrap();
-        seen(gateway, 1, 4).await;
-    });
 }

@@ -1,48 +1,49 @@
-//! A line whose bytes wait, because the processor is busy with something else.
+//! Lines whose bytes wait, because the processor is busy with something else or was stopped.
 
-use core::cell::Cell;
+use core::cell::{Cell, RefCell};
 use core::convert::Infallible;
-use core::future::{Future, pending};
-use core::pin::pin;
-use core::task::{Context, Poll, Waker};
+use core::future::{Future, pending, poll_fn};
+use core::task::{Context, Waker};
 use std::boxed::Box;
 use std::collections::VecDeque;
+use std::rc::Rc;
+use std::vec::Vec;
 
-use embassy_futures::block_on;
-use embassy_futures::join::join;
-use embassy_futures::select::select;
 use embedded_io_async::ErrorType;
 use proto_core::config::{
-    Bus, Delimiter, FieldSpec, GatewayConfig, Name, OnStale, Parity, Parts, Port, Recipe, Rs485, SendOn,
-    Span, StreamPart,
+    Bus, Delimiter, FieldSpec, GatewayConfig, InputBinding, Name, OnStale, OutputBinding, Parity, Parts,
+    Port, Recipe, Rs485, SendOn, Span, StreamPart,
 };
 use proto_core::engine::PortCounters;
 use proto_core::recipe::model::Mode;
-use proto_core::sysvar::SysVar;
 use proto_core::time::Duration as CoreDuration;
+use proto_core::wire::scalar::ScalarType;
 
 use super::*;
 use crate::test_clock::{Clock, advance};
+use crate::test_executor::{Executor, Order};
 use crate::watchdog::{TaskName, Watch};
 
 const FRAME: [u8; 5] = [0xFF, 0xFF, 0x01, 0xEE, 0xEE];
-const IDLE_GAP: Duration = Duration::from_millis(300);
+const PORT: PortId = PortId(0);
+const IDLE_GAP: Duration = Duration::from_millis(100);
+const TIMEOUT: Duration = Duration::from_millis(200);
+const BAUD: u32 = 115_200;
 
-/// What happens on the line: so long after the piece before, these bytes arrive.
-struct Piece {
-    after: Duration,
-    bytes: &'static [u8],
+/// What a device keeps, and what has become of it.
+#[derive(Default)]
+struct Device {
+    received: VecDeque<u8>,
+    /// What was sent does not leave.
+    is_stuck: bool,
+    /// Bytes read so far when a frame was begun.
+    read_before: Vec<usize>,
+    read: usize,
+    reader: Option<Waker>,
+    writer: Option<Waker>,
 }
 
-/// A line that knows when its bytes arrived. While a piece is on its way the processor is busy: all that
-/// looks at the clock next finds it late.
-struct Script {
-    pieces: VecDeque<Piece>,
-    busy: Duration,
-    begin: Option<Instant>,
-    arrival: Option<Arrival>,
-    tells_arrival: bool,
-}
+struct Script(Rc<RefCell<Device>>);
 
 impl ErrorType for Script {
     type Error = Infallible;
@@ -50,128 +51,252 @@ impl ErrorType for Script {
 
 impl Read for Script {
     async fn read(&mut self, buf: &mut [u8]) -> Result<usize, Infallible> {
-        let Some(piece) = self.pieces.front() else { return pending().await };
-        if let Some(begin) = self.begin {
-            // Who keeps the time hears of the deadline.
-            for _ in 0..3 {
-                yield_once().await;
+        poll_fn(|cx| {
+            let mut device = self.0.borrow_mut();
+            let len = device.received.len().min(buf.len());
+            if len == 0 {
+                device.reader = Some(cx.waker().clone());
+                return Poll::Pending;
             }
-            // It arrives while something else has the processor.
-            let busy = self.busy.max(piece.after);
-            advance(busy);
-            let at = begin + piece.after;
-            self.arrival = Some(Arrival { first: at, last: at });
-            // Whoever else is due comes first.
-            yield_once().await;
-        }
-        self.begin = Some(self.arrival.map_or_else(Instant::now, |arrival| arrival.last));
-        let bytes = self.pieces.pop_front().map_or(&[][..], |piece| piece.bytes);
-        buf[..bytes.len()].copy_from_slice(bytes);
-        Ok(bytes.len())
+            device.read += len;
+            buf.iter_mut().zip(device.received.drain(..len)).for_each(|(place, byte)| *place = byte);
+            Poll::Ready(Ok(len))
+        })
+        .await
     }
-}
-
-async fn yield_once() {
-    let mut yielded = false;
-    core::future::poll_fn(move |cx| {
-        if core::mem::replace(&mut yielded, true) {
-            return Poll::Ready(());
-        }
-        cx.waker().wake_by_ref();
-        Poll::Pending
-    })
-    .await;
 }
 
 impl Write for Script {
     async fn write(&mut self, buf: &[u8]) -> Result<usize, Infallible> {
+        let mut device = self.0.borrow_mut();
+        let read = device.read;
+        device.read_before.push(read);
         Ok(buf.len())
     }
 
     async fn flush(&mut self) -> Result<(), Infallible> {
-        Ok(())
+        poll_fn(|cx| {
+            let mut device = self.0.borrow_mut();
+            if device.is_stuck {
+                device.writer = Some(cx.waker().clone());
+                return Poll::Pending;
+            }
+            Poll::Ready(Ok(()))
+        })
+        .await
     }
 }
 
-impl Line for Script {
-    fn arrival(&self) -> Option<Arrival> {
-        self.arrival.filter(|_| self.tells_arrival)
-    }
-}
+impl Line for Script {}
 
-/// One RS-485 port whose frames switch DO1.
-fn config() -> GatewayConfig {
+/// One RS-485 port, whose frames are answered when `send` says so.
+fn config(send: SendOn) -> GatewayConfig {
     let mut config = GatewayConfig::empty();
-    config.controller.dialect = heapless::String::try_from("v2.3").unwrap();
+    config.controller.address = "10.0.0.1".try_into().unwrap();
+    config.controller.dialect = "v2.3".try_into().unwrap();
     let controller = &mut config.controller;
     (controller.command_port, controller.state_port, controller.modbus_port) = (2000, 2001, 502);
-    let var = SysVar::parse("DigitalOutputCommand[1]").unwrap();
-    config.fields.push(FieldSpec::System(var)).unwrap();
+    let (ty, to, from) = (ScalarType::Byte, InputBinding::Unused, OutputBinding::Constant(7.0));
+    config.fields.extend([FieldSpec::UserInput { ty, to }, FieldSpec::UserOutput { ty, from }]);
     let delimiter = |bytes: &[u8]| Delimiter::from_slice(bytes).unwrap();
-    let fields = Span { start: 0, len: 1 };
-    let input = StreamPart { head: delimiter(&FRAME[..2]), tail: delimiter(&FRAME[3..]), fields };
-    let parts = Parts::Stream { input: Some(input), output: None };
+    let part = |start| StreamPart {
+        head: delimiter(&FRAME[..2]),
+        tail: delimiter(&FRAME[3..]),
+        fields: Span { start, len: 1 },
+    };
+    let parts = Parts::Stream { input: Some(part(0)), output: Some(part(1)) };
     let name = Name::try_from("a").unwrap();
-    let (on_stale, send) = (OnStale::Hold, SendOn::Period);
-    config.recipes.push(Recipe { name: name.clone(), mode: Mode::Realtime, parts, on_stale, send }).unwrap();
+    let (mode, on_stale) = (Mode::User, OnStale::Hold);
+    config.recipes.push(Recipe { name: name.clone(), mode, parts, on_stale, send }).unwrap();
     let line = Rs485 {
-        baud: 115_200,
+        baud: BAUD,
         parity: Parity::None,
         stop_bits: 1,
         idle_gap: CoreDuration::from_micros(IDLE_GAP.as_micros()),
         turnaround: CoreDuration::ZERO,
     };
-    let second = CoreDuration::from_secs(1);
-    let (cycle, timeout, stale_after) = (second, second, second);
-    let on_timeout = Span { start: 0, len: 0 };
+    let cycle = CoreDuration::from_millis(400);
+    let timeout = CoreDuration::from_micros(TIMEOUT.as_micros());
+    let on_timeout = Span::default();
+    let stale_after = CoreDuration::from_secs(1);
     let port = Port { name, bus: Bus::Rs485(line), recipe: 0, cycle, timeout, on_timeout, stale_after };
     config.ports.push(port).unwrap();
+    config.validate().unwrap();
     config
 }
 
-/// What the engine counted of a line on which this happened.
-fn counted(tells_arrival: bool, pieces: impl Into<VecDeque<Piece>>) -> PortCounters {
-    let _clock = Clock::take();
-    let mut gateway = Box::new(Gateway::idle());
-    gateway.configure(&config()).unwrap();
-    let pieces = pieces.into();
-    let bytes: usize = pieces.iter().map(|piece| piece.bytes.len()).sum();
-    let line = Script { pieces, busy: IDLE_GAP * 3, begin: None, arrival: None, tells_arrival };
-    let watch = Watch::<2>::new();
-    let pulses = [TaskName::Engine, TaskName::Serial(PortId(0))].map(|name| watch.register(name).unwrap());
-    let counters = || {
-        let mut found = PortCounters::default();
-        gateway.report(|_| {}, |_, counters| found = *counters);
-        found
-    };
-    let all_told = core::future::poll_fn(|cx| {
-        if counters().bytes_in as usize == bytes {
-            return Poll::Ready(());
-        }
-        cx.waker().wake_by_ref();
-        Poll::Pending
-    });
-    let tasks = join(gateway.keep_time(pulses[0]), run(&gateway, pulses[1], PortId(0), line, 115_200));
-    block_on(select(pin!(tasks), all_told));
-    counters()
+/// The port, its task and the engine's.
+struct Bench {
+    gateway: &'static Gateway,
+    device: Rc<RefCell<Device>>,
+    executor: Executor<'static>,
+    _clock: Clock,
 }
 
-#[test]
-fn bytes_that_wait_for_a_busy_processor_do_not_make_a_silence() {
-    for tells_arrival in [false, true] {
-        let frame = [(Duration::MIN, 0..3), (Duration::from_millis(1), 3..5)];
-        let pieces = frame.map(|(after, part)| Piece { after, bytes: &FRAME[part] });
-        let counters = counted(tells_arrival, pieces);
-        assert_eq!((counters.frames_in, counters.discarded_bytes, counters.resync_bytes), (1, 0, 0));
+impl Bench {
+    fn new(order: Order, send: SendOn, baud: u32) -> Self {
+        let device = Rc::new(RefCell::new(Device::default()));
+        Self::with_line(order, send, baud, Script(Rc::clone(&device)), device)
+    }
+
+    fn with_line(
+        order: Order,
+        send: SendOn,
+        baud: u32,
+        line: impl Line + 'static,
+        device: Rc<RefCell<Device>>,
+    ) -> Self {
+        let clock = Clock::take();
+        let gateway = Box::leak(Box::new(Gateway::idle()));
+        gateway.configure(&config(send)).unwrap();
+        let gateway: &'static Gateway = gateway;
+        let watch: &'static Watch<2> = Box::leak(Box::new(Watch::new()));
+        let pulses = [TaskName::Engine, TaskName::Serial(PORT)].map(|name| watch.register(name).unwrap());
+        let mut executor = Executor::new(order);
+        executor.spawn(gateway.keep_time(pulses[0]));
+        executor.spawn(run(gateway, pulses[1], PORT, line, baud));
+        // The engine takes an instant of 0 for none.
+        advance(Duration::from_millis(1));
+        Self { gateway, device, executor, _clock: clock }
+    }
+
+    /// Bytes arrive; nobody has the time to look yet.
+    fn arrive(&self, bytes: impl IntoIterator<Item = u8>) {
+        let mut device = self.device.borrow_mut();
+        device.received.extend(bytes);
+        device.reader.take().inspect(Waker::wake_by_ref);
+    }
+
+    /// What was sent leaves, or does not.
+    fn stick(&self, is_stuck: bool) {
+        let mut device = self.device.borrow_mut();
+        device.is_stuck = is_stuck;
+        device.writer.take().inspect(Waker::wake_by_ref);
+    }
+
+    /// Until the next frame is sent.
+    fn wait_until_it_sends(&mut self) {
+        let before = self.device.borrow().read_before.len();
+        for _ in 0..500 {
+            if self.device.borrow().read_before.len() > before {
+                return;
+            }
+            self.wait(Duration::from_millis(1));
+        }
+        panic!("it sends nothing");
+    }
+
+    fn wait(&mut self, time: Duration) {
+        advance(time);
+        self.executor.settle();
+    }
+
+    fn counters(&self) -> PortCounters {
+        let mut found = None;
+        self.gateway.report(|_| {}, |_, counters| found = Some(*counters));
+        found.unwrap()
     }
 }
 
 #[test]
-fn a_silence_ends_a_frame_even_when_nobody_looked() {
-    let frame = [(Duration::MIN, 0..3), (IDLE_GAP * 2, 3..5), (Duration::from_millis(1), 0..5)];
-    let pieces = frame.map(|(after, part)| Piece { after, bytes: &FRAME[part] });
-    let counters = counted(true, pieces);
-    assert_eq!((counters.frames_in, counters.discarded_bytes, counters.resync_bytes), (1, 3, 2));
+fn bytes_that_wait_for_a_busy_processor_do_not_make_a_silence() {
+    for order in Order::ALL {
+        let mut bench = Bench::new(order, SendOn::Period, BAUD);
+        bench.arrive(FRAME[..3].iter().copied());
+        bench.wait(Duration::from_millis(1));
+        bench.arrive(FRAME[3..].iter().copied());
+        bench.wait(IDLE_GAP * 2);
+        let counters = bench.counters();
+        assert_eq!((counters.frames_in, counters.discarded_bytes, counters.resync_bytes), (1, 0, 0));
+        // And a silence is one.
+        bench.arrive(FRAME[..3].iter().copied());
+        bench.wait(Duration::from_millis(1));
+        bench.wait(IDLE_GAP * 2);
+        assert_eq!(bench.counters().discarded_bytes, 3);
+    }
+}
+
+#[test]
+fn all_that_waits_in_a_device_is_heard_before_a_frame_is_overdue() {
+    for order in Order::ALL {
+        let mut bench = Bench::new(order, SendOn::Period, BAUD);
+        bench.arrive(FRAME);
+        bench.wait(Duration::from_millis(1));
+        assert_eq!(bench.counters().frames_in, 1);
+        // More than is read at once.
+        bench.arrive([0; 1_000].into_iter().chain(FRAME));
+        bench.wait(TIMEOUT * 2);
+        let counters = bench.counters();
+        assert_eq!((counters.frames_in, counters.resync_bytes, counters.timeouts), (2, 1_000, 0));
+        bench.wait(TIMEOUT * 2);
+        assert_eq!(bench.counters().timeouts, 1);
+    }
+}
+
+#[test]
+fn what_a_device_has_woken_nobody_for_is_heard_before_a_frame_is_overdue() {
+    for order in Order::ALL {
+        let mut bench = Bench::new(order, SendOn::Period, BAUD);
+        for round in 1..5 {
+            // As long as less than a quarter of its FIFO is full.
+            bench.device.borrow_mut().received.extend(FRAME);
+            bench.wait(TIMEOUT * 2);
+            let counters = bench.counters();
+            assert_eq!((counters.frames_in, counters.timeouts), (round, 0));
+        }
+    }
+}
+
+#[test]
+fn what_waits_is_heard_before_anything_is_sent() {
+    for order in Order::ALL {
+        let mut bench = Bench::new(order, SendOn::Frame, BAUD);
+        bench.wait(Duration::from_millis(1));
+        // An answer is due after the first of them.
+        bench.arrive(FRAME.into_iter().chain([0; 1_000]).chain(FRAME));
+        bench.wait(Duration::from_millis(1));
+        assert_eq!(bench.counters().frames_in, 2);
+        assert_eq!(bench.device.borrow().read_before.first(), Some(&(1_000 + 2 * FRAME.len())));
+    }
+}
+
+#[test]
+fn what_waited_while_the_processor_was_stopped_is_not_heard_of_only_when_a_frame_has_left() {
+    for order in Order::ALL {
+        // At this speed a frame takes seconds.
+        let mut bench = Bench::new(order, SendOn::Period, 10);
+        bench.stick(true);
+        bench.wait_until_it_sends();
+        // The processor is stopped, what keeps the device's bytes is not.
+        bench.arrive(FRAME);
+        bench.wait(Duration::from_secs(2));
+        let counters = bench.counters();
+        let slept = (counters.bytes_in, counters.discarded_bytes, counters.asleep, counters.frames_in);
+        assert_eq!(slept, (5, 5, 1, 0));
+        assert!(bench.device.borrow().is_stuck && counters.downs == 0, "it still sends");
+        // What comes later is heard when the frame has left.
+        bench.wait(Duration::from_millis(60));
+        bench.arrive(FRAME);
+        bench.stick(false);
+        bench.wait(Duration::from_millis(1));
+        assert_eq!(bench.counters().frames_in, 1);
+    }
+}
+
+#[test]
+fn a_line_that_takes_nothing_is_given_up_and_heard_all_the_same() {
+    for order in Order::ALL {
+        let mut bench = Bench::new(order, SendOn::Period, BAUD);
+        bench.stick(true);
+        bench.wait_until_it_sends();
+        bench.wait(Duration::from_millis(10));
+        bench.arrive(FRAME);
+        bench.wait(Duration::from_millis(20));
+        assert_eq!((bench.counters().downs, bench.counters().frames_in), (1, 1));
+        bench.arrive(FRAME);
+        bench.wait(Duration::from_millis(1));
+        assert_eq!(bench.counters().frames_in, 2);
+    }
 }
 
 /// A line that never falls silent.
@@ -204,11 +329,59 @@ impl Write for Flood<'_> {
 
 impl Line for Flood<'_> {}
 
+/// A device behind whose bytes the flood comes.
+struct FloodAndScript(Script, Rc<Cell<u32>>);
+
+impl ErrorType for FloodAndScript {
+    type Error = Infallible;
+}
+
+impl Read for FloodAndScript {
+    async fn read(&mut self, buf: &mut [u8]) -> Result<usize, Infallible> {
+        if self.1.get() > 0 { Flood(&self.1).read(buf).await } else { self.0.read(buf).await }
+    }
+}
+
+impl Write for FloodAndScript {
+    async fn write(&mut self, buf: &[u8]) -> Result<usize, Infallible> {
+        self.0.write(buf).await
+    }
+
+    async fn flush(&mut self) -> Result<(), Infallible> {
+        self.0.flush().await
+    }
+}
+
+impl Line for FloodAndScript {}
+
+#[test]
+fn a_line_that_never_falls_silent_keeps_neither_the_time_nor_what_is_to_be_sent() {
+    for order in Order::ALL {
+        let reads = Rc::new(Cell::new(0));
+        let device = Rc::new(RefCell::new(Device::default()));
+        let line = FloodAndScript(Script(Rc::clone(&device)), Rc::clone(&reads));
+        let mut bench = Bench::with_line(order, SendOn::Period, BAUD, line, device);
+        bench.arrive(FRAME);
+        bench.wait(Duration::from_millis(1));
+        assert_eq!(bench.counters().frames_in, 1);
+        reads.set(u32::MAX);
+        bench.arrive([0]);
+        advance(Duration::from_millis(400));
+        let rounds = (0..99).take_while(|_| bench.counters().timeouts == 0 && bench.executor.round()).count();
+        assert!((3..=25).contains(&rounds), "a tick in {rounds} rounds");
+        let sends =
+            |bench: &mut Bench| bench.device.borrow().read_before.is_empty() && bench.executor.round();
+        let rounds = (0..99).take_while(|_| sends(&mut bench)).count();
+        assert!(rounds <= 15, "sent after {rounds} rounds");
+        assert!(reads.get() > 0);
+    }
+}
+
 #[test]
 fn a_line_that_never_falls_silent_does_not_starve_the_other_tasks() {
     let _clock = Clock::take();
     let mut gateway = Box::new(Gateway::idle());
-    gateway.configure(&config()).unwrap();
+    gateway.configure(&config(SendOn::Period)).unwrap();
     let watch = Watch::<1>::new();
     let pulse = watch.register(TaskName::Serial(PortId(0))).unwrap();
     let reads = Cell::new(100);
@@ -254,7 +427,7 @@ impl Line for Wrong<'_> {
 fn errors_are_looked_at_once_a_second_on_a_line_where_nothing_else_is_heard() {
     let _clock = Clock::take();
     let mut gateway = Box::new(Gateway::idle());
-    gateway.configure(&config()).unwrap();
+    gateway.configure(&config(SendOn::Period)).unwrap();
     let watch = Watch::<1>::new();
     let pulse = watch.register(TaskName::Serial(PortId(0))).unwrap();
     let looks = Cell::new(0);

@@ -270,12 +270,31 @@ fn a_frame_of_any_length_is_there_after_one_character_of_silence() {
 }
 
 #[test]
-fn a_line_that_never_falls_silent_is_read_a_quarter_of_the_fifo_at_a_time() {
+fn a_line_that_never_falls_silent_wakes_its_reader_each_quarter_of_the_fifo() {
+    let mut bench = Bench::new();
+    for _ in 0..8 {
+        assert_eq!(bench.read(), []);
+        let wakes = bench.wakes();
+        bench.arrive(0..3);
+        assert_eq!(bench.wakes(), wakes);
+        bench.arrive([3]);
+        assert!(bench.wakes() > wakes);
+        assert_eq!(bench.read(), [0, 1, 2, 3]);
+    }
+}
+
+#[test]
+fn whoever_reads_has_what_interrupted_nobody_yet() {
     let mut bench = Bench::new();
     bench.arrive(0..7);
-    assert_eq!(bench.read(), [0, 1, 2, 3]);
+    assert_eq!(bench.read(), [0, 1, 2, 3, 4, 5, 6]);
     bench.arrive(7..9);
-    assert_eq!(bench.read(), [4, 5, 6, 7]);
+    assert_eq!(bench.read(), [7, 8]);
+    bench.silence();
+    assert_eq!(bench.read(), []);
+    bench.arrive(9..14);
+    bench.silence();
+    assert_eq!(bench.read(), [9, 10, 11, 12, 13]);
 }
 
 #[test]
@@ -383,19 +402,4 @@ fn what_arrives_while_sending_is_kept() {
     bench.silence();
     assert_eq!(bench.read(), (0..30).collect::<Vec<u8>>());
     assert!(bench.is_flushed());
-}
-
-#[test]
-fn arrival_is_when_the_interrupt_took_it() {
-    use embassy_time::{Duration, Instant};
-    let mut bench = Bench::new();
-    let at = |millis| Instant::from_millis(millis);
-    crate::test_clock::advance(Duration::from_millis(5));
-    bench.arrive(0..4);
-    crate::test_clock::advance(Duration::from_millis(2));
-    bench.arrive(4..6);
-    bench.silence();
-    crate::test_clock::advance(Duration::from_millis(20));
-    assert_eq!(bench.read(), [0, 1, 2, 3, 4, 5]);
-    assert_eq!(bench.line.arrival(), Some(Arrival { first: at(5), last: at(7) }));
 }

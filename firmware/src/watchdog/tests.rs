@@ -102,6 +102,7 @@ fn the_task_that_has_the_processor_is_known_by_name() {
         TaskName::Serial(port),
         TaskName::Can(port),
         TaskName::Link(LinkKind::Command),
+        TaskName::Link(LinkKind::Urgent),
         TaskName::Link(LinkKind::State),
         TaskName::Link(LinkKind::Modbus),
         TaskName::Link(LinkKind::RecipeUdp),
@@ -114,7 +115,7 @@ fn the_task_that_has_the_processor_is_known_by_name() {
         TaskName::Refused,
         TaskName::Board(3),
     ];
-    let watch = Watch::<16>::new();
+    let watch = Watch::<17>::new();
     let mut cx = Context::from_waker(Waker::noop());
     for name in names {
         let pulse = watch.register(name).unwrap();

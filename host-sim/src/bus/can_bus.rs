@@ -13,16 +13,16 @@ use proto_core::time::Instant;
 use proto_core::wire::slcan::{Channel, ChannelState};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Notify;
-use tokio::task::JoinSet;
+use tokio::task::{JoinSet, yield_now};
 use tracing::{info, warn};
 
 use super::bind::{Device, Pace};
 use super::line::accept;
 use super::peer;
-use super::port::{PortEvent, PortTx};
+use super::port::{Backlog, PortEvent, PortTx};
 use super::pty::Pty;
 use super::timer::{Timer, now};
-use super::turns::give_way;
+use super::turns::{arrival, give_way};
 use super::wire::{Crossed, Full, NodeId, Pacing, Wire};
 
 /// The bus itself; clones are the same bus.
@@ -291,12 +291,12 @@ impl CanPort {
 async fn port_node(node: &Node, tx: &PortTx, events: &mut impl FnMut(PortEvent<'_>)) {
     loop {
         tokio::select! {
-            (at, frame) = node.recv() => {
+            (_, frame) = node.recv() => {
                 tx.count(|counters| {
                     counters.frames_in += 1;
                     counters.bytes_in += frame.data().len() as u64;
                 });
-                events(PortEvent::Frame { frame, at });
+                events(PortEvent::Frame { frame });
             }
             () = tx.wake.notified() => hand_over(node, tx),
             left = node.left() => {
@@ -414,21 +414,25 @@ async fn serve(io: &impl ClientIo, node: &Node, bitrate: u32, tx: &PortTx) -> io
     let mut channel = Channel::new(bitrate);
     node.set_hears(false);
     let mut out = Vec::new();
-    let mut buf = [0; CHUNK];
+    let mut buf = [0; OLD_CHUNK];
     let mut unread = 0..0;
     let mut told_dropped = 0;
+    let (mut backlog, mut is_old) = (Backlog::default(), false);
     loop {
         // A frame waits in the bounded queue until the client has taken what is before it, and a
         // client's line until its frames before it have left.
         let room = out.len() < MAX_PENDING;
+        let most = if backlog.is_open(tx) { OLD_CHUNK } else { CHUNK };
+        let mut read = None;
         let done = tokio::select! {
             ready = io.readable(), if room && unread.is_empty() => {
-                match ready.and_then(|()| io.try_read(&mut buf)) {
+                match ready.and_then(|()| io.try_read(&mut buf[..most])) {
                     Ok(0) => Err(io::ErrorKind::UnexpectedEof.into()),
                     Ok(count) => {
                         unread = 0..count;
-                        // One read holds fewer frames than a node keeps: others take them in between.
-                        if count == CHUNK { give_way().await } else { tokio::task::yield_now().await }
+                        read = Some(count);
+                        // Taking its time on the bus a frame would be believed when it is over.
+                        is_old = backlog.has(tx, count == most) || tx.is_stale();
                         Ok(())
                     }
                     Err(error) => Err(error),
@@ -446,7 +450,7 @@ async fn serve(io: &impl ClientIo, node: &Node, bitrate: u32, tx: &PortTx) -> io
             ready = io.writable(), if !out.is_empty() => ready,
             () = tokio::time::sleep(STALE_LOOK), if io.may_be_stale() => Ok(()),
         };
-        take_lines(&mut channel, node, &buf, &mut unread, &mut out);
+        take_lines(&mut channel, node, is_old.then_some(tx), &buf, &mut unread, &mut out);
         let done = done.and_then(|()| flush(io, &mut out, tx));
         if node.dropped() != told_dropped {
             told_dropped = node.dropped();
@@ -456,22 +460,40 @@ async fn serve(io: &impl ClientIo, node: &Node, bitrate: u32, tx: &PortTx) -> io
             Err(error) if error.kind() != io::ErrorKind::WouldBlock => return error,
             _ => {}
         }
+        // One read holds fewer frames than a node keeps: others take them in between.
+        match read {
+            Some(count) if count == most && !tx.is_stale() => give_way().await,
+            Some(_) => yield_now().await,
+            None => {}
+        }
     }
 }
 
-/// Carries out a client's lines as long as the node has room for the frames in them.
-fn take_lines(channel: &mut Channel, node: &Node, buf: &[u8], unread: &mut Range<usize>, out: &mut Vec<u8>) {
+/// Carries out a client's lines as long as the node has room for the frames in them. Old frames are dropped
+/// and counted.
+fn take_lines(
+    channel: &mut Channel,
+    node: &Node,
+    old: Option<&PortTx>,
+    buf: &[u8],
+    unread: &mut Range<usize>,
+    out: &mut Vec<u8>,
+) {
     while !Range::is_empty(unread) && !node.is_full() {
         let mut bytes = &buf[unread.clone()];
         if let Some(reaction) = channel.receive(&mut bytes) {
             out.extend_from_slice(reaction.answer);
-            if let Some(frame) = reaction.frame {
+            match (reaction.frame, old) {
+                (Some(_), Some(tx)) => tx.count(|counters| counters.dropped += 1),
                 // There is room, so it is taken.
-                let _ = node.send(now(), frame);
+                (Some(frame), None) => drop(node.send(arrival(), frame)),
+                (None, _) => {}
             }
         }
         unread.start = unread.end - bytes.len();
     }
+    // Frames that nobody could look at when they came have crossed the bus meanwhile.
+    node.bus.advance(now());
     let hears = channel.state() != ChannelState::Closed;
     if node.state.deaf.get() == hears {
         node.set_hears(hears);
@@ -497,6 +519,8 @@ pub const MAX_WAITING: usize = 256;
 const MAX_CLIENTS: usize = 32;
 /// Most bytes read from a client at once.
 const CHUNK: usize = 256;
+/// The same of what waited while the process slept: of that no frames come.
+const OLD_CHUNK: usize = 4_096;
 /// Bytes made out for a client and not yet taken; beyond it frames wait in the node's queue.
 const MAX_PENDING: usize = 4_096;
 /// Between two looks for a client that went away and left bytes behind.

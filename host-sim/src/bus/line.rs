@@ -14,6 +14,7 @@ use proto_core::config::{Parity, Rs485};
 use proto_core::time::{Duration, Instant};
 use tokio::io::{AsyncRead, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
+use tokio::task::yield_now;
 use tokio_serial::{SerialPort, SerialPortBuilderExt, SerialStream};
 use tracing::{debug, info, warn};
 
@@ -21,7 +22,7 @@ use super::backoff::Backoff;
 use super::bind::{Device, HostPort, Pace};
 use super::connect::connect;
 use super::peer;
-use super::port::{PortEvent, PortTx};
+use super::port::{Backlog, PortEvent, PortTx};
 use super::pty::Pty;
 use super::timer::{Timer, now};
 use super::turns::give_way;
@@ -287,16 +288,25 @@ async fn pump(
     sender: &mut Sender,
     events: &mut impl FnMut(PortEvent<'_>),
 ) -> io::Error {
-    let mut buf = [0; CHUNK];
+    let mut buf = vec![0; OLD_CHUNK];
+    let mut backlog = Backlog::default();
     loop {
+        let most = if backlog.is_open(&sender.tx) { OLD_CHUNK } else { CHUNK };
         let done = tokio::select! {
-            read = device.receive(&mut buf) => match read {
+            read = device.receive(&mut buf[..most]) => match read {
                 Ok(0) => Err(io::ErrorKind::UnexpectedEof.into()),
                 Ok(count) => {
+                    let is_full = count == most;
                     sender.tx.count(|counters| counters.bytes_in += count as u64);
-                    events(PortEvent::Bytes(&buf[..count]));
-                    // A device that never pauses must not keep everybody else waiting.
-                    if count == CHUNK { give_way().await } else { tokio::task::yield_now().await }
+                    if backlog.has(&sender.tx, is_full) {
+                        sender.tx.count(|counters| counters.dropped += count as u64);
+                    } else {
+                        events(PortEvent::Bytes(&buf[..count]));
+                    }
+                    // A device that never pauses must not keep everybody else waiting. What is refused takes
+                    // little time, and has to be gone soon.
+                    let is_much = is_full && !sender.tx.is_stale();
+                    if is_much { give_way().await } else { yield_now().await }
                     Ok(())
                 }
                 Err(error) if error.kind() == io::ErrorKind::Interrupted => Ok(()),
@@ -442,6 +452,8 @@ fn bytes_in(line: &Rs485, time: Duration) -> usize {
 
 /// Most bytes read at once: the frames in them go through the engine before anybody else has a turn.
 const CHUNK: usize = 512;
+/// The same of what waited while the process slept.
+const OLD_CHUNK: usize = 16 * 1_024;
 /// Paced bytes closer together than this appear together, as out of a UART's FIFO.
 const CLUMP: Duration = Duration::from_micros(500);
 /// Between two looks at what a serial device still holds.

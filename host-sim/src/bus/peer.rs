@@ -1,7 +1,8 @@
-//! What every TCP connection gets that others open to us: bounds on what the system holds for it, and an
-//! end when its peer has vanished.
+//! What the system is asked to do for a TCP connection: bounds on what it holds, an end when the peer has
+//! vanished, and word of what the peer has got.
 
-use std::os::fd::AsFd;
+use std::io;
+use std::os::fd::{AsFd, AsRawFd};
 use std::time::Duration;
 
 use rustix::net::sockopt;
@@ -26,9 +27,40 @@ pub(crate) fn watch(stream: &TcpStream) {
 }
 
 /// The connection ends when its peer takes nothing of what waits for it for this long.
+///
+/// While such a limit stands, the first question of [`watch`] that is lost ends the connection too.
 pub(crate) fn give_up_after(stream: &TcpStream, patience: Duration) {
     let millis = u32::try_from(patience.as_millis()).unwrap_or(u32::MAX);
     let _ = sockopt::set_tcp_user_timeout(stream, millis);
+}
+
+/// Takes the limit of [`give_up_after`] away.
+pub(crate) fn be_patient(stream: &TcpStream) {
+    give_up_after(stream, Duration::ZERO);
+}
+
+/// However the connection ends from now on, even with this process, the peer is told by a reset and gets
+/// nothing that it had not got by then.
+///
+/// # Errors
+/// When the system refuses the option.
+pub(crate) fn abandon_at_end(stream: &TcpStream) -> io::Result<()> {
+    stream.set_zero_linger()
+}
+
+/// How many of the bytes that the system took its peer has not acknowledged (SIOCOUTQ).
+///
+/// # Errors
+/// When the system does not tell.
+pub(crate) fn unacknowledged(stream: &TcpStream) -> io::Result<usize> {
+    let mut count: libc::c_int = 0;
+    // SAFETY: the descriptor is open while `stream` is borrowed, and the call writes one int to `count`,
+    // which outlives it.
+    let done = unsafe { libc::ioctl(stream.as_raw_fd(), libc::TIOCOUTQ, &raw mut count) };
+    if done < 0 {
+        return Err(io::Error::last_os_error());
+    }
+    Ok(usize::try_from(count).unwrap_or(0))
 }
 
 /// Bytes each way.

@@ -12,7 +12,7 @@ use proto_core::config::Rs485;
 use proto_core::engine::BusState;
 use proto_core::recipe::can::CanFrame;
 use proto_core::recipe::model::CanId;
-use proto_core::time::Instant;
+use proto_core::time::{Duration, Instant};
 use serde::Serialize;
 use tokio::sync::Notify;
 
@@ -21,6 +21,7 @@ use super::can_bus::CanPort;
 use super::line::Line;
 use super::quota::Quota;
 use super::socketcan::KernelCan;
+use super::timer::now;
 
 /// What a device did.
 #[derive(Debug, PartialEq)]
@@ -35,8 +36,6 @@ pub enum PortEvent<'a> {
     Frame {
         /// The frame.
         frame: CanFrame,
-        /// When: a moment ago, or earlier when nobody looked.
-        at: Instant,
     },
     /// A CAN controller's error state changed; told after each [`PortEvent::Up`] that knows it.
     Bus(BusState),
@@ -136,9 +135,22 @@ pub struct PortTx {
     pub(super) counters: Cell<DeviceCounters>,
     /// What clients do is worth a few lines of the log.
     pub(super) complaints: Quota,
+    /// What is read before this may have waited while the process slept.
+    stale_until: Cell<Instant>,
 }
 
 impl PortTx {
+    /// This process slept until a moment ago: what waits in the device is as old as that. The port's owner
+    /// refuses everything for [`STALE`]; by then nothing old may be left behind.
+    pub fn note_sleep(&self, now: Instant) {
+        self.stale_until.set(now + STALE);
+    }
+
+    /// Whether the port's owner refuses what is read now, since it may have waited while this process slept.
+    pub(super) fn is_stale(&self) -> bool {
+        self.stale_until.get() != Instant::ZERO && now() < self.stale_until.get()
+    }
+
     /// Hands bytes over to a serial port.
     pub fn send(&self, bytes: &[u8]) {
         let mut queue = self.bytes.borrow_mut();
@@ -173,6 +185,45 @@ impl PortTx {
     }
 }
 
+/// What waited while the process slept. A peer's system may hold megabytes for a connection, more than can be
+/// read in the time in which the port's owner refuses it.
+#[derive(Debug, Default)]
+pub(super) struct Backlog {
+    /// More was there than could be read in that time.
+    is_behind: bool,
+    /// Since when no more was there than could be read at once.
+    small_since: Option<Instant>,
+}
+
+impl Backlog {
+    /// Whether what is read now may be part of it: then it may be read in greater pieces.
+    pub(super) fn is_open(&self, tx: &PortTx) -> bool {
+        self.is_behind || tx.is_stale()
+    }
+
+    /// Whether what was just read is part of it and not refused by the port's owner. `is_more` if there was
+    /// more than was read.
+    pub(super) fn has(&mut self, tx: &PortTx, is_more: bool) -> bool {
+        if tx.is_stale() {
+            self.is_behind = is_more;
+            return false;
+        }
+        if !self.is_behind {
+            return false;
+        }
+        let now = now();
+        // A peer's system may pause before it sends more of it.
+        let since = *self.small_since.get_or_insert(now);
+        if is_more {
+            self.small_since = None;
+        }
+        let is_over = !is_more && now.saturating_since(since) >= PAUSE;
+        // Who never pauses is heard again some time.
+        self.is_behind = !is_over && now.saturating_since(tx.stale_until.get()) < MOST_BACKLOG;
+        self.is_behind
+    }
+}
+
 /// What a port's device did so far.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
 pub struct DeviceCounters {
@@ -186,7 +237,8 @@ pub struct DeviceCounters {
     pub frames_out: u64,
     /// Bytes sent while nobody listened.
     pub unheard: u64,
-    /// Bytes a listener left unread for too long, and whole frames given while the queue was full.
+    /// Bytes a listener left unread for too long, whole frames given while the queue was full, and what waited
+    /// while the process slept and was read too late for the engine to refuse it.
     pub dropped: u64,
     /// Clients turned away because there was one already, or too many.
     pub refused: u64,
@@ -209,6 +261,12 @@ pub struct DeviceCounters {
     pub bus: &'static str,
 }
 
+/// For how long the engine refuses what arrives after a sleep, at least.
+pub const STALE: Duration = Duration::from_millis(50);
+/// A pause after which what comes is no part of a backlog. A peer's system may need a while to send more.
+const PAUSE: Duration = Duration::from_millis(20);
+/// However long a backlog is, after this it counts as new.
+const MOST_BACKLOG: Duration = Duration::from_secs(10);
 /// A frame of every port's recipe fits several times over; a port waits for one to leave.
 const MAX_QUEUED_BYTES: usize = 4_096;
 /// Twice the most ids of a recipe's part.

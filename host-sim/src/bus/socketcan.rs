@@ -1,7 +1,6 @@
 //! A CAN interface of the Linux kernel (docs/socketcan.md).
 //!
-//! In: frames to send, in order. Out: frames with the time of their arrival, the interface's error
-//! state, and whether it is there. Refuses to know recipes: it is told which ids matter.
+//! In: frames to send, in order. Out: frames, the interface's error state, and whether it is there. Refuses to know recipes: it is told which ids matter.
 //!
 //! A frame has left when the kernel gives it back: the interface's driver does that when the frame was
 //! on the bus, so that a bus that nobody acknowledges holds one cycle's frames and not a queue of old
@@ -13,7 +12,7 @@ mod state;
 use std::io;
 use std::os::fd::AsFd;
 use std::rc::Rc;
-use std::time::{Duration as StdDuration, SystemTime};
+use std::time::Duration as StdDuration;
 
 use proto_core::engine::BusState;
 use proto_core::recipe::can::CanFrame;
@@ -29,6 +28,7 @@ use super::backoff::Backoff;
 use super::port::{PortEvent, PortTx};
 use super::reactor::register;
 use super::timer::{Timer, now};
+use super::turns::give_way;
 
 /// A port on an interface of the kernel.
 #[derive(Debug)]
@@ -115,7 +115,6 @@ impl<'a> Attached<'a> {
         }
         socket.set_error_filter_accept_all()?;
         socket.set_recv_own_msgs(true)?;
-        socket.set_recv_timestamp(true)?;
         // As much as the system allows; what does not fit is dropped by the kernel, and counted.
         let (level, forced) = (libc::SOL_SOCKET, libc::SO_RCVBUFFORCE);
         if socket.set_socket_option_int(level, forced, RECEIVE_BUFFER).is_err() {
@@ -148,11 +147,13 @@ impl<'a> Attached<'a> {
         };
         self.enter(self.state, events);
         loop {
+            let mut left = Left::Nothing;
             let done = tokio::select! {
                 // Waiting for data alone, as the crate's own async socket does, sleeps on when the
                 // interface goes down: that is an error of the socket and no data.
                 ready = ready.ready(Interest::READABLE | Interest::ERROR) => ready.and_then(|mut ready| {
-                    if self.receive_some(events)? == Left::Nothing {
+                    left = self.receive_some(events)?;
+                    if left == Left::Nothing {
                         ready.clear_ready();
                     }
                     Ok(())
@@ -162,6 +163,9 @@ impl<'a> Attached<'a> {
             };
             if let Err(error) = done.and_then(|()| self.timer.arm(self.deadline())) {
                 return error;
+            }
+            if left == Left::Perhaps && !self.port.tx.is_stale() {
+                give_way().await;
             }
         }
     }
@@ -194,7 +198,7 @@ impl<'a> Attached<'a> {
                     counters.frames_in += 1;
                     counters.bytes_in += frame.data().len() as u64;
                 });
-                events(PortEvent::Frame { frame, at: arrival(message.at) });
+                events(PortEvent::Frame { frame });
             }
             Content::Error(frame) => {
                 tx.count(|counters| counters.error_frames += 1);
@@ -380,13 +384,6 @@ fn is_full(error: &io::Error) -> bool {
 fn has_carrier(interface: &str) -> bool {
     let told = std::fs::read_to_string(format!("/sys/class/net/{interface}/carrier"));
     told.map_or(true, |told| told.trim() != "0")
-}
-
-/// A time of arrival on the clock that cores use.
-fn arrival(at: Option<SystemTime>) -> Instant {
-    let age = at.and_then(|at| SystemTime::now().duration_since(at).ok()).unwrap_or_default();
-    let age = u64::try_from(age.as_micros()).unwrap_or(u64::MAX);
-    Instant::from_micros(now().as_micros().saturating_sub(age))
 }
 
 fn pause(pause: StdDuration) -> Duration {

@@ -53,7 +53,7 @@ impl Running {
                     PortEvent::Up => Seen::Up,
                     PortEvent::Down => Seen::Down,
                     PortEvent::Bytes(bytes) => Seen::Bytes(bytes.to_vec()),
-                    PortEvent::Frame { frame, .. } => Seen::Frame(frame),
+                    PortEvent::Frame { frame } => Seen::Frame(frame),
                     PortEvent::Bus(state) => panic!("{state:?}: no device of these tests knows it"),
                     PortEvent::Sent => Seen::Sent,
                 };

@@ -1,4 +1,7 @@
-//! The clock and its timers: CLOCK_MONOTONIC in microseconds, and `timerfd`s on absolute times.
+//! The clock and its timers: CLOCK_BOOTTIME in microseconds, and `timerfd`s on absolute times.
+//!
+//! CLOCK_BOOTTIME goes on while the machine is suspended. After that everything that waited is as old as it
+//! is, and the gap shows.
 //!
 //! tokio's own timers have slots of a millisecond and run late by more than one; a `timerfd` in the
 //! same reactor is off by tens of microseconds, which a grid of 4 ms needs.
@@ -18,7 +21,7 @@ use super::reactor::register;
 
 /// The time since boot, as every core in this process sees it.
 pub fn now() -> Instant {
-    let time = clock_gettime(ClockId::Monotonic);
+    let time = clock_gettime(ClockId::Boottime);
     let seconds = u64::try_from(time.tv_sec).unwrap_or(0);
     let nanos = u64::try_from(time.tv_nsec).unwrap_or(0);
     Instant::from_micros(seconds.saturating_mul(1_000_000).saturating_add(nanos / 1_000))
@@ -38,7 +41,7 @@ impl Timer {
     /// When the system has no descriptor left.
     pub fn new() -> io::Result<Self> {
         let flags = TimerfdFlags::NONBLOCK | TimerfdFlags::CLOEXEC;
-        let fd = timerfd_create(TimerfdClockId::Monotonic, flags)?;
+        let fd = timerfd_create(TimerfdClockId::Boottime, flags)?;
         Ok(Self { fd: register(fd)?, armed: Cell::new(Instant::NEVER) })
     }
 

@@ -42,7 +42,7 @@ mod traffic;
 mod trouble;
 
 use std::collections::BTreeMap;
-use std::net::{Ipv4Addr, SocketAddr};
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 
 use proto_core::config::{Bus, GatewayConfig};
 use proto_core::engine::{BuildError as EngineError, Engine, LinkId, LinkInfo, PortCounters, PortId};
@@ -504,7 +504,7 @@ impl Cell {
     pub fn ask(&mut self, command: &str) -> String {
         let line = format!("{command}\r\n");
         self.asked.clear();
-        self.controller_input(ControllerInput::CommandOpened { conn: DESK });
+        self.controller_input(ControllerInput::CommandOpened { conn: DESK, from: HERE });
         self.controller_input(ControllerInput::CommandBytes { conn: DESK, bytes: line.as_bytes() });
         self.run_until(Duration::from_millis(500), |cell| !cell.asked.is_empty());
         self.controller_input(ControllerInput::CommandClosed { conn: DESK });
@@ -551,9 +551,11 @@ fn target(name: &str) -> InitialTarget {
 /// The gateway's address for the controller's UDP server: a new one with each opening, as a new
 /// socket has.
 fn udp_peer(turn: u64) -> SocketAddr {
-    (Ipv4Addr::LOCALHOST, 40_000 + (turn % 10_000) as u16).into()
+    (HERE, 40_000 + (turn % 10_000) as u16).into()
 }
 
+/// Where every client of the controller is.
+const HERE: IpAddr = IpAddr::V4(Ipv4Addr::LOCALHOST);
 /// The connection of [`Cell::ask`].
 const DESK: ConnId = ConnId(u64::MAX);
 /// Not zero, so that nothing depends on the clock's origin, and on no grid of the engine.

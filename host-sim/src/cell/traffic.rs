@@ -7,7 +7,7 @@ use proto_core::engine::{Input, LinkId, LinkKind};
 
 use super::drive::Due;
 use super::network::{Arrived, Connection, Door, Item, Peer, Way};
-use super::{CLIENT_RETRY, Cell, End, Owner, What, udp_peer};
+use super::{CLIENT_RETRY, Cell, End, HERE, Owner, What, udp_peer};
 use crate::controller::{ConnId, ControllerInput, Link};
 
 impl Cell {
@@ -226,9 +226,9 @@ impl Cell {
             self.send_item(id, Way::Down, Item::Opened);
         }
         self.controller_input(match peer {
-            Peer::Server(Link::Command) => ControllerInput::CommandOpened { conn },
-            Peer::Server(Link::State) => ControllerInput::StateOpened { conn },
-            Peer::Server(Link::Modbus) => ControllerInput::ModbusOpened { conn },
+            Peer::Server(Link::Command) => ControllerInput::CommandOpened { conn, from: HERE },
+            Peer::Server(Link::State) => ControllerInput::StateOpened { conn, from: HERE },
+            Peer::Server(Link::Modbus) => ControllerInput::ModbusOpened { conn, from: HERE },
             Peer::Client(port) => ControllerInput::PortUp { port },
         });
     }

@@ -8,7 +8,7 @@ mod sim;
 mod target;
 
 pub use sim::{
-    AnalogInput, BitGroup, Initial, InitialTarget, Listen, Power, Robot, RobotMode, SimBus, SimCanFrame,
-    SimConfig, SimField, SimParts, SimPort, SimProgram, SimRecipe, SimStreamPart,
+    AnalogInput, BitGroup, CommandClients, Initial, InitialTarget, Listen, Power, Robot, RobotMode, SimBus,
+    SimCanFrame, SimConfig, SimField, SimParts, SimPort, SimProgram, SimRecipe, SimStreamPart,
 };
 pub use target::TargetError;

@@ -56,11 +56,18 @@ pub struct Robot {
     pub power: Power,
     /// Operation mode.
     pub mode: RobotMode,
+    /// How many clients port 2000 takes.
+    pub command_clients: CommandClients,
 }
 
 impl Default for Robot {
     fn default() -> Self {
-        Self { dialect: "v2.3".to_owned(), power: Power::Enabled, mode: RobotMode::Remote }
+        Self {
+            dialect: "v2.3".to_owned(),
+            power: Power::Enabled,
+            mode: RobotMode::Remote,
+            command_clients: CommandClients::Many,
+        }
     }
 }
 
@@ -84,6 +91,18 @@ pub enum RobotMode {
     Auto,
     /// Remote.
     Remote,
+}
+
+/// What port 2000 does with clients beyond the first: controllers are not known to be alike (D26).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum CommandClients {
+    /// It takes them, up to its limit.
+    #[default]
+    Many,
+    /// While there is one, it closes every other at once.
+    RefuseSecond,
+    /// It closes the one it has when another one comes.
+    DropFirst,
 }
 
 /// One value at the start.

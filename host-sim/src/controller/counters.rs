@@ -11,8 +11,7 @@ pub struct ServerCounters {
     pub opened: u64,
     /// Connections closed at once: too many, or a test wanted it.
     pub refused: u64,
-    /// Connections closed because they had never asked for anything while another one came, and there were
-    /// too many.
+    /// Connections closed to make room for another one (docs/devices.md section 7).
     pub displaced: u64,
     /// Connections that are open.
     pub open: usize,

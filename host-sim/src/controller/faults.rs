@@ -9,7 +9,9 @@ use proto_core::wire::state::OperationMode;
 
 use super::machine::Machine;
 use super::registers::SetError;
+use super::spoiled::{NoSuchFloat, Spoiled};
 use super::{Controller, ControllerOutput, RecipeError, mode, start_values};
+pub use crate::config::CommandClients;
 use crate::config::InitialTarget;
 
 /// One of the controller's TCP servers.
@@ -28,13 +30,26 @@ pub enum Link {
 pub(super) struct Faults {
     muted: [bool; 3],
     refused: [bool; 3],
+    command_clients: CommandClients,
     delay: [Duration; 3],
     muted_ports: Vec<usize>,
     exception: Option<Exception>,
     state_cut: Option<usize>,
+    /// What commands begin takes this much longer.
+    transitions: Duration,
+    spoiled: Spoiled,
 }
 
 impl Faults {
+    /// None but what the configuration asks for.
+    pub(super) fn new(command_clients: CommandClients) -> Self {
+        Self { command_clients, ..Self::default() }
+    }
+
+    pub(super) fn command_clients(&self) -> CommandClients {
+        self.command_clients
+    }
+
     pub(super) fn mutes(&self, link: Link) -> bool {
         self.muted[link as usize]
     }
@@ -53,6 +68,10 @@ impl Faults {
 
     pub(super) fn exception(&self) -> Option<Exception> {
         self.exception
+    }
+
+    pub(super) fn spoiled(&self) -> &Spoiled {
+        &self.spoiled
     }
 
     pub(super) fn take_state_cut(&mut self) -> Option<usize> {
@@ -82,6 +101,12 @@ impl Controller {
         self.faults.refused[link as usize] = false;
     }
 
+    /// How many clients port 2000 takes from now on. Those that are there stay until the next one
+    /// comes.
+    pub fn command_clients(&mut self, clients: CommandClients) {
+        self.faults.command_clients = clients;
+    }
+
     /// The server closes every connection it has.
     pub fn disconnect(&mut self, link: Link) {
         self.server.close_link(link, &mut self.outputs);
@@ -93,6 +118,13 @@ impl Controller {
         self.faults.delay[link as usize] = delay;
     }
 
+    /// What `poweron`, `poweroff`, `enable`, `disable`, `stop` and `pause` begin takes this much
+    /// longer from now on.
+    pub fn delay_transitions(&mut self, by: Duration) {
+        self.faults.transitions = by;
+        self.machine.delay_transitions(by);
+    }
+
     /// Every Modbus request is answered with this exception and not carried out; `None` ends it.
     pub fn answer_modbus_with(&mut self, exception: Option<Exception>) {
         self.faults.exception = exception;
@@ -102,6 +134,26 @@ impl Controller {
     /// 2001 is closed.
     pub fn cut_next_state_packet(&mut self, len: usize) {
         self.faults.state_cut = Some(len);
+    }
+
+    /// State packets and the frames of recipes' output parts show this instead of the item's value,
+    /// such as NaN. Modbus and programs go on seeing the value.
+    ///
+    /// An item is a system variable such as `RobotState[8]`, an analog input such as `AI_V[1]`, or any
+    /// other float of the state packet, such as `joint_torque[1]` (docs/wire/state.md section 2).
+    ///
+    /// # Errors
+    /// [`NoSuchFloat`]; nothing changed.
+    pub fn spoil(&mut self, name: &str, instead: f32) -> Result<(), NoSuchFloat> {
+        self.faults.spoiled.spoil(name, instead)
+    }
+
+    /// They show its value again.
+    ///
+    /// # Errors
+    /// [`NoSuchFloat`].
+    pub fn heal(&mut self, name: &str) -> Result<(), NoSuchFloat> {
+        self.faults.spoiled.heal(name)
     }
 
     /// What the port sends gets lost.
@@ -124,8 +176,9 @@ impl Controller {
         }
     }
 
-    /// Switched off and on again: everything is closed, the registers start afresh, and the robot
-    /// goes through its start to power off. Faults stay as they are.
+    /// Switched off and on again: everything is closed, the registers start afresh with the
+    /// configuration's initial values and 0 everywhere else, and the robot goes through its start to
+    /// power off. Faults stay as they are.
     pub fn restart(&mut self, now: Instant) {
         self.server.close_all(&mut self.outputs);
         self.running = None;
@@ -148,6 +201,17 @@ impl Controller {
             self.arm_shown = None;
         }
         self.machine = Machine::booting(now, mode(&self.config));
+        self.machine.delay_transitions(self.faults.transitions);
+    }
+}
+
+/// A controller that has lost its memory.
+impl Controller {
+    /// [`Self::restart`], and registers and outputs are 0 whatever the configuration's initial values
+    /// are. Only what is wired to it or belongs to the arm is as it was at the start.
+    pub fn restart_cleared(&mut self, now: Instant) {
+        self.restart(now);
+        self.registers.clear();
     }
 }
 

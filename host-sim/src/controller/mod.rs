@@ -22,9 +22,10 @@ pub mod program;
 pub mod registers;
 mod run;
 mod server;
+mod spoiled;
 
 use std::collections::VecDeque;
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 
 use proto_core::recipe::CanFrame;
 use proto_core::schedule::Grid;
@@ -35,7 +36,7 @@ use proto_core::wire::state::{self, OperationMode};
 use crate::config::{InitialTarget, RobotMode, SimConfig};
 pub use counters::{Counters, ServerCounters};
 use faults::Faults;
-pub use faults::Link;
+pub use faults::{CommandClients, Link};
 use machine::Machine;
 use motion::Arm;
 use ports::Port;
@@ -44,7 +45,9 @@ use program::{Script, ScriptError, Variables};
 use registers::Registers;
 use run::Running;
 use server::Server;
-pub use server::{MAX_COMMAND_CONNECTIONS, MAX_MODBUS_CONNECTIONS, MAX_STATE_CONNECTIONS};
+pub use server::{MAX_COMMAND_CONNECTIONS, MAX_MODBUS_CONNECTIONS, MAX_ORDERS, MAX_STATE_CONNECTIONS};
+
+pub use spoiled::NoSuchFloat;
 
 /// A connection, as the shell numbers it; no two at a time have the same number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -60,6 +63,8 @@ pub enum ControllerInput<'a> {
     CommandOpened {
         /// Its connection.
         conn: ConnId,
+        /// Where it comes from.
+        from: IpAddr,
     },
     /// It sent bytes.
     CommandBytes {
@@ -77,6 +82,8 @@ pub enum ControllerInput<'a> {
     StateOpened {
         /// Its connection.
         conn: ConnId,
+        /// Where it comes from.
+        from: IpAddr,
     },
     /// It is gone.
     StateClosed {
@@ -87,6 +94,8 @@ pub enum ControllerInput<'a> {
     ModbusOpened {
         /// Its connection.
         conn: ConnId,
+        /// Where it comes from.
+        from: IpAddr,
     },
     /// It sent bytes.
     ModbusBytes {
@@ -320,7 +329,7 @@ impl Controller {
             server: Server::default(),
             state_grid: Grid::starting_at(Instant::ZERO, STATE_PERIOD),
             epoch: None,
-            faults: Faults::default(),
+            faults: Faults::new(config.robot.command_clients),
             counters: Counters::default(),
             outputs: VecDeque::new(),
             gone: false,
@@ -335,9 +344,9 @@ impl Controller {
         }
         self.advance(now);
         match input {
-            ControllerInput::CommandOpened { conn } => self.opened(now, Link::Command, conn),
-            ControllerInput::StateOpened { conn } => self.opened(now, Link::State, conn),
-            ControllerInput::ModbusOpened { conn } => self.opened(now, Link::Modbus, conn),
+            ControllerInput::CommandOpened { conn, from } => self.opened(now, Link::Command, conn, from),
+            ControllerInput::StateOpened { conn, from } => self.opened(now, Link::State, conn, from),
+            ControllerInput::ModbusOpened { conn, from } => self.opened(now, Link::Modbus, conn, from),
             ControllerInput::CommandClosed { conn } => self.closed(Link::Command, conn),
             ControllerInput::StateClosed { conn } => self.closed(Link::State, conn),
             ControllerInput::ModbusClosed { conn } => self.closed(Link::Modbus, conn),

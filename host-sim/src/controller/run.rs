@@ -37,6 +37,10 @@ enum Activity {
     Sending {
         port: usize,
     },
+    /// It has done enough for now.
+    GivingWay {
+        until: Instant,
+    },
 }
 
 impl Running {
@@ -54,7 +58,9 @@ impl Controller {
     pub(super) fn advance(&mut self, now: Instant) {
         while let Some(effect) = self.machine.poll(now) {
             self.apply(now, effect);
+            self.settle(now);
         }
+        self.settle(now);
         self.refresh(now);
         if self.running.is_some() {
             self.drive_program(now);
@@ -69,7 +75,7 @@ impl Controller {
     pub(super) fn deadline(&self) -> Instant {
         let program = self.running.as_ref().filter(|_| self.machine.program_runs()).and_then(|running| {
             match running.activity {
-                Activity::Waiting { until } => Some(until),
+                Activity::Waiting { until } | Activity::GivingWay { until } => Some(until),
                 Activity::Moving => self.arm.arrival(),
                 Activity::Fresh | Activity::Held { .. } | Activity::Sending { .. } => None,
             }
@@ -312,6 +318,13 @@ impl Controller {
                     self.begin_activity(Activity::Waiting { until })
                 }
             }
+            Call::GiveWay { until } => {
+                if now >= *until {
+                    Some(Answer::Done)
+                } else {
+                    self.begin_activity(Activity::GivingWay { until: *until })
+                }
+            }
             Call::Log(line) => {
                 tracing::info!(target: "program", "{line}");
                 if self.log.len() >= MAX_LOG {
@@ -339,8 +352,10 @@ impl Controller {
     }
 
     fn poll_ports(&mut self, now: Instant) {
+        let spoiled = self.faults.spoiled().image(self.registers.image());
+        let image = spoiled.as_ref().unwrap_or(self.registers.image());
         for (nth, port) in self.ports.iter_mut().enumerate() {
-            let outgoing = port.poll(now, self.registers.image());
+            let outgoing = port.poll(now, image);
             if self.faults.mutes_port(nth) {
                 if !outgoing.is_empty() {
                     port.sent();
@@ -361,7 +376,8 @@ impl Controller {
             return;
         }
         self.counters.missed_state_packets += missed;
-        let bytes = self.registers.packet(self.dialect.global_speed);
+        let mut bytes = self.registers.packet(self.dialect.global_speed);
+        self.faults.spoiled().put_in_packet(&mut bytes);
         if self.faults.mutes(Link::State) {
             self.counters.state.muted += 1;
             return;

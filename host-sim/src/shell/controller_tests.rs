@@ -231,6 +231,48 @@ fn one_client_too_many_is_turned_away() {
 }
 
 #[test]
+fn clients_that_asked_once_make_room_for_the_next_one() {
+    let handle = start(example("udp-server-controller.toml", &[]), Vec::new()).unwrap();
+    let mut clients: Vec<_> = (0..MAX_COMMAND_CONNECTIONS).map(|_| connect(&handle, "command")).collect();
+    for client in &mut clients {
+        ask(client, b"state\n", b"6:0:5:2");
+    }
+    let end = StdInstant::now() + PATIENCE;
+    // Turned away at first: those that are there may be about to ask again.
+    let mut stop = loop {
+        assert!(StdInstant::now() < end, "never let in");
+        ask(&mut clients[0], b"state\n", b"6:0:5:2");
+        let mut stream = connect(&handle, "command");
+        let mut reply = [0; 9];
+        if stream.write_all(b"stop\n").is_ok() && stream.read_exact(&mut reply).is_ok() {
+            assert_eq!(&reply, b"stop fail");
+            break stream;
+        }
+        std::thread::sleep(StdDuration::from_millis(50));
+    };
+    let stats = wait_for(&handle, |stats| stats["command"]["displaced"] == 1);
+    assert_eq!(stats["command"]["open"], MAX_COMMAND_CONNECTIONS);
+    assert!(is_closed(&mut clients[1]), "it asked longest ago");
+    ask(&mut clients[0], b"state\n", b"6:0:5:2");
+    ask(&mut stop, b"state\n", b"6:0:5:2");
+}
+
+#[test]
+fn port_2000_takes_as_many_clients_as_the_file_says() {
+    let config = |clients| example("udp-server-controller.toml", &[clients]);
+    let handle = start(config("robot.command_clients=one"), Vec::new()).unwrap();
+    let mut first = connect(&handle, "command");
+    ask(&mut first, b"isprogfinish\n", b"1");
+    assert!(is_closed(&mut connect(&handle, "command")));
+    ask(&mut first, b"isprogfinish\n", b"1");
+    let handle = start(config("robot.command_clients=newest"), Vec::new()).unwrap();
+    let mut first = connect(&handle, "command");
+    ask(&mut first, b"isprogfinish\n", b"1");
+    ask(&mut connect(&handle, "command"), b"isprogfinish\n", b"1");
+    assert!(is_closed(&mut first));
+}
+
+#[test]
 fn shutting_down_over_port_2000_answers_and_ends() {
     let handle = start(example("udp-server-controller.toml", &["robot.power=off"]), Vec::new()).unwrap();
     let mut command = connect(&handle, "command");

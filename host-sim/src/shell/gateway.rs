@@ -26,6 +26,7 @@ use crate::bus::peer;
 use crate::bus::port::{Port, PortBus, PortEvent, PortTx};
 use crate::bus::realtime::{self, Scheduling};
 use crate::bus::timer::{Timer, now};
+use crate::bus::turns;
 
 /// A gateway whose ports and links are there, before anything moves.
 struct Gateway {
@@ -42,8 +43,8 @@ struct Core {
     links: BTreeMap<LinkId, Rc<LinkControl>>,
     port_names: Vec<String>,
     deadline: Cell<Instant>,
-    /// The latest time that the engine was told.
-    told: Cell<Instant>,
+    /// How often the engine noticed that the gateway slept.
+    sleeps: Cell<u32>,
     deadline_moved: Notify,
 }
 
@@ -86,7 +87,7 @@ impl Gateway {
             port_names: config.ports.iter().map(|port| port.name.as_str().to_owned()).collect(),
             engine: RefCell::new(engine),
             deadline: Cell::new(Instant::NEVER),
-            told: Cell::new(Instant::ZERO),
+            sleeps: Cell::new(0),
             deadline_moved: Notify::new(),
         });
         Ok(Self { core, ports, links, ready: json!({ "ports": places }) })
@@ -107,7 +108,9 @@ impl Gateway {
             let core = Rc::clone(&shared);
             let Some(control) = core.links.get(&id).cloned() else { continue };
             tasks.spawn_local(async move {
-                link::run(kind.name(), &endpoint, &control, |event| core.link_event(id, event)).await;
+                let is_frame = |datagram: &[u8]| core.engine.borrow().is_frame(id, datagram);
+                let events = |event: LinkEvent<'_>| core.link_event(id, event);
+                link::run(kind.name(), &endpoint, &control, is_frame, events).await;
                 Ok(())
             });
         }
@@ -142,15 +145,16 @@ impl Core {
     async fn keep_time(&self) -> Result<(), StartError> {
         let clock = |error| StartError::new(format!("timerfd: {error}"));
         let timer = Timer::new().map_err(clock)?;
-        self.tell(now(), Input::Tick);
+        self.input(Input::Tick);
         loop {
             timer.arm(self.deadline.get()).map_err(clock)?;
+            turns::expect(self.deadline.get());
             tokio::select! {
                 expired = timer.expired() => {
                     expired.map_err(clock)?;
-                    // What arrived before this moment is told first: it may not be overdue.
-                    tokio::task::yield_now().await;
-                    self.tell(now(), Input::Tick);
+                    // What had arrived by the deadline is not overdue.
+                    turns::all_others().await;
+                    self.input(Input::Tick);
                 }
                 () = self.deadline_moved.notified() => {}
             }
@@ -162,7 +166,7 @@ impl Core {
             PortEvent::Up => self.input(Input::PortUp { port }),
             PortEvent::Down => self.input(Input::PortDown { port }),
             PortEvent::Bytes(bytes) => self.input(Input::PortBytes { port, bytes }),
-            PortEvent::Frame { frame, at } => self.input_at(at, Input::PortCan { port, frame }),
+            PortEvent::Frame { frame } => self.input(Input::PortCan { port, frame }),
             PortEvent::Bus(state) => self.input(Input::PortBus { port, state }),
             PortEvent::Sent => self.input(Input::PortSent { port }),
         }
@@ -174,30 +178,23 @@ impl Core {
             LinkEvent::Down => self.input(Input::LinkDown { link }),
             LinkEvent::Bytes(bytes) => self.input(Input::LinkBytes { link, bytes }),
             LinkEvent::Sent => self.input(Input::LinkSent { link }),
+            LinkEvent::Acked(left) => self.input(Input::LinkAcked { link, left }),
         }
     }
 
     /// One input, and everything that follows from it.
     fn input(&self, input: Input<'_>) {
-        self.input_at(now(), input);
-    }
-
-    /// The same, of something that happened at `at`.
-    ///
-    /// Only a tick takes the engine past a deadline: when nobody had the time to look, what is heard late
-    /// was not silent, and what else arrived before the tick has not been told yet.
-    fn input_at(&self, at: Instant, input: Input<'_>) {
-        let deadline = self.deadline.get().as_micros();
-        self.tell(at.min(Instant::from_micros(deadline.saturating_sub(1))), input);
-    }
-
-    /// At `at`, or a little later when the engine has been told a later time already.
-    fn tell(&self, at: Instant, input: Input<'_>) {
-        let at = at.max(self.told.get());
-        self.told.set(at);
+        let at = now();
         trace!(?input, "in");
         let mut engine = self.engine.borrow_mut();
         engine.handle(at, input);
+        let sleeps = engine.sleeps();
+        if self.sleeps.replace(sleeps) != sleeps {
+            warn!(sleeps, "nobody called for too long: what waited is discarded");
+            for (_, tx) in self.ports.values() {
+                tx.note_sleep(at);
+            }
+        }
         let mut buf = [0; OUTPUT_BUFFER];
         loop {
             let output = engine.poll_output(at, &mut buf);
@@ -276,7 +273,7 @@ impl Core {
                 ages.insert(var.to_string(), json!(age.as_millis()));
             }
         }
-        json!({ "ports": ports, "links": links, "age_ms": ages })
+        json!({ "ports": ports, "links": links, "age_ms": ages, "sleeps": engine.sleeps() })
     }
 }
 
@@ -344,7 +341,9 @@ async fn open_endpoint(config: &GatewayConfig, kind: LinkKind) -> Result<Endpoin
     };
     let refused = |address: &str, error| StartError::new(format!("listening on {address}: {error}"));
     Ok(match kind {
-        LinkKind::Command => Endpoint::Tcp { host: host()?, port: controller.command_port },
+        LinkKind::Command | LinkKind::Urgent => {
+            Endpoint::Tcp { host: host()?, port: controller.command_port }
+        }
         LinkKind::State => Endpoint::Tcp { host: host()?, port: controller.state_port },
         LinkKind::Modbus => Endpoint::Tcp { host: host()?, port: controller.modbus_port },
         LinkKind::RecipeUdp => {
@@ -380,48 +379,5 @@ impl Endpoint {
 }
 
 #[cfg(test)]
-mod tests {
-    use tokio::task::LocalSet;
-
-    use super::*;
-    use crate::config::file::{Text, parse_gateway};
-    use proto_core::engine::PortCounters;
-    use proto_core::time::Duration;
-
-    const IDLE_GAP: Duration = Duration::from_millis(5);
-    const PORT: PortId = PortId(0);
-
-    /// A gateway whose timer never gets a turn, and its port's counters after these pieces, each told late.
-    fn told_late(pieces: &[&[u8]]) -> PortCounters {
-        let folder = tempfile::tempdir().unwrap();
-        let toml = include_str!("../../configs/rs485-system.toml");
-        let overrides = ["port.rs485-1.idle_gap_ms=5".to_owned()];
-        let config = parse_gateway(Text { name: "rs485-system.toml", toml }, &overrides).unwrap();
-        let bind = format!("rs485-1=pty:{}", folder.path().join("line").display()).parse().unwrap();
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
-        LocalSet::new().block_on(&runtime, async move {
-            let gateway = Gateway::open(&config, &[bind]).await.unwrap();
-            let core = gateway.core;
-            core.tell(now(), Input::Tick);
-            core.port_event(PORT, PortEvent::Up);
-            for piece in pieces {
-                core.port_event(PORT, PortEvent::Bytes(piece));
-                std::thread::sleep(std::time::Duration::from_micros(2 * IDLE_GAP.as_micros()));
-            }
-            let engine = core.engine.borrow();
-            *engine.port_counters(PORT).unwrap()
-        })
-    }
-
-    #[test]
-    fn bytes_that_are_told_late_do_not_make_a_silence() {
-        let counters = told_late(&[&[0xFF, 0xFF, 1], &[0xEE, 0xEE]]);
-        assert_eq!((counters.frames_in, counters.discarded_bytes, counters.resync_bytes), (1, 0, 0));
-    }
-
-    #[test]
-    fn a_frame_behind_a_part_of_one_is_found() {
-        let counters = told_late(&[&[0xFF, 0xFF, 1], &[0xFF, 0xFF, 1, 0xEE, 0xEE]]);
-        assert_eq!((counters.frames_in, counters.resync_bytes), (1, 3));
-    }
-}
+#[path = "gateway_tests.rs"]
+mod tests;

@@ -1,46 +1,49 @@
 //! Links against real sockets that do what controllers do.
 
 use std::rc::Rc;
-use std::time::Duration;
 
-use tokio::net::TcpSocket;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::{TcpSocket, TcpStream};
 use tokio::task::{JoinHandle, LocalSet, spawn_local};
 
 use super::*;
 
 /// A link's event, to be kept.
 #[derive(Debug, Clone, PartialEq)]
-enum Seen {
+pub(super) enum Seen {
     Up,
     Down,
     Bytes(Vec<u8>),
     Sent,
+    Acked(u32),
 }
 
 /// A link under way, in the place of the engine.
-struct Running {
-    control: Rc<LinkControl>,
-    seen: Rc<Log>,
+pub(super) struct Running {
+    pub(super) control: Rc<LinkControl>,
+    pub(super) seen: Rc<Log>,
     task: JoinHandle<()>,
 }
 
 #[derive(Default)]
-struct Log {
-    events: RefCell<VecDeque<Seen>>,
+pub(super) struct Log {
+    pub(super) events: RefCell<VecDeque<Seen>>,
     wake: Notify,
 }
 
 impl Running {
-    fn start(endpoint: Endpoint) -> Self {
+    pub(super) fn start(endpoint: Endpoint) -> Self {
         let (control, seen) = (Rc::new(LinkControl::default()), Rc::new(Log::default()));
         let (own, log) = (Rc::clone(&control), Rc::clone(&seen));
         let task = spawn_local(async move {
-            run("test", &endpoint, &own, |event| {
+            let is_frame = |datagram: &[u8]| !datagram.starts_with(GARBAGE);
+            run("test", &endpoint, &own, is_frame, |event| {
                 log.events.borrow_mut().push_back(match event {
                     LinkEvent::Up => Seen::Up,
                     LinkEvent::Down => Seen::Down,
                     LinkEvent::Bytes(bytes) => Seen::Bytes(bytes.to_vec()),
                     LinkEvent::Sent => Seen::Sent,
+                    LinkEvent::Acked(left) => Seen::Acked(left),
                 });
                 log.wake.notify_one();
             })
@@ -49,7 +52,8 @@ impl Running {
         Self { control, seen, task }
     }
 
-    async fn next(&self) -> Seen {
+    /// The next event of any kind.
+    pub(super) async fn next(&self) -> Seen {
         loop {
             if let Some(event) = self.seen.events.borrow_mut().pop_front() {
                 return event;
@@ -58,10 +62,24 @@ impl Running {
         }
     }
 
+    /// The next event that says another thing than what is acknowledged: that comes when the system likes.
     #[track_caller]
-    fn expect(&self, expected: Seen) -> impl Future<Output = ()> {
+    pub(super) fn expect(&self, expected: Seen) -> impl Future<Output = ()> {
         let at = std::panic::Location::caller();
-        async move { assert_eq!(self.next().await, expected, "at {at}") }
+        async move {
+            let next = loop {
+                match self.next().await {
+                    Seen::Acked(_) => {}
+                    next => break next,
+                }
+            };
+            assert_eq!(next, expected, "at {at}");
+        }
+    }
+
+    /// Whether nothing was said but what is acknowledged.
+    pub(super) fn is_silent(&self) -> bool {
+        self.seen.events.borrow().iter().all(|event| matches!(event, Seen::Acked(_)))
     }
 }
 
@@ -71,14 +89,14 @@ impl Drop for Running {
     }
 }
 
-fn inside(test: impl AsyncFnOnce()) {
+pub(super) fn inside(test: impl AsyncFnOnce()) {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
     LocalSet::new().block_on(&runtime, async {
         tokio::time::timeout(Duration::from_secs(20), test()).await.expect("the test hangs");
     });
 }
 
-fn tcp_listen(listener: TcpListener) -> Endpoint {
+pub(super) fn tcp_listen(listener: TcpListener) -> Endpoint {
     Endpoint::TcpListen { listener, controller: "127.0.0.1".to_owned() }
 }
 
@@ -86,7 +104,7 @@ fn udp_listen(socket: UdpSocket) -> Endpoint {
     Endpoint::UdpListen { socket, controller: "127.0.0.1".to_owned() }
 }
 
-async fn server() -> (TcpListener, Endpoint) {
+pub(super) async fn server() -> (TcpListener, Endpoint) {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let at = listener.local_addr().unwrap();
     (listener, Endpoint::Tcp { host: at.ip().to_string(), port: at.port() })
@@ -115,7 +133,7 @@ fn a_tcp_link_opens_carries_and_tells_once_when_it_is_lost() {
             drop(peer);
             link.expect(Seen::Down).await;
         }
-        assert!(link.seen.events.borrow().is_empty());
+        assert!(link.is_silent());
     });
 }
 
@@ -180,7 +198,7 @@ fn a_peer_that_takes_nothing_does_not_keep_the_link_from_being_closed() {
         link.control.open();
         let (_fresh, _) = listener.accept().await.unwrap();
         link.expect(Seen::Up).await;
-        assert!(link.seen.events.borrow().is_empty());
+        assert!(link.is_silent());
         // What it has not taken by now it never gets: by then it is old.
         let ended = deaf.read_to_end(&mut Vec::new()).await;
         assert_eq!(ended.unwrap_err().kind(), io::ErrorKind::ConnectionReset);
@@ -203,8 +221,9 @@ fn a_listening_link_has_one_connection_and_takes_the_next_after_it() {
         link.expect(Seen::Bytes(b"here".to_vec())).await;
         drop(first);
         link.expect(Seen::Down).await;
-        let mut third = TcpStream::connect(at).await.unwrap();
         link.control.open();
+        tokio::task::yield_now().await;
+        let mut third = TcpStream::connect(at).await.unwrap();
         link.expect(Seen::Up).await;
         link.control.send(b"hello");
         let mut got = [0; 5];
@@ -236,7 +255,7 @@ fn a_udp_link_is_down_when_nobody_is_there() {
 }
 
 #[test]
-fn a_listening_udp_link_answers_whoever_sent_last() {
+fn a_listening_udp_link_answers_where_the_newest_frame_came_from() {
     inside(async || {
         let socket = UdpSocket::bind("127.0.0.1:0").await.unwrap();
         let at = socket.local_addr().unwrap();
@@ -254,6 +273,77 @@ fn a_listening_udp_link_answers_whoever_sent_last() {
         let mut got = [0; 32];
         let (len, _) = two.recv_from(&mut got).await.unwrap();
         assert_eq!(&got[..len], b"to the second");
+    });
+}
+
+/// How what is no frame begins.
+const GARBAGE: &[u8] = b"?";
+
+#[test]
+fn what_is_no_frame_is_told_and_does_not_take_the_answers_away() {
+    inside(async || {
+        let socket = UdpSocket::bind("127.0.0.1:0").await.unwrap();
+        let at = socket.local_addr().unwrap();
+        let link = Running::start(udp_listen(socket));
+        link.control.open();
+        let (robot, other) =
+            (UdpSocket::bind("127.0.0.1:0").await.unwrap(), UdpSocket::bind("127.0.0.1:0").await.unwrap());
+        robot.send_to(b"frame", at).await.unwrap();
+        link.expect(Seen::Up).await;
+        link.expect(Seen::Bytes(b"frame".to_vec())).await;
+        other.send_to(b"?", at).await.unwrap();
+        link.expect(Seen::Bytes(b"?".to_vec())).await;
+        link.control.send(b"to the robot");
+        link.expect(Seen::Sent).await;
+        let mut got = [0; 32];
+        let (len, _) = robot.recv_from(&mut got).await.unwrap();
+        assert_eq!(&got[..len], b"to the robot");
+    });
+}
+
+#[test]
+fn the_first_datagram_of_an_opening_is_answered_whatever_it_is() {
+    inside(async || {
+        let socket = UdpSocket::bind("127.0.0.1:0").await.unwrap();
+        let at = socket.local_addr().unwrap();
+        let link = Running::start(udp_listen(socket));
+        link.control.open();
+        let robot = UdpSocket::bind("127.0.0.1:0").await.unwrap();
+        robot.send_to(b"? hello", at).await.unwrap();
+        link.expect(Seen::Up).await;
+        link.expect(Seen::Bytes(b"? hello".to_vec())).await;
+        link.control.send(b"answer");
+        let mut got = [0; 32];
+        let (len, _) = robot.recv_from(&mut got).await.unwrap();
+        assert_eq!(&got[..len], b"answer");
+    });
+}
+
+#[test]
+fn datagrams_that_came_while_the_link_was_closed_are_never_told() {
+    inside(async || {
+        let socket = UdpSocket::bind("127.0.0.1:0").await.unwrap();
+        let at = socket.local_addr().unwrap();
+        let link = Running::start(udp_listen(socket));
+        let robot = UdpSocket::bind("127.0.0.1:0").await.unwrap();
+        // Before the first opening nothing was closed: the gateway just started.
+        robot.send_to(b"early", at).await.unwrap();
+        link.control.open();
+        link.expect(Seen::Up).await;
+        link.expect(Seen::Bytes(b"early".to_vec())).await;
+        for round in 0..20_u8 {
+            link.control.close();
+            tokio::task::yield_now().await;
+            for _ in 0..round {
+                robot.send_to(b"stale", at).await.unwrap();
+            }
+            link.control.open();
+            // What comes once the link waits for it is taken.
+            tokio::task::yield_now().await;
+            robot.send_to(&[round], at).await.unwrap();
+            link.expect(Seen::Up).await;
+            link.expect(Seen::Bytes(vec![round])).await;
+        }
     });
 }
 

@@ -1,12 +1,13 @@
 //! The simulated controller's servers and ports under attack.
 
+use std::io::{Read, Write};
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::time::Duration;
 
 use crate::attack::{self, Attack, Ports};
 use crate::process::{Process, host_sim};
-use crate::witness::Witnesses;
-use crate::{Scene, alone};
+use crate::witness::{Witnesses, connect};
+use crate::{ATTACK, QUIET, Scene, alone, in_some_stretch};
 
 const READ_WORDS: &[u8] = &[9, 9, 0, 0, 0, 6, 1, 3, 0, 0, 0, 118];
 const READ_ONE: &[u8] = &[9, 9, 0, 0, 0, 6, 1, 3, 0, 1, 0, 1];
@@ -177,4 +178,34 @@ fn a_host_that_the_controller_connects_to() {
     let (to, closes) = attack::server(b"\xFF\xFF\x02\xEE\xEE\xFF", attack::Hold::Close);
     let scene = robot_with(to);
     scene.survives(vec![closes]);
+}
+
+#[test]
+fn a_program_that_never_waits() {
+    let _alone = alone();
+    let process = controller(NOBODY);
+    let mut witnesses = Witnesses::default();
+    witnesses.udp2011(process.at("udp2011"));
+    witnesses.state(process.at("state"));
+    witnesses.asks("command", process.at("command"), b"getlasterror\n", b"0:no error\n");
+    witnesses.asks("modbus", process.at("modbus"), READ_ONE, READ_ONE_ANSWER);
+    witnesses.lap(QUIET);
+    let quiet = witnesses.lap(QUIET);
+    let mut command = connect(process.at("command"));
+    let mut ask = |request: &[u8], answer: &[u8]| {
+        command.write_all(request).unwrap();
+        let mut got = vec![0; answer.len()];
+        command.read_exact(&mut got).unwrap();
+        assert_eq!(String::from_utf8_lossy(&got), String::from_utf8_lossy(answer));
+    };
+    ask(b"run(busy.jspf)\n", b"run start");
+    in_some_stretch(|| {
+        let lap = witnesses.lap(ATTACK);
+        println!("quiet {quiet}\nbusy  {lap}");
+        lap.is_like(&quiet).and(lap.waits_at_most(Duration::from_millis(150)))
+    });
+    ask(b"state\n", b"6:2:5:2");
+    ask(b"stop\n", b"stop success");
+    drop(witnesses);
+    process.end();
 }

@@ -136,9 +136,17 @@ impl Witnesses {
         socket.connect(at).unwrap();
         socket.send(&[0xFF, 0xFF, 0x01, 0xEE, 0xEE]).unwrap();
         let mut frame = [0; 64];
-        self.watch("udp2011", PacedBy::Process, move || match socket.recv(&mut frame)? {
-            28 if frame[..2] == [0xFF, 0xFF] => Ok(()),
-            count => Err(std::io::Error::other(format!("a frame of {count} bytes"))),
+        let mut count = 0_u32;
+        self.watch("udp2011", PacedBy::Process, move || {
+            // Who is silent for a minute is forgotten.
+            count += 1;
+            if count.is_multiple_of(1_000) {
+                socket.send(&[0xFF, 0xFF, 0x01, 0xEE, 0xEE])?;
+            }
+            match socket.recv(&mut frame)? {
+                28 if frame[..2] == [0xFF, 0xFF] => Ok(()),
+                count => Err(std::io::Error::other(format!("a frame of {count} bytes"))),
+            }
         });
     }
 
@@ -225,6 +233,12 @@ impl Lap {
             *own = own.max(before.clients[name].1 / 4.0);
         }
         self
+    }
+
+    /// Whether nobody waited longer for anything; who did, if somebody did.
+    pub(crate) fn waits_at_most(&self, limit: Duration) -> Result<(), String> {
+        let late = self.clients.iter().find(|(_, (_, _, worst))| *worst > limit);
+        late.map_or(Ok(()), |(name, (_, _, worst))| Err(format!("{name} waited {worst:?}")))
     }
 
     /// Whether nothing much is missing that there was `before`; what is, if something is. What an attack must

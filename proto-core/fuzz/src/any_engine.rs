@@ -18,7 +18,11 @@ use crate::source::Source;
 const MOST: usize = 200;
 /// What all ports and links may say at one instant: each port a frame or 32 CAN frames, each link an
 /// action and a request.
-const MOST_OUTPUTS: usize = 8 * 32 + 2 * 12;
+const MOST_OUTPUTS: usize = 8 * 32 + 2 * LINKS;
+/// A configured engine is called at least so often.
+const HEARTBEAT: Duration = Duration::from_millis(250);
+/// Command, state, Modbus, UDP 2011, a listening port each, urgent.
+const LINKS: usize = 13;
 
 pub(crate) fn run(input: &[u8]) {
     let mut input = Source::new(input);
@@ -135,7 +139,14 @@ fn recipe(cell: &mut Cell, input: &mut Source<'_>) -> Option<()> {
     let kind = input.u8();
     let mode = if kind & 1 == 0 { Mode::Realtime } else { Mode::User };
     let table = if mode == Mode::User && cell.0.commands.len() < 20 {
-        cell.commands(&[(0, "stop"), (1, "run(pick.jspf,50)"), (2, "state"), (3, "getlasterror")])
+        cell.commands(&[
+            (0, "stop"),
+            (1, "run(pick.jspf,50)"),
+            (2, "state"),
+            (3, "getlasterror"),
+            (4, "pause"),
+            (5, "poweroff"),
+        ])
     } else {
         proto_core::config::Span::default()
     };
@@ -212,7 +223,7 @@ struct Driver {
     /// Whether it keeps its side of the contract.
     honest: bool,
     ports: [Port; 9],
-    links: [Link; 12],
+    links: [Link; LINKS],
     /// The newest Modbus request.
     asked: Vec<u8>,
 }
@@ -229,6 +240,8 @@ struct Link {
     up: bool,
     sending: bool,
     datagram: bool,
+    /// Bytes that the peer has not acknowledged.
+    unacknowledged: u32,
 }
 
 impl Driver {
@@ -240,14 +253,14 @@ impl Driver {
             wake: Instant::ZERO,
             honest: kind & 3 != 3,
             ports: [Port::default(); 9],
-            links: [Link::default(); 12],
+            links: [Link::default(); LINKS],
             asked: Vec::new(),
         };
         for info in driver.engine.links() {
             let datagram = matches!(info.kind, LinkKind::RecipeUdp | LinkKind::RecipeUdpListen { .. });
             driver.links[usize::from(info.id.0)].datagram = datagram;
         }
-        driver.drain(1);
+        driver.handle(Input::Tick);
         driver
     }
 
@@ -257,6 +270,11 @@ impl Driver {
         let pass = u64::from(op >> 4);
         if op.is_multiple_of(16) {
             let end = self.now + Duration::from_micros(pass * pass * pass * 300 + 1);
+            if matches!(pass, 11 | 13) {
+                // Nobody calls the engine for 0.4 s, or for 0.66 s: what comes next is told before the tick.
+                self.now = end;
+                return;
+            }
             for _ in 0..100 {
                 if self.wake > end {
                     break;
@@ -268,7 +286,7 @@ impl Driver {
             return self.handle(Input::Tick);
         }
         let id = input.u8();
-        let (port, link) = (PortId(id % 9), LinkId(id % 12));
+        let (port, link) = (PortId(id % 9), LinkId(id % LINKS as u8));
         let p = usize::from(port.0);
         let l = usize::from(link.0);
         match op % 16 {
@@ -293,10 +311,19 @@ impl Driver {
                 }
                 self.handle(Input::PortBus { port, state });
             }
-            5 | 6 if !self.honest || self.links[l].opening => {
+            5 if !self.honest || self.links[l].opening => {
                 self.links[l].opening = false;
                 self.links[l].up = true;
                 self.handle(Input::LinkUp { link });
+            }
+            6 if !self.honest || self.links[l].up && !self.links[l].datagram => {
+                let left = match pass {
+                    0..8 => 0,
+                    8 if !self.honest => u32::MAX,
+                    _ => self.links[l].unacknowledged / 8 * (pass as u32 - 7),
+                };
+                self.links[l].unacknowledged = left;
+                self.handle(Input::LinkAcked { link, left });
             }
             7 if !self.honest || self.links[l].opening || self.links[l].up => {
                 self.links[l] = Link { datagram: self.links[l].datagram, ..Link::default() };
@@ -317,10 +344,17 @@ impl Driver {
             }
             13 => self.link_bytes(LinkId::STATE, &[[0; 1460].as_slice(), &[0; 8]].concat()),
             14 => {
-                let answer: &[u8] =
-                    [b"run start", b"stop success".as_slice(), b"6:0:5:2\n", b"1f:x\n", b"script finish"]
-                        [usize::from(op >> 4) % 5];
-                self.link_bytes(LinkId::COMMAND, answer);
+                let answers: [&[u8]; 7] = [
+                    b"run start",
+                    b"stop success",
+                    b"6:0:5:2\n",
+                    b"1f:x\n",
+                    b"script finish",
+                    b"pause fail",
+                    b"poweroff success",
+                ];
+                let link = if id & 1 == 0 { LinkId::COMMAND } else { LinkId::URGENT };
+                self.link_bytes(link, answers[usize::from(op >> 4) % 7]);
             }
             15 if pass < 10 => self.modbus_answer(op),
             15 => {
@@ -395,15 +429,21 @@ impl Driver {
 
     fn handle(&mut self, input: Input<'_>) {
         self.engine.handle(self.now, input);
-        self.drain(MOST_OUTPUTS);
+        self.drain();
+        // Only a tick lets deadlines pass: before it, they may lie in the past.
+        let ticked = matches!(input, Input::Tick);
+        assert!(!ticked || self.wake > self.now, "asked to be called at once again");
     }
 
-    fn drain(&mut self, most: usize) {
+    fn drain(&mut self) {
         let mut out = [0xA5; OUTPUT_BUFFER];
-        for _ in 0..=most.max(MOST_OUTPUTS) {
+        for _ in 0..=MOST_OUTPUTS {
             match self.engine.poll_output(self.now, &mut out) {
                 Output::Sleep { until } => {
-                    assert!(until > self.now, "asked to be called at once again");
+                    assert!(
+                        until <= self.now + HEARTBEAT || self.is_idle(),
+                        "would not notice that it slept"
+                    );
                     assert!(until <= self.engine.deadline(), "would sleep through a deadline");
                     self.wake = until;
                     return;
@@ -433,10 +473,16 @@ impl Driver {
                         "nothing goes to a link that has not sent yet"
                     );
                     link.sending = true;
+                    link.unacknowledged = link.unacknowledged.wrapping_add(bytes.len() as u32);
                 }
             }
         }
         panic!("no end of outputs");
+    }
+
+    /// Without a field port there is nothing that could be late.
+    fn is_idle(&self) -> bool {
+        self.engine.field_ports().next().is_none()
     }
 
     fn sent(&mut self, port: PortId, bytes: &[u8]) {
@@ -478,7 +524,7 @@ pub(crate) fn seeds() -> Vec<Vec<u8>> {
         for port in 0..ports {
             life.extend([1, port, 0x99, port, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10]);
         }
-        for link in 0..12 {
+        for link in 0..LINKS as u8 {
             life.extend([5, link]);
         }
         life.extend([0x0D, 2, 0x90]);
@@ -510,6 +556,15 @@ pub(crate) fn seeds() -> Vec<Vec<u8>> {
             seeds.push([&[0][..], kind, &setup, &life(2)].concat());
         }
     }
+    // A stop beside a command that is not answered, before and after the gateway slept.
+    let mut stops = vec![0];
+    stops.extend(kinds[3]);
+    stops.extend([0, 0, 0]);
+    stops.extend(life(1));
+    stops.extend([
+        9, 0, 1, 9, 0, 0, 0x0E, 1, 6, 0, 6, 12, 0xB0, 9, 0, 4, 0x10, 0xD0, 9, 0, 0, 0x10, 0xF0, 9, 0, 4,
+    ]);
+    seeds.push(stops);
     // Two commands, a reply that overtakes the transport's report, the report.
     let two_commands =
         [0, 5, 0, 0x28, 0, 0, 0, 0, 0, 1, 0, 5, 0, 9, 0, 1, 9, 0, 0, 14, 0, 8, 0, 0x1E, 0, 8, 0];

@@ -7,7 +7,7 @@ use proto_core::command::{
 use proto_core::time::Instant;
 use proto_core::wire::dialect::Dialect;
 
-use crate::reference_command::{Client, Command, Heard, Server, Told};
+use crate::reference_command::{Client, Command, Heard, Server, Told, Turn};
 use crate::source::{Source, cut};
 
 /// Bytes of a connection that one input may lead to.
@@ -160,7 +160,8 @@ pub(crate) fn run_client(input: &[u8]) {
         received += 1;
         let bytes = match op % 8 {
             0 => {
-                ask(&mut client, &mut expected, now, TEXTS[usize::from(op >> 4)]);
+                let turn = if op & 8 == 0 { Turn::InTurn } else { Turn::Beside };
+                ask(&mut client, &mut expected, now, TEXTS[usize::from(op >> 4)], turn);
                 continue;
             }
             1 | 2 => REPLIES[usize::from(op >> 4)],
@@ -186,10 +187,13 @@ pub(crate) fn run_client(input: &[u8]) {
     }
 }
 
-fn ask(client: &mut CommandClient, expected: &mut Client, now: u64, text: &[u8]) {
+fn ask(client: &mut CommandClient, expected: &mut Client, now: u64, text: &[u8], turn: Turn) {
     let mut out = [0xA5; 300];
-    let busy = client.busy();
-    let started = client.start(Instant::from_micros(now), text, &Dialect::V2_6, &mut out);
+    let at = Instant::from_micros(now);
+    let (busy, started) = match turn {
+        Turn::InTurn => (client.busy(), client.start(at, text, &Dialect::V2_6, &mut out)),
+        Turn::Beside => (client.busy_beside(), client.start_beside(at, text, &Dialect::V2_6, &mut out)),
+    };
     let word = match Command::read(text) {
         Some(Command::Run { .. }) => "run",
         Some(Command::Speed(_)) => "speed",
@@ -199,12 +203,16 @@ fn ask(client: &mut CommandClient, expected: &mut Client, now: u64, text: &[u8])
     assert_eq!(started.is_ok(), !busy);
     if let Ok(len) = started {
         assert!(out[..len].starts_with(word.as_bytes()) && out[..len].ends_with(b")\r\n"));
-        expected.start(now, word);
+        match turn {
+            Turn::InTurn => expected.start(now, word),
+            Turn::Beside => expected.start_beside(now, word),
+        }
     }
 }
 
 fn hear(client: &mut CommandClient, expected: &mut Client, now: u64, chunk: &[u8]) {
-    let word = expected.waiting.as_ref().map(|(word, _)| word.clone());
+    let word = |request: &Option<(String, u64)>| request.as_ref().map(|(word, _)| word.clone());
+    let words = [word(&expected.waiting), word(&expected.beside)];
     let (mut rest, mut told) = (chunk, Vec::new());
     // What silence ends, and a timeout, take no bytes: one a text that was held.
     let mut free = 2 + 320;
@@ -219,15 +227,17 @@ fn hear(client: &mut CommandClient, expected: &mut Client, now: u64, chunk: &[u8
             ClientEvent::ScriptFinish => Told::ScriptFinish,
             ClientEvent::Unsolicited { text } => Told::Unsolicited(text.to_vec()),
             ClientEvent::Timeout => Told::Timeout,
-            ClientEvent::Reply { kind, reply, text } => {
-                reply_again(word.as_deref().expect("only a request is answered"), kind, &reply, text);
-                Told::Reply(text.to_vec())
+            ClientEvent::Reply { beside, kind, reply, text } => {
+                let word = words[usize::from(beside)].as_deref();
+                reply_again(word.expect("only a request is answered"), kind, &reply, text);
+                Told::Reply(if beside { Turn::Beside } else { Turn::InTurn }, text.to_vec())
             }
         });
     }
     assert!(rest.is_empty(), "None means that all was taken");
     assert_eq!(told, expected.receive(now, chunk));
     assert_eq!(client.busy(), expected.waiting.is_some());
+    assert_eq!(client.busy_beside(), expected.beside.is_some());
     assert_eq!(client.dropped_bytes(), expected.dropped);
     assert_eq!(client.deadline().map(Instant::as_micros), expected.deadline());
 }
@@ -303,6 +313,7 @@ pub(crate) fn server_seeds() -> Vec<Vec<u8>> {
 pub(crate) fn client_seeds() -> Vec<Vec<u8>> {
     let bytes = |bytes: &[u8]| [&[(bytes.len() as u8 - 1) << 3 | 3], bytes].concat();
     let ask = |nth: u8| nth << 4;
+    let beside = |nth: u8| nth << 4 | 8;
     let answer = |nth: u8| nth << 4 | 1;
     let mut seeds = Vec::new();
     for how in [0, 1, 70] {
@@ -340,6 +351,14 @@ pub(crate) fn client_seeds() -> Vec<Vec<u8>> {
             ]
             .concat(),
         );
+    }
+    // A stop beside each of them, its reply first, last, glued, and one that both could get.
+    for request in [1, 4, 5, 6, 7, 8, 9] {
+        for replies in [&[4, 0, 3, 6, 7][..], &[0, 4], &[11, 11], &[6, 13, 4], &[10, 4, 5], &[12, 4, 4]] {
+            let replies: Vec<u8> = replies.iter().map(|&nth| answer(nth)).collect();
+            seeds
+                .push([&[0, ask(request), beside(5)][..], &replies, &[5, 97, 7, ask(5), 5, 255, 7]].concat());
+        }
     }
     // The beginning of a reply when the time is up.
     seeds.push([&[0, ask(7)][..], &bytes(b"10"), &[5, 255, 7]].concat());

@@ -82,6 +82,8 @@ fn op(input: &mut Source<'_>) -> Op {
         },
         14 => match op >> 4 {
             0..10 => Op::Answer { newest: op & 16 == 0 },
+            10..12 => Op::Acks(op & 16 == 0),
+            12..14 => Op::Acked,
             _ => Op::Sent,
         },
         _ if op & 16 == 0 => Op::State {
@@ -89,8 +91,9 @@ fn op(input: &mut Source<'_>) -> Op {
             word: u16::from(op >> 6),
             float: input.below(4) as u16,
             good: op & 32 == 0,
+            unreadable: input.u8() & 3,
         },
-        _ => Op::Down { value: u16::from(op >> 6) },
+        _ => Op::Down { value: (op & 32 == 0).then_some(u16::from(op >> 6)) },
     }
 }
 

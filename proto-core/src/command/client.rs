@@ -11,7 +11,7 @@ use super::reply::{Match, Reply, ReplyKind, SCRIPT_FINISH, match_fixed, match_va
 use super::request::{EncodeError, Keyword, ParseError, Request};
 use super::text::{is_blank, is_terminator, trim_start};
 use crate::time::{Duration, Instant};
-use crate::wire::dialect::Dialect;
+use crate::wire::dialect::{Dialect, Parentheses, Terminator};
 
 /// Longest reply that is taken whole; the rest of a longer one is dropped and counted.
 pub const MAX_REPLY: usize = 320;
@@ -175,7 +175,8 @@ impl CommandClient {
     }
 
     /// Writes an urgent command without waiting for the reply to the one in flight. Replies are told
-    /// apart by their keywords (D26); one that both could get is the older request's.
+    /// apart by their keywords (D26); one that both could get is the older request's. Where that one is
+    /// a keyword without anything behind it, a line feed ends it first: `resumestop` is no command (D2).
     ///
     /// # Errors
     /// [`StartError`]; nothing has begun then. [`StartError::Busy`] when there is such a command
@@ -191,7 +192,16 @@ impl CommandClient {
             return Err(StartError::Busy);
         }
         let request = Request::parse_strict(text).map_err(StartError::Command)?;
-        let len = request.encode(dialect, out).map_err(StartError::Encode)?;
+        let is_open = self.waiting.is_some_and(|waiting| waiting.keyword.is_bare())
+            && (dialect.terminator, dialect.parentheses) == (Terminator::None, Parentheses::Omitted);
+        let len = match out.split_first_mut() {
+            Some((end, rest)) if is_open => {
+                let len = request.encode(dialect, rest).map_err(StartError::Encode)?;
+                *end = b'\n';
+                len.saturating_add(1)
+            }
+            _ => request.encode(dialect, out).map_err(StartError::Encode)?,
+        };
         self.beside = Some(Waiting { keyword: request.keyword(), until: now + self.timeout });
         Ok(len)
     }

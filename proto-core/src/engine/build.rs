@@ -316,6 +316,14 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             Some(_) => Some(groups.next().ok_or(too_many("groups", MAX_GROUPS))?),
             None => None,
         };
+        for (_, _, field) in config.fields_of(recipe, Direction::Output) {
+            // Shown by a port or not: it may tell whether the controller has a safe value.
+            if let (Some(var), Some(group)) = (field.variable(), group)
+                && self.store.image.group(var).is_none()
+            {
+                self.store.image.assign(var, group);
+            }
+        }
         let timings = match kind {
             // Nobody may connect for days: that is no failure.
             LinkKind::RecipeTcpListen { .. } | LinkKind::RecipeUdpListen { .. } => LinkTimings {

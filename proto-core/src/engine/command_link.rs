@@ -217,7 +217,7 @@ impl CommandLink {
                 self.strike(ports, now);
             }
             // Both were lost together: that was no verdict on the second one.
-            (LinkId::COMMAND, LinkState::Up { .. }, _) => {
+            (LinkId::COMMAND, LinkState::Up { .. }, _) | (LinkId::URGENT, _, Some(LinkState::Up { .. })) => {
                 self.struck_at = self.struck_at.filter(|&at| now.saturating_since(at) > TOGETHER);
             }
             (LinkId::COMMAND, LinkState::Opening { .. }, _) => self.was_away(now),
@@ -311,6 +311,9 @@ impl CommandLink {
                 session.supervisor.give_up(now);
                 self.lost(link, ports, now);
             }
+        }
+        // What becomes of the first may open the second at once.
+        for link in [LinkId::COMMAND, LinkId::URGENT] {
             self.supervise(link, ports, now);
         }
         while let Some(&waiting) = self.queue.front()
@@ -403,7 +406,11 @@ impl CommandLink {
         out: &mut [u8],
         times: (Instant, Instant),
     ) -> Option<usize> {
-        if link == LinkId::URGENT && self.ordinary.is_unacknowledged() {
+        let is_ordinary = |sent: Sent| !sent.keyword.is_urgent();
+        if link == LinkId::URGENT
+            && self.ordinary.is_unacknowledged()
+            && self.ordinary.in_flight.is_some_and(is_ordinary)
+        {
             // What is under way there could arrive after this and start the robot again.
             self.ordinary.supervisor.give_up(times.0);
             self.lost(LinkId::COMMAND, ports, times.0);
@@ -430,21 +437,13 @@ impl CommandLink {
             || self.ordinary.beside.is_some()
     }
 
-    /// When something happens by itself, on one connection or, of the command link, at all.
-    pub(super) fn deadline_of(&self, link: LinkId) -> Instant {
-        let session = match link {
-            LinkId::URGENT => match &self.urgent {
-                Some(session) => session,
-                None => return Instant::NEVER,
-            },
-            _ => &self.ordinary,
-        };
-        let own = session.deadline().min(session.supervisor.deadline());
-        if link == LinkId::URGENT {
-            return own;
-        }
+    /// When something happens by itself: what happens on one connection may concern the other.
+    pub(super) fn deadline(&self) -> Instant {
+        let sessions = [Some(&self.ordinary), self.urgent.as_ref()].into_iter().flatten();
+        let own = sessions.map(|session| session.deadline().min(session.supervisor.deadline()));
         let waiting = self.queue.front().map_or(Instant::NEVER, |waiting| waiting.since + COMMAND_TTL);
-        own.min(waiting).min(self.stops.deadline(|waiting| self.is_asked(waiting)))
+        let stops = self.stops.deadline(|waiting| self.is_asked(waiting));
+        own.min().unwrap_or(Instant::NEVER).min(waiting).min(stops)
     }
 
     fn session(&mut self, link: LinkId) -> Option<&mut Session> {

@@ -297,7 +297,7 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
 
     /// When something happens by itself.
     pub(super) fn deadline(&self) -> Instant {
-        let mut first = self.deadline_of(LinkId::COMMAND).min(self.deadline_of(LinkId::URGENT));
+        let mut first = self.deadline_of(LinkId::COMMAND);
         first = first.min(self.deadline_of(LinkId::STATE)).min(self.deadline_of(LinkId::MODBUS));
         for link in &self.recipes {
             first = first.min(link.deadline()).min(link.supervisor.deadline());
@@ -309,7 +309,7 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
     pub(super) fn deadline_of(&self, id: LinkId) -> Instant {
         let (own, supervisor) = match id {
             LinkId::COMMAND | LinkId::URGENT => {
-                return self.command.as_ref().map_or(Instant::NEVER, |link| link.deadline_of(id));
+                return self.command.as_ref().map_or(Instant::NEVER, CommandLink::deadline);
             }
             LinkId::STATE => match &self.state {
                 Some(link) => (Instant::NEVER, &link.supervisor),

@@ -272,10 +272,10 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     /// nothing is commanded, and every connection begins anew.
     fn wake(&mut self, now: Instant) {
         self.sleeps = self.sleeps.wrapping_add(1);
+        // Before deadlines pass: one of them may be to open a link that has been down.
+        self.links.slept(&mut self.store, &mut self.ports, now);
         self.advance(now);
         self.ports.iter_mut().for_each(FieldPort::slept);
-        self.links.slept(&mut self.store, &mut self.ports, now);
-        self.count_lost();
         self.is_deaf = true;
         self.deaf_until = now + DEAF;
         self.arm(self.deaf_until);
@@ -285,7 +285,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     fn drop_forgotten(&mut self) {
         if let Some(command) = &mut self.links.command {
             command.drop_forgotten(&mut self.ports);
-            let deadline = command.deadline_of(LinkId::COMMAND);
+            let deadline = command.deadline();
             self.arm(deadline);
         }
     }
@@ -423,7 +423,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         self.arm(self.store.deadline());
         if let Some(command) = &mut self.links.command {
             command.drop_overtaken(&mut self.ports);
-            let deadline = command.deadline_of(LinkId::COMMAND);
+            let deadline = command.deadline();
             self.arm(deadline);
         }
         self.image_changed();

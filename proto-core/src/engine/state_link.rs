@@ -72,7 +72,9 @@ impl StateLink {
                         } else {
                             // Nobody knows it: it must not be written back.
                             store.read_back.remove(var);
-                            bump(&mut self.counters.unreadable);
+                            if store.image.is_readable(var) {
+                                bump(&mut self.counters.unreadable);
+                            }
                         }
                     }
                     if store.may_confirm(now) {

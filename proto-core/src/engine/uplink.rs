@@ -144,8 +144,7 @@ impl Uplink {
             return;
         }
         store.again(&wanted);
-        let is_new = now.saturating_since(store.unconfirmed_since) < REPEAT_FAST;
-        let fast = is_new || !wanted.and(&self.shown).is_empty();
+        let fast = is_new(store, now) || !wanted.and(&self.shown).is_empty();
         self.repeat_at = now + if fast { REPEAT_EVERY } else { REPEAT_SLOWLY };
     }
 
@@ -222,8 +221,9 @@ impl Uplink {
             Some(layout) if wanted && self.is_ready(store, state, now) => {
                 let len = encode(layout, store, out)?;
                 store.taken(&self.writes);
-                if self.repeat_at == Instant::NEVER && !store.unconfirmed.and(&self.writes).is_empty() {
-                    self.repeat_at = now + REPEAT_EVERY;
+                let repeats = self.repeat_at == Instant::NEVER || is_new(store, now);
+                if repeats && !store.unconfirmed.and(&self.writes).is_empty() {
+                    self.repeat_at = self.repeat_at.min(now + REPEAT_EVERY);
                 }
                 bump(&mut self.counters.sent);
                 if self.greets() {
@@ -290,6 +290,11 @@ impl Uplink {
         out.get_mut(..len)?.fill(0);
         Some(len)
     }
+}
+
+/// Whether a safe value has only just become one that the controller is not known to have.
+fn is_new<const PORTS: usize>(store: &Store<PORTS>, now: Instant) -> bool {
+    now.saturating_since(store.unconfirmed_since) < REPEAT_FAST
 }
 
 /// Puts a frame into the image. What is not finite makes its variable unknown, the rest counts;

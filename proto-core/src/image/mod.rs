@@ -150,6 +150,11 @@ impl Image {
         }
     }
 
+    /// Whether the variable's newest value could be read, if there was one.
+    pub fn is_readable(&self, var: SysVar) -> bool {
+        !self.unreadable.contains(var)
+    }
+
     /// Whether the newest values of all these could be read.
     pub fn can_read(&self, vars: &VarSet) -> bool {
         !self.any_unreadable || !self.unreadable.meets(vars)

@@ -174,11 +174,11 @@ impl Supervisor {
         self.state = LinkState::Shared;
     }
 
-    /// The link does its own work again; it is opened at once.
+    /// The link does its own work again; it is opened after the shortest wait.
     pub fn unshare(&mut self, now: Instant) {
         if self.state == LinkState::Shared {
-            self.state = LinkState::Down { retry_at: now };
             self.backoff = self.timings.backoff_min;
+            self.state = LinkState::Down { retry_at: now + self.backoff };
         }
     }
 

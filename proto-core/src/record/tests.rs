@@ -118,7 +118,7 @@ fn what_is_no_recording_is_refused() {
         let mut engine = Engine::<1, 1, 8>::idle();
         replay(recording, &mut engine, &mut GatewayConfig::empty(), |_| {}).unwrap_err()
     };
-    assert_eq!(refused(b"RGR\x02"), ReplayError::NotARecording);
+    assert_eq!(refused(b"RGR\x01"), ReplayError::NotARecording);
     let with = |entry| [&MAGIC[..], &encoded(&[entry])].concat();
     assert_eq!(refused(&with(Entry::Input { at: AT, input: Input::Tick })), ReplayError::NoStart);
     assert_eq!(

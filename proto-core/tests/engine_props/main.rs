@@ -28,7 +28,8 @@ fn ops() -> impl Strategy<Value = Vec<Op>> {
     let noise =
         (stream, prop::collection::vec(byte, 1..12)).prop_map(|(port, bytes)| Op::Noise { port, bytes });
     let wrong = (0..12_u16, 0..9_usize, any::<bool>());
-    let state = (any::<u8>(), 0..4_u16, 0..4_u16, prop::bool::weighted(0.8));
+    let state =
+        (any::<u8>(), 0..4_u16, 0..4_u16, prop::bool::weighted(0.8), prop_oneof![3 => Just(0), 1 => 1..4_u8]);
     let op = prop_oneof![
         12 => frame,
         3 => prop::array::uniform3(0..3_u8).prop_map(|values| Op::Burst { values }),
@@ -39,7 +40,7 @@ fn ops() -> impl Strategy<Value = Vec<Op>> {
         1 => wrong.prop_map(|(id, len, remote)| Op::WrongCan { id, len, remote }),
         8 => short.clone().prop_map(Op::Wait),
         3 => long.clone().prop_map(Op::Wait),
-        1 => prop_oneof![short, long].prop_map(Op::Late),
+        3 => prop_oneof![short, long].prop_map(Op::Late),
         1 => (port, any::<bool>()).prop_map(|(port, up)| Op::Port { port, up }),
         1 => bus.prop_map(Op::Bus),
         2 => (link, prop::bool::weighted(0.7)).prop_map(|(link, yes)| Op::Reachable { link, yes }),
@@ -48,8 +49,12 @@ fn ops() -> impl Strategy<Value = Vec<Op>> {
         1 => any::<bool>().prop_map(Op::Refuse),
         1 => any::<bool>().prop_map(Op::Reports),
         2 => Just(Op::Sent),
-        5 => state.prop_map(|(outputs, word, float, good)| Op::State { outputs, word, float, good }),
-        2 => (0..4_u16).prop_map(|value| Op::Down { value }),
+        1 => any::<bool>().prop_map(Op::Acks),
+        2 => Just(Op::Acked),
+        5 => state.prop_map(|(outputs, word, float, good, unreadable)| {
+            Op::State { outputs, word, float, good, unreadable }
+        }),
+        2 => prop::option::weighted(0.8, 0..4_u16).prop_map(|value| Op::Down { value }),
     ];
     prop::collection::vec(op, 1..120)
 }
@@ -66,6 +71,8 @@ proptest! {
             test.counters_add_up()?;
         }
         test.settles()?;
+        test.counters_add_up()?;
+        test.becomes_safe()?;
         test.counters_add_up()?;
     }
 }

@@ -16,6 +16,7 @@ use super::rig::*;
 
 pub const IDLE_GAP: Duration = Duration::from_millis(50);
 pub const READ_BACK: Duration = Duration::from_millis(500);
+pub const DEAF: Duration = Duration::from_millis(50);
 pub const UDP: LinkId = LinkId::RECIPE_UDP;
 
 /// Modbus: a bit byte that becomes safe, and a word that holds.
@@ -119,6 +120,16 @@ pub struct Model {
     pub sent: BTreeMap<LinkId, u32>,
     pub port_up: [bool; 4],
     pub bus_off: bool,
+    /// Only a tick lets a deadline pass: what had not passed by the newest one still counts.
+    pub ticked: Instant,
+    pub sleeps: u32,
+    /// The gateway slept: until a tick at or after this, nothing that arrives from the field counts.
+    pub deaf_until: Option<Instant>,
+    pub asleep: [u32; 4],
+    /// What the newest state packet or frame says of a shown variable cannot be read.
+    pub bus_is_unreadable: bool,
+    pub knob_is_unreadable: bool,
+    pub unreadable: BTreeMap<LinkId, u32>,
 }
 
 pub fn timeout(port: PortId) -> Duration {
@@ -183,15 +194,41 @@ impl Model {
             sent: BTreeMap::new(),
             port_up: [true; 4],
             bus_off: false,
+            ticked: Instant::ZERO,
+            sleeps: 0,
+            deaf_until: None,
+            asleep: [0; 4],
+            bus_is_unreadable: false,
+            knob_is_unreadable: false,
+            unreadable: BTreeMap::new(),
         }
+    }
+
+    /// A tick: deadlines pass.
+    pub fn tick(&mut self, now: Instant) {
+        self.deaf_until = self.deaf_until.filter(|&until| now < until);
+        self.advance(now);
+    }
+
+    /// The gateway slept: deadlines pass, nothing of what had begun is continued.
+    pub fn slept(&mut self, now: Instant) {
+        self.sleeps += 1;
+        self.advance(now);
+        for line in self.lines.values_mut() {
+            line.dropped += line.held.len() as u32;
+            line.held.clear();
+        }
+        self.up.clear();
+        self.deaf_until = Some(now + DEAF);
     }
 
     pub fn live(&self, name: &str) -> bool {
         self.vars[name].newest_at.is_some() && (!self.vars[name].silent || safe_value(name).is_some())
     }
 
-    /// Owners that have fallen silent by `now`.
-    pub fn advance(&mut self, now: Instant) {
+    /// Owners that have fallen silent by `now`, and parts of frames that nobody completed.
+    fn advance(&mut self, now: Instant) {
+        self.ticked = now;
         for (port, names) in FRAMES {
             let overdue = self.vars[names[0]].newest_at.is_some_and(|at| now >= at + timeout(port));
             if !overdue || self.vars[names[0]].silent {
@@ -247,6 +284,11 @@ impl Model {
         let line = self.lines.entry(port).or_default();
         line.heard = Some(now);
         line.bytes += bytes.len() as u32;
+        if self.deaf_until.is_some() {
+            line.dropped += bytes.len() as u32;
+            self.asleep[usize::from(port.0)] += 1;
+            return;
+        }
         line.held.extend(bytes);
         loop {
             let held = &mut self.lines.get_mut(&port).unwrap();
@@ -275,8 +317,9 @@ impl Model {
         let until = |nth: usize| known.received.get(nth + 1).map_or(Instant::NEVER, |&(at, _)| at);
         let stood = |(nth, &(_, of)): (usize, &(Instant, u32))| of == value && Some(until(nth)) >= up;
         let safe = safe_value(name) == Some(value) && known.received.iter().enumerate().any(stood);
+        let judged = self.ticked;
         let came =
-            |&&(at, of): &&(Instant, u32)| of == value && now.saturating_since(at) <= timeout(owner(name));
+            |&&(at, of): &&(Instant, u32)| of == value && judged.saturating_since(at) <= timeout(owner(name));
         if carrier(name) == LinkId::MODBUS {
             // What came before the connection is not replayed on it.
             let fresh = known.received.iter().filter(came).any(|&(at, _)| Some(at) >= up);

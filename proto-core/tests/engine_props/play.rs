@@ -3,7 +3,7 @@
 #![allow(unreachable_pub, reason = "a module of a test binary")]
 
 use proptest::prelude::*;
-use proto_core::engine::{BusState, Input, LinkId, PortId};
+use proto_core::engine::{ASLEEP, BusState, Input, LinkId, PortId};
 use proto_core::modbus::Exception;
 use proto_core::recipe::CanFrame;
 use proto_core::recipe::model::CanId;
@@ -47,7 +47,8 @@ pub enum Op {
         remote: bool,
     },
     Wait(Duration),
-    /// Nobody calls the engine for a while.
+    /// Nobody calls the engine for a while; what comes next is told before the tick that is due. After
+    /// half a second the gateway slept.
     Late(Duration),
     Port {
         port: PortId,
@@ -69,14 +70,20 @@ pub enum Op {
     /// Ports and links report at once what was sent, or later.
     Reports(bool),
     Sent,
+    /// The controller's TCP acknowledges at once, or not.
+    Acks(bool),
+    Acked,
     State {
         outputs: u8,
         word: u16,
         float: u16,
         good: bool,
+        /// Bit 0: the pose, bit 1: the float register cannot be read.
+        unreadable: u8,
     },
+    /// What the controller's UDP server says; `None`: it cannot be read.
     Down {
-        value: u16,
+        value: Option<u16>,
     },
 }
 
@@ -84,18 +91,43 @@ pub struct Test {
     rig: Rig,
     model: Model,
     unanswered: Vec<Vec<u8>>,
+    /// Everything was taken and acknowledged at once so far.
+    prompt: bool,
 }
 
 impl Test {
     pub fn new() -> Self {
-        Self { rig: Rig::new(&cell()), model: Model::new(), unanswered: Vec::new() }
+        let mut rig = Rig::new(&cell());
+        rig.logs_ticks = true;
+        Self { rig, model: Model::new(), unanswered: Vec::new(), prompt: true }
+    }
+
+    /// Something is about to be told: did the gateway sleep?
+    fn wake(&mut self) {
+        if self.rig.now.saturating_since(self.rig.called) > ASLEEP {
+            self.model.slept(self.rig.now);
+            self.unanswered.clear();
+        }
+        self.rig.called = self.rig.now;
+    }
+
+    fn input(&mut self, input: Input<'_>) -> Result<(), TestCaseError> {
+        self.wake();
+        self.rig.input(input);
+        self.look()
+    }
+
+    fn run(&mut self, span: Duration) -> Result<(), TestCaseError> {
+        self.wake();
+        self.rig.run(span);
+        self.look()
     }
 
     /// What the engine handed over, in order.
     pub fn look(&mut self) -> Result<(), TestCaseError> {
         for (at, out) in std::mem::take(&mut self.rig.log) {
-            self.model.advance(at);
             match out {
+                Out::Tick => self.model.tick(at),
                 Out::Open(link) if self.rig.reachable.contains(&link.0) => {
                     self.model.up.insert(link, at);
                 }
@@ -126,10 +158,12 @@ impl Test {
                             self.model.shown.contains(&raw(&bytes[2..6])),
                             "{bytes:?} was never received"
                         );
+                        prop_assert!(!self.model.knob_is_unreadable, "nobody knows it");
                     }
                 }
                 Out::Can(port, frame) => {
                     prop_assert!(self.model.port_up[usize::from(port.0)] && !self.model.bus_off);
+                    prop_assert!(!self.model.bus_is_unreadable, "nobody knows it");
                     self.model.out[usize::from(port.0)] += 1;
                     prop_assert!(
                         self.model.shown.contains(&raw(frame.data())),
@@ -138,17 +172,20 @@ impl Test {
                 }
             }
         }
-        self.model.advance(self.rig.now);
         Ok(())
     }
 
     fn device(&mut self, frame: usize, payload: &[u8], piece: usize) -> Result<(), TestCaseError> {
         let (port, _) = FRAMES[frame];
         if port == BUS {
-            let id = if frame == 1 { 1 } else { 5 };
-            self.model.accept(frame, payload, self.rig.now);
-            self.rig.can(BUS, id, payload);
-            return self.look();
+            self.wake();
+            let id = CanId::Standard(if frame == 1 { 1 } else { 5 });
+            match self.model.deaf_until {
+                Some(_) => self.model.asleep[usize::from(BUS.0)] += 1,
+                None => self.model.accept(frame, payload, self.rig.now),
+            }
+            let frame = CanFrame::new(id, payload).unwrap();
+            return self.input(Input::PortCan { port, frame });
         }
         let bytes = [&[255, 255], payload, &[238, 238]].concat();
         for piece in bytes.chunks(piece) {
@@ -158,9 +195,9 @@ impl Test {
     }
 
     fn bytes(&mut self, port: PortId, bytes: &[u8]) -> Result<(), TestCaseError> {
+        self.wake();
         self.model.line(port, bytes, self.rig.now);
-        self.rig.bytes(port, bytes);
-        self.look()
+        self.input(Input::PortBytes { port, bytes })
     }
 
     pub fn apply(&mut self, op: &Op) -> Result<(), TestCaseError> {
@@ -176,8 +213,7 @@ impl Test {
             Op::Stream { nth, every, count } => {
                 for value in 0..*count {
                     self.device(*nth, &payload(FRAMES[*nth].1, [value * 7 % 3, value], true), 64)?;
-                    self.rig.run(*every);
-                    self.look()?;
+                    self.run(*every)?;
                 }
             }
             Op::Cut { nth, len } if FRAMES[*nth].0 != BUS => {
@@ -192,30 +228,37 @@ impl Test {
                 let frame =
                     if *remote { CanFrame::remote(id, *len) } else { CanFrame::new(id, &vec![1; *len]) };
                 if *remote || !right {
-                    self.model.wrong_can += 1;
-                    self.rig.input(Input::PortCan { port: BUS, frame: frame.unwrap() });
+                    self.wake();
+                    match self.model.deaf_until {
+                        Some(_) => self.model.asleep[usize::from(BUS.0)] += 1,
+                        None => self.model.wrong_can += 1,
+                    }
+                    return self.input(Input::PortCan { port: BUS, frame: frame.unwrap() });
                 }
             }
-            Op::Wait(span) => self.rig.run(*span),
+            Op::Wait(span) => return self.run(*span),
             Op::Late(span) => {
+                // What was due before is told before.
+                if self.rig.wake <= self.rig.now {
+                    self.input(Input::Tick)?;
+                }
                 self.rig.now += *span;
-                self.rig.input(Input::Tick);
             }
             Op::Port { port, up } => {
+                self.wake();
                 self.model.port_up[usize::from(port.0)] = *up;
                 if *up {
-                    self.rig.input(Input::PortUp { port: *port });
-                } else {
-                    if let Some(line) = self.model.lines.get_mut(port) {
-                        line.dropped += line.held.len() as u32;
-                        line.held.clear();
-                    }
-                    self.rig.input(Input::PortDown { port: *port });
+                    return self.input(Input::PortUp { port: *port });
                 }
+                if let Some(line) = self.model.lines.get_mut(port) {
+                    line.dropped += line.held.len() as u32;
+                    line.held.clear();
+                }
+                return self.input(Input::PortDown { port: *port });
             }
             Op::Bus(state) => {
                 self.model.bus_off = *state == BusState::BusOff;
-                self.rig.input(Input::PortBus { port: BUS, state: *state });
+                return self.input(Input::PortBus { port: BUS, state: *state });
             }
             Op::Reachable { link, yes } => {
                 if *yes {
@@ -227,7 +270,7 @@ impl Test {
                 if *link == LinkId::MODBUS {
                     self.unanswered.clear();
                 }
-                self.rig.input(Input::LinkDown { link: *link });
+                return self.input(Input::LinkDown { link: *link });
             }
             Op::Answers(yes) => {
                 self.rig.modbus_answers = *yes;
@@ -238,44 +281,78 @@ impl Test {
             Op::Answer { newest } => return self.answer(*newest),
             Op::Refuse(yes) => self.rig.map.exception = yes.then_some(Exception::DeviceBusy),
             Op::Reports(yes) => {
+                self.prompt &= *yes;
                 self.rig.reports_sent = *yes;
                 return self.report_sent();
             }
             Op::Sent => return self.report_sent(),
-            Op::State { outputs, word, float, good } => self.state(*outputs, *word, f32::from(*float), *good),
+            Op::Acks(yes) => {
+                self.prompt &= *yes;
+                self.rig.acknowledges = *yes;
+                return self.report_acked();
+            }
+            Op::Acked => return self.report_acked(),
+            Op::State { outputs, word, float, good, unreadable } => {
+                return self.state(*outputs, *word, f32::from(*float), *good, *unreadable);
+            }
             Op::Down { value } => {
-                let value = f32::from(*value) + 0.125;
+                self.wake();
+                let float = value.map_or(f32::NAN, |value| f32::from(value) + 0.125);
                 if self.model.up.contains_key(&UDP) {
-                    self.model.shown.insert(value.to_bits());
+                    self.model.knob_is_unreadable = value.is_none();
+                    match value {
+                        Some(_) => drop(self.model.shown.insert(float.to_bits())),
+                        None => *self.model.unreadable.entry(UDP).or_default() += 1,
+                    }
                 }
-                let frame = [&[255, 255][..], &value.to_le_bytes(), &[254, 254]].concat();
-                self.rig.link_bytes(UDP, &frame);
+                let frame = [&[255, 255][..], &float.to_le_bytes(), &[254, 254]].concat();
+                return self.input(Input::LinkBytes { link: UDP, bytes: &frame });
             }
         }
         self.look()
     }
 
     fn answer(&mut self, newest: bool) -> Result<(), TestCaseError> {
-        let nth = if newest { self.unanswered.len().checked_sub(1) } else { Some(0) };
-        if let Some(nth) = nth.filter(|&nth| nth < self.unanswered.len()) {
-            let request = self.unanswered.remove(nth);
-            let answer = self.rig.answer(&request);
-            self.rig.link_bytes(LinkId::MODBUS, &answer);
+        if self.unanswered.is_empty() {
+            return Ok(());
         }
-        self.look()
+        self.wake();
+        let newest = if newest { self.unanswered.len().saturating_sub(1) } else { 0 };
+        if newest >= self.unanswered.len() {
+            // It slept, and the connection with it.
+            return self.input(Input::Tick);
+        }
+        let request = self.unanswered.remove(newest);
+        let answer = self.rig.answer(&request);
+        self.input(Input::LinkBytes { link: LinkId::MODBUS, bytes: &answer })
     }
 
     fn report_sent(&mut self) -> Result<(), TestCaseError> {
         for port in [PLC, BUS, SENSOR, KNOB] {
-            self.rig.input(Input::PortSent { port });
+            self.input(Input::PortSent { port })?;
         }
         for link in [LinkId::MODBUS, UDP] {
-            self.rig.input(Input::LinkSent { link });
+            self.input(Input::LinkSent { link })?;
         }
-        self.look()
+        if self.rig.acknowledges { self.report_acked() } else { Ok(()) }
     }
 
-    fn state(&mut self, outputs: u8, word: u16, float: f32, good: bool) {
+    fn report_acked(&mut self) -> Result<(), TestCaseError> {
+        self.input(Input::LinkAcked { link: LinkId::MODBUS, left: 0 })
+    }
+
+    fn state(
+        &mut self,
+        outputs: u8,
+        word: u16,
+        float: f32,
+        good: bool,
+        unreadable: u8,
+    ) -> Result<(), TestCaseError> {
+        self.wake();
+        let nth = |bit: u8| unreadable >> bit & 1 == 1;
+        let (pose, register) =
+            (if nth(0) { f32::NAN } else { float }, if nth(1) { f32::INFINITY } else { float });
         let mut packet = vec![0; 1468];
         if !good {
             packet[..4].copy_from_slice(&f32::NAN.to_le_bytes());
@@ -283,21 +360,35 @@ impl Test {
         for bit in 0..8 {
             packet[760 + bit] = outputs >> bit & 1;
         }
-        packet[832..836].copy_from_slice(&float.to_le_bytes());
+        packet[832..836].copy_from_slice(&register.to_le_bytes());
         packet[1310..1312].copy_from_slice(&word.to_le_bytes());
-        packet[368..372].copy_from_slice(&float.to_le_bytes());
+        packet[368..372].copy_from_slice(&pose.to_le_bytes());
         if good && self.model.up.contains_key(&LinkId::STATE) {
             let now = self.rig.now;
             self.model.packet = Some(now);
-            self.model.shown.extend([float.to_bits(), 0]);
+            self.model.bus_is_unreadable = !pose.is_finite();
+            self.model.shown.insert(0);
+            let mut wrong = 0;
+            if pose.is_finite() {
+                self.model.shown.insert(pose.to_bits());
+            } else {
+                wrong += 1;
+            }
             self.model.read_back.insert(WORD32, (now, u32::from(word)));
-            for (name, value) in [(OUT2, u32::from(outputs)), (FLOAT, float.to_bits())] {
-                if !self.model.live(name) {
+            for (name, value) in [(OUT2, u32::from(outputs)), (FLOAT, register.to_bits())] {
+                if self.model.live(name) {
+                    continue;
+                }
+                if name == FLOAT && !register.is_finite() {
+                    self.model.read_back.remove(name);
+                    wrong += 1;
+                } else {
                     self.model.read_back.insert(name, (now, value));
                 }
             }
+            *self.model.unreadable.entry(LinkId::STATE).or_default() += wrong;
         }
-        self.rig.link_bytes(LinkId::STATE, &packet);
+        self.input(Input::LinkBytes { link: LinkId::STATE, bytes: &packet })
     }
 
     pub fn counters_add_up(&self) -> Result<(), TestCaseError> {
@@ -310,6 +401,7 @@ impl Test {
             prop_assert_eq!(counters.timeouts, model.timeouts[nth], "{:?} timeouts", port);
             prop_assert_eq!(counters.undelivered, model.undelivered[nth], "{:?} undelivered", port);
             prop_assert_eq!(counters.frames_out, model.out[nth], "{:?} frames out", port);
+            prop_assert_eq!(counters.asleep, model.asleep[nth], "{:?} asleep", port);
             prop_assert!(counters.withheld <= counters.frames_in);
             if port == BUS {
                 let rejected = counters.rejected_id + counters.rejected_length + counters.rejected_remote;
@@ -324,7 +416,10 @@ impl Test {
                 prop_assert_eq!(whole, frames * len + line.held.len() as u32);
             }
         }
+        prop_assert_eq!(self.rig.engine.sleeps(), model.sleeps);
         for link in self.rig.engine.links() {
+            let unreadable = model.unreadable.get(&link.id).copied().unwrap_or(0);
+            prop_assert_eq!(link.counters.unreadable, unreadable, "{:?}", link.kind);
             let up = link.history.connects - link.history.losses;
             prop_assert_eq!(up == 1, model.up.contains_key(&link.id), "{:?}", link);
             let sent = model.sent.get(&link.id).copied().unwrap_or(0);
@@ -332,6 +427,11 @@ impl Test {
             if link.id == LinkId::MODBUS {
                 let ended = link.counters.received + link.counters.timeouts;
                 prop_assert!(ended <= sent && sent <= ended + 1 + link.history.losses, "{link:?}");
+                let reset = link.counters.unacknowledged;
+                prop_assert!(reset <= link.counters.timeouts.min(link.history.losses), "{link:?}");
+                prop_assert!(reset == 0 || !self.prompt, "{link:?}");
+            } else {
+                prop_assert_eq!(link.counters.unacknowledged, 0, "{:?}", link.kind);
             }
         }
         Ok(())
@@ -348,7 +448,7 @@ impl Test {
     pub fn settles(&mut self) -> Result<(), TestCaseError> {
         self.rig.reachable = (0..16).collect();
         self.rig.map.exception = None;
-        for op in [Op::Reports(true), Op::Answers(true), Op::Bus(BusState::Active)] {
+        for op in [Op::Reports(true), Op::Acks(true), Op::Answers(true), Op::Bus(BusState::Active)] {
             self.apply(&op)?;
         }
         for port in [PLC, BUS, SENSOR, KNOB] {
@@ -356,10 +456,10 @@ impl Test {
         }
         // Longer than the longest wait of a link, with the controller talking.
         for _ in 0..120 {
-            self.apply(&Op::State { outputs: 0, word: 7, float: 0, good: true })?;
+            self.state(0, 7, 0.0, true, 0)?;
             self.apply(&Op::Wait(MS(50)))?;
         }
-        self.apply(&Op::State { outputs: 0, word: 7, float: 0, good: true })?;
+        self.state(0, 7, 0.0, true, 0)?;
         self.all_send(0xA0)?;
         self.model.vars.values_mut().for_each(|known| known.steps.clear());
         // The controller takes its time.
@@ -384,6 +484,33 @@ impl Test {
             let newest = known.received.last().map(|newest| newest.1);
             prop_assert_eq!(known.last_written, newest, "{} is up to date", name);
         }
+        Ok(())
+    }
+
+    /// All devices fall silent: the safe values arrive, and are repeated until the controller shows
+    /// them.
+    pub fn becomes_safe(&mut self) -> Result<(), TestCaseError> {
+        let frames = |test: &Self| test.model.sent.get(&UDP).copied().unwrap_or(0);
+        for _ in 0..40 {
+            self.state(0, 7, 0.0, true, 0)?;
+            self.run(MS(50))?;
+        }
+        for (name, safe) in [(OUT1, SAFE_OUT1), (FLOAT, SAFE_FLOAT.to_bits())] {
+            prop_assert_eq!(self.model.vars[name].last_written, Some(safe), "{} is safe", name);
+        }
+        let before = frames(self);
+        self.run(MS(100))?;
+        prop_assert_eq!(frames(self), before + 25, "every 4 ms");
+        self.state(0, 7, SAFE_FLOAT, true, 0)?;
+        self.run(MS(4))?;
+        let before = frames(self);
+        self.run(MS(100))?;
+        prop_assert_eq!(frames(self), before, "the controller has it");
+        self.apply(&Op::Reachable { link: LinkId::STATE, yes: true })?;
+        self.run(MS(6_000))?;
+        self.state(0, 7, 0.0, true, 0)?;
+        self.run(MS(10))?;
+        prop_assert!(frames(self) > before, "the controller was away");
         Ok(())
     }
 }

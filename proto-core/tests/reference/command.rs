@@ -189,10 +189,17 @@ impl Server {
 /// What a client is told.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Told {
-    Reply(Vec<u8>),
+    /// To the request that waits in turn, or to the one beside it.
+    Reply(Turn, Vec<u8>),
     ScriptFinish,
     Unsolicited(Vec<u8>),
     Timeout,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Turn {
+    InTurn,
+    Beside,
 }
 
 /// What stands at the front of received bytes.
@@ -211,6 +218,8 @@ pub struct Client {
     bytes: Vec<u8>,
     /// The keyword that is waited for, and until when.
     pub waiting: Option<(String, u64)>,
+    /// The same of an urgent request that was not kept waiting.
+    pub beside: Option<(String, u64)>,
     dropping: bool,
     newest: u64,
     pub dropped: u32,
@@ -218,10 +227,19 @@ pub struct Client {
 
 impl Client {
     pub fn start(&mut self, now: u64, word: &str) {
-        if !b"script finish".starts_with(&self.bytes) {
+        if self.beside.is_none() && !b"script finish".starts_with(&self.bytes) {
             self.bytes.clear();
         }
         self.waiting = Some((word.to_owned(), now + 10_000_000));
+    }
+
+    pub fn start_beside(&mut self, now: u64, word: &str) {
+        self.beside = Some((word.to_owned(), now + 10_000_000));
+    }
+
+    /// When the older one is given up.
+    fn until(&self) -> Option<u64> {
+        [&self.waiting, &self.beside].into_iter().flatten().map(|(_, until)| *until).min()
     }
 
     pub fn abort(&mut self) {
@@ -230,8 +248,7 @@ impl Client {
 
     pub fn deadline(&self) -> Option<u64> {
         let silence = self.silence().map(|gap| self.newest + gap);
-        let timeout = self.waiting.as_ref().map(|(_, until)| *until);
-        silence.into_iter().chain(timeout).min()
+        silence.into_iter().chain(self.until()).min()
     }
 
     /// How much silence ends what is there.
@@ -258,8 +275,8 @@ impl Client {
             self.bytes.push(byte);
             self.settle(now, &mut told);
         }
-        if self.waiting.as_ref().is_some_and(|(_, until)| now >= *until) {
-            self.waiting = None;
+        if self.until().is_some_and(|until| now >= until) {
+            (self.waiting, self.beside) = (None, None);
             told.push(Told::Timeout);
             // What was the beginning of a reply is now a text that nobody asked for.
             self.settle(now, &mut told);
@@ -301,15 +318,19 @@ impl Client {
             len = glued.unwrap_or(len);
         }
         let text: Vec<u8> = self.bytes.drain(..len).collect();
-        let answers = match (&front, &self.waiting) {
-            (Front::Other, _) | (_, None) => false,
-            (_, Some((word, _))) => answers(word, &text),
+        // What answers both is the answer to the one in turn.
+        let is_reply = !matches!(front, Front::Other);
+        let answers = |request: &Option<(String, u64)>| {
+            is_reply && request.as_ref().is_some_and(|(word, _)| answers(word, &text))
         };
         told.push(if text == b"script finish" {
             Told::ScriptFinish
-        } else if answers {
+        } else if answers(&self.waiting) {
             self.waiting = None;
-            Told::Reply(text)
+            Told::Reply(Turn::InTurn, text)
+        } else if answers(&self.beside) {
+            self.beside = None;
+            Told::Reply(Turn::Beside, text)
         } else {
             Told::Unsolicited(text)
         });

@@ -5,7 +5,9 @@ use std::collections::BTreeSet;
 
 use heapless::{String, Vec as Bounded};
 use proto_core::config::*;
-use proto_core::engine::{Engine, Input, LinkId, OUTPUT_BUFFER, Output, PortCounters, PortId};
+use proto_core::engine::{
+    Engine, Input, LinkId, LinkInfo, LinkKind, OUTPUT_BUFFER, Output, PortCounters, PortId,
+};
 use proto_core::modbus::adu::MAX_ADU;
 use proto_core::modbus::server::{RegisterBank, Server};
 use proto_core::modbus::{Coils, Exception, Registers};
@@ -226,14 +228,20 @@ pub enum Out {
     Open(LinkId),
     Close(LinkId),
     Link(LinkId, Vec<u8>),
+    /// Nothing: a tick was told, and deadlines passed. Only where a test asks for it.
+    Tick,
 }
 
 pub struct Rig {
     pub engine: Box<Engine>,
     pub now: Instant,
     pub wake: Instant,
+    /// When the engine was called last.
+    pub called: Instant,
     pub map: Map,
     server: Server,
+    /// A link was refused while outputs were drained.
+    reacted: bool,
     /// Links that come up as soon as they are opened.
     pub reachable: BTreeSet<u8>,
     /// Links of which nothing is heard when they are opened.
@@ -242,8 +250,10 @@ pub struct Rig {
     pub modbus_answers: bool,
     /// Whether ports and links report at once that everything was sent.
     pub reports_sent: bool,
-    /// Whether the controller's TCP acknowledges at once.
+    /// Whether the controller's TCP acknowledges at once what has left.
     pub acknowledges: bool,
+    /// Whether ticks stand in the log.
+    pub logs_ticks: bool,
     /// Everything handed over since the last look.
     pub log: Vec<(Instant, Out)>,
 }
@@ -256,13 +266,16 @@ impl Rig {
             engine: Box::new(engine),
             now: Instant::from_millis(1_000_001),
             wake: Instant::ZERO,
+            called: Instant::ZERO,
             map,
             server: Server::new(),
+            reacted: false,
             reachable: (0..16).collect(),
             unanswered: BTreeSet::new(),
             modbus_answers: true,
             reports_sent: true,
             acknowledges: true,
+            logs_ticks: false,
             log: Vec::new(),
         };
         let ports: Vec<_> = rig.engine.field_ports().collect();
@@ -275,8 +288,17 @@ impl Rig {
     /// One input, and everything that follows from it at this instant.
     pub fn input(&mut self, input: Input<'_>) {
         self.engine.handle(self.now, input);
+        self.called = self.now;
+        if self.logs_ticks && matches!(input, Input::Tick) {
+            self.log.push((self.now, Out::Tick));
+        }
         self.drain();
         if matches!(input, Input::Tick) {
+            if self.reacted && self.wake <= self.now {
+                // What the controller did meanwhile is due at once.
+                self.engine.handle(self.now, input);
+                self.drain();
+            }
             assert!(self.wake > self.now, "asked to be called at once again: {:?}", self.wake);
         }
     }
@@ -310,7 +332,7 @@ impl Rig {
     }
 
     #[track_caller]
-    pub fn link(&self, id: LinkId) -> proto_core::engine::LinkInfo<'_> {
+    pub fn link(&self, id: LinkId) -> LinkInfo<'_> {
         self.engine.links().find(|link| link.id == id).expect("the plan needs this link")
     }
 
@@ -336,6 +358,34 @@ impl Rig {
         })
     }
 
+    /// What was handed over to one link since the last call of this kind, and how many milliseconds
+    /// after `since`.
+    pub fn sent_after(&mut self, link: LinkId, since: Instant) -> Vec<(u64, Vec<u8>)> {
+        let sent = |entry: &(Instant, Out)| match entry {
+            (at, Out::Link(to, bytes)) if *to == link => Some((*at, bytes.clone())),
+            _ => None,
+        };
+        let all: Vec<_> = self.log.iter().filter_map(sent).collect();
+        self.log.retain(|entry| sent(entry).is_none());
+        all.into_iter().map(|(at, bytes)| (at.saturating_since(since).as_millis(), bytes)).collect()
+    }
+
+    /// When links were closed since the last call of this kind.
+    pub fn closed(&mut self) -> Vec<(Instant, LinkId)> {
+        let closed = |&(at, ref out): &(Instant, Out)| match out {
+            Out::Close(link) => Some((at, *link)),
+            _ => None,
+        };
+        let closings = self.log.iter().filter_map(closed).collect();
+        self.log.retain(|entry| closed(entry).is_none());
+        closings
+    }
+
+    /// The peer's transport has acknowledged all but so many bytes.
+    pub fn acked(&mut self, link: LinkId, left: usize) {
+        self.input(Input::LinkAcked { link, left: left as u32 });
+    }
+
     pub fn take<T>(&mut self, pick: impl Fn(&Out) -> Option<T>) -> Vec<T> {
         let picked = self.log.iter().filter_map(|(_, out)| pick(out)).collect();
         self.log.retain(|(_, out)| pick(out).is_none());
@@ -347,13 +397,15 @@ impl Rig {
     }
 
     fn drain(&mut self) {
+        self.reacted = false;
         let mut buf = [0xA5; OUTPUT_BUFFER];
         // Far more than one input can lead to: what never ends is a bug.
         for _ in 0..10_000 {
             let out = match self.engine.poll_output(self.now, &mut buf) {
                 Output::Sleep { until } => {
                     let needed = self.engine.deadline();
-                    assert!(until <= needed, "sleeps until {until:?} and misses {needed:?}");
+                    // What is due already waits for the tick that is late.
+                    assert!(until <= needed.max(self.now), "sleeps until {until:?} and misses {needed:?}");
                     self.wake = until;
                     return;
                 }
@@ -375,21 +427,26 @@ impl Rig {
             Out::Open(link) if self.reachable.contains(&link.0) => {
                 self.engine.handle(self.now, Input::LinkUp { link });
             }
-            Out::Open(link) => self.engine.handle(self.now, Input::LinkDown { link }),
-            Out::Close(_) => {}
+            Out::Open(link) => {
+                self.reacted = true;
+                self.engine.handle(self.now, Input::LinkDown { link });
+            }
             Out::Port(port, _) | Out::Can(port, _) if self.reports_sent => {
                 self.engine.handle(self.now, Input::PortSent { port });
             }
             Out::Link(link, bytes) => {
-                if link == LinkId::MODBUS && self.modbus_answers {
-                    let answer = self.answer(&bytes);
-                    self.engine.handle(self.now, Input::LinkBytes { link, bytes: &answer });
-                }
                 if self.reports_sent {
                     self.engine.handle(self.now, Input::LinkSent { link });
                 }
-                if self.acknowledges {
+                let is_tcp = |info: &LinkInfo<'_>| {
+                    !matches!(info.kind, LinkKind::RecipeUdp | LinkKind::RecipeUdpListen { .. })
+                };
+                if self.reports_sent && self.acknowledges && is_tcp(&self.link(link)) {
                     self.engine.handle(self.now, Input::LinkAcked { link, left: 0 });
+                }
+                if link == LinkId::MODBUS && self.modbus_answers {
+                    let answer = self.answer(&bytes);
+                    self.engine.handle(self.now, Input::LinkBytes { link, bytes: &answer });
                 }
             }
             _ => {}

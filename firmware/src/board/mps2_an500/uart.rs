@@ -10,9 +10,8 @@ use core::task::Poll;
 
 use critical_section::Mutex;
 use embassy_sync::waitqueue::WakerRegistration;
-use embassy_time::Instant;
 use embedded_io_async::{ErrorType, Read, Write};
-use firmware::serial::{Arrival, Line};
+use firmware::serial::Line;
 use heapless::Deque;
 
 use super::Irq;
@@ -43,10 +42,6 @@ pub(crate) struct Uart(usize);
 
 struct State {
     received: Deque<u8, RING>,
-    /// Of what is in `received`.
-    arrival: Arrival,
-    /// Of what was read last.
-    read: Arrival,
     waiting: Deque<u8, RING>,
     reader: WakerRegistration,
     writer: WakerRegistration,
@@ -65,8 +60,6 @@ impl State {
     const fn new() -> Self {
         Self {
             received: Deque::new(),
-            arrival: NEVER,
-            read: NEVER,
             waiting: Deque::new(),
             reader: WakerRegistration::new(),
             writer: WakerRegistration::new(),
@@ -91,16 +84,11 @@ impl Access<'_> {
     /// Takes what the UART has, as long as there is room.
     fn drain(&mut self) {
         write(self.base + INTCLEAR, INT_RX);
-        let now = Instant::now();
         while read(self.base + STATE) & STATE_RX_FULL != 0 {
             if self.state.received.is_full() {
                 self.clear(CTRL_RX_IRQ);
                 return;
             }
-            if self.state.received.is_empty() {
-                self.state.arrival.first = now;
-            }
-            self.state.arrival.last = now;
             let _ = self.state.received.push_back(read(self.base + DATA) as u8);
             self.state.reader.wake();
         }
@@ -168,9 +156,6 @@ impl Read for Uart {
                     *place = byte;
                     len += 1;
                 }
-                uart.state.read = uart.state.arrival;
-                // What is left came behind what was read, and not after the last.
-                uart.state.arrival.first = uart.state.arrival.last;
                 if read(uart.base + CTRL) & CTRL_RX_IRQ == 0 {
                     uart.set(CTRL_RX_IRQ);
                     uart.drain();
@@ -217,10 +202,4 @@ impl Write for Uart {
 }
 
 /// The emulated line has no driver-enable.
-impl Line for Uart {
-    fn arrival(&self) -> Option<Arrival> {
-        Some(with(self.0, |uart| uart.state.read))
-    }
-}
-
-const NEVER: Arrival = Arrival { first: Instant::MIN, last: Instant::MIN };
+impl Line for Uart {}

@@ -1,11 +1,10 @@
-//! One message of a CAN_RAW socket: a frame, whether it is our own, and when it arrived.
+//! One message of a CAN_RAW socket: a frame, and whether it is our own.
 //!
-//! The `socketcan` crate reads frames and times, but not the flag that marks an echo of our own.
+//! The `socketcan` crate reads frames, but not the flag that marks an echo of our own.
 
 use std::io;
-use std::mem::{size_of, size_of_val, zeroed};
+use std::mem::{size_of_val, zeroed};
 use std::os::fd::{AsRawFd, BorrowedFd};
-use std::time::{Duration, SystemTime};
 
 use proto_core::recipe::can::CanFrame;
 use proto_core::recipe::model::CanId;
@@ -17,8 +16,6 @@ pub(super) struct Message {
     pub(super) content: Content,
     /// The frame is one of ours, which has just left.
     pub(super) is_own: bool,
-    /// When the kernel got it, by the real-time clock.
-    pub(super) at: Option<SystemTime>,
 }
 
 #[derive(Debug)]
@@ -39,15 +36,12 @@ pub(super) enum Content {
 /// `WouldBlock` when there is none; what is wrong with the interface otherwise.
 pub(super) fn receive(socket: BorrowedFd<'_>) -> io::Result<Message> {
     let mut bytes = [0_u8; libc::CANFD_MTU];
-    let mut control = Control([0; CONTROL]);
     let mut part = libc::iovec { iov_base: bytes.as_mut_ptr().cast(), iov_len: size_of_val(&bytes) };
     // SAFETY: a `msghdr` is pointers and numbers, for which zero is a value.
     let mut header: libc::msghdr = unsafe { zeroed() };
     header.msg_iov = &raw mut part;
     header.msg_iovlen = 1;
-    header.msg_control = control.0.as_mut_ptr().cast();
-    header.msg_controllen = size_of_val(&control.0) as _;
-    // SAFETY: the header leads to `bytes` and `control`, with their lengths; both outlive the call.
+    // SAFETY: the header leads to `bytes` with their length; they outlive the call.
     let count = unsafe { libc::recvmsg(socket.as_raw_fd(), &raw mut header, libc::MSG_DONTWAIT) };
     let count = usize::try_from(count).map_err(|_| io::Error::last_os_error())?;
     Ok(Message {
@@ -57,7 +51,6 @@ pub(super) fn receive(socket: BorrowedFd<'_>) -> io::Result<Message> {
             _ => Content::Unknown,
         },
         is_own: header.msg_flags & libc::MSG_CONFIRM != 0,
-        at: arrival(&header),
     })
 }
 
@@ -81,37 +74,6 @@ fn classic(bytes: &[u8; libc::CANFD_MTU]) -> Content {
     };
     frame.map_or(Content::Unknown, Content::Frame)
 }
-
-/// The time that SO_TIMESTAMPNS attaches.
-fn arrival(header: &libc::msghdr) -> Option<SystemTime> {
-    // SAFETY: `recvmsg` filled the header; it leads to a control buffer that is alive and aligned.
-    let mut next = unsafe { libc::CMSG_FIRSTHDR(header) };
-    while !next.is_null() {
-        // SAFETY: the macros above and below give only headers that lie whole in the buffer.
-        let message = unsafe { &*next };
-        // SAFETY: reckons a length, whatever the number.
-        let enough = unsafe { libc::CMSG_LEN(size_of::<libc::timespec>() as u32) } as usize;
-        let kind = (message.cmsg_level, message.cmsg_type);
-        if kind == (libc::SOL_SOCKET, libc::SCM_TIMESTAMPNS) && message.cmsg_len as usize >= enough {
-            // SAFETY: the message is long enough for the `timespec` that this kind is, aligned or not.
-            let time: libc::timespec =
-                unsafe { libc::CMSG_DATA(next).cast::<libc::timespec>().read_unaligned() };
-            let seconds = u64::try_from(time.tv_sec).ok()?;
-            let nanos = u32::try_from(time.tv_nsec).ok()?;
-            return SystemTime::UNIX_EPOCH.checked_add(Duration::new(seconds, nanos));
-        }
-        // SAFETY: as with the first header; `next` lies in the same buffer.
-        next = unsafe { libc::CMSG_NXTHDR(header, next) };
-    }
-    None
-}
-
-/// Room for control messages, aligned as their headers are.
-#[repr(C, align(8))]
-struct Control([u8; CONTROL]);
-
-/// A time takes 32 bytes; nothing else is asked for.
-const CONTROL: usize = 64;
 
 #[cfg(test)]
 mod tests {

@@ -11,7 +11,8 @@ use super::reader::{Item, Reader, Result, Spot};
 use super::recipes::{self, FileRecipe, Flavour};
 use crate::config::TargetError;
 use crate::config::sim::{
-    Initial, InitialTarget, Listen, Power, Robot, RobotMode, SimBus, SimConfig, SimPort, SimProgram,
+    CommandClients, Initial, InitialTarget, Listen, Power, Robot, RobotMode, SimBus, SimConfig, SimPort,
+    SimProgram,
 };
 
 /// The top-level keys of a controller file.
@@ -64,7 +65,7 @@ fn read_listen(root: &Reader<'_>) -> Result<Listen> {
 fn read_robot(root: &Reader<'_>) -> Result<Robot> {
     let mut robot = Robot::default();
     let Some(item) = root.optional("robot") else { return Ok(robot) };
-    let table = item.table(&["dialect", "power", "mode"])?;
+    let table = item.table(&["dialect", "power", "mode", "command_clients"])?;
     if let Some(item) = table.optional("dialect") {
         robot.dialect = super::known_dialect(&item, item.string()?)?.to_owned();
     }
@@ -76,6 +77,13 @@ fn read_robot(root: &Reader<'_>) -> Result<Robot> {
             ("manual", RobotMode::Manual),
             ("auto", RobotMode::Auto),
             ("remote", RobotMode::Remote),
+        ])?;
+    }
+    if let Some(item) = table.optional("command_clients") {
+        robot.command_clients = item.choice(&[
+            ("many", CommandClients::Many),
+            ("one", CommandClients::RefuseSecond),
+            ("newest", CommandClients::DropFirst),
         ])?;
     }
     Ok(robot)

@@ -14,6 +14,8 @@ pub enum ErrorId {
     WrongState,
     /// A command's argument is out of range.
     BadArgument,
+    /// A command was accepted and its transition did not complete.
+    NotCompleted,
     /// The emergency stop was pressed.
     EmergencyStop,
     /// A protective stop.
@@ -30,15 +32,16 @@ impl ErrorId {
             Self::ProgramFailed => 0x1002,
             Self::WrongState => 0x2001,
             Self::BadArgument => 0x2002,
+            Self::NotCompleted => 0x2003,
             Self::EmergencyStop => 0x3001,
             Self::ProtectiveStop => 0x3002,
             Self::Collision => 0x3003,
         }
     }
 
-    /// Whether it only says that a command was refused.
+    /// Whether it only says how a command went.
     pub const fn is_refusal(self) -> bool {
-        matches!(self, Self::NoSuchProgram | Self::WrongState | Self::BadArgument)
+        matches!(self, Self::NoSuchProgram | Self::WrongState | Self::BadArgument | Self::NotCompleted)
     }
 }
 

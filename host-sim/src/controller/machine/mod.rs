@@ -5,10 +5,11 @@
 //! must happen with the arm and the program, and the states as everybody sees them. Knows neither
 //! texts nor connections; it neither runs programs nor moves the arm itself.
 //!
-//! A command is answered when it is accepted; what it begins then takes its time, as on a real
-//! controller: `poweron` is answered at once and the robot state changes 300 ms later.
+//! A command that is accepted begins a [`Transition`], which takes its time: [`Machine::progress`]
+//! tells what became of it, so that the command can be answered when it is done (D25).
 
 mod errors;
+mod transition;
 
 use proto_core::command::{Action, Percent};
 use proto_core::time::{Duration, Instant};
@@ -16,6 +17,8 @@ use proto_core::wire::state::{OperationMode, ProgramState, RobotState, SafetySta
 
 use super::motion::Braking;
 pub use errors::{ErrorEntry, ErrorId};
+use transition::Begun;
+pub use transition::{Progress, Transition};
 
 /// The state machines.
 #[derive(Debug, Clone)]
@@ -28,6 +31,10 @@ pub struct Machine {
     collision_axis: Option<u8>,
     error: Option<ErrorEntry>,
     robot_error: Option<ErrorId>,
+    /// Transitions begun so far, of power and drives and of the program.
+    begun: Begun,
+    /// What every transition that a command begins takes beyond its time.
+    delay: Duration,
 }
 
 /// What must happen with the rest of the controller.
@@ -57,8 +64,8 @@ enum Robot {
     Disabled,
     Enabling { until: Instant },
     Enabled,
-    Disabling { until: Instant },
-    PoweringOff { until: Instant },
+    Disabling { shown: RobotState, until: Instant },
+    PoweringOff { shown: RobotState, until: Instant },
     ShuttingDown { until: Instant },
     Gone,
 }
@@ -100,6 +107,8 @@ impl Machine {
             collision_axis: None,
             error: None,
             robot_error: None,
+            begun: Begun::default(),
+            delay: Duration::ZERO,
         }
     }
 
@@ -112,12 +121,14 @@ impl Machine {
     /// Robot state.
     pub fn robot(&self) -> RobotState {
         match self.robot {
-            Robot::Booting { shown, .. } => shown,
+            Robot::Booting { shown, .. }
+            | Robot::Disabling { shown, .. }
+            | Robot::PoweringOff { shown, .. } => shown,
             Robot::Off | Robot::PoweringOn { .. } | Robot::ShuttingDown { .. } | Robot::Gone => {
                 RobotState::PowerOff
             }
-            Robot::Disabled | Robot::Enabling { .. } | Robot::PoweringOff { .. } => RobotState::Disable,
-            Robot::Enabled | Robot::Disabling { .. } => RobotState::Enable,
+            Robot::Disabled | Robot::Enabling { .. } => RobotState::Disable,
+            Robot::Enabled => RobotState::Enable,
         }
     }
 
@@ -138,9 +149,7 @@ impl Machine {
             (Safety::Stopped(state), _) => state,
             (_, Robot::Booting { shown: RobotState::Start, .. }) => SafetyState::Boot,
             (_, Robot::Booting { .. }) => SafetyState::Init,
-            (_, Robot::Off | Robot::PoweringOn { .. } | Robot::ShuttingDown { .. } | Robot::Gone) => {
-                SafetyState::PowerOff
-            }
+            _ if self.robot() == RobotState::PowerOff => SafetyState::PowerOff,
             (Safety::Run, _) => SafetyState::Run,
             (Safety::Reduced, _) => SafetyState::Reduce,
             (Safety::Recovering { .. }, _) => SafetyState::Recovery,
@@ -174,7 +183,7 @@ impl Machine {
 
     /// Whether the drives hold the arm.
     pub fn drives_on(&self) -> bool {
-        matches!(self.robot, Robot::Enabled | Robot::Disabling { .. })
+        matches!(self.robot, Robot::Enabled | Robot::Disabling { shown: RobotState::Enable, .. })
     }
 
     /// The share of its planned speed that motion runs at now.
@@ -232,71 +241,103 @@ impl Machine {
         self.program = Program::Stopped;
     }
 
-    /// One of the keywords that are answered with success or fail.
+    /// One of the keywords that are answered with success or fail: begins what it asks for.
     ///
     /// # Errors
     /// The error that was recorded; nothing else changed.
-    pub fn act(&mut self, now: Instant, action: Action) -> Result<Effect, ErrorId> {
-        let refusal = match action {
+    pub fn act(&mut self, now: Instant, action: Action) -> Result<(Effect, Transition), ErrorId> {
+        let effect = match self.begin(now, action) {
+            Ok(effect) => effect,
+            Err(why) => return Err(self.refuse(ErrorId::WrongState, why)),
+        };
+        Ok((effect, Transition { action, begun: self.begun }))
+    }
+
+    /// Why not, or what must happen with the rest.
+    fn begin(&mut self, now: Instant, action: Action) -> Result<Effect, &'static str> {
+        let begins = now + self.delay;
+        let after = |length: Duration| begins + length;
+        match action {
             Action::PowerOn => match self.robot {
                 Robot::Off => {
-                    self.robot = Robot::PoweringOn { until: now + POWER_ON };
-                    return Ok(Effect::None);
+                    self.begin_robot(Robot::PoweringOn { until: after(POWER_ON) });
+                    Ok(Effect::None)
                 }
-                _ => "poweron: the robot is not powered off",
+                _ => Err("poweron: the robot is not powered off"),
             },
             Action::PowerOff => match self.robot {
-                Robot::Disabled | Robot::Enabled => {
-                    self.robot = Robot::PoweringOff { until: now + POWER_OFF };
-                    return Ok(self.abort(now, Braking::Hard));
+                // Whatever is under way must not keep the power on.
+                Robot::PoweringOn { .. }
+                | Robot::Disabled
+                | Robot::Enabling { .. }
+                | Robot::Enabled
+                | Robot::Disabling { .. } => {
+                    let shown = match self.robot {
+                        Robot::PoweringOn { .. } => RobotState::PowerOff,
+                        _ => RobotState::Disable,
+                    };
+                    self.begin_robot(Robot::PoweringOff { shown, until: after(POWER_OFF) });
+                    Ok(self.abort(after(STOP), Braking::Hard))
                 }
-                _ => "poweroff: the robot is not powered, or about to change",
+                _ => Err("poweroff: the robot is not powered, or about to lose its power"),
             },
             Action::Enable => match self.robot {
-                Robot::Disabled if self.stopped_by_safety() => "enable: a safety stop is active",
+                Robot::Disabled if self.stopped_by_safety() => Err("enable: a safety stop is active"),
                 Robot::Disabled => {
-                    self.robot = Robot::Enabling { until: now + ENABLE };
-                    return Ok(Effect::None);
+                    self.begin_robot(Robot::Enabling { until: after(ENABLE) });
+                    Ok(Effect::None)
                 }
-                _ => "enable: the robot is not powered on, or already enabled",
+                _ => Err("enable: the robot is not powered on, or already enabled"),
             },
             Action::Disable => match self.robot {
-                Robot::Enabled => {
-                    self.robot = Robot::Disabling { until: now + DISABLE };
-                    return Ok(self.abort(now, Braking::Hard));
+                Robot::Enabling { .. } | Robot::Enabled => {
+                    self.begin_robot(Robot::Disabling { shown: self.robot(), until: after(DISABLE) });
+                    Ok(self.abort(after(STOP), Braking::Hard))
                 }
-                _ => "disable: the robot is not enabled",
+                _ => Err("disable: the robot is not enabled"),
             },
             Action::Stop => match self.program {
                 Program::Running | Program::Pausing { .. } | Program::Paused => {
-                    return Ok(self.abort(now, Braking::Normal));
+                    Ok(self.abort(after(STOP), Braking::Normal))
                 }
-                Program::Stopped | Program::Stopping { .. } => "stop: no program is running",
+                Program::Stopped | Program::Stopping { .. } => Err("stop: no program is running"),
             },
             Action::Pause => match self.program {
                 Program::Running => {
-                    self.program = Program::Pausing { until: now + PAUSE };
-                    return Ok(Effect::Hold);
+                    self.begin_program(Program::Pausing { until: after(PAUSE) });
+                    Ok(Effect::Hold)
                 }
-                _ => "pause: no program is running",
+                _ => Err("pause: no program is running"),
             },
             Action::Resume => match self.program {
-                Program::Paused if self.stopped_by_safety() => "resume: a safety stop is active",
+                Program::Paused if self.stopped_by_safety() => Err("resume: a safety stop is active"),
                 Program::Paused => {
-                    self.program = Program::Running;
-                    return Ok(Effect::Continue);
+                    self.begin_program(Program::Running);
+                    Ok(Effect::Continue)
                 }
-                _ => "resume: no program is paused",
+                _ => Err("resume: no program is paused"),
             },
             Action::Shutdown => match self.robot {
                 Robot::Off => {
-                    self.robot = Robot::ShuttingDown { until: now + SHUT_DOWN };
-                    return Ok(Effect::None);
+                    self.begin_robot(Robot::ShuttingDown { until: now + SHUT_DOWN });
+                    Ok(Effect::None)
                 }
-                _ => "shutdown: the robot is not powered off",
+                _ => Err("shutdown: the robot is not powered off"),
             },
-        };
-        Err(self.refuse(ErrorId::WrongState, refusal))
+        }
+    }
+
+    /// A command whose transition was begun is answered with fail: records it, unless a safety stop
+    /// was the cause, which is the better thing to read.
+    pub fn not_completed(&mut self, action: Action, why: &str) {
+        if !matches!(self.safety, Safety::Stopped(_)) {
+            self.fail(ErrorId::NotCompleted, format!("{}: {why}", action.word()));
+        }
+    }
+
+    /// What commands begin takes this much longer from now on.
+    pub fn delay_transitions(&mut self, by: Duration) {
+        self.delay = by;
     }
 
     /// When the arm, which was told to slow down, will be at rest.
@@ -312,8 +353,8 @@ impl Machine {
             Robot::Booting { until, .. }
             | Robot::PoweringOn { until }
             | Robot::Enabling { until }
-            | Robot::Disabling { until }
-            | Robot::PoweringOff { until }
+            | Robot::Disabling { until, .. }
+            | Robot::PoweringOff { until, .. }
             | Robot::ShuttingDown { until } => Some(until),
             Robot::Off | Robot::Disabled | Robot::Enabled | Robot::Gone => None,
         };
@@ -357,8 +398,8 @@ impl Machine {
             }
             Robot::PoweringOn { until } if now >= until => Robot::Disabled,
             Robot::Enabling { until } if now >= until => Robot::Enabled,
-            Robot::Disabling { until } if now >= until => Robot::Disabled,
-            Robot::PoweringOff { until } if now >= until => Robot::Off,
+            Robot::Disabling { until, .. } if now >= until => Robot::Disabled,
+            Robot::PoweringOff { until, .. } if now >= until => Robot::Off,
             Robot::ShuttingDown { until } if now >= until => {
                 self.robot = Robot::Gone;
                 return Some(Effect::ShutDown);
@@ -406,7 +447,7 @@ impl Machine {
         self.collision_axis = Some(axis);
         self.fail(ErrorId::Collision, format!("collision on axis {axis}"));
         if self.program == Program::Running {
-            self.program = Program::Pausing { until: now + PAUSE };
+            self.begin_program(Program::Pausing { until: now + PAUSE });
             return Effect::Hold;
         }
         Effect::None
@@ -424,16 +465,16 @@ impl Machine {
         self.safety = Safety::Stopped(shown);
         self.fail(id, message);
         if matches!(self.robot, Robot::Enabled | Robot::Enabling { .. }) {
-            self.robot = Robot::Disabling { until: now + DISABLE };
+            self.begin_robot(Robot::Disabling { shown: self.robot(), until: now + DISABLE });
         }
-        self.abort(now, Braking::Hard)
+        self.abort(now + STOP, Braking::Hard)
     }
 
-    fn abort(&mut self, now: Instant, braking: Braking) -> Effect {
+    fn abort(&mut self, until: Instant, braking: Braking) -> Effect {
         match self.program {
             Program::Stopped | Program::Stopping { .. } => Effect::None,
             Program::Running | Program::Pausing { .. } | Program::Paused => {
-                self.program = Program::Stopping { until: now + STOP };
+                self.begin_program(Program::Stopping { until });
                 Effect::Abort(braking)
             }
         }

@@ -1,9 +1,9 @@
-//! Who gets the UDP server's frames (docs/simulated-controller.md section 5, D24).
+//! Who gets the UDP server's frames (docs/architecture.md section 10, D24, D30).
 
 use std::cmp::Reverse;
 use std::net::SocketAddr;
 
-use proto_core::time::Instant;
+use proto_core::time::{Duration, Instant};
 
 /// The addresses a UDP server streams to.
 #[derive(Debug, Clone, Default)]
@@ -13,6 +13,9 @@ pub(super) struct Clients {
 
 /// Most of them at a time.
 pub const MAX_UDP_CLIENTS: usize = 8;
+/// Who is expected to send and has not for this long is streamed to no more (D30): whoever can forge an
+/// address could point the stream at it for ever.
+const SILENCE: Duration = Duration::from_secs(60);
 
 impl Clients {
     /// A datagram came from `peer`. Returns whether another client had to make room: of the address that
@@ -39,6 +42,13 @@ impl Clients {
         full
     }
 
+    /// Forgets those that have been silent for too long, and returns how many.
+    pub(super) fn forget_silent(&mut self, now: Instant) -> usize {
+        let before = self.known.len();
+        self.known.retain(|&(_, heard)| now.saturating_since(heard) < SILENCE);
+        before - self.known.len()
+    }
+
     /// `peer` cannot be reached: nobody listens there any more. Returns whether it was a client.
     pub(super) fn unreachable(&mut self, peer: SocketAddr) -> bool {
         let before = self.known.len();
@@ -58,7 +68,6 @@ impl Clients {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use proto_core::time::Duration;
 
     fn at(millis: u64) -> Instant {
         Instant::ZERO + Duration::from_millis(millis)

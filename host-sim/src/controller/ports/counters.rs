@@ -43,6 +43,8 @@ pub struct PortCounters {
     pub inbox_overflows: u64,
     /// UDP clients that made room for newer ones.
     pub clients_displaced: u64,
+    /// UDP clients that had not sent anything for a minute.
+    pub clients_silent: u64,
     /// UDP clients that could not be reached any more.
     pub clients_gone: u64,
 }

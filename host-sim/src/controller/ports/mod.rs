@@ -246,10 +246,20 @@ impl Port {
 
     /// A datagram at the UDP server.
     pub(super) fn heard(&mut self, now: Instant, peer: SocketAddr) {
+        self.forget_silent(now);
         if let Medium::UdpServer(clients) = &mut self.medium
             && clients.heard(now, peer)
         {
             self.counters.clients_displaced += 1;
+        }
+    }
+
+    /// Who has something to send and does not is not streamed to for ever (D30).
+    fn forget_silent(&mut self, now: Instant) {
+        if let Medium::UdpServer(clients) = &mut self.medium
+            && self.recipe.as_ref().is_some_and(|(_, parts)| parts.has_input())
+        {
+            self.counters.clients_silent += clients.forget_silent(now) as u64;
         }
     }
 
@@ -374,6 +384,7 @@ impl Port {
         }
         match std::mem::replace(&mut self.transmitter, Transmitter::Idle) {
             Transmitter::CycleDue => {
+                self.forget_silent(now);
                 let frames = self.cycle_frames(image);
                 // Datagrams leave at once; everything else says when it has.
                 if !frames.is_empty() && !matches!(self.medium, Medium::UdpServer(_) | Medium::UdpClient) {

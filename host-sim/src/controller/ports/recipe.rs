@@ -94,6 +94,13 @@ impl Parts {
         })
     }
 
+    pub(super) fn has_input(&self) -> bool {
+        match self {
+            Self::Stream { input, .. } => input.is_some(),
+            Self::Can { input, .. } => input.is_some(),
+        }
+    }
+
     pub(super) fn has_output(&self) -> bool {
         match self {
             Self::Stream { output, .. } => output.is_some(),

@@ -10,7 +10,7 @@ use proto_core::wire::scalar::Scalar;
 use rhai::debugger::{DebuggerCommand, DebuggerEvent};
 use rhai::{AST, ASTNode, Array, Dynamic, Engine, EvalAltResult, Expr, FLOAT, INT, Position, Scope, Stmt};
 
-use super::{Answer, Call, End, MAX_OPERATIONS, Progress, Variables, script};
+use super::{Answer, CALL_OPERATIONS, Call, End, Progress, SLICE, SLICE_OPERATIONS, Variables, script};
 
 /// An answer with the model's time.
 #[derive(Debug)]
@@ -24,13 +24,14 @@ pub(super) struct Link {
     events: SyncSender<Progress>,
     answers: Mutex<Receiver<Stamped>>,
     variables: Arc<Mutex<Variables>>,
-    /// The model's time, µs.
-    now: AtomicU64,
-    /// Operations so far, and those before the present instant.
-    operations: AtomicU64,
-    operations_before: AtomicU64,
-    /// Operations when the variables' size was last looked at.
-    weighed: AtomicU64,
+    /// When the present slice began, in the model's time, µs.
+    slice_began: AtomicU64,
+    /// What the script has spent of it.
+    spent: AtomicU64,
+    /// What an operation is taken for: who copies much does less in a slice.
+    charge: AtomicU64,
+    /// Operations until the variables' size is looked at again.
+    weigh_in: AtomicU64,
     /// A call has returned since the variables were looked at.
     stale: AtomicBool,
     /// The program must end, or the model is gone. Functions that cannot fail, such as `print`,
@@ -72,10 +73,10 @@ impl Link {
             events,
             answers: Mutex::new(answers),
             variables,
-            now: AtomicU64::new(now.as_micros()),
-            operations: AtomicU64::new(0),
-            operations_before: AtomicU64::new(0),
-            weighed: AtomicU64::new(0),
+            slice_began: AtomicU64::new(now.as_micros()),
+            spent: AtomicU64::new(0),
+            charge: AtomicU64::new(1),
+            weigh_in: AtomicU64::new(WEIGH_EVERY),
             stale: AtomicBool::new(false),
             over: AtomicBool::new(false),
         }
@@ -83,6 +84,23 @@ impl Link {
 
     /// Hands control to the model until it answers.
     fn call(&self, call: Call) -> Outcome<Answer> {
+        self.spend(CALL_OPERATIONS)?;
+        let answer = self.ask(call)?;
+        self.stale.store(true, Relaxed);
+        Ok(answer)
+    }
+
+    /// Counts what the script does. When it has done enough for now, the model goes on without it
+    /// until the next slice.
+    fn spend(&self, operations: u64) -> Outcome<()> {
+        if self.spent.fetch_add(operations, Relaxed) + operations <= SLICE_OPERATIONS {
+            return Ok(());
+        }
+        let until = Instant::from_micros(self.slice_began.load(Relaxed)) + SLICE;
+        self.ask(Call::GiveWay { until }).map(|_| ())
+    }
+
+    fn ask(&self, call: Call) -> Outcome<Answer> {
         if self.over.load(Relaxed) {
             return Err(terminated());
         }
@@ -90,10 +108,10 @@ impl Link {
             self.over.store(true, Relaxed);
             return Err(terminated());
         };
-        if self.now.swap(now.as_micros(), Relaxed) != now.as_micros() {
-            self.operations_before.store(self.operations.load(Relaxed), Relaxed);
+        if now >= Instant::from_micros(self.slice_began.load(Relaxed)) + SLICE {
+            self.slice_began.store(now.as_micros(), Relaxed);
+            self.spent.store(0, Relaxed);
         }
-        self.stale.store(true, Relaxed);
         match answer {
             Answer::Abort => {
                 self.over.store(true, Relaxed);
@@ -113,15 +131,15 @@ impl Link {
     /// Ends a script whose variables have grown too large. The interpreter's own limits are for
     /// single values, and not all of them are checked when an item is added.
     fn weigh(&self, scope: &Scope<'_>) -> Outcome<()> {
-        let operations = self.operations.load(Relaxed);
-        if operations.saturating_sub(self.weighed.load(Relaxed)) < WEIGH_EVERY {
+        if self.weigh_in.load(Relaxed) > 0 {
             return Ok(());
         }
-        self.weighed.store(operations, Relaxed);
+        self.weigh_in.store(WEIGH_EVERY, Relaxed);
         let mut room = MAX_WEIGHT;
         for (_, _, value) in scope.iter_raw() {
             room = room.saturating_sub(weight(value, room));
         }
+        self.charge.store(1 + ((MAX_WEIGHT - room) / ITEMS_AN_OPERATION) as u64, Relaxed);
         if room > 0 {
             return Ok(());
         }
@@ -146,14 +164,13 @@ fn equip(mut engine: Engine, link: &Arc<Link>) -> Engine {
     let with = || Arc::clone(link);
 
     let l = with();
-    engine.on_progress(move |operations| {
+    // Called once an operation.
+    engine.on_progress(move |_| {
         if l.over.load(Relaxed) {
             return Some(Dynamic::UNIT);
         }
-        l.operations.store(operations, Relaxed);
-        let spent = operations.saturating_sub(l.operations_before.load(Relaxed));
-        let token = || Dynamic::from(format!("more than {MAX_OPERATIONS} operations without waiting"));
-        (spent > MAX_OPERATIONS).then(token)
+        let _ = l.weigh_in.fetch_update(Relaxed, Relaxed, |left| left.checked_sub(1));
+        l.spend(l.charge.load(Relaxed)).err().map(|_| Dynamic::UNIT)
     });
 
     // The variables are looked at when a call has returned and before the next one.
@@ -351,6 +368,8 @@ const CALLS: [&str; 7] = ["comm_recv", "comm_send", "get", "set", "movej", "wait
 const MAX_WEIGHT: usize = 65_536;
 /// Operations between two looks at that.
 const WEIGH_EVERY: u64 = 1_000;
+/// Items that are copied in the time of an operation.
+const ITEMS_AN_OPERATION: usize = 16;
 const MAX_WAIT_MS: f64 = 1e9;
 /// Longest log line or error text, in characters.
 const MAX_LINE: usize = 200;

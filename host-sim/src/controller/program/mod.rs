@@ -8,8 +8,11 @@
 //! control to the model, and the model's answer hands it back and waits for the next call. So a
 //! program sees the same instants in the same order in every run, however fast the machine is.
 //!
-//! Bounds: [`MAX_OPERATIONS`] between two instants of the model's time, and the sizes at the end
-//! of this file. A program that exceeds one ends with an error.
+//! A script that does not wait for anything is cut in slices by what it does, not by a clock: after
+//! [`SLICE_OPERATIONS`] operations the model goes on without it until [`SLICE`] after the slice began.
+//! So everything else keeps its timing, and every run is still the same.
+//!
+//! Bounds: the sizes at the end of this file. A program that exceeds one ends with an error.
 
 mod link;
 mod script;
@@ -68,6 +71,11 @@ pub enum Call {
     Wait(Duration),
     /// A line for the log.
     Log(String),
+    /// Go on at the next slice. No script asks for this, what it does is enough.
+    GiveWay {
+        /// When the next slice begins, at the earliest.
+        until: Instant,
+    },
 }
 
 /// What the model answers.
@@ -198,8 +206,12 @@ impl Drop for Program {
     }
 }
 
-/// Script operations between two instants of the model's time.
-pub const MAX_OPERATIONS: u64 = 200_000;
+/// How long a slice is, in the model's time.
+pub const SLICE: Duration = Duration::from_millis(1);
+/// Operations of a script in a slice: some 0.1 ms on a machine of today.
+pub const SLICE_OPERATIONS: u64 = 500;
+/// What a call counts for, since it hands control to and fro.
+const CALL_OPERATIONS: u64 = 50;
 /// Longest string.
 const MAX_STRING: usize = 4_096;
 /// Most items in an array, those of arrays inside it included; and in a map.

@@ -6,6 +6,20 @@ fn start(text: &str) -> Program {
     Program::start(&Script::compile("t", text).unwrap(), NOW).unwrap()
 }
 
+/// As far as it comes without an answer, however many slices that takes.
+fn start_slices(text: &str) -> Program {
+    let mut program = start(text);
+    give_slices(&mut program);
+    program
+}
+
+/// Lets it go on through its slices, to the next call that a script makes.
+fn give_slices(program: &mut Program) {
+    while let Progress::Calling(Call::GiveWay { until }) = *program.progress() {
+        program.answer(until, Answer::Done);
+    }
+}
+
 #[track_caller]
 fn call(program: &Program) -> Call {
     match program.progress() {
@@ -94,22 +108,76 @@ fn variables_changed_before_a_call_are_seen_during_it() {
 }
 
 #[test]
-fn an_endless_loop_ends_with_an_error_unless_time_goes_by() {
-    let program = start("let n = 0; loop { n += 1; }");
-    assert!(failure(&program).contains("200000 operations without waiting"), "{}", failure(&program));
+fn a_script_that_does_not_wait_is_cut_in_slices() {
+    let at = |millis| Instant::from_millis(millis);
+    let mut program = start("let n = 0; loop { n += 1; }");
+    for slice in 0..10 {
+        assert_eq!(call(&program), Call::GiveWay { until: at(6 + slice) });
+        program.answer(at(6 + slice), Answer::Done);
+    }
+    // A slice that begins late does not make the next one shorter.
+    program.answer(at(100), Answer::Done);
+    assert_eq!(call(&program), Call::GiveWay { until: at(101) });
+    program.answer(at(101), Answer::Abort);
+    assert_eq!(program.progress(), &Progress::Ended(End::Aborted));
 
-    // Calls alone do not help, time does.
-    let text = "loop { for i in 0..20000 { let x = i; } wait_ms(0); }";
-    let mut program = start(text);
-    for _ in 0..20 {
+    // Calls count, too; those that take their time begin a slice of their own.
+    let mut program = start("loop { wait_ms(0); }");
+    let mut calls = 0;
+    while call(&program) == Call::Wait(Duration::ZERO) {
+        calls += 1;
         program.answer(NOW, Answer::Done);
     }
-    assert!(failure(&program).contains("operations"), "{}", failure(&program));
-    let mut program = start(text);
-    for nth in 0..20 {
-        program.answer(Instant::from_millis(10 + nth), Answer::Done);
+    assert_eq!((calls, call(&program)), (9, Call::GiveWay { until: at(6) }));
+    let mut program = start("loop { for i in 0..50 { let x = i; } wait_ms(1); }");
+    for nth in 0..1_000 {
+        assert_eq!(call(&program), Call::Wait(Duration::from_millis(1)), "{nth}");
+        program.answer(at(6 + nth), Answer::Done);
     }
-    assert_eq!(call(&program), Call::Wait(Duration::ZERO));
+}
+
+#[test]
+fn a_script_gets_as_far_in_a_slice_in_every_run() {
+    let text = "let n = 0; let a = []; loop { n += 1; a.push([n, n]); if n % 97 == 0 { log(n); } \
+                if a.len() > 300 { a = []; } if n % 10 == 0 { let b = [n, 1].filter(|x| x > 1); } }";
+    let run = || {
+        let mut program = start(text);
+        let mut now = NOW;
+        let mut steps = Vec::new();
+        for _ in 0..2_000 {
+            steps.push((now, call(&program)));
+            if let Call::GiveWay { until } = call(&program) {
+                now = until;
+            }
+            program.answer(now, Answer::Done);
+        }
+        (steps, program.variables())
+    };
+    let first = run();
+    assert_eq!(first, run());
+    let slices = first.0.iter().filter(|step| matches!(step.1, Call::GiveWay { .. })).count();
+    assert!(slices > 1_000 && slices < 2_000, "{slices}");
+}
+
+#[test]
+fn who_copies_much_does_less_in_a_slice() {
+    let copies = |items: usize| {
+        let text = format!(
+            "let a = []; for i in 0..{items} {{ a.push(i); }} let n = 0; log(0); \
+             loop {{ let b = a; n += 1; if n == 2000 {{ log(n); }} }}"
+        );
+        let mut program = start_slices(&text);
+        let mut slices = 0;
+        program.answer(Instant::from_millis(60_000), Answer::Done);
+        while let Progress::Calling(Call::GiveWay { until }) = *program.progress() {
+            slices += 1;
+            program.answer(until, Answer::Done);
+        }
+        assert_eq!(call(&program), Call::Log("2000".to_owned()));
+        slices
+    };
+    let (few, many) = (copies(0), copies(1_000));
+    assert!(many > 20 * few, "{few} and {many} slices");
 }
 
 #[test]
@@ -124,7 +192,7 @@ fn memory_is_bounded() {
         ("fn f(x) { f(x + 1) } f(0);", "Stack overflow"),
         ("let a = [[]]; for i in 0..100 { a.push(a); }", "Size of array"),
     ] {
-        let program = start(text);
+        let program = start_slices(text);
         assert!(
             matches!(program.progress(), Progress::Ended(End::Failed(_))),
             "{text}: {:?}",

@@ -246,6 +246,20 @@ impl Registers {
         if writable { self.force(target, value) } else { Err(SetError::ReadOnly(target)) }
     }
 
+    /// Registers and outputs are 0.
+    pub fn clear(&mut self) {
+        self.write_inputs(|image| {
+            for var in SysVar::all().filter(|&var| is_kept(var)) {
+                let place = image.get_mut(var.image_offset()..).and_then(|bytes| bytes.get_mut(..var.size()));
+                if let Some(bytes) = place {
+                    bytes.fill(0);
+                }
+            }
+        });
+        self.analog_out = [0; 8];
+        self.tool_out = [0; 2];
+    }
+
     /// The tool's frame, from `RobotState[20..25]`.
     pub fn tool(&self) -> Frame {
         Frame::from_pose(&self.vector(PLACES.tool).map(f64::from))
@@ -327,6 +341,15 @@ static PLACES: LazyLock<Places> = LazyLock::new(|| {
         robot_state: offset("RobotState", 1),
     }
 });
+
+/// Whether the variable is what was last written to it, and neither measured nor wired from outside.
+fn is_kept(var: SysVar) -> bool {
+    match var.group() {
+        "RobotState" => false,
+        "DigitalSignalStatus" => var.index() == 8,
+        _ => true,
+    }
+}
 
 /// The variable that commands the output `var` shows.
 fn command_of(var: SysVar) -> Option<SysVar> {

@@ -116,6 +116,7 @@ fn everything() -> SimConfig {
 }
 
 fn apply(cell: &mut Cell, step: Step) {
+    let address = |nth: u8| Ipv4Addr::new(10, 0, 0, nth % 3).into();
     let conn = |kind: u8, nth: u8| ConnId(u64::from(kind) * 100 + u64::from(nth));
     let now = cell.now;
     match step {
@@ -127,9 +128,9 @@ fn apply(cell: &mut Cell, step: Step) {
             cell.input(ControllerInput::ModbusBytes { conn: conn(1, nth), bytes: &bytes });
         }
         Step::Open(kind, nth) => cell.input(match kind {
-            0 => ControllerInput::CommandOpened { conn: conn(0, nth) },
-            1 => ControllerInput::ModbusOpened { conn: conn(1, nth) },
-            _ => ControllerInput::StateOpened { conn: conn(2, nth) },
+            0 => ControllerInput::CommandOpened { conn: conn(0, nth), from: address(nth) },
+            1 => ControllerInput::ModbusOpened { conn: conn(1, nth), from: address(nth) },
+            _ => ControllerInput::StateOpened { conn: conn(2, nth), from: address(nth) },
         }),
         Step::Close(kind, nth) => cell.input(match kind {
             0 => ControllerInput::CommandClosed { conn: conn(0, nth) },
@@ -157,7 +158,7 @@ fn apply(cell: &mut Cell, step: Step) {
         Step::Knob(nth) => {
             let link = [Link::Command, Link::State, Link::Modbus][usize::from(nth) % 3];
             let c = &mut cell.controller;
-            match nth % 16 {
+            match nth % 20 {
                 0 => c.mute(link),
                 1 => c.unmute(link),
                 2 => c.refuse(link),
@@ -172,6 +173,15 @@ fn apply(cell: &mut Cell, step: Step) {
                 11 => c.protective_stop(now),
                 12 => c.collide(now, nth),
                 13 | 14 => c.clear_stop(now),
+                15 => c.command_clients(match nth % 3 {
+                    0 => CommandClients::Many,
+                    1 => CommandClients::RefuseSecond,
+                    _ => CommandClients::DropFirst,
+                }),
+                16 => c.delay_transitions(Duration::from_millis(u64::from(nth) * 30)),
+                17 if nth > 128 => drop(c.spoil("RobotState[8]", f32::NAN)),
+                17 => drop(c.heal("RobotState[8]")),
+                18 => c.restart_cleared(now),
                 _ => {
                     let _ = c.assign_recipe(now, 5, (nth > 128).then_some(1));
                 }

@@ -11,77 +11,90 @@ fn config() -> SimConfig {
 #[test]
 fn a_robot_is_powered_enabled_run_and_shut_down() {
     let mut cell = Cell::new(&with_power(config(), Power::Off));
-    let c = cell.command_client();
+    let (c, d) = (cell.command_client(), cell.command_client());
     assert_eq!(cell.ask(c, "state"), "4:0:4:2");
-    assert_eq!(cell.ask(c, "poweron"), "poweron success");
-    assert_eq!(cell.ask(c, "state"), "4:0:4:2", "it takes its time");
-    assert_eq!(cell.ask(c, "poweron"), "poweron fail", "it is on its way already");
-    cell.run_ms(300);
+    assert_eq!(cell.ask(c, "poweron"), "");
+    assert_eq!(cell.ask(d, "state"), "4:0:4:2", "it takes its time");
+    assert_eq!(cell.ask(d, "poweron"), "poweron fail", "it is on its way already");
+    cell.run_ms(299);
+    assert_eq!(cell.take(c), b"");
+    cell.run_ms(1);
+    assert_eq!(cell.take(c), b"poweron success");
     assert_eq!(cell.ask(c, "state"), "5:0:5:2");
     assert_eq!(cell.ask(c, "run(loop.jspf)"), "run fail");
     assert_eq!(cell.ask(c, "getlasterror"), "2001:run: the robot is not enabled\n");
-    assert_eq!(cell.ask(c, "enable"), "enable success");
+    assert_eq!(cell.ask(c, "enable"), "");
+    assert_eq!(cell.ask(d, "state"), "5:0:5:2");
     cell.run_ms(200);
+    assert_eq!(cell.take(c), b"enable success");
     assert_eq!(cell.ask(c, "state"), "6:0:5:2");
     assert_eq!(cell.ask(c, "isprogfinish"), "1");
     assert_eq!(cell.ask(c, "run(loop.jspf)"), "run start");
     assert_eq!(cell.ask(c, "state"), "6:2:5:2");
     assert_eq!(cell.ask(c, "isprogfinish"), "0");
-    assert_eq!(cell.ask(c, "pause"), "pause success");
-    assert_eq!(cell.ask(c, "state"), "6:4:5:2");
+    assert_eq!(cell.ask(c, "pause"), "");
+    assert_eq!(cell.ask(d, "state"), "6:4:5:2");
     cell.run_ms(20);
+    assert_eq!(cell.take(c), b"pause success");
     assert_eq!(cell.ask(c, "state"), "6:3:5:2");
     assert_eq!(cell.ask(c, "resume"), "resume success");
     assert_eq!(cell.ask(c, "state"), "6:2:5:2");
-    assert_eq!(cell.ask(c, "stop"), "stop success");
-    assert_eq!(cell.ask(c, "state"), "6:1:5:2");
+    assert_eq!(cell.ask(c, "stop"), "");
+    assert_eq!(cell.ask(d, "state"), "6:1:5:2");
+    assert_eq!(cell.ask(d, "isprogfinish"), "0");
     cell.run_ms(20);
+    assert_eq!(cell.take(c), b"stop success");
     assert_eq!(cell.ask(c, "state"), "6:0:5:2");
     assert_eq!(cell.ask(c, "shutdown"), "shutdown fail");
-    assert_eq!(cell.ask(c, "disable"), "disable success");
+    assert_eq!(cell.ask(c, "disable"), "");
     cell.run_ms(100);
-    assert_eq!(cell.ask(c, "poweroff"), "poweroff success");
+    assert_eq!(cell.take(c), b"disable success");
+    assert_eq!(cell.ask(c, "poweroff"), "");
     cell.run_ms(200);
+    assert_eq!(cell.take(c), b"poweroff success");
     assert_eq!(cell.ask(c, "state"), "4:0:4:2");
     assert_eq!(cell.ask(c, "shutdown"), "shutdown success");
     assert!(!cell.shut_down, "the reply goes first");
     cell.run_ms(100);
     assert!(cell.shut_down);
-    assert_eq!(cell.closed, [c]);
+    assert_eq!(cell.closed, [c, d]);
     assert_eq!(cell.drain(), Instant::NEVER);
     assert_eq!(cell.ask(c, "state"), "", "nobody is there any more");
 }
 
-/// Which of the commands succeed in which state.
+/// Which of the commands succeed in which state, and how long that takes.
 #[test]
 fn every_command_fails_in_every_wrong_state() {
     #[rustfmt::skip]
-    let table: [(&str, &[&str], &str); 9] = [
-        // how to get there, and what succeeds there
+    let table: [(&str, &[&str], &str); 11] = [
+        // how to get there, what is begun there, and what succeeds there
         ("off",      &[],                                             "poweron shutdown"),
-        ("powering", &["poweron"],                                    ""),
-        ("on",       &["poweron", "", ""],                            "poweroff enable"),
-        ("enabling", &["poweron", "", "", "enable"],                  ""),
-        ("enabled",  &["poweron", "", "", "enable", "", ""],          "poweroff disable run"),
-        ("running",  &["poweron", "", "", "enable", "", "", "run(loop.jspf)"], "poweroff disable stop pause"),
-        ("pausing",  &["poweron", "", "", "enable", "", "", "run(loop.jspf)", "pause"], "poweroff disable stop"),
-        ("paused",   &["poweron", "", "", "enable", "", "", "run(loop.jspf)", "pause", ""], "poweroff disable stop resume"),
-        ("stopping", &["poweron", "", "", "enable", "", "", "run(loop.jspf)", "stop"], "poweroff disable"),
+        ("powering", &["poweron.."],                                  "poweroff"),
+        ("on",       &["poweron"],                                    "poweroff enable"),
+        ("enabling", &["poweron", "enable.."],                        "poweroff disable"),
+        ("enabled",  &["poweron", "enable"],                          "poweroff disable run"),
+        ("running",  &["poweron", "enable", "run(loop.jspf)"],        "poweroff disable stop pause"),
+        ("pausing",  &["poweron", "enable", "run(loop.jspf)", "pause.."], "poweroff disable stop"),
+        ("paused",   &["poweron", "enable", "run(loop.jspf)", "pause"], "poweroff disable stop resume"),
+        ("stopping", &["poweron", "enable", "run(loop.jspf)", "stop.."], "poweroff disable"),
+        ("disabling", &["poweron", "enable", "disable.."],            "poweroff"),
+        ("unpowering", &["poweron", "poweroff.."],                    ""),
     ];
     let commands = ["poweron", "poweroff", "enable", "disable", "run", "stop", "pause", "resume", "shutdown"];
     for (state, way, succeeding) in table {
         for command in commands {
             let mut cell = Cell::new(&with_power(config(), Power::Off));
-            let c = cell.command_client();
+            let (c, other) = (cell.command_client(), cell.command_client());
             for step in way {
-                match *step {
-                    "" => cell.run_ms(150),
-                    step => assert!(!cell.ask(c, step).contains("fail"), "{state}: {step}"),
+                match step.strip_suffix("..") {
+                    Some(step) => assert_eq!(cell.ask(other, step), "", "{state}: {step}"),
+                    None => assert!(!cell.order(c, step).contains("fail"), "{state}: {step}"),
                 }
             }
             let before = cell.ask(c, "state");
             let text = if command == "run" { "run(loop.jspf)" } else { command };
-            let reply = cell.ask(c, text);
+            let asked = cell.now;
+            let reply = cell.order(c, text);
             let good = succeeding.split(' ').any(|word| word == command);
             let expected = match (command, good) {
                 ("run", true) => "run start".to_owned(),
@@ -89,6 +102,14 @@ fn every_command_fails_in_every_wrong_state() {
                 (_, false) => format!("{command} fail"),
             };
             assert_eq!(reply, expected, "{command} while {state}");
+            let takes = match command {
+                "poweron" if good => 300,
+                "poweroff" | "enable" if good => 200,
+                "disable" if good => 100,
+                "pause" | "stop" if good => 20,
+                _ => 0,
+            };
+            assert_eq!(cell.now.saturating_since(asked).as_millis(), takes, "{command} while {state}");
             if !good {
                 assert_eq!(cell.ask(c, "state"), before, "{command} while {state} changed something");
                 let error = cell.ask(c, "getlasterror");
@@ -113,8 +134,7 @@ fn a_fault_stops_and_locks_until_it_is_cleared() {
     assert_eq!(cell.ask(c, "state"), "5:0:6:2");
     assert_eq!(cell.ask(c, "enable"), "enable fail", "not while it recovers");
     cell.run_ms(200);
-    assert_eq!(cell.ask(c, "enable"), "enable success");
-    cell.run_ms(200);
+    assert_eq!(cell.order(c, "enable"), "enable success");
     assert_eq!(cell.ask(c, "state"), "6:0:5:2");
 
     cell.ask(c, "run(loop.jspf)");
@@ -205,46 +225,4 @@ fn a_later_dialect_speaks_otherwise() {
     cell.state_client();
     cell.run_ms(100);
     assert_eq!(cell.packets[0].1.reserved_656[4], 50, "global speed at byte 660");
-}
-
-#[test]
-fn connections_are_bounded() {
-    let mut cell = Cell::new(&config());
-    let conns: Vec<_> = (0..MAX_COMMAND_CONNECTIONS).map(|_| cell.command_client()).collect();
-    assert_eq!(cell.closed, []);
-    let refused = cell.command_client();
-    assert_eq!(cell.closed, [refused]);
-    assert_eq!(cell.ask(refused, "state"), "");
-    cell.input(ControllerInput::CommandClosed { conn: conns[0] });
-    let taken = cell.command_client();
-    assert_eq!(cell.ask(taken, "state"), "6:0:5:2");
-    let counters = cell.controller.counters().command;
-    assert_eq!((counters.opened, counters.refused, counters.open), (33, 1, 32));
-}
-
-#[test]
-fn who_only_holds_a_connection_makes_room_for_who_has_something_to_ask() {
-    let mut cell = Cell::new(&config());
-    let good = cell.command_client();
-    assert_eq!(cell.ask(good, "state"), "6:0:5:2");
-    let idle: Vec<_> = (1..MAX_COMMAND_CONNECTIONS).map(|_| cell.command_client()).collect();
-    // A byte now and then is nothing whole.
-    cell.input(ControllerInput::CommandBytes { conn: idle[0], bytes: b"run(" });
-    cell.run_ms(4_999);
-    let early = cell.command_client();
-    assert_eq!(cell.closed, [early], "they may be about to ask");
-    cell.run_ms(1);
-    let new = cell.command_client();
-    assert_eq!(cell.closed, [early, idle[0]]);
-    assert_eq!(cell.ask(new, "state"), "6:0:5:2");
-    assert_eq!(cell.ask(good, "state"), "6:0:5:2");
-    let counters = cell.controller.counters().command;
-    assert_eq!((counters.displaced, counters.refused, counters.open), (1, 1, MAX_COMMAND_CONNECTIONS));
-    // Who has asked stays, however long ago.
-    for &conn in &idle[1..] {
-        assert_eq!(cell.ask(conn, "isprogfinish"), "1");
-    }
-    cell.run_ms(60_000);
-    let late = cell.command_client();
-    assert_eq!(cell.closed, [early, idle[0], late]);
 }

@@ -44,6 +44,52 @@ fn a_refusing_server_closes_what_comes() {
 }
 
 #[test]
+fn port_2000_may_take_one_client_only() {
+    let mut config = with_power(SimConfig::default(), Power::Off);
+    config.robot.command_clients = CommandClients::RefuseSecond;
+    let mut cell = Cell::new(&config);
+    let first = cell.command_client();
+    let second = cell.command_client();
+    assert_eq!(cell.closed, [second]);
+    assert_eq!(cell.ask(second, "state"), "");
+    assert_eq!(cell.order(first, "poweron"), "poweron success");
+    let (m, s) = (cell.modbus_client(), cell.state_client());
+    assert_eq!(cell.modbus(m, &[3, 0, 1, 0, 1]), [3, 2, 0, 5], "the other servers are as they were");
+    cell.modbus_client();
+    cell.input(ControllerInput::CommandClosed { conn: first });
+    let third = cell.command_client();
+    assert_eq!(cell.ask(third, "state"), "5:0:5:2");
+    cell.run_ms(60_000);
+    let fourth = cell.command_client();
+    assert_eq!(cell.closed, [second, fourth], "nor does an idle one make room");
+
+    // Or the newest only: what the first one waits for gets lost with it.
+    cell.controller.command_clients(CommandClients::DropFirst);
+    cell.ask(third, "enable");
+    let fifth = cell.command_client();
+    assert_eq!(cell.closed, [second, fourth, third]);
+    cell.run_ms(200);
+    assert_eq!(cell.ask(fifth, "state"), "6:0:5:2");
+    assert_eq!(cell.take(third), b"");
+    let counters = cell.controller.counters().command;
+    assert_eq!((counters.refused, counters.displaced, counters.open), (2, 1, 1));
+    cell.controller.refuse(Link::Command);
+    let refused = cell.command_client();
+    assert_eq!(cell.closed.last(), Some(&refused), "refused before it could displace anybody");
+    cell.controller.accept(Link::Command);
+
+    // It outlives a restart.
+    cell.controller.restart(cell.now);
+    cell.drain();
+    assert!(cell.closed.ends_with(&[fifth, s, m, ConnId(6)]), "{:?}", cell.closed);
+    let (a, b) = (cell.command_client(), cell.command_client());
+    assert_eq!((cell.ask(a, "isprogfinish").as_str(), cell.ask(b, "isprogfinish").as_str()), ("", "1"));
+    cell.controller.command_clients(CommandClients::Many);
+    let c = cell.command_client();
+    assert_eq!((cell.ask(b, "isprogfinish").as_str(), cell.ask(c, "isprogfinish").as_str()), ("1", "1"));
+}
+
+#[test]
 fn modbus_answers_with_an_exception_and_changes_nothing() {
     let mut cell = Cell::new(&SimConfig::default());
     let m = cell.modbus_client();
@@ -126,7 +172,7 @@ fn a_restart_closes_everything_and_boots_to_power_off() {
         cell.run_ms(10);
     }
     assert_eq!(states, ["0:0:13:2", "1:0:0:2", "2:0:0:2", "3:0:0:2", "4:0:4:2"]);
-    assert_eq!(cell.ask(c, "poweron"), "poweron success");
+    assert_eq!(cell.order(c, "poweron"), "poweron success");
     // The serial line goes on, the TCP client waits for its connection.
     cell.sent.clear();
     cell.run_ms(4);
@@ -149,4 +195,120 @@ fn a_mute_port_goes_on_receiving() {
     cell.controller.close_port(0);
     cell.drain();
     assert_eq!(cell.sent.last().unwrap().2, Out::Closed);
+}
+
+#[test]
+fn floats_can_be_shown_as_what_they_are_not() {
+    let recipe = stream_recipe(
+        Mode::Realtime,
+        system(&["DigitalOutputCommand[1]"]),
+        system(&["RobotState[8..9]", "FloatOutputReg[1]"]),
+    );
+    let config = one_port(SimBus::TcpClient { to: String::new() }, recipe);
+    let values = [("RobotState[9]", 0.5), ("FloatOutputReg[1]", 2.5), ("AI_V[1]", 3.5), ("ToolAI[2]", 4.5)];
+    let mut cell = Cell::new(&with_initial(config, &values));
+    cell.state_client();
+    cell.run_ms(100);
+    let honest = cell.packets[0].1;
+    let odd = f32::from_bits(0xFFC1_2345);
+    assert!(odd.is_nan());
+    let c = &mut cell.controller;
+    c.spoil("FloatOutputReg[1]", 7.0).unwrap();
+    let all = [
+        ("__RobotState_8", odd),
+        ("FloatOutputReg[1]", f32::INFINITY),
+        ("AI_V[1]", f32::NEG_INFINITY),
+        ("ToolAI[2]", f32::MIN_POSITIVE / 2.0),
+        ("joint_torque[7]", f32::NAN),
+        ("RobotState[26]", f32::NAN),
+    ];
+    for (name, instead) in all {
+        c.spoil(name, instead).unwrap();
+    }
+    cell.sent.clear();
+    cell.run_ms(100);
+    let packet = cell.packets[1].1;
+    assert_eq!(packet.tcp_pose[0].to_bits(), 0xFFC1_2345, "bit for bit");
+    assert_eq!((packet.float_outputs[0], packet.analog_inputs[4]), (f32::INFINITY, f32::NEG_INFINITY));
+    assert_eq!(packet.tool_analog_inputs, [0.0, f32::MIN_POSITIVE / 2.0]);
+    assert!(packet.joint_torque[6].is_nan());
+    // Everything else is as it was.
+    let mut rest = packet;
+    rest.tcp_pose[0] = honest.tcp_pose[0];
+    rest.float_outputs[0] = 2.5;
+    rest.analog_inputs[4] = 3.5;
+    rest.tool_analog_inputs[1] = 4.5;
+    rest.joint_torque[6] = 0.0;
+    assert_eq!(rest, honest);
+    let Out::Bytes(frame) = &cell.sent[0].2 else { panic!("{:?}", cell.sent[0]) };
+    let expected = [0xFFC1_2345_u32, 0.5_f32.to_bits(), f32::INFINITY.to_bits()].map(u32::to_le_bytes);
+    assert_eq!(frame[2..14], expected.concat());
+    // The values themselves are what they were, and Modbus shows them.
+    assert_eq!(value(&cell, "FloatOutputReg[1]"), 2.5);
+    let m = cell.modbus_client();
+    let x = (honest.tcp_pose[0] * 10_000.0).round() as i16;
+    assert_eq!(cell.modbus(m, &[3, 0, 106, 0, 1])[2..], x.to_be_bytes());
+
+    for (name, _) in all {
+        cell.controller.heal(name).unwrap();
+    }
+    cell.sent.clear();
+    cell.run_ms(100);
+    assert_eq!(cell.packets[2].1, honest);
+    let Out::Bytes(frame) = &cell.sent[0].2 else { panic!("{:?}", cell.sent[0]) };
+    assert_eq!(frame[6..14], [0.5_f32, 2.5].map(f32::to_le_bytes).concat());
+
+    for wrong in [
+        "RobotState[33]",
+        "WordOutputReg[1]",
+        "DI[1]",
+        "joint_torque[8]",
+        "joint_torque[0]",
+        "drive_error[1]",
+        "robot_state",
+        "x",
+    ] {
+        let error = cell.controller.spoil(wrong, 1.0).unwrap_err();
+        assert_eq!(error, NoSuchFloat(wrong.to_owned()));
+        assert!(cell.controller.heal(wrong).is_err());
+    }
+    cell.run_ms(100);
+    assert_eq!(cell.packets[3].1, honest);
+}
+
+#[test]
+fn a_restart_brings_initial_values_back_or_not() {
+    let set = [
+        ("WordOutputReg[1]", 7.0),
+        ("BitOutputReg[3]", 5.0),
+        ("FloatInputReg[2]", 1.5),
+        ("DO[1]", 1.0),
+        ("ToolDO[2]", 1.0),
+        ("FDO[1]", 1.0),
+        ("ForceEnd[1]", 3.0),
+    ];
+    let wired = [("DI[3]", 1.0), ("AI_V[1]", 2.5), ("RobotState[20]", 0.25), ("RobotState[26]", 1.5)];
+    let config = with_initial(SimConfig::default(), &[&set[..], &wired].concat());
+    let mut cell = Cell::new(&config);
+    let m = cell.modbus_client();
+    cell.modbus(m, &[6, 0, 8, 0, 4]);
+    cell.modbus(m, &[6, 0, 80, 0, 9]);
+    let now =
+        |cell: &Cell, all: &[(&str, f64)]| all.iter().map(|(name, _)| value(cell, name)).collect::<Vec<_>>();
+    let as_set = |all: &[(&str, f64)]| all.iter().map(|item| item.1).collect::<Vec<_>>();
+    cell.controller.restart(cell.now);
+    cell.drain();
+    assert_eq!(now(&cell, &set), as_set(&set));
+    assert_eq!(value(&cell, "WordInputReg[1]"), 0.0, "what was written is gone");
+    cell.controller.restart_cleared(cell.now);
+    cell.drain();
+    assert_eq!(now(&cell, &set), [0.0; 7]);
+    assert_eq!(now(&cell, &wired), as_set(&wired));
+    let status = ["DigitalSignalStatus[4]", "DigitalSignalStatus[6]", "DigitalSignalStatus[8]"];
+    assert_eq!(status.map(|name| value(&cell, name)), [0.0; 3], "outputs show it");
+    assert_eq!(value(&cell, "RobotState[14]"), 0.0, "no force");
+    let m = cell.modbus_client();
+    assert_eq!(cell.modbus(m, &[3, 0, 80, 0, 1]), [3, 2, 0, 0]);
+    let c = cell.command_client();
+    assert_eq!(cell.ask(c, "state"), "0:0:13:2", "it starts");
 }

@@ -7,10 +7,13 @@ mod faults;
 mod modbus;
 mod ports;
 mod programs;
+mod room;
+mod slices;
 mod stream;
+mod when_done;
 
 use std::collections::BTreeMap;
-use std::net::{Ipv4Addr, SocketAddr};
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 
 use proto_core::config::{Parity, Rs485};
 use proto_core::recipe::CanFrame;
@@ -146,19 +149,19 @@ impl Cell {
 
     pub(super) fn command_client(&mut self) -> ConnId {
         let conn = self.new_conn();
-        self.input(ControllerInput::CommandOpened { conn });
+        self.input(ControllerInput::CommandOpened { conn, from: NEAR });
         conn
     }
 
     pub(super) fn modbus_client(&mut self) -> ConnId {
         let conn = self.new_conn();
-        self.input(ControllerInput::ModbusOpened { conn });
+        self.input(ControllerInput::ModbusOpened { conn, from: NEAR });
         conn
     }
 
     pub(super) fn state_client(&mut self) -> ConnId {
         let conn = self.new_conn();
-        self.input(ControllerInput::StateOpened { conn });
+        self.input(ControllerInput::StateOpened { conn, from: NEAR });
         conn
     }
 
@@ -172,6 +175,19 @@ impl Cell {
         let line = format!("{text}\r\n");
         self.input(ControllerInput::CommandBytes { conn, bytes: line.as_bytes() });
         String::from_utf8(self.take(conn)).unwrap()
+    }
+
+    /// Sends a command and lets time go by until it is answered.
+    #[track_caller]
+    pub(super) fn order(&mut self, conn: ConnId, text: &str) -> String {
+        let asked = self.now;
+        let mut reply = self.ask(conn, text);
+        while reply.is_empty() {
+            assert!(self.now < asked + Duration::from_secs(60), "{text} is never answered");
+            self.run_ms(1);
+            reply = String::from_utf8(self.take(conn)).unwrap();
+        }
+        reply
     }
 
     /// Sends a Modbus PDU and returns the answer's, function code and all.
@@ -206,6 +222,9 @@ impl Cell {
         self.controller.counters().ports[port]
     }
 }
+
+/// Where clients are, unless a test says otherwise.
+pub(super) const NEAR: IpAddr = IpAddr::V4(Ipv4Addr::LOCALHOST);
 
 pub(super) fn peer(port: u16) -> SocketAddr {
     (Ipv4Addr::LOCALHOST, port).into()

@@ -163,6 +163,68 @@ fn the_udp_server_keeps_eight_clients_the_silent_one_makes_room() {
     assert_eq!(cell.controller.counters().stray_datagrams, 1);
 }
 
+/// To whom datagrams went since the last look.
+fn streamed_to(cell: &mut Cell) -> Vec<u16> {
+    let port = |sent: (Instant, usize, Out)| match sent.2 {
+        Out::Datagram(peer, _) => peer.port(),
+        other => panic!("{other:?}"),
+    };
+    std::mem::take(&mut cell.sent).into_iter().map(port).collect()
+}
+
+#[test]
+fn a_udp_client_that_is_silent_for_a_minute_is_streamed_to_no_more() {
+    let mut cell = Cell::new(&system_port(SimBus::UdpServer));
+    let send = |cell: &mut Cell, from: u16, bytes: &[u8]| {
+        cell.input(ControllerInput::Udp2011 { peer: peer(from), bytes });
+    };
+    send(&mut cell, 1, b"");
+    send(&mut cell, 2, &ON);
+    cell.run_ms(30_000);
+    // Whatever it is that it sends.
+    send(&mut cell, 2, b"?");
+    cell.run_ms(29_992);
+    streamed_to(&mut cell);
+    cell.run_ms(4);
+    assert_eq!(streamed_to(&mut cell), [1, 2]);
+    cell.run_ms(4);
+    assert_eq!(streamed_to(&mut cell), [2], "a minute after its only datagram");
+    cell.run_ms(29_996);
+    assert!(streamed_to(&mut cell).iter().all(|&port| port == 2));
+    cell.run_ms(1_000);
+    assert!(streamed_to(&mut cell).is_empty());
+    assert_eq!(cell.counters("p").clients_silent, 2);
+    // Who sends again is there again at once.
+    send(&mut cell, 1, b"");
+    cell.run_ms(4);
+    assert_eq!(streamed_to(&mut cell), [1]);
+    // Those that have been silent do not count when places are short.
+    cell.run_ms(60_000);
+    for from in 10..18 {
+        send(&mut cell, from, b"");
+    }
+    let counters = cell.counters("p");
+    assert_eq!((counters.clients_silent, counters.clients_displaced), (3, 0));
+}
+
+#[test]
+fn without_an_input_part_a_udp_client_has_nothing_to_send() {
+    let mut config = system_port(SimBus::UdpServer);
+    if let SimParts::Stream { input, .. } = &mut config.recipes[0].parts {
+        *input = None;
+    }
+    let mut cell = Cell::new(&config);
+    cell.input(ControllerInput::Udp2011 { peer: peer(1), bytes: &[] });
+    cell.run_ms(600_000);
+    streamed_to(&mut cell);
+    cell.run_ms(4);
+    assert_eq!(streamed_to(&mut cell), [1]);
+    cell.input(ControllerInput::Udp2011Unreachable { peer: peer(1) });
+    cell.run_ms(4);
+    assert!(streamed_to(&mut cell).is_empty());
+    assert_eq!(cell.counters("p").clients_silent, 0);
+}
+
 #[test]
 fn can_frames_that_are_not_the_recipes_are_counted_and_ignored() {
     let recipe = can_recipe(Mode::Realtime, vec![can(1, system(&["DigitalOutputCommand[1]"]))], vec![]);

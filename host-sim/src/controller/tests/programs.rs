@@ -54,7 +54,8 @@ fn registers_and_io_are_read_and_outputs_written() {
         try { set("DO[1]", 2) } catch (e) { log(e); }
         try { set("ToolDO[1]", "x") } catch (e) { log(e); }
     "#;
-    let (cell, _) = runs(config, script);
+    let (mut cell, _) = runs(config, script);
+    cell.run_ms(10);
     assert_eq!(cell.controller.machine().error(), None);
     assert_eq!(value(&cell, "BitOutputReg[1]"), 129.0);
     assert_eq!(value(&cell, "FloatOutputReg[32]"), 1.5);
@@ -77,19 +78,18 @@ fn speed_scales_motion_and_pause_holds_it() {
     let config = || with_initial(SimConfig::default(), &[("RobotState[1]", 0.0)]);
     let duration = |steps: &[(u64, &str)]| {
         let (mut cell, c) = runs(config(), script);
-        let mut millis = 0;
+        let begin = cell.now;
         for (at, command) in steps {
-            cell.run_ms(at - millis);
-            millis = *at;
-            let reply = cell.ask(c, command);
+            let at = begin + Duration::from_millis(*at);
+            cell.run(at.saturating_since(cell.now));
+            let reply = cell.order(c, command);
             assert!(reply.ends_with("success"), "{command}: {reply}");
         }
         while cell.ask(c, "isprogfinish") == "0" {
             cell.run_ms(1);
-            millis += 1;
-            assert!(millis < 60_000, "it never ends");
+            assert!(cell.now < begin + Duration::from_secs(60), "it never ends");
         }
-        millis
+        cell.now.saturating_since(begin).as_millis()
     };
     // The longest way of HOME to there is joint 3's.
     let whole = duration(&[]);
@@ -101,18 +101,14 @@ fn speed_scales_motion_and_pause_holds_it() {
 
     let (mut cell, c) = runs(config(), script);
     cell.run_ms(1_000);
-    cell.ask(c, "pause");
-    cell.run_ms(99);
-    assert_eq!(cell.ask(c, "state"), "6:4:5:2", "as long as the arm moves");
-    cell.run_ms(1);
+    assert_eq!(cell.order(c, "pause"), "pause success");
     assert_eq!(cell.ask(c, "state"), "6:3:5:2");
     let held = value(&cell, "RobotState[1]");
     assert_eq!(cell.ask(c, "speed(10)"), "set success");
     cell.run_ms(5_000);
     assert_eq!(value(&cell, "RobotState[1]"), held);
     assert!(held > 0.05 && held < 0.5, "{held}");
-    cell.ask(c, "stop");
-    cell.run_ms(20);
+    assert_eq!(cell.order(c, "stop"), "stop success");
     assert_eq!(cell.ask(c, "state"), "6:0:5:2");
     assert_eq!(value(&cell, "RobotState[1]"), held);
 }
@@ -231,8 +227,6 @@ fn errors_stop_the_program_and_are_told_everywhere() {
     assert!(error.starts_with("1002:t: ") && error.contains("line 3") && error.ends_with('\n'), "{error}");
     assert_eq!(cell.packets[0].1.error_code, 0x1002);
     assert_eq!(cell.controller.counters().programs_failed, 1);
-    let (mut cell, c) = runs(SimConfig::default(), "let n = 0; loop { n += 1; }");
-    assert!(cell.ask(c, "getlasterror").contains("operations without waiting"));
     let (mut cell, c) = runs(SimConfig::default(), "comm_recv(\"nowhere\");");
     assert!(cell.ask(c, "getlasterror").contains("no port is called nowhere"));
     let (mut cell, c) = runs(SimConfig::default(), "movej([9, 0, 0, 0, 0, 0], 1);");
@@ -249,8 +243,7 @@ fn stop_ends_a_program_wherever_it_is() {
     ] {
         let (mut cell, c) = runs(user_port(), script);
         cell.run_ms(500);
-        assert_eq!(cell.ask(c, "stop"), "stop success", "{script}");
-        cell.run_ms(120);
+        assert_eq!(cell.order(c, "stop"), "stop success", "{script}");
         assert_eq!(cell.ask(c, "state"), "6:0:5:2", "{script}");
         assert_eq!(cell.controller.program_name(), None);
         assert_eq!(cell.controller.machine().error(), None);
@@ -298,8 +291,7 @@ fn a_new_program_waits_until_the_old_ones_frame_has_left() {
     cell.run_ms(30);
     cell.ask(c, "run(t)");
     assert_eq!(cell.sent.len(), 1);
-    cell.ask(c, "stop");
-    cell.run_ms(20);
+    assert_eq!(cell.order(c, "stop"), "stop success");
     assert_eq!(cell.ask(c, "run(t)"), "run start");
     assert_eq!(cell.sent.len(), 1, "the line is still busy");
     cell.run_ms(10);

@@ -51,10 +51,12 @@ impl ControllerShell {
         let (connection, read) = Connection::split(stream);
         let client = Client { link, connection: Rc::clone(&connection), subscribed: false };
         self.connections.borrow_mut().insert(conn, client);
+        // An IPv4 address is the same host however the listener names it.
+        let from = peer.ip().to_canonical();
         self.input(match link {
-            Link::Command => ControllerInput::CommandOpened { conn },
-            Link::State => ControllerInput::StateOpened { conn },
-            Link::Modbus => ControllerInput::ModbusOpened { conn },
+            Link::Command => ControllerInput::CommandOpened { conn, from },
+            Link::State => ControllerInput::StateOpened { conn, from },
+            Link::Modbus => ControllerInput::ModbusOpened { conn, from },
         });
         if let Some(client) = self.connections.borrow_mut().get_mut(&conn) {
             client.subscribed = link == Link::State;

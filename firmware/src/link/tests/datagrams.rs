@@ -1,0 +1,96 @@
+//! Where the datagrams of a listening port go, and how old they are.
+
+use embassy_net::udp::{PacketMetadata, UdpSocket};
+use embassy_time::{Instant, Timer};
+
+use super::*;
+
+macro_rules! socket {
+    ($name:ident, $net:expr, $port:expr) => {
+        let (mut rx_meta, mut tx_meta) = ([PacketMetadata::EMPTY; 16], [PacketMetadata::EMPTY; 4]);
+        let (mut rx, mut tx) = ([0; 2048], [0; 256]);
+        let mut $name = UdpSocket::new($net.controller, &mut rx_meta, &mut rx, &mut tx_meta, &mut tx);
+        $name.bind($port).unwrap();
+    };
+}
+
+/// The next frame of the gateway: which outputs it switches.
+async fn next(socket: &UdpSocket<'_>) -> u8 {
+    let mut frame = [0; 256];
+    let (len, _) = socket.recv_from(&mut frame).await.unwrap();
+    assert_eq!(frame[..len], switching(frame[2]));
+    frame[2]
+}
+
+#[test]
+fn frames_go_to_whoever_sent_a_frame_last_and_to_nobody_for_less() {
+    among(&config(udp_listen(), Speaks::Frames), listens, async |net| {
+        let at = gateway_port();
+        socket!(client, net, 1);
+        socket!(other, net, 2);
+        // Whatever it is, the first one opens the link.
+        client.send_to(&[0; 3], at).await.unwrap();
+        net.seen(1, 0).await;
+        net.hear(&switching(1));
+        assert_eq!(next(&client).await, 1);
+        let mut malformed = net.link().2.malformed;
+        for junk in [&[0; 3][..], &FRAME[..4], &[0; 1_500], &[]] {
+            other.send_to(junk, at).await.unwrap_or_default();
+            client.send_to(&FRAME, at).await.unwrap();
+            let received = net.link().2.received + 1;
+            until(|| net.link().2.received == received).await;
+            net.hear(&switching(2));
+            assert_eq!(next(&client).await, 2);
+        }
+        until(|| net.link().2.malformed > malformed + 1).await;
+        malformed = net.link().2.malformed;
+        other.send_to(&FRAME, at).await.unwrap();
+        let received = net.link().2.received + 1;
+        until(|| net.link().2.received == received).await;
+        net.hear(&switching(3));
+        assert_eq!(next(&other).await, 3);
+        // And back.
+        client.send_to(&FRAME, at).await.unwrap();
+        until(|| net.link().2.received == received + 1).await;
+        net.hear(&switching(4));
+        assert_eq!(next(&client).await, 4);
+        assert_eq!(net.link().2.malformed, malformed);
+        assert!(!client.may_recv() && !other.may_recv());
+    });
+}
+
+#[test]
+fn what_waits_for_a_host_that_is_not_found_is_not_sent_when_it_is_old() {
+    among(&config(udp_listen(), Speaks::Nothing), listens, async |net| {
+        socket!(client, net, 1);
+        client.send_to(&FRAME, gateway_port()).await.unwrap();
+        net.seen(1, 0).await;
+        net.hear(&switching(1));
+        assert_eq!(next(&client).await, 1);
+        // Long enough that its hardware address is forgotten.
+        net.wire.silence(CONTROLLER, CONTROLLER);
+        net.wire.step.set(Duration::from_millis(2));
+        let end = Instant::now() + Duration::from_secs(70);
+        while Instant::now() < end {
+            net.hear(&switching(1));
+            Timer::after(Duration::from_millis(20)).await;
+        }
+        let end = Instant::now() + Duration::from_millis(300);
+        while Instant::now() < end {
+            net.hear(&switching(2));
+            Timer::after(Duration::from_millis(20)).await;
+        }
+        net.wire.silence(0, 0);
+        net.wire.step.set(Duration::from_micros(200));
+        let mut heard = 0;
+        while heard < 50 {
+            net.hear(&switching(2));
+            Timer::after(Duration::from_millis(20)).await;
+            while client.may_recv() {
+                assert_eq!(next(&client).await, 2, "it is old");
+                heard += 1;
+            }
+        }
+        assert_eq!(net.link().0, 1, "the link stays up");
+    });
+}

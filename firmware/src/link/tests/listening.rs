@@ -1,0 +1,121 @@
+//! Who may come to a listening port.
+
+use embassy_futures::select::Either;
+use embassy_net::tcp::TcpSocket;
+use embassy_net::udp::{PacketMetadata, UdpSocket};
+use embassy_time::Timer;
+
+use super::*;
+
+/// Longer than a connection may leave probes without an answer.
+const LONG: Duration = Duration::from_secs(40);
+
+#[test]
+fn a_tcp_listener_takes_the_controller_only() {
+    among(&config(tcp_listen(), Speaks::Nothing), listens, async |net| {
+        let Net { controller, stranger, .. } = net;
+        let at = gateway_port();
+        let mut buffers = [[0; 256]; 4];
+        let [rx, tx, other_rx, other_tx] = &mut buffers;
+        let mut other = TcpSocket::new(stranger, other_rx, other_tx);
+        for round in 1..=3 {
+            // The listener may be busy with turning the one before away.
+            while other.connect(at).await.is_err() {
+                other.abort();
+            }
+            assert!(!matches!(other.read(&mut [0; 8]).await, Ok(1..)));
+            other.abort();
+            net.seen(0, round).await;
+        }
+        let mut own = TcpSocket::new(controller, rx, tx);
+        while own.connect(at).await.is_err() {
+            own.abort();
+        }
+        net.seen(1, 3).await;
+        // A controller that has nothing to say is no less there.
+        Timer::after(LONG).await;
+        net.seen(1, 3).await;
+        // There is one socket, and it is taken.
+        assert!(other.connect(at).await.is_err());
+        own.abort();
+        let _ = own.flush().await;
+    });
+}
+
+#[test]
+fn a_connection_that_never_comes_about_does_not_keep_the_listener() {
+    among(&config(tcp_listen(), Speaks::Nothing), listens, async |net| {
+        let Net { controller, stranger, wire, .. } = net;
+        let at = gateway_port();
+        let mut buffers = [[0; 256]; 4];
+        let [rx, tx, other_rx, other_tx] = &mut buffers;
+        let mut other = TcpSocket::new(stranger, other_rx, other_tx);
+        other.connect(at).await.unwrap();
+        net.seen(0, 1).await;
+        other.abort();
+        other.flush().await.unwrap();
+        // Now the hosts know each other. It asks for a connection and is gone before it is answered.
+        wire.deaf.set(STRANGER);
+        let before = wire.spoken.get();
+        let asked = poll_fn(|_| if wire.spoken.get() == before { Poll::Pending } else { Poll::Ready(()) });
+        assert!(matches!(select(other.connect(at), asked).await, Either::Second(())));
+        wire.mute.set(STRANGER);
+        let mut own = TcpSocket::new(controller, rx, tx);
+        let mut refused = 0;
+        while own.connect(at).await.is_err() {
+            own.abort();
+            refused += 1;
+        }
+        assert!(refused > 0, "nothing was in its way");
+        net.seen(1, 1).await;
+    });
+}
+
+#[test]
+fn a_controller_that_was_switched_off_finds_the_listener_free_again() {
+    among(&config(tcp_listen(), Speaks::Nothing), listens, async |net| {
+        let Net { controller, wire, .. } = net;
+        let at = gateway_port();
+        let mut buffers = [[0; 256]; 2];
+        let [rx, tx] = &mut buffers;
+        let mut own = TcpSocket::new(controller, rx, tx);
+        own.connect(at).await.unwrap();
+        net.seen(1, 0).await;
+        // Nobody hears that it goes.
+        wire.mute.set(CONTROLLER);
+        own.abort();
+        own.flush().await.unwrap();
+        wire.mute.set(0);
+        let mut refused = 0;
+        while own.connect(at).await.is_err() {
+            own.abort();
+            refused += 1;
+        }
+        assert!(refused > 0, "nothing was in its way");
+        net.seen(2, 0).await;
+    });
+}
+
+#[test]
+fn a_udp_listener_takes_the_controller_only() {
+    among(&config(udp_listen(), Speaks::Nothing), listens, async |net| {
+        let Net { controller, stranger, .. } = net;
+        let at = gateway_port();
+        let mut buffers = [[0; 256]; 4];
+        let mut metadata = [[PacketMetadata::EMPTY; 4]; 4];
+        let [rx, tx, other_rx, other_tx] = &mut buffers;
+        let [rx_meta, tx_meta, other_rx_meta, other_tx_meta] = &mut metadata;
+        let mut other = UdpSocket::new(stranger, other_rx_meta, other_rx, other_tx_meta, other_tx);
+        other.bind(1).unwrap();
+        for round in 1..=3 {
+            other.send_to(&FRAME, at).await.unwrap();
+            net.seen(0, round).await;
+        }
+        let mut own = UdpSocket::new(controller, rx_meta, rx, tx_meta, tx);
+        own.bind(1).unwrap();
+        own.send_to(&FRAME, at).await.unwrap();
+        net.seen(1, 3).await;
+        other.send_to(&FRAME, at).await.unwrap();
+        net.seen(1, 4).await;
+    });
+}

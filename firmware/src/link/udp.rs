@@ -1,0 +1,134 @@
+//! Datagrams of a link, both ways.
+
+use core::cell::Cell;
+use core::pin::pin;
+
+use embassy_futures::select::{Either, Either3, select, select3};
+use embassy_net::udp::{PacketMetadata, UdpSocket};
+use embassy_net::{IpAddress, IpEndpoint};
+use embassy_time::{Duration, Timer};
+use proto_core::engine::Input;
+
+use super::{Buffers, Driver, Way, resolve};
+
+impl Driver<'_> {
+    /// Datagrams both ways; of a listening socket, answers where the controller sent a frame from last.
+    pub(super) async fn udp(&self, turn: u32, controller: &str, way: Way, buffers: &mut Buffers<'_>) {
+        let mut received = [PacketMetadata::EMPTY; DATAGRAMS];
+        // One at a time, so that it is known when it has left.
+        let mut waiting = [PacketMetadata::EMPTY; 1];
+        let mut socket = UdpSocket::new(self.stack, &mut received, buffers.rx, &mut waiting, buffers.tx);
+        let own = match way {
+            Way::To(_) => 0,
+            Way::At(port) => port,
+        };
+        if socket.bind(own).is_err() {
+            return;
+        }
+        let own = socket.endpoint().port;
+        let resolving = select(self.control.over(turn), resolve(self.stack, controller));
+        let Either::Second(Some(address)) = self.pulse.idle(pin!(resolving)).await else { return };
+        let fixed = match way {
+            Way::To(port) => Some(IpEndpoint::new(address, port)),
+            Way::At(_) => None,
+        };
+        let peer = Cell::new(fixed);
+        if fixed.is_some() && !self.tell(turn, Input::LinkUp { link: self.link }) {
+            return;
+        }
+        loop {
+            let over = async {
+                self.receive(turn, &socket, fixed, address, &peer, buffers.chunk).await;
+                After::TheEnd
+            };
+            let sending = self.send(turn, &socket, &peer);
+            let after = match self.pulse.idle(pin!(select(over, sending))).await {
+                Either::First(after) | Either::Second(after) => after,
+            };
+            match after {
+                After::TheEnd => return,
+                // The peer is not found on the network. What waits for it would be delivered when it is
+                // there again, however old it is then.
+                After::Stuck => {
+                    socket.close();
+                    if socket.bind(own).is_err() || !self.tell(turn, Input::LinkSent { link: self.link }) {
+                        return;
+                    }
+                }
+            }
+        }
+    }
+
+    async fn receive(
+        &self,
+        turn: u32,
+        socket: &UdpSocket<'_>,
+        fixed: Option<IpEndpoint>,
+        controller: IpAddress,
+        peer: &Cell<Option<IpEndpoint>>,
+        chunk: &mut [u8],
+    ) {
+        loop {
+            // A datagram that is too long for any frame is none of ours.
+            let Ok((len, from)) = socket.recv_from(chunk).await else { continue };
+            let from = from.endpoint;
+            let bytes = chunk.get(..len).unwrap_or(&[]);
+            if !self.control.is_turn(turn) {
+                return;
+            }
+            match (fixed, peer.get()) {
+                (Some(fixed), _) if from != fixed => continue,
+                (Some(_), _) => {}
+                (None, _) if from.addr != controller => {
+                    self.control.turn_away();
+                    continue;
+                }
+                (None, None) => {
+                    peer.set(Some(from));
+                    if !self.tell(turn, Input::LinkUp { link: self.link }) {
+                        return;
+                    }
+                }
+                // Whatever else the controller's host sends does not draw the frames away from its client.
+                (None, Some(_)) if self.gateway.is_frame(self.link, bytes) => peer.set(Some(from)),
+                (None, Some(_)) => {}
+            }
+            if !self.tell(turn, Input::LinkBytes { link: self.link, bytes }) {
+                return;
+            }
+        }
+    }
+
+    async fn send(&self, turn: u32, socket: &UdpSocket<'_>, peer: &Cell<Option<IpEndpoint>>) -> After {
+        while let Some(datagram) = self.control.next(turn).await {
+            if let Some(peer) = peer.get() {
+                if socket.send_to(&datagram, peer).await.is_err() {
+                    return After::TheEnd;
+                }
+                let left = select3(self.control.over(turn), socket.wait_send_ready(), Timer::after(STUCK));
+                match left.await {
+                    Either3::First(()) => return After::TheEnd,
+                    Either3::Second(()) => {}
+                    Either3::Third(()) => return After::Stuck,
+                }
+            }
+            if !self.tell(turn, Input::LinkSent { link: self.link }) {
+                return After::TheEnd;
+            }
+        }
+        After::TheEnd
+    }
+}
+
+/// What follows.
+enum After {
+    /// The turn is over, or the socket is of no use.
+    TheEnd,
+    /// A datagram does not leave.
+    Stuck,
+}
+
+/// Datagrams that wait to be read.
+const DATAGRAMS: usize = 8;
+/// How old a datagram may leave: as old as a frame on TCP may be delivered.
+const STUCK: Duration = Duration::from_millis(250);

@@ -1,0 +1,81 @@
+//! Tasks as a board's executor runs them: those that were woken, each once in a round, the one woken
+//! last first. Who is woken meanwhile runs in the next round.
+
+use core::future::Future;
+use core::pin::Pin;
+use core::task::Context;
+use std::boxed::Box;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::task::{Wake, Waker};
+use std::vec::Vec;
+
+/// An executor whose tasks may live as long as `'a`.
+pub(crate) struct Executor<'a> {
+    tasks: Vec<(Running<'a>, Waker)>,
+    woken: Arc<Mutex<Vec<usize>>>,
+    order: Order,
+}
+
+type Running<'a> = Pin<Box<dyn Future<Output = ()> + 'a>>;
+
+/// Who of those that were woken comes first. Nobody may depend on it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Order {
+    /// As embassy's.
+    LastFirst,
+    FirstFirst,
+}
+
+impl Order {
+    pub(crate) const ALL: [Self; 2] = [Self::LastFirst, Self::FirstFirst];
+}
+
+struct Task {
+    index: usize,
+    woken: Arc<Mutex<Vec<usize>>>,
+}
+
+impl Wake for Task {
+    fn wake(self: Arc<Self>) {
+        let mut woken = self.woken.lock().unwrap_or_else(PoisonError::into_inner);
+        if !woken.contains(&self.index) {
+            woken.push(self.index);
+        }
+    }
+}
+
+impl<'a> Executor<'a> {
+    pub(crate) fn new(order: Order) -> Self {
+        Self { tasks: Vec::new(), woken: Arc::default(), order }
+    }
+
+    /// The task runs in the next round. It never ends.
+    pub(crate) fn spawn(&mut self, task: impl Future + 'a) {
+        let waker = Waker::from(Arc::new(Task { index: self.tasks.len(), woken: Arc::clone(&self.woken) }));
+        waker.wake_by_ref();
+        let task = Box::pin(async move {
+            task.await;
+            unreachable!("a task does not end");
+        });
+        self.tasks.push((task, waker));
+    }
+
+    /// Runs each task that was woken, once; whether there was one.
+    pub(crate) fn round(&mut self) -> bool {
+        let mut batch = core::mem::take(&mut *self.woken.lock().unwrap());
+        if self.order == Order::LastFirst {
+            batch.reverse();
+        }
+        for &index in &batch {
+            let (task, waker) = &mut self.tasks[index];
+            assert!(task.as_mut().poll(&mut Context::from_waker(waker)).is_pending());
+        }
+        !batch.is_empty()
+    }
+
+    /// Until nobody was woken.
+    pub(crate) fn settle(&mut self) {
+        let rounds = (0..1_000).take_while(|_| self.round()).count();
+        assert!(rounds < 1_000, "a task wakes itself for ever");
+    }
+}
