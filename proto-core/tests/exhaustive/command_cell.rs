@@ -41,15 +41,21 @@ pub enum Event {
     Up(LinkId),
     Down(LinkId),
     Taken(LinkId),
+    /// All of what is under way is acknowledged, or only the first of it.
     Acked(LinkId),
+    AckedFirst(LinkId),
     /// The Modbus request is answered.
     Answered,
     /// It is refused.
     Refused,
     /// The answer to the request before comes.
     LateAnswer,
+    /// What comes is not Modbus.
+    Garbage,
     /// A command is replied to: done, or failed.
     Replied(LinkId, Order, bool),
+    /// A reply comes that answers nothing.
+    Stray,
     Gone,
     Back,
     BusOff,
@@ -166,6 +172,9 @@ fn written(header: Header) -> [u8; 12] {
     [t1, t0, 0, 0, 0, 6, 1, 15, 0, FIRST_COIL as u8, 0, 8]
 }
 
+/// Another protocol's id.
+const GARBAGE: [u8; 9] = [0, 1, 9, 9, 0, 3, 1, 15, 4];
+
 /// Slave device failure.
 fn exception(header: Header) -> [u8; 9] {
     let [t1, t0] = header.transaction.to_be_bytes();
@@ -200,6 +209,7 @@ impl World for CommandCell {
             add(Down(link), matches!(conn.is, Is::Opening | Is::Open));
             add(Taken(link), conn.unsent);
             add(Acked(link), !conn.unsent && !conn.under_way.is_empty());
+            add(AckedFirst(link), !conn.unsent && conn.under_way.len() > 1);
             if !conn.unsent {
                 for order in judge.orders.unanswered(link) {
                     add(Replied(link, order, true), true);
@@ -210,6 +220,9 @@ impl World for CommandCell {
         add(Answered, is_asked);
         add(Refused, is_asked);
         add(LateAnswer, judge.given_up.is_some() && is_open(LinkId::MODBUS));
+        add(Garbage, is_open(LinkId::MODBUS));
+        let mut unanswered = judge.orders.unanswered(LinkId::COMMAND);
+        add(Stray, is_open(LinkId::COMMAND) && unanswered.all(|order| order != Order::Run));
         add(Gone, judge.is_up);
         add(Back, !judge.is_up);
         add(BusOff, sends);
@@ -250,6 +263,10 @@ impl World for CommandCell {
             Down(link) => self.tell(Input::LinkDown { link }),
             Taken(link) => self.tell(Input::LinkSent { link }),
             Acked(link) => self.tell(Input::LinkAcked { link, left: 0 }),
+            AckedFirst(link) => {
+                let left = self.gateway.conns.of(link).all_but_first();
+                self.tell(Input::LinkAcked { link, left })
+            }
             Answered => {
                 let bytes = written(self.judge.newest);
                 self.answer(LinkId::MODBUS, &bytes)
@@ -262,6 +279,8 @@ impl World for CommandCell {
                 let bytes = written(self.judge.given_up.take().expect("it was given up"));
                 self.tell(Input::LinkBytes { link: LinkId::MODBUS, bytes: &bytes })
             }
+            Garbage => self.tell(Input::LinkBytes { link: LinkId::MODBUS, bytes: &GARBAGE }),
+            Stray => self.tell(Input::LinkBytes { link: LinkId::COMMAND, bytes: b"run start" }),
             Replied(link, order, is_done) => {
                 let text: &[u8] = match (order, is_done) {
                     (Order::Run, true) => b"run start",
@@ -327,7 +346,7 @@ impl Facts {
 }
 
 impl Judge for Facts {
-    fn told(&mut self, now: Instant, input: &Input<'_>, conns: &Conns) -> Result<(), Broken> {
+    fn told(&mut self, now: Instant, input: &Input<'_>, conns: &mut Conns) {
         match *input {
             Input::Tick => self.deaf_until = self.deaf_until.filter(|&until| now < until),
             Input::PortCan { frame, .. } => self.frame(now, &frame, conns),
@@ -343,16 +362,19 @@ impl Judge for Facts {
                 }
             }
             Input::LinkUp { .. } => self.bits.controller_was_away(now),
-            Input::LinkBytes { link: LinkId::MODBUS, bytes } if conns.is_open(LinkId::MODBUS) => {
-                self.modbus_answered(now, bytes);
-            }
-            Input::LinkBytes { link, bytes } if link != LinkId::MODBUS => {
-                let order = if bytes.starts_with(b"run") { Order::Run } else { Order::Stop };
-                self.orders.replied(link, order, !bytes.ends_with(b"fail"));
-            }
+            Input::LinkBytes { link, bytes } if conns.is_open(link) => match link {
+                LinkId::MODBUS if bytes == GARBAGE => {
+                    conns.must_close(now, link);
+                    self.modbus_lost();
+                }
+                LinkId::MODBUS => self.modbus_answered(now, bytes),
+                _ => {
+                    let order = if bytes.starts_with(b"run") { Order::Run } else { Order::Stop };
+                    self.orders.replied(link, order, !bytes.ends_with(b"fail"));
+                }
+            },
             _ => {}
         }
-        Ok(())
     }
 
     fn down(&mut self, now: Instant, link: LinkId, was: Is, conns: &mut Conns) {

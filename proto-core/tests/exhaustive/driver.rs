@@ -68,14 +68,14 @@ pub struct Conns(pub Vec<Conn>);
 /// What a cell knows of the promises.
 pub trait Judge {
     /// An input is about to be told, other than that a connection is lost.
-    fn told(&mut self, now: Instant, input: &Input<'_>, conns: &Conns) -> Result<(), Broken>;
+    fn told(&mut self, now: Instant, input: &Input<'_>, conns: &mut Conns);
     /// The driver reports that a connection is gone or could not be opened; [`Self::lost`] came before.
     fn down(&mut self, now: Instant, link: LinkId, was: Is, conns: &mut Conns);
     /// Deadlines pass: what that makes due, or old.
     fn deadlines(&mut self, now: Instant, conns: &mut Conns) -> Result<(), Broken>;
     /// A connection is gone, whoever closed it.
     fn lost(&mut self, now: Instant, link: LinkId);
-    /// The gateway was asleep: after its deadlines passed, before the input counts.
+    /// The gateway was asleep: before its deadlines pass, and before the input counts.
     fn slept(&mut self, now: Instant);
     /// Bytes were handed over; returns until when they may be delivered.
     fn sent(
@@ -141,6 +141,11 @@ impl Conn {
         let acked = self.total - left;
         self.under_way.retain(|sent| sent.end > acked);
     }
+
+    /// What is left when the first of what is under way is acknowledged, and no more.
+    pub fn all_but_first(&self) -> u32 {
+        self.under_way.first().map_or(0, |first| self.total - first.end)
+    }
 }
 
 impl Conns {
@@ -200,9 +205,6 @@ impl Gateway {
         let is_late = self.is_late() && !is_tick;
         let sleeps = self.engine.sleeps();
         let slept = self.called != Instant::ZERO && now.saturating_since(self.called) > ASLEEP;
-        if is_tick || slept {
-            judge.deadlines(now, &mut self.conns)?;
-        }
         if slept {
             judge.slept(now);
             for nth in 0..self.conns.0.len() {
@@ -210,6 +212,9 @@ impl Gateway {
                 self.conns.must_close(now, link);
                 judge.lost(now, link);
             }
+        }
+        if is_tick || slept {
+            judge.deadlines(now, &mut self.conns)?;
         }
         match input {
             Input::LinkUp { link } => self.conns.get(link).change(now, Is::Open),
@@ -223,11 +228,11 @@ impl Gateway {
             judge.lost(now, link);
             judge.down(now, link, was, &mut self.conns);
         } else {
-            judge.told(now, &input, &self.conns)?;
+            judge.told(now, &input, &mut self.conns);
         }
         self.engine.handle(now, input);
         self.called = now;
-        let until = self.drain(judge, is_late, slept)?;
+        let until = self.drain(judge, is_late)?;
         if until > now + HEARTBEAT {
             return Err(format!("sleeps for {}", until.saturating_since(now)));
         }
@@ -243,7 +248,7 @@ impl Gateway {
     }
 
     /// What the engine answers, until it sleeps.
-    fn drain(&mut self, judge: &mut impl Judge, is_late: bool, slept: bool) -> Result<Instant, Broken> {
+    fn drain(&mut self, judge: &mut impl Judge, is_late: bool) -> Result<Instant, Broken> {
         let now = self.now;
         let mut buf = [0xA5; OUTPUT_BUFFER];
         for _ in 0..=MOST_OUTPUTS {
@@ -263,7 +268,7 @@ impl Gateway {
                 }
                 Output::LinkClose { link } => {
                     let conn = self.conns.get(link);
-                    if !std::mem::take(&mut conn.must_close) && !slept {
+                    if !std::mem::take(&mut conn.must_close) {
                         return Err(format!("closes {link:?} for no reason, which is {:?}", conn.is));
                     }
                 }

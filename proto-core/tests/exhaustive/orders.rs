@@ -162,7 +162,7 @@ impl Orders {
                 self.strike(conns, now);
             }
             // They went together: that was no verdict on the second one.
-            (LinkId::COMMAND, Is::Open) => {
+            (LinkId::COMMAND | LinkId::URGENT, Is::Open) => {
                 self.struck = self.struck.filter(|&at| now.saturating_since(at) > TOGETHER);
             }
             (LinkId::COMMAND, Is::Opening) => self.was_away(conns),
@@ -222,7 +222,8 @@ impl Orders {
         if link == LinkId::COMMAND && self.is_free(LinkId::URGENT, conns) {
             return Err("stops by the other connection than the one for it".to_owned());
         }
-        if link == LinkId::URGENT && !conns.of(LinkId::COMMAND).under_way.is_empty() {
+        let is_running = self.unanswered(LinkId::COMMAND).any(|order| order == Order::Run);
+        if link == LinkId::URGENT && is_running && !conns.of(LinkId::COMMAND).under_way.is_empty() {
             // What is under way there could arrive later and start the robot again.
             conns.must_close(now, LinkId::COMMAND);
             self.lost(LinkId::COMMAND, now);
@@ -236,10 +237,11 @@ impl Orders {
         self.asked.iter().filter(move |asked| asked.link == link).map(|asked| asked.order)
     }
 
-    /// The controller replied.
+    /// The controller replied; to something that nobody asked, it may be.
     pub fn replied(&mut self, link: LinkId, order: Order, is_done: bool) {
         let place = self.asked.iter().position(|asked| asked.link == link && asked.order == order);
-        let asked = self.asked.remove(place.expect("only what is unanswered is replied to"));
+        let Some(place) = place else { return };
+        let asked = self.asked.remove(place);
         self.settle(asked.picked.nth, if is_done { ReplyCode::Success } else { ReplyCode::Fail });
     }
 

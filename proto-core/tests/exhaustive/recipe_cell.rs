@@ -1,5 +1,5 @@
-//! An RS-485 port with a float and a bit, which go to the controller over a recipe link; each frame is
-//! answered with a float that the controller shows.
+//! An RS-485 port with a float and a bit, which go to the controller over a recipe link; the device is
+//! shown a float of the controller's and its own bit.
 
 use proto_core::config::{Bus, GatewayConfig, InputBinding, OnStale, OutputBinding, Parts, SendOn};
 use proto_core::engine::{Input, LinkId, PortId};
@@ -42,6 +42,7 @@ const BITS_AT: usize = 1120;
 const FLOATS_AT: usize = 832;
 const OUTPUTS_AT: usize = 960;
 
+const CYCLE: Duration = Duration::from_millis(200);
 const STALE_AFTER: Duration = Duration::from_millis(300);
 const READ_BACK_MAX_AGE: Duration = Duration::from_millis(500);
 const AWAY_AFTER: Duration = Duration::from_millis(500);
@@ -72,9 +73,13 @@ pub enum Event {
     Up(LinkId),
     Down(LinkId),
     Taken,
+    /// All of what is under way is acknowledged, or only the first of it.
     Acked,
+    AckedFirst,
     /// One of [`PACKETS`] comes.
     State(u8),
+    /// Three packets come that are out of step.
+    Garbage,
     /// A recipe frame with one of [`SHOWN`] comes.
     Shown(u8),
     Gone,
@@ -103,8 +108,11 @@ struct Facts {
     /// What the device is to be shown, and when it came.
     source: Option<f32>,
     source_at: Option<Instant>,
-    /// The device's frame is to be answered.
+    /// When the device sent anything.
+    frame_at: Option<Instant>,
+    /// The device is to be sent something: an answer to its frame, or by TCP what is due each cycle.
     is_due: bool,
+    cycle_at: Instant,
     /// When a safe value is sent again.
     repeat_at: Option<Instant>,
     /// When the controller is asked for its frames, and when it would forget who asked.
@@ -130,14 +138,19 @@ fn config(way: Way) -> GatewayConfig {
     let fields = cell.fields(fields);
     let input = cell.part(&[255, 255], &[238, 238], fields);
     let from = OutputBinding::Variable { var: var(shown), scale: 1.0, offset: 0.0 };
-    let fields = cell.fields([user_out(ScalarType::Float, from)]);
+    let own = OutputBinding::Variable { var: var(BIT), scale: 1.0, offset: 0.0 };
+    let fields = [user_out(ScalarType::Float, from), user_out(ScalarType::Byte, own)];
+    let fields = cell.fields(fields);
     let output = cell.part(&[255, 255], &[254, 254], fields);
     let recipe = cell.recipe(Mode::User, Parts::Stream { input, output });
-    cell.last_recipe().send = SendOn::Frame;
     cell.last_recipe().on_stale = OnStale::Stop;
+    if way != Way::Tcp {
+        cell.last_recipe().send = SendOn::Frame;
+    }
     cell.rs485(recipe);
     cell.last_port().timeout = TIMEOUT;
     cell.last_port().stale_after = STALE_AFTER;
+    cell.last_port().cycle = CYCLE;
     cell.safe(BIT, f64::from(SAFE_BIT));
     match way {
         Way::Udp | Way::UdpBoth => cell.recipe_link(link),
@@ -185,7 +198,9 @@ impl RecipeCell {
             packet_at: None,
             source: None,
             source_at: None,
+            frame_at: None,
             is_due: false,
+            cycle_at: Instant::ZERO,
             repeat_at: None,
             greet_at: None,
             speak_at: None,
@@ -261,9 +276,11 @@ impl World for RecipeCell {
         }
         add(Taken, link.unsent);
         add(Acked, !link.unsent && !link.under_way.is_empty());
+        add(AckedFirst, !link.unsent && link.under_way.len() > 1);
         for nth in 0..PACKETS.len() {
             add(State(nth as u8), is_stated);
         }
+        add(Garbage, is_stated);
         for nth in 0..SHOWN.len() {
             add(Shown(nth as u8), is_shown);
         }
@@ -306,6 +323,11 @@ impl World for RecipeCell {
             Down(link) => self.tell(Input::LinkDown { link }),
             Taken => self.tell(Input::LinkSent { link }),
             Acked => self.tell(Input::LinkAcked { link, left: 0 }),
+            AckedFirst => {
+                let left = self.gateway.conns.of(link).all_but_first();
+                self.tell(Input::LinkAcked { link, left })
+            }
+            Garbage => self.tell(Input::LinkBytes { link: LinkId::STATE, bytes: &[255; 3 * 1468] }),
             State(nth) => self.state(nth),
             Shown(nth) => self.shown(nth),
             Gone => self.tell(Input::PortDown { port }),
@@ -338,7 +360,8 @@ impl Facts {
         let is_reachable = conns.is_open(self.way.link());
         self.bits.received(bytes[6], is_reachable, now);
         self.float.received(value, is_reachable);
-        self.is_due = true;
+        self.frame_at = Some(now);
+        self.is_due |= self.way != Way::Tcp;
     }
 
     fn packet(&mut self, now: Instant, bytes: &[u8]) {
@@ -395,15 +418,16 @@ impl Facts {
         self.bits.is_waiting() || self.float.is_waiting()
     }
 
-    /// What the device may be shown.
-    fn showable(&self, now: Instant) -> Option<f32> {
-        let is_young = self.source_at.is_some_and(|at| now.saturating_since(at) <= STALE_AFTER);
-        self.source.filter(|_| is_young)
+    /// What the device may be shown: the controller's value and its own, when both are young.
+    fn showable(&self, now: Instant) -> Option<(f32, u8)> {
+        let is_young = |at: Option<Instant>| at.is_some_and(|at| now.saturating_since(at) <= STALE_AFTER);
+        let shown = self.source.zip(self.bits.newest);
+        shown.filter(|_| is_young(self.source_at) && is_young(self.frame_at))
     }
 }
 
 impl Judge for Facts {
-    fn told(&mut self, now: Instant, input: &Input<'_>, conns: &Conns) -> Result<(), Broken> {
+    fn told(&mut self, now: Instant, input: &Input<'_>, conns: &mut Conns) {
         match *input {
             Input::Tick => self.deaf_until = self.deaf_until.filter(|&until| now < until),
             Input::PortBytes { bytes, .. } => self.frame(now, bytes, conns),
@@ -420,12 +444,15 @@ impl Judge for Facts {
                 }
             }
             Input::LinkBytes { link, bytes } if conns.is_open(link) => match link {
+                LinkId::STATE if bytes.len() > 1468 => {
+                    conns.must_close(now, link);
+                    self.lost(now, link);
+                }
                 LinkId::STATE => self.packet(now, bytes),
                 _ => self.recipe_frame(now, bytes),
             },
             _ => {}
         }
-        Ok(())
     }
 
     fn down(&mut self, _: Instant, _: LinkId, _: Is, _: &mut Conns) {}
@@ -433,6 +460,11 @@ impl Judge for Facts {
     fn deadlines(&mut self, now: Instant, conns: &mut Conns) -> Result<(), Broken> {
         if self.bits.deadlines(now) {
             self.float.overdue();
+        }
+        if self.way == Way::Tcp && now >= self.cycle_at {
+            let cycle = CYCLE.as_micros();
+            self.cycle_at = Instant::from_micros((now.as_micros() / cycle + 1) * cycle);
+            self.is_due |= self.is_up;
         }
         for link in conns.overdue(now).into_iter().chain(conns.not_opened(now)) {
             conns.must_close(now, link);
@@ -510,8 +542,11 @@ impl Judge for Facts {
             return Err(format!("sends {bits} instead of {:?}", self.bits.newest));
         }
         self.float.taken();
-        if self.bits.unconfirmed_since.is_some() {
-            self.repeat_at.get_or_insert(now + REPEAT);
+        if let Some(since) = self.bits.unconfirmed_since
+            && (self.repeat_at.is_none() || now.saturating_since(since) < REPEAT_FAST_FOR)
+        {
+            let next = now + REPEAT;
+            self.repeat_at = Some(self.repeat_at.map_or(next, |at| at.min(next)));
         }
         if let Some(greet_at) = &mut self.greet_at {
             *greet_at = (*greet_at).max(now + GREET_EVERY);
@@ -521,15 +556,15 @@ impl Judge for Facts {
     }
 
     fn shown(&mut self, now: Instant, bytes: &[u8]) -> Result<(), Broken> {
-        let [255, 255, a, b, c, d, 254, 254] = *bytes else {
+        let [255, 255, a, b, c, d, bits, 254, 254] = *bytes else {
             return Err(format!("sends {bytes:?} to the field"));
         };
-        let value = f32::from_le_bytes([a, b, c, d]);
+        let shown = (f32::from_le_bytes([a, b, c, d]), bits);
         if !std::mem::take(&mut self.is_due) {
-            return Err("answers the device, which asked nothing".to_owned());
+            return Err("sends to the field what is not due".to_owned());
         }
-        if Some(value) != self.showable(now) {
-            return Err(format!("shows the device {value} instead of {:?}", self.showable(now)));
+        if Some(shown) != self.showable(now) {
+            return Err(format!("shows the device {shown:?} instead of {:?}", self.showable(now)));
         }
         Ok(())
     }
@@ -545,7 +580,7 @@ impl Judge for Facts {
                 return Err("does not greet".to_owned());
             }
             if std::mem::take(&mut self.is_due) && self.showable(now).is_some() {
-                return Err("does not answer the device".to_owned());
+                return Err("shows the device nothing".to_owned());
             }
         }
         let image = engine.image();

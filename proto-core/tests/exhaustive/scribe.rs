@@ -265,7 +265,7 @@ impl Scribe {
             b"transaction" | b"stale" | b"sleeps" | b"frames_sent" | b"packets" | b"misaligned"
             | b"dropped" | b"counted" => Word::Field(Field::Counter),
             b"bytes" | b"group" | b"ring" | b"buffer" | b"mask" => Word::Field(Field::Buffer),
-            b"stamps" => Word::Field(Field::Stamps),
+            b"stamps" | b"packet_at" | b"source_at" | b"frame_at" => Word::Field(Field::Stamps),
             b"unconfirmed_since" => Word::Field(Field::Unconfirmed),
             b"at" => Word::Field(Field::At),
             b"since" => Word::Field(Field::Since),

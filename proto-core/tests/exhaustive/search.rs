@@ -25,8 +25,8 @@ pub struct Findings {
     pub states: usize,
     /// Events that were tried.
     pub steps: usize,
-    /// Sequences of exactly so many events as the depth, those that run through states that were known
-    /// included.
+    /// Sequences of as many events as the depth allows, those that run through states that were known
+    /// included; shorter ones are the beginnings of these.
     pub sequences: u128,
     /// What was broken, and the shortest sequence to it.
     pub broken: Vec<(Broken, String)>,
@@ -48,7 +48,7 @@ const MOST_BROKEN: usize = 12;
 
 impl<W: World> Path<W> {
     /// The world of a state.
-    fn to(&mut self, nodes: &[Node<W::Event>], roots: &[W], state: u32) -> W {
+    fn to(&mut self, nodes: &[Node<W::Event>], roots: &[Root<W>], state: u32) -> W {
         let mut way = vec![state];
         loop {
             let last = way[way.len() - 1];
@@ -57,7 +57,7 @@ impl<W: World> Path<W> {
                 break;
             }
             if nodes[last as usize].event.is_none() {
-                self.0 = vec![(last, roots[last as usize].clone())];
+                self.0 = vec![(last, roots[last as usize].world.clone())];
                 break;
             }
             way.push(nodes[last as usize].parent);
@@ -73,20 +73,26 @@ impl<W: World> Path<W> {
     }
 }
 
+/// Where a search begins, and how much less deep than from elsewhere it goes.
+pub struct Root<W> {
+    pub name: &'static str,
+    pub world: W,
+    pub spared: usize,
+}
+
 /// Runs everything. With `merges`, states with the same fingerprint are one.
-pub fn search<W: World>(roots: &[W], depth: usize, merges: bool) -> Findings {
+pub fn search<W: World>(roots: &[Root<W>], depth: usize, merges: bool) -> Findings {
     let mut nodes: Vec<Node<W::Event>> = Vec::new();
     let mut known: HashMap<u64, u32> = HashMap::new();
     let mut targets: Vec<u32> = Vec::new();
     let mut broken: Vec<(Broken, String)> = Vec::new();
-    for root in roots {
-        known.insert(root.fingerprint(0), nodes.len() as u32);
-        nodes.push(Node { parent: 0, event: None, steps: 0..0 });
-    }
-    let mut level = 0..nodes.len();
+    // Roots stand at the front, so that their places are those of their worlds.
+    nodes.extend(roots.iter().map(|_| Node { parent: 0, event: None, steps: 0..0 }));
+    let mut level = 0..0;
     let mut path = Path(Vec::new());
     for left in (0..depth).rev() {
-        for state in level.clone() {
+        let begins = |nth: &usize| roots[*nth].spared == depth - 1 - left;
+        for state in (0..roots.len()).filter(begins).chain(level.clone()) {
             let world = path.to(&nodes, roots, state as u32);
             let start = targets.len() as u32;
             for event in world.events() {
@@ -94,7 +100,7 @@ pub fn search<W: World>(roots: &[W], depth: usize, merges: bool) -> Findings {
                 let target = match next.happen(event) {
                     Err(what) => {
                         if !broken.iter().any(|(other, _)| *other == what) && broken.len() < MOST_BROKEN {
-                            broken.push((what, way_to(&nodes, state, event)));
+                            broken.push((what, way_to(&nodes, roots, state, event)));
                         }
                         continue;
                     }
@@ -115,34 +121,37 @@ pub fn search<W: World>(roots: &[W], depth: usize, merges: bool) -> Findings {
             }
             nodes[state].steps = start..targets.len() as u32;
         }
-        level = level.end..nodes.len();
+        level = level.end.max(roots.len())..nodes.len();
     }
-    let sequences = count(&nodes, &targets, roots.len(), depth);
+    let sequences = count(&nodes, &targets, roots, depth);
     Findings { states: nodes.len(), steps: targets.len(), sequences, broken }
 }
 
 /// Sequences of `depth` events from the roots.
-fn count<E>(nodes: &[Node<E>], targets: &[u32], roots: usize, depth: usize) -> u128 {
+fn count<W: World>(nodes: &[Node<W::Event>], targets: &[u32], roots: &[Root<W>], depth: usize) -> u128 {
     // Of each state, the sequences of 0, 1, 2.. events that begin there.
     let mut longer = vec![1_u128; nodes.len()];
-    for _ in 0..depth {
-        let ways = |node: &Node<E>| {
+    let mut sequences = 0;
+    for length in 1..=depth {
+        let ways = |node: &Node<W::Event>| {
             let targets = &targets[node.steps.start as usize..node.steps.end as usize];
             targets.iter().map(|&target| longer.get(target as usize).copied().unwrap_or(1)).sum()
         };
         longer = nodes.iter().map(ways).collect();
+        let whole = |(root, _): &(&Root<W>, &u128)| root.spared == depth - length;
+        sequences += roots.iter().zip(&longer).filter(whole).map(|(_, ways)| ways).sum::<u128>();
     }
-    longer[..roots].iter().sum()
+    sequences
 }
 
-fn way_to<E: Copy + Debug>(nodes: &[Node<E>], state: usize, last: E) -> String {
+fn way_to<W: World>(nodes: &[Node<W::Event>], roots: &[Root<W>], state: usize, last: W::Event) -> String {
     let mut way = vec![format!("{last:?}")];
     let mut at = state;
     while let Some(event) = nodes[at].event {
         way.push(format!("{event:?}"));
         at = nodes[at].parent as usize;
     }
-    way.push(format!("root {at}"));
+    way.push(roots[at].name.to_owned());
     way.reverse();
     way.join(", ")
 }
