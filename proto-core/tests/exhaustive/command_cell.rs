@@ -1,7 +1,7 @@
 //! A CAN port with one bit and one command field; the bit goes by Modbus, `run` and `stop` by port 2000.
 
 use proto_core::config::{CanFramePart, CommandWhen, GatewayConfig, InputBinding, Parts};
-use proto_core::engine::{BusState, Input, LinkId};
+use proto_core::engine::{BusState, Input, LinkId, PortState};
 use proto_core::recipe::CanFrame;
 use proto_core::recipe::model::{CanId, Mode};
 use proto_core::time::{Duration, Instant};
@@ -468,6 +468,15 @@ impl Judge for Facts {
         let value = engine.image().is_known(var(BIT)).then(|| engine.image().value(var(BIT)));
         if value != self.bits.newest.map(Scalar::Byte) {
             return Err(format!("shows {value:?} instead of {:?}", self.bits.newest));
+        }
+        let state = match () {
+            () if !self.is_up => PortState::Gone,
+            () if self.is_bus_off => PortState::BusOff,
+            () if self.bits.is_silent() => PortState::Silent,
+            () => PortState::Working,
+        };
+        if engine.port_state(PORT) != Some(state) {
+            return Err(format!("says that its port is {:?} instead of {state:?}", engine.port_state(PORT)));
         }
         let counters = engine.port_counters(PORT).ok_or("the port is missing")?;
         let counted = [counters.frames_in, counters.asleep];

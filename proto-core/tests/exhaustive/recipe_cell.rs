@@ -2,7 +2,7 @@
 //! shown a float of the controller's and its own bit.
 
 use proto_core::config::{Bus, GatewayConfig, InputBinding, OnStale, OutputBinding, Parts, SendOn};
-use proto_core::engine::{Input, LinkId, PortId};
+use proto_core::engine::{Input, LinkId, PortId, PortState};
 use proto_core::recipe::model::Mode;
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::scalar::{Scalar, ScalarType};
@@ -587,6 +587,14 @@ impl Judge for Facts {
         let known = |name| image.is_known(var(name)).then(|| image.value(var(name)));
         if known(BIT) != self.bits.newest.map(Scalar::Byte) {
             return Err(format!("has {:?} instead of {:?}", known(BIT), self.bits.newest));
+        }
+        let state = match () {
+            () if !self.is_up => PortState::Gone,
+            () if self.bits.is_silent() => PortState::Silent,
+            () => PortState::Working,
+        };
+        if engine.port_state(PORT) != Some(state) {
+            return Err(format!("says that its port is {:?} instead of {state:?}", engine.port_state(PORT)));
         }
         let counters = engine.port_counters(PORT).ok_or("the port is missing")?;
         let counted = [counters.frames_in, counters.rejected_not_finite, counters.asleep];

@@ -132,6 +132,11 @@ impl Bits {
         Ok(())
     }
 
+    /// A frame is overdue, or has never come.
+    pub fn is_silent(&self) -> bool {
+        self.overdue_at.is_none()
+    }
+
     pub fn is_safe(&self) -> bool {
         self.safe.is_some()
     }
