@@ -1,13 +1,14 @@
 //! The cell's run loop: what is due, whom it is for, and what that leads to.
 
-use proto_core::engine::{Input, LinkId, OUTPUT_BUFFER, Output, PortId};
+use proto_core::engine::{Input, LinkId, OUTPUT_BUFFER, Output};
 use proto_core::recipe::CanFrame;
 use proto_core::recipe::model::CanId;
 use proto_core::time::{Duration, Instant};
 use std::net::SocketAddr;
 
 use super::line::{Chunk, Chunking};
-use super::network::{Connection, Door, Item, Peer, Way};
+use super::network::{Connection, Door, Item, Peer, Speaker, Way};
+use super::sleep::Told;
 use super::{BusId, Cell, DESK, End, LineId, Owner, What, udp_peer};
 use crate::controller::{ControllerInput, ControllerOutput, Link};
 
@@ -33,6 +34,7 @@ pub(super) enum Due {
     DatagramUp {
         link: LinkId,
         peer: SocketAddr,
+        tag: u64,
         bytes: Vec<u8>,
     },
     DatagramDown {
@@ -42,10 +44,12 @@ pub(super) enum Due {
     },
     ClientDatagramUp {
         port: usize,
+        tag: u64,
         bytes: Vec<u8>,
     },
     ClientDatagramDown {
         link: LinkId,
+        from: Speaker,
         bytes: Vec<u8>,
     },
     Unreachable {
@@ -73,6 +77,45 @@ pub(super) enum Due {
     TimedOut {
         conn: u64,
     },
+    /// A connection is asked for again.
+    Knock {
+        link: LinkId,
+        turn: u64,
+        pause: Duration,
+    },
+    /// The gateway's reset comes to the controller.
+    ResetUp {
+        conn: u64,
+    },
+    /// The controller's comes to the gateway.
+    ResetDown {
+        conn: u64,
+    },
+    /// What was lost of a connection is sent again.
+    SendAgain {
+        conn: u64,
+        way: Way,
+    },
+    /// The controller's TCP acknowledges what has come.
+    AckLeaves {
+        conn: u64,
+    },
+    /// Its acknowledgement comes to the gateway.
+    Ack {
+        conn: u64,
+        upto: u64,
+    },
+    /// The gateway's driver looks at what is acknowledged.
+    Look {
+        link: LinkId,
+        turn: u64,
+    },
+    /// The gateway is called again.
+    Wake {
+        turn: u64,
+    },
+    /// The model that watches looks at how everything is.
+    Survey,
 }
 
 impl Cell {
@@ -103,7 +146,7 @@ impl Cell {
             return;
         }
         self.poll_devices();
-        if self.engine_wake <= self.now {
+        if self.engine_wake <= self.now && !self.is_asleep() {
             self.engine_input(Input::Tick);
         }
         if self.controller_wake <= self.now {
@@ -115,7 +158,8 @@ impl Cell {
         let lines = self.lines.iter().filter_map(|line| line.device.as_ref()).map(|device| device.deadline());
         let buses = self.buses.iter().filter_map(|bus| bus.device.as_ref()).map(|device| device.deadline());
         let devices = lines.chain(buses).min().unwrap_or(Instant::NEVER);
-        self.queue.next().min(self.engine_wake).min(self.controller_wake).min(devices)
+        let engine = if self.is_asleep() { Instant::NEVER } else { self.engine_wake };
+        self.queue.next().min(engine).min(self.controller_wake).min(devices)
     }
 
     fn poll_devices(&mut self) {
@@ -214,8 +258,8 @@ impl Cell {
         }
         if let Some(oracle) = &mut self.oracle {
             match output {
-                Output::Sleep { .. } => {
-                    oracle.rest(now, &self.engine, self.queue.len() + self.conns.len());
+                Output::Sleep { until } => {
+                    oracle.rest(now, &self.engine, until, self.queue.len() + self.conns.len());
                 }
                 _ => oracle.output(now, &output),
             }
@@ -287,12 +331,20 @@ impl Cell {
                     };
                     let conns = self.conns.iter().filter(|(_, conn)| subscribed(conn));
                     let conns: Vec<u64> = conns.map(|(&id, _)| id).collect();
+                    let mut packet = bytes.to_vec();
+                    self.spoil_packet(&mut packet);
                     for conn in conns {
-                        self.send_item(conn, Way::Down, Item::Bytes(bytes.to_vec()));
+                        self.send_item(conn, Way::Down, Item::Bytes(packet.clone()));
                     }
                 }
-                ControllerOutput::UdpSend { peer, bytes } => self.udp_down(peer, &bytes),
-                ControllerOutput::PortSend { port, bytes } => {
+                ControllerOutput::UdpSend { peer, mut bytes } => {
+                    self.spoil_frame(LinkId::RECIPE_UDP, &mut bytes);
+                    self.udp_down(peer, &bytes);
+                }
+                ControllerOutput::PortSend { port, mut bytes } => {
+                    if let Some(link) = self.clients.get(&port).and_then(|client| client.link) {
+                        self.spoil_frame(link, &mut bytes);
+                    }
                     self.trace.add(now, What::ControllerPortSent, port as u64, &bytes);
                     self.controller_port_sends(port, bytes);
                 }
@@ -317,7 +369,8 @@ impl Cell {
         }
     }
 
-    fn carry_out(&mut self, due: Due) {
+    pub(super) fn carry_out(&mut self, due: Due) {
+        let Some(due) = self.keep_for_later(due) else { return };
         match due {
             Due::LinkUp { link, turn } => {
                 if self.is_turn(link, turn) {
@@ -337,14 +390,20 @@ impl Cell {
                 }
             }
             Due::Arrival { conn, way } => self.arrive(conn, way),
-            Due::DatagramUp { link, peer, bytes } => {
+            Due::DatagramUp { link, peer, tag, bytes } => {
+                if self.gate(link).is_cut(Way::Up) {
+                    return;
+                }
                 self.trace.add(self.now, What::ControllerReceived, link.0.into(), &bytes);
                 let before = self.inputs_before();
                 self.controller_input(ControllerInput::Udp2011 { peer, bytes: &bytes });
-                self.datagram_arrived(link, &bytes, before);
+                self.datagram_arrived(link, tag, &bytes, before);
             }
             Due::DatagramDown { link, peer, bytes } => {
                 let gate = self.gate(link);
+                if gate.is_cut(Way::Down) {
+                    return;
+                }
                 if gate.is_up && udp_peer(gate.turn) == peer {
                     self.engine_input(Input::LinkBytes { link, bytes: &bytes });
                 } else {
@@ -352,23 +411,16 @@ impl Cell {
                     self.queue.push(back, Due::Unreachable { peer });
                 }
             }
-            Due::ClientDatagramUp { port, bytes } => {
+            Due::ClientDatagramUp { port, tag, bytes } => {
+                let Some(link) = self.clients.get(&port).and_then(|client| client.link) else { return };
+                if self.gate(link).is_cut(Way::Up) {
+                    return;
+                }
                 let before = self.inputs_before();
                 self.controller_input(ControllerInput::PortBytes { port, bytes: &bytes });
-                if let Some(link) = self.clients.get(&port).and_then(|client| client.link) {
-                    self.datagram_arrived(link, &bytes, before);
-                }
+                self.datagram_arrived(link, tag, &bytes, before);
             }
-            Due::ClientDatagramDown { link, bytes } => {
-                let gate = self.gate(link);
-                if gate.is_open && !gate.is_up {
-                    gate.is_up = true;
-                    self.engine_input(Input::LinkUp { link });
-                }
-                if self.gate(link).is_up {
-                    self.engine_input(Input::LinkBytes { link, bytes: &bytes });
-                }
-            }
+            Due::ClientDatagramDown { link, from, bytes } => self.client_datagram(link, from, &bytes),
             Due::Unreachable { peer } => self.controller_input(ControllerInput::Udp2011Unreachable { peer }),
             Due::ClientTries { port } => self.client_tries(port),
             Due::Chunk { line, chunk } => self.chunk_arrives(line, chunk),
@@ -381,6 +433,41 @@ impl Cell {
             Due::CanDone { bus } => self.can_done(bus),
             Due::DeviceSends { line, bytes } => self.send(line, &bytes),
             Due::TimedOut { conn } => self.reset_conn(conn),
+            Due::Knock { link, turn, pause } => self.knock(link, turn, pause),
+            Due::ResetUp { conn } => self.reset_up(conn),
+            Due::ResetDown { conn } => self.reset_down(conn),
+            Due::SendAgain { conn, way } => self.send_again(conn, way),
+            Due::AckLeaves { conn } => self.ack_leaves(conn),
+            Due::Ack { conn, upto } => self.ack(conn, upto),
+            Due::Look { link, turn } => {
+                if self.is_turn(link, turn) && !self.is_asleep() {
+                    self.tell_acked(link);
+                }
+            }
+            Due::Wake { turn } => self.wake(turn),
+            Due::Survey => self.survey(),
+        }
+    }
+
+    /// A datagram came to a port where the gateway listens: it answers whoever opened, and moves only
+    /// to the sender of a frame.
+    fn client_datagram(&mut self, link: LinkId, from: Speaker, bytes: &[u8]) {
+        let gate = self.gate(link);
+        if gate.is_cut(Way::Down) && from != Speaker::Stranger || !gate.is_open {
+            return;
+        }
+        if !gate.is_up {
+            gate.is_up = true;
+            gate.partner = Some(from);
+            self.engine_input(Input::LinkUp { link });
+        } else if gate.partner != Some(from) && self.engine.is_frame(link, bytes) {
+            self.gate(link).partner = Some(from);
+        }
+        if let Some(oracle) = &mut self.oracle {
+            oracle.spoke(link, from, bytes);
+        }
+        if self.gate(link).is_up {
+            self.engine_input(Input::LinkBytes { link, bytes });
         }
     }
 
@@ -393,10 +480,10 @@ impl Cell {
         super::oracle::inputs_of(self.controller.registers().image())
     }
 
-    fn datagram_arrived(&mut self, link: LinkId, bytes: &[u8], before: Option<Vec<u8>>) {
-        let after = self.inputs_before();
+    fn datagram_arrived(&mut self, link: LinkId, tag: u64, bytes: &[u8], before: Option<Vec<u8>>) {
+        let (after, slowest) = (self.inputs_before(), self.gate(link).network.slowest());
         if let (Some(oracle), Some(before), Some(after)) = (&mut self.oracle, before, after) {
-            oracle.arrived_datagram(link, bytes, &before, &after, self.now);
+            oracle.arrived_datagram(link, tag, bytes, (&before, &after), slowest, self.now);
         }
     }
 
@@ -444,7 +531,7 @@ impl Cell {
 
     fn port_receives(&mut self, owner: Owner, bytes: &[u8]) {
         match owner {
-            Owner::Gateway(port) => self.engine_input(Input::PortBytes { port, bytes }),
+            Owner::Gateway(port) => self.tell_of_port(port, Told::Bytes(bytes.to_vec())),
             Owner::Controller(port) => self.controller_input(ControllerInput::PortBytes { port, bytes }),
         }
     }
@@ -463,7 +550,7 @@ impl Cell {
         let mut answers = Vec::new();
         match crossed.from {
             End::Device if crossed.arrives => match owner {
-                Owner::Gateway(port) => self.engine_input(Input::PortCan { port, frame: crossed.frame }),
+                Owner::Gateway(port) => self.tell_of_port(port, Told::Frame(crossed.frame)),
                 Owner::Controller(port) => {
                     self.controller_input(ControllerInput::PortCan { port, frame: crossed.frame });
                 }
@@ -488,7 +575,7 @@ impl Cell {
 
     fn port_sent(&mut self, owner: Owner) {
         match owner {
-            Owner::Gateway(port) => self.engine_input(Input::PortSent { port }),
+            Owner::Gateway(port) => self.tell_of_port(port, Told::Sent),
             Owner::Controller(port) => self.controller_input(ControllerInput::PortSent { port }),
         }
     }
@@ -502,9 +589,8 @@ impl Cell {
     }
 
     pub(super) fn port_input(&mut self, owner: Owner, is_up: bool) {
-        let engine = |port: PortId| if is_up { Input::PortUp { port } } else { Input::PortDown { port } };
         match owner {
-            Owner::Gateway(port) => self.engine_input(engine(port)),
+            Owner::Gateway(port) => self.tell_of_port(port, if is_up { Told::Up } else { Told::Down }),
             Owner::Controller(port) if is_up => self.controller_input(ControllerInput::PortUp { port }),
             Owner::Controller(port) => self.controller_input(ControllerInput::PortDown { port }),
         }

@@ -4,7 +4,8 @@ use proto_core::engine::{BusState, Engine, Input, LinkId, LinkKind};
 use proto_core::time::Duration;
 
 use super::drive::Due;
-use super::network::{Connection, Door, Peer, Way};
+use super::network::{Connection, Door, Peer, Speaker, Way};
+use super::sleep::Told;
 use super::{BusId, Cell, Entry, LineId, Owner, What};
 
 /// Faults of the network.
@@ -55,7 +56,42 @@ impl Cell {
         if let Some(conn) = self.conns.get_mut(&id) {
             conn.pipe(way).held = false;
             self.queue.push(self.now, Due::Arrival { conn: id, way });
+            if way == Way::Down {
+                // So are acknowledgements.
+                self.queue.push(self.now, Due::Ack { conn: id, upto: conn.up.arrived });
+            }
         }
+    }
+
+    /// What goes this way on the link is lost from now on, until as many [`Self::mend_way`]: a burst
+    /// of lost datagrams; a peer whose TCP acknowledges nothing, or takes nothing. TCP sends it again.
+    pub fn cut_way(&mut self, link: LinkId, way: Way) {
+        self.note(link);
+        self.gate(link).cuts[way as usize] += 1;
+    }
+
+    /// What is sent from now on arrives.
+    pub fn mend_way(&mut self, link: LinkId, way: Way) {
+        self.note(link);
+        let cuts = &mut self.gate(link).cuts[way as usize];
+        *cuts = cuts.saturating_sub(1);
+    }
+
+    /// The cable between gateway and controller is out: nothing gets through on this link.
+    pub fn cut_cable(&mut self, link: LinkId) {
+        Way::BOTH.into_iter().for_each(|way| self.cut_way(link, way));
+    }
+
+    /// The cable is in again.
+    pub fn mend_cable(&mut self, link: LinkId) {
+        Way::BOTH.into_iter().for_each(|way| self.mend_way(link, way));
+    }
+
+    /// Somebody else on the controller's host sends a datagram to a port where the gateway listens.
+    pub fn stranger_sends(&mut self, link: LinkId, bytes: &[u8]) {
+        self.note(link);
+        let due = Due::ClientDatagramDown { link, from: Speaker::Stranger, bytes: bytes.to_vec() };
+        self.queue.push(self.now, due);
     }
 
     /// The connection is gone and neither end is told: what they send is lost for ever. TCP itself
@@ -87,6 +123,7 @@ impl Cell {
 
     fn note(&mut self, link: LinkId) {
         self.trace.add(self.now, What::Fault, link.0.into(), &[]);
+        self.disturb(Some(link));
     }
 
     fn connection(&mut self, link: LinkId) -> Option<&mut Connection> {
@@ -102,7 +139,10 @@ impl Cell {
             let turn = gate.turn;
             self.queue.push(self.now, Due::LinkDown { link: conn.link, turn });
         }
-        self.controller_closed(id, conn.peer);
+        // And the controller may have forgotten its own.
+        if !conn.forgotten {
+            self.controller_closed(id, conn.peer);
+        }
     }
 }
 
@@ -157,7 +197,7 @@ impl Cell {
     fn bus_state(&mut self, bus: BusId, state: BusState) {
         // The simulated controller's own CAN port knows no error states.
         if let Owner::Gateway(port) = self.buses[bus.0].owner {
-            self.engine_input(Input::PortBus { port, state });
+            self.tell_of_port(port, Told::Bus(state));
         }
     }
 }
@@ -169,6 +209,48 @@ impl Cell {
         let now = self.now;
         self.trace.add(now, What::Fault, Entry::CONTROLLER, &[]);
         self.controller_mut().restart(now);
+        self.begun_anew();
+    }
+
+    /// The controller loses its power: its ends of all connections are gone without a word, and nobody
+    /// is there. [`Self::power_up`] ends it.
+    pub fn power_cut(&mut self) {
+        let links: Vec<LinkId> = self.link_ids().collect();
+        links.into_iter().for_each(|link| self.cut_cable(link));
+        let conns: Vec<(u64, Peer)> = self.conns.iter().map(|(&id, conn)| (id, conn.peer)).collect();
+        for (id, peer) in conns {
+            let Some(conn) = self.conns.get_mut(&id) else { continue };
+            match peer {
+                _ if conn.forgotten => continue,
+                _ if conn.abandoned || conn.closing => drop(self.conns.remove(&id)),
+                // The gateway goes on asking.
+                Peer::Server(_) if !conn.accepted => continue,
+                Peer::Client(_) if !conn.accepted => {
+                    let link = conn.link;
+                    self.conns.remove(&id);
+                    self.gate(link).conn = None;
+                }
+                _ => {
+                    conn.forgotten = true;
+                    conn.down.forget();
+                }
+            }
+            self.controller_closed(id, peer);
+        }
+    }
+
+    /// It has power again, and begins afresh.
+    pub fn power_up(&mut self) {
+        let links: Vec<LinkId> = self.link_ids().collect();
+        links.into_iter().for_each(|link| self.mend_cable(link));
+        self.restart_controller();
+    }
+
+    fn begun_anew(&mut self) {
+        self.clients.values_mut().for_each(|client| client.socket += 1);
+        if let Some(oracle) = &mut self.oracle {
+            oracle.controller_began(self.now);
+        }
     }
 
     /// The controller comes back with software that speaks this dialect.
@@ -176,17 +258,20 @@ impl Cell {
         let now = self.now;
         self.trace.add(now, What::Fault, Entry::CONTROLLER, dialect.as_bytes());
         self.controller_mut().replace_software(now, dialect);
+        self.begun_anew();
     }
 
     /// The gateway loses its power and starts again: its connections are reset, its counters
     /// begin afresh.
     pub fn restart_gateway(&mut self) {
         self.trace.add(self.now, What::Fault, Entry::GATEWAY, &[]);
-        let conns: Vec<(u64, Peer)> = self.conns.iter().map(|(&id, conn)| (id, conn.peer)).collect();
+        let known = self.conns.iter().filter(|(_, conn)| !conn.forgotten);
+        let conns: Vec<(u64, Peer)> = known.map(|(&id, conn)| (id, conn.peer)).collect();
         for gate in self.gates.values_mut() {
             gate.set_open(false);
         }
         self.conns.clear();
+        self.forget_waiting();
         // The same configuration made the engine that there was.
         if let Ok(engine) = Engine::new(&self.gateway) {
             if let Some(recorder) = &mut self.recorder {
@@ -196,7 +281,7 @@ impl Cell {
             *self.engine = engine;
         }
         if let Some(oracle) = &mut self.oracle {
-            oracle.restarted();
+            oracle.restarted(self.now);
         }
         self.engine_wake = self.now;
         let ports: Vec<_> = self.engine.field_ports().collect();
@@ -212,6 +297,20 @@ impl Cell {
     pub fn tcp_links(&self) -> impl Iterator<Item = LinkId> + '_ {
         let is_tcp = |kind| !matches!(kind, LinkKind::RecipeUdp | LinkKind::RecipeUdpListen { .. });
         self.gates.values().filter(move |gate| is_tcp(gate.kind)).map(|gate| gate.id)
+    }
+
+    /// The others.
+    pub fn datagram_links(&self) -> impl Iterator<Item = LinkId> + use<> {
+        let is_udp = |kind| matches!(kind, LinkKind::RecipeUdp | LinkKind::RecipeUdpListen { .. });
+        let links: Vec<LinkId> =
+            self.gates.values().filter(|gate| is_udp(gate.kind)).map(|gate| gate.id).collect();
+        links.into_iter()
+    }
+
+    /// The links where the gateway listens for datagrams, and how long the controller's frames are.
+    pub(super) fn listening_for_datagrams(&self) -> Vec<(LinkId, Option<usize>)> {
+        let listen = self.gates.values().filter(|gate| matches!(gate.kind, LinkKind::RecipeUdpListen { .. }));
+        listen.map(|gate| (gate.id, self.frame_len(gate.id))).collect()
     }
 
     /// Every link.

@@ -35,8 +35,12 @@ mod oracle;
 mod queue;
 mod recording;
 mod rng;
+mod sleep;
+mod spoil;
+mod survey;
 #[cfg(test)]
 mod tamper;
+mod tcp;
 mod trace;
 mod traffic;
 mod trouble;
@@ -47,6 +51,7 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use proto_core::config::{Bus, GatewayConfig};
 use proto_core::engine::{BuildError as EngineError, Engine, LinkId, LinkInfo, PortCounters, PortId};
 use proto_core::recipe::CanFrame;
+use proto_core::sysvar::SysVar;
 use proto_core::time::{Duration, Instant};
 
 pub use can::{BusCounters, CanBus};
@@ -118,6 +123,8 @@ struct Client {
     link: Option<LinkId>,
     is_tcp: bool,
     conn: Option<u64>,
+    /// Which socket it sends datagrams from.
+    socket: u64,
 }
 
 /// The cell.
@@ -138,6 +145,14 @@ pub struct Cell {
     buses: Vec<CanBus>,
     names: BTreeMap<String, Far>,
     controller_names: BTreeMap<String, Far>,
+    /// What waits for the gateway while it is not called.
+    asleep: Option<sleep::Waiting>,
+    wakes_at: Instant,
+    stalls: u64,
+    /// How many faults each of the controller's servers has at present.
+    ailments: [u32; 3],
+    /// What the controller sends of these variables is this.
+    spoilt: BTreeMap<SysVar, f32>,
     rng: Rng,
     trace: Trace,
     recorder: Option<Recorder>,
@@ -199,6 +214,11 @@ impl Cell {
             buses: Vec::new(),
             names: BTreeMap::new(),
             controller_names: BTreeMap::new(),
+            asleep: None,
+            wakes_at: START,
+            stalls: 0,
+            ailments: [0; 3],
+            spoilt: BTreeMap::new(),
             rng: Rng::new(seed),
             trace: Trace::new(),
             recorder,
@@ -218,8 +238,9 @@ impl Cell {
     /// time has passed.
     pub fn watch(&mut self) {
         let mut oracle = Box::new(Oracle::new(&self.gateway));
-        oracle.begin(&self.engine, self.now);
+        oracle.begin(&self.engine, self.engine_wake, self.now);
         self.oracle = Some(oracle);
+        self.queue.push(self.now, Due::Survey);
     }
 
     /// The first invariant that did not hold.
@@ -274,12 +295,12 @@ impl Cell {
                 SimBus::UdpServer => continue,
                 SimBus::TcpClient { to } => {
                     let link = self.listener(to, true);
-                    self.clients.insert(nth, Client { link, is_tcp: true, conn: None });
+                    self.clients.insert(nth, Client { link, is_tcp: true, conn: None, socket: 0 });
                     continue;
                 }
                 SimBus::UdpClient { to } => {
                     let link = self.listener(to, false);
-                    self.clients.insert(nth, Client { link, is_tcp: false, conn: None });
+                    self.clients.insert(nth, Client { link, is_tcp: false, conn: None, socket: 0 });
                     continue;
                 }
             };

@@ -1,11 +1,10 @@
 //! Connections and datagrams between the gateway and the controller.
 
-use std::collections::VecDeque;
-
 use proto_core::engine::{LinkId, LinkKind};
 use proto_core::time::{Duration, Instant};
 
 use super::rng::Rng;
+use super::tcp::Pipe;
 use crate::controller::Link;
 
 /// How one link's network behaves.
@@ -25,6 +24,15 @@ pub struct Network {
     pub loss_ppm: u32,
     /// How many of a million come twice.
     pub duplicate_ppm: u32,
+    /// The controller's TCP acknowledges this long after something has come, unless it has something
+    /// to send before.
+    pub ack_delay: Duration,
+    /// The gateway's driver looks this often at what is acknowledged, and each time before it hands
+    /// over what was received; zero: it is told at once.
+    pub ack_report: Duration,
+    /// How many bytes the gateway's transport keeps that are not acknowledged; behind that the driver
+    /// waits for room before it reports a transmission as taken.
+    pub send_buffer: u64,
 }
 
 impl Default for Network {
@@ -37,7 +45,17 @@ impl Default for Network {
             merge: Duration::ZERO,
             loss_ppm: 0,
             duplicate_ppm: 0,
+            ack_delay: Duration::ZERO,
+            ack_report: Duration::ZERO,
+            send_buffer: 64 * 1024,
         }
+    }
+}
+
+impl Network {
+    /// How long a segment or datagram takes at most when nothing is broken.
+    pub fn slowest(&self) -> Duration {
+        self.delay + self.jitter + self.merge
     }
 }
 
@@ -48,6 +66,18 @@ pub enum Way {
     Up,
     /// From the controller to the gateway.
     Down,
+}
+
+impl Way {
+    /// Both.
+    pub(super) const BOTH: [Self; 2] = [Self::Up, Self::Down];
+
+    pub(super) const fn back(self) -> Self {
+        match self {
+            Self::Up => Self::Down,
+            Self::Down => Self::Up,
+        }
+    }
 }
 
 /// What becomes of an attempt to connect.
@@ -65,18 +95,58 @@ pub(super) struct Gate {
     pub kind: LinkKind,
     pub network: Network,
     pub door: Door,
+    /// What goes this way is lost, by [`Way`]: so many faults want it so.
+    pub cuts: [u32; 2],
     pub is_open: bool,
     pub is_up: bool,
     /// One more with each opening and closing: reports of an earlier turn are dropped.
     pub turn: u64,
     pub conn: Option<u64>,
+    /// The transport has no room for what was handed over last: nothing was reported of it yet.
+    pub is_full: bool,
+    /// The driver is going to look at what is acknowledged.
+    pub looks: bool,
+    /// Whom the gateway answers, where it listens for datagrams.
+    pub partner: Option<Speaker>,
     pub rng: Rng,
+}
+
+/// Who sends datagrams to a port where the gateway listens.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Speaker {
+    /// The controller's client; its socket is another one after each restart.
+    Client { socket: u64 },
+    /// Another program on the controller's host.
+    Stranger,
 }
 
 impl Gate {
     pub(super) fn new(id: LinkId, kind: LinkKind, rng: Rng) -> Self {
         let network = Network::default();
-        Self { id, kind, network, door: Door::Open, is_open: false, is_up: false, turn: 0, conn: None, rng }
+        Self {
+            id,
+            kind,
+            network,
+            door: Door::Open,
+            cuts: [0; 2],
+            is_open: false,
+            is_up: false,
+            turn: 0,
+            conn: None,
+            is_full: false,
+            looks: false,
+            partner: None,
+            rng,
+        }
+    }
+
+    pub(super) fn is_cut(&self, way: Way) -> bool {
+        self.cuts[way as usize] > 0
+    }
+
+    /// Datagrams that go this way are lost altogether.
+    pub(super) fn swallows(&self, way: Way) -> bool {
+        self.door != Door::Open || self.is_cut(way)
     }
 
     pub(super) fn set_open(&mut self, is_open: bool) {
@@ -84,12 +154,15 @@ impl Gate {
         self.is_up = false;
         self.turn += 1;
         self.conn = None;
+        self.is_full = false;
+        self.looks = false;
+        self.partner = None;
     }
 
     /// When a datagram that leaves now arrives: never, once or twice.
-    pub(super) fn datagram_arrivals(&mut self, now: Instant) -> Vec<Instant> {
+    pub(super) fn datagram_arrivals(&mut self, now: Instant, way: Way) -> Vec<Instant> {
         let Network { delay, jitter, loss_ppm, duplicate_ppm, .. } = self.network;
-        if self.door != Door::Open || self.rng.chance(loss_ppm) {
+        if self.swallows(way) || self.rng.chance(loss_ppm) {
             return Vec::new();
         }
         let copies = 1 + usize::from(self.rng.chance(duplicate_ppm));
@@ -112,7 +185,7 @@ pub(super) enum Item {
     /// The other end is there.
     Opened,
     Bytes(Vec<u8>),
-    /// The other end closed, or turned the connection away.
+    /// The other end closed: after what it had sent, or at once, with a reset.
     Closed,
 }
 
@@ -127,11 +200,27 @@ pub(super) struct Connection {
     pub accepted: bool,
     /// The controller has closed its end.
     pub closing: bool,
+    /// The gateway has closed its end, and the controller has not heard of it.
+    pub abandoned: bool,
+    /// The controller's end is gone without a word: what comes there is answered with a reset.
+    pub forgotten: bool,
+    /// The controller's TCP is about to acknowledge.
+    pub owes_ack: bool,
 }
 
 impl Connection {
     pub(super) fn new(link: LinkId, peer: Peer) -> Self {
-        Self { link, peer, up: Pipe::default(), down: Pipe::default(), accepted: false, closing: false }
+        Self {
+            link,
+            peer,
+            up: Pipe::new(),
+            down: Pipe::new(),
+            accepted: false,
+            closing: false,
+            abandoned: false,
+            forgotten: false,
+            owes_ack: false,
+        }
     }
 
     pub(super) fn pipe(&mut self, way: Way) -> &mut Pipe {
@@ -139,96 +228,5 @@ impl Connection {
             Way::Up => &mut self.up,
             Way::Down => &mut self.down,
         }
-    }
-}
-
-/// One direction of a connection.
-#[derive(Debug, Default)]
-pub(super) struct Pipe {
-    items: VecDeque<(Instant, Item)>,
-    newest: Instant,
-    /// Nothing arrives until it is released.
-    pub held: bool,
-    /// Nothing arrives any more.
-    pub dead: bool,
-    /// The connection is reset when so many more bytes have arrived.
-    pub reset_after: Option<usize>,
-}
-
-/// What has arrived.
-#[derive(Debug, PartialEq, Eq)]
-pub(super) enum Arrived {
-    Nothing,
-    Item(Item),
-    /// The bytes were the last before a reset.
-    Reset(Vec<u8>),
-}
-
-impl Pipe {
-    /// Sends an item; when something of it arrives.
-    pub(super) fn send(&mut self, now: Instant, item: Item, gate: &mut Gate) -> Vec<Instant> {
-        if self.dead {
-            return Vec::new();
-        }
-        let network = gate.network;
-        let mut segments = Vec::new();
-        match (item, network.longest_segment) {
-            (Item::Bytes(bytes), Some(longest)) => {
-                let mut rest = bytes.as_slice();
-                while !rest.is_empty() {
-                    let len = (gate.rng.between(1, longest.max(1) as u64) as usize).min(rest.len());
-                    let (segment, after) = rest.split_at(len);
-                    segments.push(Item::Bytes(segment.to_vec()));
-                    rest = after;
-                }
-            }
-            (item, _) => segments.push(item),
-        }
-        let mut arrivals = Vec::new();
-        for segment in segments {
-            let late = gate.rng.up_to(network.jitter) + gate.rng.up_to(network.merge);
-            let mut at = (now + network.delay + late).max(self.newest);
-            if network.longest_segment.is_some() && at == self.newest {
-                // A segment of its own arrives at a time of its own.
-                at += Duration::from_micros(1);
-            }
-            self.newest = at;
-            self.items.push_back((at, segment));
-            arrivals.push(at);
-        }
-        arrivals
-    }
-
-    /// The next thing that has arrived; bytes that came together are one piece.
-    pub(super) fn next_arrived(&mut self, now: Instant) -> Arrived {
-        if self.held || self.dead {
-            return Arrived::Nothing;
-        }
-        let mut joined = Vec::new();
-        while let Some((at, item)) = self.items.front_mut()
-            && *at <= now
-        {
-            match item {
-                Item::Bytes(bytes) => joined.append(bytes),
-                _ if !joined.is_empty() => break,
-                _ => {}
-            }
-            let Some((_, item)) = self.items.pop_front() else { break };
-            if !matches!(item, Item::Bytes(_)) {
-                return Arrived::Item(item);
-            }
-        }
-        if joined.is_empty() {
-            return Arrived::Nothing;
-        }
-        if let Some(left) = &mut self.reset_after {
-            if joined.len() >= *left {
-                joined.truncate(*left);
-                self.dead = true;
-                return Arrived::Reset(joined);
-            }
-            *left -= joined.len();
-        }
-        Arrived::Item(Item::Bytes(joined))
     }
 }

@@ -4,53 +4,112 @@
 use std::net::SocketAddr;
 
 use proto_core::engine::{Input, LinkId, LinkKind};
+use proto_core::time::Duration;
 
 use super::drive::Due;
-use super::network::{Arrived, Connection, Door, Item, Peer, Way};
+use super::faults::TCP_TIMEOUT;
+use super::network::{Connection, Door, Item, Peer, Speaker, Way};
+use super::tcp::{Again, Arrived};
 use super::{CLIENT_RETRY, Cell, End, HERE, Owner, What, udp_peer};
 use crate::controller::{ConnId, ControllerInput, Link};
 
 impl Cell {
     /// The gateway opens a link.
     pub(super) fn open(&mut self, link: LinkId) {
-        let now = self.now;
         let gate = self.gate(link);
         gate.set_open(true);
-        let (turn, delay) = (gate.turn, gate.network.delay);
+        let turn = gate.turn;
+        match gate.kind {
+            LinkKind::RecipeUdp => self.queue.push(self.now, Due::LinkUp { link, turn }),
+            LinkKind::RecipeTcpListen { .. } | LinkKind::RecipeUdpListen { .. } => {}
+            _ => self.knock(link, turn, FIRST_KNOCK),
+        }
+    }
+
+    /// A connection is asked for; without an answer again, after twice the time.
+    pub(super) fn knock(&mut self, link: LinkId, turn: u64, pause: Duration) {
+        let now = self.now;
+        let gate = self.gate(link);
+        if gate.turn != turn || gate.conn.is_some() {
+            return;
+        }
+        let delay = gate.network.delay;
         let server = match gate.kind {
-            LinkKind::Command => Link::Command,
+            LinkKind::Command | LinkKind::Urgent => Link::Command,
             LinkKind::State => Link::State,
-            LinkKind::Modbus => Link::Modbus,
-            LinkKind::RecipeUdp => {
-                self.queue.push(now, Due::LinkUp { link, turn });
-                return;
-            }
-            LinkKind::RecipeTcpListen { .. } | LinkKind::RecipeUdpListen { .. } => return,
+            _ => Link::Modbus,
         };
         match gate.door {
-            Door::Silent => {}
-            Door::Refuses => self.queue.push(now + delay + delay, Due::LinkDown { link, turn }),
             Door::Open => {
                 let id = self.new_conn(link, Peer::Server(server));
                 self.send_item(id, Way::Up, Item::Opened);
             }
+            Door::Refuses if !gate.is_cut(Way::Up) && !gate.is_cut(Way::Down) => {
+                self.queue.push(now + delay + delay, Due::LinkDown { link, turn });
+            }
+            Door::Refuses | Door::Silent => {
+                let pause_after = pause.saturating_mul(2);
+                self.queue.push(now + pause, Due::Knock { link, turn, pause: pause_after });
+            }
         }
     }
 
-    /// The gateway closes a link and wants to hear nothing more of it.
+    /// The gateway closes a link with a reset, and wants to hear nothing more of it: what has not
+    /// arrived never does.
     pub(super) fn close(&mut self, link: LinkId) {
+        let now = self.now;
         let gate = self.gate(link);
         let conn = gate.conn;
         gate.set_open(false);
-        if let Some(id) = conn {
-            if let Some(conn) = self.conns.get_mut(&id) {
-                conn.down.dead = true;
-                conn.up.held = false;
-                if conn.closing {
-                    self.conns.remove(&id);
-                }
+        let delay = gate.network.delay;
+        let Some(id) = conn else { return };
+        let Some(conn) = self.conns.get_mut(&id) else { return };
+        conn.up.forget();
+        if conn.closing || conn.forgotten {
+            self.conns.remove(&id);
+        } else if !conn.accepted {
+            self.never_opened(id);
+        } else {
+            conn.abandoned = true;
+            // On a dead path it does not get far; the other end finds out by itself.
+            if !conn.up.dead {
+                self.queue.push(now + delay, Due::ResetUp { conn: id });
             }
-            self.send_item(id, Way::Up, Item::Closed);
+        }
+    }
+
+    /// A connection that the controller was never told of.
+    fn never_opened(&mut self, id: u64) {
+        if let Some(Connection { peer: Peer::Client(port), .. }) = self.conns.remove(&id) {
+            self.client_lost(port);
+        }
+    }
+
+    /// The gateway's reset reaches the controller.
+    pub(super) fn reset_up(&mut self, id: u64) {
+        let Some(conn) = self.conns.get(&id) else { return };
+        let (link, peer) = (conn.link, conn.peer);
+        if self.gate(link).is_cut(Way::Up) {
+            // It learns of it when it sends something, or at last by TCP's own patience.
+            self.queue.push(self.now + TCP_TIMEOUT, Due::TimedOut { conn: id });
+            return;
+        }
+        self.conns.remove(&id);
+        self.controller_closed(id, peer);
+    }
+
+    /// The controller's host knows nothing of this connection, and says so.
+    pub(super) fn reset_down(&mut self, id: u64) {
+        let Some(conn) = self.conns.get(&id) else { return };
+        let link = conn.link;
+        let gate = self.gate(link);
+        if gate.is_cut(Way::Down) {
+            return;
+        }
+        let (turn, is_ours) = (gate.turn, gate.conn == Some(id));
+        self.conns.remove(&id);
+        if is_ours {
+            self.queue.push(self.now, Due::LinkDown { link, turn });
         }
     }
 
@@ -75,55 +134,127 @@ impl Cell {
     }
 
     pub(super) fn send_item(&mut self, id: u64, way: Way, item: Item) {
+        let now = self.now;
         let Some(conn) = self.conns.get_mut(&id) else { return };
         let Some(gate) = self.gates.get_mut(&conn.link) else { return };
-        for at in conn.pipe(way).send(self.now, item, gate) {
+        let acks = match way {
+            Way::Up => 0,
+            Way::Down => {
+                conn.owes_ack = false;
+                conn.up.arrived
+            }
+        };
+        let waited = conn.pipe(way).again_at;
+        let arrivals = conn.pipe(way).send(now, item, acks, gate, way);
+        if waited.is_none()
+            && let Some(at) = conn.pipe(way).again_at
+        {
+            self.queue.push(at, Due::SendAgain { conn: id, way });
+        }
+        let is_too_much = way == Way::Down && !conn.down.dead && conn.down.on_the_way() > CONTROLLER_BUFFER;
+        for at in arrivals {
             self.queue.push(at, Due::Arrival { conn: id, way });
+        }
+        if is_too_much {
+            self.reset_conn(id);
         }
     }
 
     /// The gateway sends on a link.
     pub(super) fn send_up(&mut self, link: LinkId, bytes: Vec<u8>) {
         let now = self.now;
-        let client = self.clients.iter().find(|(_, client)| client.link == Some(link)).map(|(&port, _)| port);
-        if let (Some(oracle), Some(gate)) = (&mut self.oracle, self.gates.get(&link)) {
-            match (gate.kind, gate.conn) {
-                (LinkKind::RecipeUdp | LinkKind::RecipeUdpListen { .. }, _) => {
-                    oracle.sent_datagram(link, &bytes)
-                }
-                (_, Some(conn)) => oracle.sent(conn, &bytes),
-                (_, None) => {}
-            }
-        }
-        let gate = self.gate(link);
+        let Some(gate) = self.gates.get_mut(&link) else { return };
         let turn = gate.turn;
         match gate.kind {
             LinkKind::RecipeUdp => {
+                let slowest = gate.network.slowest();
+                let oracle = self.oracle.as_mut();
+                let tag = oracle.map_or(0, |oracle| oracle.sent_datagram(link, &bytes, slowest, now));
                 let peer = udp_peer(turn);
-                for at in gate.datagram_arrivals(now) {
-                    self.queue.push(at, Due::DatagramUp { link, peer, bytes: bytes.clone() });
+                for at in gate.datagram_arrivals(now, Way::Up) {
+                    self.queue.push(at, Due::DatagramUp { link, peer, tag, bytes: bytes.clone() });
                 }
             }
             LinkKind::RecipeUdpListen { .. } => {
-                let arrivals = gate.datagram_arrivals(now);
-                for (at, port) in arrivals.into_iter().zip(client.into_iter().cycle()) {
-                    self.queue.push(at, Due::ClientDatagramUp { port, bytes: bytes.clone() });
+                let (slowest, partner) = (gate.network.slowest(), gate.partner);
+                let mut tag = 0;
+                if let Some(oracle) = &mut self.oracle {
+                    oracle.answers(link, partner, now);
+                    tag = oracle.sent_datagram(link, &bytes, slowest, now);
+                }
+                let client = self.clients.iter().find(|(_, client)| client.link == Some(link));
+                let arrivals = gate.datagram_arrivals(now, Way::Up);
+                // To somebody else, or to a socket that is gone, it is lost.
+                if let Some((&port, client)) = client
+                    && partner == Some(Speaker::Client { socket: client.socket })
+                {
+                    for at in arrivals {
+                        self.queue.push(at, Due::ClientDatagramUp { port, tag, bytes: bytes.clone() });
+                    }
                 }
             }
             _ => {
-                if let Some(conn) = gate.conn {
-                    self.send_item(conn, Way::Up, Item::Bytes(bytes));
+                let Some(id) = gate.conn else { return };
+                let slowest = gate.network.slowest();
+                if let Some(oracle) = &mut self.oracle {
+                    oracle.sent(id, link, &bytes, slowest, now);
+                }
+                self.send_item(id, Way::Up, Item::Bytes(bytes));
+                let unacked = self.conns.get(&id).map_or(0, |conn| conn.up.unacked());
+                let gate = self.gate(link);
+                if unacked > gate.network.send_buffer {
+                    gate.is_full = true;
+                    return;
                 }
             }
         }
         self.queue.push(now, Due::LinkSent { link, turn });
     }
 
+    /// The gateway's transport knows that so much has arrived.
+    pub(super) fn acknowledged(&mut self, id: u64, upto: u64) {
+        let now = self.now;
+        let Some(conn) = self.conns.get_mut(&id) else { return };
+        if upto <= conn.up.acked {
+            return;
+        }
+        conn.up.acked = upto;
+        let (link, unacked) = (conn.link, conn.up.unacked());
+        let gate = self.gate(link);
+        if gate.conn != Some(id) {
+            return;
+        }
+        let turn = gate.turn;
+        if gate.is_full && unacked <= gate.network.send_buffer {
+            gate.is_full = false;
+            self.queue.push(now, Due::LinkSent { link, turn });
+        }
+        let gate = self.gate(link);
+        if !std::mem::replace(&mut gate.looks, true) {
+            let at = now + gate.network.ack_report;
+            self.queue.push(at, Due::Look { link, turn });
+        }
+    }
+
+    /// The driver looks at what is acknowledged, and tells it when that is news.
+    pub(super) fn tell_acked(&mut self, link: LinkId) {
+        if self.is_asleep() {
+            return;
+        }
+        let gate = self.gate(link);
+        if !gate.is_up || !std::mem::take(&mut gate.looks) {
+            return;
+        }
+        let Some(conn) = gate.conn.and_then(|id| self.conns.get(&id)) else { return };
+        let left = u32::try_from(conn.up.unacked()).unwrap_or(u32::MAX);
+        self.engine_input(Input::LinkAcked { link, left });
+    }
+
     /// The controller's UDP server sends.
     pub(super) fn udp_down(&mut self, peer: SocketAddr, bytes: &[u8]) {
         let (now, link) = (self.now, LinkId::RECIPE_UDP);
         let Some(gate) = self.gates.get_mut(&link) else { return };
-        for at in gate.datagram_arrivals(now) {
+        for at in gate.datagram_arrivals(now, Way::Down) {
             self.queue.push(at, Due::DatagramDown { link, peer, bytes: bytes.to_vec() });
         }
     }
@@ -138,8 +269,9 @@ impl Cell {
         match (client.is_tcp, client.conn, client.link) {
             (true, Some(conn), _) => self.send_item(conn, Way::Down, Item::Bytes(bytes)),
             (false, _, Some(link)) => {
-                for at in self.gate(link).datagram_arrivals(now) {
-                    self.queue.push(at, Due::ClientDatagramDown { link, bytes: bytes.clone() });
+                let from = Speaker::Client { socket: client.socket };
+                for at in self.gate(link).datagram_arrivals(now, Way::Down) {
+                    self.queue.push(at, Due::ClientDatagramDown { link, from, bytes: bytes.clone() });
                 }
             }
             _ => {}
@@ -176,26 +308,116 @@ impl Cell {
         }
     }
 
+    /// It is time to send again what was not acknowledged.
+    pub(super) fn send_again(&mut self, id: u64, way: Way) {
+        let now = self.now;
+        let Some(conn) = self.conns.get_mut(&id) else { return };
+        let Some(gate) = self.gates.get_mut(&conn.link) else { return };
+        match conn.pipe(way).send_again(now, gate, way) {
+            Again::Nothing => {}
+            Again::Arrives(at) => self.queue.push(at, Due::Arrival { conn: id, way }),
+            Again::Acked(at) => {
+                let upto = conn.up.arrived;
+                self.queue.push(at, Due::Ack { conn: id, upto });
+            }
+            Again::Later(at) => self.queue.push(at, Due::SendAgain { conn: id, way }),
+            Again::GivenUp => self.reset_conn(id),
+        }
+    }
+
+    /// An acknowledgement of the controller's TCP comes to the gateway.
+    pub(super) fn ack(&mut self, id: u64, upto: u64) {
+        let now = self.now;
+        let Some(conn) = self.conns.get_mut(&id) else { return };
+        if conn.down.dead || conn.down.held {
+            return;
+        }
+        if self.gates.get(&conn.link).is_some_and(|gate| gate.is_cut(Way::Down)) {
+            if let Some(at) = conn.up.sends_again(now, now) {
+                self.queue.push(at, Due::SendAgain { conn: id, way: Way::Up });
+            }
+            return;
+        }
+        self.acknowledged(id, upto);
+    }
+
+    /// The controller's TCP acknowledges what has come, unless something it sent did so already.
+    pub(super) fn ack_leaves(&mut self, id: u64) {
+        let Some(conn) = self.conns.get_mut(&id) else { return };
+        if std::mem::take(&mut conn.owes_ack) {
+            let (link, upto) = (conn.link, conn.up.arrived);
+            let at = self.now + self.gate(link).network.delay;
+            self.queue.push(at, Due::Ack { conn: id, upto });
+        }
+    }
+
+    /// Bytes came to the controller.
+    fn owe_ack(&mut self, id: u64) {
+        let now = self.now;
+        let Some(conn) = self.conns.get_mut(&id) else { return };
+        let Some(gate) = self.gates.get(&conn.link) else { return };
+        if !std::mem::replace(&mut conn.owes_ack, true) {
+            // What the controller answers at once goes first.
+            self.queue.push(now + gate.network.ack_delay, Due::AckLeaves { conn: id });
+        }
+    }
+
     /// Something may have arrived at one end of a connection.
     pub(super) fn arrive(&mut self, id: u64, way: Way) {
+        let now = self.now;
+        let is_asleep = self.is_asleep();
         let Some(conn) = self.conns.get_mut(&id) else { return };
         let (link, peer) = (conn.link, conn.peer);
-        match (conn.pipe(way).next_arrived(self.now), way) {
-            (Arrived::Nothing, _) => return,
+        let Some(gate) = self.gates.get_mut(&link) else { return };
+        if gate.is_cut(way) {
+            if let Some(at) = conn.pipe(way).lose(now) {
+                self.queue.push(at, Due::SendAgain { conn: id, way });
+            }
+            return;
+        }
+        if way == Way::Down && is_asleep && !conn.abandoned {
+            // It lies in the gateway's socket.
+            return;
+        }
+        let (arrived, acks) = conn.pipe(way).next_arrived(now);
+        if arrived == Arrived::Nothing {
+            return;
+        }
+        match way {
+            Way::Up if conn.forgotten => {
+                let back = now + gate.network.delay;
+                self.queue.push(back, Due::ResetDown { conn: id });
+                return;
+            }
+            Way::Up => {}
+            Way::Down if conn.abandoned => {
+                let back = now + gate.network.delay;
+                self.queue.push(back, Due::ResetUp { conn: id });
+                return;
+            }
+            Way::Down => {
+                conn.down.acked = conn.down.arrived;
+                self.acknowledged(id, acks);
+                self.tell_acked(link);
+            }
+        }
+        match (arrived, way) {
+            (Arrived::Nothing, _) => {}
             (Arrived::Reset(bytes), way) => {
                 match way {
-                    Way::Up => self.controller_bytes(id, peer, &bytes),
+                    Way::Up => self.controller_bytes(id, link, peer, &bytes),
                     Way::Down => self.engine_input(Input::LinkBytes { link, bytes: &bytes }),
                 }
                 self.reset_conn(id);
                 return;
             }
-            (Arrived::Item(Item::Bytes(bytes)), Way::Up) => self.controller_bytes(id, peer, &bytes),
-            (Arrived::Item(Item::Opened), Way::Up) => self.controller_opened(id, peer),
-            (Arrived::Item(Item::Closed), Way::Up) => {
-                self.conns.remove(&id);
-                self.controller_closed(id, peer);
+            (Arrived::Item(Item::Bytes(bytes)), Way::Up) => {
+                self.owe_ack(id);
+                self.controller_bytes(id, link, peer, &bytes);
             }
+            (Arrived::Item(Item::Opened), Way::Up) => self.controller_opened(id, peer),
+            // The gateway's end is reset, never closed.
+            (Arrived::Item(Item::Closed), Way::Up) => {}
             (Arrived::Item(Item::Bytes(bytes)), Way::Down) => {
                 self.engine_input(Input::LinkBytes { link, bytes: &bytes });
             }
@@ -250,7 +472,7 @@ impl Cell {
         });
     }
 
-    fn controller_bytes(&mut self, id: u64, peer: Peer, bytes: &[u8]) {
+    fn controller_bytes(&mut self, id: u64, link: LinkId, peer: Peer, bytes: &[u8]) {
         let conn = ConnId(id);
         self.trace.add(self.now, What::ControllerReceived, id, bytes);
         let before = self.inputs_before();
@@ -261,18 +483,15 @@ impl Cell {
             Peer::Server(Link::State) => return,
             Peer::Client(port) => ControllerInput::PortBytes { port, bytes },
         });
-        let link = match peer {
-            Peer::Server(Link::Command) => LinkId::COMMAND,
-            Peer::Server(Link::Modbus) => LinkId::MODBUS,
-            Peer::Server(Link::State) => LinkId::STATE,
-            Peer::Client(port) => match self.clients.get(&port).and_then(|client| client.link) {
-                Some(link) => link,
-                None => return,
-            },
-        };
-        let after = self.inputs_before();
+        let (after, slowest) = (self.inputs_before(), self.gate(link).network.slowest());
         if let (Some(oracle), Some(before), Some(after)) = (&mut self.oracle, before, after) {
-            oracle.arrived(id, link, bytes, &before, &after, self.now);
+            oracle.arrived(id, link, bytes, (&before, &after), slowest, self.now);
         }
     }
 }
+
+/// How long an attempt to connect waits for an answer before it asks again, at first.
+const FIRST_KNOCK: Duration = Duration::from_secs(1);
+/// What the controller keeps of what it sends on one connection; a client that lets more pile up is
+/// dropped.
+const CONTROLLER_BUFFER: u64 = 256 * 1024;

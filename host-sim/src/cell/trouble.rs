@@ -8,6 +8,7 @@ use std::collections::BTreeMap;
 
 use proto_core::engine::LinkId;
 use proto_core::modbus::Exception;
+use proto_core::sysvar::SysVar;
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::dialect::Dialect;
 
@@ -33,6 +34,14 @@ pub enum TroubleKind {
     Stall,
     /// Datagrams are lost, late and doubled.
     Datagrams,
+    /// All datagrams of a link are lost for a while.
+    Burst,
+    /// A peer's TCP acknowledges nothing, or nothing gets to it.
+    Unacknowledged,
+    /// A cable is out, of one link or of all.
+    Cable,
+    /// Somebody else sends datagrams to a port where the gateway listens.
+    Stranger,
     /// A server carries out and says nothing.
     Mute,
     /// A server's answers are late.
@@ -41,6 +50,8 @@ pub enum TroubleKind {
     Exception,
     /// Half a state packet, then the end.
     HalfStatePacket,
+    /// A value of the controller is not a number, or infinite.
+    Unreadable,
     /// A line flips bits.
     Noise,
     /// A device sends garbage.
@@ -53,15 +64,21 @@ pub enum TroubleKind {
     BusOff,
     /// The controller is switched off and on.
     ControllerRestart,
+    /// The controller loses its power for a while.
+    PowerCut,
     /// The controller comes back with software that speaks another dialect.
     Dialect,
     /// The gateway is switched off and on.
     GatewayRestart,
+    /// The gateway is not called for less than half a second.
+    GatewayStall,
+    /// It is not called for longer.
+    GatewaySleep,
 }
 
 impl TroubleKind {
     /// All of them.
-    pub const ALL: [Self; 19] = [
+    pub const ALL: [Self; 27] = [
         Self::Refused,
         Self::BlackHole,
         Self::Reset,
@@ -69,19 +86,37 @@ impl TroubleKind {
         Self::HalfOpen,
         Self::Stall,
         Self::Datagrams,
+        Self::Burst,
+        Self::Unacknowledged,
+        Self::Cable,
+        Self::Stranger,
         Self::Mute,
         Self::SlowAnswers,
         Self::Exception,
         Self::HalfStatePacket,
+        Self::Unreadable,
         Self::Noise,
         Self::Garbage,
         Self::Cut,
         Self::Unplugged,
         Self::BusOff,
         Self::ControllerRestart,
+        Self::PowerCut,
         Self::Dialect,
         Self::GatewayRestart,
+        Self::GatewayStall,
+        Self::GatewaySleep,
     ];
+
+    /// How often, beside the others. What stops everything for long is rare, or nothing else would
+    /// happen.
+    const fn weight(self) -> u64 {
+        match self {
+            Self::GatewaySleep | Self::PowerCut | Self::GatewayRestart | Self::Dialect => 1,
+            Self::Cable | Self::ControllerRestart => 2,
+            _ => 4,
+        }
+    }
 }
 
 impl TroubleKind {
@@ -95,18 +130,26 @@ impl TroubleKind {
             Self::HalfOpen => "half-open connection",
             Self::Stall => "one direction stalls",
             Self::Datagrams => "datagrams lost and doubled",
+            Self::Burst => "burst of lost datagrams",
+            Self::Unacknowledged => "nothing acknowledged",
+            Self::Cable => "cable out",
+            Self::Stranger => "datagram of a stranger",
             Self::Mute => "server says nothing",
             Self::SlowAnswers => "slow answers",
             Self::Exception => "Modbus exceptions",
             Self::HalfStatePacket => "half a state packet",
+            Self::Unreadable => "values not finite",
             Self::Noise => "noise on a line",
             Self::Garbage => "garbage from a device",
             Self::Cut => "line or bus cut",
             Self::Unplugged => "adapter pulled out",
             Self::BusOff => "bus-off",
             Self::ControllerRestart => "controller restart",
+            Self::PowerCut => "controller without power",
             Self::Dialect => "controller of another dialect",
             Self::GatewayRestart => "gateway restart",
+            Self::GatewayStall => "gateway stalls",
+            Self::GatewaySleep => "gateway sleeps",
         }
     }
 }
@@ -117,15 +160,20 @@ enum Remedy {
     Admit(LinkId),
     Release(LinkId),
     Datagrams(LinkId),
+    Ways(LinkId, [bool; 2]),
+    Cable(Option<LinkId>),
     Unmute(Link),
     Answers(Link),
     NoException,
+    Heal(SysVar),
     Quiet(LineId),
     Mend(LineId),
     PlugIn(LineId),
     MendBus(BusId),
     BusOn(BusId),
+    Power,
     Dialect(&'static str),
+    Wake,
 }
 
 /// Breaks and mends.
@@ -183,6 +231,7 @@ impl Trouble {
             cell.remark(format_args!("ends: {}", kind.name()));
             apply(cell, remedy, &self.networks);
         }
+        cell.wake_gateway();
     }
 
     fn poll(&mut self, cell: &mut Cell) {
@@ -193,14 +242,25 @@ impl Trouble {
             apply(cell, remedy, &self.networks);
         }
         if now >= self.next {
-            self.next = now + Duration::from_micros(1) + self.rng.up_to(self.pause.saturating_mul(2));
-            if let Some(kind) = pick(&mut self.rng, self.kinds.iter().copied())
+            // Now and then all is quiet for long enough that everything must work again.
+            let pause = if self.rng.below(CALM) == 0 { 12 } else { 2 };
+            self.next = now + Duration::from_micros(1) + self.rng.up_to(self.pause.saturating_mul(pause));
+            if let Some(kind) = self.pick_kind()
                 && self.begin(cell, kind).is_some()
             {
                 *self.counts.entry(kind).or_default() += 1;
                 cell.remark(format_args!("begins: {}", kind.name()));
             }
         }
+    }
+
+    fn pick_kind(&mut self) -> Option<TroubleKind> {
+        let mut nth = self.rng.below(self.kinds.iter().map(|kind| kind.weight()).sum());
+        self.kinds.iter().copied().find(|kind| {
+            let is_it = nth < kind.weight();
+            nth = nth.saturating_sub(kind.weight());
+            is_it
+        })
     }
 
     /// Breaks something; `None` when the cell has nothing of this kind.
@@ -210,6 +270,7 @@ impl Trouble {
         let way = if rng.below(2) == 0 { Way::Up } else { Way::Down };
         let tcp: Vec<LinkId> = cell.tcp_links().collect();
         let mut tcp = || pick(rng, tcp.iter().copied());
+        let mut lasts = None;
         let remedy = match kind {
             TroubleKind::Refused => {
                 let link = tcp()?;
@@ -242,21 +303,47 @@ impl Trouble {
                 Some(Remedy::Release(link))
             }
             TroubleKind::Datagrams => {
-                let tcp: Vec<LinkId> = cell.tcp_links().collect();
-                let links: Vec<LinkId> = cell.link_ids().filter(|link| !tcp.contains(link)).collect();
-                let link = pick(rng, links.into_iter())?;
+                let link = pick(rng, cell.datagram_links())?;
                 let network = cell.network(link);
                 network.loss_ppm = rng.between(0, 500_000) as u32;
                 network.duplicate_ppm = rng.between(0, 200_000) as u32;
                 network.jitter = rng.up_to(Duration::from_millis(20));
                 Some(Remedy::Datagrams(link))
             }
+            TroubleKind::Burst => {
+                let link = pick(rng, cell.datagram_links())?;
+                lasts = Some(longer_and_rarer(rng, Duration::from_millis(50), 6).min(Duration::from_secs(5)));
+                cut_ways(cell, link, rng.below(3))
+            }
+            TroubleKind::Unacknowledged => {
+                let link = tcp()?;
+                lasts = Some(longer_and_rarer(rng, Duration::from_millis(50), 6).min(Duration::from_secs(5)));
+                cut_ways(cell, link, rng.below(2))
+            }
+            TroubleKind::Cable => {
+                let link = pick(rng, cell.link_ids()).filter(|_| rng.below(2) == 0);
+                lasts =
+                    Some(longer_and_rarer(rng, Duration::from_millis(100), 7).min(Duration::from_secs(20)));
+                cables(cell, link).into_iter().for_each(|link| cell.cut_cable(link));
+                Some(Remedy::Cable(link))
+            }
+            TroubleKind::Stranger => {
+                let links: Vec<(LinkId, Option<usize>)> = cell.listening_for_datagrams();
+                let (link, frame) = pick(rng, links.into_iter())?;
+                // Not as long as a frame: who sends frames is answered.
+                let len = Some(rng.below(64) as usize).filter(|len| Some(*len) != frame).unwrap_or(100);
+                let bytes = rng.bytes(len);
+                cell.stranger_sends(link, &bytes);
+                None
+            }
             TroubleKind::Mute => {
+                cell.ails(server);
                 cell.controller_mut().mute(server);
                 Some(Remedy::Unmute(server))
             }
             TroubleKind::SlowAnswers => {
                 let delay = rng.up_to(Duration::from_millis(1_500));
+                cell.ails(server);
                 cell.controller_mut().delay_answers(server, delay);
                 Some(Remedy::Answers(server))
             }
@@ -264,6 +351,7 @@ impl Trouble {
                 let exceptions =
                     [Exception::DeviceFailure, Exception::DeviceBusy, Exception::IllegalDataAddress];
                 let exception = pick(rng, exceptions.into_iter());
+                cell.ails(Link::Modbus);
                 cell.controller_mut().answer_modbus_with(exception);
                 Some(Remedy::NoException)
             }
@@ -271,6 +359,12 @@ impl Trouble {
                 let len = rng.between(0, 1_467) as usize;
                 cell.controller_mut().cut_next_state_packet(len);
                 None
+            }
+            TroubleKind::Unreadable => {
+                let var = pick(rng, cell.floats().into_iter())?;
+                let value = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY][rng.below(3) as usize];
+                cell.spoil(var, value);
+                Some(Remedy::Heal(var))
             }
             TroubleKind::Noise => {
                 let line = pick(rng, cell.lines())?;
@@ -309,6 +403,11 @@ impl Trouble {
                 cell.restart_controller();
                 None
             }
+            TroubleKind::PowerCut => {
+                lasts = Some(longer_and_rarer(rng, Duration::from_millis(200), 4));
+                cell.power_cut();
+                Some(Remedy::Power)
+            }
             TroubleKind::Dialect => {
                 let before = cell.controller().dialect();
                 // One at a time, or the remedies would bring back the wrong one.
@@ -323,9 +422,23 @@ impl Trouble {
                 cell.restart_gateway();
                 None
             }
+            TroubleKind::GatewayStall => {
+                let span = Duration::from_micros(rng.between(50_000, 499_999));
+                lasts = Some(span);
+                cell.stall_gateway(span);
+                Some(Remedy::Wake)
+            }
+            TroubleKind::GatewaySleep => {
+                let longest = Duration::from_secs(20);
+                let span = longer_and_rarer(rng, Duration::from_millis(501), 5).min(longest);
+                lasts = Some(span);
+                cell.stall_gateway(span);
+                Some(Remedy::Wake)
+            }
         };
         if let Some(remedy) = remedy {
-            let until = cell.now() + self.rng.up_to(self.pause);
+            let lasts = lasts.unwrap_or_else(|| self.rng.up_to(self.pause));
+            let until = cell.now() + lasts;
             self.remedies.push((until, kind, remedy));
         }
         Some(())
@@ -340,17 +453,59 @@ fn apply(cell: &mut Cell, remedy: Remedy, networks: &BTreeMap<LinkId, Network>) 
             cell.release(link, Way::Down);
         }
         Remedy::Datagrams(link) => *cell.network(link) = networks.get(&link).copied().unwrap_or_default(),
-        Remedy::Unmute(server) => cell.controller_mut().unmute(server),
-        Remedy::Answers(server) => cell.controller_mut().delay_answers(server, Duration::ZERO),
-        Remedy::NoException => cell.controller_mut().answer_modbus_with(None),
+        Remedy::Ways(link, ways) => {
+            for way in [Way::Up, Way::Down].into_iter().filter(|way| ways[*way as usize]) {
+                cell.mend_way(link, way);
+            }
+        }
+        Remedy::Cable(link) => cables(cell, link).into_iter().for_each(|link| cell.mend_cable(link)),
+        Remedy::Unmute(server) => {
+            cell.controller_mut().unmute(server);
+            cell.recovers(server);
+        }
+        Remedy::Answers(server) => {
+            cell.controller_mut().delay_answers(server, Duration::ZERO);
+            cell.recovers(server);
+        }
+        Remedy::NoException => {
+            cell.controller_mut().answer_modbus_with(None);
+            cell.recovers(Link::Modbus);
+        }
+        Remedy::Heal(var) => cell.heal(var),
         Remedy::Quiet(line) => cell.line(line).noise_ppm = 0,
         Remedy::Mend(line) => cell.mend(line),
         Remedy::PlugIn(line) => cell.plug_in(line),
         Remedy::MendBus(bus) => cell.mend_bus(bus),
         Remedy::BusOn(bus) => cell.bus_on(bus),
+        Remedy::Power => cell.power_up(),
         Remedy::Dialect(name) => cell.replace_controller(name),
+        // One that is shorter ends by itself; another may have begun meanwhile.
+        Remedy::Wake => {}
     }
 }
+
+/// The links that a cable is for.
+fn cables(cell: &Cell, link: Option<LinkId>) -> Vec<LinkId> {
+    link.map_or_else(|| cell.link_ids().collect(), |link| vec![link])
+}
+
+/// What goes up, what comes down, or both.
+fn cut_ways(cell: &mut Cell, link: LinkId, which: u64) -> Option<Remedy> {
+    let ways = [which != 1, which != 0];
+    for way in [Way::Up, Way::Down].into_iter().filter(|way| ways[*way as usize]) {
+        cell.cut_way(link, way);
+    }
+    Some(Remedy::Ways(link, ways))
+}
+
+/// From `shortest` to twice `shortest * 2^doublings`; each doubling is as likely as the one before.
+fn longer_and_rarer(rng: &mut Rng, shortest: Duration, doublings: u64) -> Duration {
+    let least = shortest.saturating_mul(1 << rng.between(0, doublings));
+    least + rng.up_to(least)
+}
+
+/// One pause of so many is a long one.
+const CALM: u64 = 20;
 
 fn pick<T>(rng: &mut Rng, all: impl Iterator<Item = T>) -> Option<T> {
     let mut all: Vec<T> = all.collect();

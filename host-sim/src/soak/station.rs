@@ -56,6 +56,8 @@ pub(super) struct Station {
     frame_time: Duration,
     mood: Mood,
     mood_ends: Instant,
+    /// Until then orders stay as they are, as long as somebody's finger is on the button.
+    pressed_until: Instant,
     next: Instant,
     nth: usize,
 }
@@ -99,6 +101,7 @@ impl Station {
             frame_time,
             mood: Mood::Steady,
             mood_ends: start,
+            pressed_until: start,
             next,
             nth: 0,
         })
@@ -113,7 +116,8 @@ impl Station {
         (self.mood, self.mood_ends) = match rng.below(20) {
             0..12 => (Mood::Steady, now + rng.up_to(Duration::from_secs(20))),
             12..15 => (Mood::Hasty, now + rng.up_to(Duration::from_secs(2))),
-            15..17 => (Mood::Silent, now + rng.up_to(self.timeout.saturating_mul(4))),
+            15 => (Mood::Silent, now + rng.up_to(self.timeout.saturating_mul(4))),
+            16 => (Mood::Silent, now + self.timeout + rng.up_to(Duration::from_secs(10))),
             17 => (Mood::Stuck, now + rng.up_to(Duration::from_secs(5))),
             _ => (Mood::Careless, now + rng.up_to(Duration::from_secs(3))),
         };
@@ -142,8 +146,17 @@ impl Station {
         self.nth = (self.nth + 1) % self.templates.len();
         if self.mood != Mood::Stuck {
             let template = &self.templates[self.nth];
+            let is_pressed = now < self.pressed_until;
             for (value, content) in self.values[self.nth].iter_mut().zip(&template.fields) {
-                *value = changed(&mut self.rng, content, *value);
+                let is_order = matches!(content, Content::Orders { .. });
+                if is_order && is_pressed {
+                    continue;
+                }
+                let before = std::mem::replace(value, changed(&mut self.rng, content, *value));
+                // A button is pressed for a moment, or for seconds.
+                if is_order && before != *value && self.rng.below(2) == 0 {
+                    self.pressed_until = now + self.rng.up_to(Duration::from_secs(6));
+                }
             }
         }
         Some(self.nth)

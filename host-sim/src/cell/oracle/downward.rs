@@ -64,7 +64,8 @@ impl Downward {
         }
         let slot = now.as_micros() / port.cycle.as_micros();
         self.next_slot_at = Instant::from_micros((slot + 1) * port.cycle.as_micros());
-        let Some(before) = self.slot.replace(slot) else { return };
+        // The first look finds a point of the grid behind it.
+        let before = self.slot.replace(slot).unwrap_or(slot.saturating_sub(1));
         if slot == before || !self.is_usable() {
             return;
         }
@@ -84,6 +85,13 @@ impl Downward {
 
     pub(super) fn sent(&mut self) {
         self.in_flight = false;
+    }
+
+    /// The gateway slept: what was due then is not sent now, but what was handed over is under way.
+    pub(super) fn slept(&mut self) {
+        let in_flight = self.in_flight;
+        self.reset();
+        self.in_flight = in_flight;
     }
 
     /// So many input frames were accepted at once.
@@ -112,15 +120,17 @@ impl Downward {
         };
         let fields = port.outputs.iter().flat_map(|frame| &frame.fields).filter_map(shown);
         for var in fields.chain(trigger) {
+            if up.known(var).unreadable {
+                return Err((Invariant::Unreadable, format!("{var} cannot be read")));
+            }
             let Some((_, at)) = up.known(var).value else {
                 return Err((Invariant::Known, format!("{var} was never received")));
             };
             let age = now.saturating_since(at);
-            if port.stops_when_stale
-                && sheet.origin[var.ordinal()] != Some(Origin::Field)
-                && age > port.stale_after
-            {
-                return Err((Invariant::Age, format!("{var} is {age} old")));
+            if port.stops_when_stale && age > port.stale_after {
+                let is_own = sheet.origin[var.ordinal()] == Some(Origin::Field);
+                let invariant = if is_own { Invariant::OwnAge } else { Invariant::Age };
+                return Err((invariant, format!("{var} is {age} old")));
             }
         }
         Ok(())

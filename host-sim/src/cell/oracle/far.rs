@@ -2,7 +2,7 @@
 
 use proto_core::engine::LinkId;
 use proto_core::sysvar::SysVar;
-use proto_core::time::Instant;
+use proto_core::time::{Duration, Instant};
 
 use super::field::Line;
 use super::sheet::{Frame, Raw, written};
@@ -10,30 +10,20 @@ use super::wire::Asked;
 use super::{Invariant, Oracle};
 
 impl Oracle {
-    pub(in crate::cell) fn sent(&mut self, conn: u64, bytes: &[u8]) {
-        self.controller.sent(conn, bytes);
-    }
-
-    pub(in crate::cell) fn sent_datagram(&mut self, link: LinkId, bytes: &[u8]) {
-        self.controller.sent_datagram(u64::from(link.0), bytes);
-    }
-
-    pub(in crate::cell) fn conn_gone(&mut self, conn: u64) {
-        self.controller.gone(conn);
-    }
-
     /// Bytes of a connection have reached the controller, whose inputs were `before` and are `after`.
     pub(in crate::cell) fn arrived(
         &mut self,
         conn: u64,
         link: LinkId,
         bytes: &[u8],
-        before: &[u8],
-        after: &[u8],
+        (before, after): (&[u8], &[u8]),
+        slowest: Duration,
         now: Instant,
     ) {
         let result = self.controller.arrived(conn, bytes);
         self.judge(now, &[Invariant::Transport], result);
+        self.came(conn, bytes.len(), slowest, now);
+        self.robot.applied(before, after, now);
         let mut expected = before.to_vec();
         match link {
             LinkId::MODBUS => {
@@ -43,7 +33,7 @@ impl Oracle {
                     }
                 }
             }
-            LinkId::COMMAND | LinkId::STATE => {}
+            LinkId::COMMAND | LinkId::URGENT | LinkId::STATE => {}
             _ => {
                 let Some(frame) = self.sheet.link(link).and_then(|link| link.input.clone()) else { return };
                 let mut held = std::mem::take(self.controller.held(conn));
@@ -62,13 +52,16 @@ impl Oracle {
     pub(in crate::cell) fn arrived_datagram(
         &mut self,
         link: LinkId,
+        tag: u64,
         bytes: &[u8],
-        before: &[u8],
-        after: &[u8],
+        (before, after): (&[u8], &[u8]),
+        slowest: Duration,
         now: Instant,
     ) {
         let result = self.controller.arrived_datagram(u64::from(link.0), bytes);
         self.judge(now, &[Invariant::Transport], result);
+        self.datagram_came(tag, slowest, now);
+        self.robot.applied(before, after, now);
         let mut expected = before.to_vec();
         if let Some(frame) = self.sheet.link(link).and_then(|link| link.input.as_ref())
             && let Some(payload) = frame.payload_of(bytes)

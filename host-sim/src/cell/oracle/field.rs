@@ -64,9 +64,6 @@ impl Line {
 
     /// The frames that these bytes complete.
     pub(super) fn bytes(&mut self, port: &PortSheet, bytes: &[u8], now: Instant) -> Vec<Verdict> {
-        if now >= self.heard + port.idle_gap {
-            self.discard();
-        }
         self.heard = now;
         let Some(frame) = port.inputs.first() else { return Vec::new() };
         self.held.extend_from_slice(bytes);

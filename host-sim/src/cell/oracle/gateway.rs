@@ -13,15 +13,16 @@ use super::wire::Asked;
 use super::{Invariant, LinkWatch, Oracle, PortWatch, place};
 
 impl Oracle {
-    /// What time does before anything else.
-    pub(super) fn tick(&mut self, now: Instant) {
-        let overdue = self.up.tick(&self.sheet, now);
+    /// Deadlines that pass.
+    pub(super) fn pass(&mut self, now: Instant) {
+        let overdue = self.up.overdue(&self.sheet, now);
         for &(nth, frame) in &overdue {
-            self.orders.forget(nth, Some(frame));
+            self.forget_orders(nth, Some(frame), now);
         }
         if !overdue.is_empty() {
             self.values_changed();
         }
+        self.up.expire(&self.sheet, now);
         for (watch, port) in self.ports.iter_mut().zip(&self.sheet.ports) {
             watch.line.tick(port, now);
             watch.down.tick(port, now);
@@ -30,52 +31,57 @@ impl Oracle {
             self.write_refused_again();
         }
         let given_up = self.modbus.tick(now);
-        self.write_again(given_up);
+        self.up.write_again(&self.sheet, given_up);
         self.orders.tick(now);
     }
 
+    /// The gateway itself slept: nothing of what had begun is continued, and nothing is commanded.
+    pub(super) fn slept(&mut self, now: Instant) {
+        for watch in &mut self.ports {
+            watch.down.slept();
+            watch.line.discard();
+        }
+        self.orders.slept(now);
+        self.robot.forget_all(now);
+        self.deaf_until = Some(now + DEAF);
+    }
+
+    pub(super) fn forget_orders(&mut self, nth: usize, frame: Option<usize>, now: Instant) {
+        self.orders.forget(nth, frame, now);
+        let orders = &self.orders;
+        self.robot.no_longer_asked(|order| orders.is_asked(order), now);
+    }
+
     /// Links that the engine has given up by itself; those in `told` are its input's business.
-    pub(super) fn look_at_links(&mut self, engine: &Engine, told: Option<LinkId>) {
+    pub(super) fn look_at_links(&mut self, engine: &Engine, told: Option<LinkId>, now: Instant) {
         for link in engine.links() {
             let is_lost = !matches!(link.state, LinkState::Up { .. });
             if is_lost && Some(link.id) != told && self.up.is_up(link.id) {
-                self.link_lost(link.id);
+                self.link_lost(link.id, now);
             }
         }
     }
 
-    pub(super) fn link_lost(&mut self, link: LinkId) {
+    pub(super) fn link_lost(&mut self, link: LinkId, now: Instant) {
         if !self.up.is_up(link) {
             return;
         }
         match link {
             LinkId::MODBUS => {
                 let given_up = self.modbus.lost();
-                self.write_again(given_up);
+                self.up.write_again(&self.sheet, given_up);
                 self.write_refused_again();
             }
-            LinkId::COMMAND => self.orders.lost(),
+            LinkId::COMMAND | LinkId::URGENT => self.orders.lost(link, now),
             _ => {}
         }
         self.links[place(link)] = LinkWatch::default();
         self.up.link_lost(&self.sheet, link);
     }
 
-    /// Safe values whose write came to nothing wait again, if they still stand.
-    pub(super) fn write_again(&mut self, vars: Vec<SysVar>) {
-        for var in vars {
-            let safe = self.sheet.owned[var.ordinal()].and_then(|owned| owned.safe);
-            let known = &mut self.up.known[var.ordinal()];
-            if let (true, true, Some(safe)) = (known.safe, known.waiting.is_empty(), safe) {
-                known.waiting.push_back((safe, known.safe_at));
-                self.up.waits |= 1 << var.ordinal();
-            }
-        }
-    }
-
     pub(super) fn write_refused_again(&mut self) {
         let refused = std::mem::take(&mut self.refused);
-        self.write_again(refused);
+        self.up.write_again(&self.sheet, refused);
         self.again_at = Instant::NEVER;
     }
 
@@ -94,6 +100,16 @@ impl Oracle {
         let watch = &mut self.ports[nth];
         watch.counters.bytes_in = watch.counters.bytes_in.wrapping_add(bytes.len() as u32);
         watch.down.heard = now;
+        if self.deaf_until.is_some() {
+            watch.counters.asleep += 1;
+            if !port.inputs.is_empty() {
+                watch.line.discarded += bytes.len() as u64;
+                let mut apart = Line { held: bytes.to_vec(), ..Line::default() };
+                let verdicts = apart.bytes(port, &[], now);
+                self.from_sleep(verdicts);
+            }
+            return;
+        }
         if port.inputs.is_empty() {
             watch.counters.rejected_no_input += 1;
             return;
@@ -106,6 +122,12 @@ impl Oracle {
         let port = &self.sheet.ports[nth];
         let counters = &mut self.ports[nth].counters;
         counters.bytes_in = counters.bytes_in.wrapping_add(frame.data().len() as u32);
+        if self.deaf_until.is_some() {
+            counters.asleep += 1;
+            let verdict = field::can(port, frame);
+            self.from_sleep(verdict.into_iter().collect());
+            return;
+        }
         if port.inputs.is_empty() {
             counters.rejected_no_input += 1;
             return;
@@ -115,6 +137,18 @@ impl Oracle {
             Err(Refused::Remote) => counters.rejected_remote += 1,
             Err(Refused::Id) => counters.rejected_id += 1,
             Err(Refused::Length) => counters.rejected_length += 1,
+        }
+    }
+
+    /// Frames that had waited while the gateway slept: they count for nothing.
+    fn from_sleep(&mut self, verdicts: Vec<Verdict>) {
+        for verdict in verdicts {
+            let Verdict::Accepted(frame) = verdict else { continue };
+            self.checks[Invariant::FromSleep as usize] += 1;
+            self.orders.from_sleep(&self.sheet, &frame);
+            for (var, raw) in frame.values {
+                self.up.known[var.ordinal()].slept.get_or_insert_default().push(raw);
+            }
         }
     }
 
@@ -140,14 +174,20 @@ impl Oracle {
             self.frames[nth].0 += 1;
             frames += 1;
             let commands_up = self.up.is_up(LinkId::COMMAND);
-            self.orders.accepted(&self.sheet, nth, &frame, commands_up, now);
+            let urgent = self.orders.accepted(&self.sheet, nth, &frame, commands_up, now);
+            let orders = &self.orders;
+            self.robot.no_longer_asked(|order| orders.is_asked(order), now);
+            self.robot.asked(urgent);
             self.up.accepted(&self.sheet, nth, &frame, now);
             self.values_changed();
             newest = Some(frame);
+            // Somebody looks at each frame, or nobody before all are taken.
+            if self.sheet.has_triggers {
+                self.after_frames(now);
+            }
         }
-        // Nothing is overdue right after a frame, but something may have waited too long.
-        self.up.tick(&self.sheet, now);
         let Some(newest) = newest else { return };
+        self.after_frames(now);
         self.ports[nth].down.answered(&self.sheet.ports[nth], frames);
         let waits = self.sheet.links.iter().any(|link| {
             let wants = newest.values.iter().any(|(var, _)| {
@@ -161,6 +201,12 @@ impl Oracle {
         }
     }
 
+    /// What was overtaken is dropped, and what has waited too long.
+    fn after_frames(&mut self, now: Instant) {
+        self.orders.drop_overtaken();
+        self.up.expire(&self.sheet, now);
+    }
+
     pub(super) fn port_send(
         &mut self,
         port: PortId,
@@ -171,7 +217,15 @@ impl Oracle {
         let nth = usize::from(port.0);
         self.frames[nth].1 += 1;
         let result = self.ports[nth].down.check(&self.sheet, nth, &self.up, id, bytes, now);
-        self.judge(now, &[Invariant::Known, Invariant::Age, Invariant::Shown, Invariant::Line], result);
+        let invariants = [
+            Invariant::Known,
+            Invariant::Age,
+            Invariant::OwnAge,
+            Invariant::Unreadable,
+            Invariant::Shown,
+            Invariant::Line,
+        ];
+        self.judge(now, &invariants, result);
     }
 
     pub(super) fn link_bytes(&mut self, link: LinkId, bytes: &[u8], now: Instant) {
@@ -181,7 +235,7 @@ impl Oracle {
                 let (read, refused) = self.modbus.received(&self.map, bytes);
                 for (var, raw) in read {
                     if self.sheet.origin[var.ordinal()] == Some(Origin::Modbus) {
-                        self.up.known[var.ordinal()].value = Some((raw, now));
+                        self.up.received(var, raw, now);
                     }
                 }
                 if !refused.is_empty() {
@@ -199,7 +253,7 @@ impl Oracle {
                     }
                 }
             }
-            LinkId::COMMAND => {}
+            LinkId::COMMAND | LinkId::URGENT => self.orders.hears(link, bytes),
             _ => self.recipe_bytes(link, bytes, now),
         }
     }
@@ -214,6 +268,13 @@ impl Oracle {
             line.held.extend_from_slice(bytes);
             line.cut(&frame)
         };
+        if found.is_empty() {
+            return;
+        }
+        let before = self.up.frame_at[place(link)].replace(now);
+        if before.is_some_and(|at| now.saturating_since(at) > AWAY) {
+            self.up.controller_was_away(&self.sheet, now);
+        }
         for payload in found {
             let mut values: Vec<(SysVar, Raw)> = Vec::new();
             let mut rest = payload.as_slice();
@@ -227,12 +288,10 @@ impl Oracle {
                 }
                 values.push((var, raw));
             }
-            if values.iter().all(|(var, raw)| field::as_number(*var, *raw).is_finite()) {
-                for (var, raw) in values {
-                    self.up.known[var.ordinal()].value = Some((raw, now));
-                }
-                self.values_changed();
+            for (var, raw) in values {
+                self.up.received(var, raw, now);
             }
+            self.values_changed();
         }
     }
 
@@ -241,12 +300,20 @@ impl Oracle {
             return Err((Invariant::Line, "sent on a link that is not up".to_owned()));
         }
         match link {
-            LinkId::COMMAND => {
+            LinkId::COMMAND | LinkId::URGENT => {
                 self.checks[Invariant::Once as usize] += 1;
-                self.orders.sent(bytes, now)
+                let order = self.orders.sent(link, bytes, now)?;
+                self.robot.hands_over_order(order);
+                Ok(())
             }
             LinkId::STATE => Err((Invariant::Ownership, "sent on the state link".to_owned())),
             LinkId::MODBUS => {
+                if std::mem::replace(&mut self.links[place(link)].busy, true) {
+                    return Err((
+                        Invariant::Line,
+                        "sent before the transport had taken the request before".to_owned(),
+                    ));
+                }
                 let asked = self.modbus.sent(&self.map, bytes, now)?;
                 let Asked::Write(values) = asked else { return Ok(()) };
                 let mut safe = Vec::new();
@@ -276,7 +343,9 @@ impl Oracle {
             self.checks[invariant as usize] += 1;
         }
         self.checks[Invariant::Edges as usize] += u64::from(var.is_bits());
-        self.up.wrote(&self.sheet, link, var, raw, now)
+        let carried = self.up.wrote(&self.sheet, link, var, raw, now)?;
+        self.robot.hands_over(var, raw, carried);
+        Ok(())
     }
 
     pub(super) fn recipe_send(&mut self, link: LinkId, bytes: &[u8], now: Instant) -> Result<(), Wrong> {
@@ -306,14 +375,16 @@ impl Oracle {
                 self.writes += 1;
                 self.checks[Invariant::Sent as usize] += 1;
                 self.checks[Invariant::InTime as usize] += 1;
-                self.up.carried(&self.sheet, var, raw, now)?;
+                let carried = self.up.carried(&self.sheet, var, raw, now)?;
+                wanted |= is_ours && self.up.known(var).safe;
+                self.robot.hands_over(var, raw, carried);
             }
         }
-        if wanted {
-            Ok(())
-        } else {
-            Err((Invariant::Sent, "a frame that nobody's value waited for".to_owned()))
+        if !wanted {
+            return Err((Invariant::Sent, "a frame that nobody's value waited for".to_owned()));
         }
+        self.up.sent_frame(&self.sheet, link, now);
+        Ok(())
     }
 
     /// What could go to the controller now and does not.
@@ -331,8 +402,8 @@ impl Oracle {
                 continue;
             }
             let is_free = match self.sheet.link(way) {
-                None => self.modbus.is_free(),
-                Some(link) => !self.links[place(way)].busy && self.up.is_ready(link, now),
+                None => self.modbus.is_free() && !self.links[place(way)].busy,
+                Some(link) => self.links[place(way)].has_room() && self.up.is_ready(link, now),
             };
             if is_free {
                 let var = SysVar::from_ordinal(nth).map_or_else(String::new, |var| var.to_string());
@@ -364,6 +435,10 @@ impl Oracle {
             commands_dropped: orders.1,
             ..*counters
         };
+        if actual.timeouts > expected.timeouts {
+            let what = format!("port {nth} counted a timeout, and its device was not silent");
+            return Err((Invariant::FalseTimeout, what));
+        }
         if *actual != expected {
             return Err((Invariant::Counted, format!("port {nth} counted {actual:?}, not {expected:?}")));
         }
@@ -391,5 +466,9 @@ fn is_packet(packet: &[u8]) -> bool {
 }
 
 const PACKET: usize = 1_468;
+/// After it slept, the gateway takes nothing from the field for so long.
+const DEAF: Duration = Duration::from_millis(50);
+/// A recipe link that brought no frame for longer has a controller that was away.
+const AWAY: Duration = Duration::from_millis(500);
 /// A safe value that the controller refused is written again after this.
 const REFUSED_PAUSE: Duration = Duration::from_millis(500);

@@ -14,21 +14,25 @@ mod far;
 mod field;
 mod gateway;
 mod orders;
+mod robot;
+mod safe;
 mod sheet;
 mod upward;
 mod wire;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 
 use proto_core::config::GatewayConfig;
 use proto_core::engine::{BusState, Engine, Input, LinkId, Output, PortCounters};
 use proto_core::link::LinkState;
 use proto_core::sysvar::SysVar;
-use proto_core::time::Instant;
+use proto_core::time::{Duration, Instant};
 
 use downward::Downward;
 use field::Line;
 use orders::Orders;
+pub(super) use robot::Path;
+use robot::Robot;
 use sheet::Sheet;
 use upward::{Upward, Wrong};
 pub(super) use wire::inputs_of;
@@ -71,6 +75,24 @@ pub enum Invariant {
     Transport,
     /// The controller's inputs are what was written, and nothing else writes them.
     Registers,
+    /// What the controller applies is not older than promised.
+    ValueAge,
+    /// A command that the controller takes was picked, or asked for, not long ago.
+    CommandAge,
+    /// What stops the robot arrives as soon as a way to the controller works.
+    StopArrives,
+    /// The safe value of a silent owner is there as soon as a way to the controller works.
+    SafeArrives,
+    /// What cannot be read is neither shown nor written back.
+    Unreadable,
+    /// Values of our own ports are not shown when they are older than promised.
+    OwnAge,
+    /// A short stall of the gateway is no silence of a device.
+    FalseTimeout,
+    /// Nothing that waited while the gateway slept is applied or commanded.
+    FromSleep,
+    /// Datagrams go to the controller's client and to nobody else.
+    Destination,
     /// The work of one call is bounded.
     Work,
     /// What waits anywhere is bounded.
@@ -100,6 +122,15 @@ impl Invariant {
             Self::Line => "one-at-a-time",
             Self::Transport => "received-is-sent",
             Self::Registers => "registers",
+            Self::ValueAge => "value-age",
+            Self::CommandAge => "command-age",
+            Self::StopArrives => "stop-arrives",
+            Self::SafeArrives => "safe-arrives",
+            Self::Unreadable => "unreadable-shown",
+            Self::OwnAge => "own-values-age",
+            Self::FalseTimeout => "no-false-timeout",
+            Self::FromSleep => "nothing-from-sleep",
+            Self::Destination => "destination",
             Self::Work => "bounded-work",
             Self::Memory => "bounded-memory",
             Self::NoPanic => "no-panic",
@@ -144,6 +175,27 @@ struct PortWatch {
 struct LinkWatch {
     line: Line,
     busy: bool,
+    /// Bytes handed over since the link came up, and after each transmission that is not acknowledged.
+    total: u64,
+    unacked: VecDeque<u64>,
+}
+
+impl LinkWatch {
+    fn has_room(&self) -> bool {
+        !self.busy && self.unacked.len() < MOST_UNACKED
+    }
+
+    fn hands_over(&mut self, bytes: &[u8]) {
+        self.total += bytes.len() as u64;
+        self.unacked.push_back(self.total);
+    }
+
+    fn acked(&mut self, left: u32) {
+        let acked = self.total.saturating_sub(left.into());
+        while self.unacked.front().is_some_and(|end| *end <= acked) {
+            self.unacked.pop_front();
+        }
+    }
 }
 
 /// The model, and what it found.
@@ -160,6 +212,16 @@ pub(super) struct Oracle {
     again_at: Instant,
     orders: Orders,
     controller: Controller,
+    robot: Robot,
+    /// When the engine was called last.
+    called_at: Option<Instant>,
+    /// When it wants to be told that time has passed, and whether it was told something else since.
+    announced: Instant,
+    is_late: bool,
+    /// What comes from the field until then waited while the gateway slept.
+    deaf_until: Option<Instant>,
+    /// The gateway was just not called for a while, but did not sleep.
+    after_stall: bool,
     /// Outputs since the newest input, and how many there may be.
     outputs: u32,
     most_outputs: u32,
@@ -167,7 +229,7 @@ pub(super) struct Oracle {
     pub frames: Vec<(u64, u64)>,
     pub traffic: [(u64, u64); LINKS],
     pub writes: u64,
-    checks: [u64; 20],
+    checks: [u64; ALL.len()],
     violation: Option<Violation>,
 }
 
@@ -185,28 +247,36 @@ impl Oracle {
             again_at: Instant::NEVER,
             orders: Orders::default(),
             controller: Controller::new(),
+            robot: Robot::default(),
+            called_at: None,
+            announced: Instant::NEVER,
+            is_late: false,
+            deaf_until: None,
+            after_stall: false,
             outputs: 0,
-            // A frame a port and id; opening or closing, and something to send, a link.
-            most_outputs: parts as u32 + 2 * (3 + sheet.links.len() as u32),
+            // A frame a port and id; opening or closing, and something to send, a link, and one more
+            // command.
+            most_outputs: parts as u32 + 1 + 2 * (4 + sheet.links.len() as u32),
             frames: vec![(0, 0); sheet.ports.len()],
             traffic: [(0, 0); LINKS],
             writes: 0,
-            checks: [0; 20],
+            checks: [0; ALL.len()],
             violation: None,
             sheet,
         }
     }
 
-    /// The cell was switched on already: its ports are there.
-    pub(super) fn begin(&mut self, engine: &Engine, now: Instant) {
-        self.tick(now);
+    /// The cell was switched on already: its ports are there, and the engine wants a tick then.
+    pub(super) fn begin(&mut self, engine: &Engine, announced: Instant, now: Instant) {
+        self.called_at = Some(now);
+        self.announced = announced;
         for port in engine.field_ports() {
             self.ports[usize::from(port.0)].down.is_up = true;
         }
     }
 
     /// The gateway starts afresh: it knows nothing, so nothing may be expected of it.
-    pub(super) fn restarted(&mut self) {
+    pub(super) fn restarted(&mut self, now: Instant) {
         self.up = Upward::new(&self.sheet);
         self.ports = vec![PortWatch::default(); self.sheet.ports.len()];
         self.links = std::array::from_fn(|_| LinkWatch::default());
@@ -214,6 +284,11 @@ impl Oracle {
         self.refused.clear();
         self.again_at = Instant::NEVER;
         self.orders = Orders::default();
+        self.robot.restarted(now);
+        self.called_at = None;
+        self.announced = Instant::ZERO;
+        self.is_late = false;
+        self.deaf_until = None;
     }
 
     pub(super) fn violation(&self) -> Option<&Violation> {
@@ -239,12 +314,31 @@ impl Oracle {
             return;
         }
         self.outputs = 0;
-        self.tick(now);
+        let idle = self.called_at.replace(now).map_or(Duration::ZERO, |at| now.saturating_since(at));
+        let has_slept = idle > ASLEEP;
+        let is_tick = matches!(input, Input::Tick);
+        self.after_stall = is_tick && !has_slept && self.robot.has_stalled(now);
+        self.is_late = !is_tick && now >= self.announced;
+        if is_tick {
+            self.announced = Instant::NEVER;
+        }
+        if is_tick || has_slept {
+            self.pass(now);
+        }
+        if has_slept {
+            self.slept(now);
+        }
         let told = match input {
+            // After sleep, links have been given up before anything is taken.
+            _ if has_slept => None,
             Input::LinkDown { link } | Input::LinkBytes { link, .. } => Some(*link),
             _ => None,
         };
-        self.look_at_links(engine, told);
+        self.look_at_links(engine, told, now);
+        if is_tick || has_slept {
+            self.up.repeat(&self.sheet, now);
+        }
+        self.deaf_until = self.deaf_until.filter(|until| !is_tick || now < *until);
         match *input {
             Input::PortBytes { port, bytes } => self.port_bytes(usize::from(port.0), bytes, now),
             Input::PortCan { port, frame } => self.port_can(usize::from(port.0), &frame, now),
@@ -257,30 +351,37 @@ impl Oracle {
                 watch.down.is_up = false;
                 watch.down.reset();
                 watch.line.discard();
-                self.orders.forget(nth, None);
+                self.forget_orders(nth, None, now);
             }
             Input::PortBus { port, state } => {
-                let watch = &mut self.ports[usize::from(port.0)];
+                let nth = usize::from(port.0);
+                let watch = &mut self.ports[nth];
                 let is_off = state == BusState::BusOff;
-                if is_off && !watch.down.is_bus_off {
+                let is_news = is_off && !watch.down.is_bus_off;
+                watch.down.is_bus_off = is_off;
+                if is_news {
                     watch.counters.bus_offs += 1;
                     watch.down.reset();
+                    self.forget_orders(nth, None, now);
                 }
-                watch.down.is_bus_off = is_off;
             }
             Input::LinkUp { link } => {
+                self.nobody_spoke(link);
+                self.up.controller_was_away(&self.sheet, now);
                 if !self.up.is_up(link) && is_up(engine, link) {
                     self.up.link_up(link, now);
                     self.links[place(link)] = LinkWatch::default();
                 }
             }
-            Input::LinkDown { link } => self.link_lost(link),
+            Input::LinkDown { link } => self.link_lost(link, now),
             Input::LinkBytes { link, bytes } if self.up.is_up(link) => self.link_bytes(link, bytes, now),
             Input::LinkSent { link } => self.links[place(link)].busy = false,
+            Input::LinkAcked { link, left } => self.links[place(link)].acked(left),
             Input::LinkBytes { .. } | Input::Tick => {}
         }
+        self.orders.look_at_replies(engine);
         if told.is_some() {
-            self.look_at_links(engine, None);
+            self.look_at_links(engine, None, now);
         }
     }
 
@@ -300,31 +401,42 @@ impl Oracle {
             Output::PortSend { port, bytes } => self.port_send(port, None, bytes, now),
             Output::PortSendCan { port, frame } => self.port_send(port, Some(frame.id()), frame.data(), now),
             Output::LinkOpen { .. } | Output::Sleep { .. } => {}
-            Output::LinkClose { link } => self.link_lost(link),
+            Output::LinkClose { link } => self.link_lost(link, now),
             Output::LinkSend { link, bytes } => {
                 self.traffic[place(link)].0 += 1;
+                if self.sheet.link(link).is_some_and(|link| !link.is_datagram) {
+                    self.links[place(link)].hands_over(bytes);
+                }
                 let result = self.link_send(link, bytes, now);
                 self.judge(now, &[], result);
             }
         }
     }
 
-    /// The engine has nothing more to do; the cell itself holds so many things for later.
-    pub(super) fn rest(&mut self, now: Instant, engine: &Engine, things: usize) {
+    /// The engine has nothing more to do before `until`; the cell itself holds so many things for
+    /// later.
+    pub(super) fn rest(&mut self, now: Instant, engine: &Engine, until: Instant, things: usize) {
         if self.violation.is_some() {
             return;
         }
+        self.announced = self.announced.min(until);
         for nth in 0..self.ports.len() {
             if self.sheet.ports[nth].is_field {
-                let result = self.ports[nth].down.rest(&self.sheet, nth, &self.up, now);
-                self.judge(now, &[Invariant::Cycle], result);
+                if !self.is_late {
+                    let result = self.ports[nth].down.rest(&self.sheet, nth, &self.up, now);
+                    self.judge(now, &[Invariant::Cycle], result);
+                }
                 let result = self.count(nth, engine);
                 self.judge(now, &[Invariant::Counted, Invariant::Bytes], result);
+                self.checks[Invariant::FalseTimeout as usize] += u64::from(self.after_stall);
             }
         }
-        let result = self.nothing_waits(now);
-        self.judge(now, &[Invariant::Delivered], result);
-        let remembered = self.controller.size() + self.orders.len();
+        self.after_stall = false;
+        if !self.is_late {
+            let result = self.nothing_waits(now);
+            self.judge(now, &[Invariant::Delivered], result);
+        }
+        let remembered = self.controller.size() + self.orders.len() + self.robot.len();
         let result = match (remembered, things) {
             (0..MOST_BYTES, 0..MOST_THINGS) => Ok(()),
             _ => Err((Invariant::Memory, format!("{remembered} bytes and {things} things wait in the cell"))),
@@ -344,11 +456,15 @@ fn is_up(engine: &Engine, id: LinkId) -> bool {
 
 /// Four links of the controller's own, and one a listening port.
 const LINKS: usize = 16;
+/// Frames of a recipe link that the controller's TCP has not acknowledged.
+const MOST_UNACKED: usize = 64;
+/// A gateway that is not called for longer was asleep.
+const ASLEEP: Duration = Duration::from_millis(500);
 /// More than any stall can gather.
 const MOST_BYTES: usize = 1 << 20;
 const MOST_THINGS: usize = 100_000;
 
-const ALL: [Invariant; 20] = [
+const ALL: [Invariant; 29] = [
     Invariant::Sent,
     Invariant::InTime,
     Invariant::FirstFrame,
@@ -366,6 +482,15 @@ const ALL: [Invariant; 20] = [
     Invariant::Line,
     Invariant::Transport,
     Invariant::Registers,
+    Invariant::ValueAge,
+    Invariant::CommandAge,
+    Invariant::StopArrives,
+    Invariant::SafeArrives,
+    Invariant::Unreadable,
+    Invariant::OwnAge,
+    Invariant::FalseTimeout,
+    Invariant::FromSleep,
+    Invariant::Destination,
     Invariant::Work,
     Invariant::Memory,
     Invariant::NoPanic,

@@ -81,6 +81,10 @@ pub(super) struct Sheet {
     pub read_back: [bool; COUNT],
     /// Variables that the state stream may bring.
     pub in_packet: Vec<SysVar>,
+    /// Variables that have a safe value.
+    pub safe_vars: Vec<SysVar>,
+    /// There is a state link.
+    pub has_state: bool,
     /// Some port sends for a rising bit.
     pub has_triggers: bool,
     /// The texts and values of all command tables.
@@ -151,13 +155,40 @@ impl Sheet {
         let commands = config.commands.iter().map(|c| (c.value, c.text.as_str().to_owned())).collect();
         let may_bring =
             |var: &SysVar| origin[var.ordinal()] == Some(Origin::State) || read_back[var.ordinal()];
-        let in_packet = SysVar::all().filter(may_bring).collect();
+        let in_packet: Vec<SysVar> = SysVar::all().filter(may_bring).collect();
+        let has_state = !in_packet.is_empty();
+        let is_safe = |var: &SysVar| owned[var.ordinal()].is_some_and(|owned: Owned| owned.safe.is_some());
+        let safe_vars = SysVar::all().filter(is_safe).collect();
         let has_triggers = ports.iter().any(|port| matches!(port.send, SendOn::Rising { .. }));
-        Self { ports, links, owned, origin, read_back, in_packet, has_triggers, commands }
+        Self {
+            ports,
+            links,
+            owned,
+            origin,
+            read_back,
+            in_packet,
+            safe_vars,
+            has_state,
+            has_triggers,
+            commands,
+        }
     }
 
     pub(super) fn link(&self, id: LinkId) -> Option<&LinkSheet> {
         self.links.iter().find(|link| link.id == id)
+    }
+
+    /// The output that shows what an input was set to, when some port shows it.
+    pub(super) fn witness_of(&self, var: SysVar) -> Option<SysVar> {
+        let nth =
+            var.to_string().strip_prefix("DigitalOutputCommand[")?.strip_suffix(']')?.parse::<u8>().ok()?;
+        let witness = SysVar::parse(&format!("DigitalSignalStatus[{}]", nth + 3)).ok()?;
+        self.origin[witness.ordinal()].map(|_| witness)
+    }
+
+    /// Whether anything would show the variable's value at the controller.
+    pub(super) fn can_be_shown(&self, var: SysVar) -> bool {
+        self.has_state && var.stream().is_some() || self.witness_of(var).is_some()
     }
 }
 

@@ -390,7 +390,7 @@ fn what_waits_without_a_bound() {
 fn what_reaches_the_controller_and_was_not_sent() {
     let cell = cell(CELL);
     let (mut oracle, now) = (Oracle::new(cell.gateway()), cell.now());
-    oracle.sent(7, &coils(1));
+    oracle.sent(7, LinkId::MODBUS, &coils(1));
     let inputs = inputs_of(cell.controller().registers().image());
     oracle.arrived(7, LinkId::MODBUS, &coils(2), &inputs, &inputs, now);
     assert_eq!(oracle.violation().map(|broken| broken.invariant), Some(Invariant::Transport));
@@ -400,7 +400,7 @@ fn what_reaches_the_controller_and_was_not_sent() {
 fn inputs_that_are_not_what_was_written() {
     let cell = cell(CELL);
     let (mut oracle, now) = (Oracle::new(cell.gateway()), cell.now());
-    oracle.sent(7, &coils(1));
+    oracle.sent(7, LinkId::MODBUS, &coils(1));
     let before = inputs_of(cell.controller().registers().image());
     let mut after = before.clone();
     after[0] = 3;

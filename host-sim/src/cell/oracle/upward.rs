@@ -33,6 +33,31 @@ pub(super) struct Known {
     pub safe_at: Instant,
     /// The state stream has shown it since its owner fell silent, or ever.
     pub read_back: bool,
+    /// The newest value from the controller was none: not a number, or infinite.
+    pub unreadable: bool,
+    /// It stands at its safe value, and the controller is not known to have it.
+    pub unconfirmed: bool,
+    /// Values that waited while the gateway slept and have not come since.
+    pub slept: Option<Vec<Raw>>,
+}
+
+impl Known {
+    /// No frame and no safe value that was taken has this value.
+    fn is_news(&self, raw: Raw) -> bool {
+        self.value.is_none_or(|value| value.0 != raw) && self.waiting.iter().all(|next| next.0 != raw)
+    }
+}
+
+/// Where a value that was handed over comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Carried {
+    /// It is a safe value.
+    Safe,
+    /// The controller holds it already, as far as anybody knows.
+    Held,
+    /// It came then, in its owner's frame or from the state stream, and may be so old when it is
+    /// handed over.
+    Of { arrived: Instant, timeout: Duration },
 }
 
 /// What a port must have counted.
@@ -57,8 +82,16 @@ pub(super) struct Upward {
     /// When the links that carry values came up; `None` while they are down.
     pub up: [Option<Instant>; 16],
     pub state_at: Option<Instant>,
-    /// No frame is overdue and no value too old before this.
-    next: Instant,
+    /// When the newest frame of each recipe link came, whatever connection it was.
+    pub frame_at: [Option<Instant>; 16],
+    /// When a safe value was last in doubt.
+    pub doubted_at: Instant,
+    /// When each recipe link sends safe values again.
+    pub again_at: [Instant; 16],
+    /// No frame is overdue before this.
+    next_overdue: Instant,
+    /// No value has waited too long before this.
+    next_expiry: Instant,
     /// Variables that may have something waiting, by ordinal: inputs come first.
     pub waits: u128,
 }
@@ -71,7 +104,11 @@ impl Upward {
             counted: vec![Counted::default(); sheet.ports.len()],
             up: [None; 16],
             state_at: None,
-            next: Instant::NEVER,
+            frame_at: [None; 16],
+            doubted_at: Instant::ZERO,
+            again_at: [Instant::NEVER; 16],
+            next_overdue: Instant::NEVER,
+            next_expiry: Instant::NEVER,
             waits: 0,
         }
     }
@@ -88,19 +125,19 @@ impl Upward {
         self.up[usize::from(link.0)].is_some()
     }
 
-    /// Frames that are overdue, values that waited too long; the ports and frames that timed out.
-    pub(super) fn tick(&mut self, sheet: &Sheet, now: Instant) -> Vec<(usize, usize)> {
+    /// Frames that are overdue; their ports and places.
+    pub(super) fn overdue(&mut self, sheet: &Sheet, now: Instant) -> Vec<(usize, usize)> {
         let mut overdue = Vec::new();
-        if now < self.next {
+        if now < self.next_overdue {
             return overdue;
         }
-        self.next = Instant::NEVER;
+        self.next_overdue = Instant::NEVER;
         for (nth, port) in sheet.ports.iter().enumerate().filter(|(_, port)| port.is_field) {
             for (frame, part) in port.inputs.iter().enumerate() {
                 match self.overdue[nth][frame] {
                     Some(at) if now >= at => {}
                     Some(at) => {
-                        self.next = self.next.min(at);
+                        self.next_overdue = self.next_overdue.min(at);
                         continue;
                     }
                     None => continue,
@@ -112,6 +149,17 @@ impl Upward {
                     self.fell_silent(sheet, var, now);
                 }
             }
+        }
+        overdue
+    }
+
+    /// Values of bits that waited too long are dropped.
+    pub(super) fn expire(&mut self, sheet: &Sheet, now: Instant) {
+        if now < self.next_expiry {
+            return;
+        }
+        self.next_expiry = Instant::NEVER;
+        for (nth, port) in sheet.ports.iter().enumerate().filter(|(_, port)| port.is_field) {
             for var in port.inputs.iter().flat_map(|part| &part.fields).filter_map(super::sheet::written) {
                 let known = &mut self.known[var.ordinal()];
                 if !var.is_bits() || known.safe {
@@ -121,11 +169,10 @@ impl Upward {
                 known.waiting.retain(|(_, at)| now.saturating_since(*at) <= port.timeout);
                 self.counted[nth].values_expired += (before - known.waiting.len()) as u32;
                 for (_, at) in &known.waiting {
-                    self.next = self.next.min(*at + port.timeout + Duration::from_micros(1));
+                    self.next_expiry = self.next_expiry.min(*at + port.timeout + Duration::from_micros(1));
                 }
             }
         }
-        overdue
     }
 
     fn fell_silent(&mut self, sheet: &Sheet, var: SysVar, now: Instant) {
@@ -138,6 +185,8 @@ impl Upward {
             known.value = Some((safe, known.value.map_or(now, |value| value.1)));
             known.safe = true;
             known.safe_at = now;
+            known.unconfirmed = true;
+            self.doubted_at = now;
         } else {
             let waited = known.waiting.len() as u32;
             known.waiting.clear();
@@ -151,7 +200,8 @@ impl Upward {
     pub(super) fn accepted(&mut self, sheet: &Sheet, nth: usize, frame: &Accepted, now: Instant) {
         let timeout = sheet.ports[nth].timeout;
         self.overdue[nth][frame.frame] = Some(now + timeout);
-        self.next = self.next.min(now + timeout);
+        self.next_overdue = self.next_overdue.min(now + timeout);
+        self.next_expiry = self.next_expiry.min(now + timeout + Duration::from_micros(1));
         let mut undelivered = false;
         for &(var, raw) in &frame.values {
             let Some(Owned { way, .. }) = sheet.owned[var.ordinal()] else { continue };
@@ -162,9 +212,12 @@ impl Upward {
             known.value = Some((raw, now));
             known.accepted = Some(now);
             known.live = true;
+            known.unconfirmed = false;
+            known.unreadable = false;
+            known.slept = None;
             if std::mem::take(&mut known.safe) {
                 // A safe value that still waits may be too old by now.
-                self.next = now;
+                self.next_expiry = now;
             }
             let known = &mut self.known[var.ordinal()];
             if !is_up {
@@ -207,6 +260,7 @@ impl Upward {
         if self.up[usize::from(link.0)].take().is_none() {
             return;
         }
+        self.again_at[usize::from(link.0)] = Instant::NEVER;
         for (known, owned) in self.known.iter_mut().zip(&sheet.owned) {
             if let Some(owned) = owned
                 && owned.way == link
@@ -229,17 +283,30 @@ impl Upward {
                 continue;
             }
             let known = &mut self.known[nth];
-            if let Some(raw) = in_packet(var, packet) {
-                known.value = Some((raw, now));
-                known.read_back |= is_read_back;
-            } else if let Some(value) = &mut known.value {
-                // Not finite: the value before stays, and is as old as the packet.
-                value.1 = now;
+            let raw = in_packet(var, packet);
+            known.unreadable = raw.is_none();
+            if is_read_back {
+                known.read_back = raw.is_some();
             }
+            if let Some(raw) = raw {
+                known.value = Some((raw, now));
+            }
+        }
+        if self.may_confirm(now) {
+            self.confirm_by(sheet, packet);
         }
     }
 
-    /// A variable was written on the link that is its way up.
+    /// The newest value that a link brought; not finite, it is none.
+    pub(super) fn received(&mut self, var: SysVar, raw: Raw, now: Instant) {
+        let known = self.known_mut(var);
+        known.unreadable = !super::field::as_number(var, raw).is_finite();
+        if !known.unreadable {
+            known.value = Some((raw, now));
+        }
+    }
+
+    /// A variable was written on the link that is its way up; what was written.
     pub(super) fn wrote(
         &mut self,
         sheet: &Sheet,
@@ -247,19 +314,32 @@ impl Upward {
         var: SysVar,
         raw: Raw,
         now: Instant,
-    ) -> Result<(), Wrong> {
+    ) -> Result<Carried, Wrong> {
         let Some(owned) = sheet.owned[var.ordinal()].filter(|owned| owned.way == link) else {
             return Err((Invariant::Ownership, format!("{var} was written, but no port writes it there")));
         };
         let timeout = sheet.ports[owned.port].timeout;
         let up = self.up[usize::from(link.0)];
         let known = &mut self.known[var.ordinal()];
+        if known.slept.as_ref().is_some_and(|slept| slept.contains(&raw)) && known.is_news(raw) {
+            let what = format!("{var} = {} had waited while the gateway slept", show(var, raw));
+            return Err((Invariant::FromSleep, what));
+        }
         let Some(accepted) = known.accepted else {
             let what = format!("{var} = {} was written before any frame brought it", show(var, raw));
             return Err((Invariant::FirstFrame, what));
         };
+        let wanted = known.waiting.front().map(|next| next.0);
+        if known.live && !known.safe && owned.safe == Some(raw) && known.is_news(raw) && wanted != Some(raw) {
+            let what = format!("{var} = {} is its safe value, its owner is not silent", show(var, raw));
+            return Err((Invariant::FalseTimeout, what));
+        }
         let Some(&(next, at)) = known.waiting.front() else {
             let value = show(var, raw);
+            if known.safe && owned.safe == Some(raw) {
+                // It may always be written once more.
+                return Ok(Carried::Safe);
+            }
             return Err(if up.is_some_and(|up| accepted < up) {
                 (Invariant::NoReplay, format!("{var} = {value} is from before the link came up"))
             } else if now.saturating_since(accepted) > timeout {
@@ -280,11 +360,17 @@ impl Upward {
             ));
         }
         known.waiting.pop_front();
-        Ok(())
+        Ok(if known.safe { Carried::Safe } else { Carried::Of { arrived: at, timeout } })
     }
 
     /// A variable was in a frame that was sent for the sake of others.
-    pub(super) fn carried(&self, sheet: &Sheet, var: SysVar, raw: Raw, now: Instant) -> Result<(), Wrong> {
+    pub(super) fn carried(
+        &self,
+        sheet: &Sheet,
+        var: SysVar,
+        raw: Raw,
+        now: Instant,
+    ) -> Result<Carried, Wrong> {
         let known = &self.known[var.ordinal()];
         let value = || show(var, raw);
         let Some((held, _)) = known.value else {
@@ -298,12 +384,25 @@ impl Upward {
             let what = format!("{var} = {} was sent along, it is {}", value(), show(var, expected));
             return Err((Invariant::Sent, what));
         }
-        if known.live || var.stream().is_none() {
-            return Ok(());
+        if known.live {
+            let timeout = sheet.owned[var.ordinal()].map(|owned| sheet.ports[owned.port].timeout);
+            return Ok(match (known.safe, known.accepted, timeout) {
+                (false, Some(arrived), Some(timeout)) => Carried::Of { arrived, timeout },
+                _ => Carried::Safe,
+            });
+        }
+        if var.stream().is_none() {
+            return Ok(Carried::Held);
+        }
+        if known.unreadable {
+            let what = format!("{var} = {} was written back, and cannot be read now", value());
+            return Err((Invariant::Unreadable, what));
         }
         let is_fresh = self.state_at.is_some_and(|at| now.saturating_since(at) <= READ_BACK);
-        if sheet.read_back[var.ordinal()] && known.read_back && is_fresh {
-            return Ok(());
+        if let (true, true, true, Some(arrived)) =
+            (sheet.read_back[var.ordinal()], known.read_back, is_fresh, self.state_at)
+        {
+            return Ok(Carried::Of { arrived, timeout: READ_BACK });
         }
         Err((Invariant::InTime, format!("{var} = {} was sent along, read back too long ago", value())))
     }
@@ -324,7 +423,7 @@ impl Upward {
 }
 
 /// A variable's value in a state packet; `None` when it is not there or not finite.
-fn in_packet(var: SysVar, packet: &[u8]) -> Option<Raw> {
+pub(super) fn in_packet(var: SysVar, packet: &[u8]) -> Option<Raw> {
     let place = var.stream()?;
     let bytes = packet.get(usize::from(place.offset)..)?.get(..usize::from(place.len))?;
     let mut raw = Raw::default();

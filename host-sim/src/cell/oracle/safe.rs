@@ -1,0 +1,112 @@
+//! Safe values: written again until they are known to be there (docs/architecture.md section 7).
+
+use proto_core::engine::LinkId;
+use proto_core::sysvar::SysVar;
+use proto_core::time::{Duration, Instant};
+
+use super::field::as_number;
+use super::sheet::Sheet;
+use super::upward::{Upward, in_packet};
+
+/// A recipe link sends a safe value again after this, ...
+const SOON: Duration = Duration::from_millis(4);
+/// ... or, where nothing can show it, after this, once it has done so for [`NEW`].
+const SLOWLY: Duration = Duration::from_millis(100);
+const NEW: Duration = Duration::from_secs(1);
+/// What the controller shows sooner may be older.
+const SHOWN_AFTER: Duration = Duration::from_millis(200);
+
+impl Upward {
+    /// Safe values whose write came to nothing wait again, if they still stand.
+    pub(super) fn write_again(&mut self, sheet: &Sheet, vars: impl IntoIterator<Item = SysVar>) {
+        for var in vars {
+            let safe = sheet.owned[var.ordinal()].and_then(|owned| owned.safe);
+            let known = &mut self.known[var.ordinal()];
+            if let (true, true, Some(safe)) = (known.safe, known.waiting.is_empty(), safe) {
+                known.waiting.push_back((safe, known.safe_at));
+                self.waits |= 1 << var.ordinal();
+            }
+        }
+    }
+
+    /// The controller may have begun anew: all safe values wait again.
+    pub(super) fn controller_was_away(&mut self, sheet: &Sheet, now: Instant) {
+        let safe: Vec<SysVar> = sheet.safe_vars.iter().copied().filter(|var| self.known(*var).safe).collect();
+        if safe.is_empty() {
+            return;
+        }
+        for var in &safe {
+            self.known[var.ordinal()].unconfirmed = true;
+        }
+        self.doubted_at = now;
+        self.write_again(sheet, safe);
+    }
+
+    /// A frame was sent on a recipe link: what is in doubt is sent again later.
+    pub(super) fn sent_frame(&mut self, sheet: &Sheet, link: LinkId, now: Instant) {
+        let place = usize::from(link.0);
+        if self.again_at[place] == Instant::NEVER && !self.in_doubt(sheet, link).is_empty() {
+            self.again_at[place] = now + SOON;
+        }
+    }
+
+    /// Safe values that are sent again now.
+    pub(super) fn repeat(&mut self, sheet: &Sheet, now: Instant) {
+        for link in &sheet.links {
+            let place = usize::from(link.id.0);
+            if now < self.again_at[place] {
+                continue;
+            }
+            self.again_at[place] = Instant::NEVER;
+            self.look_at_witnesses(sheet, now);
+            let doubted = self.in_doubt(sheet, link.id);
+            if doubted.is_empty() || !self.is_up(link.id) {
+                continue;
+            }
+            let is_new = now.saturating_since(self.doubted_at) < NEW;
+            let soon = is_new || doubted.iter().any(|var| sheet.can_be_shown(*var));
+            self.again_at[place] = now + if soon { SOON } else { SLOWLY };
+            self.write_again(sheet, doubted);
+        }
+    }
+
+    fn in_doubt(&self, sheet: &Sheet, link: LinkId) -> Vec<SysVar> {
+        let is_in_doubt = |var: &SysVar| {
+            let way = sheet.owned[var.ordinal()].map(|owned| owned.way);
+            way == Some(link) && self.known(*var).unconfirmed
+        };
+        sheet.safe_vars.iter().copied().filter(is_in_doubt).collect()
+    }
+
+    /// Whether what the controller shows now can be what it made of the safe values.
+    pub(super) fn may_confirm(&self, now: Instant) -> bool {
+        now >= self.doubted_at + SHOWN_AFTER
+    }
+
+    /// Safe values that the packet shows are there.
+    pub(super) fn confirm_by(&mut self, sheet: &Sheet, packet: &[u8]) {
+        for &var in &sheet.safe_vars {
+            let safe = sheet.owned[var.ordinal()].and_then(|owned| owned.safe);
+            let is_there =
+                |safe| in_packet(var, packet).map(|raw| as_number(var, raw)) == Some(as_number(var, safe));
+            if self.known(var).unconfirmed && safe.is_some_and(is_there) {
+                self.known[var.ordinal()].unconfirmed = false;
+            }
+        }
+    }
+
+    /// So are those that an output shows that somebody reads anyway.
+    fn look_at_witnesses(&mut self, sheet: &Sheet, now: Instant) {
+        if !self.may_confirm(now) {
+            return;
+        }
+        let since = self.doubted_at + SHOWN_AFTER;
+        for &var in &sheet.safe_vars {
+            let safe = sheet.owned[var.ordinal()].and_then(|owned| owned.safe);
+            let shown = sheet.witness_of(var).and_then(|witness| self.known(witness).value);
+            if shown.is_some_and(|(raw, at)| at >= since && safe.is_some_and(|safe| safe[0] == raw[0])) {
+                self.known[var.ordinal()].unconfirmed = false;
+            }
+        }
+    }
+}
