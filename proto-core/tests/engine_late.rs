@@ -173,6 +173,19 @@ fn a_connection_that_came_up_while_the_driver_was_busy_is_up() {
 }
 
 #[test]
+fn an_engine_without_a_field_port_is_called_for_its_links() {
+    let mut cell = Cell::new();
+    let up = cell.stream(&[], &["RobotState[26]"]);
+    cell.recipe_link(up);
+    let mut rig = cell.rig();
+    rig.reachable.clear();
+    rig.input(Input::Tick);
+    assert!(rig.wake <= rig.now + MS(100), "{:?}", rig.wake);
+    rig.run(MS(1_000));
+    assert_eq!(rig.link(LinkId::RECIPE_UDP).history.failed_opens, 4, "at 0, 100, 300 and 700 ms");
+}
+
+#[test]
 fn a_stream_that_waited_was_not_silent() {
     let mut cell = Cell::new();
     let recipe = cell.stream(&[], &["RobotState[8]"]);
