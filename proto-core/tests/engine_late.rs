@@ -105,8 +105,8 @@ fn a_frame_in_two_parts_is_whole_however_late_the_second_is_told() {
             rig.bytes(port, &ON[..cut]);
             stall(&mut rig, busy);
             rig.bytes(port, &ON[cut..]);
-            assert_eq!(rig.take_written(), [coils(192, 1)], "cut at {cut}, {busy} ms");
             tick(&mut rig);
+            assert_eq!(rig.take_written(), [coils(192, 1)], "cut at {cut}, {busy} ms");
             assert_eq!(rig.counters(port).discarded_bytes, 0);
         }
     }
@@ -170,6 +170,19 @@ fn a_connection_that_came_up_while_the_driver_was_busy_is_up() {
     tick(&mut rig);
     assert_eq!(rig.link(MODBUS).state.name(), "up");
     assert_eq!(rig.link(MODBUS).history.failed_opens, 0);
+}
+
+#[test]
+fn an_engine_without_a_field_port_is_called_for_its_links() {
+    let mut cell = Cell::new();
+    let up = cell.stream(&[], &["RobotState[26]"]);
+    cell.recipe_link(up);
+    let mut rig = cell.rig();
+    rig.reachable.clear();
+    rig.input(Input::Tick);
+    assert!(rig.wake <= rig.now + MS(100), "{:?}", rig.wake);
+    rig.run(MS(1_000));
+    assert_eq!(rig.link(LinkId::RECIPE_UDP).history.failed_opens, 4, "at 0, 100, 300 and 700 ms");
 }
 
 #[test]

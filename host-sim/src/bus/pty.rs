@@ -84,6 +84,12 @@ impl Pty {
         }
     }
 
+    /// Throws away what clients wrote and nobody has read, also what the system has yet to make readable.
+    pub fn discard_unread(&self) {
+        // It fails only when no client can have written anything.
+        let _ = tcflush(self.master.get_ref(), QueueSelector::IFlush);
+    }
+
     /// Waits until bytes can be written. Cancel safe.
     ///
     /// # Errors
@@ -250,6 +256,22 @@ mod tests {
                 assert_eq!(read_from(&pty, 1).await, [round]);
                 assert!(!pty.is_heard());
             }
+        });
+    }
+
+    #[test]
+    fn what_is_thrown_away_is_gone_however_much_it_was() {
+        run(async |link| {
+            let pty = Pty::open(link).unwrap();
+            let mut peer = client(link);
+            let mut waits = 0;
+            while let Ok(count @ 1..) = peer.write(&[0xA5; 512]) {
+                waits += count;
+            }
+            assert!(waits > 4_096, "{waits}");
+            pty.discard_unread();
+            peer.write_all(b"new").unwrap();
+            assert_eq!(read_from(&pty, 3).await, b"new");
         });
     }
 

@@ -152,7 +152,11 @@ fn sharing_ends_when_the_controller_was_away() {
         rig.log.clear();
         rig.run(MS(1));
         assert_ne!(state(&rig, COMMAND), "up");
-        assert_eq!(state(&rig, URGENT), "up", "another may have come back: opened at once");
+        assert_eq!(state(&rig, URGENT), "down", "another may have come back");
+        rig.run(MS(99));
+        assert_eq!(state(&rig, URGENT), "down");
+        rig.run(MS(1));
+        assert_eq!(state(&rig, URGENT), "up", "opened after the shortest wait");
         press(&mut rig, A, STOP);
         assert_eq!(sent(&mut rig, URGENT), ["stop"]);
     }

@@ -80,6 +80,8 @@ pub enum Invariant {
     ValueAge,
     /// A command that the controller takes was picked, or asked for, not long ago.
     CommandAge,
+    /// The controller understands every command that arrives.
+    Understood,
     /// What stops the robot arrives as soon as a way to the controller works.
     StopArrives,
     /// The safe value of a silent owner is there as soon as a way to the controller works.
@@ -125,6 +127,7 @@ impl Invariant {
             Self::Registers => "registers",
             Self::ValueAge => "value-age",
             Self::CommandAge => "command-age",
+            Self::Understood => "commands-understood",
             Self::StopArrives => "stop-arrives",
             Self::SafeArrives => "safe-arrives",
             Self::Unreadable => "unreadable-shown",
@@ -471,7 +474,7 @@ const ASLEEP: Duration = Duration::from_millis(500);
 const MOST_BYTES: usize = 1 << 20;
 const MOST_THINGS: usize = 100_000;
 
-const ALL: [Invariant; 29] = [
+const ALL: [Invariant; 30] = [
     Invariant::Sent,
     Invariant::InTime,
     Invariant::FirstFrame,
@@ -491,6 +494,7 @@ const ALL: [Invariant; 29] = [
     Invariant::Registers,
     Invariant::ValueAge,
     Invariant::CommandAge,
+    Invariant::Understood,
     Invariant::StopArrives,
     Invariant::SafeArrives,
     Invariant::Unreadable,
