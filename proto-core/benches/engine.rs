@@ -26,7 +26,7 @@ type Pass = fn(&mut Bench);
 const NO_CYCLE: Duration = Duration::from_secs(3_600);
 
 /// Name, limit and work.
-const WORKS: [(&str, Option<u64>, Pass); 10] = [
+const WORKS: [(&str, Option<u64>, Pass); 11] = [
     ("field frame, bare", None, Bench::bare),
     ("field frame to Modbus request, answer", Some(PASS), Bench::modbus),
     ("field frame to two requests, answers", None, Bench::modbus_twice),
@@ -50,8 +50,19 @@ fn main() -> ExitCode {
             }
         };
     }
-    let works =
-        [work!(0), work!(1), work!(2), work!(3), work!(4), work!(5), work!(6), work!(7), work!(8), work!(9)];
+    let works = [
+        work!(0),
+        work!(1),
+        work!(2),
+        work!(3),
+        work!(4),
+        work!(5),
+        work!(6),
+        work!(7),
+        work!(8),
+        work!(9),
+        work!(10),
+    ];
     instructions::main(&works).unwrap_or_else(|| {
         divan::main();
         ExitCode::SUCCESS
