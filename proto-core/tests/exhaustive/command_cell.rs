@@ -22,6 +22,8 @@ const FIRST_COIL: u16 = 32;
 const ANSWER_TIMEOUT: Duration = Duration::from_millis(500);
 const REFUSED_PAUSE: Duration = Duration::from_millis(500);
 const TIMEOUTS_IN_A_ROW: u8 = 3;
+/// The device repeats a frame so often that it is never overdue.
+const STEADY: Duration = Duration::from_millis(90);
 /// What waited while the gateway was asleep may be read for so long after it.
 const DEAF: Duration = Duration::from_millis(50);
 
@@ -29,6 +31,8 @@ const DEAF: Duration = Duration::from_millis(50);
 pub enum Event {
     /// The device sends one of [`FRAMES`].
     Frame(u8),
+    /// The device repeats its newest frame for a while, often enough, and the driver keeps its time.
+    Steady,
     /// The engine is called when it wants to be.
     Tick,
     /// That instant comes, and the driver has something else to tell first.
@@ -75,6 +79,8 @@ pub struct CommandCell {
 #[derive(Debug, Clone)]
 struct Facts {
     is_up: bool,
+    /// The device's newest frame.
+    repeats: Option<u8>,
     is_bus_off: bool,
     deaf_until: Option<Instant>,
     bits: Bits,
@@ -124,6 +130,7 @@ impl CommandCell {
         let conns = Conns::new(&LINKS.map(|link| (link, true)));
         let judge = Facts {
             is_up: false,
+            repeats: None,
             is_bus_off: false,
             deaf_until: None,
             bits: Bits::new(SAFE),
@@ -148,11 +155,26 @@ impl CommandCell {
         self
     }
 
+    fn steady(&mut self) -> Result<(), Broken> {
+        let nth = self.judge.repeats.expect("the device has sent something");
+        for _ in 0..5 {
+            let next = self.gateway.now + STEADY;
+            while self.gateway.until < next {
+                self.gateway.wait_until_due();
+                self.tell(Input::Tick)?;
+            }
+            self.gateway.now = next;
+            self.frame(nth)?;
+        }
+        self.tell(Input::Tick)
+    }
+
     fn tell(&mut self, input: Input<'_>) -> Result<(), Broken> {
         self.gateway.tell(input, &mut self.judge)
     }
 
     fn frame(&mut self, nth: u8) -> Result<(), Broken> {
+        self.judge.repeats = Some(nth);
         let (value, command) = FRAMES[usize::from(nth)];
         let frame = CanFrame::new(CanId::Standard(1), &[value, command]).expect("two bytes");
         self.tell(Input::PortCan { port: PORT, frame })
@@ -196,6 +218,7 @@ impl World for CommandCell {
         for nth in 0..FRAMES.len() {
             add(Frame(nth as u8), sends);
         }
+        add(Steady, sends && judge.repeats.is_some());
         add(Tick, true);
         add(Late, !gateway.is_late());
         add(Step, true);
@@ -234,6 +257,7 @@ impl World for CommandCell {
         let port = PORT;
         match event {
             Frame(nth) => self.frame(nth),
+            Steady => self.steady(),
             Tick => {
                 self.gateway.wait_until_due();
                 self.tell(Input::Tick)

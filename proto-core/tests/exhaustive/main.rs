@@ -68,15 +68,17 @@ fn command_roots(start: Instant) -> Vec<Root<CommandCell>> {
     let silent = working.clone().after(&[Tick]);
     let unanswered = [Taken(LinkId::MODBUS), Acked(LinkId::MODBUS), Step, Step];
     let silent = silent.after(&unanswered).after(&unanswered).after(&unanswered[..2]);
-    // A command is given up after 10 s; the device has come back meanwhile.
     let command = [Frame(2), Taken(LinkId::COMMAND), Acked(LinkId::COMMAND), Taken(LinkId::MODBUS), Answered];
-    let unanswered = working.clone().after(&command).after(&[Step, Taken(LinkId::MODBUS), Answered]);
+    let busy = working.clone().after(&command).after(&first);
+    // A command is given up after 10 s.
+    let unanswered = busy.clone().after(&[Tick, Taken(LinkId::MODBUS), Answered]);
     let unanswered = unanswered.after(&[Step; 21]).after(&first);
     vec![
         root("working", working, 0),
         root("cold", cold, 1),
         root("shared", shared, 1),
         root("silent", silent, 1),
+        root("busy", busy, 1),
         root("unanswered", unanswered, 1),
     ]
 }
