@@ -519,8 +519,9 @@ pub const MAX_WAITING: usize = 256;
 const MAX_CLIENTS: usize = 32;
 /// Most bytes read from a client at once.
 const CHUNK: usize = 256;
-/// The same of what waited while the process slept: of that no frames come.
-const OLD_CHUNK: usize = 4_096;
+/// The same of what waited while the process slept: of that no frames come. A terminal that had more gives
+/// exactly this.
+const OLD_CHUNK: usize = 4_095;
 /// Bytes made out for a client and not yet taken; beyond it frames wait in the node's queue.
 const MAX_PENDING: usize = 4_096;
 /// Between two looks for a client that went away and left bytes behind.

@@ -15,7 +15,7 @@ use proto_core::time::{Duration, Instant};
 use tokio::io::{AsyncRead, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::task::yield_now;
-use tokio_serial::{SerialPort, SerialPortBuilderExt, SerialStream};
+use tokio_serial::{ClearBuffer, SerialPort, SerialPortBuilderExt, SerialStream};
 use tracing::{debug, info, warn};
 
 use super::backoff::Backoff;
@@ -195,8 +195,12 @@ trait LineIo {
     const LOSSY: bool;
 
     async fn receive(&self, buf: &mut [u8]) -> io::Result<usize>;
+    fn try_read(&self, buf: &mut [u8]) -> io::Result<usize>;
     async fn writable(&self) -> io::Result<()>;
     fn try_write(&self, bytes: &[u8]) -> io::Result<usize>;
+
+    /// Throws away what has arrived and was not read, if the system can.
+    fn discard_unread(&self) {}
 
     /// Whether the device still holds bytes that were written.
     fn is_draining(&self) -> bool {
@@ -226,11 +230,17 @@ impl LineIo for Pty {
             }
         }
     }
+    fn try_read(&self, buf: &mut [u8]) -> io::Result<usize> {
+        Self::try_read(self, buf)
+    }
     async fn writable(&self) -> io::Result<()> {
         Self::writable(self).await
     }
     fn try_write(&self, bytes: &[u8]) -> io::Result<usize> {
         Self::try_write(self, bytes)
+    }
+    fn discard_unread(&self) {
+        Self::discard_unread(self);
     }
     fn is_heard(&self) -> bool {
         Self::is_heard(self)
@@ -249,6 +259,9 @@ impl LineIo for RefCell<SerialStream> {
         poll_fn(|cx| Pin::new(&mut *self.borrow_mut()).poll_read(cx, &mut buf)).await?;
         Ok(buf.filled().len())
     }
+    fn try_read(&self, buf: &mut [u8]) -> io::Result<usize> {
+        self.borrow_mut().try_read(buf)
+    }
     async fn writable(&self) -> io::Result<()> {
         // A frame fits the system's buffer; when it does not, it empties at the line's speed.
         tokio::time::sleep(StdDuration::from_millis(1)).await;
@@ -256,6 +269,9 @@ impl LineIo for RefCell<SerialStream> {
     }
     fn try_write(&self, bytes: &[u8]) -> io::Result<usize> {
         self.borrow_mut().try_write(bytes)
+    }
+    fn discard_unread(&self) {
+        let _ = self.borrow().clear(ClearBuffer::Input);
     }
     fn is_draining(&self) -> bool {
         self.borrow().bytes_to_write().is_ok_and(|left| left > 0)
@@ -273,6 +289,9 @@ impl LineIo for TcpStream {
                 read => return read,
             }
         }
+    }
+    fn try_read(&self, buf: &mut [u8]) -> io::Result<usize> {
+        Self::try_read(self, buf)
     }
     async fn writable(&self) -> io::Result<()> {
         Self::writable(self).await
@@ -312,6 +331,10 @@ async fn pump(
                 Err(error) if error.kind() == io::ErrorKind::Interrupted => Ok(()),
                 Err(error) => Err(error),
             },
+            () = sender.tx.slept.notified() => {
+                swallow(device, &sender.tx, &mut buf, events);
+                Ok(())
+            }
             () = sender.tx.wake.notified(), if !sender.sending => sender.begin(device, events),
             expired = sender.timer.expired(), if sender.sending && !sender.blocked => {
                 expired.and_then(|()| sender.advance(device, events))
@@ -328,6 +351,17 @@ async fn pump(
             return error;
         }
     }
+}
+
+/// Tells what waited while the process slept, which is refused and counted, and throws away what of it cannot be
+/// read yet: a terminal's system makes it readable piece by piece, when it has the time.
+fn swallow(device: &impl LineIo, tx: &PortTx, buf: &mut [u8], events: &mut impl FnMut(PortEvent<'_>)) {
+    for _ in 0..MOST_SWALLOWED {
+        let Ok(count @ 1..) = device.try_read(buf) else { break };
+        tx.count(|counters| counters.bytes_in += count as u64);
+        events(PortEvent::Bytes(&buf[..count]));
+    }
+    device.discard_unread();
 }
 
 /// The transmission under way on a line, and the time it takes.
@@ -454,6 +488,8 @@ fn bytes_in(line: &Rs485, time: Duration) -> usize {
 const CHUNK: usize = 512;
 /// The same of what waited while the process slept.
 const OLD_CHUNK: usize = 16 * 1_024;
+/// Reads at the end of a sleep before others have a turn.
+const MOST_SWALLOWED: usize = 64;
 /// Paced bytes closer together than this appear together, as out of a UART's FIFO.
 const CLUMP: Duration = Duration::from_micros(500);
 /// Between two looks at what a serial device still holds.

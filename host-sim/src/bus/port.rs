@@ -137,6 +137,7 @@ pub struct PortTx {
     pub(super) complaints: Quota,
     /// What is read before this may have waited while the process slept.
     stale_until: Cell<Instant>,
+    pub(super) slept: Notify,
 }
 
 impl PortTx {
@@ -144,6 +145,7 @@ impl PortTx {
     /// refuses everything for [`STALE`]; by then nothing old may be left behind.
     pub fn note_sleep(&self, now: Instant) {
         self.stale_until.set(now + STALE);
+        self.slept.notify_one();
     }
 
     /// Whether the port's owner refuses what is read now, since it may have waited while this process slept.
@@ -263,8 +265,9 @@ pub struct DeviceCounters {
 
 /// For how long the engine refuses what arrives after a sleep, at least.
 pub const STALE: Duration = Duration::from_millis(50);
-/// A pause after which what comes is no part of a backlog. A peer's system may need a while to send more.
-const PAUSE: Duration = Duration::from_millis(20);
+/// How long less has to come than can be read at once until it is no part of a backlog: systems may need a while
+/// for more of it. The engine's links are not back earlier.
+const PAUSE: Duration = Duration::from_millis(100);
 /// However long a backlog is, after this it counts as new.
 const MOST_BACKLOG: Duration = Duration::from_secs(10);
 /// A frame of every port's recipe fits several times over; a port waits for one to leave.

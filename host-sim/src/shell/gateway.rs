@@ -190,7 +190,7 @@ impl Core {
         engine.handle(at, input);
         let sleeps = engine.sleeps();
         if self.sleeps.replace(sleeps) != sleeps {
-            warn!(sleeps, "nobody called for too long: what waited is discarded");
+            warn!(sleeps, "the gateway slept: what waited is discarded");
             for (_, tx) in self.ports.values() {
                 tx.note_sleep(at);
             }
@@ -277,7 +277,7 @@ impl Core {
     }
 }
 
-/// Runs the gateway until Ctrl-C or SIGTERM.
+/// Runs the gateway until Ctrl-C, SIGTERM or SIGHUP.
 ///
 /// # Errors
 /// What kept it from starting; nothing is left behind then.

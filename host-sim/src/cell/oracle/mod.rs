@@ -17,6 +17,7 @@ mod orders;
 mod robot;
 mod safe;
 mod sheet;
+mod stream;
 mod upward;
 mod wire;
 
@@ -177,6 +178,7 @@ struct PortWatch {
 #[derive(Debug, Clone, Default)]
 struct LinkWatch {
     line: Line,
+    stream: stream::Stream,
     busy: bool,
     /// Bytes handed over since the link came up, and after each transmission that is not acknowledged.
     total: u64,

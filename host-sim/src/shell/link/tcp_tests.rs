@@ -1,7 +1,7 @@
-//! What becomes of bytes that were handed over, with peers whose cable is pulled.
+//! What becomes of bytes that were handed over, with peers that have no room for them: what does not fit there
+//! is not acknowledged.
 
 use std::io::Read;
-use std::os::fd::AsRawFd;
 
 use tokio::io::AsyncWriteExt;
 use tokio::net::TcpSocket;
@@ -11,64 +11,48 @@ use super::super::tests::{Running, Seen, inside, server, tcp_listen};
 use super::super::{Endpoint, TurnedAway};
 use super::*;
 
-/// Pulls the cable at this end: no segment that comes reaches it, no reset either.
-fn pull(peer: &TcpStream) {
-    let mut drop_all = libc::sock_filter { code: (libc::BPF_RET | libc::BPF_K) as u16, jt: 0, jf: 0, k: 0 };
-    let program = libc::sock_fprog { len: 1, filter: &raw mut drop_all };
-    set(peer, libc::SO_ATTACH_FILTER, &program);
-}
-
-fn plug(peer: &TcpStream) {
-    set(peer, libc::SO_DETACH_FILTER, &0_i32);
-}
-
-fn set<T>(socket: &TcpStream, name: libc::c_int, value: &T) {
-    let len = size_of::<T>() as libc::socklen_t;
-    // SAFETY: the descriptor is open while `socket` is borrowed; `value`, and what a filter's value leads to,
-    // outlive the call, which copies them.
-    let done = unsafe {
-        libc::setsockopt(socket.as_raw_fd(), libc::SOL_SOCKET, name, (&raw const *value).cast(), len)
-    };
-    assert_eq!(done, 0, "{}", io::Error::last_os_error());
-}
-
-/// A link that is up, and its peer.
+/// A link that is up, and its peer, whose system takes little.
 async fn pair() -> (Running, TcpListener, TcpStream) {
-    let (listener, endpoint) = server().await;
-    let link = Running::start(endpoint);
+    let socket = TcpSocket::new_v4().unwrap();
+    socket.set_recv_buffer_size(1).unwrap();
+    socket.bind("127.0.0.1:0".parse().unwrap()).unwrap();
+    let listener = socket.listen(4).unwrap();
+    let at = listener.local_addr().unwrap();
+    let link = Running::start(Endpoint::Tcp { host: at.ip().to_string(), port: at.port() });
     link.control.open();
     let (peer, _) = listener.accept().await.unwrap();
     link.expect(Seen::Up).await;
     (link, listener, peer)
 }
 
-/// Whether the system still has the other end of this connection, be it of no process any more.
-fn has_other_end(peer: &TcpStream) -> bool {
-    let end = |at: std::net::SocketAddr| format!("0100007F:{:04X}", at.port());
-    let (own, other) = (end(peer.local_addr().unwrap()), end(peer.peer_addr().unwrap()));
-    let table = std::fs::read_to_string("/proc/self/net/tcp").unwrap();
-    table.lines().any(|line| line.contains(&format!("{other} {own} ")))
+const PIECE: usize = 1_024;
+const PIECES: u8 = 16;
+const ALL: usize = PIECE * PIECES as usize;
+
+/// Hands over more than the peer's system takes and less than ours does.
+async fn fill(link: &Running) {
+    for piece in 1..=PIECES {
+        link.control.send(&[piece; PIECE]);
+        link.expect(Seen::Sent).await;
+    }
 }
 
-/// Once plugged in, the peer learns that the connection is over, and never gets another byte.
-async fn gets_nothing(mut peer: TcpStream) {
-    // The link's task needs a few turns; a system that still tried to deliver would do so for seconds.
-    for _ in 0..100 {
-        yield_now().await;
-    }
-    assert!(!has_other_end(&peer), "it would be delivered later");
-    plug(&peer);
-    // Nobody is there to answer: that is a reset.
-    peer.write_all(b"?").await.unwrap();
+/// Who reads on now finds what its system had acknowledged, and then a reset.
+async fn gets_nothing_more(mut peer: TcpStream) {
     let mut got = Vec::new();
-    let ended = tokio::io::AsyncReadExt::read_to_end(&mut peer, &mut got).await;
-    assert_eq!((ended.unwrap_err().kind(), got), (io::ErrorKind::ConnectionReset, vec![]));
+    let ended = peer.read_to_end(&mut got).await;
+    assert!(!got.contains(&PIECES), "{} bytes", got.len());
+    assert_eq!(ended.unwrap_err().kind(), io::ErrorKind::ConnectionReset);
 }
 
 #[test]
 fn what_was_acknowledged_is_told_before_what_arrived() {
     inside(async || {
-        let (link, _listener, mut peer) = pair().await;
+        let (listener, endpoint) = server().await;
+        let link = Running::start(endpoint);
+        link.control.open();
+        let (mut peer, _) = listener.accept().await.unwrap();
+        link.expect(Seen::Up).await;
         for round in 0..50_u8 {
             link.control.send(&[round; 5]);
             assert_eq!(link.next().await, Seen::Sent);
@@ -87,22 +71,24 @@ fn what_was_acknowledged_is_told_before_what_arrived() {
 fn what_is_taken_and_not_acknowledged_is_told_when_it_is() {
     inside(async || {
         let (link, _listener, mut peer) = pair().await;
-        pull(&peer);
-        for _ in 0..3 {
-            link.control.send(b"frame");
-            assert_eq!(link.next().await, Seen::Sent);
-        }
+        fill(&link).await;
         sleep(3 * LOOK).await;
-        assert!(link.seen.events.borrow().is_empty(), "nothing has changed");
-        plug(&peer);
-        let mut got = [0; 15];
-        peer.read_exact(&mut got).await.unwrap();
-        assert_eq!(&got, b"frameframeframe");
-        loop {
-            match link.next().await {
-                Seen::Acked(0) => break,
-                Seen::Acked(left) => assert!(left < 15, "{left}"),
+        // All that was said is how little there was room for.
+        let mut left = ALL as u32;
+        while let Some(event) = link.seen.events.borrow_mut().pop_front() {
+            match event {
+                Seen::Acked(now_left) => left = now_left,
                 other => panic!("{other:?}"),
+            }
+        }
+        assert!((ALL as u32 / 2..=ALL as u32).contains(&left), "{left}");
+        let mut got = vec![0; ALL];
+        peer.read_exact(&mut got).await.unwrap();
+        assert_eq!(got.last(), Some(&PIECES));
+        while left > 0 {
+            match link.next().await {
+                Seen::Acked(now_left) if now_left < left => left = now_left,
+                other => panic!("{other:?} after {left}"),
             }
         }
     });
@@ -111,25 +97,17 @@ fn what_is_taken_and_not_acknowledged_is_told_when_it_is() {
 #[test]
 fn what_the_link_itself_still_holds_is_not_acknowledged_either() {
     inside(async || {
-        let small = TcpSocket::new_v4().unwrap();
-        small.set_recv_buffer_size(4_096).unwrap();
-        small.bind("127.0.0.1:0".parse().unwrap()).unwrap();
-        let listener = small.listen(4).unwrap();
-        let at = listener.local_addr().unwrap();
-        let link = Running::start(Endpoint::Tcp { host: at.ip().to_string(), port: at.port() });
-        link.control.open();
-        let (mut peer, _) = listener.accept().await.unwrap();
-        link.expect(Seen::Up).await;
+        let (link, _listener, mut peer) = pair().await;
         // More than the buffers of both ends take.
-        const ALL: u32 = 16 << 20;
-        link.control.send(&vec![0; ALL as usize]);
+        const MUCH: u32 = 16 << 20;
+        link.control.send(&vec![0; MUCH as usize]);
         let Seen::Acked(mut left) = link.next().await else { panic!("sent") };
-        assert!((ALL / 2..ALL).contains(&left), "{left}");
+        assert!((MUCH / 2..MUCH).contains(&left), "{left}");
         let mut is_sent = false;
         let reading = async {
             let mut read = 0;
             let mut chunk = vec![0; 1 << 16];
-            while read < ALL as usize {
+            while read < MUCH as usize {
                 read += peer.read(&mut chunk).await.unwrap();
             }
         };
@@ -154,14 +132,12 @@ fn what_the_link_itself_still_holds_is_not_acknowledged_either() {
 fn what_was_not_acknowledged_when_the_link_was_closed_never_arrives() {
     inside(async || {
         let (link, listener, peer) = pair().await;
-        pull(&peer);
-        link.control.send(b"old");
-        assert_eq!(link.next().await, Seen::Sent);
+        fill(&link).await;
         link.control.close();
         link.control.open();
         let (_fresh, _) = listener.accept().await.unwrap();
         link.expect(Seen::Up).await;
-        gets_nothing(peer).await;
+        gets_nothing_more(peer).await;
         assert!(link.is_silent());
     });
 }
@@ -170,11 +146,9 @@ fn what_was_not_acknowledged_when_the_link_was_closed_never_arrives() {
 fn nor_does_what_was_handed_over_when_the_gateway_ended() {
     inside(async || {
         let (link, _listener, peer) = pair().await;
-        pull(&peer);
-        link.control.send(b"old");
-        assert_eq!(link.next().await, Seen::Sent);
+        fill(&link).await;
         drop(link);
-        gets_nothing(peer).await;
+        gets_nothing_more(peer).await;
     });
 }
 
@@ -185,13 +159,13 @@ fn nor_what_a_listening_link_sent() {
         let at = listener.local_addr().unwrap();
         let link = Running::start(tcp_listen(listener));
         link.control.open();
-        let peer = TcpStream::connect(at).await.unwrap();
+        let socket = TcpSocket::new_v4().unwrap();
+        socket.set_recv_buffer_size(1).unwrap();
+        let peer = socket.connect(at).await.unwrap();
         link.expect(Seen::Up).await;
-        pull(&peer);
-        link.control.send(b"old");
-        assert_eq!(link.next().await, Seen::Sent);
+        fill(&link).await;
         link.control.close();
-        gets_nothing(peer).await;
+        gets_nothing_more(peer).await;
     });
 }
 
@@ -226,13 +200,11 @@ fn a_connection_that_is_made_in_the_moment_of_the_close_is_not_taken_for_the_nex
 fn the_system_gives_up_a_peer_that_acknowledges_nothing() {
     inside(async || {
         let (link, _listener, peer) = pair().await;
-        pull(&peer);
         let begin = Instant::now();
-        link.control.send(b"frame");
-        assert_eq!(link.next().await, Seen::Sent);
-        assert_eq!(link.next().await, Seen::Down);
+        fill(&link).await;
+        link.expect(Seen::Down).await;
         assert!(begin.elapsed() >= PATIENCE / 2, "{:?}", begin.elapsed());
-        gets_nothing(peer).await;
+        gets_nothing_more(peer).await;
     });
 }
 

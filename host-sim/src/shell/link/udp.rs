@@ -160,11 +160,10 @@ async fn receive(
 /// Throws away what waits in the socket: nothing tells how old it is.
 fn discard_waiting(socket: &UdpSocket) {
     for _ in 0..MOST_WAITING {
-        // Asked of the system, since the reactor may not have looked yet.
-        match rustix::net::recv(socket, &mut [0_u8; 1], RecvFlags::DONTWAIT | RecvFlags::TRUNC) {
-            Err(Errno::AGAIN) => return,
-            // A datagram, or an error that waited like one.
-            Ok(_) | Err(_) => {}
+        // Asked of the system, since the reactor may not have looked yet. An error waited like a datagram.
+        let discarded = rustix::net::recv(socket, &mut [0_u8; 1], RecvFlags::DONTWAIT | RecvFlags::TRUNC);
+        if discarded == Err(Errno::AGAIN) {
+            return;
         }
     }
 }
