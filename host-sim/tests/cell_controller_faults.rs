@@ -473,11 +473,14 @@ fn a_slow_command_server_says_so_and_no_reply_is_taken_for_another() {
         heard(cell, line)[0][3]
     };
     cell.controller_mut().mute(Link::Command);
+    // What stops has a connection of its own, and is asked for no longer.
     assert_eq!(ask(&mut cell, 9), 1);
+    assert_eq!(ask(&mut cell, 0), 1);
     cell.run_ms(10_000);
     assert_eq!(ask(&mut cell, 0), 5, "no reply");
-    let link = cell.link(LinkId::COMMAND);
+    let link = cell.link(LinkId::URGENT);
     assert_eq!((link.counters.timeouts, link.history.losses), (1, 1));
+    assert_eq!(cell.link(LinkId::COMMAND).history.losses, 0);
     cell.controller_mut().unmute(Link::Command);
     cell.run_ms(500);
     assert_eq!(ask(&mut cell, 1), 1);

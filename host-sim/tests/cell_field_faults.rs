@@ -234,7 +234,8 @@ fn a_recipe_swap_and_back() {
     assert_eq!(counters.resync_bytes + counters.discarded_bytes, 250 * 5);
     assert_eq!(force(&cell), [0.0; 6], "the safe values: nobody measures");
     let after = cell.controller().counters().ports["udp2011"].frames_in;
-    assert_eq!(after, before + 1, "the safe values, once");
+    // Nothing would show them: each 4 ms for a second.
+    assert!((240..=250).contains(&(after - before)), "the safe values, {} times", after - before);
     next_good_frame(&mut cell, line, 2);
 }
 

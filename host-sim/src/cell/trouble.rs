@@ -343,12 +343,14 @@ impl Trouble {
                 None
             }
             TroubleKind::Mute => {
+                lasts = patience(rng, server);
                 cell.ails(server);
                 cell.controller_mut().mute(server);
                 Some(Remedy::Unmute(server))
             }
             TroubleKind::SlowAnswers => {
-                let delay = rng.up_to(Duration::from_millis(1_500));
+                lasts = patience(rng, server);
+                let delay = rng.up_to(lasts.unwrap_or(Duration::from_millis(1_500)));
                 cell.ails(server);
                 cell.controller_mut().delay_answers(server, delay);
                 Some(Remedy::Answers(server))
@@ -510,6 +512,11 @@ fn cut_ways(cell: &mut Cell, link: LinkId, which: u64) -> Option<Remedy> {
         cell.cut_way(link, way);
     }
     Some(Remedy::Ways(link, ways))
+}
+
+/// Replies to commands are waited for for ten seconds; the other servers' faults last as most do.
+fn patience(rng: &mut Rng, server: Link) -> Option<Duration> {
+    (server == Link::Command).then(|| longer_and_rarer(rng, Duration::from_millis(400), 4))
 }
 
 /// From `shortest` to twice `shortest * 2^doublings`; each doubling is as likely as the one before.
