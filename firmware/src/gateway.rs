@@ -131,6 +131,11 @@ impl Gateway {
         }
     }
 
+    /// How often the processor was stopped: what waited meanwhile was discarded.
+    pub fn sleeps(&self) -> u32 {
+        self.sleeps.get()
+    }
+
     /// How many connections and datagrams of others than the controller each link has turned away.
     pub fn strangers(&self) -> impl Iterator<Item = (LinkKind, u32)> + '_ {
         self.links.iter().map(|(_, kind, control)| (*kind, control.strangers.get()))

@@ -14,6 +14,7 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse) -> ! {
     let mut links = [(0, Shown::Down); MAX_LINKS];
     let mut ports = [[0; 6]; MAX_FIELD_PORTS];
     let mut strangers = [0; MAX_LINKS];
+    let mut sleeps = 0;
     loop {
         for _ in 0..4 {
             let mut known = links.iter_mut();
@@ -43,6 +44,10 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse) -> ! {
                 |_, _| {},
             );
             pulse.idle(pin!(Timer::after(Duration::from_millis(250)))).await;
+        }
+        if sleeps != gateway.sleeps() {
+            sleeps = gateway.sleeps();
+            warn!("the processor was stopped ({}): what waited meanwhile is discarded", sleeps);
         }
         for ((kind, now), before) in gateway.strangers().zip(&mut strangers) {
             if *before != now {

@@ -6,5 +6,7 @@ pub mod cli;
 pub mod config;
 pub mod controller;
 pub mod demo;
+mod files;
+mod out;
 pub mod shell;
 pub mod soak;

@@ -131,6 +131,62 @@ fn an_image_is_what_a_board_takes() {
 }
 
 #[test]
+fn an_image_replaces_nothing_but_images() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
+    let names = || {
+        let names = std::fs::read_dir(folder.path()).unwrap();
+        let mut names: Vec<_> =
+            names.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
+        names.sort();
+        names
+    };
+    let (file, image) = (at("cell.toml"), at("cell.img"));
+    std::fs::copy(config("rs485-system.toml"), &file).unwrap();
+    let toml = std::fs::read(&file).unwrap();
+
+    // What it is made of is never lost, by whatever name and whatever is said.
+    std::os::unix::fs::symlink(&file, at("link")).unwrap();
+    for output in [&file, &at("link")] {
+        for force in [&["--force"][..], &[]] {
+            let said = refused(&[&["image", &file, "-o", output], force].concat());
+            assert!(
+                said.starts_with(&format!("{output}: this is the file that the image is made of")),
+                "{said}"
+            );
+            assert_eq!(said.lines().count(), 1);
+        }
+    }
+    // Others only when it is said.
+    std::fs::write(&image, "precious").unwrap();
+    let said = refused(&["image", &file, "-o", &image]);
+    assert!(
+        said.contains("there is a file already, and it is no image; give another name or --force"),
+        "{said}"
+    );
+    assert_eq!(std::fs::read(&image).unwrap(), b"precious");
+    ok(&["image", &file, "-o", &image, "--force"], "");
+    let first = std::fs::read(&image).unwrap();
+    assert!(first.starts_with(b"RGCI"));
+    // An image makes room, one of another version too.
+    std::fs::write(&image, [b"RGCI", &[0; 30][..]].concat()).unwrap();
+    ok(&["image", &file, "-o", &image], "");
+    assert_eq!(std::fs::read(&image).unwrap(), first);
+
+    std::fs::create_dir(at("folder")).unwrap();
+    let said = refused(&["image", &file, "-o", &at("folder"), "--force"]);
+    assert!(said.contains("a folder; give the name of a file in it"), "{said}");
+    std::os::unix::fs::symlink(at("nothing"), at("dangling")).unwrap();
+    refused(&["image", &file, "-o", &at("dangling")]);
+    refused(&["image", &file, "-o", &at("no-such-folder/cell.img")]);
+    assert_eq!(std::fs::read(&file).unwrap(), toml);
+    assert_eq!(names(), ["cell.img", "cell.toml", "dangling", "folder", "link"]);
+    // What is no place but passes things on may have it.
+    ok(&["image", &file, "-o", "/dev/null"], "");
+    assert!(!std::path::Path::new("/dev/null").is_file());
+}
+
+#[test]
 fn check_shows_a_boards_own_address() {
     let sets =
         ["network.address=192.168.12.20/24", "network.router=192.168.12.1", "network.dns=192.168.12.2"];

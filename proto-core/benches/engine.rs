@@ -26,7 +26,7 @@ type Pass = fn(&mut Bench);
 const NO_CYCLE: Duration = Duration::from_secs(3_600);
 
 /// Name, limit and work.
-const WORKS: [(&str, Option<u64>, Pass); 9] = [
+const WORKS: [(&str, Option<u64>, Pass); 11] = [
     ("field frame, bare", None, Bench::bare),
     ("field frame to Modbus request, answer", Some(PASS), Bench::modbus),
     ("field frame to two requests, answers", None, Bench::modbus_twice),
@@ -34,8 +34,10 @@ const WORKS: [(&str, Option<u64>, Pass); 9] = [
     ("field frame byte by byte to UDP", None, Bench::udp_bytes),
     ("CAN frame applied", None, Bench::can),
     ("state packet", None, Bench::state),
+    ("state packet of a starting controller", None, Bench::state_of_starting),
     ("idle tick", None, Bench::idle),
     ("cycle of one port", None, Bench::cycle),
+    ("field frame to request, acknowledged", None, Bench::modbus_acknowledged),
 ];
 
 fn main() -> ExitCode {
@@ -48,7 +50,19 @@ fn main() -> ExitCode {
             }
         };
     }
-    let works = [work!(0), work!(1), work!(2), work!(3), work!(4), work!(5), work!(6), work!(7), work!(8)];
+    let works = [
+        work!(0),
+        work!(1),
+        work!(2),
+        work!(3),
+        work!(4),
+        work!(5),
+        work!(6),
+        work!(7),
+        work!(8),
+        work!(9),
+        work!(10),
+    ];
     instructions::main(&works).unwrap_or_else(|| {
         divan::main();
         ExitCode::SUCCESS
@@ -126,7 +140,7 @@ impl Bench {
             out: [0; OUTPUT_BUFFER],
             plc: frame(0x11),
             sensor: frame(0x22),
-            packet: vec![0; 1468],
+            packet: started_packet(),
             sent: 0,
             passes: 0,
         };
@@ -187,6 +201,20 @@ impl Bench {
         self.pass(Input::LinkBytes { link: LinkId::MODBUS, bytes: black_box(&answer) });
     }
 
+    /// The same with a driver that tells what the controller's transport has acknowledged.
+    fn modbus_acknowledged(&mut self) {
+        let frame = std::mem::take(&mut self.plc);
+        self.pass(Input::PortBytes { port: PLC, bytes: black_box(&frame) });
+        self.plc = frame;
+        let answer = self.out[..12].first_chunk::<12>().copied();
+        let mut answer = answer.expect("a request is longer");
+        answer[5] = 6;
+        self.pass(Input::LinkSent { link: LinkId::MODBUS });
+        self.pass(Input::LinkAcked { link: LinkId::MODBUS, left: 0 });
+        self.pass(Input::LinkBytes { link: LinkId::MODBUS, bytes: black_box(&answer) });
+        assert!(std::mem::take(&mut self.sent) > 12);
+    }
+
     fn udp(&mut self) {
         let frame = std::mem::take(&mut self.sensor);
         self.sent = 0;
@@ -219,6 +247,10 @@ impl Bench {
         self.packet = packet;
     }
 
+    fn state_of_starting(&mut self) {
+        self.pass(Input::LinkBytes { link: LinkId::STATE, bytes: black_box(&[0; 1468]) });
+    }
+
     fn idle(&mut self) {
         self.pass(black_box(Input::Tick));
     }
@@ -232,6 +264,13 @@ impl Bench {
         }
         self.passes += 1;
     }
+}
+
+/// All zeros but the state codes: remote, enabled, stopped, running.
+fn started_packet() -> Vec<u8> {
+    let mut packet = vec![0; 1468];
+    packet[1448..1452].copy_from_slice(&[2, 6, 0, 5]);
+    packet
 }
 
 fn drain(

@@ -21,6 +21,7 @@ fn main() -> ExitCode {
         Work { name: "into typed fields", limit: None, run: |n| repeat(n, Bench::fields) },
         Work { name: "into a new value", limit: None, run: |n| repeat(n, Bench::value) },
         Work { name: "alignment check", limit: None, run: |n| repeat(n, Bench::check) },
+        Work { name: "alignment check, closer look", limit: None, run: |n| repeat(n, Bench::closer) },
         Work { name: "stream, whole packets, image", limit: None, run: |n| repeat(n, Bench::stream) },
         Work { name: "stream, 536-byte pieces, image", limit: None, run: |n| repeat(n, Bench::pieces) },
         Work { name: "typed fields into bytes", limit: None, run: |n| repeat(n, Bench::encode) },
@@ -57,6 +58,11 @@ fn alignment_check(bencher: Bencher<'_, '_>) {
 }
 
 #[divan::bench]
+fn alignment_check_closer_look(bencher: Bencher<'_, '_>) {
+    time(bencher, Bench::closer);
+}
+
+#[divan::bench]
 fn stream_of_whole_packets_into_the_image(bencher: Bencher<'_, '_>) {
     time(bencher, Bench::stream);
 }
@@ -85,6 +91,8 @@ fn repeat(iterations: u64, work: fn(&mut Bench)) {
 
 struct Bench {
     bytes: [u8; LEN],
+    /// The same from a controller that has not started yet.
+    starting: [u8; LEN],
     target: [u8; LEN],
     image: [u8; IMAGE_BYTES],
     packet: StatePacket,
@@ -101,8 +109,11 @@ impl Default for Bench {
         packet.word_outputs = std::array::from_fn(|nth| nth as u16 * 517);
         packet.digital_inputs = std::array::from_fn(|nth| u8::from(nth % 3 == 0));
         packet.bool_outputs = std::array::from_fn(|nth| u8::from(nth % 5 == 0));
+        let starting = packet.to_bytes();
+        [packet.operation_mode, packet.robot_state, packet.program_state, packet.safety_state] = [2, 6, 2, 5];
         Self {
             bytes: packet.to_bytes(),
+            starting,
             target: [0; LEN],
             image: [0; IMAGE_BYTES],
             packet,
@@ -132,6 +143,11 @@ impl Bench {
 
     fn check(&mut self) {
         let view = StateView::new(black_box(&self.bytes[..])).expect("a whole packet");
+        assert!(view.check_alignment().is_ok());
+    }
+
+    fn closer(&mut self) {
+        let view = StateView::new(black_box(&self.starting[..])).expect("a whole packet");
         assert!(view.check_alignment().is_ok());
     }
 

@@ -41,8 +41,11 @@ fn main() -> Result<(), Failure> {
                 output => board.carry_out(output),
             }
         };
-        let event = board.next_event(until);
-        gateway.handle(board.now, event.input());
+        match board.next_event(until) {
+            Some(event) => gateway.handle(board.now, event.input()),
+            // All that has happened was told: now deadlines may pass.
+            None => gateway.handle(board.now, Input::Tick),
+        }
     }
 
     let counters = gateway.port_counters(PORT).ok_or("no such port")?;
@@ -115,7 +118,7 @@ enum Event {
     LinkUp(LinkId),
     LinkBytes(LinkId, Vec<u8>),
     LinkSent(LinkId),
-    Nothing,
+    LinkAcked(LinkId, u32),
 }
 
 impl Event {
@@ -127,7 +130,7 @@ impl Event {
             Self::LinkUp(link) => Input::LinkUp { link: *link },
             Self::LinkBytes(link, bytes) => Input::LinkBytes { link: *link, bytes },
             Self::LinkSent(link) => Input::LinkSent { link: *link },
-            Self::Nothing => Input::Tick,
+            Self::LinkAcked(link, left) => Input::LinkAcked { link: *link, left: *left },
         }
     }
 }
@@ -153,18 +156,15 @@ impl Board {
         self.events.insert(place, (at, event));
     }
 
-    /// Waits: the clock jumps to what happens next.
-    fn next_event(&mut self, until: Instant) -> Event {
-        match self.events.front() {
-            Some(&(at, _)) if at <= until => {
-                self.now = at;
-                self.events.pop_front().map_or(Event::Nothing, |(_, event)| event)
-            }
-            _ => {
-                self.now = until;
-                Event::Nothing
-            }
+    /// Waits: the clock jumps to what happens next. What waits comes before the deadline, even one that
+    /// has passed: a driver that was busy tells what arrived meanwhile, and then that it is late.
+    fn next_event(&mut self, until: Instant) -> Option<Event> {
+        let next = self.events.front().map_or(Instant::NEVER, |(at, _)| *at);
+        self.now = self.now.max(next.min(until));
+        if next > self.now {
+            return None;
         }
+        self.events.pop_front().map(|(_, event)| event)
     }
 
     fn carry_out(&mut self, output: Output<'_>) {
@@ -178,7 +178,9 @@ impl Board {
             Output::LinkOpen { link } => self.happens(300, Event::LinkUp(link)),
             Output::LinkSend { link, bytes } => {
                 println!("{:>6} us  modbus >  {bytes:02X?}", self.now.as_micros());
+                // The socket has room again; the controller's TCP acknowledges before its answer comes.
                 self.happens(20, Event::LinkSent(link));
+                self.happens(300, Event::LinkAcked(link, 0));
                 let (mut request, mut answer) = (bytes, [0; MAX_ADU]);
                 while let Some(Ok(len)) = self.modbus.receive(&mut request, &mut self.coils, &mut answer) {
                     self.happens(400, Event::LinkBytes(link, answer[..len].to_vec()));

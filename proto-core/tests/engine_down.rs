@@ -75,7 +75,9 @@ fn misaligned_packets_are_dropped_and_three_reopen_the_link() {
     let (mut rig, _) = pose();
     rig.run(MS(10));
     let mut bad = pose_packet([1.0; 6]);
-    bad[0..4].copy_from_slice(&f32::NAN.to_le_bytes());
+    for joint in bad[..12].chunks_mut(4) {
+        joint.copy_from_slice(&f32::NAN.to_le_bytes());
+    }
     rig.link_bytes(LinkId::STATE, &bad);
     rig.link_bytes(LinkId::STATE, &bad);
     assert!(rig.take(|out| (*out == Out::Close(LinkId::STATE)).then_some(())).is_empty());
@@ -85,6 +87,30 @@ fn misaligned_packets_are_dropped_and_three_reopen_the_link() {
     rig.run(MS(200));
     rig.link_bytes(LinkId::STATE, &pose_packet([1.0; 6]));
     assert_eq!(rig.link(LinkId::STATE).counters.received, 1);
+}
+
+#[test]
+fn a_stream_that_lost_four_bytes_shows_the_field_nothing() {
+    let (mut rig, port) = pose();
+    rig.run(MS(10));
+    // A robot at rest, enabled: each packet is the same.
+    let mut packet = pose_packet([0.41, -0.2, 0.63, 3.1, 0.02, -1.57]);
+    packet[1448..1452].copy_from_slice(&[2, 6, 0, 5]);
+    rig.link_bytes(LinkId::STATE, &packet);
+    let turned = [&packet[4..], &packet[..4]].concat();
+    for _ in 0..3 {
+        rig.run(MS(20));
+        rig.link_bytes(LinkId::STATE, &turned);
+    }
+    assert_eq!(rig.take(|out| (*out == Out::Close(LinkId::STATE)).then_some(())).len(), 1);
+    let link = rig.link(LinkId::STATE).counters;
+    assert_eq!((link.received, link.malformed), (1, 3));
+    rig.run(MS(200));
+    rig.link_bytes(LinkId::STATE, &packet);
+    rig.run(MS(20));
+    let shown = rig.sent_to(port);
+    assert!(shown.len() > 10 && shown.iter().all(|frame| *frame == pose_frame(&[0.41, -0.2, 0.63, 3.1])));
+    assert_eq!(rig.link(LinkId::STATE).counters.received, 2);
 }
 
 #[test]

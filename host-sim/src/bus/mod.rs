@@ -12,6 +12,7 @@ mod line;
 pub(crate) mod peer;
 pub mod port;
 pub mod pty;
+mod pty_link;
 pub(crate) mod quota;
 mod reactor;
 pub mod realtime;

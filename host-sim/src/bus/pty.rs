@@ -4,11 +4,9 @@
 //! a hang-up. Bytes that nobody listens to are lost, as on a wire, and are not kept for the next client.
 
 use std::cell::{Cell, RefCell};
-use std::fs;
 use std::io;
 use std::os::fd::OwnedFd;
-use std::os::unix::fs::symlink;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::fs::OFlags;
@@ -18,15 +16,17 @@ use rustix::termios::{OptionalActions, QueueSelector, ioctl_tiocnxcl, tcflush, t
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 
+use super::pty_link::Link;
 use super::reactor::register;
 
 /// One pseudoterminal. For a current-thread runtime: see [`Pty::is_heard`].
 #[derive(Debug)]
 pub struct Pty {
+    // Removed first: as long as there is one, it leads somewhere.
+    link: Link,
     master: AsyncFd<OwnedFd>,
     // None only when a client took the terminal exclusively in the very moment of a look.
     terminal: RefCell<Option<OwnedFd>>,
-    link: Link,
     // Whether something was written that a client may have left unread.
     unread: Cell<bool>,
 }
@@ -34,8 +34,8 @@ pub struct Pty {
 impl Pty {
     /// A new pseudoterminal in raw mode with a link to it at `link`, in the current tokio runtime.
     ///
-    /// A link that is already there is replaced when it leads into `/dev/pts`: a run that was killed
-    /// left it. Anything else is not touched.
+    /// A link that is already there is replaced when it was one to a pseudoterminal and the program that
+    /// made it is gone. Anything else is not touched.
     ///
     /// # Errors
     /// With the path in the message: the link's directory cannot be made, something else is there, or
@@ -51,12 +51,12 @@ impl Pty {
         set_raw(&terminal)?;
         let master = register(master)?;
         let link = Link::place(link, Path::new(&target))?;
-        Ok(Self { master, terminal: RefCell::new(Some(terminal)), link, unread: Cell::new(false) })
+        Ok(Self { link, master, terminal: RefCell::new(Some(terminal)), unread: Cell::new(false) })
     }
 
     /// Where the link is.
     pub fn link(&self) -> &Path {
-        &self.link.path
+        self.link.path()
     }
 
     /// Waits until a client's bytes can be read. Cancel safe.
@@ -166,49 +166,10 @@ fn set_raw(terminal: &OwnedFd) -> io::Result<()> {
     Ok(tcsetattr(terminal, OptionalActions::Now, &settings)?)
 }
 
-/// The link to a pseudoterminal; removed when dropped, if it is still ours.
-#[derive(Debug)]
-struct Link {
-    path: PathBuf,
-    target: PathBuf,
-}
-
-impl Link {
-    fn place(path: &Path, target: &Path) -> io::Result<Self> {
-        let folder = path.parent().map_or(Ok(()), fs::create_dir_all);
-        let placed = folder.and_then(|()| match symlink(target, path) {
-            Err(error) if error.kind() == io::ErrorKind::AlreadyExists => Self::replace(path, target),
-            other => other,
-        });
-        placed.map_err(|error| io::Error::new(error.kind(), format!("{}: {error}", path.display())))?;
-        Ok(Self { path: path.to_owned(), target: target.to_owned() })
-    }
-
-    /// Puts a link in the place of one into `/dev/pts`, without a moment in which there is none.
-    fn replace(path: &Path, target: &Path) -> io::Result<()> {
-        if !fs::read_link(path).is_ok_and(|old| old.starts_with("/dev/pts")) {
-            let what = "there is something already, and it is not a link to a pseudoterminal";
-            return Err(io::Error::new(io::ErrorKind::AlreadyExists, what));
-        }
-        let mut name = path.as_os_str().to_owned();
-        name.push(format!(".{}", std::process::id()));
-        let new = PathBuf::from(name);
-        symlink(target, &new)?;
-        fs::rename(&new, path).inspect_err(|_| drop(fs::remove_file(&new)))
-    }
-}
-
-impl Drop for Link {
-    fn drop(&mut self) {
-        if fs::read_link(&self.path).is_ok_and(|target| target == self.target) {
-            let _ = fs::remove_file(&self.path);
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::fs;
     use std::io::{Read, Write};
     use std::os::unix::fs::OpenOptionsExt;
 
@@ -371,30 +332,16 @@ mod tests {
     }
 
     #[test]
-    fn a_link_that_a_killed_run_left_is_replaced_and_a_later_one_is_not_removed() {
+    fn a_link_in_use_is_not_taken_away() {
         run(async |link| {
             let first = Pty::open(link).unwrap();
-            let second = Pty::open(link).unwrap();
             let target = fs::read_link(link).unwrap();
-            drop(first);
+            let message = Pty::open(link).unwrap_err().to_string();
+            assert!(message.contains("line: another port has it"), "{message}");
             assert_eq!(fs::read_link(link).unwrap(), target);
-            drop(second);
-            assert!(fs::symlink_metadata(link).is_err());
-        });
-    }
-
-    #[test]
-    fn whatever_else_is_at_the_path_stays_and_is_named() {
-        run(async |link| {
-            let refused = |link: &Path| Pty::open(link).unwrap_err().to_string();
-            fs::write(link, "precious").unwrap();
-            assert!(refused(link).contains("line: there is something already"), "{}", refused(link));
-            assert_eq!(fs::read(link).unwrap(), b"precious");
-            fs::remove_file(link).unwrap();
-            symlink("/dev/null", link).unwrap();
-            assert!(refused(link).contains("there is something already"));
-            assert_eq!(fs::read_link(link).unwrap(), Path::new("/dev/null"));
-            assert!(refused(&link.join("deeper")).contains("line/deeper: "));
+            assert!(Pty::open(&link.join("deeper")).unwrap_err().to_string().contains("line/deeper: "));
+            drop(first);
+            Pty::open(link).unwrap();
         });
     }
 }

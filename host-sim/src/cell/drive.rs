@@ -105,6 +105,10 @@ pub(super) enum Due {
         conn: u64,
         upto: u64,
     },
+    /// The gateway's transport looks whether nothing was acknowledged for too long.
+    UserTimeout {
+        conn: u64,
+    },
     /// The gateway's driver looks at what is acknowledged.
     Look {
         link: LinkId,
@@ -322,6 +326,7 @@ impl Cell {
                 }
                 ControllerOutput::Send { conn: DESK, bytes } => self.asked.extend_from_slice(&bytes),
                 ControllerOutput::Send { conn, bytes } => {
+                    self.replied(conn.0, &bytes);
                     self.send_item(conn.0, Way::Down, Item::Bytes(bytes))
                 }
                 ControllerOutput::Close { conn } => self.controller_closes(conn.0),
@@ -331,20 +336,12 @@ impl Cell {
                     };
                     let conns = self.conns.iter().filter(|(_, conn)| subscribed(conn));
                     let conns: Vec<u64> = conns.map(|(&id, _)| id).collect();
-                    let mut packet = bytes.to_vec();
-                    self.spoil_packet(&mut packet);
                     for conn in conns {
-                        self.send_item(conn, Way::Down, Item::Bytes(packet.clone()));
+                        self.send_item(conn, Way::Down, Item::Bytes(bytes.to_vec()));
                     }
                 }
-                ControllerOutput::UdpSend { peer, mut bytes } => {
-                    self.spoil_frame(LinkId::RECIPE_UDP, &mut bytes);
-                    self.udp_down(peer, &bytes);
-                }
-                ControllerOutput::PortSend { port, mut bytes } => {
-                    if let Some(link) = self.clients.get(&port).and_then(|client| client.link) {
-                        self.spoil_frame(link, &mut bytes);
-                    }
+                ControllerOutput::UdpSend { peer, bytes } => self.udp_down(peer, &bytes),
+                ControllerOutput::PortSend { port, bytes } => {
                     self.trace.add(now, What::ControllerPortSent, port as u64, &bytes);
                     self.controller_port_sends(port, bytes);
                 }
@@ -439,6 +436,7 @@ impl Cell {
             Due::SendAgain { conn, way } => self.send_again(conn, way),
             Due::AckLeaves { conn } => self.ack_leaves(conn),
             Due::Ack { conn, upto } => self.ack(conn, upto),
+            Due::UserTimeout { conn } => self.user_timeout(conn),
             Due::Look { link, turn } => {
                 if self.is_turn(link, turn) && !self.is_asleep() {
                     self.tell_acked(link);

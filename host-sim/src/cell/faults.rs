@@ -212,6 +212,14 @@ impl Cell {
         self.begun_anew();
     }
 
+    /// The same, and all its registers are 0.
+    pub fn clear_controller(&mut self) {
+        let now = self.now;
+        self.trace.add(now, What::Fault, Entry::CONTROLLER, &[0]);
+        self.controller_mut().restart_cleared(now);
+        self.begun_anew();
+    }
+
     /// The controller loses its power: its ends of all connections are gone without a word, and nobody
     /// is there. [`Self::power_up`] ends it.
     pub fn power_cut(&mut self) {
@@ -239,11 +247,11 @@ impl Cell {
         }
     }
 
-    /// It has power again, and begins afresh.
+    /// It has power again, and begins afresh with all registers at 0.
     pub fn power_up(&mut self) {
         let links: Vec<LinkId> = self.link_ids().collect();
         links.into_iter().for_each(|link| self.mend_cable(link));
-        self.restart_controller();
+        self.clear_controller();
     }
 
     fn begun_anew(&mut self) {

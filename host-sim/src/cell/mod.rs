@@ -51,7 +51,6 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use proto_core::config::{Bus, GatewayConfig};
 use proto_core::engine::{BuildError as EngineError, Engine, LinkId, LinkInfo, PortCounters, PortId};
 use proto_core::recipe::CanFrame;
-use proto_core::sysvar::SysVar;
 use proto_core::time::{Duration, Instant};
 
 pub use can::{BusCounters, CanBus};
@@ -151,8 +150,6 @@ pub struct Cell {
     stalls: u64,
     /// How many faults each of the controller's servers has at present.
     ailments: [u32; 3],
-    /// What the controller sends of these variables is this.
-    spoilt: BTreeMap<SysVar, f32>,
     rng: Rng,
     trace: Trace,
     recorder: Option<Recorder>,
@@ -218,7 +215,6 @@ impl Cell {
             wakes_at: START,
             stalls: 0,
             ailments: [0; 3],
-            spoilt: BTreeMap::new(),
             rng: Rng::new(seed),
             trace: Trace::new(),
             recorder,

@@ -206,6 +206,8 @@ pub(super) struct Connection {
     pub forgotten: bool,
     /// The controller's TCP is about to acknowledge.
     pub owes_ack: bool,
+    /// The gateway's transport is going to look whether it has.
+    pub is_watched: bool,
 }
 
 impl Connection {
@@ -220,6 +222,7 @@ impl Connection {
             abandoned: false,
             forgotten: false,
             owes_ack: false,
+            is_watched: false,
         }
     }
 

@@ -44,6 +44,17 @@ impl Cell {
         self.queue.push(now + SURVEY_EVERY, Due::Survey);
     }
 
+    /// The controller says something on a connection.
+    pub(super) fn replied(&mut self, conn: u64, bytes: &[u8]) {
+        let Some(oracle) = &mut self.oracle else { return };
+        let link = self.conns.get(&conn).map(|conn| conn.link);
+        if let Some(link @ (LinkId::COMMAND | LinkId::URGENT)) = link
+            && bytes.starts_with(b"unknown command")
+        {
+            oracle.not_understood(link, self.now);
+        }
+    }
+
     fn paths(&self) -> Vec<Path> {
         let path = |gate: &Gate| {
             let server = match gate.kind {

@@ -29,6 +29,8 @@ pub(super) struct Pipe {
     pub arrived: u64,
     /// ... of these acknowledged, as the sender knows.
     pub acked: u64,
+    /// Since when something is not.
+    pub unacked_since: Instant,
     /// How long the sender waits for an acknowledgement before it sends again.
     patience: Duration,
     /// When it does so, if something was lost.
@@ -80,6 +82,7 @@ impl Pipe {
             sent: 0,
             arrived: 0,
             acked: 0,
+            unacked_since: Instant::ZERO,
             patience: FIRST_PATIENCE,
             again_at: None,
         }
@@ -96,6 +99,9 @@ impl Pipe {
         way: Way,
     ) -> Vec<Instant> {
         if let Item::Bytes(bytes) = &item {
+            if self.unacked() == 0 {
+                self.unacked_since = now;
+            }
             self.sent += bytes.len() as u64;
         }
         if self.dead {
@@ -229,6 +235,16 @@ impl Pipe {
         self.segments.clear();
         self.again_at = None;
         self.newest = Instant::ZERO;
+    }
+
+    /// The sender knows now that so much has arrived; whether that is news.
+    pub(super) fn acknowledge(&mut self, now: Instant, upto: u64) -> bool {
+        let is_news = upto > self.acked;
+        if is_news {
+            self.acked = upto;
+            self.unacked_since = now;
+        }
+        is_news
     }
 
     /// Bytes that the sender does not know to have arrived.

@@ -200,7 +200,11 @@ impl Cell {
                     oracle.sent(id, link, &bytes, slowest, now);
                 }
                 self.send_item(id, Way::Up, Item::Bytes(bytes));
-                let unacked = self.conns.get(&id).map_or(0, |conn| conn.up.unacked());
+                let Some(conn) = self.conns.get_mut(&id) else { return };
+                let unacked = conn.up.unacked();
+                if !std::mem::replace(&mut conn.is_watched, true) {
+                    self.queue.push(now + USER_TIMEOUT, Due::UserTimeout { conn: id });
+                }
                 let gate = self.gate(link);
                 if unacked > gate.network.send_buffer {
                     gate.is_full = true;
@@ -211,14 +215,40 @@ impl Cell {
         self.queue.push(now, Due::LinkSent { link, turn });
     }
 
+    /// The gateway's transport looks whether its peer has acknowledged nothing for too long: it ends the
+    /// connection, and the other end hears nothing of it.
+    pub(super) fn user_timeout(&mut self, id: u64) {
+        let now = self.now;
+        let Some(conn) = self.conns.get_mut(&id) else { return };
+        let Some(gate) = self.gates.get_mut(&conn.link) else { return };
+        let (link, turn) = (conn.link, gate.turn);
+        if gate.conn != Some(id) || conn.up.unacked() == 0 {
+            conn.is_watched = false;
+            return;
+        }
+        let at = conn.up.unacked_since + USER_TIMEOUT;
+        if now < at {
+            self.queue.push(at, Due::UserTimeout { conn: id });
+            return;
+        }
+        conn.up.forget();
+        conn.abandoned = true;
+        let is_gone = conn.closing || conn.forgotten;
+        if is_gone {
+            self.conns.remove(&id);
+        } else {
+            self.queue.push(now + TCP_TIMEOUT, Due::TimedOut { conn: id });
+        }
+        self.queue.push(now, Due::LinkDown { link, turn });
+    }
+
     /// The gateway's transport knows that so much has arrived.
     pub(super) fn acknowledged(&mut self, id: u64, upto: u64) {
         let now = self.now;
         let Some(conn) = self.conns.get_mut(&id) else { return };
-        if upto <= conn.up.acked {
+        if !conn.up.acknowledge(now, upto) {
             return;
         }
-        conn.up.acked = upto;
         let (link, unacked) = (conn.link, conn.up.unacked());
         let gate = self.gate(link);
         if gate.conn != Some(id) {
@@ -396,7 +426,7 @@ impl Cell {
                 return;
             }
             Way::Down => {
-                conn.down.acked = conn.down.arrived;
+                conn.down.acknowledge(now, conn.down.arrived);
                 self.acknowledged(id, acks);
                 self.tell_acked(link);
             }
@@ -492,6 +522,8 @@ impl Cell {
 
 /// How long an attempt to connect waits for an answer before it asks again, at first.
 const FIRST_KNOCK: Duration = Duration::from_secs(1);
+/// The gateway's transport ends a connection on which nothing was acknowledged for so long.
+pub(super) const USER_TIMEOUT: Duration = Duration::from_secs(2);
 /// What the controller keeps of what it sends on one connection; a client that lets more pile up is
 /// dropped.
 const CONTROLLER_BUFFER: u64 = 256 * 1024;

@@ -15,6 +15,7 @@ use proto_core::wire::dialect::Dialect;
 use super::network::{Network, Way};
 use super::rng::Rng;
 use super::{BusId, Cell, LineId};
+use crate::config::CommandClients;
 use crate::controller::Link;
 
 /// Kinds of faults.
@@ -48,6 +49,8 @@ pub enum TroubleKind {
     SlowAnswers,
     /// Modbus answers with an exception.
     Exception,
+    /// Port 2000 takes one client only.
+    OneClient,
     /// Half a state packet, then the end.
     HalfStatePacket,
     /// A value of the controller is not a number, or infinite.
@@ -78,7 +81,7 @@ pub enum TroubleKind {
 
 impl TroubleKind {
     /// All of them.
-    pub const ALL: [Self; 27] = [
+    pub const ALL: [Self; 28] = [
         Self::Refused,
         Self::BlackHole,
         Self::Reset,
@@ -93,6 +96,7 @@ impl TroubleKind {
         Self::Mute,
         Self::SlowAnswers,
         Self::Exception,
+        Self::OneClient,
         Self::HalfStatePacket,
         Self::Unreadable,
         Self::Noise,
@@ -137,6 +141,7 @@ impl TroubleKind {
             Self::Mute => "server says nothing",
             Self::SlowAnswers => "slow answers",
             Self::Exception => "Modbus exceptions",
+            Self::OneClient => "one client of port 2000",
             Self::HalfStatePacket => "half a state packet",
             Self::Unreadable => "values not finite",
             Self::Noise => "noise on a line",
@@ -165,6 +170,7 @@ enum Remedy {
     Unmute(Link),
     Answers(Link),
     NoException,
+    ManyClients,
     Heal(SysVar),
     Quiet(LineId),
     Mend(LineId),
@@ -355,6 +361,13 @@ impl Trouble {
                 cell.controller_mut().answer_modbus_with(exception);
                 Some(Remedy::NoException)
             }
+            TroubleKind::OneClient => {
+                lasts = Some(longer_and_rarer(rng, Duration::from_millis(500), 5));
+                let clients =
+                    [CommandClients::RefuseSecond, CommandClients::DropFirst][rng.below(2) as usize];
+                cell.controller_mut().command_clients(clients);
+                Some(Remedy::ManyClients)
+            }
             TroubleKind::HalfStatePacket => {
                 let len = rng.between(0, 1_467) as usize;
                 cell.controller_mut().cut_next_state_packet(len);
@@ -471,6 +484,7 @@ fn apply(cell: &mut Cell, remedy: Remedy, networks: &BTreeMap<LinkId, Network>) 
             cell.controller_mut().answer_modbus_with(None);
             cell.recovers(Link::Modbus);
         }
+        Remedy::ManyClients => cell.controller_mut().command_clients(CommandClients::Many),
         Remedy::Heal(var) => cell.heal(var),
         Remedy::Quiet(line) => cell.line(line).noise_ppm = 0,
         Remedy::Mend(line) => cell.mend(line),

@@ -1,21 +1,27 @@
 //! `image`: the configuration image that a board keeps, from the checked file.
 
-use std::io::Write;
-use std::path::PathBuf;
+use std::fs;
+use std::io::{self, Read, Write};
+use std::os::unix::fs::FileTypeExt;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 use proto_core::config::image;
 
 use super::{Outcome, Overrides, check};
+use crate::files::{Beside, Identity};
 
 /// What `image` is told.
 #[derive(Debug, Args)]
 pub(super) struct ImageArgs {
     /// A gateway's file
     file: PathBuf,
-    /// Where the image is written
+    /// Where the image is written; an older image there is replaced
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
+    /// Replace a file that is no image, too; never the one that is read
+    #[arg(long)]
+    force: bool,
     #[command(flatten)]
     overrides: Overrides,
 }
@@ -28,6 +34,48 @@ pub(super) fn run(args: &ImageArgs, out: &mut dyn Write) -> Outcome {
     // What a board would refuse is never written.
     image::decode(&bytes).map_err(|error| error.to_string())?;
     let name = args.output.display();
-    std::fs::write(&args.output, &bytes).map_err(|error| format!("{name}: {error}"))?;
+    write(args, &bytes).map_err(|error| format!("{name}: {error}"))?;
     writeln!(out, "{name}: {len} bytes, version {}", image::VERSION).map_err(|error| error.to_string())
+}
+
+/// Writes the image where nothing is lost by it.
+fn write(args: &ImageArgs, bytes: &[u8]) -> io::Result<()> {
+    let refused = |message: &str| Err(io::Error::new(io::ErrorKind::AlreadyExists, message));
+    let found = match fs::metadata(&args.output) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => {
+            if args.output.is_symlink() {
+                return refused("a link that leads nowhere; give another name");
+            }
+            return Beside::file(&args.output, bytes)?.0.put_new(&args.output);
+        }
+        found => found?,
+    };
+    let kind = found.file_type();
+    if kind.is_char_device() || kind.is_fifo() {
+        // What is written there is passed on.
+        return fs::File::options().write(true).open(&args.output)?.write_all(bytes);
+    }
+    if kind.is_dir() {
+        return refused("a folder; give the name of a file in it");
+    }
+    if !kind.is_file() {
+        return refused("no ordinary file; give another name");
+    }
+    if Identity::of(&found) == Identity::of(&fs::metadata(&args.file)?) {
+        return refused("this is the file that the image is made of; give another name");
+    }
+    if !args.force && !is_image(&args.output)? {
+        return refused("there is a file already, and it is no image; give another name or --force");
+    }
+    // Behind a link, it is the file that is replaced.
+    let place = fs::canonicalize(&args.output)?;
+    Beside::file(&place, bytes)?.0.replace(&place)
+}
+
+/// Whether it begins as images do, of whatever version. Nothing is lost with an empty file, which
+/// `mktemp` makes.
+fn is_image(path: &Path) -> io::Result<bool> {
+    let mut begins = Vec::new();
+    fs::File::open(path)?.take(image::MAGIC.len() as u64).read_to_end(&mut begins)?;
+    Ok(begins.is_empty() || begins == image::MAGIC)
 }

@@ -1,7 +1,8 @@
 //! The command line: what a person types, turned into calls.
 //!
-//! In: arguments. Out: text and an exit code: 0 when everything went well, 1 when a run failed, 2
-//! for a file or an argument that cannot be used (nothing was started then).
+//! In: arguments. Out: text and an exit code: 0 when everything went well, 1 when a run failed or what
+//! it said could not be written, 2 for a file or an argument that cannot be used (nothing was started
+//! then). A reader that had enough is no failure.
 
 mod check;
 mod codec;
@@ -22,7 +23,8 @@ use proto_core::sysvar::Direction;
 
 use crate::bus::bind::Bind;
 use crate::config::file;
-use crate::shell::{self, RunOptions};
+use crate::out::{Out, Printed, tell};
+use crate::shell::{self, ReadyFile, RunOptions, StartError};
 
 /// Everything that can be typed.
 #[derive(Debug, Parser)]
@@ -52,8 +54,8 @@ Examples:
   host-sim encode cell.toml --part input 1       the frame that switches DO1 on
   host-sim decode cell.toml --part input FF FF 01 EE EE
 
-Exit codes: 0 done, 1 a run failed, 2 a file or an argument is wrong and nothing
-was started.";
+Exit codes: 0 done, 1 a run failed or its output could not be written, 2 a file or
+an argument is wrong and nothing was started.";
 
 #[derive(Debug, Subcommand)]
 enum Command {
@@ -84,7 +86,8 @@ enum Command {
 }
 
 const DEMO_EXAMPLES: &str = "\
-Prints one line for each example, PASS or FAIL. Exit code 0 only when all pass.";
+Prints one line for each example, PASS or FAIL. Exit code 0 only when all pass.
+Ctrl-C ends it; nothing stays behind.";
 
 const CONTROLLER_EXAMPLES: &str = "\
 Examples:
@@ -149,10 +152,10 @@ struct Run {
     /// also as slcan-pty-unpaced and slcan-tcp-unpaced
     #[arg(long, value_name = "NAME=DEVICE")]
     bind: Vec<Bind>,
-    /// Write the actual addresses to this file, once everything listens
+    /// Write the actual addresses to this file, once everything listens; it is removed at the end
     #[arg(long, value_name = "FILE")]
     ready: Option<PathBuf>,
-    /// Print a line of counters this often, such as 1s or 200ms
+    /// Print a line of counters this often, such as 1s or 200ms, until nobody reads them
     #[arg(long, value_name = "TIME", value_parser = parse_time)]
     stats: Option<Duration>,
 }
@@ -220,72 +223,78 @@ struct DecodeArgs {
 
 /// Runs what was typed.
 pub fn main() -> ExitCode {
-    let cli = Cli::parse();
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        Err(error) => return not_run(&error),
+    };
     let _log = log::start(cli.verbose);
-    let mut out = io::stdout().lock();
+    let mut out = Out::new(io::stdout());
     let done = match cli.command.unwrap_or(Command::Demo) {
-        Command::Demo => {
-            drop(out);
-            return crate::demo::run();
-        }
-        Command::Controller(run) => {
-            drop(out);
-            return run.controller();
-        }
-        Command::Gateway(run) => {
-            drop(out);
-            return run.gateway();
-        }
+        Command::Demo => return crate::demo::run(),
+        Command::Controller(run) => return run.controller(),
+        Command::Gateway(run) => return run.gateway(),
         Command::Soak(args) => {
-            drop(out);
-            return soak::run(&args, &mut io::stdout());
+            let code = soak::run(&args, &mut out);
+            return out.finish(|_| code);
         }
         Command::Check(args) => check::run(&args, &mut out),
         Command::Image(args) => image::run(&args, &mut out),
         Command::Encode(args) => encode(&args, &mut out),
         Command::Decode(args) => decode(&args, &mut out),
     };
-    // A reader that had enough, such as `head`, is no failure of ours.
-    let _ = out.flush();
-    match done {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(message) => wrong(message),
+    out.finish(|printed| match (printed, done) {
+        (Printed::Whole, Err(message)) => wrong(message),
+        _ => ExitCode::SUCCESS,
+    })
+}
+
+/// Shows help, the version, or what is wrong with the arguments.
+fn not_run(error: &clap::Error) -> ExitCode {
+    if error.use_stderr() {
+        let _ = error.print();
+        return ExitCode::from(2);
     }
+    let mut out = Out::new(anstream::stdout());
+    let _ = write!(out, "{}", error.render().ansi());
+    out.finish(|_| ExitCode::SUCCESS)
 }
 
 /// A message for a person; exit code 2.
 type Outcome = Result<(), String>;
 
 fn wrong(message: impl std::fmt::Display) -> ExitCode {
-    eprintln!("{message}");
+    tell(message);
     ExitCode::from(2)
 }
 
 impl Run {
     fn controller(self) -> ExitCode {
         match check::load_controller(&self.config, &self.overrides.set) {
-            Ok(config) => finished(shell::controller::run(config, self.options())),
+            Ok(config) => {
+                finished(self.options().and_then(|options| shell::controller::run(config, options)))
+            }
             Err(error) => wrong(error),
         }
     }
 
     fn gateway(self) -> ExitCode {
         match check::load_gateway(&self.config, &self.overrides.set) {
-            Ok(config) => finished(shell::gateway::run(*config, self.options())),
+            Ok(config) => finished(self.options().and_then(|options| shell::gateway::run(*config, options))),
             Err(error) => wrong(error),
         }
     }
 
-    fn options(self) -> RunOptions {
-        RunOptions { binds: self.bind, ready: self.ready, stats: self.stats }
+    fn options(self) -> Result<RunOptions, StartError> {
+        let ready = self.ready.map(ReadyFile::at).transpose()?;
+        Ok(RunOptions { binds: self.bind, ready, stats: self.stats })
     }
 }
 
-fn finished(result: Result<(), shell::StartError>) -> ExitCode {
+fn finished(result: Result<(), StartError>) -> ExitCode {
     match result {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("{error}");
+            tell(&error);
             ExitCode::from(error.exit_code())
         }
     }

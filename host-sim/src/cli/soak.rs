@@ -11,9 +11,11 @@ use std::time::{Duration as WallTime, Instant as WallInstant};
 
 use clap::{Args, ValueEnum};
 use proto_core::time::Duration;
+use tokio::signal::unix::{Signal, SignalKind, signal};
 
 use super::wrong;
 use crate::cell::Cell;
+use crate::out::tell;
 use crate::soak::{Batch, Level, Progress, Scenario, Soak, Total, show_trace};
 
 pub(super) const EXAMPLES: &str = "\
@@ -128,13 +130,22 @@ fn batch(args: &SoakArgs, scenarios: Vec<Scenario>, out: &mut dyn Write) -> Exit
         Ok(runtime) => runtime,
         Err(error) => return wrong(error),
     };
+    // Listened for once: a signal between two looks is heard by the next one.
+    let interrupt = {
+        let _inside = runtime.enter();
+        signal(SignalKind::interrupt())
+    };
+    let interrupt = match interrupt {
+        Ok(interrupt) => interrupt,
+        Err(error) => return wrong(error),
+    };
     let workers: Vec<_> = (0..jobs.min(batch.runs()))
         .map(|_| {
             let batch = Arc::clone(&batch);
             std::thread::spawn(move || batch.work())
         })
         .collect();
-    let interrupted = runtime.block_on(watch(&batch, &workers, args.hours, began));
+    let interrupted = runtime.block_on(watch(&batch, &workers, interrupt, args.hours, began));
     batch.stop();
     for worker in workers {
         // It catches its own panics.
@@ -169,6 +180,7 @@ fn batch(args: &SoakArgs, scenarios: Vec<Scenario>, out: &mut dyn Write) -> Exit
 async fn watch(
     batch: &Batch,
     workers: &[std::thread::JoinHandle<()>],
+    mut interrupt: Signal,
     hours: Duration,
     began: WallInstant,
 ) -> bool {
@@ -180,18 +192,18 @@ async fn watch(
             shown = WallInstant::now();
             let line = progress_line(batch.progress(), hours, began.elapsed());
             if is_terminal {
-                eprint!("\r{line}\x1B[K");
+                show(format_args!("\r{line}\x1B[K"));
             } else {
-                eprintln!("{line}");
+                tell(line);
             }
         }
         if workers.iter().all(std::thread::JoinHandle::is_finished) {
             break;
         }
         tokio::select! {
-            _ = tokio::signal::ctrl_c() => {
+            _ = interrupt.recv() => {
                 if is_terminal {
-                    eprintln!();
+                    tell("");
                 }
                 return true;
             }
@@ -199,9 +211,14 @@ async fn watch(
         }
     }
     if is_terminal {
-        eprint!("\r\x1B[K");
+        show("\r\x1B[K");
     }
     false
+}
+
+/// Progress is for people; nothing is lost when nobody can see it.
+fn show(text: impl std::fmt::Display) {
+    let _ = write!(std::io::stderr(), "{text}");
 }
 
 fn progress_line(progress: Progress, hours: Duration, wall: WallTime) -> String {

@@ -1,10 +1,10 @@
 //! The cell of the demo: a simulated controller and a gateway on this host, from the example files,
-//! every port number free and every device in a folder that is removed at the end.
+//! every port number free.
 
 use std::io;
 use std::net::SocketAddr;
-use std::path::{Path, PathBuf};
-use std::time::Instant;
+use std::path::Path;
+use std::time::{Duration, Instant};
 
 use proto_core::modbus::adu::MAX_ADU;
 use proto_core::modbus::client::{Client, ClientEvent};
@@ -15,31 +15,6 @@ use super::device::{Line, PATIENCE};
 use crate::bus::bind::Bind;
 use crate::config::file::{self, Text};
 use crate::shell::{self, Handle};
-
-/// A folder for pseudoterminals' links, removed with everything in it.
-pub(super) struct Folder(PathBuf);
-
-impl Folder {
-    pub(super) fn new() -> io::Result<Self> {
-        let path = std::env::temp_dir().join(format!("host-sim-demo-{}", std::process::id()));
-        std::fs::create_dir_all(&path)?;
-        Ok(Self(path))
-    }
-
-    pub(super) fn root(&self) -> PathBuf {
-        self.0.clone()
-    }
-
-    pub(super) fn path(&self, name: &str) -> PathBuf {
-        self.0.join(name)
-    }
-}
-
-impl Drop for Folder {
-    fn drop(&mut self) {
-        let _ = std::fs::remove_dir_all(&self.0);
-    }
-}
 
 /// An example file, embedded.
 #[derive(Clone, Copy)]
@@ -177,9 +152,14 @@ fn until(mut is_so: impl FnMut() -> io::Result<bool>) -> io::Result<()> {
         if Instant::now() > deadline {
             return Err(io::Error::new(io::ErrorKind::TimedOut, "it did not happen in time"));
         }
+        std::thread::sleep(BETWEEN_LOOKS);
     }
     Ok(())
 }
+
+/// Whoever asks without a pause keeps the processor from what he waits for: what is written into a
+/// pseudoterminal, and at times what crosses a socket, is carried on by threads of the kernel.
+const BETWEEN_LOOKS: Duration = Duration::from_millis(2);
 
 fn address(handle: &Handle, name: &str) -> io::Result<SocketAddr> {
     handle.place(name).parse().map_err(|_| io::Error::other(format!("no address called {name}")))
@@ -187,4 +167,22 @@ fn address(handle: &Handle, name: &str) -> io::Result<SocketAddr> {
 
 fn parse_binds(binds: &[String]) -> io::Result<Vec<Bind>> {
     binds.iter().map(|bind| bind.parse().map_err(io::Error::other)).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn whoever_waits_leaves_the_processor_alone() {
+        let begun = Instant::now();
+        let mut looks = 0;
+        until(|| {
+            looks += 1;
+            Ok(begun.elapsed() >= 25 * BETWEEN_LOOKS)
+        })
+        .unwrap();
+        let most = begun.elapsed().as_micros() / BETWEEN_LOOKS.as_micros() + 1;
+        assert!(looks <= most, "{looks} looks in {:?}", begun.elapsed());
+    }
 }

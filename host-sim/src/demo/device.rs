@@ -14,8 +14,9 @@ use std::time::{Duration, Instant};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::fs::{Mode, OFlags, open};
 
-/// How long a device waits for bytes that should come at once.
-pub(super) const PATIENCE: Duration = Duration::from_secs(3);
+/// How long a device waits for what should come at once. Only a failure takes so long; a busy machine
+/// must not look like one.
+pub(super) const PATIENCE: Duration = Duration::from_secs(30);
 
 /// A stream of bytes: a serial line, or a TCP connection.
 pub(super) struct Line<S> {

@@ -6,8 +6,9 @@ use std::net::TcpListener;
 
 use serde_json::json;
 
-use super::cell::{Example, Folder, Gateway, Robot, serial};
+use super::cell::{Example, Gateway, Robot, serial};
 use super::device::{Adapter, Datagrams, Line};
+use super::folder::Folder;
 use super::show::Show;
 
 const HEAD: [u8; 2] = [0xFF, 0xFF];
@@ -87,8 +88,9 @@ fn three_bytes<S: io::Read + io::Write + std::os::fd::AsFd>(
 
 fn rs485_user(show: &Show, folder: &Folder) -> io::Result<()> {
     let path = folder.path("rs485");
-    let robot =
-        Robot::start(example!("rs485-user-controller"), &[], &[bind("rs485", "pty", path.display())])?;
+    let robot = folder.fill(|| {
+        Robot::start(example!("rs485-user-controller"), &[], &[bind("rs485", "pty", path.display())])
+    })?;
     robot.command("run(echo.jspf)", "run start")?;
     show.notes("2000", "run(echo.jspf)", "run start");
     three_bytes(show, &mut serial(&path)?)?;
@@ -101,7 +103,7 @@ fn rs485_user_gateway(show: &Show, folder: &Folder) -> io::Result<()> {
     let path = folder.path("gateway-rs485");
     let robot = Robot::start(example!("udp-server-controller"), &[], &[])?;
     let binds = [bind("rs485-1", "pty", path.display())];
-    let gateway = Gateway::start(example!("rs485-user"), Some(&robot), &[], &binds)?;
+    let gateway = folder.fill(|| Gateway::start(example!("rs485-user"), Some(&robot), &[], &binds))?;
     gateway.linked()?;
     three_bytes(show, &mut serial(&path)?)?;
     robot.registers(WORD_INPUT, &[1, 2, 3])?;
@@ -132,7 +134,7 @@ fn pose_and_do1<S: io::Read + io::Write + std::os::fd::AsFd>(
 fn rs485_system(show: &Show, folder: &Folder) -> io::Result<()> {
     let path = folder.path("rs485");
     let binds = [bind("rs485", "pty", path.display())];
-    let robot = Robot::start(example!("rs485-system-controller"), &[], &binds)?;
+    let robot = folder.fill(|| Robot::start(example!("rs485-system-controller"), &[], &binds))?;
     pose_and_do1(show, &mut serial(&path)?, &pose_of(4), &robot)
 }
 
@@ -140,7 +142,7 @@ fn rs485_system_gateway(show: &Show, folder: &Folder) -> io::Result<()> {
     let path = folder.path("gateway-rs485");
     let robot = Robot::start(example!("udp-server-controller"), &[], &[])?;
     let binds = [bind("rs485-1", "pty", path.display())];
-    let gateway = Gateway::start(example!("rs485-system"), Some(&robot), &[], &binds)?;
+    let gateway = folder.fill(|| Gateway::start(example!("rs485-system"), Some(&robot), &[], &binds))?;
     gateway.linked()?;
     pose_and_do1(show, &mut serial(&path)?, &pose_of(4), &robot)
 }
@@ -224,7 +226,7 @@ fn udp_server_gateway(show: &Show, folder: &Folder) -> io::Result<()> {
     let robot = Robot::start(example!("udp-server-controller"), &[], &[])?;
     let overrides = [format!("controller.recipe_link.udp={}", robot.address("udp2011")?.port())];
     let binds = [bind("rs485-1", "pty", path.display())];
-    let gateway = Gateway::start(example!("udp-server"), Some(&robot), &overrides, &binds)?;
+    let gateway = folder.fill(|| Gateway::start(example!("udp-server"), Some(&robot), &overrides, &binds))?;
     gateway.linked()?;
     pose_and_do1(show, &mut serial(&path)?, &POSE, &robot)
 }
@@ -253,7 +255,7 @@ fn client_gateway(show: &Show, folder: &Folder) -> io::Result<()> {
     let path = folder.path("gateway-rs485");
     let binds = [bind("rs485-1", "pty", path.display())];
     let overrides = [format!("port.up.listen={LOOPBACK}")];
-    let gateway = Gateway::start(example!("client"), None, &overrides, &binds)?;
+    let gateway = folder.fill(|| Gateway::start(example!("client"), None, &overrides, &binds))?;
     let (_unused, udp) = Datagrams::bind()?;
     let overrides = [format!("port.tcp1.to={}", gateway.address("ports/up")?), format!("port.udp1.to={udp}")];
     let robot = Robot::start(example!("client-controller"), &overrides, &[])?;

@@ -6,46 +6,52 @@
 mod cell;
 mod device;
 mod examples;
+mod folder;
 mod show;
 
+use std::io;
 use std::process::ExitCode;
 use std::time::Instant;
 
-use cell::Folder;
+use crate::out::tell;
+use crate::shell::Signals;
+use folder::Folder;
 use show::Show;
 
-/// Runs the cell and prints what it does; success only when every example passes.
+/// Runs the cell and prints what it does, until nobody reads it; success only when every example passes
+/// that was run.
 pub fn run() -> ExitCode {
     let started = Instant::now();
-    let folder = match Folder::new() {
+    let folder = match prepare() {
         Ok(folder) => folder,
         Err(error) => {
-            eprintln!("no folder for the devices: {error}");
+            tell(format_args!("no folder for the devices: {error}"));
             return ExitCode::FAILURE;
         }
     };
-    clean_up_on_interrupt(folder.root());
-    anstream::println!("{INTRODUCTION}");
-    let mut show = Show::default();
+    let mut show = Show::new();
+    show.introduce(INTRODUCTION);
     examples::run_all(&mut show, &folder);
-    if show.verdict(started.elapsed().as_secs_f64()) { ExitCode::SUCCESS } else { ExitCode::FAILURE }
+    show.verdict(started.elapsed().as_secs_f64())
 }
 
-/// Ctrl-C leaves nothing behind. Everything else ends with the process.
-fn clean_up_on_interrupt(folder: std::path::PathBuf) {
-    std::thread::spawn(move || {
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
-        let interrupted = runtime.is_ok_and(|runtime| runtime.block_on(tokio::signal::ctrl_c()).is_ok());
-        if interrupted {
-            let _ = std::fs::remove_dir_all(folder);
-            anstream::eprintln!("interrupted");
-            std::process::exit(INTERRUPTED);
-        }
-    });
+/// The folder for the devices. Ctrl-C and its like remove it; everything else ends with the process.
+fn prepare() -> io::Result<Folder> {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    let mut signals = {
+        let _inside = runtime.enter();
+        Signals::catch()?
+    };
+    let folder = Folder::new()?;
+    let remover = folder.remover();
+    std::thread::Builder::new().name("signals".to_owned()).spawn(move || {
+        let signal = runtime.block_on(signals.next());
+        tell("interrupted");
+        // The exit code as shells have it.
+        remover.remove_and_exit(128 + signal)
+    })?;
+    Ok(folder)
 }
-
-/// 128 + SIGINT, as shells have it.
-const INTERRUPTED: i32 = 130;
 
 const INTRODUCTION: &str = "\
 A DUCO CORE robot controller talks to devices in recipes: frames of bytes or CAN frames

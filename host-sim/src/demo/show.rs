@@ -1,9 +1,14 @@
 //! What the demo prints: each example as it happens, and its verdict.
 
-use std::io;
+use std::cell::RefCell;
+use std::fmt::Arguments;
+use std::io::{self, Stdout, Write};
+use std::process::ExitCode;
 
-use anstream::println;
+use anstream::AutoStream;
 use anstyle::{AnsiColor, Style};
+
+use crate::out::Out;
 
 const HEADING: Style = Style::new().bold();
 const QUIET: Style = Style::new().dimmed();
@@ -11,16 +16,26 @@ const GOOD: Style = AnsiColor::Green.on_default().bold();
 const BAD: Style = AnsiColor::Red.on_default().bold();
 
 /// The printer; it counts verdicts.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(super) struct Show {
+    out: RefCell<Out<AutoStream<Stdout>>>,
     passed: usize,
     failed: usize,
 }
 
 impl Show {
+    pub(super) fn new() -> Self {
+        Self { out: RefCell::new(Out::new(anstream::stdout())), passed: 0, failed: 0 }
+    }
+
+    /// What it is about.
+    pub(super) fn introduce(&self, text: &str) {
+        self.print(format_args!("{text}"));
+    }
+
     /// A whole example.
     pub(super) fn heading(&self, text: &str) {
-        println!("\n{HEADING}{text}{HEADING:#}");
+        self.print(format_args!("\n{HEADING}{text}{HEADING:#}"));
     }
 
     /// Bytes on their way into the cell.
@@ -38,38 +53,49 @@ impl Show {
         self.line(who, ' ', what, meaning);
     }
 
-    /// Runs one half of an example and prints its verdict.
+    /// Runs one half of an example and prints its verdict; neither when nobody reads it.
     pub(super) fn judge(&mut self, what: &str, run: impl FnOnce(&Self) -> io::Result<()>) {
-        println!("  {what}");
+        if self.out.get_mut().has_failed() {
+            return;
+        }
+        self.print(format_args!("  {what}"));
         match run(self) {
             Ok(()) => {
                 self.passed += 1;
-                println!("  {GOOD}PASS{GOOD:#}  {what}");
+                self.print(format_args!("  {GOOD}PASS{GOOD:#}  {what}"));
             }
             Err(error) => {
                 self.failed += 1;
-                println!("  {BAD}FAIL{BAD:#}  {what}: {error}");
+                self.print(format_args!("  {BAD}FAIL{BAD:#}  {what}: {error}"));
             }
         }
     }
 
-    /// The last lines; true when everything passed.
-    pub(super) fn verdict(&self, seconds: f64) -> bool {
-        let Self { passed, failed } = self;
-        let (style, word) = if *failed == 0 { (GOOD, "PASS") } else { (BAD, "FAIL") };
-        println!("\n{style}{word}{style:#}  {passed} passed, {failed} failed, in {seconds:.1} s");
-        *failed == 0
+    /// The last lines, and the exit code.
+    pub(super) fn verdict(self, seconds: f64) -> ExitCode {
+        let Self { passed, failed, .. } = self;
+        let (style, word) = if failed == 0 { (GOOD, "PASS") } else { (BAD, "FAIL") };
+        self.print(format_args!(
+            "\n{style}{word}{style:#}  {passed} passed, {failed} failed, in {seconds:.1} s"
+        ));
+        let code = if failed == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE };
+        self.out.into_inner().finish(|_| code)
+    }
+
+    fn print(&self, line: Arguments<'_>) {
+        // The first failure is kept.
+        let _ = writeln!(self.out.borrow_mut(), "{line}");
     }
 
     fn line(&self, who: &str, arrow: char, what: &str, meaning: &str) {
         let mut what = what.to_owned();
         // A long frame keeps its explanation on a line of its own.
         if what.len() > WIDTH && !meaning.is_empty() {
-            println!("    {who:<8}{arrow} {what}");
+            self.print(format_args!("    {who:<8}{arrow} {what}"));
             what.clear();
-            println!("    {:<8}  {what:<WIDTH$}  {QUIET}{meaning}{QUIET:#}", "");
+            self.print(format_args!("    {:<8}  {what:<WIDTH$}  {QUIET}{meaning}{QUIET:#}", ""));
         } else {
-            println!("    {who:<8}{arrow} {what:<WIDTH$}  {QUIET}{meaning}{QUIET:#}");
+            self.print(format_args!("    {who:<8}{arrow} {what:<WIDTH$}  {QUIET}{meaning}{QUIET:#}"));
         }
     }
 }

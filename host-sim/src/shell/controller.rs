@@ -29,7 +29,7 @@ use crate::bus::timer::{Timer, now};
 use crate::config::{SimBus, SimConfig, SimParts};
 use crate::controller::{ConnId, Controller, ControllerInput, ControllerOutput, Link};
 
-/// Runs the simulated controller until Ctrl-C or SIGTERM, or until it is shut down over port 2000.
+/// Runs the simulated controller until Ctrl-C, SIGTERM or SIGHUP, or until it is shut down over port 2000.
 ///
 /// # Errors
 /// What kept it from starting; nothing is left behind then.

@@ -277,7 +277,7 @@ impl Core {
     }
 }
 
-/// Runs the gateway until Ctrl-C or SIGTERM.
+/// Runs the gateway until Ctrl-C, SIGTERM or SIGHUP.
 ///
 /// # Errors
 /// What kept it from starting; nothing is left behind then.

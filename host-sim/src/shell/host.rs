@@ -2,16 +2,17 @@
 //! `ready` line, statistics and a clean end.
 
 use std::io::{self, Write};
-use std::path::Path;
-use std::sync::mpsc as blocking;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+use std::sync::{Arc, mpsc as blocking};
 use std::thread::JoinHandle;
 
 use serde_json::Value;
-use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
 use tokio::task::LocalSet;
+use tracing::warn;
 
-use super::{RunOptions, StartError};
+use super::{RunOptions, Signals, StartError};
+use crate::out::{is_enough, tell};
 
 /// An engine is built by value, and unoptimised code copies it on the stack several times over.
 const STACK: usize = 16 << 20;
@@ -136,7 +137,7 @@ fn joined(thread: JoinHandle<Result<(), StartError>>) -> Result<(), StartError> 
     thread.join().unwrap_or_else(|_| Err(StartError::new("a thread panicked").after_start()))
 }
 
-/// Says `ready`, prints statistics, and ends on Ctrl-C or SIGTERM.
+/// Says `ready`, prints statistics, and ends when a signal says so.
 pub(super) fn foreground(handle: Handle, options: &RunOptions) -> Result<(), StartError> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
     let runtime = runtime.map_err(|error| StartError::new(format!("no runtime: {error}")))?;
@@ -145,25 +146,32 @@ pub(super) fn foreground(handle: Handle, options: &RunOptions) -> Result<(), Sta
     let result = runtime.block_on(async {
         // Signals are caught before anybody can know that we are ready.
         let refused = |error: io::Error| StartError::new(format!("signals: {error}"));
-        let mut interrupt = signal(SignalKind::interrupt()).map_err(refused)?;
-        let mut terminate = signal(SignalKind::terminate()).map_err(refused)?;
-        if let Some(path) = &options.ready {
-            write_ready(path, handle.ready())
-                .map_err(|error| StartError::new(format!("--ready {}: {error}", path.display())))?;
-        }
+        let mut signals = Signals::catch().map_err(refused)?;
+        let ready = options.ready.as_ref().map(|file| file.write(handle.ready())).transpose()?;
         lines.print(format!("ready {}", handle.ready()));
         let mut ticks = options.stats.map(tokio::time::interval);
         let mut watch = tokio::time::interval(WATCH);
         let result = loop {
             tokio::select! {
-                _ = interrupt.recv() => break Ok(()),
-                _ = terminate.recv() => break Ok(()),
+                _ = signals.next() => break Ok(()),
                 () = tick(&mut ticks) => {
                     if let Some(mut stats) = handle.stats() {
-                        stats["lost_lines"] = lines.lost.into();
+                        stats["lost_lines"] = lines.lost().into();
                         lines.print(stats.to_string());
                     }
                 }
+                Some(failure) = lines.failures.recv() => match failure {
+                    Failure::Unread if options.stats.is_some() => {
+                        tell("stdout was closed: nobody reads the statistics, ended");
+                        break Ok(());
+                    }
+                    // There is nothing more to be said there.
+                    Failure::Unread => {}
+                    Failure::NotReady(error) => {
+                        break Err(StartError::new(format!("stdout: {error}")).after_start());
+                    }
+                    Failure::Lost(error) => warn!(%error, "statistics cannot be written to stdout"),
+                },
                 _ = watch.tick() => {
                     if handle.has_ended() {
                         break Ok(());
@@ -171,40 +179,69 @@ pub(super) fn foreground(handle: Handle, options: &RunOptions) -> Result<(), Sta
                 }
             }
         };
-        let ended = handle.shutdown();
-        if let Some(path) = &options.ready {
-            let _ = std::fs::remove_file(path);
-        }
-        result.and(ended)
+        drop(ready);
+        result.and(handle.shutdown())
     });
     lines.finish();
     result
 }
 
 /// Lines for stdout. A thread of its own writes them: a reader that does not read must not keep signals
-/// from being heard. What it leaves is lost and counted.
+/// from being heard. What it leaves, and what cannot be written, is lost and counted.
 struct Lines {
     waiting: blocking::SyncSender<String>,
+    failures: mpsc::UnboundedReceiver<Failure>,
     /// Closed when everything has been written.
     written: blocking::Receiver<()>,
-    lost: u64,
+    lost: Arc<AtomicU64>,
+}
+
+/// Why a line was not written; told once, until one is written again.
+enum Failure {
+    /// Nobody will ever read it.
+    Unread,
+    /// It was the first one, which says `ready`.
+    NotReady(io::Error),
+    /// It was another one; the next may fare better, as on a disk that is full.
+    Lost(io::Error),
 }
 
 impl Lines {
     fn start() -> io::Result<Self> {
-        let (waiting, inbox) = blocking::sync_channel(MOST_LINES);
+        let (waiting, inbox) = blocking::sync_channel::<String>(MOST_LINES);
         let (open, written) = blocking::channel();
+        let (told, failures) = mpsc::unbounded_channel();
+        let lost = Arc::<AtomicU64>::default();
+        let count = Arc::clone(&lost);
         std::thread::Builder::new().name("stdout".to_owned()).spawn(move || {
             let _open: blocking::Sender<()> = open;
-            inbox.into_iter().for_each(|line: String| print_line(&line));
+            let mut failing = false;
+            for (nth, line) in inbox.into_iter().enumerate() {
+                let Err(error) = print_line(&line) else {
+                    failing = false;
+                    continue;
+                };
+                count.fetch_add(1, Relaxed);
+                if !std::mem::replace(&mut failing, true) {
+                    let _ = told.send(match nth {
+                        _ if is_enough(&error) => Failure::Unread,
+                        0 => Failure::NotReady(error),
+                        _ => Failure::Lost(error),
+                    });
+                }
+            }
         })?;
-        Ok(Self { waiting, written, lost: 0 })
+        Ok(Self { waiting, failures, written, lost })
     }
 
     fn print(&mut self, line: String) {
         if self.waiting.try_send(line).is_err() {
-            self.lost += 1;
+            self.lost.fetch_add(1, Relaxed);
         }
+    }
+
+    fn lost(&self) -> u64 {
+        self.lost.load(Relaxed)
     }
 
     /// Waits for the reader, but not for long.
@@ -231,21 +268,8 @@ async fn tick(ticks: &mut Option<tokio::time::Interval>) {
     }
 }
 
-/// A reader that had enough, such as `head`, is no failure of ours.
-fn print_line(line: &str) {
+fn print_line(line: &str) -> io::Result<()> {
     let mut out = io::stdout().lock();
-    let _ = writeln!(out, "{line}");
-    let _ = out.flush();
-}
-
-/// Whoever sees the file sees all of it.
-fn write_ready(path: &Path, ready: &Value) -> io::Result<()> {
-    let mut partial = path.as_os_str().to_owned();
-    partial.push(format!(".{}", std::process::id()));
-    let partial = Path::new(&partial);
-    if let Some(folder) = path.parent() {
-        std::fs::create_dir_all(folder)?;
-    }
-    std::fs::write(partial, format!("{ready}\n"))?;
-    std::fs::rename(partial, path)
+    writeln!(out, "{line}")?;
+    out.flush()
 }

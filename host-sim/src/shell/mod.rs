@@ -7,14 +7,17 @@ pub mod controller;
 pub mod gateway;
 mod host;
 mod link;
+mod ready;
+mod signals;
 mod tcp;
 mod udp;
 
 use std::fmt;
-use std::path::PathBuf;
 use std::time::Duration;
 
 pub use host::Handle;
+pub use ready::ReadyFile;
+pub(crate) use signals::Signals;
 
 use crate::bus::bind::Bind;
 
@@ -24,7 +27,7 @@ pub struct RunOptions {
     /// Which device each serial or CAN port is tied to.
     pub binds: Vec<Bind>,
     /// Where the addresses are written once everything listens.
-    pub ready: Option<PathBuf>,
+    pub ready: Option<ReadyFile>,
     /// How often a line of counters is printed.
     pub stats: Option<Duration>,
 }

@@ -106,6 +106,12 @@ impl Soak {
                 network.longest_segment = (rng.below(3) > 0).then(|| rng.between(20, 2_000) as usize);
                 network.loss_ppm = rng.below(3_000) as u32;
                 network.duplicate_ppm = rng.below(3_000) as u32;
+                network.ack_delay = match rng.below(3) {
+                    0 => Duration::from_millis(rng.between(40, 200)),
+                    _ => Duration::ZERO,
+                };
+                network.ack_report = rng.up_to(Duration::from_millis(20));
+                network.send_buffer = 1_024 << rng.below(7);
             });
         }
         let world = World::new(&scenario.gateway, cell.now(), rng.fork());

@@ -36,7 +36,7 @@ enum Needs {
 }
 
 const HOW: &str = "HOST_SIM_VCAN=uml cargo test --test socketcan (Debian: apt-get install user-mode-linux \
-                   busybox-static can-utils iproute2), or HOST_SIM_VCAN=vcan0 on a machine that has one";
+                   busybox-static can-utils iproute2 gcc libc6-dev), or HOST_SIM_VCAN=vcan0 on a machine that has one";
 
 fn main() -> ExitCode {
     let mut arguments = Arguments::from_args();

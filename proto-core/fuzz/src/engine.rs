@@ -35,6 +35,8 @@ fn play(input: &mut Source<'_>) -> Result<(), TestCaseError> {
     if settles {
         test.settles()?;
         test.counters_add_up()?;
+        test.becomes_safe()?;
+        test.counters_add_up()?;
     }
     Ok(())
 }

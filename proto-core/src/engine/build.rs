@@ -347,7 +347,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             owners.filter_map(|port| config.ports.get(usize::from(port.0))).map(|port| port.timeout);
         let patience = timeouts.min().unwrap_or(PATIENCE).max(PATIENCE);
         let supervisor = Supervisor::new(timings);
-        let uplink = Uplink::new(id, kind, supervisor, input, output, (set, writes), group, patience);
+        let uplink = Uplink::new(id, kind, supervisor, (input, output), (set, writes), group, patience);
         self.links.recipes.push(uplink).map_err(|_| too_many("recipe links", UPLINKS))
     }
 

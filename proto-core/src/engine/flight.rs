@@ -40,8 +40,12 @@ impl<const N: usize> Flight<N> {
         let _ = self.transmissions.push_back(Transmission { end: self.total, until });
     }
 
-    /// So many bytes of all that was handed over are not acknowledged.
+    /// So many bytes of all that was handed over are not acknowledged; more than were handed over is
+    /// nonsense, and says nothing.
     pub(super) fn acked(&mut self, left: u32) {
+        if left > i32::MAX as u32 {
+            return;
+        }
         let acked = self.total.wrapping_sub(left);
         while let Some(first) = self.transmissions.front()
             && acked.wrapping_sub(first.end) as i32 >= 0

@@ -236,10 +236,12 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
                     self.rearm = false;
                     self.timer_at = self.deadline();
                 }
-                if self.ports.is_empty() {
-                    return Output::Sleep { until: Instant::NEVER };
+                let beat_at = if self.ports.is_empty() { Instant::NEVER } else { self.beat_at };
+                let until = self.timer_at.min(beat_at);
+                if until == Instant::NEVER {
+                    return Output::Sleep { until };
                 }
-                self.announced = self.announced.min(self.timer_at).min(self.beat_at);
+                self.announced = self.announced.min(until);
                 Output::Sleep { until: self.announced }
             }
         }

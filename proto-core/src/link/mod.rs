@@ -205,10 +205,9 @@ impl Supervisor {
         self.action.take()
     }
 
-    /// When [`Self::advance`] has something to do.
+    /// When [`Self::advance`] has something to do, once [`Self::take_action`] has been asked.
     pub fn deadline(&self) -> Instant {
         match self.state {
-            _ if self.action.is_some() => Instant::ZERO,
             LinkState::Down { retry_at } => retry_at,
             LinkState::Opening { until } => until,
             LinkState::Up { .. } => self.silent_at(),

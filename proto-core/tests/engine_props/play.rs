@@ -355,7 +355,7 @@ impl Test {
             (if nth(0) { f32::NAN } else { float }, if nth(1) { f32::INFINITY } else { float });
         let mut packet = vec![0; 1468];
         if !good {
-            packet[..4].copy_from_slice(&f32::NAN.to_le_bytes());
+            packet[..12].copy_from_slice(&[f32::NAN.to_le_bytes(); 3].concat());
         }
         for bit in 0..8 {
             packet[760 + bit] = outputs >> bit & 1;

@@ -35,14 +35,12 @@ impl Oracle {
         self.orders.tick(now);
     }
 
-    /// The gateway itself slept: nothing of what had begun is continued, and nothing is commanded.
+    /// The gateway itself slept: nothing of what had begun is continued.
     pub(super) fn slept(&mut self, now: Instant) {
         for watch in &mut self.ports {
             watch.down.slept();
             watch.line.discard();
         }
-        self.orders.slept(now);
-        self.robot.forget_all(now);
         self.deaf_until = Some(now + DEAF);
     }
 
@@ -247,7 +245,7 @@ impl Oracle {
             LinkId::STATE => {
                 self.links[place(link)].line.held.extend_from_slice(bytes);
                 while let Some(packet) = first_packet(&mut self.links[place(link)].line) {
-                    if is_packet(&packet) {
+                    if self.links[place(link)].stream.takes(&packet) {
                         self.up.state_packet(&self.sheet, &packet, now);
                         self.values_changed();
                     }
@@ -455,14 +453,6 @@ impl Oracle {
 
 fn first_packet(line: &mut Line) -> Option<Vec<u8>> {
     (line.held.len() >= PACKET).then(|| line.held.drain(..PACKET).collect())
-}
-
-/// Whether the first six joints are where joints can be (D8).
-fn is_packet(packet: &[u8]) -> bool {
-    packet.chunks_exact(4).take(6).all(|joint| {
-        let joint = f32::from_le_bytes([joint[0], joint[1], joint[2], joint[3]]);
-        joint.is_finite() && joint.abs() <= 1_000.0
-    })
 }
 
 const PACKET: usize = 1_468;

@@ -17,6 +17,7 @@ mod orders;
 mod robot;
 mod safe;
 mod sheet;
+mod stream;
 mod upward;
 mod wire;
 
@@ -79,6 +80,8 @@ pub enum Invariant {
     ValueAge,
     /// A command that the controller takes was picked, or asked for, not long ago.
     CommandAge,
+    /// The controller understands every command that arrives.
+    Understood,
     /// What stops the robot arrives as soon as a way to the controller works.
     StopArrives,
     /// The safe value of a silent owner is there as soon as a way to the controller works.
@@ -124,6 +127,7 @@ impl Invariant {
             Self::Registers => "registers",
             Self::ValueAge => "value-age",
             Self::CommandAge => "command-age",
+            Self::Understood => "commands-understood",
             Self::StopArrives => "stop-arrives",
             Self::SafeArrives => "safe-arrives",
             Self::Unreadable => "unreadable-shown",
@@ -174,6 +178,7 @@ struct PortWatch {
 #[derive(Debug, Clone, Default)]
 struct LinkWatch {
     line: Line,
+    stream: stream::Stream,
     busy: bool,
     /// Bytes handed over since the link came up, and after each transmission that is not acknowledged.
     total: u64,
@@ -322,6 +327,11 @@ impl Oracle {
         if is_tick {
             self.announced = Instant::NEVER;
         }
+        if has_slept {
+            self.orders.slept(now);
+            self.robot.forget_all(now);
+            self.look_at_links(engine, None, now);
+        }
         if is_tick || has_slept {
             self.pass(now);
         }
@@ -464,7 +474,7 @@ const ASLEEP: Duration = Duration::from_millis(500);
 const MOST_BYTES: usize = 1 << 20;
 const MOST_THINGS: usize = 100_000;
 
-const ALL: [Invariant; 29] = [
+const ALL: [Invariant; 30] = [
     Invariant::Sent,
     Invariant::InTime,
     Invariant::FirstFrame,
@@ -484,6 +494,7 @@ const ALL: [Invariant; 29] = [
     Invariant::Registers,
     Invariant::ValueAge,
     Invariant::CommandAge,
+    Invariant::Understood,
     Invariant::StopArrives,
     Invariant::SafeArrives,
     Invariant::Unreadable,

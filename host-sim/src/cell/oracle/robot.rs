@@ -16,6 +16,7 @@ use super::sheet::{Raw, Sheet};
 use super::upward::{Carried, Upward, Wrong};
 use super::{Invariant, Oracle};
 use crate::cell::network::Speaker;
+use crate::cell::traffic::USER_TIMEOUT;
 
 /// One path to the controller, as the network is at present.
 #[derive(Debug, Clone, Copy)]
@@ -157,7 +158,8 @@ impl Robot {
     /// A transmission is there: whether what it carries is young enough.
     fn judge(&mut self, parcel: &Parcel, slowest: Duration, now: Instant) -> Result<(), Wrong> {
         let network = parcel.slowest.max(slowest) + ALLOWANCE;
-        let stalled = self.stalled_since(parcel.sent_at, now);
+        // The system's own patience ends what an engine that is not called cannot.
+        let stalled = self.stalled_since(parcel.sent_at, now).min(USER_TIMEOUT);
         for &(var, raw, carried) in &parcel.values {
             let Carried::Of { arrived, timeout } = carried else { continue };
             let (age, most) = (now.saturating_since(arrived), timeout + parcel.not_after + network + stalled);
@@ -172,7 +174,7 @@ impl Robot {
             true => (unasked.unwrap_or(now), URGENT_TTL),
             false => (order.picked, COMMAND_TTL),
         };
-        let (age, most) = (now.saturating_since(since), most + network + self.stalled_since(since, now));
+        let (age, most) = (now.saturating_since(since), most + network + stalled);
         if age > most {
             let what = format!("{} comes {age} after it was wanted, {most} at most", order.text);
             return Err((Invariant::CommandAge, what));
@@ -302,6 +304,19 @@ impl Oracle {
         tag
     }
 
+    /// The controller has not understood what came on a connection of port 2000.
+    pub(in crate::cell) fn not_understood(&mut self, link: LinkId, now: Instant) {
+        let quiet = self.robot.sound.get(&link).map(|since| now.saturating_since(*since));
+        let result = match quiet {
+            // Nothing was held up on its way, which cuts what has no end of its own.
+            Some(quiet) if quiet > Duration::from_secs(1) => {
+                Err((Invariant::Understood, "the controller did not understand a command".to_owned()))
+            }
+            _ => Ok(()),
+        };
+        self.judge(now, &[], result);
+    }
+
     pub(in crate::cell) fn conn_gone(&mut self, conn: u64) {
         self.controller.gone(conn);
         self.robot.roads.remove(&conn);
@@ -330,6 +345,7 @@ impl Oracle {
     fn judge_parcel(&mut self, parcel: &Parcel, slowest: Duration, now: Instant) {
         self.checks[Invariant::ValueAge as usize] += parcel.values.len() as u64;
         self.checks[Invariant::CommandAge as usize] += u64::from(parcel.order.is_some());
+        self.checks[Invariant::Understood as usize] += u64::from(parcel.order.is_some());
         let result = self.robot.judge(parcel, slowest, now);
         self.judge(now, &[], result);
     }

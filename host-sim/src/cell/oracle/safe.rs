@@ -44,10 +44,15 @@ impl Upward {
 
     /// A frame was sent on a recipe link: what is in doubt is sent again later.
     pub(super) fn sent_frame(&mut self, sheet: &Sheet, link: LinkId, now: Instant) {
-        let place = usize::from(link.0);
-        if self.again_at[place] == Instant::NEVER && !self.in_doubt(sheet, link).is_empty() {
-            self.again_at[place] = now + SOON;
+        let again_at = self.again_at[usize::from(link.0)];
+        let is_soon = again_at == Instant::NEVER || self.is_new_doubt(now);
+        if is_soon && !self.in_doubt(sheet, link).is_empty() {
+            self.again_at[usize::from(link.0)] = again_at.min(now + SOON);
         }
+    }
+
+    fn is_new_doubt(&self, now: Instant) -> bool {
+        now.saturating_since(self.doubted_at) < NEW
     }
 
     /// Safe values that are sent again now.
@@ -63,8 +68,7 @@ impl Upward {
             if doubted.is_empty() || !self.is_up(link.id) {
                 continue;
             }
-            let is_new = now.saturating_since(self.doubted_at) < NEW;
-            let soon = is_new || doubted.iter().any(|var| sheet.can_be_shown(*var));
+            let soon = self.is_new_doubt(now) || doubted.iter().any(|var| sheet.can_be_shown(*var));
             self.again_at[place] = now + if soon { SOON } else { SLOWLY };
             self.write_again(sheet, doubted);
         }
@@ -103,7 +107,7 @@ impl Upward {
         let since = self.doubted_at + SHOWN_AFTER;
         for &var in &sheet.safe_vars {
             let safe = sheet.owned[var.ordinal()].and_then(|owned| owned.safe);
-            let shown = sheet.witness_of(var).and_then(|witness| self.known(witness).value);
+            let shown = sheet.witness[var.ordinal()].and_then(|witness| self.known(witness).value);
             if shown.is_some_and(|(raw, at)| at >= since && safe.is_some_and(|safe| safe[0] == raw[0])) {
                 self.known[var.ordinal()].unconfirmed = false;
             }

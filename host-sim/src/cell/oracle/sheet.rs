@@ -85,6 +85,8 @@ pub(super) struct Sheet {
     pub safe_vars: Vec<SysVar>,
     /// There is a state link.
     pub has_state: bool,
+    /// The output that shows what an input was set to, when some port or recipe link brings it.
+    pub witness: [Option<SysVar>; COUNT],
     /// Some port sends for a rising bit.
     pub has_triggers: bool,
     /// The texts and values of all command tables.
@@ -160,6 +162,15 @@ impl Sheet {
         let is_safe = |var: &SysVar| owned[var.ordinal()].is_some_and(|owned: Owned| owned.safe.is_some());
         let safe_vars = SysVar::all().filter(is_safe).collect();
         let has_triggers = ports.iter().any(|port| matches!(port.send, SendOn::Rising { .. }));
+        let brings = |link: &LinkSheet, var| link.output.as_ref().is_some_and(|down| down.shows(var));
+        let mut witness = [None; COUNT];
+        for nth in 1..=3 {
+            let both = [format!("DigitalOutputCommand[{nth}]"), format!("DigitalSignalStatus[{}]", nth + 3)];
+            let [Ok(input), Ok(output)] = both.map(|name| SysVar::parse(&name)) else { continue };
+            let is_there =
+                origin[output.ordinal()].is_some() || links.iter().any(|link| brings(link, output));
+            witness[input.ordinal()] = is_there.then_some(output);
+        }
         Self {
             ports,
             links,
@@ -169,6 +180,7 @@ impl Sheet {
             in_packet,
             safe_vars,
             has_state,
+            witness,
             has_triggers,
             commands,
         }
@@ -178,17 +190,9 @@ impl Sheet {
         self.links.iter().find(|link| link.id == id)
     }
 
-    /// The output that shows what an input was set to, when some port shows it.
-    pub(super) fn witness_of(&self, var: SysVar) -> Option<SysVar> {
-        let nth =
-            var.to_string().strip_prefix("DigitalOutputCommand[")?.strip_suffix(']')?.parse::<u8>().ok()?;
-        let witness = SysVar::parse(&format!("DigitalSignalStatus[{}]", nth + 3)).ok()?;
-        self.origin[witness.ordinal()].map(|_| witness)
-    }
-
     /// Whether anything would show the variable's value at the controller.
     pub(super) fn can_be_shown(&self, var: SysVar) -> bool {
-        self.has_state && var.stream().is_some() || self.witness_of(var).is_some()
+        self.has_state && var.stream().is_some() || self.witness[var.ordinal()].is_some()
     }
 }
 

@@ -4,6 +4,7 @@
 //! ([`StateView`]), a plain value ([`StatePacket`]), the output variables of the process image.
 //! Refuses to know time, connections and what a misaligned stream is answered with.
 
+mod alignment;
 mod codes;
 mod copy;
 mod packet;
@@ -11,10 +12,11 @@ mod places;
 mod stream;
 mod view;
 
+pub use alignment::Misaligned;
 pub use codes::{OperationMode, ProgramState, RobotState, SafetyState, States};
 pub use packet::{Content, FIELDS, FieldPlace, StatePacket};
 pub use stream::{MAX_MISALIGNED, StateStream};
-pub use view::{Misaligned, StateError, StateView};
+pub use view::{StateError, StateView};
 
 /// Size of a state packet in bytes.
 pub const LEN: usize = places::LEN;

@@ -5,7 +5,7 @@
     reason = "all of it runs in constants: an index out of range or an overflow fails the build"
 )]
 
-use super::packet::{Content, FIELDS};
+use super::packet::{Content, FIELDS, FieldPlace};
 use crate::sysvar::{INPUT_COUNT, SPANS};
 
 /// Bytes of the packet that go into the image as they are.
@@ -37,6 +37,75 @@ pub(super) const COPIES: &[Copy] = OUTPUTS.copies.split_at(OUTPUTS.copy_count).0
 pub(super) const PACKS: &[Pack] = OUTPUTS.packs.split_at(OUTPUTS.pack_count).0;
 /// Every bool that is not reserved, consecutive ones merged.
 pub(super) const BOOLS: &[Bools] = BOOL_RUNS.0.split_at(BOOL_RUNS.1).0;
+
+/// Fields that are looked at more closely in a packet without a started controller's codes, how
+/// many of their items, and how large these can be in their unit. Not here: what is reserved, and
+/// registers and forces, which users write.
+#[rustfmt::skip]
+pub(super) const QUANTITIES: &[(&str, usize, f32)] = &[
+    ("joint_position", 6, FARTHEST_RAD),
+    ("joint_velocity", 6, 20.0),
+    ("joint_acceleration", 6, 2_000.0),
+    ("joint_torque", 6, 2_000.0),
+    ("target_joint_position", 6, FARTHEST_RAD),
+    ("target_joint_velocity", 6, 20.0),
+    ("target_joint_acceleration", 6, 2_000.0),
+    ("target_joint_torque", 6, 2_000.0),
+    ("joint_current", 6, 20_000.0),
+    ("tcp_pose", 6, 20.0),
+    ("tcp_velocity", 6, 20.0),
+    ("tcp_acceleration", 6, 2_000.0),
+    ("target_tcp_pose", 6, 20.0),
+    ("target_tcp_velocity", 6, 20.0),
+    ("target_tcp_acceleration", 6, 2_000.0),
+    ("tool_frame", 6, 20.0),
+    ("work_object_frame", 6, 20.0),
+    ("analog_inputs", 8, 100.0),
+];
+
+/// The same for each four bytes from the packet's front to the last of them: the bits of the
+/// largest float that can stand there, 0 where nothing is looked at.
+pub(super) static LIMITS: [i32; 200] = {
+    let mut limits = [0; 200];
+    let mut nth = 0;
+    while nth < QUANTITIES.len() {
+        let (name, items, most) = QUANTITIES[nth];
+        let field = row(name);
+        assert!(items <= field.count as usize && field.ty.size() == 4 && field.offset.is_multiple_of(4));
+        let mut item = 0;
+        while item < items {
+            limits[field.offset as usize / 4 + item] = most.to_bits().cast_signed();
+            item += 1;
+        }
+        nth += 1;
+    }
+    limits
+};
+
+/// No joint turns this far.
+pub(super) const FARTHEST_RAD: f32 = 1000.0;
+
+/// Where the TCP's actual pose stands.
+pub(super) const TCP_POSE: usize = row("tcp_pose").offset as usize;
+/// Where the four state codes stand.
+pub(super) const STATES: usize = row("operation_mode").offset as usize;
+
+/// A field that is not in the table does not build.
+const fn row(name: &str) -> &'static FieldPlace {
+    let mut row = 0;
+    while !is_same(FIELDS[row].name.as_bytes(), name.as_bytes()) {
+        row += 1;
+    }
+    &FIELDS[row]
+}
+
+const fn is_same(a: &[u8], b: &[u8]) -> bool {
+    let mut at = 0;
+    while at < a.len() && at < b.len() && a[at] == b[at] {
+        at += 1;
+    }
+    at == a.len() && at == b.len()
+}
 
 struct Outputs {
     copies: [Copy; SPANS.len()],

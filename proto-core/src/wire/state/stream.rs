@@ -1,9 +1,10 @@
 //! Packets out of a connection's bytes (docs/wire/state.md section 3, D8).
 //!
 //! In: bytes in pieces of any size, from the connection's first one on. Out: packets, each checked
-//! for alignment. Does not search for a packet's beginning: the stream has no mark. Whoever owns
+//! for alignment, by itself and beside those before it. Does not search for a packet's beginning: the stream has no mark. Whoever owns
 //! the connection reopens it when [`StateStream::is_lost`].
 
+use super::alignment::Earlier;
 use super::{LEN, Misaligned, StateView};
 
 /// After this many misaligned packets in a row the connection is to be reopened.
@@ -18,12 +19,13 @@ pub struct StateStream {
     packets: u32,
     misaligned: u32,
     in_a_row: u32,
+    earlier: Earlier,
 }
 
 impl StateStream {
     /// A stream at the beginning of a connection.
     pub const fn new() -> Self {
-        Self { buffer: [0; LEN], len: 0, packets: 0, misaligned: 0, in_a_row: 0 }
+        Self { buffer: [0; LEN], len: 0, packets: 0, misaligned: 0, in_a_row: 0, earlier: Earlier::NONE }
     }
 
     /// Takes bytes off the front of `chunk` until a packet is complete. `None` means that all of
@@ -55,7 +57,7 @@ impl StateStream {
                 StateView::from_array(&self.buffer)
             }
         };
-        match view.check_alignment() {
+        match self.earlier.check(view.as_bytes()) {
             Ok(()) => {
                 self.packets = self.packets.wrapping_add(1);
                 self.in_a_row = 0;
@@ -94,10 +96,11 @@ impl StateStream {
         if self.len < LEN { self.len } else { 0 }
     }
 
-    /// Forgets an incomplete packet, for a new connection; the counters stay.
+    /// Forgets an incomplete packet and what packets showed, for a new connection; the counters stay.
     pub const fn reset(&mut self) {
         self.len = 0;
         self.in_a_row = 0;
+        self.earlier = Earlier::NONE;
     }
 }
 

@@ -1,8 +1,7 @@
-//! A checked view over the bytes of one packet, and the test whether they are one (D8).
+//! A checked view over the bytes of one packet.
 
 use core::fmt;
 
-use super::places::BOOLS;
 use super::{LEN, OperationMode, ProgramState, StatePacket, States};
 use crate::sysvar::SysVar;
 use crate::wire::dialect::Dialect;
@@ -40,42 +39,6 @@ impl fmt::Display for StateError {
 
 impl core::error::Error for StateError {}
 
-/// Why a packet does not begin where the bytes do (docs/wire/state.md section 3, D8).
-#[derive(Debug, Clone, Copy, PartialEq)]
-#[cfg_attr(feature = "defmt", derive(defmt::Format))]
-#[non_exhaustive]
-pub enum Misaligned {
-    /// A joint position is not finite or beyond ±1000 rad.
-    JointPosition {
-        /// 1..=6.
-        joint: u8,
-        /// What stands there, rad.
-        position: f32,
-    },
-    /// Too many bool bytes are neither 0 nor 1.
-    Bools {
-        /// How many are not.
-        wrong: u16,
-        /// How many may be.
-        allowed: u16,
-    },
-}
-
-impl fmt::Display for Misaligned {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::JointPosition { joint, position } => {
-                write!(f, "the position of joint {joint} is {position} rad; at most ±{FARTHEST_RAD}")
-            }
-            Self::Bools { wrong, allowed } => {
-                write!(f, "{wrong} bool bytes are neither 0 nor 1; at most {allowed}")
-            }
-        }
-    }
-}
-
-impl core::error::Error for Misaligned {}
-
 impl<'a> StateView<'a> {
     /// Looks at exactly one packet.
     ///
@@ -97,32 +60,6 @@ impl<'a> StateView<'a> {
     /// The packet's bytes.
     pub const fn as_bytes(&self) -> &'a [u8; LEN] {
         self.bytes
-    }
-
-    /// Whether the bytes can be a packet: the stream has no mark to find its beginning by (D8).
-    /// Reserved items and codes are never looked at.
-    ///
-    /// # Errors
-    /// [`Misaligned`] names the first thing no packet has.
-    pub fn check_alignment(&self) -> Result<(), Misaligned> {
-        let positions = self.joint_position();
-        let within = |position: f32| position.abs() <= FARTHEST_RAD;
-        for (joint, &position) in (1u8..=6).zip(&positions) {
-            if !within(position) {
-                return Err(Misaligned::JointPosition { joint, position });
-            }
-        }
-        let mut wrong = 0u16;
-        for run in BOOLS {
-            let bools = self.bytes.get(run.from..).and_then(|bytes| bytes.get(..run.len)).unwrap_or(&[]);
-            if !are_bools(bools) {
-                wrong = wrong.saturating_add(bools.iter().map(|&byte| u16::from(byte > 1)).sum());
-            }
-        }
-        if wrong > ALLOWED_WRONG_BOOLS {
-            return Err(Misaligned::Bools { wrong, allowed: ALLOWED_WRONG_BOOLS });
-        }
-        Ok(())
     }
 
     /// The packet as a plain value.
@@ -169,17 +106,3 @@ impl<'a> StateView<'a> {
         }
     }
 }
-
-/// Whether every byte is 0 or 1: seen four at a time, since nearly every packet is right.
-fn are_bools(bytes: &[u8]) -> bool {
-    let (words, rest) = bytes.as_chunks::<4>();
-    let words = words.iter().fold(0, |all, word| all | u32::from_ne_bytes(*word));
-    let rest = rest.iter().fold(0, |all, byte| all | byte);
-    words & 0xFEFE_FEFE == 0 && rest & 0xFE == 0
-}
-
-/// No joint turns this far; what stands in other fields mostly does not read as so small a float.
-const FARTHEST_RAD: f32 = 1000.0;
-
-/// Versions differ in what they put into a few bool bytes (D8).
-const ALLOWED_WRONG_BOOLS: u16 = 8;

@@ -1,0 +1,358 @@
+//! The link to a pseudoterminal, by which other programs find it.
+//!
+//! A link belongs to the process that made it for as long as that lives. It holds a lock on a file beside
+//! the link, `.NAME.lock`, which the system lets go of however the process ends, and in which it says which
+//! link it made: so one that a killed run left is told from one of a program that still uses it, even when
+//! the terminal's number has been given to somebody else since.
+
+use std::fs;
+use std::io::{self, Read, Seek, Write};
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt, symlink};
+use std::path::{Path, PathBuf};
+
+use rustix::fs::{FlockOperation, OFlags, flock};
+
+use crate::files::{Beside, Identity};
+
+/// A link to a pseudoterminal; removed when dropped, if it is still ours.
+#[derive(Debug)]
+pub(super) struct Link {
+    path: PathBuf,
+    made: Made,
+    /// Let go of after the link has been removed.
+    _lock: Lock,
+}
+
+impl Link {
+    /// Makes a link to `target` at `path`, and `path`'s folder if there is none.
+    ///
+    /// # Errors
+    /// With the path in the message: the folder cannot be made, or there is something else than a link
+    /// that nobody uses any more.
+    pub(super) fn place(path: &Path, target: &Path) -> io::Result<Self> {
+        let placed = || -> io::Result<Self> {
+            path.parent().map_or(Ok(()), fs::create_dir_all)?;
+            let mut lock = Lock::take(path)?;
+            let is_free = is_free(path, lock.left)?;
+            let (beside, ()) = Beside::make(path, |name| symlink(target, name))?;
+            let made = Made::of(&fs::symlink_metadata(beside.name())?);
+            lock.record(made)?;
+            if is_free {
+                beside.put_new(path)?
+            } else {
+                beside.replace(path)?
+            }
+            Ok(Self { path: path.to_owned(), made, _lock: lock })
+        };
+        placed().map_err(|error| io::Error::new(error.kind(), format!("{}: {error}", path.display())))
+    }
+
+    pub(super) fn path(&self) -> &Path {
+        &self.path
+    }
+}
+
+impl Drop for Link {
+    fn drop(&mut self) {
+        if fs::symlink_metadata(&self.path).is_ok_and(|there| Made::of(&there) == self.made) {
+            let _ = fs::remove_file(&self.path);
+        }
+    }
+}
+
+/// Whether nothing is at `path`; otherwise it is a link that nobody uses, or an error. `left` is the link
+/// that the last run made here.
+fn is_free(path: &Path, left: Option<Made>) -> io::Result<bool> {
+    let refused = |message: String| Err(io::Error::new(io::ErrorKind::AlreadyExists, message));
+    let found = match fs::symlink_metadata(path) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(true),
+        found => found?,
+    };
+    let target = if found.is_symlink() { fs::read_link(path)? } else { PathBuf::new() };
+    if !target.starts_with("/dev/pts") {
+        return refused(
+            "there is something already, and it is not a link to a pseudoterminal; \
+             give another path or remove it"
+                .to_owned(),
+        );
+    }
+    if left == Some(Made::of(&found)) {
+        return Ok(false);
+    }
+    match fs::symlink_metadata(&target) {
+        // Pseudoterminals go with the program that made them.
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(false),
+        _ => refused(format!(
+            "a link to {}, which a program has open; give another path or end that program, and \
+             if it has nothing to do with this link, remove the link",
+            target.display()
+        )),
+    }
+}
+
+/// The right to a path, for as long as it is held.
+#[derive(Debug)]
+struct Lock {
+    path: PathBuf,
+    file: fs::File,
+    /// The link that the last holder made and did not remove.
+    left: Option<Made>,
+}
+
+impl Lock {
+    fn take(link: &Path) -> io::Result<Self> {
+        let Some(name) = link.file_name() else {
+            return Err(io::Error::new(io::ErrorKind::InvalidInput, "not the name of a link"));
+        };
+        let mut hidden = std::ffi::OsString::from(".");
+        hidden.push(name);
+        hidden.push(".lock");
+        let path = link.with_file_name(hidden);
+        for _ in 0..MOST_TRIES {
+            let mut file = fs::File::options()
+                .read(true)
+                .write(true)
+                .create(true)
+                .truncate(false)
+                .custom_flags(OFlags::NOFOLLOW.bits().cast_signed())
+                .open(&path)
+                .map_err(|error| named(&path, &error))?;
+            let mut text = String::new();
+            let read = |file: &mut fs::File, text: &mut String| file.take(MOST_BYTES).read_to_string(text);
+            match flock(&file, FlockOperation::NonBlockingLockExclusive) {
+                Ok(()) => {}
+                Err(rustix::io::Errno::WOULDBLOCK) => {
+                    let _ = read(&mut file, &mut text);
+                    return Err(in_use(Record::parse(&text)));
+                }
+                Err(error) => return Err(named(&path, &error.into())),
+            }
+            // The holder before may have removed the file in the very moment.
+            let own = Identity::of(&file.metadata()?);
+            if !fs::symlink_metadata(&path).is_ok_and(|there| Identity::of(&there) == own) {
+                continue;
+            }
+            let is_text = read(&mut file, &mut text).is_ok();
+            let record = Record::parse(&text);
+            if !is_text || (record.is_none() && !text.is_empty()) {
+                let what = "there is something else, and the link's lock has no place; give another path";
+                return Err(named(&path, &io::Error::new(io::ErrorKind::AlreadyExists, what)));
+            }
+            return Ok(Self { path, file, left: record.map(|record| record.made) });
+        }
+        Err(in_use(None))
+    }
+
+    /// Says which link is ours. It is not at its place yet: whatever happens, what is there is known.
+    fn record(&mut self, made: Made) -> io::Result<()> {
+        let record = Record { process: std::process::id(), made };
+        self.file.rewind()?;
+        self.file.set_len(0)?;
+        self.file.write_all(record.show().as_bytes())
+    }
+}
+
+impl Drop for Lock {
+    fn drop(&mut self) {
+        // While it is held: whoever takes it next makes a new one.
+        let _ = fs::remove_file(&self.path);
+    }
+}
+
+fn named(path: &Path, error: &io::Error) -> io::Error {
+    io::Error::new(error.kind(), format!("{}: {error}", path.display()))
+}
+
+fn in_use(holder: Option<Record>) -> io::Error {
+    let message = match holder {
+        Some(Record { process, .. }) if process == std::process::id() => {
+            "another port has it; give each port a path of its own".to_owned()
+        }
+        Some(Record { process, .. }) => {
+            format!("another run of host-sim has it, process {process}; end that one or give another path")
+        }
+        None => "another run of host-sim has it; end that one or give another path".to_owned(),
+    };
+    io::Error::new(io::ErrorKind::ResourceBusy, message)
+}
+
+/// What a lock's file says: who holds it, and which link it made.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Record {
+    process: u32,
+    made: Made,
+}
+
+impl Record {
+    fn show(self) -> String {
+        let Self { process, made: Made { inode, seconds, nanos } } = self;
+        format!("{WORD} {process} {inode} {seconds} {nanos}\n")
+    }
+
+    /// `None` for what no run wrote.
+    fn parse(text: &str) -> Option<Self> {
+        let words: Vec<_> = text.strip_suffix('\n')?.split(' ').collect();
+        let [WORD, process, inode, seconds, nanos] = words[..] else { return None };
+        let made =
+            Made { inode: inode.parse().ok()?, seconds: seconds.parse().ok()?, nanos: nanos.parse().ok()? };
+        Some(Self { process: process.parse().ok()?, made })
+    }
+}
+
+/// Which link it is. Nobody changes a link; a later one at the same place is another one.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Made {
+    inode: u64,
+    seconds: i64,
+    nanos: i64,
+}
+
+impl Made {
+    fn of(link: &fs::Metadata) -> Self {
+        Self { inode: link.ino(), seconds: link.mtime(), nanos: link.mtime_nsec() }
+    }
+}
+
+const WORD: &str = "host-sim";
+/// The longest record that is read.
+const MOST_BYTES: u64 = 256;
+const MOST_TRIES: usize = 100;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A terminal that exists as long as it is held, as another program would have it.
+    fn terminal() -> (std::os::fd::OwnedFd, PathBuf) {
+        let master =
+            rustix::pty::openpt(rustix::pty::OpenptFlags::RDWR | rustix::pty::OpenptFlags::NOCTTY).unwrap();
+        let name = rustix::pty::ptsname(&master, Vec::new()).unwrap().into_string().unwrap();
+        (master, name.into())
+    }
+
+    /// The name of a terminal that is gone; a low number would soon be another's.
+    const GONE: &str = "/dev/pts/4000000";
+
+    /// Puts somebody else's link in the place of the one at `path`.
+    fn put_another(path: &Path, target: &Path) {
+        let made = || Made::of(&fs::symlink_metadata(path).unwrap());
+        let before = made();
+        // The clock of a file system may not have moved yet.
+        while made() == before {
+            fs::remove_file(path).unwrap();
+            symlink(target, path).unwrap();
+        }
+    }
+
+    fn place() -> (tempfile::TempDir, PathBuf) {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("line");
+        (folder, path)
+    }
+
+    fn count(path: &Path) -> usize {
+        fs::read_dir(path.parent().unwrap()).unwrap().count()
+    }
+
+    /// What a run that is killed leaves: nobody holds the lock, and nothing is removed.
+    fn kill(link: Link) {
+        flock(&link._lock.file, FlockOperation::Unlock).unwrap();
+        std::mem::forget(link);
+    }
+
+    #[test]
+    fn a_link_is_one_runs_alone_and_goes_with_it() {
+        let (_folder, path) = place();
+        let (_terminal, name) = terminal();
+        let link = Link::place(&path, &name).unwrap();
+        assert_eq!((link.path(), fs::read_link(&path).unwrap()), (&*path, name.clone()));
+        let message = Link::place(&path, &name).unwrap_err().to_string();
+        assert_eq!(
+            message,
+            format!("{}: another port has it; give each port a path of its own", path.display())
+        );
+        // Even when somebody has removed it.
+        fs::remove_file(&path).unwrap();
+        Link::place(&path, &name).unwrap_err();
+        drop(link);
+        drop(Link::place(&path, &name).unwrap());
+        assert_eq!(count(&path), 0);
+    }
+
+    #[test]
+    fn what_a_killed_run_left_is_replaced_whoever_has_its_terminals_number_now() {
+        let (_folder, path) = place();
+        let (_another, name) = terminal();
+        for target in [&*name, Path::new(GONE)] {
+            kill(Link::place(&path, target).unwrap());
+            let (_own, own) = terminal();
+            let link = Link::place(&path, &own).unwrap();
+            assert_eq!(fs::read_link(&path).unwrap(), own);
+            drop(link);
+            assert_eq!(count(&path), 0);
+        }
+    }
+
+    #[test]
+    fn a_link_of_a_program_that_runs_stays() {
+        let (_folder, path) = place();
+        let (_another, name) = terminal();
+        // Its number is that of a run that was killed; the link is another one.
+        kill(Link::place(&path, &name).unwrap());
+        put_another(&path, &name);
+        let message = Link::place(&path, Path::new(GONE)).unwrap_err().to_string();
+        let expected =
+            format!("{}: a link to {}, which a program has open; ", path.display(), name.display());
+        assert!(message.starts_with(&expected), "{message}");
+        assert_eq!((fs::read_link(&path).unwrap(), count(&path)), (name, 1));
+    }
+
+    #[test]
+    fn a_link_of_a_program_that_is_gone_is_replaced() {
+        let (_folder, path) = place();
+        symlink(GONE, &path).unwrap();
+        let (_terminal, name) = terminal();
+        let link = Link::place(&path, &name).unwrap();
+        assert_eq!(fs::read_link(&path).unwrap(), name);
+        // Somebody else's is not removed, not even one to the same terminal.
+        put_another(&path, &name);
+        drop(link);
+        assert_eq!((fs::read_link(&path).unwrap(), count(&path)), (name, 1));
+    }
+
+    #[test]
+    fn whatever_else_is_at_the_path_or_in_the_place_of_the_lock_stays() {
+        let (_folder, path) = place();
+        let refused = || Link::place(&path, Path::new(GONE)).unwrap_err().to_string();
+        fs::write(&path, "precious").unwrap();
+        assert!(refused().contains("line: there is something already"), "{}", refused());
+        assert_eq!((fs::read(&path).unwrap().as_slice(), count(&path)), (&b"precious"[..], 1));
+        fs::remove_file(&path).unwrap();
+        symlink("/dev/null", &path).unwrap();
+        assert!(refused().contains("there is something already"));
+        assert_eq!(fs::read_link(&path).unwrap(), Path::new("/dev/null"));
+        fs::remove_file(&path).unwrap();
+        let lock = path.with_file_name(".line.lock");
+        for other in [&b"precious"[..], b"\xFF", b"host-sim 1 2 3\n", &[b' '; 1 << 10]] {
+            fs::write(&lock, other).unwrap();
+            assert!(refused().contains(".line.lock: there is something else"), "{}", refused());
+            assert_eq!((fs::read(&lock).unwrap().as_slice(), count(&path)), (other, 1));
+        }
+    }
+
+    #[test]
+    fn records_are_read_as_they_were_written() {
+        let record = Record { process: 7, made: Made { inode: 8, seconds: -9, nanos: 10 } };
+        assert_eq!(Record::parse(&record.show()), Some(record));
+        for other in [
+            "",
+            "\n",
+            "host-sim 7 8 9 10",
+            "host-sim 7 8 9 10 11\n",
+            "other 7 8 9 10\n",
+            "host-sim 7 8 9 x\n",
+        ] {
+            assert_eq!(Record::parse(other), None, "{other:?}");
+        }
+    }
+}

@@ -1,0 +1,44 @@
+/* Run by `selftest` in UML: whether vector registers are as they were after a signal's handler has
+   changed them. UML saves and sets them for that as it does between two threads. */
+#include <signal.h>
+#include <stdio.h>
+#include <string.h>
+#include <sys/time.h>
+
+static volatile sig_atomic_t handled;
+static const double others[4] = {-1, -2, -3, -4};
+static int avx;
+
+static void change(int signal)
+{
+    (void)signal;
+    if (avx)
+        __asm__ volatile("vmovupd %0, %%ymm15" : : "m"(others) : "xmm15");
+    else
+        __asm__ volatile("movupd %0, %%xmm15" : : "m"(others) : "xmm15");
+    handled += 1;
+}
+
+int main(void)
+{
+    const struct itimerval often = {{0, 10000}, {0, 10000}};
+    const double before[4] = {1, 2, 3, 4};
+    avx = __builtin_cpu_supports("avx");
+    signal(SIGALRM, change);
+    setitimer(ITIMER_REAL, &often, NULL);
+    while (handled < 20) {
+        double after[4] = {1, 2, 3, 4};
+        long turns = 1000000;
+        if (avx)
+            __asm__ volatile("vmovupd %2, %%ymm15; 1: dec %0; jnz 1b; vmovupd %%ymm15, %1; vzeroupper"
+                             : "+r"(turns), "=m"(after) : "m"(before) : "cc", "xmm15", "memory");
+        else
+            __asm__ volatile("movupd %2, %%xmm15; 1: dec %0; jnz 1b; movupd %%xmm15, %1"
+                             : "+r"(turns), "+m"(after) : "m"(before) : "cc", "xmm15", "memory");
+        if (memcmp(before, after, sizeof before) != 0) {
+            printf("%g %g %g %g after %d signals\n", after[0], after[1], after[2], after[3], (int)handled);
+            return 1;
+        }
+    }
+    return 0;
+}

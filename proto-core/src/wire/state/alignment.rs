@@ -1,0 +1,250 @@
+//! Whether bytes are a packet: the stream has no mark to find its beginning by
+//! (docs/wire/state.md section 3, D8).
+//!
+//! In: the bytes of one packet, and what the packets before it on its connection showed. Out: why
+//! they cannot be one. No single item is enough: a NaN makes its own item unknown, not the packet.
+//! Refuses to look at reserved items and at what users write.
+
+use core::fmt;
+
+use super::places::{BOOLS, FARTHEST_RAD, LIMITS, STATES, TCP_POSE};
+use super::{LEN, StateView};
+
+/// Why a packet does not begin where the bytes do (docs/wire/state.md section 3, D8).
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[non_exhaustive]
+pub enum Misaligned {
+    /// Too many of the first six joint positions are not finite or beyond ±1000 rad.
+    JointPosition {
+        /// How many are.
+        wrong: u8,
+        /// How many may be.
+        allowed: u8,
+        /// The first of them, 1..=6.
+        joint: u8,
+        /// What stands there, rad.
+        position: f32,
+    },
+    /// Too many bool bytes are neither 0 nor 1.
+    Bools {
+        /// How many are not.
+        wrong: u16,
+        /// How many may be.
+        allowed: u16,
+    },
+    /// The state codes are not a started controller's, and too many quantities are not finite,
+    /// larger than their unit allows, or as good as nothing without being 0.
+    Quantities {
+        /// How many are.
+        wrong: u16,
+        /// How many may be.
+        allowed: u16,
+    },
+    /// The state codes are others than before, and the arm is too far from where it just was.
+    Elsewhere {
+        /// How far the farthest joint (rad) or coordinate of the TCP (m) is from there.
+        distance: f32,
+        /// How far it may be.
+        allowed: f32,
+    },
+}
+
+impl fmt::Display for Misaligned {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::JointPosition { wrong, allowed, joint, position } => {
+                write!(f, "{wrong} joint positions are not within ±{FARTHEST_RAD} rad, ")?;
+                write!(f, "the first that of joint {joint}, {position} rad; at most {allowed} may be so")
+            }
+            Self::Bools { wrong, allowed } => {
+                write!(f, "{wrong} bool bytes are neither 0 nor 1; at most {allowed}")
+            }
+            Self::Quantities { wrong, allowed } => {
+                write!(f, "{wrong} quantities are impossible, and the state codes are not a started ")?;
+                write!(f, "controller's; at most {allowed}")
+            }
+            Self::Elsewhere { distance, allowed } => {
+                write!(f, "the state codes have changed, and the arm is {distance} rad or m from where it ")?;
+                write!(f, "was one packet ago; at most {allowed}")
+            }
+        }
+    }
+}
+
+impl core::error::Error for Misaligned {}
+
+impl StateView<'_> {
+    /// Whether the bytes can be a packet, as far as one packet can tell (D8). Reserved items and
+    /// what users write are never looked at. [`StateStream`](super::StateStream) asks more: how the
+    /// packet fits the one before.
+    ///
+    /// # Errors
+    /// [`Misaligned`] says what no packet has.
+    pub fn check_alignment(&self) -> Result<(), Misaligned> {
+        check(self.as_bytes(), is_started(codes(self.as_bytes())))
+    }
+}
+
+/// What the packets of one connection have shown, for the next.
+#[derive(Debug, Clone)]
+pub(super) struct Earlier {
+    /// The newest state codes of a started controller.
+    codes: Option<[u8; 4]>,
+    /// Where the arm was in the packet before; meaningless without `codes`.
+    joints: [u8; JOINTS],
+    tcp: [u8; TCP],
+}
+
+impl Earlier {
+    /// A connection without a packet.
+    pub(super) const NONE: Self = Self { codes: None, joints: [0; JOINTS], tcp: [0; TCP] };
+
+    /// Whether the bytes can be the connection's next packet; if so, they are remembered.
+    #[inline]
+    pub(super) fn check(&mut self, bytes: &[u8; LEN]) -> Result<(), Misaligned> {
+        let codes = codes(bytes);
+        let is_as_before = self.codes == Some(codes);
+        let is_started = is_as_before || is_started(codes);
+        check(bytes, is_started)?;
+        if !is_as_before {
+            self.check_change(bytes, is_started)?;
+            if is_started {
+                self.codes = Some(codes);
+            }
+        }
+        self.joints = part(bytes, 0);
+        self.tcp = part(bytes, TCP_POSE);
+        Ok(())
+    }
+
+    /// The codes are others than before, or the first.
+    #[cold]
+    #[inline(never)]
+    fn check_change(&self, bytes: &[u8; LEN], is_started: bool) -> Result<(), Misaligned> {
+        if self.codes.is_none() {
+            return Ok(());
+        }
+        let mut distance = farthest(&self.joints, &part::<JOINTS>(bytes, 0));
+        // The TCP of a started controller jumps when a program takes another tool.
+        if !is_started {
+            distance = distance.max(farthest(&self.tcp, &part::<TCP>(bytes, TCP_POSE)));
+        }
+        if distance > ALLOWED_DISTANCE {
+            return Err(Misaligned::Elsewhere { distance, allowed: ALLOWED_DISTANCE });
+        }
+        Ok(())
+    }
+}
+
+#[inline]
+fn check(bytes: &[u8; LEN], is_started: bool) -> Result<(), Misaligned> {
+    let joints: [u8; JOINTS] = part(bytes, 0);
+    let wrong = wrong_joints(&joints);
+    if wrong > ALLOWED_WRONG_JOINTS {
+        return Err(first_wrong_joint(&joints, wrong));
+    }
+    let bools = BOOLS.iter().map(|run| bytes.get(run.from..).and_then(|run_on| run_on.get(..run.len)));
+    let wrong: u16 = bools.flatten().filter(|run| !are_bools(run)).map(wrong_bools).sum();
+    if wrong > ALLOWED_WRONG_BOOLS {
+        return Err(Misaligned::Bools { wrong, allowed: ALLOWED_WRONG_BOOLS });
+    }
+    if is_started { Ok(()) } else { check_quantities(bytes) }
+}
+
+/// The closer look. A shifted packet mostly has no codes, or all zeros, where a started
+/// controller's stand.
+#[cold]
+#[inline(never)]
+fn check_quantities(bytes: &[u8; LEN]) -> Result<(), Misaligned> {
+    let wrong = bytes.as_chunks().0.iter().zip(&LIMITS).map(|(item, &most)| {
+        let size = (u32::from_le_bytes(*item) & !SIGN) as i32;
+        // No branch, so that several are looked at in one instruction where there are such.
+        u32::from((most != 0) & ((size > most) | (size != 0) & (size < LEAST)))
+    });
+    let wrong: u32 = wrong.sum();
+    let wrong = u16::try_from(wrong).unwrap_or(u16::MAX);
+    if wrong > ALLOWED_WRONG_QUANTITIES {
+        return Err(Misaligned::Quantities { wrong, allowed: ALLOWED_WRONG_QUANTITIES });
+    }
+    Ok(())
+}
+
+fn codes(bytes: &[u8; LEN]) -> [u8; 4] {
+    part(bytes, STATES)
+}
+
+/// Whether a controller that is through with its start shows these codes. One of them may be one
+/// that the table of section 4 does not have: versions differ.
+fn is_started([mode, robot, program, safety]: [u8; 4]) -> bool {
+    let unknown = [mode > 2, robot > 7, program > 5, safety > 15 && safety != 99];
+    robot != 0 && safety > 1 && unknown.into_iter().filter(|unknown| *unknown).count() <= 1
+}
+
+#[inline]
+fn part<const N: usize>(bytes: &[u8; LEN], from: usize) -> [u8; N] {
+    bytes.get(from..).and_then(|bytes| bytes.first_chunk()).copied().unwrap_or([0; N])
+}
+
+#[inline]
+fn wrong_joints(joints: &[u8; JOINTS]) -> u8 {
+    joints.as_chunks().0.iter().map(|joint| u8::from(is_wrong_joint(joint))).sum()
+}
+
+fn is_wrong_joint(joint: &[u8; 4]) -> bool {
+    u32::from_le_bytes(*joint) & !SIGN > FARTHEST_RAD.to_bits()
+}
+
+#[cold]
+fn first_wrong_joint(joints: &[u8; JOINTS], wrong: u8) -> Misaligned {
+    let mut named = (1..=6).zip(joints.as_chunks().0);
+    let (joint, position) = named.find(|(_, bytes)| is_wrong_joint(bytes)).unwrap_or((0, &[0; 4]));
+    let position = f32::from_le_bytes(*position);
+    Misaligned::JointPosition { wrong, allowed: ALLOWED_WRONG_JOINTS, joint, position }
+}
+
+/// Whether every byte is 0 or 1: seen four at a time, since nearly every packet is right.
+fn are_bools(bytes: &[u8]) -> bool {
+    let (words, rest) = bytes.as_chunks::<4>();
+    let words = words.iter().fold(0, |all, word| all | u32::from_ne_bytes(*word));
+    let rest = rest.iter().fold(0, |all, byte| all | byte);
+    words & 0xFEFE_FEFE == 0 && rest & 0xFE == 0
+}
+
+#[cold]
+fn wrong_bools(bytes: &[u8]) -> u16 {
+    bytes.iter().map(|&byte| u16::from(byte > 1)).sum()
+}
+
+/// The greatest difference of two floats at the same place; those that are not finite have none.
+fn farthest(before: &[u8], now: &[u8]) -> f32 {
+    let items = before.as_chunks().0.iter().zip(now.as_chunks().0);
+    let differences = items.map(|(a, b)| (f32::from_le_bytes(*a) - f32::from_le_bytes(*b)).abs());
+    differences.filter(|difference| difference.is_finite()).fold(0.0, f32::max)
+}
+
+/// Bytes of six joint positions.
+const JOINTS: usize = 24;
+/// Bytes of the TCP's X, Y and Z.
+const TCP: usize = 12;
+
+const SIGN: u32 = 0x8000_0000;
+
+/// Bits of 2^-119, 1.5e-36. Integers and bools that are read as floats are below; squared
+/// rounding errors, 1e-33, are not.
+const LEAST: i32 = 0x0400_0000;
+
+/// Two encoders may be unreadable at a time; a shift is seen without the joints too.
+const ALLOWED_WRONG_JOINTS: u8 = 2;
+
+/// Versions differ in what they put into a few bool bytes (D8).
+const ALLOWED_WRONG_BOOLS: u16 = 8;
+
+/// What cannot be read is one NaN, perhaps two.
+const ALLOWED_WRONG_QUANTITIES: u16 = 2;
+
+/// rad or m. In 100 ms no joint turns and no TCP goes this far.
+const ALLOWED_DISTANCE: f32 = 0.5;
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,319 @@
+//! What becomes of commands: `run`, which is sent once, soon, or not at all, and `stop`, which never
+//! waits (P3, P7, D26).
+
+use proto_core::engine::{LinkId, ReplyCode};
+use proto_core::time::{Duration, Instant};
+
+use crate::driver::{Broken, Conns, Is};
+
+/// Values of the command field.
+pub const NONE: u8 = 0;
+pub const RUN: u8 = 1;
+pub const STOP: u8 = 2;
+
+/// A command has so long to be acknowledged, and a stop that nobody asks for any more to be sent.
+const SOON: Duration = Duration::from_secs(1);
+/// A reply that does not come in so long ends the connection.
+const REPLY: Duration = Duration::from_secs(10);
+const TOGETHER: Duration = Duration::from_secs(1);
+const STRIKES: Duration = Duration::from_secs(10);
+const QUEUE: usize = 8;
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Order {
+    Run,
+    Stop,
+}
+
+/// Something picked a command.
+#[derive(Debug, Clone)]
+struct Picked {
+    nth: u32,
+    /// Of a stop: since when nobody has asked for it any more.
+    since: Instant,
+}
+
+/// Handed over, and not answered.
+#[derive(Debug, Clone)]
+struct Asked {
+    link: LinkId,
+    order: Order,
+    picked: Picked,
+    answer_by: Instant,
+}
+
+#[derive(Debug, Clone)]
+pub struct Orders {
+    /// The field's value in the frame before; none after silence.
+    base: Option<u8>,
+    /// How many were picked.
+    pub total: u32,
+    runs: Vec<Picked>,
+    stop: Option<Picked>,
+    asked: Vec<Asked>,
+    pub reply: ReplyCode,
+    /// When the second connection was refused, or the first lost because of it.
+    struck: Option<Instant>,
+}
+
+impl Orders {
+    pub fn new() -> Self {
+        Self {
+            base: None,
+            total: 0,
+            runs: Vec::new(),
+            stop: None,
+            asked: Vec::new(),
+            reply: ReplyCode::None,
+            struck: None,
+        }
+    }
+
+    /// An accepted frame brought the field.
+    pub fn received(&mut self, value: u8, conns: &Conns, now: Instant) {
+        let before = self.base.replace(value);
+        if before.is_none_or(|before| before == value) {
+            return;
+        }
+        self.not_asked(now);
+        let picked = Picked { nth: self.total + 1, since: now };
+        match value {
+            RUN => {
+                self.total += 1;
+                self.reply = ReplyCode::NotSent;
+                if conns.is_open(LinkId::COMMAND) && self.runs.len() < QUEUE {
+                    self.reply = ReplyCode::Pending;
+                    self.runs.push(picked);
+                }
+            }
+            STOP => {
+                self.total += 1;
+                self.drop_runs();
+                self.stop = Some(picked);
+                self.reply = ReplyCode::Pending;
+            }
+            _ => {}
+        }
+    }
+
+    /// The device is gone, or silent: what it asked for goes with it.
+    pub fn forget(&mut self, now: Instant) {
+        if self.base.take().is_some() {
+            self.not_asked(now);
+        }
+        self.drop_runs();
+    }
+
+    /// Deadlines pass.
+    pub fn deadlines(&mut self, now: Instant, conns: &mut Conns) {
+        for link in [LinkId::URGENT, LinkId::COMMAND] {
+            let unanswered = self.asked.iter().any(|asked| asked.link == link && now >= asked.answer_by);
+            if unanswered || conns.overdue(now).contains(&link) {
+                conns.must_close(now, link);
+                self.lost(link, now);
+            }
+            if conns.not_opened(now).contains(&link) {
+                conns.must_close(now, link);
+                match link {
+                    LinkId::COMMAND => self.was_away(conns),
+                    _ if conns.is_open(LinkId::COMMAND) => self.strike(conns, now),
+                    _ => {}
+                }
+            }
+        }
+        while self.runs.first().is_some_and(|run| now >= run.since + SOON) {
+            let run = self.runs.remove(0);
+            self.settle(run.nth, ReplyCode::NotSent);
+        }
+        if !self.is_asked()
+            && let Some(stop) = self.stop.take_if(|stop| now >= stop.since + SOON)
+        {
+            self.settle(stop.nth, ReplyCode::NotSent);
+        }
+    }
+
+    /// A connection is gone.
+    pub fn lost(&mut self, link: LinkId, now: Instant) {
+        let (gone, asked) = std::mem::take(&mut self.asked).into_iter().partition(|asked| asked.link == link);
+        self.asked = asked;
+        let gone: Vec<Asked> = gone;
+        for asked in gone {
+            if asked.order == Order::Stop && self.is_asked() {
+                self.stop.get_or_insert(Picked { since: now, ..asked.picked });
+            } else {
+                self.settle(asked.picked.nth, ReplyCode::NoReply);
+            }
+        }
+        if link == LinkId::COMMAND {
+            self.drop_runs();
+        }
+    }
+
+    /// The driver reports that one is gone.
+    pub fn down(&mut self, link: LinkId, was: Is, conns: &mut Conns, now: Instant) {
+        let urgent = conns.of(LinkId::URGENT);
+        match (link, was) {
+            (LinkId::URGENT, Is::Opening | Is::Open) if conns.is_open(LinkId::COMMAND) => {
+                self.strike(conns, now);
+            }
+            (LinkId::COMMAND, Is::Open)
+                if urgent.is == Is::Open && now.saturating_since(urgent.from) <= TOGETHER =>
+            {
+                self.strike(conns, now);
+            }
+            // They went together: that was no verdict on the second one.
+            (LinkId::COMMAND | LinkId::URGENT, Is::Open) => {
+                self.struck = self.struck.filter(|&at| now.saturating_since(at) > TOGETHER);
+            }
+            (LinkId::COMMAND, Is::Opening) => self.was_away(conns),
+            _ => {}
+        }
+    }
+
+    /// The gateway was asleep.
+    pub fn slept(&mut self) {
+        self.base = None;
+        for asked in std::mem::take(&mut self.asked) {
+            self.settle(asked.picked.nth, ReplyCode::NoReply);
+        }
+        self.drop_runs();
+        if let Some(stop) = self.stop.take() {
+            self.settle(stop.nth, ReplyCode::NotSent);
+        }
+    }
+
+    /// A command is handed over; returns until when it may be delivered.
+    pub fn sent(
+        &mut self,
+        link: LinkId,
+        text: &[u8],
+        conns: &mut Conns,
+        now: Instant,
+    ) -> Result<Instant, Broken> {
+        let is_stopping = self.is_stopping();
+        let answer_by = now + REPLY;
+        if text.starts_with(b"run") {
+            if self.runs.is_empty() {
+                return Err("runs, and nobody asked for it".to_owned());
+            }
+            let picked = self.runs.remove(0);
+            let until = picked.since + SOON;
+            if now > until {
+                return Err(format!("runs {} after it was asked to", now.saturating_since(picked.since)));
+            }
+            if is_stopping {
+                return Err("runs while it is to stop".to_owned());
+            }
+            if link != LinkId::COMMAND || !self.asked.is_empty() {
+                return Err(format!("runs by {link:?} while {:?} is unanswered", self.asked));
+            }
+            self.asked.push(Asked { link, order: Order::Run, picked, answer_by });
+            return Ok(until);
+        }
+        if text != b"stop" {
+            return Err(format!("commands {text:?}"));
+        }
+        let Some(picked) = self.stop.take() else {
+            return Err("stops, and nobody asked for it".to_owned());
+        };
+        if self.stop_is_under_way() {
+            return Err("stops twice at once".to_owned());
+        }
+        if link == LinkId::COMMAND && self.is_free(LinkId::URGENT, conns) {
+            return Err("stops by the other connection than the one for it".to_owned());
+        }
+        let is_running = self.unanswered(LinkId::COMMAND).any(|order| order == Order::Run);
+        if link == LinkId::URGENT && is_running && !conns.of(LinkId::COMMAND).under_way.is_empty() {
+            // What is under way there could arrive later and start the robot again.
+            conns.must_close(now, LinkId::COMMAND);
+            self.lost(LinkId::COMMAND, now);
+        }
+        self.asked.push(Asked { link, order: Order::Stop, picked, answer_by });
+        Ok(now + SOON)
+    }
+
+    /// What is unanswered on a connection.
+    pub fn unanswered(&self, link: LinkId) -> impl Iterator<Item = Order> {
+        self.asked.iter().filter(move |asked| asked.link == link).map(|asked| asked.order)
+    }
+
+    /// The controller replied; to something that nobody asked, it may be.
+    pub fn replied(&mut self, link: LinkId, order: Order, is_done: bool) {
+        let place = self.asked.iter().position(|asked| asked.link == link && asked.order == order);
+        let Some(place) = place else { return };
+        let asked = self.asked.remove(place);
+        self.settle(asked.picked.nth, if is_done { ReplyCode::Success } else { ReplyCode::Fail });
+    }
+
+    /// Nothing waits that can go.
+    pub fn rested(&self, conns: &Conns) -> Result<(), Broken> {
+        let free = |link| self.is_free(link, conns);
+        let command = conns.of(LinkId::COMMAND);
+        // Beside a command that waits for its reply, but not with two that are not acknowledged.
+        let beside = command.is_free() && command.under_way.len() < 2;
+        let has_way = free(LinkId::URGENT) || beside;
+        if self.stop.is_some() && !self.stop_is_under_way() && has_way {
+            return Err("lets a stop wait".to_owned());
+        }
+        if !self.runs.is_empty() && !self.is_stopping() && free(LinkId::COMMAND) {
+            return Err("lets a command wait though the link is free".to_owned());
+        }
+        Ok(())
+    }
+
+    fn is_free(&self, link: LinkId, conns: &Conns) -> bool {
+        conns.of(link).is_free() && self.unanswered(link).next().is_none()
+    }
+
+    /// Whether the field still has the value that picked a stop.
+    fn is_asked(&self) -> bool {
+        self.base == Some(STOP)
+    }
+
+    fn not_asked(&mut self, now: Instant) {
+        if let Some(stop) = &mut self.stop {
+            stop.since = now;
+        }
+    }
+
+    fn stop_is_under_way(&self) -> bool {
+        self.asked.iter().any(|asked| asked.order == Order::Stop)
+    }
+
+    fn is_stopping(&self) -> bool {
+        self.stop.is_some() || self.stop_is_under_way()
+    }
+
+    fn drop_runs(&mut self) {
+        for run in std::mem::take(&mut self.runs) {
+            self.settle(run.nth, ReplyCode::NotSent);
+        }
+    }
+
+    /// A command came to its end; the newest one's is told.
+    fn settle(&mut self, nth: u32, reply: ReplyCode) {
+        if nth == self.total {
+            self.reply = reply;
+        }
+    }
+
+    /// The controller seems to take one connection only.
+    fn strike(&mut self, conns: &mut Conns, now: Instant) {
+        let again = self.struck.is_some_and(|at| now.saturating_since(at) <= STRIKES);
+        self.struck = Some(now);
+        if again {
+            conns.must_close(now, LinkId::URGENT);
+            conns.get(LinkId::URGENT).is = Is::GivenUp;
+            self.lost(LinkId::URGENT, now);
+        }
+    }
+
+    /// Another controller may have come back.
+    fn was_away(&mut self, conns: &mut Conns) {
+        self.struck = None;
+        let urgent = conns.get(LinkId::URGENT);
+        if urgent.is == Is::GivenUp {
+            urgent.is = Is::Closed;
+        }
+    }
+}

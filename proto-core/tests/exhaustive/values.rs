@@ -1,0 +1,202 @@
+//! What becomes of one variable between its device and the controller: what waits, what is safe, and
+//! what is repeated (P2).
+
+use proto_core::time::{Duration, Instant};
+
+use crate::driver::Broken;
+
+/// What the controller shows this soon may be older than the safe value.
+const SHOWN_AFTER: Duration = Duration::from_millis(200);
+
+/// The port's `timeout_ms`.
+pub const TIMEOUT: Duration = Duration::from_millis(100);
+
+/// A byte variable: each of its values is written, in order.
+#[derive(Debug, Clone)]
+pub struct Bits {
+    safe_value: u8,
+    /// As everybody sees it; `None` before the first frame.
+    pub newest: Option<u8>,
+    /// What is to be written, and since when.
+    waiting: Vec<Edge>,
+    /// When its owner is silent; `None` while it is, and before the first frame.
+    overdue_at: Option<Instant>,
+    /// Its owner is silent: the safe value stands. It is as old as the silence, however often it is
+    /// written.
+    safe: Option<Edge>,
+    /// Since when the controller is not known to have it.
+    pub unconfirmed_since: Option<Instant>,
+}
+
+#[derive(Debug, Clone)]
+struct Edge {
+    value: u8,
+    at: Instant,
+}
+
+impl Bits {
+    pub fn new(safe_value: u8) -> Self {
+        Self {
+            safe_value,
+            newest: None,
+            waiting: Vec::new(),
+            overdue_at: None,
+            safe: None,
+            unconfirmed_since: None,
+        }
+    }
+
+    /// Its owner sent it; the way up is open or not.
+    pub fn received(&mut self, value: u8, is_reachable: bool, now: Instant) {
+        self.newest = Some(value);
+        self.overdue_at = Some(now + TIMEOUT);
+        self.safe = None;
+        self.unconfirmed_since = None;
+        if !is_reachable {
+            self.waiting.clear();
+            return;
+        }
+        match self.waiting.last_mut() {
+            Some(last) if last.value == value => last.at = now,
+            _ => self.waiting.push(Edge { value, at: now }),
+        }
+        self.expire(now);
+    }
+
+    /// A deadline may have passed. Whether the owner has just fallen silent.
+    pub fn deadlines(&mut self, now: Instant) -> bool {
+        let is_overdue = self.overdue_at.is_some_and(|at| now >= at);
+        if is_overdue {
+            self.overdue_at = None;
+            self.newest = Some(self.safe_value);
+            let safe = Edge { value: self.safe_value, at: now };
+            self.waiting = vec![safe.clone()];
+            self.safe = Some(safe);
+            self.unconfirmed_since = Some(now);
+        }
+        self.expire(now);
+        is_overdue
+    }
+
+    /// A safe value that was written is to be written again, if it still stands.
+    pub fn again(&mut self) {
+        if self.waiting.is_empty() {
+            self.waiting.extend(self.safe.clone());
+        }
+    }
+
+    /// A link came up, or the controller was away: it may have started anew.
+    pub fn controller_was_away(&mut self, now: Instant) {
+        if self.is_safe() {
+            self.unconfirmed_since = Some(now);
+            self.again();
+        }
+    }
+
+    /// The way up is gone: only a safe value is written later.
+    pub fn lost(&mut self) {
+        if !self.is_safe() {
+            self.waiting.clear();
+        }
+    }
+
+    /// The controller answered that it has what was written.
+    pub fn confirm(&mut self) {
+        self.unconfirmed_since = None;
+    }
+
+    /// The controller shows this value.
+    pub fn shown(&mut self, value: u8, now: Instant) {
+        if value == self.safe_value && self.unconfirmed_since.is_some_and(|at| now >= at + SHOWN_AFTER) {
+            self.unconfirmed_since = None;
+        }
+    }
+
+    pub fn is_waiting(&self) -> bool {
+        !self.waiting.is_empty()
+    }
+
+    /// What is handed over now must be what waits first, and not too old.
+    pub fn take(&mut self, value: u8, now: Instant) -> Result<(), Broken> {
+        if self.waiting.is_empty() {
+            return Err(format!("writes {value}, which nobody asked for"));
+        }
+        let first = self.waiting.remove(0);
+        if first.value != value {
+            return Err(format!("writes {value} instead of {}", first.value));
+        }
+        let age = now.saturating_since(first.at);
+        if age > TIMEOUT && !self.is_safe() {
+            return Err(format!("writes {value}, which is {age} old"));
+        }
+        Ok(())
+    }
+
+    /// A frame is overdue, or has never come.
+    pub fn is_silent(&self) -> bool {
+        self.overdue_at.is_none()
+    }
+
+    pub fn is_safe(&self) -> bool {
+        self.safe.is_some()
+    }
+
+    fn expire(&mut self, now: Instant) {
+        if !self.is_safe() {
+            self.waiting.retain(|edge| now.saturating_since(edge.at) <= TIMEOUT);
+        }
+    }
+}
+
+/// A float: the newest value wins.
+#[derive(Debug, Clone)]
+pub struct Float {
+    /// Without one it is held when its owner falls silent.
+    safe_value: Option<f32>,
+    /// What would be written; `None` when that is not known.
+    pub newest: Option<f32>,
+    /// Its value is its owner's, or the safe one.
+    pub is_live: bool,
+    is_waiting: bool,
+}
+
+impl Float {
+    pub fn new(safe_value: Option<f32>) -> Self {
+        Self { safe_value, newest: None, is_live: false, is_waiting: false }
+    }
+
+    pub fn received(&mut self, value: f32, is_reachable: bool) {
+        self.newest = Some(value);
+        self.is_live = true;
+        self.is_waiting = is_reachable;
+    }
+
+    /// Its owner has fallen silent: without a safe value it is unknown until the controller shows it.
+    pub fn overdue(&mut self) {
+        self.is_live = self.safe_value.is_some();
+        self.is_waiting = self.is_live;
+        self.newest = self.safe_value;
+    }
+
+    /// The controller shows it, and nobody else sends it.
+    pub fn read_back(&mut self, value: Option<f32>) {
+        self.newest = value;
+    }
+
+    /// The way up is gone.
+    pub fn lost(&mut self, is_safe: bool) {
+        self.is_waiting &= is_safe && self.safe_value.is_some();
+    }
+
+    pub fn again(&mut self, is_safe: bool) {
+        self.is_waiting |= is_safe && self.safe_value.is_some();
+    }
+
+    pub fn is_waiting(&self) -> bool {
+        self.is_waiting
+    }
+
+    pub fn taken(&mut self) {
+        self.is_waiting = false;
+    }
+}
