@@ -581,4 +581,8 @@ const START: Instant = Instant::from_micros(1_000_000_300);
 const CLIENT_RETRY: Duration = Duration::from_millis(250);
 
 #[cfg(test)]
+mod network_tests;
+#[cfg(test)]
+mod sleep_tests;
+#[cfg(test)]
 mod tests;

@@ -55,7 +55,7 @@ impl Cell {
         }
     }
 
-    fn paths(&self) -> Vec<Path> {
+    pub(super) fn paths(&self) -> Vec<Path> {
         let path = |gate: &Gate| {
             let server = match gate.kind {
                 LinkKind::Command | LinkKind::Urgent => Some(Link::Command),

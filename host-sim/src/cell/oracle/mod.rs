@@ -508,4 +508,6 @@ const ALL: [Invariant; 30] = [
 ];
 
 #[cfg(test)]
+mod robot_tests;
+#[cfg(test)]
 mod tests;

@@ -13,7 +13,7 @@ use crate::config::SimConfig;
 use crate::config::file::{self, Text};
 
 /// DO1..8 and a word from a device, the pose back to it, nothing shown that is older than 300 ms.
-const CELL: &str = r#"
+pub(super) const CELL: &str = r#"
 [controller]
 address = "127.0.0.1"
 
@@ -60,9 +60,9 @@ bus = "rs485"
 recipe = "device"
 "#;
 
-const DEVICE: PortId = PortId(0);
+pub(super) const DEVICE: PortId = PortId(0);
 
-fn cell(toml: &str) -> Cell {
+pub(super) fn cell(toml: &str) -> Cell {
     let gateway = file::parse_gateway(Text { name: "cell.toml", toml }, &[]);
     let gateway = gateway.unwrap_or_else(|error| panic!("{error}"));
     let mut cell = Cell::new(&gateway, &SimConfig::default(), 1).unwrap();
@@ -71,7 +71,7 @@ fn cell(toml: &str) -> Cell {
 }
 
 /// The n-th frame: bits that change each time, two of them differ; a word that counts.
-fn frame(n: u64) -> Vec<u8> {
+pub(super) fn frame(n: u64) -> Vec<u8> {
     let bits = if n.is_multiple_of(2) { 0b01 } else { 0b10 };
     let [low, high] = (n as u16).to_le_bytes();
     vec![0xFF, 0xFF, bits, low, high, 0xEE, 0xEE]
@@ -105,23 +105,23 @@ fn caught_out(
 }
 
 /// The bytes of a Modbus write.
-fn write_of(output: &Output<'_>) -> Option<Vec<u8>> {
+pub(super) fn write_of(output: &Output<'_>) -> Option<Vec<u8>> {
     match *output {
         Output::LinkSend { link: LinkId::MODBUS, bytes } if bytes[7] >= 15 => Some(bytes.to_vec()),
         _ => None,
     }
 }
 
-fn is_rest(output: &Output<'_>) -> bool {
+pub(super) fn is_rest(output: &Output<'_>) -> bool {
     matches!(output, Output::Sleep { .. })
 }
 
 /// An FC 15 request for DO1..8.
-fn coils(bits: u8) -> Vec<u8> {
+pub(super) fn coils(bits: u8) -> Vec<u8> {
     vec![0x7F, 0, 0, 0, 0, 8, 1, 15, 0, 192, 0, 8, 1, bits]
 }
 
-fn modbus(bytes: Vec<u8>) -> Option<Vec<Forged>> {
+pub(super) fn modbus(bytes: Vec<u8>) -> Option<Vec<Forged>> {
     Some(vec![Forged::Link(LinkId::MODBUS, bytes)])
 }
 
@@ -382,7 +382,7 @@ fn work_without_an_end() {
 fn what_waits_without_a_bound() {
     let cell = cell(CELL);
     let mut oracle = Oracle::new(cell.gateway());
-    oracle.rest(cell.now(), cell.engine(), MOST_THINGS);
+    oracle.rest(cell.now(), cell.engine(), Instant::NEVER, MOST_THINGS);
     assert_eq!(oracle.violation().map(|broken| broken.invariant), Some(Invariant::Memory));
 }
 
@@ -390,9 +390,9 @@ fn what_waits_without_a_bound() {
 fn what_reaches_the_controller_and_was_not_sent() {
     let cell = cell(CELL);
     let (mut oracle, now) = (Oracle::new(cell.gateway()), cell.now());
-    oracle.sent(7, LinkId::MODBUS, &coils(1));
+    oracle.sent(7, LinkId::MODBUS, &coils(1), Duration::ZERO, now);
     let inputs = inputs_of(cell.controller().registers().image());
-    oracle.arrived(7, LinkId::MODBUS, &coils(2), &inputs, &inputs, now);
+    oracle.arrived(7, LinkId::MODBUS, &coils(2), (&inputs, &inputs), Duration::ZERO, now);
     assert_eq!(oracle.violation().map(|broken| broken.invariant), Some(Invariant::Transport));
 }
 
@@ -400,10 +400,10 @@ fn what_reaches_the_controller_and_was_not_sent() {
 fn inputs_that_are_not_what_was_written() {
     let cell = cell(CELL);
     let (mut oracle, now) = (Oracle::new(cell.gateway()), cell.now());
-    oracle.sent(7, LinkId::MODBUS, &coils(1));
+    oracle.sent(7, LinkId::MODBUS, &coils(1), Duration::ZERO, now);
     let before = inputs_of(cell.controller().registers().image());
     let mut after = before.clone();
     after[0] = 3;
-    oracle.arrived(7, LinkId::MODBUS, &coils(1), &before, &after, now);
+    oracle.arrived(7, LinkId::MODBUS, &coils(1), (&before, &after), Duration::ZERO, now);
     assert_eq!(oracle.violation().map(|broken| broken.invariant), Some(Invariant::Registers));
 }
