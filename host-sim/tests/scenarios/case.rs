@@ -57,6 +57,13 @@ impl Case {
         RobotPlan::new(self, example(file))
     }
 
+    /// A simulated controller, from this text.
+    pub(crate) fn robot_of(&self, toml: &str) -> RobotPlan<'_> {
+        let path = self.folder.path().join("controller.toml");
+        std::fs::write(&path, toml).unwrap();
+        RobotPlan::new(self, path)
+    }
+
     /// A gateway, from an example file.
     pub(crate) fn gateway(&self, file: &str) -> Plan<'_> {
         Plan::new(self, example(file))

@@ -24,6 +24,7 @@ mod program;
 mod qemu;
 mod refusal;
 mod robot;
+mod safe;
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -59,7 +60,7 @@ fn main() -> ExitCode {
         }
     };
     let scenarios = || {
-        let all = [examples::all(), faults::all(), garbage::all(), refusal::all(), load::all()];
+        let all = [examples::all(), faults::all(), garbage::all(), refusal::all(), safe::all(), load::all()];
         all.into_iter().flatten()
     };
     // Who measures has the machine for himself.
