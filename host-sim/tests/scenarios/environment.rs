@@ -16,6 +16,9 @@ pub(crate) trait Environment: Send + Sync {
     /// As in the names of the tests.
     fn name(&self) -> &'static str;
 
+    /// Makes a cable of which no end acknowledges what did not get through to the other.
+    fn lay_true_cable(&self, case: &Case);
+
     /// Starts a gateway; its field ports are there when this returns.
     fn start(&self, plan: &Plan<'_>) -> Box<dyn Gateway>;
 

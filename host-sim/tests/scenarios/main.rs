@@ -7,11 +7,14 @@
 //!
 //! * `HOST_SIM_FIRMWARE=ELF` names the firmware for QEMU (`qemu-system-arm` has to be there). Without
 //!   it the cases of QEMU are counted as ignored.
+//! * `HOST_SIM_NAMESPACES=required` fails where no user and network namespace can be made (Debian:
+//!   util-linux, iproute2). Else what needs one is counted as ignored there.
 //! * `HOST_SIM_LOAD_SECONDS` is how long the run under full load takes.
 //!
 //! What each program said is under `target/tmp/scenarios/`; it stays there when a case fails.
 
 mod case;
+mod commands;
 mod environment;
 mod examples;
 mod faults;
@@ -19,6 +22,7 @@ mod field;
 mod garbage;
 mod host;
 mod load;
+mod namespace;
 mod network;
 mod program;
 mod qemu;
@@ -59,26 +63,47 @@ fn main() -> ExitCode {
             return ExitCode::FAILURE;
         }
     };
+    let no_namespaces = namespace::refused();
+    if let Some(reason) = &no_namespaces {
+        let must = std::env::var_os("HOST_SIM_NAMESPACES").is_some_and(|level| level == "required");
+        eprintln!("scenarios: no user namespaces, so no cable of this host can be pulled truly: {reason}");
+        if must {
+            return ExitCode::FAILURE;
+        }
+    }
     let scenarios = || {
-        let all = [examples::all(), faults::all(), garbage::all(), refusal::all(), safe::all(), load::all()];
+        let all = [
+            examples::all(),
+            faults::all(),
+            garbage::all(),
+            refusal::all(),
+            safe::all(),
+            commands::all(),
+            load::all(),
+        ];
         all.into_iter().flatten()
     };
     // Who measures has the machine for himself.
     let machine = Arc::new(RwLock::new(()));
     let mut trials = Vec::new();
     for scenario in scenarios() {
-        trials.push(trial(scenario, Arc::new(host::Host), &machine));
+        trials.push(match &no_namespaces {
+            Some(_) if scenario.has_true_cable => ignored("host", &scenario, "needs user namespaces"),
+            _ => trial(scenario, Arc::new(host::Host), &machine),
+        });
     }
     for scenario in scenarios() {
         trials.push(match &firmware {
             Some(elf) => trial(scenario, Arc::new(qemu::Qemu { elf: elf.clone() }), &machine),
-            None => {
-                let name = format!("qemu::{}", scenario.name);
-                Trial::test(name, || Ok(())).with_kind("needs HOST_SIM_FIRMWARE").with_ignored_flag(true)
-            }
+            None => ignored("qemu", &scenario, "needs HOST_SIM_FIRMWARE"),
         });
     }
     libtest_mimic::run(&arguments, trials).exit_code()
+}
+
+fn ignored(environment: &str, scenario: &Scenario, why: &str) -> Trial {
+    let name = format!("{environment}::{}", scenario.name);
+    Trial::test(name, || Ok(())).with_kind(why).with_ignored_flag(true)
 }
 
 fn trial(scenario: Scenario, environment: Arc<dyn Environment>, machine: &Arc<RwLock<()>>) -> Trial {

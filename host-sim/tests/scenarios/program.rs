@@ -79,7 +79,16 @@ impl Program {
     pub(crate) fn start(case: &Case, name: &str, program: &Path, arguments: &[OsString]) -> Self {
         let log = case.logs.join(format!("{name}.log"));
         let errors = File::options().create(true).append(true).open(&log).unwrap();
-        let mut child = Command::new(std::env::current_exe().unwrap())
+        let us = std::env::current_exe().unwrap();
+        let mut command = case.namespace.get().map_or_else(
+            || Command::new(&us),
+            |namespace| {
+                let mut command = namespace.inside();
+                command.arg(&us);
+                command
+            },
+        );
+        let mut child = command
             .args([END_WITH, &std::process::id().to_string()])
             .arg(program)
             .args(arguments)
