@@ -29,6 +29,7 @@ mod qemu;
 mod refusal;
 mod robot;
 mod safe;
+mod unreadable;
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -79,6 +80,7 @@ fn main() -> ExitCode {
             refusal::all(),
             safe::all(),
             commands::all(),
+            unreadable::all(),
             load::all(),
         ];
         all.into_iter().flatten()
