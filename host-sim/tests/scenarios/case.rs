@@ -25,11 +25,13 @@ pub(crate) struct Scenario {
     limit: Duration,
     is_alone: bool,
     pub(crate) has_true_cable: bool,
+    /// Only where a gateway can notice that it was stopped.
+    pub(crate) is_of_sleep: bool,
 }
 
 impl Scenario {
     pub(crate) fn new(name: &'static str, run: fn(&Case)) -> Self {
-        Self { name, run, limit: LIMIT, is_alone: false, has_true_cable: false }
+        Self { name, run, limit: LIMIT, is_alone: false, has_true_cable: false, is_of_sleep: false }
     }
 
     /// It takes so long, beside what every scenario takes.
@@ -40,6 +42,11 @@ impl Scenario {
     /// It pulls the cable, and nobody may acknowledge what did not get through.
     pub(crate) fn with_true_cable(self) -> Self {
         Self { has_true_cable: true, ..self }
+    }
+
+    /// It stops the gateway, which has to notice.
+    pub(crate) fn of_sleep(self) -> Self {
+        Self { is_of_sleep: true, ..self }
     }
 
     /// It measures something, so nothing else runs meanwhile.

@@ -13,6 +13,7 @@ use super::robot::Robot;
 pub(crate) fn all() -> Vec<Scenario> {
     vec![
         Scenario::new("a_start_while_the_cable_is_out", late_start).with_true_cable(),
+        Scenario::new("a_gateway_that_was_stopped_starts_nothing", asleep).of_sleep(),
         Scenario::new("a_stop_behind_a_start_without_a_reply", stop_behind),
     ]
 }
@@ -55,6 +56,9 @@ mode = "remote"
 name = "endless.jspf"
 script = "loop { wait_ms(50); }"
 "#;
+
+/// The variable of DO1 to DO8.
+const OUTPUTS: &str = "DigitalOutputCommand[1]";
 
 const NOTHING: u8 = 0;
 const RUN: u8 = 1;
@@ -124,6 +128,43 @@ fn late_start(case: &Case) {
     });
     hold(&mut panel, &order(NOTHING, 0), WATCHED, must_rest);
     start(&mut panel, &mut *gateway, &robot);
+}
+
+fn asleep(case: &Case) {
+    const STOPPED: Duration = Duration::from_secs(8);
+    /// What the device asks for while nobody listens.
+    const DO1: u8 = 1;
+    const BEFORE: u8 = 2;
+    let robot = case.robot_of(ENDLESS).start();
+    let mut gateway = case.gateway_of(PANEL).robot(&robot).start();
+    gateway.until_up(Link::Command, 1);
+    gateway.until_up(Link::Modbus, 1);
+    let mut panel = gateway.line("panel");
+    robot.until_after(OUTPUTS, f64::from(BEFORE), || panel.send(&order(NOTHING, BEFORE)));
+    gateway.freeze();
+    panel.send(&order(RUN, DO1));
+    let begin = Instant::now();
+    while begin.elapsed() < STOPPED {
+        assert_eq!(robot.newest(OUTPUTS), f64::from(BEFORE), "nobody is there who could have changed it");
+        std::thread::sleep(PERIOD);
+    }
+    gateway.thaw();
+    let must_rest = || {
+        assert!(!robot.is_running(), "it was started {:?} after the gateway was stopped", begin.elapsed());
+        assert_ne!(robot.newest(OUTPUTS), f64::from(DO1), "DO1 was set by a frame of long ago");
+    };
+    until("DO8, the safe value", || {
+        must_rest();
+        (robot.newest(OUTPUTS) == 128.0).then_some(())
+    });
+    let thawed = Instant::now();
+    while thawed.elapsed() < WATCHED {
+        must_rest();
+        std::thread::sleep(PERIOD);
+    }
+    gateway.until_up(Link::Command, 2);
+    start(&mut panel, &mut *gateway, &robot);
+    robot.until_after(OUTPUTS, f64::from(DO1), || panel.send(&order(RUN, DO1)));
 }
 
 fn stop_behind(case: &Case) {

@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use proto_core::config::Bus;
 use rustix::fs::{Mode, OFlags};
+use rustix::process::Signal;
 
 use super::case::Case;
 use super::environment::{Cable, Environment, Gateway, Link, LinkStatus, Plan, PortStatus, ports};
@@ -22,6 +23,10 @@ pub(crate) struct Host;
 impl Environment for Host {
     fn name(&self) -> &'static str {
         "host"
+    }
+
+    fn sleeps_noticeably(&self) -> bool {
+        true
     }
 
     #[track_caller]
@@ -184,6 +189,16 @@ impl Gateway for HostGateway {
             Some(namespace) => namespace.set(cable),
             None => self.network.as_ref().expect("Plan::with_cable").set(cable),
         }
+    }
+
+    #[track_caller]
+    fn freeze(&self) {
+        self.host_sim.program.signal(Signal::STOP);
+    }
+
+    #[track_caller]
+    fn thaw(&self) {
+        self.host_sim.program.signal(Signal::CONT);
     }
 
     fn own_address(&self) -> Option<String> {

@@ -151,10 +151,15 @@ impl Program {
         Duration::from_millis(ticks * 1_000 / USER_HZ)
     }
 
+    #[track_caller]
+    pub(crate) fn signal(&self, signal: Signal) {
+        rustix::process::kill_process(self.pid(), signal).unwrap();
+    }
+
     /// Ends it as a person would; it must end well.
     #[track_caller]
     pub(crate) fn interrupt(&mut self) {
-        rustix::process::kill_process(self.pid(), Signal::INT).unwrap();
+        self.signal(Signal::INT);
         let status = self.ended();
         assert_eq!(status.code(), Some(0), "{} after Ctrl-C: {status}", self.log.display());
     }

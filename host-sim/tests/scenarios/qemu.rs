@@ -40,6 +40,13 @@ impl Environment for Qemu {
         "qemu"
     }
 
+    /// The guest's timers stand still while the machine is stopped, as those of a processor that a debugger
+    /// halts together with them: no time has passed, and nothing that a program could look at says so
+    /// (docs/architecture.md section 3).
+    fn sleeps_noticeably(&self) -> bool {
+        false
+    }
+
     /// The board's is one.
     fn lay_true_cable(&self, _case: &Case) {}
 
@@ -295,6 +302,16 @@ impl Gateway for Board {
     #[track_caller]
     fn cable(&self, cable: Cable) {
         self.qmp("set_link", json!({ "name": "lan9118.0", "up": cable == Cable::Plugged }));
+    }
+
+    #[track_caller]
+    fn freeze(&self) {
+        self.qmp("stop", json!({}));
+    }
+
+    #[track_caller]
+    fn thaw(&self) {
+        self.qmp("cont", json!({}));
     }
 
     fn own_address(&self) -> Option<String> {
