@@ -102,12 +102,6 @@ impl Robot {
         self.host_sim.newest()["program_state"].as_u64().is_some_and(|state| state != 0)
     }
 
-    /// Waits until a program runs, or none.
-    #[track_caller]
-    pub(crate) fn until_running(&self, is_running: bool) {
-        until(&format!("a program runs: {is_running}"), || (self.is_running() == is_running).then_some(()));
-    }
-
     /// A count of its statistics, now.
     #[track_caller]
     pub(crate) fn count(&self, pointer: &str) -> u64 {
