@@ -190,6 +190,26 @@ fn what_waited_is_discarded_and_counted() {
 }
 
 #[test]
+fn a_frame_that_had_begun_is_not_completed() {
+    let mut cell = Cell::new();
+    let recipe = cell.stream(&["DigitalOutputCommand[1]"], &[]);
+    let port = cell.rs485(recipe);
+    cell.last_port().timeout = MS(3_000);
+    if let Bus::Rs485(line) = &mut cell.last_port().bus {
+        line.idle_gap = MS(1_000);
+    }
+    let mut rig = cell.rig();
+    rig.run(MS(10));
+    rig.bytes(port, &ON[..3]);
+    rig.now += MS(600);
+    tick(&mut rig);
+    assert_eq!(rig.counters(port).discarded_bytes, 3, "though its silence may be longer");
+    rig.run(MS(60));
+    rig.bytes(port, &ON[3..]);
+    assert_eq!(rig.counters(port).frames_in, 0);
+}
+
+#[test]
 fn it_listens_again_with_a_tick_and_not_before() {
     let (mut rig, port) = guarded();
     rig.now += MS(1_000);
@@ -244,6 +264,24 @@ fn a_connection_that_was_opening_begins_anew() {
 }
 
 #[test]
+fn a_report_of_before_is_none_of_the_connection_that_is_opened_now() {
+    for up in [false, true] {
+        let (mut rig, _) = guarded();
+        rig.reachable.remove(&MODBUS.0);
+        rig.input(Input::LinkDown { link: MODBUS });
+        rig.run(MS(1_000));
+        assert_eq!(rig.link(MODBUS).state.name(), "down");
+        rig.reachable.insert(MODBUS.0);
+        rig.log.clear();
+        rig.now += MS(4_000);
+        rig.input(if up { Input::LinkUp { link: MODBUS } } else { Input::LinkDown { link: MODBUS } });
+        tick(&mut rig);
+        let opened = rig.take(|out| (*out == Out::Open(MODBUS)).then_some(()));
+        assert_eq!((opened.len(), rig.link(MODBUS).state.name()), (1, "up"));
+    }
+}
+
+#[test]
 fn overdue_safe_values_go_first() {
     let mut full = Full::new();
     // Something of each waits.
@@ -251,9 +289,10 @@ fn overdue_safe_values_go_first() {
     full.rig.bytes(full.plc, FRAME);
     full.rig.bytes(full.plc, &[255, 255, 2, 9, 0, 238, 238]);
     full.sleep(5_000);
-    tick(&mut full.rig);
-    assert_eq!(full.rig.counters(full.plc).timeouts, 1);
+    full.rig.bytes(full.plc, FRAME);
+    assert_eq!(full.rig.counters(full.plc).timeouts, 1, "with the first call");
     assert_eq!(full.rig.counters(full.sensor).timeouts, 1);
+    tick(&mut full.rig);
     full.rig.modbus_answers = true;
     full.rig.run(MS(99));
     full.rig.take_written();

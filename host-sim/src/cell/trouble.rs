@@ -224,7 +224,8 @@ impl Trouble {
             let remedy = self.remedies.iter().map(|remedy| remedy.0).min().unwrap_or(Instant::NEVER);
             let next = self.next.min(remedy).min(end);
             cell.run(next.saturating_since(cell.now()));
-            if next >= end {
+            // After a violation time stands still.
+            if next >= end || cell.violation().is_some() {
                 return;
             }
             self.poll(cell);

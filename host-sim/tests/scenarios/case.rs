@@ -1,12 +1,13 @@
 //! One scenario in one environment: its folders, its programs, its time limit.
 
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, RwLock, mpsc};
+use std::sync::{Arc, OnceLock, RwLock, mpsc};
 use std::time::{Duration, Instant};
 
 use libtest_mimic::Failed;
 
 use super::environment::{Environment, Gateway, Plan};
+use super::namespace::Namespace;
 use super::program::Running;
 use super::robot::{Robot, RobotPlan};
 
@@ -23,16 +24,29 @@ pub(crate) struct Scenario {
     run: fn(&Case),
     limit: Duration,
     is_alone: bool,
+    pub(crate) has_true_cable: bool,
+    /// Only where a gateway can notice that it was stopped.
+    pub(crate) is_of_sleep: bool,
 }
 
 impl Scenario {
     pub(crate) fn new(name: &'static str, run: fn(&Case)) -> Self {
-        Self { name, run, limit: LIMIT, is_alone: false }
+        Self { name, run, limit: LIMIT, is_alone: false, has_true_cable: false, is_of_sleep: false }
     }
 
     /// It takes so long, beside what every scenario takes.
     pub(crate) fn lasting(self, time: Duration) -> Self {
         Self { limit: LIMIT + time, ..self }
+    }
+
+    /// It pulls the cable, and nobody may acknowledge what did not get through.
+    pub(crate) fn with_true_cable(self) -> Self {
+        Self { has_true_cable: true, ..self }
+    }
+
+    /// It stops the gateway, which has to notice.
+    pub(crate) fn of_sleep(self) -> Self {
+        Self { is_of_sleep: true, ..self }
     }
 
     /// It measures something, so nothing else runs meanwhile.
@@ -49,12 +63,21 @@ pub(crate) struct Case {
     /// For what programs say.
     pub(crate) logs: PathBuf,
     pub(crate) running: Running,
+    /// Where its programs are, when not in the network of the tests.
+    pub(crate) namespace: OnceLock<Arc<Namespace>>,
 }
 
 impl Case {
     /// A simulated controller, from an example file.
     pub(crate) fn robot(&self, file: &str) -> RobotPlan<'_> {
         RobotPlan::new(self, example(file))
+    }
+
+    /// A simulated controller, from this text.
+    pub(crate) fn robot_of(&self, toml: &str) -> RobotPlan<'_> {
+        let path = self.folder.path().join("controller.toml");
+        std::fs::write(&path, toml).unwrap();
+        RobotPlan::new(self, path)
     }
 
     /// A gateway, from an example file.
@@ -108,11 +131,22 @@ pub(crate) fn run(
     std::fs::create_dir_all(&logs)?;
     let running = Running::default();
     let folder = tempfile::Builder::new().prefix("scenario-").tempdir()?;
-    let case = Case { environment, folder, logs: logs.clone(), running: running.clone() };
-    let (run, limit) = (scenario.run, scenario.limit);
+    let case = Case {
+        environment,
+        folder,
+        logs: logs.clone(),
+        running: running.clone(),
+        namespace: OnceLock::new(),
+    };
+    let (run, limit, has_true_cable) = (scenario.run, scenario.limit, scenario.has_true_cable);
     let (done, ended) = mpsc::channel();
     let thread = std::thread::Builder::new().name(name.to_owned()).spawn(move || {
-        let result = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| run(&case)));
+        let result = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
+            if has_true_cable {
+                case.environment.lay_true_cable(&case);
+            }
+            run(&case);
+        }));
         // Its folder is gone before anybody hears that it ended.
         drop(case);
         let _ = done.send(result);

@@ -16,6 +16,12 @@ pub(crate) trait Environment: Send + Sync {
     /// As in the names of the tests.
     fn name(&self) -> &'static str;
 
+    /// Whether the clock of a gateway goes on while it is stopped.
+    fn sleeps_noticeably(&self) -> bool;
+
+    /// Makes a cable of which no end acknowledges what did not get through to the other.
+    fn lay_true_cable(&self, case: &Case);
+
     /// Starts a gateway; its field ports are there when this returns.
     fn start(&self, plan: &Plan<'_>) -> Box<dyn Gateway>;
 
@@ -43,6 +49,12 @@ pub(crate) trait Gateway {
 
     /// Pulls the Ethernet cable, or plugs it in.
     fn cable(&self, cable: Cable);
+
+    /// Stops it where it is; its clock goes on.
+    fn freeze(&self);
+
+    /// Lets it go on.
+    fn thaw(&self);
 
     /// The address that it says it has; a host's gateway says none.
     fn own_address(&self) -> Option<String>;

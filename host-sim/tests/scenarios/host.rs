@@ -2,13 +2,17 @@
 
 use std::collections::BTreeMap;
 use std::net::{SocketAddr, TcpStream};
+use std::sync::Arc;
 use std::time::Duration;
 
 use proto_core::config::Bus;
 use rustix::fs::{Mode, OFlags};
+use rustix::process::Signal;
 
+use super::case::Case;
 use super::environment::{Cable, Environment, Gateway, Link, LinkStatus, Plan, PortStatus, ports};
 use super::field::{CanClient, Line};
+use super::namespace::Namespace;
 use super::network::Network;
 use super::program::HostSim;
 use super::refusal::Spoil;
@@ -21,9 +25,20 @@ impl Environment for Host {
         "host"
     }
 
+    fn sleeps_noticeably(&self) -> bool {
+        true
+    }
+
+    #[track_caller]
+    fn lay_true_cable(&self, case: &Case) {
+        let namespace = Arc::new(Namespace::new(case));
+        case.namespace.set(namespace).expect("one for a case");
+    }
+
     #[track_caller]
     fn start(&self, plan: &Plan<'_>) -> Box<dyn Gateway> {
-        let mut network = plan.pulls_cable.then(Network::default);
+        let namespace = plan.case.namespace.get().cloned();
+        let mut network = (plan.pulls_cable && namespace.is_none()).then(Network::default);
         let servers = plan.servers.iter().map(|&(name, address)| match &mut network {
             Some(network) if name == "udp2011" => (name, network.udp(address).port()),
             Some(network) => (name, network.tcp(address).port()),
@@ -43,7 +58,7 @@ impl Environment for Host {
             };
             listens.insert(name.to_owned(), reached);
         }
-        Box::new(HostGateway { host_sim, network, listens })
+        Box::new(HostGateway { host_sim, network, namespace, listens })
     }
 
     #[track_caller]
@@ -110,6 +125,8 @@ struct HostGateway {
     host_sim: HostSim,
     /// The cable, when the scenario pulls it.
     network: Option<Network>,
+    /// The true one, when the scenario has it.
+    namespace: Option<Arc<Namespace>>,
     /// Listening ports as the controller reaches them.
     listens: BTreeMap<String, SocketAddr>,
 }
@@ -168,7 +185,20 @@ impl Gateway for HostGateway {
 
     #[track_caller]
     fn cable(&self, cable: Cable) {
-        self.network.as_ref().expect("Plan::with_cable").set(cable);
+        match &self.namespace {
+            Some(namespace) => namespace.set(cable),
+            None => self.network.as_ref().expect("Plan::with_cable").set(cable),
+        }
+    }
+
+    #[track_caller]
+    fn freeze(&self) {
+        self.host_sim.program.signal(Signal::STOP);
+    }
+
+    #[track_caller]
+    fn thaw(&self) {
+        self.host_sim.program.signal(Signal::CONT);
     }
 
     fn own_address(&self) -> Option<String> {

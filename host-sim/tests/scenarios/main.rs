@@ -1,17 +1,21 @@
 //! The cell's scenarios, written once and run against the gateway on this host and against the
 //! firmware in QEMU.
 //!
-//! Each scenario is counted twice, as `host::NAME` and as `qemu::NAME`. The field devices are on
+//! Each scenario is counted twice, as `host::NAME` and as `qemu::NAME`; what a gateway does that was stopped
+//! for seconds is shown on the host only, since the guest's clock stops with it. The field devices are on
 //! pseudoterminals and slcan by TCP, or on the emulated UARTs; the controller is `host-sim controller`
 //! in both, reached over loopback or over the emulated Ethernet.
 //!
 //! * `HOST_SIM_FIRMWARE=ELF` names the firmware for QEMU (`qemu-system-arm` has to be there). Without
 //!   it the cases of QEMU are counted as ignored.
+//! * `HOST_SIM_NAMESPACES=required` fails where no user and network namespace can be made (Debian:
+//!   util-linux, iproute2). Else what needs one is counted as ignored there.
 //! * `HOST_SIM_LOAD_SECONDS` is how long the run under full load takes.
 //!
 //! What each program said is under `target/tmp/scenarios/`; it stays there when a case fails.
 
 mod case;
+mod commands;
 mod environment;
 mod examples;
 mod faults;
@@ -19,11 +23,14 @@ mod field;
 mod garbage;
 mod host;
 mod load;
+mod namespace;
 mod network;
 mod program;
 mod qemu;
 mod refusal;
 mod robot;
+mod safe;
+mod unreadable;
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -58,26 +65,51 @@ fn main() -> ExitCode {
             return ExitCode::FAILURE;
         }
     };
-    let scenarios = || {
-        let all = [examples::all(), faults::all(), garbage::all(), refusal::all(), load::all()];
-        all.into_iter().flatten()
+    let no_namespaces = namespace::refused();
+    if let Some(reason) = &no_namespaces {
+        let must = std::env::var_os("HOST_SIM_NAMESPACES").is_some_and(|level| level == "required");
+        eprintln!("scenarios: no user namespaces, so no cable of this host can be pulled truly: {reason}");
+        if must {
+            return ExitCode::FAILURE;
+        }
+    }
+    let scenarios = |environment: &dyn Environment| {
+        let sleeps = environment.sleeps_noticeably();
+        let all = [
+            examples::all(),
+            faults::all(),
+            garbage::all(),
+            refusal::all(),
+            safe::all(),
+            commands::all(),
+            unreadable::all(),
+            load::all(),
+        ];
+        all.into_iter().flatten().filter(move |scenario| sleeps || !scenario.is_of_sleep)
     };
     // Who measures has the machine for himself.
     let machine = Arc::new(RwLock::new(()));
     let mut trials = Vec::new();
-    for scenario in scenarios() {
-        trials.push(trial(scenario, Arc::new(host::Host), &machine));
+    let host: Arc<dyn Environment> = Arc::new(host::Host);
+    for scenario in scenarios(&*host) {
+        trials.push(match &no_namespaces {
+            Some(_) if scenario.has_true_cable => ignored("host", &scenario, "needs user namespaces"),
+            _ => trial(scenario, Arc::clone(&host), &machine),
+        });
     }
-    for scenario in scenarios() {
+    let qemu: Arc<dyn Environment> = Arc::new(qemu::Qemu { elf: firmware.clone().unwrap_or_default() });
+    for scenario in scenarios(&*qemu) {
         trials.push(match &firmware {
-            Some(elf) => trial(scenario, Arc::new(qemu::Qemu { elf: elf.clone() }), &machine),
-            None => {
-                let name = format!("qemu::{}", scenario.name);
-                Trial::test(name, || Ok(())).with_kind("needs HOST_SIM_FIRMWARE").with_ignored_flag(true)
-            }
+            Some(_) => trial(scenario, Arc::clone(&qemu), &machine),
+            None => ignored("qemu", &scenario, "needs HOST_SIM_FIRMWARE"),
         });
     }
     libtest_mimic::run(&arguments, trials).exit_code()
+}
+
+fn ignored(environment: &str, scenario: &Scenario, why: &str) -> Trial {
+    let name = format!("{environment}::{}", scenario.name);
+    Trial::test(name, || Ok(())).with_kind(why).with_ignored_flag(true)
 }
 
 fn trial(scenario: Scenario, environment: Arc<dyn Environment>, machine: &Arc<RwLock<()>>) -> Trial {

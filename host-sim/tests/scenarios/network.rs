@@ -11,6 +11,18 @@ use std::time::Duration;
 
 use super::environment::Cable;
 
+/// What becomes of the bytes of one way of a connection. It may change them, or leave none.
+pub(crate) type Filter = dyn FnMut(&mut Vec<u8>) -> Pass + Send;
+
+/// What becomes of a connection with what it carries.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Pass {
+    /// It goes on.
+    On,
+    /// It ends here, both ways.
+    Cut,
+}
+
 /// Ways through the cable. They end when it is dropped.
 #[derive(Debug, Default)]
 pub(crate) struct Network {
@@ -36,6 +48,18 @@ struct State {
 impl Network {
     /// A place that leads to this TCP server.
     pub(crate) fn tcp(&mut self, to: SocketAddr) -> SocketAddr {
+        self.tcp_through(to, |_| -> [Box<Filter>; 2] {
+            [Box::new(|_: &mut Vec<u8>| Pass::On), Box::new(|_: &mut Vec<u8>| Pass::On)]
+        })
+    }
+
+    /// The same through filters: what they are for the connection with this number, counted from 0;
+    /// first the one of what the client says, then the one of what it is told.
+    pub(crate) fn tcp_through(
+        &mut self,
+        to: SocketAddr,
+        mut filters: impl FnMut(u32) -> [Box<Filter>; 2] + Send + 'static,
+    ) -> SocketAddr {
         let door = TcpListener::bind("127.0.0.1:0").unwrap();
         door.set_nonblocking(true).unwrap();
         let place = door.local_addr().unwrap();
@@ -43,6 +67,7 @@ impl Network {
         self.doors.push(Arc::clone(&door));
         let shared = Arc::clone(&self.shared);
         std::thread::spawn(move || {
+            let mut number = 0;
             while let Some(client) = shared.next_client(&door) {
                 // A server that is not there refuses; here it closes.
                 let Ok(server) = TcpStream::connect(to) else { continue };
@@ -51,9 +76,12 @@ impl Network {
                     stream.set_read_timeout(Some(TURN)).unwrap();
                 }
                 let (client, server) = (Arc::new(client), Arc::new(server));
-                for (from, to) in [(Arc::clone(&client), Arc::clone(&server)), (server, client)] {
+                let [said, told] = filters(number);
+                number += 1;
+                let ways = [(Arc::clone(&client), Arc::clone(&server), said), (server, client, told)];
+                for (from, to, filter) in ways {
                     let shared = Arc::clone(&shared);
-                    std::thread::spawn(move || shared.carry(&from, &to));
+                    std::thread::spawn(move || shared.carry(&from, &to, filter));
                 }
             }
         });
@@ -155,7 +183,7 @@ impl Shared {
     }
 
     /// Carries one direction of a connection to its end.
-    fn carry(&self, mut from: &TcpStream, mut to: &TcpStream) {
+    fn carry(&self, mut from: &TcpStream, mut to: &TcpStream, mut filter: Box<Filter>) {
         let mut piece = [0; 4096];
         while !self.lock().has_ended {
             let len = match from.read(&mut piece) {
@@ -172,7 +200,8 @@ impl Shared {
             let was_reset = was_held && matches!(from.take_error(), Ok(Some(_)));
             match len {
                 Ok(len @ 1..) if !was_reset => {
-                    if to.write_all(&piece[..len]).is_err() {
+                    let mut bytes = piece[..len].to_vec();
+                    if filter(&mut bytes) == Pass::Cut || to.write_all(&bytes).is_err() {
                         break;
                     }
                 }

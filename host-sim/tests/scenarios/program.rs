@@ -79,7 +79,16 @@ impl Program {
     pub(crate) fn start(case: &Case, name: &str, program: &Path, arguments: &[OsString]) -> Self {
         let log = case.logs.join(format!("{name}.log"));
         let errors = File::options().create(true).append(true).open(&log).unwrap();
-        let mut child = Command::new(std::env::current_exe().unwrap())
+        let us = std::env::current_exe().unwrap();
+        let mut command = case.namespace.get().map_or_else(
+            || Command::new(&us),
+            |namespace| {
+                let mut command = namespace.inside();
+                command.arg(&us);
+                command
+            },
+        );
+        let mut child = command
             .args([END_WITH, &std::process::id().to_string()])
             .arg(program)
             .args(arguments)
@@ -142,10 +151,15 @@ impl Program {
         Duration::from_millis(ticks * 1_000 / USER_HZ)
     }
 
+    #[track_caller]
+    pub(crate) fn signal(&self, signal: Signal) {
+        rustix::process::kill_process(self.pid(), signal).unwrap();
+    }
+
     /// Ends it as a person would; it must end well.
     #[track_caller]
     pub(crate) fn interrupt(&mut self) {
-        rustix::process::kill_process(self.pid(), Signal::INT).unwrap();
+        self.signal(Signal::INT);
         let status = self.ended();
         assert_eq!(status.code(), Some(0), "{} after Ctrl-C: {status}", self.log.display());
     }

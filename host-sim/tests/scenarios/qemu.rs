@@ -13,7 +13,7 @@ use std::time::Duration;
 use proto_core::config::Bus;
 use serde_json::{Value, json};
 
-use super::case::until;
+use super::case::{Case, until};
 use super::environment::{Cable, Environment, Gateway, Link, LinkStatus, Plan, PortStatus, ports};
 use super::field::{CanClient, Line};
 use super::program::Program;
@@ -39,6 +39,16 @@ impl Environment for Qemu {
     fn name(&self) -> &'static str {
         "qemu"
     }
+
+    /// The guest's timers stand still while the machine is stopped, as those of a processor that a debugger
+    /// halts together with them: no time has passed, and nothing that a program could look at says so
+    /// (docs/architecture.md section 3).
+    fn sleeps_noticeably(&self) -> bool {
+        false
+    }
+
+    /// The board's is one.
+    fn lay_true_cable(&self, _case: &Case) {}
 
     #[track_caller]
     fn start(&self, plan: &Plan<'_>) -> Box<dyn Gateway> {
@@ -292,6 +302,16 @@ impl Gateway for Board {
     #[track_caller]
     fn cable(&self, cable: Cable) {
         self.qmp("set_link", json!({ "name": "lan9118.0", "up": cable == Cable::Plugged }));
+    }
+
+    #[track_caller]
+    fn freeze(&self) {
+        self.qmp("stop", json!({}));
+    }
+
+    #[track_caller]
+    fn thaw(&self) {
+        self.qmp("cont", json!({}));
     }
 
     fn own_address(&self) -> Option<String> {

@@ -97,6 +97,11 @@ impl Robot {
         self.host_sim.stats(what, found);
     }
 
+    /// Whether a program runs, as it was last told.
+    pub(crate) fn is_running(&self) -> bool {
+        self.host_sim.newest()["program_state"].as_u64().is_some_and(|state| state != 0)
+    }
+
     /// A count of its statistics, now.
     #[track_caller]
     pub(crate) fn count(&self, pointer: &str) -> u64 {

@@ -137,7 +137,7 @@ impl Supervisor {
     /// The driver reports that the link is up. False when that was not expected: the report is
     /// late, and the driver has been told to close the link.
     pub fn up(&mut self, now: Instant) -> bool {
-        if !matches!(self.state, LinkState::Opening { .. }) {
+        if !matches!(self.state, LinkState::Opening { .. }) || self.is_to_be_opened() {
             return false;
         }
         self.state = LinkState::Up { since: now };
@@ -148,11 +148,19 @@ impl Supervisor {
 
     /// The driver reports that the link is gone or could not be opened. True when it was up.
     pub fn down(&mut self, now: Instant) -> bool {
+        if self.is_to_be_opened() {
+            return false;
+        }
         let was = self.state;
         if !matches!(was, LinkState::Down { .. } | LinkState::Shared) {
             self.fall(now);
         }
         matches!(was, LinkState::Up { .. })
+    }
+
+    /// Whether the driver has still to be told to open the link: what it reports is of an earlier time.
+    fn is_to_be_opened(&self) -> bool {
+        self.action == Some(LinkAction::Open)
     }
 
     /// Bytes arrived.
@@ -281,6 +289,15 @@ mod tests {
         link.advance(MS(2000));
         assert_eq!(link.take_action(), Some(LinkAction::Close));
         assert!(!link.up(MS(2001)), "too late");
+    }
+
+    #[test]
+    fn a_report_from_before_it_is_opened_says_nothing() {
+        let mut link = Supervisor::new(LinkTimings::TCP);
+        link.advance(MS(0));
+        assert!(!link.down(MS(0)) && !link.up(MS(0)));
+        assert_eq!((link.take_action(), link.state().name()), (Some(LinkAction::Open), "opening"));
+        assert!(link.up(MS(1)));
     }
 
     #[test]

@@ -120,8 +120,6 @@ pub struct Model {
     pub sent: BTreeMap<LinkId, u32>,
     pub port_up: [bool; 4],
     pub bus_off: bool,
-    /// Only a tick lets a deadline pass: what had not passed by the newest one still counts.
-    pub ticked: Instant,
     pub sleeps: u32,
     /// The gateway slept: until a tick at or after this, nothing that arrives from the field counts.
     pub deaf_until: Option<Instant>,
@@ -194,7 +192,6 @@ impl Model {
             sent: BTreeMap::new(),
             port_up: [true; 4],
             bus_off: false,
-            ticked: Instant::ZERO,
             sleeps: 0,
             deaf_until: None,
             asleep: [0; 4],
@@ -228,7 +225,6 @@ impl Model {
 
     /// Owners that have fallen silent by `now`, and parts of frames that nobody completed.
     fn advance(&mut self, now: Instant) {
-        self.ticked = now;
         for (port, names) in FRAMES {
             let overdue = self.vars[names[0]].newest_at.is_some_and(|at| now >= at + timeout(port));
             if !overdue || self.vars[names[0]].silent {
@@ -317,9 +313,8 @@ impl Model {
         let until = |nth: usize| known.received.get(nth + 1).map_or(Instant::NEVER, |&(at, _)| at);
         let stood = |(nth, &(_, of)): (usize, &(Instant, u32))| of == value && Some(until(nth)) >= up;
         let safe = safe_value(name) == Some(value) && known.received.iter().enumerate().any(stood);
-        let judged = self.ticked;
         let came =
-            |&&(at, of): &&(Instant, u32)| of == value && judged.saturating_since(at) <= timeout(owner(name));
+            |&&(at, of): &&(Instant, u32)| of == value && now.saturating_since(at) <= timeout(owner(name));
         if carrier(name) == LinkId::MODBUS {
             // What came before the connection is not replayed on it.
             let fresh = known.received.iter().filter(came).any(|&(at, _)| Some(at) >= up);

@@ -1,0 +1,214 @@
+//! Commands that would start something late, and a stop that must not wait.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use super::case::{Case, Scenario, until};
+use super::environment::{Cable, Gateway, Link, Plan};
+use super::field::Line;
+use super::network::{Filter, Network, Pass};
+use super::robot::Robot;
+
+pub(crate) fn all() -> Vec<Scenario> {
+    vec![
+        Scenario::new("a_start_while_the_cable_is_out", |case| {
+            late_start(case, Duration::from_secs(4), Duration::from_secs(5));
+        })
+        .with_true_cable(),
+        Scenario::new("a_start_while_the_cable_is_out_for_long", |case| {
+            late_start(case, Duration::from_millis(7_500), WATCHED);
+        })
+        .with_true_cable(),
+        Scenario::new("a_gateway_that_was_stopped_starts_nothing", asleep).of_sleep(),
+        Scenario::new("a_stop_behind_a_start_without_a_reply", stop_behind),
+    ]
+}
+
+/// A panel: an order that acts when it changes, and DO1 to DO8, of which DO8 says that nobody is there.
+const PANEL: &str = r#"
+[controller]
+address = "127.0.0.1"
+
+[[recipe]]
+name = "panel"
+kind = "stream"
+mode = "user"
+[recipe.input]
+head = [255, 255]
+tail = [238, 238]
+fields = [
+    { name = "order", type = "byte", commands = { 1 = "run(endless.jspf)", 9 = "stop" } },
+    { name = "outputs", type = "byte", to = "DigitalOutputCommand[1]" },
+]
+
+[[port]]
+name = "panel"
+bus = "rs485"
+recipe = "panel"
+timeout_ms = 1000
+on_timeout = { "DigitalOutputCommand[1]" = 0x80 }
+"#;
+
+/// A controller with a program that nobody can overlook, once it was started.
+const ENDLESS: &str = r#"
+[listen]
+address = "127.0.0.1"
+
+[robot]
+power = "enabled"
+mode = "remote"
+
+[[program]]
+name = "endless.jspf"
+script = "loop { wait_ms(50); }"
+"#;
+
+/// The variable of DO1 to DO8.
+const OUTPUTS: &str = "DigitalOutputCommand[1]";
+
+const NOTHING: u8 = 0;
+const RUN: u8 = 1;
+const STOP: u8 = 9;
+
+/// What follows a start that was not prevented is there within this time, even on a busy machine.
+const WATCHED: Duration = Duration::from_secs(3);
+/// How often a panel says what its switches are.
+const PERIOD: Duration = Duration::from_millis(20);
+
+fn order(order: u8, outputs: u8) -> [u8; 6] {
+    [0xFF, 0xFF, order, outputs, 0xEE, 0xEE]
+}
+
+/// The panel's switches stand like this for so long.
+fn hold(panel: &mut Line, frame: &[u8], time: Duration, mut meanwhile: impl FnMut()) {
+    let begin = Instant::now();
+    while begin.elapsed() < time {
+        panel.send(frame);
+        meanwhile();
+        std::thread::sleep(PERIOD);
+    }
+}
+
+/// An order is given while everything works, and carried out.
+#[track_caller]
+fn start(panel: &mut Line, gateway: &mut dyn Gateway, robot: &Robot) {
+    // The first frame only sets the base.
+    let frames = gateway.port("panel").frames_in;
+    until("the base is taken", || {
+        panel.send(&order(NOTHING, 0));
+        (gateway.port("panel").frames_in > frames).then_some(())
+    });
+    until("the program runs", || {
+        panel.send(&order(RUN, 0));
+        robot.is_running().then_some(())
+    });
+}
+
+/// A transport tries again after about twice the time that it has tried. What it still holds after a cable
+/// was `out` for 4 s is therefore there within the next 5 s, before the missing reply ends the connection.
+fn late_start(case: &Case, out: Duration, watched: Duration) {
+    const PRESSED: Duration = Duration::from_millis(200);
+    let robot = case.robot_of(ENDLESS).start();
+    let mut gateway = case.gateway_of(PANEL).robot(&robot).with_cable().start();
+    gateway.until_up(Link::Command, 1);
+    let mut panel = gateway.line("panel");
+    // Known to be there, and the link to be in use.
+    start(&mut panel, &mut *gateway, &robot);
+    until("the program ends", || {
+        panel.send(&order(STOP, 0));
+        (!robot.is_running()).then_some(())
+    });
+    hold(&mut panel, &order(NOTHING, 0), 5 * PERIOD, || ());
+    gateway.cable(Cable::Pulled);
+    let begin = Instant::now();
+    hold(&mut panel, &order(RUN, 0), PRESSED, || ());
+    let rest = out.saturating_sub(begin.elapsed());
+    hold(&mut panel, &order(NOTHING, 0), rest, || gateway.must_run());
+    gateway.cable(Cable::Plugged);
+    let must_rest = || assert!(!robot.is_running(), "it was started after {:?}", begin.elapsed());
+    until("the command link is back", || {
+        must_rest();
+        panel.send(&order(NOTHING, 0));
+        let status = gateway.link(Link::Command);
+        (status.is_up && status.connects >= 2).then_some(())
+    });
+    hold(&mut panel, &order(NOTHING, 0), watched, must_rest);
+    start(&mut panel, &mut *gateway, &robot);
+}
+
+fn asleep(case: &Case) {
+    const STOPPED: Duration = Duration::from_secs(8);
+    /// What the device asks for while nobody listens.
+    const DO1: u8 = 1;
+    const BEFORE: u8 = 2;
+    let robot = case.robot_of(ENDLESS).start();
+    let mut gateway = case.gateway_of(PANEL).robot(&robot).start();
+    gateway.until_up(Link::Command, 1);
+    gateway.until_up(Link::Modbus, 1);
+    let mut panel = gateway.line("panel");
+    robot.until_after(OUTPUTS, f64::from(BEFORE), || panel.send(&order(NOTHING, BEFORE)));
+    gateway.freeze();
+    panel.send(&order(RUN, DO1));
+    let begin = Instant::now();
+    while begin.elapsed() < STOPPED {
+        assert_eq!(robot.newest(OUTPUTS), f64::from(BEFORE), "nobody is there who could have changed it");
+        std::thread::sleep(PERIOD);
+    }
+    gateway.thaw();
+    let must_rest = || {
+        assert!(!robot.is_running(), "it was started {:?} after the gateway was stopped", begin.elapsed());
+        assert_ne!(robot.newest(OUTPUTS), f64::from(DO1), "DO1 was set by a frame of long ago");
+    };
+    until("DO8, the safe value", || {
+        must_rest();
+        (robot.newest(OUTPUTS) == 128.0).then_some(())
+    });
+    let thawed = Instant::now();
+    while thawed.elapsed() < WATCHED {
+        must_rest();
+        std::thread::sleep(PERIOD);
+    }
+    gateway.until_up(Link::Command, 2);
+    start(&mut panel, &mut *gateway, &robot);
+    robot.until_after(OUTPUTS, f64::from(DO1), || panel.send(&order(RUN, DO1)));
+}
+
+fn stop_behind(case: &Case) {
+    const HELD: Duration = Duration::from_secs(3);
+    const SOON: Duration = Duration::from_millis(1_500);
+    let robot = case.robot_of(ENDLESS).start();
+    // No answer comes over a connection once it has carried a start: it owes one for 10 s.
+    let mut way = Network::default();
+    let command = way.tcp_through(robot.address("command"), |_| {
+        let is_mute = Arc::new(AtomicBool::new(false));
+        let hears = Arc::clone(&is_mute);
+        let said: Box<Filter> = Box::new(move |bytes| {
+            hears.fetch_or(bytes.windows(4).any(|word| word == b"run("), Ordering::SeqCst);
+            Pass::On
+        });
+        let told: Box<Filter> = Box::new(move |bytes| {
+            if is_mute.load(Ordering::SeqCst) {
+                bytes.clear();
+            }
+            Pass::On
+        });
+        [said, told]
+    });
+    let plan: Plan<'_> = case.gateway_of(PANEL).robot(&robot).server_at("command", command);
+    let mut gateway = plan.start();
+    gateway.until_up(Link::Command, 1);
+    let mut panel = gateway.line("panel");
+    start(&mut panel, &mut *gateway, &robot);
+    let begin = Instant::now();
+    let mut stopped = None;
+    hold(&mut panel, &order(STOP, 0), HELD, || {
+        if !robot.is_running() {
+            stopped.get_or_insert(begin.elapsed());
+        }
+    });
+    let stopped = stopped.unwrap_or_else(|| panic!("the program still runs after {HELD:?}"));
+    assert!(stopped < SOON, "it was stopped after {stopped:?}");
+    assert!(!robot.is_running(), "it was started again");
+    gateway.must_run();
+}

@@ -1,0 +1,123 @@
+//! Safe values that reach the controller although the way to it fails in the worst moment.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::time::{Duration, Instant};
+
+use super::case::{Case, Scenario, until};
+use super::environment::{Cable, Link};
+use super::examples::{DO1, DO1_OFF, DO1_ON, ROBOT};
+use super::network::{Filter, Network, Pass};
+use super::robot::reserved_ports;
+
+pub(crate) fn all() -> Vec<Scenario> {
+    vec![
+        Scenario::new("a_safe_value_whose_datagrams_are_lost", lost_datagrams),
+        Scenario::new("a_safe_value_whose_connection_drops", dropped_connection),
+        Scenario::new("a_safe_value_at_a_controller_that_restarts", restart),
+    ]
+}
+
+/// DO1 to DO8 off.
+const OFF: &str = "{ 'DigitalOutputCommand[1]' = 0 }";
+/// Only DO8 on, which no controller has by itself.
+const MARK: &str = "{ 'DigitalOutputCommand[1]' = 0x80 }";
+/// How soon a value is there when nothing is in its way: far above what a busy machine needs, and far below
+/// what another attempt by somebody else could explain.
+const SOON: Duration = Duration::from_secs(5);
+
+fn lost_datagrams(case: &Case) {
+    const TIMEOUT: Duration = Duration::from_millis(1_000);
+    // From before the timeout until 300 ms after it; the link is not away for the 500 ms after which
+    // everything would be said again anyway.
+    const PULLED: Duration = Duration::from_millis(850);
+    const PLUGGED: Duration = Duration::from_millis(1_300);
+    let robot = case.robot(ROBOT).start();
+    let way = Network::default();
+    let udp = way.udp(robot.address("udp2011"));
+    let plan = case.gateway("udp-server.toml").robot(&robot).server_at("udp2011", udp);
+    let plan = plan.set("port.rs485-1.timeout_ms", TIMEOUT.as_millis()).set("port.rs485-1.on_timeout", OFF);
+    let mut gateway = plan.start();
+    gateway.until_up(Link::Udp2011, 1);
+    let mut device = gateway.line("rs485-1");
+    robot.until_after(DO1, 1.0, || device.send(&DO1_ON));
+    device.send(&DO1_ON);
+    // It is dead from now on.
+    let begin = Instant::now();
+    std::thread::sleep(PULLED);
+    assert_eq!(robot.newest(DO1), 1.0, "before the timeout");
+    way.set(Cable::Pulled);
+    std::thread::sleep(PLUGGED.saturating_sub(begin.elapsed()));
+    assert_eq!(robot.variable(DO1), 1.0, "nothing gets through");
+    way.set(Cable::Plugged);
+    let plugged = Instant::now();
+    robot.until(DO1, 0.0);
+    assert!(plugged.elapsed() < SOON, "{:?} after the datagrams got through again", plugged.elapsed());
+    gateway.must_run();
+}
+
+fn dropped_connection(case: &Case) {
+    // More than a busy machine takes from a frame to the controller's statistics.
+    const TIMEOUT_MS: u32 = 1_000;
+    let plan = case.gateway("client.toml").set("port.rs485-1.timeout_ms", TIMEOUT_MS);
+    let mut gateway = plan.set("port.rs485-1.on_timeout", OFF).start();
+    let link = Link::TcpListen("up");
+    // The connection that carries the first frame that switches off ends there, and the frame with it: its
+    // sender's transport has it acknowledged, the controller never sees it.
+    let (is_armed, cuts) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicU32::new(0)));
+    let mut way = Network::default();
+    let place = way.tcp_through(gateway.listens("up"), {
+        let (is_armed, cuts) = (Arc::clone(&is_armed), Arc::clone(&cuts));
+        move |_| {
+            let (is_armed, cuts) = (Arc::clone(&is_armed), Arc::clone(&cuts));
+            let mut end = Vec::new();
+            // The controller is the client here, so this is what the gateway says.
+            let told: Box<Filter> = Box::new(move |bytes| {
+                end.extend_from_slice(bytes);
+                let switches_off = end.windows(DO1_OFF.len()).any(|frame| frame == DO1_OFF);
+                end.drain(..end.len().saturating_sub(DO1_OFF.len() - 1));
+                if switches_off && is_armed.swap(false, Ordering::SeqCst) {
+                    cuts.fetch_add(1, Ordering::SeqCst);
+                    return Pass::Cut;
+                }
+                Pass::On
+            });
+            [Box::new(|_: &mut Vec<u8>| Pass::On), told]
+        }
+    });
+    // Nobody is there for the other client; it goes on trying.
+    let robot = case.robot("client-controller.toml").set("port.tcp1.to", place);
+    let robot = robot.set("port.udp1.to", "127.0.0.1:9").start();
+    gateway.until_up(link, 1);
+    let mut device = gateway.line("rs485-1");
+    is_armed.store(true, Ordering::SeqCst);
+    robot.until_after(DO1, 1.0, || device.send(&DO1_ON));
+    // The device is dead from now on.
+    until("the safe frame is lost with its connection", || {
+        gateway.must_run();
+        (cuts.load(Ordering::SeqCst) == 1).then_some(())
+    });
+    gateway.until_up(link, 2);
+    let up = Instant::now();
+    robot.until(DO1, 0.0);
+    assert!(up.elapsed() < SOON, "{:?} after the link was back", up.elapsed());
+}
+
+fn restart(case: &Case) {
+    let ports = reserved_ports();
+    let robot = case.robot(ROBOT).on(ports).start();
+    let plan = case.gateway("rs485-system.toml").robot(&robot);
+    let mut gateway = plan.set("port.rs485-1.on_timeout", MARK).start();
+    gateway.until_up(Link::Modbus, 1);
+    let mut device = gateway.line("rs485-1");
+    device.send(&DO1_ON);
+    robot.until(DO1, 128.0);
+    // Answered long ago, and the device stays silent.
+    gateway.until_frames_in("rs485-1", 1);
+    robot.end();
+    gateway.until_down(Link::Modbus);
+    let robot = case.robot(ROBOT).on(ports).set(&format!("initial.{DO1:?}"), 3).start();
+    gateway.until_up(Link::Modbus, 2);
+    robot.until(DO1, 128.0);
+    assert_eq!(gateway.port("rs485-1").frames_in, 1, "the device was silent");
+}

@@ -1,0 +1,93 @@
+//! A state stream with a value in it that is no number: nobody shows it, and nobody invents one.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::time::Duration;
+
+use super::case::{Case, Scenario, until};
+use super::environment::Link;
+use super::examples::{ROBOT, pose_frame};
+use super::network::{Filter, Network, Pass};
+
+pub(crate) fn all() -> Vec<Scenario> {
+    vec![
+        Scenario::new("a_pose_that_is_no_number_is_not_shown", |case| pose(case, "stop")),
+        Scenario::new("a_pose_that_is_no_number_is_not_held", |case| pose(case, "hold")),
+    ]
+}
+
+/// The packet of the state stream, and `RobotState[8]` in it.
+const PACKET: usize = 1_468;
+const X: std::ops::Range<usize> = 368..372;
+/// Longer than a port waits before it calls a value stale.
+const WATCHED: Duration = Duration::from_secs(1);
+
+/// What a way overwrites.
+#[derive(Debug, Default)]
+struct Spoiler {
+    is_on: AtomicBool,
+    /// Packets spoiled so far.
+    spoiled: AtomicU32,
+}
+
+impl Spoiler {
+    /// For one connection: a packet that has begun stays what it is.
+    fn filter(self: Arc<Self>) -> Box<Filter> {
+        let (mut at, mut spoils) = (0, false);
+        Box::new(move |bytes| {
+            for byte in bytes {
+                if at == 0 {
+                    spoils = self.is_on.load(Ordering::SeqCst);
+                }
+                if spoils && X.contains(&at) {
+                    *byte = f32::NAN.to_le_bytes()[at - X.start];
+                }
+                at = (at + 1) % PACKET;
+                if at == 0 && spoils {
+                    self.spoiled.fetch_add(1, Ordering::SeqCst);
+                }
+            }
+            Pass::On
+        })
+    }
+
+    /// Waits until so many more have gone: of all but the newest it is certain that they were taken.
+    #[track_caller]
+    fn until_spoiled(&self, more: u32) {
+        let wanted = self.spoiled.load(Ordering::SeqCst) + more;
+        until("spoilt packets", || (self.spoiled.load(Ordering::SeqCst) >= wanted).then_some(()));
+    }
+}
+
+/// Whatever the recipe says of values that are stale.
+fn pose(case: &Case, on_stale: &str) {
+    let robot = case.robot(ROBOT).start();
+    let spoiler = Arc::new(Spoiler::default());
+    spoiler.is_on.store(true, Ordering::SeqCst);
+    let mut way = Network::default();
+    let state = way.tcp_through(robot.address("state"), {
+        let spoiler = Arc::clone(&spoiler);
+        move |_| [Box::new(|_: &mut Vec<u8>| Pass::On), Arc::clone(&spoiler).filter()]
+    });
+    let plan = case.gateway("rs485-system.toml").robot(&robot).server_at("state", state);
+    let mut gateway = plan.set("recipe.system.output.on_stale", on_stale).start();
+    let mut device = gateway.line("rs485-1");
+    gateway.until_up(Link::State, 1);
+    spoiler.until_spoiled(2);
+    device.is_silent(WATCHED);
+    let pose = pose_frame(4);
+    for _ in 0..2 {
+        spoiler.is_on.store(false, Ordering::SeqCst);
+        for nth in 0..20 {
+            assert_eq!(device.take(pose.len()), pose, "frame {nth}");
+        }
+        spoiler.is_on.store(true, Ordering::SeqCst);
+        spoiler.until_spoiled(3);
+        // Nothing but the pose came while it could be read, in whole frames.
+        let frames = device.take_all();
+        let mut frames = frames.chunks(pose.len());
+        assert!(frames.all(|frame| frame == pose), "something else than the pose was sent");
+        device.is_silent(WATCHED);
+    }
+    assert_eq!(gateway.link(Link::State).connects, 1, "the link was given up for a value");
+}
