@@ -8,8 +8,8 @@ use crate::driver::Broken;
 /// What the controller shows this soon may be older than the safe value.
 const SHOWN_AFTER: Duration = Duration::from_millis(200);
 
-/// The port's `timeout_ms`.
-pub const TIMEOUT: Duration = Duration::from_millis(100);
+/// The port's `timeout_ms`: longer than a link stays closed, so that what waited for it could be sent.
+pub const TIMEOUT: Duration = Duration::from_millis(150);
 
 /// A byte variable: each of its values is written, in order.
 #[derive(Debug, Clone)]
