@@ -47,11 +47,11 @@ fn soaked(level: Level, seed: u64, span: Duration, jobs: usize) -> Total {
 /// What these seeds mean, on every machine. A change of what the engine, the controller or the cell
 /// does, or when, changes them: then the new ones belong here. Nothing else may.
 const HASHES: [(Level, u64); 2] =
-    [(Level::None, 0x5A1C_0D0E_48B8_6E48), (Level::Harsh, 0xF0B0_2430_F49A_7CED)];
+    [(Level::None, 0x07B4_CE1A_E349_6148), (Level::Harsh, 0xBE13_52F3_B4B1_E6F6)];
 
 #[test]
 fn a_seed_means_the_same_trace_on_every_machine() {
-    let hashes = HASHES.map(|(level, _)| (level, soaked(level, 42, Duration::from_secs(27), 2).hash));
+    let hashes = HASHES.map(|(level, _)| (level, soaked(level, 42, Duration::from_secs(120), 2).hash));
     assert_eq!(hashes, HASHES, "{hashes:#x?}");
 }
 

@@ -29,6 +29,7 @@ mod can;
 mod device;
 mod drive;
 mod faults;
+mod field;
 mod line;
 mod network;
 mod oracle;

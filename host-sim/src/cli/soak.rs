@@ -23,7 +23,8 @@ Runs the gateway's engine against the simulated controller in virtual time: devi
 send what they should and what they should not, networks and lines break, both
 programs restart. At every step a model of its own checks what the gateway does:
 that no value is written that nobody sent, none too late, none twice, no edge lost
-without being counted, nothing shown that is old, and so on (docs/cell.md).
+without being counted, nothing shown that is old, and so on; and at the robot's
+side that what arrives is young, and that what stops it arrives (docs/cell.md).
 
 The same seed gives the same trace hash on every machine, whatever --jobs is. A
 violation is printed with the command that repeats it.

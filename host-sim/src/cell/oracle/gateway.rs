@@ -104,7 +104,7 @@ impl Oracle {
                 watch.line.discarded += bytes.len() as u64;
                 let mut apart = Line { held: bytes.to_vec(), ..Line::default() };
                 let verdicts = apart.bytes(port, &[], now);
-                self.from_sleep(verdicts);
+                self.waited_in_sleep(verdicts);
             }
             return;
         }
@@ -123,7 +123,7 @@ impl Oracle {
         if self.deaf_until.is_some() {
             counters.asleep += 1;
             let verdict = field::can(port, frame);
-            self.from_sleep(verdict.into_iter().collect());
+            self.waited_in_sleep(verdict.into_iter().collect());
             return;
         }
         if port.inputs.is_empty() {
@@ -139,11 +139,11 @@ impl Oracle {
     }
 
     /// Frames that had waited while the gateway slept: they count for nothing.
-    fn from_sleep(&mut self, verdicts: Vec<Verdict>) {
+    fn waited_in_sleep(&mut self, verdicts: Vec<Verdict>) {
         for verdict in verdicts {
             let Verdict::Accepted(frame) = verdict else { continue };
             self.checks[Invariant::FromSleep as usize] += 1;
-            self.orders.from_sleep(&self.sheet, &frame);
+            self.orders.waited_in_sleep(&self.sheet, &frame);
             for (var, raw) in frame.values {
                 self.up.known[var.ordinal()].slept.get_or_insert_default().push(raw);
             }

@@ -187,7 +187,7 @@ impl Orders {
     }
 
     /// What a frame that waited meanwhile would have picked.
-    pub(super) fn from_sleep(&mut self, sheet: &Sheet, frame: &Accepted) {
+    pub(super) fn waited_in_sleep(&mut self, sheet: &Sheet, frame: &Accepted) {
         for &(_, table, _, value) in &frame.orders {
             let picked = table.of(&sheet.commands).iter().find(|entry| entry.0 == value);
             self.slept.extend(picked.map(|(_, text)| plain(text.as_bytes())));
