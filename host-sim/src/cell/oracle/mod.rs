@@ -227,6 +227,8 @@ pub(super) struct Oracle {
     deaf_until: Option<Instant>,
     /// The gateway was just not called for a while, but did not sleep.
     after_stall: bool,
+    /// How much is remembered, at the newest look.
+    remembered: usize,
     /// Outputs since the newest input, and how many there may be.
     outputs: u32,
     most_outputs: u32,
@@ -258,6 +260,7 @@ impl Oracle {
             is_late: false,
             deaf_until: None,
             after_stall: false,
+            remembered: 0,
             outputs: 0,
             // A frame a port and id; opening or closing, and something to send, a link, and one more
             // command.
@@ -448,7 +451,7 @@ impl Oracle {
             let result = self.nothing_waits(now);
             self.judge(now, &[Invariant::Delivered], result);
         }
-        let remembered = self.controller.size() + self.orders.len() + self.robot.len();
+        let remembered = self.remembered;
         let result = match (remembered, things) {
             (0..MOST_BYTES, 0..MOST_THINGS) => Ok(()),
             _ => Err((Invariant::Memory, format!("{remembered} bytes and {things} things wait in the cell"))),

@@ -22,6 +22,8 @@ use crate::cell::traffic::USER_TIMEOUT;
 #[derive(Debug, Clone, Copy)]
 pub(in crate::cell) struct Path {
     pub link: LinkId,
+    /// Which connection it is, of those that are.
+    pub conn: Option<u64>,
     /// There is a connection, and what is sent gets there.
     pub is_sound: bool,
     /// The server there carries out and answers.
@@ -71,12 +73,14 @@ pub(super) struct Robot {
     values: Vec<(SysVar, Raw, Carried)>,
     order: Option<Errand>,
     roads: BTreeMap<u64, Road>,
-    datagrams: BTreeMap<u64, Parcel>,
-    tags: u64,
+    /// The newest ones; the first has this number.
+    datagrams: VecDeque<Parcel>,
+    first_tag: u64,
     demands: Vec<Demand>,
     /// Since when each path has worked without a fault, and answered; by the link's place.
     sound: BTreeMap<LinkId, Instant>,
     served: BTreeMap<LinkId, Instant>,
+    conns: BTreeMap<LinkId, Option<u64>>,
     /// Since when the frames of each recipe link could be sent.
     ready: BTreeMap<LinkId, Instant>,
     /// When the gateway was not called.
@@ -197,12 +201,14 @@ impl Robot {
                 self.foreign.insert(at, now);
             }
         }
-        self.inputs = before.to_vec();
+        self.inputs.clear();
+        self.inputs.extend_from_slice(before);
     }
 
     pub(super) fn applied(&mut self, before: &[u8], after: &[u8], now: Instant) {
         self.look_for_foreign(before, now);
-        self.inputs = after.to_vec();
+        self.inputs.clear();
+        self.inputs.extend_from_slice(after);
     }
 
     pub(super) fn len(&self) -> usize {
@@ -300,13 +306,13 @@ impl Oracle {
     ) -> u64 {
         self.controller.sent_datagram(u64::from(link.0), bytes);
         let parcel = self.robot.parcel(&self.sheet, link, slowest, now);
-        self.robot.tags += 1;
-        let tag = self.robot.tags;
-        self.robot.datagrams.insert(tag, parcel);
-        while self.robot.datagrams.len() > DATAGRAMS {
-            self.robot.datagrams.pop_first();
+        let Robot { datagrams, first_tag, .. } = &mut self.robot;
+        datagrams.push_back(parcel);
+        if datagrams.len() > DATAGRAMS {
+            datagrams.pop_front();
+            *first_tag += 1;
         }
-        tag
+        *first_tag + datagrams.len() as u64 - 1
     }
 
     /// The controller has not understood what came on a connection of port 2000.
@@ -342,7 +348,8 @@ impl Oracle {
     }
 
     pub(super) fn datagram_came(&mut self, tag: u64, slowest: Duration, now: Instant) {
-        if let Some(parcel) = self.robot.datagrams.get(&tag).cloned() {
+        let nth = tag.checked_sub(self.robot.first_tag).map(|nth| nth as usize);
+        if let Some(parcel) = nth.and_then(|nth| self.robot.datagrams.get(nth)).cloned() {
             self.judge_parcel(&parcel, slowest, now);
         }
     }
@@ -390,7 +397,12 @@ impl Oracle {
         if self.violation.is_some() {
             return;
         }
+        self.remembered = self.controller.size() + self.orders.len() + self.robot.len();
         for path in paths {
+            if self.robot.conns.insert(path.link, path.conn) != Some(path.conn) {
+                self.robot.sound.remove(&path.link);
+                self.robot.served.remove(&path.link);
+            }
             note(&mut self.robot.sound, path.link, path.is_sound, now);
             note(&mut self.robot.served, path.link, path.is_sound && path.is_served, now);
         }
