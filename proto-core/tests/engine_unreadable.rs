@@ -126,13 +126,35 @@ fn a_misaligned_packet_changes_nothing() {
     let (mut rig, both, _) = displays(OnStale::Hold);
     rig.link_bytes(STATE, &good([1.0, 2.0]));
     let mut bad = good([f32::NAN, 3.0]);
-    bad[..4].copy_from_slice(&f32::NAN.to_le_bytes());
+    for joint in bad[..12].chunks_mut(4) {
+        joint.copy_from_slice(&f32::NAN.to_le_bytes());
+    }
     rig.link_bytes(STATE, &bad);
     rig.sent_to(both);
     rig.run(MS(8));
     assert_eq!(rig.sent_to(both), vec![down(&[1.0, 2.0]); 2]);
     let counters = rig.link(STATE).counters;
     assert_eq!((counters.malformed, counters.unreadable), (1, 0));
+}
+
+#[test]
+fn a_joint_that_cannot_be_read_is_unknown_too() {
+    let mut cell = Cell::new();
+    let recipe = cell.stream(&[], &["RobotState[1]"]);
+    let first = cell.rs485(recipe);
+    let recipe = cell.stream(&[], &["RobotState[2]"]);
+    let second = cell.rs485(recipe);
+    let mut rig = cell.rig();
+    rig.run(MS(10));
+    let mut packet = good([0.0; 2]);
+    packet[..4].copy_from_slice(&f32::NAN.to_le_bytes());
+    packet[4..8].copy_from_slice(&0.5_f32.to_le_bytes());
+    rig.link_bytes(STATE, &packet);
+    rig.run(MS(4));
+    assert!(rig.sent_to(first).is_empty());
+    assert_eq!(rig.sent_to(second), [down(&[0.5])]);
+    let counters = rig.link(STATE).counters;
+    assert_eq!((counters.received, counters.unreadable, counters.malformed), (1, 1, 0));
 }
 
 #[test]

@@ -4,8 +4,8 @@ use core::hint::black_box;
 
 use firmware::gateway::Engine;
 use proto_core::config::GatewayConfig;
-use proto_core::engine::{Input, OUTPUT_BUFFER, PortId};
-use proto_core::image::{GroupId, Image, InputSet, bind_to_variable, saturate_to_field};
+use proto_core::engine::{Input, LinkId, OUTPUT_BUFFER, PortId};
+use proto_core::image::{GroupId, Image, InputSet, VarSet, bind_to_variable, saturate_to_field};
 use proto_core::link::{LinkTimings, Supervisor};
 use proto_core::schedule::Grid;
 use proto_core::sysvar::SysVar;
@@ -54,6 +54,7 @@ fn engine_poll_output(gateway: &mut Engine, now: Instant, out: &mut [u8; OUTPUT_
 fn engine_questions(gateway: &Engine) {
     let port = any(PortId(0));
     black_box((gateway.deadline(), gateway.port_counters(port), gateway.reply_code(port), gateway.image()));
+    black_box((gateway.sleeps(), gateway.is_frame(any(LinkId::RECIPE_UDP), any(&[0; 8][..]))));
     gateway.field_ports().for_each(|port| _ = black_box(port));
     for link in gateway.links() {
         black_box((link, link.kind.name(), link.state.name(), link.id.port()));
@@ -74,6 +75,12 @@ fn process_image() {
         image.forget(group);
         black_box(image.stamp_of(group));
     }
+    black_box((image.receive(var, value), image.is_readable(var), image.known_since(var), var.shown_by()));
+    image.all_readable(any(Some(var)).into_iter());
+    let mut vars = any(VarSet::EMPTY);
+    vars.insert(var);
+    black_box((image.can_read(&vars), vars.contains(any(var)), vars.is_empty()));
+    vars.remove(any(var));
     black_box(bind_to_variable(var, value, any(1.0), any(0.0)));
     black_box(saturate_to_field(any(ScalarType::Byte), any(1.0), any(1.0), any(0.0)));
     let mut set = any(InputSet::EMPTY);
@@ -91,6 +98,8 @@ fn supervisor() {
     black_box((link.up(now), link.down(now), link.advance(now)));
     link.heard(now);
     link.give_up(now);
+    link.share(now);
+    link.unshare(now);
     black_box((link.take_action(), link.deadline(), link.is_up(), link.history()));
 }
 

@@ -146,12 +146,13 @@ fn command_client() {
     let (client, now) = (black_box(&mut client), any(Instant::ZERO));
     let mut out = [0; 320];
     let _ = black_box(client.start(now, bytes(), &dialect(), room(&mut out)));
+    let _ = black_box(client.start_beside(now, bytes(), &dialect(), room(&mut out)));
     let mut chunk = bytes();
     while let Some(event) = client.receive(now, &mut chunk) {
         black_box(event);
     }
     black_box(client.poll(now));
-    black_box((client.deadline(), client.busy(), client.dropped_bytes()));
+    black_box((client.deadline(), client.busy(), client.busy_beside(), client.dropped_bytes()));
     client.abort();
 }
 

@@ -335,8 +335,9 @@ impl Cell {
                     };
                     let conns = self.conns.iter().filter(|(_, conn)| subscribed(conn));
                     let conns: Vec<u64> = conns.map(|(&id, _)| id).collect();
+                    let lost = std::mem::take(&mut self.state_bytes_lost).min(bytes.len());
                     for conn in conns {
-                        self.send_item(conn, Way::Down, Item::Bytes(bytes.to_vec()));
+                        self.send_item(conn, Way::Down, Item::Bytes(bytes[lost..].to_vec()));
                     }
                 }
                 ControllerOutput::UdpSend { peer, bytes } => self.udp_down(peer, &bytes),

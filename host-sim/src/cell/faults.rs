@@ -111,6 +111,13 @@ impl Cell {
         self.gates.get(&link).is_some_and(|gate| gate.conn.is_some())
     }
 
+    /// The next state packet lacks its first bytes, and the connection goes on: all packets after it
+    /// begin at another place.
+    pub fn lose_state_bytes(&mut self, count: usize) {
+        self.note(LinkId::STATE);
+        self.state_bytes_lost = count;
+    }
+
     fn set_door(&mut self, link: LinkId, door: Door) {
         self.note(link);
         self.gate(link).door = door;

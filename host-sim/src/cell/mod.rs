@@ -161,6 +161,8 @@ pub struct Cell {
     tamper: Option<tamper::Tamper>,
     /// What the controller has sent to [`Cell::ask`]'s own connection.
     asked: Vec<u8>,
+    /// Bytes that the next state packet lacks.
+    state_bytes_lost: usize,
 }
 
 /// What is at a port.
@@ -223,6 +225,7 @@ impl Cell {
             #[cfg(test)]
             tamper: None,
             asked: Vec::new(),
+            state_bytes_lost: 0,
         };
         cell.wire_gateway();
         cell.wire_controller(controller);

@@ -53,6 +53,8 @@ pub enum TroubleKind {
     OneClient,
     /// Half a state packet, then the end.
     HalfStatePacket,
+    /// The state stream loses bytes and goes on.
+    StateBytesLost,
     /// A value of the controller is not a number, or infinite.
     Unreadable,
     /// A line flips bits.
@@ -81,7 +83,7 @@ pub enum TroubleKind {
 
 impl TroubleKind {
     /// All of them.
-    pub const ALL: [Self; 28] = [
+    pub const ALL: [Self; 29] = [
         Self::Refused,
         Self::BlackHole,
         Self::Reset,
@@ -98,6 +100,7 @@ impl TroubleKind {
         Self::Exception,
         Self::OneClient,
         Self::HalfStatePacket,
+        Self::StateBytesLost,
         Self::Unreadable,
         Self::Noise,
         Self::Garbage,
@@ -143,6 +146,7 @@ impl TroubleKind {
             Self::Exception => "Modbus exceptions",
             Self::OneClient => "one client of port 2000",
             Self::HalfStatePacket => "half a state packet",
+            Self::StateBytesLost => "state stream loses bytes",
             Self::Unreadable => "values not finite",
             Self::Noise => "noise on a line",
             Self::Garbage => "garbage from a device",
@@ -374,6 +378,11 @@ impl Trouble {
             TroubleKind::HalfStatePacket => {
                 let len = rng.between(0, 1_467) as usize;
                 cell.controller_mut().cut_next_state_packet(len);
+                None
+            }
+            TroubleKind::StateBytesLost => {
+                cell.link_ids().find(|link| *link == LinkId::STATE)?;
+                cell.lose_state_bytes(rng.between(1, 1_467) as usize);
                 None
             }
             TroubleKind::Unreadable => {

@@ -7,7 +7,7 @@
 use std::io::{ErrorKind, Read, Write};
 use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream, UdpSocket};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use super::environment::Cable;
 
@@ -21,6 +21,33 @@ pub(crate) enum Pass {
     On,
     /// It ends here, both ways.
     Cut,
+}
+
+/// Datagrams that are lost, both ways, from the first one on that is a certain one; by default none.
+#[derive(Debug, Default)]
+pub(crate) struct Loss {
+    first: Vec<u8>,
+    lasting: Duration,
+    begun: Mutex<Option<Instant>>,
+}
+
+impl Loss {
+    pub(crate) fn new(first: &[u8], lasting: Duration) -> Arc<Self> {
+        Arc::new(Self { first: first.to_vec(), lasting, begun: Mutex::default() })
+    }
+
+    /// Since when, once it has begun.
+    pub(crate) fn begun(&self) -> Option<Instant> {
+        *self.begun.lock().unwrap()
+    }
+
+    fn takes(&self, datagram: &[u8]) -> bool {
+        let mut begun = self.begun.lock().unwrap();
+        if begun.is_none() && !self.first.is_empty() && datagram == self.first {
+            *begun = Some(Instant::now());
+        }
+        begun.is_some_and(|begun| begun.elapsed() < self.lasting)
+    }
 }
 
 /// Ways through the cable. They end when it is dropped.
@@ -90,6 +117,11 @@ impl Network {
 
     /// A place that leads to this UDP server; answers go to whoever sent last.
     pub(crate) fn udp(&self, to: SocketAddr) -> SocketAddr {
+        self.udp_losing(to, &Arc::default())
+    }
+
+    /// The same, with datagrams that are lost on the way.
+    pub(crate) fn udp_losing(&self, to: SocketAddr, loss: &Arc<Loss>) -> SocketAddr {
         let (door, way) = (UdpSocket::bind("127.0.0.1:0").unwrap(), UdpSocket::bind("127.0.0.1:0").unwrap());
         way.connect(to).unwrap();
         let place = door.local_addr().unwrap();
@@ -100,7 +132,7 @@ impl Network {
         let client = Arc::<Mutex<Option<SocketAddr>>>::default();
         for is_request in [true, false] {
             let shared = Arc::clone(&self.shared);
-            let ([door, way], client) = (ends.clone(), Arc::clone(&client));
+            let ([door, way], client, loss) = (ends.clone(), Arc::clone(&client), Arc::clone(loss));
             std::thread::spawn(move || {
                 let mut datagram = [0; 2048];
                 while !shared.lock().has_ended {
@@ -109,7 +141,7 @@ impl Network {
                     if is_request {
                         *client.lock().unwrap() = Some(sender);
                     }
-                    if shared.lock().is_pulled {
+                    if loss.takes(&datagram[..len]) || shared.lock().is_pulled {
                         continue;
                     }
                     let peer = *client.lock().unwrap();

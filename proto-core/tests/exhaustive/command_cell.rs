@@ -322,7 +322,12 @@ impl World for CommandCell {
     }
 
     fn fingerprint(&self, unique: u64) -> u64 {
-        let look_back = LookBack { bits: TIMEOUT, stamps: TIMEOUT, unconfirmed: Duration::ZERO };
+        let look_back = LookBack {
+            bits: TIMEOUT,
+            stamps: TIMEOUT,
+            unconfirmed: Duration::ZERO,
+            confirmed: Duration::ZERO,
+        };
         let mut scribe = Scribe::new(self.gateway.now, self.judge.orders.total, look_back, unique);
         self.gateway.describe(&mut scribe);
         scribe.describe(&self.judge);
@@ -503,9 +508,11 @@ impl Judge for Facts {
             return Err(format!("says that its port is {:?} instead of {state:?}", engine.port_state(PORT)));
         }
         let counters = engine.port_counters(PORT).ok_or("the port is missing")?;
-        let counted = [counters.frames_in, counters.asleep];
-        if counted != self.counted || counters.commands != self.orders.total {
-            return Err(format!("counts {counted:?} instead of {:?}", self.counted));
+        let counted = [counters.frames_in, counters.asleep, counters.commands, counters.commands_dropped];
+        let [accepted, asleep] = self.counted;
+        let expected = [accepted, asleep, self.orders.total, self.orders.dropped];
+        if counted != expected {
+            return Err(format!("counts {counted:?} instead of {expected:?}"));
         }
         let _ = now;
         Ok(())

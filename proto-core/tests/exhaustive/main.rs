@@ -73,6 +73,9 @@ fn command_roots(start: Instant) -> Vec<Root<CommandCell>> {
     // A command is given up after 10 s.
     let unanswered = busy.clone().after(&[Tick, Taken(LinkId::MODBUS), Answered]);
     let unanswered = unanswered.after(&[Step; 21]).after(&first);
+    // Both are unanswered on the connection that is left.
+    let beside = shared.clone().after(&command).after(&[Frame(3), Taken(LinkId::COMMAND)]);
+    let beside = beside.after(&[Taken(LinkId::MODBUS), Answered]);
     vec![
         root("working", working, 0),
         root("cold", cold, 1),
@@ -80,6 +83,7 @@ fn command_roots(start: Instant) -> Vec<Root<CommandCell>> {
         root("silent", silent, 1),
         root("busy", busy, 1),
         root("unanswered", unanswered, 1),
+        root("beside", beside, 1),
     ]
 }
 
@@ -105,7 +109,7 @@ fn recipe_roots(way: Way, start: Instant) -> Vec<Root<RecipeCell>> {
     if way == Way::Tcp {
         // One more frame can be handed over before some are acknowledged.
         let full = working.after(&[Frame(0), Taken].repeat(62));
-        roots.push(root("full", full, 2));
+        roots.push(root("full", full, 1));
     }
     roots
 }

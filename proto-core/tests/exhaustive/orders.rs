@@ -46,8 +46,9 @@ struct Asked {
 pub struct Orders {
     /// The field's value in the frame before; none after silence.
     base: Option<u8>,
-    /// How many were picked.
+    /// How many were picked, and how many of them were not sent.
     pub total: u32,
+    pub dropped: u32,
     runs: Vec<Picked>,
     stop: Option<Picked>,
     asked: Vec<Asked>,
@@ -61,6 +62,7 @@ impl Orders {
         Self {
             base: None,
             total: 0,
+            dropped: 0,
             runs: Vec::new(),
             stop: None,
             asked: Vec::new(),
@@ -80,10 +82,11 @@ impl Orders {
         match value {
             RUN => {
                 self.total += 1;
-                self.reply = ReplyCode::NotSent;
                 if conns.is_open(LinkId::COMMAND) && self.runs.len() < QUEUE {
                     self.reply = ReplyCode::Pending;
                     self.runs.push(picked);
+                } else {
+                    self.not_sent(&picked);
                 }
             }
             STOP => {
@@ -123,12 +126,12 @@ impl Orders {
         }
         while self.runs.first().is_some_and(|run| now >= run.since + SOON) {
             let run = self.runs.remove(0);
-            self.settle(run.nth, ReplyCode::NotSent);
+            self.not_sent(&run);
         }
         if !self.is_asked()
             && let Some(stop) = self.stop.take_if(|stop| now >= stop.since + SOON)
         {
-            self.settle(stop.nth, ReplyCode::NotSent);
+            self.not_sent(&stop);
         }
     }
 
@@ -178,7 +181,7 @@ impl Orders {
         }
         self.drop_runs();
         if let Some(stop) = self.stop.take() {
-            self.settle(stop.nth, ReplyCode::NotSent);
+            self.not_sent(&stop);
         }
     }
 
@@ -286,8 +289,13 @@ impl Orders {
 
     fn drop_runs(&mut self) {
         for run in std::mem::take(&mut self.runs) {
-            self.settle(run.nth, ReplyCode::NotSent);
+            self.not_sent(&run);
         }
+    }
+
+    fn not_sent(&mut self, picked: &Picked) {
+        self.dropped += 1;
+        self.settle(picked.nth, ReplyCode::NotSent);
     }
 
     /// A command came to its end; the newest one's is told.

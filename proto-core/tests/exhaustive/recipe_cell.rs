@@ -11,7 +11,7 @@ use crate::driver::{Broken, Conns, Gateway, Is, Judge, PORT, Small};
 use crate::rig::{Cell, user_in, user_out, var};
 use crate::scribe::{LookBack, Scribe};
 use crate::search::World;
-use crate::values::{Bits, Float, TIMEOUT};
+use crate::values::{Bits, DOUBT, Float, TIMEOUT};
 
 /// Which recipe link it is, and what is beside it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -362,7 +362,12 @@ impl World for RecipeCell {
     }
 
     fn fingerprint(&self, unique: u64) -> u64 {
-        let look_back = LookBack { bits: TIMEOUT, stamps: READ_BACK_MAX_AGE, unconfirmed: REPEAT_FAST_FOR };
+        let look_back = LookBack {
+            bits: TIMEOUT,
+            stamps: READ_BACK_MAX_AGE,
+            unconfirmed: REPEAT_FAST_FOR,
+            confirmed: DOUBT,
+        };
         let mut scribe = Scribe::new(self.gateway.now, 0, look_back, unique);
         self.gateway.describe(&mut scribe);
         scribe.describe(&self.judge);

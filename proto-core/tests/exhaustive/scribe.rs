@@ -54,6 +54,8 @@ pub struct LookBack {
     pub stamps: Duration,
     /// At since when safe values are unconfirmed.
     pub unconfirmed: Duration,
+    /// At when one was confirmed.
+    pub confirmed: Duration,
 }
 
 /// What is left out.
@@ -84,6 +86,7 @@ enum Field {
     Buffer,
     Stamps,
     Unconfirmed,
+    Confirmed,
     At,
     Since,
     Heard,
@@ -199,6 +202,7 @@ impl Scribe {
             }
             (Field::At, Kind::Bit) => ago.min(self.look_back.bits.as_micros() + 1),
             (Field::Unconfirmed, _) => ago.min(self.look_back.unconfirmed.as_micros() + 1),
+            (Field::Confirmed, _) => ago.min(self.look_back.confirmed.as_micros() + 1),
             (Field::Stamps, _) => ago.min(self.look_back.stamps.as_micros() + 1),
             _ => ago,
         };
@@ -267,6 +271,7 @@ impl Scribe {
             b"bytes" | b"group" | b"ring" | b"buffer" | b"mask" => Word::Field(Field::Buffer),
             b"stamps" | b"packet_at" | b"source_at" | b"frame_at" => Word::Field(Field::Stamps),
             b"unconfirmed_since" => Word::Field(Field::Unconfirmed),
+            b"confirmed_at" => Word::Field(Field::Confirmed),
             b"at" => Word::Field(Field::At),
             b"since" => Word::Field(Field::Since),
             b"heard" => Word::Field(Field::Heard),

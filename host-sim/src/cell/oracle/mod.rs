@@ -420,6 +420,8 @@ impl Oracle {
             Output::LinkClose { link } => self.link_lost(link, now),
             Output::LinkSend { link, bytes } => {
                 self.traffic[place(link)].0 += 1;
+                // What was handed over to a connection that is gone never leaves.
+                self.robot.hands_over_nothing();
                 if self.sheet.link(link).is_some_and(|link| !link.is_datagram) {
                     self.links[place(link)].hands_over(bytes);
                 }

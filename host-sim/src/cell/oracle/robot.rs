@@ -98,6 +98,11 @@ pub(super) struct Robot {
 }
 
 impl Robot {
+    pub(super) fn hands_over_nothing(&mut self) {
+        self.values.clear();
+        self.order = None;
+    }
+
     pub(super) fn hands_over(&mut self, var: SysVar, raw: Raw, carried: Carried) {
         self.values.push((var, raw, carried));
     }
