@@ -232,14 +232,15 @@ impl Oracle {
         self.traffic[place(link)].1 += 1;
         match link {
             LinkId::MODBUS => {
-                let (read, refused) = self.modbus.received(&self.map, bytes);
-                for (var, raw) in read {
+                let answers = self.modbus.received(&self.map, bytes);
+                for (var, raw) in answers.read {
                     if self.sheet.origin[var.ordinal()] == Some(Origin::Modbus) {
                         self.up.received(var, raw, now);
                     }
                 }
-                if !refused.is_empty() {
-                    self.refused.extend(refused);
+                self.up.confirm(answers.taken, now);
+                if !answers.refused.is_empty() {
+                    self.refused.extend(answers.refused);
                     self.again_at = self.again_at.min(now + REFUSED_PAUSE);
                 }
                 self.values_changed();

@@ -138,11 +138,6 @@ impl Orders {
         self.base.get(&order.place) == Some(&order.value)
     }
 
-    /// Whether this command was sent and has not been answered.
-    pub(super) fn is_unanswered(&self, text: &str) -> bool {
-        self.unanswered.iter().any(|(_, order)| order.text == text)
-    }
-
     /// Commands that waited too long.
     pub(super) fn tick(&mut self, now: Instant) {
         while self.queue.front().is_some_and(|first| now >= first.picked + TTL) {

@@ -11,7 +11,7 @@ use proto_core::sysvar::SysVar;
 use proto_core::time::{Duration, Instant};
 
 use super::field::show;
-use super::orders::{Order, Orders};
+use super::orders::Order;
 use super::sheet::{Raw, Sheet};
 use super::upward::{Carried, Upward, Wrong};
 use super::{Invariant, Oracle};
@@ -253,14 +253,14 @@ impl Robot {
     }
 
     /// Commands that stop the robot and have had a way for long enough.
-    fn stops(&self, orders: &Orders, now: Instant) -> Result<u64, Wrong> {
+    fn stops(&self, now: Instant) -> Result<u64, Wrong> {
         let ways = [LinkId::COMMAND, LinkId::URGENT];
         let Some(could) = ways.iter().filter_map(|link| self.sound.get(link)).min() else { return Ok(0) };
         let mut checked = 0;
         for Demand { order, is_met } in &self.demands {
             checked += 1;
             let had_a_way = now.saturating_since(order.picked.max(*could));
-            if !is_met && had_a_way > STOP_ARRIVES && !orders.is_unanswered(&order.text) {
+            if !is_met && had_a_way > STOP_ARRIVES {
                 let what =
                     format!("{} has been asked for and could have arrived for {had_a_way}", order.text);
                 return Err((Invariant::StopArrives, what));
@@ -441,7 +441,7 @@ impl Oracle {
             note(&mut self.robot.ready, link.id, is_ready, now);
         }
         self.robot.look_for_foreign(inputs, now);
-        let result = self.robot.stops(&self.orders, now);
+        let result = self.robot.stops(now);
         self.checks[Invariant::StopArrives as usize] += *result.as_ref().unwrap_or(&1);
         self.judge(now, &[], result.map(drop));
         self.robot.all_sound_since = self.robot.all_sound(paths);

@@ -16,6 +16,9 @@ const NEW: Duration = Duration::from_secs(1);
 /// What the controller shows sooner may be older.
 const SHOWN_AFTER: Duration = Duration::from_millis(200);
 
+/// A packet may be so late; what it shows later is another master's doing.
+const DOUBT: Duration = Duration::from_secs(3);
+
 impl Upward {
     /// Safe values whose write came to nothing wait again, if they still stand.
     pub(super) fn write_again(&mut self, sheet: &Sheet, vars: impl IntoIterator<Item = SysVar>) {
@@ -87,15 +90,31 @@ impl Upward {
         now >= self.doubted_at + SHOWN_AFTER
     }
 
-    /// Safe values that the packet shows are there.
-    pub(super) fn confirm_by(&mut self, sheet: &Sheet, packet: &[u8]) {
+    /// Safe values that the packet shows are there. Those that were, and that it shows otherwise, are in
+    /// doubt again: what was shown before was late, or something late has come behind the safe value.
+    pub(super) fn compare_with(&mut self, sheet: &Sheet, packet: &[u8], now: Instant) {
+        let may_confirm = self.may_confirm(now);
         for &var in &sheet.safe_vars {
-            let safe = sheet.owned[var.ordinal()].and_then(|owned| owned.safe);
-            let is_there =
-                |safe| in_packet(var, packet).map(|raw| as_number(var, raw)) == Some(as_number(var, safe));
-            if self.known(var).unconfirmed && safe.is_some_and(is_there) {
-                self.known[var.ordinal()].unconfirmed = false;
+            let Some(owned) = sheet.owned[var.ordinal()].filter(|_| self.known(var).safe) else { continue };
+            let shown = in_packet(var, packet).map(|raw| as_number(var, raw));
+            let is_there = owned.safe.is_some_and(|safe| shown == Some(as_number(var, safe)));
+            let is_answered = sheet.link(owned.way).is_none();
+            match (self.known(var).unconfirmed, is_there) {
+                (true, true) if may_confirm => self.confirm([var], now),
+                (false, false) if !is_answered && now < self.confirmed_at + DOUBT => {
+                    self.known[var.ordinal()].unconfirmed = true;
+                    self.write_again(sheet, [var]);
+                }
+                _ => {}
             }
+        }
+    }
+
+    /// The controller has these safe values.
+    pub(super) fn confirm(&mut self, vars: impl IntoIterator<Item = SysVar>, now: Instant) {
+        for var in vars {
+            self.known[var.ordinal()].unconfirmed = false;
+            self.confirmed_at = now;
         }
     }
 
@@ -108,8 +127,10 @@ impl Upward {
         for &var in &sheet.safe_vars {
             let safe = sheet.owned[var.ordinal()].and_then(|owned| owned.safe);
             let shown = sheet.witness[var.ordinal()].and_then(|witness| self.known(witness).value);
-            if shown.is_some_and(|(raw, at)| at >= since && safe.is_some_and(|safe| safe[0] == raw[0])) {
-                self.known[var.ordinal()].unconfirmed = false;
+            let is_there =
+                shown.is_some_and(|(raw, at)| at >= since && safe.is_some_and(|safe| safe[0] == raw[0]));
+            if is_there && self.known(var).unconfirmed {
+                self.confirm([var], now);
             }
         }
     }

@@ -86,6 +86,8 @@ pub(super) struct Upward {
     pub frame_at: [Option<Instant>; 16],
     /// When a safe value was last in doubt.
     pub doubted_at: Instant,
+    /// When one was last known to be there.
+    pub confirmed_at: Instant,
     /// When each recipe link sends safe values again.
     pub again_at: [Instant; 16],
     /// No frame is overdue before this.
@@ -106,6 +108,7 @@ impl Upward {
             state_at: None,
             frame_at: [None; 16],
             doubted_at: Instant::ZERO,
+            confirmed_at: Instant::ZERO,
             again_at: [Instant::NEVER; 16],
             next_overdue: Instant::NEVER,
             next_expiry: Instant::NEVER,
@@ -292,9 +295,7 @@ impl Upward {
                 known.value = Some((raw, now));
             }
         }
-        if self.may_confirm(now) {
-            self.confirm_by(sheet, packet);
-        }
+        self.compare_with(sheet, packet, now);
     }
 
     /// The newest value that a link brought; not finite, it is none.
