@@ -80,6 +80,8 @@ pub enum Invariant {
     ValueAge,
     /// A command that the controller takes was picked, or asked for, not long ago.
     CommandAge,
+    /// No command that was picked before one that stops the robot arrives after it.
+    Overtaken,
     /// The controller understands every command that arrives.
     Understood,
     /// What stops the robot arrives as soon as a way to the controller works.
@@ -127,6 +129,7 @@ impl Invariant {
             Self::Registers => "registers",
             Self::ValueAge => "value-age",
             Self::CommandAge => "command-age",
+            Self::Overtaken => "stop-is-last",
             Self::Understood => "commands-understood",
             Self::StopArrives => "stop-arrives",
             Self::SafeArrives => "safe-arrives",
@@ -479,7 +482,7 @@ const ASLEEP: Duration = Duration::from_millis(500);
 const MOST_BYTES: usize = 1 << 20;
 const MOST_THINGS: usize = 100_000;
 
-const ALL: [Invariant; 30] = [
+const ALL: [Invariant; 31] = [
     Invariant::Sent,
     Invariant::InTime,
     Invariant::FirstFrame,
@@ -499,6 +502,7 @@ const ALL: [Invariant; 30] = [
     Invariant::Registers,
     Invariant::ValueAge,
     Invariant::CommandAge,
+    Invariant::Overtaken,
     Invariant::Understood,
     Invariant::StopArrives,
     Invariant::SafeArrives,
