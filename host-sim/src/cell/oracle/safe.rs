@@ -15,6 +15,8 @@ const SLOWLY: Duration = Duration::from_millis(100);
 const NEW: Duration = Duration::from_secs(1);
 /// What the controller shows sooner may be older.
 const SHOWN_AFTER: Duration = Duration::from_millis(200);
+/// For so long another value takes back that one was there; later another master has written it.
+const DOUBT: Duration = Duration::from_secs(3);
 
 impl Upward {
     /// Safe values whose write came to nothing wait again, if they still stand.
@@ -87,15 +89,34 @@ impl Upward {
         now >= self.doubted_at + SHOWN_AFTER
     }
 
-    /// Safe values that the packet shows are there.
-    pub(super) fn confirm_by(&mut self, sheet: &Sheet, packet: &[u8]) {
+    /// Safe values that the packet shows are there; one that it does not show, soon after one was
+    /// confirmed, is not.
+    pub(super) fn compare_safe(&mut self, sheet: &Sheet, packet: &[u8], now: Instant) {
+        let may_confirm = self.may_confirm(now);
+        let may_doubt = self.confirmed_at.is_some_and(|at| now < at + DOUBT);
+        let mut doubted = Vec::new();
         for &var in &sheet.safe_vars {
-            let safe = sheet.owned[var.ordinal()].and_then(|owned| owned.safe);
+            let Some(owned) = sheet.owned[var.ordinal()] else { continue };
+            let Some(safe) = owned.safe.filter(|_| self.known(var).safe) else { continue };
+            let by_recipe = sheet.link(owned.way).is_some();
             let is_there =
-                |safe| in_packet(var, packet).map(|raw| as_number(var, raw)) == Some(as_number(var, safe));
-            if self.known(var).unconfirmed && safe.is_some_and(is_there) {
-                self.known[var.ordinal()].unconfirmed = false;
+                in_packet(var, packet).map(|raw| as_number(var, raw)) == Some(as_number(var, safe));
+            match self.known(var).unconfirmed {
+                true if is_there && may_confirm => self.confirm(var, by_recipe, now),
+                false if !is_there && may_doubt && by_recipe => doubted.push(var),
+                _ => {}
             }
+        }
+        for var in &doubted {
+            self.known[var.ordinal()].unconfirmed = true;
+        }
+        self.write_again(sheet, doubted);
+    }
+
+    fn confirm(&mut self, var: SysVar, by_recipe: bool, now: Instant) {
+        self.known[var.ordinal()].unconfirmed = false;
+        if by_recipe {
+            self.confirmed_at = Some(now);
         }
     }
 
@@ -108,8 +129,11 @@ impl Upward {
         for &var in &sheet.safe_vars {
             let safe = sheet.owned[var.ordinal()].and_then(|owned| owned.safe);
             let shown = sheet.witness[var.ordinal()].and_then(|witness| self.known(witness).value);
-            if shown.is_some_and(|(raw, at)| at >= since && safe.is_some_and(|safe| safe[0] == raw[0])) {
-                self.known[var.ordinal()].unconfirmed = false;
+            let is_there =
+                shown.is_some_and(|(raw, at)| at >= since && safe.is_some_and(|safe| safe[0] == raw[0]));
+            if is_there && self.known(var).unconfirmed {
+                let way = sheet.owned[var.ordinal()].map(|owned| owned.way);
+                self.confirm(var, way.is_some_and(|way| sheet.link(way).is_some()), now);
             }
         }
     }

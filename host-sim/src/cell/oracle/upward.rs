@@ -86,6 +86,8 @@ pub(super) struct Upward {
     pub frame_at: [Option<Instant>; 16],
     /// When a safe value was last in doubt.
     pub doubted_at: Instant,
+    /// When a safe value of a recipe link was last seen to be there.
+    pub confirmed_at: Option<Instant>,
     /// When each recipe link sends safe values again.
     pub again_at: [Instant; 16],
     /// No frame is overdue before this.
@@ -106,6 +108,7 @@ impl Upward {
             state_at: None,
             frame_at: [None; 16],
             doubted_at: Instant::ZERO,
+            confirmed_at: None,
             again_at: [Instant::NEVER; 16],
             next_overdue: Instant::NEVER,
             next_expiry: Instant::NEVER,
@@ -292,8 +295,8 @@ impl Upward {
                 known.value = Some((raw, now));
             }
         }
-        if self.may_confirm(now) {
-            self.confirm_by(sheet, packet);
+        if sheet.safe_vars.iter().any(|var| self.known(*var).safe) {
+            self.compare_safe(sheet, packet, now);
         }
     }
 
