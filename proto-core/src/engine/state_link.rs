@@ -102,12 +102,12 @@ impl StateLink {
 /// Safe values that the controller shows, it has; one that it showed by a packet from before, or that
 /// something late has overwritten, it has not.
 fn compare_safe<const PORTS: usize>(view: &StateView<'_>, store: &mut Store<PORTS>, now: Instant) {
-    let may_confirm = store.may_confirm(now);
+    let (may_confirm, may_doubt) = (store.may_confirm(now), store.may_doubt(now));
     for var in store.safe.iter() {
         let is_shown = view.read_var(var) == Some(store.image.value(var));
         match store.unconfirmed.contains(var) {
             true if is_shown && may_confirm => store.confirm(&InputSet::from_iter([var]), now),
-            false if !is_shown => store.doubt(var, now),
+            false if !is_shown && may_doubt => store.doubt(var),
             _ => {}
         }
     }

@@ -232,16 +232,21 @@ impl<const PORTS: usize> Store<PORTS> {
 
     /// The controller has these safe values, as far as they still stand.
     pub(super) fn confirm(&mut self, safe: &InputSet, now: Instant) {
-        if !safe.is_empty() {
-            self.unconfirmed = self.unconfirmed.minus(safe);
+        if !safe.and(&self.unconfirmed).and(&self.unanswered).is_empty() {
             self.confirmed_at = now;
         }
+        self.unconfirmed = self.unconfirmed.minus(safe);
     }
 
-    /// The controller shows another value than the safe one. Soon after it showed that one, this is no
-    /// other master's doing.
-    pub(super) fn doubt(&mut self, var: SysVar, now: Instant) {
-        if self.unanswered.contains(var) && now < self.confirmed_at + DOUBT {
+    /// Whether another value than the safe one, shown now, can be what the controller had all along.
+    /// Later it is another master's doing.
+    pub(super) fn may_doubt(&self, now: Instant) -> bool {
+        now < self.confirmed_at + DOUBT
+    }
+
+    /// The controller does not have a safe value that a recipe link has sent.
+    pub(super) fn doubt(&mut self, var: SysVar) {
+        if self.unanswered.contains(var) {
             self.unconfirmed.insert(var);
             self.again(&InputSet::from_iter([var]));
         }

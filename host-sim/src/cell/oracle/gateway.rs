@@ -232,15 +232,14 @@ impl Oracle {
         self.traffic[place(link)].1 += 1;
         match link {
             LinkId::MODBUS => {
-                let answers = self.modbus.received(&self.map, bytes);
-                for (var, raw) in answers.read {
+                let (read, refused) = self.modbus.received(&self.map, bytes);
+                for (var, raw) in read {
                     if self.sheet.origin[var.ordinal()] == Some(Origin::Modbus) {
                         self.up.received(var, raw, now);
                     }
                 }
-                self.up.confirm(answers.taken, now);
-                if !answers.refused.is_empty() {
-                    self.refused.extend(answers.refused);
+                if !refused.is_empty() {
+                    self.refused.extend(refused);
                     self.again_at = self.again_at.min(now + REFUSED_PAUSE);
                 }
                 self.values_changed();

@@ -15,8 +15,7 @@ const SLOWLY: Duration = Duration::from_millis(100);
 const NEW: Duration = Duration::from_secs(1);
 /// What the controller shows sooner may be older.
 const SHOWN_AFTER: Duration = Duration::from_millis(200);
-
-/// A packet may be so late; what it shows later is another master's doing.
+/// For so long another value takes back that one was there; later another master has written it.
 const DOUBT: Duration = Duration::from_secs(3);
 
 impl Upward {
@@ -90,31 +89,34 @@ impl Upward {
         now >= self.doubted_at + SHOWN_AFTER
     }
 
-    /// Safe values that the packet shows are there. Those that were, and that it shows otherwise, are in
-    /// doubt again: what was shown before was late, or something late has come behind the safe value.
-    pub(super) fn compare_with(&mut self, sheet: &Sheet, packet: &[u8], now: Instant) {
+    /// Safe values that the packet shows are there; one that it does not show, soon after one was
+    /// confirmed, is not.
+    pub(super) fn compare_safe(&mut self, sheet: &Sheet, packet: &[u8], now: Instant) {
         let may_confirm = self.may_confirm(now);
+        let may_doubt = self.confirmed_at.is_some_and(|at| now < at + DOUBT);
+        let mut doubted = Vec::new();
         for &var in &sheet.safe_vars {
-            let Some(owned) = sheet.owned[var.ordinal()].filter(|_| self.known(var).safe) else { continue };
-            let shown = in_packet(var, packet).map(|raw| as_number(var, raw));
-            let is_there = owned.safe.is_some_and(|safe| shown == Some(as_number(var, safe)));
-            let is_answered = sheet.link(owned.way).is_none();
-            match (self.known(var).unconfirmed, is_there) {
-                (true, true) if may_confirm => self.confirm([var], now),
-                (false, false) if !is_answered && now < self.confirmed_at + DOUBT => {
-                    self.known[var.ordinal()].unconfirmed = true;
-                    self.write_again(sheet, [var]);
-                }
+            let Some(owned) = sheet.owned[var.ordinal()] else { continue };
+            let Some(safe) = owned.safe.filter(|_| self.known(var).safe) else { continue };
+            let by_recipe = sheet.link(owned.way).is_some();
+            let is_there =
+                in_packet(var, packet).map(|raw| as_number(var, raw)) == Some(as_number(var, safe));
+            match self.known(var).unconfirmed {
+                true if is_there && may_confirm => self.confirm(var, by_recipe, now),
+                false if !is_there && may_doubt && by_recipe => doubted.push(var),
                 _ => {}
             }
         }
+        for var in &doubted {
+            self.known[var.ordinal()].unconfirmed = true;
+        }
+        self.write_again(sheet, doubted);
     }
 
-    /// The controller has these safe values.
-    pub(super) fn confirm(&mut self, vars: impl IntoIterator<Item = SysVar>, now: Instant) {
-        for var in vars {
-            self.known[var.ordinal()].unconfirmed = false;
-            self.confirmed_at = now;
+    fn confirm(&mut self, var: SysVar, by_recipe: bool, now: Instant) {
+        self.known[var.ordinal()].unconfirmed = false;
+        if by_recipe {
+            self.confirmed_at = Some(now);
         }
     }
 
@@ -130,7 +132,8 @@ impl Upward {
             let is_there =
                 shown.is_some_and(|(raw, at)| at >= since && safe.is_some_and(|safe| safe[0] == raw[0]));
             if is_there && self.known(var).unconfirmed {
-                self.confirm([var], now);
+                let way = sheet.owned[var.ordinal()].map(|owned| owned.way);
+                self.confirm(var, way.is_some_and(|way| sheet.link(way).is_some()), now);
             }
         }
     }

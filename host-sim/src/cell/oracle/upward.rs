@@ -86,8 +86,8 @@ pub(super) struct Upward {
     pub frame_at: [Option<Instant>; 16],
     /// When a safe value was last in doubt.
     pub doubted_at: Instant,
-    /// When one was last known to be there.
-    pub confirmed_at: Instant,
+    /// When a safe value of a recipe link was last seen to be there.
+    pub confirmed_at: Option<Instant>,
     /// When each recipe link sends safe values again.
     pub again_at: [Instant; 16],
     /// No frame is overdue before this.
@@ -108,7 +108,7 @@ impl Upward {
             state_at: None,
             frame_at: [None; 16],
             doubted_at: Instant::ZERO,
-            confirmed_at: Instant::ZERO,
+            confirmed_at: None,
             again_at: [Instant::NEVER; 16],
             next_overdue: Instant::NEVER,
             next_expiry: Instant::NEVER,
@@ -295,7 +295,9 @@ impl Upward {
                 known.value = Some((raw, now));
             }
         }
-        self.compare_with(sheet, packet, now);
+        if sheet.safe_vars.iter().any(|var| self.known(*var).safe) {
+            self.compare_safe(sheet, packet, now);
+        }
     }
 
     /// The newest value that a link brought; not finite, it is none.

@@ -66,10 +66,10 @@ impl Modbus {
         Ok(asked)
     }
 
-    /// The controller's bytes: what was read, and safe values that were refused or taken.
-    pub(super) fn received(&mut self, map: &Map, bytes: &[u8]) -> Answers {
+    /// The controller's bytes: what was read, and safe values that were refused.
+    pub(super) fn received(&mut self, map: &Map, bytes: &[u8]) -> (Vec<(SysVar, Raw)>, Vec<SysVar>) {
         self.held.extend_from_slice(bytes);
-        let Answers { read: mut found, mut refused, mut taken } = Answers::default();
+        let (mut found, mut refused) = (Vec::new(), Vec::new());
         while let Some(len) = frame_len(&self.held) {
             let frame: Vec<u8> = self.held.drain(..len).collect();
             let Some((id, asked, _)) = &self.in_flight else { continue };
@@ -84,21 +84,11 @@ impl Modbus {
             let safe = std::mem::take(&mut self.safe);
             if frame[7] & 0x80 != 0 {
                 refused.extend(safe);
-            } else {
-                taken.extend(safe);
             }
             self.in_flight = None;
         }
-        Answers { read: found, refused, taken }
+        (found, refused)
     }
-}
-
-/// What answers say.
-#[derive(Debug, Default)]
-pub(super) struct Answers {
-    pub read: Vec<(SysVar, Raw)>,
-    pub refused: Vec<SysVar>,
-    pub taken: Vec<SysVar>,
 }
 
 /// The length of the first whole frame.
