@@ -16,9 +16,13 @@ pub type Small = Engine<2, 1, 4>;
 pub type Broken = String;
 
 /// A driver that stays away for longer was asleep.
-pub const ASLEEP: Duration = Duration::from_millis(500);
+const ASLEEP: Duration = Duration::from_millis(500);
 /// The engine asks to be called at least so often.
 const HEARTBEAT: Duration = Duration::from_millis(250);
+/// What waited while the gateway was asleep may be read for so long after it.
+pub const DEAF: Duration = Duration::from_millis(50);
+/// A device repeats a frame so often that it is never overdue.
+pub const STEADY: Duration = Duration::from_millis(90);
 /// More than a cell of one port and three links can have to say after one input: each link closed,
 /// opened and spoken to once.
 const MOST_OUTPUTS: usize = 9;

@@ -9,9 +9,11 @@
 mod rig;
 
 mod command_cell;
+mod command_judge;
 mod driver;
 mod orders;
 mod recipe_cell;
+mod recipe_judge;
 mod scribe;
 mod search;
 mod values;
