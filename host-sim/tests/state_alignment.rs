@@ -1,6 +1,8 @@
 //! How many wrong alignments of the simulated controller's state stream are taken for right ones:
 //! the table of docs/wire/state.md section 3.
 
+use std::net::Ipv4Addr;
+
 use host_sim::config::{
     AnalogInput, BitGroup, Initial, InitialTarget, Power, Robot, RobotMode, SimConfig, SimProgram,
 };
@@ -57,8 +59,10 @@ fn packets(config: &SimConfig, commands: &[(u64, &str)], millis: u64) -> Vec<[u8
     let mut controller = Controller::new(config).unwrap();
     let begin = Instant::from_millis(1_000);
     let mut now = begin;
-    controller.handle(now, ControllerInput::StateOpened { conn: ConnId(1) });
-    controller.handle(now, ControllerInput::CommandOpened { conn: ConnId(2) });
+    controller
+        .handle(now, ControllerInput::StateOpened { conn: ConnId(1), from: Ipv4Addr::LOCALHOST.into() });
+    controller
+        .handle(now, ControllerInput::CommandOpened { conn: ConnId(2), from: Ipv4Addr::LOCALHOST.into() });
     let mut commands =
         commands.iter().map(|&(at, text)| (begin + Duration::from_millis(at), text)).peekable();
     let mut packets = vec![];

@@ -219,6 +219,31 @@ fn it_is_sent_every_4_ms_until_the_state_stream_shows_it() {
 }
 
 #[test]
+fn what_the_stream_shows_no_more_soon_after_was_never_there() {
+    let (mut rig, port) = seen_in_the_stream();
+    falls_silent(&mut rig, port, &float(5.0));
+    rig.run(MS(300));
+    // A packet that was late on its way, of before the owner's last value.
+    rig.link_bytes(LinkId::STATE, &packet(-1.0, 7.0));
+    rig.run(MS(100));
+    rig.log.clear();
+    let now = rig.now;
+    rig.link_bytes(LinkId::STATE, &packet(5.0, 7.0));
+    rig.run(MS(10));
+    assert_eq!(times(&mut rig, UDP, now, &floats(-1.0, 7.0)), every(4, 0, 8));
+    rig.link_bytes(LinkId::STATE, &packet(-1.0, 7.0));
+    // Much later it is another master who writes.
+    for _ in 0..31 {
+        rig.run(MS(100));
+        rig.link_bytes(LinkId::STATE, &packet(-1.0, 7.0));
+    }
+    rig.log.clear();
+    rig.link_bytes(LinkId::STATE, &packet(9.0, 7.0));
+    rig.run(MS(100));
+    assert_eq!(times(&mut rig, UDP, now, &[]), Vec::<u64>::new());
+}
+
+#[test]
 fn what_the_stream_shows_too_soon_may_be_older() {
     let (mut rig, port) = seen_in_the_stream();
     let due = falls_silent(&mut rig, port, &float(-1.0));

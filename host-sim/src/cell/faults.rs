@@ -139,7 +139,7 @@ impl Cell {
     }
 
     pub(super) fn reset_conn(&mut self, id: u64) {
-        let Some(conn) = self.conns.remove(&id) else { return };
+        let Some(conn) = self.drop_conn(id) else { return };
         let gate = self.gate(conn.link);
         // The gateway may have closed its end and moved on.
         if gate.conn == Some(id) {
@@ -237,12 +237,12 @@ impl Cell {
             let Some(conn) = self.conns.get_mut(&id) else { continue };
             match peer {
                 _ if conn.forgotten => continue,
-                _ if conn.abandoned || conn.closing => drop(self.conns.remove(&id)),
+                _ if conn.abandoned || conn.closing => drop(self.drop_conn(id)),
                 // The gateway goes on asking.
                 Peer::Server(_) if !conn.accepted => continue,
                 Peer::Client(_) if !conn.accepted => {
                     let link = conn.link;
-                    self.conns.remove(&id);
+                    self.drop_conn(id);
                     self.gate(link).conn = None;
                 }
                 _ => {
@@ -285,7 +285,10 @@ impl Cell {
         for gate in self.gates.values_mut() {
             gate.set_open(false);
         }
-        self.conns.clear();
+        let all: Vec<u64> = self.conns.keys().copied().collect();
+        for id in all {
+            self.drop_conn(id);
+        }
         self.forget_waiting();
         // The same configuration made the engine that there was.
         if let Ok(engine) = Engine::new(&self.gateway) {

@@ -65,6 +65,7 @@ impl Cell {
             };
             Path {
                 link: gate.id,
+                conn: gate.conn,
                 is_sound: !self.is_asleep() && self.is_sound(gate),
                 is_served: server.is_none_or(|server| self.ailments[server as usize] == 0),
             }
@@ -91,7 +92,7 @@ impl Cell {
     }
 }
 
-const SURVEY_EVERY: Duration = Duration::from_millis(50);
+const SURVEY_EVERY: Duration = Duration::from_millis(100);
 /// Of a network that is worse nothing is expected.
 const MUCH_LOSS: u32 = 10_000;
 const MUCH_JITTER: Duration = Duration::from_millis(5);

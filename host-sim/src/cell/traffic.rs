@@ -66,7 +66,7 @@ impl Cell {
         let Some(conn) = self.conns.get_mut(&id) else { return };
         conn.up.forget();
         if conn.closing || conn.forgotten {
-            self.conns.remove(&id);
+            self.drop_conn(id);
         } else if !conn.accepted {
             self.never_opened(id);
         } else {
@@ -78,9 +78,17 @@ impl Cell {
         }
     }
 
+    /// Nothing is left of a connection.
+    pub(super) fn drop_conn(&mut self, id: u64) -> Option<Connection> {
+        if let Some(oracle) = &mut self.oracle {
+            oracle.conn_gone(id);
+        }
+        self.conns.remove(&id)
+    }
+
     /// A connection that the controller was never told of.
     fn never_opened(&mut self, id: u64) {
-        if let Some(Connection { peer: Peer::Client(port), .. }) = self.conns.remove(&id) {
+        if let Some(Connection { peer: Peer::Client(port), .. }) = self.drop_conn(id) {
             self.client_lost(port);
         }
     }
@@ -94,7 +102,7 @@ impl Cell {
             self.queue.push(self.now + TCP_TIMEOUT, Due::TimedOut { conn: id });
             return;
         }
-        self.conns.remove(&id);
+        self.drop_conn(id);
         self.controller_closed(id, peer);
     }
 
@@ -107,7 +115,7 @@ impl Cell {
             return;
         }
         let (turn, is_ours) = (gate.turn, gate.conn == Some(id));
-        self.conns.remove(&id);
+        self.drop_conn(id);
         if is_ours {
             self.queue.push(self.now, Due::LinkDown { link, turn });
         }
@@ -121,7 +129,7 @@ impl Cell {
         conn.closing = true;
         // The gateway may have closed its end as well: then nobody is left to be told.
         if self.gates.get(&conn.link).is_none_or(|gate| gate.conn != Some(id)) {
-            self.conns.remove(&id);
+            self.drop_conn(id);
         }
     }
 
@@ -235,7 +243,7 @@ impl Cell {
         conn.abandoned = true;
         let is_gone = conn.closing || conn.forgotten;
         if is_gone {
-            self.conns.remove(&id);
+            self.drop_conn(id);
         } else {
             self.queue.push(now + TCP_TIMEOUT, Due::TimedOut { conn: id });
         }
@@ -459,7 +467,7 @@ impl Cell {
                 }
             }
             (Arrived::Item(Item::Closed), Way::Down) => {
-                self.conns.remove(&id);
+                self.drop_conn(id);
                 self.gate(link).set_open(false);
                 self.engine_input(Input::LinkDown { link });
             }

@@ -342,6 +342,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         let set: InputSet = config.written_by(recipe).collect();
         let writes: InputSet =
             set.iter().filter(|&var| plan.way_up(var) == Some(WayUp::Recipe(id))).collect();
+        self.store.unanswered = self.store.unanswered.or(&writes);
         let owners = writes.iter().filter_map(|var| plan.owner(var));
         let timeouts =
             owners.filter_map(|port| config.ports.get(usize::from(port.0))).map(|port| port.timeout);

@@ -352,7 +352,7 @@ impl CommandLink {
         now: Instant,
     ) -> Option<(LinkId, usize)> {
         while let Some(link) = self.way_of_stops()
-            && let Some(command) = self.pop_stop()
+            && let Some(command) = self.pop_stop(now)
         {
             if let Some(len) = self.send(link, command, ports, out, (now, now + STOP_TTL)) {
                 return Some((link, len));
@@ -388,11 +388,14 @@ impl CommandLink {
         self.ordinary.is_free_beside().then_some(LinkId::COMMAND)
     }
 
-    /// The next urgent command, of a kind that is not under way.
-    fn pop_stop(&mut self) -> Option<(Keyword, Waiting)> {
+    /// The next urgent command, of a kind that is not under way or has been so for too long: whether the
+    /// controller has done anything with that one is not known.
+    fn pop_stop(&mut self, now: Instant) -> Option<(Keyword, Waiting)> {
         let sessions = [Some(&self.ordinary), self.urgent.as_ref()];
         let under_way = |keyword| {
-            let same = |sent: &Option<Sent>| sent.is_some_and(|sent| sent.keyword == keyword);
+            let same = |sent: &Option<Sent>| {
+                sent.is_some_and(|sent| sent.keyword == keyword && now < sent.at + STOP_TTL)
+            };
             sessions.into_iter().flatten().any(|session| same(&session.in_flight) || same(&session.beside))
         };
         self.stops.pop(|keyword| !under_way(keyword))

@@ -201,7 +201,7 @@ impl ModbusLink {
                     self.timeouts_in_a_row = 0;
                     self.flight.answered();
                     match asked.asked {
-                        Asked::Write { safe } => store.confirm(&safe),
+                        Asked::Write { safe } => store.confirm(&safe, now),
                         Asked::Poll { block } => {
                             if let Some(block) = self.blocks.get(block) {
                                 take_poll(block, &self.polled, response, store, now);

@@ -77,8 +77,8 @@ impl StateLink {
                             }
                         }
                     }
-                    if store.may_confirm(now) {
-                        confirm(&view, store);
+                    if !store.safe.is_empty() {
+                        compare_safe(&view, store, now);
                     }
                     store.image.stamp(self.group, now);
                     if look == Look::AtEach {
@@ -99,11 +99,16 @@ impl StateLink {
     }
 }
 
-/// Safe values that the controller shows, it has.
-fn confirm<const PORTS: usize>(view: &StateView<'_>, store: &mut Store<PORTS>) {
-    for var in store.unconfirmed.iter() {
-        if view.read_var(var) == Some(store.image.value(var)) {
-            store.unconfirmed.remove(var);
+/// Safe values that the controller shows, it has; one that it showed by a packet from before, or that
+/// something late has overwritten, it has not.
+fn compare_safe<const PORTS: usize>(view: &StateView<'_>, store: &mut Store<PORTS>, now: Instant) {
+    let may_confirm = store.may_confirm(now);
+    for var in store.safe.iter() {
+        let is_shown = view.read_var(var) == Some(store.image.value(var));
+        match store.unconfirmed.contains(var) {
+            true if is_shown && may_confirm => store.confirm(&InputSet::from_iter([var]), now),
+            false if !is_shown => store.doubt(var, now),
+            _ => {}
         }
     }
 }

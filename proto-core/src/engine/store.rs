@@ -58,8 +58,11 @@ pub(super) struct Store<const PORTS: usize> {
     pub safe: InputSet,
     /// Those of them that the controller is not known to have.
     pub unconfirmed: InputSet,
-    /// When one of them became so last.
+    /// When one of them became so last, and when one was confirmed.
     pub unconfirmed_since: Instant,
+    confirmed_at: Instant,
+    /// Variables that recipe links write, which answer nothing.
+    pub unanswered: InputSet,
     /// Variables that the state stream has brought since their owner fell silent, or ever.
     pub read_back: InputSet,
     /// Variables whose link is up.
@@ -84,6 +87,8 @@ impl<const PORTS: usize> Store<PORTS> {
             safe: InputSet::EMPTY,
             unconfirmed: InputSet::EMPTY,
             unconfirmed_since: Instant::ZERO,
+            confirmed_at: Instant::ZERO,
+            unanswered: InputSet::EMPTY,
             read_back: InputSet::EMPTY,
             reachable: InputSet::EMPTY,
             lost: [0; PORTS],
@@ -226,8 +231,20 @@ impl<const PORTS: usize> Store<PORTS> {
     }
 
     /// The controller has these safe values, as far as they still stand.
-    pub(super) fn confirm(&mut self, safe: &InputSet) {
-        self.unconfirmed = self.unconfirmed.minus(safe);
+    pub(super) fn confirm(&mut self, safe: &InputSet, now: Instant) {
+        if !safe.is_empty() {
+            self.unconfirmed = self.unconfirmed.minus(safe);
+            self.confirmed_at = now;
+        }
+    }
+
+    /// The controller shows another value than the safe one. Soon after it showed that one, this is no
+    /// other master's doing.
+    pub(super) fn doubt(&mut self, var: SysVar, now: Instant) {
+        if self.unanswered.contains(var) && now < self.confirmed_at + DOUBT {
+            self.unconfirmed.insert(var);
+            self.again(&InputSet::from_iter([var]));
+        }
     }
 
     /// The controller may have started anew: safe values are written once more.
@@ -253,7 +270,7 @@ impl<const PORTS: usize> Store<PORTS> {
                 && self.image.known_since(witness).is_some_and(|at| at >= since)
                 && self.image.value(witness) == self.image.value(var)
             {
-                self.unconfirmed.remove(var);
+                self.confirm(&InputSet::from_iter([var]), now);
             }
         }
     }
@@ -261,6 +278,8 @@ impl<const PORTS: usize> Store<PORTS> {
 
 /// What the controller shows this soon may be older than the safe value.
 const SHOWN_AFTER: Duration = Duration::from_millis(200);
+/// For so long a packet of the state stream may come late: one that is silent for 2 s is reopened.
+const DOUBT: Duration = Duration::from_secs(3);
 
 /// When a value that waits since `at` has waited longer than `timeout`.
 fn too_old_at(at: Instant, timeout: Duration) -> Instant {

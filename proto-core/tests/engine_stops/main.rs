@@ -276,6 +276,22 @@ fn another_urgent_command_cannot_overtake_it() {
 // Without a second connection.
 
 #[test]
+fn it_does_not_wait_behind_its_like_that_nobody_answers() {
+    let mut rig = panels();
+    press(&mut rig, A, STOP);
+    assert_eq!(sent(&mut rig, URGENT), ["stop"]);
+    rig.run(MS(500));
+    press(&mut rig, A, NOTHING);
+    press(&mut rig, A, STOP);
+    rig.run(MS(499));
+    assert_eq!(sent(&mut rig, COMMAND), Vec::<String>::new(), "the first one may still be answered");
+    rig.run(MS(251));
+    assert_eq!(sent(&mut rig, COMMAND), ["stop"], "somebody may have started the robot since");
+    rig.link_bytes(COMMAND, b"stop success");
+    assert_eq!(reply(&rig, A), ReplyCode::Success);
+}
+
+#[test]
 fn while_the_second_connection_is_down_it_goes_over_the_first_at_once() {
     let mut rig = panels();
     rig.reachable.remove(&URGENT.0);

@@ -252,7 +252,12 @@ impl World for CommandCell {
     }
 
     fn fingerprint(&self, unique: u64) -> u64 {
-        let look_back = LookBack { bits: TIMEOUT, stamps: TIMEOUT, unconfirmed: Duration::ZERO };
+        let look_back = LookBack {
+            bits: TIMEOUT,
+            stamps: TIMEOUT,
+            unconfirmed: Duration::ZERO,
+            confirmed: Duration::ZERO,
+        };
         let mut scribe = Scribe::new(self.gateway.now, self.judge.orders.total, look_back, unique);
         self.gateway.describe(&mut scribe);
         scribe.describe(&self.judge);

@@ -219,12 +219,19 @@ impl Judge for Facts {
         Err(format!("sends {bytes:?} to the field"))
     }
 
-    fn rested(&mut self, _: Instant, engine: &Small, conns: &Conns, is_late: bool) -> Result<(), Broken> {
+    fn rested(
+        &mut self,
+        now: Instant,
+        until: Instant,
+        engine: &Small,
+        conns: &Conns,
+        is_late: bool,
+    ) -> Result<(), Broken> {
         if !is_late {
             if self.bits.is_waiting() && self.asked.is_none() && conns.of(LinkId::MODBUS).is_free() {
                 return Err("lets a value wait though the link is free".to_owned());
             }
-            self.orders.rested(conns)?;
+            self.orders.rested(conns, now, until)?;
         }
         let reply = engine.reply_code(PORT);
         if reply != Some(self.orders.reply) {

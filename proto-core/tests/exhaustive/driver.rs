@@ -93,7 +93,14 @@ pub trait Judge {
     fn shown(&mut self, now: Instant, bytes: &[u8]) -> Result<(), Broken>;
     /// The engine has nothing more to do. `is_late`: a deadline has come and its tick was not told, so
     /// nothing may be sent yet.
-    fn rested(&mut self, now: Instant, engine: &Small, conns: &Conns, is_late: bool) -> Result<(), Broken>;
+    fn rested(
+        &mut self,
+        now: Instant,
+        until: Instant,
+        engine: &Small,
+        conns: &Conns,
+        is_late: bool,
+    ) -> Result<(), Broken>;
 }
 
 #[derive(Debug, Clone)]
@@ -247,7 +254,7 @@ impl Gateway {
             return Err(format!("counts that it slept {} times", self.engine.sleeps()));
         }
         self.until = until;
-        judge.rested(now, &self.engine, &self.conns, is_late)?;
+        judge.rested(now, until, &self.engine, &self.conns, is_late)?;
         self.links_are_tended(is_tick)
     }
 

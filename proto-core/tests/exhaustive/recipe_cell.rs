@@ -15,7 +15,7 @@ use crate::recipe_judge::{
 use crate::rig::{Cell, user_in, user_out, var};
 use crate::scribe::{LookBack, Scribe};
 use crate::search::World;
-use crate::values::TIMEOUT;
+use crate::values::{DOUBT, TIMEOUT};
 
 /// Which recipe link it is, and what is beside it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -278,7 +278,8 @@ impl World for RecipeCell {
     }
 
     fn fingerprint(&self, unique: u64) -> u64 {
-        let look_back = LookBack { bits: TIMEOUT, stamps: LONGEST_AGE, unconfirmed: REPEAT_FAST_FOR };
+        let look_back =
+            LookBack { bits: TIMEOUT, stamps: LONGEST_AGE, unconfirmed: REPEAT_FAST_FOR, confirmed: DOUBT };
         let mut scribe = Scribe::new(self.gateway.now, 0, look_back, unique);
         self.gateway.describe(&mut scribe);
         scribe.describe(&self.judge);

@@ -318,7 +318,14 @@ impl Judge for Facts {
         Ok(())
     }
 
-    fn rested(&mut self, now: Instant, engine: &Small, conns: &Conns, is_late: bool) -> Result<(), Broken> {
+    fn rested(
+        &mut self,
+        now: Instant,
+        _: Instant,
+        engine: &Small,
+        conns: &Conns,
+        is_late: bool,
+    ) -> Result<(), Broken> {
         let link = conns.of(self.way.link());
         if !is_late {
             let is_free = link.is_free() && link.under_way.len() < MOST_UNACKNOWLEDGED;

@@ -54,6 +54,8 @@ pub struct LookBack {
     pub stamps: Duration,
     /// At since when safe values are unconfirmed.
     pub unconfirmed: Duration,
+    /// At when one was confirmed.
+    pub confirmed: Duration,
 }
 
 /// What is left out.
@@ -84,6 +86,7 @@ enum Field {
     Buffer,
     Stamps,
     Unconfirmed,
+    Confirmed,
     At,
     Since,
     Heard,
@@ -120,7 +123,8 @@ enum Kind {
 }
 
 const NEVER: u64 = u64::MAX;
-/// What the engine asks of a link that was lost: was another lost within this time?
+/// What the engine asks of a link that was lost: was another lost within this time? And of a command
+/// that is unanswered: has it been so for as long?
 const TOGETHER: u64 = 1_000_000;
 /// And had it been up for this long?
 const SETTLED: u64 = 5_000_000;
@@ -185,8 +189,8 @@ impl Scribe {
         }
         let ago = self.now.saturating_sub(at);
         let ago = match (self.field, self.kind()) {
-            // Only measured.
-            (Field::At, Kind::Sent) => return,
+            // When a command was sent: one that stops is sent again behind it a second later.
+            (Field::At, Kind::Sent) => ago.min(TOGETHER + 1),
             // Silence of a line counts for partial frames, and before sending where one has to wait.
             (Field::Heard, Kind::Line) => return,
             (Field::Heard, _) if self.silence_is_normal => return,
@@ -199,6 +203,7 @@ impl Scribe {
             }
             (Field::At, Kind::Bit) => ago.min(self.look_back.bits.as_micros() + 1),
             (Field::Unconfirmed, _) => ago.min(self.look_back.unconfirmed.as_micros() + 1),
+            (Field::Confirmed, _) => ago.min(self.look_back.confirmed.as_micros() + 1),
             (Field::Stamps, _) => ago.min(self.look_back.stamps.as_micros() + 1),
             _ => ago,
         };
@@ -267,6 +272,7 @@ impl Scribe {
             b"bytes" | b"group" | b"ring" | b"buffer" | b"mask" => Word::Field(Field::Buffer),
             b"stamps" | b"packet_at" | b"source_at" | b"frame_at" => Word::Field(Field::Stamps),
             b"unconfirmed_since" => Word::Field(Field::Unconfirmed),
+            b"confirmed_at" => Word::Field(Field::Confirmed),
             b"at" => Word::Field(Field::At),
             b"since" => Word::Field(Field::Since),
             b"heard" => Word::Field(Field::Heard),

@@ -8,6 +8,9 @@ use crate::driver::Broken;
 /// What the controller shows this soon may be older than the safe value.
 const SHOWN_AFTER: Duration = Duration::from_millis(200);
 
+/// So long after it was confirmed, another value that is shown takes that back.
+pub const DOUBT: Duration = Duration::from_secs(3);
+
 /// The port's `timeout_ms`: longer than a link stays closed, so that what waited for it could be sent.
 pub const TIMEOUT: Duration = Duration::from_millis(150);
 
@@ -26,6 +29,9 @@ pub struct Bits {
     safe: Option<Edge>,
     /// Since when the controller is not known to have it.
     pub unconfirmed_since: Option<Instant>,
+    /// When the controller showed it, and since when it was not known to have it then.
+    confirmed_at: Option<Instant>,
+    doubted_since: Option<Instant>,
 }
 
 #[derive(Debug, Clone)]
@@ -43,6 +49,8 @@ impl Bits {
             overdue_at: None,
             safe: None,
             unconfirmed_since: None,
+            confirmed_at: None,
+            doubted_since: None,
         }
     }
 
@@ -107,8 +115,19 @@ impl Bits {
 
     /// The controller shows this value.
     pub fn shown(&mut self, value: u8, now: Instant) {
-        if value == self.safe_value && self.unconfirmed_since.is_some_and(|at| now >= at + SHOWN_AFTER) {
-            self.unconfirmed_since = None;
+        match self.unconfirmed_since {
+            Some(at) if value == self.safe_value && now >= at + SHOWN_AFTER => {
+                (self.confirmed_at, self.doubted_since) = (Some(now), Some(at));
+                self.unconfirmed_since = None;
+            }
+            None if self.is_safe()
+                && value != self.safe_value
+                && self.confirmed_at.is_some_and(|at| now < at + DOUBT) =>
+            {
+                self.unconfirmed_since = self.doubted_since;
+                self.again();
+            }
+            _ => {}
         }
     }
 

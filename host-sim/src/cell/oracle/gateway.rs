@@ -172,10 +172,12 @@ impl Oracle {
             self.frames[nth].0 += 1;
             frames += 1;
             let commands_up = self.up.is_up(LinkId::COMMAND);
-            let urgent = self.orders.accepted(&self.sheet, nth, &frame, commands_up, now);
-            let orders = &self.orders;
-            self.robot.no_longer_asked(|order| orders.is_asked(order), now);
-            self.robot.asked(urgent);
+            if !frame.orders.is_empty() {
+                let urgent = self.orders.accepted(&self.sheet, nth, &frame, commands_up, now);
+                let orders = &self.orders;
+                self.robot.no_longer_asked(|order| orders.is_asked(order), now);
+                self.robot.asked(urgent);
+            }
             self.up.accepted(&self.sheet, nth, &frame, now);
             self.values_changed();
             newest = Some(frame);

@@ -80,6 +80,8 @@ pub enum Invariant {
     ValueAge,
     /// A command that the controller takes was picked, or asked for, not long ago.
     CommandAge,
+    /// No command that was picked before one that stops the robot arrives after it.
+    Overtaken,
     /// The controller understands every command that arrives.
     Understood,
     /// What stops the robot arrives as soon as a way to the controller works.
@@ -127,6 +129,7 @@ impl Invariant {
             Self::Registers => "registers",
             Self::ValueAge => "value-age",
             Self::CommandAge => "command-age",
+            Self::Overtaken => "stop-is-last",
             Self::Understood => "commands-understood",
             Self::StopArrives => "stop-arrives",
             Self::SafeArrives => "safe-arrives",
@@ -227,6 +230,8 @@ pub(super) struct Oracle {
     deaf_until: Option<Instant>,
     /// The gateway was just not called for a while, but did not sleep.
     after_stall: bool,
+    /// How much is remembered, at the newest look.
+    remembered: usize,
     /// Outputs since the newest input, and how many there may be.
     outputs: u32,
     most_outputs: u32,
@@ -258,6 +263,7 @@ impl Oracle {
             is_late: false,
             deaf_until: None,
             after_stall: false,
+            remembered: 0,
             outputs: 0,
             // A frame a port and id; opening or closing, and something to send, a link, and one more
             // command.
@@ -414,6 +420,8 @@ impl Oracle {
             Output::LinkClose { link } => self.link_lost(link, now),
             Output::LinkSend { link, bytes } => {
                 self.traffic[place(link)].0 += 1;
+                // What was handed over to a connection that is gone never leaves.
+                self.robot.hands_over_nothing();
                 if self.sheet.link(link).is_some_and(|link| !link.is_datagram) {
                     self.links[place(link)].hands_over(bytes);
                 }
@@ -446,7 +454,7 @@ impl Oracle {
             let result = self.nothing_waits(now);
             self.judge(now, &[Invariant::Delivered], result);
         }
-        let remembered = self.controller.size() + self.orders.len() + self.robot.len();
+        let remembered = self.remembered;
         let result = match (remembered, things) {
             (0..MOST_BYTES, 0..MOST_THINGS) => Ok(()),
             _ => Err((Invariant::Memory, format!("{remembered} bytes and {things} things wait in the cell"))),
@@ -474,7 +482,7 @@ const ASLEEP: Duration = Duration::from_millis(500);
 const MOST_BYTES: usize = 1 << 20;
 const MOST_THINGS: usize = 100_000;
 
-const ALL: [Invariant; 30] = [
+const ALL: [Invariant; 31] = [
     Invariant::Sent,
     Invariant::InTime,
     Invariant::FirstFrame,
@@ -494,6 +502,7 @@ const ALL: [Invariant; 30] = [
     Invariant::Registers,
     Invariant::ValueAge,
     Invariant::CommandAge,
+    Invariant::Overtaken,
     Invariant::Understood,
     Invariant::StopArrives,
     Invariant::SafeArrives,

@@ -207,6 +207,10 @@ impl Orders {
 
     /// Replies that the engine has taken.
     pub(super) fn look_at_replies(&mut self, engine: &Engine) {
+        if self.unanswered.is_empty() {
+            self.heard.iter_mut().for_each(String::clear);
+            return;
+        }
         for info in engine.links() {
             if info.id != LinkId::COMMAND && info.id != LinkId::URGENT {
                 continue;

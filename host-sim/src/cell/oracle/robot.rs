@@ -22,6 +22,8 @@ use crate::cell::traffic::USER_TIMEOUT;
 #[derive(Debug, Clone, Copy)]
 pub(in crate::cell) struct Path {
     pub link: LinkId,
+    /// Which connection it is, of those that are.
+    pub conn: Option<u64>,
     /// There is a connection, and what is sent gets there.
     pub is_sound: bool,
     /// The server there carries out and answers.
@@ -71,12 +73,19 @@ pub(super) struct Robot {
     values: Vec<(SysVar, Raw, Carried)>,
     order: Option<Errand>,
     roads: BTreeMap<u64, Road>,
-    datagrams: BTreeMap<u64, Parcel>,
-    tags: u64,
+    /// The newest ones; the first has this number.
+    datagrams: VecDeque<Parcel>,
+    first_tag: u64,
     demands: Vec<Demand>,
+    /// The newest command that stopped the robot.
+    stopped_by: Option<Order>,
     /// Since when each path has worked without a fault, and answered; by the link's place.
     sound: BTreeMap<LinkId, Instant>,
     served: BTreeMap<LinkId, Instant>,
+    conns: BTreeMap<LinkId, Option<u64>>,
+    all_sound_since: Option<Instant>,
+    /// When the controller began anew.
+    began_at: Option<Instant>,
     /// Since when the frames of each recipe link could be sent.
     ready: BTreeMap<LinkId, Instant>,
     /// When the gateway was not called.
@@ -89,6 +98,11 @@ pub(super) struct Robot {
 }
 
 impl Robot {
+    pub(super) fn hands_over_nothing(&mut self) {
+        self.values.clear();
+        self.order = None;
+    }
+
     pub(super) fn hands_over(&mut self, var: SysVar, raw: Raw, carried: Carried) {
         self.values.push((var, raw, carried));
     }
@@ -155,13 +169,27 @@ impl Robot {
         self.stalls.iter().map(part).fold(Duration::ZERO, |sum, part| sum + part)
     }
 
+    /// Whether the controller has begun anew since then, and the gateway must know.
+    fn has_begun_since(&self, then: Instant, now: Instant) -> bool {
+        let knows = self.all_sound_since.is_some_and(|since| now.saturating_since(since) > SAFE_ARRIVES);
+        knows && self.began_at.is_some_and(|began| began > then)
+    }
+
     /// A transmission is there: whether what it carries is young enough.
     fn judge(&mut self, parcel: &Parcel, slowest: Duration, now: Instant) -> Result<(), Wrong> {
         let network = parcel.slowest.max(slowest) + ALLOWANCE;
         // The system's own patience ends what an engine that is not called cannot.
         let stalled = self.stalled_since(parcel.sent_at, now).min(USER_TIMEOUT);
         for &(var, raw, carried) in &parcel.values {
-            let Carried::Of { arrived, timeout } = carried else { continue };
+            let (arrived, timeout) = match carried {
+                Carried::Safe => continue,
+                Carried::Held { accepted } if self.has_begun_since(accepted, now) => {
+                    let what = format!("{var} = {} is from before the controller began anew", show(var, raw));
+                    return Err((Invariant::NoReplay, what));
+                }
+                Carried::Held { .. } => continue,
+                Carried::Of { arrived, timeout } => (arrived, timeout),
+            };
             let (age, most) = (now.saturating_since(arrived), timeout + parcel.not_after + network + stalled);
             if age > most {
                 let what =
@@ -174,6 +202,14 @@ impl Robot {
             true => (unasked.unwrap_or(now), URGENT_TTL),
             false => (order.picked, COMMAND_TTL),
         };
+        let overtaken = self.stopped_by.as_ref().is_some_and(|stop| order.picked < stop.picked);
+        if overtaken && !order.is_urgent() {
+            let what = format!("{} comes behind what stopped the robot, and was picked before", order.text);
+            return Err((Invariant::Overtaken, what));
+        }
+        if order.is_urgent() {
+            self.stopped_by = Some(order.clone());
+        }
         let (age, most) = (now.saturating_since(since), most + network + stalled);
         if age > most {
             let what = format!("{} comes {age} after it was wanted, {most} at most", order.text);
@@ -192,12 +228,14 @@ impl Robot {
                 self.foreign.insert(at, now);
             }
         }
-        self.inputs = before.to_vec();
+        self.inputs.clear();
+        self.inputs.extend_from_slice(before);
     }
 
     pub(super) fn applied(&mut self, before: &[u8], after: &[u8], now: Instant) {
         self.look_for_foreign(before, now);
-        self.inputs = after.to_vec();
+        self.inputs.clear();
+        self.inputs.extend_from_slice(after);
     }
 
     pub(super) fn len(&self) -> usize {
@@ -295,13 +333,13 @@ impl Oracle {
     ) -> u64 {
         self.controller.sent_datagram(u64::from(link.0), bytes);
         let parcel = self.robot.parcel(&self.sheet, link, slowest, now);
-        self.robot.tags += 1;
-        let tag = self.robot.tags;
-        self.robot.datagrams.insert(tag, parcel);
-        while self.robot.datagrams.len() > DATAGRAMS {
-            self.robot.datagrams.pop_first();
+        let Robot { datagrams, first_tag, .. } = &mut self.robot;
+        datagrams.push_back(parcel);
+        if datagrams.len() > DATAGRAMS {
+            datagrams.pop_front();
+            *first_tag += 1;
         }
-        tag
+        *first_tag + datagrams.len() as u64 - 1
     }
 
     /// The controller has not understood what came on a connection of port 2000.
@@ -337,7 +375,8 @@ impl Oracle {
     }
 
     pub(super) fn datagram_came(&mut self, tag: u64, slowest: Duration, now: Instant) {
-        if let Some(parcel) = self.robot.datagrams.get(&tag).cloned() {
+        let nth = tag.checked_sub(self.robot.first_tag).map(|nth| nth as usize);
+        if let Some(parcel) = nth.and_then(|nth| self.robot.datagrams.get(nth)).cloned() {
             self.judge_parcel(&parcel, slowest, now);
         }
     }
@@ -346,6 +385,7 @@ impl Oracle {
         self.checks[Invariant::ValueAge as usize] += parcel.values.len() as u64;
         self.checks[Invariant::CommandAge as usize] += u64::from(parcel.order.is_some());
         self.checks[Invariant::Understood as usize] += u64::from(parcel.order.is_some());
+        self.checks[Invariant::Overtaken as usize] += u64::from(parcel.order.is_some());
         let result = self.robot.judge(parcel, slowest, now);
         self.judge(now, &[], result);
     }
@@ -365,6 +405,8 @@ impl Oracle {
     pub(in crate::cell) fn controller_began(&mut self, now: Instant) {
         self.robot.inputs.clear();
         self.robot.foreign.clear();
+        self.robot.began_at = Some(now);
+        self.robot.all_sound_since = None;
         self.robot.disturbed(now);
     }
 
@@ -385,7 +427,12 @@ impl Oracle {
         if self.violation.is_some() {
             return;
         }
+        self.remembered = self.controller.size() + self.orders.len() + self.robot.len();
         for path in paths {
+            if self.robot.conns.insert(path.link, path.conn) != Some(path.conn) {
+                self.robot.sound.remove(&path.link);
+                self.robot.served.remove(&path.link);
+            }
             note(&mut self.robot.sound, path.link, path.is_sound, now);
             note(&mut self.robot.served, path.link, path.is_sound && path.is_served, now);
         }
@@ -397,7 +444,8 @@ impl Oracle {
         let result = self.robot.stops(&self.orders, now);
         self.checks[Invariant::StopArrives as usize] += *result.as_ref().unwrap_or(&1);
         self.judge(now, &[], result.map(drop));
-        if let Some(all) = self.robot.all_sound(paths) {
+        self.robot.all_sound_since = self.robot.all_sound(paths);
+        if let Some(all) = self.robot.all_sound_since {
             let result = self.robot.safe_values(&self.sheet, &self.up, all, now);
             self.checks[Invariant::SafeArrives as usize] += *result.as_ref().unwrap_or(&1);
             self.judge(now, &[], result.map(drop));

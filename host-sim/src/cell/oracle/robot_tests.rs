@@ -6,10 +6,12 @@ use proto_core::sysvar::SysVar;
 use proto_core::time::{Duration, Instant};
 
 use super::tests::{CELL, DEVICE, cell, coils, frame, is_rest, modbus};
+use super::upward::Carried;
 use super::*;
 use crate::cell::network::Speaker;
 use crate::cell::tamper::{Forged, Outward};
 use crate::cell::{Cell, LineId, Talker, Way};
+use crate::config::file::{self, Text};
 use crate::soak::Scenario;
 
 /// A panel that starts and stops, a value with a safe one.
@@ -364,4 +366,50 @@ fn a_driver_that_answers_a_stranger() {
         cell.gate(link).partner = Some(Speaker::Stranger);
     }
     assert_eq!(broken(&cell), Invariant::Destination);
+}
+
+/// Forces of a sensor without safe values, in one frame with outputs of another device.
+fn two_clients_without_safe_forces() -> Cell {
+    let toml = include_str!("../../soak/cells/two-clients.toml");
+    let toml: String =
+        toml.lines().filter(|line| !line.contains("] = 0.0")).map(|line| format!("{line}\n")).collect();
+    let gateway = file::parse_gateway(Text { name: "two-clients.toml", toml: &toml }, &[]).unwrap();
+    let scenario = Scenario::named("two-clients").unwrap().unwrap();
+    let mut cell = Cell::new(&gateway, &scenario.controller, 1).unwrap();
+    cell.watch();
+    cell
+}
+
+#[test]
+fn a_held_value_from_before_the_controller_began_anew() {
+    let mut cell = two_clients_without_safe_forces();
+    cell.run_ms(1_000);
+    let line = cell.line_of("sensor");
+    let forces: Vec<u8> = [7.5_f32; 6].iter().flat_map(|value| value.to_le_bytes()).collect();
+    cell.send(line, &[&[0x48, 0xAA], &forces[..], &[0x0D, 0x0A]].concat());
+    cell.run_ms(1_000);
+    cell.restart_controller();
+    cell.run_ms(3_000);
+    let held = Carried::Held { accepted: cell.now() - Duration::from_secs(4) };
+    let mut oracle = cell.oracle.take().unwrap();
+    let now = cell.now();
+    oracle.robot.hands_over(SysVar::parse("ForceEnd[1]").unwrap(), 7.5_f32.to_le_bytes(), held);
+    oracle.sent(7, LinkId::of_port(PortId(0)), b"frame", Duration::ZERO, now);
+    oracle.came(7, 5, Duration::ZERO, now);
+    assert_eq!(oracle.violation().map(|broken| broken.invariant), Some(Invariant::NoReplay));
+}
+
+#[test]
+fn a_command_that_comes_behind_the_stop_that_overtook_it() {
+    let (mut cell, line) = ready(PANEL, &panel(0, 1));
+    cell.tamper(None, never_closes(LinkId::COMMAND));
+    cell.cut_way(LinkId::COMMAND, Way::Up);
+    cell.send(line, &panel(1, 1));
+    cell.run_ms(100);
+    cell.send(line, &panel(9, 1));
+    cell.run_ms(300);
+    assert_eq!(cell.violation(), None);
+    cell.mend_way(LinkId::COMMAND, Way::Up);
+    cell.run_ms(300);
+    assert_eq!(broken(&cell), Invariant::Overtaken);
 }

@@ -53,8 +53,8 @@ impl Known {
 pub(super) enum Carried {
     /// It is a safe value.
     Safe,
-    /// The controller holds it already, as far as anybody knows.
-    Held,
+    /// The controller holds it already, as far as anybody knows, since its silent owner's last frame.
+    Held { accepted: Instant },
     /// It came then, in its owner's frame or from the state stream, and may be so old when it is
     /// handed over.
     Of { arrived: Instant, timeout: Duration },
@@ -392,7 +392,7 @@ impl Upward {
             });
         }
         if var.stream().is_none() {
-            return Ok(Carried::Held);
+            return Ok(known.accepted.map_or(Carried::Safe, |accepted| Carried::Held { accepted }));
         }
         if known.unreadable {
             let what = format!("{var} = {} was written back, and cannot be read now", value());
