@@ -413,3 +413,87 @@ fn a_command_that_comes_behind_the_stop_that_overtook_it() {
     cell.run_ms(300);
     assert_eq!(broken(&cell), Invariant::Overtaken);
 }
+
+const WITNESS: &str = r#"
+[controller]
+address = "127.0.0.1"
+recipe_link = { udp = 2011, recipe = "up" }
+
+[[recipe]]
+name = "up"
+kind = "stream"
+mode = "realtime"
+[recipe.input]
+head = [1]
+fields = ["DigitalOutputCommand[1]"]
+
+[[recipe]]
+name = "device"
+kind = "stream"
+mode = "realtime"
+[recipe.input]
+head = [1]
+fields = ["DigitalOutputCommand[1]"]
+[recipe.output]
+head = [1]
+fields = ["DigitalSignalStatus[4]"]
+
+[[port]]
+name = "device"
+bus = "rs485"
+recipe = "device"
+cycle_ms = 100
+timeout_ms = 100
+[port.on_timeout]
+"DigitalOutputCommand[1]" = 128
+"#;
+
+#[test]
+fn explore_witness() {
+    let gateway = file::parse_gateway(Text { name: "x", toml: WITNESS }, &[]).unwrap();
+    let controller = r#"
+[listen]
+address = "127.0.0.1"
+[[recipe]]
+name = "up"
+kind = "stream"
+mode = "realtime"
+[recipe.input]
+head = [1]
+fields = ["DigitalOutputCommand[1]"]
+[[port]]
+name = "udp2011"
+bus = "udp-server"
+recipe = "up"
+"#;
+    let controller = file::parse_controller(Text { name: "y", toml: controller }, &[]).unwrap();
+    for offset in 0..60 {
+        let mut cell = Cell::new(&gateway, &controller, 1).unwrap();
+        cell.watch();
+        cell.run_ms(1_000);
+        let line = cell.line_of("device");
+        let go = |cell: &mut Cell, bits, n| {
+            for _ in 0..n {
+                cell.send(line, &[1, bits]);
+                cell.run_ms(50);
+            }
+        };
+        go(&mut cell, 128, 10);
+        cell.run_ms(offset * 10);
+        cell.send(line, &[1, 128]);
+        cell.controller_mut().delay_answers(crate::controller::Link::Modbus, Duration::from_millis(480));
+        cell.run_ms(90);
+        go(&mut cell, 5, 1);
+        cell.cut_way(LinkId::RECIPE_UDP, Way::Up);
+        cell.run_ms(600);
+        cell.controller_mut().delay_answers(crate::controller::Link::Modbus, Duration::ZERO);
+        cell.mend_way(LinkId::RECIPE_UDP, Way::Up);
+        cell.run_ms(4_000);
+        println!(
+            "{offset} {} {:?}",
+            cell.value("DigitalOutputCommand[1]"),
+            cell.violation().map(|v| v.invariant)
+        );
+    }
+    panic!();
+}
