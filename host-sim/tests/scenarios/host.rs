@@ -193,7 +193,7 @@ impl Gateway for HostGateway {
 
     #[track_caller]
     fn freeze(&self) {
-        self.host_sim.program.signal(Signal::STOP);
+        self.host_sim.program.freeze();
     }
 
     #[track_caller]

@@ -156,6 +156,21 @@ impl Program {
         rustix::process::kill_process(self.pid(), signal).unwrap();
     }
 
+    /// Stops it, and returns once none of its threads runs.
+    #[track_caller]
+    pub(crate) fn freeze(&self) {
+        self.signal(Signal::STOP);
+        let tasks = format!("/proc/{}/task", self.pid().as_raw_pid());
+        until("all threads are stopped", || {
+            let mut tasks = std::fs::read_dir(&tasks).unwrap();
+            let is_stopped = |task: std::io::Result<std::fs::DirEntry>| {
+                let stat = std::fs::read_to_string(task.unwrap().path().join("stat")).unwrap();
+                stat.rsplit_once(") ").is_some_and(|(_, state)| state.starts_with('T'))
+            };
+            tasks.all(is_stopped).then_some(())
+        });
+    }
+
     /// Ends it as a person would; it must end well.
     #[track_caller]
     pub(crate) fn interrupt(&mut self) {

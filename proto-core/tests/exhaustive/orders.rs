@@ -39,7 +39,7 @@ struct Asked {
     link: LinkId,
     order: Order,
     picked: Picked,
-    at: Instant,
+    answer_by: Instant,
 }
 
 #[derive(Debug, Clone)]
@@ -110,14 +110,11 @@ impl Orders {
     /// Deadlines pass.
     pub fn deadlines(&mut self, now: Instant, conns: &mut Conns) {
         for link in [LinkId::URGENT, LinkId::COMMAND] {
-            let is_asked = |asked: &Asked| asked.link == link && now >= asked.at + REPLY;
-            if self.asked.iter().any(is_asked) || conns.overdue(now).contains(&link) {
+            let unanswered = self.asked.iter().any(|asked| asked.link == link && now >= asked.answer_by);
+            if unanswered || conns.overdue(now).contains(&link) {
                 conns.must_close(now, link);
                 self.lost(link, now);
             }
-        }
-        // What becomes of the first says what it means for the second.
-        for link in [LinkId::COMMAND, LinkId::URGENT] {
             if conns.not_opened(now).contains(&link) {
                 conns.must_close(now, link);
                 match link {
@@ -143,8 +140,7 @@ impl Orders {
         let (gone, asked) = std::mem::take(&mut self.asked).into_iter().partition(|asked| asked.link == link);
         self.asked = asked;
         let gone: Vec<Asked> = gone;
-        // Of two, the newer one waits again.
-        for asked in gone.into_iter().rev() {
+        for asked in gone {
             if asked.order == Order::Stop && self.is_asked() {
                 self.stop.get_or_insert(Picked { since: now, ..asked.picked });
             } else {
@@ -198,6 +194,7 @@ impl Orders {
         now: Instant,
     ) -> Result<Instant, Broken> {
         let is_stopping = self.is_stopping();
+        let answer_by = now + REPLY;
         if text.starts_with(b"run") {
             if self.runs.is_empty() {
                 return Err("runs, and nobody asked for it".to_owned());
@@ -213,18 +210,16 @@ impl Orders {
             if link != LinkId::COMMAND || !self.asked.is_empty() {
                 return Err(format!("runs by {link:?} while {:?} is unanswered", self.asked));
             }
-            self.asked.push(Asked { link, order: Order::Run, picked, at: now });
+            self.asked.push(Asked { link, order: Order::Run, picked, answer_by });
             return Ok(until);
         }
-        // A line feed ends a keyword that is unanswered, so that the controller takes them for two.
-        let is_beside = self.unanswered(link).any(|order| order == Order::Stop);
-        if text != if is_beside { &b"\nstop"[..] } else { &b"stop"[..] } {
+        if text != b"stop" {
             return Err(format!("commands {text:?}"));
         }
         let Some(picked) = self.stop.take() else {
             return Err("stops, and nobody asked for it".to_owned());
         };
-        if self.stop_is_under_way(now) {
+        if self.stop_is_under_way() {
             return Err("stops twice at once".to_owned());
         }
         if link == LinkId::COMMAND && self.is_free(LinkId::URGENT, conns) {
@@ -236,7 +231,7 @@ impl Orders {
             conns.must_close(now, LinkId::COMMAND);
             self.lost(LinkId::COMMAND, now);
         }
-        self.asked.push(Asked { link, order: Order::Stop, picked, at: now });
+        self.asked.push(Asked { link, order: Order::Stop, picked, answer_by });
         Ok(now + SOON)
     }
 
@@ -253,19 +248,15 @@ impl Orders {
         self.settle(asked.picked.nth, if is_done { ReplyCode::Success } else { ReplyCode::Fail });
     }
 
-    /// Nothing waits that can go; and the engine is called when something can.
-    pub fn rested(&self, conns: &Conns, now: Instant, until: Instant) -> Result<(), Broken> {
+    /// Nothing waits that can go.
+    pub fn rested(&self, conns: &Conns) -> Result<(), Broken> {
         let free = |link| self.is_free(link, conns);
         let command = conns.of(LinkId::COMMAND);
         // Beside a command that waits for its reply, but not with two that are not acknowledged.
-        let is_beside_free = self.unanswered(LinkId::COMMAND).count() < 2 && command.under_way.len() < 2;
-        let has_way = free(LinkId::URGENT) || command.is_free() && is_beside_free;
-        if self.stop.is_some() && has_way && !self.stop_is_under_way(now) {
+        let beside = command.is_free() && command.under_way.len() < 2;
+        let has_way = free(LinkId::URGENT) || beside;
+        if self.stop.is_some() && !self.stop_is_under_way() && has_way {
             return Err("lets a stop wait".to_owned());
-        }
-        let before = until - Duration::from_micros(1);
-        if self.stop.is_some() && has_way && !self.stop_is_under_way(before) {
-            return Err("sleeps longer than a stop has to wait".to_owned());
         }
         if !self.runs.is_empty() && !self.is_stopping() && free(LinkId::COMMAND) {
             return Err("lets a command wait though the link is free".to_owned());
@@ -288,13 +279,12 @@ impl Orders {
         }
     }
 
-    /// A stop is on its way or being carried out, and not yet for so long that nobody knows.
-    fn stop_is_under_way(&self, now: Instant) -> bool {
-        self.asked.iter().any(|asked| asked.order == Order::Stop && now < asked.at + SOON)
+    fn stop_is_under_way(&self) -> bool {
+        self.asked.iter().any(|asked| asked.order == Order::Stop)
     }
 
     fn is_stopping(&self) -> bool {
-        self.stop.is_some() || self.asked.iter().any(|asked| asked.order == Order::Stop)
+        self.stop.is_some() || self.stop_is_under_way()
     }
 
     fn drop_runs(&mut self) {

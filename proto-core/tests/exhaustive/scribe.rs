@@ -123,8 +123,7 @@ enum Kind {
 }
 
 const NEVER: u64 = u64::MAX;
-/// What the engine asks of a link that was lost: was another lost within this time? And of a command
-/// that is unanswered: has it been so for as long?
+/// What the engine asks of a link that was lost: was another lost within this time?
 const TOGETHER: u64 = 1_000_000;
 /// And had it been up for this long?
 const SETTLED: u64 = 5_000_000;
@@ -189,8 +188,8 @@ impl Scribe {
         }
         let ago = self.now.saturating_sub(at);
         let ago = match (self.field, self.kind()) {
-            // When a command was sent: one that stops is sent again behind it a second later.
-            (Field::At, Kind::Sent) => ago.min(TOGETHER + 1),
+            // Only measured.
+            (Field::At, Kind::Sent) => return,
             // Silence of a line counts for partial frames, and before sending where one has to wait.
             (Field::Heard, Kind::Line) => return,
             (Field::Heard, _) if self.silence_is_normal => return,
