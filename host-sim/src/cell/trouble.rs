@@ -201,7 +201,7 @@ pub struct Trouble {
 
 impl Trouble {
     /// Faults of these kinds, one each `pause` on average, from now on. A fault that lasts does so
-    /// for up to `pause` as well.
+    /// for up to `pause` as well, an outage for up to twenty times as long.
     pub fn new(cell: &mut Cell, kinds: &[TroubleKind], pause: Duration) -> Self {
         let mut trouble = Self {
             rng: cell.fork_rng(),
@@ -282,6 +282,7 @@ impl Trouble {
         let tcp: Vec<LinkId> = cell.tcp_links().collect();
         let mut tcp = || pick(rng, tcp.iter().copied());
         let mut lasts = None;
+        let most = self.pause.saturating_mul(LONGEST);
         let remedy = match kind {
             TroubleKind::Refused => {
                 let link = tcp()?;
@@ -455,14 +456,15 @@ impl Trouble {
             }
             TroubleKind::GatewaySleep => {
                 let longest = Duration::from_secs(20);
-                let span = longer_and_rarer(rng, Duration::from_millis(501), 5).min(longest);
+                let shortest = Duration::from_millis(501);
+                let span = longer_and_rarer(rng, shortest, 5).min(longest.min(most)).max(shortest);
                 lasts = Some(span);
                 cell.stall_gateway(span);
                 Some(Remedy::Wake)
             }
         };
         if let Some(remedy) = remedy {
-            let lasts = lasts.unwrap_or_else(|| self.rng.up_to(self.pause));
+            let lasts = lasts.map_or_else(|| self.rng.up_to(self.pause), |lasts| lasts.min(most));
             let until = cell.now() + lasts;
             self.remedies.push((until, kind, remedy));
         }
@@ -535,6 +537,8 @@ fn longer_and_rarer(rng: &mut Rng, shortest: Duration, doublings: u64) -> Durati
     least + rng.up_to(least)
 }
 
+/// No fault lasts longer than so many pauses.
+const LONGEST: u64 = 20;
 /// One pause of so many is a long one.
 const CALM: u64 = 20;
 

@@ -81,7 +81,7 @@ fn shown(soak: &Soak, entry: &Entry) -> String {
     let bytes = &entry.bytes[..];
     let says = match (entry.what, link_of(soak, entry)) {
         (What::Remark | What::Fault, _) => return String::from_utf8_lossy(bytes).into_owned(),
-        (What::LinkSent | What::LinkReceived, Some(LinkKind::Command)) => {
+        (What::LinkSent | What::LinkReceived, Some(LinkKind::Command | LinkKind::Urgent)) => {
             return format!("\"{}\"", bytes.escape_ascii());
         }
         (What::LinkSent, Some(LinkKind::Modbus)) => request(bytes),
