@@ -29,6 +29,8 @@ pub const COMMAND_QUEUE: usize = 8;
 const COMMAND_TTL: Duration = Duration::from_secs(1);
 /// Two losses of the second connection within this time: the controller takes only one (D26).
 const STRIKES_WITHIN: Duration = Duration::from_secs(10);
+/// A connection that was given up to make way for a stop is open again by then, or another is given up.
+const WAY_MADE_WITHIN: Duration = Duration::from_millis(500);
 /// What is lost this soon after something else is lost for the same reason.
 const TOGETHER: Duration = Duration::from_secs(1);
 
@@ -72,6 +74,8 @@ pub(super) struct CommandLink {
     overtaken: usize,
     /// When the second connection, or the first because of it, was lost last.
     struck_at: Option<Instant>,
+    /// When no further connection is given up for a stop that has nowhere to go.
+    way_made_until: Instant,
 }
 
 impl Tables {
@@ -111,6 +115,7 @@ impl CommandLink {
             stops: Stops::new(),
             overtaken: 0,
             struck_at: None,
+            way_made_until: Instant::ZERO,
         })
     }
 
@@ -249,7 +254,7 @@ impl CommandLink {
     fn lost(&mut self, link: LinkId, ports: &mut [FieldPort], now: Instant) {
         let Some(session) = self.session(link) else { return };
         let [first, beside] = session.lost();
-        for sent in [beside, first].into_iter().flatten() {
+        for sent in [first, beside].into_iter().flatten() {
             if sent.keyword.is_urgent() && self.is_asked(&sent.command) {
                 self.stops.push_again(sent.keyword, Waiting { since: now, ..sent.command });
             } else {
@@ -311,6 +316,16 @@ impl CommandLink {
                 session.supervisor.give_up(now);
                 self.lost(link, ports, now);
             }
+        }
+        if let Some((link, at)) = self.crowded()
+            && now >= at
+        {
+            // Nobody answers there: it is open again sooner than a reply can be hoped for.
+            if let Some(session) = self.session(link) {
+                session.supervisor.give_up(now);
+            }
+            self.lost(link, ports, now);
+            self.way_made_until = now + WAY_MADE_WITHIN;
         }
         // What becomes of the first may open the second at once.
         for link in [LinkId::COMMAND, LinkId::URGENT] {
@@ -392,13 +407,28 @@ impl CommandLink {
     /// controller has done anything with that one is not known.
     fn pop_stop(&mut self, now: Instant) -> Option<(Keyword, Waiting)> {
         let sessions = [Some(&self.ordinary), self.urgent.as_ref()];
-        let under_way = |keyword| {
-            let same = |sent: &Option<Sent>| {
-                sent.is_some_and(|sent| sent.keyword == keyword && now < sent.at + STOP_TTL)
-            };
-            sessions.into_iter().flatten().any(|session| same(&session.in_flight) || same(&session.beside))
-        };
-        self.stops.pop(|keyword| !under_way(keyword))
+        self.stops.pop(|keyword| may_go_at(sessions, keyword) <= now)
+    }
+
+    /// When one of the urgent commands that wait may go, its way apart.
+    fn stop_may_go_at(&self) -> Instant {
+        let sessions = [Some(&self.ordinary), self.urgent.as_ref()];
+        self.stops.kinds().map(|keyword| may_go_at(sessions, keyword)).min().unwrap_or(Instant::NEVER)
+    }
+
+    /// Where an urgent command waits for nothing but replies, and when it has done so for long enough:
+    /// the connection whose newest one has been unanswered for longest.
+    fn crowded(&self) -> Option<(LinkId, Instant)> {
+        let has_room = self.ordinary.supervisor.is_up() && self.ordinary.beside.is_none();
+        if has_room || self.stops.is_empty() || self.way_of_stops().is_some() {
+            return None;
+        }
+        // Nothing is under way on a connection that is not up.
+        let urgent = self.urgent.as_ref().and_then(|session| session.in_flight);
+        let urgent = urgent.map(|sent| (LinkId::URGENT, sent.at));
+        let ordinary = self.ordinary.beside.map(|sent| (LinkId::COMMAND, sent.at));
+        let (link, at) = urgent.into_iter().chain(ordinary).min_by_key(|&(_, at)| at)?;
+        Some((link, (at + STOP_TTL).max(self.stop_may_go_at()).max(self.way_made_until)))
     }
 
     fn send(
@@ -445,8 +475,20 @@ impl CommandLink {
         let sessions = [Some(&self.ordinary), self.urgent.as_ref()].into_iter().flatten();
         let own = sessions.map(|session| session.deadline().min(session.supervisor.deadline()));
         let waiting = self.queue.front().map_or(Instant::NEVER, |waiting| waiting.since + COMMAND_TTL);
-        let stops = self.stops.deadline(|waiting| self.is_asked(waiting));
+        let stops = match self.stops.is_empty() {
+            true => Instant::NEVER,
+            false => self.stops_deadline(),
+        };
         own.min().unwrap_or(Instant::NEVER).min(waiting).min(stops)
+    }
+
+    #[inline(never)]
+    fn stops_deadline(&self) -> Instant {
+        let goes_at = match self.way_of_stops() {
+            Some(_) => self.stop_may_go_at(),
+            None => self.crowded().map_or(Instant::NEVER, |(_, at)| at),
+        };
+        goes_at.min(self.stops.deadline(|waiting| self.is_asked(waiting)))
     }
 
     fn session(&mut self, link: LinkId) -> Option<&mut Session> {
@@ -479,6 +521,13 @@ impl CommandLink {
             }
         }
     }
+}
+
+/// When an urgent command may be sent though one of its kind is unanswered.
+fn may_go_at(sessions: [Option<&Session>; 2], keyword: Keyword) -> Instant {
+    let sent = sessions.into_iter().flatten().flat_map(|session| [session.in_flight, session.beside]);
+    let same = sent.flatten().filter(|sent| sent.keyword == keyword);
+    same.map(|sent| sent.at + STOP_TTL).max().unwrap_or(Instant::ZERO)
 }
 
 fn is_asked(fields: &[CommandField], tables: &Tables, waiting: &Waiting) -> bool {

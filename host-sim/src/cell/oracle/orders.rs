@@ -155,11 +155,10 @@ impl Orders {
         let gone: Vec<Order> =
             self.unanswered.iter().filter(|(on, _)| *on == link).map(|(_, order)| order.clone()).collect();
         self.unanswered.retain(|(on, _)| *on != link);
-        // The one that was sent last waits behind the one before it.
-        for order in gone.into_iter().rev() {
+        for order in gone {
             let waits = self.stops.iter().any(|other| other.same_kind(&order));
             if order.is_urgent() && self.is_asked(&order) && !waits {
-                self.stops.insert(0, Order { since: now, ..order });
+                self.stops.push(Order { since: now, ..order });
             }
         }
         if link == LinkId::COMMAND {
