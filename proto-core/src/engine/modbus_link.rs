@@ -398,6 +398,7 @@ fn take_poll<const PORTS: usize>(
         }
     }
     store.image.stamp(block.group, now);
+    store.doubt_by_witnesses(now);
 }
 
 fn bits_at(coils: Coils<'_>, first: u16, count: u16, block: &Block) -> Option<Scalar> {

@@ -4,7 +4,7 @@ use heapless::Vec;
 
 use super::counters::{LinkCounters, add, bump};
 use super::field_port::Look;
-use super::store::Store;
+use super::store::{Store, is_gap};
 use crate::image::{GroupId, InputSet};
 use crate::link::{LinkTimings, Supervisor};
 use crate::sysvar::{COUNT, SysVar};
@@ -80,6 +80,9 @@ impl StateLink {
                     if !store.safe.is_empty() {
                         compare_safe(&view, store, now);
                     }
+                    if is_gap(store.image.stamp_of(self.group), now) {
+                        store.no_longer_held();
+                    }
                     store.image.stamp(self.group, now);
                     if look == Look::AtEach {
                         // They are counted when they are taken.
@@ -104,10 +107,11 @@ impl StateLink {
 fn compare_safe<const PORTS: usize>(view: &StateView<'_>, store: &mut Store<PORTS>, now: Instant) {
     let (may_confirm, may_doubt) = (store.may_confirm(now), store.may_doubt(now));
     for var in store.safe.iter() {
-        let is_shown = view.read_var(var) == Some(store.image.value(var));
+        let Some(shown) = view.read_var(var) else { continue };
+        let is_there = shown == store.image.value(var);
         match store.unconfirmed.contains(var) {
-            true if is_shown && may_confirm => store.confirm(&InputSet::from_iter([var]), now),
-            false if !is_shown && may_doubt => store.doubt(var),
+            true if is_there && may_confirm => store.confirm(&InputSet::from_iter([var]), now),
+            false if !is_there && may_doubt => store.doubt(var),
             _ => {}
         }
     }

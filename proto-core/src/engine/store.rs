@@ -65,6 +65,8 @@ pub(super) struct Store<const PORTS: usize> {
     pub unanswered: InputSet,
     /// Variables that the state stream has brought since their owner fell silent, or ever.
     pub read_back: InputSet,
+    /// Variables whose owner fell silent, of which the controller has had the last value ever since.
+    held: InputSet,
     /// Variables whose link is up.
     pub reachable: InputSet,
     /// Values dropped with a link, a port.
@@ -90,6 +92,7 @@ impl<const PORTS: usize> Store<PORTS> {
             confirmed_at: Instant::ZERO,
             unanswered: InputSet::EMPTY,
             read_back: InputSet::EMPTY,
+            held: InputSet::EMPTY,
             reachable: InputSet::EMPTY,
             lost: [0; PORTS],
             has_lost: false,
@@ -108,6 +111,7 @@ impl<const PORTS: usize> Store<PORTS> {
         let (set, port) = (frame.set, usize::from(frame.port));
         self.image.stamp(GroupId(nth as u8), now);
         self.live = self.live.or(&set);
+        self.held = self.held.minus(&set);
         if !self.safe.and(&set).is_empty() {
             // Safe values that still wait grow old from now on, and may be too old already.
             self.next_expiry = now;
@@ -149,6 +153,7 @@ impl<const PORTS: usize> Store<PORTS> {
                 dropped = dropped.saturating_add(self.outbox.forget(queue, &InputSet::from_iter([var])));
                 self.live.remove(var);
                 self.read_back.remove(var);
+                self.held.insert(var);
                 continue;
             };
             let place = self.image.bytes_mut().get_mut(var.image_offset()..);
@@ -244,12 +249,37 @@ impl<const PORTS: usize> Store<PORTS> {
         now < self.confirmed_at + DOUBT
     }
 
+    /// Outputs that came just now show another value than the safe one.
+    pub(super) fn doubt_by_witnesses(&mut self, now: Instant) {
+        if !self.may_doubt(now) {
+            return;
+        }
+        for var in self.safe.minus(&self.unconfirmed).and(&InputSet::BYTES).iter() {
+            if let Some(witness) = var.shown_by()
+                && self.image.known_since(witness) == Some(now)
+                && self.image.value(witness) != self.image.value(var)
+            {
+                self.doubt(var);
+            }
+        }
+    }
+
     /// The controller does not have a safe value that a recipe link has sent.
     pub(super) fn doubt(&mut self, var: SysVar) {
         if self.unanswered.contains(var) {
             self.unconfirmed.insert(var);
             self.again(&InputSet::from_iter([var]));
         }
+    }
+
+    /// Whether the variable's last value can be sent once more, long after its owner fell silent.
+    pub(super) fn is_held(&self, var: SysVar) -> bool {
+        self.held.contains(var)
+    }
+
+    /// The controller may have started anew: what it held is gone, or another's by now.
+    pub(super) fn no_longer_held(&mut self) {
+        self.held = InputSet::EMPTY;
     }
 
     /// The controller may have started anew: safe values are written once more.
@@ -285,6 +315,14 @@ impl<const PORTS: usize> Store<PORTS> {
 const SHOWN_AFTER: Duration = Duration::from_millis(200);
 /// For so long a packet of the state stream may come late: one that is silent for 2 s is reopened.
 const DOUBT: Duration = Duration::from_secs(3);
+
+/// What the controller sends steadily and has not sent for so long: it may have been away since.
+const AWAY_AFTER: Duration = Duration::from_millis(500);
+
+/// Whether what came last is so long ago, or nothing ever did, that the controller may be another by now.
+pub(super) fn is_gap(last: Option<Instant>, now: Instant) -> bool {
+    last.is_none_or(|at| now.saturating_since(at) > AWAY_AFTER)
+}
 
 /// When a value that waits since `at` has waited longer than `timeout`.
 fn too_old_at(at: Instant, timeout: Duration) -> Instant {

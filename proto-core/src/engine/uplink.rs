@@ -8,7 +8,7 @@ use super::field_port::Look;
 use super::flight::Flight;
 use super::io::{LinkId, LinkKind};
 use super::outbox::BIT_VARS;
-use super::store::Store;
+use super::store::{Store, is_gap};
 use crate::image::{GroupId, Image, InputSet};
 use crate::link::Supervisor;
 use crate::recipe::PlacedField;
@@ -26,8 +26,6 @@ const REPEAT_SLOWLY: Duration = Duration::from_millis(100);
 const REPEAT_FAST: Duration = Duration::from_secs(1);
 /// Frames that the peer's transport has not acknowledged: what is sent in 250 ms, every 4 ms.
 const MOST_UNACKNOWLEDGED: usize = 64;
-/// A stream of frames that was silent for so long comes from a controller that was away.
-const AWAY_AFTER: Duration = Duration::from_millis(500);
 /// The UDP server streams to whoever sent it something (D24); asked again when nothing comes.
 const GREET_EVERY: Duration = Duration::from_millis(500);
 /// The server may forget whom it has not heard for 60 s (D30).
@@ -193,10 +191,14 @@ impl Uplink {
         }
         if fresh {
             let before = store.image.stamp_of(group);
-            if !store.safe.is_empty() && before.is_some_and(|at| now.saturating_since(at) > AWAY_AFTER) {
-                store.controller_was_away(now);
+            if is_gap(before, now) {
+                store.no_longer_held();
+                if before.is_some() && !store.safe.is_empty() {
+                    store.controller_was_away(now);
+                }
             }
             store.image.stamp(group, now);
+            store.doubt_by_witnesses(now);
             if self.greets() {
                 self.greet_at = now + GREET_EVERY;
             }
@@ -267,13 +269,15 @@ impl Uplink {
         if others.is_empty() {
             return true;
         }
-        let read_back = state
-            .and_then(|group| store.image.stamp_of(group))
-            .is_some_and(|at| now.saturating_since(at) <= READ_BACK_MAX_AGE);
+        let stamp_of = |group: Option<GroupId>| group.and_then(|group| store.image.stamp_of(group));
+        let read_back = stamp_of(state).is_some_and(|at| now.saturating_since(at) <= READ_BACK_MAX_AGE);
+        // Without a connection, only what comes down tells that the controller has been there all along.
+        let is_there = self.framing == Framing::Bytes
+            || !is_gap(stamp_of(self.group), now)
+            || !is_gap(stamp_of(state), now);
         others.iter().all(|var| match var.stream() {
             Some(_) => read_back && store.read_back.contains(var),
-            // Never read back: only held values of an owner that has fallen silent may be repeated.
-            None => store.image.is_known(var),
+            None => is_there && store.is_held(var),
         })
     }
 
