@@ -9,12 +9,20 @@ use proto_core::time::{Duration, Instant};
 
 use super::Invariant;
 use super::field::{Accepted, show};
-use super::sheet::{Origin, Owned, Raw, Sheet};
+use super::sheet::{LinkSheet, Origin, Owned, Raw, Sheet};
 
 /// Values that wait behind the next ones, a port.
 const EDGES: usize = 16;
 /// How old a read-back value may be.
 const READ_BACK: Duration = Duration::from_millis(500);
+
+/// What comes steadily and has not come for so long: the controller may have been away.
+const AWAY: Duration = Duration::from_millis(500);
+
+/// Whether so much time lies between what came last and now.
+pub(super) fn is_gap(last: Option<Instant>, now: Instant) -> bool {
+    last.is_none_or(|at| now.saturating_since(at) > AWAY)
+}
 
 /// What is known of one variable.
 #[derive(Debug, Clone, Default)]
@@ -37,6 +45,8 @@ pub(super) struct Known {
     pub unreadable: bool,
     /// It stands at its safe value, and the controller is not known to have it.
     pub unconfirmed: bool,
+    /// Its owner fell silent, and the controller has had the last value ever since.
+    pub held: bool,
     /// Values that waited while the gateway slept and have not come since.
     pub slept: Option<Vec<Raw>>,
 }
@@ -195,6 +205,7 @@ impl Upward {
             known.waiting.clear();
             known.live = false;
             known.read_back = false;
+            known.held = true;
             self.counted[port].values_expired += waited;
         }
     }
@@ -216,6 +227,7 @@ impl Upward {
             known.accepted = Some(now);
             known.live = true;
             known.unconfirmed = false;
+            known.held = false;
             known.unreadable = false;
             known.slept = None;
             if std::mem::take(&mut known.safe) {
@@ -277,7 +289,9 @@ impl Upward {
 
     /// A packet of the state stream was taken.
     pub(super) fn state_packet(&mut self, sheet: &Sheet, packet: &[u8], now: Instant) {
-        self.state_at = Some(now);
+        if is_gap(self.state_at.replace(now), now) {
+            self.no_longer_held();
+        }
         for &var in &sheet.in_packet {
             let nth = var.ordinal();
             let is_shown = sheet.origin[nth] == Some(Origin::State);
@@ -298,6 +312,17 @@ impl Upward {
         if sheet.safe_vars.iter().any(|var| self.known(*var).safe) {
             self.compare_safe(sheet, packet, now);
         }
+    }
+
+    /// The controller may have begun anew: nothing of before is written once more.
+    pub(super) fn no_longer_held(&mut self) {
+        self.known.iter_mut().for_each(|known| known.held = false);
+    }
+
+    /// Whether the controller has been there all along, as far as a link can tell.
+    fn is_there(&self, link: &LinkSheet, now: Instant) -> bool {
+        !link.is_datagram
+            || [self.frame_at[usize::from(link.id.0)], self.state_at].iter().any(|at| !is_gap(*at, now))
     }
 
     /// The newest value that a link brought; not finite, it is none.
@@ -370,8 +395,8 @@ impl Upward {
     pub(super) fn carried(
         &self,
         sheet: &Sheet,
-        var: SysVar,
-        raw: Raw,
+        link: &LinkSheet,
+        (var, raw): (SysVar, Raw),
         now: Instant,
     ) -> Result<Carried, Wrong> {
         let known = &self.known[var.ordinal()];
@@ -395,7 +420,13 @@ impl Upward {
             });
         }
         if var.stream().is_none() {
-            return Ok(known.accepted.map_or(Carried::Safe, |accepted| Carried::Held { accepted }));
+            return match known.accepted.filter(|_| known.held && self.is_there(link, now)) {
+                Some(accepted) => Ok(Carried::Held { accepted }),
+                None => {
+                    let what = format!("{var} = {} was sent along, the controller was away since", value());
+                    Err((Invariant::NoReplay, what))
+                }
+            };
         }
         if known.unreadable {
             let what = format!("{var} = {} was written back, and cannot be read now", value());
@@ -411,7 +442,8 @@ impl Upward {
     }
 
     /// Whether a recipe link's frame may be sent: each of its variables has a value.
-    pub(super) fn is_ready(&self, link: &super::sheet::LinkSheet, now: Instant) -> bool {
+    pub(super) fn is_ready(&self, link: &LinkSheet, now: Instant) -> bool {
+        let is_there = self.is_there(link, now);
         let is_fresh = self.state_at.is_some_and(|at| now.saturating_since(at) <= READ_BACK);
         let mut vars = link.input.iter().flat_map(|up| up.fields.iter().filter_map(super::sheet::written));
         vars.all(|var| {
@@ -419,7 +451,7 @@ impl Upward {
             match var.stream() {
                 _ if known.live => true,
                 Some(_) => known.read_back && is_fresh,
-                None => known.accepted.is_some(),
+                None => known.held && is_there,
             }
         })
     }
