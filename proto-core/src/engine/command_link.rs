@@ -29,8 +29,10 @@ pub const COMMAND_QUEUE: usize = 8;
 const COMMAND_TTL: Duration = Duration::from_secs(1);
 /// Two losses of the second connection within this time: the controller takes only one (D26).
 const STRIKES_WITHIN: Duration = Duration::from_secs(10);
-/// A connection that was given up to make way for a stop is open again by then, or another is given up.
-const WAY_MADE_WITHIN: Duration = Duration::from_millis(500);
+/// A connection that is gone is open again by then, or another is given up for a stop.
+const OPEN_AGAIN: Duration = Duration::from_millis(500);
+/// Replies that are about to be told may make room for a stop that was just picked.
+const ROOM_WITHIN: Duration = Duration::from_millis(20);
 /// What is lost this soon after something else is lost for the same reason.
 const TOGETHER: Duration = Duration::from_secs(1);
 
@@ -74,7 +76,7 @@ pub(super) struct CommandLink {
     overtaken: usize,
     /// When the second connection, or the first because of it, was lost last.
     struck_at: Option<Instant>,
-    /// When no further connection is given up for a stop that has nowhere to go.
+    /// Before this no connection is given up for a stop that has nowhere to go.
     way_made_until: Instant,
 }
 
@@ -154,6 +156,7 @@ impl CommandLink {
         if keyword.is_urgent() {
             self.overtaken = self.queue.len();
             self.stops.push(*keyword, waiting);
+            self.no_way_before(now + ROOM_WITHIN);
             *reply = ReplyCode::Pending;
         } else if self.ordinary.supervisor.is_up() && self.queue.push_back(waiting).is_ok() {
             *reply = ReplyCode::Pending;
@@ -254,7 +257,11 @@ impl CommandLink {
     fn lost(&mut self, link: LinkId, ports: &mut [FieldPort], now: Instant) {
         let Some(session) = self.session(link) else { return };
         let [first, beside] = session.lost();
-        for sent in [first, beside].into_iter().flatten() {
+        if first.is_some() {
+            self.no_way_before(now + OPEN_AGAIN);
+        }
+        // Of two of a kind the newer one is sent again: its outcome is the one that is shown.
+        for sent in [beside, first].into_iter().flatten() {
             if sent.keyword.is_urgent() && self.is_asked(&sent.command) {
                 self.stops.push_again(sent.keyword, Waiting { since: now, ..sent.command });
             } else {
@@ -266,6 +273,10 @@ impl CommandLink {
                 drop_one(ports, waiting);
             }
         }
+    }
+
+    fn no_way_before(&mut self, at: Instant) {
+        self.way_made_until = self.way_made_until.max(at);
     }
 
     /// The gateway itself slept: nothing is commanded from what was asked before.
@@ -325,7 +336,6 @@ impl CommandLink {
                 session.supervisor.give_up(now);
             }
             self.lost(link, ports, now);
-            self.way_made_until = now + WAY_MADE_WITHIN;
         }
         // What becomes of the first may open the second at once.
         for link in [LinkId::COMMAND, LinkId::URGENT] {

@@ -9,9 +9,11 @@
 mod rig;
 
 mod command_cell;
+mod command_judge;
 mod driver;
 mod orders;
 mod recipe_cell;
+mod recipe_judge;
 mod scribe;
 mod search;
 mod values;
@@ -76,9 +78,16 @@ fn command_roots(start: Instant) -> Vec<Root<CommandCell>> {
     // Both are unanswered on the connection that is left.
     let beside = shared.clone().after(&command).after(&[Frame(3), Taken(LinkId::COMMAND)]);
     let beside = beside.after(&[Taken(LinkId::MODBUS), Answered]);
+    // A stop that is not answered, and is asked for again; and the same where there is one connection.
+    let stop = |link| [Frame(3), Taken(link), Acked(link), Frame(0)];
+    let stopping = working.clone().after(&stop(LinkId::URGENT)).after(&[Frame(3)]);
+    let mute = shared.clone().after(&stop(LinkId::COMMAND)).after(&[Frame(3), Steady, Steady, Steady]);
+    let mute = mute.after(&[Taken(LinkId::COMMAND), Acked(LinkId::COMMAND)]);
     vec![
         root("working", working, 0),
         root("cold", cold, 1),
+        root("stopping", stopping, 1),
+        root("mute", mute, 1),
         root("shared", shared, 1),
         root("silent", silent, 1),
         root("busy", busy, 1),

@@ -155,7 +155,8 @@ impl Orders {
         let gone: Vec<Order> =
             self.unanswered.iter().filter(|(on, _)| *on == link).map(|(_, order)| order.clone()).collect();
         self.unanswered.retain(|(on, _)| *on != link);
-        for order in gone {
+        // Of two of a kind the newer one is sent again.
+        for order in gone.into_iter().rev() {
             let waits = self.stops.iter().any(|other| other.same_kind(&order));
             if order.is_urgent() && self.is_asked(&order) && !waits {
                 self.stops.push(Order { since: now, ..order });
