@@ -72,6 +72,8 @@ pub(super) struct CommandLink {
     fields: Vec<CommandField, MAX_COMMAND_FIELDS>,
     queue: Deque<Waiting, COMMAND_QUEUE>,
     stops: Stops,
+    /// The frame that is being applied picked an urgent command.
+    stops_now: bool,
     /// The first so many of the queue were overtaken by an urgent command.
     overtaken: usize,
     /// When the second connection, or the first because of it, was lost last.
@@ -115,6 +117,7 @@ impl CommandLink {
             fields: Vec::new(),
             queue: Deque::new(),
             stops: Stops::new(),
+            stops_now: false,
             overtaken: 0,
             struck_at: None,
             way_made_until: Instant::ZERO,
@@ -128,7 +131,8 @@ impl CommandLink {
         Some(index)
     }
 
-    /// An accepted frame brought a value of a command field. [`Self::drop_overtaken`] follows.
+    /// An accepted frame brought a value of a command field. [`Self::frame_ends`] and
+    /// [`Self::drop_overtaken`] follow.
     pub(super) fn value(
         &mut self,
         field: u8,
@@ -154,7 +158,7 @@ impl CommandLink {
         bump(&mut counters.commands);
         let waiting = Waiting { port, entry, field, since: now, nth: counters.commands };
         if keyword.is_urgent() {
-            self.overtaken = self.queue.len();
+            self.stops_now = true;
             self.stops.push(*keyword, waiting);
             self.no_way_before(now + ROOM_WITHIN);
             *reply = ReplyCode::Pending;
@@ -163,6 +167,13 @@ impl CommandLink {
         } else {
             bump(&mut counters.commands_dropped);
             *reply = ReplyCode::NotSent;
+        }
+    }
+
+    /// All fields of a frame were looked at: whatever their order, what stops overtakes the rest.
+    pub(super) fn frame_ends(&mut self) {
+        if core::mem::take(&mut self.stops_now) {
+            self.overtaken = self.queue.len();
         }
     }
 

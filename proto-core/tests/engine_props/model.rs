@@ -91,6 +91,8 @@ pub struct Known {
     pub newest_at: Option<Instant>,
     /// The owner has fallen silent since.
     pub silent: bool,
+    /// And the controller has been there ever since.
+    pub held: bool,
 }
 
 /// The literal reading of D19.
@@ -109,6 +111,8 @@ pub struct Model {
     pub up: BTreeMap<LinkId, Instant>,
     /// The newest good state packet: when, and what it said of variables that can be read back.
     pub packet: Option<Instant>,
+    /// The newest frame of the recipe link.
+    pub frame: Option<Instant>,
     pub read_back: BTreeMap<&'static str, (Instant, u32)>,
     pub shown: BTreeSet<u32>,
     pub accepted: [u32; 4],
@@ -181,6 +185,7 @@ impl Model {
             lines: BTreeMap::new(),
             up: BTreeMap::new(),
             packet: None,
+            frame: None,
             read_back: BTreeMap::new(),
             shown: BTreeSet::new(),
             accepted: [0; 4],
@@ -238,6 +243,7 @@ impl Model {
                     known.received.push((now, safe));
                 } else {
                     self.read_back.remove(name);
+                    known.held = true;
                 }
             }
         }
@@ -270,7 +276,7 @@ impl Model {
             let known = self.vars.get_mut(name).unwrap();
             known.received.push((now, value));
             known.newest_at = Some(now);
-            known.silent = false;
+            (known.silent, known.held) = (false, false);
         }
     }
 
@@ -324,6 +330,9 @@ impl Model {
         } else if name == FORCE {
             // Nothing to read back: what its owner sent last is held.
             prop_assert_eq!(Some(value), known.received.last().map(|r| r.1), "{} is held", name);
+            prop_assert!(known.held, "{name} = {value:#x} may be from before the controller began anew");
+            let is_young = |at: Option<Instant>| at.is_some_and(|at| now.saturating_since(at) <= READ_BACK);
+            prop_assert!(is_young(self.packet) || is_young(self.frame), "{name}: is the controller there?");
             return Ok(());
         } else {
             let read = self.read_back.get(name);
@@ -340,6 +349,19 @@ impl Model {
             known.steps.push(value);
         }
         Ok(())
+    }
+
+    /// The controller may have begun anew.
+    pub fn no_longer_held(&mut self) {
+        self.vars.values_mut().for_each(|known| known.held = false);
+    }
+
+    /// Something came from the controller: a packet, or a frame of the recipe link.
+    pub fn heard(&mut self, link: LinkId, now: Instant) {
+        let last = if link == UDP { &mut self.frame } else { &mut self.packet };
+        if last.replace(now).is_none_or(|at| now.saturating_since(at) > READ_BACK) {
+            self.no_longer_held();
+        }
     }
 
     pub fn modbus(&mut self, request: &[u8], now: Instant) -> Result<(), TestCaseError> {

@@ -1,6 +1,9 @@
 //! A controller that answers late or never: a stop has somewhere to go all the same.
 
+use proto_core::config::{CommandWhen, InputBinding, Parts};
 use proto_core::engine::{Input, ReplyCode};
+use proto_core::recipe::model::Mode;
+use proto_core::wire::scalar::ScalarType;
 
 use super::rig::*;
 use super::{
@@ -132,4 +135,32 @@ fn a_lost_connection_is_no_reason_to_give_up_the_other_at_once() {
     press(&mut rig, A, RUN);
     rig.run(MS(20_000));
     assert_eq!(rig.closed(), [], "and there is none to give up");
+}
+
+#[test]
+fn of_one_frame_what_stops_goes_whatever_the_order_of_the_fields() {
+    for order in [[RUN, STOP], [STOP, RUN]] {
+        let mut cell = Cell::new();
+        let table = cell.commands(&super::TABLE);
+        let to = || InputBinding::Commands { table, when: CommandWhen::Change };
+        let fields = cell.fields([user_in(ScalarType::Byte, to()), user_in(ScalarType::Byte, to())]);
+        let input = cell.part(&[255, 255], &[238, 238], fields);
+        let recipe = cell.recipe(Mode::User, Parts::Stream { input, output: None });
+        cell.rs485(recipe);
+        let mut rig = cell.rig();
+        rig.run(MS(10));
+        let frame = |[a, b]: [u8; 2]| [255, 255, a, b, 238, 238];
+        rig.bytes(A, &frame([NOTHING, NOTHING]));
+        rig.bytes(A, &frame(order));
+        assert_eq!(sent(&mut rig, URGENT), ["stop"]);
+        rig.link_bytes(URGENT, b"stop success");
+        rig.run(MS(2_000));
+        assert_eq!(sent(&mut rig, COMMAND), [""; 0], "{order:?}: not behind the stop either");
+        assert_eq!((rig.counters(A).commands, rig.counters(A).commands_dropped), (2, 1));
+        // A later frame of the same piece is another matter.
+        rig.bytes(A, &frame([NOTHING, NOTHING]));
+        rig.bytes(A, &[frame(order), frame([NOTHING, NOTHING]), frame([RUN, NOTHING])].concat());
+        rig.link_bytes(URGENT, b"stop success");
+        assert_eq!(sent(&mut rig, COMMAND), ["run(pick.jspf,50)"]);
+    }
 }

@@ -89,7 +89,6 @@ impl Orders {
             counted.0 += 1;
             let order = Order { place, value, text: plain(text.as_bytes()), picked: now, since: now };
             if order.is_urgent() {
-                self.overtaken = self.queue.len();
                 urgent.push(order.clone());
                 match self.stops.iter_mut().find(|other| other.same_kind(&order)) {
                     Some(other) => *other = order,
@@ -100,6 +99,10 @@ impl Orders {
             } else {
                 counted.1 += 1;
             }
+        }
+        if !urgent.is_empty() {
+            // Whatever the order of the fields.
+            self.overtaken = self.queue.len();
         }
         urgent
     }
