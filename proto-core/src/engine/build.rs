@@ -4,7 +4,7 @@ use core::fmt;
 
 use heapless::Vec;
 
-use super::Engine;
+use super::{Engine, Left};
 use super::command_link::{CommandLink, MAX_COMMAND_BYTES, MAX_COMMAND_FIELDS};
 use super::counters::PortCounters;
 use super::field_port::{Codec, FieldPort, Line, ReplyCode};
@@ -110,6 +110,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             sleeps: 0,
             is_deaf: false,
             deaf_until: Instant::ZERO,
+            left: Left::All,
         }
     }
 
@@ -154,6 +155,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             sleeps,
             is_deaf,
             deaf_until,
+            left,
         } = self;
         *store = Store::new();
         ports.clear();
@@ -175,6 +177,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         *sleeps = 0;
         *is_deaf = false;
         *deaf_until = Instant::ZERO;
+        *left = Left::All;
     }
 
     fn build(&mut self, config: &GatewayConfig) -> Result<(), BuildError> {

@@ -345,6 +345,7 @@ impl CommandLink {
     }
 
     /// The next urgent command, when one may be sent, and where.
+    #[inline(never)]
     pub(super) fn next_stop(
         &mut self,
         ports: &mut [FieldPort],
@@ -362,6 +363,7 @@ impl CommandLink {
     }
 
     /// The next other command, when one may be sent.
+    #[inline(never)]
     pub(super) fn next_command(
         &mut self,
         ports: &mut [FieldPort],
@@ -375,6 +377,11 @@ impl CommandLink {
         let keyword = self.tables.entry(waiting.entry)?.0.keyword;
         let until = waiting.since + COMMAND_TTL;
         self.send(LinkId::COMMAND, (keyword, waiting), ports, out, (now, until))
+    }
+
+    /// Whether an urgent command waits.
+    pub(super) fn has_stops(&self) -> bool {
+        !self.stops.is_empty()
     }
 
     /// Where an urgent command can go now.

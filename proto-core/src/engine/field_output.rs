@@ -21,6 +21,7 @@ pub(super) enum Downward {
 
 impl FieldPort {
     /// The frame that is due, if its values may be shown.
+    #[inline(never)]
     pub(super) fn next_output(
         &mut self,
         image: &Image,

@@ -55,6 +55,7 @@ use user::{Bindings, forget_commands};
 use crate::config::MAX_SAFE_VALUES;
 use crate::image::Image;
 use crate::link::LinkAction;
+use crate::recipe::can::CanFrame;
 use crate::recipe::model::MAX_STREAM_FRAME;
 use crate::time::{Duration, Instant};
 
@@ -107,6 +108,16 @@ pub struct Engine<const PORTS: usize = 8, const UPLINKS: usize = 4, const FIELDS
     /// What arrives on field ports waited while the gateway slept.
     is_deaf: bool,
     deaf_until: Instant,
+    /// What [`Engine::poll_output`] has still to ask for.
+    left: Left,
+}
+
+/// What may have something to send, as long as nothing happens and no deadline comes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Left {
+    All,
+    Field,
+    Nothing,
 }
 
 impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS, UPLINKS, FIELDS> {
@@ -119,89 +130,33 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         self.is_late = now >= self.announced;
         // Whatever happens may set an earlier deadline; what it makes later is found out in time.
         match input {
-            Input::PortBytes { port: id, bytes } => {
-                let look = self.look();
-                if let Some(port) = find_port(&mut self.ports, id) {
-                    if self.is_deaf {
-                        return port.discard(bytes, now);
-                    }
-                    port.heard(bytes, now);
-                }
-                let mut rest = bytes;
-                loop {
-                    let (store, command) = (&mut self.store, &mut self.links.command);
-                    let Some(port) = find_port(&mut self.ports, id) else { return };
-                    let accepted = port.frames(&mut rest, look, &self.bindings.inputs, store, command, now);
-                    let deadline = port.deadline();
-                    self.arm(deadline);
-                    self.after_field(id, &accepted, now);
-                    if rest.is_empty() {
-                        return;
-                    }
-                }
-            }
-            Input::PortCan { port: id, frame } => {
-                let (store, command) = (&mut self.store, &mut self.links.command);
-                let Some(port) = find_port(&mut self.ports, id) else { return };
-                if self.is_deaf {
-                    return port.discard(frame.data(), now);
-                }
-                let accepted = port.can(&frame, &self.bindings.inputs, store, command, now);
-                let deadline = port.deadline();
-                self.arm(deadline);
-                self.after_field(id, &accepted, now);
-            }
+            Input::PortBytes { port, bytes } => self.port_bytes(port, bytes, now),
+            Input::PortCan { port, frame } => self.port_can(port, &frame, now),
             Input::PortSent { port } => self.change_port(port, |port| port.sender.sent()),
             Input::PortUp { port } => self.change_port(port, FieldPort::up),
-            Input::PortDown { port: id } => {
-                let Some(port) = find_port(&mut self.ports, id) else { return };
-                port.down(&self.bindings.inputs, &mut self.links.command, now);
-                self.drop_forgotten();
-            }
-            Input::PortBus { port: id, state } => {
-                let Some(port) = find_port(&mut self.ports, id) else { return };
-                port.bus_state(state, &self.bindings.inputs, &mut self.links.command, now);
-                let deadline = port.deadline();
-                self.arm(deadline);
-                self.drop_forgotten();
-            }
-            Input::LinkUp { link } => {
-                self.links.up(link, &mut self.store, now);
-                self.arm(self.links.deadline_of(link));
-            }
-            Input::LinkDown { link } => {
-                self.links.down(link, &mut self.store, &mut self.ports, now);
-                self.count_lost();
-                self.arm(self.links.deadline_of(link));
-            }
-            Input::LinkBytes { link, bytes } => {
-                let look = self.look();
-                let mut rest = bytes;
-                loop {
-                    self.links.bytes(link, &mut rest, look, &mut self.store, &mut self.ports, now);
-                    self.count_lost();
-                    self.arm(self.links.deadline_of(link));
-                    self.image_changed();
-                    if rest.is_empty() {
-                        return;
-                    }
-                }
-            }
+            Input::PortDown { port } => self.port_down(port, now),
+            Input::PortBus { port, state } => self.port_bus(port, state, now),
+            Input::LinkUp { link } => self.link_up(link, now),
+            Input::LinkDown { link } => self.link_down(link, now),
+            Input::LinkBytes { link, bytes } => self.link_bytes(link, bytes, now),
             Input::LinkSent { link } => {
                 let deadline = self.links.sent(link);
+                self.left = Left::All;
                 self.arm(deadline);
             }
             Input::LinkAcked { link, left } => {
                 self.links.acked(link, left);
-                self.arm(self.links.deadline_of(link));
+                self.arm_link(link);
             }
-            Input::Tick => {
-                (self.is_late, self.announced) = (false, Instant::NEVER);
-                self.is_deaf &= now < self.deaf_until;
-                if now >= self.timer_at {
-                    self.advance(now);
-                }
-            }
+            Input::Tick => self.tick(now),
+        }
+    }
+
+    fn tick(&mut self, now: Instant) {
+        (self.is_late, self.announced) = (false, Instant::NEVER);
+        self.is_deaf &= now < self.deaf_until;
+        if now >= self.timer_at {
+            self.advance(now);
         }
     }
 
@@ -210,28 +165,40 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     ///
     /// What stops the robot comes first, then what brings field values to the controller, then what
     /// keeps links up, then what goes to the field.
+    #[inline(never)]
     pub fn poll_output<'b>(&mut self, now: Instant, buf: &'b mut [u8; OUTPUT_BUFFER]) -> Output<'b> {
         let now = now.min(LAST).max(self.now);
-        if !self.is_late
-            && let Some((link, len)) =
-                self.links.next_upward(&mut self.store, &mut self.ports, &mut buf[..], now)
-        {
-            self.arm(self.links.deadline_of(link));
-            return Output::LinkSend { link, bytes: buf.get(..len).unwrap_or(&[]) };
+        if now >= self.timer_at {
+            self.left = Left::All;
         }
-        if let Some((link, action)) = self.links.next_action() {
-            return match action {
-                LinkAction::Open => Output::LinkOpen { link },
-                LinkAction::Close => Output::LinkClose { link },
-            };
+        if self.left == Left::All {
+            if !self.is_late
+                && let Some((link, len)) =
+                    self.links.next_upward(&mut self.store, &mut self.ports, &mut buf[..], now)
+            {
+                self.arm(self.links.deadline_of(link));
+                return Output::LinkSend { link, bytes: buf.get(..len).unwrap_or(&[]) };
+            }
+            if let Some((link, action)) = self.links.next_action() {
+                return match action {
+                    LinkAction::Open => Output::LinkOpen { link },
+                    LinkAction::Close => Output::LinkClose { link },
+                };
+            }
+            if !self.is_late && !self.links.has_stops() {
+                self.left = Left::Field;
+            }
         }
-        let downward = if self.is_late { None } else { self.next_downward(&mut buf[..], now) };
+        let downward = if self.is_late || self.left == Left::Nothing { None } else { self.next_downward(&mut buf[..], now) };
         match downward {
             Some((port, Downward::Bytes(len))) => {
                 Output::PortSend { port, bytes: buf.get(..len).unwrap_or(&[]) }
             }
             Some((port, Downward::Can(frame))) => Output::PortSendCan { port, frame },
             None => {
+                if self.left == Left::Field {
+                    self.left = Left::Nothing;
+                }
                 if self.rearm {
                     self.rearm = false;
                     self.timer_at = self.deadline();
@@ -256,6 +223,88 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         ports.min(self.links.deadline()).min(self.store.deadline()).min(hears_at)
     }
 
+    #[inline(never)]
+    fn port_bytes(&mut self, id: PortId, bytes: &[u8], now: Instant) {
+        let look = self.look();
+        if let Some(port) = find_port(&mut self.ports, id) {
+            if self.is_deaf {
+                return port.discard(bytes, now);
+            }
+            port.heard(bytes, now);
+        }
+        let mut rest = bytes;
+        loop {
+            let (store, command) = (&mut self.store, &mut self.links.command);
+            let Some(port) = find_port(&mut self.ports, id) else { return };
+            let accepted = port.frames(&mut rest, look, &self.bindings.inputs, store, command, now);
+            let deadline = port.deadline();
+            self.arm(deadline);
+            self.after_field(id, &accepted, now);
+            if rest.is_empty() {
+                return;
+            }
+        }
+    }
+
+    #[inline(never)]
+    fn port_can(&mut self, id: PortId, frame: &CanFrame, now: Instant) {
+        let (store, command) = (&mut self.store, &mut self.links.command);
+        let Some(port) = find_port(&mut self.ports, id) else { return };
+        if self.is_deaf {
+            return port.discard(frame.data(), now);
+        }
+        let accepted = port.can(frame, &self.bindings.inputs, store, command, now);
+        let deadline = port.deadline();
+        self.arm(deadline);
+        self.after_field(id, &accepted, now);
+    }
+
+    #[inline(never)]
+    fn port_down(&mut self, id: PortId, now: Instant) {
+        let Some(port) = find_port(&mut self.ports, id) else { return };
+        self.left = Left::All;
+        port.down(&self.bindings.inputs, &mut self.links.command, now);
+        self.drop_forgotten();
+    }
+
+    #[inline(never)]
+    fn port_bus(&mut self, id: PortId, state: BusState, now: Instant) {
+        let Some(port) = find_port(&mut self.ports, id) else { return };
+        self.left = Left::All;
+        port.bus_state(state, &self.bindings.inputs, &mut self.links.command, now);
+        let deadline = port.deadline();
+        self.arm(deadline);
+        self.drop_forgotten();
+    }
+
+    #[inline(never)]
+    fn link_up(&mut self, link: LinkId, now: Instant) {
+        self.links.up(link, &mut self.store, now);
+        self.arm_link(link);
+    }
+
+    #[inline(never)]
+    fn link_down(&mut self, link: LinkId, now: Instant) {
+        self.links.down(link, &mut self.store, &mut self.ports, now);
+        self.count_lost();
+        self.arm_link(link);
+    }
+
+    #[inline(never)]
+    fn link_bytes(&mut self, link: LinkId, bytes: &[u8], now: Instant) {
+        let look = self.look();
+        let mut rest = bytes;
+        loop {
+            self.links.bytes(link, &mut rest, look, &mut self.store, &mut self.ports, now);
+            self.count_lost();
+            self.arm_link(link);
+            self.image_changed();
+            if rest.is_empty() {
+                return;
+            }
+        }
+    }
+
     /// The present, and whether the gateway has slept until now.
     fn present(&mut self, now: Instant) -> Instant {
         let now = now.min(LAST).max(self.now);
@@ -272,6 +321,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
 
     /// The gateway itself slept: what waits for it is as old as that. Overdue safe values go first,
     /// nothing is commanded, and every connection begins anew.
+    #[cold]
     fn wake(&mut self, now: Instant) {
         self.sleeps = self.sleeps.wrapping_add(1);
         // Before deadlines pass: one of them may be to open a link that has been down.
@@ -352,18 +402,29 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         }
     }
 
+    /// Something happened on a link.
+    fn arm_link(&mut self, link: LinkId) {
+        self.left = Left::All;
+        self.arm(self.links.deadline_of(link));
+    }
+
     fn change_port(&mut self, id: PortId, change: impl FnOnce(&mut FieldPort)) {
         if let Some(port) = find_port(&mut self.ports, id) {
             change(port);
+            if self.left == Left::Nothing {
+                self.left = Left::Field;
+            }
             let deadline = port.deadline();
             self.arm(deadline);
         }
     }
 
     /// Everything that depends on the clock.
+    #[inline(never)]
     fn advance(&mut self, now: Instant) {
         // At one instant the clock is looked at once: what is done now is due later.
         self.timer_at = now + Duration::from_micros(1);
+        self.left = Left::All;
         self.rearm = true;
         self.expire_frames(now);
         for index in 0..self.ports.len() {
@@ -418,6 +479,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         if accepted.frames == 0 {
             return;
         }
+        self.left = Left::All;
         let deadline = self.store.deadline();
         if deadline <= now {
             self.expire_waiting(now);

@@ -40,6 +40,7 @@ impl LinkTimings {
 /// Where a link stands.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[repr(u8)]
 pub enum LinkState {
     /// Closed; opened again at `retry_at`.
     Down {
