@@ -4,7 +4,7 @@ use core::fmt;
 
 use heapless::Vec;
 
-use super::{Engine, Left};
+use super::{Ask, Engine};
 use super::command_link::{CommandLink, MAX_COMMAND_BYTES, MAX_COMMAND_FIELDS};
 use super::counters::PortCounters;
 use super::field_port::{Codec, FieldPort, Line, ReplyCode};
@@ -110,7 +110,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             sleeps: 0,
             is_deaf: false,
             deaf_until: Instant::ZERO,
-            left: Left::All,
+            ask: Ask::ALL,
         }
     }
 
@@ -155,7 +155,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             sleeps,
             is_deaf,
             deaf_until,
-            left,
+            ask,
         } = self;
         *store = Store::new();
         ports.clear();
@@ -177,7 +177,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         *sleeps = 0;
         *is_deaf = false;
         *deaf_until = Instant::ZERO;
-        *left = Left::All;
+        *ask = Ask::ALL;
     }
 
     fn build(&mut self, config: &GatewayConfig) -> Result<(), BuildError> {

@@ -108,16 +108,23 @@ pub struct Engine<const PORTS: usize = 8, const UPLINKS: usize = 4, const FIELDS
     /// What arrives on field ports waited while the gateway slept.
     is_deaf: bool,
     deaf_until: Instant,
-    /// What [`Engine::poll_output`] has still to ask for.
-    left: Left,
+    ask: Ask,
 }
 
-/// What may have something to send, as long as nothing happens and no deadline comes.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Left {
-    All,
-    Field,
-    Nothing,
+/// Whom [`Engine::poll_output`] asks. Who had nothing to say is not asked again until something happens
+/// to it, or its deadline comes.
+#[derive(Debug, Clone, Copy)]
+struct Ask {
+    /// Links, for something to send.
+    links: bool,
+    /// Links, whether they are to be opened or closed.
+    actions: bool,
+    /// Ports, for something to send.
+    ports: bool,
+}
+
+impl Ask {
+    const ALL: Self = Self { links: true, actions: true, ports: true };
 }
 
 impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS, UPLINKS, FIELDS> {
@@ -141,12 +148,13 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             Input::LinkBytes { link, bytes } => self.link_bytes(link, bytes, now),
             Input::LinkSent { link } => {
                 let deadline = self.links.sent(link);
-                self.left = Left::All;
+                self.ask.links = true;
                 self.arm(deadline);
             }
             Input::LinkAcked { link, left } => {
                 self.links.acked(link, left);
-                self.arm_link(link);
+                self.ask.links = true;
+                self.arm(self.links.deadline_of(link));
             }
             Input::Tick => self.tick(now),
         }
@@ -167,51 +175,50 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     /// keeps links up, then what goes to the field.
     #[inline(never)]
     pub fn poll_output<'b>(&mut self, now: Instant, buf: &'b mut [u8; OUTPUT_BUFFER]) -> Output<'b> {
-        let now = now.min(LAST).max(self.now);
+        let now = self.forward(now);
         if now >= self.timer_at {
-            self.left = Left::All;
+            self.ask = Ask::ALL;
         }
-        if self.left == Left::All {
-            if !self.is_late
-                && let Some((link, len)) =
-                    self.links.next_upward(&mut self.store, &mut self.ports, &mut buf[..], now)
-            {
+        if self.ask.links && !self.is_late {
+            // Before it sends a command, the command link may have to close a connection.
+            self.ask.actions |= self.links.command.is_some();
+            let upward = self.links.next_upward(&mut self.store, &mut self.ports, &mut buf[..], now);
+            if let Some((link, len)) = upward {
                 self.arm(self.links.deadline_of(link));
                 return Output::LinkSend { link, bytes: buf.get(..len).unwrap_or(&[]) };
             }
+            // Which of these may go depends on the time.
+            self.ask.links = self.links.has_stops();
+        }
+        if self.ask.actions {
             if let Some((link, action)) = self.links.next_action() {
                 return match action {
                     LinkAction::Open => Output::LinkOpen { link },
                     LinkAction::Close => Output::LinkClose { link },
                 };
             }
-            if !self.is_late && !self.links.has_stops() {
-                self.left = Left::Field;
+            self.ask.actions = false;
+        }
+        if self.ask.ports && !self.is_late {
+            match self.next_downward(&mut buf[..], now) {
+                Some((port, Downward::Bytes(len))) => {
+                    return Output::PortSend { port, bytes: buf.get(..len).unwrap_or(&[]) };
+                }
+                Some((port, Downward::Can(frame))) => return Output::PortSendCan { port, frame },
+                None => self.ask.ports = false,
             }
         }
-        let downward = if self.is_late || self.left == Left::Nothing { None } else { self.next_downward(&mut buf[..], now) };
-        match downward {
-            Some((port, Downward::Bytes(len))) => {
-                Output::PortSend { port, bytes: buf.get(..len).unwrap_or(&[]) }
-            }
-            Some((port, Downward::Can(frame))) => Output::PortSendCan { port, frame },
-            None => {
-                if self.left == Left::Field {
-                    self.left = Left::Nothing;
-                }
-                if self.rearm {
-                    self.rearm = false;
-                    self.timer_at = self.deadline();
-                }
-                let beat_at = if self.ports.is_empty() { Instant::NEVER } else { self.beat_at };
-                let until = self.timer_at.min(beat_at);
-                if until == Instant::NEVER {
-                    return Output::Sleep { until };
-                }
-                self.announced = self.announced.min(until);
-                Output::Sleep { until: self.announced }
-            }
+        if self.rearm {
+            self.rearm = false;
+            self.timer_at = self.deadline();
         }
+        let beat_at = if self.ports.is_empty() { Instant::NEVER } else { self.beat_at };
+        let until = self.timer_at.min(beat_at);
+        if until == Instant::NEVER {
+            return Output::Sleep { until };
+        }
+        self.announced = self.announced.min(until);
+        Output::Sleep { until: self.announced }
     }
 
     /// When the engine has something to do by itself, worked out anew. [`Output::Sleep`] may name an
@@ -237,6 +244,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             let (store, command) = (&mut self.store, &mut self.links.command);
             let Some(port) = find_port(&mut self.ports, id) else { return };
             let accepted = port.frames(&mut rest, look, &self.bindings.inputs, store, command, now);
+            self.ask.ports |= port.sender.is_due();
             let deadline = port.deadline();
             self.arm(deadline);
             self.after_field(id, &accepted, now);
@@ -254,6 +262,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             return port.discard(frame.data(), now);
         }
         let accepted = port.can(frame, &self.bindings.inputs, store, command, now);
+        self.ask.ports |= port.sender.is_due();
         let deadline = port.deadline();
         self.arm(deadline);
         self.after_field(id, &accepted, now);
@@ -262,7 +271,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     #[inline(never)]
     fn port_down(&mut self, id: PortId, now: Instant) {
         let Some(port) = find_port(&mut self.ports, id) else { return };
-        self.left = Left::All;
+        self.ask = Ask::ALL;
         port.down(&self.bindings.inputs, &mut self.links.command, now);
         self.drop_forgotten();
     }
@@ -270,7 +279,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     #[inline(never)]
     fn port_bus(&mut self, id: PortId, state: BusState, now: Instant) {
         let Some(port) = find_port(&mut self.ports, id) else { return };
-        self.left = Left::All;
+        self.ask = Ask::ALL;
         port.bus_state(state, &self.bindings.inputs, &mut self.links.command, now);
         let deadline = port.deadline();
         self.arm(deadline);
@@ -307,7 +316,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
 
     /// The present, and whether the gateway has slept until now.
     fn present(&mut self, now: Instant) -> Instant {
-        let now = now.min(LAST).max(self.now);
+        let now = self.forward(now);
         if now >= self.beat_at {
             // A configured engine is called at every beat; before the first call nothing was late.
             if self.now != Instant::ZERO && now.saturating_since(self.now) > ASLEEP {
@@ -317,6 +326,17 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         }
         self.now = now;
         now
+    }
+
+    /// `now`, but no earlier than was told before, and no later than the clock's last instant.
+    fn forward(&self, now: Instant) -> Instant {
+        if now < self.now || now > LAST { self.clamped(now) } else { now }
+    }
+
+    #[cold]
+    #[inline(never)]
+    fn clamped(&self, now: Instant) -> Instant {
+        now.min(LAST).max(self.now)
     }
 
     /// The gateway itself slept: what waits for it is as old as that. Overdue safe values go first,
@@ -404,16 +424,14 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
 
     /// Something happened on a link.
     fn arm_link(&mut self, link: LinkId) {
-        self.left = Left::All;
+        (self.ask.links, self.ask.actions) = (true, true);
         self.arm(self.links.deadline_of(link));
     }
 
     fn change_port(&mut self, id: PortId, change: impl FnOnce(&mut FieldPort)) {
         if let Some(port) = find_port(&mut self.ports, id) {
             change(port);
-            if self.left == Left::Nothing {
-                self.left = Left::Field;
-            }
+            self.ask.ports = true;
             let deadline = port.deadline();
             self.arm(deadline);
         }
@@ -424,7 +442,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     fn advance(&mut self, now: Instant) {
         // At one instant the clock is looked at once: what is done now is due later.
         self.timer_at = now + Duration::from_micros(1);
-        self.left = Left::All;
+        self.ask = Ask::ALL;
         self.rearm = true;
         self.expire_frames(now);
         for index in 0..self.ports.len() {
@@ -479,7 +497,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         if accepted.frames == 0 {
             return;
         }
-        self.left = Left::All;
+        self.ask.links = true;
         let deadline = self.store.deadline();
         if deadline <= now {
             self.expire_waiting(now);
@@ -513,6 +531,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         if !self.watches_bits {
             return;
         }
+        self.ask.ports = true;
         let mut first = Instant::NEVER;
         for port in &mut self.ports {
             let usable = port.is_usable();
