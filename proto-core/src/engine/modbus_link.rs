@@ -247,25 +247,10 @@ impl ModbusLink {
         }
         let poll = self.due_block(now);
         let pending = store.outbox.dirty().and(&self.writes);
-        if pending.is_empty() && poll.is_none() {
-            return None;
-        }
-        self.request(&pending, poll, store, out, now)
-    }
-
-    #[inline(never)]
-    fn request<const PORTS: usize>(
-        &mut self,
-        pending: &InputSet,
-        poll: Option<usize>,
-        store: &mut Store<PORTS>,
-        out: &mut [u8],
-        now: Instant,
-    ) -> Option<usize> {
         let asked = match (pending.is_empty(), poll) {
             (true, None) => return None,
-            (false, Some(_)) if self.turn == Turn::Write => self.write(pending, store, out),
-            (false, None) => self.write(pending, store, out),
+            (false, Some(_)) if self.turn == Turn::Write => self.write(&pending, store, out),
+            (false, None) => self.write(&pending, store, out),
             (_, Some(block)) => self.poll(block, out, now),
         };
         let (len, asked) = asked?;
