@@ -292,6 +292,7 @@ impl CommandLink {
     }
 
     /// Bytes from the controller.
+    #[inline(never)]
     pub(super) fn bytes(&mut self, link: LinkId, bytes: &[u8], ports: &mut [FieldPort], now: Instant) {
         let Some(session) = self.session(link).filter(|session| session.supervisor.is_up()) else { return };
         session.heard(bytes.len(), now);

@@ -149,6 +149,7 @@ impl Uplink {
 
     /// Bytes, or one datagram, from the controller; those that are left when somebody looks at each
     /// frame.
+    #[inline(never)]
     pub(super) fn bytes<'b, const PORTS: usize>(
         &mut self,
         bytes: &'b [u8],
