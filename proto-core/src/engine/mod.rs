@@ -208,6 +208,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
                 None => self.ask.ports = false,
             }
         }
+        debug_assert!(self.is_late || self.all_are_silent(&mut buf[..], now), "who was not asked speaks");
         if self.rearm {
             self.rearm = false;
             self.timer_at = self.deadline();
@@ -219,6 +220,13 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         }
         self.announced = self.announced.min(until);
         Output::Sleep { until: self.announced }
+    }
+
+    /// Whether who is not asked has nothing to say.
+    fn all_are_silent(&mut self, out: &mut [u8], now: Instant) -> bool {
+        self.links.next_upward(&mut self.store, &mut self.ports, out, now).is_none()
+            && self.links.next_action().is_none()
+            && self.next_downward(out, now).is_none()
     }
 
     /// When the engine has something to do by itself, worked out anew. [`Output::Sleep`] may name an
@@ -323,6 +331,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
                 self.wake(now);
             }
             self.beat_at = now + HEARTBEAT;
+            self.ask = Ask::ALL;
         }
         self.now = now;
         now
