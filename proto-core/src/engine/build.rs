@@ -4,7 +4,6 @@ use core::fmt;
 
 use heapless::Vec;
 
-use super::{Ask, Engine};
 use super::command_link::{CommandLink, MAX_COMMAND_BYTES, MAX_COMMAND_FIELDS};
 use super::counters::PortCounters;
 use super::field_port::{Codec, FieldPort, Line, ReplyCode};
@@ -18,6 +17,7 @@ use super::state_link::StateLink;
 use super::store::{InputFrame, MAX_INPUT_FRAMES, SafeBytes, Store};
 use super::uplink::Uplink;
 use super::user::{Bindings, InputBind};
+use super::{Ask, Engine};
 use crate::config::{
     Bus, ConfigError, FieldSpec, GatewayConfig, InputBinding, MAX_SAFE_VALUES, Parts, Port, Recipe, SendOn,
     Span, StreamPart,

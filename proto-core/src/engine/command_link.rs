@@ -292,7 +292,6 @@ impl CommandLink {
     }
 
     /// Bytes from the controller.
-    #[inline(never)]
     pub(super) fn bytes(&mut self, link: LinkId, bytes: &[u8], ports: &mut [FieldPort], now: Instant) {
         let Some(session) = self.session(link).filter(|session| session.supervisor.is_up()) else { return };
         session.heard(bytes.len(), now);
@@ -346,7 +345,6 @@ impl CommandLink {
     }
 
     /// The next urgent command, when one may be sent, and where.
-    #[inline(never)]
     pub(super) fn next_stop(
         &mut self,
         ports: &mut [FieldPort],
@@ -364,7 +362,6 @@ impl CommandLink {
     }
 
     /// The next other command, when one may be sent.
-    #[inline(never)]
     pub(super) fn next_command(
         &mut self,
         ports: &mut [FieldPort],

@@ -21,7 +21,6 @@ pub(super) enum Downward {
 
 impl FieldPort {
     /// The frame that is due, if its values may be shown.
-    #[inline(never)]
     pub(super) fn next_output(
         &mut self,
         image: &Image,

@@ -108,11 +108,12 @@ pub struct Engine<const PORTS: usize = 8, const UPLINKS: usize = 4, const FIELDS
     /// What arrives on field ports waited while the gateway slept.
     is_deaf: bool,
     deaf_until: Instant,
+    /// Whom [`Engine::poll_output`] asks before it sleeps.
     ask: Ask,
 }
 
-/// Whom [`Engine::poll_output`] asks. Who had nothing to say is not asked again until something happens
-/// to it, or its deadline comes.
+/// Who may have something to say. Who had nothing is not asked again until something happens to it, a
+/// deadline comes, or the next beat.
 #[derive(Debug, Clone, Copy)]
 struct Ask {
     /// Links, for something to send.
@@ -173,6 +174,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     ///
     /// What stops the robot comes first, then what brings field values to the controller, then what
     /// keeps links up, then what goes to the field.
+    // In a driver's loop, the addresses of all that it may need would be worked out before each pass.
     #[inline(never)]
     pub fn poll_output<'b>(&mut self, now: Instant, buf: &'b mut [u8; OUTPUT_BUFFER]) -> Output<'b> {
         let now = self.forward(now);
@@ -180,14 +182,14 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             self.ask = Ask::ALL;
         }
         if self.ask.links && !self.is_late {
-            // Before it sends a command, the command link may have to close a connection.
+            // To send a command, a connection may have to be closed.
             self.ask.actions |= self.links.command.is_some();
             let upward = self.links.next_upward(&mut self.store, &mut self.ports, &mut buf[..], now);
             if let Some((link, len)) = upward {
                 self.arm(self.links.deadline_of(link));
                 return Output::LinkSend { link, bytes: buf.get(..len).unwrap_or(&[]) };
             }
-            // Which of these may go depends on the time.
+            // Whether one of these may go depends on the time, and no deadline says so.
             self.ask.links = self.links.has_stops();
         }
         if self.ask.actions {
@@ -238,6 +240,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         ports.min(self.links.deadline()).min(self.store.deadline()).min(hears_at)
     }
 
+    // What an input does is a function of its own, so that no other pays for the registers it needs.
     #[inline(never)]
     fn port_bytes(&mut self, id: PortId, bytes: &[u8], now: Instant) {
         let look = self.look();
@@ -276,7 +279,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         self.after_field(id, &accepted, now);
     }
 
-    #[inline(never)]
+    #[cold]
     fn port_down(&mut self, id: PortId, now: Instant) {
         let Some(port) = find_port(&mut self.ports, id) else { return };
         self.ask = Ask::ALL;
@@ -284,7 +287,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         self.drop_forgotten();
     }
 
-    #[inline(never)]
+    #[cold]
     fn port_bus(&mut self, id: PortId, state: BusState, now: Instant) {
         let Some(port) = find_port(&mut self.ports, id) else { return };
         self.ask = Ask::ALL;
@@ -294,13 +297,13 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         self.drop_forgotten();
     }
 
-    #[inline(never)]
+    #[cold]
     fn link_up(&mut self, link: LinkId, now: Instant) {
         self.links.up(link, &mut self.store, now);
         self.arm_link(link);
     }
 
-    #[inline(never)]
+    #[cold]
     fn link_down(&mut self, link: LinkId, now: Instant) {
         self.links.down(link, &mut self.store, &mut self.ports, now);
         self.count_lost();
@@ -343,7 +346,6 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     }
 
     #[cold]
-    #[inline(never)]
     fn clamped(&self, now: Instant) -> Instant {
         now.min(LAST).max(self.now)
     }
@@ -431,7 +433,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         }
     }
 
-    /// Something happened on a link.
+    /// Something happened on a link that may change its deadline, or close it.
     fn arm_link(&mut self, link: LinkId) {
         (self.ask.links, self.ask.actions) = (true, true);
         self.arm(self.links.deadline_of(link));
@@ -447,7 +449,6 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     }
 
     /// Everything that depends on the clock.
-    #[inline(never)]
     fn advance(&mut self, now: Instant) {
         // At one instant the clock is looked at once: what is done now is due later.
         self.timer_at = now + Duration::from_micros(1);
