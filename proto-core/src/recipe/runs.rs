@@ -14,21 +14,25 @@ pub(super) fn copy(to: &mut [u8], from: &[u8]) {
     match from.len() {
         // As one number: an array of sixteen bytes is a call of `memcpy` on a Cortex-M.
         16.. => both_ends(to, from, |bytes| u128::from_ne_bytes(bytes).to_ne_bytes()),
-        8.. => both_ends::<8>(to, from, |bytes| bytes),
-        4.. => both_ends::<4>(to, from, |bytes| bytes),
-        2.. => both_ends::<2>(to, from, |bytes| bytes),
-        _ => both_ends::<1>(to, from, |bytes| bytes),
+        8.. => both_ends(to, from, as_is::<8>),
+        4.. => both_ends(to, from, as_is::<4>),
+        2.. => both_ends(to, from, as_is::<2>),
+        _ => both_ends(to, from, as_is::<1>),
     }
 }
 
+fn as_is<const N: usize>(bytes: [u8; N]) -> [u8; N] {
+    bytes
+}
+
 #[inline(always)]
-fn both_ends<const N: usize>(to: &mut [u8], from: &[u8], same: impl Fn([u8; N]) -> [u8; N]) {
+fn both_ends<const N: usize>(to: &mut [u8], from: &[u8], by: impl Fn([u8; N]) -> [u8; N]) {
     if let (Some(&front), Some(&back)) = (from.first_chunk::<N>(), from.last_chunk::<N>()) {
         if let Some(target) = to.first_chunk_mut() {
-            *target = same(front);
+            *target = by(front);
         }
         if let Some(target) = to.last_chunk_mut() {
-            *target = same(back);
+            *target = by(back);
         }
     }
 }
