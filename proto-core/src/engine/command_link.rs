@@ -413,6 +413,11 @@ impl CommandLink {
         self.send(LinkId::COMMAND, (keyword, waiting), ports, out, (now, until))
     }
 
+    /// Whether an urgent command waits.
+    pub(super) fn has_stops(&self) -> bool {
+        !self.stops.is_empty()
+    }
+
     /// Where an urgent command can go now.
     fn way_of_stops(&self) -> Option<LinkId> {
         if self.stops.is_empty() {

@@ -169,6 +169,7 @@ impl ModbusLink {
     }
 
     /// Bytes from the controller.
+    #[inline(never)]
     pub(super) fn bytes<const PORTS: usize>(&mut self, bytes: &[u8], store: &mut Store<PORTS>, now: Instant) {
         self.supervisor.heard(now);
         add(&mut self.counters.bytes_in, bytes.len());

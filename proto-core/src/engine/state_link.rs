@@ -46,6 +46,7 @@ impl StateLink {
     }
 
     /// Bytes from the controller; those that are left when somebody looks at each packet.
+    #[inline(never)]
     pub(super) fn bytes<'b, const PORTS: usize>(
         &mut self,
         bytes: &'b [u8],

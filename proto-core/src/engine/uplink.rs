@@ -147,6 +147,7 @@ impl Uplink {
 
     /// Bytes, or one datagram, from the controller; those that are left when somebody looks at each
     /// frame.
+    #[inline(never)]
     pub(super) fn bytes<'b, const PORTS: usize>(
         &mut self,
         bytes: &'b [u8],
@@ -218,6 +219,22 @@ impl Uplink {
             return None;
         }
         let wanted = !store.outbox.dirty().and(&self.writes).is_empty();
+        if !wanted && now < self.speaks_at() {
+            return None;
+        }
+        self.send(wanted, store, state, out, now)
+    }
+
+    /// The same, where there is something to say. Mostly there is not: what asks stays short without it.
+    #[inline(never)]
+    fn send<const PORTS: usize>(
+        &mut self,
+        wanted: bool,
+        store: &mut Store<PORTS>,
+        state: Option<GroupId>,
+        out: &mut [u8],
+        now: Instant,
+    ) -> Option<usize> {
         let len = match &self.input {
             Some(layout) if wanted && self.is_ready(store, state, now) => {
                 let len = encode(layout, store, out)?;
@@ -232,7 +249,7 @@ impl Uplink {
                 }
                 len
             }
-            _ if now >= self.greet_at.min(self.speak_at) => {
+            _ if now >= self.speaks_at() => {
                 self.greet_at = now + GREET_EVERY;
                 self.greeting(out)?
             }
@@ -252,9 +269,14 @@ impl Uplink {
         self.output.as_ref().is_some_and(|layout| datagram(layout, bytes).is_ok())
     }
 
+    /// When the link has something to say that is no frame.
+    fn speaks_at(&self) -> Instant {
+        self.greet_at.min(self.speak_at)
+    }
+
     /// When the link wants to send by itself.
     pub(super) fn deadline(&self) -> Instant {
-        let speaks_at = if self.busy { Instant::NEVER } else { self.greet_at.min(self.speak_at) };
+        let speaks_at = if self.busy { Instant::NEVER } else { self.speaks_at() };
         speaks_at.min(self.flight.deadline()).min(self.repeat_at)
     }
 
