@@ -46,8 +46,7 @@ fn cell(by: By) -> (Rig, LinkId) {
     let mut rig = cell.rig();
     rig.run(MS(10));
     says(&mut rig, by, link);
-    rig.bytes(BUTTONS, &[255, 255, 1, 238, 238]);
-    assert_eq!(rig.sent_on(link), Vec::<Vec<u8>>::new(), "nobody has measured yet");
+    assert_eq!(press(&mut rig, link, 1), Vec::<Vec<u8>>::new(), "nobody has measured yet");
     (rig, link)
 }
 
