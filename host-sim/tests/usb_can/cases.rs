@@ -1,0 +1,217 @@
+//! An adapter that works, one that is alone, hears noise, loses frames, is pulled out and plugged in.
+
+use std::fmt::Write;
+
+use super::Case;
+use super::candlelight::Bus;
+use super::cell::{Running, example, until};
+use super::stand::{Adapter, Cell, bind};
+
+pub(crate) const CASES: &[Case] = &[
+    ("the_worked_example_through_the_gateway", works),
+    ("nobody_acknowledges_and_then_somebody_does", nobody_acknowledges),
+    ("a_cycle_longer_than_the_queue_and_nobody_acknowledges", no_buffers),
+    ("error_passive_with_the_counters", error_passive),
+    ("what_the_adapter_lost_is_counted", overflow),
+    ("unplugged_and_plugged_in_again", unplugged),
+    ("unplugged_from_the_controller", unplugged_from_the_controller),
+];
+
+/// The worked example's captured frame.
+const POSE: &str = "002#EF54EF3EA7E7D13E";
+
+/// The pose goes out, in cycles of three frames, and id 1 switches DO1..8.
+#[track_caller]
+fn serves(adapter: &Adapter, robot: &Running, value: u8) {
+    adapter.forget();
+    let frames = adapter.sends(12);
+    in_order(&frames);
+    assert!(frames.iter().any(|frame| frame == POSE), "{frames:?}");
+    adapter.hears(&format!("001#{value:02X}"));
+    robot.stats("DO1..8", |stats| {
+        stats["registers"]["DigitalOutputCommand[1]"].as_f64() == Some(f64::from(value))
+    });
+}
+
+#[track_caller]
+fn in_order(frames: &[String]) {
+    for pair in frames.windows(2) {
+        let ids = (&pair[0][..3], &pair[1][..3]);
+        assert!(matches!(ids, ("002", "003") | ("003", "004") | ("004", "002")), "{frames:?}");
+    }
+}
+
+fn works() {
+    let adapter = Adapter::up(500_000);
+    let cell = Cell::system();
+    for value in [1, 0, 129] {
+        serves(&adapter, &cell.robot, value);
+    }
+    let port = cell.bus("active");
+    assert_eq!(port["device"]["frames_in"], 3, "{port}");
+    assert_eq!((&port["device"]["error_frames"], &port["device"]["refusals"]), (&0.into(), &0.into()), "{port}");
+    cell.end();
+}
+
+fn nobody_acknowledges() {
+    let adapter = Adapter::up(500_000);
+    let cell = Cell::system();
+    serves(&adapter, &cell.robot, 1);
+    adapter.becomes(Bus::Empty);
+    adapter.forget();
+    let port = cell.bus("passive");
+    // The sender's errors are counted up to here and no further: it is on the bus, alone.
+    let counters = (&port["device"]["tx_error_counter"], &port["device"]["rx_error_counter"]);
+    assert_eq!(counters, (&128.into(), &0.into()), "{port}");
+    assert!(!cell.gateway.log("error-passive").is_empty(), "it is warned of");
+    let (sent, given) = (port["device"]["frames_out"].as_u64().unwrap(), adapter.given());
+    let skipped = cell.port("skipped cycles", |port| port["skipped_cycles"].as_u64() > Some(100));
+    // Three that the adapter keeps, and a cycle that waits for them.
+    assert!(skipped["device"]["frames_out"].as_u64() <= Some(sent + 6), "{skipped}");
+    assert!(adapter.given() <= given + 6);
+    assert_eq!((&skipped["device"]["dropped"], &skipped["downs"]), (&0.into(), &0.into()), "{skipped}");
+
+    adapter.becomes(Bus::Sound);
+    in_order(&adapter.sends(60));
+    // Each frame that left takes one error off.
+    let port = cell.bus("active");
+    assert!(port["device"]["tx_error_counter"].as_u64() < Some(96), "{port}");
+    serves(&adapter, &cell.robot, 2);
+    assert_eq!(cell.fresh()["bus_offs"], 0);
+    cell.end();
+}
+
+fn no_buffers() {
+    const FRAMES: u64 = 30;
+    let mut file = "[controller]\naddress = \"127.0.0.1\"\n\
+                    [[recipe]]\nname = \"wide\"\nkind = \"can\"\nmode = \"user\"\n"
+        .to_owned();
+    for frame in 1..=FRAMES {
+        let field = format!("{{ name = \"v{frame}\", type = \"word\", from = \"WordOutputReg[{frame}]\" }}");
+        write!(file, "[[recipe.output.frame]]\nid = {}\nfields = [{field}]\n", 0x100 + frame).unwrap();
+    }
+    file += "[[port]]\nname = \"can\"\nbus = \"can\"\nbitrate = 500000\nrecipe = \"wide\"\ncycle_ms = 100\n";
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("wide.toml");
+    std::fs::write(&path, file).unwrap();
+
+    let adapter = Adapter::up(500_000);
+    adapter.becomes(Bus::Empty);
+    let cell = Cell::of(&path);
+    // Three in the adapter's mailboxes, ten in the driver, ten in the interface's queue; the others are
+    // refused, again and again, and at last given up.
+    let port = cell.port("given up", |port| port["device"]["dropped"].as_u64() > Some(0));
+    let count = |name: &str| port["device"][name].as_u64().unwrap();
+    assert_eq!((count("frames_out"), count("dropped")), (23, FRAMES - 23), "{port}");
+    assert!(count("refusals") > 10, "{port}");
+    cell.looks_on(|port| assert_eq!(port["device"]["frames_out"], 23, "no more wait: {port}"));
+    assert_eq!((&port["downs"], &port["device"]["ups"]), (&0.into(), &1.into()), "{port}");
+
+    adapter.becomes(Bus::Sound);
+    let ids = |frames: &[String]| {
+        let id = |frame: &String| u64::from_str_radix(&frame[..3], 16).unwrap() - 0x100;
+        frames.iter().map(id).collect::<Vec<_>>()
+    };
+    let sent = ids(&adapter.sends(23 + 3 * FRAMES as usize));
+    let whole: Vec<u64> = (1..=FRAMES).collect();
+    assert_eq!(sent[..23], whole[..23], "those that waited");
+    for cycle in sent[23..].chunks_exact(whole.len()) {
+        assert_eq!(cycle, whole, "a whole cycle, however often it was refused");
+    }
+    assert_eq!(cell.fresh()["device"]["dropped"], FRAMES - 23);
+    cell.end();
+}
+
+fn error_passive() {
+    let adapter = Adapter::up(500_000);
+    let cell = Cell::system();
+    serves(&adapter, &cell.robot, 1);
+    for (noise, state, counter) in [(96, "warning", 96), (32, "passive", 128)] {
+        adapter.hears_noise(noise);
+        let port = cell.bus(state);
+        let counters = (&port["device"]["tx_error_counter"], &port["device"]["rx_error_counter"]);
+        assert_eq!(counters, (&0.into(), &counter.into()), "{port}");
+        adapter.forget();
+        adapter.sends_a(POSE);
+    }
+    let warned = cell.gateway.log("error-passive");
+    assert!(warned.iter().any(|line| line.contains("128")), "{warned:?}");
+    // Each frame that can be read takes one off.
+    for value in 0..40 {
+        adapter.hears(&format!("001#{value:02X}"));
+    }
+    let port = cell.bus("active");
+    assert_eq!(port["device"]["rx_error_counter"], 95, "{port}");
+    serves(&adapter, &cell.robot, 2);
+    cell.end();
+}
+
+fn overflow() {
+    let adapter = Adapter::up(500_000);
+    let cell = Cell::system();
+    serves(&adapter, &cell.robot, 1);
+    adapter.hears_after_a_loss("001#05");
+    cell.register("DigitalOutputCommand[1]", 5.0);
+    let port = cell.port("an overflow", |port| port["device"]["overflows"] == 1);
+    assert_eq!((&port["device"]["error_frames"], &port["device"]["overruns"]), (&1.into(), &0.into()), "{port}");
+    assert_eq!(port["device"]["bus"], "active", "{port}");
+    serves(&adapter, &cell.robot, 6);
+    cell.end();
+}
+
+fn unplugged() {
+    let mut adapter = Adapter::up(1_000_000);
+    let cell = Cell::hand();
+    adapter.sends_a("501#000000000000");
+    // Between two frames, with frames that wait, and bus-off.
+    for (round, bus) in (1..).zip([Bus::Sound, Bus::Empty, Bus::Shorted]) {
+        adapter.hears("502#0307F401");
+        cell.register("WordInputReg[3]", 500.0);
+        adapter.becomes(bus);
+        cell.bus(match bus {
+            Bus::Sound => "active",
+            Bus::Empty => "passive",
+            Bus::Shorted => "bus-off",
+        });
+        adapter.unplug();
+        let port = cell.port("down", |port| port["downs"] == round);
+        assert!(cell.gateway.log("lost, will be opened again").len() >= round as usize, "{port}");
+        // The hand is not there.
+        cell.register("WordInputReg[1]", 0.0);
+        cell.robot.command("run(grip.jspf)", "run start");
+
+        // Plugged in, but nobody has set its bit rate and brought it up.
+        adapter = Adapter::new();
+        cell.looks_on(|port| assert_eq!(port["device"]["ups"], round, "{port}"));
+        assert_eq!(adapter.given(), 0);
+        adapter.bring_up(1_000_000);
+        let port = cell.port("up", |port| port["device"]["ups"] == round + 1);
+        assert_eq!(port["downs"], round, "{port}");
+        let first = &adapter.sends(1)[0];
+        assert_eq!(first, "501#C8C8C8C8C8C8", "what is true now, and nothing old");
+        cell.bus("active");
+    }
+    adapter.hears("502#0307F401");
+    cell.register("WordInputReg[3]", 500.0);
+    cell.end();
+}
+
+fn unplugged_from_the_controller() {
+    let mut adapter = Adapter::up(500_000);
+    let file = example("can-system-controller.toml");
+    let robot = Running::controller(&file, &[&bind("can")]);
+    for round in 1..=2 {
+        serves(&adapter, &robot, round);
+        adapter.unplug();
+        let sent = until("it says so", || {
+            let stats = robot.fresh();
+            let lost = robot.log("lost, will be opened again").len() == usize::from(round);
+            lost.then(|| stats["ports"]["can"]["device"]["frames_out"].clone())
+        });
+        assert_eq!(robot.fresh()["ports"]["can"]["device"]["frames_out"], sent);
+        adapter = Adapter::up(500_000);
+        robot.stats("up", |stats| stats["ports"]["can"]["device"]["ups"] == round + 1);
+    }
+    serves(&adapter, &robot, 7);
+    robot.end();
+}
