@@ -254,8 +254,14 @@ pub struct DeviceCounters {
     pub refusals: u64,
     /// Error frames: what a CAN interface told about itself and its bus.
     pub error_frames: u64,
+    /// Times a CAN interface told that it had lost frames that it had received.
+    pub overflows: u64,
     /// Times a CAN controller was started again after bus-off.
     pub restarts: u64,
+    /// A CAN controller's transmit error counter, as told last: what others say of what it sends.
+    pub tx_error_counter: u8,
+    /// Its receive error counter: what it says of what others send.
+    pub rx_error_counter: u8,
     /// CAN FD frames, which no recipe takes.
     pub fd_frames: u64,
     /// A CAN controller's error state, where it is known: active, warning, passive or bus-off.

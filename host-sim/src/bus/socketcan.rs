@@ -6,6 +6,7 @@
 //! on the bus, so that a bus that nobody acknowledges holds one cycle's frames and not a queue of old
 //! ones.
 
+mod link;
 mod message;
 mod state;
 
@@ -18,14 +19,16 @@ use proto_core::engine::BusState;
 use proto_core::recipe::can::CanFrame;
 use proto_core::recipe::model::CanId;
 use proto_core::time::{Duration, Instant};
-use socketcan::{CanFdSocket, CanFilter, EmbeddedFrame, Socket, SocketOptions};
+use socketcan::{CanErrorFrame, CanFdSocket, CanFilter, EmbeddedFrame, Socket, SocketOptions};
 use tokio::io::Interest;
 use tracing::{debug, info, warn};
 
+use self::link::Link;
 use self::message::{Content, Message};
 use self::state::News;
 use super::backoff::Backoff;
-use super::port::{PortEvent, PortTx};
+use super::port::{DeviceCounters, PortEvent, PortTx};
+use super::quota::Quota;
 use super::reactor::register;
 use super::timer::{Timer, now};
 use super::turns::give_way;
@@ -91,6 +94,8 @@ struct Attached<'a> {
     socket: CanFdSocket,
     timer: Timer,
     state: BusState,
+    /// A bus that is shorted changes its state many times a second.
+    lines: Quota,
     /// Frames that the kernel took and did not give back yet.
     on_their_way: usize,
     /// [`Self::lost`] when the kernel took the first of them.
@@ -124,12 +129,14 @@ impl<'a> Attached<'a> {
         if let Some(error) = socket.as_raw_socket().take_error()? {
             return Err(error);
         }
-        let state = if has_carrier(&port.interface) { BusState::Active } else { BusState::BusOff };
+        // No longer those of the controller that was there before.
+        port.tx.count(|counters| (counters.tx_error_counter, counters.rx_error_counter) = (0, 0));
         Ok(Self {
             port,
             socket,
             timer: Timer::new()?,
-            state,
+            state: Link::of(&port.interface).bus(),
+            lines: Quota::default(),
             on_their_way: 0,
             lost_before: 0,
             refused_since: None,
@@ -198,27 +205,41 @@ impl<'a> Attached<'a> {
                     counters.frames_in += 1;
                     counters.bytes_in += frame.data().len() as u64;
                 });
+                // Who hears is on the bus. Adapters with an old firmware tell in no other way.
+                if self.is_off() && !message.is_local && Link::of(&self.port.interface).has_carrier {
+                    self.enter(BusState::Active, events);
+                }
                 events(PortEvent::Frame { frame });
             }
-            Content::Error(frame) => {
-                tx.count(|counters| counters.error_frames += 1);
-                match state::news(frame) {
-                    News::Restarted => {
-                        tx.count(|counters| counters.restarts += 1);
-                        self.enter(BusState::Active, events);
-                    }
-                    // Some drivers tell a milder state before the controller was started again.
-                    News::State(state) if self.is_off() && !has_carrier(&self.port.interface) => {
-                        debug!(?state, "said while bus-off");
-                    }
-                    News::State(state) if state != self.state => self.enter(state, events),
-                    News::State(_) | News::Other => {}
-                }
-            }
+            Content::Error(frame) => self.take_error(frame, events),
             Content::Fd => tx.count(|counters| counters.fd_frames += 1),
             Content::Unknown => {}
         }
         Ok(())
+    }
+
+    fn take_error(&mut self, frame: CanErrorFrame, events: &mut impl FnMut(PortEvent<'_>)) {
+        let tx = &self.port.tx;
+        let told = state::counters(frame);
+        tx.count(|counters| {
+            counters.error_frames += 1;
+            counters.overflows += u64::from(state::is_overflow(frame));
+            if let Some(told) = told {
+                (counters.tx_error_counter, counters.rx_error_counter) = told;
+            }
+        });
+        match state::news(frame) {
+            News::Restarted => {
+                tx.count(|counters| counters.restarts += 1);
+                self.enter(BusState::Active, events);
+            }
+            // Some drivers tell a milder state before the controller was started again.
+            News::State(state) if self.is_off() && Link::of(&self.port.interface).is_off() => {
+                debug!(?state, "said while bus-off");
+            }
+            News::State(state) if state != self.state => self.enter(state, events),
+            News::State(_) | News::Other => {}
+        }
     }
 
     /// The controller's state is this from now on.
@@ -226,16 +247,26 @@ impl<'a> Attached<'a> {
         let interface = &self.port.interface;
         self.state = state;
         self.port.tx.count(|counters| counters.bus = state::name(state));
-        match state {
-            BusState::BusOff => {
-                warn!(interface, "bus-off: nothing is sent until it was restarted");
-                self.looks.reset();
-                self.look_at = now() + pause(self.looks.pause());
-                // What was under way will not leave, or would be old when it did.
-                self.on_their_way = 0;
-                self.give_up_queue();
+        let DeviceCounters { tx_error_counter, rx_error_counter, .. } = self.port.tx.counters();
+        if let Some(more) = self.lines.take(now()) {
+            match state {
+                BusState::BusOff => warn!(interface, more, "bus-off: nothing is sent until it was restarted"),
+                BusState::Passive => warn!(
+                    interface,
+                    more,
+                    tx_error_counter,
+                    rx_error_counter,
+                    "error-passive: nobody acknowledges, bit rates differ, or the cable is bad"
+                ),
+                _ => info!(interface, more, state = state::name(state), "bus state"),
             }
-            _ => info!(interface, state = state::name(state), "bus state"),
+        }
+        if state == BusState::BusOff {
+            self.looks.reset();
+            self.look_at = now() + pause(self.looks.pause());
+            // What was under way will not leave, or would be old when it did.
+            self.on_their_way = 0;
+            self.give_up_queue();
         }
         events(PortEvent::Bus(state));
     }
@@ -315,8 +346,9 @@ impl<'a> Attached<'a> {
     fn look(&mut self, events: &mut impl FnMut(PortEvent<'_>)) -> io::Result<()> {
         if self.is_off() {
             self.look_at = now() + pause(self.looks.pause());
-            if has_carrier(&self.port.interface) {
-                self.enter(BusState::Active, events);
+            let link = Link::of(&self.port.interface);
+            if !link.is_off() {
+                self.enter(link.bus(), events);
             }
             return Ok(());
         }
@@ -378,12 +410,6 @@ fn kernel_frame(frame: &CanFrame) -> io::Result<socketcan::CanFrame> {
 /// tells when the former has some again.
 fn is_full(error: &io::Error) -> bool {
     matches!(error.raw_os_error(), Some(libc::ENOBUFS | libc::EAGAIN | libc::EINTR))
-}
-
-/// Whether the interface is not bus-off, as far as the system tells: drivers take the carrier away then.
-fn has_carrier(interface: &str) -> bool {
-    let told = std::fs::read_to_string(format!("/sys/class/net/{interface}/carrier"));
-    told.map_or(true, |told| told.trim() != "0")
 }
 
 fn pause(pause: StdDuration) -> Duration {

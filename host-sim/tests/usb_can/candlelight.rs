@@ -53,6 +53,8 @@ pub(crate) struct CandleLight {
     sent: Vec<String>,
     /// How many the driver has sent.
     given: usize,
+    /// How many frames of others the driver was told.
+    heard: u64,
 }
 
 impl CandleLight {
@@ -69,6 +71,7 @@ impl CandleLight {
             to_host: VecDeque::new(),
             sent: Vec::new(),
             given: 0,
+            heard: 0,
         }
     }
 
@@ -90,6 +93,11 @@ impl CandleLight {
         self.given
     }
 
+    /// How many frames of others the driver was told so far.
+    pub(crate) fn heard(&self) -> u64 {
+        self.heard
+    }
+
     /// The bus is like this from now on.
     pub(crate) fn becomes(&mut self, bus: Bus) {
         self.bus = bus;
@@ -98,18 +106,21 @@ impl CandleLight {
 
     /// Somebody else sends a frame.
     pub(crate) fn hears(&mut self, frame: &str) {
-        if self.can_hear() {
-            self.receive_errors = self.receive_errors.saturating_sub(1);
-            self.to_host.push_back(HostFrame::heard(frame, 0));
-            self.work();
-        }
+        self.hear(HostFrame::heard(frame, 0));
     }
 
     /// Somebody else sent more than the adapter could keep, and then this. Firmware that tells of it
     /// marks the frame; candleLight's own never does.
     pub(crate) fn hears_after_a_loss(&mut self, frame: &str) {
-        if self.can_hear() {
-            self.to_host.push_back(HostFrame::heard(frame, FLAG_OVERFLOW));
+        self.hear(HostFrame::heard(frame, FLAG_OVERFLOW));
+    }
+
+    fn hear(&mut self, frame: HostFrame) {
+        if self.on && self.state() != State::BusOff {
+            self.heard += 1;
+            self.to_host.push_back(frame);
+            self.receive_errors = self.receive_errors.saturating_sub(1);
+            self.work();
         }
     }
 
@@ -135,10 +146,6 @@ impl CandleLight {
             Restart::Unsaid => self.told = State::Active,
         }
         self.work();
-    }
-
-    fn can_hear(&self) -> bool {
-        self.on && self.state() != State::BusOff
     }
 
     fn state(&self) -> State {
