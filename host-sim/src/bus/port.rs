@@ -258,10 +258,12 @@ pub struct DeviceCounters {
     pub overflows: u64,
     /// Times a CAN controller was started again after bus-off.
     pub restarts: u64,
-    /// A CAN controller's transmit error counter, as told last: what others say of what it sends.
-    pub tx_error_counter: u8,
-    /// Its receive error counter: what it says of what others send.
-    pub rx_error_counter: u8,
+    /// A CAN controller's transmit error counter, as it was told last.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub tx_error_counter: Option<u8>,
+    /// Its receive error counter.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub rx_error_counter: Option<u8>,
     /// CAN FD frames, which no recipe takes.
     pub fd_frames: u64,
     /// A CAN controller's error state, where it is known: active, warning, passive or bus-off.

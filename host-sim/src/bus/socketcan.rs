@@ -94,8 +94,9 @@ struct Attached<'a> {
     socket: CanFdSocket,
     timer: Timer,
     state: BusState,
-    /// A bus that is shorted changes its state many times a second.
-    lines: Quota,
+    /// Of each kind: a bus that is shorted changes its state many times a second.
+    off_lines: Quota,
+    passive_lines: Quota,
     /// Frames that the kernel took and did not give back yet.
     on_their_way: usize,
     /// [`Self::lost`] when the kernel took the first of them.
@@ -130,13 +131,14 @@ impl<'a> Attached<'a> {
             return Err(error);
         }
         // No longer those of the controller that was there before.
-        port.tx.count(|counters| (counters.tx_error_counter, counters.rx_error_counter) = (0, 0));
+        port.tx.count(|counters| (counters.tx_error_counter, counters.rx_error_counter) = (None, None));
         Ok(Self {
             port,
             socket,
             timer: Timer::new()?,
             state: Link::of(&port.interface).bus(),
-            lines: Quota::default(),
+            off_lines: Quota::default(),
+            passive_lines: Quota::default(),
             on_their_way: 0,
             lost_before: 0,
             refused_since: None,
@@ -224,8 +226,8 @@ impl<'a> Attached<'a> {
         tx.count(|counters| {
             counters.error_frames += 1;
             counters.overflows += u64::from(state::is_overflow(frame));
-            if let Some(told) = told {
-                (counters.tx_error_counter, counters.rx_error_counter) = told;
+            if let Some((transmit, receive)) = told {
+                (counters.tx_error_counter, counters.rx_error_counter) = (Some(transmit), Some(receive));
             }
         });
         match state::news(frame) {
@@ -248,18 +250,19 @@ impl<'a> Attached<'a> {
         self.state = state;
         self.port.tx.count(|counters| counters.bus = state::name(state));
         let DeviceCounters { tx_error_counter, rx_error_counter, .. } = self.port.tx.counters();
-        if let Some(more) = self.lines.take(now()) {
-            match state {
-                BusState::BusOff => warn!(interface, more, "bus-off: nothing is sent until it was restarted"),
-                BusState::Passive => warn!(
-                    interface,
-                    more,
-                    tx_error_counter,
-                    rx_error_counter,
-                    "error-passive: nobody acknowledges, bit rates differ, or the cable is bad"
-                ),
-                _ => info!(interface, more, state = state::name(state), "bus state"),
+        match state {
+            BusState::BusOff => {
+                if let Some(more) = self.off_lines.take(now()) {
+                    warn!(interface, more, "bus-off: nothing is sent until it was restarted");
+                }
             }
+            BusState::Passive => {
+                if let Some(more) = self.passive_lines.take(now()) {
+                    let what = "error-passive: nobody acknowledges, bit rates differ, or the cable is bad";
+                    warn!(interface, more, tx_error_counter, rx_error_counter, "{what}");
+                }
+            }
+            _ => info!(interface, state = state::name(state), "bus state"),
         }
         if state == BusState::BusOff {
             self.looks.reset();

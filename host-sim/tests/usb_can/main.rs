@@ -9,7 +9,7 @@
 //!   `modprobe -a vhci_hcd gs_usb`. There must be no interface `can0`.
 //! * Without it every test is counted as ignored.
 //!
-//! What no interface without a driver has is tested here; the rest is in `tests/socketcan`.
+//! Only what a real driver does otherwise is tested here; the rest is in `tests/socketcan`.
 
 mod bus_off;
 mod candlelight;
