@@ -80,9 +80,8 @@ impl Port {
             (PortBus::Serial(settings), _) => {
                 Driver::Line(Line::open(device, settings, Rc::clone(&tx)).await?)
             }
-            // The interface's bit rate is the administrator's business.
-            (PortBus::Can { .. }, Device::SocketCan { interface }) => {
-                Driver::Kernel(KernelCan::open(interface, Rc::clone(&tx))?)
+            (PortBus::Can { bitrate }, Device::SocketCan { interface }) => {
+                Driver::Kernel(KernelCan::open(interface, bitrate, Rc::clone(&tx))?)
             }
             (PortBus::Can { bitrate }, _) => {
                 Driver::Can(CanPort::open(device, bitrate, Rc::clone(&tx)).await?)

@@ -37,15 +37,17 @@ use super::turns::give_way;
 #[derive(Debug)]
 pub(super) struct KernelCan {
     interface: String,
+    /// Bit/s, of the configuration.
+    bitrate: u32,
     ids: Option<Vec<CanId>>,
     tx: Rc<PortTx>,
 }
 
 impl KernelCan {
-    pub(super) fn open(interface: &str, tx: Rc<PortTx>) -> io::Result<Self> {
+    pub(super) fn open(interface: &str, bitrate: u32, tx: Rc<PortTx>) -> io::Result<Self> {
         // Only to say at once what is wrong; it may still be down.
         match CanFdSocket::open(interface) {
-            Ok(_) => Ok(Self { interface: interface.to_owned(), ids: None, tx }),
+            Ok(_) => Ok(Self { interface: interface.to_owned(), bitrate, ids: None, tx }),
             Err(error) => {
                 let why = match error.raw_os_error() {
                     Some(libc::EAFNOSUPPORT) => "this kernel has no CAN".to_owned(),
@@ -66,6 +68,19 @@ impl KernelCan {
         self.ids = Some(ids);
     }
 
+    /// The interface's bit rate is the administrator's business, but a mistake is worth a word.
+    fn compare_bitrates(&self) {
+        let (interface, configured) = (&self.interface, self.bitrate);
+        // A controller may not come nearer.
+        let tolerance = configured / 100;
+        match Link::of(interface).bitrate {
+            Some(bitrate) if bitrate.abs_diff(configured) > tolerance => {
+                warn!(interface, bitrate, configured, "the interface has another bit rate than the port");
+            }
+            _ => {}
+        }
+    }
+
     pub(super) async fn run(self, mut events: impl FnMut(PortEvent<'_>)) -> io::Result<()> {
         let interface = &self.interface;
         let mut backoff = Backoff::new(LEAST_PAUSE, MOST_PAUSE);
@@ -73,6 +88,7 @@ impl KernelCan {
             match Attached::new(&self) {
                 Ok(mut attached) => {
                     info!(interface, "up");
+                    self.compare_bitrates();
                     backoff.reset();
                     self.tx.frames.borrow_mut().clear();
                     self.tx.count(|counters| counters.ups += 1);

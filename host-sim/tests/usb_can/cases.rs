@@ -9,6 +9,7 @@ use super::stand::{Adapter, Cell, bind};
 
 pub(crate) const CASES: &[Case] = &[
     ("the_worked_example_through_the_gateway", works),
+    ("another_bit_rate_is_warned_of", another_bit_rate),
     ("nobody_acknowledges_and_then_somebody_does", nobody_acknowledges),
     ("a_cycle_longer_than_the_queue_and_nobody_acknowledges", no_buffers),
     ("error_passive_with_the_counters", error_passive),
@@ -52,6 +53,16 @@ fn works() {
         (&0.into(), &0.into()),
         "{port}"
     );
+    assert_eq!(cell.gateway.log("interface="), Vec::<String>::new());
+    cell.end();
+}
+
+fn another_bit_rate() {
+    let adapter = Adapter::up(250_000);
+    let cell = Cell::system();
+    let warning = until("a warning", || cell.gateway.log("another bit rate").pop());
+    assert!(warning.contains("bitrate=250000 configured=500000"), "{warning}");
+    serves(&adapter, &cell.robot, 1);
     cell.end();
 }
 

@@ -1,7 +1,7 @@
 //! What the kernel says of a CAN interface when it is asked (rtnetlink, as `ip -details link show` does).
 //!
-//! In: an interface's name, or the kernel's answer as bytes. Out: whether it has a carrier, and the error
-//! state that its driver knows. Refuses to know what was heard before. No privileges are needed.
+//! In: an interface's name, or the kernel's answer as bytes. Out: whether it has a carrier, and the bit rate
+//! and the error state that its driver knows. Refuses to know what was heard before. No privileges are needed.
 //!
 //! Neither alone tells of bus-off: some drivers take the carrier away and know no state, `gs_usb` keeps the
 //! carrier and knows the state that its adapter told last.
@@ -16,6 +16,8 @@ use rustix::net::{AddressFamily, RecvFlags, SendFlags, SocketFlags, SocketType, 
 pub(super) struct Link {
     /// Whether it has a carrier; also when the kernel does not say.
     pub(super) has_carrier: bool,
+    /// Bit/s; `None` for an interface without a controller, or where others set it.
+    pub(super) bitrate: Option<u32>,
     /// What its driver knows of the controller; `None` for an interface without one.
     state: Option<BusState>,
 }
@@ -35,7 +37,7 @@ impl Link {
 
     /// As [`Self::ask`]; an interface that the kernel says nothing of is taken for one without errors.
     pub(super) fn of(interface: &str) -> Self {
-        Self::ask(interface).unwrap_or(Self { has_carrier: true, state: None })
+        Self::ask(interface).unwrap_or(Self { has_carrier: true, bitrate: None, state: None })
     }
 
     /// The controller's state.
@@ -59,6 +61,7 @@ impl Link {
         let info = find(attributes, libc::IFLA_LINKINFO).unwrap_or_default();
         let is_can = find(info, libc::IFLA_INFO_KIND).is_some_and(|kind| kind.starts_with(b"can\0"));
         let data = find(info, libc::IFLA_INFO_DATA).filter(|_| is_can).unwrap_or_default();
+        let bitrate = find(data, CAN_BIT_TIMING).and_then(word).filter(|&bitrate| bitrate != 0);
         let state = find(data, CAN_STATE).and_then(word).and_then(|state| match state {
             0 => Some(BusState::Active),
             1 => Some(BusState::Warning),
@@ -67,7 +70,7 @@ impl Link {
             // Stopped and sleeping: it is down.
             _ => None,
         });
-        Some(Self { has_carrier: carrier != Some(&0), state })
+        Some(Self { has_carrier: carrier != Some(&0), bitrate, state })
     }
 }
 
@@ -119,6 +122,8 @@ const ALIGNMENT: usize = 4;
 const REQUEST: u16 = 1;
 /// In an attribute's kind: nested, network byte order.
 const FLAGS: u16 = 0xC000;
+/// IFLA_CAN_BITTIMING: a structure that begins with the bit rate.
+const CAN_BIT_TIMING: u16 = 1;
 /// IFLA_CAN_STATE.
 const CAN_STATE: u16 = 4;
 /// Longest answer: an interface's takes 2 KiB.
@@ -146,7 +151,8 @@ mod tests {
     }
 
     fn can(carrier: u8, kind: &[u8], state: u32) -> Vec<u8> {
-        let data = [attribute(1, &[0; 32]), attribute(CAN_STATE, &state.to_ne_bytes())].concat();
+        let timing = [500_000_u32.to_ne_bytes(), 7_u32.to_ne_bytes()].concat();
+        let data = [attribute(CAN_BIT_TIMING, &timing), attribute(CAN_STATE, &state.to_ne_bytes())].concat();
         let info = [attribute(libc::IFLA_INFO_KIND, kind), attribute(libc::IFLA_INFO_DATA, &data)].concat();
         answer(
             libc::RTM_NEWLINK,
@@ -168,12 +174,13 @@ mod tests {
             assert_eq!((bus(1, state), bus(0, state)), (expected, BusState::BusOff));
         }
         assert_eq!(bus(1, 4), BusState::Active, "stopped");
+        assert_eq!(Link::parse(&can(1, b"can\0", 0)).unwrap().bitrate, Some(500_000));
     }
 
     #[test]
     fn an_interface_without_a_controller_has_only_its_carrier() {
         let virtual_one = Link::parse(&can(1, b"vcan\0", 3)).unwrap();
-        assert_eq!(virtual_one, Link { has_carrier: true, state: None });
+        assert_eq!(virtual_one, Link { has_carrier: true, bitrate: None, state: None });
         let bare = Link::parse(&answer(libc::RTM_NEWLINK, &[])).unwrap();
         assert_eq!(bare.bus(), BusState::Active);
     }
@@ -196,7 +203,7 @@ mod tests {
 
     #[test]
     fn the_kernel_answers() {
-        assert_eq!(Link::ask("lo").unwrap(), Link { has_carrier: true, state: None });
+        assert_eq!(Link::ask("lo").unwrap(), Link { has_carrier: true, bitrate: None, state: None });
         assert!(Link::ask("no-such-one").is_err());
         assert!(Link::ask(&"x".repeat(70_000)).is_err());
     }
