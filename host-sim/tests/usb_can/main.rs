@@ -27,7 +27,7 @@ use std::process::{Command, ExitCode};
 use libtest_mimic::{Arguments, Failed, Trial};
 
 const HOW: &str = "host-sim/tests/pc/kernel && HOST_SIM_USB_CAN=qemu cargo test --test usb_can (Debian: apt-get \
-                   install qemu-system-x86 busybox-static iproute2 can-utils), or HOST_SIM_USB_CAN=here as root \
+                   install qemu-system-x86 busybox-static can-utils iproute2 xz-utils), or HOST_SIM_USB_CAN=here as root \
                    on a kernel with vhci_hcd and gs_usb";
 
 fn main() -> ExitCode {
