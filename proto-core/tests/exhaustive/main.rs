@@ -109,6 +109,7 @@ fn recipe_roots(way: Way, start: Instant) -> Vec<Root<RecipeCell>> {
     let up = match way {
         Way::Udp => up.after(&[Up(LinkId::STATE), State(0)]),
         Way::UdpBoth => up.after(&[Taken, Up(LinkId::STATE), State(0), Shown(0)]),
+        Way::Held => up.after(&[Taken, Up(LinkId::STATE), State(0), Shown(0), Frame(1)]),
         Way::Tcp => up.after(&[Shown(0)]),
     };
     let working = up.after(&[Frame(0), Taken]);
@@ -117,8 +118,18 @@ fn recipe_roots(way: Way, start: Instant) -> Vec<Root<RecipeCell>> {
         vec![root("working", working.clone(), 0), root("cold", cold, 1), root("silent", silent, 1)];
     if way == Way::Tcp {
         // One more frame can be handed over before some are acknowledged.
-        let full = working.after(&[Frame(0), Taken].repeat(62));
+        let full = working.clone().after(&[Frame(0), Taken].repeat(62));
         roots.push(root("full", full, 1));
+    }
+    if way == Way::Held {
+        // The float's owner is silent beside the bit's, and the controller talks, or did not.
+        let alone = working.clone().after(&[Frame(1), Taken, Steady, Taken]);
+        let gap = alone.clone().after(&[Steady, Taken]);
+        // Both are silent, and what is safe is repeated slowly by now.
+        let slow = (0..3).fold(working, |cell, _| cell.after(&[Step, Taken, Shown(0)]));
+        roots.push(root("alone", alone.after(&[Shown(0)]), 1));
+        roots.push(root("gap", gap.after(&[Shown(0)]), 1));
+        roots.push(root("slow", slow, 1));
     }
     roots
 }
@@ -131,6 +142,11 @@ fn a_float_and_a_bit_by_udp() {
 #[test]
 fn a_float_and_a_bit_by_udp_with_frames_back() {
     check("the same with frames back", &recipe_roots(Way::UdpBoth, START), &size((5, 0), (7, 0)));
+}
+
+#[test]
+fn a_float_that_is_held_and_a_bit_by_udp() {
+    check("a float that is held by UDP", &recipe_roots(Way::Held, START), &size((5, 0), (7, 0)));
 }
 
 #[test]
@@ -167,7 +183,7 @@ fn compare<W: World>(roots: &[Root<W>], later: &[Root<W>]) {
 fn states_that_are_merged_behave_alike() {
     let later = START + proto_core::time::Duration::from_secs(3600);
     compare(&command_roots(START), &command_roots(later));
-    for way in [Way::Udp, Way::UdpBoth, Way::Tcp] {
+    for way in [Way::Udp, Way::UdpBoth, Way::Held, Way::Tcp] {
         compare(&recipe_roots(way, START), &recipe_roots(way, later));
     }
 }
