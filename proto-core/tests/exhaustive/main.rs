@@ -122,14 +122,14 @@ fn recipe_roots(way: Way, start: Instant) -> Vec<Root<RecipeCell>> {
         roots.push(root("full", full, 1));
     }
     if way == Way::Held {
-        // The float's owner is silent beside the bit's, and the controller talks, or did not.
+        // The float's owner is silent beside the bit's; so is the controller then.
         let alone = working.clone().after(&[Frame(1), Taken, Steady, Taken]);
         let gap = alone.clone().after(&[Steady, Taken]);
-        // Both are silent, and what is safe is repeated slowly by now.
-        let slow = (0..3).fold(working, |cell, _| cell.after(&[Step, Taken, Shown(0)]));
+        // Both are silent, and the controller talks, though not by the state stream.
+        let long = (0..3).fold(working, |cell, _| cell.after(&[Step, Taken, Shown(0)]));
         roots.push(root("alone", alone.after(&[Shown(0)]), 1));
-        roots.push(root("gap", gap.after(&[Shown(0)]), 1));
-        roots.push(root("slow", slow, 1));
+        roots.push(root("gap", gap, 1));
+        roots.push(root("long", long, 1));
     }
     roots
 }

@@ -53,7 +53,8 @@ const VALUES: [f32; 2] = [9.0, f32::INFINITY];
 pub enum Event {
     /// The device sends one of its frames.
     Frame(u8),
-    /// The device repeats its newest frame with the bit for a while, often enough, and the driver keeps its time.
+    /// The device repeats its newest frame with the bit for a while, often enough, and the driver keeps its
+    /// time.
     Steady,
     /// The engine is called when it wants to be.
     Tick,
@@ -253,9 +254,9 @@ impl World for RecipeCell {
         add(SleepPort, judge.is_up);
         let link = gateway.conns.of(judge.way.link());
         let is_stated = judge.way.has_state() && gateway.conns.is_open(LinkId::STATE);
-        // What other cells try, and has nothing to do with what is held.
-        let is_held = judge.way == Way::Held;
         let is_shown = judge.way.shows() && link.is == Is::Open;
+        // What has nothing to do with held values is left to the other cells.
+        let is_held = judge.way == Way::Held;
         add(SleepLink, !judge.is_up || is_stated || is_shown);
         for conn in &gateway.conns.0 {
             add(Up(conn.link), conn.is == Is::Opening);
@@ -264,9 +265,9 @@ impl World for RecipeCell {
         add(Taken, link.unsent);
         add(Acked, !link.unsent && !link.under_way.is_empty());
         add(AckedFirst, !link.unsent && link.under_way.len() > 1);
-        for nth in 0..PACKETS.len() {
-            let is_bit_alone = is_held && PACKETS[nth].1.iter().any(|float| float.is_nan());
-            add(State(nth as u8), is_stated && !is_bit_alone);
+        for (nth, (_, floats)) in PACKETS.iter().enumerate() {
+            let is_for_floats = floats.iter().any(|float| float.is_nan());
+            add(State(nth as u8), is_stated && !(is_for_floats && is_held));
         }
         add(Garbage, is_stated && !is_held);
         for nth in 0..VALUES.len() {

@@ -10,7 +10,7 @@ use crate::rig::var;
 use crate::values::{Bits, Float, Instead};
 
 pub const BIT: &str = "BitInputReg[3]";
-/// What the frames of [`Way::Held`] bring; the others' values come in the device's frames alone.
+/// What the controller's recipe frames bring.
 pub const SHOWN: &str = "RobotState[26]";
 pub const SAFE_BIT: u8 = 4;
 /// By TCP, where nothing could be read back.
@@ -382,7 +382,7 @@ impl Judge for Facts {
         if known(BIT) != self.bits.newest.map(Scalar::Byte) {
             return Err(format!("has {:?} instead of {:?}", known(BIT), self.bits.newest));
         }
-        if self.way == Way::Held && known(SHOWN) != self.source.map(Scalar::Float) {
+        if self.way.shows() && known(SHOWN) != self.source.map(Scalar::Float) {
             return Err(format!("has {:?} instead of {:?}", known(SHOWN), self.source));
         }
         let state = match () {
