@@ -1,16 +1,18 @@
-//! An RS-485 port with a float and a bit, which go to the controller over a recipe link; the device is
-//! shown a float of the controller's and its own bit.
+//! A port with a float and a bit, which go to the controller over a recipe link. By RS-485 both come in
+//! one frame, and the device is shown a float of the controller's and its own bit; by CAN each comes in a
+//! frame of its own, so that one can be missing beside the other.
 
 use proto_core::config::{Bus, GatewayConfig, InputBinding, OnStale, OutputBinding, Parts, SendOn};
 use proto_core::engine::{Input, LinkId, PortId};
-use proto_core::recipe::model::Mode;
+use proto_core::recipe::CanFrame;
+use proto_core::recipe::model::{CanId, Mode};
 use proto_core::time::Instant;
 use proto_core::wire::scalar::ScalarType;
 
 use crate::driver::{Broken, Conns, Gateway, Is, PORT, STEADY, Small};
 use crate::recipe_judge::{
     BIT, BITS_AT, CYCLE, FLOATS_AT, Facts, LONGEST_AGE, OUTPUTS_AT, REPEAT_FAST_FOR, SAFE_BIT, SAFE_FLOAT,
-    STALE_AFTER,
+    SHOWN, STALE_AFTER,
 };
 use crate::rig::{Cell, user_in, user_out, var};
 use crate::scribe::{LookBack, Scribe};
@@ -26,24 +28,33 @@ pub enum Way {
     UdpBoth,
     /// The controller's TCP client: nothing shows what it has, and frames come back.
     Tcp,
+    /// UDP 2011 and frames back: a float that nothing shows is held while the controller is there. The
+    /// bit is read back from the state stream.
+    Held,
 }
 
 const FLOAT: &str = "FloatInputReg[1]";
+/// One that cannot be read back.
+const FORCE: &str = "ForceEnd[1]";
 /// A neighbour in the link's frame, which nobody here sends.
 const NEIGHBOUR: &str = "FloatInputReg[2]";
-/// The device's frames.
-const FRAMES: [(f32, u8); 3] = [(1.0, 0), (2.0, 1), (f32::NAN, 1)];
+/// The device's frames: by RS-485 with both values, by CAN with one.
+const FRAMES: [(Option<f32>, Option<u8>); 3] =
+    [(Some(1.0), Some(0)), (Some(2.0), Some(1)), (Some(f32::NAN), Some(1))];
+const CAN_FRAMES: [(Option<f32>, Option<u8>); 4] =
+    [(Some(1.0), None), (None, Some(1)), (None, Some(0)), (Some(f32::NAN), None)];
 /// The controller's state packets: bit, float, neighbour and what the device is shown.
 const PACKETS: [(u8, [f32; 3]); 3] =
     [(0, [7.0, 5.0, 8.0]), (SAFE_BIT, [7.5, 5.5, 8.5]), (SAFE_BIT, [f32::NAN; 3])];
 /// What the controller's own recipe frames show.
-const SHOWN: [f32; 2] = [9.0, f32::INFINITY];
+const VALUES: [f32; 2] = [9.0, f32::INFINITY];
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Event {
-    /// The device sends one of [`FRAMES`].
+    /// The device sends one of its frames.
     Frame(u8),
-    /// The device repeats its newest frame for a while, often enough, and the driver keeps its time.
+    /// The device repeats its newest frame with the bit for a while, often enough, and the driver keeps its
+    /// time.
     Steady,
     /// The engine is called when it wants to be.
     Tick,
@@ -64,7 +75,7 @@ pub enum Event {
     State(u8),
     /// Three packets come that are out of step.
     Garbage,
-    /// A recipe frame with one of [`SHOWN`] comes.
+    /// A recipe frame with one of [`VALUES`] comes.
     Shown(u8),
     Gone,
     Back,
@@ -79,12 +90,37 @@ pub struct RecipeCell {
 
 fn config(way: Way) -> GatewayConfig {
     let mut cell = Cell::new();
-    let shown = if way == Way::Udp { "FloatOutputReg[1]" } else { "RobotState[26]" };
+    let shown = if way == Way::Udp { "FloatOutputReg[1]" } else { SHOWN };
     let link = match way {
         Way::Udp => cell.stream(&[FLOAT, BIT, NEIGHBOUR], &[]),
         Way::UdpBoth => cell.stream(&[FLOAT, BIT, NEIGHBOUR], &[shown]),
         Way::Tcp => cell.stream(&[FLOAT, BIT], &[shown]),
+        Way::Held => cell.stream(&[FORCE, BIT], &[shown]),
     };
+    if way == Way::Held {
+        let recipe = cell.can(&[(1, &[FORCE]), (2, &[BIT])], &[]);
+        cell.can_port(recipe);
+    } else {
+        let recipe = both(&mut cell, way, shown);
+        cell.rs485(recipe);
+    }
+    cell.last_port().timeout = TIMEOUT;
+    cell.last_port().stale_after = STALE_AFTER;
+    cell.last_port().cycle = CYCLE;
+    cell.safe(BIT, f64::from(SAFE_BIT));
+    match way {
+        Way::Udp | Way::UdpBoth | Way::Held => cell.recipe_link(link),
+        Way::Tcp => {
+            cell.safe(FLOAT, f64::from(SAFE_FLOAT));
+            let listen = heapless::String::try_from("0.0.0.0:50000").expect("short");
+            cell.port(Bus::TcpListen { listen }, link);
+        }
+    }
+    cell.0
+}
+
+/// The recipe of the port that has both values in one frame.
+fn both(cell: &mut Cell, way: Way, shown: &str) -> u8 {
     let bound = |name| InputBinding::Variable { var: var(name), scale: 1.0, offset: 0.0 };
     let fields = [user_in(ScalarType::Float, bound(FLOAT)), user_in(ScalarType::Byte, bound(BIT))];
     let fields = cell.fields(fields);
@@ -99,20 +135,7 @@ fn config(way: Way) -> GatewayConfig {
     if way != Way::Tcp {
         cell.last_recipe().send = SendOn::Frame;
     }
-    cell.rs485(recipe);
-    cell.last_port().timeout = TIMEOUT;
-    cell.last_port().stale_after = STALE_AFTER;
-    cell.last_port().cycle = CYCLE;
-    cell.safe(BIT, f64::from(SAFE_BIT));
-    match way {
-        Way::Udp | Way::UdpBoth => cell.recipe_link(link),
-        Way::Tcp => {
-            cell.safe(FLOAT, f64::from(SAFE_FLOAT));
-            let listen = heapless::String::try_from("0.0.0.0:50000").expect("short");
-            cell.port(Bus::TcpListen { listen }, link);
-        }
-    }
-    cell.0
+    recipe
 }
 
 impl Way {
@@ -124,12 +147,26 @@ impl Way {
         self != Way::Tcp
     }
 
+    /// Whether the state stream brings the float, and another one beside it.
+    pub fn has_neighbour(self) -> bool {
+        matches!(self, Way::Udp | Way::UdpBoth)
+    }
+
     pub fn shows(self) -> bool {
         self != Way::Udp
     }
 
     pub fn greets(self) -> bool {
-        self == Way::UdpBoth
+        matches!(self, Way::UdpBoth | Way::Held)
+    }
+
+    /// Whether each of the device's frames is answered.
+    pub fn answers(self) -> bool {
+        matches!(self, Way::Udp | Way::UdpBoth)
+    }
+
+    fn frames(self) -> &'static [(Option<f32>, Option<u8>)] {
+        if self == Way::Held { &CAN_FRAMES } else { &FRAMES }
     }
 }
 
@@ -163,12 +200,20 @@ impl RecipeCell {
     }
 
     fn frame(&mut self, nth: u8) -> Result<(), Broken> {
-        let (float, bits) = FRAMES[usize::from(nth)];
-        if float.is_finite() {
+        let (float, bits) = self.judge.way.frames()[usize::from(nth)];
+        // The held float's owner is not the one that goes on.
+        if float.is_none_or(f32::is_finite) && bits.is_some() {
             self.judge.repeats = Some(nth);
         }
-        let [a, b, c, d] = float.to_le_bytes();
-        self.tell(Input::PortBytes { port: PORT, bytes: &[255, 255, a, b, c, d, bits, 238, 238] })
+        let float = float.map(f32::to_le_bytes);
+        if let (Some([a, b, c, d]), Some(bits)) = (float, bits) {
+            let bytes = [255, 255, a, b, c, d, bits, 238, 238];
+            return self.tell(Input::PortBytes { port: PORT, bytes: &bytes });
+        }
+        let id = CanId::Standard(if float.is_some() { 1 } else { 2 });
+        let data = float.as_ref().map_or(bits.as_slice(), |float| float.as_slice());
+        let frame = CanFrame::new(id, data).expect("short");
+        self.tell(Input::PortCan { port: PORT, frame })
     }
 
     fn state(&mut self, nth: u8) -> Result<(), Broken> {
@@ -182,7 +227,7 @@ impl RecipeCell {
     }
 
     fn shown(&mut self, nth: u8) -> Result<(), Broken> {
-        let [a, b, c, d] = SHOWN[usize::from(nth)].to_le_bytes();
+        let [a, b, c, d] = VALUES[usize::from(nth)].to_le_bytes();
         let bytes = [255, 255, a, b, c, d, 254, 254];
         self.tell(Input::LinkBytes { link: self.judge.way.link(), bytes: &bytes })
     }
@@ -199,7 +244,7 @@ impl World for RecipeCell {
                 events.push(event);
             }
         };
-        for nth in 0..FRAMES.len() {
+        for nth in 0..judge.way.frames().len() {
             add(Frame(nth as u8), judge.is_up);
         }
         add(Steady, judge.is_up && judge.repeats.is_some());
@@ -210,6 +255,8 @@ impl World for RecipeCell {
         let link = gateway.conns.of(judge.way.link());
         let is_stated = judge.way.has_state() && gateway.conns.is_open(LinkId::STATE);
         let is_shown = judge.way.shows() && link.is == Is::Open;
+        // What has nothing to do with held values is left to the other cells.
+        let is_held = judge.way == Way::Held;
         add(SleepLink, !judge.is_up || is_stated || is_shown);
         for conn in &gateway.conns.0 {
             add(Up(conn.link), conn.is == Is::Opening);
@@ -218,14 +265,15 @@ impl World for RecipeCell {
         add(Taken, link.unsent);
         add(Acked, !link.unsent && !link.under_way.is_empty());
         add(AckedFirst, !link.unsent && link.under_way.len() > 1);
-        for nth in 0..PACKETS.len() {
-            add(State(nth as u8), is_stated);
+        for (nth, (_, floats)) in PACKETS.iter().enumerate() {
+            let is_for_floats = floats.iter().any(|float| float.is_nan());
+            add(State(nth as u8), is_stated && !(is_for_floats && is_held));
         }
-        add(Garbage, is_stated);
-        for nth in 0..SHOWN.len() {
+        add(Garbage, is_stated && !is_held);
+        for nth in 0..VALUES.len() {
             add(Shown(nth as u8), is_shown);
         }
-        add(Gone, judge.is_up);
+        add(Gone, judge.is_up && !is_held);
         add(Back, !judge.is_up);
         events
     }

@@ -7,9 +7,11 @@ use proto_core::wire::scalar::Scalar;
 use crate::driver::{Broken, Conns, DEAF, Is, Judge, PORT, Small};
 use crate::recipe_cell::Way;
 use crate::rig::var;
-use crate::values::{Bits, Float};
+use crate::values::{Bits, Float, Instead};
 
 pub const BIT: &str = "BitInputReg[3]";
+/// What the controller's recipe frames bring.
+pub const SHOWN: &str = "RobotState[26]";
 pub const SAFE_BIT: u8 = 4;
 /// By TCP, where nothing could be read back.
 pub const SAFE_FLOAT: f32 = 0.5;
@@ -22,7 +24,7 @@ const PACKET: usize = 1468;
 /// How often the device is shown something by TCP; else each of its frames is answered.
 pub const CYCLE: Duration = Duration::from_millis(200);
 pub const STALE_AFTER: Duration = Duration::from_millis(300);
-/// A value that was read back may be so old, and a controller whose frames were missing for longer was
+/// A value that was read back may be so old, and a controller whose frames are missing for longer is
 /// away.
 pub const LONGEST_AGE: Duration = Duration::from_millis(500);
 const GREET_EVERY: Duration = Duration::from_millis(500);
@@ -45,6 +47,8 @@ pub struct Facts {
     deaf_until: Option<Instant>,
     bits: Bits,
     float: Float,
+    /// What the controller showed before there was a value of the bit's owner.
+    bits_back: Option<u8>,
     /// As the controller showed it last, when that could be read.
     neighbour: Option<f32>,
     /// When it showed anything.
@@ -65,8 +69,9 @@ pub struct Facts {
     /// Until when links that should talk may be silent.
     packet_by: Option<Instant>,
     frame_by: Option<Instant>,
-    /// Frames accepted, not finite, and discarded after a sleep; not part of the state.
-    counted: [u32; 3],
+    /// Frames accepted, not finite, discarded after a sleep, and not passed on at once for what is not
+    /// known; not part of the state.
+    counted: [u32; 4],
 }
 
 impl Facts {
@@ -77,7 +82,12 @@ impl Facts {
             repeats: None,
             deaf_until: None,
             bits: Bits::new(SAFE_BIT),
-            float: Float::new((way == Way::Tcp).then_some(SAFE_FLOAT)),
+            float: Float::new(match way {
+                Way::Udp | Way::UdpBoth => Instead::Shown,
+                Way::Tcp => Instead::Safe(SAFE_FLOAT),
+                Way::Held => Instead::Last,
+            }),
+            bits_back: None,
             neighbour: None,
             packet_at: None,
             source: None,
@@ -90,41 +100,45 @@ impl Facts {
             speak_at: None,
             packet_by: None,
             frame_by: None,
-            counted: [0; 3],
+            counted: [0; 4],
         }
     }
 
-    /// A frame of the device came whole.
-    fn frame(&mut self, now: Instant, bytes: &[u8], conns: &Conns) {
+    /// A frame of the device came whole, with both values or one of them.
+    fn frame(&mut self, now: Instant, (float, bits): (Option<f32>, Option<u8>), conns: &Conns) {
         if self.deaf_until.is_some() {
             self.counted[2] += 1;
             return;
         }
-        let value = f32::from_le_bytes(bytes[2..6].try_into().expect("four bytes"));
-        if !value.is_finite() {
+        if float.is_some_and(|value| !value.is_finite()) {
             self.counted[1] += 1;
             return;
         }
         self.counted[0] += 1;
         let is_reachable = conns.is_open(self.way.link());
-        self.bits.received(bytes[6], is_reachable, now);
-        self.float.received(value, is_reachable);
+        if let Some(bits) = bits {
+            self.bits.received(bits, is_reachable, now);
+            self.bits_back = None;
+        }
+        if let Some(value) = float {
+            self.float.received(value, is_reachable, now);
+        }
+        self.counted[3] += u32::from(is_reachable && !self.is_ready(now));
         self.frame_at = Some(now);
-        self.is_due |= self.way != Way::Tcp;
+        self.is_due |= self.way.answers();
     }
 
     fn packet(&mut self, now: Instant, bytes: &[u8]) {
+        self.look_for_controller(now, Some(LinkId::STATE));
         self.packet_by = Some(now + SILENCE);
-        let float = |at: usize| {
-            let value = f32::from_le_bytes(bytes[at..at + 4].try_into().expect("four bytes"));
-            Some(value).filter(|value| value.is_finite())
-        };
+        let float = |at| Some(float_at(bytes, at)).filter(|value| value.is_finite());
         let bits = (0..8).fold(0, |sum, bit| sum | bytes[BITS_AT + bit] << bit);
         self.bits.shown(bits, now);
-        if !self.float.is_live {
+        self.bits_back = Some(bits).filter(|_| self.bits.newest.is_none());
+        if !self.float.is_live && self.way.has_neighbour() {
             self.float.read_back(float(FLOATS_AT));
         }
-        self.neighbour = float(FLOATS_AT + 4);
+        self.neighbour = float(FLOATS_AT + 4).filter(|_| self.way.has_neighbour());
         self.packet_at = Some(now);
         if self.way == Way::Udp {
             self.source = float(OUTPUTS_AT);
@@ -133,13 +147,13 @@ impl Facts {
     }
 
     fn recipe_frame(&mut self, now: Instant, bytes: &[u8]) {
-        self.frame_by = Some(now + SILENCE);
+        self.look_for_controller(now, Some(self.way.link()));
+        self.frame_by = (self.way == Way::Tcp).then_some(now + SILENCE);
         let was_away = self.source_at.is_some_and(|at| now.saturating_since(at) > LONGEST_AGE);
         if was_away {
             self.was_away(now);
         }
-        let value = f32::from_le_bytes(bytes[2..6].try_into().expect("four bytes"));
-        self.source = Some(value).filter(|value| value.is_finite());
+        self.source = Some(float_at(bytes, 2)).filter(|value| value.is_finite());
         self.source_at = Some(now);
         if self.way.greets() {
             self.greet_at = Some(now + GREET_EVERY);
@@ -155,8 +169,23 @@ impl Facts {
     /// Whether every variable of a frame to the controller is known.
     fn is_ready(&self, now: Instant) -> bool {
         let is_young = self.packet_at.is_some_and(|at| now.saturating_since(at) <= LONGEST_AGE);
-        let is_float_known = self.float.is_live || self.float.newest.is_some() && is_young;
-        is_float_known && (self.way == Way::Tcp || self.neighbour.is_some() && is_young)
+        let is_bit_known = self.bits.newest.is_some() || self.bits_back.is_some() && is_young;
+        let is_neighbour_known = !self.way.has_neighbour() || self.neighbour.is_some() && is_young;
+        self.float.newest.is_some() && is_bit_known && is_neighbour_known
+    }
+
+    /// Its frames or packets tell that the controller is there. When both are missing, or one of them
+    /// comes that was missing, the controller can be another.
+    fn look_for_controller(&mut self, now: Instant, comes: Option<LinkId>) {
+        let is_missing = |at: Option<Instant>| at.is_none_or(|at| now.saturating_since(at) > LONGEST_AGE);
+        let is_new = match comes {
+            Some(LinkId::STATE) => is_missing(self.packet_at),
+            Some(_) => is_missing(self.source_at),
+            None => is_missing(self.packet_at) && is_missing(self.source_at),
+        };
+        if is_new {
+            self.float.controller_is_new();
+        }
     }
 
     fn is_to_greet(&self, now: Instant) -> bool {
@@ -177,9 +206,16 @@ impl Facts {
 
 impl Judge for Facts {
     fn told(&mut self, now: Instant, input: &Input<'_>, conns: &mut Conns) {
+        self.look_for_controller(now, None);
         match *input {
             Input::Tick => self.deaf_until = self.deaf_until.filter(|&until| now < until),
-            Input::PortBytes { bytes, .. } => self.frame(now, bytes, conns),
+            Input::PortBytes { bytes, .. } => {
+                self.frame(now, (Some(float_at(bytes, 2)), Some(bytes[6])), conns);
+            }
+            Input::PortCan { frame, .. } => match *frame.data() {
+                [bits] => self.frame(now, (None, Some(bits)), conns),
+                _ => self.frame(now, (Some(float_at(frame.data(), 0)), None), conns),
+            },
             Input::PortUp { .. } => self.is_up = true,
             Input::PortDown { .. } => (self.is_up, self.is_due) = (false, false),
             Input::LinkUp { link } => {
@@ -187,7 +223,8 @@ impl Judge for Facts {
                 if link == LinkId::STATE {
                     self.packet_by = Some(now + SILENCE);
                 } else {
-                    self.frame_by = Some(now + SILENCE);
+                    self.float.controller_is_new();
+                    self.frame_by = (self.way == Way::Tcp).then_some(now + SILENCE);
                     self.greet_at = self.way.greets().then_some(now);
                     self.speak_at = self.greet_at;
                 }
@@ -207,9 +244,8 @@ impl Judge for Facts {
     fn down(&mut self, _: Instant, _: LinkId, _: Is, _: &mut Conns) {}
 
     fn deadlines(&mut self, now: Instant, conns: &mut Conns) -> Result<(), Broken> {
-        if self.bits.deadlines(now) {
-            self.float.overdue();
-        }
+        self.bits.deadlines(now);
+        self.float.deadlines(now);
         if self.way == Way::Tcp && now >= self.cycle_at {
             let cycle = CYCLE.as_micros();
             self.cycle_at = Instant::from_micros((now.as_micros() / cycle + 1) * cycle);
@@ -233,7 +269,7 @@ impl Judge for Facts {
             conns.must_close(now, LinkId::STATE);
             self.lost(now, LinkId::STATE);
         }
-        if self.way == Way::Tcp && self.frame_by.is_some_and(|by| now >= by) {
+        if self.frame_by.is_some_and(|by| now >= by) {
             conns.must_close(now, link);
             self.lost(now, link);
         }
@@ -263,8 +299,10 @@ impl Judge for Facts {
             return is_time.then_some(Instant::NEVER).ok_or("greets too soon".to_owned());
         }
         let (frame, neighbour) = match *bytes {
-            [255, 255, a, b, c, d, bits, 238, 238] if self.way == Way::Tcp => (([a, b, c, d], bits), None),
-            [255, 255, a, b, c, d, bits, e, f, g, h, 238, 238] if self.way != Way::Tcp => {
+            [255, 255, a, b, c, d, bits, 238, 238] if !self.way.has_neighbour() => {
+                (([a, b, c, d], bits), None)
+            }
+            [255, 255, a, b, c, d, bits, e, f, g, h, 238, 238] if self.way.has_neighbour() => {
                 (([a, b, c, d], bits), Some(f32::from_le_bytes([e, f, g, h])))
             }
             _ => return Err(format!("sends {bytes:?}")),
@@ -282,13 +320,13 @@ impl Judge for Facts {
         if Some(float) != self.float.newest {
             return Err(format!("sends {float} instead of {:?}", self.float.newest));
         }
-        if self.way != Way::Tcp && neighbour != self.neighbour {
+        if self.way.has_neighbour() && neighbour != self.neighbour {
             return Err(format!("sends {neighbour:?} as the neighbour instead of {:?}", self.neighbour));
         }
         if self.bits.is_waiting() {
             self.bits.take(bits, now)?;
-        } else if Some(bits) != self.bits.newest {
-            return Err(format!("sends {bits} instead of {:?}", self.bits.newest));
+        } else if Some(bits) != self.bits.newest.or(self.bits_back) {
+            return Err(format!("sends {bits} instead of {:?}", self.bits.newest.or(self.bits_back)));
         }
         self.float.taken();
         if let Some(since) = self.bits.unconfirmed_since
@@ -344,19 +382,27 @@ impl Judge for Facts {
         if known(BIT) != self.bits.newest.map(Scalar::Byte) {
             return Err(format!("has {:?} instead of {:?}", known(BIT), self.bits.newest));
         }
+        if self.way.shows() && known(SHOWN) != self.source.map(Scalar::Float) {
+            return Err(format!("has {:?} instead of {:?}", known(SHOWN), self.source));
+        }
         let state = match () {
             () if !self.is_up => PortState::Gone,
-            () if self.bits.is_silent() => PortState::Silent,
+            () if self.bits.is_silent() || self.float.is_silent() => PortState::Silent,
             () => PortState::Working,
         };
         if engine.port_state(PORT) != Some(state) {
             return Err(format!("says that its port is {:?} instead of {state:?}", engine.port_state(PORT)));
         }
         let counters = engine.port_counters(PORT).ok_or("the port is missing")?;
-        let counted = [counters.frames_in, counters.rejected_not_finite, counters.asleep];
+        let rejected = counters.rejected_not_finite;
+        let counted = [counters.frames_in, rejected, counters.asleep, counters.withheld];
         if counted != self.counted {
             return Err(format!("counts {counted:?} instead of {:?}", self.counted));
         }
         Ok(())
     }
+}
+
+fn float_at(bytes: &[u8], at: usize) -> f32 {
+    f32::from_le_bytes(bytes[at..at + 4].try_into().expect("four bytes"))
 }
