@@ -165,3 +165,44 @@ fn other_links_that_come_and_go_change_nothing() {
     says(&mut rig, By::Packets, link);
     assert_eq!(press(&mut rig, link, 1), [frame(7.5, 1)]);
 }
+
+#[test]
+fn a_value_that_waited_for_its_neighbours_in_vain_is_not_sent_later() {
+    let mut cell = Cell::new();
+    let sensor = cell.stream(&["ForceEnd[1]"], &[]);
+    cell.rs485(sensor);
+    let buttons = cell.stream(&["DigitalOutputCommand[1]"], &[]);
+    cell.rs485(buttons);
+    let up = cell.stream(&["ForceEnd[1]", "DigitalOutputCommand[1]"], &["RobotState[26]"]);
+    cell.recipe_link(up);
+    let mut rig = cell.rig();
+    rig.run(MS(10));
+    // No bit is known, and none comes from the controller: the force is never handed over.
+    live(&mut rig, By::Frames, UDP, 1_000);
+    measures(&mut rig, 7.5);
+    live(&mut rig, By::Frames, UDP, 60_000);
+    assert_eq!(press(&mut rig, UDP, 3), Vec::<Vec<u8>>::new());
+    measures(&mut rig, 2.5);
+    assert_eq!(rig.sent_on(UDP), [frame(2.5, 3)]);
+}
+
+#[test]
+fn frames_or_packets_either_of_them_is_enough() {
+    let mut cell = Cell::new();
+    let sensor = cell.stream(&["ForceEnd[1]"], &[]);
+    cell.rs485(sensor);
+    let buttons = cell.stream(&["DigitalOutputCommand[1]"], &["RobotState[8]"]);
+    cell.rs485(buttons);
+    cell.last_port().timeout = MS(60_000);
+    let up = cell.stream(&["ForceEnd[1]", "DigitalOutputCommand[1]"], &["RobotState[26]"]);
+    cell.recipe_link(up);
+    let mut rig = cell.rig();
+    rig.run(MS(10));
+    says(&mut rig, By::Frames, UDP);
+    press(&mut rig, UDP, 1);
+    measures(&mut rig, 7.5);
+    for by in [By::Frames, By::Packets, By::Frames, By::Packets] {
+        live(&mut rig, by, UDP, 1_500);
+        assert_eq!(press(&mut rig, UDP, 3), [frame(7.5, 3)], "the other was silent, this one was not");
+    }
+}

@@ -140,7 +140,6 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
                 if let Some(link) = self.recipe(id)
                     && link.supervisor.up(now)
                 {
-                    store.no_longer_held();
                     link.up(store, now);
                 }
             }

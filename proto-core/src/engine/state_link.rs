@@ -4,7 +4,7 @@ use heapless::Vec;
 
 use super::counters::{LinkCounters, add, bump};
 use super::field_port::Look;
-use super::store::{Store, is_gap};
+use super::store::Store;
 use crate::image::{GroupId, InputSet};
 use crate::link::{LinkTimings, Supervisor};
 use crate::sysvar::{COUNT, SysVar};
@@ -81,9 +81,7 @@ impl StateLink {
                     if !store.safe.is_empty() {
                         compare_safe(&view, store, now);
                     }
-                    if is_gap(store.image.stamp_of(self.group), now) {
-                        store.no_longer_held();
-                    }
+                    store.heard(now);
                     store.image.stamp(self.group, now);
                     if look == Look::AtEach {
                         // They are counted when they are taken.

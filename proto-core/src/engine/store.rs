@@ -65,8 +65,12 @@ pub(super) struct Store<const PORTS: usize> {
     pub unanswered: InputSet,
     /// Variables that the state stream has brought since their owner fell silent, or ever.
     pub read_back: InputSet,
-    /// Variables whose owner fell silent, of which the controller has had the last value ever since.
-    held: InputSet,
+    /// Variables whose owner fell silent before its last value was handed over.
+    pub unsent: InputSet,
+    /// When anything that the controller sends steadily came last: a state packet, a recipe link's frame.
+    heard_at: Option<Instant>,
+    /// How often it came after a gap, wrapping: another controller may have been there before.
+    pub era: u32,
     /// Variables whose link is up.
     pub reachable: InputSet,
     /// Values dropped with a link, a port.
@@ -92,7 +96,9 @@ impl<const PORTS: usize> Store<PORTS> {
             confirmed_at: Instant::ZERO,
             unanswered: InputSet::EMPTY,
             read_back: InputSet::EMPTY,
-            held: InputSet::EMPTY,
+            unsent: InputSet::EMPTY,
+            heard_at: None,
+            era: 0,
             reachable: InputSet::EMPTY,
             lost: [0; PORTS],
             has_lost: false,
@@ -111,7 +117,6 @@ impl<const PORTS: usize> Store<PORTS> {
         let (set, port) = (frame.set, usize::from(frame.port));
         self.image.stamp(GroupId(nth as u8), now);
         self.live = self.live.or(&set);
-        self.held = self.held.minus(&set);
         if !self.safe.and(&set).is_empty() {
             // Safe values that still wait grow old from now on, and may be too old already.
             self.next_expiry = now;
@@ -150,10 +155,14 @@ impl<const PORTS: usize> Store<PORTS> {
         let mut dropped = 0_usize;
         for var in frame.set.iter() {
             let Some(value) = safe.iter().find(|safe| safe.var == var) else {
-                dropped = dropped.saturating_add(self.outbox.forget(queue, &InputSet::from_iter([var])));
+                let waited = self.outbox.forget(queue, &InputSet::from_iter([var]));
+                dropped = dropped.saturating_add(waited);
+                match waited {
+                    0 => self.unsent.remove(var),
+                    _ => self.unsent.insert(var),
+                }
                 self.live.remove(var);
                 self.read_back.remove(var);
-                self.held.insert(var);
                 continue;
             };
             let place = self.image.bytes_mut().get_mut(var.image_offset()..);
@@ -272,14 +281,17 @@ impl<const PORTS: usize> Store<PORTS> {
         }
     }
 
-    /// Whether the variable's last value can be sent once more, long after its owner fell silent.
-    pub(super) fn is_held(&self, var: SysVar) -> bool {
-        self.held.contains(var)
+    /// Something came that the controller sends steadily.
+    pub(super) fn heard(&mut self, now: Instant) {
+        if !self.is_heard(now) {
+            self.era = self.era.wrapping_add(1);
+        }
+        self.heard_at = Some(now);
     }
 
-    /// The controller may have started anew: what it held is gone, or another's by now.
-    pub(super) fn no_longer_held(&mut self) {
-        self.held = InputSet::EMPTY;
+    /// Whether the controller has been there all the time since the era began.
+    pub(super) fn is_heard(&self, now: Instant) -> bool {
+        !is_gap(self.heard_at, now)
     }
 
     /// The controller may have started anew: safe values are written once more.

@@ -58,6 +58,8 @@ pub(super) struct Uplink {
     speak_at: Instant,
     /// When safe values are sent again.
     repeat_at: Instant,
+    /// When a frame was handed over last since the link came up, and in which era of the controller's.
+    handed_over: Option<(Instant, u32)>,
 }
 
 impl Uplink {
@@ -93,11 +95,13 @@ impl Uplink {
             greet_at: Instant::NEVER,
             speak_at: Instant::NEVER,
             repeat_at: Instant::NEVER,
+            handed_over: None,
         }
     }
 
     pub(super) fn up<const PORTS: usize>(&mut self, store: &mut Store<PORTS>, now: Instant) {
         self.busy = false;
+        self.handed_over = None;
         self.flight.clear();
         store.link_up(&self.writes);
         self.greet_at = if self.greets() { now } else { Instant::NEVER };
@@ -192,11 +196,9 @@ impl Uplink {
         }
         if fresh {
             let before = store.image.stamp_of(group);
-            if is_gap(before, now) {
-                store.no_longer_held();
-                if before.is_some() && !store.safe.is_empty() {
-                    store.controller_was_away(now);
-                }
+            store.heard(now);
+            if before.is_some() && is_gap(before, now) && !store.safe.is_empty() {
+                store.controller_was_away(now);
             }
             store.image.stamp(group, now);
             store.doubt_by_witnesses(now);
@@ -239,6 +241,7 @@ impl Uplink {
             Some(layout) if wanted && self.is_ready(store, state, now) => {
                 let len = encode(layout, store, out)?;
                 store.taken(&self.writes);
+                self.handed_over = Some((now, store.era));
                 let repeats = self.repeat_at == Instant::NEVER || is_new(store, now);
                 if repeats && !store.unconfirmed.and(&self.writes).is_empty() {
                     self.repeat_at = self.repeat_at.min(now + REPEAT_EVERY);
@@ -291,15 +294,19 @@ impl Uplink {
         if others.is_empty() {
             return true;
         }
-        let stamp_of = |group: Option<GroupId>| group.and_then(|group| store.image.stamp_of(group));
-        let read_back = stamp_of(state).is_some_and(|at| now.saturating_since(at) <= READ_BACK_MAX_AGE);
+        let read_back = state
+            .and_then(|group| store.image.stamp_of(group))
+            .is_some_and(|at| now.saturating_since(at) <= READ_BACK_MAX_AGE);
         // Without a connection, only what comes down tells that the controller has been there all along.
-        let is_there = self.framing == Framing::Bytes
-            || !is_gap(stamp_of(self.group), now)
-            || !is_gap(stamp_of(state), now);
+        let is_there = |era| self.framing == Framing::Bytes || era == store.era && store.is_heard(now);
+        let since = self.handed_over.filter(|&(_, era)| is_there(era)).map(|(at, _)| at);
         others.iter().all(|var| match var.stream() {
             Some(_) => read_back && store.read_back.contains(var),
-            None => is_there && store.is_held(var),
+            // The newest frame had the variable's last value, and the controller has had it ever since.
+            None => {
+                store.image.known_since(var).is_some_and(|at| since >= Some(at))
+                    && !store.unsent.contains(var)
+            }
         })
     }
 

@@ -131,7 +131,7 @@ impl Test {
                 Out::Open(link) if self.rig.reachable.contains(&link.0) => {
                     self.model.up.insert(link, at);
                     if link == UDP {
-                        self.model.no_longer_held();
+                        self.model.handed_over = None;
                     }
                 }
                 Out::Open(_) => {}
@@ -302,7 +302,7 @@ impl Test {
                 self.wake();
                 let float = value.map_or(f32::NAN, |value| f32::from(value) + 0.125);
                 if self.model.up.contains_key(&UDP) {
-                    self.model.heard(UDP, self.rig.now);
+                    self.model.heard(self.rig.now);
                     self.model.knob_is_unreadable = value.is_none();
                     match value {
                         Some(_) => drop(self.model.shown.insert(float.to_bits())),
@@ -369,7 +369,8 @@ impl Test {
         packet[368..372].copy_from_slice(&pose.to_le_bytes());
         if good && self.model.up.contains_key(&LinkId::STATE) {
             let now = self.rig.now;
-            self.model.heard(LinkId::STATE, now);
+            self.model.heard(now);
+            self.model.packet = Some(now);
             self.model.bus_is_unreadable = !pose.is_finite();
             self.model.shown.insert(0);
             let mut wrong = 0;

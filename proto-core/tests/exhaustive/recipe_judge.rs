@@ -129,7 +129,6 @@ impl Facts {
     }
 
     fn packet(&mut self, now: Instant, bytes: &[u8]) {
-        self.look_for_controller(now, Some(LinkId::STATE));
         self.packet_by = Some(now + SILENCE);
         let float = |at| Some(float_at(bytes, at)).filter(|value| value.is_finite());
         let bits = (0..8).fold(0, |sum, bit| sum | bytes[BITS_AT + bit] << bit);
@@ -147,7 +146,6 @@ impl Facts {
     }
 
     fn recipe_frame(&mut self, now: Instant, bytes: &[u8]) {
-        self.look_for_controller(now, Some(self.way.link()));
         self.frame_by = (self.way == Way::Tcp).then_some(now + SILENCE);
         let was_away = self.source_at.is_some_and(|at| now.saturating_since(at) > LONGEST_AGE);
         if was_away {
@@ -174,16 +172,10 @@ impl Facts {
         self.float.newest.is_some() && is_bit_known && is_neighbour_known
     }
 
-    /// Its frames or packets tell that the controller is there. When both are missing, or one of them
-    /// comes that was missing, the controller can be another.
-    fn look_for_controller(&mut self, now: Instant, comes: Option<LinkId>) {
+    /// Its frames or packets tell that the controller is there; without both it can be another.
+    fn look_for_controller(&mut self, now: Instant) {
         let is_missing = |at: Option<Instant>| at.is_none_or(|at| now.saturating_since(at) > LONGEST_AGE);
-        let is_new = match comes {
-            Some(LinkId::STATE) => is_missing(self.packet_at),
-            Some(_) => is_missing(self.source_at),
-            None => is_missing(self.packet_at) && is_missing(self.source_at),
-        };
-        if is_new {
+        if is_missing(self.packet_at) && is_missing(self.source_at) {
             self.float.controller_is_new();
         }
     }
@@ -206,7 +198,7 @@ impl Facts {
 
 impl Judge for Facts {
     fn told(&mut self, now: Instant, input: &Input<'_>, conns: &mut Conns) {
-        self.look_for_controller(now, None);
+        self.look_for_controller(now);
         match *input {
             Input::Tick => self.deaf_until = self.deaf_until.filter(|&until| now < until),
             Input::PortBytes { bytes, .. } => {

@@ -186,19 +186,22 @@ pub struct Float {
     /// Its value is its owner's, or the safe one.
     pub is_live: bool,
     is_waiting: bool,
+    /// The controller, as it is known now, was given the newest value.
+    is_there: bool,
     /// When its owner is silent; `None` while it is, and before the first frame.
     overdue_at: Option<Instant>,
 }
 
 impl Float {
     pub fn new(instead: Instead) -> Self {
-        Self { instead, newest: None, is_live: false, is_waiting: false, overdue_at: None }
+        Self { instead, newest: None, is_live: false, is_waiting: false, is_there: false, overdue_at: None }
     }
 
     pub fn received(&mut self, value: f32, is_reachable: bool, now: Instant) {
         self.newest = Some(value);
         self.overdue_at = Some(now + TIMEOUT);
         self.is_live = true;
+        self.is_there = false;
         self.is_waiting = is_reachable;
     }
 
@@ -214,12 +217,13 @@ impl Float {
                 (self.is_live, self.is_waiting) = (true, true);
             }
             Instead::Shown => self.newest = None,
-            Instead::Last => {}
+            Instead::Last => self.newest = self.newest.filter(|_| self.is_there),
         }
     }
 
     /// The controller may be another by now, which has nothing of what a silent owner sent last.
     pub fn controller_is_new(&mut self) {
+        self.is_there = false;
         if self.instead == Instead::Last && !self.is_live {
             self.newest = None;
         }
@@ -250,6 +254,7 @@ impl Float {
 
     pub fn taken(&mut self) {
         self.is_waiting = false;
+        self.is_there = true;
     }
 
     fn has_safe_value(&self) -> bool {

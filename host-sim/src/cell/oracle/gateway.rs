@@ -273,11 +273,9 @@ impl Oracle {
             return;
         }
         let before = self.up.frame_at[place(link)].replace(now);
-        if is_gap(before, now) {
-            self.up.no_longer_held();
-            if before.is_some() {
-                self.up.controller_was_away(&self.sheet, now);
-            }
+        self.up.heard(now);
+        if before.is_some() && is_gap(before, now) {
+            self.up.controller_was_away(&self.sheet, now);
         }
         for payload in found {
             let mut values: Vec<(SysVar, Raw)> = Vec::new();
@@ -391,6 +389,7 @@ impl Oracle {
         if !wanted {
             return Err((Invariant::Sent, "a frame that nobody's value waited for".to_owned()));
         }
+        self.up.handed_over[place(link)] = Some((now, self.up.era));
         self.up.sent_frame(&self.sheet, link, now);
         Ok(())
     }

@@ -385,9 +385,6 @@ impl Oracle {
                 self.nobody_spoke(link);
                 self.up.controller_was_away(&self.sheet, now);
                 if !self.up.is_up(link) && is_up(engine, link) {
-                    if self.sheet.link(link).is_some() {
-                        self.up.no_longer_held();
-                    }
                     self.up.link_up(link, now);
                     self.links[place(link)] = LinkWatch::default();
                 }

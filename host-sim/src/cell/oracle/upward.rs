@@ -45,8 +45,8 @@ pub(super) struct Known {
     pub unreadable: bool,
     /// It stands at its safe value, and the controller is not known to have it.
     pub unconfirmed: bool,
-    /// Its owner fell silent, and the controller has had the last value ever since.
-    pub held: bool,
+    /// Its owner fell silent before the last value was handed over.
+    pub unsent: bool,
     /// Values that waited while the gateway slept and have not come since.
     pub slept: Option<Vec<Raw>>,
 }
@@ -94,6 +94,11 @@ pub(super) struct Upward {
     pub state_at: Option<Instant>,
     /// When the newest frame of each recipe link came, whatever connection it was.
     pub frame_at: [Option<Instant>; 16],
+    /// When anything came that the controller sends steadily, and how often after a gap.
+    heard_at: Option<Instant>,
+    pub era: u64,
+    /// When a frame was handed over on each recipe link's present connection, and in which era.
+    pub handed_over: [Option<(Instant, u64)>; 16],
     /// When a safe value was last in doubt.
     pub doubted_at: Instant,
     /// When a safe value of a recipe link was last seen to be there.
@@ -117,6 +122,9 @@ impl Upward {
             up: [None; 16],
             state_at: None,
             frame_at: [None; 16],
+            heard_at: None,
+            era: 0,
+            handed_over: [None; 16],
             doubted_at: Instant::ZERO,
             confirmed_at: None,
             again_at: [Instant::NEVER; 16],
@@ -205,7 +213,7 @@ impl Upward {
             known.waiting.clear();
             known.live = false;
             known.read_back = false;
-            known.held = true;
+            known.unsent = waited > 0;
             self.counted[port].values_expired += waited;
         }
     }
@@ -227,7 +235,6 @@ impl Upward {
             known.accepted = Some(now);
             known.live = true;
             known.unconfirmed = false;
-            known.held = false;
             known.unreadable = false;
             known.slept = None;
             if std::mem::take(&mut known.safe) {
@@ -268,6 +275,7 @@ impl Upward {
     /// A link came up.
     pub(super) fn link_up(&mut self, link: LinkId, now: Instant) {
         self.up[usize::from(link.0)] = Some(now);
+        self.handed_over[usize::from(link.0)] = None;
     }
 
     /// A link was lost: what waits for it is dropped, safe values excepted.
@@ -289,9 +297,8 @@ impl Upward {
 
     /// A packet of the state stream was taken.
     pub(super) fn state_packet(&mut self, sheet: &Sheet, packet: &[u8], now: Instant) {
-        if is_gap(self.state_at.replace(now), now) {
-            self.no_longer_held();
-        }
+        self.state_at = Some(now);
+        self.heard(now);
         for &var in &sheet.in_packet {
             let nth = var.ordinal();
             let is_shown = sheet.origin[nth] == Some(Origin::State);
@@ -314,15 +321,26 @@ impl Upward {
         }
     }
 
-    /// The controller may have begun anew: nothing of before is written once more.
-    pub(super) fn no_longer_held(&mut self) {
-        self.known.iter_mut().for_each(|known| known.held = false);
+    /// A packet or a recipe frame came. After a gap the controller may have begun anew: what was handed
+    /// over before, without a connection, counts no more.
+    pub(super) fn heard(&mut self, now: Instant) {
+        if is_gap(self.heard_at.replace(now), now) {
+            self.era += 1;
+        }
     }
 
-    /// Whether the controller has been there all along, as far as a link can tell.
-    fn is_there(&self, link: &LinkSheet, now: Instant) -> bool {
-        !link.is_datagram
-            || [self.frame_at[usize::from(link.id.0)], self.state_at].iter().any(|at| !is_gap(*at, now))
+    /// When a frame was handed over last to the controller that is there now, as far as a link can tell.
+    fn handed_over(&self, link: &LinkSheet, now: Instant) -> Option<Instant> {
+        let (at, era) = self.handed_over[usize::from(link.id.0)]?;
+        let is_there = !link.is_datagram || era == self.era && !is_gap(self.heard_at, now);
+        is_there.then_some(at)
+    }
+
+    /// When the newest frame that brought a variable which nothing reads back was accepted; `None` when the
+    /// controller does not have its value.
+    fn held(&self, link: &LinkSheet, known: &Known, now: Instant) -> Option<Instant> {
+        let handed_over = self.handed_over(link, now)?;
+        known.accepted.filter(|&at| handed_over >= at && !known.unsent)
     }
 
     /// The newest value that a link brought; not finite, it is none.
@@ -420,10 +438,11 @@ impl Upward {
             });
         }
         if var.stream().is_none() {
-            return match known.accepted.filter(|_| known.held && self.is_there(link, now)) {
+            return match self.held(link, known, now) {
                 Some(accepted) => Ok(Carried::Held { accepted }),
                 None => {
-                    let what = format!("{var} = {} was sent along, the controller was away since", value());
+                    let what =
+                        format!("{var} = {} was sent along, and this controller never got it", value());
                     Err((Invariant::NoReplay, what))
                 }
             };
@@ -443,7 +462,6 @@ impl Upward {
 
     /// Whether a recipe link's frame may be sent: each of its variables has a value.
     pub(super) fn is_ready(&self, link: &LinkSheet, now: Instant) -> bool {
-        let is_there = self.is_there(link, now);
         let is_fresh = self.state_at.is_some_and(|at| now.saturating_since(at) <= READ_BACK);
         let mut vars = link.input.iter().flat_map(|up| up.fields.iter().filter_map(super::sheet::written));
         vars.all(|var| {
@@ -451,7 +469,7 @@ impl Upward {
             match var.stream() {
                 _ if known.live => true,
                 Some(_) => known.read_back && is_fresh,
-                None => known.held && is_there,
+                None => self.held(link, known, now).is_some(),
             }
         })
     }
