@@ -65,8 +65,15 @@ impl Stops {
 
     /// Takes out the first of a kind that may go now.
     pub(super) fn pop(&mut self, may_go: impl Fn(Keyword) -> bool) -> Option<(Keyword, Waiting)> {
-        let nth = self.0.iter().position(|(keyword, _)| may_go(*keyword))?;
-        Some(self.0.remove(nth))
+        let mut first = None;
+        self.0.retain(|stop| {
+            let goes = first.is_none() && may_go(stop.0);
+            if goes {
+                first = Some(*stop);
+            }
+            !goes
+        });
+        first
     }
 
     /// The field does not ask any more.
