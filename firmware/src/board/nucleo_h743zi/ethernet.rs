@@ -101,6 +101,8 @@ fn has_clock(ref_clk: Peri<'_, PA1>) -> bool {
     const FUNCTION: u8 = 11;
     let mut pin = Flex::new(ref_clk);
     pin.set_as_af_unchecked(FUNCTION, AfType::output(OutputType::PushPull, Speed::VeryHigh));
+    // Dropped it would be disconnected, and the MAC without its clock until the driver connects it again.
+    core::mem::forget(pin);
     critical_section::with(|_| {
         RCC.ahb1enr().modify(|w| {
             w.set_ethen(true);
