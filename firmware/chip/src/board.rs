@@ -492,8 +492,13 @@ impl Board {
         let mut bytes = vec![0; len as usize];
         core.read(address, &mut bytes);
         let mut halves = bytes.chunks_exact(2).map(|half| u16::from_le_bytes([half[0], half[1]]));
-        let mut count = 0;
-        while let Some(half) = halves.next() {
+        // `b .`, with nothing before it but what does nothing.
+        let last = bytes.rchunks_exact(2).next().map_or(0, |half| u16::from_le_bytes([half[0], half[1]]));
+        let back = 2 * (bytes.len() as u16 / 2 - 1) + 4;
+        let is_for_ever = last == 0xE000 | (0x800 - back / 2) & 0x7FF
+            && halves.clone().rev().skip(1).all(|half| half == NOP);
+        let mut count = if is_for_ever { FOR_EVER } else { 0 };
+        while let Some(half) = halves.next().filter(|_| !is_for_ever) {
             // Three of the 32 groups have a second half (Armv7-M ARM A5.1).
             if half >> 11 >= 0b11101 {
                 halves.next();
@@ -523,6 +528,11 @@ impl Handler for Board {
             return Flow::Stop;
         }
         let count = self.count(core, address, len);
+        if count == u64::from(FOR_EVER) {
+            // Nothing but an interrupt leads out of it.
+            self.now = self.now.max(self.deadline);
+            return Flow::Stop;
+        }
         self.instructions += count;
         self.now += count * self.cycle;
         Flow::On
@@ -550,6 +560,9 @@ impl Handler for Board {
     }
 }
 
+const NOP: u16 = 0xBF00;
+/// In the place of a block's number of instructions: it jumps to itself.
+const FOR_EVER: u16 = u16::MAX;
 /// Where flash is.
 pub(crate) const FLASH: u32 = 0x0800_0000;
 /// Both banks.

@@ -33,6 +33,8 @@ pub struct Chip {
     torn: Vec<u32>,
     pc: u32,
     is_locked_up: bool,
+    /// Times in a row that a deadline was not ahead.
+    stuck: u32,
     decoder: Option<Box<dyn StreamDecoder + Send + Sync>>,
     /// Each line of the log, and when it was read.
     pub log: Vec<(Picos, String)>,
@@ -79,6 +81,7 @@ impl Chip {
             torn: Vec::new(),
             pc: 0,
             is_locked_up: false,
+            stuck: 0,
             decoder: program.log_reader(),
             log: Vec::new(),
             resets: Vec::new(),
@@ -285,6 +288,8 @@ impl Chip {
     /// Nothing runs until a device has something to do.
     fn idle(&mut self, end: Picos) {
         let next = self.board.deadline().min(end);
+        self.stuck = if next > self.board.now { 0 } else { self.stuck + 1 };
+        assert!(self.stuck < 1_000, "a model's deadline is over and over: {next}");
         self.board.now = self.board.now.max(next);
         let engine = self.engine();
         self.board.advance(engine);

@@ -197,6 +197,8 @@ impl Usart {
                     None => break,
                 },
             };
+            // What comes before the line has been at rest long enough is not behind a rest.
+            self.idles = self.idles.filter(|idle| *idle <= start);
             // A glitch is none: the middle of the start bit is looked at too.
             if at.now < start + sampled {
                 self.receiving = Some(start);
@@ -225,7 +227,6 @@ impl Usart {
             self.idles = Some(start + sampled + self.character(at.clocks));
         }
         if let Some(idle) = self.idles
-            && self.receiving.is_none()
             && at.now >= idle
         {
             self.idles = None;

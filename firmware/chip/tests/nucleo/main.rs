@@ -4,6 +4,9 @@
 
 mod bench;
 mod boot;
+mod can;
+mod faults;
 mod robot;
+mod serial;
 
 use bench::Bench;
