@@ -74,7 +74,7 @@ static MAP: [Place; 25] = [
     place(0x4000_7800, 0x400, "UART7", gate(0xE8, 1 << 30), Id::Second, Some(82)),
     place(0x4000_A000, 0xC00, "FDCAN1", CAN, Id::Can, Some(19)),
     place(0x4000_AC00, 0x2800, "message RAM", CAN, Id::CanRam, None),
-    place(0x4002_8000, 0x2000, "ETH", gate(0xD8, 1 << 15), Id::Ethernet, Some(61)),
+    place(0x4002_8000, 0x2000, "ETH", gate(0xD8, 7 << 15), Id::Ethernet, Some(61)),
     place(0x4802_1800, 0x400, "RNG", gate(0xDC, 1 << 6), Id::Rng, None),
     place(0x5200_2000, 0x400, "FLASH", None, Id::Flash, None),
     place(0x5800_0000, 0x400, "EXTI", None, Id::Exti, None),

@@ -92,6 +92,8 @@ pub struct Rcc {
 /// The bits of oscillators in CR: on, ready, and how long it takes (datasheet DS12110, 6.3.9 to 6.3.11).
 const OSCILLATORS: [(u32, u32, Picos); 5] =
     [(0, 2, 2 * MICRO), (7, 8, 3 * MICRO), (12, 13, 4 * MICRO), (16, 17, 2 * MICRO), (24, 25, 100 * MICRO)];
+/// HSEBYP.
+const BYPASS: u32 = 1 << 18;
 /// LSI, longest.
 const LOW_SPEED: Picos = 130 * MICRO;
 
@@ -249,7 +251,8 @@ impl Rcc {
                 continue;
             }
             let runs = match flag {
-                17 => self.has_external,
+                // What arrives is a clock and no crystal.
+                17 => self.has_external && value & BYPASS != 0,
                 25 => self.check_pll(now).map(|()| true)?,
                 _ => true,
             };
@@ -257,7 +260,7 @@ impl Rcc {
                 self.ready[index].1 = now + time;
             }
         }
-        if changed & 1 << 18 != 0 && before & 1 << 16 != 0 && value & 1 << 16 != 0 {
+        if changed & BYPASS != 0 && before & 1 << 16 != 0 && value & 1 << 16 != 0 {
             return refuse("HSEBYP is changed while HSE is on (8.7.2)");
         }
         if value & (1 << 26 | 1 << 28) != 0 {

@@ -282,6 +282,7 @@ impl Peripheral for Usart {
                 Some((byte, _)) => Ok(byte.into()),
                 None => refuse("nothing was received"),
             },
+            TDR | ICR => refuse("nothing to read there"),
             _ => self.bank.read(offset),
         }
     }
