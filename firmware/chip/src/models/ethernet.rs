@@ -79,6 +79,8 @@ pub struct Ethernet {
     pub phy: Phy,
     /// What it has sent.
     pub sent: VecDeque<Vec<u8>>,
+    /// Frames that it has sent while there was no link.
+    pub unheard: u64,
     /// Frames that arrived and were not for it, or that there was no room for.
     pub dropped: u64,
     /// Frames that it took.
@@ -103,6 +105,7 @@ impl Ethernet {
             bank: Bank::new(&REGISTERS),
             phy: Phy::new(),
             sent: VecDeque::new(),
+            unheard: 0,
             dropped: 0,
             taken: 0,
             arriving: VecDeque::new(),
@@ -198,6 +201,8 @@ impl Ethernet {
                 memory.store(place + 12, &(u32::from_le_bytes(word) & 0x3000_0000).to_le_bytes());
                 if self.phy.is_up(at.now) {
                     self.sent.push_back(frame);
+                } else {
+                    self.unheard += 1;
                 }
                 self.raise(1);
                 continue;
@@ -347,8 +352,8 @@ impl Peripheral for Ethernet {
 
     fn reset(&mut self) {
         let (phy, sent) = (std::mem::take(&mut self.phy), std::mem::take(&mut self.sent));
-        let (dropped, taken) = (self.dropped, self.taken);
-        *self = Self { phy, sent, dropped, taken, ..Self::new() };
+        let (unheard, dropped, taken) = (self.unheard, self.dropped, self.taken);
+        *self = Self { phy, sent, unheard, dropped, taken, ..Self::new() };
     }
 }
 

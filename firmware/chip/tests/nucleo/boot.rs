@@ -63,7 +63,8 @@ fn it_boots_and_reaches_the_controller() {
     let mut bench = Bench::new(CELL).with_robot();
     bench.until_log("info: started", 10 * MILLI);
     bench.until_log("field ports", 10 * MILLI);
-    bench.until_log("address 192.168.12.20/24", 2 * SECOND);
+    let at = bench.until_log("address 192.168.12.20/24", 2 * SECOND);
+    assert!(at > bench.chip.devices().ethernet.phy.negotiation, "told while nobody can be reached at it");
     bench.until("a Modbus connection", 5 * SECOND, |bench| {
         bench.robot.as_ref().is_some_and(|robot| robot.counters().modbus.open == 1)
     });
@@ -136,6 +137,14 @@ fn without_the_phy_the_field_buses_run() {
     bench.run(5 * SECOND);
     assert!(bench.chip.resets.is_empty());
     assert!(bench.chip.devices().watchdog.feeds.len() >= 4);
+}
+
+#[test]
+#[ignore = "needs CHIP_UNICORN and CHIP_ELF"]
+fn a_phy_that_answers_late_is_waited_for() {
+    let mut bench = Bench::new(CELL).with_robot();
+    bench.chip.devices().ethernet.phy.answers_from = 100 * MILLI;
+    bench.until_log("address 192.168.12.20/24", 2 * SECOND);
 }
 
 #[test]

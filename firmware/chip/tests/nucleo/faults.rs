@@ -82,6 +82,18 @@ fn a_stack_overflow_meets_the_guard() {
 
 #[test]
 #[ignore = "needs CHIP_UNICORN and CHIP_ELF"]
+fn a_fault_before_the_watchdog_runs_is_followed_by_a_reset_too() {
+    let mut bench = Bench::new(CELL);
+    let place = bench.chip.program().symbol("main").expect("the program begins") & !1;
+    bench.chip.patch(place, &UNDEFINED);
+    bench.until("a reset", SECOND, |bench| bench.chip.resets.len() == 1);
+    bench.until_log(&format!("before the start: panic at {place:08X}"), 100 * MILLI);
+    bench.run(5 * SECOND);
+    assert_eq!(bench.chip.resets.len(), 1);
+}
+
+#[test]
+#[ignore = "needs CHIP_UNICORN and CHIP_ELF"]
 fn a_panic_is_told_twice() {
     let mut bench = Bench::new(CELL);
     let panics =
