@@ -1,5 +1,5 @@
-//! The chip's peripherals at their addresses, and what the core's accesses meet there. RM0433 section 2.3,
-//! "Memory organization", and 8.7.37 to 8.7.50 for who needs which clock.
+//! The chip's peripherals at their addresses, and what the core's accesses meet there. RM0433, "Memory and
+//! bus architecture"; who needs which clock is in RCC's registers AHB1ENR to APB4ENR.
 
 use std::collections::VecDeque;
 use std::fmt;
@@ -173,7 +173,7 @@ impl Devices {
 pub struct Access {
     /// When.
     pub at: Picos,
-    /// The instruction, or the beginning of its block.
+    /// The beginning of the block of instructions that it is in.
     pub pc: u32,
     /// The peripheral's name.
     pub peripheral: &'static str,
@@ -426,7 +426,7 @@ impl Board {
             let word = (offset / 4) as usize;
             let can = &mut self.devices.can;
             let result = self.devices.rcc.check(CAN.expect("it has one")).and_then(|()| match value {
-                _ if size != 4 => refuse("32 bits at a time (56.3.20)"),
+                _ if size != 4 => refuse("32 bits at a time"),
                 Some(value) => can.ram_write(word, value).map(|()| value),
                 None => can.ram_read(word),
             });

@@ -35,7 +35,7 @@ impl Frame {
         &self.data[..usize::from(self.len.min(8))]
     }
 
-    /// As an element of the message RAM (RM0433 56.3.20).
+    /// As an element of the message RAM (RM0433, "FDCAN Tx buffer element").
     pub(super) fn words(&self) -> [u32; 4] {
         let id = if self.is_extended { self.id | 1 << 30 } else { self.id << 18 };
         let [a, b, c, d, e, f, g, h] = self.data;

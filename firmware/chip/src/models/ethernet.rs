@@ -1,6 +1,7 @@
-//! The Ethernet MAC with its DMA, on RMII. RM0433 section 58.
+//! The Ethernet MAC with its DMA, on RMII. RM0433, "Ethernet: media access control with
+//! DMA controller".
 //!
-//! The DMA walks the rings of descriptors in the chip's memory (58.10); it reaches AXI SRAM and not the
+//! The DMA walks the rings of descriptors in the chip's memory ("Descriptors"); it reaches AXI SRAM and not the
 //! DTCM. Strict: the reset needs RMII chosen and the PHY's 50 MHz on the pin, MDC may not be faster than
 //! 2.5 MHz, a packet is one descriptor, a buffer that is too short is told.
 
@@ -212,7 +213,7 @@ impl Ethernet {
             }
             let (place, [buffer, _, lengths, control]) = self.descriptor(TRANSMIT, memory)?;
             if control >> 31 == 0 {
-                // It waits for the tail pointer to be written (58.10.3).
+                // It waits for the tail pointer to be written ("DMA transmission").
                 self.is_asked = false;
                 self.raise(1 << 2);
                 break;
@@ -289,12 +290,12 @@ impl Peripheral for Ethernet {
     fn write(&mut self, offset: u32, value: u32, at: &Moment<'_>) -> Result<(), Refusal> {
         self.advance(at)?;
         if self.resets.is_some() {
-            return refuse("it is written while it resets (58.11.2, DMAMR.SWR)");
+            return refuse("it is written while it resets (DMAMR.SWR)");
         }
         match offset {
             DMAMR if value & 1 != 0 => {
                 if !at.is_rmii {
-                    return refuse("the reset comes before RMII is chosen (58.4)");
+                    return refuse("the reset comes before RMII is chosen");
                 }
                 let done = if self.has_reference(at) { at.now + MICRO } else { Picos::MAX };
                 self.resets = Some(done);

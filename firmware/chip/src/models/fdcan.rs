@@ -1,7 +1,7 @@
-//! FDCAN1 as the program sees it: registers, message RAM, FIFOs, filters, error states. RM0433 section
-//! 56; Bosch's M_CAN manual where that leaves something out. Classic frames only.
+//! FDCAN1 as the program sees it: registers, message RAM, FIFOs, filters, error states. RM0433,
+//! "Controller area network with flexible data rate"; Bosch's M_CAN manual where that leaves something out. Classic frames only.
 //!
-//! Strict: what CCE and INIT protect (56.4.3 and each register), INIT that needs some cycles to arrive
+//! Strict: what CCE and INIT protect (said at each register), INIT that needs some cycles to arrive
 //! and CCE that is set before it has, the index of TXBAR and of the acknowledges, message RAM that is
 //! written while it waits to be sent, and the clock calibration unit, which has to be bypassed.
 
@@ -166,7 +166,7 @@ impl Fdcan {
         }
     }
 
-    /// A late access to the message RAM: MRAF, and from then on only listening (56.3.9).
+    /// A late access to the message RAM: MRAF, and from then on only listening ("Restricted operation mode").
     pub fn fail_message_ram(&mut self) {
         self.bank.set(CCCR, self.bank.get(CCCR) | RESTRICTED);
         self.raise(1 << 17);
@@ -297,7 +297,7 @@ impl Fdcan {
         Frame::from_words(words)
     }
 
-    /// Which FIFO takes an id (56.3.18, acceptance filtering).
+    /// Which FIFO takes an id ("Acceptance filtering").
     fn accepts(&self, frame: &Frame) -> Option<usize> {
         let filters = self.bank.get(GFC);
         let fifo = |code: u32| match code {
@@ -447,7 +447,7 @@ impl Peripheral for Fdcan {
             }
             TXBAR => self.request(value),
             TXBCR => {
-                // What is on the bus is ended first (56.3.11); what waits is forgotten at once.
+                // What is on the bus is ended first ("Transmit cancellation"); what waits is forgotten at once.
                 let is_meant = |index: &u32| value >> index & 1 != 0;
                 let cancelled = self.waiting.iter().filter(|index| is_meant(index));
                 let bits = cancelled.fold(0, |bits, index| bits | 1 << index);

@@ -1,4 +1,5 @@
-//! Flash's interface: wait states. RM0433 section 4.3.8, table 17. The program only reads flash.
+//! Flash's interface: wait states. RM0433, "Embedded Flash memory", at
+//! the recommended number of wait states. The program only reads flash.
 
 use crate::device::*;
 
@@ -30,7 +31,7 @@ impl Flash {
         };
         if latency < needed.0 || delay < needed.1 {
             return refuse(format!(
-                "flash has {latency} wait states for {hclk} Hz; table 17 asks for {}",
+                "flash has {latency} wait states for {hclk} Hz; the manual asks for {}",
                 needed.0
             ));
         }

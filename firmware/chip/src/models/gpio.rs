@@ -1,4 +1,4 @@
-//! GPIO ports A to K. RM0433 section 11.
+//! GPIO ports A to K. RM0433, "General-purpose I/Os".
 //!
 //! Outputs are kept with the time at which they changed; inputs read 1, as nothing drives them. What
 //! function a pin has is what other models ask.
@@ -107,7 +107,7 @@ impl Peripheral for Port {
         let outputs = self.bank.get(ODR);
         let modes: [Mode; 16] = std::array::from_fn(|pin| self.mode(pin as u8));
         if offset == BSRR {
-            // Setting comes before resetting (11.4.7).
+            // Setting comes before resetting (BSRR).
             self.bank.set(ODR, outputs & !(value >> 16) | value & 0xFFFF);
         } else {
             self.bank.write(offset, value)?;

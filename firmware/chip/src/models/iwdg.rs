@@ -1,7 +1,7 @@
-//! The independent watchdog. RM0433 section 45.
+//! The independent watchdog. RM0433, "Independent watchdog".
 //!
 //! It counts LSI's 32 kHz, which it switches on itself. PR and RLR may be written only behind the key
-//! 0x5555, and not while an earlier value is still on its way (45.4.2, 45.4.3).
+//! 0x5555, and not while an earlier value is still on its way (SR's PVU and RVU).
 
 use crate::device::*;
 

@@ -1,7 +1,7 @@
 //! The LAN8742A on the board: its 50 MHz, its registers behind MDIO, and the cable. Microchip DS00001989.
 //!
 //! It negotiates like a switch that offers everything. After a software reset it answers with the reset
-//! bit set for a while (section 3.8.4.3: 0.5 s at most).
+//! bit set for a while ("Software reset": 0.5 s at most).
 
 use crate::device::*;
 

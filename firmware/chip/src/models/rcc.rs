@@ -1,10 +1,10 @@
-//! RCC: oscillators, PLL1, the clock tree, clock gates and resets. RM0433 section 8, "Reset and clock
+//! RCC: oscillators, PLL1, the clock tree, clock gates and resets. RM0433, "Reset and clock
 //! control".
 //!
 //! Strict: writes that the hardware ignores are ignored here too (PLLSRC and DIVM1 while a PLL runs,
-//! section 8.7.11); the system clock is switched only to a clock that is ready (8.7.5). A peripheral may
+//! at PLLCKSELR); the system clock is switched only to a clock that is ready (at CFGR.SW). A peripheral may
 //! be used when its clock is on and its reset is not; and not right behind the write that switched it on,
-//! which takes two cycles of its bus (8.5.11): something has to be read in between.
+//! which takes two cycles of its bus ("Peripheral clock gating"): something has to be read in between.
 
 use crate::device::*;
 
@@ -111,7 +111,7 @@ impl Rcc {
         rcc
     }
 
-    /// The watchdog's reset: its flag is set (8.4.4).
+    /// The watchdog's reset: its flag is set (RSR).
     pub fn reset_by_watchdog(&mut self) {
         let causes = self.bank.get(RSR) | 1 << 26;
         self.reset();
@@ -189,7 +189,7 @@ impl Rcc {
         (output(16, 9), output(17, 16))
     }
 
-    /// What runs how fast (figure 53, "Core and bus clock generation").
+    /// What runs how fast ("Core and bus clock generation").
     pub fn clocks(&self) -> Clocks {
         let (p, q) = self.pll();
         let system = match self.bank.get(CFGR) >> 3 & 7 {
@@ -261,7 +261,7 @@ impl Rcc {
             }
         }
         if changed & BYPASS != 0 && before & 1 << 16 != 0 && value & 1 << 16 != 0 {
-            return refuse("HSEBYP is changed while HSE is on (8.7.2)");
+            return refuse("HSEBYP is changed while HSE is on");
         }
         if value & (1 << 26 | 1 << 28) != 0 {
             return refuse("PLL2 and PLL3 are not modelled");
@@ -270,7 +270,7 @@ impl Rcc {
         Ok(())
     }
 
-    /// What the datasheet asks of PLL1 (table 46 and 47) before it is switched on.
+    /// What the datasheet asks of PLL1 ("PLL characteristics") before it is switched on.
     fn check_pll(&self, now: Picos) -> Result<(), Refusal> {
         let (source, flag) = match self.bank.get(PLLCKSELR) & 3 {
             0 => ("HSI", 2),
@@ -348,7 +348,7 @@ impl Peripheral for Rcc {
                 Ok(())
             }
             PLLCKSELR => {
-                // What is locked while PLL1 is on stays as it is (8.7.11).
+                // What is locked while PLL1 is on stays as it is (PLLSRC, DIVM1).
                 let locked = if self.bank.get(CR) & 1 << 24 != 0 { 0x3F3 } else { 0 };
                 let value = value & !locked | self.bank.get(PLLCKSELR) & locked;
                 self.bank.write(PLLCKSELR, value)
@@ -357,7 +357,7 @@ impl Peripheral for Rcc {
                 // Only what belongs to PLL2 and PLL3 may change.
                 let changed = value ^ self.bank.get(offset);
                 if offset == PLL1DIVR || changed & 0x7_000F != 0 {
-                    return refuse("PLL1 is on (8.7.12, 8.7.13)");
+                    return refuse("PLL1 is on");
                 }
                 self.bank.write(offset, value)
             }

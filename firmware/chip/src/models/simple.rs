@@ -1,5 +1,5 @@
-//! Small ones: PWR (RM0433 section 6), SYSCFG (12), the debug unit's MCU part (60.5.8), the AXI
-//! interconnect's one register (2.2.4), and the random number generator (33).
+//! Small ones, after the chapters of RM0433: "Power control", "System configuration controller", "Debug
+//! infrastructure" (DBGMCU), "Extended interrupt and event controller", "True random number generator".
 
 use crate::device::*;
 
@@ -29,7 +29,7 @@ impl Pwr {
         Self { bank: Bank::new(&PWR), ready: 0 }
     }
 
-    /// The fastest that the core may be by the voltage (datasheet DS12110, table 21), in Hz.
+    /// The fastest that the core may be by the voltage (datasheet DS12110, "General operating conditions"), in Hz.
     pub fn fastest(&self, now: Picos) -> u32 {
         let range = if now >= self.ready { self.bank.get(PWR_D3CR) >> 14 } else { 1 };
         [0, 200_000_000, 300_000_000, 400_000_000][range as usize & 3]
@@ -124,7 +124,7 @@ pub static DBGMCU: [Register; 3] = [
     keeps(0x54, "APB4FZR1", 0, 0x5_7E00),
 ];
 
-/// EXTI (RM0433 section 20): the board uses none of its lines.
+/// EXTI: the board uses none of its lines.
 pub static EXTI: [Register; 2] =
     [keeps(0x00, "RTSR1", 0, 0x3F_FFFF), keeps(0x80, "CPUIMR1", 0xFFC0_0000, !0)];
 
@@ -189,7 +189,7 @@ impl Peripheral for Rng {
         let is_ready = self.ready.is_some_and(|ready| at.now >= ready);
         match offset {
             RNG_SR => Ok(u32::from(is_ready)),
-            RNG_DR if !is_ready => refuse("there is no number yet (33.7.3)"),
+            RNG_DR if !is_ready => refuse("there is no number yet (SR.DRDY)"),
             RNG_DR => {
                 self.word = self.word.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
                 self.ready = Some(at.now + 40 * cycle(at.clocks.rng));

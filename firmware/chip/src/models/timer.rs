@@ -1,5 +1,5 @@
-//! A general-purpose timer of 16 bits that counts up: TIM12, which keeps the program's time. RM0433
-//! section 39.
+//! A general-purpose timer of 16 bits that counts up: TIM12, which keeps the program's time. RM0433,
+//! "General-purpose timers (TIM12/TIM13/TIM14)".
 //!
 //! Flags are cleared by writing zeros; the counter may be written only while it stands, which is all that
 //! the program does.

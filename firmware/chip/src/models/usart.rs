@@ -1,9 +1,10 @@
-//! A USART with FIFOs and driver-enable, and the RS-485 line at its pins. RM0433 section 51.
+//! A USART with FIFOs and driver-enable, and the RS-485 line at its pins. RM0433, "Universal
+//! synchronous receiver transmitter".
 //!
 //! Time is exact: characters have the length that BRR and PRESC give them, and driver-enable the times of
 //! DEAT and DEDT. Characters that arrive are sampled in the middle of each bit, so a wrong speed or parity
 //! shows as it would. The transceiver's receiver is off while its driver is on (DE and /RE are tied).
-//! Settings that only a disabled USART takes are refused while it runs (51.8.1 to 51.8.5, 51.8.13).
+//! Settings that only a disabled USART takes are refused while it runs (said at each field).
 
 use std::collections::VecDeque;
 

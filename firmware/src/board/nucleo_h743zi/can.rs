@@ -51,7 +51,7 @@ impl Handler<typelevel::FDCAN1_IT0> for CanInterrupt {
 }
 
 /// The clock calibration unit, which is between the clock and the controllers, lets the clock through. After
-/// a reset it does not say so, and what it gives before it is set up is no valid clock (RM0433 section 56,
+/// a reset it does not say so, and what it gives before it is set up is no valid clock (RM0433,
 /// "Clock calibration on CAN"). It can be written in the state that [`Mcan::start`] leaves.
 fn bypass_calibration() {
     const CCFG: usize = 0x804;
