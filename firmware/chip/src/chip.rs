@@ -9,9 +9,11 @@
 
 use defmt_decoder::StreamDecoder;
 
-use crate::board::{Access, Board, Devices, FLASH, FLASH_SIZE, Halt, Violation};
+use crate::board::{Access, Board, FLASH, FLASH_SIZE, Halt, Violation};
 use crate::device::*;
+use crate::devices::Devices;
 use crate::exception::{enter, is_return, leave, masks};
+use crate::models::flash::WORD;
 use crate::models::scs::HARD_FAULT;
 use crate::program::{Program, texts};
 use crate::unicorn::{Core, Engine, Exit, MMIO, Reg};
@@ -28,11 +30,10 @@ pub struct Chip {
     core: Core,
     board: Board,
     program: &'static Program,
-    image: Vec<u8>,
-    /// Flash words whose check bits do not match.
-    torn: Vec<u32>,
     pc: u32,
     is_locked_up: bool,
+    /// The range that nobody may touch.
+    closed: Option<(u32, u32)>,
     /// Times in a row that a deadline was not ahead.
     stuck: u32,
     decoder: Option<Box<dyn StreamDecoder + Send + Sync>>,
@@ -67,20 +68,19 @@ impl Chip {
     /// # Errors
     /// The library is missing.
     pub fn new(program: &'static Program, image: &[u8]) -> Result<Self, String> {
-        let mut flash = vec![0xFF; FLASH_SIZE as usize];
+        let mut board = Board::new();
         for (address, bytes) in &program.segments {
-            let place = address.checked_sub(FLASH).ok_or("a segment that is not in flash")? as usize;
-            flash.get_mut(place..place + bytes.len()).ok_or("too long")?.copy_from_slice(bytes);
+            let place = address.checked_sub(FLASH).filter(|place| place + bytes.len() as u32 <= FLASH_SIZE);
+            board.devices.flash.load(place.ok_or("a segment that is not in flash")?, bytes);
         }
-        flash[(CONFIG - FLASH) as usize..][..image.len()].copy_from_slice(image);
+        board.devices.flash.load(CONFIG - FLASH, image);
         let mut chip = Self {
             core: Core::new()?,
-            board: Board::new(),
+            board,
             program,
-            image: flash,
-            torn: Vec::new(),
             pc: 0,
             is_locked_up: false,
+            closed: None,
             stuck: 0,
             decoder: program.log_reader(),
             log: Vec::new(),
@@ -103,7 +103,7 @@ impl Chip {
             core.map(*address, *size, true)?;
             core.engine().write(*address, bytes);
         }
-        core.engine().write(FLASH, &self.image);
+        core.engine().write(FLASH, self.board.devices.flash.cells());
         core.engine().write(UNIQUE_ID, &[1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12]);
         for range in MMIO {
             core.devices(range)?;
@@ -111,24 +111,26 @@ impl Chip {
         for address in &self.program.waits {
             core.watch(*address)?;
         }
-        for address in &self.torn {
-            core.watch_reads(*address, address + 31)?;
+        for word in self.board.devices.flash.torn() {
+            core.watch_reads(FLASH + word, FLASH + word + WORD - 1)?;
         }
         let engine = core.engine();
         engine.set(Reg::Sp, engine.word(FLASH));
         engine.set(Reg::Lr, u32::MAX);
         self.pc = engine.word(FLASH + 4);
         self.is_locked_up = false;
+        self.closed = None;
         Ok(())
     }
 
-    /// A flash word (32 bytes) whose writing was cut off: reading it is a bus fault from the next start on.
+    /// A flash word (32 bytes) whose writing was cut off: reading it is a bus fault.
     ///
     /// # Errors
     /// The library does not take it.
     pub fn tear(&mut self, address: u32) -> Result<(), String> {
-        self.torn.push(address & !31);
-        self.core.watch_reads(address & !31, (address & !31) + 31)
+        self.board.devices.flash.tear(address - FLASH);
+        let word = address & !(WORD - 1);
+        self.core.watch_reads(word, word + WORD - 1)
     }
 
     /// Another instruction in the program, until the next reset.
@@ -210,6 +212,7 @@ impl Chip {
             self.take(number, self.pc);
         }
         self.follow_guard();
+        self.follow_flash();
         let exit = self.core.run(self.pc, &mut self.board);
         self.pc = engine.reg(Reg::Pc);
         match (exit, self.board.halt.take()) {
@@ -227,7 +230,10 @@ impl Chip {
                 self.leave();
             }
             (Exit::Undefined | Exit::Exception(_), None) => self.fault(UNDEFINED, 0),
-            (Exit::Memory { address, is_fetch }, None) => {
+            (Exit::Memory { address, written: Some(written), .. }, None) if is_flash(address) => {
+                self.program_flash(address, written);
+            }
+            (Exit::Memory { address, is_fetch, .. }, None) => {
                 let guard = self.board.scs.guard();
                 let is_guard = guard.is_some_and(|(start, size)| (start..start + size).contains(&address));
                 match (is_guard, is_fetch) {
@@ -236,6 +242,34 @@ impl Chip {
                     (false, false) => self.fault(PRECISE_BUS, address),
                 }
             }
+        }
+    }
+
+    /// A write to flash: the instruction is executed, but its cells take what the model lets them.
+    fn program_flash(&mut self, address: u32, (value, size): (u32, u32)) {
+        let bytes = &value.to_le_bytes()[..size as usize];
+        self.board.program_flash(self.pc, address - FLASH, bytes);
+        let page = address & !0xFFF;
+        let engine = self.engine();
+        let opened = self.core.guard(page, 0x1000, false);
+        // What was translated before knows nothing of stopping behind one instruction.
+        self.core.forget(self.pc, 4);
+        self.board.is_forced = true;
+        self.core.run_one(self.pc, &mut self.board);
+        self.board.is_forced = false;
+        self.pc = engine.reg(Reg::Pc);
+        // Only with the end of the work the cells change.
+        let place = (page - FLASH) as usize;
+        engine.write(page, &self.board.devices.flash.cells()[place..place + 0x1000]);
+        opened.and(self.core.close_flash(page, 0x1000)).expect("there is flash");
+    }
+
+    /// Memory shows what flash's cells hold since the last erase or write.
+    fn follow_flash(&mut self) {
+        for (offset, len) in self.board.devices.flash.take_changed() {
+            let cells = &self.board.devices.flash.cells()[offset as usize..][..len as usize];
+            self.core.engine().write(FLASH + offset, cells);
+            self.core.forget(FLASH + offset, len);
         }
     }
 
@@ -263,10 +297,15 @@ impl Chip {
         if !std::mem::take(&mut self.board.guard_changed) {
             return;
         }
-        let (start, size, _) = RAM[0];
-        let opened = self.core.guard(start, size, false);
-        let closed = self.board.scs.guard().map(|(start, size)| self.core.guard(start, size, true));
-        opened.and(closed.unwrap_or(Ok(()))).expect("the guard is in the DTCM");
+        let guard = self.board.scs.guard();
+        if guard == self.closed {
+            return;
+        }
+        let core = &self.core;
+        let opened = self.closed.take().map_or(Ok(()), |(start, size)| core.guard(start, size, false));
+        let closed = guard.map_or(Ok(()), |(start, size)| core.guard(start, size, true));
+        self.closed = guard;
+        opened.and(closed).expect("the guard is in RAM");
     }
 
     /// WFE (Armv7-M ARM B1.5.18).
@@ -329,6 +368,10 @@ impl Chip {
             self.log.extend(texts(decoder.as_mut(), &bytes).into_iter().map(|text| (now, text)));
         }
     }
+}
+
+fn is_flash(address: u32) -> bool {
+    (FLASH..FLASH + FLASH_SIZE).contains(&address)
 }
 
 /// Of CFSR: an instruction that there is not.

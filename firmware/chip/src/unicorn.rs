@@ -56,6 +56,8 @@ pub enum Exit {
         address: u32,
         /// Whether an instruction was fetched.
         is_fetch: bool,
+        /// What was to be written, and how many bytes of it.
+        written: Option<(u32, u32)>,
     },
 }
 
@@ -269,16 +271,30 @@ impl Core {
         })
     }
 
+    /// Takes a range of flash from those who write.
+    ///
+    /// # Errors
+    /// There is no memory.
+    pub fn close_flash(&self, address: u32, size: u32) -> Result<(), String> {
+        self.protect(address, size, READ | EXECUTE)
+    }
+
+    fn protect(&self, address: u32, size: u32, access: u32) -> Result<(), String> {
+        const FLUSH_TLB: c_int = 11 | 1 << 30;
+        let Engine { api, uc } = self.engine;
+        // SAFETY: as above.
+        checked("uc_mem_protect", unsafe { (api.protect)(uc, address.into(), size.into(), access) })?;
+        // Without it, what the page allowed before is still allowed.
+        // SAFETY: this request takes nothing.
+        checked("uc_ctl", unsafe { (api.ctl)(uc, FLUSH_TLB) })
+    }
+
     /// Keeps everybody from a range, or gives it back.
     ///
     /// # Errors
     /// There is no memory.
     pub fn guard(&self, address: u32, size: u32, is_closed: bool) -> Result<(), String> {
-        let access = if is_closed { 0 } else { ALL };
-        // SAFETY: as above.
-        checked("uc_mem_protect", unsafe {
-            (self.engine.api.protect)(self.engine.uc, address.into(), size.into(), access)
-        })
+        self.protect(address, size, if is_closed { 0 } else { ALL })
     }
 
     /// Addresses that are the handler's; at most one range for each start in [`MMIO`].
@@ -339,6 +355,18 @@ impl Core {
     /// # Panics
     /// The library fails otherwise than a program can make it.
     pub fn run(&mut self, pc: u32, handler: &mut dyn Handler) -> Exit {
+        self.run_some(pc, 0, handler)
+    }
+
+    /// Runs one instruction.
+    ///
+    /// # Panics
+    /// As [`Core::run`].
+    pub fn run_one(&mut self, pc: u32, handler: &mut dyn Handler) -> Exit {
+        self.run_some(pc, 1, handler)
+    }
+
+    fn run_some(&mut self, pc: u32, count: usize, handler: &mut dyn Handler) -> Exit {
         const NOWHERE: u64 = 0xFFFF_FFFE;
         const NO_MEMORY: std::ops::RangeInclusive<c_int> = 6..=8;
         const FORBIDDEN: std::ops::RangeInclusive<c_int> = 12..=14;
@@ -351,14 +379,14 @@ impl Core {
         let Engine { api, uc } = self.engine;
         // Without a limit of time: each would start a thread.
         // SAFETY: the callbacks' memory is there.
-        let status = unsafe { (api.start)(uc, u64::from(pc | 1), NOWHERE, 0, 0) };
+        let status = unsafe { (api.start)(uc, u64::from(pc | 1), NOWHERE, 0, count) };
         self.shared.handler.set(None);
         match (self.shared.exit.get(), status) {
             (Some(exit), _) => exit,
             (None, 0) => Exit::Stopped,
             (None, UNDEFINED) => Exit::Undefined,
             (None, status) if NO_MEMORY.contains(&status) || FORBIDDEN.contains(&status) => {
-                Exit::Memory { address: 0, is_fetch: false }
+                Exit::Memory { address: 0, is_fetch: false, written: None }
             }
             (None, status) => panic!("uc_emu_start: error {status}, PC {:08X}", self.engine.reg(Reg::Pc)),
         }
@@ -437,14 +465,16 @@ extern "C" fn on_bad_memory(
     uc: Uc,
     access: c_int,
     address: u64,
-    _: c_int,
-    _: i64,
+    size: c_int,
+    value: i64,
     user: *mut c_void,
 ) -> bool {
     const FETCHES: [c_int; 2] = [21, 24];
+    const WRITES: [c_int; 2] = [20, 22];
     with(uc, user, |_, _, shared| {
         let is_fetch = FETCHES.contains(&access);
-        shared.exit.set(Some(Exit::Memory { address: address as u32, is_fetch }));
+        let written = WRITES.contains(&access).then_some((value as u32, size as u32));
+        shared.exit.set(Some(Exit::Memory { address: address as u32, is_fetch, written }));
     });
     false
 }

@@ -6,6 +6,7 @@ mod bench;
 mod boot;
 mod can;
 mod faults;
+mod flash;
 mod robot;
 mod serial;
 
