@@ -26,13 +26,16 @@ pub struct Access {
     pub value: u32,
     /// It was written.
     pub is_write: bool,
-    /// How often the same in a row.
+    /// How often the same in a row; 0 for what the peripheral does by itself.
     pub times: u32,
 }
 
 impl fmt::Display for Access {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { at, pc, peripheral, register, value, is_write, times } = self;
+        if *times == 0 {
+            return write!(f, "{:12.3} us  {pc:08X}  {peripheral} by itself", *at as f64 / 1e6);
+        }
         let arrow = if *is_write { "<-" } else { "->" };
         write!(f, "{:12.3} us  {pc:08X}  {peripheral}.{register} {arrow} {value:08X}", *at as f64 / 1e6)?;
         if *times > 1 { write!(f, "  {times} times") } else { Ok(()) }
@@ -190,10 +193,10 @@ impl Board {
                 at: self.now,
                 pc: core.reg(Reg::Pc),
                 peripheral,
-                register: "what it does by itself".into(),
+                register: String::new(),
                 value: 0,
                 is_write: false,
-                times: 1,
+                times: 0,
             };
             self.violation.get_or_insert(Violation { access, reason });
         }

@@ -5,6 +5,7 @@
 mod bench;
 mod boot;
 mod can;
+mod cell;
 mod faults;
 mod flash;
 mod robot;
