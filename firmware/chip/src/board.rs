@@ -62,8 +62,6 @@ impl fmt::Display for Violation {
 pub(crate) enum Halt {
     /// It waits for an event, at the instruction before this address.
     Wait(u32),
-    /// A bus fault by the flash: where, and the instruction.
-    Torn(u32, u32),
 }
 
 /// Devices, time, and what is noted of them.
@@ -418,14 +416,6 @@ impl Handler for Board {
                 self.halt = Some(Halt::Wait(address));
                 Flow::Stop
             }
-        }
-    }
-
-    fn touched(&mut self, core: Engine, address: u32) {
-        if self.scs.ignores_bus_faults(masks(core)) {
-            self.scs.note_fault(0x8200, address, false);
-        } else {
-            self.halt.get_or_insert(Halt::Torn(address, core.reg(Reg::Pc)));
         }
     }
 }

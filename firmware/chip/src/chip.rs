@@ -112,7 +112,7 @@ impl Chip {
             core.watch(*address)?;
         }
         for word in self.board.devices.flash.torn() {
-            core.watch_reads(FLASH + word, FLASH + word + WORD - 1)?;
+            self.close_page(FLASH + word)?;
         }
         let engine = core.engine();
         engine.set(Reg::Sp, engine.word(FLASH));
@@ -129,8 +129,7 @@ impl Chip {
     /// The library does not take it.
     pub fn tear(&mut self, address: u32) -> Result<(), String> {
         self.board.devices.flash.tear(address - FLASH);
-        let word = address & !(WORD - 1);
-        self.core.watch_reads(word, word + WORD - 1)
+        self.close_page(address)
     }
 
     /// Another instruction in the program, until the next reset.
@@ -220,10 +219,6 @@ impl Chip {
                 self.pc = address + 2;
                 self.wait(end);
             }
-            (_, Some(Halt::Torn(address, pc))) => {
-                self.pc = pc;
-                self.fault(PRECISE_BUS, address);
-            }
             (Exit::Stopped, None) => {}
             (Exit::Exception(8), None) => self.leave(),
             (Exit::Exception(_) | Exit::Memory { is_fetch: true, .. }, None) if is_return(self.pc) => {
@@ -232,6 +227,11 @@ impl Chip {
             (Exit::Undefined | Exit::Exception(_), None) => self.fault(UNDEFINED, 0),
             (Exit::Memory { address, written: Some(written), .. }, None) if is_flash(address) => {
                 self.program_flash(address, written);
+            }
+            (Exit::Memory { address, is_fetch: false, .. }, None)
+                if is_flash(address) && self.has_torn(address) =>
+            {
+                self.read_torn(address);
             }
             (Exit::Memory { address, is_fetch, .. }, None) => {
                 let guard = self.board.scs.guard();
@@ -245,23 +245,55 @@ impl Chip {
         }
     }
 
-    /// A write to flash: the instruction is executed, but its cells take what the model lets them.
-    fn program_flash(&mut self, address: u32, (value, size): (u32, u32)) {
-        let bytes = &value.to_le_bytes()[..size as usize];
-        self.board.program_flash(self.pc, address - FLASH, bytes);
-        let page = address & !0xFFF;
-        let engine = self.engine();
-        let opened = self.core.guard(page, 0x1000, false);
+    /// Whether a page of flash has words that cannot be read.
+    fn has_torn(&self, address: u32) -> bool {
+        let offset = page(address).wrapping_sub(FLASH);
+        self.board.devices.flash.torn().any(|word| page(word) == offset)
+    }
+
+    /// Flash is not for writing, and a page with a torn word not for reading.
+    fn close_page(&self, address: u32) -> Result<(), String> {
+        if self.has_torn(address) {
+            self.core.guard(page(address), PAGE, true)
+        } else {
+            self.core.close_flash(page(address), PAGE)
+        }
+    }
+
+    /// Executes one instruction with a page of flash open.
+    fn step_in_page(&mut self, address: u32) {
+        self.core.guard(page(address), PAGE, false).expect("there is flash");
         // What was translated before knows nothing of stopping behind one instruction.
         self.core.forget(self.pc, 4);
         self.board.is_forced = true;
         self.core.run_one(self.pc, &mut self.board);
         self.board.is_forced = false;
-        self.pc = engine.reg(Reg::Pc);
+        self.pc = self.engine().reg(Reg::Pc);
         // Only with the end of the work the cells change.
-        let place = (page - FLASH) as usize;
-        engine.write(page, &self.board.devices.flash.cells()[place..place + 0x1000]);
-        opened.and(self.core.close_flash(page, 0x1000)).expect("there is flash");
+        let place = (page(address) - FLASH) as usize;
+        let cells = &self.board.devices.flash.cells()[place..place + PAGE as usize];
+        self.engine().write(page(address), cells);
+        self.close_page(address).expect("there is flash");
+    }
+
+    /// A read of a page with a torn word: of that word it is a bus fault, unless those are held back.
+    fn read_torn(&mut self, address: u32) {
+        let word = (address - FLASH) & !(WORD - 1);
+        if self.board.devices.flash.torn().any(|torn| torn == word) {
+            if !self.board.scs.ignores_bus_faults(masks(self.engine())) {
+                self.fault(PRECISE_BUS, address);
+                return;
+            }
+            self.board.scs.note_fault(PRECISE_BUS, address, false);
+        }
+        self.step_in_page(address);
+    }
+
+    /// A write to flash: the instruction is executed, but its cells take what the model lets them.
+    fn program_flash(&mut self, address: u32, (value, size): (u32, u32)) {
+        let bytes = &value.to_le_bytes()[..size as usize];
+        self.board.program_flash(self.pc, address - FLASH, bytes);
+        self.step_in_page(address);
     }
 
     /// Memory shows what flash's cells hold since the last erase or write.
@@ -270,6 +302,9 @@ impl Chip {
             let cells = &self.board.devices.flash.cells()[offset as usize..][..len as usize];
             self.core.engine().write(FLASH + offset, cells);
             self.core.forget(FLASH + offset, len);
+            for address in (FLASH + offset..FLASH + offset + len).step_by(PAGE as usize) {
+                self.close_page(address).expect("there is flash");
+            }
         }
     }
 
@@ -368,6 +403,13 @@ impl Chip {
             self.log.extend(texts(decoder.as_mut(), &bytes).into_iter().map(|text| (now, text)));
         }
     }
+}
+
+/// What memory is opened and closed by.
+const PAGE: u32 = 0x1000;
+
+fn page(address: u32) -> u32 {
+    address & !(PAGE - 1)
 }
 
 fn is_flash(address: u32) -> bool {
