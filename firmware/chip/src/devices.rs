@@ -8,7 +8,7 @@ use crate::models::flash::Flash;
 use crate::models::gpio::Port;
 use crate::models::iwdg::Watchdog;
 use crate::models::rcc::{Gate, Rcc};
-use crate::models::simple::{DBGMCU, EXTI, Plain, Pwr, Rng, Syscfg};
+use crate::models::simple::{AXI, DBGMCU, EXTI, Plain, Pwr, Rng, Syscfg};
 use crate::models::timer::Timer;
 use crate::models::usart::{Pins, Usart};
 
@@ -23,6 +23,7 @@ pub(crate) enum Id {
     Gpio(usize),
     Watchdog,
     Debug,
+    Axi,
     Timer,
     First,
     Second,
@@ -64,7 +65,7 @@ const fn port(index: usize, name: &'static str) -> Place {
 /// Of the controller and its message RAM.
 pub(crate) const CAN: Option<Gate> = gate(0xEC, 1 << 8);
 /// All of them.
-pub(crate) static MAP: [Place; 25] = [
+pub(crate) static MAP: [Place; 26] = [
     place(0x4000_1800, 0x400, "TIM12", gate(0xE8, 1 << 6), Id::Timer, Some(43)),
     place(0x4000_4400, 0x400, "USART2", gate(0xE8, 1 << 17), Id::First, Some(38)),
     place(0x4000_7800, 0x400, "UART7", gate(0xE8, 1 << 30), Id::Second, Some(82)),
@@ -72,6 +73,7 @@ pub(crate) static MAP: [Place; 25] = [
     place(0x4000_AC00, 0x2800, "message RAM", CAN, Id::CanRam, None),
     place(0x4002_8000, 0x2000, "ETH", gate(0xD8, 7 << 15), Id::Ethernet, Some(61)),
     place(0x4802_1800, 0x400, "RNG", gate(0xDC, 1 << 6), Id::Rng, None),
+    place(0x5100_8000, 0x1000, "AXI", None, Id::Axi, None),
     place(0x5200_2000, 0x400, "FLASH", None, Id::Flash, None),
     place(0x5800_0000, 0x400, "EXTI", None, Id::Exti, None),
     place(0x5800_0400, 0x400, "SYSCFG", gate(0xF4, 1 << 1), Id::Syscfg, None),
@@ -119,8 +121,11 @@ pub struct Devices {
     pub rng: Rng,
     /// Flash's registers.
     pub flash: Flash,
+    /// What chip it is.
+    pub debug: Plain,
+    /// The AXI interconnect.
+    pub axi: Plain,
     exti: Plain,
-    debug: Plain,
 }
 
 impl Devices {
@@ -141,6 +146,7 @@ impl Devices {
             flash: Flash::new(),
             exti: Plain::new(&EXTI),
             debug: Plain::new(&DBGMCU),
+            axi: Plain::new(&AXI),
         }
     }
 
@@ -154,6 +160,7 @@ impl Devices {
             Id::Gpio(index) => &mut self.gpio[index],
             Id::Watchdog => &mut self.watchdog,
             Id::Debug => &mut self.debug,
+            Id::Axi => &mut self.axi,
             Id::Timer => &mut self.timer,
             Id::First => &mut self.first,
             Id::Second => &mut self.second,

@@ -82,6 +82,17 @@ fn it_boots_and_reaches_the_controller() {
 
 #[test]
 #[ignore = "needs CHIP_UNICORN and CHIP_ELF"]
+fn only_a_chip_of_the_old_revision_reads_its_ram_one_by_one() {
+    for (identity, mode) in [(0x1003_6450, 1), (0x2003_6450, 0)] {
+        let mut bench = Bench::blank();
+        bench.chip.devices().debug.put(0, identity);
+        bench.until_log("info: started", 10 * MILLI);
+        assert_eq!(bench.chip.devices().axi.get(0x108), mode, "{identity:08X}");
+    }
+}
+
+#[test]
+#[ignore = "needs CHIP_UNICORN and CHIP_ELF"]
 fn two_runs_are_the_same() {
     let run = || {
         let mut bench = Bench::new(CELL).with_robot();
