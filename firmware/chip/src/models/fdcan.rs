@@ -225,6 +225,7 @@ impl Fdcan {
             mask: self.bank.get(XIDAM),
         };
         let Some(fifo) = filters.accept(frame, &self.ram) else { return };
+        self.bus.passed += 1;
         let config = self.bank.get(RXFC[fifo]);
         let size = config >> 16 & 0x7F;
         let (get, put, fill) = self.fifos[fifo];
@@ -270,7 +271,7 @@ impl Fdcan {
             self.count(|can| can.is_bus_off = true);
             self.is_on_bus = false;
             self.bank.set(CCCR, self.bank.get(CCCR) | INIT);
-            self.bus.bus_offs += 1;
+            self.bus.bus_offs.push(at);
         }
         // It is sent again, before the others.
         self.waiting.push_front(index);
