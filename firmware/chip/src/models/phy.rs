@@ -52,6 +52,11 @@ impl Phy {
         }
     }
 
+    /// What it offers its partner (register 4).
+    pub fn offer(&self) -> u16 {
+        self.offer
+    }
+
     /// Whether frames pass.
     pub fn is_up(&mut self, now: Picos) -> bool {
         self.look(now);
