@@ -291,6 +291,8 @@ async fn status_led(pulse: &'static Pulse, gateway: Option<&'static Gateway>, mu
 async fn address(pulse: &'static Pulse, stack: Stack<'static>) -> ! {
     let telling = async {
         loop {
+            // A fixed address is there before the link is, and nobody can be reached at it.
+            pulse.idle(pin!(stack.wait_link_up())).await;
             pulse.idle(pin!(stack.wait_config_up())).await;
             if let Some(config) = stack.config_v4() {
                 info!("address {}", Text(&config.address));

@@ -50,6 +50,19 @@ impl Handler<typelevel::FDCAN1_IT0> for CanInterrupt {
     }
 }
 
+/// The clock calibration unit, which is between the clock and the controllers, lets the clock through. After
+/// a reset it does not say so, and what it gives before it is set up is no valid clock (RM0433,
+/// "Clock calibration on CAN"). It can be written in the state that [`Mcan::start`] leaves.
+fn bypass_calibration() {
+    const CCFG: usize = 0x804;
+    const BYPASS: u32 = 1 << 6;
+    // SAFETY: a register of the controllers' part that nobody else uses, aligned.
+    unsafe {
+        let register = FDCAN1.as_ptr().cast::<u8>().add(CCFG).cast::<u32>();
+        register.write_volatile(register.read_volatile() | BYPASS);
+    }
+}
+
 /// Receive and transmit.
 pub(super) type Pins = (Peri<'static, PD0>, Peri<'static, PD1>);
 
@@ -64,6 +77,7 @@ pub(super) fn start(pins: Pins, bitrate: u32) -> Result<CanDevice, StartError> {
     rcc::enable_and_reset::<peripherals::FDCAN1>();
     let clock = rcc::frequency::<peripherals::FDCAN1>().0;
     let started = Mcan::start(CanRegisters, 0, &WAKER, bitrate, clock)?;
+    bypass_calibration();
     // SAFETY: its handler is bound, and masks no critical section.
     unsafe { typelevel::FDCAN1_IT0::enable() };
     Ok(started)

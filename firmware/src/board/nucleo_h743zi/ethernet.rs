@@ -63,7 +63,7 @@ pub(super) struct Parts {
 }
 
 impl Parts {
-    /// Starts the controller; takes a quarter of a second at most, when the PHY's clock is missing.
+    /// Starts the controller; takes half a second at most, when the PHY gives its clock and does not answer.
     pub(super) fn start<I>(mut self, irqs: I, address: [u8; 6], led: Led) -> Result<Ethernet, EthernetError>
     where
         I: interrupt::typelevel::Binding<interrupt::typelevel::ETH, eth::InterruptHandler> + 'static,
@@ -72,9 +72,14 @@ impl Parts {
             return Err(EthernetError::NoClock);
         }
         let mut sma = Sma::new(self.sma, self.mdio, self.mdc);
-        match sma.smi_read(PHY_ADDRESS, PHY_ID1) {
-            PHY_VENDOR => {}
-            found => return Err(EthernetError::NoPhy { found }),
+        // One that has just got its power may not answer yet.
+        let until = Instant::now() + PATIENCE;
+        loop {
+            match sma.smi_read(PHY_ADDRESS, PHY_ID1) {
+                PHY_VENDOR => break,
+                found if Instant::now() > until => return Err(EthernetError::NoPhy { found }),
+                _ => {}
+            }
         }
         // In AXI SRAM, as all statics: the DMA reaches it, and the data cache is off.
         static QUEUE: ConstStaticCell<PacketQueue<TX_FRAMES, RX_FRAMES>> =
@@ -102,6 +107,8 @@ fn has_clock(ref_clk: Peri<'_, PA1>) -> bool {
     const FUNCTION: u8 = 11;
     let mut pin = Flex::new(ref_clk);
     pin.set_as_af_unchecked(FUNCTION, AfType::output(OutputType::PushPull, Speed::VeryHigh));
+    // Dropped it would be disconnected, and the MAC without its clock until the driver connects it again.
+    core::mem::forget(pin);
     critical_section::with(|_| {
         RCC.ahb1enr().modify(|w| {
             w.set_ethen(true);

@@ -14,6 +14,8 @@ pub(super) fn ethernet_address() -> [u8; 6] {
 pub(crate) fn seed() -> u64 {
     let own = firmware::identity::hash(&uid::uid()) ^ Instant::now().as_ticks();
     RCC.ahb2enr().modify(|w| w.set_rngen(true));
+    // The clock takes two cycles to arrive; what is written before that is lost.
+    RCC.ahb2enr().read();
     RNG.cr().modify(|w| w.set_rngen(true));
     (0..2).fold(own, |seed, _| seed.rotate_left(32) ^ u64::from(random_word().unwrap_or(0)))
 }

@@ -3,7 +3,8 @@
 
 use embassy_stm32::Peri;
 use embassy_stm32::gpio::{Level, Output, Speed};
-use embassy_stm32::pac::GPIOB;
+use embassy_stm32::pac::gpio::vals::Moder;
+use embassy_stm32::pac::{GPIOB, RCC};
 use embassy_stm32::peripherals::{PB0, PB14, PE1};
 use firmware::platform::Lamp;
 
@@ -37,7 +38,11 @@ impl Leds {
     }
 }
 
-/// Lights LD3, whatever else is going on.
+/// Lights LD3, whatever else is going on: the fault may have come before anything was set up.
 pub(super) fn fault() {
+    RCC.ahb4enr().modify(|w| w.set_gpioben(true));
+    // The clock takes two cycles to arrive.
+    RCC.ahb4enr().read();
+    GPIOB.moder().modify(|w| w.set_moder(14, Moder::OUTPUT));
     GPIOB.bsrr().write(|w| w.set_bs(14, true));
 }

@@ -160,6 +160,7 @@ fn tell_start(source: clocks::Source) {
 /// Also where a panic ends. The watchdog starts the board again; a debugger finds it here.
 #[cortex_m_rt::exception]
 unsafe fn HardFault(frame: &cortex_m_rt::ExceptionFrame) -> ! {
+    Watchdog::start_anyhow();
     leds::fault();
     last_words::keep(frame);
     loop {

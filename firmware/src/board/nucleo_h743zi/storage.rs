@@ -63,7 +63,7 @@ fn check(start: usize, len: usize) -> Result<(), StorageError> {
 
 fn can_read(address: usize) -> bool {
     const CCR_IGNORE_BUS_FAULTS: u32 = 1 << 8;
-    const CFSR_BUS: u32 = 0xFF << 8;
+    const CFSR_BUS: u32 = 0xBF << 8;
     // SAFETY: for one load, whose address is flash, all interrupts and faults are masked, and bus faults
     // then leave only their mark. The mark is taken away; everything else is as it was.
     unsafe {

@@ -1,0 +1,426 @@
+//! The whole chip on its board: memory, core, devices and virtual time.
+//!
+//! In: the program, the configuration image, what happens at the pins. Out: what the program did there,
+//! its log, and the first thing it was not allowed to do.
+//!
+//! Time is counted in instructions, one a cycle; while the core waits for an event it jumps to the next
+//! deadline of a device. Nothing else moves it, so a run is the same each time and everywhere. A run
+//! that keeps pace with the clock on the wall would wait in [`Chip::idle`], and nowhere else.
+
+use defmt_decoder::StreamDecoder;
+
+use crate::board::{Access, Board, FLASH, FLASH_SIZE, Halt, Violation};
+use crate::device::*;
+use crate::devices::Devices;
+use crate::exception::{enter, is_return, leave, masks};
+use crate::models::flash::WORD;
+use crate::models::scs::HARD_FAULT;
+use crate::program::{Program, texts};
+use crate::unicorn::{Core, Engine, Exit, MMIO, Reg};
+
+/// Where the configuration image is.
+pub const CONFIG: u32 = 0x081C_0000;
+const SYSTEM_FLASH: u32 = 0x1FF0_0000;
+const UNIQUE_ID: u32 = 0x1FF1_E800;
+/// RAM: start, size, and what it holds when power has come.
+const RAM: [(u32, u32, u8); 2] = [(0x2000_0000, 0x2_0000, 0x5A), (0x2400_0000, 0x8_0000, 0xA5)];
+
+/// The chip.
+pub struct Chip {
+    core: Core,
+    board: Board,
+    program: &'static Program,
+    pc: u32,
+    is_locked_up: bool,
+    /// The range that nobody may touch.
+    closed: Option<(u32, u32)>,
+    /// Times in a row that a deadline was not ahead.
+    stuck: u32,
+    decoder: Option<Box<dyn StreamDecoder + Send + Sync>>,
+    /// Each line of the log, and when it was read.
+    pub log: Vec<(Picos, String)>,
+    /// When the watchdog has reset the chip.
+    pub resets: Vec<Picos>,
+    /// Where the program faulted: the instruction, CFSR's new bits.
+    pub faults: Vec<(u32, u32)>,
+    /// How often the core waited for an event with nothing to do.
+    pub waits: u64,
+}
+
+/// Why a run ended early.
+#[derive(Debug)]
+pub struct Stopped {
+    /// What was not allowed.
+    pub violation: Violation,
+    /// Where that is.
+    pub place: String,
+}
+
+impl std::fmt::Display for Stopped {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{}\n    at {}", self.violation, self.place)
+    }
+}
+
+impl Chip {
+    /// The board with that program, and a configuration image in flash; power has just come.
+    ///
+    /// # Errors
+    /// The library is missing.
+    pub fn new(program: &'static Program, image: &[u8]) -> Result<Self, String> {
+        let mut board = Board::new();
+        for (address, bytes) in &program.segments {
+            let place = address.checked_sub(FLASH).filter(|place| place + bytes.len() as u32 <= FLASH_SIZE);
+            board.devices.flash.load(place.ok_or("a segment that is not in flash")?, bytes);
+        }
+        board.devices.flash.load(CONFIG - FLASH, image);
+        let mut chip = Self {
+            core: Core::new()?,
+            board,
+            program,
+            pc: 0,
+            is_locked_up: false,
+            closed: None,
+            stuck: 0,
+            decoder: program.log_reader(),
+            log: Vec::new(),
+            resets: Vec::new(),
+            faults: Vec::new(),
+            waits: 0,
+        };
+        let ram = RAM.map(|(_, size, fill)| vec![fill; size as usize]);
+        chip.start(&ram)?;
+        Ok(chip)
+    }
+
+    /// A new core with that RAM, at the reset vector.
+    fn start(&mut self, ram: &[Vec<u8>; 2]) -> Result<(), String> {
+        self.core = Core::new()?;
+        let core = &self.core;
+        core.map(FLASH, FLASH_SIZE, false)?;
+        core.map(SYSTEM_FLASH, 0x2_0000, false)?;
+        for ((address, size, _), bytes) in RAM.iter().zip(ram) {
+            core.map(*address, *size, true)?;
+            core.engine().write(*address, bytes);
+        }
+        core.engine().write(FLASH, self.board.devices.flash.cells());
+        core.engine().write(UNIQUE_ID, &[1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12]);
+        for range in MMIO {
+            core.devices(range)?;
+        }
+        for address in &self.program.waits {
+            core.watch(*address)?;
+        }
+        for word in self.board.devices.flash.torn() {
+            self.close_page(FLASH + word)?;
+        }
+        let engine = core.engine();
+        engine.set(Reg::Sp, engine.word(FLASH));
+        engine.set(Reg::Lr, u32::MAX);
+        self.pc = engine.word(FLASH + 4);
+        self.is_locked_up = false;
+        self.closed = None;
+        Ok(())
+    }
+
+    /// A flash word (32 bytes) whose writing was cut off: reading it is a bus fault.
+    ///
+    /// # Errors
+    /// The library does not take it.
+    pub fn tear(&mut self, address: u32) -> Result<(), String> {
+        self.board.devices.flash.tear(address - FLASH);
+        self.close_page(address)
+    }
+
+    /// Another instruction in the program, until the next reset.
+    pub fn patch(&mut self, address: u32, code: &[u8]) {
+        self.engine().write(address, code);
+        self.core.forget(address, code.len() as u32);
+    }
+
+    /// Memory and registers.
+    pub fn engine(&self) -> Engine {
+        self.core.engine()
+    }
+
+    /// The program.
+    pub fn program(&self) -> &'static Program {
+        self.program
+    }
+
+    /// The present.
+    pub fn now(&self) -> Picos {
+        self.board.now
+    }
+
+    /// The models.
+    pub fn devices(&mut self) -> &mut Devices {
+        &mut self.board.devices
+    }
+
+    /// Instructions that were executed.
+    pub fn instructions(&self) -> u64 {
+        self.board.instructions
+    }
+
+    /// Interrupts and exceptions that were taken.
+    pub fn interrupts(&self) -> u64 {
+        self.board.scs.taken.iter().sum()
+    }
+
+    /// The last accesses, and how many are kept from now on.
+    pub fn accesses(&mut self, keep: usize) -> impl Iterator<Item = &Access> {
+        self.board.keep = keep;
+        self.board.accesses.iter()
+    }
+
+    /// Where the program is.
+    pub fn place(&self) -> String {
+        self.program.place(self.pc & !1)
+    }
+
+    /// Runs up to an instant.
+    ///
+    /// # Errors
+    /// The program did what it may not.
+    pub fn run_until(&mut self, end: Picos) -> Result<(), Stopped> {
+        while self.board.now < end {
+            self.board.limit = end;
+            self.step(end);
+            self.read_log();
+            if let Some(violation) = self.board.violation.clone() {
+                let place = self.program.place(violation.access.pc);
+                return Err(Stopped { violation, place });
+            }
+        }
+        Ok(())
+    }
+
+    fn step(&mut self, end: Picos) {
+        let engine = self.engine();
+        self.board.advance(engine);
+        if self.board.devices.watchdog.bites().is_some_and(|at| self.board.now >= at) {
+            self.bite();
+            return;
+        }
+        if self.is_locked_up {
+            self.idle(end);
+            return;
+        }
+        if let Some(number) = self.board.scs.due(masks(engine)) {
+            self.take(number, self.pc);
+        }
+        self.follow_guard();
+        self.follow_flash();
+        let exit = self.core.run(self.pc, &mut self.board);
+        self.pc = engine.reg(Reg::Pc);
+        match (exit, self.board.halt.take()) {
+            (_, Some(Halt::Wait(address))) => {
+                self.pc = address + 2;
+                self.wait(end);
+            }
+            (Exit::Stopped, None) => {}
+            (Exit::Exception(8), None) => self.leave(),
+            (Exit::Exception(_) | Exit::Memory { is_fetch: true, .. }, None) if is_return(self.pc) => {
+                self.leave();
+            }
+            (Exit::Undefined | Exit::Exception(_), None) => self.fault(UNDEFINED, 0),
+            (Exit::Memory { address, written: Some(written), .. }, None) if is_flash(address) => {
+                self.program_flash(address, written);
+            }
+            (Exit::Memory { address, is_fetch: false, .. }, None)
+                if is_flash(address) && self.has_torn(address) =>
+            {
+                self.read_torn(address);
+            }
+            (Exit::Memory { address, is_fetch, .. }, None) => {
+                let guard = self.board.scs.guard();
+                let is_guard = guard.is_some_and(|(start, size)| (start..start + size).contains(&address));
+                match (is_guard, is_fetch) {
+                    (true, _) => self.fault(GUARDED, address),
+                    (false, true) => self.fault(FETCH, address),
+                    (false, false) => self.fault(PRECISE_BUS, address),
+                }
+            }
+        }
+    }
+
+    /// Whether a page of flash has words that cannot be read.
+    fn has_torn(&self, address: u32) -> bool {
+        let offset = page(address).wrapping_sub(FLASH);
+        self.board.devices.flash.torn().any(|word| page(word) == offset)
+    }
+
+    /// Flash is not for writing, and a page with a torn word not for reading.
+    fn close_page(&self, address: u32) -> Result<(), String> {
+        if self.has_torn(address) {
+            self.core.guard(page(address), PAGE, true)
+        } else {
+            self.core.close_flash(page(address), PAGE)
+        }
+    }
+
+    /// Executes one instruction with a page of flash open.
+    fn step_in_page(&mut self, address: u32) {
+        self.core.guard(page(address), PAGE, false).expect("there is flash");
+        // What was translated before knows nothing of stopping behind one instruction.
+        self.core.forget(self.pc, 4);
+        self.board.is_forced = true;
+        self.core.run_one(self.pc, &mut self.board);
+        self.board.is_forced = false;
+        self.pc = self.engine().reg(Reg::Pc);
+        // Only with the end of the work the cells change.
+        let place = (page(address) - FLASH) as usize;
+        let cells = &self.board.devices.flash.cells()[place..place + PAGE as usize];
+        self.engine().write(page(address), cells);
+        self.close_page(address).expect("there is flash");
+    }
+
+    /// A read of a page with a torn word: of that word it is a bus fault, unless those are held back.
+    fn read_torn(&mut self, address: u32) {
+        let word = (address - FLASH) & !(WORD - 1);
+        if self.board.devices.flash.torn().any(|torn| torn == word) {
+            if !self.board.scs.ignores_bus_faults(masks(self.engine())) {
+                self.fault(PRECISE_BUS, address);
+                return;
+            }
+            self.board.scs.note_fault(PRECISE_BUS, address, false);
+        }
+        self.step_in_page(address);
+    }
+
+    /// A write to flash: the instruction is executed, but its cells take what the model lets them.
+    fn program_flash(&mut self, address: u32, (value, size): (u32, u32)) {
+        let bytes = &value.to_le_bytes()[..size as usize];
+        self.board.program_flash(self.pc, address - FLASH, bytes);
+        self.step_in_page(address);
+    }
+
+    /// Memory shows what flash's cells hold since the last erase or write.
+    fn follow_flash(&mut self) {
+        for (offset, len) in self.board.devices.flash.take_changed() {
+            let cells = &self.board.devices.flash.cells()[offset as usize..][..len as usize];
+            self.core.engine().write(FLASH + offset, cells);
+            self.core.forget(FLASH + offset, len);
+            for address in (FLASH + offset..FLASH + offset + len).step_by(PAGE as usize) {
+                self.close_page(address).expect("there is flash");
+            }
+        }
+    }
+
+    fn take(&mut self, number: u16, return_address: u32) {
+        self.pc = enter(self.core.engine(), &mut self.board.scs, number, return_address);
+        self.board.guard_changed = true;
+    }
+
+    fn leave(&mut self) {
+        self.pc = leave(self.core.engine(), &mut self.board.scs, self.pc);
+        self.board.guard_changed = true;
+    }
+
+    fn fault(&mut self, status: u32, address: u32) {
+        self.faults.push((self.pc, status));
+        if self.board.scs.would_lock_up() {
+            self.is_locked_up = true;
+            return;
+        }
+        self.board.scs.note_fault(status, address, true);
+        self.take(HARD_FAULT, self.pc);
+    }
+
+    fn follow_guard(&mut self) {
+        if !std::mem::take(&mut self.board.guard_changed) {
+            return;
+        }
+        let guard = self.board.scs.guard();
+        if guard == self.closed {
+            return;
+        }
+        let core = &self.core;
+        let opened = self.closed.take().map_or(Ok(()), |(start, size)| core.guard(start, size, false));
+        let closed = guard.map_or(Ok(()), |(start, size)| core.guard(start, size, true));
+        self.closed = guard;
+        opened.and(closed).expect("the guard is in RAM");
+    }
+
+    /// WFE (Armv7-M ARM B1.5.18).
+    fn wait(&mut self, end: Picos) {
+        if std::mem::take(&mut self.board.scs.event) {
+            return;
+        }
+        self.waits += 1;
+        let engine = self.engine();
+        while self.board.now < end
+            && self.board.scs.due(masks(engine)).is_none()
+            && self.board.violation.is_none()
+            && self.board.devices.watchdog.bites().is_none_or(|at| self.board.now < at)
+        {
+            self.idle(end);
+        }
+    }
+
+    /// Nothing runs until a device has something to do.
+    fn idle(&mut self, end: Picos) {
+        let next = self.board.deadline().min(end);
+        self.stuck = if next > self.board.now { 0 } else { self.stuck + 1 };
+        assert!(self.stuck < 1_000, "a model's deadline is over and over: {next}");
+        self.board.now = self.board.now.max(next);
+        let engine = self.engine();
+        self.board.advance(engine);
+    }
+
+    /// The watchdog resets the chip; RAM keeps what it holds.
+    fn bite(&mut self) {
+        self.resets.push(self.board.now);
+        let engine = self.engine();
+        let ram = RAM.map(|(address, size, _)| {
+            let mut bytes = vec![0; size as usize];
+            engine.read(address, &mut bytes);
+            bytes
+        });
+        self.board.reset(true);
+        self.start(&ram).expect("it has started before");
+        self.decoder = self.program.log_reader();
+    }
+
+    /// What the debugger reads of the log: the ring of the first channel (SEGGER's RTT).
+    fn read_log(&mut self) {
+        let engine = self.core.engine();
+        let Some(channel) = self.program.rtt.map(|address| address + 24) else { return };
+        let word = |index: u32| engine.word(channel + 4 * index);
+        let (buffer, size, write, read) = (word(1), word(2), word(3), word(4));
+        let is_ring = buffer >= RAM[1].0 && size <= 0x1_0000 && write < size && read < size;
+        if !is_ring || write == read {
+            return;
+        }
+        let mut bytes = vec![0; size as usize];
+        engine.read(buffer, &mut bytes);
+        bytes.rotate_left(read as usize);
+        bytes.truncate(((write + size - read) % size) as usize);
+        engine.write(channel + 16, &write.to_le_bytes());
+        if let Some(decoder) = &mut self.decoder {
+            let now = self.board.now;
+            self.log.extend(texts(decoder.as_mut(), &bytes).into_iter().map(|text| (now, text)));
+        }
+    }
+}
+
+/// What memory is opened and closed by.
+const PAGE: u32 = 0x1000;
+
+fn page(address: u32) -> u32 {
+    address & !(PAGE - 1)
+}
+
+fn is_flash(address: u32) -> bool {
+    (FLASH..FLASH + FLASH_SIZE).contains(&address)
+}
+
+/// Of CFSR: an instruction that there is not.
+const UNDEFINED: u32 = 1 << 16;
+/// A precise bus fault, with its address.
+const PRECISE_BUS: u32 = 1 << 9 | 1 << 15;
+/// A fetch from where nothing is.
+const FETCH: u32 = 1 << 8;
+/// An access to the guard, with its address.
+const GUARDED: u32 = 1 << 1 | 1 << 7;

@@ -1,0 +1,92 @@
+//! How the core enters and leaves exceptions. Armv7-M ARM sections B1.5.6 to B1.5.8.
+//!
+//! The frame is on the stack as in the chip, with the floating-point registers when they are in use
+//! (CONTROL.FPCA); lazy stacking is not modelled, they are written at once. What of a frame falls into
+//! the stack's closed guard is not written, and MSTKERR says so.
+
+use crate::models::scs::{Masks, Scs};
+use crate::unicorn::{Engine, Reg};
+
+const FRAME: u32 = 0x20;
+const EXTENDED: u32 = 0x68;
+const SINGLES: u32 = 16;
+/// Of an EXC_RETURN: to thread mode, main stack, without floating point.
+const TO_THREAD: u32 = 0xFFFF_FFF9;
+const TO_HANDLER: u32 = 0xFFFF_FFF1;
+const NO_FLOATS: u32 = 1 << 4;
+const FLOATS_IN_USE: u32 = 1 << 2;
+/// Of xPSR on the stack: a word was left out to align it.
+const ALIGNED: u32 = 1 << 9;
+const STACKED: [Reg; 6] = [Reg::R0, Reg::R1, Reg::R2, Reg::R3, Reg::R12, Reg::Lr];
+
+/// The core's mask registers.
+pub(crate) fn masks(core: Engine) -> Masks {
+    Masks {
+        primask: core.reg(Reg::Primask) & 1 != 0,
+        faultmask: core.reg(Reg::Faultmask) & 1 != 0,
+        basepri: core.reg(Reg::Basepri) as u8,
+    }
+}
+
+/// Takes an exception; returns where its handler is.
+pub(crate) fn enter(core: Engine, scs: &mut Scs, number: u16, return_address: u32) -> u32 {
+    let guard = scs.guard();
+    let (control, status, stack) = (core.reg(Reg::Control), core.reg(Reg::Xpsr), core.reg(Reg::Sp));
+    let has_floats = control & FLOATS_IN_USE != 0;
+    let frame = stack.wrapping_sub(if has_floats { EXTENDED } else { FRAME }) & !4;
+    let aligned = if stack & 4 != 0 { ALIGNED } else { 0 };
+    let mut words: Vec<u32> = STACKED.iter().map(|reg| core.reg(*reg)).collect();
+    words.extend([return_address & !1, status & !ALIGNED | aligned]);
+    if has_floats {
+        words.extend((0..SINGLES).map(|number| core.single(number)));
+        words.extend([core.reg(Reg::Fpscr), 0]);
+    }
+    for (address, word) in (frame..).step_by(4).zip(words) {
+        if guard.is_some_and(|(start, size)| (start..start + size).contains(&address)) {
+            scs.note_fault(1 << 4, 0, true);
+        } else {
+            core.write(address, &word.to_le_bytes());
+        }
+    }
+    let kind = if status & 0x1FF == 0 { TO_THREAD } else { TO_HANDLER };
+    core.set(Reg::Lr, kind & if has_floats { !NO_FLOATS } else { !0 });
+    core.set(Reg::Sp, frame);
+    core.set(Reg::Control, control & !FLOATS_IN_USE);
+    core.set(Reg::Ipsr, number.into());
+    scs.enter(number);
+    core.word(scs.vectors() + 4 * u32::from(number))
+}
+
+/// Whether the core has jumped to where no instruction is, which ends an exception.
+pub(crate) fn is_return(pc: u32) -> bool {
+    pc >= 0xFFFF_FFE0
+}
+
+/// Leaves an exception by that EXC_RETURN; returns where the program goes on.
+pub(crate) fn leave(core: Engine, scs: &mut Scs, how: u32) -> u32 {
+    let frame = core.reg(Reg::Sp);
+    let has_floats = how & NO_FLOATS == 0;
+    for (address, reg) in (frame..).step_by(4).zip(STACKED) {
+        core.set(reg, core.word(address));
+    }
+    let (pc, status) = (core.word(frame + 0x18), core.word(frame + 0x1C));
+    scs.leave();
+    if core.reg(Reg::Ipsr) != u32::from(crate::models::scs::HARD_FAULT) {
+        core.set(Reg::Faultmask, 0);
+    }
+    core.set(Reg::Xpsr, status & !ALIGNED);
+    core.set(Reg::Ipsr, status & 0x1FF);
+    let control = core.reg(Reg::Control);
+    if has_floats {
+        for number in 0..SINGLES {
+            core.set_single(number, core.word(frame + FRAME + 4 * number));
+        }
+        core.set(Reg::Fpscr, core.word(frame + FRAME + 4 * SINGLES));
+        core.set(Reg::Control, control | FLOATS_IN_USE);
+    } else {
+        core.set(Reg::Control, control & !FLOATS_IN_USE);
+    }
+    let len = if has_floats { EXTENDED } else { FRAME };
+    core.set(Reg::Sp, frame + len + if status & ALIGNED != 0 { 4 } else { 0 });
+    pc
+}

@@ -1,0 +1,348 @@
+//! The core's own registers: NVIC, SysTick, fault status, MPU. Armv7-M ARM sections B3.2 (system control),
+//! B3.3 (SysTick), B3.4 (NVIC), B3.5 (MPU); priorities by B1.5.4, with the four bits that the chip has.
+//!
+//! Of the MPU's regions only one that closes a range to everybody is modelled: the stack's guard.
+
+use crate::device::*;
+
+const CSR: u32 = 0x010;
+const RVR: u32 = 0x014;
+const CVR: u32 = 0x018;
+const ICSR: u32 = 0xD04;
+const VTOR: u32 = 0xD08;
+const AIRCR: u32 = 0xD0C;
+const CCR: u32 = 0xD14;
+const CFSR: u32 = 0xD28;
+const HFSR: u32 = 0xD2C;
+const MMFAR: u32 = 0xD34;
+const BFAR: u32 = 0xD38;
+const MPU_CTRL: u32 = 0xD94;
+const MPU_RBAR: u32 = 0xD9C;
+const MPU_RASR: u32 = 0xDA0;
+const NVIC: std::ops::Range<u32> = 0x100..0x300;
+const PRIORITIES: std::ops::Range<u32> = 0x400..0x400 + LINES as u32;
+const SYSTEM_PRIORITIES: std::ops::Range<u32> = 0xD18..0xD24;
+
+static REGISTERS: [Register; 25] = [
+    keeps(CSR, "SYST_CSR", 0, 7),
+    keeps(RVR, "SYST_RVR", 0, 0xFF_FFFF),
+    keeps(CVR, "SYST_CVR", 0, !0),
+    reads(0xD00, "CPUID", 0x411F_C271),
+    does(ICSR, "ICSR", 0x9E00_0000),
+    keeps(VTOR, "VTOR", 0x0800_0000, 0xFFFF_FF80),
+    keeps(AIRCR, "AIRCR", 0xFA05_0000, 0xFFFF_0707),
+    keeps(0xD10, "SCR", 0, 0x16),
+    keeps(CCR, "CCR", 0x4_0200, 0x7_031B),
+    keeps(0xD24, "SHCSR", 0, 0x7_FD8B),
+    does(CFSR, "CFSR", 0x30F_BFBB),
+    does(HFSR, "HFSR", 0xC000_0002),
+    keeps(MMFAR, "MMFAR", 0, !0),
+    keeps(BFAR, "BFAR", 0, !0),
+    reads(0xD78, "CLIDR", 0x0900_0003),
+    reads(0xD80, "CCSIDR", 0xF007_E019),
+    keeps(0xD84, "CSSELR", 0, 0xF),
+    keeps(0xD88, "CPACR", 0, 0x00F0_0000),
+    reads(0xD90, "MPU_TYPE", 0x1000),
+    keeps(MPU_CTRL, "MPU_CTRL", 0, 7),
+    keeps(0xD98, "MPU_RNR", 0, 0xF),
+    keeps(MPU_RBAR, "MPU_RBAR", 0, !0),
+    keeps(MPU_RASR, "MPU_RASR", 0, 0x173F_FF3F),
+    keeps(0xF34, "FPCCR", 0xC000_0000, 0xC000_0001),
+    does(0xF50, "ICIALLU", !0),
+];
+
+/// Interrupt lines of the chip.
+pub const LINES: usize = 160;
+/// Numbers of exceptions.
+pub const HARD_FAULT: u16 = 3;
+const SYSTICK: u16 = 15;
+const FIRST_LINE: u16 = 16;
+
+/// What the core's mask registers say.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Masks {
+    /// PRIMASK.
+    pub primask: bool,
+    /// FAULTMASK.
+    pub faultmask: bool,
+    /// BASEPRI.
+    pub basepri: u8,
+}
+
+/// The model.
+#[derive(Debug)]
+pub struct Scs {
+    bank: Bank,
+    enabled: [u32; LINES / 32],
+    pending: [u32; LINES / 32],
+    /// The level of each line, as peripherals hold it.
+    lines: [u32; LINES / 32],
+    priorities: [u8; LINES],
+    system_priorities: [u8; 12],
+    systick_pends: bool,
+    ticks: Option<Picos>,
+    /// Exceptions that are active, the outermost first.
+    active: Vec<u16>,
+    /// The event register (B1.5.18).
+    pub event: bool,
+    /// Interrupts and exceptions that were taken, by number.
+    pub taken: Vec<u64>,
+}
+
+impl Scs {
+    /// As after a reset.
+    pub fn new() -> Self {
+        Self {
+            bank: Bank::new(&REGISTERS),
+            enabled: [0; LINES / 32],
+            pending: [0; LINES / 32],
+            lines: [0; LINES / 32],
+            priorities: [0; LINES],
+            system_priorities: [0; 12],
+            systick_pends: false,
+            ticks: None,
+            active: Vec::new(),
+            event: false,
+            taken: vec![0; LINES + usize::from(FIRST_LINE)],
+        }
+    }
+
+    /// As after a reset, but for the counters.
+    pub fn reset(&mut self) {
+        let taken = std::mem::take(&mut self.taken);
+        *self = Self { taken, ..Self::new() };
+    }
+
+    /// The vector table.
+    pub fn vectors(&self) -> u32 {
+        self.bank.get(VTOR)
+    }
+
+    /// The range that nobody may touch, if it is closed now.
+    pub fn guard(&self) -> Option<(u32, u32)> {
+        let (control, region) = (self.bank.get(MPU_CTRL), self.bank.get(MPU_RASR));
+        let is_off = control & 1 == 0 || region & 1 == 0;
+        // In a fault's handler the MPU is off (HFNMIENA).
+        if is_off || control & 2 == 0 && self.active.contains(&HARD_FAULT) {
+            return None;
+        }
+        Some((self.bank.get(MPU_RBAR) & !0x1F, 2 << (region >> 1 & 31)))
+    }
+
+    /// Whether bus faults are ignored: in a handler of faults, or with FAULTMASK (CCR.BFHFNMIGN).
+    pub fn ignores_bus_faults(&self, masks: Masks) -> bool {
+        self.bank.get(CCR) & 1 << 8 != 0 && self.priority(masks) < 0
+    }
+
+    /// Notes a fault (CFSR, and the address for the bits that say that it is valid); a fault of its own
+    /// kind is off, so it escalates.
+    pub fn note_fault(&mut self, status: u32, address: u32, is_forced: bool) {
+        self.bank.set(CFSR, self.bank.get(CFSR) | status);
+        if status & 1 << 7 != 0 {
+            self.bank.set(MMFAR, address);
+        }
+        if status & 1 << 15 != 0 {
+            self.bank.set(BFAR, address);
+        }
+        if is_forced {
+            self.bank.set(HFSR, self.bank.get(HFSR) | 1 << 30);
+        }
+    }
+
+    /// The level of an interrupt line.
+    pub fn set_line(&mut self, line: u16, level: bool) {
+        let (word, bit) = (usize::from(line / 32), 1 << (line % 32));
+        if level {
+            self.lines[word] |= bit;
+        } else {
+            self.lines[word] &= !bit;
+        }
+    }
+
+    fn is_active(&self, line: u16) -> bool {
+        self.active.contains(&(line + FIRST_LINE))
+    }
+
+    fn level(&self, number: u16) -> i16 {
+        match number {
+            HARD_FAULT => -1,
+            4..=15 => i16::from(self.system_priorities[usize::from(number - 4)] >> 4),
+            _ => i16::from(self.priorities[usize::from(number - FIRST_LINE)] >> 4),
+        }
+    }
+
+    /// The execution priority.
+    fn priority(&self, masks: Masks) -> i16 {
+        let mut priority = self.active.iter().map(|number| self.level(*number)).min().unwrap_or(256);
+        if masks.basepri != 0 {
+            priority = priority.min(i16::from(masks.basepri >> 4));
+        }
+        if masks.primask {
+            priority = priority.min(0);
+        }
+        if masks.faultmask { priority.min(-1) } else { priority }
+    }
+
+    /// What is pending and enabled, the most urgent first.
+    pub fn wanted(&self) -> Option<u16> {
+        let systick = self.systick_pends.then_some(SYSTICK);
+        let lines = (0..LINES / 32).flat_map(|word| {
+            let bits = (self.pending[word] | self.lines[word]) & self.enabled[word];
+            (0..32).filter(move |bit| bits >> bit & 1 != 0).map(move |bit| (32 * word + bit) as u16)
+        });
+        let lines = lines.filter(|line| !self.is_active(*line)).map(|line| line + FIRST_LINE);
+        systick.into_iter().chain(lines).min_by_key(|number| (self.level(*number), *number))
+    }
+
+    /// The exception that is to be taken now.
+    pub fn due(&self, masks: Masks) -> Option<u16> {
+        self.wanted().filter(|number| self.level(*number) < self.priority(masks))
+    }
+
+    /// It is taken.
+    pub fn enter(&mut self, number: u16) {
+        if number == SYSTICK {
+            self.systick_pends = false;
+        }
+        if let Some(line) = number.checked_sub(FIRST_LINE) {
+            self.pending[usize::from(line / 32)] &= !(1 << (line % 32));
+        }
+        self.active.push(number);
+        self.taken[usize::from(number)] += 1;
+        self.event = true;
+    }
+
+    /// Its handler has returned.
+    pub fn leave(&mut self) {
+        self.active.pop();
+        self.event = true;
+    }
+
+    /// Whether a fault now would be one too many.
+    pub fn would_lock_up(&self) -> bool {
+        self.active.contains(&HARD_FAULT)
+    }
+
+    /// Does what SysTick has to do by now.
+    pub fn advance(&mut self, at: &Moment<'_>) {
+        while let Some(next) = self.ticks
+            && at.now >= next
+        {
+            self.systick_pends |= self.bank.get(CSR) & 2 != 0;
+            self.ticks = Some(next + self.tick_period(at));
+        }
+    }
+
+    fn tick_period(&self, at: &Moment<'_>) -> Picos {
+        let divider = if self.bank.get(CSR) & 4 != 0 { 1 } else { 8 };
+        Picos::from(self.bank.get(RVR) + 1) * cycle(at.clocks.core / divider)
+    }
+
+    /// When SysTick is due.
+    pub fn deadline(&self) -> Option<Picos> {
+        self.ticks
+    }
+
+    /// The name of a register.
+    pub fn name(offset: u32) -> String {
+        match REGISTERS.iter().find(|register| register.offset == offset) {
+            Some(register) => register.name.into(),
+            None if PRIORITIES.contains(&offset) => format!("NVIC_IPR[{}]", offset - PRIORITIES.start),
+            None if SYSTEM_PRIORITIES.contains(&offset) => "SHPR".into(),
+            None if NVIC.contains(&offset) => {
+                let kind = ["ISER", "ICER", "ISPR", "ICPR"][((offset - NVIC.start) / 0x80) as usize];
+                format!("NVIC_{kind}{}", offset % 0x80 / 4)
+            }
+            None => format!("+{offset:03X}"),
+        }
+    }
+
+    /// A read.
+    ///
+    /// # Errors
+    /// Not modelled.
+    pub fn read(&mut self, offset: u32, _: u32, _: &Moment<'_>) -> Result<u32, Refusal> {
+        if NVIC.contains(&offset) {
+            let word = (offset % 0x80 / 4) as usize;
+            let table = if offset < 0x200 { &self.enabled } else { &self.pending };
+            return table.get(word).copied().ok_or_else(|| Refusal("no such line".into()));
+        }
+        if PRIORITIES.contains(&offset) {
+            let first = (offset - PRIORITIES.start) as usize & !3;
+            let bytes = self.priorities[first..first + 4].try_into().expect("four");
+            return Ok(u32::from_le_bytes(bytes) >> (8 * (offset & 3)));
+        }
+        if SYSTEM_PRIORITIES.contains(&offset) {
+            let first = (offset - SYSTEM_PRIORITIES.start) as usize & !3;
+            let bytes = self.system_priorities[first..first + 4].try_into().expect("four");
+            return Ok(u32::from_le_bytes(bytes) >> (8 * (offset & 3)));
+        }
+        match offset {
+            ICSR => {
+                let active = self.active.last().copied().unwrap_or(0);
+                Ok(u32::from(active) | u32::from(self.wanted().unwrap_or(0)) << 12)
+            }
+            CVR => refuse("the present count is not modelled"),
+            _ => self.bank.read(offset),
+        }
+    }
+
+    /// A write of so many bytes.
+    ///
+    /// # Errors
+    /// Not modelled, or forbidden.
+    pub fn write(&mut self, offset: u32, value: u32, size: u32, at: &Moment<'_>) -> Result<(), Refusal> {
+        if NVIC.contains(&offset) {
+            let Some(word) = Some((offset % 0x80 / 4) as usize).filter(|word| *word < LINES / 32) else {
+                return refuse("no such line");
+            };
+            match (offset - NVIC.start) / 0x80 {
+                0 => self.enabled[word] |= value,
+                1 => self.enabled[word] &= !value,
+                2 => self.pending[word] |= value,
+                _ => self.pending[word] &= !value,
+            }
+            return Ok(());
+        }
+        let bytes = &value.to_le_bytes()[..size as usize];
+        if PRIORITIES.contains(&offset) {
+            let first = (offset - PRIORITIES.start) as usize;
+            self.priorities[first..first + bytes.len()].copy_from_slice(bytes);
+            return Ok(());
+        }
+        if SYSTEM_PRIORITIES.contains(&offset) {
+            let first = (offset - SYSTEM_PRIORITIES.start) as usize;
+            self.system_priorities[first..first + bytes.len()].copy_from_slice(bytes);
+            return Ok(());
+        }
+        if size != 4 {
+            return refuse("32 bits at a time");
+        }
+        self.bank.check(offset, value)?;
+        match offset {
+            CFSR | HFSR => self.bank.set(offset, self.bank.get(offset) & !value),
+            CVR => self.bank.set(CVR, 0),
+            ICSR if value & !(1 << 25 | 1 << 26) != 0 => return refuse("PendSV and NMI are not modelled"),
+            ICSR => self.systick_pends = value & 1 << 26 != 0,
+            AIRCR if value >> 16 != 0x05FA => return refuse("without the key"),
+            AIRCR if value & 7 != 0 => return refuse("a reset by the program is not modelled"),
+            AIRCR => self.bank.set(AIRCR, 0xFA05_0000 | value & 0x700),
+            MPU_RASR if value & 1 != 0 && value >> 24 & 7 != 0 => {
+                return refuse("a region that somebody may use is not modelled");
+            }
+            CSR => {
+                self.bank.set(CSR, value);
+                self.ticks = (value & 1 != 0).then(|| at.now + self.tick_period(at));
+            }
+            0xF50 => {}
+            _ => self.bank.set(offset, value),
+        }
+        Ok(())
+    }
+}
+
+impl Default for Scs {
+    fn default() -> Self {
+        Self::new()
+    }
+}

@@ -1,0 +1,482 @@
+//! The binding to Unicorn, which emulates the instructions of a Cortex-M7: the only file with `unsafe`.
+//!
+//! In: memory, registers, and a [`Handler`] that hears of accesses to devices, of the blocks of
+//! instructions that begin, and of the places that are watched. Out: why the core stopped. It knows no
+//! exceptions and no devices.
+//!
+//! The library (GPL-2.0) is loaded while a test runs, from the path in `CHIP_UNICORN`; nothing that is
+//! shipped links it. Names and numbers are those of unicorn/unicorn.h and unicorn/arm.h, 2.1.4.
+//! Hooks on memory are not used: with them that version executes loads in IT blocks wrongly.
+
+use std::cell::Cell;
+use std::ffi::{OsString, c_int, c_void};
+use std::ptr::null_mut;
+use std::sync::OnceLock;
+
+use libloading::Library;
+
+/// Says where the library is.
+pub const LIBRARY: &str = "CHIP_UNICORN";
+
+/// Whether the core goes on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Flow {
+    /// It does.
+    On,
+    /// It comes back before the next block of instructions.
+    Stop,
+}
+
+/// What the core's accesses meet. Only between instructions can it be stopped: one that was stopped in the
+/// middle of an access would access again.
+pub trait Handler {
+    /// A read of a device.
+    fn read(&mut self, core: Engine, address: u32, size: u32) -> u32;
+    /// A write to a device.
+    fn write(&mut self, core: Engine, address: u32, value: u32, size: u32);
+    /// A block of instructions is about to run; with [`Flow::Stop`] it does not.
+    fn block(&mut self, core: Engine, address: u32, len: u32) -> Flow;
+    /// A watched place is about to be executed; with [`Flow::Stop`] it is not.
+    fn watched(&mut self, core: Engine, address: u32) -> Flow;
+}
+
+/// Why the core came back.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Exit {
+    /// A handler said so.
+    Stopped,
+    /// QEMU's number of an exception that the core raised by itself; 8 is an exception's return.
+    Exception(u32),
+    /// An instruction that there is not.
+    Undefined,
+    /// No memory there, or none that may be used so.
+    Memory {
+        /// Where.
+        address: u32,
+        /// Whether an instruction was fetched.
+        is_fetch: bool,
+        /// What was to be written, and how many bytes of it.
+        written: Option<(u32, u32)>,
+    },
+}
+
+/// A register of the core, as the library numbers it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(i32)]
+#[expect(missing_docs, reason = "the names are the core's")]
+pub enum Reg {
+    Fpscr = 6,
+    Lr = 10,
+    Pc = 11,
+    Sp = 12,
+    R0 = 66,
+    R1 = 67,
+    R2 = 68,
+    R3 = 69,
+    R4 = 70,
+    R12 = 78,
+    S0 = 79,
+    Ipsr = 114,
+    Control = 117,
+    Xpsr = 120,
+    Primask = 123,
+    Basepri = 124,
+    Faultmask = 126,
+}
+
+type Uc = *mut c_void;
+type Mmio = [usize; 2];
+
+/// The functions of the library. It is never unloaded, so they are always there.
+struct Api {
+    open: unsafe extern "C" fn(c_int, c_int, *mut Uc) -> c_int,
+    close: unsafe extern "C" fn(Uc) -> c_int,
+    ctl: unsafe extern "C" fn(Uc, c_int, ...) -> c_int,
+    map: unsafe extern "C" fn(Uc, u64, u64, u32) -> c_int,
+    protect: unsafe extern "C" fn(Uc, u64, u64, u32) -> c_int,
+    read: unsafe extern "C" fn(Uc, u64, *mut u8, u64) -> c_int,
+    write: unsafe extern "C" fn(Uc, u64, *const u8, u64) -> c_int,
+    mmio: unsafe extern "C" fn(Uc, u64, u64, OnRead, *mut c_void, OnWrite, *mut c_void) -> c_int,
+    hook: unsafe extern "C" fn(Uc, *mut usize, c_int, *mut c_void, *mut c_void, u64, u64, ...) -> c_int,
+    reg_read: unsafe extern "C" fn(Uc, c_int, *mut c_void) -> c_int,
+    reg_write: unsafe extern "C" fn(Uc, c_int, *const c_void) -> c_int,
+    start: unsafe extern "C" fn(Uc, u64, u64, u64, usize) -> c_int,
+    stop: unsafe extern "C" fn(Uc) -> c_int,
+}
+
+type OnRead = extern "C" fn(Uc, u64, u32, *mut c_void) -> u64;
+type OnWrite = extern "C" fn(Uc, u64, u32, u64, *mut c_void);
+type OnCode = extern "C" fn(Uc, u64, u32, *mut c_void);
+type OnException = extern "C" fn(Uc, u32, *mut c_void);
+type OnMemory = extern "C" fn(Uc, c_int, u64, c_int, i64, *mut c_void) -> bool;
+
+impl Api {
+    fn load() -> Result<Self, String> {
+        let path: OsString = std::env::var_os(LIBRARY)
+            .ok_or_else(|| format!("{LIBRARY} does not say where libunicorn.so.2 is (docs/chip.md)"))?;
+        // SAFETY: the library's initialisers touch nothing of ours.
+        let library = unsafe { Library::new(&path) };
+        let library = library.map_err(|error| format!("{}: {error}", path.display()))?;
+        macro_rules! symbols {
+            ($($field:ident = $name:literal),* $(,)?) => {
+                Self { $($field: {
+                    // SAFETY: the declaration of this function in unicorn.h.
+                    let symbol = unsafe { library.get($name) };
+                    *symbol.map_err(|error| error.to_string())?
+                }),* }
+            };
+        }
+        let api = symbols! {
+            open = b"uc_open", close = b"uc_close", ctl = b"uc_ctl", map = b"uc_mem_map",
+            protect = b"uc_mem_protect", read = b"uc_mem_read", write = b"uc_mem_write",
+            mmio = b"uc_mmio_map", hook = b"uc_hook_add", reg_read = b"uc_reg_read",
+            reg_write = b"uc_reg_write", start = b"uc_emu_start", stop = b"uc_emu_stop",
+        };
+        std::mem::forget(library);
+        Ok(api)
+    }
+}
+
+fn api() -> Result<&'static Api, String> {
+    static API: OnceLock<Result<Api, String>> = OnceLock::new();
+    API.get_or_init(Api::load).as_ref().map_err(Clone::clone)
+}
+
+/// The core's registers and memory, for a handler too.
+#[derive(Clone, Copy)]
+pub struct Engine {
+    api: &'static Api,
+    uc: Uc,
+}
+
+impl Engine {
+    /// What the register holds.
+    pub fn reg(self, reg: Reg) -> u32 {
+        self.numbered(reg as i32)
+    }
+
+    /// One of S0 to S15, by its bits.
+    pub fn single(self, number: u32) -> u32 {
+        self.numbered(Reg::S0 as i32 + number as i32)
+    }
+
+    /// One of R4 to R11, by its distance from R4.
+    pub fn kept(self, number: u32) -> u32 {
+        self.numbered(Reg::R4 as i32 + number as i32)
+    }
+
+    fn numbered(self, number: i32) -> u32 {
+        let mut value = 0_u64;
+        // SAFETY: the registers that we name have 32 bits; the place has 64.
+        unsafe { (self.api.reg_read)(self.uc, number, (&raw mut value).cast()) };
+        value as u32
+    }
+
+    /// Sets the register.
+    pub fn set(self, reg: Reg, value: u32) {
+        self.set_numbered(reg as i32, value);
+    }
+
+    /// Sets one of S0 to S15.
+    pub fn set_single(self, number: u32, value: u32) {
+        self.set_numbered(Reg::S0 as i32 + number as i32, value);
+    }
+
+    fn set_numbered(self, number: i32, value: u32) {
+        let value = u64::from(value);
+        // SAFETY: as above.
+        unsafe { (self.api.reg_write)(self.uc, number, (&raw const value).cast()) };
+    }
+
+    /// Reads memory, whoever may; false where there is none.
+    pub fn read(self, address: u32, bytes: &mut [u8]) -> bool {
+        // SAFETY: the library writes as many bytes as there are.
+        0 == unsafe { (self.api.read)(self.uc, address.into(), bytes.as_mut_ptr(), bytes.len() as u64) }
+    }
+
+    /// Writes memory, whoever may; false where there is none.
+    pub fn write(self, address: u32, bytes: &[u8]) -> bool {
+        // SAFETY: the library reads as many bytes as there are.
+        0 == unsafe { (self.api.write)(self.uc, address.into(), bytes.as_ptr(), bytes.len() as u64) }
+    }
+
+    /// A word of memory; 0 where there is none.
+    pub fn word(self, address: u32) -> u32 {
+        let mut bytes = [0; 4];
+        self.read(address, &mut bytes);
+        u32::from_le_bytes(bytes)
+    }
+
+    fn stop(self) {
+        // SAFETY: may be called from every callback.
+        unsafe { (self.api.stop)(self.uc) };
+    }
+}
+
+/// An emulated Cortex-M7 with its memory.
+pub struct Core {
+    engine: Engine,
+    /// Boxed: the callbacks have its address.
+    shared: Box<Shared>,
+}
+
+struct Shared {
+    api: &'static Api,
+    handler: Cell<Option<*mut (dyn Handler + 'static)>>,
+    exit: Cell<Option<Exit>>,
+}
+
+impl Core {
+    /// A core without memory.
+    ///
+    /// # Errors
+    /// The library is missing or does not do what it is asked.
+    pub fn new() -> Result<Self, String> {
+        const ARM: c_int = 1;
+        // UC_MODE_MCLASS would be a Cortex-M33, without doubles.
+        const THUMB: c_int = 16;
+        const SET_MODEL: c_int = 7 | 1 << 26 | 1 << 30;
+        const CORTEX_M7: c_int = 10;
+        let api = api()?;
+        let mut uc = null_mut();
+        // SAFETY: a place for the handle.
+        checked("uc_open", unsafe { (api.open)(ARM, THUMB, &raw mut uc) })?;
+        let core = Self {
+            engine: Engine { api, uc },
+            shared: Box::new(Shared { api, handler: Cell::new(None), exit: Cell::new(None) }),
+        };
+        // SAFETY: this request takes the model's number.
+        checked("uc_ctl", unsafe { (api.ctl)(uc, SET_MODEL, CORTEX_M7) })?;
+        core.hook(HOOK_BLOCK, on_block as OnCode as *mut c_void, 1, 0)?;
+        core.hook(HOOK_EXCEPTION, on_exception as OnException as *mut c_void, 1, 0)?;
+        core.hook(HOOK_BAD_MEMORY, on_bad_memory as OnMemory as *mut c_void, 1, 0)?;
+        Ok(core)
+    }
+
+    /// Its registers and memory.
+    pub fn engine(&self) -> Engine {
+        self.engine
+    }
+
+    /// Memory that can be executed; `is_writable` or not.
+    ///
+    /// # Errors
+    /// There is something already.
+    pub fn map(&self, address: u32, size: u32, is_writable: bool) -> Result<(), String> {
+        let access = if is_writable { ALL } else { READ | EXECUTE };
+        // SAFETY: the library's own memory.
+        checked("uc_mem_map", unsafe {
+            (self.engine.api.map)(self.engine.uc, address.into(), size.into(), access)
+        })
+    }
+
+    /// Takes a range of memory from those who write.
+    ///
+    /// # Errors
+    /// There is no memory.
+    pub fn close_flash(&self, address: u32, size: u32) -> Result<(), String> {
+        self.protect(address, size, READ | EXECUTE)
+    }
+
+    fn protect(&self, address: u32, size: u32, access: u32) -> Result<(), String> {
+        const FLUSH_TLB: c_int = 11 | 1 << 30;
+        let Engine { api, uc } = self.engine;
+        // SAFETY: as above.
+        checked("uc_mem_protect", unsafe { (api.protect)(uc, address.into(), size.into(), access) })?;
+        // Without it, what the page allowed before is still allowed.
+        // SAFETY: this request takes nothing.
+        checked("uc_ctl", unsafe { (api.ctl)(uc, FLUSH_TLB) })
+    }
+
+    /// Keeps everybody from a range, or gives it back.
+    ///
+    /// # Errors
+    /// There is no memory.
+    pub fn guard(&self, address: u32, size: u32, is_closed: bool) -> Result<(), String> {
+        self.protect(address, size, if is_closed { 0 } else { ALL })
+    }
+
+    /// Addresses that are the handler's; at most one range for each start in [`MMIO`].
+    ///
+    /// # Errors
+    /// There is something already.
+    pub fn devices(&self, [address, size]: Mmio) -> Result<(), String> {
+        let user = self.user();
+        let (read, write) = match address as u32 {
+            PERIPHERALS => (on_read::<PERIPHERALS> as OnRead, on_write::<PERIPHERALS> as OnWrite),
+            _ => (on_read::<SYSTEM> as OnRead, on_write::<SYSTEM> as OnWrite),
+        };
+        // SAFETY: `user` lives as long as the core; the callbacks have the types of unicorn.h.
+        checked("uc_mmio_map", unsafe {
+            (self.engine.api.mmio)(self.engine.uc, address as u64, size as u64, read, user, write, user)
+        })
+    }
+
+    /// Tells the handler before the instruction at this address is executed.
+    ///
+    /// # Errors
+    /// The library does not take it.
+    pub fn watch(&self, address: u32) -> Result<(), String> {
+        self.hook(HOOK_CODE, on_watched as OnCode as *mut c_void, address.into(), address.into())
+    }
+
+    fn hook(&self, kind: c_int, callback: *mut c_void, begin: u64, end: u64) -> Result<(), String> {
+        let mut handle = 0;
+        let Engine { api, uc } = self.engine;
+        // SAFETY: each caller passes a callback of the type that unicorn.h has for the kind.
+        checked("uc_hook_add", unsafe {
+            (api.hook)(uc, &raw mut handle, kind, callback, self.user(), begin, end)
+        })
+    }
+
+    fn user(&self) -> *mut c_void {
+        (&raw const *self.shared).cast_mut().cast()
+    }
+
+    /// Forgets what the memory was translated to, because it has changed.
+    pub fn forget(&self, address: u32, len: u32) {
+        const REMOVE_CACHE: c_int = 9 | 2 << 26 | 1 << 30;
+        let Engine { api, uc } = self.engine;
+        // SAFETY: this request takes a range.
+        unsafe { (api.ctl)(uc, REMOVE_CACHE, u64::from(address), u64::from(address) + u64::from(len)) };
+    }
+
+    /// Runs from `pc` on, until something is to be done; where, is in the register.
+    ///
+    /// # Panics
+    /// The library fails otherwise than a program can make it.
+    pub fn run(&mut self, pc: u32, handler: &mut dyn Handler) -> Exit {
+        self.run_some(pc, 0, handler)
+    }
+
+    /// Runs one instruction.
+    ///
+    /// # Panics
+    /// As [`Core::run`].
+    pub fn run_one(&mut self, pc: u32, handler: &mut dyn Handler) -> Exit {
+        self.run_some(pc, 1, handler)
+    }
+
+    fn run_some(&mut self, pc: u32, count: usize, handler: &mut dyn Handler) -> Exit {
+        const NOWHERE: u64 = 0xFFFF_FFFE;
+        const NO_MEMORY: std::ops::RangeInclusive<c_int> = 6..=8;
+        const FORBIDDEN: std::ops::RangeInclusive<c_int> = 12..=14;
+        const UNDEFINED: c_int = 10;
+        let handler: *mut (dyn Handler + '_) = handler;
+        // SAFETY: only the lifetime is left out; the pointer is taken back before this returns.
+        let handler: *mut (dyn Handler + 'static) = unsafe { std::mem::transmute(handler) };
+        self.shared.handler.set(Some(handler));
+        self.shared.exit.set(None);
+        let Engine { api, uc } = self.engine;
+        // Without a limit of time: each would start a thread.
+        // SAFETY: the callbacks' memory is there.
+        let status = unsafe { (api.start)(uc, u64::from(pc | 1), NOWHERE, 0, count) };
+        self.shared.handler.set(None);
+        match (self.shared.exit.get(), status) {
+            (Some(exit), _) => exit,
+            (None, 0) => Exit::Stopped,
+            (None, UNDEFINED) => Exit::Undefined,
+            (None, status) if NO_MEMORY.contains(&status) || FORBIDDEN.contains(&status) => {
+                Exit::Memory { address: 0, is_fetch: false, written: None }
+            }
+            (None, status) => panic!("uc_emu_start: error {status}, PC {:08X}", self.engine.reg(Reg::Pc)),
+        }
+    }
+}
+
+impl Drop for Core {
+    fn drop(&mut self) {
+        // SAFETY: nothing runs, and nobody has the handle any more.
+        unsafe { (self.engine.api.close)(self.engine.uc) };
+    }
+}
+
+fn checked(what: &str, status: c_int) -> Result<(), String> {
+    if status == 0 { Ok(()) } else { Err(format!("{what}: error {status}")) }
+}
+
+/// Calls the handler of the run that is going on.
+fn with<T>(
+    uc: Uc,
+    user: *mut c_void,
+    call: impl FnOnce(&mut dyn Handler, Engine, &Shared) -> T,
+) -> Option<T> {
+    // SAFETY: `user` is the core's `shared`, which lives as long as the engine.
+    let shared = unsafe { &*user.cast::<Shared>() };
+    let handler = shared.handler.get()?;
+    // SAFETY: it was lent to `run`, which has not returned; callbacks do not nest.
+    let handler = unsafe { &mut *handler };
+    Some(call(handler, Engine { api: shared.api, uc }, shared))
+}
+
+fn follow(engine: Engine, flow: Flow) {
+    if flow == Flow::Stop {
+        engine.stop();
+    }
+}
+
+extern "C" fn on_read<const BASE: u32>(uc: Uc, offset: u64, size: u32, user: *mut c_void) -> u64 {
+    let value = with(uc, user, |handler, engine, _| handler.read(engine, BASE + offset as u32, size));
+    u64::from(value.unwrap_or(0))
+}
+
+extern "C" fn on_write<const BASE: u32>(uc: Uc, offset: u64, size: u32, value: u64, user: *mut c_void) {
+    with(uc, user, |handler, engine, _| {
+        handler.write(engine, BASE + offset as u32, value as u32, size);
+    });
+}
+
+extern "C" fn on_block(uc: Uc, address: u64, size: u32, user: *mut c_void) {
+    with(uc, user, |handler, engine, _| {
+        let flow = handler.block(engine, address as u32, size);
+        follow(engine, flow);
+    });
+}
+
+extern "C" fn on_watched(uc: Uc, address: u64, _size: u32, user: *mut c_void) {
+    with(uc, user, |handler, engine, _| {
+        let flow = handler.watched(engine, address as u32);
+        follow(engine, flow);
+    });
+}
+
+extern "C" fn on_exception(uc: Uc, number: u32, user: *mut c_void) {
+    with(uc, user, |_, engine, shared| {
+        shared.exit.set(Some(Exit::Exception(number)));
+        engine.stop();
+    });
+}
+
+extern "C" fn on_bad_memory(
+    uc: Uc,
+    access: c_int,
+    address: u64,
+    size: c_int,
+    value: i64,
+    user: *mut c_void,
+) -> bool {
+    const FETCHES: [c_int; 2] = [21, 24];
+    const WRITES: [c_int; 2] = [20, 22];
+    with(uc, user, |_, _, shared| {
+        let is_fetch = FETCHES.contains(&access);
+        let written = WRITES.contains(&access).then_some((value as u32, size as u32));
+        shared.exit.set(Some(Exit::Memory { address: address as u32, is_fetch, written }));
+    });
+    false
+}
+
+/// Where the chip's peripherals begin.
+pub const PERIPHERALS: u32 = 0x4000_0000;
+/// Where those of the core begin.
+pub const SYSTEM: u32 = 0xE000_0000;
+/// The ranges of devices: start and size.
+pub const MMIO: [Mmio; 2] = [[PERIPHERALS as usize, 0x2000_0000], [SYSTEM as usize, 0x10_0000]];
+
+const READ: u32 = 1;
+const EXECUTE: u32 = 4;
+const ALL: u32 = 7;
+const HOOK_EXCEPTION: c_int = 1;
+const HOOK_CODE: c_int = 4;
+const HOOK_BLOCK: c_int = 8;
+/// No memory (16, 32, 64) and forbidden (128, 256, 512).
+const HOOK_BAD_MEMORY: c_int = 0x3F0;

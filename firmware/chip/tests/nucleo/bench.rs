@@ -1,0 +1,139 @@
+//! A board on the table: the chip with its firmware, and a robot's controller at the other end of the
+//! Ethernet cable when the test wants one.
+
+use std::sync::OnceLock;
+
+use chip::device::{MICRO, MILLI, Picos};
+use chip::{Chip, Program};
+use host_sim::config::SimConfig;
+use host_sim::config::file::{Text, parse_controller, parse_gateway};
+use proto_core::config::image;
+
+use crate::robot::Robot;
+
+pub(crate) struct Bench {
+    pub(crate) chip: Chip,
+    pub(crate) robot: Option<Robot>,
+    seen: usize,
+}
+
+/// Says where the firmware is.
+const ELF: &str = "CHIP_ELF";
+/// As long as a frame of 60 bytes takes on the cable, nearly.
+const CABLE: Picos = 20 * MICRO;
+
+fn program() -> &'static Program {
+    static PROGRAM: OnceLock<Program> = OnceLock::new();
+    PROGRAM.get_or_init(|| {
+        let path =
+            std::env::var_os(ELF).unwrap_or_else(|| panic!("{ELF} does not say where the firmware is"));
+        let bytes = std::fs::read(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+        Program::read(&bytes).expect("the firmware")
+    })
+}
+
+/// The configuration image of a gateway's file.
+pub(crate) fn image_of(toml: &str) -> Vec<u8> {
+    let config = parse_gateway(Text { name: "cell.toml", toml }, &[]).expect("a right configuration");
+    let mut bytes = vec![0; image::MAX_IMAGE];
+    let len = image::encode(&config, &mut bytes).expect("it fits");
+    bytes.truncate(len);
+    bytes
+}
+
+impl Bench {
+    /// The board with an erased configuration.
+    pub(crate) fn blank() -> Self {
+        Self::with_image(&[])
+    }
+
+    /// The board with that file's image.
+    pub(crate) fn new(toml: &str) -> Self {
+        Self::with_image(&image_of(toml))
+    }
+
+    pub(crate) fn with_image(image: &[u8]) -> Self {
+        let chip = Chip::new(program(), image).unwrap_or_else(|error| panic!("{error}"));
+        Self { chip, robot: None, seen: 0 }
+    }
+
+    /// With a controller at 192.168.12.10.
+    pub(crate) fn with_robot(mut self) -> Self {
+        self.robot = Some(Robot::new(&SimConfig::default()));
+        self
+    }
+
+    /// With the controller of that file, at 192.168.12.10.
+    pub(crate) fn with_robot_of(mut self, toml: &str) -> Self {
+        let config = parse_controller(Text { name: "controller.toml", toml }, &[]);
+        self.robot = Some(Robot::new(&config.expect("a right configuration")));
+        self
+    }
+
+    pub(crate) fn now(&self) -> Picos {
+        self.chip.now()
+    }
+
+    /// Runs for so long.
+    #[track_caller]
+    pub(crate) fn run(&mut self, span: Picos) {
+        let end = self.now() + span;
+        while self.now() < end {
+            let next = match &mut self.robot {
+                Some(robot) => {
+                    robot.exchange(self.chip.now(), &mut self.chip.devices().ethernet);
+                    end.min(self.chip.now() + CABLE)
+                }
+                None => end,
+            };
+            if let Err(stopped) = self.chip.run_until(next) {
+                panic!("{stopped}\n{}", self.history());
+            }
+        }
+    }
+
+    /// Runs until something is so, and for no longer than that.
+    #[track_caller]
+    pub(crate) fn until(&mut self, what: &str, span: Picos, mut is_so: impl FnMut(&mut Self) -> bool) {
+        let end = self.now() + span;
+        while !is_so(self) {
+            assert!(self.now() < end, "not within {} ms: {what}\n{}", span / MILLI, self.history());
+            self.run(MILLI / 4);
+        }
+    }
+
+    /// Runs until the log has a line with that, behind those that were asked for before.
+    #[track_caller]
+    pub(crate) fn until_log(&mut self, text: &str, span: Picos) -> Picos {
+        let mut found = None;
+        self.until(&format!("a log line with {text:?}"), span, |bench| {
+            let new = bench.chip.log.iter().enumerate().skip(bench.seen);
+            found = new
+                .into_iter()
+                .find(|(_, (_, line))| line.contains(text))
+                .map(|(index, (at, _))| (index, *at));
+            found.is_some()
+        });
+        let (index, at) = found.expect("it was found");
+        self.seen = index + 1;
+        at
+    }
+
+    /// Whether the log has such a line.
+    pub(crate) fn has_logged(&self, text: &str) -> bool {
+        self.chip.log.iter().any(|(_, line)| line.contains(text))
+    }
+
+    /// The log and the last accesses.
+    pub(crate) fn history(&mut self) -> String {
+        let mut text = String::from("log:\n");
+        for (at, line) in &self.chip.log {
+            text += &format!("{:12.3} ms  {line}\n", *at as f64 / MILLI as f64);
+        }
+        text += &format!("at {}\nlast accesses:\n", self.chip.place());
+        for access in self.chip.accesses(64) {
+            text += &format!("{access}\n");
+        }
+        text
+    }
+}

@@ -1,0 +1,14 @@
+//! The NUCLEO-H743ZI2's binary, unchanged, on the modelled chip. Each test needs the emulator's library
+//! and the firmware (`CHIP_UNICORN`, `CHIP_ELF`; docs/chip.md); the step of `.ci/run` has both and runs
+//! them all.
+
+mod bench;
+mod boot;
+mod can;
+mod cell;
+mod faults;
+mod flash;
+mod robot;
+mod serial;
+
+use bench::Bench;
