@@ -5,7 +5,7 @@
 //!
 //! Time is counted in instructions, one a cycle; while the core waits for an event it jumps to the next
 //! deadline of a device. Nothing else moves it, so a run is the same each time and everywhere. A run
-//! that keeps pace with the clock on the wall would wait in [`Chip::idle`], and nowhere else.
+//! that keeps pace with the clock on the wall is made of short ones ([`crate::realtime`]).
 
 use defmt_decoder::StreamDecoder;
 
@@ -33,6 +33,8 @@ pub struct Chip {
     torn: Vec<u32>,
     pc: u32,
     is_locked_up: bool,
+    /// It waits for an event.
+    is_asleep: bool,
     /// Times in a row that a deadline was not ahead.
     stuck: u32,
     decoder: Option<Box<dyn StreamDecoder + Send + Sync>>,
@@ -81,6 +83,7 @@ impl Chip {
             torn: Vec::new(),
             pc: 0,
             is_locked_up: false,
+            is_asleep: false,
             stuck: 0,
             decoder: program.log_reader(),
             log: Vec::new(),
@@ -119,6 +122,7 @@ impl Chip {
         engine.set(Reg::Lr, u32::MAX);
         self.pc = engine.word(FLASH + 4);
         self.is_locked_up = false;
+        self.is_asleep = false;
         Ok(())
     }
 
@@ -178,6 +182,17 @@ impl Chip {
         self.program.place(self.pc & !1)
     }
 
+    /// The clock tree.
+    pub fn clocks(&self) -> Clocks {
+        self.board.devices.rcc.clocks()
+    }
+
+    /// While the core waits for an event: when a device will do something next.
+    pub fn sleeps_until(&mut self) -> Option<Picos> {
+        self.board.limit = Picos::MAX;
+        (self.is_asleep || self.is_locked_up).then(|| self.board.deadline())
+    }
+
     /// Runs up to an instant.
     ///
     /// # Errors
@@ -207,7 +222,12 @@ impl Chip {
             return;
         }
         if let Some(number) = self.board.scs.due(masks(engine)) {
+            self.is_asleep = false;
             self.take(number, self.pc);
+        }
+        if self.is_asleep {
+            self.wait(end);
+            return;
         }
         self.follow_guard();
         let exit = self.core.run(self.pc, &mut self.board);
@@ -274,7 +294,8 @@ impl Chip {
         if std::mem::take(&mut self.board.scs.event) {
             return;
         }
-        self.waits += 1;
+        self.waits += u64::from(!self.is_asleep);
+        self.is_asleep = true;
         let engine = self.engine();
         while self.board.now < end
             && self.board.scs.due(masks(engine)).is_none()

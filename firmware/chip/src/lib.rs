@@ -12,6 +12,7 @@ pub mod device;
 mod exception;
 pub mod models;
 mod program;
+pub mod realtime;
 pub mod unicorn;
 
 pub use board::{Access, Devices, Violation};
