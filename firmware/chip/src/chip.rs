@@ -35,6 +35,10 @@ pub struct Chip {
     is_locked_up: bool,
     /// It waits for an event.
     is_asleep: bool,
+    /// Steps since the log was read.
+    unread: u32,
+    /// Start and size of the memory that nobody reaches.
+    closed: Option<(u32, u32)>,
     /// Times in a row that a deadline was not ahead.
     stuck: u32,
     decoder: Option<Box<dyn StreamDecoder + Send + Sync>>,
@@ -84,6 +88,8 @@ impl Chip {
             pc: 0,
             is_locked_up: false,
             is_asleep: false,
+            unread: 0,
+            closed: None,
             stuck: 0,
             decoder: program.log_reader(),
             log: Vec::new(),
@@ -123,6 +129,7 @@ impl Chip {
         self.pc = engine.word(FLASH + 4);
         self.is_locked_up = false;
         self.is_asleep = false;
+        self.closed = None;
         Ok(())
     }
 
@@ -201,7 +208,11 @@ impl Chip {
         while self.board.now < end {
             self.board.limit = end;
             self.step(end);
-            self.read_log();
+            self.unread += 1;
+            if self.is_asleep || self.unread >= LOG_PERIOD || self.board.now >= end || self.board.violation.is_some() {
+                self.unread = 0;
+                self.read_log();
+            }
             if let Some(violation) = self.board.violation.clone() {
                 let place = self.program.place(violation.access.pc);
                 return Err(Stopped { violation, place });
@@ -283,10 +294,16 @@ impl Chip {
         if !std::mem::take(&mut self.board.guard_changed) {
             return;
         }
+        // Each change makes the library forget where memory is.
+        let guard = self.board.scs.guard();
+        if guard == self.closed {
+            return;
+        }
         let (start, size, _) = RAM[0];
         let opened = self.core.guard(start, size, false);
-        let closed = self.board.scs.guard().map(|(start, size)| self.core.guard(start, size, true));
+        let closed = guard.map(|(start, size)| self.core.guard(start, size, true));
         opened.and(closed.unwrap_or(Ok(()))).expect("the guard is in the DTCM");
+        self.closed = guard;
     }
 
     /// WFE (Armv7-M ARM B1.5.18).
@@ -334,8 +351,10 @@ impl Chip {
     fn read_log(&mut self) {
         let engine = self.core.engine();
         let Some(channel) = self.program.rtt.map(|address| address + 24) else { return };
-        let word = |index: u32| engine.word(channel + 4 * index);
-        let (buffer, size, write, read) = (word(1), word(2), word(3), word(4));
+        let mut words = [0; 16];
+        engine.read(channel + 4, &mut words);
+        let word = |index: usize| u32::from_le_bytes(words[4 * index..][..4].try_into().expect("four"));
+        let (buffer, size, write, read) = (word(0), word(1), word(2), word(3));
         let is_ring = buffer >= RAM[1].0 && size <= 0x1_0000 && write < size && read < size;
         if !is_ring || write == read {
             return;
@@ -352,6 +371,8 @@ impl Chip {
     }
 }
 
+/// The log is read at least each so many steps.
+const LOG_PERIOD: u32 = 16;
 /// Of CFSR: an instruction that there is not.
 const UNDEFINED: u32 = 1 << 16;
 /// A precise bus fault, with its address.

@@ -92,10 +92,10 @@ pub(crate) fn qmp(socket: &Path, command: &str, arguments: Value) -> Value {
     let mut answer = Value::Null;
     for (command, arguments) in [("qmp_capabilities", json!({})), (command, arguments)] {
         writeln!(stream, "{}", json!({ "execute": command, "arguments": arguments })).unwrap();
-        // Events come between.
+        // Events come between, and the greeting of a connection that was closed at once.
         answer = loop {
             let line: Value = serde_json::from_str(&lines.next().unwrap().unwrap()).unwrap();
-            if line.get("event").is_none() {
+            if line.get("event").is_none() && line.get("QMP").is_none() {
                 break line;
             }
         };
