@@ -1,172 +1,15 @@
-//! The chip's peripherals at their addresses, and what the core's accesses meet there. RM0433, "Memory and
-//! bus architecture"; who needs which clock is in RCC's registers AHB1ENR to APB4ENR.
+//! What the core's accesses meet: the devices in virtual time, with their clocks looked after and each
+//! access noted.
 
 use std::collections::VecDeque;
 use std::fmt;
 
 use crate::device::*;
+use crate::devices::{CAN, Devices, Id, MAP};
 use crate::exception::masks;
-use crate::models::ethernet::Ethernet;
-use crate::models::fdcan::Fdcan;
-use crate::models::gpio::Port;
-use crate::models::iwdg::Watchdog;
-use crate::models::rcc::{Gate, Rcc};
 use crate::models::scs::Scs;
-use crate::models::simple::{DBGMCU, EXTI, Plain, Pwr, Rng, Syscfg};
-use crate::models::timer::Timer;
-use crate::models::usart::{Pins, Usart};
 use crate::program::SEV;
 use crate::unicorn::{Engine, Flow, Handler, Reg, SYSTEM};
-
-/// A device, by its place in [`MAP`].
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Id {
-    Rcc,
-    Pwr,
-    Flash,
-    Syscfg,
-    Exti,
-    Gpio(usize),
-    Watchdog,
-    Debug,
-    Timer,
-    First,
-    Second,
-    Can,
-    CanRam,
-    Ethernet,
-    Rng,
-}
-
-struct Place {
-    base: u32,
-    size: u32,
-    name: &'static str,
-    gate: Option<Gate>,
-    id: Id,
-    /// Its interrupt line.
-    line: Option<u16>,
-}
-
-const fn place(
-    base: u32,
-    size: u32,
-    name: &'static str,
-    gate: Option<Gate>,
-    id: Id,
-    line: Option<u16>,
-) -> Place {
-    Place { base, size, name, gate, id, line }
-}
-
-const fn gate(enable: u32, bits: u32) -> Option<Gate> {
-    Some(Gate { enable, bits })
-}
-
-const fn port(index: usize, name: &'static str) -> Place {
-    place(0x5802_0000 + 0x400 * index as u32, 0x400, name, gate(0xE0, 1 << index), Id::Gpio(index), None)
-}
-
-const CAN: Option<Gate> = gate(0xEC, 1 << 8);
-static MAP: [Place; 25] = [
-    place(0x4000_1800, 0x400, "TIM12", gate(0xE8, 1 << 6), Id::Timer, Some(43)),
-    place(0x4000_4400, 0x400, "USART2", gate(0xE8, 1 << 17), Id::First, Some(38)),
-    place(0x4000_7800, 0x400, "UART7", gate(0xE8, 1 << 30), Id::Second, Some(82)),
-    place(0x4000_A000, 0xC00, "FDCAN1", CAN, Id::Can, Some(19)),
-    place(0x4000_AC00, 0x2800, "message RAM", CAN, Id::CanRam, None),
-    place(0x4002_8000, 0x2000, "ETH", gate(0xD8, 7 << 15), Id::Ethernet, Some(61)),
-    place(0x4802_1800, 0x400, "RNG", gate(0xDC, 1 << 6), Id::Rng, None),
-    place(0x5200_2000, 0x400, "FLASH", None, Id::Flash, None),
-    place(0x5800_0000, 0x400, "EXTI", None, Id::Exti, None),
-    place(0x5800_0400, 0x400, "SYSCFG", gate(0xF4, 1 << 1), Id::Syscfg, None),
-    port(0, "GPIOA"),
-    port(1, "GPIOB"),
-    port(2, "GPIOC"),
-    port(3, "GPIOD"),
-    port(4, "GPIOE"),
-    port(5, "GPIOF"),
-    port(6, "GPIOG"),
-    port(7, "GPIOH"),
-    port(8, "GPIOI"),
-    port(9, "GPIOJ"),
-    port(10, "GPIOK"),
-    place(0x5802_4400, 0x400, "RCC", None, Id::Rcc, None),
-    place(0x5802_4800, 0x400, "PWR", None, Id::Pwr, None),
-    place(0x5800_4800, 0x400, "IWDG1", None, Id::Watchdog, None),
-    place(0x5C00_1000, 0x400, "DBGMCU", None, Id::Debug, None),
-];
-
-/// The models.
-#[derive(Debug)]
-pub struct Devices {
-    /// Clocks and resets.
-    pub rcc: Rcc,
-    /// The supply.
-    pub pwr: Pwr,
-    /// MII or RMII.
-    pub syscfg: Syscfg,
-    /// Ports A to K.
-    pub gpio: [Port; 11],
-    /// The independent watchdog.
-    pub watchdog: Watchdog,
-    /// TIM12.
-    pub timer: Timer,
-    /// USART2: RS-485 A.
-    pub first: Usart,
-    /// UART7: RS-485 B.
-    pub second: Usart,
-    /// FDCAN1.
-    pub can: Fdcan,
-    /// The Ethernet controller.
-    pub ethernet: Ethernet,
-    /// The random number generator.
-    pub rng: Rng,
-    /// Flash's registers.
-    pub flash: crate::models::flash::Flash,
-    exti: Plain,
-    debug: Plain,
-}
-
-impl Devices {
-    fn new() -> Self {
-        let pins = |tx, rx, de| Pins { tx, rx, de, function: 7 };
-        Self {
-            rcc: Rcc::new(),
-            pwr: Pwr::new(),
-            syscfg: Syscfg::new(),
-            gpio: std::array::from_fn(|index| Port::new((b'A' + index as u8) as char)),
-            watchdog: Watchdog::new(),
-            timer: Timer::new(),
-            first: Usart::new(pins(Pin('D', 5), Pin('D', 6), Pin('D', 4))),
-            second: Usart::new(pins(Pin('E', 8), Pin('E', 7), Pin('E', 9))),
-            can: Fdcan::new(),
-            ethernet: Ethernet::new(),
-            rng: Rng::new(),
-            flash: crate::models::flash::Flash::new(),
-            exti: Plain::new(&EXTI),
-            debug: Plain::new(&DBGMCU),
-        }
-    }
-
-    fn device(&mut self, id: Id) -> &mut dyn Peripheral {
-        match id {
-            Id::Rcc => &mut self.rcc,
-            Id::Pwr => &mut self.pwr,
-            Id::Flash => &mut self.flash,
-            Id::Syscfg => &mut self.syscfg,
-            Id::Exti => &mut self.exti,
-            Id::Gpio(index) => &mut self.gpio[index],
-            Id::Watchdog => &mut self.watchdog,
-            Id::Debug => &mut self.debug,
-            Id::Timer => &mut self.timer,
-            Id::First => &mut self.first,
-            Id::Second => &mut self.second,
-            Id::Can | Id::CanRam => &mut self.can,
-            Id::Ethernet => &mut self.ethernet,
-            Id::Rng => &mut self.rng,
-        }
-    }
-}
 
 /// An access to a register.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -183,13 +26,16 @@ pub struct Access {
     pub value: u32,
     /// It was written.
     pub is_write: bool,
-    /// How often the same in a row.
+    /// How often the same in a row; 0 for what the peripheral does by itself.
     pub times: u32,
 }
 
 impl fmt::Display for Access {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { at, pc, peripheral, register, value, is_write, times } = self;
+        if *times == 0 {
+            return write!(f, "{:12.3} us  {pc:08X}  {peripheral} by itself", *at as f64 / 1e6);
+        }
         let arrow = if *is_write { "<-" } else { "->" };
         write!(f, "{:12.3} us  {pc:08X}  {peripheral}.{register} {arrow} {value:08X}", *at as f64 / 1e6)?;
         if *times > 1 { write!(f, "  {times} times") } else { Ok(()) }
@@ -216,8 +62,6 @@ impl fmt::Display for Violation {
 pub(crate) enum Halt {
     /// It waits for an event, at the instruction before this address.
     Wait(u32),
-    /// A bus fault by the flash: where, and the instruction.
-    Torn(u32, u32),
 }
 
 /// Devices, time, and what is noted of them.
@@ -230,6 +74,8 @@ pub(crate) struct Board {
     pub(crate) halt: Option<Halt>,
     pub(crate) violation: Option<Violation>,
     pub(crate) guard_changed: bool,
+    /// The next instruction is executed, whatever is due.
+    pub(crate) is_forced: bool,
     /// The last accesses.
     pub(crate) accesses: VecDeque<Access>,
     pub(crate) keep: usize,
@@ -253,6 +99,7 @@ impl Board {
             halt: None,
             violation: None,
             guard_changed: false,
+            is_forced: false,
             accesses: VecDeque::new(),
             keep: 64,
             instructions: 0,
@@ -303,7 +150,7 @@ impl Board {
     fn refresh(&mut self) {
         let (deadline, is_wanted) = self.with(|devices, scs, at| {
             let mut deadline = scs.deadline().unwrap_or(Picos::MAX);
-            for place in &MAP {
+            for place in MAP.iter().filter(|place| place.changes_with_time()) {
                 let device = devices.device(place.id);
                 deadline = deadline.min(device.deadline(at).unwrap_or(Picos::MAX));
                 if let Some(line) = place.line {
@@ -327,7 +174,7 @@ impl Board {
         let refused = self.with(|devices, scs, at| {
             scs.advance(at);
             let mut memory = core;
-            for place in &MAP {
+            for place in MAP.iter().filter(|place| place.changes_with_time()) {
                 let result = devices.device(place.id).advance(at);
                 let result = match place.id {
                     Id::Ethernet => result.and_then(|()| devices.ethernet.transfer(&mut memory, at)),
@@ -344,13 +191,33 @@ impl Board {
                 at: self.now,
                 pc: core.reg(Reg::Pc),
                 peripheral,
-                register: "what it does by itself".into(),
+                register: String::new(),
                 value: 0,
                 is_write: false,
-                times: 1,
+                times: 0,
             };
             self.violation.get_or_insert(Violation { access, reason });
         }
+        self.refresh();
+    }
+
+    /// The program writes to flash.
+    pub(crate) fn program_flash(&mut self, pc: u32, offset: u32, bytes: &[u8]) {
+        let mut value = [0; 4];
+        value[..bytes.len()].copy_from_slice(bytes);
+        let access = Access {
+            at: self.now,
+            pc,
+            peripheral: "flash",
+            register: format!("[{offset:06X}]"),
+            value: u32::from_le_bytes(value),
+            is_write: true,
+            times: 1,
+        };
+        if let Err(Refusal(reason)) = self.devices.flash.program(offset, bytes, self.now) {
+            self.violation.get_or_insert(Violation { access: access.clone(), reason });
+        }
+        self.note(access);
         self.refresh();
     }
 
@@ -524,7 +391,8 @@ impl Handler for Board {
     fn block(&mut self, core: Engine, address: u32, len: u32) -> Flow {
         let is_asked = self.violation.is_some() || self.halt.is_some() || self.guard_changed;
         let is_over = self.now >= self.deadline || is_asked;
-        if is_over || self.is_wanted && self.scs.due(masks(core)).is_some() {
+        let is_over = is_over || self.is_wanted && self.scs.due(masks(core)).is_some();
+        if is_over && !self.is_forced {
             return Flow::Stop;
         }
         let count = self.count(core, address, len);
@@ -548,14 +416,6 @@ impl Handler for Board {
                 self.halt = Some(Halt::Wait(address));
                 Flow::Stop
             }
-        }
-    }
-
-    fn touched(&mut self, core: Engine, address: u32) {
-        if self.scs.ignores_bus_faults(masks(core)) {
-            self.scs.note_fault(0x8200, address, false);
-        } else {
-            self.halt.get_or_insert(Halt::Torn(address, core.reg(Reg::Pc)));
         }
     }
 }

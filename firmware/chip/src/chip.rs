@@ -9,9 +9,11 @@
 
 use defmt_decoder::StreamDecoder;
 
-use crate::board::{Access, Board, Devices, FLASH, FLASH_SIZE, Halt, Violation};
+use crate::board::{Access, Board, FLASH, FLASH_SIZE, Halt, Violation};
 use crate::device::*;
+use crate::devices::Devices;
 use crate::exception::{enter, is_return, leave, masks};
+use crate::models::flash::WORD;
 use crate::models::scs::HARD_FAULT;
 use crate::program::{Program, texts};
 use crate::unicorn::{Core, Engine, Exit, MMIO, Reg};
@@ -28,16 +30,13 @@ pub struct Chip {
     core: Core,
     board: Board,
     program: &'static Program,
-    image: Vec<u8>,
-    /// Flash words whose check bits do not match.
-    torn: Vec<u32>,
     pc: u32,
     is_locked_up: bool,
     /// It waits for an event.
     is_asleep: bool,
     /// Steps since the log was read.
     unread: u32,
-    /// Start and size of the memory that nobody reaches.
+    /// The range that nobody may touch.
     closed: Option<(u32, u32)>,
     /// Times in a row that a deadline was not ahead.
     stuck: u32,
@@ -73,18 +72,16 @@ impl Chip {
     /// # Errors
     /// The library is missing.
     pub fn new(program: &'static Program, image: &[u8]) -> Result<Self, String> {
-        let mut flash = vec![0xFF; FLASH_SIZE as usize];
+        let mut board = Board::new();
         for (address, bytes) in &program.segments {
-            let place = address.checked_sub(FLASH).ok_or("a segment that is not in flash")? as usize;
-            flash.get_mut(place..place + bytes.len()).ok_or("too long")?.copy_from_slice(bytes);
+            let place = address.checked_sub(FLASH).filter(|place| place + bytes.len() as u32 <= FLASH_SIZE);
+            board.devices.flash.load(place.ok_or("a segment that is not in flash")?, bytes);
         }
-        flash[(CONFIG - FLASH) as usize..][..image.len()].copy_from_slice(image);
+        board.devices.flash.load(CONFIG - FLASH, image);
         let mut chip = Self {
             core: Core::new()?,
-            board: Board::new(),
+            board,
             program,
-            image: flash,
-            torn: Vec::new(),
             pc: 0,
             is_locked_up: false,
             is_asleep: false,
@@ -112,7 +109,7 @@ impl Chip {
             core.map(*address, *size, true)?;
             core.engine().write(*address, bytes);
         }
-        core.engine().write(FLASH, &self.image);
+        core.engine().write(FLASH, self.board.devices.flash.cells());
         core.engine().write(UNIQUE_ID, &[1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12]);
         for range in MMIO {
             core.devices(range)?;
@@ -120,8 +117,8 @@ impl Chip {
         for address in &self.program.waits {
             core.watch(*address)?;
         }
-        for address in &self.torn {
-            core.watch_reads(*address, address + 31)?;
+        for word in self.board.devices.flash.torn() {
+            self.close_page(FLASH + word)?;
         }
         let engine = core.engine();
         engine.set(Reg::Sp, engine.word(FLASH));
@@ -133,13 +130,13 @@ impl Chip {
         Ok(())
     }
 
-    /// A flash word (32 bytes) whose writing was cut off: reading it is a bus fault from the next start on.
+    /// A flash word (32 bytes) whose writing was cut off: reading it is a bus fault.
     ///
     /// # Errors
     /// The library does not take it.
     pub fn tear(&mut self, address: u32) -> Result<(), String> {
-        self.torn.push(address & !31);
-        self.core.watch_reads(address & !31, (address & !31) + 31)
+        self.board.devices.flash.tear(address - FLASH);
+        self.close_page(address)
     }
 
     /// Another instruction in the program, until the next reset.
@@ -241,6 +238,7 @@ impl Chip {
             return;
         }
         self.follow_guard();
+        self.follow_flash();
         let exit = self.core.run(self.pc, &mut self.board);
         self.pc = engine.reg(Reg::Pc);
         match (exit, self.board.halt.take()) {
@@ -248,17 +246,21 @@ impl Chip {
                 self.pc = address + 2;
                 self.wait(end);
             }
-            (_, Some(Halt::Torn(address, pc))) => {
-                self.pc = pc;
-                self.fault(PRECISE_BUS, address);
-            }
             (Exit::Stopped, None) => {}
             (Exit::Exception(8), None) => self.leave(),
             (Exit::Exception(_) | Exit::Memory { is_fetch: true, .. }, None) if is_return(self.pc) => {
                 self.leave();
             }
             (Exit::Undefined | Exit::Exception(_), None) => self.fault(UNDEFINED, 0),
-            (Exit::Memory { address, is_fetch }, None) => {
+            (Exit::Memory { address, written: Some(written), .. }, None) if is_flash(address) => {
+                self.program_flash(address, written);
+            }
+            (Exit::Memory { address, is_fetch: false, .. }, None)
+                if is_flash(address) && self.has_torn(address) =>
+            {
+                self.read_torn(address);
+            }
+            (Exit::Memory { address, is_fetch, .. }, None) => {
                 let guard = self.board.scs.guard();
                 let is_guard = guard.is_some_and(|(start, size)| (start..start + size).contains(&address));
                 match (is_guard, is_fetch) {
@@ -266,6 +268,69 @@ impl Chip {
                     (false, true) => self.fault(FETCH, address),
                     (false, false) => self.fault(PRECISE_BUS, address),
                 }
+            }
+        }
+    }
+
+    /// Whether a page of flash has words that cannot be read.
+    fn has_torn(&self, address: u32) -> bool {
+        let offset = page(address).wrapping_sub(FLASH);
+        self.board.devices.flash.torn().any(|word| page(word) == offset)
+    }
+
+    /// Flash is not for writing, and a page with a torn word not for reading.
+    fn close_page(&self, address: u32) -> Result<(), String> {
+        if self.has_torn(address) {
+            self.core.guard(page(address), PAGE, true)
+        } else {
+            self.core.close_flash(page(address), PAGE)
+        }
+    }
+
+    /// Executes one instruction with a page of flash open.
+    fn step_in_page(&mut self, address: u32) {
+        self.core.guard(page(address), PAGE, false).expect("there is flash");
+        // What was translated before knows nothing of stopping behind one instruction.
+        self.core.forget(self.pc, 4);
+        self.board.is_forced = true;
+        self.core.run_one(self.pc, &mut self.board);
+        self.board.is_forced = false;
+        self.pc = self.engine().reg(Reg::Pc);
+        // Only with the end of the work the cells change.
+        let place = (page(address) - FLASH) as usize;
+        let cells = &self.board.devices.flash.cells()[place..place + PAGE as usize];
+        self.engine().write(page(address), cells);
+        self.close_page(address).expect("there is flash");
+    }
+
+    /// A read of a page with a torn word: of that word it is a bus fault, unless those are held back.
+    fn read_torn(&mut self, address: u32) {
+        let word = (address - FLASH) & !(WORD - 1);
+        if self.board.devices.flash.torn().any(|torn| torn == word) {
+            if !self.board.scs.ignores_bus_faults(masks(self.engine())) {
+                self.fault(PRECISE_BUS, address);
+                return;
+            }
+            self.board.scs.note_fault(PRECISE_BUS, address, false);
+        }
+        self.step_in_page(address);
+    }
+
+    /// A write to flash: the instruction is executed, but its cells take what the model lets them.
+    fn program_flash(&mut self, address: u32, (value, size): (u32, u32)) {
+        let bytes = &value.to_le_bytes()[..size as usize];
+        self.board.program_flash(self.pc, address - FLASH, bytes);
+        self.step_in_page(address);
+    }
+
+    /// Memory shows what flash's cells hold since the last erase or write.
+    fn follow_flash(&mut self) {
+        for (offset, len) in self.board.devices.flash.take_changed() {
+            let cells = &self.board.devices.flash.cells()[offset as usize..][..len as usize];
+            self.core.engine().write(FLASH + offset, cells);
+            self.core.forget(FLASH + offset, len);
+            for address in (FLASH + offset..FLASH + offset + len).step_by(PAGE as usize) {
+                self.close_page(address).expect("there is flash");
             }
         }
     }
@@ -294,16 +359,15 @@ impl Chip {
         if !std::mem::take(&mut self.board.guard_changed) {
             return;
         }
-        // Each change makes the library forget where memory is.
         let guard = self.board.scs.guard();
         if guard == self.closed {
             return;
         }
-        let (start, size, _) = RAM[0];
-        let opened = self.core.guard(start, size, false);
-        let closed = guard.map(|(start, size)| self.core.guard(start, size, true));
-        opened.and(closed.unwrap_or(Ok(()))).expect("the guard is in the DTCM");
+        let core = &self.core;
+        let opened = self.closed.take().map_or(Ok(()), |(start, size)| core.guard(start, size, false));
+        let closed = guard.map_or(Ok(()), |(start, size)| core.guard(start, size, true));
         self.closed = guard;
+        opened.and(closed).expect("the guard is in RAM");
     }
 
     /// WFE (Armv7-M ARM B1.5.18).
@@ -373,6 +437,17 @@ impl Chip {
 
 /// The log is read at least each so many steps.
 const LOG_PERIOD: u32 = 16;
+/// What memory is opened and closed by.
+const PAGE: u32 = 0x1000;
+
+fn page(address: u32) -> u32 {
+    address & !(PAGE - 1)
+}
+
+fn is_flash(address: u32) -> bool {
+    (FLASH..FLASH + FLASH_SIZE).contains(&address)
+}
+
 /// Of CFSR: an instruction that there is not.
 const UNDEFINED: u32 = 1 << 16;
 /// A precise bus fault, with its address.

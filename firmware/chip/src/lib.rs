@@ -9,12 +9,14 @@
 mod board;
 mod chip;
 pub mod device;
+mod devices;
 mod exception;
 pub mod models;
 mod program;
 pub mod realtime;
 pub mod unicorn;
 
-pub use board::{Access, Devices, Violation};
+pub use board::{Access, Violation};
 pub use chip::{CONFIG, Chip, Stopped};
+pub use devices::Devices;
 pub use program::Program;

@@ -1,5 +1,7 @@
 //! The binding to Unicorn, which emulates the instructions of a Cortex-M7: the only file with `unsafe`.
 //!
+//! Hooks on memory would tell more, but with them loads in IT blocks are executed wrongly (2.1.4).
+//!
 //! In: memory, registers, and a [`Handler`] that hears of accesses to devices, of the blocks of
 //! instructions that begin, and of the places that are watched. Out: why the core stopped. It knows no
 //! exceptions and no devices.
@@ -37,8 +39,6 @@ pub trait Handler {
     fn block(&mut self, core: Engine, address: u32, len: u32) -> Flow;
     /// A watched place is about to be executed; with [`Flow::Stop`] it is not.
     fn watched(&mut self, core: Engine, address: u32) -> Flow;
-    /// A watched range of memory is about to be read.
-    fn touched(&mut self, core: Engine, address: u32);
 }
 
 /// Why the core came back.
@@ -56,6 +56,8 @@ pub enum Exit {
         address: u32,
         /// Whether an instruction was fetched.
         is_fetch: bool,
+        /// What was to be written, and how many bytes of it.
+        written: Option<(u32, u32)>,
     },
 }
 
@@ -269,16 +271,30 @@ impl Core {
         })
     }
 
+    /// Takes a range of memory from those who write.
+    ///
+    /// # Errors
+    /// There is no memory.
+    pub fn close_flash(&self, address: u32, size: u32) -> Result<(), String> {
+        self.protect(address, size, READ | EXECUTE)
+    }
+
+    fn protect(&self, address: u32, size: u32, access: u32) -> Result<(), String> {
+        const FLUSH_TLB: c_int = 11 | 1 << 30;
+        let Engine { api, uc } = self.engine;
+        // SAFETY: as above.
+        checked("uc_mem_protect", unsafe { (api.protect)(uc, address.into(), size.into(), access) })?;
+        // Without it, what the page allowed before is still allowed.
+        // SAFETY: this request takes nothing.
+        checked("uc_ctl", unsafe { (api.ctl)(uc, FLUSH_TLB) })
+    }
+
     /// Keeps everybody from a range, or gives it back.
     ///
     /// # Errors
     /// There is no memory.
     pub fn guard(&self, address: u32, size: u32, is_closed: bool) -> Result<(), String> {
-        let access = if is_closed { 0 } else { ALL };
-        // SAFETY: as above.
-        checked("uc_mem_protect", unsafe {
-            (self.engine.api.protect)(self.engine.uc, address.into(), size.into(), access)
-        })
+        self.protect(address, size, if is_closed { 0 } else { ALL })
     }
 
     /// Addresses that are the handler's; at most one range for each start in [`MMIO`].
@@ -303,14 +319,6 @@ impl Core {
     /// The library does not take it.
     pub fn watch(&self, address: u32) -> Result<(), String> {
         self.hook(HOOK_CODE, on_watched as OnCode as *mut c_void, address.into(), address.into())
-    }
-
-    /// Tells the handler before memory from `address` to `last` is read.
-    ///
-    /// # Errors
-    /// The library does not take it.
-    pub fn watch_reads(&self, address: u32, last: u32) -> Result<(), String> {
-        self.hook(HOOK_MEM_READ, on_touched as OnMemory as *mut c_void, address.into(), last.into())
     }
 
     fn hook(&self, kind: c_int, callback: *mut c_void, begin: u64, end: u64) -> Result<(), String> {
@@ -339,6 +347,18 @@ impl Core {
     /// # Panics
     /// The library fails otherwise than a program can make it.
     pub fn run(&mut self, pc: u32, handler: &mut dyn Handler) -> Exit {
+        self.run_some(pc, 0, handler)
+    }
+
+    /// Runs one instruction.
+    ///
+    /// # Panics
+    /// As [`Core::run`].
+    pub fn run_one(&mut self, pc: u32, handler: &mut dyn Handler) -> Exit {
+        self.run_some(pc, 1, handler)
+    }
+
+    fn run_some(&mut self, pc: u32, count: usize, handler: &mut dyn Handler) -> Exit {
         const NOWHERE: u64 = 0xFFFF_FFFE;
         const NO_MEMORY: std::ops::RangeInclusive<c_int> = 6..=8;
         const FORBIDDEN: std::ops::RangeInclusive<c_int> = 12..=14;
@@ -351,14 +371,14 @@ impl Core {
         let Engine { api, uc } = self.engine;
         // Without a limit of time: each would start a thread.
         // SAFETY: the callbacks' memory is there.
-        let status = unsafe { (api.start)(uc, u64::from(pc | 1), NOWHERE, 0, 0) };
+        let status = unsafe { (api.start)(uc, u64::from(pc | 1), NOWHERE, 0, count) };
         self.shared.handler.set(None);
         match (self.shared.exit.get(), status) {
             (Some(exit), _) => exit,
             (None, 0) => Exit::Stopped,
             (None, UNDEFINED) => Exit::Undefined,
             (None, status) if NO_MEMORY.contains(&status) || FORBIDDEN.contains(&status) => {
-                Exit::Memory { address: 0, is_fetch: false }
+                Exit::Memory { address: 0, is_fetch: false, written: None }
             }
             (None, status) => panic!("uc_emu_start: error {status}, PC {:08X}", self.engine.reg(Reg::Pc)),
         }
@@ -421,11 +441,6 @@ extern "C" fn on_watched(uc: Uc, address: u64, _size: u32, user: *mut c_void) {
     });
 }
 
-extern "C" fn on_touched(uc: Uc, _: c_int, address: u64, _: c_int, _: i64, user: *mut c_void) -> bool {
-    with(uc, user, |handler, engine, _| handler.touched(engine, address as u32));
-    true
-}
-
 extern "C" fn on_exception(uc: Uc, number: u32, user: *mut c_void) {
     with(uc, user, |_, engine, shared| {
         shared.exit.set(Some(Exit::Exception(number)));
@@ -437,14 +452,16 @@ extern "C" fn on_bad_memory(
     uc: Uc,
     access: c_int,
     address: u64,
-    _: c_int,
-    _: i64,
+    size: c_int,
+    value: i64,
     user: *mut c_void,
 ) -> bool {
     const FETCHES: [c_int; 2] = [21, 24];
+    const WRITES: [c_int; 2] = [20, 22];
     with(uc, user, |_, _, shared| {
         let is_fetch = FETCHES.contains(&access);
-        shared.exit.set(Some(Exit::Memory { address: address as u32, is_fetch }));
+        let written = WRITES.contains(&access).then_some((value as u32, size as u32));
+        shared.exit.set(Some(Exit::Memory { address: address as u32, is_fetch, written }));
     });
     false
 }
@@ -464,4 +481,3 @@ const HOOK_CODE: c_int = 4;
 const HOOK_BLOCK: c_int = 8;
 /// No memory (16, 32, 64) and forbidden (128, 256, 512).
 const HOOK_BAD_MEMORY: c_int = 0x3F0;
-const HOOK_MEM_READ: c_int = 1024;

@@ -107,10 +107,12 @@ pub struct CanBus {
     pub heard: u64,
     /// Frames of others that it was not there for.
     pub missed: u64,
+    /// Frames of others that a filter let pass.
+    pub passed: u64,
     /// Frames that the chip broke off in the middle.
     pub broken_off: u64,
-    /// How often it went bus-off.
-    pub bus_offs: u64,
+    /// When it went bus-off.
+    pub bus_offs: Vec<Picos>,
     /// What others send: when each has ended.
     arriving: VecDeque<(Picos, Frame)>,
 }

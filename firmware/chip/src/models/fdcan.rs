@@ -8,89 +8,9 @@
 use std::collections::VecDeque;
 
 use super::can_bus::{Attempt, CanBus, Frame};
+use super::can_filters::Filters;
+use super::fdcan_registers::*;
 use crate::device::*;
-
-const CCCR: u32 = 0x18;
-const NBTP: u32 = 0x1C;
-const ECR: u32 = 0x40;
-const PSR: u32 = 0x44;
-const IR: u32 = 0x50;
-const IE: u32 = 0x54;
-const ILE: u32 = 0x5C;
-const GFC: u32 = 0x80;
-const SIDFC: u32 = 0x84;
-const XIDFC: u32 = 0x88;
-const XIDAM: u32 = 0x90;
-const RXFC: [u32; 2] = [0xA0, 0xB0];
-const RXFS: [u32; 2] = [0xA4, 0xB4];
-const RXFA: [u32; 2] = [0xA8, 0xB8];
-const TXBC: u32 = 0xC0;
-const TXFQS: u32 = 0xC4;
-const TXBRP: u32 = 0xCC;
-const TXBAR: u32 = 0xD0;
-const TXBCR: u32 = 0xD4;
-const TXBTO: u32 = 0xD8;
-const TXBCF: u32 = 0xDC;
-const TXBTIE: u32 = 0xE0;
-const CCFG: u32 = 0x804;
-
-static REGISTERS: [Register; 37] = [
-    reads(0x00, "CREL", 0x3214_1218),
-    reads(0x04, "ENDN", 0x8765_4321),
-    keeps(0x14, "RWD", 0, 0xFF),
-    keeps(CCCR, "CCCR", 1, 0xF3F7),
-    keeps(NBTP, "NBTP", 0x0600_0A03, 0xFFFF_FF7F),
-    reads(ECR, "ECR", 0),
-    reads(PSR, "PSR", 0x707),
-    does(IR, "IR", 0x3FCF_FFFF),
-    keeps(IE, "IE", 0, 0x3FCF_FFFF),
-    keeps(0x58, "ILS", 0, 0x3FCF_FFFF),
-    keeps(ILE, "ILE", 0, 3),
-    keeps(GFC, "GFC", 0, 0x3F),
-    keeps(SIDFC, "SIDFC", 0, 0xFF_FFFC),
-    keeps(XIDFC, "XIDFC", 0, 0x7F_FFFC),
-    keeps(XIDAM, "XIDAM", 0x1FFF_FFFF, 0x1FFF_FFFF),
-    keeps(RXFC[0], "RXF0C", 0, 0xFF7F_FFFC),
-    reads(RXFS[0], "RXF0S", 0),
-    does(RXFA[0], "RXF0A", 0x3F),
-    keeps(RXFC[1], "RXF1C", 0, 0xFF7F_FFFC),
-    reads(RXFS[1], "RXF1S", 0),
-    does(RXFA[1], "RXF1A", 0x3F),
-    keeps(0xAC, "RXBC", 0, 0xFFFC),
-    keeps(0xBC, "RXESC", 0, 0x777),
-    keeps(TXBC, "TXBC", 0, 0x7F3F_FFFC),
-    reads(TXFQS, "TXFQS", 0),
-    keeps(0xC8, "TXESC", 0, 7),
-    reads(TXBRP, "TXBRP", 0),
-    does(TXBAR, "TXBAR", !0),
-    does(TXBCR, "TXBCR", !0),
-    reads(TXBTO, "TXBTO", 0),
-    reads(TXBCF, "TXBCF", 0),
-    keeps(TXBTIE, "TXBTIE", 0, !0),
-    keeps(0xE4, "TXBCIE", 0, !0),
-    keeps(0xF0, "TXEFC", 0, 0x3F3F_FFFC),
-    reads(0xF4, "TXEFS", 0),
-    reads(0x800, "CCU_CREL", 0),
-    keeps(CCFG, "CCU_CCFG", 0x04, 0x80FF_FFDF),
-];
-/// Only while INIT and CCE are set.
-const PROTECTED: [u32; 14] =
-    [0x14, NBTP, GFC, SIDFC, XIDFC, XIDAM, RXFC[0], RXFC[1], 0xAC, 0xBC, TXBC, 0xC8, 0xF0, CCFG];
-
-const INIT: u32 = 1;
-const CCE: u32 = 1 << 1;
-const RESTRICTED: u32 = 1 << 2;
-/// Of IR.
-const TC: u32 = 1 << 9;
-const TCF: u32 = 1 << 10;
-const EP: u32 = 1 << 23;
-const EW: u32 = 1 << 24;
-const BO: u32 = 1 << 25;
-/// Of the clock calibration unit: bypassed.
-const BYPASS: u32 = 1 << 6;
-/// Words of the message RAM.
-const WORDS: usize = 2560;
-const ELEMENT: usize = 4;
 
 /// The model.
 #[derive(Debug)]
@@ -297,56 +217,15 @@ impl Fdcan {
         Frame::from_words(words)
     }
 
-    /// Which FIFO takes an id ("Acceptance filtering").
-    fn accepts(&self, frame: &Frame) -> Option<usize> {
-        let filters = self.bank.get(GFC);
-        let fifo = |code: u32| match code {
-            1 | 5 => Some(0),
-            2 | 6 => Some(1),
-            _ => None,
-        };
-        let id = frame.id;
-        if frame.is_remote && filters >> u32::from(!frame.is_extended) & 1 != 0 {
-            return None;
-        }
-        if frame.is_extended {
-            let list = self.bank.get(XIDFC);
-            for index in 0..(list >> 16 & 0x7F) as usize {
-                let place = (list & 0xFFFC) as usize / 4 + 2 * index;
-                let (first, second) = (self.ram[place], self.ram[place + 1]);
-                let (a, b) = (first & 0x1FFF_FFFF, second & 0x1FFF_FFFF);
-                let masked = id & self.bank.get(XIDAM);
-                let matches = match second >> 30 {
-                    0 => (a..=b).contains(&masked),
-                    1 => id == a || id == b,
-                    2 => id & b == a & b,
-                    _ => (a..=b).contains(&id),
-                };
-                if first >> 29 != 0 && matches {
-                    return fifo(first >> 29);
-                }
-            }
-            return [Some(0), Some(1), None, None][(filters >> 2 & 3) as usize];
-        }
-        let list = self.bank.get(SIDFC);
-        for index in 0..(list >> 16 & 0xFF) as usize {
-            let word = self.ram[(list & 0xFFFC) as usize / 4 + index];
-            let (a, b) = (word >> 16 & 0x7FF, word & 0x7FF);
-            let matches = match word >> 30 {
-                0 => (a..=b).contains(&id),
-                1 => id == a || id == b,
-                2 => id & b == a & b,
-                _ => false,
-            };
-            if word >> 27 & 7 != 0 && matches {
-                return fifo(word >> 27 & 7);
-            }
-        }
-        [Some(0), Some(1), None, None][(filters >> 4 & 3) as usize]
-    }
-
     fn store(&mut self, frame: &Frame) {
-        let Some(fifo) = self.accepts(frame) else { return };
+        let filters = Filters {
+            others: self.bank.get(GFC),
+            standard: self.bank.get(SIDFC),
+            extended: self.bank.get(XIDFC),
+            mask: self.bank.get(XIDAM),
+        };
+        let Some(fifo) = filters.accept(frame, &self.ram) else { return };
+        self.bus.passed += 1;
         let config = self.bank.get(RXFC[fifo]);
         let size = config >> 16 & 0x7F;
         let (get, put, fill) = self.fifos[fifo];
@@ -392,7 +271,7 @@ impl Fdcan {
             self.count(|can| can.is_bus_off = true);
             self.is_on_bus = false;
             self.bank.set(CCCR, self.bank.get(CCCR) | INIT);
-            self.bus.bus_offs += 1;
+            self.bus.bus_offs.push(at);
         }
         // It is sent again, before the others.
         self.waiting.push_front(index);

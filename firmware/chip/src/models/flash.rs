@@ -1,19 +1,141 @@
-//! Flash's interface: wait states. RM0433, "Embedded Flash memory", at
-//! the recommended number of wait states. The program only reads flash.
+//! Flash's interface, and what its cells allow. RM0433, "Embedded Flash memory".
+//!
+//! A flash word has 32 bytes and check bits. It is written whole, once after its sector was erased: written
+//! twice, or cut off in the middle, its check bits do not match, and reading it is a bus fault. Sectors have
+//! 128 KiB. Strict: the keys, LOCK, PG before a write, words that are written whole and one at a time,
+//! nothing changed in a register while the bank is busy, wait states for the clock.
+
+use std::collections::BTreeSet;
 
 use crate::device::*;
 
 const ACR: u32 = 0x00;
-static REGISTERS: [Register; 1] = [keeps(ACR, "ACR", 0x37, 0x3F)];
+/// Of each bank.
+const KEYR: u32 = 0x04;
+const CR: u32 = 0x0C;
+const SR: u32 = 0x10;
+const CCR: u32 = 0x14;
+const SECOND_BANK: u32 = 0x100;
+
+static REGISTERS: [Register; 10] = [
+    keeps(ACR, "ACR", 0x37, 0x3F),
+    does(KEYR, "KEYR1", !0),
+    keeps(CR, "CR1", 0x31, 0x0FEF_07FF),
+    reads(SR, "SR1", 0),
+    does(CCR, "CCR1", 0x0FEF_0000),
+    keeps(SECOND_BANK + ACR, "ACR", 0x37, 0x3F),
+    does(SECOND_BANK + KEYR, "KEYR2", !0),
+    keeps(SECOND_BANK + CR, "CR2", 0x31, 0x0FEF_07FF),
+    reads(SECOND_BANK + SR, "SR2", 0),
+    does(SECOND_BANK + CCR, "CCR2", 0x0FEF_0000),
+];
+
+const LOCK: u32 = 1;
+const PG: u32 = 1 << 1;
+const SER: u32 = 1 << 2;
+const BER: u32 = 1 << 3;
+const START: u32 = 1 << 7;
+const BUSY: u32 = 1 | 1 << 2;
+const EOP: u32 = 1 << 16;
+const KEYS: [u32; 2] = [0x4567_0123, 0xCDEF_89AB];
+
+/// Bytes of a flash word.
+pub const WORD: u32 = 32;
+/// Bytes of a sector.
+pub const SECTOR: u32 = 0x2_0000;
+const BANK: u32 = 0x10_0000;
+/// Datasheet DS12110, "Flash memory programming", at a parallelism of 64 bits.
+const ERASE: Picos = 1_000 * MILLI;
+const PROGRAM: Picos = 100 * MICRO;
+
+/// What a bank does at the moment.
+#[derive(Debug, Clone, PartialEq, Eq)]
+enum Work {
+    Erase { first: u32, until: Picos },
+    Program { address: u32, bytes: [u8; 32], until: Picos },
+}
+
+impl Work {
+    fn until(&self) -> Picos {
+        match self {
+            Self::Erase { until, .. } | Self::Program { until, .. } => *until,
+        }
+    }
+}
+
+#[derive(Debug, Default)]
+struct Half {
+    /// Right keys so far; none are taken behind a wrong one.
+    keys: Option<usize>,
+    is_shut: bool,
+    flags: u32,
+    work: Option<Work>,
+    /// The flash word that is being collected: its address, its bytes, which of them are there.
+    collected: Option<(u32, [u8; 32], u32)>,
+}
 
 /// The model.
 #[derive(Debug)]
-pub struct Flash(Bank);
+pub struct Flash {
+    bank: Bank,
+    halves: [Half; 2],
+    cells: Vec<u8>,
+    /// Flash words whose check bits do not match, as offsets.
+    torn: BTreeSet<u32>,
+    /// Ranges that have changed since somebody asked.
+    changed: Vec<(u32, u32)>,
+    /// Sectors that were erased.
+    pub erases: u64,
+}
 
 impl Flash {
-    /// As after power came.
+    /// Both banks erased.
     pub fn new() -> Self {
-        Self(Bank::new(&REGISTERS))
+        Self {
+            bank: Bank::new(&REGISTERS),
+            halves: Default::default(),
+            cells: vec![0xFF; 2 * BANK as usize],
+            torn: BTreeSet::new(),
+            changed: Vec::new(),
+            erases: 0,
+        }
+    }
+
+    /// Puts bytes there, as a debugger does.
+    pub fn load(&mut self, offset: u32, bytes: &[u8]) {
+        self.cells[offset as usize..][..bytes.len()].copy_from_slice(bytes);
+    }
+
+    /// What the cells hold.
+    pub fn cells(&self) -> &[u8] {
+        &self.cells
+    }
+
+    /// A flash word's check bits do not match from now on.
+    pub fn tear(&mut self, offset: u32) {
+        self.torn.insert(offset & !(WORD - 1));
+    }
+
+    /// Flash words that cannot be read.
+    pub fn torn(&self) -> impl Iterator<Item = u32> {
+        self.torn.iter().copied()
+    }
+
+    /// What has changed since this was asked last: offset and length.
+    pub fn take_changed(&mut self) -> Vec<(u32, u32)> {
+        std::mem::take(&mut self.changed)
+    }
+
+    /// Power fails now: a word that is being written is torn, a sector that is being erased as a whole.
+    pub fn cut(&mut self) {
+        for half in &mut self.halves {
+            let (first, len) = match half.work.take() {
+                Some(Work::Erase { first, .. }) => (first, SECTOR),
+                Some(Work::Program { address, .. }) => (address, WORD),
+                None => continue,
+            };
+            self.torn.extend((first..first + len).step_by(WORD as usize));
+        }
     }
 
     /// Whether its wait states are enough for this bus clock, at the highest voltage but one (VOS1).
@@ -21,7 +143,7 @@ impl Flash {
     /// # Errors
     /// They are not.
     pub fn check_speed(&self, hclk: u32) -> Result<(), Refusal> {
-        let (latency, delay) = (self.0.get(ACR) & 0xF, self.0.get(ACR) >> 4 & 3);
+        let (latency, delay) = (self.bank.get(ACR) & 0xF, self.bank.get(ACR) >> 4 & 3);
         let needed = match hclk {
             ..=70_000_000 => (0, 0),
             70_000_001..=140_000_000 => (1, 1),
@@ -30,12 +152,99 @@ impl Flash {
             _ => (3, 2),
         };
         if latency < needed.0 || delay < needed.1 {
-            return refuse(format!(
-                "flash has {latency} wait states for {hclk} Hz; the manual asks for {}",
-                needed.0
-            ));
+            return refuse(format!("{latency} wait states for {hclk} Hz; the manual asks for {}", needed.0));
         }
         Ok(())
+    }
+
+    /// The program writes to flash itself.
+    ///
+    /// # Errors
+    /// The bank is locked, not set to programming or busy; the word is not erased, or written in pieces.
+    pub fn program(&mut self, offset: u32, bytes: &[u8], now: Picos) -> Result<(), Refusal> {
+        let index = (offset / BANK) as usize;
+        let control = self.bank.get(CR + SECOND_BANK * index as u32);
+        let half = &mut self.halves[index];
+        if control & PG == 0 {
+            return refuse("flash is written while PG is 0");
+        }
+        if half.work.is_some() {
+            return refuse("flash is written while its bank is busy");
+        }
+        let (word, place) = (offset & !(WORD - 1), (offset % WORD) as usize);
+        let (address, mut content, mut there) = half.collected.take().unwrap_or((word, [0xFF; 32], 0));
+        if address != word {
+            return refuse("another flash word is written before this one is whole");
+        }
+        content[place..place + bytes.len()].copy_from_slice(bytes);
+        for index in place..place + bytes.len() {
+            there |= 1 << index;
+        }
+        if there != u32::MAX {
+            half.collected = Some((address, content, there));
+            return Ok(());
+        }
+        let is_blank = self.cells[word as usize..][..32].iter().all(|byte| *byte == 0xFF);
+        if !is_blank || self.torn.contains(&word) {
+            return refuse("the flash word was written before; it is to be erased first");
+        }
+        half.work = Some(Work::Program { address: word, bytes: content, until: now + PROGRAM });
+        Ok(())
+    }
+
+    fn write_control(&mut self, index: usize, value: u32, now: Picos) -> Result<(), Refusal> {
+        let register = CR + SECOND_BANK * index as u32;
+        let before = self.bank.get(register);
+        if before & LOCK != 0 {
+            return refuse("the bank is locked (LOCK)");
+        }
+        if self.halves[index].work.is_some() {
+            return refuse("the bank is busy (QW)");
+        }
+        self.bank.check(register, value)?;
+        self.bank.set(register, value & !START);
+        if value & LOCK != 0 {
+            self.halves[index].keys = Some(0);
+        }
+        match (value & START != 0, value & (PG | SER | BER)) {
+            (false, _) => Ok(()),
+            (true, SER) => {
+                let first = BANK * index as u32 + SECTOR * (value >> 8 & 7);
+                self.halves[index].work = Some(Work::Erase { first, until: now + ERASE });
+                Ok(())
+            }
+            _ => refuse("START without SER alone is not modelled"),
+        }
+    }
+
+    fn unlock(&mut self, index: usize, key: u32) -> Result<(), Refusal> {
+        let half = &mut self.halves[index];
+        let right = half.keys.unwrap_or(0);
+        if half.is_shut || KEYS.get(right) != Some(&key) {
+            half.is_shut = true;
+            return refuse("a wrong key: the bank stays locked until a reset");
+        }
+        half.keys = Some(right + 1);
+        if right + 1 == KEYS.len() {
+            let register = CR + SECOND_BANK * index as u32;
+            self.bank.set(register, self.bank.get(register) & !LOCK);
+        }
+        Ok(())
+    }
+
+    fn finish(&mut self, work: Work) {
+        match work {
+            Work::Erase { first, .. } => {
+                self.cells[first as usize..][..SECTOR as usize].fill(0xFF);
+                self.torn.retain(|word| !(first..first + SECTOR).contains(word));
+                self.changed.push((first, SECTOR));
+                self.erases += 1;
+            }
+            Work::Program { address, bytes, .. } => {
+                self.load(address, &bytes);
+                self.changed.push((address, WORD));
+            }
+        }
     }
 }
 
@@ -50,15 +259,121 @@ impl Peripheral for Flash {
         &REGISTERS
     }
 
-    fn read(&mut self, offset: u32, _: &Moment<'_>) -> Result<u32, Refusal> {
-        self.0.read(offset)
+    fn read(&mut self, offset: u32, at: &Moment<'_>) -> Result<u32, Refusal> {
+        self.advance(at)?;
+        let half = &self.halves[usize::from(offset >= SECOND_BANK)];
+        match offset % SECOND_BANK {
+            SR => {
+                let waits = u32::from(half.collected.is_some()) << 1;
+                Ok(half.flags | if half.work.is_some() { BUSY } else { 0 } | waits)
+            }
+            KEYR | CCR => refuse("can only be written"),
+            _ => self.bank.read(offset),
+        }
     }
 
-    fn write(&mut self, offset: u32, value: u32, _: &Moment<'_>) -> Result<(), Refusal> {
-        self.0.write(offset, value)
+    fn write(&mut self, offset: u32, value: u32, at: &Moment<'_>) -> Result<(), Refusal> {
+        self.advance(at)?;
+        let index = usize::from(offset >= SECOND_BANK);
+        match offset % SECOND_BANK {
+            KEYR => self.unlock(index, value),
+            CR => self.write_control(index, value, at.now),
+            CCR => {
+                self.bank.check(offset, value)?;
+                self.halves[index].flags &= !value;
+                Ok(())
+            }
+            _ => self.bank.write(offset, value),
+        }
     }
 
+    fn advance(&mut self, at: &Moment<'_>) -> Result<(), Refusal> {
+        for index in 0..2 {
+            if let Some(work) = self.halves[index].work.take_if(|work| at.now >= work.until()) {
+                self.halves[index].flags |= EOP;
+                self.finish(work);
+            }
+        }
+        Ok(())
+    }
+
+    fn deadline(&self, _: &Moment<'_>) -> Option<Picos> {
+        self.halves.iter().filter_map(|half| half.work.as_ref().map(Work::until)).min()
+    }
+
+    /// What is in the middle of being written is lost.
     fn reset(&mut self) {
-        *self = Self::new();
+        self.cut();
+        self.bank = Bank::new(&REGISTERS);
+        self.halves = Default::default();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    static NONE: Functions = [[None; 16]; 11];
+
+    fn at(now: Picos) -> Moment<'static> {
+        Moment { now, clocks: Clocks::default(), functions: &NONE, is_rmii: false }
+    }
+
+    fn unlocked() -> Flash {
+        let mut flash = Flash::new();
+        for key in KEYS {
+            flash.write(SECOND_BANK + KEYR, key, &at(0)).expect("the right keys");
+        }
+        flash
+    }
+
+    const CONFIG: u32 = 0x1C_0000;
+
+    fn program(flash: &mut Flash, offset: u32, now: Picos) -> Result<(), Refusal> {
+        (0..8).try_for_each(|word| flash.program(offset + 4 * word, &[word as u8; 4], now))
+    }
+
+    #[test]
+    fn a_word_is_written_once() {
+        let mut flash = unlocked();
+        assert!(program(&mut flash, CONFIG, 0).is_err(), "PG is 0");
+        flash.write(SECOND_BANK + CR, 0x32, &at(0)).expect("it is unlocked");
+        program(&mut flash, CONFIG, 0).expect("it is erased");
+        assert!(flash.write(SECOND_BANK + CR, 0x30, &at(MICRO)).is_err(), "it is busy");
+        flash.advance(&at(PROGRAM)).expect("it is done");
+        assert_eq!((flash.cells()[CONFIG as usize + 4], flash.take_changed()), (1, vec![(CONFIG, WORD)]));
+        assert!(program(&mut flash, CONFIG, PROGRAM).is_err(), "a second time");
+    }
+
+    #[test]
+    fn erasing_makes_a_torn_word_blank_again() {
+        let mut flash = unlocked();
+        flash.write(SECOND_BANK + CR, 0x32, &at(0)).expect("it is unlocked");
+        program(&mut flash, CONFIG + 64, 0).expect("it is erased");
+        flash.reset();
+        assert_eq!(flash.torn().collect::<Vec<_>>(), [CONFIG + 64]);
+        for key in KEYS {
+            flash.write(SECOND_BANK + KEYR, key, &at(0)).expect("the right keys");
+        }
+        flash.write(SECOND_BANK + CR, 0x31 & !LOCK | SER | START | 6 << 8, &at(0)).expect("it is unlocked");
+        assert_eq!(flash.deadline(&at(0)), Some(ERASE));
+        flash.advance(&at(ERASE)).expect("it is done");
+        assert_eq!((flash.torn().count(), flash.erases), (0, 1));
+    }
+
+    #[test]
+    fn a_wrong_key_locks_until_a_reset() {
+        let mut flash = Flash::new();
+        assert!(flash.write(KEYR, KEYS[1], &at(0)).is_err());
+        assert!(flash.write(KEYR, KEYS[0], &at(0)).is_err());
+        assert!(flash.write(CR, 0x32, &at(0)).is_err());
+    }
+
+    #[test]
+    fn a_word_in_pieces_is_refused() {
+        let mut flash = unlocked();
+        flash.write(SECOND_BANK + CR, 0x32, &at(0)).expect("it is unlocked");
+        flash.program(CONFIG, &[0; 4], 0).expect("the first of eight");
+        assert!(flash.program(CONFIG + 32, &[0; 4], 0).is_err(), "the next before it is whole");
     }
 }

@@ -1,5 +1,6 @@
 //! Small ones, after the chapters of RM0433: "Power control", "System configuration controller", "Debug
-//! infrastructure" (DBGMCU), "Extended interrupt and event controller", "True random number generator".
+//! infrastructure" (DBGMCU), "Extended interrupt and event controller", "AXI interconnect",
+//! "True random number generator".
 
 use crate::device::*;
 
@@ -128,7 +129,20 @@ pub static DBGMCU: [Register; 3] = [
 pub static EXTI: [Register; 2] =
     [keeps(0x00, "RTSR1", 0, 0x3F_FFFF), keeps(0x80, "CPUIMR1", 0xFFC0_0000, !0)];
 
+/// The AXI interconnect: how the SRAM is read, for chips of revision Y (errata ES0392).
+pub static AXI: [Register; 1] = [keeps(0x108, "TARG7_FN_MOD", 0, 3)];
+
 impl Plain {
+    /// What a register holds.
+    pub fn get(&self, offset: u32) -> u32 {
+        self.0.get(offset)
+    }
+
+    /// Another chip: the register holds something else, until a reset.
+    pub fn put(&mut self, offset: u32, value: u32) {
+        self.0.set(offset, value);
+    }
+
     /// As after power came.
     pub fn new(registers: &'static [Register]) -> Self {
         Self(Bank::new(registers), registers)

@@ -144,10 +144,12 @@ impl Usart {
         Picos::from(1 + self.data_bits() + self.stop_bits()) * self.bit(clocks)
     }
 
-    /// The pin of driver-enable, as the transceiver sees it: pulled down while nobody drives it.
+    /// The pin of driver-enable, as the transceiver sees it: pulled down while nobody drives it. One that is
+    /// not set up for driver-enable is the request to send, which is high at rest.
     fn show_driver(&mut self, is_active: bool, at: &Moment<'_>) {
-        let is_connected = self.pins.de.is(at.functions, self.pins.function) && self.has(CR3, DEM);
-        let level = is_connected && self.has(CR1, UE) && (is_active != self.has(CR3, DEP));
+        let is_connected = self.pins.de.is(at.functions, self.pins.function);
+        let is_set_up = self.has(CR1, UE) && self.has(CR3, DEM);
+        let level = is_connected && (!is_set_up || is_active != self.has(CR3, DEP));
         self.line.drive(at.now, level);
     }
 

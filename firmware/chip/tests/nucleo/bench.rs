@@ -5,7 +5,8 @@ use std::sync::OnceLock;
 
 use chip::device::{MICRO, MILLI, Picos};
 use chip::{Chip, Program};
-use host_sim::config::file::{Text, parse_gateway};
+use host_sim::config::SimConfig;
+use host_sim::config::file::{Text, parse_controller, parse_gateway};
 use proto_core::config::image;
 
 use crate::robot::Robot;
@@ -58,7 +59,14 @@ impl Bench {
 
     /// With a controller at 192.168.12.10.
     pub(crate) fn with_robot(mut self) -> Self {
-        self.robot = Some(Robot::new());
+        self.robot = Some(Robot::new(&SimConfig::default()));
+        self
+    }
+
+    /// With the controller of that file, at 192.168.12.10.
+    pub(crate) fn with_robot_of(mut self, toml: &str) -> Self {
+        let config = parse_controller(Text { name: "controller.toml", toml }, &[]);
+        self.robot = Some(Robot::new(&config.expect("a right configuration")));
         self
     }
 

@@ -73,10 +73,22 @@ fn it_boots_and_reaches_the_controller() {
         (clocks.core, clocks.hclk, clocks.usart, clocks.fdcan),
         (400_000_000, 200_000_000, 100_000_000, 80_000_000)
     );
+    assert!(!bench.has_logged("no 8 MHz"), "it runs on the external clock");
     // The link's LED, and no fault's.
     assert_eq!(bench.chip.devices().gpio[4].output(1), Some(true));
     assert_eq!(bench.chip.devices().gpio[1].output(14), Some(false));
     assert!(bench.chip.resets.is_empty() && bench.chip.faults.is_empty());
+}
+
+#[test]
+#[ignore = "needs CHIP_UNICORN and CHIP_ELF"]
+fn only_a_chip_of_the_old_revision_reads_its_ram_one_by_one() {
+    for (identity, mode) in [(0x1003_6450, 1), (0x2003_6450, 0)] {
+        let mut bench = Bench::blank();
+        bench.chip.devices().debug.put(0, identity);
+        bench.until_log("info: started", 10 * MILLI);
+        assert_eq!(bench.chip.devices().axi.get(0x108), mode, "{identity:08X}");
+    }
 }
 
 #[test]

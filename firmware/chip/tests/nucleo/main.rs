@@ -5,7 +5,9 @@
 mod bench;
 mod boot;
 mod can;
+mod cell;
 mod faults;
+mod flash;
 mod robot;
 mod serial;
 

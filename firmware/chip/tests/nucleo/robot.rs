@@ -50,10 +50,10 @@ struct Cable {
 }
 
 impl Robot {
-    pub(crate) fn new() -> Self {
+    pub(crate) fn new(config: &SimConfig) -> Self {
         let mut cable = Cable::default();
-        let config = Config::new(EthernetAddress([2, 0, 0, 0, 0, 1]).into());
-        let mut interface = Interface::new(config, &mut cable, smoltcp::time::Instant::ZERO);
+        let own = Config::new(EthernetAddress([2, 0, 0, 0, 0, 1]).into());
+        let mut interface = Interface::new(own, &mut cable, smoltcp::time::Instant::ZERO);
         interface.update_ip_addrs(|addresses| {
             addresses.push(IpCidr::new(ADDRESS.into(), 24)).expect("room for one");
         });
@@ -75,7 +75,7 @@ impl Robot {
             datagrams: sockets.add(socket),
             sockets,
             servers,
-            controller: Controller::new(&SimConfig::default()).expect("a right configuration"),
+            controller: Controller::new(config).expect("a right configuration"),
             connections: HashMap::new(),
             unsent: HashMap::new(),
             numbers: 0,

@@ -100,9 +100,9 @@ fn characters_with_errors_are_left_out_and_counted() {
     let wrong = Format { odd_parity: Some(true), ..format };
     let now = bench.now();
     let line = &mut bench.chip.devices().second.line;
-    // A character of wrong parity between those of a frame.
+    // Characters of wrong parity between those of a frame, each with an error of its own.
     let mut at = line.send(now, &[170], format);
-    at = line.send(at, &[99], wrong);
+    at = line.send(at, &[99, 98], wrong);
     at = line.send(at, &[42, 85], format);
     bench.run(at - now + 10 * MILLI);
     assert_eq!(word(&bench, "WordInputReg[8]"), 42.0);
@@ -113,7 +113,7 @@ fn characters_with_errors_are_left_out_and_counted() {
         line.sent.iter().map(|sent| sent.parity).collect::<Vec<_>>(),
         [Some(true), Some(true), Some(true)]
     );
-    bench.until_log("parity 1, framing 0; overruns 0", 3 * SECOND);
+    bench.until_log("parity 2, framing 0; overruns 0", 3 * SECOND);
     // A stop bit that is none: the line is held down.
     let now = bench.now();
     let line = &mut bench.chip.devices().second.line;
@@ -121,7 +121,7 @@ fn characters_with_errors_are_left_out_and_counted() {
     at = line.send(at + MILLI, &[170, 43, 85], format);
     bench.run(at - now + 10 * MILLI);
     assert_eq!(word(&bench, "WordInputReg[8]"), 43.0);
-    bench.until_log("parity 1, framing 1; overruns 0", 3 * SECOND);
+    bench.until_log("parity 2, framing 1; overruns 0", 3 * SECOND);
 }
 
 #[test]

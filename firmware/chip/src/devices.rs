@@ -1,0 +1,179 @@
+//! The chip's peripherals at their addresses, with their interrupt lines. RM0433, "Memory and bus
+//! architecture"; who needs which clock is in RCC's registers AHB1ENR to APB4ENR.
+
+use crate::device::{Peripheral, Pin};
+use crate::models::ethernet::Ethernet;
+use crate::models::fdcan::Fdcan;
+use crate::models::flash::Flash;
+use crate::models::gpio::Port;
+use crate::models::iwdg::Watchdog;
+use crate::models::rcc::{Gate, Rcc};
+use crate::models::simple::{AXI, DBGMCU, EXTI, Plain, Pwr, Rng, Syscfg};
+use crate::models::timer::Timer;
+use crate::models::usart::{Pins, Usart};
+
+/// A device, by its place in [`MAP`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Id {
+    Rcc,
+    Pwr,
+    Flash,
+    Syscfg,
+    Exti,
+    Gpio(usize),
+    Watchdog,
+    Debug,
+    Axi,
+    Timer,
+    First,
+    Second,
+    Can,
+    CanRam,
+    Ethernet,
+    Rng,
+}
+
+pub(crate) struct Place {
+    pub(crate) base: u32,
+    pub(crate) size: u32,
+    pub(crate) name: &'static str,
+    pub(crate) gate: Option<Gate>,
+    pub(crate) id: Id,
+    /// Its interrupt line.
+    pub(crate) line: Option<u16>,
+}
+
+impl Place {
+    /// Whether time does anything to it.
+    pub(crate) fn changes_with_time(&self) -> bool {
+        !matches!(self.id, Id::Gpio(_) | Id::CanRam)
+    }
+}
+
+const fn place(
+    base: u32,
+    size: u32,
+    name: &'static str,
+    gate: Option<Gate>,
+    id: Id,
+    line: Option<u16>,
+) -> Place {
+    Place { base, size, name, gate, id, line }
+}
+
+const fn gate(enable: u32, bits: u32) -> Option<Gate> {
+    Some(Gate { enable, bits })
+}
+
+const fn port(index: usize, name: &'static str) -> Place {
+    place(0x5802_0000 + 0x400 * index as u32, 0x400, name, gate(0xE0, 1 << index), Id::Gpio(index), None)
+}
+
+/// Of the controller and its message RAM.
+pub(crate) const CAN: Option<Gate> = gate(0xEC, 1 << 8);
+/// All of them.
+pub(crate) static MAP: [Place; 26] = [
+    place(0x4000_1800, 0x400, "TIM12", gate(0xE8, 1 << 6), Id::Timer, Some(43)),
+    place(0x4000_4400, 0x400, "USART2", gate(0xE8, 1 << 17), Id::First, Some(38)),
+    place(0x4000_7800, 0x400, "UART7", gate(0xE8, 1 << 30), Id::Second, Some(82)),
+    place(0x4000_A000, 0xC00, "FDCAN1", CAN, Id::Can, Some(19)),
+    place(0x4000_AC00, 0x2800, "message RAM", CAN, Id::CanRam, None),
+    place(0x4002_8000, 0x2000, "ETH", gate(0xD8, 7 << 15), Id::Ethernet, Some(61)),
+    place(0x4802_1800, 0x400, "RNG", gate(0xDC, 1 << 6), Id::Rng, None),
+    place(0x5100_8000, 0x1000, "AXI", None, Id::Axi, None),
+    place(0x5200_2000, 0x400, "FLASH", None, Id::Flash, None),
+    place(0x5800_0000, 0x400, "EXTI", None, Id::Exti, None),
+    place(0x5800_0400, 0x400, "SYSCFG", gate(0xF4, 1 << 1), Id::Syscfg, None),
+    port(0, "GPIOA"),
+    port(1, "GPIOB"),
+    port(2, "GPIOC"),
+    port(3, "GPIOD"),
+    port(4, "GPIOE"),
+    port(5, "GPIOF"),
+    port(6, "GPIOG"),
+    port(7, "GPIOH"),
+    port(8, "GPIOI"),
+    port(9, "GPIOJ"),
+    port(10, "GPIOK"),
+    place(0x5802_4400, 0x400, "RCC", None, Id::Rcc, None),
+    place(0x5802_4800, 0x400, "PWR", None, Id::Pwr, None),
+    place(0x5800_4800, 0x400, "IWDG1", None, Id::Watchdog, None),
+    place(0x5C00_1000, 0x400, "DBGMCU", None, Id::Debug, None),
+];
+
+/// The models.
+#[derive(Debug)]
+pub struct Devices {
+    /// Clocks and resets.
+    pub rcc: Rcc,
+    /// The supply.
+    pub pwr: Pwr,
+    /// MII or RMII.
+    pub syscfg: Syscfg,
+    /// Ports A to K.
+    pub gpio: [Port; 11],
+    /// The independent watchdog.
+    pub watchdog: Watchdog,
+    /// TIM12.
+    pub timer: Timer,
+    /// USART2: RS-485 A.
+    pub first: Usart,
+    /// UART7: RS-485 B.
+    pub second: Usart,
+    /// FDCAN1.
+    pub can: Fdcan,
+    /// The Ethernet controller.
+    pub ethernet: Ethernet,
+    /// The random number generator.
+    pub rng: Rng,
+    /// Flash's registers.
+    pub flash: Flash,
+    /// What chip it is.
+    pub debug: Plain,
+    /// The AXI interconnect.
+    pub axi: Plain,
+    exti: Plain,
+}
+
+impl Devices {
+    pub(crate) fn new() -> Self {
+        let pins = |tx, rx, de| Pins { tx, rx, de, function: 7 };
+        Self {
+            rcc: Rcc::new(),
+            pwr: Pwr::new(),
+            syscfg: Syscfg::new(),
+            gpio: std::array::from_fn(|index| Port::new((b'A' + index as u8) as char)),
+            watchdog: Watchdog::new(),
+            timer: Timer::new(),
+            first: Usart::new(pins(Pin('D', 5), Pin('D', 6), Pin('D', 4))),
+            second: Usart::new(pins(Pin('E', 8), Pin('E', 7), Pin('E', 9))),
+            can: Fdcan::new(),
+            ethernet: Ethernet::new(),
+            rng: Rng::new(),
+            flash: Flash::new(),
+            exti: Plain::new(&EXTI),
+            debug: Plain::new(&DBGMCU),
+            axi: Plain::new(&AXI),
+        }
+    }
+
+    pub(crate) fn device(&mut self, id: Id) -> &mut dyn Peripheral {
+        match id {
+            Id::Rcc => &mut self.rcc,
+            Id::Pwr => &mut self.pwr,
+            Id::Flash => &mut self.flash,
+            Id::Syscfg => &mut self.syscfg,
+            Id::Exti => &mut self.exti,
+            Id::Gpio(index) => &mut self.gpio[index],
+            Id::Watchdog => &mut self.watchdog,
+            Id::Debug => &mut self.debug,
+            Id::Axi => &mut self.axi,
+            Id::Timer => &mut self.timer,
+            Id::First => &mut self.first,
+            Id::Second => &mut self.second,
+            Id::Can | Id::CanRam => &mut self.can,
+            Id::Ethernet => &mut self.ethernet,
+            Id::Rng => &mut self.rng,
+        }
+    }
+}

@@ -1,0 +1,85 @@
+//! FDCAN1's registers, and what of them only the configuration may change. RM0433, "FDCAN registers".
+
+use crate::device::*;
+
+pub(super) const CCCR: u32 = 0x18;
+pub(super) const NBTP: u32 = 0x1C;
+pub(super) const ECR: u32 = 0x40;
+pub(super) const PSR: u32 = 0x44;
+pub(super) const IR: u32 = 0x50;
+pub(super) const IE: u32 = 0x54;
+pub(super) const ILE: u32 = 0x5C;
+pub(super) const GFC: u32 = 0x80;
+pub(super) const SIDFC: u32 = 0x84;
+pub(super) const XIDFC: u32 = 0x88;
+pub(super) const XIDAM: u32 = 0x90;
+pub(super) const RXFC: [u32; 2] = [0xA0, 0xB0];
+pub(super) const RXFS: [u32; 2] = [0xA4, 0xB4];
+pub(super) const RXFA: [u32; 2] = [0xA8, 0xB8];
+pub(super) const TXBC: u32 = 0xC0;
+pub(super) const TXFQS: u32 = 0xC4;
+pub(super) const TXBRP: u32 = 0xCC;
+pub(super) const TXBAR: u32 = 0xD0;
+pub(super) const TXBCR: u32 = 0xD4;
+pub(super) const TXBTO: u32 = 0xD8;
+pub(super) const TXBCF: u32 = 0xDC;
+pub(super) const TXBTIE: u32 = 0xE0;
+pub(super) const CCFG: u32 = 0x804;
+
+pub(super) static REGISTERS: [Register; 37] = [
+    reads(0x00, "CREL", 0x3214_1218),
+    reads(0x04, "ENDN", 0x8765_4321),
+    keeps(0x14, "RWD", 0, 0xFF),
+    keeps(CCCR, "CCCR", 1, 0xF3F7),
+    keeps(NBTP, "NBTP", 0x0600_0A03, 0xFFFF_FF7F),
+    reads(ECR, "ECR", 0),
+    reads(PSR, "PSR", 0x707),
+    does(IR, "IR", 0x3FCF_FFFF),
+    keeps(IE, "IE", 0, 0x3FCF_FFFF),
+    keeps(0x58, "ILS", 0, 0x3FCF_FFFF),
+    keeps(ILE, "ILE", 0, 3),
+    keeps(GFC, "GFC", 0, 0x3F),
+    keeps(SIDFC, "SIDFC", 0, 0xFF_FFFC),
+    keeps(XIDFC, "XIDFC", 0, 0x7F_FFFC),
+    keeps(XIDAM, "XIDAM", 0x1FFF_FFFF, 0x1FFF_FFFF),
+    keeps(RXFC[0], "RXF0C", 0, 0xFF7F_FFFC),
+    reads(RXFS[0], "RXF0S", 0),
+    does(RXFA[0], "RXF0A", 0x3F),
+    keeps(RXFC[1], "RXF1C", 0, 0xFF7F_FFFC),
+    reads(RXFS[1], "RXF1S", 0),
+    does(RXFA[1], "RXF1A", 0x3F),
+    keeps(0xAC, "RXBC", 0, 0xFFFC),
+    keeps(0xBC, "RXESC", 0, 0x777),
+    keeps(TXBC, "TXBC", 0, 0x7F3F_FFFC),
+    reads(TXFQS, "TXFQS", 0),
+    keeps(0xC8, "TXESC", 0, 7),
+    reads(TXBRP, "TXBRP", 0),
+    does(TXBAR, "TXBAR", !0),
+    does(TXBCR, "TXBCR", !0),
+    reads(TXBTO, "TXBTO", 0),
+    reads(TXBCF, "TXBCF", 0),
+    keeps(TXBTIE, "TXBTIE", 0, !0),
+    keeps(0xE4, "TXBCIE", 0, !0),
+    keeps(0xF0, "TXEFC", 0, 0x3F3F_FFFC),
+    reads(0xF4, "TXEFS", 0),
+    reads(0x800, "CCU_CREL", 0),
+    keeps(CCFG, "CCU_CCFG", 0x04, 0x80FF_FFDF),
+];
+/// Only while INIT and CCE are set.
+pub(super) const PROTECTED: [u32; 14] =
+    [0x14, NBTP, GFC, SIDFC, XIDFC, XIDAM, RXFC[0], RXFC[1], 0xAC, 0xBC, TXBC, 0xC8, 0xF0, CCFG];
+
+pub(super) const INIT: u32 = 1;
+pub(super) const CCE: u32 = 1 << 1;
+pub(super) const RESTRICTED: u32 = 1 << 2;
+/// Of IR.
+pub(super) const TC: u32 = 1 << 9;
+pub(super) const TCF: u32 = 1 << 10;
+pub(super) const EP: u32 = 1 << 23;
+pub(super) const EW: u32 = 1 << 24;
+pub(super) const BO: u32 = 1 << 25;
+/// Of the clock calibration unit: bypassed.
+pub(super) const BYPASS: u32 = 1 << 6;
+/// Words of the message RAM.
+pub(super) const WORDS: usize = 2560;
+pub(super) const ELEMENT: usize = 4;
