@@ -206,7 +206,11 @@ impl Chip {
             self.board.limit = end;
             self.step(end);
             self.unread += 1;
-            if self.is_asleep || self.unread >= LOG_PERIOD || self.board.now >= end || self.board.violation.is_some() {
+            if self.is_asleep
+                || self.unread >= LOG_PERIOD
+                || self.board.now >= end
+                || self.board.violation.is_some()
+            {
                 self.unread = 0;
                 self.read_log();
             }
