@@ -252,6 +252,7 @@ impl Runner {
         let next = match self.chip.sleeps_until() {
             _ if self.pace.stopped.is_some() => now + LONGEST,
             _ if is_behind => now,
+            Some(next) if next <= self.chip.now() => now,
             Some(_) if is_busy => now + SLICE / 2,
             Some(next) => next.max(now + TOGETHER).min(now + LONGEST),
             None => now + TOGETHER,
