@@ -156,7 +156,7 @@ pub struct Clocks {
     pub is_external: bool,
 }
 
-/// Which alternate function each pin has, by port and number; [`Pin`] where it has none.
+/// Which alternate function each pin has, by port and number; `None` for a pin without.
 pub type Functions = [[Option<u8>; 16]; 11];
 
 /// What a model can know of the rest of the chip at an access.

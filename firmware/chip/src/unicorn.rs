@@ -1,13 +1,12 @@
 //! The binding to Unicorn, which emulates the instructions of a Cortex-M7: the only file with `unsafe`.
 //!
-//! Hooks on memory would tell more, but with them loads in IT blocks are executed wrongly (2.1.4).
-//!
 //! In: memory, registers, and a [`Handler`] that hears of accesses to devices, of the blocks of
 //! instructions that begin, and of the places that are watched. Out: why the core stopped. It knows no
 //! exceptions and no devices.
 //!
 //! The library (GPL-2.0) is loaded while a test runs, from the path in `CHIP_UNICORN`; nothing that is
 //! shipped links it. Names and numbers are those of unicorn/unicorn.h and unicorn/arm.h, 2.1.4.
+//! Hooks on memory are not used: with them that version executes loads in IT blocks wrongly.
 
 use std::cell::Cell;
 use std::ffi::{OsString, c_int, c_void};

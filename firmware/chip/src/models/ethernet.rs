@@ -28,18 +28,18 @@ const IER: u32 = 0x1134;
 const CSR: u32 = 0x1160;
 
 static REGISTERS: [Register; 24] = [
-    keeps(MACCR, "MACCR", 0, 0xF7FF_7F7F),
+    keeps(MACCR, "MACCR", 0, 0xFFFB_7F7F),
     keeps(MACPFR, "MACPFR", 0, 0x8031_07FF),
-    keeps(0x070, "MACQTXFCR", 0, 0xFFFF_00F2),
-    keeps(MDIOAR, "MACMDIOAR", 0, 0x07FF_7F1F),
+    keeps(0x070, "MACQTXFCR", 0, 0xFFFF_00F3),
+    keeps(MDIOAR, "MACMDIOAR", 0, 0x0FFF_7F1F),
     keeps(MDIODR, "MACMDIODR", 0, !0),
     keeps(MACA0HR, "MACA0HR", 0x8000_FFFF, 0xFFFF),
     keeps(MACA0LR, "MACA0LR", !0, !0),
     keeps(0x70C, "MMC_RX_INTERRUPT_MASK", 0, 0x0C02_0060),
     keeps(0x710, "MMC_TX_INTERRUPT_MASK", 0, 0x0C20_C000),
     keeps(0xD00, "MTLTXQOMR", 0x7_0008, 0x7_0073),
-    keeps(0xD30, "MTLRXQOMR", 0x70_0000, 0x007F_E0FB),
-    keeps(DMAMR, "DMAMR", 0, 0x7801),
+    keeps(0xD30, "MTLRXQOMR", 0x70_0000, 0x0071_C7FB),
+    keeps(DMAMR, "DMAMR", 0, 0x3_7803),
     keeps(0x1004, "DMASBMR", 0x0101_0000, 0xD001),
     keeps(TXCR, "DMACTXCR", 0, 0x3F_1011),
     keeps(RXCR, "DMACRXCR", 0, 0x803F_7FFF),

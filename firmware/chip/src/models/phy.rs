@@ -63,6 +63,11 @@ impl Phy {
         self.linked = Some(now + self.negotiation);
     }
 
+    /// What it offers its partner (register 4).
+    pub fn offer(&self) -> u16 {
+        self.offer
+    }
+
     /// Whether frames pass.
     pub fn is_up(&mut self, now: Picos) -> bool {
         self.look(now);

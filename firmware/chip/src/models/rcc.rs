@@ -24,8 +24,8 @@ const RESETS: std::ops::RangeInclusive<u32> = 0x7C..=0x9C;
 const ENABLES: std::ops::RangeInclusive<u32> = 0xD4..=0xF4;
 
 static REGISTERS: [Register; 34] = [
-    keeps(CR, "CR", 0x83, 0x150D_14BB),
-    keeps(CFGR, "CFGR", 0, 0xFFFF_BFC7),
+    keeps(CR, "CR", 0x83, 0x150D_129B),
+    keeps(CFGR, "CFGR", 0, 0xFFFC_FFC7),
     keeps(D1CFGR, "D1CFGR", 0, 0xF7F),
     keeps(D2CFGR, "D2CFGR", 0, 0x770),
     keeps(0x20, "D3CFGR", 0, 0x70),
@@ -35,9 +35,9 @@ static REGISTERS: [Register; 34] = [
     keeps(0x38, "PLL2DIVR", 0x0101_0280, 0x7F7F_FFFF),
     keeps(0x40, "PLL3DIVR", 0x0101_0280, 0x7F7F_FFFF),
     keeps(0x4C, "D1CCIPR", 0, 0x3001_0033),
-    keeps(D2CCIP1R, "D2CCIP1R", 0, 0xB137_7177),
-    keeps(D2CCIP2R, "D2CCIP2R", 0, 0x7070_33FF & !0xC00),
-    keeps(0x58, "D3CCIPR", 0, 0x77E3_FF07 & !0x3_0000),
+    keeps(D2CCIP1R, "D2CCIP1R", 0, 0xB137_71C7),
+    keeps(D2CCIP2R, "D2CCIP2R", 0, 0x70F0_333F),
+    keeps(0x58, "D3CCIPR", 0, 0x77E3_FF07),
     keeps(BDCR, "BDCR", 0, 0x1_837D),
     keeps(CSR, "CSR", 0, 1),
     keeps(0x7C, "AHB3RSTR", 0, 0x8001_5031),

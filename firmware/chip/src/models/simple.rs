@@ -16,11 +16,11 @@ const PWR_CR3: u32 = 0x0C;
 const PWR_CSR1: u32 = 0x04;
 const PWR_D3CR: u32 = 0x18;
 static PWR: [Register; 6] = [
-    keeps(0x00, "CR1", 0xF000_C000, 0xF_C3F1),
+    keeps(0x00, "CR1", 0xF000_C000, 0x7_C3F1),
     reads(PWR_CSR1, "CSR1", 0x4000),
     keeps(0x08, "CR2", 0, 0x11),
-    keeps(PWR_CR3, "CR3", 0x46, 0x0100_0307),
-    keeps(0x10, "CPUCR", 0, 0xA67),
+    keeps(PWR_CR3, "CR3", 0x46, 0x0300_0307),
+    keeps(0x10, "CPUCR", 0, 0xA07),
     keeps(PWR_D3CR, "D3CR", 0x4000, 0xC000),
 ];
 

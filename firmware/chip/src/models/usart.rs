@@ -80,7 +80,7 @@ pub struct Usart {
     sending: Option<(u8, Picos, Picos)>,
     /// When driver-enable falls.
     releases: Option<Picos>,
-    /// When the character that is being received has been sampled, and when it began.
+    /// When the character that is being received began.
     receiving: Option<Picos>,
     /// When the line counts as idle.
     idles: Option<Picos>,

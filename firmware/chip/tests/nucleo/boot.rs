@@ -74,6 +74,8 @@ fn it_boots_and_reaches_the_controller() {
         (400_000_000, 200_000_000, 100_000_000, 80_000_000)
     );
     assert!(!bench.has_logged("no 8 MHz"), "it runs on the external clock");
+    // The MAC is set to 100 Mbit/s full duplex, so nothing else may be agreed on.
+    assert_eq!(bench.chip.devices().ethernet.phy.offer(), 0x0101);
     // The link's LED, and no fault's.
     assert_eq!(bench.chip.devices().gpio[4].output(1), Some(true));
     assert_eq!(bench.chip.devices().gpio[1].output(14), Some(false));

@@ -7,6 +7,8 @@ use crate::boot::CELL;
 
 const FOR_EVER: [u8; 2] = [0xFE, 0xE7];
 const UNDEFINED: [u8; 2] = [0x00, 0xDE];
+/// cpsid i; b .
+const MASKED: [u8; 4] = [0x72, 0xB6, 0xFE, 0xE7];
 /// push {r4-r7, lr}, and again.
 const OVERFLOW: [u8; 4] = [0xF0, 0xB5, 0xFD, 0xE7];
 
@@ -51,6 +53,21 @@ fn a_task_that_hangs_is_named() {
     // And then it runs as ever.
     bench.run(10 * SECOND);
     assert_eq!(bench.chip.resets.len(), 1);
+}
+
+#[test]
+#[ignore = "needs CHIP_UNICORN and CHIP_ELF"]
+fn a_hang_without_interrupts_has_no_words_and_does_not_repeat_old_ones() {
+    let mut bench = Bench::new(CELL);
+    let broken = break_it(&mut bench, &FOR_EVER);
+    check_reset(&mut bench, broken);
+    bench.until_log("before the start: ", 100 * MILLI);
+    break_it(&mut bench, &MASKED);
+    bench.until("another reset", 6 * SECOND, |bench| bench.chip.resets.len() == 2);
+    bench.until_log("started again by the watchdog", 100 * MILLI);
+    bench.run(SECOND);
+    let told = bench.chip.log.iter().filter(|(_, line)| line.contains("before the start")).count();
+    assert_eq!(told, 1, "{}", bench.history());
 }
 
 #[test]
