@@ -17,6 +17,7 @@ pub mod led;
 pub mod link;
 pub mod mcan;
 mod notify;
+pub mod platform;
 pub mod serial;
 pub mod slcan;
 pub mod status;

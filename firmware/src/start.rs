@@ -14,13 +14,25 @@ use firmware::fmt::Text;
 use firmware::gateway::{Gateway, MAX_LINKS};
 use firmware::led::Condition;
 use firmware::link::{Buffers, Endpoint};
+use firmware::platform::{self, Feed as _, Lamp as _};
 use firmware::watchdog::{Pulse, TaskName};
 use firmware::{can, error, info, led, link, serial, warn, watchdog};
 use proto_core::config::{Bus, GatewayConfig, Network, image};
 use proto_core::engine::{LinkId, LinkKind, PortId};
 use static_cell::{ConstStaticCell, StaticCell};
 
-use crate::board::{self, Board, CanDevice, Ethernet, SerialDevice};
+use crate::board::Board;
+use firmware::platform::Board as _;
+
+// What the tasks are made for: none of them can be generic.
+type SerialDevice = <Board as platform::Board>::Serial;
+type CanDevice = <Board as platform::Board>::Can;
+type Ethernet = <Board as platform::Board>::Ethernet;
+type Watchdog = <Board as platform::Board>::Watchdog;
+type Led = <Board as platform::Board>::Led;
+const SERIAL_PORTS: usize = <Board as platform::Board>::SERIAL_PORTS;
+const CAN_PORTS: usize = <Board as platform::Board>::CAN_PORTS;
+const WATCHDOG_PERIOD: Duration = <Board as platform::Board>::WATCHDOG_PERIOD;
 
 /// Starts what the configuration asks for, and gives back what a board may start tasks of its own with.
 /// Without a configuration that can run, the buses stay silent and the log says why.
@@ -70,11 +82,11 @@ impl Tasks {
 /// Why nothing runs.
 #[derive(Debug, Clone, Copy)]
 enum Refused {
-    Storage(board::StorageError),
+    Storage(<Board as platform::Board>::StorageError),
     Image(image::ImageError),
     Build(proto_core::engine::BuildError),
     NoDevice { port: u8, bus: &'static str, available: usize },
-    Ethernet(board::EthernetError),
+    Ethernet(<Board as platform::Board>::EthernetError),
 }
 
 impl core::fmt::Display for Refused {
@@ -166,18 +178,18 @@ fn run(
     mut memory: &'static mut [u8],
 ) -> Result<(), Refused> {
     // All devices are claimed before anything moves.
-    let mut serial_ports: heapless::Vec<_, { board::SERIAL_PORTS }> = heapless::Vec::new();
-    let mut can_ports: heapless::Vec<_, { board::CAN_PORTS }> = heapless::Vec::new();
+    let mut serial_ports: heapless::Vec<_, SERIAL_PORTS> = heapless::Vec::new();
+    let mut can_ports: heapless::Vec<_, CAN_PORTS> = heapless::Vec::new();
     for (id, bus) in &wiring.ports {
         match bus {
             Bus::Rs485(settings) => {
                 let line = board.serial(settings);
-                let missing = Refused::NoDevice { port: id.0, bus: "RS-485", available: board::SERIAL_PORTS };
+                let missing = Refused::NoDevice { port: id.0, bus: "RS-485", available: SERIAL_PORTS };
                 let line = line.ok_or(missing)?;
                 let _ = serial_ports.push((*id, line, settings.baud));
             }
             Bus::Can { bitrate } => {
-                let missing = Refused::NoDevice { port: id.0, bus: "CAN", available: board::CAN_PORTS };
+                let missing = Refused::NoDevice { port: id.0, bus: "CAN", available: CAN_PORTS };
                 let _ = can_ports.push((*id, board.can(*bitrate).ok_or(missing)?));
             }
             Bus::TcpListen { .. } | Bus::UdpListen { .. } => {}
@@ -199,9 +211,9 @@ fn run(
         Fair::new(ethernet, gateway),
         network_config(wiring.network),
         resources,
-        board::seed(),
+        board.seed(),
     );
-    info!("stack: {} bytes while the engine was made", board::stack_used());
+    info!("stack: {} bytes while the engine was made", board.stack_used());
     tasks.spawn(TaskName::Network, |pulse| network(pulse, runner));
     tasks.spawn(TaskName::Address, |pulse| address(pulse, stack));
     for (id, kind, endpoint) in wiring.links {
@@ -224,8 +236,8 @@ fn network_config(own: Option<Network>) -> Config {
 
 /// Not watched: it is the one that feeds.
 #[embassy_executor::task]
-async fn feeder(watch: &'static Watch, mut dog: board::Watchdog) -> ! {
-    watchdog::run(watch, board::WATCHDOG_PERIOD, || dog.feed()).await
+async fn feeder(watch: &'static Watch, mut dog: Watchdog) -> ! {
+    watchdog::run(watch, WATCHDOG_PERIOD, || dog.feed()).await
 }
 
 #[embassy_executor::task]
@@ -233,7 +245,7 @@ async fn engine(pulse: &'static Pulse, gateway: &'static Gateway) -> ! {
     pulse.run(pin!(gateway.keep_time(pulse))).await
 }
 
-#[embassy_executor::task(pool_size = board::SERIAL_PORTS)]
+#[embassy_executor::task(pool_size = SERIAL_PORTS)]
 async fn serial_port(
     pulse: &'static Pulse,
     gateway: &'static Gateway,
@@ -244,7 +256,7 @@ async fn serial_port(
     pulse.run(pin!(serial::run(gateway, pulse, id, line, baud))).await
 }
 
-#[embassy_executor::task(pool_size = board::CAN_PORTS)]
+#[embassy_executor::task(pool_size = CAN_PORTS)]
 async fn can_port(pulse: &'static Pulse, gateway: &'static Gateway, id: PortId, device: CanDevice) -> ! {
     pulse.run(pin!(can::run(gateway, pulse, id, device))).await
 }
@@ -269,7 +281,7 @@ async fn network(pulse: &'static Pulse, mut runner: Runner<'static, Fair<'static
 }
 
 #[embassy_executor::task]
-async fn status_led(pulse: &'static Pulse, gateway: Option<&'static Gateway>, mut led: board::Led) -> ! {
+async fn status_led(pulse: &'static Pulse, gateway: Option<&'static Gateway>, mut led: Led) -> ! {
     let condition = || gateway.map_or(Condition::Refused, Gateway::condition);
     pulse.run(pin!(led::run(pulse, condition, |is_lit| led.set(is_lit)))).await
 }
@@ -315,4 +327,4 @@ const SOCKETS: usize = MAX_LINKS + 2;
 /// After this long the reason is told again.
 const REPEAT: Duration = Duration::from_secs(10);
 /// A task for each port and link, and: engine, network, address, status, LED, refused, the board's own.
-const MAX_TASKS: usize = board::SERIAL_PORTS + board::CAN_PORTS + MAX_LINKS + 7;
+const MAX_TASKS: usize = SERIAL_PORTS + CAN_PORTS + MAX_LINKS + 7;

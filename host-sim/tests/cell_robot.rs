@@ -207,3 +207,79 @@ fn a_safe_value_is_written_again_to_a_controller_that_was_without_power() {
         assert_good(&cell);
     }
 }
+
+#[test]
+fn another_stop_takes_the_place_that_is_free_beside_one_that_nobody_answered() {
+    let mut cell = watched(PANEL, None);
+    hold(&mut cell, 0, 500);
+    // The second connection is refused: both stops go over the first.
+    cell.refuse(LinkId::URGENT);
+    cell.reset(LinkId::URGENT);
+    cell.ails(Link::Command);
+    cell.controller_mut().mute(Link::Command);
+    hold(&mut cell, 2, 1_000);
+    hold(&mut cell, 0, 100);
+    cell.controller_mut().unmute(Link::Command);
+    // One reply for two of a kind.
+    hold(&mut cell, 2, 1_500);
+    let before = requests(&cell);
+    hold(&mut cell, 3, 1_600);
+    assert_eq!(requests(&cell), before + 1);
+    assert_good(&cell);
+}
+
+#[test]
+fn a_safe_value_gets_there_though_a_late_answer_shows_it_from_before() {
+    let gateway = include_str!("../src/soak/cells/witness.toml");
+    let controller = include_str!("../src/soak/cells/witness-controller.toml");
+    for offset in 0..20 {
+        let mut cell = watched(gateway, Some(controller));
+        let line = cell.line_of("device");
+        let send = |cell: &mut Cell, bits: u8, times: u32| {
+            for _ in 0..times {
+                cell.send(line, &[1, bits, 0, 4]);
+                cell.run_ms(50);
+            }
+        };
+        send(&mut cell, 128, 10);
+        cell.run_ms(offset * 30);
+        cell.send(line, &[1, 128, 0, 4]);
+        cell.ails(Link::Modbus);
+        cell.controller_mut().delay_answers(Link::Modbus, Duration::from_millis(480));
+        cell.run_ms(90);
+        send(&mut cell, 5, 1);
+        cell.cut_way(LinkId::RECIPE_UDP, Way::Up);
+        cell.run_ms(600);
+        cell.controller_mut().delay_answers(Link::Modbus, Duration::ZERO);
+        cell.recovers(Link::Modbus);
+        cell.mend_way(LinkId::RECIPE_UDP, Way::Up);
+        cell.run_ms(4_000);
+        assert_eq!(cell.value("DigitalOutputCommand[1]"), 128.0, "{offset}");
+        assert_good(&cell);
+    }
+}
+
+#[test]
+fn a_value_of_a_silent_owner_is_not_written_to_a_controller_that_began_anew() {
+    let toml = include_str!("../src/soak/cells/two-clients.toml");
+    let without: Vec<&str> = toml.lines().filter(|line| !line.starts_with("\"ForceEnd")).collect();
+    let controller = include_str!("../src/soak/cells/two-clients-controller.toml");
+    let mut cell = watched(&without.join("\n"), Some(controller));
+    let (line, bus) = (cell.line_of("sensor"), cell.bus_of("buttons"));
+    cell.send_can(bus, can(5, &[1, 1]));
+    cell.run_ms(20);
+    cell.send(line, &force_frame([7.5; 6]));
+    cell.run_ms(1_000);
+    assert_eq!(force(&cell), [7.5; 6]);
+    cell.power_cut();
+    cell.run_ms(2_000);
+    cell.power_up();
+    cell.run_ms(10_000);
+    cell.send_can(bus, can(5, &[3, 1]));
+    cell.run_ms(500);
+    assert_eq!(force(&cell), [0.0; 6], "nobody has measured since");
+    cell.send(line, &force_frame([2.5; 6]));
+    cell.run_ms(100);
+    assert_eq!(force(&cell), [2.5; 6]);
+    assert_good(&cell);
+}

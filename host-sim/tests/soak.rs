@@ -47,7 +47,7 @@ fn soaked(level: Level, seed: u64, span: Duration, jobs: usize) -> Total {
 /// What these seeds mean, on every machine. A change of what the engine, the controller or the cell
 /// does, or when, changes them: then the new ones belong here. Nothing else may.
 const HASHES: [(Level, u64); 2] =
-    [(Level::None, 0x07B4_CE1A_E349_6148), (Level::Harsh, 0xEB14_8B69_B805_DEF4)];
+    [(Level::None, 0xACBF_5417_418A_76DB), (Level::Harsh, 0xC29B_8A0D_F398_6191)];
 
 #[test]
 fn a_seed_means_the_same_trace_on_every_machine() {

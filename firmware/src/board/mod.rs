@@ -1,7 +1,7 @@
 //! The boards. Each names its pins, clocks and interrupts, and nobody else does.
 //!
-//! A board gives: `Board` with `configuration`, `serial`, `can`, `ethernet`, `watchdog` and `led`; the
-//! devices' types; how many there are; a seed; the watchdog's period, at least 4 s.
+//! A board gives `Board`, which is a [`firmware::platform::Board`], and `main`, which makes one and
+//! starts the tasks with it.
 
 #[cfg(feature = "board-mps2-an500")]
 mod mps2_an500;

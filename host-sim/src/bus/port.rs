@@ -80,9 +80,8 @@ impl Port {
             (PortBus::Serial(settings), _) => {
                 Driver::Line(Line::open(device, settings, Rc::clone(&tx)).await?)
             }
-            // The interface's bit rate is the administrator's business.
-            (PortBus::Can { .. }, Device::SocketCan { interface }) => {
-                Driver::Kernel(KernelCan::open(interface, Rc::clone(&tx))?)
+            (PortBus::Can { bitrate }, Device::SocketCan { interface }) => {
+                Driver::Kernel(KernelCan::open(interface, bitrate, Rc::clone(&tx))?)
             }
             (PortBus::Can { bitrate }, _) => {
                 Driver::Can(CanPort::open(device, bitrate, Rc::clone(&tx)).await?)
@@ -254,8 +253,16 @@ pub struct DeviceCounters {
     pub refusals: u64,
     /// Error frames: what a CAN interface told about itself and its bus.
     pub error_frames: u64,
+    /// Times a CAN interface told that it had lost frames that it had received.
+    pub overflows: u64,
     /// Times a CAN controller was started again after bus-off.
     pub restarts: u64,
+    /// A CAN controller's transmit error counter, as it was told last.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub tx_error_counter: Option<u8>,
+    /// Its receive error counter.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub rx_error_counter: Option<u8>,
     /// CAN FD frames, which no recipe takes.
     pub fd_frames: u64,
     /// A CAN controller's error state, where it is known: active, warning, passive or bus-off.

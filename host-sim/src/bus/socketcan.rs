@@ -6,6 +6,7 @@
 //! on the bus, so that a bus that nobody acknowledges holds one cycle's frames and not a queue of old
 //! ones.
 
+mod link;
 mod message;
 mod state;
 
@@ -18,14 +19,16 @@ use proto_core::engine::BusState;
 use proto_core::recipe::can::CanFrame;
 use proto_core::recipe::model::CanId;
 use proto_core::time::{Duration, Instant};
-use socketcan::{CanFdSocket, CanFilter, EmbeddedFrame, Socket, SocketOptions};
+use socketcan::{CanErrorFrame, CanFdSocket, CanFilter, EmbeddedFrame, Socket, SocketOptions};
 use tokio::io::Interest;
 use tracing::{debug, info, warn};
 
+use self::link::Link;
 use self::message::{Content, Message};
 use self::state::News;
 use super::backoff::Backoff;
-use super::port::{PortEvent, PortTx};
+use super::port::{DeviceCounters, PortEvent, PortTx};
+use super::quota::Quota;
 use super::reactor::register;
 use super::timer::{Timer, now};
 use super::turns::give_way;
@@ -34,15 +37,17 @@ use super::turns::give_way;
 #[derive(Debug)]
 pub(super) struct KernelCan {
     interface: String,
+    /// Bit/s, of the configuration.
+    bitrate: u32,
     ids: Option<Vec<CanId>>,
     tx: Rc<PortTx>,
 }
 
 impl KernelCan {
-    pub(super) fn open(interface: &str, tx: Rc<PortTx>) -> io::Result<Self> {
+    pub(super) fn open(interface: &str, bitrate: u32, tx: Rc<PortTx>) -> io::Result<Self> {
         // Only to say at once what is wrong; it may still be down.
         match CanFdSocket::open(interface) {
-            Ok(_) => Ok(Self { interface: interface.to_owned(), ids: None, tx }),
+            Ok(_) => Ok(Self { interface: interface.to_owned(), bitrate, ids: None, tx }),
             Err(error) => {
                 let why = match error.raw_os_error() {
                     Some(libc::EAFNOSUPPORT) => "this kernel has no CAN".to_owned(),
@@ -63,6 +68,19 @@ impl KernelCan {
         self.ids = Some(ids);
     }
 
+    /// The interface's bit rate is the administrator's business, but a mistake is worth a word.
+    fn compare_bitrates(&self) {
+        let (interface, configured) = (&self.interface, self.bitrate);
+        // A controller may not come nearer.
+        let tolerance = configured / 100;
+        match Link::of(interface).bitrate {
+            Some(bitrate) if bitrate.abs_diff(configured) > tolerance => {
+                warn!(interface, bitrate, configured, "the interface has another bit rate than the port");
+            }
+            _ => {}
+        }
+    }
+
     pub(super) async fn run(self, mut events: impl FnMut(PortEvent<'_>)) -> io::Result<()> {
         let interface = &self.interface;
         let mut backoff = Backoff::new(LEAST_PAUSE, MOST_PAUSE);
@@ -70,6 +88,7 @@ impl KernelCan {
             match Attached::new(&self) {
                 Ok(mut attached) => {
                     info!(interface, "up");
+                    self.compare_bitrates();
                     backoff.reset();
                     self.tx.frames.borrow_mut().clear();
                     self.tx.count(|counters| counters.ups += 1);
@@ -91,6 +110,9 @@ struct Attached<'a> {
     socket: CanFdSocket,
     timer: Timer,
     state: BusState,
+    /// Of each kind: a bus that is shorted changes its state many times a second.
+    off_lines: Quota,
+    passive_lines: Quota,
     /// Frames that the kernel took and did not give back yet.
     on_their_way: usize,
     /// [`Self::lost`] when the kernel took the first of them.
@@ -124,12 +146,15 @@ impl<'a> Attached<'a> {
         if let Some(error) = socket.as_raw_socket().take_error()? {
             return Err(error);
         }
-        let state = if has_carrier(&port.interface) { BusState::Active } else { BusState::BusOff };
+        // No longer those of the controller that was there before.
+        port.tx.count(|counters| (counters.tx_error_counter, counters.rx_error_counter) = (None, None));
         Ok(Self {
             port,
             socket,
             timer: Timer::new()?,
-            state,
+            state: Link::of(&port.interface).bus(),
+            off_lines: Quota::default(),
+            passive_lines: Quota::default(),
             on_their_way: 0,
             lost_before: 0,
             refused_since: None,
@@ -198,27 +223,41 @@ impl<'a> Attached<'a> {
                     counters.frames_in += 1;
                     counters.bytes_in += frame.data().len() as u64;
                 });
+                // Who hears is on the bus. Adapters with an old firmware tell in no other way.
+                if self.is_off() && !message.is_local && Link::of(&self.port.interface).has_carrier {
+                    self.enter(BusState::Active, events);
+                }
                 events(PortEvent::Frame { frame });
             }
-            Content::Error(frame) => {
-                tx.count(|counters| counters.error_frames += 1);
-                match state::news(frame) {
-                    News::Restarted => {
-                        tx.count(|counters| counters.restarts += 1);
-                        self.enter(BusState::Active, events);
-                    }
-                    // Some drivers tell a milder state before the controller was started again.
-                    News::State(state) if self.is_off() && !has_carrier(&self.port.interface) => {
-                        debug!(?state, "said while bus-off");
-                    }
-                    News::State(state) if state != self.state => self.enter(state, events),
-                    News::State(_) | News::Other => {}
-                }
-            }
+            Content::Error(frame) => self.take_error(frame, events),
             Content::Fd => tx.count(|counters| counters.fd_frames += 1),
             Content::Unknown => {}
         }
         Ok(())
+    }
+
+    fn take_error(&mut self, frame: CanErrorFrame, events: &mut impl FnMut(PortEvent<'_>)) {
+        let tx = &self.port.tx;
+        let told = state::counters(frame);
+        tx.count(|counters| {
+            counters.error_frames += 1;
+            counters.overflows += u64::from(state::is_overflow(frame));
+            if let Some((transmit, receive)) = told {
+                (counters.tx_error_counter, counters.rx_error_counter) = (Some(transmit), Some(receive));
+            }
+        });
+        match state::news(frame) {
+            News::Restarted => {
+                tx.count(|counters| counters.restarts += 1);
+                self.enter(BusState::Active, events);
+            }
+            // Some drivers tell a milder state before the controller was started again.
+            News::State(state) if self.is_off() && Link::of(&self.port.interface).is_off() => {
+                debug!(?state, "said while bus-off");
+            }
+            News::State(state) if state != self.state => self.enter(state, events),
+            News::State(_) | News::Other => {}
+        }
     }
 
     /// The controller's state is this from now on.
@@ -226,16 +265,27 @@ impl<'a> Attached<'a> {
         let interface = &self.port.interface;
         self.state = state;
         self.port.tx.count(|counters| counters.bus = state::name(state));
+        let DeviceCounters { tx_error_counter, rx_error_counter, .. } = self.port.tx.counters();
         match state {
             BusState::BusOff => {
-                warn!(interface, "bus-off: nothing is sent until it was restarted");
-                self.looks.reset();
-                self.look_at = now() + pause(self.looks.pause());
-                // What was under way will not leave, or would be old when it did.
-                self.on_their_way = 0;
-                self.give_up_queue();
+                if let Some(more) = self.off_lines.take(now()) {
+                    warn!(interface, more, "bus-off: nothing is sent until it was restarted");
+                }
+            }
+            BusState::Passive => {
+                if let Some(more) = self.passive_lines.take(now()) {
+                    let what = "error-passive: nobody acknowledges, bit rates differ, or the cable is bad";
+                    warn!(interface, more, tx_error_counter, rx_error_counter, "{what}");
+                }
             }
             _ => info!(interface, state = state::name(state), "bus state"),
+        }
+        if state == BusState::BusOff {
+            self.looks.reset();
+            self.look_at = now() + pause(self.looks.pause());
+            // What was under way will not leave, or would be old when it did.
+            self.on_their_way = 0;
+            self.give_up_queue();
         }
         events(PortEvent::Bus(state));
     }
@@ -315,8 +365,9 @@ impl<'a> Attached<'a> {
     fn look(&mut self, events: &mut impl FnMut(PortEvent<'_>)) -> io::Result<()> {
         if self.is_off() {
             self.look_at = now() + pause(self.looks.pause());
-            if has_carrier(&self.port.interface) {
-                self.enter(BusState::Active, events);
+            let link = Link::of(&self.port.interface);
+            if !link.is_off() {
+                self.enter(link.bus(), events);
             }
             return Ok(());
         }
@@ -378,12 +429,6 @@ fn kernel_frame(frame: &CanFrame) -> io::Result<socketcan::CanFrame> {
 /// tells when the former has some again.
 fn is_full(error: &io::Error) -> bool {
     matches!(error.raw_os_error(), Some(libc::ENOBUFS | libc::EAGAIN | libc::EINTR))
-}
-
-/// Whether the interface is not bus-off, as far as the system tells: drivers take the carrier away then.
-fn has_carrier(interface: &str) -> bool {
-    let told = std::fs::read_to_string(format!("/sys/class/net/{interface}/carrier"));
-    told.map_or(true, |told| told.trim() != "0")
 }
 
 fn pause(pause: StdDuration) -> Duration {

@@ -41,7 +41,7 @@ macro_rules! embedded {
 
 /// Their order is part of what a seed means. Some worked examples have a controller with a port of
 /// its own, where nobody would be: they get one without.
-const EMBEDDED: [Embedded; 10] = [
+const EMBEDDED: [Embedded; 11] = [
     embedded!("/configs/", "rs485-system", "can-hand"),
     embedded!("/configs/", "udp-server", "udp-server"),
     embedded!("/configs/", "client", "client"),
@@ -52,6 +52,7 @@ const EMBEDDED: [Embedded; 10] = [
     embedded!("/src/soak/cells/", "several-ports", "several-ports"),
     embedded!("/src/soak/cells/", "two-clients", "two-clients"),
     embedded!("/src/soak/cells/", "orders", "orders"),
+    embedded!("/src/soak/cells/", "witness", "witness"),
 ];
 
 impl Scenario {

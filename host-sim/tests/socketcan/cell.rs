@@ -51,23 +51,22 @@ pub(crate) fn example(name: &str) -> PathBuf {
 /// A program that runs until it is dropped, and what it says line by line.
 struct Background {
     child: Child,
-    lines: Arc<Mutex<Vec<String>>>,
+    lines: Lines,
+    errors: Lines,
 }
+
+type Lines = Arc<Mutex<Vec<String>>>;
 
 impl Background {
     #[track_caller]
     fn start(command: &mut Command) -> Self {
-        let child = command.stdin(Stdio::null()).stdout(Stdio::piped()).spawn();
+        let command = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+        let child = command.spawn();
         let mut child = child.unwrap_or_else(|error| panic!("{command:?}: {error}"));
-        let out = BufReader::new(child.stdout.take().unwrap());
-        let lines = Arc::<Mutex<Vec<String>>>::default();
-        let sink = Arc::clone(&lines);
-        std::thread::spawn(move || {
-            for line in out.lines().map_while(Result::ok) {
-                sink.lock().unwrap().push(line);
-            }
-        });
-        Self { child, lines }
+        let lines = collect(child.stdout.take().unwrap(), |_| {});
+        // Also shown: it may say why a test fails.
+        let errors = collect(child.stderr.take().unwrap(), |line| eprintln!("{line}"));
+        Self { child, lines, errors }
     }
 
     fn lines(&self) -> Vec<String> {
@@ -80,6 +79,19 @@ impl Drop for Background {
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
+}
+
+/// What comes, line by line, until the end.
+fn collect(from: impl Read + Send + 'static, show: fn(&str)) -> Lines {
+    let lines = Lines::default();
+    let sink = Arc::clone(&lines);
+    std::thread::spawn(move || {
+        for line in BufReader::new(from).lines().map_while(Result::ok) {
+            show(&line);
+            sink.lock().unwrap().push(line);
+        }
+    });
+    lines
 }
 
 /// A running `host-sim`.
@@ -148,6 +160,12 @@ impl Running {
         // The line after the next was begun after the call.
         until("statistics", || (self.program.lines.lock().unwrap().len() >= before + 2).then_some(()));
         self.stats("statistics", |_| true)
+    }
+
+    /// The lines of the log so far that have these words.
+    pub(crate) fn log(&self, words: &str) -> Vec<String> {
+        let errors = self.program.errors.lock().unwrap();
+        errors.iter().filter(|line| line.contains(words)).cloned().collect()
     }
 
     /// One command on port 2000.

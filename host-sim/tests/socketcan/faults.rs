@@ -64,6 +64,7 @@ fn bus_off() {
     reported("bus-off");
     let stats = gateway.fresh();
     assert_eq!(stats["ports"]["hand"]["bus_offs"], 1, "{stats}");
+    until("a warning", || gateway.log("bus-off: nothing is sent").pop());
     let sent = stats["ports"]["hand"]["frames_out"].as_u64();
     adapter.forget();
     // Told by the adapter, but the driver was not started again.

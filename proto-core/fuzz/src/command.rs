@@ -212,7 +212,7 @@ fn ask(client: &mut CommandClient, expected: &mut Client, now: u64, text: &[u8],
 
 fn hear(client: &mut CommandClient, expected: &mut Client, now: u64, chunk: &[u8]) {
     let word = |request: &Option<(String, u64)>| request.as_ref().map(|(word, _)| word.clone());
-    let words = [word(&expected.waiting), word(&expected.beside)];
+    let mut words = [word(&expected.waiting), word(&expected.beside)];
     let (mut rest, mut told) = (chunk, Vec::new());
     // What silence ends, and a timeout, take no bytes: one a text that was held.
     let mut free = 2 + 320;
@@ -230,6 +230,8 @@ fn hear(client: &mut CommandClient, expected: &mut Client, now: u64, chunk: &[u8
             ClientEvent::Reply { beside, kind, reply, text } => {
                 let word = words[usize::from(beside)].as_deref();
                 reply_again(word.expect("only a request is answered"), kind, &reply, text);
+                // What is left is the older one.
+                words = if beside { [words[0].take(), None] } else { [words[1].take(), None] };
                 Told::Reply(if beside { Turn::Beside } else { Turn::InTurn }, text.to_vec())
             }
         });

@@ -30,8 +30,9 @@ pub struct CommandClient {
     /// A request without a reply is given up after this long: 10 s. Powering on takes seconds,
     /// and its reply comes at its end.
     pub timeout: Duration,
+    /// The older of the requests in flight.
     waiting: Option<Waiting>,
-    /// The request that was sent without waiting for the reply to the other one.
+    /// The one that was sent without waiting for its reply.
     beside: Option<Waiting>,
     buffer: [u8; MAX_REPLY],
     len: usize,
@@ -43,7 +44,7 @@ pub struct CommandClient {
     dropped: u32,
 }
 
-/// The request in flight.
+/// A request in flight.
 #[derive(Debug, Clone, Copy)]
 struct Waiting {
     keyword: Keyword,
@@ -53,9 +54,10 @@ struct Waiting {
 /// What became of a request, or came unasked.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum ClientEvent<'a> {
-    /// The reply to the request in flight, which is over.
+    /// The reply to a request in flight, which is over.
     Reply {
-        /// Whether it is the one that [`CommandClient::start_beside`] sent.
+        /// Whether that was the younger of two; the younger one is the only one when the older has its
+        /// reply.
         beside: bool,
         /// What kind of answer it is.
         kind: ReplyKind,
@@ -119,12 +121,12 @@ impl CommandClient {
         }
     }
 
-    /// Whether a request is in flight, an urgent one beside it apart.
+    /// Whether a request is in flight.
     pub const fn busy(&self) -> bool {
         self.waiting.is_some()
     }
 
-    /// Whether an urgent request is in flight beside the other one.
+    /// Whether two requests are in flight: no other one can be sent.
     pub const fn busy_beside(&self) -> bool {
         self.beside.is_some()
     }
@@ -167,7 +169,7 @@ impl CommandClient {
         let len = request.encode(dialect, out).map_err(StartError::Encode)?;
         self.drop_handed_out();
         // What came before the request cannot be the beginning of its reply.
-        if self.beside.is_none() && !SCRIPT_FINISH.as_bytes().starts_with(self.received()) {
+        if !SCRIPT_FINISH.as_bytes().starts_with(self.received()) {
             self.len = 0;
         }
         self.waiting = Some(Waiting { keyword: request.keyword(), until: now + self.timeout });
@@ -177,10 +179,10 @@ impl CommandClient {
     /// Writes an urgent command without waiting for the reply to the one in flight. Replies are told
     /// apart by their keywords (D26); one that both could get is the older request's. Where that one is
     /// a keyword without anything behind it, a line feed ends it first: `resumestop` is no command (D2).
+    /// With nothing in flight this is [`start`](Self::start).
     ///
     /// # Errors
-    /// [`StartError`]; nothing has begun then. [`StartError::Busy`] when there is such a command
-    /// already.
+    /// [`StartError`]; nothing has begun then. [`StartError::Busy`] when two are in flight already.
     pub fn start_beside(
         &mut self,
         now: Instant,
@@ -191,8 +193,9 @@ impl CommandClient {
         if self.beside.is_some() {
             return Err(StartError::Busy);
         }
+        let Some(older) = self.waiting else { return self.start(now, text, dialect, out) };
         let request = Request::parse_strict(text).map_err(StartError::Command)?;
-        let is_open = self.waiting.is_some_and(|waiting| waiting.keyword.is_bare())
+        let is_open = older.keyword.is_bare()
             && (dialect.terminator, dialect.parentheses) == (Terminator::None, Parentheses::Omitted);
         let len = match out.split_first_mut() {
             Some((end, rest)) if is_open => {
@@ -356,7 +359,7 @@ impl CommandClient {
         let (Found::Reply { len, .. } | Found::ScriptFinish { len } | Found::Unsolicited { len }) = found;
         self.handed_out = len;
         let waiting = match found {
-            Found::Reply { beside: false, .. } => self.waiting.take(),
+            Found::Reply { beside: false, .. } => core::mem::replace(&mut self.waiting, self.beside.take()),
             Found::Reply { beside: true, .. } => self.beside.take(),
             _ => None,
         };

@@ -4,7 +4,6 @@ use core::fmt;
 
 use heapless::Vec;
 
-use super::Engine;
 use super::command_link::{CommandLink, MAX_COMMAND_BYTES, MAX_COMMAND_FIELDS};
 use super::counters::PortCounters;
 use super::field_port::{Codec, FieldPort, Line, ReplyCode};
@@ -18,6 +17,7 @@ use super::state_link::StateLink;
 use super::store::{InputFrame, MAX_INPUT_FRAMES, SafeBytes, Store};
 use super::uplink::Uplink;
 use super::user::{Bindings, InputBind};
+use super::{Ask, Engine};
 use crate::config::{
     Bus, ConfigError, FieldSpec, GatewayConfig, InputBinding, MAX_SAFE_VALUES, Parts, Port, Recipe, SendOn,
     Span, StreamPart,
@@ -110,6 +110,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             sleeps: 0,
             is_deaf: false,
             deaf_until: Instant::ZERO,
+            ask: Ask::ALL,
         }
     }
 
@@ -154,6 +155,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             sleeps,
             is_deaf,
             deaf_until,
+            ask,
         } = self;
         *store = Store::new();
         ports.clear();
@@ -175,6 +177,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         *sleeps = 0;
         *is_deaf = false;
         *deaf_until = Instant::ZERO;
+        *ask = Ask::ALL;
     }
 
     fn build(&mut self, config: &GatewayConfig) -> Result<(), BuildError> {

@@ -29,6 +29,10 @@ pub const COMMAND_QUEUE: usize = 8;
 const COMMAND_TTL: Duration = Duration::from_secs(1);
 /// Two losses of the second connection within this time: the controller takes only one (D26).
 const STRIKES_WITHIN: Duration = Duration::from_secs(10);
+/// A connection that is gone is open again by then, or another is given up for a stop.
+const OPEN_AGAIN: Duration = Duration::from_millis(500);
+/// Replies that are about to be told may make room for a stop that was just picked.
+const ROOM_WITHIN: Duration = Duration::from_millis(20);
 /// What is lost this soon after something else is lost for the same reason.
 const TOGETHER: Duration = Duration::from_secs(1);
 
@@ -68,10 +72,14 @@ pub(super) struct CommandLink {
     fields: Vec<CommandField, MAX_COMMAND_FIELDS>,
     queue: Deque<Waiting, COMMAND_QUEUE>,
     stops: Stops,
+    /// The frame that is being applied picked an urgent command.
+    stops_now: bool,
     /// The first so many of the queue were overtaken by an urgent command.
     overtaken: usize,
     /// When the second connection, or the first because of it, was lost last.
     struck_at: Option<Instant>,
+    /// Before this no connection is given up for a stop that has nowhere to go.
+    way_made_until: Instant,
 }
 
 impl Tables {
@@ -109,8 +117,10 @@ impl CommandLink {
             fields: Vec::new(),
             queue: Deque::new(),
             stops: Stops::new(),
+            stops_now: false,
             overtaken: 0,
             struck_at: None,
+            way_made_until: Instant::ZERO,
         })
     }
 
@@ -121,7 +131,8 @@ impl CommandLink {
         Some(index)
     }
 
-    /// An accepted frame brought a value of a command field. [`Self::drop_overtaken`] follows.
+    /// An accepted frame brought a value of a command field. [`Self::frame_ends`] and
+    /// [`Self::drop_overtaken`] follow.
     pub(super) fn value(
         &mut self,
         field: u8,
@@ -147,14 +158,22 @@ impl CommandLink {
         bump(&mut counters.commands);
         let waiting = Waiting { port, entry, field, since: now, nth: counters.commands };
         if keyword.is_urgent() {
-            self.overtaken = self.queue.len();
+            self.stops_now = true;
             self.stops.push(*keyword, waiting);
+            self.no_way_before(now + ROOM_WITHIN);
             *reply = ReplyCode::Pending;
         } else if self.ordinary.supervisor.is_up() && self.queue.push_back(waiting).is_ok() {
             *reply = ReplyCode::Pending;
         } else {
             bump(&mut counters.commands_dropped);
             *reply = ReplyCode::NotSent;
+        }
+    }
+
+    /// All fields of a frame were looked at: whatever their order, what stops overtakes the rest.
+    pub(super) fn frame_ends(&mut self) {
+        if core::mem::take(&mut self.stops_now) {
+            self.overtaken = self.queue.len();
         }
     }
 
@@ -249,6 +268,10 @@ impl CommandLink {
     fn lost(&mut self, link: LinkId, ports: &mut [FieldPort], now: Instant) {
         let Some(session) = self.session(link) else { return };
         let [first, beside] = session.lost();
+        if first.is_some() {
+            self.no_way_before(now + OPEN_AGAIN);
+        }
+        // Of two of a kind the newer one is sent again: its outcome is the one that is shown.
         for sent in [beside, first].into_iter().flatten() {
             if sent.keyword.is_urgent() && self.is_asked(&sent.command) {
                 self.stops.push_again(sent.keyword, Waiting { since: now, ..sent.command });
@@ -261,6 +284,10 @@ impl CommandLink {
                 drop_one(ports, waiting);
             }
         }
+    }
+
+    fn no_way_before(&mut self, at: Instant) {
+        self.way_made_until = self.way_made_until.max(at);
     }
 
     /// The gateway itself slept: nothing is commanded from what was asked before.
@@ -311,6 +338,15 @@ impl CommandLink {
                 session.supervisor.give_up(now);
                 self.lost(link, ports, now);
             }
+        }
+        if let Some((link, at)) = self.crowded()
+            && now >= at
+        {
+            // Nobody answers there: it is open again sooner than a reply can be hoped for.
+            if let Some(session) = self.session(link) {
+                session.supervisor.give_up(now);
+            }
+            self.lost(link, ports, now);
         }
         // What becomes of the first may open the second at once.
         for link in [LinkId::COMMAND, LinkId::URGENT] {
@@ -377,6 +413,11 @@ impl CommandLink {
         self.send(LinkId::COMMAND, (keyword, waiting), ports, out, (now, until))
     }
 
+    /// Whether an urgent command waits.
+    pub(super) fn has_stops(&self) -> bool {
+        !self.stops.is_empty()
+    }
+
     /// Where an urgent command can go now.
     fn way_of_stops(&self) -> Option<LinkId> {
         if self.stops.is_empty() {
@@ -392,13 +433,28 @@ impl CommandLink {
     /// controller has done anything with that one is not known.
     fn pop_stop(&mut self, now: Instant) -> Option<(Keyword, Waiting)> {
         let sessions = [Some(&self.ordinary), self.urgent.as_ref()];
-        let under_way = |keyword| {
-            let same = |sent: &Option<Sent>| {
-                sent.is_some_and(|sent| sent.keyword == keyword && now < sent.at + STOP_TTL)
-            };
-            sessions.into_iter().flatten().any(|session| same(&session.in_flight) || same(&session.beside))
-        };
-        self.stops.pop(|keyword| !under_way(keyword))
+        self.stops.pop(|keyword| may_go_at(sessions, keyword) <= now)
+    }
+
+    /// When one of the urgent commands that wait may go, its way apart.
+    fn stop_may_go_at(&self) -> Instant {
+        let sessions = [Some(&self.ordinary), self.urgent.as_ref()];
+        self.stops.kinds().map(|keyword| may_go_at(sessions, keyword)).min().unwrap_or(Instant::NEVER)
+    }
+
+    /// Where an urgent command waits for nothing but replies, and when it has done so for long enough:
+    /// the connection whose newest one has been unanswered for longest.
+    fn crowded(&self) -> Option<(LinkId, Instant)> {
+        let has_room = self.ordinary.supervisor.is_up() && self.ordinary.beside.is_none();
+        if has_room || self.stops.is_empty() || self.way_of_stops().is_some() {
+            return None;
+        }
+        // Nothing is under way on a connection that is not up.
+        let urgent = self.urgent.as_ref().and_then(|session| session.in_flight);
+        let urgent = urgent.map(|sent| (LinkId::URGENT, sent.at));
+        let ordinary = self.ordinary.beside.map(|sent| (LinkId::COMMAND, sent.at));
+        let (link, at) = urgent.into_iter().chain(ordinary).min_by_key(|&(_, at)| at)?;
+        Some((link, (at + STOP_TTL).max(self.stop_may_go_at()).max(self.way_made_until)))
     }
 
     fn send(
@@ -445,8 +501,20 @@ impl CommandLink {
         let sessions = [Some(&self.ordinary), self.urgent.as_ref()].into_iter().flatten();
         let own = sessions.map(|session| session.deadline().min(session.supervisor.deadline()));
         let waiting = self.queue.front().map_or(Instant::NEVER, |waiting| waiting.since + COMMAND_TTL);
-        let stops = self.stops.deadline(|waiting| self.is_asked(waiting));
+        let stops = match self.stops.is_empty() {
+            true => Instant::NEVER,
+            false => self.stops_deadline(),
+        };
         own.min().unwrap_or(Instant::NEVER).min(waiting).min(stops)
+    }
+
+    #[inline(never)]
+    fn stops_deadline(&self) -> Instant {
+        let goes_at = match self.way_of_stops() {
+            Some(_) => self.stop_may_go_at(),
+            None => self.crowded().map_or(Instant::NEVER, |(_, at)| at),
+        };
+        goes_at.min(self.stops.deadline(|waiting| self.is_asked(waiting)))
     }
 
     fn session(&mut self, link: LinkId) -> Option<&mut Session> {
@@ -479,6 +547,13 @@ impl CommandLink {
             }
         }
     }
+}
+
+/// When an urgent command may be sent though one of its kind is unanswered.
+fn may_go_at(sessions: [Option<&Session>; 2], keyword: Keyword) -> Instant {
+    let sent = sessions.into_iter().flatten().flat_map(|session| [session.in_flight, session.beside]);
+    let same = sent.flatten().filter(|sent| sent.keyword == keyword);
+    same.map(|sent| sent.at + STOP_TTL).max().unwrap_or(Instant::ZERO)
 }
 
 fn is_asked(fields: &[CommandField], tables: &Tables, waiting: &Waiting) -> bool {

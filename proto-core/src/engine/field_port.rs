@@ -360,6 +360,9 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
                 for (binding, value) in bindings.iter().zip(layout.values(payload)) {
                     self.apply_user(binding, value);
                 }
+                if let Some(link) = self.commands {
+                    link.frame_ends();
+                }
             }
         }
         bump(&mut self.counters.frames_in);

@@ -275,6 +275,11 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
         link.next_command(ports, out, now).map(|len| (LinkId::COMMAND, len))
     }
 
+    /// Whether what stops the robot waits.
+    pub(super) fn has_stops(&self) -> bool {
+        self.command.as_ref().is_some_and(CommandLink::has_stops)
+    }
+
     /// Links to be opened and closed.
     pub(super) fn next_action(&mut self) -> Option<(LinkId, LinkAction)> {
         if let Some(link) = &mut self.command {

@@ -55,6 +55,7 @@ use user::{Bindings, forget_commands};
 use crate::config::MAX_SAFE_VALUES;
 use crate::image::Image;
 use crate::link::LinkAction;
+use crate::recipe::can::CanFrame;
 use crate::recipe::model::MAX_STREAM_FRAME;
 use crate::time::{Duration, Instant};
 
@@ -107,6 +108,24 @@ pub struct Engine<const PORTS: usize = 8, const UPLINKS: usize = 4, const FIELDS
     /// What arrives on field ports waited while the gateway slept.
     is_deaf: bool,
     deaf_until: Instant,
+    /// Whom [`Engine::poll_output`] asks before it sleeps.
+    ask: Ask,
+}
+
+/// Who may have something to say. Who had nothing is not asked again until something happens to it, a
+/// deadline comes, or the next beat.
+#[derive(Debug, Clone, Copy)]
+struct Ask {
+    /// Links, for something to send.
+    links: bool,
+    /// Links, whether they are to be opened or closed.
+    actions: bool,
+    /// Ports, for something to send.
+    ports: bool,
+}
+
+impl Ask {
+    const ALL: Self = Self { links: true, actions: true, ports: true };
 }
 
 impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS, UPLINKS, FIELDS> {
@@ -119,89 +138,34 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         self.is_late = now >= self.announced;
         // Whatever happens may set an earlier deadline; what it makes later is found out in time.
         match input {
-            Input::PortBytes { port: id, bytes } => {
-                let look = self.look();
-                if let Some(port) = find_port(&mut self.ports, id) {
-                    if self.is_deaf {
-                        return port.discard(bytes, now);
-                    }
-                    port.heard(bytes, now);
-                }
-                let mut rest = bytes;
-                loop {
-                    let (store, command) = (&mut self.store, &mut self.links.command);
-                    let Some(port) = find_port(&mut self.ports, id) else { return };
-                    let accepted = port.frames(&mut rest, look, &self.bindings.inputs, store, command, now);
-                    let deadline = port.deadline();
-                    self.arm(deadline);
-                    self.after_field(id, &accepted, now);
-                    if rest.is_empty() {
-                        return;
-                    }
-                }
-            }
-            Input::PortCan { port: id, frame } => {
-                let (store, command) = (&mut self.store, &mut self.links.command);
-                let Some(port) = find_port(&mut self.ports, id) else { return };
-                if self.is_deaf {
-                    return port.discard(frame.data(), now);
-                }
-                let accepted = port.can(&frame, &self.bindings.inputs, store, command, now);
-                let deadline = port.deadline();
-                self.arm(deadline);
-                self.after_field(id, &accepted, now);
-            }
+            Input::PortBytes { port, bytes } => self.port_bytes(port, bytes, now),
+            Input::PortCan { port, frame } => self.port_can(port, &frame, now),
             Input::PortSent { port } => self.change_port(port, |port| port.sender.sent()),
             Input::PortUp { port } => self.change_port(port, FieldPort::up),
-            Input::PortDown { port: id } => {
-                let Some(port) = find_port(&mut self.ports, id) else { return };
-                port.down(&self.bindings.inputs, &mut self.links.command, now);
-                self.drop_forgotten();
-            }
-            Input::PortBus { port: id, state } => {
-                let Some(port) = find_port(&mut self.ports, id) else { return };
-                port.bus_state(state, &self.bindings.inputs, &mut self.links.command, now);
-                let deadline = port.deadline();
-                self.arm(deadline);
-                self.drop_forgotten();
-            }
-            Input::LinkUp { link } => {
-                self.links.up(link, &mut self.store, now);
-                self.arm(self.links.deadline_of(link));
-            }
-            Input::LinkDown { link } => {
-                self.links.down(link, &mut self.store, &mut self.ports, now);
-                self.count_lost();
-                self.arm(self.links.deadline_of(link));
-            }
-            Input::LinkBytes { link, bytes } => {
-                let look = self.look();
-                let mut rest = bytes;
-                loop {
-                    self.links.bytes(link, &mut rest, look, &mut self.store, &mut self.ports, now);
-                    self.count_lost();
-                    self.arm(self.links.deadline_of(link));
-                    self.image_changed();
-                    if rest.is_empty() {
-                        return;
-                    }
-                }
-            }
+            Input::PortDown { port } => self.port_down(port, now),
+            Input::PortBus { port, state } => self.port_bus(port, state, now),
+            Input::LinkUp { link } => self.link_up(link, now),
+            Input::LinkDown { link } => self.link_down(link, now),
+            Input::LinkBytes { link, bytes } => self.link_bytes(link, bytes, now),
             Input::LinkSent { link } => {
                 let deadline = self.links.sent(link);
+                self.ask.links = true;
                 self.arm(deadline);
             }
             Input::LinkAcked { link, left } => {
                 self.links.acked(link, left);
+                self.ask.links = true;
                 self.arm(self.links.deadline_of(link));
             }
-            Input::Tick => {
-                (self.is_late, self.announced) = (false, Instant::NEVER);
-                self.is_deaf &= now < self.deaf_until;
-                if now >= self.timer_at {
-                    self.advance(now);
-                }
-            }
+            Input::Tick => self.tick(now),
+        }
+    }
+
+    fn tick(&mut self, now: Instant) {
+        (self.is_late, self.announced) = (false, Instant::NEVER);
+        self.is_deaf &= now < self.deaf_until;
+        if now >= self.timer_at {
+            self.advance(now);
         }
     }
 
@@ -210,41 +174,61 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     ///
     /// What stops the robot comes first, then what brings field values to the controller, then what
     /// keeps links up, then what goes to the field.
+    // In a driver's loop, the addresses of all that it may need would be worked out before each pass.
+    #[inline(never)]
     pub fn poll_output<'b>(&mut self, now: Instant, buf: &'b mut [u8; OUTPUT_BUFFER]) -> Output<'b> {
-        let now = now.min(LAST).max(self.now);
-        if !self.is_late
-            && let Some((link, len)) =
-                self.links.next_upward(&mut self.store, &mut self.ports, &mut buf[..], now)
-        {
-            self.arm(self.links.deadline_of(link));
-            return Output::LinkSend { link, bytes: buf.get(..len).unwrap_or(&[]) };
+        let now = self.forward(now);
+        if now >= self.timer_at {
+            self.ask = Ask::ALL;
         }
-        if let Some((link, action)) = self.links.next_action() {
-            return match action {
-                LinkAction::Open => Output::LinkOpen { link },
-                LinkAction::Close => Output::LinkClose { link },
-            };
-        }
-        let downward = if self.is_late { None } else { self.next_downward(&mut buf[..], now) };
-        match downward {
-            Some((port, Downward::Bytes(len))) => {
-                Output::PortSend { port, bytes: buf.get(..len).unwrap_or(&[]) }
+        if self.ask.links && !self.is_late {
+            // To send a command, a connection may have to be closed.
+            self.ask.actions |= self.links.command.is_some();
+            let upward = self.links.next_upward(&mut self.store, &mut self.ports, &mut buf[..], now);
+            if let Some((link, len)) = upward {
+                self.arm(self.links.deadline_of(link));
+                return Output::LinkSend { link, bytes: buf.get(..len).unwrap_or(&[]) };
             }
-            Some((port, Downward::Can(frame))) => Output::PortSendCan { port, frame },
-            None => {
-                if self.rearm {
-                    self.rearm = false;
-                    self.timer_at = self.deadline();
+            // Whether one of these may go depends on the time, and no deadline says so.
+            self.ask.links = self.links.has_stops();
+        }
+        if self.ask.actions {
+            if let Some((link, action)) = self.links.next_action() {
+                return match action {
+                    LinkAction::Open => Output::LinkOpen { link },
+                    LinkAction::Close => Output::LinkClose { link },
+                };
+            }
+            self.ask.actions = false;
+        }
+        if self.ask.ports && !self.is_late {
+            match self.next_downward(&mut buf[..], now) {
+                Some((port, Downward::Bytes(len))) => {
+                    return Output::PortSend { port, bytes: buf.get(..len).unwrap_or(&[]) };
                 }
-                let beat_at = if self.ports.is_empty() { Instant::NEVER } else { self.beat_at };
-                let until = self.timer_at.min(beat_at);
-                if until == Instant::NEVER {
-                    return Output::Sleep { until };
-                }
-                self.announced = self.announced.min(until);
-                Output::Sleep { until: self.announced }
+                Some((port, Downward::Can(frame))) => return Output::PortSendCan { port, frame },
+                None => self.ask.ports = false,
             }
         }
+        debug_assert!(self.is_late || self.all_are_silent(&mut buf[..], now), "who was not asked speaks");
+        if self.rearm {
+            self.rearm = false;
+            self.timer_at = self.deadline();
+        }
+        let beat_at = if self.ports.is_empty() { Instant::NEVER } else { self.beat_at };
+        let until = self.timer_at.min(beat_at);
+        if until == Instant::NEVER {
+            return Output::Sleep { until };
+        }
+        self.announced = self.announced.min(until);
+        Output::Sleep { until: self.announced }
+    }
+
+    /// Whether who is not asked has nothing to say.
+    fn all_are_silent(&mut self, out: &mut [u8], now: Instant) -> bool {
+        self.links.next_upward(&mut self.store, &mut self.ports, out, now).is_none()
+            && self.links.next_action().is_none()
+            && self.next_downward(out, now).is_none()
     }
 
     /// When the engine has something to do by itself, worked out anew. [`Output::Sleep`] may name an
@@ -256,22 +240,119 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         ports.min(self.links.deadline()).min(self.store.deadline()).min(hears_at)
     }
 
+    // What an input does is a function of its own, so that no other pays for the registers it needs.
+    #[inline(never)]
+    fn port_bytes(&mut self, id: PortId, bytes: &[u8], now: Instant) {
+        let look = self.look();
+        if let Some(port) = find_port(&mut self.ports, id) {
+            if self.is_deaf {
+                return port.discard(bytes, now);
+            }
+            port.heard(bytes, now);
+        }
+        let mut rest = bytes;
+        loop {
+            let (store, command) = (&mut self.store, &mut self.links.command);
+            let Some(port) = find_port(&mut self.ports, id) else { return };
+            let accepted = port.frames(&mut rest, look, &self.bindings.inputs, store, command, now);
+            self.ask.ports |= port.sender.is_due();
+            let deadline = port.deadline();
+            self.arm(deadline);
+            self.after_field(id, &accepted, now);
+            if rest.is_empty() {
+                return;
+            }
+        }
+    }
+
+    #[inline(never)]
+    fn port_can(&mut self, id: PortId, frame: &CanFrame, now: Instant) {
+        let (store, command) = (&mut self.store, &mut self.links.command);
+        let Some(port) = find_port(&mut self.ports, id) else { return };
+        if self.is_deaf {
+            return port.discard(frame.data(), now);
+        }
+        let accepted = port.can(frame, &self.bindings.inputs, store, command, now);
+        self.ask.ports |= port.sender.is_due();
+        let deadline = port.deadline();
+        self.arm(deadline);
+        self.after_field(id, &accepted, now);
+    }
+
+    #[cold]
+    fn port_down(&mut self, id: PortId, now: Instant) {
+        let Some(port) = find_port(&mut self.ports, id) else { return };
+        self.ask = Ask::ALL;
+        port.down(&self.bindings.inputs, &mut self.links.command, now);
+        self.drop_forgotten();
+    }
+
+    #[cold]
+    fn port_bus(&mut self, id: PortId, state: BusState, now: Instant) {
+        let Some(port) = find_port(&mut self.ports, id) else { return };
+        self.ask = Ask::ALL;
+        port.bus_state(state, &self.bindings.inputs, &mut self.links.command, now);
+        let deadline = port.deadline();
+        self.arm(deadline);
+        self.drop_forgotten();
+    }
+
+    #[cold]
+    fn link_up(&mut self, link: LinkId, now: Instant) {
+        self.links.up(link, &mut self.store, now);
+        self.arm_link(link);
+    }
+
+    #[cold]
+    fn link_down(&mut self, link: LinkId, now: Instant) {
+        self.links.down(link, &mut self.store, &mut self.ports, now);
+        self.count_lost();
+        self.arm_link(link);
+    }
+
+    #[inline(never)]
+    fn link_bytes(&mut self, link: LinkId, bytes: &[u8], now: Instant) {
+        let look = self.look();
+        let mut rest = bytes;
+        loop {
+            self.links.bytes(link, &mut rest, look, &mut self.store, &mut self.ports, now);
+            self.count_lost();
+            self.arm_link(link);
+            self.image_changed();
+            if rest.is_empty() {
+                return;
+            }
+        }
+    }
+
     /// The present, and whether the gateway has slept until now.
     fn present(&mut self, now: Instant) -> Instant {
-        let now = now.min(LAST).max(self.now);
+        let now = self.forward(now);
         if now >= self.beat_at {
             // A configured engine is called at every beat; before the first call nothing was late.
             if self.now != Instant::ZERO && now.saturating_since(self.now) > ASLEEP {
                 self.wake(now);
             }
             self.beat_at = now + HEARTBEAT;
+            self.ask = Ask::ALL;
         }
         self.now = now;
         now
     }
 
+    /// `now`, but no earlier than was told before, and no later than the clock's last instant.
+    fn forward(&self, now: Instant) -> Instant {
+        if now < self.now || now > LAST { self.clamped(now) } else { now }
+    }
+
+    #[cold]
+    fn clamped(&self, now: Instant) -> Instant {
+        now.min(LAST).max(self.now)
+    }
+
     /// The gateway itself slept: what waits for it is as old as that. Overdue safe values go first,
     /// nothing is commanded, and every connection begins anew.
+    #[cold]
     fn wake(&mut self, now: Instant) {
         self.sleeps = self.sleeps.wrapping_add(1);
         // Before deadlines pass: one of them may be to open a link that has been down.
@@ -352,9 +433,16 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         }
     }
 
+    /// Something happened on a link that may change its deadline, or close it.
+    fn arm_link(&mut self, link: LinkId) {
+        (self.ask.links, self.ask.actions) = (true, true);
+        self.arm(self.links.deadline_of(link));
+    }
+
     fn change_port(&mut self, id: PortId, change: impl FnOnce(&mut FieldPort)) {
         if let Some(port) = find_port(&mut self.ports, id) {
             change(port);
+            self.ask.ports = true;
             let deadline = port.deadline();
             self.arm(deadline);
         }
@@ -364,6 +452,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     fn advance(&mut self, now: Instant) {
         // At one instant the clock is looked at once: what is done now is due later.
         self.timer_at = now + Duration::from_micros(1);
+        self.ask = Ask::ALL;
         self.rearm = true;
         self.expire_frames(now);
         for index in 0..self.ports.len() {
@@ -418,6 +507,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         if accepted.frames == 0 {
             return;
         }
+        self.ask.links = true;
         let deadline = self.store.deadline();
         if deadline <= now {
             self.expire_waiting(now);
@@ -451,6 +541,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         if !self.watches_bits {
             return;
         }
+        self.ask.ports = true;
         let mut first = Instant::NEVER;
         for port in &mut self.ports {
             let usable = port.is_usable();

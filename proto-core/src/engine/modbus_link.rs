@@ -169,6 +169,7 @@ impl ModbusLink {
     }
 
     /// Bytes from the controller.
+    #[inline(never)]
     pub(super) fn bytes<const PORTS: usize>(&mut self, bytes: &[u8], store: &mut Store<PORTS>, now: Instant) {
         self.supervisor.heard(now);
         add(&mut self.counters.bytes_in, bytes.len());
@@ -398,6 +399,7 @@ fn take_poll<const PORTS: usize>(
         }
     }
     store.image.stamp(block.group, now);
+    store.doubt_by_witnesses(now);
 }
 
 fn bits_at(coils: Coils<'_>, first: u16, count: u16, block: &Block) -> Option<Scalar> {

@@ -35,7 +35,7 @@ pub(super) struct Session {
     pub supervisor: Supervisor,
     pub counters: LinkCounters,
     client: CommandClient,
-    /// The command whose reply is waited for, and an urgent one that did not wait for that.
+    /// The command whose reply is waited for, and a younger, urgent one that did not wait for that.
     pub in_flight: Option<Sent>,
     pub beside: Option<Sent>,
     /// The transport has not taken the newest command yet.
@@ -58,7 +58,7 @@ impl Session {
 
     /// Whether a command can be sent, one that waits for the reply before.
     pub(super) fn is_free(&self) -> bool {
-        self.supervisor.is_up() && !self.unsent && !self.client.busy() && !self.client.busy_beside()
+        self.supervisor.is_up() && !self.unsent && !self.client.busy()
     }
 
     /// Whether an urgent command can be sent, whatever is unanswered.
@@ -159,8 +159,11 @@ impl Session {
             ReplyKind::Fail => ReplyCode::Fail,
             _ => ReplyCode::Other,
         };
-        let sent = if beside { self.beside.take() } else { self.in_flight.take() };
-        if self.in_flight.is_none() && self.beside.is_none() {
+        let sent = match beside {
+            true => self.beside.take(),
+            false => core::mem::replace(&mut self.in_flight, self.beside.take()),
+        };
+        if self.in_flight.is_none() {
             self.flight.answered();
         }
         let Some(sent) = sent else { return Some(Event::Other) };

@@ -46,6 +46,7 @@ impl StateLink {
     }
 
     /// Bytes from the controller; those that are left when somebody looks at each packet.
+    #[inline(never)]
     pub(super) fn bytes<'b, const PORTS: usize>(
         &mut self,
         bytes: &'b [u8],
@@ -80,6 +81,7 @@ impl StateLink {
                     if !store.safe.is_empty() {
                         compare_safe(&view, store, now);
                     }
+                    store.heard(now);
                     store.image.stamp(self.group, now);
                     if look == Look::AtEach {
                         // They are counted when they are taken.
@@ -104,10 +106,11 @@ impl StateLink {
 fn compare_safe<const PORTS: usize>(view: &StateView<'_>, store: &mut Store<PORTS>, now: Instant) {
     let (may_confirm, may_doubt) = (store.may_confirm(now), store.may_doubt(now));
     for var in store.safe.iter() {
-        let is_shown = view.read_var(var) == Some(store.image.value(var));
+        let Some(shown) = view.read_var(var) else { continue };
+        let is_there = shown == store.image.value(var);
         match store.unconfirmed.contains(var) {
-            true if is_shown && may_confirm => store.confirm(&InputSet::from_iter([var]), now),
-            false if !is_shown && may_doubt => store.doubt(var),
+            true if is_there && may_confirm => store.confirm(&InputSet::from_iter([var]), now),
+            false if !is_there && may_doubt => store.doubt(var),
             _ => {}
         }
     }

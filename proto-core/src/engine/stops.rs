@@ -51,17 +51,29 @@ impl Stops {
         }
     }
 
-    /// One that was under way is to be sent again, before the others.
+    /// One that was under way is to be sent again, behind those that have not been sent yet.
     pub(super) fn push_again(&mut self, keyword: Keyword, command: Waiting) {
         if !self.0.iter().any(|other| other.0 == keyword && other.1.port == command.port) {
-            let _ = self.0.insert(0, (keyword, command));
+            let _ = self.0.push((keyword, command));
         }
+    }
+
+    /// What kinds wait.
+    pub(super) fn kinds(&self) -> impl Iterator<Item = Keyword> + '_ {
+        self.0.iter().map(|(keyword, _)| *keyword)
     }
 
     /// Takes out the first of a kind that may go now.
     pub(super) fn pop(&mut self, may_go: impl Fn(Keyword) -> bool) -> Option<(Keyword, Waiting)> {
-        let nth = self.0.iter().position(|(keyword, _)| may_go(*keyword))?;
-        Some(self.0.remove(nth))
+        let mut first = None;
+        self.0.retain(|stop| {
+            let goes = first.is_none() && may_go(stop.0);
+            if goes {
+                first = Some(*stop);
+            }
+            !goes
+        });
+        first
     }
 
     /// The field does not ask any more.

@@ -65,6 +65,12 @@ pub(super) struct Store<const PORTS: usize> {
     pub unanswered: InputSet,
     /// Variables that the state stream has brought since their owner fell silent, or ever.
     pub read_back: InputSet,
+    /// Variables whose owner fell silent before its last value was handed over.
+    pub unsent: InputSet,
+    /// When anything that the controller sends steadily came last: a state packet, a recipe link's frame.
+    heard_at: Option<Instant>,
+    /// How often it came after a gap, wrapping: another controller may have been there before.
+    pub era: u32,
     /// Variables whose link is up.
     pub reachable: InputSet,
     /// Values dropped with a link, a port.
@@ -90,6 +96,9 @@ impl<const PORTS: usize> Store<PORTS> {
             confirmed_at: Instant::ZERO,
             unanswered: InputSet::EMPTY,
             read_back: InputSet::EMPTY,
+            unsent: InputSet::EMPTY,
+            heard_at: None,
+            era: 0,
             reachable: InputSet::EMPTY,
             lost: [0; PORTS],
             has_lost: false,
@@ -146,7 +155,12 @@ impl<const PORTS: usize> Store<PORTS> {
         let mut dropped = 0_usize;
         for var in frame.set.iter() {
             let Some(value) = safe.iter().find(|safe| safe.var == var) else {
-                dropped = dropped.saturating_add(self.outbox.forget(queue, &InputSet::from_iter([var])));
+                let waited = self.outbox.forget(queue, &InputSet::from_iter([var]));
+                dropped = dropped.saturating_add(waited);
+                match waited {
+                    0 => self.unsent.remove(var),
+                    _ => self.unsent.insert(var),
+                }
                 self.live.remove(var);
                 self.read_back.remove(var);
                 continue;
@@ -244,12 +258,40 @@ impl<const PORTS: usize> Store<PORTS> {
         now < self.confirmed_at + DOUBT
     }
 
+    /// Outputs that came just now show another value than the safe one.
+    pub(super) fn doubt_by_witnesses(&mut self, now: Instant) {
+        if !self.may_doubt(now) {
+            return;
+        }
+        for var in self.safe.minus(&self.unconfirmed).and(&InputSet::BYTES).iter() {
+            if let Some(witness) = var.shown_by()
+                && self.image.known_since(witness) == Some(now)
+                && self.image.value(witness) != self.image.value(var)
+            {
+                self.doubt(var);
+            }
+        }
+    }
+
     /// The controller does not have a safe value that a recipe link has sent.
     pub(super) fn doubt(&mut self, var: SysVar) {
         if self.unanswered.contains(var) {
             self.unconfirmed.insert(var);
             self.again(&InputSet::from_iter([var]));
         }
+    }
+
+    /// Something came that the controller sends steadily.
+    pub(super) fn heard(&mut self, now: Instant) {
+        if !self.is_heard(now) {
+            self.era = self.era.wrapping_add(1);
+        }
+        self.heard_at = Some(now);
+    }
+
+    /// Whether the controller has been there all the time since the era began.
+    pub(super) fn is_heard(&self, now: Instant) -> bool {
+        !is_gap(self.heard_at, now)
     }
 
     /// The controller may have started anew: safe values are written once more.
@@ -285,6 +327,14 @@ impl<const PORTS: usize> Store<PORTS> {
 const SHOWN_AFTER: Duration = Duration::from_millis(200);
 /// For so long a packet of the state stream may come late: one that is silent for 2 s is reopened.
 const DOUBT: Duration = Duration::from_secs(3);
+
+/// What the controller sends steadily and has not sent for so long: it may have been away since.
+const AWAY_AFTER: Duration = Duration::from_millis(500);
+
+/// Whether what came last is so long ago, or nothing ever did, that the controller may be another by now.
+pub(super) fn is_gap(last: Option<Instant>, now: Instant) -> bool {
+    last.is_none_or(|at| now.saturating_since(at) > AWAY_AFTER)
+}
 
 /// When a value that waits since `at` has waited longer than `timeout`.
 fn too_old_at(at: Instant, timeout: Duration) -> Instant {

@@ -8,7 +8,7 @@ use super::field_port::Look;
 use super::flight::Flight;
 use super::io::{LinkId, LinkKind};
 use super::outbox::BIT_VARS;
-use super::store::Store;
+use super::store::{Store, is_gap};
 use crate::image::{GroupId, Image, InputSet};
 use crate::link::Supervisor;
 use crate::recipe::PlacedField;
@@ -26,8 +26,6 @@ const REPEAT_SLOWLY: Duration = Duration::from_millis(100);
 const REPEAT_FAST: Duration = Duration::from_secs(1);
 /// Frames that the peer's transport has not acknowledged: what is sent in 250 ms, every 4 ms.
 const MOST_UNACKNOWLEDGED: usize = 64;
-/// A stream of frames that was silent for so long comes from a controller that was away.
-const AWAY_AFTER: Duration = Duration::from_millis(500);
 /// The UDP server streams to whoever sent it something (D24); asked again when nothing comes.
 const GREET_EVERY: Duration = Duration::from_millis(500);
 /// The server may forget whom it has not heard for 60 s (D30).
@@ -60,6 +58,8 @@ pub(super) struct Uplink {
     speak_at: Instant,
     /// When safe values are sent again.
     repeat_at: Instant,
+    /// When a frame was handed over last since the link came up, and in which era of the controller's.
+    handed_over: Option<(Instant, u32)>,
 }
 
 impl Uplink {
@@ -95,11 +95,13 @@ impl Uplink {
             greet_at: Instant::NEVER,
             speak_at: Instant::NEVER,
             repeat_at: Instant::NEVER,
+            handed_over: None,
         }
     }
 
     pub(super) fn up<const PORTS: usize>(&mut self, store: &mut Store<PORTS>, now: Instant) {
         self.busy = false;
+        self.handed_over = None;
         self.flight.clear();
         store.link_up(&self.writes);
         self.greet_at = if self.greets() { now } else { Instant::NEVER };
@@ -149,6 +151,7 @@ impl Uplink {
 
     /// Bytes, or one datagram, from the controller; those that are left when somebody looks at each
     /// frame.
+    #[inline(never)]
     pub(super) fn bytes<'b, const PORTS: usize>(
         &mut self,
         bytes: &'b [u8],
@@ -193,10 +196,12 @@ impl Uplink {
         }
         if fresh {
             let before = store.image.stamp_of(group);
-            if !store.safe.is_empty() && before.is_some_and(|at| now.saturating_since(at) > AWAY_AFTER) {
+            store.heard(now);
+            if before.is_some() && is_gap(before, now) && !store.safe.is_empty() {
                 store.controller_was_away(now);
             }
             store.image.stamp(group, now);
+            store.doubt_by_witnesses(now);
             if self.greets() {
                 self.greet_at = now + GREET_EVERY;
             }
@@ -216,10 +221,27 @@ impl Uplink {
             return None;
         }
         let wanted = !store.outbox.dirty().and(&self.writes).is_empty();
+        if !wanted && now < self.speaks_at() {
+            return None;
+        }
+        self.send(wanted, store, state, out, now)
+    }
+
+    /// The same, where there is something to say. Mostly there is not: what asks stays short without it.
+    #[inline(never)]
+    fn send<const PORTS: usize>(
+        &mut self,
+        wanted: bool,
+        store: &mut Store<PORTS>,
+        state: Option<GroupId>,
+        out: &mut [u8],
+        now: Instant,
+    ) -> Option<usize> {
         let len = match &self.input {
             Some(layout) if wanted && self.is_ready(store, state, now) => {
                 let len = encode(layout, store, out)?;
                 store.taken(&self.writes);
+                self.handed_over = Some((now, store.era));
                 let repeats = self.repeat_at == Instant::NEVER || is_new(store, now);
                 if repeats && !store.unconfirmed.and(&self.writes).is_empty() {
                     self.repeat_at = self.repeat_at.min(now + REPEAT_EVERY);
@@ -230,7 +252,7 @@ impl Uplink {
                 }
                 len
             }
-            _ if now >= self.greet_at.min(self.speak_at) => {
+            _ if now >= self.speaks_at() => {
                 self.greet_at = now + GREET_EVERY;
                 self.greeting(out)?
             }
@@ -250,9 +272,14 @@ impl Uplink {
         self.output.as_ref().is_some_and(|layout| datagram(layout, bytes).is_ok())
     }
 
+    /// When the link has something to say that is no frame.
+    fn speaks_at(&self) -> Instant {
+        self.greet_at.min(self.speak_at)
+    }
+
     /// When the link wants to send by itself.
     pub(super) fn deadline(&self) -> Instant {
-        let speaks_at = if self.busy { Instant::NEVER } else { self.greet_at.min(self.speak_at) };
+        let speaks_at = if self.busy { Instant::NEVER } else { self.speaks_at() };
         speaks_at.min(self.flight.deadline()).min(self.repeat_at)
     }
 
@@ -270,10 +297,16 @@ impl Uplink {
         let read_back = state
             .and_then(|group| store.image.stamp_of(group))
             .is_some_and(|at| now.saturating_since(at) <= READ_BACK_MAX_AGE);
+        // Without a connection, only what comes down tells that the controller has been there all along.
+        let is_there = |era| self.framing == Framing::Bytes || era == store.era && store.is_heard(now);
+        let since = self.handed_over.filter(|&(_, era)| is_there(era)).map(|(at, _)| at);
         others.iter().all(|var| match var.stream() {
             Some(_) => read_back && store.read_back.contains(var),
-            // Never read back: only held values of an owner that has fallen silent may be repeated.
-            None => store.image.is_known(var),
+            // The newest frame had the variable's last value, and the controller has had it ever since.
+            None => {
+                store.image.known_since(var).is_some_and(|at| since >= Some(at))
+                    && !store.unsent.contains(var)
+            }
         })
     }
 

@@ -40,6 +40,8 @@ impl LinkTimings {
 /// Where a link stands.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
+// Its tag would be as wide as an instant, which takes two registers on a Cortex-M.
+#[repr(u8)]
 pub enum LinkState {
     /// Closed; opened again at `retry_at`.
     Down {

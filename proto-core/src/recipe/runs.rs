@@ -12,22 +12,27 @@ pub(super) const MAX_RUN: usize = 32;
 pub(super) fn copy(to: &mut [u8], from: &[u8]) {
     debug_assert!(to.len() == from.len() && from.len() <= MAX_RUN);
     match from.len() {
-        16.. => both_ends::<16>(to, from),
-        8.. => both_ends::<8>(to, from),
-        4.. => both_ends::<4>(to, from),
-        2.. => both_ends::<2>(to, from),
-        _ => both_ends::<1>(to, from),
+        // As one number: an array of sixteen bytes is a call of `memcpy` on a Cortex-M.
+        16.. => both_ends(to, from, |bytes| u128::from_ne_bytes(bytes).to_ne_bytes()),
+        8.. => both_ends(to, from, as_is::<8>),
+        4.. => both_ends(to, from, as_is::<4>),
+        2.. => both_ends(to, from, as_is::<2>),
+        _ => both_ends(to, from, as_is::<1>),
     }
 }
 
+fn as_is<const N: usize>(bytes: [u8; N]) -> [u8; N] {
+    bytes
+}
+
 #[inline(always)]
-fn both_ends<const N: usize>(to: &mut [u8], from: &[u8]) {
+fn both_ends<const N: usize>(to: &mut [u8], from: &[u8], by: impl Fn([u8; N]) -> [u8; N]) {
     if let (Some(&front), Some(&back)) = (from.first_chunk::<N>(), from.last_chunk::<N>()) {
         if let Some(target) = to.first_chunk_mut() {
-            *target = front;
+            *target = by(front);
         }
         if let Some(target) = to.last_chunk_mut() {
-            *target = back;
+            *target = by(back);
         }
     }
 }

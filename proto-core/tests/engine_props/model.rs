@@ -109,6 +109,10 @@ pub struct Model {
     pub up: BTreeMap<LinkId, Instant>,
     /// The newest good state packet: when, and what it said of variables that can be read back.
     pub packet: Option<Instant>,
+    /// When anything came that the controller sends steadily.
+    pub heard: Option<Instant>,
+    /// When a frame last went up the recipe link to the controller as it is known now.
+    pub handed_over: Option<Instant>,
     pub read_back: BTreeMap<&'static str, (Instant, u32)>,
     pub shown: BTreeSet<u32>,
     pub accepted: [u32; 4],
@@ -181,6 +185,8 @@ impl Model {
             lines: BTreeMap::new(),
             up: BTreeMap::new(),
             packet: None,
+            heard: None,
+            handed_over: None,
             read_back: BTreeMap::new(),
             shown: BTreeSet::new(),
             accepted: [0; 4],
@@ -324,6 +330,10 @@ impl Model {
         } else if name == FORCE {
             // Nothing to read back: what its owner sent last is held.
             prop_assert_eq!(Some(value), known.received.last().map(|r| r.1), "{} is held", name);
+            let is_there = self.handed_over.is_some() && self.handed_over >= known.newest_at;
+            prop_assert!(is_there, "{name} = {value:#x} was never given to this controller");
+            let is_young = self.heard.is_some_and(|at| now.saturating_since(at) <= READ_BACK);
+            prop_assert!(is_young, "{name} = {value:#x}: is the controller there?");
             return Ok(());
         } else {
             let read = self.read_back.get(name);
@@ -340,6 +350,14 @@ impl Model {
             known.steps.push(value);
         }
         Ok(())
+    }
+
+    /// A packet came from the controller, or a frame of the recipe link.
+    pub fn heard(&mut self, now: Instant) {
+        if self.heard.replace(now).is_none_or(|at| now.saturating_since(at) > READ_BACK) {
+            // It may have begun anew.
+            self.handed_over = None;
+        }
     }
 
     pub fn modbus(&mut self, request: &[u8], now: Instant) -> Result<(), TestCaseError> {
@@ -386,6 +404,7 @@ impl Model {
         self.written(FORCE, raw(&datagram[2..6]), now)?;
         self.written(OUT2, raw(&datagram[6..7]), now)?;
         self.written(FLOAT, raw(&datagram[9..13]), now)?;
+        self.handed_over = Some(now);
         let read = self.read_back.get(WORD32);
         prop_assert!(read.is_some_and(|&(_, value)| value == raw(&datagram[7..9])), "{datagram:?} {read:?}");
         prop_assert!(self.packet.is_some_and(|at| now.saturating_since(at) <= READ_BACK));

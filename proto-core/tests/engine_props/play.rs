@@ -130,6 +130,9 @@ impl Test {
                 Out::Tick => self.model.tick(at),
                 Out::Open(link) if self.rig.reachable.contains(&link.0) => {
                     self.model.up.insert(link, at);
+                    if link == UDP {
+                        self.model.handed_over = None;
+                    }
                 }
                 Out::Open(_) => {}
                 Out::Close(link) => {
@@ -299,6 +302,7 @@ impl Test {
                 self.wake();
                 let float = value.map_or(f32::NAN, |value| f32::from(value) + 0.125);
                 if self.model.up.contains_key(&UDP) {
+                    self.model.heard(self.rig.now);
                     self.model.knob_is_unreadable = value.is_none();
                     match value {
                         Some(_) => drop(self.model.shown.insert(float.to_bits())),
@@ -365,6 +369,7 @@ impl Test {
         packet[368..372].copy_from_slice(&pose.to_le_bytes());
         if good && self.model.up.contains_key(&LinkId::STATE) {
             let now = self.rig.now;
+            self.model.heard(now);
             self.model.packet = Some(now);
             self.model.bus_is_unreadable = !pose.is_finite();
             self.model.shown.insert(0);
@@ -508,9 +513,13 @@ impl Test {
         prop_assert_eq!(frames(self), before, "the controller has it");
         self.apply(&Op::Reachable { link: LinkId::STATE, yes: true })?;
         self.run(MS(6_000))?;
+        let before = frames(self);
         self.state(0, 7, 0.0, true, 0)?;
         self.run(MS(10))?;
-        prop_assert!(frames(self) > before, "the controller was away");
+        prop_assert_eq!(frames(self), before, "it was away, and nobody knows the force since");
+        self.device(3, &payload(FRAMES[3].1, [1, 1], true), 64)?;
+        self.run(MS(10))?;
+        prop_assert!(frames(self) > before + 2, "it was away");
         Ok(())
     }
 }

@@ -16,9 +16,13 @@ pub type Small = Engine<2, 1, 4>;
 pub type Broken = String;
 
 /// A driver that stays away for longer was asleep.
-pub const ASLEEP: Duration = Duration::from_millis(500);
+const ASLEEP: Duration = Duration::from_millis(500);
 /// The engine asks to be called at least so often.
 const HEARTBEAT: Duration = Duration::from_millis(250);
+/// What waited while the gateway was asleep may be read for so long after it.
+pub const DEAF: Duration = Duration::from_millis(50);
+/// A device repeats a frame so often that it is never overdue.
+pub const STEADY: Duration = Duration::from_millis(90);
 /// More than a cell of one port and three links can have to say after one input: each link closed,
 /// opened and spoken to once.
 const MOST_OUTPUTS: usize = 9;
@@ -89,7 +93,14 @@ pub trait Judge {
     fn shown(&mut self, now: Instant, bytes: &[u8]) -> Result<(), Broken>;
     /// The engine has nothing more to do. `is_late`: a deadline has come and its tick was not told, so
     /// nothing may be sent yet.
-    fn rested(&mut self, now: Instant, engine: &Small, conns: &Conns, is_late: bool) -> Result<(), Broken>;
+    fn rested(
+        &mut self,
+        now: Instant,
+        until: Instant,
+        engine: &Small,
+        conns: &Conns,
+        is_late: bool,
+    ) -> Result<(), Broken>;
 }
 
 #[derive(Debug, Clone)]
@@ -243,7 +254,7 @@ impl Gateway {
             return Err(format!("counts that it slept {} times", self.engine.sleeps()));
         }
         self.until = until;
-        judge.rested(now, &self.engine, &self.conns, is_late)?;
+        judge.rested(now, until, &self.engine, &self.conns, is_late)?;
         self.links_are_tended(is_tick)
     }
 

@@ -17,6 +17,9 @@ const SOON: Duration = Duration::from_secs(1);
 const REPLY: Duration = Duration::from_secs(10);
 const TOGETHER: Duration = Duration::from_secs(1);
 const STRIKES: Duration = Duration::from_secs(10);
+/// No connection makes way for a stop this soon after another is gone, and after the stop is asked for.
+const OPEN_AGAIN: Duration = Duration::from_millis(500);
+const ROOM_WITHIN: Duration = Duration::from_millis(20);
 const QUEUE: usize = 8;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -39,7 +42,7 @@ struct Asked {
     link: LinkId,
     order: Order,
     picked: Picked,
-    answer_by: Instant,
+    at: Instant,
 }
 
 #[derive(Debug, Clone)]
@@ -55,6 +58,8 @@ pub struct Orders {
     pub reply: ReplyCode,
     /// When the second connection was refused, or the first lost because of it.
     struck: Option<Instant>,
+    /// No connection is closed to make way for a stop before this.
+    way_made_until: Instant,
 }
 
 impl Orders {
@@ -68,6 +73,7 @@ impl Orders {
             asked: Vec::new(),
             reply: ReplyCode::None,
             struck: None,
+            way_made_until: Instant::ZERO,
         }
     }
 
@@ -93,6 +99,7 @@ impl Orders {
                 self.total += 1;
                 self.drop_runs();
                 self.stop = Some(picked);
+                self.way_made_until = self.way_made_until.max(now + ROOM_WITHIN);
                 self.reply = ReplyCode::Pending;
             }
             _ => {}
@@ -110,11 +117,20 @@ impl Orders {
     /// Deadlines pass.
     pub fn deadlines(&mut self, now: Instant, conns: &mut Conns) {
         for link in [LinkId::URGENT, LinkId::COMMAND] {
-            let unanswered = self.asked.iter().any(|asked| asked.link == link && now >= asked.answer_by);
-            if unanswered || conns.overdue(now).contains(&link) {
+            let is_asked = |asked: &Asked| asked.link == link && now >= asked.at + REPLY;
+            if self.asked.iter().any(is_asked) || conns.overdue(now).contains(&link) {
                 conns.must_close(now, link);
                 self.lost(link, now);
             }
+        }
+        if let Some((link, at)) = self.crowded(conns)
+            && now >= at
+        {
+            conns.must_close(now, link);
+            self.lost(link, now);
+        }
+        // What becomes of the first says what it means for the second.
+        for link in [LinkId::COMMAND, LinkId::URGENT] {
             if conns.not_opened(now).contains(&link) {
                 conns.must_close(now, link);
                 match link {
@@ -140,7 +156,11 @@ impl Orders {
         let (gone, asked) = std::mem::take(&mut self.asked).into_iter().partition(|asked| asked.link == link);
         self.asked = asked;
         let gone: Vec<Asked> = gone;
-        for asked in gone {
+        if !gone.is_empty() {
+            self.way_made_until = self.way_made_until.max(now + OPEN_AGAIN);
+        }
+        // Of two, the newer one waits again.
+        for asked in gone.into_iter().rev() {
             if asked.order == Order::Stop && self.is_asked() {
                 self.stop.get_or_insert(Picked { since: now, ..asked.picked });
             } else {
@@ -194,7 +214,6 @@ impl Orders {
         now: Instant,
     ) -> Result<Instant, Broken> {
         let is_stopping = self.is_stopping();
-        let answer_by = now + REPLY;
         if text.starts_with(b"run") {
             if self.runs.is_empty() {
                 return Err("runs, and nobody asked for it".to_owned());
@@ -210,16 +229,18 @@ impl Orders {
             if link != LinkId::COMMAND || !self.asked.is_empty() {
                 return Err(format!("runs by {link:?} while {:?} is unanswered", self.asked));
             }
-            self.asked.push(Asked { link, order: Order::Run, picked, answer_by });
+            self.asked.push(Asked { link, order: Order::Run, picked, at: now });
             return Ok(until);
         }
-        if text != b"stop" {
+        // A line feed ends a keyword that is unanswered, so that the controller takes them for two.
+        let is_beside = self.unanswered(link).any(|order| order == Order::Stop);
+        if text != if is_beside { &b"\nstop"[..] } else { &b"stop"[..] } {
             return Err(format!("commands {text:?}"));
         }
         let Some(picked) = self.stop.take() else {
             return Err("stops, and nobody asked for it".to_owned());
         };
-        if self.stop_is_under_way() {
+        if self.stop_is_under_way(now) {
             return Err("stops twice at once".to_owned());
         }
         if link == LinkId::COMMAND && self.is_free(LinkId::URGENT, conns) {
@@ -231,7 +252,7 @@ impl Orders {
             conns.must_close(now, LinkId::COMMAND);
             self.lost(LinkId::COMMAND, now);
         }
-        self.asked.push(Asked { link, order: Order::Stop, picked, answer_by });
+        self.asked.push(Asked { link, order: Order::Stop, picked, at: now });
         Ok(now + SOON)
     }
 
@@ -248,20 +269,47 @@ impl Orders {
         self.settle(asked.picked.nth, if is_done { ReplyCode::Success } else { ReplyCode::Fail });
     }
 
-    /// Nothing waits that can go.
-    pub fn rested(&self, conns: &Conns) -> Result<(), Broken> {
-        let free = |link| self.is_free(link, conns);
-        let command = conns.of(LinkId::COMMAND);
-        // Beside a command that waits for its reply, but not with two that are not acknowledged.
-        let beside = command.is_free() && command.under_way.len() < 2;
-        let has_way = free(LinkId::URGENT) || beside;
-        if self.stop.is_some() && !self.stop_is_under_way() && has_way {
+    /// Nothing waits that can go; and the engine is called when something can.
+    pub fn rested(&self, conns: &Conns, now: Instant, until: Instant) -> Result<(), Broken> {
+        let has_way = self.has_way(conns);
+        if self.stop.is_some() && has_way && !self.stop_is_under_way(now) {
             return Err("lets a stop wait".to_owned());
         }
-        if !self.runs.is_empty() && !self.is_stopping() && free(LinkId::COMMAND) {
+        let before = until - Duration::from_micros(1);
+        if self.stop.is_some() && has_way && !self.stop_is_under_way(before) {
+            return Err("sleeps longer than a stop has to wait".to_owned());
+        }
+        if self.crowded(conns).is_some_and(|(_, at)| at > now && at <= before) {
+            return Err("sleeps longer than a stop has to wait for replies".to_owned());
+        }
+        if !self.runs.is_empty() && !self.is_stopping() && self.is_free(LinkId::COMMAND, conns) {
             return Err("lets a command wait though the link is free".to_owned());
         }
         Ok(())
+    }
+
+    /// Whether a stop has somewhere to go: beside a command that waits for its reply, but not with two
+    /// that are not acknowledged.
+    fn has_way(&self, conns: &Conns) -> bool {
+        let command = conns.of(LinkId::COMMAND);
+        let is_beside_free = self.unanswered(LinkId::COMMAND).count() < 2 && command.under_way.len() < 2;
+        self.is_free(LinkId::URGENT, conns) || command.is_free() && is_beside_free
+    }
+
+    /// The connection that makes way for a stop that waits for replies alone, and when: the newest
+    /// command on it is the oldest of these, and has not been answered for a second.
+    fn crowded(&self, conns: &Conns) -> Option<(LinkId, Instant)> {
+        let newest = |link| self.asked.iter().rfind(|asked| asked.link == link).map(|asked| asked.at);
+        let is_full = self.unanswered(LinkId::COMMAND).count() == 2;
+        if self.stop.is_none() || self.has_way(conns) || conns.is_open(LinkId::COMMAND) && !is_full {
+            return None;
+        }
+        let urgent = newest(LinkId::URGENT).map(|at| (at, LinkId::URGENT));
+        let command = newest(LinkId::COMMAND).filter(|_| is_full).map(|at| (at, LinkId::COMMAND));
+        let (at, link) = [urgent, command].into_iter().flatten().min_by_key(|(at, _)| *at)?;
+        let stops = self.asked.iter().filter(|asked| asked.order == Order::Stop).map(|asked| asked.at);
+        let newest_stop = stops.max().unwrap_or(at);
+        Some((link, (at.max(newest_stop) + SOON).max(self.way_made_until)))
     }
 
     fn is_free(&self, link: LinkId, conns: &Conns) -> bool {
@@ -279,12 +327,13 @@ impl Orders {
         }
     }
 
-    fn stop_is_under_way(&self) -> bool {
-        self.asked.iter().any(|asked| asked.order == Order::Stop)
+    /// A stop is on its way or being carried out, and not yet for so long that nobody knows.
+    fn stop_is_under_way(&self, now: Instant) -> bool {
+        self.asked.iter().any(|asked| asked.order == Order::Stop && now < asked.at + SOON)
     }
 
     fn is_stopping(&self) -> bool {
-        self.stop.is_some() || self.stop_is_under_way()
+        self.stop.is_some() || self.asked.iter().any(|asked| asked.order == Order::Stop)
     }
 
     fn drop_runs(&mut self) {

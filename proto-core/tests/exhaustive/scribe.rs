@@ -101,6 +101,7 @@ enum Field {
     Backoff,
     IsDeaf,
     DeafUntil,
+    WayMade,
 }
 
 /// Structs whose fields' names say too little.
@@ -123,7 +124,8 @@ enum Kind {
 }
 
 const NEVER: u64 = u64::MAX;
-/// What the engine asks of a link that was lost: was another lost within this time?
+/// What the engine asks of a link that was lost: was another lost within this time? And of a command
+/// that is unanswered: has it been so for as long?
 const TOGETHER: u64 = 1_000_000;
 /// And had it been up for this long?
 const SETTLED: u64 = 5_000_000;
@@ -188,13 +190,15 @@ impl Scribe {
         }
         let ago = self.now.saturating_sub(at);
         let ago = match (self.field, self.kind()) {
-            // Only measured.
-            (Field::At, Kind::Sent) => return,
+            // When a command was sent: one that stops is sent again behind it a second later.
+            (Field::At, Kind::Sent) => ago.min(TOGETHER + 1),
             // Silence of a line counts for partial frames, and before sending where one has to wait.
             (Field::Heard, Kind::Line) => return,
             (Field::Heard, _) if self.silence_is_normal => return,
             (Field::Newest, Kind::Client) if self.buffer_is_empty => return,
             (Field::DeafUntil, _) if !self.is_deaf => return,
+            // Has it come?
+            (Field::WayMade, _) => ago.min(1),
             // Looked at with the backoff, which follows.
             (Field::Since, Kind::Up) => {
                 self.up_for = ago;
@@ -285,6 +289,7 @@ impl Scribe {
             b"silence" => Word::Field(Field::Silence),
             b"backoff" => Word::Field(Field::Backoff),
             b"is_deaf" => Word::Field(Field::IsDeaf),
+            b"way_made_until" => Word::Field(Field::WayMade),
             b"deaf_until" => Word::Field(Field::DeafUntil),
             _ => Word::Field(Field::Other),
         };

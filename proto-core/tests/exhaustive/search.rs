@@ -9,13 +9,23 @@ use std::fmt::Debug;
 use crate::driver::Broken;
 
 pub trait World: Clone {
-    type Event: Copy + Debug;
+    type Event: Copy + Debug + PartialEq;
     /// What can happen now.
     fn events(&self) -> Vec<Self::Event>;
     /// It happens; afterwards the engine has nothing more to do.
     fn happen(&mut self, event: Self::Event) -> Result<(), Broken>;
     /// The same for worlds that behave alike from now on; `unique` differs in every call.
     fn fingerprint(&self, unique: u64) -> u64;
+
+    /// The same after these events.
+    #[track_caller]
+    fn after(mut self, events: &[Self::Event]) -> Self {
+        for (nth, &event) in events.iter().enumerate() {
+            assert!(self.events().contains(&event), "{event:?}, number {nth}, cannot happen");
+            self.happen(event).unwrap_or_else(|broken| panic!("{event:?}, number {nth}: {broken}"));
+        }
+        self
+    }
 }
 
 /// What a search came to.

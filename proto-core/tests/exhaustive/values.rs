@@ -167,34 +167,71 @@ impl Bits {
     }
 }
 
+/// What stands in a float's place when its owner falls silent.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Instead {
+    Safe(f32),
+    /// What the controller shows.
+    Shown,
+    /// What its owner sent last, for as long as the controller is the same.
+    Last,
+}
+
 /// A float: the newest value wins.
 #[derive(Debug, Clone)]
 pub struct Float {
-    /// Without one it is held when its owner falls silent.
-    safe_value: Option<f32>,
+    instead: Instead,
     /// What would be written; `None` when that is not known.
     pub newest: Option<f32>,
     /// Its value is its owner's, or the safe one.
     pub is_live: bool,
     is_waiting: bool,
+    /// The controller, as it is known now, was given the newest value.
+    is_there: bool,
+    /// When its owner is silent; `None` while it is, and before the first frame.
+    overdue_at: Option<Instant>,
 }
 
 impl Float {
-    pub fn new(safe_value: Option<f32>) -> Self {
-        Self { safe_value, newest: None, is_live: false, is_waiting: false }
+    pub fn new(instead: Instead) -> Self {
+        Self { instead, newest: None, is_live: false, is_waiting: false, is_there: false, overdue_at: None }
     }
 
-    pub fn received(&mut self, value: f32, is_reachable: bool) {
+    pub fn received(&mut self, value: f32, is_reachable: bool, now: Instant) {
         self.newest = Some(value);
+        self.overdue_at = Some(now + TIMEOUT);
         self.is_live = true;
+        self.is_there = false;
         self.is_waiting = is_reachable;
     }
 
-    /// Its owner has fallen silent: without a safe value it is unknown until the controller shows it.
-    pub fn overdue(&mut self) {
-        self.is_live = self.safe_value.is_some();
-        self.is_waiting = self.is_live;
-        self.newest = self.safe_value;
+    /// A deadline may have passed: its owner may have fallen silent.
+    pub fn deadlines(&mut self, now: Instant) {
+        if self.overdue_at.take_if(|at| now >= *at).is_none() {
+            return;
+        }
+        (self.is_live, self.is_waiting) = (false, false);
+        match self.instead {
+            Instead::Safe(value) => {
+                self.newest = Some(value);
+                (self.is_live, self.is_waiting) = (true, true);
+            }
+            Instead::Shown => self.newest = None,
+            Instead::Last => self.newest = self.newest.filter(|_| self.is_there),
+        }
+    }
+
+    /// The controller may be another by now, which has nothing of what a silent owner sent last.
+    pub fn controller_is_new(&mut self) {
+        self.is_there = false;
+        if self.instead == Instead::Last && !self.is_live {
+            self.newest = None;
+        }
+    }
+
+    /// A frame is overdue, or has never come.
+    pub fn is_silent(&self) -> bool {
+        self.overdue_at.is_none()
     }
 
     /// The controller shows it, and nobody else sends it.
@@ -204,11 +241,11 @@ impl Float {
 
     /// The way up is gone.
     pub fn lost(&mut self, is_safe: bool) {
-        self.is_waiting &= is_safe && self.safe_value.is_some();
+        self.is_waiting &= is_safe && self.has_safe_value();
     }
 
     pub fn again(&mut self, is_safe: bool) {
-        self.is_waiting |= is_safe && self.safe_value.is_some();
+        self.is_waiting |= is_safe && self.has_safe_value();
     }
 
     pub fn is_waiting(&self) -> bool {
@@ -217,5 +254,10 @@ impl Float {
 
     pub fn taken(&mut self) {
         self.is_waiting = false;
+        self.is_there = true;
+    }
+
+    fn has_safe_value(&self) -> bool {
+        matches!(self.instead, Instead::Safe(_))
     }
 }

@@ -189,7 +189,7 @@ impl Server {
 /// What a client is told.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Told {
-    /// To the request that waits in turn, or to the one beside it.
+    /// To the older request, or to the one beside it.
     Reply(Turn, Vec<u8>),
     ScriptFinish,
     Unsolicited(Vec<u8>),
@@ -218,7 +218,7 @@ pub struct Client {
     bytes: Vec<u8>,
     /// The keyword that is waited for, and until when.
     pub waiting: Option<(String, u64)>,
-    /// The same of an urgent request that was not kept waiting.
+    /// The same of a younger, urgent request that was not kept waiting.
     pub beside: Option<(String, u64)>,
     dropping: bool,
     newest: u64,
@@ -227,13 +227,16 @@ pub struct Client {
 
 impl Client {
     pub fn start(&mut self, now: u64, word: &str) {
-        if self.beside.is_none() && !b"script finish".starts_with(&self.bytes) {
+        if !b"script finish".starts_with(&self.bytes) {
             self.bytes.clear();
         }
         self.waiting = Some((word.to_owned(), now + 10_000_000));
     }
 
     pub fn start_beside(&mut self, now: u64, word: &str) {
+        if self.waiting.is_none() {
+            return self.start(now, word);
+        }
         self.beside = Some((word.to_owned(), now + 10_000_000));
     }
 
@@ -326,7 +329,7 @@ impl Client {
         told.push(if text == b"script finish" {
             Told::ScriptFinish
         } else if answers(&self.waiting) {
-            self.waiting = None;
+            self.waiting = self.beside.take();
             Told::Reply(Turn::InTurn, text)
         } else if answers(&self.beside) {
             self.beside = None;

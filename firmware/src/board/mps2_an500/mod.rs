@@ -17,25 +17,13 @@ mod watchdog;
 use cortex_m::interrupt::InterruptNumber;
 use cortex_m::peripheral::NVIC;
 use embassy_sync::waitqueue::AtomicWaker;
-use firmware::lan9118::{Lan9118, Registers};
+use embassy_time::Duration;
+use firmware::lan9118::{Lan9118, Registers, StartError};
+use firmware::platform::{self, Lamp};
 use firmware::slcan::SlcanPort;
 use proto_core::config::Rs485;
 
-pub(crate) use firmware::lan9118::StartError as EthernetError;
-pub(crate) use stack::used as stack_used;
-pub(crate) use storage::StorageError;
-pub(crate) use uart::Uart as SerialDevice;
-pub(crate) use watchdog::{WATCHDOG_PERIOD, Watchdog};
-
-/// CAN is slcan on a UART here.
-pub(crate) type CanDevice = SlcanPort<uart::Uart>;
-/// The Ethernet controller.
-pub(crate) type Ethernet = Lan9118<LanRegisters>;
-
-/// How many RS-485 lines there are.
-pub(crate) const SERIAL_PORTS: usize = 2;
-/// How many CAN buses there are.
-pub(crate) const CAN_PORTS: usize = 1;
+use watchdog::Watchdog;
 
 /// The board's devices that nobody has yet.
 pub(crate) struct Board {
@@ -43,45 +31,62 @@ pub(crate) struct Board {
     can: usize,
 }
 
-impl Board {
-    /// The configuration image.
-    pub(crate) fn configuration(&mut self) -> Result<&'static [u8], StorageError> {
+impl platform::Board for Board {
+    const SERIAL_PORTS: usize = 2;
+    const CAN_PORTS: usize = 1;
+    const WATCHDOG_PERIOD: Duration = watchdog::PERIOD;
+
+    type Serial = uart::Uart;
+    /// CAN is slcan on a UART here.
+    type Can = SlcanPort<uart::Uart>;
+    type Ethernet = Lan9118<LanRegisters>;
+    type Watchdog = Watchdog;
+    type Led = Led;
+    type StorageError = storage::StorageError;
+    type EthernetError = StartError;
+
+    fn configuration(&mut self) -> Result<&'static [u8], Self::StorageError> {
         storage::read()
     }
 
-    /// The next RS-485 line. The speed is not emulated.
-    pub(crate) fn serial(&mut self, _: &Rs485) -> Option<SerialDevice> {
+    /// The speed is not emulated.
+    fn serial(&mut self, _: &Rs485) -> Option<Self::Serial> {
         let port = self.serial;
-        (port < SERIAL_PORTS).then(|| {
+        (port < Self::SERIAL_PORTS).then(|| {
             self.serial += 1;
             uart::Uart::open(port)
         })
     }
 
-    /// The next CAN bus.
-    pub(crate) fn can(&mut self, bitrate: u32) -> Option<CanDevice> {
+    fn can(&mut self, bitrate: u32) -> Option<Self::Can> {
         let port = self.can;
-        (port < CAN_PORTS).then(|| {
+        (port < Self::CAN_PORTS).then(|| {
             self.can += 1;
-            SlcanPort::new(uart::Uart::open(SERIAL_PORTS + port), bitrate)
+            SlcanPort::new(uart::Uart::open(Self::SERIAL_PORTS + port), bitrate)
         })
     }
 
-    /// The watchdog, from now on to be fed.
-    pub(crate) fn watchdog(&mut self) -> Watchdog {
-        Watchdog::start()
-    }
-
-    /// The status LED.
-    pub(crate) fn led(&mut self) -> Led {
-        Led
-    }
-
-    /// The Ethernet controller.
-    pub(crate) fn ethernet(&mut self) -> Result<Ethernet, EthernetError> {
+    fn ethernet(&mut self) -> Result<Self::Ethernet, StartError> {
         let driver = Lan9118::start(LanRegisters, &LAN_WAKER)?;
         Irq::LAN9118.enable();
         Ok(driver)
+    }
+
+    /// It runs from now on.
+    fn watchdog(&mut self) -> Watchdog {
+        Watchdog::start()
+    }
+
+    fn led(&mut self) -> Led {
+        Led
+    }
+
+    fn seed(&mut self) -> u64 {
+        storage::host_time()
+    }
+
+    fn stack_used(&self) -> usize {
+        stack::used()
     }
 }
 
@@ -89,16 +94,10 @@ impl Board {
 #[derive(Debug)]
 pub(crate) struct Led;
 
-impl Led {
-    /// Lights it, or not.
-    pub(crate) fn set(&mut self, is_lit: bool) {
+impl Lamp for Led {
+    fn set(&mut self, is_lit: bool) {
         registers::write(registers::FPGAIO, u32::from(is_lit));
     }
-}
-
-/// What local port numbers are drawn from.
-pub(crate) fn seed() -> u64 {
-    storage::host_time()
 }
 
 #[cortex_m_rt::entry]

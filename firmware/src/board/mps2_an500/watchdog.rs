@@ -2,6 +2,7 @@
 //! machine at its second. `qemu-system-arm -no-reboot` ends the emulation instead.
 
 use embassy_time::Duration;
+use firmware::platform::Feed;
 
 use super::console;
 use super::registers::{WATCHDOG, write};
@@ -16,7 +17,7 @@ const CONTROL_ON: u32 = 0b11;
 const CYCLES_PER_MICRO: u64 = 25;
 
 /// From the last feed to the reset. Long, because the emulator's host may be busy with something else.
-pub(crate) const WATCHDOG_PERIOD: Duration = Duration::from_secs(8);
+pub(super) const PERIOD: Duration = Duration::from_secs(8);
 
 /// The watchdog.
 #[derive(Debug)]
@@ -25,14 +26,15 @@ pub(crate) struct Watchdog;
 impl Watchdog {
     pub(super) fn start() -> Self {
         write(LOCK, UNLOCK);
-        write(LOAD, (WATCHDOG_PERIOD.as_micros() / 2 * CYCLES_PER_MICRO) as u32);
+        write(LOAD, (PERIOD.as_micros() / 2 * CYCLES_PER_MICRO) as u32);
         write(CONTROL, CONTROL_ON);
         write(LOCK, 0);
         Self
     }
+}
 
-    /// All is well: from the start again.
-    pub(crate) fn feed(&mut self) {
+impl Feed for Watchdog {
+    fn feed(&mut self) {
         write(LOCK, UNLOCK);
         write(INTCLEAR, 1);
         write(LOCK, 0);

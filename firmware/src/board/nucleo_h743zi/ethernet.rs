@@ -18,6 +18,7 @@ use embassy_time::{Duration, Instant, Timer};
 use static_cell::ConstStaticCell;
 
 use super::leds::Led;
+use firmware::platform::Lamp;
 
 /// The Ethernet controller.
 pub(crate) type Ethernet = eth::Ethernet<'static, peripherals::ETH, Lan8742>;

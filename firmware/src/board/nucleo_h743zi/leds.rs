@@ -6,13 +6,13 @@ use embassy_stm32::gpio::{Level, Output, Speed};
 use embassy_stm32::pac::gpio::vals::Moder;
 use embassy_stm32::pac::{GPIOB, RCC};
 use embassy_stm32::peripherals::{PB0, PB14, PE1};
+use firmware::platform::Lamp;
 
 /// An LED.
 pub(crate) struct Led(Output<'static>);
 
-impl Led {
-    /// Lights it or not.
-    pub(crate) fn set(&mut self, is_lit: bool) {
+impl Lamp for Led {
+    fn set(&mut self, is_lit: bool) {
         self.0.set_level(is_lit.into());
     }
 }

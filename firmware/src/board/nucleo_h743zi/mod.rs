@@ -17,25 +17,15 @@ use cortex_m::peripheral::Peripherals as Core;
 use defmt_rtt as _;
 use embassy_executor::Executor;
 use embassy_stm32::{bind_interrupts, eth};
+use embassy_time::Duration;
 use firmware::fmt::Text;
-use firmware::{error, info, warn};
+use firmware::{error, info, platform, warn};
 use panic_probe as _;
 use proto_core::config::Rs485;
 use static_cell::StaticCell;
 
-pub(crate) use can::CanDevice;
-pub(crate) use ethernet::{Ethernet, EthernetError};
-pub(crate) use identity::seed;
-pub(crate) use leds::Led;
-pub(crate) use serial::SerialDevice;
-pub(crate) use stack::used as stack_used;
-pub(crate) use storage::StorageError;
-pub(crate) use watchdog::{WATCHDOG_PERIOD, Watchdog};
-
-/// How many RS-485 lines there are.
-pub(crate) const SERIAL_PORTS: usize = 2;
-/// How many CAN buses there are.
-pub(crate) const CAN_PORTS: usize = 1;
+use leds::Led;
+use watchdog::Watchdog;
 
 bind_interrupts!(struct Irqs {
     USART2 => serial::FirstInterrupt;
@@ -56,36 +46,52 @@ pub(crate) struct Board {
     watchdog: Option<Watchdog>,
 }
 
-impl Board {
-    /// The configuration image.
-    pub(crate) fn configuration(&mut self) -> Result<&'static [u8], StorageError> {
+impl platform::Board for Board {
+    const SERIAL_PORTS: usize = 2;
+    const CAN_PORTS: usize = 1;
+    const WATCHDOG_PERIOD: Duration = watchdog::PERIOD;
+
+    type Serial = serial::SerialDevice;
+    type Can = can::CanDevice;
+    type Ethernet = ethernet::Ethernet;
+    type Watchdog = Watchdog;
+    type Led = Led;
+    type StorageError = storage::StorageError;
+    type EthernetError = ethernet::EthernetError;
+
+    fn configuration(&mut self) -> Result<&'static [u8], Self::StorageError> {
         storage::read()
     }
 
-    /// The next RS-485 line.
-    pub(crate) fn serial(&mut self, line: &Rs485) -> Option<SerialDevice> {
+    fn serial(&mut self, line: &Rs485) -> Option<Self::Serial> {
         self.serial.next(line)?.inspect_err(|error| error!("{}", Text(error))).ok()
     }
 
-    /// The CAN bus.
-    pub(crate) fn can(&mut self, bitrate: u32) -> Option<CanDevice> {
+    fn can(&mut self, bitrate: u32) -> Option<Self::Can> {
         can::start(self.can.take()?, bitrate).inspect_err(|error| error!("{}", Text(error))).ok()
     }
 
-    /// The Ethernet controller.
-    pub(crate) fn ethernet(&mut self) -> Result<Ethernet, EthernetError> {
-        let (parts, led) = self.ethernet.take().zip(self.link.take()).ok_or(EthernetError::Taken)?;
+    fn ethernet(&mut self) -> Result<Self::Ethernet, Self::EthernetError> {
+        let (parts, led) =
+            self.ethernet.take().zip(self.link.take()).ok_or(ethernet::EthernetError::Taken)?;
         parts.start(Irqs, identity::ethernet_address(), led)
     }
 
-    /// The watchdog, which runs since the reset; once.
-    pub(crate) fn watchdog(&mut self) -> Watchdog {
+    /// It runs since the reset.
+    fn watchdog(&mut self) -> Watchdog {
         self.watchdog.take().expect("asked for once")
     }
 
-    /// The status LED; once.
-    pub(crate) fn led(&mut self) -> Led {
+    fn led(&mut self) -> Led {
         self.status.take().expect("asked for once")
+    }
+
+    fn seed(&mut self) -> u64 {
+        identity::seed()
+    }
+
+    fn stack_used(&self) -> usize {
+        stack::used()
     }
 }
 

@@ -12,11 +12,12 @@ use embassy_stm32::pac::{DBGMCU, IWDG1 as IWDG1_REGISTERS};
 use embassy_stm32::peripherals::IWDG1;
 use embassy_stm32::wdg::IndependentWatchdog;
 use embassy_time::{Duration, Instant};
+use firmware::platform::Feed;
 
 use super::last_words;
 
 /// Without being fed for so long, the board starts again.
-pub(crate) const WATCHDOG_PERIOD: Duration = Duration::from_secs(4);
+pub(super) const PERIOD: Duration = Duration::from_secs(4);
 
 /// The watchdog; it cannot be stopped.
 pub(crate) struct Watchdog(IndependentWatchdog<'static, IWDG1>);
@@ -28,7 +29,7 @@ impl Watchdog {
         DBGMCU.apb4fzr1().modify(|w| w.set_iwdg1(true));
         // SAFETY: called once; nobody else has it.
         let device = unsafe { IWDG1::steal() };
-        let mut watchdog = IndependentWatchdog::new(device, WATCHDOG_PERIOD.as_micros() as u32);
+        let mut watchdog = IndependentWatchdog::new(device, PERIOD.as_micros() as u32);
         watchdog.unleash();
         Self(watchdog)
     }
@@ -38,9 +39,10 @@ impl Watchdog {
     pub(super) fn start_anyhow() {
         IWDG1_REGISTERS.kr().write(|w| w.set_key(Key::START));
     }
+}
 
-    /// Another period.
-    pub(crate) fn feed(&mut self) {
+impl Feed for Watchdog {
+    fn feed(&mut self) {
         self.0.pet();
         FED.store(millis(), Ordering::Relaxed);
         if IS_LATE.swap(false, Ordering::Relaxed) {
@@ -62,7 +64,7 @@ pub(super) fn look_after(timer: &mut SYST) {
 #[cortex_m_rt::exception]
 fn SysTick() {
     let unfed = millis().wrapping_sub(FED.load(Ordering::Relaxed));
-    let is_late = u64::from(unfed) >= WATCHDOG_PERIOD.as_millis() / 2;
+    let is_late = u64::from(unfed) >= PERIOD.as_millis() / 2;
     // Once: a reset in the middle of it would leave nothing.
     if is_late && !IS_LATE.swap(true, Ordering::Relaxed) {
         last_words::keep_hang();

@@ -16,6 +16,8 @@ pub(super) struct Message {
     pub(super) content: Content,
     /// The frame is one of ours, which has just left.
     pub(super) is_own: bool,
+    /// The frame was sent by a program on this machine, whether or not it has left.
+    pub(super) is_local: bool,
 }
 
 #[derive(Debug)]
@@ -51,6 +53,7 @@ pub(super) fn receive(socket: BorrowedFd<'_>) -> io::Result<Message> {
             _ => Content::Unknown,
         },
         is_own: header.msg_flags & libc::MSG_CONFIRM != 0,
+        is_local: header.msg_flags & libc::MSG_DONTROUTE != 0,
     })
 }
 

@@ -1,8 +1,8 @@
 //! Error frames of the kernel, as news of a CAN controller's error state.
 
 use proto_core::engine::BusState;
-use socketcan::CanErrorFrame;
 use socketcan::errors::ControllerProblems;
+use socketcan::{CanErrorFrame, EmbeddedFrame};
 
 /// What an error frame says.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -36,6 +36,27 @@ pub(super) fn news(frame: CanErrorFrame) -> News {
     } else {
         News::Other
     }
+}
+
+/// The transmit and the receive error counter, if the frame tells them.
+pub(super) fn counters(frame: CanErrorFrame) -> Option<(u8, u8)> {
+    let &[.., transmit, receive] = frame.data().first_chunk::<8>()?;
+    match news(frame) {
+        News::Restarted => Some((0, 0)),
+        News::State(BusState::BusOff) => None,
+        // The flag is as new as Linux 5.19, and the counters were there before.
+        News::State(_) => Some((transmit, receive)),
+        News::Other => {
+            let flagged = frame.error_bits() & libc::CAN_ERR_CNT != 0;
+            (flagged || (transmit, receive) != (0, 0)).then_some((transmit, receive))
+        }
+    }
+}
+
+/// Whether the adapter lost frames that it had received.
+pub(super) fn is_overflow(frame: CanErrorFrame) -> bool {
+    let problems = frame.into_error().controller().unwrap_or(ControllerProblems::empty());
+    problems.contains(ControllerProblems::RX_OVERFLOW)
 }
 
 /// As people and statistics call it.
@@ -72,6 +93,39 @@ mod tests {
         assert_eq!(of(libc::CAN_ERR_BUSOFF | libc::CAN_ERR_CNT, 0), News::State(BusState::BusOff));
         assert_eq!(of(libc::CAN_ERR_BUSOFF | controller, 0x40), News::State(BusState::BusOff));
         assert_eq!(of(libc::CAN_ERR_RESTARTED, 0), News::Restarted);
+    }
+
+    #[test]
+    fn counters_are_the_senders_and_the_receivers() {
+        let of = |class: u32, controller: i32, told: [u8; 2]| {
+            let data = [0, u8::try_from(controller).unwrap(), 0, 0, 0, 0, told[0], told[1]];
+            counters(CanErrorFrame::new_error(class, &data).unwrap())
+        };
+        let controller = libc::CAN_ERR_CRTL;
+        assert_eq!(
+            of(controller | libc::CAN_ERR_CNT, libc::CAN_ERR_CRTL_TX_PASSIVE, [128, 3]),
+            Some((128, 3))
+        );
+        // Without the flag they are where it would put them.
+        assert_eq!(of(controller, libc::CAN_ERR_CRTL_RX_PASSIVE, [0, 128]), Some((0, 128)));
+        assert_eq!(of(controller, libc::CAN_ERR_CRTL_ACTIVE, [0, 0]), Some((0, 0)));
+        assert_eq!(of(libc::CAN_ERR_ACK, 0, [8, 0]), Some((8, 0)));
+        assert_eq!(of(libc::CAN_ERR_RESTARTED, 0, [0, 0]), Some((0, 0)));
+        // Nothing is told.
+        assert_eq!(of(libc::CAN_ERR_ACK, 0, [0, 0]), None);
+        assert_eq!(of(controller, libc::CAN_ERR_CRTL_RX_OVERFLOW, [0, 0]), None);
+        assert_eq!(of(libc::CAN_ERR_BUSOFF, 0, [0, 0]), None);
+    }
+
+    #[test]
+    fn an_overflow_is_of_what_was_received() {
+        let of = |controller: i32| {
+            let data = [0, u8::try_from(controller).unwrap(), 0, 0, 0, 0, 0, 0];
+            is_overflow(CanErrorFrame::new_error(libc::CAN_ERR_CRTL, &data).unwrap())
+        };
+        assert!(of(libc::CAN_ERR_CRTL_RX_OVERFLOW));
+        assert!(of(libc::CAN_ERR_CRTL_RX_OVERFLOW | libc::CAN_ERR_CRTL_RX_WARNING));
+        assert!(!of(libc::CAN_ERR_CRTL_TX_OVERFLOW));
     }
 
     #[test]

@@ -8,7 +8,7 @@ use proto_core::time::{Duration, Instant};
 
 use super::field::{self, Accepted, Line, Refused, Verdict};
 use super::sheet::{Origin, Owned, Raw, shown, written};
-use super::upward::Wrong;
+use super::upward::{Wrong, is_gap};
 use super::wire::Asked;
 use super::{Invariant, LinkWatch, Oracle, PortWatch, place};
 
@@ -238,6 +238,7 @@ impl Oracle {
                         self.up.received(var, raw, now);
                     }
                 }
+                self.up.doubt_by_witnesses(&self.sheet, now);
                 if !refused.is_empty() {
                     self.refused.extend(refused);
                     self.again_at = self.again_at.min(now + REFUSED_PAUSE);
@@ -272,7 +273,8 @@ impl Oracle {
             return;
         }
         let before = self.up.frame_at[place(link)].replace(now);
-        if before.is_some_and(|at| now.saturating_since(at) > AWAY) {
+        self.up.heard(now);
+        if before.is_some() && is_gap(before, now) {
             self.up.controller_was_away(&self.sheet, now);
         }
         for payload in found {
@@ -291,6 +293,7 @@ impl Oracle {
             for (var, raw) in values {
                 self.up.received(var, raw, now);
             }
+            self.up.doubt_by_witnesses(&self.sheet, now);
             self.values_changed();
         }
     }
@@ -353,8 +356,11 @@ impl Oracle {
             return Err((Invariant::Line, "sent before the transport had taken the frame before".to_owned()));
         }
         let sheet = self.sheet.link(link).cloned();
-        let frame = sheet.as_ref().and_then(|sheet| sheet.input.as_ref());
-        let Some((frame, payload)) = frame.and_then(|frame| Some((frame, frame.payload_of(bytes)?))) else {
+        let found = sheet.as_ref().and_then(|sheet| {
+            let frame = sheet.input.as_ref()?;
+            Some((sheet, frame, frame.payload_of(bytes)?))
+        });
+        let Some((link_sheet, frame, payload)) = found else {
             // The greeting of the UDP server.
             let is_greeting = link == LinkId::RECIPE_UDP && bytes.len() <= 2 && bytes.iter().all(|&b| b == 0);
             let wrong = (Invariant::Sent, "sent what is neither a frame nor a greeting".to_owned());
@@ -375,7 +381,7 @@ impl Oracle {
                 self.writes += 1;
                 self.checks[Invariant::Sent as usize] += 1;
                 self.checks[Invariant::InTime as usize] += 1;
-                let carried = self.up.carried(&self.sheet, var, raw, now)?;
+                let carried = self.up.carried(&self.sheet, link_sheet, (var, raw), now)?;
                 wanted |= is_ours && self.up.known(var).safe;
                 self.robot.hands_over(var, raw, carried);
             }
@@ -383,6 +389,7 @@ impl Oracle {
         if !wanted {
             return Err((Invariant::Sent, "a frame that nobody's value waited for".to_owned()));
         }
+        self.up.handed_over[place(link)] = Some((now, self.up.era));
         self.up.sent_frame(&self.sheet, link, now);
         Ok(())
     }
@@ -460,7 +467,5 @@ fn first_packet(line: &mut Line) -> Option<Vec<u8>> {
 const PACKET: usize = 1_468;
 /// After it slept, the gateway takes nothing from the field for so long.
 const DEAF: Duration = Duration::from_millis(50);
-/// A recipe link that brought no frame for longer has a controller that was away.
-const AWAY: Duration = Duration::from_millis(500);
 /// A safe value that the controller refused is written again after this.
 const REFUSED_PAUSE: Duration = Duration::from_millis(500);

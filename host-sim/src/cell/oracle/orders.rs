@@ -89,7 +89,6 @@ impl Orders {
             counted.0 += 1;
             let order = Order { place, value, text: plain(text.as_bytes()), picked: now, since: now };
             if order.is_urgent() {
-                self.overtaken = self.queue.len();
                 urgent.push(order.clone());
                 match self.stops.iter_mut().find(|other| other.same_kind(&order)) {
                     Some(other) => *other = order,
@@ -100,6 +99,10 @@ impl Orders {
             } else {
                 counted.1 += 1;
             }
+        }
+        if !urgent.is_empty() {
+            // Whatever the order of the fields.
+            self.overtaken = self.queue.len();
         }
         urgent
     }
@@ -155,11 +158,11 @@ impl Orders {
         let gone: Vec<Order> =
             self.unanswered.iter().filter(|(on, _)| *on == link).map(|(_, order)| order.clone()).collect();
         self.unanswered.retain(|(on, _)| *on != link);
-        // The one that was sent last waits behind the one before it.
+        // Of two of a kind the newer one is sent again.
         for order in gone.into_iter().rev() {
             let waits = self.stops.iter().any(|other| other.same_kind(&order));
             if order.is_urgent() && self.is_asked(&order) && !waits {
-                self.stops.insert(0, Order { since: now, ..order });
+                self.stops.push(Order { since: now, ..order });
             }
         }
         if link == LinkId::COMMAND {

@@ -98,6 +98,9 @@ impl Upward {
         for &var in &sheet.safe_vars {
             let Some(owned) = sheet.owned[var.ordinal()] else { continue };
             let Some(safe) = owned.safe.filter(|_| self.known(var).safe) else { continue };
+            if var.stream().is_none() {
+                continue;
+            }
             let by_recipe = sheet.link(owned.way).is_some();
             let is_there =
                 in_packet(var, packet).map(|raw| as_number(var, raw)) == Some(as_number(var, safe));
@@ -105,6 +108,29 @@ impl Upward {
                 true if is_there && may_confirm => self.confirm(var, by_recipe, now),
                 false if !is_there && may_doubt && by_recipe => doubted.push(var),
                 _ => {}
+            }
+        }
+        for var in &doubted {
+            self.known[var.ordinal()].unconfirmed = true;
+        }
+        self.write_again(sheet, doubted);
+    }
+
+    /// An output that came just now shows another value, soon after one was confirmed.
+    pub(super) fn doubt_by_witnesses(&mut self, sheet: &Sheet, now: Instant) {
+        if self.confirmed_at.is_none_or(|at| now >= at + DOUBT) {
+            return;
+        }
+        let mut doubted = Vec::new();
+        for &var in &sheet.safe_vars {
+            let Some(owned) = sheet.owned[var.ordinal()] else { continue };
+            let shown = sheet.witness[var.ordinal()].map(|witness| self.known(witness));
+            let shown = shown.filter(|shown| !shown.unreadable).and_then(|shown| shown.value);
+            let is_other =
+                shown.is_some_and(|(raw, at)| at == now && owned.safe.is_some_and(|safe| safe[0] != raw[0]));
+            let known = self.known(var);
+            if is_other && known.safe && !known.unconfirmed && sheet.link(owned.way).is_some() {
+                doubted.push(var);
             }
         }
         for var in &doubted {

@@ -9,12 +9,20 @@ use proto_core::time::{Duration, Instant};
 
 use super::Invariant;
 use super::field::{Accepted, show};
-use super::sheet::{Origin, Owned, Raw, Sheet};
+use super::sheet::{LinkSheet, Origin, Owned, Raw, Sheet};
 
 /// Values that wait behind the next ones, a port.
 const EDGES: usize = 16;
 /// How old a read-back value may be.
 const READ_BACK: Duration = Duration::from_millis(500);
+
+/// What comes steadily and has not come for so long: the controller may have been away.
+const AWAY: Duration = Duration::from_millis(500);
+
+/// Whether so much time lies between what came last and now.
+pub(super) fn is_gap(last: Option<Instant>, now: Instant) -> bool {
+    last.is_none_or(|at| now.saturating_since(at) > AWAY)
+}
 
 /// What is known of one variable.
 #[derive(Debug, Clone, Default)]
@@ -37,6 +45,8 @@ pub(super) struct Known {
     pub unreadable: bool,
     /// It stands at its safe value, and the controller is not known to have it.
     pub unconfirmed: bool,
+    /// Its owner fell silent before the last value was handed over.
+    pub unsent: bool,
     /// Values that waited while the gateway slept and have not come since.
     pub slept: Option<Vec<Raw>>,
 }
@@ -84,6 +94,11 @@ pub(super) struct Upward {
     pub state_at: Option<Instant>,
     /// When the newest frame of each recipe link came, whatever connection it was.
     pub frame_at: [Option<Instant>; 16],
+    /// When anything came that the controller sends steadily, and how often after a gap.
+    heard_at: Option<Instant>,
+    pub era: u64,
+    /// When a frame was handed over on each recipe link's present connection, and in which era.
+    pub handed_over: [Option<(Instant, u64)>; 16],
     /// When a safe value was last in doubt.
     pub doubted_at: Instant,
     /// When a safe value of a recipe link was last seen to be there.
@@ -107,6 +122,9 @@ impl Upward {
             up: [None; 16],
             state_at: None,
             frame_at: [None; 16],
+            heard_at: None,
+            era: 0,
+            handed_over: [None; 16],
             doubted_at: Instant::ZERO,
             confirmed_at: None,
             again_at: [Instant::NEVER; 16],
@@ -195,6 +213,7 @@ impl Upward {
             known.waiting.clear();
             known.live = false;
             known.read_back = false;
+            known.unsent = waited > 0;
             self.counted[port].values_expired += waited;
         }
     }
@@ -256,6 +275,7 @@ impl Upward {
     /// A link came up.
     pub(super) fn link_up(&mut self, link: LinkId, now: Instant) {
         self.up[usize::from(link.0)] = Some(now);
+        self.handed_over[usize::from(link.0)] = None;
     }
 
     /// A link was lost: what waits for it is dropped, safe values excepted.
@@ -278,6 +298,7 @@ impl Upward {
     /// A packet of the state stream was taken.
     pub(super) fn state_packet(&mut self, sheet: &Sheet, packet: &[u8], now: Instant) {
         self.state_at = Some(now);
+        self.heard(now);
         for &var in &sheet.in_packet {
             let nth = var.ordinal();
             let is_shown = sheet.origin[nth] == Some(Origin::State);
@@ -298,6 +319,28 @@ impl Upward {
         if sheet.safe_vars.iter().any(|var| self.known(*var).safe) {
             self.compare_safe(sheet, packet, now);
         }
+    }
+
+    /// A packet or a recipe frame came. After a gap the controller may have begun anew: what was handed
+    /// over before, without a connection, counts no more.
+    pub(super) fn heard(&mut self, now: Instant) {
+        if is_gap(self.heard_at.replace(now), now) {
+            self.era += 1;
+        }
+    }
+
+    /// When a frame was handed over last to the controller that is there now, as far as a link can tell.
+    fn handed_over(&self, link: &LinkSheet, now: Instant) -> Option<Instant> {
+        let (at, era) = self.handed_over[usize::from(link.id.0)]?;
+        let is_there = !link.is_datagram || era == self.era && !is_gap(self.heard_at, now);
+        is_there.then_some(at)
+    }
+
+    /// When the newest frame that brought a variable which nothing reads back was accepted; `None` when the
+    /// controller does not have its value.
+    fn held(&self, link: &LinkSheet, known: &Known, now: Instant) -> Option<Instant> {
+        let handed_over = self.handed_over(link, now)?;
+        known.accepted.filter(|&at| handed_over >= at && !known.unsent)
     }
 
     /// The newest value that a link brought; not finite, it is none.
@@ -370,8 +413,8 @@ impl Upward {
     pub(super) fn carried(
         &self,
         sheet: &Sheet,
-        var: SysVar,
-        raw: Raw,
+        link: &LinkSheet,
+        (var, raw): (SysVar, Raw),
         now: Instant,
     ) -> Result<Carried, Wrong> {
         let known = &self.known[var.ordinal()];
@@ -395,7 +438,14 @@ impl Upward {
             });
         }
         if var.stream().is_none() {
-            return Ok(known.accepted.map_or(Carried::Safe, |accepted| Carried::Held { accepted }));
+            return match self.held(link, known, now) {
+                Some(accepted) => Ok(Carried::Held { accepted }),
+                None => {
+                    let what =
+                        format!("{var} = {} was sent along, and this controller never got it", value());
+                    Err((Invariant::NoReplay, what))
+                }
+            };
         }
         if known.unreadable {
             let what = format!("{var} = {} was written back, and cannot be read now", value());
@@ -411,7 +461,7 @@ impl Upward {
     }
 
     /// Whether a recipe link's frame may be sent: each of its variables has a value.
-    pub(super) fn is_ready(&self, link: &super::sheet::LinkSheet, now: Instant) -> bool {
+    pub(super) fn is_ready(&self, link: &LinkSheet, now: Instant) -> bool {
         let is_fresh = self.state_at.is_some_and(|at| now.saturating_since(at) <= READ_BACK);
         let mut vars = link.input.iter().flat_map(|up| up.fields.iter().filter_map(super::sheet::written));
         vars.all(|var| {
@@ -419,7 +469,7 @@ impl Upward {
             match var.stream() {
                 _ if known.live => true,
                 Some(_) => known.read_back && is_fresh,
-                None => known.accepted.is_some(),
+                None => self.held(link, known, now).is_some(),
             }
         })
     }

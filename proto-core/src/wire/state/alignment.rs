@@ -113,8 +113,8 @@ impl Earlier {
                 self.codes = Some(codes);
             }
         }
-        self.joints = part(bytes, 0);
-        self.tcp = part(bytes, TCP_POSE);
+        self.joints = *part(bytes, 0);
+        self.tcp = *part(bytes, TCP_POSE);
         Ok(())
     }
 
@@ -125,10 +125,10 @@ impl Earlier {
         if self.codes.is_none() {
             return Ok(());
         }
-        let mut distance = farthest(&self.joints, &part::<JOINTS>(bytes, 0));
+        let mut distance = farthest(&self.joints, part::<JOINTS>(bytes, 0));
         // The TCP of a started controller jumps when a program takes another tool.
         if !is_started {
-            distance = distance.max(farthest(&self.tcp, &part::<TCP>(bytes, TCP_POSE)));
+            distance = distance.max(farthest(&self.tcp, part::<TCP>(bytes, TCP_POSE)));
         }
         if distance > ALLOWED_DISTANCE {
             return Err(Misaligned::Elsewhere { distance, allowed: ALLOWED_DISTANCE });
@@ -139,10 +139,10 @@ impl Earlier {
 
 #[inline]
 fn check(bytes: &[u8; LEN], is_started: bool) -> Result<(), Misaligned> {
-    let joints: [u8; JOINTS] = part(bytes, 0);
-    let wrong = wrong_joints(&joints);
+    let joints: &[u8; JOINTS] = part(bytes, 0);
+    let wrong = wrong_joints(joints);
     if wrong > ALLOWED_WRONG_JOINTS {
-        return Err(first_wrong_joint(&joints, wrong));
+        return Err(first_wrong_joint(joints, wrong));
     }
     let bools = BOOLS.iter().map(|run| bytes.get(run.from..).and_then(|run_on| run_on.get(..run.len)));
     let wrong: u16 = bools.flatten().filter(|run| !are_bools(run)).map(wrong_bools).sum();
@@ -171,7 +171,7 @@ fn check_quantities(bytes: &[u8; LEN]) -> Result<(), Misaligned> {
 }
 
 fn codes(bytes: &[u8; LEN]) -> [u8; 4] {
-    part(bytes, STATES)
+    *part(bytes, STATES)
 }
 
 /// Whether a controller that is through with its start shows these codes. One of them may be one
@@ -182,8 +182,8 @@ fn is_started([mode, robot, program, safety]: [u8; 4]) -> bool {
 }
 
 #[inline]
-fn part<const N: usize>(bytes: &[u8; LEN], from: usize) -> [u8; N] {
-    bytes.get(from..).and_then(|bytes| bytes.first_chunk()).copied().unwrap_or([0; N])
+fn part<const N: usize>(bytes: &[u8; LEN], from: usize) -> &[u8; N] {
+    bytes.get(from..).and_then(|bytes| bytes.first_chunk()).unwrap_or(&[0; N])
 }
 
 #[inline]
