@@ -127,7 +127,7 @@ impl Drop for Network {
     }
 }
 
-/// With [`END_WITH`] as the first of these arguments, becomes the program that is named; returns only when it
+/// When these arguments begin with `--end-with`, becomes the program that is named; returns only when it
 /// cannot, or when nothing like that was asked for.
 ///
 /// # Errors
