@@ -107,12 +107,17 @@ impl Board {
     }
 
     #[track_caller]
-    fn figures(&self) -> Value {
+    fn ask(&self, words: &str) -> String {
         let mut stream = self.connect("control");
-        stream.write_all(b"figures\n").unwrap();
+        stream.write_all(format!("{words}\n").as_bytes()).unwrap();
         let mut line = String::new();
         BufReader::new(stream).read_line(&mut line).unwrap();
-        serde_json::from_str(&line).unwrap()
+        line.trim_end().to_owned()
+    }
+
+    #[track_caller]
+    fn figures(&self) -> Value {
+        serde_json::from_str(&self.ask("figures")).unwrap()
     }
 
     /// The process of QEMU, once it is one.
@@ -213,6 +218,30 @@ fn clients_acknowledge_and_hear_each_other() {
     let later = lines.next().unwrap();
     assert!(later.starts_with("t0024"), "{later}");
     assert_eq!(board.figures()["can_in"], 1);
+}
+
+#[test]
+#[ignore = "needs CHIP_UNICORN and CHIP_ELF"]
+fn time_can_be_stopped() {
+    let board = Board::start();
+    board.until_log("configuration: ");
+    let now = || board.figures()["virtual_s"].as_f64().unwrap();
+    assert_eq!(board.ask("stop"), "done");
+    // What was behind catches up first.
+    let still = until("time to stand still", || {
+        let before = now();
+        let begin = Instant::now();
+        while begin.elapsed() < Duration::from_millis(300) {
+            board.ask("figures");
+        }
+        (now() == before).then_some(before)
+    });
+    let going = Instant::now();
+    assert_eq!(board.ask("go"), "done");
+    let after = until("time to go on", || Some(now()).filter(|now| *now > still + 0.2));
+    // The pause is no time that would have to be made up for.
+    assert!(after - still <= going.elapsed().as_secs_f64(), "{still} s, then {after} s");
+    assert_eq!(board.ask("sto"), "unknown: sto");
 }
 
 #[test]
