@@ -72,7 +72,7 @@ impl fmt::Display for Figures {
         let Self { instructions, interrupts, feeds, resets, ethernet, serial, can, .. } = self;
         write!(
             f,
-            "{{\"wall_s\": {:.3}, \"virtual_s\": {:.3}, \"most_behind_s\": {:.6}, \"late_s\": {:.3}, \
+            "{{\"wall_s\": {:.6}, \"virtual_s\": {:.6}, \"most_behind_s\": {:.6}, \"late_s\": {:.3}, \
              \"instructions\": {instructions}, \"interrupts\": {interrupts}, \"feeds\": {feeds}, \
              \"resets\": {resets}, \"ethernet_taken\": {}, \"ethernet_dropped\": {}, \"ethernet_sent\": {}, \
              \"serial_in\": {}, \"serial_out\": {}, \"can_in\": {}, \"can_out\": {}}}",
