@@ -150,7 +150,7 @@ impl Board {
     fn refresh(&mut self) {
         let (deadline, is_wanted) = self.with(|devices, scs, at| {
             let mut deadline = scs.deadline().unwrap_or(Picos::MAX);
-            for place in &MAP {
+            for place in MAP.iter().filter(|place| place.changes_with_time()) {
                 let device = devices.device(place.id);
                 deadline = deadline.min(device.deadline(at).unwrap_or(Picos::MAX));
                 if let Some(line) = place.line {
@@ -174,7 +174,7 @@ impl Board {
         let refused = self.with(|devices, scs, at| {
             scs.advance(at);
             let mut memory = core;
-            for place in &MAP {
+            for place in MAP.iter().filter(|place| place.changes_with_time()) {
                 let result = devices.device(place.id).advance(at);
                 let result = match place.id {
                     Id::Ethernet => result.and_then(|()| devices.ethernet.transfer(&mut memory, at)),

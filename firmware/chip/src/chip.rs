@@ -5,7 +5,7 @@
 //!
 //! Time is counted in instructions, one a cycle; while the core waits for an event it jumps to the next
 //! deadline of a device. Nothing else moves it, so a run is the same each time and everywhere. A run
-//! that keeps pace with the clock on the wall would wait in [`Chip::idle`], and nowhere else.
+//! that keeps pace with the clock on the wall is made of short ones ([`crate::realtime`]).
 
 use defmt_decoder::StreamDecoder;
 
@@ -32,6 +32,10 @@ pub struct Chip {
     program: &'static Program,
     pc: u32,
     is_locked_up: bool,
+    /// It waits for an event.
+    is_asleep: bool,
+    /// Steps since the log was read.
+    unread: u32,
     /// The range that nobody may touch.
     closed: Option<(u32, u32)>,
     /// Times in a row that a deadline was not ahead.
@@ -80,6 +84,8 @@ impl Chip {
             program,
             pc: 0,
             is_locked_up: false,
+            is_asleep: false,
+            unread: 0,
             closed: None,
             stuck: 0,
             decoder: program.log_reader(),
@@ -119,6 +125,7 @@ impl Chip {
         engine.set(Reg::Lr, u32::MAX);
         self.pc = engine.word(FLASH + 4);
         self.is_locked_up = false;
+        self.is_asleep = false;
         self.closed = None;
         Ok(())
     }
@@ -179,6 +186,17 @@ impl Chip {
         self.program.place(self.pc & !1)
     }
 
+    /// The clock tree.
+    pub fn clocks(&self) -> Clocks {
+        self.board.devices.rcc.clocks()
+    }
+
+    /// While the core waits for an event: when a device will do something next.
+    pub fn sleeps_until(&mut self) -> Option<Picos> {
+        self.board.limit = Picos::MAX;
+        (self.is_asleep || self.is_locked_up).then(|| self.board.deadline())
+    }
+
     /// Runs up to an instant.
     ///
     /// # Errors
@@ -187,7 +205,15 @@ impl Chip {
         while self.board.now < end {
             self.board.limit = end;
             self.step(end);
-            self.read_log();
+            self.unread += 1;
+            if self.is_asleep
+                || self.unread >= LOG_PERIOD
+                || self.board.now >= end
+                || self.board.violation.is_some()
+            {
+                self.unread = 0;
+                self.read_log();
+            }
             if let Some(violation) = self.board.violation.clone() {
                 let place = self.program.place(violation.access.pc);
                 return Err(Stopped { violation, place });
@@ -208,7 +234,12 @@ impl Chip {
             return;
         }
         if let Some(number) = self.board.scs.due(masks(engine)) {
+            self.is_asleep = false;
             self.take(number, self.pc);
+        }
+        if self.is_asleep {
+            self.wait(end);
+            return;
         }
         self.follow_guard();
         self.follow_flash();
@@ -348,7 +379,8 @@ impl Chip {
         if std::mem::take(&mut self.board.scs.event) {
             return;
         }
-        self.waits += 1;
+        self.waits += u64::from(!self.is_asleep);
+        self.is_asleep = true;
         let engine = self.engine();
         while self.board.now < end
             && self.board.scs.due(masks(engine)).is_none()
@@ -387,8 +419,10 @@ impl Chip {
     fn read_log(&mut self) {
         let engine = self.core.engine();
         let Some(channel) = self.program.rtt.map(|address| address + 24) else { return };
-        let word = |index: u32| engine.word(channel + 4 * index);
-        let (buffer, size, write, read) = (word(1), word(2), word(3), word(4));
+        let mut words = [0; 16];
+        engine.read(channel + 4, &mut words);
+        let word = |index: usize| u32::from_le_bytes(words[4 * index..][..4].try_into().expect("four"));
+        let (buffer, size, write, read) = (word(0), word(1), word(2), word(3));
         let is_ring = buffer >= RAM[1].0 && size <= 0x1_0000 && write < size && read < size;
         if !is_ring || write == read {
             return;
@@ -405,6 +439,8 @@ impl Chip {
     }
 }
 
+/// The log is read at least each so many steps.
+const LOG_PERIOD: u32 = 16;
 /// What memory is opened and closed by.
 const PAGE: u32 = 0x1000;
 

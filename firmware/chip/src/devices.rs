@@ -43,6 +43,13 @@ pub(crate) struct Place {
     pub(crate) line: Option<u16>,
 }
 
+impl Place {
+    /// Whether time does anything to it.
+    pub(crate) fn changes_with_time(&self) -> bool {
+        !matches!(self.id, Id::Gpio(_) | Id::CanRam)
+    }
+}
+
 const fn place(
     base: u32,
     size: u32,

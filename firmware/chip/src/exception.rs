@@ -41,11 +41,17 @@ pub(crate) fn enter(core: Engine, scs: &mut Scs, number: u16, return_address: u3
         words.extend((0..SINGLES).map(|number| core.single(number)));
         words.extend([core.reg(Reg::Fpscr), 0]);
     }
-    for (address, word) in (frame..).step_by(4).zip(words) {
-        if guard.is_some_and(|(start, size)| (start..start + size).contains(&address)) {
-            scs.note_fault(1 << 4, 0, true);
-        } else {
-            core.write(address, &word.to_le_bytes());
+    let end = frame.wrapping_add(4 * words.len() as u32);
+    if guard.is_none_or(|(start, size)| end <= start || frame >= start + size) {
+        let bytes: Vec<u8> = words.iter().flat_map(|word| word.to_le_bytes()).collect();
+        core.write(frame, &bytes);
+    } else {
+        for (address, word) in (frame..).step_by(4).zip(words) {
+            if guard.is_some_and(|(start, size)| (start..start + size).contains(&address)) {
+                scs.note_fault(1 << 4, 0, true);
+            } else {
+                core.write(address, &word.to_le_bytes());
+            }
         }
     }
     let kind = if status & 0x1FF == 0 { TO_THREAD } else { TO_HANDLER };
@@ -66,10 +72,13 @@ pub(crate) fn is_return(pc: u32) -> bool {
 pub(crate) fn leave(core: Engine, scs: &mut Scs, how: u32) -> u32 {
     let frame = core.reg(Reg::Sp);
     let has_floats = how & NO_FLOATS == 0;
-    for (address, reg) in (frame..).step_by(4).zip(STACKED) {
-        core.set(reg, core.word(address));
+    let mut basic = [0; FRAME as usize];
+    core.read(frame, &mut basic);
+    let word = |index: usize| u32::from_le_bytes(basic[4 * index..][..4].try_into().expect("four"));
+    for (index, reg) in STACKED.into_iter().enumerate() {
+        core.set(reg, word(index));
     }
-    let (pc, status) = (core.word(frame + 0x18), core.word(frame + 0x1C));
+    let (pc, status) = (word(6), word(7));
     scs.leave();
     if core.reg(Reg::Ipsr) != u32::from(crate::models::scs::HARD_FAULT) {
         core.set(Reg::Faultmask, 0);

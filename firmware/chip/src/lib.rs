@@ -13,6 +13,7 @@ mod devices;
 mod exception;
 pub mod models;
 mod program;
+pub mod realtime;
 pub mod unicorn;
 
 pub use board::{Access, Violation};

@@ -1,45 +1,109 @@
 //! `chip ELF [IMAGE] [--ms N] [--last N]`: runs the firmware for N ms of virtual time (2000), shows its log,
 //! and at the end where it is, what it did last to which registers, and how fast that was.
+//!
+//! `chip ELF [IMAGE] --realtime [...]`: runs it at the pace of the clock on the wall, with sockets for its lines,
+//! its bus and its cable, until it is interrupted (docs/chip.md section 5).
 
+use std::io::Write;
+use std::os::unix::net::UnixStream;
 use std::process::ExitCode;
 use std::time::Instant;
 
-use chip::device::MILLI;
-use chip::{Chip, Program};
+use chip::device::{MILLI, SECOND};
+use chip::realtime::{Ended, Runner, Wiring, become_other};
+use chip::{Chip, Program, Stopped};
+use signal_hook::consts::{SIGINT, SIGTERM};
+
+const USAGE: &str = "usage: chip ELF [IMAGE] [--ms N] [--last N]
+       chip ELF [IMAGE] --realtime [--rs485 PLACE [--rs485 PLACE]] [--can PLACE]
+            [--network OPTIONS [--qmp PATH]] [--control PLACE] [--last N]
+a PLACE is HOST:PORT or the path of a socket; OPTIONS are those of QEMU's '-netdev user', or ''";
 
 fn main() -> ExitCode {
-    match run() {
-        Ok(code) => code,
-        Err(error) => {
-            eprintln!("{error}");
-            ExitCode::from(2)
+    let result = become_other(std::env::args().skip(1)).and_then(|()| run());
+    result.unwrap_or_else(|error| {
+        eprintln!("{error}");
+        ExitCode::from(2)
+    })
+}
+
+struct Options {
+    files: Vec<String>,
+    ms: u64,
+    last: usize,
+    wiring: Option<Wiring>,
+}
+
+fn options(mut args: impl Iterator<Item = String>) -> Result<Options, String> {
+    let mut options = Options { files: Vec::new(), ms: 2_000, last: 20, wiring: None };
+    let (mut wiring, mut is_wired) = (Wiring::default(), false);
+    while let Some(arg) = args.next() {
+        let mut value = || args.next().ok_or_else(|| format!("{arg} needs a value"));
+        let number = |value: String| value.parse().map_err(|_| format!("{value}: not a number"));
+        is_wired |= ["--rs485", "--can", "--network", "--qmp", "--control"].contains(&arg.as_str());
+        match arg.as_str() {
+            "--ms" => options.ms = number(value()?)?,
+            "--last" => options.last = number(value()?)? as usize,
+            "--realtime" => options.wiring = Some(Wiring::default()),
+            "--rs485" => wiring.serial.push(value()?),
+            "--can" => wiring.can = Some(value()?),
+            "--network" => wiring.network = Some(value()?),
+            "--qmp" => wiring.qmp = Some(value()?),
+            "--control" => wiring.control = Some(value()?),
+            _ if arg.starts_with("--") => return Err(format!("{arg}: unknown\n{USAGE}")),
+            _ => options.files.push(arg),
         }
     }
+    match &mut options.wiring {
+        Some(place) => *place = wiring,
+        None if is_wired => return Err(format!("sockets need --realtime\n{USAGE}")),
+        None => {}
+    }
+    Ok(options)
 }
 
 fn run() -> Result<ExitCode, String> {
-    let (mut files, mut ms, mut last) = (Vec::new(), 2_000, 20);
-    let mut args = std::env::args().skip(1);
-    while let Some(arg) = args.next() {
-        let mut number = || {
-            let value = args.next().and_then(|value| value.parse().ok());
-            value.ok_or_else(|| format!("{arg} needs a number"))
-        };
-        match arg.as_str() {
-            "--ms" => ms = number()?,
-            "--last" => last = number()?,
-            _ => files.push(arg),
-        }
-    }
-    let [elf, image @ ..] = files.as_slice() else {
-        return Err("usage: chip ELF [IMAGE] [--ms N] [--last N]".into());
-    };
+    let options = options(std::env::args().skip(1))?;
+    let [elf, image @ ..] = options.files.as_slice() else { return Err(USAGE.into()) };
     let read = |file: &String| std::fs::read(file).map_err(|error| format!("{file}: {error}"));
     let program: &'static Program = Box::leak(Box::new(Program::read(&read(elf)?)?));
     let image = image.first().map(read).transpose()?.unwrap_or_default();
     let mut chip = Chip::new(program, &image)?;
-    let _ = chip.accesses(last as usize).count();
-    let (begin, mut shown, mut stopped) = (Instant::now(), 0, None);
+    let _ = chip.accesses(options.last).count();
+    match &options.wiring {
+        Some(wiring) => in_real_time(chip, wiring, options.last),
+        None => in_virtual_time(chip, options.ms, options.last),
+    }
+}
+
+fn in_real_time(chip: Chip, wiring: &Wiring, last: usize) -> Result<ExitCode, String> {
+    let failed = |error: std::io::Error| error.to_string();
+    let (end, signal) = UnixStream::pair().map_err(failed)?;
+    for number in [SIGINT, SIGTERM] {
+        signal_hook::low_level::pipe::register(number, signal.try_clone().map_err(failed)?)
+            .map_err(failed)?;
+    }
+    let mut runner = Runner::new(chip, wiring)?;
+    let mut out = std::io::stdout();
+    let ended = runner.run(&end, &mut out);
+    let figures = runner.figures();
+    let _ = writeln!(out, "{figures}");
+    Ok(match ended {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(Ended::Lost(reason)) => {
+            eprintln!("{reason}");
+            ExitCode::FAILURE
+        }
+        Err(Ended::Stopped(stopped)) => {
+            show_end(runner.chip(), last, &mut std::io::stderr());
+            eprintln!("not allowed: {stopped}");
+            ExitCode::FAILURE
+        }
+    })
+}
+
+fn in_virtual_time(mut chip: Chip, ms: u64, last: usize) -> Result<ExitCode, String> {
+    let (begin, mut shown, mut stopped): (_, _, Option<Stopped>) = (Instant::now(), 0, None);
     for end in (1..=ms).map(|end| end * MILLI) {
         let result = chip.run_until(end);
         for (at, line) in &chip.log[shown..] {
@@ -52,23 +116,12 @@ fn run() -> Result<ExitCode, String> {
         }
     }
     let wall = begin.elapsed().as_secs_f64();
-    println!("\nthe last {last} accesses:");
-    for access in chip.accesses(last as usize) {
-        println!("{access}");
-        println!("{:17}at {}", "", program.place(access.pc));
-    }
-    println!("\nat {}", chip.place());
-    for (pc, status) in &chip.faults {
-        println!("a fault, CFSR {status:08X}, at {}", program.place(*pc));
-    }
-    for at in &chip.resets {
-        println!("reset by the watchdog after {:.3} ms", *at as f64 / MILLI as f64);
-    }
+    show_end(&mut chip, last, &mut std::io::stdout());
     let (instructions, interrupts) = (chip.instructions() as f64, chip.interrupts() as f64);
     println!(
         "{:.3} s of virtual time in {wall:.3} s; {instructions:.0} instructions, {:.1} million a second; \
          {interrupts:.0} interrupts, {:.0} a second; {} waits",
-        chip.now() as f64 / (1_000 * MILLI) as f64,
+        chip.now() as f64 / SECOND as f64,
         instructions / wall / 1e6,
         interrupts / wall,
         chip.waits,
@@ -80,4 +133,21 @@ fn run() -> Result<ExitCode, String> {
         }
         None => ExitCode::SUCCESS,
     })
+}
+
+/// The last accesses, where the program is, faults and resets. That it cannot be written is nobody's concern.
+fn show_end(chip: &mut Chip, last: usize, out: &mut dyn Write) {
+    let program = chip.program();
+    let mut text = format!("\nthe last {last} accesses:\n");
+    for access in chip.accesses(last) {
+        text += &format!("{access}\n{:17}at {}\n", "", program.place(access.pc));
+    }
+    text += &format!("\nat {}\n", chip.place());
+    for (pc, status) in &chip.faults {
+        text += &format!("a fault, CFSR {status:08X}, at {}\n", program.place(*pc));
+    }
+    for at in &chip.resets {
+        text += &format!("reset by the watchdog after {:.3} ms\n", *at as f64 / MILLI as f64);
+    }
+    let _ = out.write_all(text.as_bytes());
 }

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use proto_core::config::{Bus, GatewayConfig};
+use serde_json::Value;
 
 use super::case::{Case, until};
 use super::field::{CanClient, Line};
@@ -64,6 +65,11 @@ pub(crate) trait Gateway {
 
     /// The memory that it took so far at most, in bytes.
     fn memory(&self) -> u64;
+
+    /// What its emulator counts, where there is one that counts.
+    fn figures(&self) -> Value {
+        Value::Null
+    }
 
     /// Fails when it has ended, or said that it panicked.
     fn must_run(&mut self);

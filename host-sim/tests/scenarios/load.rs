@@ -8,6 +8,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use serde_json::Value;
+
 use super::case::{Case, Scenario, until};
 use super::environment::Link;
 use super::field::slcan;
@@ -138,7 +140,7 @@ fn full_load(case: &Case) {
     let done = Arc::new(AtomicBool::new(false));
     let sensor = Generator::start(&done, SENSOR_RATE, sensor.take_writer(), sensor_frame);
     let can = Generator::start(&done, CAN_RATE, bus_line.take_writer(), can_frame);
-    let (begin, spent) = (Instant::now(), gateway.processor_time());
+    let (begin, spent, figures) = (Instant::now(), gateway.processor_time(), gateway.figures());
     panel.take(&panel_line.take_all());
     bus.take(&bus_line.take_all());
     let out_before = [panel.frames, bus.frames];
@@ -155,6 +157,7 @@ fn full_load(case: &Case) {
     }
     let spent = gateway.processor_time() - spent;
     let elapsed = begin.elapsed();
+    let figures = growth(&figures, &gateway.figures(), elapsed);
     let out = [panel.frames - out_before[0], bus.frames - out_before[1]];
     done.store(true, Ordering::Relaxed);
     let (sensor, can) = (sensor.end(), can.end());
@@ -185,7 +188,7 @@ fn full_load(case: &Case) {
         "{}: {seconds:.1} s\n  force sensor: {} frames sent ({:.0}/s, {} late together with others), {} in\n  \
          CAN: {} frames sent ({:.0}/s, {} late together with others), {} in; {} out ({:.0}/s), {} cycles skipped\n  \
          panel: {} frames out ({:.0}/s), {} cycles skipped\n  controller: {requests} Modbus requests ({:.0}/s), \
-         {datagrams} datagrams of forces ({:.0}/s)\n  processor {:.0} %, memory {before} bytes, at the end {after}",
+         {datagrams} datagrams of forces ({:.0}/s)\n  processor {:.0} %, memory {before} bytes, at the end {after}{figures}",
         case.environment.name(),
         sensor.frames,
         rate(sensor.frames.into()),
@@ -209,6 +212,17 @@ fn full_load(case: &Case) {
     assert_eq!(bus_port.frames_in, u64::from(can.frames), "{bus_port:?}");
     assert!(panel.frames > 0 && bus.frames > 0, "{panel_port:?} {bus_port:?}");
     assert!(after <= before + MEMORY_NOISE, "memory grew from {before} to {after} bytes");
+}
+
+/// What an emulator counted meanwhile, with how much that is a second.
+fn growth(before: &Value, after: &Value, elapsed: Duration) -> String {
+    let mut text = String::new();
+    for (name, after) in after.as_object().into_iter().flatten() {
+        let (Some(before), Some(after)) = (before[name].as_f64(), after.as_f64()) else { continue };
+        let count = if name.starts_with("most") { after } else { after - before };
+        text += &format!("\n  {name} {count} ({:.1}/s)", count / elapsed.as_secs_f64());
+    }
+    text
 }
 
 /// Pages that the allocator of a host's process may take later.

@@ -1,19 +1,23 @@
-//! The cell's scenarios, written once and run against the gateway on this host and against the
-//! firmware in QEMU.
+//! The cell's scenarios, written once and run against the gateway on this host, against the firmware in
+//! QEMU, and against the NUCLEO's firmware on its modelled chip.
 //!
-//! Each scenario is counted twice, as `host::NAME` and as `qemu::NAME`; what a gateway does that was stopped
-//! for seconds is shown on the host only, since the guest's clock stops with it. The field devices are on
-//! pseudoterminals and slcan by TCP, or on the emulated UARTs; the controller is `host-sim controller`
-//! in both, reached over loopback or over the emulated Ethernet.
+//! Each scenario is counted three times, as `host::NAME`, `qemu::NAME` and `nucleo::NAME`; what a gateway does
+//! that was stopped for seconds is shown on the host only, since a guest's clock stops with it. The field
+//! devices are on pseudoterminals and slcan by TCP, on the emulated UARTs, or on modelled lines and a modelled CAN
+//! bus; the controller is `host-sim controller` in all, reached over loopback or over the emulated Ethernet.
 //!
 //! * `HOST_SIM_FIRMWARE=ELF` names the firmware for QEMU (`qemu-system-arm` has to be there). Without
 //!   it the cases of QEMU are counted as ignored.
+//! * `HOST_SIM_NUCLEO=ELF` names the firmware for the NUCLEO; `CHIP_UNICORN` the library that its instructions
+//!   are emulated with (docs/chip.md). `cargo build -p chip` comes before, and `qemu-system-arm` is the
+//!   network. Without it the cases of the NUCLEO are counted as ignored.
 //! * `HOST_SIM_NAMESPACES=required` fails where no user and network namespace can be made (Debian:
 //!   util-linux, iproute2). Else what needs one is counted as ignored there.
 //! * `HOST_SIM_LOAD_SECONDS` is how long the run under full load takes.
 //!
 //! What each program said is under `target/tmp/scenarios/`; it stays there when a case fails.
 
+mod board;
 mod case;
 mod commands;
 mod environment;
@@ -25,6 +29,7 @@ mod host;
 mod load;
 mod namespace;
 mod network;
+mod nucleo;
 mod program;
 mod qemu;
 mod refusal;
@@ -45,6 +50,9 @@ use environment::Environment;
 const HOW: &str = "HOST_SIM_FIRMWARE=ELF cargo test --test scenarios (Debian: apt-get install \
                    qemu-system-arm; the ELF: rustup target add thumbv7em-none-eabihf, cargo firmware-qemu, \
                    then it is target/thumbv7em-none-eabihf/firmware/firmware)";
+/// As above, for the NUCLEO.
+const HOW_NUCLEO: &str =
+    "HOST_SIM_NUCLEO=ELF CHIP_UNICORN=LIBRARY cargo test --test scenarios (docs/chip.md)";
 /// Cases at a time. Most of a case is waiting.
 const THREADS: usize = 4;
 
@@ -54,17 +62,11 @@ fn main() -> ExitCode {
     }
     let mut arguments = Arguments::from_args();
     arguments.test_threads = arguments.test_threads.or(Some(THREADS));
-    let firmware = match firmware() {
-        Ok(firmware) => Some(firmware),
-        Err(Missing::Skip(reason)) => {
-            eprintln!("scenarios: those of the firmware are skipped, {reason}; {HOW}");
-            None
-        }
-        Err(Missing::Fail(reason)) => {
-            eprintln!("scenarios: {reason}");
-            return ExitCode::FAILURE;
-        }
-    };
+    let found = [
+        found("HOST_SIM_FIRMWARE", HOW, firmware("HOST_SIM_FIRMWARE")),
+        found("HOST_SIM_NUCLEO", HOW_NUCLEO, nucleo()),
+    ];
+    let [Ok(firmware), Ok(nucleo)] = found else { return ExitCode::FAILURE };
     let no_namespaces = namespace::refused();
     if let Some(reason) = &no_namespaces {
         let must = std::env::var_os("HOST_SIM_NAMESPACES").is_some_and(|level| level == "required");
@@ -104,6 +106,15 @@ fn main() -> ExitCode {
             None => ignored("qemu", &scenario, "needs HOST_SIM_FIRMWARE"),
         });
     }
+    let emulator = Path::new(env!("CARGO_BIN_EXE_host-sim")).with_file_name("chip");
+    let chip = nucleo::Nucleo { elf: nucleo.clone().unwrap_or_default(), emulator };
+    let chip: Arc<dyn Environment> = Arc::new(chip);
+    for scenario in scenarios(&*chip) {
+        trials.push(match &nucleo {
+            Some(_) => trial(scenario, Arc::clone(&chip), &machine),
+            None => ignored("nucleo", &scenario, "needs HOST_SIM_NUCLEO"),
+        });
+    }
     libtest_mimic::run(&arguments, trials).exit_code()
 }
 
@@ -124,17 +135,44 @@ enum Missing {
     Fail(String),
 }
 
-fn firmware() -> Result<PathBuf, Missing> {
-    let Some(named) = std::env::var_os("HOST_SIM_FIRMWARE").filter(|named| !named.is_empty()) else {
-        return Err(Missing::Skip("HOST_SIM_FIRMWARE names no firmware".into()));
+/// The firmware, or `None` where its cases are to be skipped.
+fn found(variable: &str, how: &str, firmware: Result<PathBuf, Missing>) -> Result<Option<PathBuf>, ()> {
+    match firmware {
+        Ok(firmware) => Ok(Some(firmware)),
+        Err(Missing::Skip(reason)) => {
+            eprintln!("scenarios: those of {variable} are skipped, {reason}; {how}");
+            Ok(None)
+        }
+        Err(Missing::Fail(reason)) => {
+            eprintln!("scenarios: {reason}");
+            Err(())
+        }
+    }
+}
+
+fn firmware(variable: &str) -> Result<PathBuf, Missing> {
+    let Some(named) = std::env::var_os(variable).filter(|named| !named.is_empty()) else {
+        return Err(Missing::Skip("it names no firmware".into()));
     };
     // Cargo runs tests in the package's folder; what is typed is relative to the workspace's.
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(&named);
     if !path.is_file() {
-        return Err(Missing::Fail(format!("HOST_SIM_FIRMWARE={}: no such file", named.display())));
+        return Err(Missing::Fail(format!("{variable}={}: no such file", named.display())));
     }
     if !program::exists("qemu-system-arm") {
         return Err(Missing::Skip("there is no qemu-system-arm".into()));
+    }
+    Ok(path)
+}
+
+/// The NUCLEO's, which needs its emulator as well.
+fn nucleo() -> Result<PathBuf, Missing> {
+    let path = firmware("HOST_SIM_NUCLEO")?;
+    if std::env::var_os("CHIP_UNICORN").is_none() {
+        return Err(Missing::Fail("HOST_SIM_NUCLEO needs CHIP_UNICORN (docs/chip.md)".into()));
+    }
+    if !Path::new(env!("CARGO_BIN_EXE_host-sim")).with_file_name("chip").is_file() {
+        return Err(Missing::Fail("HOST_SIM_NUCLEO needs 'cargo build -p chip' before".into()));
     }
     Ok(path)
 }

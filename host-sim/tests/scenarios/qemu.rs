@@ -3,16 +3,15 @@
 
 use std::collections::BTreeMap;
 use std::ffi::OsString;
-use std::io::{BufRead, BufReader, Write};
-use std::net::{Ipv4Addr, SocketAddr};
+use std::net::SocketAddr;
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
-use std::process::Command;
 use std::time::Duration;
 
 use proto_core::config::Bus;
 use serde_json::{Value, json};
 
+use super::board;
 use super::case::{Case, until};
 use super::environment::{Cable, Environment, Gateway, Link, LinkStatus, Plan, PortStatus, ports};
 use super::field::{CanClient, Line};
@@ -24,12 +23,9 @@ pub(crate) struct Qemu {
     pub(crate) elf: PathBuf,
 }
 
-/// The host as the guest sees it.
-const HOST: &str = "10.0.2.2";
-/// The board's stack (firmware/boards/mps2-an500/memory.x), and what it is filled with at the start.
+/// The board's stack (firmware/boards/mps2-an500/memory.x).
 const STACK: u64 = 0x2030_0000;
 const STACK_SIZE: u64 = 1 << 20;
-const PAINT: u8 = 0xC5;
 /// RS-485, RS-485, CAN.
 const UARTS: usize = 3;
 /// The UART of the CAN port.
@@ -53,12 +49,12 @@ impl Environment for Qemu {
     #[track_caller]
     fn start(&self, plan: &Plan<'_>) -> Box<dyn Gateway> {
         let image = plan.case.folder.path().join("gateway.img");
-        make_image(plan, &image);
+        board::make_image(plan, &image);
         let mut board = Board::start(&self.elf, plan, &image);
         board.until_log("configuration: ");
         // Others can connect from now on.
-        if !ports(&plan.config(), listens).is_empty() {
-            board.until_log("address 10.0.2.15");
+        if !ports(&plan.config(), board::listens).is_empty() {
+            board.until_log(board::ADDRESS);
         }
         Box::new(board)
     }
@@ -66,17 +62,7 @@ impl Environment for Qemu {
     #[track_caller]
     fn refuses(&self, plan: &Plan<'_>, spoil: Spoil) -> String {
         let image = plan.case.folder.path().join("gateway.img");
-        make_image(plan, &image);
-        let mut bytes = std::fs::read(&image).unwrap();
-        match spoil {
-            Spoil::Damaged => bytes[40] ^= 1,
-            Spoil::Cut => bytes.truncate(bytes.len() - 1),
-            Spoil::Missing => std::fs::remove_file(&image).unwrap(),
-            Spoil::NoDevice => {}
-        }
-        if spoil != Spoil::Missing {
-            std::fs::write(&image, bytes).unwrap();
-        }
+        board::make_spoilt_image(plan, &image, spoil);
         let mut board = Board::start(&self.elf, plan, &image);
         board.until_log("nothing runs: ");
         let reason = until("the whole line", || {
@@ -92,22 +78,6 @@ impl Environment for Qemu {
         board.must_run();
         reason
     }
-}
-
-fn listens(bus: &Bus) -> bool {
-    matches!(bus, Bus::TcpListen { .. } | Bus::UdpListen { .. })
-}
-
-/// `host-sim image`.
-#[track_caller]
-fn make_image(plan: &Plan<'_>, image: &Path) {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_host-sim"));
-    command.arg("image").arg(plan.file()).arg("-o").arg(image);
-    for value in plan.overrides(HOST, &plan.server_ports()) {
-        command.arg("--set").arg(value);
-    }
-    let output = command.output().unwrap();
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
 }
 
 /// QEMU with the firmware.
@@ -129,21 +99,16 @@ impl Board {
         let log = plan.case.logs.join("board.log");
         let config = plan.config();
         let mut ports = BTreeMap::new();
-        let mut network = "user,id=n0,mac=02:11:22:33:44:55".to_owned();
-        let mut inside = BTreeMap::new();
+        let mut network = vec!["user,id=n0,mac=02:11:22:33:44:55".to_owned()];
+        network.extend(board::forwards(&config));
+        let network = network.join(",");
         let (mut lines, mut buses) = (0..CAN_UART, CAN_UART..UARTS);
         for (number, port) in config.ports.iter().enumerate() {
             let name = port.name.as_str().to_owned();
             let uart = match &port.bus {
                 Bus::Rs485(_) => lines.next(),
                 Bus::Can { .. } => buses.next(),
-                Bus::TcpListen { listen } | Bus::UdpListen { listen } => {
-                    let kind = if matches!(port.bus, Bus::TcpListen { .. }) { "tcp" } else { "udp" };
-                    let at = listen.parse::<SocketAddr>().unwrap().port();
-                    network.push_str(&format!(",hostfwd={kind}:127.0.0.1:0-:{at}"));
-                    inside.insert(name, (kind.to_uppercase(), at));
-                    continue;
-                }
+                Bus::TcpListen { .. } | Bus::UdpListen { .. } => continue,
             };
             if let Some(uart) = uart {
                 ports.insert(name, (number, uart));
@@ -173,12 +138,7 @@ impl Board {
             board.must_run();
             UnixStream::connect(board.folder.join("qmp")).ok()
         });
-        if !inside.is_empty() {
-            let table = board.qmp("human-monitor-command", json!({ "command-line": "info usernet" }));
-            for (name, (kind, port)) in inside {
-                board.listens.insert(name, forwarded(table.as_str().unwrap(), &kind, port));
-            }
-        }
+        board.listens = board::forwarded(&config, &board.folder.join("qmp")).into_iter().collect();
         board
     }
 
@@ -207,36 +167,8 @@ impl Board {
     /// One command to QEMU; what it returns.
     #[track_caller]
     fn qmp(&self, command: &str, arguments: Value) -> Value {
-        let mut stream = UnixStream::connect(self.folder.join("qmp")).unwrap();
-        let mut lines = BufReader::new(stream.try_clone().unwrap()).lines();
-        lines.next().unwrap().unwrap();
-        let mut answer = Value::Null;
-        for (command, arguments) in [("qmp_capabilities", json!({})), (command, arguments)] {
-            writeln!(stream, "{}", json!({ "execute": command, "arguments": arguments })).unwrap();
-            // Events come between.
-            answer = loop {
-                let line: Value = serde_json::from_str(&lines.next().unwrap().unwrap()).unwrap();
-                if line.get("event").is_none() {
-                    break line;
-                }
-            };
-            assert!(answer.get("return").is_some(), "{command}: {answer}");
-        }
-        answer["return"].take()
+        board::qmp(&self.folder.join("qmp"), command, arguments)
     }
-}
-
-/// Where the host reaches a port of the guest, from QEMU's table.
-#[track_caller]
-fn forwarded(table: &str, kind: &str, port: u16) -> SocketAddr {
-    for line in table.lines() {
-        // Protocol[HOST_FORWARD] FD source-address source-port dest-address dest-port ...
-        let words: Vec<&str> = line.split_whitespace().collect();
-        if words.len() >= 6 && words[0] == format!("{kind}[HOST_FORWARD]") && words[5] == port.to_string() {
-            return (Ipv4Addr::LOCALHOST, words[3].parse::<u16>().unwrap()).into();
-        }
-    }
-    panic!("{kind} port {port} is not forwarded:\n{table}");
 }
 
 impl Gateway for Board {
@@ -255,48 +187,12 @@ impl Gateway for Board {
         self.listens[port]
     }
 
-    /// From the lines `link NAME: up (COUNT)` and `link NAME: lost`.
     fn link(&self, link: Link<'_>) -> LinkStatus {
-        let name = match link {
-            Link::Command => "command",
-            Link::State => "state",
-            Link::Modbus => "modbus",
-            Link::Udp2011 => "udp2011",
-            Link::TcpListen(_) => "tcp-listen",
-            Link::UdpListen(_) => "udp-listen",
-        };
-        let mut status = LinkStatus::default();
-        let log = self.log();
-        for line in log.lines() {
-            let Some((_, said)) = line.split_once(&format!("link {name}: ")) else { continue };
-            status.is_up = said.starts_with("up");
-            if let Some(count) = said.strip_prefix("up (").and_then(|rest| rest.trim_end().strip_suffix(')'))
-            {
-                status.connects = count.parse().unwrap();
-            }
-        }
-        status
+        board::link(&self.log(), link)
     }
 
-    /// From the newest line `port NUMBER: in FRAMES frames, BYTES bytes; out ...`.
     fn port(&self, port: &str) -> PortStatus {
-        let start = format!("port {}: in ", self.field(port).0);
-        let log = self.log();
-        // The newest line may not be whole yet.
-        let whole = log.split_inclusive('\n').filter(|line| line.ends_with('\n'));
-        let Some(said) = whole.filter_map(|line| line.split_once(&start)).next_back() else {
-            return PortStatus::default();
-        };
-        let mut numbers = said.1.split_whitespace().filter_map(|word| word.parse().ok());
-        let mut next = || numbers.next().unwrap_or(0);
-        PortStatus {
-            frames_in: next(),
-            bytes_in: next(),
-            frames_out: next(),
-            bytes_out: next(),
-            skipped_bytes: next(),
-            skipped_cycles: next(),
-        }
+        board::port(&self.log(), self.field(port).0)
     }
 
     #[track_caller]
@@ -315,9 +211,7 @@ impl Gateway for Board {
     }
 
     fn own_address(&self) -> Option<String> {
-        let log = self.log();
-        let (_, said) = log.rsplit_once(" address ")?;
-        said.split_whitespace().next().map(str::to_owned)
+        board::own_address(&self.log())
     }
 
     fn processor_time(&self) -> Duration {
@@ -329,9 +223,7 @@ impl Gateway for Board {
     fn memory(&self) -> u64 {
         let path = self.folder.join("memory");
         self.qmp("pmemsave", json!({ "val": STACK, "size": STACK_SIZE, "filename": path }));
-        let unused = std::fs::read(&path).unwrap().iter().take_while(|&&byte| byte == PAINT).count() as u64;
-        assert!(unused > 0, "the stack is where it is not expected");
-        STACK_SIZE - unused
+        board::stack_used(&path)
     }
 
     #[track_caller]

@@ -35,13 +35,17 @@ fn refused(case: &Case, spoil: Spoil) {
     let reason = plan.robot(&robot).refused(spoil);
     let expected: &[&str] = match spoil {
         Spoil::Damaged => &["unknown key", "damaged"],
-        Spoil::Cut => &["spoilt.toml", "cut"],
-        Spoil::Missing => &["No such file", "cannot be read"],
+        Spoil::Cut => &["spoilt.toml", "cut", BEHIND_THE_END],
+        Spoil::Missing => &["No such file", "cannot be read", ERASED],
         Spoil::NoDevice => &["port line-3 needs exactly one device", "this board has 2 RS-485 ports"],
     };
     assert!(expected.iter().any(|words| reason.contains(words)), "{spoil:?}: {reason}");
 }
 
+/// In flash an image that was cut goes on with erased bytes.
+const BEHIND_THE_END: &str = "the image is damaged";
+/// Flash without an image.
+const ERASED: &str = "no configuration image: it begins with [FF, FF, FF, FF]";
 const THREE_LINES: &str = r#"
 [controller]
 address = "127.0.0.1"

@@ -57,7 +57,7 @@ impl Frame {
     }
 
     /// How many bits an attempt takes, without stuff bits, with the pause behind it.
-    pub(super) fn bits(&self, attempt: Attempt) -> u64 {
+    pub(crate) fn bits(&self, attempt: Attempt) -> u64 {
         let data = if self.is_remote { 0 } else { 8 * self.bytes().len() as u64 };
         let whole = if self.is_extended { 67 } else { 47 } + data;
         match attempt {

@@ -341,9 +341,11 @@ impl Peripheral for Ethernet {
         Ok(())
     }
 
-    fn deadline(&self, _: &Moment<'_>) -> Option<Picos> {
+    fn deadline(&self, at: &Moment<'_>) -> Option<Picos> {
         let resets = self.resets.filter(|until| *until != Picos::MAX);
-        [self.sending.as_ref().map(|(.., until)| *until), resets, self.managing].into_iter().flatten().min()
+        let sent = self.sending.as_ref().map(|(.., until)| *until);
+        let arrived = (!self.arriving.is_empty()).then_some(at.now);
+        [sent, resets, self.managing, arrived].into_iter().flatten().min()
     }
 
     fn interrupts(&self) -> bool {

@@ -97,7 +97,7 @@ impl Fdcan {
     }
 
     /// How long a bit is; `None` without a clock.
-    fn bit(&self, clocks: Clocks) -> Option<Picos> {
+    pub fn bit(&self, clocks: Clocks) -> Option<Picos> {
         let timing = self.bank.get(NBTP);
         let quanta = 3 + (timing >> 8 & 0xFF) + (timing & 0x7F);
         let cycles = u64::from((timing >> 16 & 0x1FF) + 1) * u64::from(quanta);

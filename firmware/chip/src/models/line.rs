@@ -41,6 +41,8 @@ pub struct Line {
     pub sent: Vec<Sent>,
     /// Each change of driver-enable, as the transceiver sees it.
     pub driver: Vec<(Picos, bool)>,
+    /// A pair of wires for each direction: the chip hears others while it sends.
+    pub has_four_wires: bool,
     /// What others do: edges and the level behind them. At rest it is high.
     edges: VecDeque<(Picos, bool)>,
     /// It is low before the first edge that is kept.
@@ -84,6 +86,13 @@ impl Line {
         }
     }
 
+    /// Takes out what the chip has sent, and forgets what the driver did before.
+    pub fn take_sent(&mut self) -> std::vec::Drain<'_, Sent> {
+        let old = self.driver.len().saturating_sub(DRIVER_KEPT);
+        self.driver.drain(..old);
+        self.sent.drain(..)
+    }
+
     /// Whether the chip's driver was on at that time.
     pub fn is_driven(&self, at: Picos) -> bool {
         let behind = self.driver.partition_point(|(time, _)| *time <= at);
@@ -95,7 +104,7 @@ impl Line {
     /// What the chip's receiver sees: nothing of its own transmission.
     pub(super) fn level(&self, at: Picos) -> bool {
         let last = self.edges.iter().take_while(|(time, _)| *time <= at).last();
-        self.is_driven(at) || last.map_or(!self.is_low, |(_, level)| *level)
+        !self.has_four_wires && self.is_driven(at) || last.map_or(!self.is_low, |(_, level)| *level)
     }
 
     /// The next falling edge that is not heard yet.
@@ -104,8 +113,9 @@ impl Line {
         falls.map(|(time, _)| *time).filter(|time| *time <= now)
     }
 
-    pub(super) fn next_edge(&self, now: Picos) -> Option<Picos> {
-        self.edges.iter().map(|(time, _)| *time).find(|time| *time > now)
+    /// As above, ahead too.
+    pub(super) fn next_start_bit(&self) -> Option<Picos> {
+        self.start_bit(Picos::MAX)
     }
 
     pub(super) fn heard(&mut self, until: Picos) {
@@ -118,3 +128,6 @@ impl Line {
         }
     }
 }
+
+/// Changes of driver-enable that are left when what was sent is taken out: more than a character has.
+const DRIVER_KEPT: usize = 16;

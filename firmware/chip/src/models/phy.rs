@@ -52,6 +52,17 @@ impl Phy {
         }
     }
 
+    /// The cable is pulled out.
+    pub fn pull(&mut self) {
+        self.has_cable = false;
+    }
+
+    /// The cable is plugged in again: they negotiate.
+    pub fn plug(&mut self, now: Picos) {
+        self.has_cable = true;
+        self.linked = Some(now + self.negotiation);
+    }
+
     /// What it offers its partner (register 4).
     pub fn offer(&self) -> u16 {
         self.offer

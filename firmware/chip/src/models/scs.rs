@@ -187,8 +187,12 @@ impl Scs {
     pub fn wanted(&self) -> Option<u16> {
         let systick = self.systick_pends.then_some(SYSTICK);
         let lines = (0..LINES / 32).flat_map(|word| {
-            let bits = (self.pending[word] | self.lines[word]) & self.enabled[word];
-            (0..32).filter(move |bit| bits >> bit & 1 != 0).map(move |bit| (32 * word + bit) as u16)
+            let mut bits = (self.pending[word] | self.lines[word]) & self.enabled[word];
+            std::iter::from_fn(move || {
+                let bit = (bits != 0).then(|| bits.trailing_zeros())?;
+                bits &= bits - 1;
+                Some(32 * word as u16 + bit as u16)
+            })
         });
         let lines = lines.filter(|line| !self.is_active(*line)).map(|line| line + FIRST_LINE);
         systick.into_iter().chain(lines).min_by_key(|number| (self.level(*number), *number))

@@ -10,7 +10,7 @@ use std::collections::VecDeque;
 
 use crate::device::*;
 
-pub use super::line::{Line, Sent};
+pub use super::line::{Format, Line, Sent};
 
 const CR1: u32 = 0x00;
 const CR2: u32 = 0x04;
@@ -126,6 +126,18 @@ impl Usart {
 
     fn stop_bits(&self) -> u32 {
         if self.bank.get(CR2) >> 12 & 3 == 2 { 2 } else { 1 }
+    }
+
+    /// As it sends, and as another device has to that it is to understand.
+    pub fn format(&self, clocks: Clocks) -> Format {
+        let odd_parity = self.has(CR1, 1 << 10).then(|| self.has(CR1, 1 << 9));
+        let baud = (SECOND / self.bit(clocks).max(1)) as u32;
+        Format { baud, odd_parity, stop_bits: self.stop_bits() as u8 }
+    }
+
+    /// Whether it is switched on.
+    pub fn is_on(&self) -> bool {
+        self.has(CR1, UE)
     }
 
     fn character(&self, clocks: Clocks) -> Picos {
@@ -344,9 +356,11 @@ impl Peripheral for Usart {
     fn deadline(&self, at: &Moment<'_>) -> Option<Picos> {
         let bits = Picos::from(self.data_bits() + 1);
         let bit = self.bit(at.clocks);
-        let sampled = self.receiving.map(|start| start + bits * bit + bit / 2);
+        // Edges inside of a character are looked at when it is sampled.
+        let start = self.receiving.or_else(|| self.line.next_start_bit());
+        let sampled = start.map(|start| start + bits * bit + bit / 2);
         let sent = self.sending.map(|(_, _, end)| end);
-        [sent, self.releases, sampled, self.idles, self.line.next_edge(at.now)].into_iter().flatten().min()
+        [sent, self.releases, sampled, self.idles].into_iter().flatten().min()
     }
 
     fn interrupts(&self) -> bool {

@@ -8,6 +8,7 @@ mod can;
 mod cell;
 mod faults;
 mod flash;
+mod realtime;
 mod robot;
 mod serial;
 

@@ -1,0 +1,320 @@
+//! The chip at the pace of the clock on the wall, with sockets for its lines, its bus and its cable.
+//!
+//! Virtual time is never ahead. When the machine is too slow it falls behind and catches up later; by how much
+//! is in the [`Figures`]. What comes from a socket is in virtual time when it was seen.
+
+mod can;
+mod network;
+mod serial;
+mod socket;
+
+use std::fmt;
+use std::io::Write;
+use std::os::unix::net::UnixStream;
+use std::time::{Duration, Instant};
+
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+
+use crate::device::*;
+use crate::{Chip, Stopped};
+use can::Can;
+use network::Network;
+pub use network::become_other;
+use serial::Serial;
+use socket::{Client, Listener};
+
+/// What the board is connected to. Places are `HOST:PORT` or the path of a socket.
+#[derive(Debug, Default)]
+pub struct Wiring {
+    /// RS-485 A and B.
+    pub serial: Vec<String>,
+    /// CAN, as slcan.
+    pub can: Option<String>,
+    /// Options of QEMU's user network; empty for none of them.
+    pub network: Option<String>,
+    /// Where QEMU can be asked.
+    pub qmp: Option<String>,
+    /// Where this can be asked ([`Runner::obey`]).
+    pub control: Option<String>,
+}
+
+/// How it went.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Figures {
+    /// Of the clock on the wall.
+    pub wall: Duration,
+    /// Virtual time.
+    pub virtual_time: Picos,
+    /// The most that virtual time was behind.
+    pub most_behind: Picos,
+    /// How long it was behind by more than 10 ms.
+    pub late: Duration,
+    /// Executed.
+    pub instructions: u64,
+    /// Taken.
+    pub interrupts: u64,
+    /// Times that the watchdog was fed.
+    pub feeds: u64,
+    /// Resets by the watchdog.
+    pub resets: u64,
+    /// Frames of Ethernet that the chip took, dropped and sent.
+    pub ethernet: [u64; 3],
+    /// Bytes that came and went on both lines.
+    pub serial: [u64; 2],
+    /// Frames that came and went on CAN.
+    pub can: [u64; 2],
+}
+
+/// One line, also to be read as JSON.
+impl fmt::Display for Figures {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let seconds = |time: Picos| time as f64 / SECOND as f64;
+        let Self { instructions, interrupts, feeds, resets, ethernet, serial, can, .. } = self;
+        write!(
+            f,
+            "{{\"wall_s\": {:.6}, \"virtual_s\": {:.6}, \"most_behind_s\": {:.6}, \"late_s\": {:.3}, \
+             \"instructions\": {instructions}, \"interrupts\": {interrupts}, \"feeds\": {feeds}, \
+             \"resets\": {resets}, \"ethernet_taken\": {}, \"ethernet_dropped\": {}, \"ethernet_sent\": {}, \
+             \"serial_in\": {}, \"serial_out\": {}, \"can_in\": {}, \"can_out\": {}}}",
+            self.wall.as_secs_f64(),
+            seconds(self.virtual_time),
+            seconds(self.most_behind),
+            self.late.as_secs_f64(),
+            ethernet[0],
+            ethernet[1],
+            ethernet[2],
+            serial[0],
+            serial[1],
+            can[0],
+            can[1],
+        )
+    }
+}
+
+/// Why a run has ended that nobody has ended.
+#[derive(Debug)]
+pub enum Ended {
+    /// The program did what it may not.
+    Stopped(Stopped),
+    /// Something around it is gone.
+    Lost(String),
+}
+
+/// The chip among its sockets.
+pub struct Runner {
+    chip: Chip,
+    serial: Vec<Serial>,
+    can: Option<Can>,
+    network: Option<Network>,
+    control: Option<Listener>,
+    askers: Vec<(Client, Vec<u8>)>,
+    pace: Pace,
+    figures: Figures,
+    feeds: u64,
+}
+
+/// Virtual time as the clock on the wall has it.
+struct Pace {
+    begin: Instant,
+    stopped: Option<Instant>,
+}
+
+impl Pace {
+    fn now(&self) -> Picos {
+        let now = self.stopped.unwrap_or_else(Instant::now);
+        now.saturating_duration_since(self.begin).as_nanos() as Picos * 1_000
+    }
+
+    fn stop(&mut self) {
+        self.stopped.get_or_insert_with(Instant::now);
+    }
+
+    fn go_on(&mut self) {
+        if let Some(since) = self.stopped.take() {
+            self.begin += since.elapsed();
+        }
+    }
+}
+
+/// The chip runs so long at most before its sockets are looked at.
+const SLICE: Picos = MILLI;
+/// What is due before that is done together.
+const TOGETHER: Picos = MILLI / 4;
+/// The longest sleep.
+const LONGEST: Picos = 100 * MILLI;
+/// Behind by more than that is late.
+const LATE: Picos = 10 * MILLI;
+
+impl Runner {
+    /// Opens everything; QEMU is there, but may not be ready.
+    ///
+    /// # Errors
+    /// Something cannot be opened.
+    pub fn new(chip: Chip, wiring: &Wiring) -> Result<Self, String> {
+        let listen = |place: &String| Listener::new(place);
+        let serial = wiring.serial.iter().map(|place| listen(place).map(Serial::new));
+        Ok(Self {
+            chip,
+            serial: serial.collect::<Result<_, _>>()?,
+            can: wiring.can.as_ref().map(|place| listen(place).map(Can::new)).transpose()?,
+            network: match &wiring.network {
+                Some(options) => Some(Network::new(options, wiring.qmp.as_deref())?),
+                None => None,
+            },
+            control: wiring.control.as_ref().map(listen).transpose()?,
+            askers: Vec::new(),
+            pace: Pace { begin: Instant::now(), stopped: None },
+            figures: Figures::default(),
+            feeds: 0,
+        })
+    }
+
+    /// Runs until something can be read of `end`. Lines of the log go to `log`, as they come.
+    ///
+    /// # Errors
+    /// It has ended by itself.
+    pub fn run(&mut self, end: &UnixStream, log: &mut dyn Write) -> Result<(), Ended> {
+        self.pace = Pace { begin: Instant::now(), stopped: None };
+        loop {
+            // While it sleeps nothing is to be looked at.
+            let awake = self.chip.sleeps_until().unwrap_or(0).max(self.chip.now() + SLICE);
+            let target = self.pace.now().min(awake);
+            let result = if target > self.chip.now() { self.chip.run_until(target) } else { Ok(()) };
+            for (at, line) in self.chip.log.drain(..) {
+                let written = writeln!(log, "{:12.3} ms  {line}", at as f64 / MILLI as f64);
+                written.map_err(|error| Ended::Lost(format!("its log: {error}")))?;
+            }
+            result.map_err(Ended::Stopped)?;
+            self.note();
+            self.exchange().map_err(Ended::Lost)?;
+            if self.wait(end) {
+                return Ok(());
+            }
+        }
+    }
+
+    /// The chip.
+    pub fn chip(&mut self) -> &mut Chip {
+        &mut self.chip
+    }
+
+    /// How it went so far.
+    pub fn figures(&mut self) -> Figures {
+        let mut figures = self.figures;
+        figures.instructions = self.chip.instructions();
+        figures.interrupts = self.chip.interrupts();
+        figures.feeds = self.feeds;
+        figures.resets = self.chip.resets.len() as u64;
+        let ethernet = &self.chip.devices().ethernet;
+        let [taken, dropped] = [ethernet.taken, ethernet.dropped];
+        figures.ethernet = [taken, dropped, self.network.as_ref().map_or(0, |network| network.frames_out)];
+        figures.serial = self.serial.iter().fold([0; 2], |[bytes_in, bytes_out], serial| {
+            [bytes_in + serial.bytes_in, bytes_out + serial.bytes_out]
+        });
+        figures.can = self.can.as_ref().map_or([0; 2], |can| [can.frames_in, can.frames_out]);
+        figures
+    }
+
+    fn exchange(&mut self) -> Result<(), String> {
+        let (now, clocks) = (self.chip.now(), self.chip.clocks());
+        let devices = self.chip.devices();
+        for (serial, usart) in self.serial.iter_mut().zip([&mut devices.first, &mut devices.second]) {
+            serial.exchange(usart, clocks, now);
+        }
+        if let Some(can) = &mut self.can {
+            can.exchange(&mut devices.can, clocks, now);
+        }
+        if let Some(network) = &mut self.network {
+            network.exchange(&mut devices.ethernet, now)?;
+        }
+        self.feeds += devices.watchdog.feeds.drain(..).count() as u64;
+        self.answer();
+        Ok(())
+    }
+
+    /// How far it is.
+    fn note(&mut self) {
+        let wall = Duration::from_nanos(self.pace.now() / 1_000);
+        let behind = self.pace.now().saturating_sub(self.chip.now());
+        if behind > LATE {
+            self.figures.late += wall.saturating_sub(self.figures.wall);
+        }
+        self.figures.most_behind = self.figures.most_behind.max(behind);
+        self.figures.wall = wall;
+        self.figures.virtual_time = self.chip.now();
+    }
+
+    /// Until the chip has something to do, or a socket has; true when the run is to end.
+    fn wait(&mut self, end: &UnixStream) -> bool {
+        let now = self.pace.now();
+        let is_busy = self.serial.iter().any(Serial::is_busy) || self.can.as_ref().is_some_and(Can::is_busy);
+        let is_behind = now > self.chip.now() + TOGETHER;
+        let next = match self.chip.sleeps_until() {
+            _ if self.pace.stopped.is_some() => now + LONGEST,
+            _ if is_behind => now,
+            Some(next) if next <= self.chip.now() => now,
+            Some(_) if is_busy => now + SLICE / 2,
+            Some(next) => next.max(now + TOGETHER).min(now + LONGEST),
+            None => now + TOGETHER,
+        };
+        let next = self.network.as_ref().and_then(Network::next).map_or(next, |at| next.min(at.max(now)));
+        let wait = next.saturating_sub(now) / 1_000;
+        let timeout = Timespec { tv_sec: 0, tv_nsec: wait as i64 };
+        let mut fds = vec![PollFd::new(end, PollFlags::IN)];
+        self.serial.iter().for_each(|serial| serial.poll(&mut fds));
+        self.can.iter().for_each(|can| can.poll(&mut fds));
+        fds.extend(self.network.iter().map(Network::poll));
+        fds.extend(self.control.iter().map(Listener::poll));
+        fds.extend(self.askers.iter().map(|(client, _)| client.poll(true)));
+        // Interrupted or not, everything is looked at again.
+        let _ = poll(&mut fds, Some(&timeout));
+        !fds[0].revents().is_empty()
+    }
+
+    fn answer(&mut self) {
+        let Some(control) = &self.control else { return };
+        let new = std::iter::from_fn(|| control.accept());
+        self.askers.extend(new.map(|client| (client, Vec::new())));
+        let mut asked = Vec::new();
+        for (index, (client, line)) in self.askers.iter_mut().enumerate() {
+            line.extend(client.read(256));
+            while let Some(end) = line.iter().position(|&byte| byte == b'\n') {
+                let words = line.drain(..=end).collect::<Vec<u8>>();
+                asked.push((index, String::from_utf8_lossy(&words).trim().to_owned()));
+            }
+        }
+        for (index, words) in asked {
+            let answer = self.obey(&words);
+            self.askers[index].0.write(format!("{answer}\n").as_bytes());
+        }
+        self.askers.retain(|(client, _)| !client.is_gone());
+    }
+
+    /// What can be asked, a line each, answered by a line: `cable out`, `cable in`; `stop` (time stands still, as
+    /// under a debugger), `go`; `figures`; `save START LEN PATH` (memory, into a file).
+    pub fn obey(&mut self, words: &str) -> String {
+        let now = self.chip.now();
+        match words.splitn(4, ' ').collect::<Vec<_>>().as_slice() {
+            ["cable", "out"] => self.chip.devices().ethernet.phy.pull(),
+            ["cable", "in"] => self.chip.devices().ethernet.phy.plug(now),
+            ["stop"] => self.pace.stop(),
+            ["go"] => self.pace.go_on(),
+            ["figures"] => return self.figures().to_string(),
+            ["save", start, len, path] => {
+                let number = |text: &str| u32::from_str_radix(text.trim_start_matches("0x"), 16);
+                let (Ok(start), Ok(len)) = (number(start), number(len)) else {
+                    return "two hexadecimal numbers are needed".into();
+                };
+                let mut bytes = vec![0; len as usize];
+                if !self.chip.engine().read(start, &mut bytes) {
+                    return "no such memory".into();
+                }
+                if let Err(error) = std::fs::write(path, bytes) {
+                    return format!("{path}: {error}");
+                }
+            }
+            _ => return format!("unknown: {words}"),
+        }
+        "done".into()
+    }
+}

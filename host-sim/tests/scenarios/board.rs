@@ -1,0 +1,161 @@
+//! What boards have in common that are emulated: an image of the configuration, a log, QEMU's user network.
+
+use std::io::{BufRead, BufReader, Write};
+use std::net::{Ipv4Addr, SocketAddr};
+use std::os::unix::net::UnixStream;
+use std::path::Path;
+use std::process::Command;
+
+use proto_core::config::{Bus, GatewayConfig};
+use serde_json::{Value, json};
+
+use super::environment::{Link, LinkStatus, Plan, PortStatus};
+use super::refusal::Spoil;
+
+/// The host as QEMU's guest sees it.
+const HOST: &str = "10.0.2.2";
+/// The guest, as QEMU's first.
+pub(crate) const ADDRESS: &str = "address 10.0.2.15";
+/// What an unused stack is filled with.
+pub(crate) const PAINT: u8 = 0xC5;
+
+pub(crate) fn listens(bus: &Bus) -> bool {
+    matches!(bus, Bus::TcpListen { .. } | Bus::UdpListen { .. })
+}
+
+/// `host-sim image`.
+#[track_caller]
+pub(crate) fn make_image(plan: &Plan<'_>, image: &Path) {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_host-sim"));
+    command.arg("image").arg(plan.file()).arg("-o").arg(image);
+    for value in plan.overrides(HOST, &plan.server_ports()) {
+        command.arg("--set").arg(value);
+    }
+    let output = command.output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+}
+
+/// The same, with something wrong.
+#[track_caller]
+pub(crate) fn make_spoilt_image(plan: &Plan<'_>, image: &Path, spoil: Spoil) {
+    make_image(plan, image);
+    let mut bytes = std::fs::read(image).unwrap();
+    match spoil {
+        Spoil::Damaged => bytes[40] ^= 1,
+        Spoil::Cut => bytes.truncate(bytes.len() - 1),
+        Spoil::Missing => return std::fs::remove_file(image).unwrap(),
+        Spoil::NoDevice => {}
+    }
+    std::fs::write(image, bytes).unwrap();
+}
+
+/// Options of the user network that let the host reach the listening ports.
+pub(crate) fn forwards(config: &GatewayConfig) -> Vec<String> {
+    let inside = config.ports.iter().filter_map(|port| forward(&port.bus));
+    inside.map(|(kind, at)| format!("hostfwd={kind}:127.0.0.1:0-:{at}")).collect()
+}
+
+/// Kind and number of a listening port.
+fn forward(bus: &Bus) -> Option<(&'static str, u16)> {
+    let (kind, listen) = match bus {
+        Bus::TcpListen { listen } => ("tcp", listen),
+        Bus::UdpListen { listen } => ("udp", listen),
+        Bus::Rs485(_) | Bus::Can { .. } => return None,
+    };
+    Some((kind, listen.parse::<SocketAddr>().unwrap().port()))
+}
+
+/// Listening ports by name, as the host reaches them; asked of the QEMU whose socket this is.
+#[track_caller]
+pub(crate) fn forwarded(config: &GatewayConfig, socket: &Path) -> Vec<(String, SocketAddr)> {
+    let table = qmp(socket, "human-monitor-command", json!({ "command-line": "info usernet" }));
+    let table = table.as_str().unwrap();
+    let place = |(kind, port)| {
+        let head = format!("{}[HOST_FORWARD]", str::to_uppercase(kind));
+        let row = table.lines().map(|line| line.split_whitespace().collect::<Vec<_>>()).find(|words| {
+            // Protocol[HOST_FORWARD] FD source-address source-port dest-address dest-port ...
+            words.len() >= 6 && words[0] == head && words[5] == u16::to_string(&port)
+        });
+        let row = row.unwrap_or_else(|| panic!("{kind} port {port} is not forwarded:\n{table}"));
+        (Ipv4Addr::LOCALHOST, row[3].parse::<u16>().unwrap()).into()
+    };
+    let ports = config.ports.iter();
+    ports.filter_map(|port| Some((port.name.as_str().to_owned(), place(forward(&port.bus)?)))).collect()
+}
+
+/// One command to QEMU; what it returns.
+#[track_caller]
+pub(crate) fn qmp(socket: &Path, command: &str, arguments: Value) -> Value {
+    let mut stream = UnixStream::connect(socket).unwrap();
+    let mut lines = BufReader::new(stream.try_clone().unwrap()).lines();
+    lines.next().unwrap().unwrap();
+    let mut answer = Value::Null;
+    for (command, arguments) in [("qmp_capabilities", json!({})), (command, arguments)] {
+        writeln!(stream, "{}", json!({ "execute": command, "arguments": arguments })).unwrap();
+        // Events come between, and the greeting of a connection that was closed at once.
+        answer = loop {
+            let line: Value = serde_json::from_str(&lines.next().unwrap().unwrap()).unwrap();
+            if line.get("event").is_none() && line.get("QMP").is_none() {
+                break line;
+            }
+        };
+        assert!(answer.get("return").is_some(), "{command}: {answer}");
+    }
+    answer["return"].take()
+}
+
+/// From the lines `link NAME: up (COUNT)` and `link NAME: lost` of a log.
+pub(crate) fn link(log: &str, link: Link<'_>) -> LinkStatus {
+    let name = match link {
+        Link::Command => "command",
+        Link::State => "state",
+        Link::Modbus => "modbus",
+        Link::Udp2011 => "udp2011",
+        Link::TcpListen(_) => "tcp-listen",
+        Link::UdpListen(_) => "udp-listen",
+    };
+    let mut status = LinkStatus::default();
+    for line in log.lines() {
+        let Some((_, said)) = line.split_once(&format!("link {name}: ")) else { continue };
+        status.is_up = said.starts_with("up");
+        if let Some(count) = said.strip_prefix("up (").and_then(|rest| rest.trim_end().strip_suffix(')')) {
+            status.connects = count.parse().unwrap();
+        }
+    }
+    status
+}
+
+/// From the newest line `port NUMBER: in FRAMES frames, BYTES bytes; out ...` of a log.
+pub(crate) fn port(log: &str, number: usize) -> PortStatus {
+    let start = format!("port {number}: in ");
+    // The newest line may not be whole yet.
+    let whole = log.split_inclusive('\n').filter(|line| line.ends_with('\n'));
+    let Some(said) = whole.filter_map(|line| line.split_once(&start)).next_back() else {
+        return PortStatus::default();
+    };
+    let mut numbers = said.1.split_whitespace().filter_map(|word| word.parse().ok());
+    let mut next = || numbers.next().unwrap_or(0);
+    PortStatus {
+        frames_in: next(),
+        bytes_in: next(),
+        frames_out: next(),
+        bytes_out: next(),
+        skipped_bytes: next(),
+        skipped_cycles: next(),
+    }
+}
+
+/// The address that a log tells.
+pub(crate) fn own_address(log: &str) -> Option<String> {
+    let (_, said) = log.rsplit_once(" address ")?;
+    said.split_whitespace().next().map(str::to_owned)
+}
+
+/// How much of a stack was used: all but its painted lower end.
+#[track_caller]
+pub(crate) fn stack_used(memory: &Path) -> u64 {
+    let memory = std::fs::read(memory).unwrap();
+    let unused = memory.iter().take_while(|&&byte| byte == PAINT).count();
+    assert!(unused > 0, "the stack is where it is not expected");
+    (memory.len() - unused) as u64
+}

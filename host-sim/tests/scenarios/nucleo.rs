@@ -1,0 +1,250 @@
+//! The NUCLEO-H743ZI2's firmware, unchanged, on its modelled chip in real time (docs/chip.md section 5): RS-485
+//! lines and CAN on sockets, Ethernet by QEMU's user network, the log on the emulator's stdout.
+
+use std::collections::BTreeMap;
+use std::ffi::OsString;
+use std::io::{BufRead, BufReader, Write};
+use std::net::SocketAddr;
+use std::os::unix::net::UnixStream;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use proto_core::config::Bus;
+use serde_json::Value;
+
+use super::board;
+use super::case::{Case, until};
+use super::environment::{Cable, Environment, Gateway, Link, LinkStatus, Plan, PortStatus, ports};
+use super::field::{CanClient, Line};
+use super::program::Program;
+use super::refusal::Spoil;
+
+/// The firmware for the board, on its modelled chip.
+pub(crate) struct Nucleo {
+    pub(crate) elf: PathBuf,
+    /// The program of `firmware/chip`.
+    pub(crate) emulator: PathBuf,
+}
+
+/// The board's stack above its guard (memory.x).
+const STACK: [&str; 2] = ["20004000", "1C000"];
+/// Its sockets: RS-485 A and B, CAN.
+const BUSES: [&str; 3] = ["a", "b", "can"];
+
+impl Environment for Nucleo {
+    fn name(&self) -> &'static str {
+        "nucleo"
+    }
+
+    /// Its time stands still with it, as under a debugger that stops the timers too.
+    fn sleeps_noticeably(&self) -> bool {
+        false
+    }
+
+    /// The board's is one.
+    fn lay_true_cable(&self, _case: &Case) {}
+
+    #[track_caller]
+    fn start(&self, plan: &Plan<'_>) -> Box<dyn Gateway> {
+        let image = plan.case.folder.path().join("gateway.img");
+        board::make_image(plan, &image);
+        let mut chip = Chip::start(self, plan, &image);
+        chip.until_log("configuration: ");
+        // Others can connect from now on.
+        if !ports(&plan.config(), board::listens).is_empty() {
+            chip.until_log(board::ADDRESS);
+        }
+        Box::new(chip)
+    }
+
+    #[track_caller]
+    fn refuses(&self, plan: &Plan<'_>, spoil: Spoil) -> String {
+        let image = plan.case.folder.path().join("gateway.img");
+        board::make_spoilt_image(plan, &image, spoil);
+        if spoil == Spoil::Missing {
+            // Erased flash.
+            std::fs::write(&image, []).unwrap();
+        }
+        let mut chip = Chip::start(self, plan, &image);
+        let reason = chip.until_log("nothing runs: ");
+        for bus in ["a", "b"] {
+            let mut line = Line::new(Box::new(chip.socket(bus)));
+            line.send(b"\xFF\xFF\x01\xEE\xEE");
+            line.is_silent(Duration::from_millis(300));
+        }
+        // Here the adapter is not the board; what it says is not the board's.
+        let mut bus = CanClient::join(Box::new(chip.socket("can"))).into_line();
+        bus.send(b"t001101\r");
+        assert_eq!(bus.take(2), b"z\r");
+        bus.is_silent(Duration::from_millis(300));
+        chip.must_run();
+        reason
+    }
+}
+
+/// The emulator with the firmware.
+struct Chip {
+    program: Program,
+    folder: PathBuf,
+    /// Field ports by name: the number in the log, and the socket.
+    ports: BTreeMap<String, (usize, &'static str)>,
+    /// Listening ports by name, as the host reaches them.
+    listens: BTreeMap<String, SocketAddr>,
+}
+
+impl Chip {
+    #[track_caller]
+    fn start(nucleo: &Nucleo, plan: &Plan<'_>, image: &Path) -> Self {
+        // Each board has sockets of its own: those of one that was killed stay behind.
+        let folder = tempfile::Builder::new().tempdir_in(plan.case.folder.path()).unwrap().keep();
+        let config = plan.config();
+        let mut ports = BTreeMap::new();
+        let (mut lines, mut buses) = (BUSES[..2].iter(), BUSES[2..].iter());
+        for (number, port) in config.ports.iter().enumerate() {
+            let bus = match &port.bus {
+                Bus::Rs485(_) => lines.next(),
+                Bus::Can { .. } => buses.next(),
+                Bus::TcpListen { .. } | Bus::UdpListen { .. } => None,
+            };
+            ports.extend(bus.map(|bus| (port.name.as_str().to_owned(), (number, *bus))));
+        }
+        let place = |name: &str| folder.join(name).into_os_string();
+        let mut arguments: Vec<OsString> = vec![nucleo.elf.clone().into(), image.into(), "--realtime".into()];
+        for (option, name) in ["--rs485", "--rs485", "--can"].into_iter().zip(BUSES) {
+            arguments.extend([option.into(), place(name)]);
+        }
+        let network = board::forwards(&config).join(",");
+        arguments.extend(["--network".into(), network.into(), "--qmp".into(), place("qmp")]);
+        arguments.extend(["--control".into(), place("control")]);
+        let program = Program::start(plan.case, "chip", &nucleo.emulator, &arguments);
+        let mut chip = Self { program, folder, ports, listens: BTreeMap::new() };
+        // The last of each program's sockets. That its file is there does not mean that it listens.
+        for last in ["control", "qmp"] {
+            until("the emulator's sockets", || {
+                chip.must_run();
+                UnixStream::connect(chip.folder.join(last)).ok()
+            });
+        }
+        chip.listens = board::forwarded(&config, &chip.folder.join("qmp")).into_iter().collect();
+        chip
+    }
+
+    fn log(&self) -> String {
+        self.program.lines().iter().flat_map(|line| [line.as_str(), "\n"]).collect()
+    }
+
+    /// Waits for a line with this, and returns what is behind it.
+    #[track_caller]
+    fn until_log(&mut self, text: &str) -> String {
+        until(&format!("{text:?} in the board's log"), || {
+            self.must_run();
+            let lines = self.program.lines();
+            lines.iter().find_map(|line| Some(line.split_once(text)?.1.to_owned()))
+        })
+    }
+
+    #[track_caller]
+    fn socket(&self, name: &str) -> UnixStream {
+        UnixStream::connect(self.folder.join(name)).unwrap()
+    }
+
+    #[track_caller]
+    fn field(&self, port: &str) -> (usize, &'static str) {
+        *self.ports.get(port).unwrap_or_else(|| panic!("no port {port}"))
+    }
+
+    /// Asks the emulator.
+    #[track_caller]
+    fn ask(&self, words: &str) -> String {
+        let mut stream = self.socket("control");
+        writeln!(stream, "{words}").unwrap();
+        let mut answer = String::new();
+        BufReader::new(stream).read_line(&mut answer).unwrap();
+        answer.trim_end().to_owned()
+    }
+
+    #[track_caller]
+    fn order(&self, words: &str) {
+        assert_eq!(self.ask(words), "done", "{words}");
+    }
+}
+
+impl Gateway for Chip {
+    #[track_caller]
+    fn line(&self, port: &str) -> Line {
+        Line::new(Box::new(self.socket(self.field(port).1)))
+    }
+
+    #[track_caller]
+    fn can(&self, port: &str) -> CanClient {
+        CanClient::join(Box::new(self.socket(self.field(port).1)))
+    }
+
+    #[track_caller]
+    fn listens(&self, port: &str) -> SocketAddr {
+        self.listens[port]
+    }
+
+    fn link(&self, link: Link<'_>) -> LinkStatus {
+        board::link(&self.log(), link)
+    }
+
+    fn port(&self, port: &str) -> PortStatus {
+        board::port(&self.log(), self.field(port).0)
+    }
+
+    #[track_caller]
+    fn cable(&self, cable: Cable) {
+        self.order(if cable == Cable::Plugged { "cable in" } else { "cable out" });
+    }
+
+    #[track_caller]
+    fn freeze(&self) {
+        self.order("stop");
+    }
+
+    #[track_caller]
+    fn thaw(&self) {
+        self.order("go");
+    }
+
+    fn own_address(&self) -> Option<String> {
+        board::own_address(&self.log())
+    }
+
+    fn processor_time(&self) -> Duration {
+        self.program.processor_time()
+    }
+
+    /// Its stack, which is painted before it is used; everything else is static.
+    #[track_caller]
+    fn memory(&self) -> u64 {
+        let path = self.folder.join("memory");
+        let [start, len] = STACK;
+        self.order(&format!("save {start} {len} {}", path.display()));
+        board::stack_used(&path)
+    }
+
+    #[track_caller]
+    fn figures(&self) -> Value {
+        serde_json::from_str(&self.ask("figures")).unwrap()
+    }
+
+    #[track_caller]
+    fn must_run(&mut self) {
+        self.program.must_run();
+    }
+}
+
+impl Drop for Chip {
+    fn drop(&mut self) {
+        if !std::thread::panicking() {
+            self.program.must_run();
+            let figures = self.figures();
+            self.program.interrupt();
+            assert!(!self.log().contains("panicked"), "the firmware panicked");
+            assert_eq!(figures["resets"], 0, "the watchdog has reset the board");
+            assert!(self.folder.read_dir().unwrap().all(|left| left.unwrap().file_name() == "memory"));
+        }
+    }
+}
