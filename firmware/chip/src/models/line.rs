@@ -41,6 +41,8 @@ pub struct Line {
     pub sent: Vec<Sent>,
     /// Each change of driver-enable, as the transceiver sees it.
     pub driver: Vec<(Picos, bool)>,
+    /// Others have a pair of wires for themselves: the receiver hears them while the chip sends.
+    pub is_four_wire: bool,
     /// What others do: edges and the level behind them. At rest it is high.
     edges: VecDeque<(Picos, bool)>,
     /// It is low before the first edge that is kept.
@@ -95,7 +97,7 @@ impl Line {
     /// What the chip's receiver sees: nothing of its own transmission.
     pub(super) fn level(&self, at: Picos) -> bool {
         let last = self.edges.iter().take_while(|(time, _)| *time <= at).last();
-        self.is_driven(at) || last.map_or(!self.is_low, |(_, level)| *level)
+        !self.is_four_wire && self.is_driven(at) || last.map_or(!self.is_low, |(_, level)| *level)
     }
 
     /// The next falling edge that is not heard yet.
