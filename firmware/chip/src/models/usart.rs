@@ -53,6 +53,7 @@ const RE: u32 = 1 << 2;
 const TE: u32 = 1 << 3;
 const PCE: u32 = 1 << 10;
 const OVER8: u32 = 1 << 15;
+const FIFOEN: u32 = 1 << 29;
 const ONEBIT: u32 = 1 << 11;
 const DEM: u32 = 1 << 14;
 const DEP: u32 = 1 << 15;
@@ -360,6 +361,9 @@ impl Peripheral for Usart {
         self.check_locked(offset, value)?;
         if offset == CR1 && value & OVER8 != 0 {
             return refuse("oversampling by 8 is not modelled");
+        }
+        if offset == CR1 && value & UE != 0 && value & FIFOEN == 0 {
+            return refuse("a USART without its FIFOs (FIFOEN) is not modelled");
         }
         if offset == CR1 && value & UE != 0 && !self.has(CR1, UE) && self.bank.get(BRR) < 16 {
             return refuse("it is switched on with a BRR below 16");
