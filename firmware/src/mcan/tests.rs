@@ -57,6 +57,8 @@ fn reset() -> Model {
 /// On the bus, with filters for these ids.
 fn on_the_bus(ids: &[CanId]) -> Bench {
     let (model, waker) = (reset(), &*Box::leak(Box::new(AtomicWaker::new())));
+    // The speed of all others.
+    model.with(|can| can.bus.bitrate = 500_000);
     let mut mcan = Mcan::start(Rc::clone(&model), OFFSET, waker, 500_000, CLOCK).unwrap();
     // The clock calibration unit, which is the board's affair.
     Device::write(&model, 0x804, Device::read(&model, 0x804) | 1 << 6);
