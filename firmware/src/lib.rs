@@ -27,6 +27,8 @@ pub mod watchdog;
 #[cfg(test)]
 extern crate std;
 #[cfg(test)]
+mod test_chip;
+#[cfg(test)]
 mod test_clock;
 #[cfg(test)]
 mod test_executor;

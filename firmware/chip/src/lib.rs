@@ -6,17 +6,28 @@
 //! CAN bus, an Ethernet cable. The models are strict: an access that the manual forbids, or that they do
 //! not know, ends the run with its place.
 
+#[cfg(feature = "emulator")]
 mod board;
+#[cfg(feature = "emulator")]
 mod chip;
 pub mod device;
+#[cfg(feature = "emulator")]
 mod devices;
+#[cfg(feature = "emulator")]
 mod exception;
 pub mod models;
+#[cfg(feature = "emulator")]
 mod program;
+#[cfg(feature = "emulator")]
 pub mod realtime;
+#[cfg(feature = "emulator")]
 pub mod unicorn;
 
+#[cfg(feature = "emulator")]
 pub use board::{Access, Violation};
+#[cfg(feature = "emulator")]
 pub use chip::{CONFIG, Chip, Stopped};
+#[cfg(feature = "emulator")]
 pub use devices::Devices;
+#[cfg(feature = "emulator")]
 pub use program::Program;

@@ -1,132 +1,35 @@
-//! The driver against a model of the USART: its FIFOs, their thresholds, and error flags that belong to
-//! the character that is read next.
+//! The driver on the model of the USARTs that the board's binary runs on, with a line that others send on.
 
-use core::cell::{Cell, RefCell};
 use core::future::Future;
 use core::pin::pin;
 use core::task::Context;
 use std::boxed::Box;
-use std::collections::{BTreeMap, VecDeque};
 use std::rc::Rc;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::task::{Wake, Waker};
+use std::vec;
 use std::vec::Vec;
 
+use chip::device::{Clocks, Picos, Pin, SECOND};
+use chip::models::line::{Format, Line as Wires, Sent};
+use chip::models::usart::{Pins, Usart as Chip};
 use proto_core::time::Duration as CoreDuration;
 
 use super::*;
-use crate::test_clock::Clock;
+use crate::test_chip::Device;
 
 const CLOCK: u32 = 100_000_000;
-const FIFO: usize = 16;
 
-#[derive(Default)]
-struct Model {
-    registers: RefCell<BTreeMap<u8, u32>>,
-    /// Characters with their error flags.
-    received: RefCell<VecDeque<(u8, u32)>>,
-    waiting: RefCell<VecDeque<u8>>,
-    /// In the shift register.
-    leaving: Cell<Option<u8>>,
-    line: RefCell<Vec<u8>>,
-    flags: Cell<u32>,
-}
+type Model = Rc<Device<Chip>>;
 
-impl Model {
-    fn get(&self, register: u8) -> u32 {
-        self.registers.borrow().get(&register).copied().unwrap_or(0)
-    }
-
-    fn raise(&self, flags: u32) {
-        self.flags.set(self.flags.get() | flags);
-    }
-
-    /// A character arrives.
-    fn arrive(&self, byte: u8, errors: u32) {
-        if self.received.borrow().len() == FIFO {
-            self.raise(OVERRUN);
-        } else {
-            self.received.borrow_mut().push_back((byte, errors));
-        }
-    }
-
-    /// One character of silence.
-    fn silence(&self) {
-        self.raise(IDLE);
-    }
-
-    /// One character leaves.
-    fn leave(&self) -> bool {
-        let Some(byte) = self.leaving.take() else { return false };
-        self.line.borrow_mut().push(byte);
-        self.leaving.set(self.waiting.borrow_mut().pop_front());
-        if self.leaving.get().is_none() {
-            self.raise(TX_COMPLETE);
-        }
-        true
-    }
-
-    fn status(&self) -> u32 {
-        let (received, waiting) = (self.received.borrow(), self.waiting.borrow());
-        let mut status = self.flags.get();
-        if let Some((_, errors)) = received.front() {
-            status |= RX_NOT_EMPTY | errors;
-        }
-        if waiting.len() < FIFO {
-            status |= TX_NOT_FULL;
-        }
-        status
-    }
-
-    /// Whether the interrupt line is raised.
-    fn interrupts(&self) -> bool {
-        let (status, cr1, cr3) = (self.status(), self.get(CR1), self.get(CR3));
-        let quarter = self.received.borrow().len() >= FIFO / 4;
-        let half = self.waiting.borrow().len() <= FIFO / 2;
-        status & IDLE != 0 && cr1 & CR1_IDLE_IRQ != 0
-            || status & TX_COMPLETE != 0 && cr1 & CR1_TX_COMPLETE_IRQ != 0
-            || quarter && cr3 & CR3_RX_THRESHOLD_IRQ != 0
-            || half && cr3 & CR3_TX_THRESHOLD_IRQ != 0
-    }
-}
-
-impl Registers for Rc<Model> {
+impl Registers for Model {
     fn read(&self, offset: u8) -> u32 {
-        match offset {
-            ISR => self.status(),
-            RDR => {
-                let (byte, errors) = self.received.borrow_mut().pop_front().expect("nothing to read");
-                // A flag that was not cleared in time stays, and spoils the next character.
-                self.raise(errors);
-                u32::from(byte)
-            }
-            _ => self.get(offset),
-        }
+        Device::read(self, offset.into())
     }
 
     fn write(&self, offset: u8, value: u32) {
-        match offset {
-            ICR => {
-                self.flags.set(self.flags.get() & !value);
-                if let Some((_, errors)) = self.received.borrow_mut().front_mut() {
-                    *errors &= !value;
-                }
-            }
-            TDR => {
-                assert!(self.waiting.borrow().len() < FIFO, "no room");
-                self.flags.set(self.flags.get() & !TX_COMPLETE);
-                self.waiting.borrow_mut().push_back(value as u8);
-                if self.leaving.get().is_none() {
-                    self.leaving.set(self.waiting.borrow_mut().pop_front());
-                }
-            }
-            _ => {
-                let fixed = [BRR, PRESC, CR2].contains(&offset);
-                assert!(!fixed || self.get(CR1) & CR1_ENABLE == 0, "register {offset:02X} while it runs");
-                self.registers.borrow_mut().insert(offset, value);
-            }
-        }
+        Device::write(self, offset.into(), value);
     }
 }
 
@@ -140,10 +43,11 @@ impl Wake for Wakes {
 }
 
 struct Bench {
-    model: Rc<Model>,
-    line: Usart<Rc<Model>>,
+    model: Model,
+    line: Usart<Model>,
     wakes: Arc<Wakes>,
-    _clock: Clock,
+    /// How the others send.
+    format: Format,
 }
 
 fn settings(baud: u32, parity: Parity, stop_bits: u8) -> Rs485 {
@@ -152,17 +56,30 @@ fn settings(baud: u32, parity: Parity, stop_bits: u8) -> Rs485 {
 
 impl Bench {
     fn start(line: Rs485) -> Self {
-        let clock = Clock::take();
-        let model = Rc::new(Model::default());
+        let [tx, rx, de] = [Pin('D', 5), Pin('D', 6), Pin('D', 4)];
+        let clocks = Clocks { usart: CLOCK, ..Clocks::default() };
+        let model = Device::new(Chip::new(Pins { tx, rx, de, function: 7 }), clocks, &[tx, rx, de], 7);
         let shared = &*Box::leak(Box::new(Shared::new()));
+        let odd_parity = match line.parity {
+            Parity::None => None,
+            parity => Some(parity == Parity::Odd),
+        };
+        let format = Format { baud: line.baud, odd_parity, stop_bits: line.stop_bits };
         let line = Usart::start(Rc::clone(&model), shared, &line, CLOCK).unwrap();
-        // Nothing was sent yet: the transmission of nothing is complete.
-        model.raise(TX_COMPLETE);
-        Self { model, line, wakes: Arc::default(), _clock: clock }
+        Self { model, line, wakes: Arc::default(), format }
     }
 
     fn new() -> Self {
         Self::start(settings(460_800, Parity::None, 1))
+    }
+
+    fn get(&self, register: u8) -> u32 {
+        Registers::read(&self.model, register)
+    }
+
+    /// Something at the pins.
+    fn wires<T>(&self, f: impl FnOnce(&mut Wires) -> T) -> T {
+        self.model.with(|usart| f(&mut usart.line))
     }
 
     /// The interrupts that are due; how many.
@@ -176,16 +93,67 @@ impl Bench {
         count
     }
 
+    /// Time passes, and interrupts come when they are due.
+    #[track_caller]
+    fn pass_until(&self, end: Picos) {
+        while self.model.hop(end) {
+            self.interrupts();
+        }
+        self.interrupts();
+    }
+
+    /// A bit of the others, in sixteen parts.
+    fn bit(&self) -> Picos {
+        SECOND / Picos::from(self.format.baud) / 16 * 16
+    }
+
+    /// How long a character is.
+    fn character(&self) -> Picos {
+        Picos::from(9 + u8::from(self.format.odd_parity.is_some()) + self.format.stop_bits) * self.bit()
+    }
+
+    /// Another device sends; its last stop bit has ended when this returns.
     fn arrive(&self, bytes: impl IntoIterator<Item = u8>) {
         for byte in bytes {
-            self.model.arrive(byte, 0);
-            self.interrupts();
+            self.pass_until(self.wires(|line| line.send(self.model.now(), &[byte], self.format)));
         }
     }
 
+    /// The same while interrupts are off, with these errors.
+    fn damaged(&self, byte: u8, errors: u32) {
+        let mut bits = vec![false];
+        bits.extend((0..8).map(|index| byte >> index & 1 != 0));
+        let even = byte.count_ones().is_multiple_of(2);
+        bits.extend(self.format.odd_parity.map(|is_odd| (even == is_odd) != (errors & PARITY_ERROR != 0)));
+        bits.extend([errors & FRAMING_ERROR == 0, true]);
+        let mut parts: Vec<bool> = bits.into_iter().flat_map(|bit| [bit; 16]).collect();
+        if errors & NOISE != 0 {
+            // In the middle of a bit, too short for two samples.
+            parts[3 * 16 + 8] ^= true;
+        }
+        let now = self.model.now();
+        self.model.pass(self.wires(|line| line.put(now, self.bit() / 16, &parts)) - now);
+    }
+
+    /// One character of it.
     fn silence(&self) {
-        self.model.silence();
-        self.interrupts();
+        self.pass_until(self.model.now() + self.character());
+    }
+
+    fn sent(&self) -> Vec<Sent> {
+        self.wires(|line| line.sent.clone())
+    }
+
+    /// One character leaves, if one does within the time of three.
+    fn leave(&self) -> bool {
+        let (before, end) = (self.sent().len(), self.model.now() + 3 * self.character());
+        loop {
+            let is_over = !self.model.hop(end);
+            self.interrupts();
+            if self.sent().len() > before || is_over {
+                return self.sent().len() > before;
+            }
+        }
     }
 
     fn poll<T>(waker: &Arc<Wakes>, future: impl Future<Output = Result<T, Infallible>>) -> Option<T> {
@@ -224,14 +192,29 @@ fn speed_parity_and_stop_bits_are_the_configurations() {
         (settings(1_200, Parity::None, 2), 41_667, 1, 0, 2 << 12),
         (settings(4_000_000, Parity::None, 1), 25, 0, 0, 0),
     ] {
-        let bench = Bench::start(line);
-        let model = &bench.model;
-        assert_eq!((model.get(BRR), model.get(PRESC)), (divider, prescaler), "{} baud", line.baud);
-        assert_eq!(model.get(CR1) & (CR1_NINE_BITS | CR1_PARITY | CR1_ODD), cr1);
-        assert_eq!(model.get(CR2), cr2);
+        let mut bench = Bench::start(line);
+        assert_eq!((bench.get(BRR), bench.get(PRESC)), (divider, prescaler), "{} baud", line.baud);
+        assert_eq!(bench.get(CR1) & (CR1_NINE_BITS | CR1_PARITY | CR1_ODD), cr1);
+        assert_eq!(bench.get(CR2), cr2);
         let on = CR1_ENABLE | CR1_TX | CR1_RX | CR1_FIFO;
-        assert_eq!(model.get(CR1) & on, on);
-        assert_ne!(model.get(CR3) & CR3_DRIVER_ENABLE, 0);
+        assert_eq!(bench.get(CR1) & on, on);
+        assert_ne!(bench.get(CR3) & CR3_DRIVER_ENABLE, 0);
+        // On the line: five ones, of eight bits.
+        assert_eq!(bench.write(&[0xA7]), Some(1));
+        assert!(bench.leave());
+        let [sent] = bench.sent()[..] else { panic!("one character") };
+        let bit = u64::from(divider * PRESCALERS[prescaler as usize]) * SECOND / u64::from(CLOCK);
+        let parity = [None, Some(true), Some(false)][line.parity as usize];
+        let bits = 9 + u64::from(parity.is_some()) + u64::from(line.stop_bits);
+        let (start, stop_bits) = (sent.start, line.stop_bits);
+        let expected =
+            Sent { byte: 0xA7, start, end: start + bits * bit, bit, parity, stop_bits, is_driven: true };
+        assert_eq!(sent, expected, "{} baud", line.baud);
+        assert!(!bench.leave());
+        bench.arrive([0x5C, 0xA7]);
+        bench.silence();
+        assert_eq!(bench.read(), [0x5C, 0xA7]);
+        assert_eq!(bench.line.errors(), LineErrors::NONE);
     }
 }
 
@@ -258,7 +241,7 @@ fn every_speed_that_a_file_can_have_is_within_two_per_cent_or_refused() {
 fn a_frame_of_any_length_is_there_after_one_character_of_silence() {
     let mut bench = Bench::new();
     for len in 1..=60 {
-        assert_eq!(bench.read(), []);
+        assert!(bench.read().is_empty());
         let wakes = bench.wakes();
         let frame: Vec<u8> = (0..len).collect();
         bench.arrive(frame.iter().copied());
@@ -273,7 +256,7 @@ fn a_frame_of_any_length_is_there_after_one_character_of_silence() {
 fn a_line_that_never_falls_silent_wakes_its_reader_each_quarter_of_the_fifo() {
     let mut bench = Bench::new();
     for _ in 0..8 {
-        assert_eq!(bench.read(), []);
+        assert!(bench.read().is_empty());
         let wakes = bench.wakes();
         bench.arrive(0..3);
         assert_eq!(bench.wakes(), wakes);
@@ -291,7 +274,7 @@ fn whoever_reads_has_what_interrupted_nobody_yet() {
     bench.arrive(7..9);
     assert_eq!(bench.read(), [7, 8]);
     bench.silence();
-    assert_eq!(bench.read(), []);
+    assert!(bench.read().is_empty());
     bench.arrive(9..14);
     bench.silence();
     assert_eq!(bench.read(), [9, 10, 11, 12, 13]);
@@ -302,20 +285,23 @@ fn a_character_with_an_error_is_left_out_by_itself() {
     let mut bench = Bench::start(settings(115_200, Parity::Even, 1));
     let noise = FRAMING_ERROR | PARITY_ERROR | NOISE;
     for (byte, errors) in [(1, 0), (2, PARITY_ERROR), (3, 0), (4, noise), (5, NOISE), (6, 0)] {
-        bench.model.arrive(byte, errors);
+        bench.damaged(byte, errors);
     }
     bench.silence();
     // Noise in a bit whose majority was clear is none of an error.
     assert_eq!(bench.read(), [1, 3, 5, 6]);
     let errors = LineErrors { parity: 1, framing: 1, ..LineErrors::NONE };
     assert_eq!(bench.line.errors(), errors);
+    // It was there.
+    bench.damaged(7, NOISE);
+    assert_ne!(bench.get(ISR) & NOISE, 0);
 }
 
 #[test]
 fn garbage_without_end_does_not_stop_what_is_behind_it() {
     let mut bench = Bench::new();
     for _ in 0..1_000 {
-        bench.model.arrive(0, FRAMING_ERROR);
+        bench.damaged(0, FRAMING_ERROR);
         bench.interrupts();
     }
     bench.arrive([7, 8]);
@@ -328,7 +314,7 @@ fn garbage_without_end_does_not_stop_what_is_behind_it() {
 fn an_overrun_is_counted_and_reception_goes_on() {
     let mut bench = Bench::new();
     // Interrupts are off for 20 characters.
-    (0..20).for_each(|byte| bench.model.arrive(byte, 0));
+    (0..20).for_each(|byte| bench.damaged(byte, 0));
     bench.interrupts();
     bench.arrive([100]);
     bench.silence();
@@ -360,16 +346,17 @@ fn a_frame_longer_than_everything_leaves_whole_and_without_a_gap() {
         }
         let wakes = bench.wakes();
         while bench.wakes() == wakes {
-            assert!(bench.model.leave(), "the line fell silent inside a frame");
-            bench.interrupts();
+            assert!(bench.leave(), "the line fell silent inside a frame");
         }
     }
     // While something waits, the next character is there when one has left.
     while !bench.is_flushed() {
-        assert!(bench.model.leave(), "nobody is woken at the end");
-        bench.interrupts();
+        assert!(bench.leave(), "nobody is woken at the end");
     }
-    assert_eq!(*bench.model.line.borrow(), frame);
+    let sent = bench.sent();
+    assert!(sent.iter().map(|sent| sent.byte).eq(frame));
+    assert!(sent.iter().all(|sent| sent.is_driven));
+    assert!(sent.windows(2).all(|pair| pair[0].end == pair[1].start), "a gap");
 }
 
 #[test]
@@ -382,24 +369,33 @@ fn flushed_is_when_the_last_character_has_left_and_who_waits_is_woken() {
         for left in 0..frame.len() {
             assert!(!bench.is_flushed(), "{left} of {} have left", frame.len());
             let wakes = bench.wakes();
-            bench.model.leave();
-            bench.interrupts();
+            assert!(bench.leave());
             assert!(left + 1 < frame.len() || bench.wakes() > wakes, "nobody is woken at the end");
         }
         assert!(bench.is_flushed());
-        assert!(!bench.model.leave());
+        assert!(!bench.leave());
+        // Driver-enable: half a bit before and behind.
+        let sent = bench.sent();
+        let (first, last) = (sent[sent.len() - frame.len()], sent[sent.len() - 1]);
+        let edges = bench.wires(|line| line.driver[line.driver.len() - 2..].to_vec());
+        let half = first.bit / 2;
+        assert!(edges[0].1 && first.start == edges[0].0 + half, "{edges:?}, {first:?}");
+        assert_eq!(edges[1], (last.end + half, false));
     }
 }
 
 #[test]
 fn what_arrives_while_sending_is_kept() {
     let mut bench = Bench::new();
+    bench.wires(|line| line.has_four_wires = true);
     assert_eq!(bench.write(&[1; 30]), Some(30));
-    for byte in 0..30 {
-        bench.model.leave();
-        bench.arrive([byte]);
-    }
+    let bytes: Vec<u8> = (0..30).collect();
+    let end = bench.wires(|line| line.send(bench.model.now(), &bytes, bench.format));
+    bench.pass_until(end - bench.character());
+    assert!(!bench.is_flushed());
+    bench.pass_until(end);
     bench.silence();
-    assert_eq!(bench.read(), (0..30).collect::<Vec<u8>>());
+    assert_eq!(bench.read(), bytes);
     assert!(bench.is_flushed());
+    assert!(bench.sent().iter().map(|sent| sent.byte).eq([1; 30]));
 }

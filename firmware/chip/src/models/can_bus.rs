@@ -114,13 +114,26 @@ pub struct CanBus {
     /// When it went bus-off.
     pub bus_offs: Vec<Picos>,
     /// What others send: when each has ended.
-    arriving: VecDeque<(Picos, Frame)>,
+    arriving: VecDeque<(Picos, Arrival)>,
+}
+
+/// What others put on the bus.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Arrival {
+    Frame(Frame),
+    /// Nobody can read it.
+    Broken,
 }
 
 impl CanBus {
     /// Another node sends a frame, which has ended then; later than all before.
     pub fn send(&mut self, ended: Picos, frame: Frame) {
-        self.arriving.push_back((ended, frame));
+        self.arriving.push_back((ended, Arrival::Frame(frame)));
+    }
+
+    /// As [`CanBus::send`], a frame with a wrong check sum or too many equal bits.
+    pub fn send_broken(&mut self, ended: Picos) {
+        self.arriving.push_back((ended, Arrival::Broken));
     }
 
     /// Whether a receiver with such bits understands the others: within half a percent.
@@ -146,8 +159,8 @@ impl CanBus {
         self.arriving.front().map(|(ended, _)| *ended)
     }
 
-    pub(super) fn arrival(&mut self, now: Picos) -> Option<Frame> {
+    pub(super) fn arrival(&mut self, now: Picos) -> Option<Arrival> {
         self.next_arrival().filter(|ended| *ended <= now)?;
-        self.arriving.pop_front().map(|(_, frame)| frame)
+        self.arriving.pop_front().map(|(_, arrival)| arrival)
     }
 }

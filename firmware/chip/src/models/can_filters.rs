@@ -16,14 +16,15 @@ pub(super) struct Filters {
 }
 
 impl Filters {
-    /// Which FIFO takes a frame.
-    pub(super) fn accept(&self, frame: &Frame, ram: &[u32]) -> Option<usize> {
+    /// Which FIFO takes a frame, and the index of the filter that says so; `None` for one in no list.
+    pub(super) fn accept(&self, frame: &Frame, ram: &[u32]) -> Option<(usize, Option<u32>)> {
         let filters = self.others;
         let fifo = |code: u32| match code {
             1 | 5 => Some(0),
             2 | 6 => Some(1),
             _ => None,
         };
+        let others = |code: u32| (code < 2).then_some((code as usize, None));
         let id = frame.id;
         if frame.is_remote && filters >> u32::from(!frame.is_extended) & 1 != 0 {
             return None;
@@ -42,10 +43,10 @@ impl Filters {
                     _ => (a..=b).contains(&id),
                 };
                 if first >> 29 != 0 && matches {
-                    return fifo(first >> 29);
+                    return Some((fifo(first >> 29)?, Some(index as u32)));
                 }
             }
-            return [Some(0), Some(1), None, None][(filters >> 2 & 3) as usize];
+            return others(filters >> 2 & 3);
         }
         let list = self.standard;
         for index in 0..(list >> 16 & 0xFF) as usize {
@@ -58,10 +59,10 @@ impl Filters {
                 _ => false,
             };
             if word >> 27 & 7 != 0 && matches {
-                return fifo(word >> 27 & 7);
+                return Some((fifo(word >> 27 & 7)?, Some(index as u32)));
             }
         }
-        [Some(0), Some(1), None, None][(filters >> 4 & 3) as usize]
+        others(filters >> 4 & 3)
     }
 }
 
@@ -74,7 +75,12 @@ mod tests {
         let element = |kind: u32, fifo: u32, a: u32, b: u32| kind << 30 | fifo << 27 | a << 16 | b;
         let ram = [element(1, 1, 0x10, 0x12), element(0, 2, 0x20, 0x2F), element(2, 1, 0x100, 0x700)];
         let filters = Filters { others: 0x28, standard: 3 << 16, extended: 0, mask: 0x1FFF_FFFF };
-        let fifo = |id: u32| filters.accept(&Frame::standard(id, &[]), &ram);
+        let accept = |id: u32| filters.accept(&Frame::standard(id, &[]), &ram);
+        assert_eq!(
+            [0x10, 0x20, 0x100].map(|id| accept(id).and_then(|(_, index)| index)),
+            [Some(0), Some(1), Some(2)]
+        );
+        let fifo = |id: u32| accept(id).map(|(fifo, _)| fifo);
         assert_eq!([0x10, 0x11, 0x12].map(fifo), [Some(0), None, Some(0)]);
         assert_eq!([0x1F, 0x20, 0x2F, 0x30].map(fifo), [None, Some(1), Some(1), None]);
         assert_eq!([0x100, 0x1FF, 0x200].map(fifo), [Some(0), Some(0), None]);

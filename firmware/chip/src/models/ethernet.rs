@@ -62,6 +62,7 @@ pub trait Memory {
     fn store(&mut self, address: u32, bytes: &[u8]) -> bool;
 }
 
+#[cfg(feature = "emulator")]
 impl Memory for crate::unicorn::Engine {
     fn fetch(&self, address: u32, bytes: &mut [u8]) -> bool {
         self.read(address, bytes)

@@ -7,7 +7,7 @@
 
 use std::collections::VecDeque;
 
-use super::can_bus::{Attempt, CanBus, Frame};
+use super::can_bus::{Arrival, Attempt, CanBus, Frame};
 use super::can_filters::Filters;
 use super::fdcan_registers::*;
 use crate::device::*;
@@ -84,6 +84,11 @@ impl Fdcan {
             }
             None => refuse("behind the message RAM's end"),
         }
+    }
+
+    /// It takes part in what happens on the bus.
+    pub fn is_on_bus(&self) -> bool {
+        self.is_on_bus && self.bank.get(CCCR) & RESTRICTED == 0
     }
 
     /// A late access to the message RAM: MRAF, and from then on only listening ("Restricted operation mode").
@@ -201,6 +206,10 @@ impl Fdcan {
         if bits != 1 << self.put || self.used() >= size {
             return refuse(format!("not the FIFO's put index, which is {}", self.put));
         }
+        let begin = (self.bank.get(TXBC) & 0xFFFC) as usize / 4 + ELEMENT * self.put as usize;
+        if self.ram[begin + 1] & 0x0070_FFFF != 0 {
+            return refuse("a frame of CAN FD, or reserved bits in its element");
+        }
         self.waiting.push_back(self.put);
         self.put = (self.put + 1) % size;
         Ok(())
@@ -224,7 +233,7 @@ impl Fdcan {
             extended: self.bank.get(XIDFC),
             mask: self.bank.get(XIDAM),
         };
-        let Some(fifo) = filters.accept(frame, &self.ram) else { return };
+        let Some((fifo, filter)) = filters.accept(frame, &self.ram) else { return };
         self.bus.passed += 1;
         let config = self.bank.get(RXFC[fifo]);
         let size = config >> 16 & 0x7F;
@@ -237,6 +246,8 @@ impl Fdcan {
         for (place, word) in self.ram[begin..begin + ELEMENT].iter_mut().zip(frame.words()) {
             *place = word;
         }
+        // FIDX, or ANMF ("FDCAN Rx buffer and FIFO element").
+        self.ram[begin + 1] |= filter.map_or(1 << 31, |index| index << 24);
         self.fifos[fifo] = (get, (put + 1) % size, fill + 1);
         self.raise(1 << (4 * fifo) | u32::from(fill + 1 == size) << (2 + 4 * fifo));
     }
@@ -298,7 +309,11 @@ impl Peripheral for Fdcan {
             fill | get << 8 | put << 16 | u32::from(size > 0 && fill == size) << 24
         };
         Ok(match offset {
-            ECR => self.transmit_errors.min(255) | self.receive_errors << 8,
+            // From 128 on, RP says so in the place of REC's eighth bit.
+            ECR => {
+                let passive = u32::from(self.receive_errors >= 128) << 15;
+                self.transmit_errors.min(255) | self.receive_errors.min(127) << 8 | passive
+            }
             PSR => 0x707 | self.error_state(),
             TXBRP => pending | self.sending.map_or(0, |(index, ..)| 1 << index),
             TXFQS => {
@@ -390,13 +405,18 @@ impl Peripheral for Fdcan {
                 self.sending = Some((index, frame, attempt, at.now + frame.bits(attempt) * bit));
                 continue;
             }
-            let Some(frame) = self.bus.arrival(at.now) else { break };
-            if self.is_on_bus && self.bus.is_understood(bit) {
-                self.bus.heard += 1;
-                self.count(|can| can.receive_errors = can.receive_errors.saturating_sub(1));
-                self.store(&frame);
-            } else {
-                self.bus.missed += 1;
+            let Some(arrival) = self.bus.arrival(at.now) else { break };
+            match arrival {
+                Arrival::Frame(frame) if self.is_on_bus && self.bus.is_understood(bit) => {
+                    self.bus.heard += 1;
+                    // Out of error-passive at once (ISO 11898-1).
+                    self.count(|can| can.receive_errors = can.receive_errors.saturating_sub(1).min(127));
+                    self.store(&frame);
+                }
+                Arrival::Broken if self.is_on_bus => {
+                    self.count(|can| can.receive_errors = (can.receive_errors + 1).min(128));
+                }
+                Arrival::Frame(_) | Arrival::Broken => self.bus.missed += 1,
             }
         }
         Ok(())

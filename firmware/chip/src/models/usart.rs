@@ -2,9 +2,10 @@
 //! synchronous receiver transmitter".
 //!
 //! Time is exact: characters have the length that BRR and PRESC give them, and driver-enable the times of
-//! DEAT and DEDT. Characters that arrive are sampled in the middle of each bit, so a wrong speed or parity
-//! shows as it would. The transceiver's receiver is off while its driver is on (DE and /RE are tied).
-//! Settings that only a disabled USART takes are refused while it runs (said at each field).
+//! DEAT and DEDT. Characters that arrive are sampled three times in the middle of each bit, so a wrong speed,
+//! a wrong parity and noise show as they would. The transceiver's receiver is off while its driver is on (DE
+//! and /RE are tied). Settings that only a disabled USART takes are refused while it runs (said at each
+//! field).
 
 use std::collections::VecDeque;
 
@@ -37,6 +38,7 @@ static REGISTERS: [Register; 10] = [
 
 const PE: u32 = 1;
 const FE: u32 = 1 << 1;
+const NE: u32 = 1 << 2;
 const ORE: u32 = 1 << 3;
 const IDLE: u32 = 1 << 4;
 const RXFNE: u32 = 1 << 5;
@@ -49,6 +51,10 @@ const TXFT: u32 = 1 << 27;
 const UE: u32 = 1;
 const RE: u32 = 1 << 2;
 const TE: u32 = 1 << 3;
+const PCE: u32 = 1 << 10;
+const OVER8: u32 = 1 << 15;
+const FIFOEN: u32 = 1 << 29;
+const ONEBIT: u32 = 1 << 11;
 const DEM: u32 = 1 << 14;
 const DEP: u32 = 1 << 15;
 const FIFO: usize = 16;
@@ -74,7 +80,8 @@ pub struct Usart {
     /// The line at its pins.
     pub line: Line,
     flags: u32,
-    received: VecDeque<(u8, u32)>,
+    /// Each with its parity bit and its error flags.
+    received: VecDeque<(u16, u32)>,
     waiting: VecDeque<u8>,
     /// What is on the line: its start, its end.
     sending: Option<(u8, Picos, Picos)>,
@@ -158,11 +165,14 @@ impl Usart {
     }
 
     fn begin(&mut self, byte: u8, from: Picos, clocks: Clocks) {
+        // The parity bit takes the place of the word's last bit.
+        let bits = self.data_bits() - u32::from(self.has(CR1, PCE));
+        let byte = byte & (0xFF >> 8_u32.saturating_sub(bits));
         self.sending = Some((byte, from, from + self.character(clocks)));
     }
 
     fn parity_bit(&self, byte: u8) -> Option<bool> {
-        self.has(CR1, 1 << 10).then(|| byte.count_ones().is_multiple_of(2) == self.has(CR1, 1 << 9))
+        self.has(CR1, PCE).then(|| byte.count_ones().is_multiple_of(2) == self.has(CR1, 1 << 9))
     }
 
     fn transmit(&mut self, at: &Moment<'_>) -> Result<(), Refusal> {
@@ -198,12 +208,24 @@ impl Usart {
         Ok(())
     }
 
+    /// A bit by the majority of its three samples, and whether they disagree ("Noise error"); `middle` is when
+    /// the second is taken.
+    fn sample(&self, middle: Picos, bit: Picos) -> (bool, bool) {
+        let levels = [middle - spread(bit), middle, middle + spread(bit)].map(|at| self.line.level(at));
+        if self.has(CR3, ONEBIT) {
+            return (levels[1], false);
+        }
+        let highs = levels.into_iter().filter(|level| *level).count();
+        (highs >= 2, highs % 3 != 0)
+    }
+
     fn receive(&mut self, at: &Moment<'_>) {
         let is_on = self.has(CR1, UE | RE) && self.pins.rx.is(at.functions, self.pins.function);
         let bit = self.bit(at.clocks);
         let bits = self.data_bits();
-        // Up to the middle of the first stop bit.
-        let sampled = Picos::from(bits + 1) * bit + bit / 2;
+        // Up to the middle of the first stop bit, and to the last sample of it.
+        let middle = Picos::from(bits + 1) * bit + bit / 2;
+        let sampled = middle + spread(bit);
         loop {
             let start = match self.receiving {
                 Some(start) => start,
@@ -220,16 +242,19 @@ impl Usart {
                 break;
             }
             self.receiving = None;
-            let level = |index: u32| self.line.level(start + Picos::from(index) * bit + bit / 2);
+            let sample = |index: u32| self.sample(start + Picos::from(index) * bit + bit / 2, bit);
+            let level = |index: u32| sample(index).0;
             if level(0) || !is_on {
                 self.line.heard(start + bit);
                 continue;
             }
             let word = (0..bits).fold(0_u32, |word, index| word | u32::from(level(index + 1)) << index);
             let is_stopped = level(bits + 1);
+            let is_noisy = (0..=bits + 1).any(|index| sample(index).1);
             self.line.heard(start + sampled);
-            let mut flags = if is_stopped { 0 } else { FE };
-            if let Some(parity) = self.parity_bit(word as u8)
+            let mut flags = if is_stopped { 0 } else { FE } | if is_noisy { NE } else { 0 };
+            let data = word & !(1 << (bits - 1));
+            if let Some(parity) = self.parity_bit(data as u8)
                 && (word >> (bits - 1) & 1 != 0) != parity
             {
                 flags |= PE;
@@ -237,9 +262,9 @@ impl Usart {
             if self.received.len() == FIFO {
                 self.flags |= ORE;
             } else {
-                self.received.push_back((word as u8, flags));
+                self.received.push_back((word as u16, flags));
             }
-            self.idles = Some(start + sampled + self.character(at.clocks));
+            self.idles = Some(start + middle + self.character(at.clocks));
         }
         if let Some(idle) = self.idles
             && at.now >= idle
@@ -284,6 +309,11 @@ impl Usart {
     }
 }
 
+/// From the middle sample of a bit to its neighbours ("Oversampling by 16").
+fn spread(bit: Picos) -> Picos {
+    bit / 16
+}
+
 impl Peripheral for Usart {
     fn registers(&self) -> &'static [Register] {
         &REGISTERS
@@ -294,7 +324,11 @@ impl Peripheral for Usart {
         match offset {
             ISR => Ok(self.status()),
             RDR => match self.received.pop_front() {
-                Some((byte, _)) => Ok(byte.into()),
+                Some((word, flags)) => {
+                    // Not cleared before, they stay, and are there for the next character too.
+                    self.flags |= flags;
+                    Ok(word.into())
+                }
                 None => refuse("nothing was received"),
             },
             TDR | ICR => refuse("nothing to read there"),
@@ -307,7 +341,7 @@ impl Peripheral for Usart {
         match offset {
             ICR => {
                 self.bank.check(offset, value)?;
-                self.flags &= !(value & (ORE | IDLE | TC));
+                self.flags &= !(value & (PE | FE | NE | ORE | IDLE | TC));
                 if let Some((_, flags)) = self.received.front_mut() {
                     *flags &= !value;
                 }
@@ -337,6 +371,12 @@ impl Peripheral for Usart {
             _ => {}
         }
         self.check_locked(offset, value)?;
+        if offset == CR1 && value & OVER8 != 0 {
+            return refuse("oversampling by 8 is not modelled");
+        }
+        if offset == CR1 && value & UE != 0 && value & FIFOEN == 0 {
+            return refuse("a USART without its FIFOs (FIFOEN) is not modelled");
+        }
         if offset == CR1 && value & UE != 0 && !self.has(CR1, UE) && self.bank.get(BRR) < 16 {
             return refuse("it is switched on with a BRR below 16");
         }
@@ -358,7 +398,7 @@ impl Peripheral for Usart {
         let bit = self.bit(at.clocks);
         // Edges inside of a character are looked at when it is sampled.
         let start = self.receiving.or_else(|| self.line.next_start_bit());
-        let sampled = start.map(|start| start + bits * bit + bit / 2);
+        let sampled = start.map(|start| start + bits * bit + bit / 2 + spread(bit));
         let sent = self.sending.map(|(_, _, end)| end);
         [sent, self.releases, sampled, self.idles].into_iter().flatten().min()
     }
@@ -369,7 +409,7 @@ impl Peripheral for Usart {
             (IDLE | TC | TXFNF) & cr1,
             status & (RXFNE | ORE) & if cr1 & RXFNE != 0 { !0 } else { 0 },
             if cr1 >> 8 & 1 != 0 { PE } else { 0 },
-            if cr3 & 1 != 0 { FE | ORE | 4 } else { 0 },
+            if cr3 & 1 != 0 { FE | NE | ORE } else { 0 },
             if cr3 >> 28 & 1 != 0 { RXFT } else { 0 },
             if cr3 >> 23 & 1 != 0 { TXFT } else { 0 },
             cr1 >> 30 << 23 & TXFE,

@@ -1,0 +1,103 @@
+//! A model of `chip` as a driver's registers: those that the binary runs on (docs/chip.md). Time is moved by
+//! the test, and a little by each access. What the model refuses fails the test.
+
+use core::cell::{Cell, RefCell};
+use std::rc::Rc;
+
+use chip::device::{Clocks, Functions, Moment, Peripheral, Picos, Pin, Refusal};
+
+/// A peripheral with its clocks and pins.
+pub(crate) struct Device<P> {
+    model: RefCell<P>,
+    now: Cell<Picos>,
+    clocks: Clocks,
+    functions: Functions,
+}
+
+impl<P: Peripheral> Device<P> {
+    /// As after a reset, with these pins set up for it.
+    pub(crate) fn new(model: P, clocks: Clocks, pins: &[Pin], function: u8) -> Rc<Self> {
+        let mut functions = Functions::default();
+        for pin in pins {
+            functions[pin.port()][usize::from(pin.1)] = Some(function);
+        }
+        Rc::new(Self { model: RefCell::new(model), now: Cell::new(0), clocks, functions })
+    }
+
+    /// The present.
+    pub(crate) fn now(&self) -> Picos {
+        self.now.get()
+    }
+
+    /// Whether its interrupt is asked for.
+    pub(crate) fn interrupts(&self) -> bool {
+        self.with(|model| model.interrupts())
+    }
+
+    /// The model, to look at it or to do something at its pins.
+    pub(crate) fn with<T>(&self, f: impl FnOnce(&mut P) -> T) -> T {
+        f(&mut self.model.borrow_mut())
+    }
+
+    /// The program reads a register.
+    #[track_caller]
+    pub(crate) fn read(&self, offset: u32) -> u32 {
+        let read = self.access(|model, at| model.read(offset, at));
+        read.unwrap_or_else(|refusal| panic!("{} is read: {refusal}", self.name(offset)))
+    }
+
+    /// The program writes a register.
+    #[track_caller]
+    pub(crate) fn write(&self, offset: u32, value: u32) {
+        let written = self.access(|model, at| model.write(offset, value, at));
+        written.unwrap_or_else(|refusal| panic!("{} <- {value:08X}: {refusal}", self.name(offset)));
+    }
+
+    /// The program does something else there.
+    pub(crate) fn access<T>(
+        &self,
+        f: impl FnOnce(&mut P, &Moment<'_>) -> Result<T, Refusal>,
+    ) -> Result<T, Refusal> {
+        self.now.set(self.now() + ACCESS);
+        let mut model = self.model.borrow_mut();
+        model.advance(&self.moment())?;
+        f(&mut model, &self.moment())
+    }
+
+    /// Time passes up to the next thing that the peripheral does, or to `end`, where it returns `false`.
+    #[track_caller]
+    pub(crate) fn hop(&self, end: Picos) -> bool {
+        self.advance();
+        let due = self.with(|model| model.deadline(&self.moment())).filter(|due| *due < end);
+        assert!(due.is_none_or(|due| due > self.now()), "what is due is not done");
+        self.now.set(due.unwrap_or(end).max(self.now()));
+        self.advance();
+        due.is_some()
+    }
+
+    /// Time passes.
+    #[track_caller]
+    pub(crate) fn pass(&self, span: Picos) {
+        let end = self.now() + span;
+        while self.hop(end) {}
+    }
+
+    #[track_caller]
+    fn advance(&self) {
+        let done = self.with(|model| model.advance(&self.moment()));
+        done.unwrap_or_else(|refusal| panic!("it does something by itself: {refusal}"));
+    }
+
+    fn moment(&self) -> Moment<'_> {
+        Moment { now: self.now(), clocks: self.clocks, functions: &self.functions, is_rmii: false }
+    }
+
+    fn name(&self, offset: u32) -> std::string::String {
+        let registers = self.with(|model| model.registers());
+        let found = registers.iter().find(|register| register.offset == offset);
+        found.map_or_else(|| std::format!("+{offset:03X}"), |register| register.name.into())
+    }
+}
+
+/// One cycle of a bus at 100 MHz.
+const ACCESS: Picos = 10_000;
