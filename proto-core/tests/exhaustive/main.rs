@@ -136,22 +136,22 @@ fn recipe_roots(way: Way, start: Instant) -> Vec<Root<RecipeCell>> {
 
 #[test]
 fn a_float_and_a_bit_by_udp() {
-    check("a float and a bit by UDP", &recipe_roots(Way::Udp, START), &size((5, 9_900), (7, 370_000)));
+    check("a float and a bit by UDP", &recipe_roots(Way::Udp, START), &size((5, 11_000), (7, 510_000)));
 }
 
 #[test]
 fn a_float_and_a_bit_by_udp_with_frames_back() {
-    check("the same with frames back", &recipe_roots(Way::UdpBoth, START), &size((5, 14_500), (7, 730_000)));
+    check("the same with frames back", &recipe_roots(Way::UdpBoth, START), &size((5, 15_800), (7, 910_000)));
 }
 
 #[test]
 fn a_float_that_is_held_and_a_bit_by_udp() {
-    check("a float that is held by UDP", &recipe_roots(Way::Held, START), &size((5, 12_500), (7, 590_000)));
+    check("a float that is held by UDP", &recipe_roots(Way::Held, START), &size((5, 13_800), (7, 740_000)));
 }
 
 #[test]
 fn a_float_and_a_bit_by_tcp() {
-    check("a float and a bit by TCP", &recipe_roots(Way::Tcp, START), &size((5, 4_600), (7, 100_000)));
+    check("a float and a bit by TCP", &recipe_roots(Way::Tcp, START), &size((5, 4_900), (7, 122_000)));
 }
 
 #[track_caller]
