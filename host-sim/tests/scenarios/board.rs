@@ -1,15 +1,17 @@
 //! What boards have in common that are emulated: an image of the configuration, a log, QEMU's user network.
 
+use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader, Write};
 use std::net::{Ipv4Addr, SocketAddr};
 use std::os::unix::net::UnixStream;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use proto_core::config::{Bus, GatewayConfig};
 use serde_json::{Value, json};
 
 use super::environment::{Link, LinkStatus, Plan, PortStatus};
+use super::field::{CanClient, Line};
 use super::refusal::Spoil;
 
 /// The host as QEMU's guest sees it.
@@ -49,6 +51,76 @@ pub(crate) fn make_spoilt_image(plan: &Plan<'_>, image: &Path, spoil: Spoil) {
     std::fs::write(image, bytes).unwrap();
 }
 
+/// How the host reaches a board: sockets in a folder of its own, since those of one that was ended stay
+/// behind, and what the user network forwards.
+pub(crate) struct Wires {
+    pub(crate) folder: PathBuf,
+    /// Field ports by name: the number in the log, and the socket.
+    ports: BTreeMap<String, (usize, &'static str)>,
+    /// Listening ports by name.
+    listens: BTreeMap<String, SocketAddr>,
+}
+
+impl Wires {
+    /// The file's RS-485 ports and CAN ports get these sockets, in their order.
+    pub(crate) fn new(
+        plan: &Plan<'_>,
+        config: &GatewayConfig,
+        lines: &[&'static str],
+        buses: &[&'static str],
+    ) -> Self {
+        let folder = tempfile::Builder::new().tempdir_in(plan.case.folder.path()).unwrap().keep();
+        let (mut lines, mut buses) = (lines.iter(), buses.iter());
+        let mut ports = BTreeMap::new();
+        for (number, port) in config.ports.iter().enumerate() {
+            let socket = match &port.bus {
+                Bus::Rs485(_) => lines.next(),
+                Bus::Can { .. } => buses.next(),
+                Bus::TcpListen { .. } | Bus::UdpListen { .. } => None,
+            };
+            ports.extend(socket.map(|socket| (port.name.as_str().to_owned(), (number, *socket))));
+        }
+        Self { folder, ports, listens: BTreeMap::new() }
+    }
+
+    /// Asks the QEMU whose socket this is what it forwards.
+    #[track_caller]
+    pub(crate) fn ask_forwarded(&mut self, config: &GatewayConfig, socket: &str) {
+        self.listens = forwarded(config, &self.folder.join(socket)).into_iter().collect();
+    }
+
+    #[track_caller]
+    pub(crate) fn socket(&self, name: &str) -> UnixStream {
+        UnixStream::connect(self.folder.join(name)).unwrap()
+    }
+
+    #[track_caller]
+    fn field(&self, port: &str) -> (usize, &'static str) {
+        *self.ports.get(port).unwrap_or_else(|| panic!("no port {port}"))
+    }
+
+    #[track_caller]
+    pub(crate) fn line(&self, port: &str) -> Line {
+        Line::new(Box::new(self.socket(self.field(port).1)))
+    }
+
+    #[track_caller]
+    pub(crate) fn can(&self, port: &str) -> CanClient {
+        CanClient::join(Box::new(self.socket(self.field(port).1)))
+    }
+
+    #[track_caller]
+    pub(crate) fn listens(&self, port: &str) -> SocketAddr {
+        self.listens[port]
+    }
+
+    /// How the port does, by this log.
+    #[track_caller]
+    pub(crate) fn port(&self, log: &str, port: &str) -> PortStatus {
+        port_status(log, self.field(port).0)
+    }
+}
+
 /// Options of the user network that let the host reach the listening ports.
 pub(crate) fn forwards(config: &GatewayConfig) -> Vec<String> {
     let inside = config.ports.iter().filter_map(|port| forward(&port.bus));
@@ -67,7 +139,7 @@ fn forward(bus: &Bus) -> Option<(&'static str, u16)> {
 
 /// Listening ports by name, as the host reaches them; asked of the QEMU whose socket this is.
 #[track_caller]
-pub(crate) fn forwarded(config: &GatewayConfig, socket: &Path) -> Vec<(String, SocketAddr)> {
+fn forwarded(config: &GatewayConfig, socket: &Path) -> Vec<(String, SocketAddr)> {
     let table = qmp(socket, "human-monitor-command", json!({ "command-line": "info usernet" }));
     let table = table.as_str().unwrap();
     let place = |(kind, port)| {
@@ -126,7 +198,7 @@ pub(crate) fn link(log: &str, link: Link<'_>) -> LinkStatus {
 }
 
 /// From the newest line `port NUMBER: in FRAMES frames, BYTES bytes; out ...` of a log.
-pub(crate) fn port(log: &str, number: usize) -> PortStatus {
+fn port_status(log: &str, number: usize) -> PortStatus {
     let start = format!("port {number}: in ");
     // The newest line may not be whole yet.
     let whole = log.split_inclusive('\n').filter(|line| line.ends_with('\n'));

@@ -1,7 +1,6 @@
 //! The NUCLEO-H743ZI2's firmware, unchanged, on its modelled chip in real time (docs/chip.md section 5): RS-485
 //! lines and CAN on sockets, Ethernet by QEMU's user network, the log on the emulator's stdout.
 
-use std::collections::BTreeMap;
 use std::ffi::OsString;
 use std::io::{BufRead, BufReader, Write};
 use std::net::SocketAddr;
@@ -9,10 +8,9 @@ use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use proto_core::config::Bus;
 use serde_json::Value;
 
-use super::board;
+use super::board::{self, Wires};
 use super::case::{Case, until};
 use super::environment::{Cable, Environment, Gateway, Link, LinkStatus, Plan, PortStatus, ports};
 use super::field::{CanClient, Line};
@@ -68,12 +66,12 @@ impl Environment for Nucleo {
         let mut chip = Chip::start(self, plan, &image);
         let reason = chip.until_log("nothing runs: ");
         for bus in ["a", "b"] {
-            let mut line = Line::new(Box::new(chip.socket(bus)));
+            let mut line = Line::new(Box::new(chip.wires.socket(bus)));
             line.send(b"\xFF\xFF\x01\xEE\xEE");
             line.is_silent(Duration::from_millis(300));
         }
         // Here the adapter is not the board; what it says is not the board's.
-        let mut bus = CanClient::join(Box::new(chip.socket("can"))).into_line();
+        let mut bus = CanClient::join(Box::new(chip.wires.socket("can"))).into_line();
         bus.send(b"t001101\r");
         assert_eq!(bus.take(2), b"z\r");
         bus.is_silent(Duration::from_millis(300));
@@ -85,30 +83,15 @@ impl Environment for Nucleo {
 /// The emulator with the firmware.
 struct Chip {
     program: Program,
-    folder: PathBuf,
-    /// Field ports by name: the number in the log, and the socket.
-    ports: BTreeMap<String, (usize, &'static str)>,
-    /// Listening ports by name, as the host reaches them.
-    listens: BTreeMap<String, SocketAddr>,
+    wires: Wires,
 }
 
 impl Chip {
     #[track_caller]
     fn start(nucleo: &Nucleo, plan: &Plan<'_>, image: &Path) -> Self {
-        // Each board has sockets of its own: those of one that was killed stay behind.
-        let folder = tempfile::Builder::new().tempdir_in(plan.case.folder.path()).unwrap().keep();
         let config = plan.config();
-        let mut ports = BTreeMap::new();
-        let (mut lines, mut buses) = (BUSES[..2].iter(), BUSES[2..].iter());
-        for (number, port) in config.ports.iter().enumerate() {
-            let bus = match &port.bus {
-                Bus::Rs485(_) => lines.next(),
-                Bus::Can { .. } => buses.next(),
-                Bus::TcpListen { .. } | Bus::UdpListen { .. } => None,
-            };
-            ports.extend(bus.map(|bus| (port.name.as_str().to_owned(), (number, *bus))));
-        }
-        let place = |name: &str| folder.join(name).into_os_string();
+        let wires = Wires::new(plan, &config, &BUSES[..2], &BUSES[2..]);
+        let place = |name: &str| wires.folder.join(name).into_os_string();
         let mut arguments: Vec<OsString> = vec![nucleo.elf.clone().into(), image.into(), "--realtime".into()];
         for (option, name) in ["--rs485", "--rs485", "--can"].into_iter().zip(BUSES) {
             arguments.extend([option.into(), place(name)]);
@@ -117,15 +100,15 @@ impl Chip {
         arguments.extend(["--network".into(), network.into(), "--qmp".into(), place("qmp")]);
         arguments.extend(["--control".into(), place("control")]);
         let program = Program::start(plan.case, "chip", &nucleo.emulator, &arguments);
-        let mut chip = Self { program, folder, ports, listens: BTreeMap::new() };
+        let mut chip = Self { program, wires };
         // The last of each program's sockets. That its file is there does not mean that it listens.
         for last in ["control", "qmp"] {
             until("the emulator's sockets", || {
                 chip.must_run();
-                UnixStream::connect(chip.folder.join(last)).ok()
+                UnixStream::connect(chip.wires.folder.join(last)).ok()
             });
         }
-        chip.listens = board::forwarded(&config, &chip.folder.join("qmp")).into_iter().collect();
+        chip.wires.ask_forwarded(&config, "qmp");
         chip
     }
 
@@ -143,20 +126,10 @@ impl Chip {
         })
     }
 
-    #[track_caller]
-    fn socket(&self, name: &str) -> UnixStream {
-        UnixStream::connect(self.folder.join(name)).unwrap()
-    }
-
-    #[track_caller]
-    fn field(&self, port: &str) -> (usize, &'static str) {
-        *self.ports.get(port).unwrap_or_else(|| panic!("no port {port}"))
-    }
-
     /// Asks the emulator.
     #[track_caller]
     fn ask(&self, words: &str) -> String {
-        let mut stream = self.socket("control");
+        let mut stream = self.wires.socket("control");
         writeln!(stream, "{words}").unwrap();
         let mut answer = String::new();
         BufReader::new(stream).read_line(&mut answer).unwrap();
@@ -172,17 +145,17 @@ impl Chip {
 impl Gateway for Chip {
     #[track_caller]
     fn line(&self, port: &str) -> Line {
-        Line::new(Box::new(self.socket(self.field(port).1)))
+        self.wires.line(port)
     }
 
     #[track_caller]
     fn can(&self, port: &str) -> CanClient {
-        CanClient::join(Box::new(self.socket(self.field(port).1)))
+        self.wires.can(port)
     }
 
     #[track_caller]
     fn listens(&self, port: &str) -> SocketAddr {
-        self.listens[port]
+        self.wires.listens(port)
     }
 
     fn link(&self, link: Link<'_>) -> LinkStatus {
@@ -190,7 +163,7 @@ impl Gateway for Chip {
     }
 
     fn port(&self, port: &str) -> PortStatus {
-        board::port(&self.log(), self.field(port).0)
+        self.wires.port(&self.log(), port)
     }
 
     #[track_caller]
@@ -219,7 +192,7 @@ impl Gateway for Chip {
     /// Its stack, which is painted before it is used; everything else is static.
     #[track_caller]
     fn memory(&self) -> u64 {
-        let path = self.folder.join("memory");
+        let path = self.wires.folder.join("memory");
         let [start, len] = STACK;
         self.order(&format!("save {start} {len} {}", path.display()));
         board::stack_used(&path)
@@ -244,7 +217,7 @@ impl Drop for Chip {
             self.program.interrupt();
             assert!(!self.log().contains("panicked"), "the firmware panicked");
             assert_eq!(figures["resets"], 0, "the watchdog has reset the board");
-            assert!(self.folder.read_dir().unwrap().all(|left| left.unwrap().file_name() == "memory"));
+            assert!(self.wires.folder.read_dir().unwrap().all(|left| left.unwrap().file_name() == "memory"));
         }
     }
 }

@@ -1,17 +1,15 @@
 //! The firmware in QEMU (firmware/README.md): RS-485 on UART 0 and 1, CAN as slcan on UART 2, the log on
 //! UART 3.
 
-use std::collections::BTreeMap;
 use std::ffi::OsString;
 use std::net::SocketAddr;
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use proto_core::config::Bus;
 use serde_json::{Value, json};
 
-use super::board;
+use super::board::{self, Wires};
 use super::case::{Case, until};
 use super::environment::{Cable, Environment, Gateway, Link, LinkStatus, Plan, PortStatus, ports};
 use super::field::{CanClient, Line};
@@ -26,10 +24,8 @@ pub(crate) struct Qemu {
 /// The board's stack (firmware/boards/mps2-an500/memory.x).
 const STACK: u64 = 0x2030_0000;
 const STACK_SIZE: u64 = 1 << 20;
-/// RS-485, RS-485, CAN.
-const UARTS: usize = 3;
-/// The UART of the CAN port.
-const CAN_UART: usize = 2;
+/// The sockets of its UARTs: RS-485, RS-485, CAN.
+const UARTS: [&str; 3] = ["uart0", "uart1", "uart2"];
 
 impl Environment for Qemu {
     fn name(&self) -> &'static str {
@@ -70,8 +66,8 @@ impl Environment for Qemu {
             let (_, rest) = log.split_once("nothing runs: ")?;
             Some(rest.split_once('\r')?.0.to_owned())
         });
-        for uart in 0..UARTS {
-            let mut line = Line::new(Box::new(board.uart(uart)));
+        for uart in UARTS {
+            let mut line = Line::new(Box::new(board.wires.socket(uart)));
             line.send(b"\xFF\xFF\x01\xEE\xEEO\rt001101\r");
             line.is_silent(Duration::from_millis(300));
         }
@@ -83,62 +79,44 @@ impl Environment for Qemu {
 /// QEMU with the firmware.
 struct Board {
     program: Program,
-    folder: PathBuf,
     log: PathBuf,
-    /// Field ports by name: the number in the log, and the UART.
-    ports: BTreeMap<String, (usize, usize)>,
-    /// Listening ports by name, as the host reaches them.
-    listens: BTreeMap<String, SocketAddr>,
+    wires: Wires,
 }
 
 impl Board {
     #[track_caller]
     fn start(elf: &Path, plan: &Plan<'_>, image: &Path) -> Self {
-        // Each board has sockets of its own: those of one that was ended stay behind.
-        let folder = tempfile::Builder::new().tempdir_in(plan.case.folder.path()).unwrap().keep();
         let log = plan.case.logs.join("board.log");
         let config = plan.config();
-        let mut ports = BTreeMap::new();
+        let wires = Wires::new(plan, &config, &UARTS[..2], &UARTS[2..]);
         let mut network = vec!["user,id=n0,mac=02:11:22:33:44:55".to_owned()];
         network.extend(board::forwards(&config));
         let network = network.join(",");
-        let (mut lines, mut buses) = (0..CAN_UART, CAN_UART..UARTS);
-        for (number, port) in config.ports.iter().enumerate() {
-            let name = port.name.as_str().to_owned();
-            let uart = match &port.bus {
-                Bus::Rs485(_) => lines.next(),
-                Bus::Can { .. } => buses.next(),
-                Bus::TcpListen { .. } | Bus::UdpListen { .. } => continue,
-            };
-            if let Some(uart) = uart {
-                ports.insert(name, (number, uart));
-            }
-        }
         let mut arguments: Vec<OsString> =
             ["-M", "mps2-an500", "-display", "none", "-monitor", "none", "-nic", &network]
                 .map(OsString::from)
                 .into();
         let mut add = |words: [String; 2]| arguments.extend(words.map(OsString::from));
-        for uart in 0..UARTS {
-            let path = folder.join(format!("uart{uart}"));
-            let device = format!("socket,id=u{uart},path={},server=on,wait=off", path.display());
+        for uart in UARTS {
+            let path = wires.folder.join(uart);
+            let device = format!("socket,id={uart},path={},server=on,wait=off", path.display());
             add(["-chardev".into(), device]);
-            add(["-serial".into(), format!("chardev:u{uart}")]);
+            add(["-serial".into(), format!("chardev:{uart}")]);
         }
         add(["-chardev".into(), format!("file,id=log,path={}", log.display())]);
         add(["-serial".into(), "chardev:log".into()]);
-        add(["-qmp".into(), format!("unix:{},server=on,wait=off", folder.join("qmp").display())]);
+        add(["-qmp".into(), format!("unix:{},server=on,wait=off", wires.folder.join("qmp").display())]);
         let named = format!("enable=on,target=native,arg=firmware,arg={}", image.display());
         add(["-semihosting-config".into(), named]);
         arguments.extend(["-kernel".into(), elf.into()]);
         let program = Program::start(plan.case, "qemu", Path::new("qemu-system-arm"), &arguments);
-        let mut board = Self { program, folder, log, ports, listens: BTreeMap::new() };
+        let mut board = Self { program, log, wires };
         // The last of its sockets. That its file is there does not mean that it listens.
         until("QEMU's sockets", || {
             board.must_run();
-            UnixStream::connect(board.folder.join("qmp")).ok()
+            UnixStream::connect(board.wires.folder.join("qmp")).ok()
         });
-        board.listens = board::forwarded(&config, &board.folder.join("qmp")).into_iter().collect();
+        board.wires.ask_forwarded(&config, "qmp");
         board
     }
 
@@ -154,37 +132,27 @@ impl Board {
         });
     }
 
-    #[track_caller]
-    fn uart(&self, number: usize) -> UnixStream {
-        UnixStream::connect(self.folder.join(format!("uart{number}"))).unwrap()
-    }
-
-    #[track_caller]
-    fn field(&self, port: &str) -> (usize, usize) {
-        *self.ports.get(port).unwrap_or_else(|| panic!("no port {port}"))
-    }
-
     /// One command to QEMU; what it returns.
     #[track_caller]
     fn qmp(&self, command: &str, arguments: Value) -> Value {
-        board::qmp(&self.folder.join("qmp"), command, arguments)
+        board::qmp(&self.wires.folder.join("qmp"), command, arguments)
     }
 }
 
 impl Gateway for Board {
     #[track_caller]
     fn line(&self, port: &str) -> Line {
-        Line::new(Box::new(self.uart(self.field(port).1)))
+        self.wires.line(port)
     }
 
     #[track_caller]
     fn can(&self, port: &str) -> CanClient {
-        CanClient::join(Box::new(self.uart(self.field(port).1)))
+        self.wires.can(port)
     }
 
     #[track_caller]
     fn listens(&self, port: &str) -> SocketAddr {
-        self.listens[port]
+        self.wires.listens(port)
     }
 
     fn link(&self, link: Link<'_>) -> LinkStatus {
@@ -192,7 +160,7 @@ impl Gateway for Board {
     }
 
     fn port(&self, port: &str) -> PortStatus {
-        board::port(&self.log(), self.field(port).0)
+        self.wires.port(&self.log(), port)
     }
 
     #[track_caller]
@@ -221,7 +189,7 @@ impl Gateway for Board {
     /// Its stack, which is painted before it is used; everything else is static.
     #[track_caller]
     fn memory(&self) -> u64 {
-        let path = self.folder.join("memory");
+        let path = self.wires.folder.join("memory");
         self.qmp("pmemsave", json!({ "val": STACK, "size": STACK_SIZE, "filename": path }));
         board::stack_used(&path)
     }
