@@ -189,7 +189,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
                 self.arm(self.links.deadline_of(link));
                 return Output::LinkSend { link, bytes: buf.get(..len).unwrap_or(&[]) };
             }
-            // Whether one of these may go depends on the time, and no deadline says so.
+            // What stops the robot is looked at in every call, also before the deadline that it has.
             self.ask.links = self.links.has_stops();
         }
         if self.ask.actions {
