@@ -9,6 +9,7 @@ use std::time::{Duration, Instant};
 
 use clap::CommandFactory;
 use host_sim::cli::Cli;
+use rustix::process::{Pid, Signal, kill_process};
 
 /// One command line of each command, everything it makes in `folder`.
 fn command_lines(folder: &Path) -> Vec<Vec<String>> {
@@ -183,7 +184,7 @@ fn a_disk_that_fills_up_later_costs_statistics_and_does_not_end_a_gateway() {
     assert!(std::fs::read_to_string(&log).unwrap().starts_with("ready {"));
     // It runs on, and says so only once.
     assert!(folder.path().join("ready.json").exists() && folder.path().join("line").exists());
-    assert!(Command::new("kill").arg(child.id().to_string()).status().unwrap().success());
+    kill_process(Pid::from_child(&child), Signal::TERM).unwrap();
     assert_eq!(child.wait().unwrap().code(), Some(0));
     assert_eq!(lines.iter().collect::<Vec<_>>(), [""; 0]);
     assert_eq!(left_behind(folder.path()), [log]);

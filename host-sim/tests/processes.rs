@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
+use rustix::process::{Pid, Signal, kill_process};
 use rustix::pty::OpenptFlags;
 use serde_json::Value;
 
@@ -75,13 +76,13 @@ impl Running {
     }
 
     #[track_caller]
-    fn signal(&self, signal: &str) {
+    fn signal(&self, signal: Signal) {
         send(signal, &self.child);
     }
 
     /// Stops the process, and returns once none of its threads runs.
     fn stop(&self) {
-        self.signal("STOP");
+        self.signal(Signal::STOP);
         let tasks = format!("/proc/{}/task", self.child.id());
         let is_stopped = |task: std::io::Result<std::fs::DirEntry>| {
             let stat = std::fs::read_to_string(task.unwrap().path().join("stat")).unwrap();
@@ -95,10 +96,10 @@ impl Running {
     }
 
     #[track_caller]
-    fn end(mut self, signal: &str) {
+    fn end(mut self, signal: Signal) {
         send(signal, &self.child);
         let status = self.child.wait().unwrap();
-        assert_eq!((status.code(), status.signal()), (Some(0), None), "{signal}");
+        assert_eq!((status.code(), status.signal()), (Some(0), None), "{signal:?}");
     }
 }
 
@@ -181,7 +182,7 @@ fn a_gateway_and_a_controller_find_each_other_and_end_cleanly() {
     // The controller goes away and comes back on the same ports.
     let ports =
         ["command", "state", "modbus", "udp2011"].map(|name| format!("--set=listen.{name}={}", port(name)));
-    robot.end("TERM");
+    robot.end(Signal::TERM);
     assert!(!robot_ready.exists(), "nothing says ready that is not");
     gateway.stats(|stats| stats["links"]["modbus"]["state"] != "up");
     let mut robot = Running::start(
@@ -196,9 +197,9 @@ fn a_gateway_and_a_controller_find_each_other_and_end_cleanly() {
     std::io::Write::write_all(&mut device, &[0xFF, 0xFF, 0x80, 0xEE, 0xEE]).unwrap();
     robot.stats(|stats| stats["registers"]["DigitalOutputCommand[1]"].as_f64() == Some(128.0));
 
-    gateway.end("INT");
+    gateway.end(Signal::INT);
     assert!(line.symlink_metadata().is_err(), "the link is removed");
-    robot.end("INT");
+    robot.end(Signal::INT);
 }
 
 /// `gateway` with a pseudoterminal at `line`; its controller is nowhere.
@@ -264,7 +265,7 @@ fn a_ready_file_costs_nobody_anything() {
     let said: Value = serde_json::from_str(&std::fs::read_to_string(&ready).unwrap()).unwrap();
     assert_eq!(said, second.ready);
     std::fs::write(&ready, "somebody's").unwrap();
-    second.end("TERM");
+    second.end(Signal::TERM);
     assert_eq!(std::fs::read_to_string(&ready).unwrap(), "somebody's");
     assert_eq!(names(folder.path()), ["cell.toml", "folder", "ready.json"]);
 }
@@ -277,9 +278,8 @@ fn under(hang_up: &str, command: &Command) -> Command {
     env
 }
 
-fn send(name: &str, child: &Child) {
-    let pid = child.id().to_string();
-    assert!(Command::new("kill").args(["-s", name, &pid]).status().unwrap().success());
+fn send(signal: Signal, child: &Child) {
+    kill_process(Pid::from_child(child), signal).unwrap();
 }
 
 #[test]
@@ -301,7 +301,7 @@ fn a_line_that_another_program_uses_is_not_taken_away() {
     assert_eq!(std::fs::read_link(&line).unwrap(), leads_to);
     let (number, foreign) = terminal_called(&leads_to);
     assert!(leads_to.exists());
-    Running::start(&mut gateway(&line)).end("TERM");
+    Running::start(&mut gateway(&line)).end(Signal::TERM);
     assert_eq!(names(folder.path()), [""; 0]);
 
     // The same link made by that program is in use.
@@ -315,7 +315,7 @@ fn a_line_that_another_program_uses_is_not_taken_away() {
     drop((number, foreign));
     std::fs::remove_file(&line).unwrap();
     std::os::unix::fs::symlink("/dev/pts/4000000", &line).unwrap();
-    Running::start(&mut gateway(&line)).end("TERM");
+    Running::start(&mut gateway(&line)).end(Signal::TERM);
     assert_eq!(names(folder.path()), [""; 0]);
 }
 
@@ -350,34 +350,34 @@ fn a_terminal_that_is_closed_ends_a_run_cleanly_unless_it_is_to_outlive_it() {
     robot.arg(format!("--bind=rs485=pty:{}", line.display()));
     for mut command in [gateway(&line), robot] {
         command.args(["--stats", "20ms", "--ready"]).arg(&ready);
-        Running::start(&mut under("default", &command)).end("HUP");
+        Running::start(&mut under("default", &command)).end(Signal::HUP);
         assert_eq!(names(folder.path()), [""; 0], "{command:?}");
         let mut under_nohup = Running::start(&mut under("ignore", &command));
-        send("HUP", &under_nohup.child);
+        send(Signal::HUP, &under_nohup.child);
         while under_nohup.lines.try_recv().is_ok() {}
         // More than it could say while it ended.
         (0..20).for_each(|_| drop(under_nohup.line()));
         assert!(line.exists() && ready.exists(), "{command:?}");
-        under_nohup.end("TERM");
+        under_nohup.end(Signal::TERM);
         assert_eq!(names(folder.path()), [""; 0], "{command:?}");
     }
 }
 
 #[test]
 fn a_demo_that_is_interrupted_leaves_nothing_behind() {
-    for (name, code) in [("HUP", 129), ("INT", 130), ("TERM", 143)] {
+    for (signal, code) in [(Signal::HUP, 129), (Signal::INT, 130), (Signal::TERM, 143)] {
         let folder = tempfile::tempdir().unwrap();
         let deadline = Instant::now() + PATIENCE;
         // It may be over before anybody looks; then another one is.
-        while interrupted_demo(folder.path(), name) != Some(code) {
-            assert!(Instant::now() < deadline, "{name}");
+        while interrupted_demo(folder.path(), signal) != Some(code) {
+            assert!(Instant::now() < deadline, "{signal:?}");
         }
-        assert_eq!(names(folder.path()), [""; 0], "{name}");
+        assert_eq!(names(folder.path()), [""; 0], "{signal:?}");
     }
 }
 
 /// Sends a demo the signal as soon as its first device is there; how it ended.
-fn interrupted_demo(folder: &Path, name: &str) -> Option<i32> {
+fn interrupted_demo(folder: &Path, signal: Signal) -> Option<i32> {
     let mut command = host_sim();
     command.arg("demo");
     let mut demo = under("default", &command).env("TMPDIR", folder).spawn().unwrap();
@@ -391,9 +391,9 @@ fn interrupted_demo(folder: &Path, name: &str) -> Option<i32> {
         }
         std::thread::sleep(Duration::from_millis(1));
     }
-    send(name, &demo);
+    send(signal, &demo);
     let code = demo.wait().unwrap().code();
-    assert!(code.is_some_and(|code| code == 0 || code > 128), "{name}: {code:?}");
+    assert!(code.is_some_and(|code| code == 0 || code > 128), "{signal:?}: {code:?}");
     code
 }
 
@@ -404,7 +404,7 @@ fn what_runs_long_and_leaves_nothing_ends_when_it_is_interrupted() {
     let soak = under("default", &command).spawn().unwrap();
     // Before it listens for the signal, the signal ends it without a word.
     until(|| has_signal(&soak, "SigCgt:", 2));
-    send("INT", &soak);
+    send(Signal::INT, &soak);
     let output = soak.wait_with_output().unwrap();
     let (out, err) = text(&output);
     assert_eq!(output.status.code(), Some(0), "{err}");
@@ -415,7 +415,7 @@ fn what_runs_long_and_leaves_nothing_ends_when_it_is_interrupted() {
     let mut decode = under("default", &command).stdin(Stdio::piped()).spawn().unwrap();
     // What started the tests may ignore it, and so does a child until its disposition is set.
     until(|| !has_signal(&decode, "SigIgn:", 2));
-    send("INT", &decode);
+    send(Signal::INT, &decode);
     assert_eq!(decode.wait().unwrap().signal(), Some(2));
 }
 
@@ -469,7 +469,7 @@ fn what_a_device_said_while_the_gateway_was_stopped_never_reaches_the_controller
         say(2);
     }
     std::thread::sleep(STOPPED);
-    gateway.signal("CONT");
+    gateway.signal(Signal::CONT);
     let woken = gateway.stats(|stats| stats["sleeps"] == 1);
     assert_eq!(woken["ports"]["rs485-1"]["frames_in"], 1, "{woken}");
     assert_ne!(woken["ports"]["rs485-1"]["asleep"], 0, "{woken}");
@@ -479,8 +479,8 @@ fn what_a_device_said_while_the_gateway_was_stopped_never_reaches_the_controller
         assert_ne!(output(stats), Some(2.0));
         output(stats) == Some(4.0)
     });
-    gateway.end("TERM");
-    robot.end("TERM");
+    gateway.end(Signal::TERM);
+    robot.end(Signal::TERM);
 }
 
 /// Longer than a gateway may be away without having slept.

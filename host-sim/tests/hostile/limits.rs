@@ -6,6 +6,8 @@ use std::net::TcpStream;
 use std::process::Stdio;
 use std::time::Duration;
 
+use rustix::process::Signal;
+
 use crate::process::{Process, host_sim};
 use crate::witness::{Witnesses, connect};
 use crate::{MOST_GROWTH_KIB, alone, attack, in_some_stretch, within_bounds};
@@ -41,7 +43,7 @@ fn out_of_descriptors_those_that_are_in_go_on_and_others_come_when_there_is_room
     process.stats_when(|stats| stats["modbus"]["open"] == 0);
     assert!(answers(&process).is_some());
     drop(witnesses);
-    process.signal("TERM");
+    process.signal(Signal::TERM);
     assert!(process.ended().success());
     let said = process.said();
     assert!(said.contains("could not be taken"), "{said}");
@@ -79,6 +81,6 @@ fn a_reader_that_does_not_read_keeps_nothing_from_going_on() {
         if flat { Ok(()) } else { Err(format!("{before:?} grew to {after:?}")) }
     });
     drop(witnesses);
-    process.signal("INT");
+    process.signal(Signal::INT);
     assert!(process.ended().success());
 }

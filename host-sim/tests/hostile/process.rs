@@ -8,6 +8,7 @@ use std::process::{Child, Command, Stdio};
 use std::sync::mpsc::{Receiver, TryRecvError, channel};
 use std::time::{Duration, Instant};
 
+use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
 /// How long anything that must happen may take.
@@ -129,15 +130,14 @@ impl Process {
         Usage { rss_kib: number("VmRSS:"), descriptors, threads: number("Threads:") }
     }
 
-    pub(crate) fn signal(&self, name: &str) {
-        let pid = self.child.id().to_string();
-        assert!(Command::new("kill").args(["-s", name, &pid]).status().unwrap().success());
+    pub(crate) fn signal(&self, signal: Signal) {
+        kill_process(Pid::from_child(&self.child), signal).unwrap();
     }
 
     /// Ends it as a person would, in bounded time.
     #[track_caller]
     pub(crate) fn end(mut self) {
-        self.signal("TERM");
+        self.signal(Signal::TERM);
         let status = self.ended();
         assert_eq!((status.code(), status.signal()), (Some(0), None));
     }
