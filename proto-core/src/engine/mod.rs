@@ -1,5 +1,5 @@
 //! The gateway: one run loop over field ports and controller links, sans-IO
-//! (docs/architecture.md sections 3 to 7).
+//! (docs/engine.md).
 //!
 //! One rule: change the engine once with [`Engine::handle`], then drain [`Engine::poll_output`]
 //! until it returns [`Output::Sleep`]. Polling early is harmless. The engine never reads a clock,

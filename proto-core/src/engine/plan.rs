@@ -1,4 +1,4 @@
-//! Which way each variable goes (docs/architecture.md section 6).
+//! Which way each variable goes (docs/engine.md section 4).
 //!
 //! In: a configuration. Out: for every input variable its owner and its way up, for every variable
 //! that a port shows its source. Decided once; nothing of it changes while the engine runs.

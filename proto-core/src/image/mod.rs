@@ -1,5 +1,5 @@
 //! The process image: the value, source and age of every system variable
-//! (docs/architecture.md section 4).
+//! (docs/engine.md section 3).
 //!
 //! Values are packed little-endian in one byte array, in the order of the variable table, so that
 //! neighbouring fields of a recipe are one copy. A variable's age is that of its [`GroupId`]: the

@@ -1,4 +1,4 @@
-//! Safe values: written again until they are known to be there (docs/architecture.md section 7).
+//! Safe values: written again until they are known to be there (docs/engine.md section 6).
 
 use proto_core::engine::LinkId;
 use proto_core::sysvar::SysVar;

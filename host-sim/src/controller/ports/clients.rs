@@ -1,4 +1,4 @@
-//! Who gets the UDP server's frames (docs/architecture.md section 10, D24, D30).
+//! Who gets the UDP server's frames (docs/simulated-controller.md section 5, D24, D30).
 
 use std::cmp::Reverse;
 use std::net::SocketAddr;
