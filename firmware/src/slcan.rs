@@ -1,5 +1,5 @@
 //! A CAN port on a serial line: the board is the adapter, and the one slcan client at the other end is
-//! the bus (docs/wire/slcan.md).
+//! the bus (proto-core/docs/wire/slcan.md).
 
 use embedded_io_async::{Read, Write};
 use heapless::Vec;

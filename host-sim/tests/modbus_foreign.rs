@@ -1,5 +1,5 @@
 //! The simulated controller's Modbus server with a client that we did not write, over real TCP:
-//! every function, both ends of every block of the map, every exception (docs/wire/modbus.md
+//! every function, both ends of every block of the map, every exception (proto-core/docs/wire/modbus.md
 //! sections 3 to 8).
 
 use std::net::SocketAddr;

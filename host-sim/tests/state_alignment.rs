@@ -1,5 +1,5 @@
 //! How many wrong alignments of the simulated controller's state stream are taken for right ones:
-//! the table of docs/wire/state.md section 3.
+//! the table of proto-core/docs/wire/state.md section 3.
 
 use std::net::Ipv4Addr;
 
@@ -147,8 +147,9 @@ fn no_wrong_alignment_of_a_resting_robots_stream_stays_unseen() {
         }
     }
     let page =
-        std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/wire/state.md")).unwrap();
-    assert!(page.contains(&written), "docs/wire/state.md has another table than\n{written}");
+        std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/../proto-core/docs/wire/state.md"))
+            .unwrap();
+    assert!(page.contains(&written), "proto-core/docs/wire/state.md has another table than\n{written}");
 }
 
 #[test]

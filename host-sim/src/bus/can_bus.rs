@@ -1,4 +1,4 @@
-//! A CAN bus in user space (docs/wire/slcan.md section 4): a port of ours and any number of slcan clients.
+//! A CAN bus in user space (proto-core/docs/wire/slcan.md section 4): a port of ours and any number of slcan clients.
 
 use std::cell::{Cell, RefCell};
 use std::collections::VecDeque;

@@ -1,4 +1,4 @@
-//! A CAN bus as a wire (docs/wire/slcan.md section 4): frames of its nodes and the time go in, frames
+//! A CAN bus as a wire (proto-core/docs/wire/slcan.md section 4): frames of its nodes and the time go in, frames
 //! that have crossed it come out, one after the other in the order of arbitration.
 //!
 //! No clock and no I/O here, and no bit errors: every frame is received well by all.

@@ -140,7 +140,7 @@ impl Controller {
     /// such as NaN. Modbus and programs go on seeing the value.
     ///
     /// An item is a system variable such as `RobotState[8]`, an analog input such as `AI_V[1]`, or any
-    /// other float of the state packet, such as `joint_torque[1]` (docs/wire/state.md section 2).
+    /// other float of the state packet, such as `joint_torque[1]` (proto-core/docs/wire/state.md section 2).
     ///
     /// # Errors
     /// [`NoSuchFloat`]; nothing changed.
@@ -285,7 +285,7 @@ impl Controller {
         self.apply(now, effect);
     }
 
-    /// The arm has hit something on this axis (see docs/wire/state.md section 2).
+    /// The arm has hit something on this axis (see proto-core/docs/wire/state.md section 2).
     pub fn collide(&mut self, now: Instant, axis: u8) {
         let effect = self.machine.collide(now, axis);
         self.apply(now, effect);

@@ -121,7 +121,7 @@ impl Line {
     }
 }
 
-/// A node on a CAN bus, by slcan (docs/wire/slcan.md).
+/// A node on a CAN bus, by slcan (proto-core/docs/wire/slcan.md).
 pub(crate) struct CanClient(Line);
 
 impl CanClient {

@@ -34,7 +34,7 @@ impl Environment for Qemu {
 
     /// The guest's timers stand still while the machine is stopped, as those of a processor that a debugger
     /// halts together with them: no time has passed, and nothing that a program could look at says so
-    /// (docs/engine.md section 2).
+    /// (proto-core/docs/engine.md section 2).
     fn sleeps_noticeably(&self) -> bool {
         false
     }

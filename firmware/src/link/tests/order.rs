@@ -7,7 +7,7 @@ use embassy_sync::signal::Signal;
 use super::*;
 use crate::test_executor::{Executor, Order};
 
-/// How long a controller's client may be silent (docs/engine.md section 9).
+/// How long a controller's client may be silent (proto-core/docs/engine.md section 9).
 const SILENCE: Duration = Duration::from_secs(2);
 
 /// The gateway's processor and the controller's.

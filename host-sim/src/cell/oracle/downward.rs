@@ -1,4 +1,4 @@
-//! What each field port has to send, and when (docs/engine.md section 8).
+//! What each field port has to send, and when (proto-core/docs/engine.md section 8).
 
 use proto_core::config::{FieldSpec, OutputBinding, SendOn};
 use proto_core::sysvar::SysVar;

@@ -1,5 +1,5 @@
 //! What the wire delivered to one field port, byte for byte: which of it are frames, and what they
-//! say. The slow way, straight from docs/wire/recipes.md sections 4, 6 and 7.
+//! say. The slow way, straight from proto-core/docs/wire/recipes.md sections 4, 6 and 7.
 
 use proto_core::config::{CommandWhen, FieldSpec, InputBinding, Span};
 use proto_core::recipe::CanFrame;

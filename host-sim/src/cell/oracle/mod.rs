@@ -3,7 +3,7 @@
 //!
 //! In: everything that goes into the engine and comes out of it, and what reaches the controller.
 //! Out: how often each [`Invariant`] was looked at, and the first [`Violation`]. The model is slow
-//! and plain: it cuts frames by the rules of docs/wire/recipes.md, keeps a queue a variable, and
+//! and plain: it cuts frames by the rules of proto-core/docs/wire/recipes.md, keeps a queue a variable, and
 //! uses neither the engine's recipes nor its plan. Garbage that happens to be a frame is a frame:
 //! what counts is what the wire delivered to the port.
 //!

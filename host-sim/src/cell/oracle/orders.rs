@@ -1,5 +1,5 @@
 //! Commands that field values pick: once or not at all, and what stops the robot before everything
-//! else (docs/engine.md section 7).
+//! else (proto-core/docs/engine.md section 7).
 
 use std::collections::{BTreeMap, VecDeque};
 

@@ -1,4 +1,4 @@
-//! Safe values: written again until they are known to be there (docs/engine.md section 6).
+//! Safe values: written again until they are known to be there (proto-core/docs/engine.md section 6).
 
 use proto_core::engine::LinkId;
 use proto_core::sysvar::SysVar;

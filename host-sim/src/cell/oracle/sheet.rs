@@ -1,5 +1,5 @@
 //! What the configuration promises, worked out once the slow way: who owns a variable, how it
-//! travels, where it comes from (docs/engine.md section 4).
+//! travels, where it comes from (proto-core/docs/engine.md section 4).
 //!
 //! Written from that page, without the engine's own plan.
 

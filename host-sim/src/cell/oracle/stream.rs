@@ -1,4 +1,4 @@
-//! The state stream: what of it is a packet (docs/wire/state.md section 3, D8), read slowly from
+//! The state stream: what of it is a packet (proto-core/docs/wire/state.md section 3, D8), read slowly from
 //! the fields themselves.
 
 use proto_core::wire::state::StatePacket;

@@ -1,5 +1,5 @@
 //! What is still to be written to the controller, and what each write has to be
-//! (docs/engine.md section 5).
+//! (proto-core/docs/engine.md section 5).
 
 use std::collections::VecDeque;
 

@@ -1,4 +1,4 @@
-//! What travels between the gateway and the controller: Modbus by hand (docs/wire/modbus.md), and
+//! What travels between the gateway and the controller: Modbus by hand (proto-core/docs/wire/modbus.md), and
 //! whether what arrived is what was sent.
 
 use std::collections::{BTreeMap, VecDeque};
@@ -274,7 +274,7 @@ pub(in crate::cell) fn inputs_of(image: &[u8]) -> Vec<u8> {
     image[..INPUT_BYTES].to_vec()
 }
 
-/// Inputs come first in the image (docs/wire/sysvars.md section 1).
+/// Inputs come first in the image (proto-core/docs/wire/sysvars.md section 1).
 const INPUT_BYTES: usize = 253;
 
 const _: () = assert!(COUNT < 512);

@@ -1,5 +1,5 @@
 //! The controller's states: power and enable, program, safety, mode
-//! (docs/simulated-controller.md section 1; the codes are in docs/wire/state.md section 4).
+//! (docs/simulated-controller.md section 1; the codes are in proto-core/docs/wire/state.md section 4).
 //!
 //! In: commands, faults, the time, and when the arm has come to rest. Out: what is allowed, what
 //! must happen with the arm and the program, and the states as everybody sees them. Knows neither

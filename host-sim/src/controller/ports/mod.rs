@@ -1,4 +1,4 @@
-//! The controller's recipe ports (docs/simulated-controller.md section 5, docs/wire/recipes.md).
+//! The controller's recipe ports (docs/simulated-controller.md section 5, proto-core/docs/wire/recipes.md).
 //!
 //! In: received bytes, datagrams and CAN frames, the time, and what a program sends. Out: input
 //! variables written, output frames on a fixed grid, frames for the program. Knows neither devices

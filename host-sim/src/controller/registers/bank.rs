@@ -1,4 +1,4 @@
-//! The registers as Modbus shows them (docs/wire/modbus.md sections 7 and 8, D10-D12).
+//! The registers as Modbus shows them (proto-core/docs/wire/modbus.md sections 7 and 8, D10-D12).
 //!
 //! Which coil or word is which variable comes from the table of system variables; only what is no
 //! system variable is listed here.

@@ -33,7 +33,7 @@ pub struct Status {
     pub program: u8,
     /// Safety state.
     pub safety: u8,
-    /// The collision axis while a collision is reported, see docs/wire/state.md section 2.
+    /// The collision axis while a collision is reported, see proto-core/docs/wire/state.md section 2.
     pub collision_axis: Option<u8>,
     /// The newest error's code, 0 when there is none.
     pub error: u32,

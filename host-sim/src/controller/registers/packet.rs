@@ -1,4 +1,4 @@
-//! The registers as the 2001 stream shows them (docs/wire/state.md section 2).
+//! The registers as the 2001 stream shows them (proto-core/docs/wire/state.md section 2).
 
 use proto_core::modbus::map::unscaled;
 use proto_core::sysvar::SysVar;

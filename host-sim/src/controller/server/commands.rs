@@ -1,5 +1,5 @@
 //! Port 2000: commands are carried out one after the other, and answered when they are done
-//! (docs/wire/command.md section 8, D25).
+//! (proto-core/docs/wire/command.md section 8, D25).
 //!
 //! A command that begins a transition is answered at its end. What else comes on the connection
 //! meanwhile waits for that; other connections are served.

@@ -1,5 +1,5 @@
 //! The specification's six worked examples against the controller's own ports, byte for byte
-//! (docs/wire/recipes.md section 8).
+//! (proto-core/docs/wire/recipes.md section 8).
 
 use super::*;
 use ScalarType::Byte;

@@ -1,4 +1,4 @@
-//! The Modbus map (docs/wire/modbus.md, D10-D12), and that its items are those of the other views.
+//! The Modbus map (proto-core/docs/wire/modbus.md, D10-D12), and that its items are those of the other views.
 
 use proto_core::modbus::map::{Access, COILS, HOLDING, MAP, Space};
 
