@@ -20,8 +20,9 @@ use heapless::String;
 use proto_core::config::{Bus, GatewayConfig, listen_address};
 use proto_core::engine::{Input, LinkId, LinkKind};
 
-use crate::gateway::{Gateway, LinkControl};
-use crate::watchdog::Pulse;
+use super::control::LinkControl;
+use super::gateway::Gateway;
+use super::watchdog::Pulse;
 
 /// What a link connects to.
 #[derive(Debug, Clone)]

@@ -2,7 +2,7 @@
 
 use embassy_time::{Duration, Timer};
 
-use crate::watchdog::Pulse;
+use super::watchdog::Pulse;
 
 /// What the LED shows. It is lit, without a break, from the start until a task shows something.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -7,7 +7,7 @@ use proto_core::config::{CommandEntry, CommandWhen, InputBinding};
 use proto_core::wire::scalar::ScalarType;
 
 use super::*;
-use crate::led::Condition;
+use crate::tasks::led::Condition;
 
 /// Of a connection for frames.
 const TX: usize = Buffers::SIZE - RX_FRAMES - CHUNK_FRAMES;

@@ -21,7 +21,7 @@ use proto_core::engine::BusState;
 use proto_core::recipe::can::CanFrame;
 use proto_core::recipe::model::{CanId, MAX_CAN_DATA, MAX_CAN_IDS};
 
-use crate::can::{BusOff, CanCounters, CanEvent, CanPort};
+use super::can_port::{BusOff, CanCounters, CanEvent, CanPort};
 
 use registers::*;
 

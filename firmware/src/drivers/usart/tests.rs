@@ -17,7 +17,7 @@ use chip::models::usart::{Pins, Usart as Chip};
 use proto_core::time::Duration as CoreDuration;
 
 use super::*;
-use crate::test_chip::Device;
+use crate::drivers::test_chip::Device;
 
 const CLOCK: u32 = 100_000_000;
 

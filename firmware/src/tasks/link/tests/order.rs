@@ -5,7 +5,7 @@ use embassy_sync::blocking_mutex::raw::NoopRawMutex;
 use embassy_sync::signal::Signal;
 
 use super::*;
-use crate::test_executor::{Executor, Order};
+use crate::tasks::test_executor::{Executor, Order};
 
 /// How long a controller's client may be silent (docs/architecture.md section 9).
 const SILENCE: Duration = Duration::from_secs(2);

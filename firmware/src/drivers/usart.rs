@@ -21,7 +21,7 @@ use embedded_io_async::{ErrorType, Read, Write};
 use heapless::Deque;
 use proto_core::config::{Parity, Rs485};
 
-use crate::serial::{Line, LineErrors};
+use super::line::{Line, LineErrors};
 
 /// The registers of one USART, 32 bits each.
 pub trait Registers {

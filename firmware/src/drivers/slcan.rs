@@ -7,8 +7,8 @@ use proto_core::recipe::can::CanFrame;
 use proto_core::recipe::model::CanId;
 use proto_core::wire::slcan::{Channel, MAX_LINE};
 
-use crate::can::{BusOff, CanEvent, CanPort};
-use crate::gateway::now;
+use super::can_port::{BusOff, CanEvent, CanPort};
+use crate::clock::now;
 
 /// Answers and frames that wait for the line.
 const MAX_WAITING: usize = 512;

@@ -9,7 +9,7 @@ use std::collections::VecDeque;
 use std::rc::Rc;
 use std::vec::Vec;
 
-use embedded_io_async::ErrorType;
+use embedded_io_async::{ErrorType, Read, Write};
 use proto_core::config::{
     Bus, Delimiter, FieldSpec, GatewayConfig, InputBinding, Name, OnStale, OutputBinding, Parity, Parts,
     Port, Recipe, Rs485, SendOn, Span, StreamPart,
@@ -20,9 +20,9 @@ use proto_core::time::Duration as CoreDuration;
 use proto_core::wire::scalar::ScalarType;
 
 use super::*;
-use crate::test_clock::{Clock, advance};
-use crate::test_executor::{Executor, Order};
-use crate::watchdog::{TaskName, Watch};
+use crate::tasks::test_clock::{Clock, advance};
+use crate::tasks::test_executor::{Executor, Order};
+use crate::tasks::watchdog::{TaskName, Watch};
 
 const FRAME: [u8; 5] = [0xFF, 0xFF, 0x01, 0xEE, 0xEE];
 const PORT: PortId = PortId(0);

@@ -5,8 +5,8 @@ use core::pin::pin;
 use embassy_time::{Duration, Timer};
 use proto_core::link::LinkState;
 
-use crate::gateway::{Gateway, MAX_FIELD_PORTS, MAX_LINKS};
-use crate::watchdog::Pulse;
+use super::gateway::{Gateway, MAX_FIELD_PORTS, MAX_LINKS};
+use super::watchdog::Pulse;
 use crate::{info, warn};
 
 /// Says it when it is another than before, for ever.

@@ -7,7 +7,7 @@ use core::task::Context;
 
 use embassy_net_driver::{Capabilities, Driver, HardwareAddress, LinkState};
 
-use crate::gateway::Gateway;
+use super::gateway::Gateway;
 
 /// The controller, and how many frames may still be taken in this turn.
 pub struct Fair<'a, D> {
@@ -77,7 +77,7 @@ mod tests {
     use embassy_net_driver::{RxToken, TxToken};
 
     use super::*;
-    use crate::test_clock::Clock;
+    use crate::tasks::test_clock::Clock;
 
     /// There is always another frame, and none is for us.
     struct Endless<'a>(&'a Cell<u32>);

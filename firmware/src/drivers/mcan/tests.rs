@@ -14,7 +14,7 @@ use chip::models::can_bus::{Frame as Wire, Trouble};
 use chip::models::fdcan::Fdcan;
 
 use super::*;
-use crate::test_chip::Device;
+use crate::drivers::test_chip::Device;
 
 const CLOCK: u32 = 80_000_000;
 const BIT: Picos = 2 * MICRO;

@@ -29,8 +29,8 @@ use proto_core::sysvar::SysVar;
 use proto_core::time::Duration as CoreDuration;
 
 use super::*;
-use crate::test_clock::{Clock, advance};
-use crate::watchdog::{TaskName, Watch};
+use crate::tasks::test_clock::{Clock, advance};
+use crate::tasks::watchdog::{TaskName, Watch};
 
 const GATEWAY: u8 = 1;
 const CONTROLLER: u8 = 2;

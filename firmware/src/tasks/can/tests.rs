@@ -21,8 +21,8 @@ use proto_core::recipe::model::Mode;
 use proto_core::wire::scalar::ScalarType;
 
 use super::*;
-use crate::test_clock::{Clock, advance};
-use crate::watchdog::{TaskName, Watch};
+use crate::tasks::test_clock::{Clock, advance};
+use crate::tasks::watchdog::{TaskName, Watch};
 
 const PORT: PortId = PortId(0);
 const BITRATE: u32 = 500_000;
