@@ -1,6 +1,6 @@
 //! Acceptance filtering of FDCAN1. RM0433, "Acceptance filtering" and the elements of the filter lists.
 
-use super::can_bus::Frame;
+use crate::models::can_bus::Frame;
 
 /// The registers that say where the lists are, and what becomes of frames that are in none.
 #[derive(Debug, Clone, Copy)]
