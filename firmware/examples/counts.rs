@@ -11,7 +11,7 @@ mod bare;
 
 use core::hint::black_box;
 
-use firmware::gateway::Engine;
+use firmware::tasks::gateway::Engine;
 use proto_core::config::image::{self, MAX_IMAGE};
 use proto_core::config::{GatewayConfig, Port};
 use proto_core::engine::{Input, LinkId, OUTPUT_BUFFER, Output, PortId};

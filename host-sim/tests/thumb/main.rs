@@ -25,7 +25,7 @@ use proto_core::config::GatewayConfig;
 use proto_core::engine::{Engine, Input, LinkId, Output};
 use proto_core::record::{Entry, MAGIC, replay};
 
-/// The engine of a board (firmware/src/gateway.rs); the cell's own is larger.
+/// The engine of a board (firmware/src/tasks/gateway.rs); the cell's own is larger.
 type BoardEngine = Engine<4, 2, 128>;
 
 const HOW: &str = "cargo firmware-examples, then HOST_SIM_REPLAY=target/thumbv7em-none-eabihf/firmware/\
