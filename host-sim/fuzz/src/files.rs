@@ -1,14 +1,12 @@
 //! A file, damaged or not, and `--set` overrides: one line says what is wrong, or the configuration
 //! is one that an engine and a board can take (docs/configuration.md).
 
-use host_sim::config::SimConfig;
-use host_sim::config::file::{
-    Config, FileError, Text, parse, parse_controller, parse_gateway, parse_recipes,
-};
 use proto_core::config::GatewayConfig;
 use proto_core::config::image::{MAX_IMAGE, decode, encode};
 use proto_core::engine::{BuildError, Engine};
 use proto_core_fuzz::source::Source;
+use recipe_config::SimConfig;
+use recipe_config::file::{Config, FileError, Text, parse, parse_controller, parse_gateway, parse_recipes};
 use toml::{Table, Value};
 
 const NAME: &str = "fuzz.toml";

@@ -251,7 +251,7 @@ impl<'a> Plan<'a> {
     /// The configuration, with the scenario's own overrides.
     #[track_caller]
     pub(crate) fn config(&self) -> Box<GatewayConfig> {
-        let config = host_sim::config::file::load_gateway(&self.file, &self.sets);
+        let config = recipe_config::file::load_gateway(&self.file, &self.sets);
         config.unwrap_or_else(|error| panic!("{error}"))
     }
 
