@@ -1,18 +1,16 @@
 //! The cell itself: its clock, its networks, its lines.
 
-use std::path::Path;
-
 use proto_core::engine::LinkId;
 use proto_core::recipe::model::CanId;
 use proto_core::time::Duration;
 
 use super::*;
 use recipe_config::file;
+use recipe_test_kit::example;
 
 pub(super) fn cell(name: &str, seed: u64) -> Cell {
-    let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs");
-    let gateway = file::load_gateway(&configs.join(format!("{name}.toml")), &[]).unwrap();
-    let controller = file::load_controller(&configs.join(format!("{name}-controller.toml")), &[]).unwrap();
+    let gateway = file::load_gateway(&example(&format!("{name}.toml")), &[]).unwrap();
+    let controller = file::load_controller(&example(&format!("{name}-controller.toml")), &[]).unwrap();
     Cell::new(&gateway, &controller, seed).unwrap()
 }
 

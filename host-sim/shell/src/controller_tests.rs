@@ -3,7 +3,6 @@
 use std::io::{Read, Write};
 use std::net::{TcpListener as StdListener, TcpStream as StdStream, UdpSocket as StdUdp};
 use std::os::unix::fs::OpenOptionsExt;
-use std::path::Path;
 use std::time::{Duration as StdDuration, Instant as StdInstant};
 
 use proto_core::wire::state;
@@ -14,15 +13,13 @@ use tokio::task::LocalSet;
 use super::*;
 use recipe_config::file::load_controller;
 use recipe_controller::{MAX_COMMAND_CONNECTIONS, MAX_STATE_CONNECTIONS};
-
-const PATIENCE: StdDuration = StdDuration::from_secs(20);
+use recipe_test_kit::{PATIENCE, SERVERS};
 
 /// An example file, on free ports.
 fn example(name: &str, overrides: &[&str]) -> SimConfig {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs").join(name);
-    let free = ["command", "state", "modbus", "udp2011"].map(|port| format!("listen.{port}=0"));
+    let free = SERVERS.map(|server| format!("listen.{server}=0"));
     let all: Vec<String> = free.into_iter().chain(overrides.iter().map(|text| (*text).to_owned())).collect();
-    load_controller(&path, &all).unwrap()
+    load_controller(&recipe_test_kit::example(name), &all).unwrap()
 }
 
 fn bind(text: &str) -> Vec<Bind> {

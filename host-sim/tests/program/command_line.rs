@@ -1,21 +1,14 @@
 //! The binary as a person or a script meets it: texts, exit codes, pipes.
 
 use std::io::Write;
-use std::path::PathBuf;
-use std::process::{Command, Output, Stdio};
+use std::process::{Output, Stdio};
 
-fn config(name: &str) -> PathBuf {
-    PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("configs").join(name)
-}
+use recipe_test_kit::example;
+
+use super::BINARY;
 
 fn host_sim(args: &[&str], stdin: &str) -> Output {
-    let mut child = Command::new(env!("CARGO_BIN_EXE_host-sim"))
-        .args(args)
-        .stdin(Stdio::piped())
-        .stdout(Stdio::piped())
-        .stderr(Stdio::piped())
-        .spawn()
-        .unwrap();
+    let mut child = BINARY.command().args(args).stdin(Stdio::piped()).spawn().unwrap();
     // Refused arguments leave nobody to read this; that is the test's business, not a failure here.
     let _ = child.stdin.take().unwrap().write_all(stdin.as_bytes());
     child.wait_with_output().unwrap()
@@ -39,7 +32,7 @@ fn refused(args: &[&str]) -> String {
 }
 
 fn path(name: &str) -> String {
-    config(name).to_str().unwrap().to_owned()
+    example(name).to_str().unwrap().to_owned()
 }
 
 /// What `check` prints below the file's name.
@@ -142,7 +135,7 @@ fn an_image_replaces_nothing_but_images() {
         names
     };
     let (file, image) = (at("cell.toml"), at("cell.img"));
-    std::fs::copy(config("rs485-system.toml"), &file).unwrap();
+    std::fs::copy(example("rs485-system.toml"), &file).unwrap();
     let toml = std::fs::read(&file).unwrap();
 
     // What it is made of is never lost, by whatever name and whatever is said.

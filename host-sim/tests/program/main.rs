@@ -4,3 +4,7 @@ mod command_line;
 mod output;
 mod processes;
 mod soak;
+
+use recipe_test_kit::Binary;
+
+const BINARY: Binary = Binary(env!("CARGO_BIN_EXE_host-sim"));

@@ -5,20 +5,20 @@ use std::io::{BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::mpsc::channel;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use clap::CommandFactory;
 use host_sim::cli::Cli;
+use recipe_test_kit::{ended, example, free_servers};
+
+use super::BINARY;
 
 /// One command line of each command, everything it makes in `folder`.
 fn command_lines(folder: &Path) -> Vec<Vec<String>> {
-    let config = |name: &str| {
-        let configs = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("configs");
-        configs.join(name).to_str().unwrap().to_owned()
-    };
+    let config = |name: &str| example(name).to_str().unwrap().to_owned();
     let at = |name: &str| folder.join(name).to_str().unwrap().to_owned();
     let (gateway, robot) = (config("rs485-system.toml"), config("rs485-system-controller.toml"));
-    let servers = ["command", "state", "modbus", "udp2011"].map(|server| format!("--set=listen.{server}=0"));
+    let servers = free_servers();
     let run = [format!("--ready={}", at("ready.json")), "--stats=20ms".into()];
     let line = |words: &[&str]| words.iter().map(|&word| word.to_owned()).collect::<Vec<_>>();
     let soak = ["soak", "--cell", "rs485-system"];
@@ -64,7 +64,7 @@ enum To {
 /// The exit code, and what it said on stderr.
 #[track_caller]
 fn outcome(line: &[String], to: To, folder: &Path) -> (Option<i32>, String) {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_host-sim"));
+    let mut command = Command::new(BINARY.0);
     command.args(line).env("TMPDIR", folder).stdin(Stdio::null()).stderr(Stdio::piped());
     let reader = match to {
         To::FullDisk => {
@@ -85,17 +85,7 @@ fn outcome(line: &[String], to: To, folder: &Path) -> (Option<i32>, String) {
         BufReader::new(reader).read_line(&mut first).unwrap();
         assert!(!first.is_empty(), "{line:?} says something");
     }
-    let deadline = Instant::now() + PATIENCE;
-    let status = loop {
-        if let Some(status) = child.try_wait().unwrap() {
-            break status;
-        }
-        if Instant::now() > deadline {
-            child.kill().unwrap();
-            panic!("{line:?} does not end");
-        }
-        std::thread::sleep(Duration::from_millis(1));
-    };
+    let status = ended(&mut child, PATIENCE);
     let mut said = String::new();
     child.stderr.take().unwrap().read_to_string(&mut said).unwrap();
     (status.code(), said)
@@ -153,7 +143,7 @@ fn nobody_need_read_stderr_either() {
     let wrong = vec![vec!["check".to_owned(), "no-such-file.toml".to_owned()], vec!["nonsense".to_owned()]];
     for (lines, expected) in [(command_lines(folder.path()), 1), (wrong, 2)] {
         for line in lines {
-            let mut command = Command::new(env!("CARGO_BIN_EXE_host-sim"));
+            let mut command = Command::new(BINARY.0);
             command.args(&line).env("TMPDIR", folder.path()).stdin(Stdio::null());
             let status = command.stdout(full()).stderr(full()).status().unwrap();
             assert_eq!(status.code(), Some(expected), "{line:?}");
@@ -169,7 +159,7 @@ fn a_disk_that_fills_up_later_costs_statistics_and_does_not_end_a_gateway() {
     // Files of a few kilobytes: room for the ready line and not for many others.
     let limited = ["--ignore-signal=XFSZ", "sh", "-c", "ulimit -f 8; exec \"$0\" \"$@\""];
     let mut command = Command::new("env");
-    command.args(limited).arg(env!("CARGO_BIN_EXE_host-sim")).args(gateway).stdin(Stdio::null());
+    command.args(limited).arg(BINARY.0).args(gateway).stdin(Stdio::null());
     let log = folder.path().join("log");
     let mut child = command.stdout(File::create(&log).unwrap()).stderr(Stdio::piped()).spawn().unwrap();
     let stderr = BufReader::new(child.stderr.take().unwrap());

@@ -1,113 +1,18 @@
 //! The program as a person or a script runs it: real processes, real signals.
 
-use std::io::{BufRead, BufReader, Read};
 use std::os::fd::OwnedFd;
 use std::os::unix::ffi::OsStrExt;
 use std::os::unix::process::ExitStatusExt;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
+use recipe_test_kit::{HostSim, PATIENCE, SERVERS, ended, example, free_servers, names, until};
+use rustix::process::{Pid, Signal};
 use rustix::pty::OpenptFlags;
 use serde_json::Value;
 
-fn host_sim() -> Command {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_host-sim"));
-    command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
-    command
-}
-
-fn example(name: &str) -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("configs").join(name)
-}
-
-/// A running process that is killed when a test fails.
-struct Running {
-    child: Child,
-    lines: std::sync::mpsc::Receiver<String>,
-    ready: Value,
-}
-
-const PATIENCE: Duration = Duration::from_secs(20);
-
-impl Running {
-    #[track_caller]
-    fn start(command: &mut Command) -> Self {
-        let mut child = command.spawn().unwrap();
-        let out = BufReader::new(child.stdout.take().unwrap());
-        let (sender, lines) = std::sync::mpsc::channel();
-        std::thread::spawn(move || {
-            for line in out.lines() {
-                let Ok(line) = line else { return };
-                if sender.send(line).is_err() {
-                    return;
-                }
-            }
-        });
-        let mut running = Self { child, lines, ready: Value::Null };
-        let line = running.line();
-        let json = line.strip_prefix("ready ").unwrap_or_else(|| panic!("not ready: {line}"));
-        running.ready = serde_json::from_str(json).unwrap();
-        running
-    }
-
-    #[track_caller]
-    fn line(&mut self) -> String {
-        self.lines.recv_timeout(PATIENCE).unwrap_or_else(|_| {
-            let mut said = String::new();
-            let _ = self.child.kill();
-            let _ = self.child.stderr.take().unwrap().read_to_string(&mut said);
-            panic!("no line in time; stderr: {said}")
-        })
-    }
-
-    /// A line of statistics that satisfies `found`.
-    #[track_caller]
-    fn stats(&mut self, found: impl Fn(&Value) -> bool) -> Value {
-        let deadline = Instant::now() + PATIENCE;
-        loop {
-            let stats: Value = serde_json::from_str(&self.line()).unwrap();
-            if found(&stats) {
-                return stats;
-            }
-            assert!(Instant::now() < deadline, "it never became so: {stats}");
-        }
-    }
-
-    #[track_caller]
-    fn signal(&self, signal: &str) {
-        send(signal, &self.child);
-    }
-
-    /// Stops the process, and returns once none of its threads runs.
-    fn stop(&self) {
-        self.signal("STOP");
-        let tasks = format!("/proc/{}/task", self.child.id());
-        let is_stopped = |task: std::io::Result<std::fs::DirEntry>| {
-            let stat = std::fs::read_to_string(task.unwrap().path().join("stat")).unwrap();
-            stat.rsplit_once(") ").unwrap().1.starts_with('T')
-        };
-        let deadline = Instant::now() + PATIENCE;
-        while !std::fs::read_dir(&tasks).unwrap().all(is_stopped) {
-            assert!(Instant::now() < deadline, "it does not stop");
-            std::thread::yield_now();
-        }
-    }
-
-    #[track_caller]
-    fn end(mut self, signal: &str) {
-        send(signal, &self.child);
-        let status = self.child.wait().unwrap();
-        assert_eq!((status.code(), status.signal()), (Some(0), None), "{signal}");
-    }
-}
-
-impl Drop for Running {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
-}
+use super::BINARY;
 
 fn text(output: &Output) -> (String, String) {
     let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
@@ -116,12 +21,12 @@ fn text(output: &Output) -> (String, String) {
 
 #[test]
 fn without_arguments_the_demo_passes() {
-    shows_all_examples(&host_sim().output().unwrap());
+    shows_all_examples(&BINARY.command().output().unwrap());
 }
 
 #[test]
 fn demos_do_not_disturb_each_other() {
-    let demos: Vec<Child> = (0..4).map(|_| host_sim().arg("demo").spawn().unwrap()).collect();
+    let demos: Vec<Child> = (0..4).map(|_| BINARY.command().arg("demo").spawn().unwrap()).collect();
     for demo in demos {
         shows_all_examples(&demo.wait_with_output().unwrap());
     }
@@ -149,56 +54,57 @@ fn a_gateway_and_a_controller_find_each_other_and_end_cleanly() {
     let folder = tempfile::tempdir().unwrap();
     let robot_ready = folder.path().join("robot.json");
     let line = folder.path().join("rs485-1");
-    let mut robot = Running::start(
-        host_sim()
+    let robot = HostSim::start(
+        BINARY
+            .command()
             .args(["controller", "--stats", "50ms", "-c"])
             .arg(example("udp-server-controller.toml"))
-            .args(["command", "state", "modbus", "udp2011"].map(|port| format!("--set=listen.{port}=0")))
+            .args(free_servers())
             .arg("--ready")
             .arg(&robot_ready),
     );
     let file: Value = serde_json::from_str(&std::fs::read_to_string(&robot_ready).unwrap()).unwrap();
     assert_eq!(file, robot.ready, "the file says what the line says");
-    let ready = robot.ready.clone();
-    let port = |name: &str| ready[name].as_str().unwrap().rsplit_once(':').unwrap().1.to_owned();
-    let mut gateway = Running::start(
-        host_sim()
+    let gateway = HostSim::start(
+        BINARY
+            .command()
             .args(["gateway", "--stats", "50ms", "-c"])
             .arg(example("rs485-system.toml"))
-            .args(["state", "modbus"].map(|name| format!("--set=controller.ports.{name}={}", port(name))))
+            .args(robot.links(&["state", "modbus"]))
             .arg(format!("--bind=rs485-1=pty:{}", line.display())),
     );
     assert_eq!(gateway.ready["ports"]["rs485-1"], line.to_str().unwrap());
-    gateway
-        .stats(|stats| stats["links"]["modbus"]["state"] == "up" && stats["links"]["state"]["received"] != 0);
+    gateway.next_stats(|stats| {
+        stats["links"]["modbus"]["state"] == "up" && stats["links"]["state"]["received"] != 0
+    });
 
     let mut device = std::fs::File::options().read(true).write(true).open(&line).unwrap();
     std::io::Write::write_all(&mut device, &[0x12, 0xFF, 0xFF, 0x05, 0xEE, 0xEE]).unwrap();
-    let stats = gateway.stats(|stats| stats["ports"]["rs485-1"]["frames_in"] == 1);
+    let stats = gateway.next_stats(|stats| stats["ports"]["rs485-1"]["frames_in"] == 1);
     assert_eq!(stats["ports"]["rs485-1"]["resync_bytes"], 1);
-    robot.stats(|stats| stats["registers"]["DigitalOutputCommand[1]"].as_f64() == Some(5.0));
+    robot.next_stats(|stats| stats["registers"]["DigitalOutputCommand[1]"].as_f64() == Some(5.0));
 
     // The controller goes away and comes back on the same ports.
-    let ports =
-        ["command", "state", "modbus", "udp2011"].map(|name| format!("--set=listen.{name}={}", port(name)));
-    robot.end("TERM");
+    let ports = SERVERS.map(|name| format!("--set=listen.{name}={}", robot.at(name).port()));
+    robot.ended_by(Signal::TERM);
     assert!(!robot_ready.exists(), "nothing says ready that is not");
-    gateway.stats(|stats| stats["links"]["modbus"]["state"] != "up");
-    let mut robot = Running::start(
-        host_sim()
+    gateway.next_stats(|stats| stats["links"]["modbus"]["state"] != "up");
+    let robot = HostSim::start(
+        BINARY
+            .command()
             .args(["controller", "--stats", "50ms", "-c"])
             .arg(example("udp-server-controller.toml"))
             .args(ports),
     );
-    gateway.stats(|stats| {
+    gateway.next_stats(|stats| {
         stats["links"]["modbus"]["state"] == "up" && stats["links"]["modbus"]["reconnects"] != 0
     });
     std::io::Write::write_all(&mut device, &[0xFF, 0xFF, 0x80, 0xEE, 0xEE]).unwrap();
-    robot.stats(|stats| stats["registers"]["DigitalOutputCommand[1]"].as_f64() == Some(128.0));
+    robot.next_stats(|stats| stats["registers"]["DigitalOutputCommand[1]"].as_f64() == Some(128.0));
 
-    gateway.end("INT");
+    gateway.ended_by(Signal::INT);
     assert!(line.symlink_metadata().is_err(), "the link is removed");
-    robot.end("INT");
+    robot.ended_by(Signal::INT);
 }
 
 /// `gateway` with a pseudoterminal at `line`; its controller is nowhere.
@@ -207,7 +113,7 @@ fn gateway(line: &Path) -> Command {
 }
 
 fn gateway_of(file: &Path, line: &Path) -> Command {
-    let mut command = host_sim();
+    let mut command = BINARY.command();
     command.args(["gateway", "-c"]).arg(file);
     command.arg(format!("--bind=rs485-1=pty:{}", line.display()));
     command
@@ -217,25 +123,11 @@ fn gateway_of(file: &Path, line: &Path) -> Command {
 #[track_caller]
 fn refused(command: &mut Command) -> String {
     let mut child = command.spawn().unwrap();
-    let deadline = Instant::now() + PATIENCE;
-    while child.try_wait().unwrap().is_none() {
-        if Instant::now() > deadline {
-            child.kill().unwrap();
-            panic!("{command:?} was started");
-        }
-        std::thread::sleep(Duration::from_millis(1));
-    }
+    ended(&mut child, PATIENCE);
     let output = child.wait_with_output().unwrap();
     let (out, err) = text(&output);
     assert_eq!((output.status.code(), out.as_str(), err.lines().count()), (Some(2), "", 1), "{err}");
     err
-}
-
-fn names(folder: &Path) -> Vec<String> {
-    let names = std::fs::read_dir(folder).unwrap();
-    let mut names: Vec<_> = names.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
-    names.sort();
-    names
 }
 
 #[test]
@@ -256,15 +148,14 @@ fn a_ready_file_costs_nobody_anything() {
     assert_eq!(names(folder.path()), ["cell.toml", "folder"], "nothing was started");
 
     // What a killed run left is replaced; what somebody put there since is not removed.
-    let mut first = Running::start(gateway(&line).arg("--ready").arg(&ready));
-    first.child.kill().unwrap();
-    first.child.wait().unwrap();
+    let mut first = HostSim::start(gateway(&line).arg("--ready").arg(&ready));
+    first.kill();
     assert!(ready.exists());
-    let second = Running::start(gateway(&line).arg("--ready").arg(&ready));
+    let second = HostSim::start(gateway(&line).arg("--ready").arg(&ready));
     let said: Value = serde_json::from_str(&std::fs::read_to_string(&ready).unwrap()).unwrap();
     assert_eq!(said, second.ready);
     std::fs::write(&ready, "somebody's").unwrap();
-    second.end("TERM");
+    second.ended_by(Signal::TERM);
     assert_eq!(std::fs::read_to_string(&ready).unwrap(), "somebody's");
     assert_eq!(names(folder.path()), ["cell.toml", "folder", "ready.json"]);
 }
@@ -277,31 +168,31 @@ fn under(hang_up: &str, command: &Command) -> Command {
     env
 }
 
-fn send(name: &str, child: &Child) {
-    let pid = child.id().to_string();
-    assert!(Command::new("kill").args(["-s", name, &pid]).status().unwrap().success());
+fn send(signal: Signal, child: &Child) {
+    rustix::process::kill_process(Pid::from_child(child), signal).unwrap();
 }
 
 #[test]
 fn a_line_that_another_program_uses_is_not_taken_away() {
     let folder = tempfile::tempdir().unwrap();
     let line = folder.path().join("line");
-    let mut first = Running::start(&mut gateway(&line));
+    let mut first = HostSim::start(&mut gateway(&line));
     let leads_to = std::fs::read_link(&line).unwrap();
     let message = refused(&mut gateway(&line));
-    let holder =
-        format!("line: another run of host-sim has it, process {}; end that one or give", first.child.id());
+    let holder = format!(
+        "line: another run of host-sim has it, process {}; end that one or give",
+        first.pid().as_raw_pid()
+    );
     assert!(message.starts_with(&format!("--bind rs485-1=pty:{}: ", line.display())), "{message}");
     assert!(message.contains(&holder), "{message}");
     assert_eq!(std::fs::read_link(&line).unwrap(), leads_to);
 
     // Killed, it leaves a link to a terminal whose number the next program may get, here this test.
-    first.child.kill().unwrap();
-    first.child.wait().unwrap();
+    first.kill();
     assert_eq!(std::fs::read_link(&line).unwrap(), leads_to);
     let (number, foreign) = terminal_called(&leads_to);
     assert!(leads_to.exists());
-    Running::start(&mut gateway(&line)).end("TERM");
+    HostSim::start(&mut gateway(&line)).ended_by(Signal::TERM);
     assert_eq!(names(folder.path()), [""; 0]);
 
     // The same link made by that program is in use.
@@ -315,7 +206,7 @@ fn a_line_that_another_program_uses_is_not_taken_away() {
     drop((number, foreign));
     std::fs::remove_file(&line).unwrap();
     std::os::unix::fs::symlink("/dev/pts/4000000", &line).unwrap();
-    Running::start(&mut gateway(&line)).end("TERM");
+    HostSim::start(&mut gateway(&line)).ended_by(Signal::TERM);
     assert_eq!(names(folder.path()), [""; 0]);
 }
 
@@ -344,41 +235,41 @@ fn terminal_called(name: &Path) -> (OwnedFd, Vec<OwnedFd>) {
 fn a_terminal_that_is_closed_ends_a_run_cleanly_unless_it_is_to_outlive_it() {
     let folder = tempfile::tempdir().unwrap();
     let (line, ready) = (folder.path().join("line"), folder.path().join("ready.json"));
-    let mut robot = host_sim();
+    let mut robot = BINARY.command();
     robot.args(["controller", "-c"]).arg(example("rs485-system-controller.toml"));
-    robot.args(["command", "state", "modbus", "udp2011"].map(|port| format!("--set=listen.{port}=0")));
+    robot.args(free_servers());
     robot.arg(format!("--bind=rs485=pty:{}", line.display()));
     for mut command in [gateway(&line), robot] {
         command.args(["--stats", "20ms", "--ready"]).arg(&ready);
-        Running::start(&mut under("default", &command)).end("HUP");
+        HostSim::start(&mut under("default", &command)).ended_by(Signal::HUP);
         assert_eq!(names(folder.path()), [""; 0], "{command:?}");
-        let mut under_nohup = Running::start(&mut under("ignore", &command));
-        send("HUP", &under_nohup.child);
-        while under_nohup.lines.try_recv().is_ok() {}
+        let under_nohup = HostSim::start(&mut under("ignore", &command));
+        under_nohup.signal(Signal::HUP);
+        under_nohup.skip_lines();
         // More than it could say while it ended.
         (0..20).for_each(|_| drop(under_nohup.line()));
         assert!(line.exists() && ready.exists(), "{command:?}");
-        under_nohup.end("TERM");
+        under_nohup.ended_by(Signal::TERM);
         assert_eq!(names(folder.path()), [""; 0], "{command:?}");
     }
 }
 
 #[test]
 fn a_demo_that_is_interrupted_leaves_nothing_behind() {
-    for (name, code) in [("HUP", 129), ("INT", 130), ("TERM", 143)] {
+    for (signal, code) in [(Signal::HUP, 129), (Signal::INT, 130), (Signal::TERM, 143)] {
         let folder = tempfile::tempdir().unwrap();
         let deadline = Instant::now() + PATIENCE;
         // It may be over before anybody looks; then another one is.
-        while interrupted_demo(folder.path(), name) != Some(code) {
-            assert!(Instant::now() < deadline, "{name}");
+        while interrupted_demo(folder.path(), signal) != Some(code) {
+            assert!(Instant::now() < deadline, "{signal:?}");
         }
-        assert_eq!(names(folder.path()), [""; 0], "{name}");
+        assert_eq!(names(folder.path()), [""; 0], "{signal:?}");
     }
 }
 
 /// Sends a demo the signal as soon as its first device is there; how it ended.
-fn interrupted_demo(folder: &Path, name: &str) -> Option<i32> {
-    let mut command = host_sim();
+fn interrupted_demo(folder: &Path, signal: Signal) -> Option<i32> {
+    let mut command = BINARY.command();
     command.arg("demo");
     let mut demo = under("default", &command).env("TMPDIR", folder).spawn().unwrap();
     let has_device = || {
@@ -391,41 +282,32 @@ fn interrupted_demo(folder: &Path, name: &str) -> Option<i32> {
         }
         std::thread::sleep(Duration::from_millis(1));
     }
-    send(name, &demo);
+    send(signal, &demo);
     let code = demo.wait().unwrap().code();
-    assert!(code.is_some_and(|code| code == 0 || code > 128), "{name}: {code:?}");
+    assert!(code.is_some_and(|code| code == 0 || code > 128), "{signal:?}: {code:?}");
     code
 }
 
 #[test]
 fn what_runs_long_and_leaves_nothing_ends_when_it_is_interrupted() {
-    let mut command = host_sim();
+    let mut command = BINARY.command();
     command.args(["soak", "--hours", "1000", "--cell", "rs485-system"]);
     let soak = under("default", &command).spawn().unwrap();
     // Before it listens for the signal, the signal ends it without a word.
-    until(|| has_signal(&soak, "SigCgt:", 2));
-    send("INT", &soak);
+    until("a signal that is caught", || has_signal(&soak, "SigCgt:", 2).then_some(()));
+    send(Signal::INT, &soak);
     let output = soak.wait_with_output().unwrap();
     let (out, err) = text(&output);
     assert_eq!(output.status.code(), Some(0), "{err}");
     assert!(out.contains("virtual hours") && out.contains("\ninterrupted: "), "{out}");
 
-    let mut command = host_sim();
+    let mut command = BINARY.command();
     command.args(["decode", "--part", "input"]).arg(example("rs485-system.toml"));
     let mut decode = under("default", &command).stdin(Stdio::piped()).spawn().unwrap();
     // What started the tests may ignore it, and so does a child until its disposition is set.
-    until(|| !has_signal(&decode, "SigIgn:", 2));
-    send("INT", &decode);
+    until("a signal that is heard", || (!has_signal(&decode, "SigIgn:", 2)).then_some(()));
+    send(Signal::INT, &decode);
     assert_eq!(decode.wait().unwrap().signal(), Some(2));
-}
-
-#[track_caller]
-fn until(condition: impl Fn() -> bool) {
-    let deadline = Instant::now() + PATIENCE;
-    while !condition() {
-        assert!(Instant::now() < deadline, "it never comes about");
-        std::thread::sleep(Duration::from_millis(1));
-    }
 }
 
 /// Whether a process has the signal of this number in a set of `/proc/PID/status`: those it catches,
@@ -440,47 +322,47 @@ fn has_signal(child: &Child, set: &str, signal: u32) -> bool {
 fn what_a_device_said_while_the_gateway_was_stopped_never_reaches_the_controller() {
     let folder = tempfile::tempdir().unwrap();
     let line = folder.path().join("rs485-1");
-    let mut robot = Running::start(
-        host_sim()
+    let robot = HostSim::start(
+        BINARY
+            .command()
             .args(["controller", "--stats", "10ms", "-c"])
             .arg(example("udp-server-controller.toml"))
-            .args(["command", "state", "modbus", "udp2011"].map(|port| format!("--set=listen.{port}=0"))),
+            .args(free_servers()),
     );
-    let ready = robot.ready.clone();
-    let port = |name: &str| ready[name].as_str().unwrap().rsplit_once(':').unwrap().1.to_owned();
-    let mut gateway = Running::start(
-        host_sim()
+    let gateway = HostSim::start(
+        BINARY
+            .command()
             .args(["gateway", "--stats", "50ms", "-c"])
             .arg(example("rs485-system.toml"))
-            .args(["state", "modbus"].map(|name| format!("--set=controller.ports.{name}={}", port(name))))
+            .args(robot.links(&["state", "modbus"]))
             .arg(format!("--bind=rs485-1=pty:{}", line.display())),
     );
     let is_up = |stats: &Value| stats["links"]["modbus"]["state"] == "up";
     let output = |stats: &Value| stats["registers"]["DigitalOutputCommand[1]"].as_f64();
-    gateway.stats(is_up);
+    gateway.next_stats(is_up);
     let mut device = std::fs::File::options().read(true).write(true).open(&line).unwrap();
     let mut say = |value: u8| {
         std::io::Write::write_all(&mut device, &[0xFF, 0xFF, value, 0xEE, 0xEE]).unwrap();
     };
     say(1);
-    robot.stats(|stats| output(stats) == Some(1.0));
-    gateway.stop();
+    robot.next_stats(|stats| output(stats) == Some(1.0));
+    gateway.freeze();
     for _ in 0..100 {
         say(2);
     }
     std::thread::sleep(STOPPED);
-    gateway.signal("CONT");
-    let woken = gateway.stats(|stats| stats["sleeps"] == 1);
+    gateway.signal(Signal::CONT);
+    let woken = gateway.next_stats(|stats| stats["sleeps"] == 1);
     assert_eq!(woken["ports"]["rs485-1"]["frames_in"], 1, "{woken}");
     assert_ne!(woken["ports"]["rs485-1"]["asleep"], 0, "{woken}");
-    gateway.stats(|stats| is_up(stats) && stats["links"]["modbus"]["reconnects"] != 0);
+    gateway.next_stats(|stats| is_up(stats) && stats["links"]["modbus"]["reconnects"] != 0);
     say(4);
-    robot.stats(|stats| {
+    robot.next_stats(|stats| {
         assert_ne!(output(stats), Some(2.0));
         output(stats) == Some(4.0)
     });
-    gateway.end("TERM");
-    robot.end("TERM");
+    gateway.ended_by(Signal::TERM);
+    robot.ended_by(Signal::TERM);
 }
 
 /// Longer than a gateway may be away without having slept.
@@ -496,7 +378,7 @@ fn what_cannot_start_says_why_and_exits_with_2() {
         (vec!["--bind=rs485-1=serial:/dev/does-not-exist"], "/dev/does-not-exist"),
         (vec!["--bind=rs485-1"], "NAME=DEVICE"),
     ] {
-        let output = host_sim().args(["gateway", "-c"]).arg(&file).args(&arguments).output().unwrap();
+        let output = BINARY.command().args(["gateway", "-c"]).arg(&file).args(&arguments).output().unwrap();
         let (out, err) = text(&output);
         assert_eq!(output.status.code(), Some(2), "{arguments:?}: {err}");
         assert!(err.contains(message), "{arguments:?}: {err}");

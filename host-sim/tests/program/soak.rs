@@ -1,9 +1,11 @@
 //! `host-sim soak`: what goes wrong can be repeated; what it says.
 
-use std::process::{Command, Output};
+use std::process::Output;
+
+use super::BINARY;
 
 fn host_sim(args: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_host-sim")).arg("soak").args(args).output().unwrap()
+    BINARY.command().arg("soak").args(args).output().unwrap()
 }
 
 #[track_caller]

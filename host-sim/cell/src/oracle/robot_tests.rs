@@ -13,24 +13,15 @@ use crate::soak::Scenario;
 use crate::tamper::{Forged, Outward};
 use crate::{Cell, LineId, Talker, Way};
 use recipe_config::file::{self, Text};
+use recipe_test_kit::toml;
 
 /// A panel that starts and stops, a value with a safe one.
-const PANEL: &str = r#"
-[controller]
-address = "127.0.0.1"
+fn panel_cell() -> String {
+    toml::panel(r#"1 = "speed(10)", 2 = "speed(20)", 9 = "stop""#, 100) + MIRROR
+}
 
-[[recipe]]
-name = "panel"
-kind = "stream"
-mode = "user"
-[recipe.input]
-head = [255, 255]
-tail = [238, 238]
-fields = [
-    { name = "order", type = "byte", commands = { 1 = "speed(10)", 2 = "speed(20)", 9 = "stop" } },
-    { name = "bits", type = "byte", to = "DigitalOutputCommand[1]" },
-]
-
+/// What the controller's outputs are is shown.
+const MIRROR: &str = r#"
 [[recipe]]
 name = "mirror"
 kind = "stream"
@@ -40,14 +31,6 @@ head = [1]
 tail = [4]
 on_stale = "stop"
 fields = [{ name = "bits", type = "byte", from = "DigitalOutputCommand[1]" }]
-
-[[port]]
-name = "device"
-bus = "rs485"
-recipe = "panel"
-timeout_ms = 100
-[port.on_timeout]
-"DigitalOutputCommand[1]" = 128
 
 [[port]]
 name = "mirror"
@@ -122,7 +105,7 @@ fn never_closes(link: LinkId) -> Option<Outward> {
 
 #[test]
 fn good_ones_are_not_accused() {
-    let (mut cell, line) = ready(PANEL, &panel(0, 1));
+    let (mut cell, line) = ready(&panel_cell(), &panel(0, 1));
     for (order, bits) in [(9, 2), (9, 3), (0, 4), (1, 5), (9, 6)] {
         for _ in 0..40 {
             cell.send(line, &panel(order, bits));
@@ -157,7 +140,7 @@ fn a_value_that_the_network_delivers_when_it_is_old() {
 
 #[test]
 fn a_command_that_the_network_delivers_when_it_is_old() {
-    let (mut cell, line) = ready(PANEL, &panel(0, 1));
+    let (mut cell, line) = ready(&panel_cell(), &panel(0, 1));
     cell.tamper(None, never_closes(LinkId::COMMAND));
     cell.cut_way(LinkId::COMMAND, Way::Up);
     cell.send(line, &panel(1, 1));
@@ -169,7 +152,7 @@ fn a_command_that_the_network_delivers_when_it_is_old() {
 
 #[test]
 fn a_stop_that_nobody_has_asked_for_any_more_for_long() {
-    let (mut cell, line) = ready(PANEL, &panel(0, 1));
+    let (mut cell, line) = ready(&panel_cell(), &panel(0, 1));
     cell.cut_way(LinkId::URGENT, Way::Up);
     cell.send(line, &panel(9, 1));
     cell.run_ms(20);
@@ -185,7 +168,7 @@ fn a_stop_that_nobody_has_asked_for_any_more_for_long() {
 
 #[test]
 fn a_stop_that_is_kept_back() {
-    let (mut cell, line) = ready(PANEL, &panel(0, 1));
+    let (mut cell, line) = ready(&panel_cell(), &panel(0, 1));
     let stop =
         |output: &Output<'_>| matches!(output, Output::LinkSend { bytes, .. } if bytes.starts_with(b"stop"));
     cell.tamper(None, outward(move |_, _, output| stop(output).then(Vec::new)));
@@ -203,7 +186,7 @@ fn a_stop_that_is_kept_back() {
 
 #[test]
 fn a_command_that_the_controller_does_not_understand() {
-    let (mut cell, _) = ready(PANEL, &panel(0, 1));
+    let (mut cell, _) = ready(&panel_cell(), &panel(0, 1));
     cell.run_ms(1_000);
     let (mut oracle, now) = (cell.oracle.take().unwrap(), cell.now());
     oracle.disturbed(Some(LinkId::URGENT), now);
@@ -215,7 +198,7 @@ fn a_command_that_the_controller_does_not_understand() {
 
 #[test]
 fn a_safe_value_that_is_not_there() {
-    let (mut cell, _) = ready(PANEL, &panel(0, 1));
+    let (mut cell, _) = ready(&panel_cell(), &panel(0, 1));
     cell.run_ms(3_000);
     assert_eq!(cell.value("DigitalOutputCommand[1]"), 128.0);
     let (paths, inputs, now) = (cell.paths(), cell.inputs(), cell.now());
@@ -282,7 +265,7 @@ fn a_value_that_cannot_be_read_is_written_back() {
 
 #[test]
 fn a_value_of_our_own_that_is_older_than_promised() {
-    let (mut cell, _) = ready(PANEL, &panel(0, 1));
+    let (mut cell, _) = ready(&panel_cell(), &panel(0, 1));
     cell.run_ms(500);
     assert_eq!(cell.violation(), None);
     cell.tamper(
@@ -298,7 +281,7 @@ fn a_value_of_our_own_that_is_older_than_promised() {
 
 #[test]
 fn a_timeout_of_a_device_that_was_not_silent() {
-    let (mut cell, line) = ready(PANEL, &panel(0, 1));
+    let (mut cell, line) = ready(&panel_cell(), &panel(0, 1));
     cell.attach(line, Talker::new(cell.now(), 40, u64::MAX, |_| panel(0, 1)));
     cell.run_ms(200);
     cell.stall_gateway(Duration::from_millis(300));
@@ -335,7 +318,7 @@ fn a_value_that_waited_while_the_gateway_slept() {
 
 #[test]
 fn a_command_that_waited_while_the_gateway_slept() {
-    let (mut cell, line) = ready(PANEL, &panel(0, 1));
+    let (mut cell, line) = ready(&panel_cell(), &panel(0, 1));
     cell.stall_gateway(Duration::from_millis(700));
     cell.run_ms(100);
     cell.send(line, &panel(2, 1));
@@ -401,7 +384,7 @@ fn a_held_value_from_before_the_controller_began_anew() {
 
 #[test]
 fn a_command_that_comes_behind_the_stop_that_overtook_it() {
-    let (mut cell, line) = ready(PANEL, &panel(0, 1));
+    let (mut cell, line) = ready(&panel_cell(), &panel(0, 1));
     cell.tamper(None, never_closes(LinkId::COMMAND));
     cell.cut_way(LinkId::COMMAND, Way::Up);
     cell.send(line, &panel(1, 1));

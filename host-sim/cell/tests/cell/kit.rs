@@ -1,19 +1,17 @@
 //! What the tests of whole cells share.
 
-use std::path::Path;
-
 use proto_core::config::GatewayConfig;
 use proto_core::recipe::CanFrame;
 use proto_core::recipe::model::CanId;
 use recipe_cell::{Cell, LineId};
 use recipe_config::{SimConfig, file};
+use recipe_test_kit::example;
 
 /// The gateway file of this name, and the controller's beside it.
 #[track_caller]
 pub(crate) fn files(name: &str) -> (Box<GatewayConfig>, SimConfig) {
-    let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs");
-    let gateway = file::load_gateway(&configs.join(format!("{name}.toml")), &[]);
-    let controller = file::load_controller(&configs.join(format!("{name}-controller.toml")), &[]);
+    let gateway = file::load_gateway(&example(&format!("{name}.toml")), &[]);
+    let controller = file::load_controller(&example(&format!("{name}-controller.toml")), &[]);
     match (gateway, controller) {
         (Ok(gateway), Ok(controller)) => (gateway, controller),
         (gateway, controller) => panic!("{:?} {:?}", gateway.err(), controller.err()),

@@ -8,6 +8,7 @@ use recipe_cell::{Cell, Way};
 use recipe_config::SimConfig;
 use recipe_config::file::{self, Text};
 use recipe_controller::Link;
+use recipe_test_kit::toml;
 
 use crate::kit::*;
 
@@ -38,30 +39,9 @@ fn assert_good(cell: &Cell) {
 }
 
 /// A panel that starts and stops.
-const PANEL: &str = r#"
-[controller]
-address = "127.0.0.1"
-
-[[recipe]]
-name = "panel"
-kind = "stream"
-mode = "user"
-[recipe.input]
-head = [255, 255]
-tail = [238, 238]
-fields = [
-    { name = "order", type = "byte", commands = { 1 = "speed(10)", 2 = "stop", 3 = "pause", 4 = "disable" } },
-    { name = "bits", type = "byte", to = "DigitalOutputCommand[1]" },
-]
-
-[[port]]
-name = "device"
-bus = "rs485"
-recipe = "panel"
-timeout_ms = 300
-[port.on_timeout]
-"DigitalOutputCommand[1]" = 128
-"#;
+fn panel() -> String {
+    toml::panel(r#"1 = "speed(10)", 2 = "stop", 3 = "pause", 4 = "disable""#, 300)
+}
 
 /// The device holds an order for some time.
 fn hold(cell: &mut Cell, order: u8, millis: u64) {
@@ -79,7 +59,7 @@ fn requests(cell: &Cell) -> u64 {
 #[test]
 fn a_cable_that_was_out_brings_nothing_old() {
     for millis in [100, 300, 700, 1_500, 4_000, 15_000] {
-        let mut cell = watched(PANEL, None);
+        let mut cell = watched(&panel(), None);
         hold(&mut cell, 0, 500);
         let links: Vec<LinkId> = cell.link_ids().collect();
         links.iter().for_each(|link| cell.cut_cable(*link));
@@ -97,7 +77,7 @@ fn a_cable_that_was_out_brings_nothing_old() {
 
 #[test]
 fn a_stop_arrives_when_the_cable_is_in_again() {
-    let mut cell = watched(PANEL, None);
+    let mut cell = watched(&panel(), None);
     hold(&mut cell, 0, 500);
     let links: Vec<LinkId> = cell.link_ids().collect();
     links.iter().for_each(|link| cell.cut_cable(*link));
@@ -111,7 +91,7 @@ fn a_stop_arrives_when_the_cable_is_in_again() {
 
 #[test]
 fn a_stop_does_not_wait_behind_one_that_nobody_answered() {
-    let mut cell = watched(PANEL, None);
+    let mut cell = watched(&panel(), None);
     cell.ails(Link::Command);
     cell.controller_mut().mute(Link::Command);
     hold(&mut cell, 0, 500);
@@ -125,7 +105,7 @@ fn a_stop_does_not_wait_behind_one_that_nobody_answered() {
 
 #[test]
 fn nothing_is_commanded_from_what_was_pressed_while_the_gateway_slept() {
-    let mut cell = watched(PANEL, None);
+    let mut cell = watched(&panel(), None);
     hold(&mut cell, 0, 500);
     cell.stall_gateway(Duration::from_secs(3));
     hold(&mut cell, 1, 1_000);
@@ -209,7 +189,7 @@ fn a_safe_value_is_written_again_to_a_controller_that_was_without_power() {
 
 #[test]
 fn another_stop_takes_the_place_that_is_free_beside_one_that_nobody_answered() {
-    let mut cell = watched(PANEL, None);
+    let mut cell = watched(&panel(), None);
     hold(&mut cell, 0, 500);
     // The second connection is refused: both stops go over the first.
     cell.refuse(LinkId::URGENT);

@@ -1,7 +1,5 @@
 //! The cells whose engine is recorded, and what happens in them.
 
-use std::path::Path;
-
 use proto_core::config::GatewayConfig;
 use proto_core::recipe::CanFrame;
 use proto_core::recipe::model::CanId;
@@ -9,6 +7,7 @@ use proto_core::time::Duration;
 use recipe_cell::{Cell, Chunking, Rng, Talker, Trouble, TroubleKind};
 use recipe_config::SimConfig;
 use recipe_config::file::{self, Text};
+use recipe_test_kit::{example, repository};
 
 use crate::arithmetic;
 
@@ -117,7 +116,7 @@ fn talking(name: &str, chunking: Chunking) -> Cell {
 
 /// Everything at once: a PLC to Modbus, a force sensor to UDP, CAN both ways, a display.
 fn four_ports(chunking: Chunking) -> Cell {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../firmware/examples/counts.toml");
+    let path = repository().join("firmware/examples/counts.toml");
     let set = ["plc.timeout_ms=50", "sensor.timeout_ms=20", "devices.timeout_ms=100", "devices.cycle_ms=4"];
     let set = set.into_iter().chain(["display.cycle_ms=4"]).map(|set| format!("port.{set}"));
     let gateway = file::load_gateway(&path, &set.collect::<Vec<_>>());
@@ -170,9 +169,8 @@ fn silence(cell: &mut Cell) {
 
 /// The gateway file of this name, and the controller's beside it.
 fn files(name: &str) -> (Box<GatewayConfig>, SimConfig) {
-    let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs");
-    let gateway = file::load_gateway(&configs.join(format!("{name}.toml")), &[]);
-    let controller = file::load_controller(&configs.join(format!("{name}-controller.toml")), &[]);
+    let gateway = file::load_gateway(&example(&format!("{name}.toml")), &[]);
+    let controller = file::load_controller(&example(&format!("{name}-controller.toml")), &[]);
     (gateway.unwrap_or_else(|error| panic!("{error}")), controller.unwrap_or_else(|error| panic!("{error}")))
 }
 

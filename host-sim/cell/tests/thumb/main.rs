@@ -39,7 +39,7 @@ fn main() -> ExitCode {
     // A test runs in its package's folder, not where it was named.
     let program = program.map(|path| match path.exists() {
         true => path,
-        false => Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").join(path),
+        false => recipe_test_kit::repository().join(path),
     });
     let mut trials = Vec::new();
     for Recorded { name, record } in cells::all() {

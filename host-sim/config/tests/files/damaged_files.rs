@@ -1,56 +1,12 @@
 //! Nothing a file or an override says can do more than be refused with one line.
 
-use std::path::Path;
-
 use proptest::prelude::*;
 use recipe_config::file::{Text, parse, parse_recipes};
-
-/// Pieces that mean something to a configuration file, and some that mean trouble.
-const PIECES: &[&str] = &[
-    "[",
-    "]",
-    "[[",
-    "{",
-    "}",
-    "=",
-    ",",
-    "\n",
-    "\"",
-    "\"\"",
-    "0",
-    "-1",
-    "1e308",
-    "nan",
-    "inf",
-    "0x1FFFFFFF",
-    "99999999999999999999",
-    "true",
-    "é",
-    "\u{0}",
-    "..",
-    "RobotState[1..32]",
-    "ForceEnd[1]",
-    "__RobotState_8",
-    "head = [1]",
-    "fields = []",
-    "port",
-    "recipe",
-    "\"rising:BitOutputReg[3].9\"",
-    "1979-05-27",
-    "name = \"\"",
-    "\"a\\nb\" = 1",
-    "name = \"a\\nb\"",
-    "type = \"double\"",
-    "extended = true",
-    "value = 1.5",
-    "{ 1 = \"stop\" }",
-];
+use recipe_test_kit::examples;
+use recipe_test_kit::toml::PIECES;
 
 fn configs() -> Vec<String> {
-    let dir = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs");
-    let mut files: Vec<_> = std::fs::read_dir(dir).unwrap().map(|entry| entry.unwrap().path()).collect();
-    files.sort();
-    files.iter().map(|path| std::fs::read_to_string(path).unwrap()).collect()
+    examples().iter().map(|path| std::fs::read_to_string(path).unwrap()).collect()
 }
 
 /// Cuts a text at a character near `place`.

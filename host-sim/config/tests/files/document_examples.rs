@@ -1,14 +1,13 @@
 //! The TOML that the documents show is valid as it stands, and says what it is there to say.
 
 use std::fs;
-use std::path::Path;
 
 use recipe_config::file::{self, Config, Text};
+use recipe_test_kit::repository;
 
 /// The fenced blocks of a document that are TOML, with their line numbers.
 fn blocks(document: &str) -> Vec<(usize, String)> {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").join(document);
-    let text = fs::read_to_string(path).unwrap();
+    let text = fs::read_to_string(repository().join(document)).unwrap();
     let mut blocks = Vec::new();
     let mut open: Option<(usize, String)> = None;
     for (number, line) in text.lines().enumerate() {

@@ -1,19 +1,11 @@
 //! Every file under `configs/` loads and is what its name says.
 
-use std::path::{Path, PathBuf};
-
 use recipe_config::file::{self, Config};
-
-fn configs() -> Vec<PathBuf> {
-    let dir = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs");
-    let mut files: Vec<_> = std::fs::read_dir(dir).unwrap().map(|entry| entry.unwrap().path()).collect();
-    files.sort();
-    files
-}
+use recipe_test_kit::{example, examples};
 
 #[test]
 fn every_example_file_is_valid() {
-    let files = configs();
+    let files = examples();
     assert!(files.len() >= 18, "only {} files", files.len());
     for path in files {
         let config = file::load(&path, &[]).unwrap_or_else(|error| panic!("{error}"));
@@ -26,8 +18,7 @@ fn every_example_file_is_valid() {
 fn a_controller_and_its_gateway_mean_the_same_recipe() {
     // Both ends of a recipe link must agree on every byte.
     let recipe = |file: &str, name: &str| {
-        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs").join(file);
-        let recipes = file::load_recipes(&path, &[]).unwrap();
+        let recipes = file::load_recipes(&example(file), &[]).unwrap();
         recipes.into_iter().find(|recipe| recipe.name == name).unwrap()
     };
     for (gateway, controller, name) in [

@@ -177,8 +177,7 @@ fn example_6_tcp_and_udp_client() {
 #[test]
 fn every_example_file_makes_a_controller_whose_programs_run() {
     let mut controllers = 0;
-    for entry in std::fs::read_dir(concat!(env!("CARGO_MANIFEST_DIR"), "/../configs")).unwrap() {
-        let path = entry.unwrap().path();
+    for path in recipe_test_kit::examples() {
         if !path.to_string_lossy().ends_with("-controller.toml") {
             continue;
         }
