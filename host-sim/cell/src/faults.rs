@@ -1,11 +1,12 @@
 //! What a test or a soak run can break in the cell, and mend.
 
 use proto_core::engine::{BusState, Engine, Input, LinkId, LinkKind};
-use proto_core::time::Duration;
 
-use super::drive::Due;
-use super::network::{Connection, Door, Peer, Speaker, Way};
+use super::connection::{Connection, Peer};
+use super::due::Due;
+use super::network::{Door, Speaker, Way};
 use super::sleep::Told;
+use super::tcp::TCP_TIMEOUT;
 use super::{BusId, Cell, Entry, LineId, Owner, What};
 
 /// Faults of the network.
@@ -336,6 +337,3 @@ impl Cell {
         self.gates.keys().copied()
     }
 }
-
-/// When TCP gives up a connection on which nothing is acknowledged.
-pub const TCP_TIMEOUT: Duration = Duration::from_secs(30);

@@ -3,7 +3,7 @@
 use proto_core::recipe::CanFrame;
 use proto_core::time::Instant;
 
-use super::drive::Due;
+use super::due::Due;
 use super::line::{Chunk, Chunking};
 use super::sleep::Told;
 use super::{BusId, Cell, End, LineId, Owner};

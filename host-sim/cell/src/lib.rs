@@ -26,8 +26,10 @@
 //! of [`Cell::controller_mut`]. [`Trouble`] does all of it by chance.
 
 mod can;
+mod connection;
 mod device;
 mod drive;
+mod due;
 mod faults;
 mod field;
 mod line;
@@ -57,17 +59,18 @@ use proto_core::time::{Duration, Instant};
 
 pub use can::{BusCounters, CanBus};
 pub use device::{Device, Responder, Talker};
-pub use faults::TCP_TIMEOUT;
 pub use line::{Chunking, Line, LineCounters, MAX_HEARD, Wiring};
 pub use network::{Network, Way};
 pub use oracle::{Invariant, Violation};
 pub use recording::recording_difference;
 pub use rng::Rng;
+pub use tcp::TCP_TIMEOUT;
 pub use trace::{Entry, Trace, What};
 pub use trouble::{Trouble, TroubleKind};
 
-use drive::Due;
-use network::{Connection, Gate};
+use connection::Connection;
+use due::Due;
+use network::Gate;
 use oracle::Oracle;
 use queue::Queue;
 use recipe_config::{InitialTarget, SimBus, SimConfig};

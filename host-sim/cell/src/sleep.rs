@@ -9,7 +9,7 @@ use proto_core::engine::{BusState, Input, LinkId, PortId};
 use proto_core::recipe::CanFrame;
 use proto_core::time::Duration;
 
-use super::drive::Due;
+use super::due::Due;
 use super::network::Way;
 use super::{Cell, What};
 

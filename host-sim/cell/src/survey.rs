@@ -5,8 +5,9 @@ use proto_core::engine::{LinkId, LinkKind};
 use proto_core::time::Duration;
 
 use super::Cell;
-use super::drive::Due;
-use super::network::{Connection, Door, Gate, Way};
+use super::connection::Connection;
+use super::due::Due;
+use super::network::{Door, Gate, Way};
 use super::oracle::Path;
 use recipe_controller::Link;
 

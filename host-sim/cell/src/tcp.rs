@@ -266,3 +266,7 @@ const PATIENCE: Duration = Duration::from_millis(200);
 const LAST_PATIENCE: Duration = Duration::from_secs(16);
 /// A program reads so much at once, rounded up to a segment.
 const MOST_AT_ONCE: usize = 16 * 1024;
+/// When TCP gives up a connection on which nothing is acknowledged.
+pub const TCP_TIMEOUT: Duration = Duration::from_secs(30);
+/// The gateway's transport ends a connection on which nothing was acknowledged for so long.
+pub(super) const USER_TIMEOUT: Duration = Duration::from_secs(2);

@@ -6,10 +6,10 @@ use std::net::SocketAddr;
 use proto_core::engine::{Input, LinkId, LinkKind};
 use proto_core::time::Duration;
 
-use super::drive::Due;
-use super::faults::TCP_TIMEOUT;
-use super::network::{Connection, Door, Item, Peer, Speaker, Way};
-use super::tcp::{Again, Arrived};
+use super::connection::{Connection, Peer};
+use super::due::Due;
+use super::network::{Door, Item, Speaker, Way};
+use super::tcp::{Again, Arrived, TCP_TIMEOUT, USER_TIMEOUT};
 use super::{CLIENT_RETRY, Cell, End, HERE, Owner, What, udp_peer};
 use recipe_controller::{ConnId, ControllerInput, Link};
 
@@ -530,8 +530,6 @@ impl Cell {
 
 /// How long an attempt to connect waits for an answer before it asks again, at first.
 const FIRST_KNOCK: Duration = Duration::from_secs(1);
-/// The gateway's transport ends a connection on which nothing was acknowledged for so long.
-pub(super) const USER_TIMEOUT: Duration = Duration::from_secs(2);
 /// What the controller keeps of what it sends on one connection; a client that lets more pile up is
 /// dropped.
 const CONTROLLER_BUFFER: u64 = 256 * 1024;

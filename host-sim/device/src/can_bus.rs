@@ -11,15 +11,15 @@ use std::time::Duration as StdDuration;
 use proto_core::recipe::can::CanFrame;
 use proto_core::time::Instant;
 use proto_core::wire::slcan::{Channel, ChannelState};
-use tokio::net::{TcpListener, TcpStream};
+use tokio::net::TcpListener;
 use tokio::sync::Notify;
 use tokio::task::{JoinSet, yield_now};
 use tracing::{info, warn};
 
 use super::bind::{Device, Pace};
-use super::line::accept;
-use super::port::{Backlog, PortEvent, PortTx};
+use super::exchange::{Backlog, PortEvent, PortTx};
 use super::pty::Pty;
+use super::stream::{ByteStream, accept};
 use super::wire::{Crossed, Full, NodeId, Pacing, Wire};
 use recipe_net::peer;
 use recipe_net::timer::{Timer, now};
@@ -355,62 +355,8 @@ async fn serve_all(listener: TcpListener, bus: &CanBus, bitrate: u32, tx: &Rc<Po
     }
 }
 
-/// What an slcan client is connected by.
-trait ClientIo {
-    async fn readable(&self) -> io::Result<()>;
-    fn try_read(&self, buf: &mut [u8]) -> io::Result<usize>;
-    async fn writable(&self) -> io::Result<()>;
-    fn try_write(&self, bytes: &[u8]) -> io::Result<usize>;
-
-    /// Whether anybody reads what is written.
-    fn is_heard(&self) -> bool {
-        true
-    }
-
-    /// Whether `is_heard` should be asked now and then.
-    fn may_be_stale(&self) -> bool {
-        false
-    }
-}
-
-impl ClientIo for Pty {
-    async fn readable(&self) -> io::Result<()> {
-        Self::readable(self).await
-    }
-    fn try_read(&self, buf: &mut [u8]) -> io::Result<usize> {
-        Self::try_read(self, buf)
-    }
-    async fn writable(&self) -> io::Result<()> {
-        Self::writable(self).await
-    }
-    fn try_write(&self, bytes: &[u8]) -> io::Result<usize> {
-        Self::try_write(self, bytes)
-    }
-    fn is_heard(&self) -> bool {
-        Self::is_heard(self)
-    }
-    fn may_be_stale(&self) -> bool {
-        Self::may_be_stale(self)
-    }
-}
-
-impl ClientIo for TcpStream {
-    async fn readable(&self) -> io::Result<()> {
-        Self::readable(self).await
-    }
-    fn try_read(&self, buf: &mut [u8]) -> io::Result<usize> {
-        Self::try_read(self, buf)
-    }
-    async fn writable(&self) -> io::Result<()> {
-        Self::writable(self).await
-    }
-    fn try_write(&self, bytes: &[u8]) -> io::Result<usize> {
-        Self::try_write(self, bytes)
-    }
-}
-
 /// Ties one client to the bus until its connection fails.
-async fn serve(io: &impl ClientIo, node: &Node, bitrate: u32, tx: &PortTx) -> io::Error {
+async fn serve(io: &impl ByteStream, node: &Node, bitrate: u32, tx: &PortTx) -> io::Error {
     let mut channel = Channel::new(bitrate);
     node.set_hears(false);
     let mut out = Vec::new();
@@ -425,8 +371,8 @@ async fn serve(io: &impl ClientIo, node: &Node, bitrate: u32, tx: &PortTx) -> io
         let most = if backlog.is_open(tx) { OLD_CHUNK } else { CHUNK };
         let mut read = None;
         let done = tokio::select! {
-            ready = io.readable(), if room && unread.is_empty() => {
-                match ready.and_then(|()| io.try_read(&mut buf[..most])) {
+            received = io.receive(&mut buf[..most]), if room && unread.is_empty() => {
+                match received {
                     Ok(0) => Err(io::ErrorKind::UnexpectedEof.into()),
                     Ok(count) => {
                         unread = 0..count;
@@ -501,7 +447,7 @@ fn take_lines(
 }
 
 /// Writes what the client takes; what nobody would hear is given up.
-fn flush(io: &impl ClientIo, out: &mut Vec<u8>, tx: &PortTx) -> io::Result<()> {
+fn flush(io: &impl ByteStream, out: &mut Vec<u8>, tx: &PortTx) -> io::Result<()> {
     if !io.is_heard() {
         tx.count(|counters| counters.unheard += out.len() as u64);
         out.clear();

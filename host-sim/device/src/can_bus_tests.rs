@@ -5,6 +5,7 @@ use std::io::Write;
 use proto_core::recipe::model::CanId;
 use proto_core::time::Duration;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpStream;
 
 use super::super::port::{Port, PortBus};
 use super::super::test_kit::{Client, Running, Seen, run};

@@ -11,12 +11,14 @@ compile_error!(
 
 pub mod bind;
 pub mod can_bus;
+pub mod exchange;
 pub mod files;
 mod line;
 pub mod port;
 pub mod pty;
 mod pty_link;
 mod socketcan;
+mod stream;
 #[cfg(test)]
 mod test_kit;
 pub mod wire;

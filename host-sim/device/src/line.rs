@@ -4,23 +4,21 @@
 //! wire: `Sent` comes when the last stop bit would have left, so cycles behave alike everywhere.
 
 use std::cell::RefCell;
-use std::future::poll_fn;
 use std::io;
-use std::pin::Pin;
 use std::rc::Rc;
 use std::time::Duration as StdDuration;
 
 use proto_core::config::{Parity, Rs485};
 use proto_core::time::{Duration, Instant};
-use tokio::io::{AsyncRead, ReadBuf};
-use tokio::net::{TcpListener, TcpStream};
+use tokio::net::TcpListener;
 use tokio::task::yield_now;
-use tokio_serial::{ClearBuffer, SerialPort, SerialPortBuilderExt, SerialStream};
+use tokio_serial::{SerialPortBuilderExt, SerialStream};
 use tracing::{debug, info, warn};
 
 use super::bind::{Device, HostPort, Pace};
-use super::port::{Backlog, PortEvent, PortTx};
+use super::exchange::{Backlog, PortEvent, PortTx};
 use super::pty::Pty;
+use super::stream::{ByteStream, accept};
 use recipe_net::backoff::Backoff;
 use recipe_net::connect::connect;
 use recipe_net::peer;
@@ -141,22 +139,6 @@ impl Line {
     }
 }
 
-/// Accepts one client, waiting out what is wrong with the system for the moment.
-pub(super) async fn accept(listener: &TcpListener, tx: &PortTx) -> (TcpStream, std::net::SocketAddr) {
-    loop {
-        match listener.accept().await {
-            Ok(accepted) => return accepted,
-            Err(error) => {
-                tx.count(|counters| counters.accept_failures += 1);
-                if let Some(more) = tx.complaints.take(now()) {
-                    warn!(%error, more, "a client could not be accepted");
-                }
-                tokio::time::sleep(StdDuration::from_millis(50)).await;
-            }
-        }
-    }
-}
-
 async fn refuse_all(listener: &TcpListener, tx: &PortTx) {
     loop {
         let (stream, peer) = accept(listener, tx).await;
@@ -189,121 +171,9 @@ fn open_serial(path: &str, settings: Rs485) -> io::Result<SerialStream> {
     }
 }
 
-/// A connected device: what tells the three kinds apart while bytes flow.
-trait LineIo {
-    /// Whether what cannot be written at once is lost, as on a wire, instead of waiting.
-    const LOSSY: bool;
-
-    async fn receive(&self, buf: &mut [u8]) -> io::Result<usize>;
-    fn try_read(&self, buf: &mut [u8]) -> io::Result<usize>;
-    async fn writable(&self) -> io::Result<()>;
-    fn try_write(&self, bytes: &[u8]) -> io::Result<usize>;
-
-    /// Throws away what has arrived and was not read, if the system can.
-    fn discard_unread(&self) {}
-
-    /// Whether the device still holds bytes that were written.
-    fn is_draining(&self) -> bool {
-        false
-    }
-
-    /// Whether anybody listens.
-    fn is_heard(&self) -> bool {
-        true
-    }
-
-    /// Whether `is_heard` should be asked now and then, even if nothing is to be sent.
-    fn may_be_stale(&self) -> bool {
-        false
-    }
-}
-
-impl LineIo for Pty {
-    const LOSSY: bool = true;
-
-    async fn receive(&self, buf: &mut [u8]) -> io::Result<usize> {
-        loop {
-            self.readable().await?;
-            match self.try_read(buf) {
-                Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
-                read => return read,
-            }
-        }
-    }
-    fn try_read(&self, buf: &mut [u8]) -> io::Result<usize> {
-        Self::try_read(self, buf)
-    }
-    async fn writable(&self) -> io::Result<()> {
-        Self::writable(self).await
-    }
-    fn try_write(&self, bytes: &[u8]) -> io::Result<usize> {
-        Self::try_write(self, bytes)
-    }
-    fn discard_unread(&self) {
-        Self::discard_unread(self);
-    }
-    fn is_heard(&self) -> bool {
-        Self::is_heard(self)
-    }
-    fn may_be_stale(&self) -> bool {
-        Self::may_be_stale(self)
-    }
-}
-
-impl LineIo for RefCell<SerialStream> {
-    const LOSSY: bool = false;
-
-    async fn receive(&self, buf: &mut [u8]) -> io::Result<usize> {
-        // The stream's own `readable` and `try_read` never take the readiness back.
-        let mut buf = ReadBuf::new(buf);
-        poll_fn(|cx| Pin::new(&mut *self.borrow_mut()).poll_read(cx, &mut buf)).await?;
-        Ok(buf.filled().len())
-    }
-    fn try_read(&self, buf: &mut [u8]) -> io::Result<usize> {
-        self.borrow_mut().try_read(buf)
-    }
-    async fn writable(&self) -> io::Result<()> {
-        // A frame fits the system's buffer; when it does not, it empties at the line's speed.
-        tokio::time::sleep(StdDuration::from_millis(1)).await;
-        Ok(())
-    }
-    fn try_write(&self, bytes: &[u8]) -> io::Result<usize> {
-        self.borrow_mut().try_write(bytes)
-    }
-    fn discard_unread(&self) {
-        let _ = self.borrow().clear(ClearBuffer::Input);
-    }
-    fn is_draining(&self) -> bool {
-        self.borrow().bytes_to_write().is_ok_and(|left| left > 0)
-    }
-}
-
-impl LineIo for TcpStream {
-    const LOSSY: bool = false;
-
-    async fn receive(&self, buf: &mut [u8]) -> io::Result<usize> {
-        loop {
-            self.readable().await?;
-            match self.try_read(buf) {
-                Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
-                read => return read,
-            }
-        }
-    }
-    fn try_read(&self, buf: &mut [u8]) -> io::Result<usize> {
-        Self::try_read(self, buf)
-    }
-    async fn writable(&self) -> io::Result<()> {
-        Self::writable(self).await
-    }
-    fn try_write(&self, bytes: &[u8]) -> io::Result<usize> {
-        Self::try_write(self, bytes)
-    }
-}
-
 /// Moves bytes both ways until the device fails.
 async fn pump(
-    device: &impl LineIo,
+    device: &impl ByteStream,
     sender: &mut Sender,
     events: &mut impl FnMut(PortEvent<'_>),
 ) -> io::Error {
@@ -355,7 +225,7 @@ async fn pump(
 
 /// Tells what waited while the process slept, which is refused and counted, and throws away what of it cannot be
 /// read yet: a terminal's system makes it readable piece by piece, when it has the time.
-fn swallow(device: &impl LineIo, tx: &PortTx, buf: &mut [u8], events: &mut impl FnMut(PortEvent<'_>)) {
+fn swallow(device: &impl ByteStream, tx: &PortTx, buf: &mut [u8], events: &mut impl FnMut(PortEvent<'_>)) {
     for _ in 0..MOST_SWALLOWED {
         let Ok(count @ 1..) = device.try_read(buf) else { break };
         tx.count(|counters| counters.bytes_in += count as u64);
@@ -405,7 +275,7 @@ impl Sender {
     }
 
     /// Begins the next transmission with everything handed over so far.
-    fn begin(&mut self, device: &impl LineIo, events: &mut impl FnMut(PortEvent<'_>)) -> io::Result<()> {
+    fn begin(&mut self, device: &impl ByteStream, events: &mut impl FnMut(PortEvent<'_>)) -> io::Result<()> {
         self.bytes.clear();
         self.bytes.append(&mut self.tx.bytes.borrow_mut());
         if self.bytes.is_empty() {
@@ -418,7 +288,11 @@ impl Sender {
     }
 
     /// Writes what is due and sets the timer to what comes next.
-    fn advance(&mut self, device: &impl LineIo, events: &mut impl FnMut(PortEvent<'_>)) -> io::Result<()> {
+    fn advance(
+        &mut self,
+        device: &impl ByteStream,
+        events: &mut impl FnMut(PortEvent<'_>),
+    ) -> io::Result<()> {
         let at = now();
         let end = self.start + self.line.time_on_line(self.bytes.len());
         let due = match self.paced {
@@ -448,7 +322,7 @@ impl Sender {
         Ok(())
     }
 
-    fn write_up_to<D: LineIo>(&mut self, due: usize, device: &D) -> io::Result<()> {
+    fn write_up_to<D: ByteStream>(&mut self, due: usize, device: &D) -> io::Result<()> {
         self.blocked = false;
         if self.written < due && !device.is_heard() {
             let lost = (due - self.written) as u64;

@@ -3,6 +3,7 @@
 use std::io::Write;
 
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpStream;
 
 use super::super::port::{Port, PortBus};
 use super::super::test_kit::{Client, Running, Seen, is_gone, run};

@@ -26,7 +26,7 @@ use tracing::{debug, info, warn};
 use self::link::Link;
 use self::message::{Content, Message};
 use self::state::News;
-use super::port::{DeviceCounters, PortEvent, PortTx};
+use super::exchange::{DeviceCounters, PortEvent, PortTx};
 use recipe_net::backoff::Backoff;
 use recipe_net::quota::Quota;
 use recipe_net::reactor::register;

@@ -14,7 +14,8 @@ use rustix::fs::OFlags;
 use tokio::sync::Notify;
 use tokio::task::{JoinHandle, LocalSet};
 
-use super::port::{Port, PortBus, PortEvent, PortTx};
+use super::exchange::{PortEvent, PortTx};
+use super::port::{Port, PortBus};
 use recipe_net::timer::now;
 
 /// A device's event, with its time apart.

@@ -16,7 +16,7 @@ use super::sheet::{Raw, Sheet};
 use super::upward::{Carried, Upward, Wrong};
 use super::{Invariant, Oracle};
 use crate::network::Speaker;
-use crate::traffic::USER_TIMEOUT;
+use crate::tcp::USER_TIMEOUT;
 
 /// One path to the controller, as the network is at present.
 #[derive(Debug, Clone, Copy)]
