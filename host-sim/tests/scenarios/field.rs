@@ -4,7 +4,7 @@ use std::io::{Read, Write};
 use std::sync::{Arc, Condvar, Mutex};
 use std::time::{Duration, Instant};
 
-use super::case::PATIENCE;
+use recipe_test_kit::PATIENCE;
 
 /// A connection that can be read and written at the same time.
 pub(crate) trait Stream: Send {
