@@ -63,7 +63,7 @@ use crate::time::{Duration, Instant};
 /// controller is shorter.
 pub const OUTPUT_BUFFER: usize = MAX_STREAM_FRAME;
 
-/// A driver that calls the engine later than this after the call before was asleep: stopped, suspended,
+/// A driver whose calls are further apart than this was asleep: stopped, suspended,
 /// or in a debugger.
 pub const ASLEEP: Duration = Duration::from_millis(500);
 
@@ -129,8 +129,8 @@ impl Ask {
 }
 
 impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS, UPLINKS, FIELDS> {
-    /// Something happened, or time passed. `now` is the present; an instant earlier than in the call
-    /// before counts as that.
+    /// Something happened, or time passed. `now` is the present; an instant earlier than that of the
+    /// previous call counts as that one.
     ///
     /// Inputs for a port or link that the configuration does not have are ignored.
     pub fn handle(&mut self, now: Instant, input: Input<'_>) {
@@ -419,8 +419,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         self.links.recipes.iter().any(|other| other.id == link && other.is_frame(datagram))
     }
 
-    /// How often the gateway itself slept: it was not called for so long that nothing of what waited
-    /// for it could be believed any more. Wraps.
+    /// How often the gateway itself slept: it was not called for longer than [`ASLEEP`], so what
+    /// waited for it was discarded. Wraps.
     pub fn sleeps(&self) -> u32 {
         self.sleeps
     }
