@@ -58,7 +58,7 @@ pub struct PartBudget {
 }
 
 impl GatewayConfig {
-    /// What a part of the port's recipe takes on its line; `None` if the recipe has no such part.
+    /// What a part of the port's recipe takes on its line; `None` when there is no such part.
     pub fn budget(&self, port: &Port, part: Direction) -> Option<PartBudget> {
         let recipe = self.recipes.get(usize::from(port.recipe))?;
         let bytes_of = |span: Span| {
@@ -100,7 +100,7 @@ impl GatewayConfig {
         }
     }
 
-    /// What is valid but may not do what was intended.
+    /// What is allowed but may not do what was meant.
     pub fn warnings(&self) -> impl Iterator<Item = Warning> + '_ {
         self.slow_ports().chain(self.read_back()).chain(self.unused_recipes())
     }

@@ -190,7 +190,7 @@ pub enum ConfigErrorKind {
     },
     /// A name is empty.
     EmptyName,
-    /// An earlier recipe or port has the same name.
+    /// A recipe or port before has the same name.
     DuplicateName {
         /// Index of the one before.
         other: u8,

@@ -1,5 +1,5 @@
 //! The gateway's configuration as the engine takes it: TOML on the host and postcard on the board
-//! end in these types (docs/architecture.md section 3).
+//! end in these types (docs/architecture.md section 5).
 //!
 //! Bounded and plain: names are kept for messages, everything else is numbers. Nothing here has
 //! been checked until [`GatewayConfig::validate`] said so.

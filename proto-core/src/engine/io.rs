@@ -112,7 +112,7 @@ pub enum PortState {
     Gone,
 }
 
-/// What the driver reports.
+/// What happened outside.
 #[derive(Debug, Clone, Copy)]
 pub enum Input<'a> {
     /// A port's device is ready.

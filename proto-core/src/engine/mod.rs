@@ -63,7 +63,7 @@ use crate::time::{Duration, Instant};
 /// controller is shorter.
 pub const OUTPUT_BUFFER: usize = MAX_STREAM_FRAME;
 
-/// A driver whose calls are further apart than this was asleep: stopped, suspended,
+/// A driver that calls the engine later than this after the call before was asleep: stopped, suspended,
 /// or in a debugger.
 pub const ASLEEP: Duration = Duration::from_millis(500);
 
@@ -129,8 +129,8 @@ impl Ask {
 }
 
 impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS, UPLINKS, FIELDS> {
-    /// Something happened, or time passed. `now` is the present; an instant earlier than that of the
-    /// previous call counts as that one.
+    /// Something happened, or time passed. `now` is the present; an instant earlier than in the call
+    /// before counts as that.
     ///
     /// Inputs for a port or link that the configuration does not have are ignored.
     pub fn handle(&mut self, now: Instant, input: Input<'_>) {
