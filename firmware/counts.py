@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Instructions of engine passes on a Cortex-M7, beside those of docs/cortex-m7.md section 3.
+"""Instructions of engine passes on a Cortex-M7, beside those of docs/performance.md section 2.
 
     firmware/counts.py --program target/thumbv7em-none-eabihf/firmware/examples/counts \
         --host-sim target/debug/host-sim [--update]
@@ -16,7 +16,7 @@ import sys
 import tempfile
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
-PAGE = ROOT / "docs/cortex-m7.md"
+PAGE = ROOT / "docs/performance.md"
 HEAD = "| what the engine does | mean | most |\n|---|---:|---:|\n"
 COMPILER = re.compile(r"(?<=\nCompiler: `)[^`]*(?=`\.)")
 TOLERANCE = 0.10
@@ -83,7 +83,7 @@ def main():
                 print(f"    {'GREW' if now > then else 'shrank'}: {label} was {then}")
                 wrong.add(name)
     if wrong:
-        print("not as in docs/cortex-m7.md section 3: " + ", ".join(sorted(wrong)))
+        print("not as in docs/performance.md section 2: " + ", ".join(sorted(wrong)))
         sys.exit("when that is as it should be: firmware/counts.py --update")
 
 

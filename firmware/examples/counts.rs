@@ -1,5 +1,5 @@
 //! Counts the instructions of engine passes on a Cortex-M7: `counts IMAGE`, named as a semihosting
-//! argument; IMAGE is the configuration image of `counts.toml` (docs/cortex-m7.md section 3).
+//! argument; IMAGE is the configuration image of `counts.toml` (docs/performance.md section 2).
 //!
 //! With `-icount shift=6` an instruction takes 64 ns of QEMU's time, which is 1.6 ticks of a 25 MHz
 //! timer: counts are right to the instruction and the same in every run. Each line that is printed has the
@@ -11,7 +11,7 @@ mod bare;
 
 use core::hint::black_box;
 
-use firmware::gateway::Engine;
+use firmware::tasks::gateway::Engine;
 use proto_core::config::image::{self, MAX_IMAGE};
 use proto_core::config::{GatewayConfig, Port};
 use proto_core::engine::{Input, LinkId, OUTPUT_BUFFER, Output, PortId};

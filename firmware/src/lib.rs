@@ -4,31 +4,15 @@
 //! engine of `proto-core`.
 //!
 //! Nothing here knows a protocol, and nothing here knows a board: every task is generic over
-//! `embedded_io_async`, [`can::CanPort`] or an `embassy_net::Stack`, and is bounded in memory. The
+//! `embedded_io_async`, [`drivers::can_port::CanPort`] or an `embassy_net::Stack`, and is bounded in memory. The
 //! binary beside this library names the board.
 
-pub mod can;
-pub mod fair;
+mod clock;
+pub mod drivers;
 pub mod fmt;
-pub mod gateway;
 pub mod identity;
-pub mod lan9118;
-pub mod led;
-pub mod link;
-pub mod mcan;
-mod notify;
 pub mod platform;
-pub mod serial;
-pub mod slcan;
-pub mod status;
-pub mod usart;
-pub mod watchdog;
+pub mod tasks;
 
 #[cfg(test)]
 extern crate std;
-#[cfg(test)]
-mod test_chip;
-#[cfg(test)]
-mod test_clock;
-#[cfg(test)]
-mod test_executor;

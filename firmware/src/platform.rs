@@ -9,8 +9,8 @@ use embassy_net_driver::Driver;
 use embassy_time::Duration;
 use proto_core::config::Rs485;
 
-use crate::can::CanPort;
-use crate::serial::Line;
+use crate::drivers::can_port::CanPort;
+use crate::drivers::line::Line;
 
 /// A board, as the wiring of the tasks sees it.
 ///

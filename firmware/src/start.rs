@@ -9,14 +9,15 @@ use core::pin::pin;
 use embassy_executor::{SpawnError, SpawnToken, Spawner};
 use embassy_net::{Config, Ipv4Cidr, Runner, Stack, StackResources, StaticConfigV4};
 use embassy_time::{Duration, Timer};
-use firmware::fair::Fair;
 use firmware::fmt::Text;
-use firmware::gateway::{Gateway, MAX_LINKS};
-use firmware::led::Condition;
-use firmware::link::{Buffers, Endpoint};
 use firmware::platform::{self, Feed as _, Lamp as _};
-use firmware::watchdog::{Pulse, TaskName};
-use firmware::{can, error, info, led, link, serial, warn, watchdog};
+use firmware::tasks::fair::Fair;
+use firmware::tasks::gateway::{Gateway, MAX_LINKS};
+use firmware::tasks::led::Condition;
+use firmware::tasks::link::{Buffers, Endpoint};
+use firmware::tasks::watchdog::{Pulse, TaskName};
+use firmware::tasks::{can, led, link, serial, watchdog};
+use firmware::{error, info, warn};
 use proto_core::config::{Bus, GatewayConfig, Network, image};
 use proto_core::engine::{LinkId, LinkKind, PortId};
 use static_cell::{ConstStaticCell, StaticCell};
@@ -105,7 +106,7 @@ impl core::fmt::Display for Refused {
 
 /// What the tasks need of the configuration.
 struct Wiring {
-    ports: heapless::Vec<(PortId, Bus), { firmware::gateway::MAX_FIELD_PORTS }>,
+    ports: heapless::Vec<(PortId, Bus), { firmware::tasks::gateway::MAX_FIELD_PORTS }>,
     links: heapless::Vec<(LinkId, LinkKind, Endpoint), MAX_LINKS>,
     network: Option<Network>,
 }
@@ -306,7 +307,7 @@ async fn address(pulse: &'static Pulse, stack: Stack<'static>) -> ! {
 
 #[embassy_executor::task]
 async fn status(pulse: &'static Pulse, gateway: &'static Gateway) -> ! {
-    pulse.run(pin!(firmware::status::run(gateway, pulse))).await
+    pulse.run(pin!(firmware::tasks::status::run(gateway, pulse))).await
 }
 
 /// Says again and again why nothing runs: whoever looks later wants to know as well.

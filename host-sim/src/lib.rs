@@ -1,12 +1,4 @@
-//! A simulated DUCO CORE controller and the recipe gateway on this host.
+//! The command line of `host-sim`: what a person types, and the demo.
 
-pub mod bus;
-pub mod cell;
 pub mod cli;
-pub mod config;
-pub mod controller;
 pub mod demo;
-mod files;
-mod out;
-pub mod shell;
-pub mod soak;

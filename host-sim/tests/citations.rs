@@ -1,5 +1,6 @@
 //! What the code and the documents cite exists: `docs/PAGE.md section N` names a numbered heading
-//! of a page that is there, and relative links in Markdown lead somewhere.
+//! of a page that is there, and relative links in Markdown lead somewhere. A page is that of the
+//! citing file's own package, or else its path is from the root.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -17,7 +18,9 @@ fn every_cited_section_exists() {
     for (name, text) in &files {
         for citation in citations(&unwrapped(text)) {
             seen += 1;
-            let Some(sections) = pages.get(&citation.page) else {
+            let own = name.split_once('/').map(|(package, _)| format!("{package}/{}", citation.page));
+            let own = own.and_then(|page| pages.get(&page));
+            let Some(sections) = own.or_else(|| pages.get(&citation.page)) else {
                 wrong.push(format!("{name}: there is no {}", citation.page));
                 continue;
             };
@@ -59,8 +62,14 @@ fn citations_are_read_however_they_are_written() {
     assert_eq!(cited("docs/a.md sections 2, 3 and 7"), [expect("a", &["2", "3", "7"])]);
     assert_eq!(cited("//! as docs/wire/a.md\n//! section 5 says"), [expect("wire/a", &["5"])]);
     assert_eq!(cited("docs/a.md, docs/b.md section 1"), [expect("a", &[]), expect("b", &["1"])]);
+    assert_eq!(cited("[docs/a.md section 1][a]."), [expect("a", &["1"])]);
+    let of_package = Citation { page: "proto-core/docs/a.md".to_owned(), sections: vec!["2".to_owned()] };
+    assert_eq!(cited("(proto-core/docs/a.md section 2)"), [of_package]);
     assert_eq!(cited("docs/wire/*.md, docs/wire/NAME.md"), []);
 }
+
+/// Those whose pages others cite.
+const PACKAGES_WITH_PAGES: [&str; 1] = ["proto-core/"];
 
 #[derive(Debug, PartialEq)]
 struct Citation {
@@ -69,7 +78,9 @@ struct Citation {
 }
 
 fn citations(text: &str) -> Vec<Citation> {
-    let starts = text.match_indices("docs/").map(|(at, _)| at);
+    let package = |at: usize| PACKAGES_WITH_PAGES.iter().find(|package| text[..at].ends_with(*package));
+    let starts =
+        text.match_indices("docs/").map(|(at, _)| at - package(at).map_or(0, |package| package.len()));
     starts.filter_map(|at| text.get(at..)).filter_map(citation).collect()
 }
 

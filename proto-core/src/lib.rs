@@ -1,4 +1,5 @@
 #![no_std]
+#![cfg_attr(docsrs, feature(doc_cfg))]
 #![forbid(unsafe_code)]
 #![cfg_attr(
     not(test),
@@ -17,6 +18,8 @@ extern crate std;
 
 pub mod command;
 pub mod config;
+#[cfg(doc)]
+pub mod docs;
 pub mod engine;
 pub mod image;
 pub mod link;

@@ -1,5 +1,5 @@
 //! What waited while the gateway itself slept (stopped, suspended, in a debugger) counts for nothing
-//! (docs/architecture.md section 3).
+//! (docs/engine.md section 2).
 
 mod rig;
 

@@ -1,4 +1,4 @@
-//! Whose datagrams a listening UDP link's driver answers (docs/architecture.md section 3).
+//! Whose datagrams a listening UDP link's driver answers (docs/driver.md section 5).
 
 mod rig;
 

@@ -1,5 +1,5 @@
 //! Handed over is not delivered: what the controller's TCP has not acknowledged in time ends the
-//! connection, so that nothing delivers it later (docs/architecture.md sections 7, 9).
+//! connection, so that nothing delivers it later (docs/engine.md section 5).
 
 mod rig;
 

@@ -1,5 +1,5 @@
 //! A safe value that something late seemed to show is taken back by what shows otherwise soon after
-//! (docs/architecture.md section 7).
+//! (docs/engine.md section 6).
 
 mod rig;
 

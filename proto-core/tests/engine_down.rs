@@ -1,4 +1,4 @@
-//! Controller to field: cycles, sources, staleness, half duplex (docs/architecture.md sections 6, 8).
+//! Controller to field: cycles, sources, staleness, half duplex (docs/engine.md sections 4, 8).
 
 mod rig;
 

@@ -1,5 +1,5 @@
 //! A device that is gone takes what it asked for with it, and comes back with nothing but a base
-//! (docs/architecture.md section 7).
+//! (docs/engine.md section 7).
 
 mod rig;
 

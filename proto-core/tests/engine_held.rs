@@ -1,6 +1,6 @@
 //! What a silent owner sent last, and nothing reads back, goes along in a recipe link's frame for as
-//! long as the controller has had it all along, and not to one that began anew (docs/architecture.md
-//! section 7).
+//! long as the controller has had it all along, and not to one that began anew (docs/engine.md
+//! section 5).
 
 mod rig;
 

@@ -1,5 +1,5 @@
 //! Late is judged by arrival: what waited while the driver was busy counts before deadlines pass. And
-//! old values are old, those of our own ports too (docs/architecture.md sections 3 and 8).
+//! old values are old, those of our own ports too (docs/engine.md sections 2 and 8).
 
 mod rig;
 

@@ -1,5 +1,5 @@
 //! Faults of the controller's side: each is counted, nothing is written that nobody sent, and the
-//! next good frame gets through (docs/architecture.md section 5).
+//! next good frame gets through (docs/engine.md sections 5, 9).
 
 mod rig;
 

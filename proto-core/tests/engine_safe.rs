@@ -1,4 +1,4 @@
-//! A safe value is repeated until it is known to be there (docs/architecture.md section 7).
+//! A safe value is repeated until it is known to be there (docs/engine.md section 6).
 
 mod rig;
 

@@ -1,4 +1,4 @@
-//! Rising bits that trigger a frame, when several frames come at once (docs/architecture.md section 8).
+//! Rising bits that trigger a frame, when several frames come at once (docs/engine.md section 8).
 
 mod rig;
 

@@ -1,5 +1,5 @@
 //! What cannot be read is unknown: a value that is not finite is neither shown nor written back, and
-//! the rest of its packet counts (docs/architecture.md section 4).
+//! the rest of its packet counts (docs/engine.md section 3).
 
 mod rig;
 

@@ -1,4 +1,4 @@
-//! Field to controller: what is written, when, and what never is (docs/architecture.md section 7).
+//! Field to controller: what is written, when, and what never is (docs/engine.md section 5).
 
 mod rig;
 

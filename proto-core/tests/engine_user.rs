@@ -1,5 +1,5 @@
 //! User-defined recipes on the gateway: bindings, triggers and command tables
-//! (docs/architecture.md section 8).
+//! (docs/engine.md sections 7, 8).
 
 mod rig;
 

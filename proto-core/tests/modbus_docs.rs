@@ -19,7 +19,7 @@ fn row(item: &Item) -> String {
 
 #[track_caller]
 fn assert_documents(space: Space, title: &str) {
-    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/wire/modbus.md");
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/docs/wire/modbus.md");
     let page = std::fs::read_to_string(path).unwrap();
     let section = page.split("\n## ").find(|section| section.starts_with(title)).expect(title);
     let written: Vec<&str> = section.lines().filter(|line| line.starts_with('|')).skip(2).collect();

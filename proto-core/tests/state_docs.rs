@@ -14,7 +14,7 @@ fn columns(field: &FieldPlace) -> [String; 3] {
 
 #[test]
 fn the_packet_is_documented() {
-    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/wire/state.md");
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/docs/wire/state.md");
     let page = std::fs::read_to_string(path).unwrap();
     let section = page.split("\n## ").find(|section| section.starts_with("2. The packet")).unwrap();
     let rows = section.lines().filter(|line| line.starts_with('|')).skip(2);

@@ -1,61 +1,18 @@
 //! What the core's accesses meet: the devices in virtual time, with their clocks looked after and each
 //! access noted.
 
-use std::collections::VecDeque;
-use std::fmt;
+mod blocks;
 
+use std::collections::VecDeque;
+
+use self::blocks::FOR_EVER;
+use crate::access::{Access, Violation};
 use crate::device::*;
 use crate::devices::{CAN, Devices, Id, MAP};
 use crate::exception::masks;
 use crate::models::scs::Scs;
 use crate::program::SEV;
 use crate::unicorn::{Engine, Flow, Handler, Reg, SYSTEM};
-
-/// An access to a register.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Access {
-    /// When.
-    pub at: Picos,
-    /// The beginning of the block of instructions that it is in.
-    pub pc: u32,
-    /// The peripheral's name.
-    pub peripheral: &'static str,
-    /// The register's.
-    pub register: String,
-    /// What was read or written.
-    pub value: u32,
-    /// It was written.
-    pub is_write: bool,
-    /// How often the same in a row; 0 for what the peripheral does by itself.
-    pub times: u32,
-}
-
-impl fmt::Display for Access {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { at, pc, peripheral, register, value, is_write, times } = self;
-        if *times == 0 {
-            return write!(f, "{:12.3} us  {pc:08X}  {peripheral} by itself", *at as f64 / 1e6);
-        }
-        let arrow = if *is_write { "<-" } else { "->" };
-        write!(f, "{:12.3} us  {pc:08X}  {peripheral}.{register} {arrow} {value:08X}", *at as f64 / 1e6)?;
-        if *times > 1 { write!(f, "  {times} times") } else { Ok(()) }
-    }
-}
-
-/// What the program may not do.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Violation {
-    /// The access that shows it.
-    pub access: Access,
-    /// Why not.
-    pub reason: String,
-}
-
-impl fmt::Display for Violation {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}: {}", self.access, self.reason)
-    }
-}
 
 /// Why a handler stopped the core.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -347,36 +304,6 @@ impl Board {
             self.violation.get_or_insert(Violation { access, reason });
         }
     }
-
-    /// How many instructions a block has.
-    fn count(&mut self, core: Engine, address: u32, len: u32) -> u64 {
-        let place = address.wrapping_sub(FLASH) as usize / 2;
-        if let Some(&(known, count)) = self.blocks.get(place)
-            && u32::from(known) == len
-        {
-            return count.into();
-        }
-        let mut bytes = vec![0; len as usize];
-        core.read(address, &mut bytes);
-        let mut halves = bytes.chunks_exact(2).map(|half| u16::from_le_bytes([half[0], half[1]]));
-        // `b .`, with nothing before it but what does nothing.
-        let last = bytes.rchunks_exact(2).next().map_or(0, |half| u16::from_le_bytes([half[0], half[1]]));
-        let back = 2 * (bytes.len() as u16 / 2 - 1) + 4;
-        let is_for_ever = last == 0xE000 | (0x800 - back / 2) & 0x7FF
-            && halves.clone().rev().skip(1).all(|half| half == NOP);
-        let mut count = if is_for_ever { FOR_EVER } else { 0 };
-        while let Some(half) = halves.next().filter(|_| !is_for_ever) {
-            // Three of the 32 groups have a second half (Armv7-M ARM A5.1).
-            if half >> 11 >= 0b11101 {
-                halves.next();
-            }
-            count += 1;
-        }
-        if let Some(entry) = self.blocks.get_mut(place) {
-            *entry = (len as u16, count);
-        }
-        count.into()
-    }
 }
 
 impl Handler for Board {
@@ -420,9 +347,6 @@ impl Handler for Board {
     }
 }
 
-const NOP: u16 = 0xBF00;
-/// In the place of a block's number of instructions: it jumps to itself.
-const FOR_EVER: u16 = u16::MAX;
 /// Where flash is.
 pub(crate) const FLASH: u32 = 0x0800_0000;
 /// Both banks.

@@ -7,15 +7,19 @@
 //! deadline of a device. Nothing else moves it, so a run is the same each time and everywhere. A run
 //! that keeps pace with the clock on the wall is made of short ones ([`crate::realtime`]).
 
+mod flash;
+mod log;
+
 use defmt_decoder::StreamDecoder;
 
-use crate::board::{Access, Board, FLASH, FLASH_SIZE, Halt, Violation};
+use self::flash::is_flash;
+use crate::access::{Access, Violation};
+use crate::board::{Board, FLASH, FLASH_SIZE, Halt};
 use crate::device::*;
 use crate::devices::Devices;
 use crate::exception::{enter, is_return, leave, masks};
-use crate::models::flash::WORD;
 use crate::models::scs::HARD_FAULT;
-use crate::program::{Program, texts};
+use crate::program::Program;
 use crate::unicorn::{Core, Engine, Exit, MMIO, Reg};
 
 /// Where the configuration image is.
@@ -276,69 +280,6 @@ impl Chip {
         }
     }
 
-    /// Whether a page of flash has words that cannot be read.
-    fn has_torn(&self, address: u32) -> bool {
-        let offset = page(address).wrapping_sub(FLASH);
-        self.board.devices.flash.torn().any(|word| page(word) == offset)
-    }
-
-    /// Flash is not for writing, and a page with a torn word not for reading.
-    fn close_page(&self, address: u32) -> Result<(), String> {
-        if self.has_torn(address) {
-            self.core.guard(page(address), PAGE, true)
-        } else {
-            self.core.close_flash(page(address), PAGE)
-        }
-    }
-
-    /// Executes one instruction with a page of flash open.
-    fn step_in_page(&mut self, address: u32) {
-        self.core.guard(page(address), PAGE, false).expect("there is flash");
-        // What was translated before knows nothing of stopping behind one instruction.
-        self.core.forget(self.pc, 4);
-        self.board.is_forced = true;
-        self.core.run_one(self.pc, &mut self.board);
-        self.board.is_forced = false;
-        self.pc = self.engine().reg(Reg::Pc);
-        // Only with the end of the work the cells change.
-        let place = (page(address) - FLASH) as usize;
-        let cells = &self.board.devices.flash.cells()[place..place + PAGE as usize];
-        self.engine().write(page(address), cells);
-        self.close_page(address).expect("there is flash");
-    }
-
-    /// A read of a page with a torn word: of that word it is a bus fault, unless those are held back.
-    fn read_torn(&mut self, address: u32) {
-        let word = (address - FLASH) & !(WORD - 1);
-        if self.board.devices.flash.torn().any(|torn| torn == word) {
-            if !self.board.scs.ignores_bus_faults(masks(self.engine())) {
-                self.fault(PRECISE_BUS, address);
-                return;
-            }
-            self.board.scs.note_fault(PRECISE_BUS, address, false);
-        }
-        self.step_in_page(address);
-    }
-
-    /// A write to flash: the instruction is executed, but its cells take what the model lets them.
-    fn program_flash(&mut self, address: u32, (value, size): (u32, u32)) {
-        let bytes = &value.to_le_bytes()[..size as usize];
-        self.board.program_flash(self.pc, address - FLASH, bytes);
-        self.step_in_page(address);
-    }
-
-    /// Memory shows what flash's cells hold since the last erase or write.
-    fn follow_flash(&mut self) {
-        for (offset, len) in self.board.devices.flash.take_changed() {
-            let cells = &self.board.devices.flash.cells()[offset as usize..][..len as usize];
-            self.core.engine().write(FLASH + offset, cells);
-            self.core.forget(FLASH + offset, len);
-            for address in (FLASH + offset..FLASH + offset + len).step_by(PAGE as usize) {
-                self.close_page(address).expect("there is flash");
-            }
-        }
-    }
-
     fn take(&mut self, number: u16, return_address: u32) {
         self.pc = enter(self.core.engine(), &mut self.board.scs, number, return_address);
         self.board.guard_changed = true;
@@ -414,44 +355,10 @@ impl Chip {
         self.start(&ram).expect("it has started before");
         self.decoder = self.program.log_reader();
     }
-
-    /// What the debugger reads of the log: the ring of the first channel (SEGGER's RTT).
-    fn read_log(&mut self) {
-        let engine = self.core.engine();
-        let Some(channel) = self.program.rtt.map(|address| address + 24) else { return };
-        let mut words = [0; 16];
-        engine.read(channel + 4, &mut words);
-        let word = |index: usize| u32::from_le_bytes(words[4 * index..][..4].try_into().expect("four"));
-        let (buffer, size, write, read) = (word(0), word(1), word(2), word(3));
-        let is_ring = buffer >= RAM[1].0 && size <= 0x1_0000 && write < size && read < size;
-        if !is_ring || write == read {
-            return;
-        }
-        let mut bytes = vec![0; size as usize];
-        engine.read(buffer, &mut bytes);
-        bytes.rotate_left(read as usize);
-        bytes.truncate(((write + size - read) % size) as usize);
-        engine.write(channel + 16, &write.to_le_bytes());
-        if let Some(decoder) = &mut self.decoder {
-            let now = self.board.now;
-            self.log.extend(texts(decoder.as_mut(), &bytes).into_iter().map(|text| (now, text)));
-        }
-    }
 }
 
 /// The log is read at least each so many steps.
 const LOG_PERIOD: u32 = 16;
-/// What memory is opened and closed by.
-const PAGE: u32 = 0x1000;
-
-fn page(address: u32) -> u32 {
-    address & !(PAGE - 1)
-}
-
-fn is_flash(address: u32) -> bool {
-    (FLASH..FLASH + FLASH_SIZE).contains(&address)
-}
-
 /// Of CFSR: an instruction that there is not.
 const UNDEFINED: u32 = 1 << 16;
 /// A precise bus fault, with its address.

@@ -7,6 +7,8 @@
 //! not know, ends the run with its place.
 
 #[cfg(feature = "emulator")]
+mod access;
+#[cfg(feature = "emulator")]
 mod board;
 #[cfg(feature = "emulator")]
 mod chip;
@@ -24,7 +26,7 @@ pub mod realtime;
 pub mod unicorn;
 
 #[cfg(feature = "emulator")]
-pub use board::{Access, Violation};
+pub use access::{Access, Violation};
 #[cfg(feature = "emulator")]
 pub use chip::{CONFIG, Chip, Stopped};
 #[cfg(feature = "emulator")]

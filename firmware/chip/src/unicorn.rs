@@ -1,4 +1,4 @@
-//! The binding to Unicorn, which emulates the instructions of a Cortex-M7: the only file with `unsafe`.
+//! The binding to Unicorn, which emulates the instructions of a Cortex-M7: nothing but this module has `unsafe`.
 //!
 //! In: memory, registers, and a [`Handler`] that hears of accesses to devices, of the blocks of
 //! instructions that begin, and of the places that are watched. Out: why the core stopped. It knows no
@@ -8,12 +8,15 @@
 //! shipped links it. Names and numbers are those of unicorn/unicorn.h and unicorn/arm.h, 2.1.4.
 //! Hooks on memory are not used: with them that version executes loads in IT blocks wrongly.
 
-use std::cell::Cell;
-use std::ffi::{OsString, c_int, c_void};
-use std::ptr::null_mut;
-use std::sync::OnceLock;
+mod callbacks;
+mod library;
 
-use libloading::Library;
+use std::cell::Cell;
+use std::ffi::{c_int, c_void};
+use std::ptr::null_mut;
+
+use self::callbacks::{on_bad_memory, on_block, on_exception, on_read, on_watched, on_write};
+use self::library::{Api, OnCode, OnException, OnMemory, OnRead, OnWrite, Uc, api};
 
 /// Says where the library is.
 pub const LIBRARY: &str = "CHIP_UNICORN";
@@ -84,63 +87,7 @@ pub enum Reg {
     Faultmask = 126,
 }
 
-type Uc = *mut c_void;
 type Mmio = [usize; 2];
-
-/// The functions of the library. It is never unloaded, so they are always there.
-struct Api {
-    open: unsafe extern "C" fn(c_int, c_int, *mut Uc) -> c_int,
-    close: unsafe extern "C" fn(Uc) -> c_int,
-    ctl: unsafe extern "C" fn(Uc, c_int, ...) -> c_int,
-    map: unsafe extern "C" fn(Uc, u64, u64, u32) -> c_int,
-    protect: unsafe extern "C" fn(Uc, u64, u64, u32) -> c_int,
-    read: unsafe extern "C" fn(Uc, u64, *mut u8, u64) -> c_int,
-    write: unsafe extern "C" fn(Uc, u64, *const u8, u64) -> c_int,
-    mmio: unsafe extern "C" fn(Uc, u64, u64, OnRead, *mut c_void, OnWrite, *mut c_void) -> c_int,
-    hook: unsafe extern "C" fn(Uc, *mut usize, c_int, *mut c_void, *mut c_void, u64, u64, ...) -> c_int,
-    reg_read: unsafe extern "C" fn(Uc, c_int, *mut c_void) -> c_int,
-    reg_write: unsafe extern "C" fn(Uc, c_int, *const c_void) -> c_int,
-    start: unsafe extern "C" fn(Uc, u64, u64, u64, usize) -> c_int,
-    stop: unsafe extern "C" fn(Uc) -> c_int,
-}
-
-type OnRead = extern "C" fn(Uc, u64, u32, *mut c_void) -> u64;
-type OnWrite = extern "C" fn(Uc, u64, u32, u64, *mut c_void);
-type OnCode = extern "C" fn(Uc, u64, u32, *mut c_void);
-type OnException = extern "C" fn(Uc, u32, *mut c_void);
-type OnMemory = extern "C" fn(Uc, c_int, u64, c_int, i64, *mut c_void) -> bool;
-
-impl Api {
-    fn load() -> Result<Self, String> {
-        let path: OsString = std::env::var_os(LIBRARY)
-            .ok_or_else(|| format!("{LIBRARY} does not say where libunicorn.so.2 is (docs/chip.md)"))?;
-        // SAFETY: the library's initialisers touch nothing of ours.
-        let library = unsafe { Library::new(&path) };
-        let library = library.map_err(|error| format!("{}: {error}", path.display()))?;
-        macro_rules! symbols {
-            ($($field:ident = $name:literal),* $(,)?) => {
-                Self { $($field: {
-                    // SAFETY: the declaration of this function in unicorn.h.
-                    let symbol = unsafe { library.get($name) };
-                    *symbol.map_err(|error| error.to_string())?
-                }),* }
-            };
-        }
-        let api = symbols! {
-            open = b"uc_open", close = b"uc_close", ctl = b"uc_ctl", map = b"uc_mem_map",
-            protect = b"uc_mem_protect", read = b"uc_mem_read", write = b"uc_mem_write",
-            mmio = b"uc_mmio_map", hook = b"uc_hook_add", reg_read = b"uc_reg_read",
-            reg_write = b"uc_reg_write", start = b"uc_emu_start", stop = b"uc_emu_stop",
-        };
-        std::mem::forget(library);
-        Ok(api)
-    }
-}
-
-fn api() -> Result<&'static Api, String> {
-    static API: OnceLock<Result<Api, String>> = OnceLock::new();
-    API.get_or_init(Api::load).as_ref().map_err(Clone::clone)
-}
 
 /// The core's registers and memory, for a handler too.
 #[derive(Clone, Copy)]
@@ -393,76 +340,6 @@ impl Drop for Core {
 
 fn checked(what: &str, status: c_int) -> Result<(), String> {
     if status == 0 { Ok(()) } else { Err(format!("{what}: error {status}")) }
-}
-
-/// Calls the handler of the run that is going on.
-fn with<T>(
-    uc: Uc,
-    user: *mut c_void,
-    call: impl FnOnce(&mut dyn Handler, Engine, &Shared) -> T,
-) -> Option<T> {
-    // SAFETY: `user` is the core's `shared`, which lives as long as the engine.
-    let shared = unsafe { &*user.cast::<Shared>() };
-    let handler = shared.handler.get()?;
-    // SAFETY: it was lent to `run`, which has not returned; callbacks do not nest.
-    let handler = unsafe { &mut *handler };
-    Some(call(handler, Engine { api: shared.api, uc }, shared))
-}
-
-fn follow(engine: Engine, flow: Flow) {
-    if flow == Flow::Stop {
-        engine.stop();
-    }
-}
-
-extern "C" fn on_read<const BASE: u32>(uc: Uc, offset: u64, size: u32, user: *mut c_void) -> u64 {
-    let value = with(uc, user, |handler, engine, _| handler.read(engine, BASE + offset as u32, size));
-    u64::from(value.unwrap_or(0))
-}
-
-extern "C" fn on_write<const BASE: u32>(uc: Uc, offset: u64, size: u32, value: u64, user: *mut c_void) {
-    with(uc, user, |handler, engine, _| {
-        handler.write(engine, BASE + offset as u32, value as u32, size);
-    });
-}
-
-extern "C" fn on_block(uc: Uc, address: u64, size: u32, user: *mut c_void) {
-    with(uc, user, |handler, engine, _| {
-        let flow = handler.block(engine, address as u32, size);
-        follow(engine, flow);
-    });
-}
-
-extern "C" fn on_watched(uc: Uc, address: u64, _size: u32, user: *mut c_void) {
-    with(uc, user, |handler, engine, _| {
-        let flow = handler.watched(engine, address as u32);
-        follow(engine, flow);
-    });
-}
-
-extern "C" fn on_exception(uc: Uc, number: u32, user: *mut c_void) {
-    with(uc, user, |_, engine, shared| {
-        shared.exit.set(Some(Exit::Exception(number)));
-        engine.stop();
-    });
-}
-
-extern "C" fn on_bad_memory(
-    uc: Uc,
-    access: c_int,
-    address: u64,
-    size: c_int,
-    value: i64,
-    user: *mut c_void,
-) -> bool {
-    const FETCHES: [c_int; 2] = [21, 24];
-    const WRITES: [c_int; 2] = [20, 22];
-    with(uc, user, |_, _, shared| {
-        let is_fetch = FETCHES.contains(&access);
-        let written = WRITES.contains(&access).then_some((value as u32, size as u32));
-        shared.exit.set(Some(Exit::Memory { address: address as u32, is_fetch, written }));
-    });
-    false
 }
 
 /// Where the chip's peripherals begin.

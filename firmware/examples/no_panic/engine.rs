@@ -2,7 +2,7 @@
 
 use core::hint::black_box;
 
-use firmware::gateway::Engine;
+use firmware::tasks::gateway::Engine;
 use proto_core::config::GatewayConfig;
 use proto_core::engine::{Input, LinkId, OUTPUT_BUFFER, PortId};
 use proto_core::image::{GroupId, Image, InputSet, VarSet, bind_to_variable, saturate_to_field};

@@ -2,7 +2,7 @@
 //! device, a peer or a file sent is called with values that the compiler knows nothing about, and
 //! whose panic handler needs a symbol that does not exist. It links only when the optimiser has removed
 //! every panic. `.ci/run` builds it as the firmware is built, and prints how much stack each of these
-//! functions takes (docs/architecture.md section 11).
+//! functions takes (docs/architecture.md section 4).
 //!
 //! It is never run on a board. On a host the same calls are made once, which shows little.
 #![cfg_attr(target_os = "none", no_std, no_main)]

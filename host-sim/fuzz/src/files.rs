@@ -1,69 +1,16 @@
 //! A file, damaged or not, and `--set` overrides: one line says what is wrong, or the configuration
 //! is one that an engine and a board can take (docs/configuration.md).
 
-use host_sim::config::SimConfig;
-use host_sim::config::file::{
-    Config, FileError, Text, parse, parse_controller, parse_gateway, parse_recipes,
-};
 use proto_core::config::GatewayConfig;
 use proto_core::config::image::{MAX_IMAGE, decode, encode};
 use proto_core::engine::{BuildError, Engine};
 use proto_core_fuzz::source::Source;
+use recipe_config::SimConfig;
+use recipe_config::file::{Config, FileError, Text, parse, parse_controller, parse_gateway, parse_recipes};
+use recipe_test_kit::toml::PIECES;
 use toml::{Table, Value};
 
 const NAME: &str = "fuzz.toml";
-
-/// Pieces that mean something to a configuration file, and some that mean trouble.
-const PIECES: [&str; 48] = [
-    "[",
-    "]",
-    "[[",
-    "{",
-    "}",
-    "=",
-    ",",
-    "\n",
-    "\"",
-    "'''",
-    "0",
-    "-1",
-    "1e308",
-    "nan",
-    "inf",
-    "0x1FFFFFFF",
-    "99999999999999999999",
-    "true",
-    "é",
-    "\u{0}",
-    "..",
-    "RobotState[1..32]",
-    "ForceEnd[1]",
-    "__RobotState_8",
-    "head = [1]",
-    "fields = []",
-    "[[port]]\n",
-    "[[recipe]]\n",
-    "\"rising:BitOutputReg[3].7\"",
-    "1979-05-27",
-    "name = \"\"",
-    "\"a\\nb\" = 1",
-    "name = \"a\\nb\"",
-    "type = \"double\"",
-    "extended = true",
-    "value = 1.5",
-    "{ 1 = \"stop\" }",
-    "bus = \"can\"",
-    "mode = \"user\"",
-    "cycle_ms = 5",
-    "baud = 9600",
-    "\u{7F}",
-    "\u{85}",
-    "on_timeout = { \"DI[1]\" = 1 }",
-    "to = \"WordInputReg[1]\"",
-    "from = \"counter\"",
-    "send = \"frame\"",
-    "#",
-];
 
 /// What overrides say.
 const VALUES: [&str; 24] = [

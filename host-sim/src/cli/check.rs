@@ -11,9 +11,9 @@ use proto_core::sysvar::{Direction, SysVar};
 use proto_core::time::Duration;
 
 use super::{Overrides, plan, text};
-use crate::config::file::{self, Config, FileError};
-use crate::config::{SimBus, SimConfig, SimField, SimParts, SimPort, SimRecipe, SimStreamPart};
-use crate::controller::{BuildError, Controller};
+use recipe_config::file::{self, Config, FileError};
+use recipe_config::{SimBus, SimConfig, SimField, SimParts, SimPort, SimRecipe, SimStreamPart};
+use recipe_controller::{BuildError, Controller};
 
 /// What `check` is told.
 #[derive(Debug, Args)]
@@ -71,8 +71,9 @@ fn check_build(path: &Path, overrides: &[String], config: &SimConfig) -> Result<
         BuildError::Program { program, error } => at(&["program", program, "script"], error),
         BuildError::Initial { target, reason } => at(&["initial", &target.to_string()], reason),
         BuildError::Port { port, error } => at(&["port", port, "recipe"], error),
-        BuildError::Dialect(_) => at(&["robot", "dialect"], &error),
         BuildError::SecondUdpServer { port } => at(&["port", port], &error),
+        BuildError::Dialect(_) => at(&["robot", "dialect"], &error),
+        _ => at(&["robot"], &error),
     })
 }
 

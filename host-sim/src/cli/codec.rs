@@ -7,7 +7,7 @@ use proto_core::recipe::{CanFrame, CanLayout, StreamLayout};
 use proto_core::sysvar::{Direction, SysVar};
 use proto_core::wire::scalar::{Scalar, ScalarType};
 
-use crate::config::{SimField, SimParts, SimRecipe};
+use recipe_config::{SimField, SimParts, SimRecipe};
 
 /// A compiled part.
 #[derive(Debug)]

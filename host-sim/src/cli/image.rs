@@ -9,7 +9,7 @@ use clap::Args;
 use proto_core::config::image;
 
 use super::{Outcome, Overrides, check};
-use crate::files::{Beside, Identity};
+use recipe_device::files::{Beside, Identity};
 
 /// What `image` is told.
 #[derive(Debug, Args)]

@@ -21,10 +21,10 @@ use std::time::Duration;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use proto_core::sysvar::Direction;
 
-use crate::bus::bind::Bind;
-use crate::config::file;
-use crate::out::{Out, Printed, tell};
-use crate::shell::{self, ReadyFile, RunOptions, StartError};
+use recipe_config::file;
+use recipe_device::bind::Bind;
+use recipe_shell::out::{Out, Printed, tell};
+use recipe_shell::{self as shell, ReadyFile, RunOptions, StartError};
 
 /// Everything that can be typed.
 #[derive(Debug, Parser)]

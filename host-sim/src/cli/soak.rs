@@ -14,9 +14,9 @@ use proto_core::time::Duration;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
 use super::wrong;
-use crate::cell::Cell;
-use crate::out::tell;
-use crate::soak::{Batch, Level, Progress, Scenario, Soak, Total, show_trace};
+use recipe_cell::Cell;
+use recipe_cell::soak::{Batch, Level, Progress, Scenario, Soak, Total, show_trace};
+use recipe_shell::out::tell;
 
 pub(super) const EXAMPLES: &str = "\
 Runs the gateway's engine against the simulated controller in virtual time: devices

@@ -12,9 +12,9 @@ use proto_core::modbus::pdu::{Request, Response};
 use serde_json::Value;
 
 use super::device::{Line, PATIENCE};
-use crate::bus::bind::Bind;
-use crate::config::file::{self, Text};
-use crate::shell::{self, Handle};
+use recipe_config::file::{self, Text};
+use recipe_device::bind::Bind;
+use recipe_shell::{self as shell, Handle};
 
 /// An example file, embedded.
 #[derive(Clone, Copy)]

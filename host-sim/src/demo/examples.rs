@@ -1,4 +1,4 @@
-//! The specification's six worked examples (docs/wire/recipes.md section 8), each against the
+//! The specification's six worked examples (proto-core/docs/wire/recipes.md section 8), each against the
 //! simulated controller's own ports and, for what a gateway bridges, through the gateway.
 
 use std::io;

@@ -13,9 +13,9 @@ use std::io;
 use std::process::ExitCode;
 use std::time::Instant;
 
-use crate::out::tell;
-use crate::shell::Signals;
 use folder::Folder;
+use recipe_shell::Signals;
+use recipe_shell::out::tell;
 use show::Show;
 
 /// Runs the cell and prints what it does, until nobody reads it; success only when every example passes

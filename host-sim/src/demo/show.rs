@@ -8,7 +8,7 @@ use std::process::ExitCode;
 use anstream::AutoStream;
 use anstyle::{AnsiColor, Style};
 
-use crate::out::Out;
+use recipe_shell::out::Out;
 
 const HEADING: Style = Style::new().bold();
 const QUIET: Style = Style::new().dimmed();

@@ -4,8 +4,10 @@ use std::io::{Read, Write};
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::time::Duration;
 
+use recipe_test_kit::HostSim;
+
 use crate::attack::{self, Attack, Ports};
-use crate::process::{Process, host_sim};
+use crate::process::host_sim;
 use crate::witness::{Witnesses, connect};
 use crate::{ATTACK, QUIET, Scene, alone, in_some_stretch};
 
@@ -14,8 +16,8 @@ const READ_ONE: &[u8] = &[9, 9, 0, 0, 0, 6, 1, 3, 0, 1, 0, 1];
 const READ_ONE_ANSWER: &[u8] = &[9, 9, 0, 0, 0, 5, 1, 3, 2, 0, 6];
 
 /// A controller with servers and ports of every kind.
-pub(crate) fn controller(to: SocketAddr) -> Process {
-    Process::start(
+pub(crate) fn controller(to: SocketAddr) -> HostSim {
+    HostSim::start(
         host_sim("controller", "robot.toml")
             .args(["--bind=rs485=tcp-listen:127.0.0.1:0", "--bind=can=slcan-tcp:127.0.0.1:0"])
             .arg(format!("--set=port.tcp1.to={to}")),
@@ -23,7 +25,7 @@ pub(crate) fn controller(to: SocketAddr) -> Process {
 }
 
 /// Somebody at each of its servers.
-pub(crate) fn clients(process: &Process, witnesses: &mut Witnesses) {
+pub(crate) fn clients(process: &HostSim, witnesses: &mut Witnesses) {
     witnesses.udp2011(process.at("udp2011"));
     witnesses.state(process.at("state"));
     witnesses.asks("command", process.at("command"), b"state\n", b"6:0:5:2");
@@ -31,7 +33,7 @@ pub(crate) fn clients(process: &Process, witnesses: &mut Witnesses) {
 }
 
 /// A bit of everything.
-pub(crate) fn everything(process: &Process) -> Vec<Attack> {
+pub(crate) fn everything(process: &HostSim) -> Vec<Attack> {
     vec![
         attack::scan(process.at("command")),
         attack::hoard(process.at("state"), 10),

@@ -3,19 +3,21 @@
 use std::net::{Ipv4Addr, SocketAddr};
 use std::time::Duration;
 
+use recipe_test_kit::{HostSim, free_servers};
+
 use crate::attack::{self, Attack, Hold, Ports};
-use crate::process::{Process, host_sim};
+use crate::process::host_sim;
 use crate::witness::Witnesses;
 use crate::{Scene, alone};
 
 /// A gateway with ports of every kind, and its controller, which connects to it.
-pub(crate) fn gateway(arguments: &[&str]) -> (Process, Process) {
+pub(crate) fn gateway(arguments: &[&str]) -> (HostSim, HostSim) {
     let given = |key: &str| arguments.iter().any(|argument| argument.contains(key));
     // The controller's other servers have to be there before the gateway is.
     let mut command = host_sim("controller", "../../configs/client-controller.toml");
-    let free = ["command", "state", "modbus", "udp2011"].map(|port| format!("--set=listen.{port}=0"));
+    let free = free_servers();
     let ways = reserve();
-    let robot = Process::start(
+    let robot = HostSim::start(
         command
             .args(free)
             .arg(format!("--set=port.tcp1.to={}", ways[0]))
@@ -33,17 +35,17 @@ pub(crate) fn gateway(arguments: &[&str]) -> (Process, Process) {
             command.arg(format!("--bind={port}={device}"));
         }
     }
-    (Process::start(&mut command), robot)
+    (HostSim::start(&mut command), robot)
 }
 
 /// A device at the first line and one on the bus.
-pub(crate) fn devices(process: &Process, witnesses: &mut Witnesses) {
+pub(crate) fn devices(process: &HostSim, witnesses: &mut Witnesses) {
     witnesses.field("field", process.at("ports/rs485-1"), &[0xFF, 0xFF, 1, 0xEE, 0xEE], 28, &[0xFF, 0xFF]);
     witnesses.slcan("can", process.at("ports/can-1"), b"t0028");
 }
 
 /// A bit of everything.
-pub(crate) fn everything(process: &Process) -> Vec<Attack> {
+pub(crate) fn everything(process: &HostSim) -> Vec<Attack> {
     vec![
         attack::scan(process.at("ports/up")),
         attack::hoard(process.at("ports/rs485-1"), 10),
@@ -54,7 +56,7 @@ pub(crate) fn everything(process: &Process) -> Vec<Attack> {
     ]
 }
 
-fn cell(arguments: &[&str]) -> (Scene, Process) {
+fn cell(arguments: &[&str]) -> (Scene, HostSim) {
     let alone = alone();
     let (process, robot) = gateway(arguments);
     let mut witnesses = Witnesses::default();

@@ -6,16 +6,17 @@ use std::net::TcpStream;
 use std::process::Stdio;
 use std::time::Duration;
 
+use recipe_test_kit::HostSim;
 use rustix::process::Signal;
 
-use crate::process::{Process, host_sim};
+use crate::process::{host_sim, usage};
 use crate::witness::{Witnesses, connect};
 use crate::{MOST_GROWTH_KIB, alone, attack, in_some_stretch, within_bounds};
 
 const ROBOT: [&str; 2] = ["--bind=rs485=tcp-listen:127.0.0.1:0", "--bind=can=slcan-tcp:127.0.0.1:0"];
 
 /// Whether somebody is served at port 2000.
-fn answers(process: &Process) -> Option<TcpStream> {
+fn answers(process: &HostSim) -> Option<TcpStream> {
     let mut stream = connect(process.at("command"));
     let mut answer = [0; 7];
     std::io::Write::write_all(&mut stream, b"state\n").ok()?;
@@ -30,22 +31,21 @@ fn out_of_descriptors_those_that_are_in_go_on_and_others_come_when_there_is_room
     let inner = host_sim("controller", "robot.toml");
     command.args(["-c", "ulimit -n 48; exec \"$0\" \"$@\""]).arg(inner.get_program()).args(inner.get_args());
     command.args(ROBOT).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
-    let mut process = Process::start(&mut command);
+    let mut process = HostSim::start(&mut command);
     let mut witnesses = Witnesses::default();
     witnesses.udp2011(process.at("udp2011"));
     witnesses.state(process.at("state"));
     witnesses.lap(Duration::from_millis(100));
     let quiet = witnesses.lap(Duration::from_millis(500));
     let hoard = attack::hoard(process.at("modbus"), 100);
-    process.stats_when(|stats| stats["connections"]["accept_failures"].as_u64() > Some(3));
+    process.next_stats(|stats| stats["connections"]["accept_failures"].as_u64() > Some(3));
     in_some_stretch(|| witnesses.lap(Duration::from_millis(500)).is_like(&quiet));
     drop(hoard);
-    process.stats_when(|stats| stats["modbus"]["open"] == 0);
+    process.next_stats(|stats| stats["modbus"]["open"] == 0);
     assert!(answers(&process).is_some());
     drop(witnesses);
-    process.signal(Signal::TERM);
-    assert!(process.ended().success());
-    let said = process.said();
+    process.end_by(Signal::TERM);
+    let said = process.all_errors();
     assert!(said.contains("could not be taken"), "{said}");
     assert!(said.lines().count() < 20, "a line for each:\n{said}");
     drop(alone);
@@ -59,7 +59,7 @@ fn a_reader_that_does_not_read_keeps_nothing_from_going_on() {
     command.args(ROBOT).arg("-vv").stderr(Stdio::piped());
     let file = tempfile::NamedTempFile::new().unwrap();
     command.arg("--ready").arg(file.path());
-    let mut process = Process::unread(&mut command, file.path());
+    let mut process = HostSim::unread(&mut command, file.path());
     let mut witnesses = Witnesses::default();
     witnesses.udp2011(process.at("udp2011"));
     witnesses.state(process.at("state"));
@@ -73,14 +73,13 @@ fn a_reader_that_does_not_read_keeps_nothing_from_going_on() {
     in_some_stretch(|| witnesses.lap(Duration::from_millis(500)).is_like(&quiet));
     drop(scan);
     in_some_stretch(|| {
-        let before = process.usage();
+        let before = usage(&process);
         witnesses.lap(Duration::from_millis(500));
-        let after = process.usage();
+        let after = usage(&process);
         within_bounds(&after);
         let flat = after.rss_kib <= before.rss_kib + MOST_GROWTH_KIB;
         if flat { Ok(()) } else { Err(format!("{before:?} grew to {after:?}")) }
     });
     drop(witnesses);
-    process.signal(Signal::INT);
-    assert!(process.ended().success());
+    process.end_by(Signal::INT);
 }

@@ -16,7 +16,8 @@ use std::time::Duration;
 use serde_json::Value;
 
 use attack::Attack;
-use process::{Process, Usage};
+use process::{Usage, usage};
+use recipe_test_kit::HostSim;
 use witness::{Lap, Witnesses};
 
 /// One attack at a time: they would be each other's disturbance.
@@ -28,14 +29,14 @@ fn alone() -> MutexGuard<'static, ()> {
 
 /// A process, those that depend on it, and what they got while nobody did them harm.
 struct Scene {
-    process: Process,
+    process: HostSim,
     witnesses: Witnesses,
     quiet: Lap,
     _alone: MutexGuard<'static, ()>,
 }
 
 impl Scene {
-    fn new(alone: MutexGuard<'static, ()>, process: Process, witnesses: Witnesses) -> Self {
+    fn new(alone: MutexGuard<'static, ()>, process: HostSim, witnesses: Witnesses) -> Self {
         // What comes first is the beginning's: connections, first answers.
         witnesses.lap(Duration::from_millis(50));
         let quiet = witnesses.lap(QUIET);
@@ -56,9 +57,9 @@ impl Scene {
         self.witnesses.lap(WARM_UP);
         let mut quiet = None;
         in_some_stretch(|| {
-            let before = self.process.usage();
+            let before = usage(&self.process);
             let lap = self.witnesses.lap(ATTACK);
-            let after = self.process.usage();
+            let after = usage(&self.process);
             let done: Vec<_> = attacks.iter().map(Attack::done).collect();
             // Seen when the test fails, or with --nocapture.
             println!("quiet  {}\nattack {lap}\n{before:?}\n{after:?}\ndone {done:?}", self.quiet);
@@ -77,7 +78,7 @@ impl Scene {
                 self.witnesses.lap(WARM_UP);
             })
         });
-        let stats = self.process.stats();
+        let stats = self.process.fresh();
         drop(self.witnesses);
         self.process.end();
         drop(attacks);
@@ -111,10 +112,10 @@ fn everything_at_once_for_a_long_time() {
     gateway_side::devices(&gateway, &mut witnesses);
     witnesses.lap(QUIET);
     let quiet = witnesses.lap(Duration::from_secs(5));
-    println!("quiet {quiet}\n{:?}\n{:?}", robot.usage(), gateway.usage());
+    println!("quiet {quiet}\n{:?}\n{:?}", usage(&robot), usage(&gateway));
     let mut attacks = controller_side::everything(&robot);
     attacks.extend(gateway_side::everything(&gateway));
-    let usage = || [robot.usage(), gateway.usage()];
+    let usage = || [usage(&robot), usage(&gateway)];
     let mut first = None;
     for minute in 1..=minutes {
         let lap = witnesses.lap(Duration::from_secs(60));
@@ -129,8 +130,8 @@ fn everything_at_once_for_a_long_time() {
     println!(
         "{:?}\n{}\n{}",
         attacks.iter().map(Attack::done).collect::<Vec<_>>(),
-        robot.stats(),
-        gateway.stats()
+        robot.fresh(),
+        gateway.fresh()
     );
     drop(witnesses);
     robot.end();

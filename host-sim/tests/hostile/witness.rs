@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use crate::process::PATIENCE;
+use recipe_test_kit::PATIENCE;
 
 /// What one client got so far.
 #[derive(Default)]

@@ -2,17 +2,16 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, OnceLock, RwLock, mpsc};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use libtest_mimic::Failed;
+use recipe_test_kit::example;
 
 use super::environment::{Environment, Gateway, Plan};
 use super::namespace::Namespace;
 use super::program::Running;
 use super::robot::{Robot, RobotPlan};
 
-/// Longest wait for anything, far above what a busy machine needs.
-pub(crate) const PATIENCE: Duration = Duration::from_secs(20);
 /// How long a scenario may take.
 const LIMIT: Duration = Duration::from_secs(90);
 /// Lines of each log that are shown of a case that failed.
@@ -96,24 +95,6 @@ impl Case {
     #[track_caller]
     pub(crate) fn cell(&self, file: &str, robot: &Robot) -> Box<dyn Gateway> {
         self.gateway(file).robot(robot).start()
-    }
-}
-
-/// An example file.
-fn example(name: &str) -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("configs").join(name)
-}
-
-/// Looks again and again until there is something.
-#[track_caller]
-pub(crate) fn until<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
-    let deadline = Instant::now() + PATIENCE;
-    loop {
-        if let Some(found) = look() {
-            return found;
-        }
-        assert!(Instant::now() < deadline, "not within {PATIENCE:?}: {what}");
-        std::thread::sleep(Duration::from_millis(5));
     }
 }
 

@@ -4,7 +4,10 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use super::case::{Case, Scenario, until};
+use recipe_test_kit::toml;
+use recipe_test_kit::until;
+
+use super::case::{Case, Scenario};
 use super::environment::{Cable, Gateway, Link, Plan};
 use super::field::Line;
 use super::network::{Filter, Network, Pass};
@@ -26,29 +29,9 @@ pub(crate) fn all() -> Vec<Scenario> {
 }
 
 /// A panel: an order that acts when it changes, and DO1 to DO8, of which DO8 says that nobody is there.
-const PANEL: &str = r#"
-[controller]
-address = "127.0.0.1"
-
-[[recipe]]
-name = "panel"
-kind = "stream"
-mode = "user"
-[recipe.input]
-head = [255, 255]
-tail = [238, 238]
-fields = [
-    { name = "order", type = "byte", commands = { 1 = "run(endless.jspf)", 9 = "stop" } },
-    { name = "outputs", type = "byte", to = "DigitalOutputCommand[1]" },
-]
-
-[[port]]
-name = "panel"
-bus = "rs485"
-recipe = "panel"
-timeout_ms = 1000
-on_timeout = { "DigitalOutputCommand[1]" = 0x80 }
-"#;
+fn panel() -> String {
+    toml::panel(r#"1 = "run(endless.jspf)", 9 = "stop""#, 1_000)
+}
 
 /// A controller with a program that nobody can overlook, once it was started.
 const ENDLESS: &str = r#"
@@ -94,10 +77,10 @@ fn hold(panel: &mut Line, frame: &[u8], time: Duration, mut meanwhile: impl FnMu
 #[track_caller]
 fn start(panel: &mut Line, gateway: &mut dyn Gateway, robot: &Robot) {
     // The first frame only sets the base.
-    let frames = gateway.port("panel").frames_in;
+    let frames = gateway.port("device").frames_in;
     until("the base is taken", || {
         panel.send(&order(NOTHING, 0));
-        (gateway.port("panel").frames_in > frames).then_some(())
+        (gateway.port("device").frames_in > frames).then_some(())
     });
     until("the program runs", || {
         panel.send(&order(RUN, 0));
@@ -110,9 +93,9 @@ fn start(panel: &mut Line, gateway: &mut dyn Gateway, robot: &Robot) {
 fn late_start(case: &Case, out: Duration, watched: Duration) {
     const PRESSED: Duration = Duration::from_millis(200);
     let robot = case.robot_of(ENDLESS).start();
-    let mut gateway = case.gateway_of(PANEL).robot(&robot).with_cable().start();
+    let mut gateway = case.gateway_of(&panel()).robot(&robot).with_cable().start();
     gateway.until_up(Link::Command, 1);
-    let mut panel = gateway.line("panel");
+    let mut panel = gateway.line("device");
     // Known to be there, and the link to be in use.
     start(&mut panel, &mut *gateway, &robot);
     until("the program ends", || {
@@ -143,10 +126,10 @@ fn asleep(case: &Case) {
     const DO1: u8 = 1;
     const BEFORE: u8 = 2;
     let robot = case.robot_of(ENDLESS).start();
-    let mut gateway = case.gateway_of(PANEL).robot(&robot).start();
+    let mut gateway = case.gateway_of(&panel()).robot(&robot).start();
     gateway.until_up(Link::Command, 1);
     gateway.until_up(Link::Modbus, 1);
-    let mut panel = gateway.line("panel");
+    let mut panel = gateway.line("device");
     robot.until_after(OUTPUTS, f64::from(BEFORE), || panel.send(&order(NOTHING, BEFORE)));
     gateway.freeze();
     panel.send(&order(RUN, DO1));
@@ -195,10 +178,10 @@ fn stop_behind(case: &Case) {
         });
         [said, told]
     });
-    let plan: Plan<'_> = case.gateway_of(PANEL).robot(&robot).server_at("command", command);
+    let plan: Plan<'_> = case.gateway_of(&panel()).robot(&robot).server_at("command", command);
     let mut gateway = plan.start();
     gateway.until_up(Link::Command, 1);
-    let mut panel = gateway.line("panel");
+    let mut panel = gateway.line("device");
     start(&mut panel, &mut *gateway, &robot);
     let begin = Instant::now();
     let mut stopped = None;

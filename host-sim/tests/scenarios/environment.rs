@@ -7,10 +7,12 @@ use std::time::Duration;
 use proto_core::config::{Bus, GatewayConfig};
 use serde_json::Value;
 
-use super::case::{Case, until};
+use recipe_test_kit::{SERVERS, until};
+
+use super::case::Case;
 use super::field::{CanClient, Line};
 use super::refusal::Spoil;
-use super::robot::{Robot, SERVERS};
+use super::robot::Robot;
 
 /// Where gateways run.
 pub(crate) trait Environment: Send + Sync {
@@ -251,7 +253,7 @@ impl<'a> Plan<'a> {
     /// The configuration, with the scenario's own overrides.
     #[track_caller]
     pub(crate) fn config(&self) -> Box<GatewayConfig> {
-        let config = host_sim::config::file::load_gateway(&self.file, &self.sets);
+        let config = recipe_config::file::load_gateway(&self.file, &self.sets);
         config.unwrap_or_else(|error| panic!("{error}"))
     }
 

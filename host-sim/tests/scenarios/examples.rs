@@ -2,7 +2,9 @@
 
 use std::time::{Duration, Instant};
 
-use super::case::{Case, Scenario, until};
+use recipe_test_kit::until;
+
+use super::case::{Case, Scenario};
 use super::environment::{Gateway, Link};
 use super::field::{CanClient, Line};
 use super::robot::{Robot, RobotPlan};

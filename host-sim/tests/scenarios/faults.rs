@@ -2,7 +2,9 @@
 
 use std::time::{Duration, Instant};
 
-use super::case::{Case, Scenario, until};
+use recipe_test_kit::until;
+
+use super::case::{Case, Scenario};
 use super::environment::{Cable, Link};
 use super::examples::{DO1, DO1_OFF, DO1_ON, ROBOT, pose_and_output, pose_frame};
 use super::network::Network;

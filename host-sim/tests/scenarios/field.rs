@@ -4,7 +4,7 @@ use std::io::{Read, Write};
 use std::sync::{Arc, Condvar, Mutex};
 use std::time::{Duration, Instant};
 
-use super::case::PATIENCE;
+use recipe_test_kit::PATIENCE;
 
 /// A connection that can be read and written at the same time.
 pub(crate) trait Stream: Send {
@@ -121,7 +121,7 @@ impl Line {
     }
 }
 
-/// A node on a CAN bus, by slcan (docs/wire/slcan.md).
+/// A node on a CAN bus, by slcan (proto-core/docs/wire/slcan.md).
 pub(crate) struct CanClient(Line);
 
 impl CanClient {

@@ -6,7 +6,9 @@ use std::time::Duration;
 
 use rustix::net::{self, AddressFamily, SocketType};
 
-use super::case::{Case, PATIENCE, Scenario};
+use recipe_test_kit::PATIENCE;
+
+use super::case::{Case, Scenario};
 use super::environment::{Gateway, Link};
 use super::examples::{DO1, DO1_OFF, DO1_ON, ROBOT, listening, pose_and_output, pose_frame};
 

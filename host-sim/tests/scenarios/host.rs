@@ -166,12 +166,12 @@ impl Gateway for HostGateway {
             Link::Udp2011 => "udp2011",
             Link::TcpListen(port) | Link::UdpListen(port) => port,
         };
-        let stats = &self.host_sim.newest()["links"][name];
+        let stats = &self.host_sim.program.newest()["links"][name];
         LinkStatus { is_up: stats["state"] == "up", connects: stats["connects"].as_u64().unwrap_or(0) as u32 }
     }
 
     fn port(&self, port: &str) -> PortStatus {
-        let stats = &self.host_sim.newest()["ports"][port];
+        let stats = &self.host_sim.program.newest()["ports"][port];
         let number = |name: &str| stats[name].as_u64().unwrap_or(0);
         PortStatus {
             frames_in: number("frames_in"),

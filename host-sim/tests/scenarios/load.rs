@@ -10,7 +10,9 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
-use super::case::{Case, Scenario, until};
+use recipe_test_kit::until;
+
+use super::case::{Case, Scenario};
 use super::environment::Link;
 use super::field::slcan;
 use super::robot::reserved_ports;

@@ -5,7 +5,9 @@ use std::ffi::OsString;
 use std::path::Path;
 use std::process::Command;
 
-use super::case::{Case, until};
+use recipe_test_kit::until;
+
+use super::case::Case;
 use super::environment::Cable;
 use super::program::{Program, exists};
 

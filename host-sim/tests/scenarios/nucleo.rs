@@ -10,8 +10,10 @@ use std::time::Duration;
 
 use serde_json::Value;
 
+use recipe_test_kit::until;
+
 use super::board::{self, Wires};
-use super::case::{Case, until};
+use super::case::Case;
 use super::environment::{Cable, Environment, Gateway, Link, LinkStatus, Plan, PortStatus, ports};
 use super::field::{CanClient, Line};
 use super::program::Program;

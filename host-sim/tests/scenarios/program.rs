@@ -2,17 +2,18 @@
 
 use std::ffi::OsString;
 use std::fs::File;
-use std::io::{BufRead, BufReader};
+use std::ops::{Deref, DerefMut};
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, ExitCode, ExitStatus, Stdio};
+use std::process::{Command, ExitCode, Stdio};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
+use recipe_test_kit::{Process, until};
 use rustix::process::{Pid, Signal};
 use serde_json::Value;
 
-use super::case::{Case, until};
+use super::case::Case;
 
 /// Ticks of `/proc/PID/stat` in a second, on every Linux since 2.6.
 const USER_HZ: u64 = 100;
@@ -64,12 +65,11 @@ impl Running {
     }
 }
 
-/// A program that runs until it is dropped; it is asked nothing, it only says things.
+/// A program of a case; it is asked nothing, it only says things.
 #[derive(Debug)]
 pub(crate) struct Program {
-    child: Child,
+    process: Process,
     running: Running,
-    lines: Arc<Mutex<Vec<String>>>,
     log: PathBuf,
 }
 
@@ -88,51 +88,11 @@ impl Program {
                 command
             },
         );
-        let mut child = command
-            .args([END_WITH, &std::process::id().to_string()])
-            .arg(program)
-            .args(arguments)
-            .stdin(Stdio::null())
-            .stdout(Stdio::piped())
-            .stderr(errors)
-            .env("RUST_BACKTRACE", "1")
-            .spawn()
-            .unwrap();
-        let out = BufReader::new(child.stdout.take().unwrap());
-        let lines = Arc::<Mutex<Vec<String>>>::default();
-        let sink = Arc::clone(&lines);
-        std::thread::spawn(move || {
-            for line in out.lines().map_while(Result::ok) {
-                sink.lock().unwrap().push(line);
-            }
-        });
-        let running = case.running.clone();
-        let program = Self { child, running, lines, log };
+        command.args([END_WITH, &std::process::id().to_string()]).arg(program).args(arguments);
+        command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(errors).env("RUST_BACKTRACE", "1");
+        let program = Self { process: Process::start(&mut command), running: case.running.clone(), log };
         program.running.add(program.pid());
         program
-    }
-
-    pub(crate) fn pid(&self) -> Pid {
-        Pid::from_child(&self.child)
-    }
-
-    /// Fails when it has ended by itself.
-    #[track_caller]
-    pub(crate) fn must_run(&mut self) {
-        if let Some(status) = self.child.try_wait().unwrap() {
-            panic!("{} has ended: {status}", self.log.display());
-        }
-    }
-
-    /// Waits until it has ended by itself.
-    #[track_caller]
-    pub(crate) fn ended(&mut self) -> ExitStatus {
-        until("the program's end", || self.child.try_wait().unwrap())
-    }
-
-    /// What it says on stdout, by lines.
-    pub(crate) fn lines(&self) -> std::sync::MutexGuard<'_, Vec<String>> {
-        self.lines.lock().unwrap()
     }
 
     /// Everything it said on stderr.
@@ -151,40 +111,30 @@ impl Program {
         Duration::from_millis(ticks * 1_000 / USER_HZ)
     }
 
-    #[track_caller]
-    pub(crate) fn signal(&self, signal: Signal) {
-        rustix::process::kill_process(self.pid(), signal).unwrap();
-    }
-
-    /// Stops it, and returns once none of its threads runs.
-    #[track_caller]
-    pub(crate) fn freeze(&self) {
-        self.signal(Signal::STOP);
-        let tasks = format!("/proc/{}/task", self.pid().as_raw_pid());
-        until("all threads are stopped", || {
-            let mut tasks = std::fs::read_dir(&tasks).unwrap();
-            let is_stopped = |task: std::io::Result<std::fs::DirEntry>| {
-                let stat = std::fs::read_to_string(task.unwrap().path().join("stat")).unwrap();
-                stat.rsplit_once(") ").is_some_and(|(_, state)| state.starts_with('T'))
-            };
-            tasks.all(is_stopped).then_some(())
-        });
-    }
-
     /// Ends it as a person would; it must end well.
     #[track_caller]
     pub(crate) fn interrupt(&mut self) {
-        self.signal(Signal::INT);
-        let status = self.ended();
-        assert_eq!(status.code(), Some(0), "{} after Ctrl-C: {status}", self.log.display());
+        self.end_by(Signal::INT);
+    }
+}
+
+impl Deref for Program {
+    type Target = Process;
+
+    fn deref(&self) -> &Process {
+        &self.process
+    }
+}
+
+impl DerefMut for Program {
+    fn deref_mut(&mut self) -> &mut Process {
+        &mut self.process
     }
 }
 
 impl Drop for Program {
     fn drop(&mut self) {
         self.running.remove(self.pid());
-        let _ = self.child.kill();
-        let _ = self.child.wait();
     }
 }
 
@@ -214,27 +164,5 @@ impl HostSim {
         arguments.push(file.into());
         arguments.extend(extra.iter().map(OsString::from));
         Program::start(case, what, Path::new(env!("CARGO_BIN_EXE_host-sim")), &arguments)
-    }
-
-    /// The newest statistics.
-    pub(crate) fn newest(&self) -> Value {
-        let lines = self.program.lines();
-        lines.iter().rev().find_map(|line| serde_json::from_str(line).ok()).unwrap_or_default()
-    }
-
-    /// Statistics that satisfy `found`.
-    #[track_caller]
-    pub(crate) fn stats(&self, what: &str, found: impl Fn(&Value) -> bool) -> Value {
-        let what = format!("{what}; the newest of {}", self.program.log.display());
-        until(&what, || Some(self.newest()).filter(&found))
-    }
-
-    /// Statistics that were begun after this call.
-    #[track_caller]
-    pub(crate) fn fresh(&self) -> Value {
-        let before = self.program.lines().len();
-        // One may have been under way.
-        until("statistics", || (self.program.lines().len() >= before + 2).then_some(()));
-        self.newest()
     }
 }

@@ -9,8 +9,10 @@ use std::time::Duration;
 
 use serde_json::{Value, json};
 
+use recipe_test_kit::until;
+
 use super::board::{self, Wires};
-use super::case::{Case, until};
+use super::case::Case;
 use super::environment::{Cable, Environment, Gateway, Link, LinkStatus, Plan, PortStatus, ports};
 use super::field::{CanClient, Line};
 use super::program::Program;
@@ -34,7 +36,7 @@ impl Environment for Qemu {
 
     /// The guest's timers stand still while the machine is stopped, as those of a processor that a debugger
     /// halts together with them: no time has passed, and nothing that a program could look at says so
-    /// (docs/architecture.md section 3).
+    /// (proto-core/docs/engine.md section 2).
     fn sleeps_noticeably(&self) -> bool {
         false
     }

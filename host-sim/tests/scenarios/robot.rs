@@ -5,11 +5,10 @@ use std::net::{SocketAddr, TcpListener, TcpStream, UdpSocket};
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU16, Ordering};
 
-use super::case::{Case, PATIENCE, until};
-use super::program::HostSim;
+use recipe_test_kit::{PATIENCE, SERVERS, until};
 
-/// The controller's servers.
-pub(crate) const SERVERS: [&str; 4] = ["command", "state", "modbus", "udp2011"];
+use super::case::Case;
+use super::program::HostSim;
 
 /// How a controller is started.
 pub(crate) struct RobotPlan<'a> {
@@ -66,18 +65,18 @@ impl Robot {
     /// The value of a variable, now.
     #[track_caller]
     pub(crate) fn variable(&self, name: &str) -> f64 {
-        self.host_sim.fresh()["registers"][name].as_f64().unwrap_or(0.0)
+        self.host_sim.program.fresh()["registers"][name].as_f64().unwrap_or(0.0)
     }
 
     /// The value of a variable, as it was last told.
     pub(crate) fn newest(&self, name: &str) -> f64 {
-        self.host_sim.newest()["registers"][name].as_f64().unwrap_or(0.0)
+        self.host_sim.program.newest()["registers"][name].as_f64().unwrap_or(0.0)
     }
 
     /// Waits until a variable has this value.
     #[track_caller]
     pub(crate) fn until(&self, name: &str, value: f64) {
-        self.host_sim.stats(&format!("{name} = {value}"), |stats| {
+        self.host_sim.program.stats(&format!("{name} = {value}"), |stats| {
             stats["registers"][name].as_f64().unwrap_or(0.0) == value
         });
     }
@@ -94,18 +93,18 @@ impl Robot {
     /// Waits until something its statistics count satisfies `found`.
     #[track_caller]
     pub(crate) fn until_stats(&self, what: &str, found: impl Fn(&serde_json::Value) -> bool) {
-        self.host_sim.stats(what, found);
+        self.host_sim.program.stats(what, found);
     }
 
     /// Whether a program runs, as it was last told.
     pub(crate) fn is_running(&self) -> bool {
-        self.host_sim.newest()["program_state"].as_u64().is_some_and(|state| state != 0)
+        self.host_sim.program.newest()["program_state"].as_u64().is_some_and(|state| state != 0)
     }
 
     /// A count of its statistics, now.
     #[track_caller]
     pub(crate) fn count(&self, pointer: &str) -> u64 {
-        let stats = self.host_sim.fresh();
+        let stats = self.host_sim.program.fresh();
         let count = stats.pointer(pointer).and_then(serde_json::Value::as_u64);
         count.unwrap_or_else(|| panic!("no {pointer} in {stats}"))
     }

@@ -4,7 +4,9 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
-use super::case::{Case, Scenario, until};
+use recipe_test_kit::until;
+
+use super::case::{Case, Scenario};
 use super::environment::Link;
 use super::examples::{DO1, DO1_OFF, DO1_ON, ROBOT};
 use super::network::{Filter, Loss, Network, Pass};

@@ -9,7 +9,8 @@ use rustix::fs::OFlags;
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use rustix::termios::{OptionalActions, tcgetattr, tcsetattr};
 
-use super::cell::{tool, until};
+use recipe_test_kit::can::tool;
+use recipe_test_kit::until;
 
 /// The adapter's end, and the interface that it became.
 pub(crate) struct Adapter {

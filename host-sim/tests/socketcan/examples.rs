@@ -4,8 +4,10 @@
 use std::io::Write;
 use std::process::{Command, Stdio};
 
-use super::cell::{Candump, Running, cansend, example, tool, until};
+use super::BINARY;
 use super::{Needs, Test, python};
+use recipe_test_kit::can::{Candump, cansend, tool};
+use recipe_test_kit::{HostSim, example, until};
 
 /// Example 4's captured frame.
 const POSE: &str = "002#EF54EF3EA7E7D13E";
@@ -34,19 +36,19 @@ fn bind(port: &str, interface: &str) -> String {
     format!("--bind={port}=socketcan:{interface}")
 }
 
-fn controller(file: &str, interface: &str) -> Running {
-    Running::controller(&example(file), &[&bind("can", interface)])
+fn controller(file: &str, interface: &str) -> HostSim {
+    BINARY.controller(&example(file), &[&bind("can", interface)])
 }
 
 /// A controller without a CAN port of its own on this bus, and a gateway that is on it.
-fn cell(file: &str, interface: &str) -> (Running, Running) {
-    let robot = Running::controller(&example("can-hand-controller.toml"), &[]);
-    let gateway = Running::gateway(&example(file), &robot, &[&bind("can-1", interface)]);
+fn cell(file: &str, interface: &str) -> (HostSim, HostSim) {
+    let robot = BINARY.controller(&example("can-hand-controller.toml"), &[]);
+    let gateway = BINARY.gateway(&example(file), &robot, &[&bind("can-1", interface)]);
     (robot, gateway)
 }
 
 #[track_caller]
-fn register(robot: &Running, name: &str, value: f64) {
+fn register(robot: &HostSim, name: &str, value: f64) {
     robot.stats(&format!("{name} = {value}"), |stats| {
         stats["registers"][name].as_f64().unwrap_or(0.0) == value
     });
@@ -77,7 +79,7 @@ fn user_gateway(interface: &str) {
 }
 
 /// The pose comes out in cycles of three frames, and id 1 switches DO1.
-fn system(interface: &str, robot: &Running) {
+fn system(interface: &str, robot: &HostSim) {
     let dump = Candump::start(interface);
     let frames = until("ten cycles", || Some(dump.frames()).filter(|frames| frames.len() > 32));
     let begin = frames.iter().position(|frame| frame.starts_with("002#")).unwrap();
@@ -101,16 +103,16 @@ fn system_controller(interface: &str) {
 fn system_gateway(interface: &str) {
     // The controller's own CAN port is on another bus: a user-space one.
     let file = example("can-system-controller.toml");
-    let robot = Running::controller(&file, &["--bind=can=slcan-tcp:127.0.0.1:0"]);
-    let gateway = Running::gateway(&example("can-system.toml"), &robot, &[&bind("can-1", interface)]);
+    let robot = BINARY.controller(&file, &["--bind=can=slcan-tcp:127.0.0.1:0"]);
+    let gateway = BINARY.gateway(&example("can-system.toml"), &robot, &[&bind("can-1", interface)]);
     system(interface, &robot);
     gateway.end();
     robot.end();
 }
 
 fn hand(interface: &str) {
-    let robot = Running::controller(&example("can-hand-controller.toml"), &[]);
-    let gateway = Running::gateway(&example("can-hand.toml"), &robot, &[&bind("hand", interface)]);
+    let robot = BINARY.controller(&example("can-hand-controller.toml"), &[]);
+    let gateway = BINARY.gateway(&example("can-hand.toml"), &robot, &[&bind("hand", interface)]);
     let dump = Candump::start(interface);
     dump.wait_for("501#000000000000");
     robot.command("run(grip.jspf)", "run start");
@@ -199,7 +201,8 @@ fn replay(interface: &str) {
 }
 
 fn convert(command: &str, part: &str, text: &str) -> String {
-    let mut process = Command::new(env!("CARGO_BIN_EXE_host-sim"))
+    let mut process = BINARY
+        .command()
         .arg(command)
         .arg(example("can-system-controller.toml"))
         .args(["--part", part])

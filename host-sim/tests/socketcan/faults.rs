@@ -1,13 +1,15 @@
 //! What goes wrong on a bus and with an interface, for real where the kernel has it.
 
-use std::process::Command;
 use std::time::Duration;
 
 use serde_json::Value;
 
+use super::BINARY;
 use super::adapter::Adapter;
-use super::cell::{Candump, Running, Vcan, cansend, example, tool, until};
 use super::{Needs, Test};
+use recipe_test_kit::can::{Candump, Vcan, cansend, tool};
+use recipe_test_kit::{HostSim, example, until};
+use rustix::process::Signal;
 
 pub(crate) fn trials(interface: &str) -> Vec<Test> {
     let on = |name, needs, test: fn(&str)| -> Test {
@@ -29,17 +31,17 @@ pub(crate) fn trials(interface: &str) -> Vec<Test> {
 }
 
 /// The hand's gateway, which sends one frame each 20 ms.
-fn hand(interface: &str) -> (Running, Running) {
-    let robot = Running::controller(&example("can-hand-controller.toml"), &[]);
+fn hand(interface: &str) -> (HostSim, HostSim) {
+    let robot = BINARY.controller(&example("can-hand-controller.toml"), &[]);
     let bind = format!("--bind=hand=socketcan:{interface}");
-    let gateway = Running::gateway(&example("can-hand.toml"), &robot, &[&bind]);
+    let gateway = BINARY.gateway(&example("can-hand.toml"), &robot, &[&bind]);
     (robot, gateway)
 }
 
 /// A controller that sends three frames each 4 ms.
-fn system(interface: &str) -> Running {
+fn system(interface: &str) -> HostSim {
     let bind = format!("--bind=can=socketcan:{interface}");
-    Running::controller(&example("can-system-controller.toml"), &[&bind])
+    BINARY.controller(&example("can-system-controller.toml"), &[&bind])
 }
 
 fn bus_off() {
@@ -131,7 +133,7 @@ fn error_frames(interface: &str) {
 
 /// Frames flow both ways, and this is how often the port came up.
 #[track_caller]
-fn works(interface: &str, robot: &Running, value: u8, ups: u64) {
+fn works(interface: &str, robot: &HostSim, value: u8, ups: u64) {
     let dump = Candump::start(interface);
     dump.wait_for("002#EF54EF3EA7E7D13E");
     cansend(interface, &format!("001#{value:02X}"));
@@ -165,12 +167,9 @@ fn down_and_up() {
 fn deleted() {
     let bus = Vcan::new("hsdel0");
     let (robot, gateway) = {
-        let robot = Running::controller(
-            &example("can-system-controller.toml"),
-            &["--bind=can=slcan-tcp:127.0.0.1:0"],
-        );
-        let gateway =
-            Running::gateway(&example("can-system.toml"), &robot, &["--bind=can-1=socketcan:hsdel0"]);
+        let robot =
+            BINARY.controller(&example("can-system-controller.toml"), &["--bind=can=slcan-tcp:127.0.0.1:0"]);
+        let gateway = BINARY.gateway(&example("can-system.toml"), &robot, &["--bind=can-1=socketcan:hsdel0"]);
         (robot, gateway)
     };
     for round in 1..=2 {
@@ -235,13 +234,13 @@ fn fd_frames() {
 }
 
 fn overrun(interface: &str) {
-    let robot = Running::controller(&example("can-hand-controller.toml"), &[]);
+    let robot = BINARY.controller(&example("can-hand-controller.toml"), &[]);
     let bind = format!("--bind=can-1=socketcan:{interface}");
-    let gateway = Running::gateway(&example("can-user.toml"), &robot, &[&bind]);
-    gateway.signal("STOP");
+    let gateway = BINARY.gateway(&example("can-user.toml"), &robot, &[&bind]);
+    gateway.signal(Signal::STOP);
     const SENT: u64 = 6_000;
     tool(&format!("cangen {interface} -g 0 -I 001 -L 3 -D 010203 -n {SENT}"));
-    gateway.signal("CONT");
+    gateway.signal(Signal::CONT);
     let stats = gateway.stats("all accounted for", |stats| {
         let device = &stats["ports"]["can-1"]["device"];
         device["frames_in"]
@@ -261,14 +260,14 @@ fn overrun(interface: &str) {
 }
 
 fn stopped(interface: &str) {
-    let robot = Running::controller(&example("can-hand-controller.toml"), &[]);
+    let robot = BINARY.controller(&example("can-hand-controller.toml"), &[]);
     let bind = format!("--bind=can-1=socketcan:{interface}");
-    let gateway = Running::gateway(&example("can-user.toml"), &robot, &[&bind]);
-    gateway.signal("STOP");
+    let gateway = BINARY.gateway(&example("can-user.toml"), &robot, &[&bind]);
+    gateway.signal(Signal::STOP);
     const WAITING: u64 = 50;
     tool(&format!("cangen {interface} -g 1 -I 001 -L 3 -D 010203 -n {WAITING}"));
     std::thread::sleep(STOPPED);
-    gateway.signal("CONT");
+    gateway.signal(Signal::CONT);
     let stats = gateway.stats("awake", |stats| stats["sleeps"] == 1);
     let port = &stats["ports"]["can-1"];
     assert_eq!((&port["frames_in"], &port["asleep"]), (&0.into(), &WAITING.into()), "{port}");
@@ -280,7 +279,7 @@ fn stopped(interface: &str) {
 }
 
 /// It goes on as if nothing had been, once its links are up.
-fn goes_on(interface: &str, gateway: &Running, robot: &Running) {
+fn goes_on(interface: &str, gateway: &HostSim, robot: &HostSim) {
     let links_up =
         |stats: &Value| stats["links"].as_object().unwrap().values().all(|link| link["state"] == "up");
     gateway.stats("links up", links_up);
@@ -295,7 +294,7 @@ const STOPPED: Duration = Duration::from_secs(1);
 
 fn no_interface(_: &str) {
     for (interface, message) in [("hsnone0", "no such CAN interface"), ("lo", "no such CAN interface")] {
-        let mut command = Command::new(env!("CARGO_BIN_EXE_host-sim"));
+        let mut command = BINARY.command();
         command.args(["controller", "-c"]).arg(example("can-system-controller.toml"));
         let output = command.arg(format!("--bind=can=socketcan:{interface}")).output().unwrap();
         let errors = String::from_utf8_lossy(&output.stderr);

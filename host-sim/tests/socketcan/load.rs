@@ -5,8 +5,9 @@ use std::time::{Duration, Instant};
 use serde_json::Value;
 use socketcan::{CanFrame, CanSocket, EmbeddedFrame, Frame, Socket, SocketOptions, StandardId};
 
-use super::cell::{Running, example, until};
+use super::BINARY;
 use super::{Needs, Test};
+use recipe_test_kit::{example, until};
 
 pub(crate) fn trials(interface: &str) -> Vec<Test> {
     let interface = interface.to_owned();
@@ -51,8 +52,8 @@ fn full_load(interface: &str) {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("load.toml");
     std::fs::write(&file, GATEWAY).unwrap();
-    let robot = Running::controller(&example("can-hand-controller.toml"), &[]);
-    let gateway = Running::gateway(&file, &robot, &[&format!("--bind=can-1=socketcan:{interface}")]);
+    let robot = BINARY.controller(&example("can-hand-controller.toml"), &[]);
+    let gateway = BINARY.gateway(&file, &robot, &[&format!("--bind=can-1=socketcan:{interface}")]);
     let sender = CanSocket::open(interface).unwrap();
     sender.set_filter_drop_all().unwrap();
     let mut answers = Answers::listen(interface);

@@ -12,7 +12,6 @@
 //! full load takes (2).
 
 mod adapter;
-mod cell;
 mod examples;
 mod faults;
 mod load;
@@ -22,6 +21,9 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, ExitCode};
 
 use libtest_mimic::{Arguments, Failed, Trial};
+use recipe_test_kit::Binary;
+
+const BINARY: Binary = Binary(env!("CARGO_BIN_EXE_host-sim"));
 
 /// What a test needs beside the interface.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

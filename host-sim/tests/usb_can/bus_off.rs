@@ -4,8 +4,9 @@ use std::process::Command;
 
 use super::Case;
 use super::candlelight::{Bus, Restart};
-use super::cell::{cansend, tool, until};
 use super::stand::{Adapter, Cell, INTERFACE};
+use recipe_test_kit::can::{cansend, tool};
+use recipe_test_kit::until;
 
 pub(crate) const CASES: &[Case] = &[
     ("bus_off_is_warned_of_and_nothing_is_sent", bus_off),

@@ -2,10 +2,11 @@
 
 use std::fmt::Write;
 
+use super::BINARY;
 use super::Case;
 use super::candlelight::Bus;
-use super::cell::{Running, example, until};
 use super::stand::{Adapter, Cell, bind};
+use recipe_test_kit::{HostSim, example, until};
 
 pub(crate) const CASES: &[Case] = &[
     ("the_worked_example_through_the_gateway", works),
@@ -23,7 +24,7 @@ const POSE: &str = "002#EF54EF3EA7E7D13E";
 
 /// The pose goes out, in cycles of three frames, and id 1 switches DO1..8.
 #[track_caller]
-fn serves(adapter: &Adapter, robot: &Running, value: u8) {
+fn serves(adapter: &Adapter, robot: &HostSim, value: u8) {
     adapter.forget();
     let frames = adapter.sends(12);
     in_order(&frames);
@@ -223,7 +224,7 @@ fn unplugged() {
 fn unplugged_from_the_controller() {
     let mut adapter = Adapter::up(500_000);
     let file = example("can-system-controller.toml");
-    let robot = Running::controller(&file, &[&bind("can"), "--set=port.can.cycle_ms=20"]);
+    let robot = BINARY.controller(&file, &[&bind("can"), "--set=port.can.cycle_ms=20"]);
     for round in 1..=2 {
         serves(&adapter, &robot, round);
         adapter.unplug();

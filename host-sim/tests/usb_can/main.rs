@@ -14,9 +14,6 @@
 mod bus_off;
 mod candlelight;
 mod cases;
-#[expect(dead_code, reason = "the other tests use more of it")]
-#[path = "../socketcan/cell.rs"]
-mod cell;
 mod stand;
 mod usb;
 
@@ -25,6 +22,9 @@ use std::path::Path;
 use std::process::{Command, ExitCode};
 
 use libtest_mimic::{Arguments, Failed, Trial};
+use recipe_test_kit::Binary;
+
+const BINARY: Binary = Binary(env!("CARGO_BIN_EXE_host-sim"));
 
 const HOW: &str = "host-sim/tests/pc/kernel && HOST_SIM_USB_CAN=qemu cargo test --test usb_can (Debian: apt-get \
                    install qemu-system-x86 busybox-static can-utils iproute2 xz-utils), or HOST_SIM_USB_CAN=here as root \

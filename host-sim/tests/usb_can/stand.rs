@@ -4,9 +4,11 @@ use std::path::Path;
 
 use serde_json::Value;
 
+use super::BINARY;
 use super::candlelight::{Bus, CandleLight, Restart};
-use super::cell::{Running, example, tool, until};
 use super::usb::Plugged;
+use recipe_test_kit::can::tool;
+use recipe_test_kit::{HostSim, example, until};
 
 /// What the kernel calls the first adapter.
 pub(crate) const INTERFACE: &str = "can0";
@@ -63,7 +65,7 @@ impl Adapter {
     /// Somebody else sends a frame again and again, as devices do, until the controller's register is this:
     /// a gateway that was held up for half a second discards what waited.
     #[track_caller]
-    pub(crate) fn hears_until(&self, frame: &str, robot: &Running, register: &str, value: f64) {
+    pub(crate) fn hears_until(&self, frame: &str, robot: &HostSim, register: &str, value: f64) {
         until(&format!("{register} = {value}"), || {
             self.hears(frame);
             let found = robot.fresh()["registers"][register].as_f64().unwrap_or(0.0);
@@ -117,8 +119,8 @@ fn is_there() -> bool {
 
 /// A gateway with this file on the interface, and its controller.
 pub(crate) struct Cell {
-    pub(crate) robot: Running,
-    pub(crate) gateway: Running,
+    pub(crate) robot: HostSim,
+    pub(crate) gateway: HostSim,
     port: &'static str,
 }
 
@@ -126,8 +128,8 @@ impl Cell {
     /// The hand's: one frame each 20 ms, which follows the controller's word registers.
     #[track_caller]
     pub(crate) fn hand() -> Self {
-        let robot = Running::controller(&example("can-hand-controller.toml"), &[]);
-        let gateway = Running::gateway(&example("can-hand.toml"), &robot, &[&bind("hand")]);
+        let robot = BINARY.controller(&example("can-hand-controller.toml"), &[]);
+        let gateway = BINARY.gateway(&example("can-hand.toml"), &robot, &[&bind("hand")]);
         Self { robot, gateway, port: "hand" }
     }
 
@@ -135,16 +137,16 @@ impl Cell {
     #[track_caller]
     pub(crate) fn system() -> Self {
         let elsewhere = "--bind=can=slcan-tcp:127.0.0.1:0";
-        let robot = Running::controller(&example("can-system-controller.toml"), &[elsewhere]);
-        let gateway = Running::gateway(&example("can-system.toml"), &robot, &[&bind("can-1"), SLOWLY]);
+        let robot = BINARY.controller(&example("can-system-controller.toml"), &[elsewhere]);
+        let gateway = BINARY.gateway(&example("can-system.toml"), &robot, &[&bind("can-1"), SLOWLY]);
         Self { robot, gateway, port: "can-1" }
     }
 
     /// One of the hand's controller and this file, whose port is `can`.
     #[track_caller]
     pub(crate) fn of(file: &Path) -> Self {
-        let robot = Running::controller(&example("can-hand-controller.toml"), &[]);
-        let gateway = Running::gateway(file, &robot, &[&bind("can")]);
+        let robot = BINARY.controller(&example("can-hand-controller.toml"), &[]);
+        let gateway = BINARY.gateway(file, &robot, &[&bind("can")]);
         Self { robot, gateway, port: "can" }
     }
 

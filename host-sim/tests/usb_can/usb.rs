@@ -13,7 +13,7 @@ use std::os::fd::AsRawFd;
 use std::os::unix::net::UnixStream;
 use std::sync::{Arc, Mutex, MutexGuard};
 
-use crate::cell::until;
+use recipe_test_kit::until;
 
 /// What a device does.
 pub(crate) trait Function: Send + 'static {

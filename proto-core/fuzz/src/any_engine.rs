@@ -1,4 +1,4 @@
-//! Any configuration, any inputs of a driver that keeps the contract (docs/architecture.md section 3)
+//! Any configuration, any inputs of a driver that keeps the contract (docs/driver.md)
 //! or does not: the engine keeps its side of it, and does no more for one input than it may.
 
 use proto_core::config::{

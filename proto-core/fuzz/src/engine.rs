@@ -1,6 +1,6 @@
 //! Operations on a cell of four ports, with the model of `tests/engine_props`: nothing goes up that
-//! nobody sent, everything is counted, and what works again delivers again (docs/architecture.md
-//! section 7).
+//! nobody sent, everything is counted, and what works again delivers again (docs/engine.md
+//! sections 5 to 7).
 
 use proptest::test_runner::TestCaseError;
 use proto_core::engine::{BusState, LinkId};

@@ -51,7 +51,7 @@ struct Waiting {
     until: Instant,
 }
 
-/// What became of a request, or came unasked.
+/// The outcome of a request, or a text that no request asked for.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum ClientEvent<'a> {
     /// The reply to a request in flight, which is over.
@@ -104,7 +104,7 @@ impl fmt::Display for StartError {
 impl core::error::Error for StartError {}
 
 impl CommandClient {
-    /// A client at the beginning of a connection.
+    /// A client for a new connection.
     pub const fn new() -> Self {
         Self {
             quiet_gap: Duration::from_millis(20),
@@ -240,7 +240,7 @@ impl CommandClient {
         self.receive(now, &mut &[][..])
     }
 
-    /// When [`poll`](Self::poll) has something to say if nothing more is received.
+    /// When to call [`poll`](Self::poll) if nothing more is received.
     pub fn deadline(&self) -> Option<Instant> {
         let gap = self.gap().map(|gap| self.newest + gap);
         match (gap, self.timeout_at()) {

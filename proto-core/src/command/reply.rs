@@ -11,11 +11,11 @@ use super::text::{NoSpace, Writer, is_terminator, trim};
 use crate::wire::dialect::{Dialect, RunReply, SpeedReply, Terminator};
 use crate::wire::state::{OperationMode, ProgramState, RobotState, SafetyState};
 
-/// How an action went.
+/// The result of an action.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum Outcome {
-    /// Done, or begun.
+    /// Done, or started.
     Success,
     /// Refused.
     Fail,
@@ -31,7 +31,7 @@ impl Outcome {
     }
 }
 
-/// One reply, or the one text that comes unasked.
+/// One reply, or the one text that is sent without a request.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum Reply<'a> {
@@ -46,7 +46,7 @@ pub enum Reply<'a> {
     Did {
         /// The action.
         action: Action,
-        /// How it went.
+        /// The result.
         outcome: Outcome,
     },
     /// To `state`.
@@ -119,7 +119,7 @@ pub enum ReplyKind {
 }
 
 impl<'a> Reply<'a> {
-    /// What kind of answer this is; [`ReplyKind::Value`] for the unasked text.
+    /// What kind of answer this is; [`ReplyKind::Value`] for the text without a request.
     pub const fn kind(&self) -> ReplyKind {
         match self {
             Self::Run(Outcome::Success) | Self::SpeedSet(_) | Self::Did { outcome: Outcome::Success, .. } => {

@@ -24,7 +24,7 @@ pub enum Request<'a> {
     },
     /// `speed(V)`; `None` when V was not a valid speed: the controller refuses it.
     Speed(Option<Percent>),
-    /// A keyword that makes the controller do something and answers how it went.
+    /// A keyword that makes the controller do something; the reply is its result.
     Do(Action),
     /// `state`
     State,
@@ -57,7 +57,7 @@ pub enum Action {
 }
 
 impl Action {
-    /// Every one of them.
+    /// All actions.
     pub const ALL: [Self; 8] = [
         Self::Stop,
         Self::Pause,
@@ -165,7 +165,7 @@ pub enum ParseError {
         /// Where it stops being UTF-8.
         at: usize,
     },
-    /// It begins with no keyword.
+    /// It does not begin with a keyword.
     UnknownWord,
     /// The parentheses do not close at the end, or open twice.
     Parentheses,

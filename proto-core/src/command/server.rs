@@ -47,14 +47,14 @@ pub enum ServerEvent<'a> {
 /// What is answered with `unknown command`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum UnknownCommand<'a> {
-    /// A text that is no command.
+    /// A text that is not a command.
     Text(&'a [u8]),
     /// More than [`MAX_COMMAND`] bytes without an end; what follows is dropped.
     TooLong,
 }
 
 impl CommandServer {
-    /// A server at the beginning of a connection.
+    /// A server for a new connection.
     pub const fn new() -> Self {
         Self {
             keyword_gap: Duration::from_millis(20),
@@ -94,7 +94,7 @@ impl CommandServer {
         self.receive(now, &mut &[][..])
     }
 
-    /// When silence completes what is there, if it would.
+    /// When silence completes what was received, if it does.
     pub fn deadline(&self) -> Option<Instant> {
         Some(self.newest + self.gap()?)
     }

@@ -9,7 +9,7 @@ use core::fmt;
 pub struct NoSpace {
     /// Bytes the text takes.
     pub needed: usize,
-    /// Bytes there were.
+    /// Bytes that were available.
     pub available: usize,
 }
 

@@ -136,7 +136,7 @@ impl GatewayConfig {
     }
 }
 
-/// Something that is allowed but may not do what was meant. Numbers are indices, from 0.
+/// Something that is valid but may not do what was intended. Numbers are indices, from 0.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Warning {

@@ -151,7 +151,7 @@ pub enum ConfigErrorKind {
     UnknownDialect,
     /// A port number of the controller is 0.
     ZeroPort,
-    /// A network of so many bits has no room for hosts, or is none.
+    /// A prefix that leaves no room for hosts, or is not a prefix.
     Prefix {
         /// As given.
         prefix: u8,
@@ -163,7 +163,7 @@ pub enum ConfigErrorKind {
         /// The board's.
         network: Network,
     },
-    /// Another host is meant, and this is the board.
+    /// The board's own address, where another host's is required.
     OwnAddress,
     /// The address is in another network, and there is no router.
     NeedsRouter {
@@ -204,7 +204,7 @@ pub enum ConfigErrorKind {
         /// The part.
         part: Direction,
     },
-    /// A realtime recipe is sent by period and by nothing else.
+    /// A realtime recipe can only be sent by period.
     RealtimeSendsByPeriod,
     /// A trigger, but nothing to send.
     NothingToSend,
@@ -246,7 +246,7 @@ pub enum ConfigErrorKind {
     Framing {
         /// Index of the recipe.
         recipe: u8,
-        /// What is in the way.
+        /// The reason.
         error: PartError,
     },
     /// Input fields write input variables only.
@@ -317,12 +317,12 @@ pub enum ConfigErrorKind {
     },
     /// Not an address and port to listen on.
     ListenAddress,
-    /// A port before listens on the same address and port.
+    /// An earlier port listens on the same address and port.
     ListenTwice {
         /// Index of the port before.
         other: u8,
     },
-    /// A port before writes the same variable: one owner a variable.
+    /// An earlier port writes the same variable; a variable has one owner.
     OwnedTwice {
         /// The variable.
         var: SysVar,
@@ -336,14 +336,14 @@ pub enum ConfigErrorKind {
         /// Index of the port.
         port: u8,
     },
-    /// A port wants a variable that no configured way shows (D15).
+    /// A port shows a variable that has no configured source (D15).
     NoSource {
         /// The variable.
         var: SysVar,
         /// Index of the port.
         port: u8,
     },
-    /// A way up carries a variable that no port owns and that cannot be read back, so nobody
+    /// A way up carries a variable that no port owns and that cannot be read back, so nothing
     /// knows what to send.
     Unowned {
         /// The variable.

@@ -242,7 +242,7 @@ pub enum InputBinding {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub enum CommandWhen {
-    /// When it differs from the frame before; the first frame after silence only sets the base.
+    /// When it differs from the previous frame; the first frame after silence only sets the base.
     #[default]
     Change,
     /// With every accepted frame: for devices that send a frame only when they mean it.
@@ -262,11 +262,11 @@ pub enum OutputBinding {
         /// Summand, after the factor.
         offset: f32,
     },
-    /// Always the same.
+    /// A constant.
     Constant(f64),
     /// Frames sent so far, wrapping in the field's type.
     Counter,
-    /// How the newest command of this port went: see [`crate::engine::ReplyCode`].
+    /// The outcome of this port's newest command: see [`crate::engine::ReplyCode`].
     Reply,
 }
 
@@ -298,10 +298,10 @@ pub enum OnStale {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub enum SendOn {
-    /// The port's cycle; realtime recipes know nothing else.
+    /// The port's cycle; the only choice for realtime recipes.
     #[default]
     Period,
-    /// A changed value, looked at each cycle.
+    /// Each cycle in which a value changed.
     Change,
     /// Every accepted input frame: request and response.
     Frame,
@@ -328,7 +328,7 @@ pub struct Port {
     pub cycle: Duration,
     /// After this long without an accepted frame the port's inputs take their safe values.
     pub timeout: Duration,
-    /// What inputs become then; those not named hold.
+    /// The safe values that inputs take then; inputs without one hold.
     pub on_timeout: Span,
     /// Outputs whose source is older than this are stale.
     pub stale_after: Duration,
@@ -393,7 +393,7 @@ pub enum Parity {
     Odd,
 }
 
-/// What an input variable becomes when its port times out.
+/// The value that an input variable takes when its port times out.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct SafeValue {

@@ -4,7 +4,7 @@ use core::net::Ipv4Addr;
 
 use super::error::{ConfigErrorKind as Kind, NetworkKey};
 
-/// A static IPv4 address and what belongs to it. A host has its own and looks at none of this.
+/// A static IPv4 address and its network. A host ignores it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct Network {

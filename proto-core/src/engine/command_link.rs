@@ -1,4 +1,4 @@
-//! The links to port 2000: commands that field values pick (docs/architecture.md section 7).
+//! The links to port 2000: commands that field values pick (docs/engine.md section 7).
 //!
 //! A command is sent once or not at all. What cannot be sent soon is dropped and said so in the
 //! port's reply code: a robot must not start later because of a button pressed earlier. What stops

@@ -17,9 +17,9 @@ pub struct PortCounters {
     pub rejected_not_finite: u32,
     /// Frames rejected because a bound value did not fit its variable (D22).
     pub rejected_out_of_range: u32,
-    /// CAN frames ignored for an id that the recipe does not have (D17).
+    /// CAN frames ignored because the recipe does not have their id (D17).
     pub rejected_id: u32,
-    /// CAN frames rejected for another length than declared (D17).
+    /// CAN frames rejected because their length is not the declared one (D17).
     pub rejected_length: u32,
     /// Remote frames ignored (D17).
     pub rejected_remote: u32,
@@ -76,7 +76,7 @@ pub struct LinkCounters {
     pub timeouts: u32,
     /// Exceptions and failure replies.
     pub refused: u32,
-    /// Answers, frames and packets that made no sense.
+    /// Malformed answers, frames and packets.
     pub malformed: u32,
     /// Values received that were not finite: they are unknown until a readable one comes.
     pub unreadable: u32,

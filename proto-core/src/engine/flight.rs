@@ -1,6 +1,6 @@
 //! What was handed over to a TCP link and is not known to have arrived: how much of it the peer's
 //! transport still has to acknowledge, and until when it may be delivered
-//! (docs/architecture.md section 9).
+//! (docs/engine.md section 5).
 
 use heapless::Deque;
 

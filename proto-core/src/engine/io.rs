@@ -4,7 +4,7 @@ use crate::config::MAX_PORTS;
 use crate::recipe::can::CanFrame;
 use crate::time::Instant;
 
-/// A port, by its place in [`crate::config::GatewayConfig::ports`].
+/// A port, by its index in [`crate::config::GatewayConfig::ports`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct PortId(pub u8);
@@ -23,7 +23,7 @@ impl LinkId {
     pub const MODBUS: Self = Self(2);
     /// The controller's UDP recipe server.
     pub const RECIPE_UDP: Self = Self(3);
-    /// Port 2000 once more, for commands that stop the robot (D26).
+    /// A second connection to port 2000, for commands that stop the robot (D26).
     pub const URGENT: Self = Self(FIRST_PORT + MAX_PORTS as u8);
 
     /// The link of a listening port.
@@ -43,7 +43,7 @@ impl LinkId {
 /// Links of listening ports are numbered from here on.
 const FIRST_PORT: u8 = 4;
 
-/// What a link is, and so what the driver opens for it.
+/// The kind of a link: what the driver opens for it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum LinkKind {
@@ -57,12 +57,12 @@ pub enum LinkKind {
     Modbus,
     /// UDP to the controller's recipe port.
     RecipeUdp,
-    /// TCP: listen where this port says, take one connection.
+    /// TCP: listen on the port's address, accept one connection.
     RecipeTcpListen {
         /// The port.
         port: PortId,
     },
-    /// UDP: listen where this port says, answer whoever sent last.
+    /// UDP: listen on the port's address, answer the newest sender of a frame.
     RecipeUdpListen {
         /// The port.
         port: PortId,
@@ -102,7 +102,7 @@ pub enum BusState {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum PortState {
-    /// What it receives comes in time; a port without an input part only has to be there.
+    /// Its input frames arrive in time; a port without an input part only needs its device.
     Working,
     /// A frame of its input part is overdue or has never come.
     Silent,
@@ -115,7 +115,7 @@ pub enum PortState {
 /// What happened outside.
 #[derive(Debug, Clone, Copy)]
 pub enum Input<'a> {
-    /// A port's device is there.
+    /// A port's device is ready.
     PortUp {
         /// The port.
         port: PortId,
@@ -163,7 +163,7 @@ pub enum Input<'a> {
         /// The link.
         link: LinkId,
     },
-    /// Bytes from a link; of a datagram link one whole datagram a call.
+    /// Bytes from a link; for a datagram link, one whole datagram per call.
     LinkBytes {
         /// The link.
         link: LinkId,
@@ -182,10 +182,10 @@ pub enum Input<'a> {
     LinkAcked {
         /// The link.
         link: LinkId,
-        /// Bytes, those that the driver itself still holds included.
+        /// Unacknowledged bytes, including those that the driver itself still holds.
         left: u32,
     },
-    /// Time has passed, and everything that arrived before has been told: the only input that lets
+    /// Time has passed, and everything that arrived before was reported: the only input that lets
     /// deadlines pass.
     Tick,
 }
@@ -200,7 +200,7 @@ pub enum Output<'a> {
         /// One whole frame.
         bytes: &'a [u8],
     },
-    /// Queue a CAN frame behind those before it; report [`Input::PortSent`] when the queue has
+    /// Queue a CAN frame after the previous ones; report [`Input::PortSent`] when the queue has
     /// become empty. At most [`crate::recipe::model::MAX_CAN_IDS`] are handed over before that.
     PortSendCan {
         /// The port.
@@ -213,7 +213,7 @@ pub enum Output<'a> {
         /// The link.
         link: LinkId,
     },
-    /// Close a link at once and report nothing more of it. Of TCP, with a reset: what the peer has not
+    /// Close a link at once and report nothing more about it. TCP with a reset: what the peer has not
     /// acknowledged must not be delivered later.
     LinkClose {
         /// The link.
@@ -228,7 +228,7 @@ pub enum Output<'a> {
     },
     /// Nothing more to do before this instant.
     Sleep {
-        /// When to tell [`Input::Tick`] at the latest; [`Instant::NEVER`] without a configuration.
+        /// When to report [`Input::Tick`] at the latest; [`Instant::NEVER`] without a configuration.
         until: Instant,
     },
 }

@@ -22,9 +22,9 @@ pub struct LinkInfo<'a> {
     pub kind: LinkKind,
     /// Where it stands.
     pub state: LinkState,
-    /// How often it came and went.
+    /// How often it came up and was lost.
     pub history: &'a LinkHistory,
-    /// What went over it.
+    /// What was sent and received on it.
     pub counters: &'a LinkCounters,
 }
 

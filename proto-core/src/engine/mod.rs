@@ -1,5 +1,5 @@
 //! The gateway: one run loop over field ports and controller links, sans-IO
-//! (docs/architecture.md sections 3 to 7).
+//! (docs/engine.md).
 //!
 //! One rule: change the engine once with [`Engine::handle`], then drain [`Engine::poll_output`]
 //! until it returns [`Output::Sleep`]. Polling early is harmless. The engine never reads a clock,
@@ -419,8 +419,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         self.links.recipes.iter().any(|other| other.id == link && other.is_frame(datagram))
     }
 
-    /// How often the gateway itself slept: it was not called for so long that nothing of what waited
-    /// for it could be believed any more. Wraps.
+    /// How often the gateway itself slept: it was not called for longer than [`ASLEEP`], so what
+    /// waited for it was discarded. Wraps.
     pub fn sleeps(&self) -> u32 {
         self.sleeps
     }

@@ -1,5 +1,5 @@
 //! The Modbus link: coalesced writes of what fields brought, polls of what ports show, one
-//! transaction in flight (docs/architecture.md section 7).
+//! transaction in flight (docs/engine.md section 5).
 
 use heapless::Vec;
 

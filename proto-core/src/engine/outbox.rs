@@ -1,7 +1,7 @@
 //! What is still to be written to the controller.
 //!
 //! Analog values: the newest wins. Bits: every value that differs from the one before is written,
-//! in order, through a bounded queue a port (docs/architecture.md section 7). The outbox knows
+//! in order, through a bounded queue a port (docs/engine.md section 5). The outbox knows
 //! nothing of links; it is told which variables can be delivered at all.
 
 use heapless::Vec;

@@ -1,4 +1,4 @@
-//! Which way each variable goes (docs/architecture.md section 6).
+//! Which way each variable goes (docs/engine.md section 4).
 //!
 //! In: a configuration. Out: for every input variable its owner and its way up, for every variable
 //! that a port shows its source. Decided once; nothing of it changes while the engine runs.
@@ -32,7 +32,7 @@ pub enum Source {
     Field(PortId),
 }
 
-/// The ways of all variables.
+/// Owner, way up and source of every variable.
 #[derive(Debug, Clone)]
 pub struct Plan {
     owners: [Option<PortId>; INPUT_COUNT],
@@ -45,11 +45,11 @@ pub struct Plan {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum PlanError {
-    /// Two ports claim one input variable.
+    /// Two ports write the same input variable.
     TwoOwners {
         /// The variable.
         var: SysVar,
-        /// The port that claims it first.
+        /// The port that writes it first.
         first: PortId,
         /// The other.
         second: PortId,
@@ -58,7 +58,7 @@ pub enum PlanError {
     NoWayUp {
         /// The variable.
         var: SysVar,
-        /// The port that claims it.
+        /// The port that writes it.
         port: PortId,
     },
     /// Nothing that is configured can read a variable that a port wants to show (D15).
@@ -69,7 +69,7 @@ pub enum PlanError {
         port: PortId,
     },
     /// A recipe link's frame carries a variable that no port sends and that cannot be read back:
-    /// its value would have to be made up.
+    /// its value would have to be invented.
     NobodySends {
         /// The variable.
         var: SysVar,
@@ -103,7 +103,7 @@ impl fmt::Display for PlanError {
 impl core::error::Error for PlanError {}
 
 impl Plan {
-    /// The ways of all variables of a configuration.
+    /// The plan of a configuration.
     ///
     /// # Errors
     /// [`PlanError`] names the first variable without a way.
@@ -142,7 +142,7 @@ impl Plan {
         Ok(plan)
     }
 
-    /// The field port whose frames bring the variable.
+    /// The field port whose frames contain the variable.
     pub fn owner(&self, var: SysVar) -> Option<PortId> {
         self.owners.get(var.ordinal()).copied().flatten()
     }

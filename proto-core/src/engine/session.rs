@@ -1,5 +1,5 @@
 //! One connection to port 2000: what is under way on it, and what became of that
-//! (docs/architecture.md section 7). Which command goes where is the command link's business.
+//! (docs/engine.md section 7). Which command goes where is the command link's business.
 
 use super::counters::{LinkCounters, add, bump};
 use super::flight::Flight;

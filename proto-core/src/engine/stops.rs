@@ -1,5 +1,5 @@
 //! Urgent commands that wait: what stops the robot goes ahead of everything and does not grow old
-//! while its device still asks for it (docs/architecture.md section 7).
+//! while its device still asks for it (docs/engine.md section 7).
 
 use heapless::Vec;
 

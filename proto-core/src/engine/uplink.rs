@@ -1,7 +1,7 @@
 //! A recipe link: the controller's own recipe port, the fast way up and down.
 //!
 //! What goes up is whole frames, so every variable in them needs a value that somebody sent or
-//! that was read back (docs/architecture.md section 7). What comes down goes into the image.
+//! that was read back (docs/engine.md section 5). What comes down goes into the image.
 
 use super::counters::{LinkCounters, add, bump};
 use super::field_port::Look;

@@ -1,5 +1,5 @@
 //! The process image: the value, source and age of every system variable
-//! (docs/architecture.md section 4).
+//! (docs/engine.md section 3).
 //!
 //! Values are packed little-endian in one byte array, in the order of the variable table, so that
 //! neighbouring fields of a recipe are one copy. A variable's age is that of its [`GroupId`]: the
@@ -92,26 +92,26 @@ impl Image {
         Ok(())
     }
 
-    /// Says which group brings the variable.
+    /// Assigns the variable to the group that it arrives with.
     pub fn assign(&mut self, var: SysVar, group: GroupId) {
         if let Some(slot) = self.group.get_mut(var.ordinal()) {
             *slot = group.0;
         }
     }
 
-    /// The group that brings the variable.
+    /// The group that the variable arrives with.
     pub fn group(&self, var: SysVar) -> Option<GroupId> {
         self.group.get(var.ordinal()).copied().filter(|&g| g != NO_GROUP).map(GroupId)
     }
 
-    /// The group has just arrived.
+    /// Records that the group has just arrived.
     pub fn stamp(&mut self, group: GroupId, now: Instant) {
         if let Some(stamp) = self.stamps.get_mut(usize::from(group.0)) {
             *stamp = now;
         }
     }
 
-    /// What the group brought is no longer known.
+    /// Makes the values of the group unknown.
     pub fn forget(&mut self, group: GroupId) {
         self.stamp(group, Instant::NEVER);
     }
@@ -142,7 +142,7 @@ impl Image {
         }
     }
 
-    /// Everything that these variables' sources just sent could be read.
+    /// Records that everything these variables' sources just sent could be read.
     pub fn all_readable(&mut self, vars: impl Iterator<Item = SysVar>) {
         if self.any_unreadable {
             vars.for_each(|var| self.unreadable.remove(var));

@@ -5,7 +5,7 @@
 
 use crate::time::{Duration, Instant};
 
-/// How patient a link is.
+/// Timeouts of a link.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct LinkTimings {
     /// A connection that takes longer is given up.
@@ -37,7 +37,7 @@ impl LinkTimings {
     }
 }
 
-/// Where a link stands.
+/// The state of a link.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 // Its tag would be as wide as an instant, which takes two registers on a Cortex-M.
@@ -109,7 +109,7 @@ pub struct Supervisor {
 }
 
 impl Supervisor {
-    /// A link that is to be opened at once.
+    /// The supervisor of a link that is to be opened at once.
     pub const fn new(timings: LinkTimings) -> Self {
         Self {
             timings,
@@ -121,7 +121,7 @@ impl Supervisor {
         }
     }
 
-    /// Where the link stands.
+    /// The state of the link.
     pub const fn state(&self) -> LinkState {
         self.state
     }
@@ -131,7 +131,7 @@ impl Supervisor {
         matches!(self.state, LinkState::Up { .. })
     }
 
-    /// What happened so far.
+    /// Counters since the start.
     pub const fn history(&self) -> &LinkHistory {
         &self.history
     }
@@ -192,7 +192,7 @@ impl Supervisor {
         }
     }
 
-    /// Looks at the clock. True when the link was up and has just been given up for silence.
+    /// Checks the deadlines. True if the link was up and has just been given up for silence.
     pub fn advance(&mut self, now: Instant) -> bool {
         match self.state {
             LinkState::Down { retry_at } if now >= retry_at && self.action.is_none() => {
@@ -215,7 +215,7 @@ impl Supervisor {
         self.action.take()
     }
 
-    /// When [`Self::advance`] has something to do, once [`Self::take_action`] has been asked.
+    /// When to call [`Self::advance`], after [`Self::take_action`].
     pub fn deadline(&self) -> Instant {
         match self.state {
             LinkState::Down { retry_at } => retry_at,

@@ -35,12 +35,12 @@ pub struct Adu<'a> {
 pub enum AduError {
     /// The protocol id is not 0.
     Protocol {
-        /// The id that came.
+        /// The received id.
         received: u16,
     },
     /// The length field is outside 2..=254.
     Length {
-        /// The length that came.
+        /// The received length.
         received: u16,
     },
 }

@@ -22,7 +22,7 @@ pub struct Client {
     stale: u32,
 }
 
-/// What the received bytes brought.
+/// What the received bytes contained.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum ClientEvent<'a> {
@@ -98,7 +98,7 @@ impl fmt::Display for StartError {
 impl core::error::Error for StartError {}
 
 impl Client {
-    /// A client at the start of a connection, for the server's unit id `unit`.
+    /// A client for a new connection to the server's unit id `unit`.
     pub const fn new(unit: u8) -> Self {
         let request = RequestHead { function: 0, address: 0, count_or_value: 0 };
         Self { reader: AduReader::new(), unit, transaction: 0, in_flight: false, request, stale: 0 }
@@ -114,7 +114,7 @@ impl Client {
         if self.in_flight { Some(self.request) } else { None }
     }
 
-    /// Answers that came after their request had been given up, ever.
+    /// Answers that arrived after their request had been given up, since the start.
     pub const fn stale_answers(&self) -> u32 {
         self.stale
     }

@@ -8,7 +8,7 @@ use super::exception::Exception;
 use super::pdu::{HEAD_LEN, READ_HEAD_LEN, Request, RequestHead, exception_pdu};
 use super::values::{Coils, Registers, last_mask, packed_len};
 
-/// What the server's map says and does.
+/// The registers behind a server.
 ///
 /// The server has checked counts and that `address + count` does not pass 65536. A bank answers
 /// [`Exception::IllegalDataAddress`] for anything outside its map or read-only, **before** it
@@ -49,7 +49,7 @@ pub struct Server {
 }
 
 impl Server {
-    /// A server at the start of a connection.
+    /// A server for a new connection.
     pub const fn new() -> Self {
         Self { reader: AduReader::new() }
     }
@@ -85,7 +85,7 @@ impl Server {
 
 /// Carries out the request in `pdu` and writes the answer's PDU to `out`: its length.
 ///
-/// For whoever frames PDUs otherwise; [`Server`] calls it for each frame.
+/// For other framings of PDUs; [`Server`] calls it for each frame.
 #[inline]
 pub fn answer<B: RegisterBank + ?Sized>(pdu: &[u8], bank: &mut B, out: &mut [u8; MAX_PDU]) -> usize {
     match Request::parse(pdu).and_then(|request| carry_out(request, bank, out)) {

@@ -169,7 +169,7 @@ impl<'a> Registers<'a> {
         self.bytes.as_chunks::<2>().0.iter().map(|word| u16::from_be_bytes(*word))
     }
 
-    /// The registers as they stand on the wire.
+    /// The registers as on the wire.
     pub const fn as_be_bytes(self) -> &'a [u8] {
         self.bytes
     }

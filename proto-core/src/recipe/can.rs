@@ -157,7 +157,7 @@ impl CanLayout {
         if layout.shares.is_empty() { Err(PartError::NoFrames) } else { Ok(layout) }
     }
 
-    /// What the fields are and which way they go.
+    /// The mode and the direction of the part.
     pub const fn rules(&self) -> Rules {
         self.rules
     }

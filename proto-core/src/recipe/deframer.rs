@@ -12,7 +12,7 @@ use super::model::MAX_STREAM_FRAME;
 use super::runs;
 use super::stream::StreamLayout;
 
-/// What a [`Deframer`] did since it was made.
+/// Counters of a [`Deframer`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct DeframerStats {
@@ -20,7 +20,7 @@ pub struct DeframerStats {
     pub frames: u64,
     /// Bytes dropped because no frame begins there.
     pub skipped_bytes: u64,
-    /// Times a head was followed, a frame's length on, by something else than the tail.
+    /// Times that other bytes than the tail were in its place.
     pub tail_mismatches: u64,
     /// Bytes of partial frames that [`Deframer::discard`] dropped.
     pub discarded_bytes: u64,
@@ -101,7 +101,7 @@ impl Deframer {
         dropped
     }
 
-    /// What happened so far.
+    /// Counters since it was made.
     pub const fn stats(&self) -> DeframerStats {
         self.stats
     }

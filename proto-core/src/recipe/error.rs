@@ -6,7 +6,7 @@ use super::model::{CanId, MAX_CAN_DATA, MAX_CAN_IDS, MAX_DELIMITER, MAX_FIELDS, 
 use crate::sysvar::{Direction, SysVar};
 use crate::wire::scalar::ScalarType;
 
-/// Where a field stands in its part, counted from 0.
+/// The place of a field in its part, counted from 0.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct FieldPlace {
@@ -54,7 +54,7 @@ pub enum PartError {
     WrongMode {
         /// The field.
         at: FieldPlace,
-        /// What the recipe is.
+        /// The recipe's mode.
         mode: Mode,
     },
     /// An output variable in an input part, or the other way round.
@@ -63,7 +63,7 @@ pub enum PartError {
         at: FieldPlace,
         /// The field's variable.
         var: SysVar,
-        /// Which part it stands in.
+        /// The part it is in.
         part: Direction,
     },
     /// An input variable that two fields of the part would write.
@@ -258,7 +258,7 @@ impl core::error::Error for NoSpace {}
 pub enum EncodeError {
     /// The buffer is too short.
     NoSpace(NoSpace),
-    /// Not one value a field.
+    /// Not one value per field.
     Count {
         /// How many fields there are.
         expected: usize,

@@ -9,7 +9,7 @@ use super::runs;
 use crate::sysvar::{Direction, IMAGE_BYTES, SysVar};
 use crate::wire::scalar::{Scalar, ScalarType};
 
-/// One field and where it stands in the payload.
+/// One field and its place in the payload.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PlacedField {
     /// Offset of its first byte, counted from the payload's.

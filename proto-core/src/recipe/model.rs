@@ -16,7 +16,7 @@ pub const MAX_CAN_IDS: usize = 32;
 /// Most data bytes of a classic CAN frame.
 pub const MAX_CAN_DATA: usize = 8;
 
-/// What a recipe's fields are.
+/// What kind of fields a recipe has.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]

@@ -58,7 +58,7 @@ impl StreamLayout {
         Ok(Self { rules, head, tail, frame_len, payload_len, pool })
     }
 
-    /// What the fields are and which way they go.
+    /// The mode and the direction of the part.
     pub const fn rules(&self) -> Rules {
         self.rules
     }

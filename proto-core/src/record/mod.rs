@@ -22,7 +22,7 @@ pub const MAGIC: [u8; 4] = *b"RGR\x02";
 /// Longest [`Entry::Totals`].
 pub const MAX_TOTALS: usize = 3072;
 
-/// One thing that a recording holds.
+/// One entry of a recording.
 #[derive(Debug, Clone, Copy)]
 pub enum Entry<'a> {
     /// An engine begins, with this configuration image.
@@ -39,12 +39,12 @@ pub enum Entry<'a> {
     },
     /// [`Engine::poll_output`] returned this.
     Output(Output<'a>),
-    /// What the engine has counted and what its image holds: see [`totals`].
+    /// The engine's counters and the contents of its image: see [`totals`].
     Totals(&'a [u8]),
 }
 
 impl<'a> Entry<'a> {
-    /// The entry that `bytes` begin with, and what follows it; `None` when it is none.
+    /// The entry that `bytes` begin with, and what follows it; `None` if they do not begin with one.
     pub fn parse(bytes: &'a [u8]) -> Option<(Self, &'a [u8])> {
         let mut body = Reader(bytes);
         let entry = match body.byte()? {

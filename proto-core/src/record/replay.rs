@@ -14,7 +14,7 @@ use crate::time::Instant;
 pub enum ReplayError {
     /// It does not begin with [`MAGIC`].
     NotARecording,
-    /// What stands there is no entry: cut, or changed.
+    /// The bytes there are not an entry: cut, or changed.
     Entry {
         /// Offset of its first byte.
         at: usize,
@@ -41,7 +41,7 @@ impl fmt::Display for ReplayError {
 
 impl core::error::Error for ReplayError {}
 
-/// What a replay was.
+/// The size of a replay.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Replayed {
     /// Inputs handed to the engine.

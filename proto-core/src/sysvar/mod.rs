@@ -22,10 +22,10 @@ pub enum Direction {
     Output,
 }
 
-/// Where a variable stands in the 1468-byte state packet of port 2001.
+/// The place of a variable in the 1468-byte state packet of port 2001.
 ///
 /// A byte variable is eight bools there, one byte each, lowest number first; words and floats
-/// stand as they are.
+/// are there as they are.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct StreamPlace {
     /// Offset of the first byte in the packet.
@@ -34,7 +34,7 @@ pub struct StreamPlace {
     pub len: u16,
 }
 
-/// Where a variable stands in the controller's Modbus map.
+/// The place of a variable in the controller's Modbus map.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ModbusPlace {
     /// `count` coils from `first`, the lowest-numbered item first.
@@ -128,7 +128,7 @@ impl SysVar {
         table::image_offset(self.ordinal())
     }
 
-    /// The bits of a byte variable that mean something; 0xFF for every other type (D22).
+    /// The bits of a byte variable that have a meaning; 0xFF for every other type (D22).
     pub fn valid_bits(self) -> u8 {
         self.span().valid_bits
     }
@@ -150,7 +150,7 @@ impl SysVar {
         Some(StreamPlace { offset: first.saturating_add(self.place_in_span().saturating_mul(len)), len })
     }
 
-    /// The output that shows what this input was set to: the one that stands at the same place of the
+    /// The output that shows what this input was set to: the one at the same place in the
     /// state packet.
     pub fn shown_by(self) -> Option<Self> {
         let place = self.stream().filter(|_| self.direction() == Direction::Input)?;

@@ -19,7 +19,7 @@ impl VarRange {
     }
 }
 
-/// Why a name means no variable.
+/// Why a name is not that of a variable.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum ParseError {

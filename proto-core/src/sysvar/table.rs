@@ -23,7 +23,7 @@ pub struct Span {
     pub interface: &'static str,
     /// Unit of a quantity, or empty.
     pub unit: &'static str,
-    /// Bits of a byte variable that mean something.
+    /// Bits of a byte variable that have a meaning.
     pub valid_bits: u8,
     /// Offset of the first variable in the 2001 stream.
     pub stream: Option<u16>,
@@ -75,7 +75,7 @@ impl Span {
 /// Rows of [`SPANS`] that are inputs; they come first.
 const INPUT_ROWS: usize = 8;
 
-/// Every system variable there is.
+/// All system variables.
 pub static SPANS: [Span; 25] = ROWS;
 
 #[rustfmt::skip]

@@ -49,7 +49,7 @@ pub enum Quotes {
     Double,
 }
 
-/// What a controller answers to a `run` that it carries out.
+/// A controller's answer to a `run` that it carries out.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum RunReply {
@@ -59,7 +59,7 @@ pub enum RunReply {
     Success,
 }
 
-/// What a controller answers to a `speed` that it carries out.
+/// A controller's answer to a `speed` that it carries out.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum SpeedReply {
@@ -69,7 +69,7 @@ pub enum SpeedReply {
     Percent,
 }
 
-/// Whether a controller tells its command clients when a program has ended.
+/// Whether a controller notifies its command clients when a program has ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum FinishNotice {
@@ -173,7 +173,7 @@ impl Dialect {
         global_speed: Some(660),
     };
 
-    /// Every dialect there is.
+    /// All dialects.
     pub const ALL: [Self; 2] = [Self::V2_3, Self::V2_6];
 
     /// The names that [`Dialect::named`] knows.

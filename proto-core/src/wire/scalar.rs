@@ -109,7 +109,7 @@ pub enum Scalar {
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[non_exhaustive]
 pub enum ScalarError {
-    /// The number lies outside the type's range, or is not finite.
+    /// The number is outside the type's range, or not finite.
     OutOfRange {
         /// The type that was asked for.
         ty: ScalarType,

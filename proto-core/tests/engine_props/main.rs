@@ -1,5 +1,5 @@
-//! Whatever happens in whatever order, the engine keeps its promises (docs/architecture.md
-//! section 7): random operations, checked against a model.
+//! Whatever happens in whatever order, the engine keeps its promises (docs/engine.md
+//! sections 5 to 7): random operations, checked against a model.
 
 #[path = "../rig/mod.rs"]
 mod rig;

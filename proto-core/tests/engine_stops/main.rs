@@ -1,5 +1,5 @@
 //! Stopping never waits: urgent commands go ahead of everything, by a connection of their own where
-//! the controller takes one (docs/architecture.md section 7, docs/wire/command.md, D26).
+//! the controller takes one (docs/engine.md section 7, docs/wire/command.md, D26).
 
 mod crowded;
 #[path = "../rig/mod.rs"]

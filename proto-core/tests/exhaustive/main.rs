@@ -1,5 +1,5 @@
 //! Every sequence of events up to a depth, in cells that are small enough, against a model of what the
-//! gateway promises (docs/architecture.md sections 3, 7 and 9).
+//! gateway promises (docs/engine.md sections 2, 5, 6, 7 and 9).
 //!
 //! The depth is short in the dev profile and longer with `--release`; `EXHAUSTIVE_DEPTH` sets it. What
 //! takes long to reach is where a search begins: a cell that works, that was silent, that shares a link.

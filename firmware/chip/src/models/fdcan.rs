@@ -5,11 +5,15 @@
 //! and CCE that is set before it has, the index of TXBAR and of the acknowledges, message RAM that is
 //! written while it waits to be sent, and the clock calibration unit, which has to be bypassed.
 
+mod control;
+mod filters;
+mod memory;
+mod registers;
+
 use std::collections::VecDeque;
 
+use self::registers::*;
 use super::can_bus::{Arrival, Attempt, CanBus, Frame};
-use super::can_filters::Filters;
-use super::fdcan_registers::*;
 use crate::device::*;
 
 /// The model.
@@ -55,37 +59,6 @@ impl Fdcan {
         }
     }
 
-    /// A word of the message RAM.
-    ///
-    /// # Errors
-    /// It ends before.
-    pub fn ram_read(&self, word: usize) -> Result<u32, Refusal> {
-        self.ram.get(word).copied().ok_or_else(|| Refusal("behind the message RAM's end".into()))
-    }
-
-    /// Writes it.
-    ///
-    /// # Errors
-    /// It ends before, or a frame there waits to be sent.
-    pub fn ram_write(&mut self, word: usize, value: u32) -> Result<(), Refusal> {
-        let buffers = self.bank.get(TXBC);
-        let first = (buffers & 0xFFFC) as usize / 4;
-        let waits = |index: u32| {
-            let begin = first + ELEMENT * index as usize;
-            (begin..begin + ELEMENT).contains(&word)
-        };
-        if self.waiting.iter().copied().any(waits) || self.sending.is_some_and(|(index, ..)| waits(index)) {
-            return refuse("this transmit buffer waits to be sent (TXBRP)");
-        }
-        match self.ram.get_mut(word) {
-            Some(place) => {
-                *place = value;
-                Ok(())
-            }
-            None => refuse("behind the message RAM's end"),
-        }
-    }
-
     /// It takes part in what happens on the bus.
     pub fn is_on_bus(&self) -> bool {
         self.is_on_bus && self.bank.get(CCCR) & RESTRICTED == 0
@@ -122,144 +95,6 @@ impl Fdcan {
         let changed = before ^ self.error_state();
         let flag = |place: u32, flag: u32| if changed >> place & 1 != 0 { flag } else { 0 };
         self.raise(flag(5, EP) | flag(6, EW) | flag(7, BO));
-    }
-
-    fn forget(&mut self) {
-        if self.sending.take().is_some() {
-            self.bus.broken_off += 1;
-        }
-        self.waiting.clear();
-        self.put = 0;
-        self.fifos = [(0, 0, 0); 2];
-    }
-
-    fn write_control(&mut self, value: u32, at: &Moment<'_>) -> Result<(), Refusal> {
-        let before = self.bank.get(CCCR);
-        let arrived = self.init_arrives.is_none();
-        if (value ^ before) & INIT != 0 && !arrived {
-            return refuse("INIT is changed before the value before has arrived (read it back)");
-        }
-        if value & CCE != 0 && (before & INIT == 0 || !arrived) {
-            return refuse("CCE is set while INIT is not");
-        }
-        if value & RESTRICTED != 0 && before & CCE == 0 && before & RESTRICTED == 0 {
-            return refuse("ASM can only be set while INIT and CCE are");
-        }
-        let protected = 0x73C0 & !(1 << 4);
-        if (value ^ before) & protected != 0 && before & CCE == 0 {
-            return refuse("these bits can only be set while INIT and CCE are");
-        }
-        if value & 0x80 | value & 0x300 != 0 {
-            return refuse("test mode and CAN FD are not modelled");
-        }
-        let cycles = 4 * cycle(at.clocks.fdcan);
-        if value & INIT != 0 && before & INIT == 0 {
-            self.init_arrives = Some((true, at.now + cycles));
-        } else if value & INIT == 0 && before & INIT != 0 {
-            self.check_set_up(at)?;
-            self.init_arrives = Some((false, at.now + cycles));
-        }
-        // CCE falls with INIT; INIT itself reads as before until it has arrived.
-        let value = if value & INIT == 0 { value & !CCE } else { value };
-        if value & CCE != 0 && before & CCE == 0 {
-            self.forget();
-        }
-        self.bank.set(CCCR, value & !INIT | before & INIT);
-        Ok(())
-    }
-
-    /// What has to be right before it goes onto the bus.
-    fn check_set_up(&self, at: &Moment<'_>) -> Result<(), Refusal> {
-        if self.bank.get(CCFG) & BYPASS == 0 {
-            return refuse("the clock calibration unit is neither bypassed nor set up (CCU_CCFG.BCC)");
-        }
-        if self.bit(at.clocks).is_none() {
-            return refuse("it has no clock");
-        }
-        let sections = [
-            (SIDFC, (self.bank.get(SIDFC) >> 16 & 0xFF) as usize),
-            (XIDFC, 2 * (self.bank.get(XIDFC) >> 16 & 0x7F) as usize),
-            (RXFC[0], ELEMENT * (self.bank.get(RXFC[0]) >> 16 & 0x7F) as usize),
-            (RXFC[1], ELEMENT * (self.bank.get(RXFC[1]) >> 16 & 0x7F) as usize),
-            (TXBC, ELEMENT * (self.bank.get(TXBC) >> 24 & 0x3F) as usize),
-        ];
-        let ranges = sections.map(|(register, len)| {
-            let first = (self.bank.get(register) & 0xFFFC) as usize / 4;
-            (first, first + len)
-        });
-        for (index, (first, end)) in ranges.iter().enumerate() {
-            if *end > WORDS {
-                return refuse("a section of the message RAM ends behind it");
-            }
-            if ranges[..index].iter().any(|(other, behind)| first < behind && other < end) {
-                return refuse("two sections of the message RAM overlap");
-            }
-        }
-        Ok(())
-    }
-
-    fn request(&mut self, bits: u32) -> Result<(), Refusal> {
-        if !self.is_on_bus {
-            return refuse("a transmission is requested while INIT is set");
-        }
-        let size = self.bank.get(TXBC) >> 24 & 0x3F;
-        if bits != 1 << self.put || self.used() >= size {
-            return refuse(format!("not the FIFO's put index, which is {}", self.put));
-        }
-        let begin = (self.bank.get(TXBC) & 0xFFFC) as usize / 4 + ELEMENT * self.put as usize;
-        if self.ram[begin + 1] & 0x0070_FFFF != 0 {
-            return refuse("a frame of CAN FD, or reserved bits in its element");
-        }
-        self.waiting.push_back(self.put);
-        self.put = (self.put + 1) % size;
-        Ok(())
-    }
-
-    fn used(&self) -> u32 {
-        self.waiting.len() as u32 + u32::from(self.sending.is_some())
-    }
-
-    /// The frame of a transmit buffer.
-    fn frame(&self, index: u32) -> Frame {
-        let begin = (self.bank.get(TXBC) & 0xFFFC) as usize / 4 + ELEMENT * index as usize;
-        let words: [u32; ELEMENT] = std::array::from_fn(|offset| self.ram[begin + offset]);
-        Frame::from_words(words)
-    }
-
-    fn store(&mut self, frame: &Frame) {
-        let filters = Filters {
-            others: self.bank.get(GFC),
-            standard: self.bank.get(SIDFC),
-            extended: self.bank.get(XIDFC),
-            mask: self.bank.get(XIDAM),
-        };
-        let Some((fifo, filter)) = filters.accept(frame, &self.ram) else { return };
-        self.bus.passed += 1;
-        let config = self.bank.get(RXFC[fifo]);
-        let size = config >> 16 & 0x7F;
-        let (get, put, fill) = self.fifos[fifo];
-        if fill == size {
-            self.raise(1 << (3 + 4 * fifo));
-            return;
-        }
-        let begin = (config & 0xFFFC) as usize / 4 + ELEMENT * put as usize;
-        for (place, word) in self.ram[begin..begin + ELEMENT].iter_mut().zip(frame.words()) {
-            *place = word;
-        }
-        // FIDX, or ANMF ("FDCAN Rx buffer and FIFO element").
-        self.ram[begin + 1] |= filter.map_or(1 << 31, |index| index << 24);
-        self.fifos[fifo] = (get, (put + 1) % size, fill + 1);
-        self.raise(1 << (4 * fifo) | u32::from(fill + 1 == size) << (2 + 4 * fifo));
-    }
-
-    fn take(&mut self, fifo: usize, index: u32) -> Result<(), Refusal> {
-        let (get, put, fill) = self.fifos[fifo];
-        if fill == 0 || index != get {
-            return refuse(format!("not the FIFO's get index, which is {get}; {fill} are there"));
-        }
-        let size = self.bank.get(RXFC[fifo]) >> 16 & 0x7F;
-        self.fifos[fifo] = ((get + 1) % size, put, fill - 1);
-        Ok(())
     }
 
     fn end(&mut self, index: u32, frame: Frame, attempt: Attempt, at: Picos) {

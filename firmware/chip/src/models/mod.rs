@@ -1,10 +1,8 @@
 //! The models, one file each.
 
 pub mod can_bus;
-mod can_filters;
 pub mod ethernet;
 pub mod fdcan;
-mod fdcan_registers;
 pub mod flash;
 pub mod gpio;
 pub mod iwdg;

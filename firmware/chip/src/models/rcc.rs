@@ -6,59 +6,11 @@
 //! be used when its clock is on and its reset is not; and not right behind the write that switched it on,
 //! which takes two cycles of its bus ("Peripheral clock gating"): something has to be read in between.
 
+mod registers;
+mod tree;
+
+use self::registers::*;
 use crate::device::*;
-
-const CR: u32 = 0x00;
-const CFGR: u32 = 0x10;
-const D1CFGR: u32 = 0x18;
-const D2CFGR: u32 = 0x1C;
-const PLLCKSELR: u32 = 0x28;
-const PLLCFGR: u32 = 0x2C;
-const PLL1DIVR: u32 = 0x30;
-const D2CCIP1R: u32 = 0x50;
-const D2CCIP2R: u32 = 0x54;
-const BDCR: u32 = 0x70;
-const CSR: u32 = 0x74;
-const RSR: u32 = 0xD0;
-const RESETS: std::ops::RangeInclusive<u32> = 0x7C..=0x9C;
-const ENABLES: std::ops::RangeInclusive<u32> = 0xD4..=0xF4;
-
-static REGISTERS: [Register; 34] = [
-    keeps(CR, "CR", 0x83, 0x150D_129B),
-    keeps(CFGR, "CFGR", 0, 0xFFFC_FFC7),
-    keeps(D1CFGR, "D1CFGR", 0, 0xF7F),
-    keeps(D2CFGR, "D2CFGR", 0, 0x770),
-    keeps(0x20, "D3CFGR", 0, 0x70),
-    keeps(PLLCKSELR, "PLLCKSELR", 0x0202_0200, 0x03F3_F3F3),
-    keeps(PLLCFGR, "PLLCFGR", 0x01FF_0000, 0x01FF_0FFF),
-    keeps(PLL1DIVR, "PLL1DIVR", 0x0101_0280, 0x7F7F_FFFF),
-    keeps(0x38, "PLL2DIVR", 0x0101_0280, 0x7F7F_FFFF),
-    keeps(0x40, "PLL3DIVR", 0x0101_0280, 0x7F7F_FFFF),
-    keeps(0x4C, "D1CCIPR", 0, 0x3001_0033),
-    keeps(D2CCIP1R, "D2CCIP1R", 0, 0xB137_71C7),
-    keeps(D2CCIP2R, "D2CCIP2R", 0, 0x70F0_333F),
-    keeps(0x58, "D3CCIPR", 0, 0x77E3_FF07),
-    keeps(BDCR, "BDCR", 0, 0x1_837D),
-    keeps(CSR, "CSR", 0, 1),
-    keeps(0x7C, "AHB3RSTR", 0, 0x8001_5031),
-    keeps(0x80, "AHB1RSTR", 0, 0x0A00_8023),
-    keeps(0x84, "AHB2RSTR", 0, 0x271),
-    keeps(0x88, "AHB4RSTR", 0, 0x0328_07FF),
-    keeps(0x8C, "APB3RSTR", 0, 0x8),
-    keeps(0x90, "APB1LRSTR", 0, 0xE8FF_C3FF),
-    keeps(0x94, "APB1HRSTR", 0, 0x136),
-    keeps(0x98, "APB2RSTR", 0, 0x31D7_3033),
-    keeps(0x9C, "APB4RSTR", 0, 0x0020_DEAA),
-    keeps(RSR, "RSR", 0x00FE_0000, 1 << 16),
-    keeps(0xD4, "AHB3ENR", 0, 0x0001_5031),
-    keeps(0xD8, "AHB1ENR", 0, 0x1E03_8023),
-    keeps(0xDC, "AHB2ENR", 0, 0xE000_0271),
-    keeps(0xE0, "AHB4ENR", 0, 0x1328_07FF),
-    keeps(0xE4, "APB3ENR", 0, 0x48),
-    keeps(0xE8, "APB1LENR", 0, 0xE8FF_CBFF),
-    keeps(0xEC, "APB1HENR", 0, 0x136),
-    keeps(0xF4, "APB4ENR", 0, 0x0021_DEAA),
-];
 
 /// What has to be on before a peripheral may be used: the enable register's offset, and the bits.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -159,81 +111,6 @@ impl Rcc {
         self.ready.iter().any(|&(ready, from)| ready == flag && now >= from)
     }
 
-    /// HSI, by its divider.
-    fn internal(&self) -> u32 {
-        64_000_000 >> (self.bank.get(CR) >> 3 & 3)
-    }
-
-    fn pll_input(&self) -> u32 {
-        let select = self.bank.get(PLLCKSELR);
-        let source = match select & 3 {
-            0 => self.internal(),
-            1 => 4_000_000,
-            2 => 8_000_000,
-            _ => 0,
-        };
-        source.checked_div(select >> 4 & 0x3F).unwrap_or(0)
-    }
-
-    /// PLL1's outputs P and Q.
-    fn pll(&self) -> (u32, u32) {
-        let (config, dividers) = (self.bank.get(PLLCFGR), self.bank.get(PLL1DIVR));
-        let vco = u64::from(self.pll_input()) * u64::from((dividers & 0x1FF) + 1);
-        let output = |enabled: u32, place: u32| {
-            if config >> enabled & 1 == 0 {
-                0
-            } else {
-                (vco / u64::from((dividers >> place & 0x7F) + 1)) as u32
-            }
-        };
-        (output(16, 9), output(17, 16))
-    }
-
-    /// What runs how fast ("Core and bus clock generation").
-    pub fn clocks(&self) -> Clocks {
-        let (p, q) = self.pll();
-        let system = match self.bank.get(CFGR) >> 3 & 7 {
-            0 => self.internal(),
-            1 => 4_000_000,
-            2 => 8_000_000,
-            _ => p,
-        };
-        let halves = |code: u32| if code & 8 == 0 { 0 } else { [1, 2, 3, 4, 6, 7, 8, 9][code as usize & 7] };
-        let domain1 = self.bank.get(D1CFGR);
-        let core = system >> halves(domain1 >> 8 & 0xF);
-        let hclk = core >> halves(domain1 & 0xF);
-        let apb1 = match self.bank.get(D2CFGR) >> 4 & 7 {
-            code if code & 4 == 0 => 0,
-            code => (code & 3) + 1,
-        };
-        let pclk1 = hclk >> apb1;
-        let usart = match self.bank.get(D2CCIP2R) & 7 {
-            0 => pclk1,
-            3 => self.internal(),
-            4 => 4_000_000,
-            _ => 0,
-        };
-        let fdcan = match self.bank.get(D2CCIP1R) >> 28 & 3 {
-            0 => 8_000_000,
-            1 => q,
-            _ => 0,
-        };
-        let rng = match self.bank.get(D2CCIP2R) >> 8 & 3 {
-            0 if self.bank.get(CR) & 1 << 12 != 0 => 48_000_000,
-            1 => q,
-            _ => 0,
-        };
-        Clocks {
-            core,
-            hclk,
-            timers: if apb1 < 2 { hclk } else { 2 * pclk1 },
-            usart,
-            fdcan,
-            rng,
-            is_external: self.has_external,
-        }
-    }
-
     fn write_oscillators(&mut self, value: u32, now: Picos) -> Result<(), Refusal> {
         let before = self.bank.get(CR);
         let changed = before ^ value;
@@ -267,35 +144,6 @@ impl Rcc {
             return refuse("PLL2 and PLL3 are not modelled");
         }
         self.bank.set(CR, value);
-        Ok(())
-    }
-
-    /// What the datasheet asks of PLL1 ("PLL characteristics") before it is switched on.
-    fn check_pll(&self, now: Picos) -> Result<(), Refusal> {
-        let (source, flag) = match self.bank.get(PLLCKSELR) & 3 {
-            0 => ("HSI", 2),
-            1 => ("CSI", 8),
-            2 => ("HSE", 17),
-            _ => return refuse("PLL1 has no source"),
-        };
-        if !self.is_ready(flag, now) {
-            return refuse(format!("PLL1 is switched on before {source} is ready"));
-        }
-        let (input, config) = (self.pll_input(), self.bank.get(PLLCFGR));
-        let range = match config >> 2 & 3 {
-            0 => 1_000_000..=2_000_000,
-            1 => 2_000_000..=4_000_000,
-            2 => 4_000_000..=8_000_000,
-            _ => 8_000_000..=16_000_000,
-        };
-        if !range.contains(&input) {
-            return refuse(format!("PLL1's input of {input} Hz is not in the range of PLL1RGE"));
-        }
-        let vco = u64::from(input) * u64::from((self.bank.get(PLL1DIVR) & 0x1FF) + 1);
-        let range = if config & 2 == 0 { 192_000_000..=836_000_000 } else { 150_000_000..=420_000_000 };
-        if !range.contains(&vco) {
-            return refuse(format!("PLL1's VCO would run at {vco} Hz"));
-        }
         Ok(())
     }
 

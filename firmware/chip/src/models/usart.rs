@@ -7,57 +7,16 @@
 //! and /RE are tied). Settings that only a disabled USART takes are refused while it runs (said at each
 //! field).
 
+mod receiver;
+mod registers;
+mod transmitter;
+
 use std::collections::VecDeque;
 
+use self::registers::*;
 use crate::device::*;
 
 pub use super::line::{Format, Line, Sent};
-
-const CR1: u32 = 0x00;
-const CR2: u32 = 0x04;
-const CR3: u32 = 0x08;
-const BRR: u32 = 0x0C;
-const ISR: u32 = 0x1C;
-const ICR: u32 = 0x20;
-const RDR: u32 = 0x24;
-const TDR: u32 = 0x28;
-const PRESC: u32 = 0x2C;
-
-static REGISTERS: [Register; 10] = [
-    keeps(CR1, "CR1", 0, !0),
-    keeps(CR2, "CR2", 0, 0xFFFF_FF79),
-    keeps(CR3, "CR3", 0, !0x0001_0000),
-    keeps(BRR, "BRR", 0, 0xFFFF),
-    does(0x18, "RQR", 0x1F),
-    reads(ISR, "ISR", 0),
-    does(ICR, "ICR", 0x0012_3BFF),
-    reads(RDR, "RDR", 0),
-    does(TDR, "TDR", 0x1FF),
-    keeps(PRESC, "PRESC", 0, 0xF),
-];
-
-const PE: u32 = 1;
-const FE: u32 = 1 << 1;
-const NE: u32 = 1 << 2;
-const ORE: u32 = 1 << 3;
-const IDLE: u32 = 1 << 4;
-const RXFNE: u32 = 1 << 5;
-const TC: u32 = 1 << 6;
-const TXFNF: u32 = 1 << 7;
-const TXFE: u32 = 1 << 23;
-const RXFT: u32 = 1 << 26;
-const TXFT: u32 = 1 << 27;
-
-const UE: u32 = 1;
-const RE: u32 = 1 << 2;
-const TE: u32 = 1 << 3;
-const PCE: u32 = 1 << 10;
-const OVER8: u32 = 1 << 15;
-const FIFOEN: u32 = 1 << 29;
-const ONEBIT: u32 = 1 << 11;
-const DEM: u32 = 1 << 14;
-const DEP: u32 = 1 << 15;
-const FIFO: usize = 16;
 
 /// The pins of a USART and their alternate function.
 #[derive(Debug, Clone, Copy)]
@@ -151,127 +110,8 @@ impl Usart {
         Picos::from(1 + self.data_bits() + self.stop_bits()) * self.bit(clocks)
     }
 
-    /// The pin of driver-enable, as the transceiver sees it: pulled down while nobody drives it. One that is
-    /// not set up for driver-enable is the request to send, which is high at rest.
-    fn show_driver(&mut self, is_active: bool, at: &Moment<'_>) {
-        let is_connected = self.pins.de.is(at.functions, self.pins.function);
-        let is_set_up = self.has(CR1, UE) && self.has(CR3, DEM);
-        let level = is_connected && (!is_set_up || is_active != self.has(CR3, DEP));
-        self.line.drive(at.now, level);
-    }
-
-    fn is_driving(&self) -> bool {
-        self.sending.is_some() || self.releases.is_some()
-    }
-
-    fn begin(&mut self, byte: u8, from: Picos, clocks: Clocks) {
-        // The parity bit takes the place of the word's last bit.
-        let bits = self.data_bits() - u32::from(self.has(CR1, PCE));
-        let byte = byte & (0xFF >> 8_u32.saturating_sub(bits));
-        self.sending = Some((byte, from, from + self.character(clocks)));
-    }
-
     fn parity_bit(&self, byte: u8) -> Option<bool> {
         self.has(CR1, PCE).then(|| byte.count_ones().is_multiple_of(2) == self.has(CR1, 1 << 9))
-    }
-
-    fn transmit(&mut self, at: &Moment<'_>) -> Result<(), Refusal> {
-        let bit = self.bit(at.clocks);
-        while let Some((byte, start, end)) = self.sending {
-            if at.now < end {
-                break;
-            }
-            let is_connected = self.pins.tx.is(at.functions, self.pins.function);
-            if !is_connected {
-                return refuse(format!("a character was sent, but {:?} is not its pin", self.pins.tx));
-            }
-            let is_driven = self.line.is_driven(start) && self.line.is_driven(end);
-            let (parity, stop_bits) = (self.parity_bit(byte), self.stop_bits() as u8);
-            self.line.sent.push(Sent { byte, start, end, bit, parity, stop_bits, is_driven });
-            self.sending = None;
-            match self.waiting.pop_front() {
-                Some(next) => self.begin(next, end, at.clocks),
-                None => {
-                    self.flags |= TC;
-                    let sixteenths = u64::from(self.bank.get(CR1) >> 16 & 0x1F);
-                    self.releases = Some(end + sixteenths * bit / 16);
-                }
-            }
-        }
-        if let Some(until) = self.releases
-            && at.now >= until
-        {
-            self.releases = None;
-            let then = Moment { now: until, ..*at };
-            self.show_driver(false, &then);
-        }
-        Ok(())
-    }
-
-    /// A bit by the majority of its three samples, and whether they disagree ("Noise error"); `middle` is when
-    /// the second is taken.
-    fn sample(&self, middle: Picos, bit: Picos) -> (bool, bool) {
-        let levels = [middle - spread(bit), middle, middle + spread(bit)].map(|at| self.line.level(at));
-        if self.has(CR3, ONEBIT) {
-            return (levels[1], false);
-        }
-        let highs = levels.into_iter().filter(|level| *level).count();
-        (highs >= 2, highs % 3 != 0)
-    }
-
-    fn receive(&mut self, at: &Moment<'_>) {
-        let is_on = self.has(CR1, UE | RE) && self.pins.rx.is(at.functions, self.pins.function);
-        let bit = self.bit(at.clocks);
-        let bits = self.data_bits();
-        // Up to the middle of the first stop bit, and to the last sample of it.
-        let middle = Picos::from(bits + 1) * bit + bit / 2;
-        let sampled = middle + spread(bit);
-        loop {
-            let start = match self.receiving {
-                Some(start) => start,
-                None => match self.line.start_bit(at.now) {
-                    Some(start) => start,
-                    None => break,
-                },
-            };
-            // What comes before the line has been at rest long enough is not behind a rest.
-            self.idles = self.idles.filter(|idle| *idle <= start);
-            // A glitch is none: the middle of the start bit is looked at too.
-            if at.now < start + sampled {
-                self.receiving = Some(start);
-                break;
-            }
-            self.receiving = None;
-            let sample = |index: u32| self.sample(start + Picos::from(index) * bit + bit / 2, bit);
-            let level = |index: u32| sample(index).0;
-            if level(0) || !is_on {
-                self.line.heard(start + bit);
-                continue;
-            }
-            let word = (0..bits).fold(0_u32, |word, index| word | u32::from(level(index + 1)) << index);
-            let is_stopped = level(bits + 1);
-            let is_noisy = (0..=bits + 1).any(|index| sample(index).1);
-            self.line.heard(start + sampled);
-            let mut flags = if is_stopped { 0 } else { FE } | if is_noisy { NE } else { 0 };
-            let data = word & !(1 << (bits - 1));
-            if let Some(parity) = self.parity_bit(data as u8)
-                && (word >> (bits - 1) & 1 != 0) != parity
-            {
-                flags |= PE;
-            }
-            if self.received.len() == FIFO {
-                self.flags |= ORE;
-            } else {
-                self.received.push_back((word as u16, flags));
-            }
-            self.idles = Some(start + middle + self.character(at.clocks));
-        }
-        if let Some(idle) = self.idles
-            && at.now >= idle
-        {
-            self.idles = None;
-            self.flags |= IDLE;
-        }
     }
 
     fn status(&self) -> u32 {
@@ -307,11 +147,6 @@ impl Usart {
             bits => refuse(format!("bits {bits:08X} can only be changed while UE is 0")),
         }
     }
-}
-
-/// From the middle sample of a bit to its neighbours ("Oversampling by 16").
-fn spread(bit: Picos) -> Picos {
-    bit / 16
 }
 
 impl Peripheral for Usart {
@@ -398,7 +233,7 @@ impl Peripheral for Usart {
         let bit = self.bit(at.clocks);
         // Edges inside of a character are looked at when it is sampled.
         let start = self.receiving.or_else(|| self.line.next_start_bit());
-        let sampled = start.map(|start| start + bits * bit + bit / 2 + spread(bit));
+        let sampled = start.map(|start| start + bits * bit + bit / 2 + receiver::spread(bit));
         let sent = self.sending.map(|(_, _, end)| end);
         [sent, self.releases, sampled, self.idles].into_iter().flatten().min()
     }
@@ -422,3 +257,5 @@ impl Peripheral for Usart {
         *self = Self { line, ..Self::new(self.pins) };
     }
 }
+
+const FIFO: usize = 16;

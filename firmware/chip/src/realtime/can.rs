@@ -1,4 +1,4 @@
-//! A CAN bus whose other nodes are slcan clients (docs/wire/slcan.md). Each frame of theirs takes its bits' time
+//! A CAN bus whose other nodes are slcan clients (proto-core/docs/wire/slcan.md). Each frame of theirs takes its bits' time
 //! on the bus, one after the other. The chip is acknowledged while a client's channel is open to send.
 
 use std::collections::VecDeque;

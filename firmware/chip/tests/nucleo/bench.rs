@@ -5,9 +5,9 @@ use std::sync::OnceLock;
 
 use chip::device::{MICRO, MILLI, Picos};
 use chip::{Chip, Program};
-use host_sim::config::SimConfig;
-use host_sim::config::file::{Text, parse_controller, parse_gateway};
 use proto_core::config::image;
+use recipe_config::SimConfig;
+use recipe_config::file::{Text, parse_controller, parse_gateway};
 
 use crate::robot::Robot;
 

@@ -6,9 +6,9 @@ use std::net::{IpAddr, SocketAddr};
 
 use chip::device::{MICRO, Picos};
 use chip::models::ethernet::Ethernet;
-use host_sim::config::SimConfig;
-use host_sim::controller::{ConnId, Controller, ControllerInput, ControllerOutput, Counters};
 use proto_core::time::Instant;
+use recipe_config::SimConfig;
+use recipe_controller::{ConnId, Controller, ControllerInput, ControllerOutput, Counters};
 use smoltcp::iface::{Config, Interface, SocketHandle, SocketSet};
 use smoltcp::phy::{Device, DeviceCapabilities, Medium, RxToken, TxToken};
 use smoltcp::socket::{tcp, udp};

@@ -35,7 +35,7 @@ pub(super) fn print(text: fmt::Arguments<'_>) {
 
 /// Prints which task has the processor.
 pub(super) fn print_running() {
-    match firmware::watchdog::running() {
+    match firmware::tasks::watchdog::running() {
         Some(task) => print(format_args!("task {task} was running\r\n")),
         None => print(format_args!("no task was running\r\n")),
     }

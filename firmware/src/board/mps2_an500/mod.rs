@@ -18,9 +18,9 @@ use cortex_m::interrupt::InterruptNumber;
 use cortex_m::peripheral::NVIC;
 use embassy_sync::waitqueue::AtomicWaker;
 use embassy_time::Duration;
-use firmware::lan9118::{Lan9118, Registers, StartError};
+use firmware::drivers::lan9118::{Lan9118, Registers, StartError};
+use firmware::drivers::slcan::SlcanPort;
 use firmware::platform::{self, Lamp};
-use firmware::slcan::SlcanPort;
 use proto_core::config::Rs485;
 
 use watchdog::Watchdog;

@@ -6,7 +6,7 @@ use core::hint::{black_box, spin_loop};
 use core::pin::pin;
 
 use embassy_time::{Duration, Timer};
-use firmware::watchdog::{Pulse, TaskName};
+use firmware::tasks::watchdog::{Pulse, TaskName};
 
 use super::storage;
 use crate::start::Tasks;

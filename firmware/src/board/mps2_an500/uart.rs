@@ -11,7 +11,7 @@ use core::task::Poll;
 use critical_section::Mutex;
 use embassy_sync::waitqueue::WakerRegistration;
 use embedded_io_async::{ErrorType, Read, Write};
-use firmware::serial::Line;
+use firmware::drivers::line::Line;
 use heapless::Deque;
 
 use super::Irq;

@@ -6,7 +6,7 @@ use embassy_stm32::pac::{FDCAN1, FDCANRAM};
 use embassy_stm32::peripherals::{PD0, PD1};
 use embassy_stm32::{Peri, peripherals, rcc};
 use embassy_sync::waitqueue::AtomicWaker;
-use firmware::mcan::{MESSAGE_RAM_WORDS, Mcan, Registers, StartError};
+use firmware::drivers::mcan::{MESSAGE_RAM_WORDS, Mcan, Registers, StartError};
 
 /// The CAN controller.
 pub(crate) type CanDevice = Mcan<CanRegisters>;

@@ -8,8 +8,8 @@ use cortex_m::peripheral::SCB;
 use cortex_m_rt::ExceptionFrame;
 use firmware::fmt::Text;
 use firmware::identity::hash;
+use firmware::tasks::watchdog::running;
 use firmware::warn;
-use firmware::watchdog::running;
 
 const ROOM: usize = 128;
 

@@ -5,7 +5,7 @@ use embassy_stm32::interrupt::typelevel::{self, Handler, Interrupt};
 use embassy_stm32::pac::{UART7, USART2, usart};
 use embassy_stm32::peripherals::{PD4, PD5, PD6, PE7, PE8, PE9};
 use embassy_stm32::{Peri, peripherals, rcc};
-use firmware::usart::{BaudError, Registers, Shared, Usart};
+use firmware::drivers::usart::{BaudError, Registers, Shared, Usart};
 use proto_core::config::Rs485;
 
 /// An RS-485 line.

@@ -2,7 +2,7 @@ use proptest::prelude::*;
 use proto_core::sysvar::Direction;
 
 use super::*;
-use crate::config::file::{Text, parse_recipes};
+use recipe_config::file::{Text, parse_recipes};
 
 const STREAM: &str = r#"
 [robot]

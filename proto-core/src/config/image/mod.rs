@@ -31,7 +31,7 @@ pub enum ImageError {
     TooShort {
         /// Bytes that were needed.
         needed: usize,
-        /// Bytes that were there.
+        /// Bytes that were available.
         available: usize,
     },
     /// It does not begin with [`MAGIC`]: erased flash, or something else.
@@ -49,14 +49,14 @@ pub enum ImageError {
         /// The payload's length as the header has it.
         payload: u32,
     },
-    /// Some bit is not as it was written.
+    /// Some bit has changed since it was written.
     Crc {
         /// The header's CRC.
         stored: u32,
         /// That of the bytes.
         computed: u32,
     },
-    /// The payload is no configuration; whoever wrote it has other types.
+    /// The payload is not a configuration: it was written with other types.
     Contents,
     /// The configuration is wrong.
     Config(ConfigError),

@@ -202,7 +202,7 @@ fn the_reasons_are_sentences() {
 
 #[test]
 fn the_page_has_the_same_limits() {
-    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/wire/state.md");
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/docs/wire/state.md");
     let page = std::fs::read_to_string(path).unwrap();
     let section = page.split("\n## ").find(|section| section.starts_with("3. Is it a packet?")).unwrap();
     let mut written = vec![];

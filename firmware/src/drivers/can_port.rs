@@ -1,0 +1,66 @@
+//! What the tasks ask of a CAN controller.
+
+use embedded_can::Frame;
+use proto_core::engine::BusState;
+use proto_core::recipe::can::CanFrame;
+use proto_core::recipe::model::CanId;
+
+/// A CAN controller. Its driver buffers what arrives while nobody receives.
+#[allow(async_fn_in_trait, reason = "all tasks run on one executor: no future is sent anywhere")]
+pub trait CanPort {
+    /// The driver's frame.
+    type Frame: Frame;
+
+    /// The next frame, a change of the controller's state, or the end of what was sent. Nothing is lost
+    /// when the future is dropped before it is done.
+    async fn receive(&mut self) -> CanEvent<Self::Frame>;
+
+    /// Hands a frame over for sending behind those before it, as soon as there is room for it. When all
+    /// have left, `receive` says so.
+    ///
+    /// # Errors
+    /// [`BusOff`] when the controller has left the bus; `receive` then does not report that again.
+    async fn send(&mut self, frame: &CanFrame) -> Result<(), BusOff>;
+
+    /// Forgets what waits to be sent, and lets the controller onto the bus again after bus-off.
+    /// `receive` reports when it is there, which on a disturbed bus may be never.
+    fn recover(&mut self);
+
+    /// Goes onto the bus. Frames with other ids need not be received; a controller without room for all
+    /// of the ids lets more pass. Called once, before anything else.
+    fn set_filters(&mut self, ids: &[CanId]);
+
+    /// How the controller does.
+    fn counters(&self) -> CanCounters {
+        CanCounters::default()
+    }
+
+    /// The bus' speed, in bit/s.
+    fn bitrate(&self) -> u32;
+}
+
+/// What a CAN controller brings.
+#[derive(Debug, Clone, Copy)]
+pub enum CanEvent<F> {
+    /// A frame.
+    Frame(F),
+    /// Its error state changed.
+    Bus(BusState),
+    /// All that was handed over has left.
+    Sent,
+}
+
+/// The controller has left the bus.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct BusOff;
+
+/// The counters of a CAN controller.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct CanCounters {
+    /// The transmit error counter of the CAN standard: bus-off beyond 255.
+    pub transmit_errors: u8,
+    /// The receive error counter of the CAN standard.
+    pub receive_errors: u8,
+    /// Times that a frame was lost because nobody took it from the controller in time. Wraps.
+    pub lost: u32,
+}

@@ -1,0 +1,254 @@
+//! A CAN port's task.
+//!
+//! One task drives the controller: it receives, sends what the engine hands over, and brings the
+//! controller back after bus-off. It never waits for one direction only, and after some frames in a row
+//! it lets the other tasks run, however busy the bus is.
+
+use core::pin::pin;
+
+use embassy_futures::select::{Either, Either3, select, select3};
+use embassy_futures::yield_now;
+use embassy_time::{Duration, Instant, Timer, with_timeout};
+use embedded_can::Frame;
+use proto_core::engine::{BusState, Input, PortId};
+use proto_core::recipe::can::CanFrame;
+use proto_core::recipe::model::{CanId, MAX_CAN_DATA};
+
+use super::control::PortControl;
+use super::gateway::Gateway;
+use super::watchdog::Pulse;
+use crate::drivers::can_port::{BusOff, CanCounters, CanEvent, CanPort};
+use crate::{info, warn};
+
+/// Drives the port for ever.
+pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, can: impl CanPort) -> ! {
+    let Some(control) = gateway.port(port) else { core::future::pending().await };
+    let task = Task {
+        gateway,
+        pulse,
+        port,
+        control,
+        can,
+        phase: Phase::Idle,
+        is_failing: false,
+        backoff: BACKOFF_MIN,
+        recovered: Instant::MIN,
+        lost: 0,
+        lost_told: Instant::MIN,
+    };
+    task.run().await
+}
+
+/// What the task waits for, beside frames.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Phase {
+    /// Frames to send.
+    Idle,
+    /// What was handed over has to leave the controller until then.
+    Sending { until: Instant },
+    /// Bus-off: nothing is tried until then.
+    Off { until: Instant },
+    /// The controller is on its way back to the bus; if it is not there by then, another try.
+    Recovering { until: Instant },
+}
+
+struct Task<'a, C> {
+    gateway: &'a Gateway,
+    pulse: &'a Pulse,
+    port: PortId,
+    control: &'a PortControl,
+    can: C,
+    phase: Phase,
+    /// What was handed over last did not leave.
+    is_failing: bool,
+    /// How long the next bus-off is waited out.
+    backoff: Duration,
+    /// When the controller was back on the bus.
+    recovered: Instant,
+    /// As many frames were lost when it was told last, and when that was.
+    lost: u32,
+    lost_told: Instant,
+}
+
+impl<C: CanPort> Task<'_, C> {
+    async fn run(mut self) -> ! {
+        self.can.set_filters(self.control.ids());
+        self.gateway.input(Input::PortUp { port: self.port });
+        loop {
+            for _ in 0..IN_A_ROW {
+                let alarm = self.alarm();
+                let next = select3(self.can.receive(), self.control.frame_waits(), Timer::at(alarm));
+                let next = self.pulse.idle(pin!(next)).await;
+                match next {
+                    Either3::First(event) => self.event(event),
+                    Either3::Second(()) => {}
+                    Either3::Third(()) => self.expired(),
+                }
+                // A bus that is never idle does not keep us from sending.
+                self.send_waiting().await;
+            }
+            self.tell_lost();
+            self.gateway.more_waits();
+            yield_now().await;
+        }
+    }
+
+    fn alarm(&self) -> Instant {
+        match self.phase {
+            Phase::Idle => Instant::MAX,
+            Phase::Sending { until } | Phase::Off { until } | Phase::Recovering { until } => until,
+        }
+    }
+
+    fn event(&mut self, event: CanEvent<C::Frame>) {
+        match event {
+            CanEvent::Frame(frame) => {
+                if let Some(frame) = own_frame(&frame) {
+                    self.gateway.input(Input::PortCan { port: self.port, frame });
+                }
+            }
+            CanEvent::Bus(BusState::BusOff) => self.bus_off(),
+            CanEvent::Bus(state) => {
+                self.tell_state(state);
+                if matches!(self.phase, Phase::Off { .. } | Phase::Recovering { .. }) {
+                    self.recovered = Instant::now();
+                    self.phase = Phase::Idle;
+                }
+                self.gateway.input(Input::PortBus { port: self.port, state });
+            }
+            CanEvent::Sent => {
+                if let Phase::Sending { .. } = self.phase {
+                    self.phase = Phase::Idle;
+                    self.is_failing = false;
+                    self.gateway.input(Input::PortSent { port: self.port });
+                }
+            }
+        }
+    }
+
+    /// Sends what the engine handed over.
+    async fn send_waiting(&mut self) {
+        let mut frames = 0_u32;
+        while let Some(frame) = self.control.next_frame() {
+            if matches!(self.phase, Phase::Off { .. } | Phase::Recovering { .. }) {
+                // The engine knows; what it handed over before is lost.
+                continue;
+            }
+            frames = frames.saturating_add(1);
+            let patience = patience(frames, self.can.bitrate());
+            self.control.forget_sleep();
+            // When the gateway has slept meanwhile, what waits in the controller is old and must not be
+            // heard of only when the frame has left.
+            let sending = select(self.can.send(&frame), self.control.has_slept());
+            let sent = self.pulse.idle(pin!(with_timeout(patience, sending))).await;
+            match sent {
+                Ok(Either::First(Ok(()))) => {
+                    self.phase = Phase::Sending { until: Instant::now() + patience };
+                }
+                Ok(Either::First(Err(BusOff))) => self.bus_off(),
+                Ok(Either::Second(())) => self.forget_waiting(),
+                Err(_) => self.give_up(),
+            }
+        }
+    }
+
+    fn expired(&mut self) {
+        match self.phase {
+            Phase::Idle => {}
+            Phase::Sending { .. } => self.give_up(),
+            Phase::Off { .. } | Phase::Recovering { .. } => {
+                self.can.recover();
+                self.phase = Phase::Recovering { until: Instant::now() + RECOVERY };
+            }
+        }
+    }
+
+    /// Nobody takes what is sent: another node is missing, or the cable. What waits would be old when
+    /// one comes.
+    fn give_up(&mut self) {
+        // Said once, however often it happens in a row.
+        if !self.is_failing {
+            let errors = self.can.counters().transmit_errors;
+            warn!("port {}: nothing leaves, nobody acknowledges; transmit errors {}", self.port.0, errors);
+        }
+        self.is_failing = true;
+        self.forget_waiting();
+    }
+
+    fn forget_waiting(&mut self) {
+        self.can.recover();
+        self.control.clear();
+        self.phase = Phase::Idle;
+        self.gateway.input(Input::PortDown { port: self.port });
+        self.gateway.input(Input::PortUp { port: self.port });
+    }
+
+    fn bus_off(&mut self) {
+        let now = Instant::now();
+        if matches!(self.phase, Phase::Off { .. }) {
+            return;
+        }
+        if now.saturating_duration_since(self.recovered) >= HEALTHY {
+            self.backoff = BACKOFF_MIN;
+        }
+        warn!("port {}: bus-off; onto the bus again in {} ms", self.port.0, self.backoff.as_millis());
+        self.phase = Phase::Off { until: now + self.backoff };
+        self.backoff = (self.backoff * 2).min(BACKOFF_MAX);
+        self.gateway.input(Input::PortBus { port: self.port, state: BusState::BusOff });
+        self.control.clear();
+    }
+
+    fn tell_state(&self, state: BusState) {
+        let CanCounters { transmit_errors, receive_errors, .. } = self.can.counters();
+        let name = match state {
+            BusState::Active => "error-active",
+            BusState::Warning => "error warning",
+            BusState::Passive => "error-passive",
+            BusState::BusOff => "bus-off",
+        };
+        let port = self.port.0;
+        info!("port {}: {}; errors: transmit {}, receive {}", port, name, transmit_errors, receive_errors);
+    }
+
+    /// Says that frames were lost, at most once a second.
+    fn tell_lost(&mut self) {
+        let lost = self.can.counters().lost;
+        let now = Instant::now();
+        if lost != self.lost && now.saturating_duration_since(self.lost_told) >= LOST_PERIOD {
+            warn!("port {}: frames lost {} times", self.port.0, lost);
+            self.lost = lost;
+            self.lost_told = now;
+        }
+    }
+}
+
+/// The engine's frame. Of a remote frame there is no data to look at.
+fn own_frame(frame: &impl Frame) -> Option<CanFrame> {
+    let id = CanId::from(frame.id());
+    if frame.is_remote_frame() {
+        CanFrame::remote(id, frame.dlc().min(MAX_CAN_DATA))
+    } else {
+        CanFrame::new(id, frame.data())
+    }
+}
+
+/// Four times what the frames take on a bus of their own, 160 bits each at most, and a little: others
+/// may be more urgent.
+fn patience(frames: u32, bitrate: u32) -> Duration {
+    let bits = u64::from(frames).saturating_mul(4 * 160);
+    Duration::from_micros(bits.saturating_mul(1_000_000) / u64::from(bitrate.max(1))) + PATIENCE_MIN
+}
+
+/// Events in a row, before the other tasks have their turn.
+const IN_A_ROW: usize = 16;
+const PATIENCE_MIN: Duration = Duration::from_millis(250);
+const BACKOFF_MIN: Duration = Duration::from_millis(100);
+const BACKOFF_MAX: Duration = Duration::from_secs(5);
+/// On the bus for as long, the next bus-off is the first again.
+const HEALTHY: Duration = Duration::from_secs(5);
+/// Back on the bus it needs 129 times 11 bits: 142 ms at 10 kbit/s.
+const RECOVERY: Duration = Duration::from_secs(1);
+const LOST_PERIOD: Duration = Duration::from_secs(1);
+
+#[cfg(test)]
+mod tests;

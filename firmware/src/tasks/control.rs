@@ -1,0 +1,253 @@
+//! What lies between the engine and the task of a port or link: an outbox each.
+
+use core::cell::{Cell, RefCell};
+
+use heapless::{Deque, Vec};
+use proto_core::engine::OUTPUT_BUFFER;
+use proto_core::recipe::can::CanFrame;
+use proto_core::recipe::model::{CanId, MAX_CAN_IDS};
+
+use super::notify::Notify;
+
+/// One transmission: the longest frame or request.
+pub(crate) type Transmission = Vec<u8, OUTPUT_BUFFER>;
+
+/// The engine's side of a field port.
+pub(crate) struct PortControl {
+    ids: Vec<CanId, MAX_CAN_IDS>,
+    bytes: RefCell<Option<Transmission>>,
+    frames: RefCell<Deque<CanFrame, MAX_CAN_IDS>>,
+    has_slept: Cell<bool>,
+    changed: Notify,
+}
+
+impl PortControl {
+    pub(crate) const fn new() -> Self {
+        Self {
+            ids: Vec::new(),
+            bytes: RefCell::new(None),
+            frames: RefCell::new(Deque::new()),
+            has_slept: Cell::new(false),
+            changed: Notify::new(),
+        }
+    }
+
+    /// Of a CAN port, before its task starts.
+    pub(crate) fn take_ids(&mut self, ids: impl Iterator<Item = CanId>) {
+        self.ids.extend(ids);
+    }
+
+    /// Of a CAN port: the ids whose frames its recipe takes.
+    pub(crate) fn ids(&self) -> &[CanId] {
+        &self.ids
+    }
+
+    /// The engine hands over one transmission and waits until it has left.
+    pub(crate) fn put(&self, bytes: &[u8]) {
+        *self.bytes.borrow_mut() = Transmission::from_slice(bytes).ok();
+        self.changed.notify();
+    }
+
+    /// The engine hands over at most as many frames as there is room for.
+    pub(crate) fn put_frame(&self, frame: CanFrame) {
+        let _ = self.frames.borrow_mut().push_back(frame);
+        self.changed.notify();
+    }
+
+    /// Wakes the task: its device may have what it has woken nobody for.
+    pub(crate) fn look(&self) {
+        self.changed.notify();
+    }
+
+    pub(crate) fn slept(&self) {
+        self.has_slept.set(true);
+        self.look();
+    }
+
+    /// Waits until the gateway has slept: what waits in the device has to be told at once, as long as
+    /// the engine discards it. Eats notifications, so nothing else may wait for them.
+    pub(crate) async fn has_slept(&self) {
+        while !self.has_slept.take() {
+            self.changed.notified().await;
+        }
+    }
+
+    /// From here on only a sleep to come counts.
+    pub(crate) fn forget_sleep(&self) {
+        self.has_slept.set(false);
+    }
+
+    /// The next transmission.
+    pub(crate) async fn next_bytes(&self) -> Transmission {
+        loop {
+            if let Some(bytes) = self.take_bytes() {
+                return bytes;
+            }
+            self.changed.notified().await;
+        }
+    }
+
+    fn take_bytes(&self) -> Option<Transmission> {
+        self.bytes.borrow_mut().take()
+    }
+
+    /// The next transmission, if there is one and it may be sent now.
+    pub(crate) fn take_bytes_if(&self, may_send: bool) -> Option<Transmission> {
+        if may_send { self.take_bytes() } else { None }
+    }
+
+    /// Waits until there is a frame to send.
+    pub(crate) async fn frame_waits(&self) {
+        while self.frames.borrow().is_empty() {
+            self.changed.notified().await;
+        }
+    }
+
+    /// The next frame to send, if there is one.
+    pub(crate) fn next_frame(&self) -> Option<CanFrame> {
+        self.frames.borrow_mut().pop_front()
+    }
+
+    /// Forgets what waits: the device is gone.
+    pub(crate) fn clear(&self) {
+        self.frames.borrow_mut().clear();
+        *self.bytes.borrow_mut() = None;
+    }
+}
+
+/// The engine's side of a link. A link is open for a *turn*: what belongs to an earlier turn is not
+/// reported and not sent.
+pub(crate) struct LinkControl {
+    /// Odd while the link is to be open; one more for each opening and closing.
+    turn: Cell<u32>,
+    outbox: RefCell<Option<Transmission>>,
+    /// Bytes of this turn that are not acknowledged, as the engine knows.
+    unacknowledged: Cell<u32>,
+    changed: Notify,
+    strangers: Cell<u32>,
+}
+
+impl LinkControl {
+    pub(crate) const fn new() -> Self {
+        Self {
+            turn: Cell::new(0),
+            outbox: RefCell::new(None),
+            unacknowledged: Cell::new(0),
+            changed: Notify::new(),
+            strangers: Cell::new(0),
+        }
+    }
+
+    /// Somebody else than the controller came to where the controller is awaited.
+    pub(crate) fn turn_away(&self) {
+        self.strangers.set(self.strangers.get().saturating_add(1));
+    }
+
+    /// How many of them were turned away.
+    pub(crate) fn strangers(&self) -> u32 {
+        self.strangers.get()
+    }
+
+    pub(crate) fn is_turn(&self, turn: u32) -> bool {
+        self.turn.get() == turn
+    }
+
+    pub(crate) fn open(&self) {
+        if self.turn.get().is_multiple_of(2) {
+            self.turn_over();
+        }
+    }
+
+    pub(crate) fn close(&self) {
+        if !self.turn.get().is_multiple_of(2) {
+            self.turn_over();
+        }
+    }
+
+    /// The engine hands over one transmission and waits until it was taken.
+    pub(crate) fn put(&self, bytes: &[u8]) {
+        self.unacknowledged.set(self.unacknowledged.get().saturating_add(bytes.len() as u32));
+        *self.outbox.borrow_mut() = Transmission::from_slice(bytes).ok();
+        self.changed.notify();
+    }
+
+    fn turn_over(&self) {
+        self.turn.set(self.turn.get().wrapping_add(1));
+        self.unacknowledged.set(0);
+        *self.outbox.borrow_mut() = None;
+        self.changed.notify();
+    }
+
+    /// Of what was handed over in this turn, as much as the engine believes to be unacknowledged.
+    pub(crate) fn unacknowledged(&self) -> u32 {
+        self.unacknowledged.get()
+    }
+
+    /// The task has left `left` bytes beside what waits here. The number for the engine, if it is news.
+    pub(crate) fn acknowledged(&self, left: usize) -> Option<u32> {
+        let waiting = self.outbox.borrow().as_ref().map_or(0, |bytes| bytes.len());
+        let left = left.saturating_add(waiting) as u32;
+        (self.unacknowledged.replace(left) != left).then_some(left)
+    }
+
+    /// Waits until the link is to be open; the turn it is.
+    pub(crate) async fn opened(&self) -> u32 {
+        loop {
+            let turn = self.turn.get();
+            if !turn.is_multiple_of(2) {
+                return turn;
+            }
+            self.changed.notified().await;
+        }
+    }
+
+    /// Waits until this turn is over. Eats notifications, so nothing else may wait for them.
+    pub(crate) async fn over(&self, turn: u32) {
+        while self.is_turn(turn) {
+            self.changed.notified().await;
+        }
+    }
+
+    /// The next transmission; `None` when this turn is over.
+    pub(crate) async fn next(&self, turn: u32) -> Option<Transmission> {
+        loop {
+            if !self.is_turn(turn) {
+                return None;
+            }
+            if let Some(bytes) = self.outbox.borrow_mut().take() {
+                return Some(bytes);
+            }
+            self.changed.notified().await;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_nobody_has_taken_yet_is_not_acknowledged() {
+        let link = LinkControl::new();
+        link.open();
+        link.put(&[0; 69]);
+        assert_eq!((link.unacknowledged(), link.acknowledged(0)), (69, None));
+        // The task takes it, and has room for half.
+        assert!(link.outbox.take().is_some());
+        assert_eq!((link.acknowledged(69), link.acknowledged(35)), (None, Some(35)));
+        link.put(&[0; 100]);
+        assert_eq!((link.unacknowledged(), link.acknowledged(0)), (135, Some(100)));
+        assert!(link.outbox.take().is_some());
+        assert_eq!((link.acknowledged(0), link.acknowledged(0)), (Some(0), None));
+    }
+
+    #[test]
+    fn what_an_earlier_turn_has_left_is_nobodys() {
+        let link = LinkControl::new();
+        link.open();
+        link.put(&[0; 69]);
+        link.close();
+        link.open();
+        assert_eq!((link.unacknowledged(), link.acknowledged(0)), (0, None));
+    }
+}

@@ -1,0 +1,255 @@
+//! The engine among its tasks.
+//!
+//! What a driver brings goes into the engine at once, and what the engine answers is handed over
+//! before anything else is read: one engine pass lies between the last byte of a field frame and the
+//! request on its way to the controller. All tasks run on one executor, so nobody is in the engine
+//! twice. What is handed over lies in one outbox for each port and link; a task takes it from there.
+
+use core::cell::{Cell, RefCell};
+use core::pin::pin;
+
+use embassy_futures::select::{Either, select};
+use embassy_futures::yield_now;
+use embassy_time::Timer;
+use heapless::Vec;
+use proto_core::config::{GatewayConfig, Parts};
+use proto_core::engine::{
+    BuildError, Engine as AnyEngine, Input, LinkId, LinkInfo, LinkKind, OUTPUT_BUFFER, Output, PortCounters,
+    PortId, PortState,
+};
+use proto_core::link::LinkState;
+use proto_core::time::Instant;
+
+use super::control::{LinkControl, PortControl};
+use super::led::Condition;
+use super::notify::Notify;
+use super::watchdog::Pulse;
+use crate::clock::now;
+
+/// Field ports a board can have.
+pub const MAX_FIELD_PORTS: usize = 4;
+/// Recipe links a board can have.
+pub const MAX_UPLINKS: usize = 2;
+/// User-defined fields in one direction, over all ports.
+pub const MAX_FIELDS: usize = 128;
+/// Recipe links, and command, urgent commands, state and Modbus.
+pub const MAX_LINKS: usize = MAX_UPLINKS + 4;
+
+/// The engine in the size of a board.
+pub type Engine = AnyEngine<MAX_FIELD_PORTS, MAX_UPLINKS, MAX_FIELDS>;
+
+/// The engine and what every task shares with it.
+pub struct Gateway {
+    /// None or one. Without one it is all zeros: an engine as an initial value would be 30 KB of flash,
+    /// and one that is moved here with everything else as much of the stack.
+    engine: RefCell<Vec<Engine, 1>>,
+    ports: Vec<(PortId, PortControl), MAX_FIELD_PORTS>,
+    links: Vec<(LinkId, LinkKind, LinkControl), MAX_LINKS>,
+    output: RefCell<[u8; OUTPUT_BUFFER]>,
+    deadline: Cell<Instant>,
+    deadline_moved: Notify,
+    /// Some task gave the processor back before it had told all that waits.
+    more_waits: Cell<bool>,
+    /// As often the gateway slept, as the ports' tasks know.
+    sleeps: Cell<u32>,
+}
+
+impl Gateway {
+    /// A gateway without a configuration.
+    pub const fn idle() -> Self {
+        Self {
+            engine: RefCell::new(Vec::new()),
+            ports: Vec::new(),
+            links: Vec::new(),
+            output: RefCell::new([0; OUTPUT_BUFFER]),
+            deadline: Cell::new(Instant::ZERO),
+            deadline_moved: Notify::new(),
+            more_waits: Cell::new(false),
+            sleeps: Cell::new(0),
+        }
+    }
+
+    /// Takes its configuration, in place; ports and links are down.
+    ///
+    /// # Errors
+    /// What the engine cannot run.
+    pub fn configure(&mut self, config: &GatewayConfig) -> Result<(), BuildError> {
+        // Not so in `idle`, which is all zeros and takes no flash.
+        self.deadline.set(Instant::NEVER);
+        put_idle(self.engine.get_mut());
+        self.configure_in_place(config)
+    }
+
+    /// Not inlined: what this needs of the stack and what `put_idle` needs do not add up.
+    #[inline(never)]
+    fn configure_in_place(&mut self, config: &GatewayConfig) -> Result<(), BuildError> {
+        let Some(engine) = self.engine.get_mut().first_mut() else { return Ok(()) };
+        engine.configure(config)?;
+        // As many places as the engine has.
+        self.ports.clear();
+        self.ports.extend(engine.field_ports().map(|id| (id, PortControl::new())));
+        for ((_, control), (.., recipe)) in self.ports.iter_mut().zip(config.field_ports()) {
+            if let Parts::Can { input, .. } = &recipe.parts {
+                control.take_ids(input.iter().map(|frame| frame.id));
+            }
+        }
+        self.links.clear();
+        self.links.extend(engine.links().map(|link| (link.id, link.kind, LinkControl::new())));
+        Ok(())
+    }
+
+    /// The links that need a task.
+    pub fn links(&self) -> impl Iterator<Item = (LinkId, LinkKind)> + '_ {
+        self.links.iter().map(|(id, kind, _)| (*id, *kind))
+    }
+
+    /// Shows how each link and each port does.
+    pub fn report(&self, mut link: impl FnMut(LinkInfo<'_>), mut port: impl FnMut(PortId, &PortCounters)) {
+        let engine = self.engine.borrow();
+        let Some(engine) = engine.first() else { return };
+        engine.links().for_each(&mut link);
+        for id in engine.field_ports() {
+            if let Some(counters) = engine.port_counters(id) {
+                port(id, counters);
+            }
+        }
+    }
+
+    /// What the status LED shows.
+    pub fn condition(&self) -> Condition {
+        let engine = self.engine.borrow();
+        let Some(engine) = engine.first() else { return Condition::Refused };
+        // The work of a link that is shared is done by another.
+        let is_up = |link: LinkInfo<'_>| matches!(link.state, LinkState::Up { .. } | LinkState::Shared);
+        let works = |id| engine.port_state(id) == Some(PortState::Working);
+        if !engine.links().all(is_up) {
+            Condition::NoController
+        } else if !engine.field_ports().all(works) {
+            Condition::PortSilent
+        } else {
+            Condition::Running
+        }
+    }
+
+    /// How often the processor was stopped: what waited meanwhile was discarded.
+    pub fn sleeps(&self) -> u32 {
+        self.sleeps.get()
+    }
+
+    /// How many connections and datagrams of others than the controller each link has turned away.
+    pub fn strangers(&self) -> impl Iterator<Item = (LinkKind, u32)> + '_ {
+        self.links.iter().map(|(_, kind, control)| (*kind, control.strangers()))
+    }
+
+    /// One input, now, and everything that follows from it.
+    pub fn input(&self, input: Input<'_>) {
+        let now = now();
+        let mut engine = self.engine.borrow_mut();
+        let Some(engine) = engine.first_mut() else { return };
+        let mut buf = self.output.borrow_mut();
+        engine.handle(now, input);
+        if self.sleeps.replace(engine.sleeps()) != engine.sleeps() {
+            self.ports.iter().for_each(|(_, control)| control.slept());
+        }
+        loop {
+            match engine.poll_output(now, &mut buf) {
+                Output::PortSend { port, bytes } => {
+                    if let Some(port) = self.port(port) {
+                        port.put(bytes);
+                    }
+                }
+                Output::PortSendCan { port, frame } => {
+                    if let Some(port) = self.port(port) {
+                        port.put_frame(frame);
+                    }
+                }
+                Output::LinkOpen { link } => {
+                    if let Some(link) = self.link(link) {
+                        link.open();
+                    }
+                }
+                Output::LinkClose { link } => {
+                    if let Some(link) = self.link(link) {
+                        link.close();
+                    }
+                }
+                Output::LinkSend { link, bytes } => {
+                    if let Some(link) = self.link(link) {
+                        link.put(bytes);
+                    }
+                }
+                Output::Sleep { until } => {
+                    if self.deadline.replace(until) != until {
+                        self.deadline_moved.notify();
+                    }
+                    return;
+                }
+            }
+        }
+    }
+
+    /// Lets deadlines pass whenever the engine asked for it. The engine's own task.
+    pub async fn keep_time(&self, pulse: &Pulse) -> ! {
+        self.input(Input::Tick);
+        loop {
+            let until = embassy_time::Instant::from_micros(self.deadline.get().as_micros());
+            match pulse.idle(pin!(select(Timer::at(until), self.deadline_moved.notified()))).await {
+                Either::First(()) => {
+                    self.all_told().await;
+                    self.input(Input::Tick);
+                }
+                Either::Second(()) => {}
+            }
+        }
+    }
+
+    /// Waits until the engine has heard of all that arrived before this moment: it was not late,
+    /// whatever kept the processor meanwhile. Who always has more is not waited for without an end.
+    ///
+    /// In a round of the executor each task that was woken runs once, in no particular order. What the
+    /// Ethernet controller has goes to the network's task in one round and to a link's in the next.
+    async fn all_told(&self) {
+        // A device may have what it has woken nobody for.
+        self.ports.iter().for_each(|(_, control)| control.look());
+        let mut quiet = 0_u8;
+        for _ in 0..MAX_ROUNDS {
+            self.more_waits.set(false);
+            yield_now().await;
+            quiet = if self.more_waits.get() { 0 } else { quiet.saturating_add(1) };
+            if quiet >= QUIET_ROUNDS {
+                return;
+            }
+        }
+    }
+
+    /// A task gives the processor back and may have left something that waits to be told.
+    pub(crate) fn more_waits(&self) {
+        self.more_waits.set(true);
+    }
+
+    /// Whether a datagram is a frame of the link's.
+    pub(crate) fn is_frame(&self, link: LinkId, datagram: &[u8]) -> bool {
+        self.engine.borrow().first().is_some_and(|engine| engine.is_frame(link, datagram))
+    }
+
+    pub(crate) fn port(&self, id: PortId) -> Option<&PortControl> {
+        self.ports.iter().find(|(port, _)| *port == id).map(|(_, control)| control)
+    }
+
+    pub(crate) fn link(&self, id: LinkId) -> Option<&LinkControl> {
+        self.links.iter().find(|(link, ..)| *link == id).map(|(.., control)| control)
+    }
+}
+
+/// Not inlined: an engine passes over the stack here.
+#[inline(never)]
+fn put_idle(place: &mut Vec<Engine, 1>) {
+    place.clear();
+    let _ = place.push(Engine::idle());
+}
+
+/// One for a task whose interrupt comes while the time is looked at, one for that of the network, and one
+/// for a link's behind it.
+const QUIET_ROUNDS: u8 = 3;
+/// What a port's task tells in as many is more than any device keeps.
+const MAX_ROUNDS: u8 = 20;

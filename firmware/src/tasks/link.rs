@@ -1,0 +1,185 @@
+//! One link to the controller: opened, closed and fed as the engine says.
+//!
+//! A link is one task. It owns its socket, hands what arrives to the engine and sends what is in its
+//! outbox; it knows no protocol and makes no decision. Supervision is the engine's: a link that fails
+//! says so once and waits to be opened again.
+//!
+//! Handed over is not delivered. Of a TCP link the engine hears two things: that the socket has taken what
+//! was handed over and has room for more, and how much the peer has not acknowledged. What it gives up it
+//! closes, whatever the task waits for, and then nothing but a reset leaves any more.
+
+mod tcp;
+mod udp;
+
+use core::net::Ipv4Addr;
+use core::pin::pin;
+
+use embassy_net::dns::DnsQueryType;
+use embassy_net::{IpAddress, Stack};
+use heapless::String;
+use proto_core::config::{Bus, GatewayConfig, listen_address};
+use proto_core::engine::{Input, LinkId, LinkKind};
+
+use super::control::LinkControl;
+use super::gateway::Gateway;
+use super::watchdog::Pulse;
+
+/// What a link connects to.
+#[derive(Debug, Clone)]
+pub enum Endpoint {
+    /// The controller's TCP server.
+    Tcp {
+        /// Address or name.
+        host: String<64>,
+        /// TCP port.
+        port: u16,
+    },
+    /// The controller's UDP server.
+    Udp {
+        /// Address or name.
+        host: String<64>,
+        /// UDP port.
+        port: u16,
+    },
+    /// Where the controller's TCP client connects to. Nobody else does.
+    TcpListen {
+        /// TCP port.
+        port: u16,
+        /// The controller's address or name.
+        host: String<64>,
+    },
+    /// Where the controller's UDP client sends to. Nobody else does.
+    UdpListen {
+        /// UDP port.
+        port: u16,
+        /// The controller's address or name.
+        host: String<64>,
+    },
+}
+
+impl Endpoint {
+    /// Where a link of the configuration goes. A board has one address, so of `listen` only the port
+    /// counts.
+    pub fn of(config: &GatewayConfig, kind: LinkKind) -> Self {
+        let controller = &config.controller;
+        let host = controller.address.clone();
+        let listen = |port: usize| match config.ports.get(port).map(|port| &port.bus) {
+            Some(Bus::TcpListen { listen } | Bus::UdpListen { listen }) => {
+                listen_address(listen).map_or(0, |address| address.port())
+            }
+            _ => 0,
+        };
+        match kind {
+            LinkKind::Command | LinkKind::Urgent => Self::Tcp { host, port: controller.command_port },
+            LinkKind::State => Self::Tcp { host, port: controller.state_port },
+            LinkKind::Modbus => Self::Tcp { host, port: controller.modbus_port },
+            LinkKind::RecipeUdp => {
+                Self::Udp { host, port: controller.recipe_link.map_or(0, |link| link.udp_port) }
+            }
+            LinkKind::RecipeTcpListen { port } => Self::TcpListen { port: listen(usize::from(port.0)), host },
+            LinkKind::RecipeUdpListen { port } => Self::UdpListen { port: listen(usize::from(port.0)), host },
+        }
+    }
+}
+
+/// A link's socket buffers.
+#[derive(Debug)]
+pub struct Buffers<'a> {
+    rx: &'a mut [u8],
+    tx: &'a mut [u8],
+    chunk: &'a mut [u8],
+}
+
+impl<'a> Buffers<'a> {
+    /// Bytes that a link needs.
+    pub const SIZE: usize = 6 * 1024;
+
+    /// Takes [`Buffers::SIZE`] bytes from the front of `memory`; `None` when there are fewer.
+    pub fn take(memory: &mut &'a mut [u8], endpoint: &Endpoint) -> Option<Self> {
+        let memory = memory.split_off_mut(..Self::SIZE)?;
+        let (rx, chunk) = match endpoint {
+            Endpoint::TcpListen { .. } => (RX_FRAMES, CHUNK_FRAMES),
+            Endpoint::Tcp { .. } | Endpoint::Udp { .. } | Endpoint::UdpListen { .. } => (RX, CHUNK),
+        };
+        let (rx, rest) = memory.split_at_mut_checked(rx)?;
+        let (chunk, tx) = rest.split_at_mut_checked(chunk)?;
+        Some(Self { rx, tx, chunk })
+    }
+}
+
+/// Drives the link for ever.
+pub async fn run(
+    gateway: &Gateway,
+    pulse: &Pulse,
+    link: LinkId,
+    stack: Stack<'_>,
+    endpoint: &Endpoint,
+    mut buffers: Buffers<'_>,
+) -> ! {
+    let buffers = &mut buffers;
+    let Some(control) = gateway.link(link) else { core::future::pending().await };
+    let driver = Driver { gateway, pulse, link, control, stack };
+    loop {
+        let turn = pulse.idle(pin!(control.opened())).await;
+        match endpoint {
+            Endpoint::Tcp { host, port } => driver.tcp(turn, host, Way::To(*port), buffers).await,
+            Endpoint::TcpListen { port, host } => driver.tcp(turn, host, Way::At(*port), buffers).await,
+            Endpoint::Udp { host, port } => driver.udp(turn, host, Way::To(*port), buffers).await,
+            Endpoint::UdpListen { port, host } => driver.udp(turn, host, Way::At(*port), buffers).await,
+        }
+        // A turn that is over was ended by the engine: it expects no report.
+        if control.is_turn(turn) {
+            control.close();
+            gateway.input(Input::LinkDown { link });
+        }
+    }
+}
+
+/// Who begins.
+#[derive(Clone, Copy)]
+enum Way {
+    /// We do, to this port of the controller.
+    To(u16),
+    /// The controller does, at this port of ours.
+    At(u16),
+}
+
+struct Driver<'a> {
+    gateway: &'a Gateway,
+    pulse: &'a Pulse,
+    link: LinkId,
+    control: &'a LinkControl,
+    stack: Stack<'a>,
+}
+
+impl Driver<'_> {
+    /// Tells the engine, as long as it is this turn; whether it still is then.
+    fn tell(&self, turn: u32, input: Input<'_>) -> bool {
+        if self.control.is_turn(turn) {
+            self.gateway.input(input);
+        }
+        self.control.is_turn(turn)
+    }
+}
+
+async fn resolve(stack: Stack<'_>, host: &str) -> Option<IpAddress> {
+    if let Ok(address) = host.parse::<Ipv4Addr>() {
+        return Some(IpAddress::Ipv4(address));
+    }
+    let addresses = stack.dns_query(host, DnsQueryType::A).await.ok()?;
+    addresses.first().copied()
+}
+
+/// A state packet, and a receive window that a burst cannot overrun the Ethernet controller with.
+const RX: usize = 1536;
+/// Bytes handed to the engine at once: a state packet, and longer than any frame, so that a datagram
+/// that is too long is seen to be.
+const CHUNK: usize = 1536;
+/// Of a connection for frames of a recipe, two of the longest. What is left is for those that the
+/// controller has not acknowledged: a peer that acknowledges late must not slow them down. It has room
+/// for 64 of 72 bytes, as many as the engine hands over; those of 256 bytes may wait for 70 ms.
+const RX_FRAMES: usize = 1024;
+const CHUNK_FRAMES: usize = 512;
+
+#[cfg(test)]
+mod tests;

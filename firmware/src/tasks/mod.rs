@@ -1,0 +1,18 @@
+//! The tasks: each moves what a device or socket brings into the engine, and what the engine answers
+//! out again. They are generic over the traits of [`crate::drivers`] and over the network stack.
+
+pub mod can;
+pub(crate) mod control;
+pub mod fair;
+pub mod gateway;
+pub mod led;
+pub mod link;
+mod notify;
+pub mod serial;
+pub mod status;
+pub mod watchdog;
+
+#[cfg(test)]
+mod test_clock;
+#[cfg(test)]
+mod test_executor;

@@ -1,0 +1,178 @@
+//! An RS-485 port's task: one task for a port, which drives the line, sends, waits for the last stop
+//! bit, releases the line and reads again.
+//!
+//! Its device buffers what arrives while the task is elsewhere, and its `read` and `write` lose nothing and
+//! do nothing twice when they are dropped before they are done. What waits in the device is told at once
+//! and before anything is sent: the engine judges what is late by when it heard of it.
+
+use core::pin::pin;
+use core::task::Poll;
+
+use embassy_futures::select::{Either, Either3, select, select3};
+use embassy_futures::{poll_once, yield_now};
+use embassy_time::{Duration, Instant, Timer, with_timeout};
+use embedded_io_async::{Error, ErrorKind};
+use proto_core::engine::{Input, PortId};
+
+use super::control::PortControl;
+use super::gateway::Gateway;
+use super::watchdog::Pulse;
+use crate::drivers::line::{Line, LineDirection, LineErrors};
+use crate::fmt::Text;
+use crate::warn;
+
+/// Drives the port for ever.
+pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, line: impl Line, baud: u32) -> ! {
+    let Some(control) = gateway.port(port) else { core::future::pending().await };
+    let mut task = Task { gateway, port, control, line, chunk: [0; CHUNK] };
+    let mut is_failing = false;
+    let mut errors = Told { errors: LineErrors::NONE, look: Instant::MIN };
+    loop {
+        gateway.input(Input::PortUp { port });
+        let mut full_chunks = 0_usize;
+        let failed = loop {
+            let Task { line, chunk, .. } = &mut task;
+            let next = select3(line.read(chunk), control.next_bytes(), Timer::at(errors.look));
+            let next = pulse.idle(pin!(next)).await;
+            let frame = match next {
+                Either3::First(Ok(len)) => {
+                    task.tell(len);
+                    if Instant::now() >= errors.look {
+                        errors.tell(port, task.line.errors());
+                    }
+                    // What is not yet read came before what is to be sent. But a line that never falls
+                    // silent does not keep us from sending.
+                    full_chunks = if len < CHUNK { 0 } else { full_chunks.saturating_add(1) };
+                    let may_send = full_chunks == 0 || full_chunks >= FULL_CHUNKS;
+                    if full_chunks > 0 {
+                        gateway.more_waits();
+                    }
+                    // A line that is never silent does not keep the other tasks from running.
+                    yield_now().await;
+                    match control.take_bytes_if(may_send) {
+                        Some(frame) => frame,
+                        None => continue,
+                    }
+                }
+                Either3::First(Err(error)) => break error.kind(),
+                Either3::Second(frame) => frame,
+                Either3::Third(()) => {
+                    // At the wrong speed nothing else is ever heard of a line.
+                    errors.tell(port, task.line.errors());
+                    continue;
+                }
+            };
+            full_chunks = 0;
+            task.line.drive(LineDirection::Send);
+            let sent = with_timeout(patience(frame.len(), baud), task.send(&frame));
+            // A long frame on a slow line takes seconds.
+            let sent = pulse.idle(pin!(sent)).await;
+            task.line.drive(LineDirection::Receive);
+            match sent {
+                Ok(Ok(())) => {
+                    is_failing = false;
+                    gateway.input(Input::PortSent { port });
+                }
+                Ok(Err(error)) => break error,
+                Err(_) => break ErrorKind::TimedOut,
+            }
+        };
+        // Said once, however often it fails in a row.
+        if !is_failing {
+            warn!("port {}: {}", port.0, Text(&failed));
+        }
+        is_failing = true;
+        task.tell_waiting();
+        gateway.input(Input::PortDown { port });
+        control.clear();
+        // A line that does not take its bytes is heard all the same.
+        if failed != ErrorKind::TimedOut {
+            Timer::after(RETRY).await;
+        }
+    }
+}
+
+struct Task<'a, L> {
+    gateway: &'a Gateway,
+    port: PortId,
+    control: &'a PortControl,
+    line: L,
+    chunk: [u8; CHUNK],
+}
+
+impl<L: Line> Task<'_, L> {
+    /// Tells the engine of the first `len` bytes of the chunk.
+    fn tell(&self, len: usize) {
+        let bytes = self.chunk.get(..len).unwrap_or(&[]);
+        self.gateway.input(Input::PortBytes { port: self.port, bytes });
+    }
+
+    /// Tells the engine of all that waits in the device.
+    fn tell_waiting(&mut self) {
+        for _ in 0..FULL_CHUNKS {
+            match poll_once(self.line.read(&mut self.chunk)) {
+                Poll::Ready(Ok(len @ 1..)) => self.tell(len),
+                _ => return,
+            }
+        }
+    }
+
+    /// Sends a frame, to the end of its last stop bit. When the gateway has slept meanwhile, what waits
+    /// in the device is old and must not be heard of only when the frame has left.
+    async fn send(&mut self, frame: &[u8]) -> Result<(), ErrorKind> {
+        self.control.forget_sleep();
+        let mut rest = frame;
+        while !rest.is_empty() {
+            match select(self.line.write(rest), self.control.has_slept()).await {
+                Either::First(Ok(len @ 1..)) => rest = rest.get(len..).unwrap_or(&[]),
+                Either::First(Ok(0)) => return Err(ErrorKind::WriteZero),
+                Either::First(Err(error)) => return Err(error.kind()),
+                Either::Second(()) => self.tell_waiting(),
+            }
+        }
+        loop {
+            match select(self.line.flush(), self.control.has_slept()).await {
+                Either::First(flushed) => return flushed.map_err(|error| error.kind()),
+                Either::Second(()) => self.tell_waiting(),
+            }
+        }
+    }
+}
+
+/// The errors that were told of, and when they are looked at again.
+struct Told {
+    errors: LineErrors,
+    look: Instant,
+}
+
+impl Told {
+    fn tell(&mut self, port: PortId, errors: LineErrors) {
+        self.look = Instant::now() + ERROR_PERIOD;
+        if errors == self.errors {
+            return;
+        }
+        self.errors = errors;
+        let LineErrors { parity, framing, overruns, unread } = errors;
+        warn!(
+            "port {}: characters left out for parity {}, framing {}; overruns {}, unread {}",
+            port.0, parity, framing, overruns, unread
+        );
+    }
+}
+
+/// Twice what the bytes take on the line (12 bits a byte at most), and a little.
+fn patience(bytes: usize, baud: u32) -> Duration {
+    let bits = (bytes as u64).saturating_mul(24_000_000);
+    Duration::from_micros(bits / u64::from(baud.max(1))) + Duration::from_millis(20)
+}
+
+/// Bytes read at once.
+const CHUNK: usize = 256;
+/// More than any device keeps.
+const FULL_CHUNKS: usize = 9;
+const ERROR_PERIOD: Duration = Duration::from_secs(1);
+/// After a failed device.
+const RETRY: Duration = Duration::from_millis(100);
+
+#[cfg(test)]
+mod tests;

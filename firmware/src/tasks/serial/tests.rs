@@ -1,0 +1,443 @@
+//! Lines whose bytes wait, because the processor is busy with something else or was stopped.
+
+use core::cell::{Cell, RefCell};
+use core::convert::Infallible;
+use core::future::{Future, pending, poll_fn};
+use core::task::{Context, Waker};
+use std::boxed::Box;
+use std::collections::VecDeque;
+use std::rc::Rc;
+use std::vec::Vec;
+
+use embedded_io_async::{ErrorType, Read, Write};
+use proto_core::config::{
+    Bus, Delimiter, FieldSpec, GatewayConfig, InputBinding, Name, OnStale, OutputBinding, Parity, Parts,
+    Port, Recipe, Rs485, SendOn, Span, StreamPart,
+};
+use proto_core::engine::PortCounters;
+use proto_core::recipe::model::Mode;
+use proto_core::time::Duration as CoreDuration;
+use proto_core::wire::scalar::ScalarType;
+
+use super::*;
+use crate::tasks::test_clock::{Clock, advance};
+use crate::tasks::test_executor::{Executor, Order};
+use crate::tasks::watchdog::{TaskName, Watch};
+
+const FRAME: [u8; 5] = [0xFF, 0xFF, 0x01, 0xEE, 0xEE];
+const PORT: PortId = PortId(0);
+const IDLE_GAP: Duration = Duration::from_millis(100);
+const TIMEOUT: Duration = Duration::from_millis(200);
+const BAUD: u32 = 115_200;
+
+/// What a device keeps, and what has become of it.
+#[derive(Default)]
+struct Device {
+    received: VecDeque<u8>,
+    /// What was sent does not leave.
+    is_stuck: bool,
+    /// Bytes read so far when a frame was begun.
+    read_before: Vec<usize>,
+    read: usize,
+    reader: Option<Waker>,
+    writer: Option<Waker>,
+}
+
+struct Script(Rc<RefCell<Device>>);
+
+impl ErrorType for Script {
+    type Error = Infallible;
+}
+
+impl Read for Script {
+    async fn read(&mut self, buf: &mut [u8]) -> Result<usize, Infallible> {
+        poll_fn(|cx| {
+            let mut device = self.0.borrow_mut();
+            let len = device.received.len().min(buf.len());
+            if len == 0 {
+                device.reader = Some(cx.waker().clone());
+                return Poll::Pending;
+            }
+            device.read += len;
+            buf.iter_mut().zip(device.received.drain(..len)).for_each(|(place, byte)| *place = byte);
+            Poll::Ready(Ok(len))
+        })
+        .await
+    }
+}
+
+impl Write for Script {
+    async fn write(&mut self, buf: &[u8]) -> Result<usize, Infallible> {
+        let mut device = self.0.borrow_mut();
+        let read = device.read;
+        device.read_before.push(read);
+        Ok(buf.len())
+    }
+
+    async fn flush(&mut self) -> Result<(), Infallible> {
+        poll_fn(|cx| {
+            let mut device = self.0.borrow_mut();
+            if device.is_stuck {
+                device.writer = Some(cx.waker().clone());
+                return Poll::Pending;
+            }
+            Poll::Ready(Ok(()))
+        })
+        .await
+    }
+}
+
+impl Line for Script {}
+
+/// One RS-485 port, whose frames are answered when `send` says so.
+fn config(send: SendOn) -> GatewayConfig {
+    let mut config = GatewayConfig::empty();
+    config.controller.address = "10.0.0.1".try_into().unwrap();
+    config.controller.dialect = "v2.3".try_into().unwrap();
+    let controller = &mut config.controller;
+    (controller.command_port, controller.state_port, controller.modbus_port) = (2000, 2001, 502);
+    let (ty, to, from) = (ScalarType::Byte, InputBinding::Unused, OutputBinding::Constant(7.0));
+    config.fields.extend([FieldSpec::UserInput { ty, to }, FieldSpec::UserOutput { ty, from }]);
+    let delimiter = |bytes: &[u8]| Delimiter::from_slice(bytes).unwrap();
+    let part = |start| StreamPart {
+        head: delimiter(&FRAME[..2]),
+        tail: delimiter(&FRAME[3..]),
+        fields: Span { start, len: 1 },
+    };
+    let parts = Parts::Stream { input: Some(part(0)), output: Some(part(1)) };
+    let name = Name::try_from("a").unwrap();
+    let (mode, on_stale) = (Mode::User, OnStale::Hold);
+    config.recipes.push(Recipe { name: name.clone(), mode, parts, on_stale, send }).unwrap();
+    let line = Rs485 {
+        baud: BAUD,
+        parity: Parity::None,
+        stop_bits: 1,
+        idle_gap: CoreDuration::from_micros(IDLE_GAP.as_micros()),
+        turnaround: CoreDuration::ZERO,
+    };
+    let cycle = CoreDuration::from_millis(400);
+    let timeout = CoreDuration::from_micros(TIMEOUT.as_micros());
+    let on_timeout = Span::default();
+    let stale_after = CoreDuration::from_secs(1);
+    let port = Port { name, bus: Bus::Rs485(line), recipe: 0, cycle, timeout, on_timeout, stale_after };
+    config.ports.push(port).unwrap();
+    config.validate().unwrap();
+    config
+}
+
+/// The port, its task and the engine's.
+struct Bench {
+    gateway: &'static Gateway,
+    device: Rc<RefCell<Device>>,
+    executor: Executor<'static>,
+    _clock: Clock,
+}
+
+impl Bench {
+    fn new(order: Order, send: SendOn, baud: u32) -> Self {
+        let device = Rc::new(RefCell::new(Device::default()));
+        Self::with_line(order, send, baud, Script(Rc::clone(&device)), device)
+    }
+
+    fn with_line(
+        order: Order,
+        send: SendOn,
+        baud: u32,
+        line: impl Line + 'static,
+        device: Rc<RefCell<Device>>,
+    ) -> Self {
+        let clock = Clock::take();
+        let gateway = Box::leak(Box::new(Gateway::idle()));
+        gateway.configure(&config(send)).unwrap();
+        let gateway: &'static Gateway = gateway;
+        let watch: &'static Watch<2> = Box::leak(Box::new(Watch::new()));
+        let pulses = [TaskName::Engine, TaskName::Serial(PORT)].map(|name| watch.register(name).unwrap());
+        let mut executor = Executor::new(order);
+        executor.spawn(gateway.keep_time(pulses[0]));
+        executor.spawn(run(gateway, pulses[1], PORT, line, baud));
+        // The engine takes an instant of 0 for none.
+        advance(Duration::from_millis(1));
+        Self { gateway, device, executor, _clock: clock }
+    }
+
+    /// Bytes arrive; nobody has the time to look yet.
+    fn arrive(&self, bytes: impl IntoIterator<Item = u8>) {
+        let mut device = self.device.borrow_mut();
+        device.received.extend(bytes);
+        device.reader.take().inspect(Waker::wake_by_ref);
+    }
+
+    /// What was sent leaves, or does not.
+    fn stick(&self, is_stuck: bool) {
+        let mut device = self.device.borrow_mut();
+        device.is_stuck = is_stuck;
+        device.writer.take().inspect(Waker::wake_by_ref);
+    }
+
+    /// Until the next frame is sent.
+    fn wait_until_it_sends(&mut self) {
+        let before = self.device.borrow().read_before.len();
+        for _ in 0..500 {
+            if self.device.borrow().read_before.len() > before {
+                return;
+            }
+            self.wait(Duration::from_millis(1));
+        }
+        panic!("it sends nothing");
+    }
+
+    fn wait(&mut self, time: Duration) {
+        advance(time);
+        self.executor.settle();
+    }
+
+    fn counters(&self) -> PortCounters {
+        let mut found = None;
+        self.gateway.report(|_| {}, |_, counters| found = Some(*counters));
+        found.unwrap()
+    }
+}
+
+#[test]
+fn bytes_that_wait_for_a_busy_processor_do_not_make_a_silence() {
+    for order in Order::ALL {
+        let mut bench = Bench::new(order, SendOn::Period, BAUD);
+        bench.arrive(FRAME[..3].iter().copied());
+        bench.wait(Duration::from_millis(1));
+        bench.arrive(FRAME[3..].iter().copied());
+        bench.wait(IDLE_GAP * 2);
+        let counters = bench.counters();
+        assert_eq!((counters.frames_in, counters.discarded_bytes, counters.resync_bytes), (1, 0, 0));
+        // And a silence is one.
+        bench.arrive(FRAME[..3].iter().copied());
+        bench.wait(Duration::from_millis(1));
+        bench.wait(IDLE_GAP * 2);
+        assert_eq!(bench.counters().discarded_bytes, 3);
+    }
+}
+
+#[test]
+fn all_that_waits_in_a_device_is_heard_before_a_frame_is_overdue() {
+    for order in Order::ALL {
+        let mut bench = Bench::new(order, SendOn::Period, BAUD);
+        bench.arrive(FRAME);
+        bench.wait(Duration::from_millis(1));
+        assert_eq!(bench.counters().frames_in, 1);
+        // More than is read at once.
+        bench.arrive([0; 1_000].into_iter().chain(FRAME));
+        bench.wait(TIMEOUT * 2);
+        let counters = bench.counters();
+        assert_eq!((counters.frames_in, counters.resync_bytes, counters.timeouts), (2, 1_000, 0));
+        bench.wait(TIMEOUT * 2);
+        assert_eq!(bench.counters().timeouts, 1);
+    }
+}
+
+#[test]
+fn what_a_device_has_woken_nobody_for_is_heard_before_a_frame_is_overdue() {
+    for order in Order::ALL {
+        let mut bench = Bench::new(order, SendOn::Period, BAUD);
+        for round in 1..5 {
+            // As long as less than a quarter of its FIFO is full.
+            bench.device.borrow_mut().received.extend(FRAME);
+            bench.wait(TIMEOUT * 2);
+            let counters = bench.counters();
+            assert_eq!((counters.frames_in, counters.timeouts), (round, 0));
+        }
+    }
+}
+
+#[test]
+fn what_waits_is_heard_before_anything_is_sent() {
+    for order in Order::ALL {
+        let mut bench = Bench::new(order, SendOn::Frame, BAUD);
+        bench.wait(Duration::from_millis(1));
+        // An answer is due after the first of them.
+        bench.arrive(FRAME.into_iter().chain([0; 1_000]).chain(FRAME));
+        bench.wait(Duration::from_millis(1));
+        assert_eq!(bench.counters().frames_in, 2);
+        assert_eq!(bench.device.borrow().read_before.first(), Some(&(1_000 + 2 * FRAME.len())));
+    }
+}
+
+#[test]
+fn what_waited_while_the_processor_was_stopped_is_not_heard_of_only_when_a_frame_has_left() {
+    for order in Order::ALL {
+        // At this speed a frame takes seconds.
+        let mut bench = Bench::new(order, SendOn::Period, 10);
+        bench.stick(true);
+        bench.wait_until_it_sends();
+        // The processor is stopped, what keeps the device's bytes is not.
+        bench.arrive(FRAME);
+        bench.wait(Duration::from_secs(2));
+        let counters = bench.counters();
+        let slept = (counters.bytes_in, counters.discarded_bytes, counters.asleep, counters.frames_in);
+        assert_eq!(slept, (5, 5, 1, 0));
+        assert!(bench.device.borrow().is_stuck && counters.downs == 0, "it still sends");
+        // What comes later is heard when the frame has left.
+        bench.wait(Duration::from_millis(60));
+        bench.arrive(FRAME);
+        bench.stick(false);
+        bench.wait(Duration::from_millis(1));
+        assert_eq!(bench.counters().frames_in, 1);
+    }
+}
+
+#[test]
+fn a_line_that_takes_nothing_is_given_up_and_heard_all_the_same() {
+    for order in Order::ALL {
+        let mut bench = Bench::new(order, SendOn::Period, BAUD);
+        bench.stick(true);
+        bench.wait_until_it_sends();
+        bench.wait(Duration::from_millis(10));
+        bench.arrive(FRAME);
+        bench.wait(Duration::from_millis(20));
+        assert_eq!((bench.counters().downs, bench.counters().frames_in), (1, 1));
+        bench.arrive(FRAME);
+        bench.wait(Duration::from_millis(1));
+        assert_eq!(bench.counters().frames_in, 2);
+    }
+}
+
+/// A line that never falls silent.
+struct Flood<'a>(&'a Cell<u32>);
+
+impl ErrorType for Flood<'_> {
+    type Error = Infallible;
+}
+
+impl Read for Flood<'_> {
+    async fn read(&mut self, buf: &mut [u8]) -> Result<usize, Infallible> {
+        if self.0.get() == 0 {
+            return pending().await;
+        }
+        self.0.set(self.0.get() - 1);
+        buf.fill(0xA5);
+        Ok(buf.len())
+    }
+}
+
+impl Write for Flood<'_> {
+    async fn write(&mut self, buf: &[u8]) -> Result<usize, Infallible> {
+        Ok(buf.len())
+    }
+
+    async fn flush(&mut self) -> Result<(), Infallible> {
+        Ok(())
+    }
+}
+
+impl Line for Flood<'_> {}
+
+/// A device behind whose bytes the flood comes.
+struct FloodAndScript(Script, Rc<Cell<u32>>);
+
+impl ErrorType for FloodAndScript {
+    type Error = Infallible;
+}
+
+impl Read for FloodAndScript {
+    async fn read(&mut self, buf: &mut [u8]) -> Result<usize, Infallible> {
+        if self.1.get() > 0 { Flood(&self.1).read(buf).await } else { self.0.read(buf).await }
+    }
+}
+
+impl Write for FloodAndScript {
+    async fn write(&mut self, buf: &[u8]) -> Result<usize, Infallible> {
+        self.0.write(buf).await
+    }
+
+    async fn flush(&mut self) -> Result<(), Infallible> {
+        self.0.flush().await
+    }
+}
+
+impl Line for FloodAndScript {}
+
+#[test]
+fn a_line_that_never_falls_silent_keeps_neither_the_time_nor_what_is_to_be_sent() {
+    for order in Order::ALL {
+        let reads = Rc::new(Cell::new(0));
+        let device = Rc::new(RefCell::new(Device::default()));
+        let line = FloodAndScript(Script(Rc::clone(&device)), Rc::clone(&reads));
+        let mut bench = Bench::with_line(order, SendOn::Period, BAUD, line, device);
+        bench.arrive(FRAME);
+        bench.wait(Duration::from_millis(1));
+        assert_eq!(bench.counters().frames_in, 1);
+        reads.set(u32::MAX);
+        bench.arrive([0]);
+        advance(Duration::from_millis(400));
+        let rounds = (0..99).take_while(|_| bench.counters().timeouts == 0 && bench.executor.round()).count();
+        assert!((3..=25).contains(&rounds), "a tick in {rounds} rounds");
+        let sends =
+            |bench: &mut Bench| bench.device.borrow().read_before.is_empty() && bench.executor.round();
+        let rounds = (0..99).take_while(|_| sends(&mut bench)).count();
+        assert!(rounds <= 15, "sent after {rounds} rounds");
+        assert!(reads.get() > 0);
+    }
+}
+
+#[test]
+fn a_line_that_never_falls_silent_does_not_starve_the_other_tasks() {
+    let _clock = Clock::take();
+    let mut gateway = Box::new(Gateway::idle());
+    gateway.configure(&config(SendOn::Period)).unwrap();
+    let watch = Watch::<1>::new();
+    let pulse = watch.register(TaskName::Serial(PortId(0))).unwrap();
+    let reads = Cell::new(100);
+    let mut task = pin!(run(&gateway, pulse, PortId(0), Flood(&reads), 115_200));
+    let mut cx = Context::from_waker(Waker::noop());
+    for turn in 1..=50 {
+        assert!(task.as_mut().poll(&mut cx).is_pending());
+        assert_eq!(reads.get(), 100 - turn, "one read in a turn");
+    }
+}
+
+/// A line of which nothing is heard but errors.
+struct Wrong<'a>(&'a Cell<u32>);
+
+impl ErrorType for Wrong<'_> {
+    type Error = Infallible;
+}
+
+impl Read for Wrong<'_> {
+    async fn read(&mut self, _: &mut [u8]) -> Result<usize, Infallible> {
+        pending().await
+    }
+}
+
+impl Write for Wrong<'_> {
+    async fn write(&mut self, buf: &[u8]) -> Result<usize, Infallible> {
+        Ok(buf.len())
+    }
+
+    async fn flush(&mut self) -> Result<(), Infallible> {
+        Ok(())
+    }
+}
+
+impl Line for Wrong<'_> {
+    fn errors(&self) -> LineErrors {
+        self.0.set(self.0.get() + 1);
+        LineErrors { framing: 1_000 * self.0.get(), ..LineErrors::NONE }
+    }
+}
+
+#[test]
+fn errors_are_looked_at_once_a_second_on_a_line_where_nothing_else_is_heard() {
+    let _clock = Clock::take();
+    let mut gateway = Box::new(Gateway::idle());
+    gateway.configure(&config(SendOn::Period)).unwrap();
+    let watch = Watch::<1>::new();
+    let pulse = watch.register(TaskName::Serial(PortId(0))).unwrap();
+    let looks = Cell::new(0);
+    let mut task = pin!(run(&gateway, pulse, PortId(0), Wrong(&looks), 115_200));
+    let mut cx = Context::from_waker(Waker::noop());
+    for second in 1..=5 {
+        for _ in 0..10 {
+            assert!(task.as_mut().poll(&mut cx).is_pending());
+            advance(Duration::from_millis(100));
+        }
+        assert_eq!(looks.get(), second);
+    }
+}

@@ -1,0 +1,91 @@
+//! What the log says while all is well: what came of every link, and what went through every port.
+
+use core::pin::pin;
+
+use embassy_time::{Duration, Timer};
+use proto_core::link::LinkState;
+
+use super::gateway::{Gateway, MAX_FIELD_PORTS, MAX_LINKS};
+use super::watchdog::Pulse;
+use crate::{info, warn};
+
+/// Says it when it is another than before, for ever.
+pub async fn run(gateway: &Gateway, pulse: &Pulse) -> ! {
+    let mut links = [(0, Shown::Down); MAX_LINKS];
+    let mut ports = [[0; 6]; MAX_FIELD_PORTS];
+    let mut strangers = [0; MAX_LINKS];
+    let mut sleeps = 0;
+    loop {
+        for _ in 0..4 {
+            let mut known = links.iter_mut();
+            gateway.report(
+                |link| {
+                    let Some((connects, before)) = known.next() else { return };
+                    let shown = match link.state {
+                        LinkState::Up { .. } => Shown::Up,
+                        LinkState::Shared => Shown::Shared,
+                        LinkState::Down { .. } | LinkState::Opening { .. } => Shown::Down,
+                    };
+                    let name = link.kind.name();
+                    if *connects != link.history.connects {
+                        *connects = link.history.connects;
+                        info!("link {}: up ({})", name, connects);
+                    } else if *before == Shown::Up && shown == Shown::Down {
+                        warn!("link {}: lost", name);
+                    }
+                    if *before != Shown::Shared && shown == Shown::Shared {
+                        info!(
+                            "link {}: the controller takes one connection; the command link does its work",
+                            name
+                        );
+                    }
+                    *before = shown;
+                },
+                |_, _| {},
+            );
+            pulse.idle(pin!(Timer::after(Duration::from_millis(250)))).await;
+        }
+        if sleeps != gateway.sleeps() {
+            sleeps = gateway.sleeps();
+            warn!("the processor was stopped ({}): what waited meanwhile is discarded", sleeps);
+        }
+        for ((kind, now), before) in gateway.strangers().zip(&mut strangers) {
+            if *before != now {
+                *before = now;
+                warn!("link {}: {} turned away that were not the controller", kind.name(), now);
+            }
+        }
+        let mut known = ports.iter_mut();
+        gateway.report(
+            |_| {},
+            |port, counters| {
+                let now = [
+                    counters.frames_in,
+                    counters.bytes_in,
+                    counters.frames_out,
+                    counters.bytes_out,
+                    counters.resync_bytes,
+                    counters.skipped_cycles,
+                ];
+                if let Some(before) = known.next()
+                    && *before != now
+                {
+                    *before = now;
+                    let [frames_in, bytes_in, frames_out, bytes_out, skipped, cycles] = now;
+                    info!(
+                        "port {}: in {} frames, {} bytes; out {} frames, {} bytes; {} bytes skipped, {} cycles",
+                        port.0, frames_in, bytes_in, frames_out, bytes_out, skipped, cycles,
+                    );
+                }
+            },
+        );
+    }
+}
+
+/// How a link is, as the log tells it.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Shown {
+    Down,
+    Up,
+    Shared,
+}

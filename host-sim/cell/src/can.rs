@@ -1,0 +1,133 @@
+//! A CAN bus: one port of the gateway or of the controller, and a device that may stand for many.
+
+use std::collections::VecDeque;
+
+use proto_core::config::can_frame_time;
+use proto_core::recipe::CanFrame;
+use proto_core::time::Instant;
+
+use super::device::Device;
+use super::line::MAX_HEARD;
+use super::rng::Rng;
+use super::{End, Owner};
+
+/// What happened on a bus, beside what its ends count.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct BusCounters {
+    /// Frames of the device.
+    pub device_sent: u64,
+    /// Frames of the port.
+    pub port_sent: u64,
+    /// Frames that were lost on their way.
+    pub lost: u64,
+}
+
+/// A bus.
+pub struct CanBus {
+    pub(super) owner: Owner,
+    bitrate: u32,
+    /// How many frames of a million are lost.
+    pub loss_ppm: u32,
+    /// What happened.
+    pub counters: BusCounters,
+    pub(super) connected: bool,
+    /// The port's CAN controller is bus-off: it neither sends nor hears.
+    pub(super) is_off: bool,
+    pub(super) device: Option<Box<dyn Device<CanFrame>>>,
+    waiting: [VecDeque<CanFrame>; 2],
+    on_the_bus: Option<(End, CanFrame)>,
+    heard: VecDeque<(Instant, CanFrame)>,
+    pub(super) keep_heard: usize,
+    rng: Rng,
+}
+
+impl std::fmt::Debug for CanBus {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { owner, bitrate, counters, connected, .. } = self;
+        f.debug_struct("CanBus")
+            .field("owner", owner)
+            .field("bitrate", bitrate)
+            .field("counters", counters)
+            .field("connected", connected)
+            .finish_non_exhaustive()
+    }
+}
+
+/// A frame that has crossed the bus.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Crossed {
+    pub from: End,
+    pub frame: CanFrame,
+    pub arrives: bool,
+    /// Nothing of the sender waits any more.
+    pub was_last: bool,
+}
+
+impl CanBus {
+    pub(super) fn new(owner: Owner, bitrate: u32, rng: Rng) -> Self {
+        Self {
+            owner,
+            bitrate,
+            loss_ppm: 0,
+            counters: BusCounters::default(),
+            connected: true,
+            is_off: false,
+            device: None,
+            waiting: [VecDeque::new(), VecDeque::new()],
+            on_the_bus: None,
+            heard: VecDeque::new(),
+            keep_heard: MAX_HEARD,
+            rng,
+        }
+    }
+
+    /// What the port has sent since the last look, each frame with the time of its end. The newest
+    /// [`MAX_HEARD`] are kept.
+    pub fn take_heard(&mut self) -> Vec<(Instant, CanFrame)> {
+        self.heard.drain(..).collect()
+    }
+
+    /// Queues a frame; when the one that goes onto the bus with it ends.
+    pub(super) fn send(&mut self, now: Instant, from: End, frame: CanFrame) -> Option<Instant> {
+        self.waiting[from as usize].push_back(frame);
+        match from {
+            End::Port => self.counters.port_sent += 1,
+            End::Device => self.counters.device_sent += 1,
+        }
+        self.arbitrate(now)
+    }
+
+    /// The frame on the bus has ended.
+    pub(super) fn finish(&mut self, now: Instant) -> Option<Crossed> {
+        let (from, frame) = self.on_the_bus.take()?;
+        let arrives = self.connected && !self.is_off && !self.rng.chance(self.loss_ppm);
+        self.counters.lost += u64::from(!arrives);
+        if arrives && from == End::Port && self.keep_heard > 0 {
+            if self.heard.len() >= self.keep_heard {
+                self.heard.pop_front();
+            }
+            self.heard.push_back((now, frame));
+        }
+        Some(Crossed { from, frame, arrives, was_last: self.waiting[from as usize].is_empty() })
+    }
+
+    /// Ids are ordered as they win the bus, and a data frame beats a remote one; when its frame ends, or `None` when the bus is taken or nobody wants it.
+    pub(super) fn arbitrate(&mut self, now: Instant) -> Option<Instant> {
+        if self.on_the_bus.is_some() {
+            return None;
+        }
+        let head = |end: End| {
+            let frame = self.waiting[end as usize].front()?;
+            Some((embedded_can::Frame::id(frame), frame.is_remote(), end))
+        };
+        let (.., from) = [head(End::Port), head(End::Device)].into_iter().flatten().min()?;
+        let frame = self.waiting[from as usize].pop_front()?;
+        self.on_the_bus = Some((from, frame));
+        Some(now + can_frame_time(frame.id(), frame.data().len(), self.bitrate))
+    }
+
+    /// What waits at the port is lost.
+    pub(super) fn drop_port_frames(&mut self) {
+        self.waiting[End::Port as usize].clear();
+    }
+}

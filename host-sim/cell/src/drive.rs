@@ -1,0 +1,393 @@
+//! The cell's run loop: what is due, whom it is for, and what that leads to.
+
+use proto_core::engine::{Input, LinkId, OUTPUT_BUFFER, Output};
+use proto_core::recipe::CanFrame;
+use proto_core::recipe::model::CanId;
+use proto_core::time::{Duration, Instant};
+
+use super::connection::{Connection, Peer};
+use super::due::Due;
+use super::network::{Door, Item, Speaker, Way};
+use super::{BusId, Cell, DESK, End, LineId, Owner, What, udp_peer};
+use recipe_controller::{ControllerInput, ControllerOutput, Link};
+
+impl Cell {
+    /// Lets time go by: the clock jumps from deadline to deadline.
+    pub fn run(&mut self, span: Duration) {
+        let end = self.now + span;
+        let mut turns_at_once = 0_u32;
+        loop {
+            let next = self.next_deadline();
+            if self.violation().is_some() {
+                return;
+            }
+            if next > end {
+                self.now = end;
+                return;
+            }
+            turns_at_once = if next > self.now { 0 } else { turns_at_once + 1 };
+            assert!(turns_at_once < MAX_TURNS, "the cell does not come to rest at {:?}", self.now);
+            self.now = self.now.max(next);
+            self.turn();
+        }
+    }
+
+    /// Everything that is due now, once.
+    fn turn(&mut self) {
+        if let Some(due) = self.queue.pop_due(self.now) {
+            self.carry_out(due);
+            return;
+        }
+        self.poll_devices();
+        if self.engine_wake <= self.now && !self.is_asleep() {
+            self.engine_input(Input::Tick);
+        }
+        if self.controller_wake <= self.now {
+            self.controller_input(ControllerInput::Tick);
+        }
+    }
+
+    fn next_deadline(&self) -> Instant {
+        let lines = self.lines.iter().filter_map(|line| line.device.as_ref()).map(|device| device.deadline());
+        let buses = self.buses.iter().filter_map(|bus| bus.device.as_ref()).map(|device| device.deadline());
+        let devices = lines.chain(buses).min().unwrap_or(Instant::NEVER);
+        let engine = if self.is_asleep() { Instant::NEVER } else { self.engine_wake };
+        self.queue.next().min(engine).min(self.controller_wake).min(devices)
+    }
+
+    fn poll_devices(&mut self) {
+        for nth in 0..self.lines.len() {
+            let now = self.now;
+            let device = self.lines[nth].device.as_mut().filter(|device| device.deadline() <= now);
+            for bytes in device.map_or_else(Vec::new, |device| device.poll(now)) {
+                self.transmit(LineId(nth), End::Device, &bytes);
+            }
+        }
+        for nth in 0..self.buses.len() {
+            let now = self.now;
+            let device = self.buses[nth].device.as_mut().filter(|device| device.deadline() <= now);
+            for frame in device.map_or_else(Vec::new, |device| device.poll(now)) {
+                self.transmit_can(BusId(nth), End::Device, frame);
+            }
+        }
+    }
+
+    /// Both are told that their ports are there.
+    pub(super) fn switch_on(&mut self) {
+        let ports: Vec<_> = self.engine.field_ports().collect();
+        for port in ports {
+            self.engine_input(Input::PortUp { port });
+        }
+        self.controller_input(ControllerInput::Tick);
+        let mut owned: Vec<usize> = Vec::new();
+        let owners = self.lines.iter().map(|line| line.owner).chain(self.buses.iter().map(|bus| bus.owner));
+        owned.extend(owners.filter_map(|owner| match owner {
+            Owner::Controller(port) => Some(port),
+            Owner::Gateway(_) => None,
+        }));
+        owned.extend(self.clients.iter().filter(|(_, client)| !client.is_tcp).map(|(&port, _)| port));
+        for port in owned {
+            self.controller_input(ControllerInput::PortUp { port });
+        }
+        let tcp: Vec<usize> =
+            self.clients.iter().filter(|(_, client)| client.is_tcp).map(|(&port, _)| port).collect();
+        for port in tcp {
+            self.queue.push(self.now, Due::ClientTries { port });
+        }
+    }
+
+    pub(super) fn engine_input(&mut self, input: Input<'_>) {
+        let now = self.now;
+        match input {
+            Input::LinkUp { link } => self.trace.add(now, What::LinkUp, link.0.into(), &[]),
+            Input::LinkDown { link } => self.trace.add(now, What::LinkDown, link.0.into(), &[]),
+            Input::LinkBytes { link, bytes } => {
+                self.trace.add(now, What::LinkReceived, link.0.into(), bytes);
+            }
+            Input::PortBytes { port, bytes } => {
+                self.trace.add(now, What::PortReceived, port.0.into(), bytes);
+            }
+            Input::PortCan { port, frame } => {
+                self.trace.add(now, What::PortReceived, port.0.into(), &can_bytes(&frame));
+            }
+            _ => {}
+        }
+        if let Some(recorder) = &mut self.recorder {
+            recorder.input(now, input);
+        }
+        #[cfg(test)]
+        let forged = self.forged_input(&input);
+        #[cfg(test)]
+        let given = super::tamper::instead(&input, forged.as_deref());
+        #[cfg(not(test))]
+        let given = input;
+        self.engine.handle(now, given);
+        if let Some(oracle) = &mut self.oracle {
+            oracle.input(now, &input, &self.engine);
+        }
+        let mut buf = [0; OUTPUT_BUFFER];
+        loop {
+            let output = self.engine.poll_output(now, &mut buf);
+            #[cfg(test)]
+            if let Some(forged) = self.forged_outputs(&input, &output) {
+                for forged in &forged {
+                    self.hand_over(forged.as_output());
+                }
+                if !matches!(output, Output::Sleep { .. }) {
+                    continue;
+                }
+            }
+            if !self.hand_over(output) {
+                return;
+            }
+        }
+    }
+
+    /// Carries out what the engine wants; false when that is nothing more.
+    fn hand_over(&mut self, output: Output<'_>) -> bool {
+        let now = self.now;
+        if let Some(recorder) = &mut self.recorder {
+            recorder.output(output);
+        }
+        if let Some(oracle) = &mut self.oracle {
+            match output {
+                Output::Sleep { until } => {
+                    oracle.rest(now, &self.engine, until, self.queue.len() + self.conns.len());
+                }
+                _ => oracle.output(now, &output),
+            }
+        }
+        match output {
+            Output::Sleep { until } => {
+                self.engine_wake = until;
+                return false;
+            }
+            Output::PortSend { port, bytes } => {
+                self.trace.add(now, What::PortSent, port.0.into(), bytes);
+                if let Some(line) = self.line_at(Owner::Gateway(port)) {
+                    self.transmit(line, End::Port, bytes);
+                }
+            }
+            Output::PortSendCan { port, frame } => {
+                self.trace.add(now, What::PortSent, port.0.into(), &can_bytes(&frame));
+                if let Some(bus) = self.bus_at(Owner::Gateway(port)) {
+                    self.transmit_can(bus, End::Port, frame);
+                }
+            }
+            Output::LinkOpen { link } => {
+                self.trace.add(now, What::LinkOpen, link.0.into(), &[]);
+                self.open(link);
+            }
+            Output::LinkClose { link } => {
+                self.trace.add(now, What::LinkClose, link.0.into(), &[]);
+                self.close(link);
+            }
+            Output::LinkSend { link, bytes } => {
+                self.trace.add(now, What::LinkSent, link.0.into(), bytes);
+                self.send_up(link, bytes.to_vec());
+            }
+        }
+        true
+    }
+
+    pub(super) fn controller_input(&mut self, input: ControllerInput<'_>) {
+        let now = self.now;
+        match input {
+            ControllerInput::PortBytes { port, bytes } => {
+                self.trace.add(now, What::ControllerPortReceived, port as u64, bytes);
+            }
+            ControllerInput::PortCan { port, frame } => {
+                self.trace.add(now, What::ControllerPortReceived, port as u64, &can_bytes(&frame));
+            }
+            _ => {}
+        }
+        self.controller.handle(now, input);
+        self.drain_controller();
+    }
+
+    fn drain_controller(&mut self) {
+        let now = self.now;
+        loop {
+            match self.controller.poll_output(now) {
+                ControllerOutput::Sleep { until } => {
+                    self.controller_wake = until;
+                    return;
+                }
+                ControllerOutput::Send { conn: DESK, bytes } => self.asked.extend_from_slice(&bytes),
+                ControllerOutput::Send { conn, bytes } => {
+                    self.replied(conn.0, &bytes);
+                    self.send_item(conn.0, Way::Down, Item::Bytes(bytes))
+                }
+                ControllerOutput::Close { conn } => self.controller_closes(conn.0),
+                ControllerOutput::StatePacket { bytes } => {
+                    let subscribed = |conn: &Connection| {
+                        conn.peer == Peer::Server(Link::State) && conn.accepted && !conn.closing
+                    };
+                    let conns = self.conns.iter().filter(|(_, conn)| subscribed(conn));
+                    let conns: Vec<u64> = conns.map(|(&id, _)| id).collect();
+                    let lost = std::mem::take(&mut self.state_bytes_lost).min(bytes.len());
+                    for conn in conns {
+                        self.send_item(conn, Way::Down, Item::Bytes(bytes[lost..].to_vec()));
+                    }
+                }
+                ControllerOutput::UdpSend { peer, bytes } => self.udp_down(peer, &bytes),
+                ControllerOutput::PortSend { port, bytes } => {
+                    self.trace.add(now, What::ControllerPortSent, port as u64, &bytes);
+                    self.controller_port_sends(port, bytes);
+                }
+                ControllerOutput::PortSendCan { port, frame } => {
+                    self.trace.add(now, What::ControllerPortSent, port as u64, &can_bytes(&frame));
+                    if let Some(bus) = self.bus_at(Owner::Controller(port)) {
+                        self.transmit_can(bus, End::Port, frame);
+                    }
+                }
+                ControllerOutput::PortClose { port } => {
+                    if let Some(conn) = self.clients.get(&port).and_then(|client| client.conn) {
+                        self.controller_closes(conn);
+                        self.client_lost(port);
+                    }
+                }
+                ControllerOutput::Shutdown => {
+                    for gate in self.gates.values_mut() {
+                        gate.door = Door::Refuses;
+                    }
+                }
+            }
+        }
+    }
+
+    pub(super) fn carry_out(&mut self, due: Due) {
+        let Some(due) = self.keep_for_later(due) else { return };
+        match due {
+            Due::LinkUp { link, turn } => {
+                if self.is_turn(link, turn) {
+                    self.gate(link).is_up = true;
+                    self.engine_input(Input::LinkUp { link });
+                }
+            }
+            Due::LinkDown { link, turn } => {
+                if self.is_turn(link, turn) {
+                    self.gate(link).set_open(false);
+                    self.engine_input(Input::LinkDown { link });
+                }
+            }
+            Due::LinkSent { link, turn } => {
+                if self.is_turn(link, turn) {
+                    self.engine_input(Input::LinkSent { link });
+                }
+            }
+            Due::Arrival { conn, way } => self.arrive(conn, way),
+            Due::DatagramUp { link, peer, tag, bytes } => {
+                if self.gate(link).is_cut(Way::Up) {
+                    return;
+                }
+                self.trace.add(self.now, What::ControllerReceived, link.0.into(), &bytes);
+                let before = self.inputs_before();
+                self.controller_input(ControllerInput::Udp2011 { peer, bytes: &bytes });
+                self.datagram_arrived(link, tag, &bytes, before);
+            }
+            Due::DatagramDown { link, peer, bytes } => {
+                let gate = self.gate(link);
+                if gate.is_cut(Way::Down) {
+                    return;
+                }
+                if gate.is_up && udp_peer(gate.turn) == peer {
+                    self.engine_input(Input::LinkBytes { link, bytes: &bytes });
+                } else {
+                    let back = self.now + self.gate(link).network.delay;
+                    self.queue.push(back, Due::Unreachable { peer });
+                }
+            }
+            Due::ClientDatagramUp { port, tag, bytes } => {
+                let Some(link) = self.clients.get(&port).and_then(|client| client.link) else { return };
+                if self.gate(link).is_cut(Way::Up) {
+                    return;
+                }
+                let before = self.inputs_before();
+                self.controller_input(ControllerInput::PortBytes { port, bytes: &bytes });
+                self.datagram_arrived(link, tag, &bytes, before);
+            }
+            Due::ClientDatagramDown { link, from, bytes } => self.client_datagram(link, from, &bytes),
+            Due::Unreachable { peer } => self.controller_input(ControllerInput::Udp2011Unreachable { peer }),
+            Due::ClientTries { port } => self.client_tries(port),
+            Due::Chunk { line, chunk } => self.chunk_arrives(line, chunk),
+            Due::Gathered { line } => {
+                let bytes = std::mem::take(&mut self.lines[line.0].gathered);
+                if !bytes.is_empty() {
+                    self.port_receives(self.lines[line.0].owner, &bytes);
+                }
+            }
+            Due::CanDone { bus } => self.can_done(bus),
+            Due::DeviceSends { line, bytes } => self.send(line, &bytes),
+            Due::TimedOut { conn } => self.reset_conn(conn),
+            Due::Knock { link, turn, pause } => self.knock(link, turn, pause),
+            Due::ResetUp { conn } => self.reset_up(conn),
+            Due::ResetDown { conn } => self.reset_down(conn),
+            Due::SendAgain { conn, way } => self.send_again(conn, way),
+            Due::AckLeaves { conn } => self.ack_leaves(conn),
+            Due::Ack { conn, upto } => self.ack(conn, upto),
+            Due::UserTimeout { conn } => self.user_timeout(conn),
+            Due::Look { link, turn } => {
+                if self.is_turn(link, turn) && !self.is_asleep() {
+                    self.tell_acked(link);
+                }
+            }
+            Due::Wake { turn } => self.wake(turn),
+            Due::Survey => self.survey(),
+        }
+    }
+
+    /// A datagram came to a port where the gateway listens: it answers whoever opened, and moves only
+    /// to the sender of a frame.
+    fn client_datagram(&mut self, link: LinkId, from: Speaker, bytes: &[u8]) {
+        let gate = self.gate(link);
+        if gate.is_cut(Way::Down) && from != Speaker::Stranger || !gate.is_open {
+            return;
+        }
+        if !gate.is_up {
+            gate.is_up = true;
+            gate.partner = Some(from);
+            self.engine_input(Input::LinkUp { link });
+        } else if gate.partner != Some(from) && self.engine.is_frame(link, bytes) {
+            self.gate(link).partner = Some(from);
+        }
+        if let Some(oracle) = &mut self.oracle {
+            oracle.spoke(link, from, bytes);
+        }
+        if self.gate(link).is_up {
+            self.engine_input(Input::LinkBytes { link, bytes });
+        }
+    }
+
+    /// The controller's inputs, when somebody is to compare them.
+    pub(super) fn inputs_before(&self) -> Option<Vec<u8>> {
+        self.oracle.as_ref().map(|_| self.inputs())
+    }
+
+    pub(super) fn inputs(&self) -> Vec<u8> {
+        super::oracle::inputs_of(self.controller.registers().image())
+    }
+
+    fn datagram_arrived(&mut self, link: LinkId, tag: u64, bytes: &[u8], before: Option<Vec<u8>>) {
+        let (after, slowest) = (self.inputs_before(), self.gate(link).network.slowest());
+        if let (Some(oracle), Some(before), Some(after)) = (&mut self.oracle, before, after) {
+            oracle.arrived_datagram(link, tag, bytes, (&before, &after), slowest, self.now);
+        }
+    }
+
+    fn is_turn(&self, link: LinkId, turn: u64) -> bool {
+        self.gates.get(&link).is_some_and(|gate| gate.turn == turn)
+    }
+}
+
+/// A frame as the trace shows it.
+pub(super) fn can_bytes(frame: &CanFrame) -> Vec<u8> {
+    let id = match frame.id() {
+        CanId::Standard(id) => u32::from(id),
+        CanId::Extended(id) => id | 0x8000_0000,
+    };
+    id.to_be_bytes().into_iter().chain(frame.data().iter().copied()).collect()
+}
+
+/// Far more than one instant can need.
+const MAX_TURNS: u32 = 1_000_000;

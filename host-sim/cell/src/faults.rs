@@ -1,0 +1,339 @@
+//! What a test or a soak run can break in the cell, and mend.
+
+use proto_core::engine::{BusState, Engine, Input, LinkId, LinkKind};
+
+use super::connection::{Connection, Peer};
+use super::due::Due;
+use super::network::{Door, Speaker, Way};
+use super::sleep::Told;
+use super::tcp::TCP_TIMEOUT;
+use super::{BusId, Cell, Entry, LineId, Owner, What};
+
+/// Faults of the network.
+impl Cell {
+    /// New connections are refused; of a datagram link, everything is lost.
+    pub fn refuse(&mut self, link: LinkId) {
+        self.set_door(link, Door::Refuses);
+    }
+
+    /// New connections get no answer at all; of a datagram link, everything is lost.
+    pub fn black_hole(&mut self, link: LinkId) {
+        self.set_door(link, Door::Silent);
+    }
+
+    /// New connections and datagrams get through again.
+    pub fn admit(&mut self, link: LinkId) {
+        self.set_door(link, Door::Open);
+    }
+
+    /// The link's connection is reset: both ends are told, what was under way is lost.
+    pub fn reset(&mut self, link: LinkId) {
+        self.note(link);
+        if let Some(conn) = self.gate(link).conn {
+            self.reset_conn(conn);
+        }
+    }
+
+    /// The connection is reset when so many more bytes have arrived.
+    pub fn reset_after(&mut self, link: LinkId, way: Way, bytes: usize) {
+        self.note(link);
+        if let Some(conn) = self.connection(link) {
+            conn.pipe(way).reset_after = Some(bytes);
+        }
+    }
+
+    /// Nothing arrives any more in this direction, until [`Self::release`]; nothing is lost.
+    pub fn hold(&mut self, link: LinkId, way: Way) {
+        self.note(link);
+        if let Some(conn) = self.connection(link) {
+            conn.pipe(way).held = true;
+        }
+    }
+
+    /// What was held arrives now, in as few pieces as it can.
+    pub fn release(&mut self, link: LinkId, way: Way) {
+        self.note(link);
+        let Some(id) = self.gate(link).conn else { return };
+        if let Some(conn) = self.conns.get_mut(&id) {
+            conn.pipe(way).held = false;
+            self.queue.push(self.now, Due::Arrival { conn: id, way });
+            if way == Way::Down {
+                // So are acknowledgements.
+                self.queue.push(self.now, Due::Ack { conn: id, upto: conn.up.arrived });
+            }
+        }
+    }
+
+    /// What goes this way on the link is lost from now on, until as many [`Self::mend_way`]: a burst
+    /// of lost datagrams; a peer whose TCP acknowledges nothing, or takes nothing. TCP sends it again.
+    pub fn cut_way(&mut self, link: LinkId, way: Way) {
+        self.note(link);
+        self.gate(link).cuts[way as usize] += 1;
+    }
+
+    /// What is sent from now on arrives.
+    pub fn mend_way(&mut self, link: LinkId, way: Way) {
+        self.note(link);
+        let cuts = &mut self.gate(link).cuts[way as usize];
+        *cuts = cuts.saturating_sub(1);
+    }
+
+    /// The cable between gateway and controller is out: nothing gets through on this link.
+    pub fn cut_cable(&mut self, link: LinkId) {
+        Way::BOTH.into_iter().for_each(|way| self.cut_way(link, way));
+    }
+
+    /// The cable is in again.
+    pub fn mend_cable(&mut self, link: LinkId) {
+        Way::BOTH.into_iter().for_each(|way| self.mend_way(link, way));
+    }
+
+    /// Somebody else on the controller's host sends a datagram to a port where the gateway listens.
+    pub fn stranger_sends(&mut self, link: LinkId, bytes: &[u8]) {
+        self.note(link);
+        let due = Due::ClientDatagramDown { link, from: Speaker::Stranger, bytes: bytes.to_vec() };
+        self.queue.push(self.now, due);
+    }
+
+    /// The connection is gone and neither end is told: what they send is lost for ever. TCP itself
+    /// finds out after [`TCP_TIMEOUT`].
+    pub fn half_open(&mut self, link: LinkId) {
+        self.note(link);
+        let Some(id) = self.gate(link).conn else { return };
+        if let Some(conn) = self.conns.get_mut(&id) {
+            conn.up.dead = true;
+            conn.down.dead = true;
+            self.queue.push(self.now + TCP_TIMEOUT, Due::TimedOut { conn: id });
+        }
+    }
+
+    /// Whether the network has a connection for this link.
+    pub fn is_connected(&self, link: LinkId) -> bool {
+        self.gates.get(&link).is_some_and(|gate| gate.conn.is_some())
+    }
+
+    /// The next state packet lacks its first bytes, and the connection goes on: all packets after it
+    /// begin at another place.
+    pub fn lose_state_bytes(&mut self, count: usize) {
+        self.note(LinkId::STATE);
+        self.state_bytes_lost = count;
+    }
+
+    fn set_door(&mut self, link: LinkId, door: Door) {
+        self.note(link);
+        self.gate(link).door = door;
+    }
+
+    /// Words for whoever reads the trace.
+    pub(super) fn remark(&mut self, words: std::fmt::Arguments<'_>) {
+        self.trace.remark(self.now, words);
+    }
+
+    fn note(&mut self, link: LinkId) {
+        self.trace.add(self.now, What::Fault, link.0.into(), &[]);
+        self.disturb(Some(link));
+    }
+
+    fn connection(&mut self, link: LinkId) -> Option<&mut Connection> {
+        let id = self.gate(link).conn?;
+        self.conns.get_mut(&id)
+    }
+
+    pub(super) fn reset_conn(&mut self, id: u64) {
+        let Some(conn) = self.drop_conn(id) else { return };
+        let gate = self.gate(conn.link);
+        // The gateway may have closed its end and moved on.
+        if gate.conn == Some(id) {
+            let turn = gate.turn;
+            self.queue.push(self.now, Due::LinkDown { link: conn.link, turn });
+        }
+        // And the controller may have forgotten its own.
+        if !conn.forgotten {
+            self.controller_closed(id, conn.peer);
+        }
+    }
+}
+
+/// Faults of the field.
+impl Cell {
+    /// The line is cut: bytes are lost, and nobody is told.
+    pub fn cut(&mut self, line: LineId) {
+        self.lines[line.0].connected = false;
+    }
+
+    /// The line is whole again.
+    pub fn mend(&mut self, line: LineId) {
+        self.lines[line.0].connected = true;
+    }
+
+    /// The port's adapter is pulled out: its owner is told.
+    pub fn unplug(&mut self, line: LineId) {
+        self.cut(line);
+        self.lines[line.0].gathered.clear();
+        self.port_input(self.lines[line.0].owner, false);
+    }
+
+    /// The adapter is back.
+    pub fn plug_in(&mut self, line: LineId) {
+        self.mend(line);
+        self.port_input(self.lines[line.0].owner, true);
+    }
+
+    /// The bus is cut: frames are lost, and nobody is told.
+    pub fn cut_bus(&mut self, bus: BusId) {
+        self.buses[bus.0].connected = false;
+    }
+
+    /// The bus is whole again.
+    pub fn mend_bus(&mut self, bus: BusId) {
+        self.buses[bus.0].connected = true;
+    }
+
+    /// The port's CAN controller goes bus-off: its waiting frames are lost, and it hears nothing.
+    pub fn bus_off(&mut self, bus: BusId) {
+        self.buses[bus.0].drop_port_frames();
+        self.buses[bus.0].is_off = true;
+        self.bus_state(bus, BusState::BusOff);
+    }
+
+    /// It has recovered.
+    pub fn bus_on(&mut self, bus: BusId) {
+        self.buses[bus.0].is_off = false;
+        self.bus_state(bus, BusState::Active);
+    }
+
+    fn bus_state(&mut self, bus: BusId, state: BusState) {
+        // The simulated controller's own CAN port knows no error states.
+        if let Owner::Gateway(port) = self.buses[bus.0].owner {
+            self.tell_of_port(port, Told::Bus(state));
+        }
+    }
+}
+
+/// Switching off and on.
+impl Cell {
+    /// The controller is switched off and on: see [`recipe_controller::Controller::restart`].
+    pub fn restart_controller(&mut self) {
+        let now = self.now;
+        self.trace.add(now, What::Fault, Entry::CONTROLLER, &[]);
+        self.controller_mut().restart(now);
+        self.begun_anew();
+    }
+
+    /// The same, and all its registers are 0.
+    pub fn clear_controller(&mut self) {
+        let now = self.now;
+        self.trace.add(now, What::Fault, Entry::CONTROLLER, &[0]);
+        self.controller_mut().restart_cleared(now);
+        self.begun_anew();
+    }
+
+    /// The controller loses its power: its ends of all connections are gone without a word, and nobody
+    /// is there. [`Self::power_up`] ends it.
+    pub fn power_cut(&mut self) {
+        let links: Vec<LinkId> = self.link_ids().collect();
+        links.into_iter().for_each(|link| self.cut_cable(link));
+        let conns: Vec<(u64, Peer)> = self.conns.iter().map(|(&id, conn)| (id, conn.peer)).collect();
+        for (id, peer) in conns {
+            let Some(conn) = self.conns.get_mut(&id) else { continue };
+            match peer {
+                _ if conn.forgotten => continue,
+                _ if conn.abandoned || conn.closing => drop(self.drop_conn(id)),
+                // The gateway goes on asking.
+                Peer::Server(_) if !conn.accepted => continue,
+                Peer::Client(_) if !conn.accepted => {
+                    let link = conn.link;
+                    self.drop_conn(id);
+                    self.gate(link).conn = None;
+                }
+                _ => {
+                    conn.forgotten = true;
+                    conn.down.forget();
+                }
+            }
+            self.controller_closed(id, peer);
+        }
+    }
+
+    /// It has power again, and begins afresh with all registers at 0.
+    pub fn power_up(&mut self) {
+        let links: Vec<LinkId> = self.link_ids().collect();
+        links.into_iter().for_each(|link| self.mend_cable(link));
+        self.clear_controller();
+    }
+
+    fn begun_anew(&mut self) {
+        self.clients.values_mut().for_each(|client| client.socket += 1);
+        if let Some(oracle) = &mut self.oracle {
+            oracle.controller_began(self.now);
+        }
+    }
+
+    /// The controller comes back with software that speaks this dialect.
+    pub fn replace_controller(&mut self, dialect: &str) {
+        let now = self.now;
+        self.trace.add(now, What::Fault, Entry::CONTROLLER, dialect.as_bytes());
+        self.controller_mut().replace_software(now, dialect);
+        self.begun_anew();
+    }
+
+    /// The gateway loses its power and starts again: its connections are reset, its counters
+    /// begin afresh.
+    pub fn restart_gateway(&mut self) {
+        self.trace.add(self.now, What::Fault, Entry::GATEWAY, &[]);
+        let known = self.conns.iter().filter(|(_, conn)| !conn.forgotten);
+        let conns: Vec<(u64, Peer)> = known.map(|(&id, conn)| (id, conn.peer)).collect();
+        for gate in self.gates.values_mut() {
+            gate.set_open(false);
+        }
+        let all: Vec<u64> = self.conns.keys().copied().collect();
+        for id in all {
+            self.drop_conn(id);
+        }
+        self.forget_waiting();
+        // The same configuration made the engine that there was.
+        if let Ok(engine) = Engine::new(&self.gateway) {
+            if let Some(recorder) = &mut self.recorder {
+                recorder.totals(&self.engine);
+                recorder.start();
+            }
+            *self.engine = engine;
+        }
+        if let Some(oracle) = &mut self.oracle {
+            oracle.restarted(self.now);
+        }
+        self.engine_wake = self.now;
+        let ports: Vec<_> = self.engine.field_ports().collect();
+        for port in ports {
+            self.engine_input(Input::PortUp { port });
+        }
+        for (id, peer) in conns {
+            self.controller_closed(id, peer);
+        }
+    }
+
+    /// The links that are TCP connections.
+    pub fn tcp_links(&self) -> impl Iterator<Item = LinkId> + '_ {
+        let is_tcp = |kind| !matches!(kind, LinkKind::RecipeUdp | LinkKind::RecipeUdpListen { .. });
+        self.gates.values().filter(move |gate| is_tcp(gate.kind)).map(|gate| gate.id)
+    }
+
+    /// The others.
+    pub fn datagram_links(&self) -> impl Iterator<Item = LinkId> + use<> {
+        let is_udp = |kind| matches!(kind, LinkKind::RecipeUdp | LinkKind::RecipeUdpListen { .. });
+        let links: Vec<LinkId> =
+            self.gates.values().filter(|gate| is_udp(gate.kind)).map(|gate| gate.id).collect();
+        links.into_iter()
+    }
+
+    /// The links where the gateway listens for datagrams, and how long the controller's frames are.
+    pub(super) fn listening_for_datagrams(&self) -> Vec<(LinkId, Option<usize>)> {
+        let listen = self.gates.values().filter(|gate| matches!(gate.kind, LinkKind::RecipeUdpListen { .. }));
+        listen.map(|gate| (gate.id, self.frame_len(gate.id))).collect()
+    }
+
+    /// Every link.
+    pub fn link_ids(&self) -> impl Iterator<Item = LinkId> + '_ {
+        self.gates.keys().copied()
+    }
+}

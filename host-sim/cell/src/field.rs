@@ -1,0 +1,117 @@
+//! What travels between ports and their devices: bytes on lines, frames on buses.
+
+use proto_core::recipe::CanFrame;
+use proto_core::time::Instant;
+
+use super::due::Due;
+use super::line::{Chunk, Chunking};
+use super::sleep::Told;
+use super::{BusId, Cell, End, LineId, Owner};
+use recipe_controller::ControllerInput;
+
+impl Cell {
+    pub(super) fn transmit(&mut self, line: LineId, from: End, bytes: &[u8]) {
+        let queue = &mut self.queue;
+        let each = |at, chunk| queue.push(at, Due::Chunk { line, chunk });
+        self.lines[line.0].send(self.now, from, bytes, each);
+    }
+
+    pub(super) fn chunk_arrives(&mut self, id: LineId, mut chunk: Chunk) {
+        let now = self.now;
+        let line = &mut self.lines[id.0];
+        let owner = line.owner;
+        let arrives = line.deliver(now, &mut chunk);
+        match chunk.from {
+            End::Device if !arrives => {}
+            End::Device if let Chunking::Gathered(every) = line.chunking => {
+                if line.gathered.is_empty() {
+                    let every = every.as_micros().max(1);
+                    let at = Instant::from_micros(now.as_micros().div_ceil(every) * every);
+                    self.queue.push(at, Due::Gathered { line: id });
+                }
+                line.gathered.append(&mut chunk.bytes);
+            }
+            End::Device => self.port_receives(owner, &chunk.bytes),
+            End::Port => {
+                let mut answers = Vec::new();
+                if arrives {
+                    line.hear(now, &chunk.bytes, chunk.is_first);
+                    answers = line.device.as_mut().map_or_else(Vec::new, |d| d.receive(now, &chunk.bytes));
+                }
+                if chunk.is_last {
+                    self.port_sent(owner);
+                }
+                for answer in answers {
+                    self.transmit(id, End::Device, &answer);
+                }
+            }
+        }
+    }
+
+    pub(super) fn port_receives(&mut self, owner: Owner, bytes: &[u8]) {
+        match owner {
+            Owner::Gateway(port) => self.tell_of_port(port, Told::Bytes(bytes.to_vec())),
+            Owner::Controller(port) => self.controller_input(ControllerInput::PortBytes { port, bytes }),
+        }
+    }
+
+    pub(super) fn transmit_can(&mut self, bus: BusId, from: End, frame: CanFrame) {
+        if let Some(at) = self.buses[bus.0].send(self.now, from, frame) {
+            self.queue.push(at, Due::CanDone { bus });
+        }
+    }
+
+    pub(super) fn can_done(&mut self, id: BusId) {
+        let now = self.now;
+        let bus = &mut self.buses[id.0];
+        let owner = bus.owner;
+        let Some(crossed) = bus.finish(now) else { return };
+        let mut answers = Vec::new();
+        match crossed.from {
+            End::Device if crossed.arrives => match owner {
+                Owner::Gateway(port) => self.tell_of_port(port, Told::Frame(crossed.frame)),
+                Owner::Controller(port) => {
+                    self.controller_input(ControllerInput::PortCan { port, frame: crossed.frame });
+                }
+            },
+            End::Device => {}
+            End::Port => {
+                if let Some(device) = bus.device.as_mut().filter(|_| crossed.arrives) {
+                    answers = device.receive(now, &crossed.frame);
+                }
+                if crossed.was_last {
+                    self.port_sent(owner);
+                }
+            }
+        }
+        for frame in answers {
+            self.transmit_can(id, End::Device, frame);
+        }
+        if let Some(at) = self.buses[id.0].arbitrate(now) {
+            self.queue.push(at, Due::CanDone { bus: id });
+        }
+    }
+
+    fn port_sent(&mut self, owner: Owner) {
+        match owner {
+            Owner::Gateway(port) => self.tell_of_port(port, Told::Sent),
+            Owner::Controller(port) => self.controller_input(ControllerInput::PortSent { port }),
+        }
+    }
+
+    pub(super) fn line_at(&self, owner: Owner) -> Option<LineId> {
+        self.lines.iter().position(|line| line.owner == owner).map(LineId)
+    }
+
+    pub(super) fn bus_at(&self, owner: Owner) -> Option<BusId> {
+        self.buses.iter().position(|bus| bus.owner == owner).map(BusId)
+    }
+
+    pub(super) fn port_input(&mut self, owner: Owner, is_up: bool) {
+        match owner {
+            Owner::Gateway(port) => self.tell_of_port(port, if is_up { Told::Up } else { Told::Down }),
+            Owner::Controller(port) if is_up => self.controller_input(ControllerInput::PortUp { port }),
+            Owner::Controller(port) => self.controller_input(ControllerInput::PortDown { port }),
+        }
+    }
+}

@@ -1,0 +1,596 @@
+//! A whole cell in virtual time: the gateway engine and the simulated controller, joined by
+//! simulated networks, RS-485 lines and CAN buses on one clock that jumps to the next deadline.
+//!
+//! In: a gateway configuration, a controller configuration and a seed. Out: whatever happens, the
+//! same for the same seed ([`Cell::trace`] has a digest to compare). Hours of a cell take seconds.
+//! Knows no socket, no device and no clock (docs/cell.md).
+//!
+//! ```
+//! use proto_core::time::Duration;
+//! use recipe_cell::Cell;
+//! use recipe_config::file;
+//!
+//! let configs = concat!(env!("CARGO_MANIFEST_DIR"), "/../configs");
+//! let gateway = file::load_gateway(format!("{configs}/rs485-system.toml").as_ref(), &[]).unwrap();
+//! let controller = file::load_controller(format!("{configs}/rs485-system-controller.toml").as_ref(), &[]).unwrap();
+//! let mut cell = Cell::new(&gateway, &controller, 1).unwrap();
+//! cell.run(Duration::from_secs(1));
+//! let line = cell.line_of("rs485-1");
+//! cell.send(line, &[0xFF, 0xFF, 0x01, 0xEE, 0xEE]);
+//! cell.run(Duration::from_millis(50));
+//! assert_eq!(cell.value("DO[1]"), 1.0);
+//! ```
+//!
+//! What can go wrong is a method of [`Cell`] (of its networks: refuse, lose, hold, reset, half
+//! open), a field of a [`Line`], a [`CanBus`] or a [`Network`] (noise, loss, splits), or a method
+//! of [`Cell::controller_mut`]. [`Trouble`] does all of it by chance.
+
+mod can;
+mod connection;
+mod device;
+mod drive;
+mod due;
+mod faults;
+mod field;
+mod line;
+mod network;
+mod oracle;
+mod queue;
+mod recording;
+mod rng;
+mod sleep;
+pub mod soak;
+mod spoil;
+mod survey;
+#[cfg(test)]
+mod tamper;
+mod tcp;
+mod trace;
+mod traffic;
+mod trouble;
+
+use std::collections::BTreeMap;
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+
+use proto_core::config::{Bus, GatewayConfig};
+use proto_core::engine::{BuildError as EngineError, Engine, LinkId, LinkInfo, PortCounters, PortId};
+use proto_core::recipe::CanFrame;
+use proto_core::time::{Duration, Instant};
+
+pub use can::{BusCounters, CanBus};
+pub use device::{Device, Responder, Talker};
+pub use line::{Chunking, Line, LineCounters, MAX_HEARD, Wiring};
+pub use network::{Network, Way};
+pub use oracle::{Invariant, Violation};
+pub use recording::recording_difference;
+pub use rng::Rng;
+pub use tcp::TCP_TIMEOUT;
+pub use trace::{Entry, Trace, What};
+pub use trouble::{Trouble, TroubleKind};
+
+use connection::Connection;
+use due::Due;
+use network::Gate;
+use oracle::Oracle;
+use queue::Queue;
+use recipe_config::{InitialTarget, SimBus, SimConfig};
+use recipe_controller::{BuildError, ConnId, Controller, ControllerInput};
+use recording::Recorder;
+
+/// One of the cell's RS-485 lines.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub struct LineId(usize);
+
+/// One of the cell's CAN buses.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub struct BusId(usize);
+
+/// Whose port is on a line or bus.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Owner {
+    Gateway(PortId),
+    Controller(usize),
+}
+
+/// The two ends of a line or bus.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum End {
+    Port = 0,
+    Device = 1,
+}
+
+/// Why there is no cell.
+#[derive(Debug, Clone, PartialEq)]
+#[non_exhaustive]
+pub enum CellError {
+    /// The gateway cannot run its configuration.
+    Gateway(EngineError),
+    /// The controller cannot run its configuration.
+    Controller(BuildError),
+}
+
+impl std::fmt::Display for CellError {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Gateway(error) => write!(f, "gateway: {error}"),
+            Self::Controller(error) => write!(f, "controller: {error}"),
+        }
+    }
+}
+
+impl std::error::Error for CellError {}
+
+/// A recipe port of the controller that speaks over the network.
+#[derive(Debug)]
+struct Client {
+    /// Where it connects or sends to: a listening link of the gateway, if there is one.
+    link: Option<LinkId>,
+    is_tcp: bool,
+    conn: Option<u64>,
+    /// Which socket it sends datagrams from.
+    socket: u64,
+}
+
+/// The cell.
+#[derive(Debug)]
+pub struct Cell {
+    gateway: GatewayConfig,
+    engine: Box<Engine>,
+    engine_wake: Instant,
+    controller: Controller,
+    controller_wake: Instant,
+    now: Instant,
+    queue: Queue<Due>,
+    gates: BTreeMap<LinkId, Gate>,
+    conns: BTreeMap<u64, Connection>,
+    next_conn: u64,
+    clients: BTreeMap<usize, Client>,
+    lines: Vec<Line>,
+    buses: Vec<CanBus>,
+    names: BTreeMap<String, Far>,
+    controller_names: BTreeMap<String, Far>,
+    /// What waits for the gateway while it is not called.
+    asleep: Option<sleep::Waiting>,
+    wakes_at: Instant,
+    stalls: u64,
+    /// How many faults each of the controller's servers has at present.
+    ailments: [u32; 3],
+    rng: Rng,
+    trace: Trace,
+    recorder: Option<Recorder>,
+    /// Checks everything, when it was asked to.
+    oracle: Option<Box<Oracle>>,
+    /// Makes a bad gateway of a good one.
+    #[cfg(test)]
+    tamper: Option<tamper::Tamper>,
+    /// What the controller has sent to [`Cell::ask`]'s own connection.
+    asked: Vec<u8>,
+    /// Bytes that the next state packet lacks.
+    state_bytes_lost: usize,
+}
+
+/// What is at a port.
+#[derive(Debug, Clone, Copy)]
+enum Far {
+    Line(LineId),
+    Bus(BusId),
+}
+
+impl Cell {
+    /// A cell in which everything is switched on now. Field ports have nothing attached yet, and
+    /// no link is up before time has passed.
+    ///
+    /// # Errors
+    /// [`CellError`] when one of the two cannot run its configuration.
+    pub fn new(gateway: &GatewayConfig, controller: &SimConfig, seed: u64) -> Result<Self, CellError> {
+        Self::build(gateway, controller, seed, None)
+    }
+
+    /// The same, and everything that goes into the engine and comes out of it is recorded from the
+    /// start: [`Self::into_recording`].
+    ///
+    /// # Errors
+    /// As [`Self::new`].
+    pub fn recorded(gateway: &GatewayConfig, controller: &SimConfig, seed: u64) -> Result<Self, CellError> {
+        Self::build(gateway, controller, seed, Some(Recorder::new(gateway)))
+    }
+
+    fn build(
+        gateway: &GatewayConfig,
+        controller: &SimConfig,
+        seed: u64,
+        recorder: Option<Recorder>,
+    ) -> Result<Self, CellError> {
+        let engine = Engine::new(gateway).map_err(CellError::Gateway)?;
+        let mut cell = Self {
+            gateway: gateway.clone(),
+            engine: Box::new(engine),
+            engine_wake: Instant::ZERO,
+            controller: Controller::new(controller).map_err(CellError::Controller)?,
+            controller_wake: Instant::ZERO,
+            now: START,
+            queue: Queue::new(),
+            gates: BTreeMap::new(),
+            conns: BTreeMap::new(),
+            next_conn: 1,
+            clients: BTreeMap::new(),
+            lines: Vec::new(),
+            buses: Vec::new(),
+            names: BTreeMap::new(),
+            controller_names: BTreeMap::new(),
+            asleep: None,
+            wakes_at: START,
+            stalls: 0,
+            ailments: [0; 3],
+            rng: Rng::new(seed),
+            trace: Trace::new(),
+            recorder,
+            oracle: None,
+            #[cfg(test)]
+            tamper: None,
+            asked: Vec::new(),
+            state_bytes_lost: 0,
+        };
+        cell.wire_gateway();
+        cell.wire_controller(controller);
+        cell.switch_on();
+        Ok(cell)
+    }
+
+    /// From now on everything that the gateway does is checked against a model of its own
+    /// (docs/cell.md section 4); time stands still after the first violation. To be called before
+    /// time has passed.
+    pub fn watch(&mut self) {
+        let mut oracle = Box::new(Oracle::new(&self.gateway));
+        oracle.begin(&self.engine, self.engine_wake, self.now);
+        self.oracle = Some(oracle);
+        self.queue.push(self.now, Due::Survey);
+    }
+
+    /// The first invariant that did not hold.
+    pub fn violation(&self) -> Option<&Violation> {
+        self.oracle.as_ref().and_then(|oracle| oracle.violation())
+    }
+
+    /// How often each invariant was looked at.
+    pub fn checks(&self) -> BTreeMap<Invariant, u64> {
+        self.oracle.as_ref().map(|oracle| oracle.checks()).unwrap_or_default()
+    }
+
+    /// How many values written to the controller were judged.
+    pub fn watched_writes(&self) -> u64 {
+        self.oracle.as_ref().map_or(0, |oracle| oracle.writes)
+    }
+
+    /// Frames in and out of a field port, restarts of the gateway notwithstanding.
+    pub fn watched_frames(&self, port: PortId) -> (u64, u64) {
+        let frames = self.oracle.as_ref().and_then(|oracle| oracle.frames.get(usize::from(port.0)));
+        frames.copied().unwrap_or_default()
+    }
+
+    /// What was sent and what was received on a link, in calls.
+    pub fn watched_link(&self, link: LinkId) -> (u64, u64) {
+        self.oracle.as_ref().map(|oracle| oracle.traffic[oracle::place(link)]).unwrap_or_default()
+    }
+
+    fn wire_gateway(&mut self) {
+        let links: Vec<_> = self.engine.links().map(|link| (link.id, link.kind)).collect();
+        for (id, kind) in links {
+            self.gates.insert(id, Gate::new(id, kind, self.rng.fork()));
+        }
+        let ports = self.gateway.ports.clone();
+        for (nth, port) in (0..).zip(&ports) {
+            let owner = Owner::Gateway(PortId(nth));
+            let far = match port.bus {
+                Bus::Rs485(settings) => Far::Line(self.add_line(owner, settings)),
+                Bus::Can { bitrate } => Far::Bus(self.add_bus(owner, bitrate)),
+                Bus::TcpListen { .. } | Bus::UdpListen { .. } => continue,
+            };
+            self.names.insert(port.name.as_str().to_owned(), far);
+        }
+    }
+
+    fn wire_controller(&mut self, config: &SimConfig) {
+        for (nth, port) in config.ports.iter().enumerate() {
+            let owner = Owner::Controller(nth);
+            let far = match &port.bus {
+                SimBus::Rs485(settings) => Far::Line(self.add_line(owner, *settings)),
+                SimBus::Can { bitrate } => Far::Bus(self.add_bus(owner, *bitrate)),
+                SimBus::UdpServer => continue,
+                SimBus::TcpClient { to } => {
+                    let link = self.listener(to, true);
+                    self.clients.insert(nth, Client { link, is_tcp: true, conn: None, socket: 0 });
+                    continue;
+                }
+                SimBus::UdpClient { to } => {
+                    let link = self.listener(to, false);
+                    self.clients.insert(nth, Client { link, is_tcp: false, conn: None, socket: 0 });
+                    continue;
+                }
+            };
+            self.controller_names.insert(port.name.clone(), far);
+        }
+    }
+
+    fn add_line(&mut self, owner: Owner, settings: proto_core::config::Rs485) -> LineId {
+        self.lines.push(Line::new(owner, settings, self.rng.fork()));
+        LineId(self.lines.len() - 1)
+    }
+
+    fn add_bus(&mut self, owner: Owner, bitrate: u32) -> BusId {
+        self.buses.push(CanBus::new(owner, bitrate, self.rng.fork()));
+        BusId(self.buses.len() - 1)
+    }
+
+    /// The gateway's link that listens on this address's port.
+    fn listener(&self, to: &str, tcp: bool) -> Option<LinkId> {
+        let wanted = to.rsplit(':').next()?;
+        let nth = self.gateway.ports.iter().position(|port| match &port.bus {
+            Bus::TcpListen { listen } if tcp => listen.rsplit(':').next() == Some(wanted),
+            Bus::UdpListen { listen } if !tcp => listen.rsplit(':').next() == Some(wanted),
+            _ => false,
+        })?;
+        Some(LinkId::of_port(PortId(nth as u8)))
+    }
+
+    /// The present instant.
+    pub fn now(&self) -> Instant {
+        self.now
+    }
+
+    /// The gateway's configuration.
+    pub fn gateway(&self) -> &GatewayConfig {
+        &self.gateway
+    }
+
+    /// How many transmissions each line and bus keeps for a look; [`MAX_HEARD`] at first.
+    pub fn keep_heard(&mut self, limit: usize) {
+        self.lines.iter_mut().for_each(|line| line.keep_heard = limit);
+        self.buses.iter_mut().for_each(|bus| bus.keep_heard = limit);
+    }
+
+    /// The gateway.
+    pub fn engine(&self) -> &Engine {
+        &self.engine
+    }
+
+    /// The controller.
+    pub fn controller(&self) -> &Controller {
+        &self.controller
+    }
+
+    /// The controller, to break or change something in it; what follows happens with the next
+    /// [`Self::run`].
+    pub fn controller_mut(&mut self) -> &mut Controller {
+        self.controller_wake = self.now;
+        &mut self.controller
+    }
+
+    /// The controller's item of this name, such as `DO[1]` or `WordInputReg[3]`.
+    ///
+    /// # Panics
+    /// When there is no such item.
+    #[track_caller]
+    pub fn value(&self, name: &str) -> f64 {
+        self.controller.registers().value(target(name))
+    }
+
+    /// Gives an item of the controller a value from outside, such as an input that is wired.
+    ///
+    /// # Panics
+    /// When there is no such item or it does not take the value.
+    #[track_caller]
+    pub fn set_value(&mut self, name: &str, value: f64) {
+        if let Err(error) = self.controller_mut().force(target(name), value) {
+            panic!("{name} = {value}: {error}");
+        }
+    }
+
+    /// A link of the gateway.
+    ///
+    /// # Panics
+    /// When the configuration needs no such link.
+    #[track_caller]
+    pub fn link(&self, id: LinkId) -> LinkInfo<'_> {
+        match self.engine.links().find(|link| link.id == id) {
+            Some(link) => link,
+            None => panic!("the gateway has no {id:?}"),
+        }
+    }
+
+    /// The counters of the gateway's field port of this name.
+    ///
+    /// # Panics
+    /// When there is no such field port.
+    #[track_caller]
+    pub fn port(&self, name: &str) -> &PortCounters {
+        let nth = self.gateway.ports.iter().position(|port| port.name == name);
+        match nth.and_then(|nth| self.engine.port_counters(PortId(nth as u8))) {
+            Some(counters) => counters,
+            None => panic!("the gateway has no field port {name}"),
+        }
+    }
+
+    /// The line of the gateway's RS-485 port of this name, or else of the controller's.
+    ///
+    /// # Panics
+    /// When neither has one.
+    #[track_caller]
+    pub fn line_of(&self, port: &str) -> LineId {
+        match self.names.get(port).or_else(|| self.controller_names.get(port)) {
+            Some(Far::Line(line)) => *line,
+            _ => panic!("there is no RS-485 port {port}"),
+        }
+    }
+
+    /// The bus of the gateway's CAN port of this name, or else of the controller's.
+    ///
+    /// # Panics
+    /// When neither has one.
+    #[track_caller]
+    pub fn bus_of(&self, port: &str) -> BusId {
+        match self.names.get(port).or_else(|| self.controller_names.get(port)) {
+            Some(Far::Bus(bus)) => *bus,
+            _ => panic!("there is no CAN port {port}"),
+        }
+    }
+
+    /// All lines.
+    pub fn lines(&self) -> impl Iterator<Item = LineId> + use<> {
+        (0..self.lines.len()).map(LineId)
+    }
+
+    /// All buses.
+    pub fn buses(&self) -> impl Iterator<Item = BusId> + use<> {
+        (0..self.buses.len()).map(BusId)
+    }
+
+    /// A line, to look at and to change.
+    pub fn line(&mut self, id: LineId) -> &mut Line {
+        &mut self.lines[id.0]
+    }
+
+    /// A bus, to look at and to change.
+    pub fn bus(&mut self, id: BusId) -> &mut CanBus {
+        &mut self.buses[id.0]
+    }
+
+    /// How a link's network behaves, to look at and to change.
+    ///
+    /// # Panics
+    /// When the configuration needs no such link.
+    #[track_caller]
+    pub fn network(&mut self, link: LinkId) -> &mut Network {
+        &mut self.gate(link).network
+    }
+
+    /// How the network of each link behaves.
+    pub fn networks(&self) -> BTreeMap<LinkId, Network> {
+        self.gates.iter().map(|(&link, gate)| (link, gate.network)).collect()
+    }
+
+    /// Changes the network of every link.
+    pub fn every_network(&mut self, mut change: impl FnMut(&mut Network)) {
+        for gate in self.gates.values_mut() {
+            change(&mut gate.network);
+        }
+    }
+
+    /// Attaches a device to a line; it replaces the one before.
+    pub fn attach(&mut self, line: LineId, device: impl Device<Vec<u8>> + 'static) {
+        self.lines[line.0].device = Some(Box::new(device));
+    }
+
+    /// Attaches a device to a bus; it replaces the one before.
+    pub fn attach_can(&mut self, bus: BusId, device: impl Device<CanFrame> + 'static) {
+        self.buses[bus.0].device = Some(Box::new(device));
+    }
+
+    /// The device on the line sends, as soon as what it sent before has left.
+    pub fn send(&mut self, line: LineId, bytes: &[u8]) {
+        self.transmit(line, End::Device, bytes);
+    }
+
+    /// The device sends at a later instant.
+    pub fn send_at(&mut self, at: Instant, line: LineId, bytes: &[u8]) {
+        self.queue.push(at, Due::DeviceSends { line, bytes: bytes.to_vec() });
+    }
+
+    /// The device on the bus sends.
+    pub fn send_can(&mut self, bus: BusId, frame: CanFrame) {
+        self.transmit_can(bus, End::Device, frame);
+    }
+
+    /// What happened.
+    pub fn trace(&self) -> &Trace {
+        &self.trace
+    }
+
+    /// Keeps the next `limit` things that happen in full.
+    pub fn keep_trace(&mut self, limit: usize) {
+        self.trace.keep(limit);
+    }
+
+    /// What [`Self::recorded`] recorded, as `proto_core::record` reads it; empty when nothing was.
+    pub fn into_recording(self) -> Vec<u8> {
+        self.recorder.map_or_else(Vec::new, |mut recorder| {
+            recorder.totals(&self.engine);
+            recorder.into_bytes()
+        })
+    }
+
+    /// A generator that belongs to the cell's seed.
+    pub fn fork_rng(&mut self) -> Rng {
+        self.rng.fork()
+    }
+
+    /// What the controller replies to a command of a client beside the gateway, at once or within
+    /// half a second.
+    pub fn ask(&mut self, command: &str) -> String {
+        let line = format!("{command}\r\n");
+        self.asked.clear();
+        self.controller_input(ControllerInput::CommandOpened { conn: DESK, from: HERE });
+        self.controller_input(ControllerInput::CommandBytes { conn: DESK, bytes: line.as_bytes() });
+        self.run_until(Duration::from_millis(500), |cell| !cell.asked.is_empty());
+        self.controller_input(ControllerInput::CommandClosed { conn: DESK });
+        String::from_utf8_lossy(&self.asked).into_owned()
+    }
+
+    /// Lets time go by until `done` holds or `limit` has passed; returns whether it held. It is
+    /// looked at every millisecond.
+    pub fn run_until(&mut self, limit: Duration, mut done: impl FnMut(&Self) -> bool) -> bool {
+        let end = self.now + limit;
+        loop {
+            if done(self) {
+                return true;
+            }
+            if self.now >= end {
+                return false;
+            }
+            self.run(Duration::from_millis(1).min(end.saturating_since(self.now)));
+        }
+    }
+
+    /// The same in milliseconds.
+    pub fn run_ms(&mut self, millis: u64) {
+        self.run(Duration::from_millis(millis));
+    }
+
+    #[track_caller]
+    fn gate(&mut self, link: LinkId) -> &mut Gate {
+        match self.gates.get_mut(&link) {
+            Some(gate) => gate,
+            None => panic!("the gateway has no {link:?}"),
+        }
+    }
+}
+
+#[track_caller]
+fn target(name: &str) -> InitialTarget {
+    match name.parse() {
+        Ok(target) => target,
+        Err(error) => panic!("{name}: {error}"),
+    }
+}
+
+/// The gateway's address for the controller's UDP server: a new one with each opening, as a new
+/// socket has.
+fn udp_peer(turn: u64) -> SocketAddr {
+    (HERE, 40_000 + (turn % 10_000) as u16).into()
+}
+
+/// Where every client of the controller is.
+const HERE: IpAddr = IpAddr::V4(Ipv4Addr::LOCALHOST);
+/// The connection of [`Cell::ask`].
+const DESK: ConnId = ConnId(u64::MAX);
+/// Not zero, so that nothing depends on the clock's origin, and on no grid of the engine.
+const START: Instant = Instant::from_micros(1_000_000_300);
+/// How long the controller's TCP client waits before it connects again.
+const CLIENT_RETRY: Duration = Duration::from_millis(250);
+
+#[cfg(test)]
+mod network_tests;
+#[cfg(test)]
+mod sleep_tests;
+#[cfg(test)]
+mod tests;

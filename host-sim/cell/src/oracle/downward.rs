@@ -1,0 +1,301 @@
+//! What each field port has to send, and when (proto-core/docs/engine.md section 8).
+
+use proto_core::config::{FieldSpec, OutputBinding, SendOn};
+use proto_core::sysvar::SysVar;
+use proto_core::time::Instant;
+use proto_core::wire::scalar::ScalarType;
+
+use super::Invariant;
+use super::field::as_number;
+use super::sheet::{Frame, Origin, PortSheet, Sheet, shown};
+use super::upward::{Upward, Wrong};
+
+/// One port's sending.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Downward {
+    pub is_up: bool,
+    pub is_bus_off: bool,
+    /// A frame is to be sent as soon as the line is ours.
+    pub due: bool,
+    in_flight: bool,
+    /// The next CAN frame of a cycle that has begun.
+    next_can: usize,
+    /// The newest point of the grid that was seen.
+    slot: Option<u64>,
+    next_slot_at: Instant,
+    /// The newest cycle's bytes, for a port that sends changes.
+    newest: Option<Vec<u8>>,
+    /// The bytes of the cycle that has begun.
+    begun: Vec<u8>,
+    last_bit: Option<bool>,
+    pub heard: Instant,
+    /// Cycles sent, as a counter field shows them.
+    cycles: u32,
+    pub frames_out: u32,
+    pub bytes_out: u32,
+    pub skipped: u32,
+    pub stale: u32,
+}
+
+impl Downward {
+    fn is_usable(&self) -> bool {
+        self.is_up && !self.is_bus_off
+    }
+
+    fn may_send(&self, port: &PortSheet, now: Instant) -> bool {
+        self.due && !self.in_flight && self.is_usable() && now >= self.heard + port.turnaround
+    }
+
+    /// The line is silent enough and a frame waits: when that will be so.
+    pub(super) fn raise(&mut self) {
+        if self.due {
+            self.skipped = self.skipped.wrapping_add(1);
+        }
+        self.due = true;
+    }
+
+    /// Points of the grid that have gone by.
+    pub(super) fn tick(&mut self, port: &PortSheet, now: Instant) {
+        if port.outputs.is_empty() || !matches!(port.send, SendOn::Period | SendOn::Change) {
+            return;
+        }
+        if now < self.next_slot_at {
+            return;
+        }
+        let slot = now.as_micros() / port.cycle.as_micros();
+        self.next_slot_at = Instant::from_micros((slot + 1) * port.cycle.as_micros());
+        // The first look finds a point of the grid behind it.
+        let before = self.slot.replace(slot).unwrap_or(slot.saturating_sub(1));
+        if slot == before || !self.is_usable() {
+            return;
+        }
+        if self.cycles > 0 {
+            self.skipped = self.skipped.wrapping_add((slot - before - 1) as u32);
+        }
+        self.raise();
+    }
+
+    /// The device or the bus is gone.
+    pub(super) fn reset(&mut self) {
+        self.due = false;
+        self.in_flight = false;
+        self.next_can = 0;
+        self.newest = None;
+    }
+
+    pub(super) fn sent(&mut self) {
+        self.in_flight = false;
+    }
+
+    /// The gateway slept: what was due then is not sent now, but what was handed over is under way.
+    pub(super) fn slept(&mut self) {
+        let in_flight = self.in_flight;
+        self.reset();
+        self.in_flight = in_flight;
+    }
+
+    /// So many input frames were accepted at once.
+    pub(super) fn answered(&mut self, port: &PortSheet, frames: u32) {
+        if port.send == SendOn::Frame && self.is_usable() && !port.outputs.is_empty() {
+            (0..frames).for_each(|_| self.raise());
+        }
+    }
+
+    /// A value changed: the bit that triggers may have risen.
+    pub(super) fn watch(&mut self, port: &PortSheet, up: &Upward) {
+        let SendOn::Rising { var, bit } = port.send else { return };
+        let Some((raw, _)) = up.known(var).value else { return };
+        let on = raw[0] >> bit & 1 == 1;
+        if on && self.last_bit == Some(false) && self.is_usable() {
+            self.raise();
+        }
+        self.last_bit = Some(on);
+    }
+
+    /// Whether all that the port shows is known and, where it matters, young.
+    fn may_show(&self, sheet: &Sheet, port: &PortSheet, up: &Upward, now: Instant) -> Result<(), Wrong> {
+        let trigger = match port.send {
+            SendOn::Rising { var, .. } => Some(var),
+            _ => None,
+        };
+        let fields = port.outputs.iter().flat_map(|frame| &frame.fields).filter_map(shown);
+        for var in fields.chain(trigger) {
+            if up.known(var).unreadable {
+                return Err((Invariant::Unreadable, format!("{var} cannot be read")));
+            }
+            let Some((_, at)) = up.known(var).value else {
+                return Err((Invariant::Known, format!("{var} was never received")));
+            };
+            let age = now.saturating_since(at);
+            if port.stops_when_stale && age > port.stale_after {
+                let is_own = sheet.origin[var.ordinal()] == Some(Origin::Field);
+                let invariant = if is_own { Invariant::OwnAge } else { Invariant::Age };
+                return Err((invariant, format!("{var} is {age} old")));
+            }
+        }
+        Ok(())
+    }
+
+    /// The engine hands a frame over; `id` is that of a CAN frame.
+    pub(super) fn check(
+        &mut self,
+        sheet: &Sheet,
+        nth: usize,
+        up: &Upward,
+        id: Option<proto_core::recipe::model::CanId>,
+        bytes: &[u8],
+        now: Instant,
+    ) -> Result<(), Wrong> {
+        let port = &sheet.ports[nth];
+        if !self.is_usable() {
+            return Err((Invariant::Line, "sent while the device was gone".to_owned()));
+        }
+        if self.in_flight {
+            return Err((Invariant::Line, "sent before the frame before had left".to_owned()));
+        }
+        if now < self.heard + port.turnaround {
+            return Err((Invariant::Line, "sent before the line had been silent long enough".to_owned()));
+        }
+        if !self.due {
+            return Err((Invariant::Cycle, "sent without a cycle, a request or a trigger for it".to_owned()));
+        }
+        let Some(frame) = port.outputs.get(self.next_can) else {
+            return Err((Invariant::Shown, "sent without an output part".to_owned()));
+        };
+        if frame.id != id {
+            return Err((
+                Invariant::Shown,
+                format!("frame {} of the cycle has another id", self.next_can + 1),
+            ));
+        }
+        if self.next_can == 0 {
+            self.may_show(sheet, port, up, now)?;
+            self.begun.clear();
+        }
+        let shown = frame.payload_of(bytes);
+        let Some(shown) = shown.filter(|shown| self.agrees(frame, up, shown)) else {
+            return Err((Invariant::Shown, "the frame is not what was received last".to_owned()));
+        };
+        self.begun.extend_from_slice(shown);
+        self.frames_out = self.frames_out.wrapping_add(1);
+        self.bytes_out = self.bytes_out.wrapping_add(bytes.len() as u32);
+        self.next_can += 1;
+        if self.next_can == port.outputs.len() {
+            self.next_can = 0;
+            self.due = false;
+            self.in_flight = true;
+            self.cycles = self.cycles.wrapping_add(1);
+            if port.send == SendOn::Change {
+                if self.newest.as_ref() == Some(&self.begun) {
+                    return Err((Invariant::Cycle, "sent without a change".to_owned()));
+                }
+                self.newest = Some(self.begun.clone());
+            }
+        }
+        Ok(())
+    }
+
+    /// The engine has nothing more to do: nothing that could be sent is left.
+    pub(super) fn rest(&mut self, sheet: &Sheet, nth: usize, up: &Upward, now: Instant) -> Result<(), Wrong> {
+        let port = &sheet.ports[nth];
+        if !self.may_send(port, now) {
+            return Ok(());
+        }
+        if port.outputs.is_empty() {
+            self.due = false;
+            return Ok(());
+        }
+        if self.may_show(sheet, port, up, now).is_err() {
+            self.due = false;
+            self.stale = self.stale.wrapping_add(1);
+            return Ok(());
+        }
+        if port.send == SendOn::Change
+            && self.newest.as_ref().is_some_and(|newest| self.is_same(port, up, newest))
+        {
+            self.due = false;
+            return Ok(());
+        }
+        Err((Invariant::Cycle, "a frame that was due, and could be sent, was not".to_owned()))
+    }
+
+    fn is_same(&self, port: &PortSheet, up: &Upward, newest: &[u8]) -> bool {
+        let mut rest = newest;
+        port.outputs.iter().all(|frame| {
+            let Some((part, after)) = rest.split_at_checked(frame.payload) else { return false };
+            rest = after;
+            self.agrees(frame, up, part)
+        })
+    }
+
+    /// Whether the fields' bytes are the values known now.
+    fn agrees(&self, frame: &Frame, up: &Upward, payload: &[u8]) -> bool {
+        let mut rest = payload;
+        frame.fields.iter().all(|field| {
+            let (ty, number) = match *field {
+                FieldSpec::System(var) => {
+                    let (value, after) = rest.split_at(var.size());
+                    rest = after;
+                    return raw_of(up, var).is_some_and(|raw| raw[..var.size()] == *value);
+                }
+                FieldSpec::UserOutput { ty, from } => (ty, self.number(up, ty, from)),
+                FieldSpec::UserInput { ty, .. } => (ty, None),
+            };
+            let (value, after) = rest.split_at(ty.size());
+            rest = after;
+            match (number, field) {
+                (Some(number), _) => field_bytes(ty, number)[..ty.size()] == *value,
+                // How a command went is looked at elsewhere.
+                (None, FieldSpec::UserOutput { from: OutputBinding::Reply, .. }) => true,
+                (None, _) => false,
+            }
+        })
+    }
+
+    /// What a bound field shows, before it is made to fit.
+    fn number(&self, up: &Upward, ty: ScalarType, from: OutputBinding) -> Option<f64> {
+        match from {
+            OutputBinding::Variable { var, scale, offset } => {
+                let number = as_number(var, raw_of(up, var)?);
+                Some(number * f64::from(scale) + f64::from(offset))
+            }
+            OutputBinding::Constant(value) => Some(value),
+            OutputBinding::Counter => Some(match ty {
+                ScalarType::Byte => f64::from(self.cycles as u8),
+                ScalarType::Char => f64::from(self.cycles % 128),
+                ScalarType::Word => f64::from(self.cycles as u16),
+                ScalarType::Short => f64::from(self.cycles % 32_768),
+                ScalarType::Int => f64::from(self.cycles % (1 << 31)),
+                ScalarType::Float => f64::from(self.cycles % (1 << 24)),
+                ScalarType::Dword | ScalarType::Double => f64::from(self.cycles),
+            }),
+            OutputBinding::Reply => None,
+        }
+    }
+}
+
+fn raw_of(up: &Upward, var: SysVar) -> Option<super::sheet::Raw> {
+    up.known(var).value.map(|value| value.0)
+}
+
+/// A number as a field carries it: rounded, halves away from zero, saturated.
+fn field_bytes(ty: ScalarType, number: f64) -> [u8; 8] {
+    let number = if number.is_nan() { 0.0 } else { number };
+    let whole = number.round();
+    let mut bytes = [0; 8];
+    // Casts of floats to integers saturate.
+    match ty {
+        ScalarType::Byte => bytes[0] = whole as u8,
+        ScalarType::Char => bytes[0] = whole as i8 as u8,
+        ScalarType::Word => bytes[..2].copy_from_slice(&(whole as u16).to_le_bytes()),
+        ScalarType::Short => bytes[..2].copy_from_slice(&(whole as i16).to_le_bytes()),
+        ScalarType::Dword => bytes[..4].copy_from_slice(&(whole as u32).to_le_bytes()),
+        ScalarType::Int => bytes[..4].copy_from_slice(&(whole as i32).to_le_bytes()),
+        ScalarType::Float => {
+            let most = f64::from(f32::MAX);
+            bytes[..4].copy_from_slice(&(number.clamp(-most, most) as f32).to_le_bytes());
+        }
+        ScalarType::Double => bytes = number.clamp(f64::MIN, f64::MAX).to_le_bytes(),
+    }
+    bytes
+}

@@ -1,0 +1,522 @@
+//! What the gateway has promised, checked at every step against a model of its own
+//! (docs/cell.md section 4).
+//!
+//! In: everything that goes into the engine and comes out of it, and what reaches the controller.
+//! Out: how often each [`Invariant`] was looked at, and the first [`Violation`]. The model is slow
+//! and plain: it cuts frames by the rules of proto-core/docs/wire/recipes.md, keeps a queue a variable, and
+//! uses neither the engine's recipes nor its plan. Garbage that happens to be a frame is a frame:
+//! what counts is what the wire delivered to the port.
+//!
+//! Of the engine it looks only at the counters, and at which links it holds for up.
+
+mod downward;
+mod far;
+mod field;
+mod gateway;
+mod orders;
+mod robot;
+mod safe;
+mod sheet;
+mod stream;
+mod upward;
+mod wire;
+
+use std::collections::{BTreeMap, VecDeque};
+
+use proto_core::config::GatewayConfig;
+use proto_core::engine::{BusState, Engine, Input, LinkId, Output, PortCounters};
+use proto_core::link::LinkState;
+use proto_core::sysvar::SysVar;
+use proto_core::time::{Duration, Instant};
+
+use downward::Downward;
+use field::Line;
+use orders::Orders;
+pub(super) use robot::Path;
+use robot::Robot;
+use sheet::Sheet;
+use upward::{Upward, Wrong};
+pub(super) use wire::inputs_of;
+use wire::{Controller, Map, Modbus};
+
+/// What must hold.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Invariant {
+    /// Every value written is the next one that its owner sent, or safe, or read back.
+    Sent,
+    /// No value is written after its time to live.
+    InTime,
+    /// Nothing is written before the first valid field frame.
+    FirstFrame,
+    /// Only variables that a port owns are written, whole, on their way up.
+    Ownership,
+    /// Nothing from before a reconnect is written after it.
+    NoReplay,
+    /// The edges of bits are written in order, or counted.
+    Edges,
+    /// What waits is handed over as soon as its link is free.
+    Delivered,
+    /// Every frame on the wire is applied or counted: all counters agree with the model's.
+    Counted,
+    /// Every received byte is in a frame, dropped, discarded, or held.
+    Bytes,
+    /// A command is sent once, in time, or not at all.
+    Once,
+    /// Nothing is shown before it was received.
+    Known,
+    /// Nothing is shown that is older than promised.
+    Age,
+    /// What is shown is what was received last.
+    Shown,
+    /// Never faster than the cycle, and each cycle, request and trigger is served or counted.
+    Cycle,
+    /// One transmission at a time, on a silent line, to a device that is there.
+    Line,
+    /// The controller receives what the gateway sent.
+    Transport,
+    /// The controller's inputs are what was written, and nothing else writes them.
+    Registers,
+    /// What the controller applies is not older than promised.
+    ValueAge,
+    /// A command that the controller takes was picked, or asked for, not long ago.
+    CommandAge,
+    /// No command that was picked before one that stops the robot arrives after it.
+    Overtaken,
+    /// The controller understands every command that arrives.
+    Understood,
+    /// What stops the robot arrives as soon as a way to the controller works.
+    StopArrives,
+    /// The safe value of a silent owner is there as soon as a way to the controller works.
+    SafeArrives,
+    /// What cannot be read is neither shown nor written back.
+    Unreadable,
+    /// Values of our own ports are not shown when they are older than promised.
+    OwnAge,
+    /// A short stall of the gateway is no silence of a device.
+    FalseTimeout,
+    /// Nothing that waited while the gateway slept is applied or commanded.
+    FromSleep,
+    /// Datagrams go to the controller's client and to nobody else.
+    Destination,
+    /// The work of one call is bounded.
+    Work,
+    /// What waits anywhere is bounded.
+    Memory,
+    /// Nothing panics.
+    NoPanic,
+}
+
+impl Invariant {
+    /// A name for people.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Sent => "values-were-sent",
+            Self::InTime => "values-in-time",
+            Self::FirstFrame => "nothing-before-a-frame",
+            Self::Ownership => "ownership",
+            Self::NoReplay => "no-replay",
+            Self::Edges => "edges-in-order",
+            Self::Delivered => "nothing-is-left-waiting",
+            Self::Counted => "applied-or-counted",
+            Self::Bytes => "bytes-add-up",
+            Self::Once => "commands-once",
+            Self::Known => "shown-is-known",
+            Self::Age => "shown-is-young",
+            Self::Shown => "shown-is-newest",
+            Self::Cycle => "cycle",
+            Self::Line => "one-at-a-time",
+            Self::Transport => "received-is-sent",
+            Self::Registers => "registers",
+            Self::ValueAge => "value-age",
+            Self::CommandAge => "command-age",
+            Self::Overtaken => "stop-is-last",
+            Self::Understood => "commands-understood",
+            Self::StopArrives => "stop-arrives",
+            Self::SafeArrives => "safe-arrives",
+            Self::Unreadable => "unreadable-shown",
+            Self::OwnAge => "own-values-age",
+            Self::FalseTimeout => "no-false-timeout",
+            Self::FromSleep => "nothing-from-sleep",
+            Self::Destination => "destination",
+            Self::Work => "bounded-work",
+            Self::Memory => "bounded-memory",
+            Self::NoPanic => "no-panic",
+        }
+    }
+}
+
+/// An invariant that did not hold.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Violation {
+    /// Which.
+    pub invariant: Invariant,
+    /// When.
+    pub at: Instant,
+    /// In words, with the numbers.
+    pub what: String,
+}
+
+impl Violation {
+    /// A run ended in a panic.
+    pub(crate) fn panic(at: Instant) -> Self {
+        Self { invariant: Invariant::NoPanic, at, what: "a panic: see its message".to_owned() }
+    }
+}
+
+impl std::fmt::Display for Violation {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{}: {}", self.invariant.name(), self.what)
+    }
+}
+
+/// What is known of one field port.
+#[derive(Debug, Clone, Default)]
+struct PortWatch {
+    line: Line,
+    down: Downward,
+    counters: PortCounters,
+}
+
+/// What is known of one recipe link, or of the state link.
+#[derive(Debug, Clone, Default)]
+struct LinkWatch {
+    line: Line,
+    stream: stream::Stream,
+    busy: bool,
+    /// Bytes handed over since the link came up, and after each transmission that is not acknowledged.
+    total: u64,
+    unacked: VecDeque<u64>,
+}
+
+impl LinkWatch {
+    fn has_room(&self) -> bool {
+        !self.busy && self.unacked.len() < MOST_UNACKED
+    }
+
+    fn hands_over(&mut self, bytes: &[u8]) {
+        self.total += bytes.len() as u64;
+        self.unacked.push_back(self.total);
+    }
+
+    fn acked(&mut self, left: u32) {
+        let acked = self.total.saturating_sub(left.into());
+        while self.unacked.front().is_some_and(|end| *end <= acked) {
+            self.unacked.pop_front();
+        }
+    }
+}
+
+/// The model, and what it found.
+#[derive(Debug, Clone)]
+pub(super) struct Oracle {
+    sheet: Sheet,
+    map: Map,
+    up: Upward,
+    ports: Vec<PortWatch>,
+    links: [LinkWatch; LINKS],
+    modbus: Modbus,
+    /// Safe values that the controller refused, and when they are written again.
+    refused: Vec<SysVar>,
+    again_at: Instant,
+    orders: Orders,
+    controller: Controller,
+    robot: Robot,
+    /// When the engine was called last.
+    called_at: Option<Instant>,
+    /// When it wants to be told that time has passed, and whether it was told something else since.
+    announced: Instant,
+    is_late: bool,
+    /// What comes from the field until then waited while the gateway slept.
+    deaf_until: Option<Instant>,
+    /// The gateway was just not called for a while, but did not sleep.
+    after_stall: bool,
+    /// How much is remembered, at the newest look.
+    remembered: usize,
+    /// Outputs since the newest input, and how many there may be.
+    outputs: u32,
+    most_outputs: u32,
+    /// Frames in and out, a port; sent and received, a link. They outlive a restart.
+    pub frames: Vec<(u64, u64)>,
+    pub traffic: [(u64, u64); LINKS],
+    pub writes: u64,
+    checks: [u64; ALL.len()],
+    violation: Option<Violation>,
+}
+
+impl Oracle {
+    pub(super) fn new(config: &GatewayConfig) -> Self {
+        let sheet = Sheet::new(config);
+        let parts: usize = sheet.ports.iter().map(|port| port.outputs.len()).sum();
+        Self {
+            map: Map::new(),
+            up: Upward::new(&sheet),
+            ports: vec![PortWatch::default(); sheet.ports.len()],
+            links: std::array::from_fn(|_| LinkWatch::default()),
+            modbus: Modbus::default(),
+            refused: Vec::new(),
+            again_at: Instant::NEVER,
+            orders: Orders::default(),
+            controller: Controller::new(),
+            robot: Robot::default(),
+            called_at: None,
+            announced: Instant::NEVER,
+            is_late: false,
+            deaf_until: None,
+            after_stall: false,
+            remembered: 0,
+            outputs: 0,
+            // A frame a port and id; opening or closing, and something to send, a link, and one more
+            // command.
+            most_outputs: parts as u32 + 1 + 2 * (4 + sheet.links.len() as u32),
+            frames: vec![(0, 0); sheet.ports.len()],
+            traffic: [(0, 0); LINKS],
+            writes: 0,
+            checks: [0; ALL.len()],
+            violation: None,
+            sheet,
+        }
+    }
+
+    /// The cell was switched on already: its ports are there, and the engine wants a tick then.
+    pub(super) fn begin(&mut self, engine: &Engine, announced: Instant, now: Instant) {
+        self.called_at = Some(now);
+        self.announced = announced;
+        for port in engine.field_ports() {
+            self.ports[usize::from(port.0)].down.is_up = true;
+        }
+    }
+
+    /// The gateway starts afresh: it knows nothing, so nothing may be expected of it.
+    pub(super) fn restarted(&mut self, now: Instant) {
+        self.up = Upward::new(&self.sheet);
+        self.ports = vec![PortWatch::default(); self.sheet.ports.len()];
+        self.links = std::array::from_fn(|_| LinkWatch::default());
+        self.modbus.lost();
+        self.refused.clear();
+        self.again_at = Instant::NEVER;
+        self.orders = Orders::default();
+        self.robot.restarted(now);
+        self.called_at = None;
+        self.announced = Instant::ZERO;
+        self.is_late = false;
+        self.deaf_until = None;
+    }
+
+    pub(super) fn violation(&self) -> Option<&Violation> {
+        self.violation.as_ref()
+    }
+
+    pub(super) fn checks(&self) -> BTreeMap<Invariant, u64> {
+        ALL.into_iter().zip(self.checks).collect()
+    }
+
+    fn judge(&mut self, now: Instant, invariants: &[Invariant], result: Result<(), Wrong>) {
+        for &invariant in invariants {
+            self.checks[invariant as usize] += 1;
+        }
+        if let (Err((invariant, what)), None) = (result, &self.violation) {
+            self.violation = Some(Violation { invariant, at: now, what });
+        }
+    }
+
+    /// The engine has handled an input and was not asked for outputs yet.
+    pub(super) fn input(&mut self, now: Instant, input: &Input<'_>, engine: &Engine) {
+        if self.violation.is_some() {
+            return;
+        }
+        self.outputs = 0;
+        let idle = self.called_at.replace(now).map_or(Duration::ZERO, |at| now.saturating_since(at));
+        let has_slept = idle > ASLEEP;
+        let is_tick = matches!(input, Input::Tick);
+        self.after_stall = is_tick && !has_slept && self.robot.has_stalled(now);
+        self.is_late = !is_tick && now >= self.announced;
+        if is_tick {
+            self.announced = Instant::NEVER;
+        }
+        if has_slept {
+            self.orders.slept(now);
+            self.robot.forget_all(now);
+            self.look_at_links(engine, None, now);
+        }
+        if is_tick || has_slept {
+            self.pass(now);
+        }
+        if has_slept {
+            self.slept(now);
+        }
+        let told = match input {
+            // After sleep, links have been given up before anything is taken.
+            _ if has_slept => None,
+            Input::LinkDown { link } | Input::LinkBytes { link, .. } => Some(*link),
+            _ => None,
+        };
+        self.look_at_links(engine, told, now);
+        if is_tick || has_slept {
+            self.up.repeat(&self.sheet, now);
+        }
+        self.deaf_until = self.deaf_until.filter(|until| !is_tick || now < *until);
+        match *input {
+            Input::PortBytes { port, bytes } => self.port_bytes(usize::from(port.0), bytes, now),
+            Input::PortCan { port, frame } => self.port_can(usize::from(port.0), &frame, now),
+            Input::PortSent { port } => self.ports[usize::from(port.0)].down.sent(),
+            Input::PortUp { port } => self.ports[usize::from(port.0)].down.is_up = true,
+            Input::PortDown { port } => {
+                let nth = usize::from(port.0);
+                let watch = &mut self.ports[nth];
+                watch.counters.downs += u32::from(watch.down.is_up);
+                watch.down.is_up = false;
+                watch.down.reset();
+                watch.line.discard();
+                self.forget_orders(nth, None, now);
+            }
+            Input::PortBus { port, state } => {
+                let nth = usize::from(port.0);
+                let watch = &mut self.ports[nth];
+                let is_off = state == BusState::BusOff;
+                let is_news = is_off && !watch.down.is_bus_off;
+                watch.down.is_bus_off = is_off;
+                if is_news {
+                    watch.counters.bus_offs += 1;
+                    watch.down.reset();
+                    self.forget_orders(nth, None, now);
+                }
+            }
+            Input::LinkUp { link } => {
+                self.nobody_spoke(link);
+                self.up.controller_was_away(&self.sheet, now);
+                if !self.up.is_up(link) && is_up(engine, link) {
+                    self.up.link_up(link, now);
+                    self.links[place(link)] = LinkWatch::default();
+                }
+            }
+            Input::LinkDown { link } => self.link_lost(link, now),
+            Input::LinkBytes { link, bytes } if self.up.is_up(link) => self.link_bytes(link, bytes, now),
+            Input::LinkSent { link } => self.links[place(link)].busy = false,
+            Input::LinkAcked { link, left } => self.links[place(link)].acked(left),
+            Input::LinkBytes { .. } | Input::Tick => {}
+        }
+        self.orders.look_at_replies(engine);
+        if told.is_some() {
+            self.look_at_links(engine, None, now);
+        }
+    }
+
+    /// What the engine wants done.
+    pub(super) fn output(&mut self, now: Instant, output: &Output<'_>) {
+        if self.violation.is_some() {
+            return;
+        }
+        self.outputs += 1;
+        let result = if self.outputs > self.most_outputs {
+            Err((Invariant::Work, format!("more than {} outputs for one input", self.most_outputs)))
+        } else {
+            Ok(())
+        };
+        self.judge(now, &[Invariant::Work], result);
+        match *output {
+            Output::PortSend { port, bytes } => self.port_send(port, None, bytes, now),
+            Output::PortSendCan { port, frame } => self.port_send(port, Some(frame.id()), frame.data(), now),
+            Output::LinkOpen { .. } | Output::Sleep { .. } => {}
+            Output::LinkClose { link } => self.link_lost(link, now),
+            Output::LinkSend { link, bytes } => {
+                self.traffic[place(link)].0 += 1;
+                // What was handed over to a connection that is gone never leaves.
+                self.robot.hands_over_nothing();
+                if self.sheet.link(link).is_some_and(|link| !link.is_datagram) {
+                    self.links[place(link)].hands_over(bytes);
+                }
+                let result = self.link_send(link, bytes, now);
+                self.judge(now, &[], result);
+            }
+        }
+    }
+
+    /// The engine has nothing more to do before `until`; the cell itself holds so many things for
+    /// later.
+    pub(super) fn rest(&mut self, now: Instant, engine: &Engine, until: Instant, things: usize) {
+        if self.violation.is_some() {
+            return;
+        }
+        self.announced = self.announced.min(until);
+        for nth in 0..self.ports.len() {
+            if self.sheet.ports[nth].is_field {
+                if !self.is_late {
+                    let result = self.ports[nth].down.rest(&self.sheet, nth, &self.up, now);
+                    self.judge(now, &[Invariant::Cycle], result);
+                }
+                let result = self.count(nth, engine);
+                self.judge(now, &[Invariant::Counted, Invariant::Bytes], result);
+                self.checks[Invariant::FalseTimeout as usize] += u64::from(self.after_stall);
+            }
+        }
+        self.after_stall = false;
+        if !self.is_late {
+            let result = self.nothing_waits(now);
+            self.judge(now, &[Invariant::Delivered], result);
+        }
+        let remembered = self.remembered;
+        let result = match (remembered, things) {
+            (0..MOST_BYTES, 0..MOST_THINGS) => Ok(()),
+            _ => Err((Invariant::Memory, format!("{remembered} bytes and {things} things wait in the cell"))),
+        };
+        self.judge(now, &[Invariant::Memory], result);
+    }
+}
+
+/// A link's place in what is kept of each.
+pub(super) fn place(link: LinkId) -> usize {
+    usize::from(link.0) % LINKS
+}
+
+fn is_up(engine: &Engine, id: LinkId) -> bool {
+    engine.links().any(|link| link.id == id && matches!(link.state, LinkState::Up { .. }))
+}
+
+/// Four links of the controller's own, and one a listening port.
+const LINKS: usize = 16;
+/// Frames of a recipe link that the controller's TCP has not acknowledged.
+const MOST_UNACKED: usize = 64;
+/// A gateway that is not called for longer was asleep.
+const ASLEEP: Duration = Duration::from_millis(500);
+/// More than any stall can gather.
+const MOST_BYTES: usize = 1 << 20;
+const MOST_THINGS: usize = 100_000;
+
+const ALL: [Invariant; 31] = [
+    Invariant::Sent,
+    Invariant::InTime,
+    Invariant::FirstFrame,
+    Invariant::Ownership,
+    Invariant::NoReplay,
+    Invariant::Edges,
+    Invariant::Delivered,
+    Invariant::Counted,
+    Invariant::Bytes,
+    Invariant::Once,
+    Invariant::Known,
+    Invariant::Age,
+    Invariant::Shown,
+    Invariant::Cycle,
+    Invariant::Line,
+    Invariant::Transport,
+    Invariant::Registers,
+    Invariant::ValueAge,
+    Invariant::CommandAge,
+    Invariant::Overtaken,
+    Invariant::Understood,
+    Invariant::StopArrives,
+    Invariant::SafeArrives,
+    Invariant::Unreadable,
+    Invariant::OwnAge,
+    Invariant::FalseTimeout,
+    Invariant::FromSleep,
+    Invariant::Destination,
+    Invariant::Work,
+    Invariant::Memory,
+    Invariant::NoPanic,
+];
+
+#[cfg(test)]
+mod robot_tests;
+#[cfg(test)]
+mod tests;

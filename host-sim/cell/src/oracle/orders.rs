@@ -1,0 +1,314 @@
+//! Commands that field values pick: once or not at all, and what stops the robot before everything
+//! else (proto-core/docs/engine.md section 7).
+
+use std::collections::{BTreeMap, VecDeque};
+
+use proto_core::config::{CommandWhen, MAX_PORTS};
+use proto_core::engine::{Engine, LinkId};
+use proto_core::time::{Duration, Instant};
+
+use super::Invariant;
+use super::field::Accepted;
+use super::sheet::Sheet;
+use super::upward::Wrong;
+
+/// Commands that can wait.
+const QUEUE: usize = 8;
+/// One that could not be sent within this time is dropped; an urgent one so long after nobody asks
+/// for it any more.
+const TTL: Duration = Duration::from_secs(1);
+
+/// A command field: its port, frame and place.
+pub(super) type Place = (usize, usize, usize);
+
+/// A command that a value picked.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Order {
+    pub place: Place,
+    value: i64,
+    pub text: String,
+    /// When it was picked.
+    pub picked: Instant,
+    /// Of an urgent one, since when nobody asks for it any more, or since when it waits again.
+    since: Instant,
+}
+
+/// What waits, what is unanswered, and what was counted.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Orders {
+    queue: VecDeque<Order>,
+    stops: Vec<Order>,
+    unanswered: Vec<(LinkId, Order)>,
+    /// How many of the queue an urgent command has overtaken.
+    overtaken: usize,
+    /// The value of the frame before.
+    base: BTreeMap<Place, i64>,
+    /// Picked and dropped, by port.
+    pub counted: [(u32, u32); MAX_PORTS],
+    /// Text of the newest command sent.
+    newest: Option<String>,
+    /// Texts of what waited while the gateway slept.
+    slept: Vec<String>,
+    /// Answers that the engine has counted, and what came since the newest one, on the two links.
+    answered: [u32; 2],
+    heard: [String; 2],
+}
+
+impl Order {
+    pub(super) fn is_urgent(&self) -> bool {
+        is_urgent(&self.text)
+    }
+}
+
+impl Orders {
+    /// An accepted frame's values pick commands; those that stop the robot are told to `urgent`.
+    pub(super) fn accepted(
+        &mut self,
+        sheet: &Sheet,
+        nth: usize,
+        frame: &Accepted,
+        is_up: bool,
+        now: Instant,
+    ) -> Vec<Order> {
+        let mut urgent = Vec::new();
+        for &(field, table, when, value) in &frame.orders {
+            let place = (nth, frame.frame, field);
+            let before = self.base.insert(place, value);
+            let changed = before.is_some_and(|before| before != value);
+            if changed {
+                self.no_longer_asked(place, now);
+            }
+            let acts = when == CommandWhen::Frame || changed;
+            let Some((_, text)) = table.of(&sheet.commands).iter().find(|entry| entry.0 == value) else {
+                continue;
+            };
+            if !acts {
+                continue;
+            }
+            let counted = &mut self.counted[nth];
+            counted.0 += 1;
+            let order = Order { place, value, text: plain(text.as_bytes()), picked: now, since: now };
+            if order.is_urgent() {
+                urgent.push(order.clone());
+                match self.stops.iter_mut().find(|other| other.same_kind(&order)) {
+                    Some(other) => *other = order,
+                    None => self.stops.push(order),
+                }
+            } else if is_up && self.queue.len() < QUEUE {
+                self.queue.push_back(order);
+            } else {
+                counted.1 += 1;
+            }
+        }
+        if !urgent.is_empty() {
+            // Whatever the order of the fields.
+            self.overtaken = self.queue.len();
+        }
+        urgent
+    }
+
+    /// What an urgent command has overtaken is dropped.
+    pub(super) fn drop_overtaken(&mut self) {
+        for _ in 0..std::mem::take(&mut self.overtaken) {
+            self.drop_first();
+        }
+    }
+
+    /// After silence the next value only sets the base, and what waits for this device is dropped.
+    pub(super) fn forget(&mut self, nth: usize, frame: Option<usize>, now: Instant) {
+        let is_of = |place: &Place| place.0 == nth && frame.is_none_or(|frame| frame == place.1);
+        let gone: Vec<Place> = self.base.keys().copied().filter(is_of).collect();
+        for place in gone {
+            self.base.remove(&place);
+            self.no_longer_asked(place, now);
+        }
+        let (base, counted) = (&self.base, &mut self.counted);
+        self.queue.retain(|order| {
+            let stays = base.contains_key(&order.place);
+            counted[order.place.0].1 += u32::from(!stays);
+            stays
+        });
+    }
+
+    fn no_longer_asked(&mut self, place: Place, now: Instant) {
+        for stop in self.stops.iter_mut().filter(|stop| stop.place == place) {
+            stop.since = now;
+        }
+    }
+
+    /// Whether the device's newest value is the one that picked the command.
+    pub(super) fn is_asked(&self, order: &Order) -> bool {
+        self.base.get(&order.place) == Some(&order.value)
+    }
+
+    /// Commands that waited too long.
+    pub(super) fn tick(&mut self, now: Instant) {
+        while self.queue.front().is_some_and(|first| now >= first.picked + TTL) {
+            self.drop_first();
+        }
+        let is_old = |orders: &Self, stop: &Order| now >= stop.since + TTL && !orders.is_asked(stop);
+        while let Some(old) = self.stops.iter().position(|stop| is_old(self, stop)) {
+            let old = self.stops.remove(old);
+            self.counted[old.place.0].1 += 1;
+        }
+    }
+
+    /// A link is gone: what stops the robot waits again while somebody asks for it.
+    pub(super) fn lost(&mut self, link: LinkId, now: Instant) {
+        let gone: Vec<Order> =
+            self.unanswered.iter().filter(|(on, _)| *on == link).map(|(_, order)| order.clone()).collect();
+        self.unanswered.retain(|(on, _)| *on != link);
+        // Of two of a kind the newer one is sent again.
+        for order in gone.into_iter().rev() {
+            let waits = self.stops.iter().any(|other| other.same_kind(&order));
+            if order.is_urgent() && self.is_asked(&order) && !waits {
+                self.stops.push(Order { since: now, ..order });
+            }
+        }
+        if link == LinkId::COMMAND {
+            while !self.queue.is_empty() {
+                self.drop_first();
+            }
+        }
+        self.heard[side(link)].clear();
+    }
+
+    /// The gateway slept: nothing is commanded from what was asked before.
+    pub(super) fn slept(&mut self, now: Instant) {
+        self.base.clear();
+        self.lost(LinkId::COMMAND, now);
+        self.lost(LinkId::URGENT, now);
+        for stop in std::mem::take(&mut self.stops) {
+            self.counted[stop.place.0].1 += 1;
+        }
+        self.slept.clear();
+    }
+
+    /// What a frame that waited meanwhile would have picked.
+    pub(super) fn waited_in_sleep(&mut self, sheet: &Sheet, frame: &Accepted) {
+        for &(_, table, _, value) in &frame.orders {
+            let picked = table.of(&sheet.commands).iter().find(|entry| entry.0 == value);
+            self.slept.extend(picked.map(|(_, text)| plain(text.as_bytes())));
+        }
+    }
+
+    fn drop_first(&mut self) {
+        if let Some(order) = self.queue.pop_front() {
+            self.counted[order.place.0].1 += 1;
+        }
+    }
+
+    /// The controller says something on one of the links to port 2000.
+    pub(super) fn hears(&mut self, link: LinkId, bytes: &[u8]) {
+        self.heard[side(link)].push_str(&String::from_utf8_lossy(bytes));
+    }
+
+    /// Replies that the engine has taken.
+    pub(super) fn look_at_replies(&mut self, engine: &Engine) {
+        if self.unanswered.is_empty() {
+            self.heard.iter_mut().for_each(String::clear);
+            return;
+        }
+        for info in engine.links() {
+            if info.id != LinkId::COMMAND && info.id != LinkId::URGENT {
+                continue;
+            }
+            let place = side(info.id);
+            let news = info.counters.received.wrapping_sub(self.answered[place]);
+            self.answered[place] = info.counters.received;
+            for _ in 0..news {
+                let mine = |(on, _): &&(LinkId, Order)| *on == info.id;
+                let is_named = |order: &Order| self.heard[place].contains(word(&order.text));
+                let named = self.unanswered.iter().position(|sent| mine(&sent) && is_named(&sent.1));
+                let first = self.unanswered.iter().position(|sent| mine(&sent));
+                let Some(nth) = named.or(first) else { continue };
+                let (_, order) = self.unanswered.remove(nth);
+                // The other one's reply may be in the same piece.
+                let heard = &mut self.heard[place];
+                *heard = heard.replacen(word(&order.text), "", 1);
+            }
+            if self.unanswered.iter().all(|(on, _)| *on != info.id) {
+                self.heard[place].clear();
+            }
+        }
+    }
+
+    /// The engine sends a command; which.
+    pub(super) fn sent(&mut self, link: LinkId, bytes: &[u8], now: Instant) -> Result<Order, Wrong> {
+        let text = plain(bytes);
+        let shown = String::from_utf8_lossy(bytes).trim().to_owned();
+        let order = if is_urgent(&text) {
+            let Some(nth) = self.stops.iter().position(|stop| stop.text == text) else {
+                return Err(self.nobody_picked(&shown, &text));
+            };
+            let stop = self.stops.remove(nth);
+            if now >= stop.since + TTL && !self.is_asked(&stop) {
+                return Err((Invariant::Once, format!("{shown} was sent too late")));
+            }
+            stop
+        } else {
+            if link == LinkId::URGENT {
+                return Err((Invariant::Once, format!("{shown} was sent where only what stops may go")));
+            }
+            if !self.stops.is_empty() || self.unanswered.iter().any(|(_, order)| order.is_urgent()) {
+                let what = format!("{shown} was sent while something that stops waits or is unanswered");
+                return Err((Invariant::Once, what));
+            }
+            let Some(next) = self.queue.pop_front() else { return Err(self.nobody_picked(&shown, &text)) };
+            if next.text != text {
+                return Err((Invariant::Once, format!("{shown} was sent, {} was next", next.text)));
+            }
+            if now >= next.picked + TTL {
+                return Err((Invariant::Once, format!("{shown} was sent too late")));
+            }
+            next
+        };
+        self.newest = Some(text);
+        self.unanswered.push((link, order.clone()));
+        Ok(order)
+    }
+
+    fn nobody_picked(&self, shown: &str, text: &str) -> Wrong {
+        if self.slept.iter().any(|slept| slept == text) {
+            return (
+                Invariant::FromSleep,
+                format!("{shown} was picked by what waited while the gateway slept"),
+            );
+        }
+        let again = self.newest.as_deref() == Some(text);
+        let what = if again { "once more than it was picked" } else { "and nobody picked it" };
+        (Invariant::Once, format!("{shown} was sent {what}"))
+    }
+
+    pub(super) fn len(&self) -> usize {
+        self.queue.len() + self.stops.len() + self.heard.iter().map(String::len).sum::<usize>()
+    }
+}
+
+impl Order {
+    fn same_kind(&self, other: &Self) -> bool {
+        self.place.0 == other.place.0 && self.text == other.text
+    }
+}
+
+fn side(link: LinkId) -> usize {
+    usize::from(link == LinkId::URGENT)
+}
+
+/// Its keyword.
+fn word(text: &str) -> &str {
+    text.split('(').next().unwrap_or(text)
+}
+
+fn is_urgent(text: &str) -> bool {
+    matches!(text, "stop" | "pause" | "disable" | "poweroff")
+}
+
+/// A command without what dialects add.
+pub(super) fn plain(text: &[u8]) -> String {
+    let text = String::from_utf8_lossy(text);
+    text.chars()
+        .filter(|c| !c.is_whitespace() && !matches!(c, '"' | '\0'))
+        .collect::<String>()
+        .replace("()", "")
+}

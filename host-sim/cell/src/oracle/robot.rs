@@ -1,0 +1,511 @@
+//! The robot's side: how old each value and command is when the controller takes it, and whether what
+//! must get there does (docs/cell.md section 4).
+//!
+//! In: what each transmission carries, when it arrives, and which paths to the controller work. Knows
+//! nothing of what the engine holds for delivered.
+
+use std::collections::{BTreeMap, VecDeque};
+
+use proto_core::engine::LinkId;
+use proto_core::sysvar::SysVar;
+use proto_core::time::{Duration, Instant};
+
+use super::field::show;
+use super::orders::Order;
+use super::sheet::{Raw, Sheet};
+use super::upward::{Carried, Upward, Wrong};
+use super::{Invariant, Oracle};
+use crate::network::Speaker;
+use crate::tcp::USER_TIMEOUT;
+
+/// One path to the controller, as the network is at present.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Path {
+    pub link: LinkId,
+    /// Which connection it is, of those that are.
+    pub conn: Option<u64>,
+    /// There is a connection, and what is sent gets there.
+    pub is_sound: bool,
+    /// The server there carries out and answers.
+    pub is_served: bool,
+}
+
+/// One transmission.
+#[derive(Debug, Clone)]
+struct Parcel {
+    sent_at: Instant,
+    /// How many bytes of its connection have arrived when it has.
+    end: u64,
+    /// How long it may be on its way, the network's own delay apart.
+    not_after: Duration,
+    slowest: Duration,
+    values: Vec<(SysVar, Raw, Carried)>,
+    order: Option<Errand>,
+}
+
+/// A command on its way.
+#[derive(Debug, Clone)]
+struct Errand {
+    order: Order,
+    /// Since when nobody asks for it any more.
+    unasked: Option<Instant>,
+}
+
+/// A device asks to stop the robot.
+#[derive(Debug, Clone)]
+struct Demand {
+    order: Order,
+    is_met: bool,
+}
+
+/// A connection's transmissions that have not arrived.
+#[derive(Debug, Clone, Default)]
+struct Road {
+    sent: u64,
+    arrived: u64,
+    parcels: VecDeque<Parcel>,
+}
+
+/// What is on its way, and what should be there.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Robot {
+    /// What the engine hands over at present.
+    values: Vec<(SysVar, Raw, Carried)>,
+    order: Option<Errand>,
+    roads: BTreeMap<u64, Road>,
+    /// The newest ones; the first has this number.
+    datagrams: VecDeque<Parcel>,
+    first_tag: u64,
+    demands: Vec<Demand>,
+    /// The newest command that stopped the robot.
+    stopped_by: Option<Order>,
+    /// Since when each path has worked without a fault, and answered; by the link's place.
+    sound: BTreeMap<LinkId, Instant>,
+    served: BTreeMap<LinkId, Instant>,
+    conns: BTreeMap<LinkId, Option<u64>>,
+    all_sound_since: Option<Instant>,
+    /// When the controller began anew.
+    began_at: Option<Instant>,
+    /// Since when the frames of each recipe link could be sent.
+    ready: BTreeMap<LinkId, Instant>,
+    /// When the gateway was not called.
+    stalls: VecDeque<(Instant, Instant)>,
+    /// The controller's inputs after the newest arrival, and when somebody else wrote which.
+    inputs: Vec<u8>,
+    foreign: BTreeMap<usize, Instant>,
+    /// Who sent the newest frame to a port where the gateway listens.
+    speakers: BTreeMap<LinkId, Speaker>,
+}
+
+impl Robot {
+    pub(super) fn hands_over_nothing(&mut self) {
+        self.values.clear();
+        self.order = None;
+    }
+
+    pub(super) fn hands_over(&mut self, var: SysVar, raw: Raw, carried: Carried) {
+        self.values.push((var, raw, carried));
+    }
+
+    pub(super) fn hands_over_order(&mut self, order: Order) {
+        self.order = Some(Errand { order, unasked: None });
+    }
+
+    /// Devices ask to stop the robot.
+    pub(super) fn asked(&mut self, orders: Vec<Order>) {
+        for order in orders {
+            self.demands
+                .retain(|demand| demand.order.place != order.place || demand.order.text != order.text);
+            self.demands.push(Demand { order, is_met: false });
+        }
+    }
+
+    /// What nobody asks for any more need not arrive, and soon must not.
+    pub(super) fn no_longer_asked(&mut self, is_asked: impl Fn(&Order) -> bool, now: Instant) {
+        self.demands.retain(|demand| is_asked(&demand.order));
+        let parcels = self.roads.values_mut().flat_map(|road| &mut road.parcels);
+        for errand in parcels.filter_map(|parcel| parcel.order.as_mut()) {
+            if errand.unasked.is_none() && !is_asked(&errand.order) {
+                errand.unasked = Some(now);
+            }
+        }
+    }
+
+    /// The gateway slept: nothing of what was asked before counts.
+    pub(super) fn forget_all(&mut self, now: Instant) {
+        self.no_longer_asked(|_| false, now);
+    }
+
+    pub(super) fn restarted(&mut self, now: Instant) {
+        self.forget_all(now);
+        self.speakers.clear();
+        self.disturbed(now);
+    }
+
+    /// Nothing has worked for longer than since now.
+    fn disturbed(&mut self, now: Instant) {
+        self.sound.values_mut().chain(self.served.values_mut()).for_each(|since| *since = now);
+    }
+
+    fn parcel(&mut self, sheet: &Sheet, link: LinkId, slowest: Duration, now: Instant) -> Parcel {
+        Parcel {
+            sent_at: now,
+            end: 0,
+            not_after: not_after(sheet, link),
+            slowest,
+            values: std::mem::take(&mut self.values),
+            order: self.order.take(),
+        }
+    }
+
+    /// Whether the gateway was not called until now.
+    pub(super) fn has_stalled(&self, now: Instant) -> bool {
+        self.stalls.back().is_some_and(|(_, to)| *to == now)
+    }
+
+    /// How long the gateway was not called since then.
+    fn stalled_since(&self, since: Instant, now: Instant) -> Duration {
+        let part = |&(from, to): &(Instant, Instant)| to.min(now).saturating_since(from.max(since));
+        self.stalls.iter().map(part).fold(Duration::ZERO, |sum, part| sum + part)
+    }
+
+    /// Whether the controller has begun anew since then, and the gateway must know.
+    fn has_begun_since(&self, then: Instant, now: Instant) -> bool {
+        let knows = self.all_sound_since.is_some_and(|since| now.saturating_since(since) > SAFE_ARRIVES);
+        knows && self.began_at.is_some_and(|began| began > then)
+    }
+
+    /// A transmission is there: whether what it carries is young enough.
+    fn judge(&mut self, parcel: &Parcel, slowest: Duration, now: Instant) -> Result<(), Wrong> {
+        let network = parcel.slowest.max(slowest) + ALLOWANCE;
+        // The system's own patience ends what an engine that is not called cannot.
+        let stalled = self.stalled_since(parcel.sent_at, now).min(USER_TIMEOUT);
+        for &(var, raw, carried) in &parcel.values {
+            let (arrived, timeout) = match carried {
+                Carried::Safe => continue,
+                Carried::Held { accepted } if self.has_begun_since(accepted, now) => {
+                    let what = format!("{var} = {} is from before the controller began anew", show(var, raw));
+                    return Err((Invariant::NoReplay, what));
+                }
+                Carried::Held { .. } => continue,
+                Carried::Of { arrived, timeout } => (arrived, timeout),
+            };
+            let (age, most) = (now.saturating_since(arrived), timeout + parcel.not_after + network + stalled);
+            if age > most {
+                let what =
+                    format!("{var} = {} is {age} old at the controller, {most} at most", show(var, raw));
+                return Err((Invariant::ValueAge, what));
+            }
+        }
+        let Some(Errand { order, unasked }) = &parcel.order else { return Ok(()) };
+        let (since, most) = match order.is_urgent() {
+            true => (unasked.unwrap_or(now), URGENT_TTL),
+            false => (order.picked, COMMAND_TTL),
+        };
+        let overtaken = self.stopped_by.as_ref().is_some_and(|stop| order.picked < stop.picked);
+        if overtaken && !order.is_urgent() {
+            let what = format!("{} comes behind what stopped the robot, and was picked before", order.text);
+            return Err((Invariant::Overtaken, what));
+        }
+        if order.is_urgent() {
+            self.stopped_by = Some(order.clone());
+        }
+        let (age, most) = (now.saturating_since(since), most + network + stalled);
+        if age > most {
+            let what = format!("{} comes {age} after it was wanted, {most} at most", order.text);
+            return Err((Invariant::CommandAge, what));
+        }
+        for demand in self.demands.iter_mut().filter(|demand| demand.order.text == order.text) {
+            demand.is_met = true;
+        }
+        Ok(())
+    }
+
+    /// The controller's inputs are `before` something arrives: what changed them since is not ours.
+    fn look_for_foreign(&mut self, before: &[u8], now: Instant) {
+        if self.inputs.len() == before.len() && self.inputs != before {
+            for (at, _) in before.iter().zip(&self.inputs).enumerate().filter(|(_, (new, old))| new != old) {
+                self.foreign.insert(at, now);
+            }
+        }
+        self.inputs.clear();
+        self.inputs.extend_from_slice(before);
+    }
+
+    pub(super) fn applied(&mut self, before: &[u8], after: &[u8], now: Instant) {
+        self.look_for_foreign(before, now);
+        self.inputs.clear();
+        self.inputs.extend_from_slice(after);
+    }
+
+    pub(super) fn len(&self) -> usize {
+        self.roads.values().map(|road| road.parcels.len()).sum::<usize>() + self.datagrams.len()
+    }
+
+    /// Of these paths, since when all have worked.
+    fn all_sound(&self, paths: &[Path]) -> Option<Instant> {
+        let needed = paths.iter().filter(|path| path.link != LinkId::COMMAND && path.link != LinkId::URGENT);
+        let mut since = Instant::ZERO;
+        for path in needed {
+            since = since.max(*self.sound.get(&path.link)?).max(*self.served.get(&path.link)?);
+        }
+        Some(since)
+    }
+
+    /// Commands that stop the robot and have had a way for long enough.
+    fn stops(&self, now: Instant) -> Result<u64, Wrong> {
+        let ways = [LinkId::COMMAND, LinkId::URGENT];
+        let Some(could) = ways.iter().filter_map(|link| self.sound.get(link)).min() else { return Ok(0) };
+        let mut checked = 0;
+        for Demand { order, is_met } in &self.demands {
+            checked += 1;
+            let had_a_way = now.saturating_since(order.picked.max(*could));
+            if !is_met && had_a_way > STOP_ARRIVES {
+                let what =
+                    format!("{} has been asked for and could have arrived for {had_a_way}", order.text);
+                return Err((Invariant::StopArrives, what));
+            }
+        }
+        Ok(checked)
+    }
+
+    /// Safe values of owners that are silent, when everything has worked for long enough.
+    fn safe_values(&self, sheet: &Sheet, up: &Upward, all: Instant, now: Instant) -> Result<u64, Wrong> {
+        let mut checked = 0;
+        for &var in &sheet.safe_vars {
+            let Some(owned) = sheet.owned[var.ordinal()] else { continue };
+            let (Some(safe), Some(accepted)) = (owned.safe, up.known(var).accepted) else { continue };
+            let silent = accepted + sheet.ports[owned.port].timeout;
+            let mut could = silent.max(all);
+            if sheet.link(owned.way).is_some() {
+                let Some(ready) = self.ready.get(&owned.way) else { continue };
+                could = could.max(*ready);
+            }
+            let at = var.image_offset();
+            let places = at..at + var.size();
+            let is_foreign = self.foreign.range(places.clone()).any(|(_, when)| *when > silent);
+            if now.saturating_since(could) <= SAFE_ARRIVES || now < could || is_foreign {
+                continue;
+            }
+            checked += 1;
+            let Some(there) = self.inputs.get(places) else { continue };
+            if there != &safe[..var.size()] {
+                let mut raw = Raw::default();
+                raw[..there.len()].copy_from_slice(there);
+                let what = format!(
+                    "{var} is {} at the controller, its owner has been silent for {} and its safe value is {}",
+                    show(var, raw),
+                    now.saturating_since(accepted),
+                    show(var, safe)
+                );
+                return Err((Invariant::SafeArrives, what));
+            }
+        }
+        Ok(checked)
+    }
+}
+
+impl Oracle {
+    /// The gateway's transport has got bytes for a connection.
+    pub(crate) fn sent(&mut self, conn: u64, link: LinkId, bytes: &[u8], slowest: Duration, now: Instant) {
+        self.controller.sent(conn, bytes);
+        let mut parcel = self.robot.parcel(&self.sheet, link, slowest, now);
+        let road = self.robot.roads.entry(conn).or_default();
+        road.sent += bytes.len() as u64;
+        parcel.end = road.sent;
+        road.parcels.push_back(parcel);
+    }
+
+    /// The same of a datagram, which is known by this number from now on.
+    pub(crate) fn sent_datagram(
+        &mut self,
+        link: LinkId,
+        bytes: &[u8],
+        slowest: Duration,
+        now: Instant,
+    ) -> u64 {
+        self.controller.sent_datagram(u64::from(link.0), bytes);
+        let parcel = self.robot.parcel(&self.sheet, link, slowest, now);
+        let Robot { datagrams, first_tag, .. } = &mut self.robot;
+        datagrams.push_back(parcel);
+        if datagrams.len() > DATAGRAMS {
+            datagrams.pop_front();
+            *first_tag += 1;
+        }
+        *first_tag + datagrams.len() as u64 - 1
+    }
+
+    /// The controller has not understood what came on a connection of port 2000.
+    pub(crate) fn not_understood(&mut self, link: LinkId, now: Instant) {
+        let quiet = self.robot.sound.get(&link).map(|since| now.saturating_since(*since));
+        let result = match quiet {
+            // Nothing was held up on its way, which cuts what has no end of its own.
+            Some(quiet) if quiet > Duration::from_secs(1) => {
+                Err((Invariant::Understood, "the controller did not understand a command".to_owned()))
+            }
+            _ => Ok(()),
+        };
+        self.judge(now, &[], result);
+    }
+
+    pub(crate) fn conn_gone(&mut self, conn: u64) {
+        self.controller.gone(conn);
+        self.robot.roads.remove(&conn);
+    }
+
+    /// So many bytes of a connection have reached the controller's program.
+    pub(super) fn came(&mut self, conn: u64, len: usize, slowest: Duration, now: Instant) {
+        let Some(road) = self.robot.roads.get_mut(&conn) else { return };
+        road.arrived += len as u64;
+        let arrived = road.arrived;
+        let mut came = Vec::new();
+        while let Some(parcel) = road.parcels.pop_front_if(|parcel| parcel.end <= arrived) {
+            came.push(parcel);
+        }
+        for parcel in came {
+            self.judge_parcel(&parcel, slowest, now);
+        }
+    }
+
+    pub(super) fn datagram_came(&mut self, tag: u64, slowest: Duration, now: Instant) {
+        let nth = tag.checked_sub(self.robot.first_tag).map(|nth| nth as usize);
+        if let Some(parcel) = nth.and_then(|nth| self.robot.datagrams.get(nth)).cloned() {
+            self.judge_parcel(&parcel, slowest, now);
+        }
+    }
+
+    fn judge_parcel(&mut self, parcel: &Parcel, slowest: Duration, now: Instant) {
+        self.checks[Invariant::ValueAge as usize] += parcel.values.len() as u64;
+        self.checks[Invariant::CommandAge as usize] += u64::from(parcel.order.is_some());
+        self.checks[Invariant::Understood as usize] += u64::from(parcel.order.is_some());
+        self.checks[Invariant::Overtaken as usize] += u64::from(parcel.order.is_some());
+        let result = self.robot.judge(parcel, slowest, now);
+        self.judge(now, &[], result);
+    }
+
+    /// Something was broken or mended on a path, or on all of them.
+    pub(crate) fn disturbed(&mut self, link: Option<LinkId>, now: Instant) {
+        match link {
+            Some(link) => {
+                self.robot.sound.remove(&link);
+                self.robot.served.remove(&link);
+            }
+            None => self.robot.disturbed(now),
+        }
+    }
+
+    /// The controller begins anew: its inputs are what they are then.
+    pub(crate) fn controller_began(&mut self, now: Instant) {
+        self.robot.inputs.clear();
+        self.robot.foreign.clear();
+        self.robot.began_at = Some(now);
+        self.robot.all_sound_since = None;
+        self.robot.disturbed(now);
+    }
+
+    /// The gateway is not called from now until then.
+    pub(crate) fn stalled(&mut self, until: Instant, now: Instant) {
+        let stalls = &mut self.robot.stalls;
+        stalls.retain(|(_, to)| now.saturating_since(*to) < REMEMBERED);
+        // One that is prolonged is one.
+        match stalls.back_mut() {
+            Some((_, to)) if *to >= now => *to = until,
+            _ => stalls.push_back((now, until)),
+        }
+        self.robot.disturbed(now);
+    }
+
+    /// How everything is at present. To be told every now and then.
+    pub(crate) fn survey(&mut self, paths: &[Path], inputs: &[u8], now: Instant) {
+        if self.violation.is_some() {
+            return;
+        }
+        self.remembered = self.controller.size() + self.orders.len() + self.robot.len();
+        for path in paths {
+            if self.robot.conns.insert(path.link, path.conn) != Some(path.conn) {
+                self.robot.sound.remove(&path.link);
+                self.robot.served.remove(&path.link);
+            }
+            note(&mut self.robot.sound, path.link, path.is_sound, now);
+            note(&mut self.robot.served, path.link, path.is_sound && path.is_served, now);
+        }
+        for link in &self.sheet.links {
+            let is_ready = self.up.is_up(link.id) && self.up.is_ready(link, now);
+            note(&mut self.robot.ready, link.id, is_ready, now);
+        }
+        self.robot.look_for_foreign(inputs, now);
+        let result = self.robot.stops(now);
+        self.checks[Invariant::StopArrives as usize] += *result.as_ref().unwrap_or(&1);
+        self.judge(now, &[], result.map(drop));
+        self.robot.all_sound_since = self.robot.all_sound(paths);
+        if let Some(all) = self.robot.all_sound_since {
+            let result = self.robot.safe_values(&self.sheet, &self.up, all, now);
+            self.checks[Invariant::SafeArrives as usize] += *result.as_ref().unwrap_or(&1);
+            self.judge(now, &[], result.map(drop));
+        }
+    }
+
+    /// A datagram came to a port where the gateway listens.
+    pub(crate) fn spoke(&mut self, link: LinkId, from: Speaker, bytes: &[u8]) {
+        let frame = self.sheet.link(link).and_then(|link| link.output.as_ref());
+        if frame.is_some_and(|frame| frame.payload_of(bytes).is_some()) {
+            self.robot.speakers.insert(link, from);
+        }
+    }
+
+    /// The link begins anew: whoever speaks first is answered.
+    pub(super) fn nobody_spoke(&mut self, link: LinkId) {
+        self.robot.speakers.remove(&link);
+    }
+
+    /// The gateway's datagrams of this link go to somebody.
+    pub(crate) fn answers(&mut self, link: LinkId, whom: Option<Speaker>, now: Instant) {
+        let result = match self.robot.speakers.get(&link) {
+            Some(speaker) if Some(*speaker) != whom => Err((
+                Invariant::Destination,
+                format!("a datagram goes to {whom:?}, {speaker:?} sends frames"),
+            )),
+            _ => Ok(()),
+        };
+        self.judge(now, &[Invariant::Destination], result);
+    }
+}
+
+/// Since when something has been so.
+fn note(since: &mut BTreeMap<LinkId, Instant>, link: LinkId, is_so: bool, now: Instant) {
+    if is_so {
+        since.entry(link).or_insert(now);
+    } else {
+        since.remove(&link);
+    }
+}
+
+/// How long what is handed over to a link may be on its way: what is not acknowledged then is given up
+/// with its connection. Datagrams do not wait.
+fn not_after(sheet: &Sheet, link: LinkId) -> Duration {
+    match sheet.link(link) {
+        None => Duration::from_millis(500),
+        Some(link) if link.is_datagram => Duration::ZERO,
+        Some(link) => {
+            let owned = sheet.owned.iter().flatten().filter(|owned| owned.way == link.id);
+            let timeouts = owned.map(|owned| sheet.ports[owned.port].timeout);
+            timeouts.min().unwrap_or_default().max(Duration::from_millis(250))
+        }
+    }
+}
+
+/// A command arrives within this time after it was picked.
+const COMMAND_TTL: Duration = Duration::from_secs(1);
+/// One that stops is handed over within a second after the device last asked for it, and acknowledged
+/// within another.
+const URGENT_TTL: Duration = Duration::from_secs(2);
+/// One that is asked for arrives so soon after there is a way.
+const STOP_ARRIVES: Duration = Duration::from_millis(1_500);
+/// So does a safe value.
+const SAFE_ARRIVES: Duration = Duration::from_millis(1_500);
+/// Segments that are cut come a microsecond apart.
+const ALLOWANCE: Duration = Duration::from_millis(2);
+/// Datagrams that may still arrive.
+const DATAGRAMS: usize = 4_096;
+/// A stall may matter for so long.
+const REMEMBERED: Duration = Duration::from_secs(60);

@@ -1,0 +1,314 @@
+//! What the configuration promises, worked out once the slow way: who owns a variable, how it
+//! travels, where it comes from (proto-core/docs/engine.md section 4).
+//!
+//! Written from that page, without the engine's own plan.
+
+use proto_core::config::{Bus, FieldSpec, GatewayConfig, InputBinding, OutputBinding, Parts, Recipe, SendOn};
+use proto_core::engine::{LinkId, PortId};
+use proto_core::recipe::model::{CanId, Mode};
+use proto_core::sysvar::{COUNT, Direction, ModbusPlace, SysVar};
+use proto_core::time::Duration;
+
+/// A value as it stands on the wire; unused bytes are zero.
+pub(super) type Raw = [u8; 4];
+
+/// Whose a variable is and how it reaches the controller.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Owned {
+    /// The port's index in the configuration.
+    pub port: usize,
+    /// Which of the port's input frames brings it.
+    pub frame: usize,
+    pub way: LinkId,
+    pub safe: Option<Raw>,
+}
+
+/// Where a shown variable comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Origin {
+    Field,
+    Recipe,
+    Modbus,
+    State,
+}
+
+/// One frame on the field side or on a recipe link.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Frame {
+    pub head: Vec<u8>,
+    pub tail: Vec<u8>,
+    pub id: Option<CanId>,
+    pub fields: Vec<FieldSpec>,
+    /// Bytes of the fields.
+    pub payload: usize,
+}
+
+/// A field port.
+#[derive(Debug, Clone)]
+pub(super) struct PortSheet {
+    pub is_field: bool,
+    pub is_can: bool,
+    pub mode: Mode,
+    pub inputs: Vec<Frame>,
+    pub outputs: Vec<Frame>,
+    pub timeout: Duration,
+    pub stale_after: Duration,
+    pub stops_when_stale: bool,
+    pub cycle: Duration,
+    pub send: SendOn,
+    pub idle_gap: Duration,
+    pub turnaround: Duration,
+}
+
+/// A recipe link.
+#[derive(Debug, Clone)]
+pub(super) struct LinkSheet {
+    pub id: LinkId,
+    pub is_datagram: bool,
+    pub input: Option<Frame>,
+    pub output: Option<Frame>,
+    /// Variables in its frames up that are read back while no port sends them.
+    pub reads_back: bool,
+}
+
+/// All of it.
+#[derive(Debug, Clone)]
+pub(super) struct Sheet {
+    pub ports: Vec<PortSheet>,
+    pub links: Vec<LinkSheet>,
+    pub owned: [Option<Owned>; COUNT],
+    pub origin: [Option<Origin>; COUNT],
+    pub read_back: [bool; COUNT],
+    /// Variables that the state stream may bring.
+    pub in_packet: Vec<SysVar>,
+    /// Variables that have a safe value.
+    pub safe_vars: Vec<SysVar>,
+    /// There is a state link.
+    pub has_state: bool,
+    /// The output that shows what an input was set to, when some port or recipe link brings it.
+    pub witness: [Option<SysVar>; COUNT],
+    /// Some port sends for a rising bit.
+    pub has_triggers: bool,
+    /// The texts and values of all command tables.
+    pub commands: Vec<(i64, String)>,
+}
+
+impl Sheet {
+    pub(super) fn new(config: &GatewayConfig) -> Self {
+        let ports: Vec<PortSheet> = config.ports.iter().map(|port| port_sheet(config, port)).collect();
+        let mut links: Vec<LinkSheet> = Vec::new();
+        if let Some(own) = config.controller.recipe_link {
+            let recipe = &config.recipes[usize::from(own.recipe)];
+            links.push(link_sheet(config, LinkId::RECIPE_UDP, recipe, true));
+        }
+        for (nth, port) in config.ports.iter().enumerate() {
+            let recipe = &config.recipes[usize::from(port.recipe)];
+            let id = LinkId::of_port(PortId(nth as u8));
+            match port.bus {
+                Bus::TcpListen { .. } => links.push(link_sheet(config, id, recipe, false)),
+                Bus::UdpListen { .. } => links.push(link_sheet(config, id, recipe, true)),
+                Bus::Rs485(_) | Bus::Can { .. } => {}
+            }
+        }
+        let mut owned = [None; COUNT];
+        for (nth, port) in ports.iter().enumerate().filter(|(_, port)| port.is_field) {
+            for (frame, part) in port.inputs.iter().enumerate() {
+                for var in part.fields.iter().filter_map(written) {
+                    let carries = |link: &&LinkSheet| link.input.as_ref().is_some_and(|up| up.has(var));
+                    let way = links.iter().find(carries).map_or(LinkId::MODBUS, |link| link.id);
+                    let safe = config.ports[nth].on_timeout.of(&config.safe_values);
+                    let safe = safe.iter().find(|safe| safe.var == var).map(|safe| {
+                        let mut raw = Raw::default();
+                        safe.value.encode(&mut raw);
+                        raw
+                    });
+                    owned[var.ordinal()] = Some(Owned { port: nth, frame, way, safe });
+                }
+            }
+        }
+        let mut read_back = [false; COUNT];
+        for link in &mut links {
+            link.reads_back = !is_one_frame(&ports, &owned, link);
+            for var in link.input.iter().flat_map(|up| up.fields.iter().filter_map(written)) {
+                read_back[var.ordinal()] |= link.reads_back && var.stream().is_some();
+            }
+        }
+        let mut origin = [None; COUNT];
+        for port in &ports {
+            let trigger = match port.send {
+                SendOn::Rising { var, .. } => Some(var),
+                _ => None,
+            };
+            let fields = port.outputs.iter().flat_map(|frame| &frame.fields);
+            for var in fields.filter_map(shown).chain(trigger) {
+                let from_link =
+                    links.iter().any(|link| link.output.as_ref().is_some_and(|down| down.shows(var)));
+                origin[var.ordinal()] = Some(if owned[var.ordinal()].is_some() {
+                    Origin::Field
+                } else if from_link {
+                    Origin::Recipe
+                } else if by_modbus(var) {
+                    Origin::Modbus
+                } else {
+                    Origin::State
+                });
+            }
+        }
+        let commands = config.commands.iter().map(|c| (c.value, c.text.as_str().to_owned())).collect();
+        let may_bring =
+            |var: &SysVar| origin[var.ordinal()] == Some(Origin::State) || read_back[var.ordinal()];
+        let in_packet: Vec<SysVar> = SysVar::all().filter(may_bring).collect();
+        let has_state = !in_packet.is_empty();
+        let is_safe = |var: &SysVar| owned[var.ordinal()].is_some_and(|owned: Owned| owned.safe.is_some());
+        let safe_vars = SysVar::all().filter(is_safe).collect();
+        let has_triggers = ports.iter().any(|port| matches!(port.send, SendOn::Rising { .. }));
+        let brings = |link: &LinkSheet, var| link.output.as_ref().is_some_and(|down| down.shows(var));
+        let mut witness = [None; COUNT];
+        for nth in 1..=3 {
+            let both = [format!("DigitalOutputCommand[{nth}]"), format!("DigitalSignalStatus[{}]", nth + 3)];
+            let [Ok(input), Ok(output)] = both.map(|name| SysVar::parse(&name)) else { continue };
+            let is_there =
+                origin[output.ordinal()].is_some() || links.iter().any(|link| brings(link, output));
+            witness[input.ordinal()] = is_there.then_some(output);
+        }
+        Self {
+            ports,
+            links,
+            owned,
+            origin,
+            read_back,
+            in_packet,
+            safe_vars,
+            has_state,
+            witness,
+            has_triggers,
+            commands,
+        }
+    }
+
+    pub(super) fn link(&self, id: LinkId) -> Option<&LinkSheet> {
+        self.links.iter().find(|link| link.id == id)
+    }
+
+    /// Whether anything would show the variable's value at the controller.
+    pub(super) fn can_be_shown(&self, var: SysVar) -> bool {
+        self.has_state && var.stream().is_some() || self.witness[var.ordinal()].is_some()
+    }
+}
+
+impl Frame {
+    pub(super) fn len(&self) -> usize {
+        self.head.len() + self.payload + self.tail.len()
+    }
+
+    fn has(&self, var: SysVar) -> bool {
+        self.fields.iter().any(|field| written(field) == Some(var))
+    }
+
+    fn shows(&self, var: SysVar) -> bool {
+        self.fields.iter().any(|field| shown(field) == Some(var))
+    }
+
+    /// The fields' bytes, when head, tail and length agree.
+    pub(super) fn payload_of<'b>(&self, bytes: &'b [u8]) -> Option<&'b [u8]> {
+        let rest = bytes.strip_prefix(self.head.as_slice())?.strip_suffix(self.tail.as_slice())?;
+        (rest.len() == self.payload).then_some(rest)
+    }
+}
+
+/// The variable that an input field writes.
+pub(super) fn written(field: &FieldSpec) -> Option<SysVar> {
+    match *field {
+        FieldSpec::System(var) => Some(var),
+        FieldSpec::UserInput { to: InputBinding::Variable { var, .. }, .. } => Some(var),
+        _ => None,
+    }
+}
+
+/// The variable that an output field shows.
+pub(super) fn shown(field: &FieldSpec) -> Option<SysVar> {
+    match *field {
+        FieldSpec::System(var) => Some(var),
+        FieldSpec::UserOutput { from: OutputBinding::Variable { var, .. }, .. } => Some(var),
+        _ => None,
+    }
+}
+
+fn size(field: &FieldSpec) -> usize {
+    match field {
+        FieldSpec::System(var) => var.size(),
+        FieldSpec::UserInput { ty, .. } | FieldSpec::UserOutput { ty, .. } => ty.size(),
+    }
+}
+
+fn by_modbus(var: SysVar) -> bool {
+    matches!(var.modbus(), Some(ModbusPlace::Coils { .. } | ModbusPlace::Register { .. }))
+}
+
+fn frame(head: &[u8], tail: &[u8], id: Option<CanId>, fields: &[FieldSpec]) -> Frame {
+    let payload = fields.iter().map(size).sum();
+    Frame { head: head.to_vec(), tail: tail.to_vec(), id, fields: fields.to_vec(), payload }
+}
+
+fn frames(config: &GatewayConfig, recipe: &Recipe, direction: Direction) -> Vec<Frame> {
+    match (&recipe.parts, direction) {
+        (Parts::Stream { input: part, .. }, Direction::Input)
+        | (Parts::Stream { output: part, .. }, Direction::Output) => {
+            let part = part.iter();
+            part.map(|part| frame(&part.head, &part.tail, None, part.fields.of(&config.fields))).collect()
+        }
+        (Parts::Can { input: parts, .. }, Direction::Input)
+        | (Parts::Can { output: parts, .. }, Direction::Output) => {
+            let parts = parts.iter();
+            parts.map(|part| frame(&[], &[], Some(part.id), part.fields.of(&config.fields))).collect()
+        }
+    }
+}
+
+fn port_sheet(config: &GatewayConfig, port: &proto_core::config::Port) -> PortSheet {
+    let recipe = &config.recipes[usize::from(port.recipe)];
+    let (idle_gap, turnaround) = match port.bus {
+        Bus::Rs485(line) => {
+            // 3.5 characters: a start bit, eight bits, parity, stop bits (D19).
+            let parity = u64::from(line.parity != proto_core::config::Parity::None);
+            let half_bits = 7 * (9 + parity + u64::from(line.stop_bits));
+            let characters = (half_bits * 1_000_000).div_ceil(2 * u64::from(line.baud));
+            (line.idle_gap.max(Duration::from_micros(characters)), line.turnaround)
+        }
+        _ => (Duration::MAX, Duration::ZERO),
+    };
+    PortSheet {
+        is_field: port.bus.is_field(),
+        is_can: matches!(port.bus, Bus::Can { .. }),
+        mode: recipe.mode,
+        inputs: frames(config, recipe, Direction::Input),
+        outputs: frames(config, recipe, Direction::Output),
+        timeout: port.timeout,
+        stale_after: port.stale_after,
+        stops_when_stale: recipe.on_stale == proto_core::config::OnStale::Stop,
+        cycle: port.cycle,
+        send: recipe.send,
+        idle_gap,
+        turnaround,
+    }
+}
+
+fn link_sheet(config: &GatewayConfig, id: LinkId, recipe: &Recipe, is_datagram: bool) -> LinkSheet {
+    let part = |direction| frames(config, recipe, direction).into_iter().next();
+    let (input, output) = (part(Direction::Input), part(Direction::Output));
+    LinkSheet { id, is_datagram, input, output, reads_back: false }
+}
+
+/// Whether one field frame fills the link's frame whole, with safe values for all of it or none.
+fn is_one_frame(ports: &[PortSheet], owned: &[Option<Owned>; COUNT], link: &LinkSheet) -> bool {
+    let Some(up) = &link.input else { return true };
+    let vars: Vec<SysVar> = up.fields.iter().filter_map(written).collect();
+    ports.iter().enumerate().filter(|(_, port)| port.is_field).any(|(nth, port)| {
+        (0..port.inputs.len()).any(|frame| {
+            let owners: Vec<_> = vars.iter().map(|var| owned[var.ordinal()]).collect();
+            let brought = owners.iter().all(|o| o.is_some_and(|o| (o.port, o.frame) == (nth, frame)));
+            let safe: Vec<bool> = owners.iter().map(|o| o.is_some_and(|o| o.safe.is_some())).collect();
+            brought && (safe.iter().all(|safe| *safe) || safe.iter().all(|safe| !safe))
+        })
+    })
+}

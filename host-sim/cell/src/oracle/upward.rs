@@ -1,0 +1,492 @@
+//! What is still to be written to the controller, and what each write has to be
+//! (proto-core/docs/engine.md section 5).
+
+use std::collections::VecDeque;
+
+use proto_core::engine::LinkId;
+use proto_core::sysvar::{COUNT, SysVar};
+use proto_core::time::{Duration, Instant};
+
+use super::Invariant;
+use super::field::{Accepted, show};
+use super::sheet::{LinkSheet, Origin, Owned, Raw, Sheet};
+
+/// Values that wait behind the next ones, a port.
+const EDGES: usize = 16;
+/// How old a read-back value may be.
+const READ_BACK: Duration = Duration::from_millis(500);
+
+/// What comes steadily and has not come for so long: the controller may have been away.
+const AWAY: Duration = Duration::from_millis(500);
+
+/// Whether so much time lies between what came last and now.
+pub(super) fn is_gap(last: Option<Instant>, now: Instant) -> bool {
+    last.is_none_or(|at| now.saturating_since(at) > AWAY)
+}
+
+/// What is known of one variable.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Known {
+    /// What a port would show now, and since when.
+    pub value: Option<(Raw, Instant)>,
+    /// Values to be written, the next one first, each with the time of its frame.
+    pub waiting: VecDeque<(Raw, Instant)>,
+    /// When the newest frame that brought it was accepted.
+    pub accepted: Option<Instant>,
+    /// Its owner sent it in time, or it stands at its safe value.
+    pub live: bool,
+    /// It stands at its safe value.
+    pub safe: bool,
+    /// Since when: a safe value that is written again is as old as it was.
+    pub safe_at: Instant,
+    /// The state stream has shown it since its owner fell silent, or ever.
+    pub read_back: bool,
+    /// The newest value from the controller was none: not a number, or infinite.
+    pub unreadable: bool,
+    /// It stands at its safe value, and the controller is not known to have it.
+    pub unconfirmed: bool,
+    /// Its owner fell silent before the last value was handed over.
+    pub unsent: bool,
+    /// Values that waited while the gateway slept and have not come since.
+    pub slept: Option<Vec<Raw>>,
+}
+
+impl Known {
+    /// No frame and no safe value that was taken has this value.
+    fn is_news(&self, raw: Raw) -> bool {
+        self.value.is_none_or(|value| value.0 != raw) && self.waiting.iter().all(|next| next.0 != raw)
+    }
+}
+
+/// Where a value that was handed over comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Carried {
+    /// It is a safe value.
+    Safe,
+    /// The controller holds it already, as far as anybody knows, since its silent owner's last frame.
+    Held { accepted: Instant },
+    /// It came then, in its owner's frame or from the state stream, and may be so old when it is
+    /// handed over.
+    Of { arrived: Instant, timeout: Duration },
+}
+
+/// What a port must have counted.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Counted {
+    pub edges_lost: u32,
+    pub values_expired: u32,
+    pub undelivered: u32,
+    pub timeouts: u32,
+}
+
+/// What is wrong with a write.
+pub(super) type Wrong = (Invariant, String);
+
+/// The values of all variables and what became of them.
+#[derive(Debug, Clone)]
+pub(super) struct Upward {
+    pub known: Vec<Known>,
+    /// When each input frame of each port is overdue.
+    overdue: Vec<Vec<Option<Instant>>>,
+    pub counted: Vec<Counted>,
+    /// When the links that carry values came up; `None` while they are down.
+    pub up: [Option<Instant>; 16],
+    pub state_at: Option<Instant>,
+    /// When the newest frame of each recipe link came, whatever connection it was.
+    pub frame_at: [Option<Instant>; 16],
+    /// When anything came that the controller sends steadily, and how often after a gap.
+    heard_at: Option<Instant>,
+    pub era: u64,
+    /// When a frame was handed over on each recipe link's present connection, and in which era.
+    pub handed_over: [Option<(Instant, u64)>; 16],
+    /// When a safe value was last in doubt.
+    pub doubted_at: Instant,
+    /// When a safe value of a recipe link was last seen to be there.
+    pub confirmed_at: Option<Instant>,
+    /// When each recipe link sends safe values again.
+    pub again_at: [Instant; 16],
+    /// No frame is overdue before this.
+    next_overdue: Instant,
+    /// No value has waited too long before this.
+    next_expiry: Instant,
+    /// Variables that may have something waiting, by ordinal: inputs come first.
+    pub waits: u128,
+}
+
+impl Upward {
+    pub(super) fn new(sheet: &Sheet) -> Self {
+        Self {
+            known: vec![Known::default(); COUNT],
+            overdue: sheet.ports.iter().map(|port| vec![None; port.inputs.len()]).collect(),
+            counted: vec![Counted::default(); sheet.ports.len()],
+            up: [None; 16],
+            state_at: None,
+            frame_at: [None; 16],
+            heard_at: None,
+            era: 0,
+            handed_over: [None; 16],
+            doubted_at: Instant::ZERO,
+            confirmed_at: None,
+            again_at: [Instant::NEVER; 16],
+            next_overdue: Instant::NEVER,
+            next_expiry: Instant::NEVER,
+            waits: 0,
+        }
+    }
+
+    pub(super) fn known(&self, var: SysVar) -> &Known {
+        &self.known[var.ordinal()]
+    }
+
+    fn known_mut(&mut self, var: SysVar) -> &mut Known {
+        &mut self.known[var.ordinal()]
+    }
+
+    pub(super) fn is_up(&self, link: LinkId) -> bool {
+        self.up[usize::from(link.0)].is_some()
+    }
+
+    /// Frames that are overdue; their ports and places.
+    pub(super) fn overdue(&mut self, sheet: &Sheet, now: Instant) -> Vec<(usize, usize)> {
+        let mut overdue = Vec::new();
+        if now < self.next_overdue {
+            return overdue;
+        }
+        self.next_overdue = Instant::NEVER;
+        for (nth, port) in sheet.ports.iter().enumerate().filter(|(_, port)| port.is_field) {
+            for (frame, part) in port.inputs.iter().enumerate() {
+                match self.overdue[nth][frame] {
+                    Some(at) if now >= at => {}
+                    Some(at) => {
+                        self.next_overdue = self.next_overdue.min(at);
+                        continue;
+                    }
+                    None => continue,
+                }
+                self.overdue[nth][frame] = None;
+                self.counted[nth].timeouts += 1;
+                overdue.push((nth, frame));
+                for var in part.fields.iter().filter_map(super::sheet::written) {
+                    self.fell_silent(sheet, var, now);
+                }
+            }
+        }
+        overdue
+    }
+
+    /// Values of bits that waited too long are dropped.
+    pub(super) fn expire(&mut self, sheet: &Sheet, now: Instant) {
+        if now < self.next_expiry {
+            return;
+        }
+        self.next_expiry = Instant::NEVER;
+        for (nth, port) in sheet.ports.iter().enumerate().filter(|(_, port)| port.is_field) {
+            for var in port.inputs.iter().flat_map(|part| &part.fields).filter_map(super::sheet::written) {
+                let known = &mut self.known[var.ordinal()];
+                if !var.is_bits() || known.safe {
+                    continue;
+                }
+                let before = known.waiting.len();
+                known.waiting.retain(|(_, at)| now.saturating_since(*at) <= port.timeout);
+                self.counted[nth].values_expired += (before - known.waiting.len()) as u32;
+                for (_, at) in &known.waiting {
+                    self.next_expiry = self.next_expiry.min(*at + port.timeout + Duration::from_micros(1));
+                }
+            }
+        }
+    }
+
+    fn fell_silent(&mut self, sheet: &Sheet, var: SysVar, now: Instant) {
+        let Some(Owned { port, safe, .. }) = sheet.owned[var.ordinal()] else { return };
+        self.waits |= 1 << var.ordinal();
+        let known = self.known_mut(var);
+        if let Some(safe) = safe {
+            known.waiting.clear();
+            known.waiting.push_back((safe, now));
+            known.value = Some((safe, known.value.map_or(now, |value| value.1)));
+            known.safe = true;
+            known.safe_at = now;
+            known.unconfirmed = true;
+            self.doubted_at = now;
+        } else {
+            let waited = known.waiting.len() as u32;
+            known.waiting.clear();
+            known.live = false;
+            known.read_back = false;
+            known.unsent = waited > 0;
+            self.counted[port].values_expired += waited;
+        }
+    }
+
+    /// A frame is applied.
+    pub(super) fn accepted(&mut self, sheet: &Sheet, nth: usize, frame: &Accepted, now: Instant) {
+        let timeout = sheet.ports[nth].timeout;
+        self.overdue[nth][frame.frame] = Some(now + timeout);
+        self.next_overdue = self.next_overdue.min(now + timeout);
+        self.next_expiry = self.next_expiry.min(now + timeout + Duration::from_micros(1));
+        let mut undelivered = false;
+        for &(var, raw) in &frame.values {
+            let Some(Owned { way, .. }) = sheet.owned[var.ordinal()] else { continue };
+            self.waits |= 1 << var.ordinal();
+            let is_up = self.is_up(way);
+            let queued: usize = if var.is_bits() { self.queued(sheet, nth) } else { 0 };
+            let known = self.known_mut(var);
+            known.value = Some((raw, now));
+            known.accepted = Some(now);
+            known.live = true;
+            known.unconfirmed = false;
+            known.unreadable = false;
+            known.slept = None;
+            if std::mem::take(&mut known.safe) {
+                // A safe value that still waits may be too old by now.
+                self.next_expiry = now;
+            }
+            let known = &mut self.known[var.ordinal()];
+            if !is_up {
+                undelivered = true;
+                known.waiting.clear();
+                continue;
+            }
+            if !var.is_bits() {
+                known.waiting.clear();
+                known.waiting.push_back((raw, now));
+                continue;
+            }
+            match known.waiting.back_mut() {
+                None => known.waiting.push_back((raw, now)),
+                Some(newest) if newest.0 == raw => newest.1 = now,
+                Some(newest) if queued >= EDGES => {
+                    *newest = (raw, now);
+                    self.counted[nth].edges_lost += 1;
+                }
+                Some(_) => known.waiting.push_back((raw, now)),
+            }
+        }
+        self.counted[nth].undelivered += u32::from(undelivered);
+    }
+
+    /// How many values of the port wait behind others.
+    fn queued(&self, sheet: &Sheet, nth: usize) -> usize {
+        let vars = sheet.ports[nth].inputs.iter().flat_map(|part| &part.fields);
+        let waiting = vars.filter_map(super::sheet::written).filter(|var| var.is_bits());
+        waiting.map(|var| self.known(var).waiting.len().saturating_sub(1)).sum()
+    }
+
+    /// A link came up.
+    pub(super) fn link_up(&mut self, link: LinkId, now: Instant) {
+        self.up[usize::from(link.0)] = Some(now);
+        self.handed_over[usize::from(link.0)] = None;
+    }
+
+    /// A link was lost: what waits for it is dropped, safe values excepted.
+    pub(super) fn link_lost(&mut self, sheet: &Sheet, link: LinkId) {
+        if self.up[usize::from(link.0)].take().is_none() {
+            return;
+        }
+        self.again_at[usize::from(link.0)] = Instant::NEVER;
+        for (known, owned) in self.known.iter_mut().zip(&sheet.owned) {
+            if let Some(owned) = owned
+                && owned.way == link
+                && !known.safe
+            {
+                self.counted[owned.port].values_expired += known.waiting.len() as u32;
+                known.waiting.clear();
+            }
+        }
+    }
+
+    /// A packet of the state stream was taken.
+    pub(super) fn state_packet(&mut self, sheet: &Sheet, packet: &[u8], now: Instant) {
+        self.state_at = Some(now);
+        self.heard(now);
+        for &var in &sheet.in_packet {
+            let nth = var.ordinal();
+            let is_shown = sheet.origin[nth] == Some(Origin::State);
+            let is_read_back = sheet.read_back[nth] && !self.known[nth].live;
+            if !is_shown && !is_read_back {
+                continue;
+            }
+            let known = &mut self.known[nth];
+            let raw = in_packet(var, packet);
+            known.unreadable = raw.is_none();
+            if is_read_back {
+                known.read_back = raw.is_some();
+            }
+            if let Some(raw) = raw {
+                known.value = Some((raw, now));
+            }
+        }
+        if sheet.safe_vars.iter().any(|var| self.known(*var).safe) {
+            self.compare_safe(sheet, packet, now);
+        }
+    }
+
+    /// A packet or a recipe frame came. After a gap the controller may have begun anew: what was handed
+    /// over before, without a connection, counts no more.
+    pub(super) fn heard(&mut self, now: Instant) {
+        if is_gap(self.heard_at.replace(now), now) {
+            self.era += 1;
+        }
+    }
+
+    /// When a frame was handed over last to the controller that is there now, as far as a link can tell.
+    fn handed_over(&self, link: &LinkSheet, now: Instant) -> Option<Instant> {
+        let (at, era) = self.handed_over[usize::from(link.id.0)]?;
+        let is_there = !link.is_datagram || era == self.era && !is_gap(self.heard_at, now);
+        is_there.then_some(at)
+    }
+
+    /// When the newest frame that brought a variable which nothing reads back was accepted; `None` when the
+    /// controller does not have its value.
+    fn held(&self, link: &LinkSheet, known: &Known, now: Instant) -> Option<Instant> {
+        let handed_over = self.handed_over(link, now)?;
+        known.accepted.filter(|&at| handed_over >= at && !known.unsent)
+    }
+
+    /// The newest value that a link brought; not finite, it is none.
+    pub(super) fn received(&mut self, var: SysVar, raw: Raw, now: Instant) {
+        let known = self.known_mut(var);
+        known.unreadable = !super::field::as_number(var, raw).is_finite();
+        if !known.unreadable {
+            known.value = Some((raw, now));
+        }
+    }
+
+    /// A variable was written on the link that is its way up; what was written.
+    pub(super) fn wrote(
+        &mut self,
+        sheet: &Sheet,
+        link: LinkId,
+        var: SysVar,
+        raw: Raw,
+        now: Instant,
+    ) -> Result<Carried, Wrong> {
+        let Some(owned) = sheet.owned[var.ordinal()].filter(|owned| owned.way == link) else {
+            return Err((Invariant::Ownership, format!("{var} was written, but no port writes it there")));
+        };
+        let timeout = sheet.ports[owned.port].timeout;
+        let up = self.up[usize::from(link.0)];
+        let known = &mut self.known[var.ordinal()];
+        if known.slept.as_ref().is_some_and(|slept| slept.contains(&raw)) && known.is_news(raw) {
+            let what = format!("{var} = {} had waited while the gateway slept", show(var, raw));
+            return Err((Invariant::FromSleep, what));
+        }
+        let Some(accepted) = known.accepted else {
+            let what = format!("{var} = {} was written before any frame brought it", show(var, raw));
+            return Err((Invariant::FirstFrame, what));
+        };
+        let wanted = known.waiting.front().map(|next| next.0);
+        if known.live && !known.safe && owned.safe == Some(raw) && known.is_news(raw) && wanted != Some(raw) {
+            let what = format!("{var} = {} is its safe value, its owner is not silent", show(var, raw));
+            return Err((Invariant::FalseTimeout, what));
+        }
+        let Some(&(next, at)) = known.waiting.front() else {
+            let value = show(var, raw);
+            if known.safe && owned.safe == Some(raw) {
+                // It may always be written once more.
+                return Ok(Carried::Safe);
+            }
+            return Err(if up.is_some_and(|up| accepted < up) {
+                (Invariant::NoReplay, format!("{var} = {value} is from before the link came up"))
+            } else if now.saturating_since(accepted) > timeout {
+                (Invariant::InTime, format!("{var} = {value} was written after its owner fell silent"))
+            } else {
+                (Invariant::Sent, format!("{var} = {value} was written once more than its owner sent it"))
+            });
+        };
+        if next != raw {
+            let later = known.waiting.iter().any(|(value, _)| *value == raw);
+            let what = format!("{var} = {} was written, {} was next", show(var, raw), show(var, next));
+            return Err((if later { Invariant::Edges } else { Invariant::Sent }, what));
+        }
+        if !known.safe && now.saturating_since(at) > timeout {
+            return Err((
+                Invariant::InTime,
+                format!("{var} = {} had waited longer than {timeout}", show(var, raw)),
+            ));
+        }
+        known.waiting.pop_front();
+        Ok(if known.safe { Carried::Safe } else { Carried::Of { arrived: at, timeout } })
+    }
+
+    /// A variable was in a frame that was sent for the sake of others.
+    pub(super) fn carried(
+        &self,
+        sheet: &Sheet,
+        link: &LinkSheet,
+        (var, raw): (SysVar, Raw),
+        now: Instant,
+    ) -> Result<Carried, Wrong> {
+        let known = &self.known[var.ordinal()];
+        let value = || show(var, raw);
+        let Some((held, _)) = known.value else {
+            return Err((
+                Invariant::Sent,
+                format!("{var} = {} was sent along, and nobody ever knew it", value()),
+            ));
+        };
+        let expected = known.waiting.front().map_or(held, |next| next.0);
+        if expected != raw {
+            let what = format!("{var} = {} was sent along, it is {}", value(), show(var, expected));
+            return Err((Invariant::Sent, what));
+        }
+        if known.live {
+            let timeout = sheet.owned[var.ordinal()].map(|owned| sheet.ports[owned.port].timeout);
+            return Ok(match (known.safe, known.accepted, timeout) {
+                (false, Some(arrived), Some(timeout)) => Carried::Of { arrived, timeout },
+                _ => Carried::Safe,
+            });
+        }
+        if var.stream().is_none() {
+            return match self.held(link, known, now) {
+                Some(accepted) => Ok(Carried::Held { accepted }),
+                None => {
+                    let what =
+                        format!("{var} = {} was sent along, and this controller never got it", value());
+                    Err((Invariant::NoReplay, what))
+                }
+            };
+        }
+        if known.unreadable {
+            let what = format!("{var} = {} was written back, and cannot be read now", value());
+            return Err((Invariant::Unreadable, what));
+        }
+        let is_fresh = self.state_at.is_some_and(|at| now.saturating_since(at) <= READ_BACK);
+        if let (true, true, true, Some(arrived)) =
+            (sheet.read_back[var.ordinal()], known.read_back, is_fresh, self.state_at)
+        {
+            return Ok(Carried::Of { arrived, timeout: READ_BACK });
+        }
+        Err((Invariant::InTime, format!("{var} = {} was sent along, read back too long ago", value())))
+    }
+
+    /// Whether a recipe link's frame may be sent: each of its variables has a value.
+    pub(super) fn is_ready(&self, link: &LinkSheet, now: Instant) -> bool {
+        let is_fresh = self.state_at.is_some_and(|at| now.saturating_since(at) <= READ_BACK);
+        let mut vars = link.input.iter().flat_map(|up| up.fields.iter().filter_map(super::sheet::written));
+        vars.all(|var| {
+            let known = self.known(var);
+            match var.stream() {
+                _ if known.live => true,
+                Some(_) => known.read_back && is_fresh,
+                None => self.held(link, known, now).is_some(),
+            }
+        })
+    }
+}
+
+/// A variable's value in a state packet; `None` when it is not there or not finite.
+pub(super) fn in_packet(var: SysVar, packet: &[u8]) -> Option<Raw> {
+    let place = var.stream()?;
+    let bytes = packet.get(usize::from(place.offset)..)?.get(..usize::from(place.len))?;
+    let mut raw = Raw::default();
+    if var.is_bits() {
+        raw[0] = bytes.iter().rev().fold(0, |bits, &bit| bits << 1 | u8::from(bit != 0)) & var.valid_bits();
+    } else {
+        raw[..bytes.len()].copy_from_slice(bytes);
+        if var.ty() == proto_core::wire::scalar::ScalarType::Float && !f32::from_le_bytes(raw).is_finite() {
+            return None;
+        }
+    }
+    Some(raw)
+}

@@ -1,0 +1,280 @@
+//! What travels between the gateway and the controller: Modbus by hand (proto-core/docs/wire/modbus.md), and
+//! whether what arrived is what was sent.
+
+use std::collections::{BTreeMap, VecDeque};
+
+use proto_core::sysvar::{COUNT, Direction, ModbusPlace, SysVar};
+use proto_core::time::{Duration, Instant};
+
+use super::Invariant;
+use super::sheet::Raw;
+use super::upward::Wrong;
+
+/// A request without an answer is given up after this.
+const ANSWER: Duration = Duration::from_millis(500);
+
+/// What a request asks.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) enum Asked {
+    Read { coils: bool, first: u16, count: u16 },
+    Write(Vec<(SysVar, Raw)>),
+}
+
+/// The one transaction in flight.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Modbus {
+    in_flight: Option<([u8; 2], Asked, Instant)>,
+    /// Variables of the write in flight that stood at their safe values.
+    safe: Vec<SysVar>,
+    held: Vec<u8>,
+}
+
+impl Modbus {
+    pub(super) fn is_free(&self) -> bool {
+        self.in_flight.is_none()
+    }
+
+    /// Gives up what was not answered in time; the safe values in it.
+    pub(super) fn tick(&mut self, now: Instant) -> Vec<SysVar> {
+        if self.in_flight.as_ref().is_none_or(|asked| now < asked.2 + ANSWER) {
+            return Vec::new();
+        }
+        self.in_flight = None;
+        std::mem::take(&mut self.safe)
+    }
+
+    /// The connection is gone; the safe values that were under way.
+    pub(super) fn lost(&mut self) -> Vec<SysVar> {
+        std::mem::take(self).safe
+    }
+
+    /// The write that was just sent carries these safe values.
+    pub(super) fn carries_safe(&mut self, safe: Vec<SysVar>) {
+        self.safe = safe;
+    }
+
+    /// The gateway sends a request.
+    pub(super) fn sent(&mut self, map: &Map, bytes: &[u8], now: Instant) -> Result<Asked, Wrong> {
+        let wrong = |what: &str| (Invariant::Ownership, format!("a Modbus request that {what}"));
+        if self.in_flight.is_some() {
+            return Err((Invariant::Line, "a Modbus request before the one before was over".to_owned()));
+        }
+        let (head, pdu) = bytes.split_at_checked(7).ok_or_else(|| wrong("has no header"))?;
+        let asked = map.request(pdu).ok_or_else(|| wrong("touches what is no variable"))?;
+        self.safe.clear();
+        self.in_flight = Some(([head[0], head[1]], asked.clone(), now));
+        Ok(asked)
+    }
+
+    /// The controller's bytes: what was read, and safe values that were refused.
+    pub(super) fn received(&mut self, map: &Map, bytes: &[u8]) -> (Vec<(SysVar, Raw)>, Vec<SysVar>) {
+        self.held.extend_from_slice(bytes);
+        let (mut found, mut refused) = (Vec::new(), Vec::new());
+        while let Some(len) = frame_len(&self.held) {
+            let frame: Vec<u8> = self.held.drain(..len).collect();
+            let Some((id, asked, _)) = &self.in_flight else { continue };
+            if frame[..2] != *id {
+                continue;
+            }
+            if let (Asked::Read { coils, first, count }, Some(data)) = (asked, frame.get(9..))
+                && frame[7] & 0x80 == 0
+            {
+                found.extend(map.read(*coils, *first, *count, data));
+            }
+            let safe = std::mem::take(&mut self.safe);
+            if frame[7] & 0x80 != 0 {
+                refused.extend(safe);
+            }
+            self.in_flight = None;
+        }
+        (found, refused)
+    }
+}
+
+/// The length of the first whole frame.
+fn frame_len(bytes: &[u8]) -> Option<usize> {
+    let len = 6 + usize::from(u16::from_be_bytes([*bytes.get(4)?, *bytes.get(5)?]));
+    (bytes.len() >= len).then_some(len)
+}
+
+/// Which variable is where in the controller's Modbus map.
+#[derive(Debug, Clone)]
+pub(super) struct Map {
+    coils: Vec<Option<SysVar>>,
+    inputs: [Option<SysVar>; 512],
+    words: Vec<Option<SysVar>>,
+}
+
+impl Map {
+    pub(super) fn new() -> Self {
+        let mut map = Self { coils: vec![None; 512], inputs: [None; 512], words: vec![None; 512] };
+        for var in SysVar::all() {
+            match var.modbus() {
+                Some(ModbusPlace::Coils { first, .. }) => {
+                    let slot = if var.direction() == Direction::Input {
+                        &mut map.inputs[..]
+                    } else {
+                        &mut map.coils[..]
+                    };
+                    slot[usize::from(first)] = Some(var);
+                }
+                Some(ModbusPlace::Register { address }) => map.words[usize::from(address)] = Some(var),
+                _ => {}
+            }
+        }
+        map
+    }
+
+    /// A request; `None` when it is none of the four that a gateway sends, or writes a part of a
+    /// variable or something else.
+    pub(super) fn request(&self, pdu: &[u8]) -> Option<Asked> {
+        let word = |at: usize| Some(u16::from_be_bytes([*pdu.get(at)?, *pdu.get(at + 1)?]));
+        let (first, count) = (word(1)?, word(3)?);
+        match pdu.first()? {
+            1 | 3 if pdu.len() == 5 => Some(Asked::Read { coils: pdu[0] == 1, first, count }),
+            15 => {
+                let packed = pdu.get(6..)?;
+                let mut written = Vec::new();
+                let mut at = 0_u16;
+                while at < count {
+                    let var = (*self.inputs.get(usize::from(first + at))?)?;
+                    let Some(ModbusPlace::Coils { count: bits, .. }) = var.modbus() else { return None };
+                    let mut raw = Raw::default();
+                    for bit in 0..bits {
+                        let nth = usize::from(at + bit);
+                        raw[0] |= (packed.get(nth / 8)? >> (nth % 8) & 1) << bit;
+                    }
+                    written.push((var, raw));
+                    at += bits;
+                }
+                (at == count).then_some(Asked::Write(written))
+            }
+            16 => {
+                let values = pdu.get(6..)?;
+                let mut written = Vec::new();
+                for nth in 0..usize::from(count) {
+                    let var = (*self.words.get(usize::from(first) + nth)?)?;
+                    if var.direction() != Direction::Input {
+                        return None;
+                    }
+                    let (high, low) = (*values.get(2 * nth)?, *values.get(2 * nth + 1)?);
+                    written.push((var, [low, high, 0, 0]));
+                }
+                Some(Asked::Write(written))
+            }
+            _ => None,
+        }
+    }
+
+    /// The variables that lie whole in what was read.
+    fn read(&self, coils: bool, first: u16, count: u16, data: &[u8]) -> Vec<(SysVar, Raw)> {
+        let mut found = Vec::new();
+        for address in first..first.saturating_add(count) {
+            let nth = usize::from(address - first);
+            if !coils {
+                if let (Some(Some(var)), Some(pair)) =
+                    (self.words.get(usize::from(address)), data.get(2 * nth..2 * nth + 2))
+                {
+                    found.push((*var, [pair[1], pair[0], 0, 0]));
+                }
+                continue;
+            }
+            let place = usize::from(address);
+            let both = [self.coils.get(place), self.inputs.get(place)];
+            for var in both.into_iter().flatten().filter_map(|var| *var) {
+                let Some(ModbusPlace::Coils { count: bits, .. }) = var.modbus() else { continue };
+                if address - first + bits > count {
+                    continue;
+                }
+                let bit =
+                    |bit: usize| data.get((nth + bit) / 8).map_or(0, |byte| byte >> ((nth + bit) % 8) & 1);
+                let packed = (0..usize::from(bits)).fold(0, |sum, at| sum | bit(at) << at);
+                found.push((var, [packed, 0, 0, 0]));
+            }
+        }
+        found
+    }
+}
+
+/// What was sent and has not arrived yet, and what the controller must have.
+#[derive(Debug, Clone)]
+pub(super) struct Controller {
+    sent: BTreeMap<u64, VecDeque<u8>>,
+    /// Datagrams, the newest ones of each link.
+    datagrams: BTreeMap<u64, VecDeque<Vec<u8>>>,
+    held: BTreeMap<u64, Vec<u8>>,
+}
+
+/// Datagrams that may still arrive.
+const DATAGRAMS: usize = 4_096;
+
+impl Controller {
+    pub(super) fn new() -> Self {
+        Self { sent: BTreeMap::new(), datagrams: BTreeMap::new(), held: BTreeMap::new() }
+    }
+
+    pub(super) fn sent(&mut self, conn: u64, bytes: &[u8]) {
+        self.sent.entry(conn).or_default().extend(bytes);
+    }
+
+    pub(super) fn sent_datagram(&mut self, link: u64, bytes: &[u8]) {
+        let kept = self.datagrams.entry(link).or_default();
+        if kept.len() >= DATAGRAMS {
+            kept.pop_front();
+        }
+        kept.push_back(bytes.to_vec());
+    }
+
+    pub(super) fn gone(&mut self, conn: u64) {
+        self.sent.remove(&conn);
+        self.held.remove(&conn);
+    }
+
+    pub(super) fn arrived(&mut self, conn: u64, bytes: &[u8]) -> Result<(), Wrong> {
+        let sent = self.sent.entry(conn).or_default();
+        if bytes.len() > sent.len() || !bytes.iter().eq(sent.iter().take(bytes.len())) {
+            return Err((Invariant::Transport, "the controller received what was not sent".to_owned()));
+        }
+        sent.drain(..bytes.len());
+        Ok(())
+    }
+
+    pub(super) fn arrived_datagram(&self, link: u64, bytes: &[u8]) -> Result<(), Wrong> {
+        let kept = self.datagrams.get(&link);
+        if kept.is_some_and(|kept| kept.iter().rev().any(|sent| sent == bytes)) {
+            return Ok(());
+        }
+        Err((Invariant::Transport, "the controller received a datagram that was not sent".to_owned()))
+    }
+
+    /// The whole Modbus requests in what has arrived.
+    pub(super) fn requests(&mut self, conn: u64, bytes: &[u8]) -> Vec<Vec<u8>> {
+        let held = self.held.entry(conn).or_default();
+        held.extend_from_slice(bytes);
+        let mut found = Vec::new();
+        while let Some(len) = frame_len(held) {
+            found.push(held.drain(..len).skip(7).collect());
+        }
+        found
+    }
+
+    /// The same of a recipe connection, whose frames the caller cuts.
+    pub(super) fn held(&mut self, conn: u64) -> &mut Vec<u8> {
+        self.held.entry(conn).or_default()
+    }
+
+    /// How much is remembered.
+    pub(super) fn size(&self) -> usize {
+        self.sent.values().map(VecDeque::len).sum::<usize>() + self.held.values().map(Vec::len).sum::<usize>()
+    }
+}
+
+/// The controller's input variables, as its image has them.
+pub(crate) fn inputs_of(image: &[u8]) -> Vec<u8> {
+    image[..INPUT_BYTES].to_vec()
+}
+
+/// Inputs come first in the image (proto-core/docs/wire/sysvars.md section 1).
+const INPUT_BYTES: usize = 253;
+
+const _: () = assert!(COUNT < 512);

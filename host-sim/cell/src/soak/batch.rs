@@ -1,0 +1,242 @@
+//! Many runs, on several threads, whose results do not depend on how many.
+
+use std::collections::BTreeMap;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering::Relaxed};
+use std::sync::{Mutex, PoisonError};
+
+use proto_core::time::Duration;
+
+use super::{Level, Report, Scenario, Soak};
+use crate::{Invariant, Rng, TroubleKind, Violation};
+
+/// How long one run is at most.
+pub const RUN_LENGTH: Duration = Duration::from_secs(600);
+
+/// A number of virtual hours, cut into runs with seeds of their own.
+#[derive(Debug)]
+pub struct Batch {
+    scenarios: Vec<Scenario>,
+    level: Level,
+    seed: u64,
+    span: Duration,
+    run_length: Duration,
+    runs: usize,
+    next: AtomicUsize,
+    stop: AtomicBool,
+    done: Mutex<BTreeMap<usize, Report>>,
+    /// Virtual time that has gone by, also in runs that are not finished.
+    elapsed_us: AtomicU64,
+    failed: Mutex<Option<Failure>>,
+}
+
+/// What went wrong in which run.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Failure {
+    /// The run's place in the batch.
+    pub run: usize,
+    /// The run's own seed.
+    pub seed: u64,
+    /// The cell's name.
+    pub cell: String,
+    /// How long after the run's start.
+    pub after: Duration,
+    /// What.
+    pub what: Violation,
+}
+
+/// How far a batch is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Progress {
+    /// Virtual time that has gone by.
+    pub elapsed: Duration,
+    /// Runs that are finished.
+    pub runs: usize,
+}
+
+/// The runs that were finished, summed up in their order.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Total {
+    /// How many.
+    pub runs: usize,
+    /// How many there should have been.
+    pub of: usize,
+    /// Virtual time.
+    pub span: Duration,
+    /// Runs of each cell, and their virtual time.
+    pub cells: BTreeMap<String, (usize, Duration)>,
+    /// Faults of each kind.
+    pub faults: BTreeMap<TroubleKind, u64>,
+    /// Frames in and out, by cell and port.
+    pub ports: BTreeMap<(String, String), (u64, u64)>,
+    /// Sent and received, by kind of link.
+    pub links: BTreeMap<&'static str, (u64, u64)>,
+    /// Things that happened.
+    pub events: u64,
+    /// Values written to the controller that were judged.
+    pub writes: u64,
+    /// How often each invariant was looked at.
+    pub checks: BTreeMap<Invariant, u64>,
+    /// One number for the traces of all runs.
+    pub hash: u64,
+}
+
+impl Batch {
+    /// `span` of virtual time in these cells, in turn.
+    pub fn new(scenarios: Vec<Scenario>, level: Level, seed: u64, span: Duration) -> Self {
+        // However short it is, each cell has its turn.
+        let share = span.as_micros().div_ceil(scenarios.len().max(1) as u64).max(1);
+        let run_length = RUN_LENGTH.min(Duration::from_micros(share));
+        let runs = span.as_micros().div_ceil(run_length.as_micros()) as usize;
+        Self {
+            scenarios,
+            level,
+            seed,
+            span,
+            run_length,
+            runs,
+            next: AtomicUsize::new(0),
+            stop: AtomicBool::new(false),
+            done: Mutex::new(BTreeMap::new()),
+            elapsed_us: AtomicU64::new(0),
+            failed: Mutex::new(None),
+        }
+    }
+
+    /// How many runs there are.
+    pub fn runs(&self) -> usize {
+        self.runs
+    }
+
+    /// The seed of a run; its remainder says which cell.
+    pub fn seed_of(&self, run: usize) -> u64 {
+        let cells = self.scenarios.len().max(1) as u64;
+        let mut rng = Rng::new(self.seed ^ (run as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15));
+        // Short enough to be typed.
+        let drawn = rng.below(1 << 40);
+        drawn - drawn % cells + run as u64 % cells
+    }
+
+    /// The cell that a run's seed means among these.
+    pub fn scenario_of(scenarios: &[Scenario], seed: u64) -> Option<&Scenario> {
+        scenarios.get((seed % scenarios.len().max(1) as u64) as usize)
+    }
+
+    /// Carries out runs until there are none left, one failed, or [`Batch::stop`] was called.
+    /// Several threads may do so at once.
+    pub fn work(&self) {
+        while !self.stop.load(Relaxed) {
+            let run = self.next.fetch_add(1, Relaxed);
+            if run >= self.runs {
+                return;
+            }
+            self.carry_out(run);
+        }
+    }
+
+    /// Runs under way are given up.
+    pub fn stop(&self) {
+        self.stop.store(true, Relaxed);
+    }
+
+    /// How far it is.
+    pub fn progress(&self) -> Progress {
+        let runs = self.done.lock().unwrap_or_else(PoisonError::into_inner).len();
+        Progress { elapsed: Duration::from_micros(self.elapsed_us.load(Relaxed)), runs }
+    }
+
+    /// The failure of the earliest run that failed.
+    pub fn failure(&self) -> Option<Failure> {
+        self.failed.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// What was done so far.
+    pub fn total(&self) -> Total {
+        let done = self.done.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut total = Total { of: self.runs, ..Total::default() };
+        for (&run, report) in done.iter() {
+            let cell = Self::scenario_of(&self.scenarios, self.seed_of(run)).map_or("", |cell| &cell.name);
+            total.add(run, cell, report);
+        }
+        total
+    }
+
+    fn carry_out(&self, run: usize) {
+        let seed = self.seed_of(run);
+        let Some(scenario) = Self::scenario_of(&self.scenarios, seed) else { return };
+        let begins = self.run_length.saturating_mul(run as u64);
+        let length = Duration::from_micros(self.span.as_micros() - begins.as_micros()).min(self.run_length);
+        let mut soak = match Soak::new(scenario, seed, self.level) {
+            Ok(soak) => soak,
+            // Every cell was tried before the batch began.
+            Err(error) => panic!("{}: {error}", scenario.name),
+        };
+        let mut reached = Duration::ZERO;
+        while reached < length && soak.cell().violation().is_none() {
+            if self.stop.load(Relaxed) {
+                return;
+            }
+            let next = (reached + SLICE).min(length);
+            // A panic is a finding like any other.
+            let done = catch_unwind(AssertUnwindSafe(|| soak.run_to(next)));
+            if done.is_err() {
+                let what = Violation::panic(soak.cell().now());
+                return self.fail(Failure {
+                    run,
+                    seed,
+                    cell: scenario.name.clone(),
+                    after: soak.elapsed(),
+                    what,
+                });
+            }
+            self.elapsed_us.fetch_add(next.as_micros() - reached.as_micros(), Relaxed);
+            reached = next;
+        }
+        let report = soak.report();
+        match report.violation.clone() {
+            Some((what, after)) => self.fail(Failure { run, seed, cell: scenario.name.clone(), after, what }),
+            None => {
+                self.done.lock().unwrap_or_else(PoisonError::into_inner).insert(run, report);
+            }
+        }
+    }
+
+    fn fail(&self, failure: Failure) {
+        let mut failed = self.failed.lock().unwrap_or_else(PoisonError::into_inner);
+        if failed.as_ref().is_none_or(|before| failure.run < before.run) {
+            *failed = Some(failure);
+        }
+        self.stop();
+    }
+}
+
+impl Total {
+    fn add(&mut self, run: usize, cell: &str, report: &Report) {
+        self.runs += 1;
+        self.span = self.span + report.span;
+        let of_cell = self.cells.entry(cell.to_owned()).or_default();
+        *of_cell = (of_cell.0 + 1, of_cell.1 + report.span);
+        for (&kind, count) in &report.faults {
+            *self.faults.entry(kind).or_default() += count;
+        }
+        for (port, received, sent) in &report.ports {
+            let sum = self.ports.entry((cell.to_owned(), port.clone())).or_default();
+            *sum = (sum.0 + received, sum.1 + sent);
+        }
+        for (link, sent, received) in &report.links {
+            let sum = self.links.entry(link).or_default();
+            *sum = (sum.0 + sent, sum.1 + received);
+        }
+        self.events += report.events;
+        self.writes += report.writes;
+        for (&invariant, count) in &report.checks {
+            *self.checks.entry(invariant).or_default() += count;
+        }
+        for word in [run as u64, report.digest] {
+            self.hash = (self.hash.rotate_left(5) ^ word).wrapping_mul(0x9E37_79B9_7F4A_7C15);
+        }
+    }
+}
+
+/// How long a run is not looked at.
+const SLICE: Duration = Duration::from_secs(2);

@@ -1,0 +1,113 @@
+//! The cells that a soak runs unless it is given others.
+
+use std::path::Path;
+
+use proto_core::config::GatewayConfig;
+
+use recipe_config::SimConfig;
+use recipe_config::file::{self, FileError, Text};
+
+/// A gateway and a controller.
+#[derive(Debug, Clone)]
+pub struct Scenario {
+    /// What it is called.
+    pub name: String,
+    /// The gateway's file.
+    pub gateway: Box<GatewayConfig>,
+    /// The controller's file.
+    pub controller: SimConfig,
+}
+
+struct Embedded {
+    name: &'static str,
+    gateway: &'static str,
+    controller: &'static str,
+}
+
+macro_rules! embedded {
+    ($folder:literal, $name:literal, $controller:literal) => {
+        Embedded {
+            name: $name,
+            gateway: include_str!(concat!(env!("CARGO_MANIFEST_DIR"), $folder, $name, ".toml")),
+            controller: include_str!(concat!(
+                env!("CARGO_MANIFEST_DIR"),
+                $folder,
+                $controller,
+                "-controller.toml"
+            )),
+        }
+    };
+}
+
+/// Their order is part of what a seed means. Some worked examples have a controller with a port of
+/// its own, where nobody would be: they get one without.
+const EMBEDDED: [Embedded; 11] = [
+    embedded!("/../configs/", "rs485-system", "can-hand"),
+    embedded!("/../configs/", "udp-server", "udp-server"),
+    embedded!("/../configs/", "client", "client"),
+    embedded!("/../configs/", "force-sensor", "force-sensor"),
+    embedded!("/../configs/", "request-response", "request-response"),
+    embedded!("/../configs/", "can-hand", "can-hand"),
+    embedded!("/../configs/", "can-system", "can-hand"),
+    embedded!("/src/soak/cells/", "several-ports", "several-ports"),
+    embedded!("/src/soak/cells/", "two-clients", "two-clients"),
+    embedded!("/src/soak/cells/", "orders", "orders"),
+    embedded!("/src/soak/cells/", "witness", "witness"),
+];
+
+impl Scenario {
+    /// The names of the embedded cells.
+    pub fn names() -> impl Iterator<Item = &'static str> {
+        EMBEDDED.iter().map(|cell| cell.name)
+    }
+
+    /// All embedded cells.
+    ///
+    /// # Errors
+    /// None that a test has not seen before.
+    pub fn all() -> Result<Vec<Self>, FileError> {
+        EMBEDDED.iter().map(Self::parse).collect()
+    }
+
+    /// The embedded cell of this name; `None` when there is none.
+    ///
+    /// # Errors
+    /// As [`Scenario::all`].
+    pub fn named(name: &str) -> Result<Option<Self>, FileError> {
+        EMBEDDED.iter().find(|cell| cell.name == name).map(Self::parse).transpose()
+    }
+
+    /// The cell of two files.
+    ///
+    /// # Errors
+    /// [`FileError`] says what is wrong in which of them.
+    pub fn load(gateway: &Path, controller: &Path) -> Result<Self, FileError> {
+        let name = gateway.file_stem().map_or_else(String::new, |stem| stem.to_string_lossy().into_owned());
+        Ok(Self {
+            name,
+            gateway: file::load_gateway(gateway, &[])?,
+            controller: file::load_controller(controller, &[])?,
+        })
+    }
+
+    fn parse(cell: &Embedded) -> Result<Self, FileError> {
+        let Embedded { name, gateway, controller } = *cell;
+        let gateway = file::parse_gateway(Text { name, toml: gateway }, &[])?;
+        let controller = file::parse_controller(Text { name, toml: controller }, &[])?;
+        Ok(Self { name: name.to_owned(), gateway, controller })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Cell;
+
+    #[test]
+    fn every_embedded_cell_can_run() {
+        for scenario in Scenario::all().unwrap() {
+            Cell::new(&scenario.gateway, &scenario.controller, 1).unwrap();
+        }
+        assert!(Scenario::named("no-such-cell").unwrap().is_none());
+    }
+}

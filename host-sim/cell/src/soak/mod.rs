@@ -1,0 +1,216 @@
+//! Soak runs: cells in virtual time under faults, for hours, with everything that the gateway
+//! does checked at every step (docs/cell.md sections 4 and 5).
+//!
+//! In: cells, a seed, a level of faults, a number of virtual hours. Out: a [`Total`], the same for
+//! the same seed on every machine and whatever number of threads, or the first violation with
+//! what repeats it. Knows no terminal: `host-sim soak` prints.
+
+mod batch;
+mod cells;
+mod show;
+mod station;
+mod world;
+
+use std::collections::BTreeMap;
+
+use proto_core::config::{Bus, GatewayConfig};
+use proto_core::engine::PortId;
+use proto_core::time::{Duration, Instant};
+
+pub use batch::{Batch, Progress, RUN_LENGTH, Total};
+pub use cells::Scenario;
+pub use show::show_trace;
+
+use crate::{Cell, CellError, Chunking, Invariant, Rng, Trouble, TroubleKind, Violation, Wiring};
+use station::Station;
+use world::World;
+
+/// How much goes wrong.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Level {
+    /// Nothing; devices are careless all the same.
+    None,
+    /// A fault each half minute, on a quiet network.
+    Mild,
+    /// A fault each second, on a network that delays, splits and joins.
+    Harsh,
+}
+
+impl Level {
+    /// The name that `--faults` takes.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::None => "none",
+            Self::Mild => "mild",
+            Self::Harsh => "harsh",
+        }
+    }
+
+    const fn pause(self) -> Option<Duration> {
+        match self {
+            Self::None => None,
+            Self::Mild => Some(Duration::from_secs(30)),
+            Self::Harsh => Some(Duration::from_secs(1)),
+        }
+    }
+}
+
+/// One cell that runs under faults.
+#[derive(Debug)]
+pub struct Soak {
+    cell: Cell,
+    trouble: Option<Trouble>,
+    world: World,
+    start: Instant,
+}
+
+/// What one run did.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Report {
+    /// How long it was.
+    pub span: Duration,
+    /// Its trace's digest.
+    pub digest: u64,
+    /// Things that happened, as the trace counts them.
+    pub events: u64,
+    /// Faults of each kind.
+    pub faults: BTreeMap<TroubleKind, u64>,
+    /// Frames in and out of each of the gateway's field ports, by name.
+    pub ports: Vec<(String, u64, u64)>,
+    /// Sent and received on each link, by name.
+    pub links: Vec<(&'static str, u64, u64)>,
+    /// Values written to the controller that were judged.
+    pub writes: u64,
+    /// How often each invariant was looked at.
+    pub checks: BTreeMap<Invariant, u64>,
+    /// The first one that did not hold, and how long after the start that was.
+    pub violation: Option<(Violation, Duration)>,
+}
+
+impl Soak {
+    /// The cell of this scenario and seed, switched on now.
+    ///
+    /// # Errors
+    /// [`CellError`] when a configuration cannot run.
+    pub fn new(scenario: &Scenario, seed: u64, level: Level) -> Result<Self, CellError> {
+        let mut cell = Cell::new(&scenario.gateway, &scenario.controller, seed)?;
+        let mut rng = cell.fork_rng();
+        cell.watch();
+        cell.keep_heard(0);
+        attach_stations(&mut cell, &scenario.gateway, level, &mut rng);
+        if level == Level::Harsh {
+            cell.every_network(|network| {
+                network.delay = rng.up_to(Duration::from_millis(2));
+                network.jitter = rng.up_to(Duration::from_millis(3));
+                network.merge = rng.up_to(Duration::from_millis(4));
+                network.longest_segment = (rng.below(3) > 0).then(|| rng.between(20, 2_000) as usize);
+                network.loss_ppm = rng.below(3_000) as u32;
+                network.duplicate_ppm = rng.below(3_000) as u32;
+                network.ack_delay = match rng.below(3) {
+                    0 => Duration::from_millis(rng.between(40, 200)),
+                    _ => Duration::ZERO,
+                };
+                network.ack_report = rng.up_to(Duration::from_millis(20));
+                network.send_buffer = 1_024 << rng.below(7);
+            });
+        }
+        let world = World::new(&scenario.gateway, cell.now(), rng.fork());
+        let trouble = level.pause().map(|pause| Trouble::new(&mut cell, &TroubleKind::ALL, pause));
+        let start = cell.now();
+        Ok(Self { cell, trouble, world, start })
+    }
+
+    /// The cell.
+    pub fn cell(&self) -> &Cell {
+        &self.cell
+    }
+
+    /// The cell, to keep its trace.
+    pub fn cell_mut(&mut self) -> &mut Cell {
+        &mut self.cell
+    }
+
+    /// How long it has run.
+    pub fn elapsed(&self) -> Duration {
+        self.cell.now().saturating_since(self.start)
+    }
+
+    /// Lets time go by, until so long after the start or until an invariant does not hold. How it
+    /// is cut into calls changes nothing.
+    pub fn run_to(&mut self, elapsed: Duration) {
+        let end = self.start + elapsed;
+        while self.cell.violation().is_none() {
+            let next = self.world.next().min(end);
+            let span = next.saturating_since(self.cell.now());
+            match &mut self.trouble {
+                Some(trouble) => trouble.run(&mut self.cell, span),
+                None => self.cell.run(span),
+            }
+            if next >= end {
+                return;
+            }
+            self.world.poll(&mut self.cell);
+        }
+    }
+
+    /// What happened.
+    pub fn report(&self) -> Report {
+        let engine = self.cell.engine();
+        let ports = self.cell.gateway().ports.iter().zip(0..).filter_map(|(port, nth)| {
+            let _ = engine.port_counters(PortId(nth))?;
+            let (received, sent) = self.cell.watched_frames(PortId(nth));
+            Some((port.name.as_str().to_owned(), received, sent))
+        });
+        let links = engine.links().map(|link| {
+            let (sent, received) = self.cell.watched_link(link.id);
+            (link.kind.name(), sent, received)
+        });
+        Report {
+            span: self.elapsed(),
+            digest: self.cell.trace().digest(),
+            events: self.cell.trace().count(),
+            faults: self.trouble.as_ref().map(|trouble| trouble.counts().clone()).unwrap_or_default(),
+            ports: ports.collect(),
+            links: links.collect(),
+            writes: self.cell.watched_writes(),
+            // A panic would have left no report.
+            checks: self.cell.checks().into_iter().chain([(Invariant::NoPanic, 1)]).collect(),
+            violation: self
+                .cell
+                .violation()
+                .map(|broken| (broken.clone(), broken.at.saturating_since(self.start))),
+        }
+    }
+}
+
+/// A device at each field port, and lines that deliver in one way or another.
+fn attach_stations(cell: &mut Cell, config: &GatewayConfig, level: Level, rng: &mut Rng) {
+    for port in &config.ports {
+        let mut rng = rng.fork();
+        let station = Station::new(config, port, cell.now(), rng.fork());
+        match port.bus {
+            Bus::Rs485(_) => {
+                let line = cell.line_of(&port.name);
+                cell.line(line).chunking = match rng.below(5) {
+                    2 => Chunking::Gathered(Duration::from_millis(rng.between(1, 16))),
+                    0 => Chunking::Pieces(rng.between(1, 16) as usize),
+                    1 => Chunking::Random(rng.between(1, 40) as usize),
+                    _ => Chunking::Whole,
+                };
+                if level == Level::Harsh && rng.below(4) == 0 {
+                    cell.line(line).wiring = Wiring::TwoWire;
+                }
+                if let Some(station) = station {
+                    cell.attach(line, station);
+                }
+            }
+            Bus::Can { .. } => {
+                let bus = cell.bus_of(&port.name);
+                if let Some(station) = station {
+                    cell.attach_can(bus, station);
+                }
+            }
+            Bus::TcpListen { .. } | Bus::UdpListen { .. } => {}
+        }
+    }
+}

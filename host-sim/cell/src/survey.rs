@@ -1,0 +1,99 @@
+//! Which ways to the controller work at present: what the model that watches needs to know to say what
+//! should have arrived.
+
+use proto_core::engine::{LinkId, LinkKind};
+use proto_core::time::Duration;
+
+use super::Cell;
+use super::connection::Connection;
+use super::due::Due;
+use super::network::{Door, Gate, Way};
+use super::oracle::Path;
+use recipe_controller::Link;
+
+impl Cell {
+    /// A server of the controller has a fault from now on, such as those of
+    /// [`recipe_controller::Controller::mute`]: less can be expected of the gateway. As many
+    /// [`Self::recovers`] end it.
+    pub fn ails(&mut self, server: Link) {
+        self.ailments[server as usize] += 1;
+        self.disturb(None);
+    }
+
+    /// It has that fault no longer.
+    pub fn recovers(&mut self, server: Link) {
+        let ailments = &mut self.ailments[server as usize];
+        *ailments = ailments.saturating_sub(1);
+        self.disturb(None);
+    }
+
+    /// Something was broken or mended, on one link or on all.
+    pub(super) fn disturb(&mut self, link: Option<LinkId>) {
+        if let Some(oracle) = &mut self.oracle {
+            oracle.disturbed(link, self.now);
+        }
+    }
+
+    pub(super) fn survey(&mut self) {
+        if self.oracle.is_none() {
+            return;
+        }
+        let (paths, inputs, now) = (self.paths(), self.inputs(), self.now);
+        if let Some(oracle) = &mut self.oracle {
+            oracle.survey(&paths, &inputs, now);
+        }
+        self.queue.push(now + SURVEY_EVERY, Due::Survey);
+    }
+
+    /// The controller says something on a connection.
+    pub(super) fn replied(&mut self, conn: u64, bytes: &[u8]) {
+        let Some(oracle) = &mut self.oracle else { return };
+        let link = self.conns.get(&conn).map(|conn| conn.link);
+        if let Some(link @ (LinkId::COMMAND | LinkId::URGENT)) = link
+            && bytes.starts_with(b"unknown command")
+        {
+            oracle.not_understood(link, self.now);
+        }
+    }
+
+    pub(super) fn paths(&self) -> Vec<Path> {
+        let path = |gate: &Gate| {
+            let server = match gate.kind {
+                LinkKind::Command | LinkKind::Urgent => Some(Link::Command),
+                LinkKind::State => Some(Link::State),
+                LinkKind::Modbus => Some(Link::Modbus),
+                _ => None,
+            };
+            Path {
+                link: gate.id,
+                conn: gate.conn,
+                is_sound: !self.is_asleep() && self.is_sound(gate),
+                is_served: server.is_none_or(|server| self.ailments[server as usize] == 0),
+            }
+        };
+        self.gates.values().map(path).collect()
+    }
+
+    fn is_sound(&self, gate: &Gate) -> bool {
+        let is_whole = |conn: &Connection| {
+            let is_free = |way: &super::tcp::Pipe| {
+                !way.held && !way.dead && way.again_at.is_none() && way.reset_after.is_none()
+            };
+            let is_there = conn.accepted && !conn.closing && !conn.abandoned && !conn.forgotten;
+            is_there && is_free(&conn.up) && is_free(&conn.down)
+        };
+        let has_path =
+            gate.is_up && gate.door == Door::Open && !Way::BOTH.into_iter().any(|way| gate.is_cut(way));
+        match gate.kind {
+            LinkKind::RecipeUdp | LinkKind::RecipeUdpListen { .. } => {
+                has_path && gate.network.loss_ppm < MUCH_LOSS && gate.network.jitter < MUCH_JITTER
+            }
+            _ => has_path && gate.conn.and_then(|id| self.conns.get(&id)).is_some_and(is_whole),
+        }
+    }
+}
+
+const SURVEY_EVERY: Duration = Duration::from_millis(100);
+/// Of a network that is worse nothing is expected.
+const MUCH_LOSS: u32 = 10_000;
+const MUCH_JITTER: Duration = Duration::from_millis(5);

@@ -1,0 +1,549 @@
+//! Everything that can go wrong, by chance and seeded: what a soak run is made of.
+//!
+//! A [`Trouble`] breaks something every now and then and mends it again after a while. The cell
+//! stays an ordinary cell: between two faults a caller can look at it, and at the end
+//! [`Trouble::mend`] leaves it whole.
+
+use std::collections::BTreeMap;
+
+use proto_core::engine::LinkId;
+use proto_core::modbus::Exception;
+use proto_core::sysvar::SysVar;
+use proto_core::time::{Duration, Instant};
+use proto_core::wire::dialect::Dialect;
+
+use super::network::{Network, Way};
+use super::rng::Rng;
+use super::{BusId, Cell, LineId};
+use recipe_config::CommandClients;
+use recipe_controller::Link;
+
+/// Kinds of faults.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum TroubleKind {
+    /// A server refuses connections, and the present one is reset.
+    Refused,
+    /// The network to a server swallows everything, and the present connection is half open.
+    BlackHole,
+    /// A connection is reset.
+    Reset,
+    /// A connection is reset in the middle of something.
+    ResetMidPacket,
+    /// A connection is half open.
+    HalfOpen,
+    /// One direction of a connection stalls.
+    Stall,
+    /// Datagrams are lost, late and doubled.
+    Datagrams,
+    /// All datagrams of a link are lost for a while.
+    Burst,
+    /// A peer's TCP acknowledges nothing, or nothing gets to it.
+    Unacknowledged,
+    /// A cable is out, of one link or of all.
+    Cable,
+    /// Somebody else sends datagrams to a port where the gateway listens.
+    Stranger,
+    /// A server carries out and says nothing.
+    Mute,
+    /// A server's answers are late.
+    SlowAnswers,
+    /// Modbus answers with an exception.
+    Exception,
+    /// Port 2000 takes one client only.
+    OneClient,
+    /// Half a state packet, then the end.
+    HalfStatePacket,
+    /// The state stream loses bytes and goes on.
+    StateBytesLost,
+    /// A value of the controller is not a number, or infinite.
+    Unreadable,
+    /// A line flips bits.
+    Noise,
+    /// A device sends garbage.
+    Garbage,
+    /// A line or bus is cut.
+    Cut,
+    /// A line's adapter is pulled out.
+    Unplugged,
+    /// A CAN controller is bus-off.
+    BusOff,
+    /// The controller is switched off and on.
+    ControllerRestart,
+    /// The controller loses its power for a while.
+    PowerCut,
+    /// The controller comes back with software that speaks another dialect.
+    Dialect,
+    /// The gateway is switched off and on.
+    GatewayRestart,
+    /// The gateway is not called for less than half a second.
+    GatewayStall,
+    /// It is not called for longer.
+    GatewaySleep,
+}
+
+impl TroubleKind {
+    /// All of them.
+    pub const ALL: [Self; 29] = [
+        Self::Refused,
+        Self::BlackHole,
+        Self::Reset,
+        Self::ResetMidPacket,
+        Self::HalfOpen,
+        Self::Stall,
+        Self::Datagrams,
+        Self::Burst,
+        Self::Unacknowledged,
+        Self::Cable,
+        Self::Stranger,
+        Self::Mute,
+        Self::SlowAnswers,
+        Self::Exception,
+        Self::OneClient,
+        Self::HalfStatePacket,
+        Self::StateBytesLost,
+        Self::Unreadable,
+        Self::Noise,
+        Self::Garbage,
+        Self::Cut,
+        Self::Unplugged,
+        Self::BusOff,
+        Self::ControllerRestart,
+        Self::PowerCut,
+        Self::Dialect,
+        Self::GatewayRestart,
+        Self::GatewayStall,
+        Self::GatewaySleep,
+    ];
+
+    /// How often, beside the others. What stops everything for long is rare, or nothing else would
+    /// happen.
+    const fn weight(self) -> u64 {
+        match self {
+            Self::GatewaySleep | Self::PowerCut | Self::GatewayRestart | Self::Dialect => 1,
+            Self::Cable | Self::ControllerRestart => 2,
+            _ => 4,
+        }
+    }
+}
+
+impl TroubleKind {
+    /// A name for people.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Refused => "connections refused",
+            Self::BlackHole => "network swallows",
+            Self::Reset => "connection reset",
+            Self::ResetMidPacket => "reset in the middle",
+            Self::HalfOpen => "half-open connection",
+            Self::Stall => "one direction stalls",
+            Self::Datagrams => "datagrams lost and doubled",
+            Self::Burst => "burst of lost datagrams",
+            Self::Unacknowledged => "nothing acknowledged",
+            Self::Cable => "cable out",
+            Self::Stranger => "datagram of a stranger",
+            Self::Mute => "server says nothing",
+            Self::SlowAnswers => "slow answers",
+            Self::Exception => "Modbus exceptions",
+            Self::OneClient => "one client of port 2000",
+            Self::HalfStatePacket => "half a state packet",
+            Self::StateBytesLost => "state stream loses bytes",
+            Self::Unreadable => "values not finite",
+            Self::Noise => "noise on a line",
+            Self::Garbage => "garbage from a device",
+            Self::Cut => "line or bus cut",
+            Self::Unplugged => "adapter pulled out",
+            Self::BusOff => "bus-off",
+            Self::ControllerRestart => "controller restart",
+            Self::PowerCut => "controller without power",
+            Self::Dialect => "controller of another dialect",
+            Self::GatewayRestart => "gateway restart",
+            Self::GatewayStall => "gateway stalls",
+            Self::GatewaySleep => "gateway sleeps",
+        }
+    }
+}
+
+/// What ends a fault.
+#[derive(Debug, Clone, Copy)]
+enum Remedy {
+    Admit(LinkId),
+    Release(LinkId),
+    Datagrams(LinkId),
+    Ways(LinkId, [bool; 2]),
+    Cable(Option<LinkId>),
+    Unmute(Link),
+    Answers(Link),
+    NoException,
+    ManyClients,
+    Heal(SysVar),
+    Quiet(LineId),
+    Mend(LineId),
+    PlugIn(LineId),
+    MendBus(BusId),
+    BusOn(BusId),
+    Power,
+    Dialect(&'static str),
+    Wake,
+}
+
+/// Breaks and mends.
+#[derive(Debug)]
+pub struct Trouble {
+    rng: Rng,
+    kinds: Vec<TroubleKind>,
+    pause: Duration,
+    next: Instant,
+    remedies: Vec<(Instant, TroubleKind, Remedy)>,
+    counts: BTreeMap<TroubleKind, u64>,
+    /// What the networks are like without faults.
+    networks: BTreeMap<LinkId, Network>,
+}
+
+impl Trouble {
+    /// Faults of these kinds, one each `pause` on average, from now on. A fault that lasts does so
+    /// for up to `pause` as well, an outage for up to twenty times as long.
+    pub fn new(cell: &mut Cell, kinds: &[TroubleKind], pause: Duration) -> Self {
+        let mut trouble = Self {
+            rng: cell.fork_rng(),
+            kinds: kinds.to_vec(),
+            pause,
+            next: Instant::ZERO,
+            remedies: Vec::new(),
+            counts: BTreeMap::new(),
+            networks: cell.networks(),
+        };
+        trouble.next = cell.now() + trouble.rng.up_to(pause.saturating_mul(2));
+        trouble
+    }
+
+    /// How many faults of each kind there were.
+    pub fn counts(&self) -> &BTreeMap<TroubleKind, u64> {
+        &self.counts
+    }
+
+    /// Lets time go by in the cell, with faults.
+    pub fn run(&mut self, cell: &mut Cell, span: Duration) {
+        let end = cell.now() + span;
+        loop {
+            let remedy = self.remedies.iter().map(|remedy| remedy.0).min().unwrap_or(Instant::NEVER);
+            let next = self.next.min(remedy).min(end);
+            cell.run(next.saturating_since(cell.now()));
+            // After a violation time stands still.
+            if next >= end || cell.violation().is_some() {
+                return;
+            }
+            self.poll(cell);
+        }
+    }
+
+    /// Mends everything that is broken at present.
+    pub fn mend(&mut self, cell: &mut Cell) {
+        for (_, kind, remedy) in std::mem::take(&mut self.remedies) {
+            cell.remark(format_args!("ends: {}", kind.name()));
+            apply(cell, remedy, &self.networks);
+        }
+        cell.wake_gateway();
+    }
+
+    fn poll(&mut self, cell: &mut Cell) {
+        let now = cell.now();
+        while let Some(nth) = self.remedies.iter().position(|remedy| remedy.0 <= now) {
+            let (_, kind, remedy) = self.remedies.remove(nth);
+            cell.remark(format_args!("ends: {}", kind.name()));
+            apply(cell, remedy, &self.networks);
+        }
+        if now >= self.next {
+            // Now and then all is quiet for long enough that everything must work again.
+            let pause = if self.rng.below(CALM) == 0 { 12 } else { 2 };
+            self.next = now + Duration::from_micros(1) + self.rng.up_to(self.pause.saturating_mul(pause));
+            if let Some(kind) = self.pick_kind()
+                && self.begin(cell, kind).is_some()
+            {
+                *self.counts.entry(kind).or_default() += 1;
+                cell.remark(format_args!("begins: {}", kind.name()));
+            }
+        }
+    }
+
+    fn pick_kind(&mut self) -> Option<TroubleKind> {
+        let mut nth = self.rng.below(self.kinds.iter().map(|kind| kind.weight()).sum());
+        self.kinds.iter().copied().find(|kind| {
+            let is_it = nth < kind.weight();
+            nth = nth.saturating_sub(kind.weight());
+            is_it
+        })
+    }
+
+    /// Breaks something; `None` when the cell has nothing of this kind.
+    fn begin(&mut self, cell: &mut Cell, kind: TroubleKind) -> Option<()> {
+        let rng = &mut self.rng;
+        let server = [Link::Command, Link::State, Link::Modbus][rng.below(3) as usize];
+        let way = if rng.below(2) == 0 { Way::Up } else { Way::Down };
+        let tcp: Vec<LinkId> = cell.tcp_links().collect();
+        let mut tcp = || pick(rng, tcp.iter().copied());
+        let mut lasts = None;
+        let most = self.pause.saturating_mul(LONGEST);
+        let remedy = match kind {
+            TroubleKind::Refused => {
+                let link = tcp()?;
+                cell.refuse(link);
+                cell.reset(link);
+                Some(Remedy::Admit(link))
+            }
+            TroubleKind::BlackHole => {
+                let link = tcp()?;
+                cell.black_hole(link);
+                cell.half_open(link);
+                Some(Remedy::Admit(link))
+            }
+            TroubleKind::Reset => {
+                cell.reset(tcp()?);
+                None
+            }
+            TroubleKind::ResetMidPacket => {
+                let link = tcp()?;
+                cell.reset_after(link, way, rng.between(1, 2_000) as usize);
+                None
+            }
+            TroubleKind::HalfOpen => {
+                cell.half_open(tcp()?);
+                None
+            }
+            TroubleKind::Stall => {
+                let link = tcp()?;
+                cell.hold(link, way);
+                Some(Remedy::Release(link))
+            }
+            TroubleKind::Datagrams => {
+                let link = pick(rng, cell.datagram_links())?;
+                let network = cell.network(link);
+                network.loss_ppm = rng.between(0, 500_000) as u32;
+                network.duplicate_ppm = rng.between(0, 200_000) as u32;
+                network.jitter = rng.up_to(Duration::from_millis(20));
+                Some(Remedy::Datagrams(link))
+            }
+            TroubleKind::Burst => {
+                let link = pick(rng, cell.datagram_links())?;
+                lasts = Some(longer_and_rarer(rng, Duration::from_millis(50), 6).min(Duration::from_secs(5)));
+                cut_ways(cell, link, rng.below(3))
+            }
+            TroubleKind::Unacknowledged => {
+                let link = tcp()?;
+                lasts = Some(longer_and_rarer(rng, Duration::from_millis(50), 6).min(Duration::from_secs(5)));
+                cut_ways(cell, link, rng.below(2))
+            }
+            TroubleKind::Cable => {
+                let link = pick(rng, cell.link_ids()).filter(|_| rng.below(2) == 0);
+                lasts =
+                    Some(longer_and_rarer(rng, Duration::from_millis(100), 7).min(Duration::from_secs(20)));
+                cables(cell, link).into_iter().for_each(|link| cell.cut_cable(link));
+                Some(Remedy::Cable(link))
+            }
+            TroubleKind::Stranger => {
+                let links: Vec<(LinkId, Option<usize>)> = cell.listening_for_datagrams();
+                let (link, frame) = pick(rng, links.into_iter())?;
+                // Not as long as a frame: who sends frames is answered.
+                let len = Some(rng.below(64) as usize).filter(|len| Some(*len) != frame).unwrap_or(100);
+                let bytes = rng.bytes(len);
+                cell.stranger_sends(link, &bytes);
+                None
+            }
+            TroubleKind::Mute => {
+                lasts = patience(rng, server);
+                cell.ails(server);
+                cell.controller_mut().mute(server);
+                Some(Remedy::Unmute(server))
+            }
+            TroubleKind::SlowAnswers => {
+                lasts = patience(rng, server);
+                let delay = rng.up_to(lasts.unwrap_or(Duration::from_millis(1_500)));
+                cell.ails(server);
+                cell.controller_mut().delay_answers(server, delay);
+                Some(Remedy::Answers(server))
+            }
+            TroubleKind::Exception => {
+                let exceptions =
+                    [Exception::DeviceFailure, Exception::DeviceBusy, Exception::IllegalDataAddress];
+                let exception = pick(rng, exceptions.into_iter());
+                cell.ails(Link::Modbus);
+                cell.controller_mut().answer_modbus_with(exception);
+                Some(Remedy::NoException)
+            }
+            TroubleKind::OneClient => {
+                lasts = Some(longer_and_rarer(rng, Duration::from_millis(500), 5));
+                let clients =
+                    [CommandClients::RefuseSecond, CommandClients::DropFirst][rng.below(2) as usize];
+                cell.controller_mut().command_clients(clients);
+                Some(Remedy::ManyClients)
+            }
+            TroubleKind::HalfStatePacket => {
+                let len = rng.between(0, 1_467) as usize;
+                cell.controller_mut().cut_next_state_packet(len);
+                None
+            }
+            TroubleKind::StateBytesLost => {
+                cell.link_ids().find(|link| *link == LinkId::STATE)?;
+                cell.lose_state_bytes(rng.between(1, 1_467) as usize);
+                None
+            }
+            TroubleKind::Unreadable => {
+                let var = pick(rng, cell.floats().into_iter())?;
+                let value = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY][rng.below(3) as usize];
+                cell.spoil(var, value);
+                Some(Remedy::Heal(var))
+            }
+            TroubleKind::Noise => {
+                let line = pick(rng, cell.lines())?;
+                cell.line(line).noise_ppm = rng.between(100, 100_000) as u32;
+                Some(Remedy::Quiet(line))
+            }
+            TroubleKind::Garbage => {
+                let line = pick(rng, cell.lines())?;
+                let len = rng.between(1, 300) as usize;
+                let bytes = rng.bytes(len);
+                cell.send(line, &bytes);
+                None
+            }
+            TroubleKind::Cut => match (pick(rng, cell.lines()), pick(rng, cell.buses())) {
+                (Some(line), bus) if bus.is_none() || rng.below(2) == 0 => {
+                    cell.cut(line);
+                    Some(Remedy::Mend(line))
+                }
+                (_, bus) => {
+                    let bus = bus?;
+                    cell.cut_bus(bus);
+                    Some(Remedy::MendBus(bus))
+                }
+            },
+            TroubleKind::Unplugged => {
+                let line = pick(rng, cell.lines())?;
+                cell.unplug(line);
+                Some(Remedy::PlugIn(line))
+            }
+            TroubleKind::BusOff => {
+                let bus = pick(rng, cell.buses())?;
+                cell.bus_off(bus);
+                Some(Remedy::BusOn(bus))
+            }
+            TroubleKind::ControllerRestart => {
+                cell.restart_controller();
+                None
+            }
+            TroubleKind::PowerCut => {
+                lasts = Some(longer_and_rarer(rng, Duration::from_millis(200), 4));
+                cell.power_cut();
+                Some(Remedy::Power)
+            }
+            TroubleKind::Dialect => {
+                let before = cell.controller().dialect();
+                // One at a time, or the remedies would bring back the wrong one.
+                if self.remedies.iter().any(|(.., remedy)| matches!(remedy, Remedy::Dialect(_))) {
+                    return None;
+                }
+                let others = Dialect::NAMES.into_iter().filter(|name| *name != before);
+                cell.replace_controller(pick(rng, others)?);
+                Some(Remedy::Dialect(before))
+            }
+            TroubleKind::GatewayRestart => {
+                cell.restart_gateway();
+                None
+            }
+            TroubleKind::GatewayStall => {
+                let span = Duration::from_micros(rng.between(50_000, 499_999));
+                lasts = Some(span);
+                cell.stall_gateway(span);
+                Some(Remedy::Wake)
+            }
+            TroubleKind::GatewaySleep => {
+                let longest = Duration::from_secs(20);
+                let shortest = Duration::from_millis(501);
+                let span = longer_and_rarer(rng, shortest, 5).min(longest.min(most)).max(shortest);
+                lasts = Some(span);
+                cell.stall_gateway(span);
+                Some(Remedy::Wake)
+            }
+        };
+        if let Some(remedy) = remedy {
+            let lasts = lasts.map_or_else(|| self.rng.up_to(self.pause), |lasts| lasts.min(most));
+            let until = cell.now() + lasts;
+            self.remedies.push((until, kind, remedy));
+        }
+        Some(())
+    }
+}
+
+fn apply(cell: &mut Cell, remedy: Remedy, networks: &BTreeMap<LinkId, Network>) {
+    match remedy {
+        Remedy::Admit(link) => cell.admit(link),
+        Remedy::Release(link) => {
+            cell.release(link, Way::Up);
+            cell.release(link, Way::Down);
+        }
+        Remedy::Datagrams(link) => *cell.network(link) = networks.get(&link).copied().unwrap_or_default(),
+        Remedy::Ways(link, ways) => {
+            for way in [Way::Up, Way::Down].into_iter().filter(|way| ways[*way as usize]) {
+                cell.mend_way(link, way);
+            }
+        }
+        Remedy::Cable(link) => cables(cell, link).into_iter().for_each(|link| cell.mend_cable(link)),
+        Remedy::Unmute(server) => {
+            cell.controller_mut().unmute(server);
+            cell.recovers(server);
+        }
+        Remedy::Answers(server) => {
+            cell.controller_mut().delay_answers(server, Duration::ZERO);
+            cell.recovers(server);
+        }
+        Remedy::NoException => {
+            cell.controller_mut().answer_modbus_with(None);
+            cell.recovers(Link::Modbus);
+        }
+        Remedy::ManyClients => cell.controller_mut().command_clients(CommandClients::Many),
+        Remedy::Heal(var) => cell.heal(var),
+        Remedy::Quiet(line) => cell.line(line).noise_ppm = 0,
+        Remedy::Mend(line) => cell.mend(line),
+        Remedy::PlugIn(line) => cell.plug_in(line),
+        Remedy::MendBus(bus) => cell.mend_bus(bus),
+        Remedy::BusOn(bus) => cell.bus_on(bus),
+        Remedy::Power => cell.power_up(),
+        Remedy::Dialect(name) => cell.replace_controller(name),
+        // One that is shorter ends by itself; another may have begun meanwhile.
+        Remedy::Wake => {}
+    }
+}
+
+/// The links that a cable is for.
+fn cables(cell: &Cell, link: Option<LinkId>) -> Vec<LinkId> {
+    link.map_or_else(|| cell.link_ids().collect(), |link| vec![link])
+}
+
+/// What goes up, what comes down, or both.
+fn cut_ways(cell: &mut Cell, link: LinkId, which: u64) -> Option<Remedy> {
+    let ways = [which != 1, which != 0];
+    for way in [Way::Up, Way::Down].into_iter().filter(|way| ways[*way as usize]) {
+        cell.cut_way(link, way);
+    }
+    Some(Remedy::Ways(link, ways))
+}
+
+/// Replies to commands are waited for for ten seconds; the other servers' faults last as most do.
+fn patience(rng: &mut Rng, server: Link) -> Option<Duration> {
+    (server == Link::Command).then(|| longer_and_rarer(rng, Duration::from_millis(400), 4))
+}
+
+/// From `shortest` to twice `shortest * 2^doublings`; each doubling is as likely as the one before.
+fn longer_and_rarer(rng: &mut Rng, shortest: Duration, doublings: u64) -> Duration {
+    let least = shortest.saturating_mul(1 << rng.between(0, doublings));
+    least + rng.up_to(least)
+}
+
+/// No fault lasts longer than so many pauses.
+const LONGEST: u64 = 20;
+/// One pause of so many is a long one.
+const CALM: u64 = 20;
+
+fn pick<T>(rng: &mut Rng, all: impl Iterator<Item = T>) -> Option<T> {
+    let mut all: Vec<T> = all.collect();
+    let nth = rng.below(all.len() as u64) as usize;
+    (nth < all.len()).then(|| all.swap_remove(nth))
+}

@@ -1,0 +1,273 @@
+//! A controller file: TOML to [`SimConfig`], checked.
+
+use std::net::IpAddr;
+
+use proto_core::recipe::model::{Framing, Mode};
+use proto_core::wire::scalar::Scalar;
+
+use super::document::Document;
+use super::lines::{LINE_KEYS, read_bitrate, read_cycle, read_line};
+use super::reader::{Item, Reader, Result, Spot};
+use super::recipes::{self, FileRecipe, Flavour};
+use crate::TargetError;
+use crate::sim::{
+    CommandClients, Initial, InitialTarget, Listen, Power, Robot, RobotMode, SimBus, SimConfig, SimPort,
+    SimProgram,
+};
+
+/// The top-level keys of a controller file.
+pub(super) const KEYS: [&str; 6] = ["listen", "robot", "initial", "recipe", "port", "program"];
+
+/// The whole file, valid.
+pub(super) fn read(document: &Document) -> Result<SimConfig> {
+    let root = Reader::root(document, &KEYS)?;
+    let recipes = recipes::read_all(&root, Flavour::Controller)?;
+    Ok(SimConfig {
+        listen: read_listen(&root)?,
+        robot: read_robot(&root)?,
+        initial: read_initial(&root)?,
+        recipes: recipes.iter().map(FileRecipe::to_sim).collect(),
+        ports: read_ports(&root, &recipes)?,
+        programs: read_programs(&root)?,
+    })
+}
+
+fn read_listen(root: &Reader<'_>) -> Result<Listen> {
+    let mut listen = Listen::default();
+    let Some(item) = root.optional("listen") else { return Ok(listen) };
+    let table = item.table(&["address", "command", "state", "modbus", "udp2011"])?;
+    if let Some(item) = table.optional("address") {
+        let text = item.string()?;
+        listen.address = text.parse::<IpAddr>().map_err(|_| {
+            item.error(format!("{text:?} is not an IP address, such as 127.0.0.1 or 0.0.0.0"))
+        })?;
+    }
+    for (key, target) in [
+        ("command", &mut listen.command),
+        ("state", &mut listen.state),
+        ("modbus", &mut listen.modbus),
+        ("udp2011", &mut listen.udp2011),
+    ] {
+        if let Some(item) = table.optional(key) {
+            *target = item.integer(0..=65_535)?;
+        }
+    }
+    let tcp = [("command", listen.command), ("state", listen.state), ("modbus", listen.modbus)];
+    for (nth, (key, port)) in tcp.iter().enumerate() {
+        if let Some((other, _)) = tcp.iter().take(nth).find(|(_, before)| *port != 0 && before == port) {
+            let message = format!("port {port} is that of {other} already");
+            return Err(table.optional(key).map_or(table.error(&message), |item| item.error(&message)));
+        }
+    }
+    Ok(listen)
+}
+
+fn read_robot(root: &Reader<'_>) -> Result<Robot> {
+    let mut robot = Robot::default();
+    let Some(item) = root.optional("robot") else { return Ok(robot) };
+    let table = item.table(&["dialect", "power", "mode", "command_clients"])?;
+    if let Some(item) = table.optional("dialect") {
+        robot.dialect = super::known_dialect(&item, item.string()?)?.to_owned();
+    }
+    if let Some(item) = table.optional("power") {
+        robot.power = item.choice(&[("off", Power::Off), ("on", Power::On), ("enabled", Power::Enabled)])?;
+    }
+    if let Some(item) = table.optional("mode") {
+        robot.mode = item.choice(&[
+            ("manual", RobotMode::Manual),
+            ("auto", RobotMode::Auto),
+            ("remote", RobotMode::Remote),
+        ])?;
+    }
+    if let Some(item) = table.optional("command_clients") {
+        robot.command_clients = item.choice(&[
+            ("many", CommandClients::Many),
+            ("one", CommandClients::RefuseSecond),
+            ("newest", CommandClients::DropFirst),
+        ])?;
+    }
+    Ok(robot)
+}
+
+fn read_initial(root: &Reader<'_>) -> Result<Vec<Initial>> {
+    let mut initial: Vec<Initial> = Vec::new();
+    let Some(item) = root.optional("initial") else { return Ok(initial) };
+    for (name, key_spot, item) in item.any_table()?.entries() {
+        let target: InitialTarget =
+            name.parse().map_err(|error: TargetError| key_spot.error(root.document, error.to_string()))?;
+        if initial.iter().any(|before| before.target == target) {
+            return Err(key_spot.error(root.document, format!("{target} has an initial value already")));
+        }
+        initial.push(Initial { target, value: read_value(target, &item)? });
+    }
+    Ok(initial)
+}
+
+fn read_value(target: InitialTarget, item: &Item<'_>) -> Result<f64> {
+    match target {
+        InitialTarget::Bit { .. } => match item.as_bool() {
+            Some(bit) => Ok(f64::from(u8::from(bit))),
+            None => item.integer::<u8>(0..=1).map(f64::from).map_err(|mut error| {
+                error.message.push_str(", or true and false");
+                error
+            }),
+        },
+        InitialTarget::Analog { group, .. } => {
+            let (low, high) = group.range();
+            let value = item.number()?;
+            if (low..=high).contains(&value) {
+                Ok(value)
+            } else {
+                Err(item.error(format!("{value} is out of range; {low}..={high}")))
+            }
+        }
+        InitialTarget::Var(var) => {
+            let value = Scalar::from_f64(var.ty(), item.number()?).map_err(|error| item.error(error))?;
+            match value {
+                Scalar::Byte(bits) if bits & !var.valid_bits() != 0 => {
+                    Err(item
+                        .error(format!("{bits} sets reserved bits; {var} has only 0..={}", var.valid_bits())))
+                }
+                _ => Ok(value.as_f64()),
+            }
+        }
+    }
+}
+
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum BusKind {
+    Rs485,
+    Can,
+    UdpServer,
+    TcpClient,
+    UdpClient,
+}
+
+const BUSES: [(&str, BusKind); 5] = [
+    ("rs485", BusKind::Rs485),
+    ("can", BusKind::Can),
+    ("udp-server", BusKind::UdpServer),
+    ("tcp-client", BusKind::TcpClient),
+    ("udp-client", BusKind::UdpClient),
+];
+
+const PORT_KEYS: [&str; 11] = [
+    "name",
+    "bus",
+    "recipe",
+    "cycle_ms",
+    "baud",
+    "parity",
+    "stop_bits",
+    "idle_gap_ms",
+    "turnaround_us",
+    "bitrate",
+    "to",
+];
+
+fn read_ports(root: &Reader<'_>, recipes: &[FileRecipe]) -> Result<Vec<SimPort>> {
+    let mut ports: Vec<SimPort> = Vec::new();
+    for table in root.tables("port", &PORT_KEYS)? {
+        let (port, name_spot) = read_port(&table, recipes)?;
+        if ports.iter().any(|before| before.name == port.name) {
+            let message = format!("there is a port {:?} already; names must differ", port.name);
+            return Err(name_spot.error(root.document, message));
+        }
+        if let Some(before) =
+            ports.iter().find(|before| port.bus == SimBus::UdpServer && before.bus == SimBus::UdpServer)
+        {
+            return Err(
+                table.error(format!("{:?} is the UDP server already; there is only one", before.name))
+            );
+        }
+        ports.push(port);
+    }
+    Ok(ports)
+}
+
+fn read_port(table: &Reader<'_>, recipes: &[FileRecipe]) -> Result<(SimPort, Spot)> {
+    let (name, name_spot) = recipes::read_name(table)?;
+    let kind = table.required("bus", "rs485, can, udp-server, tcp-client or udp-client")?.choice(&BUSES)?;
+    let own: &[&str] = match kind {
+        BusKind::Rs485 => &LINE_KEYS,
+        BusKind::Can => &["bitrate"],
+        BusKind::UdpServer => &[],
+        BusKind::TcpClient | BusKind::UdpClient => &["to"],
+    };
+    let bus_name = BUSES.iter().find(|(_, bus)| *bus == kind).map_or("", |(name, _)| name);
+    table.check_keys(
+        &[&["name", "bus", "recipe", "cycle_ms"], own].concat(),
+        &format!(" on bus = {bus_name:?}"),
+    )?;
+    let bus = match kind {
+        BusKind::Rs485 => SimBus::Rs485(read_line(table)?),
+        BusKind::Can => SimBus::Can { bitrate: read_bitrate(table)? },
+        BusKind::UdpServer => SimBus::UdpServer,
+        BusKind::TcpClient => SimBus::TcpClient { to: read_to(table)? },
+        BusKind::UdpClient => SimBus::UdpClient { to: read_to(table)? },
+    };
+    let recipe = match table.optional("recipe") {
+        Some(item) => {
+            let index = recipes::find(recipes, &item)?;
+            if let Some(recipe) = recipes.get(index) {
+                check_recipe(kind, recipe).map_err(|message| item.error(message))?;
+            }
+            Some(index)
+        }
+        None => None,
+    };
+    Ok((SimPort { name, bus, recipe, cycle: read_cycle(table)? }, name_spot))
+}
+
+/// Which port takes which recipe (D16, D18).
+fn check_recipe(kind: BusKind, recipe: &FileRecipe) -> std::result::Result<(), String> {
+    let name = &recipe.name;
+    let is_can_port = kind == BusKind::Can;
+    if recipe.is_can && !is_can_port {
+        return Err(format!("recipe {name:?} is a CAN recipe, and only CAN ports take those"));
+    }
+    if !recipe.is_can && is_can_port {
+        return Err(format!("recipe {name:?} is a stream recipe, and a CAN port takes CAN recipes only"));
+    }
+    if recipe.mode == Mode::User && !matches!(kind, BusKind::Rs485 | BusKind::Can) {
+        return Err(format!(
+            "recipe {name:?} is user-defined, and the controller's TCP and UDP ports take realtime recipes only"
+        ));
+    }
+    match kind {
+        BusKind::Rs485 | BusKind::TcpClient => recipe.check_framing(Framing::Bytes),
+        BusKind::Can | BusKind::UdpServer | BusKind::UdpClient => Ok(()),
+    }
+}
+
+fn read_to(table: &Reader<'_>) -> Result<String> {
+    let item = table.required("to", "HOST:PORT to connect to, such as \"127.0.0.1:50000\"")?;
+    let text = item.string()?;
+    let port = text.rsplit_once(':').and_then(|(host, port)| {
+        let port = port.parse::<u16>().ok()?;
+        (!host.is_empty() && port != 0).then_some(port)
+    });
+    match port {
+        Some(_) => Ok(text.to_owned()),
+        None => Err(item.error(format!("{text:?} is not HOST:PORT, such as \"127.0.0.1:50000\""))),
+    }
+}
+
+fn read_programs(root: &Reader<'_>) -> Result<Vec<SimProgram>> {
+    let mut programs: Vec<SimProgram> = Vec::new();
+    for table in root.tables("program", &["name", "script"])? {
+        let item = table.required("name", "as run(NAME) names it")?;
+        let name = item.string()?;
+        if name.is_empty() || name.contains([',', '(', ')', '"', '\r', '\n', '\0']) {
+            return Err(item.error(format!(
+                "{name:?} cannot be named by run(NAME); no comma, parenthesis, quote or line end, and not empty"
+            )));
+        }
+        if programs.iter().any(|before| before.name == name) {
+            return Err(item.error(format!("there is a program {name:?} already; names must differ")));
+        }
+        let script = table.required("script", "the program's text")?.string()?.to_owned();
+        programs.push(SimProgram { name: name.to_owned(), script });
+    }
+    Ok(programs)
+}

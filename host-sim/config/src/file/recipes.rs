@@ -1,0 +1,342 @@
+//! `[[recipe]]` of both kinds of files: read once, checked by the layouts themselves.
+//!
+//! In: tables. Out: [`FileRecipe`], which keeps the place of everything a later check may name.
+
+use proto_core::recipe::PartError;
+use proto_core::recipe::can::CanLayout;
+use proto_core::recipe::model::{CanId, Field, Framing, Mode, Rules};
+use proto_core::recipe::stream::StreamLayout;
+use proto_core::sysvar::{Direction, SysVar, VarRange};
+use proto_core::wire::scalar::ScalarType;
+
+use super::bindings::{self, FileInput, FileOutput};
+use super::reader::{Item, Reader, Result, Spot};
+use crate::sim::{SimCanFrame, SimField, SimParts, SimRecipe, SimStreamPart};
+
+/// Whose file it is: a gateway's recipes say what happens with each field.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Flavour {
+    Gateway,
+    Controller,
+}
+
+pub(super) struct FileRecipe {
+    pub(super) spot: Spot,
+    pub(super) name: String,
+    pub(super) name_spot: Spot,
+    pub(super) mode: Mode,
+    pub(super) is_can: bool,
+    pub(super) input: Option<FilePart>,
+    pub(super) output: Option<FilePart>,
+}
+
+pub(super) struct FilePart {
+    pub(super) spot: Spot,
+    pub(super) head: Vec<u8>,
+    pub(super) tail: Vec<u8>,
+    head_spot: Option<Spot>,
+    tail_spot: Option<Spot>,
+    /// One in a stream part, one for each id in a CAN part.
+    pub(super) frames: Vec<FileFrame>,
+    /// The gateway's keys of an output part.
+    pub(super) sending: bindings::Sending,
+}
+
+pub(super) struct FileFrame {
+    pub(super) spot: Spot,
+    /// 0 in a stream part.
+    pub(super) id: CanId,
+    id_spot: Spot,
+    pub(super) fields: Vec<FileField>,
+}
+
+pub(super) struct FileField {
+    pub(super) spot: Spot,
+    pub(super) kind: FileFieldKind,
+}
+
+pub(super) enum FileFieldKind {
+    System(SysVar),
+    UserInput { name: String, ty: ScalarType, to: FileInput },
+    UserOutput { name: String, ty: ScalarType, from: FileOutput },
+}
+
+impl FileField {
+    pub(super) fn field(&self) -> Field {
+        match self.kind {
+            FileFieldKind::System(var) => Field::System(var),
+            FileFieldKind::UserInput { ty, .. } | FileFieldKind::UserOutput { ty, .. } => Field::User(ty),
+        }
+    }
+
+    fn name(&self) -> String {
+        match &self.kind {
+            FileFieldKind::System(var) => var.to_string(),
+            FileFieldKind::UserInput { name, .. } | FileFieldKind::UserOutput { name, .. } => name.clone(),
+        }
+    }
+}
+
+/// Every recipe of a file, each within the limits whatever port it is for.
+pub(super) fn read_all(root: &Reader<'_>, flavour: Flavour) -> Result<Vec<FileRecipe>> {
+    let mut recipes: Vec<FileRecipe> = Vec::new();
+    for table in root.tables("recipe", &["name", "kind", "mode", "input", "output"])? {
+        let recipe = read(&table, flavour)?;
+        if recipes.iter().any(|before| before.name == recipe.name) {
+            let message = format!("there is a recipe {:?} already; names must differ", recipe.name);
+            return Err(recipe.name_spot.error(root.document, message));
+        }
+        recipes.push(recipe);
+    }
+    Ok(recipes)
+}
+
+/// The index of the recipe that `item` names.
+pub(super) fn find(recipes: &[FileRecipe], item: &Item<'_>) -> Result<usize> {
+    let name = item.string()?;
+    recipes.iter().position(|recipe| recipe.name == name).ok_or_else(|| {
+        let names: Vec<_> = recipes.iter().map(|recipe| format!("{:?}", recipe.name)).collect();
+        let known =
+            if names.is_empty() { "there is none".into() } else { format!("there are {}", names.join(", ")) };
+        item.error(format!("there is no recipe {name:?}; {known}"))
+    })
+}
+
+/// A name that `--bind NAME=DEVICE` and `--set` can carry, of at most 32 bytes.
+pub(super) fn read_name(table: &Reader<'_>) -> Result<(String, Spot)> {
+    let item = table.required("name", "what the rest of the file and the tools call it")?;
+    let name = item.string()?;
+    let max = proto_core::config::MAX_NAME;
+    if name.is_empty() || name.len() > max {
+        return Err(item.error(format!("{} bytes long; 1..={max}", name.len())));
+    }
+    if name.contains(|c: char| c == '=' || c == '"' || c.is_whitespace() || c.is_control()) {
+        return Err(item.error(format!("{name:?} has a blank, a quote or '=' in it")));
+    }
+    Ok((name.to_owned(), item.spot))
+}
+
+fn read(table: &Reader<'_>, flavour: Flavour) -> Result<FileRecipe> {
+    let (name, name_spot) = read_name(table)?;
+    let is_can =
+        table.required("kind", "\"stream\" or \"can\"")?.choice(&[("stream", false), ("can", true)])?;
+    let mode = table
+        .required("mode", "\"realtime\" (system variables) or \"user\" (fields of your own)")?
+        .choice(&[("realtime", Mode::Realtime), ("user", Mode::User)])?;
+    let read_part = |key, direction| match table.optional(key) {
+        Some(item) => read_part(&item, Rules { mode, direction }, is_can, flavour).map(Some),
+        None => Ok(None),
+    };
+    let input = read_part("input", Direction::Input)?;
+    let output = read_part("output", Direction::Output)?;
+    if input.is_none() && output.is_none() {
+        return Err(table.error("neither input nor output; a recipe needs at least one of them"));
+    }
+    Ok(FileRecipe { spot: table.spot.clone(), name, name_spot, mode, is_can, input, output })
+}
+
+fn read_part(item: &Item<'_>, rules: Rules, is_can: bool, flavour: Flavour) -> Result<FilePart> {
+    let is_gateway_output = flavour == Flavour::Gateway && rules.direction == Direction::Output;
+    let table = item.any_table()?;
+    let own: &[&str] = if is_can { &["frame"] } else { &["head", "tail", "fields"] };
+    let sending_keys: &[&str] = if is_gateway_output { &["on_stale", "send"] } else { &[] };
+    let when = if is_can { " of a CAN recipe" } else { " of a stream recipe" };
+    table.check_keys(&[own, sending_keys].concat(), when)?;
+
+    let mut part = FilePart {
+        spot: table.spot.clone(),
+        head: Vec::new(),
+        tail: Vec::new(),
+        head_spot: None,
+        tail_spot: None,
+        frames: Vec::new(),
+        sending: bindings::read_sending(&table)?,
+    };
+    if is_can {
+        let keys = ["id", "extended", "fields"];
+        for frame in table.tables("frame", &keys)? {
+            let item = frame.required("id", "the frame's CAN id")?;
+            let id = read_id(&frame, &item)?;
+            let fields = read_fields(&frame, rules, flavour)?;
+            part.frames.push(FileFrame { spot: frame.spot.clone(), id, id_spot: item.spot, fields });
+        }
+    } else {
+        (part.head, part.head_spot) = read_bytes(&table, "head")?;
+        (part.tail, part.tail_spot) = read_bytes(&table, "tail")?;
+        let fields = read_fields(&table, rules, flavour)?;
+        let spot = table.spot.clone();
+        part.frames.push(FileFrame { spot: spot.clone(), id: CanId::Standard(0), id_spot: spot, fields });
+    }
+    // UDP has the fewest demands; user-defined recipes are for RS-485 only (D16).
+    let framing = if rules.mode == Mode::User { Framing::Bytes } else { Framing::Datagram };
+    match part.check(rules, is_can, framing) {
+        Ok(()) => Ok(part),
+        Err(error) => Err(part.spot_of(error).error(table.document, error)),
+    }
+}
+
+/// 11 bits, or 29 with `extended = true`.
+fn read_id(frame: &Reader<'_>, item: &Item<'_>) -> Result<CanId> {
+    let is_extended = frame.optional("extended").map_or(Ok(false), |item| item.bool())?;
+    let number: i64 = item.integer(i64::MIN..=i64::MAX)?;
+    let standard = || u16::try_from(number).ok().map(CanId::Standard);
+    let extended = || u32::try_from(number).ok().map(CanId::Extended);
+    let id = if is_extended { extended() } else { standard() };
+    id.filter(|id| id.is_valid()).ok_or_else(|| {
+        let hint = if extended().is_some_and(CanId::is_valid) {
+            "; with extended = true, 0..=0x1FFFFFFF"
+        } else {
+            ""
+        };
+        let limit = if is_extended { "0x1FFFFFFF" } else { "0x7FF" };
+        let shown = if number < 0 { number.to_string() } else { format!("{number:#X}") };
+        item.error(format!("{shown} is out of range; 0..={limit}{hint}"))
+    })
+}
+
+fn read_bytes(table: &Reader<'_>, key: &str) -> Result<(Vec<u8>, Option<Spot>)> {
+    let Some(item) = table.optional(key) else { return Ok((Vec::new(), None)) };
+    let bytes =
+        item.array("such as [255, 255]")?.iter().map(|item| item.integer(0..=255)).collect::<Result<_>>()?;
+    Ok((bytes, Some(item.spot)))
+}
+
+fn read_fields(table: &Reader<'_>, rules: Rules, flavour: Flavour) -> Result<Vec<FileField>> {
+    let list = table.required("fields", "the list of the frame's fields")?;
+    let mut fields = Vec::new();
+    for item in list.array("such as [\"RobotState[8..13]\"]")? {
+        match (rules.mode, item.as_string()) {
+            (Mode::Realtime, Some(name)) => {
+                let range =
+                    VarRange::parse(name).map_err(|error| item.error(format!("{name:?}: {error}")))?;
+                fields.extend(
+                    range
+                        .iter()
+                        .map(|var| FileField { spot: item.spot.clone(), kind: FileFieldKind::System(var) }),
+                );
+            }
+            (Mode::Realtime, None) => {
+                return Err(item.error(
+                    "a realtime recipe's fields are names of system variables, such as \"RobotState[8]\"; \
+                     for fields of your own set mode = \"user\"",
+                ));
+            }
+            (Mode::User, Some(_)) => {
+                return Err(item.error(
+                    "a user recipe's fields are tables, such as { name = \"grip\", type = \"byte\" }; \
+                     for system variables set mode = \"realtime\"",
+                ));
+            }
+            (Mode::User, None) => fields.push(read_user_field(&item, rules.direction, flavour)?),
+        }
+    }
+    Ok(fields)
+}
+
+fn read_user_field(item: &Item<'_>, direction: Direction, flavour: Flavour) -> Result<FileField> {
+    let table = item.any_table()?;
+    let bound: &[&str] = match (flavour, direction) {
+        (Flavour::Controller, _) => &[],
+        (Flavour::Gateway, Direction::Input) => &["to", "commands", "when", "scale", "offset"],
+        (Flavour::Gateway, Direction::Output) => &["from", "value", "scale", "offset"],
+    };
+    let when = match direction {
+        Direction::Input => " of an input field",
+        Direction::Output => " of an output field",
+    };
+    table.check_keys(&[&["name", "type"], bound].concat(), when)?;
+    let name = table.required("name", "what you call the field")?.string()?.to_owned();
+    let types: Vec<_> = ScalarType::ALL.into_iter().map(|ty| (ty.name(), ty)).collect();
+    let ty =
+        table.required("type", "byte, char, word, short, dword, int, float or double")?.choice(&types)?;
+    let kind = match (direction, flavour) {
+        (Direction::Input, Flavour::Gateway) => {
+            FileFieldKind::UserInput { name, ty, to: bindings::read_input(&table)? }
+        }
+        (Direction::Input, Flavour::Controller) => {
+            FileFieldKind::UserInput { name, ty, to: FileInput::Unused }
+        }
+        (Direction::Output, Flavour::Gateway) => {
+            FileFieldKind::UserOutput { name, ty, from: bindings::read_output(&table)? }
+        }
+        (Direction::Output, Flavour::Controller) => {
+            FileFieldKind::UserOutput { name, ty, from: FileOutput::Program }
+        }
+    };
+    Ok(FileField { spot: item.spot.clone(), kind })
+}
+
+impl FilePart {
+    /// Whether the part is fit for this framing.
+    fn check(&self, rules: Rules, is_can: bool, framing: Framing) -> std::result::Result<(), PartError> {
+        let fields = |frame: &FileFrame| frame.fields.iter().map(FileField::field).collect::<Vec<_>>();
+        if is_can {
+            CanLayout::new(rules, self.frames.iter().map(|frame| (frame.id, fields(frame)))).map(|_| ())
+        } else {
+            let all = self.frames.iter().flat_map(fields);
+            StreamLayout::new(rules, &self.head, &self.tail, all, framing).map(|_| ())
+        }
+    }
+
+    /// The place that `error` is about.
+    fn spot_of(&self, error: PartError) -> &Spot {
+        let delimiter = match error {
+            PartError::HeadTooLong { .. } => self.head_spot.as_ref(),
+            PartError::TailTooLong { .. } => self.tail_spot.as_ref(),
+            _ => None,
+        };
+        let frame = error.frame().and_then(|frame| self.frames.get(usize::from(frame)));
+        let field = error.field().and_then(|at| {
+            self.frames.get(usize::from(at.frame.unwrap_or(0)))?.fields.get(usize::from(at.field))
+        });
+        match error {
+            PartError::InvalidId { .. } | PartError::DuplicateId { .. } => frame.map(|frame| &frame.id_spot),
+            _ => delimiter.or(field.map(|field| &field.spot)).or(frame.map(|frame| &frame.spot)),
+        }
+        .unwrap_or(&self.spot)
+    }
+}
+
+impl FileRecipe {
+    pub(super) fn part(&self, direction: Direction) -> Option<&FilePart> {
+        match direction {
+            Direction::Input => self.input.as_ref(),
+            Direction::Output => self.output.as_ref(),
+        }
+    }
+
+    /// Whether a port with this framing can carry the recipe; what is wrong otherwise.
+    pub(super) fn check_framing(&self, framing: Framing) -> std::result::Result<(), String> {
+        for direction in [Direction::Input, Direction::Output] {
+            if let Some(part) = self.part(direction) {
+                part.check(Rules { mode: self.mode, direction }, self.is_can, framing)
+                    .map_err(|error| format!("recipe {:?} does not fit this port: {error}", self.name))?;
+            }
+        }
+        Ok(())
+    }
+
+    /// The recipe with the names of its fields and without what a gateway does with them.
+    pub(super) fn to_sim(&self) -> SimRecipe {
+        let fields = |frame: &FileFrame| {
+            frame.fields.iter().map(|field| SimField { name: field.name(), field: field.field() }).collect()
+        };
+        let stream = |part: &Option<FilePart>| {
+            part.as_ref().map(|part| SimStreamPart {
+                head: part.head.clone(),
+                tail: part.tail.clone(),
+                fields: part.frames.iter().flat_map(|frame| -> Vec<_> { fields(frame) }).collect(),
+            })
+        };
+        let can = |part: &Option<FilePart>| {
+            let frames = part.iter().flat_map(|part| &part.frames);
+            frames.map(|frame| SimCanFrame { id: frame.id, fields: fields(frame) }).collect()
+        };
+        let parts = if self.is_can {
+            SimParts::Can { input: can(&self.input), output: can(&self.output) }
+        } else {
+            SimParts::Stream { input: stream(&self.input), output: stream(&self.output) }
+        };
+        SimRecipe { name: self.name.clone(), mode: self.mode, parts }
+    }
+}

@@ -1,0 +1,395 @@
+//! What time does: transitions, the program's calls, the grids.
+
+use proto_core::time::{Duration, Instant};
+use proto_core::wire::dialect::{FinishNotice, Motion};
+use proto_core::wire::scalar::Scalar;
+
+use super::faults::Link;
+use super::machine::{Effect, ErrorId};
+use super::motion::Braking;
+use super::ports::{Listening, Outgoing};
+use super::program::{Answer, Call, End, Program, Progress, Script, Variables};
+use super::registers::Status;
+use super::{ConnId, Controller, ControllerOutput, MAX_LOG};
+use recipe_config::InitialTarget;
+
+/// The program that was started and has not stopped yet.
+#[derive(Debug)]
+pub(super) struct Running {
+    program: Program,
+    activity: Activity,
+    started_by: Option<ConnId>,
+}
+
+/// What the program's pending call is doing.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Activity {
+    /// Not looked at yet, or nothing that lasts.
+    Fresh,
+    Waiting {
+        until: Instant,
+    },
+    /// A wait that a pause has interrupted.
+    Held {
+        left: Duration,
+    },
+    Moving,
+    Sending {
+        port: usize,
+    },
+    /// It has done enough for now.
+    GivingWay {
+        until: Instant,
+    },
+}
+
+impl Running {
+    pub(super) fn name(&self) -> &str {
+        self.program.name()
+    }
+
+    pub(super) fn variables(&self) -> Variables {
+        self.program.variables()
+    }
+}
+
+impl Controller {
+    /// Brings everything up to `now`.
+    pub(super) fn advance(&mut self, now: Instant) {
+        while let Some(effect) = self.machine.poll(now) {
+            self.apply(now, effect);
+            self.settle(now);
+        }
+        self.settle(now);
+        self.refresh(now);
+        if self.running.is_some() {
+            self.drive_program(now);
+            self.refresh(now);
+        }
+        self.poll_ports(now);
+        self.poll_state_stream(now);
+        self.poll_server(now);
+    }
+
+    /// When something happens by itself.
+    pub(super) fn deadline(&self) -> Instant {
+        let program = self.running.as_ref().filter(|_| self.machine.program_runs()).and_then(|running| {
+            match running.activity {
+                Activity::Waiting { until } | Activity::GivingWay { until } => Some(until),
+                Activity::Moving => self.arm.arrival(),
+                Activity::Fresh | Activity::Held { .. } | Activity::Sending { .. } => None,
+            }
+        });
+        let state = self.server.has_subscribers().then(|| self.state_grid.next());
+        let ports = self.ports.iter().filter_map(|port| port.deadline()).min();
+        let all = [self.machine.deadline(), program, state, ports, self.server.deadline()];
+        all.into_iter().flatten().min().unwrap_or(Instant::NEVER)
+    }
+
+    /// Carries out what a transition asks for.
+    pub(super) fn apply(&mut self, now: Instant, effect: Effect) {
+        match effect {
+            Effect::None => {}
+            Effect::Hold => {
+                self.slow_down(now, Braking::Normal);
+                if let Some(running) = &mut self.running
+                    && let Activity::Waiting { until } = running.activity
+                {
+                    running.activity = Activity::Held { left: until.saturating_since(now) };
+                }
+            }
+            Effect::Continue => {
+                self.arm.set_rate(now, self.machine.rate(), Braking::Normal);
+                if let Some(running) = &mut self.running
+                    && let Activity::Held { left } = running.activity
+                {
+                    running.activity = Activity::Waiting { until: now + left };
+                }
+            }
+            Effect::Abort(braking) => {
+                if let Some(running) = &mut self.running {
+                    running.program.answer(now, Answer::Abort);
+                    running.activity = Activity::Fresh;
+                }
+                self.slow_down(now, braking);
+            }
+            Effect::ProgramEnded => {
+                self.arm.settle(now);
+                self.arm_shown = None;
+                self.program_is_over(now);
+            }
+            Effect::ShutDown => {
+                self.server.close_all(&mut self.outputs);
+                self.running = None;
+                self.outputs.push_back(ControllerOutput::Shutdown);
+                self.gone = true;
+            }
+        }
+    }
+
+    /// Starts the script; its first calls are carried out with the next [`Self::advance`].
+    pub(super) fn start_program(
+        &mut self,
+        now: Instant,
+        script: &Script,
+        conn: ConnId,
+    ) -> Result<(), ErrorId> {
+        for port in &mut self.ports {
+            port.forget_received();
+        }
+        match Program::start(script, now) {
+            Ok(program) => {
+                self.running = Some(Running { program, activity: Activity::Fresh, started_by: Some(conn) });
+                self.machine.program_started();
+                self.counters.programs_started += 1;
+                Ok(())
+            }
+            Err(error) => {
+                let message = format!("{}: no thread for the program: {error}", script.name());
+                self.machine.fail(ErrorId::ProgramFailed, message);
+                Err(ErrorId::ProgramFailed)
+            }
+        }
+    }
+
+    /// Runs the arm at the present speed, if it runs at all.
+    pub(super) fn speed_changed(&mut self, now: Instant) {
+        if self.machine.program_runs() {
+            self.arm.set_rate(now, self.machine.rate(), Braking::Normal);
+        }
+    }
+
+    /// Whether frames for a program are kept.
+    pub(super) fn listening(&self) -> Listening {
+        if self.running.is_some() { Listening::Yes } else { Listening::No }
+    }
+
+    fn slow_down(&mut self, now: Instant, braking: Braking) {
+        self.arm.set_rate(now, 0.0, braking);
+        self.machine.arm_rests_at(self.arm.rest().unwrap_or(now));
+    }
+
+    /// Shows the registers what the arm and the state machines do.
+    fn refresh(&mut self, now: Instant) {
+        let machine = &self.machine;
+        self.registers.show_status(Status {
+            mode: machine.mode().code(),
+            mode_register: self.dialect.mode_to_register(machine.mode(), Motion::Real),
+            robot: self.dialect.robot_code(machine.robot()),
+            program: machine.program().code(),
+            safety: self.dialect.safety_code(machine.safety()),
+            collision_axis: machine.collision_axis(),
+            error: machine.robot_error().map_or(0, ErrorId::code),
+            // At most 100.
+            speed_percent: machine.speed_percent().round() as u8,
+            drives_on: machine.drives_on(),
+        });
+        let stale = match self.arm_shown {
+            None => true,
+            Some(shown) => {
+                let rest = self.arm.rest();
+                let at_rest = rest.is_some_and(|rest| rest <= shown);
+                let just_stopped = rest.is_some_and(|rest| rest <= now);
+                !at_rest && (just_stopped || now >= shown + SERVO_CYCLE)
+            }
+        };
+        if stale {
+            let tool = self.registers.tool();
+            let actual = self.arm.observe(now, &tool, self.registers.payload_kg());
+            // The simulated servo drives follow without lag.
+            self.registers.show_arm(actual, actual);
+            self.arm_shown = Some(now);
+        }
+    }
+
+    /// Answers the program's calls as far as they can be answered now.
+    fn drive_program(&mut self, now: Instant) {
+        while self.machine.program_runs() {
+            let Some(running) = &self.running else { return };
+            match running.program.progress().clone() {
+                Progress::Calling(call) => {
+                    let Some(answer) = self.serve(now, &call) else { return };
+                    if let Some(running) = &mut self.running {
+                        running.activity = Activity::Fresh;
+                        running.program.answer(now, answer);
+                    }
+                }
+                Progress::Ended(end) => {
+                    if let End::Failed(message) = end {
+                        self.counters.programs_failed += 1;
+                        let message = format!("{}: {message}", running.name());
+                        self.machine.fail(ErrorId::ProgramFailed, message);
+                    }
+                    self.machine.program_ended();
+                    self.program_is_over(now);
+                    return;
+                }
+            }
+        }
+    }
+
+    fn program_is_over(&mut self, now: Instant) {
+        let Some(running) = self.running.take() else { return };
+        self.variables = running.variables();
+        for port in &mut self.ports {
+            port.forget_received();
+        }
+        if self.dialect.finish_notice == FinishNotice::ScriptFinish
+            && let Some(conn) = running.started_by
+        {
+            self.send_finish_notice(now, conn);
+        }
+    }
+
+    /// The answer to a call, if it has one already.
+    fn serve(&mut self, now: Instant, call: &Call) -> Option<Answer> {
+        let activity = self.running.as_ref().map_or(Activity::Fresh, |running| running.activity);
+        match call {
+            Call::Receive { port } => {
+                let port = match self.port_named(port) {
+                    Ok(nth) => self.ports.get_mut(nth)?,
+                    Err(message) => return Some(Answer::Error(message)),
+                };
+                if let Err(message) = port.check_receive() {
+                    return Some(Answer::Error(message));
+                }
+                let frame = port.next_received()?;
+                Some(Answer::Frame { id: frame.id, values: frame.values })
+            }
+            Call::Send { port, id, values } => {
+                if let Activity::Sending { port } = activity {
+                    let port = self.ports.get(port)?;
+                    return match (port.is_busy(), port.is_up()) {
+                        (true, _) => None,
+                        (false, true) => Some(Answer::Done),
+                        (false, false) => Some(Answer::Error(format!("{} was disconnected", port.name()))),
+                    };
+                }
+                let nth = match self.port_named(port) {
+                    Ok(nth) => nth,
+                    Err(message) => return Some(Answer::Error(message)),
+                };
+                let port = self.ports.get_mut(nth)?;
+                if port.is_busy() {
+                    // What a program before this one has sent is still leaving.
+                    return None;
+                }
+                match port.send(*id, values) {
+                    Ok(()) => self.begin_activity(Activity::Sending { port: nth }),
+                    Err(message) => Some(Answer::Error(message)),
+                }
+            }
+            Call::Get { name } => Some(match name.parse() {
+                Ok(InitialTarget::Var(var)) => Answer::Value(self.registers.var(var)),
+                Ok(InitialTarget::Bit { group, index }) => Answer::Bit(self.registers.bit(group, index)),
+                Ok(target) => Answer::Value(Scalar::Double(self.registers.value(target))),
+                Err(error) => Answer::Error(format!("{name}: {error}")),
+            }),
+            Call::Set { name, value } => Some(match name.parse() {
+                Ok(target) => match self.registers.set_by_program(target, *value) {
+                    Ok(()) => Answer::Done,
+                    Err(error) => Answer::Error(error.to_string()),
+                },
+                Err(error) => Answer::Error(format!("{name}: {error}")),
+            }),
+            Call::MoveJ { target, speed_rad_s } => {
+                if activity != Activity::Moving {
+                    let started = self.arm.move_to(now, *target, *speed_rad_s, self.machine.rate());
+                    if let Err(error) = started {
+                        return Some(Answer::Error(format!("movej: {error}")));
+                    }
+                    self.begin_activity(Activity::Moving);
+                }
+                if self.arm.arrival().is_none_or(|arrival| now < arrival) {
+                    return None;
+                }
+                self.refresh(now);
+                self.arm.settle(now);
+                Some(Answer::Done)
+            }
+            Call::Wait(time) => {
+                let until = match activity {
+                    Activity::Waiting { until } => until,
+                    _ => now + *time,
+                };
+                if now >= until {
+                    Some(Answer::Done)
+                } else {
+                    self.begin_activity(Activity::Waiting { until })
+                }
+            }
+            Call::GiveWay { until } => {
+                if now >= *until {
+                    Some(Answer::Done)
+                } else {
+                    self.begin_activity(Activity::GivingWay { until: *until })
+                }
+            }
+            Call::Log(line) => {
+                tracing::info!(target: "program", "{line}");
+                if self.log.len() >= MAX_LOG {
+                    self.log.pop_front();
+                }
+                self.log.push_back(line.clone());
+                Some(Answer::Done)
+            }
+        }
+    }
+
+    /// No answer yet.
+    fn begin_activity(&mut self, activity: Activity) -> Option<Answer> {
+        if let Some(running) = &mut self.running {
+            running.activity = activity;
+        }
+        None
+    }
+
+    fn port_named(&self, name: &str) -> Result<usize, String> {
+        self.ports.iter().position(|port| port.name() == name).ok_or_else(|| {
+            let names: Vec<_> = self.ports.iter().map(|port| port.name()).collect();
+            format!("no port is called {name}; there are {}", names.join(", "))
+        })
+    }
+
+    fn poll_ports(&mut self, now: Instant) {
+        let spoiled = self.faults.spoiled().image(self.registers.image());
+        let image = spoiled.as_ref().unwrap_or(self.registers.image());
+        for (nth, port) in self.ports.iter_mut().enumerate() {
+            let outgoing = port.poll(now, image);
+            if self.faults.mutes_port(nth) {
+                if !outgoing.is_empty() {
+                    port.sent();
+                }
+                continue;
+            }
+            self.outputs.extend(outgoing.into_iter().map(|outgoing| match outgoing {
+                Outgoing::Bytes(bytes) => ControllerOutput::PortSend { port: nth, bytes },
+                Outgoing::Can(frame) => ControllerOutput::PortSendCan { port: nth, frame },
+                Outgoing::Datagram { peer, bytes } => ControllerOutput::UdpSend { peer, bytes },
+            }));
+        }
+    }
+
+    fn poll_state_stream(&mut self, now: Instant) {
+        let Some(missed) = self.state_grid.due(now) else { return };
+        if !self.server.has_subscribers() {
+            return;
+        }
+        self.counters.missed_state_packets += missed;
+        let mut bytes = self.registers.packet(self.dialect.global_speed);
+        self.faults.spoiled().put_in_packet(&mut bytes);
+        if self.faults.mutes(Link::State) {
+            self.counters.state.muted += 1;
+            return;
+        }
+        self.counters.state.requests += 1;
+        self.counters.state.bytes_out += bytes.len() as u64;
+        match self.faults.take_state_cut() {
+            Some(at) => self.send_cut_packet(bytes.get(..at).unwrap_or(&bytes[..])),
+            None => self.outputs.push_back(ControllerOutput::StatePacket { bytes }),
+        }
+    }
+}
+
+/// How often the arm's controller looks at its joints.
+const SERVO_CYCLE: Duration = Duration::from_millis(1);

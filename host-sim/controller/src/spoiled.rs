@@ -1,0 +1,105 @@
+//! Floats that are shown as something else, such as NaN: in state packets and in the frames of
+//! recipes' output parts, wherever the item stands there. The item itself keeps its value.
+
+use proto_core::sysvar::{IMAGE_BYTES, SysVar};
+use proto_core::wire::scalar::ScalarType;
+use proto_core::wire::state::{FIELDS, LEN};
+
+use recipe_config::{AnalogInput, InitialTarget};
+
+/// The items, with what is shown instead.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Spoiled(Vec<(Item, f32)>);
+
+/// Where an item is shown.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Item {
+    /// In the process image, and so in recipes' frames.
+    image: Option<usize>,
+    /// In the state packet.
+    packet: Option<usize>,
+}
+
+/// No float has this name.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct NoSuchFloat(pub String);
+
+impl std::fmt::Display for NoSuchFloat {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let name = &self.0;
+        write!(f, "{name} is no float; a system variable, an analog input, or an item of the state packet")
+    }
+}
+
+impl std::error::Error for NoSuchFloat {}
+
+impl Spoiled {
+    /// Shows `instead` for the item of this name from now on.
+    pub(super) fn spoil(&mut self, name: &str, instead: f32) -> Result<(), NoSuchFloat> {
+        let item = find(name)?;
+        self.0.retain(|other| other.0 != item);
+        self.0.push((item, instead));
+        Ok(())
+    }
+
+    /// Shows its value again.
+    pub(super) fn heal(&mut self, name: &str) -> Result<(), NoSuchFloat> {
+        let item = find(name)?;
+        self.0.retain(|other| other.0 != item);
+        Ok(())
+    }
+
+    /// The process image as recipes show it; `None` when that is as it is.
+    pub(super) fn image(&self, image: &[u8; IMAGE_BYTES]) -> Option<[u8; IMAGE_BYTES]> {
+        if self.0.is_empty() {
+            return None;
+        }
+        let mut shown = *image;
+        self.put(&mut shown, |item| item.image);
+        Some(shown)
+    }
+
+    pub(super) fn put_in_packet(&self, packet: &mut [u8; LEN]) {
+        self.put(packet, |item| item.packet);
+    }
+
+    fn put(&self, bytes: &mut [u8], place: impl Fn(Item) -> Option<usize>) {
+        for &(item, instead) in &self.0 {
+            let bytes = place(item).and_then(|offset| bytes.get_mut(offset..offset + 4));
+            if let Some(bytes) = bytes {
+                bytes.copy_from_slice(&instead.to_le_bytes());
+            }
+        }
+    }
+}
+
+/// A system variable, an analog input, or `FIELD[N]` of the packet with N from 1.
+fn find(name: &str) -> Result<Item, NoSuchFloat> {
+    let wrong = || NoSuchFloat(name.to_owned());
+    match name.parse() {
+        Ok(InitialTarget::Var(var)) if var.ty() == ScalarType::Float => return Ok(variable(var)),
+        Ok(InitialTarget::Analog { group, index }) => {
+            let (field, before) = match group {
+                AnalogInput::CabinetCurrent => ("analog_inputs", 0),
+                AnalogInput::CabinetVoltage => ("analog_inputs", AnalogInput::CabinetCurrent.count()),
+                AnalogInput::Tool => ("tool_analog_inputs", 0),
+            };
+            return in_packet(field, usize::from(before + index)).ok_or_else(wrong);
+        }
+        _ => {}
+    }
+    let field = name.strip_suffix(']').and_then(|name| name.split_once('['));
+    let item = field.and_then(|(field, index)| in_packet(field, index.parse().ok()?));
+    item.ok_or_else(wrong)
+}
+
+fn variable(var: SysVar) -> Item {
+    let packet = var.stream().map(|place| usize::from(place.offset));
+    Item { image: Some(var.image_offset()), packet }
+}
+
+fn in_packet(field: &str, index: usize) -> Option<Item> {
+    let field = FIELDS.iter().find(|place| place.name == field && place.ty == ScalarType::Float)?;
+    let nth = index.checked_sub(1).filter(|&nth| nth < usize::from(field.count))?;
+    Some(Item { image: None, packet: Some(usize::from(field.offset) + 4 * nth) })
+}

@@ -1,0 +1,311 @@
+//! The whole controller in virtual time.
+
+mod any_order;
+mod commands;
+mod examples;
+mod faults;
+mod modbus;
+mod ports;
+mod programs;
+mod room;
+mod slices;
+mod stream;
+mod when_done;
+
+use std::collections::BTreeMap;
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+
+use proto_core::config::{Parity, Rs485};
+use proto_core::recipe::CanFrame;
+use proto_core::recipe::model::{CanId, Field, Mode};
+use proto_core::sysvar::VarRange;
+use proto_core::time::{Duration, Instant};
+use proto_core::wire::scalar::ScalarType;
+use proto_core::wire::state::StatePacket;
+
+use super::*;
+use recipe_config::{
+    Initial, Power, SimBus, SimCanFrame, SimField, SimParts, SimPort, SimProgram, SimRecipe, SimStreamPart,
+};
+
+/// The shell may keep it in a task of any runtime.
+const _: fn() = || {
+    fn is_send<T: Send>() {}
+    is_send::<Controller>();
+};
+
+/// Something a port sent.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) enum Out {
+    Bytes(Vec<u8>),
+    Can(CanFrame),
+    Datagram(SocketAddr, Vec<u8>),
+    Closed,
+}
+
+/// A controller, its clients and its devices on one clock that jumps from deadline to deadline.
+pub(super) struct Cell {
+    pub(super) controller: Controller,
+    pub(super) now: Instant,
+    /// Bytes that each connection received and nobody has looked at.
+    received: BTreeMap<ConnId, Vec<u8>>,
+    pub(super) closed: Vec<ConnId>,
+    /// What ports sent, with the time.
+    pub(super) sent: Vec<(Instant, usize, Out)>,
+    pub(super) packets: Vec<(Instant, StatePacket)>,
+    /// How long a port takes to send.
+    pub(super) line_time: Duration,
+    leaving: Vec<(Instant, usize)>,
+    pub(super) shut_down: bool,
+    next_conn: u64,
+}
+
+impl Cell {
+    #[track_caller]
+    pub(super) fn new(config: &SimConfig) -> Self {
+        let mut cell = Self {
+            controller: Controller::new(config).unwrap(),
+            now: Instant::from_millis(1_000),
+            received: BTreeMap::new(),
+            closed: Vec::new(),
+            sent: Vec::new(),
+            packets: Vec::new(),
+            line_time: Duration::from_micros(700),
+            leaving: Vec::new(),
+            shut_down: false,
+            next_conn: 1,
+        };
+        for port in 0..config.ports.len() {
+            cell.input(ControllerInput::PortUp { port });
+        }
+        cell
+    }
+
+    pub(super) fn input(&mut self, input: ControllerInput<'_>) {
+        self.controller.handle(self.now, input);
+        self.drain();
+    }
+
+    /// Takes everything there is to take and returns when to come back.
+    pub(super) fn drain(&mut self) -> Instant {
+        loop {
+            match self.controller.poll_output(self.now) {
+                ControllerOutput::Send { conn, bytes } => {
+                    self.received.entry(conn).or_default().extend_from_slice(&bytes);
+                }
+                ControllerOutput::Close { conn } => self.closed.push(conn),
+                ControllerOutput::StatePacket { bytes } => {
+                    self.packets.push((self.now, StatePacket::parse(&bytes[..]).unwrap()));
+                }
+                ControllerOutput::UdpSend { peer, bytes } => {
+                    self.sent.push((self.now, usize::MAX, Out::Datagram(peer, bytes)));
+                }
+                ControllerOutput::PortSend { port, bytes } => {
+                    self.sent.push((self.now, port, Out::Bytes(bytes)));
+                    self.leaving.push((self.now + self.line_time, port));
+                }
+                ControllerOutput::PortSendCan { port, frame } => {
+                    self.sent.push((self.now, port, Out::Can(frame)));
+                    if !self.leaving.iter().any(|leaving| leaving.1 == port) {
+                        self.leaving.push((self.now + self.line_time, port));
+                    }
+                }
+                ControllerOutput::PortClose { port } => self.sent.push((self.now, port, Out::Closed)),
+                ControllerOutput::Shutdown => self.shut_down = true,
+                ControllerOutput::Sleep { until } => return until,
+            }
+        }
+    }
+
+    /// Lets time go by, deadline by deadline.
+    pub(super) fn run(&mut self, span: Duration) {
+        let end = self.now + span;
+        loop {
+            let wake = self.drain();
+            let left = self.leaving.iter().map(|leaving| leaving.0).min().unwrap_or(Instant::NEVER);
+            let next = wake.min(left);
+            assert!(next > self.now || left <= self.now, "a deadline that has come must be served");
+            if next > end {
+                self.now = end;
+                self.drain();
+                return;
+            }
+            self.now = next;
+            if let Some(nth) = self.leaving.iter().position(|leaving| leaving.0 <= next) {
+                let (_, port) = self.leaving.remove(nth);
+                self.input(ControllerInput::PortSent { port });
+            }
+        }
+    }
+
+    pub(super) fn run_ms(&mut self, millis: u64) {
+        self.run(Duration::from_millis(millis));
+    }
+
+    pub(super) fn new_conn(&mut self) -> ConnId {
+        self.next_conn += 1;
+        ConnId(self.next_conn)
+    }
+
+    pub(super) fn command_client(&mut self) -> ConnId {
+        let conn = self.new_conn();
+        self.input(ControllerInput::CommandOpened { conn, from: NEAR });
+        conn
+    }
+
+    pub(super) fn modbus_client(&mut self) -> ConnId {
+        let conn = self.new_conn();
+        self.input(ControllerInput::ModbusOpened { conn, from: NEAR });
+        conn
+    }
+
+    pub(super) fn state_client(&mut self) -> ConnId {
+        let conn = self.new_conn();
+        self.input(ControllerInput::StateOpened { conn, from: NEAR });
+        conn
+    }
+
+    /// What a connection has received since the last look.
+    pub(super) fn take(&mut self, conn: ConnId) -> Vec<u8> {
+        self.received.remove(&conn).unwrap_or_default()
+    }
+
+    /// Sends a command with a line end and returns the reply.
+    pub(super) fn ask(&mut self, conn: ConnId, text: &str) -> String {
+        let line = format!("{text}\r\n");
+        self.input(ControllerInput::CommandBytes { conn, bytes: line.as_bytes() });
+        String::from_utf8(self.take(conn)).unwrap()
+    }
+
+    /// Sends a command and lets time go by until it is answered.
+    #[track_caller]
+    pub(super) fn order(&mut self, conn: ConnId, text: &str) -> String {
+        let asked = self.now;
+        let mut reply = self.ask(conn, text);
+        while reply.is_empty() {
+            assert!(self.now < asked + Duration::from_secs(60), "{text} is never answered");
+            self.run_ms(1);
+            reply = String::from_utf8(self.take(conn)).unwrap();
+        }
+        reply
+    }
+
+    /// Sends a Modbus PDU and returns the answer's, function code and all.
+    #[track_caller]
+    pub(super) fn modbus(&mut self, conn: ConnId, pdu: &[u8]) -> Vec<u8> {
+        let mut adu = vec![0x12, 0x34, 0, 0, 0, pdu.len() as u8 + 1, 9];
+        adu.extend_from_slice(pdu);
+        self.input(ControllerInput::ModbusBytes { conn, bytes: &adu });
+        let answer = self.take(conn);
+        assert_eq!(answer[..4], [0x12, 0x34, 0, 0], "{answer:02x?}");
+        assert_eq!(usize::from(answer[5]) + 6, answer.len());
+        assert_eq!(answer[6], 9, "the unit is echoed");
+        answer[7..].to_vec()
+    }
+
+    /// One coil, through Modbus.
+    #[track_caller]
+    pub(super) fn coil(&mut self, address: u8) -> bool {
+        let conn = self.modbus_client();
+        let answer = self.modbus(conn, &[1, 0, address, 0, 1]);
+        self.input(ControllerInput::ModbusClosed { conn });
+        assert_eq!(answer[..2], [1, 1], "{answer:02x?}");
+        answer[2] == 1
+    }
+
+    /// Bytes at a port, and the time and bytes of all it sends.
+    pub(super) fn port_bytes(&mut self, port: usize, bytes: &[u8]) {
+        self.input(ControllerInput::PortBytes { port, bytes });
+    }
+
+    pub(super) fn counters(&self, port: &str) -> PortCounters {
+        self.controller.counters().ports[port]
+    }
+}
+
+/// Where clients are, unless a test says otherwise.
+pub(super) const NEAR: IpAddr = IpAddr::V4(Ipv4Addr::LOCALHOST);
+
+pub(super) fn peer(port: u16) -> SocketAddr {
+    (Ipv4Addr::LOCALHOST, port).into()
+}
+
+pub(super) fn rs485() -> SimBus {
+    SimBus::Rs485(Rs485 {
+        baud: 115_200,
+        parity: Parity::None,
+        stop_bits: 1,
+        idle_gap: Duration::from_millis(50),
+        turnaround: Duration::from_micros(300),
+    })
+}
+
+pub(super) fn system(names: &[&str]) -> Vec<SimField> {
+    let vars = names.iter().flat_map(|name| VarRange::parse(name).unwrap().iter());
+    vars.map(|var| SimField { name: var.to_string(), field: Field::System(var) }).collect()
+}
+
+pub(super) fn user(types: &[ScalarType]) -> Vec<SimField> {
+    let field =
+        |(nth, ty): (usize, &ScalarType)| SimField { name: format!("f{nth}"), field: Field::User(*ty) };
+    types.iter().enumerate().map(field).collect()
+}
+
+pub(super) fn part(head: &[u8], tail: &[u8], fields: Vec<SimField>) -> Option<SimStreamPart> {
+    Some(SimStreamPart { head: head.to_vec(), tail: tail.to_vec(), fields })
+}
+
+pub(super) fn can(id: u16, fields: Vec<SimField>) -> SimCanFrame {
+    SimCanFrame { id: CanId::Standard(id), fields }
+}
+
+/// A stream recipe with the delimiters of the worked examples.
+pub(super) fn stream_recipe(mode: Mode, input: Vec<SimField>, output: Vec<SimField>) -> SimRecipe {
+    let parts = SimParts::Stream {
+        input: part(&[255, 255], &[238, 238], input),
+        output: part(&[255, 255], &[254, 254], output),
+    };
+    SimRecipe { name: "r".to_owned(), mode, parts }
+}
+
+pub(super) fn can_recipe(mode: Mode, input: Vec<SimCanFrame>, output: Vec<SimCanFrame>) -> SimRecipe {
+    SimRecipe { name: "r".to_owned(), mode, parts: SimParts::Can { input, output } }
+}
+
+/// One port called `p` with one recipe.
+pub(super) fn one_port(bus: SimBus, recipe: SimRecipe) -> SimConfig {
+    let port = SimPort { name: "p".to_owned(), bus, recipe: Some(0), cycle: Duration::from_millis(4) };
+    SimConfig { recipes: vec![recipe], ports: vec![port], ..SimConfig::default() }
+}
+
+pub(super) fn with_program(mut config: SimConfig, name: &str, script: &str) -> SimConfig {
+    config.programs.push(SimProgram { name: name.to_owned(), script: script.to_owned() });
+    config
+}
+
+pub(super) fn with_initial(mut config: SimConfig, values: &[(&str, f64)]) -> SimConfig {
+    for (name, value) in values {
+        let target = target(name);
+        config.initial.push(Initial { target, value: *value });
+    }
+    config
+}
+
+pub(super) fn with_power(mut config: SimConfig, power: Power) -> SimConfig {
+    config.robot.power = power;
+    config
+}
+
+pub(super) fn with_dialect(mut config: SimConfig, name: &str) -> SimConfig {
+    config.robot.dialect = name.to_owned();
+    config
+}
+
+pub(super) fn target(name: &str) -> InitialTarget {
+    name.parse().unwrap()
+}
+
+/// The item's value now.
+pub(super) fn value(cell: &Cell, name: &str) -> f64 {
+    cell.controller.registers().value(target(name))
+}

@@ -1,0 +1,191 @@
+//! What a port's device and the port's owner have to say to each other: events one way, a handle to send
+//! with the other way, and the device's counters.
+
+use std::cell::{Cell, RefCell};
+use std::collections::VecDeque;
+
+use proto_core::engine::BusState;
+use proto_core::recipe::can::CanFrame;
+use proto_core::time::{Duration, Instant};
+use serde::Serialize;
+use tokio::sync::Notify;
+
+use recipe_net::quota::Quota;
+use recipe_net::timer::now;
+
+/// What a device did.
+#[derive(Debug, PartialEq)]
+pub enum PortEvent<'a> {
+    /// It can be used from now on.
+    Up,
+    /// It cannot any more.
+    Down,
+    /// Bytes arrived.
+    Bytes(&'a [u8]),
+    /// A CAN frame arrived.
+    Frame {
+        /// The frame.
+        frame: CanFrame,
+    },
+    /// A CAN controller's error state changed; told after each [`PortEvent::Up`] that knows it.
+    Bus(BusState),
+    /// Everything handed over has left.
+    Sent,
+}
+
+/// The sending side of a port. What does not fit is dropped and counted.
+#[derive(Debug, Default)]
+pub struct PortTx {
+    pub(super) bytes: RefCell<Vec<u8>>,
+    pub(super) frames: RefCell<VecDeque<CanFrame>>,
+    pub(super) wake: Notify,
+    pub(super) counters: Cell<DeviceCounters>,
+    /// What clients do is worth a few lines of the log.
+    pub(super) complaints: Quota,
+    /// What is read before this may have waited while the process slept.
+    stale_until: Cell<Instant>,
+    pub(super) slept: Notify,
+}
+
+impl PortTx {
+    /// This process slept until a moment ago: what waits in the device is as old as that. The port's owner
+    /// refuses everything for [`STALE`]; by then nothing old may be left behind.
+    pub fn note_sleep(&self, now: Instant) {
+        self.stale_until.set(now + STALE);
+        self.slept.notify_one();
+    }
+
+    /// Whether the port's owner refuses what is read now, since it may have waited while this process slept.
+    pub(super) fn is_stale(&self) -> bool {
+        self.stale_until.get() != Instant::ZERO && now() < self.stale_until.get()
+    }
+
+    /// Hands bytes over to a serial port.
+    pub fn send(&self, bytes: &[u8]) {
+        let mut queue = self.bytes.borrow_mut();
+        if queue.len() + bytes.len() > MAX_QUEUED_BYTES {
+            self.count(|counters| counters.dropped += 1);
+        } else {
+            queue.extend_from_slice(bytes);
+        }
+        self.wake.notify_one();
+    }
+
+    /// Hands a frame over to a CAN port.
+    pub fn send_frame(&self, frame: CanFrame) {
+        let mut queue = self.frames.borrow_mut();
+        if queue.len() == MAX_QUEUED_FRAMES {
+            self.count(|counters| counters.dropped += 1);
+        } else {
+            queue.push_back(frame);
+        }
+        self.wake.notify_one();
+    }
+
+    /// What the device did so far.
+    pub fn counters(&self) -> DeviceCounters {
+        self.counters.get()
+    }
+
+    pub(super) fn count(&self, change: impl FnOnce(&mut DeviceCounters)) {
+        let mut counters = self.counters.get();
+        change(&mut counters);
+        self.counters.set(counters);
+    }
+}
+
+/// What waited while the process slept. A peer's system may hold megabytes for a connection, more than can be
+/// read in the time in which the port's owner refuses it.
+#[derive(Debug, Default)]
+pub(super) struct Backlog {
+    /// More was there than could be read in that time.
+    is_behind: bool,
+    /// Since when no more was there than could be read at once.
+    small_since: Option<Instant>,
+}
+
+impl Backlog {
+    /// Whether what is read now may be part of it: then it may be read in greater pieces.
+    pub(super) fn is_open(&self, tx: &PortTx) -> bool {
+        self.is_behind || tx.is_stale()
+    }
+
+    /// Whether what was just read is part of it and not refused by the port's owner. `is_more` if there was
+    /// more than was read.
+    pub(super) fn has(&mut self, tx: &PortTx, is_more: bool) -> bool {
+        if tx.is_stale() {
+            self.is_behind = is_more;
+            return false;
+        }
+        if !self.is_behind {
+            return false;
+        }
+        let now = now();
+        // A peer's system may pause before it sends more of it.
+        let since = *self.small_since.get_or_insert(now);
+        if is_more {
+            self.small_since = None;
+        }
+        let is_over = !is_more && now.saturating_since(since) >= PAUSE;
+        // Who never pauses is heard again some time.
+        self.is_behind = !is_over && now.saturating_since(tx.stale_until.get()) < MOST_BACKLOG;
+        self.is_behind
+    }
+}
+
+/// What a port's device did so far.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+pub struct DeviceCounters {
+    /// Bytes received; of a CAN port, data bytes.
+    pub bytes_in: u64,
+    /// Bytes sent; of a CAN port, data bytes.
+    pub bytes_out: u64,
+    /// CAN frames received.
+    pub frames_in: u64,
+    /// CAN frames sent.
+    pub frames_out: u64,
+    /// Bytes sent while nobody listened.
+    pub unheard: u64,
+    /// Bytes a listener left unread for too long, whole frames given while the queue was full, and what waited
+    /// while the process slept and was read too late for the engine to refuse it.
+    pub dropped: u64,
+    /// Clients turned away because there was one already, or too many.
+    pub refused: u64,
+    /// Clients that the system could not hand over, for want of descriptors most likely.
+    pub accept_failures: u64,
+    /// Times the device became usable.
+    pub ups: u64,
+    /// Frames that the kernel dropped because they were not read in time (SO_RXQ_OVFL).
+    pub overruns: u64,
+    /// Times the kernel did not take a CAN frame for the moment; it was tried again.
+    pub refusals: u64,
+    /// Error frames: what a CAN interface told about itself and its bus.
+    pub error_frames: u64,
+    /// Times a CAN interface told that it had lost frames that it had received.
+    pub overflows: u64,
+    /// Times a CAN controller was started again after bus-off.
+    pub restarts: u64,
+    /// A CAN controller's transmit error counter, as it was told last.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub tx_error_counter: Option<u8>,
+    /// Its receive error counter.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub rx_error_counter: Option<u8>,
+    /// CAN FD frames, which no recipe takes.
+    pub fd_frames: u64,
+    /// A CAN controller's error state, where it is known: active, warning, passive or bus-off.
+    #[serde(skip_serializing_if = "str::is_empty")]
+    pub bus: &'static str,
+}
+
+/// For how long the engine refuses what arrives after a sleep, at least.
+pub const STALE: Duration = Duration::from_millis(50);
+/// How long less has to come than can be read at once until it is no part of a backlog: systems may need a while
+/// for more of it. The engine's links are not back earlier.
+const PAUSE: Duration = Duration::from_millis(100);
+/// However long a backlog is, after this it counts as new.
+const MOST_BACKLOG: Duration = Duration::from_secs(10);
+/// A frame of every port's recipe fits several times over; a port waits for one to leave.
+const MAX_QUEUED_BYTES: usize = 4_096;
+/// Twice the most ids of a recipe's part.
+const MAX_QUEUED_FRAMES: usize = 64;

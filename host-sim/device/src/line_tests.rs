@@ -1,0 +1,241 @@
+//! The three kinds of lines, with real terminals and sockets.
+
+use std::io::Write;
+
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpStream;
+
+use super::super::port::{Port, PortBus};
+use super::super::test_kit::{Client, Running, Seen, is_gone, run};
+use super::*;
+
+fn line(baud: u32) -> PortBus {
+    PortBus::Serial(Rs485 {
+        baud,
+        parity: Parity::None,
+        stop_bits: 1,
+        idle_gap: Duration::from_millis(50),
+        turnaround: Duration::ZERO,
+    })
+}
+
+#[test]
+fn a_byte_takes_its_start_data_parity_and_stop_bits() {
+    let PortBus::Serial(mut settings) = line(115_200) else { unreachable!() };
+    let micros = |settings: Rs485| settings.time_on_line(28).as_micros();
+    assert_eq!(micros(settings), 2_431);
+    settings.parity = Parity::Even;
+    settings.stop_bits = 2;
+    assert_eq!(micros(settings), 2_917);
+    for count in 0..600 {
+        let time = settings.time_on_line(count);
+        assert_eq!(bytes_in(&settings, time), count);
+        assert!(count == 0 || bytes_in(&settings, time - Duration::from_micros(1)) < count);
+    }
+}
+
+#[test]
+fn a_pty_carries_both_ways_and_reports_sent_when_the_line_would_be_free() {
+    run(async |dir| {
+        let link = dir.join("rs485").display().to_string();
+        let port = Running::start(&format!("pty:{link}"), line(9_600)).await;
+        assert_eq!(port.place, link);
+        port.expect(Seen::Up).await;
+        let mut client = Client::open(&link);
+        client.0.write_all(&[0xFF, 0xFF, 1, 2, 3, 0xEE, 0xEE]).unwrap();
+        assert_eq!(port.bytes(7).await, [0xFF, 0xFF, 1, 2, 3, 0xEE, 0xEE]);
+        let start = now();
+        port.tx.send(&[0x7D; 24]);
+        assert_eq!(client.read_exact(24).await, [0x7D; 24]);
+        let sent = port.expect(Seen::Sent).await;
+        // 240 bits at 9600 bit/s.
+        assert!(sent.saturating_since(start) >= Duration::from_micros(25_000));
+        let counters = port.tx.counters();
+        assert_eq!((counters.bytes_in, counters.bytes_out, counters.unheard), (7, 24, 0));
+        drop(port);
+        tokio::task::yield_now().await;
+        assert!(is_gone(&link));
+    });
+}
+
+#[test]
+fn a_paced_pty_shows_no_byte_before_its_time() {
+    run(async |dir| {
+        let link = dir.join("rs485").display().to_string();
+        let port = Running::start(&format!("pty-paced:{link}"), line(9_600)).await;
+        port.expect(Seen::Up).await;
+        let mut client = Client::open(&link);
+        let start = now();
+        port.tx.send(&[0x55; 24]);
+        let mut seen = 0;
+        while seen < 24 {
+            seen += client.read().len() as u64;
+            let ended = now().saturating_since(start).as_micros() * 9_600 / 10_000_000;
+            assert!(seen <= ended, "{seen} bytes where {ended} can have ended");
+            tokio::task::yield_now().await;
+        }
+        port.expect(Seen::Sent).await;
+    });
+}
+
+#[test]
+fn what_nobody_hears_is_counted_and_the_next_client_gets_only_new_bytes() {
+    run(async |dir| {
+        let link = dir.join("rs485").display().to_string();
+        let port = Running::start(&format!("pty:{link}"), line(115_200)).await;
+        port.expect(Seen::Up).await;
+        port.tx.send(b"lost");
+        port.expect(Seen::Sent).await;
+        assert_eq!(port.tx.counters().unheard, 4);
+        let first = Client::open(&link);
+        port.tx.send(b"unread");
+        port.expect(Seen::Sent).await;
+        drop(first);
+        port.tx.send(b"lost too");
+        port.expect(Seen::Sent).await;
+        let mut second = Client::open(&link);
+        port.tx.send(b"new");
+        assert_eq!(second.read_exact(3).await, b"new");
+        assert_eq!(port.tx.counters().unheard, 12);
+    });
+}
+
+#[test]
+fn a_client_that_does_not_read_loses_bytes_and_blocks_nothing() {
+    run(async |dir| {
+        let link = dir.join("rs485").display().to_string();
+        let port = Running::start(&format!("pty:{link}"), line(4_000_000)).await;
+        port.expect(Seen::Up).await;
+        let _client = Client::open(&link);
+        let mut sent = 0;
+        while port.tx.counters().dropped == 0 {
+            port.tx.send(&[0; 4_000]);
+            port.expect(Seen::Sent).await;
+            sent += 4_000;
+            assert!(sent < 4_000_000, "buffered without bound");
+        }
+        let counters = port.tx.counters();
+        assert_eq!(counters.bytes_out + counters.dropped, sent);
+    });
+}
+
+#[test]
+fn two_transmissions_follow_each_other_and_too_much_is_dropped() {
+    run(async |dir| {
+        let link = dir.join("rs485").display().to_string();
+        let port = Running::start(&format!("pty:{link}"), line(1_000_000)).await;
+        port.expect(Seen::Up).await;
+        let mut client = Client::open(&link);
+        port.tx.send(b"one");
+        assert_eq!(client.read_exact(3).await, b"one");
+        port.tx.send(b"two");
+        port.tx.send(&[b'x'; 5_000]);
+        assert_eq!(client.read_exact(3).await, b"two");
+        port.expect(Seen::Sent).await;
+        assert_eq!(port.tx.counters().dropped, 1);
+    });
+}
+
+#[test]
+fn a_serial_device_is_opened_with_any_rate_and_parity() {
+    run(async |dir| {
+        // Our own pseudoterminal stands in for the device.
+        let link = dir.join("device").display().to_string();
+        let device = Running::start(&format!("pty:{link}"), line(460_800)).await;
+        device.expect(Seen::Up).await;
+        let PortBus::Serial(settings) = line(460_800) else { unreachable!() };
+        let even = PortBus::Serial(Rs485 { parity: Parity::Even, ..settings });
+        let port = Running::start(&format!("serial:{link}"), even).await;
+        port.expect(Seen::Up).await;
+        device.tx.send(b"to the port");
+        assert_eq!(port.bytes(11).await, b"to the port");
+        device.expect(Seen::Sent).await;
+        port.tx.send(b"from it");
+        port.expect(Seen::Sent).await;
+        assert_eq!(device.bytes(7).await, b"from it");
+    });
+}
+
+#[test]
+fn a_serial_device_that_vanishes_is_opened_again() {
+    run(async |dir| {
+        let link = dir.join("device").display().to_string();
+        let device = Running::start(&format!("pty:{link}"), line(115_200)).await;
+        let port = Running::start(&format!("serial:{link}"), line(115_200)).await;
+        port.expect(Seen::Up).await;
+        drop(device);
+        port.expect(Seen::Down).await;
+        port.tx.send(b"into the void");
+        let device = Running::start(&format!("pty:{link}"), line(115_200)).await;
+        device.expect(Seen::Up).await;
+        port.expect(Seen::Up).await;
+        port.tx.send(b"back");
+        assert_eq!(device.bytes(4).await, b"back");
+        assert_eq!(port.tx.counters().ups, 2);
+    });
+}
+
+#[test]
+fn a_tcp_line_connects_when_its_server_appears_and_again_after_a_loss() {
+    run(async |_| {
+        // An address of its own: no other test is given the port while nobody listens.
+        let listener = TcpListener::bind("127.0.0.78:0").await.unwrap();
+        let at = listener.local_addr().unwrap();
+        drop(listener);
+        let port = Running::start(&format!("tcp:{at}"), line(115_200)).await;
+        assert_eq!(port.place, at.to_string());
+        let listener = TcpListener::bind(at).await.unwrap();
+        for _ in 0..2 {
+            let (mut server, _) = listener.accept().await.unwrap();
+            port.expect(Seen::Up).await;
+            server.write_all(b"hello").await.unwrap();
+            assert_eq!(port.bytes(5).await, b"hello");
+            port.tx.send(b"world");
+            let mut got = [0; 5];
+            server.read_exact(&mut got).await.unwrap();
+            assert_eq!(&got, b"world");
+            port.expect(Seen::Sent).await;
+            drop(server);
+            port.expect(Seen::Down).await;
+        }
+        assert_eq!(port.tx.counters().ups, 2);
+    });
+}
+
+#[test]
+fn a_listening_line_has_one_client_at_a_time() {
+    run(async |_| {
+        let port = Running::start("tcp:127.0.0.1:0", line(115_200)).await;
+        let mut first = TcpStream::connect(&port.place).await.unwrap();
+        port.expect(Seen::Up).await;
+        let mut second = TcpStream::connect(&port.place).await.unwrap();
+        assert_eq!(second.read(&mut [0; 8]).await.unwrap(), 0, "turned away");
+        assert_eq!(port.tx.counters().refused, 1);
+        first.write_all(b"still here").await.unwrap();
+        assert_eq!(port.bytes(10).await, b"still here");
+        drop(first);
+        port.expect(Seen::Down).await;
+        let mut third = TcpStream::connect(&port.place).await.unwrap();
+        port.expect(Seen::Up).await;
+        port.tx.send(b"next");
+        let mut got = [0; 4];
+        third.read_exact(&mut got).await.unwrap();
+        assert_eq!(&got, b"next");
+    });
+}
+
+#[test]
+fn what_does_not_suit_the_line_is_refused_by_name() {
+    run(async |dir| {
+        let refused = async |device: &str| {
+            Port::open(&device.parse().unwrap(), line(115_200)).await.unwrap_err().to_string()
+        };
+        assert!(refused("slcan-tcp:127.0.0.1:0").await.contains("is a CAN device"));
+        let missing = dir.join("ttyUSB9").display().to_string();
+        assert!(refused(&format!("serial:{missing}")).await.starts_with(&missing));
+        let held = TcpListener::bind("127.0.0.1:0").await.unwrap().local_addr().unwrap();
+        let held_open = TcpListener::bind(held).await.unwrap();
+        assert!(refused(&format!("tcp-listen:{held}")).await.starts_with(&held.to_string()));
+        drop(held_open);
+    });
+}

@@ -1,0 +1,98 @@
+//! One port's device, whatever it is: opened from a `--bind`, driven by one task, fed through a handle.
+//!
+//! The task reports what the device does as [`PortEvent`]s; whoever owns the port sends through
+//! [`PortTx`], which takes what it is given at once and never more than a fixed amount.
+
+use std::io;
+use std::rc::Rc;
+
+use proto_core::config::Rs485;
+use proto_core::recipe::model::CanId;
+
+use super::bind::Device;
+use super::can_bus::CanPort;
+use super::exchange::{PortEvent, PortTx};
+use super::line::Line;
+use super::socketcan::KernelCan;
+
+/// What the configuration says of a port's bus.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum PortBus {
+    /// A serial line.
+    Serial(Rs485),
+    /// A CAN bus of this bit rate.
+    Can {
+        /// Bit/s.
+        bitrate: u32,
+    },
+}
+
+/// A port whose device is open.
+#[derive(Debug)]
+pub struct Port {
+    driver: Driver,
+    tx: Rc<PortTx>,
+}
+
+#[derive(Debug)]
+enum Driver {
+    Line(Line),
+    Can(CanPort),
+    Kernel(KernelCan),
+}
+
+impl Port {
+    /// Opens the device in the current tokio runtime, which must be a current-thread one.
+    ///
+    /// # Errors
+    /// When the device does not suit the bus, does not exist, or cannot be opened.
+    pub async fn open(device: &Device, bus: PortBus) -> io::Result<Self> {
+        let tx = Rc::new(PortTx::default());
+        let driver = match (bus, device) {
+            (PortBus::Serial(settings), _) => {
+                Driver::Line(Line::open(device, settings, Rc::clone(&tx)).await?)
+            }
+            (PortBus::Can { bitrate }, Device::SocketCan { interface }) => {
+                Driver::Kernel(KernelCan::open(interface, bitrate, Rc::clone(&tx))?)
+            }
+            (PortBus::Can { bitrate }, _) => {
+                Driver::Can(CanPort::open(device, bitrate, Rc::clone(&tx)).await?)
+            }
+        };
+        Ok(Self { driver, tx })
+    }
+
+    /// Where others find the port: the link of a pseudoterminal, the address of a socket.
+    pub fn place(&self) -> String {
+        match &self.driver {
+            Driver::Line(line) => line.place(),
+            Driver::Can(can) => can.place(),
+            Driver::Kernel(can) => can.place(),
+        }
+    }
+
+    /// Which ids matter, of both directions: a CAN interface of the kernel then passes on no others.
+    /// Elsewhere, and until it is told, everything comes.
+    pub fn listen_to(&mut self, ids: Vec<CanId>) {
+        if let Driver::Kernel(can) = &mut self.driver {
+            can.listen_to(ids);
+        }
+    }
+
+    /// The handle to send with.
+    pub fn tx(&self) -> Rc<PortTx> {
+        Rc::clone(&self.tx)
+    }
+
+    /// Drives the device until the future is dropped, which closes it.
+    ///
+    /// # Errors
+    /// Only what makes the device unusable for good; what can come back is waited for.
+    pub async fn run(self, events: impl FnMut(PortEvent<'_>)) -> io::Result<()> {
+        match self.driver {
+            Driver::Line(line) => line.run(events).await,
+            Driver::Can(can) => can.run(events).await,
+            Driver::Kernel(can) => can.run(events).await,
+        }
+    }
+}

@@ -1,0 +1,347 @@
+//! A pseudoterminal with a link: one end of a serial line that any program can open.
+//!
+//! We keep the terminal end open too, so that the line survives its clients and the reactor never sees
+//! a hang-up. Bytes that nobody listens to are lost, as on a wire, and are not kept for the next client.
+
+use std::cell::{Cell, RefCell};
+use std::io;
+use std::os::fd::OwnedFd;
+use std::path::Path;
+
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::fs::OFlags;
+use rustix::io::Errno;
+use rustix::pty::{OpenptFlags, grantpt, ioctl_tiocgptpeer, openpt, ptsname, unlockpt};
+use rustix::termios::{OptionalActions, QueueSelector, ioctl_tiocnxcl, tcflush, tcgetattr, tcsetattr};
+use tokio::io::Interest;
+use tokio::io::unix::AsyncFd;
+
+use super::pty_link::Link;
+use recipe_net::reactor::register;
+
+/// One pseudoterminal. For a current-thread runtime: see [`Pty::is_heard`].
+#[derive(Debug)]
+pub struct Pty {
+    // Removed first: as long as there is one, it leads somewhere.
+    link: Link,
+    master: AsyncFd<OwnedFd>,
+    // None only when a client took the terminal exclusively in the very moment of a look.
+    terminal: RefCell<Option<OwnedFd>>,
+    // Whether something was written that a client may have left unread.
+    unread: Cell<bool>,
+}
+
+impl Pty {
+    /// A new pseudoterminal in raw mode with a link to it at `link`, in the current tokio runtime.
+    ///
+    /// A link that is already there is replaced when it was one to a pseudoterminal and the program that
+    /// made it is gone. Anything else is not touched.
+    ///
+    /// # Errors
+    /// With the path in the message: the link's directory cannot be made, something else is there, or
+    /// the system has no pseudoterminal left.
+    pub fn open(link: &Path) -> io::Result<Self> {
+        let flags = OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC;
+        let master = openpt(flags)?;
+        grantpt(&master)?;
+        unlockpt(&master)?;
+        rustix::fs::fcntl_setfl(&master, OFlags::RDWR | OFlags::NONBLOCK)?;
+        let target = ptsname(&master, Vec::new())?.into_string().map_err(io::Error::other)?;
+        let terminal = ioctl_tiocgptpeer(&master, flags)?;
+        set_raw(&terminal)?;
+        let master = register(master)?;
+        let link = Link::place(link, Path::new(&target))?;
+        Ok(Self { link, master, terminal: RefCell::new(Some(terminal)), unread: Cell::new(false) })
+    }
+
+    /// Where the link is.
+    pub fn link(&self) -> &Path {
+        self.link.path()
+    }
+
+    /// Waits until a client's bytes can be read. Cancel safe.
+    ///
+    /// # Errors
+    /// When the runtime is going away.
+    pub async fn readable(&self) -> io::Result<()> {
+        self.master.readable().await?.retain_ready();
+        Ok(())
+    }
+
+    /// Reads what clients wrote.
+    ///
+    /// # Errors
+    /// [`io::ErrorKind::WouldBlock`] when there is nothing.
+    pub fn try_read(&self, buf: &mut [u8]) -> io::Result<usize> {
+        let read = self.attempt(Interest::READABLE, |fd| rustix::io::read(fd, &mut *buf));
+        match read {
+            // No terminal end is open for the moment: see `is_heard`.
+            Err(error) if error.raw_os_error() == Some(Errno::IO.raw_os_error()) => {
+                self.reopen();
+                Err(io::ErrorKind::WouldBlock.into())
+            }
+            other => other,
+        }
+    }
+
+    /// Throws away what clients wrote and nobody has read, also what the system has yet to make readable.
+    pub fn discard_unread(&self) {
+        // It fails only when no client can have written anything.
+        let _ = tcflush(self.master.get_ref(), QueueSelector::IFlush);
+    }
+
+    /// Waits until bytes can be written. Cancel safe.
+    ///
+    /// # Errors
+    /// When the runtime is going away.
+    pub async fn writable(&self) -> io::Result<()> {
+        self.master.writable().await?.retain_ready();
+        Ok(())
+    }
+
+    /// Writes what a client can still take, without asking whether there is one.
+    ///
+    /// # Errors
+    /// [`io::ErrorKind::WouldBlock`] when the client has left tens of kilobytes unread.
+    pub fn try_write(&self, bytes: &[u8]) -> io::Result<usize> {
+        self.unread.set(true);
+        self.attempt(Interest::WRITABLE, |fd| rustix::io::write(fd, bytes))
+    }
+
+    /// Whether a client has the terminal open at this moment. If none has, whatever the last one left
+    /// unread is thrown away and the raw mode restored.
+    ///
+    /// The only way to ask is to close our own terminal end for an instant and look for a hang-up. The
+    /// thread that polls this runtime's reactor must be the one that asks, or the reactor would see it.
+    pub fn is_heard(&self) -> bool {
+        if let Some(terminal) = self.terminal.take() {
+            // A client's exclusive lock would keep us out of our own terminal.
+            let _ = ioctl_tiocnxcl(&terminal);
+        }
+        let mut fds = [PollFd::new(self.master.get_ref(), PollFlags::empty())];
+        let polled = poll(&mut fds, Some(&Timespec { tv_sec: 0, tv_nsec: 0 }));
+        let heard = !matches!(polled, Ok(1) if fds[0].revents().contains(PollFlags::HUP));
+        self.reopen();
+        if !heard
+            && self.unread.take()
+            && let Some(terminal) = &*self.terminal.borrow()
+        {
+            let _ = tcflush(terminal, QueueSelector::IFlush);
+            let _ = set_raw(terminal);
+        }
+        heard
+    }
+
+    /// Whether a client may have left bytes unread: [`Pty::is_heard`] should be asked now and then.
+    pub fn may_be_stale(&self) -> bool {
+        self.unread.get()
+    }
+
+    /// Makes the call whatever the reactor believes, since it has not looked at a new descriptor yet.
+    fn attempt(
+        &self,
+        interest: Interest,
+        call: impl FnOnce(&OwnedFd) -> rustix::io::Result<usize>,
+    ) -> io::Result<usize> {
+        let result = call(self.master.get_ref()).map_err(io::Error::from);
+        if result.as_ref().is_err_and(|error| error.kind() == io::ErrorKind::WouldBlock) {
+            let would_block: io::Result<()> = Err(io::ErrorKind::WouldBlock.into());
+            let _ = self.master.try_io(interest, |_| would_block);
+        }
+        result
+    }
+
+    fn reopen(&self) {
+        let flags = OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC;
+        let mut terminal = self.terminal.borrow_mut();
+        if terminal.is_none() {
+            *terminal = ioctl_tiocgptpeer(self.master.get_ref(), flags).ok();
+        }
+    }
+}
+
+fn set_raw(terminal: &OwnedFd) -> io::Result<()> {
+    let mut settings = tcgetattr(terminal)?;
+    settings.make_raw();
+    Ok(tcsetattr(terminal, OptionalActions::Now, &settings)?)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::fs;
+    use std::io::{Read, Write};
+    use std::os::unix::fs::OpenOptionsExt;
+
+    /// A client, as `serial.Serial(link)` would open it.
+    fn client(link: &Path) -> fs::File {
+        let flags = i32::try_from((OFlags::NOCTTY | OFlags::NONBLOCK).bits()).unwrap();
+        fs::OpenOptions::new().read(true).write(true).custom_flags(flags).open(link).unwrap()
+    }
+
+    async fn read_from(pty: &Pty, count: usize) -> Vec<u8> {
+        let mut bytes = Vec::new();
+        while bytes.len() < count {
+            pty.readable().await.unwrap();
+            let mut buf = [0; 64];
+            match pty.try_read(&mut buf) {
+                Ok(n) => bytes.extend_from_slice(&buf[..n]),
+                Err(error) => assert_eq!(error.kind(), io::ErrorKind::WouldBlock),
+            }
+        }
+        bytes
+    }
+
+    fn run<T>(test: impl AsyncFnOnce(&Path) -> T) -> T {
+        let dir = tempfile::tempdir().unwrap();
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        runtime.block_on(async {
+            let limit = std::time::Duration::from_secs(20);
+            tokio::time::timeout(limit, test(&dir.path().join("line"))).await.expect("the test hangs")
+        })
+    }
+
+    #[test]
+    fn every_byte_passes_both_ways_unchanged() {
+        run(async |link| {
+            let pty = Pty::open(link).unwrap();
+            let all: Vec<u8> = (0..=255).collect();
+            let mut peer = client(link);
+            peer.write_all(&all).unwrap();
+            assert_eq!(read_from(&pty, 256).await, all);
+            assert!(pty.is_heard());
+            assert_eq!(pty.try_write(&all).unwrap(), 256);
+            let mut got = vec![0; 256];
+            peer.read_exact(&mut got).unwrap();
+            assert_eq!(got, all);
+            assert_eq!(peer.read(&mut got).unwrap_err().kind(), io::ErrorKind::WouldBlock, "no echo");
+        });
+    }
+
+    #[test]
+    fn nobody_hears_a_line_without_a_client_and_what_one_left_unread_is_not_kept() {
+        run(async |link| {
+            let pty = Pty::open(link).unwrap();
+            assert!(!pty.is_heard());
+            let first = client(link);
+            let second = client(link);
+            assert!(pty.is_heard());
+            pty.try_write(b"stale").unwrap();
+            drop(first);
+            assert!(pty.is_heard(), "the second one still listens");
+            assert!(pty.may_be_stale());
+            drop(second);
+            assert!(!pty.is_heard());
+            assert!(!pty.may_be_stale());
+            let mut third = client(link);
+            assert!(pty.is_heard());
+            pty.try_write(b"fresh").unwrap();
+            let mut got = [0; 16];
+            assert_eq!(third.read(&mut got).unwrap(), 5);
+            assert_eq!(&got[..5], b"fresh");
+        });
+    }
+
+    #[test]
+    fn clients_come_and_go_without_a_hang_up() {
+        run(async |link| {
+            let pty = Pty::open(link).unwrap();
+            for round in 0..50_u8 {
+                let mut peer = client(link);
+                // An exclusive client, as tokio-serial opens it, does not lock us out.
+                rustix::termios::ioctl_tiocexcl(&peer).unwrap();
+                assert!(pty.is_heard());
+                peer.write_all(&[round]).unwrap();
+                drop(peer);
+                assert_eq!(read_from(&pty, 1).await, [round]);
+                assert!(!pty.is_heard());
+            }
+        });
+    }
+
+    #[test]
+    fn what_is_thrown_away_is_gone_however_much_it_was() {
+        run(async |link| {
+            let pty = Pty::open(link).unwrap();
+            let mut peer = client(link);
+            let mut waits = 0;
+            while let Ok(count @ 1..) = peer.write(&[0xA5; 512]) {
+                waits += count;
+            }
+            assert!(waits > 4_096, "{waits}");
+            pty.discard_unread();
+            peer.write_all(b"new").unwrap();
+            assert_eq!(read_from(&pty, 3).await, b"new");
+        });
+    }
+
+    #[test]
+    fn what_a_client_wrote_before_it_left_is_not_lost_by_looking_for_it() {
+        run(async |link| {
+            let pty = Pty::open(link).unwrap();
+            for round in 0..20 {
+                let mut peer = client(link);
+                pty.try_write(b"unread").unwrap();
+                peer.write_all(&[round, 0xEE]).unwrap();
+                drop(peer);
+                assert!(!pty.is_heard());
+                assert_eq!(read_from(&pty, 2).await, [round, 0xEE]);
+            }
+        });
+    }
+
+    #[test]
+    fn a_quiet_line_without_a_client_does_not_wake_the_reactor() {
+        run(async |link| {
+            let pty = Pty::open(link).unwrap();
+            drop(client(link));
+            assert!(!pty.is_heard());
+            let quiet = tokio::time::timeout(std::time::Duration::from_millis(50), async {
+                let mut wakes = 0;
+                loop {
+                    pty.readable().await.unwrap();
+                    let error = pty.try_read(&mut [0; 8]).unwrap_err();
+                    assert_eq!(error.kind(), io::ErrorKind::WouldBlock);
+                    wakes += 1;
+                    assert!(wakes < 10, "the reactor spins");
+                }
+            });
+            quiet.await.unwrap_err();
+        });
+    }
+
+    #[test]
+    fn the_links_folder_is_made() {
+        run(async |link| {
+            let link = link.with_file_name("run").join("line");
+            let pty = Pty::open(&link).unwrap();
+            drop(client(&link));
+            drop(pty);
+        });
+    }
+
+    #[test]
+    fn the_link_is_removed_at_the_end() {
+        run(async |link| {
+            let pty = Pty::open(link).unwrap();
+            assert_eq!(pty.link(), link);
+            assert!(fs::read_link(link).unwrap().starts_with("/dev/pts"));
+            drop(pty);
+            assert!(fs::symlink_metadata(link).is_err());
+        });
+    }
+
+    #[test]
+    fn a_link_in_use_is_not_taken_away() {
+        run(async |link| {
+            let first = Pty::open(link).unwrap();
+            let target = fs::read_link(link).unwrap();
+            let message = Pty::open(link).unwrap_err().to_string();
+            assert!(message.contains("line: another port has it"), "{message}");
+            assert_eq!(fs::read_link(link).unwrap(), target);
+            assert!(Pty::open(&link.join("deeper")).unwrap_err().to_string().contains("line/deeper: "));
+            drop(first);
+            Pty::open(link).unwrap();
+        });
+    }
+}

@@ -1,0 +1,158 @@
+//! What the tests of devices share: a port under way, its events, and clients.
+
+use std::cell::RefCell;
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, Read};
+use std::os::unix::fs::OpenOptionsExt;
+use std::path::Path;
+use std::rc::Rc;
+use std::time::Duration;
+
+use proto_core::recipe::can::CanFrame;
+use proto_core::time::Instant;
+use rustix::fs::OFlags;
+use tokio::sync::Notify;
+use tokio::task::{JoinHandle, LocalSet};
+
+use super::exchange::{PortEvent, PortTx};
+use super::port::{Port, PortBus};
+use recipe_net::timer::now;
+
+/// A device's event, with its time apart.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) enum Seen {
+    Up,
+    Down,
+    Bytes(Vec<u8>),
+    Frame(CanFrame),
+    Sent,
+}
+
+#[derive(Default)]
+struct Log {
+    events: RefCell<Vec<(Instant, Seen)>>,
+    wake: Notify,
+}
+
+/// A port that runs as a local task; its events are kept until a test takes them.
+pub(super) struct Running {
+    pub(super) place: String,
+    pub(super) tx: Rc<PortTx>,
+    seen: Rc<Log>,
+    task: JoinHandle<()>,
+}
+
+impl Running {
+    pub(super) async fn start(bind: &str, bus: PortBus) -> Self {
+        let port = Port::open(&bind.parse().unwrap(), bus).await.unwrap();
+        let (place, tx) = (port.place(), port.tx());
+        let seen = Rc::new(Log::default());
+        let sink = Rc::clone(&seen);
+        let task = tokio::task::spawn_local(async move {
+            let ended = port.run(|event| {
+                let event = match event {
+                    PortEvent::Up => Seen::Up,
+                    PortEvent::Down => Seen::Down,
+                    PortEvent::Bytes(bytes) => Seen::Bytes(bytes.to_vec()),
+                    PortEvent::Frame { frame } => Seen::Frame(frame),
+                    PortEvent::Bus(state) => panic!("{state:?}: no device of these tests knows it"),
+                    PortEvent::Sent => Seen::Sent,
+                };
+                sink.events.borrow_mut().push((now(), event));
+                sink.wake.notify_one();
+            });
+            panic!("the port ended: {:?}", ended.await);
+        });
+        Self { place, tx, seen, task }
+    }
+
+    /// The next event and its time.
+    pub(super) async fn next(&self) -> (Instant, Seen) {
+        loop {
+            if !self.seen.events.borrow().is_empty() {
+                return self.seen.events.borrow_mut().remove(0);
+            }
+            self.seen.wake.notified().await;
+        }
+    }
+
+    #[track_caller]
+    pub(super) fn expect(&self, expected: Seen) -> impl Future<Output = Instant> {
+        let at = std::panic::Location::caller();
+        async move {
+            let (time, seen) = self.next().await;
+            assert_eq!(seen, expected, "at {at}");
+            time
+        }
+    }
+
+    /// Bytes until there are `count`, whatever the chunks.
+    pub(super) async fn bytes(&self, count: usize) -> Vec<u8> {
+        let mut all = Vec::new();
+        while all.len() < count {
+            match self.next().await.1 {
+                Seen::Bytes(bytes) => all.extend(bytes),
+                other => panic!("{other:?} instead of bytes"),
+            }
+        }
+        all
+    }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        self.task.abort();
+    }
+}
+
+/// Runs a test with a directory of its own, in the kind of runtime that the shells have.
+pub(super) fn run(test: impl AsyncFnOnce(&Path)) {
+    let dir = tempfile::tempdir().unwrap();
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    let limit = Duration::from_secs(30);
+    let local = LocalSet::new();
+    local.block_on(&runtime, async {
+        tokio::time::timeout(limit, test(dir.path())).await.expect("the test hangs");
+    });
+}
+
+/// A program that has a terminal open.
+pub(super) struct Client(pub(super) File);
+
+impl Client {
+    pub(super) fn open(link: &str) -> Self {
+        let flags = i32::try_from((OFlags::NOCTTY | OFlags::NONBLOCK).bits()).unwrap();
+        Self(OpenOptions::new().read(true).write(true).custom_flags(flags).open(link).unwrap())
+    }
+
+    /// What can be read now.
+    pub(super) fn read(&mut self) -> Vec<u8> {
+        let mut buf = vec![0; 4_096];
+        match self.0.read(&mut buf) {
+            Ok(count) => buf.truncate(count),
+            Err(error) => {
+                assert_eq!(error.kind(), io::ErrorKind::WouldBlock);
+                buf.clear();
+            }
+        }
+        buf
+    }
+
+    /// Reads until there are `count` bytes, while the port's task runs.
+    pub(super) async fn read_exact(&mut self, count: usize) -> Vec<u8> {
+        let mut all = Vec::new();
+        while all.len() < count {
+            let more = self.read();
+            if more.is_empty() {
+                tokio::task::yield_now().await;
+            }
+            all.extend(more);
+        }
+        all
+    }
+}
+
+/// Whether nothing is at the path, not even a link that leads nowhere.
+pub(super) fn is_gone(path: &str) -> bool {
+    fs::symlink_metadata(path).is_err()
+}

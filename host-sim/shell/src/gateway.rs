@@ -1,0 +1,384 @@
+//! The gateway's engine on real sockets and devices.
+//!
+//! Everything runs on one thread. What a device or socket brings goes into the engine at once, and
+//! what the engine answers is handed over before anything else is read: one engine pass lies
+//! between the last byte of a field frame and the request on its way to the controller.
+
+use std::cell::{Cell, RefCell};
+use std::collections::BTreeMap;
+use std::rc::Rc;
+
+use proto_core::config::{Bus, GatewayConfig, Parts, Port as PortConfig};
+use proto_core::engine::{Engine, Input, LinkId, LinkKind, OUTPUT_BUFFER, Output, PortId};
+use proto_core::sysvar::SysVar;
+use proto_core::time::Instant;
+use serde_json::{Value, json};
+use tokio::net::{TcpListener, UdpSocket};
+use tokio::sync::Notify;
+use tokio::task::JoinSet;
+use tracing::{info, trace, warn};
+
+use super::host::{self, Handle, Shell};
+use super::link::{self, Endpoint, LinkControl, LinkEvent};
+use super::{RunOptions, StartError};
+use recipe_device::bind::Bind;
+use recipe_device::exchange::{PortEvent, PortTx};
+use recipe_device::port::{Port, PortBus};
+use recipe_net::peer;
+use recipe_net::realtime::{self, Scheduling};
+use recipe_net::timer::{Timer, now};
+use recipe_net::turns;
+
+/// A gateway whose ports and links are there, before anything moves.
+struct Gateway {
+    core: Rc<Core>,
+    ports: Vec<(PortId, Port)>,
+    links: Vec<(LinkId, LinkKind, Endpoint)>,
+    ready: Value,
+}
+
+/// What every task of the gateway shares.
+struct Core {
+    engine: RefCell<Box<Engine>>,
+    ports: BTreeMap<PortId, (String, Rc<PortTx>)>,
+    links: BTreeMap<LinkId, Rc<LinkControl>>,
+    port_names: Vec<String>,
+    deadline: Cell<Instant>,
+    /// How often the engine noticed that the gateway slept.
+    sleeps: Cell<u32>,
+    deadline_moved: Notify,
+}
+
+impl Gateway {
+    /// Opens devices and listening sockets.
+    async fn open(config: &GatewayConfig, binds: &[Bind]) -> Result<Self, StartError> {
+        let engine: Box<Engine> =
+            Box::new(Engine::new(config).map_err(|error| StartError::new(error.to_string()))?);
+        let field = || config.field_ports().map(|(_, port, _)| port);
+        if let Some(bind) = binds.iter().find(|bind| field().all(|port| port.name != bind.port.as_str())) {
+            let names: Vec<_> = field().map(|port| port.name.as_str()).collect();
+            let message = format!("--bind {bind}: no such port; there are: {}", names.join(", "));
+            return Err(StartError::new(message));
+        }
+        let mut ports = Vec::new();
+        for (index, port, recipe) in config.field_ports() {
+            let mut device = open_port(port, binds).await?;
+            if let Parts::Can { input, output } = &recipe.parts {
+                device.listen_to(input.iter().chain(output).map(|frame| frame.id).collect());
+            }
+            ports.push((PortId(index), device));
+        }
+        let mut links = Vec::new();
+        for info in engine.links() {
+            links.push((info.id, info.kind, open_endpoint(config, info.kind).await?));
+        }
+        let name = |id: PortId| config.ports.get(usize::from(id.0)).map_or("", |port| port.name.as_str());
+        let mut places = serde_json::Map::new();
+        for (id, port) in &ports {
+            places.insert(name(*id).to_owned(), json!(port.place()));
+        }
+        for (_, kind, endpoint) in &links {
+            if let LinkKind::RecipeTcpListen { port } | LinkKind::RecipeUdpListen { port } = kind {
+                places.insert(name(*port).to_owned(), json!(endpoint.place()));
+            }
+        }
+        let core = Rc::new(Core {
+            ports: ports.iter().map(|(id, port)| (*id, (name(*id).to_owned(), port.tx()))).collect(),
+            links: links.iter().map(|(id, ..)| (*id, Rc::default())).collect(),
+            port_names: config.ports.iter().map(|port| port.name.as_str().to_owned()).collect(),
+            engine: RefCell::new(engine),
+            deadline: Cell::new(Instant::NEVER),
+            sleeps: Cell::new(0),
+            deadline_moved: Notify::new(),
+        });
+        Ok(Self { core, ports, links, ready: json!({ "ports": places }) })
+    }
+
+    async fn drive(self) -> Result<(), StartError> {
+        let Self { core: shared, ports, links, .. } = self;
+        let mut tasks = JoinSet::new();
+        for (id, port) in ports {
+            let core = Rc::clone(&shared);
+            tasks.spawn_local(async move {
+                let name = core.ports.get(&id).map_or("", |(name, _)| name).to_owned();
+                let result = port.run(|event| core.port_event(id, event)).await;
+                result.map_err(|error| StartError::new(format!("port {name}: {error}")))
+            });
+        }
+        for (id, kind, endpoint) in links {
+            let core = Rc::clone(&shared);
+            let Some(control) = core.links.get(&id).cloned() else { continue };
+            tasks.spawn_local(async move {
+                let is_frame = |datagram: &[u8]| core.engine.borrow().is_frame(id, datagram);
+                let events = |event: LinkEvent<'_>| core.link_event(id, event);
+                link::run(kind.name(), &endpoint, &control, is_frame, events).await;
+                Ok(())
+            });
+        }
+        tasks.spawn_local(async move { shared.keep_time().await });
+        while let Some(ended) = tasks.join_next().await {
+            match ended {
+                Ok(done) => done?,
+                Err(error) => return Err(StartError::new(format!("a task ended: {error}"))),
+            }
+        }
+        Ok(())
+    }
+}
+
+impl Shell for Gateway {
+    fn ready(&self) -> Value {
+        self.ready.clone()
+    }
+
+    fn stats(&self) -> impl Fn() -> Value + 'static {
+        let core = Rc::clone(&self.core);
+        move || core.stats()
+    }
+
+    async fn run(self) -> Result<(), StartError> {
+        self.drive().await
+    }
+}
+
+impl Core {
+    /// Calls the engine whenever it asked to be called.
+    async fn keep_time(&self) -> Result<(), StartError> {
+        let clock = |error| StartError::new(format!("timerfd: {error}"));
+        let timer = Timer::new().map_err(clock)?;
+        self.input(Input::Tick);
+        loop {
+            timer.arm(self.deadline.get()).map_err(clock)?;
+            turns::expect(self.deadline.get());
+            tokio::select! {
+                expired = timer.expired() => {
+                    expired.map_err(clock)?;
+                    // What had arrived by the deadline is not overdue.
+                    turns::all_others().await;
+                    self.input(Input::Tick);
+                }
+                () = self.deadline_moved.notified() => {}
+            }
+        }
+    }
+
+    fn port_event(&self, port: PortId, event: PortEvent<'_>) {
+        match event {
+            PortEvent::Up => self.input(Input::PortUp { port }),
+            PortEvent::Down => self.input(Input::PortDown { port }),
+            PortEvent::Bytes(bytes) => self.input(Input::PortBytes { port, bytes }),
+            PortEvent::Frame { frame } => self.input(Input::PortCan { port, frame }),
+            PortEvent::Bus(state) => self.input(Input::PortBus { port, state }),
+            PortEvent::Sent => self.input(Input::PortSent { port }),
+        }
+    }
+
+    fn link_event(&self, link: LinkId, event: LinkEvent<'_>) {
+        match event {
+            LinkEvent::Up => self.input(Input::LinkUp { link }),
+            LinkEvent::Down => self.input(Input::LinkDown { link }),
+            LinkEvent::Bytes(bytes) => self.input(Input::LinkBytes { link, bytes }),
+            LinkEvent::Sent => self.input(Input::LinkSent { link }),
+            LinkEvent::Acked(left) => self.input(Input::LinkAcked { link, left }),
+        }
+    }
+
+    /// One input, and everything that follows from it.
+    fn input(&self, input: Input<'_>) {
+        let at = now();
+        trace!(?input, "in");
+        let mut engine = self.engine.borrow_mut();
+        engine.handle(at, input);
+        let sleeps = engine.sleeps();
+        if self.sleeps.replace(sleeps) != sleeps {
+            warn!(sleeps, "the gateway slept: what waited is discarded");
+            for (_, tx) in self.ports.values() {
+                tx.note_sleep(at);
+            }
+        }
+        let mut buf = [0; OUTPUT_BUFFER];
+        loop {
+            let output = engine.poll_output(at, &mut buf);
+            match output {
+                Output::Sleep { until } => {
+                    if self.deadline.replace(until) != until {
+                        self.deadline_moved.notify_one();
+                    }
+                    return;
+                }
+                _ => trace!(?output, "out"),
+            }
+            match output {
+                Output::PortSend { port, bytes } => self.with_port(port, |tx| tx.send(bytes)),
+                Output::PortSendCan { port, frame } => self.with_port(port, |tx| tx.send_frame(frame)),
+                Output::LinkOpen { link } => self.with_link(link, LinkControl::open),
+                Output::LinkClose { link } => self.with_link(link, LinkControl::close),
+                Output::LinkSend { link, bytes } => self.with_link(link, |control| control.send(bytes)),
+                Output::Sleep { .. } => {}
+            }
+        }
+    }
+
+    fn with_port(&self, id: PortId, act: impl FnOnce(&PortTx)) {
+        match self.ports.get(&id) {
+            Some((_, tx)) => act(tx),
+            None => warn!(?id, "the engine sends on a port that is none"),
+        }
+    }
+
+    fn with_link(&self, id: LinkId, act: impl FnOnce(&LinkControl)) {
+        match self.links.get(&id) {
+            Some(control) => act(control),
+            None => warn!(?id, "the engine uses a link that is none"),
+        }
+    }
+
+    /// One line of statistics: everything counted, links, and the ages of what is known.
+    fn stats(&self) -> Value {
+        let engine = self.engine.borrow();
+        let at = now();
+        let mut ports = serde_json::Map::new();
+        for (id, (name, tx)) in &self.ports {
+            let Some(counters) = engine.port_counters(*id) else { continue };
+            let mut port = json!(counters);
+            port["reply"] = json!(engine.reply_code(*id).map(|code| format!("{code:?}").to_lowercase()));
+            port["device"] = json!(tx.counters());
+            ports.insert(name.clone(), port);
+        }
+        let mut links = serde_json::Map::new();
+        for link in engine.links() {
+            let name = match link.kind {
+                LinkKind::RecipeTcpListen { port } | LinkKind::RecipeUdpListen { port } => {
+                    self.port_names.get(usize::from(port.0)).map_or(link.kind.name(), String::as_str)
+                }
+                kind => kind.name(),
+            };
+            let mut info = json!({ "state": link.state.name() });
+            let turned_away = match link.kind {
+                LinkKind::RecipeTcpListen { .. } | LinkKind::RecipeUdpListen { .. } => {
+                    self.links.get(&link.id).map(|control| control.turned_away())
+                }
+                _ => None,
+            };
+            for part in [json!(link.history), json!(link.counters), json!(turned_away)] {
+                if let (Value::Object(info), Value::Object(part)) = (&mut info, part) {
+                    info.extend(part);
+                }
+            }
+            info["reconnects"] = json!(link.history.connects.saturating_sub(1));
+            links.insert(name.to_owned(), info);
+        }
+        let mut ages = serde_json::Map::new();
+        for var in SysVar::all() {
+            if let Some(age) = engine.image().age(var, at) {
+                ages.insert(var.to_string(), json!(age.as_millis()));
+            }
+        }
+        json!({ "ports": ports, "links": links, "age_ms": ages, "sleeps": engine.sleeps() })
+    }
+}
+
+/// Runs the gateway until Ctrl-C, SIGTERM or SIGHUP.
+///
+/// # Errors
+/// What kept it from starting; nothing is left behind then.
+pub fn run(config: GatewayConfig, options: RunOptions) -> Result<(), StartError> {
+    let handle = spawn(config, options.binds.clone(), Scheduling::FifoIfAllowed)?;
+    host::foreground(handle, &options)
+}
+
+/// Starts the gateway on a thread of its own; dropping the handle ends it.
+///
+/// # Errors
+/// What kept it from starting; nothing is left behind then.
+pub fn start(config: GatewayConfig, binds: Vec<Bind>) -> Result<Handle, StartError> {
+    spawn(config, binds, Scheduling::Ordinary)
+}
+
+fn spawn(config: GatewayConfig, binds: Vec<Bind>, scheduling: Scheduling) -> Result<Handle, StartError> {
+    host::start("gateway", async move || {
+        let gateway = Gateway::open(&config, &binds).await?;
+        info!(scheduling = %realtime::apply(scheduling), "the gateway runs");
+        Ok(gateway)
+    })
+}
+
+async fn open_port(port: &PortConfig, binds: &[Bind]) -> Result<Port, StartError> {
+    let name = port.name.as_str();
+    let bus = match port.bus {
+        Bus::Rs485(settings) => PortBus::Serial(settings),
+        Bus::Can { bitrate } => PortBus::Can { bitrate },
+        Bus::TcpListen { .. } | Bus::UdpListen { .. } => {
+            return Err(StartError::new(format!("port {name} is no field port")));
+        }
+    };
+    let mut own = binds.iter().filter(|bind| bind.port == name);
+    let (Some(bind), None) = (own.next(), own.next()) else {
+        let examples = match bus {
+            PortBus::Serial(_) => "pty:PATH or serial:/dev/ttyUSB0",
+            PortBus::Can { .. } => "socketcan:can0, slcan-tcp:127.0.0.1:0 or slcan-pty:PATH",
+        };
+        return Err(StartError::new(format!(
+            "port {name} needs exactly one device: --bind {name}=DEVICE, such as {examples}"
+        )));
+    };
+    Port::open(&bind.device, bus)
+        .await
+        .map_err(|error| StartError::new(format!("--bind {name}={}: {error}", bind.device)))
+}
+
+async fn open_endpoint(config: &GatewayConfig, kind: LinkKind) -> Result<Endpoint, StartError> {
+    let controller = &config.controller;
+    let host = || {
+        if controller.address.is_empty() {
+            let message = "controller.address is needed: the controller's address or host name";
+            return Err(StartError::new(message));
+        }
+        Ok(controller.address.as_str().to_owned())
+    };
+    let listen = |port: PortId| match config.ports.get(usize::from(port.0)).map(|port| &port.bus) {
+        Some(Bus::TcpListen { listen } | Bus::UdpListen { listen }) => listen.as_str(),
+        _ => "",
+    };
+    let refused = |address: &str, error| StartError::new(format!("listening on {address}: {error}"));
+    Ok(match kind {
+        LinkKind::Command | LinkKind::Urgent => {
+            Endpoint::Tcp { host: host()?, port: controller.command_port }
+        }
+        LinkKind::State => Endpoint::Tcp { host: host()?, port: controller.state_port },
+        LinkKind::Modbus => Endpoint::Tcp { host: host()?, port: controller.modbus_port },
+        LinkKind::RecipeUdp => {
+            let port = controller.recipe_link.map_or(0, |link| link.udp_port);
+            Endpoint::Udp { host: host()?, port }
+        }
+        LinkKind::RecipeTcpListen { port } => {
+            let address = listen(port);
+            let listener = TcpListener::bind(address).await;
+            let listener = listener.map_err(|error| refused(address, error))?;
+            peer::bound(&listener);
+            Endpoint::TcpListen { listener, controller: host()? }
+        }
+        LinkKind::RecipeUdpListen { port } => {
+            let address = listen(port);
+            let socket = UdpSocket::bind(address).await;
+            let socket = socket.map_err(|error| refused(address, error))?;
+            Endpoint::UdpListen { socket, controller: host()? }
+        }
+    })
+}
+
+impl Endpoint {
+    /// Where a listening link listens.
+    fn place(&self) -> String {
+        let address = match self {
+            Self::TcpListen { listener, .. } => listener.local_addr(),
+            Self::UdpListen { socket, .. } => socket.local_addr(),
+            Self::Tcp { host, port } | Self::Udp { host, port } => return format!("{host}:{port}"),
+        };
+        address.map_or_else(|_| String::new(), |address| address.to_string())
+    }
+}
+
+#[cfg(test)]
+#[path = "gateway_tests.rs"]
+mod tests;

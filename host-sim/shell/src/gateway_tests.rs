@@ -1,0 +1,302 @@
+//! The gateway in a process that is kept from working: late, or asleep.
+
+use std::io::{Read, Write};
+use std::net::TcpStream;
+use std::os::unix::fs::OpenOptionsExt;
+use std::time::Duration as StdDuration;
+
+use proto_core::engine::{ASLEEP, PortCounters};
+use proto_core::time::Duration;
+use rustix::fs::OFlags;
+use tokio::task::{LocalSet, spawn_local, yield_now};
+
+use super::*;
+use recipe_config::file::{Text, parse_gateway};
+
+/// A line, a CAN bus and a controller's TCP and UDP clients.
+const CELL: &str = r#"
+[controller]
+address = "127.0.0.1"
+
+[[recipe]]
+name = "word"
+kind = "stream"
+mode = "realtime"
+[recipe.input]
+head = [1, 2]
+tail = [3, 4]
+fields = ["WordInputReg[1]"]
+
+[[recipe]]
+name = "can"
+kind = "can"
+mode = "realtime"
+[[recipe.input.frame]]
+id = 1
+fields = ["WordInputReg[2]"]
+
+[[port]]
+name = "line"
+bus = "rs485"
+recipe = "word"
+idle_gap_ms = 5
+timeout_ms = 50
+
+[[port]]
+name = "can"
+bus = "can"
+recipe = "can"
+timeout_ms = 50
+"#;
+const LINE: PortId = PortId(0);
+const CAN: PortId = PortId(1);
+
+/// A gateway without a controller.
+struct Cell {
+    core: Rc<Core>,
+    places: Value,
+}
+
+impl Cell {
+    /// Runs a test on the gateway's own thread, which the test may hold up. The line is what `line` says.
+    fn run(line: &str, test: impl AsyncFnOnce(Self)) {
+        let folder = tempfile::tempdir().unwrap();
+        let line = line.replace("FOLDER", folder.path().to_str().unwrap());
+        let config = parse_gateway(Text { name: "cell", toml: CELL }, &[]).unwrap();
+        let binds = [format!("line={line}"), "can=slcan-tcp:127.0.0.1:0".to_owned()];
+        let binds = binds.map(|bind| bind.parse().unwrap());
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        LocalSet::new().block_on(&runtime, async {
+            let gateway = Gateway::open(&config, &binds).await.unwrap();
+            let cell = Self { core: Rc::clone(&gateway.core), places: gateway.ready["ports"].clone() };
+            let running = spawn_local(gateway.drive());
+            tokio::time::timeout(StdDuration::from_secs(60), test(cell)).await.expect("the test hangs");
+            running.abort();
+        });
+    }
+
+    fn place(&self, port: &str) -> &str {
+        self.places[port].as_str().unwrap()
+    }
+
+    fn connect(&self, port: &str) -> TcpStream {
+        let stream = TcpStream::connect(self.place(port)).unwrap();
+        stream.set_nodelay(true).unwrap();
+        stream
+    }
+
+    /// An slcan client with an open channel.
+    async fn on_can(&self) -> TcpStream {
+        let mut client = self.connect("can");
+        client.write_all(b"O\r").unwrap();
+        client.set_nonblocking(true).unwrap();
+        let mut answer = [0];
+        while client.read(&mut answer).is_err() {
+            yield_now().await;
+        }
+        assert_eq!(&answer, b"\r");
+        client
+    }
+
+    fn counters(&self, port: PortId) -> PortCounters {
+        *self.core.engine.borrow().port_counters(port).unwrap()
+    }
+
+    /// Says something, and waits until it was heard: taken, or refused after a sleep.
+    async fn heard(&self, port: PortId, say: impl FnOnce()) -> PortCounters {
+        let heard = |counters: PortCounters| (counters.frames_in, counters.asleep);
+        let before = heard(self.counters(port));
+        say();
+        self.until(|cell| heard(cell.counters(port)) != before).await;
+        self.counters(port)
+    }
+
+    async fn until(&self, is_so: impl Fn(&Self) -> bool) {
+        while !is_so(self) {
+            yield_now().await;
+        }
+    }
+}
+
+/// Keeps the thread from working.
+fn hold_up(time: StdDuration) {
+    std::thread::sleep(time);
+}
+
+fn frame(value: u16) -> Vec<u8> {
+    let [low, high] = value.to_le_bytes();
+    vec![1, 2, low, high, 3, 4]
+}
+
+fn on_bus(value: u16) -> String {
+    let [low, high] = value.to_le_bytes();
+    format!("t0012{low:02X}{high:02X}\r")
+}
+
+/// Times that a process is held up for without having slept.
+const HELD_UP: [u64; 4] = [60, 120, 250, 400];
+
+/// Lets a frame wait until the port's frames are overdue because nobody looks; they must not time out.
+async fn counts_as_in_time(cell: &Cell, port: PortId, mut say: impl FnMut(u16)) {
+    for millis in HELD_UP {
+        loop {
+            let before = cell.heard(port, || say(1)).await;
+            // Until every task waits for the system again.
+            for _ in 0..10 {
+                yield_now().await;
+            }
+            hold_up(StdDuration::from_millis(millis));
+            let after = cell.heard(port, || say(2)).await;
+            // A busy machine may have held us up for so long that it was a sleep.
+            if after.asleep == before.asleep {
+                assert_eq!(after.frames_in, before.frames_in + 1);
+                assert_eq!(after.timeouts, before.timeouts, "held up for {millis} ms");
+                break;
+            }
+        }
+    }
+    // It does time out when nothing comes.
+    let timeouts = cell.counters(port).timeouts;
+    cell.until(|cell| cell.counters(port).timeouts > timeouts).await;
+}
+
+#[test]
+fn a_frame_that_waited_for_a_thread_that_was_held_up_is_in_time() {
+    Cell::run("tcp-listen:127.0.0.1:0", async |cell| {
+        let mut device = cell.connect("line");
+        counts_as_in_time(&cell, LINE, |value| device.write_all(&frame(value)).unwrap()).await;
+    });
+}
+
+#[test]
+fn so_is_one_behind_more_than_is_read_at_once() {
+    Cell::run("tcp-listen:127.0.0.1:0", async |cell| {
+        let mut device = cell.connect("line");
+        let garbage = [0xA5; 3_000];
+        counts_as_in_time(&cell, LINE, |value| {
+            if value == 2 {
+                device.write_all(&garbage).unwrap();
+            }
+            device.write_all(&frame(value)).unwrap();
+        })
+        .await;
+    });
+}
+
+#[test]
+fn so_is_one_that_has_to_cross_a_bus() {
+    Cell::run("tcp-listen:127.0.0.1:0", async |cell| {
+        let mut device = cell.on_can().await;
+        // Others come first, and take their time on a bus.
+        let others: String = (0..40).map(|_| "t7FF80102030405060708\r").collect();
+        counts_as_in_time(&cell, CAN, |value| {
+            if value == 2 {
+                device.write_all(others.as_bytes()).unwrap();
+            }
+            device.write_all(on_bus(value).as_bytes()).unwrap();
+            let _ = device.read(&mut [0; 4_096]);
+        })
+        .await;
+    });
+}
+
+/// Fills all that holds what a device sent while the process sleeps. Of that nothing may be believed, and what
+/// comes a little later is.
+async fn is_not_believed(
+    cell: &Cell,
+    port: PortId,
+    device: &mut (impl Read + Write),
+    say: impl Fn(u16) -> Vec<u8>,
+) {
+    const OLD: u16 = 0x1111;
+    const NEW: u16 = 0x2222;
+    let word = |cell: &Cell| {
+        let var = format!("WordInputReg[{}]", port.0 + 1).parse().unwrap();
+        cell.core.engine.borrow().image().value(var).as_f64() as u16
+    };
+    let before = cell.heard(port, || device.write_all(&say(1)).unwrap()).await;
+    assert_eq!(word(cell), 1);
+    hold_up(StdDuration::from_micros(ASLEEP.as_micros() + 100_000));
+    let old = say(OLD).repeat(64);
+    let mut waits = 0;
+    while let Ok(count @ 1..) = device.write(&old) {
+        waits += count;
+    }
+    assert!(waits > 4_096, "{waits} bytes");
+    let begin = now();
+    let mut said_at = begin;
+    let mut read = [0; 4_096];
+    while word(cell) != NEW {
+        yield_now().await;
+        assert_ne!(word(cell), OLD, "{waits} bytes, after {:?}", now().saturating_since(begin));
+        // A device does not stop because it was not heard.
+        if now().saturating_since(said_at) >= Duration::from_millis(20) {
+            said_at = now();
+            let _ = device.write(&say(NEW));
+        }
+        let _ = device.read(&mut read);
+    }
+    let (after, sleeps) = (cell.counters(port), cell.core.engine.borrow().sleeps());
+    assert!(after.frames_in <= before.frames_in + 2, "{after:?}");
+    assert_eq!((after.asleep > 0, sleeps > 0), (true, true), "{after:?}");
+}
+
+#[test]
+fn what_waited_on_a_terminal_while_the_process_slept_is_not_believed() {
+    Cell::run("pty:FOLDER/line", async |cell| {
+        let flags = (OFlags::NOCTTY | OFlags::NONBLOCK).bits() as i32;
+        let mut options = std::fs::OpenOptions::new();
+        let options = options.read(true).write(true).custom_flags(flags);
+        let mut device = options.open(cell.place("line")).unwrap();
+        is_not_believed(&cell, LINE, &mut device, frame).await;
+    });
+}
+
+#[test]
+fn nor_what_waited_in_a_connection() {
+    Cell::run("tcp-listen:127.0.0.1:0", async |cell| {
+        let mut device = cell.connect("line");
+        device.set_nonblocking(true).unwrap();
+        is_not_believed(&cell, LINE, &mut device, frame).await;
+    });
+}
+
+#[test]
+fn nor_what_waited_to_go_on_a_bus() {
+    Cell::run("tcp-listen:127.0.0.1:0", async |cell| {
+        let mut device = cell.on_can().await;
+        is_not_believed(&cell, CAN, &mut device, |value| on_bus(value).into_bytes()).await;
+    });
+}
+
+/// The line's counters after these pieces, told one by one after its idle gap by a driver whose timer has no
+/// turn.
+fn told_late(pieces: &[&[u8]]) -> PortCounters {
+    let config = parse_gateway(Text { name: "cell", toml: CELL }, &[]).unwrap();
+    let binds =
+        ["line=tcp-listen:127.0.0.1:0", "can=slcan-tcp:127.0.0.1:0"].map(|bind| bind.parse().unwrap());
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    LocalSet::new().block_on(&runtime, async move {
+        let core = Gateway::open(&config, &binds).await.unwrap().core;
+        core.input(Input::Tick);
+        core.port_event(LINE, PortEvent::Up);
+        for piece in pieces {
+            core.port_event(LINE, PortEvent::Bytes(piece));
+            hold_up(StdDuration::from_millis(10));
+        }
+        let engine = core.engine.borrow();
+        *engine.port_counters(LINE).unwrap()
+    })
+}
+
+#[test]
+fn bytes_that_are_told_late_do_not_make_a_silence() {
+    let counters = told_late(&[&[1, 2, 7], &[0, 3, 4]]);
+    assert_eq!((counters.frames_in, counters.discarded_bytes, counters.resync_bytes), (1, 0, 0));
+}
+
+#[test]
+fn a_frame_behind_a_part_of_one_is_found() {
+    let counters = told_late(&[&[1, 2, 7], &[1, 2, 7, 0, 3, 4]]);
+    assert_eq!((counters.frames_in, counters.resync_bytes), (1, 3));
+}

@@ -1,0 +1,67 @@
+//! The tokio shells: what ties the sans-IO controller and gateway to sockets, devices and the clock.
+//!
+//! A shell is one thread with a current-thread runtime. It owns every socket and device of its side,
+//! hands what they receive to the core and carries out what the core answers; it knows no protocol.
+
+pub mod controller;
+pub mod gateway;
+mod host;
+mod link;
+pub mod out;
+mod ready;
+mod signals;
+mod tcp;
+mod udp;
+
+use std::fmt;
+use std::time::Duration;
+
+pub use host::Handle;
+pub use ready::ReadyFile;
+pub use signals::Signals;
+
+use recipe_device::bind::Bind;
+
+/// What a run is told beside its file.
+#[derive(Debug, Clone, Default)]
+pub struct RunOptions {
+    /// Which device each serial or CAN port is tied to.
+    pub binds: Vec<Bind>,
+    /// Where the addresses are written once everything listens.
+    pub ready: Option<ReadyFile>,
+    /// How often a line of counters is printed.
+    pub stats: Option<Duration>,
+}
+
+/// Why a run could not start, or could not go on: one message, nothing was left behind.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct StartError {
+    message: String,
+    had_started: bool,
+}
+
+impl StartError {
+    /// The run could not start.
+    pub fn new(message: impl Into<String>) -> Self {
+        Self { message: message.into(), had_started: false }
+    }
+
+    /// The same, of a run that had started.
+    #[must_use]
+    pub fn after_start(self) -> Self {
+        Self { had_started: true, ..self }
+    }
+
+    /// 2 when nothing was started, 1 when the run failed later.
+    pub const fn exit_code(&self) -> u8 {
+        if self.had_started { 1 } else { 2 }
+    }
+}
+
+impl fmt::Display for StartError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.message)
+    }
+}
+
+impl std::error::Error for StartError {}

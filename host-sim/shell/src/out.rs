@@ -1,0 +1,84 @@
+//! What is printed, and what comes of it when it cannot be.
+//!
+//! Writing never panics. The first failure is kept, and the command that was at it ends: quietly when the
+//! reader had enough, as `head` has, with one message when what was said is lost.
+
+use std::io::{self, Write, stderr};
+use std::process::ExitCode;
+
+/// An output whose first failure is kept; nothing is written after it.
+#[derive(Debug)]
+pub struct Out<W> {
+    to: W,
+    failed: Option<io::Error>,
+}
+
+impl<W: Write> Out<W> {
+    /// Writes to `to`.
+    pub fn new(to: W) -> Self {
+        Self { to, failed: None }
+    }
+
+    /// Whether nothing more can be written.
+    pub fn has_failed(&self) -> bool {
+        self.failed.is_some()
+    }
+
+    /// The exit code of a command that did all its writing here and came to `done` otherwise.
+    pub fn finish(mut self, done: impl FnOnce(Printed) -> ExitCode) -> ExitCode {
+        let _ = self.flush();
+        match self.failed {
+            None => done(Printed::Whole),
+            Some(error) if is_enough(&error) => done(Printed::Enough),
+            Some(error) => {
+                tell(format_args!("stdout: {error}"));
+                ExitCode::FAILURE
+            }
+        }
+    }
+
+    fn keep<T>(&mut self, attempt: impl FnOnce(&mut W) -> io::Result<T>) -> io::Result<T> {
+        if let Some(error) = &self.failed {
+            return Err(error.kind().into());
+        }
+        attempt(&mut self.to).inspect_err(|error| {
+            if error.kind() != io::ErrorKind::Interrupted {
+                self.failed = Some(again(error));
+            }
+        })
+    }
+}
+
+/// How much of what was printed somebody got.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Printed {
+    /// All of it.
+    Whole,
+    /// As much as the reader wanted.
+    Enough,
+}
+
+impl<W: Write> Write for Out<W> {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.keep(|to| to.write(bytes))
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.keep(|to| to.flush())
+    }
+}
+
+/// Whether a failure only says that the reader had enough.
+pub fn is_enough(error: &io::Error) -> bool {
+    error.kind() == io::ErrorKind::BrokenPipe
+}
+
+/// A line for a person on stderr. When nobody can read it, nobody does.
+pub fn tell(message: impl std::fmt::Display) {
+    let _ = writeln!(stderr(), "{message}");
+}
+
+/// The same failure once more, with the system's own words.
+fn again(error: &io::Error) -> io::Error {
+    error.raw_os_error().map_or_else(|| error.kind().into(), io::Error::from_raw_os_error)
+}

@@ -1,0 +1,225 @@
+//! `--ready FILE`: the file that says where everything listens, for as long as it does.
+//!
+//! It appears whole, and it is removed at the end. What is at its place already is replaced only when it
+//! is such a file; whatever else there is belongs to somebody else.
+
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+
+use serde_json::Value;
+
+use super::StartError;
+use recipe_device::files::{Beside, Identity};
+
+/// Where the file is to be.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ReadyFile {
+    path: PathBuf,
+}
+
+impl ReadyFile {
+    /// The file at `path`, which is not written yet.
+    ///
+    /// # Errors
+    /// When there is something that is no such file, or when it could not be written.
+    pub fn at(path: PathBuf) -> Result<Self, StartError> {
+        let file = Self { path };
+        file.is_free()?;
+        // A folder that cannot be written to is found before anything is started.
+        if file.folder().is_dir() {
+            Beside::file(&file.path, b"").map_err(|error| file.refused(error))?;
+        }
+        Ok(file)
+    }
+
+    /// Writes the file; it is there until the result is dropped.
+    pub(super) fn write(&self, ready: &Value) -> Result<Written, StartError> {
+        let is_free = self.is_free()?;
+        let text = format!("{ready}\n");
+        let written = || -> io::Result<Written> {
+            fs::create_dir_all(self.folder())?;
+            let (beside, file) = Beside::file(&self.path, text.as_bytes())?;
+            match is_free {
+                true => beside.put_new(&self.path)?,
+                false => beside.replace(&self.path)?,
+            }
+            Ok(Written { path: self.path.clone(), text: text.clone(), file })
+        };
+        written().map_err(|error| self.refused(error))
+    }
+
+    /// Whether nothing is there; otherwise it is what an earlier run left, or an error.
+    fn is_free(&self) -> Result<bool, StartError> {
+        let refused = |message: &str| Err(self.refused(message));
+        if self.path.file_name().is_none() || self.path.as_os_str().as_encoded_bytes().ends_with(b"/") {
+            return refused(FOLDER);
+        }
+        match fs::symlink_metadata(&self.path) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(true),
+            Err(error) => Err(self.refused(error)),
+            Ok(found) if found.is_dir() => refused(FOLDER),
+            Ok(found) if !found.is_file() => refused("no ordinary file; give another name"),
+            Ok(found) => match read(&self.path, found.len()).map_err(|error| self.refused(error))? {
+                Some(text) if is_ready(&text) => Ok(false),
+                _ => refused(
+                    "there is a file already, and it is none that a run left; give another name or remove it",
+                ),
+            },
+        }
+    }
+
+    fn folder(&self) -> &Path {
+        match self.path.parent() {
+            Some(folder) if folder != Path::new("") => folder,
+            _ => Path::new("."),
+        }
+    }
+
+    fn refused(&self, why: impl std::fmt::Display) -> StartError {
+        StartError::new(format!("--ready {}: {why}", self.path.display()))
+    }
+}
+
+/// A ready file that was written; dropping it removes it, if it still is what was written.
+#[derive(Debug)]
+pub(super) struct Written {
+    path: PathBuf,
+    text: String,
+    /// As long as it is open, no other file gets its number.
+    file: fs::File,
+}
+
+impl Drop for Written {
+    fn drop(&mut self) {
+        let own = self.file.metadata().map(|own| Identity::of(&own));
+        let there = fs::symlink_metadata(&self.path).map(|there| (Identity::of(&there), there.len()));
+        if let (Ok(own), Ok((there, len))) = (own, there)
+            && own == there
+            && read(&self.path, len).is_ok_and(|text| text.as_ref() == Some(&self.text))
+        {
+            let _ = fs::remove_file(&self.path);
+        }
+    }
+}
+
+/// The text of a file that is short enough to be a ready file; `None` when it is no text.
+fn read(path: &Path, len: u64) -> io::Result<Option<String>> {
+    if len > MOST_BYTES {
+        return Ok(None);
+    }
+    Ok(String::from_utf8(fs::read(path)?).ok())
+}
+
+/// Whether this is what a run writes: an object of addresses, and one of ports. Nothing is lost with an
+/// empty file, which `mktemp` makes.
+fn is_ready(text: &str) -> bool {
+    let addresses =
+        |value: &Value| value.as_object().is_some_and(|ports| ports.values().all(Value::is_string));
+    let is_address = |(key, value): (&String, &Value)| match key.as_str() {
+        "ports" => addresses(value),
+        _ => value.is_string(),
+    };
+    match serde_json::from_str(text) {
+        Ok(Value::Object(ready)) => ready.contains_key("ports") && ready.iter().all(is_address),
+        _ => text.is_empty(),
+    }
+}
+
+const FOLDER: &str = "a folder; give the name of a file in it";
+/// The longest that is looked into.
+const MOST_BYTES: u64 = 1 << 16;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    fn place() -> (tempfile::TempDir, PathBuf) {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("ready.json");
+        (folder, path)
+    }
+
+    fn ready() -> Value {
+        json!({ "command": "127.0.0.1:2000", "ports": { "rs485": "run/rs485" } })
+    }
+
+    #[test]
+    fn it_is_there_as_long_as_it_is_true() {
+        let (_folder, path) = place();
+        let path = path.with_file_name("run").join("ready.json");
+        let file = ReadyFile::at(path.clone()).unwrap();
+        assert!(!path.exists() && !path.parent().unwrap().exists(), "nothing is said yet");
+        let written = file.write(&ready()).unwrap();
+        assert_eq!(fs::read_to_string(&path).unwrap(), format!("{}\n", ready()));
+        drop(written);
+        assert_eq!(fs::read_dir(path.parent().unwrap()).unwrap().count(), 0);
+    }
+
+    #[test]
+    fn what_a_killed_run_left_is_replaced() {
+        let (_folder, path) = place();
+        for left in [format!("{}\n", ready()), json!({ "ports": {} }).to_string(), String::new()] {
+            fs::write(&path, left).unwrap();
+            let written = ReadyFile::at(path.clone()).unwrap().write(&ready()).unwrap();
+            assert_eq!(fs::read_to_string(&path).unwrap(), format!("{}\n", ready()));
+            drop(written);
+            assert!(!path.exists());
+        }
+    }
+
+    #[test]
+    fn whatever_else_is_there_stays() {
+        let (_folder, path) = place();
+        let long = format!("{}{}", ready(), " ".repeat(1 << 16));
+        for other in ["[port]\n", "{}", "[]", "\n", r#"{"ports":[]}"#, r#"{"ports":{},"n":1}"#, &long] {
+            fs::write(&path, other).unwrap();
+            let message = ReadyFile::at(path.clone()).unwrap_err().to_string();
+            assert!(
+                message.starts_with(&format!("--ready {}: there is a file", path.display())),
+                "{message}"
+            );
+            assert_eq!(fs::read_to_string(&path).unwrap(), other);
+        }
+        fs::remove_file(&path).unwrap();
+        std::os::unix::fs::symlink("/dev/null", &path).unwrap();
+        assert!(ReadyFile::at(path.clone()).unwrap_err().to_string().contains("no ordinary file"));
+        fs::remove_file(&path).unwrap();
+        fs::create_dir(&path).unwrap();
+        assert!(ReadyFile::at(path.clone()).unwrap_err().to_string().contains("a folder; give the name"));
+        let under = path.with_file_name("file").join("ready.json");
+        fs::write(under.parent().unwrap(), "").unwrap();
+        ReadyFile::at(under).unwrap_err();
+        for no_name in ["", "..", "/", "new/"] {
+            assert!(ReadyFile::at(no_name.into()).unwrap_err().to_string().ends_with(FOLDER), "{no_name:?}");
+        }
+    }
+
+    #[test]
+    fn what_came_while_the_run_started_stays_too() {
+        let (_folder, path) = place();
+        let file = ReadyFile::at(path.clone()).unwrap();
+        fs::write(&path, "somebody's").unwrap();
+        file.write(&ready()).unwrap_err();
+        assert_eq!(fs::read_to_string(&path).unwrap(), "somebody's");
+    }
+
+    #[test]
+    fn only_what_was_written_is_removed() {
+        let (_folder, path) = place();
+        let file = ReadyFile::at(path.clone()).unwrap();
+        let written = file.write(&ready()).unwrap();
+        fs::write(&path, "somebody's").unwrap();
+        drop(written);
+        assert_eq!(fs::read_to_string(&path).unwrap(), "somebody's");
+        fs::remove_file(&path).unwrap();
+        // Another run says the same at the same place.
+        let first = file.write(&ready()).unwrap();
+        let second = file.write(&ready()).unwrap();
+        drop(first);
+        assert!(path.exists());
+        drop(second);
+        assert!(!path.exists());
+    }
+}

@@ -1,0 +1,85 @@
+//! Texts of configuration files that several tests use.
+
+/// A gateway with one field port, `device`, at which there is a panel: `FF FF order outputs EE EE`. The
+/// order's `commands`, such as `1 = "stop"`, are sent when it changes. The outputs are DO1 to DO8, of
+/// which only DO8 is on when the panel says nothing for `timeout_ms`.
+pub fn panel(commands: &str, timeout_ms: u32) -> String {
+    format!(
+        r#"
+[controller]
+address = "127.0.0.1"
+
+[[recipe]]
+name = "panel"
+kind = "stream"
+mode = "user"
+[recipe.input]
+head = [255, 255]
+tail = [238, 238]
+fields = [
+    {{ name = "order", type = "byte", commands = {{ {commands} }} }},
+    {{ name = "outputs", type = "byte", to = "DigitalOutputCommand[1]" }},
+]
+
+[[port]]
+name = "device"
+bus = "rs485"
+recipe = "panel"
+timeout_ms = {timeout_ms}
+on_timeout = {{ "DigitalOutputCommand[1]" = 128 }}
+"#
+    )
+}
+
+/// Pieces that mean something to a configuration file, and some that mean trouble. Seeds of a fuzzer
+/// are numbers of them: new ones belong at the end.
+pub const PIECES: [&str; 48] = [
+    "[",
+    "]",
+    "[[",
+    "{",
+    "}",
+    "=",
+    ",",
+    "\n",
+    "\"",
+    "'''",
+    "0",
+    "-1",
+    "1e308",
+    "nan",
+    "inf",
+    "0x1FFFFFFF",
+    "99999999999999999999",
+    "true",
+    "é",
+    "\u{0}",
+    "..",
+    "RobotState[1..32]",
+    "ForceEnd[1]",
+    "__RobotState_8",
+    "head = [1]",
+    "fields = []",
+    "[[port]]\n",
+    "[[recipe]]\n",
+    "\"rising:BitOutputReg[3].7\"",
+    "1979-05-27",
+    "name = \"\"",
+    "\"a\\nb\" = 1",
+    "name = \"a\\nb\"",
+    "type = \"double\"",
+    "extended = true",
+    "value = 1.5",
+    "{ 1 = \"stop\" }",
+    "bus = \"can\"",
+    "mode = \"user\"",
+    "cycle_ms = 5",
+    "baud = 9600",
+    "\u{7F}",
+    "\u{85}",
+    "on_timeout = { \"DI[1]\" = 1 }",
+    "to = \"WordInputReg[1]\"",
+    "from = \"counter\"",
+    "send = \"frame\"",
+    "#",
+];

@@ -1,0 +1,10 @@
+//! The program as a person or a script meets it.
+
+mod command_line;
+mod output;
+mod processes;
+mod soak;
+
+use recipe_test_kit::Binary;
+
+const BINARY: Binary = Binary(env!("CARGO_BIN_EXE_host-sim"));

@@ -1,0 +1,180 @@
+//! Every command's output where it cannot be written: on a disk that is full, to a reader that had enough.
+
+use std::fs::File;
+use std::io::{BufRead, BufReader, Read};
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::sync::mpsc::channel;
+use std::time::Duration;
+
+use clap::CommandFactory;
+use host_sim::cli::Cli;
+use recipe_test_kit::{ended, example, free_servers};
+
+use super::BINARY;
+
+/// One command line of each command, everything it makes in `folder`.
+fn command_lines(folder: &Path) -> Vec<Vec<String>> {
+    let config = |name: &str| example(name).to_str().unwrap().to_owned();
+    let at = |name: &str| folder.join(name).to_str().unwrap().to_owned();
+    let (gateway, robot) = (config("rs485-system.toml"), config("rs485-system-controller.toml"));
+    let servers = free_servers();
+    let run = [format!("--ready={}", at("ready.json")), "--stats=20ms".into()];
+    let line = |words: &[&str]| words.iter().map(|&word| word.to_owned()).collect::<Vec<_>>();
+    let soak = ["soak", "--cell", "rs485-system"];
+    vec![
+        line(&[]),
+        line(&["demo"]),
+        [
+            line(&["controller", "-c", &robot, "--bind", &format!("rs485=pty:{}", at("line"))]),
+            servers.into(),
+            run.clone().into(),
+        ]
+        .concat(),
+        [line(&["gateway", "-c", &gateway, "--bind", &format!("rs485-1=pty:{}", at("line"))]), run.into()]
+            .concat(),
+        line(&["check", &gateway]),
+        line(&["image", &gateway, "-o", &at("cell.img")]),
+        line(&[&soak[..], &["--hours", "0.001"]].concat()),
+        line(&[&soak[..], &["--replay", "9@2.5", "--trace"]].concat()),
+        line(&["encode", &gateway, "--part", "input", "1"]),
+        line(&["decode", &gateway, "--part", "input", "FFFF01EEEE", "FFFF01EEEE"]),
+        line(&["help"]),
+        line(&["--help"]),
+        line(&["check", "--help"]),
+        line(&["--version"]),
+    ]
+}
+
+/// Whether it says `ready` and prints statistics until it is told to end.
+fn runs_on(line: &[String]) -> bool {
+    line.first().is_some_and(|command| command == "controller" || command == "gateway")
+}
+
+/// Where its output goes.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum To {
+    FullDisk,
+    /// Nobody reads.
+    Nobody,
+    /// `head -1`.
+    Head,
+}
+
+/// The exit code, and what it said on stderr.
+#[track_caller]
+fn outcome(line: &[String], to: To, folder: &Path) -> (Option<i32>, String) {
+    let mut command = Command::new(BINARY.0);
+    command.args(line).env("TMPDIR", folder).stdin(Stdio::null()).stderr(Stdio::piped());
+    let reader = match to {
+        To::FullDisk => {
+            command.stdout(File::options().write(true).open("/dev/full").unwrap());
+            None
+        }
+        To::Nobody | To::Head => {
+            let (reader, writer) = std::io::pipe().unwrap();
+            command.stdout(writer);
+            (to == To::Head).then_some(reader)
+        }
+    };
+    let mut child = command.spawn().unwrap();
+    // The other end of the pipe is the child's alone.
+    drop(command);
+    if let Some(reader) = reader {
+        let mut first = String::new();
+        BufReader::new(reader).read_line(&mut first).unwrap();
+        assert!(!first.is_empty(), "{line:?} says something");
+    }
+    let status = ended(&mut child, PATIENCE);
+    let mut said = String::new();
+    child.stderr.take().unwrap().read_to_string(&mut said).unwrap();
+    (status.code(), said)
+}
+
+const PATIENCE: Duration = Duration::from_secs(60);
+
+/// What is in the folder, but for what `image` is told to make.
+fn left_behind(folder: &Path) -> Vec<PathBuf> {
+    let names = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path());
+    names.filter(|path| path.file_name().unwrap() != "cell.img").collect()
+}
+
+#[test]
+fn every_command_is_tried() {
+    let lines = command_lines(Path::new("folder"));
+    let command = Cli::command();
+    for command in command.get_subcommands().map(clap::Command::get_name) {
+        assert!(lines.iter().any(|line| line.first().is_some_and(|first| first == command)), "{command}");
+    }
+}
+
+#[test]
+fn what_cannot_be_written_is_one_message_and_exit_code_1() {
+    let folder = tempfile::tempdir().unwrap();
+    for line in command_lines(folder.path()) {
+        let (code, said) = outcome(&line, To::FullDisk, folder.path());
+        assert_eq!(
+            (code, said.as_str()),
+            (Some(1), "stdout: No space left on device (os error 28)\n"),
+            "{line:?}"
+        );
+        assert_eq!(left_behind(folder.path()), [""; 0].map(PathBuf::from), "{line:?}");
+    }
+}
+
+#[test]
+fn a_reader_that_had_enough_ends_a_command_quietly() {
+    let folder = tempfile::tempdir().unwrap();
+    for line in command_lines(folder.path()) {
+        for to in [To::Nobody, To::Head] {
+            let (code, said) = outcome(&line, to, folder.path());
+            let why =
+                if runs_on(&line) { "stdout was closed: nobody reads the statistics, ended\n" } else { "" };
+            assert_eq!((code, said.as_str()), (Some(0), why), "{line:?} to {to:?}");
+            assert_eq!(left_behind(folder.path()), [""; 0].map(PathBuf::from), "{line:?} to {to:?}");
+        }
+    }
+}
+
+#[test]
+fn nobody_need_read_stderr_either() {
+    let full = || File::options().write(true).open("/dev/full").unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let wrong = vec![vec!["check".to_owned(), "no-such-file.toml".to_owned()], vec!["nonsense".to_owned()]];
+    for (lines, expected) in [(command_lines(folder.path()), 1), (wrong, 2)] {
+        for line in lines {
+            let mut command = Command::new(BINARY.0);
+            command.args(&line).env("TMPDIR", folder.path()).stdin(Stdio::null());
+            let status = command.stdout(full()).stderr(full()).status().unwrap();
+            assert_eq!(status.code(), Some(expected), "{line:?}");
+        }
+    }
+}
+
+#[test]
+fn a_disk_that_fills_up_later_costs_statistics_and_does_not_end_a_gateway() {
+    let folder = tempfile::tempdir().unwrap();
+    let lines = command_lines(folder.path());
+    let gateway = lines.iter().find(|line| line.first().is_some_and(|command| command == "gateway")).unwrap();
+    // Files of a few kilobytes: room for the ready line and not for many others.
+    let limited = ["--ignore-signal=XFSZ", "sh", "-c", "ulimit -f 8; exec \"$0\" \"$@\""];
+    let mut command = Command::new("env");
+    command.args(limited).arg(BINARY.0).args(gateway).stdin(Stdio::null());
+    let log = folder.path().join("log");
+    let mut child = command.stdout(File::create(&log).unwrap()).stderr(Stdio::piped()).spawn().unwrap();
+    let stderr = BufReader::new(child.stderr.take().unwrap());
+    let (sender, lines) = channel();
+    std::thread::spawn(move || stderr.lines().map_while(Result::ok).try_for_each(|line| sender.send(line)));
+    let said = lines.recv_timeout(PATIENCE).unwrap_or_else(|_| {
+        child.kill().unwrap();
+        panic!("nothing is said")
+    });
+    assert!(said.contains("statistics cannot be written to stdout"), "{said}");
+    assert!(std::fs::read_to_string(&log).unwrap().starts_with("ready {"));
+    // It runs on, and says so only once.
+    assert!(folder.path().join("ready.json").exists() && folder.path().join("line").exists());
+    assert!(Command::new("kill").arg(child.id().to_string()).status().unwrap().success());
+    assert_eq!(child.wait().unwrap().code(), Some(0));
+    assert_eq!(lines.iter().collect::<Vec<_>>(), [""; 0]);
+    assert_eq!(left_behind(folder.path()), [log]);
+}

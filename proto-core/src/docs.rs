@@ -1,0 +1,43 @@
+//! The pages on formats and rules that comments cite, such as `docs/wire/recipes.md section 4`: the
+//! same files as in the folder `docs/` of the package. They are here only when documentation is built.
+
+/// A page of `docs/wire/` as a module. In what it has of links to other pages, the first definition
+/// counts: the page's own, at its end, is for who reads the file.
+macro_rules! page {
+    ($name:ident: $($link:ident)*) => {
+        $(#[doc = concat!("[", stringify!($link), "]: ", stringify!($link))])*
+        #[doc = ""]
+        #[allow(rustdoc::broken_intra_doc_links, reason = "`DigitalOutputCommand[3]` is a name")]
+        #[doc = include_str!(concat!("../docs/wire/", stringify!($name), ".md"))]
+        pub mod $name {}
+    };
+}
+
+/// [driver]: driver
+/// [wire]: wire
+#[doc = ""]
+#[doc = include_str!("../docs/engine.md")]
+pub mod engine {}
+
+/// [engine]: engine
+#[doc = ""]
+#[doc = include_str!("../docs/driver.md")]
+pub mod driver {}
+
+/// [engine]: engine
+/// [sysvars]: wire::sysvars
+/// [recipes]: wire::recipes
+/// [state]: wire::state
+/// [command]: wire::command
+/// [modbus]: wire::modbus
+/// [slcan]: wire::slcan
+#[doc = ""]
+#[doc = include_str!("../docs/wire/README.md")]
+pub mod wire {
+    page!(sysvars: );
+    page!(recipes: sysvars);
+    page!(state: command sysvars);
+    page!(command: state);
+    page!(modbus: sysvars);
+    page!(slcan: );
+}
