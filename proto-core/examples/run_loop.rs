@@ -7,16 +7,11 @@
 
 use std::collections::VecDeque;
 
-use proto_core::config::{
-    Bus, ControllerLink, FieldSpec, GatewayConfig, OnStale, Parity, Parts, Port, Recipe, Rs485, SendOn, Span,
-    StreamPart,
-};
+use proto_core::config::{GatewayConfig, OnStale, Port, Recipe};
 use proto_core::engine::{Engine, Input, LinkId, OUTPUT_BUFFER, Output, PortId};
 use proto_core::modbus::adu::MAX_ADU;
 use proto_core::modbus::server::{RegisterBank, Server};
 use proto_core::modbus::{Coils, Exception, Registers};
-use proto_core::recipe::model::Mode;
-use proto_core::sysvar::SysVar;
 use proto_core::time::{Duration, Instant};
 
 type Failure = Box<dyn std::error::Error>;
@@ -57,56 +52,17 @@ fn main() -> Result<(), Failure> {
 
 const PORT: PortId = PortId(0);
 
-/// On a host such a configuration comes from TOML, on a board from flash by postcard.
+/// On a host such a configuration may come from TOML, on a board from flash by postcard.
 fn configuration() -> Result<GatewayConfig, Failure> {
-    let field = |name| SysVar::parse(name).map(FieldSpec::System);
-    let bytes = |bytes: &[u8]| heapless::Vec::from_slice(bytes).map_err(|_| "more than eight bytes");
-    let part = |head: &[u8], tail: &[u8], start| -> Result<StreamPart, Failure> {
-        Ok(StreamPart { head: bytes(head)?, tail: bytes(tail)?, fields: Span { start, len: 1 } })
-    };
-    let line = Rs485 {
-        baud: 115_200,
-        parity: Parity::None,
-        stop_bits: 1,
-        idle_gap: Duration::from_millis(50),
-        turnaround: Duration::from_micros(100),
-    };
-    let parts = Parts::Stream {
-        input: Some(part(&[0xFF, 0xFF], &[0xEE, 0xEE], 0)?),
-        output: Some(part(&[0xFF, 0xFF], &[0xFE, 0xFE], 1)?),
-    };
-    let recipe = Recipe {
-        name: "system".try_into().map_err(|_| "too long")?,
-        mode: Mode::Realtime,
-        parts,
-        on_stale: OnStale::Stop,
-        send: SendOn::Period,
-    };
-    let port = Port {
-        name: "rs485-1".try_into().map_err(|_| "too long")?,
-        bus: Bus::Rs485(line),
-        recipe: 0,
-        cycle: Duration::from_millis(4),
-        timeout: Duration::from_millis(100),
-        on_timeout: Span::default(),
-        stale_after: Duration::from_millis(500),
-    };
-    Ok(GatewayConfig {
-        controller: ControllerLink {
-            address: "192.168.12.138".try_into().map_err(|_| "too long")?,
-            dialect: "v2.3".try_into().map_err(|_| "too long")?,
-            command_port: 2000,
-            state_port: 2001,
-            modbus_port: 502,
-            recipe_link: None,
-        },
-        network: None,
-        recipes: [recipe].into_iter().collect(),
-        ports: [port].into_iter().collect(),
-        fields: [field("DigitalOutputCommand[1]")?, field("DigitalSignalStatus[4]")?].into_iter().collect(),
-        commands: heapless::Vec::new(),
-        safe_values: heapless::Vec::new(),
-    })
+    let recipe = Recipe::realtime("system")
+        .stream_input(&[0xFF, 0xFF], &[0xEE, 0xEE], &["DigitalOutputCommand[1]"])
+        .stream_output(&[0xFF, 0xFF], &[0xFE, 0xFE], &["DigitalSignalStatus[4]"])
+        .on_stale(OnStale::Stop);
+    Ok(GatewayConfig::builder()
+        .controller("192.168.12.138")
+        .recipe(recipe)
+        .port(Port::rs485("rs485-1", "system"))
+        .build()?)
 }
 
 /// What a driver reports; a real one has UARTs and sockets instead of this queue.

@@ -19,7 +19,7 @@ use super::uplink::Uplink;
 use super::user::{Bindings, InputBind};
 use super::{Ask, Engine};
 use crate::config::{
-    Bus, ConfigError, FieldSpec, GatewayConfig, InputBinding, MAX_SAFE_VALUES, Parts, Port, Recipe, SendOn,
+    Bus, ConfigError, ConfigView, FieldSpec, InputBinding, MAX_SAFE_VALUES, Parts, Port, Recipe, SendOn,
     Span, StreamPart,
 };
 use crate::image::{GroupId, InputSet, MAX_GROUPS};
@@ -118,7 +118,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     ///
     /// # Errors
     /// [`BuildError`] says what is wrong with the configuration, or what there is no room for.
-    pub fn new(config: &GatewayConfig) -> Result<Self, BuildError> {
+    pub fn new<'c>(config: impl Into<ConfigView<'c>>) -> Result<Self, BuildError> {
         let mut engine = Self::idle();
         engine.configure(config)?;
         Ok(engine)
@@ -129,7 +129,13 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     ///
     /// # Errors
     /// As [`Engine::new`]; the engine is idle then.
-    pub fn configure(&mut self, config: &GatewayConfig) -> Result<(), BuildError> {
+    pub fn configure<'c>(&mut self, config: impl Into<ConfigView<'c>>) -> Result<(), BuildError> {
+        self.configure_from(config.into())
+    }
+
+    /// Not inlined: a run loop would hold this stack for ever.
+    #[inline(never)]
+    fn configure_from(&mut self, config: ConfigView<'_>) -> Result<(), BuildError> {
         self.clear();
         let done = self.build(config);
         if done.is_err() {
@@ -180,11 +186,11 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         *ask = Ask::ALL;
     }
 
-    fn build(&mut self, config: &GatewayConfig) -> Result<(), BuildError> {
+    fn build(&mut self, config: ConfigView<'_>) -> Result<(), BuildError> {
         config.validate().map_err(BuildError::Config)?;
         let plan = Plan::new(config).map_err(BuildError::Plan)?;
         let dialect = Dialect::named(&config.controller.dialect).ok_or(BuildError::UnknownDialect)?;
-        for value in &config.safe_values {
+        for value in config.safe_values {
             let full = |_| too_many("safe values", MAX_SAFE_VALUES);
             self.safe_values.push(SafeBytes::new(value)).map_err(full)?;
         }
@@ -211,7 +217,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
 
     fn add_port(
         &mut self,
-        config: &GatewayConfig,
+        config: ConfigView<'_>,
         index: u8,
         port: &Port,
         recipe: &Recipe,
@@ -224,7 +230,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         let first_frame = self.store.frames.len() as u8;
         let mut next_binding = self.bindings.inputs.len() as u16;
         for (_, fields) in recipe.frames(Direction::Input) {
-            let fields = fields.of(&config.fields);
+            let fields = fields.of(config.fields);
             let set = fields.iter().filter_map(FieldSpec::variable).collect();
             let is_bound = |field: &&FieldSpec| matches!(field, FieldSpec::UserInput { .. });
             let bound = fields.iter().filter(is_bound).count() as u16;
@@ -250,7 +256,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
                 }
                 FieldSpec::UserInput { to: InputBinding::Commands { table, when }, .. } => {
                     if self.links.command.is_none() {
-                        let link = CommandLink::new(dialect, &config.commands);
+                        let link = CommandLink::new(dialect, config.commands);
                         self.links.command =
                             Some(link.ok_or(too_many("bytes of command texts", MAX_COMMAND_BYTES))?);
                     }
@@ -294,7 +300,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
 
     fn add_uplink(
         &mut self,
-        config: &GatewayConfig,
+        config: ConfigView<'_>,
         plan: &Plan,
         id: LinkId,
         recipe: &Recipe,
@@ -365,7 +371,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
 
     fn assign_sources(
         &mut self,
-        config: &GatewayConfig,
+        config: ConfigView<'_>,
         plan: &Plan,
         groups: &mut Groups,
     ) -> Result<(), BuildError> {
@@ -450,11 +456,11 @@ fn modbus_address(var: SysVar) -> (u8, u16) {
     }
 }
 
-fn recipe_index(config: &GatewayConfig, recipe: &Recipe) -> u8 {
-    (0..).zip(&config.recipes).find(|(_, other)| other.name == recipe.name).map_or(0, |(index, _)| index)
+fn recipe_index(config: ConfigView<'_>, recipe: &Recipe) -> u8 {
+    (0..).zip(config.recipes).find(|(_, other)| other.name == recipe.name).map_or(0, |(index, _)| index)
 }
 
-fn stream_codec(config: &GatewayConfig, index: u8, recipe: &Recipe) -> Result<Codec, BuildError> {
+fn stream_codec(config: ConfigView<'_>, index: u8, recipe: &Recipe) -> Result<Codec, BuildError> {
     let Parts::Stream { input, output } = &recipe.parts else {
         return Err(too_many("stream parts in a CAN recipe", 0));
     };
@@ -469,7 +475,7 @@ fn stream_codec(config: &GatewayConfig, index: u8, recipe: &Recipe) -> Result<Co
 }
 
 fn stream_layout(
-    config: &GatewayConfig,
+    config: ConfigView<'_>,
     index: u8,
     recipe: &Recipe,
     part: Option<&StreamPart>,
@@ -478,13 +484,13 @@ fn stream_layout(
 ) -> Result<Option<StreamLayout>, BuildError> {
     let Some(part) = part else { return Ok(None) };
     let rules = Rules { mode: recipe.mode, direction };
-    let fields = part.fields.of(&config.fields).iter().map(FieldSpec::field);
+    let fields = part.fields.of(config.fields).iter().map(FieldSpec::field);
     StreamLayout::new(rules, &part.head, &part.tail, fields, framing)
         .map(Some)
         .map_err(|error| BuildError::Part { recipe: index, part: direction, error })
 }
 
-fn can_codec(config: &GatewayConfig, index: u8, recipe: &Recipe) -> Result<Codec, BuildError> {
+fn can_codec(config: ConfigView<'_>, index: u8, recipe: &Recipe) -> Result<Codec, BuildError> {
     let Parts::Can { input, output } = &recipe.parts else {
         return Err(too_many("CAN parts in a stream recipe", 0));
     };
@@ -493,7 +499,7 @@ fn can_codec(config: &GatewayConfig, index: u8, recipe: &Recipe) -> Result<Codec
             return Ok(None);
         }
         let frames = frames.iter().map(|frame| {
-            let fields = frame.fields.of(&config.fields).iter().map(FieldSpec::field);
+            let fields = frame.fields.of(config.fields).iter().map(FieldSpec::field);
             (frame.id, fields)
         });
         CanLayout::new(Rules { mode: recipe.mode, direction }, frames)
