@@ -200,7 +200,7 @@ impl fmt::Display for DescribedKind<'_> {
             Kind::TooLong { len, longest } => write!(f, "{len} bytes long; at most {longest}"),
             Kind::NameLength { len } => write!(f, "{len} bytes long; 1..={MAX_NAME}"),
             Kind::NameCharacter { character } => {
-                write!(f, "has {character:?} in it; a name has no blanks, quotes, '=' or control characters")
+                write!(f, "{character:?} in a name; no blanks, quotes, '=' and control characters")
             }
             Kind::NoSuchName => f.write_str("no recipe before has this name"),
             Kind::Variable(error) => error.fmt(f),
