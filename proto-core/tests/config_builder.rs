@@ -204,7 +204,7 @@ fn a_board_builds_in_place_what_the_builder_builds() {
 
 #[test]
 fn what_is_refused_leaves_nothing_behind() {
-    let mut config: GatewayConfig<1, 1, 3, 1, 1> = GatewayConfig::empty();
+    let mut config: GatewayConfig<1, 1, 3, 1, 2> = GatewayConfig::empty();
     let field = [InputField::commands(ScalarType::Byte, &[(1, "stop")])];
     let recipe = Recipe::user("a").stream_input(HEAD, &[], &field);
     for wrong in [
@@ -224,7 +224,8 @@ fn what_is_refused_leaves_nothing_behind() {
     for wrong in [
         Port::rs485("p", "b"),
         Port::rs485("", "a"),
-        port.safe(&[("WordInputReg[1]", 1.0), ("WordInputReg[2]", 1.0)]),
+        port.safe(&[("WordInputReg[1]", 1.0), ("WordInputReg[2]", -1.0)]),
+        port.safe(&[("WordInputReg[1]", 1.0), ("WordInputReg[2]", 1.0), ("WordInputReg[3]", 1.0)]),
         port.safe(&[("WordInputReg[1]", 65_536.0)]),
         port.safe(&[("WordInputReg[1..2]", 1.0)]),
     ] {
