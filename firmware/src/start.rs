@@ -3,7 +3,6 @@
 //! Each `#[task]` here is a shim around the library's function of the same name, because a task cannot
 //! be generic.
 
-use core::net::Ipv4Addr;
 use core::pin::pin;
 
 use embassy_executor::{SpawnError, SpawnToken, Spawner};
@@ -120,12 +119,8 @@ enum Room {
 }
 
 impl Room {
-    /// All zeros, so that it takes no flash: what it says is written over before anybody looks.
-    const BLANK: Self = {
-        let mut config = GatewayConfig::empty();
-        config.network = Some(Network { address: Ipv4Addr::UNSPECIFIED, prefix: 0, router: None, dns: None });
-        Self::Configuration(config)
-    };
+    /// All zeros, so that it takes no flash.
+    const BLANK: Self = Self::Configuration(GatewayConfig::empty());
 
     fn configuration(&mut self) -> &mut GatewayConfig {
         match self {
@@ -155,9 +150,13 @@ fn load(
     gateway.configure(config).map_err(Refused::Build)?;
     let gateway: &'static Gateway = gateway;
     let wiring = Wiring {
-        ports: config.field_ports().map(|(index, port, _)| (PortId(index), port.bus.clone())).collect(),
+        ports: config
+            .view()
+            .field_ports()
+            .map(|(index, port, _)| (PortId(index), port.bus.clone()))
+            .collect(),
         links: gateway.links().map(|(id, kind)| (id, kind, Endpoint::of(config, kind))).collect(),
-        network: config.network,
+        network: config.network.fixed().copied(),
     };
     info!(
         "configuration: {} bytes; {} field ports, {} links; the engine takes {} bytes, its configuration {}",

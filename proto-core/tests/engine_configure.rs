@@ -2,8 +2,10 @@
 
 mod rig;
 
-use proto_core::config::{CommandWhen, InputBinding, Parts};
-use proto_core::engine::{Engine, Input, OUTPUT_BUFFER, Output, PortId};
+use proto_core::config::{
+    CanFields, CommandWhen, ConfigBuilder, GatewayConfig, InputBinding, InputField, Parts, Port, Recipe,
+};
+use proto_core::engine::{BuildError, Engine, Input, OUTPUT_BUFFER, Output, PortId};
 use proto_core::recipe::model::Mode;
 use proto_core::time::Instant;
 use proto_core::wire::scalar::ScalarType;
@@ -85,4 +87,58 @@ fn after_a_refused_configuration_it_is_idle() {
     let mut buf = [0; OUTPUT_BUFFER];
     let asleep = Output::Sleep { until: Instant::NEVER };
     assert_eq!(engine.poll_output(Instant::from_millis(1), &mut buf), asleep);
+}
+
+#[test]
+fn configurations_of_every_size_are_the_same_to_it() {
+    fn builder<const P: usize, const R: usize, const F: usize, const C: usize, const S: usize>()
+    -> ConfigBuilder<P, R, F, C, S> {
+        GatewayConfig::builder()
+            .controller("10.0.0.2")
+            .recipe(
+                Recipe::realtime("panel")
+                    .stream_input(&[255], &[], &["BitInputReg[1]", "WordInputReg[1..30]"])
+                    .stream_output(&[255], &[], &["DigitalSignalStatus[1]"]),
+            )
+            .port(Port::rs485("panel", "panel").safe(&[("BitInputReg[1]", 3.0)]))
+    }
+    let small: GatewayConfig<1, 1, 32, 0, 1> = builder().build().unwrap();
+    let full: GatewayConfig = builder().build().unwrap();
+    assert!(size_of_val(&small) < 4 * 1024, "{} bytes", size_of_val(&small));
+    assert_eq!(state(&Small::new(&small).unwrap()), state(&Small::new(&full).unwrap()));
+    assert_eq!(Small::new(small.view()).map(|_| ()), Ok(()));
+}
+
+#[test]
+fn what_it_has_no_room_for_is_counted() {
+    let refused = |builder: ConfigBuilder| {
+        let config = builder.build().unwrap();
+        match Small::new(&config).map(|_| ()) {
+            Err(BuildError::TooMany { what, needed, room }) => (what, needed, room),
+            other => panic!("{other:?}"),
+        }
+    };
+    let output = || Recipe::realtime("out").stream_output(&[255], &[], &["RobotState[8]"]);
+    let base = || GatewayConfig::builder().controller("10.0.0.2").recipe(output());
+    let ports = ["a", "b", "c"].into_iter().fold(base(), |base, name| base.port(Port::rs485(name, "out")));
+    assert_eq!(refused(ports), ("field ports", 3, 2));
+    let links = ["a", "b", "c"].into_iter().enumerate().fold(base(), |base, (nth, name)| {
+        base.port(Port::udp_listen(name, "out", ["1.1.1.1:1", "1.1.1.1:2", "1.1.1.1:3"][nth]))
+    });
+    assert_eq!(refused(links.recipe_link("out")), ("recipe links", 4, 1));
+    let fields = [InputField::unused(ScalarType::Byte); 17];
+    let user = base().recipe(Recipe::user("user").stream_input(&[255], &[], &fields));
+    assert_eq!(
+        refused(user.port(Port::rs485("a", "user"))),
+        ("user-defined fields in one direction", 17, 16)
+    );
+    let frames =
+        |first: u16| (first..first + 25).map(|id| CanFields::standard(id, &fields[..1])).collect::<Vec<_>>();
+    let (one, two) = (frames(0), frames(100));
+    let can = base()
+        .recipe(Recipe::user("one").can_input(&one))
+        .recipe(Recipe::user("two").can_input(&two))
+        .port(Port::can("a", "one"))
+        .port(Port::can("b", "two"));
+    assert_eq!(refused(can), ("input frames", 50, 48));
 }

@@ -55,21 +55,21 @@ fn config_validate(config: &GatewayConfig) {
 fn config_questions(config: &GatewayConfig) {
     for port in &config.ports {
         for part in [Direction::Input, Direction::Output] {
-            black_box(config.budget(port, part));
+            black_box(config.view().budget(port, part));
         }
-        black_box(config.shortest_cycle(port));
+        black_box(config.view().shortest_cycle(port));
         black_box(port.bus.is_field());
         if let proto_core::config::Bus::Rs485(line) = &port.bus {
             let _ = black_box(line.check());
             black_box((line.bits_per_character(), line.time_on_line(any(7))));
         }
     }
-    config.warnings().for_each(|warning| _ = black_box(warning));
-    config.upstream_recipes().for_each(|recipe| _ = black_box(recipe));
-    config.field_ports().for_each(|port| _ = black_box(port));
+    config.view().warnings().for_each(|warning| _ = black_box(warning));
+    config.view().upstream_recipes().for_each(|recipe| _ = black_box(recipe));
+    config.view().field_ports().for_each(|port| _ = black_box(port));
     for recipe in &config.recipes {
-        config.fields_of(recipe, any(Direction::Input)).for_each(|field| _ = black_box(field));
-        config.written_by(recipe).for_each(|var| _ = black_box(var));
+        config.view().fields_of(recipe, any(Direction::Input)).for_each(|field| _ = black_box(field));
+        config.view().written_by(recipe).for_each(|var| _ = black_box(var));
         recipe.frames(any(Direction::Input)).for_each(|frame| _ = black_box(frame));
     }
     for field in &config.fields {

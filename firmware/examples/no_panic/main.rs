@@ -13,6 +13,7 @@ mod protocols;
 mod recipes;
 mod state;
 mod words;
+mod zeros;
 
 use core::hint::black_box;
 
@@ -38,6 +39,7 @@ fn exercise() {
     recipes::all();
     protocols::all();
     state::all();
+    zeros::all();
     match VARIANT {
         Variant::Proof | Variant::Shown => {}
         Variant::Provoked => _ = black_box(bytes()[any(7_usize)]),

@@ -35,13 +35,13 @@ pub(crate) fn all() {
     static CONFIG: GatewayConfig = GatewayConfig::empty();
     let config = black_box(&CONFIG);
     if let Err(error) = any(config.validate()) {
-        say(config.describe(error));
+        say(config.view().describe(error));
         say(error);
-        say(config.describe_kind(error.kind));
+        say(config.view().describe_kind(error.kind));
         say(any(BuildError::Config(error)));
         say(any(image::ImageError::Config(error)));
     }
-    config.warnings().for_each(|warning| say(config.describe_warning(warning)));
+    config.view().warnings().for_each(|warning| say(config.view().describe_warning(warning)));
     say(any(image::NoSpace { available: 0 }));
     let Ok(var) = any(SysVar::parse("DI[1]")) else { return };
     say(var);

@@ -88,7 +88,7 @@ impl Gateway {
         // As many places as the engine has.
         self.ports.clear();
         self.ports.extend(engine.field_ports().map(|id| (id, PortControl::new())));
-        for ((_, control), (.., recipe)) in self.ports.iter_mut().zip(config.field_ports()) {
+        for ((_, control), (.., recipe)) in self.ports.iter_mut().zip(config.view().field_ports()) {
             if let Parts::Can { input, .. } = &recipe.parts {
                 control.take_ids(input.iter().map(|frame| frame.id));
             }

@@ -54,14 +54,14 @@ impl Gateway {
     async fn open(config: &GatewayConfig, binds: &[Bind]) -> Result<Self, StartError> {
         let engine: Box<Engine> =
             Box::new(Engine::new(config).map_err(|error| StartError::new(error.to_string()))?);
-        let field = || config.field_ports().map(|(_, port, _)| port);
+        let field = || config.view().field_ports().map(|(_, port, _)| port);
         if let Some(bind) = binds.iter().find(|bind| field().all(|port| port.name != bind.port.as_str())) {
             let names: Vec<_> = field().map(|port| port.name.as_str()).collect();
             let message = format!("--bind {bind}: no such port; there are: {}", names.join(", "));
             return Err(StartError::new(message));
         }
         let mut ports = Vec::new();
-        for (index, port, recipe) in config.field_ports() {
+        for (index, port, recipe) in config.view().field_ports() {
             let mut device = open_port(port, binds).await?;
             if let Parts::Can { input, output } = &recipe.parts {
                 device.listen_to(input.iter().chain(output).map(|frame| frame.id).collect());

@@ -84,7 +84,7 @@ fn gateway(config: &GatewayConfig, recipes: &[SimRecipe]) -> String {
         "controller {} ({}): command {}, state {}, Modbus {}\n",
         link.address, link.dialect, link.command_port, link.state_port, link.modbus_port
     );
-    if let Some(network) = &config.network {
+    if let Some(network) = config.network.fixed() {
         let others = [("router", network.router), ("name server", network.dns)];
         let others = others.iter().filter_map(|(what, at)| Some(format!(", {what} {}", at.as_ref()?)));
         report +=
@@ -101,15 +101,18 @@ fn gateway(config: &GatewayConfig, recipes: &[SimRecipe]) -> String {
         report += &format!("\nport {}: {bus}, recipe {recipe}\n", port.name);
         // Devices speak on a field port, the controller on a way up.
         for part in [Direction::Input, Direction::Output] {
-            if let Some(budget) = config.budget(port, part) {
+            if let Some(budget) = config.view().budget(port, part) {
                 report += &show_budget(part, budget, port.cycle);
             }
         }
     }
     report += &plan::show(config);
     report += &pendant_of_gateway(config, recipes);
-    let warnings: Vec<_> =
-        config.warnings().map(|warning| format!("  {}\n", config.describe_warning(warning))).collect();
+    let warnings: Vec<_> = config
+        .view()
+        .warnings()
+        .map(|warning| format!("  {}\n", config.view().describe_warning(warning)))
+        .collect();
     if !warnings.is_empty() {
         report += &format!("\nwarnings\n{}", warnings.concat());
     }

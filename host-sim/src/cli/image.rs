@@ -29,7 +29,7 @@ pub(super) struct ImageArgs {
 pub(super) fn run(args: &ImageArgs, out: &mut dyn Write) -> Outcome {
     let config = check::load_gateway(&args.file, &args.overrides.set).map_err(|error| error.to_string())?;
     let mut bytes = vec![0; image::MAX_IMAGE];
-    let len = image::encode(&config, &mut bytes).map_err(|error| error.to_string())?;
+    let len = image::encode(&*config, &mut bytes).map_err(|error| error.to_string())?;
     bytes.truncate(len);
     // What a board would refuse is never written.
     image::decode(&bytes).map_err(|error| error.to_string())?;

@@ -10,10 +10,11 @@ pub(super) fn show(config: &GatewayConfig) -> String {
     let Ok(plan) = Plan::new(config) else { return String::new() };
     let mut report = String::from("\nways\n");
     let mut lines: Vec<(String, String, String)> = Vec::new();
-    for (_, port, recipe) in config.field_ports() {
-        let up = config.written_by(recipe).map(|var| (var, way_up(config, &plan, var)));
+    for (_, port, recipe) in config.view().field_ports() {
+        let up = config.view().written_by(recipe).map(|var| (var, way_up(config, &plan, var)));
         add(&mut lines, &port.name, up);
         let commands: u16 = config
+            .view()
             .fields_of(recipe, Direction::Input)
             .filter_map(|(_, _, field)| match field {
                 FieldSpec::UserInput { to: InputBinding::Commands { table, .. }, .. } => Some(table.len),
@@ -29,6 +30,7 @@ pub(super) fn show(config: &GatewayConfig) -> String {
             _ => None,
         };
         let shown = config
+            .view()
             .fields_of(recipe, Direction::Output)
             .filter_map(|(_, _, field)| field.variable())
             .chain(trigger);

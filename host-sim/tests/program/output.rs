@@ -10,6 +10,7 @@ use std::time::Duration;
 use clap::CommandFactory;
 use host_sim::cli::Cli;
 use recipe_test_kit::{ended, example, free_servers};
+use rustix::process::{Pid, Signal, kill_process};
 
 use super::BINARY;
 
@@ -173,7 +174,7 @@ fn a_disk_that_fills_up_later_costs_statistics_and_does_not_end_a_gateway() {
     assert!(std::fs::read_to_string(&log).unwrap().starts_with("ready {"));
     // It runs on, and says so only once.
     assert!(folder.path().join("ready.json").exists() && folder.path().join("line").exists());
-    assert!(Command::new("kill").arg(child.id().to_string()).status().unwrap().success());
+    kill_process(Pid::from_child(&child), Signal::TERM).unwrap();
     assert_eq!(child.wait().unwrap().code(), Some(0));
     assert_eq!(lines.iter().collect::<Vec<_>>(), [""; 0]);
     assert_eq!(left_behind(folder.path()), [log]);

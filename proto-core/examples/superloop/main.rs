@@ -10,12 +10,12 @@ mod controller;
 mod events;
 mod machine;
 
-use proto_core::config::GatewayConfig;
 use proto_core::engine::{Engine, Input, OUTPUT_BUFFER, Output};
 use proto_core::time::Instant;
 use static_cell::ConstStaticCell;
 
 use board::Board;
+use configuration::Config;
 use events::{PORT, SOURCES};
 use machine::say;
 
@@ -72,8 +72,8 @@ fn main() {
 /// Not inlined: what it needs of the stack is free again when the loop begins.
 #[inline(never)]
 fn configure(gateway: &mut Gateway) -> Result<(), &'static str> {
-    static CONFIG: ConstStaticCell<GatewayConfig> = ConstStaticCell::new(GatewayConfig::empty());
+    static CONFIG: ConstStaticCell<Config> = ConstStaticCell::new(Config::empty());
     let config = CONFIG.take();
-    configuration::write(config).ok_or("the configuration has no room")?;
-    gateway.configure(config).map_err(|_| "the configuration is refused")
+    configuration::write(config).map_err(|_| "the configuration is wrong")?;
+    gateway.configure(&*config).map_err(|_| "the configuration is refused")
 }

@@ -28,11 +28,11 @@ pub(crate) fn run(input: &[u8]) {
     let mut input = Source::new(input);
     let Some(config) = config(&mut input) else { return };
     let valid = config.validate();
-    let engine = Engine::<8, 4, 512>::new(&config);
+    let engine = Engine::<8, 4, 512>::new(&*config);
     assert!(valid.is_ok() || engine.is_err(), "{valid:?}");
     let mut bytes = vec![0xA5; image::MAX_IMAGE];
     // The largest configurations have no image.
-    if let Ok(len) = image::encode(&config, &mut bytes) {
+    if let Ok(len) = image::encode(&*config, &mut bytes) {
         match image::decode(&bytes[..len]) {
             Ok(read) => assert!(valid.is_ok() && read == *config),
             Err(error) => assert_eq!(Some(error), valid.err().map(image::ImageError::Config)),

@@ -1,9 +1,9 @@
 //! Configuration images: anything that flash can hold (docs/configuration.md section 6).
 
-use proto_core::config::GatewayConfig;
 use proto_core::config::image::{
     HEADER, ImageError, MAGIC, MAX_IMAGE, VERSION, decode, decode_into, encode, image_len,
 };
+use proto_core::config::{ControllerLink, GatewayConfig};
 use proto_core::engine::{BuildError, Engine};
 
 use crate::any_engine;
@@ -16,8 +16,8 @@ pub(crate) fn run(input: &[u8]) {
     let mut bytes = match kind % 4 {
         // Anything.
         0 => input.rest().to_vec(),
-        // Any contents, with the header that they need.
-        1 => with_header(input.rest()),
+        // Any contents, with the header that they need, of any version that is read.
+        1 => with_header(1 + u32::from(kind >> 2) % VERSION, input.rest()),
         // A configuration, right or wrong, with bytes changed but for the checksum, or with it.
         _ => {
             let Some(config) = any_engine::config(&mut input) else { return };
@@ -26,7 +26,7 @@ pub(crate) fn run(input: &[u8]) {
                 let at = usize::from(input.u16()) % bytes.len();
                 bytes[at] ^= input.u8();
             }
-            if kind % 4 == 2 { with_header(&bytes[HEADER..]) } else { bytes }
+            if kind % 4 == 2 { with_header(VERSION, &bytes[HEADER..]) } else { bytes }
         }
     };
     look_at(&bytes);
@@ -51,14 +51,16 @@ fn look_at(bytes: &[u8]) {
     let mut over = model::cell();
     assert_eq!(decode_into(bytes, &mut over).map(|()| over), read);
     match (payload(bytes), &read) {
-        (Err(()), Err(ImageError::Contents | ImageError::Config(_)) | Ok(_)) => panic!("taken: {read:?}"),
+        (Err(()), Err(ImageError::Contents | ImageError::TooMany { .. } | ImageError::Config(_)) | Ok(_)) => {
+            panic!("taken: {read:?}")
+        }
         (Err(()), Err(_)) => {}
-        (Ok(payload), _) => match postcard::take_from_bytes::<GatewayConfig>(payload) {
+        (Ok((version, payload)), _) => match contents(version, payload) {
             Ok((config, [])) => match config.validate() {
                 Ok(()) => assert_eq!(read.as_ref(), Ok(&config)),
                 Err(error) => assert_eq!(read, Err(ImageError::Config(error))),
             },
-            _ => assert_eq!(read, Err(ImageError::Contents)),
+            _ => assert!(matches!(read, Err(ImageError::Contents | ImageError::TooMany { .. })), "{read:?}"),
         },
     }
     if let Ok(config) = read {
@@ -70,6 +72,18 @@ fn look_at(bytes: &[u8]) {
     }
 }
 
+/// Version 1 had no network of the board's.
+fn contents(version: u32, payload: &[u8]) -> postcard::Result<(GatewayConfig, &[u8])> {
+    if version == VERSION {
+        return postcard::take_from_bytes(payload);
+    }
+    let (_, lists) = postcard::take_from_bytes::<ControllerLink>(payload)?;
+    let (controller, dhcp) = (&payload[..payload.len() - lists.len()], [0]);
+    let newer = [controller, &dhcp, lists].concat();
+    let (config, rest) = postcard::take_from_bytes(&newer)?;
+    Ok((config, &payload[payload.len() - rest.len()..]))
+}
+
 /// `None` for the largest configurations.
 fn image_of(config: &GatewayConfig) -> Option<Vec<u8>> {
     let mut bytes = vec![0xA5; MAX_IMAGE];
@@ -78,21 +92,24 @@ fn image_of(config: &GatewayConfig) -> Option<Vec<u8>> {
     Some(bytes)
 }
 
-/// Section 6: `RGCI`, version, length and CRC-32, four bytes each.
-fn payload(bytes: &[u8]) -> Result<&[u8], ()> {
+/// Section 6: `RGCI`, version, length and CRC-32, four bytes each. The version and the payload.
+fn payload(bytes: &[u8]) -> Result<(u32, &[u8]), ()> {
     let word = |nth: usize| {
         bytes.get(4 * nth..4 * nth + 4).map(|word| u32::from_le_bytes(word.try_into().unwrap())).ok_or(())
     };
-    if bytes.get(..4) != Some(b"RGCI") || word(1)? != VERSION || word(2)? as usize > MAX_IMAGE - 16 {
+    if bytes.get(..4) != Some(b"RGCI")
+        || !(1..=VERSION).contains(&word(1)?)
+        || word(2)? as usize > MAX_IMAGE - 16
+    {
         return Err(());
     }
     let payload = bytes.get(16..16 + word(2)? as usize).ok_or(())?;
     let covered = [&bytes[4..12], payload].concat();
-    if word(3)? == crc32(&covered) { Ok(payload) } else { Err(()) }
+    if word(3)? == crc32(&covered) { Ok((word(1)?, payload)) } else { Err(()) }
 }
 
-fn with_header(payload: &[u8]) -> Vec<u8> {
-    let covered = [&VERSION.to_le_bytes()[..], &(payload.len() as u32).to_le_bytes(), payload].concat();
+fn with_header(version: u32, payload: &[u8]) -> Vec<u8> {
+    let covered = [&version.to_le_bytes()[..], &(payload.len() as u32).to_le_bytes(), payload].concat();
     [b"RGCI", &covered[..8], &crc32(&covered).to_le_bytes(), payload].concat()
 }
 
@@ -110,7 +127,11 @@ fn crc32(bytes: &[u8]) -> u32 {
 
 pub(crate) fn seeds() -> Vec<Vec<u8>> {
     let cell = image_of(&model::cell()).expect("a small configuration");
-    let mut seeds = vec![[&[0], &cell[..]].concat(), [&[1], &cell[HEADER..]].concat(), vec![0]];
+    let mut seeds = vec![[&[0], &cell[..]].concat(), [&[5], &cell[HEADER..]].concat(), vec![0]];
+    // Kind 1 is of version 1.
+    let network = postcard::take_from_bytes::<ControllerLink>(&cell[HEADER..]).expect("it begins so").1;
+    let controller = &cell[HEADER..cell.len() - network.len()];
+    seeds.push([&[1], controller, &network[1..]].concat());
     // Another magic, version, length and checksum.
     for at in [0, 4, 8, 10, 12, HEADER, cell.len() - 1] {
         let mut wrong = cell.clone();
@@ -122,7 +143,7 @@ pub(crate) fn seeds() -> Vec<Vec<u8>> {
         seeds.push([&[3], &seed[..seed.len().min(60)]].concat());
         if let Some(image) = any_engine::config(&mut Source::new(&seed)).and_then(|config| image_of(&config))
         {
-            seeds.push([&[1], &image[HEADER..]].concat());
+            seeds.push([&[5], &image[HEADER..]].concat());
         }
     }
     seeds

@@ -5,7 +5,7 @@
 
 use core::fmt;
 
-use super::{Bus, GatewayConfig, Parity, Parts, Port, Recipe, Rs485, Span};
+use super::{Bus, ConfigView, Parity, Parts, Port, Recipe, Rs485, Span};
 use crate::recipe::model::CanId;
 use crate::sysvar::{Direction, SysVar};
 use crate::time::Duration;
@@ -57,12 +57,12 @@ pub struct PartBudget {
     pub time: Duration,
 }
 
-impl GatewayConfig {
+impl<'c> ConfigView<'c> {
     /// What a part of the port's recipe takes on its line; `None` when there is no such part.
-    pub fn budget(&self, port: &Port, part: Direction) -> Option<PartBudget> {
+    pub fn budget(self, port: &Port, part: Direction) -> Option<PartBudget> {
         let recipe = self.recipes.get(usize::from(port.recipe))?;
         let bytes_of = |span: Span| {
-            span.of(&self.fields).iter().map(|field| field.field().ty().size()).fold(0, usize::saturating_add)
+            span.of(self.fields).iter().map(|field| field.field().ty().size()).fold(0, usize::saturating_add)
         };
         match &recipe.parts {
             Parts::Stream { input, output } => {
@@ -92,7 +92,7 @@ impl GatewayConfig {
 
     /// The shortest cycle in which the port's output fits its line (D20); on RS-485 with the
     /// silence before it.
-    pub fn shortest_cycle(&self, port: &Port) -> Duration {
+    pub fn shortest_cycle(self, port: &Port) -> Duration {
         let time = self.budget(port, Direction::Output).map_or(Duration::ZERO, |budget| budget.time);
         match &port.bus {
             Bus::Rs485(line) if time > Duration::ZERO => time + line.turnaround,
@@ -101,37 +101,37 @@ impl GatewayConfig {
     }
 
     /// What is allowed but may not do what was meant.
-    pub fn warnings(&self) -> impl Iterator<Item = Warning> + '_ {
+    pub fn warnings(self) -> impl Iterator<Item = Warning> + 'c {
         self.slow_ports().chain(self.read_back()).chain(self.unused_recipes())
     }
 
-    fn slow_ports(&self) -> impl Iterator<Item = Warning> + '_ {
-        (0..).zip(&self.ports).filter_map(|(port, config)| {
+    fn slow_ports(self) -> impl Iterator<Item = Warning> + 'c {
+        (0..).zip(self.ports).filter_map(move |(port, config)| {
             let shortest = self.shortest_cycle(config);
             (shortest > config.cycle).then_some(Warning::DoesNotFit { port, cycle: config.cycle, shortest })
         })
     }
 
-    fn read_back(&self) -> impl Iterator<Item = Warning> + '_ {
+    fn read_back(self) -> impl Iterator<Item = Warning> + 'c {
         self.upstream_recipes().flat_map(move |(index, recipe)| {
             self.written_by(recipe)
-                .filter(|&var| !self.is_owned(var))
+                .filter(move |&var| !self.is_owned(var))
                 .map(move |var| Warning::ReadBack { recipe: index, var })
         })
     }
 
-    fn unused_recipes(&self) -> impl Iterator<Item = Warning> + '_ {
-        let is_used = |index: u8| {
+    fn unused_recipes(self) -> impl Iterator<Item = Warning> + 'c {
+        let is_used = move |index: u8| {
             self.ports.iter().any(|port| port.recipe == index)
                 || self.controller.recipe_link.is_some_and(|link| link.recipe == index)
         };
         (0..)
-            .zip(&self.recipes)
+            .zip(self.recipes)
             .filter_map(move |(recipe, _)| (!is_used(recipe)).then_some(Warning::Unused { recipe }))
     }
 
     /// `warning` with the names of its recipes and ports.
-    pub fn describe_warning(&self, warning: Warning) -> impl fmt::Display + '_ {
+    pub fn describe_warning(self, warning: Warning) -> impl fmt::Display + 'c {
         DescribedWarning { config: self, warning }
     }
 }
@@ -166,7 +166,7 @@ pub enum Warning {
 }
 
 struct DescribedWarning<'a> {
-    config: &'a GatewayConfig,
+    config: ConfigView<'a>,
     warning: Warning,
 }
 

@@ -1,29 +1,29 @@
 //! The checks that concern one recipe alone: its parts, what its user fields do, what sends it.
 
 use super::error::{ConfigErrorKind as Kind, Place, RecipeKey};
-use super::validate::{Check, check_name, check_pool, fail, is_marked, mark};
-use super::{FieldSpec, GatewayConfig, InputBinding, OutputBinding, Recipe, SendOn, Span};
+use super::rules::{Check, check_new_name, check_pool, fail, is_marked, mark};
+use super::{ConfigView, FieldSpec, InputBinding, OutputBinding, Parts, Recipe, SendOn, Span};
 use crate::command::Request;
-use crate::recipe::PartError;
 use crate::recipe::model::{Framing, Mode};
+use crate::recipe::{CanLayout, PartError, Rules, StreamLayout};
 use crate::sysvar::{COUNT, Direction};
 use crate::wire::scalar::{Scalar, ScalarType};
 
 /// One recipe under check.
 pub(super) struct RecipeCheck<'a> {
-    config: &'a GatewayConfig,
+    config: ConfigView<'a>,
     index: u8,
     recipe: &'a Recipe,
 }
 
 impl<'a> RecipeCheck<'a> {
-    pub(super) fn new(config: &'a GatewayConfig, index: u8, recipe: &'a Recipe) -> Self {
+    pub(super) fn new(config: ConfigView<'a>, index: u8, recipe: &'a Recipe) -> Self {
         Self { config, index, recipe }
     }
 
     pub(super) fn check(&self) -> Check {
         let names = self.config.recipes.iter().map(|recipe| &recipe.name);
-        check_name(self.at(RecipeKey::Name), &self.recipe.name, self.index, names)?;
+        check_new_name(self.at(RecipeKey::Name), &self.recipe.name, self.index, names)?;
         if !self.recipe.has(Direction::Input) && !self.recipe.has(Direction::Output) {
             return fail(self.at(RecipeKey::Whole), Kind::NoParts);
         }
@@ -34,7 +34,7 @@ impl<'a> RecipeCheck<'a> {
                 let place = Place::Frame { recipe: self.index, part, frame };
                 check_pool(place, span, self.config.fields.len())?;
             }
-            if let Err(error) = self.config.check_layout(self.recipe, part, framing) {
+            if let Err(error) = check_layout(self.config, self.recipe, part, framing) {
                 return fail(self.place_of(part, error), Kind::Part(error));
             }
             for (frame, field, spec) in self.config.fields_of(self.recipe, part) {
@@ -93,7 +93,7 @@ impl<'a> RecipeCheck<'a> {
     }
 
     fn check_commands(&self, place: Place, ty: ScalarType, table: Span) -> Check {
-        let commands = &self.config.commands;
+        let commands = self.config.commands;
         check_pool(place, table, commands.len())?;
         if table.len == 0 {
             return fail(place, Kind::EmptyTable);
@@ -175,5 +175,31 @@ fn check_output(place: Place, ty: ScalarType, from: OutputBinding) -> Check {
             fail(place, Kind::NeedsInteger { ty })
         }
         OutputBinding::Counter | OutputBinding::Reply => Ok(()),
+    }
+}
+
+/// Compiles one part, if it is there, only to hear what is wrong with it.
+pub(super) fn check_layout(
+    config: ConfigView<'_>,
+    recipe: &Recipe,
+    part: Direction,
+    framing: Framing,
+) -> Result<(), PartError> {
+    let rules = Rules { mode: recipe.mode, direction: part };
+    let fields = |span: Span| span.of(config.fields).iter().map(FieldSpec::field);
+    match &recipe.parts {
+        Parts::Stream { input, output } => {
+            let part = if part == Direction::Input { input } else { output };
+            part.as_ref().map_or(Ok(()), |part| {
+                StreamLayout::new(rules, &part.head, &part.tail, fields(part.fields), framing).map(|_| ())
+            })
+        }
+        Parts::Can { input, output } => {
+            let frames = if part == Direction::Input { input } else { output };
+            if frames.is_empty() {
+                return Ok(());
+            }
+            CanLayout::new(rules, frames.iter().map(|frame| (frame.id, fields(frame.fields)))).map(|_| ())
+        }
     }
 }

@@ -6,7 +6,7 @@
 use core::fmt;
 
 use super::error::{ConfigError, ConfigErrorKind, ControllerKey, NetworkKey, Place, PortKey, RecipeKey};
-use super::{GatewayConfig, Name};
+use super::{ConfigView, MAX_NAME, Name};
 use crate::recipe::model::Mode;
 use crate::sysvar::Direction;
 use crate::wire::dialect::Dialect;
@@ -25,20 +25,20 @@ impl fmt::Display for ConfigErrorKind {
     }
 }
 
-impl GatewayConfig {
+impl<'c> ConfigView<'c> {
     /// `error` with the names of its recipes and ports.
-    pub fn describe(&self, error: ConfigError) -> impl fmt::Display + '_ {
+    pub fn describe(self, error: ConfigError) -> impl fmt::Display + 'c {
         Described { config: Some(self), error }
     }
 
     /// What is wrong, with the names of recipes and ports and without the place.
-    pub fn describe_kind(&self, kind: ConfigErrorKind) -> impl fmt::Display + '_ {
+    pub fn describe_kind(self, kind: ConfigErrorKind) -> impl fmt::Display + 'c {
         DescribedKind { config: Some(self), kind }
     }
 }
 
 struct Described<'a> {
-    config: Option<&'a GatewayConfig>,
+    config: Option<ConfigView<'a>>,
     error: ConfigError,
 }
 
@@ -46,6 +46,7 @@ impl fmt::Display for Described<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { config, error } = self;
         match error.place {
+            Place::Whole => f.write_str("configuration")?,
             Place::Controller(key) => write!(f, "controller, {}", key.name())?,
             Place::Network(key) => write!(f, "network, {}", key.name())?,
             Place::Recipe { recipe, key } => {
@@ -86,6 +87,7 @@ impl fmt::Display for Described<'_> {
 impl ControllerKey {
     fn name(self) -> &'static str {
         match self {
+            Self::Address => "address",
             Self::Dialect => "dialect",
             Self::Ports => "ports",
             Self::RecipeLink => "recipe link",
@@ -133,7 +135,7 @@ fn one_based(index: u8) -> u16 {
     u16::from(index).saturating_add(1)
 }
 
-struct RecipeName<'a>(Option<&'a GatewayConfig>, u8);
+struct RecipeName<'a>(Option<ConfigView<'a>>, u8);
 
 impl fmt::Display for RecipeName<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -142,7 +144,7 @@ impl fmt::Display for RecipeName<'_> {
     }
 }
 
-struct PortName<'a>(Option<&'a GatewayConfig>, u8);
+struct PortName<'a>(Option<ConfigView<'a>>, u8);
 
 impl fmt::Display for PortName<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -159,7 +161,7 @@ fn named(f: &mut fmt::Formatter<'_>, what: &str, name: Option<&Name>, index: u8)
 }
 
 struct DescribedKind<'a> {
-    config: Option<&'a GatewayConfig>,
+    config: Option<ConfigView<'a>>,
     kind: ConfigErrorKind,
 }
 
@@ -192,7 +194,18 @@ impl fmt::Display for DescribedKind<'_> {
             Kind::OutsidePool { end, len } => {
                 write!(f, "a range ends at {end}, but there are only {len} entries")
             }
-            Kind::EmptyName => f.write_str("a name is needed"),
+            Kind::TooMany { what, needed, room } => {
+                write!(f, "{needed} {what}, and there is room for {room}")
+            }
+            Kind::TooLong { len, longest } => write!(f, "{len} bytes long; at most {longest}"),
+            Kind::NameLength { len } => write!(f, "{len} bytes long; 1..={MAX_NAME}"),
+            Kind::NameCharacter { character } => {
+                write!(f, "{character:?} in a name; no blanks, quotes, '=' and control characters")
+            }
+            Kind::NoSuchName => f.write_str("no recipe before has this name"),
+            Kind::Variable(error) => error.fmt(f),
+            Kind::MixedParts => f.write_str("one part is a stream and the other CAN"),
+            Kind::Address => f.write_str("neither an IP address nor a host name; port numbers go to ports"),
             Kind::DuplicateName { other } => {
                 write!(f, "number {} has this name already; names must differ", one_based(other))
             }

@@ -6,13 +6,13 @@ use super::Network;
 use crate::command::ParseError;
 use crate::recipe::PartError;
 use crate::recipe::model::Mode;
-use crate::sysvar::{Direction, SysVar};
+use crate::sysvar::{Direction, ParseError as VarError, SysVar};
 use crate::time::Duration;
 use crate::wire::scalar::{ScalarError, ScalarType};
 
-/// The first mistake that [`GatewayConfig::validate`](super::GatewayConfig::validate) met.
+/// The first mistake that [`ConfigView::validate`](super::ConfigView::validate) met.
 ///
-/// Its `Display` counts recipes and ports from 1; [`GatewayConfig::describe`](super::GatewayConfig::describe) names them.
+/// Its `Display` counts recipes and ports from 1; [`ConfigView::describe`](super::ConfigView::describe) names them.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ConfigError {
     /// Where.
@@ -23,7 +23,10 @@ pub struct ConfigError {
 
 /// A place in a configuration. Numbers are indices, from 0.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[non_exhaustive]
 pub enum Place {
+    /// All of it.
+    Whole,
     /// The controller's section.
     Controller(ControllerKey),
     /// The board's own address.
@@ -83,7 +86,10 @@ pub enum Place {
 
 /// What of the controller's section.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[non_exhaustive]
 pub enum ControllerKey {
+    /// Its address.
+    Address,
     /// Its dialect.
     Dialect,
     /// Its command, state and Modbus ports.
@@ -94,6 +100,7 @@ pub enum ControllerKey {
 
 /// What of the board's own address.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[non_exhaustive]
 pub enum NetworkKey {
     /// Address and prefix.
     Address,
@@ -105,6 +112,7 @@ pub enum NetworkKey {
 
 /// What of a recipe.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[non_exhaustive]
 pub enum RecipeKey {
     /// All of it.
     Whole,
@@ -116,6 +124,7 @@ pub enum RecipeKey {
 
 /// What of a port.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[non_exhaustive]
 pub enum PortKey {
     /// Its name.
     Name,
@@ -141,6 +150,37 @@ pub enum PortKey {
     Bitrate,
     /// Where it listens.
     Listen,
+}
+
+/// What there can be too many of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[non_exhaustive]
+pub enum Counted {
+    /// Ports.
+    Ports,
+    /// Recipes.
+    Recipes,
+    /// Fields of all recipes.
+    Fields,
+    /// Frames of one CAN part.
+    CanFrames,
+    /// Entries of all command tables.
+    Commands,
+    /// Safe values of all ports.
+    SafeValues,
+}
+
+impl core::fmt::Display for Counted {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        f.write_str(match self {
+            Self::Ports => "ports",
+            Self::Recipes => "recipes",
+            Self::Fields => "fields in all recipes together",
+            Self::CanFrames => "frames in one part",
+            Self::Commands => "commands in all recipes together",
+            Self::SafeValues => "safe values on all ports together",
+        })
+    }
 }
 
 /// What is wrong.
@@ -188,8 +228,40 @@ pub enum ConfigErrorKind {
         /// The pool's length.
         len: u32,
     },
-    /// A name is empty.
-    EmptyName,
+    /// More of something than there is room for: in this configuration's type, or in any.
+    TooMany {
+        /// Of what.
+        what: Counted,
+        /// How many are needed.
+        needed: usize,
+        /// How many there is room for.
+        room: usize,
+    },
+    /// A text or a delimiter is too long.
+    TooLong {
+        /// Its length in bytes.
+        len: usize,
+        /// The longest that is allowed, in bytes.
+        longest: usize,
+    },
+    /// A name is empty or too long.
+    NameLength {
+        /// Its length in bytes.
+        len: usize,
+    },
+    /// A name has a blank, a quote, `=` or a control character in it.
+    NameCharacter {
+        /// The first of them.
+        character: char,
+    },
+    /// No recipe that was added before has this name.
+    NoSuchName,
+    /// The name means no system variable.
+    Variable(VarError),
+    /// One part of a recipe is a stream and the other CAN.
+    MixedParts,
+    /// The controller's address is neither an IP address nor a host name.
+    Address,
     /// A recipe or port before has the same name.
     DuplicateName {
         /// Index of the one before.
@@ -217,7 +289,7 @@ pub enum ConfigErrorKind {
         /// Summand.
         offset: f32,
     },
-    /// A constant does not fit its field.
+    /// A constant does not fit its field, or a safe value its variable.
     Constant(ScalarError),
     /// This use needs a field of an integer type.
     NeedsInteger {

@@ -45,7 +45,7 @@ fn ipv4(text: &str) -> Option<Ipv4Addr> {
     Some(Ipv4Addr::new(octet(first)?, octet(second)?, octet(third)?, octet(fourth)?))
 }
 
-fn ipv6(text: &str) -> Option<Ipv6Addr> {
+pub(super) fn ipv6(text: &str) -> Option<Ipv6Addr> {
     let mut groups: Vec<u16, 8> = Vec::new();
     // How many groups stand before the `::`.
     let mut gap = None;

@@ -1,30 +1,46 @@
-//! The gateway's configuration as the engine takes it: TOML on the host and postcard on the board
-//! end in these types (docs/architecture.md section 5).
+//! The gateway's configuration as the engine takes it: TOML on the host, postcard on the board and
+//! the builder in a program end in these types (docs/architecture.md section 5).
 //!
 //! Bounded and plain: names are kept for messages, everything else is numbers. Nothing here has
-//! been checked until [`GatewayConfig::validate`] said so.
+//! been checked until [`ConfigView::validate`] said so. [`GatewayConfig::builder`] makes a
+//! configuration in a program; whoever needs less room than the default gives smaller numbers, such as
+//! `GatewayConfig<1, 1, 32, 0, 4>`: one port, one recipe, 32 fields, no commands, 4 safe values.
 
+mod add;
 mod budget;
+mod builder;
 mod check_recipe;
 mod describe;
+mod draft;
 mod error;
+mod fields;
 #[cfg(feature = "image")]
 pub mod image;
 mod listen;
 mod network;
+mod rules;
 mod validate;
+mod view;
 
+pub use add::ConfigMut;
 pub use budget::{PartBudget, Warning, can_frame_time};
-pub use error::{ConfigError, ConfigErrorKind, ControllerKey, NetworkKey, Place, PortKey, RecipeKey};
+pub use builder::ConfigBuilder;
+pub use draft::{Can, ControllerBuilder, Listen, PortBuilder, PortBus, RecipeBuilder, SafeValues};
+pub use error::{
+    ConfigError, ConfigErrorKind, ControllerKey, Counted, NetworkKey, Place, PortKey, RecipeKey,
+};
+pub use fields::{CanFields, Fields, InputField, OutputField, Var};
 pub use listen::listen_address;
-pub use network::Network;
-pub use validate::{MAX_LINE_TIME, MAX_TIME, MIN_CYCLE, check_bitrate, check_cycle};
+pub use network::{BoardAddress, Network};
+pub use rules::{MAX_LINE_TIME, MAX_TIME, MIN_CYCLE, check_address, check_bitrate, check_cycle, check_name};
+pub use view::ConfigView;
 
 use heapless::{String, Vec};
 
 use crate::recipe::model::{CanId, MAX_CAN_IDS, MAX_DELIMITER, Mode};
 use crate::sysvar::SysVar;
 use crate::time::Duration;
+use crate::wire::dialect::Dialect;
 use crate::wire::scalar::ScalarType;
 
 /// Most field ports, and most listening ports for the controller's own clients.
@@ -39,45 +55,60 @@ pub const MAX_COMMANDS: usize = 32;
 pub const MAX_SAFE_VALUES: usize = 64;
 /// Longest name of a recipe or port, in bytes.
 pub const MAX_NAME: usize = 32;
+/// Longest address or host name of the controller, in bytes.
+pub const MAX_ADDRESS: usize = 64;
+/// Longest address and port to listen on, in bytes.
+pub const MAX_LISTEN: usize = 48;
 
 /// A recipe's or port's name.
 pub type Name = String<MAX_NAME>;
 /// A stream part's head or tail.
 pub type Delimiter = Vec<u8, MAX_DELIMITER>;
 
-/// A whole gateway file.
+/// A whole gateway file, with room for so many ports, recipes, fields of all recipes, entries of all
+/// command tables and safe values of all ports.
+///
+/// The defaults are the most that a file can have, and take 44 KiB. [`Self::empty`] is all zeros, so a
+/// static one takes no flash.
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
-pub struct GatewayConfig {
+#[non_exhaustive]
+pub struct GatewayConfig<
+    const PORTS: usize = MAX_PORTS,
+    const RECIPES: usize = MAX_RECIPES,
+    const ALL_FIELDS: usize = MAX_ALL_FIELDS,
+    const COMMANDS: usize = MAX_COMMANDS,
+    const SAFE_VALUES: usize = MAX_SAFE_VALUES,
+> {
     /// Where the controller is and what it speaks.
     pub controller: ControllerLink,
-    /// A board's own address; without it DHCP is asked.
-    pub network: Option<Network>,
+    /// A board's own address.
+    pub network: BoardAddress,
     /// Every recipe, in file order.
-    pub recipes: Vec<Recipe, MAX_RECIPES>,
+    pub recipes: Vec<Recipe, RECIPES>,
     /// Every port, in file order.
-    pub ports: Vec<Port, MAX_PORTS>,
+    pub ports: Vec<Port, PORTS>,
     /// The fields of all recipes; parts name ranges of it.
-    pub fields: Vec<FieldSpec, MAX_ALL_FIELDS>,
+    pub fields: Vec<FieldSpec, ALL_FIELDS>,
     /// The entries of all command tables; bindings name ranges of it.
-    pub commands: Vec<CommandEntry, MAX_COMMANDS>,
+    pub commands: Vec<CommandEntry, COMMANDS>,
     /// What inputs become when their port times out; ports name ranges of it.
-    pub safe_values: Vec<SafeValue, MAX_SAFE_VALUES>,
+    pub safe_values: Vec<SafeValue, SAFE_VALUES>,
 }
 
-impl GatewayConfig {
-    /// Nothing at all: no controller, no recipes, no ports.
+impl<
+    const PORTS: usize,
+    const RECIPES: usize,
+    const ALL_FIELDS: usize,
+    const COMMANDS: usize,
+    const SAFE_VALUES: usize,
+> GatewayConfig<PORTS, RECIPES, ALL_FIELDS, COMMANDS, SAFE_VALUES>
+{
+    /// Nothing at all: no controller, no recipes, no ports. All bytes are zero.
     pub const fn empty() -> Self {
         Self {
-            controller: ControllerLink {
-                address: String::new(),
-                dialect: String::new(),
-                command_port: 0,
-                state_port: 0,
-                modbus_port: 0,
-                recipe_link: None,
-            },
-            network: None,
+            controller: ControllerLink::none(),
+            network: BoardAddress::Dhcp,
             recipes: Vec::new(),
             ports: Vec::new(),
             fields: Vec::new(),
@@ -85,14 +116,77 @@ impl GatewayConfig {
             safe_values: Vec::new(),
         }
     }
+
+    /// The same for every size: what the engine, the checks and the image take.
+    pub fn view(&self) -> ConfigView<'_> {
+        ConfigView {
+            controller: &self.controller,
+            network: self.network.fixed(),
+            recipes: &self.recipes,
+            ports: &self.ports,
+            fields: &self.fields,
+            commands: &self.commands,
+            safe_values: &self.safe_values,
+        }
+    }
+
+    /// The same for every size, to write to.
+    pub fn view_mut(&mut self) -> ConfigMut<'_> {
+        ConfigMut {
+            controller: &mut self.controller,
+            network: &mut self.network,
+            recipes: self.recipes.as_mut_view(),
+            ports: self.ports.as_mut_view(),
+            fields: self.fields.as_mut_view(),
+            commands: self.commands.as_mut_view(),
+            safe_values: self.safe_values.as_mut_view(),
+        }
+    }
+
+    /// Checks everything that can be checked without the controller.
+    ///
+    /// # Errors
+    /// The first mistake, with its place and the numbers.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        self.view().validate()
+    }
+}
+
+impl<
+    const PORTS: usize,
+    const RECIPES: usize,
+    const ALL_FIELDS: usize,
+    const COMMANDS: usize,
+    const SAFE_VALUES: usize,
+> Default for GatewayConfig<PORTS, RECIPES, ALL_FIELDS, COMMANDS, SAFE_VALUES>
+{
+    /// [`Self::empty`].
+    fn default() -> Self {
+        Self::empty()
+    }
+}
+
+impl<
+    'c,
+    const PORTS: usize,
+    const RECIPES: usize,
+    const ALL_FIELDS: usize,
+    const COMMANDS: usize,
+    const SAFE_VALUES: usize,
+> From<&'c GatewayConfig<PORTS, RECIPES, ALL_FIELDS, COMMANDS, SAFE_VALUES>> for ConfigView<'c>
+{
+    fn from(config: &'c GatewayConfig<PORTS, RECIPES, ALL_FIELDS, COMMANDS, SAFE_VALUES>) -> Self {
+        config.view()
+    }
 }
 
 /// The controller's side of the gateway.
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[non_exhaustive]
 pub struct ControllerLink {
     /// Address or host name; empty on a board that learns it otherwise.
-    pub address: String<64>,
+    pub address: String<MAX_ADDRESS>,
     /// Name of the dialect (see [`crate::wire::dialect`]).
     pub dialect: String<16>,
     /// Port 2000 or where it was moved to.
@@ -103,6 +197,36 @@ pub struct ControllerLink {
     pub modbus_port: u16,
     /// The controller's UDP 2011 recipe server, when it is set to one of our recipes.
     pub recipe_link: Option<RecipeLink>,
+}
+
+impl ControllerLink {
+    pub(crate) const fn none() -> Self {
+        Self {
+            address: String::new(),
+            dialect: String::new(),
+            command_port: 0,
+            state_port: 0,
+            modbus_port: 0,
+            recipe_link: None,
+        }
+    }
+
+    /// Takes a dialect's name, and the Modbus port that such a controller has.
+    pub fn set_dialect(&mut self, dialect: Dialect) {
+        self.modbus_port = dialect.modbus_port;
+        // The names of the table are short.
+        self.dialect = String::try_from(dialect.name).unwrap_or_default();
+    }
+}
+
+impl Default for ControllerLink {
+    /// What a file gets that says nothing but an address: dialect v2.3, ports 2000, 2001 and 502, no
+    /// recipe link.
+    fn default() -> Self {
+        let mut link = Self { command_port: 2000, state_port: 2001, ..Self::none() };
+        link.set_dialect(Dialect::V2_3);
+        link
+    }
 }
 
 /// The controller's own recipe port, used as the fast way up.
@@ -118,6 +242,7 @@ pub struct RecipeLink {
 /// One recipe.
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[non_exhaustive]
 pub struct Recipe {
     /// Its name.
     pub name: Name,
@@ -317,6 +442,7 @@ pub enum SendOn {
 /// One port.
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[non_exhaustive]
 pub struct Port {
     /// Its name, as `--bind` and `--stats` use it.
     pub name: Name,
@@ -334,6 +460,29 @@ pub struct Port {
     pub stale_after: Duration,
 }
 
+impl Recipe {
+    /// A recipe with these parts that is sent by period and holds stale values.
+    pub const fn new(name: Name, mode: Mode, parts: Parts) -> Self {
+        Self { name, mode, parts, on_stale: OnStale::Hold, send: SendOn::Period }
+    }
+}
+
+impl Port {
+    /// A port with the file's defaults: a cycle of 4 ms, a timeout of 100 ms, stale after 500 ms, and
+    /// inputs that hold.
+    pub const fn new(name: Name, bus: Bus, recipe: u8) -> Self {
+        Self {
+            name,
+            bus,
+            recipe,
+            cycle: MIN_CYCLE,
+            timeout: Duration::from_millis(100),
+            on_timeout: Span { start: 0, len: 0 },
+            stale_after: Duration::from_millis(500),
+        }
+    }
+}
+
 /// What a port is.
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
@@ -342,22 +491,25 @@ pub enum Bus {
     Rs485(Rs485),
     /// CAN bus on the field side.
     Can {
-        /// Bit/s, 10_000..=1_000_000.
+        /// Bit/s, 10_000..=1_000_000; a file's default is [`Bus::BITRATE`].
         bitrate: u32,
     },
     /// Where the controller's TCP client connects to: a way up, like the recipe link.
     TcpListen {
         /// Address and port, such as `0.0.0.0:50000`.
-        listen: String<48>,
+        listen: String<MAX_LISTEN>,
     },
     /// Where the controller's UDP client sends to: a way up, like the recipe link.
     UdpListen {
         /// Address and port.
-        listen: String<48>,
+        listen: String<MAX_LISTEN>,
     },
 }
 
 impl Bus {
+    /// A CAN bus's speed when nothing else is said, in bit/s.
+    pub const BITRATE: u32 = 500_000;
+
     /// Whether devices (and not the controller) are at the other end.
     pub fn is_field(&self) -> bool {
         matches!(self, Self::Rs485(_) | Self::Can { .. })
@@ -378,6 +530,20 @@ pub struct Rs485 {
     pub idle_gap: Duration,
     /// The line must have been silent for this long before we send.
     pub turnaround: Duration,
+}
+
+impl Default for Rs485 {
+    /// A file's defaults: 115 200 bit/s, no parity, 1 stop bit, an idle gap of 50 ms, a turnaround of
+    /// 100 µs.
+    fn default() -> Self {
+        Self {
+            baud: 115_200,
+            parity: Parity::None,
+            stop_bits: 1,
+            idle_gap: Duration::from_millis(50),
+            turnaround: Duration::from_micros(100),
+        }
+    }
 }
 
 /// A serial line's parity.

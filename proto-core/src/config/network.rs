@@ -18,6 +18,35 @@ pub struct Network {
     pub dns: Option<Ipv4Addr>,
 }
 
+/// Where a board's address comes from.
+// The tag stands for itself, so that DHCP is a zero: nothing of an empty configuration takes flash.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[repr(u8)]
+pub enum BoardAddress {
+    /// DHCP is asked.
+    #[default]
+    Dhcp,
+    /// It stands in the configuration.
+    Static(Network),
+}
+
+impl BoardAddress {
+    /// The address in the configuration; `None` if DHCP is asked.
+    pub const fn fixed(&self) -> Option<&Network> {
+        match self {
+            Self::Dhcp => None,
+            Self::Static(network) => Some(network),
+        }
+    }
+}
+
+impl From<Option<Network>> for BoardAddress {
+    fn from(network: Option<Network>) -> Self {
+        network.map_or(Self::Dhcp, Self::Static)
+    }
+}
+
 impl Network {
     /// Whether an address is in the board's own network.
     pub fn contains(&self, other: Ipv4Addr) -> bool {

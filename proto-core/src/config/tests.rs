@@ -26,22 +26,9 @@ struct Builder(GatewayConfig);
 impl Builder {
     /// A controller and nothing else.
     fn new() -> Self {
-        Self(GatewayConfig {
-            controller: ControllerLink {
-                address: text("192.168.12.138"),
-                dialect: text("v2.3"),
-                command_port: 2000,
-                state_port: 2001,
-                modbus_port: 502,
-                recipe_link: None,
-            },
-            network: None,
-            recipes: Vec::new(),
-            ports: Vec::new(),
-            fields: Vec::new(),
-            commands: Vec::new(),
-            safe_values: Vec::new(),
-        })
+        let mut config = GatewayConfig::empty();
+        config.set_controller("192.168.12.138").unwrap();
+        Self(config)
     }
 
     /// One RS-485 port that switches outputs and shows the pose.
@@ -49,58 +36,35 @@ impl Builder {
         Self::new().stream(&["DigitalOutputCommand[1]"], &["RobotState[8]", "RobotState[9]"]).rs485(0)
     }
 
-    fn span(&mut self, fields: impl IntoIterator<Item = FieldSpec>) -> Span {
-        let start = self.0.fields.len() as u16;
-        for field in fields {
-            self.0.fields.push(field).unwrap();
+    fn recipe(mut self, mode: Mode, input: Fields<'_>, output: Fields<'_>) -> Self {
+        let name = std::format!("recipe-{}", self.0.recipes.len());
+        let mut recipe = if mode == Mode::User { Recipe::user(&name) } else { Recipe::realtime(&name) };
+        if input.counts().0 > 0 {
+            recipe = recipe.stream_input(&[0xFF, 0xFF], &[], input);
         }
-        Span { start, len: self.0.fields.len() as u16 - start }
-    }
-
-    fn part(&mut self, fields: impl IntoIterator<Item = FieldSpec>) -> Option<StreamPart> {
-        let fields = self.span(fields);
-        let head = Delimiter::from_slice(&[0xFF, 0xFF]).unwrap();
-        (fields.len > 0).then_some(StreamPart { head, tail: Delimiter::new(), fields })
-    }
-
-    fn recipe(&mut self, mode: Mode, parts: Parts) {
-        let name = text(&std::format!("recipe-{}", self.0.recipes.len()));
-        let recipe = Recipe { name, mode, parts, on_stale: OnStale::Hold, send: SendOn::Period };
-        self.0.recipes.push(recipe).unwrap();
-    }
-
-    fn stream(mut self, input: &[&str], output: &[&str]) -> Self {
-        let input = self.part(input.iter().map(|name| FieldSpec::System(var(name))));
-        let output = self.part(output.iter().map(|name| FieldSpec::System(var(name))));
-        self.recipe(Mode::Realtime, Parts::Stream { input, output });
+        if output.counts().0 > 0 {
+            recipe = recipe.stream_output(&[0xFF, 0xFF], &[], output);
+        }
+        self.0.add_recipe(&recipe).unwrap();
         self
     }
 
-    fn user(mut self, input: &[FieldSpec], output: &[FieldSpec]) -> Self {
-        let input = self.part(input.iter().copied());
-        let output = self.part(output.iter().copied());
-        self.recipe(Mode::User, Parts::Stream { input, output });
-        self
+    fn stream(self, input: &[&str], output: &[&str]) -> Self {
+        self.recipe(Mode::Realtime, input.into(), output.into())
+    }
+
+    fn user(self, input: &[FieldSpec], output: &[FieldSpec]) -> Self {
+        self.recipe(Mode::User, input.into(), output.into())
     }
 
     fn port(mut self, recipe: u8, bus: Bus) -> Self {
-        let port = Port {
-            name: text(&std::format!("port-{}", self.0.ports.len())),
-            bus,
-            recipe,
-            cycle: MIN_CYCLE,
-            timeout: Duration::from_millis(100),
-            on_timeout: Span::default(),
-            stale_after: Duration::from_millis(500),
-        };
-        self.0.ports.push(port).unwrap();
+        let name = text(&std::format!("port-{}", self.0.ports.len()));
+        self.0.ports.push(Port::new(name, bus, recipe)).unwrap();
         self
     }
 
     fn rs485(self, recipe: u8) -> Self {
-        let (idle_gap, turnaround) = (Duration::from_millis(50), Duration::from_micros(100));
-        let line = Rs485 { baud: 115_200, parity: Parity::None, stop_bits: 1, idle_gap, turnaround };
-        self.port(recipe, Bus::Rs485(line))
+        self.port(recipe, Bus::Rs485(Rs485::default()))
     }
 
     fn link(mut self, recipe: u8) -> Self {
@@ -291,7 +255,7 @@ fn errors_name_things_when_the_configuration_is_at_hand() {
     let unnamed = "port 2, recipe: this port writes DigitalOutputCommand[1], and so does port 1; a variable has one owner";
     assert_eq!(error.to_string(), unnamed);
     let named = unnamed.replace("port 2", "port \"port-1\"").replace("port 1;", "port \"port-0\";");
-    assert_eq!(config.describe(error).to_string(), named);
+    assert_eq!(config.view().describe(error).to_string(), named);
 }
 
 #[test]
@@ -311,10 +275,14 @@ fn warnings_are_not_errors() {
         Warning::ReadBack { recipe: 1, var: var("WordInputReg[1]") },
         Warning::Unused { recipe: 2 },
     ];
-    assert!(config.warnings().eq(expected), "{:?}", config.warnings().collect::<std::vec::Vec<_>>());
-    let said = config.describe_warning(expected[0]).to_string();
+    assert!(
+        config.view().warnings().eq(expected),
+        "{:?}",
+        config.view().warnings().collect::<std::vec::Vec<_>>()
+    );
+    let said = config.view().describe_warning(expected[0]).to_string();
     assert!(said.contains("port \"port-0\"") && said.contains("10517 µs"), "{said}");
-    assert_eq!(Builder::one_port().valid().warnings().count(), 0);
+    assert_eq!(Builder::one_port().valid().view().warnings().count(), 0);
 }
 
 /// A field of each kind, on a stream port and behind a command table.
@@ -339,7 +307,7 @@ pub(super) fn every_kind() -> GatewayConfig {
                 .safe_values
                 .push(SafeValue { var: var("ForceEnd[1]"), value: Scalar::Float(0.0) })
                 .unwrap();
-            config.network = Some(network());
+            config.network = BoardAddress::Static(network());
             config.ports[1].on_timeout = Span { start: 0, len: 1 };
             config.recipes[0].send = SendOn::Rising { var: var("BitOutputReg[3]"), bit: 7 };
         })
@@ -361,10 +329,10 @@ proptest! {
         match config.validate() {
             // What passes must not surprise anybody who runs on it.
             Ok(()) => {
-                prop_assert!(config.warnings().count() < 1_000);
+                prop_assert!(config.view().warnings().count() < 1_000);
                 prop_assert!(crate::engine::Plan::new(&config).is_ok());
             }
-            Err(error) => prop_assert!(!config.describe(error).to_string().is_empty()),
+            Err(error) => prop_assert!(!config.view().describe(error).to_string().is_empty()),
         }
     }
 }
@@ -396,7 +364,9 @@ fn network() -> Network {
 fn checked(controller: &str, change: impl FnOnce(&mut Network)) -> Result<(), (NetworkKey, ConfigErrorKind)> {
     let mut config = Builder::one_port().0;
     config.controller.address = text(controller);
-    change(config.network.insert(network()));
+    let mut network = network();
+    change(&mut network);
+    config.network = BoardAddress::Static(network);
     config.validate().map_err(|error| match error.place {
         Place::Network(key) => (key, error.kind),
         place => panic!("{place:?}"),

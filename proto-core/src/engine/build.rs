@@ -19,7 +19,7 @@ use super::uplink::Uplink;
 use super::user::{Bindings, InputBind};
 use super::{Ask, Engine};
 use crate::config::{
-    Bus, ConfigError, FieldSpec, GatewayConfig, InputBinding, MAX_SAFE_VALUES, Parts, Port, Recipe, SendOn,
+    Bus, ConfigError, ConfigView, FieldSpec, InputBinding, MAX_SAFE_VALUES, Parts, Port, Recipe, SendOn,
     Span, StreamPart,
 };
 use crate::image::{GroupId, InputSet, MAX_GROUPS};
@@ -54,6 +54,9 @@ pub enum BuildError {
     TooMany {
         /// Of what.
         what: &'static str,
+        /// How many the configuration needs; where only building it tells, one more than there is room
+        /// for.
+        needed: usize,
         /// How many there is room for.
         room: usize,
     },
@@ -69,15 +72,18 @@ impl fmt::Display for BuildError {
                 write!(f, "recipe {}, {part} part: {error}", recipe.saturating_add(1))
             }
             Self::UnknownDialect => write!(f, "unknown dialect; there are {:?}", Dialect::NAMES),
-            Self::TooMany { what, room } => write!(f, "too many {what}: this gateway has room for {room}"),
+            Self::TooMany { what, needed, room } => {
+                write!(f, "too many {what}: {needed} are needed, and this gateway has room for {room}")
+            }
         }
     }
 }
 
 impl core::error::Error for BuildError {}
 
-fn too_many(what: &'static str, room: usize) -> BuildError {
-    BuildError::TooMany { what, room }
+/// There was no room for one more.
+fn one_too_many(what: &'static str, room: usize) -> BuildError {
+    BuildError::TooMany { what, needed: room.saturating_add(1), room }
 }
 
 /// Groups are handed out in order: field frames first.
@@ -118,7 +124,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     ///
     /// # Errors
     /// [`BuildError`] says what is wrong with the configuration, or what there is no room for.
-    pub fn new(config: &GatewayConfig) -> Result<Self, BuildError> {
+    pub fn new<'c>(config: impl Into<ConfigView<'c>>) -> Result<Self, BuildError> {
         let mut engine = Self::idle();
         engine.configure(config)?;
         Ok(engine)
@@ -129,7 +135,13 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     ///
     /// # Errors
     /// As [`Engine::new`]; the engine is idle then.
-    pub fn configure(&mut self, config: &GatewayConfig) -> Result<(), BuildError> {
+    pub fn configure<'c>(&mut self, config: impl Into<ConfigView<'c>>) -> Result<(), BuildError> {
+        self.configure_from(config.into())
+    }
+
+    /// Not inlined: a run loop would hold this stack for ever.
+    #[inline(never)]
+    fn configure_from(&mut self, config: ConfigView<'_>) -> Result<(), BuildError> {
         self.clear();
         let done = self.build(config);
         if done.is_err() {
@@ -180,12 +192,13 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         *ask = Ask::ALL;
     }
 
-    fn build(&mut self, config: &GatewayConfig) -> Result<(), BuildError> {
+    fn build(&mut self, config: ConfigView<'_>) -> Result<(), BuildError> {
         config.validate().map_err(BuildError::Config)?;
         let plan = Plan::new(config).map_err(BuildError::Plan)?;
         let dialect = Dialect::named(&config.controller.dialect).ok_or(BuildError::UnknownDialect)?;
-        for value in &config.safe_values {
-            let full = |_| too_many("safe values", MAX_SAFE_VALUES);
+        self.check_room(config)?;
+        for value in config.safe_values {
+            let full = |_| one_too_many("safe values", MAX_SAFE_VALUES);
             self.safe_values.push(SafeBytes::new(value)).map_err(full)?;
         }
         for (index, port, recipe) in config.field_ports() {
@@ -196,7 +209,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             self.add_uplink(config, &plan, id, recipe, &mut groups)?;
         }
         if plan.needs_state() {
-            let group = groups.next().ok_or(too_many("groups", MAX_GROUPS))?;
+            let group = groups.next().ok_or(one_too_many("groups", MAX_GROUPS))?;
             self.links.state = Some(StateLink::new(group, plan.read_back()));
         }
         if plan.needs_modbus() {
@@ -209,9 +222,43 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         Ok(())
     }
 
+    /// What can be counted before anything is built.
+    fn check_room(&self, config: ConfigView<'_>) -> Result<(), BuildError> {
+        let (mut ports, mut frames, mut inputs, mut outputs, mut commands) =
+            (0_usize, 0_usize, 0_usize, 0_usize, 0_usize);
+        for (_, _, recipe) in config.field_ports() {
+            ports = ports.saturating_add(1);
+            frames = frames.saturating_add(recipe.frames(Direction::Input).count());
+            for (_, _, field) in config.fields_of(recipe, Direction::Input) {
+                let FieldSpec::UserInput { to, .. } = field else { continue };
+                inputs = inputs.saturating_add(1);
+                commands = commands.saturating_add(usize::from(matches!(to, InputBinding::Commands { .. })));
+            }
+            outputs = config
+                .fields_of(recipe, Direction::Output)
+                .filter(|(_, _, field)| matches!(field, FieldSpec::UserOutput { .. }))
+                .fold(outputs, |count, _| count.saturating_add(1));
+        }
+        let texts = if commands == 0 { &[] } else { config.commands };
+        let bytes = texts.iter().map(|entry| entry.text.len()).fold(0, usize::saturating_add);
+        for (what, needed, room) in [
+            ("field ports", ports, PORTS),
+            ("input frames", frames, MAX_INPUT_FRAMES),
+            ("recipe links", uplinks(config).count(), UPLINKS),
+            ("user-defined fields in one direction", inputs.max(outputs), FIELDS),
+            ("command fields", commands, MAX_COMMAND_FIELDS),
+            ("bytes of command texts", bytes, MAX_COMMAND_BYTES),
+        ] {
+            if needed > room {
+                return Err(BuildError::TooMany { what, needed, room });
+            }
+        }
+        Ok(())
+    }
+
     fn add_port(
         &mut self,
-        config: &GatewayConfig,
+        config: ConfigView<'_>,
         index: u8,
         port: &Port,
         recipe: &Recipe,
@@ -224,7 +271,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         let first_frame = self.store.frames.len() as u8;
         let mut next_binding = self.bindings.inputs.len() as u16;
         for (_, fields) in recipe.frames(Direction::Input) {
-            let fields = fields.of(&config.fields);
+            let fields = fields.of(config.fields);
             let set = fields.iter().filter_map(FieldSpec::variable).collect();
             let is_bound = |field: &&FieldSpec| matches!(field, FieldSpec::UserInput { .. });
             let bound = fields.iter().filter(is_bound).count() as u16;
@@ -238,10 +285,10 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
                 timeout: port.timeout,
             };
             let group = GroupId(self.store.frames.len() as u8);
-            self.store.frames.push(frame).map_err(|_| too_many("input frames", MAX_INPUT_FRAMES))?;
+            self.store.frames.push(frame).map_err(|_| one_too_many("input frames", MAX_INPUT_FRAMES))?;
             frame.set.iter().for_each(|var| self.store.image.assign(var, group));
         }
-        let full = || too_many("user-defined fields in one direction", FIELDS);
+        let full = || one_too_many("user-defined fields in one direction", FIELDS);
         let mut inputs = Span { start: self.bindings.inputs.len() as u16, len: 0 };
         for (_, _, field) in config.fields_of(recipe, Direction::Input) {
             let bind = match *field {
@@ -250,13 +297,13 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
                 }
                 FieldSpec::UserInput { to: InputBinding::Commands { table, when }, .. } => {
                     if self.links.command.is_none() {
-                        let link = CommandLink::new(dialect, &config.commands);
+                        let link = CommandLink::new(dialect, config.commands);
                         self.links.command =
-                            Some(link.ok_or(too_many("bytes of command texts", MAX_COMMAND_BYTES))?);
+                            Some(link.ok_or(one_too_many("bytes of command texts", MAX_COMMAND_BYTES))?);
                     }
                     let Some(link) = &mut self.links.command else { continue };
                     let field = link.add_field(table, when);
-                    InputBind::Command(field.ok_or(too_many("command fields", MAX_COMMAND_FIELDS))?)
+                    InputBind::Command(field.ok_or(one_too_many("command fields", MAX_COMMAND_FIELDS))?)
                 }
                 FieldSpec::UserInput { .. } => InputBind::Unused,
                 _ => continue,
@@ -288,13 +335,13 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             reply: ReplyCode::None,
             counters: PortCounters::default(),
         };
-        self.ports.push(port).map_err(|_| too_many("field ports", PORTS))?;
-        self.store.edges.push(EdgeQueue::default()).map_err(|_| too_many("field ports", PORTS))
+        self.ports.push(port).map_err(|_| one_too_many("field ports", PORTS))?;
+        self.store.edges.push(EdgeQueue::default()).map_err(|_| one_too_many("field ports", PORTS))
     }
 
     fn add_uplink(
         &mut self,
-        config: &GatewayConfig,
+        config: ConfigView<'_>,
         plan: &Plan,
         id: LinkId,
         recipe: &Recipe,
@@ -316,7 +363,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         let input = stream_layout(config, index, recipe, input.as_ref(), Direction::Input, framing)?;
         let output = stream_layout(config, index, recipe, output.as_ref(), Direction::Output, framing)?;
         let group = match output {
-            Some(_) => Some(groups.next().ok_or(too_many("groups", MAX_GROUPS))?),
+            Some(_) => Some(groups.next().ok_or(one_too_many("groups", MAX_GROUPS))?),
             None => None,
         };
         for (_, _, field) in config.fields_of(recipe, Direction::Output) {
@@ -352,7 +399,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         let patience = timeouts.min().unwrap_or(PATIENCE).max(PATIENCE);
         let supervisor = Supervisor::new(timings);
         let uplink = Uplink::new(id, kind, supervisor, (input, output), (set, writes), group, patience);
-        self.links.recipes.push(uplink).map_err(|_| too_many("recipe links", UPLINKS))
+        self.links.recipes.push(uplink).map_err(|_| one_too_many("recipe links", UPLINKS))
     }
 
     /// Variables of recipe links that no port sends come from the state stream.
@@ -365,7 +412,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
 
     fn assign_sources(
         &mut self,
-        config: &GatewayConfig,
+        config: ConfigView<'_>,
         plan: &Plan,
         groups: &mut Groups,
     ) -> Result<(), BuildError> {
@@ -389,7 +436,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             let period = periods.get(var.ordinal()).copied().flatten().unwrap_or(port_cycle_floor());
             let Some(modbus) = &mut self.links.modbus else { break };
             let group = modbus.poll_var(var, period, || groups.next());
-            let group = group.ok_or(too_many("Modbus poll blocks", MAX_POLL_BLOCKS))?;
+            let group = group.ok_or(one_too_many("Modbus poll blocks", MAX_POLL_BLOCKS))?;
             self.store.image.assign(var, group);
         }
         for var in SysVar::all() {
@@ -450,13 +497,13 @@ fn modbus_address(var: SysVar) -> (u8, u16) {
     }
 }
 
-fn recipe_index(config: &GatewayConfig, recipe: &Recipe) -> u8 {
-    (0..).zip(&config.recipes).find(|(_, other)| other.name == recipe.name).map_or(0, |(index, _)| index)
+fn recipe_index(config: ConfigView<'_>, recipe: &Recipe) -> u8 {
+    (0..).zip(config.recipes).find(|(_, other)| other.name == recipe.name).map_or(0, |(index, _)| index)
 }
 
-fn stream_codec(config: &GatewayConfig, index: u8, recipe: &Recipe) -> Result<Codec, BuildError> {
+fn stream_codec(config: ConfigView<'_>, index: u8, recipe: &Recipe) -> Result<Codec, BuildError> {
     let Parts::Stream { input, output } = &recipe.parts else {
-        return Err(too_many("stream parts in a CAN recipe", 0));
+        return Err(one_too_many("stream parts in a CAN recipe", 0));
     };
     let layout = |part: &Option<StreamPart>, direction| {
         stream_layout(config, index, recipe, part.as_ref(), direction, Framing::Bytes)
@@ -469,7 +516,7 @@ fn stream_codec(config: &GatewayConfig, index: u8, recipe: &Recipe) -> Result<Co
 }
 
 fn stream_layout(
-    config: &GatewayConfig,
+    config: ConfigView<'_>,
     index: u8,
     recipe: &Recipe,
     part: Option<&StreamPart>,
@@ -478,22 +525,22 @@ fn stream_layout(
 ) -> Result<Option<StreamLayout>, BuildError> {
     let Some(part) = part else { return Ok(None) };
     let rules = Rules { mode: recipe.mode, direction };
-    let fields = part.fields.of(&config.fields).iter().map(FieldSpec::field);
+    let fields = part.fields.of(config.fields).iter().map(FieldSpec::field);
     StreamLayout::new(rules, &part.head, &part.tail, fields, framing)
         .map(Some)
         .map_err(|error| BuildError::Part { recipe: index, part: direction, error })
 }
 
-fn can_codec(config: &GatewayConfig, index: u8, recipe: &Recipe) -> Result<Codec, BuildError> {
+fn can_codec(config: ConfigView<'_>, index: u8, recipe: &Recipe) -> Result<Codec, BuildError> {
     let Parts::Can { input, output } = &recipe.parts else {
-        return Err(too_many("CAN parts in a stream recipe", 0));
+        return Err(one_too_many("CAN parts in a stream recipe", 0));
     };
     let layout = |frames: &[crate::config::CanFramePart], direction| {
         if frames.is_empty() {
             return Ok(None);
         }
         let frames = frames.iter().map(|frame| {
-            let fields = frame.fields.of(&config.fields).iter().map(FieldSpec::field);
+            let fields = frame.fields.of(config.fields).iter().map(FieldSpec::field);
             (frame.id, fields)
         });
         CanLayout::new(Rules { mode: recipe.mode, direction }, frames)

@@ -6,7 +6,7 @@
 use core::fmt;
 
 use super::io::{LinkId, PortId};
-use crate::config::{GatewayConfig, Recipe, SendOn};
+use crate::config::{ConfigView, Recipe, SendOn};
 use crate::image::InputSet;
 use crate::sysvar::{COUNT, Direction, INPUT_COUNT, ModbusPlace, SysVar};
 
@@ -107,7 +107,11 @@ impl Plan {
     ///
     /// # Errors
     /// [`PlanError`] names the first variable without a way.
-    pub fn new(config: &GatewayConfig) -> Result<Self, PlanError> {
+    pub fn new<'c>(config: impl Into<ConfigView<'c>>) -> Result<Self, PlanError> {
+        Self::of(config.into())
+    }
+
+    fn of(config: ConfigView<'_>) -> Result<Self, PlanError> {
         let mut plan = Self {
             owners: [None; INPUT_COUNT],
             ways: [None; INPUT_COUNT],
@@ -173,7 +177,7 @@ impl Plan {
         self.ways.contains(&Some(WayUp::Modbus)) || self.sources.contains(&Some(Source::Modbus))
     }
 
-    fn claim(&mut self, config: &GatewayConfig, var: SysVar, port: PortId) -> Result<(), PlanError> {
+    fn claim(&mut self, config: ConfigView<'_>, var: SysVar, port: PortId) -> Result<(), PlanError> {
         let Some(owner) = self.owners.get_mut(var.ordinal()) else { return Ok(()) };
         match *owner {
             Some(first) if first != port => return Err(PlanError::TwoOwners { var, first, second: port }),
@@ -190,7 +194,7 @@ impl Plan {
         Ok(())
     }
 
-    fn find_source(&self, config: &GatewayConfig, var: SysVar) -> Option<Source> {
+    fn find_source(&self, config: ConfigView<'_>, var: SysVar) -> Option<Source> {
         if var.direction() == Direction::Input
             && let Some(owner) = self.owner(var)
         {
@@ -212,10 +216,10 @@ fn is_exact_modbus(var: SysVar) -> bool {
 }
 
 /// The recipe links in order of preference, each with its recipe.
-pub(super) fn uplinks(config: &GatewayConfig) -> impl Iterator<Item = (LinkId, &Recipe)> {
+pub(super) fn uplinks<'c>(config: ConfigView<'c>) -> impl Iterator<Item = (LinkId, &'c Recipe)> {
     let own = config.controller.recipe_link.map(|link| (LinkId::RECIPE_UDP, link.recipe));
     let listening = (0..)
-        .zip(&config.ports)
+        .zip(config.ports)
         .filter(|(_, port)| !port.bus.is_field())
         .map(|(id, port)| (LinkId::of_port(PortId(id)), port.recipe));
     own.into_iter()
@@ -223,23 +227,23 @@ pub(super) fn uplinks(config: &GatewayConfig) -> impl Iterator<Item = (LinkId, &
         .filter_map(|(link, recipe)| Some((link, config.recipes.get(usize::from(recipe))?)))
 }
 
-fn field_ports(config: &GatewayConfig) -> impl Iterator<Item = (PortId, &Recipe)> {
+fn field_ports<'c>(config: ConfigView<'c>) -> impl Iterator<Item = (PortId, &'c Recipe)> {
     config.field_ports().map(|(port, _, recipe)| (PortId(port), recipe))
 }
 
 /// The input variables that a recipe's input part sets.
-fn inputs_of<'a>(config: &'a GatewayConfig, recipe: &'a Recipe) -> impl Iterator<Item = SysVar> + 'a {
+fn inputs_of<'a>(config: ConfigView<'a>, recipe: &'a Recipe) -> impl Iterator<Item = SysVar> + 'a {
     config.written_by(recipe)
 }
 
 /// Whether a recipe link's frame carries what one field frame brings and nothing else, all of it with
 /// safe values or none: then all of it is known whenever any of it is written.
-fn is_one_frame(config: &GatewayConfig, link: &Recipe) -> bool {
+fn is_one_frame(config: ConfigView<'_>, link: &Recipe) -> bool {
     config.field_ports().any(|(_, port, recipe)| {
         recipe.frames(Direction::Input).any(|(_, fields)| {
-            let fields = fields.of(&config.fields);
+            let fields = fields.of(config.fields);
             let brings = |var| fields.iter().any(|field| field.variable() == Some(var));
-            let safe = |var| port.on_timeout.of(&config.safe_values).iter().any(|safe| safe.var == var);
+            let safe = |var| port.on_timeout.of(config.safe_values).iter().any(|safe| safe.var == var);
             let mut vars = inputs_of(config, link).peekable();
             let first_is_safe = vars.peek().is_some_and(|&var| safe(var));
             vars.all(|var| brings(var) && safe(var) == first_is_safe)
@@ -248,10 +252,7 @@ fn is_one_frame(config: &GatewayConfig, link: &Recipe) -> bool {
 }
 
 /// The variables that a recipe's output part shows, and the one whose bit triggers it.
-pub(super) fn shown_by<'a>(
-    config: &'a GatewayConfig,
-    recipe: &'a Recipe,
-) -> impl Iterator<Item = SysVar> + 'a {
+pub(super) fn shown_by<'a>(config: ConfigView<'a>, recipe: &'a Recipe) -> impl Iterator<Item = SysVar> + 'a {
     let trigger = match recipe.send {
         SendOn::Rising { var, .. } => Some(var),
         _ => None,

@@ -76,7 +76,7 @@ pub fn replay<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize>(
             Entry::Start { image } => {
                 entry.encode(&mut write);
                 image::decode_into(image, config).map_err(ReplayError::Image)?;
-                engine.configure(config).map_err(ReplayError::Build)?;
+                engine.configure(&*config).map_err(ReplayError::Build)?;
                 has_started = true;
             }
             _ if !has_started => return Err(ReplayError::NoStart),

@@ -3,7 +3,6 @@
 
 use std::collections::BTreeSet;
 
-use heapless::{String, Vec as Bounded};
 use proto_core::config::*;
 use proto_core::engine::{
     Engine, Input, LinkId, LinkInfo, LinkKind, OUTPUT_BUFFER, Output, PortCounters, PortId,
@@ -28,22 +27,9 @@ pub struct Cell(pub GatewayConfig);
 
 impl Cell {
     pub fn new() -> Self {
-        Self(GatewayConfig {
-            controller: ControllerLink {
-                address: String::new(),
-                dialect: String::try_from("v2.3").unwrap(),
-                command_port: 2000,
-                state_port: 2001,
-                modbus_port: 502,
-                recipe_link: None,
-            },
-            network: None,
-            recipes: Bounded::new(),
-            ports: Bounded::new(),
-            fields: Bounded::new(),
-            commands: Bounded::new(),
-            safe_values: Bounded::new(),
-        })
+        let mut config = GatewayConfig::empty();
+        config.set_controller("").unwrap();
+        Self(config)
     }
 
     pub fn fields(&mut self, fields: impl IntoIterator<Item = FieldSpec>) -> Span {
@@ -65,40 +51,30 @@ impl Cell {
 
     pub fn recipe(&mut self, mode: Mode, parts: Parts) -> u8 {
         let index = self.0.recipes.len() as u8;
-        let name = Name::try_from(format!("recipe{index}").as_str()).unwrap();
-        let recipe = Recipe { name, mode, parts, on_stale: OnStale::Hold, send: SendOn::Period };
-        self.0.recipes.push(recipe).unwrap();
+        let name = Name::try_from(recipe_name(index).as_str()).unwrap();
+        self.0.recipes.push(Recipe::new(name, mode, parts)).unwrap();
         index
     }
 
     /// A realtime stream recipe with the specification's heads and tails.
     pub fn stream(&mut self, input: &[&str], output: &[&str]) -> u8 {
-        let input = match input {
-            [] => None,
-            names => {
-                let fields = self.system(names);
-                self.part(&[255, 255], &[238, 238], fields)
-            }
-        };
-        let output = match output {
-            [] => None,
-            names => {
-                let fields = self.system(names);
-                self.part(&[255, 255], &[254, 254], fields)
-            }
-        };
-        self.recipe(Mode::Realtime, Parts::Stream { input, output })
+        let name = recipe_name(self.0.recipes.len() as u8);
+        let mut recipe = Recipe::realtime(&name);
+        if !input.is_empty() {
+            recipe = recipe.stream_input(&[255, 255], &[238, 238], input);
+        }
+        if !output.is_empty() {
+            recipe = recipe.stream_output(&[255, 255], &[254, 254], output);
+        }
+        self.0.add_recipe(&recipe).unwrap()
     }
 
     pub fn can(&mut self, input: &[(u16, &[&str])], output: &[(u16, &[&str])]) -> u8 {
-        let mut frames = |frames: &[(u16, &[&str])]| {
-            let frames = frames
-                .iter()
-                .map(|&(id, names)| CanFramePart { id: CanId::Standard(id), fields: self.system(names) });
-            frames.collect()
-        };
-        let (input, output) = (frames(input), frames(output));
-        self.recipe(Mode::Realtime, Parts::Can { input, output })
+        let name = recipe_name(self.0.recipes.len() as u8);
+        let [input, output] = [input, output].map(|frames| {
+            frames.iter().map(|&(id, names)| CanFields::standard(id, names)).collect::<Vec<_>>()
+        });
+        self.0.add_recipe(&Recipe::realtime(&name).can_input(&input).can_output(&output)).unwrap()
     }
 
     pub fn last_recipe(&mut self) -> &mut Recipe {
@@ -112,26 +88,20 @@ impl Cell {
     pub fn port(&mut self, bus: Bus, recipe: u8) -> PortId {
         let index = self.0.ports.len() as u8;
         let name = Name::try_from(format!("port{index}").as_str()).unwrap();
-        let on_timeout = Span { start: self.0.safe_values.len() as u16, len: 0 };
-        let (cycle, timeout, stale_after) = (MS(4), MS(100), MS(500));
-        let port = Port { name, bus, recipe, cycle, timeout, on_timeout, stale_after };
+        let mut port = Port::new(name, bus, recipe);
+        port.on_timeout.start = self.0.safe_values.len() as u16;
         self.0.ports.push(port).unwrap();
         PortId(index)
     }
 
+    /// Without a turnaround: tests say when a line was silent.
     pub fn rs485(&mut self, recipe: u8) -> PortId {
-        let line = Rs485 {
-            baud: 115_200,
-            parity: Parity::None,
-            stop_bits: 1,
-            idle_gap: MS(50),
-            turnaround: Duration::ZERO,
-        };
+        let line = Rs485 { turnaround: Duration::ZERO, ..Rs485::default() };
         self.port(Bus::Rs485(line), recipe)
     }
 
     pub fn can_port(&mut self, recipe: u8) -> PortId {
-        self.port(Bus::Can { bitrate: 500_000 }, recipe)
+        self.port(Bus::Can { bitrate: Bus::BITRATE }, recipe)
     }
 
     pub fn recipe_link(&mut self, recipe: u8) {
@@ -148,7 +118,7 @@ impl Cell {
     pub fn commands(&mut self, entries: &[(i64, &str)]) -> Span {
         let start = self.0.commands.len() as u16;
         for &(value, text) in entries {
-            let text = String::try_from(text).unwrap();
+            let text = heapless::String::try_from(text).unwrap();
             self.0.commands.push(CommandEntry { value, text }).unwrap();
         }
         Span { start, len: entries.len() as u16 }
@@ -157,6 +127,10 @@ impl Cell {
     pub fn rig(&self) -> Rig {
         Rig::new(&self.0)
     }
+}
+
+fn recipe_name(index: u8) -> String {
+    format!("recipe{index}")
 }
 
 pub fn user_in(ty: ScalarType, to: InputBinding) -> FieldSpec {

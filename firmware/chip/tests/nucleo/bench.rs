@@ -36,7 +36,7 @@ fn program() -> &'static Program {
 pub(crate) fn image_of(toml: &str) -> Vec<u8> {
     let config = parse_gateway(Text { name: "cell.toml", toml }, &[]).expect("a right configuration");
     let mut bytes = vec![0; image::MAX_IMAGE];
-    let len = image::encode(&config, &mut bytes).expect("it fits");
+    let len = image::encode(&*config, &mut bytes).expect("it fits");
     bytes.truncate(len);
     bytes
 }

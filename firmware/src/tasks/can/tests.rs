@@ -12,12 +12,8 @@ use std::task::{Wake, Waker};
 use std::vec::Vec;
 
 use core::cell::RefCell;
-use proto_core::config::{
-    CanFramePart, FieldSpec, GatewayConfig, InputBinding, OnStale, OutputBinding, Parts, Port, Recipe,
-    SendOn, Span,
-};
+use proto_core::config::{CanFields, GatewayConfig, InputField, OutputField, Port, Recipe};
 use proto_core::engine::PortCounters;
-use proto_core::recipe::model::Mode;
 use proto_core::wire::scalar::ScalarType;
 
 use super::*;
@@ -232,43 +228,18 @@ impl Cell {
 
 /// Takes ids 1 and 0x12345, sends ids 2 and 3 each cycle.
 fn config() -> GatewayConfig {
-    let mut config = GatewayConfig::empty();
-    config.controller.address = "10.0.0.1".try_into().unwrap();
-    config.controller.dialect = "v2.3".try_into().unwrap();
-    config.controller.command_port = 2000;
-    config.controller.state_port = 2001;
-    config.controller.modbus_port = 502;
-    let input = FieldSpec::UserInput { ty: ScalarType::Byte, to: InputBinding::Unused };
-    let output = FieldSpec::UserOutput { ty: ScalarType::Byte, from: OutputBinding::Constant(7.0) };
-    config.fields.extend([input, input, output, output]);
-    let frame = |id, start| CanFramePart { id, fields: Span { start, len: 1 } };
-    config
-        .recipes
-        .push(Recipe {
-            name: "hand".try_into().unwrap(),
-            mode: Mode::User,
-            parts: Parts::Can {
-                input: [frame(CanId::Standard(1), 0), frame(CanId::Extended(0x12345), 1)].into(),
-                output: [frame(CanId::Standard(2), 2), frame(CanId::Standard(3), 3)].into(),
-            },
-            on_stale: OnStale::Hold,
-            send: SendOn::Period,
-        })
-        .unwrap();
-    config
-        .ports
-        .push(Port {
-            name: "can".try_into().unwrap(),
-            bus: proto_core::config::Bus::Can { bitrate: BITRATE },
-            recipe: 0,
-            cycle: proto_core::time::Duration::from_millis(CYCLE),
-            timeout: proto_core::time::Duration::from_millis(100),
-            on_timeout: Span::default(),
-            stale_after: proto_core::time::Duration::from_millis(500),
-        })
-        .unwrap();
-    config.validate().unwrap();
-    config
+    let (input, output) =
+        ([InputField::unused(ScalarType::Byte)], [OutputField::constant(ScalarType::Byte, 7.0)]);
+    GatewayConfig::builder()
+        .controller("10.0.0.1")
+        .recipe(
+            Recipe::user("hand")
+                .can_input(&[CanFields::standard(1, &input), CanFields::extended(0x12345, &input)])
+                .can_output(&[CanFields::standard(2, &output), CanFields::standard(3, &output)]),
+        )
+        .port(Port::can("can", "hand").bitrate(BITRATE).cycle(proto_core::time::Duration::from_millis(CYCLE)))
+        .build()
+        .unwrap()
 }
 
 fn input_frame() -> CanFrame {

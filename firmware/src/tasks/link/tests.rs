@@ -21,7 +21,7 @@ use embassy_net::driver::{Capabilities, Driver as Device, HardwareAddress, LinkS
 use embassy_net::{Config, IpEndpoint, Ipv4Cidr, Runner, StackResources, StaticConfigV4};
 use embassy_time::{Duration, with_timeout};
 use proto_core::config::{
-    Bus, Delimiter, FieldSpec, Name, OnStale, Parity, Parts, Port, Recipe, Rs485, SendOn, Span, StreamPart,
+    Bus, Delimiter, FieldSpec, Name, Parity, Parts, Port, Recipe, Rs485, Span, StreamPart,
 };
 use proto_core::engine::{LinkCounters, LinkInfo, PortId};
 use proto_core::recipe::model::Mode;
@@ -193,18 +193,15 @@ fn host<'d>(wire: &Rc<Wire>, host: u8, resources: &'d mut Resources) -> (Stack<'
 /// A controller, and nothing else.
 fn controller_only() -> GatewayConfig {
     let mut config = GatewayConfig::empty();
-    let controller = &mut config.controller;
-    controller.address = "10.0.0.2".try_into().unwrap();
-    controller.dialect = "v2.3".try_into().unwrap();
-    (controller.command_port, controller.state_port, controller.modbus_port) = (2000, 2001, 502);
+    config.set_controller("10.0.0.2").unwrap();
     config
 }
 
 fn add_port(config: &mut GatewayConfig, name: &str, bus: Bus, recipe: u8) {
-    let timeout = CoreDuration::from_micros(TIMEOUT.as_micros());
-    let (cycle, stale_after) = (CoreDuration::from_secs(1), CoreDuration::from_secs(1));
-    let (name, on_timeout) = (Name::try_from(name).unwrap(), Span::default());
-    config.ports.push(Port { name, bus, recipe, cycle, timeout, on_timeout, stale_after }).unwrap();
+    let mut port = Port::new(Name::try_from(name).unwrap(), bus, recipe);
+    port.timeout = CoreDuration::from_micros(TIMEOUT.as_micros());
+    (port.cycle, port.stale_after) = (CoreDuration::from_secs(1), CoreDuration::from_secs(1));
+    config.ports.push(port).unwrap();
 }
 
 fn add_recipe(config: &mut GatewayConfig, mode: Mode, input: Option<Span>, output: Option<Span>) {
@@ -212,8 +209,7 @@ fn add_recipe(config: &mut GatewayConfig, mode: Mode, input: Option<Span>, outpu
     let part = |fields| StreamPart { head: delimiter(&FRAME[..2]), tail: delimiter(&FRAME[3..]), fields };
     let parts = Parts::Stream { input: input.map(part), output: output.map(part) };
     let name = Name::try_from(["a", "b"][config.recipes.len()]).unwrap();
-    let (on_stale, send) = (OnStale::Hold, SendOn::Period);
-    config.recipes.push(Recipe { name, mode, parts, on_stale, send }).unwrap();
+    config.recipes.push(Recipe::new(name, mode, parts)).unwrap();
 }
 
 fn rs485() -> Bus {

@@ -10,12 +10,8 @@ use std::rc::Rc;
 use std::vec::Vec;
 
 use embedded_io_async::{ErrorType, Read, Write};
-use proto_core::config::{
-    Bus, Delimiter, FieldSpec, GatewayConfig, InputBinding, Name, OnStale, OutputBinding, Parity, Parts,
-    Port, Recipe, Rs485, SendOn, Span, StreamPart,
-};
+use proto_core::config::{GatewayConfig, InputField, OutputField, Port, Recipe, SendOn};
 use proto_core::engine::PortCounters;
-use proto_core::recipe::model::Mode;
 use proto_core::time::Duration as CoreDuration;
 use proto_core::wire::scalar::ScalarType;
 
@@ -91,38 +87,25 @@ impl Line for Script {}
 
 /// One RS-485 port, whose frames are answered when `send` says so.
 fn config(send: SendOn) -> GatewayConfig {
-    let mut config = GatewayConfig::empty();
-    config.controller.address = "10.0.0.1".try_into().unwrap();
-    config.controller.dialect = "v2.3".try_into().unwrap();
-    let controller = &mut config.controller;
-    (controller.command_port, controller.state_port, controller.modbus_port) = (2000, 2001, 502);
-    let (ty, to, from) = (ScalarType::Byte, InputBinding::Unused, OutputBinding::Constant(7.0));
-    config.fields.extend([FieldSpec::UserInput { ty, to }, FieldSpec::UserOutput { ty, from }]);
-    let delimiter = |bytes: &[u8]| Delimiter::from_slice(bytes).unwrap();
-    let part = |start| StreamPart {
-        head: delimiter(&FRAME[..2]),
-        tail: delimiter(&FRAME[3..]),
-        fields: Span { start, len: 1 },
-    };
-    let parts = Parts::Stream { input: Some(part(0)), output: Some(part(1)) };
-    let name = Name::try_from("a").unwrap();
-    let (mode, on_stale) = (Mode::User, OnStale::Hold);
-    config.recipes.push(Recipe { name: name.clone(), mode, parts, on_stale, send }).unwrap();
-    let line = Rs485 {
-        baud: BAUD,
-        parity: Parity::None,
-        stop_bits: 1,
-        idle_gap: CoreDuration::from_micros(IDLE_GAP.as_micros()),
-        turnaround: CoreDuration::ZERO,
-    };
-    let cycle = CoreDuration::from_millis(400);
-    let timeout = CoreDuration::from_micros(TIMEOUT.as_micros());
-    let on_timeout = Span::default();
-    let stale_after = CoreDuration::from_secs(1);
-    let port = Port { name, bus: Bus::Rs485(line), recipe: 0, cycle, timeout, on_timeout, stale_after };
-    config.ports.push(port).unwrap();
-    config.validate().unwrap();
-    config
+    GatewayConfig::builder()
+        .controller("10.0.0.1")
+        .recipe(
+            Recipe::user("a")
+                .stream_input(&FRAME[..2], &FRAME[3..], &[InputField::unused(ScalarType::Byte)])
+                .stream_output(&FRAME[..2], &FRAME[3..], &[OutputField::constant(ScalarType::Byte, 7.0)])
+                .send(send),
+        )
+        .port(
+            Port::rs485("a", "a")
+                .baud(BAUD)
+                .idle_gap(CoreDuration::from_micros(IDLE_GAP.as_micros()))
+                .turnaround(CoreDuration::ZERO)
+                .cycle(CoreDuration::from_millis(400))
+                .timeout(CoreDuration::from_micros(TIMEOUT.as_micros()))
+                .stale_after(CoreDuration::from_secs(1)),
+        )
+        .build()
+        .unwrap()
 }
 
 /// The port, its task and the engine's.

@@ -90,7 +90,7 @@ impl Station {
         if templates.is_empty() {
             return None;
         }
-        let frame_time = config.budget(port, Direction::Input).map_or(Duration::ZERO, |b| b.time);
+        let frame_time = config.view().budget(port, Direction::Input).map_or(Duration::ZERO, |b| b.time);
         let values = templates.iter().map(|template| template.fields.iter().map(zero).collect()).collect();
         let next = start + rng.up_to(port.timeout);
         Some(Self {

@@ -1,18 +1,16 @@
 //! A gateway file: TOML to [`GatewayConfig`], checked.
 
 use std::collections::HashMap;
-use std::net::IpAddr;
 
 use heapless::Vec as Bounded;
 use proto_core::config::{
     Bus, CanFramePart, CommandEntry, ConfigError, ControllerKey, ControllerLink, Delimiter, FieldSpec,
-    GatewayConfig, InputBinding, MAX_ALL_FIELDS, MAX_COMMAND_TEXT, MAX_COMMANDS, MAX_PORTS, MAX_RECIPES,
-    MAX_SAFE_VALUES, NetworkKey, OutputBinding, Parts, Place, Port, PortKey, Recipe, RecipeKey, RecipeLink,
-    SafeValue, Span, StreamPart,
+    GatewayConfig, InputBinding, MAX_ADDRESS, MAX_ALL_FIELDS, MAX_COMMAND_TEXT, MAX_COMMANDS, MAX_LISTEN,
+    MAX_PORTS, MAX_RECIPES, MAX_SAFE_VALUES, NetworkKey, OutputBinding, Parts, Place, Port, PortKey, Recipe,
+    RecipeKey, RecipeLink, SafeValue, Span, StreamPart, check_address,
 };
 use proto_core::recipe::model::{Framing, MAX_CAN_IDS};
 use proto_core::sysvar::{Direction, SysVar};
-use proto_core::time::Duration;
 use proto_core::wire::dialect::Dialect;
 use proto_core::wire::scalar::Scalar;
 
@@ -90,6 +88,7 @@ impl<'a> Builder<'a> {
             .table(&["address", "dialect", "ports", "recipe_link"])?;
         let mut spots = HashMap::new();
         for (key, name) in [
+            (ControllerKey::Address, "address"),
             (ControllerKey::Dialect, "dialect"),
             (ControllerKey::Ports, "ports"),
             (ControllerKey::RecipeLink, "recipe_link"),
@@ -109,16 +108,10 @@ impl<'a> Builder<'a> {
             }
             network = Some(network::read(&table)?);
         }
-        let config = GatewayConfig {
-            controller,
-            network,
-            recipes: Bounded::new(),
-            ports: Bounded::new(),
-            fields: Bounded::new(),
-            commands: Bounded::new(),
-            safe_values: Bounded::new(),
-        };
-        Ok(Self { document: root.document, config: Box::new(config), spots })
+        let mut config = Box::new(GatewayConfig::empty());
+        config.controller = controller;
+        config.network = network.into();
+        Ok(Self { document: root.document, config, spots })
     }
 
     fn error(&self, spot: &Spot, message: impl ToString) -> super::FileError {
@@ -149,13 +142,11 @@ impl<'a> Builder<'a> {
                 output: self.stream_part(place, Direction::Output, recipe)?,
             }
         };
-        let recipe = Recipe {
-            name: bounded_name(&recipe.name),
-            mode: recipe.mode,
-            parts,
-            on_stale: sending.map(|sending| sending.on_stale).unwrap_or_default(),
-            send: sending.map(|sending| sending.send).unwrap_or_default(),
-        };
+        let mut recipe = Recipe::new(bounded(&recipe.name), recipe.mode, parts);
+        if let Some(sending) = sending {
+            recipe.on_stale = sending.on_stale;
+            recipe.send = sending.send;
+        }
         // There is room: the index was checked above.
         let _ = self.config.recipes.push(recipe);
         Ok(())
@@ -277,18 +268,14 @@ impl<'a> Builder<'a> {
                 recipe.check_framing(framing).map_err(|message| item.error(message))?;
             }
         }
-        let time = |key, default| {
-            table.optional(key).map_or(Ok(Duration::from_millis(default)), |item| item.time(1e3))
-        };
-        let port = Port {
-            name: bounded_name(&name),
-            bus,
-            recipe: recipe as u8,
-            cycle: read_cycle(table)?,
-            timeout: time("timeout_ms", 100)?,
-            on_timeout: self.add_safe_values(table)?,
-            stale_after: time("stale_after_ms", 500)?,
-        };
+        let mut port = Port::new(bounded(&name), bus, recipe as u8);
+        port.cycle = read_cycle(table)?;
+        for (key, time) in [("timeout_ms", &mut port.timeout), ("stale_after_ms", &mut port.stale_after)] {
+            if let Some(item) = table.optional(key) {
+                *time = item.time(1e3)?;
+            }
+        }
+        port.on_timeout = self.add_safe_values(table)?;
         // There is room: the count was checked above.
         let _ = self.config.ports.push(port);
         Ok(())
@@ -324,7 +311,7 @@ impl<'a> Builder<'a> {
         match self.config.validate() {
             Ok(()) => Ok(self.config),
             Err(ConfigError { place, kind }) => {
-                let message = self.config.describe_kind(kind).to_string();
+                let message = self.config.view().describe_kind(kind).to_string();
                 Err(match self.spots.get(&place) {
                     Some(spot) => self.error(spot, message),
                     None => self.document.whole_file_error(format!("{place:?}: {message}")),
@@ -351,19 +338,14 @@ const PORT_PLACES: [PortKey; 12] = [
 
 fn read_controller(table: &Reader<'_>, recipes: &[FileRecipe]) -> Result<ControllerLink> {
     let address = table.required("address", "the controller's IP address or host name")?;
-    let mut link = ControllerLink {
-        address: read_address(&address)?,
-        dialect: bounded(Dialect::V2_3.name),
-        command_port: 2000,
-        state_port: 2001,
-        modbus_port: 502,
-        recipe_link: None,
-    };
+    let mut link = ControllerLink::default();
+    link.address = read_address(&address)?;
     if let Some(item) = table.optional("dialect") {
         let name = item.string()?;
-        link.dialect = bounded(super::known_dialect(&item, name)?);
+        if let Some(dialect) = Dialect::named(super::known_dialect(&item, name)?) {
+            link.set_dialect(dialect);
+        }
     }
-    link.modbus_port = Dialect::named(&link.dialect).map_or(link.modbus_port, |dialect| dialect.modbus_port);
     let mut udp_port = 2011;
     if let Some(ports) = table.optional("ports") {
         let ports = ports.table(&["command", "state", "modbus", "udp2011"])?;
@@ -390,22 +372,17 @@ fn read_controller(table: &Reader<'_>, recipes: &[FileRecipe]) -> Result<Control
     Ok(link)
 }
 
-fn read_address(item: &Item<'_>) -> Result<heapless::String<64>> {
+fn read_address(item: &Item<'_>) -> Result<heapless::String<MAX_ADDRESS>> {
     let text = item.string()?;
-    let is_name = |text: &str| {
-        !text.is_empty() && text.chars().all(|c| c.is_ascii_alphanumeric() || matches!(c, '.' | '-' | '_'))
-    };
-    if text.parse::<IpAddr>().is_err() && !is_name(text) {
-        let message = format!("{text:?} is neither an IP address nor a host name; port numbers go to ports");
-        return Err(item.error(message));
-    }
-    heapless::String::try_from(text).map_err(|_| item.error("longer than 64 bytes"))
+    check_address(text).map_err(|kind| item.error(format!("{text:?} is {kind}")))?;
+    Ok(bounded(text))
 }
 
 fn read_bus(table: &Reader<'_>, kind: BusKind) -> Result<Bus> {
-    let listen = || -> Result<heapless::String<48>> {
+    let listen = || -> Result<heapless::String<MAX_LISTEN>> {
         let item = table.required("listen", "an IP address and a port, such as \"0.0.0.0:50000\"")?;
-        heapless::String::try_from(item.string()?).map_err(|_| item.error("longer than 48 bytes"))
+        heapless::String::try_from(item.string()?)
+            .map_err(|_| item.error(format!("longer than {MAX_LISTEN} bytes")))
     };
     Ok(match kind {
         BusKind::Rs485 => Bus::Rs485(read_line(table)?),
@@ -420,11 +397,7 @@ fn delimiter(bytes: &[u8]) -> Delimiter {
     Delimiter::from_slice(bytes).unwrap_or_default()
 }
 
-/// Names were read with the same bound.
-fn bounded_name(name: &str) -> proto_core::config::Name {
-    bounded(name)
-}
-
+/// What was read with the same bound.
 fn bounded<const N: usize>(text: &str) -> heapless::String<N> {
     heapless::String::try_from(text).unwrap_or_default()
 }

@@ -52,7 +52,6 @@ pub(super) fn read_cycle(port: &Reader<'_>) -> Result<Duration> {
 /// The file's name for what a check calls `key`.
 pub(super) fn key_name(key: PortKey) -> &'static str {
     match key {
-        PortKey::Name => "name",
         PortKey::Recipe => "recipe",
         PortKey::Cycle => "cycle_ms",
         PortKey::Timeout => "timeout_ms",
@@ -64,6 +63,8 @@ pub(super) fn key_name(key: PortKey) -> &'static str {
         PortKey::Turnaround => "turnaround_us",
         PortKey::Bitrate => "bitrate",
         PortKey::Listen => "listen",
+        // What has no key of its own is about the port as a whole.
+        _ => "name",
     }
 }
 

@@ -106,13 +106,7 @@ pub(super) fn find(recipes: &[FileRecipe], item: &Item<'_>) -> Result<usize> {
 pub(super) fn read_name(table: &Reader<'_>) -> Result<(String, Spot)> {
     let item = table.required("name", "what the rest of the file and the tools call it")?;
     let name = item.string()?;
-    let max = proto_core::config::MAX_NAME;
-    if name.is_empty() || name.len() > max {
-        return Err(item.error(format!("{} bytes long; 1..={max}", name.len())));
-    }
-    if name.contains(|c: char| c == '=' || c == '"' || c.is_whitespace() || c.is_control()) {
-        return Err(item.error(format!("{name:?} has a blank, a quote or '=' in it")));
-    }
+    proto_core::config::check_name(name).map_err(|kind| item.error(kind))?;
     Ok((name.to_owned(), item.spot))
 }
 

@@ -1,22 +1,33 @@
 //! The configuration image: what a board keeps instead of the TOML file
 //! (docs/configuration.md section 6).
 //!
-//! In: a checked configuration, or bytes from flash or a file. Out: the other. An image that was cut,
-//! changed in any bit, written for another version or that holds a wrong configuration is refused with
-//! a reason. What follows the image is not looked at: flash is erased in whole sectors.
+//! In: a checked configuration, or bytes from flash or a file. Out: the other. An image of an older
+//! version is read as what it meant then. One that was cut, changed in any bit, written for a newer
+//! version or that holds a wrong configuration is refused with a reason. What follows the image is not
+//! looked at: flash is erased in whole sectors.
+//!
+//! **To change a serialized type,** raise [`VERSION`], copy the types as they were into the module of
+//! the old version, where nothing changes from then on, with `From` into those of the next, and give
+//! `decode_into` a new first reader. `tests/golden` says what must still be read.
+
+mod v1;
+mod v2;
 
 use core::fmt;
 
 use crc::{CRC_32_ISO_HDLC, Crc};
-use heapless::Vec;
+use heapless::VecView;
 use serde::de::DeserializeOwned;
 
-use super::{ConfigError, GatewayConfig};
+use super::error::Counted;
+use super::{ConfigError, ConfigMut, ConfigView, GatewayConfig};
 
 /// The first bytes of every image.
 pub const MAGIC: [u8; 4] = *b"RGCI";
 /// The version of what follows the header: one more for every change of a serialized type.
 pub const VERSION: u32 = 2;
+/// The oldest version that is read.
+pub const OLDEST_VERSION: u32 = 1;
 /// Length of the header: magic, version, payload length and CRC-32, four bytes each, little-endian.
 pub const HEADER: usize = 16;
 /// Longest image, header included. What a board has room for takes less; only a file with hundreds of
@@ -39,7 +50,7 @@ pub enum ImageError {
         /// What it begins with.
         found: [u8; 4],
     },
-    /// Written for another version.
+    /// Written for a version that is not known here: a newer one.
     Version {
         /// The image's.
         found: u32,
@@ -58,6 +69,15 @@ pub enum ImageError {
     },
     /// The payload is not a configuration: it was written with other types.
     Contents,
+    /// More of something than the configuration has room for.
+    TooMany {
+        /// Of what.
+        what: Counted,
+        /// How many the image has.
+        needed: usize,
+        /// How many there is room for.
+        room: usize,
+    },
     /// The configuration is wrong.
     Config(ConfigError),
 }
@@ -70,7 +90,7 @@ impl fmt::Display for ImageError {
             }
             Self::NotAnImage { found } => write!(f, "no configuration image: it begins with {found:02X?}"),
             Self::Version { found } => {
-                write!(f, "the image has version {found}; this firmware takes version {VERSION}")
+                write!(f, "the image has version {found}; this firmware takes {OLDEST_VERSION} to {VERSION}")
             }
             Self::TooLong { payload } => {
                 write!(f, "the image says it holds {payload} bytes; at most {MAX_IMAGE} are possible")
@@ -79,6 +99,9 @@ impl fmt::Display for ImageError {
                 write!(f, "the image is damaged: its CRC is {stored:08X}, its bytes have {computed:08X}")
             }
             Self::Contents => write!(f, "the image's contents are no configuration"),
+            Self::TooMany { what, needed, room } => {
+                write!(f, "the image has {needed} {what}, and there is room for {room}")
+            }
             Self::Config(error) => write!(f, "the image's configuration is wrong: {error}"),
         }
     }
@@ -101,16 +124,20 @@ impl fmt::Display for NoSpace {
 
 impl core::error::Error for NoSpace {}
 
-/// Writes the image of a configuration; its length.
+/// Writes the image of a configuration, in the newest version; its length.
 ///
 /// Whether the configuration is valid is asked when the image is read.
 ///
 /// # Errors
 /// [`NoSpace`] when `out` is too short.
-pub fn encode(config: &GatewayConfig, out: &mut [u8]) -> Result<usize, NoSpace> {
+pub fn encode<'c>(config: impl Into<ConfigView<'c>>, out: &mut [u8]) -> Result<usize, NoSpace> {
+    encode_view(config.into(), out)
+}
+
+fn encode_view(config: ConfigView<'_>, out: &mut [u8]) -> Result<usize, NoSpace> {
     let no_space = NoSpace { available: out.len() };
     let (header, room) = out.split_at_mut_checked(HEADER).ok_or(no_space)?;
-    let payload = postcard::to_slice(config, room).map_err(|_| no_space)?;
+    let payload = v2::write(config, room).map_err(|_| no_space)?;
     let length = u32::try_from(payload.len()).map_err(|_| no_space)?;
     let crc = checksum(VERSION, length, payload);
     let words = [u32::from_le_bytes(MAGIC), VERSION, length, crc];
@@ -130,26 +157,34 @@ pub fn decode(bytes: &[u8]) -> Result<GatewayConfig, ImageError> {
     Ok(config)
 }
 
-/// As [`decode`], in place: for boards whose stack is smaller than a few configurations, of more than
-/// 40 KiB each.
+/// As [`decode`], in place and into a configuration of any size: for boards whose stack is smaller than
+/// a few configurations, of more than 40 KiB each.
 ///
 /// # Errors
 /// As [`decode`]; what `config` is then is of no use.
-pub fn decode_into(bytes: &[u8], config: &mut GatewayConfig) -> Result<(), ImageError> {
-    // Postcard writes a struct as its fields one behind the other.
-    let mut rest = payload(bytes)?;
-    let GatewayConfig { controller, network, recipes, ports, fields, commands, safe_values } = config;
-    *controller = item(&mut rest)?;
-    *network = item(&mut rest)?;
-    items(&mut rest, recipes)?;
-    items(&mut rest, ports)?;
-    items(&mut rest, fields)?;
-    items(&mut rest, commands)?;
-    items(&mut rest, safe_values)?;
+pub fn decode_into<
+    const PORTS: usize,
+    const RECIPES: usize,
+    const FIELDS: usize,
+    const COMMANDS: usize,
+    const SAFE_VALUES: usize,
+>(
+    bytes: &[u8],
+    config: &mut GatewayConfig<PORTS, RECIPES, FIELDS, COMMANDS, SAFE_VALUES>,
+) -> Result<(), ImageError> {
+    decode_view(bytes, config.view_mut())
+}
+
+fn decode_view(bytes: &[u8], mut config: ConfigMut<'_>) -> Result<(), ImageError> {
+    let (version, mut rest) = payload(bytes)?;
+    match version {
+        1 => v1::read(&mut rest, &mut config),
+        _ => v2::read(&mut rest, &mut config),
+    }?;
     if !rest.is_empty() {
         return Err(ImageError::Contents);
     }
-    config.validate().map_err(ImageError::Config)
+    config.view().validate().map_err(ImageError::Config)
 }
 
 fn item<T: DeserializeOwned>(rest: &mut &[u8]) -> Result<T, ImageError> {
@@ -159,13 +194,18 @@ fn item<T: DeserializeOwned>(rest: &mut &[u8]) -> Result<T, ImageError> {
 }
 
 /// How many there are, and they.
-fn items<T: DeserializeOwned, const N: usize>(
+fn items<T: DeserializeOwned>(
     rest: &mut &[u8],
-    all: &mut Vec<T, N>,
+    what: Counted,
+    all: &mut VecView<T>,
 ) -> Result<(), ImageError> {
     all.clear();
-    let count: usize = item(rest)?;
-    for _ in 0..count {
+    let needed: usize = item(rest)?;
+    let room = all.capacity();
+    if needed > room {
+        return Err(ImageError::TooMany { what, needed, room });
+    }
+    for _ in 0..needed {
         all.push(item(rest)?).map_err(|_| ImageError::Contents)?;
     }
     Ok(())
@@ -190,7 +230,7 @@ fn header(bytes: &[u8]) -> Result<(u32, u32, u32), ImageError> {
         return Err(ImageError::NotAnImage { found: magic });
     }
     let version = u32::from_le_bytes(version);
-    if version != VERSION {
+    if !(OLDEST_VERSION..=VERSION).contains(&version) {
         return Err(ImageError::Version { found: version });
     }
     let length = u32::from_le_bytes(length);
@@ -200,7 +240,8 @@ fn header(bytes: &[u8]) -> Result<(u32, u32, u32), ImageError> {
     Ok((version, length, u32::from_le_bytes(crc)))
 }
 
-fn payload(bytes: &[u8]) -> Result<&[u8], ImageError> {
+/// The version and what it is the version of.
+fn payload(bytes: &[u8]) -> Result<(u32, &[u8]), ImageError> {
     let (version, length, stored) = header(bytes)?;
     let needed = HEADER.saturating_add(length as usize);
     let payload = bytes.get(HEADER..needed).ok_or(ImageError::TooShort { needed, available: bytes.len() })?;
@@ -208,7 +249,7 @@ fn payload(bytes: &[u8]) -> Result<&[u8], ImageError> {
     if computed != stored {
         return Err(ImageError::Crc { stored, computed });
     }
-    Ok(payload)
+    Ok((version, payload))
 }
 
 /// Over version, length and payload: the header is as precious as what it describes.

@@ -1,0 +1,386 @@
+//! Recipes and ports are added to a configuration, one after the other.
+//!
+//! In: what a program wrote ([`RecipeBuilder`], [`PortBuilder`]). Out: entries of the configuration's
+//! lists with their ranges counted, or what is wrong and where. What was refused has left nothing
+//! behind. Whether everything fits together is asked by [`ConfigView::validate`].
+
+use heapless::{String, Vec, VecView};
+
+use super::draft::{ControllerBuilder, PartFields, PortBuilder, PortBus, RecipeBuilder, Trigger};
+use super::error::{ConfigError, ConfigErrorKind as Kind, ControllerKey, Counted, Place, PortKey, RecipeKey};
+use super::fields::{CanFields, Does, Fields, InputField, OutputField, Sends};
+use super::rules::check_name;
+use super::{
+    BoardAddress, CanFramePart, CommandEntry, ConfigView, ControllerLink, Delimiter, FieldSpec,
+    GatewayConfig, InputBinding, Name, OutputBinding, Parts, Port, Recipe, RecipeLink, SafeValue, SafeValues,
+    SendOn, Span, StreamPart,
+};
+use crate::recipe::model::{MAX_CAN_IDS, MAX_DELIMITER};
+use crate::sysvar::{Direction, SysVar, VarRange};
+use crate::wire::dialect::Dialect;
+use crate::wire::scalar::Scalar;
+
+/// A configuration of any size, borrowed to write to; [`GatewayConfig`] says what is in it.
+#[derive(Debug)]
+#[non_exhaustive]
+pub struct ConfigMut<'c> {
+    /// Where the controller is and what it speaks.
+    pub controller: &'c mut ControllerLink,
+    /// A board's own address.
+    pub network: &'c mut BoardAddress,
+    /// Every recipe.
+    pub recipes: &'c mut VecView<Recipe>,
+    /// Every port.
+    pub ports: &'c mut VecView<Port>,
+    /// The fields of all recipes.
+    pub fields: &'c mut VecView<FieldSpec>,
+    /// The entries of all command tables.
+    pub commands: &'c mut VecView<CommandEntry>,
+    /// The safe values of all ports.
+    pub safe_values: &'c mut VecView<SafeValue>,
+}
+
+impl<
+    const PORTS: usize,
+    const RECIPES: usize,
+    const ALL_FIELDS: usize,
+    const COMMANDS: usize,
+    const SAFE_VALUES: usize,
+> GatewayConfig<PORTS, RECIPES, ALL_FIELDS, COMMANDS, SAFE_VALUES>
+{
+    /// Sets where the controller is and what it speaks; the recipe link stays.
+    ///
+    /// # Errors
+    /// An address that is too long, or a dialect that is not known; nothing has changed then.
+    pub fn set_controller<'a>(
+        &mut self,
+        controller: impl Into<ControllerBuilder<'a>>,
+    ) -> Result<(), ConfigError> {
+        self.view_mut().set_controller(&controller.into())
+    }
+
+    /// Adds a recipe; its index.
+    ///
+    /// # Errors
+    /// A name that cannot be, a variable that is not there, or no room; nothing was added then.
+    pub fn add_recipe(&mut self, recipe: &RecipeBuilder<'_>) -> Result<u8, ConfigError> {
+        self.view_mut().add_recipe(recipe)
+    }
+
+    /// Adds a port, after its recipe; its index.
+    ///
+    /// # Errors
+    /// A name that cannot be, a recipe that is not there, safe values that do not fit, or no room;
+    /// nothing was added then.
+    pub fn add_port<B: PortBus>(&mut self, port: &PortBuilder<'_, B>) -> Result<u8, ConfigError> {
+        self.view_mut().add_port(port)
+    }
+
+    /// The controller's UDP server at this port, normally 2011, is set to this recipe, which was
+    /// added before.
+    ///
+    /// # Errors
+    /// No recipe has this name.
+    pub fn set_recipe_link(&mut self, recipe: &str, udp_port: u16) -> Result<(), ConfigError> {
+        self.view_mut().set_recipe_link(recipe, udp_port)
+    }
+}
+
+impl ConfigMut<'_> {
+    /// The configuration, to read.
+    pub fn view(&self) -> ConfigView<'_> {
+        ConfigView {
+            controller: self.controller,
+            network: self.network.fixed(),
+            recipes: self.recipes,
+            ports: self.ports,
+            fields: self.fields,
+            commands: self.commands,
+            safe_values: self.safe_values,
+        }
+    }
+
+    /// As [`GatewayConfig::set_controller`].
+    ///
+    /// # Errors
+    /// As there.
+    pub fn set_controller(&mut self, from: &ControllerBuilder<'_>) -> Result<(), ConfigError> {
+        let at = |key| move |kind| ConfigError { place: Place::Controller(key), kind };
+        let mut link = ControllerLink::default();
+        link.address = text(from.address).map_err(at(ControllerKey::Address))?;
+        if let Some(name) = from.dialect {
+            let dialect = Dialect::named(name).ok_or(Kind::UnknownDialect);
+            link.set_dialect(dialect.map_err(at(ControllerKey::Dialect))?);
+        }
+        for (port, given) in [
+            (&mut link.command_port, from.command_port),
+            (&mut link.state_port, from.state_port),
+            (&mut link.modbus_port, from.modbus_port),
+        ] {
+            *port = given.unwrap_or(*port);
+        }
+        link.recipe_link = self.controller.recipe_link;
+        *self.controller = link;
+        Ok(())
+    }
+
+    /// As [`GatewayConfig::set_recipe_link`].
+    ///
+    /// # Errors
+    /// As there.
+    pub fn set_recipe_link(&mut self, recipe: &str, udp_port: u16) -> Result<(), ConfigError> {
+        let recipe = self.recipe_named(recipe, Place::Controller(ControllerKey::RecipeLink))?;
+        self.controller.recipe_link = Some(RecipeLink { udp_port, recipe });
+        Ok(())
+    }
+
+    /// As [`GatewayConfig::add_recipe`].
+    ///
+    /// # Errors
+    /// As there.
+    pub fn add_recipe(&mut self, from: &RecipeBuilder<'_>) -> Result<u8, ConfigError> {
+        let (fields, commands) = (self.fields.len(), self.commands.len());
+        let added = self.try_add_recipe(from);
+        if added.is_err() {
+            self.fields.truncate(fields);
+            self.commands.truncate(commands);
+        }
+        added
+    }
+
+    fn try_add_recipe(&mut self, from: &RecipeBuilder<'_>) -> Result<u8, ConfigError> {
+        let recipe = self.recipes.len() as u8;
+        let at = |key| Place::Recipe { recipe, key };
+        let name = name(from.name, at(RecipeKey::Name))?;
+        let (fields, commands) = from.counts();
+        for (what, needed, room) in [
+            (Counted::Recipes, self.recipes.len().saturating_add(1), self.recipes.capacity()),
+            (Counted::Fields, self.fields.len().saturating_add(fields), self.fields.capacity()),
+            (Counted::Commands, self.commands.len().saturating_add(commands), self.commands.capacity()),
+        ] {
+            super::rules::check_room(at(RecipeKey::Whole), what, needed, room)?;
+        }
+        let parts = match (&from.input, &from.output) {
+            (PartFields::Can(input), PartFields::Can(output)) => Parts::Can {
+                input: self.can_part(recipe, Direction::Input, input)?,
+                output: self.can_part(recipe, Direction::Output, output)?,
+            },
+            (PartFields::Can(input), PartFields::Absent) => {
+                Parts::Can { input: self.can_part(recipe, Direction::Input, input)?, output: Vec::new() }
+            }
+            (PartFields::Absent, PartFields::Can(output)) => {
+                Parts::Can { input: Vec::new(), output: self.can_part(recipe, Direction::Output, output)? }
+            }
+            (PartFields::Can(_), PartFields::Stream { .. })
+            | (PartFields::Stream { .. }, PartFields::Can(_)) => {
+                return Err(ConfigError { place: at(RecipeKey::Whole), kind: Kind::MixedParts });
+            }
+            (input, output) => Parts::Stream {
+                input: self.stream_part(recipe, Direction::Input, input)?,
+                output: self.stream_part(recipe, Direction::Output, output)?,
+            },
+        };
+        let send = match from.trigger {
+            Trigger::On(send) => send,
+            Trigger::Rising(var, bit) => {
+                let place = at(RecipeKey::Send);
+                let var = var.read().map_err(|error| ConfigError { place, kind: Kind::Variable(error) })?;
+                SendOn::Rising { var, bit }
+            }
+        };
+        let added = Recipe { on_stale: from.on_stale, send, ..Recipe::new(name, from.mode, parts) };
+        // There is room: it was asked for above.
+        let _ = self.recipes.push(added);
+        Ok(recipe)
+    }
+
+    fn stream_part(
+        &mut self,
+        recipe: u8,
+        part: Direction,
+        from: &PartFields<'_>,
+    ) -> Result<Option<StreamPart>, ConfigError> {
+        let PartFields::Stream { head, tail, fields } = from else { return Ok(None) };
+        let place = Place::Part { recipe, part };
+        let bytes = |bytes: &[u8]| {
+            let too_long = Kind::TooLong { len: bytes.len(), longest: MAX_DELIMITER };
+            Delimiter::from_slice(bytes).map_err(|_| ConfigError { place, kind: too_long })
+        };
+        let (head, tail) = (bytes(head)?, bytes(tail)?);
+        Ok(Some(StreamPart { head, tail, fields: self.fields_of_part(recipe, part, 0, fields)? }))
+    }
+
+    fn can_part(
+        &mut self,
+        recipe: u8,
+        part: Direction,
+        from: &[CanFields<'_>],
+    ) -> Result<Vec<CanFramePart, MAX_CAN_IDS>, ConfigError> {
+        super::rules::check_room(Place::Part { recipe, part }, Counted::CanFrames, from.len(), MAX_CAN_IDS)?;
+        let mut frames = Vec::new();
+        for (number, frame) in (0..).zip(from) {
+            let fields = self.fields_of_part(recipe, part, number, &frame.fields)?;
+            // There is room: it was asked for above.
+            let _ = frames.push(CanFramePart { id: frame.id, fields });
+        }
+        Ok(frames)
+    }
+
+    fn fields_of_part(
+        &mut self,
+        recipe: u8,
+        part: Direction,
+        frame: u8,
+        from: &Fields<'_>,
+    ) -> Result<Span, ConfigError> {
+        let start = self.fields.len();
+        let at = |field: usize| Place::Field { recipe, part, frame, field: field as u8 };
+        match *from {
+            Fields::Names(names) => {
+                for (nth, name) in names.iter().enumerate() {
+                    let range = VarRange::parse(name)
+                        .map_err(|error| ConfigError { place: at(nth), kind: Kind::Variable(error) })?;
+                    range.iter().for_each(|var| self.push_field(FieldSpec::System(var)));
+                }
+            }
+            Fields::Vars(vars) => vars.iter().for_each(|&var| self.push_field(FieldSpec::System(var))),
+            Fields::Inputs(fields) => {
+                for (nth, field) in fields.iter().enumerate() {
+                    let spec = self.input_spec(field).map_err(|kind| ConfigError { place: at(nth), kind })?;
+                    self.push_field(spec);
+                }
+            }
+            Fields::Outputs(fields) => {
+                for (nth, field) in fields.iter().enumerate() {
+                    let spec = output_spec(field).map_err(|kind| ConfigError { place: at(nth), kind })?;
+                    self.push_field(spec);
+                }
+            }
+            Fields::Specs(fields) => fields.iter().for_each(|&field| self.push_field(field)),
+        }
+        Ok(span(start, self.fields.len()))
+    }
+
+    /// There is room: it was asked for when the recipe was begun.
+    fn push_field(&mut self, field: FieldSpec) {
+        let _ = self.fields.push(field);
+    }
+
+    fn input_spec(&mut self, field: &InputField<'_>) -> Result<FieldSpec, Kind> {
+        let to = match field.does {
+            Does::Nothing => InputBinding::Unused,
+            Does::Writes { var, scale, offset } => {
+                InputBinding::Variable { var: var.read().map_err(Kind::Variable)?, scale, offset }
+            }
+            Does::Commands { entries, when } => {
+                InputBinding::Commands { table: self.add_commands(entries)?, when }
+            }
+        };
+        Ok(FieldSpec::UserInput { ty: field.ty, to })
+    }
+
+    /// There is room: it was asked for when the recipe was begun.
+    fn add_commands(&mut self, entries: &[(i64, &str)]) -> Result<Span, Kind> {
+        let start = self.commands.len();
+        for &(value, command) in entries {
+            let _ = self.commands.push(CommandEntry { value, text: text(command)? });
+        }
+        Ok(span(start, self.commands.len()))
+    }
+
+    /// As [`GatewayConfig::add_port`].
+    ///
+    /// # Errors
+    /// As there.
+    pub fn add_port<B: PortBus>(&mut self, from: &PortBuilder<'_, B>) -> Result<u8, ConfigError> {
+        let index = self.ports.len() as u8;
+        let at = |key| Place::Port { port: index, key };
+        let name = name(from.name, at(PortKey::Name))?;
+        let bus = from.bus.bus().map_err(|kind| ConfigError { place: at(PortKey::Listen), kind })?;
+        let recipe = self.recipe_named(from.recipe, at(PortKey::Recipe))?;
+        let mut port = Port::new(name, bus, recipe);
+        port.cycle = from.cycle.unwrap_or(port.cycle);
+        port.timeout = from.timeout.unwrap_or(port.timeout);
+        port.stale_after = from.stale_after.unwrap_or(port.stale_after);
+        self.put_port(port, &from.safe)
+    }
+
+    fn put_port(&mut self, mut port: Port, safe: &SafeValues<'_>) -> Result<u8, ConfigError> {
+        let index = self.ports.len() as u8;
+        let (ports, values) = (self.ports.len(), self.safe_values.len());
+        for (key, what, needed, room) in [
+            (PortKey::Name, Counted::Ports, ports.saturating_add(1), self.ports.capacity()),
+            (
+                PortKey::OnTimeout,
+                Counted::SafeValues,
+                values.saturating_add(safe.len()),
+                self.safe_values.capacity(),
+            ),
+        ] {
+            super::rules::check_room(Place::Port { port: index, key }, what, needed, room)?;
+        }
+        let added = match *safe {
+            SafeValues::Names(named) => self.add_safe_values(named.iter().map(|&(name, value)| {
+                SysVar::parse(name).map_err(Kind::Variable).and_then(|var| safe_value(var, value))
+            })),
+            SafeValues::Vars(vars) => {
+                self.add_safe_values(vars.iter().map(|&(var, value)| safe_value(var, value)))
+            }
+            SafeValues::Values(values) => self.add_safe_values(values.iter().map(|&value| Ok(value))),
+        };
+        added.inspect_err(|_| self.safe_values.truncate(values))?;
+        port.on_timeout = span(values, self.safe_values.len());
+        // There is room: it was asked for above.
+        let _ = self.ports.push(port);
+        Ok(index)
+    }
+
+    /// There is room: it was asked for before.
+    fn add_safe_values(
+        &mut self,
+        values: impl Iterator<Item = Result<SafeValue, Kind>>,
+    ) -> Result<(), ConfigError> {
+        for value in values {
+            let place = Place::SafeValue { entry: self.safe_values.len() as u16 };
+            let _ = self.safe_values.push(value.map_err(|kind| ConfigError { place, kind })?);
+        }
+        Ok(())
+    }
+
+    fn recipe_named(&self, name: &str, place: Place) -> Result<u8, ConfigError> {
+        let named = (0..).zip(self.recipes.iter()).find(|(_, recipe)| recipe.name == name);
+        named.map(|(index, _)| index).ok_or(ConfigError { place, kind: Kind::NoSuchName })
+    }
+}
+
+fn output_spec(field: &OutputField<'_>) -> Result<FieldSpec, Kind> {
+    let from = match field.sends {
+        Sends::Variable { var, scale, offset } => {
+            OutputBinding::Variable { var: var.read().map_err(Kind::Variable)?, scale, offset }
+        }
+        Sends::Constant(value) => OutputBinding::Constant(value),
+        Sends::Counter => OutputBinding::Counter,
+        Sends::Reply => OutputBinding::Reply,
+    };
+    Ok(FieldSpec::UserOutput { ty: field.ty, from })
+}
+
+fn safe_value(var: SysVar, value: f64) -> Result<SafeValue, Kind> {
+    let value = Scalar::from_f64(var.ty(), value).map_err(Kind::Constant)?;
+    Ok(SafeValue { var, value })
+}
+
+fn name(given: &str, place: Place) -> Result<Name, ConfigError> {
+    check_name(given).and_then(|()| text(given)).map_err(|kind| ConfigError { place, kind })
+}
+
+/// A text of the configuration.
+pub(super) fn text<const N: usize>(given: &str) -> Result<String<N>, Kind> {
+    String::try_from(given).map_err(|_| Kind::TooLong { len: given.len(), longest: N })
+}
+
+/// From one length of a list to another; lists are shorter than `u16::MAX`, or the configuration is
+/// refused by the check of its counts.
+fn span(start: usize, end: usize) -> Span {
+    Span { start: start as u16, len: end.saturating_sub(start) as u16 }
+}

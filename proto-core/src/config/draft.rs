@@ -1,0 +1,363 @@
+//! A controller, a recipe and a port as a program writes them.
+//!
+//! In: names, numbers and slices of the caller's. Out: the same, borrowed and small; every default is
+//! the file's (docs/configuration.md). [`GatewayConfig`](super::GatewayConfig) takes them by `add_recipe`
+//! and `add_port`, in a builder or in place, and says what is wrong.
+
+use super::error::ConfigErrorKind as Kind;
+use super::fields::{CanFields, Fields, Var};
+use super::{Bus, OnStale, Parity, Port, Recipe, Rs485, SafeValue, SendOn};
+use crate::recipe::model::Mode;
+use crate::sysvar::SysVar;
+use crate::time::Duration;
+
+/// Where the controller is and what it speaks; made from its address by `into()`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ControllerBuilder<'a> {
+    pub(super) address: &'a str,
+    pub(super) dialect: Option<&'a str>,
+    pub(super) command_port: Option<u16>,
+    pub(super) state_port: Option<u16>,
+    pub(super) modbus_port: Option<u16>,
+}
+
+impl<'a> ControllerBuilder<'a> {
+    /// A controller with this IP address or host name, of dialect `v2.3`, on ports 2000, 2001 and 502.
+    /// An empty address stands for one that is learnt otherwise.
+    pub const fn new(address: &'a str) -> Self {
+        Self { address, dialect: None, command_port: None, state_port: None, modbus_port: None }
+    }
+
+    /// `"v2.3"` or `"v2.6"`; sets the Modbus port as well, unless that is said.
+    pub const fn dialect(self, name: &'a str) -> Self {
+        Self { dialect: Some(name), ..self }
+    }
+
+    /// Where port 2000 was moved to.
+    pub const fn command_port(self, port: u16) -> Self {
+        Self { command_port: Some(port), ..self }
+    }
+
+    /// Where port 2001 was moved to.
+    pub const fn state_port(self, port: u16) -> Self {
+        Self { state_port: Some(port), ..self }
+    }
+
+    /// Where the Modbus port was moved to.
+    pub const fn modbus_port(self, port: u16) -> Self {
+        Self { modbus_port: Some(port), ..self }
+    }
+}
+
+impl<'a> From<&'a str> for ControllerBuilder<'a> {
+    fn from(address: &'a str) -> Self {
+        Self::new(address)
+    }
+}
+
+/// A recipe under construction: [`Recipe::realtime`], [`Recipe::user`].
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RecipeBuilder<'a> {
+    pub(super) name: &'a str,
+    pub(super) mode: Mode,
+    pub(super) input: PartFields<'a>,
+    pub(super) output: PartFields<'a>,
+    pub(super) on_stale: OnStale,
+    pub(super) trigger: Trigger<'a>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum PartFields<'a> {
+    Absent,
+    Stream { head: &'a [u8], tail: &'a [u8], fields: Fields<'a> },
+    Can(&'a [CanFields<'a>]),
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum Trigger<'a> {
+    On(SendOn),
+    Rising(Var<'a>, u8),
+}
+
+impl Recipe {
+    /// A recipe of system variables.
+    pub const fn realtime(name: &str) -> RecipeBuilder<'_> {
+        RecipeBuilder::new(name, Mode::Realtime)
+    }
+
+    /// A recipe of user-defined fields.
+    pub const fn user(name: &str) -> RecipeBuilder<'_> {
+        RecipeBuilder::new(name, Mode::User)
+    }
+}
+
+impl<'a> RecipeBuilder<'a> {
+    const fn new(name: &'a str, mode: Mode) -> Self {
+        let (input, output) = (PartFields::Absent, PartFields::Absent);
+        Self { name, mode, input, output, on_stale: OnStale::Hold, trigger: Trigger::On(SendOn::Period) }
+    }
+
+    /// User to robot, in a stream: bytes before the fields, bytes after them, at most 8 each, and the
+    /// fields.
+    pub fn stream_input(mut self, head: &'a [u8], tail: &'a [u8], fields: impl Into<Fields<'a>>) -> Self {
+        self.input = PartFields::Stream { head, tail, fields: fields.into() };
+        self
+    }
+
+    /// Robot to user, in a stream.
+    pub fn stream_output(mut self, head: &'a [u8], tail: &'a [u8], fields: impl Into<Fields<'a>>) -> Self {
+        self.output = PartFields::Stream { head, tail, fields: fields.into() };
+        self
+    }
+
+    /// User to robot, in CAN frames.
+    pub const fn can_input(mut self, frames: &'a [CanFields<'a>]) -> Self {
+        self.input = PartFields::Can(frames);
+        self
+    }
+
+    /// Robot to user, in CAN frames.
+    pub const fn can_output(mut self, frames: &'a [CanFields<'a>]) -> Self {
+        self.output = PartFields::Can(frames);
+        self
+    }
+
+    /// What a port does while the sources of its output are stale.
+    pub const fn on_stale(mut self, on_stale: OnStale) -> Self {
+        self.on_stale = on_stale;
+        self
+    }
+
+    /// What makes a port send the output part.
+    pub const fn send(mut self, send: SendOn) -> Self {
+        self.trigger = Trigger::On(send);
+        self
+    }
+
+    /// The output part is sent when this bit, 0..=7, of a bit variable goes from 0 to 1.
+    pub fn send_on_rising(mut self, var: impl Into<Var<'a>>, bit: u8) -> Self {
+        self.trigger = Trigger::Rising(var.into(), bit);
+        self
+    }
+
+    /// How many fields and commands it takes.
+    pub(super) fn counts(&self) -> (usize, usize) {
+        let mut counts = (0_usize, 0_usize);
+        let mut add = |fields: &Fields<'_>| {
+            let (fields, commands) = fields.counts();
+            counts = (counts.0.saturating_add(fields), counts.1.saturating_add(commands));
+        };
+        for part in [&self.input, &self.output] {
+            match part {
+                PartFields::Absent => {}
+                PartFields::Stream { fields, .. } => add(fields),
+                PartFields::Can(frames) => frames.iter().for_each(|frame| add(&frame.fields)),
+            }
+        }
+        counts
+    }
+}
+
+/// A port under construction: [`Port::rs485`], [`Port::can`], [`Port::tcp_listen`],
+/// [`Port::udp_listen`]. Times are those of a file: a cycle of 4 ms, a timeout of 100 ms, stale after
+/// 500 ms.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PortBuilder<'a, B = Rs485> {
+    pub(super) name: &'a str,
+    pub(super) recipe: &'a str,
+    pub(super) bus: B,
+    pub(super) cycle: Option<Duration>,
+    pub(super) timeout: Option<Duration>,
+    pub(super) stale_after: Option<Duration>,
+    pub(super) safe: SafeValues<'a>,
+}
+
+/// The bus of a [`PortBuilder`] that listens.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Listen<'a> {
+    is_tcp: bool,
+    address: &'a str,
+}
+
+/// The bus of a [`PortBuilder`] on CAN: its speed in bit/s.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Can(u32);
+
+/// What the safe values of a port are made from: `&[("DigitalOutputCommand[1]", 0.0)]`, the same with
+/// variables, or `&[SafeValue]`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
+pub enum SafeValues<'a> {
+    /// By name.
+    Names(&'a [(&'a str, f64)]),
+    /// By variable.
+    Vars(&'a [(SysVar, f64)]),
+    /// As the configuration has them.
+    Values(&'a [SafeValue]),
+}
+
+impl SafeValues<'_> {
+    pub(super) fn len(&self) -> usize {
+        match self {
+            Self::Names(values) => values.len(),
+            Self::Vars(values) => values.len(),
+            Self::Values(values) => values.len(),
+        }
+    }
+}
+
+macro_rules! safe_values_from {
+    ($($item:ty => $variant:ident),* $(,)?) => {$(
+        impl<'a> From<&'a [$item]> for SafeValues<'a> {
+            fn from(values: &'a [$item]) -> Self {
+                Self::$variant(values)
+            }
+        }
+
+        impl<'a, const N: usize> From<&'a [$item; N]> for SafeValues<'a> {
+            fn from(values: &'a [$item; N]) -> Self {
+                Self::$variant(values)
+            }
+        }
+    )*};
+}
+
+safe_values_from! { (&'a str, f64) => Names, (SysVar, f64) => Vars, SafeValue => Values }
+
+impl Port {
+    /// A half-duplex serial line: 115 200 baud, no parity, 1 stop bit, unless something else is said.
+    pub fn rs485<'a>(name: &'a str, recipe: &'a str) -> PortBuilder<'a, Rs485> {
+        PortBuilder::new(name, recipe, Rs485::default())
+    }
+
+    /// A CAN bus: 500 kbit/s, unless something else is said.
+    pub const fn can<'a>(name: &'a str, recipe: &'a str) -> PortBuilder<'a, Can> {
+        PortBuilder::new(name, recipe, Can(Bus::BITRATE))
+    }
+
+    /// Where the controller's TCP client connects to, such as `0.0.0.0:50000`.
+    pub const fn tcp_listen<'a>(
+        name: &'a str,
+        recipe: &'a str,
+        address: &'a str,
+    ) -> PortBuilder<'a, Listen<'a>> {
+        PortBuilder::new(name, recipe, Listen { is_tcp: true, address })
+    }
+
+    /// Where the controller's UDP client sends to, such as `0.0.0.0:50000`.
+    pub const fn udp_listen<'a>(
+        name: &'a str,
+        recipe: &'a str,
+        address: &'a str,
+    ) -> PortBuilder<'a, Listen<'a>> {
+        PortBuilder::new(name, recipe, Listen { is_tcp: false, address })
+    }
+}
+
+impl<'a, B> PortBuilder<'a, B> {
+    const fn new(name: &'a str, recipe: &'a str, bus: B) -> Self {
+        let safe = SafeValues::Values(&[]);
+        Self { name, recipe, bus, cycle: None, timeout: None, stale_after: None, safe }
+    }
+
+    /// How often the output part is sent: 4 ms to an hour.
+    pub fn cycle(mut self, cycle: Duration) -> Self {
+        self.cycle = Some(cycle);
+        self
+    }
+
+    /// After this long without a good frame the port's inputs take their safe values.
+    pub fn timeout(mut self, timeout: Duration) -> Self {
+        self.timeout = Some(timeout);
+        self
+    }
+
+    /// Outputs whose source is older than this are stale.
+    pub fn stale_after(mut self, stale_after: Duration) -> Self {
+        self.stale_after = Some(stale_after);
+        self
+    }
+
+    /// The safe values; variables that are not named hold. Refused on listening ports, which own no
+    /// variable.
+    pub fn safe(mut self, values: impl Into<SafeValues<'a>>) -> Self {
+        self.safe = values.into();
+        self
+    }
+}
+
+impl PortBuilder<'_, Rs485> {
+    /// Bit/s, 1200..=4_000_000.
+    pub fn baud(mut self, baud: u32) -> Self {
+        self.bus.baud = baud;
+        self
+    }
+
+    /// The parity bit.
+    pub fn parity(mut self, parity: Parity) -> Self {
+        self.bus.parity = parity;
+        self
+    }
+
+    /// 1 or 2.
+    pub fn stop_bits(mut self, stop_bits: u8) -> Self {
+        self.bus.stop_bits = stop_bits;
+        self
+    }
+
+    /// A partial frame is discarded after this silence: above 0, at most 1 s.
+    pub fn idle_gap(mut self, idle_gap: Duration) -> Self {
+        self.bus.idle_gap = idle_gap;
+        self
+    }
+
+    /// The silence before the port sends, at most 1 s.
+    pub fn turnaround(mut self, turnaround: Duration) -> Self {
+        self.bus.turnaround = turnaround;
+        self
+    }
+}
+
+impl PortBuilder<'_, Can> {
+    /// Bit/s, 10_000..=1_000_000.
+    pub fn bitrate(mut self, bitrate: u32) -> Self {
+        self.bus.0 = bitrate;
+        self
+    }
+}
+
+/// The bus of a [`PortBuilder`]: [`Rs485`], [`Can`], [`Listen`].
+pub trait PortBus: sealed::Sealed {
+    /// The bus in the configuration.
+    ///
+    /// # Errors
+    /// What is wrong with it: an address that is too long.
+    fn bus(&self) -> Result<Bus, Kind>;
+}
+
+impl PortBus for Rs485 {
+    fn bus(&self) -> Result<Bus, Kind> {
+        Ok(Bus::Rs485(*self))
+    }
+}
+
+impl PortBus for Can {
+    fn bus(&self) -> Result<Bus, Kind> {
+        Ok(Bus::Can { bitrate: self.0 })
+    }
+}
+
+impl PortBus for Listen<'_> {
+    fn bus(&self) -> Result<Bus, Kind> {
+        let listen = super::add::text(self.address)?;
+        Ok(if self.is_tcp { Bus::TcpListen { listen } } else { Bus::UdpListen { listen } })
+    }
+}
+
+mod sealed {
+    /// Buses are those of the configuration.
+    pub trait Sealed {}
+    impl Sealed for super::Rs485 {}
+    impl Sealed for super::Can {}
+    impl Sealed for super::Listen<'_> {}
+}

@@ -1,0 +1,46 @@
+//! Version 2: the configuration's own types, as postcard writes them one behind the other.
+//!
+//! It is the newest, so these are the types of the configuration themselves. Whoever changes one of them
+//! raises the version, and leaves a copy of the old one here.
+
+use serde::Serialize;
+
+use super::{ConfigMut, ConfigView, ImageError, item, items};
+use crate::config::error::Counted;
+pub(super) use crate::config::{
+    BoardAddress, CommandEntry, ControllerLink, FieldSpec, Port, Recipe, SafeValue,
+};
+
+/// A whole configuration, borrowed: postcard writes a struct as its fields, and a list as its length and
+/// its items.
+#[derive(Serialize)]
+struct Payload<'c> {
+    controller: &'c ControllerLink,
+    network: BoardAddress,
+    recipes: &'c [Recipe],
+    ports: &'c [Port],
+    fields: &'c [FieldSpec],
+    commands: &'c [CommandEntry],
+    safe_values: &'c [SafeValue],
+}
+
+pub(super) fn write<'o>(config: ConfigView<'_>, out: &'o mut [u8]) -> postcard::Result<&'o mut [u8]> {
+    let ConfigView { controller, network, recipes, ports, fields, commands, safe_values } = config;
+    let network = network.copied().into();
+    postcard::to_slice(&Payload { controller, network, recipes, ports, fields, commands, safe_values }, out)
+}
+
+pub(super) fn read(rest: &mut &[u8], config: &mut ConfigMut<'_>) -> Result<(), ImageError> {
+    *config.controller = item::<ControllerLink>(rest)?;
+    *config.network = item::<BoardAddress>(rest)?;
+    read_lists(rest, config)
+}
+
+/// What version 1 has as well.
+pub(super) fn read_lists(rest: &mut &[u8], config: &mut ConfigMut<'_>) -> Result<(), ImageError> {
+    items::<Recipe>(rest, Counted::Recipes, config.recipes)?;
+    items::<Port>(rest, Counted::Ports, config.ports)?;
+    items::<FieldSpec>(rest, Counted::Fields, config.fields)?;
+    items::<CommandEntry>(rest, Counted::Commands, config.commands)?;
+    items::<SafeValue>(rest, Counted::SafeValues, config.safe_values)
+}

@@ -1,0 +1,146 @@
+//! The rules that one value alone has to keep, and how a broken one is reported.
+//!
+//! In: a name, a number, a range. Out: nothing, or what is wrong with it. Files and
+//! [`ConfigView::validate`](super::ConfigView::validate) ask the same functions.
+
+use super::error::{ConfigError, ConfigErrorKind as Kind, Counted, Place, PortKey};
+use super::listen::ipv6;
+use super::{MAX_ADDRESS, MAX_NAME, Name, Rs485, Span};
+use crate::sysvar::{COUNT, SysVar};
+use crate::time::Duration;
+
+/// The controller's fastest cycle, and a port's.
+pub const MIN_CYCLE: Duration = Duration::from_millis(4);
+/// Longest cycle, timeout or staleness that a configuration may ask for.
+pub const MAX_TIME: Duration = Duration::from_secs(3_600);
+/// Longest idle gap and turnaround of a serial line.
+pub const MAX_LINE_TIME: Duration = Duration::from_secs(1);
+
+pub(super) type Check = Result<(), ConfigError>;
+
+impl Rs485 {
+    /// Whether the settings are within their ranges (D21).
+    ///
+    /// # Errors
+    /// The key and what is wrong with it.
+    pub fn check(&self) -> Result<(), (PortKey, Kind)> {
+        if !(1_200..=4_000_000).contains(&self.baud) {
+            return Err((PortKey::Baud, Kind::BaudOutOfRange { baud: self.baud }));
+        }
+        if !(1..=2).contains(&self.stop_bits) {
+            return Err((PortKey::StopBits, Kind::StopBits { stop_bits: self.stop_bits }));
+        }
+        if self.idle_gap == Duration::ZERO {
+            return Err((PortKey::IdleGap, Kind::ZeroTime));
+        }
+        for (key, time) in [(PortKey::IdleGap, self.idle_gap), (PortKey::Turnaround, self.turnaround)] {
+            if time > MAX_LINE_TIME {
+                return Err((key, Kind::TimeTooLong { time, longest: MAX_LINE_TIME }));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Whether a CAN bus can run at `bitrate` bit/s (D21).
+///
+/// # Errors
+/// [`ConfigErrorKind::BitrateOutOfRange`](Kind::BitrateOutOfRange).
+pub fn check_bitrate(bitrate: u32) -> Result<(), Kind> {
+    if (10_000..=1_000_000).contains(&bitrate) { Ok(()) } else { Err(Kind::BitrateOutOfRange { bitrate }) }
+}
+
+/// Whether a port can have this cycle: from the controller's fastest to [`MAX_TIME`].
+///
+/// # Errors
+/// [`ConfigErrorKind::CycleTooShort`](Kind::CycleTooShort) or
+/// [`ConfigErrorKind::TimeTooLong`](Kind::TimeTooLong).
+pub fn check_cycle(cycle: Duration) -> Result<(), Kind> {
+    match cycle {
+        _ if cycle < MIN_CYCLE => Err(Kind::CycleTooShort { cycle }),
+        _ if cycle > MAX_TIME => Err(Kind::TimeTooLong { time: cycle, longest: MAX_TIME }),
+        _ => Ok(()),
+    }
+}
+
+pub(super) fn fail(place: Place, kind: Kind) -> Check {
+    Err(ConfigError { place, kind })
+}
+
+/// Whether a recipe or port can have this name: 1..=32 bytes without blanks, quotes, `=` and control
+/// characters, so that a command line can carry it.
+///
+/// # Errors
+/// [`ConfigErrorKind::NameLength`](Kind::NameLength) or
+/// [`ConfigErrorKind::NameCharacter`](Kind::NameCharacter).
+pub fn check_name(name: &str) -> Result<(), Kind> {
+    if name.is_empty() || name.len() > MAX_NAME {
+        return Err(Kind::NameLength { len: name.len() });
+    }
+    let is_refused = |c: &char| *c == '=' || *c == '"' || c.is_whitespace() || c.is_control();
+    match name.chars().find(is_refused) {
+        Some(character) => Err(Kind::NameCharacter { character }),
+        None => Ok(()),
+    }
+}
+
+/// Whether the controller can be called so: an IP address without a port, or a host name of letters,
+/// digits, `.`, `-` and `_`; at most 64 bytes.
+///
+/// # Errors
+/// [`ConfigErrorKind::Address`](Kind::Address), or [`ConfigErrorKind::TooLong`](Kind::TooLong).
+pub fn check_address(address: &str) -> Result<(), Kind> {
+    let is_name_byte = |byte: u8| byte.is_ascii_alphanumeric() || matches!(byte, b'.' | b'-' | b'_');
+    if address.is_empty() || !(address.bytes().all(is_name_byte) || ipv6(address).is_some()) {
+        return Err(Kind::Address);
+    }
+    if address.len() > MAX_ADDRESS {
+        return Err(Kind::TooLong { len: address.len(), longest: MAX_ADDRESS });
+    }
+    Ok(())
+}
+
+/// A valid name that no recipe or port before has.
+pub(super) fn check_new_name<'a>(
+    place: Place,
+    name: &str,
+    index: u8,
+    all: impl Iterator<Item = &'a Name>,
+) -> Check {
+    check_name(name).map_err(|kind| ConfigError { place, kind })?;
+    match (0..index).zip(all).find(|(_, before)| *before == name) {
+        Some((other, _)) => fail(place, Kind::DuplicateName { other }),
+        None => Ok(()),
+    }
+}
+
+pub(super) fn check_pool(place: Place, span: Span, len: usize) -> Check {
+    let end = u32::from(span.start).saturating_add(u32::from(span.len));
+    let len = len as u32;
+    if end <= len { Ok(()) } else { fail(place, Kind::OutsidePool { end, len }) }
+}
+
+pub(super) fn check_time(place: Place, time: Duration, longest: Duration) -> Check {
+    if time == Duration::ZERO {
+        return fail(place, Kind::ZeroTime);
+    }
+    if time > longest {
+        return fail(place, Kind::TimeTooLong { time, longest });
+    }
+    Ok(())
+}
+
+pub(super) fn mark(set: &mut [bool; COUNT], var: SysVar) {
+    if let Some(place) = set.get_mut(var.ordinal()) {
+        *place = true;
+    }
+}
+
+pub(super) fn is_marked(set: &[bool; COUNT], var: SysVar) -> bool {
+    set.get(var.ordinal()).copied().unwrap_or(false)
+}
+
+/// Whether there is room for so many.
+pub(super) fn check_room(place: Place, what: Counted, needed: usize, room: usize) -> Check {
+    if needed <= room { Ok(()) } else { fail(place, Kind::TooMany { what, needed, room }) }
+}

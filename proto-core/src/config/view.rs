@@ -1,0 +1,123 @@
+//! A configuration of any size, as those who read it see it.
+//!
+//! In: a [`GatewayConfig`](super::GatewayConfig) of any parameters, or slices of a program's own. Out:
+//! borrowed slices, and the questions that concern several of them.
+
+use super::network::Network;
+use super::{
+    CommandEntry, ControllerLink, FieldSpec, InputBinding, OutputBinding, Parts, Port, Recipe, SafeValue,
+    Span,
+};
+use crate::recipe::model::Field;
+use crate::sysvar::{Direction, SysVar};
+
+/// A configuration of any size, borrowed; [`GatewayConfig`](super::GatewayConfig) says what is in it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
+pub struct ConfigView<'c> {
+    /// Where the controller is and what it speaks.
+    pub controller: &'c ControllerLink,
+    /// A board's own address; `None` asks DHCP.
+    pub network: Option<&'c Network>,
+    /// Every recipe.
+    pub recipes: &'c [Recipe],
+    /// Every port.
+    pub ports: &'c [Port],
+    /// The fields of all recipes; parts name ranges of it.
+    pub fields: &'c [FieldSpec],
+    /// The entries of all command tables; bindings name ranges of it.
+    pub commands: &'c [CommandEntry],
+    /// What inputs become when their port times out; ports name ranges of it.
+    pub safe_values: &'c [SafeValue],
+}
+
+impl<'c> ConfigView<'c> {
+    /// A controller and nothing else; a program that keeps its own slices puts them into the fields.
+    pub const fn new(controller: &'c ControllerLink) -> Self {
+        Self {
+            controller,
+            network: None,
+            recipes: &[],
+            ports: &[],
+            fields: &[],
+            commands: &[],
+            safe_values: &[],
+        }
+    }
+
+    /// The recipes on the ways up: the recipe link's, then those of the listening ports.
+    pub fn upstream_recipes(self) -> impl Iterator<Item = (u8, &'c Recipe)> {
+        let link = self.controller.recipe_link.map(|link| link.recipe);
+        let ports = self.ports.iter().filter(|port| !port.bus.is_field()).map(|port| port.recipe);
+        link.into_iter().chain(ports).filter_map(|index| Some((index, self.recipes.get(usize::from(index))?)))
+    }
+
+    /// The ports with devices behind them, with their indices and recipes.
+    pub fn field_ports(self) -> impl Iterator<Item = (u8, &'c Port, &'c Recipe)> {
+        (0..)
+            .zip(self.ports)
+            .filter(|(_, port)| port.bus.is_field())
+            .filter_map(|(index, port)| Some((index, port, self.recipes.get(usize::from(port.recipe))?)))
+    }
+
+    /// The fields of one part of `recipe`, with the index of the CAN frame (0 in a stream) and the
+    /// index of the field in it.
+    pub fn fields_of(
+        self,
+        recipe: &'c Recipe,
+        part: Direction,
+    ) -> impl Iterator<Item = (u8, u8, &'c FieldSpec)> {
+        recipe.frames(part).flat_map(move |(frame, span)| {
+            (0..).zip(span.of(self.fields)).map(move |(index, field)| (frame, index, field))
+        })
+    }
+
+    /// The input variables that a field port writes.
+    pub fn written_by(self, recipe: &'c Recipe) -> impl Iterator<Item = SysVar> + 'c {
+        self.fields_of(recipe, Direction::Input).filter_map(|(_, _, field)| field.variable())
+    }
+
+    /// Whether a field port writes the variable.
+    pub(super) fn is_owned(self, var: SysVar) -> bool {
+        self.field_ports().any(|(_, _, recipe)| self.written_by(recipe).any(|owned| owned == var))
+    }
+}
+
+impl Recipe {
+    /// The field ranges of one part: one for a stream part, one for each CAN frame.
+    pub fn frames(&self, part: Direction) -> impl Iterator<Item = (u8, Span)> + '_ {
+        let (stream, can) = match (&self.parts, part) {
+            (Parts::Stream { input, .. }, Direction::Input) => (input.as_ref(), None),
+            (Parts::Stream { output, .. }, Direction::Output) => (output.as_ref(), None),
+            (Parts::Can { input, .. }, Direction::Input) => (None, Some(input)),
+            (Parts::Can { output, .. }, Direction::Output) => (None, Some(output)),
+        };
+        let can = can.into_iter().flatten().map(|frame| frame.fields);
+        (0..).zip(stream.map(|part| part.fields).into_iter().chain(can))
+    }
+
+    /// Whether the recipe has this part.
+    pub fn has(&self, part: Direction) -> bool {
+        self.frames(part).next().is_some()
+    }
+}
+
+impl FieldSpec {
+    /// What the field is on the wire.
+    pub fn field(&self) -> Field {
+        match *self {
+            Self::System(var) => Field::System(var),
+            Self::UserInput { ty, .. } | Self::UserOutput { ty, .. } => Field::User(ty),
+        }
+    }
+
+    /// The system variable that the field is, is written to, or is read from.
+    pub fn variable(&self) -> Option<SysVar> {
+        match *self {
+            Self::System(var)
+            | Self::UserInput { to: InputBinding::Variable { var, .. }, .. }
+            | Self::UserOutput { from: OutputBinding::Variable { var, .. }, .. } => Some(var),
+            Self::UserInput { .. } | Self::UserOutput { .. } => None,
+        }
+    }
+}

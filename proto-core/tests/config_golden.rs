@@ -1,0 +1,178 @@
+//! Configuration images as they were written, one of each kind for each version.
+//!
+//! Never change an image in `tests/golden`: boards in the field hold such bytes. A change of a
+//! serialized type takes a new version, with images of its own beside these. The text beside an image is
+//! what it means; it grows when a configuration can say more.
+#![cfg(feature = "image")]
+
+use std::path::{Path, PathBuf};
+
+use proto_core::config::image::{
+    ImageError, MAX_IMAGE, OLDEST_VERSION, VERSION, decode, decode_into, encode, image_len,
+};
+use proto_core::config::{
+    BoardAddress, Bus, CommandWhen, FieldSpec, GatewayConfig, InputBinding, OnStale, OutputBinding, Parity,
+    Parts, SendOn,
+};
+use proto_core::recipe::model::{CanId, Mode};
+use proto_core::sysvar::SysVar;
+use proto_core::wire::scalar::{Scalar, ScalarType};
+
+fn golden() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden")
+}
+
+/// Every image of a version, with its name.
+fn images(version: u32) -> Vec<(String, Vec<u8>)> {
+    let folder = golden().join(format!("v{version}"));
+    let mut images: Vec<_> = std::fs::read_dir(&folder)
+        .unwrap_or_else(|error| panic!("every version has images: {}: {error}", folder.display()))
+        .map(|entry| entry.unwrap().path())
+        .filter(|path| path.extension().is_some_and(|extension| extension == "img"))
+        .map(|path| (path.file_stem().unwrap().to_str().unwrap().to_owned(), std::fs::read(&path).unwrap()))
+        .collect();
+    images.sort();
+    images
+}
+
+/// Compares with a kept text; `GOLDEN=write` writes one that is not there.
+#[track_caller]
+fn matches_text(path: &Path, said: &str) {
+    if !path.exists() && std::env::var_os("GOLDEN").is_some_and(|value| value == "write") {
+        std::fs::write(path, said).unwrap();
+    }
+    let kept = std::fs::read_to_string(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+    if kept != said {
+        let line = kept.lines().zip(said.lines()).position(|(kept, said)| kept != said);
+        panic!("{} differs from line {:?}; it is now:\n{said}", path.display(), line.map(|line| line + 1));
+    }
+}
+
+#[test]
+fn every_kept_image_means_what_it_meant() {
+    for version in OLDEST_VERSION..=VERSION {
+        let images = images(version);
+        assert!(images.len() >= 4, "version {version}: {} kinds of configuration", images.len());
+        for (name, bytes) in images {
+            assert_eq!(bytes[4..8], version.to_le_bytes(), "v{version}/{name}");
+            assert_eq!(image_len(&bytes), Ok(bytes.len()), "v{version}/{name}");
+            let config = decode(&bytes).unwrap_or_else(|error| panic!("v{version}/{name}: {error}"));
+            // What was kept in an older version is the same today.
+            matches_text(&golden().join(format!("{name}.txt")), &format!("{config:#?}\n"));
+        }
+    }
+}
+
+/// Whoever breaks this has changed a serialized type: that takes a new version.
+#[test]
+fn the_newest_version_is_written_as_it_always_was() {
+    for (name, bytes) in images(VERSION) {
+        let config = decode(&bytes).unwrap();
+        let mut out = [0; MAX_IMAGE];
+        let len = encode(&config, &mut out).unwrap();
+        assert_eq!(out[..len], bytes, "{name}");
+    }
+}
+
+/// An older image that is written again is one of today.
+#[test]
+fn migrated_images_are_of_the_newest_version() {
+    for version in OLDEST_VERSION..VERSION {
+        for (name, bytes) in images(version) {
+            let config = decode(&bytes).unwrap();
+            let mut out = [0; MAX_IMAGE];
+            let len = encode(&config, &mut out).unwrap();
+            let (_, newest) = images(VERSION).into_iter().find(|(other, _)| *other == name).unwrap();
+            assert_eq!(out[..len], newest, "{name} of version {version}");
+        }
+    }
+}
+
+#[test]
+fn every_damaged_older_image_is_refused() {
+    for (name, bytes) in images(OLDEST_VERSION) {
+        for place in 0..bytes.len() {
+            let mut damaged = bytes.clone();
+            damaged[place] ^= 0x10;
+            assert!(decode(&damaged).is_err(), "{name}: byte {place}");
+            assert!(decode(&bytes[..place]).is_err(), "{name}: cut at {place}");
+        }
+    }
+}
+
+#[test]
+fn a_newer_version_is_refused_with_its_number() {
+    for version in [0, VERSION + 1, 7, u32::MAX] {
+        let (_, mut bytes) = images(VERSION).remove(0);
+        bytes[4..8].copy_from_slice(&version.to_le_bytes());
+        assert_eq!(decode(&bytes).err(), Some(ImageError::Version { found: version }));
+        assert_eq!(image_len(&bytes), Err(ImageError::Version { found: version }));
+    }
+    let said = ImageError::Version { found: 7 }.to_string();
+    assert_eq!(said, format!("the image has version 7; this firmware takes 1 to {VERSION}"));
+}
+
+/// The board's own address came with version 2: what was there before is DHCP again.
+#[test]
+fn an_older_image_forgets_the_address_before() {
+    let (_, newest) = images(VERSION).into_iter().find(|(name, _)| name == "network").unwrap();
+    let mut config = decode(&newest).unwrap();
+    assert!(config.network.fixed().is_some());
+    let (_, oldest) = images(1).remove(0);
+    decode_into(&oldest, &mut config).unwrap();
+    assert_eq!(config.network.fixed(), None);
+}
+
+#[test]
+fn a_small_configuration_takes_what_it_has_room_for() {
+    let (_, bytes) = images(VERSION).into_iter().find(|(name, _)| name == "can").unwrap();
+    let mut small: GatewayConfig<1, 1, 6, 0, 0> = GatewayConfig::empty();
+    decode_into(&bytes, &mut small).unwrap();
+    assert_eq!(small.view(), decode(&bytes).unwrap().view());
+    let mut too_small: GatewayConfig<1, 1, 5, 0, 0> = GatewayConfig::empty();
+    let refused = decode_into(&bytes, &mut too_small).unwrap_err();
+    assert!(matches!(refused, ImageError::TooMany { needed: 6, room: 5, .. }), "{refused}");
+    let said = "the image has 6 fields in all recipes together, and there is room for 5";
+    assert_eq!(refused.to_string(), said);
+}
+
+/// Every type, field and variant that an image of the newest version can have, in their order. A change
+/// here takes a new version, even if all kept images can still be read: older firmware would take the new
+/// image for a damaged one.
+#[test]
+fn serialized_types_are_those_of_the_version() {
+    use serde_reflection::{Tracer, TracerConfig};
+
+    let mut tracer = Tracer::new(TracerConfig::default());
+    let samples = serde_reflection::Samples::new();
+    macro_rules! trace {
+        ($($kind:ty),* $(,)?) => { $(tracer.trace_type::<$kind>(&samples).unwrap();)* };
+    }
+    // Every enum for itself, or the tracer sees only some of its variants; it names those that are missing.
+    trace!(
+        BoardAddress,
+        Bus,
+        CanId,
+        CommandWhen,
+        FieldSpec,
+        InputBinding,
+        Mode,
+        OnStale,
+        OutputBinding,
+        Parity,
+        Parts,
+        Scalar,
+        ScalarType,
+        SendOn,
+        GatewayConfig,
+    );
+    let mut said = String::new();
+    for (name, format) in tracer.registry().unwrap() {
+        said += &format!("{name}: {format:#?}\n");
+    }
+    // A variable is its place in the table.
+    for var in SysVar::all() {
+        said += &format!("variable {}: {var}\n", var.ordinal());
+    }
+    matches_text(&golden().join(format!("v{VERSION}/types.txt")), &said);
+}
