@@ -18,9 +18,9 @@ use proto_core::engine::{
     PortId, PortState,
 };
 use proto_core::link::LinkState;
-use proto_core::recipe::can::CanFrame;
-use proto_core::recipe::model::{CanId, MAX_CAN_IDS};
+use proto_core::recipe::model::MAX_CAN_IDS;
 use proto_core::time::Instant;
+use proto_core::wire::can::{CanFrame, CanId};
 
 use crate::led::Condition;
 use crate::notify::Notify;

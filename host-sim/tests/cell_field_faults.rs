@@ -367,10 +367,10 @@ fn a_can_bus_that_loses_goes_off_and_carries_strangers() {
     cell.send_can(bus, can(9, &[0]));
     cell.send_can(bus, can(1, &[]));
     cell.send_can(bus, can(1, &[0, 0]));
-    let id = proto_core::recipe::model::CanId::Standard(1);
-    cell.send_can(bus, proto_core::recipe::CanFrame::remote(id, 1).unwrap());
-    let id = proto_core::recipe::model::CanId::Extended(1);
-    cell.send_can(bus, proto_core::recipe::CanFrame::new(id, &[0]).unwrap());
+    let id = proto_core::wire::can::CanId::Standard(1);
+    cell.send_can(bus, proto_core::wire::can::CanFrame::remote(id, 1).unwrap());
+    let id = proto_core::wire::can::CanId::Extended(1);
+    cell.send_can(bus, proto_core::wire::can::CanFrame::new(id, &[0]).unwrap());
     cell.run_ms(10);
     assert_eq!(cell.value("DO[1]"), 1.0);
     let counters = *cell.port("can-1");

@@ -1,11 +1,10 @@
 //! Decodes captured bytes with the recipes they were sent by: the worked examples of
 //! docs/wire/recipes.md section 8. Run it with `cargo run -p proto-core --example decode_capture`.
 
-use proto_core::recipe::model::{CanId, Field, Framing, Mode};
-use proto_core::recipe::{
-    CanFrame, CanLayout, Deframer, PartError, PlacedField, Rules, StreamLayout, datagram,
-};
+use proto_core::recipe::model::{Field, Framing, Mode};
+use proto_core::recipe::{CanLayout, Deframer, PartError, PlacedField, Rules, StreamLayout, datagram};
 use proto_core::sysvar::{Direction, VarRange};
+use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::{Scalar, ScalarType};
 
 const REALTIME_IN: Rules = Rules { mode: Mode::Realtime, direction: Direction::Input };

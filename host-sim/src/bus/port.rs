@@ -10,9 +10,8 @@ use std::rc::Rc;
 
 use proto_core::config::Rs485;
 use proto_core::engine::BusState;
-use proto_core::recipe::can::CanFrame;
-use proto_core::recipe::model::CanId;
 use proto_core::time::{Duration, Instant};
+use proto_core::wire::can::{CanFrame, CanId};
 use serde::Serialize;
 use tokio::sync::Notify;
 

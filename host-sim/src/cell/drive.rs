@@ -1,9 +1,8 @@
 //! The cell's run loop: what is due, whom it is for, and what that leads to.
 
 use proto_core::engine::{Input, LinkId, OUTPUT_BUFFER, Output};
-use proto_core::recipe::CanFrame;
-use proto_core::recipe::model::CanId;
 use proto_core::time::{Duration, Instant};
+use proto_core::wire::can::{CanFrame, CanId};
 use std::net::SocketAddr;
 
 use super::line::Chunk;

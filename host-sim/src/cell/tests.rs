@@ -3,8 +3,8 @@
 use std::path::Path;
 
 use proto_core::engine::LinkId;
-use proto_core::recipe::model::CanId;
 use proto_core::time::Duration;
+use proto_core::wire::can::CanId;
 
 use super::*;
 use crate::config::file;

@@ -6,8 +6,7 @@ use std::path::Path;
 use host_sim::cell::{Cell, LineId};
 use host_sim::config::{SimConfig, file};
 use proto_core::config::GatewayConfig;
-use proto_core::recipe::CanFrame;
-use proto_core::recipe::model::CanId;
+use proto_core::wire::can::{CanFrame, CanId};
 
 /// The gateway file of this name, and the controller's beside it.
 #[track_caller]

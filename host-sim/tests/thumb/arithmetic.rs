@@ -4,8 +4,8 @@
 use host_sim::cell::{Cell, Rng, Talker};
 use host_sim::config::SimConfig;
 use host_sim::config::file::{self, Text};
-use proto_core::recipe::CanFrame;
 use proto_core::time::Duration;
+use proto_core::wire::can::CanFrame;
 
 use crate::cell_kit::can;
 use crate::cells::recorded;

@@ -5,10 +5,10 @@ use proto_core::config::{
     Bus, CommandWhen, FieldSpec, GatewayConfig, InputBinding, OnStale, OutputBinding, Parts, SendOn, image,
 };
 use proto_core::engine::{BusState, Engine, Input, LinkId, LinkKind, OUTPUT_BUFFER, Output, PortId};
-use proto_core::recipe::CanFrame;
-use proto_core::recipe::model::{CanId, Mode};
+use proto_core::recipe::model::Mode;
 use proto_core::sysvar::{Direction, SysVar};
 use proto_core::time::{Duration, Instant};
+use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::ScalarType;
 
 use crate::rig::Cell;

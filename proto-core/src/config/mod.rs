@@ -22,9 +22,10 @@ pub use validate::{MAX_LINE_TIME, MAX_TIME, MIN_CYCLE, check_bitrate, check_cycl
 
 use heapless::{String, Vec};
 
-use crate::recipe::model::{CanId, MAX_CAN_IDS, MAX_DELIMITER, Mode};
+use crate::recipe::model::{MAX_CAN_IDS, MAX_DELIMITER, Mode};
 use crate::sysvar::SysVar;
 use crate::time::Duration;
+use crate::wire::can::CanId;
 use crate::wire::scalar::ScalarType;
 
 /// Most field ports, and most listening ports for the controller's own clients.

@@ -11,12 +11,13 @@ use super::store::Store;
 use super::user::{InputBind, fit, forget_commands};
 use crate::config::{Rs485, Span};
 use crate::image::{ImageBytes, InputSet};
-use crate::recipe::can::{CanFrame, CanLayout, CanReject};
+use crate::recipe::can::{CanLayout, CanReject};
 use crate::recipe::deframer::Deframer;
 use crate::recipe::model::Mode;
 use crate::recipe::stream::StreamLayout;
 use crate::recipe::{Applied, ValueError, Values};
 use crate::time::{Duration, Instant};
+use crate::wire::can::CanFrame;
 use crate::wire::scalar::Scalar;
 
 /// How the newest command that a port's values picked went.

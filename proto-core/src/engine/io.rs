@@ -1,8 +1,8 @@
 //! What goes into the engine and what comes out of it.
 
 use crate::config::MAX_PORTS;
-use crate::recipe::can::CanFrame;
 use crate::time::Instant;
+use crate::wire::can::CanFrame;
 
 /// A port, by its place in [`crate::config::GatewayConfig::ports`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]

@@ -55,9 +55,9 @@ use user::{Bindings, forget_commands};
 use crate::config::MAX_SAFE_VALUES;
 use crate::image::Image;
 use crate::link::LinkAction;
-use crate::recipe::can::CanFrame;
 use crate::recipe::model::MAX_STREAM_FRAME;
 use crate::time::{Duration, Instant};
+use crate::wire::can::CanFrame;
 
 /// Size of the buffer for [`Engine::poll_output`]: the longest stream frame; every request to the
 /// controller is shorter.

@@ -12,9 +12,8 @@ use embedded_can::Frame;
 use heapless::Vec;
 
 use crate::engine::{BusState, Engine, Input, LinkId, Output, PortId};
-use crate::recipe::CanFrame;
-use crate::recipe::model::{CanId, MAX_CAN_DATA};
 use crate::time::Instant;
+use crate::wire::can::{CanFrame, CanId, MAX_CAN_DATA};
 
 /// The first bytes of every recording; the last one is the format's version.
 pub const MAGIC: [u8; 4] = *b"RGR\x02";

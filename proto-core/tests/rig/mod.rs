@@ -11,10 +11,10 @@ use proto_core::engine::{
 use proto_core::modbus::adu::MAX_ADU;
 use proto_core::modbus::server::{RegisterBank, Server};
 use proto_core::modbus::{Coils, Exception, Registers};
-use proto_core::recipe::CanFrame;
-use proto_core::recipe::model::{CanId, Mode};
+use proto_core::recipe::model::Mode;
 use proto_core::sysvar::{SysVar, VarRange};
 use proto_core::time::{Duration, Instant};
+use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::ScalarType;
 
 pub fn var(name: &str) -> SysVar {

@@ -2,9 +2,9 @@
 
 use proto_core::engine::{Engine, LinkId, PortCounters, PortId};
 use proto_core::link::LinkState;
-use proto_core::recipe::CanFrame;
 use proto_core::sysvar::SysVar;
 use proto_core::time::{Duration, Instant};
+use proto_core::wire::can::CanFrame;
 
 use super::field::{self, Accepted, Line, Refused, Verdict};
 use super::sheet::{Origin, Owned, Raw, shown, written};
@@ -210,7 +210,7 @@ impl Oracle {
     pub(super) fn port_send(
         &mut self,
         port: PortId,
-        id: Option<proto_core::recipe::model::CanId>,
+        id: Option<proto_core::wire::can::CanId>,
         bytes: &[u8],
         now: Instant,
     ) {
