@@ -6,7 +6,6 @@ use heapless::Vec;
 use super::OUTPUT_BUFFER;
 use super::counters::{LinkCounters, add, bump};
 use super::flight::Flight;
-use super::outbox::BIT_VARS;
 use super::store::Store;
 use crate::image::{GroupId, InputSet};
 use crate::link::{LinkTimings, Supervisor};
@@ -15,7 +14,7 @@ use crate::modbus::client::{Client, ClientEvent};
 use crate::modbus::pdu::{MAX_WRITE_COILS, MAX_WRITE_REGISTERS, Request, Response};
 use crate::modbus::{Coils, Registers};
 use crate::schedule::Grid;
-use crate::sysvar::{ModbusPlace, SysVar};
+use crate::sysvar::{BIT_INPUT_COUNT, ModbusPlace, SysVar};
 use crate::time::{Duration, Instant};
 use crate::wire::scalar::Scalar;
 
@@ -339,7 +338,7 @@ impl ModbusLink {
         let items = each.saturating_mul(count as u16);
         let vars = InputSet::run(first, count);
         self.cursor = first.ordinal().saturating_add(count);
-        let mut bits = [0; BIT_VARS];
+        let mut bits = [0; BIT_INPUT_COUNT];
         if kind == Kind::Coils {
             for (place, var) in bits.iter_mut().zip(vars.iter()) {
                 *place = store.outbox.bit_value(var);

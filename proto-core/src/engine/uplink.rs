@@ -7,7 +7,6 @@ use super::counters::{LinkCounters, add, bump};
 use super::field_port::Look;
 use super::flight::Flight;
 use super::io::{LinkId, LinkKind};
-use super::outbox::BIT_VARS;
 use super::store::{Store, is_gap};
 use crate::image::{GroupId, Image, InputSet};
 use crate::link::Supervisor;
@@ -15,6 +14,7 @@ use crate::recipe::PlacedField;
 use crate::recipe::deframer::{Deframer, datagram};
 use crate::recipe::model::{Field, Framing};
 use crate::recipe::stream::StreamLayout;
+use crate::sysvar::BIT_INPUT_COUNT;
 use crate::time::{Duration, Instant};
 
 /// How old a read-back value may be and still go into a frame.
@@ -356,7 +356,7 @@ fn encode<const PORTS: usize>(
     if waiting.is_empty() {
         return layout.encode(store.image.bytes(), out).ok();
     }
-    let newest: [u8; BIT_VARS] = *store.image.bytes().first_chunk()?;
+    let newest: [u8; BIT_INPUT_COUNT] = *store.image.bytes().first_chunk()?;
     let mut next = newest;
     for var in waiting.iter() {
         if let Some(slot) = next.get_mut(var.image_offset()) {

@@ -3,9 +3,7 @@
 use core::fmt;
 
 use super::{LEN, OperationMode, ProgramState, StatePacket, States};
-use crate::sysvar::SysVar;
 use crate::wire::dialect::Dialect;
-use crate::wire::scalar::Scalar;
 
 /// The bytes of one packet. There is an accessor for each field; none can fail or panic.
 #[derive(Debug, Clone, Copy)]
@@ -89,20 +87,5 @@ impl<'a> StateView<'a> {
     /// The global speed in percent, where the dialect's controller sends it.
     pub fn global_speed(&self, dialect: &Dialect) -> Option<u8> {
         self.bytes.get(usize::from(dialect.global_speed?)).copied()
-    }
-
-    /// The value of a variable that stands in the packet, inputs too: what they read back as.
-    /// `None` for a variable that does not stand there.
-    ///
-    /// A byte variable's bits are packed lowest first (D13) and masked (D22); a bool byte that is
-    /// not 0 counts as 1.
-    pub fn read_var(&self, var: SysVar) -> Option<Scalar> {
-        let place = var.stream()?;
-        let bytes = self.bytes.get(usize::from(place.offset)..)?;
-        if var.is_bits() {
-            Some(Scalar::Byte(super::copy::pack(bytes.first_chunk()?) & var.valid_bits()))
-        } else {
-            Scalar::decode(var.ty(), bytes)
-        }
     }
 }
