@@ -33,7 +33,7 @@ pub const MAX_UPLINKS: usize = 2;
 /// User-defined fields in one direction, over all ports.
 pub const MAX_FIELDS: usize = 128;
 /// Recipe links, and command, urgent commands, state and Modbus.
-pub const MAX_LINKS: usize = MAX_UPLINKS + 4;
+pub const MAX_LINKS: usize = Engine::MAX_LINKS;
 
 /// The engine in the size of a board.
 pub type Engine = AnyEngine<MAX_FIELD_PORTS, MAX_UPLINKS, MAX_FIELDS>;
@@ -163,7 +163,7 @@ impl Gateway {
                         port.put_frame(frame);
                     }
                 }
-                Output::LinkOpen { link } => {
+                Output::LinkOpen { link, .. } => {
                     if let Some(link) = self.link(link) {
                         link.open();
                     }
@@ -184,6 +184,7 @@ impl Gateway {
                     }
                     return;
                 }
+                _ => {}
             }
         }
     }

@@ -175,7 +175,7 @@ impl Board {
                 // 10 bits a byte at 115200 baud.
                 self.happens(bytes.len() as u64 * 87, Event::PortSent);
             }
-            Output::LinkOpen { link } => self.happens(300, Event::LinkUp(link)),
+            Output::LinkOpen { link, .. } => self.happens(300, Event::LinkUp(link)),
             Output::LinkSend { link, bytes } => {
                 println!("{:>6} us  modbus >  {bytes:02X?}", self.now.as_micros());
                 // The socket has room again; the controller's TCP acknowledges before its answer comes.
@@ -187,7 +187,7 @@ impl Board {
                 }
             }
             // One serial port, and a link that nobody closes.
-            Output::PortSendCan { .. } | Output::LinkClose { .. } | Output::Sleep { .. } => {}
+            _ => {}
         }
     }
 }

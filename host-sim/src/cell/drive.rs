@@ -283,7 +283,7 @@ impl Cell {
                     self.transmit_can(bus, End::Port, frame);
                 }
             }
-            Output::LinkOpen { link } => {
+            Output::LinkOpen { link, .. } => {
                 self.trace.add(now, What::LinkOpen, link.0.into(), &[]);
                 self.open(link);
             }
@@ -295,6 +295,7 @@ impl Cell {
                 self.trace.add(now, What::LinkSent, link.0.into(), bytes);
                 self.send_up(link, bytes.to_vec());
             }
+            other => unreachable!("no such output: {other:?}"),
         }
         true
     }

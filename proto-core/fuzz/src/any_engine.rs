@@ -455,7 +455,7 @@ impl Driver {
                     self.sent(port, &bytes);
                 }
                 Output::PortSendCan { port, frame } => self.can_sent(port, &frame),
-                Output::LinkOpen { link } => {
+                Output::LinkOpen { link, .. } => {
                     let link = &mut self.links[usize::from(link.0)];
                     assert!(!self.honest || !link.opening && !link.up, "opened twice");
                     link.opening = true;
@@ -477,6 +477,7 @@ impl Driver {
                     link.sending = true;
                     link.unacknowledged = link.unacknowledged.wrapping_add(bytes.len() as u32);
                 }
+                other => panic!("{other:?}"),
             }
         }
         panic!("no end of outputs");

@@ -1,13 +1,14 @@
 //! From a configuration to an engine that is ready to run.
 
 use core::fmt;
+use core::net::{IpAddr, Ipv4Addr, SocketAddr};
 
 use heapless::Vec;
 
 use super::command_link::{CommandLink, MAX_COMMAND_BYTES, MAX_COMMAND_FIELDS};
 use super::counters::PortCounters;
-use super::field_port::{Codec, FieldPort, Line, ReplyCode};
-use super::io::{BusState, LinkId, LinkKind, PortId};
+use super::field_port::{Codec, FieldPort, Line};
+use super::io::{BusState, LinkId, LinkKind, PortId, ReplyCode, Transport};
 use super::links::Links;
 use super::modbus_link::{MAX_POLL_BLOCKS, ModbusLink};
 use super::outbox::EdgeQueue;
@@ -20,7 +21,7 @@ use super::user::{Bindings, InputBind};
 use super::{Ask, Engine};
 use crate::config::{
     Bus, ConfigError, FieldSpec, GatewayConfig, InputBinding, MAX_SAFE_VALUES, Parts, Port, Recipe, SendOn,
-    Span, StreamPart,
+    Span, StreamPart, listen_address,
 };
 use crate::image::{GroupId, InputSet, MAX_GROUPS};
 use crate::link::{LinkTimings, Supervisor};
@@ -162,7 +163,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         bindings.inputs.clear();
         bindings.outputs.clear();
         safe_values.clear();
-        let Links { command, state, modbus, recipes } = links;
+        let Links { host, command, state, modbus, recipes } = links;
+        host.clear();
         *command = None;
         *state = None;
         *modbus = None;
@@ -184,6 +186,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         config.validate().map_err(BuildError::Config)?;
         let plan = Plan::new(config).map_err(BuildError::Plan)?;
         let dialect = Dialect::named(&config.controller.dialect).ok_or(BuildError::UnknownDialect)?;
+        // As long as the configuration's, which is as long as the engine's.
+        let _ = self.links.host.push_str(&config.controller.address);
         for value in &config.safe_values {
             let full = |_| too_many("safe values", MAX_SAFE_VALUES);
             self.safe_values.push(SafeBytes::new(value)).map_err(full)?;
@@ -197,11 +201,12 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         }
         if plan.needs_state() {
             let group = groups.next().ok_or(too_many("groups", MAX_GROUPS))?;
-            self.links.state = Some(StateLink::new(group, plan.read_back()));
+            self.links.state = Some(StateLink::new(config.controller.state_port, group, plan.read_back()));
         }
         if plan.needs_modbus() {
             let writes = SysVar::all().filter(|&var| plan.way_up(var) == Some(WayUp::Modbus)).collect();
-            self.links.modbus = Some(ModbusLink::new(dialect.modbus_unit, writes));
+            self.links.modbus =
+                Some(ModbusLink::new(config.controller.modbus_port, dialect.modbus_unit, writes));
         }
         self.assign_read_back(&plan);
         self.assign_sources(config, &plan, &mut groups)?;
@@ -250,7 +255,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
                 }
                 FieldSpec::UserInput { to: InputBinding::Commands { table, when }, .. } => {
                     if self.links.command.is_none() {
-                        let link = CommandLink::new(dialect, &config.commands);
+                        let link =
+                            CommandLink::new(config.controller.command_port, dialect, &config.commands);
                         self.links.command =
                             Some(link.ok_or(too_many("bytes of command texts", MAX_COMMAND_BYTES))?);
                     }
@@ -302,10 +308,21 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     ) -> Result<(), BuildError> {
         let port = id.port();
         let bus = port.and_then(|port| config.ports.get(usize::from(port.0))).map(|port| &port.bus);
-        let kind = match (bus, port) {
-            (Some(Bus::TcpListen { .. }), Some(port)) => LinkKind::RecipeTcpListen { port },
-            (Some(_), Some(port)) => LinkKind::RecipeUdpListen { port },
-            _ => LinkKind::RecipeUdp,
+        // Validation has refused what is no address.
+        let local = |listen: &str| {
+            listen_address(listen).unwrap_or(SocketAddr::new(IpAddr::V4(Ipv4Addr::UNSPECIFIED), 0))
+        };
+        let (kind, transport) = match (bus, port) {
+            (Some(Bus::TcpListen { listen }), Some(port)) => {
+                (LinkKind::RecipeTcpListen { port }, Transport::TcpListen { local: local(listen) })
+            }
+            (Some(Bus::UdpListen { listen }), Some(port)) => {
+                (LinkKind::RecipeUdpListen { port }, Transport::UdpListen { local: local(listen) })
+            }
+            _ => {
+                let port = config.controller.recipe_link.map_or(0, |link| link.udp_port);
+                (LinkKind::RecipeUdp, Transport::Udp { port })
+            }
         };
         let framing = match kind {
             LinkKind::RecipeTcpListen { .. } => Framing::Bytes,
@@ -351,7 +368,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             owners.filter_map(|port| config.ports.get(usize::from(port.0))).map(|port| port.timeout);
         let patience = timeouts.min().unwrap_or(PATIENCE).max(PATIENCE);
         let supervisor = Supervisor::new(timings);
-        let uplink = Uplink::new(id, kind, supervisor, (input, output), (set, writes), group, patience);
+        let uplink =
+            Uplink::new(id, (kind, transport), supervisor, (input, output), (set, writes), group, patience);
         self.links.recipes.push(uplink).map_err(|_| too_many("recipe links", UPLINKS))
     }
 

@@ -8,8 +8,8 @@
 use heapless::{Deque, String, Vec};
 
 use super::counters::{PortCounters, bump};
-use super::field_port::{FieldPort, ReplyCode};
-use super::io::{LinkId, PortId};
+use super::field_port::FieldPort;
+use super::io::{LinkId, PortId, ReplyCode, Transport};
 use super::session::{Event, Sent, Session};
 use super::stops::{STOP_TTL, Stops, Waiting};
 use crate::command::{Keyword, Request};
@@ -67,6 +67,7 @@ pub(super) struct CommandLink {
     /// The connection for everything, and the one for urgent commands alone.
     pub ordinary: Session,
     pub urgent: Option<Session>,
+    port: u16,
     dialect: Dialect,
     tables: Tables,
     fields: Vec<CommandField, MAX_COMMAND_FIELDS>,
@@ -106,12 +107,13 @@ impl Tables {
 
 impl CommandLink {
     /// Links with these command tables; `None` when their texts are too long together.
-    pub(super) fn new(dialect: Dialect, entries: &[CommandEntry]) -> Option<Self> {
+    pub(super) fn new(port: u16, dialect: Dialect, entries: &[CommandEntry]) -> Option<Self> {
         let tables = Tables::new(entries)?;
         let stops = tables.entries.iter().any(|entry| entry.keyword.is_urgent());
         Some(Self {
             ordinary: Session::new(),
             urgent: stops.then(Session::new),
+            port,
             dialect,
             tables,
             fields: Vec::new(),
@@ -122,6 +124,10 @@ impl CommandLink {
             struck_at: None,
             way_made_until: Instant::ZERO,
         })
+    }
+
+    pub(super) fn transport(&self) -> Transport {
+        Transport::Tcp { port: self.port }
     }
 
     /// Adds a field; its index, or `None` when there are too many.

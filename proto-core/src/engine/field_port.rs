@@ -5,7 +5,7 @@
 
 use super::command_link::CommandLink;
 use super::counters::{PortCounters, add, bump};
-use super::io::{BusState, PortId};
+use super::io::{BusState, PortId, ReplyCode};
 use super::sender::Sender;
 use super::store::Store;
 use super::user::{InputBind, fit, forget_commands};
@@ -19,28 +19,6 @@ use crate::recipe::{Applied, ValueError, Values};
 use crate::time::{Duration, Instant};
 use crate::wire::can::CanFrame;
 use crate::wire::scalar::Scalar;
-
-/// How the newest command that a port's values picked went.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-#[cfg_attr(feature = "defmt", derive(defmt::Format))]
-#[repr(u8)]
-pub enum ReplyCode {
-    /// No value has picked a command yet.
-    #[default]
-    None = 0,
-    /// Waiting to be sent, or for the reply.
-    Pending = 1,
-    /// The controller replied that it succeeded.
-    Success = 2,
-    /// The controller replied that it failed.
-    Fail = 3,
-    /// The controller replied something else.
-    Other = 4,
-    /// No reply came in time, or the link was lost meanwhile.
-    NoReply = 5,
-    /// It was not sent: the link was down, or too many were waiting.
-    NotSent = 6,
-}
 
 /// The layouts of the port's recipe.
 #[derive(Debug, Clone)]

@@ -1,11 +1,11 @@
 //! The links to the controller together: whom a report is for, and in what order they speak.
 
-use heapless::Vec;
+use heapless::{String, Vec};
 
 use super::command_link::CommandLink;
 use super::counters::LinkCounters;
 use super::field_port::{FieldPort, Look};
-use super::io::{LinkId, LinkKind};
+use super::io::{Endpoint, LinkId, LinkKind, Transport};
 use super::modbus_link::ModbusLink;
 use super::state_link::StateLink;
 use super::store::Store;
@@ -13,14 +13,17 @@ use super::uplink::Uplink;
 use crate::link::{LinkAction, LinkHistory, LinkState, Supervisor};
 use crate::time::Instant;
 
-/// How one link does.
+/// State of one link.
 #[derive(Debug, Clone, Copy)]
+#[non_exhaustive]
 pub struct LinkInfo<'a> {
     /// The link.
     pub id: LinkId,
     /// What it is.
     pub kind: LinkKind,
-    /// Where it stands.
+    /// Where it goes, and how it is opened.
+    pub endpoint: Endpoint<'a>,
+    /// Whether it is usable, and since or until when.
     pub state: LinkState,
     /// How often it came and went.
     pub history: &'a LinkHistory,
@@ -28,9 +31,14 @@ pub struct LinkInfo<'a> {
     pub counters: &'a LinkCounters,
 }
 
+/// Longest address or name of the controller.
+const MAX_HOST: usize = 64;
+
 /// The links that the configuration needs.
 #[derive(Debug, Clone)]
 pub(super) struct Links<const UPLINKS: usize> {
+    /// The controller's address or name.
+    pub host: String<MAX_HOST>,
     pub command: Option<CommandLink>,
     pub state: Option<StateLink>,
     pub modbus: Option<ModbusLink>,
@@ -39,24 +47,52 @@ pub(super) struct Links<const UPLINKS: usize> {
 
 impl<const UPLINKS: usize> Links<UPLINKS> {
     pub(super) const fn new() -> Self {
-        Self { command: None, state: None, modbus: None, recipes: Vec::new() }
+        Self { host: String::new(), command: None, state: None, modbus: None, recipes: Vec::new() }
     }
 
     pub(super) fn infos(&self) -> impl Iterator<Item = LinkInfo<'_>> + '_ {
-        let command = self.command.iter().map(|link| &link.ordinary);
-        let command =
-            command.map(|link| info(LinkId::COMMAND, LinkKind::Command, &link.supervisor, &link.counters));
-        let urgent = self.command.iter().filter_map(|link| link.urgent.as_ref());
-        let urgent =
-            urgent.map(|link| info(LinkId::URGENT, LinkKind::Urgent, &link.supervisor, &link.counters));
-        let state = self.state.iter();
-        let state = state.map(|link| info(LinkId::STATE, LinkKind::State, &link.supervisor, &link.counters));
-        let modbus = self.modbus.iter();
-        let modbus =
-            modbus.map(|link| info(LinkId::MODBUS, LinkKind::Modbus, &link.supervisor, &link.counters));
+        let command = self.command.iter().flat_map(|link| {
+            let urgent = link.urgent.iter().map(|session| (LinkId::URGENT, LinkKind::Urgent, session));
+            let all = core::iter::once((LinkId::COMMAND, LinkKind::Command, &link.ordinary)).chain(urgent);
+            all.map(|(id, kind, session)| {
+                self.info(id, kind, link.transport(), &session.supervisor, &session.counters)
+            })
+        });
+        let state = self.state.iter().map(|link| {
+            self.info(LinkId::STATE, LinkKind::State, link.transport(), &link.supervisor, &link.counters)
+        });
+        let modbus = self.modbus.iter().map(|link| {
+            self.info(LinkId::MODBUS, LinkKind::Modbus, link.transport(), &link.supervisor, &link.counters)
+        });
         let recipes = self.recipes.iter();
-        let recipes = recipes.map(|link| info(link.id, link.kind, &link.supervisor, &link.counters));
-        command.chain(urgent).chain(state).chain(modbus).chain(recipes)
+        let recipes = recipes
+            .map(|link| self.info(link.id, link.kind, link.transport, &link.supervisor, &link.counters));
+        command.chain(state).chain(modbus).chain(recipes)
+    }
+
+    fn info<'a>(
+        &'a self,
+        id: LinkId,
+        kind: LinkKind,
+        transport: Transport,
+        supervisor: &'a Supervisor,
+        counters: &'a LinkCounters,
+    ) -> LinkInfo<'a> {
+        let endpoint = Endpoint::new(transport, &self.host);
+        LinkInfo { id, kind, endpoint, state: supervisor.state(), history: supervisor.history(), counters }
+    }
+
+    /// Where a link of [`Self::infos`] goes; the controller's name is written into `buf`.
+    #[cold]
+    #[inline(never)]
+    pub(super) fn endpoint<'b>(&self, id: LinkId, buf: &'b mut [u8]) -> Endpoint<'b> {
+        let transport = self.infos().find(|info| info.id == id).map(|info| info.endpoint.transport);
+        let host = buf.get_mut(..self.host.len()).unwrap_or(&mut []);
+        for (place, byte) in host.iter_mut().zip(self.host.bytes()) {
+            *place = byte;
+        }
+        let host = core::str::from_utf8(host).unwrap_or("");
+        Endpoint::new(transport.unwrap_or(Transport::Tcp { port: 0 }), host)
     }
 
     /// Everything that depends on the clock.
@@ -335,13 +371,4 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
     fn recipe(&mut self, id: LinkId) -> Option<&mut Uplink> {
         self.recipes.iter_mut().find(|link| link.id == id)
     }
-}
-
-fn info<'a>(
-    id: LinkId,
-    kind: LinkKind,
-    supervisor: &'a Supervisor,
-    counters: &'a LinkCounters,
-) -> LinkInfo<'a> {
-    LinkInfo { id, kind, state: supervisor.state(), history: supervisor.history(), counters }
 }

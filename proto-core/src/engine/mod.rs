@@ -35,8 +35,7 @@ mod user;
 pub use build::BuildError;
 pub use command_link::{COMMAND_QUEUE, MAX_COMMAND_BYTES, MAX_COMMAND_FIELDS};
 pub use counters::{LinkCounters, PortCounters};
-pub use field_port::ReplyCode;
-pub use io::{BusState, Input, LinkId, LinkKind, Output, PortId, PortState};
+pub use io::{BusState, Endpoint, Input, LinkId, LinkKind, Output, PortId, PortState, ReplyCode, Transport};
 pub use links::LinkInfo;
 pub use modbus_link::MAX_POLL_BLOCKS;
 pub use outbox::EDGE_QUEUE;
@@ -58,10 +57,16 @@ use crate::link::LinkAction;
 use crate::recipe::model::MAX_STREAM_FRAME;
 use crate::time::{Duration, Instant};
 use crate::wire::can::CanFrame;
+use crate::wire::state::LEN;
 
 /// Size of the buffer for [`Engine::poll_output`]: the longest stream frame; every request to the
 /// controller is shorter.
 pub const OUTPUT_BUFFER: usize = MAX_STREAM_FRAME;
+
+/// Size of a receive buffer that takes a state packet in one piece and shows that a datagram is longer
+/// than any frame. What arrives may be handed over in pieces of any other size.
+pub const INPUT_BUFFER: usize = 1536;
+const _: () = assert!(INPUT_BUFFER >= LEN && INPUT_BUFFER > MAX_STREAM_FRAME);
 
 /// A driver that calls the engine later than this after the call before was asleep: stopped, suspended,
 /// or in a debugger.
@@ -129,6 +134,9 @@ impl Ask {
 }
 
 impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS, UPLINKS, FIELDS> {
+    /// Most links that this engine can have: port 2000 twice, port 2001, Modbus, and the recipe links.
+    pub const MAX_LINKS: usize = UPLINKS.saturating_add(4);
+
     /// Something happened, or time passed. `now` is the present; an instant earlier than in the call
     /// before counts as that.
     ///
@@ -195,7 +203,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         if self.ask.actions {
             if let Some((link, action)) = self.links.next_action() {
                 return match action {
-                    LinkAction::Open => Output::LinkOpen { link },
+                    LinkAction::Open => {
+                        Output::LinkOpen { link, to: self.links.endpoint(link, &mut buf[..]) }
+                    }
                     LinkAction::Close => Output::LinkClose { link },
                 };
             }
@@ -378,12 +388,12 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         &self.store.image
     }
 
-    /// What happened on a field port; `None` for a port that is none.
+    /// What happened on a field port; `None` if no such port is configured.
     pub fn port_counters(&self, port: PortId) -> Option<&PortCounters> {
         self.ports.iter().find(|other| other.id == port).map(|port| &port.counters)
     }
 
-    /// How a field port does; `None` for a port that is none.
+    /// Health of a field port; `None` if no such port is configured.
     pub fn port_state(&self, port: PortId) -> Option<PortState> {
         let (index, port) = self.ports.iter().enumerate().find(|(_, other)| other.id == port)?;
         let mut frames = self.store.frames.iter().filter(|frame| usize::from(frame.port) == index);
@@ -398,7 +408,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         })
     }
 
-    /// How the newest command that a port's values picked went; `None` for a port that is none.
+    /// Result of the newest command that a port's values picked; `None` if no such port is configured.
     pub fn reply_code(&self, port: PortId) -> Option<ReplyCode> {
         self.ports.iter().find(|other| other.id == port).map(|port| port.reply)
     }

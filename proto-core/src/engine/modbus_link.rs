@@ -6,6 +6,7 @@ use heapless::Vec;
 use super::OUTPUT_BUFFER;
 use super::counters::{LinkCounters, add, bump};
 use super::flight::Flight;
+use super::io::Transport;
 use super::store::Store;
 use crate::image::{GroupId, InputSet};
 use crate::link::{LinkTimings, Supervisor};
@@ -69,6 +70,7 @@ enum Turn {
 pub(super) struct ModbusLink {
     pub supervisor: Supervisor,
     pub counters: LinkCounters,
+    port: u16,
     client: Client,
     /// Variables that are written here.
     pub writes: InputSet,
@@ -88,10 +90,11 @@ pub(super) struct ModbusLink {
 }
 
 impl ModbusLink {
-    pub(super) fn new(unit: u8, writes: InputSet) -> Self {
+    pub(super) fn new(port: u16, unit: u8, writes: InputSet) -> Self {
         Self {
             supervisor: Supervisor::new(LinkTimings::TCP),
             counters: LinkCounters::default(),
+            port,
             client: Client::new(unit),
             writes,
             polled: Vec::new(),
@@ -105,6 +108,10 @@ impl ModbusLink {
             refused: InputSet::EMPTY,
             ask_again_at: Instant::NEVER,
         }
+    }
+
+    pub(super) fn transport(&self) -> Transport {
+        Transport::Tcp { port: self.port }
     }
 
     /// Polls a variable every `period`; false when there are too many. Variables must come in the

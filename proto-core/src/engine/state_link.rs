@@ -4,6 +4,7 @@ use heapless::Vec;
 
 use super::counters::{LinkCounters, add, bump};
 use super::field_port::Look;
+use super::io::Transport;
 use super::store::Store;
 use crate::image::{GroupId, InputSet};
 use crate::link::{LinkTimings, Supervisor};
@@ -20,6 +21,7 @@ const MISALIGNED_IN_A_ROW: u32 = 3;
 pub(super) struct StateLink {
     pub supervisor: Supervisor,
     pub counters: LinkCounters,
+    port: u16,
     pub group: GroupId,
     stream: StateStream,
     /// Variables that come from here.
@@ -29,15 +31,20 @@ pub(super) struct StateLink {
 }
 
 impl StateLink {
-    pub(super) fn new(group: GroupId, read_back: InputSet) -> Self {
+    pub(super) fn new(port: u16, group: GroupId, read_back: InputSet) -> Self {
         Self {
             supervisor: Supervisor::new(LinkTimings::TCP.with_silence(SILENCE)),
             counters: LinkCounters::default(),
+            port,
             group,
             stream: StateStream::new(),
             shown: Vec::new(),
             read_back,
         }
+    }
+
+    pub(super) fn transport(&self) -> Transport {
+        Transport::Tcp { port: self.port }
     }
 
     /// The connection is gone; half a packet of it is worth nothing.

@@ -6,7 +6,7 @@
 use super::counters::{LinkCounters, add, bump};
 use super::field_port::Look;
 use super::flight::Flight;
-use super::io::{LinkId, LinkKind};
+use super::io::{LinkId, LinkKind, Transport};
 use super::store::{Store, is_gap};
 use crate::image::{GroupId, Image, InputSet};
 use crate::link::Supervisor;
@@ -35,6 +35,7 @@ const SPEAK_EVERY: Duration = Duration::from_secs(20);
 pub(super) struct Uplink {
     pub id: LinkId,
     pub kind: LinkKind,
+    pub transport: Transport,
     pub supervisor: Supervisor,
     pub counters: LinkCounters,
     framing: Framing,
@@ -65,7 +66,7 @@ pub(super) struct Uplink {
 impl Uplink {
     pub(super) fn new(
         id: LinkId,
-        kind: LinkKind,
+        (kind, transport): (LinkKind, Transport),
         supervisor: Supervisor,
         (input, output): (Option<StreamLayout>, Option<StreamLayout>),
         (set, writes): (InputSet, InputSet),
@@ -79,6 +80,7 @@ impl Uplink {
         Self {
             id,
             kind,
+            transport,
             supervisor,
             counters: LinkCounters::default(),
             framing,

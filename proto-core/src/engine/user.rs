@@ -3,7 +3,7 @@
 use heapless::Vec;
 
 use super::command_link::CommandLink;
-use super::field_port::ReplyCode;
+use super::io::ReplyCode;
 use crate::config::OutputBinding;
 use crate::image::{Image, bind_to_variable, saturate_to_field};
 use crate::recipe::model::MAX_FIELDS;

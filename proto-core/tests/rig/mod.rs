@@ -411,9 +411,10 @@ impl Rig {
                 }
                 Output::PortSend { port, bytes } => Out::Port(port, bytes.to_vec()),
                 Output::PortSendCan { port, frame } => Out::Can(port, frame),
-                Output::LinkOpen { link } => Out::Open(link),
+                Output::LinkOpen { link, .. } => Out::Open(link),
                 Output::LinkClose { link } => Out::Close(link),
                 Output::LinkSend { link, bytes } => Out::Link(link, bytes.to_vec()),
+                other => panic!("{other:?}"),
             };
             self.log.push((self.now, out.clone()));
             self.react(out);
