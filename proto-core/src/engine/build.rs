@@ -94,6 +94,8 @@ impl Groups {
 
 impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS, UPLINKS, FIELDS> {
     /// An engine without a configuration: no ports, no links, nothing to do.
+    ///
+    /// All its bytes are zero, so that a `static` one takes no flash, and no stack.
     pub const fn idle() -> Self {
         Self {
             store: Store::new(),
@@ -103,7 +105,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             links: Links::new(),
             watches_bits: false,
             timer_at: Instant::ZERO,
-            rearm: true,
+            is_armed: false,
             now: Instant::ZERO,
             is_late: false,
             announced: Instant::ZERO,
@@ -111,7 +113,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             sleeps: 0,
             is_deaf: false,
             deaf_until: Instant::ZERO,
-            ask: Ask::ALL,
+            // The first call asks everybody: `timer_at` has come.
+            ask: Ask::NONE,
         }
     }
 
@@ -130,6 +133,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     ///
     /// # Errors
     /// As [`Engine::new`]; the engine is idle then.
+    // In a driver's `main`, what this needs of the stack would never be given back.
+    #[inline(never)]
     pub fn configure(&mut self, config: &GatewayConfig) -> Result<(), BuildError> {
         self.clear();
         let done = self.build(config);
@@ -148,7 +153,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             links,
             watches_bits,
             timer_at,
-            rearm,
+            is_armed,
             now,
             is_late,
             announced,
@@ -165,13 +170,13 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         safe_values.clear();
         let Links { host, command, state, modbus, recipes } = links;
         host.clear();
-        *command = None;
-        *state = None;
-        *modbus = None;
+        command.clear();
+        state.clear();
+        modbus.clear();
         recipes.clear();
         *watches_bits = false;
         *timer_at = Instant::ZERO;
-        *rearm = true;
+        *is_armed = false;
         *now = Instant::ZERO;
         *is_late = false;
         *announced = Instant::ZERO;
@@ -179,7 +184,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         *sleeps = 0;
         *is_deaf = false;
         *deaf_until = Instant::ZERO;
-        *ask = Ask::ALL;
+        *ask = Ask::NONE;
     }
 
     fn build(&mut self, config: &GatewayConfig) -> Result<(), BuildError> {
@@ -201,12 +206,13 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         }
         if plan.needs_state() {
             let group = groups.next().ok_or(too_many("groups", MAX_GROUPS))?;
-            self.links.state = Some(StateLink::new(config.controller.state_port, group, plan.read_back()));
+            let link = StateLink::new(config.controller.state_port, group, plan.read_back());
+            let _ = self.links.state.push(link);
         }
         if plan.needs_modbus() {
             let writes = SysVar::all().filter(|&var| plan.way_up(var) == Some(WayUp::Modbus)).collect();
-            self.links.modbus =
-                Some(ModbusLink::new(config.controller.modbus_port, dialect.modbus_unit, writes));
+            let link = ModbusLink::new(config.controller.modbus_port, dialect.modbus_unit, writes);
+            let _ = self.links.modbus.push(link);
         }
         self.assign_read_back(&plan);
         self.assign_sources(config, &plan, &mut groups)?;
@@ -254,13 +260,13 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
                     InputBind::Variable { var, scale, offset }
                 }
                 FieldSpec::UserInput { to: InputBinding::Commands { table, when }, .. } => {
-                    if self.links.command.is_none() {
+                    if self.links.command.is_empty() {
                         let link =
                             CommandLink::new(config.controller.command_port, dialect, &config.commands);
-                        self.links.command =
-                            Some(link.ok_or(too_many("bytes of command texts", MAX_COMMAND_BYTES))?);
+                        let link = link.ok_or(too_many("bytes of command texts", MAX_COMMAND_BYTES))?;
+                        let _ = self.links.command.push(link);
                     }
-                    let Some(link) = &mut self.links.command else { continue };
+                    let Some(link) = self.links.command.first_mut() else { continue };
                     let field = link.add_field(table, when);
                     InputBind::Command(field.ok_or(too_many("command fields", MAX_COMMAND_FIELDS))?)
                 }
@@ -375,7 +381,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
 
     /// Variables of recipe links that no port sends come from the state stream.
     fn assign_read_back(&mut self, plan: &Plan) {
-        let Some(state) = &self.links.state else { return };
+        let Some(state) = self.links.state.first() else { return };
         for var in plan.read_back().iter().filter(|&var| plan.owner(var).is_none()) {
             self.store.image.assign(var, state.group);
         }
@@ -405,7 +411,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         }
         for &var in &polled {
             let period = periods.get(var.ordinal()).copied().flatten().unwrap_or(port_cycle_floor());
-            let Some(modbus) = &mut self.links.modbus else { break };
+            let Some(modbus) = self.links.modbus.first_mut() else { break };
             let group = modbus.poll_var(var, period, || groups.next());
             let group = group.ok_or(too_many("Modbus poll blocks", MAX_POLL_BLOCKS))?;
             self.store.image.assign(var, group);
@@ -415,7 +421,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
                 Some(Source::Recipe(id)) => {
                     self.links.recipes.iter().find(|link| link.id == id).and_then(|link| link.group)
                 }
-                Some(Source::State) => self.links.state.as_mut().map(|state| {
+                Some(Source::State) => self.links.state.first_mut().map(|state| {
                     // As many places as there are variables.
                     let _ = state.shown.push(var);
                     state.group
@@ -439,7 +445,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     /// What of the recipe links' variables shows when the controller has a safe value: the state
     /// packet, or an output that some link brings.
     fn assign_witnesses(&mut self) {
-        let has_state = self.links.state.is_some();
+        let has_state = !self.links.state.is_empty();
         let image = &self.store.image;
         for link in &mut self.links.recipes {
             let is_shown = |var: &SysVar| {

@@ -125,7 +125,7 @@ impl FieldPort {
     }
 
     /// The device is gone: nothing of what was under way is continued later.
-    pub(super) fn down(&mut self, bindings: &[InputBind], commands: &mut Option<CommandLink>, now: Instant) {
+    pub(super) fn down(&mut self, bindings: &[InputBind], commands: Option<&mut CommandLink>, now: Instant) {
         if self.is_up {
             bump(&mut self.counters.downs);
         }
@@ -140,7 +140,7 @@ impl FieldPort {
         &mut self,
         state: BusState,
         bindings: &[InputBind],
-        commands: &mut Option<CommandLink>,
+        commands: Option<&mut CommandLink>,
         now: Instant,
     ) {
         if state == BusState::BusOff && self.bus != BusState::BusOff {
@@ -180,7 +180,7 @@ impl FieldPort {
         look: Look,
         bindings: &[InputBind],
         store: &mut Store<PORTS>,
-        commands: &mut Option<CommandLink>,
+        commands: Option<&mut CommandLink>,
         now: Instant,
     ) -> Accepted {
         let mut accepted = Accepted::default();
@@ -224,7 +224,7 @@ impl FieldPort {
         frame: &CanFrame,
         bindings: &[InputBind],
         store: &mut Store<PORTS>,
-        commands: &mut Option<CommandLink>,
+        commands: Option<&mut CommandLink>,
         now: Instant,
     ) -> Accepted {
         add(&mut self.counters.bytes_in, frame.data().len());
@@ -306,7 +306,7 @@ struct Frames<'a, const PORTS: usize> {
     counters: &'a mut PortCounters,
     port: PortId,
     store: &'a mut Store<PORTS>,
-    commands: &'a mut Option<CommandLink>,
+    commands: Option<&'a mut CommandLink>,
     now: Instant,
 }
 
@@ -339,7 +339,7 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
                 for (binding, value) in bindings.iter().zip(layout.values(payload)) {
                     self.apply_user(binding, value);
                 }
-                if let Some(link) = self.commands {
+                if let Some(link) = &mut self.commands {
                     link.frame_ends();
                 }
             }
@@ -358,7 +358,7 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
                 }
             }
             InputBind::Command(field) => {
-                if let Some(link) = self.commands {
+                if let Some(link) = &mut self.commands {
                     link.value(field, value, self.port, self.reply, self.counters, self.now);
                 }
             }

@@ -31,6 +31,9 @@ pub struct LinkInfo<'a> {
     pub counters: &'a LinkCounters,
 }
 
+/// One or none. All zeros when it is empty, which an `Option` of a struct is not.
+pub(super) type Maybe<T> = Vec<T, 1>;
+
 /// Longest address or name of the controller.
 const MAX_HOST: usize = 64;
 
@@ -39,15 +42,21 @@ const MAX_HOST: usize = 64;
 pub(super) struct Links<const UPLINKS: usize> {
     /// The controller's address or name.
     pub host: String<MAX_HOST>,
-    pub command: Option<CommandLink>,
-    pub state: Option<StateLink>,
-    pub modbus: Option<ModbusLink>,
+    pub command: Maybe<CommandLink>,
+    pub state: Maybe<StateLink>,
+    pub modbus: Maybe<ModbusLink>,
     pub recipes: Vec<Uplink, UPLINKS>,
 }
 
 impl<const UPLINKS: usize> Links<UPLINKS> {
     pub(super) const fn new() -> Self {
-        Self { host: String::new(), command: None, state: None, modbus: None, recipes: Vec::new() }
+        Self {
+            host: String::new(),
+            command: Vec::new(),
+            state: Vec::new(),
+            modbus: Vec::new(),
+            recipes: Vec::new(),
+        }
     }
 
     pub(super) fn infos(&self) -> impl Iterator<Item = LinkInfo<'_>> + '_ {
@@ -102,15 +111,15 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
         ports: &mut [FieldPort],
         now: Instant,
     ) {
-        if let Some(link) = &mut self.command {
+        if let Some(link) = self.command.first_mut() {
             link.advance(ports, now);
         }
-        if let Some(link) = &mut self.state
+        if let Some(link) = self.state.first_mut()
             && link.supervisor.advance(now)
         {
             link.lost();
         }
-        if let Some(link) = &mut self.modbus {
+        if let Some(link) = self.modbus.first_mut() {
             link.advance(store, now);
             if link.supervisor.advance(now) {
                 link.lost(store);
@@ -132,14 +141,14 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
         ports: &mut [FieldPort],
         now: Instant,
     ) {
-        if let Some(link) = &mut self.command {
+        if let Some(link) = self.command.first_mut() {
             link.slept(ports, now);
         }
-        if let Some(link) = &mut self.state {
+        if let Some(link) = self.state.first_mut() {
             link.supervisor.give_up(now);
             link.lost();
         }
-        if let Some(link) = &mut self.modbus {
+        if let Some(link) = self.modbus.first_mut() {
             link.supervisor.give_up(now);
             link.lost(store);
         }
@@ -156,17 +165,17 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
         }
         match id {
             LinkId::COMMAND | LinkId::URGENT => {
-                if let Some(link) = &mut self.command {
+                if let Some(link) = self.command.first_mut() {
                     link.up(id, now);
                 }
             }
             LinkId::STATE => {
-                if let Some(link) = &mut self.state {
+                if let Some(link) = self.state.first_mut() {
                     link.supervisor.up(now);
                 }
             }
             LinkId::MODBUS => {
-                if let Some(link) = &mut self.modbus
+                if let Some(link) = self.modbus.first_mut()
                     && link.supervisor.up(now)
                 {
                     link.up(store);
@@ -192,19 +201,19 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
     ) {
         match id {
             LinkId::COMMAND | LinkId::URGENT => {
-                if let Some(link) = &mut self.command {
+                if let Some(link) = self.command.first_mut() {
                     link.down(id, ports, now);
                 }
             }
             LinkId::STATE => {
-                if let Some(link) = &mut self.state
+                if let Some(link) = self.state.first_mut()
                     && link.supervisor.down(now)
                 {
                     link.lost();
                 }
             }
             LinkId::MODBUS => {
-                if let Some(link) = &mut self.modbus
+                if let Some(link) = self.modbus.first_mut()
                     && link.supervisor.down(now)
                 {
                     link.lost(store);
@@ -234,17 +243,17 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
         let bytes = core::mem::take(rest);
         match id {
             LinkId::COMMAND | LinkId::URGENT => {
-                if let Some(link) = &mut self.command {
+                if let Some(link) = self.command.first_mut() {
                     link.bytes(id, bytes, ports, now);
                 }
             }
             LinkId::STATE => {
-                if let Some(link) = self.state.as_mut().filter(|link| link.supervisor.is_up()) {
+                if let Some(link) = self.state.first_mut().filter(|link| link.supervisor.is_up()) {
                     *rest = link.bytes(bytes, look, store, now);
                 }
             }
             LinkId::MODBUS => {
-                if let Some(link) = self.modbus.as_mut().filter(|link| link.supervisor.is_up()) {
+                if let Some(link) = self.modbus.first_mut().filter(|link| link.supervisor.is_up()) {
                     link.bytes(bytes, store, now);
                 }
             }
@@ -263,7 +272,7 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
                 self.command.iter_mut().for_each(|link| link.sent(id));
                 self.deadline_of(id)
             }
-            LinkId::MODBUS => self.modbus.as_mut().map_or(Instant::NEVER, |link| {
+            LinkId::MODBUS => self.modbus.first_mut().map_or(Instant::NEVER, |link| {
                 link.sent();
                 link.deadline()
             }),
@@ -291,34 +300,34 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
         out: &mut [u8],
         now: Instant,
     ) -> Option<(LinkId, usize)> {
-        if let Some(link) = &mut self.command
+        if let Some(link) = self.command.first_mut()
             && let Some(sent) = link.next_stop(ports, out, now)
         {
             return Some(sent);
         }
-        let state = self.state.as_ref().map(|state| state.group);
+        let state = self.state.first().map(|state| state.group);
         for link in &mut self.recipes {
             if let Some(len) = link.next_frame(store, state, out, now) {
                 return Some((link.id, len));
             }
         }
-        if let Some(link) = &mut self.modbus
+        if let Some(link) = self.modbus.first_mut()
             && let Some(len) = link.next_request(store, out, now)
         {
             return Some((LinkId::MODBUS, len));
         }
-        let link = self.command.as_mut()?;
+        let link = self.command.first_mut()?;
         link.next_command(ports, out, now).map(|len| (LinkId::COMMAND, len))
     }
 
     /// Whether what stops the robot waits.
     pub(super) fn has_stops(&self) -> bool {
-        self.command.as_ref().is_some_and(CommandLink::has_stops)
+        self.command.first().is_some_and(CommandLink::has_stops)
     }
 
     /// Links to be opened and closed.
     pub(super) fn next_action(&mut self) -> Option<(LinkId, LinkAction)> {
-        if let Some(link) = &mut self.command {
+        if let Some(link) = self.command.first_mut() {
             if let Some(action) = link.ordinary.supervisor.take_action() {
                 return Some((LinkId::COMMAND, action));
             }
@@ -326,10 +335,10 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
                 return Some((LinkId::URGENT, action));
             }
         }
-        if let Some(action) = self.state.as_mut().and_then(|link| link.supervisor.take_action()) {
+        if let Some(action) = self.state.first_mut().and_then(|link| link.supervisor.take_action()) {
             return Some((LinkId::STATE, action));
         }
-        if let Some(action) = self.modbus.as_mut().and_then(|link| link.supervisor.take_action()) {
+        if let Some(action) = self.modbus.first_mut().and_then(|link| link.supervisor.take_action()) {
             return Some((LinkId::MODBUS, action));
         }
         let mut recipes = self.recipes.iter_mut();
@@ -350,13 +359,13 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
     pub(super) fn deadline_of(&self, id: LinkId) -> Instant {
         let (own, supervisor) = match id {
             LinkId::COMMAND | LinkId::URGENT => {
-                return self.command.as_ref().map_or(Instant::NEVER, CommandLink::deadline);
+                return self.command.first().map_or(Instant::NEVER, CommandLink::deadline);
             }
-            LinkId::STATE => match &self.state {
+            LinkId::STATE => match self.state.first() {
                 Some(link) => (Instant::NEVER, &link.supervisor),
                 None => return Instant::NEVER,
             },
-            LinkId::MODBUS => match &self.modbus {
+            LinkId::MODBUS => match self.modbus.first() {
                 Some(link) => (link.deadline(), &link.supervisor),
                 None => return Instant::NEVER,
             },

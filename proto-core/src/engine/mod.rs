@@ -97,8 +97,8 @@ pub struct Engine<const PORTS: usize = 8, const UPLINKS: usize = 4, const FIELDS
     watches_bits: bool,
     /// Nothing depends on the clock before this. It may be earlier than needed, never later.
     timer_at: Instant,
-    /// The clock was looked at since `timer_at` was worked out.
-    rearm: bool,
+    /// `timer_at` was worked out after the clock was looked at last.
+    is_armed: bool,
     /// The newest instant that was told.
     now: Instant,
     /// A deadline has come and its tick has not been told: what is too old may still wait, so nothing
@@ -131,6 +131,7 @@ struct Ask {
 
 impl Ask {
     const ALL: Self = Self { links: true, actions: true, ports: true };
+    const NONE: Self = Self { links: false, actions: false, ports: false };
 }
 
 impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS, UPLINKS, FIELDS> {
@@ -191,7 +192,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         }
         if self.ask.links && !self.is_late {
             // To send a command, a connection may have to be closed.
-            self.ask.actions |= self.links.command.is_some();
+            self.ask.actions |= !self.links.command.is_empty();
             let upward = self.links.next_upward(&mut self.store, &mut self.ports, &mut buf[..], now);
             if let Some((link, len)) = upward {
                 self.arm(self.links.deadline_of(link));
@@ -221,8 +222,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             }
         }
         debug_assert!(self.is_late || self.all_are_silent(&mut buf[..], now), "who was not asked speaks");
-        if self.rearm {
-            self.rearm = false;
+        if !self.is_armed {
+            self.is_armed = true;
             self.timer_at = self.deadline();
         }
         let beat_at = if self.ports.is_empty() { Instant::NEVER } else { self.beat_at };
@@ -262,7 +263,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         }
         let mut rest = bytes;
         loop {
-            let (store, command) = (&mut self.store, &mut self.links.command);
+            let (store, command) = (&mut self.store, self.links.command.first_mut());
             let Some(port) = find_port(&mut self.ports, id) else { return };
             let accepted = port.frames(&mut rest, look, &self.bindings.inputs, store, command, now);
             self.ask.ports |= port.sender.is_due();
@@ -277,7 +278,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
 
     #[inline(never)]
     fn port_can(&mut self, id: PortId, frame: &CanFrame, now: Instant) {
-        let (store, command) = (&mut self.store, &mut self.links.command);
+        let (store, command) = (&mut self.store, self.links.command.first_mut());
         let Some(port) = find_port(&mut self.ports, id) else { return };
         if self.is_deaf {
             return port.discard(frame.data(), now);
@@ -293,7 +294,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     fn port_down(&mut self, id: PortId, now: Instant) {
         let Some(port) = find_port(&mut self.ports, id) else { return };
         self.ask = Ask::ALL;
-        port.down(&self.bindings.inputs, &mut self.links.command, now);
+        port.down(&self.bindings.inputs, self.links.command.first_mut(), now);
         self.drop_forgotten();
     }
 
@@ -301,7 +302,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     fn port_bus(&mut self, id: PortId, state: BusState, now: Instant) {
         let Some(port) = find_port(&mut self.ports, id) else { return };
         self.ask = Ask::ALL;
-        port.bus_state(state, &self.bindings.inputs, &mut self.links.command, now);
+        port.bus_state(state, &self.bindings.inputs, self.links.command.first_mut(), now);
         let deadline = port.deadline();
         self.arm(deadline);
         self.drop_forgotten();
@@ -376,7 +377,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
 
     /// Commands whose device is gone.
     fn drop_forgotten(&mut self) {
-        if let Some(command) = &mut self.links.command {
+        if let Some(command) = self.links.command.first_mut() {
             command.drop_forgotten(&mut self.ports);
             let deadline = command.deadline();
             self.arm(deadline);
@@ -463,7 +464,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         // At one instant the clock is looked at once: what is done now is due later.
         self.timer_at = now + Duration::from_micros(1);
         self.ask = Ask::ALL;
-        self.rearm = true;
+        self.is_armed = false;
         self.expire_frames(now);
         for index in 0..self.ports.len() {
             if let Some(port) = self.ports.get_mut(index) {
@@ -490,7 +491,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
                 bump(&mut port.counters.timeouts);
                 add(&mut port.counters.values_expired, dropped);
             }
-            forget_commands(frame.bindings.of(&self.bindings.inputs), &mut self.links.command, now);
+            forget_commands(frame.bindings.of(&self.bindings.inputs), self.links.command.first_mut(), now);
         }
         if timed_out {
             self.drop_forgotten();
@@ -523,14 +524,14 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             self.expire_waiting(now);
         }
         self.arm(self.store.deadline());
-        if let Some(command) = &mut self.links.command {
+        if let Some(command) = self.links.command.first_mut() {
             command.drop_overtaken(&mut self.ports);
             let deadline = command.deadline();
             self.arm(deadline);
         }
         self.image_changed();
         let dirty = self.store.outbox.dirty().and(&accepted.set);
-        let state = self.links.state.as_ref().map(|state| state.group);
+        let state = self.links.state.first().map(|state| state.group);
         let waits = self.links.recipes.iter().any(|link| {
             link.supervisor.is_up()
                 && !dirty.and(&link.writes).is_empty()

@@ -8,7 +8,7 @@ use super::outbox::{EdgeQueue, Outbox};
 use crate::config::{SafeValue, Span};
 use crate::image::{GroupId, Image, InputSet};
 use crate::sysvar::SysVar;
-use crate::time::{Duration, Instant};
+use crate::time::{Duration, Instant, Stamp};
 
 /// Input frames over all field ports: a stream recipe has one, a CAN recipe one an id.
 pub const MAX_INPUT_FRAMES: usize = 48;
@@ -77,9 +77,9 @@ pub(super) struct Store<const PORTS: usize> {
     lost: [u32; PORTS],
     has_lost: bool,
     /// No frame is overdue before this.
-    next_overdue: Instant,
+    next_overdue: Stamp,
     /// No value has waited too long before this.
-    next_expiry: Instant,
+    next_expiry: Stamp,
 }
 
 impl<const PORTS: usize> Store<PORTS> {
@@ -102,8 +102,8 @@ impl<const PORTS: usize> Store<PORTS> {
             reachable: InputSet::EMPTY,
             lost: [0; PORTS],
             has_lost: false,
-            next_overdue: Instant::NEVER,
-            next_expiry: Instant::NEVER,
+            next_overdue: Stamp::NEVER,
+            next_expiry: Stamp::NEVER,
         }
     }
 
@@ -112,14 +112,15 @@ impl<const PORTS: usize> Store<PORTS> {
     pub(super) fn accepted(&mut self, nth: usize, counters: &mut PortCounters, now: Instant) -> InputSet {
         let Some(frame) = self.frames.get_mut(nth) else { return InputSet::EMPTY };
         frame.overdue_at = now + frame.timeout;
-        self.next_overdue = self.next_overdue.min(frame.overdue_at);
-        self.next_expiry = self.next_expiry.min(too_old_at(now, frame.timeout));
+        self.next_overdue = Stamp::at(self.next_overdue.get().min(frame.overdue_at));
+        let too_old = too_old_at(now, frame.timeout);
+        self.next_expiry = Stamp::at(self.next_expiry.get().min(too_old));
         let (set, port) = (frame.set, usize::from(frame.port));
         self.image.stamp(GroupId(nth as u8), now);
         self.live = self.live.or(&set);
         if !self.safe.and(&set).is_empty() {
             // Safe values that still wait grow old from now on, and may be too old already.
-            self.next_expiry = now;
+            self.next_expiry = Stamp::at(now);
             self.safe = self.safe.minus(&set);
             self.unconfirmed = self.unconfirmed.minus(&set);
         }
@@ -141,12 +142,12 @@ impl<const PORTS: usize> Store<PORTS> {
     /// The first frame that is overdue at `now`, with its variables set to their safe values, and how
     /// many values that still waited were dropped; call again until `None`.
     pub(super) fn next_timeout(&mut self, safe: &[SafeBytes], now: Instant) -> Option<(InputFrame, usize)> {
-        if now < self.next_overdue {
+        if now < self.next_overdue.get() {
             return None;
         }
         let Some(frame) = self.frames.iter_mut().find(|frame| frame.overdue_at <= now) else {
             let next = self.frames.iter().map(|frame| frame.overdue_at).min();
-            self.next_overdue = next.unwrap_or(Instant::NEVER);
+            self.next_overdue = Stamp::at(next.unwrap_or(Instant::NEVER));
             return None;
         };
         frame.overdue_at = Instant::NEVER;
@@ -179,10 +180,10 @@ impl<const PORTS: usize> Store<PORTS> {
 
     /// Drops what has waited for longer than its port's timeout and counts it there.
     pub(super) fn expire_waiting(&mut self, mut count: impl FnMut(usize, usize), now: Instant) {
-        if now < self.next_expiry {
+        if now < self.next_expiry.get() {
             return;
         }
-        self.next_expiry = Instant::NEVER;
+        self.next_expiry = Stamp::NEVER;
         for frame in &self.frames {
             let waiting = frame.set.and(&InputSet::BYTES).and(&self.outbox.dirty()).minus(&self.safe);
             if waiting.is_empty() {
@@ -191,7 +192,8 @@ impl<const PORTS: usize> Store<PORTS> {
             let port = usize::from(frame.port);
             if let Some(queue) = self.edges.get_mut(port) {
                 let (dropped, oldest) = self.outbox.expire(queue, &waiting, frame.timeout, now);
-                self.next_expiry = self.next_expiry.min(too_old_at(oldest, frame.timeout));
+                let too_old = too_old_at(oldest, frame.timeout);
+                self.next_expiry = Stamp::at(self.next_expiry.get().min(too_old));
                 if dropped > 0 {
                     count(port, dropped);
                 }
@@ -201,7 +203,7 @@ impl<const PORTS: usize> Store<PORTS> {
 
     /// When something happens by itself.
     pub(super) fn deadline(&self) -> Instant {
-        self.next_overdue.min(self.next_expiry)
+        self.next_overdue.get().min(self.next_expiry.get())
     }
 
     /// These values have been handed to their link.

@@ -46,7 +46,7 @@ pub(super) fn fit(bindings: &[InputBind], values: impl Iterator<Item = Scalar>) 
 }
 
 /// After silence the next values pick no commands: they only set the base.
-pub(super) fn forget_commands(bindings: &[InputBind], commands: &mut Option<CommandLink>, now: Instant) {
+pub(super) fn forget_commands(bindings: &[InputBind], commands: Option<&mut CommandLink>, now: Instant) {
     let Some(link) = commands else { return };
     for binding in bindings {
         if let InputBind::Command(field) = binding {
