@@ -7,7 +7,7 @@ use heapless::Vec;
 
 use super::command_link::{CommandLink, MAX_COMMAND_BYTES, MAX_COMMAND_FIELDS};
 use super::counters::PortCounters;
-use super::field_port::{Codec, FieldPort, Line};
+use super::field_port::{Codec, FieldPort, LineTiming};
 use super::io::{BusState, LinkId, LinkKind, PortId, ReplyCode, Transport};
 use super::links::Links;
 use super::modbus_link::{MAX_POLL_BLOCKS, ModbusLink};
@@ -16,7 +16,7 @@ use super::plan::{Plan, PlanError, Source, WayUp, shown_by, uplinks};
 use super::sender::Sender;
 use super::state_link::StateLink;
 use super::store::{InputFrame, MAX_INPUT_FRAMES, SafeBytes, Store};
-use super::uplink::Uplink;
+use super::uplink::{Uplink, UplinkSetup};
 use super::user::{Bindings, InputBind};
 use super::{Ask, Engine};
 use crate::config::{
@@ -24,7 +24,7 @@ use crate::config::{
     Span, StreamPart, listen_address,
 };
 use crate::image::{GroupId, InputSet, MAX_GROUPS};
-use crate::link::{LinkTimings, Supervisor};
+use crate::link::LinkTimings;
 use crate::recipe::deframer::Deframer;
 use crate::recipe::model::{Framing, Rules};
 use crate::recipe::{CanLayout, PartError, StreamLayout};
@@ -103,7 +103,6 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             bindings: Bindings { inputs: Vec::new(), outputs: Vec::new() },
             safe_values: Vec::new(),
             links: Links::new(),
-            watches_bits: false,
             timer_at: Instant::ZERO,
             is_armed: false,
             now: Instant::ZERO,
@@ -151,7 +150,6 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             bindings,
             safe_values,
             links,
-            watches_bits,
             timer_at,
             is_armed,
             now,
@@ -174,7 +172,6 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         state.clear();
         modbus.clear();
         recipes.clear();
-        *watches_bits = false;
         *timer_at = Instant::ZERO;
         *is_armed = false;
         *now = Instant::ZERO;
@@ -229,8 +226,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         dialect: Dialect,
     ) -> Result<(), BuildError> {
         let (codec, line) = match &port.bus {
-            Bus::Rs485(settings) => (stream_codec(config, port.recipe, recipe)?, Line::new(settings)),
-            _ => (can_codec(config, port.recipe, recipe)?, Line::none()),
+            Bus::Rs485(settings) => (stream_codec(config, port.recipe, recipe)?, LineTiming::new(settings)),
+            _ => (can_codec(config, port.recipe, recipe)?, LineTiming::none()),
         };
         let first_frame = self.store.frames.len() as u8;
         let mut next_binding = self.bindings.inputs.len() as u16;
@@ -283,7 +280,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
                 outputs.len = outputs.len.saturating_add(1);
             }
         }
-        self.watches_bits |= matches!(recipe.send, SendOn::Rising { .. });
+        self.store.watches_bits |= matches!(recipe.send, SendOn::Rising { .. });
         let has_output = recipe.has(Direction::Output);
         let sender = Sender::new(recipe.send, recipe.on_stale, port.stale_after, port.cycle, has_output);
         let port = FieldPort {
@@ -373,9 +370,18 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         let timeouts =
             owners.filter_map(|port| config.ports.get(usize::from(port.0))).map(|port| port.timeout);
         let patience = timeouts.min().unwrap_or(PATIENCE).max(PATIENCE);
-        let supervisor = Supervisor::new(timings);
-        let uplink =
-            Uplink::new(id, (kind, transport), supervisor, (input, output), (set, writes), group, patience);
+        let uplink = Uplink::new(UplinkSetup {
+            id,
+            kind,
+            transport,
+            timings,
+            input,
+            output,
+            set,
+            writes,
+            group,
+            patience,
+        });
         self.links.recipes.push(uplink).map_err(|_| too_many("recipe links", UPLINKS))
     }
 

@@ -6,6 +6,7 @@
 use super::command_link::CommandLink;
 use super::counters::{PortCounters, add, bump};
 use super::io::{BusState, PortId, ReplyCode};
+use super::outcome::Outcome;
 use super::sender::Sender;
 use super::store::Store;
 use super::user::{InputBind, fit, forget_commands};
@@ -30,13 +31,13 @@ pub(super) enum Codec {
 
 /// Timing of a half-duplex line.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Line {
+pub(super) struct LineTiming {
     pub idle_gap: Duration,
     pub turnaround: Duration,
     heard: Instant,
 }
 
-impl Line {
+impl LineTiming {
     pub(super) fn new(settings: &Rs485) -> Self {
         let idle_gap = settings.idle_gap.max(settings.characters_and_a_half(3));
         Self { idle_gap, turnaround: settings.turnaround, heard: Instant::ZERO }
@@ -58,7 +59,7 @@ pub(super) struct FieldPort {
     pub id: PortId,
     pub codec: Codec,
     pub mode: Mode,
-    pub line: Line,
+    pub line: LineTiming,
     pub sender: Sender,
     /// The port's range of the input bindings, those of all CAN frames in one row.
     pub inputs: Span,
@@ -70,13 +71,6 @@ pub(super) struct FieldPort {
     pub bus: BusState,
     pub reply: ReplyCode,
     pub counters: PortCounters,
-}
-
-/// Whether somebody looks at the image between two frames: a bit may rise and fall within one chunk.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Look {
-    AtEach,
-    AfterAll,
 }
 
 /// The frames that were accepted in one call.
@@ -173,15 +167,14 @@ impl FieldPort {
         self.line.heard = now;
     }
 
-    /// Takes the frames in `rest`, or up to the first accepted one when somebody looks at each.
+    /// Takes the frames in `rest`, or up to the first accepted one when the image is looked at after
+    /// each.
     pub(super) fn frames<const PORTS: usize>(
         &mut self,
         rest: &mut &[u8],
-        look: Look,
         bindings: &[InputBind],
         store: &mut Store<PORTS>,
         commands: Option<&mut CommandLink>,
-        now: Instant,
     ) -> Accepted {
         let mut accepted = Accepted::default();
         let bytes = core::mem::take(rest);
@@ -199,13 +192,12 @@ impl FieldPort {
             port: self.id,
             store,
             commands,
-            now,
         };
         let mut left = bytes;
         while let Some(payload) = deframer.next_frame(layout, &mut left) {
             if let Some(set) = frames.take(layout, payload, usize::from(self.first_frame)) {
                 accepted = Accepted { frames: accepted.frames.wrapping_add(1), set };
-                if look == Look::AtEach {
+                if frames.store.watches_bits {
                     break;
                 }
             }
@@ -225,7 +217,6 @@ impl FieldPort {
         bindings: &[InputBind],
         store: &mut Store<PORTS>,
         commands: Option<&mut CommandLink>,
-        now: Instant,
     ) -> Accepted {
         add(&mut self.counters.bytes_in, frame.data().len());
         let usable = self.is_usable();
@@ -252,12 +243,21 @@ impl FieldPort {
             port: self.id,
             store,
             commands,
-            now,
         };
         let slot = usize::from(self.first_frame).saturating_add(index);
         let Some(set) = frames.take(&frame_layout, frame.data(), slot) else { return Accepted::default() };
         self.sender.frames_accepted(1, usable, &mut self.counters);
         Accepted { frames: 1, set }
+    }
+
+    /// One of the port's commands came to its end.
+    pub(super) fn command_ended(&mut self, outcome: Outcome) {
+        if outcome.code == ReplyCode::NotSent {
+            bump(&mut self.counters.commands_dropped);
+        }
+        if self.counters.commands == outcome.nth {
+            self.reply = outcome.code;
+        }
     }
 
     /// Looks at the clock: cycles and silence.
@@ -307,7 +307,6 @@ struct Frames<'a, const PORTS: usize> {
     port: PortId,
     store: &'a mut Store<PORTS>,
     commands: Option<&'a mut CommandLink>,
-    now: Instant,
 }
 
 impl<const PORTS: usize> Frames<'_, PORTS> {
@@ -345,7 +344,7 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
             }
         }
         bump(&mut self.counters.frames_in);
-        Some(self.store.accepted(slot, self.counters, self.now))
+        Some(self.store.accepted(slot, self.counters))
     }
 
     fn apply_user(&mut self, binding: &InputBind, value: Scalar) {
@@ -359,7 +358,14 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
             }
             InputBind::Command(field) => {
                 if let Some(link) = &mut self.commands {
-                    link.value(field, value, self.port, self.reply, self.counters, self.now);
+                    let nth = self.counters.commands.wrapping_add(1);
+                    if let Some(code) = link.value(field, value, (self.port, nth), self.store.now) {
+                        self.counters.commands = nth;
+                        *self.reply = code;
+                        if code == ReplyCode::NotSent {
+                            bump(&mut self.counters.commands_dropped);
+                        }
+                    }
                 }
             }
         }

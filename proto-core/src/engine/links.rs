@@ -1,10 +1,13 @@
 //! The links to the controller together: whom a report is for, and in what order they speak.
+//!
+//! Three kinds are one connection each: [`Connection`] says what differs between them. The command
+//! link has two connections and decides for both.
 
 use heapless::{String, Vec};
 
 use super::command_link::CommandLink;
-use super::counters::LinkCounters;
-use super::field_port::{FieldPort, Look};
+use super::connection::Connection;
+use super::counters::{LinkCounters, add};
 use super::io::{Endpoint, LinkId, LinkKind, Transport};
 use super::modbus_link::ModbusLink;
 use super::state_link::StateLink;
@@ -36,6 +39,26 @@ pub(super) type Maybe<T> = Vec<T, 1>;
 
 /// Longest address or name of the controller.
 const MAX_HOST: usize = 64;
+
+/// `$do` with the link `$id` as `$link`, if it is one of those that are one connection each.
+macro_rules! with_connection {
+    ($links:expr, $id:expr, $link:ident => $do:expr) => {
+        match $id {
+            LinkId::STATE => $links.state.first_mut().map(|$link| $do),
+            LinkId::MODBUS => $links.modbus.first_mut().map(|$link| $do),
+            id => $links.recipes.iter_mut().find(|link| link.id == id).map(|$link| $do),
+        }
+    };
+}
+
+/// `$do` with each link that is one connection as `$link`.
+macro_rules! each_connection {
+    ($links:expr, $link:ident => $do:expr) => {
+        $links.state.iter_mut().for_each(|$link| $do);
+        $links.modbus.iter_mut().for_each(|$link| $do);
+        $links.recipes.iter_mut().for_each(|$link| $do);
+    };
+}
 
 /// The links that the configuration needs.
 #[derive(Debug, Clone)]
@@ -105,219 +128,140 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
     }
 
     /// Everything that depends on the clock.
-    pub(super) fn advance<const PORTS: usize>(
-        &mut self,
-        store: &mut Store<PORTS>,
-        ports: &mut [FieldPort],
-        now: Instant,
-    ) {
+    pub(super) fn advance<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
+        let now = store.now;
         if let Some(link) = self.command.first_mut() {
-            link.advance(ports, now);
+            link.advance(now);
         }
-        if let Some(link) = self.state.first_mut()
-            && link.supervisor.advance(now)
-        {
-            link.lost();
-        }
-        if let Some(link) = self.modbus.first_mut() {
-            link.advance(store, now);
+        each_connection!(self, link => {
+            link.advance(store);
             if link.supervisor.advance(now) {
                 link.lost(store);
             }
-        }
-        for link in &mut self.recipes {
-            link.advance(store, now);
-            if link.supervisor.advance(now) {
-                link.lost(store);
-            }
-        }
+        });
     }
 
     /// The gateway itself slept: what waits on its connections is as old as that, so all of them begin
     /// anew.
-    pub(super) fn slept<const PORTS: usize>(
-        &mut self,
-        store: &mut Store<PORTS>,
-        ports: &mut [FieldPort],
-        now: Instant,
-    ) {
+    pub(super) fn slept<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
+        let now = store.now;
         if let Some(link) = self.command.first_mut() {
-            link.slept(ports, now);
+            link.slept(now);
         }
-        if let Some(link) = self.state.first_mut() {
-            link.supervisor.give_up(now);
-            link.lost();
-        }
-        if let Some(link) = self.modbus.first_mut() {
+        each_connection!(self, link => {
             link.supervisor.give_up(now);
             link.lost(store);
-        }
-        for link in &mut self.recipes {
-            link.supervisor.give_up(now);
-            link.lost(store);
-        }
+        });
     }
 
     /// The driver reports that a link is usable.
-    pub(super) fn up<const PORTS: usize>(&mut self, id: LinkId, store: &mut Store<PORTS>, now: Instant) {
+    pub(super) fn up<const PORTS: usize>(&mut self, id: LinkId, store: &mut Store<PORTS>) {
+        let now = store.now;
         if !store.safe.is_empty() {
-            store.controller_was_away(now);
+            store.controller_was_away();
         }
-        match id {
-            LinkId::COMMAND | LinkId::URGENT => {
-                if let Some(link) = self.command.first_mut() {
-                    link.up(id, now);
-                }
-            }
-            LinkId::STATE => {
-                if let Some(link) = self.state.first_mut() {
-                    link.supervisor.up(now);
-                }
-            }
-            LinkId::MODBUS => {
-                if let Some(link) = self.modbus.first_mut()
-                    && link.supervisor.up(now)
-                {
-                    link.up(store);
-                }
-            }
-            _ => {
-                if let Some(link) = self.recipe(id)
-                    && link.supervisor.up(now)
-                {
-                    link.up(store, now);
-                }
-            }
+        if let LinkId::COMMAND | LinkId::URGENT = id {
+            self.command.iter_mut().for_each(|link| link.up(id, now));
+            return;
         }
+        with_connection!(self, id, link => {
+            if link.supervisor.up(now) {
+                link.opened(store);
+            }
+        });
     }
 
     /// The driver reports that a link is lost or could not be opened.
-    pub(super) fn down<const PORTS: usize>(
-        &mut self,
-        id: LinkId,
-        store: &mut Store<PORTS>,
-        ports: &mut [FieldPort],
-        now: Instant,
-    ) {
-        match id {
-            LinkId::COMMAND | LinkId::URGENT => {
-                if let Some(link) = self.command.first_mut() {
-                    link.down(id, ports, now);
-                }
-            }
-            LinkId::STATE => {
-                if let Some(link) = self.state.first_mut()
-                    && link.supervisor.down(now)
-                {
-                    link.lost();
-                }
-            }
-            LinkId::MODBUS => {
-                if let Some(link) = self.modbus.first_mut()
-                    && link.supervisor.down(now)
-                {
-                    link.lost(store);
-                }
-            }
-            _ => {
-                if let Some(link) = self.recipe(id)
-                    && link.supervisor.down(now)
-                {
-                    link.lost(store);
-                }
-            }
+    pub(super) fn down<const PORTS: usize>(&mut self, id: LinkId, store: &mut Store<PORTS>) {
+        let now = store.now;
+        if let LinkId::COMMAND | LinkId::URGENT = id {
+            self.command.iter_mut().for_each(|link| link.down(id, now));
+            return;
         }
+        with_connection!(self, id, link => {
+            if link.supervisor.down(now) {
+                link.lost(store);
+            }
+        });
     }
 
-    /// Bytes from a link; when somebody looks at each frame, up to the first. Those of a link that is
-    /// not up, as the engine sees it, are of a connection that it gave up.
-    pub(super) fn bytes<const PORTS: usize>(
+    /// Bytes arrived on a link; whether [`Self::received`] takes them. Those of a link that is not up, as
+    /// the engine sees it, are of a connection that it gave up.
+    pub(super) fn heard(&mut self, id: LinkId, len: usize, now: Instant) -> bool {
+        if let LinkId::COMMAND | LinkId::URGENT = id {
+            return self.command.first_mut().is_some_and(|link| link.heard(id, len, now));
+        }
+        with_connection!(self, id, link => {
+            let is_up = link.supervisor.is_up();
+            if is_up {
+                link.supervisor.heard(now);
+                add(&mut link.counters.bytes_in, len);
+            }
+            is_up
+        })
+        .unwrap_or(false)
+    }
+
+    /// What was heard; the bytes that are left when the image is to be looked at first.
+    pub(super) fn received<'b, const PORTS: usize>(
         &mut self,
         id: LinkId,
-        rest: &mut &[u8],
-        look: Look,
+        bytes: &'b [u8],
         store: &mut Store<PORTS>,
-        ports: &mut [FieldPort],
-        now: Instant,
-    ) {
-        let bytes = core::mem::take(rest);
-        match id {
-            LinkId::COMMAND | LinkId::URGENT => {
-                if let Some(link) = self.command.first_mut() {
-                    link.bytes(id, bytes, ports, now);
-                }
-            }
-            LinkId::STATE => {
-                if let Some(link) = self.state.first_mut().filter(|link| link.supervisor.is_up()) {
-                    *rest = link.bytes(bytes, look, store, now);
-                }
-            }
-            LinkId::MODBUS => {
-                if let Some(link) = self.modbus.first_mut().filter(|link| link.supervisor.is_up()) {
-                    link.bytes(bytes, store, now);
-                }
-            }
-            _ => {
-                if let Some(link) = self.recipe(id).filter(|link| link.supervisor.is_up()) {
-                    *rest = link.bytes(bytes, look, store, now);
-                }
-            }
+    ) -> &'b [u8] {
+        if let LinkId::COMMAND | LinkId::URGENT = id {
+            self.command.iter_mut().for_each(|link| link.received(id, bytes, store.now));
+            return &[];
         }
+        with_connection!(self, id, link => link.received(bytes, store)).unwrap_or(&[])
     }
 
     /// The transport took everything; when something happens there by itself.
     pub(super) fn sent(&mut self, id: LinkId) -> Instant {
-        match id {
-            LinkId::COMMAND | LinkId::URGENT => {
-                self.command.iter_mut().for_each(|link| link.sent(id));
-                self.deadline_of(id)
-            }
-            LinkId::MODBUS => self.modbus.first_mut().map_or(Instant::NEVER, |link| {
-                link.sent();
-                link.deadline()
-            }),
-            _ => self.recipe(id).map_or(Instant::NEVER, |link| {
-                link.sent();
-                link.deadline()
-            }),
+        if let LinkId::COMMAND | LinkId::URGENT = id {
+            self.command.iter_mut().for_each(|link| link.sent(id));
+            return self.deadline_of(id);
         }
+        let deadline = with_connection!(self, id, link => {
+            link.sent();
+            link.deadline()
+        });
+        deadline.unwrap_or(Instant::NEVER)
     }
 
     /// The peer's transport has acknowledged all but `left` bytes.
     pub(super) fn acked(&mut self, id: LinkId, left: u32) {
-        match id {
-            LinkId::COMMAND | LinkId::URGENT => self.command.iter_mut().for_each(|link| link.acked(id, left)),
-            LinkId::MODBUS => self.modbus.iter_mut().for_each(|link| link.acked(left)),
-            _ => self.recipe(id).into_iter().for_each(|link| link.acked(left)),
+        if let LinkId::COMMAND | LinkId::URGENT = id {
+            self.command.iter_mut().for_each(|link| link.acked(id, left));
+            return;
         }
+        with_connection!(self, id, link => link.acked(left));
     }
 
     /// What goes to the controller: what stops the robot, then field values, commands last.
     pub(super) fn next_upward<const PORTS: usize>(
         &mut self,
         store: &mut Store<PORTS>,
-        ports: &mut [FieldPort],
         out: &mut [u8],
-        now: Instant,
     ) -> Option<(LinkId, usize)> {
         if let Some(link) = self.command.first_mut()
-            && let Some(sent) = link.next_stop(ports, out, now)
+            && let Some(sent) = link.next_stop(out, store.now)
         {
             return Some(sent);
         }
         let state = self.state.first().map(|state| state.group);
         for link in &mut self.recipes {
-            if let Some(len) = link.next_frame(store, state, out, now) {
+            if let Some(len) = link.next_frame(store, state, out) {
                 return Some((link.id, len));
             }
         }
         if let Some(link) = self.modbus.first_mut()
-            && let Some(len) = link.next_request(store, out, now)
+            && let Some(len) = link.next_request(store, out)
         {
             return Some((LinkId::MODBUS, len));
         }
         let link = self.command.first_mut()?;
-        link.next_command(ports, out, now).map(|len| (LinkId::COMMAND, len))
+        link.next_command(out, store.now).map(|len| (LinkId::COMMAND, len))
     }
 
     /// Whether what stops the robot waits.
@@ -357,27 +301,16 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
 
     /// When something happens by itself on one link.
     pub(super) fn deadline_of(&self, id: LinkId) -> Instant {
-        let (own, supervisor) = match id {
-            LinkId::COMMAND | LinkId::URGENT => {
-                return self.command.first().map_or(Instant::NEVER, CommandLink::deadline);
+        let of = |own: Instant, supervisor: &Supervisor| own.min(supervisor.deadline());
+        let deadline = match id {
+            LinkId::COMMAND | LinkId::URGENT => self.command.first().map(CommandLink::deadline),
+            LinkId::STATE => self.state.first().map(|link| link.supervisor.deadline()),
+            LinkId::MODBUS => self.modbus.first().map(|link| of(link.deadline(), &link.supervisor)),
+            _ => {
+                let link = self.recipes.iter().find(|link| link.id == id);
+                link.map(|link| of(link.deadline(), &link.supervisor))
             }
-            LinkId::STATE => match self.state.first() {
-                Some(link) => (Instant::NEVER, &link.supervisor),
-                None => return Instant::NEVER,
-            },
-            LinkId::MODBUS => match self.modbus.first() {
-                Some(link) => (link.deadline(), &link.supervisor),
-                None => return Instant::NEVER,
-            },
-            _ => match self.recipes.iter().find(|link| link.id == id) {
-                Some(link) => (link.deadline(), &link.supervisor),
-                None => return Instant::NEVER,
-            },
         };
-        own.min(supervisor.deadline())
-    }
-
-    fn recipe(&mut self, id: LinkId) -> Option<&mut Uplink> {
-        self.recipes.iter_mut().find(|link| link.id == id)
+        deadline.unwrap_or(Instant::NEVER)
     }
 }

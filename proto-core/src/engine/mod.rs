@@ -15,6 +15,7 @@
 
 mod build;
 mod command_link;
+mod connection;
 mod counters;
 mod field_output;
 mod field_port;
@@ -23,6 +24,7 @@ mod io;
 mod links;
 mod modbus_link;
 mod outbox;
+mod outcome;
 mod plan;
 mod sender;
 mod session;
@@ -33,20 +35,21 @@ mod uplink;
 mod user;
 
 pub use build::BuildError;
-pub use command_link::{COMMAND_QUEUE, MAX_COMMAND_BYTES, MAX_COMMAND_FIELDS};
+pub use command_link::{MAX_COMMAND_BYTES, MAX_COMMAND_FIELDS};
 pub use counters::{LinkCounters, PortCounters};
 pub use io::{BusState, Endpoint, Input, LinkId, LinkKind, Output, PortId, PortState, ReplyCode, Transport};
 pub use links::LinkInfo;
 pub use modbus_link::MAX_POLL_BLOCKS;
 pub use outbox::EDGE_QUEUE;
 pub use plan::{Plan, PlanError, Source, WayUp};
+pub use stops::COMMAND_QUEUE;
 pub use store::MAX_INPUT_FRAMES;
 
 use heapless::Vec;
 
 use counters::{add, bump};
 use field_output::Downward;
-use field_port::{Accepted, FieldPort, Look};
+use field_port::{Accepted, FieldPort};
 use links::Links;
 use store::{SafeBytes, Store};
 use user::{Bindings, forget_commands};
@@ -93,8 +96,6 @@ pub struct Engine<const PORTS: usize = 8, const UPLINKS: usize = 4, const FIELDS
     bindings: Bindings<FIELDS>,
     safe_values: Vec<SafeBytes, MAX_SAFE_VALUES>,
     links: Links<UPLINKS>,
-    /// Whether some port sends on a rising bit.
-    watches_bits: bool,
     /// Nothing depends on the clock before this. It may be earlier than needed, never later.
     timer_at: Instant,
     /// `timer_at` was worked out after the clock was looked at last.
@@ -153,8 +154,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             Input::PortUp { port } => self.change_port(port, FieldPort::up),
             Input::PortDown { port } => self.port_down(port, now),
             Input::PortBus { port, state } => self.port_bus(port, state, now),
-            Input::LinkUp { link } => self.link_up(link, now),
-            Input::LinkDown { link } => self.link_down(link, now),
+            Input::LinkUp { link } => self.link_up(link),
+            Input::LinkDown { link } => self.link_down(link),
             Input::LinkBytes { link, bytes } => self.link_bytes(link, bytes, now),
             Input::LinkSent { link } => {
                 let deadline = self.links.sent(link);
@@ -193,7 +194,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         if self.ask.links && !self.is_late {
             // To send a command, a connection may have to be closed.
             self.ask.actions |= !self.links.command.is_empty();
-            let upward = self.links.next_upward(&mut self.store, &mut self.ports, &mut buf[..], now);
+            self.store.now = now;
+            let upward = self.links.next_upward(&mut self.store, &mut buf[..]);
+            self.carry_outcomes();
             if let Some((link, len)) = upward {
                 self.arm(self.links.deadline_of(link));
                 return Output::LinkSend { link, bytes: buf.get(..len).unwrap_or(&[]) };
@@ -237,7 +240,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
 
     /// Whether who is not asked has nothing to say.
     fn all_are_silent(&mut self, out: &mut [u8], now: Instant) -> bool {
-        self.links.next_upward(&mut self.store, &mut self.ports, out, now).is_none()
+        self.links.next_upward(&mut self.store, out).is_none()
             && self.links.next_action().is_none()
             && self.next_downward(out, now).is_none()
     }
@@ -254,7 +257,6 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     // What an input does is a function of its own, so that no other pays for the registers it needs.
     #[inline(never)]
     fn port_bytes(&mut self, id: PortId, bytes: &[u8], now: Instant) {
-        let look = self.look();
         if let Some(port) = find_port(&mut self.ports, id) {
             if self.is_deaf {
                 return port.discard(bytes, now);
@@ -265,7 +267,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         loop {
             let (store, command) = (&mut self.store, self.links.command.first_mut());
             let Some(port) = find_port(&mut self.ports, id) else { return };
-            let accepted = port.frames(&mut rest, look, &self.bindings.inputs, store, command, now);
+            let accepted = port.frames(&mut rest, &self.bindings.inputs, store, command);
             self.ask.ports |= port.sender.is_due();
             let deadline = port.deadline();
             self.arm(deadline);
@@ -283,7 +285,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         if self.is_deaf {
             return port.discard(frame.data(), now);
         }
-        let accepted = port.can(frame, &self.bindings.inputs, store, command, now);
+        let accepted = port.can(frame, &self.bindings.inputs, store, command);
         self.ask.ports |= port.sender.is_due();
         let deadline = port.deadline();
         self.arm(deadline);
@@ -309,25 +311,27 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     }
 
     #[cold]
-    fn link_up(&mut self, link: LinkId, now: Instant) {
-        self.links.up(link, &mut self.store, now);
+    fn link_up(&mut self, link: LinkId) {
+        self.links.up(link, &mut self.store);
         self.arm_link(link);
     }
 
     #[cold]
-    fn link_down(&mut self, link: LinkId, now: Instant) {
-        self.links.down(link, &mut self.store, &mut self.ports, now);
-        self.count_lost();
+    fn link_down(&mut self, link: LinkId) {
+        self.links.down(link, &mut self.store);
+        self.carry_results();
         self.arm_link(link);
     }
 
     #[inline(never)]
     fn link_bytes(&mut self, link: LinkId, bytes: &[u8], now: Instant) {
-        let look = self.look();
-        let mut rest = bytes;
+        let is_up = self.links.heard(link, bytes.len(), now);
+        let mut rest = if is_up { bytes } else { &[] };
         loop {
-            self.links.bytes(link, &mut rest, look, &mut self.store, &mut self.ports, now);
-            self.count_lost();
+            if is_up {
+                rest = self.links.received(link, rest, &mut self.store);
+            }
+            self.carry_results();
             self.arm_link(link);
             self.image_changed();
             if rest.is_empty() {
@@ -339,6 +343,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     /// The present, and whether the gateway has slept until now.
     fn present(&mut self, now: Instant) -> Instant {
         let now = self.forward(now);
+        self.store.now = now;
         if now >= self.beat_at {
             // A configured engine is called at every beat; before the first call nothing was late.
             if self.now != Instant::ZERO && now.saturating_since(self.now) > ASLEEP {
@@ -367,7 +372,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     fn wake(&mut self, now: Instant) {
         self.sleeps = self.sleeps.wrapping_add(1);
         // Before deadlines pass: one of them may be to open a link that has been down.
-        self.links.slept(&mut self.store, &mut self.ports, now);
+        self.links.slept(&mut self.store);
         self.advance(now);
         self.ports.iter_mut().for_each(FieldPort::slept);
         self.is_deaf = true;
@@ -378,10 +383,11 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     /// Commands whose device is gone.
     fn drop_forgotten(&mut self) {
         if let Some(command) = self.links.command.first_mut() {
-            command.drop_forgotten(&mut self.ports);
+            command.drop_forgotten();
             let deadline = command.deadline();
             self.arm(deadline);
         }
+        self.carry_outcomes();
     }
 
     /// The process image.
@@ -471,21 +477,31 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
                 port.advance(now);
             }
         }
-        self.links.advance(&mut self.store, &mut self.ports, now);
-        self.count_lost();
+        self.links.advance(&mut self.store);
+        self.carry_results();
     }
 
-    /// Values that were dropped with their link, counted at their ports.
-    fn count_lost(&mut self) {
+    /// What came of values and commands on a link, for the ports that they are of.
+    fn carry_results(&mut self) {
+        self.carry_outcomes();
         let Some(lost) = self.store.take_lost() else { return };
         for (port, dropped) in self.ports.iter_mut().zip(lost) {
             add(&mut port.counters.values_expired, dropped as usize);
         }
     }
 
+    fn carry_outcomes(&mut self) {
+        let Some(command) = self.links.command.first_mut() else { return };
+        command.outcomes.take(|outcome| {
+            if let Some(port) = find_port(&mut self.ports, outcome.port) {
+                port.command_ended(outcome);
+            }
+        });
+    }
+
     fn expire_frames(&mut self, now: Instant) {
         let mut timed_out = false;
-        while let Some((frame, dropped)) = self.store.next_timeout(&self.safe_values, now) {
+        while let Some((frame, dropped)) = self.store.next_timeout(&self.safe_values) {
             timed_out = true;
             if let Some(port) = self.ports.get_mut(usize::from(frame.port)) {
                 bump(&mut port.counters.timeouts);
@@ -497,20 +513,17 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             self.drop_forgotten();
             self.image_changed();
         }
-        self.expire_waiting(now);
+        self.expire_waiting();
     }
 
     /// Values that have waited too long are dropped.
-    fn expire_waiting(&mut self, now: Instant) {
+    fn expire_waiting(&mut self) {
         let ports = &mut self.ports;
-        self.store.expire_waiting(
-            |port, dropped| {
-                if let Some(port) = ports.get_mut(port) {
-                    add(&mut port.counters.values_expired, dropped);
-                }
-            },
-            now,
-        );
+        self.store.expire_waiting(|port, dropped| {
+            if let Some(port) = ports.get_mut(port) {
+                add(&mut port.counters.values_expired, dropped);
+            }
+        });
     }
 
     /// After a field frame: bits that trigger, and frames that have to wait for their neighbours.
@@ -521,35 +534,31 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         self.ask.links = true;
         let deadline = self.store.deadline();
         if deadline <= now {
-            self.expire_waiting(now);
+            self.expire_waiting();
         }
         self.arm(self.store.deadline());
         if let Some(command) = self.links.command.first_mut() {
-            command.drop_overtaken(&mut self.ports);
+            command.drop_overtaken();
             let deadline = command.deadline();
             self.arm(deadline);
         }
+        self.carry_outcomes();
         self.image_changed();
         let dirty = self.store.outbox.dirty().and(&accepted.set);
         let state = self.links.state.first().map(|state| state.group);
         let waits = self.links.recipes.iter().any(|link| {
             link.supervisor.is_up()
                 && !dirty.and(&link.writes).is_empty()
-                && !link.is_ready(&self.store, state, now)
+                && !link.is_ready(&self.store, state)
         });
         if waits && let Some(port) = find_port(&mut self.ports, port) {
             add(&mut port.counters.withheld, accepted.frames as usize);
         }
     }
 
-    /// Bits that trigger are looked at after each frame, however many come at once.
-    fn look(&self) -> Look {
-        if self.watches_bits { Look::AtEach } else { Look::AfterAll }
-    }
-
     /// Values in the image changed: bits that trigger may have risen.
     fn image_changed(&mut self) {
-        if !self.watches_bits {
+        if !self.store.watches_bits {
             return;
         }
         self.ask.ports = true;

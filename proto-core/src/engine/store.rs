@@ -46,6 +46,11 @@ impl SafeBytes {
 
 #[derive(Debug, Clone)]
 pub(super) struct Store<const PORTS: usize> {
+    /// The instant of this call of the engine.
+    pub now: Instant,
+    /// Some port sends on a rising bit: the engine looks at the image after each frame, however many
+    /// came at once.
+    pub watches_bits: bool,
     pub image: Image,
     pub outbox: Outbox,
     /// One queue a field port.
@@ -85,6 +90,8 @@ pub(super) struct Store<const PORTS: usize> {
 impl<const PORTS: usize> Store<PORTS> {
     pub(super) const fn new() -> Self {
         Self {
+            now: Instant::ZERO,
+            watches_bits: false,
             image: Image::new(),
             outbox: Outbox::new(),
             edges: Vec::new(),
@@ -109,7 +116,8 @@ impl<const PORTS: usize> Store<PORTS> {
 
     /// The values of an accepted frame stand in the image: they are to be written. Returns those
     /// whose link is up.
-    pub(super) fn accepted(&mut self, nth: usize, counters: &mut PortCounters, now: Instant) -> InputSet {
+    pub(super) fn accepted(&mut self, nth: usize, counters: &mut PortCounters) -> InputSet {
+        let now = self.now;
         let Some(frame) = self.frames.get_mut(nth) else { return InputSet::EMPTY };
         frame.overdue_at = now + frame.timeout;
         self.next_overdue = Stamp::at(self.next_overdue.get().min(frame.overdue_at));
@@ -139,9 +147,10 @@ impl<const PORTS: usize> Store<PORTS> {
         reachable
     }
 
-    /// The first frame that is overdue at `now`, with its variables set to their safe values, and how
+    /// The first frame that is overdue, with its variables set to their safe values, and how
     /// many values that still waited were dropped; call again until `None`.
-    pub(super) fn next_timeout(&mut self, safe: &[SafeBytes], now: Instant) -> Option<(InputFrame, usize)> {
+    pub(super) fn next_timeout(&mut self, safe: &[SafeBytes]) -> Option<(InputFrame, usize)> {
+        let now = self.now;
         if now < self.next_overdue.get() {
             return None;
         }
@@ -179,7 +188,8 @@ impl<const PORTS: usize> Store<PORTS> {
     }
 
     /// Drops what has waited for longer than its port's timeout and counts it there.
-    pub(super) fn expire_waiting(&mut self, mut count: impl FnMut(usize, usize), now: Instant) {
+    pub(super) fn expire_waiting(&mut self, mut count: impl FnMut(usize, usize)) {
+        let now = self.now;
         if now < self.next_expiry.get() {
             return;
         }
@@ -247,27 +257,27 @@ impl<const PORTS: usize> Store<PORTS> {
     }
 
     /// The controller has these safe values, as far as they still stand.
-    pub(super) fn confirm(&mut self, safe: &InputSet, now: Instant) {
+    pub(super) fn confirm(&mut self, safe: &InputSet) {
         if !safe.and(&self.unconfirmed).and(&self.unanswered).is_empty() {
-            self.confirmed_at = now;
+            self.confirmed_at = self.now;
         }
         self.unconfirmed = self.unconfirmed.minus(safe);
     }
 
     /// Whether another value than the safe one, shown now, can be what the controller had all along.
     /// Later it is another master's doing.
-    pub(super) fn may_doubt(&self, now: Instant) -> bool {
-        now < self.confirmed_at + DOUBT
+    pub(super) fn may_doubt(&self) -> bool {
+        self.now < self.confirmed_at + DOUBT
     }
 
     /// Outputs that came just now show another value than the safe one.
-    pub(super) fn doubt_by_witnesses(&mut self, now: Instant) {
-        if !self.may_doubt(now) {
+    pub(super) fn doubt_by_witnesses(&mut self) {
+        if !self.may_doubt() {
             return;
         }
         for var in self.safe.minus(&self.unconfirmed).and(&InputSet::BYTES).iter() {
             if let Some(witness) = var.shown_by()
-                && self.image.known_since(witness) == Some(now)
+                && self.image.known_since(witness) == Some(self.now)
                 && self.image.value(witness) != self.image.value(var)
             {
                 self.doubt(var);
@@ -284,33 +294,33 @@ impl<const PORTS: usize> Store<PORTS> {
     }
 
     /// Something came that the controller sends steadily.
-    pub(super) fn heard(&mut self, now: Instant) {
-        if !self.is_heard(now) {
+    pub(super) fn heard(&mut self) {
+        if !self.is_heard() {
             self.era = self.era.wrapping_add(1);
         }
-        self.heard_at = Some(now);
+        self.heard_at = Some(self.now);
     }
 
     /// Whether the controller has been there all the time since the era began.
-    pub(super) fn is_heard(&self, now: Instant) -> bool {
-        !is_gap(self.heard_at, now)
+    pub(super) fn is_heard(&self) -> bool {
+        !is_gap(self.heard_at, self.now)
     }
 
     /// The controller may have started anew: safe values are written once more.
-    pub(super) fn controller_was_away(&mut self, now: Instant) {
+    pub(super) fn controller_was_away(&mut self) {
         self.unconfirmed = self.safe;
-        self.unconfirmed_since = now;
+        self.unconfirmed_since = self.now;
         self.outbox.again(&self.safe);
     }
 
     /// Whether what the controller shows now can be what it made of the safe values, and not older.
-    pub(super) fn may_confirm(&self, now: Instant) -> bool {
-        !self.unconfirmed.is_empty() && now >= self.unconfirmed_since + SHOWN_AFTER
+    pub(super) fn may_confirm(&self) -> bool {
+        !self.unconfirmed.is_empty() && self.now >= self.unconfirmed_since + SHOWN_AFTER
     }
 
     /// Outputs that show what an input was set to have come: they may confirm safe values.
-    pub(super) fn look_at_witnesses(&mut self, now: Instant) {
-        if !self.may_confirm(now) {
+    pub(super) fn confirm_by_witnesses(&mut self) {
+        if !self.may_confirm() {
             return;
         }
         let since = self.unconfirmed_since + SHOWN_AFTER;
@@ -319,7 +329,7 @@ impl<const PORTS: usize> Store<PORTS> {
                 && self.image.known_since(witness).is_some_and(|at| at >= since)
                 && self.image.value(witness) == self.image.value(var)
             {
-                self.confirm(&InputSet::from_iter([var]), now);
+                self.confirm(&InputSet::from_iter([var]));
             }
         }
     }
