@@ -6,7 +6,7 @@
 //! [`crate::sysvar`].
 
 mod alignment;
-mod codes;
+pub(super) mod codes;
 mod packet;
 mod places;
 mod stream;
@@ -16,10 +16,7 @@ pub use alignment::Misaligned;
 pub use codes::{OperationMode, ProgramState, RobotState, SafetyState, States};
 pub use packet::{Content, FIELDS, FieldPlace, StatePacket};
 pub use stream::{MAX_MISALIGNED, StateStream};
-pub use view::{StateError, StateView};
-
-/// Size of a state packet in bytes.
-pub const LEN: usize = places::LEN;
+pub use view::{LEN, StateError, StateView};
 
 #[cfg(test)]
 mod tests;

@@ -6,6 +6,7 @@
 )]
 
 use super::packet::{Content, FIELDS, FieldPlace};
+use super::view::LEN;
 
 /// Consecutive bool bytes that are not reserved.
 #[derive(Debug, Clone, Copy)]
@@ -104,13 +105,13 @@ const BOOL_RUNS: ([Bools; FIELDS.len()], usize) = {
     (runs, count)
 };
 
-/// Where the last field ends; a table with a gap or an overlap does not build.
-pub(super) const LEN: usize = {
+/// A table with a gap or an overlap, or of another length than a packet, does not build.
+const _: () = {
     let (mut row, mut end) = (0, 0);
     while row < FIELDS.len() {
         assert!(FIELDS[row].offset as usize == end, "the packet's table has a gap or an overlap");
         end += FIELDS[row].ty.size() * FIELDS[row].count as usize;
         row += 1;
     }
-    end
+    assert!(end == LEN, "the packet's table is not as long as a packet");
 };

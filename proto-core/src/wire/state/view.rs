@@ -2,8 +2,11 @@
 
 use core::fmt;
 
-use super::{LEN, OperationMode, ProgramState, StatePacket, States};
+use super::codes::{OperationMode, ProgramState, States};
 use crate::wire::dialect::Dialect;
+
+/// Size of a state packet in bytes.
+pub const LEN: usize = 1468;
 
 /// The bytes of one packet. There is an accessor for each field; none can fail or panic.
 #[derive(Debug, Clone, Copy)]
@@ -58,20 +61,6 @@ impl<'a> StateView<'a> {
     /// The packet's bytes.
     pub const fn as_bytes(&self) -> &'a [u8; LEN] {
         self.bytes
-    }
-
-    /// The packet as a plain value.
-    #[inline]
-    pub fn to_packet(&self) -> StatePacket {
-        let mut packet = StatePacket::ZERO;
-        packet.fill(self.bytes);
-        packet
-    }
-
-    /// Every field into a packet that exists: as [`Self::to_packet`], without a second packet on
-    /// the stack.
-    pub fn read_into(&self, packet: &mut StatePacket) {
-        packet.fill(self.bytes);
     }
 
     /// The four state machines, as `dialect` numbers them.
