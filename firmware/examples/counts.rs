@@ -15,9 +15,8 @@ use firmware::tasks::gateway::Engine;
 use proto_core::config::image::{self, MAX_IMAGE};
 use proto_core::config::{GatewayConfig, Port};
 use proto_core::engine::{Input, LinkId, OUTPUT_BUFFER, Output, PortId};
-use proto_core::recipe::CanFrame;
-use proto_core::recipe::model::CanId;
 use proto_core::time::{Duration, Instant};
+use proto_core::wire::can::{CanFrame, CanId};
 use static_cell::ConstStaticCell;
 
 /// In the order of counts.toml.

@@ -12,9 +12,8 @@ use std::process::ExitCode;
 use divan::Bencher;
 use instructions::Work;
 use proto_core::engine::{Engine, Input, LinkId, OUTPUT_BUFFER, Output, PortId};
-use proto_core::recipe::CanFrame;
-use proto_core::recipe::model::CanId;
 use proto_core::time::{Duration, Instant};
+use proto_core::wire::can::{CanFrame, CanId};
 use rig::{Cell, MS};
 
 /// The whole way of a field frame, design limit.

@@ -3,9 +3,10 @@
 
 use std::error::Error;
 
-use proto_core::recipe::model::{CanId, Field, Mode};
-use proto_core::recipe::{CanFrame, CanLayout, Rules};
+use proto_core::recipe::model::{Field, Mode};
+use proto_core::recipe::{CanLayout, Rules};
 use proto_core::sysvar::{Direction, VarRange};
+use proto_core::wire::can::{CanFrame, CanId};
 
 fn main() -> Result<(), Box<dyn Error>> {
     // The output part of a realtime recipe: the pose of the tool in three frames.

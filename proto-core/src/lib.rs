@@ -16,6 +16,9 @@
 #[cfg(any(test, feature = "std"))]
 extern crate std;
 
+/// The collections of the configuration: their version is this crate's, whatever else a program uses.
+pub use heapless;
+
 pub mod command;
 pub mod config;
 #[cfg(doc)]

@@ -38,6 +38,29 @@ impl Instant {
     }
 }
 
+/// An instant, all zeros when it is [`Instant::NEVER`]: a place for instants that are not known yet
+/// takes no flash.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Stamp(u64);
+
+impl Stamp {
+    pub(crate) const NEVER: Self = Self::at(Instant::NEVER);
+
+    pub(crate) const fn at(instant: Instant) -> Self {
+        Self(!instant.0)
+    }
+
+    pub(crate) const fn get(self) -> Instant {
+        Instant(!self.0)
+    }
+}
+
+impl fmt::Debug for Stamp {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.get().fmt(f)
+    }
+}
+
 /// A span of time in microseconds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]

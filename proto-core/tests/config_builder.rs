@@ -3,9 +3,9 @@
 use std::net::Ipv4Addr;
 
 use proto_core::config::*;
-use proto_core::recipe::model::CanId;
 use proto_core::sysvar::{Direction, ParseError, SysVar};
 use proto_core::time::Duration;
+use proto_core::wire::can::CanId;
 use proto_core::wire::scalar::{Scalar, ScalarError, ScalarType};
 
 const HEAD: &[u8] = &[0xFF, 0xFF];

@@ -14,8 +14,9 @@ use proto_core::config::{
     BoardAddress, Bus, CommandWhen, FieldSpec, GatewayConfig, InputBinding, OnStale, OutputBinding, Parity,
     Parts, SendOn,
 };
-use proto_core::recipe::model::{CanId, Mode};
+use proto_core::recipe::model::Mode;
 use proto_core::sysvar::SysVar;
+use proto_core::wire::can::CanId;
 use proto_core::wire::scalar::{Scalar, ScalarType};
 
 fn golden() -> PathBuf {

@@ -5,9 +5,9 @@ mod rig;
 
 use proto_core::config::*;
 use proto_core::engine::{Engine, Input, LinkId, OUTPUT_BUFFER, Output, PortId, ReplyCode};
-use proto_core::recipe::CanFrame;
-use proto_core::recipe::model::{CanId, Mode};
+use proto_core::recipe::model::Mode;
 use proto_core::time::{Duration, Instant};
+use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::ScalarType;
 use rig::*;
 

@@ -7,9 +7,9 @@ mod rig;
 use proptest::prelude::*;
 use proto_core::config::*;
 use proto_core::engine::{BusState, Engine, Input, LinkId, OUTPUT_BUFFER, Output, PortId};
-use proto_core::recipe::CanFrame;
-use proto_core::recipe::model::{CanId, Mode};
+use proto_core::recipe::model::Mode;
 use proto_core::time::{Duration, Instant};
+use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::ScalarType;
 use rig::*;
 

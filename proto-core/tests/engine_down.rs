@@ -4,8 +4,8 @@ mod rig;
 
 use proto_core::config::{Bus, OnStale};
 use proto_core::engine::{BusState, Input, LinkId, Output, PortId};
-use proto_core::recipe::model::CanId;
 use proto_core::time::{Duration, Instant};
+use proto_core::wire::can::CanId;
 use rig::*;
 
 fn pose_packet(pose: [f32; 6]) -> Vec<u8> {

@@ -5,7 +5,8 @@ mod rig;
 
 use proto_core::config::*;
 use proto_core::engine::{BusState, Input, LinkId, PortId, ReplyCode};
-use proto_core::recipe::model::{CanId, Mode};
+use proto_core::recipe::model::Mode;
+use proto_core::wire::can::CanId;
 use proto_core::wire::scalar::ScalarType;
 use rig::*;
 

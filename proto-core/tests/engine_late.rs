@@ -308,7 +308,7 @@ impl Loop {
         loop {
             let (port, link) = match self.engine.poll_output(self.now, &mut buf) {
                 Output::Sleep { until } => return until,
-                Output::LinkOpen { link } => {
+                Output::LinkOpen { link, .. } => {
                     self.engine.handle(self.now, Input::LinkUp { link });
                     continue;
                 }

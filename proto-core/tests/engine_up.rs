@@ -480,7 +480,7 @@ fn can_frames_are_taken_by_id_and_length() {
     rig.can(port, 2, &[1]);
     rig.can(port, 1, &[1, 2]);
     rig.can(port, 5, &[1]);
-    let remote = proto_core::recipe::CanFrame::remote(proto_core::recipe::model::CanId::Standard(1), 1);
+    let remote = proto_core::wire::can::CanFrame::remote(proto_core::wire::can::CanId::Standard(1), 1);
     rig.input(Input::PortCan { port, frame: remote.unwrap() });
     assert_eq!(rig.take_written(), []);
     let counters = rig.counters(port);

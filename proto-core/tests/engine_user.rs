@@ -5,8 +5,9 @@ mod rig;
 
 use proto_core::config::*;
 use proto_core::engine::{BusState, COMMAND_QUEUE, Input, LinkId, PortId, ReplyCode};
-use proto_core::recipe::model::{CanId, Mode};
+use proto_core::recipe::model::Mode;
 use proto_core::time::{Duration, Instant};
+use proto_core::wire::can::CanId;
 use proto_core::wire::scalar::{Scalar, ScalarType as T};
 use rig::*;
 

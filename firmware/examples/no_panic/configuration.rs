@@ -6,9 +6,9 @@ use proto_core::config::{
     CanFramePart, GatewayConfig, Span, can_frame_time, check_bitrate, check_cycle, image,
 };
 use proto_core::engine::Plan;
-use proto_core::recipe::model::CanId;
 use proto_core::sysvar::{Direction, SysVar, VarRange};
 use proto_core::time::Duration;
+use proto_core::wire::can::CanId;
 use proto_core::wire::dialect::{Dialect, Motion};
 use proto_core::wire::scalar::{Scalar, ScalarType};
 use proto_core::wire::state::{OperationMode, RobotState, SafetyState};

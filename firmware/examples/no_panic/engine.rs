@@ -11,18 +11,22 @@ use proto_core::schedule::Grid;
 use proto_core::sysvar::SysVar;
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::scalar::{Scalar, ScalarType};
+use static_cell::ConstStaticCell;
 
 use crate::any;
 
+/// Stands in .bss: all its bytes are zero, which `.ci/run` looks at.
+static ENGINE: ConstStaticCell<Engine> = ConstStaticCell::new(Engine::idle());
+
 pub(crate) fn all() {
     static CONFIG: GatewayConfig = GatewayConfig::empty();
-    let mut gateway = Engine::idle();
+    let Some(gateway) = ENGINE.try_take() else { return };
     let mut out = [0; OUTPUT_BUFFER];
-    engine_configure(black_box(&mut gateway), black_box(&CONFIG));
+    engine_configure(black_box(&mut *gateway), black_box(&CONFIG));
     engine_new(black_box(&CONFIG));
-    engine_handle(black_box(&mut gateway), any(Instant::ZERO), any(Input::Tick));
-    engine_poll_output(black_box(&mut gateway), any(Instant::ZERO), black_box(&mut out));
-    engine_questions(black_box(&gateway));
+    engine_handle(black_box(&mut *gateway), any(Instant::ZERO), any(Input::Tick));
+    engine_poll_output(black_box(&mut *gateway), any(Instant::ZERO), black_box(&mut out));
+    engine_questions(black_box(gateway));
     process_image();
     supervisor();
     grid();

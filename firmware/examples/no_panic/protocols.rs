@@ -11,9 +11,8 @@ use proto_core::modbus::map::{self, Space};
 use proto_core::modbus::pdu::{Request, RequestHead, Response, exception_pdu};
 use proto_core::modbus::server::{RegisterBank, Server, answer};
 use proto_core::modbus::{Coils, Exception, Registers};
-use proto_core::recipe::can::CanFrame;
-use proto_core::recipe::model::CanId;
 use proto_core::time::Instant;
+use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::dialect::Dialect;
 use proto_core::wire::{slcan, state};
 

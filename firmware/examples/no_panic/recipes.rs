@@ -3,11 +3,12 @@
 use core::hint::black_box;
 
 use proto_core::image::Image;
-use proto_core::recipe::can::{CanFrame, CanLayout};
+use proto_core::recipe::can::CanLayout;
 use proto_core::recipe::deframer::{Deframer, datagram};
-use proto_core::recipe::model::{CanId, Field, Framing, Mode, Rules};
+use proto_core::recipe::model::{Field, Framing, Mode, Rules};
 use proto_core::recipe::stream::StreamLayout;
 use proto_core::sysvar::Direction;
+use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::{Scalar, ScalarType};
 
 use crate::{any, bytes, room};

@@ -2,8 +2,8 @@
 
 use embedded_can::Frame;
 use proto_core::engine::BusState;
-use proto_core::recipe::can::CanFrame;
-use proto_core::recipe::model::CanId;
+use proto_core::wire::can::CanFrame;
+use proto_core::wire::can::CanId;
 
 /// A CAN controller. Its driver buffers what arrives while nobody receives.
 #[allow(async_fn_in_trait, reason = "all tasks run on one executor: no future is sent anywhere")]

@@ -18,8 +18,8 @@ use core::task::Poll;
 use embassy_sync::waitqueue::AtomicWaker;
 use embedded_can::Frame;
 use proto_core::engine::BusState;
-use proto_core::recipe::can::CanFrame;
-use proto_core::recipe::model::{CanId, MAX_CAN_DATA, MAX_CAN_IDS};
+use proto_core::recipe::model::MAX_CAN_IDS;
+use proto_core::wire::can::{CanFrame, CanId, MAX_CAN_DATA};
 
 use super::can_port::{BusOff, CanCounters, CanEvent, CanPort};
 

@@ -3,8 +3,7 @@
 
 use embedded_io_async::{Read, Write};
 use heapless::Vec;
-use proto_core::recipe::can::CanFrame;
-use proto_core::recipe::model::CanId;
+use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::slcan::{Channel, MAX_LINE};
 
 use super::can_port::{BusOff, CanEvent, CanPort};

@@ -11,8 +11,7 @@ use embassy_futures::yield_now;
 use embassy_time::{Duration, Instant, Timer, with_timeout};
 use embedded_can::Frame;
 use proto_core::engine::{BusState, Input, PortId};
-use proto_core::recipe::can::CanFrame;
-use proto_core::recipe::model::{CanId, MAX_CAN_DATA};
+use proto_core::wire::can::{CanFrame, CanId, MAX_CAN_DATA};
 
 use super::control::PortControl;
 use super::gateway::Gateway;

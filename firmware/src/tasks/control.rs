@@ -4,8 +4,9 @@ use core::cell::{Cell, RefCell};
 
 use heapless::{Deque, Vec};
 use proto_core::engine::OUTPUT_BUFFER;
-use proto_core::recipe::can::CanFrame;
-use proto_core::recipe::model::{CanId, MAX_CAN_IDS};
+use proto_core::recipe::model::MAX_CAN_IDS;
+use proto_core::wire::can::CanFrame;
+use proto_core::wire::can::CanId;
 
 use super::notify::Notify;
 

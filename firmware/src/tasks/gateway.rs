@@ -33,16 +33,14 @@ pub const MAX_UPLINKS: usize = 2;
 /// User-defined fields in one direction, over all ports.
 pub const MAX_FIELDS: usize = 128;
 /// Recipe links, and command, urgent commands, state and Modbus.
-pub const MAX_LINKS: usize = MAX_UPLINKS + 4;
+pub const MAX_LINKS: usize = Engine::MAX_LINKS;
 
 /// The engine in the size of a board.
 pub type Engine = AnyEngine<MAX_FIELD_PORTS, MAX_UPLINKS, MAX_FIELDS>;
 
 /// The engine and what every task shares with it.
 pub struct Gateway {
-    /// None or one. Without one it is all zeros: an engine as an initial value would be 30 KB of flash,
-    /// and one that is moved here with everything else as much of the stack.
-    engine: RefCell<Vec<Engine, 1>>,
+    engine: RefCell<Engine>,
     ports: Vec<(PortId, PortControl), MAX_FIELD_PORTS>,
     links: Vec<(LinkId, LinkKind, LinkControl), MAX_LINKS>,
     output: RefCell<[u8; OUTPUT_BUFFER]>,
@@ -58,7 +56,7 @@ impl Gateway {
     /// A gateway without a configuration.
     pub const fn idle() -> Self {
         Self {
-            engine: RefCell::new(Vec::new()),
+            engine: RefCell::new(Engine::idle()),
             ports: Vec::new(),
             links: Vec::new(),
             output: RefCell::new([0; OUTPUT_BUFFER]),
@@ -76,14 +74,7 @@ impl Gateway {
     pub fn configure(&mut self, config: &GatewayConfig) -> Result<(), BuildError> {
         // Not so in `idle`, which is all zeros and takes no flash.
         self.deadline.set(Instant::NEVER);
-        put_idle(self.engine.get_mut());
-        self.configure_in_place(config)
-    }
-
-    /// Not inlined: what this needs of the stack and what `put_idle` needs do not add up.
-    #[inline(never)]
-    fn configure_in_place(&mut self, config: &GatewayConfig) -> Result<(), BuildError> {
-        let Some(engine) = self.engine.get_mut().first_mut() else { return Ok(()) };
+        let engine = self.engine.get_mut();
         engine.configure(config)?;
         // As many places as the engine has.
         self.ports.clear();
@@ -106,7 +97,6 @@ impl Gateway {
     /// Shows how each link and each port does.
     pub fn report(&self, mut link: impl FnMut(LinkInfo<'_>), mut port: impl FnMut(PortId, &PortCounters)) {
         let engine = self.engine.borrow();
-        let Some(engine) = engine.first() else { return };
         engine.links().for_each(&mut link);
         for id in engine.field_ports() {
             if let Some(counters) = engine.port_counters(id) {
@@ -118,7 +108,9 @@ impl Gateway {
     /// What the status LED shows.
     pub fn condition(&self) -> Condition {
         let engine = self.engine.borrow();
-        let Some(engine) = engine.first() else { return Condition::Refused };
+        if self.ports.is_empty() && self.links.is_empty() {
+            return Condition::Refused;
+        }
         // The work of a link that is shared is done by another.
         let is_up = |link: LinkInfo<'_>| matches!(link.state, LinkState::Up { .. } | LinkState::Shared);
         let works = |id| engine.port_state(id) == Some(PortState::Working);
@@ -145,7 +137,6 @@ impl Gateway {
     pub fn input(&self, input: Input<'_>) {
         let now = now();
         let mut engine = self.engine.borrow_mut();
-        let Some(engine) = engine.first_mut() else { return };
         let mut buf = self.output.borrow_mut();
         engine.handle(now, input);
         if self.sleeps.replace(engine.sleeps()) != engine.sleeps() {
@@ -163,7 +154,7 @@ impl Gateway {
                         port.put_frame(frame);
                     }
                 }
-                Output::LinkOpen { link } => {
+                Output::LinkOpen { link, .. } => {
                     if let Some(link) = self.link(link) {
                         link.open();
                     }
@@ -184,6 +175,7 @@ impl Gateway {
                     }
                     return;
                 }
+                _ => {}
             }
         }
     }
@@ -229,7 +221,7 @@ impl Gateway {
 
     /// Whether a datagram is a frame of the link's.
     pub(crate) fn is_frame(&self, link: LinkId, datagram: &[u8]) -> bool {
-        self.engine.borrow().first().is_some_and(|engine| engine.is_frame(link, datagram))
+        self.engine.borrow().is_frame(link, datagram)
     }
 
     pub(crate) fn port(&self, id: PortId) -> Option<&PortControl> {
@@ -239,13 +231,6 @@ impl Gateway {
     pub(crate) fn link(&self, id: LinkId) -> Option<&LinkControl> {
         self.links.iter().find(|(link, ..)| *link == id).map(|(.., control)| control)
     }
-}
-
-/// Not inlined: an engine passes over the stack here.
-#[inline(never)]
-fn put_idle(place: &mut Vec<Engine, 1>) {
-    place.clear();
-    let _ = place.push(Engine::idle());
 }
 
 /// One for a task whose interrupt comes while the time is looked at, one for that of the network, and one

@@ -18,7 +18,7 @@ use embassy_net::dns::DnsQueryType;
 use embassy_net::{IpAddress, Stack};
 use heapless::String;
 use proto_core::config::{Bus, GatewayConfig, listen_address};
-use proto_core::engine::{Input, LinkId, LinkKind};
+use proto_core::engine::{INPUT_BUFFER, Input, LinkId, LinkKind};
 
 use super::control::LinkControl;
 use super::gateway::Gateway;
@@ -78,6 +78,7 @@ impl Endpoint {
             }
             LinkKind::RecipeTcpListen { port } => Self::TcpListen { port: listen(usize::from(port.0)), host },
             LinkKind::RecipeUdpListen { port } => Self::UdpListen { port: listen(usize::from(port.0)), host },
+            other => unreachable!("no such link: {}", other.name()),
         }
     }
 }
@@ -171,10 +172,10 @@ async fn resolve(stack: Stack<'_>, host: &str) -> Option<IpAddress> {
 }
 
 /// A state packet, and a receive window that a burst cannot overrun the Ethernet controller with.
-const RX: usize = 1536;
+const RX: usize = INPUT_BUFFER;
 /// Bytes handed to the engine at once: a state packet, and longer than any frame, so that a datagram
 /// that is too long is seen to be.
-const CHUNK: usize = 1536;
+const CHUNK: usize = INPUT_BUFFER;
 /// Of a connection for frames of a recipe, two of the longest. What is left is for those that the
 /// controller has not acknowledged: a peer that acknowledges late must not slow them down. It has room
 /// for 64 of 72 bytes, as many as the engine hands over; those of 256 bytes may wait for 70 ms.

@@ -64,6 +64,7 @@ impl TaskName {
             Self::Refused => (14, 0),
             Self::Board(number) => (15, number),
             Self::Link(LinkKind::Urgent) => (16, 0),
+            Self::Link(_) => (17, 0),
         };
         u16::from_be_bytes([kind, number])
     }

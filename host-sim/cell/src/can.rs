@@ -3,8 +3,8 @@
 use std::collections::VecDeque;
 
 use proto_core::config::can_frame_time;
-use proto_core::recipe::CanFrame;
 use proto_core::time::Instant;
+use proto_core::wire::can::CanFrame;
 
 use super::device::Device;
 use super::line::MAX_HEARD;

@@ -1,9 +1,8 @@
 //! The cell's run loop: what is due, whom it is for, and what that leads to.
 
 use proto_core::engine::{Input, LinkId, OUTPUT_BUFFER, Output};
-use proto_core::recipe::CanFrame;
-use proto_core::recipe::model::CanId;
 use proto_core::time::{Duration, Instant};
+use proto_core::wire::can::{CanFrame, CanId};
 
 use super::connection::{Connection, Peer};
 use super::due::Due;
@@ -174,7 +173,7 @@ impl Cell {
                     self.transmit_can(bus, End::Port, frame);
                 }
             }
-            Output::LinkOpen { link } => {
+            Output::LinkOpen { link, .. } => {
                 self.trace.add(now, What::LinkOpen, link.0.into(), &[]);
                 self.open(link);
             }
@@ -186,6 +185,7 @@ impl Cell {
                 self.trace.add(now, What::LinkSent, link.0.into(), bytes);
                 self.send_up(link, bytes.to_vec());
             }
+            other => unreachable!("no such output: {other:?}"),
         }
         true
     }

@@ -1,7 +1,7 @@
 //! What travels between ports and their devices: bytes on lines, frames on buses.
 
-use proto_core::recipe::CanFrame;
 use proto_core::time::Instant;
+use proto_core::wire::can::CanFrame;
 
 use super::due::Due;
 use super::line::{Chunk, Chunking};

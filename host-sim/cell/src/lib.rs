@@ -54,8 +54,8 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 
 use proto_core::config::{Bus, GatewayConfig};
 use proto_core::engine::{BuildError as EngineError, Engine, LinkId, LinkInfo, PortCounters, PortId};
-use proto_core::recipe::CanFrame;
 use proto_core::time::{Duration, Instant};
+use proto_core::wire::can::CanFrame;
 
 pub use can::{BusCounters, CanBus};
 pub use device::{Device, Responder, Talker};

@@ -228,8 +228,8 @@ fn the_gateway_answers_whoever_sends_frames_and_nobody_else() {
     let arrived = |cell: &Cell| cell.controller().counters().ports["udp"].frames_in;
     let bus = cell.bus_of("buttons");
     let press = |cell: &mut Cell, bits| {
-        let id = proto_core::recipe::model::CanId::Standard(5);
-        cell.send_can(bus, proto_core::recipe::CanFrame::new(id, &[0, bits]).unwrap());
+        let id = proto_core::wire::can::CanId::Standard(5);
+        cell.send_can(bus, proto_core::wire::can::CanFrame::new(id, &[0, bits]).unwrap());
         cell.run_ms(20);
         cell.value("DigitalOutputCommand[2]")
     };

@@ -6,8 +6,8 @@
 //! before goes on being sent, acknowledged and sent again by the kernel.
 
 use proto_core::engine::{BusState, Input, LinkId, PortId};
-use proto_core::recipe::CanFrame;
 use proto_core::time::Duration;
+use proto_core::wire::can::CanFrame;
 
 use super::due::Due;
 use super::network::Way;

@@ -1,8 +1,8 @@
 //! A gateway that is not called for a while.
 
 use proto_core::engine::LinkId;
-use proto_core::recipe::model::CanId;
 use proto_core::time::Duration;
+use proto_core::wire::can::CanId;
 
 use super::tests::cell;
 use super::*;

@@ -1,7 +1,7 @@
 //! Gateways that break their promises: what goes into the engine and what comes out of it is changed
 //! on the way, and the model that watches has to notice.
 
-use proto_core::engine::{Input, LinkId, Output, PortId};
+use proto_core::engine::{Endpoint, Input, LinkId, Output, PortId, Transport};
 use proto_core::time::Instant;
 
 use super::Cell;
@@ -36,7 +36,9 @@ impl Forged {
         match self {
             Self::Link(link, bytes) => Output::LinkSend { link: *link, bytes },
             Self::Port(port, bytes) => Output::PortSend { port: *port, bytes },
-            Self::Open(link) => Output::LinkOpen { link: *link },
+            Self::Open(link) => {
+                Output::LinkOpen { link: *link, to: Endpoint::new(Transport::Tcp { port: 0 }, "") }
+            }
         }
     }
 }

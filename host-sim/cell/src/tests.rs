@@ -1,8 +1,8 @@
 //! The cell itself: its clock, its networks, its lines.
 
 use proto_core::engine::LinkId;
-use proto_core::recipe::model::CanId;
 use proto_core::time::Duration;
+use proto_core::wire::can::CanId;
 
 use super::*;
 use recipe_config::file;

@@ -4,9 +4,10 @@ use std::fmt;
 use std::net::{IpAddr, Ipv4Addr};
 
 use proto_core::config::Rs485;
-use proto_core::recipe::model::{self, CanId};
+use proto_core::recipe::model;
 use proto_core::sysvar::SysVar;
 use proto_core::time::Duration;
+use proto_core::wire::can::CanId;
 
 /// A whole controller file.
 #[derive(Debug, Clone, PartialEq, Default)]

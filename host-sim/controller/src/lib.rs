@@ -27,9 +27,9 @@ mod spoiled;
 use std::collections::VecDeque;
 use std::net::{IpAddr, SocketAddr};
 
-use proto_core::recipe::CanFrame;
 use proto_core::schedule::Grid;
 use proto_core::time::{Duration, Instant};
+use proto_core::wire::can::CanFrame;
 use proto_core::wire::dialect::Dialect;
 use proto_core::wire::state::{self, OperationMode};
 

@@ -8,8 +8,8 @@ use std::ops::Range;
 use std::rc::Rc;
 use std::time::Duration as StdDuration;
 
-use proto_core::recipe::can::CanFrame;
 use proto_core::time::Instant;
+use proto_core::wire::can::CanFrame;
 use proto_core::wire::slcan::{Channel, ChannelState};
 use tokio::net::TcpListener;
 use tokio::sync::Notify;

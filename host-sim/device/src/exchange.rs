@@ -5,8 +5,8 @@ use std::cell::{Cell, RefCell};
 use std::collections::VecDeque;
 
 use proto_core::engine::BusState;
-use proto_core::recipe::can::CanFrame;
 use proto_core::time::{Duration, Instant};
+use proto_core::wire::can::CanFrame;
 use serde::Serialize;
 use tokio::sync::Notify;
 

@@ -7,7 +7,7 @@ use std::io;
 use std::rc::Rc;
 
 use proto_core::config::Rs485;
-use proto_core::recipe::model::CanId;
+use proto_core::wire::can::CanId;
 
 use super::bind::Device;
 use super::can_bus::CanPort;

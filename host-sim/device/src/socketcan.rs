@@ -16,9 +16,8 @@ use std::rc::Rc;
 use std::time::Duration as StdDuration;
 
 use proto_core::engine::BusState;
-use proto_core::recipe::can::CanFrame;
-use proto_core::recipe::model::CanId;
 use proto_core::time::{Duration, Instant};
+use proto_core::wire::can::{CanFrame, CanId};
 use socketcan::{CanErrorFrame, CanFdSocket, CanFilter, EmbeddedFrame, Socket, SocketOptions};
 use tokio::io::Interest;
 use tracing::{debug, info, warn};

@@ -8,8 +8,8 @@ use std::path::Path;
 use std::rc::Rc;
 use std::time::Duration;
 
-use proto_core::recipe::can::CanFrame;
 use proto_core::time::Instant;
+use proto_core::wire::can::CanFrame;
 use rustix::fs::OFlags;
 use tokio::sync::Notify;
 use tokio::task::{JoinHandle, LocalSet};

@@ -6,9 +6,8 @@
 use std::collections::{BTreeMap, VecDeque};
 
 use embedded_can::Frame;
-use proto_core::recipe::can::CanFrame;
-use proto_core::recipe::model::CanId;
 use proto_core::time::{Duration, Instant};
+use proto_core::wire::can::{CanFrame, CanId};
 
 /// How long frames take.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -9,7 +9,7 @@ use std::collections::BTreeMap;
 use std::rc::Rc;
 
 use proto_core::config::{Bus, GatewayConfig, Parts, Port as PortConfig};
-use proto_core::engine::{Engine, Input, LinkId, LinkKind, OUTPUT_BUFFER, Output, PortId};
+use proto_core::engine::{Engine, Input, LinkId, LinkKind, OUTPUT_BUFFER, Output, PortId, Transport};
 use proto_core::sysvar::SysVar;
 use proto_core::time::Instant;
 use serde_json::{Value, json};
@@ -70,7 +70,7 @@ impl Gateway {
         }
         let mut links = Vec::new();
         for info in engine.links() {
-            links.push((info.id, info.kind, open_endpoint(config, info.kind).await?));
+            links.push((info.id, info.kind, open_endpoint(info.endpoint).await?));
         }
         let name = |id: PortId| config.ports.get(usize::from(id.0)).map_or("", |port| port.name.as_str());
         let mut places = serde_json::Map::new();
@@ -211,10 +211,10 @@ impl Core {
             match output {
                 Output::PortSend { port, bytes } => self.with_port(port, |tx| tx.send(bytes)),
                 Output::PortSendCan { port, frame } => self.with_port(port, |tx| tx.send_frame(frame)),
-                Output::LinkOpen { link } => self.with_link(link, LinkControl::open),
+                Output::LinkOpen { link, .. } => self.with_link(link, LinkControl::open),
                 Output::LinkClose { link } => self.with_link(link, LinkControl::close),
                 Output::LinkSend { link, bytes } => self.with_link(link, |control| control.send(bytes)),
-                Output::Sleep { .. } => {}
+                _ => {}
             }
         }
     }
@@ -327,43 +327,26 @@ async fn open_port(port: &PortConfig, binds: &[Bind]) -> Result<Port, StartError
         .map_err(|error| StartError::new(format!("--bind {name}={}: {error}", bind.device)))
 }
 
-async fn open_endpoint(config: &GatewayConfig, kind: LinkKind) -> Result<Endpoint, StartError> {
-    let controller = &config.controller;
-    let host = || {
-        if controller.address.is_empty() {
-            let message = "controller.address is needed: the controller's address or host name";
-            return Err(StartError::new(message));
-        }
-        Ok(controller.address.as_str().to_owned())
-    };
-    let listen = |port: PortId| match config.ports.get(usize::from(port.0)).map(|port| &port.bus) {
-        Some(Bus::TcpListen { listen } | Bus::UdpListen { listen }) => listen.as_str(),
-        _ => "",
-    };
-    let refused = |address: &str, error| StartError::new(format!("listening on {address}: {error}"));
-    Ok(match kind {
-        LinkKind::Command | LinkKind::Urgent => {
-            Endpoint::Tcp { host: host()?, port: controller.command_port }
-        }
-        LinkKind::State => Endpoint::Tcp { host: host()?, port: controller.state_port },
-        LinkKind::Modbus => Endpoint::Tcp { host: host()?, port: controller.modbus_port },
-        LinkKind::RecipeUdp => {
-            let port = controller.recipe_link.map_or(0, |link| link.udp_port);
-            Endpoint::Udp { host: host()?, port }
-        }
-        LinkKind::RecipeTcpListen { port } => {
-            let address = listen(port);
-            let listener = TcpListener::bind(address).await;
-            let listener = listener.map_err(|error| refused(address, error))?;
+async fn open_endpoint(to: proto_core::engine::Endpoint<'_>) -> Result<Endpoint, StartError> {
+    if to.host.is_empty() {
+        let message = "controller.address is needed: the controller's address or host name";
+        return Err(StartError::new(message));
+    }
+    let host = to.host.to_owned();
+    let refused = |address, error| StartError::new(format!("listening on {address}: {error}"));
+    Ok(match to.transport {
+        Transport::Tcp { port } => Endpoint::Tcp { host, port },
+        Transport::Udp { port } => Endpoint::Udp { host, port },
+        Transport::TcpListen { local } => {
+            let listener = TcpListener::bind(local).await.map_err(|error| refused(local, error))?;
             peer::bound(&listener);
-            Endpoint::TcpListen { listener, controller: host()? }
+            Endpoint::TcpListen { listener, controller: host }
         }
-        LinkKind::RecipeUdpListen { port } => {
-            let address = listen(port);
-            let socket = UdpSocket::bind(address).await;
-            let socket = socket.map_err(|error| refused(address, error))?;
-            Endpoint::UdpListen { socket, controller: host()? }
+        Transport::UdpListen { local } => {
+            let socket = UdpSocket::bind(local).await.map_err(|error| refused(local, error))?;
+            Endpoint::UdpListen { socket, controller: host }
         }
+        other => return Err(StartError::new(format!("no link can be opened by {other:?}"))),
     })
 }
 

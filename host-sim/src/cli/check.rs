@@ -6,9 +6,10 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use proto_core::config::{Bus, GatewayConfig, MAX_PORTS, Parity, PartBudget, Rs485, can_frame_time};
 use proto_core::engine::Engine;
-use proto_core::recipe::model::{CanId, Mode};
+use proto_core::recipe::model::Mode;
 use proto_core::sysvar::{Direction, SysVar};
 use proto_core::time::Duration;
+use proto_core::wire::can::CanId;
 
 use super::{Overrides, plan, text};
 use recipe_config::file::{self, Config, FileError};

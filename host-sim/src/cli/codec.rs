@@ -2,9 +2,10 @@
 //!
 //! In: recipes as a file has them. Out: frames from values and values from frames.
 
-use proto_core::recipe::model::{CanId, Field, Framing, Rules};
-use proto_core::recipe::{CanFrame, CanLayout, StreamLayout};
+use proto_core::recipe::model::{Field, Framing, Rules};
+use proto_core::recipe::{CanLayout, StreamLayout};
 use proto_core::sysvar::{Direction, SysVar};
+use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::{Scalar, ScalarType};
 
 use recipe_config::{SimField, SimParts, SimRecipe};

@@ -6,8 +6,8 @@
 use std::collections::BTreeMap;
 use std::io::{BufRead, Write};
 
-use proto_core::recipe::model::CanId;
-use proto_core::recipe::{CanFrame, CanReject, Deframer, StreamLayout, datagram};
+use proto_core::recipe::{CanReject, Deframer, StreamLayout, datagram};
+use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::Scalar;
 
 use super::codec::{FrameFields, Layout, NamedField, Part};

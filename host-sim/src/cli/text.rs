@@ -2,8 +2,7 @@
 
 use std::fmt;
 
-use proto_core::recipe::CanFrame;
-use proto_core::recipe::model::CanId;
+use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::{Scalar, ScalarType};
 
 /// What stands before a frame in a log: a time, an interface.

@@ -1,9 +1,10 @@
 //! What the benchmarks measure, each piece of work beside its bare limit: the same bytes moved by
 //! code that was written for one recipe, with every offset a constant and no check of the values.
 
-use proto_core::recipe::model::{CanId, Field, Framing, Mode};
-use proto_core::recipe::{CanFrame, CanLayout, Deframer, NoSpace, Rules, StreamLayout};
+use proto_core::recipe::model::{Field, Framing, Mode};
+use proto_core::recipe::{CanLayout, Deframer, NoSpace, Rules, StreamLayout};
 use proto_core::sysvar::{Direction, IMAGE_BYTES, SysVar, VarRange};
+use proto_core::wire::can::{CanFrame, CanId};
 
 type Image = [u8; IMAGE_BYTES];
 

@@ -5,10 +5,10 @@ use proto_core::config::{
     Bus, CommandWhen, FieldSpec, GatewayConfig, InputBinding, OnStale, OutputBinding, Parts, SendOn, image,
 };
 use proto_core::engine::{BusState, Engine, Input, LinkId, LinkKind, OUTPUT_BUFFER, Output, PortId};
-use proto_core::recipe::CanFrame;
-use proto_core::recipe::model::{CanId, Mode};
+use proto_core::recipe::model::Mode;
 use proto_core::sysvar::{Direction, SysVar};
 use proto_core::time::{Duration, Instant};
+use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::ScalarType;
 
 use crate::rig::Cell;
@@ -455,7 +455,7 @@ impl Driver {
                     self.sent(port, &bytes);
                 }
                 Output::PortSendCan { port, frame } => self.can_sent(port, &frame),
-                Output::LinkOpen { link } => {
+                Output::LinkOpen { link, .. } => {
                     let link = &mut self.links[usize::from(link.0)];
                     assert!(!self.honest || !link.opening && !link.up, "opened twice");
                     link.opening = true;
@@ -477,6 +477,7 @@ impl Driver {
                     link.sending = true;
                     link.unacknowledged = link.unacknowledged.wrapping_add(bytes.len() as u32);
                 }
+                other => panic!("{other:?}"),
             }
         }
         panic!("no end of outputs");

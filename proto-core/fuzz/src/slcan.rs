@@ -1,7 +1,6 @@
 //! slcan: any bytes of any client, against docs/wire/slcan.md read line by line.
 
-use proto_core::recipe::CanFrame;
-use proto_core::recipe::model::CanId;
+use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::slcan::{Channel, ChannelState, decode, encode};
 
 use crate::source::{Source, cut};

@@ -6,9 +6,9 @@
 use core::fmt;
 
 use super::{Bus, ConfigView, Parity, Parts, Port, Recipe, Rs485, Span};
-use crate::recipe::model::CanId;
 use crate::sysvar::{Direction, SysVar};
 use crate::time::Duration;
+use crate::wire::can::CanId;
 
 impl Rs485 {
     /// Start bit, data bits, parity and stop bits.

@@ -4,8 +4,8 @@
 //! same, borrowed; [`GatewayConfig::add_recipe`](super::GatewayConfig::add_recipe) reads the names.
 
 use super::{CommandWhen, FieldSpec};
-use crate::recipe::model::CanId;
 use crate::sysvar::{ParseError, SysVar, VarRange};
+use crate::wire::can::CanId;
 use crate::wire::scalar::ScalarType;
 
 /// A system variable, by name or by itself.

@@ -37,9 +37,10 @@ pub use view::ConfigView;
 
 use heapless::{String, Vec};
 
-use crate::recipe::model::{CanId, MAX_CAN_IDS, MAX_DELIMITER, Mode};
+use crate::recipe::model::{MAX_CAN_IDS, MAX_DELIMITER, Mode};
 use crate::sysvar::SysVar;
 use crate::time::Duration;
+use crate::wire::can::CanId;
 use crate::wire::dialect::Dialect;
 use crate::wire::scalar::ScalarType;
 

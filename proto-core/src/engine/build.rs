@@ -1,13 +1,14 @@
 //! From a configuration to an engine that is ready to run.
 
 use core::fmt;
+use core::net::{IpAddr, Ipv4Addr, SocketAddr};
 
 use heapless::Vec;
 
 use super::command_link::{CommandLink, MAX_COMMAND_BYTES, MAX_COMMAND_FIELDS};
 use super::counters::PortCounters;
-use super::field_port::{Codec, FieldPort, Line, ReplyCode};
-use super::io::{BusState, LinkId, LinkKind, PortId};
+use super::field_port::{Codec, FieldPort, LineTiming};
+use super::io::{BusState, LinkId, LinkKind, PortId, ReplyCode, Transport};
 use super::links::Links;
 use super::modbus_link::{MAX_POLL_BLOCKS, ModbusLink};
 use super::outbox::EdgeQueue;
@@ -15,15 +16,15 @@ use super::plan::{Plan, PlanError, Source, WayUp, shown_by, uplinks};
 use super::sender::Sender;
 use super::state_link::StateLink;
 use super::store::{InputFrame, MAX_INPUT_FRAMES, SafeBytes, Store};
-use super::uplink::Uplink;
+use super::uplink::{Uplink, UplinkSetup};
 use super::user::{Bindings, InputBind};
 use super::{Ask, Engine};
 use crate::config::{
     Bus, ConfigError, ConfigView, FieldSpec, InputBinding, MAX_SAFE_VALUES, Parts, Port, Recipe, SendOn,
-    Span, StreamPart,
+    Span, StreamPart, listen_address,
 };
 use crate::image::{GroupId, InputSet, MAX_GROUPS};
-use crate::link::{LinkTimings, Supervisor};
+use crate::link::LinkTimings;
 use crate::recipe::deframer::Deframer;
 use crate::recipe::model::{Framing, Rules};
 use crate::recipe::{CanLayout, PartError, StreamLayout};
@@ -99,6 +100,8 @@ impl Groups {
 
 impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS, UPLINKS, FIELDS> {
     /// An engine without a configuration: no ports, no links, nothing to do.
+    ///
+    /// All its bytes are zero, so that a `static` one takes no flash, and no stack.
     pub const fn idle() -> Self {
         Self {
             store: Store::new(),
@@ -106,9 +109,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             bindings: Bindings { inputs: Vec::new(), outputs: Vec::new() },
             safe_values: Vec::new(),
             links: Links::new(),
-            watches_bits: false,
             timer_at: Instant::ZERO,
-            rearm: true,
+            is_armed: false,
             now: Instant::ZERO,
             is_late: false,
             announced: Instant::ZERO,
@@ -116,7 +118,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             sleeps: 0,
             is_deaf: false,
             deaf_until: Instant::ZERO,
-            ask: Ask::ALL,
+            // The first call asks everybody: `timer_at` has come.
+            ask: Ask::NONE,
         }
     }
 
@@ -157,9 +160,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             bindings,
             safe_values,
             links,
-            watches_bits,
             timer_at,
-            rearm,
+            is_armed,
             now,
             is_late,
             announced,
@@ -174,14 +176,14 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         bindings.inputs.clear();
         bindings.outputs.clear();
         safe_values.clear();
-        let Links { command, state, modbus, recipes } = links;
-        *command = None;
-        *state = None;
-        *modbus = None;
+        let Links { host, command, state, modbus, recipes } = links;
+        host.clear();
+        command.clear();
+        state.clear();
+        modbus.clear();
         recipes.clear();
-        *watches_bits = false;
         *timer_at = Instant::ZERO;
-        *rearm = true;
+        *is_armed = false;
         *now = Instant::ZERO;
         *is_late = false;
         *announced = Instant::ZERO;
@@ -189,7 +191,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         *sleeps = 0;
         *is_deaf = false;
         *deaf_until = Instant::ZERO;
-        *ask = Ask::ALL;
+        *ask = Ask::NONE;
     }
 
     fn build(&mut self, config: ConfigView<'_>) -> Result<(), BuildError> {
@@ -197,6 +199,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         let plan = Plan::new(config).map_err(BuildError::Plan)?;
         let dialect = Dialect::named(&config.controller.dialect).ok_or(BuildError::UnknownDialect)?;
         self.check_room(config)?;
+        // As long as the configuration's, which is as long as the engine's.
+        let _ = self.links.host.push_str(&config.controller.address);
         for value in config.safe_values {
             let full = |_| one_too_many("safe values", MAX_SAFE_VALUES);
             self.safe_values.push(SafeBytes::new(value)).map_err(full)?;
@@ -210,11 +214,13 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         }
         if plan.needs_state() {
             let group = groups.next().ok_or(one_too_many("groups", MAX_GROUPS))?;
-            self.links.state = Some(StateLink::new(group, plan.read_back()));
+            let link = StateLink::new(config.controller.state_port, group, plan.read_back());
+            let _ = self.links.state.push(link);
         }
         if plan.needs_modbus() {
             let writes = SysVar::all().filter(|&var| plan.way_up(var) == Some(WayUp::Modbus)).collect();
-            self.links.modbus = Some(ModbusLink::new(dialect.modbus_unit, writes));
+            let link = ModbusLink::new(config.controller.modbus_port, dialect.modbus_unit, writes);
+            let _ = self.links.modbus.push(link);
         }
         self.assign_read_back(&plan);
         self.assign_sources(config, &plan, &mut groups)?;
@@ -265,8 +271,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         dialect: Dialect,
     ) -> Result<(), BuildError> {
         let (codec, line) = match &port.bus {
-            Bus::Rs485(settings) => (stream_codec(config, port.recipe, recipe)?, Line::new(settings)),
-            _ => (can_codec(config, port.recipe, recipe)?, Line::none()),
+            Bus::Rs485(settings) => (stream_codec(config, port.recipe, recipe)?, LineTiming::new(settings)),
+            _ => (can_codec(config, port.recipe, recipe)?, LineTiming::none()),
         };
         let first_frame = self.store.frames.len() as u8;
         let mut next_binding = self.bindings.inputs.len() as u16;
@@ -296,12 +302,12 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
                     InputBind::Variable { var, scale, offset }
                 }
                 FieldSpec::UserInput { to: InputBinding::Commands { table, when }, .. } => {
-                    if self.links.command.is_none() {
-                        let link = CommandLink::new(dialect, config.commands);
-                        self.links.command =
-                            Some(link.ok_or(one_too_many("bytes of command texts", MAX_COMMAND_BYTES))?);
+                    if self.links.command.is_empty() {
+                        let link = CommandLink::new(config.controller.command_port, dialect, config.commands);
+                        let link = link.ok_or(one_too_many("bytes of command texts", MAX_COMMAND_BYTES))?;
+                        let _ = self.links.command.push(link);
                     }
-                    let Some(link) = &mut self.links.command else { continue };
+                    let Some(link) = self.links.command.first_mut() else { continue };
                     let field = link.add_field(table, when);
                     InputBind::Command(field.ok_or(one_too_many("command fields", MAX_COMMAND_FIELDS))?)
                 }
@@ -318,7 +324,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
                 outputs.len = outputs.len.saturating_add(1);
             }
         }
-        self.watches_bits |= matches!(recipe.send, SendOn::Rising { .. });
+        self.store.watches_bits |= matches!(recipe.send, SendOn::Rising { .. });
         let has_output = recipe.has(Direction::Output);
         let sender = Sender::new(recipe.send, recipe.on_stale, port.stale_after, port.cycle, has_output);
         let port = FieldPort {
@@ -349,10 +355,21 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     ) -> Result<(), BuildError> {
         let port = id.port();
         let bus = port.and_then(|port| config.ports.get(usize::from(port.0))).map(|port| &port.bus);
-        let kind = match (bus, port) {
-            (Some(Bus::TcpListen { .. }), Some(port)) => LinkKind::RecipeTcpListen { port },
-            (Some(_), Some(port)) => LinkKind::RecipeUdpListen { port },
-            _ => LinkKind::RecipeUdp,
+        // Validation has refused what is no address.
+        let local = |listen: &str| {
+            listen_address(listen).unwrap_or(SocketAddr::new(IpAddr::V4(Ipv4Addr::UNSPECIFIED), 0))
+        };
+        let (kind, transport) = match (bus, port) {
+            (Some(Bus::TcpListen { listen }), Some(port)) => {
+                (LinkKind::RecipeTcpListen { port }, Transport::TcpListen { local: local(listen) })
+            }
+            (Some(Bus::UdpListen { listen }), Some(port)) => {
+                (LinkKind::RecipeUdpListen { port }, Transport::UdpListen { local: local(listen) })
+            }
+            _ => {
+                let port = config.controller.recipe_link.map_or(0, |link| link.udp_port);
+                (LinkKind::RecipeUdp, Transport::Udp { port })
+            }
         };
         let framing = match kind {
             LinkKind::RecipeTcpListen { .. } => Framing::Bytes,
@@ -397,14 +414,24 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         let timeouts =
             owners.filter_map(|port| config.ports.get(usize::from(port.0))).map(|port| port.timeout);
         let patience = timeouts.min().unwrap_or(PATIENCE).max(PATIENCE);
-        let supervisor = Supervisor::new(timings);
-        let uplink = Uplink::new(id, kind, supervisor, (input, output), (set, writes), group, patience);
+        let uplink = Uplink::new(UplinkSetup {
+            id,
+            kind,
+            transport,
+            timings,
+            input,
+            output,
+            set,
+            writes,
+            group,
+            patience,
+        });
         self.links.recipes.push(uplink).map_err(|_| one_too_many("recipe links", UPLINKS))
     }
 
     /// Variables of recipe links that no port sends come from the state stream.
     fn assign_read_back(&mut self, plan: &Plan) {
-        let Some(state) = &self.links.state else { return };
+        let Some(state) = self.links.state.first() else { return };
         for var in plan.read_back().iter().filter(|&var| plan.owner(var).is_none()) {
             self.store.image.assign(var, state.group);
         }
@@ -434,7 +461,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         }
         for &var in &polled {
             let period = periods.get(var.ordinal()).copied().flatten().unwrap_or(port_cycle_floor());
-            let Some(modbus) = &mut self.links.modbus else { break };
+            let Some(modbus) = self.links.modbus.first_mut() else { break };
             let group = modbus.poll_var(var, period, || groups.next());
             let group = group.ok_or(one_too_many("Modbus poll blocks", MAX_POLL_BLOCKS))?;
             self.store.image.assign(var, group);
@@ -444,7 +471,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
                 Some(Source::Recipe(id)) => {
                     self.links.recipes.iter().find(|link| link.id == id).and_then(|link| link.group)
                 }
-                Some(Source::State) => self.links.state.as_mut().map(|state| {
+                Some(Source::State) => self.links.state.first_mut().map(|state| {
                     // As many places as there are variables.
                     let _ = state.shown.push(var);
                     state.group
@@ -468,7 +495,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     /// What of the recipe links' variables shows when the controller has a safe value: the state
     /// packet, or an output that some link brings.
     fn assign_witnesses(&mut self) {
-        let has_state = self.links.state.is_some();
+        let has_state = !self.links.state.is_empty();
         let image = &self.store.image;
         for link in &mut self.links.recipes {
             let is_shown = |var: &SysVar| {

@@ -1,17 +1,16 @@
 //! The links to port 2000: commands that field values pick (docs/engine.md section 7).
 //!
 //! A command is sent once or not at all. What cannot be sent soon is dropped and said so in the
-//! port's reply code: a robot must not start later because of a button pressed earlier. What stops
+//! port's reply code ([`Outcomes`]): a robot must not start later because of a button pressed earlier. What stops
 //! the robot has a connection of its own, goes ahead of everything and is not dropped while its
 //! device asks for it.
 
 use heapless::{Deque, String, Vec};
 
-use super::counters::{PortCounters, bump};
-use super::field_port::{FieldPort, ReplyCode};
-use super::io::{LinkId, PortId};
+use super::io::{LinkId, PortId, ReplyCode, Transport};
+use super::outcome::Outcomes;
 use super::session::{Event, Sent, Session};
-use super::stops::{STOP_TTL, Stops, Waiting};
+use super::stops::{COMMAND_QUEUE, STOP_TTL, Stops, Waiting};
 use crate::command::{Keyword, Request};
 use crate::config::{CommandEntry, CommandWhen, MAX_COMMANDS, Span};
 use crate::link::LinkState;
@@ -23,8 +22,6 @@ use crate::wire::scalar::Scalar;
 pub const MAX_COMMAND_FIELDS: usize = 16;
 /// Bytes of command texts, over all tables.
 pub const MAX_COMMAND_BYTES: usize = 1024;
-/// Commands that can wait for the one before them.
-pub const COMMAND_QUEUE: usize = 8;
 /// A command that has not been acknowledged this long after it was picked is dropped.
 const COMMAND_TTL: Duration = Duration::from_secs(1);
 /// Two losses of the second connection within this time: the controller takes only one (D26).
@@ -67,6 +64,7 @@ pub(super) struct CommandLink {
     /// The connection for everything, and the one for urgent commands alone.
     pub ordinary: Session,
     pub urgent: Option<Session>,
+    port: u16,
     dialect: Dialect,
     tables: Tables,
     fields: Vec<CommandField, MAX_COMMAND_FIELDS>,
@@ -80,6 +78,8 @@ pub(super) struct CommandLink {
     struck_at: Option<Instant>,
     /// Before this no connection is given up for a stop that has nowhere to go.
     way_made_until: Instant,
+    /// What became of commands, since the engine asked last.
+    pub outcomes: Outcomes,
 }
 
 impl Tables {
@@ -106,12 +106,13 @@ impl Tables {
 
 impl CommandLink {
     /// Links with these command tables; `None` when their texts are too long together.
-    pub(super) fn new(dialect: Dialect, entries: &[CommandEntry]) -> Option<Self> {
+    pub(super) fn new(port: u16, dialect: Dialect, entries: &[CommandEntry]) -> Option<Self> {
         let tables = Tables::new(entries)?;
         let stops = tables.entries.iter().any(|entry| entry.keyword.is_urgent());
         Some(Self {
             ordinary: Session::new(),
             urgent: stops.then(Session::new),
+            port,
             dialect,
             tables,
             fields: Vec::new(),
@@ -121,7 +122,12 @@ impl CommandLink {
             overtaken: 0,
             struck_at: None,
             way_made_until: Instant::ZERO,
+            outcomes: Outcomes::new(),
         })
+    }
+
+    pub(super) fn transport(&self) -> Transport {
+        Transport::Tcp { port: self.port }
     }
 
     /// Adds a field; its index, or `None` when there are too many.
@@ -131,18 +137,17 @@ impl CommandLink {
         Some(index)
     }
 
-    /// An accepted frame brought a value of a command field. [`Self::frame_ends`] and
+    /// An accepted frame brought a value of a command field. When that picks a command, `port`'s `nth`,
+    /// what is known of it at once: it waits, or is not sent. [`Self::frame_ends`] and
     /// [`Self::drop_overtaken`] follow.
     pub(super) fn value(
         &mut self,
         field: u8,
         value: Scalar,
-        port: PortId,
-        reply: &mut ReplyCode,
-        counters: &mut PortCounters,
+        (port, nth): (PortId, u32),
         now: Instant,
-    ) {
-        let Some(place) = self.fields.get_mut(usize::from(field)) else { return };
+    ) -> Option<ReplyCode> {
+        let place = self.fields.get_mut(usize::from(field))?;
         // Only integer fields can be bound to a table.
         let value = value.as_f64() as i64;
         let before = place.last.replace(value);
@@ -154,20 +159,16 @@ impl CommandLink {
         let acts = when == CommandWhen::Frame || changed;
         let entries = table.of(&self.tables.entries);
         let picked = (table.start..).zip(entries).find(|(_, entry)| entry.value == value);
-        let (true, Some((entry, Entry { keyword, .. }))) = (acts, picked) else { return };
-        bump(&mut counters.commands);
-        let waiting = Waiting { port, entry, field, since: now, nth: counters.commands };
+        let (true, Some((entry, Entry { keyword, .. }))) = (acts, picked) else { return None };
+        let waiting = Waiting { port, entry, field, since: now, nth };
         if keyword.is_urgent() {
             self.stops_now = true;
             self.stops.push(*keyword, waiting);
             self.no_way_before(now + ROOM_WITHIN);
-            *reply = ReplyCode::Pending;
-        } else if self.ordinary.supervisor.is_up() && self.queue.push_back(waiting).is_ok() {
-            *reply = ReplyCode::Pending;
-        } else {
-            bump(&mut counters.commands_dropped);
-            *reply = ReplyCode::NotSent;
+            return Some(ReplyCode::Pending);
         }
+        let is_queued = self.ordinary.supervisor.is_up() && self.queue.push_back(waiting).is_ok();
+        Some(if is_queued { ReplyCode::Pending } else { ReplyCode::NotSent })
     }
 
     /// All fields of a frame were looked at: whatever their order, what stops overtakes the rest.
@@ -178,10 +179,10 @@ impl CommandLink {
     }
 
     /// What an urgent command has overtaken is not sent any more.
-    pub(super) fn drop_overtaken(&mut self, ports: &mut [FieldPort]) {
+    pub(super) fn drop_overtaken(&mut self) {
         for _ in 0..core::mem::take(&mut self.overtaken) {
             if let Some(waiting) = self.queue.pop_front() {
-                drop_one(ports, waiting);
+                self.outcomes.push(waiting, ReplyCode::NotSent);
             }
         }
     }
@@ -196,13 +197,13 @@ impl CommandLink {
     }
 
     /// A device that is gone takes what it asked for with it.
-    pub(super) fn drop_forgotten(&mut self, ports: &mut [FieldPort]) {
+    pub(super) fn drop_forgotten(&mut self) {
         for _ in 0..self.queue.len() {
             let Some(waiting) = self.queue.pop_front() else { return };
             let is_there = self.fields.get(usize::from(waiting.field)).is_some_and(|f| f.last.is_some());
             // The one that was taken out left its place.
             if !is_there || self.queue.push_back(waiting).is_err() {
-                drop_one(ports, waiting);
+                self.outcomes.push(waiting, ReplyCode::NotSent);
             }
         }
     }
@@ -215,12 +216,12 @@ impl CommandLink {
     }
 
     /// The driver reports that a connection is lost or could not be opened.
-    pub(super) fn down(&mut self, link: LinkId, ports: &mut [FieldPort], now: Instant) {
+    pub(super) fn down(&mut self, link: LinkId, now: Instant) {
         let ordinary = self.ordinary.supervisor.state();
         let urgent = self.urgent.as_ref().map(|session| session.supervisor.state());
         let Some(session) = self.session(link) else { return };
         if session.supervisor.down(now) {
-            self.lost(link, ports, now);
+            self.lost(link, now);
         }
         match (link, ordinary, urgent) {
             (
@@ -228,12 +229,12 @@ impl CommandLink {
                 LinkState::Up { .. },
                 Some(LinkState::Opening { .. } | LinkState::Up { .. }),
             ) => {
-                self.strike(ports, now);
+                self.strike(now);
             }
             (LinkId::COMMAND, LinkState::Up { .. }, Some(LinkState::Up { since }))
                 if now.saturating_since(since) <= TOGETHER =>
             {
-                self.strike(ports, now);
+                self.strike(now);
             }
             // Both were lost together: that was no verdict on the second one.
             (LinkId::COMMAND, LinkState::Up { .. }, _) | (LinkId::URGENT, _, Some(LinkState::Up { .. })) => {
@@ -245,13 +246,13 @@ impl CommandLink {
     }
 
     /// The second connection was lost, or the first because of it.
-    fn strike(&mut self, ports: &mut [FieldPort], now: Instant) {
+    fn strike(&mut self, now: Instant) {
         let Some(urgent) = &mut self.urgent else { return };
         let again = self.struck_at.is_some_and(|at| now.saturating_since(at) <= STRIKES_WITHIN);
         self.struck_at = Some(now);
         if again {
             urgent.supervisor.share(now);
-            self.lost(LinkId::URGENT, ports, now);
+            self.lost(LinkId::URGENT, now);
         }
     }
 
@@ -265,7 +266,7 @@ impl CommandLink {
 
     /// A connection is gone: nothing that waited for it is sent later, what its device still asks to
     /// stop excepted.
-    fn lost(&mut self, link: LinkId, ports: &mut [FieldPort], now: Instant) {
+    fn lost(&mut self, link: LinkId, now: Instant) {
         let Some(session) = self.session(link) else { return };
         let [first, beside] = session.lost();
         if first.is_some() {
@@ -276,12 +277,12 @@ impl CommandLink {
             if sent.keyword.is_urgent() && self.is_asked(&sent.command) {
                 self.stops.push_again(sent.keyword, Waiting { since: now, ..sent.command });
             } else {
-                settle(ports, sent.command, ReplyCode::NoReply);
+                self.outcomes.push(sent.command, ReplyCode::NoReply);
             }
         }
         if link == LinkId::COMMAND {
             while let Some(waiting) = self.queue.pop_front() {
-                drop_one(ports, waiting);
+                self.outcomes.push(waiting, ReplyCode::NotSent);
             }
         }
     }
@@ -291,16 +292,16 @@ impl CommandLink {
     }
 
     /// The gateway itself slept: nothing is commanded from what was asked before.
-    pub(super) fn slept(&mut self, ports: &mut [FieldPort], now: Instant) {
+    pub(super) fn slept(&mut self, now: Instant) {
         self.fields.iter_mut().for_each(|field| field.last = None);
         for link in [LinkId::COMMAND, LinkId::URGENT] {
             if let Some(session) = self.session(link) {
                 session.supervisor.give_up(now);
             }
-            self.lost(link, ports, now);
+            self.lost(link, now);
         }
         while let Some((_, waiting)) = self.stops.pop(|_| true) {
-            drop_one(ports, waiting);
+            self.outcomes.push(waiting, ReplyCode::NotSent);
         }
     }
 
@@ -318,25 +319,31 @@ impl CommandLink {
         }
     }
 
-    /// Bytes from the controller.
-    pub(super) fn bytes(&mut self, link: LinkId, bytes: &[u8], ports: &mut [FieldPort], now: Instant) {
-        let Some(session) = self.session(link).filter(|session| session.supervisor.is_up()) else { return };
-        session.heard(bytes.len(), now);
-        let in_time = session.in_time(now);
-        self.take(link, bytes, ports, in_time);
+    /// Bytes arrived on a connection; whether it is up.
+    pub(super) fn heard(&mut self, link: LinkId, len: usize, now: Instant) -> bool {
+        let session = self.session(link).filter(|session| session.supervisor.is_up());
+        session.map(|session| session.heard(len, now)).is_some()
+    }
+
+    /// Replies from the controller.
+    pub(super) fn received(&mut self, link: LinkId, bytes: &[u8], now: Instant) {
+        if let Some(session) = self.session(link) {
+            let in_time = session.in_time(now);
+            self.take(link, bytes, in_time);
+        }
     }
 
     /// Looks at the clock: replies that silence completes, timeouts, what waited too long.
-    pub(super) fn advance(&mut self, ports: &mut [FieldPort], now: Instant) {
+    pub(super) fn advance(&mut self, now: Instant) {
         for link in [LinkId::URGENT, LinkId::COMMAND] {
             let Some(session) = self.session(link) else { continue };
             if session.is_due(now) {
-                self.take(link, &[], ports, now);
+                self.take(link, &[], now);
             }
             let Some(session) = self.session(link) else { continue };
             if session.is_overdue(now) {
                 session.supervisor.give_up(now);
-                self.lost(link, ports, now);
+                self.lost(link, now);
             }
         }
         if let Some((link, at)) = self.crowded()
@@ -346,26 +353,26 @@ impl CommandLink {
             if let Some(session) = self.session(link) {
                 session.supervisor.give_up(now);
             }
-            self.lost(link, ports, now);
+            self.lost(link, now);
         }
         // What becomes of the first may open the second at once.
         for link in [LinkId::COMMAND, LinkId::URGENT] {
-            self.supervise(link, ports, now);
+            self.supervise(link, now);
         }
         while let Some(&waiting) = self.queue.front()
             && now >= waiting.since + COMMAND_TTL
         {
             self.queue.pop_front();
-            drop_one(ports, waiting);
+            self.outcomes.push(waiting, ReplyCode::NotSent);
         }
         let fields = &self.fields;
         while let Some(old) = self.stops.pop_old(now, |waiting| is_asked(fields, &self.tables, waiting)) {
-            drop_one(ports, old);
+            self.outcomes.push(old, ReplyCode::NotSent);
         }
     }
 
     /// Opens a connection again when it is time; one that did not come about in time says something.
-    fn supervise(&mut self, link: LinkId, ports: &mut [FieldPort], now: Instant) {
+    fn supervise(&mut self, link: LinkId, now: Instant) {
         let ordinary_is_up = self.ordinary.supervisor.is_up();
         let Some(session) = self.session(link) else { return };
         let was_opening = matches!(session.supervisor.state(), LinkState::Opening { .. });
@@ -374,23 +381,18 @@ impl CommandLink {
         if was_opening && matches!(session.supervisor.state(), LinkState::Down { .. }) {
             match link {
                 LinkId::COMMAND => self.was_away(now),
-                _ if ordinary_is_up => self.strike(ports, now),
+                _ if ordinary_is_up => self.strike(now),
                 _ => {}
             }
         }
     }
 
     /// The next urgent command, when one may be sent, and where.
-    pub(super) fn next_stop(
-        &mut self,
-        ports: &mut [FieldPort],
-        out: &mut [u8],
-        now: Instant,
-    ) -> Option<(LinkId, usize)> {
+    pub(super) fn next_stop(&mut self, out: &mut [u8], now: Instant) -> Option<(LinkId, usize)> {
         while let Some(link) = self.way_of_stops()
             && let Some(command) = self.pop_stop(now)
         {
-            if let Some(len) = self.send(link, command, ports, out, (now, now + STOP_TTL)) {
+            if let Some(len) = self.send(link, command, out, (now, now + STOP_TTL)) {
                 return Some((link, len));
             }
         }
@@ -398,19 +400,14 @@ impl CommandLink {
     }
 
     /// The next other command, when one may be sent.
-    pub(super) fn next_command(
-        &mut self,
-        ports: &mut [FieldPort],
-        out: &mut [u8],
-        now: Instant,
-    ) -> Option<usize> {
+    pub(super) fn next_command(&mut self, out: &mut [u8], now: Instant) -> Option<usize> {
         if self.queue.is_empty() || !self.ordinary.is_free() || self.is_stopping() {
             return None;
         }
         let waiting = self.queue.pop_front()?;
         let keyword = self.tables.entry(waiting.entry)?.0.keyword;
         let until = waiting.since + COMMAND_TTL;
-        self.send(LinkId::COMMAND, (keyword, waiting), ports, out, (now, until))
+        self.send(LinkId::COMMAND, (keyword, waiting), out, (now, until))
     }
 
     /// Whether an urgent command waits.
@@ -461,7 +458,6 @@ impl CommandLink {
         &mut self,
         link: LinkId,
         command: (Keyword, Waiting),
-        ports: &mut [FieldPort],
         out: &mut [u8],
         times: (Instant, Instant),
     ) -> Option<usize> {
@@ -472,7 +468,7 @@ impl CommandLink {
         {
             // What is under way there could arrive after this and start the robot again.
             self.ordinary.supervisor.give_up(times.0);
-            self.lost(LinkId::COMMAND, ports, times.0);
+            self.lost(LinkId::COMMAND, times.0);
         }
         let session = match link {
             LinkId::URGENT => self.urgent.as_mut()?,
@@ -481,7 +477,7 @@ impl CommandLink {
         let (_, text) = self.tables.entry(command.1.entry)?;
         let sent = session.send(command, text, &self.dialect, out, times);
         if sent.is_err() {
-            drop_one(ports, command.1);
+            self.outcomes.push(command.1, ReplyCode::NotSent);
         }
         sent.ok()
     }
@@ -530,18 +526,18 @@ impl CommandLink {
     }
 
     /// Takes what is in `rest`, or what the clock has completed.
-    fn take(&mut self, link: LinkId, bytes: &[u8], ports: &mut [FieldPort], now: Instant) {
+    fn take(&mut self, link: LinkId, bytes: &[u8], now: Instant) {
         let mut rest = bytes;
         loop {
             let Some(session) = self.session(link) else { return };
             match session.step(&mut rest, now) {
                 None => return,
                 Some(Event::Other) => {}
-                Some(Event::Answered(sent, code)) => settle(ports, sent.command, code),
+                Some(Event::Answered(sent, code)) => self.outcomes.push(sent.command, code),
                 Some(Event::TimedOut) => {
                     // A late reply would be taken for that of the next command.
                     session.supervisor.give_up(now);
-                    self.lost(link, ports, now);
+                    self.lost(link, now);
                     return;
                 }
             }
@@ -560,20 +556,4 @@ fn is_asked(fields: &[CommandField], tables: &Tables, waiting: &Waiting) -> bool
     let last = fields.get(usize::from(waiting.field)).and_then(|field| field.last);
     let value = tables.entries.get(usize::from(waiting.entry)).map(|entry| entry.value);
     last.is_some() && last == value
-}
-
-/// A command came to its end.
-fn settle(ports: &mut [FieldPort], command: Waiting, code: ReplyCode) {
-    if let Some(port) = ports.iter_mut().find(|port| port.id == command.port)
-        && port.counters.commands == command.nth
-    {
-        port.reply = code;
-    }
-}
-
-fn drop_one(ports: &mut [FieldPort], command: Waiting) {
-    if let Some(port) = ports.iter_mut().find(|port| port.id == command.port) {
-        bump(&mut port.counters.commands_dropped);
-    }
-    settle(ports, command, ReplyCode::NotSent);
 }

@@ -9,9 +9,9 @@ use super::field_port::{Codec, FieldPort, fields_before};
 use super::sender::{DIGEST_SEED, digest};
 use super::user::{OutputBind, values};
 use crate::image::Image;
-use crate::recipe::can::CanFrame;
 use crate::recipe::model::Mode;
 use crate::time::Instant;
+use crate::wire::can::CanFrame;
 
 /// One thing for the field.
 pub(super) enum Downward {

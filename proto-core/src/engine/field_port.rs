@@ -5,41 +5,21 @@
 
 use super::command_link::CommandLink;
 use super::counters::{PortCounters, add, bump};
-use super::io::{BusState, PortId};
+use super::io::{BusState, PortId, ReplyCode};
+use super::outcome::Outcome;
 use super::sender::Sender;
 use super::store::Store;
 use super::user::{InputBind, fit, forget_commands};
 use crate::config::{Rs485, Span};
 use crate::image::{ImageBytes, InputSet};
-use crate::recipe::can::{CanFrame, CanLayout, CanReject};
+use crate::recipe::can::{CanLayout, CanReject};
 use crate::recipe::deframer::Deframer;
 use crate::recipe::model::Mode;
 use crate::recipe::stream::StreamLayout;
 use crate::recipe::{Applied, ValueError, Values};
 use crate::time::{Duration, Instant};
+use crate::wire::can::CanFrame;
 use crate::wire::scalar::Scalar;
-
-/// How the newest command that a port's values picked went.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-#[cfg_attr(feature = "defmt", derive(defmt::Format))]
-#[repr(u8)]
-pub enum ReplyCode {
-    /// No value has picked a command yet.
-    #[default]
-    None = 0,
-    /// Waiting to be sent, or for the reply.
-    Pending = 1,
-    /// The controller replied that it succeeded.
-    Success = 2,
-    /// The controller replied that it failed.
-    Fail = 3,
-    /// The controller replied something else.
-    Other = 4,
-    /// No reply came in time, or the link was lost meanwhile.
-    NoReply = 5,
-    /// It was not sent: the link was down, or too many were waiting.
-    NotSent = 6,
-}
 
 /// The layouts of the port's recipe.
 #[derive(Debug, Clone)]
@@ -51,13 +31,13 @@ pub(super) enum Codec {
 
 /// Timing of a half-duplex line.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Line {
+pub(super) struct LineTiming {
     pub idle_gap: Duration,
     pub turnaround: Duration,
     heard: Instant,
 }
 
-impl Line {
+impl LineTiming {
     pub(super) fn new(settings: &Rs485) -> Self {
         let idle_gap = settings.idle_gap.max(settings.characters_and_a_half(3));
         Self { idle_gap, turnaround: settings.turnaround, heard: Instant::ZERO }
@@ -79,7 +59,7 @@ pub(super) struct FieldPort {
     pub id: PortId,
     pub codec: Codec,
     pub mode: Mode,
-    pub line: Line,
+    pub line: LineTiming,
     pub sender: Sender,
     /// The port's range of the input bindings, those of all CAN frames in one row.
     pub inputs: Span,
@@ -91,13 +71,6 @@ pub(super) struct FieldPort {
     pub bus: BusState,
     pub reply: ReplyCode,
     pub counters: PortCounters,
-}
-
-/// Whether somebody looks at the image between two frames: a bit may rise and fall within one chunk.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Look {
-    AtEach,
-    AfterAll,
 }
 
 /// The frames that were accepted in one call.
@@ -146,7 +119,7 @@ impl FieldPort {
     }
 
     /// The device is gone: nothing of what was under way is continued later.
-    pub(super) fn down(&mut self, bindings: &[InputBind], commands: &mut Option<CommandLink>, now: Instant) {
+    pub(super) fn down(&mut self, bindings: &[InputBind], commands: Option<&mut CommandLink>, now: Instant) {
         if self.is_up {
             bump(&mut self.counters.downs);
         }
@@ -161,7 +134,7 @@ impl FieldPort {
         &mut self,
         state: BusState,
         bindings: &[InputBind],
-        commands: &mut Option<CommandLink>,
+        commands: Option<&mut CommandLink>,
         now: Instant,
     ) {
         if state == BusState::BusOff && self.bus != BusState::BusOff {
@@ -194,15 +167,14 @@ impl FieldPort {
         self.line.heard = now;
     }
 
-    /// Takes the frames in `rest`, or up to the first accepted one when somebody looks at each.
+    /// Takes the frames in `rest`, or up to the first accepted one when the image is looked at after
+    /// each.
     pub(super) fn frames<const PORTS: usize>(
         &mut self,
         rest: &mut &[u8],
-        look: Look,
         bindings: &[InputBind],
         store: &mut Store<PORTS>,
-        commands: &mut Option<CommandLink>,
-        now: Instant,
+        commands: Option<&mut CommandLink>,
     ) -> Accepted {
         let mut accepted = Accepted::default();
         let bytes = core::mem::take(rest);
@@ -220,13 +192,12 @@ impl FieldPort {
             port: self.id,
             store,
             commands,
-            now,
         };
         let mut left = bytes;
         while let Some(payload) = deframer.next_frame(layout, &mut left) {
             if let Some(set) = frames.take(layout, payload, usize::from(self.first_frame)) {
                 accepted = Accepted { frames: accepted.frames.wrapping_add(1), set };
-                if look == Look::AtEach {
+                if frames.store.watches_bits {
                     break;
                 }
             }
@@ -245,8 +216,7 @@ impl FieldPort {
         frame: &CanFrame,
         bindings: &[InputBind],
         store: &mut Store<PORTS>,
-        commands: &mut Option<CommandLink>,
-        now: Instant,
+        commands: Option<&mut CommandLink>,
     ) -> Accepted {
         add(&mut self.counters.bytes_in, frame.data().len());
         let usable = self.is_usable();
@@ -273,12 +243,21 @@ impl FieldPort {
             port: self.id,
             store,
             commands,
-            now,
         };
         let slot = usize::from(self.first_frame).saturating_add(index);
         let Some(set) = frames.take(&frame_layout, frame.data(), slot) else { return Accepted::default() };
         self.sender.frames_accepted(1, usable, &mut self.counters);
         Accepted { frames: 1, set }
+    }
+
+    /// One of the port's commands came to its end.
+    pub(super) fn command_ended(&mut self, outcome: Outcome) {
+        if outcome.code == ReplyCode::NotSent {
+            bump(&mut self.counters.commands_dropped);
+        }
+        if self.counters.commands == outcome.nth {
+            self.reply = outcome.code;
+        }
     }
 
     /// Looks at the clock: cycles and silence.
@@ -327,8 +306,7 @@ struct Frames<'a, const PORTS: usize> {
     counters: &'a mut PortCounters,
     port: PortId,
     store: &'a mut Store<PORTS>,
-    commands: &'a mut Option<CommandLink>,
-    now: Instant,
+    commands: Option<&'a mut CommandLink>,
 }
 
 impl<const PORTS: usize> Frames<'_, PORTS> {
@@ -360,13 +338,13 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
                 for (binding, value) in bindings.iter().zip(layout.values(payload)) {
                     self.apply_user(binding, value);
                 }
-                if let Some(link) = self.commands {
+                if let Some(link) = &mut self.commands {
                     link.frame_ends();
                 }
             }
         }
         bump(&mut self.counters.frames_in);
-        Some(self.store.accepted(slot, self.counters, self.now))
+        Some(self.store.accepted(slot, self.counters))
     }
 
     fn apply_user(&mut self, binding: &InputBind, value: Scalar) {
@@ -379,8 +357,15 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
                 }
             }
             InputBind::Command(field) => {
-                if let Some(link) = self.commands {
-                    link.value(field, value, self.port, self.reply, self.counters, self.now);
+                if let Some(link) = &mut self.commands {
+                    let nth = self.counters.commands.wrapping_add(1);
+                    if let Some(code) = link.value(field, value, (self.port, nth), self.store.now) {
+                        self.counters.commands = nth;
+                        *self.reply = code;
+                        if code == ReplyCode::NotSent {
+                            bump(&mut self.counters.commands_dropped);
+                        }
+                    }
                 }
             }
         }

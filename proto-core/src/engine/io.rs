@@ -1,8 +1,10 @@
 //! What goes into the engine and what comes out of it.
 
+use core::net::SocketAddr;
+
 use crate::config::MAX_PORTS;
-use crate::recipe::can::CanFrame;
 use crate::time::Instant;
+use crate::wire::can::CanFrame;
 
 /// A port, by its index in [`crate::config::GatewayConfig::ports`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -46,6 +48,7 @@ const FIRST_PORT: u8 = 4;
 /// The kind of a link: what the driver opens for it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[non_exhaustive]
 pub enum LinkKind {
     /// TCP to the controller's command port.
     Command,
@@ -84,6 +87,50 @@ impl LinkKind {
     }
 }
 
+/// Where a link goes, and how it is opened.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct Endpoint<'a> {
+    /// How it is opened, and at which port.
+    pub transport: Transport,
+    /// The controller's address or host name, as configured; empty where the driver learns it
+    /// otherwise. Of a link that listens, the only peer that may be let in.
+    pub host: &'a str,
+}
+
+impl<'a> Endpoint<'a> {
+    /// An endpoint at the controller `host`.
+    pub const fn new(transport: Transport, host: &'a str) -> Self {
+        Self { transport, host }
+    }
+}
+
+/// How a link is opened.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Transport {
+    /// Connect by TCP.
+    Tcp {
+        /// The controller's port.
+        port: u16,
+    },
+    /// Send UDP datagrams from any port of ours, and receive the answers.
+    Udp {
+        /// The controller's port.
+        port: u16,
+    },
+    /// Listen, and take one TCP connection.
+    TcpListen {
+        /// Where; of a board with one address, only the port counts.
+        local: SocketAddr,
+    },
+    /// Receive UDP datagrams, and answer whoever sent last.
+    UdpListen {
+        /// Where; of a board with one address, only the port counts.
+        local: SocketAddr,
+    },
+}
+
 /// A CAN controller's error state.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
@@ -98,9 +145,10 @@ pub enum BusState {
     BusOff,
 }
 
-/// How a field port does.
+/// Health of a field port.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[non_exhaustive]
 pub enum PortState {
     /// Its input frames arrive in time; a port without an input part only needs its device.
     Working,
@@ -112,8 +160,32 @@ pub enum PortState {
     Gone,
 }
 
+/// Result of the newest command that a port's values picked.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[repr(u8)]
+#[non_exhaustive]
+pub enum ReplyCode {
+    /// No value has picked a command yet.
+    #[default]
+    None = 0,
+    /// Waiting to be sent, or for the reply.
+    Pending = 1,
+    /// The controller replied that it succeeded.
+    Success = 2,
+    /// The controller replied that it failed.
+    Fail = 3,
+    /// The controller replied something else.
+    Other = 4,
+    /// No reply came in time, or the link was lost meanwhile.
+    NoReply = 5,
+    /// It was not sent: the link was down, or too many were waiting.
+    NotSent = 6,
+}
+
 /// What happened outside.
 #[derive(Debug, Clone, Copy)]
+#[non_exhaustive]
 pub enum Input<'a> {
     /// A port's device is ready.
     PortUp {
@@ -192,6 +264,7 @@ pub enum Input<'a> {
 
 /// What the driver has to do.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
 pub enum Output<'a> {
     /// Send on a serial line, then report [`Input::PortSent`].
     PortSend {
@@ -212,6 +285,8 @@ pub enum Output<'a> {
     LinkOpen {
         /// The link.
         link: LinkId,
+        /// Where it goes.
+        to: Endpoint<'a>,
     },
     /// Close a link at once and report nothing more about it. TCP with a reset: what the peer has not
     /// acknowledged must not be delivered later.

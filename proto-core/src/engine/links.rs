@@ -1,11 +1,14 @@
 //! The links to the controller together: whom a report is for, and in what order they speak.
+//!
+//! Three kinds are one connection each: [`Connection`] says what differs between them. The command
+//! link has two connections and decides for both.
 
-use heapless::Vec;
+use heapless::{String, Vec};
 
 use super::command_link::CommandLink;
-use super::counters::LinkCounters;
-use super::field_port::{FieldPort, Look};
-use super::io::{LinkId, LinkKind};
+use super::connection::Connection;
+use super::counters::{LinkCounters, add};
+use super::io::{Endpoint, LinkId, LinkKind, Transport};
 use super::modbus_link::ModbusLink;
 use super::state_link::StateLink;
 use super::store::Store;
@@ -13,14 +16,17 @@ use super::uplink::Uplink;
 use crate::link::{LinkAction, LinkHistory, LinkState, Supervisor};
 use crate::time::Instant;
 
-/// How one link does.
+/// State of one link.
 #[derive(Debug, Clone, Copy)]
+#[non_exhaustive]
 pub struct LinkInfo<'a> {
     /// The link.
     pub id: LinkId,
     /// What it is.
     pub kind: LinkKind,
-    /// Where it stands.
+    /// Where it goes, and how it is opened.
+    pub endpoint: Endpoint<'a>,
+    /// Whether it is usable, and since or until when.
     pub state: LinkState,
     /// How often it came up and was lost.
     pub history: &'a LinkHistory,
@@ -28,261 +34,244 @@ pub struct LinkInfo<'a> {
     pub counters: &'a LinkCounters,
 }
 
+/// One or none. All zeros when it is empty, which an `Option` of a struct is not.
+pub(super) type Maybe<T> = Vec<T, 1>;
+
+/// Longest address or name of the controller.
+const MAX_HOST: usize = 64;
+
+/// `$do` with the link `$id` as `$link`, if it is one of those that are one connection each.
+macro_rules! with_connection {
+    ($links:expr, $id:expr, $link:ident => $do:expr) => {
+        match $id {
+            LinkId::STATE => $links.state.first_mut().map(|$link| $do),
+            LinkId::MODBUS => $links.modbus.first_mut().map(|$link| $do),
+            id => $links.recipes.iter_mut().find(|link| link.id == id).map(|$link| $do),
+        }
+    };
+}
+
+/// `$do` with each link that is one connection as `$link`.
+macro_rules! each_connection {
+    ($links:expr, $link:ident => $do:expr) => {
+        $links.state.iter_mut().for_each(|$link| $do);
+        $links.modbus.iter_mut().for_each(|$link| $do);
+        $links.recipes.iter_mut().for_each(|$link| $do);
+    };
+}
+
 /// The links that the configuration needs.
 #[derive(Debug, Clone)]
 pub(super) struct Links<const UPLINKS: usize> {
-    pub command: Option<CommandLink>,
-    pub state: Option<StateLink>,
-    pub modbus: Option<ModbusLink>,
+    /// The controller's address or name.
+    pub host: String<MAX_HOST>,
+    pub command: Maybe<CommandLink>,
+    pub state: Maybe<StateLink>,
+    pub modbus: Maybe<ModbusLink>,
     pub recipes: Vec<Uplink, UPLINKS>,
 }
 
 impl<const UPLINKS: usize> Links<UPLINKS> {
     pub(super) const fn new() -> Self {
-        Self { command: None, state: None, modbus: None, recipes: Vec::new() }
+        Self {
+            host: String::new(),
+            command: Vec::new(),
+            state: Vec::new(),
+            modbus: Vec::new(),
+            recipes: Vec::new(),
+        }
     }
 
     pub(super) fn infos(&self) -> impl Iterator<Item = LinkInfo<'_>> + '_ {
-        let command = self.command.iter().map(|link| &link.ordinary);
-        let command =
-            command.map(|link| info(LinkId::COMMAND, LinkKind::Command, &link.supervisor, &link.counters));
-        let urgent = self.command.iter().filter_map(|link| link.urgent.as_ref());
-        let urgent =
-            urgent.map(|link| info(LinkId::URGENT, LinkKind::Urgent, &link.supervisor, &link.counters));
-        let state = self.state.iter();
-        let state = state.map(|link| info(LinkId::STATE, LinkKind::State, &link.supervisor, &link.counters));
-        let modbus = self.modbus.iter();
-        let modbus =
-            modbus.map(|link| info(LinkId::MODBUS, LinkKind::Modbus, &link.supervisor, &link.counters));
+        let command = self.command.iter().flat_map(|link| {
+            let urgent = link.urgent.iter().map(|session| (LinkId::URGENT, LinkKind::Urgent, session));
+            let all = core::iter::once((LinkId::COMMAND, LinkKind::Command, &link.ordinary)).chain(urgent);
+            all.map(|(id, kind, session)| {
+                self.info(id, kind, link.transport(), &session.supervisor, &session.counters)
+            })
+        });
+        let state = self.state.iter().map(|link| {
+            self.info(LinkId::STATE, LinkKind::State, link.transport(), &link.supervisor, &link.counters)
+        });
+        let modbus = self.modbus.iter().map(|link| {
+            self.info(LinkId::MODBUS, LinkKind::Modbus, link.transport(), &link.supervisor, &link.counters)
+        });
         let recipes = self.recipes.iter();
-        let recipes = recipes.map(|link| info(link.id, link.kind, &link.supervisor, &link.counters));
-        command.chain(urgent).chain(state).chain(modbus).chain(recipes)
+        let recipes = recipes
+            .map(|link| self.info(link.id, link.kind, link.transport, &link.supervisor, &link.counters));
+        command.chain(state).chain(modbus).chain(recipes)
+    }
+
+    fn info<'a>(
+        &'a self,
+        id: LinkId,
+        kind: LinkKind,
+        transport: Transport,
+        supervisor: &'a Supervisor,
+        counters: &'a LinkCounters,
+    ) -> LinkInfo<'a> {
+        let endpoint = Endpoint::new(transport, &self.host);
+        LinkInfo { id, kind, endpoint, state: supervisor.state(), history: supervisor.history(), counters }
+    }
+
+    /// Where a link of [`Self::infos`] goes; the controller's name is written into `buf`.
+    #[cold]
+    #[inline(never)]
+    pub(super) fn endpoint<'b>(&self, id: LinkId, buf: &'b mut [u8]) -> Endpoint<'b> {
+        let transport = self.infos().find(|info| info.id == id).map(|info| info.endpoint.transport);
+        let host = buf.get_mut(..self.host.len()).unwrap_or(&mut []);
+        for (place, byte) in host.iter_mut().zip(self.host.bytes()) {
+            *place = byte;
+        }
+        let host = core::str::from_utf8(host).unwrap_or("");
+        Endpoint::new(transport.unwrap_or(Transport::Tcp { port: 0 }), host)
     }
 
     /// Everything that depends on the clock.
-    pub(super) fn advance<const PORTS: usize>(
-        &mut self,
-        store: &mut Store<PORTS>,
-        ports: &mut [FieldPort],
-        now: Instant,
-    ) {
-        if let Some(link) = &mut self.command {
-            link.advance(ports, now);
+    pub(super) fn advance<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
+        let now = store.now;
+        if let Some(link) = self.command.first_mut() {
+            link.advance(now);
         }
-        if let Some(link) = &mut self.state
-            && link.supervisor.advance(now)
-        {
-            link.lost();
-        }
-        if let Some(link) = &mut self.modbus {
-            link.advance(store, now);
+        each_connection!(self, link => {
+            link.advance(store);
             if link.supervisor.advance(now) {
                 link.lost(store);
             }
-        }
-        for link in &mut self.recipes {
-            link.advance(store, now);
-            if link.supervisor.advance(now) {
-                link.lost(store);
-            }
-        }
+        });
     }
 
     /// The gateway itself slept: what waits on its connections is as old as that, so all of them begin
     /// anew.
-    pub(super) fn slept<const PORTS: usize>(
-        &mut self,
-        store: &mut Store<PORTS>,
-        ports: &mut [FieldPort],
-        now: Instant,
-    ) {
-        if let Some(link) = &mut self.command {
-            link.slept(ports, now);
+    pub(super) fn slept<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
+        let now = store.now;
+        if let Some(link) = self.command.first_mut() {
+            link.slept(now);
         }
-        if let Some(link) = &mut self.state {
-            link.supervisor.give_up(now);
-            link.lost();
-        }
-        if let Some(link) = &mut self.modbus {
+        each_connection!(self, link => {
             link.supervisor.give_up(now);
             link.lost(store);
-        }
-        for link in &mut self.recipes {
-            link.supervisor.give_up(now);
-            link.lost(store);
-        }
+        });
     }
 
     /// The driver reports that a link is usable.
-    pub(super) fn up<const PORTS: usize>(&mut self, id: LinkId, store: &mut Store<PORTS>, now: Instant) {
+    pub(super) fn up<const PORTS: usize>(&mut self, id: LinkId, store: &mut Store<PORTS>) {
+        let now = store.now;
         if !store.safe.is_empty() {
-            store.controller_was_away(now);
+            store.controller_was_away();
         }
-        match id {
-            LinkId::COMMAND | LinkId::URGENT => {
-                if let Some(link) = &mut self.command {
-                    link.up(id, now);
-                }
-            }
-            LinkId::STATE => {
-                if let Some(link) = &mut self.state {
-                    link.supervisor.up(now);
-                }
-            }
-            LinkId::MODBUS => {
-                if let Some(link) = &mut self.modbus
-                    && link.supervisor.up(now)
-                {
-                    link.up(store);
-                }
-            }
-            _ => {
-                if let Some(link) = self.recipe(id)
-                    && link.supervisor.up(now)
-                {
-                    link.up(store, now);
-                }
-            }
+        if let LinkId::COMMAND | LinkId::URGENT = id {
+            self.command.iter_mut().for_each(|link| link.up(id, now));
+            return;
         }
+        with_connection!(self, id, link => {
+            if link.supervisor.up(now) {
+                link.opened(store);
+            }
+        });
     }
 
     /// The driver reports that a link is lost or could not be opened.
-    pub(super) fn down<const PORTS: usize>(
-        &mut self,
-        id: LinkId,
-        store: &mut Store<PORTS>,
-        ports: &mut [FieldPort],
-        now: Instant,
-    ) {
-        match id {
-            LinkId::COMMAND | LinkId::URGENT => {
-                if let Some(link) = &mut self.command {
-                    link.down(id, ports, now);
-                }
-            }
-            LinkId::STATE => {
-                if let Some(link) = &mut self.state
-                    && link.supervisor.down(now)
-                {
-                    link.lost();
-                }
-            }
-            LinkId::MODBUS => {
-                if let Some(link) = &mut self.modbus
-                    && link.supervisor.down(now)
-                {
-                    link.lost(store);
-                }
-            }
-            _ => {
-                if let Some(link) = self.recipe(id)
-                    && link.supervisor.down(now)
-                {
-                    link.lost(store);
-                }
-            }
+    pub(super) fn down<const PORTS: usize>(&mut self, id: LinkId, store: &mut Store<PORTS>) {
+        let now = store.now;
+        if let LinkId::COMMAND | LinkId::URGENT = id {
+            self.command.iter_mut().for_each(|link| link.down(id, now));
+            return;
         }
+        with_connection!(self, id, link => {
+            if link.supervisor.down(now) {
+                link.lost(store);
+            }
+        });
     }
 
-    /// Bytes from a link; when somebody looks at each frame, up to the first. Those of a link that is
-    /// not up, as the engine sees it, are of a connection that it gave up.
-    pub(super) fn bytes<const PORTS: usize>(
+    /// Bytes arrived on a link; whether [`Self::received`] takes them. Those of a link that is not up, as
+    /// the engine sees it, are of a connection that it gave up.
+    pub(super) fn heard(&mut self, id: LinkId, len: usize, now: Instant) -> bool {
+        if let LinkId::COMMAND | LinkId::URGENT = id {
+            return self.command.first_mut().is_some_and(|link| link.heard(id, len, now));
+        }
+        with_connection!(self, id, link => {
+            let is_up = link.supervisor.is_up();
+            if is_up {
+                link.supervisor.heard(now);
+                add(&mut link.counters.bytes_in, len);
+            }
+            is_up
+        })
+        .unwrap_or(false)
+    }
+
+    /// What was heard; the bytes that are left when the image is to be looked at first.
+    pub(super) fn received<'b, const PORTS: usize>(
         &mut self,
         id: LinkId,
-        rest: &mut &[u8],
-        look: Look,
+        bytes: &'b [u8],
         store: &mut Store<PORTS>,
-        ports: &mut [FieldPort],
-        now: Instant,
-    ) {
-        let bytes = core::mem::take(rest);
-        match id {
-            LinkId::COMMAND | LinkId::URGENT => {
-                if let Some(link) = &mut self.command {
-                    link.bytes(id, bytes, ports, now);
-                }
-            }
-            LinkId::STATE => {
-                if let Some(link) = self.state.as_mut().filter(|link| link.supervisor.is_up()) {
-                    *rest = link.bytes(bytes, look, store, now);
-                }
-            }
-            LinkId::MODBUS => {
-                if let Some(link) = self.modbus.as_mut().filter(|link| link.supervisor.is_up()) {
-                    link.bytes(bytes, store, now);
-                }
-            }
-            _ => {
-                if let Some(link) = self.recipe(id).filter(|link| link.supervisor.is_up()) {
-                    *rest = link.bytes(bytes, look, store, now);
-                }
-            }
+    ) -> &'b [u8] {
+        if let LinkId::COMMAND | LinkId::URGENT = id {
+            self.command.iter_mut().for_each(|link| link.received(id, bytes, store.now));
+            return &[];
         }
+        with_connection!(self, id, link => link.received(bytes, store)).unwrap_or(&[])
     }
 
     /// The transport took everything; when something happens there by itself.
     pub(super) fn sent(&mut self, id: LinkId) -> Instant {
-        match id {
-            LinkId::COMMAND | LinkId::URGENT => {
-                self.command.iter_mut().for_each(|link| link.sent(id));
-                self.deadline_of(id)
-            }
-            LinkId::MODBUS => self.modbus.as_mut().map_or(Instant::NEVER, |link| {
-                link.sent();
-                link.deadline()
-            }),
-            _ => self.recipe(id).map_or(Instant::NEVER, |link| {
-                link.sent();
-                link.deadline()
-            }),
+        if let LinkId::COMMAND | LinkId::URGENT = id {
+            self.command.iter_mut().for_each(|link| link.sent(id));
+            return self.deadline_of(id);
         }
+        let deadline = with_connection!(self, id, link => {
+            link.sent();
+            link.deadline()
+        });
+        deadline.unwrap_or(Instant::NEVER)
     }
 
     /// The peer's transport has acknowledged all but `left` bytes.
     pub(super) fn acked(&mut self, id: LinkId, left: u32) {
-        match id {
-            LinkId::COMMAND | LinkId::URGENT => self.command.iter_mut().for_each(|link| link.acked(id, left)),
-            LinkId::MODBUS => self.modbus.iter_mut().for_each(|link| link.acked(left)),
-            _ => self.recipe(id).into_iter().for_each(|link| link.acked(left)),
+        if let LinkId::COMMAND | LinkId::URGENT = id {
+            self.command.iter_mut().for_each(|link| link.acked(id, left));
+            return;
         }
+        with_connection!(self, id, link => link.acked(left));
     }
 
     /// What goes to the controller: what stops the robot, then field values, commands last.
     pub(super) fn next_upward<const PORTS: usize>(
         &mut self,
         store: &mut Store<PORTS>,
-        ports: &mut [FieldPort],
         out: &mut [u8],
-        now: Instant,
     ) -> Option<(LinkId, usize)> {
-        if let Some(link) = &mut self.command
-            && let Some(sent) = link.next_stop(ports, out, now)
+        if let Some(link) = self.command.first_mut()
+            && let Some(sent) = link.next_stop(out, store.now)
         {
             return Some(sent);
         }
-        let state = self.state.as_ref().map(|state| state.group);
+        let state = self.state.first().map(|state| state.group);
         for link in &mut self.recipes {
-            if let Some(len) = link.next_frame(store, state, out, now) {
+            if let Some(len) = link.next_frame(store, state, out) {
                 return Some((link.id, len));
             }
         }
-        if let Some(link) = &mut self.modbus
-            && let Some(len) = link.next_request(store, out, now)
+        if let Some(link) = self.modbus.first_mut()
+            && let Some(len) = link.next_request(store, out)
         {
             return Some((LinkId::MODBUS, len));
         }
-        let link = self.command.as_mut()?;
-        link.next_command(ports, out, now).map(|len| (LinkId::COMMAND, len))
+        let link = self.command.first_mut()?;
+        link.next_command(out, store.now).map(|len| (LinkId::COMMAND, len))
     }
 
     /// Whether what stops the robot waits.
     pub(super) fn has_stops(&self) -> bool {
-        self.command.as_ref().is_some_and(CommandLink::has_stops)
+        self.command.first().is_some_and(CommandLink::has_stops)
     }
 
     /// Links to be opened and closed.
     pub(super) fn next_action(&mut self) -> Option<(LinkId, LinkAction)> {
-        if let Some(link) = &mut self.command {
+        if let Some(link) = self.command.first_mut() {
             if let Some(action) = link.ordinary.supervisor.take_action() {
                 return Some((LinkId::COMMAND, action));
             }
@@ -290,10 +279,10 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
                 return Some((LinkId::URGENT, action));
             }
         }
-        if let Some(action) = self.state.as_mut().and_then(|link| link.supervisor.take_action()) {
+        if let Some(action) = self.state.first_mut().and_then(|link| link.supervisor.take_action()) {
             return Some((LinkId::STATE, action));
         }
-        if let Some(action) = self.modbus.as_mut().and_then(|link| link.supervisor.take_action()) {
+        if let Some(action) = self.modbus.first_mut().and_then(|link| link.supervisor.take_action()) {
             return Some((LinkId::MODBUS, action));
         }
         let mut recipes = self.recipes.iter_mut();
@@ -312,36 +301,16 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
 
     /// When something happens by itself on one link.
     pub(super) fn deadline_of(&self, id: LinkId) -> Instant {
-        let (own, supervisor) = match id {
-            LinkId::COMMAND | LinkId::URGENT => {
-                return self.command.as_ref().map_or(Instant::NEVER, CommandLink::deadline);
+        let of = |own: Instant, supervisor: &Supervisor| own.min(supervisor.deadline());
+        let deadline = match id {
+            LinkId::COMMAND | LinkId::URGENT => self.command.first().map(CommandLink::deadline),
+            LinkId::STATE => self.state.first().map(|link| link.supervisor.deadline()),
+            LinkId::MODBUS => self.modbus.first().map(|link| of(link.deadline(), &link.supervisor)),
+            _ => {
+                let link = self.recipes.iter().find(|link| link.id == id);
+                link.map(|link| of(link.deadline(), &link.supervisor))
             }
-            LinkId::STATE => match &self.state {
-                Some(link) => (Instant::NEVER, &link.supervisor),
-                None => return Instant::NEVER,
-            },
-            LinkId::MODBUS => match &self.modbus {
-                Some(link) => (link.deadline(), &link.supervisor),
-                None => return Instant::NEVER,
-            },
-            _ => match self.recipes.iter().find(|link| link.id == id) {
-                Some(link) => (link.deadline(), &link.supervisor),
-                None => return Instant::NEVER,
-            },
         };
-        own.min(supervisor.deadline())
+        deadline.unwrap_or(Instant::NEVER)
     }
-
-    fn recipe(&mut self, id: LinkId) -> Option<&mut Uplink> {
-        self.recipes.iter_mut().find(|link| link.id == id)
-    }
-}
-
-fn info<'a>(
-    id: LinkId,
-    kind: LinkKind,
-    supervisor: &'a Supervisor,
-    counters: &'a LinkCounters,
-) -> LinkInfo<'a> {
-    LinkInfo { id, kind, state: supervisor.state(), history: supervisor.history(), counters }
 }

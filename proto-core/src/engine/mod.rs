@@ -15,6 +15,7 @@
 
 mod build;
 mod command_link;
+mod connection;
 mod counters;
 mod field_output;
 mod field_port;
@@ -23,6 +24,7 @@ mod io;
 mod links;
 mod modbus_link;
 mod outbox;
+mod outcome;
 mod plan;
 mod sender;
 mod session;
@@ -33,21 +35,21 @@ mod uplink;
 mod user;
 
 pub use build::BuildError;
-pub use command_link::{COMMAND_QUEUE, MAX_COMMAND_BYTES, MAX_COMMAND_FIELDS};
+pub use command_link::{MAX_COMMAND_BYTES, MAX_COMMAND_FIELDS};
 pub use counters::{LinkCounters, PortCounters};
-pub use field_port::ReplyCode;
-pub use io::{BusState, Input, LinkId, LinkKind, Output, PortId, PortState};
+pub use io::{BusState, Endpoint, Input, LinkId, LinkKind, Output, PortId, PortState, ReplyCode, Transport};
 pub use links::LinkInfo;
 pub use modbus_link::MAX_POLL_BLOCKS;
 pub use outbox::EDGE_QUEUE;
 pub use plan::{Plan, PlanError, Source, WayUp};
+pub use stops::COMMAND_QUEUE;
 pub use store::MAX_INPUT_FRAMES;
 
 use heapless::Vec;
 
 use counters::{add, bump};
 use field_output::Downward;
-use field_port::{Accepted, FieldPort, Look};
+use field_port::{Accepted, FieldPort};
 use links::Links;
 use store::{SafeBytes, Store};
 use user::{Bindings, forget_commands};
@@ -55,13 +57,19 @@ use user::{Bindings, forget_commands};
 use crate::config::MAX_SAFE_VALUES;
 use crate::image::Image;
 use crate::link::LinkAction;
-use crate::recipe::can::CanFrame;
 use crate::recipe::model::MAX_STREAM_FRAME;
 use crate::time::{Duration, Instant};
+use crate::wire::can::CanFrame;
+use crate::wire::state::LEN;
 
 /// Size of the buffer for [`Engine::poll_output`]: the longest stream frame; every request to the
 /// controller is shorter.
 pub const OUTPUT_BUFFER: usize = MAX_STREAM_FRAME;
+
+/// Size of a receive buffer that takes a state packet in one piece and shows that a datagram is longer
+/// than any frame. What arrives may be handed over in pieces of any other size.
+pub const INPUT_BUFFER: usize = 1536;
+const _: () = assert!(INPUT_BUFFER >= LEN && INPUT_BUFFER > MAX_STREAM_FRAME);
 
 /// A driver that calls the engine later than this after the call before was asleep: stopped, suspended,
 /// or in a debugger.
@@ -88,12 +96,10 @@ pub struct Engine<const PORTS: usize = 8, const UPLINKS: usize = 4, const FIELDS
     bindings: Bindings<FIELDS>,
     safe_values: Vec<SafeBytes, MAX_SAFE_VALUES>,
     links: Links<UPLINKS>,
-    /// Whether some port sends on a rising bit.
-    watches_bits: bool,
     /// Nothing depends on the clock before this. It may be earlier than needed, never later.
     timer_at: Instant,
-    /// The clock was looked at since `timer_at` was worked out.
-    rearm: bool,
+    /// `timer_at` was worked out after the clock was looked at last.
+    is_armed: bool,
     /// The newest instant that was told.
     now: Instant,
     /// A deadline has come and its tick has not been told: what is too old may still wait, so nothing
@@ -126,9 +132,13 @@ struct Ask {
 
 impl Ask {
     const ALL: Self = Self { links: true, actions: true, ports: true };
+    const NONE: Self = Self { links: false, actions: false, ports: false };
 }
 
 impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS, UPLINKS, FIELDS> {
+    /// Most links that this engine can have: port 2000 twice, port 2001, Modbus, and the recipe links.
+    pub const MAX_LINKS: usize = UPLINKS.saturating_add(4);
+
     /// Something happened, or time passed. `now` is the present; an instant earlier than in the call
     /// before counts as that.
     ///
@@ -144,8 +154,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             Input::PortUp { port } => self.change_port(port, FieldPort::up),
             Input::PortDown { port } => self.port_down(port, now),
             Input::PortBus { port, state } => self.port_bus(port, state, now),
-            Input::LinkUp { link } => self.link_up(link, now),
-            Input::LinkDown { link } => self.link_down(link, now),
+            Input::LinkUp { link } => self.link_up(link),
+            Input::LinkDown { link } => self.link_down(link),
             Input::LinkBytes { link, bytes } => self.link_bytes(link, bytes, now),
             Input::LinkSent { link } => {
                 let deadline = self.links.sent(link);
@@ -183,8 +193,10 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         }
         if self.ask.links && !self.is_late {
             // To send a command, a connection may have to be closed.
-            self.ask.actions |= self.links.command.is_some();
-            let upward = self.links.next_upward(&mut self.store, &mut self.ports, &mut buf[..], now);
+            self.ask.actions |= !self.links.command.is_empty();
+            self.store.now = now;
+            let upward = self.links.next_upward(&mut self.store, &mut buf[..]);
+            self.carry_outcomes();
             if let Some((link, len)) = upward {
                 self.arm(self.links.deadline_of(link));
                 return Output::LinkSend { link, bytes: buf.get(..len).unwrap_or(&[]) };
@@ -195,7 +207,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         if self.ask.actions {
             if let Some((link, action)) = self.links.next_action() {
                 return match action {
-                    LinkAction::Open => Output::LinkOpen { link },
+                    LinkAction::Open => {
+                        Output::LinkOpen { link, to: self.links.endpoint(link, &mut buf[..]) }
+                    }
                     LinkAction::Close => Output::LinkClose { link },
                 };
             }
@@ -211,8 +225,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             }
         }
         debug_assert!(self.is_late || self.all_are_silent(&mut buf[..], now), "who was not asked speaks");
-        if self.rearm {
-            self.rearm = false;
+        if !self.is_armed {
+            self.is_armed = true;
             self.timer_at = self.deadline();
         }
         let beat_at = if self.ports.is_empty() { Instant::NEVER } else { self.beat_at };
@@ -226,7 +240,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
 
     /// Whether who is not asked has nothing to say.
     fn all_are_silent(&mut self, out: &mut [u8], now: Instant) -> bool {
-        self.links.next_upward(&mut self.store, &mut self.ports, out, now).is_none()
+        self.links.next_upward(&mut self.store, out).is_none()
             && self.links.next_action().is_none()
             && self.next_downward(out, now).is_none()
     }
@@ -243,7 +257,6 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     // What an input does is a function of its own, so that no other pays for the registers it needs.
     #[inline(never)]
     fn port_bytes(&mut self, id: PortId, bytes: &[u8], now: Instant) {
-        let look = self.look();
         if let Some(port) = find_port(&mut self.ports, id) {
             if self.is_deaf {
                 return port.discard(bytes, now);
@@ -252,9 +265,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         }
         let mut rest = bytes;
         loop {
-            let (store, command) = (&mut self.store, &mut self.links.command);
+            let (store, command) = (&mut self.store, self.links.command.first_mut());
             let Some(port) = find_port(&mut self.ports, id) else { return };
-            let accepted = port.frames(&mut rest, look, &self.bindings.inputs, store, command, now);
+            let accepted = port.frames(&mut rest, &self.bindings.inputs, store, command);
             self.ask.ports |= port.sender.is_due();
             let deadline = port.deadline();
             self.arm(deadline);
@@ -267,12 +280,12 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
 
     #[inline(never)]
     fn port_can(&mut self, id: PortId, frame: &CanFrame, now: Instant) {
-        let (store, command) = (&mut self.store, &mut self.links.command);
+        let (store, command) = (&mut self.store, self.links.command.first_mut());
         let Some(port) = find_port(&mut self.ports, id) else { return };
         if self.is_deaf {
             return port.discard(frame.data(), now);
         }
-        let accepted = port.can(frame, &self.bindings.inputs, store, command, now);
+        let accepted = port.can(frame, &self.bindings.inputs, store, command);
         self.ask.ports |= port.sender.is_due();
         let deadline = port.deadline();
         self.arm(deadline);
@@ -283,7 +296,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     fn port_down(&mut self, id: PortId, now: Instant) {
         let Some(port) = find_port(&mut self.ports, id) else { return };
         self.ask = Ask::ALL;
-        port.down(&self.bindings.inputs, &mut self.links.command, now);
+        port.down(&self.bindings.inputs, self.links.command.first_mut(), now);
         self.drop_forgotten();
     }
 
@@ -291,32 +304,34 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     fn port_bus(&mut self, id: PortId, state: BusState, now: Instant) {
         let Some(port) = find_port(&mut self.ports, id) else { return };
         self.ask = Ask::ALL;
-        port.bus_state(state, &self.bindings.inputs, &mut self.links.command, now);
+        port.bus_state(state, &self.bindings.inputs, self.links.command.first_mut(), now);
         let deadline = port.deadline();
         self.arm(deadline);
         self.drop_forgotten();
     }
 
     #[cold]
-    fn link_up(&mut self, link: LinkId, now: Instant) {
-        self.links.up(link, &mut self.store, now);
+    fn link_up(&mut self, link: LinkId) {
+        self.links.up(link, &mut self.store);
         self.arm_link(link);
     }
 
     #[cold]
-    fn link_down(&mut self, link: LinkId, now: Instant) {
-        self.links.down(link, &mut self.store, &mut self.ports, now);
-        self.count_lost();
+    fn link_down(&mut self, link: LinkId) {
+        self.links.down(link, &mut self.store);
+        self.carry_results();
         self.arm_link(link);
     }
 
     #[inline(never)]
     fn link_bytes(&mut self, link: LinkId, bytes: &[u8], now: Instant) {
-        let look = self.look();
-        let mut rest = bytes;
+        let is_up = self.links.heard(link, bytes.len(), now);
+        let mut rest = if is_up { bytes } else { &[] };
         loop {
-            self.links.bytes(link, &mut rest, look, &mut self.store, &mut self.ports, now);
-            self.count_lost();
+            if is_up {
+                rest = self.links.received(link, rest, &mut self.store);
+            }
+            self.carry_results();
             self.arm_link(link);
             self.image_changed();
             if rest.is_empty() {
@@ -328,6 +343,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     /// The present, and whether the gateway has slept until now.
     fn present(&mut self, now: Instant) -> Instant {
         let now = self.forward(now);
+        self.store.now = now;
         if now >= self.beat_at {
             // A configured engine is called at every beat; before the first call nothing was late.
             if self.now != Instant::ZERO && now.saturating_since(self.now) > ASLEEP {
@@ -356,7 +372,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     fn wake(&mut self, now: Instant) {
         self.sleeps = self.sleeps.wrapping_add(1);
         // Before deadlines pass: one of them may be to open a link that has been down.
-        self.links.slept(&mut self.store, &mut self.ports, now);
+        self.links.slept(&mut self.store);
         self.advance(now);
         self.ports.iter_mut().for_each(FieldPort::slept);
         self.is_deaf = true;
@@ -366,11 +382,12 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
 
     /// Commands whose device is gone.
     fn drop_forgotten(&mut self) {
-        if let Some(command) = &mut self.links.command {
-            command.drop_forgotten(&mut self.ports);
+        if let Some(command) = self.links.command.first_mut() {
+            command.drop_forgotten();
             let deadline = command.deadline();
             self.arm(deadline);
         }
+        self.carry_outcomes();
     }
 
     /// The process image.
@@ -378,12 +395,12 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         &self.store.image
     }
 
-    /// What happened on a field port; `None` for a port that is none.
+    /// What happened on a field port; `None` if no such port is configured.
     pub fn port_counters(&self, port: PortId) -> Option<&PortCounters> {
         self.ports.iter().find(|other| other.id == port).map(|port| &port.counters)
     }
 
-    /// How a field port does; `None` for a port that is none.
+    /// Health of a field port; `None` if no such port is configured.
     pub fn port_state(&self, port: PortId) -> Option<PortState> {
         let (index, port) = self.ports.iter().enumerate().find(|(_, other)| other.id == port)?;
         let mut frames = self.store.frames.iter().filter(|frame| usize::from(frame.port) == index);
@@ -398,7 +415,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         })
     }
 
-    /// How the newest command that a port's values picked went; `None` for a port that is none.
+    /// Result of the newest command that a port's values picked; `None` if no such port is configured.
     pub fn reply_code(&self, port: PortId) -> Option<ReplyCode> {
         self.ports.iter().find(|other| other.id == port).map(|port| port.reply)
     }
@@ -453,53 +470,60 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         // At one instant the clock is looked at once: what is done now is due later.
         self.timer_at = now + Duration::from_micros(1);
         self.ask = Ask::ALL;
-        self.rearm = true;
+        self.is_armed = false;
         self.expire_frames(now);
         for index in 0..self.ports.len() {
             if let Some(port) = self.ports.get_mut(index) {
                 port.advance(now);
             }
         }
-        self.links.advance(&mut self.store, &mut self.ports, now);
-        self.count_lost();
+        self.links.advance(&mut self.store);
+        self.carry_results();
     }
 
-    /// Values that were dropped with their link, counted at their ports.
-    fn count_lost(&mut self) {
+    /// What came of values and commands on a link, for the ports that they are of.
+    fn carry_results(&mut self) {
+        self.carry_outcomes();
         let Some(lost) = self.store.take_lost() else { return };
         for (port, dropped) in self.ports.iter_mut().zip(lost) {
             add(&mut port.counters.values_expired, dropped as usize);
         }
     }
 
+    fn carry_outcomes(&mut self) {
+        let Some(command) = self.links.command.first_mut() else { return };
+        command.outcomes.take(|outcome| {
+            if let Some(port) = find_port(&mut self.ports, outcome.port) {
+                port.command_ended(outcome);
+            }
+        });
+    }
+
     fn expire_frames(&mut self, now: Instant) {
         let mut timed_out = false;
-        while let Some((frame, dropped)) = self.store.next_timeout(&self.safe_values, now) {
+        while let Some((frame, dropped)) = self.store.next_timeout(&self.safe_values) {
             timed_out = true;
             if let Some(port) = self.ports.get_mut(usize::from(frame.port)) {
                 bump(&mut port.counters.timeouts);
                 add(&mut port.counters.values_expired, dropped);
             }
-            forget_commands(frame.bindings.of(&self.bindings.inputs), &mut self.links.command, now);
+            forget_commands(frame.bindings.of(&self.bindings.inputs), self.links.command.first_mut(), now);
         }
         if timed_out {
             self.drop_forgotten();
             self.image_changed();
         }
-        self.expire_waiting(now);
+        self.expire_waiting();
     }
 
     /// Values that have waited too long are dropped.
-    fn expire_waiting(&mut self, now: Instant) {
+    fn expire_waiting(&mut self) {
         let ports = &mut self.ports;
-        self.store.expire_waiting(
-            |port, dropped| {
-                if let Some(port) = ports.get_mut(port) {
-                    add(&mut port.counters.values_expired, dropped);
-                }
-            },
-            now,
-        );
+        self.store.expire_waiting(|port, dropped| {
+            if let Some(port) = ports.get_mut(port) {
+                add(&mut port.counters.values_expired, dropped);
+            }
+        });
     }
 
     /// After a field frame: bits that trigger, and frames that have to wait for their neighbours.
@@ -510,35 +534,31 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         self.ask.links = true;
         let deadline = self.store.deadline();
         if deadline <= now {
-            self.expire_waiting(now);
+            self.expire_waiting();
         }
         self.arm(self.store.deadline());
-        if let Some(command) = &mut self.links.command {
-            command.drop_overtaken(&mut self.ports);
+        if let Some(command) = self.links.command.first_mut() {
+            command.drop_overtaken();
             let deadline = command.deadline();
             self.arm(deadline);
         }
+        self.carry_outcomes();
         self.image_changed();
         let dirty = self.store.outbox.dirty().and(&accepted.set);
-        let state = self.links.state.as_ref().map(|state| state.group);
+        let state = self.links.state.first().map(|state| state.group);
         let waits = self.links.recipes.iter().any(|link| {
             link.supervisor.is_up()
                 && !dirty.and(&link.writes).is_empty()
-                && !link.is_ready(&self.store, state, now)
+                && !link.is_ready(&self.store, state)
         });
         if waits && let Some(port) = find_port(&mut self.ports, port) {
             add(&mut port.counters.withheld, accepted.frames as usize);
         }
     }
 
-    /// Bits that trigger are looked at after each frame, however many come at once.
-    fn look(&self) -> Look {
-        if self.watches_bits { Look::AtEach } else { Look::AfterAll }
-    }
-
     /// Values in the image changed: bits that trigger may have risen.
     fn image_changed(&mut self) {
-        if !self.watches_bits {
+        if !self.store.watches_bits {
             return;
         }
         self.ask.ports = true;

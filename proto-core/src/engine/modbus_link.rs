@@ -4,9 +4,10 @@
 use heapless::Vec;
 
 use super::OUTPUT_BUFFER;
-use super::counters::{LinkCounters, add, bump};
+use super::connection::Connection;
+use super::counters::{LinkCounters, bump};
 use super::flight::Flight;
-use super::outbox::BIT_VARS;
+use super::io::Transport;
 use super::store::Store;
 use crate::image::{GroupId, InputSet};
 use crate::link::{LinkTimings, Supervisor};
@@ -15,7 +16,7 @@ use crate::modbus::client::{Client, ClientEvent};
 use crate::modbus::pdu::{MAX_WRITE_COILS, MAX_WRITE_REGISTERS, Request, Response};
 use crate::modbus::{Coils, Registers};
 use crate::schedule::Grid;
-use crate::sysvar::{ModbusPlace, SysVar};
+use crate::sysvar::{BIT_INPUT_COUNT, ModbusPlace, SysVar};
 use crate::time::{Duration, Instant};
 use crate::wire::scalar::Scalar;
 
@@ -59,9 +60,9 @@ struct InFlight {
     since: Instant,
 }
 
-/// Whose turn it is when both a write and a poll could be sent.
+/// What goes first when both a write and a poll could be sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Turn {
+enum First {
     Write,
     Poll,
 }
@@ -70,6 +71,7 @@ enum Turn {
 pub(super) struct ModbusLink {
     pub supervisor: Supervisor,
     pub counters: LinkCounters,
+    port: u16,
     client: Client,
     /// Variables that are written here.
     pub writes: InputSet,
@@ -80,7 +82,7 @@ pub(super) struct ModbusLink {
     unsent: bool,
     flight: Flight<2>,
     timeouts_in_a_row: u8,
-    turn: Turn,
+    first: First,
     /// The next write starts at this variable, so that none waits for ever.
     cursor: usize,
     /// Safe values that the controller refused; they are written again at `ask_again_at`.
@@ -89,10 +91,11 @@ pub(super) struct ModbusLink {
 }
 
 impl ModbusLink {
-    pub(super) fn new(unit: u8, writes: InputSet) -> Self {
+    pub(super) fn new(port: u16, unit: u8, writes: InputSet) -> Self {
         Self {
             supervisor: Supervisor::new(LinkTimings::TCP),
             counters: LinkCounters::default(),
+            port,
             client: Client::new(unit),
             writes,
             polled: Vec::new(),
@@ -101,11 +104,15 @@ impl ModbusLink {
             unsent: false,
             flight: Flight::new(),
             timeouts_in_a_row: 0,
-            turn: Turn::Write,
+            first: First::Write,
             cursor: 0,
             refused: InputSet::EMPTY,
             ask_again_at: Instant::NEVER,
         }
+    }
+
+    pub(super) fn transport(&self) -> Transport {
+        Transport::Tcp { port: self.port }
     }
 
     /// Polls a variable every `period`; false when there are too many. Variables must come in the
@@ -141,108 +148,13 @@ impl ModbusLink {
         Some(group)
     }
 
-    /// The connection is up.
-    pub(super) fn up<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
-        self.timeouts_in_a_row = 0;
-        self.flight.clear();
-        store.link_up(&self.writes);
-    }
-
-    /// The connection is gone, and with it what was under way.
-    pub(super) fn lost<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
-        self.abort(store);
-        self.unsent = false;
-        self.flight.clear();
-        self.write_refused_again(store);
-        self.client.reset();
-        store.link_lost(&self.writes);
-    }
-
-    /// The transport took everything.
-    pub(super) fn sent(&mut self) {
-        self.unsent = false;
-    }
-
-    /// The peer's transport has acknowledged all but `left` bytes.
-    pub(super) fn acked(&mut self, left: u32) {
-        self.flight.acked(left);
-    }
-
-    /// Bytes from the controller.
-    #[inline(never)]
-    pub(super) fn bytes<const PORTS: usize>(&mut self, bytes: &[u8], store: &mut Store<PORTS>, now: Instant) {
-        self.supervisor.heard(now);
-        add(&mut self.counters.bytes_in, bytes.len());
-        let mut rest = bytes;
-        while let Some(event) = self.client.receive(&mut rest) {
-            let answered = self.in_flight.take();
-            match (event, answered) {
-                (ClientEvent::Violation(_), answered) => {
-                    bump(&mut self.counters.malformed);
-                    self.in_flight = answered;
-                    self.supervisor.give_up(now);
-                    self.lost(store);
-                    return;
-                }
-                (_, None) => bump(&mut self.counters.malformed),
-                (ClientEvent::Exception(_), Some(asked)) => {
-                    self.flight.answered();
-                    bump(&mut self.counters.refused);
-                    if let Asked::Write { safe } = asked.asked
-                        && !safe.is_empty()
-                    {
-                        self.refused = self.refused.or(&safe);
-                        self.ask_again_at = self.ask_again_at.min(now + REFUSED_PAUSE);
-                    }
-                    self.counters.answered(now.saturating_since(asked.since).as_micros());
-                    self.timeouts_in_a_row = 0;
-                }
-                (ClientEvent::Response(response), Some(asked)) => {
-                    self.counters.answered(now.saturating_since(asked.since).as_micros());
-                    self.timeouts_in_a_row = 0;
-                    self.flight.answered();
-                    match asked.asked {
-                        Asked::Write { safe } => store.confirm(&safe, now),
-                        Asked::Poll { block } => {
-                            if let Some(block) = self.blocks.get(block) {
-                                take_poll(block, &self.polled, response, store, now);
-                            }
-                        }
-                    }
-                }
-            }
-        }
-    }
-
-    /// Looks at the clock: answers that did not come, safe values that were refused.
-    pub(super) fn advance<const PORTS: usize>(&mut self, store: &mut Store<PORTS>, now: Instant) {
-        if now >= self.ask_again_at {
-            self.write_refused_again(store);
-        }
-        if now < self.answer_deadline() {
-            return;
-        }
-        bump(&mut self.counters.timeouts);
-        self.abort(store);
-        self.timeouts_in_a_row = self.timeouts_in_a_row.saturating_add(1);
-        // A request that has not arrived by now would be carried out when nobody waits for it any more.
-        let is_under_way = self.unsent || !self.flight.is_empty();
-        if is_under_way {
-            bump(&mut self.counters.unacknowledged);
-        }
-        if is_under_way || self.timeouts_in_a_row >= TIMEOUTS_IN_A_ROW {
-            self.supervisor.give_up(now);
-            self.lost(store);
-        }
-    }
-
     /// The next request, when one may be sent.
     pub(super) fn next_request<const PORTS: usize>(
         &mut self,
         store: &mut Store<PORTS>,
         out: &mut [u8],
-        now: Instant,
     ) -> Option<usize> {
+        let now = store.now;
         if !self.supervisor.is_up() || self.in_flight.is_some() || self.unsent {
             return None;
         }
@@ -250,35 +162,20 @@ impl ModbusLink {
         let pending = store.outbox.dirty().and(&self.writes);
         let asked = match (pending.is_empty(), poll) {
             (true, None) => return None,
-            (false, Some(_)) if self.turn == Turn::Write => self.write(&pending, store, out),
+            (false, Some(_)) if self.first == First::Write => self.write(&pending, store, out),
             (false, None) => self.write(&pending, store, out),
             (_, Some(block)) => self.poll(block, out, now),
         };
         let (len, asked) = asked?;
-        self.turn = match asked {
-            Asked::Write { .. } => Turn::Poll,
-            Asked::Poll { .. } => Turn::Write,
+        self.first = match asked {
+            Asked::Write { .. } => First::Poll,
+            Asked::Poll { .. } => First::Write,
         };
         bump(&mut self.counters.sent);
         self.in_flight = Some(InFlight { asked, since: now });
         self.unsent = true;
         self.flight.sent(len, now + ANSWER_TIMEOUT);
         Some(len)
-    }
-
-    /// When something happens by itself.
-    pub(super) fn deadline(&self) -> Instant {
-        if self.in_flight.is_some() {
-            return self.answer_deadline().min(self.ask_again_at);
-        }
-        if !self.supervisor.is_up() {
-            return Instant::NEVER;
-        }
-        if self.unsent {
-            return self.ask_again_at;
-        }
-        let polls = self.blocks.iter().map(|block| block.grid.next()).min().unwrap_or(Instant::NEVER);
-        polls.min(self.ask_again_at)
     }
 
     fn answer_deadline(&self) -> Instant {
@@ -339,7 +236,7 @@ impl ModbusLink {
         let items = each.saturating_mul(count as u16);
         let vars = InputSet::run(first, count);
         self.cursor = first.ordinal().saturating_add(count);
-        let mut bits = [0; BIT_VARS];
+        let mut bits = [0; BIT_INPUT_COUNT];
         if kind == Kind::Coils {
             for (place, var) in bits.iter_mut().zip(vars.iter()) {
                 *place = store.outbox.bit_value(var);
@@ -363,6 +260,112 @@ impl ModbusLink {
     }
 }
 
+impl Connection for ModbusLink {
+    fn opened<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
+        self.timeouts_in_a_row = 0;
+        self.flight.clear();
+        store.link_up(&self.writes);
+    }
+
+    fn lost<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
+        self.abort(store);
+        self.unsent = false;
+        self.flight.clear();
+        self.write_refused_again(store);
+        self.client.reset();
+        store.link_lost(&self.writes);
+    }
+
+    #[inline(never)]
+    fn received<'b, const PORTS: usize>(&mut self, bytes: &'b [u8], store: &mut Store<PORTS>) -> &'b [u8] {
+        let now = store.now;
+        let mut rest = bytes;
+        while let Some(event) = self.client.receive(&mut rest) {
+            let answered = self.in_flight.take();
+            match (event, answered) {
+                (ClientEvent::Violation(_), answered) => {
+                    bump(&mut self.counters.malformed);
+                    self.in_flight = answered;
+                    self.supervisor.give_up(now);
+                    self.lost(store);
+                    return &[];
+                }
+                (_, None) => bump(&mut self.counters.malformed),
+                (ClientEvent::Exception(_), Some(asked)) => {
+                    self.flight.answered();
+                    bump(&mut self.counters.refused);
+                    if let Asked::Write { safe } = asked.asked
+                        && !safe.is_empty()
+                    {
+                        self.refused = self.refused.or(&safe);
+                        self.ask_again_at = self.ask_again_at.min(now + REFUSED_PAUSE);
+                    }
+                    self.counters.answered(now.saturating_since(asked.since).as_micros());
+                    self.timeouts_in_a_row = 0;
+                }
+                (ClientEvent::Response(response), Some(asked)) => {
+                    self.counters.answered(now.saturating_since(asked.since).as_micros());
+                    self.timeouts_in_a_row = 0;
+                    self.flight.answered();
+                    match asked.asked {
+                        Asked::Write { safe } => store.confirm(&safe),
+                        Asked::Poll { block } => {
+                            if let Some(block) = self.blocks.get(block) {
+                                take_poll(block, &self.polled, response, store);
+                            }
+                        }
+                    }
+                }
+            }
+        }
+        &[]
+    }
+
+    fn sent(&mut self) {
+        self.unsent = false;
+    }
+
+    fn acked(&mut self, left: u32) {
+        self.flight.acked(left);
+    }
+
+    fn advance<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
+        let now = store.now;
+        if now >= self.ask_again_at {
+            self.write_refused_again(store);
+        }
+        if now < self.answer_deadline() {
+            return;
+        }
+        bump(&mut self.counters.timeouts);
+        self.abort(store);
+        self.timeouts_in_a_row = self.timeouts_in_a_row.saturating_add(1);
+        // A request that has not arrived by now would be carried out when nobody waits for it any more.
+        let is_under_way = self.unsent || !self.flight.is_empty();
+        if is_under_way {
+            bump(&mut self.counters.unacknowledged);
+        }
+        if is_under_way || self.timeouts_in_a_row >= TIMEOUTS_IN_A_ROW {
+            self.supervisor.give_up(now);
+            self.lost(store);
+        }
+    }
+
+    fn deadline(&self) -> Instant {
+        if self.in_flight.is_some() {
+            return self.answer_deadline().min(self.ask_again_at);
+        }
+        if !self.supervisor.is_up() {
+            return Instant::NEVER;
+        }
+        if self.unsent {
+            return self.ask_again_at;
+        }
+        let polls = self.blocks.iter().map(|block| block.grid.next()).min().unwrap_or(Instant::NEVER);
+        polls.min(self.ask_again_at)
+    }
+}
+
 /// The longest request and its registers.
 const _: () = assert!(MAX_ADU + 2 * MAX_WRITE_REGISTERS as usize <= OUTPUT_BUFFER);
 
@@ -380,7 +383,6 @@ fn take_poll<const PORTS: usize>(
     polled: &[SysVar],
     response: Response<'_>,
     store: &mut Store<PORTS>,
-    now: Instant,
 ) {
     for &var in polled {
         let value = match (var.modbus(), response) {
@@ -398,8 +400,8 @@ fn take_poll<const PORTS: usize>(
             let _ = store.image.set(var, value);
         }
     }
-    store.image.stamp(block.group, now);
-    store.doubt_by_witnesses(now);
+    store.image.stamp(block.group, store.now);
+    store.doubt_by_witnesses();
 }
 
 fn bits_at(coils: Coils<'_>, first: u16, count: u16, block: &Block) -> Option<Scalar> {

@@ -8,14 +8,11 @@ use heapless::Vec;
 
 use super::counters::{PortCounters, bump};
 use crate::image::InputSet;
-use crate::sysvar::SysVar;
+use crate::sysvar::{BIT_INPUT_COUNT, SysVar};
 use crate::time::{Duration, Instant};
 
 /// Bit values that can wait behind the one that is written next, a port.
 pub const EDGE_QUEUE: usize = 16;
-
-/// Byte variables come first in the table of inputs, so their ordinals count from 0.
-pub(super) const BIT_VARS: usize = 13;
 
 #[derive(Debug, Clone, Copy)]
 struct Edge {
@@ -39,12 +36,13 @@ pub(super) struct EdgeQueue(Vec<Edge, EDGE_QUEUE>);
 pub(super) struct Outbox {
     /// Variables with a value to write.
     dirty: InputSet,
-    bits: [BitSlot; BIT_VARS],
+    /// By ordinal: byte variables come first in the table.
+    bits: [BitSlot; BIT_INPUT_COUNT],
 }
 
 impl Outbox {
     pub(super) const fn new() -> Self {
-        Self { dirty: InputSet::EMPTY, bits: [BitSlot { value: 0, at: Instant::ZERO }; BIT_VARS] }
+        Self { dirty: InputSet::EMPTY, bits: [BitSlot { value: 0, at: Instant::ZERO }; BIT_INPUT_COUNT] }
     }
 
     /// Variables with a value to write.
@@ -213,7 +211,7 @@ mod tests {
     #[test]
     fn the_byte_inputs_are_the_first_of_the_table() {
         let bytes = SysVar::all().filter(|v| v.direction() == Direction::Input && v.is_bits());
-        assert!(bytes.map(|v| v.ordinal()).eq(0..BIT_VARS));
+        assert!(bytes.map(|v| v.ordinal()).eq(0..BIT_INPUT_COUNT));
     }
 
     #[test]

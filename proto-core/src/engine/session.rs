@@ -3,13 +3,12 @@
 
 use super::counters::{LinkCounters, add, bump};
 use super::flight::Flight;
+use super::io::ReplyCode;
 use super::stops::Waiting;
 use crate::command::{ClientEvent, CommandClient, Keyword, ReplyKind, StartError};
 use crate::link::{LinkTimings, Supervisor};
 use crate::time::{Duration, Instant};
 use crate::wire::dialect::Dialect;
-
-use super::field_port::ReplyCode;
 
 /// A command that was handed over.
 #[derive(Debug, Clone, Copy)]

@@ -2,13 +2,14 @@
 
 use heapless::Vec;
 
-use super::counters::{LinkCounters, add, bump};
-use super::field_port::Look;
+use super::connection::Connection;
+use super::counters::{LinkCounters, bump};
+use super::io::Transport;
 use super::store::Store;
 use crate::image::{GroupId, InputSet};
 use crate::link::{LinkTimings, Supervisor};
 use crate::sysvar::{COUNT, SysVar};
-use crate::time::{Duration, Instant};
+use crate::time::Duration;
 use crate::wire::state::{StateStream, StateView};
 
 /// A stream that is silent for this long is reopened: twenty packets are missing.
@@ -20,6 +21,7 @@ const MISALIGNED_IN_A_ROW: u32 = 3;
 pub(super) struct StateLink {
     pub supervisor: Supervisor,
     pub counters: LinkCounters,
+    port: u16,
     pub group: GroupId,
     stream: StateStream,
     /// Variables that come from here.
@@ -29,10 +31,11 @@ pub(super) struct StateLink {
 }
 
 impl StateLink {
-    pub(super) fn new(group: GroupId, read_back: InputSet) -> Self {
+    pub(super) fn new(port: u16, group: GroupId, read_back: InputSet) -> Self {
         Self {
             supervisor: Supervisor::new(LinkTimings::TCP.with_silence(SILENCE)),
             counters: LinkCounters::default(),
+            port,
             group,
             stream: StateStream::new(),
             shown: Vec::new(),
@@ -40,22 +43,21 @@ impl StateLink {
         }
     }
 
-    /// The connection is gone; half a packet of it is worth nothing.
-    pub(super) fn lost(&mut self) {
+    pub(super) fn transport(&self) -> Transport {
+        Transport::Tcp { port: self.port }
+    }
+}
+
+impl Connection for StateLink {
+    fn opened<const PORTS: usize>(&mut self, _store: &mut Store<PORTS>) {}
+
+    fn lost<const PORTS: usize>(&mut self, _store: &mut Store<PORTS>) {
+        // Half a packet is worth nothing.
         self.stream.reset();
     }
 
-    /// Bytes from the controller; those that are left when somebody looks at each packet.
     #[inline(never)]
-    pub(super) fn bytes<'b, const PORTS: usize>(
-        &mut self,
-        bytes: &'b [u8],
-        look: Look,
-        store: &mut Store<PORTS>,
-        now: Instant,
-    ) -> &'b [u8] {
-        self.supervisor.heard(now);
-        add(&mut self.counters.bytes_in, bytes.len());
+    fn received<'b, const PORTS: usize>(&mut self, bytes: &'b [u8], store: &mut Store<PORTS>) -> &'b [u8] {
         let mut rest = bytes;
         while let Some(packet) = self.stream.next_packet(&mut rest) {
             match packet {
@@ -79,21 +81,19 @@ impl StateLink {
                         }
                     }
                     if !store.safe.is_empty() {
-                        compare_safe(&view, store, now);
+                        compare_safe(&view, store);
                     }
-                    store.heard(now);
-                    store.image.stamp(self.group, now);
-                    if look == Look::AtEach {
-                        // They are counted when they are taken.
-                        self.counters.bytes_in = self.counters.bytes_in.wrapping_sub(rest.len() as u32);
+                    store.heard();
+                    store.image.stamp(self.group, store.now);
+                    if store.watches_bits {
                         return rest;
                     }
                 }
                 Err(_) => bump(&mut self.counters.malformed),
             }
             if self.stream.misaligned_in_a_row() >= MISALIGNED_IN_A_ROW {
-                self.supervisor.give_up(now);
-                self.lost();
+                self.supervisor.give_up(store.now);
+                self.lost(store);
                 return &[];
             }
         }
@@ -103,13 +103,13 @@ impl StateLink {
 
 /// Safe values that the controller shows, it has; one that it showed by a packet from before, or that
 /// something late has overwritten, it has not.
-fn compare_safe<const PORTS: usize>(view: &StateView<'_>, store: &mut Store<PORTS>, now: Instant) {
-    let (may_confirm, may_doubt) = (store.may_confirm(now), store.may_doubt(now));
+fn compare_safe<const PORTS: usize>(view: &StateView<'_>, store: &mut Store<PORTS>) {
+    let (may_confirm, may_doubt) = (store.may_confirm(), store.may_doubt());
     for var in store.safe.iter() {
         let Some(shown) = view.read_var(var) else { continue };
         let is_there = shown == store.image.value(var);
         match store.unconfirmed.contains(var) {
-            true if is_there && may_confirm => store.confirm(&InputSet::from_iter([var]), now),
+            true if is_there && may_confirm => store.confirm(&InputSet::from_iter([var])),
             false if !is_there && may_doubt => store.doubt(var),
             _ => {}
         }

@@ -8,8 +8,10 @@ use crate::command::Keyword;
 use crate::config::MAX_PORTS;
 use crate::time::{Duration, Instant};
 
+/// Commands that can wait for the one before them, urgent ones apart.
+pub const COMMAND_QUEUE: usize = 8;
 /// Four urgent commands, each once for every port.
-const MOST: usize = 4 * MAX_PORTS;
+pub(super) const MAX_STOPS: usize = 4 * MAX_PORTS;
 /// How long one waits that nobody asks for any more, and how long it may take to be acknowledged.
 pub(super) const STOP_TTL: Duration = Duration::from_secs(1);
 
@@ -28,7 +30,7 @@ pub(super) struct Waiting {
 
 /// The urgent commands that wait, in the order in which they were picked.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Stops(Vec<(Keyword, Waiting), MOST>);
+pub(super) struct Stops(Vec<(Keyword, Waiting), MAX_STOPS>);
 
 impl Stops {
     pub(super) const fn new() -> Self {

@@ -8,7 +8,7 @@ use super::outbox::{EdgeQueue, Outbox};
 use crate::config::{SafeValue, Span};
 use crate::image::{GroupId, Image, InputSet};
 use crate::sysvar::SysVar;
-use crate::time::{Duration, Instant};
+use crate::time::{Duration, Instant, Stamp};
 
 /// Input frames over all field ports: a stream recipe has one, a CAN recipe one an id.
 pub const MAX_INPUT_FRAMES: usize = 48;
@@ -46,6 +46,11 @@ impl SafeBytes {
 
 #[derive(Debug, Clone)]
 pub(super) struct Store<const PORTS: usize> {
+    /// The instant of this call of the engine.
+    pub now: Instant,
+    /// Some port sends on a rising bit: the engine looks at the image after each frame, however many
+    /// came at once.
+    pub watches_bits: bool,
     pub image: Image,
     pub outbox: Outbox,
     /// One queue a field port.
@@ -77,14 +82,16 @@ pub(super) struct Store<const PORTS: usize> {
     lost: [u32; PORTS],
     has_lost: bool,
     /// No frame is overdue before this.
-    next_overdue: Instant,
+    next_overdue: Stamp,
     /// No value has waited too long before this.
-    next_expiry: Instant,
+    next_expiry: Stamp,
 }
 
 impl<const PORTS: usize> Store<PORTS> {
     pub(super) const fn new() -> Self {
         Self {
+            now: Instant::ZERO,
+            watches_bits: false,
             image: Image::new(),
             outbox: Outbox::new(),
             edges: Vec::new(),
@@ -102,24 +109,26 @@ impl<const PORTS: usize> Store<PORTS> {
             reachable: InputSet::EMPTY,
             lost: [0; PORTS],
             has_lost: false,
-            next_overdue: Instant::NEVER,
-            next_expiry: Instant::NEVER,
+            next_overdue: Stamp::NEVER,
+            next_expiry: Stamp::NEVER,
         }
     }
 
     /// The values of an accepted frame stand in the image: they are to be written. Returns those
     /// whose link is up.
-    pub(super) fn accepted(&mut self, nth: usize, counters: &mut PortCounters, now: Instant) -> InputSet {
+    pub(super) fn accepted(&mut self, nth: usize, counters: &mut PortCounters) -> InputSet {
+        let now = self.now;
         let Some(frame) = self.frames.get_mut(nth) else { return InputSet::EMPTY };
         frame.overdue_at = now + frame.timeout;
-        self.next_overdue = self.next_overdue.min(frame.overdue_at);
-        self.next_expiry = self.next_expiry.min(too_old_at(now, frame.timeout));
+        self.next_overdue = Stamp::at(self.next_overdue.get().min(frame.overdue_at));
+        let too_old = too_old_at(now, frame.timeout);
+        self.next_expiry = Stamp::at(self.next_expiry.get().min(too_old));
         let (set, port) = (frame.set, usize::from(frame.port));
         self.image.stamp(GroupId(nth as u8), now);
         self.live = self.live.or(&set);
         if !self.safe.and(&set).is_empty() {
             // Safe values that still wait grow old from now on, and may be too old already.
-            self.next_expiry = now;
+            self.next_expiry = Stamp::at(now);
             self.safe = self.safe.minus(&set);
             self.unconfirmed = self.unconfirmed.minus(&set);
         }
@@ -138,15 +147,16 @@ impl<const PORTS: usize> Store<PORTS> {
         reachable
     }
 
-    /// The first frame that is overdue at `now`, with its variables set to their safe values, and how
+    /// The first frame that is overdue, with its variables set to their safe values, and how
     /// many values that still waited were dropped; call again until `None`.
-    pub(super) fn next_timeout(&mut self, safe: &[SafeBytes], now: Instant) -> Option<(InputFrame, usize)> {
-        if now < self.next_overdue {
+    pub(super) fn next_timeout(&mut self, safe: &[SafeBytes]) -> Option<(InputFrame, usize)> {
+        let now = self.now;
+        if now < self.next_overdue.get() {
             return None;
         }
         let Some(frame) = self.frames.iter_mut().find(|frame| frame.overdue_at <= now) else {
             let next = self.frames.iter().map(|frame| frame.overdue_at).min();
-            self.next_overdue = next.unwrap_or(Instant::NEVER);
+            self.next_overdue = Stamp::at(next.unwrap_or(Instant::NEVER));
             return None;
         };
         frame.overdue_at = Instant::NEVER;
@@ -178,11 +188,12 @@ impl<const PORTS: usize> Store<PORTS> {
     }
 
     /// Drops what has waited for longer than its port's timeout and counts it there.
-    pub(super) fn expire_waiting(&mut self, mut count: impl FnMut(usize, usize), now: Instant) {
-        if now < self.next_expiry {
+    pub(super) fn expire_waiting(&mut self, mut count: impl FnMut(usize, usize)) {
+        let now = self.now;
+        if now < self.next_expiry.get() {
             return;
         }
-        self.next_expiry = Instant::NEVER;
+        self.next_expiry = Stamp::NEVER;
         for frame in &self.frames {
             let waiting = frame.set.and(&InputSet::BYTES).and(&self.outbox.dirty()).minus(&self.safe);
             if waiting.is_empty() {
@@ -191,7 +202,8 @@ impl<const PORTS: usize> Store<PORTS> {
             let port = usize::from(frame.port);
             if let Some(queue) = self.edges.get_mut(port) {
                 let (dropped, oldest) = self.outbox.expire(queue, &waiting, frame.timeout, now);
-                self.next_expiry = self.next_expiry.min(too_old_at(oldest, frame.timeout));
+                let too_old = too_old_at(oldest, frame.timeout);
+                self.next_expiry = Stamp::at(self.next_expiry.get().min(too_old));
                 if dropped > 0 {
                     count(port, dropped);
                 }
@@ -201,7 +213,7 @@ impl<const PORTS: usize> Store<PORTS> {
 
     /// When something happens by itself.
     pub(super) fn deadline(&self) -> Instant {
-        self.next_overdue.min(self.next_expiry)
+        self.next_overdue.get().min(self.next_expiry.get())
     }
 
     /// These values have been handed to their link.
@@ -245,27 +257,27 @@ impl<const PORTS: usize> Store<PORTS> {
     }
 
     /// The controller has these safe values, as far as they still stand.
-    pub(super) fn confirm(&mut self, safe: &InputSet, now: Instant) {
+    pub(super) fn confirm(&mut self, safe: &InputSet) {
         if !safe.and(&self.unconfirmed).and(&self.unanswered).is_empty() {
-            self.confirmed_at = now;
+            self.confirmed_at = self.now;
         }
         self.unconfirmed = self.unconfirmed.minus(safe);
     }
 
     /// Whether another value than the safe one, shown now, can be what the controller had all along.
     /// Later it is another master's doing.
-    pub(super) fn may_doubt(&self, now: Instant) -> bool {
-        now < self.confirmed_at + DOUBT
+    pub(super) fn may_doubt(&self) -> bool {
+        self.now < self.confirmed_at + DOUBT
     }
 
     /// Outputs that came just now show another value than the safe one.
-    pub(super) fn doubt_by_witnesses(&mut self, now: Instant) {
-        if !self.may_doubt(now) {
+    pub(super) fn doubt_by_witnesses(&mut self) {
+        if !self.may_doubt() {
             return;
         }
         for var in self.safe.minus(&self.unconfirmed).and(&InputSet::BYTES).iter() {
             if let Some(witness) = var.shown_by()
-                && self.image.known_since(witness) == Some(now)
+                && self.image.known_since(witness) == Some(self.now)
                 && self.image.value(witness) != self.image.value(var)
             {
                 self.doubt(var);
@@ -282,33 +294,33 @@ impl<const PORTS: usize> Store<PORTS> {
     }
 
     /// Something came that the controller sends steadily.
-    pub(super) fn heard(&mut self, now: Instant) {
-        if !self.is_heard(now) {
+    pub(super) fn heard(&mut self) {
+        if !self.is_heard() {
             self.era = self.era.wrapping_add(1);
         }
-        self.heard_at = Some(now);
+        self.heard_at = Some(self.now);
     }
 
     /// Whether the controller has been there all the time since the era began.
-    pub(super) fn is_heard(&self, now: Instant) -> bool {
-        !is_gap(self.heard_at, now)
+    pub(super) fn is_heard(&self) -> bool {
+        !is_gap(self.heard_at, self.now)
     }
 
     /// The controller may have started anew: safe values are written once more.
-    pub(super) fn controller_was_away(&mut self, now: Instant) {
+    pub(super) fn controller_was_away(&mut self) {
         self.unconfirmed = self.safe;
-        self.unconfirmed_since = now;
+        self.unconfirmed_since = self.now;
         self.outbox.again(&self.safe);
     }
 
     /// Whether what the controller shows now can be what it made of the safe values, and not older.
-    pub(super) fn may_confirm(&self, now: Instant) -> bool {
-        !self.unconfirmed.is_empty() && now >= self.unconfirmed_since + SHOWN_AFTER
+    pub(super) fn may_confirm(&self) -> bool {
+        !self.unconfirmed.is_empty() && self.now >= self.unconfirmed_since + SHOWN_AFTER
     }
 
     /// Outputs that show what an input was set to have come: they may confirm safe values.
-    pub(super) fn look_at_witnesses(&mut self, now: Instant) {
-        if !self.may_confirm(now) {
+    pub(super) fn confirm_by_witnesses(&mut self) {
+        if !self.may_confirm() {
             return;
         }
         let since = self.unconfirmed_since + SHOWN_AFTER;
@@ -317,7 +329,7 @@ impl<const PORTS: usize> Store<PORTS> {
                 && self.image.known_since(witness).is_some_and(|at| at >= since)
                 && self.image.value(witness) == self.image.value(var)
             {
-                self.confirm(&InputSet::from_iter([var]), now);
+                self.confirm(&InputSet::from_iter([var]));
             }
         }
     }

@@ -3,18 +3,18 @@
 //! What goes up is whole frames, so every variable in them needs a value that somebody sent or
 //! that was read back (docs/engine.md section 5). What comes down goes into the image.
 
+use super::connection::Connection;
 use super::counters::{LinkCounters, add, bump};
-use super::field_port::Look;
 use super::flight::Flight;
-use super::io::{LinkId, LinkKind};
-use super::outbox::BIT_VARS;
+use super::io::{LinkId, LinkKind, Transport};
 use super::store::{Store, is_gap};
 use crate::image::{GroupId, Image, InputSet};
-use crate::link::Supervisor;
+use crate::link::{LinkTimings, Supervisor};
 use crate::recipe::PlacedField;
 use crate::recipe::deframer::{Deframer, datagram};
 use crate::recipe::model::{Field, Framing};
 use crate::recipe::stream::StreamLayout;
+use crate::sysvar::BIT_INPUT_COUNT;
 use crate::time::{Duration, Instant};
 
 /// How old a read-back value may be and still go into a frame.
@@ -35,6 +35,7 @@ const SPEAK_EVERY: Duration = Duration::from_secs(20);
 pub(super) struct Uplink {
     pub id: LinkId,
     pub kind: LinkKind,
+    pub transport: Transport,
     pub supervisor: Supervisor,
     pub counters: LinkCounters,
     framing: Framing,
@@ -62,15 +63,24 @@ pub(super) struct Uplink {
     handed_over: Option<(Instant, u32)>,
 }
 
+/// What the configuration makes of a recipe link.
+pub(super) struct UplinkSetup {
+    pub id: LinkId,
+    pub kind: LinkKind,
+    pub transport: Transport,
+    pub timings: LinkTimings,
+    pub input: Option<StreamLayout>,
+    pub output: Option<StreamLayout>,
+    /// Variables in the frames up, and those of them that are to be written here.
+    pub set: InputSet,
+    pub writes: InputSet,
+    pub group: Option<GroupId>,
+    pub patience: Duration,
+}
+
 impl Uplink {
     pub(super) fn new(
-        id: LinkId,
-        kind: LinkKind,
-        supervisor: Supervisor,
-        (input, output): (Option<StreamLayout>, Option<StreamLayout>),
-        (set, writes): (InputSet, InputSet),
-        group: Option<GroupId>,
-        patience: Duration,
+        UplinkSetup { id, kind, transport, timings, input, output, set, writes, group, patience }: UplinkSetup,
     ) -> Self {
         let framing = match kind {
             LinkKind::RecipeTcpListen { .. } => Framing::Bytes,
@@ -79,7 +89,8 @@ impl Uplink {
         Self {
             id,
             kind,
-            supervisor,
+            transport,
+            supervisor: Supervisor::new(timings),
             counters: LinkCounters::default(),
             framing,
             input,
@@ -99,132 +110,21 @@ impl Uplink {
         }
     }
 
-    pub(super) fn up<const PORTS: usize>(&mut self, store: &mut Store<PORTS>, now: Instant) {
-        self.busy = false;
-        self.handed_over = None;
-        self.flight.clear();
-        store.link_up(&self.writes);
-        self.greet_at = if self.greets() { now } else { Instant::NEVER };
-        self.speak_at = self.greet_at;
-    }
-
-    pub(super) fn lost<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
-        self.busy = false;
-        self.flight.clear();
-        self.greet_at = Instant::NEVER;
-        self.speak_at = Instant::NEVER;
-        self.repeat_at = Instant::NEVER;
-        self.deframer.discard();
-        store.link_lost(&self.writes);
-    }
-
-    /// The transport took everything.
-    pub(super) fn sent(&mut self) {
-        self.busy = false;
-    }
-
-    /// The peer's transport has acknowledged all but `left` bytes.
-    pub(super) fn acked(&mut self, left: u32) {
-        self.flight.acked(left);
-    }
-
-    /// Looks at the clock: frames that were not acknowledged, safe values that are sent again.
-    pub(super) fn advance<const PORTS: usize>(&mut self, store: &mut Store<PORTS>, now: Instant) {
-        if now >= self.flight.deadline() {
-            bump(&mut self.counters.unacknowledged);
-            self.supervisor.give_up(now);
-            self.lost(store);
-        }
-        if now < self.repeat_at {
-            return;
-        }
-        self.repeat_at = Instant::NEVER;
-        store.look_at_witnesses(now);
-        let wanted = store.unconfirmed.and(&self.writes);
-        if wanted.is_empty() || !self.supervisor.is_up() {
-            return;
-        }
-        store.again(&wanted);
-        let fast = is_new(store, now) || !wanted.and(&self.shown).is_empty();
-        self.repeat_at = now + if fast { REPEAT_EVERY } else { REPEAT_SLOWLY };
-    }
-
-    /// Bytes, or one datagram, from the controller; those that are left when somebody looks at each
-    /// frame.
-    #[inline(never)]
-    pub(super) fn bytes<'b, const PORTS: usize>(
-        &mut self,
-        bytes: &'b [u8],
-        look: Look,
-        store: &mut Store<PORTS>,
-        now: Instant,
-    ) -> &'b [u8] {
-        add(&mut self.counters.bytes_in, bytes.len());
-        self.supervisor.heard(now);
-        let (Some(layout), Some(group)) = (&self.output, self.group) else {
-            bump(&mut self.counters.malformed);
-            return &[];
-        };
-        let (mut fresh, mut left): (bool, &[u8]) = (false, &[]);
-        let unreadable = &mut self.counters.unreadable;
-        let mut take = |payload: &[u8]| {
-            fresh = true;
-            add(unreadable, take_frame(layout, payload, &mut store.image));
-        };
-        match self.framing {
-            Framing::Datagram => match datagram(layout, bytes) {
-                Ok(payload) => {
-                    take(payload);
-                    bump(&mut self.counters.received);
-                }
-                Err(_) => bump(&mut self.counters.malformed),
-            },
-            Framing::Bytes => {
-                let mut rest = bytes;
-                while let Some(payload) = self.deframer.next_frame(layout, &mut rest) {
-                    take(payload);
-                    bump(&mut self.counters.received);
-                    if look == Look::AtEach {
-                        // They are counted when they are taken.
-                        self.counters.bytes_in = self.counters.bytes_in.wrapping_sub(rest.len() as u32);
-                        left = rest;
-                        break;
-                    }
-                }
-                self.counters.resync_bytes = self.deframer.stats().skipped_bytes as u32;
-            }
-        }
-        if fresh {
-            let before = store.image.stamp_of(group);
-            store.heard(now);
-            if before.is_some() && is_gap(before, now) && !store.safe.is_empty() {
-                store.controller_was_away(now);
-            }
-            store.image.stamp(group, now);
-            store.doubt_by_witnesses(now);
-            if self.greets() {
-                self.greet_at = now + GREET_EVERY;
-            }
-        }
-        left
-    }
-
     /// What can be sent now: a frame with new values, or a greeting.
     pub(super) fn next_frame<const PORTS: usize>(
         &mut self,
         store: &mut Store<PORTS>,
         state: Option<GroupId>,
         out: &mut [u8],
-        now: Instant,
     ) -> Option<usize> {
         if !self.supervisor.is_up() || self.busy || self.flight.is_full() {
             return None;
         }
         let wanted = !store.outbox.dirty().and(&self.writes).is_empty();
-        if !wanted && now < self.speaks_at() {
+        if !wanted && store.now < self.speaks_at() {
             return None;
         }
-        self.send(wanted, store, state, out, now)
+        self.send(wanted, store, state, out)
     }
 
     /// The same, where there is something to say. Mostly there is not: what asks stays short without it.
@@ -235,14 +135,14 @@ impl Uplink {
         store: &mut Store<PORTS>,
         state: Option<GroupId>,
         out: &mut [u8],
-        now: Instant,
     ) -> Option<usize> {
+        let now = store.now;
         let len = match &self.input {
-            Some(layout) if wanted && self.is_ready(store, state, now) => {
+            Some(layout) if wanted && self.is_ready(store, state) => {
                 let len = encode(layout, store, out)?;
                 store.taken(&self.writes);
                 self.handed_over = Some((now, store.era));
-                let repeats = self.repeat_at == Instant::NEVER || is_new(store, now);
+                let repeats = self.repeat_at == Instant::NEVER || is_new(store);
                 if repeats && !store.unconfirmed.and(&self.writes).is_empty() {
                     self.repeat_at = self.repeat_at.min(now + REPEAT_EVERY);
                 }
@@ -277,28 +177,17 @@ impl Uplink {
         self.greet_at.min(self.speak_at)
     }
 
-    /// When the link wants to send by itself.
-    pub(super) fn deadline(&self) -> Instant {
-        let speaks_at = if self.busy { Instant::NEVER } else { self.speaks_at() };
-        speaks_at.min(self.flight.deadline()).min(self.repeat_at)
-    }
-
     /// Whether every variable of the frame has a value that somebody sent or that was just read.
-    pub(super) fn is_ready<const PORTS: usize>(
-        &self,
-        store: &Store<PORTS>,
-        state: Option<GroupId>,
-        now: Instant,
-    ) -> bool {
+    pub(super) fn is_ready<const PORTS: usize>(&self, store: &Store<PORTS>, state: Option<GroupId>) -> bool {
         let others = self.set.minus(&store.live);
         if others.is_empty() {
             return true;
         }
         let read_back = state
             .and_then(|group| store.image.stamp_of(group))
-            .is_some_and(|at| now.saturating_since(at) <= READ_BACK_MAX_AGE);
+            .is_some_and(|at| store.now.saturating_since(at) <= READ_BACK_MAX_AGE);
         // Without a connection, only what comes down tells that the controller has been there all along.
-        let is_there = |era| self.framing == Framing::Bytes || era == store.era && store.is_heard(now);
+        let is_there = |era| self.framing == Framing::Bytes || era == store.era && store.is_heard();
         let since = self.handed_over.filter(|&(_, era)| is_there(era)).map(|(at, _)| at);
         others.iter().all(|var| match var.stream() {
             Some(_) => read_back && store.read_back.contains(var),
@@ -324,9 +213,113 @@ impl Uplink {
     }
 }
 
+impl Connection for Uplink {
+    fn opened<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
+        self.busy = false;
+        self.handed_over = None;
+        self.flight.clear();
+        store.link_up(&self.writes);
+        self.greet_at = if self.greets() { store.now } else { Instant::NEVER };
+        self.speak_at = self.greet_at;
+    }
+
+    fn lost<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
+        self.busy = false;
+        self.flight.clear();
+        self.greet_at = Instant::NEVER;
+        self.speak_at = Instant::NEVER;
+        self.repeat_at = Instant::NEVER;
+        self.deframer.discard();
+        store.link_lost(&self.writes);
+    }
+
+    #[inline(never)]
+    fn received<'b, const PORTS: usize>(&mut self, bytes: &'b [u8], store: &mut Store<PORTS>) -> &'b [u8] {
+        let now = store.now;
+        let (Some(layout), Some(group)) = (&self.output, self.group) else {
+            bump(&mut self.counters.malformed);
+            return &[];
+        };
+        let (mut fresh, mut left): (bool, &[u8]) = (false, &[]);
+        let unreadable = &mut self.counters.unreadable;
+        let mut take = |payload: &[u8]| {
+            fresh = true;
+            add(unreadable, take_frame(layout, payload, &mut store.image));
+        };
+        match self.framing {
+            Framing::Datagram => match datagram(layout, bytes) {
+                Ok(payload) => {
+                    take(payload);
+                    bump(&mut self.counters.received);
+                }
+                Err(_) => bump(&mut self.counters.malformed),
+            },
+            Framing::Bytes => {
+                let mut rest = bytes;
+                while let Some(payload) = self.deframer.next_frame(layout, &mut rest) {
+                    take(payload);
+                    bump(&mut self.counters.received);
+                    if store.watches_bits {
+                        left = rest;
+                        break;
+                    }
+                }
+                self.counters.resync_bytes = self.deframer.stats().skipped_bytes as u32;
+            }
+        }
+        if fresh {
+            let before = store.image.stamp_of(group);
+            store.heard();
+            if before.is_some() && is_gap(before, now) && !store.safe.is_empty() {
+                store.controller_was_away();
+            }
+            store.image.stamp(group, now);
+            store.doubt_by_witnesses();
+            if self.greets() {
+                self.greet_at = now + GREET_EVERY;
+            }
+        }
+        left
+    }
+
+    fn sent(&mut self) {
+        self.busy = false;
+    }
+
+    fn acked(&mut self, left: u32) {
+        self.flight.acked(left);
+    }
+
+    fn advance<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
+        let now = store.now;
+        if now >= self.flight.deadline() {
+            bump(&mut self.counters.unacknowledged);
+            self.supervisor.give_up(now);
+            self.lost(store);
+        }
+        if now < self.repeat_at {
+            return;
+        }
+        self.repeat_at = Instant::NEVER;
+        store.confirm_by_witnesses();
+        let wanted = store.unconfirmed.and(&self.writes);
+        if wanted.is_empty() || !self.supervisor.is_up() {
+            return;
+        }
+        store.again(&wanted);
+        let fast = is_new(store) || !wanted.and(&self.shown).is_empty();
+        self.repeat_at = now + if fast { REPEAT_EVERY } else { REPEAT_SLOWLY };
+    }
+
+    fn deadline(&self) -> Instant {
+        let speaks_at = if self.busy { Instant::NEVER } else { self.speaks_at() };
+        speaks_at.min(self.flight.deadline()).min(self.repeat_at)
+    }
+}
+
 /// Whether a safe value has only just become one that the controller is not known to have.
-fn is_new<const PORTS: usize>(store: &Store<PORTS>, now: Instant) -> bool {
-    now.saturating_since(store.unconfirmed_since) < REPEAT_FAST
+fn is_new<const PORTS: usize>(store: &Store<PORTS>) -> bool {
+    store.now.saturating_since(store.unconfirmed_since) < REPEAT_FAST
 }
 
 /// Puts a frame into the image. What is not finite makes its variable unknown, the rest counts;
@@ -356,7 +349,7 @@ fn encode<const PORTS: usize>(
     if waiting.is_empty() {
         return layout.encode(store.image.bytes(), out).ok();
     }
-    let newest: [u8; BIT_VARS] = *store.image.bytes().first_chunk()?;
+    let newest: [u8; BIT_INPUT_COUNT] = *store.image.bytes().first_chunk()?;
     let mut next = newest;
     for var in waiting.iter() {
         if let Some(slot) = next.get_mut(var.image_offset()) {

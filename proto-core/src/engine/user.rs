@@ -3,7 +3,7 @@
 use heapless::Vec;
 
 use super::command_link::CommandLink;
-use super::field_port::ReplyCode;
+use super::io::ReplyCode;
 use crate::config::OutputBinding;
 use crate::image::{Image, bind_to_variable, saturate_to_field};
 use crate::recipe::model::MAX_FIELDS;
@@ -46,7 +46,7 @@ pub(super) fn fit(bindings: &[InputBind], values: impl Iterator<Item = Scalar>) 
 }
 
 /// After silence the next values pick no commands: they only set the base.
-pub(super) fn forget_commands(bindings: &[InputBind], commands: &mut Option<CommandLink>, now: Instant) {
+pub(super) fn forget_commands(bindings: &[InputBind], commands: Option<&mut CommandLink>, now: Instant) {
     let Some(link) = commands else { return };
     for binding in bindings {
         if let InputBind::Command(field) = binding {

@@ -10,7 +10,7 @@ mod set;
 pub use set::{InputSet, VarSet};
 
 use crate::sysvar::{COUNT, IMAGE_BYTES, SysVar};
-use crate::time::{Duration, Instant};
+use crate::time::{Duration, Instant, Stamp};
 use crate::wire::scalar::{Scalar, ScalarType};
 
 /// The values alone.
@@ -24,15 +24,14 @@ pub const MAX_GROUPS: usize = 96;
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct GroupId(pub(crate) u8);
 
-const NO_GROUP: u8 = u8::MAX;
-
 /// Every system variable with value, source and age.
 #[derive(Debug, Clone)]
 pub struct Image {
     bytes: ImageBytes,
+    /// One more than the number of the group; 0 of a variable that no group brings.
     group: [u8; COUNT],
     /// When each group last arrived; [`Instant::NEVER`] before the first time.
-    stamps: [Instant; MAX_GROUPS],
+    stamps: [Stamp; MAX_GROUPS],
     /// Variables whose newest value could not be read, whatever else their group brought.
     unreadable: VarSet,
     /// Whether there are any.
@@ -46,12 +45,12 @@ impl Default for Image {
 }
 
 impl Image {
-    /// All zero, and nothing known.
+    /// All zeros, and nothing known.
     pub const fn new() -> Self {
         Self {
             bytes: [0; IMAGE_BYTES],
-            group: [NO_GROUP; COUNT],
-            stamps: [Instant::NEVER; MAX_GROUPS],
+            group: [0; COUNT],
+            stamps: [Stamp::NEVER; MAX_GROUPS],
             unreadable: VarSet::EMPTY,
             any_unreadable: false,
         }
@@ -95,19 +94,19 @@ impl Image {
     /// Assigns the variable to the group that it arrives with.
     pub fn assign(&mut self, var: SysVar, group: GroupId) {
         if let Some(slot) = self.group.get_mut(var.ordinal()) {
-            *slot = group.0;
+            *slot = group.0.saturating_add(1);
         }
     }
 
     /// The group that the variable arrives with.
     pub fn group(&self, var: SysVar) -> Option<GroupId> {
-        self.group.get(var.ordinal()).copied().filter(|&g| g != NO_GROUP).map(GroupId)
+        self.group.get(var.ordinal()).and_then(|slot| slot.checked_sub(1)).map(GroupId)
     }
 
     /// Records that the group has just arrived.
     pub fn stamp(&mut self, group: GroupId, now: Instant) {
         if let Some(stamp) = self.stamps.get_mut(usize::from(group.0)) {
-            *stamp = now;
+            *stamp = Stamp::at(now);
         }
     }
 
@@ -118,7 +117,7 @@ impl Image {
 
     /// When the group last arrived.
     pub fn stamp_of(&self, group: GroupId) -> Option<Instant> {
-        self.stamps.get(usize::from(group.0)).copied().filter(|&at| at != Instant::NEVER)
+        self.stamps.get(usize::from(group.0)).filter(|&&at| at != Stamp::NEVER).map(|at| at.get())
     }
 
     /// Gives the variable the value that its source just sent; one that cannot be read makes the

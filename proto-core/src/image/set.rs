@@ -1,9 +1,9 @@
 //! Sets of variables, as bits: what a frame carries, what is still to be written, what is unknown.
 
-use crate::sysvar::{COUNT, INPUT_COUNT, SysVar};
+use crate::sysvar::{BIT_INPUT_COUNT, COUNT, INPUT_COUNT, SysVar};
 
 const WORDS: usize = 3;
-const _: () = assert!(INPUT_COUNT.div_ceil(32) == WORDS);
+const _: () = assert!(INPUT_COUNT.div_ceil(32) == WORDS && BIT_INPUT_COUNT < 32);
 
 /// Some of the input variables. Output variables are never in it.
 #[derive(Debug, Clone, Copy, Eq, Default)]
@@ -22,7 +22,7 @@ impl InputSet {
     pub const EMPTY: Self = Self([0; WORDS]);
 
     /// The byte variables: they come first in the table of inputs.
-    pub const BYTES: Self = Self([0x1FFF, 0, 0]);
+    pub const BYTES: Self = Self([!(u32::MAX << BIT_INPUT_COUNT), 0, 0]);
 
     /// Adds an input variable; an output variable is ignored.
     pub fn insert(&mut self, var: SysVar) {

@@ -6,10 +6,9 @@ use core::fmt;
 
 pub use super::adu::MAX_PDU;
 use super::exception::Exception;
+pub use super::values::MAX_READ_COILS;
 use super::values::{Coils, Registers, packed_len};
 
-/// Most coils in one FC 1 request.
-pub const MAX_READ_COILS: u16 = 0x07D0;
 /// Most registers in one FC 3 request.
 pub const MAX_READ_REGISTERS: u16 = 0x007D;
 /// Most coils in one FC 15 request.

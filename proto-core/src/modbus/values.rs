@@ -1,7 +1,8 @@
 //! Coils and registers as they stand in a PDU: borrowed, length-checked views
 //! (docs/wire/modbus.md section 3).
 
-use super::pdu::MAX_READ_COILS;
+/// Most coils in one FC 1 request, and so in any answer or write.
+pub const MAX_READ_COILS: u16 = 0x07D0;
 
 /// A run of coils, packed eight a byte, the first coil in the least significant bit.
 ///

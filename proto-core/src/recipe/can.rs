@@ -9,19 +9,10 @@ use heapless::Vec;
 
 use super::error::{EncodeError, FieldPlace, PartError, ValueError};
 use super::fields::{Applied, FrameFields, PlacedField, Pool, Share, Values};
-use super::model::{CanId, Field, MAX_CAN_DATA, MAX_CAN_IDS, Rules};
+use super::model::{Field, MAX_CAN_IDS, Rules};
 use crate::sysvar::IMAGE_BYTES;
+use crate::wire::can::{CanFrame, CanId, MAX_CAN_DATA};
 use crate::wire::scalar::Scalar;
-
-/// A classic CAN frame: data or remote, standard or extended.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-#[cfg_attr(feature = "defmt", derive(defmt::Format))]
-pub struct CanFrame {
-    id: CanId,
-    remote: bool,
-    len: u8,
-    data: [u8; MAX_CAN_DATA],
-}
 
 /// Why a received frame is not one of the recipe's (D17).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -68,76 +59,6 @@ pub struct CanFrameLayout<'a> {
     id: CanId,
     share: &'a Share,
     pool: &'a Pool,
-}
-
-impl CanFrame {
-    /// A data frame; `None` when the id does not fit its kind or there are more than 8 bytes.
-    pub fn new(id: CanId, data: &[u8]) -> Option<Self> {
-        let mut frame = Self { id, remote: false, len: data.len() as u8, data: [0; MAX_CAN_DATA] };
-        frame.data.get_mut(..data.len())?.copy_from_slice(data);
-        id.is_valid().then_some(frame)
-    }
-
-    /// A remote frame that asks for `len` bytes; `None` when the id does not fit its kind or `len`
-    /// is more than 8.
-    pub fn remote(id: CanId, len: usize) -> Option<Self> {
-        let fits = id.is_valid() && len <= MAX_CAN_DATA;
-        fits.then_some(Self { id, remote: true, len: len as u8, data: [0; MAX_CAN_DATA] })
-    }
-
-    /// The frame's id.
-    pub const fn id(&self) -> CanId {
-        self.id
-    }
-
-    /// Whether it is a remote frame.
-    pub const fn is_remote(&self) -> bool {
-        self.remote
-    }
-
-    /// The data; empty in a remote frame.
-    pub fn data(&self) -> &[u8] {
-        let len = if self.remote { 0 } else { usize::from(self.len) };
-        self.data.get(..len).unwrap_or(&[])
-    }
-}
-
-impl Frame for CanFrame {
-    fn new(id: impl Into<embedded_can::Id>, data: &[u8]) -> Option<Self> {
-        Self::new(id.into().into(), data)
-    }
-
-    fn new_remote(id: impl Into<embedded_can::Id>, dlc: usize) -> Option<Self> {
-        Self::remote(id.into().into(), dlc)
-    }
-
-    fn is_extended(&self) -> bool {
-        matches!(self.id, CanId::Extended(_))
-    }
-
-    fn is_remote_frame(&self) -> bool {
-        self.remote
-    }
-
-    fn id(&self) -> embedded_can::Id {
-        // The constructors let only ids through that fit, so the fallbacks are never reached.
-        match self.id {
-            CanId::Standard(id) => {
-                embedded_can::StandardId::new(id).unwrap_or(embedded_can::StandardId::ZERO).into()
-            }
-            CanId::Extended(id) => {
-                embedded_can::ExtendedId::new(id).unwrap_or(embedded_can::ExtendedId::ZERO).into()
-            }
-        }
-    }
-
-    fn dlc(&self) -> usize {
-        usize::from(self.len)
-    }
-
-    fn data(&self) -> &[u8] {
-        CanFrame::data(self)
-    }
 }
 
 impl CanLayout {
@@ -308,7 +229,7 @@ impl<'a> CanFrameLayout<'a> {
 
     /// The frame with the image's values. User-defined fields have no place there and are zero.
     pub fn encode(&self, image: &[u8; IMAGE_BYTES]) -> CanFrame {
-        self.filled(|data| {
+        CanFrame::filled(self.id, self.share.len, |data| {
             if let Some(runs) = self.pool.runs(self.share) {
                 runs.encode(image, data);
             }
@@ -321,20 +242,11 @@ impl<'a> CanFrameLayout<'a> {
     /// [`EncodeError`]: too few or too many values, or a value of another type.
     pub fn encode_values(&self, values: &[Scalar]) -> Result<CanFrame, EncodeError> {
         self.frame_fields().accepts(values)?;
-        Ok(self.filled(|data| self.frame_fields().encode_values(values, data)))
+        Ok(CanFrame::filled(self.id, self.share.len, |data| self.frame_fields().encode_values(values, data)))
     }
 
     fn frame_fields(&self) -> FrameFields<'a> {
         self.pool.fields(self.share)
-    }
-
-    #[inline]
-    fn filled(&self, fill: impl FnOnce(&mut [u8])) -> CanFrame {
-        let mut data = [0; MAX_CAN_DATA];
-        if let Some(used) = data.get_mut(..self.len()) {
-            fill(used);
-        }
-        CanFrame { id: self.id, remote: false, len: self.share.len, data }
     }
 }
 

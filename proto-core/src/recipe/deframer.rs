@@ -240,7 +240,7 @@ impl Deframer {
             return start;
         }
         count_visits(RING);
-        turn(&mut self.ring, start);
+        rotate(&mut self.ring, start);
         0
     }
 
@@ -280,7 +280,7 @@ impl Deframer {
 /// length to be checked, as `rotate_left` has.
 #[cold]
 #[inline(never)]
-fn turn(ring: &mut [u8; RING], start: usize) {
+fn rotate(ring: &mut [u8; RING], start: usize) {
     if let Some((before, from)) = ring.split_at_mut_checked(start) {
         before.reverse();
         from.reverse();

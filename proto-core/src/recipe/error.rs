@@ -2,8 +2,9 @@
 
 use core::fmt;
 
-use super::model::{CanId, MAX_CAN_DATA, MAX_CAN_IDS, MAX_DELIMITER, MAX_FIELDS, MAX_STREAM_FRAME, Mode};
+use super::model::{MAX_CAN_IDS, MAX_DELIMITER, MAX_FIELDS, MAX_STREAM_FRAME, Mode};
 use crate::sysvar::{Direction, SysVar};
+use crate::wire::can::{CanId, MAX_CAN_DATA};
 use crate::wire::scalar::ScalarType;
 
 /// The place of a field in its part, counted from 0.

@@ -18,7 +18,7 @@ pub mod model;
 mod runs;
 pub mod stream;
 
-pub use can::{CanFrame, CanFrameLayout, CanLayout, CanReject};
+pub use can::{CanFrameLayout, CanLayout, CanReject};
 pub use deframer::{Deframer, DeframerStats, datagram};
 pub use error::{DatagramError, EncodeError, FieldPlace, NoSpace, PartError, ValueError};
 pub use fields::{Applied, PlacedField, Values};

@@ -1,7 +1,5 @@
 //! What a recipe is made of, and its limits (docs/wire/recipes.md section 2, D16, D18).
 
-use core::fmt;
-
 use crate::sysvar::{Direction, SysVar};
 use crate::wire::scalar::ScalarType;
 
@@ -13,8 +11,6 @@ pub const MAX_FIELDS: usize = 128;
 pub const MAX_STREAM_FRAME: usize = 512;
 /// Most frame ids of one CAN part.
 pub const MAX_CAN_IDS: usize = 32;
-/// Most data bytes of a classic CAN frame.
-pub const MAX_CAN_DATA: usize = 8;
 
 /// What kind of fields a recipe has.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -57,17 +53,6 @@ impl Field {
     }
 }
 
-/// A CAN frame id as a recipe declares it (D17).
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-#[cfg_attr(feature = "defmt", derive(defmt::Format))]
-#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
-pub enum CanId {
-    /// 11 bits.
-    Standard(u16),
-    /// 29 bits.
-    Extended(u32),
-}
-
 /// Whether frames must be found in a stream of bytes, or arrive one in each datagram (D18).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
@@ -76,32 +61,4 @@ pub enum Framing {
     Bytes,
     /// UDP: one datagram is one frame; head and tail may both be empty.
     Datagram,
-}
-
-impl CanId {
-    /// Whether the number fits its kind: 11 or 29 bits.
-    pub const fn is_valid(self) -> bool {
-        match self {
-            Self::Standard(id) => id <= 0x7FF,
-            Self::Extended(id) => id <= 0x1FFF_FFFF,
-        }
-    }
-}
-
-impl fmt::Display for CanId {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Standard(id) => write!(f, "{id:#05x}"),
-            Self::Extended(id) => write!(f, "{id:#010x} (extended)"),
-        }
-    }
-}
-
-impl From<embedded_can::Id> for CanId {
-    fn from(id: embedded_can::Id) -> Self {
-        match id {
-            embedded_can::Id::Standard(id) => Self::Standard(id.as_raw()),
-            embedded_can::Id::Extended(id) => Self::Extended(id.as_raw()),
-        }
-    }
 }

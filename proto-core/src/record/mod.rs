@@ -8,16 +8,17 @@ mod replay;
 
 pub use replay::{ReplayError, Replayed, replay};
 
+use core::net::SocketAddr;
+
 use embedded_can::Frame;
 use heapless::Vec;
 
-use crate::engine::{BusState, Engine, Input, LinkId, Output, PortId};
-use crate::recipe::CanFrame;
-use crate::recipe::model::{CanId, MAX_CAN_DATA};
+use crate::engine::{BusState, Endpoint, Engine, Input, LinkId, Output, PortId, Transport};
 use crate::time::Instant;
+use crate::wire::can::{CanFrame, CanId, MAX_CAN_DATA};
 
 /// The first bytes of every recording; the last one is the format's version.
-pub const MAGIC: [u8; 4] = *b"RGR\x02";
+pub const MAGIC: [u8; 4] = *b"RGR\x03";
 
 /// Longest [`Entry::Totals`].
 pub const MAX_TOTALS: usize = 3072;
@@ -127,6 +128,9 @@ mod tag {
 const EXTENDED: u32 = 1 << 31;
 const REMOTE: u32 = 1 << 30;
 
+/// Longest address that postcard writes: its kind, an IPv6 address, a port.
+const MAX_ADDRESS: usize = 1 + 16 + 3;
+
 /// Everything of an entry but the bytes at its end: tag, two numbers of up to ten bytes, a port and
 /// a CAN frame at most.
 #[derive(Default)]
@@ -165,6 +169,22 @@ impl Head {
         let _ = self.0.extend_from_slice(&id.to_le_bytes());
         let _ = self.byte(frame.dlc() as u8).0.extend_from_slice(frame.data());
         &[]
+    }
+
+    fn transport(&mut self, transport: Transport) -> &mut Self {
+        match transport {
+            Transport::Tcp { port } => self.byte(0).number(port.into()),
+            Transport::Udp { port } => self.byte(1).number(port.into()),
+            Transport::TcpListen { local } => self.byte(2).address(local),
+            Transport::UdpListen { local } => self.byte(3).address(local),
+        }
+    }
+
+    fn address(&mut self, address: SocketAddr) -> &mut Self {
+        let mut scratch = [0; MAX_ADDRESS];
+        let bytes = postcard::to_slice(&address, &mut scratch);
+        let _ = self.0.extend_from_slice(bytes.as_deref().unwrap_or(&[]));
+        self
     }
 
     fn input<'a>(&mut self, at: Instant, input: Input<'a>) -> &'a [u8] {
@@ -211,9 +231,8 @@ impl Head {
             }
             Output::PortSend { port, bytes } => self.tag(tag::PORT_SEND).byte(port.0).len_of(bytes),
             Output::PortSendCan { port, frame } => self.tag(tag::PORT_SEND_CAN).byte(port.0).frame(&frame),
-            Output::LinkOpen { link } => {
-                self.tag(tag::LINK_OPEN).byte(link.0);
-                &[]
+            Output::LinkOpen { link, to } => {
+                self.tag(tag::LINK_OPEN).byte(link.0).transport(to.transport).len_of(to.host.as_bytes())
             }
             Output::LinkClose { link } => {
                 self.tag(tag::LINK_CLOSE).byte(link.0);
@@ -286,6 +305,22 @@ impl<'a> Reader<'a> {
         CanFrame::new(id, self.take(len)?)
     }
 
+    fn transport(&mut self) -> Option<Transport> {
+        Some(match self.byte()? {
+            0 => Transport::Tcp { port: u16::try_from(self.number()?).ok()? },
+            1 => Transport::Udp { port: u16::try_from(self.number()?).ok()? },
+            2 => Transport::TcpListen { local: self.address()? },
+            3 => Transport::UdpListen { local: self.address()? },
+            _ => return None,
+        })
+    }
+
+    fn address(&mut self) -> Option<SocketAddr> {
+        let (address, rest) = postcard::take_from_bytes(self.0).ok()?;
+        self.0 = rest;
+        Some(address)
+    }
+
     fn input(&mut self, tag: u8) -> Option<Input<'a>> {
         Some(match tag {
             tag::PORT_UP => Input::PortUp { port: self.port()? },
@@ -321,7 +356,11 @@ impl<'a> Reader<'a> {
             tag::SLEEP => Output::Sleep { until: self.instant()? },
             tag::PORT_SEND => Output::PortSend { port: self.port()?, bytes: self.bytes()? },
             tag::PORT_SEND_CAN => Output::PortSendCan { port: self.port()?, frame: self.frame()? },
-            tag::LINK_OPEN => Output::LinkOpen { link: self.link()? },
+            tag::LINK_OPEN => {
+                let (link, transport) = (self.link()?, self.transport()?);
+                let host = core::str::from_utf8(self.bytes()?).ok()?;
+                Output::LinkOpen { link, to: Endpoint::new(transport, host) }
+            }
             tag::LINK_CLOSE => Output::LinkClose { link: self.link()? },
             tag::LINK_SEND => Output::LinkSend { link: self.link()?, bytes: self.bytes()? },
             _ => return None,

@@ -8,6 +8,13 @@ const PORT: PortId = PortId(3);
 const LINK: LinkId = LinkId(200);
 const AT: Instant = Instant::from_micros(1_000_000_300);
 
+/// As long as a host may be.
+static HOST: &str = "0123456789abcdef0123456789abcdef0123456789abcdef0123456789abcdef";
+
+fn open(transport: Transport, host: &'static str) -> Output<'static> {
+    Output::LinkOpen { link: LINK, to: Endpoint::new(transport, host) }
+}
+
 fn entries() -> Vec<Entry<'static>> {
     let data = CanFrame::new(CanId::Standard(0x7FF), &[1, 2, 3]).unwrap();
     let long = CanFrame::new(CanId::Extended(0x1FFF_FFFF), &[]).unwrap();
@@ -38,7 +45,10 @@ fn entries() -> Vec<Entry<'static>> {
         Output::Sleep { until: Instant::ZERO },
         Output::PortSend { port: PORT, bytes: &[1, 2, 3] },
         Output::PortSendCan { port: PORT, frame: data },
-        Output::LinkOpen { link: LINK },
+        open(Transport::Tcp { port: 2000 }, "robot.example"),
+        open(Transport::Udp { port: u16::MAX }, "192.168.12.10"),
+        open(Transport::TcpListen { local: "0.0.0.0:50000".parse().unwrap() }, ""),
+        open(Transport::UdpListen { local: "[fe80::ffff]:65535".parse().unwrap() }, HOST),
         Output::LinkClose { link: LINK },
         Output::LinkSend { link: LINK, bytes: &[0xFF; 128] },
     ];

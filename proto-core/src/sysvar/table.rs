@@ -111,8 +111,23 @@ const ROWS: [Span; 25] = [
 
 pub(super) const COUNT: usize = count(ROWS.len());
 pub(super) const INPUT_COUNT: usize = count(INPUT_ROWS);
+pub(super) const BIT_INPUT_COUNT: usize = count(bit_rows());
 pub(super) const IMAGE_BYTES: usize = bytes(ROWS.len());
 pub(super) const INPUT_BYTES: usize = bytes(INPUT_ROWS);
+
+/// Rows of byte variables at the beginning of the table; the inputs have no others.
+const fn bit_rows() -> usize {
+    let mut rows = 0;
+    while matches!(ROWS[rows].ty, Byte) {
+        rows += 1;
+    }
+    let mut row = rows;
+    while row < INPUT_ROWS {
+        assert!(!matches!(ROWS[row].ty, Byte), "byte inputs come first");
+        row += 1;
+    }
+    rows
+}
 
 const fn count(rows: usize) -> usize {
     let (mut row, mut sum) = (0, 0);

@@ -4,7 +4,7 @@
 //! In: a version's name. Out: a [`Dialect`], a plain struct of choices. Nothing here looks at a
 //! connection: a dialect is configured, never guessed from what a controller answers.
 
-use super::state::{OperationMode, RobotState, SafetyState};
+use super::state::codes::{OperationMode, RobotState, SafetyState};
 
 /// What ends a text on port 2000.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

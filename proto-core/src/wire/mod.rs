@@ -3,6 +3,7 @@
 //! No function of this module can panic, whatever bytes it is given.
 
 pub(crate) mod ascii;
+pub mod can;
 pub mod dialect;
 pub mod scalar;
 pub mod slcan;

@@ -5,9 +5,8 @@
 use proptest::prelude::*;
 use proto_core::engine::{ASLEEP, BusState, Input, LinkId, PortId};
 use proto_core::modbus::Exception;
-use proto_core::recipe::CanFrame;
-use proto_core::recipe::model::CanId;
 use proto_core::time::Duration;
+use proto_core::wire::can::{CanFrame, CanId};
 
 use super::model::*;
 use super::rig::*;

@@ -2,9 +2,9 @@
 
 use proto_core::config::{CanFramePart, CommandWhen, GatewayConfig, InputBinding, Parts};
 use proto_core::engine::{BusState, Input, LinkId};
-use proto_core::recipe::CanFrame;
-use proto_core::recipe::model::{CanId, Mode};
+use proto_core::recipe::model::Mode;
 use proto_core::time::{Duration, Instant};
+use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::ScalarType;
 
 use crate::command_judge::{BIT, FIRST_COIL, Facts, GARBAGE, Header, SAFE};

@@ -1,8 +1,8 @@
 //! What the gateway promises of a bit by Modbus and of commands by port 2000.
 
 use proto_core::engine::{BusState, Input, LinkId, PortState};
-use proto_core::recipe::CanFrame;
 use proto_core::time::{Duration, Instant};
+use proto_core::wire::can::CanFrame;
 use proto_core::wire::scalar::Scalar;
 
 use crate::driver::{Broken, Conns, DEAF, Is, Judge, PORT, Small};

@@ -270,7 +270,7 @@ impl Gateway {
                     }
                     return Ok(until);
                 }
-                Output::LinkOpen { link } => {
+                Output::LinkOpen { link, .. } => {
                     let conn = self.conns.get(link);
                     if conn.is != Is::Closed || conn.must_close {
                         return Err(format!("opens {link:?}, which is {:?}", conn.is));
@@ -305,6 +305,7 @@ impl Gateway {
                     self.engine.handle(now, Input::PortSent { port: PORT });
                 }
                 Output::PortSendCan { .. } => return Err("sends what no recipe has".to_owned()),
+                other => return Err(format!("says {other:?}")),
             }
         }
         Err(format!("has more than {MOST_OUTPUTS} things to say"))

@@ -4,9 +4,9 @@
 
 use proto_core::config::{Bus, GatewayConfig, InputBinding, OnStale, OutputBinding, Parts, SendOn};
 use proto_core::engine::{Input, LinkId, PortId};
-use proto_core::recipe::CanFrame;
-use proto_core::recipe::model::{CanId, Mode};
+use proto_core::recipe::model::Mode;
 use proto_core::time::Instant;
+use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::ScalarType;
 
 use crate::driver::{Broken, Conns, Gateway, Is, PORT, STEADY, Small};

@@ -265,7 +265,7 @@ impl Scribe {
             | b"CanLayout" | b"Dialect" => Word::Struct(Kind::LeftOut),
             b"Sent" => Word::Struct(Kind::Sent),
             b"Up" => Word::Struct(Kind::Up),
-            b"Line" => Word::Struct(Kind::Line),
+            b"LineTiming" => Word::Struct(Kind::Line),
             b"BitSlot" | b"Edge" => Word::Struct(Kind::Bit),
             b"CommandClient" => Word::Struct(Kind::Client),
             b"Deframer" | b"StateStream" | b"AduReader" => Word::Struct(Kind::Gatherer),

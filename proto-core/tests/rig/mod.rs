@@ -10,10 +10,10 @@ use proto_core::engine::{
 use proto_core::modbus::adu::MAX_ADU;
 use proto_core::modbus::server::{RegisterBank, Server};
 use proto_core::modbus::{Coils, Exception, Registers};
-use proto_core::recipe::CanFrame;
-use proto_core::recipe::model::{CanId, Mode};
+use proto_core::recipe::model::Mode;
 use proto_core::sysvar::{SysVar, VarRange};
 use proto_core::time::{Duration, Instant};
+use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::ScalarType;
 
 pub fn var(name: &str) -> SysVar {
@@ -385,9 +385,10 @@ impl Rig {
                 }
                 Output::PortSend { port, bytes } => Out::Port(port, bytes.to_vec()),
                 Output::PortSendCan { port, frame } => Out::Can(port, frame),
-                Output::LinkOpen { link } => Out::Open(link),
+                Output::LinkOpen { link, .. } => Out::Open(link),
                 Output::LinkClose { link } => Out::Close(link),
                 Output::LinkSend { link, bytes } => Out::Link(link, bytes.to_vec()),
+                other => panic!("{other:?}"),
             };
             self.log.push((self.now, out.clone()));
             self.react(out);

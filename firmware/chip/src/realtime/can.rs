@@ -4,8 +4,7 @@
 use std::collections::VecDeque;
 
 use embedded_can::Frame as _;
-use proto_core::recipe::can::CanFrame;
-use proto_core::recipe::model::CanId;
+use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::slcan::{Channel, ChannelState};
 use rustix::event::PollFd;
 

@@ -142,7 +142,7 @@ impl Downward {
         sheet: &Sheet,
         nth: usize,
         up: &Upward,
-        id: Option<proto_core::recipe::model::CanId>,
+        id: Option<proto_core::wire::can::CanId>,
         bytes: &[u8],
         now: Instant,
     ) -> Result<(), Wrong> {

@@ -2,10 +2,10 @@
 //! say. The slow way, straight from proto-core/docs/wire/recipes.md sections 4, 6 and 7.
 
 use proto_core::config::{CommandWhen, FieldSpec, InputBinding, Span};
-use proto_core::recipe::CanFrame;
 use proto_core::recipe::model::Mode;
 use proto_core::sysvar::SysVar;
 use proto_core::time::Instant;
+use proto_core::wire::can::CanFrame;
 use proto_core::wire::scalar::{Scalar, ScalarType};
 
 use super::sheet::{Frame, PortSheet, Raw};

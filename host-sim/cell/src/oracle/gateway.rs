@@ -1,10 +1,10 @@
 //! The gateway's side: what each input must lead to, and whether it did.
 
-use proto_core::engine::{Engine, LinkId, PortCounters, PortId};
+use proto_core::engine::{Engine, LinkId, PortId};
 use proto_core::link::LinkState;
-use proto_core::recipe::CanFrame;
 use proto_core::sysvar::SysVar;
 use proto_core::time::{Duration, Instant};
+use proto_core::wire::can::CanFrame;
 
 use super::field::{self, Accepted, Line, Refused, Verdict};
 use super::sheet::{Origin, Owned, Raw, shown, written};
@@ -210,7 +210,7 @@ impl Oracle {
     pub(super) fn port_send(
         &mut self,
         port: PortId,
-        id: Option<proto_core::recipe::model::CanId>,
+        id: Option<proto_core::wire::can::CanId>,
         bytes: &[u8],
         now: Instant,
     ) {
@@ -426,22 +426,20 @@ impl Oracle {
         let PortWatch { line, down, counters } = &self.ports[nth];
         let up = self.up.counted[nth];
         let orders = self.orders.counted[nth];
-        let expected = PortCounters {
-            tail_mismatches: line.mismatches as u32,
-            resync_bytes: line.dropped as u32,
-            discarded_bytes: line.discarded as u32,
-            frames_out: down.frames_out,
-            bytes_out: down.bytes_out,
-            skipped_cycles: down.skipped,
-            stale_cycles: down.stale,
-            edges_lost: up.edges_lost,
-            values_expired: up.values_expired,
-            undelivered: up.undelivered,
-            timeouts: up.timeouts,
-            commands: orders.0,
-            commands_dropped: orders.1,
-            ..*counters
-        };
+        let mut expected = *counters;
+        expected.tail_mismatches = line.mismatches as u32;
+        expected.resync_bytes = line.dropped as u32;
+        expected.discarded_bytes = line.discarded as u32;
+        expected.frames_out = down.frames_out;
+        expected.bytes_out = down.bytes_out;
+        expected.skipped_cycles = down.skipped;
+        expected.stale_cycles = down.stale;
+        expected.edges_lost = up.edges_lost;
+        expected.values_expired = up.values_expired;
+        expected.undelivered = up.undelivered;
+        expected.timeouts = up.timeouts;
+        expected.commands = orders.0;
+        expected.commands_dropped = orders.1;
         if actual.timeouts > expected.timeouts {
             let what = format!("port {nth} counted a timeout, and its device was not silent");
             return Err((Invariant::FalseTimeout, what));

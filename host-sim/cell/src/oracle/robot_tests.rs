@@ -342,8 +342,8 @@ fn a_driver_that_answers_a_stranger() {
     cell.run_ms(500);
     let link = cell.datagram_links().next().unwrap();
     let bus = cell.bus_of("buttons");
-    let id = proto_core::recipe::model::CanId::Standard(5);
-    cell.send_can(bus, proto_core::recipe::CanFrame::new(id, &[0, 1]).unwrap());
+    let id = proto_core::wire::can::CanId::Standard(5);
+    cell.send_can(bus, proto_core::wire::can::CanFrame::new(id, &[0, 1]).unwrap());
     for _ in 0..200 {
         cell.run(Duration::from_micros(50));
         cell.gate(link).partner = Some(Speaker::Stranger);

@@ -5,9 +5,10 @@
 
 use proto_core::config::{Bus, FieldSpec, GatewayConfig, InputBinding, OutputBinding, Parts, Recipe, SendOn};
 use proto_core::engine::{LinkId, PortId};
-use proto_core::recipe::model::{CanId, Mode};
+use proto_core::recipe::model::Mode;
 use proto_core::sysvar::{COUNT, Direction, ModbusPlace, SysVar};
 use proto_core::time::Duration;
+use proto_core::wire::can::CanId;
 
 /// A value as it stands on the wire; unused bytes are zero.
 pub(super) type Raw = [u8; 4];

@@ -5,10 +5,9 @@
 //! shares. A device has moods that last for seconds: steady, hasty, silent, stuck, careless.
 
 use proto_core::config::{Bus, FieldSpec, GatewayConfig, InputBinding, Port};
-use proto_core::recipe::CanFrame;
-use proto_core::recipe::model::CanId;
 use proto_core::sysvar::{Direction, SysVar};
 use proto_core::time::{Duration, Instant};
+use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::{Scalar, ScalarType};
 
 use crate::{Device, Rng};

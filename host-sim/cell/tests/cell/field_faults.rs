@@ -27,10 +27,12 @@ fn faulty(fault: impl FnOnce(&mut Cell, LineId)) -> PortCounters {
     fault(&mut cell, line);
     // Longer than the line's idle gap.
     cell.run_ms(10);
-    let counters = *cell.port("force");
+    let mut counters = *cell.port("force");
     next_good_frame(&mut cell, line, 2);
     assert_eq!(cell.port("force").frames_in, counters.frames_in + 1);
-    PortCounters { frames_in: counters.frames_in - 1, bytes_in: counters.bytes_in - 28, ..counters }
+    counters.frames_in -= 1;
+    counters.bytes_in -= 28;
+    counters
 }
 
 #[track_caller]
@@ -366,10 +368,10 @@ fn a_can_bus_that_loses_goes_off_and_carries_strangers() {
     cell.send_can(bus, can(9, &[0]));
     cell.send_can(bus, can(1, &[]));
     cell.send_can(bus, can(1, &[0, 0]));
-    let id = proto_core::recipe::model::CanId::Standard(1);
-    cell.send_can(bus, proto_core::recipe::CanFrame::remote(id, 1).unwrap());
-    let id = proto_core::recipe::model::CanId::Extended(1);
-    cell.send_can(bus, proto_core::recipe::CanFrame::new(id, &[0]).unwrap());
+    let id = proto_core::wire::can::CanId::Standard(1);
+    cell.send_can(bus, proto_core::wire::can::CanFrame::remote(id, 1).unwrap());
+    let id = proto_core::wire::can::CanId::Extended(1);
+    cell.send_can(bus, proto_core::wire::can::CanFrame::new(id, &[0]).unwrap());
     cell.run_ms(10);
     assert_eq!(cell.value("DO[1]"), 1.0);
     let counters = *cell.port("can-1");

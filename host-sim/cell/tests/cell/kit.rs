@@ -1,8 +1,7 @@
 //! What the tests of whole cells share.
 
 use proto_core::config::GatewayConfig;
-use proto_core::recipe::CanFrame;
-use proto_core::recipe::model::CanId;
+use proto_core::wire::can::{CanFrame, CanId};
 use recipe_cell::{Cell, LineId};
 use recipe_config::{SimConfig, file};
 use recipe_test_kit::example;

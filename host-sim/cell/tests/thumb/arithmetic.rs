@@ -1,8 +1,8 @@
 //! A cell in which everything is scaled: floats and doubles that two processors might treat
 //! differently, to and from variables of every kind.
 
-use proto_core::recipe::CanFrame;
 use proto_core::time::Duration;
+use proto_core::wire::can::CanFrame;
 use recipe_cell::{Cell, Rng, Talker};
 use recipe_config::SimConfig;
 use recipe_config::file::{self, Text};

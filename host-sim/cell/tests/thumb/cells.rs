@@ -1,9 +1,9 @@
 //! The cells whose engine is recorded, and what happens in them.
 
 use proto_core::config::GatewayConfig;
-use proto_core::recipe::CanFrame;
-use proto_core::recipe::model::CanId;
 use proto_core::time::Duration;
+use proto_core::wire::can::CanFrame;
+use proto_core::wire::can::CanId;
 use recipe_cell::{Cell, Chunking, Rng, Talker, Trouble, TroubleKind};
 use recipe_config::SimConfig;
 use recipe_config::file::{self, Text};

@@ -4,9 +4,10 @@
 
 use proto_core::recipe::PartError;
 use proto_core::recipe::can::CanLayout;
-use proto_core::recipe::model::{CanId, Field, Framing, Mode, Rules};
+use proto_core::recipe::model::{Field, Framing, Mode, Rules};
 use proto_core::recipe::stream::StreamLayout;
 use proto_core::sysvar::{Direction, SysVar, VarRange};
+use proto_core::wire::can::CanId;
 use proto_core::wire::scalar::ScalarType;
 
 use super::bindings::{self, FileInput, FileOutput};

@@ -15,11 +15,12 @@ mod recipe;
 use std::collections::VecDeque;
 use std::net::SocketAddr;
 
-use proto_core::recipe::model::{CanId, MAX_STREAM_FRAME, Mode};
-use proto_core::recipe::{CanFrame, CanReject, Deframer, EncodeError, datagram};
+use proto_core::recipe::model::{MAX_STREAM_FRAME, Mode};
+use proto_core::recipe::{CanReject, Deframer, EncodeError, datagram};
 use proto_core::schedule::Grid;
 use proto_core::sysvar::IMAGE_BYTES;
 use proto_core::time::{Duration, Instant};
+use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::{Scalar, ScalarType};
 
 use super::registers::Registers;

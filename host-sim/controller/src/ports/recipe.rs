@@ -1,8 +1,9 @@
 //! A port's recipe, compiled once.
 
-use proto_core::recipe::model::{CanId, Framing, Mode};
+use proto_core::recipe::model::{Framing, Mode};
 use proto_core::recipe::{CanLayout, PartError, Rules, StreamLayout};
 use proto_core::sysvar::Direction;
+use proto_core::wire::can::CanId;
 
 use recipe_config::{SimBus, SimCanFrame, SimField, SimParts, SimRecipe, SimStreamPart};
 

@@ -16,10 +16,10 @@ use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 
 use proto_core::config::{Parity, Rs485};
-use proto_core::recipe::CanFrame;
-use proto_core::recipe::model::{CanId, Field, Mode};
+use proto_core::recipe::model::{Field, Mode};
 use proto_core::sysvar::VarRange;
 use proto_core::time::{Duration, Instant};
+use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::ScalarType;
 use proto_core::wire::state::StatePacket;
 

@@ -1,6 +1,6 @@
 //! Recipe ports: what is accepted, what is counted, and when they send.
 
-use proto_core::recipe::model::MAX_CAN_DATA;
+use proto_core::wire::can::MAX_CAN_DATA;
 
 use super::*;
 use ScalarType::{Byte, Float};

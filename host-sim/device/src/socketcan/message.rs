@@ -6,8 +6,7 @@ use std::io;
 use std::mem::{size_of_val, zeroed};
 use std::os::fd::{AsRawFd, BorrowedFd};
 
-use proto_core::recipe::can::CanFrame;
-use proto_core::recipe::model::CanId;
+use proto_core::wire::can::{CanFrame, CanId};
 use socketcan::CanErrorFrame;
 
 /// What a read of the socket gave.

@@ -8,8 +8,7 @@ use core::fmt;
 
 use heapless::Vec;
 
-use crate::recipe::can::CanFrame;
-use crate::recipe::model::{CanId, MAX_CAN_DATA};
+use crate::wire::can::{CanFrame, CanId, MAX_CAN_DATA};
 
 /// Longest line without its CR: `T`, 8 digits of id, the length, 16 digits of data, 4 of time
 /// (section 2).

@@ -8,7 +8,7 @@
 use core::fmt;
 
 use super::places::{BOOLS, FARTHEST_RAD, LIMITS, STATES, TCP_POSE};
-use super::{LEN, StateView};
+use super::view::{LEN, StateView};
 
 /// Why a packet does not begin where the bytes do (docs/wire/state.md section 3, D8).
 #[derive(Debug, Clone, Copy, PartialEq)]

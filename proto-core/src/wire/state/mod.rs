@@ -1,12 +1,12 @@
 //! The 1468-byte state packet of port 2001 (docs/wire/state.md).
 //!
 //! In: the bytes of one packet, or of a stream of them ([`StateStream`]). Out: a checked view
-//! ([`StateView`]), a plain value ([`StatePacket`]), the output variables of the process image.
-//! Refuses to know time, connections and what a misaligned stream is answered with.
+//! ([`StateView`]) and a plain value ([`StatePacket`]). Refuses to know time, connections, what a
+//! misaligned stream is answered with, and the system variables: what they take from a packet is in
+//! [`crate::sysvar`].
 
 mod alignment;
-mod codes;
-mod copy;
+pub(super) mod codes;
 mod packet;
 mod places;
 mod stream;
@@ -16,10 +16,7 @@ pub use alignment::Misaligned;
 pub use codes::{OperationMode, ProgramState, RobotState, SafetyState, States};
 pub use packet::{Content, FIELDS, FieldPlace, StatePacket};
 pub use stream::{MAX_MISALIGNED, StateStream};
-pub use view::{StateError, StateView};
-
-/// Size of a state packet in bytes.
-pub const LEN: usize = places::LEN;
+pub use view::{LEN, StateError, StateView};
 
 #[cfg(test)]
 mod tests;

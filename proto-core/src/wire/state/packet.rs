@@ -1,7 +1,6 @@
 //! THE table of the packet's fields (docs/wire/state.md section 2), and the plain value.
 
-use super::LEN;
-use super::view::{StateError, StateView};
+use super::view::{LEN, StateError, StateView};
 use crate::wire::scalar::ScalarType;
 
 /// What a field's bytes are.
@@ -285,6 +284,22 @@ packet! {
     1456: error_code: u32 = Values;
     /// Reserved.
     1460: reserved_1460: [u8; 8] = Reserved;
+}
+
+impl StateView<'_> {
+    /// The packet as a plain value.
+    #[inline]
+    pub fn to_packet(&self) -> StatePacket {
+        let mut packet = StatePacket::ZERO;
+        packet.fill(self.as_bytes());
+        packet
+    }
+
+    /// Every field into a packet that exists: as [`Self::to_packet`], without a second packet on
+    /// the stack.
+    pub fn read_into(&self, packet: &mut StatePacket) {
+        packet.fill(self.as_bytes());
+    }
 }
 
 impl StatePacket {

@@ -6,23 +6,7 @@
 )]
 
 use super::packet::{Content, FIELDS, FieldPlace};
-use crate::sysvar::{INPUT_COUNT, SPANS};
-
-/// Bytes of the packet that go into the image as they are.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Copy {
-    pub(super) from: usize,
-    pub(super) to: usize,
-    pub(super) len: usize,
-}
-
-/// Eight bool bytes of the packet that are one byte of the image.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Pack {
-    pub(super) from: usize,
-    pub(super) to: usize,
-    pub(super) mask: u8,
-}
+use super::view::LEN;
 
 /// Consecutive bool bytes that are not reserved.
 #[derive(Debug, Clone, Copy)]
@@ -31,10 +15,6 @@ pub(super) struct Bools {
     pub(super) len: usize,
 }
 
-/// Every output word and float, consecutive ones merged.
-pub(super) const COPIES: &[Copy] = OUTPUTS.copies.split_at(OUTPUTS.copy_count).0;
-/// Every output byte.
-pub(super) const PACKS: &[Pack] = OUTPUTS.packs.split_at(OUTPUTS.pack_count).0;
 /// Every bool that is not reserved, consecutive ones merged.
 pub(super) const BOOLS: &[Bools] = BOOL_RUNS.0.split_at(BOOL_RUNS.1).0;
 
@@ -107,52 +87,6 @@ const fn is_same(a: &[u8], b: &[u8]) -> bool {
     at == a.len() && at == b.len()
 }
 
-struct Outputs {
-    copies: [Copy; SPANS.len()],
-    copy_count: usize,
-    packs: [Pack; 32],
-    pack_count: usize,
-}
-
-const OUTPUTS: Outputs = {
-    let mut all = Outputs {
-        copies: [Copy { from: 0, to: 0, len: 0 }; SPANS.len()],
-        copy_count: 0,
-        packs: [Pack { from: 0, to: 0, mask: 0 }; 32],
-        pack_count: 0,
-    };
-    let (mut row, mut var, mut image) = (0, 0, 0);
-    while row < SPANS.len() {
-        let span = &SPANS[row];
-        let (size, count) = (span.ty.size(), span.len());
-        if let (Some(from), true) = (span.stream, var >= INPUT_COUNT) {
-            let from = from as usize;
-            if size == 1 {
-                let mut nth = 0;
-                while nth < count {
-                    all.packs[all.pack_count] =
-                        Pack { from: from + nth * 8, to: image + nth, mask: span.valid_bits };
-                    all.pack_count += 1;
-                    nth += 1;
-                }
-            } else {
-                let len = size * count;
-                let last = all.copies[all.copy_count.saturating_sub(1)];
-                if all.copy_count > 0 && last.from + last.len == from && last.to + last.len == image {
-                    all.copies[all.copy_count - 1].len += len;
-                } else {
-                    all.copies[all.copy_count] = Copy { from, to: image, len };
-                    all.copy_count += 1;
-                }
-            }
-        }
-        image += size * count;
-        var += count;
-        row += 1;
-    }
-    all
-};
-
 const BOOL_RUNS: ([Bools; FIELDS.len()], usize) = {
     let mut runs = [Bools { from: 0, len: 0 }; FIELDS.len()];
     let (mut row, mut count) = (0, 0);
@@ -171,13 +105,13 @@ const BOOL_RUNS: ([Bools; FIELDS.len()], usize) = {
     (runs, count)
 };
 
-/// Where the last field ends; a table with a gap or an overlap does not build.
-pub(super) const LEN: usize = {
+/// A table with a gap or an overlap, or of another length than a packet, does not build.
+const _: () = {
     let (mut row, mut end) = (0, 0);
     while row < FIELDS.len() {
         assert!(FIELDS[row].offset as usize == end, "the packet's table has a gap or an overlap");
         end += FIELDS[row].ty.size() * FIELDS[row].count as usize;
         row += 1;
     }
-    end
+    assert!(end == LEN, "the packet's table is not as long as a packet");
 };

@@ -4,8 +4,8 @@
 //! for alignment, by itself and beside those before it. Does not search for a packet's beginning: the stream has no mark. Whoever owns
 //! the connection reopens it when [`StateStream::is_lost`].
 
-use super::alignment::Earlier;
-use super::{LEN, Misaligned, StateView};
+use super::alignment::{Earlier, Misaligned};
+use super::view::{LEN, StateView};
 
 /// After this many misaligned packets in a row the connection is to be reopened.
 pub const MAX_MISALIGNED: u32 = 3;

@@ -2,10 +2,11 @@
 
 use core::fmt;
 
-use super::{LEN, OperationMode, ProgramState, StatePacket, States};
-use crate::sysvar::SysVar;
+use super::codes::{OperationMode, ProgramState, States};
 use crate::wire::dialect::Dialect;
-use crate::wire::scalar::Scalar;
+
+/// Size of a state packet in bytes.
+pub const LEN: usize = 1468;
 
 /// The bytes of one packet. There is an accessor for each field; none can fail or panic.
 #[derive(Debug, Clone, Copy)]
@@ -62,20 +63,6 @@ impl<'a> StateView<'a> {
         self.bytes
     }
 
-    /// The packet as a plain value.
-    #[inline]
-    pub fn to_packet(&self) -> StatePacket {
-        let mut packet = StatePacket::ZERO;
-        packet.fill(self.bytes);
-        packet
-    }
-
-    /// Every field into a packet that exists: as [`Self::to_packet`], without a second packet on
-    /// the stack.
-    pub fn read_into(&self, packet: &mut StatePacket) {
-        packet.fill(self.bytes);
-    }
-
     /// The four state machines, as `dialect` numbers them.
     pub fn states(&self, dialect: &Dialect) -> States {
         States {
@@ -89,20 +76,5 @@ impl<'a> StateView<'a> {
     /// The global speed in percent, where the dialect's controller sends it.
     pub fn global_speed(&self, dialect: &Dialect) -> Option<u8> {
         self.bytes.get(usize::from(dialect.global_speed?)).copied()
-    }
-
-    /// The value of a variable that stands in the packet, inputs too: what they read back as.
-    /// `None` for a variable that does not stand there.
-    ///
-    /// A byte variable's bits are packed lowest first (D13) and masked (D22); a bool byte that is
-    /// not 0 counts as 1.
-    pub fn read_var(&self, var: SysVar) -> Option<Scalar> {
-        let place = var.stream()?;
-        let bytes = self.bytes.get(usize::from(place.offset)..)?;
-        if var.is_bits() {
-            Some(Scalar::Byte(super::copy::pack(bytes.first_chunk()?) & var.valid_bits()))
-        } else {
-            Scalar::decode(var.ty(), bytes)
-        }
     }
 }

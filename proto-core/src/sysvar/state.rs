@@ -1,11 +1,16 @@
-//! From the packet into the process image: every output variable that stands in the packet.
+//! The variables in the state packet of port 2001 (docs/wire/state.md section 5): one by one, or all
+//! outputs at once into the process image.
 //!
 //! Where a variable stands on both sides comes from the variable table; consecutive words and
 //! floats that are consecutive on both sides are one copy.
 
-use super::StateView;
-use super::places::{COPIES, PACKS};
-use crate::sysvar::IMAGE_BYTES;
+mod places;
+
+use places::{COPIES, PACKS};
+
+use super::{IMAGE_BYTES, SysVar};
+use crate::wire::scalar::Scalar;
+use crate::wire::state::StateView;
 
 impl StateView<'_> {
     /// Writes every output variable that stands in the packet (docs/wire/state.md section 5);
@@ -26,12 +31,27 @@ impl StateView<'_> {
             }
         }
     }
+
+    /// The value of a variable that stands in the packet, inputs too: what they read back as.
+    /// `None` for a variable that does not stand there.
+    ///
+    /// A byte variable's bits are packed lowest first (D13) and masked (D22); a bool byte that is
+    /// not 0 counts as 1.
+    pub fn read_var(&self, var: SysVar) -> Option<Scalar> {
+        let place = var.stream()?;
+        let bytes = self.as_bytes().get(usize::from(place.offset)..)?;
+        if var.is_bits() {
+            Some(Scalar::Byte(pack(bytes.first_chunk()?) & var.valid_bits()))
+        } else {
+            Scalar::decode(var.ty(), bytes)
+        }
+    }
 }
 
 /// Eight bool bytes as one byte, the first in the least significant bit (D13); what is not 0
 /// counts as 1.
 #[inline]
-pub(super) fn pack(bools: &[u8; 8]) -> u8 {
+fn pack(bools: &[u8; 8]) -> u8 {
     const LOW_SEVEN: u64 = 0x7F7F_7F7F_7F7F_7F7F;
     // Places bit 0 of byte n at bit 56 + n; no two bits meet, so nothing carries.
     const GATHER: u64 = 0x0102_0408_1020_4080;
@@ -40,3 +60,6 @@ pub(super) fn pack(bools: &[u8; 8]) -> u8 {
     let ones = (high & !LOW_SEVEN) >> 7;
     (ones.wrapping_mul(GATHER) >> 56) as u8
 }
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,142 @@
+//! A classic CAN frame and its id.
+//!
+//! A frame cannot be made with an id that does not fit its kind, or with more data than
+//! [`MAX_CAN_DATA`]. Which frames mean something is a recipe's business
+//! ([`crate::recipe::can`]).
+
+use core::fmt;
+
+use embedded_can::Frame;
+
+/// Most data bytes of a classic CAN frame.
+pub const MAX_CAN_DATA: usize = 8;
+
+/// A CAN frame's id (D17).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub enum CanId {
+    /// 11 bits.
+    Standard(u16),
+    /// 29 bits.
+    Extended(u32),
+}
+
+/// A classic CAN frame: data or remote, standard or extended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub struct CanFrame {
+    id: CanId,
+    remote: bool,
+    len: u8,
+    data: [u8; MAX_CAN_DATA],
+}
+
+impl CanId {
+    /// Whether the number fits its kind: 11 or 29 bits.
+    pub const fn is_valid(self) -> bool {
+        match self {
+            Self::Standard(id) => id <= 0x7FF,
+            Self::Extended(id) => id <= 0x1FFF_FFFF,
+        }
+    }
+}
+
+impl fmt::Display for CanId {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Standard(id) => write!(f, "{id:#05x}"),
+            Self::Extended(id) => write!(f, "{id:#010x} (extended)"),
+        }
+    }
+}
+
+impl From<embedded_can::Id> for CanId {
+    fn from(id: embedded_can::Id) -> Self {
+        match id {
+            embedded_can::Id::Standard(id) => Self::Standard(id.as_raw()),
+            embedded_can::Id::Extended(id) => Self::Extended(id.as_raw()),
+        }
+    }
+}
+
+impl CanFrame {
+    /// A data frame; `None` when the id does not fit its kind or there are more than 8 bytes.
+    pub fn new(id: CanId, data: &[u8]) -> Option<Self> {
+        let mut frame = Self { id, remote: false, len: data.len() as u8, data: [0; MAX_CAN_DATA] };
+        frame.data.get_mut(..data.len())?.copy_from_slice(data);
+        id.is_valid().then_some(frame)
+    }
+
+    /// A remote frame that asks for `len` bytes; `None` when the id does not fit its kind or `len`
+    /// is more than 8.
+    pub fn remote(id: CanId, len: usize) -> Option<Self> {
+        let fits = id.is_valid() && len <= MAX_CAN_DATA;
+        fits.then_some(Self { id, remote: true, len: len as u8, data: [0; MAX_CAN_DATA] })
+    }
+
+    /// A data frame of `len` bytes, which `fill` writes. The id is valid and `len` at most
+    /// [`MAX_CAN_DATA`]: whoever calls has checked both.
+    #[inline]
+    pub(crate) fn filled(id: CanId, len: u8, fill: impl FnOnce(&mut [u8])) -> Self {
+        let mut data = [0; MAX_CAN_DATA];
+        if let Some(used) = data.get_mut(..usize::from(len)) {
+            fill(used);
+        }
+        Self { id, remote: false, len, data }
+    }
+
+    /// The frame's id.
+    pub const fn id(&self) -> CanId {
+        self.id
+    }
+
+    /// Whether it is a remote frame.
+    pub const fn is_remote(&self) -> bool {
+        self.remote
+    }
+
+    /// The data; empty in a remote frame.
+    pub fn data(&self) -> &[u8] {
+        let len = if self.remote { 0 } else { usize::from(self.len) };
+        self.data.get(..len).unwrap_or(&[])
+    }
+}
+
+impl Frame for CanFrame {
+    fn new(id: impl Into<embedded_can::Id>, data: &[u8]) -> Option<Self> {
+        Self::new(id.into().into(), data)
+    }
+
+    fn new_remote(id: impl Into<embedded_can::Id>, dlc: usize) -> Option<Self> {
+        Self::remote(id.into().into(), dlc)
+    }
+
+    fn is_extended(&self) -> bool {
+        matches!(self.id, CanId::Extended(_))
+    }
+
+    fn is_remote_frame(&self) -> bool {
+        self.remote
+    }
+
+    fn id(&self) -> embedded_can::Id {
+        // The constructors let only ids through that fit, so the fallbacks are never reached.
+        match self.id {
+            CanId::Standard(id) => {
+                embedded_can::StandardId::new(id).unwrap_or(embedded_can::StandardId::ZERO).into()
+            }
+            CanId::Extended(id) => {
+                embedded_can::ExtendedId::new(id).unwrap_or(embedded_can::ExtendedId::ZERO).into()
+            }
+        }
+    }
+
+    fn dlc(&self) -> usize {
+        usize::from(self.len)
+    }
+
+    fn data(&self) -> &[u8] {
+        CanFrame::data(self)
+    }
+}
