@@ -7,7 +7,7 @@
 //! what can only be promised is in the section "Safety" of each function.
 //!
 //! This is the only crate with `unsafe` beside the boards: raw pointers become references in
-//! [`memory`] and nowhere else.
+//! `memory` and nowhere else.
 
 #![no_std]
 #![cfg_attr(

@@ -105,7 +105,7 @@ pub extern "C" fn rgw_status_text(status: u32) -> *const c_char {
     known.map_or(c"unknown status", |(_, text)| *text).as_ptr()
 }
 
-static TEXTS: [(Status, &CStr); 17] = [
+static TEXTS: [(Status, &CStr); 18] = [
     (Status::Ok, c"done"),
     (Status::Null, c"a pointer is null"),
     (Status::TooSmall, c"memory or a buffer is too small"),
@@ -123,4 +123,5 @@ static TEXTS: [(Status, &CStr); 17] = [
     (Status::ConfigPlan, c"a variable has no way to or from the controller"),
     (Status::ConfigTooLarge, c"the configuration is larger than the library was built for"),
     (Status::ConfigDialect, c"the dialect is not known here"),
+    (Status::Other, c"the image or the configuration is refused"),
 ];
