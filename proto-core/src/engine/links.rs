@@ -54,9 +54,15 @@ macro_rules! with_connection {
 /// `$do` with each link that is one connection as `$link`.
 macro_rules! each_connection {
     ($links:expr, $link:ident => $do:expr) => {
-        $links.state.iter_mut().for_each(|$link| $do);
-        $links.modbus.iter_mut().for_each(|$link| $do);
-        $links.recipes.iter_mut().for_each(|$link| $do);
+        if let Some($link) = $links.state.first_mut() {
+            $do
+        }
+        if let Some($link) = $links.modbus.first_mut() {
+            $do
+        }
+        for $link in &mut $links.recipes {
+            $do
+        }
     };
 }
 
