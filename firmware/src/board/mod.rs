@@ -3,6 +3,8 @@
 //! A board gives `Board`, which is a [`firmware::platform::Board`], and `main`, which makes one and
 //! starts the tasks with it.
 
+mod stack;
+
 #[cfg(feature = "board-mps2-an500")]
 mod mps2_an500;
 #[cfg(feature = "board-mps2-an500")]

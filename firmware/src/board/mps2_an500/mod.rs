@@ -7,7 +7,6 @@ mod console;
 mod executor;
 mod log_output;
 mod registers;
-mod stack;
 mod storage;
 mod time;
 mod trouble;
@@ -86,7 +85,7 @@ impl platform::Board for Board {
     }
 
     fn stack_used(&self) -> usize {
-        stack::used()
+        super::stack::used()
     }
 }
 
@@ -102,8 +101,8 @@ impl Lamp for Led {
 
 #[cortex_m_rt::entry]
 fn main() -> ! {
-    stack::guard();
-    stack::paint();
+    super::stack::guard();
+    super::stack::paint();
     console::start();
     log_output::start();
     time::start();

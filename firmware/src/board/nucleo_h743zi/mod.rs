@@ -9,7 +9,6 @@ mod identity;
 mod last_words;
 mod leds;
 mod serial;
-mod stack;
 mod storage;
 mod watchdog;
 
@@ -91,14 +90,14 @@ impl platform::Board for Board {
     }
 
     fn stack_used(&self) -> usize {
-        stack::used()
+        super::stack::used()
     }
 }
 
 #[cortex_m_rt::entry]
 fn main() -> ! {
-    stack::guard();
-    stack::paint();
+    super::stack::guard();
+    super::stack::paint();
     clocks::errata();
     let mut core = Core::take();
     if let Some(core) = &mut core {

@@ -1,34 +1,35 @@
-//! The stack: it has the DTCM for itself, and a guard at its end.
+//! The stack of any board: its guard, and how much of it was ever used. Where both are, its linker script
+//! says.
 
 use cortex_m::peripheral::MPU;
 
 unsafe extern "C" {
-    /// From memory.x: the lowest address of the guard, which ends where the stack may begin.
+    /// The lowest address of the guard, which is a power of two long and lies at a multiple of that.
     static _stack_guard: u32;
-    /// The stack's lowest address.
+    /// The stack's lowest address, where the guard ends.
     static _stack_end: u32;
     /// Its upper end.
     static _stack_start: u32;
 }
 
 const PAINT: u32 = 0xC5C5_C5C5;
-/// log2 of the guard's size.
-const GUARD_BITS: u32 = 14;
 
 fn bottom() -> usize {
     &raw const _stack_end as usize
 }
 
-/// Keeps everybody from the 16 KiB below the stack, so that an overflow faults. The handler of the fault
-/// is not kept from them: it has to have a stack.
+/// Keeps everybody from the memory below the stack, so that an overflow faults. The handler of the fault
+/// is not kept from it: it has to have a stack.
 pub(super) fn guard() {
-    // SAFETY: nobody else uses the MPU, and nothing is kept where the guard is (memory.x).
+    let start = &raw const _stack_guard as u32;
+    let bits = (bottom() as u32 - start).trailing_zeros();
+    // SAFETY: nobody else uses the MPU, and nothing is kept where the guard is (the linker script).
     unsafe {
         let mpu = &*MPU::PTR;
         mpu.rnr.write(0);
-        mpu.rbar.write(&raw const _stack_guard as u32);
+        mpu.rbar.write(start);
         // Execute never, no access, its size, on.
-        mpu.rasr.write(1 << 28 | (GUARD_BITS - 1) << 1 | 1);
+        mpu.rasr.write(1 << 28 | (bits - 1) << 1 | 1);
         // On, with the ordinary map for everything else.
         mpu.ctrl.write(1 << 2 | 1);
     }
@@ -40,7 +41,7 @@ pub(super) fn guard() {
 pub(super) fn paint() {
     let used = cortex_m::register::msp::read() as usize - 256;
     for address in (bottom()..used).step_by(4) {
-        // SAFETY: below everything that is on the stack now; nobody owns it.
+        // SAFETY: between the guard and everything that is on the stack now; nobody owns it.
         unsafe { core::ptr::with_exposed_provenance_mut::<u32>(address).write_volatile(PAINT) }
     }
 }
