@@ -11,7 +11,7 @@ use proto_core::config::{Bus, GatewayConfig};
 use serde_json::{Value, json};
 
 use super::environment::{Link, LinkStatus, Plan, PortStatus};
-use super::field::{CanClient, Line};
+use super::field::{CanClient, LineClient};
 use super::refusal::Spoil;
 
 /// The host as QEMU's guest sees it.
@@ -100,8 +100,8 @@ impl Wires {
     }
 
     #[track_caller]
-    pub(crate) fn line(&self, port: &str) -> Line {
-        Line::new(Box::new(self.socket(self.field(port).1)))
+    pub(crate) fn line(&self, port: &str) -> LineClient {
+        LineClient::new(Box::new(self.socket(self.field(port).1)))
     }
 
     #[track_caller]

@@ -15,7 +15,7 @@ use recipe_test_kit::until;
 use super::board::{self, Wires};
 use super::case::Case;
 use super::environment::{Cable, Environment, Gateway, Link, LinkStatus, Plan, PortStatus, ports};
-use super::field::{CanClient, Line};
+use super::field::{CanClient, LineClient};
 use super::program::Program;
 use super::refusal::Spoil;
 
@@ -68,7 +68,7 @@ impl Environment for Nucleo {
         let mut chip = Chip::start(self, plan, &image);
         let reason = chip.until_log("nothing runs: ");
         for bus in ["a", "b"] {
-            let mut line = Line::new(Box::new(chip.wires.socket(bus)));
+            let mut line = LineClient::new(Box::new(chip.wires.socket(bus)));
             line.send(b"\xFF\xFF\x01\xEE\xEE");
             line.is_silent(Duration::from_millis(300));
         }
@@ -146,7 +146,7 @@ impl Chip {
 
 impl Gateway for Chip {
     #[track_caller]
-    fn line(&self, port: &str) -> Line {
+    fn line(&self, port: &str) -> LineClient {
         self.wires.line(port)
     }
 

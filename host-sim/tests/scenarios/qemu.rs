@@ -14,7 +14,7 @@ use recipe_test_kit::until;
 use super::board::{self, Wires};
 use super::case::Case;
 use super::environment::{Cable, Environment, Gateway, Link, LinkStatus, Plan, PortStatus, ports};
-use super::field::{CanClient, Line};
+use super::field::{CanClient, LineClient};
 use super::program::Program;
 use super::refusal::Spoil;
 
@@ -69,7 +69,7 @@ impl Environment for Qemu {
             Some(rest.split_once('\r')?.0.to_owned())
         });
         for uart in UARTS {
-            let mut line = Line::new(Box::new(board.wires.socket(uart)));
+            let mut line = LineClient::new(Box::new(board.wires.socket(uart)));
             line.send(b"\xFF\xFF\x01\xEE\xEEO\rt001101\r");
             line.is_silent(Duration::from_millis(300));
         }
@@ -143,7 +143,7 @@ impl Board {
 
 impl Gateway for Board {
     #[track_caller]
-    fn line(&self, port: &str) -> Line {
+    fn line(&self, port: &str) -> LineClient {
         self.wires.line(port)
     }
 
