@@ -5,6 +5,8 @@
 //! come back. Knows no socket, no device and no clock: who drives it does: a shell with sockets, or
 //! a test, which jumps from deadline to deadline.
 //!
+//! For a test of your own code there is [`TestController`]: a controller with its clients, devices and clock.
+//!
 //! One rule: [`Controller::handle`] changes the state, then [`Controller::poll_output`] is drained
 //! until it returns [`ControllerOutput::Sleep`]. Polling early is harmless. Everything a peer sends
 //! wrong is counted and survived.
@@ -23,6 +25,7 @@ pub mod registers;
 mod run;
 mod server;
 mod spoiled;
+mod test_controller;
 
 use std::collections::VecDeque;
 use std::net::{IpAddr, SocketAddr};
@@ -48,6 +51,7 @@ use server::Server;
 pub use server::{MAX_COMMAND_CONNECTIONS, MAX_MODBUS_CONNECTIONS, MAX_ORDERS, MAX_STATE_CONNECTIONS};
 
 pub use spoiled::NoSuchFloat;
+pub use test_controller::{Out, TestController};
 
 /// A connection, as the shell numbers it; no two at a time have the same number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]

@@ -27,7 +27,7 @@ use recipe_net::turns::give_way;
 
 /// A serial port's device.
 #[derive(Debug)]
-pub(super) struct Line {
+pub(super) struct LinePort {
     source: Source,
     settings: Rs485,
     tx: Rc<PortTx>,
@@ -41,7 +41,7 @@ enum Source {
     Listen(TcpListener),
 }
 
-impl Line {
+impl LinePort {
     pub(super) async fn open(device: &Device, settings: Rs485, tx: Rc<PortTx>) -> io::Result<Self> {
         let source = match device {
             Device::Pty { link, pace } => Source::Pty(Pty::open(link)?, *pace),

@@ -12,7 +12,7 @@ use proto_core::wire::can::CanId;
 use super::bind::Device;
 use super::can_bus::CanPort;
 use super::exchange::{PortEvent, PortTx};
-use super::line::Line;
+use super::line::LinePort;
 use super::socketcan::KernelCan;
 
 /// What the configuration says of a port's bus.
@@ -36,7 +36,7 @@ pub struct Port {
 
 #[derive(Debug)]
 enum Driver {
-    Line(Line),
+    Line(LinePort),
     Can(CanPort),
     Kernel(KernelCan),
 }
@@ -50,7 +50,7 @@ impl Port {
         let tx = Rc::new(PortTx::default());
         let driver = match (bus, device) {
             (PortBus::Serial(settings), _) => {
-                Driver::Line(Line::open(device, settings, Rc::clone(&tx)).await?)
+                Driver::Line(LinePort::open(device, settings, Rc::clone(&tx)).await?)
             }
             (PortBus::Can { bitrate }, Device::SocketCan { interface }) => {
                 Driver::Kernel(KernelCan::open(interface, bitrate, Rc::clone(&tx))?)

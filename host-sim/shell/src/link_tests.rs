@@ -110,6 +110,25 @@ pub(super) async fn server() -> (TcpListener, Endpoint) {
     (listener, Endpoint::Tcp { host: at.ip().to_string(), port: at.port() })
 }
 
+/// A TCP link that is up, its server, and the server's end of the connection.
+pub(super) async fn connected() -> (Running, TcpListener, TcpStream) {
+    let (listener, endpoint) = server().await;
+    let link = Running::start(endpoint);
+    link.control.open();
+    let (peer, _) = listener.accept().await.unwrap();
+    link.expect(Seen::Up).await;
+    (link, listener, peer)
+}
+
+/// A link that waits for datagrams, and where.
+async fn udp_listening() -> (Running, std::net::SocketAddr) {
+    let socket = UdpSocket::bind("127.0.0.1:0").await.unwrap();
+    let at = socket.local_addr().unwrap();
+    let link = Running::start(udp_listen(socket));
+    link.control.open();
+    (link, at)
+}
+
 #[test]
 fn a_tcp_link_opens_carries_and_tells_once_when_it_is_lost() {
     inside(async || {
@@ -156,11 +175,7 @@ fn a_refused_connection_is_reported_and_tried_again_only_when_asked() {
 #[test]
 fn after_a_close_nothing_is_reported_and_nothing_old_is_sent() {
     inside(async || {
-        let (listener, endpoint) = server().await;
-        let link = Running::start(endpoint);
-        link.control.open();
-        let (mut peer, _) = listener.accept().await.unwrap();
-        link.expect(Seen::Up).await;
+        let (link, listener, mut peer) = connected().await;
         peer.write_all(b"late").await.unwrap();
         link.control.send(b"old");
         link.control.close();
@@ -257,10 +272,7 @@ fn a_udp_link_is_down_when_nobody_is_there() {
 #[test]
 fn a_listening_udp_link_answers_where_the_newest_frame_came_from() {
     inside(async || {
-        let socket = UdpSocket::bind("127.0.0.1:0").await.unwrap();
-        let at = socket.local_addr().unwrap();
-        let link = Running::start(udp_listen(socket));
-        link.control.open();
+        let (link, at) = udp_listening().await;
         let (one, two) =
             (UdpSocket::bind("127.0.0.1:0").await.unwrap(), UdpSocket::bind("127.0.0.1:0").await.unwrap());
         one.send_to(b"first", at).await.unwrap();
@@ -282,10 +294,7 @@ const GARBAGE: &[u8] = b"?";
 #[test]
 fn what_is_no_frame_is_told_and_does_not_take_the_answers_away() {
     inside(async || {
-        let socket = UdpSocket::bind("127.0.0.1:0").await.unwrap();
-        let at = socket.local_addr().unwrap();
-        let link = Running::start(udp_listen(socket));
-        link.control.open();
+        let (link, at) = udp_listening().await;
         let (robot, other) =
             (UdpSocket::bind("127.0.0.1:0").await.unwrap(), UdpSocket::bind("127.0.0.1:0").await.unwrap());
         robot.send_to(b"frame", at).await.unwrap();
@@ -304,10 +313,7 @@ fn what_is_no_frame_is_told_and_does_not_take_the_answers_away() {
 #[test]
 fn the_first_datagram_of_an_opening_is_answered_whatever_it_is() {
     inside(async || {
-        let socket = UdpSocket::bind("127.0.0.1:0").await.unwrap();
-        let at = socket.local_addr().unwrap();
-        let link = Running::start(udp_listen(socket));
-        link.control.open();
+        let (link, at) = udp_listening().await;
         let robot = UdpSocket::bind("127.0.0.1:0").await.unwrap();
         robot.send_to(b"? hello", at).await.unwrap();
         link.expect(Seen::Up).await;

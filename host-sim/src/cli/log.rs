@@ -20,7 +20,7 @@ pub(super) fn start(verbose: u8) -> Log {
     let log = Log::start(stderr());
     let lines = Arc::clone(&log.lines);
     let format = tracing_subscriber::fmt().with_env_filter(filter);
-    let format = format.with_writer(move || Line(Arc::clone(&lines)));
+    let format = format.with_writer(move || LogLine(Arc::clone(&lines)));
     // Fails only when somebody has set up logging before, which is as good.
     let _ = format.with_ansi(stderr().is_terminal()).try_init();
     log
@@ -102,9 +102,9 @@ impl Lines {
 }
 
 /// One event's line.
-struct Line(Arc<Lines>);
+struct LogLine(Arc<Lines>);
 
-impl Write for Line {
+impl Write for LogLine {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         self.0.put(bytes);
         Ok(bytes.len())

@@ -11,7 +11,7 @@ use proto_core::modbus::client::{Client, ClientEvent};
 use proto_core::modbus::pdu::{Request, Response};
 use serde_json::Value;
 
-use super::device::{Line, PATIENCE};
+use super::device::{FieldStream, PATIENCE};
 use recipe_config::file::{self, Text};
 use recipe_device::bind::Bind;
 use recipe_shell::{self as shell, Handle};
@@ -47,7 +47,7 @@ impl Robot {
 
     /// Sends a command to port 2000 and waits for this reply.
     pub(super) fn command(&self, command: &str, reply: &str) -> io::Result<()> {
-        let mut line = Line::connect(self.address("command")?)?;
+        let mut line = FieldStream::connect(self.address("command")?)?;
         line.send(command.as_bytes())?;
         line.wait_for(|received| (received == reply.as_bytes()).then_some(((), received.len())))
     }
@@ -114,19 +114,19 @@ impl Gateway {
 }
 
 /// Opens the device end of a bound pseudoterminal.
-pub(super) fn serial(path: &Path) -> io::Result<Line<std::fs::File>> {
-    Line::open(path)
+pub(super) fn serial(path: &Path) -> io::Result<FieldStream<std::fs::File>> {
+    FieldStream::open(path)
 }
 
 /// A Modbus client for looking at the controller from outside.
 struct Modbus {
-    line: Line<std::net::TcpStream>,
+    line: FieldStream<std::net::TcpStream>,
     client: Client,
 }
 
 impl Modbus {
     fn connect(address: SocketAddr) -> io::Result<Self> {
-        Ok(Self { line: Line::connect(address)?, client: Client::new(1) })
+        Ok(Self { line: FieldStream::connect(address)?, client: Client::new(1) })
     }
 
     fn ask(&mut self, request: Request<'_>, is_so: impl Fn(Response<'_>) -> bool) -> io::Result<bool> {

@@ -19,12 +19,12 @@ use rustix::fs::{Mode, OFlags, open};
 pub(super) const PATIENCE: Duration = Duration::from_secs(30);
 
 /// A stream of bytes: a serial line, or a TCP connection.
-pub(super) struct Line<S> {
+pub(super) struct FieldStream<S> {
     stream: S,
     received: Vec<u8>,
 }
 
-impl Line<File> {
+impl FieldStream<File> {
     /// Opens the slave end of a pseudoterminal, as a serial port is opened.
     pub(super) fn open(path: &Path) -> io::Result<Self> {
         let fd = open(path, OFlags::RDWR | OFlags::NOCTTY, Mode::empty())?;
@@ -32,7 +32,7 @@ impl Line<File> {
     }
 }
 
-impl Line<TcpStream> {
+impl FieldStream<TcpStream> {
     /// Connects.
     pub(super) fn connect(address: SocketAddr) -> io::Result<Self> {
         let stream = TcpStream::connect_timeout(&address, PATIENCE)?;
@@ -49,7 +49,7 @@ impl Line<TcpStream> {
     }
 }
 
-impl<S: Read + Write + AsFd> Line<S> {
+impl<S: Read + Write + AsFd> FieldStream<S> {
     pub(super) fn send(&mut self, bytes: &[u8]) -> io::Result<()> {
         self.stream.write_all(bytes)
     }
@@ -87,13 +87,13 @@ impl<S: Read + Write + AsFd> Line<S> {
 
 /// A CAN adapter: slcan on a TCP connection.
 pub(super) struct Adapter {
-    line: Line<TcpStream>,
+    line: FieldStream<TcpStream>,
 }
 
 impl Adapter {
     /// Connects and opens the channel at 500 kbit/s.
     pub(super) fn connect(address: SocketAddr) -> io::Result<Self> {
-        let mut line = Line::connect(address)?;
+        let mut line = FieldStream::connect(address)?;
         line.send(b"C\rS6\rO\r")?;
         Ok(Self { line })
     }

@@ -7,7 +7,7 @@ use std::net::TcpListener;
 use serde_json::json;
 
 use super::cell::{Example, Gateway, Robot, serial};
-use super::device::{Adapter, Datagrams, Line};
+use super::device::{Adapter, Datagrams, FieldStream};
 use super::folder::Folder;
 use super::show::Show;
 
@@ -77,7 +77,7 @@ pub(super) fn run_all(show: &mut Show, folder: &Folder) {
 /// The device sends three bytes and gets the answer.
 fn three_bytes<S: io::Read + io::Write + std::os::fd::AsFd>(
     show: &Show,
-    device: &mut Line<S>,
+    device: &mut FieldStream<S>,
 ) -> io::Result<()> {
     show.sends("device", &THREE_BYTES, "head, 1, 2, 3, tail");
     device.send(&THREE_BYTES)?;
@@ -114,7 +114,7 @@ fn rs485_user_gateway(show: &Show, folder: &Folder) -> io::Result<()> {
 /// The device sees this pose each cycle and switches DO1.
 fn pose_and_do1<S: io::Read + io::Write + std::os::fd::AsFd>(
     show: &Show,
-    device: &mut Line<S>,
+    device: &mut FieldStream<S>,
     pose: &[u8],
     robot: &Robot,
 ) -> io::Result<()> {
@@ -237,12 +237,12 @@ fn clients(show: &Show) -> io::Result<()> {
     let overrides = [format!("port.tcp1.to={}", listener.local_addr()?), format!("port.udp1.to={udp}")];
     let robot = Robot::start(example!("client-controller"), &overrides, &[])?;
     {
-        let mut connection = Line::accept(&listener)?;
+        let mut connection = FieldStream::accept(&listener)?;
         show.notes("TCP", "the controller connected", "");
         pose_and_do1(show, &mut connection, &POSE, &robot)?;
     }
     show.notes("TCP", "connection closed", "the controller has to come back");
-    pose_and_do1(show, &mut Line::accept(&listener)?, &POSE, &robot)?;
+    pose_and_do1(show, &mut FieldStream::accept(&listener)?, &POSE, &robot)?;
     let frame = datagrams.receive()?;
     show.sees("UDP", &frame, "the same frame, a datagram each");
     same(&frame, &POSE)?;

@@ -61,7 +61,7 @@ impl Process {
 
     /// Everything it said on stderr. Only of a program that has ended or soon will.
     pub fn all_errors(&mut self) -> String {
-        self.errors.to_the_end();
+        self.errors.read_whole();
         self.errors().join("\n")
     }
 
@@ -203,7 +203,7 @@ impl Drop for Process {
         let _ = self.child.kill();
         let _ = self.child.wait();
         if std::thread::panicking() {
-            self.errors.to_the_end();
+            self.errors.read_whole();
             self.errors().iter().for_each(|line| eprintln!("{}: {line}", self.pid().as_raw_pid()));
         }
     }
@@ -254,7 +254,7 @@ impl Said {
     }
 
     /// Waits until the pipe is closed.
-    fn to_the_end(&mut self) {
+    fn read_whole(&mut self) {
         if let Some(reader) = self.reader.take() {
             let _ = reader.join();
         }

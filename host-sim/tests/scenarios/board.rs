@@ -6,12 +6,14 @@ use std::net::{Ipv4Addr, SocketAddr};
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::time::Duration;
 
 use proto_core::config::{Bus, GatewayConfig};
 use serde_json::{Value, json};
 
-use super::environment::{Link, LinkStatus, Plan, PortStatus};
-use super::field::{CanClient, Line};
+use super::environment::{Cable, Gateway, Link, LinkStatus, Plan, PortStatus};
+use super::field::{CanClient, LineClient};
+use super::program::Program;
 use super::refusal::Spoil;
 
 /// The host as QEMU's guest sees it.
@@ -100,8 +102,8 @@ impl Wires {
     }
 
     #[track_caller]
-    pub(crate) fn line(&self, port: &str) -> Line {
-        Line::new(Box::new(self.socket(self.field(port).1)))
+    pub(crate) fn line(&self, port: &str) -> LineClient {
+        LineClient::new(Box::new(self.socket(self.field(port).1)))
     }
 
     #[track_caller]
@@ -118,6 +120,100 @@ impl Wires {
     #[track_caller]
     pub(crate) fn port(&self, log: &str, port: &str) -> PortStatus {
         port_status(log, self.field(port).0)
+    }
+}
+
+/// What runs a board's firmware: a gateway that says what it does in its log.
+pub(crate) trait Machine {
+    fn program(&self) -> &Program;
+
+    fn program_mut(&mut self) -> &mut Program;
+
+    fn wires(&self) -> &Wires;
+
+    /// What the firmware said so far.
+    fn log(&self) -> String;
+
+    fn cable(&self, cable: Cable);
+
+    /// Stops the board where it is.
+    fn stop(&self);
+
+    /// Lets it go on.
+    fn go_on(&self);
+
+    /// Writes what is in the memory of the board's stack to a file.
+    fn save_stack(&self, to: &Path);
+
+    /// What the emulator counts, if it does.
+    fn counts(&self) -> Value {
+        Value::Null
+    }
+}
+
+impl<M: Machine> Gateway for M {
+    #[track_caller]
+    fn line(&self, port: &str) -> LineClient {
+        self.wires().line(port)
+    }
+
+    #[track_caller]
+    fn can(&self, port: &str) -> CanClient {
+        self.wires().can(port)
+    }
+
+    #[track_caller]
+    fn listens(&self, port: &str) -> SocketAddr {
+        self.wires().listens(port)
+    }
+
+    fn link(&self, link: Link<'_>) -> LinkStatus {
+        link_status(&self.log(), link)
+    }
+
+    fn port(&self, port: &str) -> PortStatus {
+        self.wires().port(&self.log(), port)
+    }
+
+    #[track_caller]
+    fn cable(&self, cable: Cable) {
+        Machine::cable(self, cable);
+    }
+
+    #[track_caller]
+    fn freeze(&self) {
+        self.stop();
+    }
+
+    #[track_caller]
+    fn thaw(&self) {
+        self.go_on();
+    }
+
+    fn own_address(&self) -> Option<String> {
+        own_address(&self.log())
+    }
+
+    fn processor_time(&self) -> Duration {
+        self.program().processor_time()
+    }
+
+    /// Its stack, which is painted before it is used; everything else is static.
+    #[track_caller]
+    fn memory(&self) -> u64 {
+        let path = self.wires().folder.join("memory");
+        self.save_stack(&path);
+        stack_used(&path)
+    }
+
+    #[track_caller]
+    fn figures(&self) -> Value {
+        self.counts()
+    }
+
+    #[track_caller]
+    fn must_run(&mut self) {
+        self.program_mut().must_run();
     }
 }
 
@@ -177,7 +273,7 @@ pub(crate) fn qmp(socket: &Path, command: &str, arguments: Value) -> Value {
 }
 
 /// From the lines `link NAME: up (COUNT)` and `link NAME: lost` of a log.
-pub(crate) fn link(log: &str, link: Link<'_>) -> LinkStatus {
+fn link_status(log: &str, link: Link<'_>) -> LinkStatus {
     let name = match link {
         Link::Command => "command",
         Link::State => "state",
@@ -218,14 +314,14 @@ fn port_status(log: &str, number: usize) -> PortStatus {
 }
 
 /// The address that a log tells.
-pub(crate) fn own_address(log: &str) -> Option<String> {
+fn own_address(log: &str) -> Option<String> {
     let (_, said) = log.rsplit_once(" address ")?;
     said.split_whitespace().next().map(str::to_owned)
 }
 
 /// How much of a stack was used: all but its painted lower end.
 #[track_caller]
-pub(crate) fn stack_used(memory: &Path) -> u64 {
+fn stack_used(memory: &Path) -> u64 {
     let memory = std::fs::read(memory).unwrap();
     let unused = memory.iter().take_while(|&&byte| byte == PAINT).count();
     assert!(unused > 0, "the stack is where it is not expected");

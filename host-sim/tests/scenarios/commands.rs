@@ -9,7 +9,7 @@ use recipe_test_kit::until;
 
 use super::case::{Case, Scenario};
 use super::environment::{Cable, Gateway, Link, Plan};
-use super::field::Line;
+use super::field::LineClient;
 use super::network::{Filter, Network, Pass};
 use super::robot::Robot;
 
@@ -64,7 +64,7 @@ fn order(order: u8, outputs: u8) -> [u8; 6] {
 }
 
 /// The panel's switches stand like this for so long.
-fn hold(panel: &mut Line, frame: &[u8], time: Duration, mut meanwhile: impl FnMut()) {
+fn hold(panel: &mut LineClient, frame: &[u8], time: Duration, mut meanwhile: impl FnMut()) {
     let begin = Instant::now();
     while begin.elapsed() < time {
         panel.send(frame);
@@ -75,7 +75,7 @@ fn hold(panel: &mut Line, frame: &[u8], time: Duration, mut meanwhile: impl FnMu
 
 /// An order is given while everything works, and carried out.
 #[track_caller]
-fn start(panel: &mut Line, gateway: &mut dyn Gateway, robot: &Robot) {
+fn start(panel: &mut LineClient, gateway: &mut dyn Gateway, robot: &Robot) {
     // The first frame only sets the base.
     let frames = gateway.port("device").frames_in;
     until("the base is taken", || {

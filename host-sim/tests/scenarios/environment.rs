@@ -10,7 +10,7 @@ use serde_json::Value;
 use recipe_test_kit::{SERVERS, until};
 
 use super::case::Case;
-use super::field::{CanClient, Line};
+use super::field::{CanClient, LineClient};
 use super::refusal::Spoil;
 use super::robot::Robot;
 
@@ -36,7 +36,7 @@ pub(crate) trait Environment: Send + Sync {
 /// A running gateway. It fails the scenario when it panics or ends.
 pub(crate) trait Gateway {
     /// The device at an RS-485 port.
-    fn line(&self, port: &str) -> Line;
+    fn line(&self, port: &str) -> LineClient;
 
     /// A node on the bus of a CAN port.
     fn can(&self, port: &str) -> CanClient;

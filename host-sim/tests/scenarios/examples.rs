@@ -6,7 +6,7 @@ use recipe_test_kit::until;
 
 use super::case::{Case, Scenario};
 use super::environment::{Gateway, Link};
-use super::field::{CanClient, Line};
+use super::field::{CanClient, LineClient};
 use super::robot::{Robot, RobotPlan};
 
 pub(crate) fn all() -> Vec<Scenario> {
@@ -49,7 +49,7 @@ pub(crate) fn pose_frame(floats: usize) -> Vec<u8> {
 
 /// The device sees this pose each cycle and switches DO1.
 #[track_caller]
-pub(crate) fn pose_and_output(robot: &Robot, device: &mut Line, pose: &[u8]) {
+pub(crate) fn pose_and_output(robot: &Robot, device: &mut LineClient, pose: &[u8]) {
     device.until(pose);
     for nth in 0..20 {
         assert_eq!(device.take(pose.len()), pose, "frame {nth} behind the first");

@@ -30,13 +30,13 @@ struct Inbox {
 }
 
 /// A device on a serial line. It takes what comes, whether anybody looks or not.
-pub(crate) struct Line {
+pub(crate) struct LineClient {
     writer: Box<dyn Write + Send>,
     inbox: Arc<Inbox>,
     received: Vec<u8>,
 }
 
-impl Line {
+impl LineClient {
     pub(crate) fn new(stream: Box<dyn Stream>) -> Self {
         let (mut reader, writer) = stream.split();
         let inbox = Arc::<Inbox>::default();
@@ -122,13 +122,13 @@ impl Line {
 }
 
 /// A node on a CAN bus, by slcan (proto-core/docs/wire/slcan.md).
-pub(crate) struct CanClient(Line);
+pub(crate) struct CanClient(LineClient);
 
 impl CanClient {
     /// Joins the bus.
     #[track_caller]
     pub(crate) fn join(stream: Box<dyn Stream>) -> Self {
-        let mut line = Line::new(stream);
+        let mut line = LineClient::new(stream);
         line.send(b"C\rO\r");
         assert_eq!(line.take(2), b"\r\r", "answers to closing and opening");
         Self(line)
@@ -177,7 +177,7 @@ impl CanClient {
     }
 
     /// The bare line.
-    pub(crate) fn into_line(self) -> Line {
+    pub(crate) fn into_line(self) -> LineClient {
         self.0
     }
 

@@ -11,7 +11,7 @@ use rustix::process::Signal;
 
 use super::case::Case;
 use super::environment::{Cable, Environment, Gateway, Link, LinkStatus, Plan, PortStatus, ports};
-use super::field::{CanClient, Line};
+use super::field::{CanClient, LineClient};
 use super::namespace::Namespace;
 use super::network::Network;
 use super::program::HostSim;
@@ -140,10 +140,10 @@ impl HostGateway {
 
 impl Gateway for HostGateway {
     #[track_caller]
-    fn line(&self, port: &str) -> Line {
+    fn line(&self, port: &str) -> LineClient {
         let flags = OFlags::RDWR | OFlags::NOCTTY;
         let line = rustix::fs::open(self.place(port), flags, Mode::empty()).unwrap();
-        Line::new(Box::new(std::fs::File::from(line)))
+        LineClient::new(Box::new(std::fs::File::from(line)))
     }
 
     #[track_caller]

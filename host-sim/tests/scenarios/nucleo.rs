@@ -3,7 +3,6 @@
 
 use std::ffi::OsString;
 use std::io::{BufRead, BufReader, Write};
-use std::net::SocketAddr;
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -12,10 +11,10 @@ use serde_json::Value;
 
 use recipe_test_kit::until;
 
-use super::board::{self, Wires};
+use super::board::{self, Machine, Wires};
 use super::case::Case;
-use super::environment::{Cable, Environment, Gateway, Link, LinkStatus, Plan, PortStatus, ports};
-use super::field::{CanClient, Line};
+use super::environment::{Cable, Environment, Gateway, Plan, ports};
+use super::field::{CanClient, LineClient};
 use super::program::Program;
 use super::refusal::Spoil;
 
@@ -68,7 +67,7 @@ impl Environment for Nucleo {
         let mut chip = Chip::start(self, plan, &image);
         let reason = chip.until_log("nothing runs: ");
         for bus in ["a", "b"] {
-            let mut line = Line::new(Box::new(chip.wires.socket(bus)));
+            let mut line = LineClient::new(Box::new(chip.wires.socket(bus)));
             line.send(b"\xFF\xFF\x01\xEE\xEE");
             line.is_silent(Duration::from_millis(300));
         }
@@ -114,10 +113,6 @@ impl Chip {
         chip
     }
 
-    fn log(&self) -> String {
-        self.program.lines().iter().flat_map(|line| [line.as_str(), "\n"]).collect()
-    }
-
     /// Waits for a line with this, and returns what is behind it.
     #[track_caller]
     fn until_log(&mut self, text: &str) -> String {
@@ -144,28 +139,21 @@ impl Chip {
     }
 }
 
-impl Gateway for Chip {
-    #[track_caller]
-    fn line(&self, port: &str) -> Line {
-        self.wires.line(port)
+impl Machine for Chip {
+    fn program(&self) -> &Program {
+        &self.program
     }
 
-    #[track_caller]
-    fn can(&self, port: &str) -> CanClient {
-        self.wires.can(port)
+    fn program_mut(&mut self) -> &mut Program {
+        &mut self.program
     }
 
-    #[track_caller]
-    fn listens(&self, port: &str) -> SocketAddr {
-        self.wires.listens(port)
+    fn wires(&self) -> &Wires {
+        &self.wires
     }
 
-    fn link(&self, link: Link<'_>) -> LinkStatus {
-        board::link(&self.log(), link)
-    }
-
-    fn port(&self, port: &str) -> PortStatus {
-        self.wires.port(&self.log(), port)
+    fn log(&self) -> String {
+        self.program.lines().iter().flat_map(|line| [line.as_str(), "\n"]).collect()
     }
 
     #[track_caller]
@@ -174,40 +162,24 @@ impl Gateway for Chip {
     }
 
     #[track_caller]
-    fn freeze(&self) {
+    fn stop(&self) {
         self.order("stop");
     }
 
     #[track_caller]
-    fn thaw(&self) {
+    fn go_on(&self) {
         self.order("go");
     }
 
-    fn own_address(&self) -> Option<String> {
-        board::own_address(&self.log())
-    }
-
-    fn processor_time(&self) -> Duration {
-        self.program.processor_time()
-    }
-
-    /// Its stack, which is painted before it is used; everything else is static.
     #[track_caller]
-    fn memory(&self) -> u64 {
-        let path = self.wires.folder.join("memory");
+    fn save_stack(&self, to: &Path) {
         let [start, len] = STACK;
-        self.order(&format!("save {start} {len} {}", path.display()));
-        board::stack_used(&path)
+        self.order(&format!("save {start} {len} {}", to.display()));
     }
 
     #[track_caller]
-    fn figures(&self) -> Value {
+    fn counts(&self) -> Value {
         serde_json::from_str(&self.ask("figures")).unwrap()
-    }
-
-    #[track_caller]
-    fn must_run(&mut self) {
-        self.program.must_run();
     }
 }
 
@@ -215,7 +187,7 @@ impl Drop for Chip {
     fn drop(&mut self) {
         if !std::thread::panicking() {
             self.program.must_run();
-            let figures = self.figures();
+            let figures = self.counts();
             self.program.interrupt();
             assert!(!self.log().contains("panicked"), "the firmware panicked");
             assert_eq!(figures["resets"], 0, "the watchdog has reset the board");

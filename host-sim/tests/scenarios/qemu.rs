@@ -2,7 +2,6 @@
 //! UART 3.
 
 use std::ffi::OsString;
-use std::net::SocketAddr;
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -11,10 +10,10 @@ use serde_json::{Value, json};
 
 use recipe_test_kit::until;
 
-use super::board::{self, Wires};
+use super::board::{self, Machine, Wires};
 use super::case::Case;
-use super::environment::{Cable, Environment, Gateway, Link, LinkStatus, Plan, PortStatus, ports};
-use super::field::{CanClient, Line};
+use super::environment::{Cable, Environment, Gateway, Plan, ports};
+use super::field::LineClient;
 use super::program::Program;
 use super::refusal::Spoil;
 
@@ -69,7 +68,7 @@ impl Environment for Qemu {
             Some(rest.split_once('\r')?.0.to_owned())
         });
         for uart in UARTS {
-            let mut line = Line::new(Box::new(board.wires.socket(uart)));
+            let mut line = LineClient::new(Box::new(board.wires.socket(uart)));
             line.send(b"\xFF\xFF\x01\xEE\xEEO\rt001101\r");
             line.is_silent(Duration::from_millis(300));
         }
@@ -122,10 +121,6 @@ impl Board {
         board
     }
 
-    fn log(&self) -> String {
-        String::from_utf8_lossy(&std::fs::read(&self.log).unwrap_or_default()).into_owned()
-    }
-
     #[track_caller]
     fn until_log(&mut self, text: &str) {
         until(&format!("{text:?} in the board's log"), || {
@@ -141,28 +136,21 @@ impl Board {
     }
 }
 
-impl Gateway for Board {
-    #[track_caller]
-    fn line(&self, port: &str) -> Line {
-        self.wires.line(port)
+impl Machine for Board {
+    fn program(&self) -> &Program {
+        &self.program
     }
 
-    #[track_caller]
-    fn can(&self, port: &str) -> CanClient {
-        self.wires.can(port)
+    fn program_mut(&mut self) -> &mut Program {
+        &mut self.program
     }
 
-    #[track_caller]
-    fn listens(&self, port: &str) -> SocketAddr {
-        self.wires.listens(port)
+    fn wires(&self) -> &Wires {
+        &self.wires
     }
 
-    fn link(&self, link: Link<'_>) -> LinkStatus {
-        board::link(&self.log(), link)
-    }
-
-    fn port(&self, port: &str) -> PortStatus {
-        self.wires.port(&self.log(), port)
+    fn log(&self) -> String {
+        String::from_utf8_lossy(&std::fs::read(&self.log).unwrap_or_default()).into_owned()
     }
 
     #[track_caller]
@@ -171,34 +159,18 @@ impl Gateway for Board {
     }
 
     #[track_caller]
-    fn freeze(&self) {
+    fn stop(&self) {
         self.qmp("stop", json!({}));
     }
 
     #[track_caller]
-    fn thaw(&self) {
+    fn go_on(&self) {
         self.qmp("cont", json!({}));
     }
 
-    fn own_address(&self) -> Option<String> {
-        board::own_address(&self.log())
-    }
-
-    fn processor_time(&self) -> Duration {
-        self.program.processor_time()
-    }
-
-    /// Its stack, which is painted before it is used; everything else is static.
     #[track_caller]
-    fn memory(&self) -> u64 {
-        let path = self.wires.folder.join("memory");
-        self.qmp("pmemsave", json!({ "val": STACK, "size": STACK_SIZE, "filename": path }));
-        board::stack_used(&path)
-    }
-
-    #[track_caller]
-    fn must_run(&mut self) {
-        self.program.must_run();
+    fn save_stack(&self, to: &Path) {
+        self.qmp("pmemsave", json!({ "val": STACK, "size": STACK_SIZE, "filename": to }));
     }
 }
 

@@ -4,7 +4,7 @@ use proto_core::engine::LinkId;
 use proto_core::sysvar::SysVar;
 use proto_core::time::{Duration, Instant};
 
-use super::field::Line;
+use super::field::LineWatch;
 use super::sheet::{Frame, Raw, written};
 use super::wire::Asked;
 use super::{Invariant, Oracle};
@@ -38,7 +38,7 @@ impl Oracle {
                 let Some(frame) = self.sheet.link(link).and_then(|link| link.input.clone()) else { return };
                 let mut held = std::mem::take(self.controller.held(conn));
                 held.extend_from_slice(bytes);
-                let mut line = Line { held, ..Line::default() };
+                let mut line = LineWatch { held, ..LineWatch::default() };
                 for payload in line.cut(&frame) {
                     put_all(&mut expected, &values_of(&frame, &payload));
                 }

@@ -40,7 +40,7 @@ pub(super) enum Refused {
 
 /// Bytes of a line that are not judged yet.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Line {
+pub(super) struct LineWatch {
     pub held: Vec<u8>,
     pub heard: Instant,
     pub mismatches: u64,
@@ -49,7 +49,7 @@ pub(super) struct Line {
     pub frame_bytes: u64,
 }
 
-impl Line {
+impl LineWatch {
     /// A partial frame is not continued after silence.
     pub(super) fn tick(&mut self, port: &PortSheet, now: Instant) {
         if !self.held.is_empty() && now >= self.heard + port.idle_gap {

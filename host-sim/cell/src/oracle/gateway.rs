@@ -6,7 +6,7 @@ use proto_core::sysvar::SysVar;
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::can::CanFrame;
 
-use super::field::{self, Accepted, Line, Refused, Verdict};
+use super::field::{self, Accepted, LineWatch, Refused, Verdict};
 use super::sheet::{Origin, Owned, Raw, shown, written};
 use super::upward::{Wrong, is_gap};
 use super::wire::Asked;
@@ -102,7 +102,7 @@ impl Oracle {
             watch.counters.asleep += 1;
             if !port.inputs.is_empty() {
                 watch.line.discarded += bytes.len() as u64;
-                let mut apart = Line { held: bytes.to_vec(), ..Line::default() };
+                let mut apart = LineWatch { held: bytes.to_vec(), ..LineWatch::default() };
                 let verdicts = apart.bytes(port, &[], now);
                 self.waited_in_sleep(verdicts);
             }
@@ -458,7 +458,7 @@ impl Oracle {
     }
 }
 
-fn first_packet(line: &mut Line) -> Option<Vec<u8>> {
+fn first_packet(line: &mut LineWatch) -> Option<Vec<u8>> {
     (line.held.len() >= PACKET).then(|| line.held.drain(..PACKET).collect())
 }
 

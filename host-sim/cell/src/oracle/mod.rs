@@ -30,7 +30,7 @@ use proto_core::sysvar::SysVar;
 use proto_core::time::{Duration, Instant};
 
 use downward::Downward;
-use field::Line;
+use field::LineWatch;
 use orders::Orders;
 pub(super) use robot::Path;
 use robot::Robot;
@@ -172,7 +172,7 @@ impl std::fmt::Display for Violation {
 /// What is known of one field port.
 #[derive(Debug, Clone, Default)]
 struct PortWatch {
-    line: Line,
+    line: LineWatch,
     down: Downward,
     counters: PortCounters,
 }
@@ -180,7 +180,7 @@ struct PortWatch {
 /// What is known of one recipe link, or of the state link.
 #[derive(Debug, Clone, Default)]
 struct LinkWatch {
-    line: Line,
+    line: LineWatch,
     stream: stream::Stream,
     busy: bool,
     /// Bytes handed over since the link came up, and after each transmission that is not acknowledged.

@@ -115,7 +115,7 @@ fn everything() -> SimConfig {
     config
 }
 
-fn apply(cell: &mut Cell, step: Step) {
+fn apply(cell: &mut TestController, step: Step) {
     let address = |nth: u8| Ipv4Addr::new(10, 0, 0, nth % 3).into();
     let conn = |kind: u8, nth: u8| ConnId(u64::from(kind) * 100 + u64::from(nth));
     let now = cell.now;
@@ -196,7 +196,7 @@ proptest! {
 
     #[test]
     fn nothing_that_happens_breaks_the_controller(steps in proptest::collection::vec(step(), 1..120)) {
-        let mut cell = Cell::new(&everything());
+        let mut cell = robot(&everything());
         cell.run_ms(1);
         for (kind, nth) in [(0, 0), (1, 0), (2, 0)] {
             apply(&mut cell, Step::Open(kind, nth));

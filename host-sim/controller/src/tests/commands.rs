@@ -10,7 +10,7 @@ fn config() -> SimConfig {
 
 #[test]
 fn a_robot_is_powered_enabled_run_and_shut_down() {
-    let mut cell = Cell::new(&with_power(config(), Power::Off));
+    let mut cell = robot(&with_power(config(), Power::Off));
     let (c, d) = (cell.command_client(), cell.command_client());
     assert_eq!(cell.ask(c, "state"), "4:0:4:2");
     assert_eq!(cell.ask(c, "poweron"), "");
@@ -83,7 +83,7 @@ fn every_command_fails_in_every_wrong_state() {
     let commands = ["poweron", "poweroff", "enable", "disable", "run", "stop", "pause", "resume", "shutdown"];
     for (state, way, succeeding) in table {
         for command in commands {
-            let mut cell = Cell::new(&with_power(config(), Power::Off));
+            let mut cell = robot(&with_power(config(), Power::Off));
             let (c, other) = (cell.command_client(), cell.command_client());
             for step in way {
                 match step.strip_suffix("..") {
@@ -121,7 +121,7 @@ fn every_command_fails_in_every_wrong_state() {
 
 #[test]
 fn a_fault_stops_and_locks_until_it_is_cleared() {
-    let mut cell = Cell::new(&config());
+    let mut cell = robot(&config());
     let c = cell.command_client();
     cell.ask(c, "run(loop.jspf)");
     cell.controller.emergency_stop(cell.now);
@@ -160,7 +160,7 @@ fn a_fault_stops_and_locks_until_it_is_cleared() {
 
 #[test]
 fn run_finds_programs_by_name_and_sets_the_speed() {
-    let mut cell = Cell::new(&with_program(config(), "done.jspf", "log(\"x\");"));
+    let mut cell = robot(&with_program(config(), "done.jspf", "log(\"x\");"));
     let c = cell.command_client();
     assert_eq!(cell.ask(c, "run(nothing.jspf)"), "run fail");
     assert_eq!(cell.ask(c, "getlasterror"), "1001:run: there is no program nothing.jspf\n");
@@ -183,7 +183,7 @@ fn run_finds_programs_by_name_and_sets_the_speed() {
 
 #[test]
 fn nothing_marks_the_end_of_a_command_and_pieces_are_joined() {
-    let mut cell = Cell::new(&config());
+    let mut cell = robot(&config());
     let c = cell.command_client();
     for byte in b"state" {
         cell.input(ControllerInput::CommandBytes { conn: c, bytes: &[*byte] });
@@ -213,7 +213,7 @@ fn nothing_marks_the_end_of_a_command_and_pieces_are_joined() {
 #[test]
 fn a_later_dialect_speaks_otherwise() {
     let config = with_program(with_dialect(config(), "v2.6"), "done.jspf", "wait_ms(30);");
-    let mut cell = Cell::new(&config);
+    let mut cell = robot(&config);
     let (c, other) = (cell.command_client(), cell.command_client());
     assert_eq!(cell.ask(c, "run(done.jspf)"), "run success\r\n");
     assert_eq!(cell.ask(c, "speed(50)"), "set speed 50%\r\n");

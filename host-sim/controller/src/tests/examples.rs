@@ -36,7 +36,7 @@ fn example_1_rs485_user_defined() {
         comm_send("p", [125, 125, 125]);
         wait_ms(1000);
     "#;
-    let mut cell = Cell::new(&with_program(one_port(rs485(), recipe), "echo.jspf", script));
+    let mut cell = robot(&with_program(one_port(rs485(), recipe), "echo.jspf", script));
     let client = cell.command_client();
     assert_eq!(cell.ask(client, "run(echo.jspf)"), "run start");
     cell.run_ms(50);
@@ -54,7 +54,7 @@ fn example_2_rs485_system() {
     let recipe =
         stream_recipe(Mode::Realtime, system(&["DigitalOutputCommand[1]"]), system(&["RobotState[8..11]"]));
     let config = SimConfig { initial: captured_pose().initial, ..one_port(rs485(), recipe) };
-    let mut cell = Cell::new(&config);
+    let mut cell = robot(&config);
     cell.run_ms(40);
     assert_eq!(cell.sent.len(), 10, "one each 4 ms");
     let frame = [
@@ -78,7 +78,7 @@ fn example_3_can_user_defined() {
     let recipe = can_recipe(Mode::User, vec![can(1, user(&[Byte; 3]))], vec![can(2, user(&[Byte; 3]))]);
     let script = r#"let list1 = comm_recv("p"); comm_send("p", 2, [125, 125, 125]);"#;
     let bus = SimBus::Can { bitrate: 500_000 };
-    let mut cell = Cell::new(&with_program(one_port(bus, recipe), "echo.jspf", script));
+    let mut cell = robot(&with_program(one_port(bus, recipe), "echo.jspf", script));
     let client = cell.command_client();
     assert_eq!(cell.ask(client, "run(echo.jspf)"), "run start");
     let frame = CanFrame::new(CanId::Standard(1), &[1, 2, 3]).unwrap();
@@ -103,7 +103,7 @@ fn example_4_can_system() {
     assert!((float(0) - 0.467_445).abs() < 1e-6 && (float(4) - 0.409_970).abs() < 1e-6);
     let config = one_port(SimBus::Can { bitrate: 500_000 }, recipe);
     let config = with_initial(config, &[("RobotState[8]", float(0)), ("RobotState[9]", float(4))]);
-    let mut cell = Cell::new(&config);
+    let mut cell = robot(&config);
     cell.run_ms(8);
     let ids: Vec<_> = cell
         .sent
@@ -129,7 +129,7 @@ fn example_5_udp_server() {
     let recipe =
         stream_recipe(Mode::Realtime, system(&["DigitalOutputCommand[1]"]), system(&["RobotState[8..13]"]));
     let config = SimConfig { initial: captured_pose().initial, ..one_port(SimBus::UdpServer, recipe) };
-    let mut cell = Cell::new(&config);
+    let mut cell = robot(&config);
     cell.run_ms(20);
     assert_eq!(cell.sent, [], "nobody has asked yet");
     cell.input(ControllerInput::Udp2011 { peer: peer(5000), bytes: b"hello" });
@@ -157,7 +157,7 @@ fn example_6_tcp_and_udp_client() {
             system(&["RobotState[8..13]"]),
         );
         let config = SimConfig { initial: captured_pose().initial, ..one_port(bus, recipe) };
-        let mut cell = Cell::new(&config);
+        let mut cell = robot(&config);
         cell.run_ms(12);
         assert_eq!(cell.sent.len(), 3);
         cell.port_bytes(0, &[0xFF, 0xFF, 0x01, 0xEE, 0xEE]);
@@ -185,7 +185,7 @@ fn every_example_file_makes_a_controller_whose_programs_run() {
             recipe_config::file::load_controller(&path, &[]).unwrap_or_else(|error| panic!("{error}"));
         controllers += 1;
         for program in &config.programs {
-            let mut cell = Cell::new(&config);
+            let mut cell = robot(&config);
             let c = cell.command_client();
             assert_eq!(cell.ask(c, &format!("run({})", program.name)), "run start", "{}", path.display());
             cell.run_ms(1_000);

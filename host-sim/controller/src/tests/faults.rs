@@ -6,7 +6,7 @@ use super::*;
 
 #[test]
 fn a_mute_server_carries_out_and_says_nothing() {
-    let mut cell = Cell::new(&with_power(SimConfig::default(), Power::Off));
+    let mut cell = robot(&with_power(SimConfig::default(), Power::Off));
     let (c, m, _) = (cell.command_client(), cell.modbus_client(), cell.state_client());
     for link in [Link::Command, Link::Modbus, Link::State] {
         cell.controller.mute(link);
@@ -29,7 +29,7 @@ fn a_mute_server_carries_out_and_says_nothing() {
 
 #[test]
 fn a_refusing_server_closes_what_comes() {
-    let mut cell = Cell::new(&SimConfig::default());
+    let mut cell = robot(&SimConfig::default());
     cell.controller.refuse(Link::Modbus);
     let refused = cell.modbus_client();
     assert_eq!(cell.closed, [refused]);
@@ -47,7 +47,7 @@ fn a_refusing_server_closes_what_comes() {
 fn port_2000_may_take_one_client_only() {
     let mut config = with_power(SimConfig::default(), Power::Off);
     config.robot.command_clients = CommandClients::RefuseSecond;
-    let mut cell = Cell::new(&config);
+    let mut cell = robot(&config);
     let first = cell.command_client();
     let second = cell.command_client();
     assert_eq!(cell.closed, [second]);
@@ -91,7 +91,7 @@ fn port_2000_may_take_one_client_only() {
 
 #[test]
 fn modbus_answers_with_an_exception_and_changes_nothing() {
-    let mut cell = Cell::new(&SimConfig::default());
+    let mut cell = robot(&SimConfig::default());
     let m = cell.modbus_client();
     cell.controller.answer_modbus_with(Some(Exception::DeviceBusy));
     assert_eq!(cell.modbus(m, &[5, 0, 192, 0xFF, 0]), [0x85, 6]);
@@ -105,7 +105,7 @@ fn modbus_answers_with_an_exception_and_changes_nothing() {
 
 #[test]
 fn delayed_answers_keep_their_order_and_die_with_their_connection() {
-    let mut cell = Cell::new(&SimConfig::default());
+    let mut cell = robot(&SimConfig::default());
     let (c, d) = (cell.command_client(), cell.command_client());
     cell.controller.delay_answers(Link::Command, Duration::from_millis(250));
     assert_eq!(cell.ask(c, "state"), "");
@@ -130,10 +130,10 @@ fn delayed_answers_keep_their_order_and_die_with_their_connection() {
 
 #[test]
 fn half_a_state_packet_is_the_last_of_its_connection() {
-    let mut cell = Cell::new(&SimConfig::default());
+    let mut cell = robot(&SimConfig::default());
     let (a, b) = (cell.state_client(), cell.state_client());
     cell.run_ms(100);
-    assert_eq!(cell.packets.len(), 1);
+    assert_eq!((cell.take(a).len(), cell.take(b).len()), (1_468, 1_468));
     cell.controller.cut_next_state_packet(734);
     cell.run_ms(100);
     assert_eq!(cell.packets.len(), 1);
@@ -151,7 +151,7 @@ fn a_restart_closes_everything_and_boots_to_power_off() {
     let mut config = with_program(one_port(rs485(), recipe), "t", "loop { wait_ms(10); }");
     let tcp = SimBus::TcpClient { to: String::new() };
     config.ports.push(SimPort { name: "q".to_owned(), bus: tcp, ..config.ports[0].clone() });
-    let mut cell = Cell::new(&with_initial(config, &[("WordOutputReg[1]", 7.0)]));
+    let mut cell = robot(&with_initial(config, &[("WordOutputReg[1]", 7.0)]));
     let (c, s, m) = (cell.command_client(), cell.state_client(), cell.modbus_client());
     cell.ask(c, "run(t)");
     cell.port_bytes(0, &[0xFF, 0xFF, 0x01, 0xEE, 0xEE]);
@@ -160,7 +160,7 @@ fn a_restart_closes_everything_and_boots_to_power_off() {
     cell.drain();
     assert_eq!(cell.closed, [c, s, m]);
     assert!(cell.sent.contains(&(cell.now, 1, Out::Closed)));
-    let values = ["DO[1]", "WordInputReg[1]", "WordOutputReg[1]"].map(|name| value(&cell, name));
+    let values = ["DO[1]", "WordInputReg[1]", "WordOutputReg[1]"].map(|name| cell.value(name));
     assert_eq!(values, [0.0, 0.0, 7.0]);
     let c = cell.command_client();
     let mut states = Vec::new();
@@ -183,12 +183,12 @@ fn a_restart_closes_everything_and_boots_to_power_off() {
 fn a_mute_port_goes_on_receiving() {
     let recipe =
         stream_recipe(Mode::Realtime, system(&["DigitalOutputCommand[1]"]), system(&["RobotState[8..11]"]));
-    let mut cell = Cell::new(&one_port(SimBus::TcpClient { to: String::new() }, recipe));
+    let mut cell = robot(&one_port(SimBus::TcpClient { to: String::new() }, recipe));
     cell.controller.mute_port(0);
     cell.run_ms(40);
     assert_eq!(cell.sent, []);
     cell.port_bytes(0, &[0xFF, 0xFF, 0x01, 0xEE, 0xEE]);
-    assert_eq!(value(&cell, "DO[1]"), 1.0);
+    assert_eq!(cell.value("DO[1]"), 1.0);
     cell.controller.unmute_port(0);
     cell.run_ms(8);
     assert_eq!(cell.sent.len(), 2);
@@ -206,7 +206,7 @@ fn floats_can_be_shown_as_what_they_are_not() {
     );
     let config = one_port(SimBus::TcpClient { to: String::new() }, recipe);
     let values = [("RobotState[9]", 0.5), ("FloatOutputReg[1]", 2.5), ("AI_V[1]", 3.5), ("ToolAI[2]", 4.5)];
-    let mut cell = Cell::new(&with_initial(config, &values));
+    let mut cell = robot(&with_initial(config, &values));
     cell.state_client();
     cell.run_ms(100);
     let honest = cell.packets[0].1;
@@ -244,7 +244,7 @@ fn floats_can_be_shown_as_what_they_are_not() {
     let expected = [0xFFC1_2345_u32, 0.5_f32.to_bits(), f32::INFINITY.to_bits()].map(u32::to_le_bytes);
     assert_eq!(frame[2..14], expected.concat());
     // The values themselves are what they were, and Modbus shows them.
-    assert_eq!(value(&cell, "FloatOutputReg[1]"), 2.5);
+    assert_eq!(cell.value("FloatOutputReg[1]"), 2.5);
     let m = cell.modbus_client();
     let x = (honest.tcp_pose[0] * 10_000.0).round() as i16;
     assert_eq!(cell.modbus(m, &[3, 0, 106, 0, 1])[2..], x.to_be_bytes());
@@ -289,24 +289,25 @@ fn a_restart_brings_initial_values_back_or_not() {
     ];
     let wired = [("DI[3]", 1.0), ("AI_V[1]", 2.5), ("RobotState[20]", 0.25), ("RobotState[26]", 1.5)];
     let config = with_initial(SimConfig::default(), &[&set[..], &wired].concat());
-    let mut cell = Cell::new(&config);
+    let mut cell = robot(&config);
     let m = cell.modbus_client();
     cell.modbus(m, &[6, 0, 8, 0, 4]);
     cell.modbus(m, &[6, 0, 80, 0, 9]);
-    let now =
-        |cell: &Cell, all: &[(&str, f64)]| all.iter().map(|(name, _)| value(cell, name)).collect::<Vec<_>>();
+    let now = |cell: &TestController, all: &[(&str, f64)]| {
+        all.iter().map(|(name, _)| cell.value(name)).collect::<Vec<_>>()
+    };
     let as_set = |all: &[(&str, f64)]| all.iter().map(|item| item.1).collect::<Vec<_>>();
     cell.controller.restart(cell.now);
     cell.drain();
     assert_eq!(now(&cell, &set), as_set(&set));
-    assert_eq!(value(&cell, "WordInputReg[1]"), 0.0, "what was written is gone");
+    assert_eq!(cell.value("WordInputReg[1]"), 0.0, "what was written is gone");
     cell.controller.restart_cleared(cell.now);
     cell.drain();
     assert_eq!(now(&cell, &set), [0.0; 7]);
     assert_eq!(now(&cell, &wired), as_set(&wired));
     let status = ["DigitalSignalStatus[4]", "DigitalSignalStatus[6]", "DigitalSignalStatus[8]"];
-    assert_eq!(status.map(|name| value(&cell, name)), [0.0; 3], "outputs show it");
-    assert_eq!(value(&cell, "RobotState[14]"), 0.0, "no force");
+    assert_eq!(status.map(|name| cell.value(name)), [0.0; 3], "outputs show it");
+    assert_eq!(cell.value("RobotState[14]"), 0.0, "no force");
     let m = cell.modbus_client();
     assert_eq!(cell.modbus(m, &[3, 0, 80, 0, 1]), [3, 2, 0, 0]);
     let c = cell.command_client();

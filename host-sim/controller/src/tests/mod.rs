@@ -12,17 +12,16 @@ mod slices;
 mod stream;
 mod when_done;
 
-use std::collections::BTreeMap;
-use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::net::{Ipv4Addr, SocketAddr};
 
 use proto_core::config::{Parity, Rs485};
 use proto_core::recipe::model::{Field, Mode};
 use proto_core::sysvar::VarRange;
-use proto_core::time::{Duration, Instant};
+use proto_core::time::Duration;
 use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::ScalarType;
-use proto_core::wire::state::StatePacket;
 
+use super::test_controller::NEAR;
 use super::*;
 use recipe_config::{
     Initial, Power, SimBus, SimCanFrame, SimField, SimParts, SimPort, SimProgram, SimRecipe, SimStreamPart,
@@ -34,140 +33,26 @@ const _: fn() = || {
     is_send::<Controller>();
 };
 
-/// Something a port sent.
-#[derive(Debug, Clone, PartialEq)]
-pub(super) enum Out {
-    Bytes(Vec<u8>),
-    Can(CanFrame),
-    Datagram(SocketAddr, Vec<u8>),
-    Closed,
+#[track_caller]
+pub(super) fn robot(config: &SimConfig) -> TestController {
+    TestController::new(config).unwrap_or_else(|error| panic!("{error}"))
 }
 
-/// A controller, its clients and its devices on one clock that jumps from deadline to deadline.
-pub(super) struct Cell {
-    pub(super) controller: Controller,
-    pub(super) now: Instant,
-    /// Bytes that each connection received and nobody has looked at.
-    received: BTreeMap<ConnId, Vec<u8>>,
-    pub(super) closed: Vec<ConnId>,
-    /// What ports sent, with the time.
-    pub(super) sent: Vec<(Instant, usize, Out)>,
-    pub(super) packets: Vec<(Instant, StatePacket)>,
-    /// How long a port takes to send.
-    pub(super) line_time: Duration,
-    leaving: Vec<(Instant, usize)>,
-    pub(super) shut_down: bool,
-    next_conn: u64,
-}
-
-impl Cell {
-    #[track_caller]
-    pub(super) fn new(config: &SimConfig) -> Self {
-        let mut cell = Self {
-            controller: Controller::new(config).unwrap(),
-            now: Instant::from_millis(1_000),
-            received: BTreeMap::new(),
-            closed: Vec::new(),
-            sent: Vec::new(),
-            packets: Vec::new(),
-            line_time: Duration::from_micros(700),
-            leaving: Vec::new(),
-            shut_down: false,
-            next_conn: 1,
-        };
-        for port in 0..config.ports.len() {
-            cell.input(ControllerInput::PortUp { port });
-        }
-        cell
-    }
-
-    pub(super) fn input(&mut self, input: ControllerInput<'_>) {
-        self.controller.handle(self.now, input);
-        self.drain();
-    }
-
-    /// Takes everything there is to take and returns when to come back.
-    pub(super) fn drain(&mut self) -> Instant {
-        loop {
-            match self.controller.poll_output(self.now) {
-                ControllerOutput::Send { conn, bytes } => {
-                    self.received.entry(conn).or_default().extend_from_slice(&bytes);
-                }
-                ControllerOutput::Close { conn } => self.closed.push(conn),
-                ControllerOutput::StatePacket { bytes } => {
-                    self.packets.push((self.now, StatePacket::parse(&bytes[..]).unwrap()));
-                }
-                ControllerOutput::UdpSend { peer, bytes } => {
-                    self.sent.push((self.now, usize::MAX, Out::Datagram(peer, bytes)));
-                }
-                ControllerOutput::PortSend { port, bytes } => {
-                    self.sent.push((self.now, port, Out::Bytes(bytes)));
-                    self.leaving.push((self.now + self.line_time, port));
-                }
-                ControllerOutput::PortSendCan { port, frame } => {
-                    self.sent.push((self.now, port, Out::Can(frame)));
-                    if !self.leaving.iter().any(|leaving| leaving.1 == port) {
-                        self.leaving.push((self.now + self.line_time, port));
-                    }
-                }
-                ControllerOutput::PortClose { port } => self.sent.push((self.now, port, Out::Closed)),
-                ControllerOutput::Shutdown => self.shut_down = true,
-                ControllerOutput::Sleep { until } => return until,
-            }
-        }
-    }
-
-    /// Lets time go by, deadline by deadline.
-    pub(super) fn run(&mut self, span: Duration) {
-        let end = self.now + span;
-        loop {
-            let wake = self.drain();
-            let left = self.leaving.iter().map(|leaving| leaving.0).min().unwrap_or(Instant::NEVER);
-            let next = wake.min(left);
-            assert!(next > self.now || left <= self.now, "a deadline that has come must be served");
-            if next > end {
-                self.now = end;
-                self.drain();
-                return;
-            }
-            self.now = next;
-            if let Some(nth) = self.leaving.iter().position(|leaving| leaving.0 <= next) {
-                let (_, port) = self.leaving.remove(nth);
-                self.input(ControllerInput::PortSent { port });
-            }
-        }
-    }
-
+impl TestController {
     pub(super) fn run_ms(&mut self, millis: u64) {
         self.run(Duration::from_millis(millis));
     }
 
-    pub(super) fn new_conn(&mut self) -> ConnId {
-        self.next_conn += 1;
-        ConnId(self.next_conn)
-    }
-
     pub(super) fn command_client(&mut self) -> ConnId {
-        let conn = self.new_conn();
-        self.input(ControllerInput::CommandOpened { conn, from: NEAR });
-        conn
+        self.connect(Link::Command)
     }
 
     pub(super) fn modbus_client(&mut self) -> ConnId {
-        let conn = self.new_conn();
-        self.input(ControllerInput::ModbusOpened { conn, from: NEAR });
-        conn
+        self.connect(Link::Modbus)
     }
 
     pub(super) fn state_client(&mut self) -> ConnId {
-        let conn = self.new_conn();
-        self.input(ControllerInput::StateOpened { conn, from: NEAR });
-        conn
-    }
-
-    /// What a connection has received since the last look.
-    pub(super) fn take(&mut self, conn: ConnId) -> Vec<u8> {
-        self.received.remove(&conn).unwrap_or_default()
+        self.connect(Link::State)
     }
 
     /// Sends a command with a line end and returns the reply.
@@ -213,18 +98,10 @@ impl Cell {
         answer[2] == 1
     }
 
-    /// Bytes at a port, and the time and bytes of all it sends.
-    pub(super) fn port_bytes(&mut self, port: usize, bytes: &[u8]) {
-        self.input(ControllerInput::PortBytes { port, bytes });
-    }
-
     pub(super) fn counters(&self, port: &str) -> PortCounters {
         self.controller.counters().ports[port]
     }
 }
-
-/// Where clients are, unless a test says otherwise.
-pub(super) const NEAR: IpAddr = IpAddr::V4(Ipv4Addr::LOCALHOST);
 
 pub(super) fn peer(port: u16) -> SocketAddr {
     (Ipv4Addr::LOCALHOST, port).into()
@@ -303,9 +180,4 @@ pub(super) fn with_dialect(mut config: SimConfig, name: &str) -> SimConfig {
 
 pub(super) fn target(name: &str) -> InitialTarget {
     name.parse().unwrap()
-}
-
-/// The item's value now.
-pub(super) fn value(cell: &Cell, name: &str) -> f64 {
-    cell.controller.registers().value(target(name))
 }

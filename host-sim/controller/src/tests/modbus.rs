@@ -19,7 +19,7 @@ fn word(address: u16) -> [u8; 2] {
 
 #[test]
 fn every_address_of_the_map_is_read_and_only_what_may_be_is_written() {
-    let mut cell = Cell::new(&SimConfig::default());
+    let mut cell = robot(&SimConfig::default());
     let c = cell.modbus_client();
     for address in 0..COILS + 2 {
         let [a, b] = word(address);
@@ -59,7 +59,7 @@ fn every_address_of_the_map_is_read_and_only_what_may_be_is_written() {
 
 #[test]
 fn coils_are_the_bits_that_recipes_and_the_stream_show() {
-    let mut cell = Cell::new(&SimConfig::default());
+    let mut cell = robot(&SimConfig::default());
     let (c, _) = (cell.modbus_client(), cell.state_client());
     // The writable groups, each in one request.
     for (first, count) in [(0_u16, 16_u16), (32, 64), (192, 16), (216, 8)] {
@@ -86,7 +86,7 @@ fn coils_are_the_bits_that_recipes_and_the_stream_show() {
     for (nth, name) in [(192, "DO[1]"), (199, "DO[8]"), (207, "DO[16]"), (217, "ToolDO[2]")] {
         assert_eq!(registers.value(target(name)) == 1.0, coil_pattern(nth), "{name}");
     }
-    assert_eq!(value(&cell, "DigitalOutputCommand[1]"), value(&cell, "DigitalSignalStatus[4]"));
+    assert_eq!(cell.value("DigitalOutputCommand[1]"), cell.value("DigitalSignalStatus[4]"));
     // Read across every boundary at once, from an odd address.
     let answer = cell.modbus(c, &[1, 0, 3, 0, 225]);
     assert_eq!(answer.len(), 2 + 29);
@@ -100,14 +100,14 @@ fn coils_are_the_bits_that_recipes_and_the_stream_show() {
 
 #[test]
 fn a_write_that_touches_anything_read_only_changes_nothing() {
-    let mut cell = Cell::new(&SimConfig::default());
+    let mut cell = robot(&SimConfig::default());
     let c = cell.modbus_client();
     assert_eq!(cell.modbus(c, &[15, 0, 14, 0, 4, 1, 0xFF]), [0x8F, 2]);
     assert_eq!(cell.modbus(c, &[1, 0, 14, 0, 4]), [1, 1, 0]);
     assert_eq!(cell.modbus(c, &[16, 0, 39, 0, 2, 4, 0, 1, 0, 2]), [0x90, 2]);
     assert_eq!(cell.modbus(c, &[3, 0, 39, 0, 2]), [3, 4, 0, 0, 0, 0]);
     assert_eq!(cell.modbus(c, &[16, 0, 8, 0, 2, 4, 0, 1, 0xFF, 2]), [16, 0, 8, 0, 2]);
-    assert_eq!(value(&cell, "WordInputReg[2]"), f64::from(0xFF02));
+    assert_eq!(cell.value("WordInputReg[2]"), f64::from(0xFF02));
     assert_eq!(cell.modbus(c, &[4, 0, 0, 0, 1]), [0x84, 1], "input registers are not there");
     assert_eq!(cell.modbus(c, &[5, 0, 0, 0x12, 0]), [0x85, 3], "neither on nor off");
 }
@@ -124,7 +124,7 @@ fn quantities_are_scaled_signed_and_saturated() {
         ("ToolAI[2]", 0.001),
         ("WordOutputReg[32]", 65_535.0),
     ];
-    let mut cell = Cell::new(&with_initial(SimConfig::default(), &values));
+    let mut cell = robot(&with_initial(SimConfig::default(), &values));
     let (c, _) = (cell.modbus_client(), cell.state_client());
     let mut read = |address: u8| {
         let answer = cell.modbus(c, &[3, 0, address, 0, 1]);
@@ -149,7 +149,7 @@ fn quantities_are_scaled_signed_and_saturated() {
 fn speeds_are_shown_while_the_arm_moves() {
     let config =
         with_program(SimConfig::default(), "m", "movej([1.0, -0.785, -1.57, -0.785, 1.57, 0], 1.0);");
-    let mut cell = Cell::new(&config);
+    let mut cell = robot(&config);
     let (c, m) = (cell.command_client(), cell.modbus_client());
     assert_eq!(cell.ask(c, "run(m)"), "run start");
     cell.run_ms(900);
@@ -171,7 +171,7 @@ fn requests_come_in_any_pieces_and_several_at_once() {
     let request = [0, 1, 0, 0, 0, 6, 255, 3, 0, 0, 0, 4];
     let answer = [0, 1, 0, 0, 0, 11, 255, 3, 8, 0, 2, 0, 6, 0, 0, 0, 5];
     for cut in 0..request.len() {
-        let mut cell = Cell::new(&SimConfig::default());
+        let mut cell = robot(&SimConfig::default());
         let c = cell.modbus_client();
         cell.input(ControllerInput::ModbusBytes { conn: c, bytes: &request[..cut] });
         assert_eq!(cell.take(c), b"", "cut at {cut}");
@@ -181,7 +181,7 @@ fn requests_come_in_any_pieces_and_several_at_once() {
         cell.input(ControllerInput::ModbusBytes { conn: c, bytes: &both });
         assert_eq!(cell.take(c), [answer, answer].concat());
     }
-    let mut cell = Cell::new(&SimConfig::default());
+    let mut cell = robot(&SimConfig::default());
     let c = cell.modbus_client();
     cell.input(ControllerInput::ModbusBytes { conn: c, bytes: &[0, 1, 0, 7, 0, 6, 1, 3, 0, 0, 0, 1] });
     assert_eq!(cell.closed, [c], "not Modbus");
@@ -192,7 +192,7 @@ fn requests_come_in_any_pieces_and_several_at_once() {
 
 #[test]
 fn a_later_dialect_keeps_the_mode_in_the_units_digit() {
-    let mut cell = Cell::new(&with_dialect(SimConfig::default(), "v2.6"));
+    let mut cell = robot(&with_dialect(SimConfig::default(), "v2.6"));
     let c = cell.modbus_client();
     assert_eq!(cell.modbus(c, &[3, 0, 0, 0, 1]), [3, 2, 0, 2]);
 }

@@ -15,20 +15,20 @@ fn system_port(bus: SimBus) -> SimConfig {
     )
 }
 
-fn do1(cell: &Cell) -> bool {
-    value(cell, "DO[1]") == 1.0
+fn do1(cell: &TestController) -> bool {
+    cell.value("DO[1]") == 1.0
 }
 
 #[test]
 fn frames_are_found_in_any_pieces_and_in_garbage() {
     for bus in [rs485(), SimBus::TcpClient { to: String::new() }] {
         for cut in 0..=ON.len() {
-            let mut cell = Cell::new(&system_port(bus.clone()));
+            let mut cell = robot(&system_port(bus.clone()));
             cell.port_bytes(0, &ON[..cut]);
             cell.port_bytes(0, &ON[cut..]);
             assert!(do1(&cell), "cut at {cut}");
         }
-        let mut cell = Cell::new(&system_port(bus));
+        let mut cell = robot(&system_port(bus));
         let noise = [0x00, 0xFF, 0xEE, 0xFF, 0xFF, 0x7F];
         cell.port_bytes(0, &[&noise[..], &ON, &noise[..3], &OFF, &ON].concat());
         assert!(do1(&cell));
@@ -40,7 +40,7 @@ fn frames_are_found_in_any_pieces_and_in_garbage() {
 
 #[test]
 fn a_partial_frame_does_not_survive_silence() {
-    let mut cell = Cell::new(&system_port(rs485()));
+    let mut cell = robot(&system_port(rs485()));
     cell.port_bytes(0, &ON[..3]);
     cell.run_ms(49);
     cell.port_bytes(0, &ON[3..]);
@@ -58,16 +58,16 @@ fn a_partial_frame_does_not_survive_silence() {
 fn values_that_cannot_be_are_rejected_or_masked() {
     let input = system(&["ForceEnd[1..6]", "DigitalOutputCommand[3]"]);
     let recipe = stream_recipe(Mode::Realtime, input, system(&["RobotState[14..19]"]));
-    let mut cell = Cell::new(&one_port(rs485(), recipe));
+    let mut cell = robot(&one_port(rs485(), recipe));
     let frame = |force: f32, bits: u8| {
         let floats = [force, 2.0, 3.0, 0.4, 0.5, 0.6].into_iter().flat_map(f32::to_le_bytes);
         [0xFF, 0xFF].into_iter().chain(floats).chain([bits, 0xEE, 0xEE]).collect::<Vec<u8>>()
     };
     cell.port_bytes(0, &frame(1.0, 0xFF));
-    assert_eq!(value(&cell, "DigitalOutputCommand[3]"), 3.0, "six bits are reserved");
-    assert_eq!((value(&cell, "RobotState[14]"), value(&cell, "RobotState[19]")), (1.0, f64::from(0.6_f32)));
+    assert_eq!(cell.value("DigitalOutputCommand[3]"), 3.0, "six bits are reserved");
+    assert_eq!((cell.value("RobotState[14]"), cell.value("RobotState[19]")), (1.0, f64::from(0.6_f32)));
     cell.port_bytes(0, &frame(f32::NAN, 0));
-    assert_eq!(value(&cell, "DigitalOutputCommand[3]"), 3.0, "nothing of the frame is taken");
+    assert_eq!(cell.value("DigitalOutputCommand[3]"), 3.0, "nothing of the frame is taken");
     let counters = cell.counters("p");
     assert_eq!((counters.masked_fields, counters.rejected_values), (1, 1));
     cell.state_client();
@@ -77,7 +77,7 @@ fn values_that_cannot_be_are_rejected_or_masked() {
 
 #[test]
 fn a_slow_line_skips_cycles_and_stays_on_the_grid() {
-    let mut cell = Cell::new(&system_port(rs485()));
+    let mut cell = robot(&system_port(rs485()));
     cell.line_time = Duration::from_micros(9_500);
     cell.run_ms(40);
     let times: Vec<_> = cell.sent.iter().map(|sent| sent.0.as_micros() - 1_000_000).collect();
@@ -88,7 +88,7 @@ fn a_slow_line_skips_cycles_and_stays_on_the_grid() {
 
 #[test]
 fn a_late_call_never_makes_up_for_missed_cycles() {
-    let mut cell = Cell::new(&system_port(rs485()));
+    let mut cell = robot(&system_port(rs485()));
     cell.run_ms(1);
     cell.now += Duration::from_millis(14);
     cell.drain();
@@ -100,7 +100,7 @@ fn a_late_call_never_makes_up_for_missed_cycles() {
 
 #[test]
 fn a_half_duplex_line_is_driven_only_after_silence() {
-    let mut cell = Cell::new(&system_port(rs485()));
+    let mut cell = robot(&system_port(rs485()));
     cell.run(Duration::from_micros(3_900));
     cell.port_bytes(0, &ON[..2]);
     cell.run(Duration::from_micros(150));
@@ -117,7 +117,7 @@ fn a_half_duplex_line_is_driven_only_after_silence() {
 
 #[test]
 fn datagrams_are_frames_or_nothing() {
-    let mut cell = Cell::new(&system_port(SimBus::UdpClient { to: String::new() }));
+    let mut cell = robot(&system_port(SimBus::UdpClient { to: String::new() }));
     cell.port_bytes(0, &[&ON[..], &ON].concat());
     cell.port_bytes(0, &ON[..4]);
     cell.port_bytes(0, &[0xFF, 0xFE, 1, 0xEE, 0xEE]);
@@ -130,7 +130,7 @@ fn datagrams_are_frames_or_nothing() {
 
 #[test]
 fn the_udp_server_keeps_eight_clients_the_silent_one_makes_room() {
-    let mut cell = Cell::new(&system_port(SimBus::UdpServer));
+    let mut cell = robot(&system_port(SimBus::UdpServer));
     for nth in 0..8 {
         cell.input(ControllerInput::Udp2011 { peer: peer(5_000 + nth), bytes: &[] });
         cell.run_ms(1);
@@ -158,13 +158,13 @@ fn the_udp_server_keeps_eight_clients_the_silent_one_makes_room() {
     let counters = cell.counters("p");
     assert_eq!((counters.clients_displaced, counters.clients_gone), (1, 8));
 
-    let mut cell = Cell::new(&SimConfig::default());
+    let mut cell = robot(&SimConfig::default());
     cell.input(ControllerInput::Udp2011 { peer: peer(1), bytes: &ON });
     assert_eq!(cell.controller.counters().stray_datagrams, 1);
 }
 
 /// To whom datagrams went since the last look.
-fn streamed_to(cell: &mut Cell) -> Vec<u16> {
+fn streamed_to(cell: &mut TestController) -> Vec<u16> {
     let port = |sent: (Instant, usize, Out)| match sent.2 {
         Out::Datagram(peer, _) => peer.port(),
         other => panic!("{other:?}"),
@@ -174,8 +174,8 @@ fn streamed_to(cell: &mut Cell) -> Vec<u16> {
 
 #[test]
 fn a_udp_client_that_is_silent_for_a_minute_is_streamed_to_no_more() {
-    let mut cell = Cell::new(&system_port(SimBus::UdpServer));
-    let send = |cell: &mut Cell, from: u16, bytes: &[u8]| {
+    let mut cell = robot(&system_port(SimBus::UdpServer));
+    let send = |cell: &mut TestController, from: u16, bytes: &[u8]| {
         cell.input(ControllerInput::Udp2011 { peer: peer(from), bytes });
     };
     send(&mut cell, 1, b"");
@@ -213,7 +213,7 @@ fn without_an_input_part_a_udp_client_has_nothing_to_send() {
     if let SimParts::Stream { input, .. } = &mut config.recipes[0].parts {
         *input = None;
     }
-    let mut cell = Cell::new(&config);
+    let mut cell = robot(&config);
     cell.input(ControllerInput::Udp2011 { peer: peer(1), bytes: &[] });
     cell.run_ms(600_000);
     streamed_to(&mut cell);
@@ -228,8 +228,9 @@ fn without_an_input_part_a_udp_client_has_nothing_to_send() {
 #[test]
 fn can_frames_that_are_not_the_recipes_are_counted_and_ignored() {
     let recipe = can_recipe(Mode::Realtime, vec![can(1, system(&["DigitalOutputCommand[1]"]))], vec![]);
-    let mut cell = Cell::new(&one_port(SimBus::Can { bitrate: 500_000 }, recipe));
-    let send = |cell: &mut Cell, frame: CanFrame| cell.input(ControllerInput::PortCan { port: 0, frame });
+    let mut cell = robot(&one_port(SimBus::Can { bitrate: 500_000 }, recipe));
+    let send =
+        |cell: &mut TestController, frame: CanFrame| cell.input(ControllerInput::PortCan { port: 0, frame });
     send(&mut cell, CanFrame::new(CanId::Standard(2), &[1]).unwrap());
     send(&mut cell, CanFrame::new(CanId::Extended(1), &[1]).unwrap());
     send(&mut cell, CanFrame::new(CanId::Standard(1), &[1; MAX_CAN_DATA]).unwrap());
@@ -248,7 +249,7 @@ fn can_frames_that_are_not_the_recipes_are_counted_and_ignored() {
 fn an_idle_port_takes_bytes_and_does_nothing() {
     let mut config = system_port(rs485());
     config.ports[0].recipe = None;
-    let mut cell = Cell::new(&config);
+    let mut cell = robot(&config);
     cell.port_bytes(0, &ON);
     cell.run_ms(20);
     assert!(!do1(&cell));
@@ -298,7 +299,7 @@ fn another_recipe_takes_over_at_once_and_forgets_the_old_ones_bytes() {
     ));
     config.recipes.push(stream_recipe(Mode::User, user(&[Byte]), user(&[Byte])));
     config.ports.push(SimPort { name: "q".to_owned(), bus: rs485(), ..config.ports[0].clone() });
-    let mut cell = Cell::new(&config);
+    let mut cell = robot(&config);
     cell.input(ControllerInput::Udp2011 { peer: peer(1), bytes: &[] });
     cell.port_bytes(1, &ON[..3]);
     for port in [0, 1] {
@@ -307,18 +308,18 @@ fn another_recipe_takes_over_at_once_and_forgets_the_old_ones_bytes() {
     cell.sent.clear();
     cell.port_bytes(1, &ON[3..]);
     cell.port_bytes(1, &ON);
-    assert_eq!((do1(&cell), value(&cell, "BitInputReg[1]")), (false, 1.0));
+    assert_eq!((do1(&cell), cell.value("BitInputReg[1]")), (false, 1.0));
     cell.run_ms(4);
     let sent: Vec<_> = cell.sent.iter().map(|sent| (sent.1, sent.2.clone())).collect();
     assert_eq!(sent, [(1, Out::Bytes(vec![0xFF, 0xFF, 0, 0xFE, 0xFE]))], "UDP clients have to ask again");
     let refused = cell.controller.assign_recipe(cell.now, 0, Some(2));
     assert_eq!(refused, Err(RecipeError::UserOnNetwork));
     cell.input(ControllerInput::Udp2011 { peer: peer(1), bytes: &OFF });
-    assert_eq!(value(&cell, "BitInputReg[1]"), 0.0, "it still has the one before");
+    assert_eq!(cell.value("BitInputReg[1]"), 0.0, "it still has the one before");
     cell.controller.assign_recipe(cell.now, 1, None).unwrap();
     cell.sent.clear();
     cell.port_bytes(1, &ON);
     cell.run_ms(8);
     assert!(cell.sent.iter().all(|sent| sent.1 != 1));
-    assert_eq!(value(&cell, "BitInputReg[1]"), 0.0);
+    assert_eq!(cell.value("BitInputReg[1]"), 0.0);
 }

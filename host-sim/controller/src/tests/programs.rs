@@ -3,8 +3,8 @@
 use super::*;
 use ScalarType::{Byte, Float, Word};
 
-fn runs(config: SimConfig, script: &str) -> (Cell, ConnId) {
-    let mut cell = Cell::new(&with_program(config, "t", script));
+fn runs(config: SimConfig, script: &str) -> (TestController, ConnId) {
+    let mut cell = robot(&with_program(config, "t", script));
     let c = cell.command_client();
     assert_eq!(cell.ask(c, "run(t)"), "run start");
     (cell, c)
@@ -23,9 +23,9 @@ fn waits_last_exactly_as_long_as_they_say() {
     let (mut cell, c) =
         runs(SimConfig::default(), "for n in 0..1000 { wait_ms(3.5); set(\"WordOutputReg[1]\", n); }");
     cell.run(Duration::from_micros(3_500 * 500 - 1));
-    assert_eq!(value(&cell, "WordOutputReg[1]"), 498.0);
+    assert_eq!(cell.value("WordOutputReg[1]"), 498.0);
     cell.run(Duration::from_micros(1));
-    assert_eq!(value(&cell, "WordOutputReg[1]"), 499.0);
+    assert_eq!(cell.value("WordOutputReg[1]"), 499.0);
     cell.run(Duration::from_micros(3_500 * 500 - 1));
     assert_eq!(cell.ask(c, "isprogfinish"), "0");
     cell.run(Duration::from_micros(1));
@@ -57,9 +57,9 @@ fn registers_and_io_are_read_and_outputs_written() {
     let (mut cell, _) = runs(config, script);
     cell.run_ms(10);
     assert_eq!(cell.controller.machine().error(), None);
-    assert_eq!(value(&cell, "BitOutputReg[1]"), 129.0);
-    assert_eq!(value(&cell, "FloatOutputReg[32]"), 1.5);
-    assert_eq!((value(&cell, "DO[16]"), value(&cell, "ToolDO[2]"), value(&cell, "FDO[1]")), (1.0, 1.0, 1.0));
+    assert_eq!(cell.value("BitOutputReg[1]"), 129.0);
+    assert_eq!(cell.value("FloatOutputReg[32]"), 1.5);
+    assert_eq!((cell.value("DO[16]"), cell.value("ToolDO[2]"), cell.value("FDO[1]")), (1.0, 1.0, 1.0));
     assert_eq!(cell.controller.program_variables()["shown"], serde_json::json!([2_500, 128, 0.0]));
     let log: Vec<_> = cell.controller.program_log().collect();
     assert_eq!(log[0], "a program cannot write WordInputReg[1]");
@@ -103,21 +103,21 @@ fn speed_scales_motion_and_pause_holds_it() {
     cell.run_ms(1_000);
     assert_eq!(cell.order(c, "pause"), "pause success");
     assert_eq!(cell.ask(c, "state"), "6:3:5:2");
-    let held = value(&cell, "RobotState[1]");
+    let held = cell.value("RobotState[1]");
     assert_eq!(cell.ask(c, "speed(10)"), "set success");
     cell.run_ms(5_000);
-    assert_eq!(value(&cell, "RobotState[1]"), held);
+    assert_eq!(cell.value("RobotState[1]"), held);
     assert!(held > 0.05 && held < 0.5, "{held}");
     assert_eq!(cell.order(c, "stop"), "stop success");
     assert_eq!(cell.ask(c, "state"), "6:0:5:2");
-    assert_eq!(value(&cell, "RobotState[1]"), held);
+    assert_eq!(cell.value("RobotState[1]"), held);
 }
 
 #[test]
 fn reduced_speed_and_an_emergency_stop_reach_the_arm() {
     let (mut cell, c) = runs(SimConfig::default(), "movej([1.0, 0, 0, 0, 0, 0], 1.0);");
     cell.run_ms(1_000);
-    let velocity = |cell: &Cell| cell.controller.registers().arm().velocity[2];
+    let velocity = |cell: &TestController| cell.controller.registers().arm().velocity[2];
     let before = velocity(&cell);
     cell.controller.enter_reduced(cell.now);
     cell.run_ms(100);
@@ -150,7 +150,7 @@ fn a_pause_stretches_waits_too() {
 fn frames_wait_for_the_program_and_only_for_it() {
     let config =
         with_program(user_port(), "t", "let a = comm_recv(\"p\"); wait_ms(50); let b = comm_recv(\"p\");");
-    let mut cell = Cell::new(&config);
+    let mut cell = robot(&config);
     cell.port_bytes(0, &frame([9, 9, 9]));
     assert_eq!(cell.counters("p").frames_without_program, 1);
     let c = cell.command_client();

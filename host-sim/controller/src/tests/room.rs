@@ -6,7 +6,7 @@ fn host(nth: u8) -> IpAddr {
     Ipv4Addr::new(192, 168, 12, nth).into()
 }
 
-fn open(cell: &mut Cell, link: Link, from: IpAddr) -> ConnId {
+fn open(cell: &mut TestController, link: Link, from: IpAddr) -> ConnId {
     let conn = cell.new_conn();
     cell.input(match link {
         Link::Command => ControllerInput::CommandOpened { conn, from },
@@ -17,13 +17,13 @@ fn open(cell: &mut Cell, link: Link, from: IpAddr) -> ConnId {
 }
 
 /// Clients of port 2000 from one host.
-fn several(cell: &mut Cell, count: usize, from: IpAddr) -> Vec<ConnId> {
+fn several(cell: &mut TestController, count: usize, from: IpAddr) -> Vec<ConnId> {
     (0..count).map(|_| open(cell, Link::Command, from)).collect()
 }
 
 #[test]
 fn connections_are_bounded() {
-    let mut cell = Cell::new(&SimConfig::default());
+    let mut cell = robot(&SimConfig::default());
     let conns = several(&mut cell, MAX_COMMAND_CONNECTIONS, NEAR);
     assert_eq!(cell.closed, []);
     let refused = cell.command_client();
@@ -38,7 +38,7 @@ fn connections_are_bounded() {
 
 #[test]
 fn who_only_holds_a_connection_makes_room_for_who_has_something_to_ask() {
-    let mut cell = Cell::new(&SimConfig::default());
+    let mut cell = robot(&SimConfig::default());
     let good = cell.command_client();
     let idle = several(&mut cell, MAX_COMMAND_CONNECTIONS - 1, NEAR);
     cell.run_ms(1_000);
@@ -60,7 +60,7 @@ fn who_only_holds_a_connection_makes_room_for_who_has_something_to_ask() {
 #[test]
 fn clients_that_asked_once_make_room_for_the_next_ones_stop() {
     let config = with_program(SimConfig::default(), "t", "loop { wait_ms(10); }");
-    let mut cell = Cell::new(&config);
+    let mut cell = robot(&config);
     let mut clients = several(&mut cell, MAX_COMMAND_CONNECTIONS, NEAR);
     assert_eq!(cell.ask(clients[0], "run(t)"), "run start");
     for &conn in &clients[1..] {
@@ -98,7 +98,7 @@ fn clients_that_asked_once_make_room_for_the_next_ones_stop() {
 
 #[test]
 fn who_waits_for_an_answer_is_not_idle() {
-    let mut cell = Cell::new(&with_power(SimConfig::default(), Power::Off));
+    let mut cell = robot(&with_power(SimConfig::default(), Power::Off));
     cell.controller.delay_transitions(Duration::from_secs(60));
     let waits = cell.command_client();
     assert_eq!(cell.ask(waits, "poweron"), "");
@@ -123,7 +123,7 @@ fn who_waits_for_an_answer_is_not_idle() {
 
 #[test]
 fn a_host_with_many_connections_displaces_its_own_and_gives_way_to_others() {
-    let mut cell = Cell::new(&SimConfig::default());
+    let mut cell = robot(&SimConfig::default());
     // Two idle clients of another host, such as a gateway that has nothing to say.
     let gateway = several(&mut cell, 2, host(1));
     cell.run_ms(60_000);
@@ -139,11 +139,11 @@ fn a_host_with_many_connections_displaces_its_own_and_gives_way_to_others() {
     assert!(refused < 1_000 && cell.closed.len() > refused, "its own make room when they are idle");
 
     // Those that ask all the time keep out none but their own host's.
-    let mut cell = Cell::new(&SimConfig::default());
+    let mut cell = robot(&SimConfig::default());
     let gateway = several(&mut cell, 2, host(1));
     cell.ask(gateway[0], "state");
     let busy = several(&mut cell, MAX_COMMAND_CONNECTIONS - 2, host(2));
-    let ask_all = |cell: &mut Cell| {
+    let ask_all = |cell: &mut TestController| {
         for &conn in &busy {
             cell.ask(conn, "isprogfinish");
         }
@@ -161,7 +161,7 @@ fn a_host_with_many_connections_displaces_its_own_and_gives_way_to_others() {
 
 #[test]
 fn a_host_with_its_share_is_not_displaced_while_it_asks() {
-    let mut cell = Cell::new(&SimConfig::default());
+    let mut cell = robot(&SimConfig::default());
     let half = several(&mut cell, MAX_COMMAND_CONNECTIONS / 2, host(1));
     let other_half = several(&mut cell, MAX_COMMAND_CONNECTIONS / 2, host(2));
     for nth in 0..100 {
@@ -178,7 +178,7 @@ fn a_host_with_its_share_is_not_displaced_while_it_asks() {
 #[test]
 fn the_state_stream_and_modbus_know_the_same_rules() {
     // Who listens to port 2001 never asks, and is not idle for that.
-    let mut cell = Cell::new(&SimConfig::default());
+    let mut cell = robot(&SimConfig::default());
     let listeners: Vec<_> =
         (0..MAX_STATE_CONNECTIONS).map(|_| open(&mut cell, Link::State, host(1))).collect();
     cell.run_ms(60_000);
@@ -189,7 +189,7 @@ fn the_state_stream_and_modbus_know_the_same_rules() {
     assert_eq!(cell.closed, [own, listeners[0]]);
     assert_eq!(cell.controller.counters().state.open, MAX_STATE_CONNECTIONS);
 
-    let mut cell = Cell::new(&SimConfig::default());
+    let mut cell = robot(&SimConfig::default());
     let masters: Vec<_> =
         (0..MAX_MODBUS_CONNECTIONS).map(|_| open(&mut cell, Link::Modbus, host(1))).collect();
     cell.run_ms(5_000);

@@ -22,7 +22,7 @@ const SCRIPTS: [&str; 5] = [
 #[test]
 fn servers_streams_and_ports_keep_their_time() {
     for script in SCRIPTS {
-        let mut cell = Cell::new(&config(script));
+        let mut cell = robot(&config(script));
         let c = cell.command_client();
         let m = cell.modbus_client();
         cell.state_client();
@@ -52,26 +52,26 @@ fn servers_streams_and_ports_keep_their_time() {
 #[test]
 fn a_slice_is_a_millisecond_of_a_few_calls() {
     let count = "let n = 0; loop { n += 1; set(\"WordOutputReg[1]\", n); }";
-    let mut cell = Cell::new(&config(count));
+    let mut cell = robot(&config(count));
     let c = cell.command_client();
     cell.ask(c, "run(t)");
-    let in_a_slice = value(&cell, "WordOutputReg[1]");
+    let in_a_slice = cell.value("WordOutputReg[1]");
     assert!((5.0..=10.0).contains(&in_a_slice), "{in_a_slice}");
     for slice in 2..=100_u32 {
         cell.run(Duration::from_micros(999));
-        let before = value(&cell, "WordOutputReg[1]");
+        let before = cell.value("WordOutputReg[1]");
         cell.run(Duration::from_micros(1));
-        let done = value(&cell, "WordOutputReg[1]") - before;
+        let done = cell.value("WordOutputReg[1]") - before;
         assert!((5.0..=10.0).contains(&done), "{done} in slice {slice}");
     }
     // A pause keeps it from the next slice, a stop ends it at once.
     assert_eq!(cell.order(c, "pause"), "pause success");
-    let held = value(&cell, "WordOutputReg[1]");
+    let held = cell.value("WordOutputReg[1]");
     cell.run_ms(1_000);
-    assert_eq!(value(&cell, "WordOutputReg[1]"), held);
+    assert_eq!(cell.value("WordOutputReg[1]"), held);
     assert_eq!(cell.ask(c, "resume"), "resume success");
     cell.run_ms(2);
-    assert!(value(&cell, "WordOutputReg[1]") > held);
+    assert!(cell.value("WordOutputReg[1]") > held);
     assert_eq!(cell.order(c, "stop"), "stop success");
     assert_eq!(cell.controller.program_name(), None);
 }
@@ -92,7 +92,7 @@ fn a_busy_program_is_the_same_however_often_the_model_is_called() {
         let parts = SimParts::Stream { input: None, output: part(&[255], &[254], user(&[ScalarType::Byte])) };
         config.recipes.push(SimRecipe { name: "own".to_owned(), mode: Mode::User, parts });
         config.ports[1].recipe = Some(1);
-        let mut cell = Cell::new(&config);
+        let mut cell = robot(&config);
         let c = cell.command_client();
         cell.ask(c, "run(t)");
         for step in 0..1_500_u32 {

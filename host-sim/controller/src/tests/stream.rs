@@ -8,7 +8,7 @@ const MOVE: &str = "movej([1.0, -1.2, -1.0, 0.3, 0.9, -0.5], 1.0);";
 
 #[test]
 fn packets_come_on_a_fixed_grid_to_whoever_is_there() {
-    let mut cell = Cell::new(&SimConfig::default());
+    let mut cell = robot(&SimConfig::default());
     cell.run_ms(350);
     assert_eq!(cell.packets, []);
     let first = cell.state_client();
@@ -53,7 +53,7 @@ fn every_field_is_filled() {
         ("RobotState[26]", 2.0),
     ];
     let config = with_program(with_initial(SimConfig::default(), &values), "m", MOVE);
-    let mut cell = Cell::new(&config);
+    let mut cell = robot(&config);
     let (c, _) = (cell.command_client(), cell.state_client());
     cell.ask(c, "run(m)");
     cell.run_ms(1_000);
@@ -110,7 +110,7 @@ fn every_field_is_filled() {
 
 #[test]
 fn the_arm_moves_smoothly_from_packet_to_packet() {
-    let mut cell = Cell::new(&with_program(SimConfig::default(), "m", MOVE));
+    let mut cell = robot(&with_program(SimConfig::default(), "m", MOVE));
     let (c, _) = (cell.command_client(), cell.state_client());
     cell.run_ms(200);
     cell.ask(c, "run(m)");

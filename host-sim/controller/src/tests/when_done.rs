@@ -4,25 +4,25 @@ use super::*;
 
 const LOOP: &str = "loop { wait_ms(10); }";
 
-fn enabled() -> (Cell, ConnId, ConnId) {
+fn enabled() -> (TestController, ConnId, ConnId) {
     clients(&with_program(SimConfig::default(), "t", LOOP))
 }
 
-fn with(power: Power) -> (Cell, ConnId, ConnId) {
+fn with(power: Power) -> (TestController, ConnId, ConnId) {
     clients(&with_power(with_program(SimConfig::default(), "t", LOOP), power))
 }
 
-fn clients(config: &SimConfig) -> (Cell, ConnId, ConnId) {
-    let mut cell = Cell::new(config);
+fn clients(config: &SimConfig) -> (TestController, ConnId, ConnId) {
+    let mut cell = robot(config);
     let (a, b) = (cell.command_client(), cell.command_client());
     (cell, a, b)
 }
 
-fn got(cell: &mut Cell, conn: ConnId) -> String {
+fn got(cell: &mut TestController, conn: ConnId) -> String {
     String::from_utf8(cell.take(conn)).unwrap()
 }
 
-fn error(cell: &mut Cell, conn: ConnId) -> String {
+fn error(cell: &mut TestController, conn: ConnId) -> String {
     cell.ask(conn, "getlasterror").trim_end().to_owned()
 }
 

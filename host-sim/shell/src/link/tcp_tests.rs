@@ -7,7 +7,7 @@ use tokio::io::AsyncWriteExt;
 use tokio::net::TcpSocket;
 use tokio::task::yield_now;
 
-use super::super::tests::{Running, Seen, inside, server, tcp_listen};
+use super::super::tests::{Running, Seen, connected, inside, tcp_listen};
 use super::super::{Endpoint, TurnedAway};
 use super::*;
 
@@ -48,11 +48,7 @@ async fn gets_nothing_more(mut peer: TcpStream) {
 #[test]
 fn what_was_acknowledged_is_told_before_what_arrived() {
     inside(async || {
-        let (listener, endpoint) = server().await;
-        let link = Running::start(endpoint);
-        link.control.open();
-        let (mut peer, _) = listener.accept().await.unwrap();
-        link.expect(Seen::Up).await;
+        let (link, _listener, mut peer) = connected().await;
         for round in 0..50_u8 {
             link.control.send(&[round; 5]);
             assert_eq!(link.next().await, Seen::Sent);
