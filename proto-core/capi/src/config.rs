@@ -1,0 +1,202 @@
+//! Configurations: from an image to what a driver has to set up.
+
+use core::ffi::c_void;
+
+use proto_core::config::{Bus, GatewayConfig, Parity, image};
+
+use crate::Status;
+use crate::memory::{bytes, give, place, shared};
+
+/// Version of the configuration images that this library reads; those of older versions are read too
+/// where they can be.
+pub const RGW_IMAGE_VERSION: u32 = 2;
+const _: () = assert!(RGW_IMAGE_VERSION == image::VERSION);
+
+/// Memory that a configuration takes, in bytes: as much as on any machine. It is needed until
+/// `rgw_gateway_configure` has returned.
+pub const RGW_CONFIG_SIZE: usize = 44_544;
+const _: () = assert!(size_of::<Config>() <= RGW_CONFIG_SIZE);
+
+/// A configuration in the caller's memory.
+#[derive(Debug)]
+pub struct Config(pub(crate) GatewayConfig);
+
+/// What a port is.
+#[repr(u8)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Kind {
+    /// A half-duplex serial line.
+    Rs485 = 0,
+    /// A CAN bus.
+    Can = 1,
+    /// Where the controller connects to by TCP. A link, not a field port.
+    TcpListen = 2,
+    /// Where the controller sends datagrams to. A link, not a field port.
+    UdpListen = 3,
+}
+
+/// A serial line's parity.
+#[repr(u8)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LineParity {
+    /// No parity bit.
+    None = 0,
+    /// Even.
+    Even = 1,
+    /// Odd.
+    Odd = 2,
+}
+
+/// What a driver sets up for a port.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct PortSettings {
+    /// What it is.
+    pub kind: Kind,
+    /// Of a serial line.
+    pub parity: LineParity,
+    /// Of a serial line: 1 or 2.
+    pub stop_bits: u8,
+    /// Bit/s of a serial line or a CAN bus; 0 of others.
+    pub bit_rate: u32,
+}
+
+/// The board's own address and what belongs to it.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct NetworkSettings {
+    /// The address.
+    pub address: [u8; 4],
+    /// The way to other networks; 0.0.0.0 for none.
+    pub router: [u8; 4],
+    /// The server that knows the controller's name; 0.0.0.0 for none.
+    pub dns: [u8; 4],
+    /// Bits of the network, 1 to 30.
+    pub prefix: u8,
+}
+
+/// Size of a configuration here, in bytes; at most `RGW_CONFIG_SIZE`.
+#[unsafe(no_mangle)]
+pub extern "C" fn rgw_config_size() -> usize {
+    size_of::<Config>()
+}
+
+/// The version of an image, whether it can be read here or not.
+///
+/// # Safety
+/// There are `len` bytes at `image`, and room for a number at `version`.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn rgw_image_version(image: *const u8, len: usize, version: *mut u32) -> Status {
+    // SAFETY: as promised by the caller.
+    let image = match unsafe { bytes(image, len) } {
+        Ok(image) => image,
+        Err(status) => return status,
+    };
+    let found = match image::image_len(image) {
+        Err(image::ImageError::Version { found }) => found,
+        Err(error) => return error.into(),
+        Ok(_) => RGW_IMAGE_VERSION,
+    };
+    // SAFETY: as promised by the caller.
+    unsafe { give(version, found) }.into()
+}
+
+/// Reads an image and checks the configuration in it. `*config` is in `memory` then; when it is refused,
+/// the memory holds nothing and is free again.
+///
+/// # Safety
+/// There are `len` bytes at `memory`, which nobody else uses as long as the configuration is used; there
+/// are `image_len` bytes at `image`, elsewhere; there is room for a pointer at `config`.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn rgw_config_read(
+    memory: *mut c_void,
+    len: usize,
+    image: *const u8,
+    image_len: usize,
+    config: *mut *mut Config,
+) -> Status {
+    let read = || {
+        let place = place::<Config>(memory, len)?;
+        // SAFETY: as promised by the caller.
+        let image = unsafe { bytes(image, image_len) }?;
+        // SAFETY: there is room, it is aligned and the caller leaves it to us.
+        let read = unsafe {
+            place.write(const { Config(GatewayConfig::empty()) });
+            &mut *place.as_ptr()
+        };
+        image::decode_into(image, &mut read.0)?;
+        // SAFETY: as promised by the caller.
+        unsafe { give(config, place.as_ptr()) }
+    };
+    read().into()
+}
+
+/// How many ports a configuration has, field ports and others; 0 for a null pointer.
+///
+/// # Safety
+/// `config` is from `rgw_config_read`, and its memory has not been used for anything else.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn rgw_config_ports(config: *const Config) -> usize {
+    // SAFETY: as promised by the caller.
+    unsafe { shared(config) }.map_or(0, |config| config.0.ports.len())
+}
+
+/// What a driver sets up for a port, the `port`th of the configuration, counted from 0.
+///
+/// # Safety
+/// `config` is from `rgw_config_read`, and its memory has not been used for anything else; there is room
+/// at `settings`.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn rgw_config_port(
+    config: *const Config,
+    port: u8,
+    settings: *mut PortSettings,
+) -> Status {
+    let read = || {
+        // SAFETY: as promised by the caller.
+        let config = unsafe { shared(config) }?;
+        let port = config.0.ports.get(usize::from(port)).ok_or(Status::NotThere)?;
+        let other = |kind| PortSettings { kind, parity: LineParity::None, stop_bits: 0, bit_rate: 0 };
+        let found = match &port.bus {
+            Bus::Rs485(line) => PortSettings {
+                kind: Kind::Rs485,
+                parity: match line.parity {
+                    Parity::None => LineParity::None,
+                    Parity::Even => LineParity::Even,
+                    Parity::Odd => LineParity::Odd,
+                },
+                stop_bits: line.stop_bits,
+                bit_rate: line.baud,
+            },
+            Bus::Can { bitrate } => PortSettings { bit_rate: *bitrate, ..other(Kind::Can) },
+            Bus::TcpListen { .. } => other(Kind::TcpListen),
+            Bus::UdpListen { .. } => other(Kind::UdpListen),
+        };
+        // SAFETY: as promised by the caller.
+        unsafe { give(settings, found) }
+    };
+    read().into()
+}
+
+/// The board's own address; `NotThere` when DHCP is to be asked.
+///
+/// # Safety
+/// `config` is from `rgw_config_read`, and its memory has not been used for anything else; there is room
+/// at `settings`.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn rgw_config_network(config: *const Config, settings: *mut NetworkSettings) -> Status {
+    let read = || {
+        // SAFETY: as promised by the caller.
+        let config = unsafe { shared(config) }?;
+        let network = config.0.network.as_ref().ok_or(Status::NotThere)?;
+        let found = NetworkSettings {
+            address: network.address.octets(),
+            router: network.router.map_or([0; 4], |router| router.octets()),
+            dns: network.dns.map_or([0; 4], |dns| dns.octets()),
+            prefix: network.prefix,
+        };
+        // SAFETY: as promised by the caller.
+        unsafe { give(settings, found) }
+    };
+    read().into()
+}

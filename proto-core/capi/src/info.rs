@@ -1,0 +1,281 @@
+//! Counters and states, for a display, a log or a LED.
+
+use proto_core::engine::{LinkId, PortId, PortState};
+use proto_core::link::LinkState;
+
+use crate::memory::{bytes, give, shared};
+use crate::{Gateway, Status};
+
+/// What happened on a field port. Counters wrap after 2^32.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct PortCounters {
+    /// Frames accepted.
+    pub frames_in: u32,
+    /// Bytes received (CAN: data bytes).
+    pub bytes_in: u32,
+    /// Frames handed over for sending.
+    pub frames_out: u32,
+    /// Bytes handed over for sending (CAN: data bytes).
+    pub bytes_out: u32,
+    /// Frames rejected for a value that is not finite (D22).
+    pub rejected_not_finite: u32,
+    /// Frames rejected because a bound value did not fit its variable (D22).
+    pub rejected_out_of_range: u32,
+    /// CAN frames ignored for an id that the recipe does not have (D17).
+    pub rejected_id: u32,
+    /// CAN frames rejected for another length than declared (D17).
+    pub rejected_length: u32,
+    /// Remote frames ignored (D17).
+    pub rejected_remote: u32,
+    /// Frames on a port whose recipe has no input part.
+    pub rejected_no_input: u32,
+    /// Heads whose frame did not end in the tail (D19).
+    pub tail_mismatches: u32,
+    /// Bytes dropped while looking for a frame (D19).
+    pub resync_bytes: u32,
+    /// Bytes of partial frames discarded after silence (D19), and bytes that waited while the gateway
+    /// itself slept.
+    pub discarded_bytes: u32,
+    /// Chunks of bytes, or CAN frames, discarded because they waited while the gateway itself slept.
+    pub asleep: u32,
+    /// Accepted frames in which reserved bits were masked (D22).
+    pub masked: u32,
+    /// Bit values that were replaced by newer ones because the queue of edges was full.
+    pub edges_lost: u32,
+    /// Values dropped before they could be written: older than the port's timeout, or waiting for a
+    /// link that was lost.
+    pub values_expired: u32,
+    /// Accepted frames with a value that could not be passed on: its link was down.
+    pub undelivered: u32,
+    /// Accepted frames with a value that had to wait for its neighbours to be read back.
+    pub withheld: u32,
+    /// Cycles in which no output frame could be sent in time (D20).
+    pub skipped_cycles: u32,
+    /// Cycles in which no output frame was sent because its sources were stale or unknown.
+    pub stale_cycles: u32,
+    /// Times the field frame was overdue.
+    pub timeouts: u32,
+    /// Times the device was reported gone.
+    pub downs: u32,
+    /// Times the CAN controller was reported bus-off.
+    pub bus_offs: u32,
+    /// Commands picked by a value.
+    pub commands: u32,
+    /// Commands that could not be sent.
+    pub commands_dropped: u32,
+}
+
+/// What happened on a link. Counters wrap after 2^32.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct LinkCounters {
+    /// Times the link came up.
+    pub connects: u32,
+    /// Times it was lost after it had been up, whoever closed it.
+    pub losses: u32,
+    /// Times it could not be opened.
+    pub failed_opens: u32,
+    /// Times it was closed because nothing arrived.
+    pub silences: u32,
+    /// Requests, frames or commands sent.
+    pub sent: u32,
+    /// Answers, frames or packets accepted.
+    pub received: u32,
+    /// Bytes received.
+    pub bytes_in: u32,
+    /// Requests without an answer in time.
+    pub timeouts: u32,
+    /// Exceptions and failure replies.
+    pub refused: u32,
+    /// Answers, frames and packets that made no sense.
+    pub malformed: u32,
+    /// Values received that were not finite: they are unknown until a readable one comes.
+    pub unreadable: u32,
+    /// Connections reset because the peer's transport had not acknowledged what was handed over by
+    /// the time after which it must not be delivered.
+    pub unacknowledged: u32,
+    /// Bytes dropped while looking for a frame.
+    pub resync_bytes: u32,
+    /// Microseconds from the newest request to its answer.
+    pub round_trip_us: u32,
+    /// The longest of these.
+    pub round_trip_max_us: u32,
+}
+
+/// Health of a field port.
+#[repr(u8)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum PortHealth {
+    /// What it receives comes in time; a port without an input part only has to be there.
+    Working = 0,
+    /// A frame of its input part is overdue or has never come.
+    Silent = 1,
+    /// The CAN controller has left the bus.
+    BusOff = 2,
+    /// Its device is not there.
+    Gone = 3,
+}
+
+/// Where a link stands.
+#[repr(u8)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LinkHealth {
+    /// Closed, and opened again later.
+    Down = 0,
+    /// Opened, not yet up.
+    Opening = 1,
+    /// Usable.
+    Up = 2,
+    /// Not opened: the controller takes no second connection, and another link does its work.
+    Shared = 3,
+}
+
+/// A field port.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct PortInfo {
+    /// What happened.
+    pub counters: PortCounters,
+    /// Its health.
+    pub health: PortHealth,
+    /// How the newest command that its values picked went; 0 for none.
+    pub reply_code: u8,
+}
+
+/// A link to the controller.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct LinkInfo {
+    /// What happened.
+    pub counters: LinkCounters,
+    /// The link's number.
+    pub id: u8,
+    /// Where it stands.
+    pub health: LinkHealth,
+}
+
+/// A field port, by its number; `NotThere` if it is none.
+///
+/// # Safety
+/// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else; there is room
+/// at `info`.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn rgw_port_info(gateway: *const Gateway, port: u8, info: *mut PortInfo) -> Status {
+    let ask = || {
+        // SAFETY: as promised by the caller.
+        let engine = unsafe { &shared(gateway)?.engine };
+        let port = PortId(port);
+        let counters = engine.port_counters(port).ok_or(Status::NotThere)?;
+        let health = match engine.port_state(port) {
+            Some(PortState::Working) => PortHealth::Working,
+            Some(PortState::Silent) => PortHealth::Silent,
+            Some(PortState::BusOff) => PortHealth::BusOff,
+            _ => PortHealth::Gone,
+        };
+        let reply_code = engine.reply_code(port).map_or(0, |code| code as u8);
+        let counters = PortCounters {
+            frames_in: counters.frames_in,
+            bytes_in: counters.bytes_in,
+            frames_out: counters.frames_out,
+            bytes_out: counters.bytes_out,
+            rejected_not_finite: counters.rejected_not_finite,
+            rejected_out_of_range: counters.rejected_out_of_range,
+            rejected_id: counters.rejected_id,
+            rejected_length: counters.rejected_length,
+            rejected_remote: counters.rejected_remote,
+            rejected_no_input: counters.rejected_no_input,
+            tail_mismatches: counters.tail_mismatches,
+            resync_bytes: counters.resync_bytes,
+            discarded_bytes: counters.discarded_bytes,
+            asleep: counters.asleep,
+            masked: counters.masked,
+            edges_lost: counters.edges_lost,
+            values_expired: counters.values_expired,
+            undelivered: counters.undelivered,
+            withheld: counters.withheld,
+            skipped_cycles: counters.skipped_cycles,
+            stale_cycles: counters.stale_cycles,
+            timeouts: counters.timeouts,
+            downs: counters.downs,
+            bus_offs: counters.bus_offs,
+            commands: counters.commands,
+            commands_dropped: counters.commands_dropped,
+        };
+        // SAFETY: as promised by the caller.
+        unsafe { give(info, PortInfo { counters, health, reply_code }) }
+    };
+    ask().into()
+}
+
+/// The links one after the other: the `nth`, counted from 0; `NotThere` behind the last.
+///
+/// # Safety
+/// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else; there is room
+/// at `info`.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn rgw_link_info(gateway: *const Gateway, nth: usize, info: *mut LinkInfo) -> Status {
+    let ask = || {
+        // SAFETY: as promised by the caller.
+        let engine = unsafe { &shared(gateway)?.engine };
+        let link = engine.links().nth(nth).ok_or(Status::NotThere)?;
+        let health = match link.state {
+            LinkState::Down { .. } => LinkHealth::Down,
+            LinkState::Opening { .. } => LinkHealth::Opening,
+            LinkState::Up { .. } => LinkHealth::Up,
+            LinkState::Shared => LinkHealth::Shared,
+        };
+        let (history, counters) = (link.history, link.counters);
+        let counters = LinkCounters {
+            connects: history.connects,
+            losses: history.losses,
+            failed_opens: history.failed_opens,
+            silences: history.silences,
+            sent: counters.sent,
+            received: counters.received,
+            bytes_in: counters.bytes_in,
+            timeouts: counters.timeouts,
+            refused: counters.refused,
+            malformed: counters.malformed,
+            unreadable: counters.unreadable,
+            unacknowledged: counters.unacknowledged,
+            resync_bytes: counters.resync_bytes,
+            round_trip_us: counters.round_trip_us,
+            round_trip_max_us: counters.round_trip_max_us,
+        };
+        // SAFETY: as promised by the caller.
+        unsafe { give(info, LinkInfo { counters, id: link.id.0, health }) }
+    };
+    ask().into()
+}
+
+/// How often the gateway slept: it was not called for more than half a second, and what waited for it was
+/// discarded. Wraps; 0 for a null pointer.
+///
+/// # Safety
+/// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn rgw_sleeps(gateway: *const Gateway) -> u32 {
+    // SAFETY: as promised by the caller.
+    unsafe { shared(gateway) }.map_or(0, |gateway| gateway.engine.sleeps())
+}
+
+/// Whether a datagram is a frame of the link's output part: what the driver of a listening UDP link asks
+/// before it answers another sender than so far. No for null pointers.
+///
+/// # Safety
+/// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else; there are
+/// `len` bytes at `datagram`.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn rgw_is_frame(
+    gateway: *const Gateway,
+    link: u8,
+    datagram: *const u8,
+    len: usize,
+) -> bool {
+    // SAFETY: as promised by the caller.
+    match unsafe { (shared(gateway), bytes(datagram, len)) } {
+        (Ok(gateway), Ok(datagram)) => gateway.engine.is_frame(LinkId(link), datagram),
+        _ => false,
+    }
+}

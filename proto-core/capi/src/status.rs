@@ -1,0 +1,126 @@
+//! What a call says of itself, and the version of the interface.
+
+use core::ffi::{CStr, c_char};
+
+use proto_core::config::image::ImageError;
+use proto_core::engine::BuildError;
+
+/// Version of this interface: one more for every change of a function, a type or a number in it.
+/// `rgw_gateway_init` refuses a program that was compiled with the header of another one.
+pub const RGW_ABI_VERSION: u32 = 1;
+
+/// What became of a call. Zero is success, and nothing was changed where it is not, unless the function
+/// says otherwise.
+#[repr(u32)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Status {
+    /// Done.
+    Ok = 0,
+    /// A pointer is null.
+    Null = 1,
+    /// Memory or a buffer is too small.
+    TooSmall = 2,
+    /// Memory is not aligned to `RGW_ALIGN`.
+    Misaligned = 3,
+    /// The program was compiled with the header of another version.
+    AbiVersion = 4,
+    /// A port, a link or an index that is not there.
+    NotThere = 5,
+    /// A code or a CAN frame that cannot be.
+    Invalid = 6,
+    /// The image is cut.
+    ImageCut = 16,
+    /// It is no configuration image.
+    ImageNone = 17,
+    /// The image has a version that this library does not read; `rgw_image_version` says which.
+    ImageVersion = 18,
+    /// The image says that it is longer than any.
+    ImageTooLong = 19,
+    /// The image is damaged.
+    ImageDamaged = 20,
+    /// The image holds no configuration.
+    ImageContents = 21,
+    /// The configuration in the image is wrong; `host-sim check` says how.
+    ConfigWrong = 22,
+    /// A variable of the configuration has no way to or from the controller.
+    ConfigPlan = 23,
+    /// The configuration has more of something than this library was built for.
+    ConfigTooLarge = 24,
+    /// The configuration names a dialect that this library does not know.
+    ConfigDialect = 25,
+    /// The image or the configuration is refused for another reason.
+    Other = 31,
+}
+
+impl From<ImageError> for Status {
+    fn from(error: ImageError) -> Self {
+        match error {
+            ImageError::TooShort { .. } => Self::ImageCut,
+            ImageError::NotAnImage { .. } => Self::ImageNone,
+            ImageError::Version { .. } => Self::ImageVersion,
+            ImageError::TooLong { .. } => Self::ImageTooLong,
+            ImageError::Crc { .. } => Self::ImageDamaged,
+            ImageError::Contents => Self::ImageContents,
+            ImageError::Config(_) => Self::ConfigWrong,
+            _ => Self::Other,
+        }
+    }
+}
+
+impl From<BuildError> for Status {
+    fn from(error: BuildError) -> Self {
+        match error {
+            BuildError::Config(_) | BuildError::Part { .. } => Self::ConfigWrong,
+            BuildError::Plan(_) => Self::ConfigPlan,
+            BuildError::UnknownDialect => Self::ConfigDialect,
+            BuildError::TooMany { .. } => Self::ConfigTooLarge,
+            _ => Self::Other,
+        }
+    }
+}
+
+impl From<Result<(), Status>> for Status {
+    fn from(result: Result<(), Status>) -> Self {
+        match result {
+            Ok(()) => Self::Ok,
+            Err(status) => status,
+        }
+    }
+}
+
+/// The version of this interface that the library has; a program compares it with `RGW_ABI_VERSION`.
+#[unsafe(no_mangle)]
+pub extern "C" fn rgw_abi_version() -> u32 {
+    RGW_ABI_VERSION
+}
+
+/// A status in words: English, for ever, ends with a zero byte. Any number is taken.
+#[unsafe(no_mangle)]
+pub extern "C" fn rgw_status_text(status: u32) -> *const c_char {
+    #[allow(clippy::indexing_slicing, reason = "never but to see that the proof can fail")]
+    if crate::no_panic::PROVOKED {
+        return TEXTS[status as usize].1.as_ptr();
+    }
+    let known = TEXTS.iter().find(|(known, _)| *known as u32 == status);
+    known.map_or(c"unknown status", |(_, text)| *text).as_ptr()
+}
+
+static TEXTS: [(Status, &CStr); 17] = [
+    (Status::Ok, c"done"),
+    (Status::Null, c"a pointer is null"),
+    (Status::TooSmall, c"memory or a buffer is too small"),
+    (Status::Misaligned, c"memory is not aligned"),
+    (Status::AbiVersion, c"header and library are of different versions"),
+    (Status::NotThere, c"no such port, link or index"),
+    (Status::Invalid, c"a code or a CAN frame that cannot be"),
+    (Status::ImageCut, c"the image is cut"),
+    (Status::ImageNone, c"no configuration image"),
+    (Status::ImageVersion, c"the image has a version that is not known here"),
+    (Status::ImageTooLong, c"the image says that it is longer than any"),
+    (Status::ImageDamaged, c"the image is damaged"),
+    (Status::ImageContents, c"the image's contents are no configuration"),
+    (Status::ConfigWrong, c"the configuration is wrong"),
+    (Status::ConfigPlan, c"a variable has no way to or from the controller"),
+    (Status::ConfigTooLarge, c"the configuration is larger than the library was built for"),
+    (Status::ConfigDialect, c"the dialect is not known here"),
+];
