@@ -15,7 +15,7 @@ extern const uint8_t image_start[], image_end[];
 extern int main(void);
 
 static uint8_t received[64];
-static bool port_sent, is_open[LINES], link_up[LINES], link_sent[LINES], link_acked[LINES], link_absent[LINKS];
+static bool port_sent, is_open[LINES], was_open[LINES], link_up[LINES], link_sent[LINES], link_acked[LINES], link_absent[LINKS];
 
 const uint8_t *board_image(size_t *len)
 {
@@ -66,7 +66,7 @@ void board_link_open(uint8_t link, rgw_transport transport, const uint8_t *host,
 {
     (void)transport, (void)host, (void)len, (void)port; /* QEMU was told */
     if (link < LINES)
-        is_open[link] = link_up[link] = true;
+        is_open[link] = was_open[link] = link_up[link] = true;
     else if (link < LINKS)
         link_absent[link] = true;
 }
@@ -111,7 +111,9 @@ struct board_event board_wait(uint64_t until_us)
                 return (struct board_event){ .kind = BOARD_LINK_SENT, .id = id };
             if (told(&link_acked[id]))
                 return (struct board_event){ .kind = BOARD_LINK_ACKED, .id = id };
-            len = take(1u + id);
+            /* What came before the first opening is the beginning of the stream; after a closing, it is
+             * of a connection that is no more. */
+            len = was_open[id] ? take(1u + id) : 0;
             if (len > 0 && is_open[id])
                 return (struct board_event){ .kind = BOARD_LINK_BYTES, .id = id, .bytes = received, .len = len };
         }
