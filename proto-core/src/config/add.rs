@@ -106,8 +106,8 @@ impl ConfigMut<'_> {
     /// As there.
     pub fn set_controller(&mut self, from: &ControllerBuilder<'_>) -> Result<(), ConfigError> {
         let at = |key| move |kind| ConfigError { place: Place::Controller(key), kind };
-        let mut link = ControllerLink::default();
-        link.address = text(from.address).map_err(at(ControllerKey::Address))?;
+        let address = text(from.address).map_err(at(ControllerKey::Address))?;
+        let mut link = ControllerLink { address, ..ControllerLink::default() };
         if let Some(name) = from.dialect {
             let dialect = Dialect::named(name).ok_or(Kind::UnknownDialect);
             link.set_dialect(dialect.map_err(at(ControllerKey::Dialect))?);

@@ -42,7 +42,7 @@ impl<'c> ConfigView<'c> {
     }
 
     /// The engine and the image have room for what a file can have.
-    fn check_counts(self) -> Check {
+    fn check_counts(&self) -> Check {
         for (what, needed, room) in [
             (Counted::Ports, self.ports.len(), MAX_PORTS),
             (Counted::Recipes, self.recipes.len(), MAX_RECIPES),
@@ -55,7 +55,7 @@ impl<'c> ConfigView<'c> {
         Ok(())
     }
 
-    fn check_controller(self) -> Check {
+    fn check_controller(&self) -> Check {
         let controller = self.controller;
         if !controller.address.is_empty() {
             let place = Place::Controller(ControllerKey::Address);
@@ -75,14 +75,14 @@ impl<'c> ConfigView<'c> {
         self.check_upstream_recipe(place, link.recipe)
     }
 
-    fn check_network(self) -> Check {
+    fn check_network(&self) -> Check {
         let Some(network) = self.network else { return Ok(()) };
         let checked = network.check(&self.controller.address);
         checked.map_err(|(key, kind)| ConfigError { place: Place::Network(key), kind })
     }
 
     /// The controller's TCP and UDP ports take realtime stream recipes only (D16).
-    fn check_upstream_recipe(self, place: Place, index: u8) -> Check {
+    fn check_upstream_recipe(&self, place: Place, index: u8) -> Check {
         let recipe = self.recipe_at(place, index)?;
         if !matches!(recipe.parts, Parts::Stream { .. }) {
             return fail(place, Kind::NeedsStreamRecipe { recipe: index });
@@ -93,14 +93,14 @@ impl<'c> ConfigView<'c> {
         Ok(())
     }
 
-    fn recipe_at(self, place: Place, index: u8) -> Result<&'c Recipe, ConfigError> {
+    fn recipe_at(&self, place: Place, index: u8) -> Result<&'c Recipe, ConfigError> {
         let recipes = self.recipes.len() as u8;
         self.recipes
             .get(usize::from(index))
             .ok_or(ConfigError { place, kind: Kind::NoSuchRecipe { recipe: index, recipes } })
     }
 
-    fn check_port(self, index: u8, port: &Port) -> Check {
+    fn check_port(&self, index: u8, port: &Port) -> Check {
         let at = |key| Place::Port { port: index, key };
         check_new_name(at(PortKey::Name), &port.name, index, self.ports.iter().map(|port| &port.name))?;
         let recipe = self.recipe_at(at(PortKey::Recipe), port.recipe)?;
@@ -135,9 +135,9 @@ impl<'c> ConfigView<'c> {
 
     /// A byte stream needs a head or a tail to find frames by (D18); the rest holds on any line and
     /// was checked with the recipe.
-    fn check_framing(self, port: u8, index: u8, recipe: &Recipe) -> Check {
+    fn check_framing(&self, port: u8, index: u8, recipe: &Recipe) -> Check {
         for part in [Direction::Input, Direction::Output] {
-            if let Err(error) = check_layout(self, recipe, part, Framing::Bytes) {
+            if let Err(error) = check_layout(*self, recipe, part, Framing::Bytes) {
                 let place = Place::Port { port, key: PortKey::Recipe };
                 return fail(place, Kind::Framing { recipe: index, error });
             }
@@ -145,7 +145,7 @@ impl<'c> ConfigView<'c> {
         Ok(())
     }
 
-    fn check_listen(self, index: u8, port: &Port, listen: &str) -> Check {
+    fn check_listen(&self, index: u8, port: &Port, listen: &str) -> Check {
         let place = Place::Port { port: index, key: PortKey::Listen };
         let Some(address) = listen_address(listen) else {
             return fail(place, Kind::ListenAddress);
@@ -167,7 +167,7 @@ impl<'c> ConfigView<'c> {
     }
 
     /// One owner a variable.
-    fn check_owners(self) -> Check {
+    fn check_owners(&self) -> Check {
         let mut owners = [None; INPUT_COUNT];
         for (index, _, recipe) in self.field_ports() {
             for var in self.written_by(recipe) {
@@ -186,7 +186,7 @@ impl<'c> ConfigView<'c> {
     }
 
     /// Every variable a port writes can be carried, and everything that is carried has a value.
-    fn check_ways_up(self) -> Check {
+    fn check_ways_up(&self) -> Check {
         for (port, port_config, recipe) in self.field_ports() {
             for (frame, field, spec) in self.fields_of(recipe, Direction::Input) {
                 let Some(var) = spec.variable() else { continue };
@@ -210,7 +210,7 @@ impl<'c> ConfigView<'c> {
     }
 
     /// Every variable a port sends or triggers on is shown somewhere.
-    fn check_sources(self) -> Check {
+    fn check_sources(&self) -> Check {
         for (port, port_config, recipe) in self.field_ports() {
             let index = port_config.recipe;
             // An input variable can be shown as its owner last sent it.
@@ -237,13 +237,13 @@ impl<'c> ConfigView<'c> {
     }
 
     /// Whether a way up carries `var` in its input part, or shows it in its output part.
-    fn carried(self, part: Direction, var: SysVar) -> bool {
+    fn carried(&self, part: Direction, var: SysVar) -> bool {
         self.upstream_recipes()
             .flat_map(|(_, recipe)| self.fields_of(recipe, part))
             .any(|(_, _, spec)| *spec == FieldSpec::System(var))
     }
 
-    fn check_safe_values(self) -> Check {
+    fn check_safe_values(&self) -> Check {
         for (index, port) in (0..).zip(self.ports) {
             let mut seen = [false; COUNT];
             for (entry, safe) in (port.on_timeout.start..).zip(port.on_timeout.of(self.safe_values)) {
