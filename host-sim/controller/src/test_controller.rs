@@ -4,8 +4,8 @@
 use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 
-use proto_core::recipe::CanFrame;
 use proto_core::time::{Duration, Instant};
+use proto_core::wire::can::CanFrame;
 use proto_core::wire::state::StatePacket;
 use recipe_config::{InitialTarget, SimConfig};
 
