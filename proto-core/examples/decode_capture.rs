@@ -1,8 +1,8 @@
 //! Decodes captured bytes with the recipes they were sent by: the worked examples of
 //! docs/wire/recipes.md section 8. Run it with `cargo run -p proto-core --example decode_capture`.
 
-use proto_core::recipe::model::{Field, Framing, Mode};
-use proto_core::recipe::{CanLayout, Deframer, PartError, PlacedField, Rules, StreamLayout, datagram};
+use proto_core::recipe::model::{Field, Framing, Mode, Rules};
+use proto_core::recipe::{CanLayout, Deframer, PartError, PlacedField, StreamLayout, datagram};
 use proto_core::sysvar::{Direction, VarRange};
 use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::{Scalar, ScalarType};

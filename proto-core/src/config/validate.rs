@@ -10,8 +10,8 @@ use super::listen::listen_address;
 use super::{
     Bus, FieldSpec, GatewayConfig, InputBinding, OutputBinding, Parts, Port, Recipe, Rs485, SendOn, Span,
 };
-use crate::recipe::model::{Field, Framing, Mode};
-use crate::recipe::{CanLayout, PartError, Rules, StreamLayout};
+use crate::recipe::model::{Field, Framing, Mode, Rules};
+use crate::recipe::{CanLayout, PartError, StreamLayout};
 use crate::sysvar::{COUNT, Direction, INPUT_COUNT, SysVar};
 use crate::time::Duration;
 use crate::wire::dialect::Dialect;
