@@ -12,8 +12,8 @@ use std::process::ExitCode;
 use divan::Bencher;
 use divan::counter::BytesCount;
 use instructions::Work;
-use proto_core::recipe::model::{Field, Framing, Mode};
-use proto_core::recipe::{Deframer, Rules, StreamLayout};
+use proto_core::recipe::model::{Field, Framing, Mode, Rules};
+use proto_core::recipe::{Deframer, StreamLayout};
 use proto_core::sysvar::Direction;
 use proto_core::wire::scalar::ScalarType;
 

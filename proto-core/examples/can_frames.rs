@@ -3,8 +3,8 @@
 
 use std::error::Error;
 
-use proto_core::recipe::model::{Field, Mode};
-use proto_core::recipe::{CanLayout, Rules};
+use proto_core::recipe::CanLayout;
+use proto_core::recipe::model::{Field, Mode, Rules};
 use proto_core::sysvar::{Direction, VarRange};
 use proto_core::wire::can::{CanFrame, CanId};
 

@@ -4,7 +4,7 @@
 use std::error::Error;
 
 use proto_core::recipe::model::{Field, Framing, Mode};
-use proto_core::recipe::{Deframer, Rules, StreamLayout};
+use proto_core::recipe::{Deframer, StreamLayout};
 use proto_core::sysvar::{Direction, VarRange};
 
 /// What came over the line (docs/wire/recipes.md section 8 has frames like these).

@@ -5,8 +5,8 @@ mod reference;
 
 use proptest::collection::vec as many;
 use proptest::prelude::*;
-use proto_core::recipe::model::{Field, Framing, Mode};
-use proto_core::recipe::{CanLayout, Deframer, Rules, StreamLayout, datagram};
+use proto_core::recipe::model::{Field, Framing, Mode, Rules};
+use proto_core::recipe::{CanLayout, Deframer, StreamLayout, datagram};
 use proto_core::sysvar::{Direction, IMAGE_BYTES, SysVar};
 use proto_core::wire::can::CanId;
 use proto_core::wire::scalar::{Scalar, ScalarType};

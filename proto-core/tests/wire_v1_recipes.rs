@@ -1,8 +1,8 @@
 //! The six worked examples of the controller's recipes, byte for byte (docs/wire/recipes.md
 //! section 8). These vectors are frozen: a change that breaks one breaks every robot.
 
-use proto_core::recipe::model::{Field, Framing, Mode};
-use proto_core::recipe::{CanLayout, Deframer, Rules, StreamLayout, datagram};
+use proto_core::recipe::model::{Field, Framing, Mode, Rules};
+use proto_core::recipe::{CanLayout, Deframer, StreamLayout, datagram};
 use proto_core::sysvar::{Direction, IMAGE_BYTES, ModbusPlace, SysVar, VarRange};
 use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::Scalar::{self, Byte, Float};

@@ -3,10 +3,10 @@
 use core::hint::black_box;
 
 use proto_core::image::Image;
-use proto_core::recipe::can::CanLayout;
-use proto_core::recipe::deframer::{Deframer, datagram};
+use proto_core::recipe::CanLayout;
+use proto_core::recipe::StreamLayout;
 use proto_core::recipe::model::{Field, Framing, Mode, Rules};
-use proto_core::recipe::stream::StreamLayout;
+use proto_core::recipe::{Deframer, datagram};
 use proto_core::sysvar::Direction;
 use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::{Scalar, ScalarType};

@@ -7,7 +7,7 @@ use proto_core::command::{self, Percent, StateCodes};
 use proto_core::config::{GatewayConfig, image};
 use proto_core::engine::{BuildError, PlanError};
 use proto_core::modbus::{Exception, adu, client, pdu};
-use proto_core::recipe::can::CanReject;
+use proto_core::recipe::CanReject;
 use proto_core::recipe::{DatagramError, EncodeError, NoSpace, PartError, ValueError};
 use proto_core::sysvar::{self, SysVar};
 use proto_core::time::Duration;

@@ -1,8 +1,8 @@
 //! What the benchmarks measure, each piece of work beside its bare limit: the same bytes moved by
 //! code that was written for one recipe, with every offset a constant and no check of the values.
 
-use proto_core::recipe::model::{Field, Framing, Mode};
-use proto_core::recipe::{CanLayout, Deframer, NoSpace, Rules, StreamLayout};
+use proto_core::recipe::model::{Field, Framing, Mode, Rules};
+use proto_core::recipe::{CanLayout, Deframer, NoSpace, StreamLayout};
 use proto_core::sysvar::{Direction, IMAGE_BYTES, SysVar, VarRange};
 use proto_core::wire::can::{CanFrame, CanId};
 

@@ -1,8 +1,8 @@
 //! CAN recipes: any part, any frame, against a list that is searched from its front
 //! (docs/wire/recipes.md sections 2, 6 and 7).
 
-use proto_core::recipe::model::Field;
-use proto_core::recipe::{CanFrameLayout, CanLayout, CanReject, Rules, ValueError};
+use proto_core::recipe::model::{Field, Rules};
+use proto_core::recipe::{CanFrameLayout, CanLayout, CanReject, ValueError};
 use proto_core::sysvar::IMAGE_BYTES;
 use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::Scalar;

@@ -1,7 +1,7 @@
 //! Recipe parts out of an input, and what the rules say of them (docs/wire/recipes.md section 2).
 
-use proto_core::recipe::model::{Field, Framing, Mode};
-use proto_core::recipe::{Rules, StreamLayout};
+use proto_core::recipe::StreamLayout;
+use proto_core::recipe::model::{Field, Framing, Mode, Rules};
 use proto_core::sysvar::{Direction, SysVar};
 use proto_core::wire::scalar::ScalarType;
 

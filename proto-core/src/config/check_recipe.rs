@@ -4,8 +4,9 @@ use super::error::{ConfigErrorKind as Kind, Place, RecipeKey};
 use super::rules::{Check, check_new_name, check_pool, fail, is_marked, mark};
 use super::{ConfigView, FieldSpec, InputBinding, OutputBinding, Parts, Recipe, SendOn, Span};
 use crate::command::Request;
+use crate::recipe::model::Rules;
 use crate::recipe::model::{Framing, Mode};
-use crate::recipe::{CanLayout, PartError, Rules, StreamLayout};
+use crate::recipe::{CanLayout, PartError, StreamLayout};
 use crate::sysvar::{COUNT, Direction};
 use crate::wire::scalar::{Scalar, ScalarType};
 

@@ -25,7 +25,7 @@ use crate::config::{
 };
 use crate::image::{GroupId, InputSet, MAX_GROUPS};
 use crate::link::LinkTimings;
-use crate::recipe::deframer::Deframer;
+use crate::recipe::Deframer;
 use crate::recipe::model::{Framing, Rules};
 use crate::recipe::{CanLayout, PartError, StreamLayout};
 use crate::sysvar::{Direction, SysVar};

@@ -12,11 +12,11 @@ use super::store::Store;
 use super::user::{InputBind, fit, forget_commands};
 use crate::config::{Rs485, Span};
 use crate::image::{ImageBytes, InputSet};
-use crate::recipe::can::{CanLayout, CanReject};
-use crate::recipe::deframer::Deframer;
+use crate::recipe::Deframer;
+use crate::recipe::StreamLayout;
 use crate::recipe::model::Mode;
-use crate::recipe::stream::StreamLayout;
 use crate::recipe::{Applied, ValueError, Values};
+use crate::recipe::{CanLayout, CanReject};
 use crate::time::{Duration, Instant};
 use crate::wire::can::CanFrame;
 use crate::wire::scalar::Scalar;
@@ -100,7 +100,7 @@ impl InputLayout for StreamLayout {
     }
 }
 
-impl InputLayout for crate::recipe::can::CanFrameLayout<'_> {
+impl InputLayout for crate::recipe::CanFrameLayout<'_> {
     fn apply(&self, payload: &[u8], image: &mut ImageBytes) -> Result<Applied, ValueError> {
         Self::apply(self, payload, image)
     }

@@ -11,9 +11,9 @@ use super::store::{Store, is_gap};
 use crate::image::{GroupId, Image, InputSet};
 use crate::link::{LinkTimings, Supervisor};
 use crate::recipe::PlacedField;
-use crate::recipe::deframer::{Deframer, datagram};
+use crate::recipe::StreamLayout;
 use crate::recipe::model::{Field, Framing};
-use crate::recipe::stream::StreamLayout;
+use crate::recipe::{Deframer, datagram};
 use crate::sysvar::BIT_INPUT_COUNT;
 use crate::time::{Duration, Instant};
 

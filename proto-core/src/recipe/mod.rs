@@ -9,18 +9,17 @@
 //! function here can fail on anything but the received bytes themselves or a buffer that is too
 //! short, and none can panic.
 
-pub mod can;
-pub mod deframer;
+mod can;
+mod deframer;
 mod delimiter;
 mod error;
 mod fields;
 pub mod model;
 mod runs;
-pub mod stream;
+mod stream;
 
 pub use can::{CanFrameLayout, CanLayout, CanReject};
 pub use deframer::{Deframer, DeframerStats, datagram};
 pub use error::{DatagramError, EncodeError, FieldPlace, NoSpace, PartError, ValueError};
 pub use fields::{Applied, PlacedField, Values};
-pub use model::Rules;
 pub use stream::StreamLayout;

@@ -2,7 +2,7 @@
 //!
 //! A frame cannot be made with an id that does not fit its kind, or with more data than
 //! [`MAX_CAN_DATA`]. Which frames mean something is a recipe's business
-//! ([`crate::recipe::can`]).
+//! ([`crate::recipe::CanLayout`]).
 
 use core::fmt;
 

@@ -2,10 +2,10 @@
 //!
 //! In: tables. Out: [`FileRecipe`], which keeps the place of everything a later check may name.
 
+use proto_core::recipe::CanLayout;
 use proto_core::recipe::PartError;
-use proto_core::recipe::can::CanLayout;
+use proto_core::recipe::StreamLayout;
 use proto_core::recipe::model::{Field, Framing, Mode, Rules};
-use proto_core::recipe::stream::StreamLayout;
 use proto_core::sysvar::{Direction, SysVar, VarRange};
 use proto_core::wire::can::CanId;
 use proto_core::wire::scalar::ScalarType;

@@ -1,7 +1,7 @@
 //! A port's recipe, compiled once.
 
-use proto_core::recipe::model::{Framing, Mode};
-use proto_core::recipe::{CanLayout, PartError, Rules, StreamLayout};
+use proto_core::recipe::model::{Framing, Mode, Rules};
+use proto_core::recipe::{CanLayout, PartError, StreamLayout};
 use proto_core::sysvar::Direction;
 use proto_core::wire::can::CanId;
 

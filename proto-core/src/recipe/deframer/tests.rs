@@ -6,7 +6,7 @@ use proptest::collection::vec as many;
 use proptest::prelude::*;
 
 use super::*;
-use crate::recipe::Rules;
+use crate::recipe::model::Rules;
 use crate::recipe::model::{Field, Framing, Mode};
 use crate::sysvar::Direction;
 use crate::wire::scalar::{Scalar, ScalarType};
