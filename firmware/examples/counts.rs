@@ -126,7 +126,7 @@ impl Bench {
             let port: Option<&mut Port> = config.ports.get_mut(usize::from(port.0));
             port.expect("counts.toml has four ports").cycle = CYCLE;
         }
-        if let Err(error) = self.engine.configure(config) {
+        if let Err(error) = self.engine.configure(&*config) {
             bare::fail("configuration", &error);
         }
         self.connect();

@@ -1,4 +1,5 @@
-//! Version 1: as version 2, but boards asked DHCP, always.
+//! Version 1: as version 2, but boards asked DHCP, always. Its images could have 64 KiB; one of more than 16 KiB is
+//! too long today, as its configuration is.
 
 use super::{ConfigMut, ImageError, item, v2};
 
