@@ -15,7 +15,7 @@ pub fn bound(listener: &TcpListener) {
     let _ = sockopt::set_socket_send_buffer_size(listener, BUFFER);
 }
 
-/// Nothing waits for more to come, and a peer that has vanished without a word is found after [`VANISHED`].
+/// Nothing waits for more to come, and a peer that has vanished without a word is found after 20 s.
 pub fn watch(stream: &TcpStream) {
     // A stream that refuses works all the same, and a peer that is gone already is found by the next read.
     let _ = stream.set_nodelay(true);
