@@ -3,7 +3,7 @@
 
 use std::error::Error;
 
-use proto_core::recipe::model::{Field, Framing, Mode};
+use proto_core::recipe::model::{Field, Framing, Mode, Rules};
 use proto_core::recipe::{Deframer, StreamLayout};
 use proto_core::sysvar::{Direction, VarRange};
 
