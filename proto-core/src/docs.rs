@@ -13,6 +13,9 @@ macro_rules! page {
     };
 }
 
+#[doc = include_str!("../docs/driver.md")]
+pub mod driver {}
+
 /// [sysvars]: wire::sysvars
 /// [recipes]: wire::recipes
 /// [state]: wire::state
