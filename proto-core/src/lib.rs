@@ -11,6 +11,10 @@
         clippy::arithmetic_side_effects
     )
 )]
+// The first definition of a link counts: here within this documentation, and in the file to docs.rs.
+//! [`docs::driver`]: crate::docs::driver
+//! [`docs::wire`]: crate::docs::wire
+//!
 #![doc = include_str!("../README.md")]
 
 #[cfg(any(test, feature = "std"))]
