@@ -14,12 +14,13 @@ const _: () = assert!(RGW_IMAGE_VERSION == image::VERSION);
 
 /// Memory that a configuration takes, in bytes: as much as on any machine. It is needed until
 /// `rgw_gateway_configure` has returned.
-pub const RGW_CONFIG_SIZE: usize = 44_544;
+pub const RGW_CONFIG_SIZE: usize = 16_640;
 const _: () = assert!(size_of::<Config>() <= RGW_CONFIG_SIZE);
 
-/// A configuration in the caller's memory.
+/// A configuration in the caller's memory: 6 ports, 6 recipes with 256 fields, 32 commands and 32 safe
+/// values at most.
 #[derive(Debug)]
-pub struct Config(pub(crate) GatewayConfig);
+pub struct Config(pub(crate) GatewayConfig<6, 6, 256, 32, 32>);
 
 /// What a port is.
 #[repr(u8)]

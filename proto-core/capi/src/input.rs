@@ -5,7 +5,8 @@
 
 use proto_core::engine::{BusState, Input, LinkId, PortId};
 use proto_core::time::Instant;
-use proto_core::wire::can::{CanFrame as CoreFrame, CanId};
+use proto_core::wire::can::CanFrame as CoreFrame;
+use proto_core::wire::can::CanId;
 
 use crate::memory::{bytes, shared, unique};
 use crate::{Gateway, Status};

@@ -1,6 +1,6 @@
 //! What a driver has to do.
 
-use proto_core::engine::{OUTPUT_BUFFER, Output, Transport as CoreTransport};
+use proto_core::engine::{Endpoint, OUTPUT_BUFFER, Output, Transport as Way};
 
 use crate::memory::{give, unique};
 use crate::{CanFrame, Gateway, Status};
@@ -105,26 +105,29 @@ pub unsafe extern "C" fn rgw_poll_output(
 fn next(gateway: &mut Gateway, now_us: u64, buffer: &mut [u8; OUTPUT_BUFFER]) -> Task {
     let now = proto_core::time::Instant::from_micros(now_us);
     match gateway.engine.poll_output(now, buffer) {
+        Output::Sleep { until } => Task { until_us: until.as_micros(), ..Task::new(OutputKind::Sleep, 0, 0) },
         Output::PortSend { port, bytes } => Task::new(OutputKind::PortSend, port.0, bytes.len()),
         Output::PortSendCan { port, frame } => {
             Task { frame: (&frame).into(), ..Task::new(OutputKind::PortSendCan, port.0, 0) }
         }
         Output::LinkOpen { link, to } => {
-            let (transport, port) = match to.transport {
-                CoreTransport::Udp { port } => (Transport::Udp, port),
-                CoreTransport::TcpListen { local } => (Transport::TcpListen, local.port()),
-                CoreTransport::UdpListen { local } => (Transport::UdpListen, local.port()),
-                CoreTransport::Tcp { port } => (Transport::Tcp, port),
-                // This version of the engine has no other.
-                _ => (Transport::Tcp, 0),
-            };
-            // The engine has put the text at the beginning of the buffer.
+            let (transport, port) = way(to);
+            // The engine has put the host where a text of it is wanted: at the buffer's beginning.
             Task { transport, port, ..Task::new(OutputKind::LinkOpen, link.0, to.host.len()) }
         }
         Output::LinkClose { link } => Task::new(OutputKind::LinkClose, link.0, 0),
         Output::LinkSend { link, bytes } => Task::new(OutputKind::LinkSend, link.0, bytes.len()),
-        Output::Sleep { until } => Task { until_us: until.as_micros(), ..Task::new(OutputKind::Sleep, 0, 0) },
-        // What a later engine adds may be left undone; this one has nothing else.
+        // This library is built with all outputs that its engine has.
         _ => Task::new(OutputKind::Sleep, 0, 0),
+    }
+}
+
+fn way(to: Endpoint<'_>) -> (Transport, u16) {
+    match to.transport {
+        Way::Tcp { port } => (Transport::Tcp, port),
+        Way::Udp { port } => (Transport::Udp, port),
+        Way::TcpListen { local } => (Transport::TcpListen, local.port()),
+        Way::UdpListen { local } => (Transport::UdpListen, local.port()),
+        _ => (Transport::Udp, 0),
     }
 }

@@ -62,6 +62,7 @@ impl From<ImageError> for Status {
             ImageError::Crc { .. } => Self::ImageDamaged,
             ImageError::Contents => Self::ImageContents,
             ImageError::Config(_) => Self::ConfigWrong,
+            ImageError::TooMany { .. } => Self::ConfigTooLarge,
             _ => Self::Other,
         }
     }
