@@ -94,7 +94,7 @@ pub enum StartError {
 impl fmt::Display for StartError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::Busy => f.write_str("the command before has not been answered yet"),
+            Self::Busy => f.write_str("the previous command has not been answered yet"),
             Self::Command(error) => error.fmt(f),
             Self::Encode(error) => error.fmt(f),
         }

@@ -192,7 +192,7 @@ impl fmt::Display for ParseError {
             Self::TooLong { len } => write!(f, "the command has {len} bytes; at most {MAX_COMMAND}"),
             Self::NotText { at } => write!(f, "the command is not UTF-8 from byte {at} on"),
             Self::UnknownWord => {
-                f.write_str("the command begins with none of")?;
+                f.write_str("unknown command; the commands are")?;
                 for (nth, keyword) in Keyword::ALL.iter().enumerate() {
                     write!(f, "{} {}", if nth == 0 { "" } else { "," }, keyword.word())?;
                 }
@@ -239,8 +239,10 @@ impl fmt::Display for EncodeError {
         match *self {
             Self::NoSpace(error) => error.fmt(f),
             Self::TooLong { len } => write!(f, "the command has {len} bytes; at most {MAX_COMMAND}"),
-            Self::ProgramName => f.write_str("a program's name is not empty and has no blanks around it"),
-            Self::ProgramByte { byte } => write!(f, "byte {byte:#04x} cannot stand in a program's name"),
+            Self::ProgramName => {
+                f.write_str("a program's name cannot be empty, or begin or end with a space")
+            }
+            Self::ProgramByte { byte } => write!(f, "a program's name cannot contain byte {byte:#04x}"),
             Self::NoSpeed => f.write_str("speed needs a number above 0 and at most 100"),
         }
     }

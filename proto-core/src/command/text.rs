@@ -15,7 +15,7 @@ pub struct NoSpace {
 
 impl fmt::Display for NoSpace {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "the text takes {} bytes, the buffer has {}", self.needed, self.available)
+        write!(f, "the text needs {} bytes; the buffer has {}", self.needed, self.available)
     }
 }
 

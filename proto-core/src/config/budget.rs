@@ -186,10 +186,10 @@ impl fmt::Display for DescribedWarning<'_> {
             Warning::ReadBack { recipe, var } => write!(
                 f,
                 "recipe {:?} carries {var}, which no port writes: it is read back from the controller and sent on, \
-                 and a change that somebody else makes can be undone for 100 ms",
+                 so a change made by somebody else can be undone for 100 ms",
                 recipe_name(recipe)
             ),
-            Warning::Unused { recipe } => write!(f, "recipe {:?} is used by nothing", recipe_name(recipe)),
+            Warning::Unused { recipe } => write!(f, "recipe {:?} is not used", recipe_name(recipe)),
         }
     }
 }

@@ -252,7 +252,7 @@ fn what_only_recipe_ports_carry_needs_one() {
 fn errors_name_things_when_the_configuration_is_at_hand() {
     let config = Builder::one_port().rs485(0).0;
     let error = config.validate().unwrap_err();
-    let unnamed = "port 2, recipe: this port writes DigitalOutputCommand[1], and so does port 1; a variable has one owner";
+    let unnamed = "port 2, recipe: DigitalOutputCommand[1] is written by this port and by port 1; a variable has one owner";
     assert_eq!(error.to_string(), unnamed);
     let named = unnamed.replace("port 2", "port \"port-1\"").replace("port 1;", "port \"port-0\";");
     assert_eq!(config.view().describe(error).to_string(), named);

@@ -82,7 +82,11 @@ impl fmt::Display for PlanError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::TwoOwners { var, first, second } => {
-                write!(f, "{var} is claimed by port {} and by port {}", first.0, second.0)
+                write!(
+                    f,
+                    "{var} is written by port {} and by port {}; a variable has one owner",
+                    first.0, second.0
+                )
             }
             Self::NoWayUp { var, .. } => {
                 write!(f, "{var} can be written only through a recipe link whose input part carries it")

@@ -187,7 +187,7 @@ pub struct NotForVariable {
 impl core::fmt::Display for NotForVariable {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
         let Self { var, value } = self;
-        write!(f, "{var} is a finite {}, not the {} {value}", var.ty(), value.ty())
+        write!(f, "{var} needs a finite {}, not the {} {value}", var.ty(), value.ty())
     }
 }
 

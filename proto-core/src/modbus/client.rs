@@ -65,9 +65,11 @@ impl fmt::Display for Violation {
         match self {
             Self::Header(error) => error.fmt(f),
             Self::Transaction { newest, received } => {
-                write!(f, "an answer to transaction {received}, which is not among those up to {newest}")
+                write!(f, "an answer to transaction {received}, but the newest request is {newest}")
             }
-            Self::Unit { expected, received } => write!(f, "unit {received} answers for unit {expected}"),
+            Self::Unit { expected, received } => {
+                write!(f, "an answer from unit {received}, but the request was for unit {expected}")
+            }
             Self::Response(error) => error.fmt(f),
         }
     }

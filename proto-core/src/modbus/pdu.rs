@@ -205,7 +205,7 @@ impl fmt::Display for ResponseError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Function { expected, received } => {
-                write!(f, "function 0x{received:02x} answers a request of function 0x{expected:02x}")
+                write!(f, "the answer has function 0x{received:02x} instead of 0x{expected:02x}")
             }
             Self::Length { expected, received } => {
                 write!(f, "the answer has {received} bytes instead of {expected}")
@@ -215,7 +215,7 @@ impl fmt::Display for ResponseError {
             }
             Self::Echo { expected, received } => write!(
                 f,
-                "address {} with 0x{:04x} was to be written, the answer echoes address {} with 0x{:04x}",
+                "the request writes 0x{1:04x} to address {0}, the answer echoes 0x{3:04x} to address {2}",
                 expected.address, expected.count_or_value, received.address, received.count_or_value
             ),
         }

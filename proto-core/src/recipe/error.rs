@@ -148,30 +148,30 @@ impl fmt::Display for PartError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match *self {
             Self::NoFields { frame: None } => {
-                write!(f, "a part has 1..={MAX_FIELDS} fields, this one has none")
+                write!(f, "a part needs 1..={MAX_FIELDS} fields; this one has none")
             }
             Self::NoFields { frame: Some(frame) } => {
                 write!(f, "frame {} has no fields", u16::from(frame).saturating_add(1))
             }
-            Self::TooManyFields { at } => write!(f, "{at} is one too many: a part has at most {MAX_FIELDS}"),
+            Self::TooManyFields { at } => write!(f, "{at} is one too many; a part has at most {MAX_FIELDS}"),
             Self::HeadTooLong { len } => {
-                write!(f, "the head has {len} bytes, at most {MAX_DELIMITER} are allowed")
+                write!(f, "the head has {len} bytes; at most {MAX_DELIMITER} are allowed")
             }
             Self::TailTooLong { len } => {
-                write!(f, "the tail has {len} bytes, at most {MAX_DELIMITER} are allowed")
+                write!(f, "the tail has {len} bytes; at most {MAX_DELIMITER} are allowed")
             }
             Self::NoDelimiter => {
                 f.write_str("a part on a byte stream needs a head or a tail of at least one byte")
             }
             Self::StreamFrameTooLong { len } => {
-                write!(f, "head, fields and tail are {len} bytes, at most {MAX_STREAM_FRAME} are allowed")
+                write!(f, "head, fields and tail take {len} bytes; at most {MAX_STREAM_FRAME} are allowed")
             }
-            Self::UserDatagram => f.write_str("UDP carries system data only, not user-defined fields"),
+            Self::UserDatagram => f.write_str("UDP carries only system data, not user-defined fields"),
             Self::WrongMode { at, mode: Mode::Realtime } => {
-                write!(f, "{at} is user-defined, a realtime recipe has system variables only")
+                write!(f, "{at} is user-defined; a realtime recipe has only system variables")
             }
             Self::WrongMode { at, mode: Mode::User } => {
-                write!(f, "{at} is a system variable, a user-defined recipe has typed fields only")
+                write!(f, "{at} is a system variable; a user-defined recipe has only typed fields")
             }
             Self::WrongDirection { at, var, part: Direction::Input } => {
                 write!(f, "{at}: {var} is an output of the robot and cannot be in an input part")
@@ -180,21 +180,21 @@ impl fmt::Display for PartError {
                 write!(f, "{at}: {var} is an input of the robot and cannot be in an output part")
             }
             Self::DuplicateVariable { at, first, var } => write!(f, "{at}: {var} is already {first}"),
-            Self::NoFrames => write!(f, "a CAN part has 1..={MAX_CAN_IDS} frames, this one has none"),
+            Self::NoFrames => write!(f, "a CAN part needs 1..={MAX_CAN_IDS} frames; this one has none"),
             Self::TooManyFrames => write!(f, "a CAN part has at most {MAX_CAN_IDS} frames"),
             Self::CanFrameTooLong { frame, len } => write!(
                 f,
-                "the fields of frame {} are {len} bytes, a CAN frame carries at most {MAX_CAN_DATA}",
+                "the fields of frame {} take {len} bytes; a CAN frame carries at most {MAX_CAN_DATA}",
                 u16::from(frame).saturating_add(1)
             ),
             Self::InvalidId { id: id @ CanId::Standard(_), .. } => {
-                write!(f, "id {id} does not fit 11 bits (0x000..=0x7ff)")
+                write!(f, "id {id} does not fit in 11 bits (0x000..=0x7ff)")
             }
             Self::InvalidId { id: CanId::Extended(id), .. } => {
-                write!(f, "id {id:#010x} does not fit 29 bits (0x00000000..=0x1fffffff)")
+                write!(f, "id {id:#010x} does not fit in 29 bits (0x00000000..=0x1fffffff)")
             }
             Self::DuplicateId { first, id, .. } => {
-                write!(f, "id {id} is already that of frame {}", u16::from(first).saturating_add(1))
+                write!(f, "frame {} already has id {id}", u16::from(first).saturating_add(1))
             }
         }
     }
@@ -246,7 +246,7 @@ pub struct NoSpace {
 
 impl fmt::Display for NoSpace {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "the frame is {} bytes, the buffer has {}", self.needed, self.available)
+        write!(f, "the frame has {} bytes; the buffer has {}", self.needed, self.available)
     }
 }
 
@@ -287,9 +287,13 @@ impl fmt::Display for EncodeError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match *self {
             Self::NoSpace(error) => error.fmt(f),
-            Self::Count { expected, got } => write!(f, "there are {expected} fields but {got} values"),
+            Self::Count { expected, got } => write!(f, "{expected} fields, but {got} values"),
             Self::Type { field, expected, got } => {
-                write!(f, "field {} is a {expected}, not a {got}", u16::from(field).saturating_add(1))
+                write!(
+                    f,
+                    "field {} is a {expected}, but the value is a {got}",
+                    u16::from(field).saturating_add(1)
+                )
             }
         }
     }

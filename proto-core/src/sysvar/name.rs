@@ -66,7 +66,7 @@ impl fmt::Display for ParseError {
                 Ok(())
             }
             Self::OutOfRange { group, index, last } => {
-                write!(f, "{group} has no [{index}], only [1..{last}]")
+                write!(f, "there is no {group}[{index}], only {group}[1..{last}]")
             }
             Self::Backwards { first, last } => write!(f, "the range {first}..{last} runs backwards"),
             Self::NotSingle => f.write_str("one variable is needed here, not a range"),

@@ -61,14 +61,14 @@ impl From<embedded_can::Id> for CanId {
 }
 
 impl CanFrame {
-    /// A data frame; `None` when the id does not fit its kind or there are more than 8 bytes.
+    /// A data frame; `None` when the id is too large for its kind or there are more than 8 bytes.
     pub fn new(id: CanId, data: &[u8]) -> Option<Self> {
         let mut frame = Self { id, remote: false, len: data.len() as u8, data: [0; MAX_CAN_DATA] };
         frame.data.get_mut(..data.len())?.copy_from_slice(data);
         id.is_valid().then_some(frame)
     }
 
-    /// A remote frame that asks for `len` bytes; `None` when the id does not fit its kind or `len`
+    /// A remote frame that asks for `len` bytes; `None` when the id is too large for its kind or `len`
     /// is more than 8.
     pub fn remote(id: CanId, len: usize) -> Option<Self> {
         let fits = id.is_valid() && len <= MAX_CAN_DATA;

@@ -130,9 +130,9 @@ impl fmt::Display for ScalarError {
         match *self {
             Self::OutOfRange { ty, value } => {
                 let (low, high) = ty.range();
-                write!(f, "{value} does not fit a {ty} ({low}..={high})")
+                write!(f, "{value} does not fit in a {ty} ({low}..={high})")
             }
-            Self::NotWhole { ty, value } => write!(f, "{value} is not a whole number, as a {ty} must be"),
+            Self::NotWhole { ty, value } => write!(f, "{value} is not an integer, but a {ty} must be"),
         }
     }
 }

@@ -86,23 +86,26 @@ impl fmt::Display for ImageError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::TooShort { needed, available } => {
-                write!(f, "the image is cut: {needed} bytes are needed, {available} are there")
+                write!(f, "the image is cut short: {needed} bytes are needed, {available} are there")
             }
-            Self::NotAnImage { found } => write!(f, "no configuration image: it begins with {found:02X?}"),
+            Self::NotAnImage { found } => write!(f, "not a configuration image: it begins with {found:02X?}"),
             Self::Version { found } => {
-                write!(f, "the image has version {found}; this firmware takes {OLDEST_VERSION} to {VERSION}")
+                write!(f, "the image has version {found}; this program reads {OLDEST_VERSION} to {VERSION}")
             }
             Self::TooLong { payload } => {
-                write!(f, "the image says it holds {payload} bytes; at most {MAX_IMAGE} are possible")
+                write!(f, "the image announces {payload} bytes; at most {MAX_IMAGE} are allowed")
             }
             Self::Crc { stored, computed } => {
-                write!(f, "the image is damaged: its CRC is {stored:08X}, its bytes have {computed:08X}")
+                write!(
+                    f,
+                    "the image is damaged: it stores the CRC {stored:08X}, its bytes give {computed:08X}"
+                )
             }
-            Self::Contents => write!(f, "the image's contents are no configuration"),
+            Self::Contents => write!(f, "the image does not contain a configuration"),
             Self::TooMany { what, needed, room } => {
-                write!(f, "the image has {needed} {what}, and there is room for {room}")
+                write!(f, "the image has {needed} {what}; there is room for {room}")
             }
-            Self::Config(error) => write!(f, "the image's configuration is wrong: {error}"),
+            Self::Config(error) => write!(f, "the image's configuration is invalid: {error}"),
         }
     }
 }

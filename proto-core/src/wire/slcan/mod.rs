@@ -188,9 +188,9 @@ pub enum LineError {
 impl fmt::Display for LineError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
-            Self::NotAFrame => "not a frame: it begins with none of t, T, r, R",
+            Self::NotAFrame => "not a frame: it does not begin with t, T, r or R",
             Self::Malformed => "a hexadecimal digit is missing or wrong, or something follows the frame",
-            Self::Id => "the id does not fit its kind",
+            Self::Id => "the id is too large for its kind",
             Self::Length => "a frame has at most 8 bytes",
         })
     }
