@@ -1,15 +1,15 @@
-//! Writing text into a caller's buffer, and the few byte classes the texts are made of.
+//! Writing text into a caller's buffer, and the byte classes of the texts.
 
 use core::fmt;
 
-/// The buffer was too small; nothing useful was written.
+/// The buffer was too small; its content is not useful.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
 pub struct NoSpace {
-    /// Bytes the text takes.
+    /// Number of bytes that the text needs.
     pub needed: usize,
-    /// Bytes that were available.
+    /// Number of bytes available.
     pub available: usize,
 }
 
@@ -21,7 +21,7 @@ impl fmt::Display for NoSpace {
 
 impl core::error::Error for NoSpace {}
 
-/// Appends to a byte slice and goes on counting when the slice is full.
+/// Appends to a byte slice, and continues to count when the slice is full.
 pub(super) struct Writer<'a> {
     out: &'a mut [u8],
     len: usize,

@@ -1,7 +1,7 @@
 //! What is wrong with a configuration, in words.
 //!
-//! In: an error, and the configuration where it is at hand. Out: one sentence that says what is
-//! wrong and what is allowed. Recipes and ports are named, or counted from 1.
+//! In: an error, and the configuration if available. Out: one sentence that says what is wrong and
+//! what is allowed. Recipes and ports are named, or counted from 1.
 
 use core::fmt;
 
@@ -26,12 +26,12 @@ impl fmt::Display for ConfigErrorKind {
 }
 
 impl<'c> ConfigView<'c> {
-    /// `error` with the names of its recipes and ports.
+    /// Displays `error` with the names of its recipes and ports.
     pub fn describe(self, error: ConfigError) -> impl fmt::Display + 'c {
         Described { config: Some(self), error }
     }
 
-    /// What is wrong, with the names of recipes and ports and without the place.
+    /// Displays what is wrong, with the names of recipes and ports and without the place.
     pub fn describe_kind(self, kind: ConfigErrorKind) -> impl fmt::Display + 'c {
         DescribedKind { config: Some(self), kind }
     }

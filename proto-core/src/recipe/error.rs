@@ -11,25 +11,25 @@ use crate::wire::scalar::ScalarType;
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct FieldPlace {
-    /// Which frame of a CAN part; `None` in a stream part.
+    /// The frame of a CAN part; `None` in a stream part.
     pub frame: Option<u8>,
-    /// Which field of the stream part or of that frame.
+    /// The field in the stream part or in that frame.
     pub field: u8,
 }
 
-/// Why a part cannot be a recipe's part (docs/wire/recipes.md section 2).
+/// Why a part is not valid (docs/wire/recipes.md section 2).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
 pub enum PartError {
     /// A part (or one frame of a CAN part) without fields.
     NoFields {
-        /// Which frame of a CAN part; `None` in a stream part.
+        /// The frame of a CAN part; `None` in a stream part.
         frame: Option<u8>,
     },
     /// More than [`MAX_FIELDS`] fields in a part.
     TooManyFields {
-        /// The first field too many.
+        /// The first field that is too many.
         at: FieldPlace,
     },
     /// A head longer than [`MAX_DELIMITER`].
@@ -42,7 +42,7 @@ pub enum PartError {
         /// Its length in bytes.
         len: usize,
     },
-    /// A part for a byte stream with neither head nor tail: frames could not be found in it.
+    /// A part for a byte stream without head and tail: frames could not be found in it.
     NoDelimiter,
     /// Head, fields and tail together are longer than [`MAX_STREAM_FRAME`].
     StreamFrameTooLong {
@@ -82,14 +82,14 @@ pub enum PartError {
     TooManyFrames,
     /// The fields of a CAN frame are longer than [`MAX_CAN_DATA`] together.
     CanFrameTooLong {
-        /// Which frame.
+        /// The frame.
         frame: u8,
         /// The fields' length in bytes.
         len: usize,
     },
     /// A CAN id that does not fit its kind.
     InvalidId {
-        /// Which frame.
+        /// The frame.
         frame: u8,
         /// Its id.
         id: CanId,
@@ -106,7 +106,7 @@ pub enum PartError {
 }
 
 impl PartError {
-    /// The field the error is about, if it is about one.
+    /// The field that the error concerns, if there is one.
     pub const fn field(&self) -> Option<FieldPlace> {
         match *self {
             Self::TooManyFields { at }
@@ -117,7 +117,7 @@ impl PartError {
         }
     }
 
-    /// The frame of a CAN part the error is about, if it is about one.
+    /// The frame of a CAN part that the error concerns, if there is one.
     pub const fn frame(&self) -> Option<u8> {
         match *self {
             Self::NoFields { frame } => frame,
@@ -134,7 +134,7 @@ impl PartError {
 }
 
 impl fmt::Display for FieldPlace {
-    /// People count from 1.
+    /// Messages count from 1.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let field = u16::from(self.field).saturating_add(1);
         match self.frame {
@@ -212,11 +212,11 @@ pub enum ValueError {
         /// The first such field, counted from 0.
         field: u8,
     },
-    /// The payload is not as long as the fields are.
+    /// The payload is not as long as the fields.
     Length {
         /// The fields' length in bytes.
         expected: usize,
-        /// The payload's.
+        /// The length of the payload.
         got: usize,
     },
 }
@@ -240,7 +240,7 @@ impl core::error::Error for ValueError {}
 pub struct NoSpace {
     /// The frame's length in bytes.
     pub needed: usize,
-    /// The buffer's.
+    /// The length of the buffer.
     pub available: usize,
 }
 
@@ -252,27 +252,27 @@ impl fmt::Display for NoSpace {
 
 impl core::error::Error for NoSpace {}
 
-/// Why given values do not make a frame; nothing was written.
+/// Why values do not make a frame; nothing was written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
 pub enum EncodeError {
     /// The buffer is too short.
     NoSpace(NoSpace),
-    /// Not one value per field.
+    /// The number of values is not the number of fields.
     Count {
-        /// How many fields there are.
+        /// Number of fields.
         expected: usize,
-        /// How many values were given.
+        /// Number of values.
         got: usize,
     },
-    /// A value is not of its field's type.
+    /// A value does not have its field's type.
     Type {
         /// The field, counted from 0.
         field: u8,
-        /// Its type.
+        /// The field's type.
         expected: ScalarType,
-        /// The value's.
+        /// The value's type.
         got: ScalarType,
     },
 }
@@ -310,7 +310,7 @@ pub enum DatagramError {
     Length {
         /// The frame's length in bytes.
         expected: usize,
-        /// The datagram's.
+        /// The datagram's length.
         got: usize,
     },
     /// It does not begin with the head.
