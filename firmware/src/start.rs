@@ -159,7 +159,7 @@ fn load(
         network: config.network.fixed().copied(),
     };
     info!(
-        "configuration: {} bytes; {} field ports, {} links; the engine takes {} bytes, its configuration {}",
+        "configuration: {} bytes; {} field ports, {} links; the engine has {} bytes, its configuration {}",
         bytes.len(),
         wiring.ports.len(),
         wiring.links.len(),

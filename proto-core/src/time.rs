@@ -1,12 +1,12 @@
 //! Virtual time: instants and durations in whole microseconds.
 //!
-//! The core never reads a clock; whoever drives it passes [`Instant`]s in. Arithmetic saturates,
-//! so no instant a driver can pass makes the core panic.
+//! The core never reads a clock; its caller passes [`Instant`]s. Arithmetic saturates, so no
+//! instant makes the core panic.
 
 use core::fmt;
 use core::ops::{Add, AddAssign, Sub};
 
-/// A point in time, in microseconds since an epoch that the driver chooses (boot, usually).
+/// A point in time, in microseconds since an epoch that the caller chooses (usually boot).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct Instant(u64);
@@ -38,8 +38,8 @@ impl Instant {
     }
 }
 
-/// An instant, all zeros when it is [`Instant::NEVER`]: a place for instants that are not known yet
-/// takes no flash.
+/// An instant that is all zeros for [`Instant::NEVER`]: instants that are not known yet take no
+/// flash.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Stamp(u64);
 
@@ -68,9 +68,9 @@ impl fmt::Debug for Stamp {
 pub struct Duration(u64);
 
 impl Duration {
-    /// No time at all.
+    /// Zero.
     pub const ZERO: Self = Self(0);
-    /// Longer than anything: "no limit".
+    /// The longest duration: "no limit".
     pub const MAX: Self = Self(u64::MAX);
 
     /// `micros` µs.
@@ -98,7 +98,7 @@ impl Duration {
         self.0 / 1_000
     }
 
-    /// The span `factor` times over, saturating.
+    /// The span multiplied by `factor`, saturating.
     pub const fn saturating_mul(self, factor: u64) -> Self {
         Self(self.0.saturating_mul(factor))
     }

@@ -373,5 +373,5 @@ fn larger_configurations_than_a_file_can_be_are_refused() {
     let kind = ConfigErrorKind::TooMany { what: Counted::Ports, needed: 9, room: MAX_PORTS };
     let error = ConfigError { place: Place::Whole, kind };
     assert_eq!(config.validate(), Err(error));
-    assert_eq!(error.to_string(), "configuration: 9 ports, and there is room for 8");
+    assert_eq!(error.to_string(), "configuration: 9 ports; there is room for 8");
 }

@@ -110,7 +110,7 @@ fn a_newer_version_is_refused_with_its_number() {
         assert_eq!(image_len(&bytes), Err(ImageError::Version { found: version }));
     }
     let said = ImageError::Version { found: 7 }.to_string();
-    assert_eq!(said, format!("the image has version 7; this firmware takes 1 to {VERSION}"));
+    assert_eq!(said, format!("the image has version 7; this program reads 1 to {VERSION}"));
 }
 
 /// The board's own address came with version 2: what was there before is DHCP again.
@@ -133,7 +133,7 @@ fn a_small_configuration_takes_what_it_has_room_for() {
     let mut too_small: GatewayConfig<1, 1, 5, 0, 0> = GatewayConfig::empty();
     let refused = decode_into(&bytes, &mut too_small).unwrap_err();
     assert!(matches!(refused, ImageError::TooMany { needed: 6, room: 5, .. }), "{refused}");
-    let said = "the image has 6 fields in all recipes together, and there is room for 5";
+    let said = "the image has 6 fields in all recipes together; there is room for 5";
     assert_eq!(refused.to_string(), said);
 }
 

@@ -17,7 +17,7 @@ use signal_hook::consts::{SIGINT, SIGTERM};
 const USAGE: &str = "usage: chip ELF [IMAGE] [--ms N] [--last N]
        chip ELF [IMAGE] --realtime [--rs485 PLACE [--rs485 PLACE]] [--can PLACE]
             [--network OPTIONS [--qmp PATH]] [--control PLACE] [--last N]
-a PLACE is HOST:PORT or the path of a socket; OPTIONS are those of QEMU's '-netdev user', or ''";
+PLACE is HOST:PORT or the path of a socket; OPTIONS are those of QEMU's '-netdev user', or ''";
 
 fn main() -> ExitCode {
     let result = become_other(std::env::args().skip(1)).and_then(|()| run());
@@ -50,7 +50,7 @@ fn options(mut args: impl Iterator<Item = String>) -> Result<Options, String> {
             "--network" => wiring.network = Some(value()?),
             "--qmp" => wiring.qmp = Some(value()?),
             "--control" => wiring.control = Some(value()?),
-            _ if arg.starts_with("--") => return Err(format!("{arg}: unknown\n{USAGE}")),
+            _ if arg.starts_with("--") => return Err(format!("{arg}: unknown argument\n{USAGE}")),
             _ => options.files.push(arg),
         }
     }

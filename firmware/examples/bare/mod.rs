@@ -59,7 +59,7 @@ unsafe fn HardFault(frame: &cortex_m_rt::ExceptionFrame) -> ! {
 }
 
 fn on_interrupt() {
-    panic!("an interrupt that nobody enabled");
+    panic!("an interrupt that was not enabled");
 }
 
 #[unsafe(link_section = ".vector_table.interrupts")]

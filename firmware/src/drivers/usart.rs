@@ -64,7 +64,7 @@ pub struct BaudError {
 
 impl core::fmt::Display for BaudError {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
-        write!(f, "no {} baud from {} Hz", self.baud, self.clock)
+        write!(f, "{} baud cannot be made from {} Hz", self.baud, self.clock)
     }
 }
 

@@ -168,7 +168,10 @@ impl<C: CanPort> Task<'_, C> {
         // Said once, however often it happens in a row.
         if !self.is_failing {
             let errors = self.can.counters().transmit_errors;
-            warn!("port {}: nothing leaves, nobody acknowledges; transmit errors {}", self.port.0, errors);
+            warn!(
+                "port {}: frames are not acknowledged by any node; transmit errors {}",
+                self.port.0, errors
+            );
         }
         self.is_failing = true;
         self.forget_waiting();
@@ -190,7 +193,7 @@ impl<C: CanPort> Task<'_, C> {
         if now.saturating_duration_since(self.recovered) >= HEALTHY {
             self.backoff = BACKOFF_MIN;
         }
-        warn!("port {}: bus-off; onto the bus again in {} ms", self.port.0, self.backoff.as_millis());
+        warn!("port {}: bus-off; restart in {} ms", self.port.0, self.backoff.as_millis());
         self.phase = Phase::Off { until: now + self.backoff };
         self.backoff = (self.backoff * 2).min(BACKOFF_MAX);
         self.gateway.input(Input::PortBus { port: self.port, state: BusState::BusOff });
@@ -214,7 +217,7 @@ impl<C: CanPort> Task<'_, C> {
         let lost = self.can.counters().lost;
         let now = Instant::now();
         if lost != self.lost && now.saturating_duration_since(self.lost_told) >= LOST_PERIOD {
-            warn!("port {}: frames lost {} times", self.port.0, lost);
+            warn!("port {}: frames were lost {} times", self.port.0, lost);
             self.lost = lost;
             self.lost_told = now;
         }

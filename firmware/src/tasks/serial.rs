@@ -154,7 +154,7 @@ impl Told {
         self.errors = errors;
         let LineErrors { parity, framing, overruns, unread } = errors;
         warn!(
-            "port {}: characters left out for parity {}, framing {}; overruns {}, unread {}",
+            "port {}: characters discarded: parity {}, framing {}; overruns {}, unread {}",
             port.0, parity, framing, overruns, unread
         );
     }

@@ -232,8 +232,8 @@ pub async fn run<const N: usize>(watch: &Watch<N>, period: Duration, mut feed: i
 
 fn say(name: TaskName, answer: Answer) {
     match answer {
-        Answer::Missing => error!("task {} does not answer: the watchdog is not fed", Text(&name)),
-        Answer::Late => info!("task {} answers again", Text(&name)),
+        Answer::Missing => error!("task {} does not respond: the watchdog is not fed", Text(&name)),
+        Answer::Late => info!("task {} responds again", Text(&name)),
     }
 }
 

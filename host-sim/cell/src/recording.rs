@@ -59,7 +59,7 @@ pub fn recording_difference(expected: &[u8], found: &[u8]) -> Option<String> {
     }
     let (Some(mut left), Some(mut right)) = (expected.strip_prefix(&MAGIC), found.strip_prefix(&MAGIC))
     else {
-        return Some("one of them is no recording".to_owned());
+        return Some("one of them is not a recording".to_owned());
     };
     let mut cause = "no input yet".to_owned();
     for nth in 0.. {

@@ -25,7 +25,7 @@ pub enum TargetError {
 impl fmt::Display for TargetError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::Index { group, last } => write!(f, "{group} has only [1..{last}]"),
+            Self::Index { group, last } => write!(f, "there is only {group}[1..{last}]"),
             Self::Variable(error) => {
                 let bits: Vec<_> = BitGroup::ALL.into_iter().map(BitGroup::name).collect();
                 let analog: Vec<_> = AnalogInput::ALL.into_iter().map(AnalogInput::name).collect();

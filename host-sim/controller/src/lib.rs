@@ -253,7 +253,7 @@ impl std::fmt::Display for BuildError {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             Self::Dialect(name) => {
-                write!(f, "no dialect is called {name}; there are {}", Dialect::NAMES.join(", "))
+                write!(f, "there is no dialect {name}; there are {}", Dialect::NAMES.join(", "))
             }
             Self::Port { port, error } => write!(f, "port {port}: {error}"),
             Self::SecondUdpServer { port } => {

@@ -145,7 +145,7 @@ impl Controller {
                 Ok(())
             }
             Err(error) => {
-                let message = format!("{}: no thread for the program: {error}", script.name());
+                let message = format!("{}: cannot start a thread for the program: {error}", script.name());
                 self.machine.fail(ErrorId::ProgramFailed, message);
                 Err(ErrorId::ProgramFailed)
             }
@@ -347,7 +347,7 @@ impl Controller {
     fn port_named(&self, name: &str) -> Result<usize, String> {
         self.ports.iter().position(|port| port.name() == name).ok_or_else(|| {
             let names: Vec<_> = self.ports.iter().map(|port| port.name()).collect();
-            format!("no port is called {name}; there are {}", names.join(", "))
+            format!("there is no port {name}; there are {}", names.join(", "))
         })
     }
 

@@ -27,7 +27,10 @@ pub struct NoSuchFloat(pub String);
 impl std::fmt::Display for NoSuchFloat {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let name = &self.0;
-        write!(f, "{name} is no float; a system variable, an analog input, or an item of the state packet")
+        write!(
+            f,
+            "{name} is not a float; choose a system variable, an analog input, or an item of the state packet"
+        )
     }
 }
 

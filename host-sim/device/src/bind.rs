@@ -258,11 +258,11 @@ impl fmt::Display for BindError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::NoEquals { text } => {
-                write!(f, "`{text}` has no `=`; write NAME=DEVICE, DEVICE being {DEVICE_FORMS}")
+                write!(f, "`{text}` has no `=`; write NAME=DEVICE, where DEVICE is {DEVICE_FORMS}")
             }
-            Self::NoName { text } => write!(f, "`{text}` names no port before the `=`; write NAME=DEVICE"),
+            Self::NoName { text } => write!(f, "`{text}` has no port name before `=`; write NAME=DEVICE"),
             Self::UnknownDevice { text } => write!(f, "`{text}` is not a device; allowed are {DEVICE_FORMS}"),
-            Self::Empty { kind } => write!(f, "`{kind}:` is followed by nothing; allowed are {DEVICE_FORMS}"),
+            Self::Empty { kind } => write!(f, "`{kind}:` needs an argument; allowed are {DEVICE_FORMS}"),
             Self::NoPath { kind } => write!(f, "`{kind}:` has no PATH after its comma"),
             Self::Address { kind, why } => write!(f, "`{kind}:` needs HOST:PORT, but {why}"),
         }
@@ -291,7 +291,7 @@ impl fmt::Display for HostPortError {
             Self::NoPort => "there is no `:PORT`",
             Self::NoHost => "there is no host before the colon",
             Self::BadPort => "the port is not a number from 0 to 65535",
-            Self::Brackets => "an IPv6 address stands in brackets, as in [::1]:50000",
+            Self::Brackets => "an IPv6 address needs brackets, as in [::1]:50000",
         })
     }
 }
@@ -337,18 +337,18 @@ mod tests {
         let message = |text: &str| text.parse::<Bind>().unwrap_err().to_string();
         for (text, begins) in [
             ("rs485", "`rs485` has no `=`"),
-            ("=pty:x", "`=pty:x` names no port"),
+            ("=pty:x", "`=pty:x` has no port name"),
             ("a=x", "`x` is not a device; allowed are pty:PATH"),
             ("a=usb:x", "`usb:x` is not a device"),
-            ("a=pty:", "`pty:` is followed by nothing"),
-            ("a=socketcan:", "`socketcan:` is followed by nothing"),
+            ("a=pty:", "`pty:` needs an argument"),
+            ("a=socketcan:", "`socketcan:` needs an argument"),
             ("a=slcan-tcp:h:1,", "`slcan-tcp:` has no PATH"),
             ("a=slcan-tcp:h,p", "`slcan-tcp:` needs HOST:PORT, but there is no `:PORT`"),
             ("a=tcp:host", "`tcp:` needs HOST:PORT, but there is no `:PORT`"),
             ("a=tcp::5", "`tcp:` needs HOST:PORT, but there is no host"),
             ("a=tcp:h:65536", "`tcp:` needs HOST:PORT, but the port is not a number"),
-            ("a=tcp:::1:5", "`tcp:` needs HOST:PORT, but an IPv6 address stands in brackets"),
-            ("a=tcp:[::1:5", "`tcp:` needs HOST:PORT, but an IPv6 address stands in brackets"),
+            ("a=tcp:::1:5", "`tcp:` needs HOST:PORT, but an IPv6 address needs brackets"),
+            ("a=tcp:[::1:5", "`tcp:` needs HOST:PORT, but an IPv6 address needs brackets"),
         ] {
             assert!(message(text).starts_with(begins), "{text}: {}", message(text));
         }

@@ -331,17 +331,17 @@ async fn serve_all(listener: TcpListener, bus: &CanBus, bitrate: u32, tx: &Rc<Po
                     drop(stream);
                     tx.count(|counters| counters.refused += 1);
                     if let Some(more) = tx.complaints.take(now()) {
-                        warn!(%peer, more, "refused: the bus has {MAX_CLIENTS} slcan clients already");
+                        warn!(%peer, more, "refused: the bus already has {MAX_CLIENTS} slcan clients");
                     }
                     give_way().await;
                     continue;
                 }
-                info!(%peer, "slcan client");
+                info!(%peer, "slcan client connected");
                 peer::watch(&stream);
                 let (node, tx) = (bus.join(), Rc::clone(tx));
                 clients.spawn_local(async move {
                     let error = serve(&stream, &node, bitrate, &tx).await;
-                    info!(%peer, %error, "slcan client left");
+                    info!(%peer, %error, "slcan client disconnected");
                     drop(stream);
                     // What was answered as sent is sent.
                     node.set_hears(false);

@@ -94,7 +94,7 @@ impl LinePort {
                     let device = match stream.take().map_or_else(|| open_serial(&path, settings), Ok) {
                         Ok(device) => RefCell::new(device),
                         Err(error) => {
-                            debug!(%path, %error, "cannot be opened");
+                            debug!(%path, %error, "cannot open the device");
                             backoff.wait().await;
                             continue;
                         }
@@ -102,7 +102,7 @@ impl LinePort {
                     backoff.reset();
                     sender.up(&mut events);
                     let error = pump(&device, &mut sender, &mut events).await;
-                    warn!(%path, %error, "lost, will be opened again");
+                    warn!(%path, %error, "device lost, will be reopened");
                     sender.down(&mut events);
                 }
             }
@@ -119,18 +119,18 @@ impl LinePort {
                             info!(%to, %error, "connection lost");
                             sender.down(&mut events);
                         }
-                        Err(error) => debug!(%to, %error, "no connection"),
+                        Err(error) => debug!(%to, %error, "cannot connect"),
                     }
                     backoff.wait().await;
                 }
             }
             Source::Listen(listener) => loop {
                 let (stream, peer) = accept(&listener, &tx).await;
-                info!(%peer, "client");
+                info!(%peer, "client connected");
                 peer::watch(&stream);
                 sender.up(&mut events);
                 tokio::select! {
-                    error = pump(&stream, &mut sender, &mut events) => info!(%peer, %error, "client left"),
+                    error = pump(&stream, &mut sender, &mut events) => info!(%peer, %error, "client disconnected"),
                     () = refuse_all(&listener, &tx) => {}
                 }
                 sender.down(&mut events);
@@ -145,7 +145,7 @@ async fn refuse_all(listener: &TcpListener, tx: &PortTx) {
         drop(stream);
         tx.count(|counters| counters.refused += 1);
         if let Some(more) = tx.complaints.take(now()) {
-            warn!(%peer, more, "refused: the line has a client already");
+            warn!(%peer, more, "refused: the line already has a client");
         }
         give_way().await;
     }
@@ -164,7 +164,7 @@ fn open_serial(path: &str, settings: Rs485) -> io::Result<SerialStream> {
         // Pseudoterminals have no parity bit; some systems say so instead of ignoring it.
         Err(_) if settings.parity != Parity::None => {
             let stream = builder.open_native_async()?;
-            warn!(path, "the device has no parity, used without");
+            warn!(path, "the device does not support parity; used without");
             Ok(stream)
         }
         opened => Ok(opened?),

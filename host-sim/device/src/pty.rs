@@ -337,7 +337,7 @@ mod tests {
             let first = Pty::open(link).unwrap();
             let target = fs::read_link(link).unwrap();
             let message = Pty::open(link).unwrap_err().to_string();
-            assert!(message.contains("line: another port has it"), "{message}");
+            assert!(message.contains("line: another port uses this path"), "{message}");
             assert_eq!(fs::read_link(link).unwrap(), target);
             assert!(Pty::open(&link.join("deeper")).unwrap_err().to_string().contains("line/deeper: "));
             drop(first);

@@ -27,8 +27,8 @@ impl Link {
     /// Makes a link to `target` at `path`, and `path`'s folder if there is none.
     ///
     /// # Errors
-    /// With the path in the message: the folder cannot be made, or there is something else than a link
-    /// that nobody uses any more.
+    /// With the path in the message: the folder cannot be made, or the path is something other than a
+    /// link that nobody uses any more.
     pub(super) fn place(path: &Path, target: &Path) -> io::Result<Self> {
         let placed = || -> io::Result<Self> {
             path.parent().map_or(Ok(()), fs::create_dir_all)?;
@@ -71,9 +71,7 @@ fn is_free(path: &Path, left: Option<Made>) -> io::Result<bool> {
     let target = if found.is_symlink() { fs::read_link(path)? } else { PathBuf::new() };
     if !target.starts_with("/dev/pts") {
         return refused(
-            "there is something already, and it is not a link to a pseudoterminal; \
-             give another path or remove it"
-                .to_owned(),
+            "this exists and is not a link to a pseudoterminal; give another path or remove it".to_owned(),
         );
     }
     if left == Some(Made::of(&found)) {
@@ -83,8 +81,8 @@ fn is_free(path: &Path, left: Option<Made>) -> io::Result<bool> {
         // Pseudoterminals go with the program that made them.
         Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(false),
         _ => refused(format!(
-            "a link to {}, which a program has open; give another path or end that program, and \
-             if it has nothing to do with this link, remove the link",
+            "a link to {}, which a program has open; give another path or end that program; if \
+             it does not use this link, remove the link",
             target.display()
         )),
     }
@@ -135,7 +133,7 @@ impl Lock {
             let is_text = read(&mut file, &mut text).is_ok();
             let record = Record::parse(&text);
             if !is_text || (record.is_none() && !text.is_empty()) {
-                let what = "there is something else, and the link's lock has no place; give another path";
+                let what = "the lock of the link cannot be created: another file is there; give another path";
                 return Err(named(&path, &io::Error::new(io::ErrorKind::AlreadyExists, what)));
             }
             return Ok(Self { path, file, left: record.map(|record| record.made) });
@@ -166,12 +164,12 @@ fn named(path: &Path, error: &io::Error) -> io::Error {
 fn in_use(holder: Option<Record>) -> io::Error {
     let message = match holder {
         Some(Record { process, .. }) if process == std::process::id() => {
-            "another port has it; give each port a path of its own".to_owned()
+            "another port uses this path; give each port its own path".to_owned()
         }
         Some(Record { process, .. }) => {
-            format!("another run of host-sim has it, process {process}; end that one or give another path")
+            format!("another run of host-sim uses this path, process {process}; end it or give another path")
         }
-        None => "another run of host-sim has it; end that one or give another path".to_owned(),
+        None => "another run of host-sim uses this path; end it or give another path".to_owned(),
     };
     io::Error::new(io::ErrorKind::ResourceBusy, message)
 }
@@ -269,7 +267,7 @@ mod tests {
         let message = Link::place(&path, &name).unwrap_err().to_string();
         assert_eq!(
             message,
-            format!("{}: another port has it; give each port a path of its own", path.display())
+            format!("{}: another port uses this path; give each port its own path", path.display())
         );
         // Even when somebody has removed it.
         fs::remove_file(&path).unwrap();
@@ -325,17 +323,21 @@ mod tests {
         let (_folder, path) = place();
         let refused = || Link::place(&path, Path::new(GONE)).unwrap_err().to_string();
         fs::write(&path, "precious").unwrap();
-        assert!(refused().contains("line: there is something already"), "{}", refused());
+        assert!(refused().contains("line: this exists and is not a link"), "{}", refused());
         assert_eq!((fs::read(&path).unwrap().as_slice(), count(&path)), (&b"precious"[..], 1));
         fs::remove_file(&path).unwrap();
         symlink("/dev/null", &path).unwrap();
-        assert!(refused().contains("there is something already"));
+        assert!(refused().contains("this exists and is not a link"));
         assert_eq!(fs::read_link(&path).unwrap(), Path::new("/dev/null"));
         fs::remove_file(&path).unwrap();
         let lock = path.with_file_name(".line.lock");
         for other in [&b"precious"[..], b"\xFF", b"host-sim 1 2 3\n", &[b' '; 1 << 10]] {
             fs::write(&lock, other).unwrap();
-            assert!(refused().contains(".line.lock: there is something else"), "{}", refused());
+            assert!(
+                refused().contains(".line.lock: the lock of the link cannot be created"),
+                "{}",
+                refused()
+            );
             assert_eq!((fs::read(&lock).unwrap().as_slice(), count(&path)), (other, 1));
         }
     }

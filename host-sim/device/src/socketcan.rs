@@ -74,7 +74,7 @@ impl KernelCan {
         let tolerance = configured / 100;
         match Link::of(interface).bitrate {
             Some(bitrate) if bitrate.abs_diff(configured) > tolerance => {
-                warn!(interface, bitrate, configured, "the interface has another bit rate than the port");
+                warn!(interface, bitrate, configured, "the interface and the port have different bit rates");
             }
             _ => {}
         }
@@ -93,10 +93,10 @@ impl KernelCan {
                     self.tx.count(|counters| counters.ups += 1);
                     events(PortEvent::Up);
                     let error = attached.work(&mut events).await;
-                    warn!(interface, %error, "lost, will be opened again");
+                    warn!(interface, %error, "interface lost, will be reopened");
                     events(PortEvent::Down);
                 }
-                Err(error) => debug!(interface, %error, "not there"),
+                Err(error) => debug!(interface, %error, "cannot open the interface"),
             }
             backoff.wait().await;
         }
@@ -252,7 +252,7 @@ impl<'a> Attached<'a> {
             }
             // Some drivers tell a milder state before the controller was started again.
             News::State(state) if self.is_off() && Link::of(&self.port.interface).is_off() => {
-                debug!(?state, "said while bus-off");
+                debug!(?state, "state reported during bus-off");
             }
             News::State(state) if state != self.state => self.enter(state, events),
             News::State(_) | News::Other => {}
@@ -268,12 +268,12 @@ impl<'a> Attached<'a> {
         match state {
             BusState::BusOff => {
                 if let Some(more) = self.off_lines.take(now()) {
-                    warn!(interface, more, "bus-off: nothing is sent until it was restarted");
+                    warn!(interface, more, "bus-off: nothing is sent until the interface is restarted");
                 }
             }
             BusState::Passive => {
                 if let Some(more) = self.passive_lines.take(now()) {
-                    let what = "error-passive: nobody acknowledges, bit rates differ, or the cable is bad";
+                    let what = "error-passive: no node acknowledges, bit rates differ, or the cable is bad";
                     warn!(interface, more, tx_error_counter, rx_error_counter, "{what}");
                 }
             }

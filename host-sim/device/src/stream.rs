@@ -137,7 +137,7 @@ pub(super) async fn accept(listener: &TcpListener, tx: &PortTx) -> (TcpStream, s
             Err(error) => {
                 tx.count(|counters| counters.accept_failures += 1);
                 if let Some(more) = tx.complaints.take(now()) {
-                    warn!(%error, more, "a client could not be accepted");
+                    warn!(%error, more, "cannot accept a client");
                 }
                 tokio::time::sleep(StdDuration::from_millis(50)).await;
             }

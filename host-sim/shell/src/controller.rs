@@ -51,7 +51,7 @@ pub fn start(config: SimConfig, binds: Vec<Bind>) -> Result<Handle, StartError> 
 fn spawn(config: SimConfig, binds: Vec<Bind>, scheduling: Scheduling) -> Result<Handle, StartError> {
     host::start("controller", async move || {
         let running = Running::open(config, &binds).await?;
-        info!(scheduling = %realtime::apply(scheduling), "the simulated controller runs");
+        info!(scheduling = %realtime::apply(scheduling), "the simulated controller is running");
         Ok(running)
     })
 }
@@ -201,7 +201,8 @@ impl Running {
             pending: RefCell::default(),
             lingering: RefCell::default(),
             busy: Cell::new(false),
-            timer: Timer::new().map_err(|error| StartError::new(format!("no timer: {error}")))?,
+            timer: Timer::new()
+                .map_err(|error| StartError::new(format!("cannot create a timer: {error}")))?,
             ended: Notify::new(),
             counters: Cell::default(),
             refusals: Quota::default(),
@@ -243,7 +244,7 @@ impl ControllerShell {
             });
         });
         if let Err(error) = ended.await {
-            error!(port = %self.port_names[port], %error, "the device failed for good");
+            error!(port = %self.port_names[port], %error, "the device failed permanently");
             self.input(ControllerInput::PortDown { port });
         }
     }
@@ -252,7 +253,7 @@ impl ControllerShell {
     async fn keep_time(self: Rc<Self>) {
         loop {
             if let Err(error) = self.timer.expired().await {
-                error!(%error, "no time any more");
+                error!(%error, "the timer failed");
                 return;
             }
             self.input(ControllerInput::Tick);
@@ -287,7 +288,7 @@ impl ControllerShell {
         };
         self.busy.set(false);
         if let Err(error) = self.timer.arm(until) {
-            error!(%error, "the timer cannot be set");
+            error!(%error, "cannot set the timer");
         }
     }
 
@@ -367,7 +368,7 @@ impl ControllerShell {
         if let Some(client) = connections.remove(&conn) {
             client.connection.abort();
             if let Some(more) = self.complaints.take(now()) {
-                warn!(link = ?client.link, conn = conn.0, more, "dropped: does not take what is sent");
+                warn!(link = ?client.link, conn = conn.0, more, "disconnected: does not read what is sent");
             }
             self.count(|counters| counters.slow_clients += 1);
             self.pending.borrow_mut().push_back(Report::Dropped(client.link, conn));
@@ -428,12 +429,12 @@ async fn open_devices(config: &SimConfig, binds: &[Bind]) -> Result<Vec<Option<P
     for (index, bind) in binds.iter().enumerate() {
         let refused = |why: &str| Err(StartError::new(format!("--bind {bind}: {why}")));
         match config.ports.iter().find(|port| port.name == bind.port) {
-            None => return refused(&format!("no port has this name; {}", bindable(config))),
+            None => return refused(&format!("there is no such port; {}", bindable(config))),
             Some(port) if bus_of(&port.bus).is_none() => {
                 return refused("this port is reached over the network and takes no device");
             }
             Some(_) if binds[..index].iter().any(|other| other.port == bind.port) => {
-                return refused("the port is bound already");
+                return refused("the port is already bound");
             }
             Some(_) => {}
         }
@@ -464,7 +465,7 @@ async fn open_device(name: &str, bus: PortBus, binds: &[Bind]) -> Result<Port, S
             PortBus::Can { .. } => ("CAN bus", "socketcan:INTERFACE, slcan-pty:PATH or slcan-tcp:HOST:PORT"),
         };
         return Err(StartError::new(format!(
-            "port {name} is a {kind} without a device: add --bind {name}=DEVICE, DEVICE being {forms}"
+            "port {name} is a {kind} without a device: add --bind {name}=DEVICE, where DEVICE is {forms}"
         )));
     };
     let opened = Port::open(&bind.device, bus).await;
@@ -475,9 +476,9 @@ fn bindable(config: &SimConfig) -> String {
     let ports = config.ports.iter().filter(|port| bus_of(&port.bus).is_some());
     let names: Vec<_> = ports.map(|port| port.name.as_str()).collect();
     if names.is_empty() {
-        "there is none that takes a device".to_owned()
+        "no port takes a device".to_owned()
     } else {
-        format!("those that take a device: {}", names.join(", "))
+        format!("ports that take a device: {}", names.join(", "))
     }
 }
 

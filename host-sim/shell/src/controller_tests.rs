@@ -387,7 +387,7 @@ fn what_keeps_it_from_starting_is_one_message_and_nothing_stays() {
     let message = refused(serial(), &[]);
     assert!(message.starts_with("port rs485 is a serial line without a device: add --bind rs485=DEVICE"));
     let message = refused(serial(), &["rs485-1=pty:/dev/null/x"]);
-    assert!(message.contains("no port has this name; those that take a device: rs485"), "{message}");
+    assert!(message.contains("there is no such port; ports that take a device: rs485"), "{message}");
     let message = refused(serial(), &["rs485=slcan-tcp:127.0.0.1:0"]);
     assert!(message.contains("is a CAN device; the port is a serial line"), "{message}");
     let message = refused(example("udp-server-controller.toml", &[]), &["udp2011=pty:/dev/null/x"]);
@@ -398,7 +398,7 @@ fn what_keeps_it_from_starting_is_one_message_and_nothing_stays() {
     let folder = tempfile::tempdir().unwrap();
     let link = folder.path().join("rs485").display().to_string();
     let once = format!("rs485=pty:{link}");
-    assert!(refused(serial(), &[&once, &once]).contains("the port is bound already"));
+    assert!(refused(serial(), &[&once, &once]).contains("the port is already bound"));
     // The device was opened, then a server's port turned out to be taken.
     let held = StdListener::bind("127.0.0.1:0").unwrap();
     let mut config = serial();

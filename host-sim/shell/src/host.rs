@@ -51,7 +51,8 @@ pub(super) fn start<S: Shell>(
     let (opened, outcome) = blocking::channel();
     let thread = std::thread::Builder::new().name(name.to_owned()).stack_size(STACK).spawn(move || {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
-        let runtime = runtime.map_err(|error| StartError::new(format!("no runtime: {error}")))?;
+        let runtime =
+            runtime.map_err(|error| StartError::new(format!("cannot start the runtime: {error}")))?;
         let local = LocalSet::new();
         local.block_on(&runtime, async move {
             let shell = match open().await {
@@ -69,7 +70,7 @@ pub(super) fn start<S: Shell>(
             }
         })
     });
-    let thread = thread.map_err(|error| StartError::new(format!("no thread: {error}")))?;
+    let thread = thread.map_err(|error| StartError::new(format!("cannot start a thread: {error}")))?;
     match outcome.recv() {
         Ok(Ok(ready)) => Ok(Handle { ready, requests, thread: Some(thread) }),
         Ok(Err(error)) => Err(error),
@@ -140,9 +141,9 @@ fn joined(thread: JoinHandle<Result<(), StartError>>) -> Result<(), StartError> 
 /// Says `ready`, prints statistics, and ends when a signal says so.
 pub(super) fn foreground(handle: Handle, options: &RunOptions) -> Result<(), StartError> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
-    let runtime = runtime.map_err(|error| StartError::new(format!("no runtime: {error}")))?;
-    let mut lines =
-        Lines::start().map_err(|error| StartError::new(format!("no thread for statistics: {error}")))?;
+    let runtime = runtime.map_err(|error| StartError::new(format!("cannot start the runtime: {error}")))?;
+    let mut lines = Lines::start()
+        .map_err(|error| StartError::new(format!("cannot start the thread for statistics: {error}")))?;
     let result = runtime.block_on(async {
         // Signals are caught before anybody can know that we are ready.
         let refused = |error: io::Error| StartError::new(format!("signals: {error}"));
@@ -162,7 +163,7 @@ pub(super) fn foreground(handle: Handle, options: &RunOptions) -> Result<(), Sta
                 }
                 Some(failure) = lines.failures.recv() => match failure {
                     Failure::Unread if options.stats.is_some() => {
-                        tell("stdout was closed: nobody reads the statistics, ended");
+                        tell("stdout was closed; ended, because nobody reads the statistics");
                         break Ok(());
                     }
                     // There is nothing more to be said there.
@@ -170,7 +171,7 @@ pub(super) fn foreground(handle: Handle, options: &RunOptions) -> Result<(), Sta
                     Failure::NotReady(error) => {
                         break Err(StartError::new(format!("stdout: {error}")).after_start());
                     }
-                    Failure::Lost(error) => warn!(%error, "statistics cannot be written to stdout"),
+                    Failure::Lost(error) => warn!(%error, "cannot write statistics to stdout"),
                 },
                 _ = watch.tick() => {
                     if handle.has_ended() {

@@ -117,7 +117,7 @@ impl LinkControl {
         count(&mut turned_away);
         self.turned_away.set(turned_away);
         if let Some(more) = self.complaints.take(now()) {
-            warn!(link = name, %peer, more, "turned away: {why}");
+            warn!(link = name, %peer, more, "rejected: {why}");
         }
     }
 
@@ -205,7 +205,7 @@ pub(super) async fn run(
         if !control.is_over(turn) {
             match result {
                 Ok(()) => info!(link = name, "closed by the controller"),
-                Err(error) => debug!(link = name, %error, "not connected"),
+                Err(error) => debug!(link = name, %error, "cannot connect"),
             }
             control.close();
             events(LinkEvent::Down);

@@ -59,12 +59,10 @@ impl ReadyFile {
             Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(true),
             Err(error) => Err(self.refused(error)),
             Ok(found) if found.is_dir() => refused(FOLDER),
-            Ok(found) if !found.is_file() => refused("no ordinary file; give another name"),
+            Ok(found) if !found.is_file() => refused("not a regular file; give another name"),
             Ok(found) => match read(&self.path, found.len()).map_err(|error| self.refused(error))? {
                 Some(text) if is_ready(&text) => Ok(false),
-                _ => refused(
-                    "there is a file already, and it is none that a run left; give another name or remove it",
-                ),
+                _ => refused("this file exists and was not left by a run; give another name or remove it"),
             },
         }
     }
@@ -177,14 +175,14 @@ mod tests {
             fs::write(&path, other).unwrap();
             let message = ReadyFile::at(path.clone()).unwrap_err().to_string();
             assert!(
-                message.starts_with(&format!("--ready {}: there is a file", path.display())),
+                message.starts_with(&format!("--ready {}: this file exists", path.display())),
                 "{message}"
             );
             assert_eq!(fs::read_to_string(&path).unwrap(), other);
         }
         fs::remove_file(&path).unwrap();
         std::os::unix::fs::symlink("/dev/null", &path).unwrap();
-        assert!(ReadyFile::at(path.clone()).unwrap_err().to_string().contains("no ordinary file"));
+        assert!(ReadyFile::at(path.clone()).unwrap_err().to_string().contains("not a regular file"));
         fs::remove_file(&path).unwrap();
         fs::create_dir(&path).unwrap();
         assert!(ReadyFile::at(path.clone()).unwrap_err().to_string().contains("a folder; give the name"));

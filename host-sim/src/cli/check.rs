@@ -16,10 +16,10 @@ use recipe_config::file::{self, Config, FileError};
 use recipe_config::{SimBus, SimConfig, SimField, SimParts, SimPort, SimRecipe, SimStreamPart};
 use recipe_controller::{BuildError, Controller};
 
-/// What `check` is told.
+/// Arguments of `check`.
 #[derive(Debug, Args)]
 pub(super) struct CheckArgs {
-    /// A gateway's or a controller's file
+    /// A gateway file or a controller file
     file: PathBuf,
     #[command(flatten)]
     overrides: Overrides,

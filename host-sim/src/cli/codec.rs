@@ -53,7 +53,7 @@ impl Part {
         let recipe = match (name, recipes) {
             (_, []) => return Err("there is no recipe in this file".into()),
             (None, [only]) => only,
-            (None, _) => return Err(format!("which recipe? --recipe NAME; there are {}", names())),
+            (None, _) => return Err(format!("several recipes; choose one with --recipe NAME: {}", names())),
             (Some(name), _) => recipes
                 .iter()
                 .find(|recipe| recipe.name == name)
@@ -77,7 +77,7 @@ impl Part {
             (None, false, _) => Direction::Output,
             (None, true, true) => {
                 return Err(format!(
-                    "recipe {:?} has both parts; --part input (user to robot) or --part output (robot to user)",
+                    "recipe {:?} has both parts; choose one: --part input (user to robot) or --part output (robot to user)",
                     recipe.name
                 ));
             }

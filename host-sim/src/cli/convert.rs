@@ -68,7 +68,7 @@ pub(super) fn decode_lines(
         Layout::Datagram(layout) => decode_datagrams(part, layout, input, out, notes)?,
         Layout::Can(_) => decode_can(part, input, out, notes)?,
     };
-    if frames == 0 { Err("no frame of this recipe was found".into()) } else { Ok(()) }
+    if frames == 0 { Err("the input has no frame of this recipe".into()) } else { Ok(()) }
 }
 
 /// Which frame of a CAN part is meant.
@@ -103,7 +103,7 @@ fn find_frame(part: &Part, wanted: Option<Wanted>) -> Result<usize, String> {
     };
     let (found, shown) = match wanted {
         None if part.frames.len() == 1 => (Some(0), String::new()),
-        None => return Err(format!("which frame? --id ID; there are {}", known())),
+        None => return Err(format!("several frames; choose one with --id ID: {}", known())),
         Some(Wanted::Number(wanted)) => (ids().position(|id| number(id) == wanted), format!("{wanted:#x}")),
         Some(Wanted::Exactly(wanted)) => (ids().position(|id| id == wanted), text::show_id(wanted)),
     };
@@ -128,8 +128,9 @@ fn scalars(frame: &FrameFields, tokens: &[String]) -> Result<Vec<Scalar>, String
         let place = frame.fields.iter().zip(&values).position(is_meant).ok_or_else(|| {
             let names: Vec<_> = frame.fields.iter().map(|field| field.name.as_str()).collect();
             match name {
-                Some(name) => format!("no field {name:?} is left; there are {}", names.join(", ")),
-                None => format!("{text:?} is one value too many; there are {}", names.join(", ")),
+                Some(name) if names.contains(&name) => format!("field {name:?} is given twice"),
+                Some(name) => format!("there is no field {name:?}; there are {}", names.join(", ")),
+                None => format!("too many values, from {text:?} on; the fields are {}", names.join(", ")),
             }
         })?;
         let field = &frame.fields[place];
@@ -175,7 +176,7 @@ fn decode_stream(
         note(notes, &format!("{} bytes skipped outside of frames", stats.skipped_bytes));
     }
     if stats.tail_mismatches > 0 {
-        note(notes, &format!("{} times a head without its tail", stats.tail_mismatches));
+        note(notes, &format!("{} heads without a tail", stats.tail_mismatches));
     }
     if pending > 0 {
         note(notes, &format!("{pending} bytes of an unfinished frame at the end"));
@@ -262,7 +263,7 @@ fn show_can(part: &Part, frame: &CanFrame, line: usize, notes: &mut dyn Write) -
         CanReject::UnknownId { id } => format!("id {} is not in the recipe", text::show_id(id)),
         CanReject::Remote { id } => format!("id {}: a remote frame", text::show_id(id)),
         CanReject::WrongLength { expected, got, .. } => {
-            format!("id {}: {got} bytes, and the recipe has {expected}", text::show_id(frame.id()))
+            format!("id {}: {got} bytes instead of {expected}", text::show_id(frame.id()))
         }
         other => format!("{other}"),
     })?;

@@ -11,15 +11,15 @@ use proto_core::config::image;
 use super::{Outcome, Overrides, check};
 use recipe_device::files::{Beside, Identity};
 
-/// What `image` is told.
+/// Arguments of `image`.
 #[derive(Debug, Args)]
 pub(super) struct ImageArgs {
-    /// A gateway's file
+    /// A gateway file
     file: PathBuf,
     /// Where the image is written; an older image there is replaced
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
-    /// Replace a file that is no image, too; never the one that is read
+    /// Replace a file even if it is not an image; never the file that is read
     #[arg(long)]
     force: bool,
     #[command(flatten)]
@@ -44,7 +44,7 @@ fn write(args: &ImageArgs, bytes: &[u8]) -> io::Result<()> {
     let found = match fs::metadata(&args.output) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => {
             if args.output.is_symlink() {
-                return refused("a link that leads nowhere; give another name");
+                return refused("a link to a file that does not exist; give another name");
             }
             return Beside::file(&args.output, bytes)?.0.put_new(&args.output);
         }
@@ -59,13 +59,13 @@ fn write(args: &ImageArgs, bytes: &[u8]) -> io::Result<()> {
         return refused("a folder; give the name of a file in it");
     }
     if !kind.is_file() {
-        return refused("no ordinary file; give another name");
+        return refused("not a regular file; give another name");
     }
     if Identity::of(&found) == Identity::of(&fs::metadata(&args.file)?) {
-        return refused("this is the file that the image is made of; give another name");
+        return refused("this is the file that the image is made from; give another name");
     }
     if !args.force && !is_image(&args.output)? {
-        return refused("there is a file already, and it is no image; give another name or --force");
+        return refused("this file exists and is not an image; give another name or --force");
     }
     // Behind a link, it is the file that is replaced.
     let place = fs::canonicalize(&args.output)?;

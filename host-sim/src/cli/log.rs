@@ -85,7 +85,7 @@ impl Lines {
         }
         let lost = std::mem::take(&mut waiting.lost);
         if lost > 0 {
-            waiting.bytes.extend_from_slice(format!("{lost} lines of the log are lost\n").as_bytes());
+            waiting.bytes.extend_from_slice(format!("{lost} log lines lost\n").as_bytes());
         }
         waiting.bytes.extend_from_slice(line);
         self.changed.notify_all();
@@ -154,7 +154,7 @@ mod tests {
         assert_eq!(begun.recv().unwrap().len(), MOST_WAITING);
         log.lines.put(b"last\n");
         go.send(()).unwrap();
-        assert_eq!(begun.recv().unwrap(), b"2048 lines of the log are lost\nlast\n");
+        assert_eq!(begun.recv().unwrap(), b"2048 log lines lost\nlast\n");
         go.send(()).unwrap();
     }
 

@@ -40,7 +40,7 @@ use recipe_shell::{self as shell, ReadyFile, RunOptions, StartError};
 pub struct Cli {
     #[command(subcommand)]
     command: Option<Command>,
-    /// Say more on stderr: once for what happens, twice for every frame
+    /// Log more to stderr: -v what happens, -vv every frame
     #[arg(short, long, action = clap::ArgAction::Count, global = true)]
     verbose: u8,
 }
@@ -48,7 +48,7 @@ pub struct Cli {
 const TOP_EXAMPLES: &str = "\
 Examples:
   host-sim                                       the demo
-  host-sim check cell.toml                       is it right, what goes on the pendant?
+  host-sim check cell.toml                       check the file; what to set on the pendant
   host-sim controller -c robot.toml --bind rs485=pty:run/rs485
   host-sim gateway -c cell.toml --bind rs485-1=serial:/dev/ttyUSB0
   host-sim encode cell.toml --part input 1       the frame that switches DO1 on
@@ -68,19 +68,19 @@ enum Command {
     /// Run the gateway
     #[command(after_help = GATEWAY_EXAMPLES)]
     Gateway(Run),
-    /// Check a file; print the bus budget, the ways up and what to set on the pendant
+    /// Check a file; print the bus budget, the way of each variable and what to set on the pendant
     #[command(after_help = CHECK_EXAMPLES)]
     Check(check::CheckArgs),
-    /// Write the configuration image that a board keeps
+    /// Write the configuration image for a board
     #[command(after_help = IMAGE_EXAMPLES)]
     Image(image::ImageArgs),
-    /// Run cells in virtual time, under faults, and check everything that the gateway does
+    /// Run cells in virtual time with injected faults, and check everything that the gateway does
     #[command(after_help = soak::EXAMPLES)]
     Soak(soak::SoakArgs),
-    /// Make a frame from values
+    /// Encode values as a frame
     #[command(after_help = ENCODE_EXAMPLES)]
     Encode(EncodeArgs),
-    /// Show the values in frames
+    /// Decode frames to values
     #[command(after_help = DECODE_EXAMPLES)]
     Decode(DecodeArgs),
 }
@@ -95,7 +95,7 @@ Examples:
   host-sim controller -c robot.toml --bind rs485=pty:run/rs485 --bind can=slcan-tcp:127.0.0.1:3333
   host-sim controller -c robot.toml --set listen.modbus=1502 --ready run/ready.json --stats 1s
 
-Once everything listens, a line `ready {json}` on stdout tells the actual addresses.";
+Once everything is listening, a line `ready {json}` on stdout gives the actual addresses.";
 
 const GATEWAY_EXAMPLES: &str = "\
 Examples:
@@ -108,7 +108,7 @@ Examples:
   host-sim check cell.toml
   host-sim check cell.toml --set port.rs485-1.baud=9600
 
-Exit code 2 and one message with file, line, column and key when something is wrong.";
+If something is wrong: exit code 2 and one message with file, line, column and key.";
 
 const IMAGE_EXAMPLES: &str = "\
 Examples:
@@ -116,8 +116,8 @@ Examples:
   host-sim image cell.toml --set controller.address=10.0.2.2 -o cell.img";
 
 const ENCODE_EXAMPLES: &str = "\
-Values stand in field order or as NAME=VALUE; decimal, 0x1F or 0.5.
-Without values, lines as `decode` prints them are read from stdin.
+Values are given in field order or as NAME=VALUE: decimal, 0x1F or 0.5.
+Without values, lines in the form that `decode` prints are read from stdin.
 
 Examples:
   host-sim encode cell.toml --part input 1
@@ -128,7 +128,7 @@ Examples:
       host-sim encode can.toml --part output";
 
 const DECODE_EXAMPLES: &str = "\
-Frames are hex bytes (FF FF 01 EE EE, FFFF01EEEE), or of a CAN recipe what
+Frames are hex bytes (FF FF 01 EE EE, FFFF01EEEE); for a CAN recipe, what
 candump prints:
   (1436509052.249713) can0 123#AABB
     can0  123   [2]  AA BB
@@ -139,7 +139,7 @@ Examples:
   host-sim decode cell.toml --part input FF FF 01 EE EE
   candump -L can0 | host-sim decode can.toml --part output";
 
-/// What `controller` and `gateway` are told.
+/// Arguments of `controller` and `gateway`.
 #[derive(Debug, Args)]
 struct Run {
     /// The file
@@ -147,15 +147,15 @@ struct Run {
     config: PathBuf,
     #[command(flatten)]
     overrides: Overrides,
-    /// Tie a port to a device: pty:PATH, pty-paced:PATH, serial:/dev/ttyUSB0, tcp:HOST:PORT,
+    /// Bind a port to a device: pty:PATH, pty-paced:PATH, serial:/dev/ttyUSB0, tcp:HOST:PORT,
     /// tcp-listen:HOST:PORT; socketcan:vcan0, slcan-pty:PATH, slcan-tcp:HOST:PORT[,PATH], the last two
     /// also as slcan-pty-unpaced and slcan-tcp-unpaced
     #[arg(long, value_name = "NAME=DEVICE")]
     bind: Vec<Bind>,
-    /// Write the actual addresses to this file, once everything listens; it is removed at the end
+    /// Write the actual addresses to this file once everything is listening; removed at the end
     #[arg(long, value_name = "FILE")]
     ready: Option<PathBuf>,
-    /// Print a line of counters this often, such as 1s or 200ms, until nobody reads them
+    /// Print a line of counters at this interval, such as 1s or 200ms, until stdout is closed
     #[arg(long, value_name = "TIME", value_parser = parse_time)]
     stats: Option<Duration>,
 }
@@ -171,7 +171,7 @@ struct Overrides {
 /// Which recipe of which file.
 #[derive(Debug, Args)]
 struct Which {
-    /// A gateway's or a controller's file
+    /// A gateway file or a controller file
     file: PathBuf,
     /// The recipe's name; not needed when there is only one
     #[arg(long, value_name = "NAME")]
@@ -202,7 +202,7 @@ impl From<PartName> for Direction {
 struct EncodeArgs {
     #[command(flatten)]
     which: Which,
-    /// Which frame of a CAN recipe, by its id; not needed when there is only one
+    /// The CAN id of the frame; not needed when there is only one
     #[arg(long, value_name = "ID", value_parser = convert::parse_id)]
     id: Option<u32>,
     /// The values

@@ -20,11 +20,11 @@ use recipe_shell::out::tell;
 
 pub(super) const EXAMPLES: &str = "\
 Runs the gateway's engine against the simulated controller in virtual time: devices
-send what they should and what they should not, networks and lines break, both
-programs restart. At every step a model of its own checks what the gateway does:
-that no value is written that nobody sent, none too late, none twice, no edge lost
-without being counted, nothing shown that is old, and so on; and at the robot's
-side that what arrives is young, and that what stops it arrives (docs/cell.md).
+send valid and invalid data, networks and lines break, both
+programs restart. At every step an independent model checks what the gateway does:
+that every value written was sent by somebody, in time and once, that no edge is lost
+without being counted, that nothing stale is shown, and so on; and at the robot's
+side that what arrives is recent, and that what stops it arrives (docs/cell.md).
 
 The same seed gives the same trace hash on every machine, whatever --jobs is. A
 violation is printed with the command that repeats it.
@@ -36,9 +36,9 @@ Examples:
   host-sim soak --cell cell.toml,robot.toml      your own gateway and controller
   host-sim soak --replay 93570312@41.250300 --trace
 
-Exit codes: 0 all invariants held, 1 one did not, 2 an argument is wrong.";
+Exit codes: 0 all invariants held; 1 one was violated; 2 an argument is invalid.";
 
-/// What `soak` is told.
+/// Arguments of `soak`.
 #[derive(Debug, Args)]
 pub(super) struct SoakArgs {
     /// Virtual hours, over all runs together
@@ -47,14 +47,14 @@ pub(super) struct SoakArgs {
     /// The seed that all others are derived from
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// How much goes wrong
+    /// How many faults
     #[arg(long, value_name = "LEVEL", default_value = "harsh")]
     faults: LevelName,
-    /// An embedded cell by name, or GATEWAY.toml,CONTROLLER.toml; again for more, all embedded ones
-    /// when there is none
+    /// An embedded cell by name, or GATEWAY.toml,CONTROLLER.toml; repeat it for more cells
+    /// [default: all embedded cells]
     #[arg(long, value_name = "CELL")]
     cell: Vec<String>,
-    /// How many threads [default: one for each processor]
+    /// Number of threads [default: one for each processor]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
     jobs: Option<u16>,
     /// Repeat one run up to this instant, with the same --cell and --faults
@@ -67,11 +67,11 @@ pub(super) struct SoakArgs {
 
 #[derive(Debug, Clone, Copy, ValueEnum)]
 enum LevelName {
-    /// Devices are careless, nothing else
+    /// No faults; devices send carelessly
     None,
-    /// A fault each half minute
+    /// A fault every 30 s
     Mild,
-    /// A fault each second, on a network that delays, splits and joins
+    /// A fault every second, on a network that delays, splits and joins
     Harsh,
 }
 
@@ -106,7 +106,7 @@ fn scenarios(cells: &[String]) -> Result<Vec<Scenario>, String> {
             None => Scenario::named(cell).map_err(|error| error.to_string())?.ok_or_else(|| {
                 let names: Vec<_> = Scenario::names().collect();
                 format!(
-                    "--cell {cell}: no cell is called so; there are {}, or give GATEWAY.toml,CONTROLLER.toml",
+                    "--cell {cell}: there is no such cell; there are {}; or give GATEWAY.toml,CONTROLLER.toml",
                     names.join(", ")
                 )
             })?,

@@ -45,7 +45,7 @@ fn split_time(line: &str) -> Result<(Option<String>, &str), String> {
     if !line.starts_with('(') {
         return Ok((None, line));
     }
-    let (time, rest) = line.split_once(')').ok_or("a time without its ')'")?;
+    let (time, rest) = line.split_once(')').ok_or("a time without ')'")?;
     Ok((Some(format!("{time})")), rest.trim_start()))
 }
 
@@ -59,7 +59,7 @@ pub(super) fn parse_can_line(line: &str) -> Result<Option<CanLine>, String> {
     let tokens: Vec<&str> = rest.split_whitespace().collect();
     let not_can = || {
         format!(
-            "{:?} is no CAN frame; write 123#AABB, (time) can0 123#AABB, or can0 123 [2] AA BB",
+            "{:?} is not a CAN frame; write 123#AABB, (time) can0 123#AABB, or can0 123 [2] AA BB",
             line.trim()
         )
     };
@@ -129,7 +129,7 @@ fn is_error(id: &str) -> bool {
 /// Up to three hexadecimal digits are a standard id, eight an extended one, as candump has it.
 pub(super) fn parse_can_id(digits: &str) -> Result<CanId, String> {
     let refused =
-        || format!("{digits:?} is no CAN id; three hexadecimal digits, or eight for an extended id");
+        || format!("{digits:?} is not a CAN id; write three hexadecimal digits, or eight for an extended id");
     let id = u32::from_str_radix(digits, 16).map_err(|_| refused())?;
     let id = match digits.len() {
         1..=3 => CanId::Standard(id as u16),
@@ -177,7 +177,7 @@ pub(super) fn parse_hex_line(line: &str) -> Result<Vec<u8>, String> {
 }
 
 fn parse_hex(digits: &str) -> Result<Vec<u8>, String> {
-    let refused = || format!("{digits:?} is not hexadecimal, two digits a byte");
+    let refused = || format!("{digits:?} is not hexadecimal with two digits for each byte");
     if !digits.is_ascii() || !digits.len().is_multiple_of(2) {
         return Err(refused());
     }

@@ -56,7 +56,8 @@ fn check_says_how_full_lines_are_which_way_variables_go_and_what_goes_on_the_pen
 fn wrong_files_and_arguments_start_nothing() {
     let file = path("rs485-system.toml");
     let baud = "port.rs485-1.baud=1";
-    let expected = "--set port.rs485-1.baud=1: port.rs485-1.baud: 1 is out of range; 1200..=4000000\n";
+    let expected =
+        "--set port.rs485-1.baud=1: port.rs485-1.baud: 1 is out of range; allowed: 1200..=4000000\n";
     assert_eq!(refused(&["check", &file, "--set", baud]), expected);
     assert_eq!(refused(&["gateway", "-c", &file, "--set", baud]), expected);
     assert!(refused(&["controller", "-c", &file]).contains("this is a gateway file"));
@@ -68,7 +69,10 @@ fn wrong_files_and_arguments_start_nothing() {
     assert!(refused(&["gateway"]).contains("--config"));
     assert!(refused(&["nonsense"]).contains("nonsense"));
     let which = refused(&["encode", &file, "1"]);
-    assert!(which.contains("has both parts; --part input (user to robot) or --part output"), "{which}");
+    assert!(
+        which.contains("has both parts; choose one: --part input (user to robot) or --part output"),
+        "{which}"
+    );
 }
 
 #[test]
@@ -144,7 +148,7 @@ fn an_image_replaces_nothing_but_images() {
         for force in [&["--force"][..], &[]] {
             let said = refused(&[&["image", &file, "-o", output], force].concat());
             assert!(
-                said.starts_with(&format!("{output}: this is the file that the image is made of")),
+                said.starts_with(&format!("{output}: this is the file that the image is made from")),
                 "{said}"
             );
             assert_eq!(said.lines().count(), 1);
@@ -153,10 +157,7 @@ fn an_image_replaces_nothing_but_images() {
     // Others only when it is said.
     std::fs::write(&image, "precious").unwrap();
     let said = refused(&["image", &file, "-o", &image]);
-    assert!(
-        said.contains("there is a file already, and it is no image; give another name or --force"),
-        "{said}"
-    );
+    assert!(said.contains("this file exists and is not an image; give another name or --force"), "{said}");
     assert_eq!(std::fs::read(&image).unwrap(), b"precious");
     ok(&["image", &file, "-o", &image, "--force"], "");
     let first = std::fs::read(&image).unwrap();

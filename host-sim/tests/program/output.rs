@@ -129,8 +129,11 @@ fn a_reader_that_had_enough_ends_a_command_quietly() {
     for line in command_lines(folder.path()) {
         for to in [To::Nobody, To::Head] {
             let (code, said) = outcome(&line, to, folder.path());
-            let why =
-                if runs_on(&line) { "stdout was closed: nobody reads the statistics, ended\n" } else { "" };
+            let why = if runs_on(&line) {
+                "stdout was closed; ended, because nobody reads the statistics\n"
+            } else {
+                ""
+            };
             assert_eq!((code, said.as_str()), (Some(0), why), "{line:?} to {to:?}");
             assert_eq!(left_behind(folder.path()), [""; 0].map(PathBuf::from), "{line:?} to {to:?}");
         }
@@ -170,7 +173,7 @@ fn a_disk_that_fills_up_later_costs_statistics_and_does_not_end_a_gateway() {
         child.kill().unwrap();
         panic!("nothing is said")
     });
-    assert!(said.contains("statistics cannot be written to stdout"), "{said}");
+    assert!(said.contains("cannot write statistics to stdout"), "{said}");
     assert!(std::fs::read_to_string(&log).unwrap().starts_with("ready {"));
     // It runs on, and says so only once.
     assert!(folder.path().join("ready.json").exists() && folder.path().join("line").exists());

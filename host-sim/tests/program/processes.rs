@@ -138,9 +138,7 @@ fn a_ready_file_costs_nobody_anything() {
     std::fs::copy(example("rs485-system.toml"), &file).unwrap();
     let toml = std::fs::read(&file).unwrap();
     std::fs::create_dir(at("folder")).unwrap();
-    for (place, why) in
-        [(&file, "there is a file already, and it is none that a run left"), (&at("folder"), "a folder")]
-    {
+    for (place, why) in [(&file, "this file exists and was not left by a run"), (&at("folder"), "a folder")] {
         let message = refused(gateway_of(&file, &line).arg("--ready").arg(place));
         assert!(message.starts_with(&format!("--ready {}: {why}; give ", place.display())), "{message}");
     }
@@ -180,7 +178,7 @@ fn a_line_that_another_program_uses_is_not_taken_away() {
     let leads_to = std::fs::read_link(&line).unwrap();
     let message = refused(&mut gateway(&line));
     let holder = format!(
-        "line: another run of host-sim has it, process {}; end that one or give",
+        "line: another run of host-sim uses this path, process {}; end it or give",
         first.pid().as_raw_pid()
     );
     assert!(message.starts_with(&format!("--bind rs485-1=pty:{}: ", line.display())), "{message}");

@@ -45,7 +45,7 @@ fn refused(case: &Case, spoil: Spoil) {
 /// In flash an image that was cut goes on with erased bytes.
 const BEHIND_THE_END: &str = "the image is damaged";
 /// Flash without an image.
-const ERASED: &str = "no configuration image: it begins with [FF, FF, FF, FF]";
+const ERASED: &str = "not a configuration image: it begins with [FF, FF, FF, FF]";
 const THREE_LINES: &str = r#"
 [controller]
 address = "127.0.0.1"

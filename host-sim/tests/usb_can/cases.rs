@@ -197,7 +197,7 @@ fn unplugged() {
         let port = cell.port("down", |port| port["downs"] == round);
         assert_eq!(port["device"]["ups"], round, "{port}");
         until("a warning", || {
-            let warnings = cell.gateway.log("lost, will be opened again");
+            let warnings = cell.gateway.log("interface lost, will be reopened");
             (warnings.len() == usize::from(round)).then_some(())
         });
         // The hand is not there.
@@ -230,7 +230,7 @@ fn unplugged_from_the_controller() {
         adapter.unplug();
         let sent = until("it says so", || {
             let stats = robot.fresh();
-            let lost = robot.log("lost, will be opened again").len() == usize::from(round);
+            let lost = robot.log("interface lost, will be reopened").len() == usize::from(round);
             lost.then(|| stats["ports"]["can"]["device"]["frames_out"].clone())
         });
         assert_eq!(robot.fresh()["ports"]["can"]["device"]["frames_out"], sent);

@@ -1,8 +1,8 @@
-//! The gateway's side of a port-2000 connection: one request in flight, one urgent one beside it,
-//! and where their replies end (docs/wire/command.md section 6).
+//! The gateway's side of a port-2000 connection: one request in flight, one urgent request beside
+//! it, and where their replies end (docs/wire/command.md section 6).
 //!
-//! In: a command to send, received bytes and the time. Out: the bytes to send, replies, texts
-//! that nobody asked for, and a timeout. Decides nothing about what to send or to send again.
+//! In: a command to send, received bytes and the time. Out: the bytes to send, replies, unsolicited
+//! texts, and a timeout. Does not decide what to send or to repeat.
 
 use core::cell::Cell;
 use core::fmt;
@@ -13,7 +13,7 @@ use super::text::{is_blank, is_terminator, trim_start};
 use crate::time::{Duration, Instant};
 use crate::wire::dialect::{Dialect, Parentheses, Terminator};
 
-/// Longest reply that is taken whole; the rest of a longer one is dropped and counted.
+/// Maximum length of a reply; the rest of a longer one is dropped and counted.
 pub const MAX_REPLY: usize = 320;
 
 /// One connection to port 2000.
@@ -32,13 +32,13 @@ pub struct CommandClient {
     pub timeout: Duration,
     /// The older of the requests in flight.
     waiting: Option<Waiting>,
-    /// The one that was sent without waiting for its reply.
+    /// The urgent request that was sent without waiting for the other's reply.
     beside: Option<Waiting>,
     buffer: [u8; MAX_REPLY],
     len: usize,
-    /// Bytes at the front that were handed out; they go at the next call.
+    /// Bytes at the front that were returned; they are removed by the next call.
     handed_out: usize,
-    /// Behind a text that was too long, up to its end.
+    /// After a text that was too long, until its end.
     dropping: bool,
     newest: Instant,
     dropped: u32,
@@ -51,30 +51,30 @@ struct Waiting {
     until: Instant,
 }
 
-/// The outcome of a request, or a text that no request asked for.
+/// The result of a request, or an unsolicited text.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum ClientEvent<'a> {
-    /// The reply to a request in flight, which is over.
+    /// The reply to a request in flight, which is then over.
     Reply {
-        /// Whether that was the younger of two; the younger one is the only one when the older has its
-        /// reply.
+        /// Whether it was the newer of two requests. When the older one has its reply, the newer
+        /// one is the only one.
         beside: bool,
-        /// What kind of answer it is.
+        /// The kind of answer.
         kind: ReplyKind,
         /// The answer.
         reply: Reply<'a>,
-        /// Its text, without a terminator.
+        /// The answer's text, without a terminator.
         text: &'a [u8],
     },
     /// A program that was started from port 2000 has ended.
     ScriptFinish,
-    /// A text that answers nothing in flight: a late reply, or one we do not know.
+    /// A text that answers no request in flight: a late reply, or an unknown text.
     Unsolicited {
         /// The text, without a terminator.
         text: &'a [u8],
     },
-    /// What is in flight is given up. A reply may still come, as an unsolicited text; a value would
-    /// be taken for the next reply of its kind, so reconnect before asking again.
+    /// The request in flight is given up. A reply may still come, as an unsolicited text; a value
+    /// would be taken for the next reply of its kind, so reconnect before the next request.
     Timeout,
 }
 
@@ -83,18 +83,18 @@ pub enum ClientEvent<'a> {
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
 pub enum StartError {
-    /// A request is in flight.
+    /// A request is already in flight.
     Busy,
     /// The text is not a command.
     Command(ParseError),
-    /// The command cannot be written.
+    /// The command cannot be encoded.
     Encode(EncodeError),
 }
 
 impl fmt::Display for StartError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::Busy => f.write_str("the command before has not been answered yet"),
+            Self::Busy => f.write_str("the previous command has not been answered yet"),
             Self::Command(error) => error.fmt(f),
             Self::Encode(error) => error.fmt(f),
         }
@@ -126,7 +126,7 @@ impl CommandClient {
         self.waiting.is_some()
     }
 
-    /// Whether two requests are in flight: no other one can be sent.
+    /// Whether two requests are in flight, so that no other can be sent.
     pub const fn busy_beside(&self) -> bool {
         self.beside.is_some()
     }
@@ -137,10 +137,10 @@ impl CommandClient {
     }
 
     /// Writes the command `text` in the dialect's form to the front of `out` and returns its
-    /// length; from now on its reply is waited for.
+    /// length; the request is then in flight.
     ///
     /// # Errors
-    /// [`StartError`]; nothing has begun then.
+    /// [`StartError`]; nothing was started then.
     pub fn start(
         &mut self,
         now: Instant,
@@ -152,10 +152,10 @@ impl CommandClient {
         self.start_request(now, &request, dialect, out)
     }
 
-    /// As [`start`](Self::start), for a request that is not text yet.
+    /// Same as [`start`](Self::start), for a request that is not text yet.
     ///
     /// # Errors
-    /// [`StartError`]; nothing has begun then.
+    /// [`StartError`]; nothing was started then.
     pub fn start_request(
         &mut self,
         now: Instant,
@@ -168,7 +168,7 @@ impl CommandClient {
         }
         let len = request.encode(dialect, out).map_err(StartError::Encode)?;
         self.drop_handed_out();
-        // What came before the request cannot be the beginning of its reply.
+        // Bytes that came before the request cannot be the beginning of its reply.
         if !SCRIPT_FINISH.as_bytes().starts_with(self.received()) {
             self.len = 0;
         }
@@ -176,13 +176,14 @@ impl CommandClient {
         Ok(len)
     }
 
-    /// Writes an urgent command without waiting for the reply to the one in flight. Replies are told
-    /// apart by their keywords (D26); one that both could get is the older request's. Where that one is
-    /// a keyword without anything behind it, a line feed ends it first: `resumestop` is no command (D2).
-    /// With nothing in flight this is [`start`](Self::start).
+    /// Writes an urgent command without waiting for the reply to the request in flight. Replies are
+    /// matched by their keywords (D26); a reply that fits both belongs to the older request. If the
+    /// older one is a keyword with nothing after it, a line feed ends it first: `resumestop` is not
+    /// a command (D2). Without a request in flight this is the same as [`start`](Self::start).
     ///
     /// # Errors
-    /// [`StartError`]; nothing has begun then. [`StartError::Busy`] when two are in flight already.
+    /// [`StartError`]; nothing was started then. [`StartError::Busy`] if two requests are already
+    /// in flight.
     pub fn start_beside(
         &mut self,
         now: Instant,
@@ -209,8 +210,8 @@ impl CommandClient {
         Ok(len)
     }
 
-    /// Takes bytes off the front of `bytes` until something is complete. `None` means that all of
-    /// them were taken and nothing is.
+    /// Takes bytes from the front of `bytes` until an event is complete. `None` means that all of
+    /// them were taken and no event is complete.
     pub fn receive(&mut self, now: Instant, bytes: &mut &[u8]) -> Option<ClientEvent<'_>> {
         self.drop_handed_out();
         let mut silent = self.gap().is_some_and(|gap| now >= self.newest + gap);
@@ -235,12 +236,12 @@ impl CommandClient {
         }
     }
 
-    /// What silence has completed by `now`, or a timeout.
+    /// An event that silence has completed by `now`, or a timeout.
     pub fn poll(&mut self, now: Instant) -> Option<ClientEvent<'_>> {
         self.receive(now, &mut &[][..])
     }
 
-    /// When to call [`poll`](Self::poll) if nothing more is received.
+    /// When to call [`poll`](Self::poll) if no more bytes are received.
     pub fn deadline(&self) -> Option<Instant> {
         let gap = self.gap().map(|gap| self.newest + gap);
         match (gap, self.timeout_at()) {
@@ -249,7 +250,7 @@ impl CommandClient {
         }
     }
 
-    /// Forgets what is in flight and everything received, for a new connection.
+    /// Forgets the requests in flight and everything received, for a new connection.
     pub fn abort(&mut self) {
         self.waiting = None;
         self.beside = None;
@@ -258,7 +259,7 @@ impl CommandClient {
         self.dropping = false;
     }
 
-    /// Looks at the front of the buffer, behind which there was enough silence or not.
+    /// Reads the front of the buffer, which enough silence has followed or not.
     fn scan(&mut self, silent: bool) -> Option<Found> {
         let blanks = self.received().iter().take_while(|&&byte| is_blank(byte)).count();
         self.drop_front(blanks);
@@ -285,7 +286,7 @@ impl CommandClient {
                     return None;
                 }
                 let end = line.unwrap_or(bytes.len());
-                // A reply may be glued to a text that we do not know.
+                // A reply may be glued to an unknown text.
                 let glued = (1..end).find(|&at| {
                     let rest = bytes.get(at..).unwrap_or(&[]);
                     matches!(match_fixed(rest), Match::Complete { .. })
@@ -295,7 +296,7 @@ impl CommandClient {
         }
     }
 
-    /// What the front of `bytes` is, seen from the request in flight.
+    /// What the front of `bytes` is, given the request in flight.
     fn front<'b>(&self, bytes: &'b [u8]) -> Match<'b> {
         let fixed = match_fixed(bytes);
         if matches!(fixed, Match::Complete { .. }) {
@@ -323,7 +324,7 @@ impl CommandClient {
         waiting.map(|waiting| waiting.until).min()
     }
 
-    /// How much silence would end what is in the buffer.
+    /// The silence that would end the text in the buffer.
     fn gap(&self) -> Option<Duration> {
         if self.dropping {
             return Some(self.message_gap);
@@ -350,7 +351,7 @@ impl CommandClient {
                 *place = byte;
                 self.len = self.len.saturating_add(1);
             }
-            // A beginning that fills the whole buffer does not exist: see the longest replies.
+            // No beginning of a reply fills the whole buffer: see the longest replies.
             None => self.len = 0,
         }
     }
@@ -391,7 +392,7 @@ impl CommandClient {
             && let Some(held) = self.buffer.get_mut(..self.len)
             && count <= held.len()
         {
-            // As `copy_within`, without a range to be checked.
+            // Same as `copy_within`, without a range check.
             let held = Cell::from_mut(held).as_slice_of_cells();
             for (to, from) in held.iter().zip(held.iter().skip(count)) {
                 to.set(from.get());

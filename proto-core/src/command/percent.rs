@@ -1,7 +1,7 @@
 //! A speed in percent, and its text.
 //!
-//! In: a number, or its decimal text. Out: the other. The reading and printing of floats in `core`
-//! is not used: it is some 20 KiB, with checks of its own that no compiler can remove.
+//! In: a number, or its decimal text. Out: the other. The parsing and printing of floats in `core`
+//! is not used: it takes about 20 KiB, with checks that no compiler can remove.
 
 use core::fmt;
 
@@ -19,18 +19,18 @@ impl Percent {
         (percent > 0.0 && percent <= 100.0).then_some(Self(percent))
     }
 
-    /// The number, such as 50.0.
+    /// The value, such as 50.0.
     pub const fn value(self) -> f32 {
         self.0
     }
 
-    /// The speed written as a decimal number, blanks around it ignored; the binary32 nearest to it as
-    /// far as its first 19 digits tell. Less than 1e-30 is no speed.
+    /// The speed in decimal text, surrounding blanks ignored; the binary32 nearest to it as far as
+    /// its first 19 digits determine. Less than 1e-30 is not a speed.
     pub fn parse(text: &str) -> Option<Self> {
         Self::new(Decimal::parse(trim_str(text))?.nearest()?)
     }
 
-    /// The shortest decimal number that is read as this speed, with at most 30 decimals.
+    /// The shortest decimal number that is parsed as this speed, with at most 30 decimals.
     fn decimal(self) -> Decimal {
         let is_same = |decimal: &Decimal| decimal.nearest() == Some(self.0);
         let mut all = (0..MAX_DECIMALS).map(|decimals| Decimal::round(self.0, decimals));
@@ -54,13 +54,13 @@ impl fmt::Display for Percent {
 struct Decimal {
     digits: u64,
     decimals: u32,
-    /// More digits than fit follow behind the last one, and not all of them are 0.
+    /// More digits follow than fit, and not all of them are 0.
     more: bool,
 }
 
 impl Decimal {
-    /// What the number's text says. `None` when it is no number that is above 0, or one far beyond
-    /// what a speed can be.
+    /// The number in the text. `None` if it is not a number above 0, or far beyond the range of a
+    /// speed.
     fn parse(text: &str) -> Option<Self> {
         let (number, exponent) = match text.split_once(['e', 'E']) {
             Some((number, exponent)) => (number, exponent.parse().ok()?),
@@ -97,7 +97,7 @@ impl Decimal {
         (digits != 0).then_some(Self { digits, decimals: decimals.unsigned_abs(), more })
     }
 
-    /// `value`, which is above 0 and at most 100, rounded to so many decimals.
+    /// `value`, above 0 and at most 100, rounded to this many decimals.
     fn round(value: f32, decimals: u32) -> Self {
         let bits = value.to_bits();
         let (exponent, fraction) = (bits >> FRACTION_BITS, bits & FRACTION);
@@ -126,7 +126,7 @@ impl Decimal {
         Some((quotient | u128::from(inexact)) as f32 * unit)
     }
 
-    /// The number's text.
+    /// The number as text.
     fn bytes(self) -> impl Iterator<Item = u8> {
         let length = self.digits.checked_ilog10().unwrap_or(0);
         (0..=length.max(self.decimals)).rev().flat_map(move |place| {

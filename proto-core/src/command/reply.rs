@@ -1,7 +1,7 @@
-//! What a controller answers (docs/wire/command.md sections 3 and 4).
+//! The controller's replies (docs/wire/command.md sections 3 and 4).
 //!
-//! In: a [`Reply`] to be written in a [`Dialect`]'s form, or the text of one to be read. How the
-//! end of a reply is found is the client's business ([`CommandClient`](super::CommandClient)).
+//! In: a [`Reply`] to be written in a [`Dialect`]'s form, or the text of one to be read. The end of
+//! a reply is found by the client ([`CommandClient`](super::CommandClient)).
 
 use core::fmt;
 
@@ -31,14 +31,14 @@ impl Outcome {
     }
 }
 
-/// One reply, or the one text that is sent without a request.
+/// One reply, or the one unsolicited text.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum Reply<'a> {
     /// To `run`: `run start` or `run success`, `run fail`.
     Run(Outcome),
-    /// To `speed`, done: `set success`, or `set speed 50%`. `None` when read from `set success`,
-    /// which does not say; written as `set success` in every dialect then.
+    /// To `speed`, done: `set success`, or `set speed 50%`. `None` if read from `set success`,
+    /// which has no value; it is then written as `set success` in every dialect.
     SpeedSet(Option<Percent>),
     /// To `speed`, refused: `set fail`.
     SpeedRefused,
@@ -104,7 +104,7 @@ impl fmt::Display for StateCodes {
     }
 }
 
-/// What kind of answer a reply is.
+/// The kind of answer that a reply is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum ReplyKind {
@@ -119,7 +119,7 @@ pub enum ReplyKind {
 }
 
 impl<'a> Reply<'a> {
-    /// What kind of answer this is; [`ReplyKind::Value`] for the text without a request.
+    /// The kind of answer; [`ReplyKind::Value`] for the unsolicited text.
     pub const fn kind(&self) -> ReplyKind {
         match self {
             Self::Run(Outcome::Success) | Self::SpeedSet(_) | Self::Did { outcome: Outcome::Success, .. } => {
@@ -187,8 +187,8 @@ impl<'a> Reply<'a> {
         writer.finish()
     }
 
-    /// Reads the whole text of a reply to `keyword`, in the form of any dialect, with or without
-    /// a terminator. `None` when it is not one.
+    /// Reads the whole text of a reply to `keyword`, in the form of any dialect, with or without a
+    /// terminator. `None` if it is not one.
     pub fn parse(keyword: Keyword, text: &'a [u8]) -> Option<Self> {
         let text = trim(text);
         let whole = |found: Match<'a>| match found {
@@ -202,7 +202,7 @@ impl<'a> Reply<'a> {
             .filter(|reply| reply.answers(keyword) || *reply == Self::ScriptFinish)
     }
 
-    /// Whether this is an answer that `keyword` can get.
+    /// Whether this can be an answer to `keyword`.
     pub(super) fn answers(&self, keyword: Keyword) -> bool {
         match *self {
             Self::Run(_) => keyword == Keyword::Run,
@@ -220,13 +220,13 @@ impl<'a> Reply<'a> {
 /// What the front of received bytes is.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Match<'a> {
-    /// A reply of `len` bytes that no further byte could change.
+    /// A complete reply of `len` bytes, whatever follows.
     Complete { len: usize, reply: Reply<'a> },
-    /// A reply of `len` bytes, all there are, that further bytes could make longer.
+    /// A reply of `len` bytes, all there are; further bytes could make it longer.
     Open { len: usize, reply: Reply<'a> },
     /// The beginning of a reply.
     Partial,
-    /// None of it.
+    /// None of these.
     No,
 }
 
@@ -282,13 +282,13 @@ pub(super) fn match_fixed(bytes: &[u8]) -> Match<'static> {
     if partial { Match::Partial } else { Match::No }
 }
 
-/// Replies that are values; they are only looked for when `keyword` asked for one.
+/// Replies that are values; checked only if `keyword` asked for one.
 pub(super) fn match_value(keyword: Keyword, bytes: &[u8]) -> Match<'_> {
     match keyword {
         Keyword::State => match_state(bytes),
         Keyword::IsProgFinish => match bytes {
             [] => Match::Partial,
-            // More of a number is not this reply.
+            // A longer number is not this reply.
             [_, b'0'..=b'9' | b':', ..] => Match::No,
             [b'0', ..] => Match::Complete { len: 1, reply: Reply::ProgramFinished(false) },
             [b'1', ..] => Match::Complete { len: 1, reply: Reply::ProgramFinished(true) },
@@ -363,13 +363,13 @@ fn match_error(bytes: &[u8]) -> Match<'_> {
     }
 }
 
-/// How `bytes` begin, compared with `text`.
+/// How `bytes` compare with `text`.
 enum Front<'a> {
-    /// With the whole text; this is behind it.
+    /// They begin with the whole text; this is the rest.
     Whole(&'a [u8]),
-    /// They are the beginning of it.
+    /// They are the beginning of the text.
     Beginning,
-    /// Otherwise.
+    /// Neither.
     Other,
 }
 

@@ -1,4 +1,4 @@
-//! What a client asks (docs/wire/command.md section 2).
+//! The client's requests (docs/wire/command.md section 2).
 //!
 //! In: the text of one command, found by [`CommandServer`](super::CommandServer) or taken from a
 //! command table. Out: a [`Request`]. And back, in a [`Dialect`]'s form.
@@ -19,12 +19,12 @@ pub enum Request<'a> {
     Run {
         /// The program's name as written, without quotes (D3). May be empty when received.
         program: &'a str,
-        /// Speed; `None` when it was absent or not a valid one: the current speed is used.
+        /// The speed; `None` if it was absent or invalid: the current speed is used.
         speed: Option<Percent>,
     },
-    /// `speed(V)`; `None` when V was not a valid speed: the controller refuses it.
+    /// `speed(V)`; `None` if V was not a valid speed: the controller refuses it.
     Speed(Option<Percent>),
-    /// A keyword that makes the controller do something; the reply is its result.
+    /// A keyword for an action; the reply is its result.
     Do(Action),
     /// `state`
     State,
@@ -34,7 +34,7 @@ pub enum Request<'a> {
     GetLastError,
 }
 
-/// The keywords whose reply is the keyword with `success` or `fail`.
+/// The actions: keywords whose reply is the keyword with `success` or `fail`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum Action {
@@ -84,7 +84,7 @@ impl Action {
     }
 }
 
-/// The word a command begins with.
+/// The first word of a command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum Keyword {
@@ -132,7 +132,7 @@ impl Keyword {
         }
     }
 
-    /// Whether the command stops or switches off: it goes ahead of all others (D26).
+    /// Whether the command is urgent: it stops or switches off, and goes ahead of all others (D26).
     pub const fn is_urgent(self) -> bool {
         matches!(self, Self::Do(Action::Stop | Action::Pause | Action::Disable | Action::PowerOff))
     }
@@ -142,7 +142,7 @@ impl Keyword {
         !matches!(self, Self::Run | Self::Speed)
     }
 
-    /// The keyword written exactly so; case matters (D2).
+    /// The keyword with exactly this spelling; case matters (D2).
     pub fn from_word(word: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|keyword| keyword.word() == word)
     }
@@ -162,26 +162,26 @@ pub enum ParseError {
     },
     /// Not UTF-8.
     NotText {
-        /// Where it stops being UTF-8.
+        /// Offset of the first byte that is not UTF-8.
         at: usize,
     },
     /// It does not begin with a keyword.
     UnknownWord,
     /// The parentheses do not close at the end, or open twice.
     Parentheses,
-    /// `run` and `speed` need an argument.
+    /// `run` or `speed` without an argument.
     MissingArgument {
-        /// Which of the two.
+        /// The keyword.
         keyword: Keyword,
     },
-    /// Every other keyword takes none.
+    /// An argument after a keyword that takes none.
     UnexpectedArgument {
         /// The keyword.
         keyword: Keyword,
     },
-    /// A speed outside (0, 100], or not a number; only [`Request::parse_strict`] says so.
+    /// A speed outside (0, 100], or not a number; reported only by [`Request::parse_strict`].
     InvalidSpeed,
-    /// A program without a name; only [`Request::parse_strict`] says so.
+    /// A program without a name; reported only by [`Request::parse_strict`].
     NoProgram,
 }
 
@@ -192,7 +192,7 @@ impl fmt::Display for ParseError {
             Self::TooLong { len } => write!(f, "the command has {len} bytes; at most {MAX_COMMAND}"),
             Self::NotText { at } => write!(f, "the command is not UTF-8 from byte {at} on"),
             Self::UnknownWord => {
-                f.write_str("the command begins with none of")?;
+                f.write_str("unknown command; the commands are")?;
                 for (nth, keyword) in Keyword::ALL.iter().enumerate() {
                     write!(f, "{} {}", if nth == 0 { "" } else { "," }, keyword.word())?;
                 }
@@ -211,7 +211,7 @@ impl fmt::Display for ParseError {
 
 impl core::error::Error for ParseError {}
 
-/// Why a [`Request`] cannot be written.
+/// Why a [`Request`] cannot be encoded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
@@ -225,7 +225,7 @@ pub enum EncodeError {
     },
     /// The program's name is empty, or begins or ends with a blank.
     ProgramName,
-    /// The program's name holds a byte that would end it or its command.
+    /// The program's name contains a byte that would end the name or the command.
     ProgramByte {
         /// The first such byte.
         byte: u8,
@@ -239,8 +239,10 @@ impl fmt::Display for EncodeError {
         match *self {
             Self::NoSpace(error) => error.fmt(f),
             Self::TooLong { len } => write!(f, "the command has {len} bytes; at most {MAX_COMMAND}"),
-            Self::ProgramName => f.write_str("a program's name is not empty and has no blanks around it"),
-            Self::ProgramByte { byte } => write!(f, "byte {byte:#04x} cannot stand in a program's name"),
+            Self::ProgramName => {
+                f.write_str("a program's name cannot be empty, or begin or end with a space")
+            }
+            Self::ProgramByte { byte } => write!(f, "a program's name cannot contain byte {byte:#04x}"),
             Self::NoSpeed => f.write_str("speed needs a number above 0 and at most 100"),
         }
     }
@@ -255,7 +257,7 @@ impl From<NoSpace> for EncodeError {
 }
 
 impl<'a> Request<'a> {
-    /// Reads one command as a controller does: a speed that is not valid counts as absent.
+    /// Reads one command as a controller does: an invalid speed counts as absent.
     ///
     /// # Errors
     /// [`ParseError`] for everything that is answered with `unknown command`.
@@ -284,8 +286,8 @@ impl<'a> Request<'a> {
         }
     }
 
-    /// Reads one command that we are going to send: as [`Request::parse`], but a speed that is
-    /// not valid and a missing program name are refused instead of left to the controller.
+    /// Reads one command that we are going to send: same as [`Request::parse`], but an invalid
+    /// speed or a missing program name is refused instead of left to the controller.
     ///
     /// # Errors
     /// [`ParseError`].
@@ -299,7 +301,7 @@ impl<'a> Request<'a> {
         }
     }
 
-    /// The word the command begins with.
+    /// The first word of the command.
     pub const fn keyword(&self) -> Keyword {
         match self {
             Self::Run { .. } => Keyword::Run,
@@ -315,7 +317,7 @@ impl<'a> Request<'a> {
     /// length.
     ///
     /// # Errors
-    /// [`EncodeError`] when the request cannot be written, or not into `out`.
+    /// [`EncodeError`] if the request cannot be encoded, or `out` is too short.
     pub fn encode(&self, dialect: &Dialect, out: &mut [u8]) -> Result<usize, EncodeError> {
         let terminator = dialect.terminator.text();
         let mut writer = Writer::new(out);
@@ -363,7 +365,7 @@ pub(super) fn may_become_command(text: &[u8]) -> bool {
         match text.strip_prefix(word) {
             Some(rest) => match trim_start(rest).split_first() {
                 None => room >= 2,
-                // The argument of a bare keyword is empty or it is none of ours.
+                // A bare keyword with an argument is not a command.
                 Some((b'(', argument)) if keyword.is_bare() => room >= 1 && trim(argument).is_empty(),
                 Some((b'(', argument)) => room >= 1 && may_become_argument(argument),
                 Some(_) => false,
@@ -373,7 +375,7 @@ pub(super) fn may_become_command(text: &[u8]) -> bool {
     })
 }
 
-/// No second parenthesis, and UTF-8 whose last letter may be cut.
+/// No second parenthesis, and UTF-8 whose last character may be cut.
 fn may_become_argument(argument: &[u8]) -> bool {
     let readable = core::str::from_utf8(argument).map_or_else(|error| error.error_len().is_none(), |_| true);
     readable && !argument.contains(&b'(')

@@ -1,8 +1,8 @@
 //! The controller's side of a port-2000 connection: where one command ends and the next begins
 //! (docs/wire/command.md section 5).
 //!
-//! In: received bytes and the time. Out: requests and what must be answered with
-//! `unknown command`. Carries nothing out.
+//! In: received bytes and the time. Out: requests, and texts that must be answered with `unknown
+//! command`. Does not carry out anything.
 
 use super::MAX_COMMAND;
 use super::request::{Keyword, Request, may_become_command};
@@ -18,18 +18,18 @@ use crate::time::{Duration, Instant};
 pub struct CommandServer {
     /// A bare keyword is complete after this much silence: 20 ms (D2).
     pub keyword_gap: Duration,
-    /// Dropping a command that was too long ends after this much silence, and a text that no
-    /// further byte can make a command is given up after it: 100 ms (D5).
+    /// After this much silence the rest of an overlong command is no longer dropped, and a text
+    /// that no further byte can make a command is given up: 100 ms (D5).
     pub drop_gap: Duration,
     /// The beginning of a command is given up after this much silence: 10 s.
     pub beginning_gap: Duration,
     buffer: [u8; MAX_COMMAND],
     len: usize,
-    /// The buffer holds a command that was handed out; it goes at the next call.
+    /// The buffer holds a command that was returned; it is removed by the next call.
     handed_out: bool,
-    /// Behind a command that was too long, up to its end.
+    /// After an overlong command, until its end.
     dropping: bool,
-    /// The command before was ended by silence: its empty parentheses may still be on the way.
+    /// The previous command was ended by silence: its empty parentheses may still be on the way.
     ended_by_gap: bool,
     /// When the newest byte came.
     newest: Instant,
@@ -44,7 +44,7 @@ pub enum ServerEvent<'a> {
     Unknown(UnknownCommand<'a>),
 }
 
-/// What is answered with `unknown command`.
+/// A text that is answered with `unknown command`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum UnknownCommand<'a> {
     /// A text that is not a command.
@@ -69,8 +69,8 @@ impl CommandServer {
         }
     }
 
-    /// Takes bytes off the front of `bytes` until a command is complete. `None` means that all of
-    /// them were taken and none is.
+    /// Takes bytes from the front of `bytes` until a command is complete. `None` means that all of
+    /// them were taken and no command is complete.
     pub fn receive(&mut self, now: Instant, bytes: &mut &[u8]) -> Option<ServerEvent<'_>> {
         if self.handed_out {
             self.handed_out = false;
@@ -89,7 +89,7 @@ impl CommandServer {
         }
     }
 
-    /// What silence has completed by `now`.
+    /// The command that silence has completed by `now`.
     pub fn poll(&mut self, now: Instant) -> Option<ServerEvent<'_>> {
         self.receive(now, &mut &[][..])
     }
@@ -151,7 +151,7 @@ impl CommandServer {
         End::Command
     }
 
-    /// How much silence would end what is there.
+    /// The silence that would end the text in the buffer.
     fn gap(&self) -> Option<Duration> {
         if self.dropping {
             return Some(self.drop_gap);

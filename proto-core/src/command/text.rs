@@ -1,27 +1,27 @@
-//! Writing text into a caller's buffer, and the few byte classes the texts are made of.
+//! Writing text into a caller's buffer, and the byte classes of the texts.
 
 use core::fmt;
 
-/// The buffer was too small; nothing useful was written.
+/// The buffer was too small; its content is not useful.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
 pub struct NoSpace {
-    /// Bytes the text takes.
+    /// Number of bytes that the text needs.
     pub needed: usize,
-    /// Bytes that were available.
+    /// Number of bytes available.
     pub available: usize,
 }
 
 impl fmt::Display for NoSpace {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "the text takes {} bytes, the buffer has {}", self.needed, self.available)
+        write!(f, "the text needs {} bytes; the buffer has {}", self.needed, self.available)
     }
 }
 
 impl core::error::Error for NoSpace {}
 
-/// Appends to a byte slice and goes on counting when the slice is full.
+/// Appends to a byte slice, and continues to count when the slice is full.
 pub(super) struct Writer<'a> {
     out: &'a mut [u8],
     len: usize,

@@ -1,8 +1,8 @@
 //! Recipes and ports are added to a configuration, one after the other.
 //!
-//! In: what a program wrote ([`RecipeBuilder`], [`PortBuilder`]). Out: entries of the configuration's
-//! lists with their ranges counted, or what is wrong and where. What was refused has left nothing
-//! behind. Whether everything fits together is asked by [`ConfigView::validate`].
+//! In: what a program wrote ([`RecipeBuilder`], [`PortBuilder`]). Out: entries of the
+//! configuration's lists with their ranges, or what is wrong and where. A refused recipe or port
+//! leaves nothing behind. Whether everything fits together is checked by [`ConfigView::validate`].
 
 use heapless::{String, Vec, VecView};
 
@@ -20,13 +20,13 @@ use crate::sysvar::{Direction, SysVar, VarRange};
 use crate::wire::dialect::Dialect;
 use crate::wire::scalar::Scalar;
 
-/// A configuration of any size, borrowed to write to; [`GatewayConfig`] says what is in it.
+/// A mutable borrow of a configuration of any size; [`GatewayConfig`] describes the fields.
 #[derive(Debug)]
 #[non_exhaustive]
 pub struct ConfigMut<'c> {
-    /// Where the controller is and what it speaks.
+    /// The controller's address, ports and dialect.
     pub controller: &'c mut ControllerLink,
-    /// A board's own address.
+    /// The board's own address.
     pub network: &'c mut BoardAddress,
     /// Every recipe.
     pub recipes: &'c mut VecView<Recipe>,
@@ -48,10 +48,10 @@ impl<
     const SAFE_VALUES: usize,
 > GatewayConfig<PORTS, RECIPES, ALL_FIELDS, COMMANDS, SAFE_VALUES>
 {
-    /// Sets where the controller is and what it speaks; the recipe link stays.
+    /// Sets the controller's address, ports and dialect; the recipe link stays.
     ///
     /// # Errors
-    /// An address that is too long, or a dialect that is not known; nothing has changed then.
+    /// An address that is too long, or an unknown dialect; nothing has changed then.
     pub fn set_controller<'a>(
         &mut self,
         controller: impl Into<ControllerBuilder<'a>>,
@@ -59,25 +59,25 @@ impl<
         self.view_mut().set_controller(&controller.into())
     }
 
-    /// Adds a recipe; its index.
+    /// Adds a recipe and returns its index.
     ///
     /// # Errors
-    /// A name that cannot be, a variable that is not there, or no room; nothing was added then.
+    /// An invalid name, an unknown variable, or no room; nothing was added then.
     pub fn add_recipe(&mut self, recipe: &RecipeBuilder<'_>) -> Result<u8, ConfigError> {
         self.view_mut().add_recipe(recipe)
     }
 
-    /// Adds a port, after its recipe; its index.
+    /// Adds a port and returns its index. Its recipe must be added first.
     ///
     /// # Errors
-    /// A name that cannot be, a recipe that is not there, safe values that do not fit, or no room;
-    /// nothing was added then.
+    /// An invalid name, an unknown recipe, safe values that do not fit, or no room; nothing was
+    /// added then.
     pub fn add_port<B: PortBus>(&mut self, port: &PortBuilder<'_, B>) -> Result<u8, ConfigError> {
         self.view_mut().add_port(port)
     }
 
-    /// The controller's UDP server at this port, normally 2011, is set to this recipe, which was
-    /// added before.
+    /// Declares that the controller's UDP server at this port, normally 2011, is set to this
+    /// recipe, which must have been added.
     ///
     /// # Errors
     /// No recipe has this name.
@@ -87,7 +87,7 @@ impl<
 }
 
 impl ConfigMut<'_> {
-    /// The configuration, to read.
+    /// A read-only view of the configuration.
     pub fn view(&self) -> ConfigView<'_> {
         ConfigView {
             controller: self.controller,
@@ -103,7 +103,7 @@ impl ConfigMut<'_> {
     /// As [`GatewayConfig::set_controller`].
     ///
     /// # Errors
-    /// As there.
+    /// See there.
     pub fn set_controller(&mut self, from: &ControllerBuilder<'_>) -> Result<(), ConfigError> {
         let at = |key| move |kind| ConfigError { place: Place::Controller(key), kind };
         let address = text(from.address).map_err(at(ControllerKey::Address))?;
@@ -127,7 +127,7 @@ impl ConfigMut<'_> {
     /// As [`GatewayConfig::set_recipe_link`].
     ///
     /// # Errors
-    /// As there.
+    /// See there.
     pub fn set_recipe_link(&mut self, recipe: &str, udp_port: u16) -> Result<(), ConfigError> {
         let recipe = self.recipe_named(recipe, Place::Controller(ControllerKey::RecipeLink))?;
         self.controller.recipe_link = Some(RecipeLink { udp_port, recipe });
@@ -137,7 +137,7 @@ impl ConfigMut<'_> {
     /// As [`GatewayConfig::add_recipe`].
     ///
     /// # Errors
-    /// As there.
+    /// See there.
     pub fn add_recipe(&mut self, from: &RecipeBuilder<'_>) -> Result<u8, ConfigError> {
         let (fields, commands) = (self.fields.len(), self.commands.len());
         let added = self.try_add_recipe(from);
@@ -189,7 +189,7 @@ impl ConfigMut<'_> {
             }
         };
         let added = Recipe { on_stale: from.on_stale, send, ..Recipe::new(name, from.mode, parts) };
-        // There is room: it was asked for above.
+        // There is room: checked above.
         let _ = self.recipes.push(added);
         Ok(recipe)
     }
@@ -220,7 +220,7 @@ impl ConfigMut<'_> {
         let mut frames = Vec::new();
         for (number, frame) in (0..).zip(from) {
             let fields = self.fields_of_part(recipe, part, number, &frame.fields)?;
-            // There is room: it was asked for above.
+            // There is room: checked above.
             let _ = frames.push(CanFramePart { id: frame.id, fields });
         }
         Ok(frames)
@@ -261,7 +261,7 @@ impl ConfigMut<'_> {
         Ok(span(start, self.fields.len()))
     }
 
-    /// There is room: it was asked for when the recipe was begun.
+    /// There is room: checked when the recipe was begun.
     fn push_field(&mut self, field: FieldSpec) {
         let _ = self.fields.push(field);
     }
@@ -279,7 +279,7 @@ impl ConfigMut<'_> {
         Ok(FieldSpec::UserInput { ty: field.ty, to })
     }
 
-    /// There is room: it was asked for when the recipe was begun.
+    /// There is room: checked when the recipe was begun.
     fn add_commands(&mut self, entries: &[(i64, &str)]) -> Result<Span, Kind> {
         let start = self.commands.len();
         for &(value, command) in entries {
@@ -291,7 +291,7 @@ impl ConfigMut<'_> {
     /// As [`GatewayConfig::add_port`].
     ///
     /// # Errors
-    /// As there.
+    /// See there.
     pub fn add_port<B: PortBus>(&mut self, from: &PortBuilder<'_, B>) -> Result<u8, ConfigError> {
         let index = self.ports.len() as u8;
         let at = |key| Place::Port { port: index, key };
@@ -330,12 +330,12 @@ impl ConfigMut<'_> {
         };
         added.inspect_err(|_| self.safe_values.truncate(values))?;
         port.on_timeout = span(values, self.safe_values.len());
-        // There is room: it was asked for above.
+        // There is room: checked above.
         let _ = self.ports.push(port);
         Ok(index)
     }
 
-    /// There is room: it was asked for before.
+    /// There is room: checked before.
     fn add_safe_values(
         &mut self,
         values: impl Iterator<Item = Result<SafeValue, Kind>>,
@@ -379,8 +379,8 @@ pub(super) fn text<const N: usize>(given: &str) -> Result<String<N>, Kind> {
     String::try_from(given).map_err(|_| Kind::TooLong { len: given.len(), longest: N })
 }
 
-/// From one length of a list to another; lists are shorter than `u16::MAX`, or the configuration is
-/// refused by the check of its counts.
+/// The range between two lengths of a list. Lists are shorter than `u16::MAX`; the check of the
+/// counts refuses others.
 fn span(start: usize, end: usize) -> Span {
     Span { start: start as u16, len: end.saturating_sub(start) as u16 }
 }

@@ -1,7 +1,7 @@
-//! How long frames take on a line, and what that says about a configuration that is valid but may
-//! not do what was meant.
+//! How long frames take on a line, and warnings about configurations that are valid but may not do
+//! what was intended.
 //!
-//! In: a configuration. Out: times, and [`Warning`]s. Nothing here refuses anything.
+//! In: a configuration. Out: times, and [`Warning`]s. Nothing is refused here.
 
 use core::fmt;
 
@@ -11,7 +11,7 @@ use crate::time::Duration;
 use crate::wire::can::CanId;
 
 impl Rs485 {
-    /// Start bit, data bits, parity and stop bits.
+    /// Bits of one character: start bit, data bits, parity and stop bits.
     pub fn bits_per_character(&self) -> u64 {
         let parity = u64::from(self.parity != Parity::None);
         9_u64.saturating_add(parity).saturating_add(u64::from(self.stop_bits))
@@ -22,7 +22,7 @@ impl Rs485 {
         bits_time((len as u64).saturating_mul(self.bits_per_character()), self.baud)
     }
 
-    /// The time that `n` characters and a half take on the line.
+    /// The time that `n` and a half characters take on the line.
     pub(crate) fn characters_and_a_half(&self, n: u64) -> Duration {
         let half_bits = n.saturating_mul(2).saturating_add(1).saturating_mul(self.bits_per_character());
         bits_time(half_bits, self.baud.saturating_mul(2))
@@ -33,7 +33,7 @@ impl Rs485 {
 /// the space between frames.
 pub fn can_frame_time(id: CanId, len: usize, bitrate: u32) -> Duration {
     let data = (len as u64).saturating_mul(8);
-    // Of the frame's bits these can be stuffed, and those cannot (delimiters, end, space).
+    // Bits of the frame that can be stuffed, and bits that cannot (delimiters, end, space).
     let (stuffed, fixed) = match id {
         CanId::Standard(_) => (data.saturating_add(34), 13_u64),
         CanId::Extended(_) => (data.saturating_add(54), 13_u64),
@@ -46,7 +46,7 @@ fn bits_time(bits: u64, per_second: u32) -> Duration {
     Duration::from_micros(bits.saturating_mul(1_000_000).div_ceil(u64::from(per_second.max(1))))
 }
 
-/// What a recipe's part takes on a port's line.
+/// How much of a port's line a part of its recipe takes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct PartBudget {
     /// Frames: 1 in a stream part.
@@ -58,7 +58,8 @@ pub struct PartBudget {
 }
 
 impl<'c> ConfigView<'c> {
-    /// What a part of the port's recipe takes on its line; `None` when there is no such part.
+    /// How much of the port's line a part of its recipe takes; `None` if the recipe has no such
+    /// part.
     pub fn budget(self, port: &Port, part: Direction) -> Option<PartBudget> {
         let recipe = self.recipes.get(usize::from(port.recipe))?;
         let bytes_of = |span: Span| {
@@ -90,8 +91,8 @@ impl<'c> ConfigView<'c> {
         }
     }
 
-    /// The shortest cycle in which the port's output fits its line (D20); on RS-485 with the
-    /// silence before it.
+    /// The shortest cycle in which the port's output fits its line (D20); on RS-485 including the
+    /// turnaround.
     pub fn shortest_cycle(self, port: &Port) -> Duration {
         let time = self.budget(port, Direction::Output).map_or(Duration::ZERO, |budget| budget.time);
         match &port.bus {
@@ -100,7 +101,7 @@ impl<'c> ConfigView<'c> {
         }
     }
 
-    /// What is allowed but may not do what was meant.
+    /// What is valid but may not do what was intended.
     pub fn warnings(self) -> impl Iterator<Item = Warning> + 'c {
         self.slow_ports().chain(self.read_back()).chain(self.unused_recipes())
     }
@@ -147,18 +148,18 @@ pub enum Warning {
         port: u8,
         /// Its cycle.
         cycle: Duration,
-        /// The shortest in which the output fits.
+        /// The shortest cycle in which the output fits.
         shortest: Duration,
     },
     /// A way up carries a variable that no port writes: it is read back from the state stream and
-    /// sent on, so that what others write to it may be undone for as long as that takes.
+    /// sent on, so a change made by somebody else can be undone within that time.
     ReadBack {
         /// The recipe of the way up.
         recipe: u8,
         /// The variable.
         var: SysVar,
     },
-    /// Nothing uses a recipe.
+    /// A recipe that is not used.
     Unused {
         /// The recipe.
         recipe: u8,
@@ -186,10 +187,10 @@ impl fmt::Display for DescribedWarning<'_> {
             Warning::ReadBack { recipe, var } => write!(
                 f,
                 "recipe {:?} carries {var}, which no port writes: it is read back from the controller and sent on, \
-                 and a change that somebody else makes can be undone for 100 ms",
+                 so a change made by somebody else can be undone for 100 ms",
                 recipe_name(recipe)
             ),
-            Warning::Unused { recipe } => write!(f, "recipe {:?} is used by nothing", recipe_name(recipe)),
+            Warning::Unused { recipe } => write!(f, "recipe {:?} is not used", recipe_name(recipe)),
         }
     }
 }

@@ -1,8 +1,8 @@
 //! A configuration in one expression.
 //!
 //! In: controller, recipes, ports, in this order. Out: a checked [`GatewayConfig`], or the first
-//! mistake. The same as `set_controller`, `add_recipe` and `add_port` one after the other, which a board
-//! with a small stack uses on a static configuration.
+//! mistake. A board with a small stack uses `set_controller`, `add_recipe` and `add_port` on a
+//! static configuration instead; they do the same step by step.
 
 use super::draft::{ControllerBuilder, PortBuilder, PortBus, RecipeBuilder};
 use super::error::{ConfigError, ConfigErrorKind as Kind, Counted};
@@ -23,7 +23,7 @@ pub struct ConfigBuilder<
     needed: Needed,
 }
 
-/// How many of everything were asked for, whether there was room or not.
+/// Number of items asked for, including those for which there was no room.
 #[derive(Debug, Clone, Copy, Default)]
 struct Needed {
     ports: usize,
@@ -41,9 +41,9 @@ impl<
     const SAFE_VALUES: usize,
 > GatewayConfig<PORTS, RECIPES, ALL_FIELDS, COMMANDS, SAFE_VALUES>
 {
-    /// A configuration in one expression; recipes come before what names them.
+    /// Builds a configuration in one expression; a recipe comes before the ports that use it.
     ///
-    /// It moves by value: where the stack is small, take a static [`Self::empty`] and
+    /// The builder moves by value. Where the stack is small, take a static [`Self::empty`] and
     /// [`Self::set_controller`], [`Self::add_recipe`], [`Self::add_port`], [`Self::validate`].
     ///
     /// ```
@@ -82,20 +82,20 @@ impl<
     const SAFE_VALUES: usize,
 > ConfigBuilder<PORTS, RECIPES, ALL_FIELDS, COMMANDS, SAFE_VALUES>
 {
-    /// Where the controller is: its address, or a [`ControllerBuilder`].
+    /// The controller: its address, or a [`ControllerBuilder`].
     pub fn controller<'a>(mut self, controller: impl Into<ControllerBuilder<'a>>) -> Self {
         let controller = controller.into();
         self.attempt(|config| config.set_controller(controller));
         self
     }
 
-    /// The board's own address; without it DHCP is asked.
+    /// The board's own address; without it the board uses DHCP.
     pub fn network(mut self, network: Network) -> Self {
         self.config.network = super::BoardAddress::Static(network);
         self
     }
 
-    /// One more recipe.
+    /// Adds a recipe.
     pub fn recipe(mut self, recipe: RecipeBuilder<'_>) -> Self {
         let (fields, commands) = recipe.counts();
         self.needed.recipes = self.needed.recipes.saturating_add(1);
@@ -105,7 +105,7 @@ impl<
         self
     }
 
-    /// One more port.
+    /// Adds a port.
     pub fn port<B: PortBus>(mut self, port: PortBuilder<'_, B>) -> Self {
         self.needed.ports = self.needed.ports.saturating_add(1);
         self.needed.safe_values = self.needed.safe_values.saturating_add(port.safe.len());
@@ -113,22 +113,22 @@ impl<
         self
     }
 
-    /// The controller's UDP server at port 2011 is set to this recipe.
+    /// Declares that the controller's UDP server at port 2011 is set to this recipe.
     pub fn recipe_link(self, recipe: &str) -> Self {
         self.recipe_link_at(recipe, 2011)
     }
 
-    /// The controller's UDP server at another port is set to this recipe.
+    /// Declares that the controller's UDP server at another port is set to this recipe.
     pub fn recipe_link_at(mut self, recipe: &str, udp_port: u16) -> Self {
         self.attempt(|config| config.set_recipe_link(recipe, udp_port));
         self
     }
 
-    /// The configuration, if everything in it fits together.
+    /// Checks the configuration and returns it.
     ///
     /// # Errors
-    /// The first mistake, with its place. Where there is no room, `needed` counts everything that was
-    /// asked for.
+    /// The first mistake, with its place. If there is too little room, `needed` is the number of
+    /// all items that were asked for.
     pub fn build(
         self,
     ) -> Result<GatewayConfig<PORTS, RECIPES, ALL_FIELDS, COMMANDS, SAFE_VALUES>, ConfigError> {
@@ -149,7 +149,7 @@ impl<
         Err(error)
     }
 
-    /// After the first mistake everything is only counted.
+    /// After the first mistake items are only counted.
     fn attempt(
         &mut self,
         add: impl FnOnce(

@@ -1,4 +1,5 @@
-//! The checks that concern one recipe alone: its parts, what its user fields do, what sends it.
+//! The checks that concern one recipe alone: its parts, the bindings of its user fields, its
+//! trigger.
 
 use super::error::{ConfigErrorKind as Kind, Place, RecipeKey};
 use super::rules::{Check, check_new_name, check_pool, fail, is_marked, mark};
@@ -28,7 +29,7 @@ impl<'a> RecipeCheck<'a> {
         if !self.recipe.has(Direction::Input) && !self.recipe.has(Direction::Output) {
             return fail(self.at(RecipeKey::Whole), Kind::NoParts);
         }
-        // UDP asks for the least of a stream, and takes no user-defined recipes (D16).
+        // UDP needs the least of a stream recipe; it does not take user-defined recipes (D16).
         let framing = if self.recipe.mode == Mode::User { Framing::Bytes } else { Framing::Datagram };
         for part in [Direction::Input, Direction::Output] {
             for (frame, span) in self.recipe.frames(part) {
@@ -116,7 +117,7 @@ impl<'a> RecipeCheck<'a> {
         Ok(())
     }
 
-    /// In a realtime recipe the layout sees to this.
+    /// In a realtime recipe the layout checks this.
     fn check_written_once(&self) -> Check {
         let mut seen = [false; COUNT];
         for (frame, field, spec) in self.config.fields_of(self.recipe, Direction::Input) {
@@ -179,7 +180,7 @@ fn check_output(place: Place, ty: ScalarType, from: OutputBinding) -> Check {
     }
 }
 
-/// Compiles one part, if it is there, only to hear what is wrong with it.
+/// Compiles one part, if the recipe has it, only to find its mistakes.
 pub(super) fn check_layout(
     config: ConfigView<'_>,
     recipe: &Recipe,

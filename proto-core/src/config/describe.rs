@@ -1,7 +1,7 @@
 //! What is wrong with a configuration, in words.
 //!
-//! In: an error, and the configuration where it is at hand. Out: one sentence that says what is
-//! wrong and what is allowed. Recipes and ports are named, or counted from 1.
+//! In: an error, and the configuration if available. Out: one sentence that says what is wrong and
+//! what is allowed. Recipes and ports are named, or counted from 1.
 
 use core::fmt;
 
@@ -26,12 +26,12 @@ impl fmt::Display for ConfigErrorKind {
 }
 
 impl<'c> ConfigView<'c> {
-    /// `error` with the names of its recipes and ports.
+    /// Displays `error` with the names of its recipes and ports.
     pub fn describe(self, error: ConfigError) -> impl fmt::Display + 'c {
         Described { config: Some(self), error }
     }
 
-    /// What is wrong, with the names of recipes and ports and without the place.
+    /// Displays what is wrong, with the names of recipes and ports and without the place.
     pub fn describe_kind(self, kind: ConfigErrorKind) -> impl fmt::Display + 'c {
         DescribedKind { config: Some(self), kind }
     }
@@ -172,22 +172,26 @@ impl fmt::Display for DescribedKind<'_> {
         let port_name = |port| PortName(self.config, port);
         match self.kind {
             Kind::UnknownDialect => {
-                f.write_str("no such dialect; there are")?;
+                f.write_str("there is no such dialect; there are")?;
                 for (nth, name) in Dialect::NAMES.iter().enumerate() {
                     write!(f, "{} {name:?}", if nth == 0 { "" } else { "," })?;
                 }
                 Ok(())
             }
-            Kind::ZeroPort => f.write_str("0 is no port of the controller; 1..=65535"),
-            Kind::Prefix { prefix } => write!(f, "a network of {prefix} bits; 1..=30"),
+            Kind::ZeroPort => f.write_str("port 0 is out of range; allowed: 1..=65535"),
+            Kind::Prefix { prefix } => {
+                write!(f, "a prefix of {prefix} bits is out of range; allowed: 1..=30")
+            }
             Kind::NoHostAddress { address, network } => {
-                write!(f, "{address} is no host's address in the board's network {network}")
+                write!(f, "{address} is not a host address in the board's network {network}")
             }
             Kind::OwnAddress => f.write_str("this is the board's own address"),
             Kind::NeedsRouter { address, network } => {
                 write!(f, "{address} is not in the board's network {network}; a router is needed")
             }
-            Kind::NeedsDns => f.write_str("the controller has a name, so dns is needed; or give its address"),
+            Kind::NeedsDns => {
+                f.write_str("controller.address is a host name, so dns is needed; or write an IP address")
+            }
             Kind::NoSuchRecipe { recipe, recipes } => {
                 write!(f, "there is no recipe {}; there are {recipes}", one_based(recipe))
             }
@@ -195,93 +199,99 @@ impl fmt::Display for DescribedKind<'_> {
                 write!(f, "a range ends at {end}, but there are only {len} entries")
             }
             Kind::TooMany { what, needed, room } => {
-                write!(f, "{needed} {what}, and there is room for {room}")
+                write!(f, "{needed} {what}; there is room for {room}")
             }
-            Kind::TooLong { len, longest } => write!(f, "{len} bytes long; at most {longest}"),
-            Kind::NameLength { len } => write!(f, "{len} bytes long; 1..={MAX_NAME}"),
+            Kind::TooLong { len, longest } => write!(f, "{len} bytes long; at most {longest} are allowed"),
+            Kind::NameLength { len } => write!(f, "{len} bytes long; allowed: 1..={MAX_NAME}"),
             Kind::NameCharacter { character } => {
-                write!(f, "{character:?} in a name; no blanks, quotes, '=' and control characters")
+                write!(
+                    f,
+                    "a name cannot contain {character:?}; spaces, quotes, '=' and control characters are not allowed"
+                )
             }
-            Kind::NoSuchName => f.write_str("no recipe before has this name"),
+            Kind::NoSuchName => f.write_str("no earlier recipe has this name"),
             Kind::Variable(error) => error.fmt(f),
-            Kind::MixedParts => f.write_str("one part is a stream and the other CAN"),
-            Kind::Address => f.write_str("neither an IP address nor a host name; port numbers go to ports"),
-            Kind::DuplicateName { other } => {
-                write!(f, "number {} has this name already; names must differ", one_based(other))
+            Kind::MixedParts => f.write_str("one part is a stream, the other is CAN"),
+            Kind::Address => {
+                f.write_str("neither an IP address nor a host name; port numbers go in controller.ports")
             }
-            Kind::NoParts => f.write_str("a recipe needs an input part, an output part, or both"),
+            Kind::DuplicateName { other } => {
+                write!(f, "entry {} already has this name; names must differ", one_based(other))
+            }
+            Kind::NoParts => f.write_str("a recipe needs an input part, an output part or both"),
             Kind::WrongField { mode: Mode::Realtime, .. } => {
-                f.write_str("fields of a realtime recipe are system variables")
+                f.write_str("the fields of a realtime recipe are system variables")
             }
             Kind::WrongField { mode: Mode::User, part } => {
                 write!(f, "the {} of a user recipe takes user fields with its own bindings", part_name(part))
             }
-            Kind::RealtimeSendsByPeriod => {
-                f.write_str("a realtime recipe is sent by period; other triggers need mode = \"user\"")
-            }
+            Kind::RealtimeSendsByPeriod => f.write_str(
+                "a realtime recipe allows only send = \"period\"; other triggers need mode = \"user\"",
+            ),
             Kind::NothingToSend => f.write_str("the recipe has no output part to send"),
             Kind::NoInputToAnswer => {
-                f.write_str("sent with each input frame, but the recipe has no input part")
+                f.write_str("sent for each input frame, but the recipe has no input part")
             }
             Kind::BadScale { scale, offset } => write!(
                 f,
                 "scale {scale} and offset {offset} must be finite numbers, and scale not 0: the value would be lost"
             ),
             Kind::Constant(error) => error.fmt(f),
-            Kind::NeedsInteger { ty } => write!(
-                f,
-                "needs an integer field (byte, char, word, short, dword, int), and this one is a {ty}"
-            ),
+            Kind::NeedsInteger { ty } => {
+                write!(f, "needs an integer field (byte, char, word, short, dword, int); this one is a {ty}")
+            }
             Kind::EmptyTable => f.write_str("a command table needs at least one command"),
             Kind::CommandValue { value, ty } => {
                 let (low, high) = ty.range();
-                write!(f, "a {ty} is never {value}, only {low}..={high}")
+                write!(f, "a {ty} cannot be {value}; allowed: {low}..={high}")
             }
-            Kind::DuplicateCommand { value } => write!(f, "{value} picks a command before this one already"),
+            Kind::DuplicateCommand { value } => write!(f, "an earlier command already has the value {value}"),
             Kind::Command(error) => error.fmt(f),
             Kind::Part(error) => error.fmt(f),
             Kind::Framing { recipe, error } => write!(f, "{} does not fit: {error}", recipe_name(recipe)),
             Kind::NotAnInput { var } => write!(
                 f,
-                "{var} is shown by the robot and cannot be written; inputs are DigitalOutputCommand, BitInputReg, \
+                "{var} is an output of the robot and cannot be written; inputs are DigitalOutputCommand, BitInputReg, \
                  WordInputReg, FloatInputReg, ForceEnd, ForceBase"
             ),
             Kind::WrittenTwice { var } => {
-                write!(f, "{var} is written by another field of this recipe already")
+                write!(f, "another field of this recipe already writes {var}")
             }
             Kind::NotBits { var } => {
-                write!(f, "{var} is a {}, and a trigger needs one of the variables made of bits", var.ty())
+                write!(f, "{var} is a {}; a trigger needs a variable made of bits", var.ty())
             }
             Kind::NoSuchBit { var, bit } => {
                 let bits = var.valid_bits().count_ones();
-                write!(f, "{var} has no bit {bit}, only 0..={}", bits.saturating_sub(1))
+                write!(f, "{var} has no bit {bit}; allowed: 0..={}", bits.saturating_sub(1))
             }
-            Kind::BaudOutOfRange { baud } => write!(f, "{baud} baud is out of range; 1200..=4000000"),
-            Kind::StopBits { stop_bits } => write!(f, "{stop_bits} stop bits; 1 or 2"),
+            Kind::BaudOutOfRange { baud } => {
+                write!(f, "{baud} baud is out of range; allowed: 1200..=4000000")
+            }
+            Kind::StopBits { stop_bits } => write!(f, "{stop_bits} stop bits; allowed: 1, 2"),
             Kind::BitrateOutOfRange { bitrate } => {
-                write!(f, "{bitrate} bit/s is out of range; 10000..=1000000")
+                write!(f, "{bitrate} bit/s is out of range; allowed: 10000..=1000000")
             }
             Kind::CycleTooShort { cycle } => write!(f, "a cycle of {cycle} is too short; at least 4 ms"),
             Kind::ZeroTime => f.write_str("must be longer than 0"),
             Kind::TimeTooLong { time, longest } => write!(f, "{time} is too long; at most {longest}"),
             Kind::NeedsStreamRecipe { recipe } => {
-                write!(f, "{} is a CAN recipe, and only CAN ports take those", recipe_name(recipe))
+                write!(f, "{} is a CAN recipe; only CAN ports take CAN recipes", recipe_name(recipe))
             }
             Kind::NeedsCanRecipe { recipe } => {
-                write!(f, "{} is a stream recipe, and a CAN port takes CAN recipes only", recipe_name(recipe))
+                write!(f, "{} is a stream recipe; a CAN port takes only CAN recipes", recipe_name(recipe))
             }
             Kind::NeedsRealtimeRecipe { recipe } => write!(
                 f,
-                "{} is user-defined, and the controller's TCP and UDP ports take realtime recipes only",
+                "{} is user-defined; the controller's TCP and UDP ports take only realtime recipes",
                 recipe_name(recipe)
             ),
             Kind::ListenAddress => f.write_str(
-                "not an address to listen on; an IP address and a port, such as \"0.0.0.0:50000\"",
+                "not an address to listen on; write an IP address and a port, such as \"0.0.0.0:50000\"",
             ),
-            Kind::ListenTwice { other } => write!(f, "{} listens here already", port_name(other)),
+            Kind::ListenTwice { other } => write!(f, "{} already listens here", port_name(other)),
             Kind::OwnedTwice { var, other } => write!(
                 f,
-                "this port writes {var}, and so does {}; a variable has one owner",
+                "{var} is written by this port and by {}; a variable has one owner",
                 port_name(other)
             ),
             Kind::NoWayUp { var, port } => write!(
@@ -299,14 +309,14 @@ impl fmt::Display for DescribedKind<'_> {
             Kind::Unowned { var } => write!(
                 f,
                 "{var} goes to the controller with this recipe, but no port writes it and it cannot be read back, so \
-                 its value would be made up; let a port write it, or take it out here and on the controller"
+                 its value would be invented; let a port write it, or remove it here and on the controller"
             ),
             Kind::NotOwned { var } => write!(f, "this port does not write {var}"),
-            Kind::SafeType { var, ty } => write!(f, "{var} is a {}, and its safe value a {ty}", var.ty()),
+            Kind::SafeType { var, ty } => write!(f, "{var} is a {}, but its safe value is a {ty}", var.ty()),
             Kind::SafeValue { var } => {
-                write!(f, "the value does not fit {var}: not finite, or reserved bits are set")
+                write!(f, "not a value for {var}: not finite, or reserved bits are set")
             }
-            Kind::SafeTwice { var } => write!(f, "{var} has a safe value already"),
+            Kind::SafeTwice { var } => write!(f, "{var} already has a safe value"),
         }
     }
 }

@@ -1,8 +1,8 @@
 //! A controller, a recipe and a port as a program writes them.
 //!
-//! In: names, numbers and slices of the caller's. Out: the same, borrowed and small; every default is
-//! the file's (docs/configuration.md). [`GatewayConfig`](super::GatewayConfig) takes them by `add_recipe`
-//! and `add_port`, in a builder or in place, and says what is wrong.
+//! In: names, numbers and slices of the caller. Out: the same, borrowed and small; every default is
+//! that of the file (docs/configuration.md). [`GatewayConfig`](super::GatewayConfig) takes them
+//! with `add_recipe` and `add_port`, in a builder or in place, and reports mistakes.
 
 use super::error::ConfigErrorKind as Kind;
 use super::fields::{CanFields, Fields, Var};
@@ -11,7 +11,7 @@ use crate::recipe::model::Mode;
 use crate::sysvar::SysVar;
 use crate::time::Duration;
 
-/// Where the controller is and what it speaks; made from its address by `into()`.
+/// The controller's address, ports and dialect; an address converts by `into()`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ControllerBuilder<'a> {
     pub(super) address: &'a str,
@@ -22,28 +22,28 @@ pub struct ControllerBuilder<'a> {
 }
 
 impl<'a> ControllerBuilder<'a> {
-    /// A controller with this IP address or host name, of dialect `v2.3`, on ports 2000, 2001 and 502.
-    /// An empty address stands for one that is learnt otherwise.
+    /// A controller with this IP address or host name, dialect `v2.3`, and ports 2000, 2001 and
+    /// 502. An empty address stands for one that is learnt otherwise.
     pub const fn new(address: &'a str) -> Self {
         Self { address, dialect: None, command_port: None, state_port: None, modbus_port: None }
     }
 
-    /// `"v2.3"` or `"v2.6"`; sets the Modbus port as well, unless that is said.
+    /// `"v2.3"` or `"v2.6"`; also sets the Modbus port unless [`Self::modbus_port`] was called.
     pub const fn dialect(self, name: &'a str) -> Self {
         Self { dialect: Some(name), ..self }
     }
 
-    /// Where port 2000 was moved to.
+    /// The command port, if it is not 2000.
     pub const fn command_port(self, port: u16) -> Self {
         Self { command_port: Some(port), ..self }
     }
 
-    /// Where port 2001 was moved to.
+    /// The state port, if it is not 2001.
     pub const fn state_port(self, port: u16) -> Self {
         Self { state_port: Some(port), ..self }
     }
 
-    /// Where the Modbus port was moved to.
+    /// The Modbus port, if it is not the dialect's.
     pub const fn modbus_port(self, port: u16) -> Self {
         Self { modbus_port: Some(port), ..self }
     }
@@ -97,26 +97,26 @@ impl<'a> RecipeBuilder<'a> {
         Self { name, mode, input, output, on_stale: OnStale::Hold, trigger: Trigger::On(SendOn::Period) }
     }
 
-    /// User to robot, in a stream: bytes before the fields, bytes after them, at most 8 each, and the
+    /// The input part (user to robot) as a stream: head, tail, at most 8 bytes each, and the
     /// fields.
     pub fn stream_input(mut self, head: &'a [u8], tail: &'a [u8], fields: impl Into<Fields<'a>>) -> Self {
         self.input = PartFields::Stream { head, tail, fields: fields.into() };
         self
     }
 
-    /// Robot to user, in a stream.
+    /// The output part (robot to user) as a stream.
     pub fn stream_output(mut self, head: &'a [u8], tail: &'a [u8], fields: impl Into<Fields<'a>>) -> Self {
         self.output = PartFields::Stream { head, tail, fields: fields.into() };
         self
     }
 
-    /// User to robot, in CAN frames.
+    /// The input part (user to robot) as CAN frames.
     pub const fn can_input(mut self, frames: &'a [CanFields<'a>]) -> Self {
         self.input = PartFields::Can(frames);
         self
     }
 
-    /// Robot to user, in CAN frames.
+    /// The output part (robot to user) as CAN frames.
     pub const fn can_output(mut self, frames: &'a [CanFields<'a>]) -> Self {
         self.output = PartFields::Can(frames);
         self
@@ -140,7 +140,7 @@ impl<'a> RecipeBuilder<'a> {
         self
     }
 
-    /// How many fields and commands it takes.
+    /// Number of fields and commands.
     pub(super) fn counts(&self) -> (usize, usize) {
         let mut counts = (0_usize, 0_usize);
         let mut add = |fields: &Fields<'_>| {
@@ -159,8 +159,8 @@ impl<'a> RecipeBuilder<'a> {
 }
 
 /// A port under construction: [`Port::rs485`], [`Port::can`], [`Port::tcp_listen`],
-/// [`Port::udp_listen`]. Times are those of a file: a cycle of 4 ms, a timeout of 100 ms, stale after
-/// 500 ms.
+/// [`Port::udp_listen`]. The defaults are those of a file: a cycle of 4 ms, a timeout of 100 ms,
+/// stale after 500 ms.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PortBuilder<'a, B = Rs485> {
     pub(super) name: &'a str,
@@ -179,12 +179,12 @@ pub struct Listen<'a> {
     address: &'a str,
 }
 
-/// The bus of a [`PortBuilder`] on CAN: its speed in bit/s.
+/// The bus of a [`PortBuilder`] on CAN: its bit rate.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Can(u32);
 
-/// What the safe values of a port are made from: `&[("DigitalOutputCommand[1]", 0.0)]`, the same with
-/// variables, or `&[SafeValue]`.
+/// The safe values of a port: `&[("DigitalOutputCommand[1]", 0.0)]`, the same with variables, or
+/// `&[SafeValue]`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[non_exhaustive]
 pub enum SafeValues<'a> {
@@ -192,7 +192,7 @@ pub enum SafeValues<'a> {
     Names(&'a [(&'a str, f64)]),
     /// By variable.
     Vars(&'a [(SysVar, f64)]),
-    /// As the configuration has them.
+    /// As in the configuration.
     Values(&'a [SafeValue]),
 }
 
@@ -225,17 +225,17 @@ macro_rules! safe_values_from {
 safe_values_from! { (&'a str, f64) => Names, (SysVar, f64) => Vars, SafeValue => Values }
 
 impl Port {
-    /// A half-duplex serial line: 115 200 baud, no parity, 1 stop bit, unless something else is said.
+    /// A half-duplex serial line; by default 115 200 baud, no parity, 1 stop bit.
     pub fn rs485<'a>(name: &'a str, recipe: &'a str) -> PortBuilder<'a, Rs485> {
         PortBuilder::new(name, recipe, Rs485::default())
     }
 
-    /// A CAN bus: 500 kbit/s, unless something else is said.
+    /// A CAN bus; by default 500 kbit/s.
     pub const fn can<'a>(name: &'a str, recipe: &'a str) -> PortBuilder<'a, Can> {
         PortBuilder::new(name, recipe, Can(Bus::BITRATE))
     }
 
-    /// Where the controller's TCP client connects to, such as `0.0.0.0:50000`.
+    /// A TCP port that the controller's TCP client connects to, such as `0.0.0.0:50000`.
     pub const fn tcp_listen<'a>(
         name: &'a str,
         recipe: &'a str,
@@ -244,7 +244,7 @@ impl Port {
         PortBuilder::new(name, recipe, Listen { is_tcp: true, address })
     }
 
-    /// Where the controller's UDP client sends to, such as `0.0.0.0:50000`.
+    /// A UDP port that the controller's UDP client sends to, such as `0.0.0.0:50000`.
     pub const fn udp_listen<'a>(
         name: &'a str,
         recipe: &'a str,
@@ -260,13 +260,14 @@ impl<'a, B> PortBuilder<'a, B> {
         Self { name, recipe, bus, cycle: None, timeout: None, stale_after: None, safe }
     }
 
-    /// How often the output part is sent: 4 ms to an hour.
+    /// The cycle: how often the output part is sent, 4 ms to an hour.
     pub fn cycle(mut self, cycle: Duration) -> Self {
         self.cycle = Some(cycle);
         self
     }
 
-    /// After this long without a good frame the port's inputs take their safe values.
+    /// The timeout: after this long without an accepted frame the port's inputs take their safe
+    /// values.
     pub fn timeout(mut self, timeout: Duration) -> Self {
         self.timeout = Some(timeout);
         self
@@ -278,8 +279,7 @@ impl<'a, B> PortBuilder<'a, B> {
         self
     }
 
-    /// The safe values; variables that are not named hold. Refused on listening ports, which own no
-    /// variable.
+    /// The safe values; other variables hold. Refused on listening ports, which own no variable.
     pub fn safe(mut self, values: impl Into<SafeValues<'a>>) -> Self {
         self.safe = values.into();
         self
@@ -299,7 +299,7 @@ impl PortBuilder<'_, Rs485> {
         self
     }
 
-    /// 1 or 2.
+    /// Stop bits, 1 or 2.
     pub fn stop_bits(mut self, stop_bits: u8) -> Self {
         self.bus.stop_bits = stop_bits;
         self
@@ -328,10 +328,10 @@ impl PortBuilder<'_, Can> {
 
 /// The bus of a [`PortBuilder`]: [`Rs485`], [`Can`], [`Listen`].
 pub trait PortBus: sealed::Sealed {
-    /// The bus in the configuration.
+    /// Converts to the bus of the configuration.
     ///
     /// # Errors
-    /// What is wrong with it: an address that is too long.
+    /// The address to listen on is too long.
     fn bus(&self) -> Result<Bus, Kind>;
 }
 
@@ -355,7 +355,7 @@ impl PortBus for Listen<'_> {
 }
 
 mod sealed {
-    /// Buses are those of the configuration.
+    /// Accepts the buses of the configuration.
     pub trait Sealed {}
     impl Sealed for super::Rs485 {}
     impl Sealed for super::Can {}

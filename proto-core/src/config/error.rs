@@ -10,14 +10,14 @@ use crate::sysvar::{Direction, ParseError as VarError, SysVar};
 use crate::time::Duration;
 use crate::wire::scalar::{ScalarError, ScalarType};
 
-/// The first mistake that [`ConfigView::validate`](super::ConfigView::validate) met.
+/// The first mistake that [`ConfigView::validate`](super::ConfigView::validate) found.
 ///
 /// Its `Display` counts recipes and ports from 1; [`ConfigView::describe`](super::ConfigView::describe) names them.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ConfigError {
-    /// Where.
+    /// Where it is.
     pub place: Place,
-    /// What.
+    /// What is wrong.
     pub kind: ConfigErrorKind,
 }
 
@@ -25,17 +25,17 @@ pub struct ConfigError {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[non_exhaustive]
 pub enum Place {
-    /// All of it.
+    /// The configuration as a whole.
     Whole,
     /// The controller's section.
     Controller(ControllerKey),
     /// The board's own address.
     Network(NetworkKey),
-    /// A recipe as a whole, or what is said about it once.
+    /// A recipe, or one of its keys.
     Recipe {
         /// Index of the recipe.
         recipe: u8,
-        /// What of it.
+        /// The key.
         key: RecipeKey,
     },
     /// A recipe's part.
@@ -74,7 +74,7 @@ pub enum Place {
     Port {
         /// Index of the port.
         port: u8,
-        /// What of it.
+        /// The key.
         key: PortKey,
     },
     /// One safe value of a port.
@@ -84,7 +84,7 @@ pub enum Place {
     },
 }
 
-/// What of the controller's section.
+/// A key of the controller's section.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[non_exhaustive]
 pub enum ControllerKey {
@@ -98,7 +98,7 @@ pub enum ControllerKey {
     RecipeLink,
 }
 
-/// What of the board's own address.
+/// A key of the board's own address.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[non_exhaustive]
 pub enum NetworkKey {
@@ -110,11 +110,11 @@ pub enum NetworkKey {
     Dns,
 }
 
-/// What of a recipe.
+/// A key of a recipe.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[non_exhaustive]
 pub enum RecipeKey {
-    /// All of it.
+    /// The recipe as a whole.
     Whole,
     /// Its name.
     Name,
@@ -122,7 +122,7 @@ pub enum RecipeKey {
     Send,
 }
 
-/// What of a port.
+/// A key of a port.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[non_exhaustive]
 pub enum PortKey {
@@ -148,11 +148,11 @@ pub enum PortKey {
     Turnaround,
     /// A CAN bus's speed.
     Bitrate,
-    /// Where it listens.
+    /// The address to listen on.
     Listen,
 }
 
-/// What there can be too many of.
+/// A list with a limited number of entries.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[non_exhaustive]
 pub enum Counted {
@@ -187,32 +187,32 @@ impl core::fmt::Display for Counted {
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[non_exhaustive]
 pub enum ConfigErrorKind {
-    /// No dialect has this name.
+    /// There is no dialect of this name.
     UnknownDialect,
     /// A port number of the controller is 0.
     ZeroPort,
     /// A prefix that leaves no room for hosts, or is not a prefix.
     Prefix {
-        /// As given.
+        /// The prefix.
         prefix: u8,
     },
-    /// No host of the board's network can have this address.
+    /// The address cannot be that of a host in the board's network.
     NoHostAddress {
-        /// As given.
+        /// The address.
         address: Ipv4Addr,
-        /// The board's.
+        /// The board's network.
         network: Network,
     },
-    /// The board's own address, where another host's is required.
+    /// The board's own address, where that of another host is required.
     OwnAddress,
-    /// The address is in another network, and there is no router.
+    /// The address is in another network, and no router is configured.
     NeedsRouter {
-        /// As given.
+        /// The address.
         address: Ipv4Addr,
-        /// The board's.
+        /// The board's network.
         network: Network,
     },
-    /// The controller has a name, and there is no name server.
+    /// The controller is configured by name, and no name server is configured.
     NeedsDns,
     /// There is no recipe with this index.
     NoSuchRecipe {
@@ -221,20 +221,20 @@ pub enum ConfigErrorKind {
         /// How many recipes there are.
         recipes: u8,
     },
-    /// A range of fields, commands or safe values leaves its pool.
+    /// A range of fields, commands or safe values ends beyond its list.
     OutsidePool {
-        /// The range's end.
+        /// The end of the range.
         end: u32,
-        /// The pool's length.
+        /// The length of the list.
         len: u32,
     },
-    /// More of something than there is room for: in this configuration's type, or in any.
+    /// More entries than there is room for: in this configuration's type, or in any.
     TooMany {
-        /// Of what.
+        /// The list.
         what: Counted,
-        /// How many are needed.
+        /// Number of entries needed.
         needed: usize,
-        /// How many there is room for.
+        /// Number of entries there is room for.
         room: usize,
     },
     /// A text or a delimiter is too long.
@@ -249,22 +249,22 @@ pub enum ConfigErrorKind {
         /// Its length in bytes.
         len: usize,
     },
-    /// A name has a blank, a quote, `=` or a control character in it.
+    /// A name contains a space, a quote, `=` or a control character.
     NameCharacter {
-        /// The first of them.
+        /// The first such character.
         character: char,
     },
-    /// No recipe that was added before has this name.
+    /// No earlier recipe has this name.
     NoSuchName,
-    /// The name means no system variable.
+    /// The name is not that of a system variable.
     Variable(VarError),
     /// One part of a recipe is a stream and the other CAN.
     MixedParts,
     /// The controller's address is neither an IP address nor a host name.
     Address,
-    /// A recipe or port before has the same name.
+    /// An earlier recipe or port has the same name.
     DuplicateName {
-        /// Index of the one before.
+        /// Index of the earlier one.
         other: u8,
     },
     /// A recipe has neither an input nor an output part.
@@ -276,20 +276,20 @@ pub enum ConfigErrorKind {
         /// The part.
         part: Direction,
     },
-    /// A realtime recipe can only be sent by period.
+    /// A realtime recipe can only be sent every period.
     RealtimeSendsByPeriod,
-    /// A trigger, but nothing to send.
+    /// A trigger, but no output part to send.
     NothingToSend,
-    /// Sent with each input frame, but there is no input part.
+    /// Sent for each input frame, but there is no input part.
     NoInputToAnswer,
-    /// A factor is 0 or not finite, or a summand is not finite.
+    /// A scale is 0 or not finite, or an offset is not finite.
     BadScale {
-        /// Factor.
+        /// Scale.
         scale: f32,
-        /// Summand.
+        /// Offset.
         offset: f32,
     },
-    /// A constant does not fit its field, or a safe value its variable.
+    /// A constant does not fit in its field, or a safe value in its variable.
     Constant(ScalarError),
     /// This use needs a field of an integer type.
     NeedsInteger {
@@ -298,7 +298,7 @@ pub enum ConfigErrorKind {
     },
     /// A command table has no entries.
     EmptyTable,
-    /// A command's value can never be the field's.
+    /// The field can never have a command's value.
     CommandValue {
         /// The value.
         value: i64,
@@ -348,9 +348,9 @@ pub enum ConfigErrorKind {
         /// Bit/s.
         baud: u32,
     },
-    /// Neither 1 nor 2 stop bits.
+    /// The number of stop bits is neither 1 nor 2.
     StopBits {
-        /// As given.
+        /// The number of stop bits.
         stop_bits: u8,
     },
     /// The CAN bus's speed is out of range (D21).
@@ -358,18 +358,18 @@ pub enum ConfigErrorKind {
         /// Bit/s.
         bitrate: u32,
     },
-    /// A cycle below the controller's fastest.
+    /// A cycle shorter than the controller's fastest.
     CycleTooShort {
-        /// As given.
+        /// The cycle.
         cycle: Duration,
     },
     /// A time that must be positive is 0.
     ZeroTime,
     /// A time is longer than makes sense.
     TimeTooLong {
-        /// As given.
+        /// The time.
         time: Duration,
-        /// The longest.
+        /// The longest allowed.
         longest: Duration,
     },
     /// A CAN recipe on a port or link that carries byte streams (D16).
@@ -391,14 +391,14 @@ pub enum ConfigErrorKind {
     ListenAddress,
     /// An earlier port listens on the same address and port.
     ListenTwice {
-        /// Index of the port before.
+        /// Index of the earlier port.
         other: u8,
     },
     /// An earlier port writes the same variable; a variable has one owner.
     OwnedTwice {
         /// The variable.
         var: SysVar,
-        /// Index of the port before.
+        /// Index of the earlier port.
         other: u8,
     },
     /// A port writes a variable that no configured way up can carry (D15).
@@ -415,8 +415,8 @@ pub enum ConfigErrorKind {
         /// Index of the port.
         port: u8,
     },
-    /// A way up carries a variable that no port owns and that cannot be read back, so nothing
-    /// knows what to send.
+    /// A way up carries a variable that no port owns and that cannot be read back, so its value is
+    /// not known.
     Unowned {
         /// The variable.
         var: SysVar,

@@ -1,14 +1,15 @@
-//! The fields of a recipe's part as a program writes them.
+//! The fields of a recipe's part, as a program writes them.
 //!
-//! In: names such as `"ForceEnd[1..6]"`, variables, or user-defined fields with what they do. Out: the
-//! same, borrowed; [`GatewayConfig::add_recipe`](super::GatewayConfig::add_recipe) reads the names.
+//! In: names such as `"ForceEnd[1..6]"`, variables, or user-defined fields with their bindings.
+//! Out: the same, borrowed; [`GatewayConfig::add_recipe`](super::GatewayConfig::add_recipe) reads
+//! the names.
 
 use super::{CommandWhen, FieldSpec};
 use crate::sysvar::{ParseError, SysVar, VarRange};
 use crate::wire::can::CanId;
 use crate::wire::scalar::ScalarType;
 
-/// A system variable, by name or by itself.
+/// A system variable, by name or as a value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Var<'a> {
     /// `RobotState[8]` or `__RobotState_8`.
@@ -49,16 +50,16 @@ pub enum Fields<'a> {
     Names(&'a [&'a str]),
     /// System variables.
     Vars(&'a [SysVar]),
-    /// Of the input part of a user-defined recipe.
+    /// Fields of the input part of a user-defined recipe.
     Inputs(&'a [InputField<'a>]),
-    /// Of the output part of a user-defined recipe.
+    /// Fields of the output part of a user-defined recipe.
     Outputs(&'a [OutputField<'a>]),
-    /// As the configuration has them; command tables are ranges of its `commands`.
+    /// As in the configuration; command tables are ranges of its `commands`.
     Specs(&'a [FieldSpec]),
 }
 
 impl Fields<'_> {
-    /// How many fields and how many commands these are; a name that cannot be read is one.
+    /// Number of fields and of commands; a name that cannot be read counts as one field.
     pub(super) fn counts(&self) -> (usize, usize) {
         match self {
             Self::Names(names) => {
@@ -119,7 +120,7 @@ impl<'a> InputField<'a> {
         Self { ty, does: Does::Nothing }
     }
 
-    /// A field whose value becomes that of an input variable.
+    /// A field whose value is written to an input variable.
     pub fn variable(ty: ScalarType, var: impl Into<Var<'a>>) -> Self {
         Self { ty, does: Does::Writes { var: var.into(), scale: 1.0, offset: 0.0 } }
     }
@@ -130,7 +131,7 @@ impl<'a> InputField<'a> {
         Self { ty, does: Does::Commands { entries, when: CommandWhen::Change } }
     }
 
-    /// The variable becomes `value * scale + offset`. Of no effect on other fields.
+    /// Makes the variable `value * scale + offset`. No effect on other fields.
     pub fn scaled(mut self, scale: f32, offset: f32) -> Self {
         if let Does::Writes { scale: own_scale, offset: own_offset, .. } = &mut self.does {
             (*own_scale, *own_offset) = (scale, offset);
@@ -138,7 +139,7 @@ impl<'a> InputField<'a> {
         self
     }
 
-    /// When a value picks its command. Of no effect on other fields.
+    /// Sets when a value picks its command. No effect on other fields.
     pub fn when(mut self, when: CommandWhen) -> Self {
         if let Does::Commands { when: own, .. } = &mut self.does {
             *own = when;
@@ -175,22 +176,22 @@ impl<'a> OutputField<'a> {
         Self { ty, sends: Sends::Variable { var: var.into(), scale: 1.0, offset: 0.0 } }
     }
 
-    /// Always the same.
+    /// A constant.
     pub const fn constant(ty: ScalarType, value: f64) -> Self {
         Self { ty, sends: Sends::Constant(value) }
     }
 
-    /// Frames sent so far, wrapping in the field's type. Integer types only.
+    /// The number of frames sent so far, wrapping in the field's type. Integer types only.
     pub const fn counter(ty: ScalarType) -> Self {
         Self { ty, sends: Sends::Counter }
     }
 
-    /// How the newest command of the port went: see [`crate::engine::ReplyCode`].
+    /// The result of the port's newest command: see [`crate::engine::ReplyCode`].
     pub const fn reply(ty: ScalarType) -> Self {
         Self { ty, sends: Sends::Reply }
     }
 
-    /// The field is `variable * scale + offset`. Of no effect on other fields.
+    /// Makes the field `variable * scale + offset`. No effect on other fields.
     pub fn scaled(mut self, scale: f32, offset: f32) -> Self {
         if let Sends::Variable { scale: own_scale, offset: own_offset, .. } = &mut self.sends {
             (*own_scale, *own_offset) = (scale, offset);

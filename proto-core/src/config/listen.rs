@@ -1,7 +1,8 @@
 //! The address and port that a port listens on.
 //!
-//! In: text such as `0.0.0.0:50000` or `[::]:50000`. Out: what [`SocketAddr`]'s own reader makes of
-//! it, for every text; that reader's indices are out of the compiler's sight.
+//! In: text such as `0.0.0.0:50000` or `[::]:50000`. Out: the same result as the parser of
+//! [`SocketAddr`] for every text. That parser is not used because the compiler cannot prove that it
+//! does not panic.
 
 use core::net::{Ipv4Addr, Ipv6Addr, SocketAddr, SocketAddrV4, SocketAddrV6};
 
@@ -29,7 +30,7 @@ pub fn listen_address(text: &str) -> Option<SocketAddr> {
 }
 
 fn decimal<T: core::str::FromStr>(digits: &str) -> Option<T> {
-    // `parse` would take a sign.
+    // `parse` would accept a sign.
     digits.bytes().all(|byte| byte.is_ascii_digit()).then(|| digits.parse().ok())?
 }
 
@@ -38,7 +39,7 @@ fn ipv4(text: &str) -> Option<Ipv4Addr> {
     let (second, rest) = split_once(rest, b'.')?;
     let (third, fourth) = split_once(rest, b'.')?;
     let octet = |text: &str| {
-        // A leading zero means octal to some.
+        // A leading zero means octal to some programs.
         let leading_zero = text.len() > 1 && text.starts_with('0');
         if leading_zero { None } else { decimal(text) }
     };
@@ -47,7 +48,7 @@ fn ipv4(text: &str) -> Option<Ipv4Addr> {
 
 pub(super) fn ipv6(text: &str) -> Option<Ipv6Addr> {
     let mut groups: Vec<u16, 8> = Vec::new();
-    // How many groups stand before the `::`.
+    // Number of groups before the `::`.
     let mut gap = None;
     let mut rest = text;
     if let Some(behind) = rest.strip_prefix("::") {
@@ -78,7 +79,7 @@ pub(super) fn ipv6(text: &str) -> Option<Ipv6Addr> {
     }
     let mut all = [0; 8];
     match gap {
-        // It stands for one group at least.
+        // It stands for at least one group.
         Some(before) if !groups.is_full() => {
             let (front, back) = groups.split_at_checked(before)?;
             all.iter_mut().zip(front).for_each(|(place, group)| *place = *group);

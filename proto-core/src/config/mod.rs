@@ -1,9 +1,9 @@
-//! The gateway's configuration as the engine takes it: TOML on the host, postcard on the board and
-//! the builder in a program end in these types (docs/architecture.md section 5).
+//! The gateway's configuration as the engine takes it. TOML on the host, postcard on the board and
+//! the builder in a program all produce these types (docs/architecture.md section 5).
 //!
 //! Bounded and plain: names are kept for messages, everything else is numbers. Nothing here has
-//! been checked until [`ConfigView::validate`] said so. [`GatewayConfig::builder`] makes a
-//! configuration in a program; whoever needs less room than the default gives smaller numbers, such as
+//! been checked until [`ConfigView::validate`] has accepted it. [`GatewayConfig::builder`] makes a
+//! configuration in a program. If the default sizes are too large, give smaller ones, such as
 //! `GatewayConfig<1, 1, 32, 0, 4>`: one port, one recipe, 32 fields, no commands, 4 safe values.
 
 mod add;
@@ -44,32 +44,32 @@ use crate::wire::can::CanId;
 use crate::wire::dialect::Dialect;
 use crate::wire::scalar::ScalarType;
 
-/// Most field ports, and most listening ports for the controller's own clients.
+/// Maximum number of ports: field ports, and listening ports for the controller's own clients.
 pub const MAX_PORTS: usize = 8;
-/// Most recipes in one configuration.
+/// Maximum number of recipes.
 pub const MAX_RECIPES: usize = 16;
-/// Fields over all recipes together.
+/// Maximum number of fields in all recipes together.
 pub const MAX_ALL_FIELDS: usize = 1024;
-/// Entries over all command tables together.
+/// Maximum number of entries in all command tables together.
 pub const MAX_COMMANDS: usize = 32;
-/// Safe values over all ports together.
+/// Maximum number of safe values on all ports together.
 pub const MAX_SAFE_VALUES: usize = 64;
-/// Longest name of a recipe or port, in bytes.
+/// Maximum length of the name of a recipe or port, in bytes.
 pub const MAX_NAME: usize = 32;
-/// Longest address or host name of the controller, in bytes.
+/// Maximum length of the controller's address or host name, in bytes.
 pub const MAX_ADDRESS: usize = 64;
-/// Longest address and port to listen on, in bytes.
+/// Maximum length of an address and port to listen on, in bytes.
 pub const MAX_LISTEN: usize = 48;
 
-/// A recipe's or port's name.
+/// Name of a recipe or port.
 pub type Name = String<MAX_NAME>;
-/// A stream part's head or tail.
+/// Head or tail of a stream part.
 pub type Delimiter = Vec<u8, MAX_DELIMITER>;
 
-/// A whole gateway file, with room for so many ports, recipes, fields of all recipes, entries of all
-/// command tables and safe values of all ports.
+/// A whole gateway file. The parameters are the numbers of ports, recipes, fields in all recipes,
+/// entries in all command tables and safe values on all ports that there is room for.
 ///
-/// The defaults are the most that a file can have, and take 44 KiB. [`Self::empty`] is all zeros, so a
+/// The defaults are the maximum for a file and take 44 KiB. [`Self::empty`] is all zeros, so a
 /// static one takes no flash.
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
@@ -81,19 +81,19 @@ pub struct GatewayConfig<
     const COMMANDS: usize = MAX_COMMANDS,
     const SAFE_VALUES: usize = MAX_SAFE_VALUES,
 > {
-    /// Where the controller is and what it speaks.
+    /// The controller's address, ports and dialect.
     pub controller: ControllerLink,
-    /// A board's own address.
+    /// The board's own address.
     pub network: BoardAddress,
     /// Every recipe, in file order.
     pub recipes: Vec<Recipe, RECIPES>,
     /// Every port, in file order.
     pub ports: Vec<Port, PORTS>,
-    /// The fields of all recipes; parts name ranges of it.
+    /// The fields of all recipes; parts refer to ranges of it.
     pub fields: Vec<FieldSpec, ALL_FIELDS>,
-    /// The entries of all command tables; bindings name ranges of it.
+    /// The entries of all command tables; bindings refer to ranges of it.
     pub commands: Vec<CommandEntry, COMMANDS>,
-    /// What inputs become when their port times out; ports name ranges of it.
+    /// The values that inputs take when their port times out; ports refer to ranges of it.
     pub safe_values: Vec<SafeValue, SAFE_VALUES>,
 }
 
@@ -105,7 +105,7 @@ impl<
     const SAFE_VALUES: usize,
 > GatewayConfig<PORTS, RECIPES, ALL_FIELDS, COMMANDS, SAFE_VALUES>
 {
-    /// Nothing at all: no controller, no recipes, no ports. All bytes are zero.
+    /// An empty configuration: no controller, no recipes, no ports. All bytes are zero.
     pub const fn empty() -> Self {
         Self {
             controller: ControllerLink::none(),
@@ -118,7 +118,7 @@ impl<
         }
     }
 
-    /// The same for every size: what the engine, the checks and the image take.
+    /// A view of the same type for every size, as the engine, the checks and the image take it.
     pub fn view(&self) -> ConfigView<'_> {
         ConfigView {
             controller: &self.controller,
@@ -131,7 +131,7 @@ impl<
         }
     }
 
-    /// The same for every size, to write to.
+    /// A mutable view of the same type for every size.
     pub fn view_mut(&mut self) -> ConfigMut<'_> {
         ConfigMut {
             controller: &mut self.controller,
@@ -161,7 +161,7 @@ impl<
     const SAFE_VALUES: usize,
 > Default for GatewayConfig<PORTS, RECIPES, ALL_FIELDS, COMMANDS, SAFE_VALUES>
 {
-    /// [`Self::empty`].
+    /// Same as [`Self::empty`].
     fn default() -> Self {
         Self::empty()
     }
@@ -190,13 +190,13 @@ pub struct ControllerLink {
     pub address: String<MAX_ADDRESS>,
     /// Name of the dialect (see [`crate::wire::dialect`]).
     pub dialect: String<16>,
-    /// Port 2000 or where it was moved to.
+    /// Command port, normally 2000.
     pub command_port: u16,
-    /// Port 2001.
+    /// State port, normally 2001.
     pub state_port: u16,
-    /// Port 502.
+    /// Modbus port, normally 502.
     pub modbus_port: u16,
-    /// The controller's UDP 2011 recipe server, when it is set to one of our recipes.
+    /// The controller's UDP 2011 recipe server, if it is set to one of our recipes.
     pub recipe_link: Option<RecipeLink>,
 }
 
@@ -212,7 +212,7 @@ impl ControllerLink {
         }
     }
 
-    /// Takes a dialect's name, and the Modbus port that such a controller has.
+    /// Sets the dialect, and the Modbus port that a controller of this dialect has.
     pub fn set_dialect(&mut self, dialect: Dialect) {
         self.modbus_port = dialect.modbus_port;
         // The names of the table are short.
@@ -221,8 +221,8 @@ impl ControllerLink {
 }
 
 impl Default for ControllerLink {
-    /// What a file gets that says nothing but an address: dialect v2.3, ports 2000, 2001 and 502, no
-    /// recipe link.
+    /// The defaults of a file that gives only an address: dialect v2.3, ports 2000, 2001 and 502,
+    /// no recipe link.
     fn default() -> Self {
         let mut link = Self { command_port: 2000, state_port: 2001, ..Self::none() };
         link.set_dialect(Dialect::V2_3);
@@ -306,19 +306,19 @@ pub struct CanFramePart {
 pub struct Span {
     /// First index.
     pub start: u16,
-    /// How many.
+    /// Number of entries.
     pub len: u16,
 }
 
 impl Span {
-    /// The part of `pool` this range names; empty when it does not fit.
+    /// The part of `pool` that this range covers; empty if it does not fit.
     pub fn of<T>(self, pool: &[T]) -> &[T] {
         let start = usize::from(self.start);
         pool.get(start..start.saturating_add(usize::from(self.len))).unwrap_or(&[])
     }
 }
 
-/// One field with what the gateway does with it.
+/// One field, and what the gateway does with it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub enum FieldSpec {
@@ -328,7 +328,7 @@ pub enum FieldSpec {
     UserInput {
         /// The field's type on the wire.
         ty: ScalarType,
-        /// What its value does.
+        /// What is done with its value.
         to: InputBinding,
     },
     /// A field of a user-defined recipe's output part.
@@ -340,31 +340,31 @@ pub enum FieldSpec {
     },
 }
 
-/// What a received user-defined value does.
+/// What is done with a received user-defined value.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub enum InputBinding {
-    /// Nothing.
+    /// It is ignored.
     Unused,
     /// `value * scale + offset` becomes the variable's value.
     Variable {
         /// An input variable.
         var: SysVar,
-        /// Factor.
+        /// Scale.
         scale: f32,
-        /// Summand, after the factor.
+        /// Offset, added after scaling.
         offset: f32,
     },
     /// The value picks a port-2000 command from a table; a value not in the table does nothing.
     Commands {
         /// The table, in [`GatewayConfig::commands`].
         table: Span,
-        /// When a value acts.
+        /// When a value takes effect.
         when: CommandWhen,
     },
 }
 
-/// When a value that picks a command acts.
+/// When a value that picks a command takes effect.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub enum CommandWhen {
@@ -383,20 +383,20 @@ pub enum OutputBinding {
     Variable {
         /// Any variable that the controller shows.
         var: SysVar,
-        /// Factor.
+        /// Scale.
         scale: f32,
-        /// Summand, after the factor.
+        /// Offset, added after scaling.
         offset: f32,
     },
     /// A constant.
     Constant(f64),
     /// Frames sent so far, wrapping in the field's type.
     Counter,
-    /// The outcome of this port's newest command: see [`crate::engine::ReplyCode`].
+    /// The result of this port's newest command: see [`crate::engine::ReplyCode`].
     Reply,
 }
 
-/// One line of a command table.
+/// One entry of a command table.
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct CommandEntry {
@@ -406,7 +406,7 @@ pub struct CommandEntry {
     pub text: String<MAX_COMMAND_TEXT>,
 }
 
-/// Longest command a table can hold, in bytes; well below what the controller takes (D5).
+/// Maximum length of a command in a table, in bytes; well below the controller's limit (D5).
 pub const MAX_COMMAND_TEXT: usize = 96;
 
 /// What a port does while the sources of its output are older than `stale_after`.
@@ -447,7 +447,7 @@ pub enum SendOn {
 pub struct Port {
     /// Its name, as `--bind` and `--stats` use it.
     pub name: Name,
-    /// What it is.
+    /// Its bus.
     pub bus: Bus,
     /// Index into [`GatewayConfig::recipes`].
     pub recipe: u8,
@@ -455,14 +455,14 @@ pub struct Port {
     pub cycle: Duration,
     /// After this long without an accepted frame the port's inputs take their safe values.
     pub timeout: Duration,
-    /// The safe values that inputs take then; inputs without one hold.
+    /// The safe values that inputs take then; inputs without a safe value hold.
     pub on_timeout: Span,
     /// Outputs whose source is older than this are stale.
     pub stale_after: Duration,
 }
 
 impl Recipe {
-    /// A recipe with these parts that is sent by period and holds stale values.
+    /// A recipe with these parts that is sent every cycle and holds stale values.
     pub const fn new(name: Name, mode: Mode, parts: Parts) -> Self {
         Self { name, mode, parts, on_stale: OnStale::Hold, send: SendOn::Period }
     }
@@ -484,7 +484,7 @@ impl Port {
     }
 }
 
-/// What a port is.
+/// The bus of a port.
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub enum Bus {
@@ -508,10 +508,10 @@ pub enum Bus {
 }
 
 impl Bus {
-    /// A CAN bus's speed when nothing else is said, in bit/s.
+    /// Default bit rate of a CAN bus, in bit/s.
     pub const BITRATE: u32 = 500_000;
 
-    /// Whether devices (and not the controller) are at the other end.
+    /// Whether devices (not the controller) are at the other end.
     pub fn is_field(&self) -> bool {
         matches!(self, Self::Rs485(_) | Self::Can { .. })
     }
@@ -527,15 +527,15 @@ pub struct Rs485 {
     pub parity: Parity,
     /// 1 or 2.
     pub stop_bits: u8,
-    /// A partial frame is discarded when the line was silent for this long.
+    /// A partial frame is discarded after the line has been silent for this long.
     pub idle_gap: Duration,
-    /// The line must have been silent for this long before we send.
+    /// The line must have been silent for this long before a frame is sent.
     pub turnaround: Duration,
 }
 
 impl Default for Rs485 {
-    /// A file's defaults: 115 200 bit/s, no parity, 1 stop bit, an idle gap of 50 ms, a turnaround of
-    /// 100 µs.
+    /// The defaults of a file: 115 200 bit/s, no parity, 1 stop bit, an idle gap of 50 ms, a
+    /// turnaround of 100 µs.
     fn default() -> Self {
         Self {
             baud: 115_200,
@@ -554,9 +554,9 @@ pub enum Parity {
     /// No parity bit.
     #[default]
     None,
-    /// Even.
+    /// Even parity.
     Even,
-    /// Odd.
+    /// Odd parity.
     Odd,
 }
 

@@ -1,4 +1,4 @@
-//! A board's own address, when it does not get one by DHCP.
+//! The board's own address, if it does not use DHCP.
 
 use core::net::Ipv4Addr;
 
@@ -10,29 +10,30 @@ use super::error::{ConfigErrorKind as Kind, NetworkKey};
 pub struct Network {
     /// The board's address.
     pub address: Ipv4Addr,
-    /// Bits of the network, 1..=30.
+    /// Prefix length in bits, 1..=30.
     pub prefix: u8,
-    /// Where packets to other networks go.
+    /// The router for packets to other networks.
     pub router: Option<Ipv4Addr>,
-    /// The server that knows the controller's name.
+    /// The name server that resolves the controller's name.
     pub dns: Option<Ipv4Addr>,
 }
 
-/// Where a board's address comes from.
+/// Where a board's address comes from. A tag of its own makes DHCP all zeros, so that an empty
+/// configuration takes no flash.
 // The tag stands for itself, so that DHCP is a zero: nothing of an empty configuration takes flash.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[repr(u8)]
 pub enum BoardAddress {
-    /// DHCP is asked.
+    /// From DHCP.
     #[default]
     Dhcp,
-    /// It stands in the configuration.
+    /// From the configuration.
     Static(Network),
 }
 
 impl BoardAddress {
-    /// The address in the configuration; `None` if DHCP is asked.
+    /// The address in the configuration; `None` with DHCP.
     pub const fn fixed(&self) -> Option<&Network> {
         match self {
             Self::Dhcp => None,
@@ -57,13 +58,13 @@ impl Network {
         u32::MAX.checked_shl(32_u32.saturating_sub(self.prefix.into())).unwrap_or(0)
     }
 
-    /// Whether a host of this network can have this address.
+    /// Whether the address can be that of a host in this network.
     fn is_host(&self, address: Ipv4Addr) -> bool {
         let host = address.to_bits() & !self.mask();
         is_unicast(address) && self.contains(address) && host != 0 && host != !self.mask()
     }
 
-    /// Everything that can be wrong; `controller` is an address or a name.
+    /// Checks the network; `controller` is an address or a name.
     pub(super) fn check(&self, controller: &str) -> Result<(), (NetworkKey, Kind)> {
         if !(1..=30).contains(&self.prefix) {
             return Err((NetworkKey::Address, Kind::Prefix { prefix: self.prefix }));

@@ -1,7 +1,7 @@
-//! The rules that one value alone has to keep, and how a broken one is reported.
+//! The rules for single values, and how a broken one is reported.
 //!
-//! In: a name, a number, a range. Out: nothing, or what is wrong with it. Files and
-//! [`ConfigView::validate`](super::ConfigView::validate) ask the same functions.
+//! In: a name, a number, a range. Out: nothing, or what is wrong with it. The reader of files and
+//! [`ConfigView::validate`](super::ConfigView::validate) use the same functions.
 
 use super::error::{ConfigError, ConfigErrorKind as Kind, Counted, Place, PortKey};
 use super::listen::ipv6;
@@ -9,17 +9,17 @@ use super::{MAX_ADDRESS, MAX_NAME, Name, Rs485, Span};
 use crate::sysvar::{COUNT, SysVar};
 use crate::time::Duration;
 
-/// The controller's fastest cycle, and a port's.
+/// The shortest cycle, of the controller and of a port.
 pub const MIN_CYCLE: Duration = Duration::from_millis(4);
-/// Longest cycle, timeout or staleness that a configuration may ask for.
+/// The longest cycle, timeout or staleness that a configuration may have.
 pub const MAX_TIME: Duration = Duration::from_secs(3_600);
-/// Longest idle gap and turnaround of a serial line.
+/// The longest idle gap and turnaround of a serial line.
 pub const MAX_LINE_TIME: Duration = Duration::from_secs(1);
 
 pub(super) type Check = Result<(), ConfigError>;
 
 impl Rs485 {
-    /// Whether the settings are within their ranges (D21).
+    /// Checks that the settings are within their ranges (D21).
     ///
     /// # Errors
     /// The key and what is wrong with it.
@@ -42,7 +42,7 @@ impl Rs485 {
     }
 }
 
-/// Whether a CAN bus can run at `bitrate` bit/s (D21).
+/// Checks that a CAN bus can run at `bitrate` bit/s (D21).
 ///
 /// # Errors
 /// [`ConfigErrorKind::BitrateOutOfRange`](Kind::BitrateOutOfRange).
@@ -50,7 +50,7 @@ pub fn check_bitrate(bitrate: u32) -> Result<(), Kind> {
     if (10_000..=1_000_000).contains(&bitrate) { Ok(()) } else { Err(Kind::BitrateOutOfRange { bitrate }) }
 }
 
-/// Whether a port can have this cycle: from the controller's fastest to [`MAX_TIME`].
+/// Checks the cycle of a port: from the controller's fastest to [`MAX_TIME`].
 ///
 /// # Errors
 /// [`ConfigErrorKind::CycleTooShort`](Kind::CycleTooShort) or
@@ -67,7 +67,7 @@ pub(super) fn fail(place: Place, kind: Kind) -> Check {
     Err(ConfigError { place, kind })
 }
 
-/// Whether a recipe or port can have this name: 1..=32 bytes without blanks, quotes, `=` and control
+/// Checks the name of a recipe or port: 1..=32 bytes without spaces, quotes, `=` and control
 /// characters, so that a command line can carry it.
 ///
 /// # Errors
@@ -84,7 +84,7 @@ pub fn check_name(name: &str) -> Result<(), Kind> {
     }
 }
 
-/// Whether the controller can be called so: an IP address without a port, or a host name of letters,
+/// Checks the controller's address: an IP address without a port, or a host name of letters,
 /// digits, `.`, `-` and `_`; at most 64 bytes.
 ///
 /// # Errors
@@ -100,7 +100,7 @@ pub fn check_address(address: &str) -> Result<(), Kind> {
     Ok(())
 }
 
-/// A valid name that no recipe or port before has.
+/// A valid name that no earlier recipe or port has.
 pub(super) fn check_new_name<'a>(
     place: Place,
     name: &str,
@@ -140,7 +140,7 @@ pub(super) fn is_marked(set: &[bool; COUNT], var: SysVar) -> bool {
     set.get(var.ordinal()).copied().unwrap_or(false)
 }
 
-/// Whether there is room for so many.
+/// Checks that there is room for so many entries.
 pub(super) fn check_room(place: Place, what: Counted, needed: usize, room: usize) -> Check {
     if needed <= room { Ok(()) } else { fail(place, Kind::TooMany { what, needed, room }) }
 }

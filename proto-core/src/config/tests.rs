@@ -107,7 +107,7 @@ fn good_configurations_pass() {
     Builder::one_port().stream(&["DigitalOutputCommand[1]"], &["RobotState[26]"]).link(1).valid();
     let listen = Bus::TcpListen { listen: text("[::]:50000") };
     Builder::one_port().port(0, listen).valid();
-    // Nothing to do is no mistake.
+    // Doing nothing is not a mistake.
     Builder::new().valid();
 }
 
@@ -221,7 +221,7 @@ fn a_variable_has_one_owner() {
         Place::Port { port: 1, key: PortKey::Recipe },
         ConfigErrorKind::OwnedTwice { var, other: 0 },
     );
-    // A way up carries what a port owns; it owns nothing itself.
+    // A way up carries what a port owns; it does not own anything itself.
     Builder::one_port().port(0, Bus::UdpListen { listen: text("0.0.0.0:0") }).valid();
 }
 
@@ -252,7 +252,7 @@ fn what_only_recipe_ports_carry_needs_one() {
 fn errors_name_things_when_the_configuration_is_at_hand() {
     let config = Builder::one_port().rs485(0).0;
     let error = config.validate().unwrap_err();
-    let unnamed = "port 2, recipe: this port writes DigitalOutputCommand[1], and so does port 1; a variable has one owner";
+    let unnamed = "port 2, recipe: DigitalOutputCommand[1] is written by this port and by port 1; a variable has one owner";
     assert_eq!(error.to_string(), unnamed);
     let named = unnamed.replace("port 2", "port \"port-1\"").replace("port 1;", "port \"port-0\";");
     assert_eq!(config.view().describe(error).to_string(), named);
@@ -327,7 +327,7 @@ proptest! {
         }
         let Ok(config) = postcard::from_bytes::<GatewayConfig>(&bytes[..len]) else { return Ok(()) };
         match config.validate() {
-            // What passes must not surprise anybody who runs on it.
+            // What passes must not surprise anybody who runs it.
             Ok(()) => {
                 prop_assert!(config.view().warnings().count() < 1_000);
                 prop_assert!(crate::engine::Plan::new(&config).is_ok());

@@ -1,8 +1,8 @@
-//! The checks that make a configuration fit for the engine.
+//! The checks that a configuration must pass before the engine takes it.
 //!
 //! In: a configuration, from whatever file format. Out: nothing, or the first mistake with its
-//! place. Order: controller, recipes, ports, then what concerns several of them (ownership and
-//! ways up and down).
+//! place. Order: controller, recipes, ports, then what concerns several of them (owners, ways up
+//! and sources).
 
 use super::check_recipe::{RecipeCheck, check_layout};
 use super::error::{ConfigError, ConfigErrorKind as Kind, ControllerKey, Counted, Place, PortKey, RecipeKey};
@@ -41,7 +41,7 @@ impl<'c> ConfigView<'c> {
         self.check_safe_values()
     }
 
-    /// The engine and the image have room for what a file can have.
+    /// The engine and the image have room for the maximum of a file.
     fn check_counts(&self) -> Check {
         for (what, needed, room) in [
             (Counted::Ports, self.ports.len(), MAX_PORTS),
@@ -133,8 +133,8 @@ impl<'c> ConfigView<'c> {
         check_pool(at(PortKey::OnTimeout), port.on_timeout, self.safe_values.len())
     }
 
-    /// A byte stream needs a head or a tail to find frames by (D18); the rest holds on any line and
-    /// was checked with the recipe.
+    /// A byte stream needs a head or a tail to find frames by (D18); everything else is valid on
+    /// any line and was checked with the recipe.
     fn check_framing(&self, port: u8, index: u8, recipe: &Recipe) -> Check {
         for part in [Direction::Input, Direction::Output] {
             if let Err(error) = check_layout(*self, recipe, part, Framing::Bytes) {
@@ -166,12 +166,12 @@ impl<'c> ConfigView<'c> {
         }
     }
 
-    /// One owner a variable.
+    /// Each variable has one owner.
     fn check_owners(&self) -> Check {
         let mut owners = [None; INPUT_COUNT];
         for (index, _, recipe) in self.field_ports() {
             for var in self.written_by(recipe) {
-                // An input variable's ordinal is below INPUT_COUNT; others were refused before.
+                // An input variable's ordinal is below INPUT_COUNT; others are refused earlier.
                 let Some(owner) = owners.get_mut(var.ordinal()) else { continue };
                 match *owner {
                     Some(other) if other != index => {
@@ -185,7 +185,8 @@ impl<'c> ConfigView<'c> {
         Ok(())
     }
 
-    /// Every variable a port writes can be carried, and everything that is carried has a value.
+    /// Every variable that a port writes can be carried, and everything that is carried has a
+    /// value.
     fn check_ways_up(&self) -> Check {
         for (port, port_config, recipe) in self.field_ports() {
             for (frame, field, spec) in self.fields_of(recipe, Direction::Input) {
@@ -209,11 +210,11 @@ impl<'c> ConfigView<'c> {
         Ok(())
     }
 
-    /// Every variable a port sends or triggers on is shown somewhere.
+    /// Every variable that a port sends or triggers on has a source.
     fn check_sources(&self) -> Check {
         for (port, port_config, recipe) in self.field_ports() {
             let index = port_config.recipe;
-            // An input variable can be shown as its owner last sent it.
+            // An input variable can be shown as its owner sent it last.
             let is_shown = |var: SysVar| {
                 var.stream().is_some()
                     || var.modbus().is_some()

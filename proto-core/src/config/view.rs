@@ -1,4 +1,4 @@
-//! A configuration of any size, as those who read it see it.
+//! A borrowed view of a configuration of any size.
 //!
 //! In: a [`GatewayConfig`](super::GatewayConfig) of any parameters, or slices of a program's own. Out:
 //! borrowed slices, and the questions that concern several of them.
@@ -11,28 +11,30 @@ use super::{
 use crate::recipe::model::Field;
 use crate::sysvar::{Direction, SysVar};
 
-/// A configuration of any size, borrowed; [`GatewayConfig`](super::GatewayConfig) says what is in it.
+/// A configuration of any size, borrowed; [`GatewayConfig`](super::GatewayConfig) describes the
+/// fields.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[non_exhaustive]
 pub struct ConfigView<'c> {
-    /// Where the controller is and what it speaks.
+    /// The controller's address, ports and dialect.
     pub controller: &'c ControllerLink,
-    /// A board's own address; `None` asks DHCP.
+    /// The board's own address; `None` means DHCP.
     pub network: Option<&'c Network>,
     /// Every recipe.
     pub recipes: &'c [Recipe],
     /// Every port.
     pub ports: &'c [Port],
-    /// The fields of all recipes; parts name ranges of it.
+    /// The fields of all recipes; parts refer to ranges of it.
     pub fields: &'c [FieldSpec],
-    /// The entries of all command tables; bindings name ranges of it.
+    /// The entries of all command tables; bindings refer to ranges of it.
     pub commands: &'c [CommandEntry],
-    /// What inputs become when their port times out; ports name ranges of it.
+    /// The values that inputs take when their port times out; ports refer to ranges of it.
     pub safe_values: &'c [SafeValue],
 }
 
 impl<'c> ConfigView<'c> {
-    /// A controller and nothing else; a program that keeps its own slices puts them into the fields.
+    /// A view with a controller and nothing else; a program that keeps its own slices sets the
+    /// other fields.
     pub const fn new(controller: &'c ControllerLink) -> Self {
         Self {
             controller,
@@ -45,14 +47,14 @@ impl<'c> ConfigView<'c> {
         }
     }
 
-    /// The recipes on the ways up: the recipe link's, then those of the listening ports.
+    /// The recipes on the ways up: that of the recipe link, then those of the listening ports.
     pub fn upstream_recipes(self) -> impl Iterator<Item = (u8, &'c Recipe)> {
         let link = self.controller.recipe_link.map(|link| link.recipe);
         let ports = self.ports.iter().filter(|port| !port.bus.is_field()).map(|port| port.recipe);
         link.into_iter().chain(ports).filter_map(|index| Some((index, self.recipes.get(usize::from(index))?)))
     }
 
-    /// The ports with devices behind them, with their indices and recipes.
+    /// The field ports, each with its index and recipe.
     pub fn field_ports(self) -> impl Iterator<Item = (u8, &'c Port, &'c Recipe)> {
         (0..)
             .zip(self.ports)
@@ -103,7 +105,7 @@ impl Recipe {
 }
 
 impl FieldSpec {
-    /// What the field is on the wire.
+    /// The field as it is on the wire.
     pub fn field(&self) -> Field {
         match *self {
             Self::System(var) => Field::System(var),
@@ -111,7 +113,7 @@ impl FieldSpec {
         }
     }
 
-    /// The system variable that the field is, is written to, or is read from.
+    /// The system variable that the field is, or that it is bound to.
     pub fn variable(&self) -> Option<SysVar> {
         match *self {
             Self::System(var)

@@ -1,9 +1,9 @@
 //! The links to port 2000: commands that field values pick (docs/engine.md section 7).
 //!
-//! A command is sent once or not at all. What cannot be sent soon is dropped and said so in the
-//! port's reply code ([`Outcomes`]): a robot must not start later because of a button pressed earlier. What stops
-//! the robot has a connection of its own, goes ahead of everything and is not dropped while its
-//! device asks for it.
+//! A command is sent once or not at all. A command that cannot be sent soon is dropped, and the
+//! port's reply code ([`Outcomes`]) says so: a robot must not start later because a button was
+//! pressed earlier. A command that stops the robot has its own connection, goes ahead of
+//! everything, and is not dropped while its device asks for it.
 
 use heapless::{Deque, String, Vec};
 
@@ -22,15 +22,16 @@ use crate::wire::scalar::Scalar;
 pub const MAX_COMMAND_FIELDS: usize = 16;
 /// Bytes of command texts, over all tables.
 pub const MAX_COMMAND_BYTES: usize = 1024;
-/// A command that has not been acknowledged this long after it was picked is dropped.
+/// A command that is not acknowledged this long after it was picked is dropped.
 const COMMAND_TTL: Duration = Duration::from_secs(1);
-/// Two losses of the second connection within this time: the controller takes only one (D26).
+/// Two losses of the second connection within this time mean that the controller takes only one
+/// (D26).
 const STRIKES_WITHIN: Duration = Duration::from_secs(10);
-/// A connection that is gone is open again by then, or another is given up for a stop.
+/// Within this time a lost connection is open again, or another one is given up for a stop.
 const OPEN_AGAIN: Duration = Duration::from_millis(500);
-/// Replies that are about to be told may make room for a stop that was just picked.
+/// Replies that are about to be handled may make room for a stop that was just picked.
 const ROOM_WITHIN: Duration = Duration::from_millis(20);
-/// What is lost this soon after something else is lost for the same reason.
+/// A second loss within this time has the same cause as the first.
 const TOGETHER: Duration = Duration::from_secs(1);
 
 /// A field whose values pick commands.
@@ -38,7 +39,7 @@ const TOGETHER: Duration = Duration::from_secs(1);
 pub(super) struct CommandField {
     pub table: Span,
     pub when: CommandWhen,
-    /// The value of the frame before; none after silence.
+    /// The value in the previous frame; none after silence.
     pub last: Option<i64>,
 }
 
@@ -46,11 +47,11 @@ pub(super) struct CommandField {
 #[derive(Debug, Clone)]
 struct Tables {
     entries: Vec<Entry, MAX_COMMANDS>,
-    /// The texts of all entries, one behind the other.
+    /// The texts of all entries, one after the other.
     texts: String<MAX_COMMAND_BYTES>,
 }
 
-/// One line of a command table.
+/// One entry of a command table.
 #[derive(Debug, Clone, Copy)]
 struct Entry {
     value: i64,
@@ -70,17 +71,17 @@ pub(super) struct CommandLink {
     fields: Vec<CommandField, MAX_COMMAND_FIELDS>,
     queue: Deque<Waiting, COMMAND_QUEUE>,
     stops: Stops,
-    /// The frame that is being applied picked an urgent command.
+    /// The frame that is being applied has picked an urgent command.
     stops_now: bool,
-    /// The first so many of the queue were overtaken by an urgent command.
+    /// Number of commands at the front of the queue that an urgent command has overtaken.
     overtaken: usize,
     /// When the second connection, or the first because of it, was lost last.
     struck_at: Option<Instant>,
-    /// Before this no connection is given up for a stop that has nowhere to go.
+    /// Until then no connection is given up for a stop that cannot be sent.
     way_made_until: Instant,
     /// The newest command that each port's values picked.
     picked: [Option<u16>; MAX_PORTS],
-    /// What became of commands, since the engine asked last.
+    /// Results of commands since the engine asked last.
     pub outcomes: Outcomes,
 }
 
@@ -90,7 +91,7 @@ impl Tables {
         for entry in entries {
             let start = tables.texts.len() as u16;
             tables.texts.push_str(&entry.text).ok()?;
-            // Validation has refused what is no command.
+            // Validation has refused everything that is not a command.
             let keyword = Request::parse(entry.text.as_bytes()).map_or(Keyword::State, |r| r.keyword());
             let entry = Entry { value: entry.value, start, len: entry.text.len() as u16, keyword };
             tables.entries.push(entry).ok()?;
@@ -107,7 +108,7 @@ impl Tables {
 }
 
 impl CommandLink {
-    /// Links with these command tables; `None` when their texts are too long together.
+    /// Links with these command tables; `None` if their texts are too long together.
     pub(super) fn new(port: u16, dialect: Dialect, entries: &[CommandEntry]) -> Option<Self> {
         let tables = Tables::new(entries)?;
         let stops = tables.entries.iter().any(|entry| entry.keyword.is_urgent());
@@ -139,16 +140,16 @@ impl CommandLink {
         Transport::Tcp { port: self.port }
     }
 
-    /// Adds a field; its index, or `None` when there are too many.
+    /// Adds a field and returns its index, or `None` if there are too many.
     pub(super) fn add_field(&mut self, table: Span, when: CommandWhen) -> Option<u8> {
         let index = self.fields.len() as u8;
         self.fields.push(CommandField { table, when, last: None }).ok()?;
         Some(index)
     }
 
-    /// An accepted frame brought a value of a command field. When that picks a command, `port`'s `nth`,
-    /// what is known of it at once: it waits, or is not sent. [`Self::frame_ends`] and
-    /// [`Self::drop_overtaken`] follow.
+    /// An accepted frame brought a value of a command field. If it picks a command, returns what is
+    /// known at once about `port`'s `nth` command: it waits, or is not sent. [`Self::frame_ends`]
+    /// and [`Self::drop_overtaken`] follow.
     pub(super) fn value(
         &mut self,
         field: u8,
@@ -183,14 +184,15 @@ impl CommandLink {
         Some(if is_queued { ReplyCode::Pending } else { ReplyCode::NotSent })
     }
 
-    /// All fields of a frame were looked at: whatever their order, what stops overtakes the rest.
+    /// All fields of a frame have been handled: an urgent command overtakes the rest, whatever
+    /// their order.
     pub(super) fn frame_ends(&mut self) {
         if core::mem::take(&mut self.stops_now) {
             self.overtaken = self.queue.len();
         }
     }
 
-    /// What an urgent command has overtaken is not sent any more.
+    /// Drops the commands that an urgent command has overtaken.
     pub(super) fn drop_overtaken(&mut self) {
         for _ in 0..core::mem::take(&mut self.overtaken) {
             if let Some(waiting) = self.queue.pop_front() {
@@ -199,7 +201,8 @@ impl CommandLink {
         }
     }
 
-    /// After silence the next value of the field only sets the base. [`Self::drop_forgotten`] follows.
+    /// After silence the next value of the field only sets the base. [`Self::drop_forgotten`]
+    /// follows.
     pub(super) fn forget(&mut self, field: u8, now: Instant) {
         if let Some(place) = self.fields.get_mut(usize::from(field))
             && place.last.take().is_some()
@@ -208,12 +211,12 @@ impl CommandLink {
         }
     }
 
-    /// A device that is gone takes what it asked for with it.
+    /// The device is gone: its waiting commands are dropped.
     pub(super) fn drop_forgotten(&mut self) {
         for _ in 0..self.queue.len() {
             let Some(waiting) = self.queue.pop_front() else { return };
             let is_there = self.fields.get(usize::from(waiting.field)).is_some_and(|f| f.last.is_some());
-            // The one that was taken out left its place.
+            // The queue has moved up by one.
             if !is_there || self.queue.push_back(waiting).is_err() {
                 self.outcomes.push(waiting, ReplyCode::NotSent);
             }
@@ -248,7 +251,7 @@ impl CommandLink {
             {
                 self.strike(now);
             }
-            // Both were lost together: that was no verdict on the second one.
+            // Both were lost together: this says nothing about the second one.
             (LinkId::COMMAND, LinkState::Up { .. }, _) | (LinkId::URGENT, _, Some(LinkState::Up { .. })) => {
                 self.struck_at = self.struck_at.filter(|&at| now.saturating_since(at) > TOGETHER);
             }
@@ -268,7 +271,7 @@ impl CommandLink {
         }
     }
 
-    /// The controller was away: another may have come back.
+    /// The controller was away: another one may be in its place.
     fn was_away(&mut self, now: Instant) {
         self.struck_at = None;
         if let Some(urgent) = &mut self.urgent {
@@ -276,15 +279,16 @@ impl CommandLink {
         }
     }
 
-    /// A connection is gone: nothing that waited for it is sent later, what its device still asks to
-    /// stop excepted.
+    /// A connection is gone: what waited for it is not sent later, except a stop that its device
+    /// still asks for.
     fn lost(&mut self, link: LinkId, now: Instant) {
         let Some(session) = self.session(link) else { return };
         let [first, beside] = session.lost();
         if first.is_some() {
             self.no_way_before(now + OPEN_AGAIN);
         }
-        // Of two of a kind the newer one is sent again: its outcome is the one that is shown.
+        // Of two commands of a kind the newer one is sent again: its result is the one that is
+        // shown.
         for sent in [beside, first].into_iter().flatten() {
             if sent.keyword.is_urgent() && self.is_asked(&sent.command) {
                 self.stops.push_again(sent.keyword, Waiting { since: now, ..sent.command });
@@ -303,7 +307,7 @@ impl CommandLink {
         self.way_made_until = self.way_made_until.max(at);
     }
 
-    /// The gateway itself slept: nothing is commanded from what was asked before.
+    /// The gateway itself slept: commands picked before are dropped.
     pub(super) fn slept(&mut self, now: Instant) {
         self.fields.iter_mut().for_each(|field| field.last = None);
         for link in [LinkId::COMMAND, LinkId::URGENT] {
@@ -317,7 +321,7 @@ impl CommandLink {
         }
     }
 
-    /// The transport took everything.
+    /// The transport has taken everything.
     pub(super) fn sent(&mut self, link: LinkId) {
         if let Some(session) = self.session(link) {
             session.taken();
@@ -331,7 +335,7 @@ impl CommandLink {
         }
     }
 
-    /// Bytes arrived on a connection; whether it is up.
+    /// Bytes arrived on a connection. Returns whether it is up.
     pub(super) fn heard(&mut self, link: LinkId, len: usize, now: Instant) -> bool {
         let session = self.session(link).filter(|session| session.supervisor.is_up());
         session.map(|session| session.heard(len, now)).is_some()
@@ -345,7 +349,7 @@ impl CommandLink {
         }
     }
 
-    /// Looks at the clock: replies that silence completes, timeouts, what waited too long.
+    /// Handles the clock: replies completed by silence, timeouts, commands that waited too long.
     pub(super) fn advance(&mut self, now: Instant) {
         for link in [LinkId::URGENT, LinkId::COMMAND] {
             let Some(session) = self.session(link) else { continue };
@@ -361,13 +365,14 @@ impl CommandLink {
         if let Some((link, at)) = self.crowded()
             && now >= at
         {
-            // Nobody answers there: it is open again sooner than a reply can be hoped for.
+            // The peer does not answer: a new connection is open sooner than a reply can be
+            // expected.
             if let Some(session) = self.session(link) {
                 session.supervisor.give_up(now);
             }
             self.lost(link, now);
         }
-        // What becomes of the first may open the second at once.
+        // A change of the first connection may open the second at once.
         for link in [LinkId::COMMAND, LinkId::URGENT] {
             self.supervise(link, now);
         }
@@ -383,12 +388,13 @@ impl CommandLink {
         }
     }
 
-    /// Opens a connection again when it is time; one that did not come about in time says something.
+    /// Opens a connection again when it is due. One that did not open in time tells whether the
+    /// controller takes two.
     fn supervise(&mut self, link: LinkId, now: Instant) {
         let ordinary_is_up = self.ordinary.supervisor.is_up();
         let Some(session) = self.session(link) else { return };
         let was_opening = matches!(session.supervisor.state(), LinkState::Opening { .. });
-        // Silence is normal here, so nothing that is up is given up.
+        // Silence is normal here, so a connection that is up is never given up for it.
         session.supervisor.advance(now);
         if was_opening && matches!(session.supervisor.state(), LinkState::Down { .. }) {
             match link {
@@ -399,7 +405,7 @@ impl CommandLink {
         }
     }
 
-    /// The next urgent command, when one may be sent, and where.
+    /// The next urgent command that may be sent, and its connection.
     pub(super) fn next_stop(&mut self, out: &mut [u8], now: Instant) -> Option<(LinkId, usize)> {
         while let Some(link) = self.way_of_stops()
             && let Some(command) = self.pop_stop(now)
@@ -411,7 +417,7 @@ impl CommandLink {
         None
     }
 
-    /// The next other command, when one may be sent.
+    /// The next other command that may be sent.
     pub(super) fn next_command(&mut self, out: &mut [u8], now: Instant) -> Option<usize> {
         if self.queue.is_empty() || !self.ordinary.is_free() || self.is_stopping() {
             return None;
@@ -427,7 +433,7 @@ impl CommandLink {
         !self.stops.is_empty()
     }
 
-    /// Where an urgent command can go now.
+    /// The connection on which an urgent command can be sent now.
     fn way_of_stops(&self) -> Option<LinkId> {
         if self.stops.is_empty() {
             return None;
@@ -438,27 +444,27 @@ impl CommandLink {
         self.ordinary.is_free_beside().then_some(LinkId::COMMAND)
     }
 
-    /// The next urgent command, of a kind that is not under way or has been so for too long: whether the
-    /// controller has done anything with that one is not known.
+    /// The next urgent command of a kind that is not in flight, or has been for too long: nobody
+    /// knows whether the controller has carried that one out.
     fn pop_stop(&mut self, now: Instant) -> Option<(Keyword, Waiting)> {
         let sessions = [Some(&self.ordinary), self.urgent.as_ref()];
         self.stops.pop(|keyword| may_go_at(sessions, keyword) <= now)
     }
 
-    /// When one of the urgent commands that wait may go, its way apart.
+    /// When one of the waiting urgent commands may be sent, if a connection can take it.
     fn stop_may_go_at(&self) -> Instant {
         let sessions = [Some(&self.ordinary), self.urgent.as_ref()];
         self.stops.kinds().map(|keyword| may_go_at(sessions, keyword)).min().unwrap_or(Instant::NEVER)
     }
 
-    /// Where an urgent command waits for nothing but replies, and when it has done so for long enough:
-    /// the connection whose newest one has been unanswered for longest.
+    /// If an urgent command waits only for replies, and has waited long enough: the connection
+    /// whose newest command has been unanswered longest.
     fn crowded(&self) -> Option<(LinkId, Instant)> {
         let has_room = self.ordinary.supervisor.is_up() && self.ordinary.beside.is_none();
         if has_room || self.stops.is_empty() || self.way_of_stops().is_some() {
             return None;
         }
-        // Nothing is under way on a connection that is not up.
+        // Nothing is in flight on a connection that is not up.
         let urgent = self.urgent.as_ref().and_then(|session| session.in_flight);
         let urgent = urgent.map(|sent| (LinkId::URGENT, sent.at));
         let ordinary = self.ordinary.beside.map(|sent| (LinkId::COMMAND, sent.at));
@@ -478,7 +484,7 @@ impl CommandLink {
             && self.ordinary.is_unacknowledged()
             && self.ordinary.in_flight.is_some_and(is_ordinary)
         {
-            // What is under way there could arrive after this and start the robot again.
+            // A command in flight there could arrive after this one and start the robot again.
             self.ordinary.supervisor.give_up(times.0);
             self.lost(LinkId::COMMAND, times.0);
         }
@@ -504,7 +510,7 @@ impl CommandLink {
             || self.ordinary.beside.is_some()
     }
 
-    /// When something happens by itself: what happens on one connection may concern the other.
+    /// When something happens without an input. An event on one connection may concern the other.
     pub(super) fn deadline(&self) -> Instant {
         let sessions = [Some(&self.ordinary), self.urgent.as_ref()].into_iter().flatten();
         let own = sessions.map(|session| session.deadline().min(session.supervisor.deadline()));
@@ -537,7 +543,7 @@ impl CommandLink {
         is_asked(&self.fields, &self.tables, waiting)
     }
 
-    /// Takes what is in `rest`, or what the clock has completed.
+    /// Takes the events in `rest`, or those that the clock has completed.
     fn take(&mut self, link: LinkId, bytes: &[u8], now: Instant) {
         let mut rest = bytes;
         loop {
@@ -557,7 +563,7 @@ impl CommandLink {
     }
 }
 
-/// When an urgent command may be sent though one of its kind is unanswered.
+/// When an urgent command may be sent although one of its kind is unanswered.
 fn may_go_at(sessions: [Option<&Session>; 2], keyword: Keyword) -> Instant {
     let sent = sessions.into_iter().flatten().flat_map(|session| [session.in_flight, session.beside]);
     let same = sent.flatten().filter(|sent| sent.keyword == keyword);

@@ -1,6 +1,6 @@
-//! Everything that was done, refused or skipped, counted.
+//! Counters of everything that was accepted, rejected or skipped.
 
-/// What happened on a field port. Counters wrap after 2^32.
+/// Counters of a field port. They wrap after 2^32.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
@@ -10,9 +10,9 @@ pub struct PortCounters {
     pub frames_in: u32,
     /// Bytes received (CAN: data bytes).
     pub bytes_in: u32,
-    /// Frames handed over for sending.
+    /// Frames handed over to the driver.
     pub frames_out: u32,
-    /// Bytes handed over for sending (CAN: data bytes).
+    /// Bytes handed over to the driver (CAN: data bytes).
     pub bytes_out: u32,
     /// Frames rejected for a value that is not finite (D22).
     pub rejected_not_finite: u32,
@@ -24,33 +24,34 @@ pub struct PortCounters {
     pub rejected_length: u32,
     /// Remote frames ignored (D17).
     pub rejected_remote: u32,
-    /// Frames on a port whose recipe has no input part.
+    /// Frames received on a port whose recipe has no input part.
     pub rejected_no_input: u32,
-    /// Heads whose frame did not end in the tail (D19).
+    /// Frames that began with the head but did not end with the tail (D19).
     pub tail_mismatches: u32,
     /// Bytes dropped while looking for a frame (D19).
     pub resync_bytes: u32,
-    /// Bytes of partial frames discarded after silence (D19), and bytes that waited while the gateway
-    /// itself slept.
+    /// Bytes of partial frames discarded after silence (D19), and bytes discarded because they
+    /// waited while the gateway itself slept.
     pub discarded_bytes: u32,
-    /// Chunks of bytes, or CAN frames, discarded because they waited while the gateway itself slept.
+    /// Chunks of bytes, or CAN frames, discarded because they waited while the gateway itself
+    /// slept.
     pub asleep: u32,
     /// Accepted frames in which reserved bits were masked (D22).
     pub masked: u32,
-    /// Bit values that were replaced by newer ones because the queue of edges was full.
+    /// Bit values replaced by newer ones because the queue of edges was full.
     pub edges_lost: u32,
-    /// Values dropped before they could be written: older than the port's timeout, or waiting for a
+    /// Values dropped before they were written: older than the port's timeout, or waiting for a
     /// link that was lost.
     pub values_expired: u32,
-    /// Accepted frames with a value that could not be passed on: its link was down.
+    /// Accepted frames with a value that was dropped because its link was down.
     pub undelivered: u32,
-    /// Accepted frames with a value that had to wait for its neighbours to be read back.
+    /// Accepted frames with a value that was withheld until its neighbours were read back.
     pub withheld: u32,
     /// Cycles in which no output frame could be sent in time (D20).
     pub skipped_cycles: u32,
     /// Cycles in which no output frame was sent because its sources were stale or unknown.
     pub stale_cycles: u32,
-    /// Times the field frame was overdue.
+    /// Times an input frame became overdue.
     pub timeouts: u32,
     /// Times the device was reported gone.
     pub downs: u32,
@@ -62,7 +63,7 @@ pub struct PortCounters {
     pub commands_dropped: u32,
 }
 
-/// What happened on a controller link, beside [`crate::link::LinkHistory`]. Counters wrap.
+/// Counters of a controller link, in addition to [`crate::link::LinkHistory`]. They wrap.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
@@ -74,27 +75,28 @@ pub struct LinkCounters {
     pub received: u32,
     /// Bytes received.
     pub bytes_in: u32,
-    /// Requests without an answer in time.
+    /// Requests without an answer within the timeout.
     pub timeouts: u32,
     /// Exceptions and failure replies.
     pub refused: u32,
     /// Malformed answers, frames and packets.
     pub malformed: u32,
-    /// Values received that were not finite: they are unknown until a readable one comes.
+    /// Received values that were not finite; the variables are unknown until a readable value
+    /// comes.
     pub unreadable: u32,
-    /// Connections reset because the peer's transport had not acknowledged what was handed over by
-    /// the time after which it must not be delivered.
+    /// Connections reset because the peer's transport had not acknowledged data before its
+    /// deadline.
     pub unacknowledged: u32,
     /// Bytes dropped while looking for a frame.
     pub resync_bytes: u32,
-    /// Microseconds from the newest request to its answer.
+    /// Time from the newest request to its answer, in microseconds.
     pub round_trip_us: u32,
-    /// The longest of these.
+    /// The longest such time, in microseconds.
     pub round_trip_max_us: u32,
 }
 
 impl LinkCounters {
-    /// Nothing happened yet.
+    /// All zero.
     pub(super) const ZERO: Self = Self {
         sent: 0,
         received: 0,
@@ -109,7 +111,7 @@ impl LinkCounters {
         round_trip_max_us: 0,
     };
 
-    /// An answer came `micros` after its request.
+    /// Counts an answer that came `micros` after its request.
     pub(super) fn answered(&mut self, micros: u64) {
         bump(&mut self.received);
         self.round_trip_us = u32::try_from(micros).unwrap_or(u32::MAX);
@@ -117,12 +119,12 @@ impl LinkCounters {
     }
 }
 
-/// One more.
+/// Adds one.
 pub(super) fn bump(counter: &mut u32) {
     add(counter, 1);
 }
 
-/// `n` more.
+/// Adds `n`.
 pub(super) fn add(counter: &mut u32, n: usize) {
     *counter = counter.wrapping_add(n as u32);
 }

@@ -1,8 +1,8 @@
-//! The frames that a field port sends: from the image, or from the bindings of a user-defined
+//! The frames that a field port sends, made from the image or from the bindings of a user-defined
 //! recipe.
 //!
-//! In: the image when the port's sender says that a frame is due. Out: bytes or CAN frames, one a
-//! call. Refuses to know when that is.
+//! In: the image, when the port's sender says that a frame is due. Out: bytes or CAN frames, one
+//! per call. Does not know when a frame is due.
 
 use super::counters::{add, bump};
 use super::field_port::{Codec, FieldPort, fields_before};
@@ -13,7 +13,7 @@ use crate::recipe::model::Mode;
 use crate::time::Instant;
 use crate::wire::can::CanFrame;
 
-/// One thing for the field.
+/// One item to send to the field.
 pub(super) enum Downward {
     Bytes(usize),
     Can(CanFrame),

@@ -1,4 +1,4 @@
-//! What goes into the engine and what comes out of it.
+//! The engine's inputs and outputs.
 
 use core::net::SocketAddr;
 
@@ -6,7 +6,7 @@ use crate::config::MAX_PORTS;
 use crate::time::Instant;
 use crate::wire::can::CanFrame;
 
-/// A port, by its index in [`crate::config::GatewayConfig::ports`].
+/// A field or listening port, by its index in [`crate::config::GatewayConfig::ports`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct PortId(pub u8);
@@ -17,15 +17,15 @@ pub struct PortId(pub u8);
 pub struct LinkId(pub u8);
 
 impl LinkId {
-    /// Port 2000.
+    /// The command link: port 2000.
     pub const COMMAND: Self = Self(0);
-    /// Port 2001.
+    /// The state link: port 2001.
     pub const STATE: Self = Self(1);
-    /// Modbus TCP.
+    /// The Modbus link.
     pub const MODBUS: Self = Self(2);
-    /// The controller's UDP recipe server.
+    /// The recipe link to the controller's UDP server.
     pub const RECIPE_UDP: Self = Self(3);
-    /// A second connection to port 2000, for commands that stop the robot (D26).
+    /// The urgent link: a second connection to port 2000, for commands that stop the robot (D26).
     pub const URGENT: Self = Self(FIRST_PORT + MAX_PORTS as u8);
 
     /// The link of a listening port.
@@ -33,7 +33,7 @@ impl LinkId {
         Self(port.0.saturating_add(FIRST_PORT))
     }
 
-    /// The listening port that the link belongs to.
+    /// The listening port that the link belongs to, if it belongs to one.
     pub const fn port(self) -> Option<PortId> {
         match self.0.checked_sub(FIRST_PORT) {
             Some(port) if self.0 < Self::URGENT.0 => Some(PortId(port)),
@@ -42,7 +42,7 @@ impl LinkId {
     }
 }
 
-/// Links of listening ports are numbered from here on.
+/// First id of the links of listening ports.
 const FIRST_PORT: u8 = 4;
 
 /// The kind of a link: what the driver opens for it.
@@ -73,7 +73,7 @@ pub enum LinkKind {
 }
 
 impl LinkKind {
-    /// A short name for people and statistics.
+    /// A short name for logs and statistics.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Command => "command",
@@ -94,7 +94,7 @@ pub struct Endpoint<'a> {
     /// How it is opened, and at which port.
     pub transport: Transport,
     /// The controller's address or host name, as configured; empty where the driver learns it
-    /// otherwise. Of a link that listens, the only peer that may be let in.
+    /// otherwise. For a listening link, the only peer that may connect or send.
     pub host: &'a str,
 }
 
@@ -109,24 +109,24 @@ impl<'a> Endpoint<'a> {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Transport {
-    /// Connect by TCP.
+    /// Connect with TCP.
     Tcp {
         /// The controller's port.
         port: u16,
     },
-    /// Send UDP datagrams from any port of ours, and receive the answers.
+    /// Send UDP datagrams from any local port, and receive the answers.
     Udp {
         /// The controller's port.
         port: u16,
     },
-    /// Listen, and take one TCP connection.
+    /// Listen, and accept one TCP connection.
     TcpListen {
-        /// Where; of a board with one address, only the port counts.
+        /// The address to listen on; on a board with one address only the port matters.
         local: SocketAddr,
     },
-    /// Receive UDP datagrams, and answer whoever sent last.
+    /// Receive UDP datagrams, and answer the newest sender.
     UdpListen {
-        /// Where; of a board with one address, only the port counts.
+        /// The address to listen on; on a board with one address only the port matters.
         local: SocketAddr,
     },
 }
@@ -135,9 +135,9 @@ pub enum Transport {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum BusState {
-    /// Error-active: all is well.
+    /// Error-active: normal operation.
     Active,
-    /// An error counter passed 96.
+    /// Error-warning: an error counter has passed 96.
     Warning,
     /// Error-passive.
     Passive,
@@ -164,11 +164,11 @@ impl BusState {
 pub enum PortState {
     /// Its input frames arrive in time; a port without an input part only needs its device.
     Working,
-    /// A frame of its input part is overdue or has never come.
+    /// An input frame is overdue, or none has come yet.
     Silent,
     /// The CAN controller has left the bus.
     BusOff,
-    /// Its device is not there.
+    /// Its device is not available.
     Gone,
 }
 
@@ -193,17 +193,17 @@ pub enum ReplyCode {
     /// No value has picked a command yet.
     #[default]
     None = 0,
-    /// Waiting to be sent, or for the reply.
+    /// Waiting to be sent, or for a reply.
     Pending = 1,
     /// The controller replied that it succeeded.
     Success = 2,
     /// The controller replied that it failed.
     Fail = 3,
-    /// The controller replied something else.
+    /// The controller sent another reply.
     Other = 4,
-    /// No reply came in time, or the link was lost meanwhile.
+    /// No reply came in time, or the link was lost before the reply.
     NoReply = 5,
-    /// It was not sent: the link was down, or too many were waiting.
+    /// It was not sent: the link was down, or too many commands were waiting.
     NotSent = 6,
 }
 
@@ -222,7 +222,7 @@ impl ReplyCode {
     }
 }
 
-/// What happened outside.
+/// An event that the driver reports to the engine.
 #[derive(Debug, Clone, Copy)]
 #[non_exhaustive]
 pub enum Input<'a> {
@@ -231,7 +231,7 @@ pub enum Input<'a> {
         /// The port.
         port: PortId,
     },
-    /// A port's device is gone; what was handed over for sending is lost, and no
+    /// A port's device is gone. What was handed over for sending is lost, and no
     /// [`Input::PortSent`] follows for it.
     PortDown {
         /// The port.
@@ -251,7 +251,7 @@ pub enum Input<'a> {
         /// The frame.
         frame: CanFrame,
     },
-    /// Everything that was handed over for sending has left the port.
+    /// Everything handed over for sending has left the port.
     PortSent {
         /// The port.
         port: PortId,
@@ -263,12 +263,12 @@ pub enum Input<'a> {
         /// The new state.
         state: BusState,
     },
-    /// A link that was to be opened is usable.
+    /// A link that the engine opened is usable.
     LinkUp {
         /// The link.
         link: LinkId,
     },
-    /// A link could not be opened, or was lost; no [`Input::LinkSent`] follows for what was handed
+    /// A link could not be opened, or was lost. No [`Input::LinkSent`] follows for what was handed
     /// over to it.
     LinkDown {
         /// The link.
@@ -281,27 +281,27 @@ pub enum Input<'a> {
         /// The bytes.
         bytes: &'a [u8],
     },
-    /// Everything that was handed over for sending was taken by the transport, which has room for
-    /// more. It says nothing about delivery.
+    /// The transport has taken everything handed over, and has room for more. It says nothing about
+    /// delivery.
     LinkSent {
         /// The link.
         link: LinkId,
     },
-    /// How much of what was handed over to a TCP link, since it came up, the peer's transport has not
-    /// acknowledged. To be reported before bytes that arrived, and at least every 20 ms while the
-    /// number changes; never of a datagram link.
+    /// How much of what was handed over to a TCP link since it came up has not been acknowledged by
+    /// the peer's transport. Report it before bytes that arrived, and at least every 20 ms while
+    /// the number changes; never for a datagram link.
     LinkAcked {
         /// The link.
         link: LinkId,
         /// Unacknowledged bytes, including those that the driver itself still holds.
         left: u32,
     },
-    /// Time has passed, and everything that arrived before was reported: the only input that lets
+    /// Time has passed, and everything that arrived before has been reported. Only this input lets
     /// deadlines pass.
     Tick,
 }
 
-/// What the driver has to do.
+/// A task for the driver.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[non_exhaustive]
 pub enum Output<'a> {
@@ -312,8 +312,8 @@ pub enum Output<'a> {
         /// One whole frame.
         bytes: &'a [u8],
     },
-    /// Queue a CAN frame after the previous ones; report [`Input::PortSent`] when the queue has
-    /// become empty. At most [`crate::recipe::model::MAX_CAN_IDS`] are handed over before that.
+    /// Queue a CAN frame after the previous ones; report [`Input::PortSent`] when the queue is
+    /// empty. At most [`crate::recipe::model::MAX_CAN_IDS`] frames are handed over before that.
     PortSendCan {
         /// The port.
         port: PortId,
@@ -327,13 +327,13 @@ pub enum Output<'a> {
         /// Where it goes.
         to: Endpoint<'a>,
     },
-    /// Close a link at once and report nothing more about it. TCP with a reset: what the peer has not
-    /// acknowledged must not be delivered later.
+    /// Close a link at once and report nothing more about it. Close TCP with a reset: what the peer
+    /// has not acknowledged must not be delivered later.
     LinkClose {
         /// The link.
         link: LinkId,
     },
-    /// Send on a link (of a datagram link: one datagram), then report [`Input::LinkSent`].
+    /// Send on a link (on a datagram link: one datagram), then report [`Input::LinkSent`].
     LinkSend {
         /// The link.
         link: LinkId,
@@ -342,7 +342,7 @@ pub enum Output<'a> {
     },
     /// Nothing more to do before this instant.
     Sleep {
-        /// When to report [`Input::Tick`] at the latest; [`Instant::NEVER`] without a configuration.
+        /// The latest time to report [`Input::Tick`]; [`Instant::NEVER`] without a configuration.
         until: Instant,
     },
 }

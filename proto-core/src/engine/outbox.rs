@@ -1,8 +1,8 @@
-//! What is still to be written to the controller.
+//! Values that are still to be written to the controller.
 //!
-//! Analog values: the newest wins. Bits: every value that differs from the one before is written,
-//! in order, through a bounded queue a port (docs/engine.md section 5). The outbox knows
-//! nothing of links; it is told which variables can be delivered at all.
+//! Analog values: the newest wins. Bits: every value that differs from the previous one is written,
+//! in order, through a bounded queue per port (docs/engine.md section 5). The outbox does not know
+//! links; the caller says which variables can be delivered.
 
 use heapless::Vec;
 
@@ -11,7 +11,7 @@ use crate::image::InputSet;
 use crate::sysvar::{BIT_INPUT_COUNT, SysVar};
 use crate::time::{Duration, Instant};
 
-/// Bit values that can wait behind the one that is written next, a port.
+/// Number of bit values per port that can wait behind the one that is written next.
 pub const EDGE_QUEUE: usize = 16;
 
 #[derive(Debug, Clone, Copy)]
@@ -55,7 +55,7 @@ impl Outbox {
         self.bits.get(var.ordinal()).map_or(0, |slot| slot.value)
     }
 
-    /// An accepted frame brought a byte variable.
+    /// An accepted frame set a byte variable.
     pub(super) fn offer_bits(
         &mut self,
         queue: &mut EdgeQueue,
@@ -70,7 +70,7 @@ impl Outbox {
             self.dirty.insert(var);
             return;
         }
-        // Something for this variable is already waiting: only a value that differs is an edge.
+        // A value of this variable is already waiting: only a value that differs is an edge.
         let full = queue.0.is_full();
         match queue.0.iter_mut().rev().find(|edge| edge.var == var) {
             Some(newest) if newest.value == value => newest.at = now,
@@ -90,13 +90,13 @@ impl Outbox {
         }
     }
 
-    /// An accepted frame brought variables that are not bits.
+    /// An accepted frame set variables that are not bits.
     pub(super) fn offer_analog(&mut self, vars: &InputSet) {
         self.dirty = self.dirty.or(vars);
     }
 
-    /// The owner is silent: the variable takes its safe value, in place of everything that waits.
-    /// `bits` is that value of a byte variable.
+    /// The owner is silent: the variable takes its safe value, which replaces everything that
+    /// waits. `bits` is the safe value of a byte variable.
     pub(super) fn offer_safe(&mut self, queue: &mut EdgeQueue, var: SysVar, bits: u8, now: Instant) {
         queue.0.retain(|edge| edge.var != var);
         if let Some(slot) = self.bits.get_mut(var.ordinal()) {
@@ -105,12 +105,12 @@ impl Outbox {
         self.dirty.insert(var);
     }
 
-    /// Values that were written last, and came to nothing, are to be written again.
+    /// Writes again the values that were written last and may not have arrived.
     pub(super) fn again(&mut self, vars: &InputSet) {
         self.dirty = self.dirty.or(vars);
     }
 
-    /// Nothing of these variables is to be written any more; returns how many values waited.
+    /// Drops everything that is to be written of these variables; returns how many values waited.
     pub(super) fn forget(&mut self, queue: &mut EdgeQueue, vars: &InputSet) -> usize {
         let before = queue.0.len();
         queue.0.retain(|edge| !vars.contains(edge.var));
@@ -119,8 +119,8 @@ impl Outbox {
         before.saturating_sub(queue.0.len()).saturating_add(dropped)
     }
 
-    /// Drops what has waited for longer than `timeout`; returns how many values that were, and since
-    /// when the oldest of the others waits.
+    /// Drops values that have waited for longer than `timeout`. Returns their number, and since
+    /// when the oldest remaining one waits.
     pub(super) fn expire(
         &mut self,
         queue: &mut EdgeQueue,
@@ -147,12 +147,13 @@ impl Outbox {
         (dropped, oldest)
     }
 
-    /// The variables' values have been handed to their link.
+    /// The variables' values have been handed over to their link.
     pub(super) fn taken(&mut self, vars: &InputSet) {
         self.dirty = self.dirty.minus(vars);
     }
 
-    /// For byte variables whose value was taken: the next one in the queue, if any, takes its place.
+    /// For byte variables whose value was taken: the next value in the queue takes its place, if
+    /// there is one.
     pub(super) fn next_edges(&mut self, queue: &mut EdgeQueue, bits: &InputSet) {
         if queue.0.is_empty() {
             return;
@@ -195,7 +196,7 @@ mod tests {
             self.outbox.offer_bits(&mut self.queue, &mut self.counters, var, value, self.now);
         }
 
-        /// What is written, one value after the other, until nothing is left.
+        /// All values that are written, one after the other.
         fn drain(&mut self, var: SysVar) -> std::vec::Vec<u8> {
             let mut written = std::vec::Vec::new();
             while self.outbox.dirty().contains(var) {

@@ -1,7 +1,7 @@
-//! Which way each variable goes (docs/engine.md section 4).
+//! The plan: the way of each variable (docs/engine.md section 4).
 //!
-//! In: a configuration. Out: for every input variable its owner and its way up, for every variable
-//! that a port shows its source. Decided once; nothing of it changes while the engine runs.
+//! In: a configuration. Out: the owner and way up of every input variable, and the source of every
+//! variable that a port shows. Decided once; it does not change while the engine runs.
 
 use core::fmt;
 
@@ -41,7 +41,7 @@ pub struct Plan {
     read_back: InputSet,
 }
 
-/// Why there is no way for a variable.
+/// Why a variable has no way.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum PlanError {
@@ -54,14 +54,14 @@ pub enum PlanError {
         /// The other.
         second: PortId,
     },
-    /// Nothing that is configured can carry an input variable to the controller (D15).
+    /// No configured way up can carry the input variable (D15).
     NoWayUp {
         /// The variable.
         var: SysVar,
         /// The port that writes it.
         port: PortId,
     },
-    /// Nothing that is configured can read a variable that a port wants to show (D15).
+    /// No configured source has the variable that a port shows (D15).
     NoSource {
         /// The variable.
         var: SysVar,
@@ -82,7 +82,11 @@ impl fmt::Display for PlanError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::TwoOwners { var, first, second } => {
-                write!(f, "{var} is claimed by port {} and by port {}", first.0, second.0)
+                write!(
+                    f,
+                    "{var} is written by port {} and by port {}; a variable has one owner",
+                    first.0, second.0
+                )
             }
             Self::NoWayUp { var, .. } => {
                 write!(f, "{var} can be written only through a recipe link whose input part carries it")
@@ -103,7 +107,7 @@ impl fmt::Display for PlanError {
 impl core::error::Error for PlanError {}
 
 impl Plan {
-    /// The plan of a configuration.
+    /// Makes the plan of a configuration.
     ///
     /// # Errors
     /// [`PlanError`] names the first variable without a way.
@@ -146,7 +150,7 @@ impl Plan {
         Ok(plan)
     }
 
-    /// The field port whose frames contain the variable.
+    /// The field port that owns the variable: its frames contain it.
     pub fn owner(&self, var: SysVar) -> Option<PortId> {
         self.owners.get(var.ordinal()).copied().flatten()
     }
@@ -161,8 +165,8 @@ impl Plan {
         self.sources.get(var.ordinal()).copied().flatten()
     }
 
-    /// Input variables that share a recipe link's frame: their present value is read back from the
-    /// state stream for as long as no port sends them.
+    /// Input variables that share a recipe link's frame. Their present values are read back from
+    /// the state stream as long as no port sends them.
     pub fn read_back(&self) -> InputSet {
         self.read_back
     }
@@ -236,8 +240,8 @@ fn inputs_of<'a>(config: ConfigView<'a>, recipe: &'a Recipe) -> impl Iterator<It
     config.written_by(recipe)
 }
 
-/// Whether a recipe link's frame carries what one field frame brings and nothing else, all of it with
-/// safe values or none: then all of it is known whenever any of it is written.
+/// Whether a recipe link's frame carries exactly the variables of one field frame, all of them with
+/// safe values or none. Then all of them are known whenever one is written.
 fn is_one_frame(config: ConfigView<'_>, link: &Recipe) -> bool {
     config.field_ports().any(|(_, port, recipe)| {
         recipe.frames(Direction::Input).any(|(_, fields)| {

@@ -1,5 +1,5 @@
-//! One connection to port 2000: what is under way on it, and what became of that
-//! (docs/engine.md section 7). Which command goes where is the command link's business.
+//! One connection to port 2000: the commands in flight on it, and their results (docs/engine.md
+//! section 7). The command link decides which command goes where.
 
 use super::counters::{LinkCounters, add, bump};
 use super::flight::Flight;
@@ -19,13 +19,13 @@ pub(super) struct Sent {
     pub at: Instant,
 }
 
-/// What happened on a connection.
+/// An event on a connection.
 pub(super) enum Event {
-    /// A command came to its end.
+    /// A command has its result.
     Answered(Sent, ReplyCode),
-    /// Something else, which is counted.
+    /// Another event, which is counted.
     Other,
-    /// The connection is to be given up.
+    /// The connection must be given up.
     TimedOut,
 }
 
@@ -34,7 +34,7 @@ pub(super) struct Session {
     pub supervisor: Supervisor,
     pub counters: LinkCounters,
     client: CommandClient,
-    /// The command whose reply is waited for, and a younger, urgent one that did not wait for that.
+    /// The command whose reply is awaited, and a newer, urgent one that did not wait for it.
     pub in_flight: Option<Sent>,
     pub beside: Option<Sent>,
     /// The transport has not taken the newest command yet.
@@ -55,7 +55,7 @@ impl Session {
         }
     }
 
-    /// Whether a command can be sent, one that waits for the reply before.
+    /// Whether a command can be sent that must wait for the previous reply.
     pub(super) fn is_free(&self) -> bool {
         self.supervisor.is_up() && !self.unsent && !self.client.busy()
     }
@@ -70,7 +70,7 @@ impl Session {
         !self.flight.is_empty()
     }
 
-    /// The command's bytes are put into `out`, to be acknowledged by `until`.
+    /// Writes the command into `out`, to be acknowledged by `until`.
     pub(super) fn send(
         &mut self,
         (keyword, command): (Keyword, Waiting),
@@ -95,7 +95,7 @@ impl Session {
         Ok(len)
     }
 
-    /// The transport took everything.
+    /// The transport has taken everything.
     pub(super) fn taken(&mut self) {
         self.unsent = false;
     }
@@ -111,13 +111,13 @@ impl Session {
         add(&mut self.counters.bytes_in, len);
     }
 
-    /// What came in time, however late it is told: only a tick lets a deadline pass.
+    /// Events count as in time, however late they are handled: only a tick lets a deadline pass.
     pub(super) fn in_time(&self, now: Instant) -> Instant {
         let before = |at: Instant| at - Duration::from_micros(1);
         self.client.deadline().map_or(now, |deadline| now.min(before(deadline)))
     }
 
-    /// The connection is gone; what was under way is handed out.
+    /// The connection is gone; returns the commands in flight.
     pub(super) fn lost(&mut self) -> [Option<Sent>; 2] {
         self.client.abort();
         self.flight.clear();
@@ -125,7 +125,7 @@ impl Session {
         [self.in_flight.take(), self.beside.take()]
     }
 
-    /// Whether the connection has to be given up for what nobody acknowledged.
+    /// Whether the connection must be given up because something was not acknowledged.
     pub(super) fn is_overdue(&mut self, now: Instant) -> bool {
         let overdue = now >= self.flight.deadline();
         if overdue {
@@ -134,12 +134,12 @@ impl Session {
         overdue
     }
 
-    /// Whether the client has something to say by itself.
+    /// Whether the client has an event without new bytes.
     pub(super) fn is_due(&self, now: Instant) -> bool {
         self.client.deadline().is_some_and(|at| now >= at)
     }
 
-    /// The next event in `rest`, or by the clock.
+    /// The next event, from `rest` or from the clock.
     pub(super) fn step(&mut self, rest: &mut &[u8], now: Instant) -> Option<Event> {
         let (beside, kind) = match self.client.receive(now, rest)? {
             ClientEvent::Reply { beside, kind, .. } => (beside, kind),
@@ -173,7 +173,7 @@ impl Session {
         Some(Event::Answered(sent, code))
     }
 
-    /// When something happens by itself, the supervisor apart.
+    /// When something happens without an input, apart from the supervisor.
     pub(super) fn deadline(&self) -> Instant {
         self.client.deadline().unwrap_or(Instant::NEVER).min(self.flight.deadline())
     }

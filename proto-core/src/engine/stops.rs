@@ -1,4 +1,4 @@
-//! Urgent commands that wait: what stops the robot goes ahead of everything and does not grow old
+//! Urgent commands that wait. What stops the robot goes ahead of everything and does not expire
 //! while its device still asks for it (docs/engine.md section 7).
 
 use heapless::Vec;
@@ -8,19 +8,20 @@ use crate::command::Keyword;
 use crate::config::MAX_PORTS;
 use crate::time::{Duration, Instant};
 
-/// Commands that can wait for the one before them, urgent ones apart.
+/// Number of commands, other than urgent ones, that can wait.
 pub const COMMAND_QUEUE: usize = 8;
-/// Four urgent commands, each once for every port.
+/// Four urgent commands, each once per port.
 pub(super) const MAX_STOPS: usize = 4 * MAX_PORTS;
-/// How long one waits that nobody asks for any more, and how long it may take to be acknowledged.
+/// How long an urgent command waits after its device has stopped asking for it, and how long it may
+/// take to be acknowledged.
 pub(super) const STOP_TTL: Duration = Duration::from_secs(1);
 
 /// A command that a value picked.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Waiting {
-    /// Since when; of an urgent one, since when nobody has asked for it any more.
+    /// When it was picked; for an urgent one whose device no longer asks for it, when that ended.
     pub since: Instant,
-    /// How many commands the port had picked with it: only the newest one's outcome is shown.
+    /// Number of the port's commands up to this one: only the newest one's result is shown.
     pub nth: u32,
     pub entry: u16,
     pub port: PortId,
@@ -41,7 +42,7 @@ impl Stops {
         self.0.is_empty()
     }
 
-    /// A value picked an urgent command; of one kind and port, one waits.
+    /// A value picked an urgent command. Of each kind and port, one waits.
     pub(super) fn push(&mut self, keyword: Keyword, command: Waiting) {
         let same = |other: &&mut (Keyword, Waiting)| other.0 == keyword && other.1.port == command.port;
         match self.0.iter_mut().find(same) {
@@ -53,19 +54,19 @@ impl Stops {
         }
     }
 
-    /// One that was under way is to be sent again, behind those that have not been sent yet.
+    /// A command that was in flight is to be sent again, after those that have not been sent yet.
     pub(super) fn push_again(&mut self, keyword: Keyword, command: Waiting) {
         if !self.0.iter().any(|other| other.0 == keyword && other.1.port == command.port) {
             let _ = self.0.push((keyword, command));
         }
     }
 
-    /// What kinds wait.
+    /// The kinds that wait.
     pub(super) fn kinds(&self) -> impl Iterator<Item = Keyword> + '_ {
         self.0.iter().map(|(keyword, _)| *keyword)
     }
 
-    /// Takes out the first of a kind that may go now.
+    /// Takes the first of a kind that may be sent now.
     pub(super) fn pop(&mut self, may_go: impl Fn(Keyword) -> bool) -> Option<(Keyword, Waiting)> {
         let mut first = None;
         self.0.retain(|stop| {
@@ -78,14 +79,14 @@ impl Stops {
         first
     }
 
-    /// The field does not ask any more.
+    /// The field no longer asks for it.
     pub(super) fn no_longer_asked(&mut self, field: u8, now: Instant) {
         for (_, command) in self.0.iter_mut().filter(|(_, command)| command.field == field) {
             command.since = now;
         }
     }
 
-    /// Takes out the first that nobody asks for any more, and that has waited too long since.
+    /// Takes the first that no field asks for any more and that has waited too long since.
     pub(super) fn pop_old(&mut self, now: Instant, is_asked: impl Fn(&Waiting) -> bool) -> Option<Waiting> {
         let is_old = |command: &Waiting| now >= command.since + STOP_TTL && !is_asked(command);
         let old = self.0.iter().map(|(_, command)| *command).find(is_old)?;
@@ -93,7 +94,7 @@ impl Stops {
         Some(old)
     }
 
-    /// When the next one has waited too long.
+    /// When the next one will have waited too long.
     pub(super) fn deadline(&self, is_asked: impl Fn(&Waiting) -> bool) -> Instant {
         let waiting = self.0.iter().map(|(_, command)| command).filter(|command| !is_asked(command));
         waiting.map(|command| command.since + STOP_TTL).min().unwrap_or(Instant::NEVER)

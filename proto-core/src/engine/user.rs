@@ -1,4 +1,4 @@
-//! What the gateway does with the fields of user-defined recipes: the bindings, compiled.
+//! The compiled bindings of user-defined fields.
 
 use heapless::Vec;
 
@@ -11,7 +11,7 @@ use crate::sysvar::SysVar;
 use crate::time::Instant;
 use crate::wire::scalar::{Scalar, ScalarType};
 
-/// What a received value does.
+/// The binding of an input field.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum InputBind {
     Unused,
@@ -25,8 +25,8 @@ pub(super) enum InputBind {
 }
 
 impl InputBind {
-    /// The variable and what the received value makes of it; `None` when it does not fit or the
-    /// binding is to no variable.
+    /// The variable and the value that the received value becomes; `None` if the value does not fit
+    /// or the binding is not to a variable.
     pub(super) fn bound(&self, value: Scalar) -> Option<(SysVar, Scalar)> {
         match *self {
             Self::Variable { var, scale, offset } => {
@@ -45,7 +45,7 @@ pub(super) fn fit(bindings: &[InputBind], values: impl Iterator<Item = Scalar>) 
     })
 }
 
-/// After silence the next values pick no commands: they only set the base.
+/// After silence the next values pick no commands; they only set the base.
 pub(super) fn forget_commands(bindings: &[InputBind], commands: Option<&mut CommandLink>, now: Instant) {
     let Some(link) = commands else { return };
     for binding in bindings {
@@ -55,7 +55,7 @@ pub(super) fn forget_commands(bindings: &[InputBind], commands: Option<&mut Comm
     }
 }
 
-/// A field of an output part: its type, and where its value comes from.
+/// An output field: its type, and the source of its value.
 pub(super) type OutputBind = (ScalarType, OutputBinding);
 
 /// The values of the fields.
@@ -88,7 +88,7 @@ pub(super) struct Bindings<const FIELDS: usize> {
     pub outputs: Vec<OutputBind, FIELDS>,
 }
 
-/// The count as a field counts: it wraps where the type does.
+/// The count in the field's type, wrapping.
 fn wrapping_count(ty: ScalarType, count: u32) -> Scalar {
     match ty {
         ScalarType::Byte => Scalar::Byte(count as u8),

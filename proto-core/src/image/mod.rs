@@ -2,8 +2,8 @@
 //! (docs/engine.md section 3).
 //!
 //! Values are packed little-endian in one byte array, in the order of the variable table, so that
-//! neighbouring fields of a recipe are one copy. A variable's age is that of its [`GroupId`]: the
-//! frame, poll or packet that brings it. The image refuses to know recipes, ports and links.
+//! neighbouring fields of a recipe are one copy. A variable has the age of its [`GroupId`]: the
+//! frame, poll or packet that brings it. The image does not know recipes, ports or links.
 
 mod set;
 
@@ -16,10 +16,11 @@ use crate::wire::scalar::{Scalar, ScalarType};
 /// The values alone.
 pub type ImageBytes = [u8; IMAGE_BYTES];
 
-/// Most groups of variables that arrive together.
+/// Maximum number of groups of variables that arrive together.
 pub const MAX_GROUPS: usize = 96;
 
-/// Variables that arrive together and so have one age: a field frame, a Modbus block, a packet.
+/// A group of variables that arrive together and so have one age: a field frame, a Modbus block, a
+/// packet.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct GroupId(pub(crate) u8);
@@ -28,7 +29,7 @@ pub struct GroupId(pub(crate) u8);
 #[derive(Debug, Clone)]
 pub struct Image {
     bytes: ImageBytes,
-    /// One more than the number of the group; 0 of a variable that no group brings.
+    /// One more than the number of the group; 0 for a variable without a group.
     group: [u8; COUNT],
     /// When each group last arrived; [`Instant::NEVER`] before the first time.
     stamps: [Stamp; MAX_GROUPS],
@@ -45,7 +46,7 @@ impl Default for Image {
 }
 
 impl Image {
-    /// All zeros, and nothing known.
+    /// All zeros, and all unknown.
     pub const fn new() -> Self {
         Self {
             bytes: [0; IMAGE_BYTES],
@@ -61,7 +62,7 @@ impl Image {
         &self.bytes
     }
 
-    /// The packed values, to be changed by a recipe or packet that fits them.
+    /// The packed values, mutable, for a recipe or packet whose layout fits them.
     pub fn bytes_mut(&mut self) -> &mut ImageBytes {
         &mut self.bytes
     }
@@ -73,10 +74,10 @@ impl Image {
         Scalar::decode(var.ty(), bytes).unwrap_or(Scalar::Byte(0))
     }
 
-    /// Gives the variable a value: reserved bits are masked (D22).
+    /// Sets the value of the variable; reserved bits are masked (D22).
     ///
     /// # Errors
-    /// [`NotForVariable`], with nothing changed, when the type is another or the value not finite.
+    /// [`NotForVariable`], with nothing changed, if the type is wrong or the value is not finite.
     pub fn set(&mut self, var: SysVar, value: Scalar) -> Result<(), NotForVariable> {
         if value.ty() != var.ty() || !value.is_finite() {
             return Err(NotForVariable { var, value });
@@ -120,8 +121,8 @@ impl Image {
         self.stamps.get(usize::from(group.0)).filter(|&&at| at != Stamp::NEVER).map(|at| at.get())
     }
 
-    /// Gives the variable the value that its source just sent; one that cannot be read makes the
-    /// variable unknown until a readable one comes. Whether it could be read.
+    /// Sets the variable to the value that its source just sent; an unreadable value makes the
+    /// variable unknown until a readable one comes. Returns whether the value was readable.
     #[inline]
     pub fn receive(&mut self, var: SysVar, value: Scalar) -> bool {
         let readable = self.set(var, value).is_ok();
@@ -141,7 +142,7 @@ impl Image {
         }
     }
 
-    /// Records that everything these variables' sources just sent could be read.
+    /// Records that everything that the sources of these variables just sent was readable.
     pub fn all_readable(&mut self, vars: impl Iterator<Item = SysVar>) {
         if self.any_unreadable {
             vars.for_each(|var| self.unreadable.remove(var));
@@ -149,27 +150,27 @@ impl Image {
         }
     }
 
-    /// Whether the variable's newest value could be read, if there was one.
+    /// Whether the variable's newest value was readable, if there was one.
     pub fn is_readable(&self, var: SysVar) -> bool {
         !self.unreadable.contains(var)
     }
 
-    /// Whether the newest values of all these could be read.
+    /// Whether the newest values of all these variables were readable.
     pub fn can_read(&self, vars: &VarSet) -> bool {
         !self.any_unreadable || !self.unreadable.meets(vars)
     }
 
-    /// How long ago the variable's value arrived; `None` when it never did, or could not be read.
+    /// The age of the variable's value; `None` if it never arrived or was unreadable.
     pub fn age(&self, var: SysVar, now: Instant) -> Option<Duration> {
         self.known_since(var).map(|at| now.saturating_since(at))
     }
 
-    /// Whether the variable's value ever arrived, and the newest one could be read.
+    /// Whether the variable's value ever arrived, and the newest one was readable.
     pub fn is_known(&self, var: SysVar) -> bool {
         self.known_since(var).is_some()
     }
 
-    /// When the variable's value arrived; `None` when it never did, or could not be read.
+    /// When the variable's value arrived; `None` if it never did or was unreadable.
     pub fn known_since(&self, var: SysVar) -> Option<Instant> {
         self.group(var).and_then(|group| self.stamp_of(group)).filter(|_| !self.unreadable.contains(var))
     }
@@ -187,16 +188,16 @@ pub struct NotForVariable {
 impl core::fmt::Display for NotForVariable {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
         let Self { var, value } = self;
-        write!(f, "{var} is a finite {}, not the {} {value}", var.ty(), value.ty())
+        write!(f, "{var} needs a finite {}, not the {} {value}", var.ty(), value.ty())
     }
 }
 
 impl core::error::Error for NotForVariable {}
 
-/// `raw * scale + offset` as a value of `var`, the way a user-defined input field is bound.
+/// `raw * scale + offset` as a value of `var`: the binding of a user-defined input field.
 ///
-/// Integers are rounded to the nearest, halves away from zero. `None` when the result is not
-/// finite or out of the variable's range: such a frame is rejected (D22).
+/// Integers are rounded to the nearest, halves away from zero. `None` if the result is not finite
+/// or out of the variable's range: such a frame is rejected (D22).
 pub fn bind_to_variable(var: SysVar, raw: Scalar, scale: f32, offset: f32) -> Option<Scalar> {
     let value = raw.as_f64() * f64::from(scale) + f64::from(offset);
     let value = if var.ty() == ScalarType::Float { value } else { round(value) };
@@ -207,8 +208,8 @@ pub fn bind_to_variable(var: SysVar, raw: Scalar, scale: f32, offset: f32) -> Op
     }
 }
 
-/// `value * scale + offset` as a field of type `ty`, the way a user-defined output field is bound:
-/// rounded like an input, and saturated at the type's range. Not a number becomes 0.
+/// `value * scale + offset` as a field of type `ty`: the binding of a user-defined output field.
+/// Rounded like an input, and saturated at the type's range. Not a number becomes 0.
 pub fn saturate_to_field(ty: ScalarType, value: f64, scale: f32, offset: f32) -> Scalar {
     let value = value * f64::from(scale) + f64::from(offset);
     let value = match ty {
@@ -216,7 +217,7 @@ pub fn saturate_to_field(ty: ScalarType, value: f64, scale: f32, offset: f32) ->
         _ => round(value),
     };
     let (low, high) = ty.range();
-    // `clamp` asks whether `low` is above `high`, and panics then.
+    // `clamp` panics if `low` is above `high`.
     let value = match value {
         _ if value.is_nan() => 0.0,
         _ if value < low => low,
@@ -226,9 +227,9 @@ pub fn saturate_to_field(ty: ScalarType, value: f64, scale: f32, offset: f32) ->
     Scalar::from_f64(ty, value).unwrap_or(Scalar::Byte(0))
 }
 
-/// To the nearest whole number, halves away from zero; `core` has no `round`.
+/// To the nearest integer, halves away from zero; `core` has no `round`.
 fn round(value: f64) -> f64 {
-    // Beyond 2^52 every binary64 is whole, and the cast below would saturate.
+    // Beyond 2^52 every binary64 is an integer, and the cast below would saturate.
     if !(-4.5e15..=4.5e15).contains(&value) {
         return value;
     }

@@ -1,15 +1,16 @@
-//! Sets of variables, as bits: what a frame carries, what is still to be written, what is unknown.
+//! Sets of variables, as bits: the variables of a frame, those still to be written, those that are
+//! unknown.
 
 use crate::sysvar::{BIT_INPUT_COUNT, COUNT, INPUT_COUNT, SysVar};
 
 const WORDS: usize = 3;
 const _: () = assert!(INPUT_COUNT.div_ceil(32) == WORDS && BIT_INPUT_COUNT < 32);
 
-/// Some of the input variables. Output variables are never in it.
+/// A set of input variables. Output variables are never in it.
 #[derive(Debug, Clone, Copy, Eq, Default)]
 pub struct InputSet([u32; WORDS]);
 
-/// Of arrays it would be a call of `memcmp` on a Cortex-M.
+/// Comparing arrays would be a call of `memcmp` on a Cortex-M.
 impl PartialEq for InputSet {
     fn eq(&self, other: &Self) -> bool {
         let ([a, b, c], [d, e, f]) = (self.0, other.0);
@@ -21,7 +22,7 @@ impl InputSet {
     /// The empty set.
     pub const EMPTY: Self = Self([0; WORDS]);
 
-    /// The byte variables: they come first in the table of inputs.
+    /// The byte variables, which come first in the table of inputs.
     pub const BYTES: Self = Self([!(u32::MAX << BIT_INPUT_COUNT), 0, 0]);
 
     /// Adds an input variable; an output variable is ignored.
@@ -50,39 +51,39 @@ impl InputSet {
         a | b | c == 0
     }
 
-    /// How many variables are in the set.
+    /// Number of variables in the set.
     pub fn len(&self) -> usize {
         self.0.iter().fold(0, |sum, word| sum.saturating_add(word.count_ones() as usize))
     }
 
-    /// What is in both.
+    /// The intersection.
     #[must_use]
     pub fn and(&self, other: &Self) -> Self {
         let ([a, b, c], [d, e, f]) = (self.0, other.0);
         Self([a & d, b & e, c & f])
     }
 
-    /// What is in either.
+    /// The union.
     #[must_use]
     pub fn or(&self, other: &Self) -> Self {
         let ([a, b, c], [d, e, f]) = (self.0, other.0);
         Self([a | d, b | e, c | f])
     }
 
-    /// What is in this set but not in the other.
+    /// The variables in this set but not in the other.
     #[must_use]
     pub fn minus(&self, other: &Self) -> Self {
         let ([a, b, c], [d, e, f]) = (self.0, other.0);
         Self([a & !d, b & !e, c & !f])
     }
 
-    /// How many variables follow each other in the table from `first` on and are all in the set.
+    /// Number of consecutive variables in the table, from `first` on, that are all in the set.
     pub fn run_len(&self, first: SysVar) -> usize {
         let ordinal = first.ordinal() as u32;
         self.bits().checked_shr(ordinal).map_or(0, |bits| bits.trailing_ones() as usize)
     }
 
-    /// The `len` variables from `first` on, as far as they are inputs.
+    /// The `len` variables from `first` on, without those that are not inputs.
     pub fn run(first: SysVar, len: usize) -> Self {
         let upto = |end: usize| !u128::MAX.checked_shl(end.min(INPUT_COUNT) as u32).unwrap_or(0);
         let start = first.ordinal();
@@ -119,7 +120,7 @@ impl InputSet {
     }
 }
 
-/// Some of all variables.
+/// A set of any variables.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct VarSet([u32; COUNT.div_ceil(32)]);
 
@@ -151,7 +152,7 @@ impl VarSet {
         self.0.iter().all(|word| *word == 0)
     }
 
-    /// Whether some variable is in both.
+    /// Whether a variable is in both sets.
     pub fn meets(&self, other: &Self) -> bool {
         self.0.iter().zip(&other.0).any(|(one, other)| one & other != 0)
     }

@@ -1,20 +1,20 @@
-//! Supervision of one controller link: when to open it, when to give it up, when to try again.
+//! Supervises one controller link: when to open it, when to give it up, when to try again.
 //!
-//! In: what the driver reports and what the engine thinks of the peer. Out: [`LinkAction`]s and a
-//! deadline. Refuses to know sockets, protocols and addresses.
+//! In: what the driver reports, and the engine's judgement of the peer. Out: [`LinkAction`]s and a
+//! deadline. Does not know sockets, protocols or addresses.
 
 use crate::time::{Duration, Instant};
 
 /// Timeouts of a link.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct LinkTimings {
-    /// A connection that takes longer is given up.
+    /// A link that is not up within this time is given up.
     pub connect_timeout: Duration,
-    /// The first wait after a loss; each further one is twice as long.
+    /// The wait after the first loss; it doubles after each further one.
     pub backoff_min: Duration,
     /// The longest wait.
     pub backoff_max: Duration,
-    /// A link that was up for this long starts again from the shortest wait.
+    /// A link that was up for this long starts again with the shortest wait.
     pub settled_after: Duration,
     /// A link on which nothing arrives for this long is closed; `None` where silence is normal.
     pub silence: Option<Duration>,
@@ -30,7 +30,7 @@ impl LinkTimings {
         silence: None,
     };
 
-    /// The same, closed after `silence` without a byte.
+    /// Same, but closed after `silence` without a byte.
     #[must_use]
     pub const fn with_silence(self, silence: Duration) -> Self {
         Self { silence: Some(silence), ..self }
@@ -40,30 +40,30 @@ impl LinkTimings {
 /// The state of a link.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
-// Its tag would be as wide as an instant, which takes two registers on a Cortex-M.
+// Otherwise the tag would be as wide as an instant, which takes two registers on a Cortex-M.
 #[repr(u8)]
 pub enum LinkState {
     /// Closed; opened again at `retry_at`.
     Down {
-        /// When.
+        /// When it is opened again.
         retry_at: Instant,
     },
     /// Opened, not yet up; given up at `until`.
     Opening {
-        /// When.
+        /// When it is given up.
         until: Instant,
     },
-    /// Usable.
+    /// Up.
     Up {
-        /// Since when.
+        /// When it came up.
         since: Instant,
     },
-    /// Not opened: the peer takes no second connection, and another link does its work.
+    /// Not opened: the peer takes only one connection, and another link carries this one's traffic.
     Shared,
 }
 
 impl LinkState {
-    /// One word for people and statistics.
+    /// One word for logs and statistics.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Down { .. } => "down",
@@ -74,22 +74,22 @@ impl LinkState {
     }
 }
 
-/// What the driver has to do.
+/// A task for the driver.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LinkAction {
     /// Open the link and report when it is up or has failed.
     Open,
-    /// Close it and report nothing more of it.
+    /// Close it and report nothing more about it.
     Close,
 }
 
-/// What happened to a link since the start.
+/// Counters of a link since the start.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub struct LinkHistory {
     /// Times the link came up.
     pub connects: u32,
-    /// Times it was lost after it had been up, whoever closed it.
+    /// Times it was lost after it had been up, whichever side closed it.
     pub losses: u32,
     /// Times it could not be opened.
     pub failed_opens: u32,
@@ -136,8 +136,8 @@ impl Supervisor {
         &self.history
     }
 
-    /// The driver reports that the link is up. False when that was not expected: the report is
-    /// late, and the driver has been told to close the link.
+    /// The driver reports that the link is up. False if that was not expected: the report is late,
+    /// and the driver has already been told to close the link.
     pub fn up(&mut self, now: Instant) -> bool {
         if !matches!(self.state, LinkState::Opening { .. }) || self.is_to_be_opened() {
             return false;
@@ -148,7 +148,7 @@ impl Supervisor {
         true
     }
 
-    /// The driver reports that the link is gone or could not be opened. True when it was up.
+    /// The driver reports that the link is gone or could not be opened. True if it was up.
     pub fn down(&mut self, now: Instant) -> bool {
         if self.is_to_be_opened() {
             return false;
@@ -160,7 +160,8 @@ impl Supervisor {
         matches!(was, LinkState::Up { .. })
     }
 
-    /// Whether the driver has still to be told to open the link: what it reports is of an earlier time.
+    /// Whether the link has yet to be opened by the driver: what it reports belongs to an earlier
+    /// connection.
     fn is_to_be_opened(&self) -> bool {
         self.action == Some(LinkAction::Open)
     }
@@ -170,7 +171,7 @@ impl Supervisor {
         self.heard = now;
     }
 
-    /// The engine gives the link up: what the peer sends makes no sense, or nothing.
+    /// The engine gives the link up because the peer sends nonsense or nothing.
     pub fn give_up(&mut self, now: Instant) {
         if !matches!(self.state, LinkState::Down { .. } | LinkState::Shared) {
             self.fall(now);
@@ -178,13 +179,13 @@ impl Supervisor {
         }
     }
 
-    /// Another link does this one's work from now on.
+    /// Another link carries this one's traffic from now on.
     pub fn share(&mut self, now: Instant) {
         self.give_up(now);
         self.state = LinkState::Shared;
     }
 
-    /// The link does its own work again; it is opened after the shortest wait.
+    /// The link carries its own traffic again; it is opened after the shortest wait.
     pub fn unshare(&mut self, now: Instant) {
         if self.state == LinkState::Shared {
             self.backoff = self.timings.backoff_min;
@@ -192,7 +193,7 @@ impl Supervisor {
         }
     }
 
-    /// Checks the deadlines. True if the link was up and has just been given up for silence.
+    /// Checks the deadlines. True if the link was up and has just been given up because of silence.
     pub fn advance(&mut self, now: Instant) -> bool {
         match self.state {
             LinkState::Down { retry_at } if now >= retry_at && self.action.is_none() => {
@@ -210,7 +211,7 @@ impl Supervisor {
         false
     }
 
-    /// What the driver has to do now, once.
+    /// The task for the driver, once.
     pub fn take_action(&mut self) -> Option<LinkAction> {
         self.action.take()
     }

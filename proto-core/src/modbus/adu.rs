@@ -1,6 +1,6 @@
 //! The Modbus TCP frame: seven bytes of header before each PDU (docs/wire/modbus.md section 2).
 //!
-//! In: a connection's bytes in chunks of any size. Out: whole frames. Knows nothing of functions.
+//! In: a connection's bytes in chunks of any size. Out: whole frames. Does not know functions.
 
 use core::fmt;
 
@@ -11,7 +11,7 @@ pub const HEADER_LEN: usize = 7;
 /// Longest PDU.
 pub const MAX_PDU: usize = 253;
 
-/// The part of the header before what its length field counts.
+/// Length of the header up to and including its length field.
 const PREFIX_LEN: usize = 6;
 /// The length field counts the unit id and the PDU: at least a function code, at most 253 bytes (D10).
 const LENGTHS: core::ops::RangeInclusive<u16> = 2..=254;
@@ -28,7 +28,7 @@ pub struct Adu<'a> {
     pub pdu: &'a [u8],
 }
 
-/// A header after which the stream cannot be followed any more: the connection has to be closed (D10).
+/// A header after which frames can no longer be found: the connection must be closed (D10).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
@@ -66,7 +66,7 @@ pub(super) const fn header(transaction: u16, unit: u8, pdu_len: usize) -> [u8; H
 
 /// Cuts a connection's bytes into frames.
 ///
-/// Holds at most one partial frame. Whole frames inside one chunk are handed out where they lie,
+/// Holds at most one partial frame. A frame that lies whole in a chunk is returned in place,
 /// without a copy.
 #[derive(Debug, Clone)]
 pub struct AduReader {
@@ -74,7 +74,7 @@ pub struct AduReader {
     filled: usize,
 }
 
-/// Where a whole frame lies.
+/// Where a whole frame is.
 #[derive(Clone, Copy)]
 pub(super) enum Place<'c> {
     Chunk(&'c [u8]),
@@ -104,12 +104,12 @@ impl AduReader {
         Some(place.map(|place| self.adu(place)))
     }
 
-    /// Forgets a partial frame: the connection is a new one.
+    /// Forgets a partial frame, for a new connection.
     pub const fn reset(&mut self) {
         self.filled = 0;
     }
 
-    /// Bytes of a partial frame that are being kept.
+    /// Bytes of a partial frame that are held.
     pub const fn pending(&self) -> usize {
         self.filled
     }
@@ -163,7 +163,7 @@ impl AduReader {
         Some(Ok(Place::Buffer(total)))
     }
 
-    /// Moves bytes from `chunk` until `target` are buffered; false when the chunk ended before.
+    /// Moves bytes from `chunk` until `target` are buffered; false if the chunk was too short.
     fn fill_to(&mut self, target: usize, chunk: &mut &[u8]) -> bool {
         let missing = target.saturating_sub(self.filled);
         let (moved, rest) = chunk.split_at_checked(missing).unwrap_or((*chunk, &[]));
@@ -184,7 +184,7 @@ impl AduReader {
     }
 }
 
-/// The whole frame's length by the header's first six bytes.
+/// The length of the whole frame, from the first six bytes of its header.
 #[inline]
 fn frame_len(&[_, _, p1, p0, l1, l0]: &[u8; PREFIX_LEN]) -> Result<usize, AduError> {
     let protocol = u16::from_be_bytes([p1, p0]);

@@ -1,8 +1,8 @@
 //! The client's side of one connection, one transaction in flight (docs/wire/modbus.md section 6).
 //!
 //! In: a request to send, then the connection's bytes. Out: the request's frame, then its answer.
-//! Knows no time: a caller whose patience ends calls [`Client::abort`], and the answer that comes
-//! too late is recognised by its transaction id, counted and skipped.
+//! Does not know time: the caller decides when an answer is overdue and calls [`Client::abort`].
+//! The late answer is recognised by its transaction id, counted and skipped.
 
 use core::fmt;
 
@@ -22,7 +22,7 @@ pub struct Client {
     stale: u32,
 }
 
-/// What the received bytes contained.
+/// An event in the received bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum ClientEvent<'a> {
@@ -30,8 +30,8 @@ pub enum ClientEvent<'a> {
     Response(Response<'a>),
     /// The server refused the request; the connection is fine.
     Exception(Exception),
-    /// The server does not speak the protocol: the connection must be closed. The request, if one
-    /// was in flight, is over; what else the chunk brought has been dropped.
+    /// The server violated the protocol: the connection must be closed. A request in flight is
+    /// over, and the rest of the chunk is dropped.
     Violation(Violation),
 }
 
@@ -40,20 +40,20 @@ pub enum ClientEvent<'a> {
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
 pub enum Violation {
-    /// A header that cannot be followed.
+    /// A header after which frames can no longer be found.
     Header(AduError),
     /// An answer to a request that was never sent.
     Transaction {
         /// Id of the newest request.
         newest: u16,
-        /// The one that came.
+        /// The id in the answer.
         received: u16,
     },
     /// An answer from another unit.
     Unit {
-        /// The unit that was asked.
+        /// The unit of the request.
         expected: u8,
-        /// The one that came.
+        /// The unit in the answer.
         received: u8,
     },
     /// A PDU that does not answer the request.
@@ -65,9 +65,11 @@ impl fmt::Display for Violation {
         match self {
             Self::Header(error) => error.fmt(f),
             Self::Transaction { newest, received } => {
-                write!(f, "an answer to transaction {received}, which is not among those up to {newest}")
+                write!(f, "an answer to transaction {received}, but the newest request is {newest}")
             }
-            Self::Unit { expected, received } => write!(f, "unit {received} answers for unit {expected}"),
+            Self::Unit { expected, received } => {
+                write!(f, "an answer from unit {received}, but the request was for unit {expected}")
+            }
             Self::Response(error) => error.fmt(f),
         }
     }
@@ -173,7 +175,7 @@ impl Client {
                     }
                 });
             }
-            // Ids count up, so the half of their circle behind the newest one is the past.
+            // Ids count up, so those in the half circle behind the newest one are older.
             if self.transaction.wrapping_sub(transaction) >= 0x8000 {
                 let violation = Violation::Transaction { newest: self.transaction, received: transaction };
                 return Some(self.violated(bytes, violation));
@@ -182,12 +184,12 @@ impl Client {
         }
     }
 
-    /// Gives the request in flight up, on the same connection: its answer will be skipped.
+    /// Gives up the request in flight, on the same connection: its answer will be skipped.
     pub const fn abort(&mut self) {
         self.in_flight = false;
     }
 
-    /// The connection is a new one: gives up the request in flight and forgets a partial answer.
+    /// Gives up the request in flight and forgets a partial answer, for a new connection.
     pub const fn reset(&mut self) {
         self.in_flight = false;
         self.reader.reset();

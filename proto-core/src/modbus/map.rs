@@ -1,7 +1,7 @@
 //! The controller's address map (docs/wire/modbus.md sections 7 and 8).
 //!
-//! Addresses of system variables come from the table in [`crate::sysvar`]; what is not a variable
-//! is written here. The gaps between rows are checked when the crate is built: there are none.
+//! Addresses of system variables come from the table in [`crate::sysvar`]; the rest is listed here.
+//! The build fails if there is a gap between rows.
 
 use super::exception::Exception;
 
@@ -23,7 +23,7 @@ pub enum Space {
 pub enum Access {
     /// A write is refused with exception 02.
     ReadOnly,
-    /// Both.
+    /// Reads and writes are allowed.
     ReadWrite,
 }
 
@@ -34,35 +34,35 @@ pub struct Item {
     pub space: Space,
     /// First address.
     pub first: u16,
-    /// How many addresses, at least 1.
+    /// Number of addresses, at least 1.
     pub count: u16,
     /// Whether a client may write.
     pub access: Access,
-    /// What it is.
+    /// What the addresses hold.
     pub content: &'static str,
     /// Counts per unit of a quantity; 0 for coils, codes and plain words.
     pub per_unit: u16,
 }
 
-/// How many coils there are, from address 0.
+/// Number of coils, from address 0.
 pub const COILS: u16 = rows::end(Space::Coils);
-/// How many holding registers there are, from address 0.
+/// Number of holding registers, from address 0.
 pub const HOLDING: u16 = rows::end(Space::Holding);
 
 /// The map in address order, coils first.
 pub static MAP: [Item; 27] = rows::ROWS;
 
 impl Item {
-    /// One past the last address.
+    /// The first address after the run.
     pub const fn end(&self) -> u16 {
         self.first.saturating_add(self.count)
     }
 }
 
-/// Whether `count` items from `address` can be read.
+/// Checks that `count` items from `address` can be read.
 ///
 /// # Errors
-/// [`Exception::IllegalDataAddress`] when one of them is outside the map.
+/// [`Exception::IllegalDataAddress`] if one of them is outside the map.
 #[inline]
 pub fn check_read(space: Space, address: u16, count: u16) -> Result<(), Exception> {
     let end = match space {
@@ -75,10 +75,10 @@ pub fn check_read(space: Space, address: u16, count: u16) -> Result<(), Exceptio
     }
 }
 
-/// Whether `count` items from `address` can be written, all of them (D10).
+/// Checks that `count` items from `address` can be written, all of them (D10).
 ///
 /// # Errors
-/// [`Exception::IllegalDataAddress`] when one of them is outside the map or read-only.
+/// [`Exception::IllegalDataAddress`] if one of them is outside the map or read-only.
 #[inline]
 pub fn check_write(space: Space, address: u16, count: u16) -> Result<(), Exception> {
     let run_end = match space {
@@ -91,8 +91,8 @@ pub fn check_write(space: Space, address: u16, count: u16) -> Result<(), Excepti
     }
 }
 
-/// `value` as a register of `per_unit` counts per unit: to the nearest count, two's complement,
-/// saturated at ±32767, and 0 for a value that is not a number (D11).
+/// `value` as a register of `per_unit` counts per unit: rounded to the nearest count, two's
+/// complement, saturated at ±32767, and 0 for a value that is not a number (D11).
 #[inline]
 pub fn scaled(value: f32, per_unit: u16) -> u16 {
     let counts = f64::from(value) * f64::from(per_unit);

@@ -1,6 +1,6 @@
 //! Requests and responses of the six function codes (docs/wire/modbus.md section 3).
 //!
-//! In: PDUs or values. Out: the other. Knows nothing of connections, transactions or the map.
+//! In: PDUs or values. Out: the other. Does not know connections, transactions or the map.
 
 use core::fmt;
 
@@ -34,7 +34,7 @@ pub mod function {
     pub const EXCEPTION_FLAG: u8 = 0x80;
 }
 
-/// What a client asks for.
+/// A client's request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum Request<'a> {
@@ -82,7 +82,7 @@ pub enum Request<'a> {
     },
 }
 
-/// What a server answers when it carried a request out.
+/// A server's answer to a request that it carried out.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum Response<'a> {
@@ -108,19 +108,19 @@ pub enum Response<'a> {
     WroteCoils {
         /// First coil.
         address: u16,
-        /// How many were written.
+        /// Number of coils written.
         count: u16,
     },
     /// FC 16.
     WroteRegisters {
         /// First register.
         address: u16,
-        /// How many were written.
+        /// Number of registers written.
         count: u16,
     },
 }
 
-/// Function code, address, and count or value of a request: what its response is checked against.
+/// Function code, address, and count or value of a request; its response is checked against them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct RequestHead {
@@ -139,14 +139,14 @@ pub struct RequestHead {
 pub enum EncodeError {
     /// The buffer is too short; nothing was written.
     NoSpace {
-        /// Bytes the PDU or frame takes.
+        /// Number of bytes that the PDU or frame needs.
         needed: usize,
-        /// Bytes there were.
+        /// Number of bytes available.
         available: usize,
     },
     /// A count of 0 or over the function's limit.
     Count {
-        /// The count that was asked for.
+        /// The count in the request.
         count: u16,
         /// The function's limit.
         max: u16,
@@ -166,7 +166,7 @@ impl fmt::Display for EncodeError {
 
 impl core::error::Error for EncodeError {}
 
-/// Why bytes are not an answer to the request they should answer.
+/// Why bytes are not an answer to the request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
@@ -175,28 +175,28 @@ pub enum ResponseError {
     Function {
         /// The request's function code.
         expected: u8,
-        /// The one that came.
+        /// The function code in the answer.
         received: u8,
     },
-    /// More or fewer bytes than the answer has.
+    /// More or fewer bytes than the answer must have.
     Length {
-        /// Length of the PDU that answers the request.
+        /// The length that the answer must have.
         expected: usize,
-        /// The one that came.
+        /// The length of the answer.
         received: usize,
     },
-    /// The byte count of a read does not fit the count asked for.
+    /// The byte count of a read does not fit the requested count.
     ByteCount {
-        /// Bytes asked for.
+        /// The number of bytes requested.
         expected: u8,
-        /// The byte count that came.
+        /// The byte count in the answer.
         received: u8,
     },
-    /// The echo of a write names another address, count or value.
+    /// The echo of a write has another address, count or value.
     Echo {
-        /// What was requested.
+        /// The request.
         expected: RequestHead,
-        /// What came back.
+        /// The echo.
         received: RequestHead,
     },
 }
@@ -205,7 +205,7 @@ impl fmt::Display for ResponseError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Function { expected, received } => {
-                write!(f, "function 0x{received:02x} answers a request of function 0x{expected:02x}")
+                write!(f, "the answer has function 0x{received:02x} instead of 0x{expected:02x}")
             }
             Self::Length { expected, received } => {
                 write!(f, "the answer has {received} bytes instead of {expected}")
@@ -215,7 +215,7 @@ impl fmt::Display for ResponseError {
             }
             Self::Echo { expected, received } => write!(
                 f,
-                "address {} with 0x{:04x} was to be written, the answer echoes address {} with 0x{:04x}",
+                "the request writes 0x{1:04x} to address {0}, the answer echoes 0x{3:04x} to address {2}",
                 expected.address, expected.count_or_value, received.address, received.count_or_value
             ),
         }
@@ -273,7 +273,7 @@ impl<'a> Request<'a> {
         self.parts().head
     }
 
-    /// Length of the request's PDU, 5..=252 for a request that can be sent.
+    /// Length of the request's PDU; 5..=252 for a request that can be sent.
     #[inline]
     pub fn encoded_len(&self) -> usize {
         self.parts().encoded_len()
@@ -320,7 +320,7 @@ impl<'a> Request<'a> {
     }
 }
 
-/// What a request's PDU is made of.
+/// The contents of a request's PDU.
 #[derive(Clone, Copy)]
 pub(super) struct Parts<'a> {
     pub(super) head: RequestHead,

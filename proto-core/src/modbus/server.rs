@@ -1,7 +1,7 @@
 //! The server's side of one connection (docs/wire/modbus.md section 5).
 //!
-//! In: a connection's bytes. Out: one answer a request, from a [`RegisterBank`] that knows the map.
-//! Any unit id is answered and echoed (D10).
+//! In: a connection's bytes. Out: one answer for each request, from a [`RegisterBank`] that knows
+//! the map. Any unit id is answered and echoed (D10).
 
 use super::adu::{self, AduError, AduReader, HEADER_LEN, MAX_ADU, MAX_PDU};
 use super::exception::Exception;
@@ -22,20 +22,19 @@ pub trait RegisterBank {
     /// The exception to answer with.
     fn read_coils(&self, address: u16, count: u16, packed: &mut [u8]) -> Result<(), Exception>;
 
-    /// Takes the coils from `address` on.
+    /// Writes the coils from `address` on.
     ///
     /// # Errors
     /// The exception to answer with; nothing was changed.
     fn write_coils(&mut self, address: u16, coils: Coils<'_>) -> Result<(), Exception>;
 
-    /// Writes the registers from `address` on into `words`, each big-endian: as many as there is
-    /// room for.
+    /// Reads the registers from `address` on into `words`, each big-endian, until `words` is full.
     ///
     /// # Errors
     /// The exception to answer with.
     fn read_holding(&self, address: u16, words: &mut [[u8; 2]]) -> Result<(), Exception>;
 
-    /// Takes the registers from `address` on.
+    /// Writes the registers from `address` on.
     ///
     /// # Errors
     /// The exception to answer with; nothing was changed.
@@ -54,12 +53,12 @@ impl Server {
         Self { reader: AduReader::new() }
     }
 
-    /// Takes one request from the front of `bytes`, carries it out on `bank`, and writes the answer
-    /// to the front of `out`: its length. To be called until it returns `None`, which is when all
-    /// of `bytes` has been taken.
+    /// Takes one request from the front of `bytes`, carries it out on `bank`, writes the answer to
+    /// the front of `out` and returns its length. Call it until it returns `None`, which means that
+    /// all of `bytes` has been taken.
     ///
     /// # Errors
-    /// The connection must be closed (D10); what else it brought has been dropped.
+    /// The connection must be closed (D10); the rest of its bytes is dropped.
     #[inline]
     pub fn receive<B: RegisterBank + ?Sized>(
         &mut self,
@@ -77,13 +76,13 @@ impl Server {
         Some(Ok(len.saturating_add(HEADER_LEN)))
     }
 
-    /// Forgets a partial request: the connection is a new one.
+    /// Forgets a partial request, for a new connection.
     pub const fn reset(&mut self) {
         self.reader.reset();
     }
 }
 
-/// Carries out the request in `pdu` and writes the answer's PDU to `out`: its length.
+/// Carries out the request in `pdu`, writes the answer's PDU to `out` and returns its length.
 ///
 /// For other framings of PDUs; [`Server`] calls it for each frame.
 #[inline]
@@ -140,7 +139,7 @@ fn carry_out<B: RegisterBank + ?Sized>(
     Ok(HEAD_LEN)
 }
 
-/// Function code and byte count of a read's answer; returns the data's place.
+/// Function code and byte count of a read's answer; returns the place for the data.
 #[inline]
 fn read_answer(out: &mut [u8; MAX_PDU], head: RequestHead, len: usize) -> Result<&mut [u8], Exception> {
     let (answer_head, data) = out.split_first_chunk_mut().ok_or(Exception::DeviceFailure)?;
@@ -164,7 +163,7 @@ fn split_frame(out: &mut [u8; MAX_ADU]) -> Option<(&mut [u8; HEADER_LEN], &mut [
     Some((header, body.first_chunk_mut()?))
 }
 
-/// Addresses are 16 bits: a run that passes the last one is outside every map.
+/// Addresses are 16 bits: a run beyond the last one is outside every map.
 #[inline]
 fn check_end(address: u16, count: u16) -> Result<(), Exception> {
     let end = u32::from(address).wrapping_add(u32::from(count));

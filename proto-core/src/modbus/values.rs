@@ -1,10 +1,10 @@
-//! Coils and registers as they stand in a PDU: borrowed, length-checked views
-//! (docs/wire/modbus.md section 3).
+//! Coils and registers as they are in a PDU: borrowed, length-checked views (docs/wire/modbus.md
+//! section 3).
 
-/// Most coils in one FC 1 request, and so in any answer or write.
+/// Maximum number of coils in an FC 1 request, and so in any answer or write.
 pub const MAX_READ_COILS: u16 = 0x07D0;
 
-/// A run of coils, packed eight a byte, the first coil in the least significant bit.
+/// A run of coils, packed eight per byte, the first coil in the least significant bit.
 ///
 /// Bits beyond the last coil are ignored when read and compared, and sent as 0.
 #[derive(Debug, Clone, Copy)]
@@ -50,7 +50,7 @@ impl<'a> Coils<'a> {
         Self::new(buffer, count)
     }
 
-    /// How many coils there are, at least 1.
+    /// Number of coils, at least 1.
     #[inline]
     pub const fn count(self) -> u16 {
         self.count
@@ -70,7 +70,7 @@ impl<'a> Coils<'a> {
     }
 
     /// Up to eight coils from `first` on as one byte, the first in the least significant bit: a
-    /// byte variable of the map. `None` when `first` is past the last coil.
+    /// byte variable of the map. `None` if `first` is beyond the last coil.
     pub fn byte(self, first: u16) -> Option<u8> {
         let left = self.count.checked_sub(first).filter(|left| *left != 0)?;
         let at = usize::from(first >> 3);
@@ -144,8 +144,8 @@ impl<'a> Registers<'a> {
         Self::new(words.as_flattened().get(..count.saturating_mul(2))?)
     }
 
-    /// Turns little-endian words, as the process image holds them, into registers in the front of
-    /// `buffer`; `None` where [`Registers::pack`] gives it.
+    /// Turns little-endian words, as in the process image, into registers in the front of `buffer`;
+    /// `None` in the same cases as [`Registers::pack`].
     pub fn from_little_endian(words: &[u8], buffer: &'a mut [u8]) -> Option<Self> {
         let (words, odd) = words.as_chunks::<2>();
         if !odd.is_empty() {
@@ -154,7 +154,7 @@ impl<'a> Registers<'a> {
         Self::pack(words.iter().map(|word| u16::from_le_bytes(*word)), buffer)
     }
 
-    /// How many registers there are, at least 1.
+    /// Number of registers, at least 1.
     pub const fn count(self) -> u16 {
         // At most 125 by construction.
         (self.bytes.len() >> 1) as u16
@@ -185,7 +185,7 @@ pub(super) const fn packed_len(count: u16) -> usize {
 /// The bits of the last packed byte of `count` coils that are coils.
 #[inline]
 pub(super) const fn last_mask(count: u16) -> u8 {
-    // The unused bits are as many as are missing to the next multiple of 8.
+    // As many bits are unused as are missing to the next multiple of 8.
     0xFF_u8 >> (count.wrapping_neg() & 7)
 }
 

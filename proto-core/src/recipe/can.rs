@@ -1,8 +1,8 @@
 //! The compiled part of a CAN recipe: frame ids, each with its fields
 //! (docs/wire/recipes.md section 6).
 //!
-//! In: anything that is an [`embedded_can::Frame`], or the process image. Out: the other. Frames
-//! that are not the recipe's are refused with a reason to count, never applied in part.
+//! In: anything that is an [`embedded_can::Frame`], or the process image. Out: the other. A frame
+//! that is not of the recipe is rejected with a reason to count, and never applied in part.
 
 use embedded_can::Frame;
 use heapless::Vec;
@@ -14,7 +14,7 @@ use crate::sysvar::IMAGE_BYTES;
 use crate::wire::can::{CanFrame, CanId, MAX_CAN_DATA};
 use crate::wire::scalar::Scalar;
 
-/// Why a received frame is not one of the recipe's (D17).
+/// Why a received frame is not a frame of the recipe (D17).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
@@ -33,9 +33,9 @@ pub enum CanReject {
     WrongLength {
         /// The frame's index in the part.
         frame: u8,
-        /// The fields' length in bytes.
+        /// Length of the fields in bytes.
         expected: u8,
-        /// The data's.
+        /// Length of the data in bytes.
         got: u8,
     },
 }
@@ -47,8 +47,7 @@ pub struct CanLayout {
     /// The frames' ids, in one word each.
     keys: Vec<u32, MAX_CAN_IDS>,
     shares: Vec<Share, MAX_CAN_IDS>,
-    /// Where to look for an id: indices of frames, or [`EMPTY`]. See
-    /// [`CanLayout::search_order`].
+    /// Places of the ids: indices of frames, or [`EMPTY`]. See [`CanLayout::search_order`].
     places: [u8; PLACES],
     pool: Pool,
 }
@@ -88,12 +87,12 @@ impl CanLayout {
         self.keys.iter().map(|&key| id_of(key))
     }
 
-    /// How many frames the part has, 1..=32.
+    /// Number of frames in the part, 1..=32.
     pub fn frame_count(&self) -> usize {
         self.shares.len()
     }
 
-    /// Which frame of the part a received frame is.
+    /// The index of the part's frame that a received frame is.
     ///
     /// # Errors
     /// [`CanReject`]: another id, a remote frame, or another length.
@@ -156,19 +155,19 @@ impl CanLayout {
         {
             *place = frame;
         }
-        // There is space: the count was looked at above.
+        // There is room: the count was checked above.
         let share = self.pool.share_since(first_field, first_step, len);
         self.shares.push(share).map_err(|_| PartError::TooManyFrames)?;
         self.keys.push(key).map_err(|_| PartError::TooManyFrames)
     }
 
-    /// The index of the frame with this id. At least half of the places are empty, so the search
-    /// is short.
+    /// The index of the frame with this id. At least half of the places are empty, so the search is
+    /// short.
     #[inline]
     fn index_of(&self, key: u32) -> Option<usize> {
         for at in self.search_order(key) {
             let index = usize::from(*self.places.get(at)?);
-            // An empty place is no index.
+            // An empty place is not an index.
             if *self.keys.get(index)? == key {
                 return Some(index);
             }
@@ -190,7 +189,7 @@ impl<'a> CanFrameLayout<'a> {
         self.id
     }
 
-    /// Its data's length in bytes, 1..=8.
+    /// Length of its data in bytes, 1..=8.
     #[allow(clippy::len_without_is_empty, reason = "no frame of a recipe is empty")]
     pub const fn len(&self) -> usize {
         self.share.len as usize
@@ -206,7 +205,7 @@ impl<'a> CanFrameLayout<'a> {
         self.frame_fields().values(data)
     }
 
-    /// Whether every value of the data may be used (D22).
+    /// Checks that every value of the data may be used (D22).
     ///
     /// # Errors
     /// [`ValueError`]: a float or double that is not finite, or data of another length.
@@ -236,7 +235,7 @@ impl<'a> CanFrameLayout<'a> {
         })
     }
 
-    /// The frame with these values, one a field.
+    /// The frame with these values, one per field.
     ///
     /// # Errors
     /// [`EncodeError`]: too few or too many values, or a value of another type.
@@ -250,7 +249,7 @@ impl<'a> CanFrameLayout<'a> {
     }
 }
 
-/// Where the n-th field of the part stands; fields past the finished frames are those of `frame`.
+/// The place of the n-th field of the part; fields after the finished frames belong to `frame`.
 fn place_among(finished: &[Share], frame: u8, nth: usize) -> FieldPlace {
     let holds = |share: &Share| nth < usize::from(share.field_end);
     let index = finished.iter().position(holds);
@@ -262,7 +261,7 @@ fn place_among(finished: &[Share], frame: u8, nth: usize) -> FieldPlace {
     FieldPlace { frame: Some(frame), field: nth.saturating_sub(usize::from(first)) as u8 }
 }
 
-/// Twice the ids there can be, so that the search for one that is not there ends soon.
+/// Twice the maximum number of ids, so that the search for a missing one ends soon.
 const PLACES: usize = 2 * MAX_CAN_IDS;
 const PLACE_SHIFT: u32 = u32::BITS - PLACES.ilog2();
 const _: () = assert!(PLACES.is_power_of_two());

@@ -1,11 +1,11 @@
 //! Finds frames in a stream of bytes (docs/wire/recipes.md section 4, D19), and checks datagrams
 //! (section 5).
 //!
-//! In: chunks of any size. Out: the payload of each frame, and counts of everything else. Whether
-//! the line was silent too long is the caller's knowledge: it calls [`Deframer::discard`].
+//! In: chunks of any size. Out: the payload of each frame, and counts of everything else. The
+//! caller knows when the line was silent for too long, and calls [`Deframer::discard`].
 //!
-//! Work is linear in the bytes received, whatever they are: each costs at most a few comparisons
-//! with the up to eight bytes of head and tail and a few copies, which a test counts.
+//! Work is linear in the bytes received, whatever they are: each byte costs at most a few
+//! comparisons with the up to eight bytes of head and tail and a few copies, which a test counts.
 
 use super::error::DatagramError;
 use super::model::MAX_STREAM_FRAME;
@@ -20,7 +20,7 @@ pub struct DeframerStats {
     pub frames: u64,
     /// Bytes dropped because no frame begins there.
     pub skipped_bytes: u64,
-    /// Times that other bytes than the tail were in its place.
+    /// Times that the bytes in the tail's place were not the tail.
     pub tail_mismatches: u64,
     /// Bytes of partial frames that [`Deframer::discard`] dropped.
     pub discarded_bytes: u64,
@@ -28,7 +28,7 @@ pub struct DeframerStats {
 
 /// Cuts a byte stream into frames.
 ///
-/// It holds at most one frame less a byte, and only bytes that may still become a frame.
+/// It holds at most one byte less than a frame, and only bytes that may still become a frame.
 #[derive(Debug, Clone)]
 pub struct Deframer {
     /// A ring, so that dropping a byte at the front moves nothing; it starts at 0 whenever it is
@@ -45,7 +45,7 @@ const _: () = assert!(RING.is_power_of_two());
 
 /// How completing a partial frame ended.
 enum Held {
-    /// A whole frame stands in the ring from here on, and nothing is held any more.
+    /// A whole frame is in the ring from here on, and nothing is held any more.
     Frame { at: usize },
     /// The chunk is used up.
     Partial,
@@ -66,8 +66,8 @@ impl Deframer {
         Self { ring: [0; RING], start: 0, len: 0, stats }
     }
 
-    /// The payload of the next frame. Bytes are taken from the front of `chunk`; call it again
-    /// with what is left until it returns `None`, which means that the chunk is used up.
+    /// The payload of the next frame. Takes bytes from the front of `chunk`. Call it again with the
+    /// rest until it returns `None`, which means that the chunk is used up.
     ///
     /// All calls between two [`Self::discard`]s must be given the same layout.
     #[inline]
@@ -94,13 +94,13 @@ impl Deframer {
         (first, self.ring.get(..len.saturating_sub(straight)).unwrap_or(&[]))
     }
 
-    /// How many bytes of a possible frame are held.
+    /// Number of held bytes, which may become a frame.
     pub const fn pending(&self) -> usize {
         self.len as usize
     }
 
-    /// Drops a partial frame, because the line was silent or the recipe changed, and returns how
-    /// many bytes that were.
+    /// Drops a partial frame, because the line was silent or the recipe changed, and returns its
+    /// number of bytes.
     pub fn discard(&mut self) -> usize {
         let dropped = self.pending();
         self.stats.discarded_bytes = self.stats.discarded_bytes.wrapping_add(dropped as u64);
@@ -109,12 +109,13 @@ impl Deframer {
         dropped
     }
 
-    /// Counters since it was made.
+    /// Counters since the deframer was made.
     pub const fn stats(&self) -> DeframerStats {
         self.stats
     }
 
-    /// Looks for a frame in the chunk itself, with nothing held. What may become one is held.
+    /// Looks for a frame in the chunk itself, with nothing held. Bytes that may become one are
+    /// held.
     #[inline]
     fn search<'c>(&mut self, layout: &StreamLayout, chunk: &mut &'c [u8]) -> Option<&'c [u8]> {
         let skip = layout.head_word().find(chunk);
@@ -184,7 +185,7 @@ impl Deframer {
                 *chunk = after;
                 return Held::Frame { at: 0 };
             }
-            // Nothing was taken yet: the bytes behind those held do not count.
+            // Nothing was taken yet: the bytes after the held ones do not count.
         }
         let mut rest = *chunk;
         let held = self.complete_carefully(layout, &mut rest);
@@ -192,8 +193,8 @@ impl Deframer {
         held
     }
 
-    /// The same, whatever is held and whatever comes. Nothing of the chunk is taken before it is
-    /// known what for.
+    /// Same, whatever is held and whatever comes. Nothing of the chunk is taken before it is known
+    /// what it is.
     #[inline(never)]
     fn complete_carefully(&mut self, layout: &StreamLayout, chunk: &mut &[u8]) -> Held {
         let tail_at = layout.frame_len().saturating_sub(layout.tail().len());
@@ -224,8 +225,8 @@ impl Deframer {
         Held::Nothing
     }
 
-    /// Whether the held bytes followed by the chunk agree with `expected` from `at` on, as far as
-    /// they go.
+    /// Whether the held bytes followed by the chunk match `expected` from `at` on, as far as they
+    /// go.
     fn agrees(&self, chunk: &[u8], at: usize, expected: &[u8]) -> bool {
         count_visits(expected.len());
         let held = self.pending();
@@ -238,7 +239,7 @@ impl Deframer {
         })
     }
 
-    /// Where the held frame stands, in one piece; nothing is held afterwards.
+    /// The held frame, in one piece; nothing is held afterwards.
     fn settle(&mut self, layout: &StreamLayout) -> usize {
         self.stats.frames = self.stats.frames.wrapping_add(1);
         let start = usize::from(self.start) & WRAP;
@@ -252,7 +253,7 @@ impl Deframer {
         0
     }
 
-    /// Holds more bytes; there is always space, since what is held stays below a frame's length.
+    /// Holds more bytes. There is always room, since less than a frame is held.
     fn append(&mut self, bytes: &[u8]) {
         count_visits(bytes.len());
         let end = usize::from(self.start).wrapping_add(self.pending());
@@ -284,8 +285,8 @@ impl Deframer {
     }
 }
 
-/// Turns the ring until what stood at `start` is at its front, by three reversals: none of them has a
-/// length to be checked, as `rotate_left` has.
+/// Rotates the ring until the byte at `start` is at its front, by three reversals: unlike
+/// `rotate_left`, they need no length check.
 #[cold]
 #[inline(never)]
 fn rotate(ring: &mut [u8; RING], start: usize) {
@@ -296,7 +297,7 @@ fn rotate(ring: &mut [u8; RING], start: usize) {
     ring.reverse();
 }
 
-/// A call of its own, so that short copies do without one.
+/// Out of line, so that short copies do without the call.
 #[inline(never)]
 fn copy_long(to: &mut [u8], from: &[u8]) {
     if to.len() == from.len() {

@@ -60,7 +60,7 @@ impl Head {
         }
     }
 
-    /// How many bytes at the front of `data` cannot begin a frame.
+    /// Number of bytes at the front of `data` that cannot begin a frame.
     #[inline]
     pub(super) fn find(&self, data: &[u8]) -> usize {
         match data.first_chunk() {

@@ -11,25 +11,25 @@ use crate::wire::scalar::ScalarType;
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct FieldPlace {
-    /// Which frame of a CAN part; `None` in a stream part.
+    /// The frame of a CAN part; `None` in a stream part.
     pub frame: Option<u8>,
-    /// Which field of the stream part or of that frame.
+    /// The field in the stream part or in that frame.
     pub field: u8,
 }
 
-/// Why a part cannot be a recipe's part (docs/wire/recipes.md section 2).
+/// Why a part is not valid (docs/wire/recipes.md section 2).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
 pub enum PartError {
     /// A part (or one frame of a CAN part) without fields.
     NoFields {
-        /// Which frame of a CAN part; `None` in a stream part.
+        /// The frame of a CAN part; `None` in a stream part.
         frame: Option<u8>,
     },
     /// More than [`MAX_FIELDS`] fields in a part.
     TooManyFields {
-        /// The first field too many.
+        /// The first field that is too many.
         at: FieldPlace,
     },
     /// A head longer than [`MAX_DELIMITER`].
@@ -42,7 +42,7 @@ pub enum PartError {
         /// Its length in bytes.
         len: usize,
     },
-    /// A part for a byte stream with neither head nor tail: frames could not be found in it.
+    /// A part for a byte stream without head and tail: frames could not be found in it.
     NoDelimiter,
     /// Head, fields and tail together are longer than [`MAX_STREAM_FRAME`].
     StreamFrameTooLong {
@@ -82,14 +82,14 @@ pub enum PartError {
     TooManyFrames,
     /// The fields of a CAN frame are longer than [`MAX_CAN_DATA`] together.
     CanFrameTooLong {
-        /// Which frame.
+        /// The frame.
         frame: u8,
         /// The fields' length in bytes.
         len: usize,
     },
     /// A CAN id that does not fit its kind.
     InvalidId {
-        /// Which frame.
+        /// The frame.
         frame: u8,
         /// Its id.
         id: CanId,
@@ -106,7 +106,7 @@ pub enum PartError {
 }
 
 impl PartError {
-    /// The field the error is about, if it is about one.
+    /// The field that the error concerns, if there is one.
     pub const fn field(&self) -> Option<FieldPlace> {
         match *self {
             Self::TooManyFields { at }
@@ -117,7 +117,7 @@ impl PartError {
         }
     }
 
-    /// The frame of a CAN part the error is about, if it is about one.
+    /// The frame of a CAN part that the error concerns, if there is one.
     pub const fn frame(&self) -> Option<u8> {
         match *self {
             Self::NoFields { frame } => frame,
@@ -134,7 +134,7 @@ impl PartError {
 }
 
 impl fmt::Display for FieldPlace {
-    /// People count from 1.
+    /// Messages count from 1.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let field = u16::from(self.field).saturating_add(1);
         match self.frame {
@@ -148,30 +148,30 @@ impl fmt::Display for PartError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match *self {
             Self::NoFields { frame: None } => {
-                write!(f, "a part has 1..={MAX_FIELDS} fields, this one has none")
+                write!(f, "a part needs 1..={MAX_FIELDS} fields; this one has none")
             }
             Self::NoFields { frame: Some(frame) } => {
                 write!(f, "frame {} has no fields", u16::from(frame).saturating_add(1))
             }
-            Self::TooManyFields { at } => write!(f, "{at} is one too many: a part has at most {MAX_FIELDS}"),
+            Self::TooManyFields { at } => write!(f, "{at} is one too many; a part has at most {MAX_FIELDS}"),
             Self::HeadTooLong { len } => {
-                write!(f, "the head has {len} bytes, at most {MAX_DELIMITER} are allowed")
+                write!(f, "the head has {len} bytes; at most {MAX_DELIMITER} are allowed")
             }
             Self::TailTooLong { len } => {
-                write!(f, "the tail has {len} bytes, at most {MAX_DELIMITER} are allowed")
+                write!(f, "the tail has {len} bytes; at most {MAX_DELIMITER} are allowed")
             }
             Self::NoDelimiter => {
                 f.write_str("a part on a byte stream needs a head or a tail of at least one byte")
             }
             Self::StreamFrameTooLong { len } => {
-                write!(f, "head, fields and tail are {len} bytes, at most {MAX_STREAM_FRAME} are allowed")
+                write!(f, "head, fields and tail take {len} bytes; at most {MAX_STREAM_FRAME} are allowed")
             }
-            Self::UserDatagram => f.write_str("UDP carries system data only, not user-defined fields"),
+            Self::UserDatagram => f.write_str("UDP carries only system data, not user-defined fields"),
             Self::WrongMode { at, mode: Mode::Realtime } => {
-                write!(f, "{at} is user-defined, a realtime recipe has system variables only")
+                write!(f, "{at} is user-defined; a realtime recipe has only system variables")
             }
             Self::WrongMode { at, mode: Mode::User } => {
-                write!(f, "{at} is a system variable, a user-defined recipe has typed fields only")
+                write!(f, "{at} is a system variable; a user-defined recipe has only typed fields")
             }
             Self::WrongDirection { at, var, part: Direction::Input } => {
                 write!(f, "{at}: {var} is an output of the robot and cannot be in an input part")
@@ -180,21 +180,21 @@ impl fmt::Display for PartError {
                 write!(f, "{at}: {var} is an input of the robot and cannot be in an output part")
             }
             Self::DuplicateVariable { at, first, var } => write!(f, "{at}: {var} is already {first}"),
-            Self::NoFrames => write!(f, "a CAN part has 1..={MAX_CAN_IDS} frames, this one has none"),
+            Self::NoFrames => write!(f, "a CAN part needs 1..={MAX_CAN_IDS} frames; this one has none"),
             Self::TooManyFrames => write!(f, "a CAN part has at most {MAX_CAN_IDS} frames"),
             Self::CanFrameTooLong { frame, len } => write!(
                 f,
-                "the fields of frame {} are {len} bytes, a CAN frame carries at most {MAX_CAN_DATA}",
+                "the fields of frame {} take {len} bytes; a CAN frame carries at most {MAX_CAN_DATA}",
                 u16::from(frame).saturating_add(1)
             ),
             Self::InvalidId { id: id @ CanId::Standard(_), .. } => {
-                write!(f, "id {id} does not fit 11 bits (0x000..=0x7ff)")
+                write!(f, "id {id} does not fit in 11 bits (0x000..=0x7ff)")
             }
             Self::InvalidId { id: CanId::Extended(id), .. } => {
-                write!(f, "id {id:#010x} does not fit 29 bits (0x00000000..=0x1fffffff)")
+                write!(f, "id {id:#010x} does not fit in 29 bits (0x00000000..=0x1fffffff)")
             }
             Self::DuplicateId { first, id, .. } => {
-                write!(f, "id {id} is already that of frame {}", u16::from(first).saturating_add(1))
+                write!(f, "frame {} already has id {id}", u16::from(first).saturating_add(1))
             }
         }
     }
@@ -212,11 +212,11 @@ pub enum ValueError {
         /// The first such field, counted from 0.
         field: u8,
     },
-    /// The payload is not as long as the fields are.
+    /// The payload is not as long as the fields.
     Length {
         /// The fields' length in bytes.
         expected: usize,
-        /// The payload's.
+        /// The length of the payload.
         got: usize,
     },
 }
@@ -240,39 +240,39 @@ impl core::error::Error for ValueError {}
 pub struct NoSpace {
     /// The frame's length in bytes.
     pub needed: usize,
-    /// The buffer's.
+    /// The length of the buffer.
     pub available: usize,
 }
 
 impl fmt::Display for NoSpace {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "the frame is {} bytes, the buffer has {}", self.needed, self.available)
+        write!(f, "the frame has {} bytes; the buffer has {}", self.needed, self.available)
     }
 }
 
 impl core::error::Error for NoSpace {}
 
-/// Why given values do not make a frame; nothing was written.
+/// Why values do not make a frame; nothing was written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
 pub enum EncodeError {
     /// The buffer is too short.
     NoSpace(NoSpace),
-    /// Not one value per field.
+    /// The number of values is not the number of fields.
     Count {
-        /// How many fields there are.
+        /// Number of fields.
         expected: usize,
-        /// How many values were given.
+        /// Number of values.
         got: usize,
     },
-    /// A value is not of its field's type.
+    /// A value does not have its field's type.
     Type {
         /// The field, counted from 0.
         field: u8,
-        /// Its type.
+        /// The field's type.
         expected: ScalarType,
-        /// The value's.
+        /// The value's type.
         got: ScalarType,
     },
 }
@@ -287,9 +287,13 @@ impl fmt::Display for EncodeError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match *self {
             Self::NoSpace(error) => error.fmt(f),
-            Self::Count { expected, got } => write!(f, "there are {expected} fields but {got} values"),
+            Self::Count { expected, got } => write!(f, "{expected} fields, but {got} values"),
             Self::Type { field, expected, got } => {
-                write!(f, "field {} is a {expected}, not a {got}", u16::from(field).saturating_add(1))
+                write!(
+                    f,
+                    "field {} is a {expected}, but the value is a {got}",
+                    u16::from(field).saturating_add(1)
+                )
             }
         }
     }
@@ -306,7 +310,7 @@ pub enum DatagramError {
     Length {
         /// The frame's length in bytes.
         expected: usize,
-        /// The datagram's.
+        /// The datagram's length.
         got: usize,
     },
     /// It does not begin with the head.

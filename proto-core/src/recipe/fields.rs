@@ -18,7 +18,7 @@ pub struct PlacedField {
     pub field: Field,
 }
 
-/// What applying a payload found (D22).
+/// The result of applying a payload (D22).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct Applied {
@@ -55,8 +55,8 @@ pub(super) struct Pool {
     steps: Vec<Step, MAX_FIELDS>,
 }
 
-/// At most [`runs::MAX_RUN`] payload bytes that are neighbours in the image too. The runs of a frame
-/// cover its payload in order, without gaps.
+/// At most [`runs::MAX_RUN`] payload bytes that are neighbours in the image too. The runs of a
+/// frame cover its payload in order, without gaps.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Step {
     image: u16,
@@ -64,7 +64,7 @@ pub(super) struct Step {
     kind: Kind,
 }
 
-/// What a run holds: the bits that mean something if it is one byte with reserved bits, else
+/// The content of a run: the bits that are not reserved if it is one byte with reserved bits, else
 /// [`Kind::FLOATS`] or [`Kind::PLAIN`]. One byte, because parts have up to 128 runs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Kind(u8);
@@ -72,7 +72,7 @@ struct Kind(u8);
 impl Kind {
     /// Floats, which must be finite.
     const FLOATS: Self = Self(0);
-    /// Anything that is right whatever its bits are.
+    /// Anything that is valid whatever its bits are.
     const PLAIN: Self = Self(0xFF);
 }
 
@@ -92,7 +92,7 @@ pub(super) struct Runs<'a> {
     len: usize,
 }
 
-/// Which fields and runs of a [`Pool`] are a frame's, and how long they are on the wire.
+/// The range of fields and runs of a [`Pool`] that belong to a frame, and their length on the wire.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Share {
     pub(super) first_field: u8,
@@ -116,9 +116,9 @@ impl Pool {
         self.steps.len()
     }
 
-    /// Adds a field after those there are. `frame_starts` is the step count where its frame
-    /// begins, so that runs never reach across frames; `place_of` says where the n-th field of the
-    /// pool stands.
+    /// Adds a field after the existing ones. `frame_starts` is the step count at the beginning of
+    /// its frame, so that runs never reach across frames; `place_of` gives the place of the n-th
+    /// field of the pool.
     pub(super) fn push(
         &mut self,
         rules: Rules,
@@ -151,7 +151,7 @@ impl Pool {
         Ok(())
     }
 
-    /// What was added since `first_field` and `first_step` were the next ones.
+    /// The fields and runs added since `first_field` and `first_step` were the next ones.
     pub(super) fn share_since(&self, first_field: usize, first_step: usize, len: usize) -> Share {
         Share {
             first_field: first_field as u8,
@@ -206,8 +206,8 @@ impl Step {
 }
 
 impl Runs<'_> {
-    /// Writes a payload into the image; `None`, with nothing written, when that needs a closer
-    /// look: [`FrameFields::check`] knows.
+    /// Writes a payload into the image; `None`, with nothing written, if [`FrameFields::check`] has
+    /// to look closer.
     #[inline(always)]
     pub(super) fn apply(self, payload: &[u8], image: &mut [u8; IMAGE_BYTES]) -> Option<Applied> {
         // Most parts are one run.
@@ -292,7 +292,7 @@ impl<'a> FrameFields<'a> {
         }
     }
 
-    /// Whether `values` are one a field, each of its field's type.
+    /// Whether there is one value per field, each of its field's type.
     pub(super) fn accepts(self, values: &[Scalar]) -> Result<(), EncodeError> {
         if values.len() != self.fields.len() {
             return Err(EncodeError::Count { expected: self.fields.len(), got: values.len() });
@@ -322,7 +322,8 @@ impl Step {
         self.kind != Kind::FLOATS || runs::all_finite(run)
     }
 
-    /// Writes a run to its place in the image; returns how many of its fields had reserved bits set.
+    /// Writes a run to its place in the image, and returns how many of its fields had reserved bits
+    /// set.
     #[inline]
     fn write(&self, run: &[u8], image: &mut [u8; IMAGE_BYTES]) -> u16 {
         let Some(target) = image.get_mut(self.range()) else { return 0 };

@@ -30,7 +30,7 @@ pub enum ReplayError {
 impl fmt::Display for ReplayError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::NotARecording => f.write_str("no recording"),
+            Self::NotARecording => f.write_str("not a recording"),
             Self::Entry { at } => write!(f, "the recording is damaged at byte {at}"),
             Self::NoStart => f.write_str("the recording does not begin with a configuration"),
             Self::Image(error) => error.fmt(f),

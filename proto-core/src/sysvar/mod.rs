@@ -1,5 +1,4 @@
-//! THE table of system variables: every other form of this knowledge is derived from it
-//! (docs/wire/sysvars.md).
+//! THE table of system variables; every other form of it is derived from it (docs/wire/sysvars.md).
 //!
 //! A [`SysVar`] is one variable, such as `RobotState[8]`. Its type, direction, unit, its place in
 //! the 2001 stream, its Modbus range and its place in the process image all come from [`SPANS`].
@@ -68,11 +67,11 @@ pub enum ModbusPlace {
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub struct SysVar(u8);
 
-/// How many system variables there are.
+/// Number of system variables.
 pub const COUNT: usize = table::COUNT;
-/// How many of them are inputs; they have the lowest ordinals.
+/// Number of inputs; they have the lowest ordinals.
 pub const INPUT_COUNT: usize = table::INPUT_COUNT;
-/// How many of the inputs are byte variables; they have the lowest ordinals of all.
+/// Number of inputs that are byte variables; they have the lowest ordinals of all.
 pub const BIT_INPUT_COUNT: usize = table::BIT_INPUT_COUNT;
 /// Size of the process image: every variable packed in order.
 pub const IMAGE_BYTES: usize = table::IMAGE_BYTES;
@@ -80,7 +79,7 @@ pub const IMAGE_BYTES: usize = table::IMAGE_BYTES;
 pub const INPUT_BYTES: usize = table::INPUT_BYTES;
 
 impl SysVar {
-    /// The variable with this place in the table, `0..COUNT`.
+    /// The variable with this ordinal, `0..COUNT`.
     pub const fn from_ordinal(ordinal: usize) -> Option<Self> {
         if ordinal < COUNT { Some(Self(ordinal as u8)) } else { None }
     }
@@ -90,7 +89,7 @@ impl SysVar {
         (0..COUNT as u8).map(Self)
     }
 
-    /// The variable's place in the table, `0..COUNT`.
+    /// The variable's ordinal: its place in the table, `0..COUNT`.
     pub const fn ordinal(self) -> usize {
         self.0 as usize
     }
@@ -131,7 +130,7 @@ impl SysVar {
         table::image_offset(self.ordinal())
     }
 
-    /// The bits of a byte variable that have a meaning; 0xFF for every other type (D22).
+    /// The bits of a byte variable that are not reserved; 0xFF for every other type (D22).
     pub fn valid_bits(self) -> u8 {
         self.span().valid_bits
     }
@@ -146,21 +145,22 @@ impl SysVar {
         self.span().unit
     }
 
-    /// Where port 2001 shows the variable; for an input, where its present value can be read back.
+    /// The variable's place in the state packet; for an input, where its present value can be read
+    /// back.
     pub fn stream(self) -> Option<StreamPlace> {
         let len = if self.is_bits() { 8 } else { self.size() } as u16;
         let first = self.span().stream?;
         Some(StreamPlace { offset: first.saturating_add(self.place_in_span().saturating_mul(len)), len })
     }
 
-    /// The output that shows what this input was set to: the one at the same place in the
-    /// state packet.
+    /// The output that shows the value of this input: the one at the same place in the state
+    /// packet.
     pub fn shown_by(self) -> Option<Self> {
         let place = self.stream().filter(|_| self.direction() == Direction::Input)?;
         Self::all().find(|var| var.direction() == Direction::Output && var.stream() == Some(place))
     }
 
-    /// Where the Modbus map shows the variable; inputs can be written and read back there.
+    /// The variable's place in the Modbus map; inputs can be written and read back there.
     pub fn modbus(self) -> Option<ModbusPlace> {
         let nth = self.place_in_span();
         self.span().modbus.map(|place| match place {

@@ -1,4 +1,4 @@
-//! Names as people write them: `RobotState[8]`, `RobotState[8..13]`, `__RobotState_8` (D14).
+//! Names of variables as text: `RobotState[8]`, `RobotState[8..13]`, `__RobotState_8` (D14).
 
 use core::fmt;
 
@@ -19,7 +19,7 @@ impl VarRange {
     }
 }
 
-/// Why a name is not that of a variable.
+/// Why a text is not the name of a variable.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum ParseError {
@@ -31,7 +31,7 @@ pub enum ParseError {
     OutOfRange {
         /// The group's name.
         group: &'static str,
-        /// The index that was asked for.
+        /// The index in the text.
         index: u32,
         /// The group's last index; the first is 1.
         last: u8,
@@ -66,7 +66,7 @@ impl fmt::Display for ParseError {
                 Ok(())
             }
             Self::OutOfRange { group, index, last } => {
-                write!(f, "{group} has no [{index}], only [1..{last}]")
+                write!(f, "there is no {group}[{index}], only {group}[1..{last}]")
             }
             Self::Backwards { first, last } => write!(f, "the range {first}..{last} runs backwards"),
             Self::NotSingle => f.write_str("one variable is needed here, not a range"),
@@ -77,10 +77,10 @@ impl fmt::Display for ParseError {
 impl core::error::Error for ParseError {}
 
 impl SysVar {
-    /// The variable `name` means: `RobotState[8]` or `__RobotState_8`.
+    /// The variable with this name: `RobotState[8]` or `__RobotState_8`.
     ///
     /// # Errors
-    /// [`ParseError`] says what is wrong and what there is.
+    /// [`ParseError`] says what is wrong and what is allowed.
     pub fn parse(name: &str) -> Result<Self, ParseError> {
         let range = VarRange::parse(name)?;
         if range.first == range.last { Ok(range.first) } else { Err(ParseError::NotSingle) }
@@ -113,11 +113,11 @@ impl SysVar {
 }
 
 impl VarRange {
-    /// The variables `name` means: one (`RobotState[8]`, `__RobotState_8`) or a range
+    /// The variables with this name: one (`RobotState[8]`, `__RobotState_8`) or a range
     /// (`RobotState[8..13]`, both ends included).
     ///
     /// # Errors
-    /// [`ParseError`] says what is wrong and what there is.
+    /// [`ParseError`] says what is wrong and what is allowed.
     pub fn parse(name: &str) -> Result<Self, ParseError> {
         if let Some(pendant) = name.strip_prefix("__") {
             let (group, index) = rsplit_once(pendant, b'_').ok_or(ParseError::Syntax)?;

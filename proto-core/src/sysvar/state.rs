@@ -1,8 +1,8 @@
 //! The variables in the state packet of port 2001 (docs/wire/state.md section 5): one by one, or all
 //! outputs at once into the process image.
 //!
-//! Where a variable stands on both sides comes from the variable table; consecutive words and
-//! floats that are consecutive on both sides are one copy.
+//! The variable table has every variable's place on both sides. Words and floats that are
+//! consecutive on both sides are copied at once.
 
 mod places;
 
@@ -13,8 +13,8 @@ use crate::wire::scalar::Scalar;
 use crate::wire::state::StateView;
 
 impl StateView<'_> {
-    /// Writes every output variable that stands in the packet (docs/wire/state.md section 5);
-    /// all others keep what they have.
+    /// Writes every output variable that is in the packet (docs/wire/state.md section 5); the
+    /// others keep their values.
     pub fn copy_to_image(&self, image: &mut [u8; IMAGE_BYTES]) {
         let bytes = self.as_bytes();
         for copy in COPIES {
@@ -32,8 +32,8 @@ impl StateView<'_> {
         }
     }
 
-    /// The value of a variable that stands in the packet, inputs too: what they read back as.
-    /// `None` for a variable that does not stand there.
+    /// The value of a variable that is in the packet; for an input, its present value. `None` for a
+    /// variable that is not in the packet.
     ///
     /// A byte variable's bits are packed lowest first (D13) and masked (D22); a bool byte that is
     /// not 0 counts as 1.

@@ -23,7 +23,7 @@ pub struct Span {
     pub interface: &'static str,
     /// Unit of a quantity, or empty.
     pub unit: &'static str,
-    /// Bits of a byte variable that have a meaning.
+    /// Bits of a byte variable that are not reserved.
     pub valid_bits: u8,
     /// Offset of the first variable in the 2001 stream.
     pub stream: Option<u16>,
@@ -61,7 +61,7 @@ impl Span {
         Self { modbus: Some(ModbusPlace::Scaled { address, per_unit }), ..self }
     }
 
-    /// How many variables the row holds.
+    /// Number of variables in the row.
     pub const fn len(&self) -> usize {
         (self.last - self.first + 1) as usize
     }
@@ -115,7 +115,7 @@ pub(super) const BIT_INPUT_COUNT: usize = count(bit_rows());
 pub(super) const IMAGE_BYTES: usize = bytes(ROWS.len());
 pub(super) const INPUT_BYTES: usize = bytes(INPUT_ROWS);
 
-/// Rows of byte variables at the beginning of the table; the inputs have no others.
+/// Rows of byte variables at the beginning of the table; no other rows have byte inputs.
 const fn bit_rows() -> usize {
     let mut rows = 0;
     while matches!(ROWS[rows].ty, Byte) {

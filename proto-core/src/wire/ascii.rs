@@ -1,14 +1,14 @@
-//! Text cut at ASCII characters.
+//! Splitting text at ASCII characters.
 //!
-//! As the methods of `str`, which cannot be shown not to panic: a `char` is searched for by its
-//! encoding there, whose length the compiler loses sight of.
+//! Same as the methods of `str`, which cannot be shown not to panic: they search for the encoding
+//! of a `char`, whose length the compiler cannot follow.
 
-/// What stands before and behind the first `separator`, an ASCII character.
+/// The text before and after the first `separator`, an ASCII character.
 pub(crate) fn split_once(text: &str, separator: u8) -> Option<(&str, &str)> {
     split_at(text, text.bytes().position(|byte| byte == separator)?)
 }
 
-/// What stands before and behind the last `separator`, an ASCII character.
+/// The text before and after the last `separator`, an ASCII character.
 pub(crate) fn rsplit_once(text: &str, separator: u8) -> Option<(&str, &str)> {
     split_at(text, text.bytes().rposition(|byte| byte == separator)?)
 }

@@ -1,8 +1,7 @@
 //! A classic CAN frame and its id.
 //!
 //! A frame cannot be made with an id that does not fit its kind, or with more data than
-//! [`MAX_CAN_DATA`]. Which frames mean something is a recipe's business
-//! ([`crate::recipe::CanLayout`]).
+//! [`MAX_CAN_DATA`]. Which frames are used is decided by a recipe ([`crate::recipe::CanLayout`]).
 
 use core::fmt;
 
@@ -61,22 +60,22 @@ impl From<embedded_can::Id> for CanId {
 }
 
 impl CanFrame {
-    /// A data frame; `None` when the id does not fit its kind or there are more than 8 bytes.
+    /// A data frame; `None` when the id is too large for its kind or there are more than 8 bytes.
     pub fn new(id: CanId, data: &[u8]) -> Option<Self> {
         let mut frame = Self { id, remote: false, len: data.len() as u8, data: [0; MAX_CAN_DATA] };
         frame.data.get_mut(..data.len())?.copy_from_slice(data);
         id.is_valid().then_some(frame)
     }
 
-    /// A remote frame that asks for `len` bytes; `None` when the id does not fit its kind or `len`
+    /// A remote frame that asks for `len` bytes; `None` when the id is too large for its kind or `len`
     /// is more than 8.
     pub fn remote(id: CanId, len: usize) -> Option<Self> {
         let fits = id.is_valid() && len <= MAX_CAN_DATA;
         fits.then_some(Self { id, remote: true, len: len as u8, data: [0; MAX_CAN_DATA] })
     }
 
-    /// A data frame of `len` bytes, which `fill` writes. The id is valid and `len` at most
-    /// [`MAX_CAN_DATA`]: whoever calls has checked both.
+    /// A data frame of `len` bytes, which `fill` writes. The caller has checked that the id is
+    /// valid and `len` at most [`MAX_CAN_DATA`].
     #[inline]
     pub(crate) fn filled(id: CanId, len: u8, fill: impl FnOnce(&mut [u8])) -> Self {
         let mut data = [0; MAX_CAN_DATA];
@@ -121,7 +120,7 @@ impl Frame for CanFrame {
     }
 
     fn id(&self) -> embedded_can::Id {
-        // The constructors let only ids through that fit, so the fallbacks are never reached.
+        // The constructors accept only ids that fit, so the fallbacks are never reached.
         match self.id {
             CanId::Standard(id) => {
                 embedded_can::StandardId::new(id).unwrap_or(embedded_can::StandardId::ZERO).into()

@@ -1,8 +1,8 @@
-//! What differs between controller versions, as data (docs/wire/command.md section 7,
+//! Differences between controller versions, as data (docs/wire/command.md section 7,
 //! docs/wire/state.md section 6).
 //!
 //! In: a version's name. Out: a [`Dialect`], a plain struct of choices. Nothing here looks at a
-//! connection: a dialect is configured, never guessed from what a controller answers.
+//! connection: a dialect is configured, never guessed from the controller's answers.
 
 use super::state::codes::{OperationMode, RobotState, SafetyState};
 
@@ -100,7 +100,7 @@ pub enum Motion {
     Simulated,
 }
 
-/// One controller version's choices.
+/// The choices of one controller version.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct Dialect {
@@ -153,9 +153,8 @@ impl Dialect {
         global_speed: None,
     };
 
-    /// What was seen of later versions, all of it together. No single release is known to do
-    /// every one of these; as a client's dialect it is as safe as V2.3, since a client takes
-    /// every form of a reply anyway.
+    /// Everything that was reported of later versions. No single release is known to do all of it;
+    /// as a client's dialect it is as safe as V2.3, since a client takes every form of a reply.
     pub const V2_6: Self = Self {
         name: "v2.6",
         terminator: Terminator::CrLf,
@@ -179,18 +178,18 @@ impl Dialect {
     /// The names that [`Dialect::named`] knows.
     pub const NAMES: [&'static str; 2] = [Self::V2_3.name, Self::V2_6.name];
 
-    /// The dialect called `name`.
+    /// The dialect with this name.
     pub fn named(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|dialect| dialect.name == name)
     }
 
-    /// The robot state that this version means by `code`.
+    /// The robot state for `code` in this version.
     pub fn robot_state(&self, code: u8) -> RobotState {
         if self.robot_update == Some(code) { RobotState::Update } else { RobotState::from_code(code) }
     }
 
-    /// This version's code for `state`; the later versions' 7 for an update in a version that
-    /// has no code of its own.
+    /// This version's code for `state`. If the version has no code for an update, it is the later
+    /// versions' 7.
     pub fn robot_code(&self, state: RobotState) -> u8 {
         match state {
             RobotState::Update => self.robot_update.unwrap_or(RobotState::Update.code()),
@@ -198,13 +197,13 @@ impl Dialect {
         }
     }
 
-    /// The safety state that this version means by `code`.
+    /// The safety state for `code` in this version.
     pub fn safety_state(&self, code: u8) -> SafetyState {
         if code == self.safety_update {
             return SafetyState::Update;
         }
         match SafetyState::from_code(code) {
-            // The code another version uses: nothing is known of it in this one.
+            // The code of another version: its meaning in this one is not known.
             SafetyState::Update => SafetyState::Unknown(code),
             other => other,
         }
@@ -227,7 +226,7 @@ impl Dialect {
         }
     }
 
-    /// The operation mode that holding register 0 shows.
+    /// The operation mode for a value of holding register 0.
     pub fn mode_from_register(&self, register: u16) -> (OperationMode, Motion) {
         match self.mode_register {
             ModeRegister::Code => {

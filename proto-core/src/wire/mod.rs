@@ -1,6 +1,7 @@
-//! Stateless bytes ↔ values: nothing here knows time, connections or configuration.
+//! Stateless conversions between bytes and values. Time, connections and configuration are not
+//! known here.
 //!
-//! No function of this module can panic, whatever bytes it is given.
+//! No function of this module can panic, whatever bytes it gets.
 
 pub(crate) mod ascii;
 pub mod can;

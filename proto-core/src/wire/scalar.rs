@@ -1,6 +1,6 @@
 //! The eight scalar types of recipe fields (docs/wire/recipes.md section 1).
 //!
-//! In: little-endian bytes or numbers. Out: the other. Knows nothing of fields, frames or units.
+//! In: little-endian bytes or numbers. Out: the other. Does not know fields, frames or units.
 
 use core::fmt;
 
@@ -56,12 +56,12 @@ impl ScalarType {
         }
     }
 
-    /// The type called `name`, if there is one.
+    /// The type with this name, if there is one.
     pub fn from_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|ty| ty.name() == name)
     }
 
-    /// The least and the greatest value a field of this type can carry.
+    /// The smallest and the largest value of a field of this type.
     pub const fn range(self) -> (f64, f64) {
         match self {
             Self::Byte => (0.0, u8::MAX as f64),
@@ -105,22 +105,22 @@ pub enum Scalar {
     Double(f64),
 }
 
-/// Why a number does not fit a [`ScalarType`].
+/// Why a number does not fit in a [`ScalarType`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[non_exhaustive]
 pub enum ScalarError {
     /// The number is outside the type's range, or not finite.
     OutOfRange {
-        /// The type that was asked for.
+        /// The type.
         ty: ScalarType,
-        /// The number that was given.
+        /// The number.
         value: f64,
     },
-    /// An integer type was given a number with a fraction.
+    /// A number with a fraction for an integer type.
     NotWhole {
-        /// The type that was asked for.
+        /// The type.
         ty: ScalarType,
-        /// The number that was given.
+        /// The number.
         value: f64,
     },
 }
@@ -130,9 +130,9 @@ impl fmt::Display for ScalarError {
         match *self {
             Self::OutOfRange { ty, value } => {
                 let (low, high) = ty.range();
-                write!(f, "{value} does not fit a {ty} ({low}..={high})")
+                write!(f, "{value} does not fit in a {ty} ({low}..={high})")
             }
-            Self::NotWhole { ty, value } => write!(f, "{value} is not a whole number, as a {ty} must be"),
+            Self::NotWhole { ty, value } => write!(f, "{value} is not an integer, but a {ty} must be"),
         }
     }
 }
@@ -140,7 +140,7 @@ impl fmt::Display for ScalarError {
 impl core::error::Error for ScalarError {}
 
 impl Scalar {
-    /// Reads a value of type `ty` from the front of `bytes`; `None` when there are too few.
+    /// Reads a value of type `ty` from the front of `bytes`; `None` if there are too few bytes.
     pub fn decode(ty: ScalarType, bytes: &[u8]) -> Option<Self> {
         Some(match ty {
             ScalarType::Byte => Self::Byte(*bytes.first()?),
@@ -155,7 +155,7 @@ impl Scalar {
     }
 
     /// Writes the value to the front of `out` and returns its size; `None`, with nothing written,
-    /// when `out` is too short.
+    /// if `out` is too short.
     pub fn encode(self, out: &mut [u8]) -> Option<usize> {
         match self {
             Self::Byte(v) => *out.first_chunk_mut()? = v.to_le_bytes(),
@@ -198,8 +198,8 @@ impl Scalar {
         }
     }
 
-    /// `value` as a scalar of type `ty`, refused when it does not fit exactly: an integer type
-    /// takes whole numbers only. A `float` takes the nearest binary32.
+    /// `value` as a scalar of type `ty`, refused if it does not fit exactly: an integer type takes
+    /// only integers. A `float` takes the nearest binary32.
     ///
     /// # Errors
     /// [`ScalarError`] names the type and the number.

@@ -108,7 +108,7 @@ fn two_runs_are_the_same() {
 #[ignore = "needs CHIP_UNICORN and CHIP_ELF"]
 fn without_a_configuration_the_buses_stay_silent() {
     let mut bench = Bench::blank();
-    bench.until_log("nothing runs: no configuration image", SECOND);
+    bench.until_log("nothing runs: not a configuration image", SECOND);
     bench.run(12 * SECOND);
     let again = bench.chip.log.iter().filter(|(_, line)| line.contains("nothing runs")).count();
     assert_eq!(again, 2, "it is told every ten seconds");

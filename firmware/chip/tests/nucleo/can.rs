@@ -72,7 +72,7 @@ fn a_short_circuit_ends_in_bus_off_and_each_pause_is_longer() {
     send(&mut bench, Frame::standard(1, &[1]));
     bench.run(150 * MICRO);
     bench.chip.devices().can.bus.trouble = Trouble::Short;
-    let first = bench.until_log("bus-off; onto the bus again in 100 ms", SECOND);
+    let first = bench.until_log("bus-off; restart in 100 ms", SECOND);
     bench.run(50 * MILLI);
     let offs = &bench.chip.devices().can.bus.bus_offs;
     assert_eq!(offs.len(), 1);
@@ -81,7 +81,7 @@ fn a_short_circuit_ends_in_bus_off_and_each_pause_is_longer() {
     bench.until_log("error-active", SECOND);
     assert!(bench.now() - first >= 100 * MILLI);
     send(&mut bench, Frame::standard(1, &[2]));
-    bench.until_log("bus-off; onto the bus again in 200 ms", SECOND);
+    bench.until_log("bus-off; restart in 200 ms", SECOND);
     bench.chip.devices().can.bus.trouble = Trouble::None;
     bench.until_log("error-active", SECOND);
     let before = sent(&mut bench);
@@ -111,7 +111,7 @@ fn a_burst_as_long_as_the_fifo_is_taken_whole() {
 fn a_late_access_to_the_message_ram_is_cured_like_bus_off() {
     let mut bench = ready(CELL);
     bench.chip.devices().can.fail_message_ram();
-    bench.until_log("bus-off; onto the bus again in 100 ms", SECOND);
+    bench.until_log("bus-off; restart in 100 ms", SECOND);
     bench.run(SECOND);
     send(&mut bench, Frame::standard(1, &[5]));
     bench.until("an answer", 100 * MILLI, |bench| sent(bench) == 1);

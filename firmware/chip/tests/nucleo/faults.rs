@@ -27,7 +27,7 @@ fn check_reset(bench: &mut Bench, broken: Picos) {
     let fed = bench.chip.devices().watchdog.feeds.iter().copied().filter(|at| *at <= broken + SECOND).max();
     let waited = bench.chip.resets[0] - fed.expect("it was fed");
     assert!((3_990 * MILLI..4_010 * MILLI).contains(&waited), "{} ms", waited / MILLI);
-    bench.until_log("started again by the watchdog", 100 * MILLI);
+    bench.until_log("restarted by the watchdog", 100 * MILLI);
 }
 
 #[test]
@@ -49,7 +49,7 @@ fn a_task_that_hangs_is_named() {
     let mut bench = Bench::new(CELL);
     let broken = break_it(&mut bench, &FOR_EVER);
     check_reset(&mut bench, broken);
-    bench.until_log("before the start: the watchdog was not fed, task ", 100 * MILLI);
+    bench.until_log("previous run: the watchdog was not fed, task ", 100 * MILLI);
     // And then it runs as ever.
     bench.run(10 * SECOND);
     assert_eq!(bench.chip.resets.len(), 1);
@@ -61,12 +61,12 @@ fn a_hang_without_interrupts_has_no_words_and_does_not_repeat_old_ones() {
     let mut bench = Bench::new(CELL);
     let broken = break_it(&mut bench, &FOR_EVER);
     check_reset(&mut bench, broken);
-    bench.until_log("before the start: ", 100 * MILLI);
+    bench.until_log("previous run: ", 100 * MILLI);
     break_it(&mut bench, &MASKED);
     bench.until("another reset", 6 * SECOND, |bench| bench.chip.resets.len() == 2);
-    bench.until_log("started again by the watchdog", 100 * MILLI);
+    bench.until_log("restarted by the watchdog", 100 * MILLI);
     bench.run(SECOND);
-    let told = bench.chip.log.iter().filter(|(_, line)| line.contains("before the start")).count();
+    let told = bench.chip.log.iter().filter(|(_, line)| line.contains("previous run")).count();
     assert_eq!(told, 1, "{}", bench.history());
 }
 
@@ -79,7 +79,7 @@ fn an_instruction_that_there_is_not_is_told_with_its_place() {
     bench.run(SECOND);
     assert_eq!(bench.chip.devices().gpio[1].output(14), Some(true), "LD3 is lit");
     check_reset(&mut bench, broken);
-    bench.until_log(&format!("before the start: panic at {place:08X}, from 08"), 100 * MILLI);
+    bench.until_log(&format!("previous run: panic at {place:08X}, from 08"), 100 * MILLI);
     assert!(bench.has_logged("CFSR 00010000, task "), "{}", bench.history());
     assert_eq!(bench.chip.devices().gpio[1].output(14), Some(false));
 }
@@ -92,7 +92,7 @@ fn a_stack_overflow_meets_the_guard() {
     bench.run(SECOND);
     assert_eq!(bench.chip.faults.len(), 1);
     check_reset(&mut bench, broken);
-    bench.until_log("before the start: fault at ", 100 * MILLI);
+    bench.until_log("previous run: fault at ", 100 * MILLI);
     // The guard is below 0x20004000; what of the frame was in it could not be written.
     assert!(bench.has_logged("CFSR 00000092, address 20003F"), "{}", bench.history());
 }
@@ -104,7 +104,7 @@ fn a_fault_before_the_watchdog_runs_is_followed_by_a_reset_too() {
     let place = bench.chip.program().symbol("main").expect("the program begins") & !1;
     bench.chip.patch(place, &UNDEFINED);
     bench.until("a reset", SECOND, |bench| bench.chip.resets.len() == 1);
-    bench.until_log(&format!("before the start: panic at {place:08X}"), 100 * MILLI);
+    bench.until_log(&format!("previous run: panic at {place:08X}"), 100 * MILLI);
     bench.run(5 * SECOND);
     assert_eq!(bench.chip.resets.len(), 1);
 }
@@ -119,7 +119,7 @@ fn a_panic_is_told_twice() {
     let broken = break_it(&mut bench, &jump(place, panics));
     bench.until_log("error: panicked at", SECOND);
     check_reset(&mut bench, broken);
-    bench.until_log("before the start: panic at 08", 100 * MILLI);
+    bench.until_log("previous run: panic at 08", 100 * MILLI);
 }
 
 /// B.W, encoding T4 (Armv7-M ARM A7.7.12).

@@ -180,7 +180,7 @@ unsafe impl InterruptNumber for Irq {
 }
 
 fn on_unexpected() {
-    panic!("an interrupt that nobody enabled");
+    panic!("an interrupt that was not enabled");
 }
 
 #[unsafe(link_section = ".vector_table.interrupts")]

@@ -23,8 +23,8 @@ pub(crate) enum StorageError {
 impl fmt::Display for StorageError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
-            Self::NoName => "no configuration: its path is the second semihosting argument",
-            Self::Unreadable => "the configuration's file cannot be read",
+            Self::NoName => "no configuration: give its path as the second semihosting argument",
+            Self::Unreadable => "cannot read the configuration file",
         })
     }
 }

@@ -40,7 +40,7 @@ pub(crate) enum EthernetError {
 impl fmt::Display for EthernetError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::NoClock => f.write_str("no Ethernet: the PHY gives no 50 MHz on PA1"),
+            Self::NoClock => f.write_str("no Ethernet: no 50 MHz clock from the PHY on PA1"),
             Self::NoPhy { found } => write!(f, "no Ethernet: the PHY's identifier reads {found:04X}"),
             Self::Taken => f.write_str("Ethernet was started before"),
         }

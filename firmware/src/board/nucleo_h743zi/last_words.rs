@@ -108,7 +108,7 @@ pub(super) fn tell() {
     if sum(&bytes) == kept().sum.load(Ordering::Relaxed)
         && let Some(Ok(text)) = bytes.get(..len).map(core::str::from_utf8)
     {
-        warn!("before the start: {}", Text(&text));
+        warn!("previous run: {}", Text(&text));
     }
 }
 

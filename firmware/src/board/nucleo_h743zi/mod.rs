@@ -146,13 +146,13 @@ fn tell_start(source: clocks::Source) {
     let cause = embassy_stm32::pac::RCC.rsr().read();
     embassy_stm32::pac::RCC.rsr().modify(|w| w.set_rmvf(true));
     if cause.iwdg1rstf() {
-        warn!("started again by the watchdog");
+        warn!("restarted by the watchdog");
     } else {
         info!("started");
     }
     last_words::tell();
     if source == clocks::Source::Internal {
-        warn!("no 8 MHz from the debugger: on the chip's own clock, too far off for fast CAN");
+        warn!("no 8 MHz clock from the debugger: using the internal clock, too inaccurate for fast CAN");
     }
 }
 

@@ -24,7 +24,7 @@ pub struct BitrateError {
 
 impl fmt::Display for BitrateError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "no {} bit/s from {} Hz", self.bitrate, self.clock)
+        write!(f, "{} bit/s cannot be made from {} Hz", self.bitrate, self.clock)
     }
 }
 

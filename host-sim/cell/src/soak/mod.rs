@@ -25,14 +25,14 @@ use crate::{Cell, CellError, Chunking, Invariant, Rng, Trouble, TroubleKind, Vio
 use station::Station;
 use world::World;
 
-/// How much goes wrong.
+/// How many faults.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Level {
     /// Nothing; devices are careless all the same.
     None,
-    /// A fault each half minute, on a quiet network.
+    /// A fault every 30 s, on a quiet network.
     Mild,
-    /// A fault each second, on a network that delays, splits and joins.
+    /// A fault every second, on a network that delays, splits and joins.
     Harsh,
 }
 

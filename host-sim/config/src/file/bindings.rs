@@ -60,7 +60,9 @@ fn read_send(item: &Item<'_>) -> Result<SendOn> {
     };
     let bit = place.rsplit_once('.').and_then(|(name, bit)| Some((name, bit.parse::<u8>().ok()?)));
     let Some((name, bit)) = bit else {
-        return Err(item.error(format!("{text:?} names no bit; write it as in \"rising:BitOutputReg[3].0\"")));
+        return Err(
+            item.error(format!("{text:?} names no bit; write for example \"rising:BitOutputReg[3].0\""))
+        );
     };
     let var = SysVar::parse(name).map_err(|error| item.error(format!("{name:?}: {error}")))?;
     Ok(SendOn::Rising { var, bit })
@@ -69,10 +71,10 @@ fn read_send(item: &Item<'_>) -> Result<SendOn> {
 pub(super) fn read_input(field: &Reader<'_>) -> Result<FileInput> {
     let (to, commands) = (field.optional("to"), field.optional("commands"));
     if to.is_none() {
-        refuse(field, &["scale", "offset"], "only goes with to")?;
+        refuse(field, &["scale", "offset"], "allowed only together with to")?;
     }
     if commands.is_none() {
-        refuse(field, &["when"], "only goes with commands")?;
+        refuse(field, &["when"], "allowed only together with commands")?;
     }
     match (to, commands) {
         (None, None) => Ok(FileInput::Unused),
@@ -89,11 +91,11 @@ pub(super) fn read_input(field: &Reader<'_>) -> Result<FileInput> {
             };
             let entries = commands.any_table()?.entries().map(read_command).collect::<Result<Vec<_>>>()?;
             if entries.is_empty() {
-                return Err(commands.error("no commands; write them as in { 1 = \"run(pick.jspf,50)\" }"));
+                return Err(commands.error("no commands; write for example { 1 = \"run(pick.jspf,50)\" }"));
             }
             Ok(FileInput::Commands { entries, when })
         }
-        (Some(_), Some(commands)) => Err(commands.error("a field has either to or commands, not both")),
+        (Some(_), Some(commands)) => Err(commands.error("a field takes to or commands, not both")),
     }
 }
 
@@ -105,7 +107,7 @@ fn read_command((key, key_spot, item): (&str, Spot, Item<'_>)) -> Result<FileCom
     let Ok(value) = number else {
         return Err(item
             .at(key_spot)
-            .error(format!("{key:?} is not a whole number; a value of the field picks a command")));
+            .error(format!("{key:?} is not an integer; the keys of commands are values of the field")));
     };
     Ok(FileCommand { value, text: item.string()?.to_owned(), spot: item.spot })
 }
@@ -115,11 +117,11 @@ pub(super) fn read_output(field: &Reader<'_>) -> Result<FileOutput> {
     let binding = match (from, value) {
         (None, None) => {
             return Err(field.error(
-                "nothing says what to send; add from = \"RobotState[8]\", from = \"counter\", from = \"reply\" \
+                "no value to send; add from = \"RobotState[8]\", from = \"counter\", from = \"reply\" \
                  or value = 125",
             ));
         }
-        (Some(_), Some(value)) => return Err(value.error("a field has either from or value, not both")),
+        (Some(_), Some(value)) => return Err(value.error("a field takes from or value, not both")),
         (None, Some(value)) => OutputBinding::Constant(value.number()?),
         (Some(from), None) => match from.string()? {
             "counter" => OutputBinding::Counter,
@@ -131,7 +133,7 @@ pub(super) fn read_output(field: &Reader<'_>) -> Result<FileOutput> {
         },
     };
     if !matches!(binding, OutputBinding::Variable { .. }) {
-        refuse(field, &["scale", "offset"], "only goes with from and a variable")?;
+        refuse(field, &["scale", "offset"], "allowed only together with from = a variable")?;
     }
     Ok(FileOutput::Bound(binding))
 }

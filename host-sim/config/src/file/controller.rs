@@ -55,7 +55,7 @@ fn read_listen(root: &Reader<'_>) -> Result<Listen> {
     let tcp = [("command", listen.command), ("state", listen.state), ("modbus", listen.modbus)];
     for (nth, (key, port)) in tcp.iter().enumerate() {
         if let Some((other, _)) = tcp.iter().take(nth).find(|(_, before)| *port != 0 && before == port) {
-            let message = format!("port {port} is that of {other} already");
+            let message = format!("port {port} is already used by {other}");
             return Err(table.optional(key).map_or(table.error(&message), |item| item.error(&message)));
         }
     }
@@ -96,7 +96,7 @@ fn read_initial(root: &Reader<'_>) -> Result<Vec<Initial>> {
         let target: InitialTarget =
             name.parse().map_err(|error: TargetError| key_spot.error(root.document, error.to_string()))?;
         if initial.iter().any(|before| before.target == target) {
-            return Err(key_spot.error(root.document, format!("{target} has an initial value already")));
+            return Err(key_spot.error(root.document, format!("{target} already has an initial value")));
         }
         initial.push(Initial { target, value: read_value(target, &item)? });
     }
@@ -108,7 +108,7 @@ fn read_value(target: InitialTarget, item: &Item<'_>) -> Result<f64> {
         InitialTarget::Bit { .. } => match item.as_bool() {
             Some(bit) => Ok(f64::from(u8::from(bit))),
             None => item.integer::<u8>(0..=1).map(f64::from).map_err(|mut error| {
-                error.message.push_str(", or true and false");
+                error.message.push_str(", false or true");
                 error
             }),
         },
@@ -118,16 +118,16 @@ fn read_value(target: InitialTarget, item: &Item<'_>) -> Result<f64> {
             if (low..=high).contains(&value) {
                 Ok(value)
             } else {
-                Err(item.error(format!("{value} is out of range; {low}..={high}")))
+                Err(item.error(format!("{value} is out of range; allowed: {low}..={high}")))
             }
         }
         InitialTarget::Var(var) => {
             let value = Scalar::from_f64(var.ty(), item.number()?).map_err(|error| item.error(error))?;
             match value {
-                Scalar::Byte(bits) if bits & !var.valid_bits() != 0 => {
-                    Err(item
-                        .error(format!("{bits} sets reserved bits; {var} has only 0..={}", var.valid_bits())))
-                }
+                Scalar::Byte(bits) if bits & !var.valid_bits() != 0 => Err(item.error(format!(
+                    "{bits} sets reserved bits; allowed for {var}: 0..={}",
+                    var.valid_bits()
+                ))),
                 _ => Ok(value.as_f64()),
             }
         }
@@ -170,14 +170,14 @@ fn read_ports(root: &Reader<'_>, recipes: &[FileRecipe]) -> Result<Vec<SimPort>>
     for table in root.tables("port", &PORT_KEYS)? {
         let (port, name_spot) = read_port(&table, recipes)?;
         if ports.iter().any(|before| before.name == port.name) {
-            let message = format!("there is a port {:?} already; names must differ", port.name);
+            let message = format!("there is already a port {:?}; names must differ", port.name);
             return Err(name_spot.error(root.document, message));
         }
         if let Some(before) =
             ports.iter().find(|before| port.bus == SimBus::UdpServer && before.bus == SimBus::UdpServer)
         {
             return Err(
-                table.error(format!("{:?} is the UDP server already; there is only one", before.name))
+                table.error(format!("{:?} is already the UDP server; there is only one", before.name))
             );
         }
         ports.push(port);
@@ -224,14 +224,14 @@ fn check_recipe(kind: BusKind, recipe: &FileRecipe) -> std::result::Result<(), S
     let name = &recipe.name;
     let is_can_port = kind == BusKind::Can;
     if recipe.is_can && !is_can_port {
-        return Err(format!("recipe {name:?} is a CAN recipe, and only CAN ports take those"));
+        return Err(format!("recipe {name:?} is a CAN recipe; only CAN ports take CAN recipes"));
     }
     if !recipe.is_can && is_can_port {
-        return Err(format!("recipe {name:?} is a stream recipe, and a CAN port takes CAN recipes only"));
+        return Err(format!("recipe {name:?} is a stream recipe; a CAN port takes only CAN recipes"));
     }
     if recipe.mode == Mode::User && !matches!(kind, BusKind::Rs485 | BusKind::Can) {
         return Err(format!(
-            "recipe {name:?} is user-defined, and the controller's TCP and UDP ports take realtime recipes only"
+            "recipe {name:?} is user-defined; the controller's TCP and UDP ports take only realtime recipes"
         ));
     }
     match kind {
@@ -256,15 +256,15 @@ fn read_to(table: &Reader<'_>) -> Result<String> {
 fn read_programs(root: &Reader<'_>) -> Result<Vec<SimProgram>> {
     let mut programs: Vec<SimProgram> = Vec::new();
     for table in root.tables("program", &["name", "script"])? {
-        let item = table.required("name", "as run(NAME) names it")?;
+        let item = table.required("name", "the name that run(NAME) uses")?;
         let name = item.string()?;
         if name.is_empty() || name.contains([',', '(', ')', '"', '\r', '\n', '\0']) {
             return Err(item.error(format!(
-                "{name:?} cannot be named by run(NAME); no comma, parenthesis, quote or line end, and not empty"
+                "run(NAME) cannot name {name:?}; commas, parentheses, quotes, line ends and an empty name are not allowed"
             )));
         }
         if programs.iter().any(|before| before.name == name) {
-            return Err(item.error(format!("there is a program {name:?} already; names must differ")));
+            return Err(item.error(format!("there is already a program {name:?}; names must differ")));
         }
         let script = table.required("script", "the program's text")?.string()?.to_owned();
         programs.push(SimProgram { name: name.to_owned(), script });

@@ -48,8 +48,8 @@ impl Value {
     pub(super) fn kind(&self) -> &'static str {
         match self {
             Self::Str(_) => "a string",
-            Self::Int(_) => "a whole number",
-            Self::Float(_) => "a number",
+            Self::Int(_) => "an integer",
+            Self::Float(_) => "a float",
             Self::Bool(_) => "true or false",
             Self::Datetime => "a date",
             Self::Array(_) => "an array",
@@ -90,7 +90,7 @@ impl Document {
             Ok(table) => document.root = convert_table(table.get_ref(), &At::File),
             Err(error) => {
                 let at = At::File(error.span().map_or(0, |span| span.start));
-                return Err(document.error(at, "", format!("not TOML: {}", one_line(error.message()))));
+                return Err(document.error(at, "", format!("invalid TOML: {}", one_line(error.message()))));
             }
         }
         for (number, text) in overrides.iter().enumerate() {
@@ -148,7 +148,7 @@ impl Document {
         };
         let path = match split_path(key.trim()) {
             Some(path) => path,
-            None => return Err(self.error(at, key, "not a key; write names with dots between them")),
+            None => return Err(self.error(at, key, "not a key; write names separated by dots")),
         };
         let node = match parse_value(value.trim(), at) {
             Ok(node) => node,
@@ -193,7 +193,7 @@ fn parse_value(text: &str, at: At) -> Result<Node, String> {
     match DeValue::parse(text) {
         Ok(value) => Ok(convert(&value, &|_| at)),
         Err(error) if text.starts_with(['[', '{', '"', '\'']) => {
-            Err(format!("not a TOML value: {}", one_line(error.message())))
+            Err(format!("invalid TOML value: {}", one_line(error.message())))
         }
         Err(_) => Ok(Node { at, value: Value::Str(text.to_owned()) }),
     }
@@ -235,7 +235,7 @@ fn insert(table: &mut Table, path: &[String], node: Node, at: At) -> Result<(), 
     match &mut entry.node.value {
         Value::Table(inner) => insert(inner, rest, node, at),
         Value::Array(items) => insert_into_item(key, items, rest, node, at),
-        other => Err(format!("{key} is {}, and has no keys of its own", other.kind())),
+        other => Err(format!("{key} is {} and has no keys", other.kind())),
     }
 }
 
@@ -257,7 +257,7 @@ fn insert_into_item(
     let Some(place) = place else {
         let names: Vec<_> = names.into_iter().flatten().map(|name| format!("{name:?}")).collect();
         return Err(match names.len() {
-            0 => format!("there is no {key} {wanted:?}; they are chosen by number, 1..={}", items.len()),
+            0 => format!("there is no {key} {wanted:?}; write its number, 1..={}", items.len()),
             _ => format!("there is no {key} {wanted:?}; there are {}", names.join(", ")),
         });
     };
@@ -267,9 +267,7 @@ fn insert_into_item(
             Ok(())
         }
         (Node { value: Value::Table(table), .. }, rest) => insert(table, rest, node, at),
-        (Node { value, .. }, _) => {
-            Err(format!("{key} {wanted} is {}, and has no keys of its own", value.kind()))
-        }
+        (Node { value, .. }, _) => Err(format!("{key} {wanted} is {} and has no keys", value.kind())),
     }
 }
 

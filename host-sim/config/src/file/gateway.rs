@@ -83,7 +83,7 @@ impl<'a> Builder<'a> {
         let table = root
             .required(
                 "controller",
-                "a gateway file says where the controller is: [controller] address = \"...\"",
+                "a gateway file needs the controller's address: [controller] address = \"...\"",
             )?
             .table(&["address", "dialect", "ports", "recipe_link"])?;
         let mut spots = HashMap::new();
@@ -120,7 +120,7 @@ impl<'a> Builder<'a> {
 
     fn add_recipe(&mut self, index: usize, recipe: &FileRecipe) -> Result<()> {
         let Some(place) = u8::try_from(index).ok().filter(|_| index < MAX_RECIPES) else {
-            return Err(self.error(&recipe.spot, format!("one recipe too many; at most {MAX_RECIPES}")));
+            return Err(self.error(&recipe.spot, format!("too many recipes; at most {MAX_RECIPES}")));
         };
         let sending = recipe.output.as_ref().map(|part| &part.sending);
         let send_spot = sending.and_then(|sending| sending.send_spot.as_ref()).unwrap_or(&recipe.spot);
@@ -184,7 +184,7 @@ impl<'a> Builder<'a> {
             self.spots.insert(Place::Field { recipe, part, frame, field: number }, field.spot.clone());
             let spec = self.field_spec(field)?;
             if self.config.fields.push(spec).is_err() {
-                let message = format!("one field too many; at most {MAX_ALL_FIELDS} in all recipes together");
+                let message = format!("too many fields; at most {MAX_ALL_FIELDS} in all recipes together");
                 return Err(self.error(&field.spot, message));
             }
         }
@@ -223,13 +223,13 @@ impl<'a> Builder<'a> {
 
     fn add_command(&mut self, value: i64, text: &str, spot: &Spot) -> Result<()> {
         let Ok(bounded) = heapless::String::try_from(text) else {
-            let message = format!("a command of {} bytes; at most {MAX_COMMAND_TEXT}", text.len());
+            let message = format!("the command has {} bytes; at most {MAX_COMMAND_TEXT}", text.len());
             return Err(self.error(spot, message));
         };
         let entry = self.config.commands.len() as u16;
         self.spots.insert(Place::Command { entry }, spot.clone());
         self.config.commands.push(CommandEntry { value, text: bounded }).map_err(|_| {
-            self.error(spot, format!("one command too many; at most {MAX_COMMANDS} in all recipes together"))
+            self.error(spot, format!("too many commands; at most {MAX_COMMANDS} in all recipes together"))
         })
     }
 
@@ -247,14 +247,14 @@ impl<'a> Builder<'a> {
 
         let index = self.config.ports.len() as u8;
         if usize::from(index) == MAX_PORTS {
-            return Err(table.error(format!("one port too many; at most {MAX_PORTS}")));
+            return Err(table.error(format!("too many ports; at most {MAX_PORTS}")));
         }
         for key in PORT_PLACES {
             let spot = table.optional(key_name(key)).map_or(table.spot.clone(), |item| item.spot);
             self.spots.insert(Place::Port { port: index, key }, spot);
         }
         let bus = read_bus(table, kind)?;
-        let item = table.required("recipe", "the name of one of the recipes of this file")?;
+        let item = table.required("recipe", "the name of a recipe of this file")?;
         let recipe = recipes::find(recipes, &item)?;
         let framing = match kind {
             BusKind::Rs485 | BusKind::TcpListen => Some(Framing::Bytes),
@@ -299,7 +299,7 @@ impl<'a> Builder<'a> {
             self.spots.insert(Place::SafeValue { entry }, item.spot.clone());
             if self.config.safe_values.push(SafeValue { var, value }).is_err() {
                 let message =
-                    format!("one safe value too many; at most {MAX_SAFE_VALUES} on all ports together");
+                    format!("too many safe values; at most {MAX_SAFE_VALUES} on all ports together");
                 return Err(self.error(&key_spot, message));
             }
         }

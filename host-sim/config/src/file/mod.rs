@@ -95,7 +95,7 @@ pub fn parse_gateway(text: Text<'_>, overrides: &[String]) -> Result<Box<Gateway
     let document = Document::parse(text.name, text.toml, overrides)?;
     if let Ok(Flavour::Controller) = kind_of(&document) {
         return Err(document.whole_file_error(
-            "this is a controller file, and a gateway file is needed; host-sim controller -c FILE runs it",
+            "this is a controller file, not a gateway file; run it with host-sim controller -c FILE",
         ));
     }
     gateway::read(&document)
@@ -109,7 +109,7 @@ pub fn parse_controller(text: Text<'_>, overrides: &[String]) -> Result<SimConfi
     let document = Document::parse(text.name, text.toml, overrides)?;
     if let Ok(Flavour::Gateway) = kind_of(&document) {
         return Err(document.whole_file_error(
-            "this is a gateway file, and a controller file is needed; host-sim gateway -c FILE runs it",
+            "this is a gateway file, not a controller file; run it with host-sim gateway -c FILE",
         ));
     }
     controller::read(&document)
@@ -167,7 +167,7 @@ fn kind_of(document: &Document) -> Result<Flavour> {
              these are two files",
         )),
         (false, false) => Err(document.whole_file_error(
-            "neither a gateway file, which has [controller], nor a controller file, which has [listen] or [robot]",
+            "not a gateway file, which has [controller], and not a controller file, which has [listen] or [robot]",
         )),
     }
 }
@@ -177,7 +177,7 @@ fn known_dialect<'a>(item: &Item<'_>, name: &'a str) -> Result<&'a str> {
         Some(_) => Ok(name),
         None => {
             let names: Vec<_> = Dialect::NAMES.iter().map(|name| format!("{name:?}")).collect();
-            Err(item.error(format!("no dialect {name:?}; there are {}", names.join(", "))))
+            Err(item.error(format!("there is no dialect {name:?}; there are {}", names.join(", "))))
         }
     }
 }

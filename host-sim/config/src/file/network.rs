@@ -11,13 +11,13 @@ pub(super) const KEYS: [&str; 3] = ["address", "router", "dns"];
 
 pub(super) fn read(table: &Reader<'_>) -> Result<Network> {
     let item = table
-        .required("address", "the board's IPv4 address and bits of its network: \"192.168.12.20/24\"")?;
+        .required("address", "the board's IPv4 address and prefix length, such as \"192.168.12.20/24\"")?;
     let text = item.string()?;
     let parts = text.split_once('/');
     let parsed = parts.and_then(|(address, prefix)| Some((address.parse().ok()?, prefix.parse().ok()?)));
     let (address, prefix) = parsed.ok_or_else(|| {
         item.error(format!(
-            "{text:?} is no IPv4 address with the bits of its network, such as \"192.168.12.20/24\""
+            "{text:?} is not an IPv4 address with a prefix length, such as \"192.168.12.20/24\""
         ))
     })?;
     let optional = |key| table.optional(key).map(|item| host(&item)).transpose();
@@ -26,5 +26,5 @@ pub(super) fn read(table: &Reader<'_>) -> Result<Network> {
 
 fn host(item: &Item<'_>) -> Result<Ipv4Addr> {
     let text = item.string()?;
-    text.parse().map_err(|_| item.error(format!("{text:?} is no IPv4 address, such as \"192.168.12.1\"")))
+    text.parse().map_err(|_| item.error(format!("{text:?} is not an IPv4 address, such as \"192.168.12.1\"")))
 }

@@ -93,7 +93,7 @@ impl<'a> Reader<'a> {
     /// The tables of the array `key`, each called by its name or its number.
     pub(super) fn tables(&self, key: &str, allowed: &[&str]) -> Result<Vec<Reader<'a>>> {
         let Some(item) = self.optional(key) else { return Ok(Vec::new()) };
-        let items = item.array(&format!("write [[{key}]]"))?;
+        let items = item.array(&format!("of tables, written [[{key}]]"))?;
         let mut readers = Vec::new();
         for item in items {
             readers.push(item.named_table(key, &self.spot.key, allowed)?);
@@ -117,7 +117,7 @@ impl<'a> Item<'a> {
     }
 
     fn wrong_kind(&self, wanted: &str) -> FileError {
-        self.error(format!("{} where {wanted} is needed", self.node.value.kind()))
+        self.error(format!("expected {wanted}, found {}", self.node.value.kind()))
     }
 
     pub(super) fn string(&self) -> Result<&'a str> {
@@ -150,10 +150,10 @@ impl<'a> Item<'a> {
         }
     }
 
-    /// A whole number in `range`.
+    /// An integer in `range`.
     pub(super) fn integer<T: TryFrom<i64>>(&self, range: RangeInclusive<i64>) -> Result<T> {
         let refused = |shown: &str| {
-            Err(self.error(format!("{shown} is out of range; {}..={}", range.start(), range.end())))
+            Err(self.error(format!("{shown} is out of range; allowed: {}..={}", range.start(), range.end())))
         };
         match &self.node.value {
             Value::Int(Ok(value)) if range.contains(value) => match T::try_from(*value) {
@@ -162,7 +162,7 @@ impl<'a> Item<'a> {
             },
             Value::Int(Ok(value)) => refused(&value.to_string()),
             Value::Int(Err(text)) => refused(text),
-            _ => Err(self.wrong_kind(&format!("a whole number, {}..={},", range.start(), range.end()))),
+            _ => Err(self.wrong_kind(&format!("an integer in {}..={}", range.start(), range.end()))),
         }
     }
 
@@ -172,7 +172,7 @@ impl<'a> Item<'a> {
             Value::Int(Ok(value)) => Ok(*value as f64),
             Value::Int(Err(text)) => Err(self.error(format!("{text} is out of range"))),
             Value::Float(value) if value.is_finite() => Ok(*value),
-            Value::Float(value) => Err(self.error(format!("{value} where a finite number is needed"))),
+            Value::Float(value) => Err(self.error(format!("expected a finite number, found {value}"))),
             _ => Err(self.wrong_kind("a number")),
         }
     }
@@ -181,14 +181,14 @@ impl<'a> Item<'a> {
     pub(super) fn time(&self, unit_us: f64) -> Result<Duration> {
         let value = self.number()?;
         if value < 0.0 {
-            return Err(self.error(format!("{value} is negative, and a time cannot be")));
+            return Err(self.error(format!("{value} is negative; a time cannot be")));
         }
         Ok(Duration::from_micros((value * unit_us).round() as u64))
     }
 
     pub(super) fn array(&self, hint: &str) -> Result<Vec<Item<'a>>> {
         let Value::Array(items) = &self.node.value else {
-            return Err(self.wrong_kind(&format!("an array ({hint})")));
+            return Err(self.wrong_kind(&format!("an array {hint}")));
         };
         Ok(items
             .iter()

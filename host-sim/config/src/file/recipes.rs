@@ -84,7 +84,7 @@ pub(super) fn read_all(root: &Reader<'_>, flavour: Flavour) -> Result<Vec<FileRe
     for table in root.tables("recipe", &["name", "kind", "mode", "input", "output"])? {
         let recipe = read(&table, flavour)?;
         if recipes.iter().any(|before| before.name == recipe.name) {
-            let message = format!("there is a recipe {:?} already; names must differ", recipe.name);
+            let message = format!("there is already a recipe {:?}; names must differ", recipe.name);
             return Err(recipe.name_spot.error(root.document, message));
         }
         recipes.push(recipe);
@@ -105,7 +105,7 @@ pub(super) fn find(recipes: &[FileRecipe], item: &Item<'_>) -> Result<usize> {
 
 /// A name that `--bind NAME=DEVICE` and `--set` can carry, of at most 32 bytes.
 pub(super) fn read_name(table: &Reader<'_>) -> Result<(String, Spot)> {
-    let item = table.required("name", "what the rest of the file and the tools call it")?;
+    let item = table.required("name", "the name that ports and tools refer to it by")?;
     let name = item.string()?;
     proto_core::config::check_name(name).map_err(|kind| item.error(kind))?;
     Ok((name.to_owned(), item.spot))
@@ -125,7 +125,7 @@ fn read(table: &Reader<'_>, flavour: Flavour) -> Result<FileRecipe> {
     let input = read_part("input", Direction::Input)?;
     let output = read_part("output", Direction::Output)?;
     if input.is_none() && output.is_none() {
-        return Err(table.error("neither input nor output; a recipe needs at least one of them"));
+        return Err(table.error("a recipe needs an input part, an output part or both"));
     }
     Ok(FileRecipe { spot: table.spot.clone(), name, name_spot, mode, is_can, input, output })
 }
@@ -135,7 +135,7 @@ fn read_part(item: &Item<'_>, rules: Rules, is_can: bool, flavour: Flavour) -> R
     let table = item.any_table()?;
     let own: &[&str] = if is_can { &["frame"] } else { &["head", "tail", "fields"] };
     let sending_keys: &[&str] = if is_gateway_output { &["on_stale", "send"] } else { &[] };
-    let when = if is_can { " of a CAN recipe" } else { " of a stream recipe" };
+    let when = if is_can { " in a CAN recipe" } else { " in a stream recipe" };
     table.check_keys(&[own, sending_keys].concat(), when)?;
 
     let mut part = FilePart {
@@ -179,27 +179,30 @@ fn read_id(frame: &Reader<'_>, item: &Item<'_>) -> Result<CanId> {
     let id = if is_extended { extended() } else { standard() };
     id.filter(|id| id.is_valid()).ok_or_else(|| {
         let hint = if extended().is_some_and(CanId::is_valid) {
-            "; with extended = true, 0..=0x1FFFFFFF"
+            ", or 0..=0x1FFFFFFF with extended = true"
         } else {
             ""
         };
         let limit = if is_extended { "0x1FFFFFFF" } else { "0x7FF" };
         let shown = if number < 0 { number.to_string() } else { format!("{number:#X}") };
-        item.error(format!("{shown} is out of range; 0..={limit}{hint}"))
+        item.error(format!("{shown} is out of range; allowed: 0..={limit}{hint}"))
     })
 }
 
 fn read_bytes(table: &Reader<'_>, key: &str) -> Result<(Vec<u8>, Option<Spot>)> {
     let Some(item) = table.optional(key) else { return Ok((Vec::new(), None)) };
-    let bytes =
-        item.array("such as [255, 255]")?.iter().map(|item| item.integer(0..=255)).collect::<Result<_>>()?;
+    let bytes = item
+        .array("of bytes, such as [255, 255]")?
+        .iter()
+        .map(|item| item.integer(0..=255))
+        .collect::<Result<_>>()?;
     Ok((bytes, Some(item.spot)))
 }
 
 fn read_fields(table: &Reader<'_>, rules: Rules, flavour: Flavour) -> Result<Vec<FileField>> {
     let list = table.required("fields", "the list of the frame's fields")?;
     let mut fields = Vec::new();
-    for item in list.array("such as [\"RobotState[8..13]\"]")? {
+    for item in list.array("of fields, such as [\"RobotState[8..13]\"]")? {
         match (rules.mode, item.as_string()) {
             (Mode::Realtime, Some(name)) => {
                 let range =
@@ -212,13 +215,13 @@ fn read_fields(table: &Reader<'_>, rules: Rules, flavour: Flavour) -> Result<Vec
             }
             (Mode::Realtime, None) => {
                 return Err(item.error(
-                    "a realtime recipe's fields are names of system variables, such as \"RobotState[8]\"; \
+                    "the fields of a realtime recipe are names of system variables, such as \"RobotState[8]\"; \
                      for fields of your own set mode = \"user\"",
                 ));
             }
             (Mode::User, Some(_)) => {
                 return Err(item.error(
-                    "a user recipe's fields are tables, such as { name = \"grip\", type = \"byte\" }; \
+                    "the fields of a user recipe are tables, such as { name = \"grip\", type = \"byte\" }; \
                      for system variables set mode = \"realtime\"",
                 ));
             }
@@ -236,11 +239,11 @@ fn read_user_field(item: &Item<'_>, direction: Direction, flavour: Flavour) -> R
         (Flavour::Gateway, Direction::Output) => &["from", "value", "scale", "offset"],
     };
     let when = match direction {
-        Direction::Input => " of an input field",
-        Direction::Output => " of an output field",
+        Direction::Input => " in an input field",
+        Direction::Output => " in an output field",
     };
     table.check_keys(&[&["name", "type"], bound].concat(), when)?;
-    let name = table.required("name", "what you call the field")?.string()?.to_owned();
+    let name = table.required("name", "give the field a name")?.string()?.to_owned();
     let types: Vec<_> = ScalarType::ALL.into_iter().map(|ty| (ty.name(), ty)).collect();
     let ty =
         table.required("type", "byte, char, word, short, dword, int, float or double")?.choice(&types)?;

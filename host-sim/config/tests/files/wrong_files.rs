@@ -408,7 +408,7 @@ fn overrides_change_what_they_name() {
 #[test]
 fn the_other_kind_of_file_is_recognised() {
     let error = parse_gateway(Text { name: "robot.toml", toml: CONTROLLER }, &[]).unwrap_err().to_string();
-    insta::assert_snapshot!(error, @"robot.toml: this is a controller file, and a gateway file is needed; host-sim controller -c FILE runs it");
+    insta::assert_snapshot!(error, @"robot.toml: this is a controller file, not a gateway file; run it with host-sim controller -c FILE");
     let error = parse_controller(Text { name: "cell.toml", toml: GATEWAY }, &[]).unwrap_err().to_string();
-    insta::assert_snapshot!(error, @"cell.toml: this is a gateway file, and a controller file is needed; host-sim gateway -c FILE runs it");
+    insta::assert_snapshot!(error, @"cell.toml: this is a gateway file, not a controller file; run it with host-sim gateway -c FILE");
 }

@@ -279,7 +279,7 @@ impl Machine {
                     self.begin_robot(Robot::PoweringOff { shown, until: after(POWER_OFF) });
                     Ok(self.abort(after(STOP), Braking::Hard))
                 }
-                _ => Err("poweroff: the robot is not powered, or about to lose its power"),
+                _ => Err("poweroff: the robot is not powered, or is losing power"),
             },
             Action::Enable => match self.robot {
                 Robot::Disabled if self.stopped_by_safety() => Err("enable: a safety stop is active"),

@@ -346,7 +346,7 @@ impl Port {
                     Some(id) => recipe::frame_of(layout, id)
                         .ok_or_else(|| format!("{name}: id {id} is not in the recipe's output part"))?,
                     None if layout.frame_count() == 1 => 0,
-                    None => return Err(format!("{name}: the output part has several ids; name one")),
+                    None => return Err(format!("{name}: the output part has several ids; give one")),
                 };
                 let part = layout.frame(index).ok_or_else(|| format!("{name}: no such frame"))?;
                 let values = typed(name, values, part.fields().map(|placed| placed.field.ty()))?;

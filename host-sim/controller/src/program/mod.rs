@@ -190,7 +190,7 @@ impl Program {
     fn wait(&mut self) {
         let event = self.events.as_ref().and_then(|events| events.recv().ok());
         self.progress = event.unwrap_or_else(|| {
-            Progress::Ended(End::Failed("the script's thread ended without a word".to_owned()))
+            Progress::Ended(End::Failed("the script's thread ended without a result".to_owned()))
         });
     }
 }

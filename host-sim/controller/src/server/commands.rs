@@ -130,7 +130,7 @@ impl Controller {
                     let outcome = match progress {
                         Progress::Done => Outcome::Success,
                         Progress::BrokenOff => {
-                            self.machine.not_completed(action, "something else was begun before it was done");
+                            self.machine.not_completed(action, "another operation began before it was done");
                             Outcome::Fail
                         }
                         Progress::UnderWay => {

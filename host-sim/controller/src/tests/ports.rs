@@ -286,7 +286,7 @@ fn what_no_port_can_have_is_refused_with_its_name() {
     let error = Controller::new(&with_initial(SimConfig::default(), &[("RobotState[1]", 7.0)])).unwrap_err();
     assert_eq!(error.to_string(), "RobotState[1]: a joint position is within ±6.2832 rad");
     let error = Controller::new(&with_dialect(SimConfig::default(), "v9")).unwrap_err();
-    assert_eq!(error.to_string(), "no dialect is called v9; there are v2.3, v2.6");
+    assert_eq!(error.to_string(), "there is no dialect v9; there are v2.3, v2.6");
 }
 
 #[test]

@@ -64,7 +64,7 @@ fn registers_and_io_are_read_and_outputs_written() {
     let log: Vec<_> = cell.controller.program_log().collect();
     assert_eq!(log[0], "a program cannot write WordInputReg[1]");
     assert_eq!(log[1], "a program cannot write DI[1]");
-    assert_eq!(log[5], "DI[17]: DI has only [1..16]");
+    assert_eq!(log[5], "DI[17]: there is only DI[1..16]");
     assert!(log[6].starts_with("Nothing[1]: no such system variable"), "{}", log[6]);
     assert_eq!(log[8], "WordOutputReg[1] cannot be 65536");
     assert_eq!(log[9], "DO[1] cannot be 2");
@@ -193,11 +193,11 @@ fn sends_wait_for_the_line_and_say_what_is_wrong() {
     for text in [
         "p: the frame has 2 fields, 1 values were given",
         "p: the frame has 2 fields, 3 values were given",
-        "p: 256 does not fit a byte (0..=255)",
-        "p: 0.5 is not a whole number, as a byte must be",
-        "does not fit a float",
+        "p: 256 does not fit in a byte (0..=255)",
+        "p: 0.5 is not an integer, but a byte must be",
+        "does not fit in a float",
         "p carries a stream recipe: comm_send takes no frame id",
-        "no port is called q; there are p",
+        "there is no port q; there are p",
     ] {
         assert!(errors.contains(text), "{text}: {errors}");
     }
@@ -228,7 +228,7 @@ fn errors_stop_the_program_and_are_told_everywhere() {
     assert_eq!(cell.packets[0].1.error_code, 0x1002);
     assert_eq!(cell.controller.counters().programs_failed, 1);
     let (mut cell, c) = runs(SimConfig::default(), "comm_recv(\"nowhere\");");
-    assert!(cell.ask(c, "getlasterror").contains("no port is called nowhere"));
+    assert!(cell.ask(c, "getlasterror").contains("there is no port nowhere"));
     let (mut cell, c) = runs(SimConfig::default(), "movej([9, 0, 0, 0, 0, 0], 1);");
     assert!(cell.ask(c, "getlasterror").contains("joint 1: 9 rad is outside"));
 }

@@ -78,7 +78,7 @@ fn what_breaks_a_transition_off_fails_its_command_at_once() {
     cell.run_ms(50);
     assert_eq!(cell.ask(b, "poweroff"), "");
     assert_eq!(got(&mut cell, a), "enable fail");
-    assert_eq!(error(&mut cell, a), "2003:enable: something else was begun before it was done");
+    assert_eq!(error(&mut cell, a), "2003:enable: another operation began before it was done");
     assert_eq!(cell.ask(a, "state"), "5:0:5:2");
     cell.run_ms(200);
     assert_eq!(got(&mut cell, b), "poweroff success");

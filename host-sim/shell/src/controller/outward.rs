@@ -63,8 +63,8 @@ impl ControllerShell {
                     *slot.borrow_mut() = None;
                     self.input(ControllerInput::PortDown { port });
                 }
-                Ok(Err(error)) => debug!(%to, %error, "no connection"),
-                Err(_elapsed) => debug!(%to, "no connection in time"),
+                Ok(Err(error)) => debug!(%to, %error, "cannot connect"),
+                Err(_elapsed) => debug!(%to, "connecting timed out"),
             }
             backoff.wait().await;
         }
@@ -77,7 +77,7 @@ impl ControllerShell {
         let socket = loop {
             match connected(&to).await {
                 Ok(socket) => break Rc::new(socket),
-                Err(error) => debug!(%to, %error, "no address"),
+                Err(error) => debug!(%to, %error, "cannot resolve the address"),
             }
             backoff.wait().await;
         };

@@ -31,7 +31,7 @@ impl ControllerShell {
                 Err(error) => {
                     self.count(|counters| counters.accept_failures += 1);
                     if let Some(more) = self.complaints.take(now()) {
-                        warn!(?link, %error, more, "a connection could not be taken");
+                        warn!(?link, %error, more, "cannot accept a connection");
                     }
                     tokio::time::sleep(StdDuration::from_millis(50)).await;
                 }

@@ -86,7 +86,7 @@ impl Link<'_> {
                 && self.control.knows(self.name, known, peer)
             {
                 let count = |turned_away: &mut TurnedAway| turned_away.refused += 1;
-                self.control.turn_away(self.name, peer, "it came while the link was closed", count);
+                self.control.turn_away(self.name, peer, "the link is closed", count);
             }
             // Not each time: who comes back at once comes in time.
             if nth.is_multiple_of(ENDED_AT_ONCE) {
@@ -104,7 +104,7 @@ impl Link<'_> {
                     drop(stream);
                     if self.control.knows(self.name, known, peer) {
                         let count = |turned_away: &mut TurnedAway| turned_away.refused += 1;
-                        self.control.turn_away(self.name, peer, "there is a connection already", count);
+                        self.control.turn_away(self.name, peer, "there is already a connection", count);
                     }
                     give_way().await;
                 }

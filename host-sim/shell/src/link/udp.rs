@@ -36,7 +36,7 @@ impl Link<'_> {
     ) -> io::Result<()> {
         let first = self.while_open(turn, self.first_datagram(turn, socket, controller)).await?;
         let Some((peer, known, datagram)) = first else { return Ok(()) };
-        info!(link = self.name, %peer, "the controller sends");
+        info!(link = self.name, %peer, "the controller's first datagram");
         events(LinkEvent::Up);
         if !self.control.is_over(turn) {
             events(LinkEvent::Bytes(&datagram));

@@ -93,17 +93,17 @@ fn values_stand_in_order_or_by_name() {
 fn wrong_values_are_refused_by_name() {
     let can = part(CAN, Direction::Output);
     let refused = |id, values: &[&str]| from_values(&can, id, values).unwrap_err();
-    assert_eq!(refused(None, &["1"]), "which frame? --id ID; there are 0x002, 0x1ABCDEF0, 0x7FF");
+    assert_eq!(refused(None, &["1"]), "several frames; choose one with --id ID: 0x002, 0x1ABCDEF0, 0x7FF");
     assert_eq!(refused(Some(3), &["1"]), "id 0x3 is not in this part; there are 0x002, 0x1ABCDEF0, 0x7FF");
     assert_eq!(refused(Some(2), &["1"]), "no value for y");
-    assert_eq!(refused(Some(2), &["1", "2", "3"]), "\"3\" is one value too many; there are x, y");
-    assert_eq!(refused(Some(2), &["z=1"]), "no field \"z\" is left; there are x, y");
-    assert_eq!(refused(Some(2), &["x=1", "x=1"]), "no field \"x\" is left; there are x, y");
+    assert_eq!(refused(Some(2), &["1", "2", "3"]), "too many values, from \"3\" on; the fields are x, y");
+    assert_eq!(refused(Some(2), &["z=1"]), "there is no field \"z\"; there are x, y");
+    assert_eq!(refused(Some(2), &["x=1", "x=1"]), "field \"x\" is given twice");
     assert_eq!(refused(Some(2), &["1", "1e300"]), "y: \"1e300\" is not a number");
-    assert_eq!(refused(Some(0x1ABC_DEF0), &["200", "0", "0"]), "a: 200 does not fit a char (-128..=127)");
+    assert_eq!(refused(Some(0x1ABC_DEF0), &["200", "0", "0"]), "a: 200 does not fit in a char (-128..=127)");
     assert_eq!(
         refused(Some(0x1ABC_DEF0), &["1", "0.5", "0"]),
-        "b: 0.5 is not a whole number, as a word must be"
+        "b: 0.5 is not an integer, but a word must be"
     );
 }
 
@@ -123,25 +123,25 @@ fn what_is_not_hex_or_not_can_names_its_line() {
     let (mut out, mut notes) = (Vec::new(), Vec::new());
     let mut refused =
         |part: &Part, log: &str| decode_lines(part, log.as_bytes(), &mut out, &mut notes).unwrap_err();
-    assert_eq!(refused(&stream, "FF\nF"), "line 2: \"F\" is not hexadecimal, two digits a byte");
-    assert_eq!(refused(&stream, "FF GG"), "line 1: \"GG\" is not hexadecimal, two digits a byte");
-    assert_eq!(refused(&stream, "FF é"), "line 1: \"é\" is not hexadecimal, two digits a byte");
-    assert_eq!(refused(&stream, ""), "no frame of this recipe was found");
+    assert_eq!(refused(&stream, "FF\nF"), "line 2: \"F\" is not hexadecimal with two digits for each byte");
+    assert_eq!(refused(&stream, "FF GG"), "line 1: \"GG\" is not hexadecimal with two digits for each byte");
+    assert_eq!(refused(&stream, "FF é"), "line 1: \"é\" is not hexadecimal with two digits for each byte");
+    assert_eq!(refused(&stream, ""), "the input has no frame of this recipe");
     let can = part(CAN, Direction::Output);
     assert_eq!(
         refused(&can, "can0 FF FF"),
-        "line 1: \"can0 FF FF\" is no CAN frame; write 123#AABB, (time) can0 123#AABB, or can0 123 [2] AA BB"
+        "line 1: \"can0 FF FF\" is not a CAN frame; write 123#AABB, (time) can0 123#AABB, or can0 123 [2] AA BB"
     );
     assert_eq!(
         refused(&can, "1234#00"),
-        "line 1: \"1234\" is no CAN id; three hexadecimal digits, or eight for an extended id"
+        "line 1: \"1234\" is not a CAN id; write three hexadecimal digits, or eight for an extended id"
     );
     assert_eq!(
         refused(&can, "800#00"),
-        "line 1: \"800\" is no CAN id; three hexadecimal digits, or eight for an extended id"
+        "line 1: \"800\" is not a CAN id; write three hexadecimal digits, or eight for an extended id"
     );
     assert_eq!(refused(&can, "  can0  002   [2]  11"), "line 1: fewer than 2 bytes");
-    assert_eq!(refused(&can, "(1.0 can0 002#00"), "line 1: a time without its ')'");
+    assert_eq!(refused(&can, "(1.0 can0 002#00"), "line 1: a time without ')'");
 }
 
 #[test]
@@ -184,7 +184,7 @@ fn what_no_recipe_takes_is_counted_by_reason() {
     assert_eq!(
         notes,
         "1 rejected: a CAN FD frame\n2 rejected: a remote frame\n1 rejected: an error frame\n\
-         1 rejected: id 0x002: 1 bytes, and the recipe has 8\n2 rejected: id 0x003 is not in the recipe\n"
+         1 rejected: id 0x002: 1 bytes instead of 8\n2 rejected: id 0x003 is not in the recipe\n"
     );
 }
 
@@ -197,7 +197,7 @@ fn a_datagram_without_head_and_tail_is_one_line() {
     assert_eq!(encoded(&part, &values).unwrap().trim_end(), payload);
     let (mut out, mut notes) = (Vec::new(), Vec::new());
     let short = decode_lines(&part, &b"00 11"[..], &mut out, &mut notes);
-    assert_eq!(short.unwrap_err(), "no frame of this recipe was found");
+    assert_eq!(short.unwrap_err(), "the input has no frame of this recipe");
     assert_eq!(String::from_utf8(notes).unwrap(), "line 1: a frame is 24 bytes, the datagram 2\n");
 }
 

@@ -1,14 +1,15 @@
-//! The configuration image: what a board keeps instead of the TOML file
-//! (docs/configuration.md section 6).
+//! The configuration image: what a board stores instead of the TOML file (docs/configuration.md
+//! section 6).
 //!
 //! In: a checked configuration, or bytes from flash or a file. Out: the other. An image of an older
-//! version is read as what it meant then. One that was cut, changed in any bit, written for a newer
-//! version or that holds a wrong configuration is refused with a reason. What follows the image is not
-//! looked at: flash is erased in whole sectors.
+//! version is migrated. An image that was cut short, damaged in any bit, written for a newer
+//! version, or that holds an invalid configuration is refused with a reason. Bytes after the image
+//! are ignored, because flash is erased in whole sectors.
 //!
-//! **To change a serialized type,** raise [`VERSION`], copy the types as they were into the module of
-//! the old version, where nothing changes from then on, with `From` into those of the next, and give
-//! `decode_into` a new first reader. `tests/golden` says what must still be read.
+//! **To change a serialized type,** raise [`VERSION`], copy the types as they were into the module
+//! of the old version, which is never changed afterwards, with `From` into those of the next
+//! version, and give `decode_into` a new first reader. `tests/golden` has the images that must
+//! remain readable.
 
 mod v1;
 mod v2;
@@ -24,25 +25,26 @@ use super::{ConfigError, ConfigMut, ConfigView, GatewayConfig};
 
 /// The first bytes of every image.
 pub const MAGIC: [u8; 4] = *b"RGCI";
-/// The version of what follows the header: one more for every change of a serialized type.
+/// The version of the payload: one more for every change of a serialized type.
 pub const VERSION: u32 = 2;
 /// The oldest version that is read.
 pub const OLDEST_VERSION: u32 = 1;
 /// Length of the header: magic, version, payload length and CRC-32, four bytes each, little-endian.
 pub const HEADER: usize = 16;
-/// Longest image, header included. What a board has room for takes less; only a file with hundreds of
-/// fields and CAN ids takes more, and is refused when the image is made.
+/// Maximum length of an image, header included. Every configuration that a board has room for is
+/// shorter; only a file with hundreds of fields and CAN ids is longer, and is refused when the
+/// image is made.
 pub const MAX_IMAGE: usize = 16 * 1024;
 
 /// Why an image is refused.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[non_exhaustive]
 pub enum ImageError {
-    /// Fewer bytes than the header, or than the header says.
+    /// The image is shorter than the header, or than the header announces.
     TooShort {
-        /// Bytes that were needed.
+        /// Number of bytes needed.
         needed: usize,
-        /// Bytes that were available.
+        /// Number of bytes available.
         available: usize,
     },
     /// It does not begin with [`MAGIC`]: erased flash, or something else.
@@ -50,35 +52,35 @@ pub enum ImageError {
         /// What it begins with.
         found: [u8; 4],
     },
-    /// Written for a version that is not known here: a newer one.
+    /// The image has an unknown version: a newer one.
     Version {
-        /// The image's.
+        /// The image's version.
         found: u32,
     },
-    /// Longer than any image.
+    /// The header announces more bytes than an image can have.
     TooLong {
-        /// The payload's length as the header has it.
+        /// The payload's length in the header.
         payload: u32,
     },
-    /// Some bit has changed since it was written.
+    /// A bit has changed since the image was written.
     Crc {
-        /// The header's CRC.
+        /// The CRC in the header.
         stored: u32,
-        /// That of the bytes.
+        /// The CRC of the bytes.
         computed: u32,
     },
-    /// The payload is not a configuration: it was written with other types.
+    /// The payload is not a configuration; it was written with other types.
     Contents,
-    /// More of something than the configuration has room for.
+    /// The image has more entries than the configuration has room for.
     TooMany {
-        /// Of what.
+        /// The list.
         what: Counted,
-        /// How many the image has.
+        /// Number of entries in the image.
         needed: usize,
-        /// How many there is room for.
+        /// Number of entries there is room for.
         room: usize,
     },
-    /// The configuration is wrong.
+    /// The configuration is invalid.
     Config(ConfigError),
 }
 
@@ -86,33 +88,36 @@ impl fmt::Display for ImageError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::TooShort { needed, available } => {
-                write!(f, "the image is cut: {needed} bytes are needed, {available} are there")
+                write!(f, "the image is cut short: {needed} bytes are needed, {available} are there")
             }
-            Self::NotAnImage { found } => write!(f, "no configuration image: it begins with {found:02X?}"),
+            Self::NotAnImage { found } => write!(f, "not a configuration image: it begins with {found:02X?}"),
             Self::Version { found } => {
-                write!(f, "the image has version {found}; this firmware takes {OLDEST_VERSION} to {VERSION}")
+                write!(f, "the image has version {found}; this program reads {OLDEST_VERSION} to {VERSION}")
             }
             Self::TooLong { payload } => {
-                write!(f, "the image says it holds {payload} bytes; at most {MAX_IMAGE} are possible")
+                write!(f, "the image announces {payload} bytes; at most {MAX_IMAGE} are allowed")
             }
             Self::Crc { stored, computed } => {
-                write!(f, "the image is damaged: its CRC is {stored:08X}, its bytes have {computed:08X}")
+                write!(
+                    f,
+                    "the image is damaged: it stores the CRC {stored:08X}, its bytes give {computed:08X}"
+                )
             }
-            Self::Contents => write!(f, "the image's contents are no configuration"),
+            Self::Contents => write!(f, "the image does not contain a configuration"),
             Self::TooMany { what, needed, room } => {
-                write!(f, "the image has {needed} {what}, and there is room for {room}")
+                write!(f, "the image has {needed} {what}; there is room for {room}")
             }
-            Self::Config(error) => write!(f, "the image's configuration is wrong: {error}"),
+            Self::Config(error) => write!(f, "the image's configuration is invalid: {error}"),
         }
     }
 }
 
 impl core::error::Error for ImageError {}
 
-/// There was no room for an image.
+/// The buffer is too short for the image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct NoSpace {
-    /// Bytes that were there; no image has more than [`MAX_IMAGE`].
+    /// Length of the buffer; no image is longer than [`MAX_IMAGE`].
     pub available: usize,
 }
 
@@ -124,9 +129,9 @@ impl fmt::Display for NoSpace {
 
 impl core::error::Error for NoSpace {}
 
-/// Writes the image of a configuration, in the newest version; its length.
+/// Writes the image of a configuration in the newest version, and returns its length.
 ///
-/// Whether the configuration is valid is asked when the image is read.
+/// The configuration is checked when the image is read, not here.
 ///
 /// # Errors
 /// [`NoSpace`] when `out` is too short.
@@ -157,11 +162,11 @@ pub fn decode(bytes: &[u8]) -> Result<GatewayConfig, ImageError> {
     Ok(config)
 }
 
-/// As [`decode`], in place and into a configuration of any size: for boards whose stack is smaller than
-/// a few configurations, of more than 40 KiB each.
+/// Same as [`decode`], in place and into a configuration of any size: for boards whose stack is
+/// smaller than a few configurations of more than 40 KiB each.
 ///
 /// # Errors
-/// As [`decode`]; what `config` is then is of no use.
+/// Same as [`decode`]; `config` must not be used then.
 pub fn decode_into<
     const PORTS: usize,
     const RECIPES: usize,
@@ -193,7 +198,7 @@ fn item<T: DeserializeOwned>(rest: &mut &[u8]) -> Result<T, ImageError> {
     Ok(item)
 }
 
-/// How many there are, and they.
+/// The number of entries, and the entries.
 fn items<T: DeserializeOwned>(
     rest: &mut &[u8],
     what: Counted,
@@ -211,10 +216,10 @@ fn items<T: DeserializeOwned>(
     Ok(())
 }
 
-/// The length of the image whose header `bytes` begin with.
+/// The length of the image whose header is at the start of `bytes`.
 ///
 /// # Errors
-/// [`ImageError`] when it is no header, or the header's image is not possible.
+/// [`ImageError`] if it is not a header, or if the announced length is not possible.
 pub fn image_len(bytes: &[u8]) -> Result<usize, ImageError> {
     let (_, length, _) = header(bytes)?;
     Ok(HEADER.saturating_add(length as usize))
@@ -240,7 +245,7 @@ fn header(bytes: &[u8]) -> Result<(u32, u32, u32), ImageError> {
     Ok((version, length, u32::from_le_bytes(crc)))
 }
 
-/// The version and what it is the version of.
+/// The version and the payload.
 fn payload(bytes: &[u8]) -> Result<(u32, &[u8]), ImageError> {
     let (version, length, stored) = header(bytes)?;
     let needed = HEADER.saturating_add(length as usize);
@@ -252,7 +257,7 @@ fn payload(bytes: &[u8]) -> Result<(u32, &[u8]), ImageError> {
     Ok((version, payload))
 }
 
-/// Over version, length and payload: the header is as precious as what it describes.
+/// Over version, length and payload: the header must be intact as well.
 fn checksum(version: u32, length: u32, payload: &[u8]) -> u32 {
     let mut digest = CRC.digest();
     digest.update(&version.to_le_bytes());

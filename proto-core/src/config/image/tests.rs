@@ -95,7 +95,7 @@ fn erased_flash_is_no_image() {
     }
     assert_eq!(
         decode(&[0xFF; 256]).unwrap_err().to_string(),
-        "no configuration image: it begins with [FF, FF, FF, FF]"
+        "not a configuration image: it begins with [FF, FF, FF, FF]"
     );
 }
 

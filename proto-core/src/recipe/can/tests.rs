@@ -40,7 +40,7 @@ fn assert_refused(rules: Rules, frames: &[(CanId, Vec<Field>)], expected: PartEr
 #[test]
 fn frames_that_break_a_rule_are_named() {
     let var = |name| SysVar::parse(name).unwrap();
-    assert_refused(USER_IN, &[], PartError::NoFrames, "a CAN part has 1..=32 frames, this one has none");
+    assert_refused(USER_IN, &[], PartError::NoFrames, "a CAN part needs 1..=32 frames; this one has none");
     let many: Vec<_> = (0..33).map(|number| (id(number), bytes(1))).collect();
     assert_refused(USER_IN, &many, PartError::TooManyFrames, "a CAN part has at most 32 frames");
     CanLayout::new(USER_IN, many.into_iter().take(32)).unwrap();
@@ -48,7 +48,7 @@ fn frames_that_break_a_rule_are_named() {
         USER_IN,
         &[(id(1), bytes(8)), (id(2), bytes(9))],
         PartError::CanFrameTooLong { frame: 1, len: 9 },
-        "the fields of frame 2 are 9 bytes, a CAN frame carries at most 8",
+        "the fields of frame 2 take 9 bytes; a CAN frame carries at most 8",
     );
     assert_refused(
         USER_IN,
@@ -61,25 +61,25 @@ fn frames_that_break_a_rule_are_named() {
         USER_IN,
         &many,
         PartError::TooManyFields { at: at(16, 0) },
-        "field 1 of frame 17 is one too many: a part has at most 128",
+        "field 1 of frame 17 is one too many; a part has at most 128",
     );
     assert_refused(
         USER_IN,
         &[(id(0x800), bytes(1))],
         PartError::InvalidId { frame: 0, id: id(0x800) },
-        "id 0x800 does not fit 11 bits (0x000..=0x7ff)",
+        "id 0x800 does not fit in 11 bits (0x000..=0x7ff)",
     );
     assert_refused(
         USER_IN,
         &[(CanId::Extended(0x2000_0000), bytes(1))],
         PartError::InvalidId { frame: 0, id: CanId::Extended(0x2000_0000) },
-        "id 0x20000000 does not fit 29 bits (0x00000000..=0x1fffffff)",
+        "id 0x20000000 does not fit in 29 bits (0x00000000..=0x1fffffff)",
     );
     assert_refused(
         USER_IN,
         &[(id(1), bytes(1)), (id(2), bytes(1)), (id(1), bytes(2))],
         PartError::DuplicateId { frame: 2, first: 0, id: id(1) },
-        "id 0x001 is already that of frame 1",
+        "frame 1 already has id 0x001",
     );
     assert_refused(
         REALTIME_IN,
@@ -91,7 +91,7 @@ fn frames_that_break_a_rule_are_named() {
         REALTIME_IN,
         &[(id(1), bytes(1))],
         PartError::WrongMode { at: at(0, 0), mode: Mode::Realtime },
-        "field 1 of frame 1 is user-defined, a realtime recipe has system variables only",
+        "field 1 of frame 1 is user-defined; a realtime recipe has only system variables",
     );
     assert_refused(
         REALTIME_IN,

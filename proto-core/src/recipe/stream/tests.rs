@@ -51,13 +51,13 @@ fn fields_that_break_a_rule_are_named() {
         REALTIME_IN,
         vec![],
         PartError::NoFields { frame: None },
-        "a part has 1..=128 fields, this one has none",
+        "a part needs 1..=128 fields; this one has none",
     );
     assert_refused(
         USER_IN,
         bytes(129),
         PartError::TooManyFields { at: at(128) },
-        "field 129 is one too many: a part has at most 128",
+        "field 129 is one too many; a part has at most 128",
     );
     assert_refused(
         REALTIME_IN,
@@ -75,13 +75,13 @@ fn fields_that_break_a_rule_are_named() {
         REALTIME_IN,
         vec![Field::System(var("ForceEnd[1]")), Field::User(ScalarType::Float)],
         PartError::WrongMode { at: at(1), mode: Mode::Realtime },
-        "field 2 is user-defined, a realtime recipe has system variables only",
+        "field 2 is user-defined; a realtime recipe has only system variables",
     );
     assert_refused(
         USER_IN,
         system(&["ForceEnd[1]"]),
         PartError::WrongMode { at: at(0), mode: Mode::User },
-        "field 1 is a system variable, a user-defined recipe has typed fields only",
+        "field 1 is a system variable; a user-defined recipe has only typed fields",
     );
     assert_refused(
         REALTIME_IN,
@@ -102,9 +102,9 @@ fn lengths_are_limited() {
     };
     assert_eq!(new(&[1; 8], &[2; 8], bytes(1), Framing::Bytes), Ok(17));
     let error = new(&[1; 9], &[], bytes(1), Framing::Bytes).unwrap_err();
-    assert_eq!(error.to_string(), "the head has 9 bytes, at most 8 are allowed");
+    assert_eq!(error.to_string(), "the head has 9 bytes; at most 8 are allowed");
     let error = new(&[], &[1; 300], bytes(1), Framing::Bytes).unwrap_err();
-    assert_eq!(error.to_string(), "the tail has 300 bytes, at most 8 are allowed");
+    assert_eq!(error.to_string(), "the tail has 300 bytes; at most 8 are allowed");
     assert_eq!(new(&[], &[], bytes(1), Framing::Bytes), Err(PartError::NoDelimiter));
     assert_eq!(new(&[1], &[], bytes(1), Framing::Datagram), Err(PartError::UserDatagram));
     let doubles = |count| vec![Field::User(ScalarType::Double); count];

@@ -1,8 +1,8 @@
 //! The adapter's side of slcan, the serial-line CAN protocol (docs/wire/slcan.md).
 //!
-//! Bytes of one client go in; frames for the bus and answers for the client come out, and frames of
-//! the bus become lines. No device, no bus and no clock is known here. `host-sim`'s bus and the boards
-//! that have a serial line where others have a CAN controller speak it.
+//! In: bytes of one client, and frames of the bus. Out: frames for the bus and answers for the
+//! client, and lines for the client. Does not know devices, buses or clocks. It is used by
+//! `host-sim`'s bus, and by boards with a serial line in place of a CAN controller.
 
 use core::fmt;
 
@@ -34,7 +34,7 @@ pub struct Channel {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum ChannelState {
-    /// No frame passes.
+    /// Frames do not pass.
     Closed,
     /// Frames pass both ways.
     Open,
@@ -57,7 +57,7 @@ impl Channel {
         }
     }
 
-    /// Whether the client has opened it.
+    /// Whether the client has opened the channel.
     pub fn state(&self) -> ChannelState {
         self.state
     }
@@ -67,12 +67,14 @@ impl Channel {
         self.refused
     }
 
-    /// Notes that a frame of the bus could not be kept for the client; the status tells it once.
+    /// Records that a frame of the bus could not be kept for the client; the status reports it
+    /// once.
     pub fn note_overrun(&mut self) {
         self.overrun = true;
     }
 
-    /// Takes bytes up to the end of the next line that is not empty; call it until it returns `None`.
+    /// Takes bytes up to the end of the next line that is not empty. Call it until it returns
+    /// `None`.
     pub fn receive(&mut self, bytes: &mut &[u8]) -> Option<Reaction> {
         while let Some((&byte, rest)) = bytes.split_first() {
             *bytes = rest;
@@ -87,7 +89,7 @@ impl Channel {
                     self.refused = self.refused.saturating_add(u64::from(reaction == Reaction::REFUSED));
                     return Some(reaction);
                 }
-                // Of a client that ends its lines with CR LF.
+                // From a client that ends its lines with CR LF.
                 b'\n' => {}
                 _ => self.overlong |= self.line.push(byte).is_err(),
             }
@@ -95,7 +97,8 @@ impl Channel {
         None
     }
 
-    /// The line that tells the client of a frame on the bus at `millis`; `None` while it is closed.
+    /// The line that reports a frame on the bus at `millis` to the client; `None` while the channel
+    /// is closed.
     pub fn deliver(&self, frame: &CanFrame, millis: u64) -> Option<Line> {
         let open = self.state != ChannelState::Closed;
         let stamp = u16::try_from(millis % TIMESTAMP_MODULUS).unwrap_or(0);
@@ -133,7 +136,7 @@ impl Channel {
                 self.timestamps = line == b"Z1";
                 Reaction::DONE
             }
-            // Frames are always passed on without being asked for.
+            // Frames are always passed on without a request.
             b"X1" => Reaction::DONE,
             b"V" => Reaction::answer(b"V1013\r"),
             b"v" => Reaction::answer(b"v1013\r"),
@@ -153,12 +156,12 @@ impl Channel {
     }
 }
 
-/// What follows from one line of a client.
+/// The effect of one line of a client.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Reaction {
-    /// What the client is answered, at most eight bytes.
+    /// The answer to the client, at most eight bytes.
     pub answer: &'static [u8],
-    /// What is put on the bus.
+    /// The frame for the bus.
     pub frame: Option<CanFrame>,
 }
 
@@ -177,7 +180,7 @@ impl Reaction {
 pub enum LineError {
     /// It does not begin with `t`, `T`, `r` or `R`.
     NotAFrame,
-    /// A digit is missing or is not one, or something follows the frame.
+    /// A digit is missing or wrong, or something follows the frame.
     Malformed,
     /// The id has more than 29 bits, or more than 11 in a standard frame.
     Id,
@@ -188,9 +191,9 @@ pub enum LineError {
 impl fmt::Display for LineError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
-            Self::NotAFrame => "not a frame: it begins with none of t, T, r, R",
+            Self::NotAFrame => "not a frame: it does not begin with t, T, r or R",
             Self::Malformed => "a hexadecimal digit is missing or wrong, or something follows the frame",
-            Self::Id => "the id does not fit its kind",
+            Self::Id => "the id is too large for its kind",
             Self::Length => "a frame has at most 8 bytes",
         })
     }

@@ -1,51 +1,51 @@
-//! Whether bytes are a packet: the stream has no mark to find its beginning by
+//! Checks whether bytes are a packet: the stream has no mark that shows where a packet begins
 //! (docs/wire/state.md section 3, D8).
 //!
-//! In: the bytes of one packet, and what the packets before it on its connection showed. Out: why
-//! they cannot be one. No single item is enough: a NaN makes its own item unknown, not the packet.
-//! Refuses to look at reserved items and at what users write.
+//! In: the bytes of one packet, and what the previous packets on its connection showed. Out: why
+//! they cannot be a packet. No single item decides: a NaN makes its own item unknown, not the
+//! packet. Reserved items and items that users write are not looked at.
 
 use core::fmt;
 
 use super::places::{BOOLS, FARTHEST_RAD, LIMITS, STATES, TCP_POSE};
 use super::view::{LEN, StateView};
 
-/// Why a packet does not begin where the bytes do (docs/wire/state.md section 3, D8).
+/// Why bytes do not begin at the beginning of a packet (docs/wire/state.md section 3, D8).
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
 pub enum Misaligned {
     /// Too many of the first six joint positions are not finite or beyond ±1000 rad.
     JointPosition {
-        /// How many are.
+        /// Number of such positions.
         wrong: u8,
-        /// How many may be.
+        /// Number allowed.
         allowed: u8,
-        /// The first of them, 1..=6.
+        /// The first such joint, 1..=6.
         joint: u8,
-        /// What stands there, rad.
+        /// Its position, in rad.
         position: f32,
     },
     /// Too many bool bytes are neither 0 nor 1.
     Bools {
-        /// How many are not.
+        /// Number of such bytes.
         wrong: u16,
-        /// How many may be.
+        /// Number allowed.
         allowed: u16,
     },
     /// The state codes are not a started controller's, and too many quantities are not finite,
-    /// larger than their unit allows, or as good as nothing without being 0.
+    /// larger than their unit allows, or tiny without being 0.
     Quantities {
-        /// How many are.
+        /// Number of such quantities.
         wrong: u16,
-        /// How many may be.
+        /// Number allowed.
         allowed: u16,
     },
-    /// The state codes are others than before, and the arm is too far from where it just was.
+    /// The state codes have changed, and the arm is too far from where it was one packet ago.
     Elsewhere {
-        /// How far the farthest joint (rad) or coordinate of the TCP (m) is from there.
+        /// The largest distance of a joint (rad) or of a coordinate of the TCP (m).
         distance: f32,
-        /// How far it may be.
+        /// The distance allowed.
         allowed: f32,
     },
 }
@@ -75,32 +75,33 @@ impl fmt::Display for Misaligned {
 impl core::error::Error for Misaligned {}
 
 impl StateView<'_> {
-    /// Whether the bytes can be a packet, as far as one packet can tell (D8). Reserved items and
-    /// what users write are never looked at. [`StateStream`](super::StateStream) asks more: how the
-    /// packet fits the one before.
+    /// Checks whether the bytes can be a packet, as far as one packet can show it (D8). Reserved
+    /// items and items that users write are not looked at. [`StateStream`](super::StateStream) also
+    /// checks how the packet fits the previous one.
     ///
     /// # Errors
-    /// [`Misaligned`] says what no packet has.
+    /// [`Misaligned`] says why they cannot.
     pub fn check_alignment(&self) -> Result<(), Misaligned> {
         check(self.as_bytes(), is_started(codes(self.as_bytes())))
     }
 }
 
-/// What the packets of one connection have shown, for the next.
+/// What the previous packets of a connection have shown.
 #[derive(Debug, Clone)]
 pub(super) struct Earlier {
     /// The newest state codes of a started controller.
     codes: Option<[u8; 4]>,
-    /// Where the arm was in the packet before; meaningless without `codes`.
+    /// Where the arm was in the previous packet; meaningless without `codes`.
     joints: [u8; JOINTS],
     tcp: [u8; TCP],
 }
 
 impl Earlier {
-    /// A connection without a packet.
+    /// A connection before its first packet.
     pub(super) const NONE: Self = Self { codes: None, joints: [0; JOINTS], tcp: [0; TCP] };
 
-    /// Whether the bytes can be the connection's next packet; if so, they are remembered.
+    /// Whether the bytes can be the connection's next packet; if so, their codes and position are
+    /// remembered.
     #[inline]
     pub(super) fn check(&mut self, bytes: &[u8; LEN]) -> Result<(), Misaligned> {
         let codes = codes(bytes);
@@ -118,7 +119,7 @@ impl Earlier {
         Ok(())
     }
 
-    /// The codes are others than before, or the first.
+    /// The codes differ from the previous ones, or are the first.
     #[cold]
     #[inline(never)]
     fn check_change(&self, bytes: &[u8; LEN], is_started: bool) -> Result<(), Misaligned> {
@@ -152,14 +153,14 @@ fn check(bytes: &[u8; LEN], is_started: bool) -> Result<(), Misaligned> {
     if is_started { Ok(()) } else { check_quantities(bytes) }
 }
 
-/// The closer look. A shifted packet mostly has no codes, or all zeros, where a started
-/// controller's stand.
+/// The closer check. A shifted packet mostly has no codes, or all zeros, in place of a started
+/// controller's.
 #[cold]
 #[inline(never)]
 fn check_quantities(bytes: &[u8; LEN]) -> Result<(), Misaligned> {
     let wrong = bytes.as_chunks().0.iter().zip(&LIMITS).map(|(item, &most)| {
         let size = (u32::from_le_bytes(*item) & !SIGN) as i32;
-        // No branch, so that several are looked at in one instruction where there are such.
+        // Without a branch, so that the compiler can check several per instruction.
         u32::from((most != 0) & ((size > most) | (size != 0) & (size < LEAST)))
     });
     let wrong: u32 = wrong.sum();
@@ -174,8 +175,8 @@ fn codes(bytes: &[u8; LEN]) -> [u8; 4] {
     *part(bytes, STATES)
 }
 
-/// Whether a controller that is through with its start shows these codes. One of them may be one
-/// that the table of section 4 does not have: versions differ.
+/// Whether a controller that has finished its start shows these codes. One of them may be missing
+/// in the table of section 4: versions differ.
 fn is_started([mode, robot, program, safety]: [u8; 4]) -> bool {
     let unknown = [mode > 2, robot > 7, program > 5, safety > 15 && safety != 99];
     robot != 0 && safety > 1 && unknown.into_iter().filter(|unknown| *unknown).count() <= 1
@@ -203,7 +204,7 @@ fn first_wrong_joint(joints: &[u8; JOINTS], wrong: u8) -> Misaligned {
     Misaligned::JointPosition { wrong, allowed: ALLOWED_WRONG_JOINTS, joint, position }
 }
 
-/// Whether every byte is 0 or 1: seen four at a time, since nearly every packet is right.
+/// Whether every byte is 0 or 1: checked four at a time, since nearly every packet is right.
 fn are_bools(bytes: &[u8]) -> bool {
     let (words, rest) = bytes.as_chunks::<4>();
     let words = words.iter().fold(0, |all, word| all | u32::from_ne_bytes(*word));
@@ -216,7 +217,7 @@ fn wrong_bools(bytes: &[u8]) -> u16 {
     bytes.iter().map(|&byte| u16::from(byte > 1)).sum()
 }
 
-/// The greatest difference of two floats at the same place; those that are not finite have none.
+/// The largest difference of two floats at the same place, not counting floats that are not finite.
 fn farthest(before: &[u8], now: &[u8]) -> f32 {
     let items = before.as_chunks().0.iter().zip(now.as_chunks().0);
     let differences = items.map(|(a, b)| (f32::from_le_bytes(*a) - f32::from_le_bytes(*b)).abs());
@@ -234,16 +235,16 @@ const SIGN: u32 = 0x8000_0000;
 /// rounding errors, 1e-33, are not.
 const LEAST: i32 = 0x0400_0000;
 
-/// Two encoders may be unreadable at a time; a shift is seen without the joints too.
+/// Two encoders may be unreadable at a time; a shift is noticed without the joints too.
 const ALLOWED_WRONG_JOINTS: u8 = 2;
 
 /// Versions differ in what they put into a few bool bytes (D8).
 const ALLOWED_WRONG_BOOLS: u16 = 8;
 
-/// What cannot be read is one NaN, perhaps two.
+/// A value that cannot be read is a NaN; two are allowed.
 const ALLOWED_WRONG_QUANTITIES: u16 = 2;
 
-/// rad or m. In 100 ms no joint turns and no TCP goes this far.
+/// In rad or m. In 100 ms no joint and no TCP moves this far.
 const ALLOWED_DISTANCE: f32 = 0.5;
 
 #[cfg(test)]

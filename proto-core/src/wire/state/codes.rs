@@ -12,7 +12,7 @@ macro_rules! codes {
         pub enum $name {
             $($(#[$doc])* $variant,)*
             $($($(#[$also_doc])* $also,)*)?
-            /// A code this table does not have; kept as it came.
+            /// A code that is not in this table, kept as received.
             Unknown(u8),
         }
 
@@ -59,7 +59,7 @@ codes! {
 }
 
 codes! {
-    /// How far the robot is on its way from boot to moving.
+    /// The robot's progress from boot to moving.
     RobotState {
         /// SR_Start: the software is starting.
         0 = Start,

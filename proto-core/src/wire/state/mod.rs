@@ -1,9 +1,9 @@
 //! The 1468-byte state packet of port 2001 (docs/wire/state.md).
 //!
 //! In: the bytes of one packet, or of a stream of them ([`StateStream`]). Out: a checked view
-//! ([`StateView`]) and a plain value ([`StatePacket`]). Refuses to know time, connections, what a
-//! misaligned stream is answered with, and the system variables: what they take from a packet is in
-//! [`crate::sysvar`].
+//! ([`StateView`]) and a plain value ([`StatePacket`]). Does not know time, connections, the
+//! reaction to a misaligned stream, or system variables; [`crate::sysvar`] takes those from a
+//! packet.
 
 mod alignment;
 pub(super) mod codes;

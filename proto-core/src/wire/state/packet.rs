@@ -3,7 +3,7 @@
 use super::view::{LEN, StateError, StateView};
 use crate::wire::scalar::ScalarType;
 
-/// What a field's bytes are.
+/// The kind of a field's content.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum Content {
@@ -11,10 +11,10 @@ pub enum Content {
     Values,
     /// Bools, one byte each; the first `real` of them exist, the others are reserved.
     Bools {
-        /// How many exist.
+        /// Number of bools that exist.
         real: u8,
     },
-    /// Reserved; passed through as they came.
+    /// Reserved; passed through as received.
     Reserved,
 }
 
@@ -28,9 +28,9 @@ pub struct FieldPlace {
     pub offset: u16,
     /// Type of an item.
     pub ty: ScalarType,
-    /// How many items.
+    /// Number of items.
     pub count: u16,
-    /// What they are.
+    /// Their kind.
     pub content: Content,
 }
 
@@ -295,8 +295,8 @@ impl StateView<'_> {
         packet
     }
 
-    /// Every field into a packet that exists: as [`Self::to_packet`], without a second packet on
-    /// the stack.
+    /// Decodes every field into an existing packet: same as [`Self::to_packet`], without a second
+    /// packet on the stack.
     pub fn read_into(&self, packet: &mut StatePacket) {
         packet.fill(self.as_bytes());
     }
@@ -306,8 +306,8 @@ impl StatePacket {
     /// Decodes one packet.
     ///
     /// # Errors
-    /// [`StateError`] when `bytes` are not as many as a packet has. What they mean is not judged;
-    /// see [`StateView::check_alignment`].
+    /// [`StateError`] if `bytes` is not as long as a packet. Its content is not judged; see
+    /// [`StateView::check_alignment`].
     #[inline]
     pub fn parse(bytes: &[u8]) -> Result<Self, StateError> {
         Ok(StateView::new(bytes)?.to_packet())

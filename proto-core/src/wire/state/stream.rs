@@ -1,20 +1,21 @@
 //! Packets out of a connection's bytes (docs/wire/state.md section 3, D8).
 //!
-//! In: bytes in pieces of any size, from the connection's first one on. Out: packets, each checked
-//! for alignment, by itself and beside those before it. Does not search for a packet's beginning: the stream has no mark. Whoever owns
-//! the connection reopens it when [`StateStream::is_lost`].
+//! In: bytes in pieces of any size, from the connection's first byte on. Out: packets, each checked
+//! for alignment by itself and against the previous ones. Does not search for the beginning of a
+//! packet: the stream has no mark. The owner of the connection reopens it when
+//! [`StateStream::is_lost`].
 
 use super::alignment::{Earlier, Misaligned};
 use super::view::{LEN, StateView};
 
-/// After this many misaligned packets in a row the connection is to be reopened.
+/// After this many misaligned packets in a row the connection must be reopened.
 pub const MAX_MISALIGNED: u32 = 3;
 
 /// One connection to port 2001.
 #[derive(Debug, Clone)]
 pub struct StateStream {
     buffer: [u8; LEN],
-    /// Bytes of an incomplete packet in the buffer; [`LEN`] when it was completed and handed out.
+    /// Bytes of an incomplete packet in the buffer; [`LEN`] after it was completed and returned.
     len: usize,
     packets: u32,
     misaligned: u32,
@@ -28,8 +29,8 @@ impl StateStream {
         Self { buffer: [0; LEN], len: 0, packets: 0, misaligned: 0, in_a_row: 0, earlier: Earlier::NONE }
     }
 
-    /// Takes bytes off the front of `chunk` until a packet is complete. `None` means that all of
-    /// them were taken and none is.
+    /// Takes bytes from the front of `chunk` until a packet is complete. `None` means that all of
+    /// them were taken and no packet is complete.
     ///
     /// A packet that lies whole in `chunk` is not copied.
     pub fn next_packet<'s, 'c: 's>(
@@ -76,7 +77,7 @@ impl StateStream {
         self.in_a_row
     }
 
-    /// Whether the connection is to be dropped and reopened.
+    /// Whether the connection must be closed and reopened.
     pub const fn is_lost(&self) -> bool {
         self.in_a_row >= MAX_MISALIGNED
     }
@@ -96,7 +97,8 @@ impl StateStream {
         if self.len < LEN { self.len } else { 0 }
     }
 
-    /// Forgets an incomplete packet and what packets showed, for a new connection; the counters stay.
+    /// Forgets an incomplete packet and what packets have shown, for a new connection; the counters
+    /// stay.
     pub const fn reset(&mut self) {
         self.len = 0;
         self.in_a_row = 0;

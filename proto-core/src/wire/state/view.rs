@@ -21,9 +21,9 @@ pub struct StateView<'a> {
 pub enum StateError {
     /// There are too few or too many.
     WrongLength {
-        /// Bytes of a packet.
+        /// Length of a packet.
         expected: usize,
-        /// Bytes that were given.
+        /// Number of bytes.
         actual: usize,
     },
 }
@@ -41,7 +41,7 @@ impl fmt::Display for StateError {
 impl core::error::Error for StateError {}
 
 impl<'a> StateView<'a> {
-    /// Looks at exactly one packet.
+    /// A view of exactly one packet.
     ///
     /// # Errors
     /// [`StateError`] when `bytes` are more or fewer.
@@ -53,7 +53,7 @@ impl<'a> StateView<'a> {
         }
     }
 
-    /// Looks at one packet.
+    /// A view of one packet.
     pub const fn from_array(bytes: &'a [u8; LEN]) -> Self {
         Self { bytes }
     }
@@ -73,7 +73,7 @@ impl<'a> StateView<'a> {
         States::from_codes(self.state_codes(), dialect)
     }
 
-    /// The global speed in percent, where the dialect's controller sends it.
+    /// The global speed in percent, if the dialect's controller sends it.
     pub fn global_speed(&self, dialect: &Dialect) -> Option<u8> {
         self.bytes.get(usize::from(dialect.global_speed?)).copied()
     }
