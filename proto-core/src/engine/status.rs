@@ -83,7 +83,8 @@ pub struct PortStatus<'a> {
     pub reply: ReplyCode,
     /// The text of that command, such as `run(pick.jspf)`.
     pub command: Option<&'a str>,
-    /// The newest frame or bytes that were rejected.
+    /// The newest frame or bytes that were rejected. CAN frames of a foreign id are kept only where nothing
+    /// else was rejected: on a shared bus they are for others.
     pub last_rejection: Option<&'a LastRejection>,
     /// What happened since the start.
     pub counters: &'a PortCounters,
