@@ -28,6 +28,7 @@ pub mod config;
 #[cfg(doc)]
 pub mod docs;
 pub mod engine;
+pub mod histogram;
 pub mod image;
 pub mod link;
 pub mod modbus;

@@ -14,10 +14,8 @@ use embassy_time::Timer;
 use heapless::Vec;
 use proto_core::config::{GatewayConfig, Parts};
 use proto_core::engine::{
-    BuildError, Engine as AnyEngine, Input, LinkId, LinkInfo, LinkKind, OUTPUT_BUFFER, Output, PortCounters,
-    PortId, PortState,
+    BuildError, Engine as AnyEngine, Health, Input, LinkId, LinkKind, OUTPUT_BUFFER, Output, PortId, Status,
 };
-use proto_core::link::LinkState;
 use proto_core::time::Instant;
 
 use super::control::{LinkControl, PortControl};
@@ -94,32 +92,18 @@ impl Gateway {
         self.links.iter().map(|(id, kind, _)| (*id, *kind))
     }
 
-    /// Shows how each link and each port does.
-    pub fn report(&self, mut link: impl FnMut(LinkInfo<'_>), mut port: impl FnMut(PortId, &PortCounters)) {
-        let engine = self.engine.borrow();
-        engine.links().for_each(&mut link);
-        for id in engine.field_ports() {
-            if let Some(counters) = engine.port_counters(id) {
-                port(id, counters);
-            }
-        }
+    /// Shows the engine's status to `look`.
+    pub fn report<R>(&self, look: impl FnOnce(Status<'_>) -> R) -> R {
+        look(self.engine.borrow().status(now()))
     }
 
     /// What the status LED shows.
     pub fn condition(&self) -> Condition {
-        let engine = self.engine.borrow();
-        if self.ports.is_empty() && self.links.is_empty() {
-            return Condition::Refused;
-        }
-        // The work of a link that is shared is done by another.
-        let is_up = |link: LinkInfo<'_>| matches!(link.state, LinkState::Up { .. } | LinkState::Shared);
-        let works = |id| engine.port_state(id) == Some(PortState::Working);
-        if !engine.links().all(is_up) {
-            Condition::NoController
-        } else if !engine.field_ports().all(works) {
-            Condition::PortSilent
-        } else {
-            Condition::Running
+        match self.report(|status| status.health()) {
+            Health::Idle => Condition::Refused,
+            Health::NoController => Condition::NoController,
+            Health::PortSilent => Condition::PortSilent,
+            _ => Condition::Running,
         }
     }
 

@@ -17,16 +17,14 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse) -> ! {
     let mut sleeps = 0;
     loop {
         for _ in 0..4 {
-            let mut known = links.iter_mut();
-            gateway.report(
-                |link| {
-                    let Some((connects, before)) = known.next() else { return };
+            gateway.report(|status| {
+                for (link, (connects, before)) in status.links().zip(&mut links) {
                     let shown = match link.state {
                         LinkState::Up { .. } => Shown::Up,
                         LinkState::Shared => Shown::Shared,
                         LinkState::Down { .. } | LinkState::Opening { .. } => Shown::Down,
                     };
-                    let name = link.kind.name();
+                    let name = link.name;
                     if *connects != link.history.connects {
                         *connects = link.history.connects;
                         info!("link {}: up ({})", name, connects);
@@ -40,9 +38,8 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse) -> ! {
                         );
                     }
                     *before = shown;
-                },
-                |_, _| {},
-            );
+                }
+            });
             pulse.idle(pin!(Timer::after(Duration::from_millis(250)))).await;
         }
         if sleeps != gateway.sleeps() {
@@ -55,10 +52,9 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse) -> ! {
                 warn!("link {}: {} turned away that were not the controller", kind.name(), now);
             }
         }
-        let mut known = ports.iter_mut();
-        gateway.report(
-            |_| {},
-            |port, counters| {
+        gateway.report(|status| {
+            for (port, before) in status.ports().zip(&mut ports) {
+                let counters = port.counters;
                 let now = [
                     counters.frames_in,
                     counters.bytes_in,
@@ -67,18 +63,16 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse) -> ! {
                     counters.resync_bytes,
                     counters.skipped_cycles,
                 ];
-                if let Some(before) = known.next()
-                    && *before != now
-                {
+                if *before != now {
                     *before = now;
                     let [frames_in, bytes_in, frames_out, bytes_out, skipped, cycles] = now;
                     info!(
                         "port {}: in {} frames, {} bytes; out {} frames, {} bytes; {} bytes skipped, {} cycles",
-                        port.0, frames_in, bytes_in, frames_out, bytes_out, skipped, cycles,
+                        port.name, frames_in, bytes_in, frames_out, bytes_out, skipped, cycles,
                     );
                 }
-            },
-        );
+            }
+        });
     }
 }
 

@@ -12,3 +12,8 @@ pub use sim::{
     SimCanFrame, SimConfig, SimField, SimParts, SimPort, SimProgram, SimRecipe, SimStreamPart,
 };
 pub use target::TargetError;
+
+/// The example of README.md is a test.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;

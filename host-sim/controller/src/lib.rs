@@ -500,5 +500,10 @@ const STATE_PERIOD: Duration = Duration::from_millis(100);
 /// Log lines kept.
 pub const MAX_LOG: usize = 200;
 
+/// The example of README.md is a test.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;
+
 #[cfg(test)]
 mod tests;

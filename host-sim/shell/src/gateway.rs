@@ -10,7 +10,6 @@ use std::rc::Rc;
 
 use proto_core::config::{Bus, GatewayConfig, Parts, Port as PortConfig};
 use proto_core::engine::{Engine, Input, LinkId, LinkKind, OUTPUT_BUFFER, Output, PortId, Transport};
-use proto_core::sysvar::SysVar;
 use proto_core::time::Instant;
 use serde_json::{Value, json};
 use tokio::net::{TcpListener, UdpSocket};
@@ -42,7 +41,6 @@ struct Core {
     engine: RefCell<Box<Engine>>,
     ports: BTreeMap<PortId, (String, Rc<PortTx>)>,
     links: BTreeMap<LinkId, Rc<LinkControl>>,
-    port_names: Vec<String>,
     deadline: Cell<Instant>,
     /// How often the engine noticed that the gateway slept.
     sleeps: Cell<u32>,
@@ -85,7 +83,6 @@ impl Gateway {
         let core = Rc::new(Core {
             ports: ports.iter().map(|(id, port)| (*id, (name(*id).to_owned(), port.tx()))).collect(),
             links: links.iter().map(|(id, ..)| (*id, Rc::default())).collect(),
-            port_names: config.ports.iter().map(|port| port.name.as_str().to_owned()).collect(),
             engine: RefCell::new(engine),
             deadline: Cell::new(Instant::NEVER),
             sleeps: Cell::new(0),
@@ -233,48 +230,45 @@ impl Core {
         }
     }
 
-    /// One line of statistics: everything counted, links, and the ages of what is known.
+    /// One line of statistics: the engine's status, and what devices and sockets did beside it.
     fn stats(&self) -> Value {
         let engine = self.engine.borrow();
-        let at = now();
-        let mut ports = serde_json::Map::new();
-        for (id, (name, tx)) in &self.ports {
-            let Some(counters) = engine.port_counters(*id) else { continue };
-            let mut port = json!(counters);
-            port["reply"] = json!(engine.reply_code(*id).map(|code| format!("{code:?}").to_lowercase()));
-            port["device"] = json!(tx.counters());
-            ports.insert(name.clone(), port);
-        }
-        let mut links = serde_json::Map::new();
-        for link in engine.links() {
-            let name = match link.kind {
-                LinkKind::RecipeTcpListen { port } | LinkKind::RecipeUdpListen { port } => {
-                    self.port_names.get(usize::from(port.0)).map_or(link.kind.name(), String::as_str)
-                }
-                kind => kind.name(),
-            };
-            let mut info = json!({ "state": link.state.name() });
-            let turned_away = match link.kind {
-                LinkKind::RecipeTcpListen { .. } | LinkKind::RecipeUdpListen { .. } => {
-                    self.links.get(&link.id).map(|control| control.turned_away())
-                }
-                _ => None,
-            };
-            for part in [json!(link.history), json!(link.counters), json!(turned_away)] {
-                if let (Value::Object(info), Value::Object(part)) = (&mut info, part) {
-                    info.extend(part);
-                }
-            }
-            info["reconnects"] = json!(link.history.connects.saturating_sub(1));
-            links.insert(name.to_owned(), info);
-        }
-        let mut ages = serde_json::Map::new();
-        for var in SysVar::all() {
-            if let Some(age) = engine.image().age(var, at) {
-                ages.insert(var.to_string(), json!(age.as_millis()));
+        let status = engine.status(now());
+        let mut stats = json!(status);
+        let values = stats["values"].take();
+        let ages = values.as_object().into_iter().flatten();
+        let ages = ages.map(|(var, known)| (var.clone(), known["age_ms"].clone()));
+        stats["age_ms"] = Value::Object(ages.collect());
+        stats["values"] = values;
+        for port in status.ports() {
+            let shown = &mut stats["ports"][port.name];
+            lift(shown, "counters");
+            if let Some((_, tx)) = self.ports.get(&port.id) {
+                shown["device"] = json!(tx.counters());
             }
         }
-        json!({ "ports": ports, "links": links, "age_ms": ages, "sleeps": engine.sleeps() })
+        for link in status.links() {
+            let shown = &mut stats["links"][link.name];
+            lift(shown, "history");
+            lift(shown, "counters");
+            shown["reconnects"] = json!(link.history.connects.saturating_sub(1));
+            if let LinkKind::RecipeTcpListen { .. } | LinkKind::RecipeUdpListen { .. } = link.kind
+                && let Some(control) = self.links.get(&link.id)
+            {
+                shown["turned_away"] = json!(control.turned_away());
+                lift(shown, "turned_away");
+            }
+        }
+        stats
+    }
+}
+
+/// Puts the entries of an object that is in another into that.
+fn lift(outer: &mut Value, key: &str) {
+    if let Some(outer) = outer.as_object_mut()
+        && let Some(Value::Object(inner)) = outer.remove(key)
+    {
+        outer.extend(inner);
     }
 }
 

@@ -22,7 +22,7 @@ pub(crate) struct Qemu {
     pub(crate) elf: PathBuf,
 }
 
-/// The board's stack (firmware/boards/mps2-an500/memory.x).
+/// The board's stack (firmware/boards/mps2-an500/mps2-an500.x).
 const STACK: u64 = 0x2030_0000;
 const STACK_SIZE: u64 = 1 << 20;
 /// The sockets of its UARTs: RS-485, RS-485, CAN.

@@ -25,7 +25,7 @@
 #define RGW_MAX_FIELDS 128
 
 // Memory that a gateway takes, in bytes: as much as on any machine.
-#define RGW_GATEWAY_SIZE 35840
+#define RGW_GATEWAY_SIZE 37888
 
 // Alignment of all memory that is given to this library, in bytes.
 #define RGW_ALIGN 16

@@ -16,6 +16,7 @@ use super::plan::{Plan, PlanError, Source, WayUp, shown_by, uplinks};
 use super::sender::Sender;
 use super::state_link::StateLink;
 use super::store::{InputFrame, MAX_INPUT_FRAMES, SafeBytes, Store};
+use super::tap::Tap;
 use super::uplink::{Uplink, UplinkSetup};
 use super::user::{Bindings, InputBind};
 use super::{Ask, Engine};
@@ -98,7 +99,9 @@ impl Groups {
     }
 }
 
-impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS, UPLINKS, FIELDS> {
+impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: usize>
+    Engine<PORTS, UPLINKS, FIELDS, TAP>
+{
     /// An engine without a configuration: no ports, no links, nothing to do.
     ///
     /// All its bytes are zero, so that a `static` one takes no flash, and no stack.
@@ -120,6 +123,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             deaf_until: Instant::ZERO,
             // The first call asks everybody: `timer_at` has come.
             ask: Ask::NONE,
+            tap: Tap::new(),
         }
     }
 
@@ -170,6 +174,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             is_deaf,
             deaf_until,
             ask,
+            // Whoever listens goes on.
+            tap: _,
         } = self;
         *store = Store::new();
         ports.clear();
@@ -214,7 +220,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         }
         if plan.needs_state() {
             let group = groups.next().ok_or(one_too_many("groups", MAX_GROUPS))?;
-            let link = StateLink::new(config.controller.state_port, group, plan.read_back());
+            let link = StateLink::new(config.controller.state_port, dialect, group, plan.read_back());
             let _ = self.links.state.push(link);
         }
         if plan.needs_modbus() {
@@ -329,6 +335,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         let sender = Sender::new(recipe.send, recipe.on_stale, port.stale_after, port.cycle, has_output);
         let port = FieldPort {
             id: PortId(index),
+            name: port.name.clone(),
+            recipe: port.recipe,
             codec,
             mode: recipe.mode,
             line,
@@ -340,6 +348,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             bus: BusState::Active,
             reply: ReplyCode::None,
             counters: PortCounters::default(),
+            last_rejection: None,
         };
         self.ports.push(port).map_err(|_| one_too_many("field ports", PORTS))?;
         self.store.edges.push(EdgeQueue::default()).map_err(|_| one_too_many("field ports", PORTS))
@@ -417,6 +426,10 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         let uplink = Uplink::new(UplinkSetup {
             id,
             kind,
+            name: id
+                .port()
+                .and_then(|port| config.ports.get(usize::from(port.0)))
+                .map(|port| port.name.clone()),
             transport,
             timings,
             input,

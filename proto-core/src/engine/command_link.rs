@@ -12,7 +12,7 @@ use super::outcome::Outcomes;
 use super::session::{Event, Sent, Session};
 use super::stops::{COMMAND_QUEUE, STOP_TTL, Stops, Waiting};
 use crate::command::{Keyword, Request};
-use crate::config::{CommandEntry, CommandWhen, MAX_COMMANDS, Span};
+use crate::config::{CommandEntry, CommandWhen, MAX_COMMANDS, MAX_PORTS, Span};
 use crate::link::LinkState;
 use crate::time::{Duration, Instant};
 use crate::wire::dialect::Dialect;
@@ -79,6 +79,8 @@ pub(super) struct CommandLink {
     struck_at: Option<Instant>,
     /// Until then no connection is given up for a stop that cannot be sent.
     way_made_until: Instant,
+    /// The newest command that each port's values picked.
+    picked: [Option<u16>; MAX_PORTS],
     /// Results of commands since the engine asked last.
     pub outcomes: Outcomes,
 }
@@ -123,8 +125,15 @@ impl CommandLink {
             overtaken: 0,
             struck_at: None,
             way_made_until: Instant::ZERO,
+            picked: [None; MAX_PORTS],
             outcomes: Outcomes::new(),
         })
+    }
+
+    /// The text of the newest command that a port's values picked.
+    pub(super) fn newest_of(&self, port: PortId) -> Option<&str> {
+        let entry = (*self.picked.get(usize::from(port.0))?)?;
+        self.tables.entry(entry).map(|(_, text)| text)
     }
 
     pub(super) fn transport(&self) -> Transport {
@@ -161,6 +170,9 @@ impl CommandLink {
         let entries = table.of(&self.tables.entries);
         let picked = (table.start..).zip(entries).find(|(_, entry)| entry.value == value);
         let (true, Some((entry, Entry { keyword, .. }))) = (acts, picked) else { return None };
+        if let Some(newest) = self.picked.get_mut(usize::from(port.0)) {
+            *newest = Some(entry);
+        }
         let waiting = Waiting { port, entry, field, since: now, nth };
         if keyword.is_urgent() {
             self.stops_now = true;

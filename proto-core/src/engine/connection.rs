@@ -19,7 +19,7 @@ pub(super) trait Connection {
     fn sent(&mut self) {}
 
     /// The peer's transport has acknowledged all but `left` bytes.
-    fn acked(&mut self, _left: u32) {}
+    fn acked<const PORTS: usize>(&mut self, _left: u32, _store: &mut Store<PORTS>) {}
 
     /// Looks at the clock, the supervisor apart.
     fn advance<const PORTS: usize>(&mut self, _store: &mut Store<PORTS>) {}

@@ -5,12 +5,14 @@
 
 use super::command_link::CommandLink;
 use super::counters::{PortCounters, add, bump};
-use super::io::{BusState, PortId, ReplyCode};
+use super::io::{BusState, PortId, PortState, ReplyCode};
 use super::outcome::Outcome;
+use super::rejection::{LastRejection, Rejection};
 use super::sender::Sender;
-use super::store::Store;
+use super::store::{InputFrame, Store};
+use super::tap::{Tap, TapDirection, TapPlace, TapVerdict, Tapped};
 use super::user::{InputBind, fit, forget_commands};
-use crate::config::{Rs485, Span};
+use crate::config::{Name, Rs485, Span};
 use crate::image::{ImageBytes, InputSet};
 use crate::recipe::Deframer;
 use crate::recipe::StreamLayout;
@@ -18,7 +20,7 @@ use crate::recipe::model::Mode;
 use crate::recipe::{Applied, ValueError, Values};
 use crate::recipe::{CanLayout, CanReject};
 use crate::time::{Duration, Instant};
-use crate::wire::can::CanFrame;
+use crate::wire::can::{CanFrame, CanId};
 use crate::wire::scalar::Scalar;
 
 /// The layouts of the port's recipe.
@@ -57,6 +59,9 @@ impl LineTiming {
 #[derive(Debug, Clone)]
 pub(super) struct FieldPort {
     pub id: PortId,
+    /// Its name in the configuration, and the place of its recipe there.
+    pub name: Name,
+    pub recipe: u8,
     pub codec: Codec,
     pub mode: Mode,
     pub line: LineTiming,
@@ -71,6 +76,7 @@ pub(super) struct FieldPort {
     pub bus: BusState,
     pub reply: ReplyCode,
     pub counters: PortCounters,
+    pub last_rejection: Option<LastRejection>,
 }
 
 /// The frames that were accepted in one call.
@@ -119,13 +125,19 @@ impl FieldPort {
     }
 
     /// The device is gone: nothing of what was under way is continued later.
-    pub(super) fn down(&mut self, bindings: &[InputBind], commands: Option<&mut CommandLink>, now: Instant) {
+    pub(super) fn down<const TAP: usize>(
+        &mut self,
+        bindings: &[InputBind],
+        commands: Option<&mut CommandLink>,
+        tap: &mut Tap<TAP>,
+        now: Instant,
+    ) {
         if self.is_up {
             bump(&mut self.counters.downs);
         }
         self.is_up = false;
         self.sender.reset();
-        self.discard_partial();
+        self.discard_partial(tap, now);
         forget_commands(self.inputs.of(bindings), commands, now);
     }
 
@@ -146,13 +158,21 @@ impl FieldPort {
     }
 
     /// The gateway itself slept: nothing of what had begun is continued.
-    pub(super) fn slept(&mut self) {
+    pub(super) fn slept<const TAP: usize>(&mut self, tap: &mut Tap<TAP>, now: Instant) {
         self.sender.skip();
-        self.discard_partial();
+        self.discard_partial(tap, now);
     }
 
     /// What waited while the gateway itself slept is as old as that, and counts for nothing.
-    pub(super) fn discard(&mut self, bytes: &[u8], now: Instant) {
+    pub(super) fn discard<const TAP: usize>(
+        &mut self,
+        bytes: &[u8],
+        can_id: Option<CanId>,
+        tap: &mut Tap<TAP>,
+        now: Instant,
+    ) {
+        tap.record(|| came(self.id, now, Err(Rejection::Asleep), can_id, [bytes, &[], &[]]));
+        self.last_rejection = Some(LastRejection::new(now, Rejection::Asleep, can_id, bytes));
         add(&mut self.counters.bytes_in, bytes.len());
         bump(&mut self.counters.asleep);
         if let Codec::Stream { input: Some(_), .. } = &self.codec {
@@ -169,19 +189,23 @@ impl FieldPort {
 
     /// Takes the frames in `rest`, or up to the first accepted one when the image is looked at after
     /// each.
-    pub(super) fn frames<const PORTS: usize>(
+    pub(super) fn frames<const PORTS: usize, const TAP: usize>(
         &mut self,
         rest: &mut &[u8],
         bindings: &[InputBind],
         store: &mut Store<PORTS>,
         commands: Option<&mut CommandLink>,
+        tap: &mut Tap<TAP>,
     ) -> Accepted {
         let mut accepted = Accepted::default();
+        let now = store.now;
         let bytes = core::mem::take(rest);
         let usable = self.is_usable();
         let Codec::Stream { input, deframer, .. } = &mut self.codec else { return accepted };
         let Some(layout) = input else {
             bump(&mut self.counters.rejected_no_input);
+            tap.record(|| came(self.id, now, Err(Rejection::NoInput), None, [bytes, &[], &[]]));
+            self.last_rejection = Some(LastRejection::new(now, Rejection::NoInput, None, bytes));
             return accepted;
         };
         let mut frames = Frames {
@@ -195,45 +219,80 @@ impl FieldPort {
         };
         let mut left = bytes;
         while let Some(payload) = deframer.next_frame(layout, &mut left) {
-            if let Some(set) = frames.take(layout, payload, usize::from(self.first_frame)) {
-                accepted = Accepted { frames: accepted.frames.wrapping_add(1), set };
-                if frames.store.watches_bits {
-                    break;
+            let taken = frames.take(layout, payload, usize::from(self.first_frame));
+            let verdict = taken.map(|_| ());
+            tap.record(|| came(self.id, now, verdict, None, [layout.head(), payload, layout.tail()]));
+            match taken {
+                Ok(set) => {
+                    accepted = Accepted { frames: accepted.frames.wrapping_add(1), set };
+                    if frames.store.watches_bits {
+                        break;
+                    }
                 }
+                Err(why) => self.last_rejection = Some(LastRejection::new(now, why, None, payload)),
             }
         }
         *rest = left;
         let stats = deframer.stats();
         self.counters.tail_mismatches = stats.tail_mismatches as u32;
-        self.counters.resync_bytes = stats.skipped_bytes as u32;
-        self.sender.frames_accepted(accepted.frames, usable, &mut self.counters);
+        let skipped = (stats.skipped_bytes as u32).wrapping_sub(self.counters.resync_bytes);
+        if skipped > 0 {
+            self.counters.resync_bytes = stats.skipped_bytes as u32;
+            self.no_frame(bytes, skipped as usize, tap, now);
+        }
+        self.sender.frames_accepted(accepted.frames, usable, &mut self.counters, now);
         accepted
     }
 
     /// A frame from the bus.
-    pub(super) fn can<const PORTS: usize>(
+    pub(super) fn can<const PORTS: usize, const TAP: usize>(
         &mut self,
         frame: &CanFrame,
         bindings: &[InputBind],
         store: &mut Store<PORTS>,
         commands: Option<&mut CommandLink>,
+        tap: &mut Tap<TAP>,
     ) -> Accepted {
+        let now = store.now;
+        let verdict = self.take_can(frame, bindings, store, commands);
+        tap.record(|| came(self.id, now, verdict.map(|_| ()), Some(frame.id()), [frame.data(), &[], &[]]));
+        match verdict {
+            Ok(accepted) => accepted,
+            Err(why) => {
+                self.last_rejection = Some(LastRejection::new(now, why, Some(frame.id()), frame.data()));
+                Accepted::default()
+            }
+        }
+    }
+
+    #[inline]
+    fn take_can<const PORTS: usize>(
+        &mut self,
+        frame: &CanFrame,
+        bindings: &[InputBind],
+        store: &mut Store<PORTS>,
+        commands: Option<&mut CommandLink>,
+    ) -> Result<Accepted, Rejection> {
+        let now = store.now;
         add(&mut self.counters.bytes_in, frame.data().len());
         let usable = self.is_usable();
-        let Codec::Can { input, .. } = &self.codec else { return Accepted::default() };
+        let Codec::Can { input, .. } = &self.codec else { return Ok(Accepted::default()) };
         let Some(layout) = input else {
             bump(&mut self.counters.rejected_no_input);
-            return Accepted::default();
+            return Err(Rejection::NoInput);
         };
         let accepted = layout.accept(frame);
         let (Ok(index), Some(frame_layout)) = (accepted, accepted.ok().and_then(|nth| layout.frame(nth)))
         else {
-            bump(match accepted {
-                Err(CanReject::Remote { .. }) => &mut self.counters.rejected_remote,
-                Err(CanReject::WrongLength { .. }) => &mut self.counters.rejected_length,
-                _ => &mut self.counters.rejected_id,
-            });
-            return Accepted::default();
+            let (counter, why) = match accepted {
+                Err(CanReject::Remote { .. }) => (&mut self.counters.rejected_remote, Rejection::Remote),
+                Err(CanReject::WrongLength { .. }) => {
+                    (&mut self.counters.rejected_length, Rejection::WrongLength)
+                }
+                _ => (&mut self.counters.rejected_id, Rejection::ForeignId),
+            };
+            bump(counter);
+            return Err(why);
         };
         let mut frames = Frames {
             mode: self.mode,
@@ -245,9 +304,9 @@ impl FieldPort {
             commands,
         };
         let slot = usize::from(self.first_frame).saturating_add(index);
-        let Some(set) = frames.take(&frame_layout, frame.data(), slot) else { return Accepted::default() };
-        self.sender.frames_accepted(1, usable, &mut self.counters);
-        Accepted { frames: 1, set }
+        let set = frames.take(&frame_layout, frame.data(), slot)?;
+        self.sender.frames_accepted(1, usable, &mut self.counters, now);
+        Ok(Accepted { frames: 1, set })
     }
 
     /// One of the port's commands came to its end.
@@ -261,9 +320,9 @@ impl FieldPort {
     }
 
     /// Looks at the clock: cycles and silence.
-    pub(super) fn advance(&mut self, now: Instant) {
+    pub(super) fn advance<const TAP: usize>(&mut self, tap: &mut Tap<TAP>, now: Instant) {
         if now >= self.partial_until() {
-            self.discard_partial();
+            self.discard_partial(tap, now);
         }
         self.sender.advance(self.is_usable(), &mut self.counters, now);
     }
@@ -290,12 +349,53 @@ impl FieldPort {
         }
     }
 
-    fn discard_partial(&mut self) {
-        if let Codec::Stream { deframer, .. } = &mut self.codec {
-            let dropped = deframer.discard();
-            add(&mut self.counters.discarded_bytes, dropped);
+    #[cold]
+    fn discard_partial<const TAP: usize>(&mut self, tap: &mut Tap<TAP>, now: Instant) {
+        let Codec::Stream { deframer, .. } = &mut self.codec else { return };
+        let (first, second) = deframer.held();
+        if !first.is_empty() {
+            tap.record(|| came(self.id, now, Err(Rejection::Partial), None, [first, second, &[]]));
+            self.last_rejection = Some(LastRejection::new(now, Rejection::Partial, None, first));
+        }
+        let dropped = deframer.discard();
+        add(&mut self.counters.discarded_bytes, dropped);
+    }
+
+    /// In a chunk, or in what was held before it, `skipped` bytes belong to no frame. What follows without
+    /// silence is of the same rejection.
+    #[cold]
+    fn no_frame<const TAP: usize>(&mut self, bytes: &[u8], skipped: usize, tap: &mut Tap<TAP>, now: Instant) {
+        tap.record(|| came(self.id, now, Err(Rejection::NoFrame), None, [bytes, &[], &[]]));
+        match &mut self.last_rejection {
+            Some(last) if last.goes_on(now, self.line.idle_gap) => last.append(now, skipped, bytes),
+            last => *last = Some(LastRejection::no_frame(now, skipped, bytes)),
         }
     }
+
+    /// Health of the port, of whose input frames `frames` are.
+    pub(super) fn state<'f>(&self, mut frames: impl Iterator<Item = &'f InputFrame>) -> PortState {
+        if !self.is_up {
+            PortState::Gone
+        } else if self.bus == BusState::BusOff {
+            PortState::BusOff
+        } else if frames.any(|frame| frame.overdue_at == Instant::NEVER) {
+            PortState::Silent
+        } else {
+            PortState::Working
+        }
+    }
+}
+
+/// What came from a field port's device, for the tap.
+fn came<'a>(
+    port: PortId,
+    at: Instant,
+    verdict: Result<(), Rejection>,
+    can_id: Option<CanId>,
+    pieces: [&'a [u8]; 3],
+) -> Tapped<'a> {
+    let verdict = verdict.map_or_else(TapVerdict::Rejected, |()| TapVerdict::Taken);
+    Tapped { at, place: TapPlace::Port(port), direction: TapDirection::In, verdict, can_id, pieces }
 }
 
 /// What taking a frame needs.
@@ -310,9 +410,13 @@ struct Frames<'a, const PORTS: usize> {
 }
 
 impl<const PORTS: usize> Frames<'_, PORTS> {
-    /// Takes a frame whole or not at all: its variables whose link is up, or `None` when it was
-    /// rejected.
-    fn take(&mut self, layout: &impl InputLayout, payload: &[u8], slot: usize) -> Option<InputSet> {
+    /// Takes a frame whole or not at all: its variables whose link is up, or why it was rejected.
+    fn take(
+        &mut self,
+        layout: &impl InputLayout,
+        payload: &[u8],
+        slot: usize,
+    ) -> Result<InputSet, Rejection> {
         match self.mode {
             Mode::Realtime => match layout.apply(payload, self.store.image.bytes_mut()) {
                 Ok(applied) => {
@@ -322,18 +426,19 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
                 }
                 Err(_) => {
                     bump(&mut self.counters.rejected_not_finite);
-                    return None;
+                    return Err(Rejection::NotFinite);
                 }
             },
             Mode::User => {
                 if layout.check(payload).is_err() {
                     bump(&mut self.counters.rejected_not_finite);
-                    return None;
+                    return Err(Rejection::NotFinite);
                 }
-                let bindings = self.store.frames.get(slot)?.bindings.of(self.bindings);
+                let frame = self.store.frames.get(slot).ok_or(Rejection::NoInput)?;
+                let bindings = frame.bindings.of(self.bindings);
                 if !fit(bindings, layout.values(payload)) {
                     bump(&mut self.counters.rejected_out_of_range);
-                    return None;
+                    return Err(Rejection::OutOfRange);
                 }
                 for (binding, value) in bindings.iter().zip(layout.values(payload)) {
                     self.apply_user(binding, value);
@@ -344,7 +449,7 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
             }
         }
         bump(&mut self.counters.frames_in);
-        Some(self.store.accepted(slot, self.counters))
+        Ok(self.store.accepted(slot, self.counters))
     }
 
     fn apply_user(&mut self, binding: &InputBind, value: Scalar) {

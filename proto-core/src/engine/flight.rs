@@ -4,7 +4,7 @@
 
 use heapless::Deque;
 
-use crate::time::Instant;
+use crate::time::{Duration, Instant};
 
 /// Transmissions in order, at most `N` of them unacknowledged.
 #[derive(Debug, Clone)]
@@ -20,6 +20,9 @@ struct Transmission {
     end: u32,
     /// It must not be delivered after this.
     until: Instant,
+    /// The low half of the microseconds at which its first value was received; 0 where that is not
+    /// measured.
+    born: u32,
 }
 
 impl<const N: usize> Flight<N> {
@@ -35,14 +38,14 @@ impl<const N: usize> Flight<N> {
 
     /// `len` bytes were handed over, not to be delivered after `until`, which is not earlier than that
     /// of the transmission before. Whoever hands over asks [`Self::is_full`] first.
-    pub(super) fn sent(&mut self, len: usize, until: Instant) {
+    pub(super) fn sent(&mut self, len: usize, until: Instant, born: Instant) {
         self.total = self.total.wrapping_add(len as u32);
-        let _ = self.transmissions.push_back(Transmission { end: self.total, until });
+        let _ = self.transmissions.push_back(Transmission { end: self.total, until, born: low(born) });
     }
 
     /// So many bytes of all that was handed over are not acknowledged; more than were handed over is
-    /// nonsense, and says nothing.
-    pub(super) fn acked(&mut self, left: u32) {
+    /// nonsense, and says nothing. `arrived` gets, of each transmission, the time since its first value was received.
+    pub(super) fn acked(&mut self, left: u32, now: Instant, mut arrived: impl FnMut(Duration)) {
         if left > i32::MAX as u32 {
             return;
         }
@@ -50,6 +53,9 @@ impl<const N: usize> Flight<N> {
         while let Some(first) = self.transmissions.front()
             && acked.wrapping_sub(first.end) as i32 >= 0
         {
+            if first.born != 0 {
+                arrived(Duration::from_micros(u64::from(low(now).wrapping_sub(first.born))));
+            }
             self.transmissions.pop_front();
         }
     }
@@ -75,6 +81,11 @@ impl<const N: usize> Flight<N> {
     }
 }
 
+/// What is measured takes less than the hour after which this begins anew.
+fn low(at: Instant) -> u32 {
+    if at == Instant::NEVER { 0 } else { at.as_micros() as u32 }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -86,14 +97,14 @@ mod tests {
         let mut flight = Flight::<3>::new();
         assert!(flight.is_empty() && flight.deadline() == Instant::NEVER);
         for (len, until) in [(10, 1), (20, 2), (30, 3)] {
-            flight.sent(len, MS(until));
+            flight.sent(len, MS(until), Instant::NEVER);
         }
         assert!(flight.is_full());
-        flight.acked(55);
+        flight.acked(55, MS(0), |_| ());
         assert_eq!(flight.deadline(), MS(1), "half a transmission is none");
-        flight.acked(49);
+        flight.acked(49, MS(0), |_| ());
         assert_eq!(flight.deadline(), MS(2));
-        flight.acked(0);
+        flight.acked(0, MS(0), |_| ());
         assert!(flight.is_empty());
     }
 
@@ -101,13 +112,15 @@ mod tests {
     fn the_count_of_bytes_may_wrap() {
         let mut flight = Flight::<2>::new();
         for _ in 0..70_000 {
-            flight.sent(65_536, MS(5));
-            flight.acked(0);
+            flight.sent(65_536, MS(5), Instant::NEVER);
+            flight.acked(0, MS(0), |_| ());
         }
-        flight.sent(100, MS(7));
-        flight.acked(100);
+        flight.sent(100, MS(7), MS(6));
+        flight.acked(100, MS(0), |_| ());
         assert_eq!(flight.deadline(), MS(7));
-        flight.acked(0);
+        let mut took = None;
+        flight.acked(0, MS(9), |time| took = Some(time));
+        assert_eq!(took, Some(Duration::from_millis(3)));
         assert!(flight.is_empty());
     }
 }

@@ -145,6 +145,18 @@ pub enum BusState {
     BusOff,
 }
 
+impl BusState {
+    /// One word for people and statistics.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Active => "active",
+            Self::Warning => "warning",
+            Self::Passive => "passive",
+            Self::BusOff => "bus-off",
+        }
+    }
+}
+
 /// Health of a field port.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
@@ -158,6 +170,18 @@ pub enum PortState {
     BusOff,
     /// Its device is not available.
     Gone,
+}
+
+impl PortState {
+    /// One word for people and statistics.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Working => "working",
+            Self::Silent => "silent",
+            Self::BusOff => "bus-off",
+            Self::Gone => "gone",
+        }
+    }
 }
 
 /// Result of the newest command that a port's values picked.
@@ -181,6 +205,21 @@ pub enum ReplyCode {
     NoReply = 5,
     /// It was not sent: the link was down, or too many commands were waiting.
     NotSent = 6,
+}
+
+impl ReplyCode {
+    /// One word for people and statistics.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::None => "none",
+            Self::Pending => "pending",
+            Self::Success => "success",
+            Self::Fail => "fail",
+            Self::Other => "other",
+            Self::NoReply => "noreply",
+            Self::NotSent => "notsent",
+        }
+    }
 }
 
 /// An event that the driver reports to the engine.

@@ -22,6 +22,8 @@ use crate::time::Instant;
 pub struct LinkInfo<'a> {
     /// The link.
     pub id: LinkId,
+    /// Of a listening port, its name in the configuration; of others [`LinkKind::name`].
+    pub name: &'a str,
     /// What it is.
     pub kind: LinkKind,
     /// Where it goes, and how it is opened.
@@ -77,6 +79,60 @@ pub(super) struct Links<const UPLINKS: usize> {
     pub recipes: Vec<Uplink, UPLINKS>,
 }
 
+/// All links, whatever their number, to be looked at.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct LinksView<'a> {
+    host: &'a str,
+    pub command: Option<&'a CommandLink>,
+    pub state: Option<&'a StateLink>,
+    modbus: Option<&'a ModbusLink>,
+    recipes: &'a [Uplink],
+}
+
+impl<'a> LinksView<'a> {
+    pub(super) fn infos(self) -> impl Iterator<Item = LinkInfo<'a>> {
+        let command = self.command.into_iter().flat_map(move |link| {
+            let urgent = link.urgent.iter().map(|session| (LinkId::URGENT, LinkKind::Urgent, session));
+            let all = core::iter::once((LinkId::COMMAND, LinkKind::Command, &link.ordinary)).chain(urgent);
+            all.map(move |(id, kind, session)| {
+                self.info(id, kind, link.transport(), &session.supervisor, &session.counters)
+            })
+        });
+        let state = self.state.into_iter().map(move |link| {
+            self.info(LinkId::STATE, LinkKind::State, link.transport(), &link.supervisor, &link.counters)
+        });
+        let modbus = self.modbus.into_iter().map(move |link| {
+            self.info(LinkId::MODBUS, LinkKind::Modbus, link.transport(), &link.supervisor, &link.counters)
+        });
+        let recipes = self.recipes.iter();
+        let recipes = recipes.map(move |link| {
+            let info = self.info(link.id, link.kind, link.transport, &link.supervisor, &link.counters);
+            LinkInfo { name: link.name.as_deref().unwrap_or(info.name), ..info }
+        });
+        command.chain(state).chain(modbus).chain(recipes)
+    }
+
+    fn info(
+        self,
+        id: LinkId,
+        kind: LinkKind,
+        transport: Transport,
+        supervisor: &'a Supervisor,
+        counters: &'a LinkCounters,
+    ) -> LinkInfo<'a> {
+        let endpoint = Endpoint::new(transport, self.host);
+        LinkInfo {
+            id,
+            name: kind.name(),
+            kind,
+            endpoint,
+            state: supervisor.state(),
+            history: supervisor.history(),
+            counters,
+        }
+    }
+}
+
 impl<const UPLINKS: usize> Links<UPLINKS> {
     pub(super) const fn new() -> Self {
         Self {
@@ -88,36 +144,18 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
         }
     }
 
-    pub(super) fn infos(&self) -> impl Iterator<Item = LinkInfo<'_>> + '_ {
-        let command = self.command.iter().flat_map(|link| {
-            let urgent = link.urgent.iter().map(|session| (LinkId::URGENT, LinkKind::Urgent, session));
-            let all = core::iter::once((LinkId::COMMAND, LinkKind::Command, &link.ordinary)).chain(urgent);
-            all.map(|(id, kind, session)| {
-                self.info(id, kind, link.transport(), &session.supervisor, &session.counters)
-            })
-        });
-        let state = self.state.iter().map(|link| {
-            self.info(LinkId::STATE, LinkKind::State, link.transport(), &link.supervisor, &link.counters)
-        });
-        let modbus = self.modbus.iter().map(|link| {
-            self.info(LinkId::MODBUS, LinkKind::Modbus, link.transport(), &link.supervisor, &link.counters)
-        });
-        let recipes = self.recipes.iter();
-        let recipes = recipes
-            .map(|link| self.info(link.id, link.kind, link.transport, &link.supervisor, &link.counters));
-        command.chain(state).chain(modbus).chain(recipes)
+    pub(super) fn view(&self) -> LinksView<'_> {
+        LinksView {
+            host: &self.host,
+            command: self.command.first(),
+            state: self.state.first(),
+            modbus: self.modbus.first(),
+            recipes: &self.recipes,
+        }
     }
 
-    fn info<'a>(
-        &'a self,
-        id: LinkId,
-        kind: LinkKind,
-        transport: Transport,
-        supervisor: &'a Supervisor,
-        counters: &'a LinkCounters,
-    ) -> LinkInfo<'a> {
-        let endpoint = Endpoint::new(transport, &self.host);
-        LinkInfo { id, kind, endpoint, state: supervisor.state(), history: supervisor.history(), counters }
+    pub(super) fn infos(&self) -> impl Iterator<Item = LinkInfo<'_>> + '_ {
+        self.view().infos()
     }
 
     /// Where a link of [`Self::infos`] goes; the controller's name is written into `buf`.
@@ -236,12 +274,12 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
     }
 
     /// The peer's transport has acknowledged all but `left` bytes.
-    pub(super) fn acked(&mut self, id: LinkId, left: u32) {
+    pub(super) fn acked<const PORTS: usize>(&mut self, id: LinkId, left: u32, store: &mut Store<PORTS>) {
         if let LinkId::COMMAND | LinkId::URGENT = id {
             self.command.iter_mut().for_each(|link| link.acked(id, left));
             return;
         }
-        with_connection!(self, id, link => link.acked(left));
+        with_connection!(self, id, link => link.acked(left, store));
     }
 
     /// What goes to the controller: what stops the robot, then field values, commands last.

@@ -21,16 +21,22 @@ mod field_output;
 mod field_port;
 mod flight;
 mod io;
+mod latency;
 mod links;
 mod modbus_link;
 mod outbox;
 mod outcome;
 mod plan;
+mod rejection;
 mod sender;
 mod session;
 mod state_link;
+mod status;
+#[cfg(feature = "serde")]
+mod status_serde;
 mod stops;
 mod store;
+mod tap;
 mod uplink;
 mod user;
 
@@ -38,12 +44,16 @@ pub use build::BuildError;
 pub use command_link::{MAX_COMMAND_BYTES, MAX_COMMAND_FIELDS};
 pub use counters::{LinkCounters, PortCounters};
 pub use io::{BusState, Endpoint, Input, LinkId, LinkKind, Output, PortId, PortState, ReplyCode, Transport};
+pub use latency::Latency;
 pub use links::LinkInfo;
 pub use modbus_link::MAX_POLL_BLOCKS;
 pub use outbox::EDGE_QUEUE;
 pub use plan::{Plan, PlanError, Source, WayUp};
+pub use rejection::{KEPT_BYTES, LastRejection, Rejection};
+pub use status::{ControllerStatus, FieldBus, Health, PortStatus, Status, VariableStatus};
 pub use stops::COMMAND_QUEUE;
 pub use store::MAX_INPUT_FRAMES;
+pub use tap::{MAX_TAPPED, TAP_OVERHEAD, Tap, TapDirection, TapPlace, TapRecord, TapVerdict};
 
 use heapless::Vec;
 
@@ -88,9 +98,16 @@ const LAST: Instant = Instant::from_micros(u64::MAX - 1);
 /// The gateway engine for up to `PORTS` field ports, `UPLINKS` recipe links and, over all ports,
 /// `FIELDS` user-defined input fields and as many output fields.
 ///
+/// `TAP` bytes are for the ring of [`Engine::tap`], which nobody who leaves it 0 pays for.
+///
 /// `Engine<4, 1, 128>` takes less than 32 KiB.
 #[derive(Debug, Clone)]
-pub struct Engine<const PORTS: usize = 8, const UPLINKS: usize = 4, const FIELDS: usize = 512> {
+pub struct Engine<
+    const PORTS: usize = 8,
+    const UPLINKS: usize = 4,
+    const FIELDS: usize = 512,
+    const TAP: usize = 0,
+> {
     store: Store<PORTS>,
     ports: Vec<FieldPort, PORTS>,
     bindings: Bindings<FIELDS>,
@@ -116,6 +133,7 @@ pub struct Engine<const PORTS: usize = 8, const UPLINKS: usize = 4, const FIELDS
     deaf_until: Instant,
     /// Whom [`Engine::poll_output`] asks before it sleeps.
     ask: Ask,
+    tap: Tap<TAP>,
 }
 
 /// Who may have something to say. Who had nothing is not asked again until something happens to it, a
@@ -135,7 +153,9 @@ impl Ask {
     const NONE: Self = Self { links: false, actions: false, ports: false };
 }
 
-impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS, UPLINKS, FIELDS> {
+impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: usize>
+    Engine<PORTS, UPLINKS, FIELDS, TAP>
+{
     /// Most links that this engine can have: port 2000 twice, port 2001, Modbus, and the recipe links.
     pub const MAX_LINKS: usize = UPLINKS.saturating_add(4);
 
@@ -163,7 +183,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
                 self.arm(deadline);
             }
             Input::LinkAcked { link, left } => {
-                self.links.acked(link, left);
+                self.links.acked(link, left, &mut self.store);
                 self.ask.links = true;
                 self.arm(self.links.deadline_of(link));
             }
@@ -199,7 +219,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             self.carry_outcomes();
             if let Some((link, len)) = upward {
                 self.arm(self.links.deadline_of(link));
-                return Output::LinkSend { link, bytes: buf.get(..len).unwrap_or(&[]) };
+                let bytes = buf.get(..len).unwrap_or(&[]);
+                self.tap.went(TapPlace::Link(link), None, bytes, now);
+                return Output::LinkSend { link, bytes };
             }
             // What stops the robot is looked at in every call, also before the deadline that it has.
             self.ask.links = self.links.has_stops();
@@ -218,9 +240,14 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         if self.ask.ports && !self.is_late {
             match self.next_downward(&mut buf[..], now) {
                 Some((port, Downward::Bytes(len))) => {
-                    return Output::PortSend { port, bytes: buf.get(..len).unwrap_or(&[]) };
+                    let bytes = buf.get(..len).unwrap_or(&[]);
+                    self.tap.went(TapPlace::Port(port), None, bytes, now);
+                    return Output::PortSend { port, bytes };
                 }
-                Some((port, Downward::Can(frame))) => return Output::PortSendCan { port, frame },
+                Some((port, Downward::Can(frame))) => {
+                    self.tap.went(TapPlace::Port(port), Some(frame.id()), frame.data(), now);
+                    return Output::PortSendCan { port, frame };
+                }
                 None => self.ask.ports = false,
             }
         }
@@ -259,7 +286,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     fn port_bytes(&mut self, id: PortId, bytes: &[u8], now: Instant) {
         if let Some(port) = find_port(&mut self.ports, id) {
             if self.is_deaf {
-                return port.discard(bytes, now);
+                return port.discard(bytes, None, &mut self.tap, now);
             }
             port.heard(bytes, now);
         }
@@ -267,7 +294,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         loop {
             let (store, command) = (&mut self.store, self.links.command.first_mut());
             let Some(port) = find_port(&mut self.ports, id) else { return };
-            let accepted = port.frames(&mut rest, &self.bindings.inputs, store, command);
+            let accepted = port.frames(&mut rest, &self.bindings.inputs, store, command, &mut self.tap);
             self.ask.ports |= port.sender.is_due();
             let deadline = port.deadline();
             self.arm(deadline);
@@ -283,9 +310,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         let (store, command) = (&mut self.store, self.links.command.first_mut());
         let Some(port) = find_port(&mut self.ports, id) else { return };
         if self.is_deaf {
-            return port.discard(frame.data(), now);
+            return port.discard(frame.data(), Some(frame.id()), &mut self.tap, now);
         }
-        let accepted = port.can(frame, &self.bindings.inputs, store, command);
+        let accepted = port.can(frame, &self.bindings.inputs, store, command, &mut self.tap);
         self.ask.ports |= port.sender.is_due();
         let deadline = port.deadline();
         self.arm(deadline);
@@ -296,7 +323,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     fn port_down(&mut self, id: PortId, now: Instant) {
         let Some(port) = find_port(&mut self.ports, id) else { return };
         self.ask = Ask::ALL;
-        port.down(&self.bindings.inputs, self.links.command.first_mut(), now);
+        port.down(&self.bindings.inputs, self.links.command.first_mut(), &mut self.tap, now);
         self.drop_forgotten();
     }
 
@@ -329,7 +356,10 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         let mut rest = if is_up { bytes } else { &[] };
         loop {
             if is_up {
+                let before = rest;
                 rest = self.links.received(link, rest, &mut self.store);
+                let taken = before.get(..before.len().saturating_sub(rest.len())).unwrap_or(&[]);
+                self.tap.came(link, taken, now);
             }
             self.carry_results();
             self.arm_link(link);
@@ -374,7 +404,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         // Before deadlines pass: one of them may be to open a link that has been down.
         self.links.slept(&mut self.store);
         self.advance(now);
-        self.ports.iter_mut().for_each(FieldPort::slept);
+        self.ports.iter_mut().for_each(|port| port.slept(&mut self.tap, now));
         self.is_deaf = true;
         self.deaf_until = now + DEAF;
         self.arm(self.deaf_until);
@@ -403,16 +433,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     /// Health of a field port; `None` if no such port is configured.
     pub fn port_state(&self, port: PortId) -> Option<PortState> {
         let (index, port) = self.ports.iter().enumerate().find(|(_, other)| other.id == port)?;
-        let mut frames = self.store.frames.iter().filter(|frame| usize::from(frame.port) == index);
-        Some(if !port.is_up {
-            PortState::Gone
-        } else if port.bus == BusState::BusOff {
-            PortState::BusOff
-        } else if frames.any(|frame| frame.overdue_at == Instant::NEVER) {
-            PortState::Silent
-        } else {
-            PortState::Working
-        })
+        Some(port.state(self.store.frames.iter().filter(|frame| usize::from(frame.port) == index)))
     }
 
     /// Result of the newest command that a port's values picked; `None` if no such port is configured.
@@ -440,6 +461,29 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
     /// waited for it was discarded. Wraps.
     pub fn sleeps(&self) -> u32 {
         self.sleeps
+    }
+
+    /// Everything that a person or a program may ask about the gateway, at `now`.
+    pub fn status(&self, now: Instant) -> Status<'_> {
+        Status {
+            at: self.forward(now),
+            ports: &self.ports,
+            frames: &self.store.frames,
+            image: &self.store.image,
+            links: self.links.view(),
+            latency: &self.store.latency,
+            sleeps: self.sleeps,
+        }
+    }
+
+    /// How long things took since the start.
+    pub fn latency(&self) -> &Latency {
+        &self.store.latency
+    }
+
+    /// What goes over ports and links, for whoever listens.
+    pub fn tap(&mut self) -> &mut Tap<TAP> {
+        &mut self.tap
     }
 
     /// Something depends on the clock from `at` on. What is due already is served before the engine
@@ -474,7 +518,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         self.expire_frames(now);
         for index in 0..self.ports.len() {
             if let Some(port) = self.ports.get_mut(index) {
-                port.advance(now);
+                port.advance(&mut self.tap, now);
             }
         }
         self.links.advance(&mut self.store);
@@ -546,11 +590,18 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         self.image_changed();
         let dirty = self.store.outbox.dirty().and(&accepted.set);
         let state = self.links.state.first().map(|state| state.group);
-        let waits = self.links.recipes.iter().any(|link| {
-            link.supervisor.is_up()
-                && !dirty.and(&link.writes).is_empty()
-                && !link.is_ready(&self.store, state)
-        });
+        let mut waits = false;
+        for link in &mut self.links.recipes {
+            if !dirty.and(&link.writes).is_empty() {
+                link.offered_at = link.offered_at.min(now);
+                waits = waits || link.supervisor.is_up() && !link.is_ready(&self.store, state);
+            }
+        }
+        if let Some(link) = self.links.modbus.first_mut()
+            && !dirty.and(&link.writes).is_empty()
+        {
+            link.offered_at = link.offered_at.min(now);
+        }
         if waits && let Some(port) = find_port(&mut self.ports, port) {
             add(&mut port.counters.withheld, accepted.frames as usize);
         }
@@ -565,7 +616,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
         let mut first = Instant::NEVER;
         for port in &mut self.ports {
             let usable = port.is_usable();
-            port.sender.image_changed(&self.store.image, usable, &mut port.counters);
+            port.sender.image_changed(&self.store.image, usable, &mut port.counters, self.store.now);
             first = first.min(port.deadline());
         }
         self.arm(first);
@@ -578,6 +629,10 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize> Engine<PORTS
             if port.may_send(now)
                 && let Some(downward) = port.next_output(image, bindings, out, now)
             {
+                let due_at = port.sender.take_due_at();
+                if due_at <= now {
+                    self.store.latency.lateness.record(now.saturating_since(due_at));
+                }
                 return Some((port.id, downward));
             }
         }

@@ -58,6 +58,8 @@ enum Asked {
 struct InFlight {
     asked: Asked,
     since: Instant,
+    /// Since when the oldest value of a write had waited.
+    born: Instant,
 }
 
 /// What goes first when both a write and a poll could be sent.
@@ -78,6 +80,9 @@ pub(super) struct ModbusLink {
     polled: Vec<SysVar, MAX_POLLED>,
     blocks: Vec<Block, MAX_POLL_BLOCKS>,
     in_flight: Option<InFlight>,
+    /// Since when a value that a field frame brought waits to be handed over; [`Instant::NEVER`] if none
+    /// does.
+    pub offered_at: Instant,
     /// The transport has not taken the newest request yet.
     unsent: bool,
     flight: Flight<2>,
@@ -101,6 +106,7 @@ impl ModbusLink {
             polled: Vec::new(),
             blocks: Vec::new(),
             in_flight: None,
+            offered_at: Instant::NEVER,
             unsent: false,
             flight: Flight::new(),
             timeouts_in_a_row: 0,
@@ -160,10 +166,14 @@ impl ModbusLink {
         }
         let poll = self.due_block(now);
         let pending = store.outbox.dirty().and(&self.writes);
+        if pending.is_empty() {
+            self.offered_at = Instant::NEVER;
+        }
+        let mut born = Instant::NEVER;
         let asked = match (pending.is_empty(), poll) {
             (true, None) => return None,
-            (false, Some(_)) if self.first == First::Write => self.write(&pending, store, out),
-            (false, None) => self.write(&pending, store, out),
+            (false, Some(_)) if self.first == First::Write => self.write(&pending, store, out, &mut born),
+            (false, None) => self.write(&pending, store, out, &mut born),
             (_, Some(block)) => self.poll(block, out, now),
         };
         let (len, asked) = asked?;
@@ -172,9 +182,9 @@ impl ModbusLink {
             Asked::Poll { .. } => First::Write,
         };
         bump(&mut self.counters.sent);
-        self.in_flight = Some(InFlight { asked, since: now });
+        self.in_flight = Some(InFlight { asked, since: now, born });
         self.unsent = true;
-        self.flight.sent(len, now + ANSWER_TIMEOUT);
+        self.flight.sent(len, now + ANSWER_TIMEOUT, Instant::NEVER);
         Some(len)
     }
 
@@ -222,6 +232,7 @@ impl ModbusLink {
         pending: &InputSet,
         store: &mut Store<PORTS>,
         out: &mut [u8],
+        born: &mut Instant,
     ) -> Option<(usize, Asked)> {
         let first = pending.iter().find(|var| var.ordinal() >= self.cursor).or(pending.iter().next())?;
         let (address, kind) = place_of(first)?;
@@ -254,8 +265,13 @@ impl ModbusLink {
             }
         };
         let len = self.client.start(request, out).ok()?;
+        *born = self.offered_at;
+        store.handed_over(*born);
         let safe = store.safe.and(&vars);
         store.taken(&vars);
+        if pending.minus(&vars).is_empty() {
+            self.offered_at = Instant::NEVER;
+        }
         Some((len, Asked::Write { safe }))
     }
 }
@@ -301,14 +317,19 @@ impl Connection for ModbusLink {
                         self.ask_again_at = self.ask_again_at.min(now + REFUSED_PAUSE);
                     }
                     self.counters.answered(now.saturating_since(asked.since).as_micros());
+                    store.latency.modbus.record(now.saturating_since(asked.since));
                     self.timeouts_in_a_row = 0;
                 }
                 (ClientEvent::Response(response), Some(asked)) => {
                     self.counters.answered(now.saturating_since(asked.since).as_micros());
+                    store.latency.modbus.record(now.saturating_since(asked.since));
                     self.timeouts_in_a_row = 0;
                     self.flight.answered();
                     match asked.asked {
-                        Asked::Write { safe } => store.confirm(&safe),
+                        Asked::Write { safe } => {
+                            store.arrived(asked.born);
+                            store.confirm(&safe);
+                        }
                         Asked::Poll { block } => {
                             if let Some(block) = self.blocks.get(block) {
                                 take_poll(block, &self.polled, response, store);
@@ -325,8 +346,8 @@ impl Connection for ModbusLink {
         self.unsent = false;
     }
 
-    fn acked(&mut self, left: u32) {
-        self.flight.acked(left);
+    fn acked<const PORTS: usize>(&mut self, left: u32, _store: &mut Store<PORTS>) {
+        self.flight.acked(left, Instant::ZERO, |_| ());
     }
 
     fn advance<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {

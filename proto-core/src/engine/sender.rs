@@ -42,6 +42,8 @@ pub(super) struct Sender {
     /// The variables: all must be readable.
     pub shown: VarSet,
     due: bool,
+    /// When the frame that is due became so; [`Instant::NEVER`] once that was taken.
+    due_at: Instant,
     in_flight: bool,
     /// The next CAN frame of a cycle that is being handed over.
     pub next_can: usize,
@@ -68,6 +70,7 @@ impl Sender {
             sources: GroupSet::default(),
             shown: VarSet::EMPTY,
             due: false,
+            due_at: Instant::NEVER,
             in_flight: false,
             next_can: 0,
             digest: None,
@@ -106,6 +109,11 @@ impl Sender {
         self.in_flight = false;
     }
 
+    /// When the frame, or the first CAN frame of the cycle, became due; told once.
+    pub(super) fn take_due_at(&mut self) -> Instant {
+        core::mem::replace(&mut self.due_at, Instant::NEVER)
+    }
+
     /// The frame, or the last CAN frame of the cycle, was handed over.
     pub(super) fn handed_over(&mut self) {
         self.due = false;
@@ -126,29 +134,42 @@ impl Sender {
         if !usable {
             return;
         }
+        let due_at = grid.next() - grid.period();
         if self.frames_sent > 0 {
             add(&mut counters.skipped_cycles, usize::try_from(missed).unwrap_or(usize::MAX));
         }
-        self.raise(counters);
+        self.raise(counters, due_at);
     }
 
     /// So many input frames were accepted at once: the newest is answered.
-    pub(super) fn frames_accepted(&mut self, count: u32, usable: bool, counters: &mut PortCounters) {
+    pub(super) fn frames_accepted(
+        &mut self,
+        count: u32,
+        usable: bool,
+        counters: &mut PortCounters,
+        now: Instant,
+    ) {
         if self.on == SendOn::Frame && usable && count > 0 {
             counters.skipped_cycles = counters.skipped_cycles.wrapping_add(count.wrapping_sub(1));
-            self.raise(counters);
+            self.raise(counters, now);
         }
     }
 
     /// Values in the image changed: looks at the bit that triggers.
-    pub(super) fn image_changed(&mut self, image: &Image, usable: bool, counters: &mut PortCounters) {
+    pub(super) fn image_changed(
+        &mut self,
+        image: &Image,
+        usable: bool,
+        counters: &mut PortCounters,
+        now: Instant,
+    ) {
         let SendOn::Rising { var, bit } = self.on else { return };
         if !image.is_known(var) {
             return;
         }
         let on = bit_of(image, var, bit);
         if on && self.last_bit == Some(false) && usable {
-            self.raise(counters);
+            self.raise(counters, now);
         }
         self.last_bit = Some(on);
     }
@@ -178,12 +199,13 @@ impl Sender {
         if self.is_due() { cycle.min(quiet_at) } else { cycle }
     }
 
-    fn raise(&mut self, counters: &mut PortCounters) {
+    fn raise(&mut self, counters: &mut PortCounters, at: Instant) {
         if self.due {
             // The frame that was due is overtaken by this one.
             bump(&mut counters.skipped_cycles);
         }
         self.due = true;
+        self.due_at = at;
     }
 }
 

@@ -91,7 +91,7 @@ impl Session {
         };
         bump(&mut self.counters.sent);
         self.unsent = true;
-        self.flight.sent(len, until);
+        self.flight.sent(len, until, Instant::NEVER);
         Ok(len)
     }
 
@@ -102,7 +102,7 @@ impl Session {
 
     /// The peer's transport has acknowledged all but `left` bytes.
     pub(super) fn acked(&mut self, left: u32) {
-        self.flight.acked(left);
+        self.flight.acked(left, Instant::ZERO, |_| ());
     }
 
     /// Bytes arrived.

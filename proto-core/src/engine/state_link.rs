@@ -10,6 +10,7 @@ use crate::image::{GroupId, InputSet};
 use crate::link::{LinkTimings, Supervisor};
 use crate::sysvar::{COUNT, SysVar};
 use crate::time::Duration;
+use crate::wire::dialect::Dialect;
 use crate::wire::state::{StateStream, StateView};
 
 /// A stream that is silent for this long is reopened: twenty packets are missing.
@@ -22,24 +23,29 @@ pub(super) struct StateLink {
     pub supervisor: Supervisor,
     pub counters: LinkCounters,
     port: u16,
+    pub dialect: Dialect,
     pub group: GroupId,
     stream: StateStream,
     /// Variables that come from here.
     pub shown: Vec<SysVar, COUNT>,
     /// Input variables whose present value is read back while no port sends them.
     pub read_back: InputSet,
+    /// Codes of mode, robot, program and safety in the newest packet.
+    pub codes: [u8; 4],
 }
 
 impl StateLink {
-    pub(super) fn new(port: u16, group: GroupId, read_back: InputSet) -> Self {
+    pub(super) fn new(port: u16, dialect: Dialect, group: GroupId, read_back: InputSet) -> Self {
         Self {
             supervisor: Supervisor::new(LinkTimings::TCP.with_silence(SILENCE)),
             counters: LinkCounters::default(),
             port,
+            dialect,
             group,
             stream: StateStream::new(),
             shown: Vec::new(),
             read_back,
+            codes: [0; 4],
         }
     }
 
@@ -63,6 +69,7 @@ impl Connection for StateLink {
             match packet {
                 Ok(view) => {
                     bump(&mut self.counters.received);
+                    self.codes = view.state_codes();
                     let not_live = self.read_back.minus(&store.live);
                     for &var in &self.shown {
                         if !view.read_var(var).is_some_and(|value| store.image.receive(var, value)) {

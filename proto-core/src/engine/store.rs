@@ -4,6 +4,7 @@
 use heapless::Vec;
 
 use super::counters::{PortCounters, bump};
+use super::latency::Latency;
 use super::outbox::{EdgeQueue, Outbox};
 use crate::config::{SafeValue, Span};
 use crate::image::{GroupId, Image, InputSet};
@@ -46,6 +47,7 @@ impl SafeBytes {
 
 #[derive(Debug, Clone)]
 pub(super) struct Store<const PORTS: usize> {
+    pub latency: Latency,
     /// The instant of this call of the engine.
     pub now: Instant,
     /// Some port sends on a rising bit: the engine looks at the image after each frame, however many
@@ -92,6 +94,7 @@ impl<const PORTS: usize> Store<PORTS> {
         Self {
             now: Instant::ZERO,
             watches_bits: false,
+            latency: Latency::new(),
             image: Image::new(),
             outbox: Outbox::new(),
             edges: Vec::new(),
@@ -214,6 +217,20 @@ impl<const PORTS: usize> Store<PORTS> {
     /// When something happens by itself.
     pub(super) fn deadline(&self) -> Instant {
         self.next_overdue.get().min(self.next_expiry.get())
+    }
+
+    /// What has waited since `born` has been handed over.
+    pub(super) fn handed_over(&mut self, born: Instant) {
+        if born <= self.now {
+            self.latency.handed_over.record(self.now.saturating_since(born));
+        }
+    }
+
+    /// What has waited since `born` has arrived.
+    pub(super) fn arrived(&mut self, born: Instant) {
+        if born <= self.now {
+            self.latency.arrived.record(self.now.saturating_since(born));
+        }
     }
 
     /// These values have been handed to their link.

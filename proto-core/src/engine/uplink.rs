@@ -8,6 +8,7 @@ use super::counters::{LinkCounters, add, bump};
 use super::flight::Flight;
 use super::io::{LinkId, LinkKind, Transport};
 use super::store::{Store, is_gap};
+use crate::config::Name;
 use crate::image::{GroupId, Image, InputSet};
 use crate::link::{LinkTimings, Supervisor};
 use crate::recipe::PlacedField;
@@ -35,6 +36,8 @@ const SPEAK_EVERY: Duration = Duration::from_secs(20);
 pub(super) struct Uplink {
     pub id: LinkId,
     pub kind: LinkKind,
+    /// Of a listening port, its name in the configuration.
+    pub name: Option<Name>,
     pub transport: Transport,
     pub supervisor: Supervisor,
     pub counters: LinkCounters,
@@ -50,6 +53,9 @@ pub(super) struct Uplink {
     pub group: Option<GroupId>,
     /// Of those that are written here, variables that something would show if the controller had them.
     pub shown: InputSet,
+    /// Since when a value that a field frame brought waits to be handed over; [`Instant::NEVER`] if none
+    /// does.
+    pub offered_at: Instant,
     /// How long a frame may take to be acknowledged.
     patience: Duration,
     busy: bool,
@@ -67,6 +73,7 @@ pub(super) struct Uplink {
 pub(super) struct UplinkSetup {
     pub id: LinkId,
     pub kind: LinkKind,
+    pub name: Option<Name>,
     pub transport: Transport,
     pub timings: LinkTimings,
     pub input: Option<StreamLayout>,
@@ -80,7 +87,7 @@ pub(super) struct UplinkSetup {
 
 impl Uplink {
     pub(super) fn new(
-        UplinkSetup { id, kind, transport, timings, input, output, set, writes, group, patience }: UplinkSetup,
+        UplinkSetup { id, kind, name, transport, timings, input, output, set, writes, group, patience }: UplinkSetup,
     ) -> Self {
         let framing = match kind {
             LinkKind::RecipeTcpListen { .. } => Framing::Bytes,
@@ -89,6 +96,7 @@ impl Uplink {
         Self {
             id,
             kind,
+            name,
             transport,
             supervisor: Supervisor::new(timings),
             counters: LinkCounters::default(),
@@ -100,6 +108,7 @@ impl Uplink {
             writes,
             group,
             shown: InputSet::EMPTY,
+            offered_at: Instant::NEVER,
             patience,
             busy: false,
             flight: Flight::new(),
@@ -121,8 +130,11 @@ impl Uplink {
             return None;
         }
         let wanted = !store.outbox.dirty().and(&self.writes).is_empty();
-        if !wanted && store.now < self.speaks_at() {
-            return None;
+        if !wanted {
+            self.offered_at = Instant::NEVER;
+            if store.now < self.speaks_at() {
+                return None;
+            }
         }
         self.send(wanted, store, state, out)
     }
@@ -136,10 +148,12 @@ impl Uplink {
         state: Option<GroupId>,
         out: &mut [u8],
     ) -> Option<usize> {
-        let now = store.now;
+        let (now, mut born) = (store.now, Instant::NEVER);
         let len = match &self.input {
             Some(layout) if wanted && self.is_ready(store, state) => {
                 let len = encode(layout, store, out)?;
+                born = core::mem::replace(&mut self.offered_at, Instant::NEVER);
+                store.handed_over(born);
                 store.taken(&self.writes);
                 self.handed_over = Some((now, store.era));
                 let repeats = self.repeat_at == Instant::NEVER || is_new(store);
@@ -160,7 +174,7 @@ impl Uplink {
         };
         self.busy = true;
         match self.framing {
-            Framing::Bytes => self.flight.sent(len, now + self.patience),
+            Framing::Bytes => self.flight.sent(len, now + self.patience, born),
             Framing::Datagram if self.speak_at != Instant::NEVER => self.speak_at = now + SPEAK_EVERY,
             Framing::Datagram => {}
         }
@@ -286,8 +300,8 @@ impl Connection for Uplink {
         self.busy = false;
     }
 
-    fn acked(&mut self, left: u32) {
-        self.flight.acked(left);
+    fn acked<const PORTS: usize>(&mut self, left: u32, store: &mut Store<PORTS>) {
+        self.flight.acked(left, store.now, |time| store.latency.arrived.record(time));
     }
 
     fn advance<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {

@@ -86,6 +86,14 @@ impl Deframer {
         self.search(layout, chunk)
     }
 
+    /// The bytes of a possible frame that are held, in two pieces.
+    pub fn held(&self) -> (&[u8], &[u8]) {
+        let (start, len) = (usize::from(self.start), self.pending());
+        let straight = len.min(RING.saturating_sub(start));
+        let first = self.ring.get(start..start.saturating_add(straight)).unwrap_or(&[]);
+        (first, self.ring.get(..len.saturating_sub(straight)).unwrap_or(&[]))
+    }
+
     /// Number of held bytes, which may become a frame.
     pub const fn pending(&self) -> usize {
         self.len as usize

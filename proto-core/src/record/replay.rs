@@ -58,9 +58,9 @@ pub struct Replayed {
 ///
 /// # Errors
 /// [`ReplayError`]; what was written until then is this engine's.
-pub fn replay<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize>(
+pub fn replay<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: usize>(
     recording: &[u8],
-    engine: &mut Engine<PORTS, UPLINKS, FIELDS>,
+    engine: &mut Engine<PORTS, UPLINKS, FIELDS, TAP>,
     config: &mut GatewayConfig,
     mut write: impl FnMut(&[u8]),
 ) -> Result<Replayed, ReplayError> {
@@ -93,8 +93,8 @@ pub fn replay<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize>(
     Ok(replayed)
 }
 
-fn pass<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize>(
-    engine: &mut Engine<PORTS, UPLINKS, FIELDS>,
+fn pass<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: usize>(
+    engine: &mut Engine<PORTS, UPLINKS, FIELDS, TAP>,
     at: Instant,
     input: Input<'_>,
     mut write: impl FnMut(&[u8]),

@@ -18,6 +18,8 @@
 //! - Bytes handed over on a connection are compared with marks on the same count: written as the
 //!   difference. Modbus transactions are numbered; an answer carries the number of a request a few
 //!   before the newest at most, and the engine tells numbers apart over 2^15.
+//! - What only the status shows: latency, the newest rejection, states and commands, and since when
+//!   something waits.
 //! - Layouts and dialects: computed from the configuration, never changed.
 
 use std::fmt::{Debug, Write};
@@ -82,6 +84,8 @@ enum Field {
     Other,
     /// Numbers that the engine writes and never reads.
     Counter,
+    /// What only the status shows: an instant, a number, or nothing.
+    Shown,
     /// Arrays of bytes that are constant, empty, or read elsewhere.
     Buffer,
     Stamps,
@@ -185,6 +189,9 @@ impl Scribe {
     }
 
     fn instant(&mut self, at: u64) {
+        if self.field == Field::Shown {
+            return;
+        }
         if at == NEVER || at == 0 {
             return self.mix(at ^ 0x5555);
         }
@@ -222,7 +229,7 @@ impl Scribe {
             return self.instant(number);
         }
         match (self.field, self.kind()) {
-            (Field::Counter, _) => return,
+            (Field::Counter | Field::Shown, _) => return,
             (Field::Nth, _) => return self.mix(self.commands.wrapping_sub(number)),
             (Field::Total, _) => {
                 self.total = number;
@@ -252,6 +259,9 @@ impl Scribe {
     }
 
     fn word(&mut self, text: &[u8]) {
+        if self.field == Field::Shown && matches!(text, b"None" | b"Some") {
+            return;
+        }
         // The next word is the name of the next field.
         match std::mem::replace(&mut self.field, Field::Other) {
             Field::Silence => self.silence_is_normal = text == b"None",
@@ -262,7 +272,9 @@ impl Scribe {
         self.word = match text {
             b"Instant" => Word::Instant,
             b"PortCounters" | b"LinkCounters" | b"LinkHistory" | b"DeframerStats" | b"StreamLayout"
-            | b"CanLayout" | b"Dialect" => Word::Struct(Kind::LeftOut),
+            | b"CanLayout" | b"Dialect" | b"Latency" | b"LastRejection" | b"Tap" => {
+                Word::Struct(Kind::LeftOut)
+            }
             b"Sent" => Word::Struct(Kind::Sent),
             b"Up" => Word::Struct(Kind::Up),
             b"LineTiming" => Word::Struct(Kind::Line),
@@ -272,7 +284,10 @@ impl Scribe {
             _ if text[0].is_ascii_uppercase() => Word::Struct(Kind::Other),
             b"transaction" | b"stale" | b"sleeps" | b"frames_sent" | b"packets" | b"misaligned"
             | b"dropped" | b"counted" => Word::Field(Field::Counter),
-            b"bytes" | b"group" | b"ring" | b"buffer" | b"mask" => Word::Field(Field::Buffer),
+            b"bytes" | b"group" | b"ring" | b"buffer" | b"mask" | b"codes" | b"picked" => {
+                Word::Field(Field::Buffer)
+            }
+            b"last_rejection" | b"offered_at" | b"due_at" | b"born" => Word::Field(Field::Shown),
             b"stamps" | b"packet_at" | b"source_at" | b"frame_at" => Word::Field(Field::Stamps),
             b"unconfirmed_since" => Word::Field(Field::Unconfirmed),
             b"confirmed_at" => Word::Field(Field::Confirmed),

@@ -23,7 +23,7 @@ use embassy_time::{Duration, with_timeout};
 use proto_core::config::{
     Bus, Delimiter, FieldSpec, Name, Parity, Parts, Port, Recipe, Rs485, Span, StreamPart,
 };
-use proto_core::engine::{LinkCounters, LinkInfo, PortId};
+use proto_core::engine::{LinkCounters, PortId};
 use proto_core::recipe::model::Mode;
 use proto_core::sysvar::SysVar;
 use proto_core::time::Duration as CoreDuration;
@@ -296,15 +296,11 @@ impl Net<'_> {
 
     /// How often the link was up, whether it is, and what was counted.
     fn link(&self) -> (u32, bool, LinkCounters) {
-        let mut found = None;
-        let look = |link: LinkInfo<'_>| {
-            if link.id == self.link {
-                let is_up = matches!(link.state, proto_core::link::LinkState::Up { .. });
-                found = Some((link.history.connects, is_up, *link.counters));
-            }
-        };
-        self.gateway.report(look, |_, _| {});
-        found.unwrap()
+        self.gateway.report(|status| {
+            let link = status.links().find(|link| link.id == self.link).unwrap();
+            let is_up = matches!(link.state, proto_core::link::LinkState::Up { .. });
+            (link.history.connects, is_up, *link.counters)
+        })
     }
 
     /// Waits until the link was up so often and so many were turned away.

@@ -2,7 +2,7 @@
 
 use core::fmt;
 
-use super::codes::{OperationMode, ProgramState, States};
+use super::codes::States;
 use crate::wire::dialect::Dialect;
 
 /// Size of a state packet in bytes.
@@ -63,14 +63,14 @@ impl<'a> StateView<'a> {
         self.bytes
     }
 
+    /// The codes of mode, robot, program and safety state.
+    pub fn state_codes(&self) -> [u8; 4] {
+        [self.operation_mode(), self.robot_state(), self.program_state(), self.safety_state()]
+    }
+
     /// The four state machines, as `dialect` numbers them.
     pub fn states(&self, dialect: &Dialect) -> States {
-        States {
-            mode: OperationMode::from_code(self.operation_mode()),
-            robot: dialect.robot_state(self.robot_state()),
-            program: ProgramState::from_code(self.program_state()),
-            safety: dialect.safety_state(self.safety_state()),
-        }
+        States::from_codes(self.state_codes(), dialect)
     }
 
     /// The global speed in percent, if the dialect's controller sends it.

@@ -266,8 +266,8 @@ fn a_controller_that_takes_one_connection_is_no_fault() {
     assert_eq!(gateway.condition(), Condition::NoController);
     wait(&gateway);
     gateway.input(Input::LinkDown { link: LinkId::URGENT });
-    let mut states = Vec::new();
-    gateway.report(|link| states.push((link.kind, link.state)), |_, _| {});
+    let states =
+        gateway.report(|status| status.links().map(|link| (link.kind, link.state)).collect::<Vec<_>>());
     let [(LinkKind::Command, _), (LinkKind::Urgent, state)] = states[..] else { panic!("{states:?}") };
     assert_eq!(state, proto_core::link::LinkState::Shared);
     assert_eq!(gateway.condition(), Condition::Running);

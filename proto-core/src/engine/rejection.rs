@@ -1,0 +1,121 @@
+//! Why something that arrived on a port or link was not taken, in the words of counters, tap and status.
+
+use crate::time::{Duration, Instant};
+use crate::wire::can::CanId;
+
+/// Why a frame, packet or answer was rejected. Nothing of it was applied.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[cfg_attr(feature = "serde", derive(serde::Serialize), serde(rename_all = "snake_case"))]
+#[non_exhaustive]
+pub enum Rejection {
+    /// Bytes in which no frame begins, or that a wrong tail ends (D19).
+    NoFrame,
+    /// A partial frame that silence ended (D19).
+    Partial,
+    /// A value that is not finite (D22).
+    NotFinite,
+    /// A value that does not fit the variable it is bound to (D22).
+    OutOfRange,
+    /// A CAN id that the recipe does not have (D17).
+    ForeignId,
+    /// A CAN frame of another length than the recipe's (D17).
+    WrongLength,
+    /// A remote frame (D17).
+    Remote,
+    /// The recipe has no input part.
+    NoInput,
+    /// It waited while the gateway itself slept.
+    Asleep,
+    /// It is not what the link's protocol allows.
+    Malformed,
+}
+
+impl Rejection {
+    /// Every one of them.
+    pub const ALL: [Self; 10] = [
+        Self::NoFrame,
+        Self::Partial,
+        Self::NotFinite,
+        Self::OutOfRange,
+        Self::ForeignId,
+        Self::WrongLength,
+        Self::Remote,
+        Self::NoInput,
+        Self::Asleep,
+        Self::Malformed,
+    ];
+
+    /// A few words for people, such as `no frame found`.
+    pub const fn text(self) -> &'static str {
+        match self {
+            Self::NoFrame => "no frame found",
+            Self::Partial => "a partial frame, ended by silence",
+            Self::NotFinite => "a value is not finite",
+            Self::OutOfRange => "a value does not fit its variable",
+            Self::ForeignId => "a CAN id that the recipe does not have",
+            Self::WrongLength => "a CAN frame of another length",
+            Self::Remote => "a remote frame",
+            Self::NoInput => "the recipe has no input part",
+            Self::Asleep => "it waited while the gateway slept",
+            Self::Malformed => "not as the protocol requires",
+        }
+    }
+}
+
+/// Bytes of a rejection that are kept.
+pub const KEPT_BYTES: usize = 32;
+
+/// The newest rejection of a port, with the first [`KEPT_BYTES`] of what was rejected.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct LastRejection {
+    /// When; of bytes without a frame, when the first came.
+    pub at: Instant,
+    /// Why.
+    pub why: Rejection,
+    /// The frame's id on a CAN bus.
+    pub can_id: Option<CanId>,
+    /// Length of what was rejected in bytes, of which the first are kept. Of [`Rejection::NoFrame`] it
+    /// counts what belongs to no frame, and the bytes kept are those of the chunks in which that was.
+    pub len: usize,
+    /// When its newest bytes came.
+    newest_at: Instant,
+    kept: u8,
+    bytes: [u8; KEPT_BYTES],
+}
+
+impl LastRejection {
+    pub(super) fn new(at: Instant, why: Rejection, can_id: Option<CanId>, bytes: &[u8]) -> Self {
+        let mut rejection =
+            Self { at, why, can_id, len: bytes.len(), newest_at: at, kept: 0, bytes: [0; KEPT_BYTES] };
+        for (kept, &byte) in rejection.bytes.iter_mut().zip(bytes) {
+            *kept = byte;
+        }
+        rejection.kept = bytes.len().min(KEPT_BYTES) as u8;
+        rejection
+    }
+
+    /// `skipped` bytes in a chunk of `bytes` belong to no frame.
+    pub(super) fn no_frame(at: Instant, skipped: usize, bytes: &[u8]) -> Self {
+        Self { len: skipped, ..Self::new(at, Rejection::NoFrame, None, bytes) }
+    }
+
+    /// Whether bytes without a frame at `now` belong to this rejection: no silence was between.
+    pub(super) fn goes_on(&self, now: Instant, idle_gap: Duration) -> bool {
+        self.why == Rejection::NoFrame && now.saturating_since(self.newest_at) <= idle_gap
+    }
+
+    /// More of the same: `skipped` bytes, in a chunk of `bytes`.
+    pub(super) fn append(&mut self, now: Instant, skipped: usize, bytes: &[u8]) {
+        let free = self.bytes.iter_mut().skip(usize::from(self.kept));
+        let added = free.zip(bytes).map(|(kept, &byte)| *kept = byte).count();
+        self.kept = self.kept.saturating_add(added as u8);
+        self.len = self.len.saturating_add(skipped);
+        self.newest_at = now;
+    }
+
+    /// The first bytes of what was rejected.
+    pub fn bytes(&self) -> &[u8] {
+        self.bytes.get(..usize::from(self.kept)).unwrap_or(&[])
+    }
+}

@@ -1,0 +1,175 @@
+//! A [`Status`] as an object: what statistics, an API and a metrics page are made of.
+//!
+//! ```text
+//! { "time_us", "sleeps",
+//!   "ports": { NAME: { "bus", "bus_state"?, "recipe", "state", "age_ms"?, "overdue", "reply",
+//!                      "command"?, "last_rejection"?, "counters" } },
+//!   "links": { NAME: { "kind", "state", "history", "counters" } },
+//!   "controller"?: { "mode", "robot", "program", "safety", "age_ms" },
+//!   "values": { VARIABLE: { "value", "age_ms", "owner"? } },
+//!   "latency" }
+//! ```
+//!
+//! What is unknown is absent. Ages are in milliseconds, times in microseconds.
+
+use core::fmt;
+
+use serde::ser::{Serialize, SerializeMap, Serializer};
+
+use super::links::LinkInfo;
+use super::rejection::LastRejection;
+use super::status::{ControllerStatus, FieldBus, PortStatus, Status, VariableStatus};
+use crate::time::Instant;
+use crate::wire::scalar::Scalar;
+
+/// A map whose entries come from an iterator.
+struct Map<F>(F);
+
+impl<K: Serialize, V: Serialize, I: Iterator<Item = (K, V)>, F: Fn() -> I> Serialize for Map<F> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let mut map = serializer.serialize_map(None)?;
+        for (key, value) in (self.0)() {
+            map.serialize_entry(&key, &value)?;
+        }
+        map.end()
+    }
+}
+
+/// Something as the text that it displays.
+struct Text<T>(T);
+
+impl<T: fmt::Display> Serialize for Text<T> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(&self.0)
+    }
+}
+
+/// Bytes in hexadecimal, such as `48 AA`.
+struct Hex<'a>(&'a [u8]);
+
+impl fmt::Display for Hex<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for (nth, byte) in self.0.iter().enumerate() {
+            let space = if nth == 0 { "" } else { " " };
+            write!(f, "{space}{byte:02X}")?;
+        }
+        Ok(())
+    }
+}
+
+/// A rejection, seen at an instant.
+struct Rejected<'a>(&'a LastRejection, Instant);
+
+impl Serialize for Rejected<'_> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let &Self(rejection, at) = self;
+        let mut map = serializer.serialize_map(None)?;
+        map.serialize_entry("why", &rejection.why)?;
+        map.serialize_entry("text", rejection.why.text())?;
+        map.serialize_entry("age_ms", &at.saturating_since(rejection.at).as_millis())?;
+        if let Some(id) = rejection.can_id {
+            map.serialize_entry("can_id", &Text(id))?;
+        }
+        map.serialize_entry("len", &rejection.len)?;
+        map.serialize_entry("bytes", &Text(Hex(rejection.bytes())))?;
+        map.end()
+    }
+}
+
+impl Serialize for Status<'_> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let mut map = serializer.serialize_map(None)?;
+        map.serialize_entry("time_us", &self.at().as_micros())?;
+        map.serialize_entry("sleeps", &self.sleeps())?;
+        map.serialize_entry("ports", &Map(|| self.ports().map(|port| (port.name, At(port, self.at())))))?;
+        map.serialize_entry("links", &Map(|| self.links().map(|link| (link.name, link))))?;
+        if let Some(controller) = self.controller() {
+            map.serialize_entry("controller", &controller)?;
+        }
+        map.serialize_entry("values", &Map(|| self.variables().map(|known| (Text(known.var), known))))?;
+        map.serialize_entry("latency", self.latency())?;
+        map.end()
+    }
+}
+
+/// A part of a status with its instant.
+struct At<T>(T, Instant);
+
+impl Serialize for At<PortStatus<'_>> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let Self(port, at) = self;
+        let mut map = serializer.serialize_map(None)?;
+        match port.bus {
+            FieldBus::Rs485 => map.serialize_entry("bus", "rs485")?,
+            FieldBus::Can { state } => {
+                map.serialize_entry("bus", "can")?;
+                map.serialize_entry("bus_state", state.name())?;
+            }
+        }
+        map.serialize_entry("recipe", &port.recipe)?;
+        map.serialize_entry("state", port.state.name())?;
+        if let Some(age) = port.age {
+            map.serialize_entry("age_ms", &age.as_millis())?;
+        }
+        map.serialize_entry("overdue", &port.overdue)?;
+        map.serialize_entry("reply", port.reply.name())?;
+        if let Some(command) = port.command {
+            map.serialize_entry("command", command)?;
+        }
+        if let Some(rejection) = port.last_rejection {
+            map.serialize_entry("last_rejection", &Rejected(rejection, *at))?;
+        }
+        map.serialize_entry("counters", port.counters)?;
+        map.end()
+    }
+}
+
+impl Serialize for LinkInfo<'_> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let mut map = serializer.serialize_map(None)?;
+        map.serialize_entry("kind", self.kind.name())?;
+        map.serialize_entry("state", self.state.name())?;
+        map.serialize_entry("history", self.history)?;
+        map.serialize_entry("counters", self.counters)?;
+        map.end()
+    }
+}
+
+impl Serialize for ControllerStatus {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let states = [
+            ("mode", (self.states.mode.code(), self.states.mode.name())),
+            ("robot", (self.states.robot.code(), self.states.robot.name())),
+            ("program", (self.states.program.code(), self.states.program.name())),
+            ("safety", (self.states.safety.code(), self.states.safety.name())),
+        ];
+        let mut map = serializer.serialize_map(None)?;
+        for (key, (code, name)) in states {
+            map.serialize_entry(key, &State { code, name })?;
+        }
+        map.serialize_entry("age_ms", &self.age.as_millis())?;
+        map.end()
+    }
+}
+
+/// One of the controller's states.
+#[derive(serde::Serialize)]
+struct State {
+    code: u8,
+    name: &'static str,
+}
+
+impl Serialize for VariableStatus<'_> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let mut map = serializer.serialize_map(None)?;
+        match self.value {
+            Scalar::Float(value) => map.serialize_entry("value", &value)?,
+            value => map.serialize_entry("value", &(value.as_f64() as i64))?,
+        }
+        map.serialize_entry("age_ms", &self.age.as_millis())?;
+        if let Some(owner) = self.owner {
+            map.serialize_entry("owner", owner)?;
+        }
+        map.end()
+    }
+}
