@@ -1,4 +1,5 @@
-//! A CAN bus: one port of the gateway or of the controller, and a device that may stand for many.
+//! A CAN bus: one port of the gateway or of the controller, and a device that may stand for
+//! several.
 
 use std::collections::VecDeque;
 
@@ -11,7 +12,7 @@ use super::line::MAX_HEARD;
 use super::rng::Rng;
 use super::{End, Owner};
 
-/// What happened on a bus, beside what its ends count.
+/// Counters of a bus, in addition to those of its ends.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct BusCounters {
     /// Frames of the device.
@@ -26,12 +27,12 @@ pub struct BusCounters {
 pub struct CanBus {
     pub(super) owner: Owner,
     bitrate: u32,
-    /// How many frames of a million are lost.
+    /// Number of lost frames per million.
     pub loss_ppm: u32,
-    /// What happened.
+    /// Counters.
     pub counters: BusCounters,
     pub(super) connected: bool,
-    /// The port's CAN controller is bus-off: it neither sends nor hears.
+    /// The port's CAN controller is bus-off: it neither sends nor receives.
     pub(super) is_off: bool,
     pub(super) device: Option<Box<dyn Device<CanFrame>>>,
     waiting: [VecDeque<CanFrame>; 2],
@@ -59,7 +60,7 @@ pub(super) struct Crossed {
     pub from: End,
     pub frame: CanFrame,
     pub arrives: bool,
-    /// Nothing of the sender waits any more.
+    /// No frame of the sender waits any more.
     pub was_last: bool,
 }
 
@@ -81,13 +82,13 @@ impl CanBus {
         }
     }
 
-    /// What the port has sent since the last look, each frame with the time of its end. The newest
-    /// [`MAX_HEARD`] are kept.
+    /// The frames that the port has sent since the last call, each with the time of its end. The
+    /// newest [`MAX_HEARD`] are kept.
     pub fn take_heard(&mut self) -> Vec<(Instant, CanFrame)> {
         self.heard.drain(..).collect()
     }
 
-    /// Queues a frame; when the one that goes onto the bus with it ends.
+    /// Queues a frame. If a frame starts on the bus now, returns when that ends.
     pub(super) fn send(&mut self, now: Instant, from: End, frame: CanFrame) -> Option<Instant> {
         self.waiting[from as usize].push_back(frame);
         match from {
@@ -111,7 +112,8 @@ impl CanBus {
         Some(Crossed { from, frame, arrives, was_last: self.waiting[from as usize].is_empty() })
     }
 
-    /// Ids are ordered as they win the bus, and a data frame beats a remote one; when its frame ends, or `None` when the bus is taken or nobody wants it.
+    /// Lower ids win the bus, and a data frame wins over a remote one. Returns when the winning
+    /// frame ends; `None` if the bus is busy or no frame waits.
     pub(super) fn arbitrate(&mut self, now: Instant) -> Option<Instant> {
         if self.on_the_bus.is_some() {
             return None;
@@ -126,7 +128,7 @@ impl CanBus {
         Some(now + can_frame_time(frame.id(), frame.data().len(), self.bitrate))
     }
 
-    /// What waits at the port is lost.
+    /// Drops the frames that wait at the port.
     pub(super) fn drop_port_frames(&mut self) {
         self.waiting[End::Port as usize].clear();
     }

@@ -6,7 +6,7 @@ use super::network::Way;
 use super::tcp::Pipe;
 use recipe_controller::Link;
 
-/// Who is at the controller's end.
+/// The controller's end of a connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Peer {
     /// One of its servers.
@@ -22,17 +22,18 @@ pub(super) struct Connection {
     pub peer: Peer,
     pub up: Pipe,
     pub down: Pipe,
-    /// The controller was told of it.
+    /// The controller has been told of the connection.
     pub accepted: bool,
     /// The controller has closed its end.
     pub closing: bool,
-    /// The gateway has closed its end, and the controller has not heard of it.
+    /// The gateway has closed its end, and the controller does not know it yet.
     pub abandoned: bool,
-    /// The controller's end is gone without a word: what comes there is answered with a reset.
+    /// The controller's end is gone without notice: data that arrives there is answered with a
+    /// reset.
     pub forgotten: bool,
     /// The controller's TCP is about to acknowledge.
     pub owes_ack: bool,
-    /// The gateway's transport is going to look whether it has.
+    /// The gateway's transport is going to check its acknowledgements.
     pub is_watched: bool,
 }
 

@@ -4,16 +4,15 @@ use proto_core::time::{Duration, Instant};
 
 /// A device: `M` is `Vec<u8>` on an RS-485 line and a CAN frame on a bus.
 ///
-/// What it returns is sent in order, each as soon as the line is free of what the device sent
-/// before.
+/// Returned messages are sent in order, each as soon as the device's previous one has left.
 pub trait Device<M> {
-    /// Something came in: a chunk of bytes as the line delivers it, or a CAN frame.
+    /// A message arrived: a chunk of bytes as the line delivers it, or a CAN frame.
     fn receive(&mut self, now: Instant, message: &M) -> Vec<M> {
         let _ = (now, message);
         Vec::new()
     }
 
-    /// When [`Self::poll`] is to be called.
+    /// When to call [`Self::poll`].
     fn deadline(&self) -> Instant {
         Instant::NEVER
     }
@@ -25,10 +24,10 @@ pub trait Device<M> {
     }
 }
 
-/// Sends by itself: the `n`-th time what `make(n)` returns, on a grid that keeps its phase.
+/// Sends by itself: the `n`-th message is `make(n)`, on a grid that keeps its phase.
 ///
-/// The n-th message leaves at `start + n * 1 s / rate`, rounded down to the microsecond, so that no
-/// error adds up at rates that do not divide a second.
+/// The n-th message leaves at `start + n * 1 s / rate`, rounded down to the microsecond, so that
+/// rates that do not divide a second accumulate no error.
 #[derive(Debug, Clone)]
 pub struct Talker<F> {
     start: Instant,
@@ -39,7 +38,7 @@ pub struct Talker<F> {
 }
 
 impl<F> Talker<F> {
-    /// `per_second` messages a second from `start` on, `count` of them altogether.
+    /// `per_second` messages per second from `start` on, `count` in total.
     ///
     /// The rate must be from 1 to 1 000 000.
     pub fn new(start: Instant, per_second: u64, count: u64, make: F) -> Self {

@@ -1,4 +1,4 @@
-//! The cell's run loop: what is due, whom it is for, and what that leads to.
+//! The cell's run loop: handles what is due.
 
 use proto_core::engine::{Input, LinkId, OUTPUT_BUFFER, Output};
 use proto_core::time::{Duration, Instant};
@@ -11,7 +11,7 @@ use super::{BusId, Cell, DESK, End, LineId, Owner, What, udp_peer};
 use recipe_controller::{ControllerInput, ControllerOutput, Link};
 
 impl Cell {
-    /// Lets time go by: the clock jumps from deadline to deadline.
+    /// Advances time: the clock jumps from deadline to deadline.
     pub fn run(&mut self, span: Duration) {
         let end = self.now + span;
         let mut turns_at_once = 0_u32;
@@ -31,7 +31,7 @@ impl Cell {
         }
     }
 
-    /// Everything that is due now, once.
+    /// Handles everything that is due now, once.
     fn turn(&mut self) {
         if let Some(due) = self.queue.pop_due(self.now) {
             self.carry_out(due);
@@ -71,7 +71,7 @@ impl Cell {
         }
     }
 
-    /// Both are told that their ports are there.
+    /// Reports to both that their ports are up.
     pub(super) fn switch_on(&mut self) {
         let ports: Vec<_> = self.engine.field_ports().collect();
         for port in ports {
@@ -142,7 +142,7 @@ impl Cell {
         }
     }
 
-    /// Carries out what the engine wants; false when that is nothing more.
+    /// Carries out the engine's output; false if it was `Sleep`.
     fn hand_over(&mut self, output: Output<'_>) -> bool {
         let now = self.now;
         if let Some(recorder) = &mut self.recorder {
@@ -337,8 +337,8 @@ impl Cell {
         }
     }
 
-    /// A datagram came to a port where the gateway listens: it answers whoever opened, and moves only
-    /// to the sender of a frame.
+    /// A datagram came to a port where the gateway listens: it answers the first sender, and later
+    /// moves only to the sender of a frame.
     fn client_datagram(&mut self, link: LinkId, from: Speaker, bytes: &[u8]) {
         let gate = self.gate(link);
         if gate.is_cut(Way::Down) && from != Speaker::Stranger || !gate.is_open {
@@ -359,7 +359,7 @@ impl Cell {
         }
     }
 
-    /// The controller's inputs, when somebody is to compare them.
+    /// The controller's inputs, if a model compares them.
     pub(super) fn inputs_before(&self) -> Option<Vec<u8>> {
         self.oracle.as_ref().map(|_| self.inputs())
     }
@@ -380,7 +380,7 @@ impl Cell {
     }
 }
 
-/// A frame as the trace shows it.
+/// A frame in the form of the trace.
 pub(super) fn can_bytes(frame: &CanFrame) -> Vec<u8> {
     let id = match frame.id() {
         CanId::Standard(id) => u32::from(id),

@@ -1,4 +1,4 @@
-//! What is to happen in the cell at a later instant.
+//! Events of the cell at a later instant.
 
 use std::net::SocketAddr;
 
@@ -9,7 +9,7 @@ use super::line::Chunk;
 use super::network::{Speaker, Way};
 use super::{BusId, LineId};
 
-/// What is to happen at a later instant.
+/// An event at a later instant.
 #[derive(Debug)]
 pub(super) enum Due {
     LinkUp {
@@ -59,7 +59,7 @@ pub(super) enum Due {
         line: LineId,
         chunk: Chunk,
     },
-    /// What the line has gathered is handed over.
+    /// Bytes gathered by the line are handed over.
     Gathered {
         line: LineId,
     },
@@ -70,43 +70,43 @@ pub(super) enum Due {
         line: LineId,
         bytes: Vec<u8>,
     },
-    /// TCP itself gives a dead connection up.
+    /// TCP gives up a dead connection.
     TimedOut {
         conn: u64,
     },
-    /// A connection is asked for again.
+    /// A connection attempt is repeated.
     Knock {
         link: LinkId,
         turn: u64,
         pause: Duration,
     },
-    /// The gateway's reset comes to the controller.
+    /// The gateway's reset arrives at the controller.
     ResetUp {
         conn: u64,
     },
-    /// The controller's comes to the gateway.
+    /// The controller's reset arrives at the gateway.
     ResetDown {
         conn: u64,
     },
-    /// What was lost of a connection is sent again.
+    /// Lost data of a connection is sent again.
     SendAgain {
         conn: u64,
         way: Way,
     },
-    /// The controller's TCP acknowledges what has come.
+    /// The controller's TCP acknowledges received data.
     AckLeaves {
         conn: u64,
     },
-    /// Its acknowledgement comes to the gateway.
+    /// That acknowledgement arrives at the gateway.
     Ack {
         conn: u64,
         upto: u64,
     },
-    /// The gateway's transport looks whether nothing was acknowledged for too long.
+    /// The gateway's transport checks whether nothing was acknowledged for too long.
     UserTimeout {
         conn: u64,
     },
-    /// The gateway's driver looks at what is acknowledged.
+    /// The gateway's driver reads what is acknowledged.
     Look {
         link: LinkId,
         turn: u64,
@@ -115,6 +115,6 @@ pub(super) enum Due {
     Wake {
         turn: u64,
     },
-    /// The model that watches looks at how everything is.
+    /// The model takes a look at the state of everything.
     Survey,
 }

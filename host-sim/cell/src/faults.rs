@@ -1,4 +1,4 @@
-//! What a test or a soak run can break in the cell, and mend.
+//! Faults that a test or a soak run can inject, and their repair.
 
 use proto_core::engine::{BusState, Engine, Input, LinkId, LinkKind};
 
@@ -11,12 +11,12 @@ use super::{BusId, Cell, Entry, LineId, Owner, What};
 
 /// Faults of the network.
 impl Cell {
-    /// New connections are refused; of a datagram link, everything is lost.
+    /// New connections are refused; on a datagram link, everything is lost.
     pub fn refuse(&mut self, link: LinkId) {
         self.set_door(link, Door::Refuses);
     }
 
-    /// New connections get no answer at all; of a datagram link, everything is lost.
+    /// New connections get no answer; on a datagram link, everything is lost.
     pub fn black_hole(&mut self, link: LinkId) {
         self.set_door(link, Door::Silent);
     }
@@ -26,7 +26,7 @@ impl Cell {
         self.set_door(link, Door::Open);
     }
 
-    /// The link's connection is reset: both ends are told, what was under way is lost.
+    /// The link's connection is reset: both ends are told, and data in flight is lost.
     pub fn reset(&mut self, link: LinkId) {
         self.note(link);
         if let Some(conn) = self.gate(link).conn {
@@ -34,7 +34,7 @@ impl Cell {
         }
     }
 
-    /// The connection is reset when so many more bytes have arrived.
+    /// The connection is reset after this many more bytes have arrived.
     pub fn reset_after(&mut self, link: LinkId, way: Way, bytes: usize) {
         self.note(link);
         if let Some(conn) = self.connection(link) {
@@ -42,7 +42,7 @@ impl Cell {
         }
     }
 
-    /// Nothing arrives any more in this direction, until [`Self::release`]; nothing is lost.
+    /// Nothing arrives any more in this direction until [`Self::release`]; nothing is lost.
     pub fn hold(&mut self, link: LinkId, way: Way) {
         self.note(link);
         if let Some(conn) = self.connection(link) {
@@ -50,7 +50,7 @@ impl Cell {
         }
     }
 
-    /// What was held arrives now, in as few pieces as it can.
+    /// Held data arrives now, in as few pieces as possible.
     pub fn release(&mut self, link: LinkId, way: Way) {
         self.note(link);
         let Some(id) = self.gate(link).conn else { return };
@@ -64,14 +64,15 @@ impl Cell {
         }
     }
 
-    /// What goes this way on the link is lost from now on, until as many [`Self::mend_way`]: a burst
-    /// of lost datagrams; a peer whose TCP acknowledges nothing, or takes nothing. TCP sends it again.
+    /// Everything that goes this way on the link is lost from now on, until as many
+    /// [`Self::mend_way`]: a burst of lost datagrams; a peer whose TCP acknowledges or accepts
+    /// nothing. TCP sends it again.
     pub fn cut_way(&mut self, link: LinkId, way: Way) {
         self.note(link);
         self.gate(link).cuts[way as usize] += 1;
     }
 
-    /// What is sent from now on arrives.
+    /// Data sent from now on arrives.
     pub fn mend_way(&mut self, link: LinkId, way: Way) {
         self.note(link);
         let cuts = &mut self.gate(link).cuts[way as usize];
@@ -88,15 +89,16 @@ impl Cell {
         Way::BOTH.into_iter().for_each(|way| self.mend_way(link, way));
     }
 
-    /// Somebody else on the controller's host sends a datagram to a port where the gateway listens.
+    /// Another program on the controller's host sends a datagram to a port where the gateway
+    /// listens.
     pub fn stranger_sends(&mut self, link: LinkId, bytes: &[u8]) {
         self.note(link);
         let due = Due::ClientDatagramDown { link, from: Speaker::Stranger, bytes: bytes.to_vec() };
         self.queue.push(self.now, due);
     }
 
-    /// The connection is gone and neither end is told: what they send is lost for ever. TCP itself
-    /// finds out after [`TCP_TIMEOUT`].
+    /// The connection is gone and neither end is told: data that they send is lost. TCP notices
+    /// after [`TCP_TIMEOUT`].
     pub fn half_open(&mut self, link: LinkId) {
         self.note(link);
         let Some(id) = self.gate(link).conn else { return };
@@ -112,8 +114,8 @@ impl Cell {
         self.gates.get(&link).is_some_and(|gate| gate.conn.is_some())
     }
 
-    /// The next state packet lacks its first bytes, and the connection goes on: all packets after it
-    /// begin at another place.
+    /// The next state packet lacks its first bytes, and the connection continues: all later packets
+    /// are misaligned.
     pub fn lose_state_bytes(&mut self, count: usize) {
         self.note(LinkId::STATE);
         self.state_bytes_lost = count;
@@ -124,7 +126,7 @@ impl Cell {
         self.gate(link).door = door;
     }
 
-    /// Words for whoever reads the trace.
+    /// A note in the trace.
     pub(super) fn remark(&mut self, words: std::fmt::Arguments<'_>) {
         self.trace.remark(self.now, words);
     }
@@ -156,7 +158,7 @@ impl Cell {
 
 /// Faults of the field.
 impl Cell {
-    /// The line is cut: bytes are lost, and nobody is told.
+    /// The line is cut: bytes are lost, and neither end is told.
     pub fn cut(&mut self, line: LineId) {
         self.lines[line.0].connected = false;
     }
@@ -179,7 +181,7 @@ impl Cell {
         self.port_input(self.lines[line.0].owner, true);
     }
 
-    /// The bus is cut: frames are lost, and nobody is told.
+    /// The bus is cut: frames are lost, and neither end is told.
     pub fn cut_bus(&mut self, bus: BusId) {
         self.buses[bus.0].connected = false;
     }
@@ -189,7 +191,8 @@ impl Cell {
         self.buses[bus.0].connected = true;
     }
 
-    /// The port's CAN controller goes bus-off: its waiting frames are lost, and it hears nothing.
+    /// The port's CAN controller goes bus-off: its waiting frames are lost, and it receives
+    /// nothing.
     pub fn bus_off(&mut self, bus: BusId) {
         self.buses[bus.0].drop_port_frames();
         self.buses[bus.0].is_off = true;
@@ -220,7 +223,7 @@ impl Cell {
         self.begun_anew();
     }
 
-    /// The same, and all its registers are 0.
+    /// Same, and all its registers are 0.
     pub fn clear_controller(&mut self) {
         let now = self.now;
         self.trace.add(now, What::Fault, Entry::CONTROLLER, &[0]);
@@ -228,8 +231,8 @@ impl Cell {
         self.begun_anew();
     }
 
-    /// The controller loses its power: its ends of all connections are gone without a word, and nobody
-    /// is there. [`Self::power_up`] ends it.
+    /// The controller loses power: its ends of all connections are gone without notice.
+    /// [`Self::power_up`] ends it.
     pub fn power_cut(&mut self) {
         let links: Vec<LinkId> = self.link_ids().collect();
         links.into_iter().for_each(|link| self.cut_cable(link));
@@ -239,7 +242,7 @@ impl Cell {
             match peer {
                 _ if conn.forgotten => continue,
                 _ if conn.abandoned || conn.closing => drop(self.drop_conn(id)),
-                // The gateway goes on asking.
+                // The gateway keeps trying to connect.
                 Peer::Server(_) if !conn.accepted => continue,
                 Peer::Client(_) if !conn.accepted => {
                     let link = conn.link;
@@ -255,7 +258,7 @@ impl Cell {
         }
     }
 
-    /// It has power again, and begins afresh with all registers at 0.
+    /// Power is back; the controller starts with all registers at 0.
     pub fn power_up(&mut self) {
         let links: Vec<LinkId> = self.link_ids().collect();
         links.into_iter().for_each(|link| self.mend_cable(link));
@@ -269,7 +272,7 @@ impl Cell {
         }
     }
 
-    /// The controller comes back with software that speaks this dialect.
+    /// The controller restarts with software that has this dialect.
     pub fn replace_controller(&mut self, dialect: &str) {
         let now = self.now;
         self.trace.add(now, What::Fault, Entry::CONTROLLER, dialect.as_bytes());
@@ -277,8 +280,8 @@ impl Cell {
         self.begun_anew();
     }
 
-    /// The gateway loses its power and starts again: its connections are reset, its counters
-    /// begin afresh.
+    /// The gateway loses power and restarts: its connections are reset, and its counters start at
+    /// 0.
     pub fn restart_gateway(&mut self) {
         self.trace.add(self.now, What::Fault, Entry::GATEWAY, &[]);
         let known = self.conns.iter().filter(|(_, conn)| !conn.forgotten);

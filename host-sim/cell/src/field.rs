@@ -1,4 +1,4 @@
-//! What travels between ports and their devices: bytes on lines, frames on buses.
+//! Traffic between ports and their devices: bytes on lines, frames on buses.
 
 use proto_core::time::Instant;
 use proto_core::wire::can::CanFrame;

@@ -1,9 +1,9 @@
 //! A whole cell in virtual time: the gateway engine and the simulated controller, joined by
 //! simulated networks, RS-485 lines and CAN buses on one clock that jumps to the next deadline.
 //!
-//! In: a gateway configuration, a controller configuration and a seed. Out: whatever happens, the
-//! same for the same seed ([`Cell::trace`] has a digest to compare). Hours of a cell take seconds.
-//! Knows no socket, no device and no clock (docs/cell.md).
+//! In: a gateway configuration, a controller configuration and a seed. Out: everything that
+//! happens, the same for the same seed ([`Cell::trace`] has a digest to compare). Hours of a cell
+//! take seconds. Does not know sockets, devices or the host's clock (docs/cell.md).
 //!
 //! ```
 //! use proto_core::time::Duration;
@@ -21,9 +21,9 @@
 //! assert_eq!(cell.value("DO[1]"), 1.0);
 //! ```
 //!
-//! What can go wrong is a method of [`Cell`] (of its networks: refuse, lose, hold, reset, half
-//! open), a field of a [`Line`], a [`CanBus`] or a [`Network`] (noise, loss, splits), or a method
-//! of [`Cell::controller_mut`]. [`Trouble`] does all of it by chance.
+//! Each fault is a method of [`Cell`] (of its networks: refuse, lose, hold, reset, half open), a
+//! field of a [`Line`], a [`CanBus`] or a [`Network`] (noise, loss, splits), or a method of
+//! [`Cell::controller_mut`]. [`Trouble`] injects all of them at random.
 
 mod can;
 mod connection;
@@ -85,7 +85,7 @@ pub struct LineId(usize);
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub struct BusId(usize);
 
-/// Whose port is on a line or bus.
+/// The owner of the port on a line or bus.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Owner {
     Gateway(PortId),
@@ -99,7 +99,7 @@ enum End {
     Device = 1,
 }
 
-/// Why there is no cell.
+/// Why a cell cannot be made.
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
 pub enum CellError {
@@ -127,7 +127,7 @@ struct Client {
     link: Option<LinkId>,
     is_tcp: bool,
     conn: Option<u64>,
-    /// Which socket it sends datagrams from.
+    /// The socket from which it sends datagrams.
     socket: u64,
 }
 
@@ -149,27 +149,27 @@ pub struct Cell {
     buses: Vec<CanBus>,
     names: BTreeMap<String, Far>,
     controller_names: BTreeMap<String, Far>,
-    /// What waits for the gateway while it is not called.
+    /// Events that wait for the gateway while it is not called.
     asleep: Option<sleep::Waiting>,
     wakes_at: Instant,
     stalls: u64,
-    /// How many faults each of the controller's servers has at present.
+    /// Number of present faults of each of the controller's servers.
     ailments: [u32; 3],
     rng: Rng,
     trace: Trace,
     recorder: Option<Recorder>,
-    /// Checks everything, when it was asked to.
+    /// Checks everything, if requested.
     oracle: Option<Box<Oracle>>,
-    /// Makes a bad gateway of a good one.
+    /// Makes a broken gateway of a correct one.
     #[cfg(test)]
     tamper: Option<tamper::Tamper>,
-    /// What the controller has sent to [`Cell::ask`]'s own connection.
+    /// What the controller has sent on [`Cell::ask`]'s connection.
     asked: Vec<u8>,
-    /// Bytes that the next state packet lacks.
+    /// Number of bytes that the next state packet lacks.
     state_bytes_lost: usize,
 }
 
-/// What is at a port.
+/// What is connected to a port.
 #[derive(Debug, Clone, Copy)]
 enum Far {
     Line(LineId),
@@ -177,20 +177,20 @@ enum Far {
 }
 
 impl Cell {
-    /// A cell in which everything is switched on now. Field ports have nothing attached yet, and
-    /// no link is up before time has passed.
+    /// A cell in which everything is switched on now. Field ports have no devices yet, and no link
+    /// is up before time has passed.
     ///
     /// # Errors
-    /// [`CellError`] when one of the two cannot run its configuration.
+    /// [`CellError`] if one of the two cannot run its configuration.
     pub fn new(gateway: &GatewayConfig, controller: &SimConfig, seed: u64) -> Result<Self, CellError> {
         Self::build(gateway, controller, seed, None)
     }
 
-    /// The same, and everything that goes into the engine and comes out of it is recorded from the
-    /// start: [`Self::into_recording`].
+    /// Same, and all inputs and outputs of the engine are recorded from the start:
+    /// [`Self::into_recording`].
     ///
     /// # Errors
-    /// As [`Self::new`].
+    /// Same as [`Self::new`].
     pub fn recorded(gateway: &GatewayConfig, controller: &SimConfig, seed: u64) -> Result<Self, CellError> {
         Self::build(gateway, controller, seed, Some(Recorder::new(gateway)))
     }
@@ -237,9 +237,9 @@ impl Cell {
         Ok(cell)
     }
 
-    /// From now on everything that the gateway does is checked against a model of its own
-    /// (docs/cell.md section 4); time stands still after the first violation. To be called before
-    /// time has passed.
+    /// From now on everything that the gateway does is checked against an independent model
+    /// (docs/cell.md section 4); time stops after the first violation. Call it before time has
+    /// passed.
     pub fn watch(&mut self) {
         let mut oracle = Box::new(Oracle::new(&self.gateway));
         oracle.begin(&self.engine, self.engine_wake, self.now);
@@ -247,28 +247,28 @@ impl Cell {
         self.queue.push(self.now, Due::Survey);
     }
 
-    /// The first invariant that did not hold.
+    /// The first violation.
     pub fn violation(&self) -> Option<&Violation> {
         self.oracle.as_ref().and_then(|oracle| oracle.violation())
     }
 
-    /// How often each invariant was looked at.
+    /// Number of checks of each invariant.
     pub fn checks(&self) -> BTreeMap<Invariant, u64> {
         self.oracle.as_ref().map(|oracle| oracle.checks()).unwrap_or_default()
     }
 
-    /// How many values written to the controller were judged.
+    /// Number of values written to the controller that were checked.
     pub fn watched_writes(&self) -> u64 {
         self.oracle.as_ref().map_or(0, |oracle| oracle.writes)
     }
 
-    /// Frames in and out of a field port, restarts of the gateway notwithstanding.
+    /// Frames in and out of a field port, counted across restarts of the gateway.
     pub fn watched_frames(&self, port: PortId) -> (u64, u64) {
         let frames = self.oracle.as_ref().and_then(|oracle| oracle.frames.get(usize::from(port.0)));
         frames.copied().unwrap_or_default()
     }
 
-    /// What was sent and what was received on a link, in calls.
+    /// Number of sends and receives on a link.
     pub fn watched_link(&self, link: LinkId) -> (u64, u64) {
         self.oracle.as_ref().map(|oracle| oracle.traffic[oracle::place(link)]).unwrap_or_default()
     }
@@ -343,7 +343,7 @@ impl Cell {
         &self.gateway
     }
 
-    /// How many transmissions each line and bus keeps for a look; [`MAX_HEARD`] at first.
+    /// How many transmissions each line and bus keeps for inspection; initially [`MAX_HEARD`].
     pub fn keep_heard(&mut self, limit: usize) {
         self.lines.iter_mut().for_each(|line| line.keep_heard = limit);
         self.buses.iter_mut().for_each(|bus| bus.keep_heard = limit);
@@ -359,8 +359,7 @@ impl Cell {
         &self.controller
     }
 
-    /// The controller, to break or change something in it; what follows happens with the next
-    /// [`Self::run`].
+    /// The controller, mutable, to inject faults; the effects begin with the next [`Self::run`].
     pub fn controller_mut(&mut self) -> &mut Controller {
         self.controller_wake = self.now;
         &mut self.controller
@@ -369,16 +368,16 @@ impl Cell {
     /// The controller's item of this name, such as `DO[1]` or `WordInputReg[3]`.
     ///
     /// # Panics
-    /// When there is no such item.
+    /// If there is no such item.
     #[track_caller]
     pub fn value(&self, name: &str) -> f64 {
         self.controller.registers().value(target(name))
     }
 
-    /// Gives an item of the controller a value from outside, such as an input that is wired.
+    /// Sets an item of the controller from outside, such as an input that is wired.
     ///
     /// # Panics
-    /// When there is no such item or it does not take the value.
+    /// If there is no such item, or it does not take the value.
     #[track_caller]
     pub fn set_value(&mut self, name: &str, value: f64) {
         if let Err(error) = self.controller_mut().force(target(name), value) {
@@ -389,7 +388,7 @@ impl Cell {
     /// A link of the gateway.
     ///
     /// # Panics
-    /// When the configuration needs no such link.
+    /// If the configuration does not need this link.
     #[track_caller]
     pub fn link(&self, id: LinkId) -> LinkInfo<'_> {
         match self.engine.links().find(|link| link.id == id) {
@@ -401,7 +400,7 @@ impl Cell {
     /// The counters of the gateway's field port of this name.
     ///
     /// # Panics
-    /// When there is no such field port.
+    /// If there is no such field port.
     #[track_caller]
     pub fn port(&self, name: &str) -> &PortCounters {
         let nth = self.gateway.ports.iter().position(|port| port.name == name);
@@ -411,10 +410,10 @@ impl Cell {
         }
     }
 
-    /// The line of the gateway's RS-485 port of this name, or else of the controller's.
+    /// The line of the gateway's RS-485 port of this name, otherwise of the controller's.
     ///
     /// # Panics
-    /// When neither has one.
+    /// If neither has one.
     #[track_caller]
     pub fn line_of(&self, port: &str) -> LineId {
         match self.names.get(port).or_else(|| self.controller_names.get(port)) {
@@ -423,10 +422,10 @@ impl Cell {
         }
     }
 
-    /// The bus of the gateway's CAN port of this name, or else of the controller's.
+    /// The bus of the gateway's CAN port of this name, otherwise of the controller's.
     ///
     /// # Panics
-    /// When neither has one.
+    /// If neither has one.
     #[track_caller]
     pub fn bus_of(&self, port: &str) -> BusId {
         match self.names.get(port).or_else(|| self.controller_names.get(port)) {
@@ -445,26 +444,26 @@ impl Cell {
         (0..self.buses.len()).map(BusId)
     }
 
-    /// A line, to look at and to change.
+    /// A line, to inspect and to change.
     pub fn line(&mut self, id: LineId) -> &mut Line {
         &mut self.lines[id.0]
     }
 
-    /// A bus, to look at and to change.
+    /// A bus, to inspect and to change.
     pub fn bus(&mut self, id: BusId) -> &mut CanBus {
         &mut self.buses[id.0]
     }
 
-    /// How a link's network behaves, to look at and to change.
+    /// The network of a link, to inspect and to change.
     ///
     /// # Panics
-    /// When the configuration needs no such link.
+    /// If the configuration does not need this link.
     #[track_caller]
     pub fn network(&mut self, link: LinkId) -> &mut Network {
         &mut self.gate(link).network
     }
 
-    /// How the network of each link behaves.
+    /// The network of each link.
     pub fn networks(&self) -> BTreeMap<LinkId, Network> {
         self.gates.iter().map(|(&link, gate)| (link, gate.network)).collect()
     }
@@ -476,17 +475,17 @@ impl Cell {
         }
     }
 
-    /// Attaches a device to a line; it replaces the one before.
+    /// Attaches a device to a line; it replaces the previous one.
     pub fn attach(&mut self, line: LineId, device: impl Device<Vec<u8>> + 'static) {
         self.lines[line.0].device = Some(Box::new(device));
     }
 
-    /// Attaches a device to a bus; it replaces the one before.
+    /// Attaches a device to a bus; it replaces the previous one.
     pub fn attach_can(&mut self, bus: BusId, device: impl Device<CanFrame> + 'static) {
         self.buses[bus.0].device = Some(Box::new(device));
     }
 
-    /// The device on the line sends, as soon as what it sent before has left.
+    /// The device on the line sends, as soon as its previous transmission has left.
     pub fn send(&mut self, line: LineId, bytes: &[u8]) {
         self.transmit(line, End::Device, bytes);
     }
@@ -501,17 +500,17 @@ impl Cell {
         self.transmit_can(bus, End::Device, frame);
     }
 
-    /// What happened.
+    /// The trace.
     pub fn trace(&self) -> &Trace {
         &self.trace
     }
 
-    /// Keeps the next `limit` things that happen in full.
+    /// Keeps the next `limit` entries of the trace in full.
     pub fn keep_trace(&mut self, limit: usize) {
         self.trace.keep(limit);
     }
 
-    /// What [`Self::recorded`] recorded, as `proto_core::record` reads it; empty when nothing was.
+    /// The recording of [`Self::recorded`], as `proto_core::record` reads it; empty without one.
     pub fn into_recording(self) -> Vec<u8> {
         self.recorder.map_or_else(Vec::new, |mut recorder| {
             recorder.totals(&self.engine);
@@ -519,13 +518,12 @@ impl Cell {
         })
     }
 
-    /// A generator that belongs to the cell's seed.
+    /// A generator derived from the cell's seed.
     pub fn fork_rng(&mut self) -> Rng {
         self.rng.fork()
     }
 
-    /// What the controller replies to a command of a client beside the gateway, at once or within
-    /// half a second.
+    /// The controller's reply to a command of another client, at once or within half a second.
     pub fn ask(&mut self, command: &str) -> String {
         let line = format!("{command}\r\n");
         self.asked.clear();
@@ -536,8 +534,8 @@ impl Cell {
         String::from_utf8_lossy(&self.asked).into_owned()
     }
 
-    /// Lets time go by until `done` holds or `limit` has passed; returns whether it held. It is
-    /// looked at every millisecond.
+    /// Advances time until `done` holds or `limit` has passed; returns whether it held. It is
+    /// checked every millisecond.
     pub fn run_until(&mut self, limit: Duration, mut done: impl FnMut(&Self) -> bool) -> bool {
         let end = self.now + limit;
         loop {
@@ -551,7 +549,7 @@ impl Cell {
         }
     }
 
-    /// The same in milliseconds.
+    /// Same, in milliseconds.
     pub fn run_ms(&mut self, millis: u64) {
         self.run(Duration::from_millis(millis));
     }
@@ -573,19 +571,19 @@ fn target(name: &str) -> InitialTarget {
     }
 }
 
-/// The gateway's address for the controller's UDP server: a new one with each opening, as a new
-/// socket has.
+/// The gateway's address for the controller's UDP server: a new one each time the link is opened,
+/// as a new socket has.
 fn udp_peer(turn: u64) -> SocketAddr {
     (HERE, 40_000 + (turn % 10_000) as u16).into()
 }
 
-/// Where every client of the controller is.
+/// The address of every client of the controller.
 const HERE: IpAddr = IpAddr::V4(Ipv4Addr::LOCALHOST);
 /// The connection of [`Cell::ask`].
 const DESK: ConnId = ConnId(u64::MAX);
 /// Not zero, so that nothing depends on the clock's origin, and on no grid of the engine.
 const START: Instant = Instant::from_micros(1_000_000_300);
-/// How long the controller's TCP client waits before it connects again.
+/// The wait of the controller's TCP client before it connects again.
 const CLIENT_RETRY: Duration = Duration::from_millis(250);
 
 #[cfg(test)]

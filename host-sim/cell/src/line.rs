@@ -12,36 +12,36 @@ use super::{End, Owner};
 /// How the receiver's driver hands bytes over.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Chunking {
-    /// Each transmission in one piece, when its last byte has come.
+    /// Each transmission in one piece, when its last byte has arrived.
     Whole,
-    /// In pieces of so many bytes, each when its last byte has come.
+    /// In pieces of this many bytes, each when its last byte has arrived.
     Pieces(usize),
-    /// In pieces of 1 to so many bytes.
+    /// In pieces of 1 to this many bytes.
     Random(usize),
-    /// As a USB adapter does: what the device has sent lies in a buffer, which is handed over at each
-    /// multiple of this time.
+    /// Like a USB adapter: received bytes are buffered and handed over at each multiple of this
+    /// time.
     Gathered(Duration),
 }
 
 /// How the two ends are joined.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Wiring {
-    /// Both speak on one pair: what is sent at the same time is garbled for both.
+    /// Both use one pair: simultaneous transmissions are garbled for both.
     TwoWire,
-    /// A pair for each direction, as a pseudoterminal has it.
+    /// A pair for each direction, as on a pseudoterminal.
     FourWire,
 }
 
-/// What happened on a line, beside what its ends count.
+/// Counters of a line, in addition to those of its ends.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct LineCounters {
     /// Transmissions of the device.
     pub device_sent: u64,
-    /// Bytes of them.
+    /// Their bytes.
     pub device_bytes: u64,
     /// Transmissions of the port.
     pub port_sent: u64,
-    /// Bytes of them.
+    /// Their bytes.
     pub port_bytes: u64,
     /// Transmissions that began while the other end was sending.
     pub overlaps: u64,
@@ -59,9 +59,9 @@ pub struct Line {
     pub chunking: Chunking,
     /// How the ends are joined.
     pub wiring: Wiring,
-    /// How many bytes of a million have a bit flipped.
+    /// Number of bytes per million that have a bit flipped.
     pub noise_ppm: u32,
-    /// What happened.
+    /// Counters.
     pub counters: LineCounters,
     pub(super) connected: bool,
     pub(super) device: Option<Box<dyn Device<Vec<u8>>>>,
@@ -69,7 +69,7 @@ pub struct Line {
     collision: (Instant, Instant),
     heard: VecDeque<(Instant, Vec<u8>)>,
     pub(super) keep_heard: usize,
-    /// What has been gathered and not been handed over.
+    /// Bytes gathered and not handed over yet.
     pub(super) gathered: Vec<u8>,
     rng: Rng,
 }
@@ -126,13 +126,13 @@ impl Line {
         self.busy_until[End::Device as usize]
     }
 
-    /// What the port has sent since the last look, each transmission with the time of its last
-    /// byte. The newest [`MAX_HEARD`] are kept.
+    /// The transmissions of the port since the last call, each with the time of its last byte. The
+    /// newest [`MAX_HEARD`] are kept.
     pub fn take_heard(&mut self) -> Vec<(Instant, Vec<u8>)> {
         self.heard.drain(..).collect()
     }
 
-    /// Puts a transmission on the line; `each` is told when each of its pieces will have come, in
+    /// Starts a transmission on the line; `each` gets the time at which each piece has arrived, in
     /// order.
     pub(super) fn send(
         &mut self,
@@ -179,7 +179,7 @@ impl Line {
         }
     }
 
-    /// Changes a piece to what arrives of it; false when the line is cut.
+    /// Changes a piece to what arrives of it; false if the line is cut.
     pub(super) fn deliver(&mut self, now: Instant, chunk: &mut Chunk) -> bool {
         if !self.connected {
             self.counters.lost_bytes += chunk.bytes.len() as u64;
@@ -196,7 +196,7 @@ impl Line {
         true
     }
 
-    /// Keeps what the port has sent.
+    /// Keeps a transmission of the port.
     pub(super) fn hear(&mut self, now: Instant, bytes: &[u8], is_first: bool) {
         if let Some(newest) = self.heard.back_mut().filter(|_| !is_first) {
             newest.0 = now;
@@ -212,11 +212,11 @@ impl Line {
         self.heard.push_back((now, bytes.to_vec()));
     }
 
-    /// The time that so many bytes take.
+    /// The time that this many bytes take.
     pub fn time_of(&self, len: usize) -> Duration {
         self.settings.time_on_line(len)
     }
 }
 
-/// Transmissions or frames kept for a look.
+/// Number of transmissions or frames kept for inspection.
 pub const MAX_HEARD: usize = 100_000;

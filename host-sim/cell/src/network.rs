@@ -5,31 +5,31 @@ use proto_core::time::{Duration, Instant};
 
 use super::rng::Rng;
 
-/// How one link's network behaves.
+/// The behaviour of one link's network.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Network {
-    /// From one end to the other.
+    /// Delay from one end to the other.
     pub delay: Duration,
-    /// Up to this much is added, by chance, to each segment or datagram. Segments keep their
+    /// Up to this much random delay is added to each segment or datagram. Segments keep their
     /// order, datagrams do not.
     pub jitter: Duration,
-    /// What is sent on a connection is cut into segments of 1 to so many bytes, by chance.
+    /// Data sent on a connection is cut into segments of 1 to this many bytes, at random.
     pub longest_segment: Option<usize>,
-    /// A segment waits up to this long, by chance, for the next one, and comes in one piece with
+    /// A segment waits up to this long, at random, for the next one, and arrives in one piece with
     /// it.
     pub merge: Duration,
-    /// How many datagrams of a million are lost.
+    /// Number of datagrams per million that are lost.
     pub loss_ppm: u32,
-    /// How many of a million come twice.
+    /// Number per million that arrive twice.
     pub duplicate_ppm: u32,
-    /// The controller's TCP acknowledges this long after something has come, unless it has something
-    /// to send before.
+    /// The controller's TCP acknowledges this long after data has arrived, unless it sends
+    /// something before.
     pub ack_delay: Duration,
-    /// The gateway's driver looks this often at what is acknowledged, and each time before it hands
-    /// over what was received; zero: it is told at once.
+    /// The gateway's driver reads the acknowledgements at this interval, and before it hands over
+    /// received data; zero: it is told at once.
     pub ack_report: Duration,
-    /// How many bytes the gateway's transport keeps that are not acknowledged; behind that the driver
-    /// waits for room before it reports a transmission as taken.
+    /// How many unacknowledged bytes the gateway's transport keeps; beyond that the driver waits
+    /// for room before it reports a transmission as taken.
     pub send_buffer: u64,
 }
 
@@ -51,13 +51,13 @@ impl Default for Network {
 }
 
 impl Network {
-    /// How long a segment or datagram takes at most when nothing is broken.
+    /// The longest time that a segment or datagram takes without faults.
     pub fn slowest(&self) -> Duration {
         self.delay + self.jitter + self.merge
     }
 }
 
-/// Which way something goes.
+/// A direction.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Way {
     /// From the gateway to the controller.
@@ -78,7 +78,7 @@ impl Way {
     }
 }
 
-/// What becomes of an attempt to connect.
+/// The result of an attempt to connect.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Door {
     Open,
@@ -93,26 +93,27 @@ pub(super) struct Gate {
     pub kind: LinkKind,
     pub network: Network,
     pub door: Door,
-    /// What goes this way is lost, by [`Way`]: so many faults want it so.
+    /// Number of faults that make data in this direction be lost, by [`Way`].
     pub cuts: [u32; 2],
     pub is_open: bool,
     pub is_up: bool,
-    /// One more with each opening and closing: reports of an earlier turn are dropped.
+    /// Incremented each time the link is opened or closed: older reports are dropped.
     pub turn: u64,
     pub conn: Option<u64>,
-    /// The transport has no room for what was handed over last: nothing was reported of it yet.
+    /// The transport has no room for the last data handed over, which has not been reported as
+    /// taken yet.
     pub is_full: bool,
-    /// The driver is going to look at what is acknowledged.
+    /// The driver is going to read the acknowledgements.
     pub looks: bool,
-    /// Whom the gateway answers, where it listens for datagrams.
+    /// The peer that the gateway answers, where it listens for datagrams.
     pub partner: Option<Speaker>,
     pub rng: Rng,
 }
 
-/// Who sends datagrams to a port where the gateway listens.
+/// Senders of datagrams to a port where the gateway listens.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Speaker {
-    /// The controller's client; its socket is another one after each restart.
+    /// The controller's client; it has a new socket after each restart.
     Client { socket: u64 },
     /// Another program on the controller's host.
     Stranger,
@@ -142,7 +143,7 @@ impl Gate {
         self.cuts[way as usize] > 0
     }
 
-    /// Datagrams that go this way are lost altogether.
+    /// All datagrams in this direction are lost.
     pub(super) fn swallows(&self, way: Way) -> bool {
         self.door != Door::Open || self.is_cut(way)
     }

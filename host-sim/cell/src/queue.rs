@@ -1,11 +1,11 @@
-//! What is due when, in the order of time and, at one instant, of arrival.
+//! A queue of events, ordered by time and, at one instant, by arrival.
 
 use std::cmp::Ordering;
 use std::collections::BinaryHeap;
 
 use proto_core::time::Instant;
 
-/// Things to be done later.
+/// Events for later.
 #[derive(Debug)]
 pub(super) struct Queue<T> {
     entries: BinaryHeap<Entry<T>>,
@@ -45,7 +45,7 @@ impl<T> Queue<T> {
     }
 }
 
-/// The earliest is the greatest: that is the one a heap gives back first.
+/// The earliest is the greatest, because a heap returns the greatest first.
 impl<T> Ord for Entry<T> {
     fn cmp(&self, other: &Self) -> Ordering {
         (other.at, other.nth).cmp(&(self.at, self.nth))

@@ -1,9 +1,9 @@
 //! A gateway that is not called for a while: its process was stopped, or its machine was busy or
-//! suspended. Everything else goes on, and what comes for it waits where a kernel keeps it.
+//! suspended. Everything else continues, and input for it waits where a kernel keeps it.
 //!
-//! Bounds: 4 KiB of a line, 256 frames of a bus, 256 datagrams of a link; what comes beyond them is
-//! lost. Connections lose nothing: what does not fit stays with the sender. What was handed over
-//! before goes on being sent, acknowledged and sent again by the kernel.
+//! Bounds: 4 KiB per line, 256 frames per bus, 256 datagrams per link; more is lost. Connections
+//! lose nothing: what does not fit stays with the sender. The kernel continues to send, acknowledge
+//! and repeat what was handed over before.
 
 use proto_core::engine::{BusState, Input, LinkId, PortId};
 use proto_core::time::Duration;
@@ -13,7 +13,7 @@ use super::due::Due;
 use super::network::Way;
 use super::{Cell, What};
 
-/// What waits for the gateway.
+/// Events that wait for the gateway.
 #[derive(Debug, Default)]
 pub(super) struct Waiting {
     /// Of several stalls that overlap, only the one that ends last wakes it.
@@ -22,7 +22,7 @@ pub(super) struct Waiting {
     links: Vec<Due>,
 }
 
-/// Something that a port has to tell.
+/// An event of a port.
 #[derive(Debug)]
 pub(super) enum Told {
     Up,
@@ -34,8 +34,8 @@ pub(super) enum Told {
 }
 
 impl Cell {
-    /// The gateway is not called for so long; then it is told everything that waits, and then that
-    /// time has passed. It sleeps longer when it sleeps already.
+    /// The gateway is not called for this long; then it gets everything that waits, and then a
+    /// tick. If it sleeps already, it sleeps longer.
     pub fn stall_gateway(&mut self, span: Duration) {
         self.trace.add(self.now, What::Fault, super::Entry::GATEWAY, &span.as_micros().to_le_bytes());
         self.stalls += 1;
@@ -68,7 +68,7 @@ impl Cell {
         }
         let Some(Waiting { ports, links, .. }) = self.asleep.take() else { return };
         self.disturb(None);
-        // A driver looks at its sources in one order or another.
+        // A driver reads its sources in any order.
         if self.rng.below(2) == 0 {
             self.tell_ports(ports);
             self.tell_links(links);
@@ -79,7 +79,7 @@ impl Cell {
         self.engine_input(Input::Tick);
     }
 
-    /// Its process has ended: what waited for it is gone.
+    /// Its process has ended: waiting events are gone.
     pub(super) fn forget_waiting(&mut self) {
         self.asleep = None;
         self.wakes_at = self.now;
@@ -112,7 +112,7 @@ impl Cell {
         }
     }
 
-    /// A port has something to tell the gateway.
+    /// A port has an event for the gateway.
     pub(super) fn tell_of_port(&mut self, port: PortId, told: Told) {
         match &mut self.asleep {
             Some(waiting) => waiting.keep(port, told),
@@ -120,7 +120,7 @@ impl Cell {
         }
     }
 
-    /// What a link is to tell the gateway waits, when it must.
+    /// An event of a link waits, if it must.
     pub(super) fn keep_for_later(&mut self, due: Due) -> Option<Due> {
         let Some(waiting) = &mut self.asleep else { return Some(due) };
         let link = match &due {
@@ -161,9 +161,9 @@ impl Waiting {
     }
 }
 
-/// What a kernel keeps of a line.
+/// Bytes of a line that a kernel keeps.
 const LINE_BUFFER: usize = 4_096;
-/// Frames that it keeps of a bus.
+/// Frames of a bus that it keeps.
 const MOST_FRAMES: usize = 256;
-/// Datagrams that it keeps of a socket.
+/// Datagrams of a socket that it keeps.
 const MOST_DATAGRAMS: usize = 256;

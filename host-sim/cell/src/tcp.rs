@@ -1,9 +1,9 @@
-//! One direction of a TCP connection: what was handed over arrives once and in order, or not at all;
-//! what the network lost is sent again, later and later.
+//! One direction of a TCP connection: data arrives once and in order, or not at all; data lost in
+//! the network is sent again after growing waits.
 //!
-//! In: what the sender hands over, and whether the path is cut. Out: when something arrives or is to
-//! be sent again. Knows no window and no congestion: after a loss everything waits for the next
-//! retransmission, as it does in the network stacks of both ends while nothing is acknowledged.
+//! In: what the sender hands over, and whether the path is cut. Out: when something arrives or is
+//! to be sent again. Does not model windows or congestion: after a loss everything waits for the
+//! next retransmission, as in the network stacks of both ends while nothing is acknowledged.
 
 use std::collections::VecDeque;
 

@@ -1,8 +1,8 @@
-//! What happened in the cell, as a digest and, when wanted, in full.
+//! What happened in the cell, as a hash and, if requested, in full.
 
 use proto_core::time::Instant;
 
-/// What one entry tells.
+/// The kind of an entry.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[repr(u8)]
 pub enum What {
@@ -45,7 +45,7 @@ pub struct Entry {
     pub at: Instant,
     /// What.
     pub what: What,
-    /// Of which link, port or connection.
+    /// The link, port or connection.
     pub subject: u64,
     /// The bytes; a CAN frame's id (4 bytes, big-endian) and data; a remark's words.
     pub bytes: Vec<u8>,
@@ -78,17 +78,17 @@ impl Trace {
         self.limit = limit;
     }
 
-    /// A number that two runs share when the same happened at the same times.
+    /// A hash of all entries: equal for two runs in which the same happened at the same times.
     pub fn digest(&self) -> u64 {
         self.digest
     }
 
-    /// How many things happened.
+    /// Number of entries.
     pub fn count(&self) -> u64 {
         self.count
     }
 
-    /// What was kept, see [`Self::keep`].
+    /// The entries kept; see [`Self::keep`].
     pub fn entries(&self) -> &[Entry] {
         &self.entries
     }
@@ -109,7 +109,7 @@ impl Trace {
         }
     }
 
-    /// Words beside what happened. The digest does not know of them.
+    /// A note, which is not part of the hash.
     pub(super) fn remark(&mut self, at: Instant, words: std::fmt::Arguments<'_>) {
         if self.entries.len() < self.limit {
             let bytes = words.to_string().into_bytes();

@@ -1,8 +1,7 @@
-//! Everything that can go wrong, by chance and seeded: what a soak run is made of.
+//! Everything that can go wrong, at random and seeded: the faults of a soak run.
 //!
-//! A [`Trouble`] breaks something every now and then and mends it again after a while. The cell
-//! stays an ordinary cell: between two faults a caller can look at it, and at the end
-//! [`Trouble::mend`] leaves it whole.
+//! A [`Trouble`] injects a fault now and then and ends it again after a while. Between two faults a
+//! caller can inspect the cell as usual; at the end [`Trouble::mend`] ends all faults.
 
 use std::collections::BTreeMap;
 
@@ -41,9 +40,9 @@ pub enum TroubleKind {
     Unacknowledged,
     /// A cable is out, of one link or of all.
     Cable,
-    /// Somebody else sends datagrams to a port where the gateway listens.
+    /// Another program sends datagrams to a port where the gateway listens.
     Stranger,
-    /// A server carries out and says nothing.
+    /// A server carries out requests and does not answer.
     Mute,
     /// A server's answers are late.
     SlowAnswers,
@@ -115,7 +114,7 @@ impl TroubleKind {
         Self::GatewaySleep,
     ];
 
-    /// How often, beside the others. What stops everything for long is rare, or nothing else would
+    /// Relative frequency. A fault that stops everything for long is rare, or little else would
     /// happen.
     const fn weight(self) -> u64 {
         match self {
@@ -127,7 +126,7 @@ impl TroubleKind {
 }
 
 impl TroubleKind {
-    /// A name for people.
+    /// A short name.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Refused => "connections refused",
@@ -200,8 +199,8 @@ pub struct Trouble {
 }
 
 impl Trouble {
-    /// Faults of these kinds, one each `pause` on average, from now on. A fault that lasts does so
-    /// for up to `pause` as well, an outage for up to twenty times as long.
+    /// Faults of these kinds, one per `pause` on average, from now on. A lasting fault lasts up to
+    /// `pause`, an outage up to twenty times as long.
     pub fn new(cell: &mut Cell, kinds: &[TroubleKind], pause: Duration) -> Self {
         let mut trouble = Self {
             rng: cell.fork_rng(),
@@ -216,19 +215,19 @@ impl Trouble {
         trouble
     }
 
-    /// How many faults of each kind there were.
+    /// Number of faults of each kind so far.
     pub fn counts(&self) -> &BTreeMap<TroubleKind, u64> {
         &self.counts
     }
 
-    /// Lets time go by in the cell, with faults.
+    /// Advances time in the cell, with faults.
     pub fn run(&mut self, cell: &mut Cell, span: Duration) {
         let end = cell.now() + span;
         loop {
             let remedy = self.remedies.iter().map(|remedy| remedy.0).min().unwrap_or(Instant::NEVER);
             let next = self.next.min(remedy).min(end);
             cell.run(next.saturating_since(cell.now()));
-            // After a violation time stands still.
+            // After a violation time stops.
             if next >= end || cell.violation().is_some() {
                 return;
             }
@@ -236,7 +235,7 @@ impl Trouble {
         }
     }
 
-    /// Mends everything that is broken at present.
+    /// Ends all present faults.
     pub fn mend(&mut self, cell: &mut Cell) {
         for (_, kind, remedy) in std::mem::take(&mut self.remedies) {
             cell.remark(format_args!("ends: {}", kind.name()));
@@ -253,7 +252,7 @@ impl Trouble {
             apply(cell, remedy, &self.networks);
         }
         if now >= self.next {
-            // Now and then all is quiet for long enough that everything must work again.
+            // Now and then there are no faults for long enough that everything must work again.
             let pause = if self.rng.below(CALM) == 0 { 12 } else { 2 };
             self.next = now + Duration::from_micros(1) + self.rng.up_to(self.pause.saturating_mul(pause));
             if let Some(kind) = self.pick_kind()
@@ -274,7 +273,7 @@ impl Trouble {
         })
     }
 
-    /// Breaks something; `None` when the cell has nothing of this kind.
+    /// Injects a fault; `None` if the cell has nothing of this kind.
     fn begin(&mut self, cell: &mut Cell, kind: TroubleKind) -> Option<()> {
         let rng = &mut self.rng;
         let server = [Link::Command, Link::State, Link::Modbus][rng.below(3) as usize];

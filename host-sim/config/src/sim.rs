@@ -1,4 +1,4 @@
-//! What the simulated controller runs on: a controller file after it was checked.
+//! The simulated controller's configuration: a controller file after it was checked.
 
 use std::fmt;
 use std::net::{IpAddr, Ipv4Addr};
@@ -12,9 +12,9 @@ use proto_core::wire::can::CanId;
 /// A whole controller file.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct SimConfig {
-    /// Where it listens.
+    /// The addresses to listen on.
     pub listen: Listen,
-    /// The state it starts in.
+    /// The robot's state at the start.
     pub robot: Robot,
     /// Values at the start, in file order.
     pub initial: Vec<Initial>,
@@ -22,7 +22,7 @@ pub struct SimConfig {
     pub recipes: Vec<SimRecipe>,
     /// Every recipe port, in file order.
     pub ports: Vec<SimPort>,
-    /// The programs that `run(NAME)` knows.
+    /// The programs for `run(NAME)`.
     pub programs: Vec<SimProgram>,
 }
 
@@ -51,13 +51,13 @@ impl Default for Listen {
 /// The robot at the start.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Robot {
-    /// Name of the dialect the controller speaks; one that `proto_core::wire::dialect` knows.
+    /// Name of the controller's dialect, one of `proto_core::wire::dialect`.
     pub dialect: String,
     /// Power.
     pub power: Power,
     /// Operation mode.
     pub mode: RobotMode,
-    /// How many clients port 2000 takes.
+    /// How many clients port 2000 accepts.
     pub command_clients: CommandClients,
 }
 
@@ -94,28 +94,28 @@ pub enum RobotMode {
     Remote,
 }
 
-/// What port 2000 does with clients beyond the first: controllers are not known to be alike (D26).
+/// What port 2000 does with further clients: controllers may differ (D26).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum CommandClients {
-    /// It takes them, up to its limit.
+    /// It accepts them, up to its limit.
     #[default]
     Many,
-    /// While there is one, it closes every other at once.
+    /// While it has a client, it closes every other connection at once.
     RefuseSecond,
-    /// It closes the one it has when another one comes.
+    /// It closes its connection when another client connects.
     DropFirst,
 }
 
 /// One value at the start.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Initial {
-    /// What gets it.
+    /// The target.
     pub target: InitialTarget,
     /// The value, which fits the target; a bit is 0 or 1.
     pub value: f64,
 }
 
-/// What an initial value can be given to.
+/// A target for an initial value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum InitialTarget {
     /// A whole system variable.
@@ -183,7 +183,7 @@ impl BitGroup {
         }
     }
 
-    /// How many bits the group has.
+    /// Number of bits in the group.
     pub fn count(self) -> u8 {
         match self {
             Self::Di | Self::Do => 16,
@@ -217,7 +217,7 @@ impl AnalogInput {
         }
     }
 
-    /// How many inputs the group has.
+    /// Number of inputs in the group.
     pub fn count(self) -> u8 {
         match self {
             Self::CabinetCurrent | Self::CabinetVoltage => 4,
@@ -225,7 +225,7 @@ impl AnalogInput {
         }
     }
 
-    /// The least and the greatest value: mA or V.
+    /// The smallest and the largest value, in mA or V.
     pub fn range(self) -> (f64, f64) {
         match self {
             Self::CabinetCurrent => (0.0, 20.0),
@@ -298,7 +298,7 @@ pub struct SimField {
 pub struct SimPort {
     /// Its name, as `--bind`, `--stats` and programs use it.
     pub name: String,
-    /// What it is.
+    /// Its bus or connection.
     pub bus: SimBus,
     /// Index into [`SimConfig::recipes`]; a port without a recipe is idle.
     pub recipe: Option<usize>,
@@ -306,7 +306,7 @@ pub struct SimPort {
     pub cycle: Duration,
 }
 
-/// What a controller's recipe port is.
+/// Kind of a recipe port of the controller.
 #[derive(Debug, Clone, PartialEq)]
 pub enum SimBus {
     /// Half-duplex serial line.
@@ -333,7 +333,7 @@ pub enum SimBus {
 /// One program of the controller.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct SimProgram {
-    /// As `run(NAME)` names it.
+    /// The name that `run(NAME)` uses.
     pub name: String,
     /// Its Rhai text.
     pub script: String,

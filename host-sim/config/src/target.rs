@@ -1,4 +1,4 @@
-//! Items as files and programs name them: `WordOutputReg[1]`, `DI[3]`, `AI_V[2]`.
+//! Names of items in files and programs: `WordOutputReg[1]`, `DI[3]`, `AI_V[2]`.
 
 use std::fmt;
 use std::str::FromStr;
@@ -7,7 +7,7 @@ use proto_core::sysvar::{ParseError, SysVar};
 
 use super::{AnalogInput, BitGroup, InitialTarget};
 
-/// Why a name means no item.
+/// Why a name is not that of an item.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum TargetError {

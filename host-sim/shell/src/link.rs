@@ -117,7 +117,7 @@ impl LinkControl {
         count(&mut turned_away);
         self.turned_away.set(turned_away);
         if let Some(more) = self.complaints.take(now()) {
-            warn!(link = name, %peer, more, "rejected: {why}");
+            warn!(link = name, %peer, more, "refused: {why}");
         }
     }
 

@@ -1,13 +1,13 @@
-//! What the gateway has promised, checked at every step against a model of its own
-//! (docs/cell.md section 4).
+//! Checks the gateway's promises at every step against an independent model (docs/cell.md section
+//! 4).
 //!
-//! In: everything that goes into the engine and comes out of it, and what reaches the controller.
-//! Out: how often each [`Invariant`] was looked at, and the first [`Violation`]. The model is slow
-//! and plain: it cuts frames by the rules of proto-core/docs/wire/recipes.md, keeps a queue a variable, and
-//! uses neither the engine's recipes nor its plan. Garbage that happens to be a frame is a frame:
-//! what counts is what the wire delivered to the port.
+//! In: all inputs and outputs of the engine, and what reaches the controller. Out: how often each
+//! [`Invariant`] was checked, and the first [`Violation`]. The model is slow and plain: it cuts
+//! frames by the rules of proto-core/docs/wire/recipes.md, keeps a queue per variable, and uses
+//! neither the engine's recipes nor its plan. Garbage that happens to be a frame is a frame: what
+//! the line delivered to the port decides.
 //!
-//! Of the engine it looks only at the counters, and at which links it holds for up.
+//! Of the engine it reads only the counters, and which links it considers up.
 
 mod downward;
 mod far;
@@ -39,10 +39,10 @@ use upward::{Upward, Wrong};
 pub(super) use wire::inputs_of;
 use wire::{Controller, Map, Modbus};
 
-/// What must hold.
+/// The invariants.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Invariant {
-    /// Every value written is the next one that its owner sent, or safe, or read back.
+    /// Every value written is the next one that its owner sent, or a safe value, or was read back.
     Sent,
     /// No value is written after its time to live.
     InTime,
@@ -54,7 +54,7 @@ pub enum Invariant {
     NoReplay,
     /// The edges of bits are written in order, or counted.
     Edges,
-    /// What waits is handed over as soon as its link is free.
+    /// A waiting value is handed over as soon as its link is free.
     Delivered,
     /// Every frame on the wire is applied or counted: all counters agree with the model's.
     Counted,
@@ -62,11 +62,11 @@ pub enum Invariant {
     Bytes,
     /// A command is sent once, in time, or not at all.
     Once,
-    /// Nothing is shown before it was received.
+    /// No value is shown before it was received.
     Known,
-    /// Nothing is shown that is older than promised.
+    /// No value is shown that is older than promised.
     Age,
-    /// What is shown is what was received last.
+    /// The value shown is the newest one received.
     Shown,
     /// Never faster than the cycle, and each cycle, request and trigger is served or counted.
     Cycle,
@@ -74,40 +74,40 @@ pub enum Invariant {
     Line,
     /// The controller receives what the gateway sent.
     Transport,
-    /// The controller's inputs are what was written, and nothing else writes them.
+    /// The controller's inputs are the values written, and nothing else writes them.
     Registers,
-    /// What the controller applies is not older than promised.
+    /// No value that the controller applies is older than promised.
     ValueAge,
-    /// A command that the controller takes was picked, or asked for, not long ago.
+    /// A command that the controller accepts was picked, or asked for, not long ago.
     CommandAge,
     /// No command that was picked before one that stops the robot arrives after it.
     Overtaken,
     /// The controller understands every command that arrives.
     Understood,
-    /// What stops the robot arrives as soon as a way to the controller works.
+    /// A command that stops the robot arrives as soon as a way to the controller works.
     StopArrives,
-    /// The safe value of a silent owner is there as soon as a way to the controller works.
+    /// The safe value of a silent owner arrives as soon as a way to the controller works.
     SafeArrives,
-    /// What cannot be read is neither shown nor written back.
+    /// An unreadable value is neither shown nor written back.
     Unreadable,
     /// Values of our own ports are not shown when they are older than promised.
     OwnAge,
-    /// A short stall of the gateway is no silence of a device.
+    /// A short stall of the gateway is not taken for silence of a device.
     FalseTimeout,
     /// Nothing that waited while the gateway slept is applied or commanded.
     FromSleep,
-    /// Datagrams go to the controller's client and to nobody else.
+    /// Datagrams go only to the controller's client.
     Destination,
     /// The work of one call is bounded.
     Work,
-    /// What waits anywhere is bounded.
+    /// Every queue is bounded.
     Memory,
-    /// Nothing panics.
+    /// There is no panic.
     NoPanic,
 }
 
 impl Invariant {
-    /// A name for people.
+    /// A short name.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Sent => "values-were-sent",
@@ -145,14 +145,14 @@ impl Invariant {
     }
 }
 
-/// An invariant that did not hold.
+/// A violated invariant.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Violation {
-    /// Which.
+    /// The invariant.
     pub invariant: Invariant,
-    /// When.
+    /// When it was violated.
     pub at: Instant,
-    /// In words, with the numbers.
+    /// A description, with the numbers.
     pub what: String,
 }
 
@@ -169,7 +169,7 @@ impl std::fmt::Display for Violation {
     }
 }
 
-/// What is known of one field port.
+/// The model's state of one field port.
 #[derive(Debug, Clone, Default)]
 struct PortWatch {
     line: LineWatch,
@@ -177,13 +177,13 @@ struct PortWatch {
     counters: PortCounters,
 }
 
-/// What is known of one recipe link, or of the state link.
+/// The model's state of one recipe link, or of the state link.
 #[derive(Debug, Clone, Default)]
 struct LinkWatch {
     line: LineWatch,
     stream: stream::Stream,
     busy: bool,
-    /// Bytes handed over since the link came up, and after each transmission that is not acknowledged.
+    /// Bytes handed over since the link came up, after each unacknowledged transmission.
     total: u64,
     unacked: VecDeque<u64>,
 }
@@ -206,7 +206,7 @@ impl LinkWatch {
     }
 }
 
-/// The model, and what it found.
+/// The model and its findings.
 #[derive(Debug, Clone)]
 pub(super) struct Oracle {
     sheet: Sheet,
@@ -223,19 +223,19 @@ pub(super) struct Oracle {
     robot: Robot,
     /// When the engine was called last.
     called_at: Option<Instant>,
-    /// When it wants to be told that time has passed, and whether it was told something else since.
+    /// When the engine asked to be called, and whether it had another input since.
     announced: Instant,
     is_late: bool,
-    /// What comes from the field until then waited while the gateway slept.
+    /// Input from the field until then waited while the gateway slept.
     deaf_until: Option<Instant>,
-    /// The gateway was just not called for a while, but did not sleep.
+    /// The gateway was not called for a while, but did not sleep.
     after_stall: bool,
-    /// How much is remembered, at the newest look.
+    /// Size of what is remembered, at the last check.
     remembered: usize,
-    /// Outputs since the newest input, and how many there may be.
+    /// Outputs since the newest input, and their limit.
     outputs: u32,
     most_outputs: u32,
-    /// Frames in and out, a port; sent and received, a link. They outlive a restart.
+    /// Frames in and out per port; sends and receives per link. They survive a restart.
     pub frames: Vec<(u64, u64)>,
     pub traffic: [(u64, u64); LINKS],
     pub writes: u64,
@@ -265,8 +265,8 @@ impl Oracle {
             after_stall: false,
             remembered: 0,
             outputs: 0,
-            // A frame a port and id; opening or closing, and something to send, a link, and one more
-            // command.
+            // A frame per port and id; opening or closing, and one transmission, per link, and one
+            // more command.
             most_outputs: parts as u32 + 1 + 2 * (4 + sheet.links.len() as u32),
             frames: vec![(0, 0); sheet.ports.len()],
             traffic: [(0, 0); LINKS],
@@ -277,7 +277,7 @@ impl Oracle {
         }
     }
 
-    /// The cell was switched on already: its ports are there, and the engine wants a tick then.
+    /// The cell was switched on before: its ports are up, and the engine expects a tick then.
     pub(super) fn begin(&mut self, engine: &Engine, announced: Instant, now: Instant) {
         self.called_at = Some(now);
         self.announced = announced;
@@ -286,7 +286,7 @@ impl Oracle {
         }
     }
 
-    /// The gateway starts afresh: it knows nothing, so nothing may be expected of it.
+    /// The gateway restarts without any state, so nothing may be expected of it.
     pub(super) fn restarted(&mut self, now: Instant) {
         self.up = Upward::new(&self.sheet);
         self.ports = vec![PortWatch::default(); self.sheet.ports.len()];
@@ -345,7 +345,7 @@ impl Oracle {
             self.slept(now);
         }
         let told = match input {
-            // After sleep, links have been given up before anything is taken.
+            // After sleep, links have been given up before any input is handled.
             _ if has_slept => None,
             Input::LinkDown { link } | Input::LinkBytes { link, .. } => Some(*link),
             _ => None,
@@ -401,7 +401,7 @@ impl Oracle {
         }
     }
 
-    /// What the engine wants done.
+    /// An output of the engine.
     pub(super) fn output(&mut self, now: Instant, output: &Output<'_>) {
         if self.violation.is_some() {
             return;
@@ -419,7 +419,7 @@ impl Oracle {
             Output::LinkClose { link } => self.link_lost(link, now),
             Output::LinkSend { link, bytes } => {
                 self.traffic[place(link)].0 += 1;
-                // What was handed over to a connection that is gone never leaves.
+                // Data handed over to a lost connection never leaves.
                 self.robot.hands_over_nothing();
                 if self.sheet.link(link).is_some_and(|link| !link.is_datagram) {
                     self.links[place(link)].hands_over(bytes);
@@ -431,8 +431,8 @@ impl Oracle {
         }
     }
 
-    /// The engine has nothing more to do before `until`; the cell itself holds so many things for
-    /// later.
+    /// The engine has nothing more to do before `until`; the cell itself holds this many later
+    /// events.
     pub(super) fn rest(&mut self, now: Instant, engine: &Engine, until: Instant, things: usize) {
         if self.violation.is_some() {
             return;
@@ -463,7 +463,7 @@ impl Oracle {
     }
 }
 
-/// A link's place in what is kept of each.
+/// Index of a link in per-link state.
 pub(super) fn place(link: LinkId) -> usize {
     usize::from(link.0) % LINKS
 }
@@ -472,7 +472,7 @@ fn is_up(engine: &Engine, id: LinkId) -> bool {
     engine.links().any(|link| link.id == id && matches!(link.state, LinkState::Up { .. }))
 }
 
-/// Four links of the controller's own, and one a listening port.
+/// Four links to fixed ports of the controller, and one per listening port.
 const LINKS: usize = 16;
 /// Frames of a recipe link that the controller's TCP has not acknowledged.
 const MOST_UNACKED: usize = 64;

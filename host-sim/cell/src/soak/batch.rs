@@ -10,7 +10,7 @@ use proto_core::time::Duration;
 use super::{Level, Report, Scenario, Soak};
 use crate::{Invariant, Rng, TroubleKind, Violation};
 
-/// How long one run is at most.
+/// Maximum length of one run.
 pub const RUN_LENGTH: Duration = Duration::from_secs(600);
 
 /// A number of virtual hours, cut into runs with seeds of their own.
@@ -25,12 +25,12 @@ pub struct Batch {
     next: AtomicUsize,
     stop: AtomicBool,
     done: Mutex<BTreeMap<usize, Report>>,
-    /// Virtual time that has gone by, also in runs that are not finished.
+    /// Virtual time that has passed, unfinished runs included.
     elapsed_us: AtomicU64,
     failed: Mutex<Option<Failure>>,
 }
 
-/// What went wrong in which run.
+/// A failed run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Failure {
     /// The run's place in the batch.
@@ -39,27 +39,27 @@ pub struct Failure {
     pub seed: u64,
     /// The cell's name.
     pub cell: String,
-    /// How long after the run's start.
+    /// Time from the run's start.
     pub after: Duration,
-    /// What.
+    /// The violation.
     pub what: Violation,
 }
 
-/// How far a batch is.
+/// Progress of a batch.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Progress {
-    /// Virtual time that has gone by.
+    /// Virtual time that has passed.
     pub elapsed: Duration,
     /// Runs that are finished.
     pub runs: usize,
 }
 
-/// The runs that were finished, summed up in their order.
+/// The sums of all finished runs, in their order.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Total {
-    /// How many.
+    /// Number of finished runs.
     pub runs: usize,
-    /// How many there should have been.
+    /// Number of all runs.
     pub of: usize,
     /// Virtual time.
     pub span: Duration,
@@ -71,20 +71,20 @@ pub struct Total {
     pub ports: BTreeMap<(String, String), (u64, u64)>,
     /// Sent and received, by kind of link.
     pub links: BTreeMap<&'static str, (u64, u64)>,
-    /// Things that happened.
+    /// Entries of the traces.
     pub events: u64,
-    /// Values written to the controller that were judged.
+    /// Values written to the controller that were checked.
     pub writes: u64,
-    /// How often each invariant was looked at.
+    /// Number of checks of each invariant.
     pub checks: BTreeMap<Invariant, u64>,
-    /// One number for the traces of all runs.
+    /// One hash of the traces of all runs.
     pub hash: u64,
 }
 
 impl Batch {
     /// `span` of virtual time in these cells, in turn.
     pub fn new(scenarios: Vec<Scenario>, level: Level, seed: u64, span: Duration) -> Self {
-        // However short it is, each cell has its turn.
+        // However short it is, each cell gets a run.
         let share = span.as_micros().div_ceil(scenarios.len().max(1) as u64).max(1);
         let run_length = RUN_LENGTH.min(Duration::from_micros(share));
         let runs = span.as_micros().div_ceil(run_length.as_micros()) as usize;
@@ -103,12 +103,12 @@ impl Batch {
         }
     }
 
-    /// How many runs there are.
+    /// Number of runs.
     pub fn runs(&self) -> usize {
         self.runs
     }
 
-    /// The seed of a run; its remainder says which cell.
+    /// The seed of a run; its remainder determines the cell.
     pub fn seed_of(&self, run: usize) -> u64 {
         let cells = self.scenarios.len().max(1) as u64;
         let mut rng = Rng::new(self.seed ^ (run as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15));
@@ -117,13 +117,13 @@ impl Batch {
         drawn - drawn % cells + run as u64 % cells
     }
 
-    /// The cell that a run's seed means among these.
+    /// The cell for a run's seed.
     pub fn scenario_of(scenarios: &[Scenario], seed: u64) -> Option<&Scenario> {
         scenarios.get((seed % scenarios.len().max(1) as u64) as usize)
     }
 
-    /// Carries out runs until there are none left, one failed, or [`Batch::stop`] was called.
-    /// Several threads may do so at once.
+    /// Runs until all are done, one fails, or [`Batch::stop`] is called. Several threads may call
+    /// it at once.
     pub fn work(&self) {
         while !self.stop.load(Relaxed) {
             let run = self.next.fetch_add(1, Relaxed);
@@ -134,12 +134,12 @@ impl Batch {
         }
     }
 
-    /// Runs under way are given up.
+    /// Stops the present runs.
     pub fn stop(&self) {
         self.stop.store(true, Relaxed);
     }
 
-    /// How far it is.
+    /// The progress.
     pub fn progress(&self) -> Progress {
         let runs = self.done.lock().unwrap_or_else(PoisonError::into_inner).len();
         Progress { elapsed: Duration::from_micros(self.elapsed_us.load(Relaxed)), runs }
@@ -150,7 +150,7 @@ impl Batch {
         self.failed.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// What was done so far.
+    /// The sums so far.
     pub fn total(&self) -> Total {
         let done = self.done.lock().unwrap_or_else(PoisonError::into_inner);
         let mut total = Total { of: self.runs, ..Total::default() };
@@ -177,7 +177,7 @@ impl Batch {
                 return;
             }
             let next = (reached + SLICE).min(length);
-            // A panic is a finding like any other.
+            // A panic is a violation like any other.
             let done = catch_unwind(AssertUnwindSafe(|| soak.run_to(next)));
             if done.is_err() {
                 let what = Violation::panic(soak.cell().now());
@@ -238,5 +238,5 @@ impl Total {
     }
 }
 
-/// How long a run is not looked at.
+/// How long a run goes on between two checks for a stop.
 const SLICE: Duration = Duration::from_secs(2);

@@ -10,7 +10,7 @@ use recipe_config::file::{self, FileError, Text};
 /// A gateway and a controller.
 #[derive(Debug, Clone)]
 pub struct Scenario {
-    /// What it is called.
+    /// Its name.
     pub name: String,
     /// The gateway's file.
     pub gateway: Box<GatewayConfig>,
@@ -64,7 +64,7 @@ impl Scenario {
     /// All embedded cells.
     ///
     /// # Errors
-    /// None that a test has not seen before.
+    /// Never: a test reads the embedded files.
     pub fn all() -> Result<Vec<Self>, FileError> {
         EMBEDDED.iter().map(Self::parse).collect()
     }
@@ -77,7 +77,7 @@ impl Scenario {
         EMBEDDED.iter().find(|cell| cell.name == name).map(Self::parse).transpose()
     }
 
-    /// The cell of two files.
+    /// A cell from two files.
     ///
     /// # Errors
     /// [`FileError`] says what is wrong in which of them.

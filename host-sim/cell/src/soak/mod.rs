@@ -2,8 +2,8 @@
 //! does checked at every step (docs/cell.md sections 4 and 5).
 //!
 //! In: cells, a seed, a level of faults, a number of virtual hours. Out: a [`Total`], the same for
-//! the same seed on every machine and whatever number of threads, or the first violation with
-//! what repeats it. Knows no terminal: `host-sim soak` prints.
+//! the same seed on every machine and for any number of threads, or the first violation and how to
+//! repeat it. Does not print: `host-sim soak` does.
 
 mod batch;
 mod cells;
@@ -28,7 +28,7 @@ use world::World;
 /// How many faults.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Level {
-    /// Nothing; devices are careless all the same.
+    /// None; devices send carelessly all the same.
     None,
     /// A fault every 30 s, on a quiet network.
     Mild,
@@ -64,26 +64,26 @@ pub struct Soak {
     start: Instant,
 }
 
-/// What one run did.
+/// The report of one run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Report {
     /// How long it was.
     pub span: Duration,
-    /// Its trace's digest.
+    /// The hash of its trace.
     pub digest: u64,
-    /// Things that happened, as the trace counts them.
+    /// Entries of its trace.
     pub events: u64,
     /// Faults of each kind.
     pub faults: BTreeMap<TroubleKind, u64>,
     /// Frames in and out of each of the gateway's field ports, by name.
     pub ports: Vec<(String, u64, u64)>,
-    /// Sent and received on each link, by name.
+    /// Sends and receives on each link, by name.
     pub links: Vec<(&'static str, u64, u64)>,
-    /// Values written to the controller that were judged.
+    /// Values written to the controller that were checked.
     pub writes: u64,
-    /// How often each invariant was looked at.
+    /// Number of checks of each invariant.
     pub checks: BTreeMap<Invariant, u64>,
-    /// The first one that did not hold, and how long after the start that was.
+    /// The first violation, and its time from the start.
     pub violation: Option<(Violation, Duration)>,
 }
 
@@ -130,13 +130,13 @@ impl Soak {
         &mut self.cell
     }
 
-    /// How long it has run.
+    /// Virtual time that has passed.
     pub fn elapsed(&self) -> Duration {
         self.cell.now().saturating_since(self.start)
     }
 
-    /// Lets time go by, until so long after the start or until an invariant does not hold. How it
-    /// is cut into calls changes nothing.
+    /// Advances time until this long after the start, or until an invariant is violated. It does
+    /// not matter how the time is split into calls.
     pub fn run_to(&mut self, elapsed: Duration) {
         let end = self.start + elapsed;
         while self.cell.violation().is_none() {
@@ -153,7 +153,7 @@ impl Soak {
         }
     }
 
-    /// What happened.
+    /// The report so far.
     pub fn report(&self) -> Report {
         let engine = self.cell.engine();
         let ports = self.cell.gateway().ports.iter().zip(0..).filter_map(|(port, nth)| {
@@ -183,7 +183,7 @@ impl Soak {
     }
 }
 
-/// A device at each field port, and lines that deliver in one way or another.
+/// A device at each field port, and lines with various deliveries.
 fn attach_stations(cell: &mut Cell, config: &GatewayConfig, level: Level, rng: &mut Rng) {
     for port in &config.ports {
         let mut rng = rng.fork();

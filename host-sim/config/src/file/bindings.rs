@@ -1,11 +1,11 @@
-//! What a gateway file says about a field beside its name and type, and about sending.
+//! The bindings of fields and the triggers of output parts in a gateway file.
 
 use proto_core::config::{CommandWhen, OnStale, OutputBinding, SendOn};
 use proto_core::sysvar::SysVar;
 
 use super::reader::{Item, Reader, Result, Spot};
 
-/// What a received value does.
+/// The binding of an input field.
 pub(super) enum FileInput {
     Unused,
     Variable { var: SysVar, scale: f32, offset: f32 },
@@ -18,9 +18,9 @@ pub(super) struct FileCommand {
     pub(super) text: String,
 }
 
-/// Where a sent value comes from.
+/// The source of an output field.
 pub(super) enum FileOutput {
-    /// A program of the controller gives it.
+    /// A program of the controller sets it.
     Program,
     Bound(OutputBinding),
 }

@@ -18,7 +18,7 @@ use crate::sim::{
 /// The top-level keys of a controller file.
 pub(super) const KEYS: [&str; 6] = ["listen", "robot", "initial", "recipe", "port", "program"];
 
-/// The whole file, valid.
+/// Reads the whole file and checks it.
 pub(super) fn read(document: &Document) -> Result<SimConfig> {
     let root = Reader::root(document, &KEYS)?;
     let recipes = recipes::read_all(&root, Flavour::Controller)?;

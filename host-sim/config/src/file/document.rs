@@ -1,13 +1,14 @@
-//! A TOML text and its overrides as one tree that knows where everything was written.
+//! A TOML text and its overrides as one tree, with the place of everything in it.
 //!
-//! In: text, and `KEY=VALUE` overrides. Out: tables in file order. Knows no key of any file.
+//! In: text, and `KEY=VALUE` overrides. Out: tables in file order. Does not know the keys of any
+//! file.
 
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
 use super::error::{FileError, Source};
 
-/// The tree and the texts it came from.
+/// The tree, and the texts that it was read from.
 pub(super) struct Document {
     name: String,
     text: String,
@@ -15,12 +16,12 @@ pub(super) struct Document {
     pub(super) root: Table,
 }
 
-/// Where something was written.
+/// The place where something was written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum At {
     /// Byte offset in the file.
     File(usize),
-    /// Which override.
+    /// Index of the override.
     Override(usize),
 }
 
@@ -34,7 +35,7 @@ pub(super) struct Node {
 #[derive(Debug, Clone)]
 pub(super) enum Value {
     Str(String),
-    /// TOML's 64 bits, or what does not fit them, as it was written.
+    /// A 64-bit integer of TOML, or the text of one that does not fit.
     Int(Result<i64, String>),
     Float(f64),
     Bool(bool),
@@ -58,7 +59,7 @@ impl Value {
     }
 }
 
-/// Entries in the order they were written.
+/// Entries in file order.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Table {
     pub(super) entries: Vec<Entry>,
@@ -78,7 +79,7 @@ impl Table {
 }
 
 impl Document {
-    /// Reads `text`, called `name` in messages, and puts the overrides in.
+    /// Reads `text`, called `name` in messages, and applies the overrides.
     pub(super) fn parse(name: &str, text: &str, overrides: &[String]) -> Result<Self, FileError> {
         let mut document = Self {
             name: name.to_owned(),
@@ -120,7 +121,7 @@ impl Document {
         FileError { source, key: String::new(), message: message.into() }
     }
 
-    /// Where the value of `path` was written, or the nearest table around it.
+    /// The place of the value at `path`, or of the nearest table around it.
     pub(super) fn find(&self, path: &[&str]) -> Option<At> {
         let (first, mut rest) = path.split_first()?;
         let mut node = &self.root.get(first)?.node;
@@ -140,7 +141,7 @@ impl Document {
         Some(node.at)
     }
 
-    /// Puts one `KEY=VALUE` into the tree.
+    /// Applies one `KEY=VALUE` to the tree.
     fn put(&mut self, number: usize, text: &str) -> Result<(), FileError> {
         let at = At::Override(number);
         let Some((key, value)) = text.split_once('=') else {
@@ -177,7 +178,7 @@ fn convert(node: &Spanned<DeValue<'_>>, at: &dyn Fn(usize) -> At) -> Node {
         DeValue::Integer(number) => {
             Value::Int(i64::from_str_radix(number.as_str(), number.radix()).map_err(|_| number.to_string()))
         }
-        // TOML's floats are Rust's, up to the underscores that the parser took out.
+        // TOML's floats are Rust's, apart from underscores, which the parser has removed.
         DeValue::Float(number) => Value::Float(number.as_str().parse().unwrap_or(f64::NAN)),
         DeValue::Boolean(value) => Value::Bool(*value),
         DeValue::Datetime(_) => Value::Datetime,
@@ -187,8 +188,8 @@ fn convert(node: &Spanned<DeValue<'_>>, at: &dyn Fn(usize) -> At) -> Node {
     Node { at: at(node.span().start), value }
 }
 
-/// An override's value: TOML where it looks like TOML, else the text itself, so that
-/// `controller.address=10.0.0.2` needs no quotes that a shell would take away.
+/// The value of an override: TOML if it looks like TOML, else the text itself, so that
+/// `controller.address=10.0.0.2` needs no quotes, which a shell would remove.
 fn parse_value(text: &str, at: At) -> Result<Node, String> {
     match DeValue::parse(text) {
         Ok(value) => Ok(convert(&value, &|_| at)),
@@ -199,7 +200,7 @@ fn parse_value(text: &str, at: At) -> Result<Node, String> {
     }
 }
 
-/// Names between dots; a name with dots in it stands in double quotes.
+/// Names separated by dots; a name that contains dots is in double quotes.
 fn split_path(key: &str) -> Option<Vec<String>> {
     let mut path = vec![String::new()];
     // The dots of `RobotState[8..13]` are part of the name.
@@ -239,7 +240,7 @@ fn insert(table: &mut Table, path: &[String], node: Node, at: At) -> Result<(), 
     }
 }
 
-/// Items of an array of tables are chosen by their `name`, or by their number counted from 1.
+/// Items of an array of tables are selected by their `name`, or by their number, counted from 1.
 fn insert_into_item(
     key: &str,
     items: &mut [Node],

@@ -2,23 +2,23 @@
 
 use std::fmt;
 
-/// A mistake, as `FILE:LINE:COLUMN: KEY: what is wrong; what is allowed`.
+/// A mistake, displayed as `FILE:LINE:COLUMN: KEY: what is wrong; what is allowed`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct FileError {
-    /// Where it was written.
+    /// The place.
     pub source: Source,
-    /// The key, as a path such as `port.rs485-1.baud`; empty when the text is no TOML at all.
+    /// The key as a path, such as `port.rs485-1.baud`; empty if the text is not TOML.
     pub key: String,
     /// What is wrong, and what is allowed.
     pub message: String,
 }
 
-/// Where something was written.
+/// The place of a mistake.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Source {
     /// In a file, counted from 1.
     File {
-        /// The file as it was named.
+        /// The file's name.
         file: String,
         /// Line.
         line: usize,
@@ -27,12 +27,12 @@ pub enum Source {
     },
     /// The file as a whole.
     WholeFile {
-        /// The file as it was named.
+        /// The file's name.
         file: String,
     },
     /// In a `--set` override.
     Override {
-        /// As it was given.
+        /// The override's text.
         text: String,
     },
 }
@@ -64,7 +64,7 @@ impl fmt::Display for FileError {
 
 impl std::error::Error for FileError {}
 
-/// One line stays one line, whatever a key or a value has in it.
+/// Keeps a message on one line, whatever a key or a value contains.
 fn write_line(f: &mut fmt::Formatter<'_>, text: &str) -> fmt::Result {
     for c in text.chars() {
         if c.is_control() { write!(f, "{}", c.escape_default())? } else { write!(f, "{c}")? }

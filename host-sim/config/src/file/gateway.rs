@@ -24,7 +24,7 @@ use super::recipes::{self, FileField, FileFieldKind, FilePart, FileRecipe, Flavo
 /// The top-level keys of a gateway file.
 pub(super) const KEYS: [&str; 4] = ["controller", "network", "recipe", "port"];
 
-/// The whole file, valid.
+/// Reads the whole file and checks it.
 pub(super) fn read(document: &Document) -> Result<Box<GatewayConfig>> {
     let root = Reader::root(document, &KEYS)?;
     let recipes = recipes::read_all(&root, Flavour::Gateway)?;
@@ -71,7 +71,7 @@ const BUSES: [(&str, BusKind); 4] = [
     ("udp-listen", BusKind::UdpListen),
 ];
 
-/// The configuration as far as it is read, and where each place of it was written.
+/// The configuration read so far, with the place of everything in it.
 struct Builder<'a> {
     document: &'a Document,
     config: Box<GatewayConfig>,
@@ -168,7 +168,7 @@ impl<'a> Builder<'a> {
         let mut frames = Bounded::new();
         let Some(file) = from.part(part) else { return Ok(frames) };
         self.spots.insert(Place::Part { recipe, part }, file.spot.clone());
-        // The layout allowed no more frames than there is room for.
+        // The layout accepted no more frames than there is room for.
         for (number, frame) in (0..).zip(&file.frames) {
             self.spots.insert(Place::Frame { recipe, part, frame: number }, frame.spot.clone());
             let fields = self.add_fields(recipe, part, file, number)?;
@@ -263,7 +263,7 @@ impl<'a> Builder<'a> {
         };
         if let (Some(framing), Some(recipe)) = (framing, recipes.get(recipe).filter(|recipe| !recipe.is_can))
         {
-            // What a user recipe on UDP is refused for is said better by the configuration's check.
+            // The check of the configuration has the better message for a user recipe on UDP.
             if framing == Framing::Bytes {
                 recipe.check_framing(framing).map_err(|message| item.error(message))?;
             }
@@ -392,12 +392,12 @@ fn read_bus(table: &Reader<'_>, kind: BusKind) -> Result<Bus> {
     })
 }
 
-/// The layout allowed no more bytes than there is room for.
+/// The layout accepted no more bytes than there is room for.
 fn delimiter(bytes: &[u8]) -> Delimiter {
     Delimiter::from_slice(bytes).unwrap_or_default()
 }
 
-/// What was read with the same bound.
+/// Read with the same limit.
 fn bounded<const N: usize>(text: &str) -> heapless::String<N> {
     heapless::String::try_from(text).unwrap_or_default()
 }

@@ -1,4 +1,4 @@
-//! The keys that ports of both kinds of files share.
+//! The keys that ports have in both kinds of files.
 
 use proto_core::config::{ConfigErrorKind, Parity, PortKey, Rs485, check_bitrate, check_cycle};
 use proto_core::time::Duration;
@@ -8,7 +8,7 @@ use super::reader::{Reader, Result};
 /// The keys of a serial line.
 pub(super) const LINE_KEYS: [&str; 5] = ["baud", "parity", "stop_bits", "idle_gap_ms", "turnaround_us"];
 
-/// A serial line's settings, within their ranges.
+/// The settings of a serial line, within their ranges.
 pub(super) fn read_line(port: &Reader<'_>) -> Result<Rs485> {
     let mut line = Rs485 {
         baud: 115_200,
@@ -49,7 +49,7 @@ pub(super) fn read_cycle(port: &Reader<'_>) -> Result<Duration> {
     Ok(cycle)
 }
 
-/// The file's name for what a check calls `key`.
+/// The file's key for a key of the configuration.
 pub(super) fn key_name(key: PortKey) -> &'static str {
     match key {
         PortKey::Recipe => "recipe",
@@ -63,7 +63,7 @@ pub(super) fn key_name(key: PortKey) -> &'static str {
         PortKey::Turnaround => "turnaround_us",
         PortKey::Bitrate => "bitrate",
         PortKey::Listen => "listen",
-        // What has no key of its own is about the port as a whole.
+        // A mistake without a key of its own concerns the port as a whole.
         _ => "name",
     }
 }

@@ -1,4 +1,4 @@
-//! Configuration files: TOML to checked types, or one message that says where and what.
+//! Configuration files: TOML to checked types, or one message that says where and what is wrong.
 //!
 //! In: a file and its `--set` overrides. Out: `GatewayConfig` or `SimConfig`. Every mistake is one
 //! [`FileError`]; the keys are those of docs/configuration.md.
@@ -34,12 +34,12 @@ pub enum Config {
     Controller(SimConfig),
 }
 
-/// A configuration text with the name it has in messages.
+/// A configuration text and its name in messages.
 #[derive(Debug, Clone, Copy)]
 pub struct Text<'a> {
     /// The file's name.
     pub name: &'a str,
-    /// What is in it.
+    /// Its content.
     pub toml: &'a str,
 }
 
@@ -75,7 +75,7 @@ pub fn load_recipes(path: &Path, overrides: &[String]) -> Result<Vec<SimRecipe>>
     with_text(path, |text| parse_recipes(text, overrides))
 }
 
-/// Like [`load`], from a text.
+/// Same as [`load`], from a text.
 ///
 /// # Errors
 /// The first mistake, with its place.
@@ -87,7 +87,7 @@ pub fn parse(text: Text<'_>, overrides: &[String]) -> Result<Config> {
     }
 }
 
-/// Like [`load_gateway`], from a text.
+/// Same as [`load_gateway`], from a text.
 ///
 /// # Errors
 /// The first mistake, with its place.
@@ -101,7 +101,7 @@ pub fn parse_gateway(text: Text<'_>, overrides: &[String]) -> Result<Box<Gateway
     gateway::read(&document)
 }
 
-/// Like [`load_controller`], from a text.
+/// Same as [`load_controller`], from a text.
 ///
 /// # Errors
 /// The first mistake, with its place.
@@ -115,7 +115,7 @@ pub fn parse_controller(text: Text<'_>, overrides: &[String]) -> Result<SimConfi
     controller::read(&document)
 }
 
-/// Like [`load_recipes`], from a text.
+/// Same as [`load_recipes`], from a text.
 ///
 /// # Errors
 /// The first mistake in any of the recipes, with its place.
@@ -130,8 +130,8 @@ pub fn parse_recipes(text: Text<'_>, overrides: &[String]) -> Result<Vec<SimReci
     Ok(recipes::read_all(&root, flavour)?.iter().map(recipes::FileRecipe::to_sim).collect())
 }
 
-/// A mistake that was only found after the file had been read, at the place of `key` (names, and
-/// for an item of an array its `name`), or as near to it as there is something.
+/// A mistake found after the file was read, at the place of `key` (names; an item of an array by
+/// its `name`), or at the nearest place that exists.
 pub fn error_at(path: &Path, overrides: &[String], key: &[&str], message: impl ToString) -> FileError {
     let message = message.to_string();
     let located = with_text(path, |text| {
@@ -156,7 +156,7 @@ fn with_text<T>(path: &Path, read: impl FnOnce(Text<'_>) -> Result<T>) -> Result
     }
 }
 
-/// Only gateways know a controller elsewhere; a controller file has sections of its own.
+/// Only a gateway file has a `[controller]`; a controller file has its own sections.
 fn kind_of(document: &Document) -> Result<Flavour> {
     let has = |key: &str| document.root.get(key).is_some();
     match (has("controller"), has("listen") || has("robot") || has("initial") || has("program")) {

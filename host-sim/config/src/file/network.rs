@@ -1,4 +1,4 @@
-//! `[network]` of a gateway file: a board's own address. This host has its own and does not look at it.
+//! `[network]` of a gateway file: the board's own address. `host-sim` does not use it.
 
 use std::net::Ipv4Addr;
 

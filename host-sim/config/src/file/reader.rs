@@ -1,4 +1,4 @@
-//! Typed access to a [`Document`]: every refusal carries the place and the whole key.
+//! Typed access to a [`Document`]: every error has the place and the whole key.
 
 use std::ops::RangeInclusive;
 
@@ -8,7 +8,7 @@ use proto_core::time::Duration;
 
 pub(super) type Result<T> = std::result::Result<T, FileError>;
 
-/// A place with the key that stands there.
+/// A place and the key there.
 #[derive(Debug, Clone)]
 pub(super) struct Spot {
     pub(super) at: At,
@@ -50,7 +50,7 @@ impl<'a> Reader<'a> {
         Ok(reader)
     }
 
-    /// Refuses every key that is not in `allowed`; `when` says what the list depends on.
+    /// Refuses a key that is not in `allowed`; `when` says what the list depends on.
     pub(super) fn check_keys(&self, allowed: &[&str], when: &str) -> Result<()> {
         match self.table.entries.iter().find(|entry| !allowed.contains(&entry.key.as_str())) {
             None => Ok(()),
@@ -62,12 +62,12 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// A message about the whole table.
+    /// An error that concerns the whole table.
     pub(super) fn error(&self, message: impl ToString) -> FileError {
         self.spot.error(self.document, message)
     }
 
-    /// The value of `key`, if it is there.
+    /// The value of `key`, if it is present.
     pub(super) fn optional(&self, key: &str) -> Option<Item<'a>> {
         let entry = self.table.get(key)?;
         // An array of tables has no place of its own; its values do.
@@ -75,7 +75,7 @@ impl<'a> Reader<'a> {
         Some(Item { document: self.document, spot, node: &entry.node })
     }
 
-    /// The value of `key`, which must be there; `what` says what it should be.
+    /// The value of `key`, which must be present; `what` says what it should be.
     pub(super) fn required(&self, key: &str, what: &str) -> Result<Item<'a>> {
         self.optional(key).ok_or_else(|| self.error(format!("{key} is missing; {what}")))
     }
@@ -90,7 +90,7 @@ impl<'a> Reader<'a> {
         })
     }
 
-    /// The tables of the array `key`, each called by its name or its number.
+    /// The tables of the array `key`, each with its name or its number.
     pub(super) fn tables(&self, key: &str, allowed: &[&str]) -> Result<Vec<Reader<'a>>> {
         let Some(item) = self.optional(key) else { return Ok(Vec::new()) };
         let items = item.array(&format!("of tables, written [[{key}]]"))?;
@@ -111,7 +111,7 @@ impl<'a> Item<'a> {
         self.spot.error(self.document, message)
     }
 
-    /// The value with another place, such as that of its key.
+    /// The same value with another place, such as that of its key.
     pub(super) fn at(self, spot: Spot) -> Self {
         Self { spot, ..self }
     }
@@ -142,7 +142,7 @@ impl<'a> Item<'a> {
         }
     }
 
-    /// The value as true or false, if it is that.
+    /// The value as true or false, if it is a bool.
     pub(super) fn as_bool(&self) -> Option<bool> {
         match self.node.value {
             Value::Bool(value) => Some(value),
@@ -210,7 +210,7 @@ impl<'a> Item<'a> {
         Ok(reader)
     }
 
-    /// A table whose keys are not known beforehand.
+    /// A table with any keys.
     pub(super) fn any_table(&self) -> Result<Reader<'a>> {
         match &self.node.value {
             Value::Table(table) => Ok(Reader { document: self.document, spot: self.spot.clone(), table }),
@@ -218,7 +218,7 @@ impl<'a> Item<'a> {
         }
     }
 
-    /// An item of an array of tables, called `KEY.NAME` where it has a name.
+    /// An item of an array of tables, called `KEY.NAME` if it has a name.
     fn named_table(&self, key: &str, parent: &str, allowed: &[&str]) -> Result<Reader<'a>> {
         let Value::Table(table) = &self.node.value else { return Err(self.wrong_kind("a table")) };
         let mut spot = self.spot.clone();
@@ -228,7 +228,7 @@ impl<'a> Item<'a> {
         Reader::checked(self.document, spot, table, allowed)
     }
 
-    /// One of several words.
+    /// One of several strings.
     pub(super) fn choice<T: Clone>(&self, choices: &[(&str, T)]) -> Result<T> {
         let allowed = || choices.iter().map(|(name, _)| format!("{name:?}")).collect::<Vec<_>>().join(", ");
         let Some(text) = self.as_string() else {

@@ -1,6 +1,6 @@
-//! `[[recipe]]` of both kinds of files: read once, checked by the layouts themselves.
+//! `[[recipe]]` of both kinds of files: read once, and checked by the layouts themselves.
 //!
-//! In: tables. Out: [`FileRecipe`], which keeps the place of everything a later check may name.
+//! In: tables. Out: [`FileRecipe`], which keeps the places for later checks.
 
 use proto_core::recipe::CanLayout;
 use proto_core::recipe::PartError;
@@ -14,7 +14,7 @@ use super::bindings::{self, FileInput, FileOutput};
 use super::reader::{Item, Reader, Result, Spot};
 use crate::sim::{SimCanFrame, SimField, SimParts, SimRecipe, SimStreamPart};
 
-/// Whose file it is: a gateway's recipes say what happens with each field.
+/// The kind of file: only a gateway's recipes have bindings.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Flavour {
     Gateway,
@@ -78,7 +78,7 @@ impl FileField {
     }
 }
 
-/// Every recipe of a file, each within the limits whatever port it is for.
+/// Every recipe of a file, within the limits of any port.
 pub(super) fn read_all(root: &Reader<'_>, flavour: Flavour) -> Result<Vec<FileRecipe>> {
     let mut recipes: Vec<FileRecipe> = Vec::new();
     for table in root.tables("recipe", &["name", "kind", "mode", "input", "output"])? {
@@ -92,7 +92,7 @@ pub(super) fn read_all(root: &Reader<'_>, flavour: Flavour) -> Result<Vec<FileRe
     Ok(recipes)
 }
 
-/// The index of the recipe that `item` names.
+/// The index of the recipe with the name in `item`.
 pub(super) fn find(recipes: &[FileRecipe], item: &Item<'_>) -> Result<usize> {
     let name = item.string()?;
     recipes.iter().position(|recipe| recipe.name == name).ok_or_else(|| {
@@ -162,7 +162,7 @@ fn read_part(item: &Item<'_>, rules: Rules, is_can: bool, flavour: Flavour) -> R
         let spot = table.spot.clone();
         part.frames.push(FileFrame { spot: spot.clone(), id: CanId::Standard(0), id_spot: spot, fields });
     }
-    // UDP has the fewest demands; user-defined recipes are for RS-485 only (D16).
+    // UDP has the lowest demands; user-defined recipes are for RS-485 only (D16).
     let framing = if rules.mode == Mode::User { Framing::Bytes } else { Framing::Datagram };
     match part.check(rules, is_can, framing) {
         Ok(()) => Ok(part),
@@ -265,7 +265,7 @@ fn read_user_field(item: &Item<'_>, direction: Direction, flavour: Flavour) -> R
 }
 
 impl FilePart {
-    /// Whether the part is fit for this framing.
+    /// Checks that the part fits this framing.
     fn check(&self, rules: Rules, is_can: bool, framing: Framing) -> std::result::Result<(), PartError> {
         let fields = |frame: &FileFrame| frame.fields.iter().map(FileField::field).collect::<Vec<_>>();
         if is_can {
@@ -276,7 +276,7 @@ impl FilePart {
         }
     }
 
-    /// The place that `error` is about.
+    /// The place of `error`.
     fn spot_of(&self, error: PartError) -> &Spot {
         let delimiter = match error {
             PartError::HeadTooLong { .. } => self.head_spot.as_ref(),
@@ -303,7 +303,7 @@ impl FileRecipe {
         }
     }
 
-    /// Whether a port with this framing can carry the recipe; what is wrong otherwise.
+    /// Checks that a port with this framing can carry the recipe.
     pub(super) fn check_framing(&self, framing: Framing) -> std::result::Result<(), String> {
         for direction in [Direction::Input, Direction::Output] {
             if let Some(part) = self.part(direction) {
@@ -314,7 +314,7 @@ impl FileRecipe {
         Ok(())
     }
 
-    /// The recipe with the names of its fields and without what a gateway does with them.
+    /// The recipe with the names of its fields, without bindings.
     pub(super) fn to_sim(&self) -> SimRecipe {
         let fields = |frame: &FileFrame| {
             frame.fields.iter().map(|field| SimField { name: field.name(), field: field.field() }).collect()
