@@ -10,11 +10,11 @@ use crate::sysvar::{COUNT, SysVar};
 use crate::time::Duration;
 
 /// The controller's fastest cycle, and a port's.
-pub const MIN_CYCLE: Duration = Duration::from_millis(4);
+pub(crate) const MIN_CYCLE: Duration = Duration::from_millis(4);
 /// Longest cycle, timeout or staleness that a configuration may ask for.
-pub const MAX_TIME: Duration = Duration::from_secs(3_600);
+pub(crate) const MAX_TIME: Duration = Duration::from_secs(3_600);
 /// Longest idle gap and turnaround of a serial line.
-pub const MAX_LINE_TIME: Duration = Duration::from_secs(1);
+pub(crate) const MAX_LINE_TIME: Duration = Duration::from_secs(1);
 
 pub(super) type Check = Result<(), ConfigError>;
 
@@ -50,7 +50,7 @@ pub fn check_bitrate(bitrate: u32) -> Result<(), Kind> {
     if (10_000..=1_000_000).contains(&bitrate) { Ok(()) } else { Err(Kind::BitrateOutOfRange { bitrate }) }
 }
 
-/// Whether a port can have this cycle: from the controller's fastest to [`MAX_TIME`].
+/// Whether a port can have this cycle: 4 ms, the controller's fastest, to an hour.
 ///
 /// # Errors
 /// [`ConfigErrorKind::CycleTooShort`](Kind::CycleTooShort) or

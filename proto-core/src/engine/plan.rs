@@ -163,7 +163,7 @@ impl Plan {
 
     /// Input variables that share a recipe link's frame: their present value is read back from the
     /// state stream for as long as no port sends them.
-    pub fn read_back(&self) -> InputSet {
+    pub(crate) fn read_back(&self) -> InputSet {
         self.read_back
     }
 
