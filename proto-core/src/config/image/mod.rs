@@ -1,5 +1,4 @@
-//! The configuration image: what a board keeps instead of the TOML file
-//! (docs/configuration.md section 6).
+//! The configuration image: what a board keeps instead of the TOML file.
 //!
 //! In: a checked configuration, or bytes from flash or a file. Out: the other. An image of an older
 //! version is read as what it meant then. One that was cut, changed in any bit, written for a newer
@@ -127,6 +126,27 @@ impl core::error::Error for NoSpace {}
 /// Writes the image of a configuration, in the newest version; its length.
 ///
 /// Whether the configuration is valid is asked when the image is read.
+///
+/// ```
+/// use proto_core::config::{GatewayConfig, Port, Recipe, image};
+/// type Config = GatewayConfig<1, 1, 1, 0, 0>;
+///
+/// // A host program writes it to a file.
+/// let outputs = &["DigitalOutputCommand[1]"];
+/// let config: Config = GatewayConfig::builder()
+///     .controller("192.168.12.138")
+///     .recipe(Recipe::realtime("outputs").stream_input(&[0xFF, 0xFF], &[0xEE, 0xEE], outputs))
+///     .port(Port::rs485("rs485-1", "outputs"))
+///     .build()?;
+/// let mut flash = [0xFF; image::MAX_IMAGE];
+/// let len = image::encode(&config, &mut flash)?;
+///
+/// // The board reads it; what follows in its sector does not matter.
+/// let mut read = Config::empty();
+/// image::decode_into(&flash, &mut read)?;
+/// assert_eq!((read, len < 128), (config, true));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 ///
 /// # Errors
 /// [`NoSpace`] when `out` is too short.
