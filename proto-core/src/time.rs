@@ -104,6 +104,19 @@ impl Duration {
     }
 }
 
+impl From<core::time::Duration> for Duration {
+    /// In whole microseconds, rounded down; [`Duration::MAX`] where that is too long.
+    fn from(span: core::time::Duration) -> Self {
+        Self(u64::try_from(span.as_micros()).unwrap_or(u64::MAX))
+    }
+}
+
+impl From<Duration> for core::time::Duration {
+    fn from(span: Duration) -> Self {
+        Self::from_micros(span.0)
+    }
+}
+
 impl Add<Duration> for Instant {
     type Output = Self;
     fn add(self, rhs: Duration) -> Self {
@@ -158,5 +171,13 @@ mod tests {
         assert_eq!(Instant::ZERO - Duration::from_secs(1), Instant::ZERO);
         assert_eq!(Instant::ZERO.saturating_since(Instant::from_millis(4)), Duration::ZERO);
         assert_eq!(Duration::from_secs(u64::MAX), Duration::MAX);
+        assert_eq!(Duration::from(core::time::Duration::MAX), Duration::MAX);
+    }
+
+    #[test]
+    fn a_span_of_core_is_rounded_down() {
+        let span = core::time::Duration::from_nanos(2_999);
+        assert_eq!(Duration::from(span), Duration::from_micros(2));
+        assert_eq!(core::time::Duration::from(Duration::from_millis(4)).as_micros(), 4_000);
     }
 }

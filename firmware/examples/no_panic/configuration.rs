@@ -57,7 +57,6 @@ fn config_questions(config: &GatewayConfig) {
         for part in [Direction::Input, Direction::Output] {
             black_box(config.view().budget(port, part));
         }
-        black_box(config.view().shortest_cycle(port));
         black_box(port.bus.is_field());
         if let proto_core::config::Bus::Rs485(line) = &port.bus {
             let _ = black_box(line.check());
@@ -65,7 +64,6 @@ fn config_questions(config: &GatewayConfig) {
         }
     }
     config.view().warnings().for_each(|warning| _ = black_box(warning));
-    config.view().upstream_recipes().for_each(|recipe| _ = black_box(recipe));
     config.view().field_ports().for_each(|port| _ = black_box(port));
     for recipe in &config.recipes {
         config.view().fields_of(recipe, any(Direction::Input)).for_each(|field| _ = black_box(field));
@@ -88,7 +86,7 @@ fn plan_new(config: &GatewayConfig) {
         for var in SysVar::all() {
             black_box((plan.owner(var), plan.way_up(var), plan.source(var)));
         }
-        black_box((plan.read_back(), plan.needs_state(), plan.needs_modbus()));
+        black_box((plan.needs_state(), plan.needs_modbus()));
     }
 }
 

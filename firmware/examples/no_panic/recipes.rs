@@ -2,12 +2,11 @@
 
 use core::hint::black_box;
 
-use proto_core::image::Image;
 use proto_core::recipe::CanLayout;
 use proto_core::recipe::StreamLayout;
 use proto_core::recipe::model::{Field, Framing, Mode, Rules};
 use proto_core::recipe::{Deframer, datagram};
-use proto_core::sysvar::Direction;
+use proto_core::sysvar::{Direction, IMAGE_BYTES};
 use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::{Scalar, ScalarType};
 
@@ -55,13 +54,13 @@ fn deframer_next_frame(deframer: &mut Deframer, layout: &StreamLayout) {
 
 #[inline(never)]
 fn stream_codec(layout: &StreamLayout) {
-    let (mut image, mut out) = (Image::new(), [0; 512]);
+    let (mut image, mut out) = ([0; IMAGE_BYTES], [0; 512]);
     let image = black_box(&mut image);
     let _ = black_box(layout.check(bytes()));
-    let _ = black_box(layout.apply(bytes(), image.bytes_mut()));
+    let _ = black_box(layout.apply(bytes(), image));
     layout.values(bytes()).for_each(|value| _ = black_box(value));
     layout.fields().for_each(|field| _ = black_box(field));
-    let _ = black_box(layout.encode(image.bytes(), room(&mut out)));
+    let _ = black_box(layout.encode(image, room(&mut out)));
     let _ = black_box(layout.encode_values(values(), room(&mut out)));
     black_box((layout.head(), layout.tail(), layout.rules()));
 }
@@ -75,16 +74,16 @@ fn can_layout() -> Option<CanLayout> {
 #[inline(never)]
 fn can_codec(layout: &CanLayout) {
     let Some(frame) = any(CanFrame::new(any(CanId::Standard(1)), bytes())) else { return };
-    let mut image = Image::new();
+    let mut image = [0; IMAGE_BYTES];
     let image = black_box(&mut image);
     let _ = black_box(layout.accept(&frame));
     layout.ids().for_each(|id| _ = black_box(id));
     for frame in layout.frames() {
         let _ = black_box(frame.check(bytes()));
-        let _ = black_box(frame.apply(bytes(), image.bytes_mut()));
+        let _ = black_box(frame.apply(bytes(), image));
         frame.values(bytes()).for_each(|value| _ = black_box(value));
         frame.fields().for_each(|field| _ = black_box(field));
-        black_box(frame.encode(image.bytes()));
+        black_box(frame.encode(image));
         let _ = black_box(frame.encode_values(values()));
     }
 }

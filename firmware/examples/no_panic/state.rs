@@ -2,8 +2,7 @@
 
 use core::hint::black_box;
 
-use proto_core::image::Image;
-use proto_core::sysvar::SysVar;
+use proto_core::sysvar::{IMAGE_BYTES, SysVar};
 use proto_core::wire::dialect::Dialect;
 use proto_core::wire::state::{LEN, StatePacket, StateStream, StateView};
 
@@ -31,8 +30,8 @@ fn state_stream() {
 
 #[inline(never)]
 fn state_view(view: StateView<'_>) {
-    let mut image = Image::new();
-    view.copy_to_image(black_box(&mut image).bytes_mut());
+    let mut image = [0; IMAGE_BYTES];
+    view.copy_to_image(black_box(&mut image));
     let _ = black_box(view.check_alignment());
     let dialect = any(Dialect::V2_3);
     black_box((view.states(&dialect), view.global_speed(&dialect)));

@@ -1,4 +1,6 @@
-//! Configuration files and the checked values they become.
+#![doc = include_str!("../README.md")]
+//!
+//! # The parts
 //!
 //! In: TOML text and `--set` overrides. Out: [`SimConfig`] for the simulated controller, or
 //! `proto_core::config::GatewayConfig` for the gateway. Nothing here opens a device or a socket.

@@ -1,11 +1,12 @@
-//! The simulated controller, sans-IO: ports 2000 and 2001, Modbus, UDP 2011, recipe ports and
-//! programs behind one run loop.
+#![doc = include_str!("../README.md")]
+//!
+//! # The run loop
+//!
+//! [`Controller`] is ports 2000 and 2001, Modbus, UDP 2011, recipe ports and programs behind one run loop.
 //!
 //! In: what connections and devices bring, and the time. Out: what they are to send, and when to
 //! come back. Knows no socket, no device and no clock: who drives it does: a shell with sockets, or
 //! a test, which jumps from deadline to deadline.
-//!
-//! For a test of your own code there is [`TestController`]: a controller with its clients, devices and clock.
 //!
 //! One rule: [`Controller::handle`] changes the state, then [`Controller::poll_output`] is drained
 //! until it returns [`ControllerOutput::Sleep`]. Polling early is harmless. Everything a peer sends

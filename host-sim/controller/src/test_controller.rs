@@ -2,11 +2,13 @@
 //! deadline to deadline.
 
 use std::collections::BTreeMap;
+use std::error::Error;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::can::CanFrame;
 use proto_core::wire::state::StatePacket;
+use recipe_config::file::{Text, parse_controller};
 use recipe_config::{InitialTarget, SimConfig};
 
 use super::faults::Link;
@@ -16,10 +18,9 @@ use super::{BuildError, ConnId, Controller, ControllerInput, ControllerOutput};
 ///
 /// ```
 /// use proto_core::time::Duration;
-/// use recipe_config::file::{Text, parse_controller};
 /// use recipe_controller::{Link, TestController};
 ///
-/// let toml = r#"
+/// let mut robot = TestController::from_toml(r#"
 ///     [robot]
 ///     power = "enabled"
 ///     [[recipe]]
@@ -34,9 +35,7 @@ use super::{BuildError, ConnId, Controller, ControllerInput, ControllerOutput};
 ///     name = "rs485"
 ///     bus = "rs485"
 ///     recipe = "outputs"
-/// "#;
-/// let config = parse_controller(Text { name: "robot.toml", toml }, &[]).unwrap();
-/// let mut robot = TestController::new(&config).unwrap();
+/// "#).unwrap();
 ///
 /// // A device on its own recipe port switches DO1 on.
 /// robot.port_bytes(0, &[0xFF, 0xFF, 0x01, 0xEE, 0xEE]);
@@ -108,6 +107,15 @@ impl TestController {
         Ok(robot)
     }
 
+    /// The controller of a configuration file's text; [`Self::new`] takes one that was read before.
+    ///
+    /// # Errors
+    /// The first mistake in the text, with its place, or what [`Controller::new`] refuses.
+    pub fn from_toml(toml: &str) -> Result<Self, Box<dyn Error + Send + Sync>> {
+        let config = parse_controller(Text { name: "controller", toml }, &[])?;
+        Ok(Self::new(&config)?)
+    }
+
     /// The present instant.
     pub fn now(&self) -> Instant {
         self.now
@@ -124,12 +132,12 @@ impl TestController {
         &mut self.controller
     }
 
-    /// Lets time go by, deadline by deadline.
+    /// Lets time go by, deadline by deadline: a [`std::time::Duration`] or one of proto-core.
     ///
     /// # Panics
     /// When the controller does not do what it wanted to be called for.
-    pub fn run(&mut self, span: Duration) {
-        let end = self.now + span;
+    pub fn run(&mut self, span: impl Into<Duration>) {
+        let end = self.now + span.into();
         loop {
             let wake = self.drain();
             let left = self.leaving.iter().map(|leaving| leaving.0).min().unwrap_or(Instant::NEVER);

@@ -27,6 +27,24 @@
 // Memory that a gateway takes, in bytes: as much as on any machine.
 #define RGW_GATEWAY_SIZE 37888
 
+// Number of the link to port 2000.
+#define RGW_LINK_COMMAND 0
+
+// Number of the link to port 2001.
+#define RGW_LINK_STATE 1
+
+// Number of the Modbus link.
+#define RGW_LINK_MODBUS 2
+
+// Number of the link to the UDP recipe server of the controller.
+#define RGW_LINK_RECIPE_UDP 3
+
+// Number of the link of the first port, if it is one that listens; those of other ports follow.
+#define RGW_LINK_FIRST_PORT 4
+
+// Number of the second link to port 2000, for commands that stop the robot. No link has a higher one.
+#define RGW_LINK_URGENT 12
+
 // Alignment of all memory that is given to this library, in bytes.
 #define RGW_ALIGN 16
 
@@ -233,6 +251,58 @@ typedef uint8_t rgw_transport;
 #endif // __STDC_VERSION__ >= 202311L
 #endif // __cplusplus
 
+// A CAN controller's error state; `rgw_port_bus` takes its number.
+enum rgw_can_state
+#if defined(__cplusplus) || __STDC_VERSION__ >= 202311L
+  : uint8_t
+#endif // defined(__cplusplus) || __STDC_VERSION__ >= 202311L
+ {
+  // Error-active: all is well.
+  RGW_CAN_STATE_ACTIVE = 0,
+  // An error counter passed 96.
+  RGW_CAN_STATE_WARNING = 1,
+  // Error-passive.
+  RGW_CAN_STATE_PASSIVE = 2,
+  // Bus-off: nothing can be sent until the driver recovers it and reports another state.
+  RGW_CAN_STATE_BUS_OFF = 3,
+};
+#ifndef __cplusplus
+#if __STDC_VERSION__ >= 202311L
+typedef enum rgw_can_state rgw_can_state;
+#else
+typedef uint8_t rgw_can_state;
+#endif // __STDC_VERSION__ >= 202311L
+#endif // __cplusplus
+
+// How the newest command went that a port's values picked.
+enum rgw_reply_code
+#if defined(__cplusplus) || __STDC_VERSION__ >= 202311L
+  : uint8_t
+#endif // defined(__cplusplus) || __STDC_VERSION__ >= 202311L
+ {
+  // No value has picked a command yet.
+  RGW_REPLY_CODE_NONE = 0,
+  // Waiting to be sent, or for the reply.
+  RGW_REPLY_CODE_PENDING = 1,
+  // The controller replied that it succeeded.
+  RGW_REPLY_CODE_SUCCESS = 2,
+  // The controller replied that it failed.
+  RGW_REPLY_CODE_FAIL = 3,
+  // The controller replied something else.
+  RGW_REPLY_CODE_OTHER = 4,
+  // No reply came in time, or the link was lost meanwhile.
+  RGW_REPLY_CODE_NO_REPLY = 5,
+  // It was not sent: the link was down, or too many were waiting.
+  RGW_REPLY_CODE_NOT_SENT = 6,
+};
+#ifndef __cplusplus
+#if __STDC_VERSION__ >= 202311L
+typedef enum rgw_reply_code rgw_reply_code;
+#else
+typedef uint8_t rgw_reply_code;
+#endif // __STDC_VERSION__ >= 202311L
+#endif // __cplusplus
+
 // A configuration in the caller's memory: 6 ports, 6 recipes with 256 fields, 32 commands and 32 safe
 // values at most.
 typedef struct rgw_config rgw_config;
@@ -328,7 +398,7 @@ typedef struct rgw_port_info_t {
   struct rgw_port_counters counters;
   // Its health.
   rgw_port_health health;
-  // How the newest command that its values picked went; 0 for none.
+  // How the newest command went that its values picked: one of `rgw_reply_code`.
   uint8_t reply_code;
 } rgw_port_info_t;
 
@@ -371,7 +441,7 @@ typedef struct rgw_link_counters {
 typedef struct rgw_link_info_t {
   // What happened.
   struct rgw_link_counters counters;
-  // The link's number.
+  // The link's number, such as `RGW_LINK_MODBUS`.
   uint8_t id;
   // Where it stands.
   rgw_link_health health;
@@ -447,7 +517,7 @@ size_t rgw_config_ports(const struct rgw_config *config);
 // at `settings`.
 rgw_status rgw_config_port(const struct rgw_config *config, uint8_t port, struct rgw_port_settings *settings);
 
-// The board's own address; `NotThere` when DHCP is to be asked.
+// The board's own address; `RGW_STATUS_NOT_THERE` when DHCP is to be asked.
 //
 // # Safety
 // `config` is from `rgw_config_read`, and its memory has not been used for anything else; there is room
@@ -474,14 +544,14 @@ rgw_status rgw_gateway_init(uint32_t abi_version, void *memory, size_t len, stru
 // used for anything else.
 rgw_status rgw_gateway_configure(struct rgw_gateway *gateway, const struct rgw_config *config);
 
-// A field port, by its number; `NotThere` if it is none.
+// A field port, by its number; `RGW_STATUS_NOT_THERE` if it is none.
 //
 // # Safety
 // `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else; there is room
 // at `info`.
 rgw_status rgw_port_info(const struct rgw_gateway *gateway, uint8_t port, struct rgw_port_info_t *info);
 
-// The links one after the other: the `nth`, counted from 0; `NotThere` behind the last.
+// The links one after the other: the `nth`, counted from 0; `RGW_STATUS_NOT_THERE` behind the last.
 //
 // # Safety
 // `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else; there is room
@@ -591,8 +661,8 @@ rgw_status rgw_link_bytes(struct rgw_gateway *gateway,
 // `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else.
 rgw_status rgw_link_acked(struct rgw_gateway *gateway, uint64_t now_us, uint8_t link, uint32_t left);
 
-// What the driver has to do next; called again until it is `Sleep`. The bytes are in `buffer` and stay
-// there until the next call.
+// What the driver has to do next; called again until it is `RGW_TASK_KIND_SLEEP`. The bytes are in
+// `buffer` and stay there until the next call.
 //
 // # Safety
 // `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else; there are

@@ -179,7 +179,7 @@ pub unsafe extern "C" fn rgw_config_port(
     read().into()
 }
 
-/// The board's own address; `NotThere` when DHCP is to be asked.
+/// The board's own address; `RGW_STATUS_NOT_THERE` when DHCP is to be asked.
 ///
 /// # Safety
 /// `config` is from `rgw_config_read`, and its memory has not been used for anything else; there is room

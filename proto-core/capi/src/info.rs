@@ -6,6 +6,29 @@ use proto_core::link::LinkState;
 use crate::memory::{bytes, give, shared};
 use crate::{Gateway, Status};
 
+/// Number of the link to port 2000.
+pub const RGW_LINK_COMMAND: u8 = 0;
+/// Number of the link to port 2001.
+pub const RGW_LINK_STATE: u8 = 1;
+/// Number of the Modbus link.
+pub const RGW_LINK_MODBUS: u8 = 2;
+/// Number of the link to the UDP recipe server of the controller.
+pub const RGW_LINK_RECIPE_UDP: u8 = 3;
+/// Number of the link of the first port, if it is one that listens; those of other ports follow.
+pub const RGW_LINK_FIRST_PORT: u8 = 4;
+/// Number of the second link to port 2000, for commands that stop the robot. No link has a higher one.
+pub const RGW_LINK_URGENT: u8 = 12;
+
+// The engine's numbers are those of the header.
+const _: () = {
+    assert!(LinkId::COMMAND.0 == RGW_LINK_COMMAND);
+    assert!(LinkId::STATE.0 == RGW_LINK_STATE);
+    assert!(LinkId::MODBUS.0 == RGW_LINK_MODBUS);
+    assert!(LinkId::RECIPE_UDP.0 == RGW_LINK_RECIPE_UDP);
+    assert!(LinkId::of_port(PortId(0)).0 == RGW_LINK_FIRST_PORT);
+    assert!(LinkId::URGENT.0 == RGW_LINK_URGENT);
+};
+
 /// What happened on a field port. Counters wrap after 2^32.
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
@@ -139,9 +162,41 @@ pub struct PortInfo {
     pub counters: PortCounters,
     /// Its health.
     pub health: PortHealth,
-    /// How the newest command that its values picked went; 0 for none.
+    /// How the newest command went that its values picked: one of `rgw_reply_code`.
     pub reply_code: u8,
 }
+
+/// How the newest command went that a port's values picked.
+#[repr(u8)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ReplyCode {
+    /// No value has picked a command yet.
+    None = 0,
+    /// Waiting to be sent, or for the reply.
+    Pending = 1,
+    /// The controller replied that it succeeded.
+    Success = 2,
+    /// The controller replied that it failed.
+    Fail = 3,
+    /// The controller replied something else.
+    Other = 4,
+    /// No reply came in time, or the link was lost meanwhile.
+    NoReply = 5,
+    /// It was not sent: the link was down, or too many were waiting.
+    NotSent = 6,
+}
+
+// The engine's numbers are those of the header.
+const _: () = {
+    use proto_core::engine::ReplyCode as Core;
+    assert!(ReplyCode::None as u8 == Core::None as u8);
+    assert!(ReplyCode::Pending as u8 == Core::Pending as u8);
+    assert!(ReplyCode::Success as u8 == Core::Success as u8);
+    assert!(ReplyCode::Fail as u8 == Core::Fail as u8);
+    assert!(ReplyCode::Other as u8 == Core::Other as u8);
+    assert!(ReplyCode::NoReply as u8 == Core::NoReply as u8);
+    assert!(ReplyCode::NotSent as u8 == Core::NotSent as u8);
+};
 
 /// A link to the controller.
 #[repr(C)]
@@ -149,13 +204,13 @@ pub struct PortInfo {
 pub struct LinkInfo {
     /// What happened.
     pub counters: LinkCounters,
-    /// The link's number.
+    /// The link's number, such as `RGW_LINK_MODBUS`.
     pub id: u8,
     /// Where it stands.
     pub health: LinkHealth,
 }
 
-/// A field port, by its number; `NotThere` if it is none.
+/// A field port, by its number; `RGW_STATUS_NOT_THERE` if it is none.
 ///
 /// # Safety
 /// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else; there is room
@@ -208,7 +263,7 @@ pub unsafe extern "C" fn rgw_port_info(gateway: *const Gateway, port: u8, info: 
     ask().into()
 }
 
-/// The links one after the other: the `nth`, counted from 0; `NotThere` behind the last.
+/// The links one after the other: the `nth`, counted from 0; `RGW_STATUS_NOT_THERE` behind the last.
 ///
 /// # Safety
 /// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else; there is room

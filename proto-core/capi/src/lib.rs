@@ -1,5 +1,5 @@
 //! The gateway engine for programs in C: `include/rgw.h` and a static library
-//! (docs/architecture.md section 3 has the rules of a driver).
+//! (`proto-core/docs/driver.md` has the rules of a driver).
 //!
 //! In: the caller's memory, a configuration image, and what happened. Out: what has to be done, counters
 //! and states. Nothing is allocated, nothing is called back, no clock is read. What a caller passes is

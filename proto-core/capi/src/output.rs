@@ -72,8 +72,8 @@ impl Task {
     }
 }
 
-/// What the driver has to do next; called again until it is `Sleep`. The bytes are in `buffer` and stay
-/// there until the next call.
+/// What the driver has to do next; called again until it is `RGW_TASK_KIND_SLEEP`. The bytes are in
+/// `buffer` and stay there until the next call.
 ///
 /// # Safety
 /// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else; there are

@@ -11,9 +11,8 @@ use super::error::{ConfigError, ConfigErrorKind as Kind, ControllerKey, Counted,
 use super::fields::{CanFields, Does, Fields, InputField, OutputField, Sends};
 use super::rules::check_name;
 use super::{
-    BoardAddress, CanFramePart, CommandEntry, ConfigView, ControllerLink, Delimiter, FieldSpec,
-    GatewayConfig, InputBinding, Name, OutputBinding, Parts, Port, Recipe, RecipeLink, SafeValue, SafeValues,
-    SendOn, Span, StreamPart,
+    CanFramePart, CommandEntry, ControllerLink, Delimiter, FieldSpec, GatewayConfig, InputBinding, Name,
+    OutputBinding, Parts, Port, Recipe, RecipeLink, SafeValue, SafeValues, SendOn, Span, StreamPart,
 };
 use crate::recipe::model::{MAX_CAN_IDS, MAX_DELIMITER};
 use crate::sysvar::{Direction, SysVar, VarRange};
@@ -22,22 +21,22 @@ use crate::wire::scalar::Scalar;
 
 /// A mutable borrow of a configuration of any size; [`GatewayConfig`] describes the fields.
 #[derive(Debug)]
-#[non_exhaustive]
-pub struct ConfigMut<'c> {
+pub(crate) struct ConfigMut<'c> {
     /// The controller's address, ports and dialect.
-    pub controller: &'c mut ControllerLink,
+    pub(crate) controller: &'c mut ControllerLink,
     /// The board's own address.
-    pub network: &'c mut BoardAddress,
+    #[cfg(feature = "image")]
+    pub(crate) network: &'c mut super::BoardAddress,
     /// Every recipe.
-    pub recipes: &'c mut VecView<Recipe>,
+    pub(crate) recipes: &'c mut VecView<Recipe>,
     /// Every port.
-    pub ports: &'c mut VecView<Port>,
+    pub(crate) ports: &'c mut VecView<Port>,
     /// The fields of all recipes.
-    pub fields: &'c mut VecView<FieldSpec>,
+    pub(crate) fields: &'c mut VecView<FieldSpec>,
     /// The entries of all command tables.
-    pub commands: &'c mut VecView<CommandEntry>,
+    pub(crate) commands: &'c mut VecView<CommandEntry>,
     /// The safe values of all ports.
-    pub safe_values: &'c mut VecView<SafeValue>,
+    pub(crate) safe_values: &'c mut VecView<SafeValue>,
 }
 
 impl<
@@ -88,8 +87,9 @@ impl<
 
 impl ConfigMut<'_> {
     /// A read-only view of the configuration.
-    pub fn view(&self) -> ConfigView<'_> {
-        ConfigView {
+    #[cfg(feature = "image")]
+    pub(crate) fn view(&self) -> super::ConfigView<'_> {
+        super::ConfigView {
             controller: self.controller,
             network: self.network.fixed(),
             recipes: self.recipes,
@@ -104,7 +104,7 @@ impl ConfigMut<'_> {
     ///
     /// # Errors
     /// See there.
-    pub fn set_controller(&mut self, from: &ControllerBuilder<'_>) -> Result<(), ConfigError> {
+    pub(crate) fn set_controller(&mut self, from: &ControllerBuilder<'_>) -> Result<(), ConfigError> {
         let at = |key| move |kind| ConfigError { place: Place::Controller(key), kind };
         let address = text(from.address).map_err(at(ControllerKey::Address))?;
         let mut link = ControllerLink { address, ..ControllerLink::default() };
@@ -128,7 +128,7 @@ impl ConfigMut<'_> {
     ///
     /// # Errors
     /// See there.
-    pub fn set_recipe_link(&mut self, recipe: &str, udp_port: u16) -> Result<(), ConfigError> {
+    pub(crate) fn set_recipe_link(&mut self, recipe: &str, udp_port: u16) -> Result<(), ConfigError> {
         let recipe = self.recipe_named(recipe, Place::Controller(ControllerKey::RecipeLink))?;
         self.controller.recipe_link = Some(RecipeLink { udp_port, recipe });
         Ok(())
@@ -138,7 +138,7 @@ impl ConfigMut<'_> {
     ///
     /// # Errors
     /// See there.
-    pub fn add_recipe(&mut self, from: &RecipeBuilder<'_>) -> Result<u8, ConfigError> {
+    pub(crate) fn add_recipe(&mut self, from: &RecipeBuilder<'_>) -> Result<u8, ConfigError> {
         let (fields, commands) = (self.fields.len(), self.commands.len());
         let added = self.try_add_recipe(from);
         if added.is_err() {
@@ -292,7 +292,7 @@ impl ConfigMut<'_> {
     ///
     /// # Errors
     /// See there.
-    pub fn add_port<B: PortBus>(&mut self, from: &PortBuilder<'_, B>) -> Result<u8, ConfigError> {
+    pub(crate) fn add_port<B: PortBus>(&mut self, from: &PortBuilder<'_, B>) -> Result<u8, ConfigError> {
         let index = self.ports.len() as u8;
         let at = |key| Place::Port { port: index, key };
         let name = name(from.name, at(PortKey::Name))?;

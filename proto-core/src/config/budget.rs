@@ -93,7 +93,7 @@ impl<'c> ConfigView<'c> {
 
     /// The shortest cycle in which the port's output fits its line (D20); on RS-485 including the
     /// turnaround.
-    pub fn shortest_cycle(self, port: &Port) -> Duration {
+    pub(crate) fn shortest_cycle(self, port: &Port) -> Duration {
         let time = self.budget(port, Direction::Output).map_or(Duration::ZERO, |budget| budget.time);
         match &port.bus {
             Bus::Rs485(line) if time > Duration::ZERO => time + line.turnaround,

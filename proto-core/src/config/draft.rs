@@ -86,6 +86,38 @@ impl Recipe {
     }
 
     /// A recipe of user-defined fields.
+    ///
+    /// It borrows its fields, so it is written where it is added:
+    ///
+    /// ```
+    /// use proto_core::config::{CanFields, GatewayConfig, InputField, OutputField, Port, Recipe};
+    /// use proto_core::wire::scalar::ScalarType::{Byte, Short, Word};
+    ///
+    /// // One port, one recipe, 4 fields, 2 commands, no safe values.
+    /// let mut config: GatewayConfig<1, 1, 4, 2, 0> = GatewayConfig::empty();
+    /// config.set_controller("192.168.12.138")?;
+    /// config.add_recipe(
+    ///     &Recipe::user("gripper")
+    ///         .can_input(&[
+    ///             CanFields::standard(0x101, &[InputField::variable(Word, "WordInputReg[1]")]),
+    ///             CanFields::standard(
+    ///                 0x102,
+    ///                 &[InputField::commands(Byte, &[(1, "run(pick.jspf,50)"), (2, "stop()")])],
+    ///             ),
+    ///         ])
+    ///         .can_output(&[CanFields::standard(
+    ///             0x201,
+    ///             // The pose is in m, the field in mm.
+    ///             &[
+    ///                 OutputField::variable(Short, "RobotState[8]").scaled(1000.0, 0.0),
+    ///                 OutputField::reply(Byte),
+    ///             ],
+    ///         )]),
+    /// )?;
+    /// config.add_port(&Port::can("can-1", "gripper").bitrate(250_000))?;
+    /// config.validate()?;
+    /// # Ok::<(), proto_core::config::ConfigError>(())
+    /// ```
     pub const fn user(name: &str) -> RecipeBuilder<'_> {
         RecipeBuilder::new(name, Mode::User)
     }
@@ -327,37 +359,40 @@ impl PortBuilder<'_, Can> {
 }
 
 /// The bus of a [`PortBuilder`]: [`Rs485`], [`Can`], [`Listen`].
-pub trait PortBus: sealed::Sealed {
-    /// Converts to the bus of the configuration.
-    ///
-    /// # Errors
-    /// The address to listen on is too long.
-    fn bus(&self) -> Result<Bus, Kind>;
-}
+pub trait PortBus: sealed::Sealed {}
 
-impl PortBus for Rs485 {
-    fn bus(&self) -> Result<Bus, Kind> {
-        Ok(Bus::Rs485(*self))
+impl PortBus for Rs485 {}
+impl PortBus for Can {}
+impl PortBus for Listen<'_> {}
+
+pub(super) mod sealed {
+    use super::{Bus, Can, Kind, Listen, Rs485};
+
+    /// Buses are those of the configuration.
+    pub trait Sealed {
+        /// The bus in the configuration.
+        ///
+        /// # Errors
+        /// What is wrong with it: an address that is too long.
+        fn bus(&self) -> Result<Bus, Kind>;
     }
-}
 
-impl PortBus for Can {
-    fn bus(&self) -> Result<Bus, Kind> {
-        Ok(Bus::Can { bitrate: self.0 })
+    impl Sealed for Rs485 {
+        fn bus(&self) -> Result<Bus, Kind> {
+            Ok(Bus::Rs485(*self))
+        }
     }
-}
 
-impl PortBus for Listen<'_> {
-    fn bus(&self) -> Result<Bus, Kind> {
-        let listen = super::add::text(self.address)?;
-        Ok(if self.is_tcp { Bus::TcpListen { listen } } else { Bus::UdpListen { listen } })
+    impl Sealed for Can {
+        fn bus(&self) -> Result<Bus, Kind> {
+            Ok(Bus::Can { bitrate: self.0 })
+        }
     }
-}
 
-mod sealed {
-    /// Accepts the buses of the configuration.
-    pub trait Sealed {}
-    impl Sealed for super::Rs485 {}
-    impl Sealed for super::Can {}
-    impl Sealed for super::Listen<'_> {}
+    impl Sealed for Listen<'_> {
+        fn bus(&self) -> Result<Bus, Kind> {
+            let listen = crate::config::add::text(self.address)?;
+            Ok(if self.is_tcp { Bus::TcpListen { listen } } else { Bus::UdpListen { listen } })
+        }
+    }
 }

@@ -22,7 +22,7 @@ mod rules;
 mod validate;
 mod view;
 
-pub use add::ConfigMut;
+pub(crate) use add::ConfigMut;
 pub use budget::{PartBudget, Warning, can_frame_time};
 pub use builder::ConfigBuilder;
 pub use draft::{Can, ControllerBuilder, Listen, PortBuilder, PortBus, RecipeBuilder, SafeValues};
@@ -32,7 +32,8 @@ pub use error::{
 pub use fields::{CanFields, Fields, InputField, OutputField, Var};
 pub use listen::listen_address;
 pub use network::{BoardAddress, Network};
-pub use rules::{MAX_LINE_TIME, MAX_TIME, MIN_CYCLE, check_address, check_bitrate, check_cycle, check_name};
+pub(crate) use rules::MIN_CYCLE;
+pub use rules::{check_address, check_bitrate, check_cycle, check_name};
 pub use view::ConfigView;
 
 use heapless::{String, Vec};
@@ -132,9 +133,10 @@ impl<
     }
 
     /// A mutable view of the same type for every size.
-    pub fn view_mut(&mut self) -> ConfigMut<'_> {
+    pub(crate) fn view_mut(&mut self) -> ConfigMut<'_> {
         ConfigMut {
             controller: &mut self.controller,
+            #[cfg(feature = "image")]
             network: &mut self.network,
             recipes: self.recipes.as_mut_view(),
             ports: self.ports.as_mut_view(),

@@ -10,11 +10,11 @@ use crate::sysvar::{COUNT, SysVar};
 use crate::time::Duration;
 
 /// The shortest cycle, of the controller and of a port.
-pub const MIN_CYCLE: Duration = Duration::from_millis(4);
+pub(crate) const MIN_CYCLE: Duration = Duration::from_millis(4);
 /// The longest cycle, timeout or staleness that a configuration may have.
-pub const MAX_TIME: Duration = Duration::from_secs(3_600);
+pub(crate) const MAX_TIME: Duration = Duration::from_secs(3_600);
 /// The longest idle gap and turnaround of a serial line.
-pub const MAX_LINE_TIME: Duration = Duration::from_secs(1);
+pub(crate) const MAX_LINE_TIME: Duration = Duration::from_secs(1);
 
 pub(super) type Check = Result<(), ConfigError>;
 

@@ -48,7 +48,7 @@ impl<'c> ConfigView<'c> {
     }
 
     /// The recipes on the ways up: that of the recipe link, then those of the listening ports.
-    pub fn upstream_recipes(self) -> impl Iterator<Item = (u8, &'c Recipe)> {
+    pub(crate) fn upstream_recipes(self) -> impl Iterator<Item = (u8, &'c Recipe)> {
         let link = self.controller.recipe_link.map(|link| link.recipe);
         let ports = self.ports.iter().filter(|port| !port.bus.is_field()).map(|port| port.recipe);
         link.into_iter().chain(ports).filter_map(|index| Some((index, self.recipes.get(usize::from(index))?)))

@@ -167,7 +167,7 @@ impl Plan {
 
     /// Input variables that share a recipe link's frame. Their present values are read back from
     /// the state stream as long as no port sends them.
-    pub fn read_back(&self) -> InputSet {
+    pub(crate) fn read_back(&self) -> InputSet {
         self.read_back
     }
 

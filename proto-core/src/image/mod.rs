@@ -7,23 +7,23 @@
 
 mod set;
 
-pub use set::{InputSet, VarSet};
+pub(crate) use set::{InputSet, VarSet};
 
 use crate::sysvar::{COUNT, IMAGE_BYTES, SysVar};
 use crate::time::{Duration, Instant, Stamp};
 use crate::wire::scalar::{Scalar, ScalarType};
 
 /// The values alone.
-pub type ImageBytes = [u8; IMAGE_BYTES];
+pub(crate) type ImageBytes = [u8; IMAGE_BYTES];
 
 /// Maximum number of groups of variables that arrive together.
-pub const MAX_GROUPS: usize = 96;
+pub(crate) const MAX_GROUPS: usize = 96;
 
 /// A group of variables that arrive together and so have one age: a field frame, a Modbus block, a
 /// packet.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
-pub struct GroupId(pub(crate) u8);
+pub(crate) struct GroupId(pub(crate) u8);
 
 /// Every system variable with value, source and age.
 #[derive(Debug, Clone)]
@@ -39,15 +39,9 @@ pub struct Image {
     any_unreadable: bool,
 }
 
-impl Default for Image {
-    fn default() -> Self {
-        Self::new()
-    }
-}
-
 impl Image {
     /// All zeros, and all unknown.
-    pub const fn new() -> Self {
+    pub(crate) const fn new() -> Self {
         Self {
             bytes: [0; IMAGE_BYTES],
             group: [0; COUNT],
@@ -63,7 +57,7 @@ impl Image {
     }
 
     /// The packed values, mutable, for a recipe or packet whose layout fits them.
-    pub fn bytes_mut(&mut self) -> &mut ImageBytes {
+    pub(crate) fn bytes_mut(&mut self) -> &mut ImageBytes {
         &mut self.bytes
     }
 
@@ -78,7 +72,7 @@ impl Image {
     ///
     /// # Errors
     /// [`NotForVariable`], with nothing changed, if the type is wrong or the value is not finite.
-    pub fn set(&mut self, var: SysVar, value: Scalar) -> Result<(), NotForVariable> {
+    pub(crate) fn set(&mut self, var: SysVar, value: Scalar) -> Result<(), NotForVariable> {
         if value.ty() != var.ty() || !value.is_finite() {
             return Err(NotForVariable { var, value });
         }
@@ -93,38 +87,33 @@ impl Image {
     }
 
     /// Assigns the variable to the group that it arrives with.
-    pub fn assign(&mut self, var: SysVar, group: GroupId) {
+    pub(crate) fn assign(&mut self, var: SysVar, group: GroupId) {
         if let Some(slot) = self.group.get_mut(var.ordinal()) {
             *slot = group.0.saturating_add(1);
         }
     }
 
     /// The group that the variable arrives with.
-    pub fn group(&self, var: SysVar) -> Option<GroupId> {
+    pub(crate) fn group(&self, var: SysVar) -> Option<GroupId> {
         self.group.get(var.ordinal()).and_then(|slot| slot.checked_sub(1)).map(GroupId)
     }
 
     /// Records that the group has just arrived.
-    pub fn stamp(&mut self, group: GroupId, now: Instant) {
+    pub(crate) fn stamp(&mut self, group: GroupId, now: Instant) {
         if let Some(stamp) = self.stamps.get_mut(usize::from(group.0)) {
             *stamp = Stamp::at(now);
         }
     }
 
-    /// Makes the values of the group unknown.
-    pub fn forget(&mut self, group: GroupId) {
-        self.stamp(group, Instant::NEVER);
-    }
-
     /// When the group last arrived.
-    pub fn stamp_of(&self, group: GroupId) -> Option<Instant> {
+    pub(crate) fn stamp_of(&self, group: GroupId) -> Option<Instant> {
         self.stamps.get(usize::from(group.0)).filter(|&&at| at != Stamp::NEVER).map(|at| at.get())
     }
 
     /// Sets the variable to the value that its source just sent; an unreadable value makes the
     /// variable unknown until a readable one comes. Returns whether the value was readable.
     #[inline]
-    pub fn receive(&mut self, var: SysVar, value: Scalar) -> bool {
+    pub(crate) fn receive(&mut self, var: SysVar, value: Scalar) -> bool {
         let readable = self.set(var, value).is_ok();
         if !readable || self.any_unreadable {
             self.note_readable(var, readable);
@@ -143,7 +132,7 @@ impl Image {
     }
 
     /// Records that everything that the sources of these variables just sent was readable.
-    pub fn all_readable(&mut self, vars: impl Iterator<Item = SysVar>) {
+    pub(crate) fn all_readable(&mut self, vars: impl Iterator<Item = SysVar>) {
         if self.any_unreadable {
             vars.for_each(|var| self.unreadable.remove(var));
             self.any_unreadable = !self.unreadable.is_empty();
@@ -151,12 +140,12 @@ impl Image {
     }
 
     /// Whether the variable's newest value was readable, if there was one.
-    pub fn is_readable(&self, var: SysVar) -> bool {
+    pub(crate) fn is_readable(&self, var: SysVar) -> bool {
         !self.unreadable.contains(var)
     }
 
     /// Whether the newest values of all these variables were readable.
-    pub fn can_read(&self, vars: &VarSet) -> bool {
+    pub(crate) fn can_read(&self, vars: &VarSet) -> bool {
         !self.any_unreadable || !self.unreadable.meets(vars)
     }
 
@@ -171,14 +160,14 @@ impl Image {
     }
 
     /// When the variable's value arrived; `None` if it never did or was unreadable.
-    pub fn known_since(&self, var: SysVar) -> Option<Instant> {
+    pub(crate) fn known_since(&self, var: SysVar) -> Option<Instant> {
         self.group(var).and_then(|group| self.stamp_of(group)).filter(|_| !self.unreadable.contains(var))
     }
 }
 
 /// A value that a variable cannot take.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct NotForVariable {
+pub(crate) struct NotForVariable {
     /// The variable.
     pub var: SysVar,
     /// The value.
@@ -198,7 +187,7 @@ impl core::error::Error for NotForVariable {}
 ///
 /// Integers are rounded to the nearest, halves away from zero. `None` if the result is not finite
 /// or out of the variable's range: such a frame is rejected (D22).
-pub fn bind_to_variable(var: SysVar, raw: Scalar, scale: f32, offset: f32) -> Option<Scalar> {
+pub(crate) fn bind_to_variable(var: SysVar, raw: Scalar, scale: f32, offset: f32) -> Option<Scalar> {
     let value = raw.as_f64() * f64::from(scale) + f64::from(offset);
     let value = if var.ty() == ScalarType::Float { value } else { round(value) };
     let scalar = Scalar::from_f64(var.ty(), value).ok()?;
@@ -210,7 +199,7 @@ pub fn bind_to_variable(var: SysVar, raw: Scalar, scale: f32, offset: f32) -> Op
 
 /// `value * scale + offset` as a field of type `ty`: the binding of a user-defined output field.
 /// Rounded like an input, and saturated at the type's range. Not a number becomes 0.
-pub fn saturate_to_field(ty: ScalarType, value: f64, scale: f32, offset: f32) -> Scalar {
+pub(crate) fn saturate_to_field(ty: ScalarType, value: f64, scale: f32, offset: f32) -> Scalar {
     let value = value * f64::from(scale) + f64::from(offset);
     let value = match ty {
         ScalarType::Float | ScalarType::Double => value,
@@ -261,7 +250,7 @@ mod tests {
         assert_eq!(image.age(word, Instant::from_millis(5)), None);
         image.stamp(group, Instant::from_millis(5));
         assert_eq!(image.age(word, Instant::from_millis(12)), Some(Duration::from_millis(7)));
-        image.forget(group);
+        image.stamp(group, Instant::NEVER);
         assert!(!image.is_known(word));
     }
 

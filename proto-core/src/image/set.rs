@@ -8,7 +8,7 @@ const _: () = assert!(INPUT_COUNT.div_ceil(32) == WORDS && BIT_INPUT_COUNT < 32)
 
 /// A set of input variables. Output variables are never in it.
 #[derive(Debug, Clone, Copy, Eq, Default)]
-pub struct InputSet([u32; WORDS]);
+pub(crate) struct InputSet([u32; WORDS]);
 
 /// Comparing arrays would be a call of `memcmp` on a Cortex-M.
 impl PartialEq for InputSet {
@@ -20,71 +20,72 @@ impl PartialEq for InputSet {
 
 impl InputSet {
     /// The empty set.
-    pub const EMPTY: Self = Self([0; WORDS]);
+    pub(crate) const EMPTY: Self = Self([0; WORDS]);
 
     /// The byte variables, which come first in the table of inputs.
-    pub const BYTES: Self = Self([!(u32::MAX << BIT_INPUT_COUNT), 0, 0]);
+    pub(crate) const BYTES: Self = Self([!(u32::MAX << BIT_INPUT_COUNT), 0, 0]);
 
     /// Adds an input variable; an output variable is ignored.
-    pub fn insert(&mut self, var: SysVar) {
+    pub(crate) fn insert(&mut self, var: SysVar) {
         if let Some((word, bit)) = self.slot(var) {
             *word |= bit;
         }
     }
 
     /// Removes a variable.
-    pub fn remove(&mut self, var: SysVar) {
+    pub(crate) fn remove(&mut self, var: SysVar) {
         if let Some((word, bit)) = self.slot(var) {
             *word &= !bit;
         }
     }
 
     /// Whether the variable is in the set.
-    pub fn contains(&self, var: SysVar) -> bool {
+    pub(crate) fn contains(&self, var: SysVar) -> bool {
         let ordinal = var.ordinal();
         ordinal < INPUT_COUNT && self.0.get(ordinal / 32).is_some_and(|word| word >> (ordinal % 32) & 1 == 1)
     }
 
     /// Whether nothing is in the set.
-    pub fn is_empty(&self) -> bool {
+    pub(crate) fn is_empty(&self) -> bool {
         let [a, b, c] = self.0;
         a | b | c == 0
     }
 
     /// Number of variables in the set.
-    pub fn len(&self) -> usize {
+    #[cfg(test)]
+    pub(crate) fn len(&self) -> usize {
         self.0.iter().fold(0, |sum, word| sum.saturating_add(word.count_ones() as usize))
     }
 
     /// The intersection.
     #[must_use]
-    pub fn and(&self, other: &Self) -> Self {
+    pub(crate) fn and(&self, other: &Self) -> Self {
         let ([a, b, c], [d, e, f]) = (self.0, other.0);
         Self([a & d, b & e, c & f])
     }
 
     /// The union.
     #[must_use]
-    pub fn or(&self, other: &Self) -> Self {
+    pub(crate) fn or(&self, other: &Self) -> Self {
         let ([a, b, c], [d, e, f]) = (self.0, other.0);
         Self([a | d, b | e, c | f])
     }
 
     /// The variables in this set but not in the other.
     #[must_use]
-    pub fn minus(&self, other: &Self) -> Self {
+    pub(crate) fn minus(&self, other: &Self) -> Self {
         let ([a, b, c], [d, e, f]) = (self.0, other.0);
         Self([a & !d, b & !e, c & !f])
     }
 
     /// Number of consecutive variables in the table, from `first` on, that are all in the set.
-    pub fn run_len(&self, first: SysVar) -> usize {
+    pub(crate) fn run_len(&self, first: SysVar) -> usize {
         let ordinal = first.ordinal() as u32;
         self.bits().checked_shr(ordinal).map_or(0, |bits| bits.trailing_ones() as usize)
     }
 
     /// The `len` variables from `first` on, without those that are not inputs.
-    pub fn run(first: SysVar, len: usize) -> Self {
+    pub(crate) fn run(first: SysVar, len: usize) -> Self {
         let upto = |end: usize| !u128::MAX.checked_shl(end.min(INPUT_COUNT) as u32).unwrap_or(0);
         let start = first.ordinal();
         let bits = upto(start.saturating_add(len)) & !upto(start);
@@ -92,7 +93,7 @@ impl InputSet {
     }
 
     /// The variables, in table order.
-    pub fn iter(&self) -> impl Iterator<Item = SysVar> + use<> {
+    pub(crate) fn iter(&self) -> impl Iterator<Item = SysVar> + use<> {
         let mut words = self.0;
         core::iter::from_fn(move || {
             for (nth, word) in words.iter_mut().enumerate() {
@@ -122,38 +123,38 @@ impl InputSet {
 
 /// A set of any variables.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct VarSet([u32; COUNT.div_ceil(32)]);
+pub(crate) struct VarSet([u32; COUNT.div_ceil(32)]);
 
 impl VarSet {
     /// The empty set.
-    pub const EMPTY: Self = Self([0; COUNT.div_ceil(32)]);
+    pub(crate) const EMPTY: Self = Self([0; COUNT.div_ceil(32)]);
 
     /// Adds a variable.
-    pub fn insert(&mut self, var: SysVar) {
+    pub(crate) fn insert(&mut self, var: SysVar) {
         if let Some(word) = self.0.get_mut(var.ordinal() / 32) {
             *word |= bit_of(var);
         }
     }
 
     /// Removes a variable.
-    pub fn remove(&mut self, var: SysVar) {
+    pub(crate) fn remove(&mut self, var: SysVar) {
         if let Some(word) = self.0.get_mut(var.ordinal() / 32) {
             *word &= !bit_of(var);
         }
     }
 
     /// Whether the variable is in the set.
-    pub fn contains(&self, var: SysVar) -> bool {
+    pub(crate) fn contains(&self, var: SysVar) -> bool {
         self.0.get(var.ordinal() / 32).is_some_and(|word| word & bit_of(var) != 0)
     }
 
     /// Whether nothing is in the set.
-    pub fn is_empty(&self) -> bool {
+    pub(crate) fn is_empty(&self) -> bool {
         self.0.iter().all(|word| *word == 0)
     }
 
     /// Whether a variable is in both sets.
-    pub fn meets(&self, other: &Self) -> bool {
+    pub(crate) fn meets(&self, other: &Self) -> bool {
         self.0.iter().zip(&other.0).any(|(one, other)| one & other != 0)
     }
 }

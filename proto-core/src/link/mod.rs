@@ -7,22 +7,22 @@ use crate::time::{Duration, Instant};
 
 /// Timeouts of a link.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct LinkTimings {
+pub(crate) struct LinkTimings {
     /// A link that is not up within this time is given up.
-    pub connect_timeout: Duration,
+    pub(crate) connect_timeout: Duration,
     /// The wait after the first loss; it doubles after each further one.
-    pub backoff_min: Duration,
+    pub(crate) backoff_min: Duration,
     /// The longest wait.
-    pub backoff_max: Duration,
+    pub(crate) backoff_max: Duration,
     /// A link that was up for this long starts again with the shortest wait.
-    pub settled_after: Duration,
+    pub(crate) settled_after: Duration,
     /// A link on which nothing arrives for this long is closed; `None` where silence is normal.
-    pub silence: Option<Duration>,
+    pub(crate) silence: Option<Duration>,
 }
 
 impl LinkTimings {
     /// For TCP links to the controller.
-    pub const TCP: Self = Self {
+    pub(crate) const TCP: Self = Self {
         connect_timeout: Duration::from_secs(2),
         backoff_min: Duration::from_millis(100),
         backoff_max: Duration::from_secs(5),
@@ -32,7 +32,7 @@ impl LinkTimings {
 
     /// Same, but closed after `silence` without a byte.
     #[must_use]
-    pub const fn with_silence(self, silence: Duration) -> Self {
+    pub(crate) const fn with_silence(self, silence: Duration) -> Self {
         Self { silence: Some(silence), ..self }
     }
 }
@@ -76,7 +76,7 @@ impl LinkState {
 
 /// A task for the driver.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum LinkAction {
+pub(crate) enum LinkAction {
     /// Open the link and report when it is up or has failed.
     Open,
     /// Close it and report nothing more about it.
@@ -99,7 +99,7 @@ pub struct LinkHistory {
 
 /// Supervisor of one link.
 #[derive(Debug, Clone)]
-pub struct Supervisor {
+pub(crate) struct Supervisor {
     timings: LinkTimings,
     state: LinkState,
     backoff: Duration,
@@ -110,7 +110,7 @@ pub struct Supervisor {
 
 impl Supervisor {
     /// The supervisor of a link that is to be opened at once.
-    pub const fn new(timings: LinkTimings) -> Self {
+    pub(crate) const fn new(timings: LinkTimings) -> Self {
         Self {
             timings,
             state: LinkState::Down { retry_at: Instant::ZERO },
@@ -122,23 +122,23 @@ impl Supervisor {
     }
 
     /// The state of the link.
-    pub const fn state(&self) -> LinkState {
+    pub(crate) const fn state(&self) -> LinkState {
         self.state
     }
 
     /// Whether the link is usable.
-    pub const fn is_up(&self) -> bool {
+    pub(crate) const fn is_up(&self) -> bool {
         matches!(self.state, LinkState::Up { .. })
     }
 
     /// Counters since the start.
-    pub const fn history(&self) -> &LinkHistory {
+    pub(crate) const fn history(&self) -> &LinkHistory {
         &self.history
     }
 
     /// The driver reports that the link is up. False if that was not expected: the report is late,
     /// and the driver has already been told to close the link.
-    pub fn up(&mut self, now: Instant) -> bool {
+    pub(crate) fn up(&mut self, now: Instant) -> bool {
         if !matches!(self.state, LinkState::Opening { .. }) || self.is_to_be_opened() {
             return false;
         }
@@ -149,7 +149,7 @@ impl Supervisor {
     }
 
     /// The driver reports that the link is gone or could not be opened. True if it was up.
-    pub fn down(&mut self, now: Instant) -> bool {
+    pub(crate) fn down(&mut self, now: Instant) -> bool {
         if self.is_to_be_opened() {
             return false;
         }
@@ -167,12 +167,12 @@ impl Supervisor {
     }
 
     /// Bytes arrived.
-    pub fn heard(&mut self, now: Instant) {
+    pub(crate) fn heard(&mut self, now: Instant) {
         self.heard = now;
     }
 
     /// The engine gives the link up because the peer sends nonsense or nothing.
-    pub fn give_up(&mut self, now: Instant) {
+    pub(crate) fn give_up(&mut self, now: Instant) {
         if !matches!(self.state, LinkState::Down { .. } | LinkState::Shared) {
             self.fall(now);
             self.action = Some(LinkAction::Close);
@@ -180,13 +180,13 @@ impl Supervisor {
     }
 
     /// Another link carries this one's traffic from now on.
-    pub fn share(&mut self, now: Instant) {
+    pub(crate) fn share(&mut self, now: Instant) {
         self.give_up(now);
         self.state = LinkState::Shared;
     }
 
     /// The link carries its own traffic again; it is opened after the shortest wait.
-    pub fn unshare(&mut self, now: Instant) {
+    pub(crate) fn unshare(&mut self, now: Instant) {
         if self.state == LinkState::Shared {
             self.backoff = self.timings.backoff_min;
             self.state = LinkState::Down { retry_at: now + self.backoff };
@@ -194,7 +194,7 @@ impl Supervisor {
     }
 
     /// Checks the deadlines. True if the link was up and has just been given up because of silence.
-    pub fn advance(&mut self, now: Instant) -> bool {
+    pub(crate) fn advance(&mut self, now: Instant) -> bool {
         match self.state {
             LinkState::Down { retry_at } if now >= retry_at && self.action.is_none() => {
                 self.state = LinkState::Opening { until: now + self.timings.connect_timeout };
@@ -212,12 +212,12 @@ impl Supervisor {
     }
 
     /// The task for the driver, once.
-    pub fn take_action(&mut self) -> Option<LinkAction> {
+    pub(crate) fn take_action(&mut self) -> Option<LinkAction> {
         self.action.take()
     }
 
     /// When to call [`Self::advance`], after [`Self::take_action`].
-    pub fn deadline(&self) -> Instant {
+    pub(crate) fn deadline(&self) -> Instant {
         match self.state {
             LinkState::Down { retry_at } => retry_at,
             LinkState::Opening { until } => until,

@@ -21,7 +21,7 @@ use crate::wire::can::{CanFrame, CanId, MAX_CAN_DATA};
 pub const MAGIC: [u8; 4] = *b"RGR\x03";
 
 /// Longest [`Entry::Totals`].
-pub const MAX_TOTALS: usize = 3072;
+pub(crate) const MAX_TOTALS: usize = 3072;
 
 /// One entry of a recording.
 #[derive(Debug, Clone, Copy)]

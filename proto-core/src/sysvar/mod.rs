@@ -70,9 +70,9 @@ pub struct SysVar(u8);
 /// Number of system variables.
 pub const COUNT: usize = table::COUNT;
 /// Number of inputs; they have the lowest ordinals.
-pub const INPUT_COUNT: usize = table::INPUT_COUNT;
+pub(crate) const INPUT_COUNT: usize = table::INPUT_COUNT;
 /// Number of inputs that are byte variables; they have the lowest ordinals of all.
-pub const BIT_INPUT_COUNT: usize = table::BIT_INPUT_COUNT;
+pub(crate) const BIT_INPUT_COUNT: usize = table::BIT_INPUT_COUNT;
 /// Size of the process image: every variable packed in order.
 pub const IMAGE_BYTES: usize = table::IMAGE_BYTES;
 /// Size of the image's first part, the inputs.

@@ -4,26 +4,34 @@
 
 use core::fmt;
 
-/// A field's data type.
+/// A field's data type, with the specification's names.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub enum ScalarType {
-    /// Unsigned 8 bit.
+    /// Unsigned 8 bit: `u8`.
+    #[doc(alias = "u8")]
     Byte,
-    /// Signed 8 bit.
+    /// Signed 8 bit: `i8`.
+    #[doc(alias = "i8")]
     Char,
-    /// Unsigned 16 bit.
+    /// Unsigned 16 bit: `u16`.
+    #[doc(alias = "u16")]
     Word,
-    /// Signed 16 bit.
+    /// Signed 16 bit: `i16`.
+    #[doc(alias = "i16")]
     Short,
-    /// Unsigned 32 bit.
+    /// Unsigned 32 bit: `u32`.
+    #[doc(alias = "u32")]
     Dword,
-    /// Signed 32 bit.
+    /// Signed 32 bit: `i32`.
+    #[doc(alias = "i32")]
     Int,
-    /// IEEE-754 binary32.
+    /// IEEE-754 binary32: `f32`.
+    #[doc(alias = "f32")]
     Float,
-    /// IEEE-754 binary64.
+    /// IEEE-754 binary64: `f64`.
+    #[doc(alias = "f64")]
     Double,
 }
 

@@ -133,6 +133,27 @@ impl core::error::Error for NoSpace {}
 ///
 /// The configuration is checked when the image is read, not here.
 ///
+/// ```
+/// use proto_core::config::{GatewayConfig, Port, Recipe, image};
+/// type Config = GatewayConfig<1, 1, 1, 0, 0>;
+///
+/// // A host program writes it to a file.
+/// let outputs = &["DigitalOutputCommand[1]"];
+/// let config: Config = GatewayConfig::builder()
+///     .controller("192.168.12.138")
+///     .recipe(Recipe::realtime("outputs").stream_input(&[0xFF, 0xFF], &[0xEE, 0xEE], outputs))
+///     .port(Port::rs485("rs485-1", "outputs"))
+///     .build()?;
+/// let mut flash = [0xFF; image::MAX_IMAGE];
+/// let len = image::encode(&config, &mut flash)?;
+///
+/// // The board reads it; what follows in its sector does not matter.
+/// let mut read = Config::empty();
+/// image::decode_into(&flash, &mut read)?;
+/// assert_eq!((read, len < 128), (config, true));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+///
 /// # Errors
 /// [`NoSpace`] when `out` is too short.
 pub fn encode<'c>(config: impl Into<ConfigView<'c>>, out: &mut [u8]) -> Result<usize, NoSpace> {
