@@ -50,7 +50,7 @@ pub fn check_bitrate(bitrate: u32) -> Result<(), Kind> {
     if (10_000..=1_000_000).contains(&bitrate) { Ok(()) } else { Err(Kind::BitrateOutOfRange { bitrate }) }
 }
 
-/// Checks the cycle of a port: from the controller's fastest to [`MAX_TIME`].
+/// Checks the cycle of a port: from 4 ms, the controller's fastest, to an hour.
 ///
 /// # Errors
 /// [`ConfigErrorKind::CycleTooShort`](Kind::CycleTooShort) or

@@ -2,7 +2,7 @@
 //! (docs/engine.md section 3).
 //!
 //! Values are packed little-endian in one byte array, in the order of the variable table, so that
-//! neighbouring fields of a recipe are one copy. A variable has the age of its [`GroupId`]: the
+//! neighbouring fields of a recipe are one copy. A variable has the age of its group: the
 //! frame, poll or packet that brings it. The image does not know recipes, ports or links.
 
 mod set;

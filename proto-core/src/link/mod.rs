@@ -1,6 +1,6 @@
 //! Supervises one controller link: when to open it, when to give it up, when to try again.
 //!
-//! In: what the driver reports, and the engine's judgement of the peer. Out: [`LinkAction`]s and a
+//! In: what the driver reports, and the engine's judgement of the peer. Out: actions and a
 //! deadline. Does not know sockets, protocols or addresses.
 
 use crate::time::{Duration, Instant};
