@@ -17,6 +17,8 @@ const NO_FLOATS: u32 = 1 << 4;
 const FLOATS_IN_USE: u32 = 1 << 2;
 /// Of xPSR on the stack: a word was left out to align it.
 const ALIGNED: u32 = 1 << 9;
+/// Of xPSR: what remains of an IT block. A block of the core's ends at each KiB, so also within one.
+const IT: u32 = 0x0600_FC00;
 const STACKED: [Reg; 6] = [Reg::R0, Reg::R1, Reg::R2, Reg::R3, Reg::R12, Reg::Lr];
 
 /// The core's mask registers.
@@ -58,6 +60,8 @@ pub(crate) fn enter(core: Engine, scs: &mut Scs, number: u16, return_address: u3
     core.set(Reg::Lr, kind & if has_floats { !NO_FLOATS } else { !0 });
     core.set(Reg::Sp, frame);
     core.set(Reg::Control, control & !FLOATS_IN_USE);
+    // The handler's first instruction is in no IT block.
+    core.set(Reg::Xpsr, status & !IT);
     core.set(Reg::Ipsr, number.into());
     scs.enter(number);
     core.word(scs.vectors() + 4 * u32::from(number))
