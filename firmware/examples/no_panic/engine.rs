@@ -4,7 +4,8 @@ use core::hint::black_box;
 
 use firmware::tasks::gateway::Engine;
 use proto_core::config::GatewayConfig;
-use proto_core::engine::{Input, LinkId, OUTPUT_BUFFER, PortId};
+use proto_core::engine::{Engine as AnyEngine, Input, LinkId, MAX_TAPPED, OUTPUT_BUFFER, PortId};
+use proto_core::histogram::Histogram;
 use proto_core::image::{GroupId, Image, InputSet, VarSet, bind_to_variable, saturate_to_field};
 use proto_core::link::{LinkTimings, Supervisor};
 use proto_core::schedule::Grid;
@@ -18,6 +19,9 @@ use crate::any;
 /// Stands in .bss: all its bytes are zero, which `.ci/run` looks at.
 static ENGINE: ConstStaticCell<Engine> = ConstStaticCell::new(Engine::idle());
 
+/// One that can be listened to.
+type EngineWithTap = AnyEngine<2, 1, 32, 2048>;
+
 pub(crate) fn all() {
     static CONFIG: GatewayConfig = GatewayConfig::empty();
     let Some(gateway) = ENGINE.try_take() else { return };
@@ -27,6 +31,8 @@ pub(crate) fn all() {
     engine_handle(black_box(&mut *gateway), any(Instant::ZERO), any(Input::Tick));
     engine_poll_output(black_box(&mut *gateway), any(Instant::ZERO), black_box(&mut out));
     engine_questions(black_box(gateway));
+    engine_status(black_box(gateway), any(Instant::ZERO));
+    engine_tap();
     process_image();
     supervisor();
     grid();
@@ -63,6 +69,35 @@ fn engine_questions(gateway: &Engine) {
     for link in gateway.links() {
         black_box((link, link.kind.name(), link.state.name(), link.id.port()));
     }
+}
+
+#[inline(never)]
+fn engine_status(gateway: &Engine, now: Instant) {
+    let status = gateway.status(now);
+    black_box((status.at(), status.health(), status.controller(), status.sleeps()));
+    status.variables().for_each(|known| _ = black_box(known));
+    status.links().for_each(|link| _ = black_box(link));
+    for port in status.ports() {
+        black_box((port, port.state.name(), port.reply.name()));
+        if let Some(rejection) = port.last_rejection {
+            black_box((rejection.bytes(), rejection.why.text()));
+        }
+    }
+    let mut histogram = status.latency().arrived;
+    histogram.merge(&status.latency().lateness);
+    black_box((histogram.percentile(any(500)), histogram.sum(), histogram.max(), histogram.buckets()));
+    black_box(Histogram::bucket_end(any(3)));
+}
+
+#[inline(never)]
+fn engine_tap() {
+    static TAPPED: ConstStaticCell<EngineWithTap> = ConstStaticCell::new(EngineWithTap::idle());
+    let Some(gateway) = TAPPED.try_take() else { return };
+    let gateway = black_box(gateway);
+    gateway.tap().listen(any(true));
+    gateway.handle(any(Instant::ZERO), any(Input::Tick));
+    black_box(gateway.poll_output(any(Instant::ZERO), &mut [0; OUTPUT_BUFFER]));
+    black_box((gateway.tap().is_listening(), gateway.tap().next(&mut [0; MAX_TAPPED])));
 }
 
 #[inline(never)]

@@ -229,7 +229,7 @@ impl FieldPort {
                         break;
                     }
                 }
-                Err(why) => self.last_rejection = Some(LastRejection::new(now, why, None, payload)),
+                Err(why) => keep(&mut self.last_rejection, why, payload, now),
             }
         }
         *rest = left;
@@ -254,18 +254,29 @@ impl FieldPort {
         tap: &mut Tap<TAP>,
     ) -> Accepted {
         let now = store.now;
-        let verdict = self.take_can(frame, bindings, store, commands);
-        tap.record(|| came(self.id, now, verdict.map(|_| ()), Some(frame.id()), [frame.data(), &[], &[]]));
-        match verdict {
-            Ok(accepted) => accepted,
+        match self.take_can(frame, bindings, store, commands) {
+            Ok(accepted) => {
+                tap.record(|| came(self.id, now, Ok(()), Some(frame.id()), [frame.data(), &[], &[]]));
+                accepted
+            }
             Err(why) => {
-                self.last_rejection = Some(LastRejection::new(now, why, Some(frame.id()), frame.data()));
+                tap.record(|| came(self.id, now, Err(why), Some(frame.id()), [frame.data(), &[], &[]]));
+                // On a shared bus, frames for others are no news.
+                if why != Rejection::ForeignId || self.last_rejection.is_none() {
+                    self.reject(why, Some(frame.id()), frame.data(), now);
+                }
                 Accepted::default()
             }
         }
     }
 
-    #[inline]
+    #[cold]
+    #[inline(never)]
+    fn reject(&mut self, why: Rejection, can_id: Option<CanId>, bytes: &[u8], now: Instant) {
+        self.last_rejection = Some(LastRejection::new(now, why, can_id, bytes));
+    }
+
+    #[inline(always)]
     fn take_can<const PORTS: usize>(
         &mut self,
         frame: &CanFrame,
@@ -384,6 +395,12 @@ impl FieldPort {
             PortState::Working
         }
     }
+}
+
+#[cold]
+#[inline(never)]
+fn keep(last: &mut Option<LastRejection>, why: Rejection, bytes: &[u8], now: Instant) {
+    *last = Some(LastRejection::new(now, why, None, bytes));
 }
 
 /// Input from a field port's device, for the tap.

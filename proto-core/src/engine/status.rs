@@ -82,7 +82,8 @@ pub struct PortStatus<'a> {
     pub reply: ReplyCode,
     /// The text of that command, such as `run(pick.jspf)`.
     pub command: Option<&'a str>,
-    /// The newest rejection.
+    /// The newest rejection. A CAN frame with an unknown id replaces no other rejection: on a
+    /// shared bus it is for another node.
     pub last_rejection: Option<&'a LastRejection>,
     /// Counters since the start.
     pub counters: &'a PortCounters,

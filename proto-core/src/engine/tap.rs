@@ -214,30 +214,21 @@ impl<const N: usize> Tap<N> {
 
     /// Appends bytes; there is room.
     fn push(&mut self, bytes: &[u8]) {
-        let size = self.ring.len();
-        let end = wrapped(self.start.saturating_add(self.used), size);
-        let (first, second) = bytes.split_at_checked(size.saturating_sub(end)).unwrap_or((bytes, &[]));
-        if let Some(to) = self.ring.get_mut(end..end.saturating_add(first.len())) {
-            to.copy_from_slice(first);
-        }
-        if let Some(to) = self.ring.get_mut(..second.len()) {
-            to.copy_from_slice(second);
+        let end = wrapped(self.start.saturating_add(self.used), N);
+        let (before, behind) = self.ring.split_at_mut_checked(end).unwrap_or((&mut [], &mut []));
+        for (place, &byte) in behind.iter_mut().chain(before).zip(bytes) {
+            *place = byte;
         }
         self.used = self.used.saturating_add(bytes.len());
     }
 
     /// Removes the first bytes; they exist.
     fn pull(&mut self, into: &mut [u8]) {
-        let straight = self.ring.len().saturating_sub(self.start).min(into.len());
-        let len = into.len();
-        let Some((first, second)) = into.split_at_mut_checked(straight) else { return };
-        if let Some(from) = self.ring.get(self.start..self.start.saturating_add(first.len())) {
-            first.copy_from_slice(from);
+        let (before, behind) = self.ring.split_at_checked(self.start).unwrap_or((&[], &[]));
+        for (place, &byte) in into.iter_mut().zip(behind.iter().chain(before)) {
+            *place = byte;
         }
-        if let Some(from) = self.ring.get(..second.len()) {
-            second.copy_from_slice(from);
-        }
-        self.forget(len);
+        self.forget(into.len());
     }
 
     fn array<const LEN: usize>(&mut self) -> [u8; LEN] {
