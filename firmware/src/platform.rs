@@ -1,7 +1,8 @@
-//! What a board gives to the tasks: the one interface between them and a chip, its pins and its memory.
+//! What a board provides for the tasks: the one interface between them and a chip, its pins and its
+//! memory.
 //!
-//! In: nothing of a protocol. Out: devices that nobody has yet, each handed out once. How a board of
-//! your own comes to this, and which tests tell that it does: docs/boards.md.
+//! In: nothing of a protocol. Out: unused devices, each handed out once. How to write your own, and
+//! the tests for it: docs/boards.md.
 
 use core::fmt::{Debug, Display};
 
@@ -18,9 +19,9 @@ use crate::drivers::line::Line;
 /// device is called from one task at the start, before any device is used; `ethernet` comes last, so
 /// that a PHY that is not there does not keep the field buses from running.
 pub trait Board {
-    /// How many RS-485 lines there are: ports of the configuration get them in its order.
+    /// Number of RS-485 lines; ports of the configuration get them in order.
     const SERIAL_PORTS: usize;
-    /// How many CAN buses there are, likewise.
+    /// Number of CAN buses; likewise.
     const CAN_PORTS: usize;
     /// How long the watchdog waits for [`Feed::feed`]: at least 4 s, since a task may take a second to
     /// answer and is asked four times in it.
@@ -41,17 +42,17 @@ pub trait Board {
     /// Why there is no Ethernet.
     type EthernetError: Debug + Display + Copy;
 
-    /// The configuration image, as it lies in memory that can be read; what is behind it does not matter.
+    /// The configuration image, in memory that can be read; bytes after it are ignored.
     ///
     /// # Errors
     /// There is none, or it cannot be read: then the buses stay silent.
     fn configuration(&mut self) -> Result<&'static [u8], Self::StorageError>;
 
-    /// The next RS-485 line with these settings; `None` when there are no more, or it cannot have them
-    /// (which the log has said).
+    /// The next RS-485 line with these settings; `None` if there are no more, or it cannot have
+    /// them (which is logged).
     fn serial(&mut self, line: &Rs485) -> Option<Self::Serial>;
 
-    /// The next CAN bus at so many bits a second; `None` as for [`Self::serial`].
+    /// The next CAN bus with this bit rate; `None` as for [`Self::serial`].
     fn can(&mut self, bitrate: u32) -> Option<Self::Can>;
 
     /// The Ethernet controller.
@@ -66,10 +67,10 @@ pub trait Board {
     /// The status LED; asked for once.
     fn led(&mut self) -> Self::Led;
 
-    /// What local port numbers are drawn from: another at each start.
+    /// A seed for local port numbers: another at each start.
     fn seed(&mut self) -> u64;
 
-    /// The most that was on the stack so far, in bytes.
+    /// The maximum stack use so far, in bytes.
     fn stack_used(&self) -> usize;
 }
 

@@ -34,7 +34,7 @@ const SERIAL_PORTS: usize = <Board as platform::Board>::SERIAL_PORTS;
 const CAN_PORTS: usize = <Board as platform::Board>::CAN_PORTS;
 const WATCHDOG_PERIOD: Duration = <Board as platform::Board>::WATCHDOG_PERIOD;
 
-/// Starts what the configuration asks for, and gives back what a board may start tasks of its own with.
+/// Starts the tasks of the configuration, and returns what a board needs to start tasks of its own.
 /// Without a configuration that can run, the buses stay silent and the log says why.
 pub(crate) fn start(spawner: Spawner, mut board: Board) -> Tasks {
     info!("recipe gateway {}", env!("CARGO_PKG_VERSION"));
@@ -42,7 +42,7 @@ pub(crate) fn start(spawner: Spawner, mut board: Board) -> Tasks {
     led.set(true);
     static WATCH: StaticCell<Watch> = StaticCell::new();
     let tasks = Tasks { spawner, watch: WATCH.init_with(Watch::new) };
-    // The first: what hangs behind it ends in a reset.
+    // First of all: if anything later hangs, the watchdog resets the board.
     spawner.spawn(feeder(tasks.watch, board.watchdog()).expect("the first of its kind"));
     // Both are all zeros: nothing of them is in flash or passes over the stack.
     static GATEWAY: ConstStaticCell<Gateway> = ConstStaticCell::new(Gateway::idle());
@@ -58,7 +58,7 @@ pub(crate) fn start(spawner: Spawner, mut board: Board) -> Tasks {
     tasks
 }
 
-/// Starts tasks. Nothing else does, so there is none that the watchdog does not know.
+/// Starts tasks. Nothing else does, so the watchdog knows all of them.
 #[derive(Clone, Copy)]
 pub(crate) struct Tasks {
     spawner: Spawner,
@@ -103,14 +103,14 @@ impl core::fmt::Display for Refused {
     }
 }
 
-/// What the tasks need of the configuration.
+/// The tasks' part of the configuration.
 struct Wiring {
     ports: heapless::Vec<(PortId, Bus), { firmware::tasks::gateway::MAX_FIELD_PORTS }>,
     links: heapless::Vec<(LinkId, LinkKind, Endpoint), MAX_LINKS>,
     network: Option<Network>,
 }
 
-/// What takes room only until everything is started, and what takes the room then.
+/// Room that is used by one thing until everything is started, and by another afterwards.
 #[allow(clippy::large_enum_variant, reason = "that is what it is for")]
 #[repr(u8)]
 enum Room {
@@ -177,7 +177,7 @@ fn run(
     wiring: Wiring,
     mut memory: &'static mut [u8],
 ) -> Result<(), Refused> {
-    // All devices are claimed before anything moves.
+    // All devices are claimed before anything runs.
     let mut serial_ports: heapless::Vec<_, SERIAL_PORTS> = heapless::Vec::new();
     let mut can_ports: heapless::Vec<_, CAN_PORTS> = heapless::Vec::new();
     for (id, bus) in &wiring.ports {
@@ -286,12 +286,12 @@ async fn status_led(pulse: &'static Pulse, gateway: Option<&'static Gateway>, mu
     pulse.run(pin!(led::run(pulse, condition, |is_lit| led.set(is_lit)))).await
 }
 
-/// Tells the board's address whenever it changes.
+/// Logs the board's address whenever it changes.
 #[embassy_executor::task]
 async fn address(pulse: &'static Pulse, stack: Stack<'static>) -> ! {
     let telling = async {
         loop {
-            // A fixed address is there before the link is, and nobody can be reached at it.
+            // A fixed address exists before the link is up, and cannot be reached yet.
             pulse.idle(pin!(stack.wait_link_up())).await;
             pulse.idle(pin!(stack.wait_config_up())).await;
             if let Some(config) = stack.config_v4() {
@@ -309,7 +309,7 @@ async fn status(pulse: &'static Pulse, gateway: &'static Gateway) -> ! {
     pulse.run(pin!(firmware::tasks::status::run(gateway, pulse))).await
 }
 
-/// Says again and again why nothing runs: whoever looks later wants to know as well.
+/// Logs again and again why nothing runs, for readers who come later.
 #[embassy_executor::task]
 async fn refused(pulse: &'static Pulse, reason: Refused) -> ! {
     let what = if matches!(reason, Refused::Ethernet(_)) { "no controller" } else { "nothing runs" };
@@ -324,7 +324,7 @@ async fn refused(pulse: &'static Pulse, reason: Refused) -> ! {
 
 /// One for each link, DHCP and DNS.
 const SOCKETS: usize = MAX_LINKS + 2;
-/// After this long the reason is told again.
+/// Interval of logging the reason.
 const REPEAT: Duration = Duration::from_secs(10);
 /// A task for each port and link, and: engine, network, address, status, LED, refused, the board's own.
 const MAX_TASKS: usize = SERIAL_PORTS + CAN_PORTS + MAX_LINKS + 7;

@@ -1,18 +1,17 @@
-//! How long something took, counted in buckets that double: enough for a median, a 99th percentile
-//! and a maximum, in constant memory and a few instructions a sample.
+//! Durations counted in buckets of doubling width: enough for a median, a 99th percentile and a
+//! maximum, in constant memory and with a few instructions per sample.
 //!
-//! In: durations. Out: counts, percentiles, the longest. Refuses to know what is measured.
+//! In: durations. Out: counts, percentiles, the maximum. Does not know what is measured.
 
 use crate::time::Duration;
 
-/// Buckets of a [`Histogram`].
+/// Number of buckets of a [`Histogram`].
 pub const BUCKETS: usize = 24;
 
 /// Durations in power-of-two buckets of microseconds.
 ///
-/// Bucket 0 counts what took less than 1 µs, bucket `n` what took from 2^(n-1) µs up to less than 2^n µs,
-/// and the last one everything from 2^22 µs (4.2 s) on. Counts stay at their highest value, 2^32 - 1,
-/// once they have reached it.
+/// Bucket 0 counts durations below 1 µs, bucket `n` durations from 2^(n-1) µs up to less than 2^n
+/// µs, and the last one everything from 2^22 µs (4.2 s) on. Counts saturate at 2^32 - 1.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct Histogram {
@@ -28,12 +27,12 @@ impl Default for Histogram {
 }
 
 impl Histogram {
-    /// Without a sample. All its bytes are 0.
+    /// An empty histogram. All its bytes are 0.
     pub const fn new() -> Self {
         Self { counts: [0; BUCKETS], sum_us: 0, max_us: 0 }
     }
 
-    /// One more sample.
+    /// Adds a sample.
     #[inline]
     pub fn record(&mut self, duration: Duration) {
         let micros = u32::try_from(duration.as_micros()).unwrap_or(u32::MAX);
@@ -50,12 +49,12 @@ impl Histogram {
         self.counts.iter().map(|&count| u64::from(count)).sum()
     }
 
-    /// All samples together. A sample longer than 2^32 µs (71 minutes) counts as that.
+    /// The sum of all samples. A sample longer than 2^32 µs (71 minutes) counts as that long.
     pub const fn sum(&self) -> Duration {
         Duration::from_micros(self.sum_us)
     }
 
-    /// The longest sample; zero without one.
+    /// The longest sample; zero if there is none.
     pub const fn max(&self) -> Duration {
         Duration::from_micros(self.max_us as u64)
     }
@@ -65,14 +64,15 @@ impl Histogram {
         &self.counts
     }
 
-    /// Where bucket `index` ends: every sample in it was shorter than this. [`Duration::MAX`] for the
-    /// last bucket and beyond.
+    /// The end of bucket `index`: every sample in it was shorter than this. [`Duration::MAX`] for
+    /// the last bucket and beyond.
     pub const fn bucket_end(index: usize) -> Duration {
         if index < BUCKETS - 1 { Duration::from_micros(1 << index) } else { Duration::MAX }
     }
 
-    /// What `per_mille` thousandths of the samples did not exceed, to the end of their bucket, and never
-    /// more than the longest sample. `None` without a sample. The median is 500, the 99th percentile 990.
+    /// The duration that `per_mille` thousandths of the samples did not exceed, rounded up to the
+    /// end of its bucket, and never more than the longest sample. `None` without a sample. The
+    /// median is 500, the 99th percentile 990.
     pub fn percentile(&self, per_mille: u16) -> Option<Duration> {
         let count = self.count();
         if count == 0 {
@@ -99,8 +99,8 @@ impl Histogram {
 
 #[cfg(feature = "serde")]
 impl serde::Serialize for Histogram {
-    /// As people ask for it: the count, median, 99th percentile and maximum in microseconds, and the
-    /// buckets. Percentiles are absent without a sample.
+    /// The count, median, 99th percentile and maximum in microseconds, and the buckets. Percentiles
+    /// are absent without a sample.
     fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         #[derive(serde::Serialize)]
         struct Shown<'a> {

@@ -1,11 +1,11 @@
-//! What the tasks ask of a CAN controller.
+//! The trait of a CAN controller for the tasks.
 
 use embedded_can::Frame;
 use proto_core::engine::BusState;
 use proto_core::wire::can::CanFrame;
 use proto_core::wire::can::CanId;
 
-/// A CAN controller. Its driver buffers what arrives while nobody receives.
+/// A CAN controller. Its driver buffers received frames while no task receives.
 #[allow(async_fn_in_trait, reason = "all tasks run on one executor: no future is sent anywhere")]
 pub trait CanPort {
     /// The driver's frame.
@@ -15,38 +15,38 @@ pub trait CanPort {
     /// when the future is dropped before it is done.
     async fn receive(&mut self) -> CanEvent<Self::Frame>;
 
-    /// Hands a frame over for sending behind those before it, as soon as there is room for it. When all
-    /// have left, `receive` says so.
+    /// Hands a frame over for sending after the previous ones, as soon as there is room. When all
+    /// have left, `receive` reports it.
     ///
     /// # Errors
     /// [`BusOff`] when the controller has left the bus; `receive` then does not report that again.
     async fn send(&mut self, frame: &CanFrame) -> Result<(), BusOff>;
 
-    /// Forgets what waits to be sent, and lets the controller onto the bus again after bus-off.
-    /// `receive` reports when it is there, which on a disturbed bus may be never.
+    /// Drops the frames that wait to be sent, and lets the controller back onto the bus after
+    /// bus-off. `receive` reports when it is back, which on a disturbed bus may be never.
     fn recover(&mut self);
 
     /// Goes onto the bus. Frames with other ids need not be received; a controller without room for all
     /// of the ids lets more pass. Called once, before anything else.
     fn set_filters(&mut self, ids: &[CanId]);
 
-    /// How the controller does.
+    /// State of the controller.
     fn counters(&self) -> CanCounters {
         CanCounters::default()
     }
 
-    /// The bus' speed, in bit/s.
+    /// The bit rate of the bus, in bit/s.
     fn bitrate(&self) -> u32;
 }
 
-/// What a CAN controller brings.
+/// An event of a CAN controller.
 #[derive(Debug, Clone, Copy)]
 pub enum CanEvent<F> {
     /// A frame.
     Frame(F),
     /// Its error state changed.
     Bus(BusState),
-    /// All that was handed over has left.
+    /// Everything handed over has left.
     Sent,
 }
 
@@ -61,6 +61,6 @@ pub struct CanCounters {
     pub transmit_errors: u8,
     /// The receive error counter of the CAN standard.
     pub receive_errors: u8,
-    /// Times that a frame was lost because nobody took it from the controller in time. Wraps.
+    /// Times that a frame was lost because it was not read from the controller in time. Wraps.
     pub lost: u32,
 }

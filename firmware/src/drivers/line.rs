@@ -1,4 +1,4 @@
-//! What the tasks ask of an RS-485 line.
+//! The trait of an RS-485 line for the tasks.
 
 use embedded_io_async::{Read, Write};
 
@@ -9,22 +9,22 @@ pub trait Line: Read + Write {
         let _ = direction;
     }
 
-    /// What the device could not take.
+    /// Counters of characters that the device could not take.
     fn errors(&self) -> LineErrors {
         LineErrors::NONE
     }
 }
 
-/// What a line's device could not take since it was started. Counters wrap.
+/// Characters that a line's device could not take since it was started. Counters wrap.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct LineErrors {
-    /// Characters left out for their parity.
+    /// Characters discarded because of their parity.
     pub parity: u32,
-    /// Characters left out for a stop bit that was none.
+    /// Characters discarded because of a missing stop bit.
     pub framing: u32,
     /// Times that the receive FIFO was full, with one character or more lost.
     pub overruns: u32,
-    /// Characters lost because nobody read.
+    /// Characters lost because they were not read in time.
     pub unread: u32,
 }
 
@@ -32,11 +32,11 @@ impl LineErrors {
     pub(crate) const NONE: Self = Self { parity: 0, framing: 0, overruns: 0, unread: 0 };
 }
 
-/// Who drives the line.
+/// Which side drives the line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LineDirection {
     /// The devices.
     Receive,
-    /// We.
+    /// The gateway.
     Send,
 }

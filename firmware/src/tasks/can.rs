@@ -38,14 +38,14 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, can: impl CanPo
     task.run().await
 }
 
-/// What the task waits for, beside frames.
+/// What the task waits for, besides frames.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Phase {
     /// Frames to send.
     Idle,
-    /// What was handed over has to leave the controller until then.
+    /// Frames handed over must leave the controller until then.
     Sending { until: Instant },
-    /// Bus-off: nothing is tried until then.
+    /// Bus-off: no restart until then.
     Off { until: Instant },
     /// The controller is on its way back to the bus; if it is not there by then, another try.
     Recovering { until: Instant },
@@ -58,13 +58,13 @@ struct Task<'a, C> {
     control: &'a PortControl,
     can: C,
     phase: Phase,
-    /// What was handed over last did not leave.
+    /// The newest frames handed over did not leave.
     is_failing: bool,
-    /// How long the next bus-off is waited out.
+    /// The wait after the next bus-off.
     backoff: Duration,
     /// When the controller was back on the bus.
     recovered: Instant,
-    /// As many frames were lost when it was told last, and when that was.
+    /// Number of lost frames in the newest log line, and when that was.
     lost: u32,
     lost_told: Instant,
 }
@@ -83,7 +83,7 @@ impl<C: CanPort> Task<'_, C> {
                     Either3::Second(()) => {}
                     Either3::Third(()) => self.expired(),
                 }
-                // A bus that is never idle does not keep us from sending.
+                // A bus that is never idle does not keep the task from sending.
                 self.send_waiting().await;
             }
             self.tell_lost();
@@ -136,8 +136,8 @@ impl<C: CanPort> Task<'_, C> {
             frames = frames.saturating_add(1);
             let patience = patience(frames, self.can.bitrate());
             self.control.forget_sleep();
-            // When the gateway has slept meanwhile, what waits in the controller is old and must not be
-            // heard of only when the frame has left.
+            // If the gateway has slept meanwhile, data in the controller is old and must be
+            // reported before the frame has left.
             let sending = select(self.can.send(&frame), self.control.has_slept());
             let sent = self.pulse.idle(pin!(with_timeout(patience, sending))).await;
             match sent {
@@ -162,10 +162,10 @@ impl<C: CanPort> Task<'_, C> {
         }
     }
 
-    /// Nobody takes what is sent: another node is missing, or the cable. What waits would be old when
-    /// one comes.
+    /// Frames are not acknowledged: another node is missing, or the cable. Waiting frames would be
+    /// old when one comes.
     fn give_up(&mut self) {
-        // Said once, however often it happens in a row.
+        // Logged once, however often it happens in a row.
         if !self.is_failing {
             let errors = self.can.counters().transmit_errors;
             warn!(
@@ -212,7 +212,7 @@ impl<C: CanPort> Task<'_, C> {
         info!("port {}: {}; errors: transmit {}, receive {}", port, name, transmit_errors, receive_errors);
     }
 
-    /// Says that frames were lost, at most once a second.
+    /// Logs that frames were lost, at most once a second.
     fn tell_lost(&mut self) {
         let lost = self.can.counters().lost;
         let now = Instant::now();
@@ -224,7 +224,7 @@ impl<C: CanPort> Task<'_, C> {
     }
 }
 
-/// The engine's frame. Of a remote frame there is no data to look at.
+/// The engine's frame. A remote frame has no data.
 fn own_frame(frame: &impl Frame) -> Option<CanFrame> {
     let id = CanId::from(frame.id());
     if frame.is_remote_frame() {

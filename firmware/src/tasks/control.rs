@@ -1,4 +1,4 @@
-//! What lies between the engine and the task of a port or link: an outbox each.
+//! The connection between the engine and the task of a port or link: an outbox each.
 
 use core::cell::{Cell, RefCell};
 
@@ -55,7 +55,7 @@ impl PortControl {
         self.changed.notify();
     }
 
-    /// Wakes the task: its device may have what it has woken nobody for.
+    /// Wakes the task: its device may have data for which it has woken no task.
     pub(crate) fn look(&self) {
         self.changed.notify();
     }
@@ -65,15 +65,15 @@ impl PortControl {
         self.look();
     }
 
-    /// Waits until the gateway has slept: what waits in the device has to be told at once, as long as
-    /// the engine discards it. Eats notifications, so nothing else may wait for them.
+    /// Waits until the gateway has slept: data that waits in the device must be reported at once,
+    /// while the engine discards it. Consumes notifications, so nothing else may wait for them.
     pub(crate) async fn has_slept(&self) {
         while !self.has_slept.take() {
             self.changed.notified().await;
         }
     }
 
-    /// From here on only a sleep to come counts.
+    /// From here on only a future sleep counts.
     pub(crate) fn forget_sleep(&self) {
         self.has_slept.set(false);
     }
@@ -109,17 +109,17 @@ impl PortControl {
         self.frames.borrow_mut().pop_front()
     }
 
-    /// Forgets what waits: the device is gone.
+    /// Drops what waits: the device is gone.
     pub(crate) fn clear(&self) {
         self.frames.borrow_mut().clear();
         *self.bytes.borrow_mut() = None;
     }
 }
 
-/// The engine's side of a link. A link is open for a *turn*: what belongs to an earlier turn is not
-/// reported and not sent.
+/// The engine's side of a link. A link is open for a *turn*: events of an earlier turn are not
+/// reported, and its data is not sent.
 pub(crate) struct LinkControl {
-    /// Odd while the link is to be open; one more for each opening and closing.
+    /// Odd while the link is to be open; incremented by each opening and closing.
     turn: Cell<u32>,
     outbox: RefCell<Option<Transmission>>,
     /// Bytes of this turn that are not acknowledged, as the engine knows.
@@ -139,12 +139,12 @@ impl LinkControl {
         }
     }
 
-    /// Somebody else than the controller came to where the controller is awaited.
+    /// Another host than the controller connected or sent to a listening link.
     pub(crate) fn turn_away(&self) {
         self.strangers.set(self.strangers.get().saturating_add(1));
     }
 
-    /// How many of them were turned away.
+    /// How often that happened.
     pub(crate) fn strangers(&self) -> u32 {
         self.strangers.get()
     }
@@ -179,19 +179,20 @@ impl LinkControl {
         self.changed.notify();
     }
 
-    /// Of what was handed over in this turn, as much as the engine believes to be unacknowledged.
+    /// The number of this turn's bytes that the engine considers unacknowledged.
     pub(crate) fn unacknowledged(&self) -> u32 {
         self.unacknowledged.get()
     }
 
-    /// The task has left `left` bytes beside what waits here. The number for the engine, if it is news.
+    /// The task holds `left` bytes in addition to those that wait here. Returns the number for the
+    /// engine, if it has changed.
     pub(crate) fn acknowledged(&self, left: usize) -> Option<u32> {
         let waiting = self.outbox.borrow().as_ref().map_or(0, |bytes| bytes.len());
         let left = left.saturating_add(waiting) as u32;
         (self.unacknowledged.replace(left) != left).then_some(left)
     }
 
-    /// Waits until the link is to be open; the turn it is.
+    /// Waits until the link is to be open; returns the turn.
     pub(crate) async fn opened(&self) -> u32 {
         loop {
             let turn = self.turn.get();
@@ -202,7 +203,7 @@ impl LinkControl {
         }
     }
 
-    /// Waits until this turn is over. Eats notifications, so nothing else may wait for them.
+    /// Waits until this turn is over. Consumes notifications, so nothing else may wait for them.
     pub(crate) async fn over(&self, turn: u32) {
         while self.is_turn(turn) {
             self.changed.notified().await;

@@ -1,4 +1,4 @@
-//! An Ethernet controller whose frames are taken some at a time.
+//! An Ethernet controller with limited reads.
 //!
 //! The network stack takes all frames that are there before it gives the processor back. When they come
 //! faster than it takes them, nothing else would run any more: no port, no deadline, no watchdog.
@@ -17,7 +17,7 @@ pub struct Fair<'a, D> {
 }
 
 impl<'a, D: Driver> Fair<'a, D> {
-    /// The gateway hears when more waits than the network takes in one turn.
+    /// Wakes the gateway when more waits than the network takes in one turn.
     pub fn new(device: D, gateway: &'a Gateway) -> Self {
         Self { device, gateway, left: FRAMES }
     }
@@ -47,7 +47,7 @@ impl<D: Driver> Driver for Fair<'_, D> {
         self.device.transmit(cx)
     }
 
-    /// The stack asks once in each turn, behind the frames.
+    /// The stack asks once in each turn, after the frames.
     fn link_state(&mut self, cx: &mut Context<'_>) -> LinkState {
         self.left = FRAMES;
         self.device.link_state(cx)

@@ -1,9 +1,9 @@
-//! The engine among its tasks.
+//! The engine, shared by the tasks.
 //!
-//! What a driver brings goes into the engine at once, and what the engine answers is handed over
-//! before anything else is read: one engine pass lies between the last byte of a field frame and the
-//! request on its way to the controller. All tasks run on one executor, so nobody is in the engine
-//! twice. What is handed over lies in one outbox for each port and link; a task takes it from there.
+//! Input of a driver goes into the engine at once, and the engine's outputs are carried out before
+//! anything else is read: one engine pass lies between the last byte of a field frame and the
+//! request on its way to the controller. All tasks run on one executor, so the engine is never
+//! entered twice. Each port and link has one outbox; its task takes data from there.
 
 use core::cell::{Cell, RefCell};
 use core::pin::pin;
@@ -24,9 +24,9 @@ use super::notify::Notify;
 use super::watchdog::Pulse;
 use crate::clock::now;
 
-/// Field ports a board can have.
+/// Number of field ports that a board can have.
 pub const MAX_FIELD_PORTS: usize = 4;
-/// Recipe links a board can have.
+/// Number of recipe links that a board can have.
 pub const MAX_UPLINKS: usize = 2;
 /// User-defined fields in one direction, over all ports.
 pub const MAX_FIELDS: usize = 128;
@@ -44,9 +44,9 @@ pub struct Gateway {
     output: RefCell<[u8; OUTPUT_BUFFER]>,
     deadline: Cell<Instant>,
     deadline_moved: Notify,
-    /// Some task gave the processor back before it had told all that waits.
+    /// A task has yielded before it reported everything that waits.
     more_waits: Cell<bool>,
-    /// As often the gateway slept, as the ports' tasks know.
+    /// Number of sleeps that the ports' tasks have been told of.
     sleeps: Cell<u32>,
 }
 
@@ -65,10 +65,10 @@ impl Gateway {
         }
     }
 
-    /// Takes its configuration, in place; ports and links are down.
+    /// Takes the configuration, in place; ports and links are down.
     ///
     /// # Errors
-    /// What the engine cannot run.
+    /// Why the engine cannot run it.
     pub fn configure(&mut self, config: &GatewayConfig) -> Result<(), BuildError> {
         // Not so in `idle`, which is all zeros and takes no flash.
         self.deadline.set(Instant::NEVER);
@@ -92,12 +92,12 @@ impl Gateway {
         self.links.iter().map(|(id, kind, _)| (*id, *kind))
     }
 
-    /// Shows the engine's status to `look`.
+    /// Passes the engine's status to `look`.
     pub fn report<R>(&self, look: impl FnOnce(Status<'_>) -> R) -> R {
         look(self.engine.borrow().status(now()))
     }
 
-    /// What the status LED shows.
+    /// The condition for the status LED.
     pub fn condition(&self) -> Condition {
         match self.report(|status| status.health()) {
             Health::Idle => Condition::Refused,
@@ -107,17 +107,17 @@ impl Gateway {
         }
     }
 
-    /// How often the processor was stopped: what waited meanwhile was discarded.
+    /// How often the gateway slept: waiting input was discarded.
     pub fn sleeps(&self) -> u32 {
         self.sleeps.get()
     }
 
-    /// How many connections and datagrams of others than the controller each link has turned away.
+    /// Number of connections and datagrams of other hosts that each link has refused.
     pub fn strangers(&self) -> impl Iterator<Item = (LinkKind, u32)> + '_ {
         self.links.iter().map(|(_, kind, control)| (*kind, control.strangers()))
     }
 
-    /// One input, now, and everything that follows from it.
+    /// Handles one input, now, and all outputs that follow.
     pub fn input(&self, input: Input<'_>) {
         let now = now();
         let mut engine = self.engine.borrow_mut();
@@ -164,7 +164,7 @@ impl Gateway {
         }
     }
 
-    /// Lets deadlines pass whenever the engine asked for it. The engine's own task.
+    /// Lets deadlines pass when the engine has asked for it. The engine's own task.
     pub async fn keep_time(&self, pulse: &Pulse) -> ! {
         self.input(Input::Tick);
         loop {
@@ -179,13 +179,13 @@ impl Gateway {
         }
     }
 
-    /// Waits until the engine has heard of all that arrived before this moment: it was not late,
-    /// whatever kept the processor meanwhile. Who always has more is not waited for without an end.
+    /// Waits until everything that arrived before this moment has been reported: it was not late,
+    /// whatever kept the processor. A task that always has more is not waited for without limit.
     ///
     /// In a round of the executor each task that was woken runs once, in no particular order. What the
     /// Ethernet controller has goes to the network's task in one round and to a link's in the next.
     async fn all_told(&self) {
-        // A device may have what it has woken nobody for.
+        // A device may have data for which it has woken no task.
         self.ports.iter().for_each(|(_, control)| control.look());
         let mut quiet = 0_u8;
         for _ in 0..MAX_ROUNDS {
@@ -198,12 +198,12 @@ impl Gateway {
         }
     }
 
-    /// A task gives the processor back and may have left something that waits to be told.
+    /// A task yields and may have left something that must be reported.
     pub(crate) fn more_waits(&self) {
         self.more_waits.set(true);
     }
 
-    /// Whether a datagram is a frame of the link's.
+    /// Whether a datagram is a frame of the link.
     pub(crate) fn is_frame(&self, link: LinkId, datagram: &[u8]) -> bool {
         self.engine.borrow().is_frame(link, datagram)
     }
@@ -217,8 +217,8 @@ impl Gateway {
     }
 }
 
-/// One for a task whose interrupt comes while the time is looked at, one for that of the network, and one
-/// for a link's behind it.
+/// One for a task whose interrupt comes while the time is read, one for that of the network, and
+/// one for a link's after it.
 const QUIET_ROUNDS: u8 = 3;
-/// What a port's task tells in as many is more than any device keeps.
+/// As many reports of a port's task contain more than any device can buffer.
 const MAX_ROUNDS: u8 = 20;

@@ -1,10 +1,10 @@
-//! The status LED: what a person without a log can see (the table is in README.md).
+//! The status LED (its table is in README.md).
 
 use embassy_time::{Duration, Timer};
 
 use super::watchdog::Pulse;
 
-/// What the LED shows. It is lit, without a break, from the start until a task shows something.
+/// What the LED shows. It is lit from the start until a task sets a condition.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Condition {
     /// The configuration was refused: nothing runs.
@@ -29,7 +29,7 @@ impl Condition {
     }
 }
 
-/// Shows the condition for ever; asks for it before each round of the pattern.
+/// Shows the condition for ever; reads it before each round of the pattern.
 pub async fn run(pulse: &Pulse, condition: impl Fn() -> Condition, mut set: impl FnMut(bool)) -> ! {
     loop {
         for &(lit, dark) in condition().pattern() {

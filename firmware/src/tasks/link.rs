@@ -1,12 +1,13 @@
-//! One link to the controller: opened, closed and fed as the engine says.
+//! One link to the controller: opened, closed and fed as the engine requests.
 //!
-//! A link is one task. It owns its socket, hands what arrives to the engine and sends what is in its
-//! outbox; it knows no protocol and makes no decision. Supervision is the engine's: a link that fails
-//! says so once and waits to be opened again.
+//! A link is one task. It owns its socket, reports what arrives to the engine and sends what is in
+//! its outbox; it does not know protocols and makes no decision. The engine supervises: a link that
+//! fails reports this once and waits to be opened again.
 //!
-//! Handed over is not delivered. Of a TCP link the engine hears two things: that the socket has taken what
-//! was handed over and has room for more, and how much the peer has not acknowledged. What it gives up it
-//! closes, whatever the task waits for, and then nothing but a reset leaves any more.
+//! Handed over is not delivered. For a TCP link the engine gets two reports: that the socket has
+//! taken everything and has room for more, and how much the peer has not acknowledged. A link that
+//! the engine gives up is closed, whatever the task waits for, and then nothing but a reset is
+//! sent.
 
 mod tcp;
 mod udp;
@@ -24,7 +25,7 @@ use super::control::LinkControl;
 use super::gateway::Gateway;
 use super::watchdog::Pulse;
 
-/// What a link connects to.
+/// The remote end of a link.
 #[derive(Debug, Clone)]
 pub enum Endpoint {
     /// The controller's TCP server.
@@ -41,14 +42,14 @@ pub enum Endpoint {
         /// UDP port.
         port: u16,
     },
-    /// Where the controller's TCP client connects to. Nobody else does.
+    /// The controller's TCP client; connections of other hosts are refused.
     TcpListen {
         /// TCP port.
         port: u16,
         /// The controller's address or name.
         host: String<64>,
     },
-    /// Where the controller's UDP client sends to. Nobody else does.
+    /// The controller's UDP client; datagrams of other hosts are refused.
     UdpListen {
         /// UDP port.
         port: u16,
@@ -58,8 +59,8 @@ pub enum Endpoint {
 }
 
 impl Endpoint {
-    /// Where a link of the configuration goes. A board has one address, so of `listen` only the port
-    /// counts.
+    /// The remote end of a link of the configuration. A board has one address, so only the port of
+    /// `listen` counts.
     pub fn of(config: &GatewayConfig, kind: LinkKind) -> Self {
         let controller = &config.controller;
         let host = controller.address.clone();
@@ -95,7 +96,7 @@ impl<'a> Buffers<'a> {
     /// Bytes that a link needs.
     pub const SIZE: usize = 6 * 1024;
 
-    /// Takes [`Buffers::SIZE`] bytes from the front of `memory`; `None` when there are fewer.
+    /// Takes [`Buffers::SIZE`] bytes from the front of `memory`; `None` if there are fewer.
     pub fn take(memory: &mut &'a mut [u8], endpoint: &Endpoint) -> Option<Self> {
         let memory = memory.split_off_mut(..Self::SIZE)?;
         let (rx, chunk) = match endpoint {
@@ -128,7 +129,7 @@ pub async fn run(
             Endpoint::Udp { host, port } => driver.udp(turn, host, Way::To(*port), buffers).await,
             Endpoint::UdpListen { port, host } => driver.udp(turn, host, Way::At(*port), buffers).await,
         }
-        // A turn that is over was ended by the engine: it expects no report.
+        // The engine has ended a turn that is over, so it expects no report.
         if control.is_turn(turn) {
             control.close();
             gateway.input(Input::LinkDown { link });
@@ -136,12 +137,12 @@ pub async fn run(
     }
 }
 
-/// Who begins.
+/// Which side connects.
 #[derive(Clone, Copy)]
 enum Way {
-    /// We do, to this port of the controller.
+    /// The board, to this port of the controller.
     To(u16),
-    /// The controller does, at this port of ours.
+    /// The controller, to this port of the board.
     At(u16),
 }
 
@@ -154,7 +155,7 @@ struct Driver<'a> {
 }
 
 impl Driver<'_> {
-    /// Tells the engine, as long as it is this turn; whether it still is then.
+    /// Reports to the engine while it is this turn; returns whether it still is afterwards.
     fn tell(&self, turn: u32, input: Input<'_>) -> bool {
         if self.control.is_turn(turn) {
             self.gateway.input(input);

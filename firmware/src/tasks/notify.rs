@@ -3,7 +3,7 @@
 use embassy_sync::blocking_mutex::raw::NoopRawMutex;
 use embassy_sync::signal::Signal;
 
-/// Kept until somebody waits for it; several are one.
+/// Kept until a task waits for it; several count as one.
 pub(crate) struct Notify(Signal<NoopRawMutex, ()>);
 
 impl Notify {
@@ -15,7 +15,7 @@ impl Notify {
         self.0.signal(());
     }
 
-    /// Waits for the next notification and eats it.
+    /// Waits for the next notification and consumes it.
     pub(crate) async fn notified(&self) {
         self.0.wait().await;
     }

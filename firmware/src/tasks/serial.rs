@@ -1,9 +1,9 @@
-//! An RS-485 port's task: one task for a port, which drives the line, sends, waits for the last stop
-//! bit, releases the line and reads again.
+//! An RS-485 port's task, one per port: it drives the line, sends, waits for the last stop bit,
+//! releases the line and reads again.
 //!
-//! Its device buffers what arrives while the task is elsewhere, and its `read` and `write` lose nothing and
-//! do nothing twice when they are dropped before they are done. What waits in the device is told at once
-//! and before anything is sent: the engine judges what is late by when it heard of it.
+//! Its device buffers input while the task is elsewhere, and its `read` and `write` lose and repeat
+//! nothing if they are dropped before they are done. Data that waits in the device is reported at
+//! once, and before anything is sent, because the engine judges lateness by the time of the report.
 
 use core::pin::pin;
 use core::task::Poll;
@@ -40,8 +40,8 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, line: impl Line
                     if Instant::now() >= errors.look {
                         errors.tell(port, task.line.errors());
                     }
-                    // What is not yet read came before what is to be sent. But a line that never falls
-                    // silent does not keep us from sending.
+                    // Unread data came before what is to be sent. But a line that is never silent
+                    // does not keep the task from sending.
                     full_chunks = if len < CHUNK { 0 } else { full_chunks.saturating_add(1) };
                     let may_send = full_chunks == 0 || full_chunks >= FULL_CHUNKS;
                     if full_chunks > 0 {
@@ -57,7 +57,7 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, line: impl Line
                 Either3::First(Err(error)) => break error.kind(),
                 Either3::Second(frame) => frame,
                 Either3::Third(()) => {
-                    // At the wrong speed nothing else is ever heard of a line.
+                    // At the wrong speed nothing else is ever received from a line.
                     errors.tell(port, task.line.errors());
                     continue;
                 }
@@ -77,7 +77,7 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, line: impl Line
                 Err(_) => break ErrorKind::TimedOut,
             }
         };
-        // Said once, however often it fails in a row.
+        // Logged once, however often it fails in a row.
         if !is_failing {
             warn!("port {}: {}", port.0, Text(&failed));
         }
@@ -85,7 +85,7 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, line: impl Line
         task.tell_waiting();
         gateway.input(Input::PortDown { port });
         control.clear();
-        // A line that does not take its bytes is heard all the same.
+        // A line that does not take its bytes is still read.
         if failed != ErrorKind::TimedOut {
             Timer::after(RETRY).await;
         }
@@ -101,13 +101,13 @@ struct Task<'a, L> {
 }
 
 impl<L: Line> Task<'_, L> {
-    /// Tells the engine of the first `len` bytes of the chunk.
+    /// Reports the first `len` bytes of the chunk to the engine.
     fn tell(&self, len: usize) {
         let bytes = self.chunk.get(..len).unwrap_or(&[]);
         self.gateway.input(Input::PortBytes { port: self.port, bytes });
     }
 
-    /// Tells the engine of all that waits in the device.
+    /// Reports everything that waits in the device to the engine.
     fn tell_waiting(&mut self) {
         for _ in 0..FULL_CHUNKS {
             match poll_once(self.line.read(&mut self.chunk)) {
@@ -117,8 +117,8 @@ impl<L: Line> Task<'_, L> {
         }
     }
 
-    /// Sends a frame, to the end of its last stop bit. When the gateway has slept meanwhile, what waits
-    /// in the device is old and must not be heard of only when the frame has left.
+    /// Sends a frame, to the end of its last stop bit. If the gateway has slept meanwhile, data in
+    /// the device is old and must be reported before the frame has left.
     async fn send(&mut self, frame: &[u8]) -> Result<(), ErrorKind> {
         self.control.forget_sleep();
         let mut rest = frame;
@@ -139,7 +139,7 @@ impl<L: Line> Task<'_, L> {
     }
 }
 
-/// The errors that were told of, and when they are looked at again.
+/// The errors that were logged, and when they are checked again.
 struct Told {
     errors: LineErrors,
     look: Instant,
@@ -168,7 +168,7 @@ fn patience(bytes: usize, baud: u32) -> Duration {
 
 /// Bytes read at once.
 const CHUNK: usize = 256;
-/// More than any device keeps.
+/// More than any device can buffer.
 const FULL_CHUNKS: usize = 9;
 const ERROR_PERIOD: Duration = Duration::from_secs(1);
 /// After a failed device.

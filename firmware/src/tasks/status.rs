@@ -1,4 +1,4 @@
-//! What the log says while all is well: what came of every link, and what went through every port.
+//! The log of normal operation: changes of every link, and the traffic of every port.
 
 use core::pin::pin;
 
@@ -9,7 +9,7 @@ use super::gateway::{Gateway, MAX_FIELD_PORTS, MAX_LINKS};
 use super::watchdog::Pulse;
 use crate::{info, warn};
 
-/// Says it when it is another than before, for ever.
+/// Logs the status whenever it has changed, for ever.
 pub async fn run(gateway: &Gateway, pulse: &Pulse) -> ! {
     let mut links = [(0, Shown::Down); MAX_LINKS];
     let mut ports = [[0; 6]; MAX_FIELD_PORTS];
@@ -33,7 +33,7 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse) -> ! {
                     }
                     if *before != Shown::Shared && shown == Shown::Shared {
                         info!(
-                            "link {}: the controller takes one connection; the command link does its work",
+                            "link {}: the controller takes only one connection; the command link carries its commands",
                             name
                         );
                     }
@@ -44,12 +44,12 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse) -> ! {
         }
         if sleeps != gateway.sleeps() {
             sleeps = gateway.sleeps();
-            warn!("the processor was stopped ({}): what waited meanwhile is discarded", sleeps);
+            warn!("the gateway slept ({}): waiting input is discarded", sleeps);
         }
         for ((kind, now), before) in gateway.strangers().zip(&mut strangers) {
             if *before != now {
                 *before = now;
-                warn!("link {}: {} turned away that were not the controller", kind.name(), now);
+                warn!("link {}: {} connections or datagrams of other hosts refused", kind.name(), now);
             }
         }
         gateway.report(|status| {
@@ -76,7 +76,7 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse) -> ! {
     }
 }
 
-/// How a link is, as the log tells it.
+/// A link's state in the log.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Shown {
     Down,

@@ -1,10 +1,10 @@
-//! Whether every task still runs, and a watchdog that is fed only then.
+//! Checks that every task still runs; the watchdog is fed only then.
 //!
 //! A task may wait for a byte for ever, so it is asked: it has a [`Pulse`], and where it waits for
-//! something that may never come it waits through [`Pulse::idle`], which answers. A task that hangs
-//! anywhere else does not answer, is named in the log, and the watchdog starves. One that never gives
-//! the processor back starves it too, since the feeder cannot run; [`running`] names that one to an
-//! interrupt.
+//! something that may never come it waits through [`Pulse::idle`], which responds. A task that
+//! hangs anywhere else does not respond, is named in the log, and the watchdog is not fed. A task
+//! that never yields keeps the feeder from running, with the same effect; [`running`] names that
+//! task to an interrupt.
 
 use core::cell::{Cell, RefCell};
 use core::fmt;
@@ -19,7 +19,7 @@ use proto_core::engine::{LinkKind, PortId};
 use crate::fmt::Text;
 use crate::{error, info};
 
-/// A task, as the log names it.
+/// A task, by its name in the log.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum TaskName {
     /// Calls the engine when it is time.
@@ -32,13 +32,13 @@ pub enum TaskName {
     Link(LinkKind),
     /// The network stack.
     Network,
-    /// Tells the address.
+    /// Logs the address.
     Address,
-    /// Tells what ports and links do.
+    /// Logs the state of ports and links.
     Status,
     /// The status LED.
     Led,
-    /// Says why nothing runs.
+    /// Logs why nothing runs.
     Refused,
     /// A task of the board's own.
     Board(u8),
@@ -121,7 +121,7 @@ pub fn running() -> Option<TaskName> {
 pub struct Pulse {
     name: Cell<Option<TaskName>>,
     has_answered: Cell<bool>,
-    /// It was named in the log and has not answered since.
+    /// It was named in the log and has not responded since.
     is_suspect: Cell<bool>,
     waker: RefCell<WakerRegistration>,
 }
@@ -136,7 +136,7 @@ impl Pulse {
         }
     }
 
-    /// Waits for what may never come; the task answers meanwhile.
+    /// Waits for something that may never come; the task responds meanwhile.
     ///
     /// A wait that ends by itself in less than a quarter of the watchdog's period needs none of this.
     pub async fn idle<F: Future>(&self, mut wait: Pin<&mut F>) -> F::Output {
@@ -179,7 +179,8 @@ impl<const N: usize> Watch<N> {
         Self { pulses: [const { Pulse::new() }; N], count: Cell::new(0) }
     }
 
-    /// From here on the watchdog is fed only when this task answers. `None` when there are too many.
+    /// From here on the watchdog is fed only if this task responds. `None` if there are too many
+    /// tasks.
     pub fn register(&self, name: TaskName) -> Option<&Pulse> {
         let pulse = self.pulses.get(self.count.get())?;
         self.count.set(self.count.get().saturating_add(1));
@@ -187,8 +188,8 @@ impl<const N: usize> Watch<N> {
         Some(pulse)
     }
 
-    /// Whether all have answered since the round before; then they are asked again. Each that has not is
-    /// told once, and once more when it answers after all.
+    /// Whether all have responded since the last round; then they are asked again. Each missing
+    /// response is logged once, and once more when it comes.
     fn round(&self, mut tell: impl FnMut(TaskName, Answer)) -> bool {
         let registered = || self.pulses.iter().take(self.count.get());
         for pulse in registered() {
@@ -219,7 +220,7 @@ enum Answer {
     Late,
 }
 
-/// Feeds a watchdog that bites after `period`, for ever; four times in a period as long as all is well.
+/// Feeds a watchdog with this `period`, for ever; four times per period while all tasks respond.
 pub async fn run<const N: usize>(watch: &Watch<N>, period: Duration, mut feed: impl FnMut()) -> ! {
     let quarter = period / 4;
     loop {

@@ -1,4 +1,4 @@
-//! What the controller has seen, as `--stats` prints it.
+//! The counters of the controller, as `--stats` prints them.
 
 use std::collections::BTreeMap;
 
@@ -7,13 +7,13 @@ use super::ports::PortCounters;
 /// Counters of one of the TCP servers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize)]
 pub struct ServerCounters {
-    /// Connections taken.
+    /// Connections accepted.
     pub opened: u64,
-    /// Connections closed at once: too many, or a test wanted it.
+    /// Connections closed at once: too many, or a fault of a test.
     pub refused: u64,
     /// Connections closed to make room for another one (docs/devices.md section 7).
     pub displaced: u64,
-    /// Connections that are open.
+    /// Open connections.
     pub open: usize,
     /// Bytes received.
     pub bytes_in: u64,
@@ -21,15 +21,15 @@ pub struct ServerCounters {
     pub bytes_out: u64,
     /// Requests answered; on the state stream, packets.
     pub requests: u64,
-    /// Of them, those refused: unknown commands, Modbus exceptions.
+    /// Requests of these that were refused: unknown commands, Modbus exceptions.
     pub refusals: u64,
     /// Connections closed because the client broke the protocol.
     pub violations: u64,
-    /// Answers swallowed because a test wanted it.
+    /// Answers lost because of a fault of a test.
     pub muted: u64,
 }
 
-/// Everything that is counted, since the controller was made.
+/// All counters, since the controller was made.
 #[derive(Debug, Clone, PartialEq, Eq, Default, serde::Serialize)]
 pub struct Counters {
     /// Port 2000.
@@ -40,12 +40,12 @@ pub struct Counters {
     pub modbus: ServerCounters,
     /// Recipe ports by name.
     pub ports: BTreeMap<String, PortCounters>,
-    /// Datagrams at the UDP server while no port has it.
+    /// Datagrams at the UDP server while no port uses it.
     pub stray_datagrams: u64,
-    /// Programs that were started.
+    /// Programs started.
     pub programs_started: u64,
-    /// Of them, those that ended with an error.
+    /// Programs of these that ended with an error.
     pub programs_failed: u64,
-    /// State packets that a late call missed on the 100 ms grid.
+    /// State packets skipped on the 100 ms grid because of a late call.
     pub missed_state_packets: u64,
 }

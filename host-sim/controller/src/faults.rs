@@ -1,4 +1,4 @@
-//! What a test, or somebody at the teach pendant, can do to the controller.
+//! Faults and operations that a test, or a person at the teach pendant, can cause.
 //!
 //! Plain methods; none of them is reachable from outside the process.
 
@@ -25,7 +25,7 @@ pub enum Link {
     Modbus,
 }
 
-/// What is broken at present.
+/// The present faults.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Faults {
     muted: [bool; 3],
@@ -35,13 +35,13 @@ pub(super) struct Faults {
     muted_ports: Vec<usize>,
     exception: Option<Exception>,
     state_cut: Option<usize>,
-    /// What commands begin takes this much longer.
+    /// Additional time of transitions that commands begin.
     transitions: Duration,
     spoiled: Spoiled,
 }
 
 impl Faults {
-    /// None but what the configuration asks for.
+    /// No faults but those of the configuration.
     pub(super) fn new(command_clients: CommandClients) -> Self {
         Self { command_clients, ..Self::default() }
     }
@@ -81,7 +81,7 @@ impl Faults {
 
 /// Faults of the connection to the controller.
 impl Controller {
-    /// The server takes requests and carries them out, but its answers get lost.
+    /// The server carries out requests, but its answers are lost.
     pub fn mute(&mut self, link: Link) {
         self.faults.muted[link as usize] = true;
     }
@@ -96,12 +96,12 @@ impl Controller {
         self.faults.refused[link as usize] = true;
     }
 
-    /// The server takes connections again.
+    /// The server accepts connections again.
     pub fn accept(&mut self, link: Link) {
         self.faults.refused[link as usize] = false;
     }
 
-    /// How many clients port 2000 takes from now on. Those that are there stay until the next one
+    /// Sets how many clients port 2000 accepts from now on. Present ones stay until the next one
     /// comes.
     pub fn command_clients(&mut self, clients: CommandClients) {
         self.faults.command_clients = clients;
@@ -112,14 +112,14 @@ impl Controller {
         self.server.close_link(link, &mut self.outputs);
     }
 
-    /// Every answer of the server is late by this much from now on. The state stream, which is
-    /// not asked for, knows no delay.
+    /// Delays every answer of the server by this much from now on. The state stream, which answers
+    /// nothing, is not delayed.
     pub fn delay_answers(&mut self, link: Link, delay: Duration) {
         self.faults.delay[link as usize] = delay;
     }
 
-    /// What `poweron`, `poweroff`, `enable`, `disable`, `stop` and `pause` begin takes this much
-    /// longer from now on.
+    /// Makes the transitions of `poweron`, `poweroff`, `enable`, `disable`, `stop` and `pause` this
+    /// much longer from now on.
     pub fn delay_transitions(&mut self, by: Duration) {
         self.faults.transitions = by;
         self.machine.delay_transitions(by);
@@ -130,14 +130,14 @@ impl Controller {
         self.faults.exception = exception;
     }
 
-    /// Of the next state packet only the first `len` bytes are sent, then every connection of port
-    /// 2001 is closed.
+    /// Sends only the first `len` bytes of the next state packet, then closes every connection of
+    /// port 2001.
     pub fn cut_next_state_packet(&mut self, len: usize) {
         self.faults.state_cut = Some(len);
     }
 
-    /// State packets and the frames of recipes' output parts show this instead of the item's value,
-    /// such as NaN. Modbus and programs go on seeing the value.
+    /// Makes state packets and the frames of recipes' output parts show `instead` of the item's
+    /// value, such as NaN. Modbus and programs still see the value.
     ///
     /// An item is a system variable such as `RobotState[8]`, an analog input such as `AI_V[1]`, or any
     /// other float of the state packet, such as `joint_torque[1]` (proto-core/docs/wire/state.md section 2).
@@ -148,7 +148,7 @@ impl Controller {
         self.faults.spoiled.spoil(name, instead)
     }
 
-    /// They show its value again.
+    /// Shows the item's value again.
     ///
     /// # Errors
     /// [`NoSuchFloat`].
@@ -156,14 +156,14 @@ impl Controller {
         self.faults.spoiled.heal(name)
     }
 
-    /// What the port sends gets lost.
+    /// Loses everything that the port sends.
     pub fn mute_port(&mut self, port: usize) {
         if !self.faults.mutes_port(port) {
             self.faults.muted_ports.push(port);
         }
     }
 
-    /// What the port sends arrives again.
+    /// Ends the loss on this port.
     pub fn unmute_port(&mut self, port: usize) {
         self.faults.muted_ports.retain(|&muted| muted != port);
     }
@@ -176,9 +176,9 @@ impl Controller {
         }
     }
 
-    /// Switched off and on again: everything is closed, the registers start afresh with the
-    /// configuration's initial values and 0 everywhere else, and the robot goes through its start to
-    /// power off. Faults stay as they are.
+    /// Switches the controller off and on: everything is closed, the registers get the
+    /// configuration's initial values and 0 everywhere else, and the robot goes through its start
+    /// to power off. Faults stay.
     pub fn restart(&mut self, now: Instant) {
         self.server.close_all(&mut self.outputs);
         self.running = None;
@@ -188,13 +188,13 @@ impl Controller {
         }
         let epoch = self.epoch.unwrap_or(now);
         for port in &mut self.ports {
-            // A serial line or bus is still there, and so is the address of the UDP server.
+            // A serial line or bus still exists, and so does the address of the UDP server.
             if port.is_up() {
                 port.went_down();
                 port.came_up(now, epoch);
             }
         }
-        // The same configuration made the values that there were at the start.
+        // The initial values were valid at the start, from the same configuration.
         if let Ok((registers, arm)) = start_values(&self.config) {
             self.registers = registers;
             self.arm = arm;
@@ -207,8 +207,8 @@ impl Controller {
 
 /// A controller that has lost its memory.
 impl Controller {
-    /// [`Self::restart`], and registers and outputs are 0 whatever the configuration's initial values
-    /// are. Only what is wired to it or belongs to the arm is as it was at the start.
+    /// Same as [`Self::restart`], but registers and outputs are 0 whatever the configuration's
+    /// initial values are. Only wired inputs and the arm are as at the start.
     pub fn restart_cleared(&mut self, now: Instant) {
         self.restart(now);
         self.registers.clear();
@@ -217,13 +217,13 @@ impl Controller {
 
 /// Another version of the controller's software.
 impl Controller {
-    /// The name of the dialect that it speaks.
+    /// The name of its dialect.
     pub fn dialect(&self) -> &'static str {
         self.dialect.name
     }
 
-    /// Its software is replaced by one that speaks this dialect: it restarts. Nothing happens when
-    /// no dialect has this name.
+    /// Replaces the software by one with this dialect: the controller restarts. Nothing happens if
+    /// there is no such dialect.
     pub fn replace_software(&mut self, now: Instant, dialect: &str) {
         if let Some(dialect) = Dialect::named(dialect) {
             self.dialect = dialect;
@@ -232,9 +232,9 @@ impl Controller {
     }
 }
 
-/// What happens in the cell.
+/// Events in the cell.
 impl Controller {
-    /// Gives an input, or any other item, a value.
+    /// Sets the value of an input, or of any other item.
     ///
     /// # Errors
     /// [`SetError::Value`]; nothing changed.
@@ -245,11 +245,11 @@ impl Controller {
         Ok(())
     }
 
-    /// Another recipe is assigned to a port at the teach pendant, by its index in
+    /// Assigns another recipe to a port, as at the teach pendant, by its index in
     /// [`recipe_config::SimConfig::recipes`]; `None` leaves the port idle.
     ///
     /// # Errors
-    /// [`RecipeError`] when the port cannot have it; nothing changed.
+    /// [`RecipeError`] if the port cannot have the recipe; nothing changed.
     pub fn assign_recipe(
         &mut self,
         now: Instant,
@@ -268,41 +268,41 @@ impl Controller {
         result
     }
 
-    /// The key switch is turned.
+    /// Turns the key switch.
     pub fn set_mode(&mut self, mode: OperationMode) {
         self.machine.set_mode(mode);
     }
 
-    /// The emergency stop is pressed.
+    /// Presses the emergency stop.
     pub fn emergency_stop(&mut self, now: Instant) {
         let effect = self.machine.emergency_stop(now);
         self.apply(now, effect);
     }
 
-    /// A protective stop, such as an open door.
+    /// Causes a protective stop, such as by an open door.
     pub fn protective_stop(&mut self, now: Instant) {
         let effect = self.machine.protective_stop(now);
         self.apply(now, effect);
     }
 
-    /// The arm has hit something on this axis (see proto-core/docs/wire/state.md section 2).
+    /// Makes the arm collide on this axis (see proto-core/docs/wire/state.md section 2).
     pub fn collide(&mut self, now: Instant, axis: u8) {
         let effect = self.machine.collide(now, axis);
         self.apply(now, effect);
     }
 
-    /// The cause of a stop is gone and was acknowledged.
+    /// Removes and acknowledges the cause of a stop.
     pub fn clear_stop(&mut self, now: Instant) {
         self.machine.clear_stop(now);
     }
 
-    /// Somebody enters the zone of reduced speed.
+    /// A person enters the zone of reduced speed.
     pub fn enter_reduced(&mut self, now: Instant) {
         self.machine.set_reduced(true);
         self.speed_changed(now);
     }
 
-    /// Nobody is in the zone of reduced speed any more.
+    /// The zone of reduced speed is empty again.
     pub fn leave_reduced(&mut self, now: Instant) {
         self.machine.set_reduced(false);
         self.speed_changed(now);

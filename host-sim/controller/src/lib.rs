@@ -4,17 +4,17 @@
 //!
 //! [`Controller`] is ports 2000 and 2001, Modbus, UDP 2011, recipe ports and programs behind one run loop.
 //!
-//! In: what connections and devices bring, and the time. Out: what they are to send, and when to
-//! come back. Knows no socket, no device and no clock: who drives it does: a shell with sockets, or
-//! a test, which jumps from deadline to deadline.
+//! In: events of connections and devices, and the time. Out: data to send, and when to call again.
+//! Does not know sockets, devices or clocks: its caller does. That is a shell with sockets, or a
+//! test, which jumps from deadline to deadline.
 //!
 //! One rule: [`Controller::handle`] changes the state, then [`Controller::poll_output`] is drained
-//! until it returns [`ControllerOutput::Sleep`]. Polling early is harmless. Everything a peer sends
-//! wrong is counted and survived.
+//! until it returns [`ControllerOutput::Sleep`]. Polling early is harmless. Errors of a peer are
+//! counted and do no harm.
 //!
-//! All registers and IO live in [`registers`]; what is allowed when in [`machine`]; where the arm
-//! is in [`motion`]; scripts in [`program`]; recipe ports in `ports`; connections in `server`;
-//! what a test can break in `faults`.
+//! All registers and IO are in [`registers`]; what is allowed when is in [`machine`], the arm's
+//! position in [`motion`], scripts in [`program`], recipe ports in `ports`, connections in
+//! `server`, and the faults for tests in `faults`.
 
 mod counters;
 mod faults;
@@ -54,11 +54,11 @@ pub use server::{MAX_COMMAND_CONNECTIONS, MAX_MODBUS_CONNECTIONS, MAX_ORDERS, MA
 pub use spoiled::NoSuchFloat;
 pub use test_controller::{Out, TestController};
 
-/// A connection, as the shell numbers it; no two at a time have the same number.
+/// A connection, by a number that the caller assigns; no two open connections have the same.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct ConnId(pub u64);
 
-/// What happened outside.
+/// An event that the caller reports.
 ///
 /// A port is an index into [`SimConfig::ports`].
 #[derive(Debug, Clone, Copy)]
@@ -68,17 +68,17 @@ pub enum ControllerInput<'a> {
     CommandOpened {
         /// Its connection.
         conn: ConnId,
-        /// Where it comes from.
+        /// Its address.
         from: IpAddr,
     },
-    /// It sent bytes.
+    /// The client of port 2000 sent bytes.
     CommandBytes {
         /// Its connection.
         conn: ConnId,
         /// In pieces of any size.
         bytes: &'a [u8],
     },
-    /// It is gone.
+    /// The client of port 2000 is gone.
     CommandClosed {
         /// Its connection.
         conn: ConnId,
@@ -87,10 +87,10 @@ pub enum ControllerInput<'a> {
     StateOpened {
         /// Its connection.
         conn: ConnId,
-        /// Where it comes from.
+        /// Its address.
         from: IpAddr,
     },
-    /// It is gone.
+    /// The client of port 2001 is gone.
     StateClosed {
         /// Its connection.
         conn: ConnId,
@@ -99,29 +99,29 @@ pub enum ControllerInput<'a> {
     ModbusOpened {
         /// Its connection.
         conn: ConnId,
-        /// Where it comes from.
+        /// Its address.
         from: IpAddr,
     },
-    /// It sent bytes.
+    /// The Modbus client sent bytes.
     ModbusBytes {
         /// Its connection.
         conn: ConnId,
         /// In pieces of any size.
         bytes: &'a [u8],
     },
-    /// It is gone.
+    /// The Modbus client is gone.
     ModbusClosed {
         /// Its connection.
         conn: ConnId,
     },
     /// A datagram came to the UDP server.
     Udp2011 {
-        /// Who sent it.
+        /// The sender's address.
         peer: SocketAddr,
-        /// All of it.
+        /// The whole datagram.
         bytes: &'a [u8],
     },
-    /// An earlier datagram to this address came back as unreachable.
+    /// An earlier datagram to this address was returned as unreachable.
     Udp2011Unreachable {
         /// The address.
         peer: SocketAddr,
@@ -131,19 +131,19 @@ pub enum ControllerInput<'a> {
         /// The port.
         port: usize,
     },
-    /// It cannot be used any more.
+    /// A port's device or connection cannot be used any more.
     PortDown {
         /// The port.
         port: usize,
     },
-    /// Bytes came in at a serial or TCP port, or one datagram at a UDP client.
+    /// Bytes arrived at a serial or TCP port, or one datagram at a UDP client.
     PortBytes {
         /// The port.
         port: usize,
         /// In pieces of any size; a datagram whole.
         bytes: &'a [u8],
     },
-    /// A frame came in at a CAN port.
+    /// A frame arrived at a CAN port.
     PortCan {
         /// The port.
         port: usize,
@@ -155,11 +155,11 @@ pub enum ControllerInput<'a> {
         /// The port.
         port: usize,
     },
-    /// Nothing but time.
+    /// Time has passed.
     Tick,
 }
 
-/// What is to be done outside. Exhaustive: who leaves one of them undone has another controller.
+/// A task for the caller. Exhaustive, because each of them must be carried out.
 #[derive(Debug, Clone, PartialEq)]
 pub enum ControllerOutput {
     /// Send bytes on a TCP connection.
@@ -169,8 +169,8 @@ pub enum ControllerOutput {
         /// The bytes.
         bytes: Vec<u8>,
     },
-    /// Close a TCP connection, after what was handed over for it has been sent. Nothing more is to
-    /// be reported of it.
+    /// Close a TCP connection after everything handed over for it has been sent. Report nothing
+    /// more about it.
     Close {
         /// The connection.
         conn: ConnId,
@@ -182,9 +182,9 @@ pub enum ControllerOutput {
     },
     /// Send a datagram from the UDP server.
     UdpSend {
-        /// To whom.
+        /// The receiver's address.
         peer: SocketAddr,
-        /// All of it.
+        /// The whole datagram.
         bytes: Vec<u8>,
     },
     /// Send bytes, or one datagram, on a port, and report [`ControllerInput::PortSent`] after.
@@ -209,24 +209,24 @@ pub enum ControllerOutput {
     },
     /// The controller was shut down: stop listening and end.
     Shutdown,
-    /// Nothing more now: come back then, or earlier with an input.
+    /// Nothing more to do before this instant, unless there is an input.
     Sleep {
-        /// When, or [`Instant::NEVER`].
+        /// When to call again, or [`Instant::NEVER`].
         until: Instant,
     },
 }
 
-/// Why a configuration makes no controller.
+/// Why a controller cannot be made from a configuration.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum BuildError {
-    /// No dialect has this name.
+    /// There is no dialect of this name.
     Dialect(String),
     /// A port cannot have its recipe.
     Port {
         /// The port's name.
         port: String,
-        /// Why not.
+        /// The reason.
         error: RecipeError,
     },
     /// More than one port is the UDP server.
@@ -238,14 +238,14 @@ pub enum BuildError {
     Program {
         /// Its name.
         program: String,
-        /// Why not.
+        /// The reason.
         error: ScriptError,
     },
-    /// A value at the start does not fit.
+    /// An initial value does not fit.
     Initial {
-        /// What was to get it.
+        /// The target.
         target: InitialTarget,
-        /// Why not.
+        /// The reason.
         reason: String,
     },
 }
@@ -277,7 +277,7 @@ pub struct Controller {
     registers: Registers,
     machine: Machine,
     arm: Arm,
-    /// When the registers last took over what the arm does.
+    /// When the registers last got the arm's state.
     arm_shown: Option<Instant>,
     running: Option<Running>,
     /// The newest program's variables, after it has ended.
@@ -286,7 +286,7 @@ pub struct Controller {
     ports: Vec<Port>,
     server: Server,
     state_grid: Grid,
-    /// Where all grids begin: the first instant the controller was told.
+    /// The origin of all grids: the first instant of a call.
     epoch: Option<Instant>,
     faults: Faults,
     counters: Counters,
@@ -340,7 +340,7 @@ impl Controller {
         })
     }
 
-    /// Takes one input. Drain [`Self::poll_output`] after.
+    /// Handles one input. Drain [`Self::poll_output`] afterwards.
     pub fn handle(&mut self, now: Instant, input: ControllerInput<'_>) {
         self.begin(now);
         if self.gone {
@@ -392,10 +392,10 @@ impl Controller {
             }
             ControllerInput::Tick => {}
         }
-        // What follows from it happens when the outputs are drained.
+        // The consequences happen when the outputs are drained.
     }
 
-    /// The next thing to do; [`ControllerOutput::Sleep`] when there is nothing more.
+    /// The next task; [`ControllerOutput::Sleep`] if there is nothing more.
     pub fn poll_output(&mut self, now: Instant) -> ControllerOutput {
         self.begin(now);
         if let Some(output) = self.outputs.pop_front() {
@@ -421,22 +421,22 @@ impl Controller {
         &self.machine
     }
 
-    /// The variables of the program that runs, or of the newest that did.
+    /// The variables of the running program, or of the newest one.
     pub fn program_variables(&self) -> Variables {
         self.running.as_ref().map_or_else(|| self.variables.clone(), Running::variables)
     }
 
-    /// The program that is not yet stopped.
+    /// The program that has not ended.
     pub fn program_name(&self) -> Option<&str> {
         self.running.as_ref().map(Running::name)
     }
 
-    /// What programs have logged, the newest [`MAX_LOG`] lines.
+    /// The log of programs, the newest [`MAX_LOG`] lines.
     pub fn program_log(&self) -> impl Iterator<Item = &str> {
         self.log.iter().map(String::as_str)
     }
 
-    /// Counters of everything.
+    /// All counters.
     pub fn counters(&self) -> Counters {
         let ports = self.ports.iter().map(|port| (port.name().to_owned(), port.counters()));
         let mut counters = Counters { ports: ports.collect(), ..self.counters.clone() };

@@ -1,4 +1,4 @@
-//! What time does: transitions, the program's calls, the grids.
+//! The effects of time: transitions, the program's calls, the grids.
 
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::dialect::{FinishNotice, Motion};
@@ -21,10 +21,10 @@ pub(super) struct Running {
     started_by: Option<ConnId>,
 }
 
-/// What the program's pending call is doing.
+/// The state of the program's pending call.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Activity {
-    /// Not looked at yet, or nothing that lasts.
+    /// Not handled yet, or nothing that lasts.
     Fresh,
     Waiting {
         until: Instant,
@@ -71,7 +71,7 @@ impl Controller {
         self.poll_server(now);
     }
 
-    /// When something happens by itself.
+    /// When something happens without an input.
     pub(super) fn deadline(&self) -> Instant {
         let program = self.running.as_ref().filter(|_| self.machine.program_runs()).and_then(|running| {
             match running.activity {
@@ -86,7 +86,7 @@ impl Controller {
         all.into_iter().flatten().min().unwrap_or(Instant::NEVER)
     }
 
-    /// Carries out what a transition asks for.
+    /// Carries out a transition.
     pub(super) fn apply(&mut self, now: Instant, effect: Effect) {
         match effect {
             Effect::None => {}
@@ -169,7 +169,7 @@ impl Controller {
         self.machine.arm_rests_at(self.arm.rest().unwrap_or(now));
     }
 
-    /// Shows the registers what the arm and the state machines do.
+    /// Writes the state of the arm and the state machines to the registers.
     fn refresh(&mut self, now: Instant) {
         let machine = &self.machine;
         self.registers.show_status(Status {
@@ -202,7 +202,7 @@ impl Controller {
         }
     }
 
-    /// Answers the program's calls as far as they can be answered now.
+    /// Answers the program's calls that can be answered now.
     fn drive_program(&mut self, now: Instant) {
         while self.machine.program_runs() {
             let Some(running) = &self.running else { return };
@@ -271,7 +271,7 @@ impl Controller {
                 };
                 let port = self.ports.get_mut(nth)?;
                 if port.is_busy() {
-                    // What a program before this one has sent is still leaving.
+                    // Data of an earlier program is still being sent.
                     return None;
                 }
                 match port.send(*id, values) {
@@ -391,5 +391,5 @@ impl Controller {
     }
 }
 
-/// How often the arm's controller looks at its joints.
+/// Interval at which the arm's controller checks its joints.
 const SERVO_CYCLE: Duration = Duration::from_millis(1);

@@ -1,5 +1,5 @@
-//! Floats that are shown as something else, such as NaN: in state packets and in the frames of
-//! recipes' output parts, wherever the item stands there. The item itself keeps its value.
+//! Floats shown with another value, such as NaN, in state packets and in the frames of recipes'
+//! output parts. The item itself keeps its value.
 
 use proto_core::sysvar::{IMAGE_BYTES, SysVar};
 use proto_core::wire::scalar::ScalarType;
@@ -7,11 +7,11 @@ use proto_core::wire::state::{FIELDS, LEN};
 
 use recipe_config::{AnalogInput, InitialTarget};
 
-/// The items, with what is shown instead.
+/// The items and the values shown instead.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Spoiled(Vec<(Item, f32)>);
 
-/// Where an item is shown.
+/// The place where an item is shown.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Item {
     /// In the process image, and so in recipes' frames.
@@ -20,7 +20,7 @@ struct Item {
     packet: Option<usize>,
 }
 
-/// No float has this name.
+/// There is no float of this name.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct NoSuchFloat(pub String);
 
@@ -52,7 +52,7 @@ impl Spoiled {
         Ok(())
     }
 
-    /// The process image as recipes show it; `None` when that is as it is.
+    /// The process image as recipes show it; `None` if it is unchanged.
     pub(super) fn image(&self, image: &[u8; IMAGE_BYTES]) -> Option<[u8; IMAGE_BYTES]> {
         if self.0.is_empty() {
             return None;

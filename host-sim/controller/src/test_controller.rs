@@ -49,18 +49,18 @@ use super::{BuildError, ConnId, Controller, ControllerInput, ControllerOutput};
 /// assert_eq!(robot.take(client), b"6:0:5:2");
 /// ```
 ///
-/// What can be broken in it is a method of [`Controller`]: [`Self::controller_mut`].
+/// Faults are methods of [`Controller`]: see [`Self::controller_mut`].
 #[derive(Debug)]
 pub struct TestController {
     pub(crate) controller: Controller,
     pub(crate) now: Instant,
     links: BTreeMap<ConnId, Link>,
-    /// Bytes that each connection received and nobody has looked at.
+    /// Bytes that each connection has received and no call has returned.
     received: BTreeMap<ConnId, Vec<u8>>,
     pub(crate) closed: Vec<ConnId>,
-    /// What ports sent, with the time.
+    /// Data sent by ports, with the time.
     pub(crate) sent: Vec<(Instant, usize, Out)>,
-    /// What went to all clients of port 2001, with the time.
+    /// Packets sent to all clients of port 2001, with the time.
     pub(crate) packets: Vec<(Instant, StatePacket)>,
     /// How long a port takes to send.
     pub(crate) line_time: Duration,
@@ -69,24 +69,24 @@ pub struct TestController {
     next_conn: u64,
 }
 
-/// What a port of a [`TestController`] sent.
+/// Data sent by a port of a [`TestController`].
 #[derive(Debug, Clone, PartialEq)]
 pub enum Out {
     /// Bytes on a line or connection, or one datagram of a UDP client.
     Bytes(Vec<u8>),
     /// A frame on a CAN bus.
     Can(CanFrame),
-    /// A datagram of the UDP server, and to whom. Its port's number is [`usize::MAX`].
+    /// A datagram of the UDP server, and its receiver. The port number is [`usize::MAX`].
     Datagram(SocketAddr, Vec<u8>),
     /// It closed its connection.
     Closed,
 }
 
 impl TestController {
-    /// A controller that was switched on a second ago; the devices of all its ports are there.
+    /// A controller that was switched on a second ago; the devices of all its ports are up.
     ///
     /// # Errors
-    /// As [`Controller::new`].
+    /// Same as [`Controller::new`].
     pub fn new(config: &SimConfig) -> Result<Self, BuildError> {
         let mut robot = Self {
             controller: Controller::new(config)?,
@@ -126,16 +126,16 @@ impl TestController {
         &self.controller
     }
 
-    /// The controller itself, to break or change something in it; what follows happens with the next
+    /// The controller itself, mutable, to cause faults; the effects begin with the next
     /// [`Self::run`].
     pub fn controller_mut(&mut self) -> &mut Controller {
         &mut self.controller
     }
 
-    /// Lets time go by, deadline by deadline: a [`std::time::Duration`] or one of proto-core.
+    /// Advances time, deadline by deadline, by a [`std::time::Duration`] or one of proto-core.
     ///
     /// # Panics
-    /// When the controller does not do what it wanted to be called for.
+    /// If the controller does nothing at a deadline that it has set.
     pub fn run(&mut self, span: impl Into<Duration>) {
         let end = self.now + span.into();
         loop {
@@ -156,7 +156,7 @@ impl TestController {
         }
     }
 
-    /// A client on this host connects to one of the servers. One that is not welcome finds its connection
+    /// A client on this host connects to one of the servers. If it is refused, its connection is
     /// closed: [`Self::is_closed`].
     pub fn connect(&mut self, link: Link) -> ConnId {
         let conn = self.new_conn();
@@ -189,7 +189,7 @@ impl TestController {
         }
     }
 
-    /// What the client has received since the last look.
+    /// The bytes that the client has received since the last call.
     pub fn take(&mut self, conn: ConnId) -> Vec<u8> {
         self.received.remove(&conn).unwrap_or_default()
     }
@@ -199,23 +199,23 @@ impl TestController {
         self.closed.contains(&conn)
     }
 
-    /// Bytes come in at a serial or TCP port, in one piece, or one datagram at a UDP client. Ports are
-    /// numbered in the order of their file.
+    /// Bytes arrive at a serial or TCP port, in one piece, or one datagram at a UDP client. Ports
+    /// are numbered in the order of their file.
     pub fn port_bytes(&mut self, port: usize, bytes: &[u8]) {
         self.input(ControllerInput::PortBytes { port, bytes });
     }
 
-    /// A frame comes in at a CAN port.
+    /// A frame arrives at a CAN port.
     pub fn port_frame(&mut self, port: usize, frame: CanFrame) {
         self.input(ControllerInput::PortCan { port, frame });
     }
 
-    /// A datagram comes to the UDP server.
+    /// A datagram arrives at the UDP server.
     pub fn datagram(&mut self, peer: SocketAddr, bytes: &[u8]) {
         self.input(ControllerInput::Udp2011 { peer, bytes });
     }
 
-    /// What ports have sent since the last look, each with its time and port.
+    /// The data that ports have sent since the last call, each with its time and port.
     pub fn take_sent(&mut self) -> Vec<(Instant, usize, Out)> {
         std::mem::take(&mut self.sent)
     }
@@ -223,16 +223,16 @@ impl TestController {
     /// The present value of an item, such as `DO[1]` or `FloatInputReg[3]`.
     ///
     /// # Panics
-    /// When there is no such item.
+    /// If there is no such item.
     #[track_caller]
     pub fn value(&self, name: &str) -> f64 {
         self.controller.registers().value(target(name))
     }
 
-    /// Gives an item a value from outside, such as an input that is wired.
+    /// Sets an item from outside, such as an input that is wired.
     ///
     /// # Panics
-    /// When there is no such item or it does not take the value.
+    /// If there is no such item, or it does not take the value.
     #[track_caller]
     pub fn set_value(&mut self, name: &str, value: f64) {
         if let Err(error) = self.controller.force(target(name), value) {
@@ -255,7 +255,7 @@ impl TestController {
         self.drain();
     }
 
-    /// Takes everything there is to take and returns when to come back.
+    /// Takes all outputs and returns when to call again.
     pub(crate) fn drain(&mut self) -> Instant {
         loop {
             match self.controller.poll_output(self.now) {
@@ -294,11 +294,11 @@ impl TestController {
 }
 
 /// # Panics
-/// When no item is called so.
+/// If there is no such item.
 #[track_caller]
 fn target(name: &str) -> InitialTarget {
     name.parse().unwrap_or_else(|error| panic!("{error}"))
 }
 
-/// Where clients are.
+/// The address of clients.
 pub(crate) const NEAR: IpAddr = IpAddr::V4(Ipv4Addr::LOCALHOST);

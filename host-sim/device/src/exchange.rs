@@ -1,5 +1,5 @@
-//! What a port's device and the port's owner have to say to each other: events one way, a handle to send
-//! with the other way, and the device's counters.
+//! The exchange between a port's device and the port's owner: events one way, a handle to send with
+//! the other way, and the device's counters.
 
 use std::cell::{Cell, RefCell};
 use std::collections::VecDeque;
@@ -13,12 +13,12 @@ use tokio::sync::Notify;
 use recipe_net::quota::Quota;
 use recipe_net::timer::now;
 
-/// What a device did.
+/// An event of a device.
 #[derive(Debug, PartialEq)]
 pub enum PortEvent<'a> {
-    /// It can be used from now on.
+    /// The device can be used from now on.
     Up,
-    /// It cannot any more.
+    /// The device cannot be used any more.
     Down,
     /// Bytes arrived.
     Bytes(&'a [u8]),
@@ -27,35 +27,37 @@ pub enum PortEvent<'a> {
         /// The frame.
         frame: CanFrame,
     },
-    /// A CAN controller's error state changed; told after each [`PortEvent::Up`] that knows it.
+    /// A CAN controller's error state changed; reported after each [`PortEvent::Up`] if it is
+    /// known.
     Bus(BusState),
     /// Everything handed over has left.
     Sent,
 }
 
-/// The sending side of a port. What does not fit is dropped and counted.
+/// The sending side of a port. Data that does not fit is dropped and counted.
 #[derive(Debug, Default)]
 pub struct PortTx {
     pub(super) bytes: RefCell<Vec<u8>>,
     pub(super) frames: RefCell<VecDeque<CanFrame>>,
     pub(super) wake: Notify,
     pub(super) counters: Cell<DeviceCounters>,
-    /// What clients do is worth a few lines of the log.
+    /// Limits the log lines about clients.
     pub(super) complaints: Quota,
-    /// What is read before this may have waited while the process slept.
+    /// Data read before this may have waited while the process slept.
     stale_until: Cell<Instant>,
     pub(super) slept: Notify,
 }
 
 impl PortTx {
-    /// This process slept until a moment ago: what waits in the device is as old as that. The port's owner
-    /// refuses everything for [`STALE`]; by then nothing old may be left behind.
+    /// The process slept until just now: the age of data that waits in the device is unknown. The
+    /// port's owner discards everything for [`STALE`]; by then no old data may be left.
     pub fn note_sleep(&self, now: Instant) {
         self.stale_until.set(now + STALE);
         self.slept.notify_one();
     }
 
-    /// Whether the port's owner refuses what is read now, since it may have waited while this process slept.
+    /// Whether the port's owner discards data read now, since it may have waited while the process
+    /// slept.
     pub(super) fn is_stale(&self) -> bool {
         self.stale_until.get() != Instant::ZERO && now() < self.stale_until.get()
     }
@@ -82,7 +84,7 @@ impl PortTx {
         self.wake.notify_one();
     }
 
-    /// What the device did so far.
+    /// The counters of the device.
     pub fn counters(&self) -> DeviceCounters {
         self.counters.get()
     }
@@ -94,24 +96,24 @@ impl PortTx {
     }
 }
 
-/// What waited while the process slept. A peer's system may hold megabytes for a connection, more than can be
-/// read in the time in which the port's owner refuses it.
+/// Data that waited while the process slept. A peer's system may hold megabytes for a connection,
+/// more than can be read while the port's owner discards it.
 #[derive(Debug, Default)]
 pub(super) struct Backlog {
-    /// More was there than could be read in that time.
+    /// There was more than could be read in that time.
     is_behind: bool,
-    /// Since when no more was there than could be read at once.
+    /// Since when there was no more than could be read at once.
     small_since: Option<Instant>,
 }
 
 impl Backlog {
-    /// Whether what is read now may be part of it: then it may be read in greater pieces.
+    /// Whether data read now may be part of it: then it may be read in larger pieces.
     pub(super) fn is_open(&self, tx: &PortTx) -> bool {
         self.is_behind || tx.is_stale()
     }
 
-    /// Whether what was just read is part of it and not refused by the port's owner. `is_more` if there was
-    /// more than was read.
+    /// Whether data just read is part of it and not discarded by the port's owner. `is_more` if
+    /// there was more than was read.
     pub(super) fn has(&mut self, tx: &PortTx, is_more: bool) -> bool {
         if tx.is_stale() {
             self.is_behind = is_more;
@@ -127,13 +129,13 @@ impl Backlog {
             self.small_since = None;
         }
         let is_over = !is_more && now.saturating_since(since) >= PAUSE;
-        // Who never pauses is heard again some time.
+        // A peer that never pauses is read again after some time.
         self.is_behind = !is_over && now.saturating_since(tx.stale_until.get()) < MOST_BACKLOG;
         self.is_behind
     }
 }
 
-/// What a port's device did so far.
+/// The counters of a device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
 pub struct DeviceCounters {
     /// Bytes received; of a CAN port, data bytes.
@@ -144,28 +146,28 @@ pub struct DeviceCounters {
     pub frames_in: u64,
     /// CAN frames sent.
     pub frames_out: u64,
-    /// Bytes sent while nobody listened.
+    /// Bytes sent while no client was connected.
     pub unheard: u64,
-    /// Bytes a listener left unread for too long, whole frames given while the queue was full, and what waited
-    /// while the process slept and was read too late for the engine to refuse it.
+    /// Bytes that a client did not read in time, whole frames sent while the queue was full, and
+    /// data that waited while the process slept and was read too late for the engine to discard it.
     pub dropped: u64,
-    /// Clients turned away because there was one already, or too many.
+    /// Clients refused because there was one already, or too many.
     pub refused: u64,
-    /// Clients that the system could not hand over, for want of descriptors most likely.
+    /// Clients that the system could not hand over, probably for lack of descriptors.
     pub accept_failures: u64,
     /// Times the device became usable.
     pub ups: u64,
     /// Frames that the kernel dropped because they were not read in time (SO_RXQ_OVFL).
     pub overruns: u64,
-    /// Times the kernel did not take a CAN frame for the moment; it was tried again.
+    /// Times the kernel did not accept a CAN frame; it was tried again.
     pub refusals: u64,
-    /// Error frames: what a CAN interface told about itself and its bus.
+    /// Error frames of a CAN interface.
     pub error_frames: u64,
-    /// Times a CAN interface told that it had lost frames that it had received.
+    /// Times a CAN interface reported that it had lost received frames.
     pub overflows: u64,
     /// Times a CAN controller was started again after bus-off.
     pub restarts: u64,
-    /// A CAN controller's transmit error counter, as it was told last.
+    /// The newest transmit error counter of a CAN controller.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tx_error_counter: Option<u8>,
     /// Its receive error counter.
@@ -178,14 +180,14 @@ pub struct DeviceCounters {
     pub bus: &'static str,
 }
 
-/// For how long the engine refuses what arrives after a sleep, at least.
+/// The minimum time for which the engine discards input after sleep.
 pub const STALE: Duration = Duration::from_millis(50);
-/// How long less has to come than can be read at once until it is no part of a backlog: systems may need a while
-/// for more of it. The engine's links are not back earlier.
+/// A backlog ends after this long with less data than can be read at once: systems may pause within
+/// one. The engine's links are not up earlier.
 const PAUSE: Duration = Duration::from_millis(100);
-/// However long a backlog is, after this it counts as new.
+/// A longer backlog counts as new data after this.
 const MOST_BACKLOG: Duration = Duration::from_secs(10);
-/// A frame of every port's recipe fits several times over; a port waits for one to leave.
+/// A frame of every port's recipe fits several times; a port waits for one to leave.
 const MAX_QUEUED_BYTES: usize = 4_096;
-/// Twice the most ids of a recipe's part.
+/// Twice the maximum number of ids in a recipe's part.
 const MAX_QUEUED_FRAMES: usize = 64;

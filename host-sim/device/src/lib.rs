@@ -1,8 +1,8 @@
-//! Devices a configured port can be tied to: pseudoterminals, serial lines, byte streams over TCP and
-//! a CAN bus in user space, CAN interfaces of the kernel.
+//! Devices that a configured port can be bound to: pseudoterminals, serial lines, byte streams over
+//! TCP and a CAN bus in user space, CAN interfaces of the kernel.
 //!
-//! Bytes and frames go in and out; no recipe, no controller and no engine is known here, but for the
-//! engine's word for a CAN controller's error state.
+//! In and out: bytes and frames. Does not know recipes, controller or engine, except the engine's
+//! type for a CAN controller's error state.
 
 #[cfg(not(target_os = "linux"))]
 compile_error!(

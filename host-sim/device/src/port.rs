@@ -1,7 +1,8 @@
-//! One port's device, whatever it is: opened from a `--bind`, driven by one task, fed through a handle.
+//! One port's device of any kind: opened from a `--bind`, driven by one task, used through a
+//! handle.
 //!
-//! The task reports what the device does as [`PortEvent`]s; whoever owns the port sends through
-//! [`PortTx`], which takes what it is given at once and never more than a fixed amount.
+//! The task reports events of the device as [`PortEvent`]s. The port's owner sends through
+//! [`PortTx`], which takes everything at once and never more than a fixed amount.
 
 use std::io;
 use std::rc::Rc;
@@ -15,7 +16,7 @@ use super::exchange::{PortEvent, PortTx};
 use super::line::LinePort;
 use super::socketcan::KernelCan;
 
-/// What the configuration says of a port's bus.
+/// The settings of a port's bus in the configuration.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum PortBus {
     /// A serial line.
@@ -45,7 +46,7 @@ impl Port {
     /// Opens the device in the current tokio runtime, which must be a current-thread one.
     ///
     /// # Errors
-    /// When the device does not suit the bus, does not exist, or cannot be opened.
+    /// If the device does not suit the bus, does not exist, or cannot be opened.
     pub async fn open(device: &Device, bus: PortBus) -> io::Result<Self> {
         let tx = Rc::new(PortTx::default());
         let driver = match (bus, device) {
@@ -62,7 +63,7 @@ impl Port {
         Ok(Self { driver, tx })
     }
 
-    /// Where others find the port: the link of a pseudoterminal, the address of a socket.
+    /// The port's public place: the link of a pseudoterminal, the address of a socket.
     pub fn place(&self) -> String {
         match &self.driver {
             Driver::Line(line) => line.place(),
@@ -71,8 +72,8 @@ impl Port {
         }
     }
 
-    /// Which ids matter, of both directions: a CAN interface of the kernel then passes on no others.
-    /// Elsewhere, and until it is told, everything comes.
+    /// Sets the ids that are used in either direction: a CAN interface of the kernel then passes on
+    /// no others. Other devices, and an interface before this call, pass on everything.
     pub fn listen_to(&mut self, ids: Vec<CanId>) {
         if let Driver::Kernel(can) = &mut self.driver {
             can.listen_to(ids);
@@ -87,7 +88,7 @@ impl Port {
     /// Drives the device until the future is dropped, which closes it.
     ///
     /// # Errors
-    /// Only what makes the device unusable for good; what can come back is waited for.
+    /// Only if the device is permanently unusable; otherwise the task waits for it to come back.
     pub async fn run(self, events: impl FnMut(PortEvent<'_>)) -> io::Result<()> {
         match self.driver {
             Driver::Line(line) => line.run(events).await,

@@ -1,8 +1,8 @@
 //! The gateway's engine on real sockets and devices.
 //!
-//! Everything runs on one thread. What a device or socket brings goes into the engine at once, and
-//! what the engine answers is handed over before anything else is read: one engine pass lies
-//! between the last byte of a field frame and the request on its way to the controller.
+//! Everything runs on one thread. Input of a device or socket goes into the engine at once, and the
+//! engine's outputs are carried out before anything else is read: one engine pass lies between the
+//! last byte of a field frame and the request on its way to the controller.
 
 use std::cell::{Cell, RefCell};
 use std::collections::BTreeMap;
@@ -28,7 +28,7 @@ use recipe_net::realtime::{self, Scheduling};
 use recipe_net::timer::{Timer, now};
 use recipe_net::turns;
 
-/// A gateway whose ports and links are there, before anything moves.
+/// A gateway with its ports and links, before it runs.
 struct Gateway {
     core: Rc<Core>,
     ports: Vec<(PortId, Port)>,
@@ -36,7 +36,7 @@ struct Gateway {
     ready: Value,
 }
 
-/// What every task of the gateway shares.
+/// What all tasks of the gateway share.
 struct Core {
     engine: RefCell<Box<Engine>>,
     ports: BTreeMap<PortId, (String, Rc<PortTx>)>,
@@ -55,7 +55,7 @@ impl Gateway {
         let field = || config.view().field_ports().map(|(_, port, _)| port);
         if let Some(bind) = binds.iter().find(|bind| field().all(|port| port.name != bind.port.as_str())) {
             let names: Vec<_> = field().map(|port| port.name.as_str()).collect();
-            let message = format!("--bind {bind}: no such port; there are: {}", names.join(", "));
+            let message = format!("--bind {bind}: there is no such port; there are {}", names.join(", "));
             return Err(StartError::new(message));
         }
         let mut ports = Vec::new();
@@ -139,7 +139,7 @@ impl Shell for Gateway {
 }
 
 impl Core {
-    /// Calls the engine whenever it asked to be called.
+    /// Calls the engine when it has asked to be called.
     async fn keep_time(&self) -> Result<(), StartError> {
         let clock = |error| StartError::new(format!("timerfd: {error}"));
         let timer = Timer::new().map_err(clock)?;
@@ -150,7 +150,7 @@ impl Core {
             tokio::select! {
                 expired = timer.expired() => {
                     expired.map_err(clock)?;
-                    // What had arrived by the deadline is not overdue.
+                    // Input that had arrived by the deadline is not overdue.
                     turns::all_others().await;
                     self.input(Input::Tick);
                 }
@@ -180,7 +180,7 @@ impl Core {
         }
     }
 
-    /// One input, and everything that follows from it.
+    /// Handles one input and all outputs that follow.
     fn input(&self, input: Input<'_>) {
         let at = now();
         trace!(?input, "in");
@@ -188,7 +188,7 @@ impl Core {
         engine.handle(at, input);
         let sleeps = engine.sleeps();
         if self.sleeps.replace(sleeps) != sleeps {
-            warn!(sleeps, "the gateway slept: what waited is discarded");
+            warn!(sleeps, "the gateway slept: waiting input is discarded");
             for (_, tx) in self.ports.values() {
                 tx.note_sleep(at);
             }
@@ -219,18 +219,18 @@ impl Core {
     fn with_port(&self, id: PortId, act: impl FnOnce(&PortTx)) {
         match self.ports.get(&id) {
             Some((_, tx)) => act(tx),
-            None => warn!(?id, "the engine sends on a port that is none"),
+            None => warn!(?id, "the engine sends on an unknown port"),
         }
     }
 
     fn with_link(&self, id: LinkId, act: impl FnOnce(&LinkControl)) {
         match self.links.get(&id) {
             Some(control) => act(control),
-            None => warn!(?id, "the engine uses a link that is none"),
+            None => warn!(?id, "the engine uses an unknown link"),
         }
     }
 
-    /// One line of statistics: the engine's status, and what devices and sockets did beside it.
+    /// One line of statistics: the engine's status, and the counters of devices and sockets.
     fn stats(&self) -> Value {
         let engine = self.engine.borrow();
         let status = engine.status(now());
@@ -263,7 +263,7 @@ impl Core {
     }
 }
 
-/// Puts the entries of an object that is in another into that.
+/// Adds the entries of one object to another.
 fn lift(outer: &mut Value, key: &str) {
     if let Some(outer) = outer.as_object_mut()
         && let Some(Value::Object(inner)) = outer.remove(key)
@@ -275,7 +275,7 @@ fn lift(outer: &mut Value, key: &str) {
 /// Runs the gateway until Ctrl-C, SIGTERM or SIGHUP.
 ///
 /// # Errors
-/// What kept it from starting; nothing is left behind then.
+/// The reason why it could not start; nothing is left behind then.
 pub fn run(config: GatewayConfig, options: RunOptions) -> Result<(), StartError> {
     let handle = spawn(config, options.binds.clone(), Scheduling::FifoIfAllowed)?;
     host::foreground(handle, &options)
@@ -284,7 +284,7 @@ pub fn run(config: GatewayConfig, options: RunOptions) -> Result<(), StartError>
 /// Starts the gateway on a thread of its own; dropping the handle ends it.
 ///
 /// # Errors
-/// What kept it from starting; nothing is left behind then.
+/// The reason why it could not start; nothing is left behind then.
 pub fn start(config: GatewayConfig, binds: Vec<Bind>) -> Result<Handle, StartError> {
     spawn(config, binds, Scheduling::Ordinary)
 }
@@ -292,7 +292,7 @@ pub fn start(config: GatewayConfig, binds: Vec<Bind>) -> Result<Handle, StartErr
 fn spawn(config: GatewayConfig, binds: Vec<Bind>, scheduling: Scheduling) -> Result<Handle, StartError> {
     host::start("gateway", async move || {
         let gateway = Gateway::open(&config, &binds).await?;
-        info!(scheduling = %realtime::apply(scheduling), "the gateway runs");
+        info!(scheduling = %realtime::apply(scheduling), "the gateway is running");
         Ok(gateway)
     })
 }
@@ -303,7 +303,7 @@ async fn open_port(port: &PortConfig, binds: &[Bind]) -> Result<Port, StartError
         Bus::Rs485(settings) => PortBus::Serial(settings),
         Bus::Can { bitrate } => PortBus::Can { bitrate },
         Bus::TcpListen { .. } | Bus::UdpListen { .. } => {
-            return Err(StartError::new(format!("port {name} is no field port")));
+            return Err(StartError::new(format!("port {name} is not a field port")));
         }
     };
     let mut own = binds.iter().filter(|bind| bind.port == name);
@@ -327,7 +327,7 @@ async fn open_endpoint(to: proto_core::engine::Endpoint<'_>) -> Result<Endpoint,
         return Err(StartError::new(message));
     }
     let host = to.host.to_owned();
-    let refused = |address, error| StartError::new(format!("listening on {address}: {error}"));
+    let refused = |address, error| StartError::new(format!("cannot listen on {address}: {error}"));
     Ok(match to.transport {
         Transport::Tcp { port } => Endpoint::Tcp { host, port },
         Transport::Udp { port } => Endpoint::Udp { host, port },
@@ -340,12 +340,12 @@ async fn open_endpoint(to: proto_core::engine::Endpoint<'_>) -> Result<Endpoint,
             let socket = UdpSocket::bind(local).await.map_err(|error| refused(local, error))?;
             Endpoint::UdpListen { socket, controller: host }
         }
-        other => return Err(StartError::new(format!("no link can be opened by {other:?}"))),
+        other => return Err(StartError::new(format!("unknown kind of link: {other:?}"))),
     })
 }
 
 impl Endpoint {
-    /// Where a listening link listens.
+    /// The address of a listening link.
     fn place(&self) -> String {
         let address = match self {
             Self::TcpListen { listener, .. } => listener.local_addr(),

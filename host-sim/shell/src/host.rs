@@ -1,4 +1,4 @@
-//! What every shell needs around it: a thread with a runtime, a handle, and in the foreground the
+//! The environment of every shell: a thread with a runtime, a handle, and in the foreground the
 //! `ready` line, statistics and a clean end.
 
 use std::io::{self, Write};
@@ -19,11 +19,11 @@ const STACK: usize = 16 << 20;
 
 /// Something that runs on one thread until it is dropped.
 pub(super) trait Shell {
-    /// What `ready` says: addresses and paths by name.
+    /// The addresses and paths of `ready`, by name.
     fn ready(&self) -> Value;
     /// How to take one line of statistics while the shell runs.
     fn stats(&self) -> impl Fn() -> Value + 'static;
-    /// Runs inside a [`LocalSet`]; ends by itself only when something is gone for good.
+    /// Runs inside a [`LocalSet`]; ends by itself only if something fails permanently.
     fn run(self) -> impl Future<Output = Result<(), StartError>>;
 }
 
@@ -42,7 +42,7 @@ enum Request {
     Shutdown,
 }
 
-/// Opens a shell on a thread of its own and waits until everything listens.
+/// Opens a shell on a thread of its own and waits until everything is listening.
 pub(super) fn start<S: Shell>(
     name: &str,
     open: impl AsyncFnOnce() -> Result<S, StartError> + Send + 'static,
@@ -74,12 +74,12 @@ pub(super) fn start<S: Shell>(
     match outcome.recv() {
         Ok(Ok(ready)) => Ok(Handle { ready, requests, thread: Some(thread) }),
         Ok(Err(error)) => Err(error),
-        // The thread ended before it said anything: its result says why.
+        // The thread ended without a report: its result says why.
         Err(_) => Err(joined(thread).err().unwrap_or_else(|| StartError::new(format!("{name} ended")))),
     }
 }
 
-/// Answers requests until it is told to end.
+/// Answers requests until it is to end.
 async fn serve(mut inbox: mpsc::UnboundedReceiver<Request>, stats: impl Fn() -> Value) {
     while let Some(request) = inbox.recv().await {
         match request {
@@ -97,12 +97,12 @@ impl Handle {
         &self.ready
     }
 
-    /// The address or path called `name` (`"command"`, `"ports/rs485"`); empty when there is none.
+    /// The address or path called `name` (`"command"`, `"ports/rs485"`); empty if there is none.
     pub fn place(&self, name: &str) -> &str {
         self.ready.pointer(&format!("/{name}")).and_then(Value::as_str).unwrap_or("")
     }
 
-    /// One line of statistics; `None` when the shell has ended.
+    /// One line of statistics; `None` if the shell has ended.
     pub fn stats(&self) -> Option<Value> {
         let (answer, stats) = blocking::channel();
         self.requests.send(Request::Stats(answer)).ok()?;
@@ -117,7 +117,7 @@ impl Handle {
     /// Ends the shell and waits for it.
     ///
     /// # Errors
-    /// What made it end by itself before.
+    /// Why it had ended by itself.
     pub fn shutdown(mut self) -> Result<(), StartError> {
         self.end()
     }
@@ -138,14 +138,14 @@ fn joined(thread: JoinHandle<Result<(), StartError>>) -> Result<(), StartError> 
     thread.join().unwrap_or_else(|_| Err(StartError::new("a thread panicked").after_start()))
 }
 
-/// Says `ready`, prints statistics, and ends when a signal says so.
+/// Prints `ready` and statistics, and ends on a signal.
 pub(super) fn foreground(handle: Handle, options: &RunOptions) -> Result<(), StartError> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
     let runtime = runtime.map_err(|error| StartError::new(format!("cannot start the runtime: {error}")))?;
     let mut lines = Lines::start()
         .map_err(|error| StartError::new(format!("cannot start the thread for statistics: {error}")))?;
     let result = runtime.block_on(async {
-        // Signals are caught before anybody can know that we are ready.
+        // Signals are handled before anybody can know that we are ready.
         let refused = |error: io::Error| StartError::new(format!("signals: {error}"));
         let mut signals = Signals::catch().map_err(refused)?;
         let ready = options.ready.as_ref().map(|file| file.write(handle.ready())).transpose()?;
@@ -187,8 +187,8 @@ pub(super) fn foreground(handle: Handle, options: &RunOptions) -> Result<(), Sta
     result
 }
 
-/// Lines for stdout. A thread of its own writes them: a reader that does not read must not keep signals
-/// from being heard. What it leaves, and what cannot be written, is lost and counted.
+/// Lines for stdout, written by a thread of its own: a slow reader must not delay signals. Lines
+/// that are not read or cannot be written are lost and counted.
 struct Lines {
     waiting: blocking::SyncSender<String>,
     failures: mpsc::UnboundedReceiver<Failure>,
@@ -197,13 +197,13 @@ struct Lines {
     lost: Arc<AtomicU64>,
 }
 
-/// Why a line was not written; told once, until one is written again.
+/// Why a line was not written; reported once, until one is written again.
 enum Failure {
     /// Nobody will ever read it.
     Unread,
     /// It was the first one, which says `ready`.
     NotReady(io::Error),
-    /// It was another one; the next may fare better, as on a disk that is full.
+    /// It was another one; the next may succeed, as on a disk that is full.
     Lost(io::Error),
 }
 
@@ -257,7 +257,7 @@ const MOST_LINES: usize = 16;
 /// How long the end waits for it.
 const FAREWELL: std::time::Duration = std::time::Duration::from_millis(500);
 
-/// How often the foreground looks whether the shell still runs.
+/// Interval at which the foreground checks that the shell still runs.
 const WATCH: std::time::Duration = std::time::Duration::from_millis(100);
 
 async fn tick(ticks: &mut Option<tokio::time::Interval>) {

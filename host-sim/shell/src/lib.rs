@@ -1,7 +1,9 @@
-//! The tokio shells: what ties the sans-IO controller and gateway to sockets, devices and the clock.
+//! The tokio shells, which connect the controller and the gateway to sockets, devices and the
+//! clock.
 //!
-//! A shell is one thread with a current-thread runtime. It owns every socket and device of its side,
-//! hands what they receive to the core and carries out what the core answers; it knows no protocol.
+//! A shell is one thread with a current-thread runtime. It owns every socket and device of its
+//! side, hands received data to the core and carries out the core's outputs; it does not know
+//! protocols.
 
 pub mod controller;
 pub mod gateway;
@@ -22,18 +24,18 @@ pub use signals::Signals;
 
 use recipe_device::bind::Bind;
 
-/// What a run is told beside its file.
+/// Options of a run beside its file.
 #[derive(Debug, Clone, Default)]
 pub struct RunOptions {
-    /// Which device each serial or CAN port is tied to.
+    /// The device that each serial or CAN port is bound to.
     pub binds: Vec<Bind>,
-    /// Where the addresses are written once everything listens.
+    /// Where the addresses are written once everything is listening.
     pub ready: Option<ReadyFile>,
-    /// How often a line of counters is printed.
+    /// Interval at which a line of counters is printed.
     pub stats: Option<Duration>,
 }
 
-/// Why a run could not start, or could not go on: one message, nothing was left behind.
+/// Why a run could not start, or could not continue: one message; nothing was left behind.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct StartError {
     message: String,
@@ -46,13 +48,13 @@ impl StartError {
         Self { message: message.into(), had_started: false }
     }
 
-    /// The same, of a run that had started.
+    /// The same, for a run that had started.
     #[must_use]
     pub fn after_start(self) -> Self {
         Self { had_started: true, ..self }
     }
 
-    /// 2 when nothing was started, 1 when the run failed later.
+    /// 2 if nothing was started, 1 if the run failed later.
     pub const fn exit_code(&self) -> u8 {
         if self.had_started { 1 } else { 2 }
     }

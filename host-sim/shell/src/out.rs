@@ -1,12 +1,12 @@
-//! What is printed, and what comes of it when it cannot be.
+//! Printing, and the handling of its failures.
 //!
-//! Writing never panics. The first failure is kept, and the command that was at it ends: quietly when the
-//! reader had enough, as `head` has, with one message when what was said is lost.
+//! Writing never panics. The first failure is kept and ends its command: quietly if the reader had
+//! enough, as `head` has; with one message if output is lost.
 
 use std::io::{self, Write, stderr};
 use std::process::ExitCode;
 
-/// An output whose first failure is kept; nothing is written after it.
+/// An output that keeps its first failure; nothing is written after it.
 #[derive(Debug)]
 pub struct Out<W> {
     to: W,
@@ -49,7 +49,7 @@ impl<W: Write> Out<W> {
     }
 }
 
-/// How much of what was printed somebody got.
+/// How much of the output was read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Printed {
     /// All of it.
@@ -68,12 +68,12 @@ impl<W: Write> Write for Out<W> {
     }
 }
 
-/// Whether a failure only says that the reader had enough.
+/// Whether a failure only means that the reader had enough.
 pub fn is_enough(error: &io::Error) -> bool {
     error.kind() == io::ErrorKind::BrokenPipe
 }
 
-/// A line for a person on stderr. When nobody can read it, nobody does.
+/// A line for a person on stderr; lost if nobody can read it.
 pub fn tell(message: impl std::fmt::Display) {
     let _ = writeln!(stderr(), "{message}");
 }

@@ -1,7 +1,7 @@
-//! `--ready FILE`: the file that says where everything listens, for as long as it does.
+//! `--ready FILE`: the file with all addresses, which exists while they are listened on.
 //!
-//! It appears whole, and it is removed at the end. What is at its place already is replaced only when it
-//! is such a file; whatever else there is belongs to somebody else.
+//! It appears whole, and it is removed at the end. A file at its place is replaced only if it is
+//! such a file; any other belongs to somebody else.
 
 use std::fs;
 use std::io;
@@ -22,7 +22,7 @@ impl ReadyFile {
     /// The file at `path`, which is not written yet.
     ///
     /// # Errors
-    /// When there is something that is no such file, or when it could not be written.
+    /// If there is another kind of file, or it could not be written.
     pub fn at(path: PathBuf) -> Result<Self, StartError> {
         let file = Self { path };
         file.is_free()?;
@@ -49,7 +49,7 @@ impl ReadyFile {
         written().map_err(|error| self.refused(error))
     }
 
-    /// Whether nothing is there; otherwise it is what an earlier run left, or an error.
+    /// Whether there is nothing; otherwise it was left by an earlier run, or it is an error.
     fn is_free(&self) -> Result<bool, StartError> {
         let refused = |message: &str| Err(self.refused(message));
         if self.path.file_name().is_none() || self.path.as_os_str().as_encoded_bytes().ends_with(b"/") {
@@ -101,7 +101,7 @@ impl Drop for Written {
     }
 }
 
-/// The text of a file that is short enough to be a ready file; `None` when it is no text.
+/// The text of a file that is short enough to be a ready file; `None` if it is not text.
 fn read(path: &Path, len: u64) -> io::Result<Option<String>> {
     if len > MOST_BYTES {
         return Ok(None);
@@ -125,7 +125,7 @@ fn is_ready(text: &str) -> bool {
 }
 
 const FOLDER: &str = "a folder; give the name of a file in it";
-/// The longest that is looked into.
+/// Maximum length that is read.
 const MOST_BYTES: u64 = 1 << 16;
 
 #[cfg(test)]
@@ -212,7 +212,7 @@ mod tests {
         drop(written);
         assert_eq!(fs::read_to_string(&path).unwrap(), "somebody's");
         fs::remove_file(&path).unwrap();
-        // Another run says the same at the same place.
+        // Another run has written the same at the same place.
         let first = file.write(&ready()).unwrap();
         let second = file.write(&ready()).unwrap();
         drop(first);

@@ -371,7 +371,7 @@ fn what_cannot_start_says_why_and_exits_with_2() {
     let file = example("rs485-system.toml");
     for (arguments, message) in [
         (vec![], "port rs485-1 needs exactly one device: --bind rs485-1=DEVICE"),
-        (vec!["--bind=rs485-2=pty:/tmp/x"], "no such port; there are: rs485-1"),
+        (vec!["--bind=rs485-2=pty:/tmp/x"], "there is no such port; there are rs485-1"),
         (vec!["--bind=rs485-1=socketcan:vcan0"], "socketcan"),
         (vec!["--bind=rs485-1=serial:/dev/does-not-exist"], "/dev/does-not-exist"),
         (vec!["--bind=rs485-1"], "NAME=DEVICE"),

@@ -79,9 +79,9 @@ enum rgw_status
   RGW_STATUS_NOT_THERE = 5,
   // A code or a CAN frame that cannot be.
   RGW_STATUS_INVALID = 6,
-  // The image is cut.
+  // The image is cut short.
   RGW_STATUS_IMAGE_CUT = 16,
-  // It is no configuration image.
+  // It is not a configuration image.
   RGW_STATUS_IMAGE_NONE = 17,
   // The image has a version that this library does not read; `rgw_image_version` says which.
   RGW_STATUS_IMAGE_VERSION = 18,
@@ -189,7 +189,7 @@ enum rgw_link_health
   RGW_LINK_HEALTH_OPENING = 1,
   // Usable.
   RGW_LINK_HEALTH_UP = 2,
-  // Not opened: the controller takes no second connection, and another link does its work.
+  // Not opened: the controller takes only one connection; another link carries its traffic.
   RGW_LINK_HEALTH_SHARED = 3,
 };
 #ifndef __cplusplus

@@ -150,7 +150,7 @@ pub enum LinkHealth {
     Opening = 1,
     /// Usable.
     Up = 2,
-    /// Not opened: the controller takes no second connection, and another link does its work.
+    /// Not opened: the controller takes only one connection; another link carries its traffic.
     Shared = 3,
 }
 

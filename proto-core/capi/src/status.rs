@@ -28,9 +28,9 @@ pub enum Status {
     NotThere = 5,
     /// A code or a CAN frame that cannot be.
     Invalid = 6,
-    /// The image is cut.
+    /// The image is cut short.
     ImageCut = 16,
-    /// It is no configuration image.
+    /// It is not a configuration image.
     ImageNone = 17,
     /// The image has a version that this library does not read; `rgw_image_version` says which.
     ImageVersion = 18,

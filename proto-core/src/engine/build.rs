@@ -1,4 +1,4 @@
-//! From a configuration to an engine that is ready to run.
+//! Builds an engine from a configuration.
 
 use core::fmt;
 use core::net::{IpAddr, Ipv4Addr, SocketAddr};
@@ -37,29 +37,29 @@ use crate::wire::dialect::Dialect;
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[non_exhaustive]
 pub enum BuildError {
-    /// The configuration is wrong.
+    /// The configuration is invalid.
     Config(ConfigError),
     /// A variable has no way.
     Plan(PlanError),
-    /// A recipe's part is wrong.
+    /// A recipe's part is invalid.
     Part {
         /// Index of the recipe.
         recipe: u8,
-        /// Which part.
+        /// The part.
         part: Direction,
         /// What is wrong.
         error: PartError,
     },
-    /// No dialect has the configured name.
+    /// There is no dialect of the configured name.
     UnknownDialect,
-    /// More of something than this engine has room for.
+    /// The configuration needs more entries than this engine has room for.
     TooMany {
-        /// Of what.
+        /// The list.
         what: &'static str,
-        /// How many the configuration needs; where only building it tells, one more than there is room
-        /// for.
+        /// Number of entries that the configuration needs; if only building it shows that, one more
+        /// than there is room for.
         needed: usize,
-        /// How many there is room for.
+        /// Number of entries there is room for.
         room: usize,
     },
 }
@@ -75,7 +75,7 @@ impl fmt::Display for BuildError {
             }
             Self::UnknownDialect => write!(f, "unknown dialect; there are {:?}", Dialect::NAMES),
             Self::TooMany { what, needed, room } => {
-                write!(f, "too many {what}: {needed} are needed, and this gateway has room for {room}")
+                write!(f, "too many {what}: {needed} are needed; this gateway has room for {room}")
             }
         }
     }
@@ -83,12 +83,12 @@ impl fmt::Display for BuildError {
 
 impl core::error::Error for BuildError {}
 
-/// There was no room for one more.
+/// There was no room for another entry.
 fn one_too_many(what: &'static str, room: usize) -> BuildError {
     BuildError::TooMany { what, needed: room.saturating_add(1), room }
 }
 
-/// Groups are handed out in order: field frames first.
+/// Groups are assigned in order: field frames first.
 struct Groups(u8);
 
 impl Groups {
@@ -121,13 +121,14 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             sleeps: 0,
             is_deaf: false,
             deaf_until: Instant::ZERO,
-            // The first call asks everybody: `timer_at` has come.
+            // The first call asks every port and link, because `timer_at` has come.
             ask: Ask::NONE,
             tap: Tap::new(),
         }
     }
 
-    /// An engine that runs this configuration; everything is down until its driver says otherwise.
+    /// An engine that runs this configuration. All ports and links are down until the driver
+    /// reports otherwise.
     ///
     /// # Errors
     /// [`BuildError`] says what is wrong with the configuration, or what there is no room for.
@@ -137,16 +138,16 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         Ok(engine)
     }
 
-    /// Runs this configuration from now on, and forgets everything that was. The engine stays where it
-    /// is: for boards whose stack is smaller than a few engines.
+    /// Runs this configuration from now on, and forgets the previous one. The engine is built in
+    /// place: for boards whose stack is smaller than a few engines.
     ///
     /// # Errors
-    /// As [`Engine::new`]; the engine is idle then.
+    /// Same as [`Engine::new`]; the engine is idle then.
     pub fn configure<'c>(&mut self, config: impl Into<ConfigView<'c>>) -> Result<(), BuildError> {
         self.configure_from(config.into())
     }
 
-    /// Not inlined: a run loop would hold this stack for ever.
+    /// Not inlined, because a run loop would hold this stack for ever.
     #[inline(never)]
     fn configure_from(&mut self, config: ConfigView<'_>) -> Result<(), BuildError> {
         self.clear();
@@ -174,7 +175,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             is_deaf,
             deaf_until,
             ask,
-            // Whoever listens goes on.
+            // A tap that listens continues.
             tap: _,
         } = self;
         *store = Store::new();
@@ -234,7 +235,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         Ok(())
     }
 
-    /// What can be counted before anything is built.
+    /// The checks that only need counts.
     fn check_room(&self, config: ConfigView<'_>) -> Result<(), BuildError> {
         let (mut ports, mut frames, mut inputs, mut outputs, mut commands) =
             (0_usize, 0_usize, 0_usize, 0_usize, 0_usize);
@@ -364,7 +365,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     ) -> Result<(), BuildError> {
         let port = id.port();
         let bus = port.and_then(|port| config.ports.get(usize::from(port.0))).map(|port| &port.bus);
-        // Validation has refused what is no address.
+        // Validation has refused everything that is not an address.
         let local = |listen: &str| {
             listen_address(listen).unwrap_or(SocketAddr::new(IpAddr::V4(Ipv4Addr::UNSPECIFIED), 0))
         };
@@ -393,7 +394,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             None => None,
         };
         for (_, _, field) in config.fields_of(recipe, Direction::Output) {
-            // Shown by a port or not: it may tell whether the controller has a safe value.
+            // Whether a port shows it or not: it may show that the controller has a safe value.
             if let (Some(var), Some(group)) = (field.variable(), group)
                 && self.store.image.group(var).is_none()
             {
@@ -401,7 +402,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             }
         }
         let timings = match kind {
-            // Nobody may connect for days: that is no failure.
+            // The controller's client may connect only after days: that is not a failure.
             LinkKind::RecipeTcpListen { .. } | LinkKind::RecipeUdpListen { .. } => LinkTimings {
                 connect_timeout: Duration::MAX,
                 backoff_max: LinkTimings::TCP.backoff_min,
@@ -505,8 +506,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         Ok(())
     }
 
-    /// What of the recipe links' variables shows when the controller has a safe value: the state
-    /// packet, or an output that some link brings.
+    /// The outputs that show whether the controller has a safe value of a recipe link's variable:
+    /// in the state packet, or in a recipe link's frame.
     fn assign_witnesses(&mut self) {
         let has_state = !self.links.state.is_empty();
         let image = &self.store.image;
@@ -520,8 +521,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     }
 }
 
-/// However short the owners' timeouts are, a recipe frame has so long to be acknowledged: peers
-/// acknowledge up to 200 ms late.
+/// The minimum time in which a recipe frame must be acknowledged, however short the owners'
+/// timeouts are: peers acknowledge up to 200 ms late.
 const PATIENCE: Duration = Duration::from_millis(250);
 
 const fn port_cycle_floor() -> Duration {

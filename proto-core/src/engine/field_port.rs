@@ -1,7 +1,7 @@
 //! One port on the field side: frames in, frames out, and the timing of a shared line.
 //!
-//! In: bytes and CAN frames. Out: values in the store, and frames when they are due. Refuses to
-//! know how values reach the controller.
+//! In: bytes and CAN frames. Out: values in the store, and frames when they are due. Does not know
+//! how values reach the controller.
 
 use super::command_link::CommandLink;
 use super::counters::{PortCounters, add, bump};
@@ -50,7 +50,7 @@ impl LineTiming {
         Self { idle_gap: Duration::MAX, turnaround: Duration::ZERO, heard: Instant::ZERO }
     }
 
-    /// When the line is ours.
+    /// When the line is free for the gateway.
     fn quiet_at(&self) -> Instant {
         self.heard + self.turnaround
     }
@@ -66,7 +66,7 @@ pub(super) struct FieldPort {
     pub mode: Mode,
     pub line: LineTiming,
     pub sender: Sender,
-    /// The port's range of the input bindings, those of all CAN frames in one row.
+    /// The port's range of the input bindings; those of all CAN frames follow each other.
     pub inputs: Span,
     /// The port's range of the output bindings.
     pub outputs: Span,
@@ -83,11 +83,11 @@ pub(super) struct FieldPort {
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Accepted {
     pub frames: u32,
-    /// Their variables whose link is up.
+    /// Those of their variables whose link is up.
     pub set: InputSet,
 }
 
-/// What a frame's layout offers, stream or CAN.
+/// The operations of a frame's layout, stream or CAN.
 trait InputLayout {
     fn apply(&self, payload: &[u8], image: &mut ImageBytes) -> Result<Applied, ValueError>;
     fn check(&self, payload: &[u8]) -> Result<(), ValueError>;
@@ -124,7 +124,7 @@ impl FieldPort {
         self.is_up = true;
     }
 
-    /// The device is gone: nothing of what was under way is continued later.
+    /// The device is gone: nothing that has begun is continued later.
     pub(super) fn down<const TAP: usize>(
         &mut self,
         bindings: &[InputBind],
@@ -141,7 +141,7 @@ impl FieldPort {
         forget_commands(self.inputs.of(bindings), commands, now);
     }
 
-    /// The CAN controller reports its error state. One that has left the bus is as good as gone.
+    /// The CAN controller reports its error state. Bus-off is handled like a device that is gone.
     pub(super) fn bus_state(
         &mut self,
         state: BusState,
@@ -157,13 +157,13 @@ impl FieldPort {
         self.bus = state;
     }
 
-    /// The gateway itself slept: nothing of what had begun is continued.
+    /// The gateway itself slept: nothing that has begun is continued.
     pub(super) fn slept<const TAP: usize>(&mut self, tap: &mut Tap<TAP>, now: Instant) {
         self.sender.skip();
         self.discard_partial(tap, now);
     }
 
-    /// What waited while the gateway itself slept is as old as that, and counts for nothing.
+    /// Input that waited while the gateway itself slept is discarded, because its age is unknown.
     pub(super) fn discard<const TAP: usize>(
         &mut self,
         bytes: &[u8],
@@ -181,14 +181,14 @@ impl FieldPort {
         self.line.heard = now;
     }
 
-    /// Bytes came from the line; [`Self::frames`] takes them.
+    /// Bytes came from the line; [`Self::frames`] reads them.
     pub(super) fn heard(&mut self, bytes: &[u8], now: Instant) {
         add(&mut self.counters.bytes_in, bytes.len());
         self.line.heard = now;
     }
 
-    /// Takes the frames in `rest`, or up to the first accepted one when the image is looked at after
-    /// each.
+    /// Reads the frames in `rest`; stops after the first accepted one if the image is to be checked
+    /// after each frame.
     pub(super) fn frames<const PORTS: usize, const TAP: usize>(
         &mut self,
         rest: &mut &[u8],
@@ -320,7 +320,7 @@ impl FieldPort {
         Ok(Accepted { frames: 1, set })
     }
 
-    /// One of the port's commands came to its end.
+    /// One of the port's commands has its result.
     pub(super) fn command_ended(&mut self, outcome: Outcome) {
         if outcome.code == ReplyCode::NotSent {
             bump(&mut self.counters.commands_dropped);
@@ -330,7 +330,7 @@ impl FieldPort {
         }
     }
 
-    /// Looks at the clock: cycles and silence.
+    /// Handles the clock: cycles and silence.
     pub(super) fn advance<const TAP: usize>(&mut self, tap: &mut Tap<TAP>, now: Instant) {
         if now >= self.partial_until() {
             self.discard_partial(tap, now);
@@ -338,7 +338,7 @@ impl FieldPort {
         self.sender.advance(self.is_usable(), &mut self.counters, now);
     }
 
-    /// When the port has something to do by itself.
+    /// When something happens on the port without an input.
     pub(super) fn deadline(&self) -> Instant {
         self.partial_until().min(self.sender.deadline(self.line.quiet_at()))
     }
@@ -348,7 +348,7 @@ impl FieldPort {
         self.sender.is_due() && self.is_usable() && now >= self.line.quiet_at()
     }
 
-    /// Whether what is handed over now can leave.
+    /// Whether frames that are handed over now can leave.
     pub(super) fn is_usable(&self) -> bool {
         self.is_up && self.bus != BusState::BusOff
     }
@@ -372,8 +372,8 @@ impl FieldPort {
         add(&mut self.counters.discarded_bytes, dropped);
     }
 
-    /// In a chunk, or in what was held before it, `skipped` bytes belong to no frame. What follows without
-    /// silence is of the same rejection.
+    /// `skipped` bytes of a chunk, or of bytes held before it, belong to no frame. Without silence
+    /// between, further ones belong to the same rejection.
     #[cold]
     fn no_frame<const TAP: usize>(&mut self, bytes: &[u8], skipped: usize, tap: &mut Tap<TAP>, now: Instant) {
         tap.record(|| came(self.id, now, Err(Rejection::NoFrame), None, [bytes, &[], &[]]));
@@ -383,7 +383,7 @@ impl FieldPort {
         }
     }
 
-    /// Health of the port, of whose input frames `frames` are.
+    /// Health of the port, given the state of its input frames in `frames`.
     pub(super) fn state<'f>(&self, mut frames: impl Iterator<Item = &'f InputFrame>) -> PortState {
         if !self.is_up {
             PortState::Gone
@@ -403,7 +403,7 @@ fn keep(last: &mut Option<LastRejection>, why: Rejection, bytes: &[u8], now: Ins
     *last = Some(LastRejection::new(now, why, None, bytes));
 }
 
-/// What came from a field port's device, for the tap.
+/// Input from a field port's device, for the tap.
 fn came<'a>(
     port: PortId,
     at: Instant,
@@ -415,7 +415,7 @@ fn came<'a>(
     Tapped { at, place: TapPlace::Port(port), direction: TapDirection::In, verdict, can_id, pieces }
 }
 
-/// What taking a frame needs.
+/// The context for applying a frame.
 struct Frames<'a, const PORTS: usize> {
     mode: Mode,
     bindings: &'a [InputBind],
@@ -427,7 +427,8 @@ struct Frames<'a, const PORTS: usize> {
 }
 
 impl<const PORTS: usize> Frames<'_, PORTS> {
-    /// Takes a frame whole or not at all: its variables whose link is up, or why it was rejected.
+    /// Applies a frame as a whole or not at all. Returns its variables whose link is up, or why it
+    /// was rejected.
     fn take(
         &mut self,
         layout: &impl InputLayout,
@@ -474,7 +475,7 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
             InputBind::Unused => {}
             InputBind::Variable { .. } => {
                 if let Some((var, value)) = binding.bound(value) {
-                    // It fits: all of them were tried before the first was applied.
+                    // It fits: all values were tried before the first was applied.
                     let _ = self.store.image.set(var, value);
                 }
             }
@@ -494,8 +495,8 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
     }
 }
 
-/// How many fields the part's frames before the `index`-th have: the bindings of all of them stand
-/// in one row.
+/// Number of fields in the part's frames before the `index`-th; the bindings of all frames follow
+/// each other.
 pub(super) fn fields_before(layout: &CanLayout, index: usize) -> usize {
     let before = layout.frames().take(index);
     before.fold(0, |sum, frame| sum.saturating_add(frame.fields().count()))

@@ -1,6 +1,6 @@
-//! What was handed over to a TCP link and is not known to have arrived: how much of it the peer's
-//! transport still has to acknowledge, and until when it may be delivered
-//! (docs/engine.md section 5).
+//! The bytes that were handed over to a TCP link and may not have arrived: how many the peer's
+//! transport still has to acknowledge, and until when they may be delivered (docs/engine.md section
+//! 5).
 
 use heapless::Deque;
 
@@ -16,12 +16,12 @@ pub(super) struct Flight<const N: usize> {
 
 #[derive(Debug, Clone, Copy)]
 struct Transmission {
-    /// The total when it had been handed over.
+    /// The total after it was handed over.
     end: u32,
-    /// It must not be delivered after this.
+    /// The end of the time in which it may be delivered.
     until: Instant,
-    /// The low half of the microseconds at which its first value was received; 0 where that is not
-    /// measured.
+    /// The low half of the time, in microseconds, at which its first value was received; 0 if that
+    /// is not measured.
     born: u32,
 }
 
@@ -30,21 +30,22 @@ impl<const N: usize> Flight<N> {
         Self { total: 0, transmissions: Deque::new() }
     }
 
-    /// A connection begins or ends: nothing is under way.
+    /// A connection begins or ends: nothing is in flight.
     pub(super) fn clear(&mut self) {
         self.total = 0;
         self.transmissions.clear();
     }
 
-    /// `len` bytes were handed over, not to be delivered after `until`, which is not earlier than that
-    /// of the transmission before. Whoever hands over asks [`Self::is_full`] first.
+    /// `len` bytes were handed over, to be delivered before `until`, which is not earlier than that
+    /// of the previous transmission. The caller has checked [`Self::is_full`].
     pub(super) fn sent(&mut self, len: usize, until: Instant, born: Instant) {
         self.total = self.total.wrapping_add(len as u32);
         let _ = self.transmissions.push_back(Transmission { end: self.total, until, born: low(born) });
     }
 
-    /// So many bytes of all that was handed over are not acknowledged; more than were handed over is
-    /// nonsense, and says nothing. `arrived` gets, of each transmission, the time since its first value was received.
+    /// This many of the bytes handed over are not acknowledged; a number larger than all of them is
+    /// ignored. `arrived` gets, for each transmission that is acknowledged, the time since its
+    /// first value was received.
     pub(super) fn acked(&mut self, left: u32, now: Instant, mut arrived: impl FnMut(Duration)) {
         if left > i32::MAX as u32 {
             return;
@@ -60,7 +61,7 @@ impl<const N: usize> Flight<N> {
         }
     }
 
-    /// The peer answered everything: it has arrived, whatever its transport says.
+    /// The peer has answered everything, so it has arrived, whatever its transport reports.
     pub(super) fn answered(&mut self) {
         self.transmissions.clear();
     }
@@ -70,18 +71,18 @@ impl<const N: usize> Flight<N> {
         self.transmissions.is_empty()
     }
 
-    /// Whether nothing more may be handed over for now.
+    /// Whether nothing more may be handed over at present.
     pub(super) fn is_full(&self) -> bool {
         self.transmissions.is_full()
     }
 
-    /// When what was handed over first must have been acknowledged.
+    /// When the oldest transmission must be acknowledged.
     pub(super) fn deadline(&self) -> Instant {
         self.transmissions.front().map_or(Instant::NEVER, |first| first.until)
     }
 }
 
-/// What is measured takes less than the hour after which this begins anew.
+/// The measured times are shorter than the hour after which the low half wraps.
 fn low(at: Instant) -> u32 {
     if at == Instant::NEVER { 0 } else { at.as_micros() as u32 }
 }

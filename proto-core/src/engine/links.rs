@@ -1,6 +1,6 @@
-//! The links to the controller together: whom a report is for, and in what order they speak.
+//! All links to the controller: which link a report is for, and the order in which they send.
 //!
-//! Three kinds are one connection each: [`Connection`] says what differs between them. The command
+//! Three kinds of links are one connection each; [`Connection`] has their differences. The command
 //! link has two connections and decides for both.
 
 use heapless::{String, Vec};
@@ -22,27 +22,27 @@ use crate::time::Instant;
 pub struct LinkInfo<'a> {
     /// The link.
     pub id: LinkId,
-    /// Of a listening port, its name in the configuration; of others [`LinkKind::name`].
+    /// The name in the configuration of a listening port; for other links [`LinkKind::name`].
     pub name: &'a str,
-    /// What it is.
+    /// Its kind.
     pub kind: LinkKind,
     /// Where it goes, and how it is opened.
     pub endpoint: Endpoint<'a>,
-    /// Whether it is usable, and since or until when.
+    /// Its state, and since or until when.
     pub state: LinkState,
     /// How often it came up and was lost.
     pub history: &'a LinkHistory,
-    /// What was sent and received on it.
+    /// Its counters.
     pub counters: &'a LinkCounters,
 }
 
-/// One or none. All zeros when it is empty, which an `Option` of a struct is not.
+/// One item or none. All zeros when empty, unlike an `Option` of a struct.
 pub(super) type Maybe<T> = Vec<T, 1>;
 
-/// Longest address or name of the controller.
+/// Maximum length of the controller's address or name.
 const MAX_HOST: usize = 64;
 
-/// `$do` with the link `$id` as `$link`, if it is one of those that are one connection each.
+/// Runs `$do` with the link `$id` as `$link`, if it is one of those with one connection.
 macro_rules! with_connection {
     ($links:expr, $id:expr, $link:ident => $do:expr) => {
         match $id {
@@ -53,7 +53,7 @@ macro_rules! with_connection {
     };
 }
 
-/// `$do` with each link that is one connection as `$link`.
+/// Runs `$do` with each link that has one connection as `$link`.
 macro_rules! each_connection {
     ($links:expr, $link:ident => $do:expr) => {
         if let Some($link) = $links.state.first_mut() {
@@ -79,7 +79,7 @@ pub(super) struct Links<const UPLINKS: usize> {
     pub recipes: Vec<Uplink, UPLINKS>,
 }
 
-/// All links, whatever their number, to be looked at.
+/// All links, read-only.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct LinksView<'a> {
     host: &'a str,
@@ -171,7 +171,7 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
         Endpoint::new(transport.unwrap_or(Transport::Tcp { port: 0 }), host)
     }
 
-    /// Everything that depends on the clock.
+    /// Handles everything that depends on the clock.
     pub(super) fn advance<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
         let now = store.now;
         if let Some(link) = self.command.first_mut() {
@@ -185,8 +185,8 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
         });
     }
 
-    /// The gateway itself slept: what waits on its connections is as old as that, so all of them begin
-    /// anew.
+    /// The gateway itself slept: the age of data on its connections is unknown, so all of them are
+    /// opened again.
     pub(super) fn slept<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
         let now = store.now;
         if let Some(link) = self.command.first_mut() {
@@ -229,8 +229,8 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
         });
     }
 
-    /// Bytes arrived on a link; whether [`Self::received`] takes them. Those of a link that is not up, as
-    /// the engine sees it, are of a connection that it gave up.
+    /// Bytes arrived on a link. Returns whether [`Self::received`] reads them: bytes of a link that
+    /// is not up belong to a connection that the engine gave up.
     pub(super) fn heard(&mut self, id: LinkId, len: usize, now: Instant) -> bool {
         if let LinkId::COMMAND | LinkId::URGENT = id {
             return self.command.first_mut().is_some_and(|link| link.heard(id, len, now));
@@ -246,7 +246,7 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
         .unwrap_or(false)
     }
 
-    /// What was heard; the bytes that are left when the image is to be looked at first.
+    /// Reads the bytes; returns the rest if the image is to be checked first.
     pub(super) fn received<'b, const PORTS: usize>(
         &mut self,
         id: LinkId,
@@ -260,7 +260,7 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
         with_connection!(self, id, link => link.received(bytes, store)).unwrap_or(&[])
     }
 
-    /// The transport took everything; when something happens there by itself.
+    /// The transport has taken everything. Returns when something happens there without an input.
     pub(super) fn sent(&mut self, id: LinkId) -> Instant {
         if let LinkId::COMMAND | LinkId::URGENT = id {
             self.command.iter_mut().for_each(|link| link.sent(id));
@@ -282,7 +282,8 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
         with_connection!(self, id, link => link.acked(left, store));
     }
 
-    /// What goes to the controller: what stops the robot, then field values, commands last.
+    /// The next output to the controller: commands that stop the robot, then field values, then
+    /// other commands.
     pub(super) fn next_upward<const PORTS: usize>(
         &mut self,
         store: &mut Store<PORTS>,
@@ -308,7 +309,7 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
         link.next_command(out, store.now).map(|len| (LinkId::COMMAND, len))
     }
 
-    /// Whether what stops the robot waits.
+    /// Whether a command that stops the robot waits.
     pub(super) fn has_stops(&self) -> bool {
         self.command.first().is_some_and(CommandLink::has_stops)
     }
@@ -333,7 +334,7 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
         recipes.find_map(|link| link.supervisor.take_action().map(|action| (link.id, action)))
     }
 
-    /// When something happens by itself.
+    /// When something happens without an input.
     pub(super) fn deadline(&self) -> Instant {
         let mut first = self.deadline_of(LinkId::COMMAND);
         first = first.min(self.deadline_of(LinkId::STATE)).min(self.deadline_of(LinkId::MODBUS));
@@ -343,7 +344,7 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
         first
     }
 
-    /// When something happens by itself on one link.
+    /// When something happens on one link without an input.
     pub(super) fn deadline_of(&self, id: LinkId) -> Instant {
         let of = |own: Instant, supervisor: &Supervisor| own.min(supervisor.deadline());
         let deadline = match id {

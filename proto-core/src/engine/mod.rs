@@ -1,17 +1,16 @@
-//! The gateway: one run loop over field ports and controller links, sans-IO
-//! (docs/engine.md).
+//! The gateway: one run loop over field ports and controller links, without I/O (docs/engine.md).
 //!
 //! One rule: change the engine once with [`Engine::handle`], then drain [`Engine::poll_output`]
 //! until it returns [`Output::Sleep`]. Polling early is harmless. The engine never reads a clock,
 //! never sleeps, never does I/O and never allocates; the work of a call is bounded by the size of
-//! the configuration and of what it was given.
+//! the configuration and of its input.
 //!
-//! Late is judged by arrival: only [`Input::Tick`] lets a deadline pass, so that what waited while
-//! the driver was busy still counts. A driver that was away for more than [`ASLEEP`] has nothing to
-//! tell that could be believed: it is discarded.
+//! Arrival decides what is late: only [`Input::Tick`] lets a deadline pass, so input that waited
+//! while the driver was busy still counts. After more than [`ASLEEP`] without a call the age of
+//! such input is unknown, and it is discarded.
 //!
-//! What a device or the controller sends wrong is counted and skipped; it is never an error of the
-//! run loop, and never applied in part.
+//! Errors of a device or of the controller are counted and skipped. They are never an error of the
+//! run loop, and nothing is applied in part.
 
 mod build;
 mod command_link;
@@ -76,29 +75,30 @@ use crate::wire::state::LEN;
 /// controller is shorter.
 pub const OUTPUT_BUFFER: usize = MAX_STREAM_FRAME;
 
-/// Size of a receive buffer that takes a state packet in one piece and shows that a datagram is longer
-/// than any frame. What arrives may be handed over in pieces of any other size.
+/// Size of a receive buffer that holds a state packet in one piece, and shows that a datagram is
+/// longer than any frame. Bytes may be reported in pieces of any other size.
 pub const INPUT_BUFFER: usize = 1536;
 const _: () = assert!(INPUT_BUFFER >= LEN && INPUT_BUFFER > MAX_STREAM_FRAME);
 
-/// A driver that calls the engine later than this after the call before was asleep: stopped, suspended,
-/// or in a debugger.
+/// If two calls of the engine are further apart than this, the gateway was asleep: stopped,
+/// suspended, or in a debugger.
 pub const ASLEEP: Duration = Duration::from_millis(500);
 
-/// The engine asks to be called so often even when it has nothing to do, so that it notices.
+/// The engine asks to be called at least this often, even if it has nothing to do, so that it
+/// notices sleep.
 const HEARTBEAT: Duration = Duration::from_millis(250);
 
-/// After it slept, the gateway takes nothing from the field for so long, and until the next tick:
-/// drivers read what waits in devices in pieces.
+/// After sleep, input from the field is discarded for this long, and until the next tick: drivers
+/// read what waits in devices in pieces.
 const DEAF: Duration = Duration::from_millis(50);
 
-/// The clock's last instant. [`Instant::NEVER`] is behind it, so that "no deadline" never comes.
+/// The clock's last instant. [`Instant::NEVER`] is after it, so that "no deadline" never comes.
 const LAST: Instant = Instant::from_micros(u64::MAX - 1);
 
 /// The gateway engine for up to `PORTS` field ports, `UPLINKS` recipe links and, over all ports,
 /// `FIELDS` user-defined input fields and as many output fields.
 ///
-/// `TAP` bytes are for the ring of [`Engine::tap`], which nobody who leaves it 0 pays for.
+/// `TAP` bytes are for the ring of [`Engine::tap`]; 0 costs nothing.
 ///
 /// `Engine<4, 1, 128>` takes less than 32 KiB.
 #[derive(Debug, Clone)]
@@ -115,36 +115,37 @@ pub struct Engine<
     links: Links<UPLINKS>,
     /// Nothing depends on the clock before this. It may be earlier than needed, never later.
     timer_at: Instant,
-    /// `timer_at` was worked out after the clock was looked at last.
+    /// `timer_at` was computed after the clock was last checked.
     is_armed: bool,
-    /// The newest instant that was told.
+    /// The newest instant of a call.
     now: Instant,
-    /// A deadline has come and its tick has not been told: what is too old may still wait, so nothing
-    /// is sent before that.
+    /// A deadline has come and its tick has not been reported. Expired data may still wait, so
+    /// nothing is sent before that tick.
     is_late: bool,
-    /// The instant of the newest [`Output::Sleep`]; that of a tick that was not told stands until then.
+    /// The instant of the newest [`Output::Sleep`]; it stays while its tick is not reported.
     announced: Instant,
-    /// Whoever is not called until [`ASLEEP`] after the call before was asleep; this sees to a call.
+    /// The engine asks to be called by then, because calls further apart than [`ASLEEP`] mean
+    /// sleep.
     beat_at: Instant,
-    /// Times the gateway slept.
+    /// Number of times that the gateway slept.
     sleeps: u32,
-    /// What arrives on field ports waited while the gateway slept.
+    /// Input from field ports is discarded, because it waited while the gateway slept.
     is_deaf: bool,
     deaf_until: Instant,
-    /// Whom [`Engine::poll_output`] asks before it sleeps.
+    /// The ports and links that [`Engine::poll_output`] asks before it sleeps.
     ask: Ask,
     tap: Tap<TAP>,
 }
 
-/// Who may have something to say. Who had nothing is not asked again until something happens to it, a
-/// deadline comes, or the next beat.
+/// The ports and links that may have an output. One that had none is not asked again until
+/// something happens to it, a deadline comes, or the next beat.
 #[derive(Debug, Clone, Copy)]
 struct Ask {
-    /// Links, for something to send.
+    /// Links that may send.
     links: bool,
-    /// Links, whether they are to be opened or closed.
+    /// Links that may be opened or closed.
     actions: bool,
-    /// Ports, for something to send.
+    /// Ports that may send.
     ports: bool,
 }
 
@@ -156,17 +157,18 @@ impl Ask {
 impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: usize>
     Engine<PORTS, UPLINKS, FIELDS, TAP>
 {
-    /// Most links that this engine can have: port 2000 twice, port 2001, Modbus, and the recipe links.
+    /// Maximum number of links of this engine: port 2000 twice, port 2001, Modbus, and the recipe
+    /// links.
     pub const MAX_LINKS: usize = UPLINKS.saturating_add(4);
 
-    /// Something happened, or time passed. `now` is the present; an instant earlier than in the call
-    /// before counts as that.
+    /// Reports an event, or that time has passed. `now` is the present; an instant earlier than
+    /// that of the previous call counts as the previous one.
     ///
     /// Inputs for a port or link that the configuration does not have are ignored.
     pub fn handle(&mut self, now: Instant, input: Input<'_>) {
         let now = self.present(now);
         self.is_late = now >= self.announced;
-        // Whatever happens may set an earlier deadline; what it makes later is found out in time.
+        // Any input may set an earlier deadline; one that becomes later is noticed in time.
         match input {
             Input::PortBytes { port, bytes } => self.port_bytes(port, bytes, now),
             Input::PortCan { port, frame } => self.port_can(port, &frame, now),
@@ -199,7 +201,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
     }
 
-    /// What the driver has to do next; call it again until it is [`Output::Sleep`]. Nothing is sent
+    /// The next output for the driver. Call it again until it is [`Output::Sleep`]. Nothing is sent
     /// between a deadline and the [`Input::Tick`] that lets it pass.
     ///
     /// What stops the robot comes first, then what brings field values to the controller, then what
@@ -212,7 +214,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             self.ask = Ask::ALL;
         }
         if self.ask.links && !self.is_late {
-            // To send a command, a connection may have to be closed.
+            // To send a command, a connection may have to be closed first.
             self.ask.actions |= !self.links.command.is_empty();
             self.store.now = now;
             let upward = self.links.next_upward(&mut self.store, &mut buf[..]);
@@ -223,7 +225,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 self.tap.went(TapPlace::Link(link), None, bytes, now);
                 return Output::LinkSend { link, bytes };
             }
-            // What stops the robot is looked at in every call, also before the deadline that it has.
+            // Commands that stop the robot are checked in every call, even before their deadline.
             self.ask.links = self.links.has_stops();
         }
         if self.ask.actions {
@@ -251,7 +253,10 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 None => self.ask.ports = false,
             }
         }
-        debug_assert!(self.is_late || self.all_are_silent(&mut buf[..], now), "who was not asked speaks");
+        debug_assert!(
+            self.is_late || self.all_are_silent(&mut buf[..], now),
+            "a port or link that was not asked has an output"
+        );
         if !self.is_armed {
             self.is_armed = true;
             self.timer_at = self.deadline();
@@ -265,15 +270,15 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         Output::Sleep { until: self.announced }
     }
 
-    /// Whether who is not asked has nothing to say.
+    /// Whether ports and links that are not asked really have no output.
     fn all_are_silent(&mut self, out: &mut [u8], now: Instant) -> bool {
         self.links.next_upward(&mut self.store, out).is_none()
             && self.links.next_action().is_none()
             && self.next_downward(out, now).is_none()
     }
 
-    /// When the engine has something to do by itself, worked out anew. [`Output::Sleep`] may name an
-    /// earlier instant, never a later one.
+    /// When the engine has something to do without an input, computed exactly. [`Output::Sleep`]
+    /// may be earlier, never later.
     pub fn deadline(&self) -> Instant {
         let ports = self.ports.iter().map(FieldPort::deadline);
         let ports = ports.min().unwrap_or(Instant::NEVER);
@@ -281,7 +286,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         ports.min(self.links.deadline()).min(self.store.deadline()).min(hears_at)
     }
 
-    // What an input does is a function of its own, so that no other pays for the registers it needs.
+    // Each input has its own function, so that no other pays for the registers it needs.
     #[inline(never)]
     fn port_bytes(&mut self, id: PortId, bytes: &[u8], now: Instant) {
         if let Some(port) = find_port(&mut self.ports, id) {
@@ -386,7 +391,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         now
     }
 
-    /// `now`, but no earlier than was told before, and no later than the clock's last instant.
+    /// `now`, but no earlier than the previous call, and no later than the clock's last instant.
     fn forward(&self, now: Instant) -> Instant {
         if now < self.now || now > LAST { self.clamped(now) } else { now }
     }
@@ -396,8 +401,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         now.min(LAST).max(self.now)
     }
 
-    /// The gateway itself slept: what waits for it is as old as that. Overdue safe values go first,
-    /// nothing is commanded, and every connection begins anew.
+    /// The gateway itself slept: the age of everything that waits is unknown. Overdue safe values
+    /// go first, no command is sent, and every connection is opened again.
     #[cold]
     fn wake(&mut self, now: Instant) {
         self.sleeps = self.sleeps.wrapping_add(1);
@@ -410,7 +415,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         self.arm(self.deaf_until);
     }
 
-    /// Commands whose device is gone.
+    /// Drops commands whose device is gone.
     fn drop_forgotten(&mut self) {
         if let Some(command) = self.links.command.first_mut() {
             command.drop_forgotten();
@@ -425,7 +430,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         &self.store.image
     }
 
-    /// What happened on a field port; `None` if no such port is configured.
+    /// Counters of a field port; `None` if no such port is configured.
     pub fn port_counters(&self, port: PortId) -> Option<&PortCounters> {
         self.ports.iter().find(|other| other.id == port).map(|port| &port.counters)
     }
@@ -451,19 +456,19 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         self.links.infos()
     }
 
-    /// Whether a datagram is a frame of the link's output part: what a listening UDP link's driver
-    /// asks before it answers another sender than so far.
+    /// Whether a datagram is a frame of the link's output part. The driver of a listening UDP link
+    /// checks this before it answers another sender than before.
     pub fn is_frame(&self, link: LinkId, datagram: &[u8]) -> bool {
         self.links.recipes.iter().any(|other| other.id == link && other.is_frame(datagram))
     }
 
-    /// How often the gateway itself slept: it was not called for longer than [`ASLEEP`], so what
-    /// waited for it was discarded. Wraps.
+    /// How often the gateway itself slept: it was not called for longer than [`ASLEEP`], so waiting
+    /// input was discarded. Wraps.
     pub fn sleeps(&self) -> u32 {
         self.sleeps
     }
 
-    /// Everything that a person or a program may ask about the gateway, at `now`.
+    /// A snapshot of the whole gateway at `now`.
     pub fn status(&self, now: Instant) -> Status<'_> {
         Status {
             at: self.forward(now),
@@ -476,18 +481,18 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
     }
 
-    /// How long things took since the start.
+    /// The latencies since the start.
     pub fn latency(&self) -> &Latency {
         &self.store.latency
     }
 
-    /// What goes over ports and links, for whoever listens.
+    /// The ring of records of everything that goes over ports and links.
     pub fn tap(&mut self) -> &mut Tap<TAP> {
         &mut self.tap
     }
 
-    /// Something depends on the clock from `at` on. What is due already is served before the engine
-    /// sleeps, or at the tick that is late.
+    /// Something depends on the clock from `at` on. If it is due already, it is handled before the
+    /// engine sleeps, or at the tick that is late.
     fn arm(&mut self, at: Instant) {
         if at > self.now {
             self.timer_at = self.timer_at.min(at);
@@ -509,9 +514,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
     }
 
-    /// Everything that depends on the clock.
+    /// Handles everything that depends on the clock.
     fn advance(&mut self, now: Instant) {
-        // At one instant the clock is looked at once: what is done now is due later.
+        // At one instant the clock is checked once: what is done now is due later.
         self.timer_at = now + Duration::from_micros(1);
         self.ask = Ask::ALL;
         self.is_armed = false;
@@ -525,7 +530,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         self.carry_results();
     }
 
-    /// What came of values and commands on a link, for the ports that they are of.
+    /// Passes the results of values and commands on a link on to their ports.
     fn carry_results(&mut self) {
         self.carry_outcomes();
         let Some(lost) = self.store.take_lost() else { return };
@@ -560,7 +565,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         self.expire_waiting();
     }
 
-    /// Values that have waited too long are dropped.
+    /// Drops values that have waited too long.
     fn expire_waiting(&mut self) {
         let ports = &mut self.ports;
         self.store.expire_waiting(|port, dropped| {
@@ -570,7 +575,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         });
     }
 
-    /// After a field frame: bits that trigger, and frames that have to wait for their neighbours.
+    /// After a field frame: checks bits that trigger, and frames that wait for their neighbours.
     fn after_field(&mut self, port: PortId, accepted: &Accepted, now: Instant) {
         if accepted.frames == 0 {
             return;
@@ -607,7 +612,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
     }
 
-    /// Values in the image changed: bits that trigger may have risen.
+    /// Values in the image changed: checks for rising bits that trigger.
     fn image_changed(&mut self) {
         if !self.store.watches_bits {
             return;
@@ -622,7 +627,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         self.arm(first);
     }
 
-    /// What goes to the field.
+    /// The next output to the field.
     fn next_downward(&mut self, out: &mut [u8], now: Instant) -> Option<(PortId, Downward)> {
         let (image, bindings) = (&self.store.image, &self.bindings.outputs);
         for port in &mut self.ports {

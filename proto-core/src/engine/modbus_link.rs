@@ -1,4 +1,4 @@
-//! The Modbus link: coalesced writes of what fields brought, polls of what ports show, one
+//! The Modbus link: coalesced writes of values from the field, polls of values that ports show, one
 //! transaction in flight (docs/engine.md section 5).
 
 use heapless::Vec;
@@ -24,7 +24,7 @@ use crate::wire::scalar::Scalar;
 pub const MAX_POLL_BLOCKS: usize = 16;
 /// Variables polled by Modbus.
 const MAX_POLLED: usize = 64;
-/// Coils or registers that nobody asked for but that are read to join two blocks.
+/// Maximum number of unneeded coils or registers that are read to join two blocks.
 const JOIN_GAP: u16 = 16;
 /// A request without an answer is given up after this.
 const ANSWER_TIMEOUT: Duration = Duration::from_millis(500);
@@ -58,11 +58,11 @@ enum Asked {
 struct InFlight {
     asked: Asked,
     since: Instant,
-    /// Since when the oldest value of a write had waited.
+    /// Since when the oldest value of a write has waited.
     born: Instant,
 }
 
-/// What goes first when both a write and a poll could be sent.
+/// What goes first when both a write and a poll are due.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum First {
     Write,
@@ -80,8 +80,8 @@ pub(super) struct ModbusLink {
     polled: Vec<SysVar, MAX_POLLED>,
     blocks: Vec<Block, MAX_POLL_BLOCKS>,
     in_flight: Option<InFlight>,
-    /// Since when a value that a field frame brought waits to be handed over; [`Instant::NEVER`] if none
-    /// does.
+    /// Since when a value from a field frame has waited to be handed over; [`Instant::NEVER`] if
+    /// none waits.
     pub offered_at: Instant,
     /// The transport has not taken the newest request yet.
     unsent: bool,
@@ -121,8 +121,8 @@ impl ModbusLink {
         Transport::Tcp { port: self.port }
     }
 
-    /// Polls a variable every `period`; false when there are too many. Variables must come in the
-    /// order of their Modbus places for blocks to join.
+    /// Polls a variable every `period`; false if there are too many. Variables must be added in the
+    /// order of their Modbus places, so that blocks join.
     pub(super) fn poll_var(
         &mut self,
         var: SysVar,
@@ -154,7 +154,7 @@ impl ModbusLink {
         Some(group)
     }
 
-    /// The next request, when one may be sent.
+    /// The next request that may be sent.
     pub(super) fn next_request<const PORTS: usize>(
         &mut self,
         store: &mut Store<PORTS>,
@@ -192,8 +192,8 @@ impl ModbusLink {
         self.in_flight.map_or(Instant::NEVER, |asked| asked.since + ANSWER_TIMEOUT)
     }
 
-    /// Gives up the transaction in flight. Whether a write was carried out is not known; only safe
-    /// values are written again.
+    /// Gives up the transaction in flight. It is not known whether a write was carried out; only
+    /// safe values are written again.
     fn abort<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
         self.client.abort();
         if let Some(InFlight { asked: Asked::Write { safe }, .. }) = self.in_flight.take() {
@@ -215,7 +215,7 @@ impl ModbusLink {
 
     fn poll(&mut self, nth: usize, out: &mut [u8], now: Instant) -> Option<(usize, Asked)> {
         let block = self.blocks.get_mut(nth)?;
-        // What was missed while a transaction was in flight is not made up for.
+        // Polls missed while a transaction was in flight are not made up for.
         block.grid.due(now);
         let (address, count) = (block.first, block.count);
         let request = match block.kind {
@@ -253,7 +253,7 @@ impl ModbusLink {
                 *place = store.outbox.bit_value(var);
             }
         }
-        // Registers are packed behind the longest request, where nothing has to be cleared for them.
+        // Registers are packed after the longest request, where nothing has to be cleared for them.
         let (out, room) = out.split_at_mut_checked(MAX_ADU)?;
         let request = match kind {
             Kind::Coils => Request::WriteCoils { address, coils: Coils::new(bits.get(..count)?, items)? },
@@ -361,7 +361,7 @@ impl Connection for ModbusLink {
         bump(&mut self.counters.timeouts);
         self.abort(store);
         self.timeouts_in_a_row = self.timeouts_in_a_row.saturating_add(1);
-        // A request that has not arrived by now would be carried out when nobody waits for it any more.
+        // A request that has not arrived by now would be carried out after it was given up.
         let is_under_way = self.unsent || !self.flight.is_empty();
         if is_under_way {
             bump(&mut self.counters.unacknowledged);
@@ -398,7 +398,7 @@ fn place_of(var: SysVar) -> Option<(u16, Kind)> {
     }
 }
 
-/// Puts the answer to a poll into the image.
+/// Writes the answer to a poll into the image.
 fn take_poll<const PORTS: usize>(
     block: &Block,
     polled: &[SysVar],

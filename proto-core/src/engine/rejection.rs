@@ -1,4 +1,4 @@
-//! Why something that arrived on a port or link was not taken, in the words of counters, tap and status.
+//! Why input on a port or link was rejected, as counters, tap and status report it.
 
 use crate::time::{Duration, Instant};
 use crate::wire::can::CanId;
@@ -27,12 +27,12 @@ pub enum Rejection {
     NoInput,
     /// It waited while the gateway itself slept.
     Asleep,
-    /// It is not what the link's protocol allows.
+    /// It violates the link's protocol.
     Malformed,
 }
 
 impl Rejection {
-    /// Every one of them.
+    /// All reasons.
     pub const ALL: [Self; 10] = [
         Self::NoFrame,
         Self::Partial,
@@ -46,7 +46,7 @@ impl Rejection {
         Self::Malformed,
     ];
 
-    /// A few words for people, such as `no frame found`.
+    /// A short text, such as `no frame found`.
     pub const fn text(self) -> &'static str {
         match self {
             Self::NoFrame => "no frame found",
@@ -57,26 +57,27 @@ impl Rejection {
             Self::WrongLength => "a CAN frame of another length",
             Self::Remote => "a remote frame",
             Self::NoInput => "the recipe has no input part",
-            Self::Asleep => "it waited while the gateway slept",
-            Self::Malformed => "not as the protocol requires",
+            Self::Asleep => "waited while the gateway slept",
+            Self::Malformed => "a violation of the protocol",
         }
     }
 }
 
-/// Bytes of a rejection that are kept.
+/// Number of bytes of a rejection that are kept.
 pub const KEPT_BYTES: usize = 32;
 
-/// The newest rejection of a port, with the first [`KEPT_BYTES`] of what was rejected.
+/// The newest rejection of a port, with the first [`KEPT_BYTES`] of the rejected bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct LastRejection {
-    /// When; of bytes without a frame, when the first came.
+    /// When it was; for bytes without a frame, when the first came.
     pub at: Instant,
-    /// Why.
+    /// The reason.
     pub why: Rejection,
     /// The frame's id on a CAN bus.
     pub can_id: Option<CanId>,
-    /// Length of what was rejected in bytes, of which the first are kept. Of [`Rejection::NoFrame`] it
-    /// counts what belongs to no frame, and the bytes kept are those of the chunks in which that was.
+    /// Length of the rejected frame or bytes; only the first bytes are kept. For
+    /// [`Rejection::NoFrame`] it is the number of bytes that belong to no frame, and the kept bytes
+    /// are those of the chunks with them.
     pub len: usize,
     /// When its newest bytes came.
     newest_at: Instant,
@@ -100,7 +101,8 @@ impl LastRejection {
         Self { len: skipped, ..Self::new(at, Rejection::NoFrame, None, bytes) }
     }
 
-    /// Whether bytes without a frame at `now` belong to this rejection: no silence was between.
+    /// Whether bytes without a frame at `now` belong to this rejection: there was no silence
+    /// between.
     pub(super) fn goes_on(&self, now: Instant, idle_gap: Duration) -> bool {
         self.why == Rejection::NoFrame && now.saturating_since(self.newest_at) <= idle_gap
     }
@@ -114,7 +116,7 @@ impl LastRejection {
         self.newest_at = now;
     }
 
-    /// The first bytes of what was rejected.
+    /// The first bytes of the rejected frame or bytes.
     pub fn bytes(&self) -> &[u8] {
         self.bytes.get(..usize::from(self.kept)).unwrap_or(&[])
     }

@@ -1,4 +1,4 @@
-//! When a port sends its output part: by its cycle, on a change, by each frame, by a rising bit.
+//! The trigger of a port's output part: its cycle, a change, an input frame, or a rising bit.
 //!
 //! The cycle keeps its phase and never bursts; cycles that could not be served are counted.
 
@@ -10,7 +10,7 @@ use crate::sysvar::SysVar;
 use crate::time::{Duration, Instant};
 use crate::wire::scalar::Scalar;
 
-/// Some of the image's groups.
+/// A set of the image's groups.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct GroupSet(u128);
 
@@ -37,12 +37,12 @@ pub(super) struct Sender {
     on_stale: OnStale,
     stale_after: Duration,
     grid: Option<Grid>,
-    /// Where the values come from: all must be known, and fresh unless the recipe holds.
+    /// Groups of the values: all must be known, and fresh unless the recipe holds.
     pub sources: GroupSet,
     /// The variables: all must be readable.
     pub shown: VarSet,
     due: bool,
-    /// When the frame that is due became so; [`Instant::NEVER`] once that was taken.
+    /// When the due frame became due; [`Instant::NEVER`] after that was taken.
     due_at: Instant,
     in_flight: bool,
     /// The next CAN frame of a cycle that is being handed over.
@@ -89,7 +89,7 @@ impl Sender {
         self.on == SendOn::Change
     }
 
-    /// The port is gone or bus-off: what was due is not sent later.
+    /// The port is gone or bus-off: due frames are dropped.
     pub(super) fn reset(&mut self) {
         self.due = false;
         self.in_flight = false;
@@ -97,19 +97,19 @@ impl Sender {
         self.digest = None;
     }
 
-    /// The gateway slept: what was due then is not sent now. What was handed over is still reported.
+    /// The gateway slept: due frames are dropped. Frames that were handed over are still reported.
     pub(super) fn skip(&mut self) {
         self.due = false;
         self.next_can = 0;
         self.digest = None;
     }
 
-    /// All that was handed over has left.
+    /// Everything handed over has left.
     pub(super) fn sent(&mut self) {
         self.in_flight = false;
     }
 
-    /// When the frame, or the first CAN frame of the cycle, became due; told once.
+    /// When the frame, or the first CAN frame of the cycle, became due; returned once.
     pub(super) fn take_due_at(&mut self) -> Instant {
         core::mem::replace(&mut self.due_at, Instant::NEVER)
     }
@@ -141,7 +141,7 @@ impl Sender {
         self.raise(counters, due_at);
     }
 
-    /// So many input frames were accepted at once: the newest is answered.
+    /// This many input frames were accepted at once: the newest is answered.
     pub(super) fn frames_accepted(
         &mut self,
         count: u32,
@@ -155,7 +155,7 @@ impl Sender {
         }
     }
 
-    /// Values in the image changed: looks at the bit that triggers.
+    /// Values in the image changed: checks the bit that triggers.
     pub(super) fn image_changed(
         &mut self,
         image: &Image,
@@ -183,7 +183,7 @@ impl Sender {
             })
     }
 
-    /// Whether a frame with this digest is news to a port that sends changes only.
+    /// Whether a frame with this digest is new, on a port that sends only changes.
     pub(super) fn is_news(&mut self, digest: u64) -> bool {
         if self.on != SendOn::Change {
             return true;
@@ -193,7 +193,8 @@ impl Sender {
         news
     }
 
-    /// When something happens by itself; `quiet_at` is when the line is ours.
+    /// When something happens without an input; `quiet_at` is when the line is free for the
+    /// gateway.
     pub(super) fn deadline(&self, quiet_at: Instant) -> Instant {
         let cycle = self.grid.as_ref().map_or(Instant::NEVER, Grid::next);
         if self.is_due() { cycle.min(quiet_at) } else { cycle }
@@ -201,7 +202,7 @@ impl Sender {
 
     fn raise(&mut self, counters: &mut PortCounters, at: Instant) {
         if self.due {
-            // The frame that was due is overtaken by this one.
+            // This frame replaces the one that was due.
             bump(&mut counters.skipped_cycles);
         }
         self.due = true;
@@ -209,12 +210,12 @@ impl Sender {
     }
 }
 
-/// FNV-1a: tells frames apart without keeping them.
+/// FNV-1a: distinguishes frames without keeping them.
 pub(super) fn digest(seed: u64, bytes: &[u8]) -> u64 {
     bytes.iter().fold(seed, |hash, &byte| (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01B3))
 }
 
-/// Where a digest starts.
+/// Initial value of a digest.
 pub(super) const DIGEST_SEED: u64 = 0xCBF2_9CE4_8422_2325;
 
 fn bit_of(image: &Image, var: SysVar, bit: u8) -> bool {

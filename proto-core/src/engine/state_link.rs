@@ -1,4 +1,4 @@
-//! The state link: the 10 Hz stream of port 2001, for what nothing faster shows.
+//! The state link: the 10 Hz stream of port 2001, for variables that no faster source has.
 
 use heapless::Vec;
 
@@ -58,7 +58,7 @@ impl Connection for StateLink {
     fn opened<const PORTS: usize>(&mut self, _store: &mut Store<PORTS>) {}
 
     fn lost<const PORTS: usize>(&mut self, _store: &mut Store<PORTS>) {
-        // Half a packet is worth nothing.
+        // Half a packet is of no use.
         self.stream.reset();
     }
 
@@ -80,7 +80,7 @@ impl Connection for StateLink {
                         if view.read_var(var).is_some_and(|value| store.image.set(var, value).is_ok()) {
                             store.read_back.insert(var);
                         } else {
-                            // Nobody knows it: it must not be written back.
+                            // It is unknown, so it must not be written back.
                             store.read_back.remove(var);
                             if store.image.is_readable(var) {
                                 bump(&mut self.counters.unreadable);
@@ -108,8 +108,8 @@ impl Connection for StateLink {
     }
 }
 
-/// Safe values that the controller shows, it has; one that it showed by a packet from before, or that
-/// something late has overwritten, it has not.
+/// Confirms safe values that the controller shows. A value shown by an old packet, or overwritten
+/// by late data, loses its confirmation.
 fn compare_safe<const PORTS: usize>(view: &StateView<'_>, store: &mut Store<PORTS>) {
     let (may_confirm, may_doubt) = (store.may_confirm(), store.may_doubt());
     for var in store.safe.iter() {

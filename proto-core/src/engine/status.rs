@@ -1,9 +1,9 @@
-//! One snapshot of everything that a person or a program asks about a running gateway: statistics, log
-//! lines, the status LED, an API and metrics are all made from it.
+//! A snapshot of a running gateway. Statistics, log lines, the status LED, an API and metrics are
+//! all made from it.
 //!
-//! In: the engine, at one instant. Out: ports, links, variables, the controller's
-//! states, latency. It is a view: making it costs a few pointers, and each part is worked out when asked.
-//! What is unknown is absent, never 0.
+//! In: the engine, at one instant. Out: ports, links, variables, the controller's states, latency.
+//! It is a view: making it costs a few pointers, and each part is computed on request. Unknown
+//! values are absent, never 0.
 
 use super::counters::PortCounters;
 use super::field_port::{Codec, FieldPort};
@@ -19,7 +19,7 @@ use crate::time::{Duration, Instant};
 use crate::wire::scalar::Scalar;
 use crate::wire::state::States;
 
-/// What a gateway is and did, at one instant. [`super::Engine::status`] makes it.
+/// State and counters of a gateway at one instant; made by [`super::Engine::status`].
 #[derive(Debug, Clone, Copy)]
 pub struct Status<'a> {
     pub(super) at: Instant,
@@ -45,7 +45,7 @@ pub enum FieldBus {
     },
 }
 
-/// What a person who sees only a lamp has to know, the worst first.
+/// The gateway's condition for an indicator such as a lamp, the worst first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
@@ -68,29 +68,28 @@ pub struct PortStatus<'a> {
     pub id: PortId,
     /// Its name in the configuration.
     pub name: &'a str,
-    /// What it is.
+    /// Its bus.
     pub bus: FieldBus,
-    /// Its recipe's place in the configuration.
+    /// Index of its recipe in the configuration.
     pub recipe: u8,
-    /// Whether it works.
+    /// Its health.
     pub state: PortState,
-    /// How old the newest accepted frame is; of a CAN recipe, that of the id heard last. `None` before
-    /// the first.
+    /// Age of the newest accepted frame; for a CAN recipe, of any id. `None` before the first.
     pub age: Option<Duration>,
-    /// How many of its input frames are overdue or have never come.
+    /// Number of its input frames that are overdue or have never come.
     pub overdue: usize,
-    /// The outcome of the newest command that one of its values picked.
+    /// Result of the newest command that one of its values picked.
     pub reply: ReplyCode,
     /// The text of that command, such as `run(pick.jspf)`.
     pub command: Option<&'a str>,
-    /// The newest frame or bytes that were rejected. CAN frames of a foreign id are kept only where nothing
-    /// else was rejected: on a shared bus they are for others.
+    /// The newest rejection. A CAN frame with an unknown id replaces no other rejection: on a
+    /// shared bus it is for another node.
     pub last_rejection: Option<&'a LastRejection>,
-    /// What happened since the start.
+    /// Counters since the start.
     pub counters: &'a PortCounters,
 }
 
-/// The value of a variable that is known.
+/// A known variable and its value.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[non_exhaustive]
 pub struct VariableStatus<'a> {
@@ -100,11 +99,11 @@ pub struct VariableStatus<'a> {
     pub value: Scalar,
     /// Time since it was received.
     pub age: Duration,
-    /// The field port whose recipe sends an input variable; `None` for what the controller shows.
+    /// The field port that owns an input variable; `None` for a value from the controller.
     pub owner: Option<&'a str>,
 }
 
-/// What the controller said of itself in the newest state packet.
+/// The controller's states in the newest state packet.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct ControllerStatus {
@@ -130,7 +129,7 @@ impl<'a> Status<'a> {
         self.links.infos()
     }
 
-    /// The variables whose value is known, in the order of the table.
+    /// The known variables, in the order of the table.
     pub fn variables(self) -> impl Iterator<Item = VariableStatus<'a>> {
         SysVar::all().filter_map(move |var| {
             let age = self.image.age(var, self.at)?;
@@ -151,9 +150,9 @@ impl<'a> Status<'a> {
         Some(ControllerStatus { states, age: self.at.saturating_since(at) })
     }
 
-    /// The worst of everything.
+    /// The worst present condition.
     pub fn health(&self) -> Health {
-        // Another link does the work of one that is shared.
+        // Another link carries the traffic of a shared one.
         let is_up = |link: LinkInfo<'_>| matches!(link.state, LinkState::Up { .. } | LinkState::Shared);
         if self.ports.is_empty() && self.links().next().is_none() {
             Health::Idle
@@ -166,7 +165,7 @@ impl<'a> Status<'a> {
         }
     }
 
-    /// How long things took since the start.
+    /// The latencies since the start.
     pub fn latency(&self) -> &'a Latency {
         self.latency
     }
@@ -176,7 +175,7 @@ impl<'a> Status<'a> {
         self.sleeps
     }
 
-    /// The field port that sends an input variable.
+    /// The field port that owns an input variable.
     fn owner(&self, var: SysVar) -> Option<&'a str> {
         if var.direction() != Direction::Input {
             return None;

@@ -1,4 +1,4 @@
-//! A [`Status`] as an object: what statistics, an API and a metrics page are made of.
+//! Serializes a [`Status`] as an object, for statistics, an API and a metrics page.
 //!
 //! ```text
 //! { "time_us", "sleeps",
@@ -10,7 +10,7 @@
 //!   "latency" }
 //! ```
 //!
-//! What is unknown is absent. Ages are in milliseconds, times in microseconds.
+//! Unknown values are absent. Ages are in milliseconds, times in microseconds.
 
 use core::fmt;
 
@@ -35,7 +35,7 @@ impl<K: Serialize, V: Serialize, I: Iterator<Item = (K, V)>, F: Fn() -> I> Seria
     }
 }
 
-/// Something as the text that it displays.
+/// A value as the text that it displays.
 struct Text<T>(T);
 
 impl<T: fmt::Display> Serialize for Text<T> {
@@ -57,7 +57,7 @@ impl fmt::Display for Hex<'_> {
     }
 }
 
-/// A rejection, seen at an instant.
+/// A rejection, with the instant of the status.
 struct Rejected<'a>(&'a LastRejection, Instant);
 
 impl Serialize for Rejected<'_> {
@@ -92,7 +92,7 @@ impl Serialize for Status<'_> {
     }
 }
 
-/// A part of a status with its instant.
+/// A part of a status, with the instant of the status.
 struct At<T>(T, Instant);
 
 impl Serialize for At<PortStatus<'_>> {

@@ -1,5 +1,5 @@
-//! What the ports and links of one engine share: the image, the outbox, and for each field frame
-//! when it is overdue.
+//! The state that the ports and links of one engine share: the image, the outbox, and for each
+//! field frame when it is overdue.
 
 use heapless::Vec;
 
@@ -11,25 +11,26 @@ use crate::image::{GroupId, Image, InputSet};
 use crate::sysvar::SysVar;
 use crate::time::{Duration, Instant, Stamp};
 
-/// Input frames over all field ports: a stream recipe has one, a CAN recipe one an id.
+/// Maximum number of input frames over all field ports: a stream recipe has one, a CAN recipe one
+/// per id.
 pub const MAX_INPUT_FRAMES: usize = 48;
 
-/// One frame that a device sends.
+/// One input frame of a device.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct InputFrame {
     /// The variables it carries.
     pub set: InputSet,
-    /// The port's place in the engine.
+    /// Index of the port in the engine.
     pub port: u8,
     /// Its range of the user-defined bindings.
     pub bindings: Span,
-    /// When it is overdue; [`Instant::NEVER`] before the first one and after it was.
+    /// When it is overdue; [`Instant::NEVER`] before the first one, and after it was overdue.
     pub overdue_at: Instant,
-    /// How long it may take.
+    /// Its timeout.
     pub timeout: Duration,
 }
 
-/// A safe value as it stands in the image.
+/// A safe value in the form of the image.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct SafeBytes {
     var: SysVar,
@@ -39,7 +40,7 @@ pub(super) struct SafeBytes {
 impl SafeBytes {
     pub(super) fn new(safe: &SafeValue) -> Self {
         let mut bytes = [0; 4];
-        // Every variable has at most four bytes, and validation saw to the type.
+        // Every variable has at most four bytes, and validation has checked the type.
         safe.value.encode(&mut bytes);
         Self { var: safe.var, bytes }
     }
@@ -50,37 +51,37 @@ pub(super) struct Store<const PORTS: usize> {
     pub latency: Latency,
     /// The instant of this call of the engine.
     pub now: Instant,
-    /// Some port sends on a rising bit: the engine looks at the image after each frame, however many
-    /// came at once.
+    /// Some port sends on a rising bit, so the engine checks the image after each frame, even if
+    /// several came at once.
     pub watches_bits: bool,
     pub image: Image,
     pub outbox: Outbox,
-    /// One queue a field port.
+    /// One queue per field port.
     pub edges: Vec<EdgeQueue, PORTS>,
     /// Their indices are the frames' groups in the image.
     pub frames: Vec<InputFrame, MAX_INPUT_FRAMES>,
-    /// Variables whose value is their owner's: received in time, or configured as safe.
+    /// Variables with a value of their owner: received in time, or configured as safe.
     pub live: InputSet,
-    /// Variables that have stood at their safe value since their owner fell silent.
+    /// Variables at their safe value since their owner fell silent.
     pub safe: InputSet,
     /// Those of them that the controller is not known to have.
     pub unconfirmed: InputSet,
-    /// When one of them became so last, and when one was confirmed.
+    /// When the newest of them was added, and when the newest was confirmed.
     pub unconfirmed_since: Instant,
     confirmed_at: Instant,
-    /// Variables that recipe links write, which answer nothing.
+    /// Variables written through recipe links, which do not answer.
     pub unanswered: InputSet,
-    /// Variables that the state stream has brought since their owner fell silent, or ever.
+    /// Variables that the state stream has brought since their owner fell silent, or at all.
     pub read_back: InputSet,
     /// Variables whose owner fell silent before its last value was handed over.
     pub unsent: InputSet,
-    /// When anything that the controller sends steadily came last: a state packet, a recipe link's frame.
+    /// When the newest state packet or recipe frame came, which the controller sends steadily.
     heard_at: Option<Instant>,
-    /// How often it came after a gap, wrapping: another controller may have been there before.
+    /// Number of gaps in these, wrapping: the controller may have restarted in each.
     pub era: u32,
     /// Variables whose link is up.
     pub reachable: InputSet,
-    /// Values dropped with a link, a port.
+    /// Values dropped because a link was lost, per port.
     lost: [u32; PORTS],
     has_lost: bool,
     /// No frame is overdue before this.
@@ -117,7 +118,7 @@ impl<const PORTS: usize> Store<PORTS> {
         }
     }
 
-    /// The values of an accepted frame stand in the image: they are to be written. Returns those
+    /// The values of an accepted frame are in the image: they are to be written. Returns those
     /// whose link is up.
     pub(super) fn accepted(&mut self, nth: usize, counters: &mut PortCounters) -> InputSet {
         let now = self.now;
@@ -130,7 +131,7 @@ impl<const PORTS: usize> Store<PORTS> {
         self.image.stamp(GroupId(nth as u8), now);
         self.live = self.live.or(&set);
         if !self.safe.and(&set).is_empty() {
-            // Safe values that still wait grow old from now on, and may be too old already.
+            // Waiting safe values begin to age now, and may have expired already.
             self.next_expiry = Stamp::at(now);
             self.safe = self.safe.minus(&set);
             self.unconfirmed = self.unconfirmed.minus(&set);
@@ -139,7 +140,7 @@ impl<const PORTS: usize> Store<PORTS> {
         let Some(queue) = self.edges.get_mut(port) else { return InputSet::EMPTY };
         if reachable != set {
             bump(&mut counters.undelivered);
-            // A safe value that waits for the link is overtaken: its owner is back.
+            // A safe value that waits for the link is replaced: its owner is back.
             self.outbox.forget(queue, &set.minus(&reachable));
         }
         self.outbox.offer_analog(&reachable.minus(&InputSet::BYTES));
@@ -150,8 +151,8 @@ impl<const PORTS: usize> Store<PORTS> {
         reachable
     }
 
-    /// The first frame that is overdue, with its variables set to their safe values, and how
-    /// many values that still waited were dropped; call again until `None`.
+    /// Handles the first overdue frame: sets its variables to their safe values. Returns the frame
+    /// and how many waiting values were dropped. Call it again until `None`.
     pub(super) fn next_timeout(&mut self, safe: &[SafeBytes]) -> Option<(InputFrame, usize)> {
         let now = self.now;
         if now < self.next_overdue.get() {
@@ -190,7 +191,7 @@ impl<const PORTS: usize> Store<PORTS> {
         Some((frame, dropped))
     }
 
-    /// Drops what has waited for longer than its port's timeout and counts it there.
+    /// Drops values that have waited for longer than their port's timeout, and counts them there.
     pub(super) fn expire_waiting(&mut self, mut count: impl FnMut(usize, usize)) {
         let now = self.now;
         if now < self.next_expiry.get() {
@@ -214,26 +215,26 @@ impl<const PORTS: usize> Store<PORTS> {
         }
     }
 
-    /// When something happens by itself.
+    /// When something happens without an input.
     pub(super) fn deadline(&self) -> Instant {
         self.next_overdue.get().min(self.next_expiry.get())
     }
 
-    /// What has waited since `born` has been handed over.
+    /// A value that has waited since `born` has been handed over.
     pub(super) fn handed_over(&mut self, born: Instant) {
         if born <= self.now {
             self.latency.handed_over.record(self.now.saturating_since(born));
         }
     }
 
-    /// What has waited since `born` has arrived.
+    /// A value that has waited since `born` has arrived.
     pub(super) fn arrived(&mut self, born: Instant) {
         if born <= self.now {
             self.latency.arrived.record(self.now.saturating_since(born));
         }
     }
 
-    /// These values have been handed to their link.
+    /// These values have been handed over to their link.
     pub(super) fn taken(&mut self, vars: &InputSet) {
         self.outbox.taken(vars);
         let bits = vars.and(&InputSet::BYTES);
@@ -244,12 +245,12 @@ impl<const PORTS: usize> Store<PORTS> {
         }
     }
 
-    /// A link came up: from now on frames are passed on to it. What was received before is not.
+    /// A link came up: from now on frames are passed on to it. Earlier ones are not.
     pub(super) fn link_up(&mut self, vars: &InputSet) {
         self.reachable = self.reachable.or(vars);
     }
 
-    /// A link was lost: nothing that waited for it is written later, safe values excepted.
+    /// A link was lost: waiting values are dropped, except safe values.
     pub(super) fn link_lost(&mut self, vars: &InputSet) {
         self.reachable = self.reachable.minus(vars);
         for frame in &self.frames {
@@ -263,17 +264,18 @@ impl<const PORTS: usize> Store<PORTS> {
         }
     }
 
-    /// How many values of each port were dropped because their link was lost, since the last call.
+    /// Number of values per port that were dropped because their link was lost, since the last
+    /// call.
     pub(super) fn take_lost(&mut self) -> Option<[u32; PORTS]> {
         core::mem::take(&mut self.has_lost).then(|| core::mem::replace(&mut self.lost, [0; PORTS]))
     }
 
-    /// A write of safe values came to nothing: they are written again, if they still stand.
+    /// A write of safe values failed: they are written again, if they are still current.
     pub(super) fn again(&mut self, safe: &InputSet) {
         self.outbox.again(&safe.and(&self.safe));
     }
 
-    /// The controller has these safe values, as far as they still stand.
+    /// The controller has these safe values, as far as they are still current.
     pub(super) fn confirm(&mut self, safe: &InputSet) {
         if !safe.and(&self.unconfirmed).and(&self.unanswered).is_empty() {
             self.confirmed_at = self.now;
@@ -281,13 +283,13 @@ impl<const PORTS: usize> Store<PORTS> {
         self.unconfirmed = self.unconfirmed.minus(safe);
     }
 
-    /// Whether another value than the safe one, shown now, can be what the controller had all along.
-    /// Later it is another master's doing.
+    /// Whether the controller can have had this other value all along. Later another master has
+    /// written it.
     pub(super) fn may_doubt(&self) -> bool {
         self.now < self.confirmed_at + DOUBT
     }
 
-    /// Outputs that came just now show another value than the safe one.
+    /// Outputs that have just arrived show another value than the safe one.
     pub(super) fn doubt_by_witnesses(&mut self) {
         if !self.may_doubt() {
             return;
@@ -310,7 +312,7 @@ impl<const PORTS: usize> Store<PORTS> {
         }
     }
 
-    /// Something came that the controller sends steadily.
+    /// A state packet or a recipe frame came, which the controller sends steadily.
     pub(super) fn heard(&mut self) {
         if !self.is_heard() {
             self.era = self.era.wrapping_add(1);
@@ -318,24 +320,25 @@ impl<const PORTS: usize> Store<PORTS> {
         self.heard_at = Some(self.now);
     }
 
-    /// Whether the controller has been there all the time since the era began.
+    /// Whether the controller has been there without a gap since the era began.
     pub(super) fn is_heard(&self) -> bool {
         !is_gap(self.heard_at, self.now)
     }
 
-    /// The controller may have started anew: safe values are written once more.
+    /// The controller may have restarted: safe values are written once more.
     pub(super) fn controller_was_away(&mut self) {
         self.unconfirmed = self.safe;
         self.unconfirmed_since = self.now;
         self.outbox.again(&self.safe);
     }
 
-    /// Whether what the controller shows now can be what it made of the safe values, and not older.
+    /// Whether a value that the controller shows now can be the result of the safe values, and not
+    /// older.
     pub(super) fn may_confirm(&self) -> bool {
         !self.unconfirmed.is_empty() && self.now >= self.unconfirmed_since + SHOWN_AFTER
     }
 
-    /// Outputs that show what an input was set to have come: they may confirm safe values.
+    /// Outputs that show input variables have arrived: they may confirm safe values.
     pub(super) fn confirm_by_witnesses(&mut self) {
         if !self.may_confirm() {
             return;
@@ -352,20 +355,21 @@ impl<const PORTS: usize> Store<PORTS> {
     }
 }
 
-/// What the controller shows this soon may be older than the safe value.
+/// A value shown sooner than this may be older than the safe value.
 const SHOWN_AFTER: Duration = Duration::from_millis(200);
-/// For so long a packet of the state stream may come late: one that is silent for 2 s is reopened.
+/// A packet of the state stream may be this late: a stream that is silent for 2 s is reopened.
 const DOUBT: Duration = Duration::from_secs(3);
 
-/// What the controller sends steadily and has not sent for so long: it may have been away since.
+/// After this long without a state packet or recipe frame the controller may have restarted.
 const AWAY_AFTER: Duration = Duration::from_millis(500);
 
-/// Whether what came last is so long ago, or nothing ever did, that the controller may be another by now.
+/// Whether the newest packet or frame is so old, or none ever came, that the controller may have
+/// restarted.
 pub(super) fn is_gap(last: Option<Instant>, now: Instant) -> bool {
     last.is_none_or(|at| now.saturating_since(at) > AWAY_AFTER)
 }
 
-/// When a value that waits since `at` has waited longer than `timeout`.
+/// When a value that has waited since `at` has waited longer than `timeout`.
 fn too_old_at(at: Instant, timeout: Duration) -> Instant {
     at + timeout + Duration::from_micros(1)
 }

@@ -1,18 +1,18 @@
-//! What goes over ports and links, for whoever listens: a trace, a capture, a page.
+//! A tap on ports and links, for a trace, a capture or a page.
 //!
-//! In: frames and bytes with what became of them. Out: records, in order. The ring is bounded and
-//! lossy: what finds no room is counted, and the engine never waits for a reader. While nobody listens,
-//! it costs one branch.
+//! In: frames and bytes, and whether they were accepted. Out: records, in order. The ring is
+//! bounded and lossy: records without room are counted, and the engine never waits for a reader.
+//! While it does not listen, it costs one branch.
 
 use super::io::{LinkId, PortId};
 use super::rejection::Rejection;
 use crate::time::Instant;
 use crate::wire::can::CanId;
 
-/// Most bytes of one record; of what is longer the first are kept.
+/// Maximum number of bytes in a record; of longer data the first are kept.
 pub const MAX_TAPPED: usize = 1536;
 
-/// Where something went.
+/// The place of a record.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum TapPlace {
@@ -22,7 +22,7 @@ pub enum TapPlace {
     Link(LinkId),
 }
 
-/// Which way something went.
+/// The direction of a record.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum TapDirection {
@@ -32,58 +32,58 @@ pub enum TapDirection {
     Out,
 }
 
-/// What became of it.
+/// The verdict on a record.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
 pub enum TapVerdict {
-    /// A whole frame or datagram that was taken, or bytes that were handed over for sending.
+    /// A whole frame or datagram was accepted, or bytes were handed over for sending.
     Taken,
-    /// Bytes or a datagram of a link, as they came; answers, packets and frames are found in them.
+    /// Bytes or a datagram of a link, as received; answers, packets and frames are found in them.
     Link,
-    /// It was rejected whole.
+    /// It was rejected as a whole.
     Rejected(Rejection),
 }
 
-/// One thing that went over a port or link.
+/// One record: data that went over a port or link.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct TapRecord<'a> {
-    /// When it was told to the engine, or handed over.
+    /// When it was reported to the engine, or handed over.
     pub at: Instant,
-    /// Where.
+    /// The port or link.
     pub place: TapPlace,
-    /// Which way.
+    /// The direction.
     pub direction: TapDirection,
-    /// What became of it.
+    /// The verdict.
     pub verdict: TapVerdict,
     /// The frame's id on a CAN bus.
     pub can_id: Option<CanId>,
-    /// Its length in bytes; more than `bytes` has where that was cut to [`MAX_TAPPED`].
+    /// Length in bytes; more than in `bytes` if that was cut to [`MAX_TAPPED`].
     pub len: usize,
     /// The bytes.
     pub bytes: &'a [u8],
-    /// Records that were lost since the one before.
+    /// Number of records lost since the previous one.
     pub lost: u32,
 }
 
-/// The ring. `Tap<N>` holds `N` bytes: of each record its contents and [`TAP_OVERHEAD`] bytes more.
+/// The ring. `Tap<N>` has `N` bytes; each record takes its contents and [`TAP_OVERHEAD`] bytes.
 /// Without room for one record it never listens.
 #[derive(Debug, Clone)]
 pub struct Tap<const N: usize> {
     is_listening: bool,
-    /// Records lost since the newest that was kept.
+    /// Number of records lost since the newest that was kept.
     lost: u32,
-    /// Where the oldest record begins.
+    /// The beginning of the oldest record.
     start: usize,
     /// Bytes in use.
     used: usize,
     ring: [u8; N],
 }
 
-/// Bytes that a record takes beside its contents.
+/// Number of bytes that a record takes in addition to its contents.
 pub const TAP_OVERHEAD: usize = 23;
 
-/// What the engine tells.
+/// What the engine reports to the tap.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Tapped<'a> {
     pub at: Instant,
@@ -101,7 +101,7 @@ impl<const N: usize> Tap<N> {
         Self { is_listening: false, lost: 0, start: 0, used: 0, ring: [0; N] }
     }
 
-    /// Keeps a record if somebody listens.
+    /// Keeps a record if the tap listens.
     #[inline]
     pub(super) fn record<'a>(&mut self, what: impl FnOnce() -> Tapped<'a>) {
         if N > TAP_OVERHEAD && self.is_listening {
@@ -109,7 +109,7 @@ impl<const N: usize> Tap<N> {
         }
     }
 
-    /// Something is handed over for sending.
+    /// Data is handed over for sending.
     #[inline]
     pub(super) fn went(&mut self, place: TapPlace, can_id: Option<CanId>, bytes: &[u8], at: Instant) {
         let (direction, verdict) = (TapDirection::Out, TapVerdict::Taken);
@@ -123,7 +123,7 @@ impl<const N: usize> Tap<N> {
         self.record(|| Tapped { at, place, direction, verdict, can_id: None, pieces: [bytes, &[], &[]] });
     }
 
-    /// Begins or ends listening; either forgets what is in the ring.
+    /// Starts or stops listening; both clear the ring.
     pub fn listen(&mut self, listen: bool) {
         self.is_listening = listen && self.ring.len() > TAP_OVERHEAD;
         (self.lost, self.start, self.used) = (0, 0, 0);
@@ -134,8 +134,9 @@ impl<const N: usize> Tap<N> {
         self.is_listening
     }
 
-    /// The oldest record, which leaves the ring; its bytes are put into `room`, which should have
-    /// [`MAX_TAPPED`] bytes: of a longer record the first are returned. `None` when nothing waits.
+    /// Removes and returns the oldest record. Its bytes are written to `room`, which should have
+    /// [`MAX_TAPPED`] bytes: of a longer record the first are returned. `None` if there is no
+    /// record.
     pub fn next<'b>(&mut self, room: &'b mut [u8]) -> Option<TapRecord<'b>> {
         if self.used < TAP_OVERHEAD {
             return None;
@@ -211,7 +212,7 @@ impl<const N: usize> Tap<N> {
         }
     }
 
-    /// Puts bytes behind those that are there; there is room.
+    /// Appends bytes; there is room.
     fn push(&mut self, bytes: &[u8]) {
         let end = wrapped(self.start.saturating_add(self.used), N);
         let (before, behind) = self.ring.split_at_mut_checked(end).unwrap_or((&mut [], &mut []));
@@ -221,7 +222,7 @@ impl<const N: usize> Tap<N> {
         self.used = self.used.saturating_add(bytes.len());
     }
 
-    /// Takes the first bytes; they are there.
+    /// Removes the first bytes; they exist.
     fn pull(&mut self, into: &mut [u8]) {
         let (before, behind) = self.ring.split_at_checked(self.start).unwrap_or((&[], &[]));
         for (place, &byte) in into.iter_mut().zip(behind.iter().chain(before)) {
@@ -252,7 +253,7 @@ const IS_OUT: u8 = 2;
 const HAS_ID: u8 = 4;
 const IS_EXTENDED: u8 = 8;
 
-/// What a record has for its verdict: 0 taken, 1 from a link, and from 2 on why it was rejected.
+/// Code of a record's verdict: 0 accepted, 1 from a link, from 2 on the reason of a rejection.
 fn code_of(verdict: TapVerdict) -> u8 {
     match verdict {
         TapVerdict::Taken => 0,

@@ -1,7 +1,7 @@
 //! A recipe link: the controller's own recipe port, the fast way up and down.
 //!
-//! What goes up is whole frames, so every variable in them needs a value that somebody sent or
-//! that was read back (docs/engine.md section 5). What comes down goes into the image.
+//! Whole frames go up, so every variable in them needs a value that its owner sent or that was read
+//! back (docs/engine.md section 5). Frames that come down go into the image.
 
 use super::connection::Connection;
 use super::counters::{LinkCounters, add, bump};
@@ -18,25 +18,26 @@ use crate::recipe::{Deframer, datagram};
 use crate::sysvar::BIT_INPUT_COUNT;
 use crate::time::{Duration, Instant};
 
-/// How old a read-back value may be and still go into a frame.
+/// Maximum age of a value that was read back, to go into a frame.
 const READ_BACK_MAX_AGE: Duration = Duration::from_millis(500);
-/// A safe value is sent again after this, until the controller shows it.
+/// Interval at which a safe value is sent again, until the controller shows it.
 const REPEAT_EVERY: Duration = Duration::from_millis(4);
-/// The same where nothing can show it, after [`REPEAT_FAST`].
+/// The same if nothing can show it, after [`REPEAT_FAST`].
 const REPEAT_SLOWLY: Duration = Duration::from_millis(100);
 const REPEAT_FAST: Duration = Duration::from_secs(1);
-/// Frames that the peer's transport has not acknowledged: what is sent in 250 ms, every 4 ms.
+/// Maximum number of unacknowledged frames: those of 250 ms, one every 4 ms.
 const MOST_UNACKNOWLEDGED: usize = 64;
-/// The UDP server streams to whoever sent it something (D24); asked again when nothing comes.
+/// Interval of greetings without frames: the UDP server streams to everybody who has sent it
+/// something (D24).
 const GREET_EVERY: Duration = Duration::from_millis(500);
-/// The server may forget whom it has not heard for 60 s (D30).
+/// The server may forget a client that was silent for 60 s (D30).
 const SPEAK_EVERY: Duration = Duration::from_secs(20);
 
 #[derive(Debug, Clone)]
 pub(super) struct Uplink {
     pub id: LinkId,
     pub kind: LinkKind,
-    /// Of a listening port, its name in the configuration.
+    /// The name in the configuration of a listening port.
     pub name: Option<Name>,
     pub transport: Transport,
     pub supervisor: Supervisor,
@@ -47,29 +48,30 @@ pub(super) struct Uplink {
     deframer: Deframer,
     /// Variables in the frames up.
     set: InputSet,
-    /// Those of them that are to be written here: a frame is sent for their sake.
+    /// Those of them that are written here: a frame is sent when one has a new value.
     pub writes: InputSet,
-    /// What the frames down bring.
+    /// The contents of the frames down.
     pub group: Option<GroupId>,
-    /// Of those that are written here, variables that something would show if the controller had them.
+    /// Of the variables written here, those for which something shows the controller's value.
     pub shown: InputSet,
-    /// Since when a value that a field frame brought waits to be handed over; [`Instant::NEVER`] if none
-    /// does.
+    /// Since when a value from a field frame has waited to be handed over; [`Instant::NEVER`] if
+    /// none waits.
     pub offered_at: Instant,
-    /// How long a frame may take to be acknowledged.
+    /// The time in which a frame must be acknowledged.
     patience: Duration,
     busy: bool,
     flight: Flight<MOST_UNACKNOWLEDGED>,
     greet_at: Instant,
-    /// When the controller would forget who it streams to (D30).
+    /// When the controller may forget the gateway (D30).
     speak_at: Instant,
     /// When safe values are sent again.
     repeat_at: Instant,
-    /// When a frame was handed over last since the link came up, and in which era of the controller's.
+    /// When the newest frame since the link came up was handed over, and in which era of the
+    /// controller.
     handed_over: Option<(Instant, u32)>,
 }
 
-/// What the configuration makes of a recipe link.
+/// The configuration of a recipe link, compiled.
 pub(super) struct UplinkSetup {
     pub id: LinkId,
     pub kind: LinkKind,
@@ -78,7 +80,7 @@ pub(super) struct UplinkSetup {
     pub timings: LinkTimings,
     pub input: Option<StreamLayout>,
     pub output: Option<StreamLayout>,
-    /// Variables in the frames up, and those of them that are to be written here.
+    /// Variables in the frames up, and those of them that are written here.
     pub set: InputSet,
     pub writes: InputSet,
     pub group: Option<GroupId>,
@@ -119,7 +121,7 @@ impl Uplink {
         }
     }
 
-    /// What can be sent now: a frame with new values, or a greeting.
+    /// The next output: a frame with new values, or a greeting.
     pub(super) fn next_frame<const PORTS: usize>(
         &mut self,
         store: &mut Store<PORTS>,
@@ -139,7 +141,7 @@ impl Uplink {
         self.send(wanted, store, state, out)
     }
 
-    /// The same, where there is something to say. Mostly there is not: what asks stays short without it.
+    /// The same, if there is something to send. Mostly there is not: so the check stays short.
     #[inline(never)]
     fn send<const PORTS: usize>(
         &mut self,
@@ -186,12 +188,13 @@ impl Uplink {
         self.output.as_ref().is_some_and(|layout| datagram(layout, bytes).is_ok())
     }
 
-    /// When the link has something to say that is no frame.
+    /// When a greeting is due.
     fn speaks_at(&self) -> Instant {
         self.greet_at.min(self.speak_at)
     }
 
-    /// Whether every variable of the frame has a value that somebody sent or that was just read.
+    /// Whether every variable of the frame has a value that its owner sent or that was just read
+    /// back.
     pub(super) fn is_ready<const PORTS: usize>(&self, store: &Store<PORTS>, state: Option<GroupId>) -> bool {
         let others = self.set.minus(&store.live);
         if others.is_empty() {
@@ -200,7 +203,8 @@ impl Uplink {
         let read_back = state
             .and_then(|group| store.image.stamp_of(group))
             .is_some_and(|at| store.now.saturating_since(at) <= READ_BACK_MAX_AGE);
-        // Without a connection, only what comes down tells that the controller has been there all along.
+        // Without a connection, only frames that come down show that the controller has been there
+        // all along.
         let is_there = |era| self.framing == Framing::Bytes || era == store.era && store.is_heard();
         let since = self.handed_over.filter(|&(_, era)| is_there(era)).map(|(at, _)| at);
         others.iter().all(|var| match var.stream() {
@@ -213,7 +217,7 @@ impl Uplink {
         })
     }
 
-    /// Whether the controller has to be asked for its frames.
+    /// Whether the controller must be asked for its frames.
     fn greets(&self) -> bool {
         self.kind == LinkKind::RecipeUdp && self.output.is_some()
     }
@@ -331,13 +335,13 @@ impl Connection for Uplink {
     }
 }
 
-/// Whether a safe value has only just become one that the controller is not known to have.
+/// Whether a safe value has just become one that the controller is not known to have.
 fn is_new<const PORTS: usize>(store: &Store<PORTS>) -> bool {
     store.now.saturating_since(store.unconfirmed_since) < REPEAT_FAST
 }
 
-/// Puts a frame into the image. What is not finite makes its variable unknown, the rest counts;
-/// returns how many were not.
+/// Writes a frame into the image. A value that is not finite makes its variable unknown; the others
+/// are used. Returns the number of such values.
 #[inline(never)]
 fn take_frame(layout: &StreamLayout, payload: &[u8], image: &mut Image) -> usize {
     let system = |field: PlacedField| match field.field {
@@ -353,7 +357,7 @@ fn take_frame(layout: &StreamLayout, payload: &[u8], image: &mut Image) -> usize
     values.fold(0, |sum: usize, (var, value)| sum.saturating_add(usize::from(!image.receive(var, value))))
 }
 
-/// The frame with byte variables as they are to be written next, not as they were received last.
+/// The frame, with byte variables as they are written next, not as they were received last.
 fn encode<const PORTS: usize>(
     layout: &StreamLayout,
     store: &mut Store<PORTS>,

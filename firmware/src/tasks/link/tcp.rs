@@ -37,16 +37,17 @@ impl Driver<'_> {
                 let _ = with_timeout(FAREWELL, farewell).await;
             }
         }
-        // What was not acknowledged must not be delivered later, after newer values: from here on nothing
-        // but the reset is sent. And the peer must not go on believing in a connection that is gone.
+        // Unacknowledged data must not be delivered later, after newer values: from here on only
+        // the reset is sent. The peer must not keep a connection that is gone.
         socket.abort();
         let _ = with_timeout(FAREWELL, socket.flush()).await;
     }
 
-    /// Waits for a connection of the controller. All others are turned away: what comes here is believed.
+    /// Waits for a connection of the controller. Others are refused, because data on this link is
+    /// trusted.
     async fn accept(&self, socket: &mut TcpSocket<'_>, port: u16, controller: IpAddress) -> bool {
         loop {
-            // Who begins a connection and never completes it must not keep the only socket.
+            // A peer that begins a connection and never completes it must not keep the only socket.
             socket.set_keep_alive(None);
             socket.set_timeout(Some(HANDSHAKE));
             if socket.accept(port).await.is_err() {
@@ -71,7 +72,7 @@ impl Driver<'_> {
     async fn exchange(&self, turn: u32, socket: &mut TcpSocket<'_>, chunk: &mut [u8]) {
         let (reader, writer) = socket.split();
         let outgoing = Outgoing { writer: RefCell::new(writer), held: Cell::new(0) };
-        // Reading is first: after an error nothing is told of what was acknowledged.
+        // Reading comes first: after an error nothing is known about acknowledgements.
         let reading = self.read(turn, reader, &outgoing, chunk);
         let writing = self.write(turn, &outgoing);
         let looking = self.look(turn, &outgoing);
@@ -106,10 +107,10 @@ impl Driver<'_> {
         }
     }
 
-    /// Tells the engine what was acknowledged, as long as something is to be.
+    /// Reports acknowledgements to the engine while something is unacknowledged.
     async fn look(&self, turn: u32, outgoing: &Outgoing<'_>) {
         loop {
-            // Nobody has to be woken for it: what is handed over wakes this task.
+            // No wake-up is needed: data that is handed over wakes this task.
             poll_fn(|_| if self.control.unacknowledged() > 0 { Poll::Ready(()) } else { Poll::Pending })
                 .await;
             Timer::after(LOOK).await;
@@ -119,7 +120,8 @@ impl Driver<'_> {
         }
     }
 
-    /// Tells the engine what the peer has not acknowledged, if it is news; whether the turn goes on.
+    /// Reports unacknowledged bytes to the engine if their number has changed; returns whether the
+    /// turn goes on.
     fn tell_acknowledged(&self, turn: u32, outgoing: &Outgoing<'_>) -> bool {
         if !self.control.is_turn(turn) {
             return false;
@@ -131,7 +133,7 @@ impl Driver<'_> {
     }
 }
 
-/// What is on its way to the peer.
+/// Data on its way to the peer.
 struct Outgoing<'a> {
     writer: RefCell<TcpWriter<'a>>,
     /// Bytes for which the socket had no room yet.
@@ -139,8 +141,8 @@ struct Outgoing<'a> {
 }
 
 impl Outgoing<'_> {
-    /// Waits until the socket takes some of the bytes; `None` when it is closed. The socket can be looked
-    /// at meanwhile.
+    /// Waits until the socket takes some of the bytes; `None` if it is closed. The socket can be
+    /// used meanwhile.
     async fn write(&self, bytes: &[u8]) -> Option<usize> {
         poll_fn(|cx| pin!(self.writer.borrow_mut().write(bytes)).poll(cx)).await.ok()
     }
@@ -151,13 +153,13 @@ impl Outgoing<'_> {
     }
 }
 
-/// Between two looks at what was acknowledged.
+/// Interval of reading the acknowledgements.
 const LOOK: Duration = Duration::from_millis(10);
 /// How long a connection may take to come about at a listening socket.
 const HANDSHAKE: Duration = Duration::from_secs(2);
-/// Between two questions whether the controller's client is still there.
+/// Interval of keep-alives to the controller's client.
 const PROBE: Duration = Duration::from_secs(5);
-/// How long it may leave them without an answer.
+/// How long they may be unanswered.
 const VANISHED: Duration = Duration::from_secs(20);
-/// How long a closing socket is waited for.
+/// How long to wait for a closing socket.
 const FAREWELL: Duration = Duration::from_millis(100);

@@ -12,7 +12,8 @@ use proto_core::engine::Input;
 use super::{Buffers, Driver, Way, resolve};
 
 impl Driver<'_> {
-    /// Datagrams both ways; of a listening socket, answers where the controller sent a frame from last.
+    /// Datagrams both ways; on a listening socket, answers go to the sender of the controller's
+    /// newest frame.
     pub(super) async fn udp(&self, turn: u32, controller: &str, way: Way, buffers: &mut Buffers<'_>) {
         let mut received = [PacketMetadata::EMPTY; DATAGRAMS];
         // One at a time, so that it is known when it has left.
@@ -47,7 +48,7 @@ impl Driver<'_> {
             };
             match after {
                 After::TheEnd => return,
-                // The peer is not found on the network. What waits for it would be delivered when it is
+                // The peer is not found on the network. Waiting data would be delivered when it is
                 // there again, however old it is then.
                 After::Stuck => {
                     socket.close();
@@ -69,7 +70,7 @@ impl Driver<'_> {
         chunk: &mut [u8],
     ) {
         loop {
-            // A datagram that is too long for any frame is none of ours.
+            // A datagram that is too long for any frame is dropped.
             let Ok((len, from)) = socket.recv_from(chunk).await else { continue };
             let from = from.endpoint;
             let bytes = chunk.get(..len).unwrap_or(&[]);
@@ -89,7 +90,7 @@ impl Driver<'_> {
                         return;
                     }
                 }
-                // Whatever else the controller's host sends does not draw the frames away from its client.
+                // Other datagrams of the controller's host do not redirect the answers.
                 (None, Some(_)) if self.gateway.is_frame(self.link, bytes) => peer.set(Some(from)),
                 (None, Some(_)) => {}
             }
@@ -124,11 +125,11 @@ impl Driver<'_> {
 enum After {
     /// The turn is over, or the socket is of no use.
     TheEnd,
-    /// A datagram does not leave.
+    /// A datagram cannot be sent.
     Stuck,
 }
 
 /// Datagrams that wait to be read.
 const DATAGRAMS: usize = 8;
-/// How old a datagram may leave: as old as a frame on TCP may be delivered.
+/// How old a datagram may be when it leaves: as old as a frame on TCP may be when it is delivered.
 const STUCK: Duration = Duration::from_millis(250);

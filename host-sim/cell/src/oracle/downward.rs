@@ -1,4 +1,4 @@
-//! What each field port has to send, and when (proto-core/docs/engine.md section 8).
+//! What each field port must send, and when (proto-core/docs/engine.md section 8).
 
 use proto_core::config::{FieldSpec, OutputBinding, SendOn};
 use proto_core::sysvar::SysVar;
@@ -15,12 +15,12 @@ use super::upward::{Upward, Wrong};
 pub(super) struct Downward {
     pub is_up: bool,
     pub is_bus_off: bool,
-    /// A frame is to be sent as soon as the line is ours.
+    /// A frame is to be sent as soon as the line is free.
     pub due: bool,
     in_flight: bool,
     /// The next CAN frame of a cycle that has begun.
     next_can: usize,
-    /// The newest point of the grid that was seen.
+    /// The newest point of the grid so far.
     slot: Option<u64>,
     next_slot_at: Instant,
     /// The newest cycle's bytes, for a port that sends changes.
@@ -46,7 +46,7 @@ impl Downward {
         self.due && !self.in_flight && self.is_usable() && now >= self.heard + port.turnaround
     }
 
-    /// The line is silent enough and a frame waits: when that will be so.
+    /// When the line will be silent for long enough, if a frame waits.
     pub(super) fn raise(&mut self) {
         if self.due {
             self.skipped = self.skipped.wrapping_add(1);
@@ -54,7 +54,7 @@ impl Downward {
         self.due = true;
     }
 
-    /// Points of the grid that have gone by.
+    /// Points of the grid that have passed.
     pub(super) fn tick(&mut self, port: &PortSheet, now: Instant) {
         if port.outputs.is_empty() || !matches!(port.send, SendOn::Period | SendOn::Change) {
             return;
@@ -64,7 +64,7 @@ impl Downward {
         }
         let slot = now.as_micros() / port.cycle.as_micros();
         self.next_slot_at = Instant::from_micros((slot + 1) * port.cycle.as_micros());
-        // The first look finds a point of the grid behind it.
+        // The first call finds a past point of the grid.
         let before = self.slot.replace(slot).unwrap_or(slot.saturating_sub(1));
         if slot == before || !self.is_usable() {
             return;
@@ -87,14 +87,14 @@ impl Downward {
         self.in_flight = false;
     }
 
-    /// The gateway slept: what was due then is not sent now, but what was handed over is under way.
+    /// The gateway slept: due frames are dropped, but frames that were handed over are in flight.
     pub(super) fn slept(&mut self) {
         let in_flight = self.in_flight;
         self.reset();
         self.in_flight = in_flight;
     }
 
-    /// So many input frames were accepted at once.
+    /// This many input frames were accepted at once.
     pub(super) fn answered(&mut self, port: &PortSheet, frames: u32) {
         if port.send == SendOn::Frame && self.is_usable() && !port.outputs.is_empty() {
             (0..frames).for_each(|_| self.raise());
@@ -112,7 +112,7 @@ impl Downward {
         self.last_bit = Some(on);
     }
 
-    /// Whether all that the port shows is known and, where it matters, young.
+    /// Whether all values of the port are known and, where it matters, fresh.
     fn may_show(&self, sheet: &Sheet, port: &PortSheet, up: &Upward, now: Instant) -> Result<(), Wrong> {
         let trigger = match port.send {
             SendOn::Rising { var, .. } => Some(var),
@@ -121,7 +121,7 @@ impl Downward {
         let fields = port.outputs.iter().flat_map(|frame| &frame.fields).filter_map(shown);
         for var in fields.chain(trigger) {
             if up.known(var).unreadable {
-                return Err((Invariant::Unreadable, format!("{var} cannot be read")));
+                return Err((Invariant::Unreadable, format!("{var} is unreadable")));
             }
             let Some((_, at)) = up.known(var).value else {
                 return Err((Invariant::Known, format!("{var} was never received")));
@@ -151,10 +151,10 @@ impl Downward {
             return Err((Invariant::Line, "sent while the device was gone".to_owned()));
         }
         if self.in_flight {
-            return Err((Invariant::Line, "sent before the frame before had left".to_owned()));
+            return Err((Invariant::Line, "sent before the previous frame had left".to_owned()));
         }
         if now < self.heard + port.turnaround {
-            return Err((Invariant::Line, "sent before the line had been silent long enough".to_owned()));
+            return Err((Invariant::Line, "sent before the line was silent for long enough".to_owned()));
         }
         if !self.due {
             return Err((Invariant::Cycle, "sent without a cycle, a request or a trigger for it".to_owned()));
@@ -174,7 +174,7 @@ impl Downward {
         }
         let shown = frame.payload_of(bytes);
         let Some(shown) = shown.filter(|shown| self.agrees(frame, up, shown)) else {
-            return Err((Invariant::Shown, "the frame is not what was received last".to_owned()));
+            return Err((Invariant::Shown, "the frame does not have the newest values".to_owned()));
         };
         self.begun.extend_from_slice(shown);
         self.frames_out = self.frames_out.wrapping_add(1);
@@ -195,7 +195,7 @@ impl Downward {
         Ok(())
     }
 
-    /// The engine has nothing more to do: nothing that could be sent is left.
+    /// The engine has nothing more to do: nothing that could be sent may be left.
     pub(super) fn rest(&mut self, sheet: &Sheet, nth: usize, up: &Upward, now: Instant) -> Result<(), Wrong> {
         let port = &sheet.ports[nth];
         if !self.may_send(port, now) {
@@ -216,7 +216,7 @@ impl Downward {
             self.due = false;
             return Ok(());
         }
-        Err((Invariant::Cycle, "a frame that was due, and could be sent, was not".to_owned()))
+        Err((Invariant::Cycle, "a frame was due and could be sent, but was not".to_owned()))
     }
 
     fn is_same(&self, port: &PortSheet, up: &Upward, newest: &[u8]) -> bool {
@@ -228,7 +228,7 @@ impl Downward {
         })
     }
 
-    /// Whether the fields' bytes are the values known now.
+    /// Whether the fields' bytes are the present values.
     fn agrees(&self, frame: &Frame, up: &Upward, payload: &[u8]) -> bool {
         let mut rest = payload;
         frame.fields.iter().all(|field| {
@@ -245,14 +245,14 @@ impl Downward {
             rest = after;
             match (number, field) {
                 (Some(number), _) => field_bytes(ty, number)[..ty.size()] == *value,
-                // How a command went is looked at elsewhere.
+                // The result of a command is checked elsewhere.
                 (None, FieldSpec::UserOutput { from: OutputBinding::Reply, .. }) => true,
                 (None, _) => false,
             }
         })
     }
 
-    /// What a bound field shows, before it is made to fit.
+    /// The value of a bound field, before it is made to fit.
     fn number(&self, up: &Upward, ty: ScalarType, from: OutputBinding) -> Option<f64> {
         match from {
             OutputBinding::Variable { var, scale, offset } => {

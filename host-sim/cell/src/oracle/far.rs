@@ -1,4 +1,4 @@
-//! The far end: what reaches the controller, and what it does with it.
+//! The far end: what reaches the controller, and its effect.
 
 use proto_core::engine::LinkId;
 use proto_core::sysvar::SysVar;
@@ -48,7 +48,7 @@ impl Oracle {
         self.registers(before, &expected, after, now);
     }
 
-    /// The same of a datagram.
+    /// Same, for a datagram.
     pub(crate) fn arrived_datagram(
         &mut self,
         link: LinkId,
@@ -71,12 +71,12 @@ impl Oracle {
         self.registers(before, &expected, after, now);
     }
 
-    /// Whole, or, when the controller refuses, not at all.
+    /// As a whole or, if the controller refuses it, not at all.
     fn registers(&mut self, before: &[u8], expected: &[u8], after: &[u8], now: Instant) {
         let result = if after == expected || after == before {
             Ok(())
         } else {
-            Err((Invariant::Registers, "the controller's inputs are not what was written".to_owned()))
+            Err((Invariant::Registers, "the controller's inputs are not the values written".to_owned()))
         };
         self.judge(now, &[Invariant::Registers], result);
     }

@@ -1,5 +1,5 @@
-//! What the wire delivered to one field port, byte for byte: which of it are frames, and what they
-//! say. The slow way, straight from proto-core/docs/wire/recipes.md sections 4, 6 and 7.
+//! The frames in the bytes that the line delivered to one field port, and their values. Written the
+//! slow way, straight from proto-core/docs/wire/recipes.md sections 4, 6 and 7.
 
 use proto_core::config::{CommandWhen, FieldSpec, InputBinding, Span};
 use proto_core::recipe::model::Mode;
@@ -10,7 +10,7 @@ use proto_core::wire::scalar::{Scalar, ScalarType};
 
 use super::sheet::{Frame, PortSheet, Raw};
 
-/// What a frame says.
+/// The content of a frame.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Verdict {
     Accepted(Accepted),
@@ -26,11 +26,12 @@ pub(super) struct Accepted {
     pub values: Vec<(SysVar, Raw)>,
     /// Reserved bits were set.
     pub masked: bool,
-    /// Values of command fields: the field's place in the port, its table, when it acts.
+    /// Values of command fields: the field's place in the port, its table, and when it takes
+    /// effect.
     pub orders: Vec<(usize, Span, CommandWhen, i64)>,
 }
 
-/// Why a CAN frame is none of the recipe's.
+/// Why a CAN frame is not a frame of the recipe.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Refused {
     Remote,
@@ -38,7 +39,7 @@ pub(super) enum Refused {
     Length,
 }
 
-/// Bytes of a line that are not judged yet.
+/// Bytes of a line that are not checked yet.
 #[derive(Debug, Clone, Default)]
 pub(super) struct LineWatch {
     pub held: Vec<u8>,
@@ -70,7 +71,7 @@ impl LineWatch {
         self.cut(frame).iter().map(|payload| judge(port.mode, frame, 0, payload)).collect()
     }
 
-    /// Takes whole frames off the held bytes; their fields' bytes.
+    /// Removes whole frames from the held bytes; returns the bytes of their fields.
     pub(super) fn cut(&mut self, frame: &Frame) -> Vec<Vec<u8>> {
         let mut found = Vec::new();
         let mut at = 0;
@@ -97,7 +98,7 @@ impl LineWatch {
     }
 }
 
-/// What a CAN frame says.
+/// The content of a CAN frame.
 pub(super) fn can(port: &PortSheet, received: &CanFrame) -> Result<Verdict, Refused> {
     if received.is_remote() {
         return Err(Refused::Remote);
@@ -151,7 +152,7 @@ fn judge(mode: Mode, frame: &Frame, nth: usize, payload: &[u8]) -> Verdict {
     if out_of_range { Verdict::OutOfRange } else { Verdict::Accepted(accepted) }
 }
 
-/// A number as a variable takes it: rounded, halves away from zero, or refused (D22).
+/// A number as a value of a variable: rounded, halves away from zero, or rejected (D22).
 fn bound(var: SysVar, value: f64) -> Option<Raw> {
     let mut raw = Raw::default();
     match var.ty() {
@@ -201,7 +202,7 @@ pub(super) fn as_number(var: SysVar, raw: Raw) -> f64 {
     read(var.ty(), &raw[..var.size()])
 }
 
-/// Raw bytes as people read them.
+/// Raw bytes in readable form.
 pub(super) fn show(var: SysVar, raw: Raw) -> String {
     let value = Scalar::decode(var.ty(), &raw);
     value.map_or_else(String::new, |value| value.to_string())

@@ -13,7 +13,7 @@ use super::wire::Asked;
 use super::{Invariant, LinkWatch, Oracle, PortWatch, place};
 
 impl Oracle {
-    /// Deadlines that pass.
+    /// Lets deadlines pass.
     pub(super) fn pass(&mut self, now: Instant) {
         let overdue = self.up.overdue(&self.sheet, now);
         for &(nth, frame) in &overdue {
@@ -35,7 +35,7 @@ impl Oracle {
         self.orders.tick(now);
     }
 
-    /// The gateway itself slept: nothing of what had begun is continued.
+    /// The gateway itself slept: nothing that had begun is continued.
     pub(super) fn slept(&mut self, now: Instant) {
         for watch in &mut self.ports {
             watch.down.slept();
@@ -50,7 +50,7 @@ impl Oracle {
         self.robot.no_longer_asked(|order| orders.is_asked(order), now);
     }
 
-    /// Links that the engine has given up by itself; those in `told` are its input's business.
+    /// Links that the engine has given up by itself; the input accounts for those in `told`.
     pub(super) fn look_at_links(&mut self, engine: &Engine, told: Option<LinkId>, now: Instant) {
         for link in engine.links() {
             let is_lost = !matches!(link.state, LinkState::Up { .. });
@@ -138,7 +138,7 @@ impl Oracle {
         }
     }
 
-    /// Frames that had waited while the gateway slept: they count for nothing.
+    /// Frames that had waited while the gateway slept: they are discarded.
     fn waited_in_sleep(&mut self, verdicts: Vec<Verdict>) {
         for verdict in verdicts {
             let Verdict::Accepted(frame) = verdict else { continue };
@@ -181,7 +181,7 @@ impl Oracle {
             self.up.accepted(&self.sheet, nth, &frame, now);
             self.values_changed();
             newest = Some(frame);
-            // Somebody looks at each frame, or nobody before all are taken.
+            // Either the image is checked after each frame, or after all of them.
             if self.sheet.has_triggers {
                 self.after_frames(now);
             }
@@ -201,7 +201,7 @@ impl Oracle {
         }
     }
 
-    /// What was overtaken is dropped, and what has waited too long.
+    /// Drops what was overtaken, and what has waited too long.
     fn after_frames(&mut self, now: Instant) {
         self.orders.drop_overtaken();
         self.up.expire(&self.sheet, now);
@@ -314,7 +314,7 @@ impl Oracle {
                 if std::mem::replace(&mut self.links[place(link)].busy, true) {
                     return Err((
                         Invariant::Line,
-                        "sent before the transport had taken the request before".to_owned(),
+                        "sent before the transport had taken the previous request".to_owned(),
                     ));
                 }
                 let asked = self.modbus.sent(&self.map, bytes, now)?;
@@ -353,7 +353,10 @@ impl Oracle {
 
     pub(super) fn recipe_send(&mut self, link: LinkId, bytes: &[u8], now: Instant) -> Result<(), Wrong> {
         if std::mem::replace(&mut self.links[place(link)].busy, true) {
-            return Err((Invariant::Line, "sent before the transport had taken the frame before".to_owned()));
+            return Err((
+                Invariant::Line,
+                "sent before the transport had taken the previous frame".to_owned(),
+            ));
         }
         let sheet = self.sheet.link(link).cloned();
         let found = sheet.as_ref().and_then(|sheet| {
@@ -363,7 +366,7 @@ impl Oracle {
         let Some((link_sheet, frame, payload)) = found else {
             // The greeting of the UDP server.
             let is_greeting = link == LinkId::RECIPE_UDP && bytes.len() <= 2 && bytes.iter().all(|&b| b == 0);
-            let wrong = (Invariant::Sent, "sent what is neither a frame nor a greeting".to_owned());
+            let wrong = (Invariant::Sent, "sent data that is neither a frame nor a greeting".to_owned());
             return if is_greeting { Ok(()) } else { Err(wrong) };
         };
         let mut rest = payload;
@@ -387,14 +390,14 @@ impl Oracle {
             }
         }
         if !wanted {
-            return Err((Invariant::Sent, "a frame that nobody's value waited for".to_owned()));
+            return Err((Invariant::Sent, "a frame although no value waited".to_owned()));
         }
         self.up.handed_over[place(link)] = Some((now, self.up.era));
         self.up.sent_frame(&self.sheet, link, now);
         Ok(())
     }
 
-    /// What could go to the controller now and does not.
+    /// Finds values that could be sent to the controller and are not.
     pub(super) fn nothing_waits(&mut self, now: Instant) -> Result<(), Wrong> {
         let mut left = self.up.waits;
         while left != 0 {
@@ -414,7 +417,7 @@ impl Oracle {
             };
             if is_free {
                 let var = SysVar::from_ordinal(nth).map_or_else(String::new, |var| var.to_string());
-                return Err((Invariant::Delivered, format!("{var} waits, and its link is free")));
+                return Err((Invariant::Delivered, format!("{var} waits although its link is free")));
             }
         }
         Ok(())
@@ -441,7 +444,7 @@ impl Oracle {
         expected.commands = orders.0;
         expected.commands_dropped = orders.1;
         if actual.timeouts > expected.timeouts {
-            let what = format!("port {nth} counted a timeout, and its device was not silent");
+            let what = format!("port {nth} counted a timeout although its device was not silent");
             return Err((Invariant::FalseTimeout, what));
         }
         if *actual != expected {
@@ -463,7 +466,7 @@ fn first_packet(line: &mut LineWatch) -> Option<Vec<u8>> {
 }
 
 const PACKET: usize = 1_468;
-/// After it slept, the gateway takes nothing from the field for so long.
+/// After sleep, the gateway discards input from the field for this long.
 const DEAF: Duration = Duration::from_millis(50);
-/// A safe value that the controller refused is written again after this.
+/// A safe value that the controller refused is written again after this time.
 const REFUSED_PAUSE: Duration = Duration::from_millis(500);

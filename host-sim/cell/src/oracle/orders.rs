@@ -1,5 +1,5 @@
-//! Commands that field values pick: once or not at all, and what stops the robot before everything
-//! else (proto-core/docs/engine.md section 7).
+//! Commands that field values pick: once or not at all, and urgent ones before everything else
+//! (proto-core/docs/engine.md section 7).
 
 use std::collections::{BTreeMap, VecDeque};
 
@@ -12,10 +12,10 @@ use super::field::Accepted;
 use super::sheet::Sheet;
 use super::upward::Wrong;
 
-/// Commands that can wait.
+/// Number of commands that can wait.
 const QUEUE: usize = 8;
-/// One that could not be sent within this time is dropped; an urgent one so long after nobody asks
-/// for it any more.
+/// A command that could not be sent within this time is dropped; an urgent one when it has not been
+/// asked for during this time.
 const TTL: Duration = Duration::from_secs(1);
 
 /// A command field: its port, frame and place.
@@ -29,19 +29,19 @@ pub(super) struct Order {
     pub text: String,
     /// When it was picked.
     pub picked: Instant,
-    /// Of an urgent one, since when nobody asks for it any more, or since when it waits again.
+    /// For an urgent one, since when it is not asked for any more, or since when it waits again.
     since: Instant,
 }
 
-/// What waits, what is unanswered, and what was counted.
+/// Commands that wait, commands that are unanswered, and counters.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Orders {
     queue: VecDeque<Order>,
     stops: Vec<Order>,
     unanswered: Vec<(LinkId, Order)>,
-    /// How many of the queue an urgent command has overtaken.
+    /// Number of waiting commands that an urgent command has overtaken.
     overtaken: usize,
-    /// The value of the frame before.
+    /// The value in the previous frame.
     base: BTreeMap<Place, i64>,
     /// Picked and dropped, by port.
     pub counted: [(u32, u32); MAX_PORTS],
@@ -61,7 +61,7 @@ impl Order {
 }
 
 impl Orders {
-    /// An accepted frame's values pick commands; those that stop the robot are told to `urgent`.
+    /// Values of an accepted frame pick commands; urgent ones are passed to `urgent`.
     pub(super) fn accepted(
         &mut self,
         sheet: &Sheet,
@@ -107,14 +107,15 @@ impl Orders {
         urgent
     }
 
-    /// What an urgent command has overtaken is dropped.
+    /// Drops commands that an urgent command has overtaken.
     pub(super) fn drop_overtaken(&mut self) {
         for _ in 0..std::mem::take(&mut self.overtaken) {
             self.drop_first();
         }
     }
 
-    /// After silence the next value only sets the base, and what waits for this device is dropped.
+    /// After silence the next value only sets the base, and this device's waiting commands are
+    /// dropped.
     pub(super) fn forget(&mut self, nth: usize, frame: Option<usize>, now: Instant) {
         let is_of = |place: &Place| place.0 == nth && frame.is_none_or(|frame| frame == place.1);
         let gone: Vec<Place> = self.base.keys().copied().filter(is_of).collect();
@@ -153,7 +154,7 @@ impl Orders {
         }
     }
 
-    /// A link is gone: what stops the robot waits again while somebody asks for it.
+    /// A link is gone: an urgent command waits again while it is asked for.
     pub(super) fn lost(&mut self, link: LinkId, now: Instant) {
         let gone: Vec<Order> =
             self.unanswered.iter().filter(|(on, _)| *on == link).map(|(_, order)| order.clone()).collect();
@@ -173,7 +174,7 @@ impl Orders {
         self.heard[side(link)].clear();
     }
 
-    /// The gateway slept: nothing is commanded from what was asked before.
+    /// The gateway slept: commands picked before are dropped.
     pub(super) fn slept(&mut self, now: Instant) {
         self.base.clear();
         self.lost(LinkId::COMMAND, now);
@@ -184,7 +185,7 @@ impl Orders {
         self.slept.clear();
     }
 
-    /// What a frame that waited meanwhile would have picked.
+    /// The commands that a discarded frame would have picked.
     pub(super) fn waited_in_sleep(&mut self, sheet: &Sheet, frame: &Accepted) {
         for &(_, table, _, value) in &frame.orders {
             let picked = table.of(&sheet.commands).iter().find(|entry| entry.0 == value);
@@ -198,12 +199,12 @@ impl Orders {
         }
     }
 
-    /// The controller says something on one of the links to port 2000.
+    /// The controller sends something on one of the links to port 2000.
     pub(super) fn hears(&mut self, link: LinkId, bytes: &[u8]) {
         self.heard[side(link)].push_str(&String::from_utf8_lossy(bytes));
     }
 
-    /// Replies that the engine has taken.
+    /// Replies that the engine has handled.
     pub(super) fn look_at_replies(&mut self, engine: &Engine) {
         if self.unanswered.is_empty() {
             self.heard.iter_mut().for_each(String::clear);
@@ -233,7 +234,7 @@ impl Orders {
         }
     }
 
-    /// The engine sends a command; which.
+    /// The engine sends a command; returns which.
     pub(super) fn sent(&mut self, link: LinkId, bytes: &[u8], now: Instant) -> Result<Order, Wrong> {
         let text = plain(bytes);
         let shown = String::from_utf8_lossy(bytes).trim().to_owned();
@@ -248,15 +249,18 @@ impl Orders {
             stop
         } else {
             if link == LinkId::URGENT {
-                return Err((Invariant::Once, format!("{shown} was sent where only what stops may go")));
+                return Err((
+                    Invariant::Once,
+                    format!("{shown} was sent where only urgent commands may be sent"),
+                ));
             }
             if !self.stops.is_empty() || self.unanswered.iter().any(|(_, order)| order.is_urgent()) {
-                let what = format!("{shown} was sent while something that stops waits or is unanswered");
+                let what = format!("{shown} was sent while an urgent command waits or is unanswered");
                 return Err((Invariant::Once, what));
             }
             let Some(next) = self.queue.pop_front() else { return Err(self.nobody_picked(&shown, &text)) };
             if next.text != text {
-                return Err((Invariant::Once, format!("{shown} was sent, {} was next", next.text)));
+                return Err((Invariant::Once, format!("{shown} was sent, but {} was next", next.text)));
             }
             if now >= next.picked + TTL {
                 return Err((Invariant::Once, format!("{shown} was sent too late")));
@@ -272,11 +276,11 @@ impl Orders {
         if self.slept.iter().any(|slept| slept == text) {
             return (
                 Invariant::FromSleep,
-                format!("{shown} was picked by what waited while the gateway slept"),
+                format!("{shown} was picked by a frame that waited while the gateway slept"),
             );
         }
         let again = self.newest.as_deref() == Some(text);
-        let what = if again { "once more than it was picked" } else { "and nobody picked it" };
+        let what = if again { "once more than it was picked" } else { "although no value picked it" };
         (Invariant::Once, format!("{shown} was sent {what}"))
     }
 
@@ -304,7 +308,7 @@ fn is_urgent(text: &str) -> bool {
     matches!(text, "stop" | "pause" | "disable" | "poweroff")
 }
 
-/// A command without what dialects add.
+/// A command without the additions of dialects.
 pub(super) fn plain(text: &[u8]) -> String {
     let text = String::from_utf8_lossy(text);
     text.chars()

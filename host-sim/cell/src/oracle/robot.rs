@@ -1,8 +1,8 @@
-//! The robot's side: how old each value and command is when the controller takes it, and whether what
-//! must get there does (docs/cell.md section 4).
+//! The robot's side: how old each value and command is when the controller receives it, and whether
+//! everything arrives that must (docs/cell.md section 4).
 //!
-//! In: what each transmission carries, when it arrives, and which paths to the controller work. Knows
-//! nothing of what the engine holds for delivered.
+//! In: the content of each transmission, when it arrives, and which paths to the controller work.
+//! Does not know what the engine considers delivered.
 
 use std::collections::{BTreeMap, VecDeque};
 
@@ -18,15 +18,15 @@ use super::{Invariant, Oracle};
 use crate::network::Speaker;
 use crate::tcp::USER_TIMEOUT;
 
-/// One path to the controller, as the network is at present.
+/// One path to the controller, in the present state of the network.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Path {
     pub link: LinkId,
     /// Which connection it is, of those that are.
     pub conn: Option<u64>,
-    /// There is a connection, and what is sent gets there.
+    /// There is a connection, and data sent on it arrives.
     pub is_sound: bool,
-    /// The server there carries out and answers.
+    /// The server there carries out and answers requests.
     pub is_served: bool,
 }
 
@@ -34,20 +34,20 @@ pub(crate) struct Path {
 #[derive(Debug, Clone)]
 struct Parcel {
     sent_at: Instant,
-    /// How many bytes of its connection have arrived when it has.
+    /// Number of the connection's bytes that have arrived when it has.
     end: u64,
-    /// How long it may be on its way, the network's own delay apart.
+    /// How long it may be in flight, apart from the network's own delay.
     not_after: Duration,
     slowest: Duration,
     values: Vec<(SysVar, Raw, Carried)>,
     order: Option<Errand>,
 }
 
-/// A command on its way.
+/// A command in flight.
 #[derive(Debug, Clone)]
 struct Errand {
     order: Order,
-    /// Since when nobody asks for it any more.
+    /// Since when it is not asked for any more.
     unasked: Option<Instant>,
 }
 
@@ -66,25 +66,25 @@ struct Road {
     parcels: VecDeque<Parcel>,
 }
 
-/// What is on its way, and what should be there.
+/// Transmissions in flight, and what must be at the controller.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Robot {
-    /// What the engine hands over at present.
+    /// The transmission that the engine hands over now.
     values: Vec<(SysVar, Raw, Carried)>,
     order: Option<Errand>,
     roads: BTreeMap<u64, Road>,
-    /// The newest ones; the first has this number.
+    /// The newest transmissions; the first has this number.
     datagrams: VecDeque<Parcel>,
     first_tag: u64,
     demands: Vec<Demand>,
-    /// The newest command that stopped the robot.
+    /// The newest urgent command.
     stopped_by: Option<Order>,
     /// Since when each path has worked without a fault, and answered; by the link's place.
     sound: BTreeMap<LinkId, Instant>,
     served: BTreeMap<LinkId, Instant>,
     conns: BTreeMap<LinkId, Option<u64>>,
     all_sound_since: Option<Instant>,
-    /// When the controller began anew.
+    /// When the controller restarted.
     began_at: Option<Instant>,
     /// Since when the frames of each recipe link could be sent.
     ready: BTreeMap<LinkId, Instant>,
@@ -120,7 +120,7 @@ impl Robot {
         }
     }
 
-    /// What nobody asks for any more need not arrive, and soon must not.
+    /// A command that is not asked for any more need not arrive, and soon must not.
     pub(super) fn no_longer_asked(&mut self, is_asked: impl Fn(&Order) -> bool, now: Instant) {
         self.demands.retain(|demand| is_asked(&demand.order));
         let parcels = self.roads.values_mut().flat_map(|road| &mut road.parcels);
@@ -131,7 +131,7 @@ impl Robot {
         }
     }
 
-    /// The gateway slept: nothing of what was asked before counts.
+    /// The gateway slept: earlier requests do not count.
     pub(super) fn forget_all(&mut self, now: Instant) {
         self.no_longer_asked(|_| false, now);
     }
@@ -169,22 +169,22 @@ impl Robot {
         self.stalls.iter().map(part).fold(Duration::ZERO, |sum, part| sum + part)
     }
 
-    /// Whether the controller has begun anew since then, and the gateway must know.
+    /// Whether the controller has restarted since then, and the gateway must know.
     fn has_begun_since(&self, then: Instant, now: Instant) -> bool {
         let knows = self.all_sound_since.is_some_and(|since| now.saturating_since(since) > SAFE_ARRIVES);
         knows && self.began_at.is_some_and(|began| began > then)
     }
 
-    /// A transmission is there: whether what it carries is young enough.
+    /// A transmission arrives: checks whether its values are recent enough.
     fn judge(&mut self, parcel: &Parcel, slowest: Duration, now: Instant) -> Result<(), Wrong> {
         let network = parcel.slowest.max(slowest) + ALLOWANCE;
-        // The system's own patience ends what an engine that is not called cannot.
+        // Only the system's TCP timeout ends connections of an engine that is not called.
         let stalled = self.stalled_since(parcel.sent_at, now).min(USER_TIMEOUT);
         for &(var, raw, carried) in &parcel.values {
             let (arrived, timeout) = match carried {
                 Carried::Safe => continue,
                 Carried::Held { accepted } if self.has_begun_since(accepted, now) => {
-                    let what = format!("{var} = {} is from before the controller began anew", show(var, raw));
+                    let what = format!("{var} = {} is from before the controller restarted", show(var, raw));
                     return Err((Invariant::NoReplay, what));
                 }
                 Carried::Held { .. } => continue,
@@ -192,8 +192,10 @@ impl Robot {
             };
             let (age, most) = (now.saturating_since(arrived), timeout + parcel.not_after + network + stalled);
             if age > most {
-                let what =
-                    format!("{var} = {} is {age} old at the controller, {most} at most", show(var, raw));
+                let what = format!(
+                    "{var} = {} is {age} old at the controller; at most {most} is allowed",
+                    show(var, raw)
+                );
                 return Err((Invariant::ValueAge, what));
             }
         }
@@ -204,7 +206,7 @@ impl Robot {
         };
         let overtaken = self.stopped_by.as_ref().is_some_and(|stop| order.picked < stop.picked);
         if overtaken && !order.is_urgent() {
-            let what = format!("{} comes behind what stopped the robot, and was picked before", order.text);
+            let what = format!("{} arrives after an urgent command, but was picked before it", order.text);
             return Err((Invariant::Overtaken, what));
         }
         if order.is_urgent() {
@@ -212,7 +214,8 @@ impl Robot {
         }
         let (age, most) = (now.saturating_since(since), most + network + stalled);
         if age > most {
-            let what = format!("{} comes {age} after it was wanted, {most} at most", order.text);
+            let what =
+                format!("{} arrives {age} after it was asked for; at most {most} is allowed", order.text);
             return Err((Invariant::CommandAge, what));
         }
         for demand in self.demands.iter_mut().filter(|demand| demand.order.text == order.text) {
@@ -221,7 +224,8 @@ impl Robot {
         Ok(())
     }
 
-    /// The controller's inputs are `before` something arrives: what changed them since is not ours.
+    /// The controller's inputs are `before` something arrives: other programs made the changes
+    /// since.
     fn look_for_foreign(&mut self, before: &[u8], now: Instant) {
         if self.inputs.len() == before.len() && self.inputs != before {
             for (at, _) in before.iter().zip(&self.inputs).enumerate().filter(|(_, (new, old))| new != old) {
@@ -252,7 +256,7 @@ impl Robot {
         Some(since)
     }
 
-    /// Commands that stop the robot and have had a way for long enough.
+    /// Urgent commands that have had a working way for long enough.
     fn stops(&self, now: Instant) -> Result<u64, Wrong> {
         let ways = [LinkId::COMMAND, LinkId::URGENT];
         let Some(could) = ways.iter().filter_map(|link| self.sound.get(link)).min() else { return Ok(0) };
@@ -261,15 +265,17 @@ impl Robot {
             checked += 1;
             let had_a_way = now.saturating_since(order.picked.max(*could));
             if !is_met && had_a_way > STOP_ARRIVES {
-                let what =
-                    format!("{} has been asked for and could have arrived for {had_a_way}", order.text);
+                let what = format!(
+                    "{} is asked for and has not arrived, although a way has worked for {had_a_way}",
+                    order.text
+                );
                 return Err((Invariant::StopArrives, what));
             }
         }
         Ok(checked)
     }
 
-    /// Safe values of owners that are silent, when everything has worked for long enough.
+    /// Safe values of silent owners, after everything has worked for long enough.
     fn safe_values(&self, sheet: &Sheet, up: &Upward, all: Instant, now: Instant) -> Result<u64, Wrong> {
         let mut checked = 0;
         for &var in &sheet.safe_vars {
@@ -293,7 +299,7 @@ impl Robot {
                 let mut raw = Raw::default();
                 raw[..there.len()].copy_from_slice(there);
                 let what = format!(
-                    "{var} is {} at the controller, its owner has been silent for {} and its safe value is {}",
+                    "{var} is {} at the controller; its owner has been silent for {} and its safe value is {}",
                     show(var, raw),
                     now.saturating_since(accepted),
                     show(var, safe)
@@ -306,7 +312,7 @@ impl Robot {
 }
 
 impl Oracle {
-    /// The gateway's transport has got bytes for a connection.
+    /// The gateway's transport has taken bytes for a connection.
     pub(crate) fn sent(&mut self, conn: u64, link: LinkId, bytes: &[u8], slowest: Duration, now: Instant) {
         self.controller.sent(conn, bytes);
         let mut parcel = self.robot.parcel(&self.sheet, link, slowest, now);
@@ -316,7 +322,7 @@ impl Oracle {
         road.parcels.push_back(parcel);
     }
 
-    /// The same of a datagram, which is known by this number from now on.
+    /// Same, for a datagram, which has this number from now on.
     pub(crate) fn sent_datagram(
         &mut self,
         link: LinkId,
@@ -339,7 +345,7 @@ impl Oracle {
     pub(crate) fn not_understood(&mut self, link: LinkId, now: Instant) {
         let quiet = self.robot.sound.get(&link).map(|since| now.saturating_since(*since));
         let result = match quiet {
-            // Nothing was held up on its way, which cuts what has no end of its own.
+            // Nothing was delayed, which would join texts without terminators.
             Some(quiet) if quiet > Duration::from_secs(1) => {
                 Err((Invariant::Understood, "the controller did not understand a command".to_owned()))
             }
@@ -383,7 +389,7 @@ impl Oracle {
         self.judge(now, &[], result);
     }
 
-    /// Something was broken or mended on a path, or on all of them.
+    /// A fault began or ended on a path, or on all of them.
     pub(crate) fn disturbed(&mut self, link: Option<LinkId>, now: Instant) {
         match link {
             Some(link) => {
@@ -394,7 +400,7 @@ impl Oracle {
         }
     }
 
-    /// The controller begins anew: its inputs are what they are then.
+    /// The controller restarts: its inputs have their present values then.
     pub(crate) fn controller_began(&mut self, now: Instant) {
         self.robot.inputs.clear();
         self.robot.foreign.clear();
@@ -407,7 +413,7 @@ impl Oracle {
     pub(crate) fn stalled(&mut self, until: Instant, now: Instant) {
         let stalls = &mut self.robot.stalls;
         stalls.retain(|(_, to)| now.saturating_since(*to) < REMEMBERED);
-        // One that is prolonged is one.
+        // A prolonged stall is one stall.
         match stalls.back_mut() {
             Some((_, to)) if *to >= now => *to = until,
             _ => stalls.push_back((now, until)),
@@ -415,7 +421,7 @@ impl Oracle {
         self.robot.disturbed(now);
     }
 
-    /// How everything is at present. To be told every now and then.
+    /// The present state of everything. Call it now and then.
     pub(crate) fn survey(&mut self, paths: &[Path], inputs: &[u8], now: Instant) {
         if self.violation.is_some() {
             return;
@@ -453,7 +459,7 @@ impl Oracle {
         }
     }
 
-    /// The link begins anew: whoever speaks first is answered.
+    /// The link restarts: the first sender is answered.
     pub(super) fn nobody_spoke(&mut self, link: LinkId) {
         self.robot.speakers.remove(&link);
     }
@@ -463,7 +469,7 @@ impl Oracle {
         let result = match self.robot.speakers.get(&link) {
             Some(speaker) if Some(*speaker) != whom => Err((
                 Invariant::Destination,
-                format!("a datagram goes to {whom:?}, {speaker:?} sends frames"),
+                format!("a datagram goes to {whom:?}, but {speaker:?} sends frames"),
             )),
             _ => Ok(()),
         };
@@ -471,7 +477,7 @@ impl Oracle {
     }
 }
 
-/// Since when something has been so.
+/// Since when a condition has held.
 fn note(since: &mut BTreeMap<LinkId, Instant>, link: LinkId, is_so: bool, now: Instant) {
     if is_so {
         since.entry(link).or_insert(now);
@@ -480,8 +486,8 @@ fn note(since: &mut BTreeMap<LinkId, Instant>, link: LinkId, is_so: bool, now: I
     }
 }
 
-/// How long what is handed over to a link may be on its way: what is not acknowledged then is given up
-/// with its connection. Datagrams do not wait.
+/// How long data handed over to a link may be in flight: after that, unacknowledged data is given
+/// up with its connection. Datagrams do not wait.
 fn not_after(sheet: &Sheet, link: LinkId) -> Duration {
     match sheet.link(link) {
         None => Duration::from_millis(500),
@@ -496,10 +502,10 @@ fn not_after(sheet: &Sheet, link: LinkId) -> Duration {
 
 /// A command arrives within this time after it was picked.
 const COMMAND_TTL: Duration = Duration::from_secs(1);
-/// One that stops is handed over within a second after the device last asked for it, and acknowledged
-/// within another.
+/// An urgent command is handed over within a second after the device last asked for it, and
+/// acknowledged within another.
 const URGENT_TTL: Duration = Duration::from_secs(2);
-/// One that is asked for arrives so soon after there is a way.
+/// A command that is asked for arrives within this time after a way works.
 const STOP_ARRIVES: Duration = Duration::from_millis(1_500);
 /// So does a safe value.
 const SAFE_ARRIVES: Duration = Duration::from_millis(1_500);
@@ -507,5 +513,5 @@ const SAFE_ARRIVES: Duration = Duration::from_millis(1_500);
 const ALLOWANCE: Duration = Duration::from_millis(2);
 /// Datagrams that may still arrive.
 const DATAGRAMS: usize = 4_096;
-/// A stall may matter for so long.
+/// How long a stall may matter.
 const REMEMBERED: Duration = Duration::from_secs(60);

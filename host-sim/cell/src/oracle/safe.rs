@@ -1,4 +1,5 @@
-//! Safe values: written again until they are known to be there (proto-core/docs/engine.md section 6).
+//! Safe values: written again until the controller is known to have them (proto-core/docs/engine.md
+//! section 6).
 
 use proto_core::engine::LinkId;
 use proto_core::sysvar::SysVar;
@@ -13,13 +14,13 @@ const SOON: Duration = Duration::from_millis(4);
 /// ... or, where nothing can show it, after this, once it has done so for [`NEW`].
 const SLOWLY: Duration = Duration::from_millis(100);
 const NEW: Duration = Duration::from_secs(1);
-/// What the controller shows sooner may be older.
+/// A value that the controller shows sooner may be older.
 const SHOWN_AFTER: Duration = Duration::from_millis(200);
-/// For so long another value takes back that one was there; later another master has written it.
+/// For this long another value revokes the confirmation; later another master has written it.
 const DOUBT: Duration = Duration::from_secs(3);
 
 impl Upward {
-    /// Safe values whose write came to nothing wait again, if they still stand.
+    /// Safe values whose write failed wait again, if they are still current.
     pub(super) fn write_again(&mut self, sheet: &Sheet, vars: impl IntoIterator<Item = SysVar>) {
         for var in vars {
             let safe = sheet.owned[var.ordinal()].and_then(|owned| owned.safe);
@@ -31,7 +32,7 @@ impl Upward {
         }
     }
 
-    /// The controller may have begun anew: all safe values wait again.
+    /// The controller may have restarted: all safe values wait again.
     pub(super) fn controller_was_away(&mut self, sheet: &Sheet, now: Instant) {
         let safe: Vec<SysVar> = sheet.safe_vars.iter().copied().filter(|var| self.known(*var).safe).collect();
         if safe.is_empty() {
@@ -44,7 +45,7 @@ impl Upward {
         self.write_again(sheet, safe);
     }
 
-    /// A frame was sent on a recipe link: what is in doubt is sent again later.
+    /// A frame was sent on a recipe link: unconfirmed values are sent again later.
     pub(super) fn sent_frame(&mut self, sheet: &Sheet, link: LinkId, now: Instant) {
         let again_at = self.again_at[usize::from(link.0)];
         let is_soon = again_at == Instant::NEVER || self.is_new_doubt(now);
@@ -84,13 +85,13 @@ impl Upward {
         sheet.safe_vars.iter().copied().filter(is_in_doubt).collect()
     }
 
-    /// Whether what the controller shows now can be what it made of the safe values.
+    /// Whether the value that the controller shows now can be the result of the safe values.
     pub(super) fn may_confirm(&self, now: Instant) -> bool {
         now >= self.doubted_at + SHOWN_AFTER
     }
 
-    /// Safe values that the packet shows are there; one that it does not show, soon after one was
-    /// confirmed, is not.
+    /// Safe values that the packet shows are confirmed; one that it does not show soon after its
+    /// confirmation is not.
     pub(super) fn compare_safe(&mut self, sheet: &Sheet, packet: &[u8], now: Instant) {
         let may_confirm = self.may_confirm(now);
         let may_doubt = self.confirmed_at.is_some_and(|at| now < at + DOUBT);
@@ -116,7 +117,7 @@ impl Upward {
         self.write_again(sheet, doubted);
     }
 
-    /// An output that came just now shows another value, soon after one was confirmed.
+    /// An output that just arrived shows another value, soon after a confirmation.
     pub(super) fn doubt_by_witnesses(&mut self, sheet: &Sheet, now: Instant) {
         if self.confirmed_at.is_none_or(|at| now >= at + DOUBT) {
             return;
@@ -146,7 +147,7 @@ impl Upward {
         }
     }
 
-    /// So are those that an output shows that somebody reads anyway.
+    /// Same for those that an output shows that is read anyway.
     fn look_at_witnesses(&mut self, sheet: &Sheet, now: Instant) {
         if !self.may_confirm(now) {
             return;

@@ -1,5 +1,5 @@
-//! What the configuration promises, worked out once the slow way: who owns a variable, how it
-//! travels, where it comes from (proto-core/docs/engine.md section 4).
+//! The configuration's promises, computed once the slow way: owners, ways up and sources
+//! (proto-core/docs/engine.md section 4).
 //!
 //! Written from that page, without the engine's own plan.
 
@@ -10,10 +10,10 @@ use proto_core::sysvar::{COUNT, Direction, ModbusPlace, SysVar};
 use proto_core::time::Duration;
 use proto_core::wire::can::CanId;
 
-/// A value as it stands on the wire; unused bytes are zero.
+/// A value as on the wire; unused bytes are zero.
 pub(super) type Raw = [u8; 4];
 
-/// Whose a variable is and how it reaches the controller.
+/// A variable's owner and way up.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Owned {
     /// The port's index in the configuration.
@@ -24,7 +24,7 @@ pub(super) struct Owned {
     pub safe: Option<Raw>,
 }
 
-/// Where a shown variable comes from.
+/// The source of a shown variable.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Origin {
     Field,
@@ -88,7 +88,7 @@ pub(super) struct Sheet {
     pub has_state: bool,
     /// The output that shows what an input was set to, when some port or recipe link brings it.
     pub witness: [Option<SysVar>; COUNT],
-    /// Some port sends for a rising bit.
+    /// Some port sends on a rising bit.
     pub has_triggers: bool,
     /// The texts and values of all command tables.
     pub commands: Vec<(i64, String)>,
@@ -191,7 +191,7 @@ impl Sheet {
         self.links.iter().find(|link| link.id == id)
     }
 
-    /// Whether anything would show the variable's value at the controller.
+    /// Whether anything shows the variable's value at the controller.
     pub(super) fn can_be_shown(&self, var: SysVar) -> bool {
         self.has_state && var.stream().is_some() || self.witness[var.ordinal()].is_some()
     }
@@ -300,7 +300,8 @@ fn link_sheet(config: &GatewayConfig, id: LinkId, recipe: &Recipe, is_datagram: 
     LinkSheet { id, is_datagram, input, output, reads_back: false }
 }
 
-/// Whether one field frame fills the link's frame whole, with safe values for all of it or none.
+/// Whether one field frame fills the link's frame completely, with safe values for all of it or
+/// none.
 fn is_one_frame(ports: &[PortSheet], owned: &[Option<Owned>; COUNT], link: &LinkSheet) -> bool {
     let Some(up) = &link.input else { return true };
     let vars: Vec<SysVar> = up.fields.iter().filter_map(written).collect();

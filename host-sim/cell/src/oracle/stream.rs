@@ -1,4 +1,4 @@
-//! The state stream: what of it is a packet (proto-core/docs/wire/state.md section 3, D8), read slowly from
+//! The packets in the state stream (proto-core/docs/wire/state.md section 3, D8), read slowly from
 //! the fields themselves.
 
 use proto_core::wire::state::StatePacket;
@@ -13,7 +13,7 @@ pub(super) struct Stream {
 }
 
 impl Stream {
-    /// Whether this is the next packet. After three that are not, nothing is.
+    /// Whether this is the next packet. After three misaligned ones, nothing is.
     pub(super) fn takes(&mut self, bytes: &[u8]) -> bool {
         let Ok(packet) = StatePacket::parse(bytes) else { return false };
         if self.wrong_in_a_row >= 3 || !is_packet(&packet) || self.is_elsewhere(&packet) {
@@ -75,7 +75,7 @@ fn is_packet(packet: &StatePacket) -> bool {
     joints < 3 && bools <= 8 && (is_started(packet) || strange(packet) < 3)
 }
 
-/// Quantities that are not finite, too large for their unit, or next to nothing.
+/// Quantities that are not finite, too large for their unit, or tiny.
 fn strange(packet: &StatePacket) -> usize {
     let joints = [
         (packet.joint_position, 1_000.0),
@@ -115,8 +115,8 @@ mod tests {
 
     use super::*;
 
-    /// The engine's reading and this one, of a packet turned by every number of bytes, whole and
-    /// with items that are strange.
+    /// Compares the engine's check and this one, for a packet rotated by every number of bytes,
+    /// whole and with strange items.
     #[test]
     fn both_readings_agree() {
         let mut packet = StatePacket { robot_state: 6, safety_state: 5, ..StatePacket::ZERO };

@@ -1,4 +1,4 @@
-//! What is still to be written to the controller, and what each write has to be
+//! The values that are still to be written to the controller, and the checks of each write
 //! (proto-core/docs/engine.md section 5).
 
 use std::collections::VecDeque;
@@ -11,39 +11,39 @@ use super::Invariant;
 use super::field::{Accepted, show};
 use super::sheet::{LinkSheet, Origin, Owned, Raw, Sheet};
 
-/// Values that wait behind the next ones, a port.
+/// Number of values per port that wait behind the next ones.
 const EDGES: usize = 16;
-/// How old a read-back value may be.
+/// Maximum age of a value that was read back.
 const READ_BACK: Duration = Duration::from_millis(500);
 
-/// What comes steadily and has not come for so long: the controller may have been away.
+/// After this long without the data that the controller sends steadily, it may have restarted.
 const AWAY: Duration = Duration::from_millis(500);
 
-/// Whether so much time lies between what came last and now.
+/// Whether so much time lies between the newest data and now.
 pub(super) fn is_gap(last: Option<Instant>, now: Instant) -> bool {
     last.is_none_or(|at| now.saturating_since(at) > AWAY)
 }
 
-/// What is known of one variable.
+/// The state of one variable.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Known {
-    /// What a port would show now, and since when.
+    /// The value that a port would show now, and since when.
     pub value: Option<(Raw, Instant)>,
     /// Values to be written, the next one first, each with the time of its frame.
     pub waiting: VecDeque<(Raw, Instant)>,
-    /// When the newest frame that brought it was accepted.
+    /// When the newest frame with it was accepted.
     pub accepted: Option<Instant>,
-    /// Its owner sent it in time, or it stands at its safe value.
+    /// Its owner sent it in time, or it has its safe value.
     pub live: bool,
-    /// It stands at its safe value.
+    /// It has its safe value.
     pub safe: bool,
     /// Since when: a safe value that is written again is as old as it was.
     pub safe_at: Instant,
     /// The state stream has shown it since its owner fell silent, or ever.
     pub read_back: bool,
-    /// The newest value from the controller was none: not a number, or infinite.
+    /// The newest value from the controller was not finite.
     pub unreadable: bool,
-    /// It stands at its safe value, and the controller is not known to have it.
+    /// It has its safe value, and the controller is not known to have it.
     pub unconfirmed: bool,
     /// Its owner fell silent before the last value was handed over.
     pub unsent: bool,
@@ -52,25 +52,25 @@ pub(super) struct Known {
 }
 
 impl Known {
-    /// No frame and no safe value that was taken has this value.
+    /// No accepted frame and no safe value has this value.
     fn is_news(&self, raw: Raw) -> bool {
         self.value.is_none_or(|value| value.0 != raw) && self.waiting.iter().all(|next| next.0 != raw)
     }
 }
 
-/// Where a value that was handed over comes from.
+/// The origin of a value that was handed over.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Carried {
     /// It is a safe value.
     Safe,
-    /// The controller holds it already, as far as anybody knows, since its silent owner's last frame.
+    /// The controller holds it already, as far as is known, since its silent owner's last frame.
     Held { accepted: Instant },
-    /// It came then, in its owner's frame or from the state stream, and may be so old when it is
-    /// handed over.
+    /// It came at this time, in its owner's frame or from the state stream, and may be this old
+    /// when it is handed over.
     Of { arrived: Instant, timeout: Duration },
 }
 
-/// What a port must have counted.
+/// The counters that a port must have.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Counted {
     pub edges_lost: u32,
@@ -82,7 +82,7 @@ pub(super) struct Counted {
 /// What is wrong with a write.
 pub(super) type Wrong = (Invariant, String);
 
-/// The values of all variables and what became of them.
+/// The values of all variables, and their progress.
 #[derive(Debug, Clone)]
 pub(super) struct Upward {
     pub known: Vec<Known>,
@@ -94,7 +94,7 @@ pub(super) struct Upward {
     pub state_at: Option<Instant>,
     /// When the newest frame of each recipe link came, whatever connection it was.
     pub frame_at: [Option<Instant>; 16],
-    /// When anything came that the controller sends steadily, and how often after a gap.
+    /// When any data came that the controller sends steadily, and how often after a gap.
     heard_at: Option<Instant>,
     pub era: u64,
     /// When a frame was handed over on each recipe link's present connection, and in which era.
@@ -218,7 +218,7 @@ impl Upward {
         }
     }
 
-    /// A frame is applied.
+    /// Applies a frame.
     pub(super) fn accepted(&mut self, sheet: &Sheet, nth: usize, frame: &Accepted, now: Instant) {
         let timeout = sheet.ports[nth].timeout;
         self.overdue[nth][frame.frame] = Some(now + timeout);
@@ -278,7 +278,7 @@ impl Upward {
         self.handed_over[usize::from(link.0)] = None;
     }
 
-    /// A link was lost: what waits for it is dropped, safe values excepted.
+    /// A link was lost: waiting values are dropped, except safe values.
     pub(super) fn link_lost(&mut self, sheet: &Sheet, link: LinkId) {
         if self.up[usize::from(link.0)].take().is_none() {
             return;
@@ -295,7 +295,7 @@ impl Upward {
         }
     }
 
-    /// A packet of the state stream was taken.
+    /// A packet of the state stream was accepted.
     pub(super) fn state_packet(&mut self, sheet: &Sheet, packet: &[u8], now: Instant) {
         self.state_at = Some(now);
         self.heard(now);
@@ -343,7 +343,7 @@ impl Upward {
         known.accepted.filter(|&at| handed_over >= at && !known.unsent)
     }
 
-    /// The newest value that a link brought; not finite, it is none.
+    /// The newest value from a link; one that is not finite makes the variable unreadable.
     pub(super) fn received(&mut self, var: SysVar, raw: Raw, now: Instant) {
         let known = self.known_mut(var);
         known.unreadable = !super::field::as_number(var, raw).is_finite();
@@ -352,7 +352,7 @@ impl Upward {
         }
     }
 
-    /// A variable was written on the link that is its way up; what was written.
+    /// A variable was written on the link that is its way up; returns the value.
     pub(super) fn wrote(
         &mut self,
         sheet: &Sheet,
@@ -372,18 +372,18 @@ impl Upward {
             return Err((Invariant::FromSleep, what));
         }
         let Some(accepted) = known.accepted else {
-            let what = format!("{var} = {} was written before any frame brought it", show(var, raw));
+            let what = format!("{var} = {} was written before any frame had it", show(var, raw));
             return Err((Invariant::FirstFrame, what));
         };
         let wanted = known.waiting.front().map(|next| next.0);
         if known.live && !known.safe && owned.safe == Some(raw) && known.is_news(raw) && wanted != Some(raw) {
-            let what = format!("{var} = {} is its safe value, its owner is not silent", show(var, raw));
+            let what = format!("{var} = {} is its safe value, but its owner is not silent", show(var, raw));
             return Err((Invariant::FalseTimeout, what));
         }
         let Some(&(next, at)) = known.waiting.front() else {
             let value = show(var, raw);
             if known.safe && owned.safe == Some(raw) {
-                // It may always be written once more.
+                // One more write is always allowed.
                 return Ok(Carried::Safe);
             }
             return Err(if up.is_some_and(|up| accepted < up) {
@@ -391,12 +391,12 @@ impl Upward {
             } else if now.saturating_since(accepted) > timeout {
                 (Invariant::InTime, format!("{var} = {value} was written after its owner fell silent"))
             } else {
-                (Invariant::Sent, format!("{var} = {value} was written once more than its owner sent it"))
+                (Invariant::Sent, format!("{var} = {value} was written more often than its owner sent it"))
             });
         };
         if next != raw {
             let later = known.waiting.iter().any(|(value, _)| *value == raw);
-            let what = format!("{var} = {} was written, {} was next", show(var, raw), show(var, next));
+            let what = format!("{var} = {} was written, but {} was next", show(var, raw), show(var, next));
             return Err((if later { Invariant::Edges } else { Invariant::Sent }, what));
         }
         if !known.safe && now.saturating_since(at) > timeout {
@@ -409,7 +409,7 @@ impl Upward {
         Ok(if known.safe { Carried::Safe } else { Carried::Of { arrived: at, timeout } })
     }
 
-    /// A variable was in a frame that was sent for the sake of others.
+    /// A variable was in a frame that was sent because of others.
     pub(super) fn carried(
         &self,
         sheet: &Sheet,
@@ -422,12 +422,12 @@ impl Upward {
         let Some((held, _)) = known.value else {
             return Err((
                 Invariant::Sent,
-                format!("{var} = {} was sent along, and nobody ever knew it", value()),
+                format!("{var} = {} was sent along, but was never known", value()),
             ));
         };
         let expected = known.waiting.front().map_or(held, |next| next.0);
         if expected != raw {
-            let what = format!("{var} = {} was sent along, it is {}", value(), show(var, expected));
+            let what = format!("{var} = {} was sent along, but it is {}", value(), show(var, expected));
             return Err((Invariant::Sent, what));
         }
         if known.live {
@@ -442,13 +442,13 @@ impl Upward {
                 Some(accepted) => Ok(Carried::Held { accepted }),
                 None => {
                     let what =
-                        format!("{var} = {} was sent along, and this controller never got it", value());
+                        format!("{var} = {} was sent along, but this controller never got it", value());
                     Err((Invariant::NoReplay, what))
                 }
             };
         }
         if known.unreadable {
-            let what = format!("{var} = {} was written back, and cannot be read now", value());
+            let what = format!("{var} = {} was written back, but is unreadable", value());
             return Err((Invariant::Unreadable, what));
         }
         let is_fresh = self.state_at.is_some_and(|at| now.saturating_since(at) <= READ_BACK);

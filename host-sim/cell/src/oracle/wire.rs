@@ -1,5 +1,5 @@
-//! What travels between the gateway and the controller: Modbus by hand (proto-core/docs/wire/modbus.md), and
-//! whether what arrived is what was sent.
+//! Traffic between the gateway and the controller: Modbus by hand (proto-core/docs/wire/modbus.md),
+//! and whether the data that arrives is the data sent.
 
 use std::collections::{BTreeMap, VecDeque};
 
@@ -24,7 +24,7 @@ pub(super) enum Asked {
 #[derive(Debug, Clone, Default)]
 pub(super) struct Modbus {
     in_flight: Option<([u8; 2], Asked, Instant)>,
-    /// Variables of the write in flight that stood at their safe values.
+    /// Variables of the write in flight that had their safe values.
     safe: Vec<SysVar>,
     held: Vec<u8>,
 }
@@ -34,7 +34,7 @@ impl Modbus {
         self.in_flight.is_none()
     }
 
-    /// Gives up what was not answered in time; the safe values in it.
+    /// Gives up a request that was not answered in time; returns its safe values.
     pub(super) fn tick(&mut self, now: Instant) -> Vec<SysVar> {
         if self.in_flight.as_ref().is_none_or(|asked| now < asked.2 + ANSWER) {
             return Vec::new();
@@ -43,7 +43,7 @@ impl Modbus {
         std::mem::take(&mut self.safe)
     }
 
-    /// The connection is gone; the safe values that were under way.
+    /// The connection is gone; returns the safe values in flight.
     pub(super) fn lost(&mut self) -> Vec<SysVar> {
         std::mem::take(self).safe
     }
@@ -57,10 +57,10 @@ impl Modbus {
     pub(super) fn sent(&mut self, map: &Map, bytes: &[u8], now: Instant) -> Result<Asked, Wrong> {
         let wrong = |what: &str| (Invariant::Ownership, format!("a Modbus request that {what}"));
         if self.in_flight.is_some() {
-            return Err((Invariant::Line, "a Modbus request before the one before was over".to_owned()));
+            return Err((Invariant::Line, "a Modbus request before the previous one was over".to_owned()));
         }
         let (head, pdu) = bytes.split_at_checked(7).ok_or_else(|| wrong("has no header"))?;
-        let asked = map.request(pdu).ok_or_else(|| wrong("touches what is no variable"))?;
+        let asked = map.request(pdu).ok_or_else(|| wrong("touches addresses that are not a variable"))?;
         self.safe.clear();
         self.in_flight = Some(([head[0], head[1]], asked.clone(), now));
         Ok(asked)
@@ -97,7 +97,7 @@ fn frame_len(bytes: &[u8]) -> Option<usize> {
     (bytes.len() >= len).then_some(len)
 }
 
-/// Which variable is where in the controller's Modbus map.
+/// The variables in the controller's Modbus map.
 #[derive(Debug, Clone)]
 pub(super) struct Map {
     coils: Vec<Option<SysVar>>,
@@ -125,7 +125,7 @@ impl Map {
         map
     }
 
-    /// A request; `None` when it is none of the four that a gateway sends, or writes a part of a
+    /// A request; `None` if it is not one of the four that a gateway sends, or writes a part of a
     /// variable or something else.
     pub(super) fn request(&self, pdu: &[u8]) -> Option<Asked> {
         let word = |at: usize| Some(u16::from_be_bytes([*pdu.get(at)?, *pdu.get(at + 1)?]));
@@ -196,7 +196,7 @@ impl Map {
     }
 }
 
-/// What was sent and has not arrived yet, and what the controller must have.
+/// Data that was sent and has not arrived yet, and what the controller must have.
 #[derive(Debug, Clone)]
 pub(super) struct Controller {
     sent: BTreeMap<u64, VecDeque<u8>>,
@@ -233,7 +233,10 @@ impl Controller {
     pub(super) fn arrived(&mut self, conn: u64, bytes: &[u8]) -> Result<(), Wrong> {
         let sent = self.sent.entry(conn).or_default();
         if bytes.len() > sent.len() || !bytes.iter().eq(sent.iter().take(bytes.len())) {
-            return Err((Invariant::Transport, "the controller received what was not sent".to_owned()));
+            return Err((
+                Invariant::Transport,
+                "the controller received bytes that were not sent".to_owned(),
+            ));
         }
         sent.drain(..bytes.len());
         Ok(())
@@ -247,7 +250,7 @@ impl Controller {
         Err((Invariant::Transport, "the controller received a datagram that was not sent".to_owned()))
     }
 
-    /// The whole Modbus requests in what has arrived.
+    /// The whole Modbus requests in the data that has arrived.
     pub(super) fn requests(&mut self, conn: u64, bytes: &[u8]) -> Vec<Vec<u8>> {
         let held = self.held.entry(conn).or_default();
         held.extend_from_slice(bytes);
