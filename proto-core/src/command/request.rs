@@ -138,7 +138,7 @@ impl Keyword {
     }
 
     /// Whether the command is the keyword alone.
-    pub const fn is_bare(self) -> bool {
+    pub(crate) const fn is_bare(self) -> bool {
         !matches!(self, Self::Run | Self::Speed)
     }
 
