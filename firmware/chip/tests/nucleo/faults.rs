@@ -11,6 +11,11 @@ const UNDEFINED: [u8; 2] = [0x00, 0xDE];
 const MASKED: [u8; 4] = [0x72, 0xB6, 0xFE, 0xE7];
 /// push {r4-r7, lr}, and again.
 const OVERFLOW: [u8; 4] = [0xF0, 0xB5, 0xFD, 0xE7];
+/// cmp r0, r0; it ne; movne r0, #3; b back. Where it lies, a block of the core's ends behind `it`.
+const IT_BLOCKS: [u8; 8] = [0x80, 0x42, 0x18, 0xBF, 0x03, 0x20, 0xFB, 0xE7];
+const IT_BLOCKS_AT: u32 = 0x080F_FC00 - 4;
+/// movw r0, #0xFBFD; movt r0, #0x080F; bx r0: there.
+const TO_IT_BLOCKS: [u8; 10] = [0x4F, 0xF6, 0xFD, 0x30, 0xC0, 0xF6, 0x0F, 0x00, 0x00, 0x47];
 
 /// Something goes wrong where the tasks begin to wait for time; returns when.
 fn break_it(bench: &mut Bench, code: &[u8]) -> Picos {
@@ -68,6 +73,20 @@ fn a_hang_without_interrupts_has_no_words_and_does_not_repeat_old_ones() {
     bench.run(SECOND);
     let told = bench.chip.log.iter().filter(|(_, line)| line.contains("previous run")).count();
     assert_eq!(told, 1, "{}", bench.history());
+}
+
+/// A handler whose first instruction were in that block would save no registers.
+#[test]
+#[ignore = "needs CHIP_UNICORN and CHIP_ELF"]
+fn an_interrupt_within_an_it_block_does_no_harm() {
+    let mut bench = Bench::new(CELL);
+    bench.chip.patch(IT_BLOCKS_AT, &IT_BLOCKS);
+    let broken = break_it(&mut bench, &TO_IT_BLOCKS);
+    let before = bench.chip.interrupts();
+    bench.run(SECOND);
+    assert!(bench.chip.faults.is_empty(), "{}", bench.history());
+    assert!(bench.chip.interrupts() > before + 10, "nothing interrupts it");
+    check_reset(&mut bench, broken);
 }
 
 #[test]
