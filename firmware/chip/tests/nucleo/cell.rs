@@ -82,5 +82,5 @@ fn forces_of_a_sensor_go_up_by_udp() {
     // Nobody measures any more.
     bench.run(500 * MILLI);
     assert_eq!(word(&bench, "ForceEnd[6]"), 0.0);
-    assert!(!bench.has_logged("left out"));
+    assert!(!bench.has_logged("discarded"));
 }

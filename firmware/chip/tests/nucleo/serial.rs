@@ -149,5 +149,5 @@ fn a_fast_line_without_pauses_loses_nothing() {
     }
     bench.run(at - begin + 50 * MILLI);
     assert_eq!(word(&bench, "WordInputReg[3]"), 199.0);
-    assert!(!bench.has_logged("characters left out"), "{}", bench.history());
+    assert!(!bench.has_logged("characters discarded"), "{}", bench.history());
 }
