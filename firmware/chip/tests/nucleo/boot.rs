@@ -135,7 +135,7 @@ fn a_torn_word_of_flash_is_told_with_its_address() {
 fn without_the_external_clock_it_runs_on_its_own() {
     let mut bench = Bench::new(CELL).with_robot();
     bench.chip.devices().rcc.has_external = false;
-    bench.until_log("no 8 MHz from the debugger", 100 * MILLI);
+    bench.until_log("no 8 MHz clock from the debugger", 100 * MILLI);
     bench.until("a Modbus connection", 5 * SECOND, |bench| {
         bench.robot.as_ref().is_some_and(|robot| robot.counters().modbus.open == 1)
     });
@@ -166,7 +166,7 @@ fn a_phy_that_answers_late_is_waited_for() {
 fn without_the_phys_clock_the_field_buses_run() {
     let mut bench = Bench::new(CELL);
     bench.chip.devices().ethernet.phy.has_clock = false;
-    bench.until_log("no controller: no Ethernet: the PHY gives no 50 MHz", SECOND);
+    bench.until_log("no controller: no Ethernet: no 50 MHz clock from the PHY", SECOND);
     bench.run(5 * SECOND);
     assert!(bench.chip.resets.is_empty());
 }

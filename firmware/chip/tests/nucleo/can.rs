@@ -55,7 +55,7 @@ fn alone_on_the_bus_it_says_so_and_sends_again_when_somebody_comes() {
     send(&mut bench, Frame::standard(1, &[1]));
     bench.chip.devices().can.bus.trouble = Trouble::Alone;
     bench.until_log("error-passive", SECOND);
-    bench.until_log("nobody acknowledges; transmit errors 128", SECOND);
+    bench.until_log("frames are not acknowledged by any node; transmit errors 128", SECOND);
     assert_eq!((sent(&mut bench), bench.chip.devices().can.bus.bus_offs.len()), (0, 0));
     bench.chip.devices().can.bus.trouble = Trouble::None;
     bench.run(SECOND);
