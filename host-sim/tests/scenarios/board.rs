@@ -57,8 +57,8 @@ pub(crate) fn make_spoilt_image(plan: &Plan<'_>, image: &Path, spoil: Spoil) {
 /// behind, and what the user network forwards.
 pub(crate) struct Wires {
     pub(crate) folder: PathBuf,
-    /// Field ports by name: the number in the log, and the socket.
-    ports: BTreeMap<String, (usize, &'static str)>,
+    /// The sockets of the field ports, by name.
+    ports: BTreeMap<String, &'static str>,
     /// Listening ports by name.
     listens: BTreeMap<String, SocketAddr>,
 }
@@ -74,13 +74,13 @@ impl Wires {
         let folder = tempfile::Builder::new().tempdir_in(plan.case.folder.path()).unwrap().keep();
         let (mut lines, mut buses) = (lines.iter(), buses.iter());
         let mut ports = BTreeMap::new();
-        for (number, port) in config.ports.iter().enumerate() {
+        for port in &config.ports {
             let socket = match &port.bus {
                 Bus::Rs485(_) => lines.next(),
                 Bus::Can { .. } => buses.next(),
                 Bus::TcpListen { .. } | Bus::UdpListen { .. } => None,
             };
-            ports.extend(socket.map(|socket| (port.name.as_str().to_owned(), (number, *socket))));
+            ports.extend(socket.map(|socket| (port.name.as_str().to_owned(), *socket)));
         }
         Self { folder, ports, listens: BTreeMap::new() }
     }
@@ -97,18 +97,18 @@ impl Wires {
     }
 
     #[track_caller]
-    fn field(&self, port: &str) -> (usize, &'static str) {
+    fn field(&self, port: &str) -> &'static str {
         *self.ports.get(port).unwrap_or_else(|| panic!("no port {port}"))
     }
 
     #[track_caller]
     pub(crate) fn line(&self, port: &str) -> LineClient {
-        LineClient::new(Box::new(self.socket(self.field(port).1)))
+        LineClient::new(Box::new(self.socket(self.field(port))))
     }
 
     #[track_caller]
     pub(crate) fn can(&self, port: &str) -> CanClient {
-        CanClient::join(Box::new(self.socket(self.field(port).1)))
+        CanClient::join(Box::new(self.socket(self.field(port))))
     }
 
     #[track_caller]
@@ -116,10 +116,10 @@ impl Wires {
         self.listens[port]
     }
 
-    /// How the port does, by this log.
+    /// Counters of a port, from this log.
     #[track_caller]
     pub(crate) fn port(&self, log: &str, port: &str) -> PortStatus {
-        port_status(log, self.field(port).0)
+        port_status(log, port)
     }
 }
 
@@ -279,8 +279,7 @@ fn link_status(log: &str, link: Link<'_>) -> LinkStatus {
         Link::State => "state",
         Link::Modbus => "modbus",
         Link::Udp2011 => "udp2011",
-        Link::TcpListen(_) => "tcp-listen",
-        Link::UdpListen(_) => "udp-listen",
+        Link::TcpListen(port) | Link::UdpListen(port) => port,
     };
     let mut status = LinkStatus::default();
     for line in log.lines() {
@@ -293,9 +292,9 @@ fn link_status(log: &str, link: Link<'_>) -> LinkStatus {
     status
 }
 
-/// From the newest line `port NUMBER: in FRAMES frames, BYTES bytes; out ...` of a log.
-fn port_status(log: &str, number: usize) -> PortStatus {
-    let start = format!("port {number}: in ");
+/// From the newest line `port NAME: in FRAMES frames, BYTES bytes; out ...` of a log.
+fn port_status(log: &str, name: &str) -> PortStatus {
+    let start = format!("port {name}: in ");
     // The newest line may not be whole yet.
     let whole = log.split_inclusive('\n').filter(|line| line.ends_with('\n'));
     let Some(said) = whole.filter_map(|line| line.split_once(&start)).next_back() else {

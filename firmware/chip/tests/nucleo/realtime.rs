@@ -185,7 +185,7 @@ fn a_line_has_its_speed_and_virtual_time_is_never_ahead() {
 #[ignore = "needs CHIP_UNICORN and CHIP_ELF"]
 fn clients_acknowledge_and_hear_each_other() {
     let board = Board::start();
-    board.until_log("not acknowledged by any node");
+    board.until_log("frames are not acknowledged by any node");
     let mut clients = [board.connect("bus"), board.connect("bus")];
     for client in &mut clients {
         client.write_all(b"O\r").unwrap();
