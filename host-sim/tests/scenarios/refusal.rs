@@ -36,7 +36,7 @@ fn refused(case: &Case, spoil: Spoil) {
     let expected: &[&str] = match spoil {
         Spoil::Damaged => &["unknown key", "damaged"],
         Spoil::Cut => &["spoilt.toml", "cut", BEHIND_THE_END],
-        Spoil::Missing => &["No such file", "cannot be read", ERASED],
+        Spoil::Missing => &["No such file", "cannot read", ERASED],
         Spoil::NoDevice => &["port line-3 needs exactly one device", "this board has 2 RS-485 ports"],
     };
     assert!(expected.iter().any(|words| reason.contains(words)), "{spoil:?}: {reason}");
