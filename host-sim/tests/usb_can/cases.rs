@@ -61,7 +61,7 @@ fn works() {
 fn another_bit_rate() {
     let adapter = Adapter::up(250_000);
     let cell = Cell::system();
-    let warning = until("a warning", || cell.gateway.log("another bit rate").pop());
+    let warning = until("a warning", || cell.gateway.log("different bit rates").pop());
     assert!(warning.contains("bitrate=250000 configured=500000"), "{warning}");
     serves(&adapter, &cell.robot, 1);
     cell.end();
