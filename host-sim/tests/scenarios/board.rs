@@ -98,7 +98,7 @@ impl Wires {
 
     #[track_caller]
     fn field(&self, port: &str) -> &'static str {
-        *self.ports.get(port).unwrap_or_else(|| panic!("no port {port}"))
+        self.ports.get(port).unwrap_or_else(|| panic!("no port {port}"))
     }
 
     #[track_caller]
