@@ -219,7 +219,7 @@ fn a_task_that_hangs_is_named_and_then_the_machine_is_reset() {
     let (status, log) = Machine::start(nothing(), "stall", &["-no-reboot"]).end();
     assert_said(
         &log,
-        &["nothing runs", "task board 0 does not answer", "the watchdog was not fed", "no task was running"],
+        &["nothing runs", "task board 0 does not respond", "the watchdog was not fed", "no task was running"],
     );
     // QEMU ends in place of a reset.
     assert_eq!(status.code(), Some(0));
