@@ -115,12 +115,6 @@ impl Wires {
     pub(crate) fn listens(&self, port: &str) -> SocketAddr {
         self.listens[port]
     }
-
-    /// Counters of a port, from this log.
-    #[track_caller]
-    pub(crate) fn port(&self, log: &str, port: &str) -> PortStatus {
-        port_status(log, port)
-    }
 }
 
 /// What runs a board's firmware: a gateway that says what it does in its log.
@@ -172,7 +166,7 @@ impl<M: Machine> Gateway for M {
     }
 
     fn port(&self, port: &str) -> PortStatus {
-        self.wires().port(&self.log(), port)
+        port_status(&self.log(), port)
     }
 
     #[track_caller]
