@@ -172,7 +172,7 @@ impl FieldPort {
         now: Instant,
     ) {
         tap.record(|| came(self.id, now, Err(Rejection::Asleep), can_id, [bytes, &[], &[]]));
-        self.last_rejection = Some(LastRejection::new(now, Rejection::Asleep, can_id, bytes));
+        keep(&mut self.last_rejection, Rejection::Asleep, can_id, bytes, now);
         add(&mut self.counters.bytes_in, bytes.len());
         bump(&mut self.counters.asleep);
         if let Codec::Stream { input: Some(_), .. } = &self.codec {
@@ -205,7 +205,7 @@ impl FieldPort {
         let Some(layout) = input else {
             bump(&mut self.counters.rejected_no_input);
             tap.record(|| came(self.id, now, Err(Rejection::NoInput), None, [bytes, &[], &[]]));
-            self.last_rejection = Some(LastRejection::new(now, Rejection::NoInput, None, bytes));
+            keep(&mut self.last_rejection, Rejection::NoInput, None, bytes, now);
             return accepted;
         };
         let mut frames = Frames {
@@ -229,7 +229,7 @@ impl FieldPort {
                         break;
                     }
                 }
-                Err(why) => keep(&mut self.last_rejection, why, payload, now),
+                Err(why) => keep(&mut self.last_rejection, why, None, payload, now),
             }
         }
         *rest = left;
@@ -263,17 +263,11 @@ impl FieldPort {
                 tap.record(|| came(self.id, now, Err(why), Some(frame.id()), [frame.data(), &[], &[]]));
                 // On a shared bus, frames for others are no news.
                 if why != Rejection::ForeignId || self.last_rejection.is_none() {
-                    self.reject(why, Some(frame.id()), frame.data(), now);
+                    keep(&mut self.last_rejection, why, Some(frame.id()), frame.data(), now);
                 }
                 Accepted::default()
             }
         }
-    }
-
-    #[cold]
-    #[inline(never)]
-    fn reject(&mut self, why: Rejection, can_id: Option<CanId>, bytes: &[u8], now: Instant) {
-        self.last_rejection = Some(LastRejection::new(now, why, can_id, bytes));
     }
 
     #[inline(always)]
@@ -366,7 +360,7 @@ impl FieldPort {
         let (first, second) = deframer.held();
         if !first.is_empty() {
             tap.record(|| came(self.id, now, Err(Rejection::Partial), None, [first, second, &[]]));
-            self.last_rejection = Some(LastRejection::new(now, Rejection::Partial, None, first));
+            keep(&mut self.last_rejection, Rejection::Partial, None, first, now);
         }
         let dropped = deframer.discard();
         add(&mut self.counters.discarded_bytes, dropped);
@@ -399,8 +393,8 @@ impl FieldPort {
 
 #[cold]
 #[inline(never)]
-fn keep(last: &mut Option<LastRejection>, why: Rejection, bytes: &[u8], now: Instant) {
-    *last = Some(LastRejection::new(now, why, None, bytes));
+fn keep(last: &mut Option<LastRejection>, why: Rejection, can_id: Option<CanId>, bytes: &[u8], now: Instant) {
+    *last = Some(LastRejection::new(now, why, can_id, bytes));
 }
 
 /// Input from a field port's device, for the tap.
