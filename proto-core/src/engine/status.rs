@@ -146,7 +146,7 @@ impl<'a> Status<'a> {
     pub fn controller(&self) -> Option<ControllerStatus> {
         let link = self.links.state?;
         let at = self.image.stamp_of(link.group)?;
-        let states = States::from_codes(link.codes, &link.dialect);
+        let states = link.dialect.states(link.codes);
         Some(ControllerStatus { states, age: self.at.saturating_since(at) })
     }
 

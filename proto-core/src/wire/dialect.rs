@@ -4,7 +4,7 @@
 //! In: a version's name. Out: a [`Dialect`], a plain struct of choices. Nothing here looks at a
 //! connection: a dialect is configured, never guessed from the controller's answers.
 
-use super::state::codes::{OperationMode, RobotState, SafetyState};
+use super::state::codes::{OperationMode, ProgramState, RobotState, SafetyState, States};
 
 /// What ends a text on port 2000.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -181,6 +181,16 @@ impl Dialect {
     /// The dialect with this name.
     pub fn named(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|dialect| dialect.name == name)
+    }
+
+    /// The states with these codes of mode, robot, program and safety.
+    pub fn states(&self, [mode, robot, program, safety]: [u8; 4]) -> States {
+        States {
+            mode: OperationMode::from_code(mode),
+            robot: self.robot_state(robot),
+            program: ProgramState::from_code(program),
+            safety: self.safety_state(safety),
+        }
     }
 
     /// The robot state for `code` in this version.

@@ -1,8 +1,6 @@
 //! The four state machines' codes (docs/wire/state.md section 4): the same numbers in the state
 //! packet, in Modbus holding registers 0..=3 and in the reply to `state`.
 
-use crate::wire::dialect::Dialect;
-
 /// An enum of codes with a place for the unknown ones, both directions from one table.
 macro_rules! codes {
     ($(#[$meta:meta])* $name:ident { $($(#[$doc:meta])* $code:literal = $variant:ident,)* } $(also { $($(#[$also_doc:meta])* $also_code:literal = $also:ident,)* })?) => {
@@ -147,18 +145,6 @@ pub struct States {
     pub program: ProgramState,
     /// Safety state.
     pub safety: SafetyState,
-}
-
-impl States {
-    /// The states with the codes of mode, robot, program and safety, as `dialect` numbers them.
-    pub fn from_codes([mode, robot, program, safety]: [u8; 4], dialect: &Dialect) -> Self {
-        Self {
-            mode: OperationMode::from_code(mode),
-            robot: dialect.robot_state(robot),
-            program: ProgramState::from_code(program),
-            safety: dialect.safety_state(safety),
-        }
-    }
 }
 
 #[cfg(test)]

@@ -70,7 +70,7 @@ impl<'a> StateView<'a> {
 
     /// The four state machines, as `dialect` numbers them.
     pub fn states(&self, dialect: &Dialect) -> States {
-        States::from_codes(self.state_codes(), dialect)
+        dialect.states(self.state_codes())
     }
 
     /// The global speed in percent, if the dialect's controller sends it.
