@@ -217,7 +217,7 @@ pub(crate) fn saturate_to_field(ty: ScalarType, value: f64, scale: f32, offset: 
 }
 
 /// To the nearest integer, halves away from zero; `core` has no `round`.
-fn round(value: f64) -> f64 {
+pub(crate) fn round(value: f64) -> f64 {
     // Beyond 2^52 every binary64 is an integer, and the cast below would saturate.
     if !(-4.5e15..=4.5e15).contains(&value) {
         return value;

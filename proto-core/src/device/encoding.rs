@@ -1,0 +1,406 @@
+//! How one field of a device's frame is written: numbers in any byte order, bits, BCD, digits.
+//!
+//! In: the field's bytes, or a number. Out: the other. Does not know where in a frame the field is,
+//! nor what its value is for.
+
+use core::fmt;
+
+use super::order::ByteOrder;
+use crate::image::round;
+use crate::wire::scalar::{Scalar, ScalarType};
+
+/// Maximum number of characters of a number in digits, sign and point included.
+pub const MAX_DIGITS: usize = 16;
+
+/// How a field is written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct Encoding {
+    /// What the bytes mean.
+    pub kind: Kind,
+    /// Their order. Digits are read from left to right, whatever it is.
+    pub order: ByteOrder,
+}
+
+/// What the bytes of a field mean.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[non_exhaustive]
+pub enum Kind {
+    /// One of the recipes' own types.
+    Scalar(ScalarType),
+    /// Unsigned, three bytes.
+    Uint24,
+    /// Signed, three bytes, two's complement.
+    Int24,
+    /// Packed decimal digits, two a byte.
+    Bcd {
+        /// Number of bytes, 1..=4.
+        bytes: u8,
+    },
+    /// Decimal digits in ASCII, with a sign if negative.
+    Decimal(Digits),
+    /// Hexadecimal digits in ASCII, at most eight; written in capitals.
+    Hex(Width),
+    /// Some bits of an unsigned number.
+    Bits(Bits),
+}
+
+/// A decimal number in ASCII.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct Digits {
+    /// Number of characters.
+    pub width: Width,
+    /// Number of digits that are written behind a point; 0 writes no point. What is read may have a
+    /// point or not.
+    pub decimals: u8,
+}
+
+/// Number of characters of a field.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub enum Width {
+    /// Always so many, 1..=16; written with leading zeros.
+    Fixed(u8),
+    /// As many as there are before this byte, which follows the field; at most 16.
+    Until(u8),
+}
+
+/// Bits of a number of 8, 16 or 32 bits; the lowest is bit 0.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct Bits {
+    /// Bytes of the number: 1, 2 or 4.
+    pub bytes: u8,
+    /// The lowest of the bits.
+    pub first: u8,
+    /// Number of bits.
+    pub count: u8,
+    /// The highest of them is a sign.
+    pub signed: bool,
+    /// They are bits of the same number as those of the field before.
+    pub shared: bool,
+}
+
+/// Why the bytes of a field are not a value.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[non_exhaustive]
+pub enum Unreadable {
+    /// Too few or too many bytes.
+    Length,
+    /// A character or half byte that is not a digit.
+    NotADigit,
+    /// More digits than the number can have.
+    TooLarge,
+}
+
+impl fmt::Display for Unreadable {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Length => "the field has too few or too many bytes",
+            Self::NotADigit => "the field has a character that is not a digit",
+            Self::TooLarge => "the field has too many digits",
+        })
+    }
+}
+
+impl core::error::Error for Unreadable {}
+
+/// What becomes of a number that a field or a variable cannot hold.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub enum Overflow {
+    /// A received frame with it is rejected; a sent one has the nearest number.
+    #[default]
+    Usual,
+    /// It wraps around, as a counter does. Integers only.
+    Wrap,
+}
+
+impl Encoding {
+    /// A value of this type, lowest byte first: as recipes have it.
+    pub const fn scalar(ty: ScalarType) -> Self {
+        Self { kind: Kind::Scalar(ty), order: ByteOrder::Little }
+    }
+
+    /// Number of bytes in the frame, the byte that ends the field not included; `None` if it varies.
+    pub const fn size(&self) -> Option<usize> {
+        Some(match self.kind {
+            Kind::Scalar(ty) => ty.size(),
+            Kind::Uint24 | Kind::Int24 => 3,
+            Kind::Bcd { bytes } | Kind::Bits(Bits { bytes, .. }) => bytes as usize,
+            Kind::Decimal(Digits { width: Width::Fixed(width), .. }) | Kind::Hex(Width::Fixed(width)) => {
+                width as usize
+            }
+            Kind::Decimal(_) | Kind::Hex(_) => return None,
+        })
+    }
+
+    /// The byte that ends the field, if its length varies.
+    pub const fn until(&self) -> Option<u8> {
+        match self.kind {
+            Kind::Decimal(Digits { width: Width::Until(end), .. }) | Kind::Hex(Width::Until(end)) => {
+                Some(end)
+            }
+            _ => None,
+        }
+    }
+
+    /// Whether all values are integers.
+    pub const fn is_integer(&self) -> bool {
+        match self.kind {
+            Kind::Scalar(ty) => !matches!(ty, ScalarType::Float | ScalarType::Double),
+            Kind::Decimal(Digits { decimals, .. }) => decimals == 0,
+            Kind::Uint24 | Kind::Int24 | Kind::Bcd { .. } | Kind::Hex(_) | Kind::Bits(_) => true,
+        }
+    }
+
+    /// The smallest and the largest number that can be written.
+    pub fn range(&self) -> (f64, f64) {
+        match self.kind {
+            Kind::Scalar(ty) => ty.range(),
+            Kind::Uint24 => (0.0, f64::from(0x00FF_FFFF)),
+            Kind::Int24 => (f64::from(-0x0080_0000), f64::from(0x007F_FFFF)),
+            Kind::Bcd { bytes } => (0.0, power_of_ten(bytes.saturating_mul(2)) - 1.0),
+            Kind::Hex(Width::Fixed(width)) => (0.0, mask(width.saturating_mul(4)) as f64),
+            Kind::Hex(Width::Until(_)) => (0.0, f64::from(u32::MAX)),
+            Kind::Bits(bits) if bits.signed => {
+                let half = mask(bits.count.saturating_sub(1)) as f64;
+                (-half - 1.0, half)
+            }
+            Kind::Bits(bits) => (0.0, mask(bits.count) as f64),
+            Kind::Decimal(Digits { width, decimals }) => {
+                let width = match width {
+                    Width::Fixed(width) => width.min(MAX_DIGITS as u8),
+                    Width::Until(_) => MAX_DIGITS as u8,
+                };
+                let point = if decimals == 0 { 0 } else { decimals.saturating_add(1) };
+                let unit = power_of_ten(decimals);
+                // Sixteen digits are more than a binary64 keeps apart.
+                let digits = width.saturating_sub(point).saturating_add(decimals);
+                let most = |digits: u8| (power_of_ten(digits.min(15)) - 1.0) / unit;
+                (-most(digits.saturating_sub(1)), most(digits))
+            }
+        }
+    }
+
+    /// The number that is written for `value`: rounded, and inside the range. `None` if it is not a
+    /// number, or if a value that should wrap has more than 53 bits.
+    pub fn fit(&self, value: f64, overflow: Overflow) -> Option<f64> {
+        let (low, high) = self.range();
+        if value.is_nan() {
+            return None;
+        }
+        let value = if self.is_integer() { round(value) } else { value };
+        match overflow {
+            Overflow::Wrap if self.is_integer() => wrap(value, low, high),
+            _ if value < low => Some(low),
+            _ if value > high => Some(high),
+            _ => Some(value),
+        }
+    }
+
+    /// The value of a field's bytes, without the byte that ends it. A float may be infinite or not a
+    /// number.
+    ///
+    /// # Errors
+    /// [`Unreadable`]: another length, or something that is not a digit.
+    pub fn read(&self, bytes: &[u8]) -> Result<Scalar, Unreadable> {
+        if self.size().is_some_and(|len| len != bytes.len()) {
+            return Err(Unreadable::Length);
+        }
+        let raw = || self.order.read(bytes);
+        Ok(match self.kind {
+            Kind::Scalar(ty) => scalar(ty, raw()),
+            Kind::Uint24 => Scalar::Dword(raw() as u32),
+            Kind::Int24 => Scalar::Int(sign_extended(raw() as u32, 24)),
+            Kind::Bits(bits) => {
+                let value = (raw() as u32).unbounded_shr(u32::from(bits.first)) & mask(bits.count);
+                if bits.signed { Scalar::Int(sign_extended(value, bits.count)) } else { Scalar::Dword(value) }
+            }
+            Kind::Bcd { bytes } => {
+                let raw = raw();
+                let mut value = 0_u32;
+                for digit in (0..u32::from(bytes).saturating_mul(2)).rev() {
+                    let digit = raw.unbounded_shr(digit.saturating_mul(4)) as u32 & 0xF;
+                    if digit > 9 {
+                        return Err(Unreadable::NotADigit);
+                    }
+                    value = value.wrapping_mul(10).wrapping_add(digit);
+                }
+                Scalar::Dword(value)
+            }
+            Kind::Hex(_) => Scalar::Dword(read_hex(bytes)?),
+            Kind::Decimal(_) => read_decimal(bytes)?,
+        })
+    }
+
+    /// Writes `value`, which [`Self::fit`] gave, to the front of `out`, and returns the number of
+    /// bytes; the byte that ends the field is the caller's. Bits are added to those that are there.
+    /// `None`, with nothing written, if `out` is too short.
+    pub fn write(&self, value: f64, out: &mut [u8]) -> Option<usize> {
+        let len = self.size().unwrap_or(0);
+        let raw = match self.kind {
+            Kind::Scalar(ScalarType::Float) => u64::from((value as f32).to_bits()),
+            Kind::Scalar(ScalarType::Double) => value.to_bits(),
+            Kind::Scalar(_) | Kind::Uint24 | Kind::Int24 => value as i64 as u64,
+            Kind::Bits(bits) => {
+                let field = out.get(..len)?;
+                let value = (value as i64 as u32 & mask(bits.count)).unbounded_shl(u32::from(bits.first));
+                self.order.read(field) | u64::from(value)
+            }
+            Kind::Bcd { bytes } => {
+                let digits = u32::from(bytes).saturating_mul(2);
+                let (_, raw) = (0..digits).fold((value as u32, 0_u64), |(left, raw), digit| {
+                    let next = u64::from(left % 10).unbounded_shl(digit.saturating_mul(4));
+                    (left / 10, raw | next)
+                });
+                raw
+            }
+            Kind::Hex(width) => return write_digits(value as i64, 16, width, 0, out),
+            Kind::Decimal(Digits { width, decimals }) => {
+                let scaled = round(value * power_of_ten(decimals));
+                return write_digits(scaled as i64, 10, width, decimals, out);
+            }
+        };
+        self.order.write(raw, out.get_mut(..len)?);
+        Some(len)
+    }
+}
+
+/// The lowest `bits` bits.
+const fn mask(bits: u8) -> u32 {
+    u32::MAX.unbounded_shr(32_u32.saturating_sub(bits as u32))
+}
+
+fn sign_extended(value: u32, bits: u8) -> i32 {
+    let unused = 32_u32.saturating_sub(u32::from(bits));
+    value.unbounded_shl(unused).cast_signed().unbounded_shr(unused)
+}
+
+fn power_of_ten(power: u8) -> f64 {
+    (0..power).fold(1.0, |product, _| product * 10.0)
+}
+
+fn scalar(ty: ScalarType, raw: u64) -> Scalar {
+    match ty {
+        ScalarType::Byte => Scalar::Byte(raw as u8),
+        ScalarType::Char => Scalar::Char(raw as i8),
+        ScalarType::Word => Scalar::Word(raw as u16),
+        ScalarType::Short => Scalar::Short(raw as i16),
+        ScalarType::Dword => Scalar::Dword(raw as u32),
+        ScalarType::Int => Scalar::Int(raw as i32),
+        ScalarType::Float => Scalar::Float(f32::from_bits(raw as u32)),
+        ScalarType::Double => Scalar::Double(f64::from_bits(raw)),
+    }
+}
+
+/// An integer, or an infinite number, into a range of integers: around and around.
+pub(crate) fn wrap(value: f64, low: f64, high: f64) -> Option<f64> {
+    // Beyond, a binary64 does not tell neighbouring integers apart.
+    if !(-9.0e15..=9.0e15).contains(&value) {
+        return None;
+    }
+    let span = (high - low) as i64;
+    let above = (value - low) as i64;
+    above.checked_rem_euclid(span.saturating_add(1)).map(|above| above as f64 + low)
+}
+
+fn read_hex(bytes: &[u8]) -> Result<u32, Unreadable> {
+    if bytes.is_empty() {
+        return Err(Unreadable::Length);
+    }
+    bytes.iter().try_fold(0_u32, |value, &digit| {
+        let digit = (digit as char).to_digit(16).ok_or(Unreadable::NotADigit)?;
+        let shifted = value.checked_mul(16).ok_or(Unreadable::TooLarge)?;
+        Ok(shifted | digit)
+    })
+}
+
+/// Blanks before the number, a sign, digits, and perhaps a point with digits behind it.
+fn read_decimal(bytes: &[u8]) -> Result<Scalar, Unreadable> {
+    let bytes = bytes.trim_ascii_start();
+    let (negative, digits) = match bytes {
+        [b'-', digits @ ..] => (true, digits),
+        [b'+', digits @ ..] => (false, digits),
+        digits => (false, digits),
+    };
+    // Scales put blanks between the sign and the number.
+    let digits = digits.trim_ascii();
+    let (mut value, mut decimals, mut count, mut has_point) = (0_u64, 0_u8, 0_u8, false);
+    for &byte in digits {
+        match byte {
+            b'.' if !has_point => has_point = true,
+            b'0'..=b'9' => {
+                let digit = u64::from(byte.wrapping_sub(b'0'));
+                value = value
+                    .checked_mul(10)
+                    .and_then(|value| value.checked_add(digit))
+                    .ok_or(Unreadable::TooLarge)?;
+                decimals = decimals.saturating_add(u8::from(has_point));
+                count = count.saturating_add(1);
+            }
+            _ => return Err(Unreadable::NotADigit),
+        }
+    }
+    if count == 0 {
+        return Err(Unreadable::NotADigit);
+    }
+    // A binary64 keeps all integers below apart.
+    if value >= 1 << 53 {
+        return Err(Unreadable::TooLarge);
+    }
+    let signed = if negative { -(value as f64) } else { value as f64 };
+    Ok(match i32::try_from(value) {
+        Ok(_) if decimals == 0 => Scalar::Int(signed as i32),
+        _ => Scalar::Double(signed / power_of_ten(decimals)),
+    })
+}
+
+fn write_digits(value: i64, base: u64, width: Width, decimals: u8, out: &mut [u8]) -> Option<usize> {
+    let mut digits = [b'0'; MAX_DIGITS];
+    let mut left = value.unsigned_abs();
+    let mut used = 0_usize;
+    let sign = usize::from(value < 0);
+    let least = match width {
+        Width::Fixed(width) => usize::from(width),
+        // A digit before the point.
+        Width::Until(_) if decimals > 0 => usize::from(decimals).saturating_add(2).saturating_add(sign),
+        Width::Until(_) => sign.saturating_add(1),
+    };
+    for at in (0..MAX_DIGITS).rev() {
+        let is_point = decimals > 0 && used == usize::from(decimals);
+        if left == 0 && used.saturating_add(sign) >= least && !is_point {
+            break;
+        }
+        let slot = digits.get_mut(at)?;
+        if is_point {
+            *slot = b'.';
+        } else {
+            let digit = left.checked_rem(base)? as u32;
+            *slot = char::from_digit(digit, 16)?.to_ascii_uppercase() as u8;
+            left = left.checked_div(base)?;
+        }
+        used = used.saturating_add(1);
+    }
+    if value < 0 {
+        *digits.get_mut(MAX_DIGITS.saturating_sub(used).checked_sub(1)?)? = b'-';
+        used = used.saturating_add(1);
+    }
+    let text = digits.get(MAX_DIGITS.saturating_sub(used)..)?;
+    for (slot, &digit) in out.get_mut(..used)?.iter_mut().zip(text) {
+        *slot = digit;
+    }
+    Some(used)
+}
+
+#[cfg(test)]
+mod tests;

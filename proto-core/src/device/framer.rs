@@ -1,0 +1,192 @@
+//! Finds a device's frames in a stream of bytes.
+//!
+//! In: chunks of any size, and a probe that says what bytes are ([`FrameLayout::probe`] of one or
+//! several layouts). Out: frames, good or with a wrong checksum, and counts of everything else. The
+//! caller knows when the line was silent for too long, and calls [`Framer::discard`].
+//!
+//! After a broken frame one byte is dropped, never a frame's worth, so that a frame inside it is
+//! still found. To look closely at each byte of a stream of false beginnings would be endless work;
+//! beyond [`EFFORT`] steps for each byte received, bytes are dropped unseen.
+//!
+//! [`FrameLayout::probe`]: super::FrameLayout::probe
+
+use super::layout::Probe;
+use crate::recipe::model::MAX_STREAM_FRAME;
+
+/// Steps that a received byte pays for; a probe that finds no frame takes `effort` of them.
+const EFFORT: i32 = 16;
+/// Unused steps are kept for a whole frame's worth of bytes.
+const MAX_CREDIT: i32 = EFFORT * MAX_STREAM_FRAME as i32;
+/// Twice the longest frame, so that held bytes move to the front once in a frame's worth of bytes.
+const BUFFER: usize = 2 * MAX_STREAM_FRAME;
+
+/// What was found in the stream.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Found<'a> {
+    /// A frame.
+    Frame(&'a [u8]),
+    /// A frame whose checksum is right and whose constants are another device's.
+    Other(&'a [u8]),
+    /// A frame, where one was expected, whose checksum is wrong.
+    Wrong(&'a [u8]),
+}
+
+/// Counters of a [`Framer`], wrapping.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub struct FramerStats {
+    /// Frames found.
+    pub frames: u32,
+    /// Frames of others.
+    pub others: u32,
+    /// Frames with a wrong checksum, where a frame was expected.
+    pub wrong: u32,
+    /// Bytes that belong to no frame.
+    pub skipped_bytes: u32,
+    /// Bytes of partial frames that [`Framer::discard`] dropped.
+    pub discarded_bytes: u32,
+}
+
+/// Cuts a stream of bytes into frames of any layouts.
+#[derive(Debug, Clone)]
+pub struct Framer {
+    buffer: [u8; BUFFER],
+    start: u16,
+    end: u16,
+    /// How many bytes from the start a frame is expected to begin; `None` if nobody knows.
+    expected: Option<u16>,
+    /// Steps that were paid for; negative after too many.
+    credit: i32,
+    stats: FramerStats,
+}
+
+impl Default for Framer {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl Framer {
+    /// An empty framer; the first byte is expected to begin a frame.
+    pub const fn new() -> Self {
+        let stats = FramerStats { frames: 0, others: 0, wrong: 0, skipped_bytes: 0, discarded_bytes: 0 };
+        Self { buffer: [0; BUFFER], start: 0, end: 0, expected: Some(0), credit: 0, stats }
+    }
+
+    /// The next frame. Takes bytes from the front of `chunk`. Call it again with the rest until it
+    /// returns `None`, even when the rest is empty: frames can be held behind a broken one.
+    ///
+    /// `probe` is always the same between two [`Self::discard`]s, and never asks for more than a
+    /// frame of 512 bytes; `effort` is about how many steps it takes.
+    pub fn next_frame(
+        &mut self,
+        chunk: &mut &[u8],
+        effort: usize,
+        probe: impl Fn(&[u8]) -> Probe,
+    ) -> Option<Found<'_>> {
+        let effort = i32::try_from(effort).unwrap_or(i32::MAX);
+        loop {
+            let missing = match self.held() {
+                [] => 1,
+                held => match probe(held) {
+                    Probe::Partial(missing) => missing,
+                    Probe::Frame(len) => {
+                        self.stats.frames = self.stats.frames.wrapping_add(1);
+                        return Some(Found::Frame(self.take(len)));
+                    }
+                    Probe::Other(len) => {
+                        self.stats.others = self.stats.others.wrapping_add(1);
+                        return Some(Found::Other(self.take(len)));
+                    }
+                    Probe::Wrong(len) if self.expected == Some(0) => {
+                        let at = usize::from(self.start);
+                        self.stats.wrong = self.stats.wrong.wrapping_add(1);
+                        self.skip(effort);
+                        self.expected = Some(len.saturating_sub(1) as u16);
+                        return Some(Found::Wrong(self.buffer.get(at..at.saturating_add(len))?));
+                    }
+                    Probe::No | Probe::Wrong(_) => {
+                        self.skip(effort);
+                        continue;
+                    }
+                },
+            };
+            if chunk.is_empty() {
+                return None;
+            }
+            self.hold(chunk, missing);
+        }
+    }
+
+    /// The bytes of a possible frame.
+    pub fn held(&self) -> &[u8] {
+        self.buffer.get(usize::from(self.start)..usize::from(self.end)).unwrap_or(&[])
+    }
+
+    /// Drops a partial frame, because the line was silent or the layouts changed, and returns its
+    /// number of bytes. What comes next is expected to begin a frame.
+    pub fn discard(&mut self) -> usize {
+        let dropped = self.held().len();
+        self.stats.discarded_bytes = self.stats.discarded_bytes.wrapping_add(dropped as u32);
+        (self.start, self.end, self.expected) = (0, 0, Some(0));
+        dropped
+    }
+
+    /// Counters since the framer was made.
+    pub const fn stats(&self) -> FramerStats {
+        self.stats
+    }
+
+    /// The frame at the start, which is held no longer.
+    fn take(&mut self, len: usize) -> &[u8] {
+        let at = usize::from(self.start);
+        self.start = self.start.saturating_add(len as u16).min(self.end);
+        self.expected = Some(0);
+        self.buffer.get(at..usize::from(self.start)).unwrap_or(&[])
+    }
+
+    /// Drops the byte at the start, and all that there are if the probes have taken too long.
+    fn skip(&mut self, effort: i32) {
+        self.credit = self.credit.saturating_sub(effort);
+        let skipped = if self.credit < 0 { self.end.saturating_sub(self.start) } else { 1 };
+        self.start = self.start.saturating_add(skipped);
+        self.expected = self.expected.and_then(|expected| expected.checked_sub(skipped));
+        self.stats.skipped_bytes = self.stats.skipped_bytes.wrapping_add(u32::from(skipped));
+    }
+
+    /// Holds up to `missing` more bytes.
+    fn hold(&mut self, chunk: &mut &[u8], missing: usize) {
+        if self.start == self.end {
+            (self.start, self.end) = (0, 0);
+        }
+        let more = missing.min(chunk.len()).min(MAX_STREAM_FRAME);
+        if usize::from(self.end).saturating_add(more) > BUFFER {
+            self.move_to_front();
+        }
+        let (more, rest) = chunk.split_at_checked(more).unwrap_or((&[], chunk));
+        let room = self.buffer.get_mut(usize::from(self.end)..).unwrap_or(&mut []);
+        for (slot, &byte) in room.iter_mut().zip(more) {
+            *slot = byte;
+        }
+        self.end = self.end.saturating_add(more.len() as u16).min(BUFFER as u16);
+        let paid = (more.len() as i32).saturating_mul(EFFORT);
+        self.credit = self.credit.saturating_add(paid).min(MAX_CREDIT);
+        *chunk = rest;
+    }
+
+    #[cold]
+    fn move_to_front(&mut self) {
+        let start = usize::from(self.start);
+        let held = usize::from(self.end).saturating_sub(start);
+        for at in 0..held {
+            let byte = self.buffer.get(start.saturating_add(at)).copied().unwrap_or(0);
+            if let Some(slot) = self.buffer.get_mut(at) {
+                *slot = byte;
+            }
+        }
+        (self.start, self.end) = (0, held as u16);
+    }
+}
+
+#[cfg(test)]
+mod tests;

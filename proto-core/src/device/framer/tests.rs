@@ -1,0 +1,187 @@
+use std::vec;
+use std::vec::Vec;
+
+use proptest::prelude::*;
+
+use super::super::{Algorithm, Carrier, Checksum, Element, Encoding, FrameLayout};
+use super::*;
+use crate::wire::scalar::ScalarType;
+
+fn byte() -> Element {
+    Element::Value(Encoding::scalar(ScalarType::Byte))
+}
+
+/// A head of one byte, two bytes of values, CRC-16/MODBUS: frames of five bytes.
+fn small() -> (Vec<Element>, FrameLayout) {
+    let elements = vec![byte(), byte()];
+    let checksum = Checksum::standard(Algorithm::named("crc16-modbus").unwrap());
+    let layout = FrameLayout::new(Carrier::Stream, &[0xAA], &[], &elements, Some(checksum)).unwrap();
+    (elements, layout)
+}
+
+fn frame(values: [u8; 2]) -> Vec<u8> {
+    let (elements, layout) = small();
+    let mut out = [0; 16];
+    let number = |nth: usize| (f64::from(values[nth]), super::super::Overflow::Usual);
+    let len = layout.encode(&elements, number, &mut out).unwrap();
+    out[..len].to_vec()
+}
+
+#[derive(Debug, Clone, PartialEq)]
+enum Event {
+    Frame(Vec<u8>),
+    Other(Vec<u8>),
+    Wrong(Vec<u8>),
+}
+
+fn run(framer: &mut Framer, chunks: &[&[u8]]) -> Vec<Event> {
+    let (elements, layout) = small();
+    let mut events = Vec::new();
+    for chunk in chunks {
+        let mut rest = *chunk;
+        while let Some(found) = framer.next_frame(&mut rest, 8, |bytes| layout.probe(&elements, bytes)) {
+            events.push(match found {
+                Found::Frame(bytes) => Event::Frame(bytes.to_vec()),
+                Found::Other(bytes) => Event::Other(bytes.to_vec()),
+                Found::Wrong(bytes) => Event::Wrong(bytes.to_vec()),
+            });
+        }
+        assert!(rest.is_empty());
+    }
+    events
+}
+
+#[test]
+fn frames_are_found_however_they_are_cut() {
+    let stream: Vec<u8> = [frame([1, 2]), vec![0x55], frame([0xAA, 0xAA]), frame([3, 4])].concat();
+    for cut in 0..stream.len() {
+        let mut framer = Framer::new();
+        let (first, second) = stream.split_at(cut);
+        let events = run(&mut framer, &[first, second]);
+        let expected = [frame([1, 2]), frame([0xAA, 0xAA]), frame([3, 4])].map(Event::Frame);
+        assert_eq!(events, expected, "cut at {cut}");
+        assert_eq!((framer.stats().skipped_bytes, framer.stats().wrong), (1, 0));
+    }
+}
+
+#[test]
+fn a_wrong_checksum_is_told_once_and_the_next_frame_is_taken() {
+    let mut broken = frame([0xAA, 7]);
+    broken[2] ^= 1;
+    let mut framer = Framer::new();
+    let events = run(&mut framer, &[&[broken.clone(), broken.clone(), frame([1, 2])].concat()]);
+    // The false beginning inside, a value that looks like a head, is not told.
+    let expected = [Event::Wrong(broken.clone()), Event::Wrong(broken), Event::Frame(frame([1, 2]))];
+    assert_eq!(events, expected);
+    let stats = framer.stats();
+    assert_eq!((stats.frames, stats.wrong, stats.skipped_bytes), (1, 2, 10));
+}
+
+#[test]
+fn a_frame_inside_a_broken_one_is_found() {
+    // A byte was lost, so the next frame begins where this one should end.
+    let stream = [&frame([1, 2])[..4], &frame([3, 4])[..]].concat();
+    let events = run(&mut Framer::new(), &[&stream]);
+    assert_eq!(events.last(), Some(&Event::Frame(frame([3, 4]))));
+}
+
+#[test]
+fn silence_discards_what_is_partial() {
+    let mut framer = Framer::new();
+    assert_eq!(run(&mut framer, &[&frame([1, 2])[..3]]), []);
+    assert_eq!(framer.discard(), 3);
+    assert_eq!(run(&mut framer, &[&frame([3, 4])]), [Event::Frame(frame([3, 4]))]);
+    assert_eq!(framer.stats().discarded_bytes, 3);
+}
+
+#[test]
+fn endless_false_beginnings_cost_bounded_work() {
+    let elements = vec![byte(); 100];
+    let checksum = Checksum::standard(Algorithm::named("crc32").unwrap());
+    let layout = FrameLayout::new(Carrier::Stream, &[0xAA], &[], &elements, Some(checksum)).unwrap();
+    let effort = elements.len() + layout.lengths().1;
+    let (mut framer, mut probes) = (Framer::new(), std::cell::Cell::new(0_usize));
+    let stream = vec![0xAA; 100_000];
+    let mut rest = stream.as_slice();
+    let probe = |bytes: &[u8]| {
+        let found = layout.probe(&elements, bytes);
+        if !matches!(found, Probe::Partial(_)) {
+            probes.set(probes.get() + 1);
+        }
+        found
+    };
+    while framer.next_frame(&mut rest, effort, probe).is_some() {}
+    let steps = *probes.get_mut() * effort;
+    assert!(steps <= stream.len() * EFFORT as usize + effort, "{steps} steps");
+    // And a good frame after a pause is taken.
+    framer.discard();
+    let mut out = [0; 512];
+    let zero = |_: usize| (0.0, super::super::Overflow::Usual);
+    let len = layout.encode(&elements, zero, &mut out).unwrap();
+    let mut rest = &out[..len];
+    let found = framer.next_frame(&mut rest, effort, |bytes| layout.probe(&elements, bytes));
+    assert_eq!(found, Some(Found::Frame(&out[..len])));
+}
+
+/// What a reader with all bytes before it would find, a byte at a time.
+fn reference(stream: &[u8]) -> Vec<Vec<u8>> {
+    let (elements, layout) = small();
+    let (mut at, mut frames) = (0, Vec::new());
+    while at < stream.len() {
+        match layout.probe(&elements, &stream[at..]) {
+            Probe::Frame(len) => {
+                frames.push(stream[at..at + len].to_vec());
+                at += len;
+            }
+            Probe::Partial(_) => break,
+            Probe::Other(len) => at += len,
+            Probe::No | Probe::Wrong(_) => at += 1,
+        }
+    }
+    frames
+}
+
+fn any_stream() -> impl Strategy<Value = Vec<u8>> {
+    let piece = prop_oneof![
+        4 => any::<[u8; 2]>().prop_map(frame),
+        1 => prop::collection::vec(prop_oneof![Just(0xAA_u8), any::<u8>()], 0..7),
+        1 => (any::<[u8; 2]>(), 0_usize..5, any::<u8>()).prop_map(|(values, at, byte)| {
+            let mut broken = frame(values);
+            broken[at] = byte;
+            broken
+        }),
+    ];
+    prop::collection::vec(piece, 0..30).prop_map(|pieces| pieces.concat())
+}
+
+proptest! {
+    #[test]
+    fn any_stream_gives_the_frames_of_the_slow_reference(
+        stream in any_stream(),
+        sizes in prop::collection::vec(1_usize..20, 1..20),
+    ) {
+        let mut chunks = Vec::new();
+        let mut rest = stream.as_slice();
+        for size in sizes.iter().cycle() {
+            if rest.is_empty() {
+                break;
+            }
+            let (chunk, after) = rest.split_at((*size).min(rest.len()));
+            chunks.push(chunk);
+            rest = after;
+        }
+        let mut framer = Framer::new();
+        let events = run(&mut framer, &chunks);
+        let frames: Vec<Vec<u8>> = events
+            .into_iter()
+            .filter_map(|event| match event {
+                Event::Frame(bytes) => Some(bytes),
+                _ => None,
+            })
+            .collect();
+        prop_assert_eq!(&frames, &reference(&stream));
+        let stats = framer.stats();
+        let accounted = frames.iter().map(Vec::len).sum::<usize>() + stats.skipped_bytes as usize;
+        prop_assert_eq!(accounted + framer.held().len(), stream.len());
+    }
+}

@@ -1,0 +1,664 @@
+//! One frame of a device: head, elements, checksum, tail.
+//!
+//! In: bytes that may begin with such a frame, or the numbers to send. Out: whether and how far they
+//! are one and the values in it, or the frame. The elements stay with the caller, so that the frames
+//! of many devices share one pool; every call takes the ones that [`FrameLayout::new`] checked.
+
+use core::fmt;
+
+use heapless::Vec;
+
+use super::checksum::Algorithm;
+use super::encoding::{Bits, Digits, Encoding, Kind, MAX_DIGITS, Overflow, Unreadable, Width};
+use super::order::ByteOrder;
+use crate::recipe::model::{MAX_DELIMITER, MAX_FIELDS, MAX_STREAM_FRAME};
+use crate::wire::can::MAX_CAN_DATA;
+use crate::wire::scalar::{Scalar, ScalarType};
+
+/// One element of a frame, in the order of the wire.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub enum Element {
+    /// A value.
+    Value(Encoding),
+    /// A value that is always the same: a frame with another one is not this frame.
+    Fixed {
+        /// How it is written.
+        encoding: Encoding,
+        /// The value, an integer.
+        value: i64,
+    },
+    /// Bytes without a meaning: any are accepted.
+    Padding {
+        /// Number of bytes, 1 or more.
+        len: u8,
+        /// What is sent.
+        fill: u8,
+    },
+}
+
+/// The checksum of a frame.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct Checksum {
+    /// How it is computed.
+    pub algorithm: Algorithm,
+    /// The order of its bytes: little or big.
+    pub order: ByteOrder,
+    /// Written as two hexadecimal digits in ASCII for each byte.
+    pub text: bool,
+    /// The first byte of the frame that it covers; 0 is the first of the head.
+    pub first: u16,
+    /// The last one; `None` is the one before the checksum.
+    pub last: Option<u16>,
+    /// Where in the frame it stands; `None` is behind the elements and before the tail.
+    pub at: Option<u16>,
+}
+
+impl Checksum {
+    /// This algorithm as its standard has it: over everything before it, before the tail, in the
+    /// standard's byte order.
+    pub const fn standard(algorithm: Algorithm) -> Self {
+        Self { algorithm, order: algorithm.order(), text: false, first: 0, last: None, at: None }
+    }
+
+    /// Number of bytes in the frame, 1..=8.
+    pub const fn len(&self) -> usize {
+        self.algorithm.len().saturating_mul(if self.text { 2 } else { 1 })
+    }
+
+    /// Whether it has no bytes: never, for a valid algorithm.
+    pub const fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// The bytes it covers, if it stands at `at` itself.
+    fn covered(&self, at: usize) -> core::ops::Range<usize> {
+        let end = self.last.map_or(at, |last| usize::from(last).saturating_add(1));
+        usize::from(self.first)..end
+    }
+
+    /// The bytes that stand for the checksum of `covered`.
+    fn write(&self, covered: &[u8], out: &mut [u8]) {
+        let sum = self.algorithm.of([covered]);
+        let mut bytes = [0; 4];
+        let Some(bytes) = bytes.get_mut(..self.algorithm.len()) else { return };
+        self.order.write(u64::from(sum), bytes);
+        if self.text {
+            for (digits, &byte) in out.chunks_exact_mut(2).zip(&*bytes) {
+                for (digit, half) in digits.iter_mut().zip([byte >> 4, byte & 0xF]) {
+                    *digit = HEX_DIGITS.get(usize::from(half)).copied().unwrap_or(b'0');
+                }
+            }
+        } else {
+            for (slot, &byte) in out.iter_mut().zip(&*bytes) {
+                *slot = byte;
+            }
+        }
+    }
+}
+
+const HEX_DIGITS: [u8; 16] = *b"0123456789ABCDEF";
+
+/// What carries the frames.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum Carrier {
+    /// A stream of bytes, in which frames must be found; at most 512 bytes.
+    Stream,
+    /// CAN frames, which their id tells apart; at most 8 bytes.
+    Can,
+}
+
+/// What bytes are, seen as a frame that begins at the first of them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Probe {
+    /// Not the beginning of a frame.
+    No,
+    /// Perhaps the beginning of one; at least so many more bytes are needed to tell.
+    Partial(usize),
+    /// A frame of so many bytes.
+    Frame(usize),
+    /// A frame of so many bytes with a checksum that is right, and another constant: not for us.
+    Other(usize),
+    /// A frame of so many bytes with a checksum that is wrong.
+    Wrong(usize),
+}
+
+/// A frame, checked and ready to find, decode and encode.
+#[derive(Debug, Clone)]
+pub struct FrameLayout {
+    head: Vec<u8, MAX_DELIMITER>,
+    tail: Vec<u8, MAX_DELIMITER>,
+    checksum: Option<Checksum>,
+    shortest: u16,
+    longest: u16,
+}
+
+/// Why a frame cannot be laid out.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[non_exhaustive]
+pub enum LayoutError {
+    /// The head or the tail has more than 8 bytes.
+    DelimiterTooLong {
+        /// Number of bytes.
+        len: usize,
+    },
+    /// There is no element.
+    Empty,
+    /// There are more than 128 elements.
+    TooManyElements,
+    /// The frame is longer than its carrier allows.
+    TooLong {
+        /// Maximum number of bytes of the frame.
+        len: usize,
+        /// Number of bytes that the carrier allows.
+        room: usize,
+    },
+    /// Nothing tells where a frame begins: no head, no tail, no checksum, no constant.
+    NothingToFind,
+    /// A parameter of an element's encoding is out of range, such as bits that its number does not
+    /// have.
+    Encoding {
+        /// Index of the element.
+        element: u8,
+    },
+    /// The order swaps words, but the element does not consist of whole words.
+    NotWords {
+        /// Index of the element.
+        element: u8,
+    },
+    /// Bits share a number with the element before, which is no bits, or bits of another number, or
+    /// has one of these bits.
+    NotShared {
+        /// Index of the element.
+        element: u8,
+    },
+    /// The constant does not fit in its encoding.
+    Constant {
+        /// Index of the element.
+        element: u8,
+    },
+    /// The parameters are not those of a CRC.
+    Algorithm,
+    /// The checksum's place is inside an element or behind the frame.
+    ChecksumPlace {
+        /// The place.
+        at: u16,
+    },
+    /// The checksum covers nothing, itself, the tail, or bytes behind a field of varying length.
+    ChecksumRange,
+}
+
+impl fmt::Display for LayoutError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match *self {
+            Self::DelimiterTooLong { len } => {
+                write!(f, "{len} bytes of head or tail; at most {MAX_DELIMITER} are allowed")
+            }
+            Self::Empty => f.write_str("the frame has no fields"),
+            Self::TooManyElements => write!(f, "more than {MAX_FIELDS} fields"),
+            Self::TooLong { len, room } => write!(f, "a frame of {len} bytes; at most {room} are allowed"),
+            Self::NothingToFind => {
+                f.write_str("nothing tells where a frame begins: a head, a tail, a checksum or a constant is needed")
+            }
+            Self::Encoding { .. } => f.write_str("the field cannot be written like this"),
+            Self::NotWords { .. } => {
+                f.write_str("an order that swaps words needs a field of whole words: 2, 4 or 8 bytes")
+            }
+            Self::NotShared { .. } => f.write_str(
+                "these bits cannot be in one number with those of the field before: another type or order, or \
+                 the same bits",
+            ),
+            Self::Constant { .. } => f.write_str("the field cannot have this value"),
+            Self::Algorithm => f.write_str("these are not the parameters of a CRC: 1 to 32 bits, no number with more"),
+            Self::ChecksumPlace { at } => {
+                write!(f, "no field ends at byte {at} of the frame, so the checksum cannot stand there")
+            }
+            Self::ChecksumRange => f.write_str(
+                "the checksum must cover bytes of head and fields, and not itself",
+            ),
+        }
+    }
+}
+
+impl core::error::Error for LayoutError {}
+
+impl Element {
+    /// How it is written; `None` for padding.
+    pub const fn encoding(&self) -> Option<Encoding> {
+        match *self {
+            Self::Value(encoding) | Self::Fixed { encoding, .. } => Some(encoding),
+            Self::Padding { .. } => None,
+        }
+    }
+
+    fn bits(&self) -> Option<(Bits, ByteOrder)> {
+        match self.encoding()? {
+            Encoding { kind: Kind::Bits(bits), order } => Some((bits, order)),
+            _ => None,
+        }
+    }
+
+    fn is_shared(&self) -> bool {
+        self.bits().is_some_and(|(bits, _)| bits.shared)
+    }
+
+    /// Number of bytes on the wire; `None` if it varies.
+    fn len(&self) -> Option<usize> {
+        match self {
+            Self::Padding { len, .. } => Some(usize::from(*len)),
+            Self::Value(encoding) | Self::Fixed { encoding, .. } => encoding.size(),
+        }
+    }
+}
+
+/// The places of elements, one after the other.
+struct Places {
+    /// Where the next element begins.
+    at: usize,
+    /// Where the newest number of bits begins.
+    shared_at: usize,
+    /// Where the checksum stands, and its length.
+    checksum_at: Option<usize>,
+    checksum_len: usize,
+    /// An element begins or ends there.
+    has_checksum: bool,
+}
+
+/// Why the place of an element is unknown.
+enum Unplaced {
+    /// The bytes end before it does; at least so many are missing.
+    Partial(usize),
+    /// It is too long.
+    No,
+}
+
+impl Places {
+    fn new(layout: &FrameLayout) -> Self {
+        let at = layout.checksum.and_then(|sum| sum.at).map(usize::from);
+        let mut places = Self {
+            at: layout.head.len(),
+            shared_at: 0,
+            checksum_at: at,
+            checksum_len: layout.checksum.map_or(0, |sum| sum.len()),
+            has_checksum: false,
+        };
+        places.step_over_checksum();
+        places
+    }
+
+    fn step_over_checksum(&mut self) {
+        if self.checksum_at == Some(self.at) {
+            self.has_checksum = true;
+            self.at = self.at.saturating_add(self.checksum_len);
+        }
+    }
+
+    /// The place of the next element, whose length is `len`, with `further` bytes behind it that
+    /// belong to it.
+    fn next(&mut self, element: &Element, len: usize, further: usize) -> core::ops::Range<usize> {
+        if element.is_shared() {
+            return self.shared_at..self.shared_at.saturating_add(len);
+        }
+        let start = self.at;
+        let end = start.saturating_add(len);
+        self.shared_at = start;
+        self.at = end.saturating_add(further);
+        self.step_over_checksum();
+        start..end
+    }
+
+    /// The place of the next element in `bytes`.
+    fn find(&mut self, element: &Element, bytes: &[u8]) -> Result<core::ops::Range<usize>, Unplaced> {
+        let (len, further) = match element.len() {
+            Some(len) => (len, 0),
+            None => {
+                let end = element.encoding().and_then(|encoding| encoding.until()).ok_or(Unplaced::No)?;
+                let rest = bytes.get(self.at..).unwrap_or(&[]);
+                match rest.iter().take(MAX_DIGITS.saturating_add(1)).position(|&byte| byte == end) {
+                    Some(len) => (len, 1),
+                    None if rest.len() > MAX_DIGITS => return Err(Unplaced::No),
+                    None => return Err(Unplaced::Partial(1)),
+                }
+            }
+        };
+        let place = self.next(element, len, further);
+        match place.end.saturating_add(further).checked_sub(bytes.len()) {
+            None | Some(0) => Ok(place),
+            Some(missing) => Err(Unplaced::Partial(missing)),
+        }
+    }
+}
+
+impl FrameLayout {
+    /// Checks a frame.
+    ///
+    /// # Errors
+    /// [`LayoutError`] says which rule is broken, and by which element.
+    pub fn new(
+        carrier: Carrier,
+        head: &[u8],
+        tail: &[u8],
+        elements: &[Element],
+        checksum: Option<Checksum>,
+    ) -> Result<Self, LayoutError> {
+        let delimiter = |bytes: &[u8]| {
+            Vec::from_slice(bytes).map_err(|_| LayoutError::DelimiterTooLong { len: bytes.len() })
+        };
+        let (head, tail) = (delimiter(head)?, delimiter(tail)?);
+        if elements.is_empty() {
+            return Err(LayoutError::Empty);
+        }
+        if elements.len() > MAX_FIELDS {
+            return Err(LayoutError::TooManyElements);
+        }
+        let mut layout = Self { head, tail, checksum, shortest: 0, longest: 0 };
+        check_elements(elements)?;
+        let shortest = layout.length_with(elements, 0);
+        let longest = layout.length_with(elements, MAX_DIGITS);
+        let room = match carrier {
+            Carrier::Stream => MAX_STREAM_FRAME,
+            Carrier::Can => MAX_CAN_DATA,
+        };
+        if longest > room {
+            return Err(LayoutError::TooLong { len: longest, room });
+        }
+        (layout.shortest, layout.longest) = (shortest as u16, longest as u16);
+        layout.check_checksum(elements)?;
+        let has_constant = elements.iter().any(|element| matches!(element, Element::Fixed { .. }));
+        let can_be_found =
+            has_constant || checksum.is_some() || !layout.head.is_empty() || !layout.tail.is_empty();
+        if carrier == Carrier::Stream && !can_be_found {
+            return Err(LayoutError::NothingToFind);
+        }
+        Ok(layout)
+    }
+
+    /// The bytes of the whole frame if every field of varying length has so many.
+    fn length_with(&self, elements: &[Element], varying: usize) -> usize {
+        let mut places = Places::new(self);
+        for element in elements {
+            match element.len() {
+                Some(len) => places.next(element, len, 0),
+                None => places.next(element, varying, 1),
+            };
+        }
+        let behind = match self.checksum {
+            Some(sum) if sum.at.is_none() => sum.len(),
+            _ => 0,
+        };
+        places.at.saturating_add(behind).saturating_add(self.tail.len())
+    }
+
+    fn check_checksum(&self, elements: &[Element]) -> Result<(), LayoutError> {
+        let Some(sum) = self.checksum else { return Ok(()) };
+        if let Algorithm::Crc(crc) = sum.algorithm
+            && !crc.is_valid()
+        {
+            return Err(LayoutError::Algorithm);
+        }
+        if sum.order.swaps_words() {
+            return Err(LayoutError::Algorithm);
+        }
+        // Bytes whose place is the same in every frame.
+        let mut places = Places::new(self);
+        let mut varies = false;
+        for element in elements {
+            match element.len() {
+                Some(len) => places.next(element, len, 0),
+                None => {
+                    varies = true;
+                    break;
+                }
+            };
+        }
+        if let Some(at) = sum.at
+            && !places.has_checksum
+        {
+            return Err(LayoutError::ChecksumPlace { at });
+        }
+        let behind_fields = usize::from(self.shortest).saturating_sub(self.tail.len());
+        let own_place = match sum.at {
+            Some(at) => usize::from(at),
+            None => behind_fields.saturating_sub(sum.len()),
+        };
+        let own = own_place..own_place.saturating_add(sum.len());
+        let covered = sum.covered(own_place);
+        let overlaps = covered.start < own.end && own.start < covered.end;
+        // Behind a field of varying length no byte has a number.
+        let reaches = match sum.last {
+            Some(_) if varies => covered.end <= places.at,
+            _ => covered.end <= behind_fields,
+        };
+        if covered.is_empty() || overlaps || !reaches {
+            return Err(LayoutError::ChecksumRange);
+        }
+        Ok(())
+    }
+
+    /// Minimum and maximum number of bytes of a frame.
+    pub fn lengths(&self) -> (usize, usize) {
+        (usize::from(self.shortest), usize::from(self.longest))
+    }
+
+    /// What `bytes` are, seen as a frame that begins at the first of them.
+    pub fn probe(&self, elements: &[Element], bytes: &[u8]) -> Probe {
+        if self.head.iter().zip(bytes).any(|(expected, byte)| expected != byte) {
+            return Probe::No;
+        }
+        if let Some(missing @ 1..) = usize::from(self.shortest).checked_sub(bytes.len()) {
+            return Probe::Partial(missing);
+        }
+        let mut places = Places::new(self);
+        let mut is_ours = true;
+        for element in elements {
+            let place = match places.find(element, bytes) {
+                Ok(place) => place,
+                Err(Unplaced::Partial(missing)) if is_ours || self.checksum.is_some() => {
+                    return Probe::Partial(missing);
+                }
+                Err(_) => return Probe::No,
+            };
+            if let Element::Fixed { encoding, value } = *element {
+                let field = bytes.get(place).unwrap_or(&[]);
+                is_ours &= encoding.read(field).is_ok_and(|read| read.as_f64() == value as f64);
+            }
+        }
+        let end = places.at;
+        let sum = self.checksum.filter(|sum| sum.at.is_none());
+        let tail_at = end.saturating_add(sum.map_or(0, |sum| sum.len()));
+        let len = tail_at.saturating_add(self.tail.len());
+        let rest = bytes.get(tail_at..).unwrap_or(&[]);
+        if self.tail.iter().zip(rest).any(|(expected, byte)| expected != byte) {
+            return Probe::No;
+        }
+        if let Some(missing @ 1..) = len.checked_sub(bytes.len()) {
+            return Probe::Partial(missing);
+        }
+        match (self.checksum_is_right(bytes, end), is_ours) {
+            (None, false) => Probe::No,
+            (None | Some(true), true) => Probe::Frame(len),
+            (Some(true), false) => Probe::Other(len),
+            (Some(false), _) => Probe::Wrong(len),
+        }
+    }
+
+    /// `None` without a checksum. `end` is where the elements end.
+    fn checksum_is_right(&self, frame: &[u8], end: usize) -> Option<bool> {
+        let sum = self.checksum?;
+        let at = sum.at.map_or(end, usize::from);
+        let found = frame.get(at..at.saturating_add(sum.len())).unwrap_or(&[]);
+        let mut expected = [0; 8];
+        let expected = expected.get_mut(..sum.len())?;
+        sum.write(frame.get(sum.covered(at)).unwrap_or(&[]), expected);
+        Some(if sum.text { found.eq_ignore_ascii_case(expected) } else { found == expected })
+    }
+
+    /// The elements of a frame that [`Self::probe`] found, each with its value; `None` for what is
+    /// not a value.
+    pub fn values<'a>(
+        &self,
+        elements: &'a [Element],
+        frame: &'a [u8],
+    ) -> impl Iterator<Item = Result<Option<Scalar>, Unreadable>> + 'a {
+        let mut places = Places::new(self);
+        elements.iter().map(move |element| {
+            let place = places.find(element, frame).map_err(|_| Unreadable::Length)?;
+            match element {
+                Element::Value(encoding) => encoding.read(frame.get(place).unwrap_or(&[])).map(Some),
+                Element::Fixed { .. } | Element::Padding { .. } => Ok(None),
+            }
+        })
+    }
+
+    /// Writes a frame to the front of `out` and returns its length. `value` is asked for the number
+    /// of each element that is a value, by its index; a number that does not fit becomes the nearest
+    /// that does, or wraps if `value` says so. `None` if there is no such number, or no room.
+    pub fn encode(
+        &self,
+        elements: &[Element],
+        mut value: impl FnMut(usize) -> (f64, Overflow),
+        out: &mut [u8],
+    ) -> Option<usize> {
+        let mut places = Places::new(self);
+        put(out, 0, &self.head)?;
+        for (nth, element) in elements.iter().enumerate() {
+            let at = if element.is_shared() { places.shared_at } else { places.at };
+            let rest = out.get_mut(at..)?;
+            let (encoding, number) = match *element {
+                Element::Padding { len, fill } => {
+                    let len = usize::from(len);
+                    rest.get_mut(..len)?.fill(fill);
+                    places.next(element, len, 0);
+                    continue;
+                }
+                Element::Fixed { encoding, value } => (encoding, value as f64),
+                Element::Value(encoding) => {
+                    let (number, overflow) = value(nth);
+                    (encoding, encoding.fit(number, overflow)?)
+                }
+            };
+            if let Some((bits, _)) = element.bits()
+                && !bits.shared
+            {
+                rest.get_mut(..usize::from(bits.bytes))?.fill(0);
+            }
+            let len = encoding.write(number, rest)?;
+            match encoding.until() {
+                Some(end) => {
+                    *rest.get_mut(len)? = end;
+                    places.next(element, len, 1);
+                }
+                None => {
+                    places.next(element, len, 0);
+                }
+            }
+        }
+        let end = places.at;
+        let mut tail_at = end;
+        if let Some(sum) = self.checksum {
+            let at = match sum.at {
+                Some(at) => usize::from(at),
+                None => {
+                    tail_at = end.saturating_add(sum.len());
+                    end
+                }
+            };
+            let mut bytes = [0; 8];
+            let bytes = bytes.get_mut(..sum.len())?;
+            sum.write(out.get(sum.covered(at))?, bytes);
+            put(out, at, bytes)?;
+        }
+        put(out, tail_at, &self.tail)?;
+        Some(tail_at.saturating_add(self.tail.len()))
+    }
+}
+
+fn put(out: &mut [u8], at: usize, bytes: &[u8]) -> Option<()> {
+    let place = out.get_mut(at..at.saturating_add(bytes.len()))?;
+    for (slot, &byte) in place.iter_mut().zip(bytes) {
+        *slot = byte;
+    }
+    Some(())
+}
+
+fn check_elements(elements: &[Element]) -> Result<(), LayoutError> {
+    // The number that bits may share, and which of its bits are taken.
+    let mut number: Option<(u8, ByteOrder, u32)> = None;
+    for (nth, element) in elements.iter().enumerate() {
+        let nth = nth as u8;
+        let Some(encoding) = element.encoding() else {
+            if element.len() == Some(0) {
+                return Err(LayoutError::Encoding { element: nth });
+            }
+            number = None;
+            continue;
+        };
+        check_encoding(&encoding, nth)?;
+        if let Element::Fixed { value, .. } = *element {
+            let (low, high) = encoding.range();
+            let is_float = matches!(encoding.kind, Kind::Scalar(ScalarType::Float | ScalarType::Double));
+            if is_float || !(low..=high).contains(&(value as f64)) {
+                return Err(LayoutError::Constant { element: nth });
+            }
+        }
+        let Some((bits, order)) = element.bits() else {
+            number = None;
+            continue;
+        };
+        let ones = u32::MAX.unbounded_shr(32_u32.saturating_sub(u32::from(bits.count)));
+        let ones = ones.unbounded_shl(u32::from(bits.first));
+        let taken = match number {
+            _ if !bits.shared => ones,
+            Some((bytes, same_order, taken))
+                if bytes == bits.bytes && same_order == order && taken & ones == 0 =>
+            {
+                taken | ones
+            }
+            _ => return Err(LayoutError::NotShared { element: nth }),
+        };
+        number = Some((bits.bytes, order, taken));
+    }
+    Ok(())
+}
+
+fn check_encoding(encoding: &Encoding, element: u8) -> Result<(), LayoutError> {
+    let in_range = |number: u8, most: usize| (1..=most).contains(&usize::from(number));
+    let is_valid = match encoding.kind {
+        Kind::Scalar(_) | Kind::Uint24 | Kind::Int24 => true,
+        Kind::Bcd { bytes } => in_range(bytes, 4),
+        Kind::Hex(Width::Fixed(width)) => in_range(width, 8),
+        Kind::Hex(Width::Until(end)) => !end.is_ascii_hexdigit(),
+        Kind::Decimal(Digits { width: Width::Fixed(width), decimals }) => {
+            // A sign, a digit and a point stand before the decimals.
+            let least = if decimals == 0 { 1 } else { usize::from(decimals).saturating_add(3) };
+            in_range(width, MAX_DIGITS) && usize::from(width) >= least
+        }
+        Kind::Decimal(Digits { width: Width::Until(end), decimals }) => {
+            decimals <= 9 && !matches!(end, b'0'..=b'9' | b'+' | b'-' | b'.' | b' ')
+        }
+        Kind::Bits(Bits { bytes, first, count, .. }) => {
+            let all = u16::from(bytes).saturating_mul(8);
+            matches!(bytes, 1 | 2 | 4)
+                && count > 0
+                && u16::from(first).saturating_add(u16::from(count)) <= all
+        }
+    };
+    if !is_valid {
+        return Err(LayoutError::Encoding { element });
+    }
+    let is_words = match encoding.kind {
+        Kind::Decimal(_) | Kind::Hex(_) => false,
+        _ => encoding.size().is_some_and(|len| len.is_multiple_of(2)),
+    };
+    if encoding.order.swaps_words() && !is_words {
+        return Err(LayoutError::NotWords { element });
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,193 @@
+use std::vec;
+use std::vec::Vec;
+
+use super::*;
+
+fn value(kind: Kind, order: ByteOrder) -> Element {
+    Element::Value(Encoding { kind, order })
+}
+
+fn big(ty: ScalarType) -> Element {
+    value(Kind::Scalar(ty), ByteOrder::Big)
+}
+
+fn fixed(ty: ScalarType, number: i64) -> Element {
+    Element::Fixed { encoding: Encoding::scalar(ty), value: number }
+}
+
+fn bits(first: u8, count: u8, shared: bool) -> Element {
+    value(Kind::Bits(Bits { bytes: 1, first, count, signed: false, shared }), ByteOrder::Little)
+}
+
+fn standard(name: &str) -> Option<Checksum> {
+    Some(Checksum::standard(Algorithm::named(name).unwrap()))
+}
+
+fn encoded(layout: &FrameLayout, elements: &[Element], numbers: &[f64]) -> Vec<u8> {
+    let mut out = [0xEE; 64];
+    let len = layout.encode(elements, |nth| (numbers[nth], Overflow::Usual), &mut out).unwrap();
+    assert!(out[len..].iter().all(|&byte| byte == 0xEE), "nothing is written behind the frame");
+    out[..len].to_vec()
+}
+
+fn decoded(layout: &FrameLayout, elements: &[Element], frame: &[u8]) -> Vec<f64> {
+    assert_eq!(layout.probe(elements, frame), Probe::Frame(frame.len()));
+    layout.values(elements, frame).filter_map(|value| value.unwrap()).map(Scalar::as_f64).collect()
+}
+
+/// The reply of a Modbus RTU slave 9 with three registers, as the manual of a gripper has it.
+#[test]
+fn a_reply_with_constants_and_a_crc() {
+    let elements = vec![
+        fixed(ScalarType::Byte, 9),
+        fixed(ScalarType::Byte, 3),
+        fixed(ScalarType::Byte, 6),
+        bits(0, 1, false),
+        bits(3, 1, true),
+        bits(4, 2, true),
+        Element::Padding { len: 1, fill: 0 },
+        big(ScalarType::Byte),
+        big(ScalarType::Byte),
+        big(ScalarType::Byte),
+        big(ScalarType::Byte),
+    ];
+    let layout = FrameLayout::new(Carrier::Stream, &[], &[], &elements, standard("crc16-modbus")).unwrap();
+    assert_eq!(layout.lengths(), (11, 11));
+    let numbers = [0.0, 0.0, 0.0, 1.0, 1.0, 3.0, 0.0, 0.0, 230.0, 66.0, 5.0];
+    let frame = encoded(&layout, &elements, &numbers);
+    let crc = Algorithm::named("crc16-modbus").unwrap().of([&frame[..9]]) as u16;
+    assert_eq!(frame[..9], [9, 3, 6, 0x39, 0, 0, 230, 66, 5]);
+    assert_eq!(frame[9..], crc.to_le_bytes());
+    assert_eq!(decoded(&layout, &elements, &frame), [1.0, 1.0, 3.0, 0.0, 230.0, 66.0, 5.0]);
+
+    // Any flipped bit is found.
+    for bit in 0..frame.len() * 8 {
+        let mut broken = frame.clone();
+        broken[bit / 8] ^= 1 << (bit % 8);
+        assert_eq!(layout.probe(&elements, &broken), Probe::Wrong(11), "bit {bit}");
+    }
+    // Another slave's frame is right, and not ours.
+    let mut other = frame.clone();
+    other[0] = 8;
+    let crc = Algorithm::named("crc16-modbus").unwrap().of([&other[..9]]) as u16;
+    other[9..].copy_from_slice(&crc.to_le_bytes());
+    assert_eq!(layout.probe(&elements, &other), Probe::Other(11));
+}
+
+#[test]
+fn without_a_checksum_another_constant_is_no_frame() {
+    let elements = [fixed(ScalarType::Byte, 9), big(ScalarType::Word)];
+    let layout = FrameLayout::new(Carrier::Stream, &[], &[0xEE], &elements, None).unwrap();
+    assert_eq!(layout.probe(&elements, &[9, 1, 2, 0xEE]), Probe::Frame(4));
+    assert_eq!(layout.probe(&elements, &[8, 1, 2, 0xEE]), Probe::No);
+    assert_eq!(layout.probe(&elements, &[9, 1, 2, 0xEF]), Probe::No);
+    assert_eq!(layout.probe(&elements, &[9, 1]), Probe::Partial(2));
+}
+
+#[test]
+fn a_checksum_stands_where_its_device_has_it() {
+    let elements = [big(ScalarType::Byte), big(ScalarType::Word)];
+    let place = |at, first, last| {
+        let sum = Checksum { at, first, last, ..Checksum::standard(Algorithm::Xor8) };
+        FrameLayout::new(Carrier::Stream, &[0x55], &[0xEE], &elements, Some(sum))
+    };
+    let behind = place(None, 0, None).unwrap();
+    assert_eq!(encoded(&behind, &elements, &[1.0, 515.0]), [0x55, 1, 2, 3, 0x55, 0xEE]);
+    let without_head = place(None, 1, None).unwrap();
+    assert_eq!(encoded(&without_head, &elements, &[1.0, 515.0]), [0x55, 1, 2, 3, 0, 0xEE]);
+    let second = place(Some(1), 2, Some(4)).unwrap();
+    let frame = encoded(&second, &elements, &[1.0, 515.0]);
+    assert_eq!(frame, [0x55, 0, 1, 2, 3, 0xEE]);
+    assert_eq!(decoded(&second, &elements, &frame), [1.0, 515.0]);
+    let between = place(Some(2), 0, None).unwrap();
+    let frame = encoded(&between, &elements, &[1.0, 515.0]);
+    assert_eq!(frame, [0x55, 1, 0x54, 2, 3, 0xEE]);
+    assert_eq!(decoded(&between, &elements, &frame), [1.0, 515.0]);
+
+    assert_eq!(place(Some(3), 0, None).unwrap_err(), LayoutError::ChecksumPlace { at: 3 });
+    assert_eq!(place(Some(0), 0, None).unwrap_err(), LayoutError::ChecksumPlace { at: 0 });
+    assert_eq!(place(Some(9), 0, None).unwrap_err(), LayoutError::ChecksumPlace { at: 9 });
+    assert_eq!(place(None, 4, None).unwrap_err(), LayoutError::ChecksumRange, "nothing");
+    assert_eq!(place(None, 0, Some(4)).unwrap_err(), LayoutError::ChecksumRange, "itself");
+    assert_eq!(place(Some(1), 2, Some(5)).unwrap_err(), LayoutError::ChecksumRange, "the tail");
+}
+
+#[test]
+fn a_checksum_in_digits() {
+    // Modbus ASCII: LRC of the bytes... of this frame's own, in two digits.
+    let elements = [value(Kind::Hex(Width::Fixed(4)), ByteOrder::Big)];
+    let sum = Checksum { text: true, first: 1, ..Checksum::standard(Algorithm::Sum8) };
+    let layout = FrameLayout::new(Carrier::Stream, b":", b"\r\n", &elements, Some(sum)).unwrap();
+    let frame = encoded(&layout, &elements, &[f64::from(0x12AB)]);
+    // '1' + '2' + 'A' + 'B' is 0xE6.
+    assert_eq!(frame, b":12ABE6\r\n");
+    assert_eq!(layout.probe(&elements, b":12ABe6\r\n"), Probe::Frame(9));
+    assert_eq!(layout.probe(&elements, b":12ABE7\r\n"), Probe::Wrong(9));
+}
+
+#[test]
+fn fields_of_varying_length_end_where_their_delimiter_is() {
+    let digits = |end, decimals| {
+        value(Kind::Decimal(Digits { width: Width::Until(end), decimals }), ByteOrder::Little)
+    };
+    let elements = [digits(b',', 0), digits(b'\r', 2)];
+    let layout = FrameLayout::new(Carrier::Stream, b"ST,", b"\n", &elements, None).unwrap();
+    assert_eq!(layout.lengths(), (6, 38));
+    assert_eq!(decoded(&layout, &elements, b"ST,17,-  3.25\r\n"), [17.0, -3.25]);
+    assert_eq!(encoded(&layout, &elements, &[17.0, -3.25]), b"ST,17,-3.25\r\n");
+    for len in 1..15 {
+        let probe = layout.probe(&elements, &b"ST,17,-  3.25\r\n"[..len]);
+        assert!(matches!(probe, Probe::Partial(1..)), "{len} bytes: {probe:?}");
+    }
+    assert_eq!(layout.probe(&elements, b"ST,17,123456789012345678\r\n"), Probe::No, "too long");
+    // Found, and refused by its value.
+    let frame = b"ST,x,1\r\n";
+    assert_eq!(layout.probe(&elements, frame), Probe::Frame(8));
+    assert_eq!(layout.values(&elements, frame).next(), Some(Err(Unreadable::NotADigit)));
+}
+
+#[test]
+fn can_frames_have_no_delimiters_and_eight_bytes() {
+    let elements = [bits(0, 4, false), bits(4, 4, true), big(ScalarType::Float), big(ScalarType::Word)];
+    let layout = FrameLayout::new(Carrier::Can, &[], &[], &elements, standard("crc8-sae-j1850")).unwrap();
+    assert_eq!(layout.lengths(), (8, 8));
+    let frame = encoded(&layout, &elements, &[3.0, 12.0, 1.5, 258.0]);
+    assert_eq!(frame[..7], [0xC3, 0x3F, 0xC0, 0, 0, 1, 2]);
+    assert_eq!(decoded(&layout, &elements, &frame), [3.0, 12.0, 1.5, 258.0]);
+    let too_long = [big(ScalarType::Double), big(ScalarType::Byte)];
+    let error = FrameLayout::new(Carrier::Can, &[], &[], &too_long, None).unwrap_err();
+    assert_eq!(error, LayoutError::TooLong { len: 9, room: 8 });
+}
+
+#[test]
+fn what_cannot_be_laid_out_is_refused() {
+    let new = |elements: &[Element]| {
+        FrameLayout::new(Carrier::Stream, &[1], &[], elements, None).map(|layout| layout.lengths())
+    };
+    assert_eq!(new(&[]), Err(LayoutError::Empty));
+    assert_eq!(new(&vec![big(ScalarType::Byte); 129]), Err(LayoutError::TooManyElements));
+    assert_eq!(new(&vec![big(ScalarType::Double); 64]), Err(LayoutError::TooLong { len: 513, room: 512 }));
+    let encoding = Err(LayoutError::Encoding { element: 1 });
+    let with = |element: Element| new(&[big(ScalarType::Byte), element]);
+    assert_eq!(with(Element::Padding { len: 0, fill: 0 }), encoding);
+    assert_eq!(with(value(Kind::Bcd { bytes: 5 }, ByteOrder::Big)), encoding);
+    assert_eq!(with(value(Kind::Hex(Width::Fixed(9)), ByteOrder::Big)), encoding);
+    assert_eq!(with(value(Kind::Hex(Width::Until(b'A')), ByteOrder::Big)), encoding);
+    assert_eq!(with(bits(5, 4, false)), encoding);
+    assert_eq!(with(bits(0, 0, false)), encoding);
+    let three = Digits { width: Width::Fixed(3), decimals: 2 };
+    assert_eq!(with(value(Kind::Decimal(three), ByteOrder::Big)), encoding);
+    let words = Err(LayoutError::NotWords { element: 1 });
+    assert_eq!(with(value(Kind::Int24, ByteOrder::BigSwapped)), words);
+    assert_eq!(with(value(Kind::Scalar(ScalarType::Byte), ByteOrder::LittleSwapped)), words);
+    assert_eq!(with(fixed(ScalarType::Byte, 256)), Err(LayoutError::Constant { element: 1 }));
+    assert_eq!(with(fixed(ScalarType::Float, 1)), Err(LayoutError::Constant { element: 1 }));
+    let shared = Err(LayoutError::NotShared { element: 1 });
+    assert_eq!(with(bits(0, 1, true)), shared, "no bits before");
+    assert_eq!(new(&[bits(0, 2, false), bits(1, 1, true)]), shared, "the same bit");
+    assert_eq!(new(&[bits(0, 2, false), bits(2, 6, true)]), Ok((2, 2)));
+    let nothing = FrameLayout::new(Carrier::Stream, &[], &[], &[big(ScalarType::Byte)], None);
+    assert_eq!(nothing.unwrap_err(), LayoutError::NothingToFind);
+    let long = FrameLayout::new(Carrier::Stream, &[0; 9], &[], &[big(ScalarType::Byte)], None);
+    assert_eq!(long.unwrap_err(), LayoutError::DelimiterTooLong { len: 9 });
+}
