@@ -21,6 +21,9 @@ pub struct Encoding {
     pub kind: Kind,
     /// Their order. Digits are read from left to right, whatever it is.
     pub order: ByteOrder,
+    /// The field begins where the one before it began: other bits of the same number, or a second
+    /// use of the same bytes.
+    pub shared: bool,
 }
 
 /// What the bytes of a field mean.
@@ -84,8 +87,6 @@ pub struct Bits {
     pub count: u8,
     /// The highest of them is a sign.
     pub signed: bool,
-    /// They are bits of the same number as those of the field before.
-    pub shared: bool,
 }
 
 /// Why the bytes of a field are not a value.
@@ -128,7 +129,7 @@ pub enum Overflow {
 impl Encoding {
     /// A value of this type, lowest byte first: as recipes have it.
     pub const fn scalar(ty: ScalarType) -> Self {
-        Self { kind: Kind::Scalar(ty), order: ByteOrder::Little }
+        Self { kind: Kind::Scalar(ty), order: ByteOrder::Little, shared: false }
     }
 
     /// Number of bytes in the frame, the byte that ends the field not included; `None` if it varies.

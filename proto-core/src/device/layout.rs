@@ -12,6 +12,7 @@ use super::checksum::Algorithm;
 use super::encoding::{Bits, Digits, Encoding, Kind, MAX_DIGITS, Overflow, Unreadable, Width};
 use super::order::ByteOrder;
 use crate::recipe::model::{MAX_DELIMITER, MAX_FIELDS, MAX_STREAM_FRAME};
+use crate::sysvar::Direction;
 use crate::wire::can::MAX_CAN_DATA;
 use crate::wire::scalar::{Scalar, ScalarType};
 
@@ -52,15 +53,13 @@ pub struct Checksum {
     pub first: u16,
     /// The last one; `None` is the one before the checksum.
     pub last: Option<u16>,
-    /// Where in the frame it stands; `None` is behind the elements and before the tail.
-    pub at: Option<u16>,
 }
 
 impl Checksum {
-    /// This algorithm as its standard has it: over everything before it, before the tail, in the
-    /// standard's byte order.
+    /// This algorithm as its standard has it: over everything before it, in the standard's byte
+    /// order.
     pub const fn standard(algorithm: Algorithm) -> Self {
-        Self { algorithm, order: algorithm.order(), text: false, first: 0, last: None, at: None }
+        Self { algorithm, order: algorithm.order(), text: false, first: 0, last: None }
     }
 
     /// Number of bytes in the frame, 1..=8.
@@ -126,12 +125,19 @@ pub enum Probe {
     Wrong(usize),
 }
 
+/// A checksum, and the number of elements before it.
+#[derive(Debug, Clone, Copy)]
+struct Placed {
+    sum: Checksum,
+    behind: u8,
+}
+
 /// A frame, checked and ready to find, decode and encode.
 #[derive(Debug, Clone)]
 pub struct FrameLayout {
     head: Vec<u8, MAX_DELIMITER>,
     tail: Vec<u8, MAX_DELIMITER>,
-    checksum: Option<Checksum>,
+    checksum: Option<Placed>,
     shortest: u16,
     longest: u16,
 }
@@ -170,8 +176,8 @@ pub enum LayoutError {
         /// Index of the element.
         element: u8,
     },
-    /// Bits share a number with the element before, which is no bits, or bits of another number, or
-    /// has one of these bits.
+    /// An element shares its place with one that is shorter; or, in an output part, bits share a
+    /// number with what is no bits, or bits of another number, or has one of these bits.
     NotShared {
         /// Index of the element.
         element: u8,
@@ -183,11 +189,8 @@ pub enum LayoutError {
     },
     /// The parameters are not those of a CRC.
     Algorithm,
-    /// The checksum's place is inside an element or behind the frame.
-    ChecksumPlace {
-        /// The place.
-        at: u16,
-    },
+    /// The checksum stands behind more elements than there are, or between bits of one number.
+    ChecksumPlace,
     /// The checksum covers nothing, itself, the tail, or bytes behind a field of varying length.
     ChecksumRange,
 }
@@ -209,13 +212,13 @@ impl fmt::Display for LayoutError {
                 f.write_str("an order that swaps words needs a field of whole words: 2, 4 or 8 bytes")
             }
             Self::NotShared { .. } => f.write_str(
-                "these bits cannot be in one number with those of the field before: another type or order, or \
-                 the same bits",
+                "the field cannot share the bytes of the one before: there is none, or it is shorter, or (in an \
+                 output part) it is not other bits of the same number",
             ),
             Self::Constant { .. } => f.write_str("the field cannot have this value"),
             Self::Algorithm => f.write_str("these are not the parameters of a CRC: 1 to 32 bits, no number with more"),
-            Self::ChecksumPlace { at } => {
-                write!(f, "no field ends at byte {at} of the frame, so the checksum cannot stand there")
+            Self::ChecksumPlace => {
+                f.write_str("the checksum must stand between two fields, or behind the last one")
             }
             Self::ChecksumRange => f.write_str(
                 "the checksum must cover bytes of head and fields, and not itself",
@@ -237,13 +240,13 @@ impl Element {
 
     fn bits(&self) -> Option<(Bits, ByteOrder)> {
         match self.encoding()? {
-            Encoding { kind: Kind::Bits(bits), order } => Some((bits, order)),
+            Encoding { kind: Kind::Bits(bits), order, .. } => Some((bits, order)),
             _ => None,
         }
     }
 
     fn is_shared(&self) -> bool {
-        self.bits().is_some_and(|(bits, _)| bits.shared)
+        self.encoding().is_some_and(|encoding| encoding.shared)
     }
 
     /// Number of bytes on the wire; `None` if it varies.
@@ -259,13 +262,16 @@ impl Element {
 struct Places {
     /// Where the next element begins.
     at: usize,
-    /// Where the newest number of bits begins.
+    /// Where the newest element begins that shares its place with none before, and its length.
     shared_at: usize,
-    /// Where the checksum stands, and its length.
-    checksum_at: Option<usize>,
+    shared_len: usize,
+    /// Elements that have been placed.
+    nth: usize,
+    /// How many of them stand before the checksum.
+    checksum_behind: usize,
     checksum_len: usize,
-    /// An element begins or ends there.
-    has_checksum: bool,
+    /// Where the checksum stands, once it is known.
+    checksum_at: usize,
 }
 
 /// Why the place of an element is unknown.
@@ -278,21 +284,24 @@ enum Unplaced {
 
 impl Places {
     fn new(layout: &FrameLayout) -> Self {
-        let at = layout.checksum.and_then(|sum| sum.at).map(usize::from);
+        let (behind, len) =
+            layout.checksum.map_or((usize::MAX, 0), |placed| (usize::from(placed.behind), placed.sum.len()));
         let mut places = Self {
             at: layout.head.len(),
             shared_at: 0,
-            checksum_at: at,
-            checksum_len: layout.checksum.map_or(0, |sum| sum.len()),
-            has_checksum: false,
+            shared_len: 0,
+            nth: 0,
+            checksum_behind: behind,
+            checksum_len: len,
+            checksum_at: 0,
         };
         places.step_over_checksum();
         places
     }
 
     fn step_over_checksum(&mut self) {
-        if self.checksum_at == Some(self.at) {
-            self.has_checksum = true;
+        if self.checksum_behind == self.nth {
+            self.checksum_at = self.at;
             self.at = self.at.saturating_add(self.checksum_len);
         }
     }
@@ -300,12 +309,15 @@ impl Places {
     /// The place of the next element, whose length is `len`, with `further` bytes behind it that
     /// belong to it.
     fn next(&mut self, element: &Element, len: usize, further: usize) -> core::ops::Range<usize> {
+        self.nth = self.nth.saturating_add(1);
         if element.is_shared() {
-            return self.shared_at..self.shared_at.saturating_add(len);
+            let place = self.shared_at..self.shared_at.saturating_add(len);
+            self.step_over_checksum();
+            return place;
         }
         let start = self.at;
         let end = start.saturating_add(len);
-        self.shared_at = start;
+        (self.shared_at, self.shared_len) = (start, len);
         self.at = end.saturating_add(further);
         self.step_over_checksum();
         start..end
@@ -315,6 +327,7 @@ impl Places {
     fn find(&mut self, element: &Element, bytes: &[u8]) -> Result<core::ops::Range<usize>, Unplaced> {
         let (len, further) = match element.len() {
             Some(len) => (len, 0),
+            None if element.is_shared() => (self.shared_len, 0),
             None => {
                 let end = element.encoding().and_then(|encoding| encoding.until()).ok_or(Unplaced::No)?;
                 let rest = bytes.get(self.at..).unwrap_or(&[]);
@@ -334,16 +347,17 @@ impl Places {
 }
 
 impl FrameLayout {
-    /// Checks a frame.
+    /// Checks a frame. A checksum comes with the number of elements before it.
     ///
     /// # Errors
     /// [`LayoutError`] says which rule is broken, and by which element.
     pub fn new(
         carrier: Carrier,
+        direction: Direction,
         head: &[u8],
         tail: &[u8],
         elements: &[Element],
-        checksum: Option<Checksum>,
+        checksum: Option<(Checksum, usize)>,
     ) -> Result<Self, LayoutError> {
         let delimiter = |bytes: &[u8]| {
             Vec::from_slice(bytes).map_err(|_| LayoutError::DelimiterTooLong { len: bytes.len() })
@@ -355,8 +369,18 @@ impl FrameLayout {
         if elements.len() > MAX_FIELDS {
             return Err(LayoutError::TooManyElements);
         }
+        check_elements(elements, direction)?;
+        let checksum = match checksum {
+            Some((sum, behind)) => {
+                let splits = elements.get(behind).is_some_and(Element::is_shared);
+                if behind > elements.len() || splits {
+                    return Err(LayoutError::ChecksumPlace);
+                }
+                Some(Placed { sum, behind: behind as u8 })
+            }
+            None => None,
+        };
         let mut layout = Self { head, tail, checksum, shortest: 0, longest: 0 };
-        check_elements(elements)?;
         let shortest = layout.length_with(elements, 0);
         let longest = layout.length_with(elements, MAX_DIGITS);
         let room = match carrier {
@@ -383,57 +407,39 @@ impl FrameLayout {
         for element in elements {
             match element.len() {
                 Some(len) => places.next(element, len, 0),
+                None if element.is_shared() => places.next(element, varying, 0),
                 None => places.next(element, varying, 1),
             };
         }
-        let behind = match self.checksum {
-            Some(sum) if sum.at.is_none() => sum.len(),
-            _ => 0,
-        };
-        places.at.saturating_add(behind).saturating_add(self.tail.len())
+        places.at.saturating_add(self.tail.len())
     }
 
     fn check_checksum(&self, elements: &[Element]) -> Result<(), LayoutError> {
-        let Some(sum) = self.checksum else { return Ok(()) };
-        if let Algorithm::Crc(crc) = sum.algorithm
-            && !crc.is_valid()
-        {
-            return Err(LayoutError::Algorithm);
-        }
-        if sum.order.swaps_words() {
-            return Err(LayoutError::Algorithm);
-        }
-        // Bytes whose place is the same in every frame.
-        let mut places = Places::new(self);
-        let mut varies = false;
-        for element in elements {
-            match element.len() {
-                Some(len) => places.next(element, len, 0),
-                None => {
-                    varies = true;
-                    break;
-                }
-            };
-        }
-        if let Some(at) = sum.at
-            && !places.has_checksum
-        {
-            return Err(LayoutError::ChecksumPlace { at });
-        }
-        let behind_fields = usize::from(self.shortest).saturating_sub(self.tail.len());
-        let own_place = match sum.at {
-            Some(at) => usize::from(at),
-            None => behind_fields.saturating_sub(sum.len()),
+        let Some(Placed { sum, .. }) = self.checksum else { return Ok(()) };
+        let is_valid = match sum.algorithm {
+            Algorithm::Crc(crc) => crc.is_valid(),
+            _ => true,
         };
-        let own = own_place..own_place.saturating_add(sum.len());
-        let covered = sum.covered(own_place);
-        let overlaps = covered.start < own.end && own.start < covered.end;
+        if !is_valid || sum.order.swaps_words() {
+            return Err(LayoutError::Algorithm);
+        }
         // Behind a field of varying length no byte has a number.
-        let reaches = match sum.last {
-            Some(_) if varies => covered.end <= places.at,
-            _ => covered.end <= behind_fields,
-        };
-        if covered.is_empty() || overlaps || !reaches {
+        let mut places = Places::new(self);
+        let mut numbered = None;
+        for element in elements {
+            let len = element.len();
+            if len.is_none() {
+                numbered = numbered.or(Some(places.at));
+            }
+            places.next(element, len.unwrap_or(0), usize::from(len.is_none()));
+        }
+        let at = places.checksum_at;
+        let own = at..at.saturating_add(sum.len());
+        let covered = sum.covered(at);
+        let overlaps = covered.start < own.end && own.start < covered.end;
+        let end = if sum.last.is_some() { numbered.unwrap_or(places.at) } else { places.at };
+        let comes_late = numbered.is_some_and(|numbered| usize::from(sum.first) > numbered);
+        if covered.is_empty() || overlaps || covered.end > end || comes_late {
             return Err(LayoutError::ChecksumRange);
         }
         Ok(())
@@ -467,9 +473,7 @@ impl FrameLayout {
                 is_ours &= encoding.read(field).is_ok_and(|read| read.as_f64() == value as f64);
             }
         }
-        let end = places.at;
-        let sum = self.checksum.filter(|sum| sum.at.is_none());
-        let tail_at = end.saturating_add(sum.map_or(0, |sum| sum.len()));
+        let tail_at = places.at;
         let len = tail_at.saturating_add(self.tail.len());
         let rest = bytes.get(tail_at..).unwrap_or(&[]);
         if self.tail.iter().zip(rest).any(|(expected, byte)| expected != byte) {
@@ -478,7 +482,7 @@ impl FrameLayout {
         if let Some(missing @ 1..) = len.checked_sub(bytes.len()) {
             return Probe::Partial(missing);
         }
-        match (self.checksum_is_right(bytes, end), is_ours) {
+        match (self.checksum_is_right(bytes, places.checksum_at), is_ours) {
             (None, false) => Probe::No,
             (None | Some(true), true) => Probe::Frame(len),
             (Some(true), false) => Probe::Other(len),
@@ -486,10 +490,9 @@ impl FrameLayout {
         }
     }
 
-    /// `None` without a checksum. `end` is where the elements end.
-    fn checksum_is_right(&self, frame: &[u8], end: usize) -> Option<bool> {
-        let sum = self.checksum?;
-        let at = sum.at.map_or(end, usize::from);
+    /// Whether the checksum at `at` is right; `None` without one.
+    fn checksum_is_right(&self, frame: &[u8], at: usize) -> Option<bool> {
+        let sum = self.checksum?.sum;
         let found = frame.get(at..at.saturating_add(sum.len())).unwrap_or(&[]);
         let mut expected = [0; 8];
         let expected = expected.get_mut(..sum.len())?;
@@ -542,7 +545,7 @@ impl FrameLayout {
                 }
             };
             if let Some((bits, _)) = element.bits()
-                && !bits.shared
+                && !element.is_shared()
             {
                 rest.get_mut(..usize::from(bits.bytes))?.fill(0);
             }
@@ -557,21 +560,13 @@ impl FrameLayout {
                 }
             }
         }
-        let end = places.at;
-        let mut tail_at = end;
-        if let Some(sum) = self.checksum {
-            let at = match sum.at {
-                Some(at) => usize::from(at),
-                None => {
-                    tail_at = end.saturating_add(sum.len());
-                    end
-                }
-            };
+        if let Some(Placed { sum, .. }) = self.checksum {
             let mut bytes = [0; 8];
             let bytes = bytes.get_mut(..sum.len())?;
-            sum.write(out.get(sum.covered(at))?, bytes);
-            put(out, at, bytes)?;
+            sum.write(out.get(sum.covered(places.checksum_at))?, bytes);
+            put(out, places.checksum_at, bytes)?;
         }
+        let tail_at = places.at;
         put(out, tail_at, &self.tail)?;
         Some(tail_at.saturating_add(self.tail.len()))
     }
@@ -585,16 +580,17 @@ fn put(out: &mut [u8], at: usize, bytes: &[u8]) -> Option<()> {
     Some(())
 }
 
-fn check_elements(elements: &[Element]) -> Result<(), LayoutError> {
-    // The number that bits may share, and which of its bits are taken.
-    let mut number: Option<(u8, ByteOrder, u32)> = None;
+fn check_elements(elements: &[Element], direction: Direction) -> Result<(), LayoutError> {
+    // The newest element that shares its place with none before: its length and the byte that ends
+    // it, its order, and which of its bits are taken.
+    let mut place: Option<(Encoding, u32)> = None;
     for (nth, element) in elements.iter().enumerate() {
         let nth = nth as u8;
         let Some(encoding) = element.encoding() else {
             if element.len() == Some(0) {
                 return Err(LayoutError::Encoding { element: nth });
             }
-            number = None;
+            place = None;
             continue;
         };
         check_encoding(&encoding, nth)?;
@@ -605,24 +601,33 @@ fn check_elements(elements: &[Element]) -> Result<(), LayoutError> {
                 return Err(LayoutError::Constant { element: nth });
             }
         }
-        let Some((bits, order)) = element.bits() else {
-            number = None;
-            continue;
-        };
-        let ones = u32::MAX.unbounded_shr(32_u32.saturating_sub(u32::from(bits.count)));
-        let ones = ones.unbounded_shl(u32::from(bits.first));
-        let taken = match number {
-            _ if !bits.shared => ones,
-            Some((bytes, same_order, taken))
-                if bytes == bits.bytes && same_order == order && taken & ones == 0 =>
-            {
-                taken | ones
+        let ones = element.bits().map_or(u32::MAX, |(bits, _)| {
+            let ones = u32::MAX.unbounded_shr(32_u32.saturating_sub(u32::from(bits.count)));
+            ones.unbounded_shl(u32::from(bits.first))
+        });
+        place = match place {
+            _ if !encoding.shared => Some((encoding, ones)),
+            Some((first, taken)) if may_share(&first, &encoding, taken & ones, direction) => {
+                Some((first, taken | ones))
             }
             _ => return Err(LayoutError::NotShared { element: nth }),
         };
-        number = Some((bits.bytes, order, taken));
     }
     Ok(())
+}
+
+/// Whether `second` may have the place of `first`; `both` are the bits that both have.
+fn may_share(first: &Encoding, second: &Encoding, both: u32, direction: Direction) -> bool {
+    match direction {
+        Direction::Input => match (first.size(), second.size()) {
+            (Some(first), Some(second)) => second <= first,
+            _ => first.until() == second.until(),
+        },
+        Direction::Output => {
+            let are_bits = matches!((first.kind, second.kind), (Kind::Bits(_), Kind::Bits(_)));
+            are_bits && first.size() == second.size() && first.order == second.order && both == 0
+        }
+    }
 }
 
 fn check_encoding(encoding: &Encoding, element: u8) -> Result<(), LayoutError> {

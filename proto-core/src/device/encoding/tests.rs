@@ -7,7 +7,7 @@ use proptest::prelude::*;
 use super::*;
 
 fn of(kind: Kind, order: ByteOrder) -> Encoding {
-    Encoding { kind, order }
+    Encoding { kind, order, shared: false }
 }
 
 fn decimal(width: Width, decimals: u8) -> Encoding {
@@ -15,7 +15,7 @@ fn decimal(width: Width, decimals: u8) -> Encoding {
 }
 
 fn bits(bytes: u8, first: u8, count: u8, signed: bool) -> Encoding {
-    of(Kind::Bits(Bits { bytes, first, count, signed, shared: false }), ByteOrder::Little)
+    of(Kind::Bits(Bits { bytes, first, count, signed }), ByteOrder::Little)
 }
 
 fn written(encoding: Encoding, value: f64) -> Vec<u8> {
@@ -159,12 +159,12 @@ fn any_encoding() -> impl Strategy<Value = Encoding> {
             |(bytes, [first, count], signed)| {
                 let first = first % (8 * bytes);
                 let count = 1 + count % (8 * bytes - first);
-                Kind::Bits(Bits { bytes, first, count, signed, shared: false })
+                Kind::Bits(Bits { bytes, first, count, signed })
             }
         ),
     ];
     (kind, order)
-        .prop_map(|(kind, order)| Encoding { kind, order })
+        .prop_map(|(kind, order)| Encoding { kind, order, shared: false })
         .prop_filter("words are swapped in whole words", |encoding| {
             !encoding.order.swaps_words() || encoding.size().is_none_or(|len| len % 2 == 0)
         })

@@ -5,6 +5,7 @@ use proptest::prelude::*;
 
 use super::super::{Algorithm, Carrier, Checksum, Element, Encoding, FrameLayout};
 use super::*;
+use crate::sysvar::Direction;
 use crate::wire::scalar::ScalarType;
 
 fn byte() -> Element {
@@ -15,7 +16,15 @@ fn byte() -> Element {
 fn small() -> (Vec<Element>, FrameLayout) {
     let elements = vec![byte(), byte()];
     let checksum = Checksum::standard(Algorithm::named("crc16-modbus").unwrap());
-    let layout = FrameLayout::new(Carrier::Stream, &[0xAA], &[], &elements, Some(checksum)).unwrap();
+    let layout = FrameLayout::new(
+        Carrier::Stream,
+        Direction::Output,
+        &[0xAA],
+        &[],
+        &elements,
+        Some((checksum, elements.len())),
+    )
+    .unwrap();
     (elements, layout)
 }
 
@@ -98,7 +107,15 @@ fn silence_discards_what_is_partial() {
 fn endless_false_beginnings_cost_bounded_work() {
     let elements = vec![byte(); 100];
     let checksum = Checksum::standard(Algorithm::named("crc32").unwrap());
-    let layout = FrameLayout::new(Carrier::Stream, &[0xAA], &[], &elements, Some(checksum)).unwrap();
+    let layout = FrameLayout::new(
+        Carrier::Stream,
+        Direction::Output,
+        &[0xAA],
+        &[],
+        &elements,
+        Some((checksum, elements.len())),
+    )
+    .unwrap();
     let effort = elements.len() + layout.lengths().1;
     let (mut framer, mut probes) = (Framer::new(), std::cell::Cell::new(0_usize));
     let stream = vec![0xAA; 100_000];

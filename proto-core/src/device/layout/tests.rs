@@ -4,7 +4,7 @@ use std::vec::Vec;
 use super::*;
 
 fn value(kind: Kind, order: ByteOrder) -> Element {
-    Element::Value(Encoding { kind, order })
+    Element::Value(Encoding { kind, order, shared: false })
 }
 
 fn big(ty: ScalarType) -> Element {
@@ -16,11 +16,12 @@ fn fixed(ty: ScalarType, number: i64) -> Element {
 }
 
 fn bits(first: u8, count: u8, shared: bool) -> Element {
-    value(Kind::Bits(Bits { bytes: 1, first, count, signed: false, shared }), ByteOrder::Little)
+    let kind = Kind::Bits(Bits { bytes: 1, first, count, signed: false });
+    Element::Value(Encoding { kind, order: ByteOrder::Little, shared })
 }
 
-fn standard(name: &str) -> Option<Checksum> {
-    Some(Checksum::standard(Algorithm::named(name).unwrap()))
+fn standard(name: &str, behind: usize) -> Option<(Checksum, usize)> {
+    Some((Checksum::standard(Algorithm::named(name).unwrap()), behind))
 }
 
 fn encoded(layout: &FrameLayout, elements: &[Element], numbers: &[f64]) -> Vec<u8> {
@@ -51,7 +52,15 @@ fn a_reply_with_constants_and_a_crc() {
         big(ScalarType::Byte),
         big(ScalarType::Byte),
     ];
-    let layout = FrameLayout::new(Carrier::Stream, &[], &[], &elements, standard("crc16-modbus")).unwrap();
+    let layout = FrameLayout::new(
+        Carrier::Stream,
+        Direction::Output,
+        &[],
+        &[],
+        &elements,
+        standard("crc16-modbus", 11),
+    )
+    .unwrap();
     assert_eq!(layout.lengths(), (11, 11));
     let numbers = [0.0, 0.0, 0.0, 1.0, 1.0, 3.0, 0.0, 0.0, 230.0, 66.0, 5.0];
     let frame = encoded(&layout, &elements, &numbers);
@@ -77,7 +86,7 @@ fn a_reply_with_constants_and_a_crc() {
 #[test]
 fn without_a_checksum_another_constant_is_no_frame() {
     let elements = [fixed(ScalarType::Byte, 9), big(ScalarType::Word)];
-    let layout = FrameLayout::new(Carrier::Stream, &[], &[0xEE], &elements, None).unwrap();
+    let layout = FrameLayout::new(Carrier::Stream, Direction::Output, &[], &[0xEE], &elements, None).unwrap();
     assert_eq!(layout.probe(&elements, &[9, 1, 2, 0xEE]), Probe::Frame(4));
     assert_eq!(layout.probe(&elements, &[8, 1, 2, 0xEE]), Probe::No);
     assert_eq!(layout.probe(&elements, &[9, 1, 2, 0xEF]), Probe::No);
@@ -87,29 +96,30 @@ fn without_a_checksum_another_constant_is_no_frame() {
 #[test]
 fn a_checksum_stands_where_its_device_has_it() {
     let elements = [big(ScalarType::Byte), big(ScalarType::Word)];
-    let place = |at, first, last| {
-        let sum = Checksum { at, first, last, ..Checksum::standard(Algorithm::Xor8) };
-        FrameLayout::new(Carrier::Stream, &[0x55], &[0xEE], &elements, Some(sum))
+    let place = |behind, first, last| {
+        let sum = Checksum { first, last, ..Checksum::standard(Algorithm::Xor8) };
+        FrameLayout::new(Carrier::Stream, Direction::Output, &[0x55], &[0xEE], &elements, Some((sum, behind)))
     };
-    let behind = place(None, 0, None).unwrap();
+    let behind = place(2, 0, None).unwrap();
     assert_eq!(encoded(&behind, &elements, &[1.0, 515.0]), [0x55, 1, 2, 3, 0x55, 0xEE]);
-    let without_head = place(None, 1, None).unwrap();
+    let without_head = place(2, 1, None).unwrap();
     assert_eq!(encoded(&without_head, &elements, &[1.0, 515.0]), [0x55, 1, 2, 3, 0, 0xEE]);
-    let second = place(Some(1), 2, Some(4)).unwrap();
-    let frame = encoded(&second, &elements, &[1.0, 515.0]);
+    let before = place(0, 2, Some(4)).unwrap();
+    let frame = encoded(&before, &elements, &[1.0, 515.0]);
     assert_eq!(frame, [0x55, 0, 1, 2, 3, 0xEE]);
-    assert_eq!(decoded(&second, &elements, &frame), [1.0, 515.0]);
-    let between = place(Some(2), 0, None).unwrap();
+    assert_eq!(decoded(&before, &elements, &frame), [1.0, 515.0]);
+    let between = place(1, 0, None).unwrap();
     let frame = encoded(&between, &elements, &[1.0, 515.0]);
     assert_eq!(frame, [0x55, 1, 0x54, 2, 3, 0xEE]);
     assert_eq!(decoded(&between, &elements, &frame), [1.0, 515.0]);
 
-    assert_eq!(place(Some(3), 0, None).unwrap_err(), LayoutError::ChecksumPlace { at: 3 });
-    assert_eq!(place(Some(0), 0, None).unwrap_err(), LayoutError::ChecksumPlace { at: 0 });
-    assert_eq!(place(Some(9), 0, None).unwrap_err(), LayoutError::ChecksumPlace { at: 9 });
-    assert_eq!(place(None, 4, None).unwrap_err(), LayoutError::ChecksumRange, "nothing");
-    assert_eq!(place(None, 0, Some(4)).unwrap_err(), LayoutError::ChecksumRange, "itself");
-    assert_eq!(place(Some(1), 2, Some(5)).unwrap_err(), LayoutError::ChecksumRange, "the tail");
+    assert_eq!(place(3, 0, None).unwrap_err(), LayoutError::ChecksumPlace);
+    assert_eq!(place(2, 4, None).unwrap_err(), LayoutError::ChecksumRange, "nothing");
+    assert_eq!(place(2, 0, Some(4)).unwrap_err(), LayoutError::ChecksumRange, "itself");
+    assert_eq!(place(0, 2, Some(5)).unwrap_err(), LayoutError::ChecksumRange, "the tail");
+    let bits = [bits(0, 1, false), bits(1, 1, true)];
+    let split = FrameLayout::new(Carrier::Stream, Direction::Output, &[], &[], &bits, standard("sum8", 1));
+    assert_eq!(split.unwrap_err(), LayoutError::ChecksumPlace);
 }
 
 #[test]
@@ -117,7 +127,9 @@ fn a_checksum_in_digits() {
     // Modbus ASCII: LRC of the bytes... of this frame's own, in two digits.
     let elements = [value(Kind::Hex(Width::Fixed(4)), ByteOrder::Big)];
     let sum = Checksum { text: true, first: 1, ..Checksum::standard(Algorithm::Sum8) };
-    let layout = FrameLayout::new(Carrier::Stream, b":", b"\r\n", &elements, Some(sum)).unwrap();
+    let layout =
+        FrameLayout::new(Carrier::Stream, Direction::Output, b":", b"\r\n", &elements, Some((sum, 1)))
+            .unwrap();
     let frame = encoded(&layout, &elements, &[f64::from(0x12AB)]);
     // '1' + '2' + 'A' + 'B' is 0xE6.
     assert_eq!(frame, b":12ABE6\r\n");
@@ -131,7 +143,8 @@ fn fields_of_varying_length_end_where_their_delimiter_is() {
         value(Kind::Decimal(Digits { width: Width::Until(end), decimals }), ByteOrder::Little)
     };
     let elements = [digits(b',', 0), digits(b'\r', 2)];
-    let layout = FrameLayout::new(Carrier::Stream, b"ST,", b"\n", &elements, None).unwrap();
+    let layout =
+        FrameLayout::new(Carrier::Stream, Direction::Output, b"ST,", b"\n", &elements, None).unwrap();
     assert_eq!(layout.lengths(), (6, 38));
     assert_eq!(decoded(&layout, &elements, b"ST,17,-  3.25\r\n"), [17.0, -3.25]);
     assert_eq!(encoded(&layout, &elements, &[17.0, -3.25]), b"ST,17,-3.25\r\n");
@@ -149,20 +162,23 @@ fn fields_of_varying_length_end_where_their_delimiter_is() {
 #[test]
 fn can_frames_have_no_delimiters_and_eight_bytes() {
     let elements = [bits(0, 4, false), bits(4, 4, true), big(ScalarType::Float), big(ScalarType::Word)];
-    let layout = FrameLayout::new(Carrier::Can, &[], &[], &elements, standard("crc8-sae-j1850")).unwrap();
+    let layout =
+        FrameLayout::new(Carrier::Can, Direction::Output, &[], &[], &elements, standard("crc8-sae-j1850", 4))
+            .unwrap();
     assert_eq!(layout.lengths(), (8, 8));
     let frame = encoded(&layout, &elements, &[3.0, 12.0, 1.5, 258.0]);
     assert_eq!(frame[..7], [0xC3, 0x3F, 0xC0, 0, 0, 1, 2]);
     assert_eq!(decoded(&layout, &elements, &frame), [3.0, 12.0, 1.5, 258.0]);
     let too_long = [big(ScalarType::Double), big(ScalarType::Byte)];
-    let error = FrameLayout::new(Carrier::Can, &[], &[], &too_long, None).unwrap_err();
+    let error = FrameLayout::new(Carrier::Can, Direction::Output, &[], &[], &too_long, None).unwrap_err();
     assert_eq!(error, LayoutError::TooLong { len: 9, room: 8 });
 }
 
 #[test]
 fn what_cannot_be_laid_out_is_refused() {
     let new = |elements: &[Element]| {
-        FrameLayout::new(Carrier::Stream, &[1], &[], elements, None).map(|layout| layout.lengths())
+        FrameLayout::new(Carrier::Stream, Direction::Output, &[1], &[], elements, None)
+            .map(|layout| layout.lengths())
     };
     assert_eq!(new(&[]), Err(LayoutError::Empty));
     assert_eq!(new(&vec![big(ScalarType::Byte); 129]), Err(LayoutError::TooManyElements));
@@ -186,8 +202,19 @@ fn what_cannot_be_laid_out_is_refused() {
     assert_eq!(with(bits(0, 1, true)), shared, "no bits before");
     assert_eq!(new(&[bits(0, 2, false), bits(1, 1, true)]), shared, "the same bit");
     assert_eq!(new(&[bits(0, 2, false), bits(2, 6, true)]), Ok((2, 2)));
-    let nothing = FrameLayout::new(Carrier::Stream, &[], &[], &[big(ScalarType::Byte)], None);
+    // What is received may be used twice.
+    let twice = Element::Value(Encoding { shared: true, ..Encoding::scalar(ScalarType::Byte) });
+    assert_eq!(with(twice), shared);
+    let input = |elements: &[Element]| {
+        FrameLayout::new(Carrier::Stream, Direction::Input, &[1], &[], elements, None)
+            .map(|layout| layout.lengths())
+    };
+    assert_eq!(input(&[big(ScalarType::Word), twice, bits(3, 1, true)]), Ok((3, 3)));
+    assert_eq!(input(&[twice]), Err(LayoutError::NotShared { element: 0 }));
+    let nothing =
+        FrameLayout::new(Carrier::Stream, Direction::Output, &[], &[], &[big(ScalarType::Byte)], None);
     assert_eq!(nothing.unwrap_err(), LayoutError::NothingToFind);
-    let long = FrameLayout::new(Carrier::Stream, &[0; 9], &[], &[big(ScalarType::Byte)], None);
+    let long =
+        FrameLayout::new(Carrier::Stream, Direction::Output, &[0; 9], &[], &[big(ScalarType::Byte)], None);
     assert_eq!(long.unwrap_err(), LayoutError::DelimiterTooLong { len: 9 });
 }
