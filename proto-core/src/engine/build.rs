@@ -269,6 +269,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         Ok(())
     }
 
+    /// Not inlined, nor are the other parts that make large values: their stacks would add up.
+    #[inline(never)]
     fn add_port(
         &mut self,
         config: ConfigView<'_>,
@@ -318,9 +320,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 }
                 FieldSpec::UserInput { to: InputBinding::Commands { table, when }, .. } => {
                     if self.links.command.is_empty() {
-                        let link = CommandLink::new(config.controller.command_port, dialect, config.commands);
-                        let link = link.ok_or(one_too_many(Counted::CommandBytes, MAX_COMMAND_BYTES))?;
-                        let _ = self.links.command.push(link);
+                        self.add_command_link(config, dialect)?;
                     }
                     let Some(link) = self.links.command.first_mut() else { continue };
                     let field = link.add_field(table, when);
@@ -363,6 +363,15 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         self.store.edges.push(EdgeQueue::default()).map_err(|_| one_too_many(Counted::FieldPorts, PORTS))
     }
 
+    #[inline(never)]
+    fn add_command_link(&mut self, config: ConfigView<'_>, dialect: Dialect) -> Result<(), BuildError> {
+        let link = CommandLink::new(config.controller.command_port, dialect, config.commands);
+        let link = link.ok_or(one_too_many(Counted::CommandBytes, MAX_COMMAND_BYTES))?;
+        let _ = self.links.command.push(link);
+        Ok(())
+    }
+
+    #[inline(never)]
     fn add_uplink(
         &mut self,
         config: ConfigView<'_>,
@@ -459,6 +468,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
     }
 
+    #[inline(never)]
     fn assign_sources(
         &mut self,
         config: ConfigView<'_>,
@@ -550,6 +560,7 @@ fn recipe_index(config: ConfigView<'_>, recipe: &Recipe) -> u8 {
     (0..).zip(config.recipes).find(|(_, other)| other.name == recipe.name).map_or(0, |(index, _)| index)
 }
 
+#[inline(never)]
 fn stream_codec(
     config: ConfigView<'_>,
     index: u8,
@@ -582,6 +593,7 @@ fn stream_layout(
         .map_err(|error| BuildError::Part { recipe: index, part: direction, error })
 }
 
+#[inline(never)]
 fn can_codec(
     config: ConfigView<'_>,
     index: u8,
