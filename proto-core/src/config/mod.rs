@@ -22,7 +22,6 @@ mod rules;
 mod validate;
 mod view;
 
-pub(crate) use add::ConfigMut;
 pub use budget::{PartBudget, Warning, can_frame_time};
 pub use builder::ConfigBuilder;
 pub use draft::{Can, ControllerBuilder, Listen, PortBuilder, PortBus, RecipeBuilder, SafeValues};
@@ -34,6 +33,7 @@ pub use listen::listen_address;
 pub use network::{BoardAddress, Network};
 pub(crate) use rules::MIN_CYCLE;
 pub use rules::{check_address, check_bitrate, check_cycle, check_name};
+pub(crate) use view::ConfigMut;
 pub use view::ConfigView;
 
 use heapless::{String, Vec};

@@ -3,6 +3,8 @@
 //! In: a name, a number, a range. Out: nothing, or what is wrong with it. The reader of files and
 //! [`ConfigView::validate`](super::ConfigView::validate) use the same functions.
 
+use heapless::String;
+
 use super::error::{ConfigError, ConfigErrorKind as Kind, Counted, Place, PortKey};
 use super::listen::ipv6;
 use super::{MAX_ADDRESS, MAX_NAME, Name, Rs485, Span};
@@ -118,6 +120,11 @@ pub(super) fn check_pool(place: Place, span: Span, len: usize) -> Check {
     let end = u32::from(span.start).saturating_add(u32::from(span.len));
     let len = len as u32;
     if end <= len { Ok(()) } else { fail(place, Kind::OutsidePool { end, len }) }
+}
+
+/// A text of the configuration, at most `N` bytes long.
+pub(super) fn text<const N: usize>(given: &str) -> Result<String<N>, Kind> {
+    String::try_from(given).map_err(|_| Kind::TooLong { len: given.len(), longest: N })
 }
 
 pub(super) fn check_time(place: Place, time: Duration, longest: Duration) -> Check {

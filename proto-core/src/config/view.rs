@@ -3,6 +3,8 @@
 //! In: a [`GatewayConfig`](super::GatewayConfig) of any parameters, or slices of a program's own. Out:
 //! borrowed slices, and the questions that concern several of them.
 
+use heapless::VecView;
+
 use super::network::Network;
 use super::{
     CommandEntry, ControllerLink, FieldSpec, InputBinding, OutputBinding, Parts, Port, Recipe, SafeValue,
@@ -82,6 +84,42 @@ impl<'c> ConfigView<'c> {
     /// Whether a field port writes the variable.
     pub(super) fn is_owned(self, var: SysVar) -> bool {
         self.field_ports().any(|(_, _, recipe)| self.written_by(recipe).any(|owned| owned == var))
+    }
+}
+
+/// A mutable borrow of a configuration of any size; [`GatewayConfig`](super::GatewayConfig) describes the fields.
+#[derive(Debug)]
+pub(crate) struct ConfigMut<'c> {
+    /// The controller's address, ports and dialect.
+    pub(crate) controller: &'c mut ControllerLink,
+    /// The board's own address.
+    #[cfg(feature = "image")]
+    pub(crate) network: &'c mut super::BoardAddress,
+    /// Every recipe.
+    pub(crate) recipes: &'c mut VecView<Recipe>,
+    /// Every port.
+    pub(crate) ports: &'c mut VecView<Port>,
+    /// The fields of all recipes.
+    pub(crate) fields: &'c mut VecView<FieldSpec>,
+    /// The entries of all command tables.
+    pub(crate) commands: &'c mut VecView<CommandEntry>,
+    /// The safe values of all ports.
+    pub(crate) safe_values: &'c mut VecView<SafeValue>,
+}
+
+#[cfg(feature = "image")]
+impl ConfigMut<'_> {
+    /// A read-only view of the configuration.
+    pub(crate) fn view(&self) -> ConfigView<'_> {
+        ConfigView {
+            controller: self.controller,
+            network: self.network.fixed(),
+            recipes: self.recipes,
+            ports: self.ports,
+            fields: self.fields,
+            commands: self.commands,
+            safe_values: self.safe_values,
+        }
     }
 }
 
