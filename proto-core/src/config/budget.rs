@@ -5,7 +5,7 @@
 
 use core::fmt;
 
-use super::{Bus, ConfigView, Parity, Parts, Port, Recipe, Rs485, Span};
+use super::{Bus, ConfigView, FieldSpec, Parity, Parts, Port, Recipe, Rs485, Span};
 use crate::sysvar::{Direction, SysVar};
 use crate::time::Duration;
 use crate::wire::can::CanId;
@@ -62,9 +62,8 @@ impl<'c> ConfigView<'c> {
     /// part.
     pub fn budget(self, port: &Port, part: Direction) -> Option<PartBudget> {
         let recipe = self.recipes.get(usize::from(port.recipe))?;
-        let bytes_of = |span: Span| {
-            span.of(self.fields).iter().map(|field| field.field().ty().size()).fold(0, usize::saturating_add)
-        };
+        let bytes_of =
+            |span: Span| span.of(self.fields).iter().map(FieldSpec::longest).fold(0, usize::saturating_add);
         match &recipe.parts {
             Parts::Stream { input, output } => {
                 let part = if part == Direction::Input { input } else { output }.as_ref()?;

@@ -3,8 +3,12 @@
 
 use super::error::{ConfigErrorKind as Kind, Place, RecipeKey};
 use super::rules::{Check, check_new_name, check_pool, fail, is_marked, mark};
-use super::{ConfigView, FieldSpec, InputBinding, OutputBinding, Parts, Recipe, SendOn, Span};
+use super::{
+    CanFramePart, ConfigView, DeviceFrame, FieldSpec, InputBinding, OutputBinding, Parts, Recipe, SendOn,
+    Span,
+};
 use crate::command::Request;
+use crate::device::{Encoding, Overflow};
 use crate::recipe::model::Rules;
 use crate::recipe::model::{Framing, Mode};
 use crate::recipe::{CanLayout, PartError, StreamLayout};
@@ -36,7 +40,9 @@ impl<'a> RecipeCheck<'a> {
                 let place = Place::Frame { recipe: self.index, part, frame };
                 check_pool(place, span, self.config.fields.len())?;
             }
-            if let Err(error) = check_layout(self.config, self.recipe, part, framing) {
+            if self.config.is_device(self.recipe) {
+                self.check_device_frames(part)?;
+            } else if let Err(error) = check_layout(self.config, self.recipe, part, framing) {
                 return fail(self.place_of(part, error), Kind::Part(error));
             }
             for (frame, field, spec) in self.config.fields_of(self.recipe, part) {
@@ -67,16 +73,32 @@ impl<'a> RecipeCheck<'a> {
         match (self.recipe.mode, part, *spec) {
             (Mode::Realtime, _, FieldSpec::System(_)) => Ok(()),
             (Mode::User, Direction::Input, FieldSpec::UserInput { ty, to }) => {
-                self.check_input(place, ty, to)
+                self.check_input(place, Numbers::of(ty), to)
             }
             (Mode::User, Direction::Output, FieldSpec::UserOutput { ty, from }) => {
                 check_output(place, ty, from)
+            }
+            (Mode::User, Direction::Input, FieldSpec::DeviceInput { encoding, overflow, to }) => {
+                let wraps = matches!(to, InputBinding::Variable { var, .. } if var.ty() != ScalarType::Float);
+                if overflow == Overflow::Wrap && !wraps {
+                    return fail(place, Kind::OnlyIntegersWrap);
+                }
+                self.check_input(place, Numbers::written(&encoding), to)
+            }
+            (Mode::User, Direction::Output, FieldSpec::DeviceOutput { encoding, overflow, from }) => {
+                if overflow == Overflow::Wrap && !encoding.is_integer() {
+                    return fail(place, Kind::OnlyIntegersWrap);
+                }
+                check_device_output(place, &encoding, from)
+            }
+            (Mode::User, _, FieldSpec::Fixed { .. } | FieldSpec::Padding { .. } | FieldSpec::Checksum(_)) => {
+                Ok(())
             }
             (mode, part, _) => fail(place, Kind::WrongField { mode, part }),
         }
     }
 
-    fn check_input(&self, place: Place, ty: ScalarType, to: InputBinding) -> Check {
+    fn check_input(&self, place: Place, numbers: Numbers, to: InputBinding) -> Check {
         match to {
             InputBinding::Unused => Ok(()),
             InputBinding::Variable { var, scale, offset } => {
@@ -86,15 +108,18 @@ impl<'a> RecipeCheck<'a> {
                 check_scale(place, scale, offset)
             }
             InputBinding::Commands { table, .. } => {
-                if matches!(ty, ScalarType::Float | ScalarType::Double) {
-                    return fail(place, Kind::NeedsInteger { ty });
+                if !numbers.integers {
+                    return fail(
+                        place,
+                        numbers.ty.map_or(Kind::NeedsIntegers, |ty| Kind::NeedsInteger { ty }),
+                    );
                 }
-                self.check_commands(place, ty, table)
+                self.check_commands(place, numbers, table)
             }
         }
     }
 
-    fn check_commands(&self, place: Place, ty: ScalarType, table: Span) -> Check {
+    fn check_commands(&self, place: Place, numbers: Numbers, table: Span) -> Check {
         let commands = self.config.commands;
         check_pool(place, table, commands.len())?;
         if table.len == 0 {
@@ -106,13 +131,65 @@ impl<'a> RecipeCheck<'a> {
             if let Err(error) = Request::parse_strict(command.text.as_bytes()) {
                 return fail(place, Kind::Command(error));
             }
-            let (low, high) = ty.range();
-            if !(low..=high).contains(&(command.value as f64)) {
-                return fail(place, Kind::CommandValue { value: command.value, ty });
+            let Numbers { low, high, ty, .. } = numbers;
+            let value = command.value as f64;
+            if !(low..=high).contains(&value) {
+                let written = Kind::NotInField { value, low, high };
+                let value = command.value;
+                return fail(place, ty.map_or(written, |ty| Kind::CommandValue { value, ty }));
             }
             if entries().any(|(other, before)| other < entry && before.value == command.value) {
                 return fail(place, Kind::DuplicateCommand { value: command.value });
             }
+        }
+        Ok(())
+    }
+
+    fn check_device_frames(&self, part: Direction) -> Check {
+        let recipe = self.index;
+        for frame in self.config.device_frames(self.recipe, part) {
+            let Err(error) = DeviceFrame::new(frame.carrier, part, frame.delimiters, frame.fields) else {
+                continue;
+            };
+            // A checksum is a field, and no element.
+            let element = error.element().map(usize::from);
+            let field = match element {
+                Some(element) => {
+                    let is_element = |field: &(usize, &FieldSpec)| field.1.element().is_some();
+                    frame.fields.iter().enumerate().filter(is_element).nth(element).map(|(nth, _)| nth)
+                }
+                None if error.is_of_checksum() => {
+                    frame.fields.iter().rposition(|field| matches!(field, FieldSpec::Checksum(_)))
+                }
+                None => None,
+            };
+            let place = match field {
+                Some(field) => Place::Field { recipe, part, frame: frame.nth, field: field as u8 },
+                None => Place::Frame { recipe, part, frame: frame.nth },
+            };
+            return fail(place, Kind::Layout(error));
+        }
+        match &self.recipe.parts {
+            Parts::Can { input, output } => {
+                let frames = if part == Direction::Input { input } else { output };
+                self.check_ids(part, frames)
+            }
+            Parts::Stream { .. } => Ok(()),
+        }
+    }
+
+    /// In a plain recipe the layout checks this.
+    fn check_ids(&self, part: Direction, frames: &[CanFramePart]) -> Check {
+        let recipe = self.index;
+        for (nth, frame) in (0..).zip(frames) {
+            let id = frame.id;
+            let earlier = (0..nth).zip(frames).find(|(_, earlier)| earlier.id == id);
+            let error = match earlier {
+                _ if !id.is_valid() => PartError::InvalidId { frame: nth, id },
+                Some((first, _)) => PartError::DuplicateId { frame: nth, first, id },
+                None => continue,
+            };
+            return fail(Place::Frame { recipe, part, frame: nth }, Kind::Part(error));
         }
         Ok(())
     }
@@ -158,6 +235,43 @@ impl<'a> RecipeCheck<'a> {
     }
 }
 
+/// The numbers that a field can have.
+#[derive(Clone, Copy)]
+struct Numbers {
+    low: f64,
+    high: f64,
+    integers: bool,
+    /// Its type, if it is one of the recipes' own.
+    ty: Option<ScalarType>,
+}
+
+impl Numbers {
+    fn of(ty: ScalarType) -> Self {
+        Self { ty: Some(ty), ..Self::written(&Encoding::scalar(ty)) }
+    }
+
+    fn written(encoding: &Encoding) -> Self {
+        let (low, high) = encoding.range();
+        Self { low, high, integers: encoding.is_integer(), ty: None }
+    }
+}
+
+fn check_device_output(place: Place, encoding: &Encoding, from: OutputBinding) -> Check {
+    let (low, high) = encoding.range();
+    match from {
+        OutputBinding::Variable { scale, offset, .. } => check_scale(place, scale, offset),
+        OutputBinding::Constant(value) => {
+            if !(low..=high).contains(&value) {
+                return fail(place, Kind::NotInField { value, low, high });
+            }
+            let is_whole = encoding.fit(value, Overflow::Usual) == Some(value);
+            if is_whole { Ok(()) } else { fail(place, Kind::NeedsIntegers) }
+        }
+        OutputBinding::Counter if !encoding.is_integer() => fail(place, Kind::NeedsIntegers),
+        OutputBinding::Counter | OutputBinding::Reply => Ok(()),
+    }
+}
+
 fn check_scale(place: Place, scale: f32, offset: f32) -> Check {
     if scale.is_finite() && scale != 0.0 && offset.is_finite() {
         Ok(())
@@ -187,8 +301,12 @@ pub(super) fn check_layout(
     part: Direction,
     framing: Framing,
 ) -> Result<(), PartError> {
+    // A device's frames are laid out when the recipe is checked, the same for every line.
+    if config.is_device(recipe) {
+        return Ok(());
+    }
     let rules = Rules { mode: recipe.mode, direction: part };
-    let fields = |span: Span| span.of(config.fields).iter().map(FieldSpec::field);
+    let fields = |span: Span| span.of(config.fields).iter().filter_map(FieldSpec::field);
     match &recipe.parts {
         Parts::Stream { input, output } => {
             let part = if part == Direction::Input { input } else { output };

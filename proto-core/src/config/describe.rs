@@ -240,6 +240,12 @@ impl fmt::Display for DescribedKind<'_> {
             Kind::NeedsInteger { ty } => {
                 write!(f, "needs an integer field (byte, char, word, short, dword, int); this one is a {ty}")
             }
+            Kind::Layout(error) => error.fmt(f),
+            Kind::NotInField { value, low, high } => {
+                write!(f, "the field cannot be {value}; allowed: {low}..={high}")
+            }
+            Kind::NeedsIntegers => f.write_str("needs a field that has integers only"),
+            Kind::OnlyIntegersWrap => f.write_str("only integers wrap; this one may have a fraction"),
             Kind::EmptyTable => f.write_str("a command table needs at least one command"),
             Kind::CommandValue { value, ty } => {
                 let (low, high) = ty.range();

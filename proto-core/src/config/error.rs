@@ -4,6 +4,7 @@ use core::net::Ipv4Addr;
 
 use super::Network;
 use crate::command::ParseError;
+use crate::device::LayoutError;
 use crate::recipe::PartError;
 use crate::recipe::model::Mode;
 use crate::sysvar::{Direction, ParseError as VarError, SysVar};
@@ -180,6 +181,8 @@ pub enum Counted {
     CommandFields,
     /// Bytes of all command texts.
     CommandBytes,
+    /// Frames of one port with a device's own frames.
+    DeviceFrames,
     /// Groups of variables that arrive together.
     Groups,
     /// Blocks of neighbouring variables that are polled by Modbus.
@@ -196,6 +199,7 @@ impl core::fmt::Display for Counted {
             Self::Commands => "commands in all recipes together",
             Self::SafeValues => "safe values on all ports together",
             Self::FieldPorts => "field ports",
+            Self::DeviceFrames => "frames of a device on one port",
             Self::InputFrames => "input frames",
             Self::RecipeLinks => "recipe links",
             Self::UserFields => "user-defined fields in one direction",
@@ -320,6 +324,21 @@ pub enum ConfigErrorKind {
         /// The field's type.
         ty: ScalarType,
     },
+    /// The frame of a device cannot be laid out.
+    Layout(LayoutError),
+    /// A number that its field cannot have.
+    NotInField {
+        /// The number.
+        value: f64,
+        /// The smallest number that the field can have.
+        low: f64,
+        /// The largest.
+        high: f64,
+    },
+    /// This use needs a field that has integers only.
+    NeedsIntegers,
+    /// Only integers wrap around.
+    OnlyIntegersWrap,
     /// A command table has no entries.
     EmptyTable,
     /// The field can never have a command's value.

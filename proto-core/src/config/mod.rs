@@ -11,6 +11,7 @@ mod budget;
 mod builder;
 mod check_recipe;
 mod describe;
+mod device;
 mod draft;
 mod error;
 mod fields;
@@ -24,6 +25,7 @@ mod view;
 
 pub use budget::{PartBudget, Warning, can_frame_time};
 pub use builder::ConfigBuilder;
+pub use device::DeviceFrame;
 pub use draft::{Can, ControllerBuilder, Listen, PortBuilder, PortBus, RecipeBuilder, SafeValues};
 pub use error::{
     ConfigError, ConfigErrorKind, ControllerKey, Counted, NetworkKey, Place, PortKey, RecipeKey,
@@ -38,6 +40,7 @@ pub use view::ConfigView;
 
 use heapless::{String, Vec};
 
+use crate::device::{Checksum, Encoding, Overflow};
 use crate::recipe::model::{MAX_CAN_IDS, MAX_DELIMITER, Mode};
 use crate::sysvar::SysVar;
 use crate::time::Duration;
@@ -340,6 +343,41 @@ pub enum FieldSpec {
         /// Where its value comes from.
         from: OutputBinding,
     },
+    /// A field of a device's frame, in the input part of a user recipe.
+    DeviceInput {
+        /// How it is written.
+        encoding: Encoding,
+        /// What becomes of a number that its variable cannot hold.
+        overflow: Overflow,
+        /// What is done with its value.
+        to: InputBinding,
+    },
+    /// A field of a device's frame, in the output part of a user recipe.
+    DeviceOutput {
+        /// How it is written.
+        encoding: Encoding,
+        /// What becomes of a number that it cannot hold.
+        overflow: Overflow,
+        /// Where its value comes from.
+        from: OutputBinding,
+    },
+    /// An integer that is the same in every frame; a received frame with another one is not this
+    /// frame.
+    Fixed {
+        /// How it is written.
+        encoding: Encoding,
+        /// The integer.
+        value: i64,
+    },
+    /// Bytes without a meaning: any are accepted.
+    Padding {
+        /// Number of bytes.
+        len: u8,
+        /// What is sent.
+        fill: u8,
+    },
+    /// The frame's checksum stands here.
+    Checksum(Checksum),
 }
 
 /// What is done with a received user-defined value.

@@ -143,21 +143,28 @@ impl Recipe {
 }
 
 impl FieldSpec {
-    /// The field as it is on the wire.
-    pub fn field(&self) -> Field {
+    /// The field as the controller's recipes have it; `None` if only frames of devices have it.
+    pub fn field(&self) -> Option<Field> {
         match *self {
-            Self::System(var) => Field::System(var),
-            Self::UserInput { ty, .. } | Self::UserOutput { ty, .. } => Field::User(ty),
+            Self::System(var) => Some(Field::System(var)),
+            Self::UserInput { ty, .. } | Self::UserOutput { ty, .. } => Some(Field::User(ty)),
+            _ => None,
         }
     }
 
     /// The system variable that the field is, or that it is bound to.
     pub fn variable(&self) -> Option<SysVar> {
         match *self {
-            Self::System(var)
-            | Self::UserInput { to: InputBinding::Variable { var, .. }, .. }
-            | Self::UserOutput { from: OutputBinding::Variable { var, .. }, .. } => Some(var),
-            Self::UserInput { .. } | Self::UserOutput { .. } => None,
+            Self::System(var) => Some(var),
+            Self::UserInput { to, .. } | Self::DeviceInput { to, .. } => match to {
+                InputBinding::Variable { var, .. } => Some(var),
+                InputBinding::Unused | InputBinding::Commands { .. } => None,
+            },
+            Self::UserOutput { from, .. } | Self::DeviceOutput { from, .. } => match from {
+                OutputBinding::Variable { var, .. } => Some(var),
+                OutputBinding::Constant(_) | OutputBinding::Counter | OutputBinding::Reply => None,
+            },
+            Self::Fixed { .. } | Self::Padding { .. } | Self::Checksum(_) => None,
         }
     }
 }

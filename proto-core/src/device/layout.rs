@@ -21,7 +21,12 @@ use crate::wire::scalar::{Scalar, ScalarType};
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub enum Element {
     /// A value.
-    Value(Encoding),
+    Value {
+        /// How it is written.
+        encoding: Encoding,
+        /// What is sent for a number that it cannot hold.
+        overflow: Overflow,
+    },
     /// A value that is always the same: a frame with another one is not this frame.
     Fixed {
         /// How it is written.
@@ -229,11 +234,34 @@ impl fmt::Display for LayoutError {
 
 impl core::error::Error for LayoutError {}
 
+impl LayoutError {
+    /// Index of the element that it is about.
+    pub const fn element(&self) -> Option<u8> {
+        match *self {
+            Self::Encoding { element }
+            | Self::NotWords { element }
+            | Self::NotShared { element }
+            | Self::Constant { element } => Some(element),
+            _ => None,
+        }
+    }
+
+    /// Whether it is about the checksum.
+    pub const fn is_of_checksum(&self) -> bool {
+        matches!(self, Self::Algorithm | Self::ChecksumPlace | Self::ChecksumRange)
+    }
+}
+
 impl Element {
+    /// A value that is written like this, or the nearest that fits.
+    pub const fn value(encoding: Encoding) -> Self {
+        Self::Value { encoding, overflow: Overflow::Usual }
+    }
+
     /// How it is written; `None` for padding.
     pub const fn encoding(&self) -> Option<Encoding> {
         match *self {
-            Self::Value(encoding) | Self::Fixed { encoding, .. } => Some(encoding),
+            Self::Value { encoding, .. } | Self::Fixed { encoding, .. } => Some(encoding),
             Self::Padding { .. } => None,
         }
     }
@@ -253,7 +281,7 @@ impl Element {
     fn len(&self) -> Option<usize> {
         match self {
             Self::Padding { len, .. } => Some(usize::from(*len)),
-            Self::Value(encoding) | Self::Fixed { encoding, .. } => encoding.size(),
+            Self::Value { encoding, .. } | Self::Fixed { encoding, .. } => encoding.size(),
         }
     }
 }
@@ -451,7 +479,7 @@ impl FrameLayout {
     }
 
     /// What `bytes` are, seen as a frame that begins at the first of them.
-    pub fn probe(&self, elements: &[Element], bytes: &[u8]) -> Probe {
+    pub fn probe<'e>(&self, elements: impl IntoIterator<Item = &'e Element>, bytes: &[u8]) -> Probe {
         if self.head.iter().zip(bytes).any(|(expected, byte)| expected != byte) {
             return Probe::No;
         }
@@ -504,31 +532,31 @@ impl FrameLayout {
     /// not a value.
     pub fn values<'a>(
         &self,
-        elements: &'a [Element],
+        elements: impl IntoIterator<Item = &'a Element>,
         frame: &'a [u8],
-    ) -> impl Iterator<Item = Result<Option<Scalar>, Unreadable>> + 'a {
+    ) -> impl Iterator<Item = Result<Option<Scalar>, Unreadable>> {
         let mut places = Places::new(self);
-        elements.iter().map(move |element| {
+        elements.into_iter().map(move |element| {
             let place = places.find(element, frame).map_err(|_| Unreadable::Length)?;
             match element {
-                Element::Value(encoding) => encoding.read(frame.get(place).unwrap_or(&[])).map(Some),
+                Element::Value { encoding, .. } => encoding.read(frame.get(place).unwrap_or(&[])).map(Some),
                 Element::Fixed { .. } | Element::Padding { .. } => Ok(None),
             }
         })
     }
 
     /// Writes a frame to the front of `out` and returns its length. `value` is asked for the number
-    /// of each element that is a value, by its index; a number that does not fit becomes the nearest
-    /// that does, or wraps if `value` says so. `None` if there is no such number, or no room.
-    pub fn encode(
+    /// of each element that is a value, by its index. `None` if one is not a number, or cannot be
+    /// wrapped, or if there is no room.
+    pub fn encode<'e>(
         &self,
-        elements: &[Element],
-        mut value: impl FnMut(usize) -> (f64, Overflow),
+        elements: impl IntoIterator<Item = &'e Element>,
+        mut value: impl FnMut(usize) -> f64,
         out: &mut [u8],
     ) -> Option<usize> {
         let mut places = Places::new(self);
         put(out, 0, &self.head)?;
-        for (nth, element) in elements.iter().enumerate() {
+        for (nth, element) in elements.into_iter().enumerate() {
             let at = if element.is_shared() { places.shared_at } else { places.at };
             let rest = out.get_mut(at..)?;
             let (encoding, number) = match *element {
@@ -539,10 +567,7 @@ impl FrameLayout {
                     continue;
                 }
                 Element::Fixed { encoding, value } => (encoding, value as f64),
-                Element::Value(encoding) => {
-                    let (number, overflow) = value(nth);
-                    (encoding, encoding.fit(number, overflow)?)
-                }
+                Element::Value { encoding, overflow } => (encoding, encoding.fit(value(nth), overflow)?),
             };
             if let Some((bits, _)) = element.bits()
                 && !element.is_shared()

@@ -13,3 +13,5 @@ pub use encoding::{Bits, Digits, Encoding, Kind, MAX_DIGITS, Overflow, Unreadabl
 pub use framer::{Found, Framer, FramerStats};
 pub use layout::{Carrier, Checksum, Element, FrameLayout, LayoutError, Probe};
 pub use order::ByteOrder;
+
+pub(crate) use encoding::wrap;

@@ -7,6 +7,7 @@ use heapless::Vec;
 
 use super::command_link::{CommandLink, MAX_COMMAND_BYTES, MAX_COMMAND_FIELDS};
 use super::counters::PortCounters;
+use super::device_port::DeviceCodec;
 use super::field_port::{Codec, FieldPort, LineTiming};
 use super::io::{BusState, LinkId, LinkKind, PortId, ReplyCode, Transport};
 use super::links::Links;
@@ -18,12 +19,13 @@ use super::state_link::StateLink;
 use super::store::{InputFrame, MAX_INPUT_FRAMES, SafeBytes, Store};
 use super::tap::Tap;
 use super::uplink::{Uplink, UplinkSetup};
-use super::user::{Bindings, InputBind};
+use super::user::{Bindings, InputBind, InputTo, OutputBind};
 use super::{Ask, Engine};
 use crate::config::{
-    Bus, CanFramePart, ConfigError, ConfigView, Counted, FieldSpec, InputBinding, Parts, Port, Recipe,
-    SendOn, Span, StreamPart, listen_address,
+    Bus, CanFramePart, ConfigError, ConfigView, Counted, FieldSpec, InputBinding, OutputBinding, Parts, Port,
+    Recipe, SendOn, Span, StreamPart, listen_address,
 };
+use crate::device::LayoutError;
 use crate::image::{GroupId, InputSet, MAX_GROUPS};
 use crate::link::LinkTimings;
 use crate::recipe::Deframer;
@@ -32,6 +34,7 @@ use crate::recipe::{CanLayout, PartError, StreamLayout};
 use crate::sysvar::{Direction, SysVar};
 use crate::time::{Duration, Instant};
 use crate::wire::dialect::Dialect;
+use crate::wire::scalar::ScalarType;
 
 /// Why an engine cannot run a configuration.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -49,6 +52,17 @@ pub enum BuildError {
         part: Direction,
         /// What is wrong.
         error: PartError,
+    },
+    /// A device's frame cannot be laid out.
+    Layout {
+        /// Index of the recipe.
+        recipe: u8,
+        /// The part.
+        part: Direction,
+        /// Index of the CAN frame; 0 in a stream recipe.
+        frame: u8,
+        /// What is wrong.
+        error: LayoutError,
     },
     /// There is no dialect of the configured name.
     UnknownDialect,
@@ -73,6 +87,11 @@ impl fmt::Display for BuildError {
                 let part = if *part == Direction::Input { "input" } else { "output" };
                 write!(f, "recipe {}, {part} part: {error}", recipe.saturating_add(1))
             }
+            Self::Layout { recipe, part, frame, error } => {
+                let part = if *part == Direction::Input { "input" } else { "output" };
+                let (recipe, frame) = (recipe.saturating_add(1), frame.saturating_add(1));
+                write!(f, "recipe {recipe}, {part} part, frame {frame}: {error}")
+            }
             Self::UnknownDialect => write!(f, "unknown dialect; there are {:?}", Dialect::NAMES),
             Self::TooMany { what, needed, room } => {
                 write!(f, "too many {what}: {needed} are needed; this gateway has room for {room}")
@@ -84,7 +103,7 @@ impl fmt::Display for BuildError {
 impl core::error::Error for BuildError {}
 
 /// There was no room for another entry.
-fn one_too_many(what: Counted, room: usize) -> BuildError {
+pub(super) fn one_too_many(what: Counted, room: usize) -> BuildError {
     BuildError::TooMany { what, needed: room.saturating_add(1), room }
 }
 
@@ -243,13 +262,17 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             ports = ports.saturating_add(1);
             frames = frames.saturating_add(recipe.frames(Direction::Input).count());
             for (_, _, field) in config.fields_of(recipe, Direction::Input) {
-                let FieldSpec::UserInput { to, .. } = field else { continue };
+                let to = match field {
+                    FieldSpec::UserInput { to, .. } | FieldSpec::DeviceInput { to, .. } => *to,
+                    _ if field.element().is_some() => InputBinding::Unused,
+                    _ => continue,
+                };
                 inputs = inputs.saturating_add(1);
                 commands = commands.saturating_add(usize::from(matches!(to, InputBinding::Commands { .. })));
             }
             outputs = config
                 .fields_of(recipe, Direction::Output)
-                .filter(|(_, _, field)| matches!(field, FieldSpec::UserOutput { .. }))
+                .filter(|(_, _, field)| field.element().is_some())
                 .fold(outputs, |count, _| count.saturating_add(1));
         }
         let texts = if commands == 0 { &[] } else { config.commands };
@@ -281,6 +304,11 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     ) -> Result<(), BuildError> {
         // Validation has refused recipes that the bus cannot carry.
         let codec = match &recipe.parts {
+            _ if config.is_device(recipe) => {
+                let inputs = self.bindings.inputs.len() as u16;
+                let outputs = self.bindings.outputs.len() as u16;
+                Codec::Device(DeviceCodec::new(config, port.recipe, recipe, inputs, outputs)?)
+            }
             Parts::Stream { input, output } => stream_codec(config, port.recipe, recipe, [input, output])?,
             Parts::Can { input, output } => can_codec(config, port.recipe, recipe, [input, output])?,
         };
@@ -293,7 +321,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         for (_, fields) in recipe.frames(Direction::Input) {
             let fields = fields.of(config.fields);
             let set = fields.iter().filter_map(FieldSpec::variable).collect();
-            let is_bound = |field: &&FieldSpec| matches!(field, FieldSpec::UserInput { .. });
+            let is_bound = |field: &&FieldSpec| field.element().is_some();
             let bound = fields.iter().filter(is_bound).count() as u16;
             let bindings = Span { start: next_binding, len: bound };
             next_binding = next_binding.saturating_add(bound);
@@ -314,30 +342,37 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         let full = || one_too_many(Counted::UserFields, FIELDS);
         let mut inputs = Span { start: self.bindings.inputs.len() as u16, len: 0 };
         for (_, _, field) in config.fields_of(recipe, Direction::Input) {
-            let bind = match *field {
-                FieldSpec::UserInput { to: InputBinding::Variable { var, scale, offset }, .. } => {
-                    InputBind::Variable { var, scale, offset }
-                }
-                FieldSpec::UserInput { to: InputBinding::Commands { table, when }, .. } => {
+            let Some(element) = field.element() else { continue };
+            let to = match *field {
+                FieldSpec::UserInput { to, .. } | FieldSpec::DeviceInput { to, .. } => to,
+                _ => InputBinding::Unused,
+            };
+            let to = match to {
+                InputBinding::Variable { var, scale, offset } => InputTo::Variable { var, scale, offset },
+                InputBinding::Commands { table, when } => {
                     if self.links.command.is_empty() {
                         self.add_command_link(config, dialect)?;
                     }
                     let Some(link) = self.links.command.first_mut() else { continue };
                     let field = link.add_field(table, when);
-                    InputBind::Command(field.ok_or(one_too_many(Counted::CommandFields, MAX_COMMAND_FIELDS))?)
+                    InputTo::Command(field.ok_or(one_too_many(Counted::CommandFields, MAX_COMMAND_FIELDS))?)
                 }
-                FieldSpec::UserInput { .. } => InputBind::Unused,
-                _ => continue,
+                InputBinding::Unused => InputTo::Unused,
             };
-            self.bindings.inputs.push(bind).map_err(|_| full())?;
+            self.bindings.inputs.push(InputBind { to, element }).map_err(|_| full())?;
             inputs.len = inputs.len.saturating_add(1);
         }
         let mut outputs = Span { start: self.bindings.outputs.len() as u16, len: 0 };
         for (_, _, field) in config.fields_of(recipe, Direction::Output) {
-            if let FieldSpec::UserOutput { ty, from } = *field {
-                self.bindings.outputs.push((ty, from)).map_err(|_| full())?;
-                outputs.len = outputs.len.saturating_add(1);
-            }
+            let Some(element) = field.element() else { continue };
+            // How constants and padding are sent is the element's business.
+            let (ty, from) = match *field {
+                FieldSpec::UserOutput { ty, from } => (ty, from),
+                FieldSpec::DeviceOutput { from, .. } => (ScalarType::Double, from),
+                _ => (ScalarType::Double, OutputBinding::Constant(0.0)),
+            };
+            self.bindings.outputs.push(OutputBind { ty, from, element }).map_err(|_| full())?;
+            outputs.len = outputs.len.saturating_add(1);
         }
         self.store.watches_bits |= matches!(recipe.send, SendOn::Rising { .. });
         let has_output = recipe.has(Direction::Output);
@@ -587,7 +622,7 @@ fn stream_layout(
 ) -> Result<Option<StreamLayout>, BuildError> {
     let Some(part) = part else { return Ok(None) };
     let rules = Rules { mode: recipe.mode, direction };
-    let fields = part.fields.of(config.fields).iter().map(FieldSpec::field);
+    let fields = part.fields.of(config.fields).iter().filter_map(FieldSpec::field);
     StreamLayout::new(rules, &part.head, &part.tail, fields, framing)
         .map(Some)
         .map_err(|error| BuildError::Part { recipe: index, part: direction, error })
@@ -605,7 +640,7 @@ fn can_codec(
             return Ok(None);
         }
         let frames = frames.iter().map(|frame| {
-            let fields = frame.fields.of(config.fields).iter().map(FieldSpec::field);
+            let fields = frame.fields.of(config.fields).iter().filter_map(FieldSpec::field);
             (frame.id, fields)
         });
         CanLayout::new(Rules { mode: recipe.mode, direction }, frames)

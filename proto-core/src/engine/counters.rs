@@ -24,6 +24,12 @@ pub struct PortCounters {
     pub rejected_length: u32,
     /// Remote frames ignored (D17).
     pub rejected_remote: u32,
+    /// Frames rejected because their checksum is wrong.
+    pub rejected_checksum: u32,
+    /// Frames rejected because a field is not a number, such as a letter among digits.
+    pub rejected_unreadable: u32,
+    /// Frames that are right and of another device: a constant is not ours.
+    pub rejected_other_device: u32,
     /// Frames received on a port whose recipe has no input part.
     pub rejected_no_input: u32,
     /// Frames that began with the head but did not end with the tail (D19).

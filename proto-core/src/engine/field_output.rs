@@ -36,6 +36,7 @@ impl FieldPort {
         match self.codec {
             Codec::Stream { .. } => self.next_stream(image, self.outputs.of(bindings), out),
             Codec::Can { .. } => self.next_can(image, self.outputs.of(bindings)),
+            Codec::Device(_) => self.next_device(image, bindings, out),
         }
     }
 

@@ -5,13 +5,14 @@
 
 use super::command_link::CommandLink;
 use super::counters::{PortCounters, add, bump};
+use super::device_port::DeviceCodec;
 use super::io::{BusState, PortId, PortState, ReplyCode};
 use super::outcome::Outcome;
 use super::rejection::{LastRejection, Rejection};
 use super::sender::Sender;
 use super::store::{InputFrame, Store};
 use super::tap::{Tap, TapDirection, TapPlace, TapVerdict, Tapped};
-use super::user::{InputBind, fit, forget_commands};
+use super::user::{InputBind, InputTo, fit, forget_commands};
 use crate::config::{Name, Rs485, Span};
 use crate::image::{ImageBytes, InputSet};
 use crate::recipe::Deframer;
@@ -29,6 +30,7 @@ use crate::wire::scalar::Scalar;
 pub(super) enum Codec {
     Stream { input: Option<StreamLayout>, output: Option<StreamLayout>, deframer: Deframer },
     Can { input: Option<CanLayout>, output: Option<CanLayout> },
+    Device(DeviceCodec),
 }
 
 /// Timing of a half-duplex line.
@@ -175,7 +177,12 @@ impl FieldPort {
         keep(&mut self.last_rejection, Rejection::Asleep, can_id, bytes, now);
         add(&mut self.counters.bytes_in, bytes.len());
         bump(&mut self.counters.asleep);
-        if let Codec::Stream { input: Some(_), .. } = &self.codec {
+        let reads_bytes = match &self.codec {
+            Codec::Stream { input, .. } => input.is_some(),
+            Codec::Device(device) => device.framer.is_some(),
+            Codec::Can { .. } => false,
+        };
+        if reads_bytes {
             add(&mut self.counters.discarded_bytes, bytes.len());
         }
         self.line.heard = now;
@@ -201,7 +208,10 @@ impl FieldPort {
         let now = store.now;
         let bytes = core::mem::take(rest);
         let usable = self.is_usable();
-        let Codec::Stream { input, deframer, .. } = &mut self.codec else { return accepted };
+        let Codec::Stream { input, deframer, .. } = &mut self.codec else {
+            *rest = bytes;
+            return self.device_frames(rest, bindings, store, commands, tap);
+        };
         let Some(layout) = input else {
             bump(&mut self.counters.rejected_no_input);
             tap.record(|| came(self.id, now, Err(Rejection::NoInput), None, [bytes, &[], &[]]));
@@ -281,7 +291,9 @@ impl FieldPort {
         let now = store.now;
         add(&mut self.counters.bytes_in, frame.data().len());
         let usable = self.is_usable();
-        let Codec::Can { input, .. } = &self.codec else { return Ok(Accepted::default()) };
+        let Codec::Can { input, .. } = &self.codec else {
+            return self.device_can(frame, bindings, store, commands);
+        };
         let Some(layout) = input else {
             bump(&mut self.counters.rejected_no_input);
             return Err(Rejection::NoInput);
@@ -350,13 +362,28 @@ impl FieldPort {
     fn partial_until(&self) -> Instant {
         match &self.codec {
             Codec::Stream { deframer, .. } if deframer.pending() > 0 => self.line.heard + self.line.idle_gap,
+            Codec::Device(DeviceCodec { framer: Some(framer), .. }) if !framer.held().is_empty() => {
+                self.line.heard + self.line.idle_gap
+            }
             _ => Instant::NEVER,
         }
     }
 
     #[cold]
     fn discard_partial<const TAP: usize>(&mut self, tap: &mut Tap<TAP>, now: Instant) {
-        let Codec::Stream { deframer, .. } = &mut self.codec else { return };
+        let deframer = match &mut self.codec {
+            Codec::Stream { deframer, .. } => deframer,
+            Codec::Device(DeviceCodec { framer: Some(framer), .. }) => {
+                let held = framer.held();
+                if !held.is_empty() {
+                    tap.record(|| came(self.id, now, Err(Rejection::Partial), None, [held, &[], &[]]));
+                    keep(&mut self.last_rejection, Rejection::Partial, None, held, now);
+                }
+                let dropped = framer.discard();
+                return add(&mut self.counters.discarded_bytes, dropped);
+            }
+            _ => return,
+        };
         let (first, second) = deframer.held();
         if !first.is_empty() {
             tap.record(|| came(self.id, now, Err(Rejection::Partial), None, [first, second, &[]]));
@@ -369,7 +396,13 @@ impl FieldPort {
     /// `skipped` bytes of a chunk, or of bytes held before it, belong to no frame. Without silence
     /// between, further ones belong to the same rejection.
     #[cold]
-    fn no_frame<const TAP: usize>(&mut self, bytes: &[u8], skipped: usize, tap: &mut Tap<TAP>, now: Instant) {
+    pub(super) fn no_frame<const TAP: usize>(
+        &mut self,
+        bytes: &[u8],
+        skipped: usize,
+        tap: &mut Tap<TAP>,
+        now: Instant,
+    ) {
         tap.record(|| came(self.id, now, Err(Rejection::NoFrame), None, [bytes, &[], &[]]));
         match &mut self.last_rejection {
             Some(last) if last.goes_on(now, self.line.idle_gap) => last.append(now, skipped, bytes),
@@ -393,12 +426,18 @@ impl FieldPort {
 
 #[cold]
 #[inline(never)]
-fn keep(last: &mut Option<LastRejection>, why: Rejection, can_id: Option<CanId>, bytes: &[u8], now: Instant) {
+pub(super) fn keep(
+    last: &mut Option<LastRejection>,
+    why: Rejection,
+    can_id: Option<CanId>,
+    bytes: &[u8],
+    now: Instant,
+) {
     *last = Some(LastRejection::new(now, why, can_id, bytes));
 }
 
 /// Input from a field port's device, for the tap.
-fn came<'a>(
+pub(super) fn came<'a>(
     port: PortId,
     at: Instant,
     verdict: Result<(), Rejection>,
@@ -410,14 +449,14 @@ fn came<'a>(
 }
 
 /// The context for applying a frame.
-struct Frames<'a, const PORTS: usize> {
-    mode: Mode,
-    bindings: &'a [InputBind],
-    reply: &'a mut ReplyCode,
-    counters: &'a mut PortCounters,
-    port: PortId,
-    store: &'a mut Store<PORTS>,
-    commands: Option<&'a mut CommandLink>,
+pub(super) struct Frames<'a, const PORTS: usize> {
+    pub mode: Mode,
+    pub bindings: &'a [InputBind],
+    pub reply: &'a mut ReplyCode,
+    pub counters: &'a mut PortCounters,
+    pub port: PortId,
+    pub store: &'a mut Store<PORTS>,
+    pub commands: Option<&'a mut CommandLink>,
 }
 
 impl<const PORTS: usize> Frames<'_, PORTS> {
@@ -453,7 +492,7 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
                     return Err(Rejection::OutOfRange);
                 }
                 for (binding, value) in bindings.iter().zip(layout.values(payload)) {
-                    self.apply_user(binding, value);
+                    self.apply_user(&binding.to, value);
                 }
                 if let Some(link) = &mut self.commands {
                     link.frame_ends();
@@ -464,16 +503,16 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
         Ok(self.store.accepted(slot, self.counters))
     }
 
-    fn apply_user(&mut self, binding: &InputBind, value: Scalar) {
+    pub(super) fn apply_user(&mut self, binding: &InputTo, value: Scalar) {
         match *binding {
-            InputBind::Unused => {}
-            InputBind::Variable { .. } => {
+            InputTo::Unused => {}
+            InputTo::Variable { .. } => {
                 if let Some((var, value)) = binding.bound(value) {
                     // It fits: all values were tried before the first was applied.
                     let _ = self.store.image.set(var, value);
                 }
             }
-            InputBind::Command(field) => {
+            InputTo::Command(field) => {
                 if let Some(link) = &mut self.commands {
                     let nth = self.counters.commands.wrapping_add(1);
                     if let Some(code) = link.value(field, value, (self.port, nth), self.store.now) {

@@ -16,6 +16,7 @@ mod build;
 mod command_link;
 mod connection;
 mod counters;
+mod device_port;
 mod field_output;
 mod field_port;
 mod flight;

@@ -23,6 +23,12 @@ pub enum Rejection {
     WrongLength,
     /// A remote frame (D17).
     Remote,
+    /// A checksum that is wrong.
+    Checksum,
+    /// A field that is not a number, such as a letter among digits.
+    Unreadable,
+    /// A frame of another device: a constant is not ours.
+    OtherDevice,
     /// The recipe has no input part.
     NoInput,
     /// It waited while the gateway itself slept.
@@ -33,7 +39,7 @@ pub enum Rejection {
 
 impl Rejection {
     /// All reasons.
-    pub const ALL: [Self; 10] = [
+    pub const ALL: [Self; 13] = [
         Self::NoFrame,
         Self::Partial,
         Self::NotFinite,
@@ -41,6 +47,9 @@ impl Rejection {
         Self::ForeignId,
         Self::WrongLength,
         Self::Remote,
+        Self::Checksum,
+        Self::Unreadable,
+        Self::OtherDevice,
         Self::NoInput,
         Self::Asleep,
         Self::Malformed,
@@ -56,6 +65,9 @@ impl Rejection {
             Self::ForeignId => "a CAN id that the recipe does not have",
             Self::WrongLength => "a CAN frame of another length",
             Self::Remote => "a remote frame",
+            Self::Checksum => "a wrong checksum",
+            Self::Unreadable => "a field is not a number",
+            Self::OtherDevice => "a frame of another device",
             Self::NoInput => "the recipe has no input part",
             Self::Asleep => "waited while the gateway slept",
             Self::Malformed => "a violation of the protocol",

@@ -189,10 +189,12 @@ impl<'a> Status<'a> {
         let groups = (0..).zip(self.frames).filter(|(_, frame)| own(frame)).map(|(group, _)| group);
         let heard_at = groups.filter_map(|group| self.image.stamp_of(GroupId(group))).max();
         let overdue = self.frames.iter().filter(own).filter(|frame| frame.overdue_at == Instant::NEVER);
-        let bus = match port.codec {
-            Codec::Stream { .. } => FieldBus::Rs485,
-            Codec::Can { .. } => FieldBus::Can { state: port.bus },
+        let is_can = match &port.codec {
+            Codec::Stream { .. } => false,
+            Codec::Can { .. } => true,
+            Codec::Device(device) => device.framer.is_none(),
         };
+        let bus = if is_can { FieldBus::Can { state: port.bus } } else { FieldBus::Rs485 };
         PortStatus {
             id: port.id,
             name: &port.name,

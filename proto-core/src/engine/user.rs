@@ -5,15 +5,23 @@ use heapless::Vec;
 use super::command_link::CommandLink;
 use super::io::ReplyCode;
 use crate::config::OutputBinding;
+use crate::device::{Element, wrap};
 use crate::image::{Image, bind_to_variable, saturate_to_field};
 use crate::recipe::model::MAX_FIELDS;
 use crate::sysvar::SysVar;
 use crate::time::Instant;
 use crate::wire::scalar::{Scalar, ScalarType};
 
-/// The binding of an input field.
+/// An input field: what is done with its value, and how it is written in a device's own frame.
 #[derive(Debug, Clone, Copy)]
-pub(super) enum InputBind {
+pub(super) struct InputBind {
+    pub to: InputTo,
+    pub element: Element,
+}
+
+/// What is done with the value of an input field.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum InputTo {
     Unused,
     Variable {
         var: SysVar,
@@ -24,7 +32,7 @@ pub(super) enum InputBind {
     Command(u8),
 }
 
-impl InputBind {
+impl InputTo {
     /// The variable and the value that the received value becomes; `None` if the value does not fit
     /// or the binding is not to a variable.
     pub(super) fn bound(&self, value: Scalar) -> Option<(SysVar, Scalar)> {
@@ -39,8 +47,8 @@ impl InputBind {
 
 /// Whether every value fits the variable it is bound to (D22).
 pub(super) fn fit(bindings: &[InputBind], values: impl Iterator<Item = Scalar>) -> bool {
-    bindings.iter().zip(values).all(|(binding, value)| match binding {
-        InputBind::Variable { .. } => binding.bound(value).is_some(),
+    bindings.iter().zip(values).all(|(binding, value)| match binding.to {
+        InputTo::Variable { .. } => binding.to.bound(value).is_some(),
         _ => true,
     })
 }
@@ -49,14 +57,20 @@ pub(super) fn fit(bindings: &[InputBind], values: impl Iterator<Item = Scalar>) 
 pub(super) fn forget_commands(bindings: &[InputBind], commands: Option<&mut CommandLink>, now: Instant) {
     let Some(link) = commands else { return };
     for binding in bindings {
-        if let InputBind::Command(field) = binding {
-            link.forget(*field, now);
+        if let InputTo::Command(field) = binding.to {
+            link.forget(field, now);
         }
     }
 }
 
-/// An output field: its type, and the source of its value.
-pub(super) type OutputBind = (ScalarType, OutputBinding);
+/// An output field: its type, the source of its value, and how it is written in a device's own
+/// frame.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct OutputBind {
+    pub ty: ScalarType,
+    pub from: OutputBinding,
+    pub element: Element,
+}
 
 /// The values of the fields.
 pub(super) fn values(
@@ -66,7 +80,7 @@ pub(super) fn values(
     reply: ReplyCode,
 ) -> Vec<Scalar, MAX_FIELDS> {
     let mut values = Vec::new();
-    for &(ty, from) in bindings {
+    for &OutputBind { ty, from, .. } in bindings {
         let value = match from {
             OutputBinding::Variable { var, scale, offset } => {
                 saturate_to_field(ty, image.value(var).as_f64(), scale, offset)
@@ -79,6 +93,22 @@ pub(super) fn values(
         let _ = values.push(value);
     }
     values
+}
+
+/// The number that a device's frame shows for a field; not a number if there is none.
+pub(super) fn number_of(binding: &OutputBind, image: &Image, frames_sent: u32, reply: ReplyCode) -> f64 {
+    match binding.from {
+        OutputBinding::Variable { var, scale, offset } => {
+            image.value(var).as_f64() * f64::from(scale) + f64::from(offset)
+        }
+        OutputBinding::Constant(value) => value,
+        OutputBinding::Counter => {
+            // It never turns negative, nor stays at the highest number.
+            let high = binding.element.encoding().map_or(0.0, |encoding| encoding.range().1);
+            wrap(f64::from(frames_sent), 0.0, high.min(f64::from(u32::MAX))).unwrap_or(f64::NAN)
+        }
+        OutputBinding::Reply => f64::from(reply as u8),
+    }
 }
 
 /// The bindings of all ports; ports name ranges of it.

@@ -9,7 +9,7 @@ use crate::sysvar::Direction;
 use crate::wire::scalar::ScalarType;
 
 fn byte() -> Element {
-    Element::Value(Encoding::scalar(ScalarType::Byte))
+    Element::value(Encoding::scalar(ScalarType::Byte))
 }
 
 /// A head of one byte, two bytes of values, CRC-16/MODBUS: frames of five bytes.
@@ -31,7 +31,7 @@ fn small() -> (Vec<Element>, FrameLayout) {
 fn frame(values: [u8; 2]) -> Vec<u8> {
     let (elements, layout) = small();
     let mut out = [0; 16];
-    let number = |nth: usize| (f64::from(values[nth]), super::super::Overflow::Usual);
+    let number = |nth: usize| f64::from(values[nth]);
     let len = layout.encode(&elements, number, &mut out).unwrap();
     out[..len].to_vec()
 }
@@ -133,7 +133,7 @@ fn endless_false_beginnings_cost_bounded_work() {
     // And a good frame after a pause is taken.
     framer.discard();
     let mut out = [0; 512];
-    let zero = |_: usize| (0.0, super::super::Overflow::Usual);
+    let zero = |_: usize| 0.0;
     let len = layout.encode(&elements, zero, &mut out).unwrap();
     let mut rest = &out[..len];
     let found = framer.next_frame(&mut rest, effort, |bytes| layout.probe(&elements, bytes));

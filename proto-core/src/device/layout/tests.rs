@@ -4,7 +4,7 @@ use std::vec::Vec;
 use super::*;
 
 fn value(kind: Kind, order: ByteOrder) -> Element {
-    Element::Value(Encoding { kind, order, shared: false })
+    Element::value(Encoding { kind, order, shared: false })
 }
 
 fn big(ty: ScalarType) -> Element {
@@ -17,7 +17,7 @@ fn fixed(ty: ScalarType, number: i64) -> Element {
 
 fn bits(first: u8, count: u8, shared: bool) -> Element {
     let kind = Kind::Bits(Bits { bytes: 1, first, count, signed: false });
-    Element::Value(Encoding { kind, order: ByteOrder::Little, shared })
+    Element::value(Encoding { kind, order: ByteOrder::Little, shared })
 }
 
 fn standard(name: &str, behind: usize) -> Option<(Checksum, usize)> {
@@ -26,7 +26,7 @@ fn standard(name: &str, behind: usize) -> Option<(Checksum, usize)> {
 
 fn encoded(layout: &FrameLayout, elements: &[Element], numbers: &[f64]) -> Vec<u8> {
     let mut out = [0xEE; 64];
-    let len = layout.encode(elements, |nth| (numbers[nth], Overflow::Usual), &mut out).unwrap();
+    let len = layout.encode(elements, |nth| numbers[nth], &mut out).unwrap();
     assert!(out[len..].iter().all(|&byte| byte == 0xEE), "nothing is written behind the frame");
     out[..len].to_vec()
 }
@@ -203,7 +203,7 @@ fn what_cannot_be_laid_out_is_refused() {
     assert_eq!(new(&[bits(0, 2, false), bits(1, 1, true)]), shared, "the same bit");
     assert_eq!(new(&[bits(0, 2, false), bits(2, 6, true)]), Ok((2, 2)));
     // What is received may be used twice.
-    let twice = Element::Value(Encoding { shared: true, ..Encoding::scalar(ScalarType::Byte) });
+    let twice = Element::value(Encoding { shared: true, ..Encoding::scalar(ScalarType::Byte) });
     assert_eq!(with(twice), shared);
     let input = |elements: &[Element]| {
         FrameLayout::new(Carrier::Stream, Direction::Input, &[1], &[], elements, None)

@@ -1,0 +1,133 @@
+//! Frames of devices in a configuration: the fields of one frame as the elements of a layout.
+//!
+//! In: the fields of a user recipe's frame. Out: elements and layout, or what is wrong with them.
+
+use heapless::Vec;
+
+use super::{FieldSpec, Parts, Recipe};
+use crate::config::ConfigView;
+use crate::device::{Carrier, Checksum, Element, Encoding, FrameLayout, LayoutError, MAX_DIGITS};
+use crate::recipe::model::MAX_FIELDS;
+use crate::sysvar::Direction;
+
+/// The elements of one frame, and its layout.
+#[derive(Debug, Clone)]
+pub struct DeviceFrame {
+    /// What the frame consists of, without the checksum.
+    pub elements: Vec<Element, MAX_FIELDS>,
+    /// Their layout.
+    pub layout: FrameLayout,
+}
+
+impl DeviceFrame {
+    /// Lays out a frame. Head and tail are those of a stream part, or empty.
+    ///
+    /// # Errors
+    /// [`LayoutError`]: its elements are counted without the checksum.
+    pub fn new(
+        carrier: Carrier,
+        direction: Direction,
+        (head, tail): (&[u8], &[u8]),
+        fields: &[FieldSpec],
+    ) -> Result<Self, LayoutError> {
+        let mut elements = Vec::new();
+        let mut checksum: Option<(Checksum, usize)> = None;
+        for field in fields {
+            match (field.element(), field) {
+                (Some(element), _) => {
+                    elements.push(element).map_err(|_| LayoutError::TooManyElements)?;
+                }
+                (None, FieldSpec::Checksum(sum)) if checksum.is_none() => {
+                    checksum = Some((*sum, elements.len()));
+                }
+                (None, _) => return Err(LayoutError::ChecksumPlace),
+            }
+        }
+        let layout = FrameLayout::new(carrier, direction, head, tail, &elements, checksum)?;
+        Ok(Self { elements, layout })
+    }
+}
+
+impl FieldSpec {
+    /// Whether the controller's own recipes have no such field: only frames of devices have it.
+    pub const fn is_device(&self) -> bool {
+        match self {
+            Self::System(_) | Self::UserInput { .. } | Self::UserOutput { .. } => false,
+            Self::DeviceInput { .. }
+            | Self::DeviceOutput { .. }
+            | Self::Fixed { .. }
+            | Self::Padding { .. }
+            | Self::Checksum(_) => true,
+        }
+    }
+
+    /// The field as an element of a device's frame; `None` for a checksum and for the fields of
+    /// realtime recipes.
+    pub const fn element(&self) -> Option<Element> {
+        Some(match *self {
+            Self::UserInput { ty, .. } | Self::UserOutput { ty, .. } => Element::value(Encoding::scalar(ty)),
+            Self::DeviceInput { encoding, overflow, .. } | Self::DeviceOutput { encoding, overflow, .. } => {
+                Element::Value { encoding, overflow }
+            }
+            Self::Fixed { encoding, value } => Element::Fixed { encoding, value },
+            Self::Padding { len, fill } => Element::Padding { len, fill },
+            Self::System(_) | Self::Checksum(_) => return None,
+        })
+    }
+
+    /// Maximum number of bytes that the field adds to a frame.
+    pub(super) fn longest(&self) -> usize {
+        match (self.element(), self) {
+            (_, Self::System(var)) => var.size(),
+            (_, Self::Checksum(sum)) => sum.len(),
+            (Some(Element::Padding { len, .. }), _) => usize::from(len),
+            (Some(Element::Value { encoding, .. } | Element::Fixed { encoding, .. }), _) => {
+                let varying = MAX_DIGITS.saturating_add(1);
+                if encoding.shared { 0 } else { encoding.size().unwrap_or(varying) }
+            }
+            (None, _) => 0,
+        }
+    }
+}
+
+/// One frame of a part, as the configuration has it.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct FrameFields<'c> {
+    /// 0 in a stream recipe, else the index of the CAN frame.
+    pub(crate) nth: u8,
+    pub(crate) carrier: Carrier,
+    pub(crate) delimiters: (&'c [u8], &'c [u8]),
+    pub(crate) fields: &'c [FieldSpec],
+}
+
+impl<'c> ConfigView<'c> {
+    /// The frames of one part of a device's recipe.
+    pub(crate) fn device_frames(
+        self,
+        recipe: &'c Recipe,
+        part: Direction,
+    ) -> impl Iterator<Item = FrameFields<'c>> {
+        let (carrier, delimiters) = match (&recipe.parts, part) {
+            (Parts::Can { .. }, _) => (Carrier::Can, None),
+            (Parts::Stream { input: stream, .. }, Direction::Input)
+            | (Parts::Stream { output: stream, .. }, Direction::Output) => {
+                (Carrier::Stream, stream.as_ref().map(|part| (&*part.head, &*part.tail)))
+            }
+        };
+        let delimiters = delimiters.unwrap_or((&[], &[]));
+        recipe.frames(part).map(move |(nth, span)| FrameFields {
+            nth,
+            carrier,
+            delimiters,
+            fields: span.of(self.fields),
+        })
+    }
+
+    /// Whether a port with this recipe speaks a device's own frames, beyond what the controller's
+    /// recipes can describe.
+    pub fn is_device(self, recipe: &Recipe) -> bool {
+        [Direction::Input, Direction::Output]
+            .into_iter()
+            .any(|part| self.fields_of(recipe, part).any(|(_, _, field)| field.is_device()))
+    }
+}

@@ -1,0 +1,370 @@
+//! The frames of a device that no recipe of the controller can describe: found, taken, and made.
+//!
+//! In: bytes and CAN frames, and the port's bindings with their elements. Out: values in the store,
+//! and frames when they are due. Recipes of the controller's own kinds do not come here.
+
+use heapless::Vec;
+
+use super::build::{BuildError, one_too_many};
+use super::command_link::CommandLink;
+use super::counters::{add, bump};
+use super::field_output::Downward;
+use super::field_port::{Accepted, Codec, FieldPort, Frames, came, keep};
+use super::rejection::Rejection;
+use super::sender::{DIGEST_SEED, digest};
+use super::store::Store;
+use super::tap::Tap;
+use super::user::{InputBind, InputTo, OutputBind, number_of};
+use crate::config::{CanFramePart, ConfigView, Counted, DeviceFrame, Parts, Recipe, Span};
+use crate::device::{Element, Encoding, Found, FrameLayout, Framer, Overflow, Probe};
+use crate::image::{Image, bind_to_variable};
+use crate::sysvar::{Direction, SysVar};
+use crate::wire::can::{CanFrame, CanId, MAX_CAN_DATA};
+use crate::wire::scalar::Scalar;
+
+/// Maximum number of frames of one port with a device's own frames, both ways together.
+pub(super) const MAX_DEVICE_FRAMES: usize = 24;
+
+/// One frame of the device.
+#[derive(Debug, Clone)]
+pub(super) struct DeviceFormat {
+    pub layout: FrameLayout,
+    /// Its id on a CAN bus.
+    pub id: CanId,
+    /// Its range of the bindings of its direction, which have its elements.
+    pub bindings: Span,
+}
+
+/// The frames of a device, and what finds them in a stream.
+#[derive(Debug, Clone)]
+pub(super) struct DeviceCodec {
+    /// The input frames, then the output frames.
+    pub formats: Vec<DeviceFormat, MAX_DEVICE_FRAMES>,
+    pub inputs: u8,
+    /// `None` on a CAN bus.
+    pub framer: Option<Framer>,
+}
+
+impl DeviceCodec {
+    fn input(&self) -> &[DeviceFormat] {
+        self.formats.get(..usize::from(self.inputs)).unwrap_or(&[])
+    }
+
+    fn output(&self) -> &[DeviceFormat] {
+        self.formats.get(usize::from(self.inputs)..).unwrap_or(&[])
+    }
+}
+
+/// What the bytes are, seen as any of the frames: a frame wins over more bytes that are needed, and
+/// these over a wrong checksum.
+fn probe_all(formats: &[DeviceFormat], bindings: &[InputBind], bytes: &[u8]) -> Probe {
+    let probes = formats.iter().map(|format| probe(format, bindings, bytes));
+    probes.fold(Probe::No, |best, probe| match (best, probe) {
+        (Probe::Frame(len), _) | (_, Probe::Frame(len)) => Probe::Frame(len),
+        (Probe::Other(len), _) | (_, Probe::Other(len)) => Probe::Other(len),
+        (Probe::Partial(one), Probe::Partial(other)) => Probe::Partial(one.min(other)),
+        (Probe::Partial(missing), _) | (_, Probe::Partial(missing)) => Probe::Partial(missing),
+        (Probe::Wrong(len), _) | (_, Probe::Wrong(len)) => Probe::Wrong(len),
+        (Probe::No, Probe::No) => Probe::No,
+    })
+}
+
+fn probe(format: &DeviceFormat, bindings: &[InputBind], bytes: &[u8]) -> Probe {
+    format.layout.probe(elements(format.bindings.of(bindings)), bytes)
+}
+
+fn elements(bindings: &[InputBind]) -> impl Iterator<Item = &Element> + Clone {
+    bindings.iter().map(|binding| &binding.element)
+}
+
+impl DeviceCodec {
+    /// The frames of a recipe, whose bindings will begin at these places.
+    #[inline(never)]
+    pub(super) fn new(
+        config: ConfigView<'_>,
+        index: u8,
+        recipe: &Recipe,
+        mut next_input: u16,
+        mut next_output: u16,
+    ) -> Result<Self, BuildError> {
+        let mut codec = Self { formats: Vec::new(), inputs: 0, framer: None };
+        let ids: [&[CanFramePart]; 2] = match &recipe.parts {
+            Parts::Can { input, output } => [input, output],
+            Parts::Stream { .. } => {
+                codec.framer = Some(Framer::new());
+                [&[], &[]]
+            }
+        };
+        for (part, ids, next) in
+            [(Direction::Input, ids[0], &mut next_input), (Direction::Output, ids[1], &mut next_output)]
+        {
+            for frame in config.device_frames(recipe, part) {
+                let DeviceFrame { elements, layout } =
+                    DeviceFrame::new(frame.carrier, part, frame.delimiters, frame.fields).map_err(
+                        |error| BuildError::Layout { recipe: index, part, frame: frame.nth, error },
+                    )?;
+                let bindings = Span { start: *next, len: elements.len() as u16 };
+                *next = next.saturating_add(bindings.len);
+                let id = ids.get(usize::from(frame.nth)).map_or(CanId::Standard(0), |frame| frame.id);
+                codec
+                    .formats
+                    .push(DeviceFormat { layout, id, bindings })
+                    .map_err(|_| one_too_many(Counted::DeviceFrames, MAX_DEVICE_FRAMES))?;
+                if part == Direction::Input {
+                    codec.inputs = codec.inputs.saturating_add(1);
+                }
+            }
+        }
+        Ok(codec)
+    }
+}
+
+impl FieldPort {
+    /// Reads the frames in `rest`; see [`FieldPort::frames`].
+    #[inline(never)]
+    pub(super) fn device_frames<const PORTS: usize, const TAP: usize>(
+        &mut self,
+        rest: &mut &[u8],
+        bindings: &[InputBind],
+        store: &mut Store<PORTS>,
+        commands: Option<&mut CommandLink>,
+        tap: &mut Tap<TAP>,
+    ) -> Accepted {
+        let mut accepted = Accepted::default();
+        let (now, usable, bytes) = (store.now, self.is_usable(), *rest);
+        let mut left = core::mem::take(rest);
+        let Codec::Device(DeviceCodec { formats, inputs, framer: Some(framer) }) = &mut self.codec else {
+            return accepted;
+        };
+        let formats = formats.get(..usize::from(*inputs)).unwrap_or(&[]);
+        if formats.is_empty() {
+            bump(&mut self.counters.rejected_no_input);
+            tap.record(|| came(self.id, now, Err(Rejection::NoInput), None, [bytes, &[], &[]]));
+            keep(&mut self.last_rejection, Rejection::NoInput, None, bytes, now);
+            return accepted;
+        }
+        let mut frames = Frames {
+            mode: self.mode,
+            bindings,
+            reply: &mut self.reply,
+            counters: &mut self.counters,
+            port: self.id,
+            store,
+            commands,
+        };
+        let effort = formats
+            .iter()
+            .map(|format| format.layout.lengths().1.saturating_add(usize::from(format.bindings.len)));
+        let effort = effort.fold(0, usize::saturating_add);
+        while let Some(found) =
+            framer.next_frame(&mut left, effort, |bytes| probe_all(formats, bindings, bytes))
+        {
+            let (frame, verdict) = match found {
+                Found::Frame(frame) => {
+                    let is_this = |format: &&DeviceFormat| matches!(probe(format, bindings, frame), Probe::Frame(len) if len == frame.len());
+                    let taken =
+                        (0..).zip(formats).find(|(_, format)| is_this(format)).map(|(nth, format)| {
+                            let slot = usize::from(self.first_frame).saturating_add(nth);
+                            frames.take_device(format, frame, slot, &mut accepted)
+                        });
+                    (frame, taken.unwrap_or(Err(Rejection::NoFrame)))
+                }
+                Found::Other(frame) => (frame, frames.rejected(Rejection::OtherDevice)),
+                Found::Wrong(frame) => (frame, frames.rejected(Rejection::Checksum)),
+            };
+            tap.record(|| came(self.id, now, verdict, None, [frame, &[], &[]]));
+            match verdict {
+                // What is held can hold further frames, so only the rest of the chunk waits.
+                Ok(()) if frames.store.watches_bits && !left.is_empty() => break,
+                Ok(()) => {}
+                Err(why) => keep(&mut self.last_rejection, why, None, frame, now),
+            }
+        }
+        *rest = left;
+        let stats = framer.stats();
+        let skipped = stats.skipped_bytes.wrapping_sub(self.counters.resync_bytes);
+        if skipped > 0 {
+            self.counters.resync_bytes = stats.skipped_bytes;
+            // The bytes of a frame with a wrong checksum are kept as that.
+            if !matches!(&self.last_rejection, Some(last) if last.why == Rejection::Checksum && last.at == now)
+            {
+                self.no_frame(bytes, skipped as usize, tap, now);
+            }
+        }
+        self.sender.frames_accepted(accepted.frames, usable, &mut self.counters, now);
+        accepted
+    }
+
+    /// A frame from the bus; see [`FieldPort::can`].
+    #[inline(never)]
+    pub(super) fn device_can<const PORTS: usize>(
+        &mut self,
+        frame: &CanFrame,
+        bindings: &[InputBind],
+        store: &mut Store<PORTS>,
+        commands: Option<&mut CommandLink>,
+    ) -> Result<Accepted, Rejection> {
+        let (now, usable) = (store.now, self.is_usable());
+        let Codec::Device(device) = &self.codec else { return Ok(Accepted::default()) };
+        let mut frames = Frames {
+            mode: self.mode,
+            bindings,
+            reply: &mut self.reply,
+            counters: &mut self.counters,
+            port: self.id,
+            store,
+            commands,
+        };
+        if device.inputs == 0 {
+            frames.rejected(Rejection::NoInput)?;
+        }
+        if frame.is_remote() {
+            frames.rejected(Rejection::Remote)?;
+        }
+        let formats = (0..).zip(device.input());
+        let Some((nth, format)) = formats.into_iter().find(|(_, format)| format.id == frame.id()) else {
+            frames.rejected(Rejection::ForeignId)?;
+            return Ok(Accepted::default());
+        };
+        match probe(format, bindings, frame.data()) {
+            Probe::Frame(len) if len == frame.data().len() => {}
+            Probe::Wrong(len) if len == frame.data().len() => frames.rejected(Rejection::Checksum)?,
+            Probe::Other(_) | Probe::No if frame.data().len() == format.layout.lengths().0 => {
+                frames.rejected(Rejection::OtherDevice)?;
+            }
+            _ => frames.rejected(Rejection::WrongLength)?,
+        }
+        let slot = usize::from(self.first_frame).saturating_add(nth);
+        let mut accepted = Accepted::default();
+        frames.take_device(format, frame.data(), slot, &mut accepted)?;
+        self.sender.frames_accepted(1, usable, &mut self.counters, now);
+        Ok(accepted)
+    }
+
+    /// The frame of the device that is due.
+    #[inline(never)]
+    pub(super) fn next_device(
+        &mut self,
+        image: &Image,
+        bindings: &[OutputBind],
+        out: &mut [u8],
+    ) -> Option<Downward> {
+        let Codec::Device(device) = &self.codec else { return None };
+        let nth = self.sender.next_can;
+        let (frames_sent, reply) = (self.sender.frames_sent, self.reply);
+        let encode = |format: &DeviceFormat, out: &mut [u8]| {
+            let bindings = format.bindings.of(bindings);
+            let number = |nth: usize| {
+                bindings.get(nth).map_or(f64::NAN, |binding| number_of(binding, image, frames_sent, reply))
+            };
+            format.layout.encode(bindings.iter().map(|binding| &binding.element), number, out)
+        };
+        let formats = device.output();
+        if nth == 0 && self.sender.sends_changes() {
+            let mut hash = DIGEST_SEED;
+            for format in formats {
+                let len = encode(format, out).unwrap_or(0);
+                hash = digest(hash, out.get(..len).unwrap_or(&[]));
+            }
+            if !self.sender.is_news(hash) {
+                self.sender.dismiss();
+                return None;
+            }
+        }
+        let Some((format, len)) = formats.get(nth).and_then(|format| Some((format, encode(format, out)?)))
+        else {
+            self.sender.dismiss();
+            return None;
+        };
+        let frame = out.get(..len).unwrap_or(&[]);
+        let downward = match device.framer {
+            Some(_) => Downward::Bytes(len),
+            None => Downward::Can(CanFrame::filled(format.id, len.min(MAX_CAN_DATA) as u8, |data| {
+                for (slot, &byte) in data.iter_mut().zip(frame) {
+                    *slot = byte;
+                }
+            })),
+        };
+        let is_last = nth.saturating_add(1) >= formats.len();
+        bump(&mut self.counters.frames_out);
+        add(&mut self.counters.bytes_out, len);
+        if is_last {
+            self.sender.handed_over();
+        } else {
+            self.sender.next_can = nth.saturating_add(1);
+        }
+        Some(downward)
+    }
+}
+
+impl<const PORTS: usize> Frames<'_, PORTS> {
+    /// Counts a rejection, and is one.
+    fn rejected(&mut self, why: Rejection) -> Result<(), Rejection> {
+        let counters = &mut *self.counters;
+        bump(match why {
+            Rejection::NoInput => &mut counters.rejected_no_input,
+            Rejection::Remote => &mut counters.rejected_remote,
+            Rejection::ForeignId => &mut counters.rejected_id,
+            Rejection::WrongLength => &mut counters.rejected_length,
+            Rejection::Checksum => &mut counters.rejected_checksum,
+            Rejection::OtherDevice => &mut counters.rejected_other_device,
+            Rejection::Unreadable => &mut counters.rejected_unreadable,
+            Rejection::NotFinite => &mut counters.rejected_not_finite,
+            _ => &mut counters.rejected_out_of_range,
+        });
+        Err(why)
+    }
+
+    /// Applies a frame as a whole or not at all, and counts it in `accepted`.
+    fn take_device(
+        &mut self,
+        format: &DeviceFormat,
+        frame: &[u8],
+        slot: usize,
+        accepted: &mut Accepted,
+    ) -> Result<(), Rejection> {
+        let bindings = format.bindings.of(self.bindings);
+        let values = || bindings.iter().zip(format.layout.values(elements(bindings), frame));
+        for (binding, value) in values() {
+            match value {
+                Err(_) => self.rejected(Rejection::Unreadable)?,
+                Ok(Some(value)) if !value.is_finite() => self.rejected(Rejection::NotFinite)?,
+                Ok(Some(value)) if !fits(binding, value) => self.rejected(Rejection::OutOfRange)?,
+                Ok(_) => {}
+            }
+        }
+        for (binding, value) in values() {
+            let Ok(Some(value)) = value else { continue };
+            match bound(binding, value) {
+                Some((var, value)) => {
+                    // It fits: all values were tried before the first was applied.
+                    let _ = self.store.image.set(var, value);
+                }
+                None => self.apply_user(&binding.to, value),
+            }
+        }
+        if let Some(link) = &mut self.commands {
+            link.frame_ends();
+        }
+        bump(&mut self.counters.frames_in);
+        accepted.frames = accepted.frames.wrapping_add(1);
+        accepted.set = self.store.accepted(slot, self.counters);
+        Ok(())
+    }
+}
+
+/// The variable and the value that a field's value becomes; `None` if it does not fit, or is not for
+/// a variable.
+fn bound(binding: &InputBind, value: Scalar) -> Option<(SysVar, Scalar)> {
+    let InputTo::Variable { var, scale, offset } = binding.to else { return None };
+    let Element::Value { overflow: Overflow::Wrap, .. } = binding.element else {
+        return binding.to.bound(value);
+    };
+    let number = value.as_f64() * f64::from(scale) + f64::from(offset);
+    let number = Encoding::scalar(var.ty()).fit(number, Overflow::Wrap)?;
+    bind_to_variable(var, Scalar::Double(number), 1.0, 0.0).map(|value| (var, value))
+}
+
+fn fits(binding: &InputBind, value: Scalar) -> bool {
+    !matches!(binding.to, InputTo::Variable { .. }) || bound(binding, value).is_some()
+}
