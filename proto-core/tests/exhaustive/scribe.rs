@@ -287,7 +287,7 @@ impl Scribe {
             b"bytes" | b"group" | b"ring" | b"buffer" | b"mask" | b"codes" | b"picked" => {
                 Word::Field(Field::Buffer)
             }
-            b"last_rejection" | b"offered_at" | b"due_at" | b"born" => Word::Field(Field::Shown),
+            b"last_rejection" | b"offered" | b"due_since" | b"born" => Word::Field(Field::Shown),
             b"stamps" | b"packet_at" | b"source_at" | b"frame_at" => Word::Field(Field::Stamps),
             b"unconfirmed_since" => Word::Field(Field::Unconfirmed),
             b"confirmed_at" => Word::Field(Field::Confirmed),
