@@ -7,11 +7,10 @@
 #include <stddef.h>
 #include <stdint.h>
 
-// Version of the configuration images that this library reads; those of older versions are read too
-// where they can be.
+// Newest version of the configuration images that this library reads. Older versions are read too.
 #define RGW_IMAGE_VERSION 2
 
-// Memory that a configuration takes, in bytes: as much as on any machine. It is needed until
+// Memory for a configuration, in bytes: enough on every machine. It is needed until
 // `rgw_gateway_configure` has returned.
 #define RGW_CONFIG_SIZE 16640
 
@@ -21,10 +20,10 @@
 // Recipe links that a gateway has room for.
 #define RGW_MAX_RECIPE_LINKS 2
 
-// User-defined fields over all ports that a gateway has room for, in each direction.
+// User-defined fields on all ports together that a gateway has room for, in each direction.
 #define RGW_MAX_FIELDS 128
 
-// Memory that a gateway takes, in bytes: as much as on any machine.
+// Memory for a gateway, in bytes: enough on every machine.
 #define RGW_GATEWAY_SIZE 37888
 
 // Number of the link to port 2000.
@@ -39,27 +38,27 @@
 // Number of the link to the UDP recipe server of the controller.
 #define RGW_LINK_RECIPE_UDP 3
 
-// Number of the link of the first port, if it is one that listens; those of other ports follow.
+// Number of the link of port 0, if that is a listening port; the numbers of other ports follow.
 #define RGW_LINK_FIRST_PORT 4
 
-// Number of the second link to port 2000, for commands that stop the robot. No link has a higher one.
+// Number of the second link to port 2000, for commands that stop the robot. It is the highest number.
 #define RGW_LINK_URGENT 12
 
-// Alignment of all memory that is given to this library, in bytes.
+// Alignment of all memory that a program gives to this library, in bytes.
 #define RGW_ALIGN 16
 
 // Bytes of the buffer for `rgw_poll_output`.
 #define RGW_OUTPUT_BUFFER 512
 
-// `until_us` of a gateway without a configuration: nothing will ever have to be done.
+// `until_us` of a gateway without a configuration: it never has a task.
 #define RGW_NEVER UINT64_MAX
 
 // Version of this interface: one more for every change of a function, a type or a number in it.
-// `rgw_gateway_init` refuses a program that was compiled with the header of another one.
+// `rgw_gateway_init` refuses a program that was compiled with another version of the header.
 #define RGW_ABI_VERSION 1
 
-// What became of a call. Zero is success, and nothing was changed where it is not, unless the function
-// says otherwise.
+// Status of a call. Zero is success. After any other status nothing has changed, unless the function says
+// otherwise.
 enum rgw_status
 #if defined(__cplusplus) || __STDC_VERSION__ >= 202311L
   : uint32_t
@@ -73,11 +72,11 @@ enum rgw_status
   RGW_STATUS_TOO_SMALL = 2,
   // Memory is not aligned to `RGW_ALIGN`.
   RGW_STATUS_MISALIGNED = 3,
-  // The program was compiled with the header of another version.
+  // The program was compiled with another version of the header.
   RGW_STATUS_ABI_VERSION = 4,
-  // A port, a link or an index that is not there.
+  // There is no such port, link or index.
   RGW_STATUS_NOT_THERE = 5,
-  // A code or a CAN frame that cannot be.
+  // Not a valid code or CAN frame.
   RGW_STATUS_INVALID = 6,
   // The image is cut short.
   RGW_STATUS_IMAGE_CUT = 16,
@@ -85,17 +84,17 @@ enum rgw_status
   RGW_STATUS_IMAGE_NONE = 17,
   // The image has a version that this library does not read; `rgw_image_version` says which.
   RGW_STATUS_IMAGE_VERSION = 18,
-  // The image says that it is longer than any.
+  // The image announces more bytes than an image can have.
   RGW_STATUS_IMAGE_TOO_LONG = 19,
   // The image is damaged.
   RGW_STATUS_IMAGE_DAMAGED = 20,
-  // The image holds no configuration.
+  // The image does not contain a configuration.
   RGW_STATUS_IMAGE_CONTENTS = 21,
-  // The configuration in the image is wrong; `host-sim check` says how.
+  // The configuration in the image is invalid; `host-sim check` says why.
   RGW_STATUS_CONFIG_WRONG = 22,
   // A variable of the configuration has no way to or from the controller.
   RGW_STATUS_CONFIG_PLAN = 23,
-  // The configuration has more of something than this library was built for.
+  // The configuration is larger than this library was built for.
   RGW_STATUS_CONFIG_TOO_LARGE = 24,
   // The configuration names a dialect that this library does not know.
   RGW_STATUS_CONFIG_DIALECT = 25,
@@ -110,7 +109,7 @@ typedef uint32_t rgw_status;
 #endif // __STDC_VERSION__ >= 202311L
 #endif // __cplusplus
 
-// What a port is.
+// The bus of a port.
 enum rgw_port_kind
 #if defined(__cplusplus) || __STDC_VERSION__ >= 202311L
   : uint8_t
@@ -120,9 +119,9 @@ enum rgw_port_kind
   RGW_PORT_KIND_RS485 = 0,
   // A CAN bus.
   RGW_PORT_KIND_CAN = 1,
-  // Where the controller connects to by TCP. A link, not a field port.
+  // A TCP port that the controller connects to: a link, not a field port.
   RGW_PORT_KIND_TCP_LISTEN = 2,
-  // Where the controller sends datagrams to. A link, not a field port.
+  // A UDP port that the controller sends to: a link, not a field port.
   RGW_PORT_KIND_UDP_LISTEN = 3,
 };
 #ifndef __cplusplus
@@ -160,13 +159,13 @@ enum rgw_port_health
   : uint8_t
 #endif // defined(__cplusplus) || __STDC_VERSION__ >= 202311L
  {
-  // What it receives comes in time; a port without an input part only has to be there.
+  // Its input frames come in time; a port without an input part only has to be there.
   RGW_PORT_HEALTH_WORKING = 0,
-  // A frame of its input part is overdue or has never come.
+  // An input frame is overdue, or none has come yet.
   RGW_PORT_HEALTH_SILENT = 1,
-  // The CAN controller has left the bus.
+  // Its CAN controller is bus-off.
   RGW_PORT_HEALTH_BUS_OFF = 2,
-  // Its device is not there.
+  // Its device is gone.
   RGW_PORT_HEALTH_GONE = 3,
 };
 #ifndef __cplusplus
@@ -177,13 +176,13 @@ typedef uint8_t rgw_port_health;
 #endif // __STDC_VERSION__ >= 202311L
 #endif // __cplusplus
 
-// Where a link stands.
+// State of a link.
 enum rgw_link_health
 #if defined(__cplusplus) || __STDC_VERSION__ >= 202311L
   : uint8_t
 #endif // defined(__cplusplus) || __STDC_VERSION__ >= 202311L
  {
-  // Closed, and opened again later.
+  // Closed; it is opened again later.
   RGW_LINK_HEALTH_DOWN = 0,
   // Opened, not yet up.
   RGW_LINK_HEALTH_OPENING = 1,
@@ -200,7 +199,7 @@ typedef uint8_t rgw_link_health;
 #endif // __STDC_VERSION__ >= 202311L
 #endif // __cplusplus
 
-// What a driver has to do.
+// The kinds of tasks of a driver.
 enum rgw_task_kind
 #if defined(__cplusplus) || __STDC_VERSION__ >= 202311L
   : uint8_t
@@ -213,11 +212,11 @@ enum rgw_task_kind
   // Queue `frame` on the CAN bus `id`; `rgw_port_sent` when the queue has become empty.
   RGW_TASK_KIND_PORT_SEND_CAN = 2,
   // Open the link `id` by `transport` at `port`, then `rgw_link_up` or `rgw_link_down`. `len` bytes of
-  // the buffer are the controller's address or name as configured, without a zero behind.
+  // the buffer are the controller's address or name as configured, without a terminating zero.
   RGW_TASK_KIND_LINK_OPEN = 3,
-  // Close the link `id` at once and report nothing more of it; of TCP, with a reset.
+  // Close the link `id` at once, TCP with a reset, and report nothing more of it.
   RGW_TASK_KIND_LINK_CLOSE = 4,
-  // Send `len` bytes of the buffer on the link `id` (by UDP: one datagram), then `rgw_link_sent`.
+  // Send `len` bytes of the buffer on the link `id` (UDP: one datagram), then `rgw_link_sent`.
   RGW_TASK_KIND_LINK_SEND = 5,
 };
 #ifndef __cplusplus
@@ -228,7 +227,7 @@ typedef uint8_t rgw_task_kind;
 #endif // __STDC_VERSION__ >= 202311L
 #endif // __cplusplus
 
-// How a link is opened.
+// The transport of a link, and the side that opens it.
 enum rgw_transport
 #if defined(__cplusplus) || __STDC_VERSION__ >= 202311L
   : uint8_t
@@ -236,11 +235,11 @@ enum rgw_transport
  {
   // Connect by TCP.
   RGW_TRANSPORT_TCP = 0,
-  // Send UDP datagrams, and receive the answers.
+  // Send UDP datagrams and receive the answers.
   RGW_TRANSPORT_UDP = 1,
-  // Listen, and take one TCP connection.
+  // Listen, and accept one TCP connection.
   RGW_TRANSPORT_TCP_LISTEN = 2,
-  // Receive UDP datagrams, and answer whoever sent last.
+  // Receive UDP datagrams, and answer the newest sender.
   RGW_TRANSPORT_UDP_LISTEN = 3,
 };
 #ifndef __cplusplus
@@ -257,9 +256,9 @@ enum rgw_can_state
   : uint8_t
 #endif // defined(__cplusplus) || __STDC_VERSION__ >= 202311L
  {
-  // Error-active: all is well.
+  // Error-active, with low error counters.
   RGW_CAN_STATE_ACTIVE = 0,
-  // An error counter passed 96.
+  // An error counter has reached 96.
   RGW_CAN_STATE_WARNING = 1,
   // Error-passive.
   RGW_CAN_STATE_PASSIVE = 2,
@@ -274,7 +273,7 @@ typedef uint8_t rgw_can_state;
 #endif // __STDC_VERSION__ >= 202311L
 #endif // __cplusplus
 
-// How the newest command went that a port's values picked.
+// The result of the newest command that a port's values picked.
 enum rgw_reply_code
 #if defined(__cplusplus) || __STDC_VERSION__ >= 202311L
   : uint8_t
@@ -288,9 +287,9 @@ enum rgw_reply_code
   RGW_REPLY_CODE_SUCCESS = 2,
   // The controller replied that it failed.
   RGW_REPLY_CODE_FAIL = 3,
-  // The controller replied something else.
+  // The controller sent another reply.
   RGW_REPLY_CODE_OTHER = 4,
-  // No reply came in time, or the link was lost meanwhile.
+  // No reply came in time, or the link was lost before it came.
   RGW_REPLY_CODE_NO_REPLY = 5,
   // It was not sent: the link was down, or too many were waiting.
   RGW_REPLY_CODE_NOT_SENT = 6,
@@ -303,84 +302,84 @@ typedef uint8_t rgw_reply_code;
 #endif // __STDC_VERSION__ >= 202311L
 #endif // __cplusplus
 
-// A configuration in the caller's memory: 6 ports, 6 recipes with 256 fields, 32 commands and 32 safe
-// values at most.
+// A configuration in the caller's memory: at most 6 ports, 6 recipes with 256 fields together, 32
+// commands and 32 safe values.
 typedef struct rgw_config rgw_config;
 
-// A gateway in the caller's memory; it has to stay where it is.
+// A gateway in the caller's memory; it must not be moved.
 typedef struct rgw_gateway rgw_gateway;
 
 // What a driver sets up for a port.
 typedef struct rgw_port_settings {
-  // What it is.
+  // Its bus.
   rgw_port_kind kind;
-  // Of a serial line.
+  // Parity of a serial line.
   rgw_parity parity;
-  // Of a serial line: 1 or 2.
+  // Stop bits of a serial line, 1 or 2; 0 on other buses.
   uint8_t stop_bits;
-  // Bit/s of a serial line or a CAN bus; 0 of others.
+  // Bit/s of a serial line or a CAN bus; 0 on other buses.
   uint32_t bit_rate;
 } rgw_port_settings;
 
-// The board's own address and what belongs to it.
+// The board's own address, and its network.
 typedef struct rgw_network_settings {
   // The address.
   uint8_t address[4];
-  // The way to other networks; 0.0.0.0 for none.
+  // The router; 0.0.0.0 if there is none.
   uint8_t router[4];
-  // The server that knows the controller's name; 0.0.0.0 for none.
+  // The name server; 0.0.0.0 if there is none.
   uint8_t dns[4];
-  // Bits of the network, 1 to 30.
+  // Prefix length of the network in bits, 1 to 30.
   uint8_t prefix;
 } rgw_network_settings;
 
-// What happened on a field port. Counters wrap after 2^32.
+// Counters of a field port. They wrap after 2^32.
 typedef struct rgw_port_counters {
   // Frames accepted.
   uint32_t frames_in;
   // Bytes received (CAN: data bytes).
   uint32_t bytes_in;
-  // Frames handed over for sending.
+  // Frames handed over to the driver.
   uint32_t frames_out;
-  // Bytes handed over for sending (CAN: data bytes).
+  // Bytes handed over to the driver (CAN: data bytes).
   uint32_t bytes_out;
   // Frames rejected for a value that is not finite (D22).
   uint32_t rejected_not_finite;
   // Frames rejected because a bound value did not fit its variable (D22).
   uint32_t rejected_out_of_range;
-  // CAN frames ignored for an id that the recipe does not have (D17).
+  // CAN frames ignored because the recipe does not have their id (D17).
   uint32_t rejected_id;
-  // CAN frames rejected for another length than declared (D17).
+  // CAN frames rejected because their length is not the declared one (D17).
   uint32_t rejected_length;
   // Remote frames ignored (D17).
   uint32_t rejected_remote;
-  // Frames on a port whose recipe has no input part.
+  // Frames received on a port whose recipe has no input part.
   uint32_t rejected_no_input;
-  // Heads whose frame did not end in the tail (D19).
+  // Frames that began with the head but did not end with the tail (D19).
   uint32_t tail_mismatches;
   // Bytes dropped while looking for a frame (D19).
   uint32_t resync_bytes;
-  // Bytes of partial frames discarded after silence (D19), and bytes that waited while the gateway
-  // itself slept.
+  // Bytes of partial frames discarded after silence (D19), and bytes discarded because they waited
+  // while the gateway itself slept.
   uint32_t discarded_bytes;
   // Chunks of bytes, or CAN frames, discarded because they waited while the gateway itself slept.
   uint32_t asleep;
   // Accepted frames in which reserved bits were masked (D22).
   uint32_t masked;
-  // Bit values that were replaced by newer ones because the queue of edges was full.
+  // Bit values replaced by newer ones because the queue of edges was full.
   uint32_t edges_lost;
-  // Values dropped before they could be written: older than the port's timeout, or waiting for a
-  // link that was lost.
+  // Values dropped before they were written: older than the port's timeout, or waiting for a link
+  // that was lost.
   uint32_t values_expired;
-  // Accepted frames with a value that could not be passed on: its link was down.
+  // Accepted frames with a value that was dropped because its link was down.
   uint32_t undelivered;
-  // Accepted frames with a value that had to wait for its neighbours to be read back.
+  // Accepted frames with a value that was withheld until its neighbours were read back.
   uint32_t withheld;
   // Cycles in which no output frame could be sent in time (D20).
   uint32_t skipped_cycles;
   // Cycles in which no output frame was sent because its sources were stale or unknown.
   uint32_t stale_cycles;
-  // Times the field frame was overdue.
+  // Times an input frame became overdue.
   uint32_t timeouts;
   // Times the device was reported gone.
   uint32_t downs;
@@ -394,19 +393,19 @@ typedef struct rgw_port_counters {
 
 // A field port.
 typedef struct rgw_port_info_t {
-  // What happened.
+  // Its counters.
   struct rgw_port_counters counters;
   // Its health.
   rgw_port_health health;
-  // How the newest command went that its values picked: one of `rgw_reply_code`.
+  // The result of the newest command that its values picked: one of `rgw_reply_code`.
   uint8_t reply_code;
 } rgw_port_info_t;
 
-// What happened on a link. Counters wrap after 2^32.
+// Counters of a link. They wrap after 2^32.
 typedef struct rgw_link_counters {
   // Times the link came up.
   uint32_t connects;
-  // Times it was lost after it had been up, whoever closed it.
+  // Times it was lost after it had been up, whichever side closed it.
   uint32_t losses;
   // Times it could not be opened.
   uint32_t failed_opens;
@@ -418,64 +417,63 @@ typedef struct rgw_link_counters {
   uint32_t received;
   // Bytes received.
   uint32_t bytes_in;
-  // Requests without an answer in time.
+  // Requests without an answer within the timeout.
   uint32_t timeouts;
   // Exceptions and failure replies.
   uint32_t refused;
-  // Answers, frames and packets that made no sense.
+  // Malformed answers, frames and packets.
   uint32_t malformed;
-  // Values received that were not finite: they are unknown until a readable one comes.
+  // Received values that were not finite; the variables are unknown until a readable value comes.
   uint32_t unreadable;
-  // Connections reset because the peer's transport had not acknowledged what was handed over by
-  // the time after which it must not be delivered.
+  // Connections reset because the peer's transport had not acknowledged data before its deadline.
   uint32_t unacknowledged;
   // Bytes dropped while looking for a frame.
   uint32_t resync_bytes;
-  // Microseconds from the newest request to its answer.
+  // Time from the newest request to its answer, in microseconds.
   uint32_t round_trip_us;
-  // The longest of these.
+  // The longest such time, in microseconds.
   uint32_t round_trip_max_us;
 } rgw_link_counters;
 
 // A link to the controller.
 typedef struct rgw_link_info_t {
-  // What happened.
+  // Its counters.
   struct rgw_link_counters counters;
   // The link's number, such as `RGW_LINK_MODBUS`.
   uint8_t id;
-  // Where it stands.
+  // Its state.
   rgw_link_health health;
 } rgw_link_info_t;
 
 // A classic CAN frame.
 typedef struct rgw_can_frame {
-  // 11 or 29 bits.
+  // Its id of 11 or 29 bits.
   uint32_t id;
   // Whether the id has 29 bits.
   uint8_t extended;
-  // Whether it is a remote frame; its data does not count then.
+  // Whether it is a remote frame, which has no data.
   uint8_t remote;
   // Data bytes, 0 to 8.
   uint8_t len;
-  // The data; zero behind `len`.
+  // The data; zero after `len`.
   uint8_t data[8];
 } rgw_can_frame;
 
-// What a driver has to do; what its kind does not name is zero.
+// A task of a driver; fields that its kind does not name are zero.
 typedef struct rgw_task {
   // When to call `rgw_tick` at the latest, in microseconds of the driver's clock.
   uint64_t until_us;
-  // Bytes of the buffer, from its beginning.
+  // Number of bytes, from the beginning of the buffer.
   size_t len;
   // A CAN frame.
   struct rgw_can_frame frame;
   // TCP or UDP port.
   uint16_t port;
-  // What to do.
+  // Its kind.
   rgw_task_kind kind;
   // The port or the link.
   uint8_t id;
-  // How a link is opened.
+  // How the link is opened.
   rgw_transport transport;
 } rgw_task;
 
@@ -483,98 +481,98 @@ typedef struct rgw_task {
 extern "C" {
 #endif // __cplusplus
 
-// Size of a configuration here, in bytes; at most `RGW_CONFIG_SIZE`.
+// Size of a configuration on this machine, in bytes; at most `RGW_CONFIG_SIZE`.
 size_t rgw_config_size(void);
 
-// The version of an image, whether it can be read here or not.
+// The version of an image, whether this library can read it or not.
 //
 // # Safety
-// There are `len` bytes at `image`, and room for a number at `version`.
+// `image` points to `len` bytes, and `version` to room for a number.
 rgw_status rgw_image_version(const uint8_t *image, size_t len, uint32_t *version);
 
-// Reads an image and checks the configuration in it. `*config` is in `memory` then; when it is refused,
-// the memory holds nothing and is free again.
+// Reads an image into `memory`, checks the configuration in it, and sets `*config` to it. If it is
+// refused, `*config` is not set and the memory is free again.
 //
 // # Safety
-// There are `len` bytes at `memory`, which nobody else uses as long as the configuration is used; there
-// are `image_len` bytes at `image`, elsewhere; there is room for a pointer at `config`.
+// `memory` points to `len` bytes that nothing else uses as long as the configuration is in use; `image`
+// points to `image_len` bytes elsewhere, and `config` to room for a pointer.
 rgw_status rgw_config_read(void *memory,
                            size_t len,
                            const uint8_t *image,
                            size_t image_len,
                            struct rgw_config **config);
 
-// How many ports a configuration has, field ports and others; 0 for a null pointer.
+// Number of ports of a configuration, field ports and others; 0 for a null pointer.
 //
 // # Safety
 // `config` is from `rgw_config_read`, and its memory has not been used for anything else.
 size_t rgw_config_ports(const struct rgw_config *config);
 
-// What a driver sets up for a port, the `port`th of the configuration, counted from 0.
+// What a driver sets up for the port with this number, counted from 0.
 //
 // # Safety
-// `config` is from `rgw_config_read`, and its memory has not been used for anything else; there is room
-// at `settings`.
+// `config` is from `rgw_config_read`, and its memory has not been used for anything else; `settings`
+// points to room for the result.
 rgw_status rgw_config_port(const struct rgw_config *config, uint8_t port, struct rgw_port_settings *settings);
 
-// The board's own address; `RGW_STATUS_NOT_THERE` when DHCP is to be asked.
+// The board's own address; `RGW_STATUS_NOT_THERE` if it comes from DHCP.
 //
 // # Safety
-// `config` is from `rgw_config_read`, and its memory has not been used for anything else; there is room
-// at `settings`.
+// `config` is from `rgw_config_read`, and its memory has not been used for anything else; `settings`
+// points to room for the result.
 rgw_status rgw_config_network(const struct rgw_config *config, struct rgw_network_settings *settings);
 
-// Size of a gateway here, in bytes; at most `RGW_GATEWAY_SIZE`.
+// Size of a gateway on this machine, in bytes; at most `RGW_GATEWAY_SIZE`.
 size_t rgw_gateway_size(void);
 
-// Makes a gateway without a configuration in the caller's memory. `*gateway` is in `memory` then.
-// `abi_version` is `RGW_ABI_VERSION`, as the program's header has it. There is nothing to be freed:
-// memory that is used for something else ends the gateway.
+// Makes a gateway without a configuration in `memory`, and sets `*gateway` to it. `abi_version` is
+// `RGW_ABI_VERSION` of the header that the program was compiled with. Nothing has to be freed: the
+// gateway ends when its memory is used for something else.
 //
 // # Safety
-// There are `len` bytes at `memory`, which nobody else uses as long as the gateway is used; there is room
-// for a pointer at `gateway`.
+// `memory` points to `len` bytes that nothing else uses as long as the gateway is in use; `gateway`
+// points to room for a pointer.
 rgw_status rgw_gateway_init(uint32_t abi_version, void *memory, size_t len, struct rgw_gateway **gateway);
 
-// Gives a gateway its configuration, instead of one that it may have had: all ports and links are down
-// then. When it is refused, the gateway has none and does nothing.
+// Gives a gateway its configuration, and drops the previous one: all ports and links are down then. If
+// the configuration is refused, the gateway has none and does nothing.
 //
 // # Safety
 // `gateway` is from `rgw_gateway_init` and `config` from `rgw_config_read`; their memory has not been
 // used for anything else.
 rgw_status rgw_gateway_configure(struct rgw_gateway *gateway, const struct rgw_config *config);
 
-// A field port, by its number; `RGW_STATUS_NOT_THERE` if it is none.
+// State and counters of a field port, by its number; `RGW_STATUS_NOT_THERE` if there is no such field port.
 //
 // # Safety
-// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else; there is room
-// at `info`.
+// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else; `info`
+// points to room for the result.
 rgw_status rgw_port_info(const struct rgw_gateway *gateway, uint8_t port, struct rgw_port_info_t *info);
 
-// The links one after the other: the `nth`, counted from 0; `RGW_STATUS_NOT_THERE` behind the last.
+// State and counters of the `nth` link, counted from 0; `RGW_STATUS_NOT_THERE` after the last.
 //
 // # Safety
-// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else; there is room
-// at `info`.
+// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else; `info`
+// points to room for the result.
 rgw_status rgw_link_info(const struct rgw_gateway *gateway, size_t nth, struct rgw_link_info_t *info);
 
-// How often the gateway slept: it was not called for more than half a second, and what waited for it was
-// discarded. Wraps; 0 for a null pointer.
+// Times the gateway slept: it was not called for more than half a second, and what waited for it was
+// discarded. The number wraps; 0 for a null pointer.
 //
 // # Safety
 // `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else.
 uint32_t rgw_sleeps(const struct rgw_gateway *gateway);
 
-// Whether a datagram is a frame of the link's output part: what the driver of a listening UDP link asks
-// before it answers another sender than so far. No for null pointers.
+// Whether a datagram is a frame of the link's output part. The driver of a listening UDP link asks this
+// before it answers another sender than before. False for null pointers.
 //
 // # Safety
-// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else; there are
-// `len` bytes at `datagram`.
+// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else; `datagram`
+// points to `len` bytes.
 bool rgw_is_frame(const struct rgw_gateway *gateway, uint8_t link, const uint8_t *datagram, size_t len);
 
-// Time has passed, and everything that arrived before has been told: the only input that lets deadlines
-// pass.
+// Time has passed, and everything that arrived before has been reported: the only input that lets
+// deadlines pass.
 //
 // # Safety
 // `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else.
@@ -586,13 +584,13 @@ rgw_status rgw_tick(struct rgw_gateway *gateway, uint64_t now_us);
 // `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else.
 rgw_status rgw_port_up(struct rgw_gateway *gateway, uint64_t now_us, uint8_t port);
 
-// A port's device is gone; what was handed over for sending is lost, and no `rgw_port_sent` follows for it.
+// A port's device is gone; what was handed over is lost, and no `rgw_port_sent` follows for it.
 //
 // # Safety
 // `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else.
 rgw_status rgw_port_down(struct rgw_gateway *gateway, uint64_t now_us, uint8_t port);
 
-// Everything that was handed over for sending has left the port.
+// Everything that was handed over has left the port.
 //
 // # Safety
 // `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else.
@@ -601,8 +599,8 @@ rgw_status rgw_port_sent(struct rgw_gateway *gateway, uint64_t now_us, uint8_t p
 // Bytes from a serial line, in chunks of any size.
 //
 // # Safety
-// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else; there are
-// `len` bytes at `data`.
+// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else; `data`
+// points to `len` bytes.
 rgw_status rgw_port_bytes(struct rgw_gateway *gateway,
                           uint64_t now_us,
                           uint8_t port,
@@ -612,8 +610,8 @@ rgw_status rgw_port_bytes(struct rgw_gateway *gateway,
 // A frame from a CAN bus.
 //
 // # Safety
-// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else; there is a
-// frame at `frame`.
+// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else; `frame`
+// points to a frame.
 rgw_status rgw_port_can(struct rgw_gateway *gateway,
                         uint64_t now_us,
                         uint8_t port,
@@ -637,7 +635,7 @@ rgw_status rgw_link_up(struct rgw_gateway *gateway, uint64_t now_us, uint8_t lin
 // `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else.
 rgw_status rgw_link_down(struct rgw_gateway *gateway, uint64_t now_us, uint8_t link);
 
-// Everything that was handed over for sending was taken by the transport, which has room for more.
+// The transport has taken everything that was handed over, and has room for more.
 //
 // # Safety
 // `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else.
@@ -646,8 +644,8 @@ rgw_status rgw_link_sent(struct rgw_gateway *gateway, uint64_t now_us, uint8_t l
 // Bytes from a link; of a datagram link one whole datagram a call.
 //
 // # Safety
-// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else; there are
-// `len` bytes at `data`.
+// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else; `data`
+// points to `len` bytes.
 rgw_status rgw_link_bytes(struct rgw_gateway *gateway,
                           uint64_t now_us,
                           uint8_t link,
@@ -661,22 +659,22 @@ rgw_status rgw_link_bytes(struct rgw_gateway *gateway,
 // `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else.
 rgw_status rgw_link_acked(struct rgw_gateway *gateway, uint64_t now_us, uint8_t link, uint32_t left);
 
-// What the driver has to do next; called again until it is `RGW_TASK_KIND_SLEEP`. The bytes are in
-// `buffer` and stay there until the next call.
+// The driver's next task. Call it again until the kind is `RGW_TASK_KIND_SLEEP`. The bytes of a task are
+// in `buffer` and stay there until the next call.
 //
 // # Safety
-// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else; there are
-// `len` bytes at `buffer` and room at `task`, elsewhere.
+// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else; `buffer`
+// points to `len` bytes and `task` to room for a task, both elsewhere.
 rgw_status rgw_poll_output(struct rgw_gateway *gateway,
                            uint64_t now_us,
                            uint8_t *buffer,
                            size_t len,
                            struct rgw_task *task);
 
-// The version of this interface that the library has; a program compares it with `RGW_ABI_VERSION`.
+// The library's version of this interface; a program compares it with `RGW_ABI_VERSION`.
 uint32_t rgw_abi_version(void);
 
-// A status in words: English, for ever, ends with a zero byte. Any number is taken.
+// A status in English words: a static text that ends with a zero byte. Takes any number.
 const char *rgw_status_text(uint32_t status);
 
 #ifdef __cplusplus

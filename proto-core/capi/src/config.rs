@@ -1,4 +1,4 @@
-//! Configurations: from an image to what a driver has to set up.
+//! Configurations: reading an image, and what a driver has to set up.
 
 use core::ffi::c_void;
 
@@ -7,22 +7,21 @@ use proto_core::config::{Bus, GatewayConfig, Parity, image};
 use crate::Status;
 use crate::memory::{bytes, give, place, shared};
 
-/// Version of the configuration images that this library reads; those of older versions are read too
-/// where they can be.
+/// Newest version of the configuration images that this library reads. Older versions are read too.
 pub const RGW_IMAGE_VERSION: u32 = 2;
 const _: () = assert!(RGW_IMAGE_VERSION == image::VERSION);
 
-/// Memory that a configuration takes, in bytes: as much as on any machine. It is needed until
+/// Memory for a configuration, in bytes: enough on every machine. It is needed until
 /// `rgw_gateway_configure` has returned.
 pub const RGW_CONFIG_SIZE: usize = 16_640;
 const _: () = assert!(size_of::<Config>() <= RGW_CONFIG_SIZE);
 
-/// A configuration in the caller's memory: 6 ports, 6 recipes with 256 fields, 32 commands and 32 safe
-/// values at most.
+/// A configuration in the caller's memory: at most 6 ports, 6 recipes with 256 fields together, 32
+/// commands and 32 safe values.
 #[derive(Debug)]
 pub struct Config(pub(crate) GatewayConfig<6, 6, 256, 32, 32>);
 
-/// What a port is.
+/// The bus of a port.
 #[repr(u8)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
@@ -30,9 +29,9 @@ pub enum Kind {
     Rs485 = 0,
     /// A CAN bus.
     Can = 1,
-    /// Where the controller connects to by TCP. A link, not a field port.
+    /// A TCP port that the controller connects to: a link, not a field port.
     TcpListen = 2,
-    /// Where the controller sends datagrams to. A link, not a field port.
+    /// A UDP port that the controller sends to: a link, not a field port.
     UdpListen = 3,
 }
 
@@ -52,40 +51,40 @@ pub enum LineParity {
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct PortSettings {
-    /// What it is.
+    /// Its bus.
     pub kind: Kind,
-    /// Of a serial line.
+    /// Parity of a serial line.
     pub parity: LineParity,
-    /// Of a serial line: 1 or 2.
+    /// Stop bits of a serial line, 1 or 2; 0 on other buses.
     pub stop_bits: u8,
-    /// Bit/s of a serial line or a CAN bus; 0 of others.
+    /// Bit/s of a serial line or a CAN bus; 0 on other buses.
     pub bit_rate: u32,
 }
 
-/// The board's own address and what belongs to it.
+/// The board's own address, and its network.
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct NetworkSettings {
     /// The address.
     pub address: [u8; 4],
-    /// The way to other networks; 0.0.0.0 for none.
+    /// The router; 0.0.0.0 if there is none.
     pub router: [u8; 4],
-    /// The server that knows the controller's name; 0.0.0.0 for none.
+    /// The name server; 0.0.0.0 if there is none.
     pub dns: [u8; 4],
-    /// Bits of the network, 1 to 30.
+    /// Prefix length of the network in bits, 1 to 30.
     pub prefix: u8,
 }
 
-/// Size of a configuration here, in bytes; at most `RGW_CONFIG_SIZE`.
+/// Size of a configuration on this machine, in bytes; at most `RGW_CONFIG_SIZE`.
 #[unsafe(no_mangle)]
 pub extern "C" fn rgw_config_size() -> usize {
     size_of::<Config>()
 }
 
-/// The version of an image, whether it can be read here or not.
+/// The version of an image, whether this library can read it or not.
 ///
 /// # Safety
-/// There are `len` bytes at `image`, and room for a number at `version`.
+/// `image` points to `len` bytes, and `version` to room for a number.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rgw_image_version(image: *const u8, len: usize, version: *mut u32) -> Status {
     // SAFETY: as promised by the caller.
@@ -96,18 +95,19 @@ pub unsafe extern "C" fn rgw_image_version(image: *const u8, len: usize, version
     let found = match image::image_len(image) {
         Err(image::ImageError::Version { found }) => found,
         Err(error) => return error.into(),
-        Ok(_) => RGW_IMAGE_VERSION,
+        // The header is there; the version is its second word.
+        Ok(_) => image.as_chunks().0.get(1).map_or(RGW_IMAGE_VERSION, |word| u32::from_le_bytes(*word)),
     };
     // SAFETY: as promised by the caller.
     unsafe { give(version, found) }.into()
 }
 
-/// Reads an image and checks the configuration in it. `*config` is in `memory` then; when it is refused,
-/// the memory holds nothing and is free again.
+/// Reads an image into `memory`, checks the configuration in it, and sets `*config` to it. If it is
+/// refused, `*config` is not set and the memory is free again.
 ///
 /// # Safety
-/// There are `len` bytes at `memory`, which nobody else uses as long as the configuration is used; there
-/// are `image_len` bytes at `image`, elsewhere; there is room for a pointer at `config`.
+/// `memory` points to `len` bytes that nothing else uses as long as the configuration is in use; `image`
+/// points to `image_len` bytes elsewhere, and `config` to room for a pointer.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rgw_config_read(
     memory: *mut c_void,
@@ -120,7 +120,7 @@ pub unsafe extern "C" fn rgw_config_read(
         let place = place::<Config>(memory, len)?;
         // SAFETY: as promised by the caller.
         let image = unsafe { bytes(image, image_len) }?;
-        // SAFETY: there is room, it is aligned and the caller leaves it to us.
+        // SAFETY: there is room, it is aligned, and nothing else uses it.
         let read = unsafe {
             place.write(const { Config(GatewayConfig::empty()) });
             &mut *place.as_ptr()
@@ -132,7 +132,7 @@ pub unsafe extern "C" fn rgw_config_read(
     read().into()
 }
 
-/// How many ports a configuration has, field ports and others; 0 for a null pointer.
+/// Number of ports of a configuration, field ports and others; 0 for a null pointer.
 ///
 /// # Safety
 /// `config` is from `rgw_config_read`, and its memory has not been used for anything else.
@@ -142,11 +142,11 @@ pub unsafe extern "C" fn rgw_config_ports(config: *const Config) -> usize {
     unsafe { shared(config) }.map_or(0, |config| config.0.ports.len())
 }
 
-/// What a driver sets up for a port, the `port`th of the configuration, counted from 0.
+/// What a driver sets up for the port with this number, counted from 0.
 ///
 /// # Safety
-/// `config` is from `rgw_config_read`, and its memory has not been used for anything else; there is room
-/// at `settings`.
+/// `config` is from `rgw_config_read`, and its memory has not been used for anything else; `settings`
+/// points to room for the result.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rgw_config_port(
     config: *const Config,
@@ -179,11 +179,11 @@ pub unsafe extern "C" fn rgw_config_port(
     read().into()
 }
 
-/// The board's own address; `RGW_STATUS_NOT_THERE` when DHCP is to be asked.
+/// The board's own address; `RGW_STATUS_NOT_THERE` if it comes from DHCP.
 ///
 /// # Safety
-/// `config` is from `rgw_config_read`, and its memory has not been used for anything else; there is room
-/// at `settings`.
+/// `config` is from `rgw_config_read`, and its memory has not been used for anything else; `settings`
+/// points to room for the result.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rgw_config_network(config: *const Config, settings: *mut NetworkSettings) -> Status {
     let read = || {

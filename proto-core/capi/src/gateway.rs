@@ -1,4 +1,4 @@
-//! The gateway in the caller's memory: made, and given its configuration.
+//! The gateway in the caller's memory: making it, and giving it a configuration.
 
 use core::ffi::c_void;
 
@@ -11,32 +11,32 @@ use crate::{Config, RGW_ABI_VERSION, Status};
 pub const RGW_MAX_PORTS: usize = 4;
 /// Recipe links that a gateway has room for.
 pub const RGW_MAX_RECIPE_LINKS: usize = 2;
-/// User-defined fields over all ports that a gateway has room for, in each direction.
+/// User-defined fields on all ports together that a gateway has room for, in each direction.
 pub const RGW_MAX_FIELDS: usize = 128;
 
-/// Memory that a gateway takes, in bytes: as much as on any machine.
+/// Memory for a gateway, in bytes: enough on every machine.
 pub const RGW_GATEWAY_SIZE: usize = 37_888;
 const _: () = assert!(size_of::<Gateway>() <= RGW_GATEWAY_SIZE);
 
-/// A gateway in the caller's memory; it has to stay where it is.
+/// A gateway in the caller's memory; it must not be moved.
 #[derive(Debug)]
 pub struct Gateway {
     pub(crate) engine: Engine<RGW_MAX_PORTS, RGW_MAX_RECIPE_LINKS, RGW_MAX_FIELDS>,
 }
 
-/// Size of a gateway here, in bytes; at most `RGW_GATEWAY_SIZE`.
+/// Size of a gateway on this machine, in bytes; at most `RGW_GATEWAY_SIZE`.
 #[unsafe(no_mangle)]
 pub extern "C" fn rgw_gateway_size() -> usize {
     size_of::<Gateway>()
 }
 
-/// Makes a gateway without a configuration in the caller's memory. `*gateway` is in `memory` then.
-/// `abi_version` is `RGW_ABI_VERSION`, as the program's header has it. There is nothing to be freed:
-/// memory that is used for something else ends the gateway.
+/// Makes a gateway without a configuration in `memory`, and sets `*gateway` to it. `abi_version` is
+/// `RGW_ABI_VERSION` of the header that the program was compiled with. Nothing has to be freed: the
+/// gateway ends when its memory is used for something else.
 ///
 /// # Safety
-/// There are `len` bytes at `memory`, which nobody else uses as long as the gateway is used; there is room
-/// for a pointer at `gateway`.
+/// `memory` points to `len` bytes that nothing else uses as long as the gateway is in use; `gateway`
+/// points to room for a pointer.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rgw_gateway_init(
     abi_version: u32,
@@ -49,7 +49,7 @@ pub unsafe extern "C" fn rgw_gateway_init(
             return Err(Status::AbiVersion);
         }
         let place = place::<Gateway>(memory, len)?;
-        // SAFETY: there is room, it is aligned and the caller leaves it to us.
+        // SAFETY: there is room, it is aligned, and nothing else uses it.
         unsafe { place.write(const { Gateway { engine: Engine::idle() } }) };
         // SAFETY: as promised by the caller.
         unsafe { give(gateway, place.as_ptr()) }
@@ -57,8 +57,8 @@ pub unsafe extern "C" fn rgw_gateway_init(
     make().into()
 }
 
-/// Gives a gateway its configuration, instead of one that it may have had: all ports and links are down
-/// then. When it is refused, the gateway has none and does nothing.
+/// Gives a gateway its configuration, and drops the previous one: all ports and links are down then. If
+/// the configuration is refused, the gateway has none and does nothing.
 ///
 /// # Safety
 /// `gateway` is from `rgw_gateway_init` and `config` from `rgw_config_read`; their memory has not been

@@ -1,7 +1,7 @@
-//! Counters and states, for a display, a log or a LED.
+//! Counters and states, for a display, a log or an LED.
 
-use proto_core::engine::{LinkId, PortId, PortState};
-use proto_core::link::LinkState;
+use proto_core::engine::{self, LinkId, PortId, PortState};
+use proto_core::link::{LinkHistory, LinkState};
 
 use crate::memory::{bytes, give, shared};
 use crate::{Gateway, Status};
@@ -14,12 +14,12 @@ pub const RGW_LINK_STATE: u8 = 1;
 pub const RGW_LINK_MODBUS: u8 = 2;
 /// Number of the link to the UDP recipe server of the controller.
 pub const RGW_LINK_RECIPE_UDP: u8 = 3;
-/// Number of the link of the first port, if it is one that listens; those of other ports follow.
+/// Number of the link of port 0, if that is a listening port; the numbers of other ports follow.
 pub const RGW_LINK_FIRST_PORT: u8 = 4;
-/// Number of the second link to port 2000, for commands that stop the robot. No link has a higher one.
+/// Number of the second link to port 2000, for commands that stop the robot. It is the highest number.
 pub const RGW_LINK_URGENT: u8 = 12;
 
-// The engine's numbers are those of the header.
+// The numbers of the header are the engine's.
 const _: () = {
     assert!(LinkId::COMMAND.0 == RGW_LINK_COMMAND);
     assert!(LinkId::STATE.0 == RGW_LINK_STATE);
@@ -29,7 +29,7 @@ const _: () = {
     assert!(LinkId::URGENT.0 == RGW_LINK_URGENT);
 };
 
-/// What happened on a field port. Counters wrap after 2^32.
+/// Counters of a field port. They wrap after 2^32.
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct PortCounters {
@@ -37,47 +37,47 @@ pub struct PortCounters {
     pub frames_in: u32,
     /// Bytes received (CAN: data bytes).
     pub bytes_in: u32,
-    /// Frames handed over for sending.
+    /// Frames handed over to the driver.
     pub frames_out: u32,
-    /// Bytes handed over for sending (CAN: data bytes).
+    /// Bytes handed over to the driver (CAN: data bytes).
     pub bytes_out: u32,
     /// Frames rejected for a value that is not finite (D22).
     pub rejected_not_finite: u32,
     /// Frames rejected because a bound value did not fit its variable (D22).
     pub rejected_out_of_range: u32,
-    /// CAN frames ignored for an id that the recipe does not have (D17).
+    /// CAN frames ignored because the recipe does not have their id (D17).
     pub rejected_id: u32,
-    /// CAN frames rejected for another length than declared (D17).
+    /// CAN frames rejected because their length is not the declared one (D17).
     pub rejected_length: u32,
     /// Remote frames ignored (D17).
     pub rejected_remote: u32,
-    /// Frames on a port whose recipe has no input part.
+    /// Frames received on a port whose recipe has no input part.
     pub rejected_no_input: u32,
-    /// Heads whose frame did not end in the tail (D19).
+    /// Frames that began with the head but did not end with the tail (D19).
     pub tail_mismatches: u32,
     /// Bytes dropped while looking for a frame (D19).
     pub resync_bytes: u32,
-    /// Bytes of partial frames discarded after silence (D19), and bytes that waited while the gateway
-    /// itself slept.
+    /// Bytes of partial frames discarded after silence (D19), and bytes discarded because they waited
+    /// while the gateway itself slept.
     pub discarded_bytes: u32,
     /// Chunks of bytes, or CAN frames, discarded because they waited while the gateway itself slept.
     pub asleep: u32,
     /// Accepted frames in which reserved bits were masked (D22).
     pub masked: u32,
-    /// Bit values that were replaced by newer ones because the queue of edges was full.
+    /// Bit values replaced by newer ones because the queue of edges was full.
     pub edges_lost: u32,
-    /// Values dropped before they could be written: older than the port's timeout, or waiting for a
-    /// link that was lost.
+    /// Values dropped before they were written: older than the port's timeout, or waiting for a link
+    /// that was lost.
     pub values_expired: u32,
-    /// Accepted frames with a value that could not be passed on: its link was down.
+    /// Accepted frames with a value that was dropped because its link was down.
     pub undelivered: u32,
-    /// Accepted frames with a value that had to wait for its neighbours to be read back.
+    /// Accepted frames with a value that was withheld until its neighbours were read back.
     pub withheld: u32,
     /// Cycles in which no output frame could be sent in time (D20).
     pub skipped_cycles: u32,
     /// Cycles in which no output frame was sent because its sources were stale or unknown.
     pub stale_cycles: u32,
-    /// Times the field frame was overdue.
+    /// Times an input frame became overdue.
     pub timeouts: u32,
     /// Times the device was reported gone.
     pub downs: u32,
@@ -89,13 +89,13 @@ pub struct PortCounters {
     pub commands_dropped: u32,
 }
 
-/// What happened on a link. Counters wrap after 2^32.
+/// Counters of a link. They wrap after 2^32.
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct LinkCounters {
     /// Times the link came up.
     pub connects: u32,
-    /// Times it was lost after it had been up, whoever closed it.
+    /// Times it was lost after it had been up, whichever side closed it.
     pub losses: u32,
     /// Times it could not be opened.
     pub failed_opens: u32,
@@ -107,44 +107,77 @@ pub struct LinkCounters {
     pub received: u32,
     /// Bytes received.
     pub bytes_in: u32,
-    /// Requests without an answer in time.
+    /// Requests without an answer within the timeout.
     pub timeouts: u32,
     /// Exceptions and failure replies.
     pub refused: u32,
-    /// Answers, frames and packets that made no sense.
+    /// Malformed answers, frames and packets.
     pub malformed: u32,
-    /// Values received that were not finite: they are unknown until a readable one comes.
+    /// Received values that were not finite; the variables are unknown until a readable value comes.
     pub unreadable: u32,
-    /// Connections reset because the peer's transport had not acknowledged what was handed over by
-    /// the time after which it must not be delivered.
+    /// Connections reset because the peer's transport had not acknowledged data before its deadline.
     pub unacknowledged: u32,
     /// Bytes dropped while looking for a frame.
     pub resync_bytes: u32,
-    /// Microseconds from the newest request to its answer.
+    /// Time from the newest request to its answer, in microseconds.
     pub round_trip_us: u32,
-    /// The longest of these.
+    /// The longest such time, in microseconds.
     pub round_trip_max_us: u32,
 }
+
+/// The counters with these names, under the same names.
+macro_rules! copied {
+    ($($from:ident: $($counter:ident)+);+) => { Self { $($($counter: $from.$counter,)+)+ } };
+}
+
+impl From<&engine::PortCounters> for PortCounters {
+    fn from(counters: &engine::PortCounters) -> Self {
+        copied! {
+            counters: frames_in bytes_in frames_out bytes_out
+                rejected_not_finite rejected_out_of_range rejected_id rejected_length rejected_remote rejected_no_input
+                tail_mismatches resync_bytes discarded_bytes asleep masked
+                edges_lost values_expired undelivered withheld
+                skipped_cycles stale_cycles timeouts downs bus_offs
+                commands commands_dropped
+        }
+    }
+}
+
+impl From<(&LinkHistory, &engine::LinkCounters)> for LinkCounters {
+    fn from((history, counters): (&LinkHistory, &engine::LinkCounters)) -> Self {
+        copied! {
+            history: connects losses failed_opens silences;
+            counters: sent received bytes_in timeouts refused malformed unreadable unacknowledged resync_bytes
+                round_trip_us round_trip_max_us
+        }
+    }
+}
+
+// All counters have one size: none of the engine's is missing here.
+const _: () = {
+    assert!(size_of::<PortCounters>() == size_of::<engine::PortCounters>());
+    assert!(size_of::<LinkCounters>() == size_of::<LinkHistory>() + size_of::<engine::LinkCounters>());
+};
 
 /// Health of a field port.
 #[repr(u8)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum PortHealth {
-    /// What it receives comes in time; a port without an input part only has to be there.
+    /// Its input frames come in time; a port without an input part only has to be there.
     Working = 0,
-    /// A frame of its input part is overdue or has never come.
+    /// An input frame is overdue, or none has come yet.
     Silent = 1,
-    /// The CAN controller has left the bus.
+    /// Its CAN controller is bus-off.
     BusOff = 2,
-    /// Its device is not there.
+    /// Its device is gone.
     Gone = 3,
 }
 
-/// Where a link stands.
+/// State of a link.
 #[repr(u8)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LinkHealth {
-    /// Closed, and opened again later.
+    /// Closed; it is opened again later.
     Down = 0,
     /// Opened, not yet up.
     Opening = 1,
@@ -158,15 +191,15 @@ pub enum LinkHealth {
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct PortInfo {
-    /// What happened.
+    /// Its counters.
     pub counters: PortCounters,
     /// Its health.
     pub health: PortHealth,
-    /// How the newest command went that its values picked: one of `rgw_reply_code`.
+    /// The result of the newest command that its values picked: one of `rgw_reply_code`.
     pub reply_code: u8,
 }
 
-/// How the newest command went that a port's values picked.
+/// The result of the newest command that a port's values picked.
 #[repr(u8)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ReplyCode {
@@ -178,15 +211,15 @@ pub enum ReplyCode {
     Success = 2,
     /// The controller replied that it failed.
     Fail = 3,
-    /// The controller replied something else.
+    /// The controller sent another reply.
     Other = 4,
-    /// No reply came in time, or the link was lost meanwhile.
+    /// No reply came in time, or the link was lost before it came.
     NoReply = 5,
     /// It was not sent: the link was down, or too many were waiting.
     NotSent = 6,
 }
 
-// The engine's numbers are those of the header.
+// The numbers of the header are the engine's.
 const _: () = {
     use proto_core::engine::ReplyCode as Core;
     assert!(ReplyCode::None as u8 == Core::None as u8);
@@ -202,26 +235,26 @@ const _: () = {
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct LinkInfo {
-    /// What happened.
+    /// Its counters.
     pub counters: LinkCounters,
     /// The link's number, such as `RGW_LINK_MODBUS`.
     pub id: u8,
-    /// Where it stands.
+    /// Its state.
     pub health: LinkHealth,
 }
 
-/// A field port, by its number; `RGW_STATUS_NOT_THERE` if it is none.
+/// State and counters of a field port, by its number; `RGW_STATUS_NOT_THERE` if there is no such field port.
 ///
 /// # Safety
-/// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else; there is room
-/// at `info`.
+/// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else; `info`
+/// points to room for the result.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rgw_port_info(gateway: *const Gateway, port: u8, info: *mut PortInfo) -> Status {
     let ask = || {
         // SAFETY: as promised by the caller.
         let engine = unsafe { &shared(gateway)?.engine };
         let port = PortId(port);
-        let counters = engine.port_counters(port).ok_or(Status::NotThere)?;
+        let counters = engine.port_counters(port).ok_or(Status::NotThere)?.into();
         let health = match engine.port_state(port) {
             Some(PortState::Working) => PortHealth::Working,
             Some(PortState::Silent) => PortHealth::Silent,
@@ -229,45 +262,17 @@ pub unsafe extern "C" fn rgw_port_info(gateway: *const Gateway, port: u8, info: 
             _ => PortHealth::Gone,
         };
         let reply_code = engine.reply_code(port).map_or(0, |code| code as u8);
-        let counters = PortCounters {
-            frames_in: counters.frames_in,
-            bytes_in: counters.bytes_in,
-            frames_out: counters.frames_out,
-            bytes_out: counters.bytes_out,
-            rejected_not_finite: counters.rejected_not_finite,
-            rejected_out_of_range: counters.rejected_out_of_range,
-            rejected_id: counters.rejected_id,
-            rejected_length: counters.rejected_length,
-            rejected_remote: counters.rejected_remote,
-            rejected_no_input: counters.rejected_no_input,
-            tail_mismatches: counters.tail_mismatches,
-            resync_bytes: counters.resync_bytes,
-            discarded_bytes: counters.discarded_bytes,
-            asleep: counters.asleep,
-            masked: counters.masked,
-            edges_lost: counters.edges_lost,
-            values_expired: counters.values_expired,
-            undelivered: counters.undelivered,
-            withheld: counters.withheld,
-            skipped_cycles: counters.skipped_cycles,
-            stale_cycles: counters.stale_cycles,
-            timeouts: counters.timeouts,
-            downs: counters.downs,
-            bus_offs: counters.bus_offs,
-            commands: counters.commands,
-            commands_dropped: counters.commands_dropped,
-        };
         // SAFETY: as promised by the caller.
         unsafe { give(info, PortInfo { counters, health, reply_code }) }
     };
     ask().into()
 }
 
-/// The links one after the other: the `nth`, counted from 0; `RGW_STATUS_NOT_THERE` behind the last.
+/// State and counters of the `nth` link, counted from 0; `RGW_STATUS_NOT_THERE` after the last.
 ///
 /// # Safety
-/// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else; there is room
-/// at `info`.
+/// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else; `info`
+/// points to room for the result.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rgw_link_info(gateway: *const Gateway, nth: usize, info: *mut LinkInfo) -> Status {
     let ask = || {
@@ -280,32 +285,15 @@ pub unsafe extern "C" fn rgw_link_info(gateway: *const Gateway, nth: usize, info
             LinkState::Up { .. } => LinkHealth::Up,
             LinkState::Shared => LinkHealth::Shared,
         };
-        let (history, counters) = (link.history, link.counters);
-        let counters = LinkCounters {
-            connects: history.connects,
-            losses: history.losses,
-            failed_opens: history.failed_opens,
-            silences: history.silences,
-            sent: counters.sent,
-            received: counters.received,
-            bytes_in: counters.bytes_in,
-            timeouts: counters.timeouts,
-            refused: counters.refused,
-            malformed: counters.malformed,
-            unreadable: counters.unreadable,
-            unacknowledged: counters.unacknowledged,
-            resync_bytes: counters.resync_bytes,
-            round_trip_us: counters.round_trip_us,
-            round_trip_max_us: counters.round_trip_max_us,
-        };
+        let counters = (link.history, link.counters).into();
         // SAFETY: as promised by the caller.
         unsafe { give(info, LinkInfo { counters, id: link.id.0, health }) }
     };
     ask().into()
 }
 
-/// How often the gateway slept: it was not called for more than half a second, and what waited for it was
-/// discarded. Wraps; 0 for a null pointer.
+/// Times the gateway slept: it was not called for more than half a second, and what waited for it was
+/// discarded. The number wraps; 0 for a null pointer.
 ///
 /// # Safety
 /// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else.
@@ -315,12 +303,12 @@ pub unsafe extern "C" fn rgw_sleeps(gateway: *const Gateway) -> u32 {
     unsafe { shared(gateway) }.map_or(0, |gateway| gateway.engine.sleeps())
 }
 
-/// Whether a datagram is a frame of the link's output part: what the driver of a listening UDP link asks
-/// before it answers another sender than so far. No for null pointers.
+/// Whether a datagram is a frame of the link's output part. The driver of a listening UDP link asks this
+/// before it answers another sender than before. False for null pointers.
 ///
 /// # Safety
-/// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else; there are
-/// `len` bytes at `datagram`.
+/// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else; `datagram`
+/// points to `len` bytes.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rgw_is_frame(
     gateway: *const Gateway,

@@ -1,6 +1,6 @@
-//! What happened: a function for each input of the engine.
+//! A function for each input of the engine.
 //!
-//! `now_us` is the present in microseconds of the driver's clock, which never goes back. Inputs of a port
+//! `now_us` is the present in microseconds of the driver's clock, which never goes back. Inputs for a port
 //! or a link that the configuration does not have are ignored.
 
 use proto_core::engine::{BusState, Input, LinkId, PortId};
@@ -15,15 +15,15 @@ use crate::{Gateway, Status};
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct CanFrame {
-    /// 11 or 29 bits.
+    /// Its id of 11 or 29 bits.
     pub id: u32,
     /// Whether the id has 29 bits.
     pub extended: u8,
-    /// Whether it is a remote frame; its data does not count then.
+    /// Whether it is a remote frame, which has no data.
     pub remote: u8,
     /// Data bytes, 0 to 8.
     pub len: u8,
-    /// The data; zero behind `len`.
+    /// The data; zero after `len`.
     pub data: [u8; 8],
 }
 
@@ -59,9 +59,9 @@ impl From<&CoreFrame> for CanFrame {
 #[repr(u8)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum CanState {
-    /// Error-active: all is well.
+    /// Error-active, with low error counters.
     Active = 0,
-    /// An error counter passed 96.
+    /// An error counter has reached 96.
     Warning = 1,
     /// Error-passive.
     Passive = 2,
@@ -70,7 +70,7 @@ pub enum CanState {
 }
 
 /// # Safety
-/// As of the functions below.
+/// As for the functions below.
 unsafe fn handle(gateway: *mut Gateway, now_us: u64, input: Result<Input<'_>, Status>) -> Status {
     let handle = || {
         // SAFETY: as promised by the caller.
@@ -81,8 +81,8 @@ unsafe fn handle(gateway: *mut Gateway, now_us: u64, input: Result<Input<'_>, St
     handle().into()
 }
 
-/// Time has passed, and everything that arrived before has been told: the only input that lets deadlines
-/// pass.
+/// Time has passed, and everything that arrived before has been reported: the only input that lets
+/// deadlines pass.
 ///
 /// # Safety
 /// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else.
@@ -102,7 +102,7 @@ pub unsafe extern "C" fn rgw_port_up(gateway: *mut Gateway, now_us: u64, port: u
     unsafe { handle(gateway, now_us, Ok(Input::PortUp { port: PortId(port) })) }
 }
 
-/// A port's device is gone; what was handed over for sending is lost, and no `rgw_port_sent` follows for it.
+/// A port's device is gone; what was handed over is lost, and no `rgw_port_sent` follows for it.
 ///
 /// # Safety
 /// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else.
@@ -112,7 +112,7 @@ pub unsafe extern "C" fn rgw_port_down(gateway: *mut Gateway, now_us: u64, port:
     unsafe { handle(gateway, now_us, Ok(Input::PortDown { port: PortId(port) })) }
 }
 
-/// Everything that was handed over for sending has left the port.
+/// Everything that was handed over has left the port.
 ///
 /// # Safety
 /// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else.
@@ -125,8 +125,8 @@ pub unsafe extern "C" fn rgw_port_sent(gateway: *mut Gateway, now_us: u64, port:
 /// Bytes from a serial line, in chunks of any size.
 ///
 /// # Safety
-/// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else; there are
-/// `len` bytes at `data`.
+/// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else; `data`
+/// points to `len` bytes.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rgw_port_bytes(
     gateway: *mut Gateway,
@@ -145,8 +145,8 @@ pub unsafe extern "C" fn rgw_port_bytes(
 /// A frame from a CAN bus.
 ///
 /// # Safety
-/// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else; there is a
-/// frame at `frame`.
+/// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else; `frame`
+/// points to a frame.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rgw_port_can(
     gateway: *mut Gateway,
@@ -199,7 +199,7 @@ pub unsafe extern "C" fn rgw_link_down(gateway: *mut Gateway, now_us: u64, link:
     unsafe { handle(gateway, now_us, Ok(Input::LinkDown { link: LinkId(link) })) }
 }
 
-/// Everything that was handed over for sending was taken by the transport, which has room for more.
+/// The transport has taken everything that was handed over, and has room for more.
 ///
 /// # Safety
 /// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else.
@@ -212,8 +212,8 @@ pub unsafe extern "C" fn rgw_link_sent(gateway: *mut Gateway, now_us: u64, link:
 /// Bytes from a link; of a datagram link one whole datagram a call.
 ///
 /// # Safety
-/// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else; there are
-/// `len` bytes at `data`.
+/// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else; `data`
+/// points to `len` bytes.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rgw_link_bytes(
     gateway: *mut Gateway,

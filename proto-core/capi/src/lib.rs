@@ -1,13 +1,13 @@
 //! The gateway engine for programs in C: `include/rgw.h` and a static library
 //! (`proto-core/docs/driver.md` has the rules of a driver).
 //!
-//! In: the caller's memory, a configuration image, and what happened. Out: what has to be done, counters
-//! and states. Nothing is allocated, nothing is called back, no clock is read. What a caller passes is
-//! checked as far as it can be: null pointers, sizes, alignment and codes are refused with a [`Status`];
-//! what can only be promised is in the section "Safety" of each function.
+//! In: the caller's memory, a configuration image, and inputs. Out: tasks for the driver, counters and
+//! states. The library does not allocate, call back or read a clock. Null pointers, wrong sizes,
+//! misaligned memory and unknown codes are refused with a [`Status`]; what a call cannot check is in the
+//! section "Safety" of each function.
 //!
-//! This is the only crate with `unsafe` beside the boards: raw pointers become references in
-//! `memory` and nowhere else.
+//! Apart from the firmware's boards and drivers this is the only crate with `unsafe`: raw pointers
+//! become references in `memory` and nowhere else.
 
 #![no_std]
 #![cfg_attr(
@@ -41,12 +41,12 @@ pub use memory::RGW_ALIGN;
 pub use output::*;
 pub use status::*;
 
-/// What is built: the environment variable `NO_PANIC` says it.
+/// What is built, as the environment variable `NO_PANIC` says.
 mod no_panic {
-    /// For the proof of `.ci/run capi`: a panic does not link.
+    /// For the proof in `.ci/run capi`: a panic does not link.
     #[cfg(target_os = "none")]
     pub(crate) const PROOF: bool = option_env!("NO_PANIC").is_some();
-    /// The same with an index that nobody checked, to see that the proof can fail.
+    /// The same with an unchecked index, to see that the proof can fail.
     pub(crate) const PROVOKED: bool = matches!(option_env!("NO_PANIC"), Some(name) if name.len() == 8);
 }
 

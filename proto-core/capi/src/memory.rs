@@ -1,14 +1,14 @@
-//! Raw pointers of the caller as references, after what can be checked of them has been.
+//! Raw pointers of the caller become references, after everything that can be checked was checked.
 
 use core::ffi::c_void;
 use core::ptr::NonNull;
 
 use crate::Status;
 
-/// Alignment of all memory that is given to this library, in bytes.
+/// Alignment of all memory that a program gives to this library, in bytes.
 pub const RGW_ALIGN: usize = 16;
 
-/// A place for a `T` in the caller's memory, not yet written.
+/// A place for a `T` in the caller's memory, not written yet.
 pub(crate) fn place<T>(memory: *mut c_void, len: usize) -> Result<NonNull<T>, Status> {
     const { assert!(align_of::<T>() <= RGW_ALIGN) };
     let place = NonNull::new(memory.cast::<T>()).ok_or(Status::Null)?;
@@ -21,39 +21,39 @@ pub(crate) fn place<T>(memory: *mut c_void, len: usize) -> Result<NonNull<T>, St
     Ok(place)
 }
 
-/// What a pointer points to.
+/// The value behind a pointer.
 ///
 /// # Safety
-/// Unless it is null, it points to a `T` that nobody changes during the call.
+/// Unless it is null, it points to a `T` that nothing changes during the call.
 pub(crate) unsafe fn shared<'a, T>(pointer: *const T) -> Result<&'a T, Status> {
-    // SAFETY: as promised by the caller; null is none.
+    // SAFETY: as promised by the caller; null becomes `None`.
     unsafe { pointer.as_ref() }.ok_or(Status::Null)
 }
 
-/// What a pointer points to, to be changed.
+/// The value behind a pointer, to be changed.
 ///
 /// # Safety
-/// Unless it is null, it points to a `T` that nobody else uses during the call.
+/// Unless it is null, it points to a `T` that nothing else uses during the call.
 pub(crate) unsafe fn unique<'a, T>(pointer: *mut T) -> Result<&'a mut T, Status> {
-    // SAFETY: as promised by the caller; null is none.
+    // SAFETY: as promised by the caller; null becomes `None`.
     unsafe { pointer.as_mut() }.ok_or(Status::Null)
 }
 
-/// Writes a result where a caller wants it, whatever was there.
+/// Writes a result to the caller's memory, whatever was there before.
 ///
 /// # Safety
 /// Unless it is null, there is room for a `T` at `pointer`.
 pub(crate) unsafe fn give<T>(pointer: *mut T, value: T) -> Result<(), Status> {
     let pointer = NonNull::new(pointer).ok_or(Status::Null)?;
-    // SAFETY: there is room, as promised by the caller, and it is not null.
+    // SAFETY: it is not null, and there is room, as promised by the caller.
     unsafe { pointer.write(value) };
     Ok(())
 }
 
-/// The caller's bytes; null stands for none when there are none.
+/// The caller's bytes; with a length of 0 the pointer may be null.
 ///
 /// # Safety
-/// Unless it is null, there are `len` bytes at `pointer` that nobody changes during the call.
+/// Unless it is null, `pointer` points to `len` bytes that nothing changes during the call.
 pub(crate) unsafe fn bytes<'a>(pointer: *const u8, len: usize) -> Result<&'a [u8], Status> {
     if len == 0 {
         return Ok(&[]);
@@ -64,7 +64,7 @@ pub(crate) unsafe fn bytes<'a>(pointer: *const u8, len: usize) -> Result<&'a [u8
     if isize::try_from(len).is_err() {
         return Err(Status::Invalid);
     }
-    // SAFETY: that many bytes are there, as promised by the caller; it is not null, and not longer than
-    // anything can be.
+    // SAFETY: the bytes are there, as promised by the caller; the pointer is not null, and the length
+    // fits an `isize`.
     Ok(unsafe { core::slice::from_raw_parts(pointer, len) })
 }

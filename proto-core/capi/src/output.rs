@@ -1,4 +1,4 @@
-//! What a driver has to do.
+//! The tasks of a driver.
 
 use proto_core::engine::{Endpoint, OUTPUT_BUFFER, Output, Transport as Way};
 
@@ -9,10 +9,10 @@ use crate::{CanFrame, Gateway, Status};
 pub const RGW_OUTPUT_BUFFER: usize = 512;
 const _: () = assert!(RGW_OUTPUT_BUFFER == OUTPUT_BUFFER);
 
-/// `until_us` of a gateway without a configuration: nothing will ever have to be done.
+/// `until_us` of a gateway without a configuration: it never has a task.
 pub const RGW_NEVER: u64 = u64::MAX;
 
-/// What a driver has to do.
+/// The kinds of tasks of a driver.
 #[repr(u8)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum OutputKind {
@@ -23,45 +23,45 @@ pub enum OutputKind {
     /// Queue `frame` on the CAN bus `id`; `rgw_port_sent` when the queue has become empty.
     PortSendCan = 2,
     /// Open the link `id` by `transport` at `port`, then `rgw_link_up` or `rgw_link_down`. `len` bytes of
-    /// the buffer are the controller's address or name as configured, without a zero behind.
+    /// the buffer are the controller's address or name as configured, without a terminating zero.
     LinkOpen = 3,
-    /// Close the link `id` at once and report nothing more of it; of TCP, with a reset.
+    /// Close the link `id` at once, TCP with a reset, and report nothing more of it.
     LinkClose = 4,
-    /// Send `len` bytes of the buffer on the link `id` (by UDP: one datagram), then `rgw_link_sent`.
+    /// Send `len` bytes of the buffer on the link `id` (UDP: one datagram), then `rgw_link_sent`.
     LinkSend = 5,
 }
 
-/// How a link is opened.
+/// The transport of a link, and the side that opens it.
 #[repr(u8)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Transport {
     /// Connect by TCP.
     Tcp = 0,
-    /// Send UDP datagrams, and receive the answers.
+    /// Send UDP datagrams and receive the answers.
     Udp = 1,
-    /// Listen, and take one TCP connection.
+    /// Listen, and accept one TCP connection.
     TcpListen = 2,
-    /// Receive UDP datagrams, and answer whoever sent last.
+    /// Receive UDP datagrams, and answer the newest sender.
     UdpListen = 3,
 }
 
-/// What a driver has to do; what its kind does not name is zero.
+/// A task of a driver; fields that its kind does not name are zero.
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct Task {
     /// When to call `rgw_tick` at the latest, in microseconds of the driver's clock.
     pub until_us: u64,
-    /// Bytes of the buffer, from its beginning.
+    /// Number of bytes, from the beginning of the buffer.
     pub len: usize,
     /// A CAN frame.
     pub frame: CanFrame,
     /// TCP or UDP port.
     pub port: u16,
-    /// What to do.
+    /// Its kind.
     pub kind: OutputKind,
     /// The port or the link.
     pub id: u8,
-    /// How a link is opened.
+    /// How the link is opened.
     pub transport: Transport,
 }
 
@@ -72,12 +72,12 @@ impl Task {
     }
 }
 
-/// What the driver has to do next; called again until it is `RGW_TASK_KIND_SLEEP`. The bytes are in
-/// `buffer` and stay there until the next call.
+/// The driver's next task. Call it again until the kind is `RGW_TASK_KIND_SLEEP`. The bytes of a task are
+/// in `buffer` and stay there until the next call.
 ///
 /// # Safety
-/// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else; there are
-/// `len` bytes at `buffer` and room at `task`, elsewhere.
+/// `gateway` is from `rgw_gateway_init`, and its memory has not been used for anything else; `buffer`
+/// points to `len` bytes and `task` to room for a task, both elsewhere.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rgw_poll_output(
     gateway: *mut Gateway,
@@ -93,7 +93,7 @@ pub unsafe extern "C" fn rgw_poll_output(
         if len < OUTPUT_BUFFER {
             return Err(Status::TooSmall);
         }
-        // SAFETY: as promised by the caller; there are that many bytes.
+        // SAFETY: as promised by the caller; the buffer is long enough.
         let (gateway, buffer) = unsafe { (unique(gateway)?, unique(buffer.cast::<[u8; OUTPUT_BUFFER]>())?) };
         let next = next(gateway, now_us, buffer);
         // SAFETY: as promised by the caller.
@@ -112,12 +112,12 @@ fn next(gateway: &mut Gateway, now_us: u64, buffer: &mut [u8; OUTPUT_BUFFER]) ->
         }
         Output::LinkOpen { link, to } => {
             let (transport, port) = way(to);
-            // The engine has put the host where a text of it is wanted: at the buffer's beginning.
+            // The engine has written the host's name to the beginning of the buffer.
             Task { transport, port, ..Task::new(OutputKind::LinkOpen, link.0, to.host.len()) }
         }
         Output::LinkClose { link } => Task::new(OutputKind::LinkClose, link.0, 0),
         Output::LinkSend { link, bytes } => Task::new(OutputKind::LinkSend, link.0, bytes.len()),
-        // This library is built with all outputs that its engine has.
+        // The engine has no other outputs.
         _ => Task::new(OutputKind::Sleep, 0, 0),
     }
 }

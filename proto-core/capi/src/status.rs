@@ -1,4 +1,4 @@
-//! What a call says of itself, and the version of the interface.
+//! The status that every call returns, and the version of the interface.
 
 use core::ffi::{CStr, c_char};
 
@@ -6,11 +6,11 @@ use proto_core::config::image::ImageError;
 use proto_core::engine::BuildError;
 
 /// Version of this interface: one more for every change of a function, a type or a number in it.
-/// `rgw_gateway_init` refuses a program that was compiled with the header of another one.
+/// `rgw_gateway_init` refuses a program that was compiled with another version of the header.
 pub const RGW_ABI_VERSION: u32 = 1;
 
-/// What became of a call. Zero is success, and nothing was changed where it is not, unless the function
-/// says otherwise.
+/// Status of a call. Zero is success. After any other status nothing has changed, unless the function says
+/// otherwise.
 #[repr(u32)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Status {
@@ -22,11 +22,11 @@ pub enum Status {
     TooSmall = 2,
     /// Memory is not aligned to `RGW_ALIGN`.
     Misaligned = 3,
-    /// The program was compiled with the header of another version.
+    /// The program was compiled with another version of the header.
     AbiVersion = 4,
-    /// A port, a link or an index that is not there.
+    /// There is no such port, link or index.
     NotThere = 5,
-    /// A code or a CAN frame that cannot be.
+    /// Not a valid code or CAN frame.
     Invalid = 6,
     /// The image is cut short.
     ImageCut = 16,
@@ -34,17 +34,17 @@ pub enum Status {
     ImageNone = 17,
     /// The image has a version that this library does not read; `rgw_image_version` says which.
     ImageVersion = 18,
-    /// The image says that it is longer than any.
+    /// The image announces more bytes than an image can have.
     ImageTooLong = 19,
     /// The image is damaged.
     ImageDamaged = 20,
-    /// The image holds no configuration.
+    /// The image does not contain a configuration.
     ImageContents = 21,
-    /// The configuration in the image is wrong; `host-sim check` says how.
+    /// The configuration in the image is invalid; `host-sim check` says why.
     ConfigWrong = 22,
     /// A variable of the configuration has no way to or from the controller.
     ConfigPlan = 23,
-    /// The configuration has more of something than this library was built for.
+    /// The configuration is larger than this library was built for.
     ConfigTooLarge = 24,
     /// The configuration names a dialect that this library does not know.
     ConfigDialect = 25,
@@ -89,16 +89,16 @@ impl From<Result<(), Status>> for Status {
     }
 }
 
-/// The version of this interface that the library has; a program compares it with `RGW_ABI_VERSION`.
+/// The library's version of this interface; a program compares it with `RGW_ABI_VERSION`.
 #[unsafe(no_mangle)]
 pub extern "C" fn rgw_abi_version() -> u32 {
     RGW_ABI_VERSION
 }
 
-/// A status in words: English, for ever, ends with a zero byte. Any number is taken.
+/// A status in English words: a static text that ends with a zero byte. Takes any number.
 #[unsafe(no_mangle)]
 pub extern "C" fn rgw_status_text(status: u32) -> *const c_char {
-    #[allow(clippy::indexing_slicing, reason = "never but to see that the proof can fail")]
+    #[allow(clippy::indexing_slicing, reason = "only to see that the proof can fail")]
     if crate::no_panic::PROVOKED {
         return TEXTS[status as usize].1.as_ptr();
     }

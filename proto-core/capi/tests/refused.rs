@@ -1,5 +1,5 @@
-//! What a C program may do wrong and is told: null pointers, memory that is too small or crooked, another
-//! header, images that are none. The calls are those of the header.
+//! Mistakes of a C program that are refused: null pointers, memory that is too small or misaligned, another
+//! version of the header, invalid images. The calls are those of the header.
 
 use std::ffi::{CStr, c_void};
 use std::ptr::{null, null_mut};
@@ -62,6 +62,7 @@ fn a_configuration_that_is_none() {
         unsafe { rgw_config_read(start, RGW_CONFIG_SIZE, image.as_ptr(), image.len(), &mut config) }
     };
     let newer = *b"RGCI\xE7\x03\0\0\0\0\0\0\0\0\0\0";
+    let older = *b"RGCI\x01\0\0\0\0\0\0\0\0\0\0\0";
     let damaged = *b"RGCI\x02\0\0\0\0\0\0\0\0\0\0\0";
     assert_eq!(read(&[]), Status::ImageCut);
     assert_eq!(read(&[0xFF; 64]), Status::ImageNone);
@@ -73,6 +74,8 @@ fn a_configuration_that_is_none() {
     unsafe {
         assert_eq!(rgw_image_version(newer.as_ptr(), newer.len(), &mut version), Status::Ok);
         assert_eq!(version, 999);
+        assert_eq!(rgw_image_version(older.as_ptr(), older.len(), &mut version), Status::Ok);
+        assert_eq!(version, 1);
         assert_eq!(rgw_image_version(null(), 16, &mut version), Status::Null);
         assert_eq!(rgw_image_version(newer.as_ptr(), newer.len(), null_mut()), Status::Null);
         assert_eq!(rgw_config_read(start, 16, newer.as_ptr(), 16, &mut config), Status::TooSmall);

@@ -4,12 +4,13 @@
 //! configuration's lists with their ranges, or what is wrong and where. A refused recipe or port
 //! leaves nothing behind. Whether everything fits together is checked by [`ConfigView::validate`].
 
-use heapless::{String, Vec, VecView};
+use heapless::Vec;
 
 use super::draft::{ControllerBuilder, PartFields, PortBuilder, PortBus, RecipeBuilder, Trigger};
 use super::error::{ConfigError, ConfigErrorKind as Kind, ControllerKey, Counted, Place, PortKey, RecipeKey};
 use super::fields::{CanFields, Does, Fields, InputField, OutputField, Sends};
-use super::rules::check_name;
+use super::rules::{check_name, check_room, text};
+use super::view::ConfigMut;
 use super::{
     CanFramePart, CommandEntry, ControllerLink, Delimiter, FieldSpec, GatewayConfig, InputBinding, Name,
     OutputBinding, Parts, Port, Recipe, RecipeLink, SafeValue, SafeValues, SendOn, Span, StreamPart,
@@ -18,26 +19,6 @@ use crate::recipe::model::{MAX_CAN_IDS, MAX_DELIMITER};
 use crate::sysvar::{Direction, SysVar, VarRange};
 use crate::wire::dialect::Dialect;
 use crate::wire::scalar::Scalar;
-
-/// A mutable borrow of a configuration of any size; [`GatewayConfig`] describes the fields.
-#[derive(Debug)]
-pub(crate) struct ConfigMut<'c> {
-    /// The controller's address, ports and dialect.
-    pub(crate) controller: &'c mut ControllerLink,
-    /// The board's own address.
-    #[cfg(feature = "image")]
-    pub(crate) network: &'c mut super::BoardAddress,
-    /// Every recipe.
-    pub(crate) recipes: &'c mut VecView<Recipe>,
-    /// Every port.
-    pub(crate) ports: &'c mut VecView<Port>,
-    /// The fields of all recipes.
-    pub(crate) fields: &'c mut VecView<FieldSpec>,
-    /// The entries of all command tables.
-    pub(crate) commands: &'c mut VecView<CommandEntry>,
-    /// The safe values of all ports.
-    pub(crate) safe_values: &'c mut VecView<SafeValue>,
-}
 
 impl<
     const PORTS: usize,
@@ -86,20 +67,6 @@ impl<
 }
 
 impl ConfigMut<'_> {
-    /// A read-only view of the configuration.
-    #[cfg(feature = "image")]
-    pub(crate) fn view(&self) -> super::ConfigView<'_> {
-        super::ConfigView {
-            controller: self.controller,
-            network: self.network.fixed(),
-            recipes: self.recipes,
-            ports: self.ports,
-            fields: self.fields,
-            commands: self.commands,
-            safe_values: self.safe_values,
-        }
-    }
-
     /// As [`GatewayConfig::set_controller`].
     ///
     /// # Errors
@@ -158,7 +125,7 @@ impl ConfigMut<'_> {
             (Counted::Fields, self.fields.len().saturating_add(fields), self.fields.capacity()),
             (Counted::Commands, self.commands.len().saturating_add(commands), self.commands.capacity()),
         ] {
-            super::rules::check_room(at(RecipeKey::Whole), what, needed, room)?;
+            check_room(at(RecipeKey::Whole), what, needed, room)?;
         }
         let parts = match (&from.input, &from.output) {
             (PartFields::Can(input), PartFields::Can(output)) => Parts::Can {
@@ -216,7 +183,7 @@ impl ConfigMut<'_> {
         part: Direction,
         from: &[CanFields<'_>],
     ) -> Result<Vec<CanFramePart, MAX_CAN_IDS>, ConfigError> {
-        super::rules::check_room(Place::Part { recipe, part }, Counted::CanFrames, from.len(), MAX_CAN_IDS)?;
+        check_room(Place::Part { recipe, part }, Counted::CanFrames, from.len(), MAX_CAN_IDS)?;
         let mut frames = Vec::new();
         for (number, frame) in (0..).zip(from) {
             let fields = self.fields_of_part(recipe, part, number, &frame.fields)?;
@@ -317,7 +284,7 @@ impl ConfigMut<'_> {
                 self.safe_values.capacity(),
             ),
         ] {
-            super::rules::check_room(Place::Port { port: index, key }, what, needed, room)?;
+            check_room(Place::Port { port: index, key }, what, needed, room)?;
         }
         let added = match *safe {
             SafeValues::Names(named) => self.add_safe_values(named.iter().map(|&(name, value)| {
@@ -372,11 +339,6 @@ fn safe_value(var: SysVar, value: f64) -> Result<SafeValue, Kind> {
 
 fn name(given: &str, place: Place) -> Result<Name, ConfigError> {
     check_name(given).and_then(|()| text(given)).map_err(|kind| ConfigError { place, kind })
-}
-
-/// A text of the configuration.
-pub(super) fn text<const N: usize>(given: &str) -> Result<String<N>, Kind> {
-    String::try_from(given).map_err(|_| Kind::TooLong { len: given.len(), longest: N })
 }
 
 /// The range between two lengths of a list. Lists are shorter than `u16::MAX`; the check of the

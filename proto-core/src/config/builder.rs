@@ -143,7 +143,8 @@ impl<
                 Counted::Fields => self.needed.fields,
                 Counted::Commands => self.needed.commands,
                 Counted::SafeValues => self.needed.safe_values,
-                Counted::CanFrames => *needed,
+                // Lists of one recipe, and those of the engine.
+                _ => *needed,
             };
         }
         Err(error)

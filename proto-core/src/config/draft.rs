@@ -6,6 +6,7 @@
 
 use super::error::ConfigErrorKind as Kind;
 use super::fields::{CanFields, Fields, Var};
+use super::rules::text;
 use super::{Bus, OnStale, Parity, Port, Recipe, Rs485, SafeValue, SendOn};
 use crate::recipe::model::Mode;
 use crate::sysvar::SysVar;
@@ -366,7 +367,7 @@ impl PortBus for Can {}
 impl PortBus for Listen<'_> {}
 
 pub(super) mod sealed {
-    use super::{Bus, Can, Kind, Listen, Rs485};
+    use super::{Bus, Can, Kind, Listen, Rs485, text};
 
     /// Buses are those of the configuration.
     pub trait Sealed {
@@ -391,7 +392,7 @@ pub(super) mod sealed {
 
     impl Sealed for Listen<'_> {
         fn bus(&self) -> Result<Bus, Kind> {
-            let listen = crate::config::add::text(self.address)?;
+            let listen = text(self.address)?;
             Ok(if self.is_tcp { Bus::TcpListen { listen } } else { Bus::UdpListen { listen } })
         }
     }

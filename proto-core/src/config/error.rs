@@ -152,7 +152,7 @@ pub enum PortKey {
     Listen,
 }
 
-/// A list with a limited number of entries.
+/// A list with a limited number of entries: of a configuration, or of the engine that runs it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[non_exhaustive]
 pub enum Counted {
@@ -168,6 +168,22 @@ pub enum Counted {
     Commands,
     /// Safe values of all ports.
     SafeValues,
+    /// Field ports of an engine.
+    FieldPorts,
+    /// Input frames of all field ports.
+    InputFrames,
+    /// Recipe links of an engine.
+    RecipeLinks,
+    /// User-defined fields of all field ports in one direction.
+    UserFields,
+    /// User-defined fields that pick commands.
+    CommandFields,
+    /// Bytes of all command texts.
+    CommandBytes,
+    /// Groups of variables that arrive together.
+    Groups,
+    /// Blocks of neighbouring variables that are polled by Modbus.
+    PollBlocks,
 }
 
 impl core::fmt::Display for Counted {
@@ -179,6 +195,14 @@ impl core::fmt::Display for Counted {
             Self::CanFrames => "frames in one part",
             Self::Commands => "commands in all recipes together",
             Self::SafeValues => "safe values on all ports together",
+            Self::FieldPorts => "field ports",
+            Self::InputFrames => "input frames",
+            Self::RecipeLinks => "recipe links",
+            Self::UserFields => "user-defined fields in one direction",
+            Self::CommandFields => "command fields",
+            Self::CommandBytes => "bytes of command texts",
+            Self::Groups => "groups",
+            Self::PollBlocks => "Modbus poll blocks",
         })
     }
 }

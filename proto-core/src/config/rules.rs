@@ -3,14 +3,15 @@
 //! In: a name, a number, a range. Out: nothing, or what is wrong with it. The reader of files and
 //! [`ConfigView::validate`](super::ConfigView::validate) use the same functions.
 
+use heapless::String;
+
 use super::error::{ConfigError, ConfigErrorKind as Kind, Counted, Place, PortKey};
 use super::listen::ipv6;
+use super::port::MIN_CYCLE;
 use super::{MAX_ADDRESS, MAX_NAME, Name, Rs485, Span};
 use crate::sysvar::{COUNT, SysVar};
 use crate::time::Duration;
 
-/// The shortest cycle, of the controller and of a port.
-pub(crate) const MIN_CYCLE: Duration = Duration::from_millis(4);
 /// The longest cycle, timeout or staleness that a configuration may have.
 pub(crate) const MAX_TIME: Duration = Duration::from_secs(3_600);
 /// The longest idle gap and turnaround of a serial line.
@@ -118,6 +119,11 @@ pub(super) fn check_pool(place: Place, span: Span, len: usize) -> Check {
     let end = u32::from(span.start).saturating_add(u32::from(span.len));
     let len = len as u32;
     if end <= len { Ok(()) } else { fail(place, Kind::OutsidePool { end, len }) }
+}
+
+/// A text of the configuration, at most `N` bytes long.
+pub(super) fn text<const N: usize>(given: &str) -> Result<String<N>, Kind> {
+    String::try_from(given).map_err(|_| Kind::TooLong { len: given.len(), longest: N })
 }
 
 pub(super) fn check_time(place: Place, time: Duration, longest: Duration) -> Check {

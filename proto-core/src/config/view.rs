@@ -3,12 +3,10 @@
 //! In: a [`GatewayConfig`](super::GatewayConfig) of any parameters, or slices of a program's own. Out:
 //! borrowed slices, and the questions that concern several of them.
 
+use heapless::VecView;
+
 use super::network::Network;
-use super::{
-    CommandEntry, ControllerLink, FieldSpec, InputBinding, OutputBinding, Parts, Port, Recipe, SafeValue,
-    Span,
-};
-use crate::recipe::model::Field;
+use super::{CommandEntry, ControllerLink, FieldSpec, Port, Recipe, SafeValue};
 use crate::sysvar::{Direction, SysVar};
 
 /// A configuration of any size, borrowed; [`GatewayConfig`](super::GatewayConfig) describes the
@@ -85,41 +83,38 @@ impl<'c> ConfigView<'c> {
     }
 }
 
-impl Recipe {
-    /// The field ranges of one part: one for a stream part, one for each CAN frame.
-    pub fn frames(&self, part: Direction) -> impl Iterator<Item = (u8, Span)> + '_ {
-        let (stream, can) = match (&self.parts, part) {
-            (Parts::Stream { input, .. }, Direction::Input) => (input.as_ref(), None),
-            (Parts::Stream { output, .. }, Direction::Output) => (output.as_ref(), None),
-            (Parts::Can { input, .. }, Direction::Input) => (None, Some(input)),
-            (Parts::Can { output, .. }, Direction::Output) => (None, Some(output)),
-        };
-        let can = can.into_iter().flatten().map(|frame| frame.fields);
-        (0..).zip(stream.map(|part| part.fields).into_iter().chain(can))
-    }
-
-    /// Whether the recipe has this part.
-    pub fn has(&self, part: Direction) -> bool {
-        self.frames(part).next().is_some()
-    }
+/// A mutable borrow of a configuration of any size; [`GatewayConfig`](super::GatewayConfig) describes the fields.
+#[derive(Debug)]
+pub(crate) struct ConfigMut<'c> {
+    /// The controller's address, ports and dialect.
+    pub(crate) controller: &'c mut ControllerLink,
+    /// The board's own address.
+    #[cfg(feature = "image")]
+    pub(crate) network: &'c mut super::BoardAddress,
+    /// Every recipe.
+    pub(crate) recipes: &'c mut VecView<Recipe>,
+    /// Every port.
+    pub(crate) ports: &'c mut VecView<Port>,
+    /// The fields of all recipes.
+    pub(crate) fields: &'c mut VecView<FieldSpec>,
+    /// The entries of all command tables.
+    pub(crate) commands: &'c mut VecView<CommandEntry>,
+    /// The safe values of all ports.
+    pub(crate) safe_values: &'c mut VecView<SafeValue>,
 }
 
-impl FieldSpec {
-    /// The field as it is on the wire.
-    pub fn field(&self) -> Field {
-        match *self {
-            Self::System(var) => Field::System(var),
-            Self::UserInput { ty, .. } | Self::UserOutput { ty, .. } => Field::User(ty),
-        }
-    }
-
-    /// The system variable that the field is, or that it is bound to.
-    pub fn variable(&self) -> Option<SysVar> {
-        match *self {
-            Self::System(var)
-            | Self::UserInput { to: InputBinding::Variable { var, .. }, .. }
-            | Self::UserOutput { from: OutputBinding::Variable { var, .. }, .. } => Some(var),
-            Self::UserInput { .. } | Self::UserOutput { .. } => None,
+#[cfg(feature = "image")]
+impl ConfigMut<'_> {
+    /// A read-only view of the configuration.
+    pub(crate) fn view(&self) -> ConfigView<'_> {
+        ConfigView {
+            controller: self.controller,
+            network: self.network.fixed(),
+            recipes: self.recipes,
+            ports: self.ports,
+            fields: self.fields,
+            commands: self.commands,
+            safe_values: self.safe_values,
         }
     }
 }

@@ -21,8 +21,8 @@ use super::uplink::{Uplink, UplinkSetup};
 use super::user::{Bindings, InputBind};
 use super::{Ask, Engine};
 use crate::config::{
-    Bus, ConfigError, ConfigView, FieldSpec, InputBinding, MAX_SAFE_VALUES, Parts, Port, Recipe, SendOn,
-    Span, StreamPart, listen_address,
+    Bus, CanFramePart, ConfigError, ConfigView, Counted, FieldSpec, InputBinding, Parts, Port, Recipe,
+    SendOn, Span, StreamPart, listen_address,
 };
 use crate::image::{GroupId, InputSet, MAX_GROUPS};
 use crate::link::LinkTimings;
@@ -55,7 +55,7 @@ pub enum BuildError {
     /// The configuration needs more entries than this engine has room for.
     TooMany {
         /// The list.
-        what: &'static str,
+        what: Counted,
         /// Number of entries that the configuration needs; if only building it shows that, one more
         /// than there is room for.
         needed: usize,
@@ -84,7 +84,7 @@ impl fmt::Display for BuildError {
 impl core::error::Error for BuildError {}
 
 /// There was no room for another entry.
-fn one_too_many(what: &'static str, room: usize) -> BuildError {
+fn one_too_many(what: Counted, room: usize) -> BuildError {
     BuildError::TooMany { what, needed: room.saturating_add(1), room }
 }
 
@@ -209,8 +209,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         // As long as the configuration's, which is as long as the engine's.
         let _ = self.links.host.push_str(&config.controller.address);
         for value in config.safe_values {
-            let full = |_| one_too_many("safe values", MAX_SAFE_VALUES);
-            self.safe_values.push(SafeBytes::new(value)).map_err(full)?;
+            // Validation has refused more than there is room for.
+            let _ = self.safe_values.push(SafeBytes::new(value));
         }
         for (index, port, recipe) in config.field_ports() {
             self.add_port(config, index, port, recipe, dialect)?;
@@ -220,7 +220,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             self.add_uplink(config, &plan, id, recipe, &mut groups)?;
         }
         if plan.needs_state() {
-            let group = groups.next().ok_or(one_too_many("groups", MAX_GROUPS))?;
+            let group = groups.next().ok_or(one_too_many(Counted::Groups, MAX_GROUPS))?;
             let link = StateLink::new(config.controller.state_port, dialect, group, plan.read_back());
             let _ = self.links.state.push(link);
         }
@@ -255,12 +255,12 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         let texts = if commands == 0 { &[] } else { config.commands };
         let bytes = texts.iter().map(|entry| entry.text.len()).fold(0, usize::saturating_add);
         for (what, needed, room) in [
-            ("field ports", ports, PORTS),
-            ("input frames", frames, MAX_INPUT_FRAMES),
-            ("recipe links", uplinks(config).count(), UPLINKS),
-            ("user-defined fields in one direction", inputs.max(outputs), FIELDS),
-            ("command fields", commands, MAX_COMMAND_FIELDS),
-            ("bytes of command texts", bytes, MAX_COMMAND_BYTES),
+            (Counted::FieldPorts, ports, PORTS),
+            (Counted::InputFrames, frames, MAX_INPUT_FRAMES),
+            (Counted::RecipeLinks, uplinks(config).count(), UPLINKS),
+            (Counted::UserFields, inputs.max(outputs), FIELDS),
+            (Counted::CommandFields, commands, MAX_COMMAND_FIELDS),
+            (Counted::CommandBytes, bytes, MAX_COMMAND_BYTES),
         ] {
             if needed > room {
                 return Err(BuildError::TooMany { what, needed, room });
@@ -269,6 +269,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         Ok(())
     }
 
+    /// Not inlined, nor are the other parts that make large values: their stacks would add up.
+    #[inline(never)]
     fn add_port(
         &mut self,
         config: ConfigView<'_>,
@@ -277,9 +279,14 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         recipe: &Recipe,
         dialect: Dialect,
     ) -> Result<(), BuildError> {
-        let (codec, line) = match &port.bus {
-            Bus::Rs485(settings) => (stream_codec(config, port.recipe, recipe)?, LineTiming::new(settings)),
-            _ => (can_codec(config, port.recipe, recipe)?, LineTiming::none()),
+        // Validation has refused recipes that the bus cannot carry.
+        let codec = match &recipe.parts {
+            Parts::Stream { input, output } => stream_codec(config, port.recipe, recipe, [input, output])?,
+            Parts::Can { input, output } => can_codec(config, port.recipe, recipe, [input, output])?,
+        };
+        let line = match &port.bus {
+            Bus::Rs485(settings) => LineTiming::new(settings),
+            _ => LineTiming::none(),
         };
         let first_frame = self.store.frames.len() as u8;
         let mut next_binding = self.bindings.inputs.len() as u16;
@@ -298,10 +305,13 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 timeout: port.timeout,
             };
             let group = GroupId(self.store.frames.len() as u8);
-            self.store.frames.push(frame).map_err(|_| one_too_many("input frames", MAX_INPUT_FRAMES))?;
+            self.store
+                .frames
+                .push(frame)
+                .map_err(|_| one_too_many(Counted::InputFrames, MAX_INPUT_FRAMES))?;
             frame.set.iter().for_each(|var| self.store.image.assign(var, group));
         }
-        let full = || one_too_many("user-defined fields in one direction", FIELDS);
+        let full = || one_too_many(Counted::UserFields, FIELDS);
         let mut inputs = Span { start: self.bindings.inputs.len() as u16, len: 0 };
         for (_, _, field) in config.fields_of(recipe, Direction::Input) {
             let bind = match *field {
@@ -310,13 +320,11 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 }
                 FieldSpec::UserInput { to: InputBinding::Commands { table, when }, .. } => {
                     if self.links.command.is_empty() {
-                        let link = CommandLink::new(config.controller.command_port, dialect, config.commands);
-                        let link = link.ok_or(one_too_many("bytes of command texts", MAX_COMMAND_BYTES))?;
-                        let _ = self.links.command.push(link);
+                        self.add_command_link(config, dialect)?;
                     }
                     let Some(link) = self.links.command.first_mut() else { continue };
                     let field = link.add_field(table, when);
-                    InputBind::Command(field.ok_or(one_too_many("command fields", MAX_COMMAND_FIELDS))?)
+                    InputBind::Command(field.ok_or(one_too_many(Counted::CommandFields, MAX_COMMAND_FIELDS))?)
                 }
                 FieldSpec::UserInput { .. } => InputBind::Unused,
                 _ => continue,
@@ -351,10 +359,19 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             counters: PortCounters::default(),
             last_rejection: None,
         };
-        self.ports.push(port).map_err(|_| one_too_many("field ports", PORTS))?;
-        self.store.edges.push(EdgeQueue::default()).map_err(|_| one_too_many("field ports", PORTS))
+        self.ports.push(port).map_err(|_| one_too_many(Counted::FieldPorts, PORTS))?;
+        self.store.edges.push(EdgeQueue::default()).map_err(|_| one_too_many(Counted::FieldPorts, PORTS))
     }
 
+    #[inline(never)]
+    fn add_command_link(&mut self, config: ConfigView<'_>, dialect: Dialect) -> Result<(), BuildError> {
+        let link = CommandLink::new(config.controller.command_port, dialect, config.commands);
+        let link = link.ok_or(one_too_many(Counted::CommandBytes, MAX_COMMAND_BYTES))?;
+        let _ = self.links.command.push(link);
+        Ok(())
+    }
+
+    #[inline(never)]
     fn add_uplink(
         &mut self,
         config: ConfigView<'_>,
@@ -390,7 +407,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         let input = stream_layout(config, index, recipe, input.as_ref(), Direction::Input, framing)?;
         let output = stream_layout(config, index, recipe, output.as_ref(), Direction::Output, framing)?;
         let group = match output {
-            Some(_) => Some(groups.next().ok_or(one_too_many("groups", MAX_GROUPS))?),
+            Some(_) => Some(groups.next().ok_or(one_too_many(Counted::Groups, MAX_GROUPS))?),
             None => None,
         };
         for (_, _, field) in config.fields_of(recipe, Direction::Output) {
@@ -440,7 +457,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             group,
             patience,
         });
-        self.links.recipes.push(uplink).map_err(|_| one_too_many("recipe links", UPLINKS))
+        self.links.recipes.push(uplink).map_err(|_| one_too_many(Counted::RecipeLinks, UPLINKS))
     }
 
     /// Variables of recipe links that no port sends come from the state stream.
@@ -451,6 +468,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
     }
 
+    #[inline(never)]
     fn assign_sources(
         &mut self,
         config: ConfigView<'_>,
@@ -477,7 +495,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             let period = periods.get(var.ordinal()).copied().flatten().unwrap_or(port_cycle_floor());
             let Some(modbus) = self.links.modbus.first_mut() else { break };
             let group = modbus.poll_var(var, period, || groups.next());
-            let group = group.ok_or(one_too_many("Modbus poll blocks", MAX_POLL_BLOCKS))?;
+            let group = group.ok_or(one_too_many(Counted::PollBlocks, MAX_POLL_BLOCKS))?;
             self.store.image.assign(var, group);
         }
         for var in SysVar::all() {
@@ -542,10 +560,13 @@ fn recipe_index(config: ConfigView<'_>, recipe: &Recipe) -> u8 {
     (0..).zip(config.recipes).find(|(_, other)| other.name == recipe.name).map_or(0, |(index, _)| index)
 }
 
-fn stream_codec(config: ConfigView<'_>, index: u8, recipe: &Recipe) -> Result<Codec, BuildError> {
-    let Parts::Stream { input, output } = &recipe.parts else {
-        return Err(one_too_many("stream parts in a CAN recipe", 0));
-    };
+#[inline(never)]
+fn stream_codec(
+    config: ConfigView<'_>,
+    index: u8,
+    recipe: &Recipe,
+    [input, output]: [&Option<StreamPart>; 2],
+) -> Result<Codec, BuildError> {
     let layout = |part: &Option<StreamPart>, direction| {
         stream_layout(config, index, recipe, part.as_ref(), direction, Framing::Bytes)
     };
@@ -572,11 +593,14 @@ fn stream_layout(
         .map_err(|error| BuildError::Part { recipe: index, part: direction, error })
 }
 
-fn can_codec(config: ConfigView<'_>, index: u8, recipe: &Recipe) -> Result<Codec, BuildError> {
-    let Parts::Can { input, output } = &recipe.parts else {
-        return Err(one_too_many("CAN parts in a stream recipe", 0));
-    };
-    let layout = |frames: &[crate::config::CanFramePart], direction| {
+#[inline(never)]
+fn can_codec(
+    config: ConfigView<'_>,
+    index: u8,
+    recipe: &Recipe,
+    [input, output]: [&[CanFramePart]; 2],
+) -> Result<Codec, BuildError> {
+    let layout = |frames: &[CanFramePart], direction| {
         if frames.is_empty() {
             return Ok(None);
         }

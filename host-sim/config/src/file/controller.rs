@@ -151,23 +151,13 @@ const BUSES: [(&str, BusKind); 5] = [
     ("udp-client", BusKind::UdpClient),
 ];
 
-const PORT_KEYS: [&str; 11] = [
-    "name",
-    "bus",
-    "recipe",
-    "cycle_ms",
-    "baud",
-    "parity",
-    "stop_bits",
-    "idle_gap_ms",
-    "turnaround_us",
-    "bitrate",
-    "to",
-];
+/// The keys of a port on any bus.
+const COMMON_KEYS: [&str; 4] = ["name", "bus", "recipe", "cycle_ms"];
 
 fn read_ports(root: &Reader<'_>, recipes: &[FileRecipe]) -> Result<Vec<SimPort>> {
     let mut ports: Vec<SimPort> = Vec::new();
-    for table in root.tables("port", &PORT_KEYS)? {
+    let keys = [&COMMON_KEYS[..], &LINE_KEYS, &["bitrate", "to"]].concat();
+    for table in root.tables("port", &keys)? {
         let (port, name_spot) = read_port(&table, recipes)?;
         if ports.iter().any(|before| before.name == port.name) {
             let message = format!("there is already a port {:?}; names must differ", port.name);
@@ -195,10 +185,7 @@ fn read_port(table: &Reader<'_>, recipes: &[FileRecipe]) -> Result<(SimPort, Spo
         BusKind::TcpClient | BusKind::UdpClient => &["to"],
     };
     let bus_name = BUSES.iter().find(|(_, bus)| *bus == kind).map_or("", |(name, _)| name);
-    table.check_keys(
-        &[&["name", "bus", "recipe", "cycle_ms"], own].concat(),
-        &format!(" on bus = {bus_name:?}"),
-    )?;
+    table.check_keys(&[&COMMON_KEYS, own].concat(), &format!(" on bus = {bus_name:?}"))?;
     let bus = match kind {
         BusKind::Rs485 => SimBus::Rs485(read_line(table)?),
         BusKind::Can => SimBus::Can { bitrate: read_bitrate(table)? },

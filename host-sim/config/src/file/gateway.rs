@@ -32,29 +32,15 @@ pub(super) fn read(document: &Document) -> Result<Box<GatewayConfig>> {
     for (index, recipe) in recipes.iter().enumerate() {
         builder.add_recipe(index, recipe)?;
     }
-    for port in root.tables("port", &PORT_KEYS)? {
+    let port_keys = [&COMMON_KEYS[..], &["on_timeout"], &LINE_KEYS, &["bitrate", "listen"]].concat();
+    for port in root.tables("port", &port_keys)? {
         builder.add_port(&port, &recipes)?;
     }
     builder.finish()
 }
 
+/// The keys of a port on any bus.
 const COMMON_KEYS: [&str; 6] = ["name", "bus", "recipe", "cycle_ms", "timeout_ms", "stale_after_ms"];
-const PORT_KEYS: [&str; 14] = [
-    "name",
-    "bus",
-    "recipe",
-    "cycle_ms",
-    "timeout_ms",
-    "stale_after_ms",
-    "on_timeout",
-    "baud",
-    "parity",
-    "stop_bits",
-    "idle_gap_ms",
-    "turnaround_us",
-    "bitrate",
-    "listen",
-];
 
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum BusKind {

@@ -1,6 +1,6 @@
 //! The keys that ports have in both kinds of files.
 
-use proto_core::config::{ConfigErrorKind, Parity, PortKey, Rs485, check_bitrate, check_cycle};
+use proto_core::config::{Bus, ConfigErrorKind, Parity, PortKey, Rs485, check_bitrate, check_cycle};
 use proto_core::time::Duration;
 
 use super::reader::{Reader, Result};
@@ -10,13 +10,7 @@ pub(super) const LINE_KEYS: [&str; 5] = ["baud", "parity", "stop_bits", "idle_ga
 
 /// The settings of a serial line, within their ranges.
 pub(super) fn read_line(port: &Reader<'_>) -> Result<Rs485> {
-    let mut line = Rs485 {
-        baud: 115_200,
-        parity: Parity::None,
-        stop_bits: 1,
-        idle_gap: Duration::from_millis(50),
-        turnaround: Duration::from_micros(100),
-    };
+    let mut line = Rs485::default();
     if let Some(item) = port.optional("baud") {
         line.baud = item.integer(1_200..=4_000_000)?;
     }
@@ -38,7 +32,7 @@ pub(super) fn read_line(port: &Reader<'_>) -> Result<Rs485> {
 
 pub(super) fn read_bitrate(port: &Reader<'_>) -> Result<u32> {
     let bitrate =
-        port.optional("bitrate").map_or(Ok(500_000), |item| item.integer(0..=i64::from(u32::MAX)))?;
+        port.optional("bitrate").map_or(Ok(Bus::BITRATE), |item| item.integer(0..=i64::from(u32::MAX)))?;
     check_bitrate(bitrate).map_err(|kind| refused(port, PortKey::Bitrate, kind))?;
     Ok(bitrate)
 }
