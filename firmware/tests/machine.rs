@@ -219,7 +219,12 @@ fn a_task_that_hangs_is_named_and_then_the_machine_is_reset() {
     let (status, log) = Machine::start(nothing(), "stall", &["-no-reboot"]).end();
     assert_said(
         &log,
-        &["nothing runs", "task board 0 does not respond", "the watchdog was not fed", "no task was running"],
+        &[
+            "nothing runs",
+            &format!("task {TROUBLED} does not respond"),
+            "the watchdog was not fed",
+            "no task was running",
+        ],
     );
     // QEMU ends in place of a reset.
     assert_eq!(status.code(), Some(0));
@@ -231,7 +236,7 @@ fn a_task_that_keeps_the_processor_is_named_and_after_the_reset_all_begins_again
     let mut machine = Machine::start(nothing(), "spin", &[]);
     machine.until("recipe gateway");
     machine.until("the watchdog was not fed");
-    machine.until("task board 0 was running");
+    machine.until(&format!("task {TROUBLED} was running"));
     machine.until("recipe gateway");
     machine.until("nothing runs");
 }
@@ -300,7 +305,7 @@ fn a_run_without_trouble_never_starves_the_watchdog() {
 #[ignore = "needs QEMU and the firmware"]
 fn a_panic_says_where_and_ends_with_101() {
     let (status, log) = Machine::start(nothing(), "panic", &[]).end();
-    assert_said(&log, &["panicked at", "as asked", "task board 0 was running"]);
+    assert_said(&log, &["panicked at", "as asked", &format!("task {TROUBLED} was running")]);
     assert_eq!(status.code(), Some(101));
 }
 
@@ -309,12 +314,14 @@ fn a_panic_says_where_and_ends_with_101() {
 fn a_stack_overflow_and_a_read_of_nothing_fault_and_end_with_102() {
     for trouble in ["overflow", "fault"] {
         let (status, log) = Machine::start(nothing(), trouble, &[]).end();
-        assert_said(&log, &["hard fault", "task board 0 was running"]);
+        assert_said(&log, &["hard fault", &format!("task {TROUBLED} was running")]);
         assert!(!log.contains("panicked"), "{log}");
         assert_eq!(status.code(), Some(102), "{trouble}");
     }
 }
 
+/// The task that a trouble is in.
+const TROUBLED: &str = "board 0";
 /// IP protocols.
 const TCP: u8 = 6;
 const UDP: u8 = 17;

@@ -119,9 +119,14 @@ impl Bench {
         at
     }
 
-    /// Whether the log has such a line.
+    /// Whether the log has a line with this text.
     pub(crate) fn has_logged(&self, text: &str) -> bool {
-        self.chip.log.iter().any(|(_, line)| line.contains(text))
+        self.times_logged(text) > 0
+    }
+
+    /// The number of lines with this text.
+    pub(crate) fn times_logged(&self, text: &str) -> usize {
+        self.chip.log.iter().filter(|(_, line)| line.contains(text)).count()
     }
 
     /// The log and the last accesses.

@@ -178,7 +178,7 @@ fn a_line_has_its_speed_and_virtual_time_is_never_ahead() {
     for figures in [before, after] {
         assert!(seconds(&figures, "virtual_s") <= seconds(&figures, "wall_s"), "{figures}");
     }
-    board.until_log("port line: in 120 frames, 480 bytes");
+    board.until_log(": in 120 frames, 480 bytes");
 }
 
 #[test]

@@ -75,8 +75,8 @@ pub(super) fn keep(frame: &ExceptionFrame) {
     };
     let mut words = Words(0);
     // A panic ends in an undefined instruction: the log had its message.
-    let kind = if cause & UNDEFINED_INSTRUCTION != 0 { "panic" } else { "fault" };
-    let _ = write!(words, "{kind} at {:08X}, from {:08X}, CFSR {cause:08X}", frame.pc(), frame.lr());
+    let kind = if cause & UNDEFINED_INSTRUCTION != 0 { "panic at" } else { "fault at" };
+    let _ = write!(words, "{kind} {:08X}, from {:08X}, CFSR {cause:08X}", frame.pc(), frame.lr());
     if cause & MEMORY_ADDRESS_VALID != 0 {
         let _ = write!(words, ", address {memory:08X}");
     }
