@@ -4,7 +4,7 @@
 use core::cell::{Cell, RefCell};
 use std::rc::Rc;
 
-use chip::device::{Clocks, Functions, Moment, Peripheral, Picos, Pin, Refusal};
+use chip::device::{Clocks, Context, Functions, Peripheral, Picos, Pin, Refusal};
 
 /// A peripheral with its clocks and pins.
 pub(crate) struct Device<P> {
@@ -30,8 +30,8 @@ impl<P: Peripheral> Device<P> {
     }
 
     /// Whether its interrupt is asked for.
-    pub(crate) fn interrupts(&self) -> bool {
-        self.with(|model| model.interrupts())
+    pub(crate) fn interrupt_line(&self) -> bool {
+        self.with(|model| model.interrupt_line())
     }
 
     /// The model, to look at it or to do something at its pins.
@@ -56,19 +56,19 @@ impl<P: Peripheral> Device<P> {
     /// The program does something else there.
     pub(crate) fn access<T>(
         &self,
-        f: impl FnOnce(&mut P, &Moment<'_>) -> Result<T, Refusal>,
+        f: impl FnOnce(&mut P, &Context<'_>) -> Result<T, Refusal>,
     ) -> Result<T, Refusal> {
         self.now.set(self.now() + ACCESS);
         let mut model = self.model.borrow_mut();
-        model.advance(&self.moment())?;
-        f(&mut model, &self.moment())
+        model.advance(&self.context())?;
+        f(&mut model, &self.context())
     }
 
     /// Time passes up to the next thing that the peripheral does, or to `end`, where it returns `false`.
     #[track_caller]
     pub(crate) fn hop(&self, end: Picos) -> bool {
         self.advance();
-        let due = self.with(|model| model.deadline(&self.moment())).filter(|due| *due < end);
+        let due = self.with(|model| model.deadline(&self.context())).filter(|due| *due < end);
         assert!(due.is_none_or(|due| due > self.now()), "what is due is not done");
         self.now.set(due.unwrap_or(end).max(self.now()));
         self.advance();
@@ -84,12 +84,12 @@ impl<P: Peripheral> Device<P> {
 
     #[track_caller]
     fn advance(&self) {
-        let done = self.with(|model| model.advance(&self.moment()));
+        let done = self.with(|model| model.advance(&self.context()));
         done.unwrap_or_else(|refusal| panic!("it does something by itself: {refusal}"));
     }
 
-    fn moment(&self) -> Moment<'_> {
-        Moment { now: self.now(), clocks: self.clocks, functions: &self.functions, is_rmii: false }
+    fn context(&self) -> Context<'_> {
+        Context { now: self.now(), clocks: self.clocks, functions: &self.functions, is_rmii: false }
     }
 
     fn name(&self, offset: u32) -> std::string::String {

@@ -10,7 +10,7 @@ use std::task::{Wake, Waker};
 use std::vec::Vec;
 
 use chip::device::{Clocks, MICRO, MILLI, Picos, Pin};
-use chip::models::can_bus::{Frame as Wire, Trouble};
+use chip::models::can_bus::{BusFault, Frame as Wire};
 use chip::models::fdcan::Fdcan;
 
 use super::*;
@@ -146,21 +146,21 @@ impl Bench {
     fn broken(&self, times: usize) {
         for _ in 0..times {
             let ended = self.model.now() + 140 * BIT;
-            self.model.with(|can| can.bus.send_broken(ended));
+            self.model.with(|can| can.bus.send_error_frame(ended));
             self.model.pass(141 * BIT);
         }
     }
 
-    fn trouble(&self, trouble: Trouble) {
-        self.model.with(|can| can.bus.trouble = trouble);
+    fn trouble(&self, trouble: BusFault) {
+        self.model.with(|can| can.bus.fault = trouble);
     }
 
     /// What it is sending goes into a short circuit, which is over then.
     #[track_caller]
     fn bus_off(&mut self) {
-        self.trouble(Trouble::Short);
+        self.trouble(BusFault::ShortCircuit);
         self.until(|cell| cell.model.with(|can| !can.bus.bus_offs.is_empty()));
-        self.trouble(Trouble::None);
+        self.trouble(BusFault::None);
     }
 
     /// The next frame leaves.
@@ -234,7 +234,7 @@ fn frames_of_the_ids_come_whole_and_nothing_else_does() {
     near.into_iter().for_each(|id| cell.data(id, &[1]));
     assert!(cell.next().is_none());
     // They were acknowledged all the same.
-    assert_eq!(cell.model.with(|can| (can.bus.heard, can.bus.missed, can.bus.passed)), (8, 0, 4));
+    assert_eq!(cell.model.with(|can| (can.bus.received, can.bus.missed, can.bus.accepted)), (8, 0, 4));
 }
 
 #[test]
@@ -330,7 +330,7 @@ fn a_cycle_leaves_in_its_order_and_its_end_is_told_once() {
     let words = Wire { is_remote: true, len: 5, ..Wire::standard(1, &[]) };
     assert_eq!(cell.transmit(), Some(words));
     // One attempt each.
-    assert_eq!(cell.model.with(|can| (can.bus.attempts, can.bus.broken_off)), (34, 0));
+    assert_eq!(cell.model.with(|can| (can.bus.attempts, can.bus.aborted)), (34, 0));
 }
 
 #[test]
@@ -370,7 +370,7 @@ fn error_states_are_told_as_they_change() {
     let mut cell = on_the_bus(&[]);
     assert_eq!(cell.send(A, &[1]), Poll::Ready(Ok(())));
     // Nobody acknowledges: 8 for each attempt, and no more from 128 on.
-    cell.trouble(Trouble::Alone);
+    cell.trouble(BusFault::NoAcknowledge);
     cell.wait_for(BusState::Warning);
     assert_eq!(cell.mcan.counters().transmit_errors, 96);
     assert!(cell.next().is_none());
@@ -380,7 +380,7 @@ fn error_states_are_told_as_they_change() {
     assert_eq!(cell.mcan.counters().transmit_errors, 128);
     assert!(cell.next().is_none());
     // Somebody is there again: 1 less for each frame.
-    cell.trouble(Trouble::None);
+    cell.trouble(BusFault::None);
     cell.wait_for(BusState::Warning);
     assert!(matches!(cell.wait(), CanEvent::Sent));
     for errors in (95..127).rev() {
@@ -400,7 +400,7 @@ fn error_counters_are_those_of_the_controller() {
     cell.broken(17);
     assert!(cell.next().is_none());
     assert_eq!(cell.send(A, &[1]), Poll::Ready(Ok(())));
-    cell.trouble(Trouble::Short);
+    cell.trouble(BusFault::ShortCircuit);
     cell.until(|cell| cell.get(ECR) & 0xFF == 0xF8);
     let counters = CanCounters { transmit_errors: 0xF8, receive_errors: 17, lost: 0 };
     assert_eq!(cell.mcan.counters(), counters);
@@ -440,17 +440,17 @@ fn the_interrupt_wakes_who_waits_and_falls_silent_whatever_happened() {
             let task = Waker::from(Arc::clone(&wakes));
             assert!(pin!(cell.mcan.receive()).poll(&mut Context::from_waker(&task)).is_pending());
         }
-        assert!(!cell.model.interrupts());
+        assert!(!cell.model.interrupt_line());
         happens(cell);
-        assert!(cell.model.interrupts());
+        assert!(cell.model.interrupt_line());
         Mcan::interrupt(&cell.model, waker);
-        assert!(!cell.model.interrupts(), "it would come again for ever");
+        assert!(!cell.model.interrupt_line(), "it would come again for ever");
         assert_eq!(wakes.0.load(Ordering::Relaxed), before + 1);
         core::iter::from_fn(|| cell.next()).last()
     };
     let comes = |cell: &Bench| {
         let end = cell.model.now() + 10 * MILLI;
-        while !cell.model.interrupts() && cell.model.hop(end) {}
+        while !cell.model.interrupt_line() && cell.model.hop(end) {}
     };
     interrupted(&mut cell, &|cell| cell.data(A, &[1]));
     interrupted(&mut cell, &|cell| cell.data(B, &[1]));
@@ -461,12 +461,12 @@ fn the_interrupt_wakes_who_waits_and_falls_silent_whatever_happened() {
     assert!(matches!(last, Some(CanEvent::Sent)));
     // Each change of the error state.
     assert_eq!(cell.send(A, &[1]), Poll::Ready(Ok(())));
-    cell.trouble(Trouble::Short);
+    cell.trouble(BusFault::ShortCircuit);
     for state in [BusState::Warning, BusState::Passive, BusState::BusOff] {
         let last = interrupted(&mut cell, &comes);
         assert!(matches!(last, Some(CanEvent::Bus(now)) if now == state), "{last:?} and not {state:?}");
     }
-    cell.trouble(Trouble::None);
+    cell.trouble(BusFault::None);
     cell.mcan.recover();
     let last = interrupted(&mut cell, &comes);
     assert!(matches!(last, Some(CanEvent::Bus(BusState::Active))));

@@ -85,7 +85,7 @@ impl Bench {
     /// The interrupts that are due; how many.
     fn interrupts(&self) -> usize {
         let mut count = 0;
-        while self.model.interrupts() {
+        while self.model.interrupt_line() {
             count += 1;
             assert!(count < 10, "the interrupt comes again for ever");
             Usart::interrupt(&self.model, self.line.shared);
