@@ -22,8 +22,8 @@ struct Machine {
 
 impl Machine {
     /// Starts it with an image (or the name of a file that is not there), a trouble, and more options.
-    fn start(image: &Path, trouble: &str, options: &[&str]) -> Self {
-        let arguments = format!("enable=on,target=native,arg=firmware,arg={},arg={trouble}", image.display());
+    fn start(image: &Path, fault: &str, options: &[&str]) -> Self {
+        let arguments = format!("enable=on,target=native,arg=firmware,arg={},arg={fault}", image.display());
         let monitor = tempfile::tempdir().unwrap();
         let socket = format!("unix:{}/socket,server=on,wait=off", monitor.path().display());
         let mut qemu = Command::new("qemu-system-arm")
@@ -221,7 +221,7 @@ fn a_task_that_hangs_is_named_and_then_the_machine_is_reset() {
         &log,
         &[
             "nothing runs",
-            &format!("task {TROUBLED} does not respond"),
+            &format!("task {FAULTY_TASK} does not respond"),
             "the watchdog was not fed",
             "no task was running",
         ],
@@ -236,7 +236,7 @@ fn a_task_that_keeps_the_processor_is_named_and_after_the_reset_all_begins_again
     let mut machine = Machine::start(nothing(), "spin", &[]);
     machine.until("recipe gateway");
     machine.until("the watchdog was not fed");
-    machine.until(&format!("task {TROUBLED} was running"));
+    machine.until(&format!("task {FAULTY_TASK} was running"));
     machine.until("recipe gateway");
     machine.until("nothing runs");
 }
@@ -305,23 +305,23 @@ fn a_run_without_trouble_never_starves_the_watchdog() {
 #[ignore = "needs QEMU and the firmware"]
 fn a_panic_says_where_and_ends_with_101() {
     let (status, log) = Machine::start(nothing(), "panic", &[]).end();
-    assert_said(&log, &["panicked at", "as asked", &format!("task {TROUBLED} was running")]);
+    assert_said(&log, &["panicked at", "as asked", &format!("task {FAULTY_TASK} was running")]);
     assert_eq!(status.code(), Some(101));
 }
 
 #[test]
 #[ignore = "needs QEMU and the firmware"]
 fn a_stack_overflow_and_a_read_of_nothing_fault_and_end_with_102() {
-    for trouble in ["overflow", "fault"] {
-        let (status, log) = Machine::start(nothing(), trouble, &[]).end();
-        assert_said(&log, &["hard fault", &format!("task {TROUBLED} was running")]);
+    for fault in ["overflow", "fault"] {
+        let (status, log) = Machine::start(nothing(), fault, &[]).end();
+        assert_said(&log, &["hard fault", &format!("task {FAULTY_TASK} was running")]);
         assert!(!log.contains("panicked"), "{log}");
-        assert_eq!(status.code(), Some(102), "{trouble}");
+        assert_eq!(status.code(), Some(102), "{fault}");
     }
 }
 
 /// The task that a trouble is in.
-const TROUBLED: &str = "board 0";
+const FAULTY_TASK: &str = "board 0";
 /// IP protocols.
 const TCP: u8 = 6;
 const UDP: u8 = 17;

@@ -304,9 +304,9 @@ impl Net<'_> {
     }
 
     /// Waits until the link was up so often and so many were turned away.
-    async fn seen(&self, connects: u32, strangers: u32) {
-        let turned_away = || self.gateway.strangers().map(|(_, count)| count).max();
-        until(|| (self.link().0, turned_away()) == (connects, Some(strangers))).await;
+    async fn seen(&self, connects: u32, refused_peers: u32) {
+        let turned_away = || self.gateway.refused_peers().map(|(_, count)| count).max();
+        until(|| (self.link().0, turned_away()) == (connects, Some(refused_peers))).await;
     }
 }
 
