@@ -1,4 +1,4 @@
-//! From power on to idle; and with each part missing.
+//! From power-on to operation, also with each external part missing.
 
 use chip::CONFIG;
 use chip::device::{MILLI, SECOND};
@@ -64,7 +64,7 @@ fn it_boots_and_reaches_the_controller() {
     bench.until_log("info: started", 10 * MILLI);
     bench.until_log("field ports", 10 * MILLI);
     let at = bench.until_log("address 192.168.12.20/24", 2 * SECOND);
-    assert!(at > bench.chip.devices().ethernet.phy.negotiation, "told while nobody can be reached at it");
+    assert!(at > bench.chip.devices().ethernet.phy.negotiation, "logged before it can be reached");
     bench.until("a Modbus connection", 5 * SECOND, |bench| {
         bench.robot.as_ref().is_some_and(|robot| robot.counters().modbus.open == 1)
     });
@@ -74,9 +74,9 @@ fn it_boots_and_reaches_the_controller() {
         (400_000_000, 200_000_000, 100_000_000, 80_000_000)
     );
     assert!(!bench.has_logged("no 8 MHz clock"), "it runs on the external clock");
-    // The MAC is set to 100 Mbit/s full duplex, so nothing else may be agreed on.
+    // The MAC is set to 100 Mbit/s full duplex, so the PHY must advertise nothing else.
     assert_eq!(bench.chip.devices().ethernet.phy.advertised(), 0x0101);
-    // The link's LED, and no fault's.
+    // The link's LED is on, the fault's is off.
     assert_eq!(bench.chip.devices().gpio[4].output(1), Some(true));
     assert_eq!(bench.chip.devices().gpio[1].output(14), Some(false));
     assert!(bench.chip.resets.is_empty() && bench.chip.faults.is_empty());

@@ -1,4 +1,4 @@
-//! CAN: frames, a bus that nobody else is on, and one that is broken.
+//! CAN: frames, a bus without other nodes, and a short circuit.
 
 use chip::device::{MICRO, MILLI, SECOND};
 use chip::models::can_bus::{BusFault, Frame};
@@ -8,7 +8,7 @@ use crate::boot::CELL;
 use crate::serial::{ready, word};
 
 fn send(bench: &mut Bench, frame: Frame) {
-    // It begins now.
+    // Its end, if it begins now.
     let at = bench.now() + 200 * MICRO;
     bench.chip.devices().can.bus.send(at, frame);
 }
@@ -40,7 +40,7 @@ fn what_no_filter_names_is_acknowledged_and_not_looked_at() {
         send(&mut bench, Frame { is_extended: true, ..Frame::standard(id, &[9]) });
         bench.run(MILLI);
     }
-    // The same number as an extended id is another id.
+    // An extended id with the same number is another id.
     send(&mut bench, Frame { is_extended: true, ..Frame::standard(1, &[9]) });
     bench.run(20 * MILLI);
     assert_eq!((word(&bench, "WordInputReg[4]"), sent(&mut bench)), (0.0, 0));
@@ -77,7 +77,7 @@ fn a_short_circuit_ends_in_bus_off_and_each_pause_is_longer() {
     let offs = &bench.chip.devices().can.bus.bus_offs;
     assert_eq!(offs.len(), 1);
     assert!(first - offs[0] < 5 * MILLI, "told {} us later", (first - offs[0]) / MICRO);
-    // Still broken when it is back, and asked to send again.
+    // The short circuit persists when it sends again.
     bench.until_log("error-active", SECOND);
     assert!(bench.now() - first >= 100 * MILLI);
     send(&mut bench, Frame::standard(1, &[2]));
@@ -95,7 +95,7 @@ fn a_short_circuit_ends_in_bus_off_and_each_pause_is_longer() {
 fn a_burst_as_long_as_the_fifo_is_taken_whole() {
     let mut bench = ready(CELL);
     let begin = bench.now();
-    // As fast as 1-byte frames can follow each other.
+    // Back-to-back frames of 1 byte.
     for number in 1..=64_u64 {
         let frame = Frame::standard(1, &[number as u8]);
         bench.chip.devices().can.bus.send(begin + number * 110 * MICRO, frame);

@@ -1,4 +1,4 @@
-//! A cell at work: both field buses, the controller, the watchdog, for a while.
+//! A cell in operation for some time: both field buses, the controller, the watchdog.
 
 use chip::device::{MICRO, MILLI, SECOND};
 use chip::models::can_bus::Frame;
@@ -50,7 +50,7 @@ fn outputs_leave_every_four_milliseconds_on_both_buses() {
     for (what, times) in [("RS-485", lines), ("CAN", bus)] {
         assert!((249..=251).contains(&times.len()), "{what}: {} in a second", times.len());
         let worst = times.windows(2).map(|pair| (pair[1] - pair[0]).abs_diff(4 * MILLI)).max();
-        // As long as another task or an interrupt may take.
+        // The delay that another task or an interrupt may cause.
         assert!(worst < Some(300 * MICRO), "{what}: off by {worst:?}");
         println!("{what}: off by {worst:?} at most");
     }
@@ -79,7 +79,7 @@ fn forces_of_a_sensor_go_up_by_udp() {
     assert_eq!(word(&bench, "ForceEnd[6]") as f32, 200.6);
     let robot = bench.robot.as_ref().expect("there is one");
     assert_eq!(robot.counters().ports["udp2011"].frames_in, 200);
-    // Nobody measures any more.
+    // The device is silent from here on.
     bench.run(500 * MILLI);
     assert_eq!(word(&bench, "ForceEnd[6]"), 0.0);
     assert!(!bench.has_logged("discarded"));
