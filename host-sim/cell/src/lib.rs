@@ -25,6 +25,7 @@
 //! field of a [`Line`], a [`CanBus`] or a [`Network`] (noise, loss, splits), or a method of
 //! [`Cell::controller_mut`]. [`Trouble`] injects all of them at random.
 
+mod access;
 mod can;
 mod connection;
 mod device;
@@ -32,6 +33,7 @@ mod drive;
 mod due;
 mod faults;
 mod field;
+mod injector;
 mod line;
 mod network;
 mod oracle;
@@ -47,18 +49,18 @@ mod tamper;
 mod tcp;
 mod trace;
 mod traffic;
-mod trouble;
+mod wiring;
 
 use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 
-use proto_core::config::{Bus, GatewayConfig};
-use proto_core::engine::{BuildError as EngineError, Engine, LinkId, LinkInfo, PortCounters, PortId};
+use proto_core::config::GatewayConfig;
+use proto_core::engine::{BuildError as EngineError, Engine, LinkId, PortId};
 use proto_core::time::{Duration, Instant};
-use proto_core::wire::can::CanFrame;
 
 pub use can::{BusCounters, CanBus};
 pub use device::{Device, Responder, Talker};
+pub use injector::{Trouble, TroubleKind};
 pub use line::{Chunking, Line, LineCounters, MAX_HEARD, Wiring};
 pub use network::{Network, Way};
 pub use oracle::{Invariant, Violation};
@@ -66,14 +68,13 @@ pub use recording::recording_difference;
 pub use rng::Rng;
 pub use tcp::TCP_TIMEOUT;
 pub use trace::{Entry, Trace, What};
-pub use trouble::{Trouble, TroubleKind};
 
 use connection::Connection;
 use due::Due;
 use network::Gate;
 use oracle::Oracle;
 use queue::Queue;
-use recipe_config::{InitialTarget, SimBus, SimConfig};
+use recipe_config::SimConfig;
 use recipe_controller::{BuildError, ConnId, Controller, ControllerInput};
 use recording::Recorder;
 
@@ -273,256 +274,6 @@ impl Cell {
         self.oracle.as_ref().map(|oracle| oracle.traffic[oracle::place(link)]).unwrap_or_default()
     }
 
-    fn wire_gateway(&mut self) {
-        let links: Vec<_> = self.engine.links().map(|link| (link.id, link.kind)).collect();
-        for (id, kind) in links {
-            self.gates.insert(id, Gate::new(id, kind, self.rng.fork()));
-        }
-        let ports = self.gateway.ports.clone();
-        for (nth, port) in (0..).zip(&ports) {
-            let owner = Owner::Gateway(PortId(nth));
-            let far = match port.bus {
-                Bus::Rs485(settings) => Far::Line(self.add_line(owner, settings)),
-                Bus::Can { bitrate } => Far::Bus(self.add_bus(owner, bitrate)),
-                Bus::TcpListen { .. } | Bus::UdpListen { .. } => continue,
-            };
-            self.names.insert(port.name.as_str().to_owned(), far);
-        }
-    }
-
-    fn wire_controller(&mut self, config: &SimConfig) {
-        for (nth, port) in config.ports.iter().enumerate() {
-            let owner = Owner::Controller(nth);
-            let far = match &port.bus {
-                SimBus::Rs485(settings) => Far::Line(self.add_line(owner, *settings)),
-                SimBus::Can { bitrate } => Far::Bus(self.add_bus(owner, *bitrate)),
-                SimBus::UdpServer => continue,
-                SimBus::TcpClient { to } => {
-                    let link = self.listener(to, true);
-                    self.clients.insert(nth, Client { link, is_tcp: true, conn: None, socket: 0 });
-                    continue;
-                }
-                SimBus::UdpClient { to } => {
-                    let link = self.listener(to, false);
-                    self.clients.insert(nth, Client { link, is_tcp: false, conn: None, socket: 0 });
-                    continue;
-                }
-            };
-            self.controller_names.insert(port.name.clone(), far);
-        }
-    }
-
-    fn add_line(&mut self, owner: Owner, settings: proto_core::config::Rs485) -> LineId {
-        self.lines.push(Line::new(owner, settings, self.rng.fork()));
-        LineId(self.lines.len() - 1)
-    }
-
-    fn add_bus(&mut self, owner: Owner, bitrate: u32) -> BusId {
-        self.buses.push(CanBus::new(owner, bitrate, self.rng.fork()));
-        BusId(self.buses.len() - 1)
-    }
-
-    /// The gateway's link that listens on this address's port.
-    fn listener(&self, to: &str, tcp: bool) -> Option<LinkId> {
-        let wanted = to.rsplit(':').next()?;
-        let nth = self.gateway.ports.iter().position(|port| match &port.bus {
-            Bus::TcpListen { listen } if tcp => listen.rsplit(':').next() == Some(wanted),
-            Bus::UdpListen { listen } if !tcp => listen.rsplit(':').next() == Some(wanted),
-            _ => false,
-        })?;
-        Some(LinkId::of_port(PortId(nth as u8)))
-    }
-
-    /// The present instant.
-    pub fn now(&self) -> Instant {
-        self.now
-    }
-
-    /// The gateway's configuration.
-    pub fn gateway(&self) -> &GatewayConfig {
-        &self.gateway
-    }
-
-    /// How many transmissions each line and bus keeps for inspection; initially [`MAX_HEARD`].
-    pub fn keep_heard(&mut self, limit: usize) {
-        self.lines.iter_mut().for_each(|line| line.keep_heard = limit);
-        self.buses.iter_mut().for_each(|bus| bus.keep_heard = limit);
-    }
-
-    /// The gateway.
-    pub fn engine(&self) -> &Engine {
-        &self.engine
-    }
-
-    /// The controller.
-    pub fn controller(&self) -> &Controller {
-        &self.controller
-    }
-
-    /// The controller, mutable, to inject faults; the effects begin with the next [`Self::run`].
-    pub fn controller_mut(&mut self) -> &mut Controller {
-        self.controller_wake = self.now;
-        &mut self.controller
-    }
-
-    /// The controller's item of this name, such as `DO[1]` or `WordInputReg[3]`.
-    ///
-    /// # Panics
-    /// If there is no such item.
-    #[track_caller]
-    pub fn value(&self, name: &str) -> f64 {
-        self.controller.registers().value(target(name))
-    }
-
-    /// Sets an item of the controller from outside, such as an input that is wired.
-    ///
-    /// # Panics
-    /// If there is no such item, or it does not take the value.
-    #[track_caller]
-    pub fn set_value(&mut self, name: &str, value: f64) {
-        if let Err(error) = self.controller_mut().force(target(name), value) {
-            panic!("{name} = {value}: {error}");
-        }
-    }
-
-    /// A link of the gateway.
-    ///
-    /// # Panics
-    /// If the configuration does not need this link.
-    #[track_caller]
-    pub fn link(&self, id: LinkId) -> LinkInfo<'_> {
-        match self.engine.links().find(|link| link.id == id) {
-            Some(link) => link,
-            None => panic!("the gateway has no {id:?}"),
-        }
-    }
-
-    /// The counters of the gateway's field port of this name.
-    ///
-    /// # Panics
-    /// If there is no such field port.
-    #[track_caller]
-    pub fn port(&self, name: &str) -> &PortCounters {
-        let nth = self.gateway.ports.iter().position(|port| port.name == name);
-        match nth.and_then(|nth| self.engine.port_counters(PortId(nth as u8))) {
-            Some(counters) => counters,
-            None => panic!("the gateway has no field port {name}"),
-        }
-    }
-
-    /// The line of the gateway's RS-485 port of this name, otherwise of the controller's.
-    ///
-    /// # Panics
-    /// If neither has one.
-    #[track_caller]
-    pub fn line_of(&self, port: &str) -> LineId {
-        match self.names.get(port).or_else(|| self.controller_names.get(port)) {
-            Some(Far::Line(line)) => *line,
-            _ => panic!("there is no RS-485 port {port}"),
-        }
-    }
-
-    /// The bus of the gateway's CAN port of this name, otherwise of the controller's.
-    ///
-    /// # Panics
-    /// If neither has one.
-    #[track_caller]
-    pub fn bus_of(&self, port: &str) -> BusId {
-        match self.names.get(port).or_else(|| self.controller_names.get(port)) {
-            Some(Far::Bus(bus)) => *bus,
-            _ => panic!("there is no CAN port {port}"),
-        }
-    }
-
-    /// All lines.
-    pub fn lines(&self) -> impl Iterator<Item = LineId> + use<> {
-        (0..self.lines.len()).map(LineId)
-    }
-
-    /// All buses.
-    pub fn buses(&self) -> impl Iterator<Item = BusId> + use<> {
-        (0..self.buses.len()).map(BusId)
-    }
-
-    /// A line, to inspect and to change.
-    pub fn line(&mut self, id: LineId) -> &mut Line {
-        &mut self.lines[id.0]
-    }
-
-    /// A bus, to inspect and to change.
-    pub fn bus(&mut self, id: BusId) -> &mut CanBus {
-        &mut self.buses[id.0]
-    }
-
-    /// The network of a link, to inspect and to change.
-    ///
-    /// # Panics
-    /// If the configuration does not need this link.
-    #[track_caller]
-    pub fn network(&mut self, link: LinkId) -> &mut Network {
-        &mut self.gate(link).network
-    }
-
-    /// The network of each link.
-    pub fn networks(&self) -> BTreeMap<LinkId, Network> {
-        self.gates.iter().map(|(&link, gate)| (link, gate.network)).collect()
-    }
-
-    /// Changes the network of every link.
-    pub fn every_network(&mut self, mut change: impl FnMut(&mut Network)) {
-        for gate in self.gates.values_mut() {
-            change(&mut gate.network);
-        }
-    }
-
-    /// Attaches a device to a line; it replaces the previous one.
-    pub fn attach(&mut self, line: LineId, device: impl Device<Vec<u8>> + 'static) {
-        self.lines[line.0].device = Some(Box::new(device));
-    }
-
-    /// Attaches a device to a bus; it replaces the previous one.
-    pub fn attach_can(&mut self, bus: BusId, device: impl Device<CanFrame> + 'static) {
-        self.buses[bus.0].device = Some(Box::new(device));
-    }
-
-    /// The device on the line sends, as soon as its previous transmission has left.
-    pub fn send(&mut self, line: LineId, bytes: &[u8]) {
-        self.transmit(line, End::Device, bytes);
-    }
-
-    /// The device sends at a later instant.
-    pub fn send_at(&mut self, at: Instant, line: LineId, bytes: &[u8]) {
-        self.queue.push(at, Due::DeviceSends { line, bytes: bytes.to_vec() });
-    }
-
-    /// The device on the bus sends.
-    pub fn send_can(&mut self, bus: BusId, frame: CanFrame) {
-        self.transmit_can(bus, End::Device, frame);
-    }
-
-    /// The trace.
-    pub fn trace(&self) -> &Trace {
-        &self.trace
-    }
-
-    /// Keeps the next `limit` entries of the trace in full.
-    pub fn keep_trace(&mut self, limit: usize) {
-        self.trace.keep(limit);
-    }
-
-    /// The recording of [`Self::recorded`], as `proto_core::record` reads it; empty without one.
-    pub fn into_recording(self) -> Vec<u8> {
-        self.recorder.map_or_else(Vec::new, |mut recorder| {
-            recorder.totals(&self.engine);
-            recorder.into_bytes()
-        })
-    }
-
-    /// A generator derived from the cell's seed.
-    pub fn fork_rng(&mut self) -> Rng {
-        self.rng.fork()
-    }
-
     /// The controller's reply to a command of another client, at once or within half a second.
     pub fn ask(&mut self, command: &str) -> String {
         let line = format!("{command}\r\n");
@@ -560,14 +311,6 @@ impl Cell {
             Some(gate) => gate,
             None => panic!("the gateway has no {link:?}"),
         }
-    }
-}
-
-#[track_caller]
-fn target(name: &str) -> InitialTarget {
-    match name.parse() {
-        Ok(target) => target,
-        Err(error) => panic!("{name}: {error}"),
     }
 }
 

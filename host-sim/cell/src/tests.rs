@@ -2,7 +2,7 @@
 
 use proto_core::engine::LinkId;
 use proto_core::time::Duration;
-use proto_core::wire::can::CanId;
+use proto_core::wire::can::{CanFrame, CanId};
 
 use super::*;
 use recipe_config::file;

@@ -4,16 +4,20 @@
 //! In: the content of each transmission, when it arrives, and which paths to the controller work.
 //! Does not know what the engine considers delivered.
 
+mod must_arrive;
+
 use std::collections::{BTreeMap, VecDeque};
 
 use proto_core::engine::LinkId;
 use proto_core::sysvar::SysVar;
 use proto_core::time::{Duration, Instant};
 
+use must_arrive::SAFE_ARRIVES;
+
 use super::field::show;
 use super::orders::Order;
 use super::sheet::{Raw, Sheet};
-use super::upward::{Carried, Upward, Wrong};
+use super::upward::{Carried, Wrong};
 use super::{Invariant, Oracle};
 use crate::network::Speaker;
 use crate::tcp::USER_TIMEOUT;
@@ -245,70 +249,6 @@ impl Robot {
     pub(super) fn len(&self) -> usize {
         self.roads.values().map(|road| road.parcels.len()).sum::<usize>() + self.datagrams.len()
     }
-
-    /// Of these paths, since when all have worked.
-    fn all_sound(&self, paths: &[Path]) -> Option<Instant> {
-        let needed = paths.iter().filter(|path| path.link != LinkId::COMMAND && path.link != LinkId::URGENT);
-        let mut since = Instant::ZERO;
-        for path in needed {
-            since = since.max(*self.sound.get(&path.link)?).max(*self.served.get(&path.link)?);
-        }
-        Some(since)
-    }
-
-    /// Urgent commands that have had a working way for long enough.
-    fn stops(&self, now: Instant) -> Result<u64, Wrong> {
-        let ways = [LinkId::COMMAND, LinkId::URGENT];
-        let Some(could) = ways.iter().filter_map(|link| self.sound.get(link)).min() else { return Ok(0) };
-        let mut checked = 0;
-        for Demand { order, is_met } in &self.demands {
-            checked += 1;
-            let had_a_way = now.saturating_since(order.picked.max(*could));
-            if !is_met && had_a_way > STOP_ARRIVES {
-                let what = format!(
-                    "{} is asked for and has not arrived, although a way has worked for {had_a_way}",
-                    order.text
-                );
-                return Err((Invariant::StopArrives, what));
-            }
-        }
-        Ok(checked)
-    }
-
-    /// Safe values of silent owners, after everything has worked for long enough.
-    fn safe_values(&self, sheet: &Sheet, up: &Upward, all: Instant, now: Instant) -> Result<u64, Wrong> {
-        let mut checked = 0;
-        for &var in &sheet.safe_vars {
-            let Some(owned) = sheet.owned[var.ordinal()] else { continue };
-            let (Some(safe), Some(accepted)) = (owned.safe, up.known(var).accepted) else { continue };
-            let silent = accepted + sheet.ports[owned.port].timeout;
-            let mut could = silent.max(all);
-            if sheet.link(owned.way).is_some() {
-                let Some(ready) = self.ready.get(&owned.way) else { continue };
-                could = could.max(*ready);
-            }
-            let at = var.image_offset();
-            let places = at..at + var.size();
-            let is_foreign = self.foreign.range(places.clone()).any(|(_, when)| *when > silent);
-            if now.saturating_since(could) <= SAFE_ARRIVES || now < could || is_foreign {
-                continue;
-            }
-            checked += 1;
-            let Some(there) = self.inputs.get(places) else { continue };
-            if there != &safe[..var.size()] {
-                let mut raw = Raw::default();
-                raw[..there.len()].copy_from_slice(there);
-                let what = format!(
-                    "{var} is {} at the controller; its owner has been silent for {} and its safe value is {}",
-                    show(var, raw),
-                    now.saturating_since(accepted),
-                    show(var, safe)
-                );
-                return Err((Invariant::SafeArrives, what));
-            }
-        }
-        Ok(checked)
-    }
 }
 
 impl Oracle {
@@ -421,36 +361,6 @@ impl Oracle {
         self.robot.disturbed(now);
     }
 
-    /// The present state of everything. Call it now and then.
-    pub(crate) fn survey(&mut self, paths: &[Path], inputs: &[u8], now: Instant) {
-        if self.violation.is_some() {
-            return;
-        }
-        self.remembered = self.controller.size() + self.orders.len() + self.robot.len();
-        for path in paths {
-            if self.robot.conns.insert(path.link, path.conn) != Some(path.conn) {
-                self.robot.sound.remove(&path.link);
-                self.robot.served.remove(&path.link);
-            }
-            note(&mut self.robot.sound, path.link, path.is_sound, now);
-            note(&mut self.robot.served, path.link, path.is_sound && path.is_served, now);
-        }
-        for link in &self.sheet.links {
-            let is_ready = self.up.is_up(link.id) && self.up.is_ready(link, now);
-            note(&mut self.robot.ready, link.id, is_ready, now);
-        }
-        self.robot.look_for_foreign(inputs, now);
-        let result = self.robot.stops(now);
-        self.checks[Invariant::StopArrives as usize] += *result.as_ref().unwrap_or(&1);
-        self.judge(now, &[], result.map(drop));
-        self.robot.all_sound_since = self.robot.all_sound(paths);
-        if let Some(all) = self.robot.all_sound_since {
-            let result = self.robot.safe_values(&self.sheet, &self.up, all, now);
-            self.checks[Invariant::SafeArrives as usize] += *result.as_ref().unwrap_or(&1);
-            self.judge(now, &[], result.map(drop));
-        }
-    }
-
     /// A datagram came to a port where the gateway listens.
     pub(crate) fn spoke(&mut self, link: LinkId, from: Speaker, bytes: &[u8]) {
         let frame = self.sheet.link(link).and_then(|link| link.output.as_ref());
@@ -477,15 +387,6 @@ impl Oracle {
     }
 }
 
-/// Since when a condition has held.
-fn note(since: &mut BTreeMap<LinkId, Instant>, link: LinkId, is_so: bool, now: Instant) {
-    if is_so {
-        since.entry(link).or_insert(now);
-    } else {
-        since.remove(&link);
-    }
-}
-
 /// How long data handed over to a link may be in flight: after that, unacknowledged data is given
 /// up with its connection. Datagrams do not wait.
 fn not_after(sheet: &Sheet, link: LinkId) -> Duration {
@@ -505,10 +406,6 @@ const COMMAND_TTL: Duration = Duration::from_secs(1);
 /// An urgent command is handed over within a second after the device last asked for it, and
 /// acknowledged within another.
 const URGENT_TTL: Duration = Duration::from_secs(2);
-/// A command that is asked for arrives within this time after a way works.
-const STOP_ARRIVES: Duration = Duration::from_millis(1_500);
-/// So does a safe value.
-const SAFE_ARRIVES: Duration = Duration::from_millis(1_500);
 /// Segments that are cut come a microsecond apart.
 const ALLOWANCE: Duration = Duration::from_millis(2);
 /// Datagrams that may still arrive.

@@ -1,0 +1,129 @@
+//! Acknowledgements and retransmissions of TCP.
+
+use proto_core::engine::{Input, LinkId};
+
+use crate::Cell;
+use crate::due::Due;
+use crate::network::Way;
+use crate::tcp::{Again, TCP_TIMEOUT, USER_TIMEOUT};
+
+impl Cell {
+    /// The gateway's transport looks whether its peer has acknowledged nothing for too long: it ends the
+    /// connection, and the other end hears nothing of it.
+    pub(crate) fn user_timeout(&mut self, id: u64) {
+        let now = self.now;
+        let Some(conn) = self.conns.get_mut(&id) else { return };
+        let Some(gate) = self.gates.get_mut(&conn.link) else { return };
+        let (link, turn) = (conn.link, gate.turn);
+        if gate.conn != Some(id) || conn.up.unacked() == 0 {
+            conn.is_watched = false;
+            return;
+        }
+        let at = conn.up.unacked_since + USER_TIMEOUT;
+        if now < at {
+            self.queue.push(at, Due::UserTimeout { conn: id });
+            return;
+        }
+        conn.up.forget();
+        conn.abandoned = true;
+        let is_gone = conn.closing || conn.forgotten;
+        if is_gone {
+            self.drop_conn(id);
+        } else {
+            self.queue.push(now + TCP_TIMEOUT, Due::TimedOut { conn: id });
+        }
+        self.queue.push(now, Due::LinkDown { link, turn });
+    }
+
+    /// The gateway's transport knows that so much has arrived.
+    pub(crate) fn acknowledged(&mut self, id: u64, upto: u64) {
+        let now = self.now;
+        let Some(conn) = self.conns.get_mut(&id) else { return };
+        if !conn.up.acknowledge(now, upto) {
+            return;
+        }
+        let (link, unacked) = (conn.link, conn.up.unacked());
+        let gate = self.gate(link);
+        if gate.conn != Some(id) {
+            return;
+        }
+        let turn = gate.turn;
+        if gate.is_full && unacked <= gate.network.send_buffer {
+            gate.is_full = false;
+            self.queue.push(now, Due::LinkSent { link, turn });
+        }
+        let gate = self.gate(link);
+        if !std::mem::replace(&mut gate.looks, true) {
+            let at = now + gate.network.ack_report;
+            self.queue.push(at, Due::Look { link, turn });
+        }
+    }
+
+    /// The driver looks at what is acknowledged, and tells it when that is news.
+    pub(crate) fn tell_acked(&mut self, link: LinkId) {
+        if self.is_asleep() {
+            return;
+        }
+        let gate = self.gate(link);
+        if !gate.is_up || !std::mem::take(&mut gate.looks) {
+            return;
+        }
+        let Some(conn) = gate.conn.and_then(|id| self.conns.get(&id)) else { return };
+        let left = u32::try_from(conn.up.unacked()).unwrap_or(u32::MAX);
+        self.engine_input(Input::LinkAcked { link, left });
+    }
+
+    /// It is time to send again what was not acknowledged.
+    pub(crate) fn send_again(&mut self, id: u64, way: Way) {
+        let now = self.now;
+        let Some(conn) = self.conns.get_mut(&id) else { return };
+        let Some(gate) = self.gates.get_mut(&conn.link) else { return };
+        match conn.pipe(way).send_again(now, gate, way) {
+            Again::Nothing => {}
+            Again::Arrives(at) => self.queue.push(at, Due::Arrival { conn: id, way }),
+            Again::Acked(at) => {
+                let upto = conn.up.arrived;
+                self.queue.push(at, Due::Ack { conn: id, upto });
+            }
+            Again::Later(at) => self.queue.push(at, Due::SendAgain { conn: id, way }),
+            Again::GivenUp => self.reset_conn(id),
+        }
+    }
+
+    /// An acknowledgement of the controller's TCP comes to the gateway.
+    pub(crate) fn ack(&mut self, id: u64, upto: u64) {
+        let now = self.now;
+        let Some(conn) = self.conns.get_mut(&id) else { return };
+        if conn.down.dead || conn.down.held {
+            return;
+        }
+        if self.gates.get(&conn.link).is_some_and(|gate| gate.is_cut(Way::Down)) {
+            if let Some(at) = conn.up.sends_again(now, now) {
+                self.queue.push(at, Due::SendAgain { conn: id, way: Way::Up });
+            }
+            return;
+        }
+        self.acknowledged(id, upto);
+    }
+
+    /// The controller's TCP acknowledges what has come, unless something it sent did so already.
+    pub(crate) fn ack_leaves(&mut self, id: u64) {
+        let Some(conn) = self.conns.get_mut(&id) else { return };
+        if std::mem::take(&mut conn.owes_ack) {
+            let (link, upto) = (conn.link, conn.up.arrived);
+            let at = self.now + self.gate(link).network.delay;
+            self.queue.push(at, Due::Ack { conn: id, upto });
+        }
+    }
+
+    /// Bytes came to the controller.
+    pub(super) fn owe_ack(&mut self, id: u64) {
+        let now = self.now;
+        let Some(conn) = self.conns.get_mut(&id) else { return };
+        let Some(gate) = self.gates.get(&conn.link) else { return };
+        if !std::mem::replace(&mut conn.owes_ack, true) {
+            // What the controller answers at once goes first.
+            self.queue.push(now + gate.network.ack_delay, Due::AckLeaves { conn: id });
+        }
+    }
+}
