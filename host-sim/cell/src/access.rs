@@ -8,7 +8,7 @@ use proto_core::time::Instant;
 use proto_core::wire::can::CanFrame;
 
 use super::due::Due;
-use super::{BusId, CanBus, Cell, Device, End, Far, Line, LineId, Network, Rng, Trace};
+use super::{BusId, CanBus, Cell, Device, End, Line, LineId, Medium, Network, Rng, Trace};
 use recipe_config::InitialTarget;
 use recipe_controller::Controller;
 
@@ -23,7 +23,8 @@ impl Cell {
         &self.gateway
     }
 
-    /// How many transmissions each line and bus keeps for inspection; initially [`MAX_HEARD`].
+    /// Sets how many transmissions each line and bus keeps for inspection; initially
+    /// [`crate::MAX_HEARD`].
     pub fn keep_heard(&mut self, limit: usize) {
         self.lines.iter_mut().for_each(|line| line.keep_heard = limit);
         self.buses.iter_mut().for_each(|bus| bus.keep_heard = limit);
@@ -39,7 +40,7 @@ impl Cell {
         &self.controller
     }
 
-    /// The controller, mutable, to inject faults; the effects begin with the next [`Self::run`].
+    /// The controller, to inject faults. They take effect with the next [`Self::run`].
     pub fn controller_mut(&mut self) -> &mut Controller {
         self.controller_wake = self.now;
         &mut self.controller
@@ -54,10 +55,10 @@ impl Cell {
         self.controller.registers().value(target(name))
     }
 
-    /// Sets an item of the controller from outside, such as an input that is wired.
+    /// Sets an item of the controller from outside, as a wired input does.
     ///
     /// # Panics
-    /// If there is no such item, or it does not take the value.
+    /// If there is no such item, or the value does not fit.
     #[track_caller]
     pub fn set_value(&mut self, name: &str, value: f64) {
         if let Err(error) = self.controller_mut().force(target(name), value) {
@@ -90,26 +91,26 @@ impl Cell {
         }
     }
 
-    /// The line of the gateway's RS-485 port of this name, otherwise of the controller's.
+    /// The line of the gateway's RS-485 port of this name; if there is none, of the controller's.
     ///
     /// # Panics
     /// If neither has one.
     #[track_caller]
     pub fn line_of(&self, port: &str) -> LineId {
         match self.names.get(port).or_else(|| self.controller_names.get(port)) {
-            Some(Far::Line(line)) => *line,
+            Some(Medium::Line(line)) => *line,
             _ => panic!("there is no RS-485 port {port}"),
         }
     }
 
-    /// The bus of the gateway's CAN port of this name, otherwise of the controller's.
+    /// The bus of the gateway's CAN port of this name; if there is none, of the controller's.
     ///
     /// # Panics
     /// If neither has one.
     #[track_caller]
     pub fn bus_of(&self, port: &str) -> BusId {
         match self.names.get(port).or_else(|| self.controller_names.get(port)) {
-            Some(Far::Bus(bus)) => *bus,
+            Some(Medium::Bus(bus)) => *bus,
             _ => panic!("there is no CAN port {port}"),
         }
     }
@@ -165,17 +166,17 @@ impl Cell {
         self.buses[bus.0].device = Some(Box::new(device));
     }
 
-    /// The device on the line sends, as soon as its previous transmission has left.
+    /// Sends as the device on the line, after its previous transmission.
     pub fn send(&mut self, line: LineId, bytes: &[u8]) {
         self.transmit(line, End::Device, bytes);
     }
 
-    /// The device sends at a later instant.
+    /// Same, at a later instant.
     pub fn send_at(&mut self, at: Instant, line: LineId, bytes: &[u8]) {
         self.queue.push(at, Due::DeviceSends { line, bytes: bytes.to_vec() });
     }
 
-    /// The device on the bus sends.
+    /// Sends as the device on the bus.
     pub fn send_can(&mut self, bus: BusId, frame: CanFrame) {
         self.transmit_can(bus, End::Device, frame);
     }
@@ -190,7 +191,8 @@ impl Cell {
         self.trace.keep(limit);
     }
 
-    /// The recording of [`Self::recorded`], as `proto_core::record` reads it; empty without one.
+    /// The recording, in the format of `proto_core::record`; empty if the cell was not made with
+    /// [`Self::recorded`].
     pub fn into_recording(self) -> Vec<u8> {
         self.recorder.map_or_else(Vec::new, |mut recorder| {
             recorder.totals(&self.engine);

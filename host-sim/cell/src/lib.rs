@@ -21,9 +21,9 @@
 //! assert_eq!(cell.value("DO[1]"), 1.0);
 //! ```
 //!
-//! Each fault is a method of [`Cell`] (of its networks: refuse, lose, hold, reset, half open), a
-//! field of a [`Line`], a [`CanBus`] or a [`Network`] (noise, loss, splits), or a method of
-//! [`Cell::controller_mut`]. [`Trouble`] injects all of them at random.
+//! Each fault is a method of [`Cell`] (such as [`Cell::refuse`] or [`Cell::half_open`]), a field of a
+//! [`Line`], a [`CanBus`] or a [`Network`] (noise, loss, splits), or a method of
+//! [`Cell::controller_mut`]. [`FaultInjector`] injects all of them at random.
 
 mod access;
 mod can;
@@ -60,7 +60,7 @@ use proto_core::time::{Duration, Instant};
 
 pub use can::{BusCounters, CanBus};
 pub use device::{Device, Responder, Talker};
-pub use injector::{Trouble, TroubleKind};
+pub use injector::{FaultInjector, FaultKind};
 pub use line::{Chunking, Line, LineCounters, MAX_HEARD, Wiring};
 pub use network::{Network, Way};
 pub use oracle::{Invariant, Violation};
@@ -86,9 +86,9 @@ pub struct LineId(usize);
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub struct BusId(usize);
 
-/// The owner of the port on a line or bus.
+/// A port on a line or bus.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Owner {
+enum AnyPort {
     Gateway(PortId),
     Controller(usize),
 }
@@ -124,7 +124,7 @@ impl std::error::Error for CellError {}
 /// A recipe port of the controller that speaks over the network.
 #[derive(Debug)]
 struct Client {
-    /// Where it connects or sends to: a listening link of the gateway, if there is one.
+    /// The gateway's listening link that it connects or sends to; `None` if there is none.
     link: Option<LinkId>,
     is_tcp: bool,
     conn: Option<u64>,
@@ -148,46 +148,46 @@ pub struct Cell {
     clients: BTreeMap<usize, Client>,
     lines: Vec<Line>,
     buses: Vec<CanBus>,
-    names: BTreeMap<String, Far>,
-    controller_names: BTreeMap<String, Far>,
-    /// Events that wait for the gateway while it is not called.
+    names: BTreeMap<String, Medium>,
+    controller_names: BTreeMap<String, Medium>,
+    /// Events that wait while the gateway is not called; `None` while it is called.
     asleep: Option<sleep::Waiting>,
     wakes_at: Instant,
     stalls: u64,
-    /// Number of present faults of each of the controller's servers.
-    ailments: [u32; 3],
+    /// Number of faults that each of the controller's servers has now.
+    server_faults: [u32; 3],
     rng: Rng,
     trace: Trace,
     recorder: Option<Recorder>,
-    /// Checks everything, if requested.
+    /// The model that checks everything; `None` before [`Cell::watch`].
     oracle: Option<Box<Oracle>>,
-    /// Makes a broken gateway of a correct one.
+    /// Changes the engine's inputs and outputs, so that the gateway breaks its promises.
     #[cfg(test)]
     tamper: Option<tamper::Tamper>,
-    /// What the controller has sent on [`Cell::ask`]'s connection.
-    asked: Vec<u8>,
-    /// Number of bytes that the next state packet lacks.
+    /// What the controller has sent on the connection of [`Cell::send_command`].
+    reply: Vec<u8>,
+    /// Number of bytes that are missing at the start of the next state packet.
     state_bytes_lost: usize,
 }
 
-/// What is connected to a port.
+/// What a port is connected to.
 #[derive(Debug, Clone, Copy)]
-enum Far {
+enum Medium {
     Line(LineId),
     Bus(BusId),
 }
 
 impl Cell {
-    /// A cell in which everything is switched on now. Field ports have no devices yet, and no link
-    /// is up before time has passed.
+    /// A cell that is switched on now. Field ports have no devices yet. Links come up when time
+    /// advances.
     ///
     /// # Errors
-    /// [`CellError`] if one of the two cannot run its configuration.
+    /// [`CellError`] if the gateway or the controller cannot run its configuration.
     pub fn new(gateway: &GatewayConfig, controller: &SimConfig, seed: u64) -> Result<Self, CellError> {
         Self::build(gateway, controller, seed, None)
     }
 
-    /// Same, and all inputs and outputs of the engine are recorded from the start:
+    /// Same, with a recording of all inputs and outputs of the engine from the start, for
     /// [`Self::into_recording`].
     ///
     /// # Errors
@@ -222,14 +222,14 @@ impl Cell {
             asleep: None,
             wakes_at: START,
             stalls: 0,
-            ailments: [0; 3],
+            server_faults: [0; 3],
             rng: Rng::new(seed),
             trace: Trace::new(),
             recorder,
             oracle: None,
             #[cfg(test)]
             tamper: None,
-            asked: Vec::new(),
+            reply: Vec::new(),
             state_bytes_lost: 0,
         };
         cell.wire_gateway();
@@ -238,9 +238,8 @@ impl Cell {
         Ok(cell)
     }
 
-    /// From now on everything that the gateway does is checked against an independent model
-    /// (docs/cell.md section 4); time stops after the first violation. Call it before time has
-    /// passed.
+    /// Checks everything that the gateway does from now on against an independent model
+    /// (docs/cell.md section 4). Time stops after the first violation. Call it before time advances.
     pub fn watch(&mut self) {
         let mut oracle = Box::new(Oracle::new(&self.gateway));
         oracle.begin(&self.engine, self.engine_wake, self.now);
@@ -248,7 +247,7 @@ impl Cell {
         self.queue.push(self.now, Due::Survey);
     }
 
-    /// The first violation.
+    /// The first violation; `None` if there was none.
     pub fn violation(&self) -> Option<&Violation> {
         self.oracle.as_ref().and_then(|oracle| oracle.violation())
     }
@@ -274,19 +273,20 @@ impl Cell {
         self.oracle.as_ref().map(|oracle| oracle.traffic[oracle::place(link)]).unwrap_or_default()
     }
 
-    /// The controller's reply to a command of another client, at once or within half a second.
-    pub fn ask(&mut self, command: &str) -> String {
+    /// Sends a command from a client other than the gateway; returns the controller's reply, empty if
+    /// there is none within 500 ms.
+    pub fn send_command(&mut self, command: &str) -> String {
         let line = format!("{command}\r\n");
-        self.asked.clear();
-        self.controller_input(ControllerInput::CommandOpened { conn: DESK, from: HERE });
-        self.controller_input(ControllerInput::CommandBytes { conn: DESK, bytes: line.as_bytes() });
-        self.run_until(Duration::from_millis(500), |cell| !cell.asked.is_empty());
-        self.controller_input(ControllerInput::CommandClosed { conn: DESK });
-        String::from_utf8_lossy(&self.asked).into_owned()
+        self.reply.clear();
+        self.controller_input(ControllerInput::CommandOpened { conn: COMMAND_CLIENT, from: CLIENT_IP });
+        self.controller_input(ControllerInput::CommandBytes { conn: COMMAND_CLIENT, bytes: line.as_bytes() });
+        self.run_until(Duration::from_millis(500), |cell| !cell.reply.is_empty());
+        self.controller_input(ControllerInput::CommandClosed { conn: COMMAND_CLIENT });
+        String::from_utf8_lossy(&self.reply).into_owned()
     }
 
-    /// Advances time until `done` holds or `limit` has passed; returns whether it held. It is
-    /// checked every millisecond.
+    /// Advances time until `done` returns true, or by `limit`; returns whether it did. `done` is called
+    /// every millisecond.
     pub fn run_until(&mut self, limit: Duration, mut done: impl FnMut(&Self) -> bool) -> bool {
         let end = self.now + limit;
         loop {
@@ -300,7 +300,7 @@ impl Cell {
         }
     }
 
-    /// Same, in milliseconds.
+    /// Same as [`Self::run`], in milliseconds.
     pub fn run_ms(&mut self, millis: u64) {
         self.run(Duration::from_millis(millis));
     }
@@ -316,17 +316,17 @@ impl Cell {
 
 /// The gateway's address for the controller's UDP server: a new one each time the link is opened,
 /// as a new socket has.
-fn udp_peer(turn: u64) -> SocketAddr {
-    (HERE, 40_000 + (turn % 10_000) as u16).into()
+fn udp_peer(generation: u64) -> SocketAddr {
+    (CLIENT_IP, 40_000 + (generation % 10_000) as u16).into()
 }
 
 /// The address of every client of the controller.
-const HERE: IpAddr = IpAddr::V4(Ipv4Addr::LOCALHOST);
-/// The connection of [`Cell::ask`].
-const DESK: ConnId = ConnId(u64::MAX);
-/// Not zero, so that nothing depends on the clock's origin, and on no grid of the engine.
+const CLIENT_IP: IpAddr = IpAddr::V4(Ipv4Addr::LOCALHOST);
+/// The connection of [`Cell::send_command`].
+const COMMAND_CLIENT: ConnId = ConnId(u64::MAX);
+/// Neither zero nor on a grid of the engine, so that nothing can depend on the clock's origin.
 const START: Instant = Instant::from_micros(1_000_000_300);
-/// The wait of the controller's TCP client before it connects again.
+/// How long the controller's TCP client waits before it connects again.
 const CLIENT_RETRY: Duration = Duration::from_millis(250);
 
 #[cfg(test)]

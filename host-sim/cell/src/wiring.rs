@@ -6,7 +6,7 @@ use proto_core::engine::{LinkId, PortId};
 use super::can::CanBus;
 use super::line::Line;
 use super::network::Gate;
-use super::{BusId, Cell, Client, Far, LineId, Owner};
+use super::{AnyPort, BusId, Cell, Client, LineId, Medium};
 use recipe_config::{SimBus, SimConfig};
 
 impl Cell {
@@ -17,10 +17,10 @@ impl Cell {
         }
         let ports = self.gateway.ports.clone();
         for (nth, port) in (0..).zip(&ports) {
-            let owner = Owner::Gateway(PortId(nth));
+            let owner = AnyPort::Gateway(PortId(nth));
             let far = match port.bus {
-                Bus::Rs485(settings) => Far::Line(self.add_line(owner, settings)),
-                Bus::Can { bitrate } => Far::Bus(self.add_bus(owner, bitrate)),
+                Bus::Rs485(settings) => Medium::Line(self.add_line(owner, settings)),
+                Bus::Can { bitrate } => Medium::Bus(self.add_bus(owner, bitrate)),
                 Bus::TcpListen { .. } | Bus::UdpListen { .. } => continue,
             };
             self.names.insert(port.name.as_str().to_owned(), far);
@@ -29,10 +29,10 @@ impl Cell {
 
     pub(super) fn wire_controller(&mut self, config: &SimConfig) {
         for (nth, port) in config.ports.iter().enumerate() {
-            let owner = Owner::Controller(nth);
+            let owner = AnyPort::Controller(nth);
             let far = match &port.bus {
-                SimBus::Rs485(settings) => Far::Line(self.add_line(owner, *settings)),
-                SimBus::Can { bitrate } => Far::Bus(self.add_bus(owner, *bitrate)),
+                SimBus::Rs485(settings) => Medium::Line(self.add_line(owner, *settings)),
+                SimBus::Can { bitrate } => Medium::Bus(self.add_bus(owner, *bitrate)),
                 SimBus::UdpServer => continue,
                 SimBus::TcpClient { to } => {
                     let link = self.listener(to, true);
@@ -49,17 +49,17 @@ impl Cell {
         }
     }
 
-    fn add_line(&mut self, owner: Owner, settings: proto_core::config::Rs485) -> LineId {
+    fn add_line(&mut self, owner: AnyPort, settings: proto_core::config::Rs485) -> LineId {
         self.lines.push(Line::new(owner, settings, self.rng.fork()));
         LineId(self.lines.len() - 1)
     }
 
-    fn add_bus(&mut self, owner: Owner, bitrate: u32) -> BusId {
+    fn add_bus(&mut self, owner: AnyPort, bitrate: u32) -> BusId {
         self.buses.push(CanBus::new(owner, bitrate, self.rng.fork()));
         BusId(self.buses.len() - 1)
     }
 
-    /// The gateway's link that listens on this address's port.
+    /// The gateway's link that listens on the port number of this address.
     fn listener(&self, to: &str, tcp: bool) -> Option<LinkId> {
         let wanted = to.rsplit(':').next()?;
         let nth = self.gateway.ports.iter().position(|port| match &port.bus {

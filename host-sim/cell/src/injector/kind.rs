@@ -2,42 +2,42 @@
 
 /// Kinds of faults.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub enum TroubleKind {
+pub enum FaultKind {
     /// A server refuses connections, and the present one is reset.
     Refused,
     /// The network to a server swallows everything, and the present connection is half open.
     BlackHole,
     /// A connection is reset.
     Reset,
-    /// A connection is reset in the middle of something.
+    /// A connection is reset in the middle of a transmission.
     ResetMidPacket,
     /// A connection is half open.
     HalfOpen,
     /// One direction of a connection stalls.
     Stall,
-    /// Datagrams are lost, late and doubled.
+    /// Datagrams are lost, delayed and duplicated.
     Datagrams,
     /// All datagrams of a link are lost for a while.
     Burst,
-    /// A peer's TCP acknowledges nothing, or nothing gets to it.
+    /// A peer's TCP acknowledges nothing, or receives nothing.
     Unacknowledged,
-    /// A cable is out, of one link or of all.
+    /// The cable of one link, or of all links, is out.
     Cable,
     /// Another program sends datagrams to a port where the gateway listens.
     Stranger,
-    /// A server carries out requests and does not answer.
+    /// A server carries out requests but does not answer.
     Mute,
     /// A server's answers are late.
     SlowAnswers,
     /// Modbus answers with an exception.
     Exception,
-    /// Port 2000 takes one client only.
+    /// Port 2000 accepts only one client.
     OneClient,
-    /// Half a state packet, then the end.
+    /// The state link is closed in the middle of a packet.
     HalfStatePacket,
     /// The state stream loses bytes and goes on.
     StateBytesLost,
-    /// A value of the controller is not a number, or infinite.
+    /// A value of the controller is NaN or infinite.
     Unreadable,
     /// A line flips bits.
     Noise,
@@ -53,7 +53,7 @@ pub enum TroubleKind {
     ControllerRestart,
     /// The controller loses its power for a while.
     PowerCut,
-    /// The controller comes back with software that speaks another dialect.
+    /// The controller restarts with software of another dialect.
     Dialect,
     /// The gateway is switched off and on.
     GatewayRestart,
@@ -63,7 +63,7 @@ pub enum TroubleKind {
     GatewaySleep,
 }
 
-impl TroubleKind {
+impl FaultKind {
     /// All of them.
     pub const ALL: [Self; 29] = [
         Self::Refused,
@@ -97,8 +97,8 @@ impl TroubleKind {
         Self::GatewaySleep,
     ];
 
-    /// Relative frequency. A fault that stops everything for long is rare, or little else would
-    /// happen.
+    /// Relative frequency. Faults that stop everything for long are rare, or there would be little
+    /// time for others.
     pub(super) const fn weight(self) -> u64 {
         match self {
             Self::GatewaySleep | Self::PowerCut | Self::GatewayRestart | Self::Dialect => 1,

@@ -1,7 +1,7 @@
-//! Everything that can go wrong, at random and seeded: the faults of a soak run.
+//! Random faults from a seed: the faults of a soak run.
 //!
-//! A [`Trouble`] injects a fault now and then and ends it again after a while. Between two faults a
-//! caller can inspect the cell as usual; at the end [`Trouble::mend`] ends all faults.
+//! A [`FaultInjector`] injects faults at random times and ends each of them after a while. The caller
+//! can inspect the cell at any time; [`FaultInjector::end_all`] ends all faults.
 
 mod kind;
 
@@ -16,13 +16,13 @@ use proto_core::wire::dialect::Dialect;
 use super::network::{Network, Way};
 use super::rng::Rng;
 use super::{BusId, Cell, LineId};
-pub use kind::TroubleKind;
+pub use kind::FaultKind;
 use recipe_config::CommandClients;
 use recipe_controller::Link;
 
-/// What ends a fault.
+/// How a fault is ended.
 #[derive(Debug, Clone, Copy)]
-enum Remedy {
+enum Repair {
     Admit(LinkId),
     Release(LinkId),
     Datagrams(LinkId),
@@ -32,49 +32,49 @@ enum Remedy {
     Answers(Link),
     NoException,
     ManyClients,
-    Heal(SysVar),
+    Variable(SysVar),
     Quiet(LineId),
-    Mend(LineId),
+    Line(LineId),
     PlugIn(LineId),
-    MendBus(BusId),
+    Bus(BusId),
     BusOn(BusId),
     Power,
     Dialect(&'static str),
     Wake,
 }
 
-/// Breaks and mends.
+/// Injects faults and ends them.
 #[derive(Debug)]
-pub struct Trouble {
+pub struct FaultInjector {
     rng: Rng,
-    kinds: Vec<TroubleKind>,
+    kinds: Vec<FaultKind>,
     pause: Duration,
     next: Instant,
-    remedies: Vec<(Instant, TroubleKind, Remedy)>,
-    counts: BTreeMap<TroubleKind, u64>,
-    /// What the networks are like without faults.
+    repairs: Vec<(Instant, FaultKind, Repair)>,
+    counts: BTreeMap<FaultKind, u64>,
+    /// The networks without faults.
     networks: BTreeMap<LinkId, Network>,
 }
 
-impl Trouble {
-    /// Faults of these kinds, one per `pause` on average, from now on. A lasting fault lasts up to
-    /// `pause`, an outage up to twenty times as long.
-    pub fn new(cell: &mut Cell, kinds: &[TroubleKind], pause: Duration) -> Self {
-        let mut trouble = Self {
+impl FaultInjector {
+    /// Injects faults of these kinds from now on, one per `pause` on average. Most faults last up to
+    /// `pause`, outages up to 20 times as long.
+    pub fn new(cell: &mut Cell, kinds: &[FaultKind], pause: Duration) -> Self {
+        let mut injector = Self {
             rng: cell.fork_rng(),
             kinds: kinds.to_vec(),
             pause,
             next: Instant::ZERO,
-            remedies: Vec::new(),
+            repairs: Vec::new(),
             counts: BTreeMap::new(),
             networks: cell.networks(),
         };
-        trouble.next = cell.now() + trouble.rng.up_to(pause.saturating_mul(2));
-        trouble
+        injector.next = cell.now() + injector.rng.up_to(pause.saturating_mul(2));
+        injector
     }
 
     /// Number of faults of each kind so far.
-    pub fn counts(&self) -> &BTreeMap<TroubleKind, u64> {
+    pub fn counts(&self) -> &BTreeMap<FaultKind, u64> {
         &self.counts
     }
 
@@ -82,10 +82,10 @@ impl Trouble {
     pub fn run(&mut self, cell: &mut Cell, span: Duration) {
         let end = cell.now() + span;
         loop {
-            let remedy = self.remedies.iter().map(|remedy| remedy.0).min().unwrap_or(Instant::NEVER);
-            let next = self.next.min(remedy).min(end);
+            let repair = self.repairs.iter().map(|repair| repair.0).min().unwrap_or(Instant::NEVER);
+            let next = self.next.min(repair).min(end);
             cell.run(next.saturating_since(cell.now()));
-            // After a violation time stops.
+            // Time stops after a violation.
             if next >= end || cell.violation().is_some() {
                 return;
             }
@@ -94,24 +94,24 @@ impl Trouble {
     }
 
     /// Ends all present faults.
-    pub fn mend(&mut self, cell: &mut Cell) {
-        for (_, kind, remedy) in std::mem::take(&mut self.remedies) {
+    pub fn end_all(&mut self, cell: &mut Cell) {
+        for (_, kind, repair) in std::mem::take(&mut self.repairs) {
             cell.remark(format_args!("ends: {}", kind.name()));
-            apply(cell, remedy, &self.networks);
+            apply(cell, repair, &self.networks);
         }
         cell.wake_gateway();
     }
 
     fn poll(&mut self, cell: &mut Cell) {
         let now = cell.now();
-        while let Some(nth) = self.remedies.iter().position(|remedy| remedy.0 <= now) {
-            let (_, kind, remedy) = self.remedies.remove(nth);
+        while let Some(nth) = self.repairs.iter().position(|repair| repair.0 <= now) {
+            let (_, kind, repair) = self.repairs.remove(nth);
             cell.remark(format_args!("ends: {}", kind.name()));
-            apply(cell, remedy, &self.networks);
+            apply(cell, repair, &self.networks);
         }
         if now >= self.next {
-            // Now and then there are no faults for long enough that everything must work again.
-            let pause = if self.rng.below(CALM) == 0 { 12 } else { 2 };
+            // Some pauses are long enough that everything must work again.
+            let pause = if self.rng.below(LONG_PAUSE_IN) == 0 { 12 } else { 2 };
             self.next = now + Duration::from_micros(1) + self.rng.up_to(self.pause.saturating_mul(pause));
             if let Some(kind) = self.pick_kind()
                 && self.begin(cell, kind).is_some()
@@ -122,7 +122,7 @@ impl Trouble {
         }
     }
 
-    fn pick_kind(&mut self) -> Option<TroubleKind> {
+    fn pick_kind(&mut self) -> Option<FaultKind> {
         let mut nth = self.rng.below(self.kinds.iter().map(|kind| kind.weight()).sum());
         self.kinds.iter().copied().find(|kind| {
             let is_it = nth < kind.weight();
@@ -131,273 +131,272 @@ impl Trouble {
         })
     }
 
-    /// Injects a fault; `None` if the cell has nothing of this kind.
-    fn begin(&mut self, cell: &mut Cell, kind: TroubleKind) -> Option<()> {
+    /// Injects a fault; `None` if the cell has nothing that it applies to.
+    fn begin(&mut self, cell: &mut Cell, kind: FaultKind) -> Option<()> {
         let rng = &mut self.rng;
         let server = [Link::Command, Link::State, Link::Modbus][rng.below(3) as usize];
         let way = if rng.below(2) == 0 { Way::Up } else { Way::Down };
         let tcp: Vec<LinkId> = cell.tcp_links().collect();
         let mut tcp = || pick(rng, tcp.iter().copied());
         let mut lasts = None;
-        let most = self.pause.saturating_mul(LONGEST);
-        let remedy = match kind {
-            TroubleKind::Refused => {
+        let most = self.pause.saturating_mul(MAX_PAUSES);
+        let repair = match kind {
+            FaultKind::Refused => {
                 let link = tcp()?;
                 cell.refuse(link);
                 cell.reset(link);
-                Some(Remedy::Admit(link))
+                Some(Repair::Admit(link))
             }
-            TroubleKind::BlackHole => {
+            FaultKind::BlackHole => {
                 let link = tcp()?;
                 cell.black_hole(link);
                 cell.half_open(link);
-                Some(Remedy::Admit(link))
+                Some(Repair::Admit(link))
             }
-            TroubleKind::Reset => {
+            FaultKind::Reset => {
                 cell.reset(tcp()?);
                 None
             }
-            TroubleKind::ResetMidPacket => {
+            FaultKind::ResetMidPacket => {
                 let link = tcp()?;
                 cell.reset_after(link, way, rng.between(1, 2_000) as usize);
                 None
             }
-            TroubleKind::HalfOpen => {
+            FaultKind::HalfOpen => {
                 cell.half_open(tcp()?);
                 None
             }
-            TroubleKind::Stall => {
+            FaultKind::Stall => {
                 let link = tcp()?;
                 cell.hold(link, way);
-                Some(Remedy::Release(link))
+                Some(Repair::Release(link))
             }
-            TroubleKind::Datagrams => {
+            FaultKind::Datagrams => {
                 let link = pick(rng, cell.datagram_links())?;
                 let network = cell.network(link);
                 network.loss_ppm = rng.between(0, 500_000) as u32;
                 network.duplicate_ppm = rng.between(0, 200_000) as u32;
                 network.jitter = rng.up_to(Duration::from_millis(20));
-                Some(Remedy::Datagrams(link))
+                Some(Repair::Datagrams(link))
             }
-            TroubleKind::Burst => {
+            FaultKind::Burst => {
                 let link = pick(rng, cell.datagram_links())?;
-                lasts = Some(longer_and_rarer(rng, Duration::from_millis(50), 6).min(Duration::from_secs(5)));
+                lasts = Some(mostly_short(rng, Duration::from_millis(50), 6).min(Duration::from_secs(5)));
                 cut_ways(cell, link, rng.below(3))
             }
-            TroubleKind::Unacknowledged => {
+            FaultKind::Unacknowledged => {
                 let link = tcp()?;
-                lasts = Some(longer_and_rarer(rng, Duration::from_millis(50), 6).min(Duration::from_secs(5)));
+                lasts = Some(mostly_short(rng, Duration::from_millis(50), 6).min(Duration::from_secs(5)));
                 cut_ways(cell, link, rng.below(2))
             }
-            TroubleKind::Cable => {
+            FaultKind::Cable => {
                 let link = pick(rng, cell.link_ids()).filter(|_| rng.below(2) == 0);
-                lasts =
-                    Some(longer_and_rarer(rng, Duration::from_millis(100), 7).min(Duration::from_secs(20)));
+                lasts = Some(mostly_short(rng, Duration::from_millis(100), 7).min(Duration::from_secs(20)));
                 cables(cell, link).into_iter().for_each(|link| cell.cut_cable(link));
-                Some(Remedy::Cable(link))
+                Some(Repair::Cable(link))
             }
-            TroubleKind::Stranger => {
+            FaultKind::Stranger => {
                 let links: Vec<(LinkId, Option<usize>)> = cell.listening_for_datagrams();
                 let (link, frame) = pick(rng, links.into_iter())?;
-                // Not as long as a frame: who sends frames is answered.
+                // Never a frame's length: the gateway would answer its sender.
                 let len = Some(rng.below(64) as usize).filter(|len| Some(*len) != frame).unwrap_or(100);
                 let bytes = rng.bytes(len);
                 cell.stranger_sends(link, &bytes);
                 None
             }
-            TroubleKind::Mute => {
-                lasts = patience(rng, server);
-                cell.ails(server);
+            FaultKind::Mute => {
+                lasts = fault_length(rng, server);
+                cell.server_fault_begins(server);
                 cell.controller_mut().mute(server);
-                Some(Remedy::Unmute(server))
+                Some(Repair::Unmute(server))
             }
-            TroubleKind::SlowAnswers => {
-                lasts = patience(rng, server);
+            FaultKind::SlowAnswers => {
+                lasts = fault_length(rng, server);
                 let delay = rng.up_to(lasts.unwrap_or(Duration::from_millis(1_500)));
-                cell.ails(server);
+                cell.server_fault_begins(server);
                 cell.controller_mut().delay_answers(server, delay);
-                Some(Remedy::Answers(server))
+                Some(Repair::Answers(server))
             }
-            TroubleKind::Exception => {
+            FaultKind::Exception => {
                 let exceptions =
                     [Exception::DeviceFailure, Exception::DeviceBusy, Exception::IllegalDataAddress];
                 let exception = pick(rng, exceptions.into_iter());
-                cell.ails(Link::Modbus);
+                cell.server_fault_begins(Link::Modbus);
                 cell.controller_mut().answer_modbus_with(exception);
-                Some(Remedy::NoException)
+                Some(Repair::NoException)
             }
-            TroubleKind::OneClient => {
-                lasts = Some(longer_and_rarer(rng, Duration::from_millis(500), 5));
+            FaultKind::OneClient => {
+                lasts = Some(mostly_short(rng, Duration::from_millis(500), 5));
                 let clients =
                     [CommandClients::RefuseSecond, CommandClients::DropFirst][rng.below(2) as usize];
                 cell.controller_mut().command_clients(clients);
-                Some(Remedy::ManyClients)
+                Some(Repair::ManyClients)
             }
-            TroubleKind::HalfStatePacket => {
+            FaultKind::HalfStatePacket => {
                 let len = rng.between(0, 1_467) as usize;
                 cell.controller_mut().cut_next_state_packet(len);
                 None
             }
-            TroubleKind::StateBytesLost => {
+            FaultKind::StateBytesLost => {
                 cell.link_ids().find(|link| *link == LinkId::STATE)?;
                 cell.lose_state_bytes(rng.between(1, 1_467) as usize);
                 None
             }
-            TroubleKind::Unreadable => {
+            FaultKind::Unreadable => {
                 let var = pick(rng, cell.floats().into_iter())?;
                 let value = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY][rng.below(3) as usize];
                 cell.spoil(var, value);
-                Some(Remedy::Heal(var))
+                Some(Repair::Variable(var))
             }
-            TroubleKind::Noise => {
+            FaultKind::Noise => {
                 let line = pick(rng, cell.lines())?;
                 cell.line(line).noise_ppm = rng.between(100, 100_000) as u32;
-                Some(Remedy::Quiet(line))
+                Some(Repair::Quiet(line))
             }
-            TroubleKind::Garbage => {
+            FaultKind::Garbage => {
                 let line = pick(rng, cell.lines())?;
                 let len = rng.between(1, 300) as usize;
                 let bytes = rng.bytes(len);
                 cell.send(line, &bytes);
                 None
             }
-            TroubleKind::Cut => match (pick(rng, cell.lines()), pick(rng, cell.buses())) {
+            FaultKind::Cut => match (pick(rng, cell.lines()), pick(rng, cell.buses())) {
                 (Some(line), bus) if bus.is_none() || rng.below(2) == 0 => {
                     cell.cut(line);
-                    Some(Remedy::Mend(line))
+                    Some(Repair::Line(line))
                 }
                 (_, bus) => {
                     let bus = bus?;
                     cell.cut_bus(bus);
-                    Some(Remedy::MendBus(bus))
+                    Some(Repair::Bus(bus))
                 }
             },
-            TroubleKind::Unplugged => {
+            FaultKind::Unplugged => {
                 let line = pick(rng, cell.lines())?;
                 cell.unplug(line);
-                Some(Remedy::PlugIn(line))
+                Some(Repair::PlugIn(line))
             }
-            TroubleKind::BusOff => {
+            FaultKind::BusOff => {
                 let bus = pick(rng, cell.buses())?;
                 cell.bus_off(bus);
-                Some(Remedy::BusOn(bus))
+                Some(Repair::BusOn(bus))
             }
-            TroubleKind::ControllerRestart => {
+            FaultKind::ControllerRestart => {
                 cell.restart_controller();
                 None
             }
-            TroubleKind::PowerCut => {
-                lasts = Some(longer_and_rarer(rng, Duration::from_millis(200), 4));
+            FaultKind::PowerCut => {
+                lasts = Some(mostly_short(rng, Duration::from_millis(200), 4));
                 cell.power_cut();
-                Some(Remedy::Power)
+                Some(Repair::Power)
             }
-            TroubleKind::Dialect => {
+            FaultKind::Dialect => {
                 let before = cell.controller().dialect();
-                // One at a time, or the remedies would bring back the wrong one.
-                if self.remedies.iter().any(|(.., remedy)| matches!(remedy, Remedy::Dialect(_))) {
+                // One at a time, or the repairs would restore the wrong dialect.
+                if self.repairs.iter().any(|(.., repair)| matches!(repair, Repair::Dialect(_))) {
                     return None;
                 }
                 let others = Dialect::NAMES.into_iter().filter(|name| *name != before);
                 cell.replace_controller(pick(rng, others)?);
-                Some(Remedy::Dialect(before))
+                Some(Repair::Dialect(before))
             }
-            TroubleKind::GatewayRestart => {
+            FaultKind::GatewayRestart => {
                 cell.restart_gateway();
                 None
             }
-            TroubleKind::GatewayStall => {
+            FaultKind::GatewayStall => {
                 let span = Duration::from_micros(rng.between(50_000, 499_999));
                 lasts = Some(span);
                 cell.stall_gateway(span);
-                Some(Remedy::Wake)
+                Some(Repair::Wake)
             }
-            TroubleKind::GatewaySleep => {
+            FaultKind::GatewaySleep => {
                 let longest = Duration::from_secs(20);
                 let shortest = Duration::from_millis(501);
-                let span = longer_and_rarer(rng, shortest, 5).min(longest.min(most)).max(shortest);
+                let span = mostly_short(rng, shortest, 5).min(longest.min(most)).max(shortest);
                 lasts = Some(span);
                 cell.stall_gateway(span);
-                Some(Remedy::Wake)
+                Some(Repair::Wake)
             }
         };
-        if let Some(remedy) = remedy {
+        if let Some(repair) = repair {
             let lasts = lasts.map_or_else(|| self.rng.up_to(self.pause), |lasts| lasts.min(most));
             let until = cell.now() + lasts;
-            self.remedies.push((until, kind, remedy));
+            self.repairs.push((until, kind, repair));
         }
         Some(())
     }
 }
 
-fn apply(cell: &mut Cell, remedy: Remedy, networks: &BTreeMap<LinkId, Network>) {
-    match remedy {
-        Remedy::Admit(link) => cell.admit(link),
-        Remedy::Release(link) => {
+fn apply(cell: &mut Cell, repair: Repair, networks: &BTreeMap<LinkId, Network>) {
+    match repair {
+        Repair::Admit(link) => cell.admit(link),
+        Repair::Release(link) => {
             cell.release(link, Way::Up);
             cell.release(link, Way::Down);
         }
-        Remedy::Datagrams(link) => *cell.network(link) = networks.get(&link).copied().unwrap_or_default(),
-        Remedy::Ways(link, ways) => {
+        Repair::Datagrams(link) => *cell.network(link) = networks.get(&link).copied().unwrap_or_default(),
+        Repair::Ways(link, ways) => {
             for way in [Way::Up, Way::Down].into_iter().filter(|way| ways[*way as usize]) {
-                cell.mend_way(link, way);
+                cell.repair_way(link, way);
             }
         }
-        Remedy::Cable(link) => cables(cell, link).into_iter().for_each(|link| cell.mend_cable(link)),
-        Remedy::Unmute(server) => {
+        Repair::Cable(link) => cables(cell, link).into_iter().for_each(|link| cell.repair_cable(link)),
+        Repair::Unmute(server) => {
             cell.controller_mut().unmute(server);
-            cell.recovers(server);
+            cell.server_fault_ends(server);
         }
-        Remedy::Answers(server) => {
+        Repair::Answers(server) => {
             cell.controller_mut().delay_answers(server, Duration::ZERO);
-            cell.recovers(server);
+            cell.server_fault_ends(server);
         }
-        Remedy::NoException => {
+        Repair::NoException => {
             cell.controller_mut().answer_modbus_with(None);
-            cell.recovers(Link::Modbus);
+            cell.server_fault_ends(Link::Modbus);
         }
-        Remedy::ManyClients => cell.controller_mut().command_clients(CommandClients::Many),
-        Remedy::Heal(var) => cell.heal(var),
-        Remedy::Quiet(line) => cell.line(line).noise_ppm = 0,
-        Remedy::Mend(line) => cell.mend(line),
-        Remedy::PlugIn(line) => cell.plug_in(line),
-        Remedy::MendBus(bus) => cell.mend_bus(bus),
-        Remedy::BusOn(bus) => cell.bus_on(bus),
-        Remedy::Power => cell.power_up(),
-        Remedy::Dialect(name) => cell.replace_controller(name),
-        // One that is shorter ends by itself; another may have begun meanwhile.
-        Remedy::Wake => {}
+        Repair::ManyClients => cell.controller_mut().command_clients(CommandClients::Many),
+        Repair::Variable(var) => cell.heal(var),
+        Repair::Quiet(line) => cell.line(line).noise_ppm = 0,
+        Repair::Line(line) => cell.repair(line),
+        Repair::PlugIn(line) => cell.plug_in(line),
+        Repair::Bus(bus) => cell.repair_bus(bus),
+        Repair::BusOn(bus) => cell.bus_on(bus),
+        Repair::Power => cell.power_up(),
+        Repair::Dialect(name) => cell.replace_controller(name),
+        // The cell wakes the gateway by itself; another stall may have begun since.
+        Repair::Wake => {}
     }
 }
 
-/// The links that a cable is for.
+/// The links whose cable it is; all links if `None`.
 fn cables(cell: &Cell, link: Option<LinkId>) -> Vec<LinkId> {
     link.map_or_else(|| cell.link_ids().collect(), |link| vec![link])
 }
 
-/// What goes up, what comes down, or both.
-fn cut_ways(cell: &mut Cell, link: LinkId, which: u64) -> Option<Remedy> {
+/// Cuts the link's direction up, down, or both.
+fn cut_ways(cell: &mut Cell, link: LinkId, which: u64) -> Option<Repair> {
     let ways = [which != 1, which != 0];
     for way in [Way::Up, Way::Down].into_iter().filter(|way| ways[*way as usize]) {
         cell.cut_way(link, way);
     }
-    Some(Remedy::Ways(link, ways))
+    Some(Repair::Ways(link, ways))
 }
 
-/// Replies to commands are waited for for ten seconds; the other servers' faults last as most do.
-fn patience(rng: &mut Rng, server: Link) -> Option<Duration> {
-    (server == Link::Command).then(|| longer_and_rarer(rng, Duration::from_millis(400), 4))
+/// The gateway waits 10 s for replies to commands, so faults of that server may last longer.
+fn fault_length(rng: &mut Rng, server: Link) -> Option<Duration> {
+    (server == Link::Command).then(|| mostly_short(rng, Duration::from_millis(400), 4))
 }
 
-/// From `shortest` to twice `shortest * 2^doublings`; each doubling is as likely as the one before.
-fn longer_and_rarer(rng: &mut Rng, shortest: Duration, doublings: u64) -> Duration {
+/// From `shortest` to twice `shortest * 2^doublings`; each number of doublings is equally likely.
+fn mostly_short(rng: &mut Rng, shortest: Duration, doublings: u64) -> Duration {
     let least = shortest.saturating_mul(1 << rng.between(0, doublings));
     least + rng.up_to(least)
 }
 
-/// No fault lasts longer than so many pauses.
-const LONGEST: u64 = 20;
-/// One pause of so many is a long one.
-const CALM: u64 = 20;
+/// Maximum length of a fault, in pauses.
+const MAX_PAUSES: u64 = 20;
+/// One pause in this many is a long one.
+const LONG_PAUSE_IN: u64 = 20;
 
 fn pick<T>(rng: &mut Rng, all: impl Iterator<Item = T>) -> Option<T> {
     let mut all: Vec<T> = all.collect();

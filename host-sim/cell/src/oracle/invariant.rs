@@ -5,15 +5,15 @@ use proto_core::time::Instant;
 /// The invariants.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Invariant {
-    /// Every value written is the next one that its owner sent, or a safe value, or was read back.
+    /// Each value written is the next one that its owner sent, a safe value, or one that was read back.
     Sent,
     /// No value is written after its time to live.
     InTime,
-    /// Nothing is written before the first valid field frame.
+    /// No value is written before the first valid field frame with it.
     FirstFrame,
     /// Only variables that a port owns are written, whole, on their way up.
     Ownership,
-    /// Nothing from before a reconnect is written after it.
+    /// Nothing that was received before a reconnect is written after it.
     NoReplay,
     /// The edges of bits are written in order, or counted.
     Edges,
@@ -27,7 +27,7 @@ pub enum Invariant {
     Once,
     /// No value is shown before it was received.
     Known,
-    /// No value is shown that is older than promised.
+    /// No value older than promised is shown.
     Age,
     /// The value shown is the newest one received.
     Shown,
@@ -41,31 +41,31 @@ pub enum Invariant {
     Registers,
     /// No value that the controller applies is older than promised.
     ValueAge,
-    /// A command that the controller accepts was picked, or asked for, not long ago.
+    /// No command that the controller receives was picked, or last requested, too long ago.
     CommandAge,
-    /// No command that was picked before one that stops the robot arrives after it.
+    /// No command that was picked before an urgent one arrives after it.
     Overtaken,
     /// The controller understands every command that arrives.
     Understood,
-    /// A command that stops the robot arrives as soon as a way to the controller works.
+    /// An urgent command arrives soon after a path to the controller works.
     StopArrives,
-    /// The safe value of a silent owner arrives as soon as a way to the controller works.
+    /// The safe value of an overdue owner arrives soon after a path to the controller works.
     SafeArrives,
     /// An unreadable value is neither shown nor written back.
     Unreadable,
-    /// Values of our own ports are not shown when they are older than promised.
+    /// No value of another field port older than promised is shown.
     OwnAge,
-    /// A short stall of the gateway is not taken for silence of a device.
+    /// A short stall of the gateway does not make a device overdue.
     FalseTimeout,
     /// Nothing that waited while the gateway slept is applied or commanded.
     FromSleep,
-    /// Datagrams go only to the controller's client.
+    /// Datagrams are sent only to the controller's client.
     Destination,
-    /// The work of one call is bounded.
+    /// The number of outputs for one input is bounded.
     Work,
     /// Every queue is bounded.
     Memory,
-    /// There is no panic.
+    /// Nothing panics.
     NoPanic,
 }
 

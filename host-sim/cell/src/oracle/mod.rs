@@ -2,22 +2,22 @@
 //! 4).
 //!
 //! In: all inputs and outputs of the engine, and what reaches the controller. Out: how often each
-//! [`Invariant`] was checked, and the first [`Violation`]. The model is slow and plain: it cuts
+//! [`Invariant`] was checked, and the first [`Violation`]. The model is slow and simple: it finds
 //! frames by the rules of proto-core/docs/wire/recipes.md, keeps a queue per variable, and uses
-//! neither the engine's recipes nor its plan. Garbage that happens to be a frame is a frame: what
-//! the line delivered to the port decides.
+//! neither the engine's recipes nor its plan. Garbage that happens to be a valid frame counts as one:
+//! the model sees what the port received, not what the device sent.
 //!
-//! Of the engine it reads only the counters, and which links it considers up.
+//! It reads nothing of the engine but the counters and the states of the links.
 
+mod arrivals;
+mod commands;
 mod downward;
-mod far;
 mod field;
 mod gateway;
 mod invariant;
-mod orders;
 mod robot;
 mod safe;
-mod sheet;
+mod spec;
 mod stream;
 mod upward;
 mod wire;
@@ -30,14 +30,14 @@ use proto_core::link::LinkState;
 use proto_core::sysvar::SysVar;
 use proto_core::time::{Duration, Instant};
 
+use commands::Commands;
 use downward::Downward;
 use field::LineWatch;
 use invariant::ALL;
 pub use invariant::{Invariant, Violation};
-use orders::Orders;
 pub(super) use robot::Path;
 use robot::Robot;
-use sheet::Sheet;
+use spec::Spec;
 use upward::{Upward, Wrong};
 pub(super) use wire::inputs_of;
 use wire::{Controller, Map, Modbus};
@@ -56,14 +56,15 @@ struct LinkWatch {
     line: LineWatch,
     stream: stream::Stream,
     busy: bool,
-    /// Bytes handed over since the link came up, after each unacknowledged transmission.
+    /// Number of bytes handed over since the link came up, in total and up to the end of each
+    /// unacknowledged transmission.
     total: u64,
     unacked: VecDeque<u64>,
 }
 
 impl LinkWatch {
     fn has_room(&self) -> bool {
-        !self.busy && self.unacked.len() < MOST_UNACKED
+        !self.busy && self.unacked.len() < MAX_UNACKED
     }
 
     fn hands_over(&mut self, bytes: &[u8]) {
@@ -79,10 +80,10 @@ impl LinkWatch {
     }
 }
 
-/// The model and its findings.
+/// The model and its results.
 #[derive(Debug, Clone)]
 pub(super) struct Oracle {
-    sheet: Sheet,
+    spec: Spec,
     map: Map,
     up: Upward,
     ports: Vec<PortWatch>,
@@ -90,25 +91,25 @@ pub(super) struct Oracle {
     modbus: Modbus,
     /// Safe values that the controller refused, and when they are written again.
     refused: Vec<SysVar>,
-    again_at: Instant,
-    orders: Orders,
+    rewrite_at: Instant,
+    commands: Commands,
     controller: Controller,
     robot: Robot,
     /// When the engine was called last.
     called_at: Option<Instant>,
-    /// When the engine asked to be called, and whether it had another input since.
+    /// When the engine asked to be called, and whether another input came first at that time.
     announced: Instant,
     is_late: bool,
-    /// Input from the field until then waited while the gateway slept.
-    deaf_until: Option<Instant>,
-    /// The gateway was not called for a while, but did not sleep.
+    /// Field input is discarded until this instant: it waited while the gateway slept.
+    discards_until: Option<Instant>,
+    /// The input ended a stall that was too short to count as sleep.
     after_stall: bool,
-    /// Size of what is remembered, at the last check.
+    /// Size of the model's own queues at the last check.
     remembered: usize,
-    /// Outputs since the newest input, and their limit.
+    /// Number of outputs since the newest input, and its limit.
     outputs: u32,
-    most_outputs: u32,
-    /// Frames in and out per port; sends and receives per link. They survive a restart.
+    max_outputs: u32,
+    /// Frames in and out per port, sends and receives per link, across restarts of the gateway.
     pub frames: Vec<(u64, u64)>,
     pub traffic: [(u64, u64); LINKS],
     pub writes: u64,
@@ -118,39 +119,40 @@ pub(super) struct Oracle {
 
 impl Oracle {
     pub(super) fn new(config: &GatewayConfig) -> Self {
-        let sheet = Sheet::new(config);
-        let parts: usize = sheet.ports.iter().map(|port| port.outputs.len()).sum();
+        let spec = Spec::new(config);
+        let parts: usize = spec.ports.iter().map(|port| port.outputs.len()).sum();
         Self {
             map: Map::new(),
-            up: Upward::new(&sheet),
-            ports: vec![PortWatch::default(); sheet.ports.len()],
+            up: Upward::new(&spec),
+            ports: vec![PortWatch::default(); spec.ports.len()],
             links: std::array::from_fn(|_| LinkWatch::default()),
             modbus: Modbus::default(),
             refused: Vec::new(),
-            again_at: Instant::NEVER,
-            orders: Orders::default(),
+            rewrite_at: Instant::NEVER,
+            commands: Commands::default(),
             controller: Controller::new(),
             robot: Robot::default(),
             called_at: None,
             announced: Instant::NEVER,
             is_late: false,
-            deaf_until: None,
+            discards_until: None,
             after_stall: false,
             remembered: 0,
             outputs: 0,
-            // A frame per port and id; opening or closing, and one transmission, per link, and one
+            // Per port one frame of each id, per link one open or close and one transmission, and one
             // more command.
-            most_outputs: parts as u32 + 1 + 2 * (4 + sheet.links.len() as u32),
-            frames: vec![(0, 0); sheet.ports.len()],
+            max_outputs: parts as u32 + 1 + 2 * (4 + spec.links.len() as u32),
+            frames: vec![(0, 0); spec.ports.len()],
             traffic: [(0, 0); LINKS],
             writes: 0,
             checks: [0; ALL.len()],
             violation: None,
-            sheet,
+            spec,
         }
     }
 
-    /// The cell was switched on before: its ports are up, and the engine expects a tick then.
+    /// Begins with a cell that is switched on: its ports are up, and the engine expects a tick at
+    /// `announced`.
     pub(super) fn begin(&mut self, engine: &Engine, announced: Instant, now: Instant) {
         self.called_at = Some(now);
         self.announced = announced;
@@ -159,20 +161,20 @@ impl Oracle {
         }
     }
 
-    /// The gateway restarts without any state, so nothing may be expected of it.
+    /// The gateway has restarted without any state.
     pub(super) fn restarted(&mut self, now: Instant) {
-        self.up = Upward::new(&self.sheet);
-        self.ports = vec![PortWatch::default(); self.sheet.ports.len()];
+        self.up = Upward::new(&self.spec);
+        self.ports = vec![PortWatch::default(); self.spec.ports.len()];
         self.links = std::array::from_fn(|_| LinkWatch::default());
         self.modbus.lost();
         self.refused.clear();
-        self.again_at = Instant::NEVER;
-        self.orders = Orders::default();
+        self.rewrite_at = Instant::NEVER;
+        self.commands = Commands::default();
         self.robot.restarted(now);
         self.called_at = None;
         self.announced = Instant::ZERO;
         self.is_late = false;
-        self.deaf_until = None;
+        self.discards_until = None;
     }
 
     pub(super) fn violation(&self) -> Option<&Violation> {
@@ -192,7 +194,7 @@ impl Oracle {
         }
     }
 
-    /// The engine has handled an input and was not asked for outputs yet.
+    /// The engine has handled an input; its outputs follow.
     pub(super) fn input(&mut self, now: Instant, input: &Input<'_>, engine: &Engine) {
         if self.violation.is_some() {
             return;
@@ -207,9 +209,9 @@ impl Oracle {
             self.announced = Instant::NEVER;
         }
         if has_slept {
-            self.orders.slept(now);
+            self.commands.slept(now);
             self.robot.forget_all(now);
-            self.look_at_links(engine, None, now);
+            self.find_lost_links(engine, None, now);
         }
         if is_tick || has_slept {
             self.pass(now);
@@ -217,17 +219,17 @@ impl Oracle {
         if has_slept {
             self.slept(now);
         }
-        let told = match input {
+        let reported = match input {
             // After sleep, links have been given up before any input is handled.
             _ if has_slept => None,
             Input::LinkDown { link } | Input::LinkBytes { link, .. } => Some(*link),
             _ => None,
         };
-        self.look_at_links(engine, told, now);
+        self.find_lost_links(engine, reported, now);
         if is_tick || has_slept {
-            self.up.repeat(&self.sheet, now);
+            self.up.repeat(&self.spec, now);
         }
-        self.deaf_until = self.deaf_until.filter(|until| !is_tick || now < *until);
+        self.discards_until = self.discards_until.filter(|until| !is_tick || now < *until);
         match *input {
             Input::PortBytes { port, bytes } => self.port_bytes(usize::from(port.0), bytes, now),
             Input::PortCan { port, frame } => self.port_can(usize::from(port.0), &frame, now),
@@ -240,7 +242,7 @@ impl Oracle {
                 watch.down.is_up = false;
                 watch.down.reset();
                 watch.line.discard();
-                self.forget_orders(nth, None, now);
+                self.forget_commands(nth, None, now);
             }
             Input::PortBus { port, state } => {
                 let nth = usize::from(port.0);
@@ -251,12 +253,12 @@ impl Oracle {
                 if is_news {
                     watch.counters.bus_offs += 1;
                     watch.down.reset();
-                    self.forget_orders(nth, None, now);
+                    self.forget_commands(nth, None, now);
                 }
             }
             Input::LinkUp { link } => {
-                self.nobody_spoke(link);
-                self.up.controller_was_away(&self.sheet, now);
+                self.forget_sender(link);
+                self.up.controller_was_away(&self.spec, now);
                 if !self.up.is_up(link) && is_up(engine, link) {
                     self.up.link_up(link, now);
                     self.links[place(link)] = LinkWatch::default();
@@ -268,9 +270,9 @@ impl Oracle {
             Input::LinkAcked { link, left } => self.links[place(link)].acked(left),
             _ => {}
         }
-        self.orders.look_at_replies(engine);
-        if told.is_some() {
-            self.look_at_links(engine, None, now);
+        self.commands.match_replies(engine);
+        if reported.is_some() {
+            self.find_lost_links(engine, None, now);
         }
     }
 
@@ -280,8 +282,8 @@ impl Oracle {
             return;
         }
         self.outputs += 1;
-        let result = if self.outputs > self.most_outputs {
-            Err((Invariant::Work, format!("more than {} outputs for one input", self.most_outputs)))
+        let result = if self.outputs > self.max_outputs {
+            Err((Invariant::Work, format!("more than {} outputs for one input", self.max_outputs)))
         } else {
             Ok(())
         };
@@ -292,9 +294,9 @@ impl Oracle {
             Output::LinkClose { link } => self.link_lost(link, now),
             Output::LinkSend { link, bytes } => {
                 self.traffic[place(link)].0 += 1;
-                // Data handed over to a lost connection never leaves.
+                // Values handed over to a lost connection never leave: start with none.
                 self.robot.hands_over_nothing();
-                if self.sheet.link(link).is_some_and(|link| !link.is_datagram) {
+                if self.spec.link(link).is_some_and(|link| !link.is_datagram) {
                     self.links[place(link)].hands_over(bytes);
                 }
                 let result = self.link_send(link, bytes, now);
@@ -304,17 +306,17 @@ impl Oracle {
         }
     }
 
-    /// The engine has nothing more to do before `until`; the cell itself holds this many later
-    /// events.
-    pub(super) fn rest(&mut self, now: Instant, engine: &Engine, until: Instant, things: usize) {
+    /// The engine has nothing to do before `until`. `pending` is the number of events and connections
+    /// in the cell.
+    pub(super) fn rest(&mut self, now: Instant, engine: &Engine, until: Instant, pending: usize) {
         if self.violation.is_some() {
             return;
         }
         self.announced = self.announced.min(until);
         for nth in 0..self.ports.len() {
-            if self.sheet.ports[nth].is_field {
+            if self.spec.ports[nth].is_field {
                 if !self.is_late {
-                    let result = self.ports[nth].down.rest(&self.sheet, nth, &self.up, now);
+                    let result = self.ports[nth].down.rest(&self.spec, nth, &self.up, now);
                     self.judge(now, &[Invariant::Cycle], result);
                 }
                 let result = self.count(nth, engine);
@@ -328,15 +330,17 @@ impl Oracle {
             self.judge(now, &[Invariant::Delivered], result);
         }
         let remembered = self.remembered;
-        let result = match (remembered, things) {
-            (0..MOST_BYTES, 0..MOST_THINGS) => Ok(()),
-            _ => Err((Invariant::Memory, format!("{remembered} bytes and {things} things wait in the cell"))),
+        let result = match (remembered, pending) {
+            (0..MAX_BYTES, 0..MAX_PENDING) => Ok(()),
+            _ => {
+                Err((Invariant::Memory, format!("{remembered} bytes and {pending} things wait in the cell")))
+            }
         };
         self.judge(now, &[Invariant::Memory], result);
     }
 }
 
-/// Index of a link in per-link state.
+/// Index of a link in arrays of per-link state.
 pub(super) fn place(link: LinkId) -> usize {
     usize::from(link.0) % LINKS
 }
@@ -345,15 +349,15 @@ fn is_up(engine: &Engine, id: LinkId) -> bool {
     engine.links().any(|link| link.id == id && matches!(link.state, LinkState::Up { .. }))
 }
 
-/// Four links to fixed ports of the controller, and one per listening port.
+/// Maximum number of links: those to the controller's fixed ports, and one per listening port.
 const LINKS: usize = 16;
-/// Frames of a recipe link that the controller's TCP has not acknowledged.
-const MOST_UNACKED: usize = 64;
-/// A gateway that is not called for longer was asleep.
+/// Maximum number of unacknowledged frames of a recipe link.
+const MAX_UNACKED: usize = 64;
+/// A gateway that is not called for longer has slept.
 const ASLEEP: Duration = Duration::from_millis(500);
-/// More than any stall can gather.
-const MOST_BYTES: usize = 1 << 20;
-const MOST_THINGS: usize = 100_000;
+/// More than can gather in any stall.
+const MAX_BYTES: usize = 1 << 20;
+const MAX_PENDING: usize = 100_000;
 
 #[cfg(test)]
 mod robot_tests;

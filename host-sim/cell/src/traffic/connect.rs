@@ -5,9 +5,9 @@ use proto_core::time::Duration;
 
 use crate::connection::{Connection, Peer};
 use crate::due::Due;
-use crate::network::{Door, Item, Way};
+use crate::network::{ConnectPolicy, Item, Way};
 use crate::tcp::TCP_TIMEOUT;
-use crate::{CLIENT_RETRY, Cell, HERE, What};
+use crate::{CLIENT_IP, CLIENT_RETRY, Cell, What};
 use recipe_controller::{ConnId, ControllerInput, Link};
 
 impl Cell {
@@ -15,19 +15,19 @@ impl Cell {
     pub(crate) fn open(&mut self, link: LinkId) {
         let gate = self.gate(link);
         gate.set_open(true);
-        let turn = gate.turn;
+        let generation = gate.generation;
         match gate.kind {
-            LinkKind::RecipeUdp => self.queue.push(self.now, Due::LinkUp { link, turn }),
+            LinkKind::RecipeUdp => self.queue.push(self.now, Due::LinkUp { link, generation }),
             LinkKind::RecipeTcpListen { .. } | LinkKind::RecipeUdpListen { .. } => {}
-            _ => self.knock(link, turn, FIRST_KNOCK),
+            _ => self.connect(link, generation, FIRST_CONNECT_WAIT),
         }
     }
 
-    /// A connection is asked for; without an answer again, after twice the time.
-    pub(crate) fn knock(&mut self, link: LinkId, turn: u64, pause: Duration) {
+    /// Sends a connection request; repeats it after `pause`, then twice as long, while there is no answer.
+    pub(crate) fn connect(&mut self, link: LinkId, generation: u64, pause: Duration) {
         let now = self.now;
         let gate = self.gate(link);
-        if gate.turn != turn || gate.conn.is_some() {
+        if gate.generation != generation || gate.conn.is_some() {
             return;
         }
         let delay = gate.network.delay;
@@ -36,23 +36,22 @@ impl Cell {
             LinkKind::State => Link::State,
             _ => Link::Modbus,
         };
-        match gate.door {
-            Door::Open => {
+        match gate.connect_policy {
+            ConnectPolicy::Open => {
                 let id = self.new_conn(link, Peer::Server(server));
                 self.send_item(id, Way::Up, Item::Opened);
             }
-            Door::Refuses if !gate.is_cut(Way::Up) && !gate.is_cut(Way::Down) => {
-                self.queue.push(now + delay + delay, Due::LinkDown { link, turn });
+            ConnectPolicy::Refuse if !gate.is_cut(Way::Up) && !gate.is_cut(Way::Down) => {
+                self.queue.push(now + delay + delay, Due::LinkDown { link, generation });
             }
-            Door::Refuses | Door::Silent => {
+            ConnectPolicy::Refuse | ConnectPolicy::Silent => {
                 let pause_after = pause.saturating_mul(2);
-                self.queue.push(now + pause, Due::Knock { link, turn, pause: pause_after });
+                self.queue.push(now + pause, Due::Connect { link, generation, pause: pause_after });
             }
         }
     }
 
-    /// The gateway closes a link with a reset, and wants to hear nothing more of it: what has not
-    /// arrived never does.
+    /// The gateway closes a link with a reset: data that has not arrived is lost, in both directions.
     pub(crate) fn close(&mut self, link: LinkId) {
         let now = self.now;
         let gate = self.gate(link);
@@ -68,14 +67,14 @@ impl Cell {
             self.never_opened(id);
         } else {
             conn.abandoned = true;
-            // On a dead path it does not get far; the other end finds out by itself.
+            // On a half-open connection the reset is lost; the controller detects it by a timeout.
             if !conn.up.dead {
                 self.queue.push(now + delay, Due::ResetUp { conn: id });
             }
         }
     }
 
-    /// Nothing is left of a connection.
+    /// Removes a connection.
     pub(crate) fn drop_conn(&mut self, id: u64) -> Option<Connection> {
         if let Some(oracle) = &mut self.oracle {
             oracle.conn_gone(id);
@@ -83,7 +82,7 @@ impl Cell {
         self.conns.remove(&id)
     }
 
-    /// A connection that the controller was never told of.
+    /// Removes a connection that the controller has not accepted.
     fn never_opened(&mut self, id: u64) {
         if let Some(Connection { peer: Peer::Client(port), .. }) = self.drop_conn(id) {
             self.client_lost(port);
@@ -95,7 +94,7 @@ impl Cell {
         let Some(conn) = self.conns.get(&id) else { return };
         let (link, peer) = (conn.link, conn.peer);
         if self.gate(link).is_cut(Way::Up) {
-            // It learns of it when it sends something, or at last by TCP's own patience.
+            // It learns of it when it sends something, or by TCP's timeout.
             self.queue.push(self.now + TCP_TIMEOUT, Due::TimedOut { conn: id });
             return;
         }
@@ -103,7 +102,7 @@ impl Cell {
         self.controller_closed(id, peer);
     }
 
-    /// The controller's host knows nothing of this connection, and says so.
+    /// A reset from the controller's host, which has no such connection, reaches the gateway.
     pub(crate) fn reset_down(&mut self, id: u64) {
         let Some(conn) = self.conns.get(&id) else { return };
         let link = conn.link;
@@ -111,20 +110,20 @@ impl Cell {
         if gate.is_cut(Way::Down) {
             return;
         }
-        let (turn, is_ours) = (gate.turn, gate.conn == Some(id));
+        let (generation, is_ours) = (gate.generation, gate.conn == Some(id));
         self.drop_conn(id);
         if is_ours {
-            self.queue.push(self.now, Due::LinkDown { link, turn });
+            self.queue.push(self.now, Due::LinkDown { link, generation });
         }
     }
 
-    /// The controller closes its end, after what it has sent.
+    /// The controller closes its end, after the data that it has sent.
     pub(crate) fn controller_closes(&mut self, id: u64) {
         self.send_item(id, Way::Down, Item::Closed);
         let Some(conn) = self.conns.get_mut(&id) else { return };
         conn.up.dead = true;
         conn.closing = true;
-        // The gateway may have closed its end as well: then nobody is left to be told.
+        // If the gateway has closed its end too, nothing is left of the connection.
         if self.gates.get(&conn.link).is_none_or(|gate| gate.conn != Some(id)) {
             self.drop_conn(id);
         }
@@ -143,7 +142,7 @@ impl Cell {
         let Some(client) = self.clients.get(&port) else { return };
         let (None, Some(link)) = (client.conn, client.link) else { return };
         let gate = self.gate(link);
-        if !gate.is_open || gate.conn.is_some() || gate.door != Door::Open {
+        if !gate.is_open || gate.conn.is_some() || gate.connect_policy != ConnectPolicy::Open {
             self.queue.push(self.now + CLIENT_RETRY, Due::ClientTries { port });
             return;
         }
@@ -172,9 +171,9 @@ impl Cell {
             self.send_item(id, Way::Down, Item::Opened);
         }
         self.controller_input(match peer {
-            Peer::Server(Link::Command) => ControllerInput::CommandOpened { conn, from: HERE },
-            Peer::Server(Link::State) => ControllerInput::StateOpened { conn, from: HERE },
-            Peer::Server(Link::Modbus) => ControllerInput::ModbusOpened { conn, from: HERE },
+            Peer::Server(Link::Command) => ControllerInput::CommandOpened { conn, from: CLIENT_IP },
+            Peer::Server(Link::State) => ControllerInput::StateOpened { conn, from: CLIENT_IP },
+            Peer::Server(Link::Modbus) => ControllerInput::ModbusOpened { conn, from: CLIENT_IP },
             Peer::Client(port) => ControllerInput::PortUp { port },
         });
     }
@@ -197,5 +196,5 @@ impl Cell {
     }
 }
 
-/// How long an attempt to connect waits for an answer before it asks again, at first.
-const FIRST_KNOCK: Duration = Duration::from_secs(1);
+/// How long the first connection request waits for an answer before it is repeated.
+const FIRST_CONNECT_WAIT: Duration = Duration::from_secs(1);

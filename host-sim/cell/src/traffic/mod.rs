@@ -1,5 +1,4 @@
-//! What travels between the gateway and the controller: connections come and go, bytes and
-//! datagrams arrive.
+//! Bytes and datagrams between the gateway and the controller: how they are sent and how they arrive.
 
 mod acks;
 mod connect;
@@ -10,9 +9,9 @@ use proto_core::engine::{Input, LinkId, LinkKind};
 
 use super::connection::Peer;
 use super::due::Due;
-use super::network::{Item, Speaker, Way};
+use super::network::{Item, Sender, Way};
 use super::tcp::{Arrived, USER_TIMEOUT};
-use super::{Cell, End, Owner, What, udp_peer};
+use super::{AnyPort, Cell, End, What, udp_peer};
 use recipe_controller::{ConnId, ControllerInput, Link};
 
 impl Cell {
@@ -27,12 +26,12 @@ impl Cell {
                 conn.up.arrived
             }
         };
-        let waited = conn.pipe(way).again_at;
+        let waited = conn.pipe(way).retransmit_at;
         let arrivals = conn.pipe(way).send(now, item, acks, gate, way);
         if waited.is_none()
-            && let Some(at) = conn.pipe(way).again_at
+            && let Some(at) = conn.pipe(way).retransmit_at
         {
-            self.queue.push(at, Due::SendAgain { conn: id, way });
+            self.queue.push(at, Due::Retransmit { conn: id, way });
         }
         let is_too_much = way == Way::Down && !conn.down.dead && conn.down.on_the_way() > CONTROLLER_BUFFER;
         for at in arrivals {
@@ -47,29 +46,29 @@ impl Cell {
     pub(crate) fn send_up(&mut self, link: LinkId, bytes: Vec<u8>) {
         let now = self.now;
         let Some(gate) = self.gates.get_mut(&link) else { return };
-        let turn = gate.turn;
+        let generation = gate.generation;
         match gate.kind {
             LinkKind::RecipeUdp => {
                 let slowest = gate.network.slowest();
                 let oracle = self.oracle.as_mut();
                 let tag = oracle.map_or(0, |oracle| oracle.sent_datagram(link, &bytes, slowest, now));
-                let peer = udp_peer(turn);
+                let peer = udp_peer(generation);
                 for at in gate.datagram_arrivals(now, Way::Up) {
                     self.queue.push(at, Due::DatagramUp { link, peer, tag, bytes: bytes.clone() });
                 }
             }
             LinkKind::RecipeUdpListen { .. } => {
-                let (slowest, partner) = (gate.network.slowest(), gate.partner);
+                let (slowest, answers_to) = (gate.network.slowest(), gate.answers_to);
                 let mut tag = 0;
                 if let Some(oracle) = &mut self.oracle {
-                    oracle.answers(link, partner, now);
+                    oracle.answers(link, answers_to, now);
                     tag = oracle.sent_datagram(link, &bytes, slowest, now);
                 }
                 let client = self.clients.iter().find(|(_, client)| client.link == Some(link));
                 let arrivals = gate.datagram_arrivals(now, Way::Up);
-                // To somebody else, or to a socket that is gone, it is lost.
+                // A datagram to another sender or to a closed socket is lost.
                 if let Some((&port, client)) = client
-                    && partner == Some(Speaker::Client { socket: client.socket })
+                    && answers_to == Some(Sender::Client { socket: client.socket })
                 {
                     for at in arrivals {
                         self.queue.push(at, Due::ClientDatagramUp { port, tag, bytes: bytes.clone() });
@@ -95,7 +94,7 @@ impl Cell {
                 }
             }
         }
-        self.queue.push(now, Due::LinkSent { link, turn });
+        self.queue.push(now, Due::LinkSent { link, generation });
     }
 
     /// The controller's UDP server sends.
@@ -108,7 +107,7 @@ impl Cell {
     }
 
     pub(crate) fn controller_port_sends(&mut self, port: usize, bytes: Vec<u8>) {
-        if let Some(line) = self.line_at(Owner::Controller(port)) {
+        if let Some(line) = self.line_at(AnyPort::Controller(port)) {
             self.transmit(line, End::Port, &bytes);
             return;
         }
@@ -117,7 +116,7 @@ impl Cell {
         match (client.is_tcp, client.conn, client.link) {
             (true, Some(conn), _) => self.send_item(conn, Way::Down, Item::Bytes(bytes)),
             (false, _, Some(link)) => {
-                let from = Speaker::Client { socket: client.socket };
+                let from = Sender::Client { socket: client.socket };
                 for at in self.gate(link).datagram_arrivals(now, Way::Down) {
                     self.queue.push(at, Due::ClientDatagramDown { link, from, bytes: bytes.clone() });
                 }
@@ -127,7 +126,7 @@ impl Cell {
         self.controller_input_later(port);
     }
 
-    /// What was handed over to a network port has left at once.
+    /// Network ports send without delay.
     fn controller_input_later(&mut self, port: usize) {
         self.controller.handle(self.now, ControllerInput::PortSent { port });
     }
@@ -141,12 +140,12 @@ impl Cell {
         let Some(gate) = self.gates.get_mut(&link) else { return };
         if gate.is_cut(way) {
             if let Some(at) = conn.pipe(way).lose(now) {
-                self.queue.push(at, Due::SendAgain { conn: id, way });
+                self.queue.push(at, Due::Retransmit { conn: id, way });
             }
             return;
         }
         if way == Way::Down && is_asleep && !conn.abandoned {
-            // It lies in the gateway's socket.
+            // It waits in the gateway's socket.
             return;
         }
         let (arrived, acks) = conn.pipe(way).next_arrived(now);
@@ -168,7 +167,7 @@ impl Cell {
             Way::Down => {
                 conn.down.acknowledge(now, conn.down.arrived);
                 self.acknowledged(id, acks);
-                self.tell_acked(link);
+                self.report_acked(link);
             }
         }
         match (arrived, way) {
@@ -186,7 +185,7 @@ impl Cell {
                 self.controller_bytes(id, link, peer, &bytes);
             }
             (Arrived::Item(Item::Opened), Way::Up) => self.controller_opened(id, peer),
-            // The gateway's end is reset, never closed.
+            // The gateway resets its end, and never closes it.
             (Arrived::Item(Item::Closed), Way::Up) => {}
             (Arrived::Item(Item::Bytes(bytes)), Way::Down) => {
                 self.engine_input(Input::LinkBytes { link, bytes: &bytes });
@@ -204,7 +203,7 @@ impl Cell {
                 self.engine_input(Input::LinkDown { link });
             }
         }
-        // What came with it but is another item.
+        // More may have arrived at the same time.
         self.arrive(id, way);
     }
 
@@ -215,7 +214,7 @@ impl Cell {
         self.controller_input(match peer {
             Peer::Server(Link::Command) => ControllerInput::CommandBytes { conn, bytes },
             Peer::Server(Link::Modbus) => ControllerInput::ModbusBytes { conn, bytes },
-            // Port 2001 takes nothing.
+            // Port 2001 ignores what clients send.
             Peer::Server(Link::State) => return,
             Peer::Client(port) => ControllerInput::PortBytes { port, bytes },
         });
@@ -226,6 +225,5 @@ impl Cell {
     }
 }
 
-/// What the controller keeps of what it sends on one connection; a client that lets more pile up is
-/// dropped.
+/// Bytes that the controller keeps for one connection. Beyond that it resets the connection.
 const CONTROLLER_BUFFER: u64 = 256 * 1024;

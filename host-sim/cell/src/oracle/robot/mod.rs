@@ -1,5 +1,5 @@
-//! The robot's side: how old each value and command is when the controller receives it, and whether
-//! everything arrives that must (docs/cell.md section 4).
+//! The robot's side: the age of each value and command when the controller receives it, and whether what
+//! must arrive does (docs/cell.md section 4).
 //!
 //! In: the content of each transmission, when it arrives, and which paths to the controller work.
 //! Does not know what the engine considers delivered.
@@ -14,187 +14,189 @@ use proto_core::time::{Duration, Instant};
 
 use must_arrive::SAFE_ARRIVES;
 
+use super::commands::Command;
 use super::field::show;
-use super::orders::Order;
-use super::sheet::{Raw, Sheet};
+use super::spec::{Raw, Spec};
 use super::upward::{Carried, Wrong};
 use super::{Invariant, Oracle};
-use crate::network::Speaker;
+use crate::network::Sender;
 use crate::tcp::USER_TIMEOUT;
 
-/// One path to the controller, in the present state of the network.
+/// The present state of one path to the controller.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Path {
     pub link: LinkId,
-    /// Which connection it is, of those that are.
+    /// The connection; `None` if there is none or the link has none.
     pub conn: Option<u64>,
-    /// There is a connection, and data sent on it arrives.
+    /// Data that is sent on it arrives.
     pub is_sound: bool,
     /// The server there carries out and answers requests.
     pub is_served: bool,
 }
 
-/// One transmission.
+/// A transmission.
 #[derive(Debug, Clone)]
-struct Parcel {
+struct Transmission {
     sent_at: Instant,
-    /// Number of the connection's bytes that have arrived when it has.
+    /// Offset of its end in the connection's bytes.
     end: u64,
-    /// How long it may be in flight, apart from the network's own delay.
+    /// Maximum time in flight, without the network's delay.
     not_after: Duration,
     slowest: Duration,
     values: Vec<(SysVar, Raw, Carried)>,
-    order: Option<Errand>,
+    command: Option<InFlightCommand>,
 }
 
 /// A command in flight.
 #[derive(Debug, Clone)]
-struct Errand {
-    order: Order,
-    /// Since when it is not asked for any more.
+struct InFlightCommand {
+    command: Command,
+    /// Since when it is no longer requested.
     unasked: Option<Instant>,
 }
 
-/// A device asks to stop the robot.
+/// A device's request to stop the robot.
 #[derive(Debug, Clone)]
-struct Demand {
-    order: Order,
-    is_met: bool,
+struct StopRequest {
+    command: Command,
+    has_arrived: bool,
 }
 
-/// A connection's transmissions that have not arrived.
+/// The transmissions of a connection that have not arrived.
 #[derive(Debug, Clone, Default)]
-struct Road {
+struct InFlight {
     sent: u64,
     arrived: u64,
-    parcels: VecDeque<Parcel>,
+    transmissions: VecDeque<Transmission>,
 }
 
 /// Transmissions in flight, and what must be at the controller.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Robot {
-    /// The transmission that the engine hands over now.
+    /// Content of the transmission that the engine is handing over.
     values: Vec<(SysVar, Raw, Carried)>,
-    order: Option<Errand>,
-    roads: BTreeMap<u64, Road>,
-    /// The newest transmissions; the first has this number.
-    datagrams: VecDeque<Parcel>,
+    command: Option<InFlightCommand>,
+    in_flight: BTreeMap<u64, InFlight>,
+    /// The newest datagrams; the first one has this number.
+    datagrams: VecDeque<Transmission>,
     first_tag: u64,
-    demands: Vec<Demand>,
+    stop_requests: Vec<StopRequest>,
     /// The newest urgent command.
-    stopped_by: Option<Order>,
-    /// Since when each path has worked without a fault, and answered; by the link's place.
+    stopped_by: Option<Command>,
+    /// Since when each path has worked without a fault, and been served.
     sound: BTreeMap<LinkId, Instant>,
     served: BTreeMap<LinkId, Instant>,
     conns: BTreeMap<LinkId, Option<u64>>,
     all_sound_since: Option<Instant>,
-    /// When the controller restarted.
-    began_at: Option<Instant>,
+    /// When the controller last restarted.
+    started_at: Option<Instant>,
     /// Since when the frames of each recipe link could be sent.
     ready: BTreeMap<LinkId, Instant>,
-    /// When the gateway was not called.
+    /// Beginning and end of the gateway's stalls.
     stalls: VecDeque<(Instant, Instant)>,
-    /// The controller's inputs after the newest arrival, and when somebody else wrote which.
+    /// The controller's inputs after the newest arrival, and when another program changed which byte.
     inputs: Vec<u8>,
-    foreign: BTreeMap<usize, Instant>,
-    /// Who sent the newest frame to a port where the gateway listens.
-    speakers: BTreeMap<LinkId, Speaker>,
+    foreign_writes: BTreeMap<usize, Instant>,
+    /// The sender of the newest frame to each port where the gateway listens.
+    senders: BTreeMap<LinkId, Sender>,
 }
 
 impl Robot {
     pub(super) fn hands_over_nothing(&mut self) {
         self.values.clear();
-        self.order = None;
+        self.command = None;
     }
 
     pub(super) fn hands_over(&mut self, var: SysVar, raw: Raw, carried: Carried) {
         self.values.push((var, raw, carried));
     }
 
-    pub(super) fn hands_over_order(&mut self, order: Order) {
-        self.order = Some(Errand { order, unasked: None });
+    pub(super) fn hands_over_command(&mut self, command: Command) {
+        self.command = Some(InFlightCommand { command, unasked: None });
     }
 
-    /// Devices ask to stop the robot.
-    pub(super) fn asked(&mut self, orders: Vec<Order>) {
-        for order in orders {
-            self.demands
-                .retain(|demand| demand.order.place != order.place || demand.order.text != order.text);
-            self.demands.push(Demand { order, is_met: false });
+    /// Devices request to stop the robot.
+    pub(super) fn asked(&mut self, commands: Vec<Command>) {
+        for command in commands {
+            self.stop_requests.retain(|request| {
+                request.command.place != command.place || request.command.text != command.text
+            });
+            self.stop_requests.push(StopRequest { command, has_arrived: false });
         }
     }
 
-    /// A command that is not asked for any more need not arrive, and soon must not.
-    pub(super) fn no_longer_asked(&mut self, is_asked: impl Fn(&Order) -> bool, now: Instant) {
-        self.demands.retain(|demand| is_asked(&demand.order));
-        let parcels = self.roads.values_mut().flat_map(|road| &mut road.parcels);
-        for errand in parcels.filter_map(|parcel| parcel.order.as_mut()) {
-            if errand.unasked.is_none() && !is_asked(&errand.order) {
-                errand.unasked = Some(now);
+    /// Commands that are no longer requested need not arrive, and after a while must not.
+    pub(super) fn no_longer_asked(&mut self, is_asked: impl Fn(&Command) -> bool, now: Instant) {
+        self.stop_requests.retain(|request| is_asked(&request.command));
+        let transmissions = self.in_flight.values_mut().flat_map(|in_flight| &mut in_flight.transmissions);
+        for in_flight in transmissions.filter_map(|transmission| transmission.command.as_mut()) {
+            if in_flight.unasked.is_none() && !is_asked(&in_flight.command) {
+                in_flight.unasked = Some(now);
             }
         }
     }
 
-    /// The gateway slept: earlier requests do not count.
+    /// The gateway slept: earlier requests no longer count.
     pub(super) fn forget_all(&mut self, now: Instant) {
         self.no_longer_asked(|_| false, now);
     }
 
     pub(super) fn restarted(&mut self, now: Instant) {
         self.forget_all(now);
-        self.speakers.clear();
+        self.senders.clear();
         self.disturbed(now);
     }
 
-    /// Nothing has worked for longer than since now.
+    /// No path has worked for longer than since now.
     fn disturbed(&mut self, now: Instant) {
         self.sound.values_mut().chain(self.served.values_mut()).for_each(|since| *since = now);
     }
 
-    fn parcel(&mut self, sheet: &Sheet, link: LinkId, slowest: Duration, now: Instant) -> Parcel {
-        Parcel {
+    fn transmission(&mut self, spec: &Spec, link: LinkId, slowest: Duration, now: Instant) -> Transmission {
+        Transmission {
             sent_at: now,
             end: 0,
-            not_after: not_after(sheet, link),
+            not_after: not_after(spec, link),
             slowest,
             values: std::mem::take(&mut self.values),
-            order: self.order.take(),
+            command: self.command.take(),
         }
     }
 
-    /// Whether the gateway was not called until now.
+    /// Whether a stall of the gateway ends now.
     pub(super) fn has_stalled(&self, now: Instant) -> bool {
         self.stalls.back().is_some_and(|(_, to)| *to == now)
     }
 
-    /// How long the gateway was not called since then.
+    /// For how long the gateway was not called since `since`.
     fn stalled_since(&self, since: Instant, now: Instant) -> Duration {
         let part = |&(from, to): &(Instant, Instant)| to.min(now).saturating_since(from.max(since));
         self.stalls.iter().map(part).fold(Duration::ZERO, |sum, part| sum + part)
     }
 
-    /// Whether the controller has restarted since then, and the gateway must know.
-    fn has_begun_since(&self, then: Instant, now: Instant) -> bool {
+    /// Whether the controller has restarted since `then` and the gateway must know.
+    fn has_started_since(&self, then: Instant, now: Instant) -> bool {
         let knows = self.all_sound_since.is_some_and(|since| now.saturating_since(since) > SAFE_ARRIVES);
-        knows && self.began_at.is_some_and(|began| began > then)
+        knows && self.started_at.is_some_and(|began| began > then)
     }
 
-    /// A transmission arrives: checks whether its values are recent enough.
-    fn judge(&mut self, parcel: &Parcel, slowest: Duration, now: Instant) -> Result<(), Wrong> {
-        let network = parcel.slowest.max(slowest) + ALLOWANCE;
-        // Only the system's TCP timeout ends connections of an engine that is not called.
-        let stalled = self.stalled_since(parcel.sent_at, now).min(USER_TIMEOUT);
-        for &(var, raw, carried) in &parcel.values {
+    /// A transmission arrives: checks the age of its values and of its command.
+    fn judge(&mut self, transmission: &Transmission, slowest: Duration, now: Instant) -> Result<(), Wrong> {
+        let network = transmission.slowest.max(slowest) + ALLOWANCE;
+        // While the engine is not called, only the transport's timeout ends connections.
+        let stalled = self.stalled_since(transmission.sent_at, now).min(USER_TIMEOUT);
+        for &(var, raw, carried) in &transmission.values {
             let (arrived, timeout) = match carried {
                 Carried::Safe => continue,
-                Carried::Held { accepted } if self.has_begun_since(accepted, now) => {
+                Carried::Held { accepted } if self.has_started_since(accepted, now) => {
                     let what = format!("{var} = {} is from before the controller restarted", show(var, raw));
                     return Err((Invariant::NoReplay, what));
                 }
                 Carried::Held { .. } => continue,
                 Carried::Of { arrived, timeout } => (arrived, timeout),
             };
-            let (age, most) = (now.saturating_since(arrived), timeout + parcel.not_after + network + stalled);
+            let (age, most) =
+                (now.saturating_since(arrived), timeout + transmission.not_after + network + stalled);
             if age > most {
                 let what = format!(
                     "{var} = {} is {age} old at the controller; at most {most} is allowed",
@@ -203,37 +205,37 @@ impl Robot {
                 return Err((Invariant::ValueAge, what));
             }
         }
-        let Some(Errand { order, unasked }) = &parcel.order else { return Ok(()) };
-        let (since, most) = match order.is_urgent() {
+        let Some(InFlightCommand { command, unasked }) = &transmission.command else { return Ok(()) };
+        let (since, most) = match command.is_urgent() {
             true => (unasked.unwrap_or(now), URGENT_TTL),
-            false => (order.picked, COMMAND_TTL),
+            false => (command.picked, COMMAND_TTL),
         };
-        let overtaken = self.stopped_by.as_ref().is_some_and(|stop| order.picked < stop.picked);
-        if overtaken && !order.is_urgent() {
-            let what = format!("{} arrives after an urgent command, but was picked before it", order.text);
+        let overtaken = self.stopped_by.as_ref().is_some_and(|stop| command.picked < stop.picked);
+        if overtaken && !command.is_urgent() {
+            let what = format!("{} arrives after an urgent command, but was picked before it", command.text);
             return Err((Invariant::Overtaken, what));
         }
-        if order.is_urgent() {
-            self.stopped_by = Some(order.clone());
+        if command.is_urgent() {
+            self.stopped_by = Some(command.clone());
         }
         let (age, most) = (now.saturating_since(since), most + network + stalled);
         if age > most {
             let what =
-                format!("{} arrives {age} after it was asked for; at most {most} is allowed", order.text);
+                format!("{} arrives {age} after it was asked for; at most {most} is allowed", command.text);
             return Err((Invariant::CommandAge, what));
         }
-        for demand in self.demands.iter_mut().filter(|demand| demand.order.text == order.text) {
-            demand.is_met = true;
+        for request in self.stop_requests.iter_mut().filter(|request| request.command.text == command.text) {
+            request.has_arrived = true;
         }
         Ok(())
     }
 
-    /// The controller's inputs are `before` something arrives: other programs made the changes
-    /// since.
-    fn look_for_foreign(&mut self, before: &[u8], now: Instant) {
+    /// Compares the controller's inputs before an arrival with those after the previous one: other programs
+    /// made the changes.
+    fn find_foreign_writes(&mut self, before: &[u8], now: Instant) {
         if self.inputs.len() == before.len() && self.inputs != before {
             for (at, _) in before.iter().zip(&self.inputs).enumerate().filter(|(_, (new, old))| new != old) {
-                self.foreign.insert(at, now);
+                self.foreign_writes.insert(at, now);
             }
         }
         self.inputs.clear();
@@ -241,28 +243,29 @@ impl Robot {
     }
 
     pub(super) fn applied(&mut self, before: &[u8], after: &[u8], now: Instant) {
-        self.look_for_foreign(before, now);
+        self.find_foreign_writes(before, now);
         self.inputs.clear();
         self.inputs.extend_from_slice(after);
     }
 
     pub(super) fn len(&self) -> usize {
-        self.roads.values().map(|road| road.parcels.len()).sum::<usize>() + self.datagrams.len()
+        self.in_flight.values().map(|in_flight| in_flight.transmissions.len()).sum::<usize>()
+            + self.datagrams.len()
     }
 }
 
 impl Oracle {
-    /// The gateway's transport has taken bytes for a connection.
+    /// The gateway hands bytes over to a connection.
     pub(crate) fn sent(&mut self, conn: u64, link: LinkId, bytes: &[u8], slowest: Duration, now: Instant) {
         self.controller.sent(conn, bytes);
-        let mut parcel = self.robot.parcel(&self.sheet, link, slowest, now);
-        let road = self.robot.roads.entry(conn).or_default();
-        road.sent += bytes.len() as u64;
-        parcel.end = road.sent;
-        road.parcels.push_back(parcel);
+        let mut transmission = self.robot.transmission(&self.spec, link, slowest, now);
+        let in_flight = self.robot.in_flight.entry(conn).or_default();
+        in_flight.sent += bytes.len() as u64;
+        transmission.end = in_flight.sent;
+        in_flight.transmissions.push_back(transmission);
     }
 
-    /// Same, for a datagram, which has this number from now on.
+    /// Same, for a datagram; returns its number.
     pub(crate) fn sent_datagram(
         &mut self,
         link: LinkId,
@@ -271,9 +274,9 @@ impl Oracle {
         now: Instant,
     ) -> u64 {
         self.controller.sent_datagram(u64::from(link.0), bytes);
-        let parcel = self.robot.parcel(&self.sheet, link, slowest, now);
+        let transmission = self.robot.transmission(&self.spec, link, slowest, now);
         let Robot { datagrams, first_tag, .. } = &mut self.robot;
-        datagrams.push_back(parcel);
+        datagrams.push_back(transmission);
         if datagrams.len() > DATAGRAMS {
             datagrams.pop_front();
             *first_tag += 1;
@@ -281,11 +284,11 @@ impl Oracle {
         *first_tag + datagrams.len() as u64 - 1
     }
 
-    /// The controller has not understood what came on a connection of port 2000.
+    /// The controller replied `unknown command` on a connection of port 2000.
     pub(crate) fn not_understood(&mut self, link: LinkId, now: Instant) {
         let quiet = self.robot.sound.get(&link).map(|since| now.saturating_since(*since));
         let result = match quiet {
-            // Nothing was delayed, which would join texts without terminators.
+            // After a delay, texts without terminators may have been joined.
             Some(quiet) if quiet > Duration::from_secs(1) => {
                 Err((Invariant::Understood, "the controller did not understand a command".to_owned()))
             }
@@ -296,36 +299,38 @@ impl Oracle {
 
     pub(crate) fn conn_gone(&mut self, conn: u64) {
         self.controller.gone(conn);
-        self.robot.roads.remove(&conn);
+        self.robot.in_flight.remove(&conn);
     }
 
-    /// So many bytes of a connection have reached the controller's program.
-    pub(super) fn came(&mut self, conn: u64, len: usize, slowest: Duration, now: Instant) {
-        let Some(road) = self.robot.roads.get_mut(&conn) else { return };
-        road.arrived += len as u64;
-        let arrived = road.arrived;
-        let mut came = Vec::new();
-        while let Some(parcel) = road.parcels.pop_front_if(|parcel| parcel.end <= arrived) {
-            came.push(parcel);
+    /// The controller has received this many more bytes on a connection.
+    pub(super) fn delivered(&mut self, conn: u64, len: usize, slowest: Duration, now: Instant) {
+        let Some(in_flight) = self.robot.in_flight.get_mut(&conn) else { return };
+        in_flight.arrived += len as u64;
+        let arrived = in_flight.arrived;
+        let mut delivered = Vec::new();
+        while let Some(transmission) =
+            in_flight.transmissions.pop_front_if(|transmission| transmission.end <= arrived)
+        {
+            delivered.push(transmission);
         }
-        for parcel in came {
-            self.judge_parcel(&parcel, slowest, now);
+        for transmission in delivered {
+            self.judge_transmission(&transmission, slowest, now);
         }
     }
 
-    pub(super) fn datagram_came(&mut self, tag: u64, slowest: Duration, now: Instant) {
+    pub(super) fn datagram_delivered(&mut self, tag: u64, slowest: Duration, now: Instant) {
         let nth = tag.checked_sub(self.robot.first_tag).map(|nth| nth as usize);
-        if let Some(parcel) = nth.and_then(|nth| self.robot.datagrams.get(nth)).cloned() {
-            self.judge_parcel(&parcel, slowest, now);
+        if let Some(transmission) = nth.and_then(|nth| self.robot.datagrams.get(nth)).cloned() {
+            self.judge_transmission(&transmission, slowest, now);
         }
     }
 
-    fn judge_parcel(&mut self, parcel: &Parcel, slowest: Duration, now: Instant) {
-        self.checks[Invariant::ValueAge as usize] += parcel.values.len() as u64;
-        self.checks[Invariant::CommandAge as usize] += u64::from(parcel.order.is_some());
-        self.checks[Invariant::Understood as usize] += u64::from(parcel.order.is_some());
-        self.checks[Invariant::Overtaken as usize] += u64::from(parcel.order.is_some());
-        let result = self.robot.judge(parcel, slowest, now);
+    fn judge_transmission(&mut self, transmission: &Transmission, slowest: Duration, now: Instant) {
+        self.checks[Invariant::ValueAge as usize] += transmission.values.len() as u64;
+        self.checks[Invariant::CommandAge as usize] += u64::from(transmission.command.is_some());
+        self.checks[Invariant::Understood as usize] += u64::from(transmission.command.is_some());
+        self.checks[Invariant::Overtaken as usize] += u64::from(transmission.command.is_some());
+        let result = self.robot.judge(transmission, slowest, now);
         self.judge(now, &[], result);
     }
 
@@ -340,16 +345,16 @@ impl Oracle {
         }
     }
 
-    /// The controller restarts: its inputs have their present values then.
-    pub(crate) fn controller_began(&mut self, now: Instant) {
+    /// The controller restarts.
+    pub(crate) fn controller_started(&mut self, now: Instant) {
         self.robot.inputs.clear();
-        self.robot.foreign.clear();
-        self.robot.began_at = Some(now);
+        self.robot.foreign_writes.clear();
+        self.robot.started_at = Some(now);
         self.robot.all_sound_since = None;
         self.robot.disturbed(now);
     }
 
-    /// The gateway is not called from now until then.
+    /// The gateway is not called from now until `until`.
     pub(crate) fn stalled(&mut self, until: Instant, now: Instant) {
         let stalls = &mut self.robot.stalls;
         stalls.retain(|(_, to)| now.saturating_since(*to) < REMEMBERED);
@@ -361,25 +366,25 @@ impl Oracle {
         self.robot.disturbed(now);
     }
 
-    /// A datagram came to a port where the gateway listens.
-    pub(crate) fn spoke(&mut self, link: LinkId, from: Speaker, bytes: &[u8]) {
-        let frame = self.sheet.link(link).and_then(|link| link.output.as_ref());
+    /// A datagram arrives at a port where the gateway listens.
+    pub(crate) fn datagram_received(&mut self, link: LinkId, from: Sender, bytes: &[u8]) {
+        let frame = self.spec.link(link).and_then(|link| link.output.as_ref());
         if frame.is_some_and(|frame| frame.payload_of(bytes).is_some()) {
-            self.robot.speakers.insert(link, from);
+            self.robot.senders.insert(link, from);
         }
     }
 
-    /// The link restarts: the first sender is answered.
-    pub(super) fn nobody_spoke(&mut self, link: LinkId) {
-        self.robot.speakers.remove(&link);
+    /// The link restarts: the gateway may answer any first sender.
+    pub(super) fn forget_sender(&mut self, link: LinkId) {
+        self.robot.senders.remove(&link);
     }
 
-    /// The gateway's datagrams of this link go to somebody.
-    pub(crate) fn answers(&mut self, link: LinkId, whom: Option<Speaker>, now: Instant) {
-        let result = match self.robot.speakers.get(&link) {
-            Some(speaker) if Some(*speaker) != whom => Err((
+    /// The gateway sends a datagram on this link to `whom`.
+    pub(crate) fn answers(&mut self, link: LinkId, whom: Option<Sender>, now: Instant) {
+        let result = match self.robot.senders.get(&link) {
+            Some(sender) if Some(*sender) != whom => Err((
                 Invariant::Destination,
-                format!("a datagram goes to {whom:?}, but {speaker:?} sends frames"),
+                format!("a datagram goes to {whom:?}, but {sender:?} sends frames"),
             )),
             _ => Ok(()),
         };
@@ -387,15 +392,15 @@ impl Oracle {
     }
 }
 
-/// How long data handed over to a link may be in flight: after that, unacknowledged data is given
-/// up with its connection. Datagrams do not wait.
-fn not_after(sheet: &Sheet, link: LinkId) -> Duration {
-    match sheet.link(link) {
+/// How long data handed over to a link may be in flight. After that, unacknowledged data is given up with
+/// its connection. Datagrams do not wait.
+fn not_after(spec: &Spec, link: LinkId) -> Duration {
+    match spec.link(link) {
         None => Duration::from_millis(500),
         Some(link) if link.is_datagram => Duration::ZERO,
         Some(link) => {
-            let owned = sheet.owned.iter().flatten().filter(|owned| owned.way == link.id);
-            let timeouts = owned.map(|owned| sheet.ports[owned.port].timeout);
+            let owned = spec.owned.iter().flatten().filter(|owned| owned.way == link.id);
+            let timeouts = owned.map(|owned| spec.ports[owned.port].timeout);
             timeouts.min().unwrap_or_default().max(Duration::from_millis(250))
         }
     }
@@ -403,12 +408,12 @@ fn not_after(sheet: &Sheet, link: LinkId) -> Duration {
 
 /// A command arrives within this time after it was picked.
 const COMMAND_TTL: Duration = Duration::from_secs(1);
-/// An urgent command is handed over within a second after the device last asked for it, and
-/// acknowledged within another.
+/// An urgent command is handed over within 1 s after the device last requested it, and acknowledged within
+/// another.
 const URGENT_TTL: Duration = Duration::from_secs(2);
-/// Segments that are cut come a microsecond apart.
+/// Parts of a transmission that is split into segments arrive at least a microsecond apart.
 const ALLOWANCE: Duration = Duration::from_millis(2);
-/// Datagrams that may still arrive.
+/// Maximum number of datagrams that may still arrive.
 const DATAGRAMS: usize = 4_096;
-/// How long a stall may matter.
+/// For how long a stall is remembered.
 const REMEMBERED: Duration = Duration::from_secs(60);

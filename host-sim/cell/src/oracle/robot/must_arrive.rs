@@ -5,14 +5,14 @@ use std::collections::BTreeMap;
 use proto_core::engine::LinkId;
 use proto_core::time::{Duration, Instant};
 
-use super::{Demand, Path, Robot};
+use super::{Path, Robot, StopRequest};
 use crate::oracle::field::show;
-use crate::oracle::sheet::{Raw, Sheet};
+use crate::oracle::spec::{Raw, Spec};
 use crate::oracle::upward::{Upward, Wrong};
 use crate::oracle::{Invariant, Oracle};
 
 impl Robot {
-    /// Of these paths, since when all have worked.
+    /// Since when all paths that carry values have worked; `None` if one does not.
     fn all_sound(&self, paths: &[Path]) -> Option<Instant> {
         let needed = paths.iter().filter(|path| path.link != LinkId::COMMAND && path.link != LinkId::URGENT);
         let mut since = Instant::ZERO;
@@ -22,18 +22,18 @@ impl Robot {
         Some(since)
     }
 
-    /// Urgent commands that have had a working way for long enough.
-    fn stops(&self, now: Instant) -> Result<u64, Wrong> {
+    /// Checks urgent commands that have had a working path for long enough; returns their number.
+    fn urgent(&self, now: Instant) -> Result<u64, Wrong> {
         let ways = [LinkId::COMMAND, LinkId::URGENT];
         let Some(could) = ways.iter().filter_map(|link| self.sound.get(link)).min() else { return Ok(0) };
         let mut checked = 0;
-        for Demand { order, is_met } in &self.demands {
+        for StopRequest { command, has_arrived } in &self.stop_requests {
             checked += 1;
-            let had_a_way = now.saturating_since(order.picked.max(*could));
-            if !is_met && had_a_way > STOP_ARRIVES {
+            let had_a_way = now.saturating_since(command.picked.max(*could));
+            if !has_arrived && had_a_way > STOP_ARRIVES {
                 let what = format!(
                     "{} is asked for and has not arrived, although a way has worked for {had_a_way}",
-                    order.text
+                    command.text
                 );
                 return Err((Invariant::StopArrives, what));
             }
@@ -41,21 +41,21 @@ impl Robot {
         Ok(checked)
     }
 
-    /// Safe values of silent owners, after everything has worked for long enough.
-    fn safe_values(&self, sheet: &Sheet, up: &Upward, all: Instant, now: Instant) -> Result<u64, Wrong> {
+    /// Checks safe values of overdue owners, if everything has worked for long enough; returns their number.
+    fn safe_values(&self, spec: &Spec, up: &Upward, all: Instant, now: Instant) -> Result<u64, Wrong> {
         let mut checked = 0;
-        for &var in &sheet.safe_vars {
-            let Some(owned) = sheet.owned[var.ordinal()] else { continue };
+        for &var in &spec.safe_vars {
+            let Some(owned) = spec.owned[var.ordinal()] else { continue };
             let (Some(safe), Some(accepted)) = (owned.safe, up.known(var).accepted) else { continue };
-            let silent = accepted + sheet.ports[owned.port].timeout;
+            let silent = accepted + spec.ports[owned.port].timeout;
             let mut could = silent.max(all);
-            if sheet.link(owned.way).is_some() {
+            if spec.link(owned.way).is_some() {
                 let Some(ready) = self.ready.get(&owned.way) else { continue };
                 could = could.max(*ready);
             }
             let at = var.image_offset();
             let places = at..at + var.size();
-            let is_foreign = self.foreign.range(places.clone()).any(|(_, when)| *when > silent);
+            let is_foreign = self.foreign_writes.range(places.clone()).any(|(_, when)| *when > silent);
             if now.saturating_since(could) <= SAFE_ARRIVES || now < could || is_foreign {
                 continue;
             }
@@ -78,12 +78,12 @@ impl Robot {
 }
 
 impl Oracle {
-    /// The present state of everything. Call it now and then.
+    /// Checks what must have arrived, given the present state of paths and inputs. Called at intervals.
     pub(crate) fn survey(&mut self, paths: &[Path], inputs: &[u8], now: Instant) {
         if self.violation.is_some() {
             return;
         }
-        self.remembered = self.controller.size() + self.orders.len() + self.robot.len();
+        self.remembered = self.controller.size() + self.commands.len() + self.robot.len();
         for path in paths {
             if self.robot.conns.insert(path.link, path.conn) != Some(path.conn) {
                 self.robot.sound.remove(&path.link);
@@ -92,24 +92,24 @@ impl Oracle {
             note(&mut self.robot.sound, path.link, path.is_sound, now);
             note(&mut self.robot.served, path.link, path.is_sound && path.is_served, now);
         }
-        for link in &self.sheet.links {
+        for link in &self.spec.links {
             let is_ready = self.up.is_up(link.id) && self.up.is_ready(link, now);
             note(&mut self.robot.ready, link.id, is_ready, now);
         }
-        self.robot.look_for_foreign(inputs, now);
-        let result = self.robot.stops(now);
+        self.robot.find_foreign_writes(inputs, now);
+        let result = self.robot.urgent(now);
         self.checks[Invariant::StopArrives as usize] += *result.as_ref().unwrap_or(&1);
         self.judge(now, &[], result.map(drop));
         self.robot.all_sound_since = self.robot.all_sound(paths);
         if let Some(all) = self.robot.all_sound_since {
-            let result = self.robot.safe_values(&self.sheet, &self.up, all, now);
+            let result = self.robot.safe_values(&self.spec, &self.up, all, now);
             self.checks[Invariant::SafeArrives as usize] += *result.as_ref().unwrap_or(&1);
             self.judge(now, &[], result.map(drop));
         }
     }
 }
 
-/// Since when a condition has held.
+/// Notes since when a condition has held.
 fn note(since: &mut BTreeMap<LinkId, Instant>, link: LinkId, is_so: bool, now: Instant) {
     if is_so {
         since.entry(link).or_insert(now);
@@ -118,7 +118,7 @@ fn note(since: &mut BTreeMap<LinkId, Instant>, link: LinkId, is_so: bool, now: I
     }
 }
 
-/// A command that is asked for arrives within this time after a way works.
+/// An urgent command arrives within this time after it is requested and a path works.
 const STOP_ARRIVES: Duration = Duration::from_millis(1_500);
-/// So does a safe value.
+/// A safe value arrives within this time after its owner is overdue and all paths work.
 pub(super) const SAFE_ARRIVES: Duration = Duration::from_millis(1_500);
