@@ -1,4 +1,4 @@
-//! Puts the board's memory layout where the linker looks.
+//! Provides the board's linker script.
 
 use std::path::{Path, PathBuf};
 use std::{env, fs};
@@ -8,11 +8,11 @@ fn main() {
     if env::var("CARGO_CFG_TARGET_OS").as_deref() != Ok("none") {
         return;
     }
-    // Two boards or none are the sources' to refuse, with a better message.
+    // The sources refuse two boards or none, with a better message.
     let (file, script) = if env::var_os("CARGO_FEATURE_BOARD_MPS2_AN500").is_some() {
         ("boards/mps2-an500/mps2-an500.x", "mps2-an500.x")
     } else {
-        // The script of cortex-m-rt, which includes memory.x.
+        // cortex-m-rt's script, which includes memory.x.
         ("../memory.x", "link.x")
     };
     let out = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets OUT_DIR"));

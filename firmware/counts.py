@@ -4,8 +4,7 @@
     firmware/counts.py --program target/thumbv7em-none-eabihf/firmware/examples/counts \
         --host-sim target/debug/host-sim [--update]
 
-Fails when a figure has grown by more than a tenth, or shrunk by more than a tenth: then the table is to be
-written anew, with --update. Python and QEMU are all it needs.
+Fails if a figure differs by more than a tenth: then rewrite the table with --update. Needs Python and QEMU.
 """
 
 import argparse
@@ -23,7 +22,7 @@ TOLERANCE = 0.10
 
 
 def count(program, image):
-    """What one run in QEMU prints: name to mean and most."""
+    """Runs the program in QEMU; returns mean and maximum by name."""
     command = ["timeout", "-k", "5", "60", "qemu-system-arm", "-M", "mps2-an500", "-icount", "shift=6"]
     command += ["-display", "none", "-monitor", "none", "-serial", "null", "-nic", "none"]
     command += ["-semihosting-config", f"enable=on,target=native,arg=counts,arg={image}", "-kernel", program]
@@ -35,13 +34,13 @@ def count(program, image):
 
 
 def compiler(program):
-    """As the compiler wrote it into the program."""
+    """The compiler's version, as noted in the program."""
     found = re.search(rb"\0rustc version ([^\0]+)", b"\0" + pathlib.Path(program).read_bytes())
     return "rustc " + found.group(1).decode() if found else "unknown"
 
 
 def split(page):
-    """The page before the table, its rows, and the page behind it."""
+    """The page before the table, the table's rows, and the rest of the page."""
     before, _, rest = page.partition(HEAD)
     rows = re.match(r"(?:\|.*\n)*", rest).group(0)
     cells = [[cell.strip() for cell in row.strip("|").split("|")] for row in rows.splitlines()]
@@ -84,7 +83,7 @@ def main():
                 wrong.add(name)
     if wrong:
         print("not as in docs/performance.md section 2: " + ", ".join(sorted(wrong)))
-        sys.exit("when that is as it should be: firmware/counts.py --update")
+        sys.exit("if that is intended: firmware/counts.py --update")
 
 
 if __name__ == "__main__":

@@ -1,5 +1,5 @@
-//! Replays a recording of the engine on a Cortex-M7, in the size of a board: `replay IN OUT`, both named
-//! as semihosting arguments (docs/cortex-m7.md section 2). OUT is what this engine makes of it.
+//! Replays a recording of the engine on a Cortex-M7, with the capacity of a board: `replay IN OUT`, given as
+//! semihosting arguments (docs/cortex-m7.md section 2). OUT gets the output of this engine.
 #![no_std]
 #![no_main]
 
@@ -37,7 +37,7 @@ fn main() -> ! {
     }
 }
 
-/// Semihosting calls are dear.
+/// Buffer size: semihosting calls are slow.
 struct Buffered {
     file: File,
     buffer: &'static mut [u8],

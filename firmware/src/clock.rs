@@ -2,7 +2,7 @@
 
 use proto_core::time::Instant;
 
-/// The present, counted from the start of the board.
+/// Time since the start of the board.
 pub(crate) fn now() -> Instant {
     Instant::from_micros(embassy_time::Instant::now().as_micros())
 }

@@ -1,39 +1,38 @@
 //! The log: [`trace!`](crate::trace) to [`error!`](crate::error), for the library and the binary.
 //!
-//! With the feature `defmt`, and not on a host, they are defmt's macros, otherwise those of the crate
-//! `log`. What a level below the chosen one would say is not in the image at all: defmt's levels are
-//! chosen by `DEFMT_LOG` when it is built, `log`'s by the features `log-off`, `log-error` and
-//! `log-warn`.
+//! On a microcontroller with the feature `defmt` they are defmt's macros, otherwise those of the crate `log`.
+//! Messages below the chosen level are not in the image: the level is chosen at build time by `DEFMT_LOG`, or
+//! by the features `log-off`, `log-error` and `log-warn`.
 //!
-//! Both take `{}` and arguments behind the text, and nothing else that is the same in both.
+//! Only `{}` with arguments after the text has the same meaning in both.
 
 use core::fmt;
 
-/// Says something that only a developer of the firmware wants to know.
+/// Logs details for developers of the firmware.
 #[macro_export]
 macro_rules! trace {
     ($($text_and_values:tt)*) => { $crate::log_at!(trace, $($text_and_values)*) };
 }
 
-/// Says something that helps to find a mistake.
+/// Logs details that help to find a fault.
 #[macro_export]
 macro_rules! debug {
     ($($text_and_values:tt)*) => { $crate::log_at!(debug, $($text_and_values)*) };
 }
 
-/// Says something that happened and should have.
+/// Logs a normal event.
 #[macro_export]
 macro_rules! info {
     ($($text_and_values:tt)*) => { $crate::log_at!(info, $($text_and_values)*) };
 }
 
-/// Says something that should not have happened, and what is done about it is known.
+/// Logs a fault that the firmware handles.
 #[macro_export]
 macro_rules! warn {
     ($($text_and_values:tt)*) => { $crate::log_at!(warn, $($text_and_values)*) };
 }
 
-/// Says why something cannot be done.
+/// Logs why something cannot be done.
 #[macro_export]
 macro_rules! error {
     ($($text_and_values:tt)*) => { $crate::log_at!(error, $($text_and_values)*) };
@@ -53,8 +52,7 @@ macro_rules! log_at {
     ($level:ident, $($text_and_values:tt)*) => { ::log::$level!($($text_and_values)*) };
 }
 
-/// A value that is logged as the text it displays, by both: for errors, whose words are for people and
-/// exist once.
+/// Logs a value as the text that it displays, with both crates: for errors, whose texts exist once.
 #[derive(Debug, Clone, Copy)]
 pub struct Text<'a, T>(pub &'a T);
 

@@ -1,14 +1,14 @@
-//! Names that a board makes for itself from its chip's unique number.
+//! Addresses and seeds derived from a chip's unique number.
 
-/// An Ethernet address that nobody was assigned: locally administered, of one station.
+/// A locally administered unicast Ethernet address.
 pub fn ethernet_address(unique: &[u8]) -> [u8; 6] {
     let [_, _, first, rest @ ..] = hash(unique).to_be_bytes();
     let [b, c, d, e, f] = rest;
-    // Bit 1: locally administered. Bit 0: a group, which a station is not.
+    // Bit 1: locally administered. Bit 0: multicast.
     [first & !0b11 | 0b10, b, c, d, e, f]
 }
 
-/// FNV-1a: numbers that differ in one bit have hashes that have nothing in common.
+/// FNV-1a.
 pub fn hash(bytes: &[u8]) -> u64 {
     bytes.iter().fold(0xCBF2_9CE4_8422_2325, |hash, byte| {
         (hash ^ u64::from(*byte)).wrapping_mul(0x0000_0100_0000_01B3)

@@ -3,9 +3,9 @@
 //! The recipe gateway on a board: tasks that move bytes, frames and events between drivers and the
 //! engine of `proto-core`.
 //!
-//! Nothing here knows a protocol, and nothing here knows a board: every task is generic over
-//! `embedded_io_async`, [`drivers::can_port::CanPort`] or an `embassy_net::Stack`, and is bounded in memory. The
-//! binary beside this library names the board.
+//! Nothing here knows a protocol or a board: every task is generic over `embedded_io_async`,
+//! [`drivers::can_port::CanPort`] or an `embassy_net::Stack`, and its memory is bounded. The binary chooses the
+//! board.
 
 mod clock;
 pub mod drivers;

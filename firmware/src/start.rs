@@ -1,7 +1,6 @@
 //! From a board and its configuration to running tasks.
 //!
-//! Each `#[task]` here is a shim around the library's function of the same name, because a task cannot
-//! be generic.
+//! Each `#[task]` here wraps a generic function of the library, because a task cannot be generic.
 
 use core::pin::pin;
 
@@ -9,7 +8,7 @@ use embassy_executor::{SpawnError, SpawnToken, Spawner};
 use embassy_net::{Config, Ipv4Cidr, Runner, Stack, StackResources, StaticConfigV4};
 use embassy_time::{Duration, Timer};
 use firmware::fmt::Text;
-use firmware::platform::{self, Feed as _, Lamp as _};
+use firmware::platform::{self, FeedWatchdog as _, StatusLed as _};
 use firmware::tasks::fair::Fair;
 use firmware::tasks::gateway::{Gateway, MAX_LINKS};
 use firmware::tasks::led::Condition;
@@ -24,7 +23,7 @@ use static_cell::{ConstStaticCell, StaticCell};
 use crate::board::Board;
 use firmware::platform::Board as _;
 
-// What the tasks are made for: none of them can be generic.
+// The devices of the chosen board.
 type SerialDevice = <Board as platform::Board>::Serial;
 type CanDevice = <Board as platform::Board>::Can;
 type Ethernet = <Board as platform::Board>::Ethernet;
@@ -42,15 +41,15 @@ pub(crate) fn start(spawner: Spawner, mut board: Board) -> Tasks {
     led.set(true);
     static WATCH: StaticCell<Watch> = StaticCell::new();
     let tasks = Tasks { spawner, watch: WATCH.init_with(Watch::new) };
-    // First of all: if anything later hangs, the watchdog resets the board.
-    spawner.spawn(feeder(tasks.watch, board.watchdog()).expect("the first of its kind"));
-    // Both are all zeros: nothing of them is in flash or passes over the stack.
+    // First of all, so that the watchdog resets the board if anything later hangs.
+    spawner.spawn(feeder(tasks.watch, board.watchdog()).expect("it is spawned once"));
+    // Both are all zeros, so they take no flash, and are not built on the stack.
     static GATEWAY: ConstStaticCell<Gateway> = ConstStaticCell::new(Gateway::idle());
-    static ROOM: ConstStaticCell<Room> = ConstStaticCell::new(Room::BLANK);
-    let room = ROOM.take();
-    let loaded = load(&mut board, GATEWAY.take(), room.configuration());
+    static OVERLAY: ConstStaticCell<Overlay> = ConstStaticCell::new(Overlay::ZEROED);
+    let overlay = OVERLAY.take();
+    let loaded = load(&mut board, GATEWAY.take(), overlay.configuration());
     let gateway = loaded.as_ref().ok().map(|(gateway, _)| *gateway);
-    let started = loaded.and_then(|(gateway, wiring)| run(&tasks, board, gateway, wiring, room.links()));
+    let started = loaded.and_then(|(gateway, wiring)| run(&tasks, board, gateway, wiring, overlay.links()));
     tasks.spawn(TaskName::Led, |pulse| status_led(pulse, gateway.filter(|_| started.is_ok()), led));
     if let Err(reason) = started {
         tasks.spawn(TaskName::Refused, |pulse| refused(pulse, reason));
@@ -58,7 +57,7 @@ pub(crate) fn start(spawner: Spawner, mut board: Board) -> Tasks {
     tasks
 }
 
-/// Starts tasks. Nothing else does, so the watchdog knows all of them.
+/// Starts tasks. All tasks are started through it, so the watchdog knows all of them.
 #[derive(Clone, Copy)]
 pub(crate) struct Tasks {
     spawner: Spawner,
@@ -68,14 +67,14 @@ pub(crate) struct Tasks {
 type Watch = watchdog::Watch<MAX_TASKS>;
 
 impl Tasks {
-    /// Starts a task, which gets its pulse.
+    /// Starts a task with its pulse.
     pub(crate) fn spawn<S>(
         &self,
         name: TaskName,
         task: impl FnOnce(&'static Pulse) -> Result<SpawnToken<S>, SpawnError>,
     ) {
-        let pulse = self.watch.register(name).expect("MAX_TASKS counts all");
-        self.spawner.spawn(task(pulse).expect("its pool has as many as there are"));
+        let pulse = self.watch.register(name).expect("MAX_TASKS is large enough");
+        self.spawner.spawn(task(pulse).expect("its pool is large enough"));
     }
 }
 
@@ -103,24 +102,24 @@ impl core::fmt::Display for Refused {
     }
 }
 
-/// The tasks' part of the configuration.
+/// The parts of the configuration that the tasks need.
 struct Wiring {
     ports: heapless::Vec<(PortId, Bus), { firmware::tasks::gateway::MAX_FIELD_PORTS }>,
     links: heapless::Vec<(LinkId, LinkKind, Endpoint), MAX_LINKS>,
     network: Option<Network>,
 }
 
-/// Room that is used by one thing until everything is started, and by another afterwards.
-#[allow(clippy::large_enum_variant, reason = "that is what it is for")]
+/// Memory for the configuration during the start, and for the links' buffers afterwards.
+#[allow(clippy::large_enum_variant, reason = "both share one memory")]
 #[repr(u8)]
-enum Room {
+enum Overlay {
     Configuration(GatewayConfig),
     Links(heapless::Vec<u8, { MAX_LINKS * Buffers::SIZE }>),
 }
 
-impl Room {
+impl Overlay {
     /// All zeros, so that it takes no flash.
-    const BLANK: Self = Self::Configuration(GatewayConfig::empty());
+    const ZEROED: Self = Self::Configuration(GatewayConfig::empty());
 
     fn configuration(&mut self) -> &mut GatewayConfig {
         match self {
@@ -129,7 +128,7 @@ impl Room {
         }
     }
 
-    /// The links' buffers, in the place of the configuration.
+    /// The links' buffers, which replace the configuration.
     fn links(&mut self) -> &mut [u8] {
         *self = Self::Links(heapless::Vec::new());
         let Self::Links(buffers) = self else { return &mut [] };
@@ -138,7 +137,7 @@ impl Room {
     }
 }
 
-/// Not inlined: what is on the stack here is not there when the tasks run.
+/// Not inlined, so that its stack frame is free when the tasks run.
 #[inline(never)]
 fn load(
     board: &mut Board,
@@ -203,7 +202,7 @@ fn run(
         tasks.spawn(TaskName::Can(id), |pulse| can_port(pulse, gateway, id, can));
     }
     tasks.spawn(TaskName::Status, |pulse| status(pulse, gateway));
-    // The network is last: a missing PHY does not keep the field buses from running.
+    // The network is last, so that the field buses run without a PHY.
     let ethernet = board.ethernet().map_err(Refused::Ethernet)?;
     static RESOURCES: StaticCell<StackResources<SOCKETS>> = StaticCell::new();
     let resources = RESOURCES.init(StackResources::new());
@@ -234,7 +233,7 @@ fn network_config(own: Option<Network>) -> Config {
     })
 }
 
-/// Not watched: it is the one that feeds.
+/// The only task that is not watched.
 #[embassy_executor::task]
 async fn feeder(watch: &'static Watch, mut dog: Watchdog) -> ! {
     watchdog::run(watch, WATCHDOG_PERIOD, || dog.feed()).await
@@ -275,7 +274,7 @@ async fn controller_link(
 
 #[embassy_executor::task]
 async fn network(pulse: &'static Pulse, mut runner: Runner<'static, Fair<'static, Ethernet>>) -> ! {
-    // Its driver's waits are inside: that it is polled and comes back is all that can be seen.
+    // The stack's own waits cannot be wrapped: that it is polled and returns is all that is checked.
     let mut running = pin!(runner.run());
     pulse.run(pin!(pulse.idle(running.as_mut()))).await
 }
@@ -291,7 +290,7 @@ async fn status_led(pulse: &'static Pulse, gateway: Option<&'static Gateway>, mu
 async fn address(pulse: &'static Pulse, stack: Stack<'static>) -> ! {
     let telling = async {
         loop {
-            // A fixed address exists before the link is up, and cannot be reached yet.
+            // A fixed address exists before the link is up, but cannot be reached yet.
             pulse.idle(pin!(stack.wait_link_up())).await;
             pulse.idle(pin!(stack.wait_config_up())).await;
             if let Some(config) = stack.config_v4() {
@@ -309,7 +308,7 @@ async fn status(pulse: &'static Pulse, gateway: &'static Gateway) -> ! {
     pulse.run(pin!(firmware::tasks::status::run(gateway, pulse))).await
 }
 
-/// Logs again and again why nothing runs, for readers who come later.
+/// Logs the reason repeatedly, because the log may be read late.
 #[embassy_executor::task]
 async fn refused(pulse: &'static Pulse, reason: Refused) -> ! {
     let what = if matches!(reason, Refused::Ethernet(_)) { "no controller" } else { "nothing runs" };
@@ -324,7 +323,7 @@ async fn refused(pulse: &'static Pulse, reason: Refused) -> ! {
 
 /// One for each link, DHCP and DNS.
 const SOCKETS: usize = MAX_LINKS + 2;
-/// Interval of logging the reason.
+/// Interval of that log line.
 const REPEAT: Duration = Duration::from_secs(10);
 /// A task for each port and link, and: engine, network, address, status, LED, refused, the board's own.
 const MAX_TASKS: usize = SERIAL_PORTS + CAN_PORTS + MAX_LINKS + 7;

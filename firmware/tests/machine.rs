@@ -1,4 +1,4 @@
-//! The firmware's last resorts in QEMU: the watchdog, the exit codes, and what is said before.
+//! The firmware in QEMU when something goes wrong: watchdog, exit codes, and the log before.
 //!
 //! They need QEMU (`apt-get install qemu-system-arm`), the firmware for `mps2-an500` and `host-sim`:
 //! `FIRMWARE_ELF=... HOST_SIM=target/debug/host-sim cargo test -p firmware --test machine -- --ignored`
@@ -11,19 +11,19 @@ use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
 use std::time::{Duration, Instant};
 
-/// A running machine; its log comes line by line.
+/// A running machine, with the lines of its log.
 struct Machine {
     qemu: Child,
     lines: Receiver<String>,
     log: String,
-    /// The folder of QEMU's monitor.
+    /// Folder of the socket of QEMU's monitor.
     monitor: tempfile::TempDir,
 }
 
 impl Machine {
-    /// Starts it with an image (or the name of a file that is not there), a trouble, and more options.
-    fn start(image: &Path, trouble: &str, options: &[&str]) -> Self {
-        let arguments = format!("enable=on,target=native,arg=firmware,arg={},arg={trouble}", image.display());
+    /// Starts it with an image (or the name of a missing file), a fault to inject, and more options.
+    fn start(image: &Path, fault: &str, options: &[&str]) -> Self {
+        let arguments = format!("enable=on,target=native,arg=firmware,arg={},arg={fault}", image.display());
         let monitor = tempfile::tempdir().unwrap();
         let socket = format!("unix:{}/socket,server=on,wait=off", monitor.path().display());
         let mut qemu = Command::new("qemu-system-arm")
@@ -63,7 +63,7 @@ impl Machine {
         panic!("{text:?} was never said:\n{}", self.log);
     }
 
-    /// Waits until the machine is gone; everything that was said.
+    /// Waits until the machine has ended; returns its whole log.
     #[track_caller]
     fn end(mut self) -> (ExitStatus, String) {
         let limit = Instant::now() + PATIENCE;
@@ -78,7 +78,7 @@ impl Machine {
         (self.qemu.wait().unwrap(), log)
     }
 
-    /// What QEMU's monitor shows of the word at an address, again and again until all these were seen.
+    /// Polls the word at an address through QEMU's monitor until it has had all these values.
     fn until_seen(&self, address: u32, values: &[u32]) {
         let mut monitor = UnixStream::connect(self.monitor.path().join("socket")).unwrap();
         monitor.set_read_timeout(Some(PATIENCE)).unwrap();
@@ -89,7 +89,7 @@ impl Machine {
             assert!(Instant::now() < limit, "{missing:08X?} never stood at {address:08X}");
             writeln!(monitor, "xp /1wx {address}").unwrap();
             let mut line = String::new();
-            // Its echo and its prompt come in between.
+            // Skips the echo and the prompt.
             while !line.starts_with("00000000") {
                 line.clear();
                 assert_ne!(answers.read_line(&mut line).unwrap(), 0, "QEMU ended");
@@ -100,7 +100,7 @@ impl Machine {
         }
     }
 
-    /// Everything that is said in so long a time.
+    /// Collects the log for `time`; returns all of it.
     fn listen(&mut self, time: Duration) -> &str {
         let limit = Instant::now() + time;
         while let Ok(line) = self.lines.recv_timeout(limit.saturating_duration_since(Instant::now())) {
@@ -120,7 +120,7 @@ impl Drop for Machine {
 fn variable(name: &str) -> PathBuf {
     let value =
         std::env::var_os(name).unwrap_or_else(|| panic!("{name} is not set; see the top of this file"));
-    // Cargo runs tests in the package's folder.
+    // Relative to the workspace: Cargo runs tests in the package's folder.
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(value)
 }
 
@@ -137,7 +137,7 @@ fn image(folder: &tempfile::TempDir, example: &str, sets: &[&str]) -> PathBuf {
     image
 }
 
-/// An Ethernet cable to the machine: each datagram is a frame.
+/// The Ethernet cable to the machine: each datagram is a frame.
 struct Cable {
     socket: UdpSocket,
     machine: u16,
@@ -164,19 +164,19 @@ impl Cable {
         frame
     }
 
-    /// To whoever sent `frame`.
+    /// Answers the sender of `frame`.
     fn answer(&self, frame: &[u8], kind: [u8; 2], payload: &[u8]) {
         let whole = [&frame[6..12], &CABLE_END, &kind, payload].concat();
         self.socket.send_to(&whole, ("127.0.0.1", self.machine)).unwrap();
     }
 
-    /// Every address of the network is at this end.
+    /// Answers an ARP request: every address is at this end.
     fn answer_arp(&self, frame: &[u8]) {
         let (sender, asked) = (&frame[22..32], &frame[38..42]);
         self.answer(frame, [8, 6], &[&[0, 1, 8, 0, 6, 4, 0, 2][..], &CABLE_END, asked, sender].concat());
     }
 
-    /// Every name has this address.
+    /// Answers a DNS query with this address.
     fn answer_dns(&self, frame: &[u8], address: [u8; 4]) {
         let (ip, udp) = (&frame[14..34], &frame[34..]);
         let question = &udp[8..usize::from(u16::from_be_bytes([udp[4], udp[5]]))];
@@ -219,9 +219,14 @@ fn a_task_that_hangs_is_named_and_then_the_machine_is_reset() {
     let (status, log) = Machine::start(nothing(), "stall", &["-no-reboot"]).end();
     assert_said(
         &log,
-        &["nothing runs", "task board 0 does not respond", "the watchdog was not fed", "no task was running"],
+        &[
+            "nothing runs",
+            &format!("task {FAULTY_TASK} does not respond"),
+            "the watchdog was not fed",
+            "no task was running",
+        ],
     );
-    // QEMU ends in place of a reset.
+    // QEMU ends instead of resetting.
     assert_eq!(status.code(), Some(0));
 }
 
@@ -231,7 +236,7 @@ fn a_task_that_keeps_the_processor_is_named_and_after_the_reset_all_begins_again
     let mut machine = Machine::start(nothing(), "spin", &[]);
     machine.until("recipe gateway");
     machine.until("the watchdog was not fed");
-    machine.until("task board 0 was running");
+    machine.until(&format!("task {FAULTY_TASK} was running"));
     machine.until("recipe gateway");
     machine.until("nothing runs");
 }
@@ -246,8 +251,8 @@ fn the_led_blinks_when_nothing_runs() {
     }
 }
 
-/// The board has the address of its file, asks the file's name server for the controller, and connects
-/// to where that says it is.
+/// The board uses the address of its file, asks the file's name server for the controller, and connects to the
+/// answer.
 #[test]
 #[ignore = "needs QEMU and the firmware"]
 fn with_an_address_of_its_own_the_board_finds_the_controller_by_name() {
@@ -278,7 +283,7 @@ fn with_an_address_of_its_own_the_board_finds_the_controller_by_name() {
     assert!(asked > 0);
 }
 
-/// Longer than the watchdog's period; the links to a controller that is not there come and go meanwhile.
+/// For longer than the watchdog's period, while links to a missing controller are retried.
 #[test]
 #[ignore = "needs QEMU and the firmware"]
 fn a_run_without_trouble_never_starves_the_watchdog() {
@@ -289,7 +294,7 @@ fn a_run_without_trouble_never_starves_the_watchdog() {
     let log = machine.listen(Duration::from_secs(12));
     assert_eq!(log.matches("recipe gateway").count(), 1, "{log}");
     assert!(!log.contains("watchdog") && !log.contains("panicked"), "{log}");
-    // What the machine code says that the stack can take, where somebody looked (.ci/stack).
+    // The bound computed from the machine code (.ci/stack), if given.
     if let Ok(bound) = std::env::var("FIRMWARE_STACK") {
         let used = log.split_once("stack: ").and_then(|(_, rest)| rest.split_once(' ')).unwrap().0;
         assert!(used.parse::<u32>().unwrap() <= bound.parse().unwrap(), "{used} of {bound} bytes");
@@ -300,27 +305,29 @@ fn a_run_without_trouble_never_starves_the_watchdog() {
 #[ignore = "needs QEMU and the firmware"]
 fn a_panic_says_where_and_ends_with_101() {
     let (status, log) = Machine::start(nothing(), "panic", &[]).end();
-    assert_said(&log, &["panicked at", "as asked", "task board 0 was running"]);
+    assert_said(&log, &["panicked at", "as asked", &format!("task {FAULTY_TASK} was running")]);
     assert_eq!(status.code(), Some(101));
 }
 
 #[test]
 #[ignore = "needs QEMU and the firmware"]
 fn a_stack_overflow_and_a_read_of_nothing_fault_and_end_with_102() {
-    for trouble in ["overflow", "fault"] {
-        let (status, log) = Machine::start(nothing(), trouble, &[]).end();
-        assert_said(&log, &["hard fault", "task board 0 was running"]);
+    for fault in ["overflow", "fault"] {
+        let (status, log) = Machine::start(nothing(), fault, &[]).end();
+        assert_said(&log, &["hard fault", &format!("task {FAULTY_TASK} was running")]);
         assert!(!log.contains("panicked"), "{log}");
-        assert_eq!(status.code(), Some(102), "{trouble}");
+        assert_eq!(status.code(), Some(102), "{fault}");
     }
 }
 
+/// The task with the injected fault.
+const FAULTY_TASK: &str = "board 0";
 /// IP protocols.
 const TCP: u8 = 6;
 const UDP: u8 = 17;
-/// The Ethernet address at our end.
+/// The Ethernet address of the test's end.
 const CABLE_END: [u8; 6] = [2, 0x11, 0x22, 0x33, 0x44, 0x66];
-/// The machine's LEDs, a bit each.
+/// The register of the machine's LEDs.
 const FPGAIO_LED: u32 = 0x4002_8000;
-/// What does not come within this time never comes.
+/// Limit of every wait.
 const PATIENCE: Duration = Duration::from_secs(120);

@@ -18,10 +18,6 @@ const COMMAND: LinkId = LinkId::COMMAND;
 const STATE: LinkId = LinkId::STATE;
 const UDP: LinkId = LinkId::RECIPE_UDP;
 
-fn coils(address: u16, byte: u8) -> Written {
-    Written::Coils(address, (0..8).map(|bit| byte >> bit & 1 == 1).collect())
-}
-
 fn tick(rig: &mut Rig) {
     rig.input(Input::Tick);
 }

@@ -18,7 +18,7 @@ fn only_a_whole_frame_of_the_links_output_part_is_one() {
     cell.recipe_link(both);
     let listen = |port: u16| heapless::String::try_from(format!("0.0.0.0:{port}").as_str()).unwrap();
     let listens = LinkId::of_port(cell.port(Bus::UdpListen { listen: listen(50_000) }, both));
-    let tells = LinkId::of_port(cell.port(Bus::UdpListen { listen: listen(50_001) }, up));
+    let writes = LinkId::of_port(cell.port(Bus::UdpListen { listen: listen(50_001) }, up));
     let field = cell.rs485(up);
     let rig = cell.rig();
     let is_frame = |link, bytes: &[u8]| rig.engine.is_frame(link, bytes);
@@ -39,7 +39,7 @@ fn only_a_whole_frame_of_the_links_output_part_is_one() {
         let input = [&[255, 255][..], &1.0_f32.to_le_bytes(), &[238, 238]].concat();
         assert!(!is_frame(link, &input), "what we send is none");
     }
-    for link in [tells, LinkId::of_port(field), LinkId::STATE, LinkId::MODBUS, LinkId::URGENT, LinkId(200)] {
+    for link in [writes, LinkId::of_port(field), LinkId::STATE, LinkId::MODBUS, LinkId::URGENT, LinkId(200)] {
         assert!(!is_frame(link, &frame(1.0)), "{link:?} has no output part");
     }
     let counters = rig.link(listens).counters;

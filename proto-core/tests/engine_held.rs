@@ -13,7 +13,7 @@ const SENSOR: PortId = PortId(0);
 const BUTTONS: PortId = PortId(1);
 const UDP: LinkId = LinkId::RECIPE_UDP;
 
-/// What tells that the controller is there.
+/// What shows that the controller is there.
 #[derive(Clone, Copy, PartialEq)]
 enum By {
     Connection,

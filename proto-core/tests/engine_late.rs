@@ -18,11 +18,7 @@ const MODBUS: LinkId = LinkId::MODBUS;
 const COMMAND: LinkId = LinkId::COMMAND;
 const STATE: LinkId = LinkId::STATE;
 
-fn coils(address: u16, byte: u8) -> Written {
-    Written::Coils(address, (0..8).map(|bit| byte >> bit & 1 == 1).collect())
-}
-
-/// Nobody calls the engine; what is told next is told before the tick that is due.
+/// The driver does not call the engine for this long; the test's next input comes before the tick that is due.
 fn stall(rig: &mut Rig, millis: u64) {
     tick(rig);
     rig.now += MS(millis);
@@ -337,7 +333,7 @@ impl Loop {
             }
         }
         if self.ports.iter().flatten().any(|(at, _)| *at <= self.now) {
-            // Something still waits: it is told before deadlines pass.
+            // Something still waits: it is reported before deadlines pass.
             return;
         }
         if until <= self.now {

@@ -155,19 +155,19 @@ fn the_newest_command_of_a_port_is_told_with_its_outcome() {
     let recipe = cell.recipe(Mode::User, Parts::Stream { input, output: None });
     let panel = cell.rs485(recipe);
     let mut rig = cell.rig();
-    let told = |rig: &Rig| {
+    let newest_command = |rig: &Rig| {
         let status = rig.engine.status(rig.now);
         let panel = port(&status, "port0");
         (panel.command.map(str::to_owned), panel.reply)
     };
-    assert_eq!(told(&rig), (None, ReplyCode::None));
+    assert_eq!(newest_command(&rig), (None, ReplyCode::None));
     rig.run(MS(10));
     rig.bytes(panel, &[255, 1, 254]);
-    assert_eq!(told(&rig), (Some("run(pick.jspf)".into()), ReplyCode::Pending));
+    assert_eq!(newest_command(&rig), (Some("run(pick.jspf)".into()), ReplyCode::Pending));
     rig.link_bytes(LinkId::COMMAND, b"run fail\r\n");
-    assert_eq!(told(&rig), (Some("run(pick.jspf)".into()), ReplyCode::Fail));
+    assert_eq!(newest_command(&rig), (Some("run(pick.jspf)".into()), ReplyCode::Fail));
     rig.bytes(panel, &[255, 2, 254]);
-    assert_eq!(told(&rig).0.as_deref(), Some("resume"));
+    assert_eq!(newest_command(&rig).0.as_deref(), Some("resume"));
 }
 
 #[test]

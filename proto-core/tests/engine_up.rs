@@ -9,10 +9,6 @@ use rig::*;
 const ON: &[u8] = &[0xFF, 0xFF, 1, 0xEE, 0xEE];
 const OFF: &[u8] = &[0xFF, 0xFF, 0, 0xEE, 0xEE];
 
-fn coils(address: u16, byte: u8) -> Written {
-    Written::Coils(address, (0..8).map(|bit| byte >> bit & 1 == 1).collect())
-}
-
 /// Worked example 2: DigitalOutputCommand[1] from an RS-485 device.
 fn digital_output() -> (Rig, PortId) {
     let mut cell = Cell::new();

@@ -10,7 +10,7 @@ use proto_core::recipe::{CanLayout, Deframer, StreamLayout, datagram};
 use proto_core::sysvar::{Direction, IMAGE_BYTES, SysVar};
 use proto_core::wire::can::CanId;
 use proto_core::wire::scalar::{Scalar, ScalarType};
-use reference::Line;
+use reference::PlainDeframer;
 
 /// A part that keeps every rule, and its fields.
 type Recipe = (StreamLayout, Vec<Field>);
@@ -200,7 +200,7 @@ proptest! {
         all in many((many(prop_oneof![Just(0xFF_u8), Just(0xFE), any::<u8>()], 1..60), 0..6_u8, any::<u16>()), 1..20),
         sizes in sizes(),
     ) {
-        let (mut deframer, mut line) = (Deframer::new(), Line::new(&recipe.0));
+        let (mut deframer, mut line) = (Deframer::new(), PlainDeframer::new(&recipe.0));
         for (bytes, kind, at) in &all {
             let mut piece = encode(&recipe, &values(&recipe.1, bytes));
             let at = usize::from(*at) % piece.len();

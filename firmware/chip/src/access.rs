@@ -1,4 +1,4 @@
-//! What is noted of the program's accesses to registers, and the one that it may not do.
+//! The record of the program's register accesses, and the violation that ends a run.
 
 use std::fmt;
 
@@ -7,19 +7,19 @@ use crate::device::Picos;
 /// An access to a register.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Access {
-    /// When.
+    /// Virtual time.
     pub at: Picos,
-    /// The beginning of the block of instructions that it is in.
+    /// Start of the basic block that contains the instruction.
     pub pc: u32,
     /// The peripheral's name.
     pub peripheral: &'static str,
-    /// The register's.
+    /// The register's name.
     pub register: String,
-    /// What was read or written.
+    /// The value read or written.
     pub value: u32,
-    /// It was written.
+    /// Whether it was a write.
     pub is_write: bool,
-    /// How often the same in a row; 0 for what the peripheral does by itself.
+    /// Number of identical accesses in a row; 0 for an action of the peripheral itself.
     pub times: u32,
 }
 
@@ -35,12 +35,12 @@ impl fmt::Display for Access {
     }
 }
 
-/// What the program may not do.
+/// Something that the program must not do.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Violation {
-    /// The access that shows it.
+    /// The access at fault.
     pub access: Access,
-    /// Why not.
+    /// Why it is not allowed.
     pub reason: String,
 }
 

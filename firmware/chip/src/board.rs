@@ -1,11 +1,11 @@
-//! What the core's accesses meet: the devices in virtual time, with their clocks looked after and each
-//! access noted.
+//! The bus: routes the core's accesses to the devices, advances these in virtual time, checks clocks and
+//! resets, and records each access.
 
 mod blocks;
 
 use std::collections::VecDeque;
 
-use self::blocks::FOR_EVER;
+use self::blocks::ENDLESS;
 use crate::access::{Access, Violation};
 use crate::device::*;
 use crate::devices::{CAN, Devices, Id, MAP};
@@ -17,32 +17,32 @@ use crate::unicorn::{Engine, Flow, Handler, Reg, SYSTEM};
 /// Why a handler stopped the core.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Halt {
-    /// It waits for an event, at the instruction before this address.
+    /// At the WFE or WFI at this address.
     Wait(u32),
 }
 
-/// Devices, time, and what is noted of them.
+/// Devices, virtual time and the access record.
 pub(crate) struct Board {
     pub(crate) devices: Devices,
     pub(crate) scs: Scs,
     pub(crate) now: Picos,
-    /// Up to here the core runs on its own.
+    /// The core runs at most up to this time.
     pub(crate) limit: Picos,
     pub(crate) halt: Option<Halt>,
     pub(crate) violation: Option<Violation>,
     pub(crate) guard_changed: bool,
-    /// The next instruction is executed, whatever is due.
-    pub(crate) is_forced: bool,
+    /// Execute the next instruction even if something is due.
+    pub(crate) is_single_step: bool,
     /// The last accesses.
     pub(crate) accesses: VecDeque<Access>,
-    pub(crate) keep: usize,
+    pub(crate) max_accesses: usize,
     pub(crate) instructions: u64,
     functions: Functions,
     clocks: Clocks,
     cycle: Picos,
     deadline: Picos,
-    is_wanted: bool,
-    /// Instructions of the blocks of flash that were met: length in bytes, and number.
+    has_pending: bool,
+    /// Length in bytes and number of instructions of each basic block seen in flash, by its address.
     blocks: Vec<(u16, u16)>,
 }
 
@@ -56,22 +56,22 @@ impl Board {
             halt: None,
             violation: None,
             guard_changed: false,
-            is_forced: false,
+            is_single_step: false,
             accesses: VecDeque::new(),
-            keep: 64,
+            max_accesses: 64,
             instructions: 0,
             functions: [[None; 16]; 11],
             clocks: Clocks::default(),
             cycle: 1,
             deadline: 0,
-            is_wanted: false,
+            has_pending: false,
             blocks: vec![(0, 0); FLASH_SIZE as usize / 2],
         };
-        board.follow_clocks();
+        board.update_clocks();
         board
     }
 
-    /// Everything but time and what is outside of the chip.
+    /// Resets the chip; virtual time and what is outside the chip stay as they are.
     pub(crate) fn reset(&mut self, by_watchdog: bool) {
         for place in &MAP {
             if place.id != Id::Rcc {
@@ -87,48 +87,48 @@ impl Board {
         self.functions = [[None; 16]; 11];
         self.halt = None;
         self.guard_changed = true;
-        self.follow_clocks();
+        self.update_clocks();
     }
 
-    fn follow_clocks(&mut self) {
+    fn update_clocks(&mut self) {
         self.clocks = self.devices.rcc.clocks();
         self.cycle = cycle(self.clocks.core);
         self.refresh();
     }
 
-    /// Runs `act` on the devices with what they may know.
-    fn with<T>(&mut self, act: impl FnOnce(&mut Devices, &mut Scs, &Moment<'_>) -> T) -> T {
+    /// Calls `act` with the devices and the present [`Context`].
+    fn with_devices<T>(&mut self, act: impl FnOnce(&mut Devices, &mut Scs, &Context<'_>) -> T) -> T {
         let is_rmii = self.devices.syscfg.is_rmii();
-        let at = Moment { now: self.now, clocks: self.clocks, functions: &self.functions, is_rmii };
+        let at = Context { now: self.now, clocks: self.clocks, functions: &self.functions, is_rmii };
         act(&mut self.devices, &mut self.scs, &at)
     }
 
-    /// Deadline and interrupts as they are now.
+    /// Updates the next deadline and the interrupt lines.
     fn refresh(&mut self) {
-        let (deadline, is_wanted) = self.with(|devices, scs, at| {
+        let (deadline, has_pending) = self.with_devices(|devices, scs, at| {
             let mut deadline = scs.deadline().unwrap_or(Picos::MAX);
             for place in MAP.iter().filter(|place| place.changes_with_time()) {
                 let device = devices.device(place.id);
                 deadline = deadline.min(device.deadline(at).unwrap_or(Picos::MAX));
                 if let Some(line) = place.line {
-                    scs.set_line(line, device.interrupts());
+                    scs.set_line(line, device.interrupt_line());
                 }
             }
-            (deadline, scs.wanted().is_some())
+            (deadline, scs.most_urgent().is_some())
         });
         self.deadline = deadline.min(self.limit);
-        self.is_wanted = is_wanted;
+        self.has_pending = has_pending;
     }
 
-    /// When something is due next.
+    /// Time of the next event of any device.
     pub(crate) fn deadline(&mut self) -> Picos {
         self.refresh();
         self.deadline
     }
 
-    /// All devices do what is due by now.
+    /// Lets all devices carry out what is due.
     pub(crate) fn advance(&mut self, core: Engine) {
-        let refused = self.with(|devices, scs, at| {
+        let refused = self.with_devices(|devices, scs, at| {
             scs.advance(at);
             let mut memory = core;
             for place in MAP.iter().filter(|place| place.changes_with_time()) {
@@ -158,7 +158,7 @@ impl Board {
         self.refresh();
     }
 
-    /// The program writes to flash.
+    /// A write by the program to flash memory.
     pub(crate) fn program_flash(&mut self, pc: u32, offset: u32, bytes: &[u8]) {
         let mut value = [0; 4];
         value[..bytes.len()].copy_from_slice(bytes);
@@ -174,11 +174,11 @@ impl Board {
         if let Err(Refusal(reason)) = self.devices.flash.program(offset, bytes, self.now) {
             self.violation.get_or_insert(Violation { access: access.clone(), reason });
         }
-        self.note(access);
+        self.record(access);
         self.refresh();
     }
 
-    fn note(&mut self, access: Access) {
+    fn record(&mut self, access: Access) {
         if let Some(last) = self.accesses.back_mut()
             && (last.pc, last.peripheral, last.value, last.is_write)
                 == (access.pc, access.peripheral, access.value, access.is_write)
@@ -187,23 +187,23 @@ impl Board {
             last.times += 1;
             return;
         }
-        if self.accesses.len() >= self.keep {
+        if self.accesses.len() >= self.max_accesses {
             self.accesses.pop_front();
         }
         self.accesses.push_back(access);
     }
 
-    fn reach(&mut self, core: Engine, address: u32, size: u32, value: Option<u32>) -> u32 {
+    fn access(&mut self, core: Engine, address: u32, size: u32, value: Option<u32>) -> u32 {
         let (name, register, result) = if address >= SYSTEM {
             let offset = address.wrapping_sub(0xE000_E000);
-            let result = self.with(|_, scs, at| match value {
+            let result = self.with_devices(|_, scs, at| match value {
                 Some(value) => scs.write(offset, value, size, at).map(|()| value),
                 None => scs.read(offset, size, at),
             });
             self.guard_changed |= value.is_some() && (0xD90..0xDB0).contains(&offset);
             ("core", Scs::name(offset), result)
         } else {
-            self.reach_device(address, size, value)
+            self.access_device(address, size, value)
         };
         let is_write = value.is_some();
         let access = Access {
@@ -218,10 +218,10 @@ impl Board {
         if let Err(Refusal(reason)) = &result {
             self.violation.get_or_insert(Violation { access: access.clone(), reason: reason.clone() });
         }
-        self.note(access);
+        self.record(access);
         if is_write && name == "RCC" {
-            self.follow_resets();
-            self.follow_clocks();
+            self.apply_resets();
+            self.update_clocks();
             self.check_speed();
         }
         if is_write && name.starts_with("GPIO") {
@@ -235,7 +235,7 @@ impl Board {
         result.unwrap_or(0)
     }
 
-    fn reach_device(
+    fn access_device(
         &mut self,
         address: u32,
         size: u32,
@@ -243,20 +243,20 @@ impl Board {
     ) -> (&'static str, String, Result<u32, Refusal>) {
         let found = MAP.iter().find(|place| (place.base..place.base + place.size).contains(&address));
         let Some(place) = found else {
-            return ("nothing", format!("{address:08X}"), refuse("there is nothing that is modelled"));
+            return ("nothing", format!("{address:08X}"), refuse("nothing is modelled at this address"));
         };
         let offset = address - place.base;
         if place.id == Id::CanRam {
             let word = (offset / 4) as usize;
             let can = &mut self.devices.can;
-            let result = self.devices.rcc.check(CAN.expect("it has one")).and_then(|()| match value {
+            let result = self.devices.rcc.check(CAN.expect("FDCAN1 has a gate")).and_then(|()| match value {
                 _ if size != 4 => refuse("32 bits at a time"),
                 Some(value) => can.ram_write(word, value).map(|()| value),
                 None => can.ram_read(word),
             });
             return (place.name, format!("[{word}]"), result);
         }
-        let result = self.with(|devices, _, at| {
+        let result = self.with_devices(|devices, _, at| {
             if let Some(gate) = place.gate {
                 devices.rcc.check(gate)?;
             }
@@ -265,7 +265,7 @@ impl Board {
             }
             let device = devices.device(place.id);
             match value {
-                Some(_) if size != 4 && !(size == 2 && device.takes_halves()) => {
+                Some(_) if size != 4 && !(size == 2 && device.accepts_halfwords()) => {
                     refuse(format!("a write of {} bits", 8 * size))
                 }
                 Some(value) => device.write(offset, value, at).map(|()| value),
@@ -281,8 +281,8 @@ impl Board {
         (place.name, register, result)
     }
 
-    /// What is held in reset is as after a reset.
-    fn follow_resets(&mut self) {
+    /// Resets the devices whose reset bit is set.
+    fn apply_resets(&mut self) {
         for place in &MAP {
             if place.gate.is_some_and(|gate| self.devices.rcc.is_held(gate)) {
                 self.devices.device(place.id).reset();
@@ -290,7 +290,7 @@ impl Board {
         }
     }
 
-    /// Whether voltage and flash can keep up with the clock.
+    /// Checks that the core voltage and the flash wait states allow the present clock.
     fn check_speed(&mut self) {
         let (clocks, fastest) = (self.clocks, self.devices.pwr.fastest(self.now));
         let reason = if clocks.core > fastest {
@@ -308,36 +308,36 @@ impl Board {
 
 impl Handler for Board {
     fn read(&mut self, core: Engine, address: u32, size: u32) -> u32 {
-        self.reach(core, address, size, None)
+        self.access(core, address, size, None)
     }
 
     fn write(&mut self, core: Engine, address: u32, value: u32, size: u32) {
-        self.reach(core, address, size, Some(value));
+        self.access(core, address, size, Some(value));
     }
 
     fn block(&mut self, core: Engine, address: u32, len: u32) -> Flow {
-        let is_asked = self.violation.is_some() || self.halt.is_some() || self.guard_changed;
-        let is_over = self.now >= self.deadline || is_asked;
-        let is_over = is_over || self.is_wanted && self.scs.due(masks(core)).is_some();
-        if is_over && !self.is_forced {
+        let must_stop = self.violation.is_some() || self.halt.is_some() || self.guard_changed;
+        let is_due = self.now >= self.deadline || must_stop;
+        let is_due = is_due || self.has_pending && self.scs.due(masks(core)).is_some();
+        if is_due && !self.is_single_step {
             return Flow::Stop;
         }
         let count = self.count(core, address, len);
-        if count == u64::from(FOR_EVER) {
-            // Nothing but an interrupt leads out of it.
+        if count == u64::from(ENDLESS) {
+            // Only an interrupt can end it.
             self.now = self.now.max(self.deadline);
             return Flow::Stop;
         }
         self.instructions += count;
         self.now += count * self.cycle;
-        Flow::On
+        Flow::Continue
     }
 
     fn watched(&mut self, core: Engine, address: u32) -> Flow {
         match core.word(address) as u16 {
             SEV => {
                 self.scs.event = true;
-                Flow::On
+                Flow::Continue
             }
             _ => {
                 self.halt = Some(Halt::Wait(address));
@@ -347,7 +347,7 @@ impl Handler for Board {
     }
 }
 
-/// Where flash is.
+/// Address of flash.
 pub(crate) const FLASH: u32 = 0x0800_0000;
-/// Both banks.
+/// Size of both banks together.
 pub(crate) const FLASH_SIZE: u32 = 0x20_0000;

@@ -1,11 +1,11 @@
 //! The whole chip on its board: memory, core, devices and virtual time.
 //!
-//! In: the program, the configuration image, what happens at the pins. Out: what the program did there,
-//! its log, and the first thing it was not allowed to do.
+//! In: the program, the configuration image, signals at the pins. Out: signals at the pins, the program's log,
+//! and its first violation.
 //!
-//! Time is counted in instructions, one a cycle; while the core waits for an event it jumps to the next
-//! deadline of a device. Nothing else moves it, so a run is the same each time and everywhere. A run
-//! that keeps pace with the clock on the wall is made of short ones ([`crate::realtime`]).
+//! Each instruction takes one cycle; while the core sleeps, time jumps to the next deadline of a device.
+//! Nothing else advances time, so every run is the same on every machine. Real time is made of short runs
+//! ([`crate::realtime`]).
 
 mod flash;
 mod log;
@@ -22,11 +22,11 @@ use crate::models::scs::HARD_FAULT;
 use crate::program::Program;
 use crate::unicorn::{Core, Engine, Exit, MMIO, Reg};
 
-/// Where the configuration image is.
+/// Address of the configuration image.
 pub const CONFIG: u32 = 0x081C_0000;
 const SYSTEM_FLASH: u32 = 0x1FF0_0000;
 const UNIQUE_ID: u32 = 0x1FF1_E800;
-/// RAM: start, size, and what it holds when power has come.
+/// RAM: address, size, and the byte it is filled with at power-on.
 const RAM: [(u32, u32, u8); 2] = [(0x2000_0000, 0x2_0000, 0x5A), (0x2400_0000, 0x8_0000, 0xA5)];
 
 /// The chip.
@@ -36,31 +36,31 @@ pub struct Chip {
     program: &'static Program,
     pc: u32,
     is_locked_up: bool,
-    /// It waits for an event.
+    /// It is in WFE or WFI.
     is_asleep: bool,
     /// Steps since the log was read.
-    unread: u32,
-    /// The range that nobody may touch.
+    steps_unread: u32,
+    /// The range of the MPU's guard region that is in effect.
     closed: Option<(u32, u32)>,
-    /// Times in a row that a deadline was not ahead.
-    stuck: u32,
+    /// Consecutive deadlines that were not in the future.
+    stalled: u32,
     decoder: Option<Box<dyn StreamDecoder + Send + Sync>>,
-    /// Each line of the log, and when it was read.
+    /// The lines of the log, with the time at which each was read.
     pub log: Vec<(Picos, String)>,
-    /// When the watchdog has reset the chip.
+    /// Times of the watchdog's resets.
     pub resets: Vec<Picos>,
-    /// Where the program faulted: the instruction, CFSR's new bits.
+    /// Faults: address of the instruction, and the bits set in CFSR.
     pub faults: Vec<(u32, u32)>,
-    /// How often the core waited for an event with nothing to do.
+    /// How often the core went to sleep.
     pub waits: u64,
 }
 
 /// Why a run ended early.
 #[derive(Debug)]
 pub struct Stopped {
-    /// What was not allowed.
+    /// What the program did wrong.
     pub violation: Violation,
-    /// Where that is.
+    /// The function it is in.
     pub place: String,
 }
 
@@ -71,10 +71,10 @@ impl std::fmt::Display for Stopped {
 }
 
 impl Chip {
-    /// The board with that program, and a configuration image in flash; power has just come.
+    /// A board after power-on, with the program and the configuration image in flash.
     ///
     /// # Errors
-    /// The library is missing.
+    /// The emulator's library is missing.
     pub fn new(program: &'static Program, image: &[u8]) -> Result<Self, String> {
         let mut board = Board::new();
         for (address, bytes) in &program.segments {
@@ -89,9 +89,9 @@ impl Chip {
             pc: 0,
             is_locked_up: false,
             is_asleep: false,
-            unread: 0,
+            steps_unread: 0,
             closed: None,
-            stuck: 0,
+            stalled: 0,
             decoder: program.log_reader(),
             log: Vec::new(),
             resets: Vec::new(),
@@ -103,7 +103,7 @@ impl Chip {
         Ok(chip)
     }
 
-    /// A new core with that RAM, at the reset vector.
+    /// A new core at the reset vector, with this RAM.
     fn start(&mut self, ram: &[Vec<u8>; 2]) -> Result<(), String> {
         self.core = Core::new()?;
         let core = &self.core;
@@ -116,7 +116,7 @@ impl Chip {
         core.engine().write(FLASH, self.board.devices.flash.cells());
         core.engine().write(UNIQUE_ID, &[1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12]);
         for range in MMIO {
-            core.devices(range)?;
+            core.map_devices(range)?;
         }
         for address in &self.program.waits {
             core.watch(*address)?;
@@ -134,22 +134,23 @@ impl Chip {
         Ok(())
     }
 
-    /// A flash word (32 bytes) whose writing was cut off: reading it is a bus fault.
+    /// Makes a flash word (32 bytes) torn, as by a power failure while it is programmed: reading it is a bus
+    /// fault.
     ///
     /// # Errors
-    /// The library does not take it.
+    /// The emulator refuses it.
     pub fn tear(&mut self, address: u32) -> Result<(), String> {
         self.board.devices.flash.tear(address - FLASH);
         self.close_page(address)
     }
 
-    /// Another instruction in the program, until the next reset.
+    /// Replaces instructions of the program until the next reset.
     pub fn patch(&mut self, address: u32, code: &[u8]) {
         self.engine().write(address, code);
-        self.core.forget(address, code.len() as u32);
+        self.core.invalidate(address, code.len() as u32);
     }
 
-    /// Memory and registers.
+    /// Access to memory and the core's registers.
     pub fn engine(&self) -> Engine {
         self.core.engine()
     }
@@ -159,63 +160,63 @@ impl Chip {
         self.program
     }
 
-    /// The present.
+    /// Virtual time.
     pub fn now(&self) -> Picos {
         self.board.now
     }
 
-    /// The models.
+    /// The models of the peripherals.
     pub fn devices(&mut self) -> &mut Devices {
         &mut self.board.devices
     }
 
-    /// Instructions that were executed.
+    /// Number of executed instructions.
     pub fn instructions(&self) -> u64 {
         self.board.instructions
     }
 
-    /// Interrupts and exceptions that were taken.
+    /// Number of interrupts and exceptions taken.
     pub fn interrupts(&self) -> u64 {
         self.board.scs.taken.iter().sum()
     }
 
-    /// The last accesses, and how many are kept from now on.
+    /// The last accesses; from now on, `keep` of them are recorded.
     pub fn accesses(&mut self, keep: usize) -> impl Iterator<Item = &Access> {
-        self.board.keep = keep;
+        self.board.max_accesses = keep;
         self.board.accesses.iter()
     }
 
-    /// Where the program is.
+    /// The program counter and its function.
     pub fn place(&self) -> String {
         self.program.place(self.pc & !1)
     }
 
-    /// The clock tree.
+    /// Frequencies of the clock tree.
     pub fn clocks(&self) -> Clocks {
         self.board.devices.rcc.clocks()
     }
 
-    /// While the core waits for an event: when a device will do something next.
+    /// While the core sleeps: the time of the next event of a device.
     pub fn sleeps_until(&mut self) -> Option<Picos> {
         self.board.limit = Picos::MAX;
         (self.is_asleep || self.is_locked_up).then(|| self.board.deadline())
     }
 
-    /// Runs up to an instant.
+    /// Runs until `end`.
     ///
     /// # Errors
-    /// The program did what it may not.
+    /// A violation.
     pub fn run_until(&mut self, end: Picos) -> Result<(), Stopped> {
         while self.board.now < end {
             self.board.limit = end;
             self.step(end);
-            self.unread += 1;
+            self.steps_unread += 1;
             if self.is_asleep
-                || self.unread >= LOG_PERIOD
+                || self.steps_unread >= LOG_PERIOD
                 || self.board.now >= end
                 || self.board.violation.is_some()
             {
-                self.unread = 0;
+                self.steps_unread = 0;
                 self.read_log();
             }
             if let Some(violation) = self.board.violation.clone() {
@@ -229,8 +230,8 @@ impl Chip {
     fn step(&mut self, end: Picos) {
         let engine = self.engine();
         self.board.advance(engine);
-        if self.board.devices.watchdog.bites().is_some_and(|at| self.board.now >= at) {
-            self.bite();
+        if self.board.devices.watchdog.expires_at().is_some_and(|at| self.board.now >= at) {
+            self.reset_by_watchdog();
             return;
         }
         if self.is_locked_up {
@@ -239,14 +240,14 @@ impl Chip {
         }
         if let Some(number) = self.board.scs.due(masks(engine)) {
             self.is_asleep = false;
-            self.take(number, self.pc);
+            self.enter_exception(number, self.pc);
         }
         if self.is_asleep {
             self.wait(end);
             return;
         }
-        self.follow_guard();
-        self.follow_flash();
+        self.update_guard();
+        self.update_flash();
         let exit = self.core.run(self.pc, &mut self.board);
         self.pc = engine.reg(Reg::Pc);
         match (exit, self.board.halt.take()) {
@@ -255,9 +256,9 @@ impl Chip {
                 self.wait(end);
             }
             (Exit::Stopped, None) => {}
-            (Exit::Exception(8), None) => self.leave(),
+            (Exit::Exception(8), None) => self.leave_exception(),
             (Exit::Exception(_) | Exit::Memory { is_fetch: true, .. }, None) if is_return(self.pc) => {
-                self.leave();
+                self.leave_exception();
             }
             (Exit::Undefined | Exit::Exception(_), None) => self.fault(UNDEFINED, 0),
             (Exit::Memory { address, written: Some(written), .. }, None) if is_flash(address) => {
@@ -280,12 +281,12 @@ impl Chip {
         }
     }
 
-    fn take(&mut self, number: u16, return_address: u32) {
+    fn enter_exception(&mut self, number: u16, return_address: u32) {
         self.pc = enter(self.core.engine(), &mut self.board.scs, number, return_address);
         self.board.guard_changed = true;
     }
 
-    fn leave(&mut self) {
+    fn leave_exception(&mut self) {
         self.pc = leave(self.core.engine(), &mut self.board.scs, self.pc);
         self.board.guard_changed = true;
     }
@@ -296,11 +297,11 @@ impl Chip {
             self.is_locked_up = true;
             return;
         }
-        self.board.scs.note_fault(status, address, true);
-        self.take(HARD_FAULT, self.pc);
+        self.board.scs.record_fault(status, address, true);
+        self.enter_exception(HARD_FAULT, self.pc);
     }
 
-    fn follow_guard(&mut self) {
+    fn update_guard(&mut self) {
         if !std::mem::take(&mut self.board.guard_changed) {
             return;
         }
@@ -309,8 +310,8 @@ impl Chip {
             return;
         }
         let core = &self.core;
-        let opened = self.closed.take().map_or(Ok(()), |(start, size)| core.guard(start, size, false));
-        let closed = guard.map_or(Ok(()), |(start, size)| core.guard(start, size, true));
+        let opened = self.closed.take().map_or(Ok(()), |(start, size)| core.protect(start, size, false));
+        let closed = guard.map_or(Ok(()), |(start, size)| core.protect(start, size, true));
         self.closed = guard;
         opened.and(closed).expect("the guard is in RAM");
     }
@@ -326,24 +327,24 @@ impl Chip {
         while self.board.now < end
             && self.board.scs.due(masks(engine)).is_none()
             && self.board.violation.is_none()
-            && self.board.devices.watchdog.bites().is_none_or(|at| self.board.now < at)
+            && self.board.devices.watchdog.expires_at().is_none_or(|at| self.board.now < at)
         {
             self.idle(end);
         }
     }
 
-    /// Nothing runs until a device has something to do.
+    /// Advances time to the next event of a device.
     fn idle(&mut self, end: Picos) {
         let next = self.board.deadline().min(end);
-        self.stuck = if next > self.board.now { 0 } else { self.stuck + 1 };
-        assert!(self.stuck < 1_000, "a model's deadline is over and over: {next}");
+        self.stalled = if next > self.board.now { 0 } else { self.stalled + 1 };
+        assert!(self.stalled < 1_000, "a model's deadline does not advance: {next}");
         self.board.now = self.board.now.max(next);
         let engine = self.engine();
         self.board.advance(engine);
     }
 
-    /// The watchdog resets the chip; RAM keeps what it holds.
-    fn bite(&mut self) {
+    /// Resets the chip; RAM keeps its contents.
+    fn reset_by_watchdog(&mut self) {
         self.resets.push(self.board.now);
         let engine = self.engine();
         let ram = RAM.map(|(address, size, _)| {
@@ -357,13 +358,13 @@ impl Chip {
     }
 }
 
-/// The log is read at least each so many steps.
+/// The log is read at least once in so many steps.
 const LOG_PERIOD: u32 = 16;
-/// Of CFSR: an instruction that there is not.
+/// CFSR: UNDEFINSTR.
 const UNDEFINED: u32 = 1 << 16;
-/// A precise bus fault, with its address.
+/// CFSR: PRECISERR and BFARVALID.
 const PRECISE_BUS: u32 = 1 << 9 | 1 << 15;
-/// A fetch from where nothing is.
+/// CFSR: IBUSERR.
 const FETCH: u32 = 1 << 8;
-/// An access to the guard, with its address.
+/// CFSR: DACCVIOL and MMARVALID.
 const GUARDED: u32 = 1 << 1 | 1 << 7;

@@ -1,11 +1,11 @@
-//! What all models share: registers with names and rules, and the trait of a model.
+//! What all models share: register tables with access rules, and the trait of a model.
 //!
-//! A model refuses what its manual forbids or leaves open, and what it does not model. A refused access
-//! ends the run: the test fails with the place.
+//! A model refuses what its manual forbids or leaves undefined, and what is not modelled. A refused access
+//! ends the run, and the test fails with its address.
 
 use std::fmt;
 
-/// Virtual time in picoseconds, since power came. One cycle at 400 MHz is 2500.
+/// Virtual time in picoseconds since power-on. One cycle at 400 MHz is 2500.
 pub type Picos = u64;
 /// A microsecond.
 pub const MICRO: Picos = 1_000_000;
@@ -14,7 +14,7 @@ pub const MILLI: Picos = 1_000 * MICRO;
 /// A second.
 pub const SECOND: Picos = 1_000 * MILLI;
 
-/// One cycle of a clock.
+/// The period of a clock.
 pub fn cycle(hertz: u32) -> Picos {
     SECOND / Picos::from(hertz.max(1))
 }
@@ -23,7 +23,7 @@ pub fn cycle(hertz: u32) -> Picos {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Refusal(pub String);
 
-/// Refuses, with the reason.
+/// Refuses an access.
 pub fn refuse<T>(reason: impl Into<String>) -> Result<T, Refusal> {
     Err(Refusal(reason.into()))
 }
@@ -37,34 +37,34 @@ impl fmt::Display for Refusal {
 /// A register of 32 bits.
 #[derive(Debug, Clone, Copy)]
 pub struct Register {
-    /// From the peripheral's base.
+    /// Offset from the peripheral's base.
     pub offset: u32,
-    /// As the manual has it.
+    /// Name in the manual.
     pub name: &'static str,
-    /// What it holds after a reset.
+    /// Value after a reset.
     pub reset: u32,
-    /// The bits that a program may change; all others are to be written as they read.
+    /// Bits that a program may change; all others must be written as they read.
     pub writable: u32,
-    /// A register of flags or commands: what is written is not compared with what it reads.
+    /// Writing ones acts, as on flags and commands: a write is not compared with the present value.
     pub is_command: bool,
 }
 
-/// A register that keeps what is written.
-pub const fn keeps(offset: u32, name: &'static str, reset: u32, writable: u32) -> Register {
+/// A register that holds what is written.
+pub const fn read_write(offset: u32, name: &'static str, reset: u32, writable: u32) -> Register {
     Register { offset, name, reset, writable, is_command: false }
 }
 
-/// A register that can only be read.
-pub const fn reads(offset: u32, name: &'static str, reset: u32) -> Register {
+/// A read-only register.
+pub const fn read_only(offset: u32, name: &'static str, reset: u32) -> Register {
     Register { offset, name, reset, writable: 0, is_command: false }
 }
 
-/// A register where ones do something; other bits are to be zero.
-pub const fn does(offset: u32, name: &'static str, bits: u32) -> Register {
+/// A register in which writing ones acts; other bits must be zero.
+pub const fn command(offset: u32, name: &'static str, bits: u32) -> Register {
     Register { offset, name, reset: 0, writable: bits, is_command: true }
 }
 
-/// The registers of a peripheral and what they hold.
+/// The registers of a peripheral and their values.
 #[derive(Debug, Clone)]
 pub struct Bank {
     registers: &'static [Register],
@@ -72,7 +72,7 @@ pub struct Bank {
 }
 
 impl Bank {
-    /// As after a reset.
+    /// All registers with their reset values.
     pub fn new(registers: &'static [Register]) -> Self {
         Self { registers, values: registers.iter().map(|register| register.reset).collect() }
     }
@@ -81,7 +81,7 @@ impl Bank {
         self.registers.iter().position(|register| register.offset == offset)
     }
 
-    /// What the register at `offset` holds.
+    /// The value of the register at `offset`.
     ///
     /// # Panics
     /// The table has no such register.
@@ -90,7 +90,7 @@ impl Bank {
         self.values[self.index(offset).expect("in the table")]
     }
 
-    /// Sets it, whatever the rules.
+    /// Sets the value, without checks.
     ///
     /// # Panics
     /// The table has no such register.
@@ -100,7 +100,7 @@ impl Bank {
         self.values[index] = value;
     }
 
-    /// What a program reads.
+    /// A read by the program.
     ///
     /// # Errors
     /// The register is not modelled.
@@ -111,10 +111,10 @@ impl Bank {
         }
     }
 
-    /// What a program may write.
+    /// Whether the program may write `value`.
     ///
     /// # Errors
-    /// The register is not modelled, can only be read, or a reserved bit is changed.
+    /// The register is not modelled or read-only, or a reserved bit is changed.
     pub fn check(&self, offset: u32, value: u32) -> Result<(), Refusal> {
         let Some(index) = self.index(offset) else { return refuse("this register is not modelled") };
         let register = self.registers[index];
@@ -126,7 +126,7 @@ impl Bank {
         }
     }
 
-    /// Checks and keeps.
+    /// A write by the program.
     ///
     /// # Errors
     /// As [`Bank::check`].
@@ -137,38 +137,38 @@ impl Bank {
     }
 }
 
-/// The frequencies that the clock tree makes, in Hz; 0 where there is none.
+/// Frequencies of the clock tree, in Hz; 0 for a clock that is off.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Clocks {
-    /// Of the core.
+    /// Core clock.
     pub core: u32,
-    /// Of the AHB buses.
+    /// AHB clock.
     pub hclk: u32,
-    /// Of the timers on APB1.
+    /// Clock of the timers on APB1.
     pub timers: u32,
-    /// What drives USART2 and UART7.
+    /// Kernel clock of USART2 and UART7.
     pub usart: u32,
-    /// What drives FDCAN.
+    /// Kernel clock of FDCAN.
     pub fdcan: u32,
-    /// What drives the random number generator.
+    /// Kernel clock of the random number generator.
     pub rng: u32,
-    /// The external clock may be used.
+    /// Whether the external clock is present.
     pub is_external: bool,
 }
 
-/// Which alternate function each pin has, by port and number; `None` for a pin without.
+/// The alternate function of each pin, by port and number; `None` for a pin in another mode.
 pub type Functions = [[Option<u8>; 16]; 11];
 
-/// What a model can know of the rest of the chip at an access.
+/// What a model can see of the rest of the chip during an access.
 #[derive(Debug, Clone, Copy)]
-pub struct Moment<'a> {
-    /// The present.
+pub struct Context<'a> {
+    /// Present time.
     pub now: Picos,
-    /// The clock tree.
+    /// Present frequencies.
     pub clocks: Clocks,
-    /// The pins.
+    /// Alternate functions of the pins.
     pub functions: &'a Functions,
-    /// SYSCFG says RMII.
+    /// Whether SYSCFG selects RMII.
     pub is_rmii: bool,
 }
 
@@ -182,45 +182,45 @@ impl Pin {
         usize::from(self.0 as u8 - b'A')
     }
 
-    /// Whether it has this alternate function.
+    /// Whether the pin has this alternate function.
     pub fn is(self, functions: &Functions, function: u8) -> bool {
         functions[self.port()][usize::from(self.1)] == Some(function)
     }
 }
 
-/// A model.
+/// The model of a peripheral.
 pub trait Peripheral {
-    /// The table of its registers.
+    /// Its register table.
     fn registers(&self) -> &'static [Register];
     /// A read of 32 bits.
     ///
     /// # Errors
-    /// The manual forbids it here, or it is not modelled.
-    fn read(&mut self, offset: u32, at: &Moment<'_>) -> Result<u32, Refusal>;
+    /// The manual forbids it in this state, or it is not modelled.
+    fn read(&mut self, offset: u32, at: &Context<'_>) -> Result<u32, Refusal>;
     /// A write of 32 bits.
     ///
     /// # Errors
     /// As above.
-    fn write(&mut self, offset: u32, value: u32, at: &Moment<'_>) -> Result<(), Refusal>;
-    /// Does what is due by now.
+    fn write(&mut self, offset: u32, value: u32, at: &Context<'_>) -> Result<(), Refusal>;
+    /// Carries out everything due up to now.
     ///
     /// # Errors
-    /// What is due cannot be done as the program has set it up.
-    fn advance(&mut self, _at: &Moment<'_>) -> Result<(), Refusal> {
+    /// The program's settings make it impossible.
+    fn advance(&mut self, _at: &Context<'_>) -> Result<(), Refusal> {
         Ok(())
     }
-    /// When something is due next.
-    fn deadline(&self, _at: &Moment<'_>) -> Option<Picos> {
+    /// Time of the next event.
+    fn deadline(&self, _at: &Context<'_>) -> Option<Picos> {
         None
     }
-    /// Whether writes of 16 bits are taken; without this only 32 are.
-    fn takes_halves(&self) -> bool {
+    /// Whether 16-bit writes are allowed; otherwise only 32-bit writes are.
+    fn accepts_halfwords(&self) -> bool {
         false
     }
-    /// Whether its interrupt is asked for.
-    fn interrupts(&self) -> bool {
+    /// Level of its interrupt line.
+    fn interrupt_line(&self) -> bool {
         false
     }
-    /// As after a reset; what is outside of the chip stays.
+    /// Resets the peripheral; what is outside the chip stays as it is.
     fn reset(&mut self);
 }

@@ -1,5 +1,5 @@
-//! The chip's peripherals at their addresses, with their interrupt lines. RM0433, "Memory and bus
-//! architecture"; who needs which clock is in RCC's registers AHB1ENR to APB4ENR.
+//! The memory map and interrupt lines of the peripherals. RM0433, "Memory and bus architecture"; the clock
+//! gates are those of RCC's registers AHB1ENR to APB4ENR.
 
 use crate::device::{Peripheral, Pin};
 use crate::models::ethernet::Ethernet;
@@ -8,25 +8,24 @@ use crate::models::flash::Flash;
 use crate::models::gpio::Port;
 use crate::models::iwdg::Watchdog;
 use crate::models::rcc::{Gate, Rcc};
-use crate::models::simple::{AXI, DBGMCU, EXTI, Plain, Pwr, Rng, Syscfg};
+use crate::models::simple::{AXI, DBGMCU, Plain, Pwr, Rng, Syscfg};
 use crate::models::timer::Timer;
 use crate::models::usart::{Pins, Usart};
 
-/// A device, by its place in [`MAP`].
+/// A device in [`MAP`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Id {
     Rcc,
     Pwr,
     Flash,
     Syscfg,
-    Exti,
     Gpio(usize),
     Watchdog,
-    Debug,
+    Dbgmcu,
     Axi,
-    Timer,
-    First,
-    Second,
+    Tim12,
+    Usart2,
+    Uart7,
     Can,
     CanRam,
     Ethernet,
@@ -39,12 +38,12 @@ pub(crate) struct Place {
     pub(crate) name: &'static str,
     pub(crate) gate: Option<Gate>,
     pub(crate) id: Id,
-    /// Its interrupt line.
+    /// Number of its interrupt.
     pub(crate) line: Option<u16>,
 }
 
 impl Place {
-    /// Whether time does anything to it.
+    /// Whether it has to be advanced when time passes.
     pub(crate) fn changes_with_time(&self) -> bool {
         !matches!(self.id, Id::Gpio(_) | Id::CanRam)
     }
@@ -69,20 +68,19 @@ const fn port(index: usize, name: &'static str) -> Place {
     place(0x5802_0000 + 0x400 * index as u32, 0x400, name, gate(0xE0, 1 << index), Id::Gpio(index), None)
 }
 
-/// Of the controller and its message RAM.
+/// Clock gate of FDCAN1 and its message RAM.
 pub(crate) const CAN: Option<Gate> = gate(0xEC, 1 << 8);
-/// All of them.
-pub(crate) static MAP: [Place; 26] = [
-    place(0x4000_1800, 0x400, "TIM12", gate(0xE8, 1 << 6), Id::Timer, Some(43)),
-    place(0x4000_4400, 0x400, "USART2", gate(0xE8, 1 << 17), Id::First, Some(38)),
-    place(0x4000_7800, 0x400, "UART7", gate(0xE8, 1 << 30), Id::Second, Some(82)),
+/// The memory map. An access outside of it ends the run.
+pub(crate) static MAP: [Place; 25] = [
+    place(0x4000_1800, 0x400, "TIM12", gate(0xE8, 1 << 6), Id::Tim12, Some(43)),
+    place(0x4000_4400, 0x400, "USART2", gate(0xE8, 1 << 17), Id::Usart2, Some(38)),
+    place(0x4000_7800, 0x400, "UART7", gate(0xE8, 1 << 30), Id::Uart7, Some(82)),
     place(0x4000_A000, 0xC00, "FDCAN1", CAN, Id::Can, Some(19)),
     place(0x4000_AC00, 0x2800, "message RAM", CAN, Id::CanRam, None),
     place(0x4002_8000, 0x2000, "ETH", gate(0xD8, 7 << 15), Id::Ethernet, Some(61)),
     place(0x4802_1800, 0x400, "RNG", gate(0xDC, 1 << 6), Id::Rng, None),
     place(0x5100_8000, 0x1000, "AXI", None, Id::Axi, None),
     place(0x5200_2000, 0x400, "FLASH", None, Id::Flash, None),
-    place(0x5800_0000, 0x400, "EXTI", None, Id::Exti, None),
     place(0x5800_0400, 0x400, "SYSCFG", gate(0xF4, 1 << 1), Id::Syscfg, None),
     port(0, "GPIOA"),
     port(1, "GPIOB"),
@@ -98,7 +96,7 @@ pub(crate) static MAP: [Place; 26] = [
     place(0x5802_4400, 0x400, "RCC", None, Id::Rcc, None),
     place(0x5802_4800, 0x400, "PWR", None, Id::Pwr, None),
     place(0x5800_4800, 0x400, "IWDG1", None, Id::Watchdog, None),
-    place(0x5C00_1000, 0x400, "DBGMCU", None, Id::Debug, None),
+    place(0x5C00_1000, 0x400, "DBGMCU", None, Id::Dbgmcu, None),
 ];
 
 /// The models.
@@ -106,33 +104,32 @@ pub(crate) static MAP: [Place; 26] = [
 pub struct Devices {
     /// Clocks and resets.
     pub rcc: Rcc,
-    /// The supply.
+    /// Power control.
     pub pwr: Pwr,
-    /// MII or RMII.
+    /// Selects MII or RMII.
     pub syscfg: Syscfg,
     /// Ports A to K.
     pub gpio: [Port; 11],
     /// The independent watchdog.
     pub watchdog: Watchdog,
     /// TIM12.
-    pub timer: Timer,
+    pub tim12: Timer,
     /// USART2: RS-485 A.
-    pub first: Usart,
+    pub usart2: Usart,
     /// UART7: RS-485 B.
-    pub second: Usart,
+    pub uart7: Usart,
     /// FDCAN1.
     pub can: Fdcan,
     /// The Ethernet controller.
     pub ethernet: Ethernet,
     /// The random number generator.
     pub rng: Rng,
-    /// Flash's registers.
+    /// Flash and its registers.
     pub flash: Flash,
-    /// What chip it is.
-    pub debug: Plain,
+    /// The chip's device and revision identifiers.
+    pub dbgmcu: Plain,
     /// The AXI interconnect.
     pub axi: Plain,
-    exti: Plain,
 }
 
 impl Devices {
@@ -144,15 +141,14 @@ impl Devices {
             syscfg: Syscfg::new(),
             gpio: std::array::from_fn(|index| Port::new((b'A' + index as u8) as char)),
             watchdog: Watchdog::new(),
-            timer: Timer::new(),
-            first: Usart::new(pins(Pin('D', 5), Pin('D', 6), Pin('D', 4))),
-            second: Usart::new(pins(Pin('E', 8), Pin('E', 7), Pin('E', 9))),
+            tim12: Timer::new(),
+            usart2: Usart::new(pins(Pin('D', 5), Pin('D', 6), Pin('D', 4))),
+            uart7: Usart::new(pins(Pin('E', 8), Pin('E', 7), Pin('E', 9))),
             can: Fdcan::new(),
             ethernet: Ethernet::new(),
             rng: Rng::new(),
             flash: Flash::new(),
-            exti: Plain::new(&EXTI),
-            debug: Plain::new(&DBGMCU),
+            dbgmcu: Plain::new(&DBGMCU),
             axi: Plain::new(&AXI),
         }
     }
@@ -163,14 +159,13 @@ impl Devices {
             Id::Pwr => &mut self.pwr,
             Id::Flash => &mut self.flash,
             Id::Syscfg => &mut self.syscfg,
-            Id::Exti => &mut self.exti,
             Id::Gpio(index) => &mut self.gpio[index],
             Id::Watchdog => &mut self.watchdog,
-            Id::Debug => &mut self.debug,
+            Id::Dbgmcu => &mut self.dbgmcu,
             Id::Axi => &mut self.axi,
-            Id::Timer => &mut self.timer,
-            Id::First => &mut self.first,
-            Id::Second => &mut self.second,
+            Id::Tim12 => &mut self.tim12,
+            Id::Usart2 => &mut self.usart2,
+            Id::Uart7 => &mut self.uart7,
             Id::Can | Id::CanRam => &mut self.can,
             Id::Ethernet => &mut self.ethernet,
             Id::Rng => &mut self.rng,

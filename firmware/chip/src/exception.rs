@@ -1,8 +1,8 @@
-//! How the core enters and leaves exceptions. Armv7-M ARM sections B1.5.6 to B1.5.8.
+//! Exception entry and return. Armv7-M ARM sections B1.5.6 to B1.5.8.
 //!
-//! The frame is on the stack as in the chip, with the floating-point registers when they are in use
-//! (CONTROL.FPCA); lazy stacking is not modelled, they are written at once. What of a frame falls into
-//! the stack's closed guard is not written, and MSTKERR says so.
+//! The exception frame includes the floating-point registers if they are in use (CONTROL.FPCA); lazy
+//! stacking is not modelled. The part of a frame that would be in the stack guard is not written, and
+//! MSTKERR is set.
 
 use crate::models::scs::{Masks, Scs};
 use crate::unicorn::{Engine, Reg};
@@ -10,14 +10,14 @@ use crate::unicorn::{Engine, Reg};
 const FRAME: u32 = 0x20;
 const EXTENDED: u32 = 0x68;
 const SINGLES: u32 = 16;
-/// Of an EXC_RETURN: to thread mode, main stack, without floating point.
+/// EXC_RETURN: to thread mode, main stack, without floating point.
 const TO_THREAD: u32 = 0xFFFF_FFF9;
 const TO_HANDLER: u32 = 0xFFFF_FFF1;
 const NO_FLOATS: u32 = 1 << 4;
 const FLOATS_IN_USE: u32 = 1 << 2;
-/// Of xPSR on the stack: a word was left out to align it.
+/// Stacked xPSR: the stack was aligned by one word.
 const ALIGNED: u32 = 1 << 9;
-/// Of xPSR: what remains of an IT block. A block of the core's ends at each KiB, so also within one.
+/// xPSR: the state of an IT block. The emulator ends basic blocks at each KiB, also inside an IT block.
 const IT: u32 = 0x0600_FC00;
 const STACKED: [Reg; 6] = [Reg::R0, Reg::R1, Reg::R2, Reg::R3, Reg::R12, Reg::Lr];
 
@@ -30,7 +30,7 @@ pub(crate) fn masks(core: Engine) -> Masks {
     }
 }
 
-/// Takes an exception; returns where its handler is.
+/// Enters an exception; returns the address of its handler.
 pub(crate) fn enter(core: Engine, scs: &mut Scs, number: u16, return_address: u32) -> u32 {
     let guard = scs.guard();
     let (control, status, stack) = (core.reg(Reg::Control), core.reg(Reg::Xpsr), core.reg(Reg::Sp));
@@ -50,7 +50,7 @@ pub(crate) fn enter(core: Engine, scs: &mut Scs, number: u16, return_address: u3
     } else {
         for (address, word) in (frame..).step_by(4).zip(words) {
             if guard.is_some_and(|(start, size)| (start..start + size).contains(&address)) {
-                scs.note_fault(1 << 4, 0, true);
+                scs.record_fault(1 << 4, 0, true);
             } else {
                 core.write(address, &word.to_le_bytes());
             }
@@ -67,12 +67,12 @@ pub(crate) fn enter(core: Engine, scs: &mut Scs, number: u16, return_address: u3
     core.word(scs.vectors() + 4 * u32::from(number))
 }
 
-/// Whether the core has jumped to where no instruction is, which ends an exception.
+/// Whether a jump to `pc` is an exception return (EXC_RETURN).
 pub(crate) fn is_return(pc: u32) -> bool {
     pc >= 0xFFFF_FFE0
 }
 
-/// Leaves an exception by that EXC_RETURN; returns where the program goes on.
+/// Returns from an exception with the EXC_RETURN `how`; returns the address to continue at.
 pub(crate) fn leave(core: Engine, scs: &mut Scs, how: u32) -> u32 {
     let frame = core.reg(Reg::Sp);
     let has_floats = how & NO_FLOATS == 0;

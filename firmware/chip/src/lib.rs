@@ -1,10 +1,11 @@
-//! The NUCLEO-H743ZI2 for tests of the firmware's binary: an emulated Cortex-M7 (Unicorn, loaded while a
-//! test runs) among readable models of what the board uses. What is modelled, and what this cannot show,
+//! The NUCLEO-H743ZI2 for tests of the firmware's binary: an emulated Cortex-M7 (Unicorn, loaded at run
+//! time) and models of the peripherals that the firmware uses. What is modelled, and what this cannot show,
 //! is in docs/chip.md.
 //!
-//! [`Chip`] runs a [`Program`] in virtual time. Its [`Devices`] have the pins' other ends: RS-485 lines, a
-//! CAN bus, an Ethernet cable. The models are strict: an access that the manual forbids, or that they do
-//! not know, ends the run with its place.
+//! [`Chip`] runs a [`Program`] in virtual time. Its [`Devices`] include what the pins are connected to: RS-485
+//! lines, a CAN bus, an Ethernet cable. The models are strict: an access that the manual forbids, or that
+//! is not modelled, ends the run and is reported with its address. Manuals are cited by the titles of their
+//! sections.
 
 #[cfg(feature = "emulator")]
 mod access;

@@ -1,8 +1,8 @@
-//! `chip ELF [IMAGE] [--ms N] [--last N]`: runs the firmware for N ms of virtual time (2000), shows its log,
-//! and at the end where it is, what it did last to which registers, and how fast that was.
+//! `chip ELF [IMAGE] [--ms N] [--last N]`: runs the firmware for N ms of virtual time (default 2000) and
+//! prints its log; at the end the program counter, the last register accesses, and the speed of the run.
 //!
-//! `chip ELF [IMAGE] --realtime [...]`: runs it at the pace of the clock on the wall, with sockets for its lines,
-//! its bus and its cable, until it is interrupted (docs/chip.md section 5).
+//! `chip ELF [IMAGE] --realtime [...]`: runs it in real time until it is interrupted, with sockets for its serial
+//! lines, CAN bus and Ethernet (docs/chip.md section 5).
 
 use std::io::Write;
 use std::os::unix::net::UnixStream;
@@ -10,7 +10,7 @@ use std::process::ExitCode;
 use std::time::Instant;
 
 use chip::device::{MILLI, SECOND};
-use chip::realtime::{Ended, Runner, Wiring, become_other};
+use chip::realtime::{Ended, Runner, Wiring, exec_if_requested};
 use chip::{Chip, Program, Stopped};
 use signal_hook::consts::{SIGINT, SIGTERM};
 
@@ -20,7 +20,7 @@ const USAGE: &str = "usage: chip ELF [IMAGE] [--ms N] [--last N]
 PLACE is HOST:PORT or the path of a socket; OPTIONS are those of QEMU's '-netdev user', or ''";
 
 fn main() -> ExitCode {
-    let result = become_other(std::env::args().skip(1)).and_then(|()| run());
+    let result = exec_if_requested(std::env::args().skip(1)).and_then(|()| run());
     result.unwrap_or_else(|error| {
         eprintln!("{error}");
         ExitCode::from(2)
@@ -135,7 +135,7 @@ fn in_virtual_time(mut chip: Chip, ms: u64, last: usize) -> Result<ExitCode, Str
     })
 }
 
-/// The last accesses, where the program is, faults and resets. That it cannot be written is nobody's concern.
+/// Prints the last accesses, the program counter, faults and resets. Write errors are ignored.
 fn show_end(chip: &mut Chip, last: usize, out: &mut dyn Write) {
     let program = chip.program();
     let mut text = format!("\nthe last {last} accesses:\n");

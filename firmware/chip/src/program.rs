@@ -1,35 +1,33 @@
-//! The program: the firmware's ELF file, with its symbols and the texts of its log.
+//! The firmware's ELF file, with its symbols and defmt's format strings.
 
 use defmt_decoder::{DecodeError, StreamDecoder, Table};
 use object::elf::{FileHeader32, PT_LOAD};
 use object::read::elf::{FileHeader, ProgramHeader};
 use object::{LittleEndian, Object, ObjectSection, ObjectSymbol, SymbolKind};
 
-/// The program.
+/// A program for the chip.
 pub struct Program {
-    /// What is in flash, and where.
+    /// The loadable segments: address and contents.
     pub segments: Vec<(u32, Vec<u8>)>,
-    /// Places where the core waits for events, or makes one.
+    /// Addresses of WFE, WFI and SEV.
     pub waits: Vec<u32>,
-    /// The debugger's channel.
+    /// Address of SEGGER RTT's control block.
     pub rtt: Option<u32>,
     functions: Vec<(u32, u32, String)>,
     symbols: Vec<(String, u32)>,
     table: Option<Box<Table>>,
 }
 
-/// WFE, WFI and SEV.
+// Encodings of instructions.
 pub(crate) const WFE: u16 = 0xBF20;
-/// As above.
 pub(crate) const WFI: u16 = 0xBF30;
-/// As above.
 pub(crate) const SEV: u16 = 0xBF40;
 
 impl Program {
-    /// Reads it.
+    /// Parses an ELF file.
     ///
     /// # Errors
-    /// No ELF file of a Cortex-M.
+    /// It is not an ELF file of a Cortex-M.
     pub fn read(bytes: &[u8]) -> Result<Self, String> {
         let header = FileHeader32::<LittleEndian>::parse(bytes).map_err(|error| error.to_string())?;
         let endian = header.endian().map_err(|error| error.to_string())?;
@@ -63,7 +61,7 @@ impl Program {
         Ok(Self { segments, waits: waits.collect(), rtt, functions, symbols, table })
     }
 
-    /// The function that an address is in.
+    /// Address, function and offset, for messages.
     pub fn place(&self, address: u32) -> String {
         let behind = self.functions.partition_point(|(start, ..)| *start <= address);
         match behind.checked_sub(1).map(|index| &self.functions[index]) {
@@ -74,24 +72,24 @@ impl Program {
         }
     }
 
-    /// The first function whose name has all these parts.
+    /// The first function whose name contains all these parts.
     pub fn function(&self, parts: &[&str]) -> Option<u32> {
         let has_all = |name: &str| parts.iter().all(|part| name.contains(part));
         self.functions.iter().find(|(.., name)| has_all(name)).map(|(start, ..)| *start)
     }
 
-    /// A symbol by its whole name.
+    /// The address of a symbol, by its full name.
     pub fn symbol(&self, name: &str) -> Option<u32> {
         self.symbols.iter().find(|(symbol, _)| symbol == name).map(|(_, address)| *address)
     }
 
-    /// Reads the log from now on.
+    /// A new decoder for the log; `None` if the program has no defmt log.
     pub fn log_reader(&self) -> Option<Box<dyn StreamDecoder + Send + Sync + '_>> {
         self.table.as_ref().map(|table| table.new_stream_decoder())
     }
 }
 
-/// What came whole of a log, one text a line.
+/// Decodes the complete records, each as `level: text`.
 pub(crate) fn texts(decoder: &mut (dyn StreamDecoder + Send + Sync + '_), bytes: &[u8]) -> Vec<String> {
     decoder.received(bytes);
     let mut texts = Vec::new();

@@ -1,7 +1,7 @@
-//! The chip at the pace of the clock on the wall, with sockets for its lines, its bus and its cable.
+//! The chip in real time, with sockets for its serial lines, CAN bus and Ethernet.
 //!
-//! Virtual time is never ahead. When the machine is too slow it falls behind and catches up later; by how much
-//! is in the [`Figures`]. What comes from a socket is in virtual time when it was seen.
+//! Virtual time is never ahead of real time. If the host is too slow it falls behind and catches up later; the
+//! [`Figures`] say by how much. Input from a socket gets the virtual time at which it was read.
 
 mod can;
 mod network;
@@ -19,53 +19,53 @@ use crate::device::*;
 use crate::{Chip, Stopped};
 use can::Can;
 use network::Network;
-pub use network::become_other;
+pub use network::exec_if_requested;
 use serial::Serial;
 use socket::{Client, Listener};
 
-/// What the board is connected to. Places are `HOST:PORT` or the path of a socket.
+/// What the board is connected to. Addresses are `HOST:PORT` or the path of a socket.
 #[derive(Debug, Default)]
 pub struct Wiring {
     /// RS-485 A and B.
     pub serial: Vec<String>,
     /// CAN, as slcan.
     pub can: Option<String>,
-    /// Options of QEMU's user network; empty for none of them.
+    /// Options of QEMU's user network; may be empty.
     pub network: Option<String>,
-    /// Where QEMU can be asked.
+    /// Path of QEMU's QMP socket.
     pub qmp: Option<String>,
-    /// Where this can be asked ([`Runner::obey`]).
+    /// Address of the control socket ([`Runner::execute`]).
     pub control: Option<String>,
 }
 
-/// How it went.
+/// Statistics of a run.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Figures {
-    /// Of the clock on the wall.
+    /// Real time.
     pub wall: Duration,
     /// Virtual time.
     pub virtual_time: Picos,
-    /// The most that virtual time was behind.
+    /// The largest lag of virtual time.
     pub most_behind: Picos,
-    /// How long it was behind by more than 10 ms.
+    /// How long the lag was above 10 ms.
     pub late: Duration,
-    /// Executed.
+    /// Executed instructions.
     pub instructions: u64,
-    /// Taken.
+    /// Interrupts taken.
     pub interrupts: u64,
-    /// Times that the watchdog was fed.
+    /// Feeds of the watchdog.
     pub feeds: u64,
     /// Resets by the watchdog.
     pub resets: u64,
-    /// Frames of Ethernet that the chip took, dropped and sent.
+    /// Ethernet frames that the chip received, dropped and sent.
     pub ethernet: [u64; 3],
-    /// Bytes that came and went on both lines.
+    /// Bytes that the chip received and sent on both serial lines.
     pub serial: [u64; 2],
-    /// Frames that came and went on CAN.
+    /// Frames that the chip received and sent on CAN.
     pub can: [u64; 2],
 }
 
-/// One line, also to be read as JSON.
+/// One line of JSON.
 impl fmt::Display for Figures {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let seconds = |time: Picos| time as f64 / SECOND as f64;
@@ -91,29 +91,29 @@ impl fmt::Display for Figures {
     }
 }
 
-/// Why a run has ended that nobody has ended.
+/// Why a run ended by itself.
 #[derive(Debug)]
 pub enum Ended {
-    /// The program did what it may not.
+    /// A violation of the program.
     Stopped(Stopped),
-    /// Something around it is gone.
+    /// Something that it needs is gone.
     Lost(String),
 }
 
-/// The chip among its sockets.
+/// The chip with its sockets.
 pub struct Runner {
     chip: Chip,
     serial: Vec<Serial>,
     can: Option<Can>,
     network: Option<Network>,
     control: Option<Listener>,
-    askers: Vec<(Client, Vec<u8>)>,
+    control_clients: Vec<(Client, Vec<u8>)>,
     pace: Pace,
     figures: Figures,
     feeds: u64,
 }
 
-/// Virtual time as the clock on the wall has it.
+/// The virtual time that corresponds to real time.
 struct Pace {
     begin: Instant,
     stopped: Option<Instant>,
@@ -129,27 +129,27 @@ impl Pace {
         self.stopped.get_or_insert_with(Instant::now);
     }
 
-    fn go_on(&mut self) {
+    fn resume(&mut self) {
         if let Some(since) = self.stopped.take() {
             self.begin += since.elapsed();
         }
     }
 }
 
-/// The chip runs so long at most before its sockets are looked at.
+/// Longest run between two looks at the sockets.
 const SLICE: Picos = MILLI;
-/// What is due before that is done together.
-const TOGETHER: Picos = MILLI / 4;
+/// Events within this time are handled together.
+const COALESCE: Picos = MILLI / 4;
 /// The longest sleep.
 const LONGEST: Picos = 100 * MILLI;
-/// Behind by more than that is late.
+/// A larger lag counts as late.
 const LATE: Picos = 10 * MILLI;
 
 impl Runner {
-    /// Opens everything; QEMU is there, but may not be ready.
+    /// Opens the sockets and starts QEMU, which may not be ready yet.
     ///
     /// # Errors
-    /// Something cannot be opened.
+    /// A socket cannot be opened, or QEMU cannot be started.
     pub fn new(chip: Chip, wiring: &Wiring) -> Result<Self, String> {
         let listen = |place: &String| Listener::new(place);
         let serial = wiring.serial.iter().map(|place| listen(place).map(Serial::new));
@@ -162,21 +162,21 @@ impl Runner {
                 None => None,
             },
             control: wiring.control.as_ref().map(listen).transpose()?,
-            askers: Vec::new(),
+            control_clients: Vec::new(),
             pace: Pace { begin: Instant::now(), stopped: None },
             figures: Figures::default(),
             feeds: 0,
         })
     }
 
-    /// Runs until something can be read of `end`. Lines of the log go to `log`, as they come.
+    /// Runs until `end` is readable. Writes the log's lines to `log`.
     ///
     /// # Errors
-    /// It has ended by itself.
+    /// The run ended by itself.
     pub fn run(&mut self, end: &UnixStream, log: &mut dyn Write) -> Result<(), Ended> {
         self.pace = Pace { begin: Instant::now(), stopped: None };
         loop {
-            // While it sleeps nothing is to be looked at.
+            // While the core sleeps, the sockets need no look before its next event.
             let awake = self.chip.sleeps_until().unwrap_or(0).max(self.chip.now() + SLICE);
             let target = self.pace.now().min(awake);
             let result = if target > self.chip.now() { self.chip.run_until(target) } else { Ok(()) };
@@ -185,7 +185,7 @@ impl Runner {
                 written.map_err(|error| Ended::Lost(format!("its log: {error}")))?;
             }
             result.map_err(Ended::Stopped)?;
-            self.note();
+            self.update_figures();
             self.exchange().map_err(Ended::Lost)?;
             if self.wait(end) {
                 return Ok(());
@@ -198,7 +198,7 @@ impl Runner {
         &mut self.chip
     }
 
-    /// How it went so far.
+    /// The statistics so far.
     pub fn figures(&mut self) -> Figures {
         let mut figures = self.figures;
         figures.instructions = self.chip.instructions();
@@ -206,7 +206,7 @@ impl Runner {
         figures.feeds = self.feeds;
         figures.resets = self.chip.resets.len() as u64;
         let ethernet = &self.chip.devices().ethernet;
-        let [taken, dropped] = [ethernet.taken, ethernet.dropped];
+        let [taken, dropped] = [ethernet.received, ethernet.dropped];
         figures.ethernet = [taken, dropped, self.network.as_ref().map_or(0, |network| network.frames_out)];
         figures.serial = self.serial.iter().fold([0; 2], |[bytes_in, bytes_out], serial| {
             [bytes_in + serial.bytes_in, bytes_out + serial.bytes_out]
@@ -218,7 +218,7 @@ impl Runner {
     fn exchange(&mut self) -> Result<(), String> {
         let (now, clocks) = (self.chip.now(), self.chip.clocks());
         let devices = self.chip.devices();
-        for (serial, usart) in self.serial.iter_mut().zip([&mut devices.first, &mut devices.second]) {
+        for (serial, usart) in self.serial.iter_mut().zip([&mut devices.usart2, &mut devices.uart7]) {
             serial.exchange(usart, clocks, now);
         }
         if let Some(can) = &mut self.can {
@@ -228,12 +228,12 @@ impl Runner {
             network.exchange(&mut devices.ethernet, now)?;
         }
         self.feeds += devices.watchdog.feeds.drain(..).count() as u64;
-        self.answer();
+        self.serve_control();
         Ok(())
     }
 
-    /// How far it is.
-    fn note(&mut self) {
+    /// Updates the statistics of time.
+    fn update_figures(&mut self) {
         let wall = Duration::from_nanos(self.pace.now() / 1_000);
         let behind = self.pace.now().saturating_sub(self.chip.now());
         if behind > LATE {
@@ -244,18 +244,18 @@ impl Runner {
         self.figures.virtual_time = self.chip.now();
     }
 
-    /// Until the chip has something to do, or a socket has; true when the run is to end.
+    /// Waits for the next event of the chip or of a socket; returns `true` if the run is to end.
     fn wait(&mut self, end: &UnixStream) -> bool {
         let now = self.pace.now();
         let is_busy = self.serial.iter().any(Serial::is_busy) || self.can.as_ref().is_some_and(Can::is_busy);
-        let is_behind = now > self.chip.now() + TOGETHER;
+        let is_behind = now > self.chip.now() + COALESCE;
         let next = match self.chip.sleeps_until() {
             _ if self.pace.stopped.is_some() => now + LONGEST,
             _ if is_behind => now,
             Some(next) if next <= self.chip.now() => now,
             Some(_) if is_busy => now + SLICE / 2,
-            Some(next) => next.max(now + TOGETHER).min(now + LONGEST),
-            None => now + TOGETHER,
+            Some(next) => next.max(now + COALESCE).min(now + LONGEST),
+            None => now + COALESCE,
         };
         let next = self.network.as_ref().and_then(Network::next).map_or(next, |at| next.min(at.max(now)));
         let wait = next.saturating_sub(now) / 1_000;
@@ -265,18 +265,18 @@ impl Runner {
         self.can.iter().for_each(|can| can.poll(&mut fds));
         fds.extend(self.network.iter().map(Network::poll));
         fds.extend(self.control.iter().map(Listener::poll));
-        fds.extend(self.askers.iter().map(|(client, _)| client.poll(true)));
-        // Interrupted or not, everything is looked at again.
+        fds.extend(self.control_clients.iter().map(|(client, _)| client.poll(true)));
+        // An error such as EINTR does no harm: everything is checked again.
         let _ = poll(&mut fds, Some(&timeout));
         !fds[0].revents().is_empty()
     }
 
-    fn answer(&mut self) {
+    fn serve_control(&mut self) {
         let Some(control) = &self.control else { return };
         let new = std::iter::from_fn(|| control.accept());
-        self.askers.extend(new.map(|client| (client, Vec::new())));
+        self.control_clients.extend(new.map(|client| (client, Vec::new())));
         let mut asked = Vec::new();
-        for (index, (client, line)) in self.askers.iter_mut().enumerate() {
+        for (index, (client, line)) in self.control_clients.iter_mut().enumerate() {
             line.extend(client.read(256));
             while let Some(end) = line.iter().position(|&byte| byte == b'\n') {
                 let words = line.drain(..=end).collect::<Vec<u8>>();
@@ -284,21 +284,21 @@ impl Runner {
             }
         }
         for (index, words) in asked {
-            let answer = self.obey(&words);
-            self.askers[index].0.write(format!("{answer}\n").as_bytes());
+            let answer = self.execute(&words);
+            self.control_clients[index].0.write(format!("{answer}\n").as_bytes());
         }
-        self.askers.retain(|(client, _)| !client.is_gone());
+        self.control_clients.retain(|(client, _)| !client.is_gone());
     }
 
-    /// What can be asked, a line each, answered by a line: `cable out`, `cable in`; `stop` (time stands still, as
-    /// under a debugger), `go`; `figures`; `save START LEN PATH` (memory, into a file).
-    pub fn obey(&mut self, words: &str) -> String {
+    /// Executes a command of the control socket and returns the line to answer: `cable out`, `cable in`; `stop`
+    /// (time stands still, as under a debugger), `go`; `figures`; `save START LEN PATH` (memory, to a file).
+    pub fn execute(&mut self, words: &str) -> String {
         let now = self.chip.now();
         match words.splitn(4, ' ').collect::<Vec<_>>().as_slice() {
-            ["cable", "out"] => self.chip.devices().ethernet.phy.pull(),
+            ["cable", "out"] => self.chip.devices().ethernet.phy.unplug(),
             ["cable", "in"] => self.chip.devices().ethernet.phy.plug(now),
             ["stop"] => self.pace.stop(),
-            ["go"] => self.pace.go_on(),
+            ["go"] => self.pace.resume(),
             ["figures"] => return self.figures().to_string(),
             ["save", start, len, path] => {
                 let number = |text: &str| u32::from_str_radix(text.trim_start_matches("0x"), 16);

@@ -1,12 +1,11 @@
-//! The binding to Unicorn, which emulates the instructions of a Cortex-M7: nothing but this module has `unsafe`.
+//! The binding to Unicorn, which emulates the instructions of a Cortex-M7. Only this module has `unsafe`.
 //!
-//! In: memory, registers, and a [`Handler`] that hears of accesses to devices, of the blocks of
-//! instructions that begin, and of the places that are watched. Out: why the core stopped. It knows no
-//! exceptions and no devices.
+//! In: memory, registers, and a [`Handler`] that is called for accesses to devices, at the start of each basic
+//! block, and at watched addresses. Out: why the core stopped. It does not know exceptions or devices.
 //!
-//! The library (GPL-2.0) is loaded while a test runs, from the path in `CHIP_UNICORN`; nothing that is
-//! shipped links it. Names and numbers are those of unicorn/unicorn.h and unicorn/arm.h, 2.1.4.
-//! Hooks on memory are not used: with them that version executes loads in IT blocks wrongly.
+//! The library (GPL-2.0) is loaded at run time from the path in `CHIP_UNICORN`; nothing that is shipped
+//! links it. Names and numbers are those of unicorn/unicorn.h and unicorn/arm.h, 2.1.4.
+//! Memory hooks are not used: with them that version executes loads in IT blocks wrongly.
 
 mod callbacks;
 mod library;
@@ -18,52 +17,52 @@ use std::ptr::null_mut;
 use self::callbacks::{on_bad_memory, on_block, on_exception, on_read, on_watched, on_write};
 use self::library::{Api, OnCode, OnException, OnMemory, OnRead, OnWrite, Uc, api};
 
-/// Says where the library is.
+/// The environment variable with the path of the library.
 pub const LIBRARY: &str = "CHIP_UNICORN";
 
-/// Whether the core goes on.
+/// Whether the core continues.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Flow {
-    /// It does.
-    On,
-    /// It comes back before the next block of instructions.
+    /// It continues.
+    Continue,
+    /// It stops before the next basic block.
     Stop,
 }
 
-/// What the core's accesses meet. Only between instructions can it be stopped: one that was stopped in the
-/// middle of an access would access again.
+/// Handles the core's accesses. The core can be stopped only between instructions: one that is stopped in the
+/// middle of an access would repeat the access.
 pub trait Handler {
     /// A read of a device.
     fn read(&mut self, core: Engine, address: u32, size: u32) -> u32;
     /// A write to a device.
     fn write(&mut self, core: Engine, address: u32, value: u32, size: u32);
-    /// A block of instructions is about to run; with [`Flow::Stop`] it does not.
+    /// A basic block is about to be executed; [`Flow::Stop`] prevents it.
     fn block(&mut self, core: Engine, address: u32, len: u32) -> Flow;
-    /// A watched place is about to be executed; with [`Flow::Stop`] it is not.
+    /// A watched instruction is about to be executed; [`Flow::Stop`] prevents it.
     fn watched(&mut self, core: Engine, address: u32) -> Flow;
 }
 
-/// Why the core came back.
+/// Why the core stopped.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Exit {
-    /// A handler said so.
+    /// A handler returned [`Flow::Stop`].
     Stopped,
-    /// QEMU's number of an exception that the core raised by itself; 8 is an exception's return.
+    /// QEMU's number of an exception that the core raised; 8 is an exception return.
     Exception(u32),
-    /// An instruction that there is not.
+    /// An undefined instruction.
     Undefined,
-    /// No memory there, or none that may be used so.
+    /// No memory at the address, or the access is not allowed.
     Memory {
-        /// Where.
+        /// The address.
         address: u32,
-        /// Whether an instruction was fetched.
+        /// Whether it was an instruction fetch.
         is_fetch: bool,
-        /// What was to be written, and how many bytes of it.
+        /// Value and number of bytes of a write.
         written: Option<(u32, u32)>,
     },
 }
 
-/// A register of the core, as the library numbers it.
+/// A register of the core, with the library's number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(i32)]
 #[expect(missing_docs, reason = "the names are the core's")]
@@ -89,7 +88,7 @@ pub enum Reg {
 
 type Mmio = [usize; 2];
 
-/// The core's registers and memory, for a handler too.
+/// Access to the core's registers and memory, also for a handler.
 #[derive(Clone, Copy)]
 pub struct Engine {
     api: &'static Api,
@@ -97,24 +96,24 @@ pub struct Engine {
 }
 
 impl Engine {
-    /// What the register holds.
+    /// The register's value.
     pub fn reg(self, reg: Reg) -> u32 {
         self.numbered(reg as i32)
     }
 
-    /// One of S0 to S15, by its bits.
+    /// The bits of one of S0 to S15.
     pub fn single(self, number: u32) -> u32 {
         self.numbered(Reg::S0 as i32 + number as i32)
     }
 
-    /// One of R4 to R11, by its distance from R4.
-    pub fn kept(self, number: u32) -> u32 {
+    /// R4 to R11; 0 is R4.
+    pub fn callee_saved(self, number: u32) -> u32 {
         self.numbered(Reg::R4 as i32 + number as i32)
     }
 
     fn numbered(self, number: i32) -> u32 {
         let mut value = 0_u64;
-        // SAFETY: the registers that we name have 32 bits; the place has 64.
+        // SAFETY: all registers of `Reg` have 32 bits; there is room for 64.
         unsafe { (self.api.reg_read)(self.uc, number, (&raw mut value).cast()) };
         value as u32
     }
@@ -135,19 +134,19 @@ impl Engine {
         unsafe { (self.api.reg_write)(self.uc, number, (&raw const value).cast()) };
     }
 
-    /// Reads memory, whoever may; false where there is none.
+    /// Reads memory without checking access rights; `false` if there is none.
     pub fn read(self, address: u32, bytes: &mut [u8]) -> bool {
-        // SAFETY: the library writes as many bytes as there are.
+        // SAFETY: the library writes `bytes.len()` bytes.
         0 == unsafe { (self.api.read)(self.uc, address.into(), bytes.as_mut_ptr(), bytes.len() as u64) }
     }
 
-    /// Writes memory, whoever may; false where there is none.
+    /// Writes memory without checking access rights; `false` if there is none.
     pub fn write(self, address: u32, bytes: &[u8]) -> bool {
-        // SAFETY: the library reads as many bytes as there are.
+        // SAFETY: the library reads `bytes.len()` bytes.
         0 == unsafe { (self.api.write)(self.uc, address.into(), bytes.as_ptr(), bytes.len() as u64) }
     }
 
-    /// A word of memory; 0 where there is none.
+    /// A word of memory; 0 if there is none.
     pub fn word(self, address: u32) -> u32 {
         let mut bytes = [0; 4];
         self.read(address, &mut bytes);
@@ -163,7 +162,7 @@ impl Engine {
 /// An emulated Cortex-M7 with its memory.
 pub struct Core {
     engine: Engine,
-    /// Boxed: the callbacks have its address.
+    /// Boxed, because the callbacks get its address.
     shared: Box<Shared>,
 }
 
@@ -177,7 +176,7 @@ impl Core {
     /// A core without memory.
     ///
     /// # Errors
-    /// The library is missing or does not do what it is asked.
+    /// The library is missing or returns an error.
     pub fn new() -> Result<Self, String> {
         const ARM: c_int = 1;
         // UC_MODE_MCLASS would be a Cortex-M33, without doubles.
@@ -186,7 +185,7 @@ impl Core {
         const CORTEX_M7: c_int = 10;
         let api = api()?;
         let mut uc = null_mut();
-        // SAFETY: a place for the handle.
+        // SAFETY: `uc` is valid for the handle.
         checked("uc_open", unsafe { (api.open)(ARM, THUMB, &raw mut uc) })?;
         let core = Self {
             engine: Engine { api, uc },
@@ -205,49 +204,49 @@ impl Core {
         self.engine
     }
 
-    /// Memory that can be executed; `is_writable` or not.
+    /// Maps executable memory.
     ///
     /// # Errors
-    /// There is something already.
+    /// The range is mapped already.
     pub fn map(&self, address: u32, size: u32, is_writable: bool) -> Result<(), String> {
         let access = if is_writable { ALL } else { READ | EXECUTE };
-        // SAFETY: the library's own memory.
+        // SAFETY: the library allocates the memory itself.
         checked("uc_mem_map", unsafe {
             (self.engine.api.map)(self.engine.uc, address.into(), size.into(), access)
         })
     }
 
-    /// Takes a range of memory from those who write.
+    /// Makes a range of memory read-only.
     ///
     /// # Errors
-    /// There is no memory.
-    pub fn close_flash(&self, address: u32, size: u32) -> Result<(), String> {
-        self.protect(address, size, READ | EXECUTE)
+    /// The range is not mapped.
+    pub fn make_read_only(&self, address: u32, size: u32) -> Result<(), String> {
+        self.set_access(address, size, READ | EXECUTE)
     }
 
-    fn protect(&self, address: u32, size: u32, access: u32) -> Result<(), String> {
+    fn set_access(&self, address: u32, size: u32, access: u32) -> Result<(), String> {
         const FLUSH_TLB: c_int = 11 | 1 << 30;
         let Engine { api, uc } = self.engine;
         // SAFETY: as above.
         checked("uc_mem_protect", unsafe { (api.protect)(uc, address.into(), size.into(), access) })?;
-        // Without it, what the page allowed before is still allowed.
+        // Cached translations keep the old access rights.
         // SAFETY: this request takes nothing.
         checked("uc_ctl", unsafe { (api.ctl)(uc, FLUSH_TLB) })
     }
 
-    /// Keeps everybody from a range, or gives it back.
+    /// Makes a range of memory inaccessible, or accessible again.
     ///
     /// # Errors
-    /// There is no memory.
-    pub fn guard(&self, address: u32, size: u32, is_closed: bool) -> Result<(), String> {
-        self.protect(address, size, if is_closed { 0 } else { ALL })
+    /// The range is not mapped.
+    pub fn protect(&self, address: u32, size: u32, is_closed: bool) -> Result<(), String> {
+        self.set_access(address, size, if is_closed { 0 } else { ALL })
     }
 
-    /// Addresses that are the handler's; at most one range for each start in [`MMIO`].
+    /// Passes accesses to a range of [`MMIO`] to the handler.
     ///
     /// # Errors
-    /// There is something already.
-    pub fn devices(&self, [address, size]: Mmio) -> Result<(), String> {
+    /// The range is mapped already.
+    pub fn map_devices(&self, [address, size]: Mmio) -> Result<(), String> {
         let user = self.user();
         let (read, write) = match address as u32 {
             PERIPHERALS => (on_read::<PERIPHERALS> as OnRead, on_write::<PERIPHERALS> as OnWrite),
@@ -259,10 +258,10 @@ impl Core {
         })
     }
 
-    /// Tells the handler before the instruction at this address is executed.
+    /// Calls the handler before the instruction at this address is executed.
     ///
     /// # Errors
-    /// The library does not take it.
+    /// The library returns an error.
     pub fn watch(&self, address: u32) -> Result<(), String> {
         self.hook(HOOK_CODE, on_watched as OnCode as *mut c_void, address.into(), address.into())
     }
@@ -280,18 +279,18 @@ impl Core {
         (&raw const *self.shared).cast_mut().cast()
     }
 
-    /// Forgets what the memory was translated to, because it has changed.
-    pub fn forget(&self, address: u32, len: u32) {
+    /// Drops cached translations of memory that has changed.
+    pub fn invalidate(&self, address: u32, len: u32) {
         const REMOVE_CACHE: c_int = 9 | 2 << 26 | 1 << 30;
         let Engine { api, uc } = self.engine;
         // SAFETY: this request takes a range.
         unsafe { (api.ctl)(uc, REMOVE_CACHE, u64::from(address), u64::from(address) + u64::from(len)) };
     }
 
-    /// Runs from `pc` on, until something is to be done; where, is in the register.
+    /// Runs from `pc` until the core stops; the program counter then is in its register.
     ///
     /// # Panics
-    /// The library fails otherwise than a program can make it.
+    /// The library fails in a way that no program can cause.
     pub fn run(&mut self, pc: u32, handler: &mut dyn Handler) -> Exit {
         self.run_some(pc, 0, handler)
     }
@@ -310,13 +309,13 @@ impl Core {
         const FORBIDDEN: std::ops::RangeInclusive<c_int> = 12..=14;
         const UNDEFINED: c_int = 10;
         let handler: *mut (dyn Handler + '_) = handler;
-        // SAFETY: only the lifetime is left out; the pointer is taken back before this returns.
+        // SAFETY: only the lifetime is extended; the pointer is cleared before this returns.
         let handler: *mut (dyn Handler + 'static) = unsafe { std::mem::transmute(handler) };
         self.shared.handler.set(Some(handler));
         self.shared.exit.set(None);
         let Engine { api, uc } = self.engine;
-        // Without a limit of time: each would start a thread.
-        // SAFETY: the callbacks' memory is there.
+        // No time limit: the library would start a thread for it.
+        // SAFETY: the memory that the callbacks use is valid.
         let status = unsafe { (api.start)(uc, u64::from(pc | 1), NOWHERE, 0, count) };
         self.shared.handler.set(None);
         match (self.shared.exit.get(), status) {
@@ -333,7 +332,7 @@ impl Core {
 
 impl Drop for Core {
     fn drop(&mut self) {
-        // SAFETY: nothing runs, and nobody has the handle any more.
+        // SAFETY: nothing is running, and the handle is not used again.
         unsafe { (self.engine.api.close)(self.engine.uc) };
     }
 }
@@ -342,9 +341,9 @@ fn checked(what: &str, status: c_int) -> Result<(), String> {
     if status == 0 { Ok(()) } else { Err(format!("{what}: error {status}")) }
 }
 
-/// Where the chip's peripherals begin.
+/// Start of the chip's peripherals.
 pub const PERIPHERALS: u32 = 0x4000_0000;
-/// Where those of the core begin.
+/// Start of the core's own peripherals.
 pub const SYSTEM: u32 = 0xE000_0000;
 /// The ranges of devices: start and size.
 pub const MMIO: [Mmio; 2] = [[PERIPHERALS as usize, 0x2000_0000], [SYSTEM as usize, 0x10_0000]];
@@ -355,5 +354,5 @@ const ALL: u32 = 7;
 const HOOK_EXCEPTION: c_int = 1;
 const HOOK_CODE: c_int = 4;
 const HOOK_BLOCK: c_int = 8;
-/// No memory (16, 32, 64) and forbidden (128, 256, 512).
+/// Unmapped memory (16, 32, 64) and missing access rights (128, 256, 512).
 const HOOK_BAD_MEMORY: c_int = 0x3F0;

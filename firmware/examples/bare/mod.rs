@@ -1,5 +1,5 @@
-//! What programs on QEMU's `mps2-an500` need when they need nothing of the board: interrupt vectors, an
-//! end after a panic, arguments and files of the host.
+//! Support for programs on QEMU's `mps2-an500` that do not use the board: interrupt vectors, exit after a panic,
+//! arguments and files of the host.
 
 use core::ffi::CStr;
 use core::fmt::Display;
@@ -8,13 +8,13 @@ use semihosting::experimental::env;
 use semihosting::fs::File;
 use semihosting::io::Read;
 
-/// Ends the emulation and says why.
+/// Ends QEMU with a message.
 pub(crate) fn fail(what: &str, why: &dyn Display) -> ! {
     semihosting::eprintln!("{what}: {why}");
     semihosting::process::exit(1)
 }
 
-/// Does something with the path that is the `nth` semihosting argument.
+/// Passes the path in the `nth` semihosting argument to a function.
 pub(crate) fn with_path<T>(nth: usize, then: impl FnOnce(&CStr) -> T) -> T {
     let Ok(args) = env::args::<1024>() else { fail("arguments", &"too long") };
     let mut name = [0; 1024];

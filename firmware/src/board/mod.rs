@@ -1,7 +1,7 @@
-//! The boards. Each names its pins, clocks and interrupts, and nobody else does.
+//! The boards. Only they know pins, clocks and interrupts.
 //!
-//! A board gives `Board`, which is a [`firmware::platform::Board`], and `main`, which makes one and
-//! starts the tasks with it.
+//! A board defines `Board`, which implements [`firmware::platform::Board`], and `main`, which creates it and
+//! starts the tasks.
 
 mod stack;
 

@@ -1,10 +1,9 @@
-//! The stack of any board: its guard, and how much of it was ever used. Where both are, its linker script
-//! says.
+//! The stack of any board: its guard, and how much of it was used. The linker script places both.
 
 use cortex_m::peripheral::MPU;
 
 unsafe extern "C" {
-    /// The lowest address of the guard, which is a power of two long and lies at a multiple of that.
+    /// The lowest address of the guard, whose size is a power of two and which is aligned to it.
     static _stack_guard: u32;
     /// The stack's lowest address, where the guard ends.
     static _stack_end: u32;
@@ -18,35 +17,35 @@ fn bottom() -> usize {
     &raw const _stack_end as usize
 }
 
-/// Keeps everybody from the memory below the stack, so that an overflow faults. The handler of the fault
-/// is not kept from it: it has to have a stack.
+/// Makes the memory below the stack inaccessible, so that an overflow faults. The fault's handler can access
+/// it, because it needs a stack.
 pub(super) fn guard() {
     let start = &raw const _stack_guard as u32;
     let bits = (bottom() as u32 - start).trailing_zeros();
-    // SAFETY: nobody else uses the MPU, and nothing is kept where the guard is (the linker script).
+    // SAFETY: nothing else uses the MPU, and the linker script places nothing in the guard.
     unsafe {
         let mpu = &*MPU::PTR;
         mpu.rnr.write(0);
         mpu.rbar.write(start);
-        // Execute never, no access, its size, on.
+        // Execute never, no access, size, enabled.
         mpu.rasr.write(1 << 28 | (bits - 1) << 1 | 1);
-        // On, with the ordinary map for everything else.
+        // Enabled, with the default memory map for everything else.
         mpu.ctrl.write(1 << 2 | 1);
     }
     cortex_m::asm::dsb();
     cortex_m::asm::isb();
 }
 
-/// Marks the stack's unused part.
+/// Fills the unused part of the stack with a pattern.
 pub(super) fn paint() {
     let used = cortex_m::register::msp::read() as usize - 256;
     for address in (bottom()..used).step_by(4) {
-        // SAFETY: between the guard and everything that is on the stack now; nobody owns it.
+        // SAFETY: the memory between the guard and the present stack frames is unused.
         unsafe { core::ptr::with_exposed_provenance_mut::<u32>(address).write_volatile(PAINT) }
     }
 }
 
-/// The most that was ever on the stack, in bytes.
+/// Highest stack use so far, in bytes.
 pub(crate) fn used() -> usize {
     let top = &raw const _stack_start as usize;
     // SAFETY: the stack is readable as a whole.

@@ -11,26 +11,25 @@ pub trait CanPort {
     /// The driver's frame.
     type Frame: Frame;
 
-    /// The next frame, a change of the controller's state, or the end of what was sent. Nothing is lost
-    /// when the future is dropped before it is done.
+    /// The next event. No event is lost if the future is dropped before it completes.
     async fn receive(&mut self) -> CanEvent<Self::Frame>;
 
-    /// Hands a frame over for sending after the previous ones, as soon as there is room. When all
-    /// have left, `receive` reports it.
+    /// Queues a frame for sending, as soon as there is room. When all queued frames have left, `receive`
+    /// reports [`CanEvent::Sent`].
     ///
     /// # Errors
-    /// [`BusOff`] when the controller has left the bus; `receive` then does not report that again.
+    /// [`BusOff`] if the controller is bus-off; `receive` then does not report that again.
     async fn send(&mut self, frame: &CanFrame) -> Result<(), BusOff>;
 
-    /// Drops the frames that wait to be sent, and lets the controller back onto the bus after
-    /// bus-off. `receive` reports when it is back, which on a disturbed bus may be never.
+    /// Drops the queued frames, and after bus-off starts the recovery. `receive` reports when the controller is back
+    /// on the bus, which on a disturbed bus may be never.
     fn recover(&mut self);
 
-    /// Goes onto the bus. Frames with other ids need not be received; a controller without room for all
-    /// of the ids lets more pass. Called once, before anything else.
+    /// Sets the acceptance filters and joins the bus. Frames with other ids need not be received; a controller
+    /// without room for all ids may accept more. Called once, before anything else.
     fn set_filters(&mut self, ids: &[CanId]);
 
-    /// State of the controller.
+    /// The controller's counters.
     fn counters(&self) -> CanCounters {
         CanCounters::default()
     }
@@ -46,11 +45,11 @@ pub enum CanEvent<F> {
     Frame(F),
     /// Its error state changed.
     Bus(BusState),
-    /// Everything handed over has left.
+    /// All queued frames have left.
     Sent,
 }
 
-/// The controller has left the bus.
+/// The controller is bus-off.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct BusOff;
 

@@ -1,8 +1,8 @@
 //! SMSC LAN9118 Ethernet controller as a driver of `embassy_net`.
 //!
-//! In: register accesses through [`Registers`], and a waker that the interrupt handler wakes. Out:
-//! Ethernet frames. Of the receive interrupts only "status FIFO level" is used; it says that a whole
-//! frame is there.
+//! In: register accesses through [`Registers`], and a waker that the interrupt handler wakes. Out: Ethernet
+//! frames. The only receive interrupt used is "status FIFO level", which means that a whole frame has
+//! arrived.
 
 use core::task::Context;
 
@@ -13,15 +13,15 @@ use embassy_sync::waitqueue::AtomicWaker;
 pub trait Registers {
     /// Reads the register at `offset`.
     fn read(&self, offset: u16) -> u32;
-    /// Writes it.
+    /// Writes the register at `offset`.
     fn write(&self, offset: u16, value: u32);
-    /// A frame was handed over completely.
+    /// Called after a frame was written completely.
     fn transmitted(&self) {}
 }
 
 /// Longest frame without its CRC.
 const MTU: usize = 1514;
-/// Longest frame with what the controller adds, in whole words.
+/// Longest frame with the controller's padding, in whole words.
 const BUFFER: usize = 1536;
 
 /// The driver. Its interrupt handler calls [`Lan9118::interrupt`].
@@ -31,7 +31,7 @@ pub struct Lan9118<R> {
     address: [u8; 6],
     rx: [u8; BUFFER],
     tx: [u8; BUFFER],
-    /// Frames that were received broken or longer than any frame.
+    /// Number of received frames with errors or too long.
     dropped: u32,
 }
 
@@ -39,9 +39,9 @@ pub struct Lan9118<R> {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum StartError {
-    /// The byte order register reads otherwise: no LAN9118.
+    /// The byte order register has a wrong value: no LAN9118.
     NoController {
-        /// What it reads.
+        /// The register's value.
         found: u32,
     },
     /// A register bit did not change in time.
@@ -63,7 +63,7 @@ impl core::fmt::Display for StartError {
 impl core::error::Error for StartError {}
 
 impl<R: Registers> Lan9118<R> {
-    /// Resets the controller and starts it; interrupts are still off in it.
+    /// Resets and starts the controller, with its interrupts disabled.
     ///
     /// # Errors
     /// See [`StartError`]. A missing controller does not hang the board.
@@ -91,7 +91,7 @@ impl<R: Registers> Lan9118<R> {
         let low = driver.mac_read(MAC_ADDRL)?.to_le_bytes();
         let high = driver.mac_read(MAC_ADDRH)?.to_le_bytes();
         driver.address = [low[0], low[1], low[2], low[3], high[0], high[1]];
-        // Auto-negotiation, and an interrupt for each change of the link.
+        // Auto-negotiation, and an interrupt on changes of the link.
         driver.phy_write(PHY_BMCR, 0x1200)?;
         driver.phy_write(PHY_INT_MASK, 0xD0)?;
         driver.phy_read(PHY_INT_SOURCE)?;
@@ -100,31 +100,30 @@ impl<R: Registers> Lan9118<R> {
         Ok(driver)
     }
 
-    /// The address that the controller has from its EEPROM.
+    /// The MAC address from the EEPROM.
     pub fn address(&self) -> [u8; 6] {
         self.address
     }
 
-    /// Frames that were received broken or too long.
+    /// Number of received frames with errors or too long.
     pub fn dropped(&self) -> u32 {
         self.dropped
     }
 
-    /// What the interrupt handler does: silence, until the driver's task has looked.
+    /// The interrupt handler: disables the controller's interrupts until the task has run.
     pub fn interrupt(regs: &R, waker: &AtomicWaker) {
         regs.write(INT_EN, 0);
         waker.wake();
     }
 
-    /// Takes the next good frame into the buffer; its length.
+    /// Reads the next good frame into the buffer; returns its length.
     fn take_frame(&mut self) -> Option<usize> {
         while self.regs.read(RX_FIFO_INF) >> 16 & 0xFF != 0 {
             let status = self.regs.read(RX_STATUS);
             let length = (status >> 16 & 0x3FFF) as usize;
             let good = status & RX_ERROR == 0 && (CRC..=MTU + CRC).contains(&length);
             let mut words = self.rx.chunks_exact_mut(4);
-            // What is not wanted is read all the same: the controller has no other way to skip it that
-            // works everywhere.
+            // A bad frame is read too: there is no other way to skip it that works on all controllers.
             for _ in 0..length.div_ceil(4) {
                 let word = self.regs.read(RX_DATA);
                 if let Some(bytes) = words.next() {
@@ -182,9 +181,9 @@ impl<R: Registers> Lan9118<R> {
     }
 }
 
-/// A bounded wait: a controller that is not there does not hang the board.
+/// Polls a register with a limit.
 fn wait(regs: &impl Registers, offset: u16, done: impl Fn(u32) -> bool) -> Result<(), StartError> {
-    let is_done = (0..PATIENCE).any(|_| done(regs.read(offset)));
+    let is_done = (0..MAX_POLLS).any(|_| done(regs.read(offset)));
     if is_done { Ok(()) } else { Err(StartError::Stuck { offset }) }
 }
 
@@ -209,7 +208,7 @@ impl<R: Registers> Driver for Lan9118<R> {
             None => {
                 self.regs.write(INT_STS, INT_RX_STATUS);
                 self.enable_interrupts();
-                // One may have come before interrupts were on again.
+                // A frame may have arrived before interrupts were enabled.
                 self.take_frame()?
             }
         };
@@ -219,7 +218,7 @@ impl<R: Registers> Driver for Lan9118<R> {
 
     fn transmit(&mut self, cx: &mut Context<'_>) -> Option<Transmit<'_, R>> {
         if !self.has_room() {
-            // It empties by itself; there is no interrupt for it that works everywhere.
+            // It empties by itself; no interrupt for that works on all controllers.
             cx.waker().wake_by_ref();
             return None;
         }
@@ -228,8 +227,8 @@ impl<R: Registers> Driver for Lan9118<R> {
 
     fn link_state(&mut self, cx: &mut Context<'_>) -> LinkState {
         self.waker.register(cx.waker());
-        // The PHY's interrupt is acknowledged by reading its source, and its link bit keeps a loss until
-        // it was read.
+        // Reading the source acknowledges the PHY's interrupt. The link bit latches a loss until it is read, so
+        // it is read twice.
         let state = self.phy_read(PHY_INT_SOURCE).and_then(|_| {
             self.phy_read(PHY_BMSR)?;
             self.phy_read(PHY_BMSR)
@@ -289,8 +288,8 @@ impl<R: Registers> TxToken for Transmit<'_, R> {
 }
 
 const CRC: usize = 4;
-/// Register reads before something that takes microseconds is given up.
-const PATIENCE: u32 = 100_000;
+/// Polls of something that takes microseconds.
+const MAX_POLLS: u32 = 100_000;
 
 const RX_DATA: u16 = 0x00;
 const TX_DATA: u16 = 0x20;

@@ -4,27 +4,27 @@ use embedded_io_async::{Read, Write};
 
 /// A half-duplex line (D20).
 pub trait Line: Read + Write {
-    /// Raises or releases driver-enable; nothing where the hardware does it, or where there is none.
+    /// Switches driver-enable; does nothing if the hardware does it, or if there is none.
     fn drive(&mut self, direction: LineDirection) {
         let _ = direction;
     }
 
-    /// Counters of characters that the device could not take.
+    /// Counters of characters that were discarded or lost.
     fn errors(&self) -> LineErrors {
         LineErrors::NONE
     }
 }
 
-/// Characters that a line's device could not take since it was started. Counters wrap.
+/// Characters discarded or lost since the start. Counters wrap.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct LineErrors {
     /// Characters discarded because of their parity.
     pub parity: u32,
     /// Characters discarded because of a missing stop bit.
     pub framing: u32,
-    /// Times that the receive FIFO was full, with one character or more lost.
+    /// Overruns of the receive FIFO, each of which loses one character or more.
     pub overruns: u32,
-    /// Characters lost because they were not read in time.
+    /// Characters lost because the task did not read them in time.
     pub unread: u32,
 }
 

@@ -3,10 +3,9 @@
 //! In: accesses to its registers and its message RAM through [`Registers`], and calls of
 //! [`Mcan::interrupt`]. Out: a [`CanPort`]. It knows no board and no pins.
 //!
-//! The message RAM is laid out for a gateway that must not lose frames: two receive FIFOs of 64, so
-//! that 3 ms may pass at 1 Mbit/s before a frame is lost and counted, and a transmit FIFO that takes a
-//! whole cycle of 32. A frame's id chooses its receive FIFO, so frames of one id stay in order. The
-//! interrupt only wakes the task.
+//! The message RAM has two receive FIFOs of 64 frames, so that none is lost within 3 ms at 1 Mbit/s, and a
+//! transmit FIFO for a whole cycle of 32. The id of a frame determines its receive FIFO, so frames of one id
+//! stay in order. The interrupt only wakes the task.
 
 mod registers;
 mod timing;
@@ -32,11 +31,11 @@ pub use timing::{BitTiming, BitrateError};
 pub trait Registers {
     /// Reads the register at `offset`.
     fn read(&self, offset: u8) -> u32;
-    /// Writes it.
+    /// Writes the register at `offset`.
     fn write(&self, offset: u8, value: u32);
     /// Reads a word of the message RAM; `word` is below [`MESSAGE_RAM_WORDS`].
     fn ram_read(&self, word: u16) -> u32;
-    /// Writes it.
+    /// Writes a word of the message RAM.
     fn ram_write(&self, word: u16, value: u32);
 }
 
@@ -45,12 +44,12 @@ pub struct Mcan<R> {
     regs: R,
     waker: &'static AtomicWaker,
     bitrate: u32,
-    /// What was reported last.
+    /// The state reported last.
     state: Cell<BusState>,
-    /// Something was handed over whose end was not reported.
+    /// Frames were queued, and that they have left was not reported yet.
     is_sending: Cell<bool>,
     lost: u32,
-    /// The FIFO that is looked at first, by turns.
+    /// Alternates which FIFO is read first.
     first: bool,
 }
 
@@ -58,12 +57,12 @@ pub struct Mcan<R> {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum StartError {
-    /// The byte order register reads otherwise: no M_CAN, or one without a clock.
+    /// The endian register has a wrong value: no M_CAN, or one without a clock.
     NoController {
-        /// What it reads.
+        /// The register's value.
         found: u32,
     },
-    /// Its clock cannot be divided down to the bus' speed.
+    /// The bit rate cannot be derived from the clock.
     Bitrate(BitrateError),
 }
 
@@ -79,8 +78,8 @@ impl core::fmt::Display for StartError {
 impl core::error::Error for StartError {}
 
 impl<R: Registers> Mcan<R> {
-    /// Sets the controller up, which is clocked by `clock` Hz and was reset. It stays off the bus until
-    /// its filters are set. `ram_offset` is where its message RAM begins, in words, as it counts them.
+    /// Configures the controller after its reset. `clock` is its kernel clock in Hz; `ram_offset` is the start of
+    /// its part of the message RAM, in words. It joins the bus when its filters are set.
     ///
     /// # Errors
     /// See [`StartError`]. A missing controller does not hang the board.
@@ -106,9 +105,9 @@ impl<R: Registers> Mcan<R> {
             first: false,
         };
         mcan.enter_configuration();
-        mcan.lay_out(ram_offset);
+        mcan.layout_message_ram(ram_offset);
         mcan.regs.write(NBTP, timing.register());
-        // Classic frames only, sent again until they are acknowledged.
+        // Classic frames only, with automatic retransmission.
         mcan.regs.write(CCCR, CCCR_INIT | CCCR_CONFIGURE);
         mcan.regs.write(TXBTIE, u32::MAX);
         mcan.regs.write(IE, INTERRUPTS);
@@ -117,15 +116,15 @@ impl<R: Registers> Mcan<R> {
         Ok(mcan)
     }
 
-    /// What its interrupt does.
+    /// The interrupt handler.
     pub fn interrupt(regs: &R, waker: &AtomicWaker) {
-        // The flags of lost frames, which interrupt nobody, stay for `take_frame` to count.
+        // The flags of lost frames cause no interrupt; `take_frame` counts and clears them.
         regs.write(IR, regs.read(IR) & !LOST);
         waker.wake();
     }
 
-    /// Where everything is in the message RAM; all filters off.
-    fn lay_out(&self, ram_offset: u16) {
+    /// Sets the layout of the message RAM, with all filters disabled.
+    fn layout_message_ram(&self, ram_offset: u16) {
         for word in 0..MESSAGE_RAM_WORDS {
             self.regs.ram_write(word, 0);
         }
@@ -137,14 +136,14 @@ impl<R: Registers> Mcan<R> {
         self.regs.write(RXF0C, address(RX_FIFOS[0]) | count(RX_ELEMENTS, 16));
         self.regs.write(RXF1C, address(RX_FIFOS[1]) | count(RX_ELEMENTS, 16));
         self.regs.write(TXEFC, 0);
-        // A FIFO, not a queue that the lowest id leaves first.
+        // A FIFO, not a queue ordered by ids.
         self.regs.write(TXBC, address(TX_FIFO) | count(TX_ELEMENTS, 24));
-        // 8 bytes of data each.
+        // Elements with 8 bytes of data.
         self.regs.write(RXESC, 0);
         self.regs.write(TXESC, 0);
     }
 
-    /// Off the bus; what waited either way is forgotten by the controller.
+    /// Leaves the bus; the controller drops all queued frames.
     fn enter_configuration(&self) {
         let control = self.regs.read(CCCR) & CCCR_KEPT;
         self.regs.write(CCCR, control | CCCR_INIT);
@@ -152,7 +151,7 @@ impl<R: Registers> Mcan<R> {
         self.regs.write(CCCR, control | CCCR_INIT | CCCR_CONFIGURE);
     }
 
-    /// Onto the bus, after 11 recessive bits; after bus-off, 129 times as many.
+    /// Joins the bus after 11 recessive bits, or 129 times as many after bus-off.
     fn leave_configuration(&self) {
         let control = self.regs.read(CCCR) & CCCR_KEPT;
         self.regs.write(CCCR, control | CCCR_INIT);
@@ -160,19 +159,19 @@ impl<R: Registers> Mcan<R> {
         self.wait_for_init(0);
     }
 
-    /// The bit crosses to the bus' clock: some cycles, without which later writes are ignored.
+    /// Waits for INIT to cross to the CAN clock domain; later writes would be ignored before.
     fn wait_for_init(&self, wanted: u32) {
-        for _ in 0..PATIENCE {
+        for _ in 0..MAX_POLLS {
             if self.regs.read(CCCR) & CCCR_INIT == wanted {
                 return;
             }
         }
     }
 
-    /// The controller's error state as it is now.
+    /// The controller's present error state.
     fn bus_state(&self) -> BusState {
-        // After an access to the message RAM that came too late the controller only listens: as good
-        // as off the bus, and cured in the same way.
+        // After a message RAM access failure the controller only listens. The recovery is the same as from
+        // bus-off.
         if self.regs.read(CCCR) & CCCR_RESTRICTED != 0 {
             return BusState::BusOff;
         }
@@ -184,7 +183,7 @@ impl<R: Registers> Mcan<R> {
         }
     }
 
-    /// The next frame, from both FIFOs by turns.
+    /// The next frame, from both FIFOs in turn.
     fn take_frame(&mut self) -> Option<CanFrame> {
         let lost = self.regs.read(IR) & LOST;
         if lost != 0 {
@@ -212,7 +211,7 @@ impl<R: Registers> Mcan<R> {
         }
     }
 
-    /// The frame of a receive FIFO's element; none for a frame that is not classic.
+    /// The frame of a receive FIFO's element; `None` for a CAN FD frame.
     fn element(&self, word: u16) -> Option<CanFrame> {
         let read = |offset: u16| self.regs.ram_read(word.saturating_add(offset));
         let (head, control) = (read(0), read(1));
@@ -235,7 +234,7 @@ impl<R: Registers> Mcan<R> {
         CanFrame::new(id, data.get(..len)?)
     }
 
-    /// Puts a frame into the transmit FIFO; whether there was room.
+    /// Puts a frame into the transmit FIFO; returns whether there was room.
     fn put_frame(&self, frame: &CanFrame) -> bool {
         let status = self.regs.read(TXFQS);
         if status & TXFQS_FULL != 0 {
@@ -267,7 +266,7 @@ impl<R: Registers> Mcan<R> {
         true
     }
 
-    /// Whether something is in the transmit FIFO.
+    /// Whether the transmit FIFO contains frames.
     fn is_transmitting(&self) -> bool {
         self.regs.read(TXBRP) != 0
     }
@@ -309,7 +308,7 @@ impl<R: Registers> CanPort for Mcan<R> {
 
     fn recover(&mut self) {
         self.is_sending.set(false);
-        // Forgets what waited to be sent.
+        // Drops the queued frames.
         self.enter_configuration();
         self.leave_configuration();
     }
@@ -319,7 +318,7 @@ impl<R: Registers> CanPort for Mcan<R> {
         let (mut standard, mut extended) = (0, 0);
         for (index, id) in ids.iter().take(MAX_CAN_IDS).enumerate() {
             let fifo = if index % 2 == 0 { TO_FIFO_0 } else { TO_FIFO_1 };
-            // Of two ids that may be the same: a range's ends are easily swapped, a mask lets more pass.
+            // A dual-id filter with the same id twice accepts exactly this id.
             match *id {
                 CanId::Standard(id) => {
                     let (id, place) = (u32::from(id), STANDARD_FILTERS.saturating_add(standard));
@@ -357,8 +356,8 @@ fn element(start: u16, index: u32) -> u16 {
     start.saturating_add(ELEMENT_WORDS.saturating_mul(index as u16))
 }
 
-/// How often a bit is looked at that changes after some cycles of the bus' clock.
-const PATIENCE: usize = 10_000;
+/// Polls of a bit that changes after some cycles of the CAN clock.
+const MAX_POLLS: usize = 10_000;
 
 #[cfg(test)]
 mod tests;

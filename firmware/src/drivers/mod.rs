@@ -1,6 +1,6 @@
-//! What moves bytes and frames: the traits that the tasks ask of a device, and drivers for some.
+//! The traits of devices that the tasks use, and drivers that implement them.
 //!
-//! A driver knows its registers, through a trait, and neither a board nor a task.
+//! A driver accesses its registers through a trait; it knows neither a board nor a task.
 
 pub mod can_port;
 pub mod lan9118;

@@ -1,5 +1,5 @@
-//! A CAN port on a serial line: the board is the adapter, and the one slcan client at the other end is
-//! the bus (proto-core/docs/wire/slcan.md).
+//! A CAN port on a serial line: the board acts as slcan adapter, and the slcan client is the bus
+//! (proto-core/docs/wire/slcan.md).
 
 use embedded_io_async::{Read, Write};
 use heapless::Vec;
@@ -11,7 +11,7 @@ use crate::clock::now;
 
 /// Answers and frames that wait for the line.
 const MAX_WAITING: usize = 512;
-/// Bytes read at once.
+/// Bytes per read.
 const CHUNK: usize = 64;
 
 /// The adapter.
@@ -22,22 +22,22 @@ pub struct SlcanPort<D> {
     bitrate: u32,
     input: Vec<u8, CHUNK>,
     output: Vec<u8, MAX_WAITING>,
-    /// A frame was sent whose end was not reported.
+    /// A frame was sent, which was not reported yet.
     is_sending: bool,
 }
 
 impl<D: Read + Write> SlcanPort<D> {
-    /// An adapter whose client has not opened it, on a bus of `bitrate` bit/s.
+    /// An adapter with a closed channel, on a bus of `bitrate` bit/s.
     pub fn new(line: D, bitrate: u32) -> Self {
         let channel = Channel::new(bitrate);
         Self { line, channel, bitrate, input: Vec::new(), output: Vec::new(), is_sending: false }
     }
 
-    /// A frame that the bytes so far hold.
+    /// The next complete frame in the received bytes.
     fn take_frame(&mut self) -> Option<CanFrame> {
         let mut rest = self.input.as_slice();
         let mut frame = None;
-        // No line is begun whose answer has no room.
+        // No line is processed without room for its answer.
         while frame.is_none()
             && self.output.capacity().saturating_sub(self.output.len()) > MAX_ANSWER
             && let Some(reaction) = self.channel.receive(&mut rest)
@@ -50,12 +50,12 @@ impl<D: Read + Write> SlcanPort<D> {
         frame
     }
 
-    /// Writes all that waits. What was written is forgotten at once, so nothing is sent twice.
+    /// Writes all pending output. What was written is removed at once, so nothing is sent twice.
     async fn write_out(&mut self) {
         while !self.output.is_empty() {
             match self.line.write(&self.output).await {
                 Ok(len) if len > 0 => remove(&mut self.output, len),
-                // Nobody can be told.
+                // A failure cannot be reported.
                 _ => self.output.clear(),
             }
         }
@@ -78,7 +78,7 @@ impl<D: Read + Write> CanPort for SlcanPort<D> {
             if self.input.is_empty() {
                 let mut chunk = [0; CHUNK];
                 if let Ok(len) = self.line.read(&mut chunk).await {
-                    // As much as was asked for at most, and nothing is in it.
+                    // `input` is empty and as long as the chunk.
                     let _ = self.input.extend_from_slice(chunk.get(..len).unwrap_or(&[]));
                 }
             }
@@ -97,10 +97,10 @@ impl<D: Read + Write> CanPort for SlcanPort<D> {
         Ok(())
     }
 
-    /// There is no bus to be off; what waits is written when the line takes it.
+    /// There is no bus-off; pending output is written when the line accepts it.
     fn recover(&mut self) {}
 
-    /// The client hears and is heard as the bus' only other node.
+    /// The client receives everything, and all its frames are received.
     fn set_filters(&mut self, _: &[CanId]) {}
 
     fn bitrate(&self) -> u32 {

@@ -1,10 +1,10 @@
-//! A model of `chip` as a driver's registers: those that the binary runs on (docs/chip.md). Time is moved by
-//! the test, and a little by each access. What the model refuses fails the test.
+//! The models of `chip` as a driver's registers: the same that the firmware's binary is tested on
+//! (docs/chip.md). The test advances time, and each access a little. A refused access fails the test.
 
 use core::cell::{Cell, RefCell};
 use std::rc::Rc;
 
-use chip::device::{Clocks, Functions, Moment, Peripheral, Picos, Pin, Refusal};
+use chip::device::{Clocks, Context, Functions, Peripheral, Picos, Pin, Refusal};
 
 /// A peripheral with its clocks and pins.
 pub(crate) struct Device<P> {
@@ -15,7 +15,7 @@ pub(crate) struct Device<P> {
 }
 
 impl<P: Peripheral> Device<P> {
-    /// As after a reset, with these pins set up for it.
+    /// A peripheral after a reset, with its pins configured.
     pub(crate) fn new(model: P, clocks: Clocks, pins: &[Pin], function: u8) -> Rc<Self> {
         let mut functions = Functions::default();
         for pin in pins {
@@ -24,58 +24,58 @@ impl<P: Peripheral> Device<P> {
         Rc::new(Self { model: RefCell::new(model), now: Cell::new(0), clocks, functions })
     }
 
-    /// The present.
+    /// Virtual time.
     pub(crate) fn now(&self) -> Picos {
         self.now.get()
     }
 
-    /// Whether its interrupt is asked for.
-    pub(crate) fn interrupts(&self) -> bool {
-        self.with(|model| model.interrupts())
+    /// Level of its interrupt line.
+    pub(crate) fn interrupt_line(&self) -> bool {
+        self.with(|model| model.interrupt_line())
     }
 
-    /// The model, to look at it or to do something at its pins.
+    /// Direct access to the model.
     pub(crate) fn with<T>(&self, f: impl FnOnce(&mut P) -> T) -> T {
         f(&mut self.model.borrow_mut())
     }
 
-    /// The program reads a register.
+    /// A read of a register by the driver.
     #[track_caller]
     pub(crate) fn read(&self, offset: u32) -> u32 {
         let read = self.access(|model, at| model.read(offset, at));
         read.unwrap_or_else(|refusal| panic!("{} is read: {refusal}", self.name(offset)))
     }
 
-    /// The program writes a register.
+    /// A write of a register by the driver.
     #[track_caller]
     pub(crate) fn write(&self, offset: u32, value: u32) {
         let written = self.access(|model, at| model.write(offset, value, at));
         written.unwrap_or_else(|refusal| panic!("{} <- {value:08X}: {refusal}", self.name(offset)));
     }
 
-    /// The program does something else there.
+    /// Another access by the driver.
     pub(crate) fn access<T>(
         &self,
-        f: impl FnOnce(&mut P, &Moment<'_>) -> Result<T, Refusal>,
+        f: impl FnOnce(&mut P, &Context<'_>) -> Result<T, Refusal>,
     ) -> Result<T, Refusal> {
         self.now.set(self.now() + ACCESS);
         let mut model = self.model.borrow_mut();
-        model.advance(&self.moment())?;
-        f(&mut model, &self.moment())
+        model.advance(&self.context())?;
+        f(&mut model, &self.context())
     }
 
-    /// Time passes up to the next thing that the peripheral does, or to `end`, where it returns `false`.
+    /// Advances time to the peripheral's next event, or to `end`, and then returns `false`.
     #[track_caller]
     pub(crate) fn hop(&self, end: Picos) -> bool {
         self.advance();
-        let due = self.with(|model| model.deadline(&self.moment())).filter(|due| *due < end);
-        assert!(due.is_none_or(|due| due > self.now()), "what is due is not done");
+        let due = self.with(|model| model.deadline(&self.context())).filter(|due| *due < end);
+        assert!(due.is_none_or(|due| due > self.now()), "an event was due and not handled");
         self.now.set(due.unwrap_or(end).max(self.now()));
         self.advance();
         due.is_some()
     }
 
-    /// Time passes.
+    /// Advances time.
     #[track_caller]
     pub(crate) fn pass(&self, span: Picos) {
         let end = self.now() + span;
@@ -84,12 +84,12 @@ impl<P: Peripheral> Device<P> {
 
     #[track_caller]
     fn advance(&self) {
-        let done = self.with(|model| model.advance(&self.moment()));
-        done.unwrap_or_else(|refusal| panic!("it does something by itself: {refusal}"));
+        let done = self.with(|model| model.advance(&self.context()));
+        done.unwrap_or_else(|refusal| panic!("an event of the peripheral: {refusal}"));
     }
 
-    fn moment(&self) -> Moment<'_> {
-        Moment { now: self.now(), clocks: self.clocks, functions: &self.functions, is_rmii: false }
+    fn context(&self) -> Context<'_> {
+        Context { now: self.now(), clocks: self.clocks, functions: &self.functions, is_rmii: false }
     }
 
     fn name(&self, offset: u32) -> std::string::String {
@@ -99,5 +99,5 @@ impl<P: Peripheral> Device<P> {
     }
 }
 
-/// One cycle of a bus at 100 MHz.
+/// Duration of an access: one cycle of a bus at 100 MHz.
 const ACCESS: Picos = 10_000;

@@ -3,12 +3,11 @@
 //! In: register accesses through [`Registers`], the line's settings, and calls of [`Usart::interrupt`].
 //! Out: a [`Line`]. It knows no board and no pins.
 //!
-//! Why interrupts and not DMA: a character with a parity or framing error has to be left out by itself.
-//! A recipe's stream has no checksum, so it must not pass for good, and a disturbed character (they
-//! are usual when a half-duplex line turns round) must not stop the reception of those behind it. The
-//! receive FIFO is emptied when it is a quarter full, or when the line falls silent for one character;
-//! 12 more characters fit in it meanwhile, 260 µs at 460800 baud. Driver-enable is the hardware's: it
-//! falls half a bit after the last stop bit, whatever the tasks do.
+//! Interrupts are used instead of DMA, because each character with a parity or framing error has to be
+//! discarded: a recipe's stream has no checksum. Disturbed characters are usual when a half-duplex line changes
+//! direction, and must not stop the reception of the next ones. The receive FIFO is emptied when it is a quarter
+//! full, or when the line is idle for one character; 12 more characters fit in it meanwhile, 260 µs at 460800
+//! baud. The hardware controls driver-enable and releases it half a bit after the last stop bit.
 
 use core::cell::RefCell;
 use core::convert::Infallible;
@@ -27,15 +26,15 @@ use super::line::{Line, LineErrors};
 pub trait Registers {
     /// Reads the register at `offset`.
     fn read(&self, offset: u8) -> u32;
-    /// Writes it.
+    /// Writes the register at `offset`.
     fn write(&self, offset: u8, value: u32);
 }
 
-/// What a line and its interrupt handler share.
+/// State shared by a line and its interrupt handler.
 pub struct Shared(Mutex<RefCell<State>>);
 
 impl Shared {
-    /// Of a line that is not started.
+    /// The state of a line that is not started.
     pub const fn new() -> Self {
         Self(Mutex::new(RefCell::new(State {
             received: Deque::new(),
@@ -53,12 +52,12 @@ impl Default for Shared {
     }
 }
 
-/// The USART cannot run at that speed.
+/// The USART does not support this baud rate.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct BaudError {
-    /// What was asked for, in bit/s.
+    /// Requested baud rate, in bit/s.
     pub baud: u32,
-    /// What drives the USART, in Hz.
+    /// The USART's kernel clock, in Hz.
     pub clock: u32,
 }
 
@@ -77,11 +76,11 @@ pub struct Usart<R: 'static> {
 }
 
 impl<R: Registers> Usart<R> {
-    /// Starts the USART, which is clocked by `clock` Hz and was reset. From here on its interrupt has to
-    /// call [`Usart::interrupt`].
+    /// Starts the USART after its reset. `clock` is its kernel clock in Hz. From here on its interrupt handler
+    /// has to call [`Usart::interrupt`].
     ///
     /// # Errors
-    /// [`BaudError`] when the clock cannot be divided down to the line's speed within 1 %.
+    /// [`BaudError`] if no divider gives the baud rate within 1 %.
     pub fn start(regs: R, shared: &'static Shared, line: &Rs485, clock: u32) -> Result<Self, BaudError> {
         let speed = Speed::of(line.baud, clock)?;
         regs.write(CR1, 0);
@@ -89,7 +88,7 @@ impl<R: Registers> Usart<R> {
         regs.write(BRR, speed.divider);
         regs.write(CR2, if line.stop_bits == 2 { CR2_TWO_STOP_BITS } else { 0 });
         regs.write(CR3, CR3_DRIVER_ENABLE | CR3_RX_QUARTER | CR3_RX_THRESHOLD_IRQ | CR3_TX_HALF);
-        // The parity bit is one of the word's bits.
+        // The parity bit counts as a bit of the word.
         let parity = match line.parity {
             Parity::None => 0,
             Parity::Even => CR1_NINE_BITS | CR1_PARITY,
@@ -101,7 +100,7 @@ impl<R: Registers> Usart<R> {
         Ok(Self { regs, shared })
     }
 
-    /// What its interrupt does.
+    /// The interrupt handler.
     pub fn interrupt(regs: &R, shared: &Shared) {
         with(regs, shared, |line| {
             line.receive();
@@ -117,7 +116,7 @@ impl<R: Registers> Usart<R> {
     }
 }
 
-/// Alone with the registers and the shared state, for a moment.
+/// Calls `f` with the registers and the shared state, in a critical section.
 fn with<R, T>(regs: &R, shared: &Shared, f: impl FnOnce(&mut Access<'_, R>) -> T) -> T {
     critical_section::with(|cs| f(&mut Access { regs, state: &mut shared.0.borrow_ref_mut(cs) }))
 }
@@ -146,11 +145,11 @@ impl<R: Registers> Access<'_, R> {
 
     /// Empties the receive FIFO.
     fn receive(&mut self) {
-        // What is pending here is for what arrived before; the FIFO is emptied behind it.
+        // Cleared before the FIFO is emptied, so that a later idle line interrupts again.
         self.regs.write(ICR, IDLE);
         let errors = &mut self.state.errors;
-        // Each character is there with its own error flags. They are cleared before the character is
-        // taken, because the flags behind it are those of the next.
+        // Each character has its own error flags. They are cleared before the character is read, because
+        // afterwards they are those of the next.
         for _ in 0..MAX_AT_ONCE {
             let status = self.regs.read(ISR);
             if status & OVERRUN != 0 {
@@ -176,7 +175,7 @@ impl<R: Registers> Access<'_, R> {
         }
     }
 
-    /// Fills the transmit FIFO; when nothing waits any more, wakes who flushes.
+    /// Fills the transmit FIFO. Wakes a flush when all characters have left.
     fn transmit(&mut self) {
         while !self.state.waiting.is_empty() && self.regs.read(ISR) & TX_NOT_FULL != 0 {
             if let Some(byte) = self.state.waiting.pop_front() {
@@ -204,7 +203,7 @@ impl<R: Registers> Read for Usart<R> {
     async fn read(&mut self, buf: &mut [u8]) -> Result<usize, Infallible> {
         poll_fn(|cx| {
             self.with(|line| {
-                // Less than a quarter of the FIFO interrupts nobody until the line falls silent.
+                // Less than a quarter of the FIFO causes no interrupt until the line is idle.
                 line.receive();
                 if line.state.received.is_empty() && !buf.is_empty() {
                     line.state.reader.register(cx.waker());
@@ -269,7 +268,7 @@ impl<R: Registers> Line for Usart<R> {
 /// How the USART's clock is divided.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Speed {
-    /// Index of [`PRESCALERS`], as the register has it.
+    /// Index in [`PRESCALERS`], the value of the register.
     prescaler: u32,
     divider: u32,
 }
@@ -294,11 +293,11 @@ impl Speed {
     }
 }
 
-/// Characters kept for the task: 22 ms at 460800 baud.
+/// Characters buffered for the task: 22 ms at 460800 baud.
 const RX_RING: usize = 1024;
-/// Characters kept for the line: the longest frame.
+/// Characters buffered for the line: the longest frame.
 const TX_RING: usize = 512;
-/// More than the FIFO holds: one call cannot be kept busy by a fast line.
+/// Bound of one call, above the size of the FIFO.
 const MAX_AT_ONCE: usize = 32;
 
 const PRESCALERS: [u32; 12] = [1, 2, 4, 6, 8, 10, 12, 16, 32, 64, 128, 256];
@@ -323,7 +322,7 @@ const CR1_TX_COMPLETE_IRQ: u32 = 1 << 6;
 const CR1_ODD: u32 = 1 << 9;
 const CR1_PARITY: u32 = 1 << 10;
 const CR1_NINE_BITS: u32 = 1 << 12;
-/// Half a bit before the first start bit, half a bit behind the last stop bit.
+/// Half a bit before the first start bit and half a bit after the last stop bit.
 const CR1_DRIVER_TIMES: u32 = 8 << 16 | 8 << 21;
 const CR1_FIFO: u32 = 1 << 29;
 const CR2_TWO_STOP_BITS: u32 = 2 << 12;
@@ -331,20 +330,20 @@ const CR3_DRIVER_ENABLE: u32 = 1 << 14;
 const CR3_TX_THRESHOLD_IRQ: u32 = 1 << 23;
 const CR3_RX_QUARTER: u32 = 1 << 25;
 const CR3_RX_THRESHOLD_IRQ: u32 = 1 << 28;
-/// The interrupt comes when half of the transmit FIFO is free.
+/// Threshold of the transmit interrupt: half of the FIFO is free.
 const CR3_TX_HALF: u32 = 2 << 29;
 
-/// Of ISR, and in ICR what clears them.
+// Flags of ISR, and in ICR the bits that clear them.
 const PARITY_ERROR: u32 = 1;
 const FRAMING_ERROR: u32 = 1 << 1;
 const NOISE: u32 = 1 << 2;
 const OVERRUN: u32 = 1 << 3;
 const IDLE: u32 = 1 << 4;
 const TX_COMPLETE: u32 = 1 << 6;
-/// Of ISR only.
+// Flags of ISR only.
 const RX_NOT_EMPTY: u32 = 1 << 5;
 const TX_NOT_FULL: u32 = 1 << 7;
-/// Noise is only told: the samples of the bit disagreed, its majority was taken.
+/// Noise is cleared but not counted: the majority of the bit's samples was taken.
 const CHARACTER_ERRORS: u32 = PARITY_ERROR | FRAMING_ERROR | NOISE;
 
 #[cfg(test)]

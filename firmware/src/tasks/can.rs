@@ -1,8 +1,7 @@
 //! A CAN port's task.
 //!
-//! One task drives the controller: it receives, sends what the engine hands over, and brings the
-//! controller back after bus-off. It never waits for one direction only, and after some frames in a row
-//! it lets the other tasks run, however busy the bus is.
+//! The task receives, sends what the engine hands over, and restarts the controller after bus-off. It never waits
+//! for one direction only, and yields after some events in a row, however busy the bus is.
 
 use core::pin::pin;
 
@@ -33,7 +32,7 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, can: impl CanPo
         backoff: BACKOFF_MIN,
         recovered: Instant::MIN,
         lost: 0,
-        lost_told: Instant::MIN,
+        lost_logged: Instant::MIN,
     };
     task.run().await
 }
@@ -58,15 +57,15 @@ struct Task<'a, C> {
     control: &'a PortControl,
     can: C,
     phase: Phase,
-    /// The newest frames handed over did not leave.
+    /// The last attempt to send failed.
     is_failing: bool,
-    /// The wait after the next bus-off.
+    /// Wait after the next bus-off.
     backoff: Duration,
     /// When the controller was back on the bus.
     recovered: Instant,
-    /// Number of lost frames in the newest log line, and when that was.
+    /// Number of lost frames in the last log line, and its time.
     lost: u32,
-    lost_told: Instant,
+    lost_logged: Instant,
 }
 
 impl<C: CanPort> Task<'_, C> {
@@ -75,24 +74,24 @@ impl<C: CanPort> Task<'_, C> {
         self.gateway.input(Input::PortUp { port: self.port });
         loop {
             for _ in 0..IN_A_ROW {
-                let alarm = self.alarm();
-                let next = select3(self.can.receive(), self.control.frame_waits(), Timer::at(alarm));
+                let deadline = self.deadline();
+                let next = select3(self.can.receive(), self.control.frame_waits(), Timer::at(deadline));
                 let next = self.pulse.idle(pin!(next)).await;
                 match next {
                     Either3::First(event) => self.event(event),
                     Either3::Second(()) => {}
                     Either3::Third(()) => self.expired(),
                 }
-                // A bus that is never idle does not keep the task from sending.
+                // Also while the bus is never idle.
                 self.send_waiting().await;
             }
-            self.tell_lost();
+            self.log_lost();
             self.gateway.more_waits();
             yield_now().await;
         }
     }
 
-    fn alarm(&self) -> Instant {
+    fn deadline(&self) -> Instant {
         match self.phase {
             Phase::Idle => Instant::MAX,
             Phase::Sending { until } | Phase::Off { until } | Phase::Recovering { until } => until,
@@ -102,13 +101,13 @@ impl<C: CanPort> Task<'_, C> {
     fn event(&mut self, event: CanEvent<C::Frame>) {
         match event {
             CanEvent::Frame(frame) => {
-                if let Some(frame) = own_frame(&frame) {
+                if let Some(frame) = to_core(&frame) {
                     self.gateway.input(Input::PortCan { port: self.port, frame });
                 }
             }
             CanEvent::Bus(BusState::BusOff) => self.bus_off(),
             CanEvent::Bus(state) => {
-                self.tell_state(state);
+                self.log_state(state);
                 if matches!(self.phase, Phase::Off { .. } | Phase::Recovering { .. }) {
                     self.recovered = Instant::now();
                     self.phase = Phase::Idle;
@@ -130,22 +129,22 @@ impl<C: CanPort> Task<'_, C> {
         let mut frames = 0_u32;
         while let Some(frame) = self.control.next_frame() {
             if matches!(self.phase, Phase::Off { .. } | Phase::Recovering { .. }) {
-                // The engine knows; what it handed over before is lost.
+                // The engine knows the state of the bus; earlier frames are dropped.
                 continue;
             }
             frames = frames.saturating_add(1);
-            let patience = patience(frames, self.can.bitrate());
-            self.control.forget_sleep();
-            // If the gateway has slept meanwhile, data in the controller is old and must be
-            // reported before the frame has left.
-            let sending = select(self.can.send(&frame), self.control.has_slept());
-            let sent = self.pulse.idle(pin!(with_timeout(patience, sending))).await;
+            let timeout = send_timeout(frames, self.can.bitrate());
+            self.control.clear_sleep();
+            // If the gateway has slept meanwhile, data in the controller is old and must be reported before
+            // the frame has left.
+            let sending = select(self.can.send(&frame), self.control.wait_for_sleep());
+            let sent = self.pulse.idle(pin!(with_timeout(timeout, sending))).await;
             match sent {
                 Ok(Either::First(Ok(()))) => {
-                    self.phase = Phase::Sending { until: Instant::now() + patience };
+                    self.phase = Phase::Sending { until: Instant::now() + timeout };
                 }
                 Ok(Either::First(Err(BusOff))) => self.bus_off(),
-                Ok(Either::Second(())) => self.forget_waiting(),
+                Ok(Either::Second(())) => self.drop_waiting(),
                 Err(_) => self.give_up(),
             }
         }
@@ -162,10 +161,9 @@ impl<C: CanPort> Task<'_, C> {
         }
     }
 
-    /// Frames are not acknowledged: another node is missing, or the cable. Waiting frames would be
-    /// old when one comes.
+    /// Frames are not acknowledged: no other node is connected. Waiting frames would be old when one is.
     fn give_up(&mut self) {
-        // Logged once, however often it happens in a row.
+        // Logged only the first time in a row.
         if !self.is_failing {
             let errors = self.can.counters().transmit_errors;
             warn!(
@@ -174,10 +172,10 @@ impl<C: CanPort> Task<'_, C> {
             );
         }
         self.is_failing = true;
-        self.forget_waiting();
+        self.drop_waiting();
     }
 
-    fn forget_waiting(&mut self) {
+    fn drop_waiting(&mut self) {
         self.can.recover();
         self.control.clear();
         self.phase = Phase::Idle;
@@ -200,7 +198,7 @@ impl<C: CanPort> Task<'_, C> {
         self.control.clear();
     }
 
-    fn tell_state(&self, state: BusState) {
+    fn log_state(&self, state: BusState) {
         let CanCounters { transmit_errors, receive_errors, .. } = self.can.counters();
         let name = match state {
             BusState::Active => "error-active",
@@ -213,19 +211,19 @@ impl<C: CanPort> Task<'_, C> {
     }
 
     /// Logs that frames were lost, at most once a second.
-    fn tell_lost(&mut self) {
+    fn log_lost(&mut self) {
         let lost = self.can.counters().lost;
         let now = Instant::now();
-        if lost != self.lost && now.saturating_duration_since(self.lost_told) >= LOST_PERIOD {
+        if lost != self.lost && now.saturating_duration_since(self.lost_logged) >= LOST_PERIOD {
             warn!("port {}: frames were lost {} times", self.port.0, lost);
             self.lost = lost;
-            self.lost_told = now;
+            self.lost_logged = now;
         }
     }
 }
 
-/// The engine's frame. A remote frame has no data.
-fn own_frame(frame: &impl Frame) -> Option<CanFrame> {
+/// Converts a frame of the driver.
+fn to_core(frame: &impl Frame) -> Option<CanFrame> {
     let id = CanId::from(frame.id());
     if frame.is_remote_frame() {
         CanFrame::remote(id, frame.dlc().min(MAX_CAN_DATA))
@@ -234,21 +232,21 @@ fn own_frame(frame: &impl Frame) -> Option<CanFrame> {
     }
 }
 
-/// Four times what the frames take on a bus of their own, 160 bits each at most, and a little: others
-/// may be more urgent.
-fn patience(frames: u32, bitrate: u32) -> Duration {
+/// Four times the duration of the frames on an idle bus (at most 160 bits each), plus a minimum: frames of other
+/// nodes may have priority.
+fn send_timeout(frames: u32, bitrate: u32) -> Duration {
     let bits = u64::from(frames).saturating_mul(4 * 160);
-    Duration::from_micros(bits.saturating_mul(1_000_000) / u64::from(bitrate.max(1))) + PATIENCE_MIN
+    Duration::from_micros(bits.saturating_mul(1_000_000) / u64::from(bitrate.max(1))) + SEND_TIMEOUT_MIN
 }
 
-/// Events in a row, before the other tasks have their turn.
+/// Events in a row before the task yields.
 const IN_A_ROW: usize = 16;
-const PATIENCE_MIN: Duration = Duration::from_millis(250);
+const SEND_TIMEOUT_MIN: Duration = Duration::from_millis(250);
 const BACKOFF_MIN: Duration = Duration::from_millis(100);
 const BACKOFF_MAX: Duration = Duration::from_secs(5);
-/// On the bus for as long, the next bus-off is the first again.
+/// After this time on the bus, the next bus-off has the shortest wait again.
 const HEALTHY: Duration = Duration::from_secs(5);
-/// Back on the bus it needs 129 times 11 bits: 142 ms at 10 kbit/s.
+/// Limit of a recovery, which takes 129 times 11 bits: 142 ms at 10 kbit/s.
 const RECOVERY: Duration = Duration::from_secs(1);
 const LOST_PERIOD: Duration = Duration::from_secs(1);
 

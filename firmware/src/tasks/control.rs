@@ -1,4 +1,4 @@
-//! The connection between the engine and the task of a port or link: an outbox each.
+//! The outboxes between the engine and the tasks of ports and links.
 
 use core::cell::{Cell, RefCell};
 
@@ -33,48 +33,48 @@ impl PortControl {
         }
     }
 
-    /// Of a CAN port, before its task starts.
-    pub(crate) fn take_ids(&mut self, ids: impl Iterator<Item = CanId>) {
+    /// Sets the ids of a CAN port, before its task starts.
+    pub(crate) fn set_ids(&mut self, ids: impl Iterator<Item = CanId>) {
         self.ids.extend(ids);
     }
 
-    /// Of a CAN port: the ids whose frames its recipe takes.
+    /// The ids that the recipe of a CAN port receives.
     pub(crate) fn ids(&self) -> &[CanId] {
         &self.ids
     }
 
-    /// The engine hands over one transmission and waits until it has left.
+    /// Takes one transmission from the engine, which waits until it has left.
     pub(crate) fn put(&self, bytes: &[u8]) {
         *self.bytes.borrow_mut() = Transmission::from_slice(bytes).ok();
         self.changed.notify();
     }
 
-    /// The engine hands over at most as many frames as there is room for.
+    /// Takes a frame from the engine, which hands over at most as many as there is room for.
     pub(crate) fn put_frame(&self, frame: CanFrame) {
         let _ = self.frames.borrow_mut().push_back(frame);
         self.changed.notify();
     }
 
-    /// Wakes the task: its device may have data for which it has woken no task.
-    pub(crate) fn look(&self) {
+    /// Wakes the task, because its device may hold data without having woken it.
+    pub(crate) fn wake(&self) {
         self.changed.notify();
     }
 
     pub(crate) fn slept(&self) {
         self.has_slept.set(true);
-        self.look();
+        self.wake();
     }
 
-    /// Waits until the gateway has slept: data that waits in the device must be reported at once,
-    /// while the engine discards it. Consumes notifications, so nothing else may wait for them.
-    pub(crate) async fn has_slept(&self) {
+    /// Waits until the gateway has slept: data in the device then must be reported at once, while the engine
+    /// discards it. Consumes notifications, so nothing else may wait for them.
+    pub(crate) async fn wait_for_sleep(&self) {
         while !self.has_slept.take() {
             self.changed.notified().await;
         }
     }
 
-    /// From here on only a future sleep counts.
-    pub(crate) fn forget_sleep(&self) {
+    /// Ignores earlier sleeps.
+    pub(crate) fn clear_sleep(&self) {
         self.has_slept.set(false);
     }
 
@@ -109,7 +109,7 @@ impl PortControl {
         self.frames.borrow_mut().pop_front()
     }
 
-    /// Drops what waits: the device is gone.
+    /// Drops all data to send: the device is gone.
     pub(crate) fn clear(&self) {
         self.frames.borrow_mut().clear();
         *self.bytes.borrow_mut() = None;
@@ -125,7 +125,7 @@ pub(crate) struct LinkControl {
     /// Bytes of this turn that are not acknowledged, as the engine knows.
     unacknowledged: Cell<u32>,
     changed: Notify,
-    strangers: Cell<u32>,
+    refused_peers: Cell<u32>,
 }
 
 impl LinkControl {
@@ -135,18 +135,18 @@ impl LinkControl {
             outbox: RefCell::new(None),
             unacknowledged: Cell::new(0),
             changed: Notify::new(),
-            strangers: Cell::new(0),
+            refused_peers: Cell::new(0),
         }
     }
 
-    /// Another host than the controller connected or sent to a listening link.
-    pub(crate) fn turn_away(&self) {
-        self.strangers.set(self.strangers.get().saturating_add(1));
+    /// Counts a connection or datagram of another host than the controller.
+    pub(crate) fn count_refused_peer(&self) {
+        self.refused_peers.set(self.refused_peers.get().saturating_add(1));
     }
 
-    /// How often that happened.
-    pub(crate) fn strangers(&self) -> u32 {
-        self.strangers.get()
+    /// Number of refused connections and datagrams.
+    pub(crate) fn refused_peers(&self) -> u32 {
+        self.refused_peers.get()
     }
 
     pub(crate) fn is_turn(&self, turn: u32) -> bool {
@@ -165,7 +165,7 @@ impl LinkControl {
         }
     }
 
-    /// The engine hands over one transmission and waits until it was taken.
+    /// Takes one transmission from the engine, which waits until the socket has accepted it.
     pub(crate) fn put(&self, bytes: &[u8]) {
         self.unacknowledged.set(self.unacknowledged.get().saturating_add(bytes.len() as u32));
         *self.outbox.borrow_mut() = Transmission::from_slice(bytes).ok();

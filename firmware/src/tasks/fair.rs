@@ -1,7 +1,7 @@
 //! An Ethernet controller with limited reads.
 //!
-//! The network stack takes all frames that are there before it gives the processor back. When they come
-//! faster than it takes them, nothing else would run any more: no port, no deadline, no watchdog.
+//! The network stack processes all waiting frames before it yields. If they arrived faster than it processes
+//! them, no other task would run any more: no port, no deadline, no watchdog.
 
 use core::task::Context;
 
@@ -9,7 +9,7 @@ use embassy_net_driver::{Capabilities, Driver, HardwareAddress, LinkState};
 
 use super::gateway::Gateway;
 
-/// The controller, and how many frames may still be taken in this turn.
+/// The controller, and the number of frames that may still be read in this turn.
 pub struct Fair<'a, D> {
     device: D,
     gateway: &'a Gateway,
@@ -17,7 +17,7 @@ pub struct Fair<'a, D> {
 }
 
 impl<'a, D: Driver> Fair<'a, D> {
-    /// Wakes the gateway when more waits than the network takes in one turn.
+    /// Limits `device`, and tells `gateway` if frames are left at the end of a turn.
     pub fn new(device: D, gateway: &'a Gateway) -> Self {
         Self { device, gateway, left: FRAMES }
     }
@@ -47,7 +47,7 @@ impl<D: Driver> Driver for Fair<'_, D> {
         self.device.transmit(cx)
     }
 
-    /// The stack asks once in each turn, after the frames.
+    /// The stack calls it once in each turn, after reading frames.
     fn link_state(&mut self, cx: &mut Context<'_>) -> LinkState {
         self.left = FRAMES;
         self.device.link_state(cx)
@@ -62,7 +62,7 @@ impl<D: Driver> Driver for Fair<'_, D> {
     }
 }
 
-/// Frames in a turn: more than a board's receive ring holds, and some 100 µs of work.
+/// Frames in a turn: more than a board's receive ring, and about 100 µs of work.
 const FRAMES: usize = 16;
 
 #[cfg(test)]
@@ -79,7 +79,7 @@ mod tests {
     use super::*;
     use crate::tasks::test_clock::Clock;
 
-    /// There is always another frame, and none is for us.
+    /// Always has another frame, for another station.
     struct Endless<'a>(&'a Cell<u32>);
     struct Token;
 

@@ -1,9 +1,9 @@
 //! The engine, shared by the tasks.
 //!
-//! Input of a driver goes into the engine at once, and the engine's outputs are carried out before
-//! anything else is read: one engine pass lies between the last byte of a field frame and the
-//! request on its way to the controller. All tasks run on one executor, so the engine is never
-//! entered twice. Each port and link has one outbox; its task takes data from there.
+//! A driver's input is handled at once, and the engine's outputs are carried out before anything else is read:
+//! there is one engine pass between the last byte of a field frame and the request to the controller. All tasks
+//! run on one executor, so the engine is never entered twice. Each port and link has one outbox, from which its
+//! task takes data.
 
 use core::cell::{Cell, RefCell};
 use core::pin::pin;
@@ -65,21 +65,21 @@ impl Gateway {
         }
     }
 
-    /// Takes the configuration, in place; ports and links are down.
+    /// Applies the configuration; ports and links are down.
     ///
     /// # Errors
-    /// Why the engine cannot run it.
+    /// The engine refuses it.
     pub fn configure(&mut self, config: &GatewayConfig) -> Result<(), BuildError> {
-        // Not so in `idle`, which is all zeros and takes no flash.
+        // Not in `idle`, which must be all zeros to take no flash.
         self.deadline.set(Instant::NEVER);
         let engine = self.engine.get_mut();
         engine.configure(config)?;
-        // As many places as the engine has.
+        // The vectors are as long as the engine's.
         self.ports.clear();
         self.ports.extend(engine.field_ports().map(|id| (id, PortControl::new())));
         for ((_, control), (.., recipe)) in self.ports.iter_mut().zip(config.view().field_ports()) {
             if let Parts::Can { input, .. } = &recipe.parts {
-                control.take_ids(input.iter().map(|frame| frame.id));
+                control.set_ids(input.iter().map(|frame| frame.id));
             }
         }
         self.links.clear();
@@ -107,17 +107,17 @@ impl Gateway {
         }
     }
 
-    /// How often the gateway slept: waiting input was discarded.
+    /// How often the gateway slept, so that waiting input was discarded.
     pub fn sleeps(&self) -> u32 {
         self.sleeps.get()
     }
 
     /// Number of connections and datagrams of other hosts that each link has refused.
-    pub fn strangers(&self) -> impl Iterator<Item = (LinkKind, u32)> + '_ {
-        self.links.iter().map(|(_, kind, control)| (*kind, control.strangers()))
+    pub fn refused_peers(&self) -> impl Iterator<Item = (LinkKind, u32)> + '_ {
+        self.links.iter().map(|(_, kind, control)| (*kind, control.refused_peers()))
     }
 
-    /// Handles one input, now, and all outputs that follow.
+    /// Handles one input at the present time, and all outputs that follow.
     pub fn input(&self, input: Input<'_>) {
         let now = now();
         let mut engine = self.engine.borrow_mut();
@@ -164,14 +164,14 @@ impl Gateway {
         }
     }
 
-    /// Lets deadlines pass when the engine has asked for it. The engine's own task.
+    /// The engine's own task: calls it at its deadlines.
     pub async fn keep_time(&self, pulse: &Pulse) -> ! {
         self.input(Input::Tick);
         loop {
             let until = embassy_time::Instant::from_micros(self.deadline.get().as_micros());
             match pulse.idle(pin!(select(Timer::at(until), self.deadline_moved.notified()))).await {
                 Either::First(()) => {
-                    self.all_told().await;
+                    self.drain_inputs().await;
                     self.input(Input::Tick);
                 }
                 Either::Second(()) => {}
@@ -179,14 +179,14 @@ impl Gateway {
         }
     }
 
-    /// Waits until everything that arrived before this moment has been reported: it was not late,
-    /// whatever kept the processor. A task that always has more is not waited for without limit.
+    /// Waits until everything that arrived before now has been reported, so that it does not count as late because
+    /// the processor was busy. The wait is bounded, as a task may always have more.
     ///
-    /// In a round of the executor each task that was woken runs once, in no particular order. What the
-    /// Ethernet controller has goes to the network's task in one round and to a link's in the next.
-    async fn all_told(&self) {
-        // A device may have data for which it has woken no task.
-        self.ports.iter().for_each(|(_, control)| control.look());
+    /// In a round of the executor each woken task runs once, in no particular order. Data in the Ethernet controller
+    /// reaches the network's task in one round and a link's task in the next.
+    async fn drain_inputs(&self) {
+        // A device may hold data without having woken its task.
+        self.ports.iter().for_each(|(_, control)| control.wake());
         let mut quiet = 0_u8;
         for _ in 0..MAX_ROUNDS {
             self.more_waits.set(false);
@@ -217,8 +217,8 @@ impl Gateway {
     }
 }
 
-/// One for a task whose interrupt comes while the time is read, one for that of the network, and
-/// one for a link's after it.
+/// One for a task whose interrupt occurs while the time is read, one for the network's task, and one for a link's
+/// task after it.
 const QUIET_ROUNDS: u8 = 3;
-/// As many reports of a port's task contain more than any device can buffer.
+/// In so many rounds a port's task reports more than any device can buffer.
 const MAX_ROUNDS: u8 = 20;

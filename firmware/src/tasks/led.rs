@@ -4,7 +4,7 @@ use embassy_time::{Duration, Timer};
 
 use super::watchdog::Pulse;
 
-/// What the LED shows. It is lit from the start until a task sets a condition.
+/// What the LED shows. It is on until the first pattern begins.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Condition {
     /// The configuration was refused: nothing runs.
@@ -13,12 +13,12 @@ pub enum Condition {
     NoController,
     /// All links are up; a field port is silent, gone or bus-off.
     PortSilent,
-    /// All is well.
+    /// All links are up and all field ports are alive.
     Running,
 }
 
 impl Condition {
-    /// How long the LED is lit and dark in turn, in milliseconds; less than a second together.
+    /// On and off times in milliseconds; at most a second in total.
     const fn pattern(self) -> &'static [(u64, u64)] {
         match self {
             Self::Refused => &[(100, 100)],

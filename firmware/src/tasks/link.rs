@@ -1,13 +1,12 @@
 //! One link to the controller: opened, closed and fed as the engine requests.
 //!
-//! A link is one task. It owns its socket, reports what arrives to the engine and sends what is in
-//! its outbox; it does not know protocols and makes no decision. The engine supervises: a link that
-//! fails reports this once and waits to be opened again.
+//! A link is one task. It owns its socket, reports received data to the engine and sends what is in its
+//! outbox. It knows no protocol and makes no decision: a link that fails reports this once and waits to be
+//! opened again.
 //!
-//! Handed over is not delivered. For a TCP link the engine gets two reports: that the socket has
-//! taken everything and has room for more, and how much the peer has not acknowledged. A link that
-//! the engine gives up is closed, whatever the task waits for, and then nothing but a reset is
-//! sent.
+//! Handed over is not delivered. For a TCP link the engine gets two reports: that the socket has accepted
+//! everything, and how much the peer has not acknowledged. If the engine gives up a link, its connection is
+//! closed whatever the task waits for, and nothing but a reset is sent.
 
 mod tcp;
 mod udp;
@@ -59,8 +58,7 @@ pub enum Endpoint {
 }
 
 impl Endpoint {
-    /// The remote end of a link of the configuration. A board has one address, so only the port of
-    /// `listen` counts.
+    /// The remote end of a link. A board has one address, so of `listen` only the port is used.
     pub fn of(config: &GatewayConfig, kind: LinkKind) -> Self {
         let controller = &config.controller;
         let host = controller.address.clone();
@@ -93,7 +91,7 @@ pub struct Buffers<'a> {
 }
 
 impl<'a> Buffers<'a> {
-    /// Bytes that a link needs.
+    /// Size in bytes.
     pub const SIZE: usize = 6 * 1024;
 
     /// Takes [`Buffers::SIZE`] bytes from the front of `memory`; `None` if there are fewer.
@@ -124,12 +122,12 @@ pub async fn run(
     loop {
         let turn = pulse.idle(pin!(control.opened())).await;
         match endpoint {
-            Endpoint::Tcp { host, port } => driver.tcp(turn, host, Way::To(*port), buffers).await,
-            Endpoint::TcpListen { port, host } => driver.tcp(turn, host, Way::At(*port), buffers).await,
-            Endpoint::Udp { host, port } => driver.udp(turn, host, Way::To(*port), buffers).await,
-            Endpoint::UdpListen { port, host } => driver.udp(turn, host, Way::At(*port), buffers).await,
+            Endpoint::Tcp { host, port } => driver.tcp(turn, host, Role::Client(*port), buffers).await,
+            Endpoint::TcpListen { port, host } => driver.tcp(turn, host, Role::Server(*port), buffers).await,
+            Endpoint::Udp { host, port } => driver.udp(turn, host, Role::Client(*port), buffers).await,
+            Endpoint::UdpListen { port, host } => driver.udp(turn, host, Role::Server(*port), buffers).await,
         }
-        // The engine has ended a turn that is over, so it expects no report.
+        // If the turn is over, the engine has closed the link itself and expects no report.
         if control.is_turn(turn) {
             control.close();
             gateway.input(Input::LinkDown { link });
@@ -137,13 +135,13 @@ pub async fn run(
     }
 }
 
-/// Which side connects.
+/// Which side connects, and to which port.
 #[derive(Clone, Copy)]
-enum Way {
-    /// The board, to this port of the controller.
-    To(u16),
-    /// The controller, to this port of the board.
-    At(u16),
+enum Role {
+    /// The board connects to this port of the controller.
+    Client(u16),
+    /// The controller connects to this port of the board.
+    Server(u16),
 }
 
 struct Driver<'a> {
@@ -155,8 +153,8 @@ struct Driver<'a> {
 }
 
 impl Driver<'_> {
-    /// Reports to the engine while it is this turn; returns whether it still is afterwards.
-    fn tell(&self, turn: u32, input: Input<'_>) -> bool {
+    /// Reports to the engine if the turn is not over; returns whether it goes on.
+    fn report(&self, turn: u32, input: Input<'_>) -> bool {
         if self.control.is_turn(turn) {
             self.gateway.input(input);
         }
@@ -172,14 +170,14 @@ async fn resolve(stack: Stack<'_>, host: &str) -> Option<IpAddress> {
     addresses.first().copied()
 }
 
-/// A state packet, and a receive window that a burst cannot overrun the Ethernet controller with.
+/// Receive buffer: a state packet, but a receive window too small for a burst that overruns the Ethernet controller.
 const RX: usize = INPUT_BUFFER;
-/// Bytes handed to the engine at once: a state packet, and longer than any frame, so that a datagram
-/// that is too long is seen to be.
+/// Bytes handed to the engine at once: a state packet, and more than any frame, so that a datagram that is too
+/// long is noticed.
 const CHUNK: usize = INPUT_BUFFER;
-/// Of a connection for frames of a recipe, two of the longest. What is left is for those that the
-/// controller has not acknowledged: a peer that acknowledges late must not slow them down. It has room
-/// for 64 of 72 bytes, as many as the engine hands over; those of 256 bytes may wait for 70 ms.
+/// Receive buffer of a connection for recipe frames: two of the longest. The rest of the memory is the transmit
+/// buffer, so that a controller that acknowledges late does not slow the frames down: 64 frames of 72 bytes, as
+/// many as the engine hands over, or 70 ms of frames of 256 bytes.
 const RX_FRAMES: usize = 1024;
 const CHUNK_FRAMES: usize = 512;
 

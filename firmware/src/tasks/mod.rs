@@ -1,5 +1,5 @@
-//! The tasks: each moves what a device or socket brings into the engine, and what the engine answers
-//! out again. They are generic over the traits of [`crate::drivers`] and over the network stack.
+//! The tasks: each moves data between a device or socket and the engine. They are generic over the traits of
+//! [`crate::drivers`] and over the network stack.
 
 pub mod can;
 pub(crate) mod control;

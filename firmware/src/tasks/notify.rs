@@ -1,9 +1,9 @@
-//! "Something changed", for one waiter on the same executor.
+//! A notification for one waiter on the same executor.
 
 use embassy_sync::blocking_mutex::raw::NoopRawMutex;
 use embassy_sync::signal::Signal;
 
-/// Kept until a task waits for it; several count as one.
+/// Stays set until a task waits for it; several notifications count as one.
 pub(crate) struct Notify(Signal<NoopRawMutex, ()>);
 
 impl Notify {

@@ -1,9 +1,8 @@
-//! An RS-485 port's task, one per port: it drives the line, sends, waits for the last stop bit,
-//! releases the line and reads again.
+//! The task of an RS-485 port: it drives the line, sends, waits for the last stop bit, releases the line and
+//! reads again.
 //!
-//! Its device buffers input while the task is elsewhere, and its `read` and `write` lose and repeat
-//! nothing if they are dropped before they are done. Data that waits in the device is reported at
-//! once, and before anything is sent, because the engine judges lateness by the time of the report.
+//! The device buffers input meanwhile, and its `read` and `write` are cancel-safe. Data in the device is reported
+//! at once, and before anything is sent, because the engine judges lateness by the time of the report.
 
 use core::pin::pin;
 use core::task::Poll;
@@ -26,28 +25,28 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, line: impl Line
     let Some(control) = gateway.port(port) else { core::future::pending().await };
     let mut task = Task { gateway, port, control, line, chunk: [0; CHUNK] };
     let mut is_failing = false;
-    let mut errors = Told { errors: LineErrors::NONE, look: Instant::MIN };
+    let mut errors = LoggedErrors { errors: LineErrors::NONE, next_check: Instant::MIN };
     loop {
         gateway.input(Input::PortUp { port });
         let mut full_chunks = 0_usize;
         let failed = loop {
             let Task { line, chunk, .. } = &mut task;
-            let next = select3(line.read(chunk), control.next_bytes(), Timer::at(errors.look));
+            let next = select3(line.read(chunk), control.next_bytes(), Timer::at(errors.next_check));
             let next = pulse.idle(pin!(next)).await;
             let frame = match next {
                 Either3::First(Ok(len)) => {
-                    task.tell(len);
-                    if Instant::now() >= errors.look {
-                        errors.tell(port, task.line.errors());
+                    task.report(len);
+                    if Instant::now() >= errors.next_check {
+                        errors.log(port, task.line.errors());
                     }
-                    // Unread data came before what is to be sent. But a line that is never silent
-                    // does not keep the task from sending.
+                    // Unread data is reported before anything is sent, up to a limit for a line that is never
+                    // silent.
                     full_chunks = if len < CHUNK { 0 } else { full_chunks.saturating_add(1) };
                     let may_send = full_chunks == 0 || full_chunks >= FULL_CHUNKS;
                     if full_chunks > 0 {
                         gateway.more_waits();
                     }
-                    // A line that is never silent does not keep the other tasks from running.
+                    // Lets other tasks run while the line is never silent.
                     yield_now().await;
                     match control.take_bytes_if(may_send) {
                         Some(frame) => frame,
@@ -57,14 +56,14 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, line: impl Line
                 Either3::First(Err(error)) => break error.kind(),
                 Either3::Second(frame) => frame,
                 Either3::Third(()) => {
-                    // At the wrong speed nothing else is ever received from a line.
-                    errors.tell(port, task.line.errors());
+                    // At a wrong baud rate errors are all that a line receives.
+                    errors.log(port, task.line.errors());
                     continue;
                 }
             };
             full_chunks = 0;
             task.line.drive(LineDirection::Send);
-            let sent = with_timeout(patience(frame.len(), baud), task.send(&frame));
+            let sent = with_timeout(send_timeout(frame.len(), baud), task.send(&frame));
             // A long frame on a slow line takes seconds.
             let sent = pulse.idle(pin!(sent)).await;
             task.line.drive(LineDirection::Receive);
@@ -77,15 +76,15 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, line: impl Line
                 Err(_) => break ErrorKind::TimedOut,
             }
         };
-        // Logged once, however often it fails in a row.
+        // Logged only the first time in a row.
         if !is_failing {
             warn!("port {}: {}", port.0, Text(&failed));
         }
         is_failing = true;
-        task.tell_waiting();
+        task.report_waiting();
         gateway.input(Input::PortDown { port });
         control.clear();
-        // A line that does not take its bytes is still read.
+        // A line that only does not accept bytes is read without a pause.
         if failed != ErrorKind::TimedOut {
             Timer::after(RETRY).await;
         }
@@ -102,52 +101,52 @@ struct Task<'a, L> {
 
 impl<L: Line> Task<'_, L> {
     /// Reports the first `len` bytes of the chunk to the engine.
-    fn tell(&self, len: usize) {
+    fn report(&self, len: usize) {
         let bytes = self.chunk.get(..len).unwrap_or(&[]);
         self.gateway.input(Input::PortBytes { port: self.port, bytes });
     }
 
-    /// Reports everything that waits in the device to the engine.
-    fn tell_waiting(&mut self) {
+    /// Reports all data in the device to the engine.
+    fn report_waiting(&mut self) {
         for _ in 0..FULL_CHUNKS {
             match poll_once(self.line.read(&mut self.chunk)) {
-                Poll::Ready(Ok(len @ 1..)) => self.tell(len),
+                Poll::Ready(Ok(len @ 1..)) => self.report(len),
                 _ => return,
             }
         }
     }
 
-    /// Sends a frame, to the end of its last stop bit. If the gateway has slept meanwhile, data in
-    /// the device is old and must be reported before the frame has left.
+    /// Sends a frame, to the end of its last stop bit. If the gateway has slept meanwhile, data in the device is
+    /// old and must be reported before the frame has left.
     async fn send(&mut self, frame: &[u8]) -> Result<(), ErrorKind> {
-        self.control.forget_sleep();
+        self.control.clear_sleep();
         let mut rest = frame;
         while !rest.is_empty() {
-            match select(self.line.write(rest), self.control.has_slept()).await {
+            match select(self.line.write(rest), self.control.wait_for_sleep()).await {
                 Either::First(Ok(len @ 1..)) => rest = rest.get(len..).unwrap_or(&[]),
                 Either::First(Ok(0)) => return Err(ErrorKind::WriteZero),
                 Either::First(Err(error)) => return Err(error.kind()),
-                Either::Second(()) => self.tell_waiting(),
+                Either::Second(()) => self.report_waiting(),
             }
         }
         loop {
-            match select(self.line.flush(), self.control.has_slept()).await {
+            match select(self.line.flush(), self.control.wait_for_sleep()).await {
                 Either::First(flushed) => return flushed.map_err(|error| error.kind()),
-                Either::Second(()) => self.tell_waiting(),
+                Either::Second(()) => self.report_waiting(),
             }
         }
     }
 }
 
-/// The errors that were logged, and when they are checked again.
-struct Told {
+/// The errors logged last, and the time of the next check.
+struct LoggedErrors {
     errors: LineErrors,
-    look: Instant,
+    next_check: Instant,
 }
 
-impl Told {
-    fn tell(&mut self, port: PortId, errors: LineErrors) {
-        self.look = Instant::now() + ERROR_PERIOD;
+impl LoggedErrors {
+    fn log(&mut self, port: PortId, errors: LineErrors) {
+        self.next_check = Instant::now() + ERROR_PERIOD;
         if errors == self.errors {
             return;
         }
@@ -160,18 +159,18 @@ impl Told {
     }
 }
 
-/// Twice what the bytes take on the line (12 bits a byte at most), and a little.
-fn patience(bytes: usize, baud: u32) -> Duration {
+/// Twice the duration of the bytes on the line (at most 12 bits each), plus a margin.
+fn send_timeout(bytes: usize, baud: u32) -> Duration {
     let bits = (bytes as u64).saturating_mul(24_000_000);
     Duration::from_micros(bits / u64::from(baud.max(1))) + Duration::from_millis(20)
 }
 
-/// Bytes read at once.
+/// Bytes per read.
 const CHUNK: usize = 256;
-/// More than any device can buffer.
+/// Full chunks in a row: more than any device can buffer.
 const FULL_CHUNKS: usize = 9;
 const ERROR_PERIOD: Duration = Duration::from_secs(1);
-/// After a failed device.
+/// Pause after a failure of the device.
 const RETRY: Duration = Duration::from_millis(100);
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! The log of normal operation: changes of every link, and the traffic of every port.
+//! The log of normal operation: changes of links, and the traffic of ports.
 
 use core::pin::pin;
 
@@ -9,11 +9,11 @@ use super::gateway::{Gateway, MAX_FIELD_PORTS, MAX_LINKS};
 use super::watchdog::Pulse;
 use crate::{info, warn};
 
-/// Logs the status whenever it has changed, for ever.
+/// Logs changes of the status, for ever.
 pub async fn run(gateway: &Gateway, pulse: &Pulse) -> ! {
     let mut links = [(0, Shown::Down); MAX_LINKS];
     let mut ports = [[0; 6]; MAX_FIELD_PORTS];
-    let mut strangers = [0; MAX_LINKS];
+    let mut refused_peers = [0; MAX_LINKS];
     let mut sleeps = 0;
     loop {
         for _ in 0..4 {
@@ -46,7 +46,7 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse) -> ! {
             sleeps = gateway.sleeps();
             warn!("the gateway slept ({}): waiting input is discarded", sleeps);
         }
-        for ((kind, now), before) in gateway.strangers().zip(&mut strangers) {
+        for ((kind, now), before) in gateway.refused_peers().zip(&mut refused_peers) {
             if *before != now {
                 *before = now;
                 warn!("link {}: {} connections or datagrams of other hosts refused", kind.name(), now);

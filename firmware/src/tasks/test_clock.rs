@@ -1,14 +1,14 @@
-//! The clock of the tests: it stands still until a test moves it.
+//! The clock of the tests, which only tests advance.
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use embassy_time::{Duration, MockDriver};
 
-/// The one clock there is, for one test at a time; at 0 when it is handed over.
+/// The only clock, for one test at a time; it starts at 0.
 pub(crate) struct Clock(#[allow(dead_code, reason = "held")] MutexGuard<'static, ()>);
 
 impl Clock {
-    /// Waits until nobody has it.
+    /// Waits until no other test uses it.
     pub(crate) fn take() -> Self {
         static CLOCK: Mutex<()> = Mutex::new(());
         let held = CLOCK.lock().unwrap_or_else(PoisonError::into_inner);
@@ -17,7 +17,7 @@ impl Clock {
     }
 }
 
-/// Time passes.
+/// Advances time.
 pub(crate) fn advance(by: Duration) {
     MockDriver::get().advance(by);
 }

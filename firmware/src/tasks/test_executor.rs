@@ -1,5 +1,5 @@
-//! Tasks as a board's executor runs them: those that were woken, each once in a round, the one woken
-//! last first. Who is woken meanwhile runs in the next round.
+//! An executor that runs tasks like that of a board: woken tasks run once in a round, the one woken last first.
+//! Tasks woken during a round run in the next.
 
 use core::future::Future;
 use core::pin::Pin;
@@ -18,10 +18,10 @@ pub(crate) struct Executor<'a> {
 
 type Running<'a> = Pin<Box<dyn Future<Output = ()> + 'a>>;
 
-/// Who of those that were woken comes first. Nobody may depend on it.
+/// The order of the woken tasks, on which nothing may depend.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Order {
-    /// As embassy's.
+    /// Embassy's order.
     LastFirst,
     FirstFirst,
 }
@@ -49,7 +49,7 @@ impl<'a> Executor<'a> {
         Self { tasks: Vec::new(), woken: Arc::default(), order }
     }
 
-    /// The task runs in the next round. It never ends.
+    /// Adds a task that never ends; it runs in the next round.
     pub(crate) fn spawn(&mut self, task: impl Future + 'a) {
         let waker = Waker::from(Arc::new(Task { index: self.tasks.len(), woken: Arc::clone(&self.woken) }));
         waker.wake_by_ref();
@@ -60,7 +60,7 @@ impl<'a> Executor<'a> {
         self.tasks.push((task, waker));
     }
 
-    /// Runs each task that was woken, once; whether there was one.
+    /// Runs each woken task once; returns whether there was one.
     pub(crate) fn round(&mut self) -> bool {
         let mut batch = core::mem::take(&mut *self.woken.lock().unwrap());
         if self.order == Order::LastFirst {
@@ -73,7 +73,7 @@ impl<'a> Executor<'a> {
         !batch.is_empty()
     }
 
-    /// Until nobody was woken.
+    /// Runs until no task is woken.
     pub(crate) fn settle(&mut self) {
         let rounds = (0..1_000).take_while(|_| self.round()).count();
         assert!(rounds < 1_000, "a task wakes itself for ever");

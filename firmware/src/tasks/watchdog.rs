@@ -1,10 +1,9 @@
 //! Checks that every task still runs; the watchdog is fed only then.
 //!
-//! A task may wait for a byte for ever, so it is asked: it has a [`Pulse`], and where it waits for
-//! something that may never come it waits through [`Pulse::idle`], which responds. A task that
-//! hangs anywhere else does not respond, is named in the log, and the watchdog is not fed. A task
-//! that never yields keeps the feeder from running, with the same effect; [`running`] names that
-//! task to an interrupt.
+//! A task may wait for a byte for ever, so it has a [`Pulse`]: where it waits for something that may never
+//! come, it waits through [`Pulse::idle`], which answers the check. A task that hangs anywhere else does not
+//! answer, is named in the log, and the watchdog is not fed. A task that never yields keeps the feeder from
+//! running, with the same effect; an interrupt gets its name from [`running`].
 
 use core::cell::{Cell, RefCell};
 use core::fmt;
@@ -22,7 +21,7 @@ use crate::{error, info};
 /// A task, by its name in the log.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum TaskName {
-    /// Calls the engine when it is time.
+    /// Calls the engine at its deadlines.
     Engine,
     /// An RS-485 port.
     Serial(PortId),
@@ -111,17 +110,16 @@ impl fmt::Display for TaskName {
     }
 }
 
-/// The task that has the processor; `None` between tasks. For interrupts and for the last words of a
-/// panic.
+/// The running task; `None` between tasks. For interrupts, and for the crash record.
 pub fn running() -> Option<TaskName> {
     TaskName::from_code(RUNNING.load(Ordering::Relaxed))
 }
 
-/// One task's proof that it runs.
+/// A task's answers to the watchdog's checks.
 pub struct Pulse {
     name: Cell<Option<TaskName>>,
     has_answered: Cell<bool>,
-    /// It was named in the log and has not responded since.
+    /// It was named in the log and has not answered since.
     is_suspect: Cell<bool>,
     waker: RefCell<WakerRegistration>,
 }
@@ -136,9 +134,9 @@ impl Pulse {
         }
     }
 
-    /// Waits for something that may never come; the task responds meanwhile.
+    /// Waits for something that may never come, and answers checks meanwhile.
     ///
-    /// A wait that ends by itself in less than a quarter of the watchdog's period needs none of this.
+    /// A wait that ends by itself within a quarter of the watchdog's period does not need it.
     pub async fn idle<F: Future>(&self, mut wait: Pin<&mut F>) -> F::Output {
         poll_fn(|cx| {
             self.has_answered.set(true);
@@ -148,11 +146,11 @@ impl Pulse {
         .await
     }
 
-    /// The whole of the task: what runs in it is known to be this task.
+    /// Runs the whole task, so that [`running`] knows it.
     pub async fn run<F: Future>(&self, mut task: Pin<&mut F>) -> F::Output {
         let code = self.name.get().map_or(0, TaskName::code);
         poll_fn(|cx| {
-            // A task of an interrupt's executor may have come in between.
+            // It may have interrupted a task of another executor.
             let before = RUNNING.swap(code, Ordering::Relaxed);
             let result = task.as_mut().poll(cx);
             RUNNING.store(before, Ordering::Relaxed);
@@ -161,7 +159,7 @@ impl Pulse {
         .await
     }
 
-    fn ask(&self) {
+    fn request(&self) {
         self.has_answered.set(false);
         self.waker.borrow_mut().wake();
     }
@@ -174,13 +172,12 @@ pub struct Watch<const N: usize> {
 }
 
 impl<const N: usize> Watch<N> {
-    /// Nobody is watched.
+    /// Without tasks.
     pub const fn new() -> Self {
         Self { pulses: [const { Pulse::new() }; N], count: Cell::new(0) }
     }
 
-    /// From here on the watchdog is fed only if this task responds. `None` if there are too many
-    /// tasks.
+    /// From here on the watchdog is fed only if this task answers. `None` if there are too many tasks.
     pub fn register(&self, name: TaskName) -> Option<&Pulse> {
         let pulse = self.pulses.get(self.count.get())?;
         self.count.set(self.count.get().saturating_add(1));
@@ -202,7 +199,7 @@ impl<const N: usize> Watch<N> {
         }
         let all = registered().all(|pulse| pulse.has_answered.get());
         if all {
-            registered().for_each(Pulse::ask);
+            registered().for_each(Pulse::request);
         }
         all
     }
@@ -220,25 +217,25 @@ enum Answer {
     Late,
 }
 
-/// Feeds a watchdog with this `period`, for ever; four times per period while all tasks respond.
+/// Feeds a watchdog with this `period` for ever, four times per period while all tasks answer.
 pub async fn run<const N: usize>(watch: &Watch<N>, period: Duration, mut feed: impl FnMut()) -> ! {
     let quarter = period / 4;
     loop {
         Timer::after(quarter).await;
-        if watch.round(say) {
+        if watch.round(log_answer) {
             feed();
         }
     }
 }
 
-fn say(name: TaskName, answer: Answer) {
+fn log_answer(name: TaskName, answer: Answer) {
     match answer {
         Answer::Missing => error!("task {} does not respond: the watchdog is not fed", Text(&name)),
         Answer::Late => info!("task {} responds again", Text(&name)),
     }
 }
 
-/// [`TaskName::code`] of the task that has the processor.
+/// [`TaskName::code`] of the running task.
 static RUNNING: AtomicU16 = AtomicU16::new(0);
 
 #[cfg(test)]

@@ -1,5 +1,5 @@
-//! A CAN bus: one port of the gateway or of the controller, and a device that may stand for
-//! several.
+//! A CAN bus: one port of the gateway or of the controller, and a device, which may simulate several
+//! nodes.
 
 use std::collections::VecDeque;
 
@@ -10,14 +10,14 @@ use proto_core::wire::can::CanFrame;
 use super::device::Device;
 use super::line::MAX_HEARD;
 use super::rng::Rng;
-use super::{End, Owner};
+use super::{AnyPort, End};
 
 /// Counters of a bus, in addition to those of its ends.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct BusCounters {
-    /// Frames of the device.
+    /// Frames sent by the device.
     pub device_sent: u64,
-    /// Frames of the port.
+    /// Frames sent by the port.
     pub port_sent: u64,
     /// Frames that were lost on their way.
     pub lost: u64,
@@ -25,7 +25,7 @@ pub struct BusCounters {
 
 /// A bus.
 pub struct CanBus {
-    pub(super) owner: Owner,
+    pub(super) owner: AnyPort,
     bitrate: u32,
     /// Number of lost frames per million.
     pub loss_ppm: u32,
@@ -65,7 +65,7 @@ pub(super) struct Crossed {
 }
 
 impl CanBus {
-    pub(super) fn new(owner: Owner, bitrate: u32, rng: Rng) -> Self {
+    pub(super) fn new(owner: AnyPort, bitrate: u32, rng: Rng) -> Self {
         Self {
             owner,
             bitrate,
@@ -88,7 +88,7 @@ impl CanBus {
         self.heard.drain(..).collect()
     }
 
-    /// Queues a frame. If a frame starts on the bus now, returns when that ends.
+    /// Queues a frame. Returns when the frame that starts on the bus now ends; `None` if none starts.
     pub(super) fn send(&mut self, now: Instant, from: End, frame: CanFrame) -> Option<Instant> {
         self.waiting[from as usize].push_back(frame);
         match from {

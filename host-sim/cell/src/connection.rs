@@ -28,12 +28,11 @@ pub(super) struct Connection {
     pub closing: bool,
     /// The gateway has closed its end, and the controller does not know it yet.
     pub abandoned: bool,
-    /// The controller's end is gone without notice: data that arrives there is answered with a
-    /// reset.
+    /// The controller has lost its end in a power cut: data that arrives there is answered with a reset.
     pub forgotten: bool,
-    /// The controller's TCP is about to acknowledge.
+    /// The controller's TCP has to acknowledge received data.
     pub owes_ack: bool,
-    /// The gateway's transport is going to check its acknowledgements.
+    /// The gateway's transport will check for a timeout: [`super::due::Due::UserTimeout`] is queued.
     pub is_watched: bool,
 }
 

@@ -24,10 +24,8 @@ pub trait Device<M> {
     }
 }
 
-/// Sends by itself: the `n`-th message is `make(n)`, on a grid that keeps its phase.
-///
-/// The n-th message leaves at `start + n * 1 s / rate`, rounded down to the microsecond, so that
-/// rates that do not divide a second accumulate no error.
+/// Sends at a rate: the n-th message is `make(n)` and leaves at `start + n * 1 s / rate`, rounded down
+/// to the microsecond. No rounding errors accumulate.
 #[derive(Debug, Clone)]
 pub struct Talker<F> {
     start: Instant,

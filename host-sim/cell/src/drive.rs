@@ -6,15 +6,15 @@ use proto_core::wire::can::{CanFrame, CanId};
 
 use super::connection::{Connection, Peer};
 use super::due::Due;
-use super::network::{Door, Item, Speaker, Way};
-use super::{BusId, Cell, DESK, End, LineId, Owner, What, udp_peer};
+use super::network::{ConnectPolicy, Item, Sender, Way};
+use super::{AnyPort, BusId, COMMAND_CLIENT, Cell, End, LineId, What, udp_peer};
 use recipe_controller::{ControllerInput, ControllerOutput, Link};
 
 impl Cell {
     /// Advances time: the clock jumps from deadline to deadline.
     pub fn run(&mut self, span: Duration) {
         let end = self.now + span;
-        let mut turns_at_once = 0_u32;
+        let mut steps_at_once = 0_u32;
         loop {
             let next = self.next_deadline();
             if self.violation().is_some() {
@@ -24,15 +24,15 @@ impl Cell {
                 self.now = end;
                 return;
             }
-            turns_at_once = if next > self.now { 0 } else { turns_at_once + 1 };
-            assert!(turns_at_once < MAX_TURNS, "the cell does not come to rest at {:?}", self.now);
+            steps_at_once = if next > self.now { 0 } else { steps_at_once + 1 };
+            assert!(steps_at_once < MAX_STEPS, "the cell does not come to rest at {:?}", self.now);
             self.now = self.now.max(next);
-            self.turn();
+            self.step();
         }
     }
 
     /// Handles everything that is due now, once.
-    fn turn(&mut self) {
+    fn step(&mut self) {
         if let Some(due) = self.queue.pop_due(self.now) {
             self.carry_out(due);
             return;
@@ -71,7 +71,7 @@ impl Cell {
         }
     }
 
-    /// Reports to both that their ports are up.
+    /// Reports to the gateway and to the controller that their ports are up.
     pub(super) fn switch_on(&mut self) {
         let ports: Vec<_> = self.engine.field_ports().collect();
         for port in ports {
@@ -81,8 +81,8 @@ impl Cell {
         let mut owned: Vec<usize> = Vec::new();
         let owners = self.lines.iter().map(|line| line.owner).chain(self.buses.iter().map(|bus| bus.owner));
         owned.extend(owners.filter_map(|owner| match owner {
-            Owner::Controller(port) => Some(port),
-            Owner::Gateway(_) => None,
+            AnyPort::Controller(port) => Some(port),
+            AnyPort::Gateway(_) => None,
         }));
         owned.extend(self.clients.iter().filter(|(_, client)| !client.is_tcp).map(|(&port, _)| port));
         for port in owned {
@@ -163,13 +163,13 @@ impl Cell {
             }
             Output::PortSend { port, bytes } => {
                 self.trace.add(now, What::PortSent, port.0.into(), bytes);
-                if let Some(line) = self.line_at(Owner::Gateway(port)) {
+                if let Some(line) = self.line_at(AnyPort::Gateway(port)) {
                     self.transmit(line, End::Port, bytes);
                 }
             }
             Output::PortSendCan { port, frame } => {
                 self.trace.add(now, What::PortSent, port.0.into(), &can_bytes(&frame));
-                if let Some(bus) = self.bus_at(Owner::Gateway(port)) {
+                if let Some(bus) = self.bus_at(AnyPort::Gateway(port)) {
                     self.transmit_can(bus, End::Port, frame);
                 }
             }
@@ -213,7 +213,9 @@ impl Cell {
                     self.controller_wake = until;
                     return;
                 }
-                ControllerOutput::Send { conn: DESK, bytes } => self.asked.extend_from_slice(&bytes),
+                ControllerOutput::Send { conn: COMMAND_CLIENT, bytes } => {
+                    self.reply.extend_from_slice(&bytes)
+                }
                 ControllerOutput::Send { conn, bytes } => {
                     self.replied(conn.0, &bytes);
                     self.send_item(conn.0, Way::Down, Item::Bytes(bytes))
@@ -237,7 +239,7 @@ impl Cell {
                 }
                 ControllerOutput::PortSendCan { port, frame } => {
                     self.trace.add(now, What::ControllerPortSent, port as u64, &can_bytes(&frame));
-                    if let Some(bus) = self.bus_at(Owner::Controller(port)) {
+                    if let Some(bus) = self.bus_at(AnyPort::Controller(port)) {
                         self.transmit_can(bus, End::Port, frame);
                     }
                 }
@@ -249,7 +251,7 @@ impl Cell {
                 }
                 ControllerOutput::Shutdown => {
                     for gate in self.gates.values_mut() {
-                        gate.door = Door::Refuses;
+                        gate.connect_policy = ConnectPolicy::Refuse;
                     }
                 }
             }
@@ -259,20 +261,20 @@ impl Cell {
     pub(super) fn carry_out(&mut self, due: Due) {
         let Some(due) = self.keep_for_later(due) else { return };
         match due {
-            Due::LinkUp { link, turn } => {
-                if self.is_turn(link, turn) {
+            Due::LinkUp { link, generation } => {
+                if self.is_current(link, generation) {
                     self.gate(link).is_up = true;
                     self.engine_input(Input::LinkUp { link });
                 }
             }
-            Due::LinkDown { link, turn } => {
-                if self.is_turn(link, turn) {
+            Due::LinkDown { link, generation } => {
+                if self.is_current(link, generation) {
                     self.gate(link).set_open(false);
                     self.engine_input(Input::LinkDown { link });
                 }
             }
-            Due::LinkSent { link, turn } => {
-                if self.is_turn(link, turn) {
+            Due::LinkSent { link, generation } => {
+                if self.is_current(link, generation) {
                     self.engine_input(Input::LinkSent { link });
                 }
             }
@@ -291,7 +293,7 @@ impl Cell {
                 if gate.is_cut(Way::Down) {
                     return;
                 }
-                if gate.is_up && udp_peer(gate.turn) == peer {
+                if gate.is_up && udp_peer(gate.generation) == peer {
                     self.engine_input(Input::LinkBytes { link, bytes: &bytes });
                 } else {
                     let back = self.now + self.gate(link).network.delay;
@@ -320,46 +322,46 @@ impl Cell {
             Due::CanDone { bus } => self.can_done(bus),
             Due::DeviceSends { line, bytes } => self.send(line, &bytes),
             Due::TimedOut { conn } => self.reset_conn(conn),
-            Due::Knock { link, turn, pause } => self.knock(link, turn, pause),
+            Due::Connect { link, generation, pause } => self.connect(link, generation, pause),
             Due::ResetUp { conn } => self.reset_up(conn),
             Due::ResetDown { conn } => self.reset_down(conn),
-            Due::SendAgain { conn, way } => self.send_again(conn, way),
+            Due::Retransmit { conn, way } => self.retransmit(conn, way),
             Due::AckLeaves { conn } => self.ack_leaves(conn),
             Due::Ack { conn, upto } => self.ack(conn, upto),
             Due::UserTimeout { conn } => self.user_timeout(conn),
-            Due::Look { link, turn } => {
-                if self.is_turn(link, turn) && !self.is_asleep() {
-                    self.tell_acked(link);
+            Due::ReadAcks { link, generation } => {
+                if self.is_current(link, generation) && !self.is_asleep() {
+                    self.report_acked(link);
                 }
             }
-            Due::Wake { turn } => self.wake(turn),
+            Due::Wake { generation } => self.wake(generation),
             Due::Survey => self.survey(),
         }
     }
 
-    /// A datagram came to a port where the gateway listens: it answers the first sender, and later
-    /// moves only to the sender of a frame.
-    fn client_datagram(&mut self, link: LinkId, from: Speaker, bytes: &[u8]) {
+    /// A datagram arrives at a port where the gateway listens: it answers the first sender, and after
+    /// that moves only to the sender of a frame.
+    fn client_datagram(&mut self, link: LinkId, from: Sender, bytes: &[u8]) {
         let gate = self.gate(link);
-        if gate.is_cut(Way::Down) && from != Speaker::Stranger || !gate.is_open {
+        if gate.is_cut(Way::Down) && from != Sender::Stranger || !gate.is_open {
             return;
         }
         if !gate.is_up {
             gate.is_up = true;
-            gate.partner = Some(from);
+            gate.answers_to = Some(from);
             self.engine_input(Input::LinkUp { link });
-        } else if gate.partner != Some(from) && self.engine.is_frame(link, bytes) {
-            self.gate(link).partner = Some(from);
+        } else if gate.answers_to != Some(from) && self.engine.is_frame(link, bytes) {
+            self.gate(link).answers_to = Some(from);
         }
         if let Some(oracle) = &mut self.oracle {
-            oracle.spoke(link, from, bytes);
+            oracle.datagram_received(link, from, bytes);
         }
         if self.gate(link).is_up {
             self.engine_input(Input::LinkBytes { link, bytes });
         }
     }
 
-    /// The controller's inputs, if a model compares them.
+    /// The controller's inputs; `None` if no model compares them.
     pub(super) fn inputs_before(&self) -> Option<Vec<u8>> {
         self.oracle.as_ref().map(|_| self.inputs())
     }
@@ -375,8 +377,8 @@ impl Cell {
         }
     }
 
-    fn is_turn(&self, link: LinkId, turn: u64) -> bool {
-        self.gates.get(&link).is_some_and(|gate| gate.turn == turn)
+    fn is_current(&self, link: LinkId, generation: u64) -> bool {
+        self.gates.get(&link).is_some_and(|gate| gate.generation == generation)
     }
 }
 
@@ -389,5 +391,5 @@ pub(super) fn can_bytes(frame: &CanFrame) -> Vec<u8> {
     id.to_be_bytes().into_iter().chain(frame.data().iter().copied()).collect()
 }
 
-/// Far more than one instant can need.
-const MAX_TURNS: u32 = 1_000_000;
+/// Maximum number of steps at one instant, far more than needed.
+const MAX_STEPS: u32 = 1_000_000;

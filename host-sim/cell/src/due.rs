@@ -6,7 +6,7 @@ use proto_core::engine::LinkId;
 use proto_core::time::Duration;
 
 use super::line::Chunk;
-use super::network::{Speaker, Way};
+use super::network::{Sender, Way};
 use super::{BusId, LineId};
 
 /// An event at a later instant.
@@ -14,15 +14,15 @@ use super::{BusId, LineId};
 pub(super) enum Due {
     LinkUp {
         link: LinkId,
-        turn: u64,
+        generation: u64,
     },
     LinkDown {
         link: LinkId,
-        turn: u64,
+        generation: u64,
     },
     LinkSent {
         link: LinkId,
-        turn: u64,
+        generation: u64,
     },
     Arrival {
         conn: u64,
@@ -46,7 +46,7 @@ pub(super) enum Due {
     },
     ClientDatagramDown {
         link: LinkId,
-        from: Speaker,
+        from: Sender,
         bytes: Vec<u8>,
     },
     Unreachable {
@@ -59,7 +59,7 @@ pub(super) enum Due {
         line: LineId,
         chunk: Chunk,
     },
-    /// Bytes gathered by the line are handed over.
+    /// Bytes gathered by the line are reported.
     Gathered {
         line: LineId,
     },
@@ -70,14 +70,14 @@ pub(super) enum Due {
         line: LineId,
         bytes: Vec<u8>,
     },
-    /// TCP gives up a dead connection.
+    /// TCP gives up a half-open connection.
     TimedOut {
         conn: u64,
     },
     /// A connection attempt is repeated.
-    Knock {
+    Connect {
         link: LinkId,
-        turn: u64,
+        generation: u64,
         pause: Duration,
     },
     /// The gateway's reset arrives at the controller.
@@ -88,8 +88,8 @@ pub(super) enum Due {
     ResetDown {
         conn: u64,
     },
-    /// Lost data of a connection is sent again.
-    SendAgain {
+    /// Lost data of a connection is retransmitted.
+    Retransmit {
         conn: u64,
         way: Way,
     },
@@ -97,7 +97,7 @@ pub(super) enum Due {
     AckLeaves {
         conn: u64,
     },
-    /// That acknowledgement arrives at the gateway.
+    /// An acknowledgement arrives at the gateway.
     Ack {
         conn: u64,
         upto: u64,
@@ -106,15 +106,15 @@ pub(super) enum Due {
     UserTimeout {
         conn: u64,
     },
-    /// The gateway's driver reads what is acknowledged.
-    Look {
+    /// The gateway's driver reads how much is acknowledged.
+    ReadAcks {
         link: LinkId,
-        turn: u64,
+        generation: u64,
     },
     /// The gateway is called again.
     Wake {
-        turn: u64,
+        generation: u64,
     },
-    /// The model takes a look at the state of everything.
+    /// The model checks what should have arrived.
     Survey,
 }

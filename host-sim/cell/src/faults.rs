@@ -1,29 +1,29 @@
-//! Faults that a test or a soak run can inject, and their repair.
+//! Faults that a test or a soak run can inject, and how they are repaired.
 
 use proto_core::engine::{BusState, Engine, Input, LinkId, LinkKind};
 
 use super::connection::{Connection, Peer};
 use super::due::Due;
-use super::network::{Door, Speaker, Way};
-use super::sleep::Told;
+use super::network::{ConnectPolicy, Sender, Way};
+use super::sleep::PortEvent;
 use super::tcp::TCP_TIMEOUT;
-use super::{BusId, Cell, Entry, LineId, Owner, What};
+use super::{AnyPort, BusId, Cell, Entry, LineId, What};
 
 /// Faults of the network.
 impl Cell {
     /// New connections are refused; on a datagram link, everything is lost.
     pub fn refuse(&mut self, link: LinkId) {
-        self.set_door(link, Door::Refuses);
+        self.set_connect_policy(link, ConnectPolicy::Refuse);
     }
 
     /// New connections get no answer; on a datagram link, everything is lost.
     pub fn black_hole(&mut self, link: LinkId) {
-        self.set_door(link, Door::Silent);
+        self.set_connect_policy(link, ConnectPolicy::Silent);
     }
 
     /// New connections and datagrams get through again.
     pub fn admit(&mut self, link: LinkId) {
-        self.set_door(link, Door::Open);
+        self.set_connect_policy(link, ConnectPolicy::Open);
     }
 
     /// The link's connection is reset: both ends are told, and data in flight is lost.
@@ -58,46 +58,45 @@ impl Cell {
             conn.pipe(way).held = false;
             self.queue.push(self.now, Due::Arrival { conn: id, way });
             if way == Way::Down {
-                // So are acknowledgements.
+                // Acknowledgements were held, too.
                 self.queue.push(self.now, Due::Ack { conn: id, upto: conn.up.arrived });
             }
         }
     }
 
-    /// Everything that goes this way on the link is lost from now on, until as many
-    /// [`Self::mend_way`]: a burst of lost datagrams; a peer whose TCP acknowledges or accepts
-    /// nothing. TCP sends it again.
+    /// Everything sent in this direction is lost until [`Self::repair_way`] is called as often. TCP
+    /// retransmits it.
     pub fn cut_way(&mut self, link: LinkId, way: Way) {
         self.note(link);
         self.gate(link).cuts[way as usize] += 1;
     }
 
-    /// Data sent from now on arrives.
-    pub fn mend_way(&mut self, link: LinkId, way: Way) {
+    /// Ends one [`Self::cut_way`].
+    pub fn repair_way(&mut self, link: LinkId, way: Way) {
         self.note(link);
         let cuts = &mut self.gate(link).cuts[way as usize];
         *cuts = cuts.saturating_sub(1);
     }
 
-    /// The cable between gateway and controller is out: nothing gets through on this link.
+    /// Pulls the cable between gateway and controller, as far as this link is concerned.
     pub fn cut_cable(&mut self, link: LinkId) {
         Way::BOTH.into_iter().for_each(|way| self.cut_way(link, way));
     }
 
-    /// The cable is in again.
-    pub fn mend_cable(&mut self, link: LinkId) {
-        Way::BOTH.into_iter().for_each(|way| self.mend_way(link, way));
+    /// Ends one [`Self::cut_cable`].
+    pub fn repair_cable(&mut self, link: LinkId) {
+        Way::BOTH.into_iter().for_each(|way| self.repair_way(link, way));
     }
 
     /// Another program on the controller's host sends a datagram to a port where the gateway
     /// listens.
     pub fn stranger_sends(&mut self, link: LinkId, bytes: &[u8]) {
         self.note(link);
-        let due = Due::ClientDatagramDown { link, from: Speaker::Stranger, bytes: bytes.to_vec() };
+        let due = Due::ClientDatagramDown { link, from: Sender::Stranger, bytes: bytes.to_vec() };
         self.queue.push(self.now, due);
     }
 
-    /// The connection is gone and neither end is told: data that they send is lost. TCP notices
+    /// The connection is gone and neither end is told: data that they send is lost. TCP gives it up
     /// after [`TCP_TIMEOUT`].
     pub fn half_open(&mut self, link: LinkId) {
         self.note(link);
@@ -121,9 +120,9 @@ impl Cell {
         self.state_bytes_lost = count;
     }
 
-    fn set_door(&mut self, link: LinkId, door: Door) {
+    fn set_connect_policy(&mut self, link: LinkId, connect_policy: ConnectPolicy) {
         self.note(link);
-        self.gate(link).door = door;
+        self.gate(link).connect_policy = connect_policy;
     }
 
     /// A note in the trace.
@@ -144,12 +143,12 @@ impl Cell {
     pub(super) fn reset_conn(&mut self, id: u64) {
         let Some(conn) = self.drop_conn(id) else { return };
         let gate = self.gate(conn.link);
-        // The gateway may have closed its end and moved on.
+        // The gateway may have closed its end and opened another connection.
         if gate.conn == Some(id) {
-            let turn = gate.turn;
-            self.queue.push(self.now, Due::LinkDown { link: conn.link, turn });
+            let generation = gate.generation;
+            self.queue.push(self.now, Due::LinkDown { link: conn.link, generation });
         }
-        // And the controller may have forgotten its own.
+        // The controller may have lost its end in a power cut.
         if !conn.forgotten {
             self.controller_closed(id, conn.peer);
         }
@@ -163,8 +162,8 @@ impl Cell {
         self.lines[line.0].connected = false;
     }
 
-    /// The line is whole again.
-    pub fn mend(&mut self, line: LineId) {
+    /// The line is connected again.
+    pub fn repair(&mut self, line: LineId) {
         self.lines[line.0].connected = true;
     }
 
@@ -177,7 +176,7 @@ impl Cell {
 
     /// The adapter is back.
     pub fn plug_in(&mut self, line: LineId) {
-        self.mend(line);
+        self.repair(line);
         self.port_input(self.lines[line.0].owner, true);
     }
 
@@ -186,8 +185,8 @@ impl Cell {
         self.buses[bus.0].connected = false;
     }
 
-    /// The bus is whole again.
-    pub fn mend_bus(&mut self, bus: BusId) {
+    /// The bus is connected again.
+    pub fn repair_bus(&mut self, bus: BusId) {
         self.buses[bus.0].connected = true;
     }
 
@@ -199,36 +198,36 @@ impl Cell {
         self.bus_state(bus, BusState::BusOff);
     }
 
-    /// It has recovered.
+    /// It is error-active again.
     pub fn bus_on(&mut self, bus: BusId) {
         self.buses[bus.0].is_off = false;
         self.bus_state(bus, BusState::Active);
     }
 
     fn bus_state(&mut self, bus: BusId, state: BusState) {
-        // The simulated controller's own CAN port knows no error states.
-        if let Owner::Gateway(port) = self.buses[bus.0].owner {
-            self.tell_of_port(port, Told::Bus(state));
+        // The simulated controller's own CAN port has no error states.
+        if let AnyPort::Gateway(port) = self.buses[bus.0].owner {
+            self.report_port_event(port, PortEvent::Bus(state));
         }
     }
 }
 
-/// Switching off and on.
+/// Restarts and power cuts.
 impl Cell {
-    /// The controller is switched off and on: see [`recipe_controller::Controller::restart`].
+    /// Restarts the controller: see [`recipe_controller::Controller::restart`].
     pub fn restart_controller(&mut self) {
         let now = self.now;
         self.trace.add(now, What::Fault, Entry::CONTROLLER, &[]);
         self.controller_mut().restart(now);
-        self.begun_anew();
+        self.controller_started();
     }
 
-    /// Same, and all its registers are 0.
+    /// Same, with all registers at 0.
     pub fn clear_controller(&mut self) {
         let now = self.now;
         self.trace.add(now, What::Fault, Entry::CONTROLLER, &[0]);
         self.controller_mut().restart_cleared(now);
-        self.begun_anew();
+        self.controller_started();
     }
 
     /// The controller loses power: its ends of all connections are gone without notice.
@@ -261,14 +260,14 @@ impl Cell {
     /// Power is back; the controller starts with all registers at 0.
     pub fn power_up(&mut self) {
         let links: Vec<LinkId> = self.link_ids().collect();
-        links.into_iter().for_each(|link| self.mend_cable(link));
+        links.into_iter().for_each(|link| self.repair_cable(link));
         self.clear_controller();
     }
 
-    fn begun_anew(&mut self) {
+    fn controller_started(&mut self) {
         self.clients.values_mut().for_each(|client| client.socket += 1);
         if let Some(oracle) = &mut self.oracle {
-            oracle.controller_began(self.now);
+            oracle.controller_started(self.now);
         }
     }
 
@@ -277,7 +276,7 @@ impl Cell {
         let now = self.now;
         self.trace.add(now, What::Fault, Entry::CONTROLLER, dialect.as_bytes());
         self.controller_mut().replace_software(now, dialect);
-        self.begun_anew();
+        self.controller_started();
     }
 
     /// The gateway loses power and restarts: its connections are reset, and its counters start at
@@ -294,7 +293,7 @@ impl Cell {
             self.drop_conn(id);
         }
         self.forget_waiting();
-        // The same configuration made the engine that there was.
+        // Cannot fail: the previous engine had the same configuration.
         if let Ok(engine) = Engine::new(&self.gateway) {
             if let Some(recorder) = &mut self.recorder {
                 recorder.totals(&self.engine);
@@ -321,7 +320,7 @@ impl Cell {
         self.gates.values().filter(move |gate| is_tcp(gate.kind)).map(|gate| gate.id)
     }
 
-    /// The others.
+    /// The links without connections.
     pub fn datagram_links(&self) -> impl Iterator<Item = LinkId> + use<> {
         let is_udp = |kind| matches!(kind, LinkKind::RecipeUdp | LinkKind::RecipeUdpListen { .. });
         let links: Vec<LinkId> =
@@ -329,7 +328,8 @@ impl Cell {
         links.into_iter()
     }
 
-    /// The links where the gateway listens for datagrams, and how long the controller's frames are.
+    /// The links where the gateway listens for datagrams, each with the length of the controller's
+    /// frames.
     pub(super) fn listening_for_datagrams(&self) -> Vec<(LinkId, Option<usize>)> {
         let listen = self.gates.values().filter(|gate| matches!(gate.kind, LinkKind::RecipeUdpListen { .. }));
         listen.map(|gate| (gate.id, self.frame_len(gate.id))).collect()

@@ -5,8 +5,8 @@ use proto_core::wire::can::CanFrame;
 
 use super::due::Due;
 use super::line::{Chunk, Chunking};
-use super::sleep::Told;
-use super::{BusId, Cell, End, LineId, Owner};
+use super::sleep::PortEvent;
+use super::{AnyPort, BusId, Cell, End, LineId};
 use recipe_controller::ControllerInput;
 
 impl Cell {
@@ -48,10 +48,10 @@ impl Cell {
         }
     }
 
-    pub(super) fn port_receives(&mut self, owner: Owner, bytes: &[u8]) {
+    pub(super) fn port_receives(&mut self, owner: AnyPort, bytes: &[u8]) {
         match owner {
-            Owner::Gateway(port) => self.tell_of_port(port, Told::Bytes(bytes.to_vec())),
-            Owner::Controller(port) => self.controller_input(ControllerInput::PortBytes { port, bytes }),
+            AnyPort::Gateway(port) => self.report_port_event(port, PortEvent::Bytes(bytes.to_vec())),
+            AnyPort::Controller(port) => self.controller_input(ControllerInput::PortBytes { port, bytes }),
         }
     }
 
@@ -69,8 +69,8 @@ impl Cell {
         let mut answers = Vec::new();
         match crossed.from {
             End::Device if crossed.arrives => match owner {
-                Owner::Gateway(port) => self.tell_of_port(port, Told::Frame(crossed.frame)),
-                Owner::Controller(port) => {
+                AnyPort::Gateway(port) => self.report_port_event(port, PortEvent::Frame(crossed.frame)),
+                AnyPort::Controller(port) => {
                     self.controller_input(ControllerInput::PortCan { port, frame: crossed.frame });
                 }
             },
@@ -92,26 +92,28 @@ impl Cell {
         }
     }
 
-    fn port_sent(&mut self, owner: Owner) {
+    fn port_sent(&mut self, owner: AnyPort) {
         match owner {
-            Owner::Gateway(port) => self.tell_of_port(port, Told::Sent),
-            Owner::Controller(port) => self.controller_input(ControllerInput::PortSent { port }),
+            AnyPort::Gateway(port) => self.report_port_event(port, PortEvent::Sent),
+            AnyPort::Controller(port) => self.controller_input(ControllerInput::PortSent { port }),
         }
     }
 
-    pub(super) fn line_at(&self, owner: Owner) -> Option<LineId> {
+    pub(super) fn line_at(&self, owner: AnyPort) -> Option<LineId> {
         self.lines.iter().position(|line| line.owner == owner).map(LineId)
     }
 
-    pub(super) fn bus_at(&self, owner: Owner) -> Option<BusId> {
+    pub(super) fn bus_at(&self, owner: AnyPort) -> Option<BusId> {
         self.buses.iter().position(|bus| bus.owner == owner).map(BusId)
     }
 
-    pub(super) fn port_input(&mut self, owner: Owner, is_up: bool) {
+    pub(super) fn port_input(&mut self, owner: AnyPort, is_up: bool) {
         match owner {
-            Owner::Gateway(port) => self.tell_of_port(port, if is_up { Told::Up } else { Told::Down }),
-            Owner::Controller(port) if is_up => self.controller_input(ControllerInput::PortUp { port }),
-            Owner::Controller(port) => self.controller_input(ControllerInput::PortDown { port }),
+            AnyPort::Gateway(port) => {
+                self.report_port_event(port, if is_up { PortEvent::Up } else { PortEvent::Down })
+            }
+            AnyPort::Controller(port) if is_up => self.controller_input(ControllerInput::PortUp { port }),
+            AnyPort::Controller(port) => self.controller_input(ControllerInput::PortDown { port }),
         }
     }
 }

@@ -21,10 +21,11 @@
 //! assert_eq!(cell.value("DO[1]"), 1.0);
 //! ```
 //!
-//! Each fault is a method of [`Cell`] (of its networks: refuse, lose, hold, reset, half open), a
-//! field of a [`Line`], a [`CanBus`] or a [`Network`] (noise, loss, splits), or a method of
-//! [`Cell::controller_mut`]. [`Trouble`] injects all of them at random.
+//! Each fault is a method of [`Cell`] (such as [`Cell::refuse`] or [`Cell::half_open`]), a field of a
+//! [`Line`], a [`CanBus`] or a [`Network`] (noise, loss, splits), or a method of
+//! [`Cell::controller_mut`]. [`FaultInjector`] injects all of them at random.
 
+mod access;
 mod can;
 mod connection;
 mod device;
@@ -32,6 +33,7 @@ mod drive;
 mod due;
 mod faults;
 mod field;
+mod injector;
 mod line;
 mod network;
 mod oracle;
@@ -47,18 +49,18 @@ mod tamper;
 mod tcp;
 mod trace;
 mod traffic;
-mod trouble;
+mod wiring;
 
 use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 
-use proto_core::config::{Bus, GatewayConfig};
-use proto_core::engine::{BuildError as EngineError, Engine, LinkId, LinkInfo, PortCounters, PortId};
+use proto_core::config::GatewayConfig;
+use proto_core::engine::{BuildError as EngineError, Engine, LinkId, PortId};
 use proto_core::time::{Duration, Instant};
-use proto_core::wire::can::CanFrame;
 
 pub use can::{BusCounters, CanBus};
 pub use device::{Device, Responder, Talker};
+pub use injector::{FaultInjector, FaultKind};
 pub use line::{Chunking, Line, LineCounters, MAX_HEARD, Wiring};
 pub use network::{Network, Way};
 pub use oracle::{Invariant, Violation};
@@ -66,14 +68,13 @@ pub use recording::recording_difference;
 pub use rng::Rng;
 pub use tcp::TCP_TIMEOUT;
 pub use trace::{Entry, Trace, What};
-pub use trouble::{Trouble, TroubleKind};
 
 use connection::Connection;
 use due::Due;
 use network::Gate;
 use oracle::Oracle;
 use queue::Queue;
-use recipe_config::{InitialTarget, SimBus, SimConfig};
+use recipe_config::SimConfig;
 use recipe_controller::{BuildError, ConnId, Controller, ControllerInput};
 use recording::Recorder;
 
@@ -85,9 +86,9 @@ pub struct LineId(usize);
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub struct BusId(usize);
 
-/// The owner of the port on a line or bus.
+/// A port on a line or bus.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Owner {
+enum AnyPort {
     Gateway(PortId),
     Controller(usize),
 }
@@ -123,7 +124,7 @@ impl std::error::Error for CellError {}
 /// A recipe port of the controller that speaks over the network.
 #[derive(Debug)]
 struct Client {
-    /// Where it connects or sends to: a listening link of the gateway, if there is one.
+    /// The gateway's listening link that it connects or sends to; `None` if there is none.
     link: Option<LinkId>,
     is_tcp: bool,
     conn: Option<u64>,
@@ -147,46 +148,46 @@ pub struct Cell {
     clients: BTreeMap<usize, Client>,
     lines: Vec<Line>,
     buses: Vec<CanBus>,
-    names: BTreeMap<String, Far>,
-    controller_names: BTreeMap<String, Far>,
-    /// Events that wait for the gateway while it is not called.
+    names: BTreeMap<String, Medium>,
+    controller_names: BTreeMap<String, Medium>,
+    /// Events that wait while the gateway is not called; `None` while it is called.
     asleep: Option<sleep::Waiting>,
     wakes_at: Instant,
     stalls: u64,
-    /// Number of present faults of each of the controller's servers.
-    ailments: [u32; 3],
+    /// Number of faults that each of the controller's servers has now.
+    server_faults: [u32; 3],
     rng: Rng,
     trace: Trace,
     recorder: Option<Recorder>,
-    /// Checks everything, if requested.
+    /// The model that checks everything; `None` before [`Cell::watch`].
     oracle: Option<Box<Oracle>>,
-    /// Makes a broken gateway of a correct one.
+    /// Changes the engine's inputs and outputs, so that the gateway breaks its promises.
     #[cfg(test)]
     tamper: Option<tamper::Tamper>,
-    /// What the controller has sent on [`Cell::ask`]'s connection.
-    asked: Vec<u8>,
-    /// Number of bytes that the next state packet lacks.
+    /// What the controller has sent on the connection of [`Cell::send_command`].
+    reply: Vec<u8>,
+    /// Number of bytes that are missing at the start of the next state packet.
     state_bytes_lost: usize,
 }
 
-/// What is connected to a port.
+/// What a port is connected to.
 #[derive(Debug, Clone, Copy)]
-enum Far {
+enum Medium {
     Line(LineId),
     Bus(BusId),
 }
 
 impl Cell {
-    /// A cell in which everything is switched on now. Field ports have no devices yet, and no link
-    /// is up before time has passed.
+    /// A cell that is switched on now. Field ports have no devices yet. Links come up when time
+    /// advances.
     ///
     /// # Errors
-    /// [`CellError`] if one of the two cannot run its configuration.
+    /// [`CellError`] if the gateway or the controller cannot run its configuration.
     pub fn new(gateway: &GatewayConfig, controller: &SimConfig, seed: u64) -> Result<Self, CellError> {
         Self::build(gateway, controller, seed, None)
     }
 
-    /// Same, and all inputs and outputs of the engine are recorded from the start:
+    /// Same, with a recording of all inputs and outputs of the engine from the start, for
     /// [`Self::into_recording`].
     ///
     /// # Errors
@@ -221,14 +222,14 @@ impl Cell {
             asleep: None,
             wakes_at: START,
             stalls: 0,
-            ailments: [0; 3],
+            server_faults: [0; 3],
             rng: Rng::new(seed),
             trace: Trace::new(),
             recorder,
             oracle: None,
             #[cfg(test)]
             tamper: None,
-            asked: Vec::new(),
+            reply: Vec::new(),
             state_bytes_lost: 0,
         };
         cell.wire_gateway();
@@ -237,9 +238,8 @@ impl Cell {
         Ok(cell)
     }
 
-    /// From now on everything that the gateway does is checked against an independent model
-    /// (docs/cell.md section 4); time stops after the first violation. Call it before time has
-    /// passed.
+    /// Checks everything that the gateway does from now on against an independent model
+    /// (docs/cell.md section 4). Time stops after the first violation. Call it before time advances.
     pub fn watch(&mut self) {
         let mut oracle = Box::new(Oracle::new(&self.gateway));
         oracle.begin(&self.engine, self.engine_wake, self.now);
@@ -247,7 +247,7 @@ impl Cell {
         self.queue.push(self.now, Due::Survey);
     }
 
-    /// The first violation.
+    /// The first violation; `None` if there was none.
     pub fn violation(&self) -> Option<&Violation> {
         self.oracle.as_ref().and_then(|oracle| oracle.violation())
     }
@@ -273,269 +273,20 @@ impl Cell {
         self.oracle.as_ref().map(|oracle| oracle.traffic[oracle::place(link)]).unwrap_or_default()
     }
 
-    fn wire_gateway(&mut self) {
-        let links: Vec<_> = self.engine.links().map(|link| (link.id, link.kind)).collect();
-        for (id, kind) in links {
-            self.gates.insert(id, Gate::new(id, kind, self.rng.fork()));
-        }
-        let ports = self.gateway.ports.clone();
-        for (nth, port) in (0..).zip(&ports) {
-            let owner = Owner::Gateway(PortId(nth));
-            let far = match port.bus {
-                Bus::Rs485(settings) => Far::Line(self.add_line(owner, settings)),
-                Bus::Can { bitrate } => Far::Bus(self.add_bus(owner, bitrate)),
-                Bus::TcpListen { .. } | Bus::UdpListen { .. } => continue,
-            };
-            self.names.insert(port.name.as_str().to_owned(), far);
-        }
-    }
-
-    fn wire_controller(&mut self, config: &SimConfig) {
-        for (nth, port) in config.ports.iter().enumerate() {
-            let owner = Owner::Controller(nth);
-            let far = match &port.bus {
-                SimBus::Rs485(settings) => Far::Line(self.add_line(owner, *settings)),
-                SimBus::Can { bitrate } => Far::Bus(self.add_bus(owner, *bitrate)),
-                SimBus::UdpServer => continue,
-                SimBus::TcpClient { to } => {
-                    let link = self.listener(to, true);
-                    self.clients.insert(nth, Client { link, is_tcp: true, conn: None, socket: 0 });
-                    continue;
-                }
-                SimBus::UdpClient { to } => {
-                    let link = self.listener(to, false);
-                    self.clients.insert(nth, Client { link, is_tcp: false, conn: None, socket: 0 });
-                    continue;
-                }
-            };
-            self.controller_names.insert(port.name.clone(), far);
-        }
-    }
-
-    fn add_line(&mut self, owner: Owner, settings: proto_core::config::Rs485) -> LineId {
-        self.lines.push(Line::new(owner, settings, self.rng.fork()));
-        LineId(self.lines.len() - 1)
-    }
-
-    fn add_bus(&mut self, owner: Owner, bitrate: u32) -> BusId {
-        self.buses.push(CanBus::new(owner, bitrate, self.rng.fork()));
-        BusId(self.buses.len() - 1)
-    }
-
-    /// The gateway's link that listens on this address's port.
-    fn listener(&self, to: &str, tcp: bool) -> Option<LinkId> {
-        let wanted = to.rsplit(':').next()?;
-        let nth = self.gateway.ports.iter().position(|port| match &port.bus {
-            Bus::TcpListen { listen } if tcp => listen.rsplit(':').next() == Some(wanted),
-            Bus::UdpListen { listen } if !tcp => listen.rsplit(':').next() == Some(wanted),
-            _ => false,
-        })?;
-        Some(LinkId::of_port(PortId(nth as u8)))
-    }
-
-    /// The present instant.
-    pub fn now(&self) -> Instant {
-        self.now
-    }
-
-    /// The gateway's configuration.
-    pub fn gateway(&self) -> &GatewayConfig {
-        &self.gateway
-    }
-
-    /// How many transmissions each line and bus keeps for inspection; initially [`MAX_HEARD`].
-    pub fn keep_heard(&mut self, limit: usize) {
-        self.lines.iter_mut().for_each(|line| line.keep_heard = limit);
-        self.buses.iter_mut().for_each(|bus| bus.keep_heard = limit);
-    }
-
-    /// The gateway.
-    pub fn engine(&self) -> &Engine {
-        &self.engine
-    }
-
-    /// The controller.
-    pub fn controller(&self) -> &Controller {
-        &self.controller
-    }
-
-    /// The controller, mutable, to inject faults; the effects begin with the next [`Self::run`].
-    pub fn controller_mut(&mut self) -> &mut Controller {
-        self.controller_wake = self.now;
-        &mut self.controller
-    }
-
-    /// The controller's item of this name, such as `DO[1]` or `WordInputReg[3]`.
-    ///
-    /// # Panics
-    /// If there is no such item.
-    #[track_caller]
-    pub fn value(&self, name: &str) -> f64 {
-        self.controller.registers().value(target(name))
-    }
-
-    /// Sets an item of the controller from outside, such as an input that is wired.
-    ///
-    /// # Panics
-    /// If there is no such item, or it does not take the value.
-    #[track_caller]
-    pub fn set_value(&mut self, name: &str, value: f64) {
-        if let Err(error) = self.controller_mut().force(target(name), value) {
-            panic!("{name} = {value}: {error}");
-        }
-    }
-
-    /// A link of the gateway.
-    ///
-    /// # Panics
-    /// If the configuration does not need this link.
-    #[track_caller]
-    pub fn link(&self, id: LinkId) -> LinkInfo<'_> {
-        match self.engine.links().find(|link| link.id == id) {
-            Some(link) => link,
-            None => panic!("the gateway has no {id:?}"),
-        }
-    }
-
-    /// The counters of the gateway's field port of this name.
-    ///
-    /// # Panics
-    /// If there is no such field port.
-    #[track_caller]
-    pub fn port(&self, name: &str) -> &PortCounters {
-        let nth = self.gateway.ports.iter().position(|port| port.name == name);
-        match nth.and_then(|nth| self.engine.port_counters(PortId(nth as u8))) {
-            Some(counters) => counters,
-            None => panic!("the gateway has no field port {name}"),
-        }
-    }
-
-    /// The line of the gateway's RS-485 port of this name, otherwise of the controller's.
-    ///
-    /// # Panics
-    /// If neither has one.
-    #[track_caller]
-    pub fn line_of(&self, port: &str) -> LineId {
-        match self.names.get(port).or_else(|| self.controller_names.get(port)) {
-            Some(Far::Line(line)) => *line,
-            _ => panic!("there is no RS-485 port {port}"),
-        }
-    }
-
-    /// The bus of the gateway's CAN port of this name, otherwise of the controller's.
-    ///
-    /// # Panics
-    /// If neither has one.
-    #[track_caller]
-    pub fn bus_of(&self, port: &str) -> BusId {
-        match self.names.get(port).or_else(|| self.controller_names.get(port)) {
-            Some(Far::Bus(bus)) => *bus,
-            _ => panic!("there is no CAN port {port}"),
-        }
-    }
-
-    /// All lines.
-    pub fn lines(&self) -> impl Iterator<Item = LineId> + use<> {
-        (0..self.lines.len()).map(LineId)
-    }
-
-    /// All buses.
-    pub fn buses(&self) -> impl Iterator<Item = BusId> + use<> {
-        (0..self.buses.len()).map(BusId)
-    }
-
-    /// A line, to inspect and to change.
-    pub fn line(&mut self, id: LineId) -> &mut Line {
-        &mut self.lines[id.0]
-    }
-
-    /// A bus, to inspect and to change.
-    pub fn bus(&mut self, id: BusId) -> &mut CanBus {
-        &mut self.buses[id.0]
-    }
-
-    /// The network of a link, to inspect and to change.
-    ///
-    /// # Panics
-    /// If the configuration does not need this link.
-    #[track_caller]
-    pub fn network(&mut self, link: LinkId) -> &mut Network {
-        &mut self.gate(link).network
-    }
-
-    /// The network of each link.
-    pub fn networks(&self) -> BTreeMap<LinkId, Network> {
-        self.gates.iter().map(|(&link, gate)| (link, gate.network)).collect()
-    }
-
-    /// Changes the network of every link.
-    pub fn every_network(&mut self, mut change: impl FnMut(&mut Network)) {
-        for gate in self.gates.values_mut() {
-            change(&mut gate.network);
-        }
-    }
-
-    /// Attaches a device to a line; it replaces the previous one.
-    pub fn attach(&mut self, line: LineId, device: impl Device<Vec<u8>> + 'static) {
-        self.lines[line.0].device = Some(Box::new(device));
-    }
-
-    /// Attaches a device to a bus; it replaces the previous one.
-    pub fn attach_can(&mut self, bus: BusId, device: impl Device<CanFrame> + 'static) {
-        self.buses[bus.0].device = Some(Box::new(device));
-    }
-
-    /// The device on the line sends, as soon as its previous transmission has left.
-    pub fn send(&mut self, line: LineId, bytes: &[u8]) {
-        self.transmit(line, End::Device, bytes);
-    }
-
-    /// The device sends at a later instant.
-    pub fn send_at(&mut self, at: Instant, line: LineId, bytes: &[u8]) {
-        self.queue.push(at, Due::DeviceSends { line, bytes: bytes.to_vec() });
-    }
-
-    /// The device on the bus sends.
-    pub fn send_can(&mut self, bus: BusId, frame: CanFrame) {
-        self.transmit_can(bus, End::Device, frame);
-    }
-
-    /// The trace.
-    pub fn trace(&self) -> &Trace {
-        &self.trace
-    }
-
-    /// Keeps the next `limit` entries of the trace in full.
-    pub fn keep_trace(&mut self, limit: usize) {
-        self.trace.keep(limit);
-    }
-
-    /// The recording of [`Self::recorded`], as `proto_core::record` reads it; empty without one.
-    pub fn into_recording(self) -> Vec<u8> {
-        self.recorder.map_or_else(Vec::new, |mut recorder| {
-            recorder.totals(&self.engine);
-            recorder.into_bytes()
-        })
-    }
-
-    /// A generator derived from the cell's seed.
-    pub fn fork_rng(&mut self) -> Rng {
-        self.rng.fork()
-    }
-
-    /// The controller's reply to a command of another client, at once or within half a second.
-    pub fn ask(&mut self, command: &str) -> String {
+    /// Sends a command from a client other than the gateway; returns the controller's reply, empty if
+    /// there is none within 500 ms.
+    pub fn send_command(&mut self, command: &str) -> String {
         let line = format!("{command}\r\n");
-        self.asked.clear();
-        self.controller_input(ControllerInput::CommandOpened { conn: DESK, from: HERE });
-        self.controller_input(ControllerInput::CommandBytes { conn: DESK, bytes: line.as_bytes() });
-        self.run_until(Duration::from_millis(500), |cell| !cell.asked.is_empty());
-        self.controller_input(ControllerInput::CommandClosed { conn: DESK });
-        String::from_utf8_lossy(&self.asked).into_owned()
+        self.reply.clear();
+        self.controller_input(ControllerInput::CommandOpened { conn: COMMAND_CLIENT, from: CLIENT_IP });
+        self.controller_input(ControllerInput::CommandBytes { conn: COMMAND_CLIENT, bytes: line.as_bytes() });
+        self.run_until(Duration::from_millis(500), |cell| !cell.reply.is_empty());
+        self.controller_input(ControllerInput::CommandClosed { conn: COMMAND_CLIENT });
+        String::from_utf8_lossy(&self.reply).into_owned()
     }
 
-    /// Advances time until `done` holds or `limit` has passed; returns whether it held. It is
-    /// checked every millisecond.
+    /// Advances time until `done` returns true, or by `limit`; returns whether it did. `done` is called
+    /// every millisecond.
     pub fn run_until(&mut self, limit: Duration, mut done: impl FnMut(&Self) -> bool) -> bool {
         let end = self.now + limit;
         loop {
@@ -549,7 +300,7 @@ impl Cell {
         }
     }
 
-    /// Same, in milliseconds.
+    /// Same as [`Self::run`], in milliseconds.
     pub fn run_ms(&mut self, millis: u64) {
         self.run(Duration::from_millis(millis));
     }
@@ -563,27 +314,19 @@ impl Cell {
     }
 }
 
-#[track_caller]
-fn target(name: &str) -> InitialTarget {
-    match name.parse() {
-        Ok(target) => target,
-        Err(error) => panic!("{name}: {error}"),
-    }
-}
-
 /// The gateway's address for the controller's UDP server: a new one each time the link is opened,
 /// as a new socket has.
-fn udp_peer(turn: u64) -> SocketAddr {
-    (HERE, 40_000 + (turn % 10_000) as u16).into()
+fn udp_peer(generation: u64) -> SocketAddr {
+    (CLIENT_IP, 40_000 + (generation % 10_000) as u16).into()
 }
 
 /// The address of every client of the controller.
-const HERE: IpAddr = IpAddr::V4(Ipv4Addr::LOCALHOST);
-/// The connection of [`Cell::ask`].
-const DESK: ConnId = ConnId(u64::MAX);
-/// Not zero, so that nothing depends on the clock's origin, and on no grid of the engine.
+const CLIENT_IP: IpAddr = IpAddr::V4(Ipv4Addr::LOCALHOST);
+/// The connection of [`Cell::send_command`].
+const COMMAND_CLIENT: ConnId = ConnId(u64::MAX);
+/// Neither zero nor on a grid of the engine, so that nothing can depend on the clock's origin.
 const START: Instant = Instant::from_micros(1_000_000_300);
-/// The wait of the controller's TCP client before it connects again.
+/// How long the controller's TCP client waits before it connects again.
 const CLIENT_RETRY: Duration = Duration::from_millis(250);
 
 #[cfg(test)]

@@ -7,9 +7,9 @@ use proto_core::time::{Duration, Instant};
 
 use super::device::Device;
 use super::rng::Rng;
-use super::{End, Owner};
+use super::{AnyPort, End};
 
-/// How the receiver's driver hands bytes over.
+/// How the receiver's driver reports bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Chunking {
     /// Each transmission in one piece, when its last byte has arrived.
@@ -18,8 +18,7 @@ pub enum Chunking {
     Pieces(usize),
     /// In pieces of 1 to this many bytes.
     Random(usize),
-    /// Like a USB adapter: received bytes are buffered and handed over at each multiple of this
-    /// time.
+    /// Like a USB adapter: received bytes are buffered and reported at each multiple of this time.
     Gathered(Duration),
 }
 
@@ -53,9 +52,9 @@ pub struct LineCounters {
 
 /// A line.
 pub struct Line {
-    pub(super) owner: Owner,
+    pub(super) owner: AnyPort,
     settings: Rs485,
-    /// How received bytes are handed over, at both ends.
+    /// How received bytes are reported, at both ends.
     pub chunking: Chunking,
     /// How the ends are joined.
     pub wiring: Wiring,
@@ -69,7 +68,7 @@ pub struct Line {
     collision: (Instant, Instant),
     heard: VecDeque<(Instant, Vec<u8>)>,
     pub(super) keep_heard: usize,
-    /// Bytes gathered and not handed over yet.
+    /// Bytes gathered and not reported yet.
     pub(super) gathered: Vec<u8>,
     rng: Rng,
 }
@@ -97,7 +96,7 @@ impl std::fmt::Debug for Line {
 }
 
 impl Line {
-    pub(super) fn new(owner: Owner, settings: Rs485, rng: Rng) -> Self {
+    pub(super) fn new(owner: AnyPort, settings: Rs485, rng: Rng) -> Self {
         Self {
             owner,
             settings,
@@ -179,7 +178,7 @@ impl Line {
         }
     }
 
-    /// Changes a piece to what arrives of it; false if the line is cut.
+    /// Applies collisions and noise to a piece; returns false if the line is cut.
     pub(super) fn deliver(&mut self, now: Instant, chunk: &mut Chunk) -> bool {
         if !self.connected {
             self.counters.lost_bytes += chunk.bytes.len() as u64;
@@ -196,7 +195,7 @@ impl Line {
         true
     }
 
-    /// Keeps a transmission of the port.
+    /// Keeps a transmission of the port for inspection.
     pub(super) fn hear(&mut self, now: Instant, bytes: &[u8], is_first: bool) {
         if let Some(newest) = self.heard.back_mut().filter(|_| !is_first) {
             newest.0 = now;

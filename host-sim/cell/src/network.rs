@@ -25,16 +25,16 @@ pub struct Network {
     /// The controller's TCP acknowledges this long after data has arrived, unless it sends
     /// something before.
     pub ack_delay: Duration,
-    /// The gateway's driver reads the acknowledgements at this interval, and before it hands over
-    /// received data; zero: it is told at once.
+    /// The gateway's driver reports acknowledgements this long after they arrive, and before it reports
+    /// received data.
     pub ack_report: Duration,
-    /// How many unacknowledged bytes the gateway's transport keeps; beyond that the driver waits
-    /// for room before it reports a transmission as taken.
+    /// How many unacknowledged bytes the gateway's transport keeps. Beyond that the driver reports a
+    /// transmission as sent only when there is room again.
     pub send_buffer: u64,
 }
 
 impl Default for Network {
-    /// A quiet wire: 200 µs, nothing split, nothing lost.
+    /// 200 µs, nothing split, nothing lost.
     fn default() -> Self {
         Self {
             delay: Duration::from_micros(200),
@@ -78,11 +78,11 @@ impl Way {
     }
 }
 
-/// The result of an attempt to connect.
+/// What happens to connection requests.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Door {
+pub(super) enum ConnectPolicy {
     Open,
-    Refuses,
+    Refuse,
     Silent,
 }
 
@@ -92,27 +92,26 @@ pub(super) struct Gate {
     pub id: LinkId,
     pub kind: LinkKind,
     pub network: Network,
-    pub door: Door,
-    /// Number of faults that make data in this direction be lost, by [`Way`].
+    pub connect_policy: ConnectPolicy,
+    /// Number of faults that cut each direction, by [`Way`].
     pub cuts: [u32; 2],
     pub is_open: bool,
     pub is_up: bool,
-    /// Incremented each time the link is opened or closed: older reports are dropped.
-    pub turn: u64,
+    /// Incremented each time the link is opened or closed; events of an older generation are dropped.
+    pub generation: u64,
     pub conn: Option<u64>,
-    /// The transport has no room for the last data handed over, which has not been reported as
-    /// taken yet.
+    /// The transport had no room for the newest transmission, which is not reported as sent yet.
     pub is_full: bool,
-    /// The driver is going to read the acknowledgements.
-    pub looks: bool,
-    /// The peer that the gateway answers, where it listens for datagrams.
-    pub partner: Option<Speaker>,
+    /// The driver will read the acknowledgements: [`super::due::Due::ReadAcks`] is queued.
+    pub reads_acks: bool,
+    /// Where the gateway listens for datagrams: the sender that it answers.
+    pub answers_to: Option<Sender>,
     pub rng: Rng,
 }
 
 /// Senders of datagrams to a port where the gateway listens.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Speaker {
+pub(super) enum Sender {
     /// The controller's client; it has a new socket after each restart.
     Client { socket: u64 },
     /// Another program on the controller's host.
@@ -126,15 +125,15 @@ impl Gate {
             id,
             kind,
             network,
-            door: Door::Open,
+            connect_policy: ConnectPolicy::Open,
             cuts: [0; 2],
             is_open: false,
             is_up: false,
-            turn: 0,
+            generation: 0,
             conn: None,
             is_full: false,
-            looks: false,
-            partner: None,
+            reads_acks: false,
+            answers_to: None,
             rng,
         }
     }
@@ -145,17 +144,17 @@ impl Gate {
 
     /// All datagrams in this direction are lost.
     pub(super) fn swallows(&self, way: Way) -> bool {
-        self.door != Door::Open || self.is_cut(way)
+        self.connect_policy != ConnectPolicy::Open || self.is_cut(way)
     }
 
     pub(super) fn set_open(&mut self, is_open: bool) {
         self.is_open = is_open;
         self.is_up = false;
-        self.turn += 1;
+        self.generation += 1;
         self.conn = None;
         self.is_full = false;
-        self.looks = false;
-        self.partner = None;
+        self.reads_acks = false;
+        self.answers_to = None;
     }
 
     /// When a datagram that leaves now arrives: never, once or twice.
@@ -172,9 +171,9 @@ impl Gate {
 /// What travels on a connection.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Item {
-    /// The other end is there.
+    /// The other end has opened the connection.
     Opened,
     Bytes(Vec<u8>),
-    /// The other end closed: after what it had sent, or at once, with a reset.
+    /// The other end has closed the connection.
     Closed,
 }

@@ -1,4 +1,4 @@
-//! Outages, and what TCP makes of them.
+//! Outages of the network, and TCP's behaviour in them.
 
 use proto_core::config::Bus;
 use proto_core::engine::{LinkId, PortId};
@@ -31,7 +31,7 @@ fn what_was_sent_into_an_outage_arrives_when_it_is_sent_again() {
     cell.cut_cable(LinkId::MODBUS);
     cell.send(line, &DO1);
     cell.run_ms(100);
-    cell.mend_cable(LinkId::MODBUS);
+    cell.repair_cable(LinkId::MODBUS);
     cell.run_ms(95);
     assert_eq!(do1(&cell), 0.0, "the cable is in, and nobody has tried again");
     cell.run_ms(10);
@@ -41,14 +41,14 @@ fn what_was_sent_into_an_outage_arrives_when_it_is_sent_again() {
 
 #[test]
 fn each_wait_is_twice_as_long_and_order_is_kept() {
-    // The controller's client sends a frame each 4 ms; the state stream has nothing to be judged by.
+    // The controller's client sends a frame each 4 ms, which can be checked; the state stream cannot.
     let mut cell = cell("client", 1);
     cell.run_ms(505);
     cell.cut_way(CLIENT, Way::Down);
     let before = cell.link(CLIENT).counters.received;
     cell.run_ms(620);
-    // Sent again after 200, 600 and 1400 ms: the second try was in vain as well.
-    cell.mend_way(CLIENT, Way::Down);
+    // Retransmitted after 200, 600 and 1400 ms; the second one was lost, too.
+    cell.repair_way(CLIENT, Way::Down);
     cell.run_ms(770);
     assert_eq!(cell.link(CLIENT).counters.received, before);
     cell.run_ms(20);
@@ -66,7 +66,7 @@ fn what_the_sender_has_reset_never_arrives_and_the_peer_is_long_in_the_dark() {
     // Given up after 500 ms without an answer.
     cell.run_ms(700);
     assert_eq!(cell.link(LinkId::MODBUS).history.losses, 1);
-    cell.mend_cable(LinkId::MODBUS);
+    cell.repair_cable(LinkId::MODBUS);
     cell.run_ms(5_000);
     let modbus = cell.controller().counters().modbus;
     assert_eq!((do1(&cell), modbus.requests), (0.0, requests));
@@ -79,11 +79,11 @@ fn what_the_sender_has_reset_never_arrives_and_the_peer_is_long_in_the_dark() {
 fn a_peer_that_sends_to_a_connection_that_is_gone_is_told_so() {
     let (mut cell, _) = system();
     cell.cut_cable(LinkId::STATE);
-    // Silent for two seconds: closed, and the controller does not hear of it.
+    // Closed after two silent seconds; the controller is not told.
     cell.run_ms(2_200);
     assert_eq!(cell.controller().counters().state.open, 1);
-    cell.mend_cable(LinkId::STATE);
-    // It sends again after 0.2, 0.6, 1.4 and 3 s.
+    cell.repair_cable(LinkId::STATE);
+    // It retransmits after 0.2, 0.6, 1.4 and 3 s.
     cell.run_ms(1_000);
     let link = cell.link(LinkId::STATE);
     assert!(matches!(link.state, LinkState::Up { .. }), "{link:?}");
@@ -95,21 +95,21 @@ fn a_connection_asked_for_in_an_outage_comes_late() {
     let (mut cell, _) = system();
     cell.cut_cable(LinkId::MODBUS);
     cell.reset(LinkId::MODBUS);
-    // Opened after 100 ms, asked for again a second later.
+    // Opened after 100 ms; the connection request is repeated a second later.
     cell.run_ms(600);
-    cell.mend_cable(LinkId::MODBUS);
+    cell.repair_cable(LinkId::MODBUS);
     cell.run_ms(495);
     assert!(matches!(cell.link(LinkId::MODBUS).state, LinkState::Opening { .. }));
     cell.run_ms(10);
     let link = cell.link(LinkId::MODBUS);
     assert!(matches!(link.state, LinkState::Up { .. }));
     assert_eq!(link.history.failed_opens, 0);
-    // The same through a door that says nothing for a while.
+    // The same with a server that does not answer for a while.
     cell.black_hole(LinkId::MODBUS);
     cell.reset(LinkId::MODBUS);
     cell.run_ms(600);
     cell.admit(LinkId::MODBUS);
-    // Lost twice at short intervals: opened after 200 ms.
+    // Lost twice in a short time: opened after 200 ms.
     cell.run_ms(605);
     assert!(matches!(cell.link(LinkId::MODBUS).state, LinkState::Up { .. }));
 }
@@ -128,7 +128,7 @@ fn a_peer_that_acknowledges_late_slows_nothing_and_one_that_does_not_is_given_up
     assert_eq!((link.history.losses, link.counters.unacknowledged), (0, 0));
     let sent = link.counters.sent;
     assert!(sent >= 1_249, "{sent}");
-    // From now on the frames arrive, and no word of that.
+    // From now on the frames arrive, but no acknowledgements.
     cell.cut_way(CLIENT, Way::Down);
     cell.run_ms(200);
     let value = cell.value("DigitalOutputCommand[1]");
@@ -147,10 +147,10 @@ fn the_transport_itself_gives_up_a_peer_that_acknowledges_nothing() {
     cell.cut_way(CLIENT, Way::Up);
     cell.send(line, &DO1);
     cell.run_ms(1);
-    // Nobody is there to give it up.
+    // No call of the engine can give it up.
     cell.stall_gateway(Duration::from_secs(10));
     cell.run_ms(2_100);
-    cell.mend_way(CLIENT, Way::Up);
+    cell.repair_way(CLIENT, Way::Up);
     cell.run_ms(7_000);
     assert_eq!(do1(&cell), 0.0, "it is not sent again for ever");
 }
@@ -179,11 +179,11 @@ fn a_burst_loses_all_datagrams_and_no_more() {
     let line = cell.line_of("rs485-1");
     cell.cut_way(LinkId::RECIPE_UDP, Way::Up);
     cell.cut_way(LinkId::RECIPE_UDP, Way::Up);
-    cell.mend_way(LinkId::RECIPE_UDP, Way::Up);
+    cell.repair_way(LinkId::RECIPE_UDP, Way::Up);
     cell.send(line, &DO1);
     cell.run_ms(50);
     assert_eq!(do1(&cell), 0.0, "one of two faults is still there");
-    cell.mend_way(LinkId::RECIPE_UDP, Way::Up);
+    cell.repair_way(LinkId::RECIPE_UDP, Way::Up);
     cell.run_ms(2_000);
     assert_eq!(do1(&cell), 0.0, "what is lost is lost");
     cell.send(line, &DO1);
@@ -222,7 +222,7 @@ fn the_gateway_answers_whoever_sends_frames_and_nobody_else() {
     cell.watch();
     let nth = scenario.gateway.ports.iter().position(|port| matches!(port.bus, Bus::UdpListen { .. }));
     let link = LinkId::of_port(PortId(nth.unwrap() as u8));
-    // The first datagram of an opening may be anybody's.
+    // After the link is opened, any sender's first datagram is answered.
     cell.stranger_sends(link, &[1, 2, 3]);
     cell.run_ms(500);
     let arrived = |cell: &Cell| cell.controller().counters().ports["udp"].frames_in;
@@ -239,7 +239,7 @@ fn the_gateway_answers_whoever_sends_frames_and_nobody_else() {
     cell.run_ms(1);
     assert_eq!(press(&mut cell, 5), 5.0, "the stranger changed nothing");
     assert!(arrived(&cell) > before);
-    // A client that begins anew has a new socket, and its next frame says so.
+    // A client that restarts has a new socket, from which its next frame comes.
     cell.restart_controller();
     cell.run_ms(500);
     assert_eq!(press(&mut cell, 6), 6.0);

@@ -5,7 +5,7 @@ use std::collections::BinaryHeap;
 
 use proto_core::time::Instant;
 
-/// Events for later.
+/// The queue.
 #[derive(Debug)]
 pub(super) struct Queue<T> {
     entries: BinaryHeap<Entry<T>>,
@@ -45,7 +45,7 @@ impl<T> Queue<T> {
     }
 }
 
-/// The earliest is the greatest, because a heap returns the greatest first.
+/// The earliest entry is the greatest, because a heap returns the greatest first.
 impl<T> Ord for Entry<T> {
     fn cmp(&self, other: &Self) -> Ordering {
         (other.at, other.nth).cmp(&(self.at, self.nth))

@@ -1,5 +1,5 @@
-//! Everything that goes into the cell's engine and comes out of it, as `proto_core::record` has it: to
-//! be replayed by the same engine on another machine (docs/cortex-m7.md section 1).
+//! A recording of all inputs and outputs of the cell's engine, in the format of `proto_core::record`, to
+//! be replayed on another machine (docs/cortex-m7.md section 1).
 
 use proto_core::config::{GatewayConfig, image};
 use proto_core::engine::{Engine, Input, Output};
@@ -14,7 +14,7 @@ pub(super) struct Recorder {
 }
 
 impl Recorder {
-    /// Of an engine that begins with this configuration.
+    /// A recording of an engine with this configuration.
     pub(super) fn new(config: &GatewayConfig) -> Self {
         let mut room = vec![0; image::MAX_IMAGE];
         let len = image::encode(config, &mut room).expect("there is room for every configuration");
@@ -24,7 +24,7 @@ impl Recorder {
         recorder
     }
 
-    /// The engine begins anew.
+    /// The engine starts or restarts.
     pub(super) fn start(&mut self) {
         Entry::Start { image: &self.image }.encode(|piece| self.bytes.extend_from_slice(piece));
     }
@@ -37,7 +37,7 @@ impl Recorder {
         self.add(&Entry::Output(output));
     }
 
-    /// What has become of the engine.
+    /// Adds the engine's counters.
     pub(super) fn totals(&mut self, engine: &Engine) {
         self.add(&Entry::Totals(&totals(engine)));
     }
@@ -51,8 +51,8 @@ impl Recorder {
     }
 }
 
-/// Where two recordings differ, for a person: the entry, its input, and what either says. `None` when
-/// they are the same, byte for byte.
+/// The first difference of two recordings as text: the entry, the input before it, and both contents.
+/// `None` if they are equal.
 pub fn recording_difference(expected: &[u8], found: &[u8]) -> Option<String> {
     if expected == found {
         return None;

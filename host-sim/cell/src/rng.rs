@@ -1,7 +1,7 @@
 //! The cell's random numbers.
 //!
-//! SplitMix64, written out: a seed in a report must mean the same run for ever, and no crate in
-//! the tree promises its sequence across versions.
+//! SplitMix64, written out: a seed in a report must always mean the same run, and no crate in the
+//! dependency tree promises its sequence across versions.
 
 use proto_core::time::Duration;
 
@@ -24,9 +24,9 @@ impl Rng {
         mixed ^ (mixed >> 31)
     }
 
-    /// A number below `bound`; 0 when the bound is 0.
+    /// A number below `bound`; 0 if the bound is 0.
     pub fn below(&mut self, bound: u64) -> u64 {
-        // The high half of the product: even enough for a simulation, without a division.
+        // The high half of the product: uniform enough for a simulation, without a division.
         ((u128::from(self.next_u64()) * u128::from(bound)) >> 64) as u64
     }
 
@@ -35,7 +35,7 @@ impl Rng {
         low + self.below(high.saturating_sub(low).saturating_add(1))
     }
 
-    /// True this often in a million.
+    /// True with this probability, in millionths.
     pub fn chance(&mut self, per_million: u32) -> bool {
         per_million > 0 && self.below(1_000_000) < u64::from(per_million)
     }
@@ -50,8 +50,8 @@ impl Rng {
         (0..len).map(|_| self.next_u64() as u8).collect()
     }
 
-    /// A generator of its own for a part of the cell: what one part draws does not change what
-    /// another does.
+    /// A separate generator for a part of the cell, so that what one part draws does not change what
+    /// another one draws.
     #[must_use]
     pub fn fork(&mut self) -> Self {
         Self(self.next_u64())

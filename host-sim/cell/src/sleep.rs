@@ -1,9 +1,9 @@
-//! A gateway that is not called for a while: its process was stopped, or its machine was busy or
-//! suspended. Everything else continues, and input for it waits where a kernel keeps it.
+//! A gateway that is not called for a while: its process is stopped, or its machine is busy or
+//! suspended. Everything else goes on, and its input waits in buffers like a kernel's.
 //!
-//! Bounds: 4 KiB per line, 256 frames per bus, 256 datagrams per link; more is lost. Connections
-//! lose nothing: what does not fit stays with the sender. The kernel continues to send, acknowledge
-//! and repeat what was handed over before.
+//! Bounds: 4 KiB per line, 256 frames per bus, 256 datagrams per link; more is lost. Connections lose
+//! nothing: data stays with the sender. The kernel still sends, acknowledges and retransmits what was
+//! handed over before.
 
 use proto_core::engine::{BusState, Input, LinkId, PortId};
 use proto_core::time::Duration;
@@ -16,15 +16,15 @@ use super::{Cell, What};
 /// Events that wait for the gateway.
 #[derive(Debug, Default)]
 pub(super) struct Waiting {
-    /// Of several stalls that overlap, only the one that ends last wakes it.
-    turn: u64,
-    ports: Vec<(PortId, Told)>,
+    /// The number of the stall: of several that overlap, only the newest one wakes the gateway.
+    generation: u64,
+    ports: Vec<(PortId, PortEvent)>,
     links: Vec<Due>,
 }
 
 /// An event of a port.
 #[derive(Debug)]
-pub(super) enum Told {
+pub(super) enum PortEvent {
     Up,
     Down,
     Sent,
@@ -34,25 +34,25 @@ pub(super) enum Told {
 }
 
 impl Cell {
-    /// The gateway is not called for this long; then it gets everything that waits, and then a
-    /// tick. If it sleeps already, it sleeps longer.
+    /// The gateway is not called for this long. Then it gets everything that waits, and a tick. A stall
+    /// that has begun is prolonged.
     pub fn stall_gateway(&mut self, span: Duration) {
         self.trace.add(self.now, What::Fault, super::Entry::GATEWAY, &span.as_micros().to_le_bytes());
         self.stalls += 1;
-        let turn = self.stalls;
-        self.asleep.get_or_insert_default().turn = turn;
+        let generation = self.stalls;
+        self.asleep.get_or_insert_default().generation = generation;
         self.wakes_at = self.wakes_at.max(self.now + span);
-        self.queue.push(self.wakes_at, Due::Wake { turn });
+        self.queue.push(self.wakes_at, Due::Wake { generation });
         if let Some(oracle) = &mut self.oracle {
             oracle.stalled(self.wakes_at, self.now);
         }
     }
 
-    /// It is called again now.
+    /// Ends a stall now.
     pub fn wake_gateway(&mut self) {
-        if let Some(turn) = self.asleep.as_ref().map(|waiting| waiting.turn) {
+        if let Some(generation) = self.asleep.as_ref().map(|waiting| waiting.generation) {
             self.wakes_at = self.now;
-            self.queue.push(self.now, Due::Wake { turn });
+            self.queue.push(self.now, Due::Wake { generation });
         }
     }
 
@@ -61,44 +61,44 @@ impl Cell {
         self.asleep.is_some()
     }
 
-    /// It is called again.
-    pub(super) fn wake(&mut self, turn: u64) {
-        if self.asleep.as_ref().is_none_or(|waiting| waiting.turn != turn) {
+    /// A stall ends.
+    pub(super) fn wake(&mut self, generation: u64) {
+        if self.asleep.as_ref().is_none_or(|waiting| waiting.generation != generation) {
             return;
         }
         let Some(Waiting { ports, links, .. }) = self.asleep.take() else { return };
         self.disturb(None);
-        // A driver reads its sources in any order.
+        // The order in which a driver reads its sources is not specified.
         if self.rng.below(2) == 0 {
-            self.tell_ports(ports);
-            self.tell_links(links);
+            self.report_port_events(ports);
+            self.report_link_events(links);
         } else {
-            self.tell_links(links);
-            self.tell_ports(ports);
+            self.report_link_events(links);
+            self.report_port_events(ports);
         }
         self.engine_input(Input::Tick);
     }
 
-    /// Its process has ended: waiting events are gone.
+    /// The gateway's process has ended: waiting events are lost.
     pub(super) fn forget_waiting(&mut self) {
         self.asleep = None;
         self.wakes_at = self.now;
     }
 
-    fn tell_ports(&mut self, waiting: Vec<(PortId, Told)>) {
-        for (port, told) in waiting {
-            self.engine_input(match &told {
-                Told::Up => Input::PortUp { port },
-                Told::Down => Input::PortDown { port },
-                Told::Sent => Input::PortSent { port },
-                Told::Bus(state) => Input::PortBus { port, state: *state },
-                Told::Bytes(bytes) => Input::PortBytes { port, bytes },
-                Told::Frame(frame) => Input::PortCan { port, frame: *frame },
+    fn report_port_events(&mut self, waiting: Vec<(PortId, PortEvent)>) {
+        for (port, event) in waiting {
+            self.engine_input(match &event {
+                PortEvent::Up => Input::PortUp { port },
+                PortEvent::Down => Input::PortDown { port },
+                PortEvent::Sent => Input::PortSent { port },
+                PortEvent::Bus(state) => Input::PortBus { port, state: *state },
+                PortEvent::Bytes(bytes) => Input::PortBytes { port, bytes },
+                PortEvent::Frame(frame) => Input::PortCan { port, frame: *frame },
             });
         }
     }
 
-    fn tell_links(&mut self, waiting: Vec<Due>) {
+    fn report_link_events(&mut self, waiting: Vec<Due>) {
         for due in waiting {
             self.carry_out(due);
         }
@@ -108,19 +108,19 @@ impl Cell {
         }
         let links: Vec<LinkId> = self.gates.keys().copied().collect();
         for link in links {
-            self.tell_acked(link);
+            self.report_acked(link);
         }
     }
 
-    /// A port has an event for the gateway.
-    pub(super) fn tell_of_port(&mut self, port: PortId, told: Told) {
+    /// Reports an event of a port, now or after the stall.
+    pub(super) fn report_port_event(&mut self, port: PortId, event: PortEvent) {
         match &mut self.asleep {
-            Some(waiting) => waiting.keep(port, told),
-            None => self.tell_ports(vec![(port, told)]),
+            Some(waiting) => waiting.keep(port, event),
+            None => self.report_port_events(vec![(port, event)]),
         }
     }
 
-    /// An event of a link waits, if it must.
+    /// Keeps an event of a link for after the stall; returns it if it can be handled now.
     pub(super) fn keep_for_later(&mut self, due: Due) -> Option<Due> {
         let Some(waiting) = &mut self.asleep else { return Some(due) };
         let link = match &due {
@@ -134,7 +134,7 @@ impl Cell {
             }
             _ => false,
         };
-        if link.is_none() || waiting.links.iter().filter(is_of).count() < MOST_DATAGRAMS {
+        if link.is_none() || waiting.links.iter().filter(is_of).count() < MAX_DATAGRAMS {
             waiting.links.push(due);
         }
         None
@@ -142,28 +142,28 @@ impl Cell {
 }
 
 impl Waiting {
-    fn keep(&mut self, port: PortId, told: Told) {
-        let mut of_port = self.ports.iter_mut().filter(|(of, _)| *of == port).map(|(_, told)| told);
-        match told {
-            Told::Bytes(mut bytes) => {
-                if let Some(Told::Bytes(waiting)) = of_port.next_back() {
+    fn keep(&mut self, port: PortId, event: PortEvent) {
+        let mut of_port = self.ports.iter_mut().filter(|(of, _)| *of == port).map(|(_, event)| event);
+        match event {
+            PortEvent::Bytes(mut bytes) => {
+                if let Some(PortEvent::Bytes(waiting)) = of_port.next_back() {
                     bytes.truncate(LINE_BUFFER.saturating_sub(waiting.len()));
                     waiting.append(&mut bytes);
                 } else {
                     bytes.truncate(LINE_BUFFER);
-                    self.ports.push((port, Told::Bytes(bytes)));
+                    self.ports.push((port, PortEvent::Bytes(bytes)));
                 }
             }
-            Told::Frame(_)
-                if of_port.filter(|told| matches!(told, Told::Frame(_))).count() >= MOST_FRAMES => {}
-            told => self.ports.push((port, told)),
+            PortEvent::Frame(_)
+                if of_port.filter(|event| matches!(event, PortEvent::Frame(_))).count() >= MAX_FRAMES => {}
+            event => self.ports.push((port, event)),
         }
     }
 }
 
-/// Bytes of a line that a kernel keeps.
+/// Number of bytes that a kernel keeps for a line.
 const LINE_BUFFER: usize = 4_096;
-/// Frames of a bus that it keeps.
-const MOST_FRAMES: usize = 256;
-/// Datagrams of a socket that it keeps.
-const MOST_DATAGRAMS: usize = 256;
+/// Number of frames that it keeps for a bus.
+const MAX_FRAMES: usize = 256;
+/// Number of datagrams that it keeps for a socket.
+const MAX_DATAGRAMS: usize = 256;

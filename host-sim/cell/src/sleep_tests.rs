@@ -2,7 +2,7 @@
 
 use proto_core::engine::LinkId;
 use proto_core::time::Duration;
-use proto_core::wire::can::CanId;
+use proto_core::wire::can::{CanFrame, CanId};
 
 use super::tests::cell;
 use super::*;
@@ -77,7 +77,7 @@ fn the_kernel_goes_on_without_the_gateway() {
     cell.send(line, &DO1);
     cell.run_ms(1);
     cell.stall_gateway(Duration::from_millis(400));
-    cell.mend_cable(LinkId::MODBUS);
+    cell.repair_cable(LinkId::MODBUS);
     cell.run_ms(250);
     assert_eq!(cell.value("DO[1]"), 1.0, "it was sent again");
     cell.run_ms(160);

@@ -1,5 +1,4 @@
-//! Values of the controller that cannot be read: not a number, or infinite, in its state packets and
-//! recipe frames.
+//! Unreadable values of the controller: NaN or infinite in its state packets and recipe frames.
 
 use proto_core::config::{FieldSpec, Parts, StreamPart};
 use proto_core::engine::LinkId;
@@ -9,15 +8,15 @@ use proto_core::wire::scalar::ScalarType;
 use super::{Cell, Entry, What};
 
 impl Cell {
-    /// What the controller sends of this variable is `value` from now on, whatever it has.
+    /// The controller sends `value` for this variable from now on, whatever its register has.
     pub fn spoil(&mut self, var: SysVar, value: f32) {
         self.trace.add(self.now, What::Fault, Entry::CONTROLLER, &value.to_le_bytes());
-        // What is no float is sent as it is.
+        // A variable that is no float is left as it is.
         let _ = self.controller_mut().spoil(&var.to_string(), value);
         self.disturb(None);
     }
 
-    /// It sends what it has.
+    /// It sends the register's value again.
     pub fn heal(&mut self, var: SysVar) {
         self.trace.add(self.now, What::Fault, Entry::CONTROLLER, &[]);
         let _ = self.controller_mut().heal(&var.to_string());
@@ -30,8 +29,7 @@ impl Cell {
         SysVar::all().filter(|var| var.ty() == ScalarType::Float && named(var)).collect()
     }
 
-    /// How long the controller's frames are to a port where the gateway listens; `None` when it sends
-    /// none.
+    /// Length of the controller's frames to a port where the gateway listens; `None` if it sends none.
     pub(super) fn frame_len(&self, link: LinkId) -> Option<usize> {
         let port = self.gateway.ports.get(usize::from(link.port()?.0))?;
         let recipe = self.gateway.recipes.get(usize::from(port.recipe))?;

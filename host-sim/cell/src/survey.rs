@@ -1,5 +1,4 @@
-//! Which ways to the controller work at present: what the model that watches needs to know to say what
-//! should have arrived.
+//! Which paths to the controller work at present. The model needs it to know what should have arrived.
 
 use proto_core::engine::{LinkId, LinkKind};
 use proto_core::time::Duration;
@@ -7,27 +6,27 @@ use proto_core::time::Duration;
 use super::Cell;
 use super::connection::Connection;
 use super::due::Due;
-use super::network::{Door, Gate, Way};
+use super::network::{ConnectPolicy, Gate, Way};
 use super::oracle::Path;
 use recipe_controller::Link;
 
 impl Cell {
-    /// A server of the controller has a fault from now on, such as those of
-    /// [`recipe_controller::Controller::mute`]: less can be expected of the gateway. As many
-    /// [`Self::recovers`] end it.
-    pub fn ails(&mut self, server: Link) {
-        self.ailments[server as usize] += 1;
+    /// Announces that a server of the controller has a fault, such as
+    /// [`recipe_controller::Controller::mute`], so that the model expects less of the gateway. Call
+    /// [`Self::server_fault_ends`] as often.
+    pub fn server_fault_begins(&mut self, server: Link) {
+        self.server_faults[server as usize] += 1;
         self.disturb(None);
     }
 
-    /// It has that fault no longer.
-    pub fn recovers(&mut self, server: Link) {
-        let ailments = &mut self.ailments[server as usize];
-        *ailments = ailments.saturating_sub(1);
+    /// Announces that the fault has ended.
+    pub fn server_fault_ends(&mut self, server: Link) {
+        let server_faults = &mut self.server_faults[server as usize];
+        *server_faults = server_faults.saturating_sub(1);
         self.disturb(None);
     }
 
-    /// Something was broken or mended, on one link or on all.
+    /// A fault began or ended, on one link or on all.
     pub(super) fn disturb(&mut self, link: Option<LinkId>) {
         if let Some(oracle) = &mut self.oracle {
             oracle.disturbed(link, self.now);
@@ -45,7 +44,7 @@ impl Cell {
         self.queue.push(now + SURVEY_EVERY, Due::Survey);
     }
 
-    /// The controller says something on a connection.
+    /// The controller sends on a connection: checks for a command that it did not understand.
     pub(super) fn replied(&mut self, conn: u64, bytes: &[u8]) {
         let Some(oracle) = &mut self.oracle else { return };
         let link = self.conns.get(&conn).map(|conn| conn.link);
@@ -68,7 +67,7 @@ impl Cell {
                 link: gate.id,
                 conn: gate.conn,
                 is_sound: !self.is_asleep() && self.is_sound(gate),
-                is_served: server.is_none_or(|server| self.ailments[server as usize] == 0),
+                is_served: server.is_none_or(|server| self.server_faults[server as usize] == 0),
             }
         };
         self.gates.values().map(path).collect()
@@ -77,13 +76,14 @@ impl Cell {
     fn is_sound(&self, gate: &Gate) -> bool {
         let is_whole = |conn: &Connection| {
             let is_free = |way: &super::tcp::Pipe| {
-                !way.held && !way.dead && way.again_at.is_none() && way.reset_after.is_none()
+                !way.held && !way.dead && way.retransmit_at.is_none() && way.reset_after.is_none()
             };
             let is_there = conn.accepted && !conn.closing && !conn.abandoned && !conn.forgotten;
             is_there && is_free(&conn.up) && is_free(&conn.down)
         };
-        let has_path =
-            gate.is_up && gate.door == Door::Open && !Way::BOTH.into_iter().any(|way| gate.is_cut(way));
+        let has_path = gate.is_up
+            && gate.connect_policy == ConnectPolicy::Open
+            && !Way::BOTH.into_iter().any(|way| gate.is_cut(way));
         match gate.kind {
             LinkKind::RecipeUdp | LinkKind::RecipeUdpListen { .. } => {
                 has_path && gate.network.loss_ppm < MUCH_LOSS && gate.network.jitter < MUCH_JITTER
@@ -94,6 +94,6 @@ impl Cell {
 }
 
 const SURVEY_EVERY: Duration = Duration::from_millis(100);
-/// Of a network that is worse nothing is expected.
+/// Nothing is expected of a worse network.
 const MUCH_LOSS: u32 = 10_000;
 const MUCH_JITTER: Duration = Duration::from_millis(5);

@@ -1,12 +1,12 @@
-//! Gateways that break their promises: what goes into the engine and what comes out of it is changed
-//! on the way, and the model that watches has to notice.
+//! Gateways that break their promises: inputs and outputs of the engine are changed on the way, and the
+//! model has to report it.
 
 use proto_core::engine::{Endpoint, Input, LinkId, Output, PortId, Transport};
 use proto_core::time::Instant;
 
 use super::Cell;
 
-/// Something that the engine did not want.
+/// An output that the engine did not make.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Forged {
     Link(LinkId, Vec<u8>),
@@ -14,12 +14,12 @@ pub(super) enum Forged {
     Open(LinkId),
 }
 
-/// Bytes that the engine is given instead of these, if any.
+/// Returns the bytes that the engine gets in place of the input's; `None` leaves the input as it is.
 pub(super) type Inward = Box<dyn FnMut(Instant, &Input<'_>) -> Option<Vec<u8>>>;
-/// What is handed over instead of an output, if anything; before a `Sleep`, in addition.
+/// Returns what replaces an output, or precedes a `Sleep`; `None` leaves the output as it is.
 pub(super) type Outward = Box<dyn FnMut(Instant, &Input<'_>, &Output<'_>) -> Option<Vec<Forged>>>;
 
-/// What is changed.
+/// The changes to inputs and outputs.
 pub(super) struct Tamper {
     pub inward: Inward,
     pub outward: Outward,
@@ -44,7 +44,7 @@ impl Forged {
 }
 
 impl Cell {
-    /// From now on.
+    /// Changes inputs and outputs from now on.
     pub(super) fn tamper(&mut self, inward: Option<Inward>, outward: Option<Outward>) {
         self.tamper = Some(Tamper {
             inward: inward.unwrap_or_else(|| Box::new(|_, _| None)),

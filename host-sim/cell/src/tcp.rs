@@ -2,8 +2,8 @@
 //! the network is sent again after growing waits.
 //!
 //! In: what the sender hands over, and whether the path is cut. Out: when something arrives or is
-//! to be sent again. Does not model windows or congestion: after a loss everything waits for the
-//! next retransmission, as in the network stacks of both ends while nothing is acknowledged.
+//! retransmitted. Does not model windows or congestion: after a loss everything waits for the next
+//! retransmission, as in a real stack while nothing is acknowledged.
 
 use std::collections::VecDeque;
 
@@ -15,34 +15,34 @@ use super::network::{Gate, Item, Way};
 #[derive(Debug)]
 pub(super) struct Pipe {
     segments: VecDeque<Segment>,
-    /// When the newest segment arrives.
+    /// When the newest segment arrives: later ones do not overtake it.
     newest: Instant,
-    /// Nothing arrives until it is released.
+    /// Nothing arrives until [`super::Cell::release`].
     pub held: bool,
     /// Nothing arrives any more.
     pub dead: bool,
-    /// The connection is reset when so many more bytes have arrived.
+    /// The connection is reset after this many more bytes have arrived.
     pub reset_after: Option<usize>,
-    /// Bytes that were handed over, ...
+    /// Number of bytes that were handed over.
     pub sent: u64,
-    /// ... of these arrived at the other end, ...
+    /// Number of these that have arrived.
     pub arrived: u64,
-    /// ... of these acknowledged, as the sender knows.
+    /// Number of these that the sender knows to be acknowledged.
     pub acked: u64,
-    /// Since when something is not.
+    /// When the oldest unacknowledged byte was sent, or the newest acknowledgement came.
     pub unacked_since: Instant,
-    /// How long the sender waits for an acknowledgement before it sends again.
-    patience: Duration,
-    /// When it does so, if something was lost.
-    pub again_at: Option<Instant>,
+    /// Retransmission timeout.
+    rto: Duration,
+    /// When the sender retransmits; `None` if nothing was lost.
+    pub retransmit_at: Option<Instant>,
 }
 
 #[derive(Debug)]
 struct Segment {
     sent_at: Instant,
-    /// [`Instant::NEVER`] when it was lost.
+    /// [`Instant::NEVER`] if it was lost.
     arrives: Instant,
-    /// How much of the other direction it acknowledges.
+    /// Number of bytes of the other direction that it acknowledges.
     acks: u64,
     item: Item,
 }
@@ -56,18 +56,18 @@ pub(super) enum Arrived {
     Reset(Vec<u8>),
 }
 
-/// What comes of sending again.
+/// The result of a retransmission.
 #[derive(Debug, PartialEq, Eq)]
-pub(super) enum Again {
-    /// There is no need for it.
+pub(super) enum Retransmission {
+    /// There was nothing to retransmit.
     Nothing,
-    /// What was lost arrives then.
+    /// The lost data arrives at this instant.
     Arrives(Instant),
-    /// All had arrived: its acknowledgement comes then.
+    /// No data was lost: the acknowledgement arrives at this instant.
     Acked(Instant),
-    /// The path is cut still.
+    /// The path is still cut: the next retransmission is at this instant.
     Later(Instant),
-    /// The sender takes the connection for lost.
+    /// The sender gives up the connection.
     GivenUp,
 }
 
@@ -83,13 +83,12 @@ impl Pipe {
             arrived: 0,
             acked: 0,
             unacked_since: Instant::ZERO,
-            patience: FIRST_PATIENCE,
-            again_at: None,
+            rto: INITIAL_RTO,
+            retransmit_at: None,
         }
     }
 
-    /// Hands an item over; when something of it arrives. Nothing does while something before it is
-    /// lost.
+    /// Hands an item over; returns when its segments arrive. None do while an earlier one is lost.
     pub(super) fn send(
         &mut self,
         now: Instant,
@@ -107,9 +106,9 @@ impl Pipe {
         if self.dead {
             return Vec::new();
         }
-        if gate.is_cut(way) || self.again_at.is_some() {
+        if gate.is_cut(way) || self.retransmit_at.is_some() {
             self.segments.push_back(Segment { sent_at: now, arrives: Instant::NEVER, acks, item });
-            self.again_at.get_or_insert(now + self.patience);
+            self.retransmit_at.get_or_insert(now + self.rto);
             return Vec::new();
         }
         let network = gate.network;
@@ -118,7 +117,7 @@ impl Pipe {
             let late = gate.rng.up_to(network.jitter) + gate.rng.up_to(network.merge);
             let mut at = (now + network.delay + late).max(self.newest);
             if network.longest_segment.is_some() && at == self.newest {
-                // A segment of its own arrives at a time of its own.
+                // Segments that arrive at one instant would be received as one.
                 at += Duration::from_micros(1);
             }
             self.newest = at;
@@ -140,8 +139,8 @@ impl Pipe {
         arrivals
     }
 
-    /// The next thing that has arrived; bytes that came together are one piece. With it, how much of
-    /// the other direction is acknowledged.
+    /// Takes the next item that has arrived; bytes that came together are one piece. Also returns how
+    /// many bytes of the other direction are acknowledged.
     pub(super) fn next_arrived(&mut self, now: Instant) -> (Arrived, u64) {
         let mut acks = 0;
         if self.held || self.dead {
@@ -153,14 +152,14 @@ impl Pipe {
         {
             match &mut segment.item {
                 Item::Bytes(bytes) if joined.is_empty() => joined = std::mem::take(bytes),
-                Item::Bytes(_) if joined.len() >= MOST_AT_ONCE => break,
+                Item::Bytes(_) if joined.len() >= MAX_READ => break,
                 Item::Bytes(bytes) => joined.append(bytes),
                 _ if !joined.is_empty() => break,
                 _ => {}
             }
             let Some(segment) = self.segments.pop_front() else { break };
             acks = acks.max(segment.acks);
-            self.patience = PATIENCE;
+            self.rto = MIN_RTO;
             if !matches!(segment.item, Item::Bytes(_)) {
                 return (Arrived::Item(segment.item), acks);
             }
@@ -180,46 +179,47 @@ impl Pipe {
         (Arrived::Item(Item::Bytes(joined)), acks)
     }
 
-    /// What should arrive now is lost: when it is to be sent again, if that is news.
+    /// Loses what would arrive now; returns when it is retransmitted, if that was not known yet.
     pub(super) fn lose(&mut self, now: Instant) -> Option<Instant> {
         let mut first = None;
         for segment in self.segments.iter_mut().filter(|segment| segment.arrives <= now) {
             segment.arrives = Instant::NEVER;
             first.get_or_insert(segment.sent_at);
         }
-        self.sends_again(now, first?)
+        self.schedule_retransmission(now, first?)
     }
 
-    /// Something that was sent then is not acknowledged: when the sender sends again, if that is news.
-    pub(super) fn sends_again(&mut self, now: Instant, sent_at: Instant) -> Option<Instant> {
-        if self.again_at.is_some() {
+    /// Data sent at `sent_at` was not acknowledged; returns when it is retransmitted, if that was not
+    /// known yet.
+    pub(super) fn schedule_retransmission(&mut self, now: Instant, sent_at: Instant) -> Option<Instant> {
+        if self.retransmit_at.is_some() {
             return None;
         }
-        let at = (sent_at + self.patience).max(now + Duration::from_micros(1));
-        self.again_at = Some(at);
+        let at = (sent_at + self.rto).max(now + Duration::from_micros(1));
+        self.retransmit_at = Some(at);
         Some(at)
     }
 
-    /// It is time to send again; what comes of it.
-    pub(super) fn send_again(&mut self, now: Instant, gate: &mut Gate, way: Way) -> Again {
-        if self.dead || self.again_at != Some(now) {
-            return Again::Nothing;
+    /// Retransmits what was lost.
+    pub(super) fn retransmit(&mut self, now: Instant, gate: &mut Gate, way: Way) -> Retransmission {
+        if self.dead || self.retransmit_at != Some(now) {
+            return Retransmission::Nothing;
         }
-        self.again_at = None;
+        self.retransmit_at = None;
         let is_lost = |segment: &&mut Segment| segment.arrives == Instant::NEVER;
         let any_lost = self.segments.iter_mut().any(|segment| is_lost(&segment));
         if !any_lost && self.unacked() == 0 {
-            return Again::Nothing;
+            return Retransmission::Nothing;
         }
-        // What has arrived is sent again as well, for the sake of its acknowledgement.
+        // If only acknowledgements were lost, arrived data is retransmitted to get them again.
         if gate.is_cut(way) || !any_lost && gate.is_cut(way.back()) {
-            self.patience = self.patience.saturating_mul(2);
-            if self.patience > LAST_PATIENCE {
-                return Again::GivenUp;
+            self.rto = self.rto.saturating_mul(2);
+            if self.rto > MAX_RTO {
+                return Retransmission::GivenUp;
             }
-            let next = now + self.patience;
-            self.again_at = Some(next);
-            return Again::Later(next);
+            let next = now + self.rto;
+            self.retransmit_at = Some(next);
+            return Retransmission::Later(next);
         }
         let at = (now + gate.network.delay + gate.rng.up_to(gate.network.jitter)).max(self.newest);
         self.newest = at;
@@ -227,17 +227,17 @@ impl Pipe {
             segment.arrives = at;
             segment.sent_at = now;
         }
-        if any_lost { Again::Arrives(at) } else { Again::Acked(at + gate.network.delay) }
+        if any_lost { Retransmission::Arrives(at) } else { Retransmission::Acked(at + gate.network.delay) }
     }
 
-    /// The sender has reset the connection: nothing that has not arrived ever does.
+    /// The sender has reset the connection: data that has not arrived is lost.
     pub(super) fn forget(&mut self) {
         self.segments.clear();
-        self.again_at = None;
+        self.retransmit_at = None;
         self.newest = Instant::ZERO;
     }
 
-    /// The sender knows now that so much has arrived; whether that is news.
+    /// The sender receives an acknowledgement; returns whether it covers more than the one before.
     pub(super) fn acknowledge(&mut self, now: Instant, upto: u64) -> bool {
         let is_news = upto > self.acked;
         if is_news {
@@ -247,26 +247,26 @@ impl Pipe {
         is_news
     }
 
-    /// Bytes that the sender does not know to have arrived.
+    /// Number of unacknowledged bytes.
     pub(super) fn unacked(&self) -> u64 {
         self.sent - self.acked
     }
 
-    /// Bytes that have not arrived.
+    /// Number of bytes that have not arrived.
     pub(super) fn on_the_way(&self) -> u64 {
         self.sent - self.arrived
     }
 }
 
-/// How long a new connection waits before it sends again.
-const FIRST_PATIENCE: Duration = Duration::from_secs(1);
-/// The shortest wait on one that exists; it is doubled each time.
-const PATIENCE: Duration = Duration::from_millis(200);
-/// When it would be longer, the connection is given up.
-const LAST_PATIENCE: Duration = Duration::from_secs(16);
-/// A program reads so much at once, rounded up to a segment.
-const MOST_AT_ONCE: usize = 16 * 1024;
+/// The retransmission timeout of a new connection.
+const INITIAL_RTO: Duration = Duration::from_secs(1);
+/// The retransmission timeout after data has arrived. Each retransmission doubles it.
+const MIN_RTO: Duration = Duration::from_millis(200);
+/// A connection that would need a longer one is given up.
+const MAX_RTO: Duration = Duration::from_secs(16);
+/// Number of bytes that a program reads at once, rounded up to a segment.
+const MAX_READ: usize = 16 * 1024;
 /// When TCP gives up a connection on which nothing is acknowledged.
 pub const TCP_TIMEOUT: Duration = Duration::from_secs(30);
-/// The gateway's transport ends a connection on which nothing was acknowledged for so long.
+/// The gateway's transport gives up a connection on which nothing was acknowledged for this long.
 pub(super) const USER_TIMEOUT: Duration = Duration::from_secs(2);

@@ -2,7 +2,7 @@
 
 use proto_core::engine::LinkId;
 use proto_core::time::Duration;
-use proto_core::wire::can::CanId;
+use proto_core::wire::can::{CanFrame, CanId};
 
 use super::*;
 use recipe_config::file;
@@ -116,7 +116,7 @@ fn a_half_open_connection_is_noticed_by_both_in_the_end() {
     cell.half_open(LinkId::STATE);
     cell.run_ms(2_500);
     assert_eq!(cell.link(LinkId::STATE).history.silences, 1);
-    // The gateway has a new connection; the controller still counts the old one.
+    // The gateway has a new connection; the controller still has the old one.
     assert_eq!(cell.controller().counters().state.open, 2);
     cell.run(TCP_TIMEOUT);
     assert_eq!(cell.controller().counters().state.open, 1);
@@ -144,13 +144,13 @@ fn the_lowest_id_wins_the_bus() {
         })
         .collect()
     };
-    // Each end's frames keep their order; between the ends the id decides.
+    // Each end's frames keep their order; between the ends the lower id wins.
     let expected_from = [End::Device, End::Device, End::Port, End::Port, End::Port];
     assert_eq!(order.iter().map(|(from, _)| *from).collect::<Vec<_>>(), expected_from);
 }
 
 #[test]
-fn every_kind_of_trouble_and_the_cell_is_whole_again() {
+fn every_kind_of_fault_and_the_cell_recovers() {
     let mut kinds = std::collections::BTreeSet::new();
     for name in ["rs485-system", "udp-server", "can-system"] {
         let mut cell = cell(name, 42);
@@ -163,10 +163,10 @@ fn every_kind_of_trouble_and_the_cell_is_whole_again() {
             let frame = |n: u64| CanFrame::new(CanId::Standard(1), &[(n & 1) as u8]).unwrap();
             cell.attach_can(bus, Talker::new(start, 20, u64::MAX, frame));
         }
-        let mut trouble = Trouble::new(&mut cell, &TroubleKind::ALL, Duration::from_millis(300));
-        trouble.run(&mut cell, Duration::from_secs(80));
-        trouble.mend(&mut cell);
-        kinds.extend(trouble.counts().keys().copied());
+        let mut injector = FaultInjector::new(&mut cell, &FaultKind::ALL, Duration::from_millis(300));
+        injector.run(&mut cell, Duration::from_secs(80));
+        injector.end_all(&mut cell);
+        kinds.extend(injector.counts().keys().copied());
         cell.run(Duration::from_secs(40));
         let mut seen = [0, 0];
         for _ in 0..20 {
@@ -181,8 +181,8 @@ fn every_kind_of_trouble_and_the_cell_is_whole_again() {
         assert_eq!(open, wanted, "{name}: no connection is left over, none is missing");
         assert!(cell.conns.len() == wanted.iter().sum::<usize>(), "{name}: {:?}", cell.conns);
     }
-    // Nobody listens for datagrams in these.
-    let all = TroubleKind::ALL.into_iter().filter(|kind| *kind != TroubleKind::Stranger);
+    // These cells have no port that listens for datagrams.
+    let all = FaultKind::ALL.into_iter().filter(|kind| *kind != FaultKind::Stranger);
     assert!(kinds.into_iter().eq(all));
 }
 

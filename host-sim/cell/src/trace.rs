@@ -6,9 +6,9 @@ use proto_core::time::Instant;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[repr(u8)]
 pub enum What {
-    /// The gateway wants a link open.
+    /// The gateway opens a link.
     LinkOpen,
-    /// The gateway gives a link up.
+    /// The gateway closes a link.
     LinkClose,
     /// The gateway was told that a link is up.
     LinkUp,
@@ -18,7 +18,7 @@ pub enum What {
     LinkSent,
     /// The gateway received on a link.
     LinkReceived,
-    /// A connection reached the controller.
+    /// The controller accepted a connection.
     ControllerOpened,
     /// The controller was told that a connection is gone.
     ControllerClosed,
@@ -34,16 +34,16 @@ pub enum What {
     ControllerPortReceived,
     /// A fault began or ended.
     Fault,
-    /// What a fault is, in words; no part of the digest.
+    /// A fault in words; not part of the digest.
     Remark,
 }
 
 /// One entry.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Entry {
-    /// When.
+    /// When it happened.
     pub at: Instant,
-    /// What.
+    /// Its kind.
     pub what: What,
     /// The link, port or connection.
     pub subject: u64,
@@ -117,7 +117,7 @@ impl Trace {
         }
     }
 
-    /// The same on every machine: whole words, in little-endian order.
+    /// Takes whole words in little-endian order, so that the digest is the same on every machine.
     fn mix(&mut self, word: u64) {
         self.digest = (self.digest.rotate_left(23) ^ word).wrapping_mul(ODD);
     }

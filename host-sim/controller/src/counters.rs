@@ -9,7 +9,7 @@ use super::ports::PortCounters;
 pub struct ServerCounters {
     /// Connections accepted.
     pub opened: u64,
-    /// Connections closed at once: too many, or a fault of a test.
+    /// Connections closed at once: too many, or a fault for tests.
     pub refused: u64,
     /// Connections closed to make room for another one (docs/devices.md section 7).
     pub displaced: u64,
@@ -21,15 +21,15 @@ pub struct ServerCounters {
     pub bytes_out: u64,
     /// Requests answered; on the state stream, packets.
     pub requests: u64,
-    /// Requests of these that were refused: unknown commands, Modbus exceptions.
+    /// Of these, requests that were refused: unknown commands, Modbus exceptions.
     pub refusals: u64,
     /// Connections closed because the client broke the protocol.
     pub violations: u64,
-    /// Answers lost because of a fault of a test.
+    /// Answers dropped by a fault for tests.
     pub muted: u64,
 }
 
-/// All counters, since the controller was made.
+/// All counters since the controller was created.
 #[derive(Debug, Clone, PartialEq, Eq, Default, serde::Serialize)]
 pub struct Counters {
     /// Port 2000.
@@ -44,7 +44,7 @@ pub struct Counters {
     pub stray_datagrams: u64,
     /// Programs started.
     pub programs_started: u64,
-    /// Programs of these that ended with an error.
+    /// Of these, programs that ended with an error.
     pub programs_failed: u64,
     /// State packets skipped on the 100 ms grid because of a late call.
     pub missed_state_packets: u64,

@@ -1,16 +1,17 @@
-//! Faults and operations that a test, or a person at the teach pendant, can cause.
+//! Faults for tests, and operations at the teach pendant (docs/simulated-controller.md section 6).
 //!
-//! Plain methods; none of them is reachable from outside the process.
+//! They are methods of [`Controller`]; no client can cause them.
 
 use proto_core::modbus::Exception;
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::dialect::Dialect;
 use proto_core::wire::state::OperationMode;
 
+use super::build::{mode, start_values};
 use super::machine::Machine;
 use super::registers::SetError;
 use super::spoiled::{NoSuchFloat, Spoiled};
-use super::{Controller, ControllerOutput, RecipeError, mode, start_values};
+use super::{Controller, ControllerOutput, RecipeError};
 pub use recipe_config::CommandClients;
 use recipe_config::InitialTarget;
 
@@ -41,7 +42,7 @@ pub(super) struct Faults {
 }
 
 impl Faults {
-    /// No faults but those of the configuration.
+    /// Only the faults of the configuration.
     pub(super) fn new(command_clients: CommandClients) -> Self {
         Self { command_clients, ..Self::default() }
     }
@@ -81,51 +82,49 @@ impl Faults {
 
 /// Faults of the connection to the controller.
 impl Controller {
-    /// The server carries out requests, but its answers are lost.
+    /// Drops all answers of the server from now on; requests are still carried out.
     pub fn mute(&mut self, link: Link) {
         self.faults.muted[link as usize] = true;
     }
 
-    /// The server's answers arrive again.
+    /// Ends [`Self::mute`].
     pub fn unmute(&mut self, link: Link) {
         self.faults.muted[link as usize] = false;
     }
 
-    /// The server closes new connections at once.
+    /// Closes every new connection of the server at once from now on.
     pub fn refuse(&mut self, link: Link) {
         self.faults.refused[link as usize] = true;
     }
 
-    /// The server accepts connections again.
+    /// Ends [`Self::refuse`].
     pub fn accept(&mut self, link: Link) {
         self.faults.refused[link as usize] = false;
     }
 
-    /// Sets how many clients port 2000 accepts from now on. Present ones stay until the next one
-    /// comes.
+    /// Sets how many clients port 2000 accepts. Connected clients stay until the next one connects.
     pub fn command_clients(&mut self, clients: CommandClients) {
         self.faults.command_clients = clients;
     }
 
-    /// The server closes every connection it has.
+    /// Closes all connections of the server.
     pub fn disconnect(&mut self, link: Link) {
         self.server.close_link(link, &mut self.outputs);
     }
 
-    /// Delays every answer of the server by this much from now on. The state stream, which answers
-    /// nothing, is not delayed.
+    /// Delays every answer of the server from now on. Without effect on the state stream, which has no answers.
     pub fn delay_answers(&mut self, link: Link, delay: Duration) {
         self.faults.delay[link as usize] = delay;
     }
 
-    /// Makes the transitions of `poweron`, `poweroff`, `enable`, `disable`, `stop` and `pause` this
-    /// much longer from now on.
+    /// Makes the transitions of `poweron`, `poweroff`, `enable`, `disable`, `stop` and `pause` longer by `by` from
+    /// now on.
     pub fn delay_transitions(&mut self, by: Duration) {
         self.faults.transitions = by;
         self.machine.delay_transitions(by);
     }
 
-    /// Every Modbus request is answered with this exception and not carried out; `None` ends it.
+    /// Answers every Modbus request with this exception, without carrying it out; `None` ends it.
     pub fn answer_modbus_with(&mut self, exception: Option<Exception>) {
         self.faults.exception = exception;
     }
@@ -136,39 +135,39 @@ impl Controller {
         self.faults.state_cut = Some(len);
     }
 
-    /// Makes state packets and the frames of recipes' output parts show `instead` of the item's
-    /// value, such as NaN. Modbus and programs still see the value.
+    /// Sends `instead`, such as NaN, in place of the item's value in state packets and in frames of recipes' output
+    /// parts. Modbus and programs still see the value.
     ///
     /// An item is a system variable such as `RobotState[8]`, an analog input such as `AI_V[1]`, or any
     /// other float of the state packet, such as `joint_torque[1]` (proto-core/docs/wire/state.md section 2).
     ///
     /// # Errors
-    /// [`NoSuchFloat`]; nothing changed.
+    /// [`NoSuchFloat`] if there is no such item; nothing changed.
     pub fn spoil(&mut self, name: &str, instead: f32) -> Result<(), NoSuchFloat> {
         self.faults.spoiled.spoil(name, instead)
     }
 
-    /// Shows the item's value again.
+    /// Ends [`Self::spoil`] for the item.
     ///
     /// # Errors
-    /// [`NoSuchFloat`].
+    /// [`NoSuchFloat`] if there is no such item.
     pub fn heal(&mut self, name: &str) -> Result<(), NoSuchFloat> {
         self.faults.spoiled.heal(name)
     }
 
-    /// Loses everything that the port sends.
+    /// Drops everything that the port sends from now on. `port` is its index in the configuration.
     pub fn mute_port(&mut self, port: usize) {
         if !self.faults.mutes_port(port) {
             self.faults.muted_ports.push(port);
         }
     }
 
-    /// Ends the loss on this port.
+    /// Ends [`Self::mute_port`].
     pub fn unmute_port(&mut self, port: usize) {
         self.faults.muted_ports.retain(|&muted| muted != port);
     }
 
-    /// A TCP client's connection is lost.
+    /// Closes the connection of a TCP client port. Without effect on other ports.
     pub fn close_port(&mut self, port: usize) {
         if let Some(own) = self.ports.get_mut(port).filter(|own| own.is_tcp_client() && own.is_up()) {
             own.went_down();
@@ -176,9 +175,9 @@ impl Controller {
         }
     }
 
-    /// Switches the controller off and on: everything is closed, the registers get the
-    /// configuration's initial values and 0 everywhere else, and the robot goes through its start
-    /// to power off. Faults stay.
+    /// Switches the controller off and on: all connections are closed, the registers get the configuration's initial
+    /// values and otherwise 0, and the robot boots to power off (docs/simulated-controller.md section 1). Faults
+    /// stay.
     pub fn restart(&mut self, now: Instant) {
         self.server.close_all(&mut self.outputs);
         self.running = None;
@@ -205,25 +204,25 @@ impl Controller {
     }
 }
 
-/// A controller that has lost its memory.
+/// Loss of the registers.
 impl Controller {
-    /// Same as [`Self::restart`], but registers and outputs are 0 whatever the configuration's
-    /// initial values are. Only wired inputs and the arm are as at the start.
+    /// As [`Self::restart`], but registers and outputs are 0 whatever their initial values are. Only wired inputs and
+    /// the arm have their initial values.
     pub fn restart_cleared(&mut self, now: Instant) {
         self.restart(now);
         self.registers.clear();
     }
 }
 
-/// Another version of the controller's software.
+/// Other versions of the controller's software.
 impl Controller {
-    /// The name of its dialect.
+    /// The name of the dialect in use.
     pub fn dialect(&self) -> &'static str {
         self.dialect.name
     }
 
-    /// Replaces the software by one with this dialect: the controller restarts. Nothing happens if
-    /// there is no such dialect.
+    /// Switches to another dialect, as a software update would, and restarts the controller. Without effect if there
+    /// is no such dialect.
     pub fn replace_software(&mut self, now: Instant, dialect: &str) {
         if let Some(dialect) = Dialect::named(dialect) {
             self.dialect = dialect;
@@ -234,10 +233,10 @@ impl Controller {
 
 /// Events in the cell.
 impl Controller {
-    /// Sets the value of an input, or of any other item.
+    /// Sets the value of an input or of any other item.
     ///
     /// # Errors
-    /// [`SetError::Value`]; nothing changed.
+    /// [`SetError::Value`] if the value is out of range; nothing changed.
     pub fn force(&mut self, target: InitialTarget, value: f64) -> Result<(), SetError> {
         self.registers.force(target, value)?;
         // The tool's frame decides where the TCP is.
@@ -245,11 +244,11 @@ impl Controller {
         Ok(())
     }
 
-    /// Assigns another recipe to a port, as at the teach pendant, by its index in
-    /// [`recipe_config::SimConfig::recipes`]; `None` leaves the port idle.
+    /// Assigns another recipe to a port, as at the teach pendant. `recipe` is an index into
+    /// [`recipe_config::SimConfig::recipes`]; without one the port is idle.
     ///
     /// # Errors
-    /// [`RecipeError`] if the port cannot have the recipe; nothing changed.
+    /// [`RecipeError`] if the port cannot carry the recipe; nothing changed.
     pub fn assign_recipe(
         &mut self,
         now: Instant,
@@ -268,41 +267,41 @@ impl Controller {
         result
     }
 
-    /// Turns the key switch.
+    /// Changes the operation mode, as the key switch does.
     pub fn set_mode(&mut self, mode: OperationMode) {
         self.machine.set_mode(mode);
     }
 
-    /// Presses the emergency stop.
+    /// Presses the emergency stop: the program ends, and the robot is disabled.
     pub fn emergency_stop(&mut self, now: Instant) {
         let effect = self.machine.emergency_stop(now);
         self.apply(now, effect);
     }
 
-    /// Causes a protective stop, such as by an open door.
+    /// Causes a protective stop, as an open door does: the program ends, and the robot is disabled.
     pub fn protective_stop(&mut self, now: Instant) {
         let effect = self.machine.protective_stop(now);
         self.apply(now, effect);
     }
 
-    /// Makes the arm collide on this axis (see proto-core/docs/wire/state.md section 2).
+    /// Makes the arm collide on this axis (proto-core/docs/wire/state.md section 2): the program is paused.
     pub fn collide(&mut self, now: Instant, axis: u8) {
         let effect = self.machine.collide(now, axis);
         self.apply(now, effect);
     }
 
-    /// Removes and acknowledges the cause of a stop.
+    /// Removes and acknowledges the cause of a stop: the safety state recovers.
     pub fn clear_stop(&mut self, now: Instant) {
         self.machine.clear_stop(now);
     }
 
-    /// A person enters the zone of reduced speed.
+    /// Reduces the speed, as a person in a safety zone does.
     pub fn enter_reduced(&mut self, now: Instant) {
         self.machine.set_reduced(true);
         self.speed_changed(now);
     }
 
-    /// The zone of reduced speed is empty again.
+    /// Ends the reduced speed.
     pub fn leave_reduced(&mut self, now: Instant) {
         self.machine.set_reduced(false);
         self.speed_changed(now);

@@ -1,4 +1,4 @@
-//! The effects of time: transitions, the program's calls, the grids.
+//! What happens with time: transitions, the program's calls, cycles and the state stream.
 
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::dialect::{FinishNotice, Motion};
@@ -13,7 +13,7 @@ use super::registers::Status;
 use super::{ConnId, Controller, ControllerOutput, MAX_LOG};
 use recipe_config::InitialTarget;
 
-/// The program that was started and has not stopped yet.
+/// The program that has not ended.
 #[derive(Debug)]
 pub(super) struct Running {
     program: Program,
@@ -24,12 +24,12 @@ pub(super) struct Running {
 /// The state of the program's pending call.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Activity {
-    /// Not handled yet, or nothing that lasts.
-    Fresh,
+    /// The call takes no time, or was not handled yet.
+    None,
     Waiting {
         until: Instant,
     },
-    /// A wait that a pause has interrupted.
+    /// A wait that was interrupted by a pause.
     Held {
         left: Duration,
     },
@@ -37,7 +37,7 @@ enum Activity {
     Sending {
         port: usize,
     },
-    /// It has done enough for now.
+    /// Until the next slice.
     GivingWay {
         until: Instant,
     },
@@ -54,7 +54,7 @@ impl Running {
 }
 
 impl Controller {
-    /// Brings everything up to `now`.
+    /// Advances everything to `now`.
     pub(super) fn advance(&mut self, now: Instant) {
         while let Some(effect) = self.machine.poll(now) {
             self.apply(now, effect);
@@ -71,13 +71,13 @@ impl Controller {
         self.poll_server(now);
     }
 
-    /// When something happens without an input.
+    /// When something is due without an input.
     pub(super) fn deadline(&self) -> Instant {
         let program = self.running.as_ref().filter(|_| self.machine.program_runs()).and_then(|running| {
             match running.activity {
                 Activity::Waiting { until } | Activity::GivingWay { until } => Some(until),
                 Activity::Moving => self.arm.arrival(),
-                Activity::Fresh | Activity::Held { .. } | Activity::Sending { .. } => None,
+                Activity::None | Activity::Held { .. } | Activity::Sending { .. } => None,
             }
         });
         let state = self.server.has_subscribers().then(|| self.state_grid.next());
@@ -86,7 +86,7 @@ impl Controller {
         all.into_iter().flatten().min().unwrap_or(Instant::NEVER)
     }
 
-    /// Carries out a transition.
+    /// Carries out the effect of a state change.
     pub(super) fn apply(&mut self, now: Instant, effect: Effect) {
         match effect {
             Effect::None => {}
@@ -109,7 +109,7 @@ impl Controller {
             Effect::Abort(braking) => {
                 if let Some(running) = &mut self.running {
                     running.program.answer(now, Answer::Abort);
-                    running.activity = Activity::Fresh;
+                    running.activity = Activity::None;
                 }
                 self.slow_down(now, braking);
             }
@@ -122,12 +122,12 @@ impl Controller {
                 self.server.close_all(&mut self.outputs);
                 self.running = None;
                 self.outputs.push_back(ControllerOutput::Shutdown);
-                self.gone = true;
+                self.is_shut_down = true;
             }
         }
     }
 
-    /// Starts the script; its first calls are carried out with the next [`Self::advance`].
+    /// Starts the script; its first calls are handled in the next [`Self::advance`].
     pub(super) fn start_program(
         &mut self,
         now: Instant,
@@ -139,7 +139,7 @@ impl Controller {
         }
         match Program::start(script, now) {
             Ok(program) => {
-                self.running = Some(Running { program, activity: Activity::Fresh, started_by: Some(conn) });
+                self.running = Some(Running { program, activity: Activity::None, started_by: Some(conn) });
                 self.machine.program_started();
                 self.counters.programs_started += 1;
                 Ok(())
@@ -152,7 +152,7 @@ impl Controller {
         }
     }
 
-    /// Runs the arm at the present speed, if it runs at all.
+    /// Applies the present speed to the arm, if the program runs.
     pub(super) fn speed_changed(&mut self, now: Instant) {
         if self.machine.program_runs() {
             self.arm.set_rate(now, self.machine.rate(), Braking::Normal);
@@ -202,7 +202,7 @@ impl Controller {
         }
     }
 
-    /// Answers the program's calls that can be answered now.
+    /// Answers the program's calls as far as possible now.
     fn drive_program(&mut self, now: Instant) {
         while self.machine.program_runs() {
             let Some(running) = &self.running else { return };
@@ -210,7 +210,7 @@ impl Controller {
                 Progress::Calling(call) => {
                     let Some(answer) = self.serve(now, &call) else { return };
                     if let Some(running) = &mut self.running {
-                        running.activity = Activity::Fresh;
+                        running.activity = Activity::None;
                         running.program.answer(now, answer);
                     }
                 }
@@ -241,9 +241,9 @@ impl Controller {
         }
     }
 
-    /// The answer to a call, if it has one already.
+    /// The answer to a call; `None` if it has none yet.
     fn serve(&mut self, now: Instant, call: &Call) -> Option<Answer> {
-        let activity = self.running.as_ref().map_or(Activity::Fresh, |running| running.activity);
+        let activity = self.running.as_ref().map_or(Activity::None, |running| running.activity);
         match call {
             Call::Receive { port } => {
                 let port = match self.port_named(port) {
@@ -271,7 +271,7 @@ impl Controller {
                 };
                 let port = self.ports.get_mut(nth)?;
                 if port.is_busy() {
-                    // Data of an earlier program is still being sent.
+                    // A frame of an earlier program is still being sent.
                     return None;
                 }
                 match port.send(*id, values) {
@@ -336,7 +336,7 @@ impl Controller {
         }
     }
 
-    /// No answer yet.
+    /// Notes what the call waits for, and returns no answer.
     fn begin_activity(&mut self, activity: Activity) -> Option<Answer> {
         if let Some(running) = &mut self.running {
             running.activity = activity;
@@ -391,5 +391,5 @@ impl Controller {
     }
 }
 
-/// Interval at which the arm's controller checks its joints.
+/// Interval at which the arm's state is updated.
 const SERVO_CYCLE: Duration = Duration::from_millis(1);

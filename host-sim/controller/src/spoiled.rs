@@ -1,5 +1,5 @@
-//! Floats shown with another value, such as NaN, in state packets and in the frames of recipes'
-//! output parts. The item itself keeps its value.
+//! A fault for tests: floats with another value, such as NaN, in state packets and in frames of recipes' output
+//! parts. The item itself keeps its value.
 
 use proto_core::sysvar::{IMAGE_BYTES, SysVar};
 use proto_core::wire::scalar::ScalarType;
@@ -7,16 +7,16 @@ use proto_core::wire::state::{FIELDS, LEN};
 
 use recipe_config::{AnalogInput, InitialTarget};
 
-/// The items and the values shown instead.
+/// The items, and the values that are sent instead.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Spoiled(Vec<(Item, f32)>);
 
-/// The place where an item is shown.
+/// Where an item is sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Item {
-    /// In the process image, and so in recipes' frames.
+    /// Its offset in the process image, and so in recipes' frames.
     image: Option<usize>,
-    /// In the state packet.
+    /// Its offset in the state packet.
     packet: Option<usize>,
 }
 
@@ -37,7 +37,7 @@ impl std::fmt::Display for NoSuchFloat {
 impl std::error::Error for NoSuchFloat {}
 
 impl Spoiled {
-    /// Shows `instead` for the item of this name from now on.
+    /// Sends `instead` for the item of this name from now on.
     pub(super) fn spoil(&mut self, name: &str, instead: f32) -> Result<(), NoSuchFloat> {
         let item = find(name)?;
         self.0.retain(|other| other.0 != item);
@@ -45,14 +45,14 @@ impl Spoiled {
         Ok(())
     }
 
-    /// Shows its value again.
+    /// Sends its value again.
     pub(super) fn heal(&mut self, name: &str) -> Result<(), NoSuchFloat> {
         let item = find(name)?;
         self.0.retain(|other| other.0 != item);
         Ok(())
     }
 
-    /// The process image as recipes show it; `None` if it is unchanged.
+    /// The process image for recipes' frames; `None` if it is unchanged.
     pub(super) fn image(&self, image: &[u8; IMAGE_BYTES]) -> Option<[u8; IMAGE_BYTES]> {
         if self.0.is_empty() {
             return None;

@@ -1,5 +1,5 @@
-//! A controller in virtual time, for tests: its clients and devices are calls, and the clock jumps from
-//! deadline to deadline.
+//! The simulated controller in virtual time, for tests: clients and devices are method calls, and the clock jumps
+//! from deadline to deadline.
 
 use std::collections::BTreeMap;
 use std::error::Error;
@@ -14,7 +14,11 @@ use recipe_config::{InitialTarget, SimConfig};
 use super::faults::Link;
 use super::{BuildError, ConnId, Controller, ControllerInput, ControllerOutput};
 
-/// A controller, its clients and its devices on one clock. Nothing here opens a socket or waits.
+/// A simulated controller with its clients and devices, on a virtual clock. It opens no socket and never waits, so
+/// a test takes milliseconds and every run is the same.
+///
+/// Calls that send return at once; what follows happens in [`Self::run`]. Errors of the test itself, such as the
+/// name of an item that does not exist, panic at the caller's line.
 ///
 /// ```
 /// use proto_core::time::Duration;
@@ -42,51 +46,53 @@ use super::{BuildError, ConnId, Controller, ControllerInput, ControllerOutput};
 /// robot.run(Duration::from_millis(20));
 /// assert_eq!(robot.value("DO[1]"), 1.0);
 ///
-/// // A client of port 2000 asks how it is.
+/// // A client of port 2000 asks for the states: enabled, stopped, run, remote.
 /// let client = robot.connect(Link::Command);
 /// robot.send(client, b"state\n");
 /// robot.run(Duration::from_millis(20));
 /// assert_eq!(robot.take(client), b"6:0:5:2");
 /// ```
 ///
-/// Faults are methods of [`Controller`]: see [`Self::controller_mut`].
+/// Faults, such as a mute server or an emergency stop, are methods of [`Controller`]: see
+/// [`Self::controller_mut`].
 #[derive(Debug)]
 pub struct TestController {
     pub(crate) controller: Controller,
     pub(crate) now: Instant,
     links: BTreeMap<ConnId, Link>,
-    /// Bytes that each connection has received and no call has returned.
+    /// Bytes that each client has received and [`Self::take`] has not returned.
     received: BTreeMap<ConnId, Vec<u8>>,
     pub(crate) closed: Vec<ConnId>,
     /// Data sent by ports, with the time.
     pub(crate) sent: Vec<(Instant, usize, Out)>,
     /// Packets sent to all clients of port 2001, with the time.
     pub(crate) packets: Vec<(Instant, StatePacket)>,
-    /// How long a port takes to send.
+    /// Time that a port takes to send.
     pub(crate) line_time: Duration,
-    leaving: Vec<(Instant, usize)>,
+    /// Ports that are sending, with the time of their end.
+    sending: Vec<(Instant, usize)>,
     pub(crate) shut_down: bool,
     next_conn: u64,
 }
 
-/// Data sent by a port of a [`TestController`].
+/// What a port of a [`TestController`] has sent, as [`TestController::take_sent`] returns it.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Out {
-    /// Bytes on a line or connection, or one datagram of a UDP client.
+    /// One frame on an RS-485 line or a TCP connection, or one datagram of a UDP client port.
     Bytes(Vec<u8>),
     /// A frame on a CAN bus.
     Can(CanFrame),
-    /// A datagram of the UDP server, and its receiver. The port number is [`usize::MAX`].
+    /// A datagram of the UDP server (port 2011), with its receiver. Its port index is [`usize::MAX`].
     Datagram(SocketAddr, Vec<u8>),
-    /// It closed its connection.
+    /// The port closed its TCP connection.
     Closed,
 }
 
 impl TestController {
-    /// A controller that was switched on a second ago; the devices of all its ports are up.
+    /// A controller with this configuration. The clock is at 1 s, and the devices of all ports are up.
     ///
     /// # Errors
-    /// Same as [`Controller::new`].
+    /// [`BuildError`], as [`Controller::new`].
     pub fn new(config: &SimConfig) -> Result<Self, BuildError> {
         let mut robot = Self {
             controller: Controller::new(config)?,
@@ -97,7 +103,7 @@ impl TestController {
             sent: Vec::new(),
             packets: Vec::new(),
             line_time: Duration::from_micros(700),
-            leaving: Vec::new(),
+            sending: Vec::new(),
             shut_down: false,
             next_conn: 1,
         };
@@ -107,61 +113,62 @@ impl TestController {
         Ok(robot)
     }
 
-    /// The controller of a configuration file's text; [`Self::new`] takes one that was read before.
+    /// The same from the text of a configuration file (docs/configuration.md section 5).
     ///
     /// # Errors
-    /// The first mistake in the text, with its place, or what [`Controller::new`] refuses.
+    /// The first mistake in the text, with its line, or a [`BuildError`].
     pub fn from_toml(toml: &str) -> Result<Self, Box<dyn Error + Send + Sync>> {
         let config = parse_controller(Text { name: "controller", toml }, &[])?;
         Ok(Self::new(&config)?)
     }
 
-    /// The present instant.
+    /// The virtual time, in microseconds; [`Self::run`] advances it.
     pub fn now(&self) -> Instant {
         self.now
     }
 
-    /// The controller itself.
+    /// The controller: its registers, states, counters and program log.
     pub fn controller(&self) -> &Controller {
         &self.controller
     }
 
-    /// The controller itself, mutable, to cause faults; the effects begin with the next
+    /// The controller, for faults and operations at the teach pendant. Their effects begin with the next
     /// [`Self::run`].
     pub fn controller_mut(&mut self) -> &mut Controller {
         &mut self.controller
     }
 
-    /// Advances time, deadline by deadline, by a [`std::time::Duration`] or one of proto-core.
+    /// Advances the clock by `span`, a [`std::time::Duration`] or a [`proto_core::time::Duration`], and handles every
+    /// deadline on the way. A span of zero handles what is due now.
     ///
     /// # Panics
-    /// If the controller does nothing at a deadline that it has set.
+    /// If the controller does not handle its deadline, which would be a bug of this crate.
     pub fn run(&mut self, span: impl Into<Duration>) {
         let end = self.now + span.into();
         loop {
             let wake = self.drain();
-            let left = self.leaving.iter().map(|leaving| leaving.0).min().unwrap_or(Instant::NEVER);
-            let next = wake.min(left);
-            assert!(next > self.now || left <= self.now, "a deadline that has come must be served");
+            let sent = self.sending.iter().map(|sending| sending.0).min().unwrap_or(Instant::NEVER);
+            let next = wake.min(sent);
+            assert!(next > self.now || sent <= self.now, "the controller has not handled its deadline");
             if next > end {
                 self.now = end;
                 self.drain();
                 return;
             }
             self.now = next;
-            if let Some(nth) = self.leaving.iter().position(|leaving| leaving.0 <= next) {
-                let (_, port) = self.leaving.remove(nth);
+            if let Some(nth) = self.sending.iter().position(|sending| sending.0 <= next) {
+                let (_, port) = self.sending.remove(nth);
                 self.input(ControllerInput::PortSent { port });
             }
         }
     }
 
-    /// A client on this host connects to one of the servers. If it is refused, its connection is
-    /// closed: [`Self::is_closed`].
+    /// Connects a client to one of the servers, from 127.0.0.1. Returns its connection even if the server refuses
+    /// it: [`Self::is_closed`] is true then.
     pub fn connect(&mut self, link: Link) -> ConnId {
         let conn = self.new_conn();
         self.links.insert(conn, link);
-        let from = NEAR;
+        let from = CLIENT_ADDRESS;
         self.input(match link {
             Link::Command => ControllerInput::CommandOpened { conn, from },
             Link::State => ControllerInput::StateOpened { conn, from },
@@ -170,7 +177,11 @@ impl TestController {
         conn
     }
 
-    /// The client sends bytes, in one piece. Port 2001 takes none.
+    /// Sends bytes from a client, in one piece: commands (proto-core/docs/wire/command.md section 2), or a
+    /// Modbus TCP request (proto-core/docs/wire/modbus.md section 2). Without effect on a closed connection, and on
+    /// port 2001, which reads nothing.
+    ///
+    /// A command ends with a line end, or when nothing follows it (section 5).
     pub fn send(&mut self, conn: ConnId, bytes: &[u8]) {
         match self.links.get(&conn) {
             Some(Link::Command) => self.input(ControllerInput::CommandBytes { conn, bytes }),
@@ -179,7 +190,7 @@ impl TestController {
         }
     }
 
-    /// The client closes its connection.
+    /// Closes a client's connection. Without effect if it is closed already.
     pub fn close(&mut self, conn: ConnId) {
         match self.links.remove(&conn) {
             Some(Link::Command) => self.input(ControllerInput::CommandClosed { conn }),
@@ -189,38 +200,42 @@ impl TestController {
         }
     }
 
-    /// The bytes that the client has received since the last call.
+    /// The bytes that the client has received since the last call; empty if there are none. On port 2001 they are
+    /// packets of 1468 bytes (proto-core/docs/wire/state.md section 2).
     pub fn take(&mut self, conn: ConnId) -> Vec<u8> {
         self.received.remove(&conn).unwrap_or_default()
     }
 
-    /// Whether the controller has closed the connection.
+    /// Whether the controller has closed the connection. `false` if [`Self::close`] did.
     pub fn is_closed(&self, conn: ConnId) -> bool {
         self.closed.contains(&conn)
     }
 
-    /// Bytes arrive at a serial or TCP port, in one piece, or one datagram at a UDP client. Ports
-    /// are numbered in the order of their file.
+    /// Delivers bytes to an RS-485 or TCP client port, in one piece, or one datagram to a UDP client port. `port` is
+    /// its index in the configuration, from 0; without effect if there is no such port.
     pub fn port_bytes(&mut self, port: usize, bytes: &[u8]) {
         self.input(ControllerInput::PortBytes { port, bytes });
     }
 
-    /// A frame arrives at a CAN port.
+    /// Delivers a frame to a CAN port. `port` is its index in the configuration, from 0; without effect if there is
+    /// no such port.
     pub fn port_frame(&mut self, port: usize, frame: CanFrame) {
         self.input(ControllerInput::PortCan { port, frame });
     }
 
-    /// A datagram arrives at the UDP server.
+    /// Delivers a datagram from `peer` to the UDP server (port 2011). The server streams to `peer` from then on
+    /// (docs/simulated-controller.md section 5).
     pub fn datagram(&mut self, peer: SocketAddr, bytes: &[u8]) {
         self.input(ControllerInput::Udp2011 { peer, bytes });
     }
 
-    /// The data that ports have sent since the last call, each with its time and port.
+    /// Everything that ports have sent since the last call, in order: time, port index, data.
     pub fn take_sent(&mut self) -> Vec<(Instant, usize, Out)> {
         std::mem::take(&mut self.sent)
     }
 
-    /// The present value of an item, such as `DO[1]` or `FloatInputReg[3]`.
+    /// The value of a system variable or an input or output, such as `FloatInputReg[3]` or `DO[1]`. A bit is 0.0 or
+    /// 1.0; other units are those of the item (docs/configuration.md section 5).
     ///
     /// # Panics
     /// If there is no such item.
@@ -229,10 +244,10 @@ impl TestController {
         self.controller.registers().value(target(name))
     }
 
-    /// Sets an item from outside, such as an input that is wired.
+    /// Sets a system variable or an input or output, as outside wiring would. Name and unit are as in [`Self::value`].
     ///
     /// # Panics
-    /// If there is no such item, or it does not take the value.
+    /// If there is no such item, or the value is out of its range.
     #[track_caller]
     pub fn set_value(&mut self, name: &str, value: f64) {
         if let Err(error) = self.controller.force(target(name), value) {
@@ -240,7 +255,7 @@ impl TestController {
         }
     }
 
-    /// Whether the controller was shut down, by a command.
+    /// Whether the controller was shut down by the command `shutdown`.
     pub fn is_shut_down(&self) -> bool {
         self.shut_down
     }
@@ -255,7 +270,7 @@ impl TestController {
         self.drain();
     }
 
-    /// Takes all outputs and returns when to call again.
+    /// Carries out all outputs and returns when to call again.
     pub(crate) fn drain(&mut self) -> Instant {
         loop {
             match self.controller.poll_output(self.now) {
@@ -277,12 +292,12 @@ impl TestController {
                 }
                 ControllerOutput::PortSend { port, bytes } => {
                     self.sent.push((self.now, port, Out::Bytes(bytes)));
-                    self.leaving.push((self.now + self.line_time, port));
+                    self.sending.push((self.now + self.line_time, port));
                 }
                 ControllerOutput::PortSendCan { port, frame } => {
                     self.sent.push((self.now, port, Out::Can(frame)));
-                    if !self.leaving.iter().any(|leaving| leaving.1 == port) {
-                        self.leaving.push((self.now + self.line_time, port));
+                    if !self.sending.iter().any(|sending| sending.1 == port) {
+                        self.sending.push((self.now + self.line_time, port));
                     }
                 }
                 ControllerOutput::PortClose { port } => self.sent.push((self.now, port, Out::Closed)),
@@ -300,5 +315,5 @@ fn target(name: &str) -> InitialTarget {
     name.parse().unwrap_or_else(|error| panic!("{error}"))
 }
 
-/// The address of clients.
-pub(crate) const NEAR: IpAddr = IpAddr::V4(Ipv4Addr::LOCALHOST);
+/// The clients' address.
+pub(crate) const CLIENT_ADDRESS: IpAddr = IpAddr::V4(Ipv4Addr::LOCALHOST);

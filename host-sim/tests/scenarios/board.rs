@@ -9,6 +9,7 @@ use std::process::Command;
 use std::time::Duration;
 
 use proto_core::config::{Bus, GatewayConfig};
+use recipe_test_kit::until;
 use serde_json::{Value, json};
 
 use super::environment::{Cable, Gateway, Link, LinkStatus, Plan, PortStatus};
@@ -18,8 +19,8 @@ use super::refusal::Spoil;
 
 /// The host as QEMU's guest sees it.
 const HOST: &str = "10.0.2.2";
-/// The guest, as QEMU's first.
-pub(crate) const ADDRESS: &str = "address 10.0.2.15";
+/// The log's line about the guest's address, which is QEMU's first.
+const ADDRESS: &str = "address 10.0.2.15";
 /// What an unused stack is filled with.
 pub(crate) const PAINT: u8 = 0xC5;
 
@@ -27,30 +28,36 @@ pub(crate) fn listens(bus: &Bus) -> bool {
     matches!(bus, Bus::TcpListen { .. } | Bus::UdpListen { .. })
 }
 
-/// `host-sim image`.
+/// The configuration image, made by `host-sim image`.
 #[track_caller]
-pub(crate) fn make_image(plan: &Plan<'_>, image: &Path) {
+pub(crate) fn make_image(plan: &Plan<'_>) -> PathBuf {
+    let image = plan.case.folder.path().join("gateway.img");
     let mut command = Command::new(env!("CARGO_BIN_EXE_host-sim"));
-    command.arg("image").arg(plan.file()).arg("-o").arg(image);
+    command.arg("image").arg(plan.file()).arg("-o").arg(&image);
     for value in plan.overrides(HOST, &plan.server_ports()) {
         command.arg("--set").arg(value);
     }
     let output = command.output().unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    image
 }
 
 /// The same, with something wrong.
 #[track_caller]
-pub(crate) fn make_spoilt_image(plan: &Plan<'_>, image: &Path, spoil: Spoil) {
-    make_image(plan, image);
-    let mut bytes = std::fs::read(image).unwrap();
+pub(crate) fn make_spoilt_image(plan: &Plan<'_>, spoil: Spoil) -> PathBuf {
+    let image = make_image(plan);
+    let mut bytes = std::fs::read(&image).unwrap();
     match spoil {
         Spoil::Damaged => bytes[40] ^= 1,
         Spoil::Cut => bytes.truncate(bytes.len() - 1),
-        Spoil::Missing => return std::fs::remove_file(image).unwrap(),
+        Spoil::Missing => {
+            std::fs::remove_file(&image).unwrap();
+            return image;
+        }
         Spoil::NoDevice => {}
     }
-    std::fs::write(image, bytes).unwrap();
+    std::fs::write(&image, bytes).unwrap();
+    image
 }
 
 /// How the host reaches a board: sockets in a folder of its own, since those of one that was ended stay
@@ -138,6 +145,32 @@ pub(crate) trait Machine {
 
     /// Writes what is in the memory of the board's stack to a file.
     fn save_stack(&self, to: &Path);
+
+    /// Waits for a whole line of the log with this text, and returns what follows it in the line.
+    #[track_caller]
+    fn until_log(&mut self, text: &str) -> String {
+        until(&format!("{text:?} in the board's log"), || {
+            self.program_mut().must_run();
+            let log = self.log();
+            let mut whole = log.split_inclusive('\n').filter(|line| line.ends_with('\n'));
+            whole.find_map(|line| Some(line.split_once(text)?.1.trim_end().to_owned()))
+        })
+    }
+
+    /// Waits until the firmware runs its configuration, and others can connect to it.
+    #[track_caller]
+    fn until_started(&mut self, config: &GatewayConfig) {
+        self.until_log("configuration: ");
+        if config.ports.iter().any(|port| listens(&port.bus)) {
+            self.until_log(ADDRESS);
+        }
+    }
+
+    /// Waits until the firmware refuses its configuration, and returns the reason.
+    #[track_caller]
+    fn until_refused(&mut self) -> String {
+        self.until_log("nothing runs: ")
+    }
 
     /// What the emulator counts, if it does.
     fn counts(&self) -> Value {

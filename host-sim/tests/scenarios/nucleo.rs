@@ -13,7 +13,7 @@ use recipe_test_kit::until;
 
 use super::board::{self, Machine, Wires};
 use super::case::Case;
-use super::environment::{Cable, Environment, Gateway, Plan, ports};
+use super::environment::{Cable, Environment, Gateway, Plan};
 use super::field::{CanClient, LineClient};
 use super::program::Program;
 use super::refusal::Spoil;
@@ -45,27 +45,20 @@ impl Environment for Nucleo {
 
     #[track_caller]
     fn start(&self, plan: &Plan<'_>) -> Box<dyn Gateway> {
-        let image = plan.case.folder.path().join("gateway.img");
-        board::make_image(plan, &image);
-        let mut chip = Chip::start(self, plan, &image);
-        chip.until_log("configuration: ");
-        // Others can connect from now on.
-        if !ports(&plan.config(), board::listens).is_empty() {
-            chip.until_log(board::ADDRESS);
-        }
+        let mut chip = Chip::start(self, plan, &board::make_image(plan));
+        chip.until_started(&plan.config());
         Box::new(chip)
     }
 
     #[track_caller]
     fn refuses(&self, plan: &Plan<'_>, spoil: Spoil) -> String {
-        let image = plan.case.folder.path().join("gateway.img");
-        board::make_spoilt_image(plan, &image, spoil);
+        let image = board::make_spoilt_image(plan, spoil);
         if spoil == Spoil::Missing {
             // Erased flash.
             std::fs::write(&image, []).unwrap();
         }
         let mut chip = Chip::start(self, plan, &image);
-        let reason = chip.until_log("nothing runs: ");
+        let reason = chip.until_refused();
         for bus in ["a", "b"] {
             let mut line = LineClient::new(Box::new(chip.wires.socket(bus)));
             line.send(b"\xFF\xFF\x01\xEE\xEE");
@@ -111,16 +104,6 @@ impl Chip {
         }
         chip.wires.ask_forwarded(&config, "qmp");
         chip
-    }
-
-    /// Waits for a line with this, and returns what is behind it.
-    #[track_caller]
-    fn until_log(&mut self, text: &str) -> String {
-        until(&format!("{text:?} in the board's log"), || {
-            self.must_run();
-            let lines = self.program.lines();
-            lines.iter().find_map(|line| Some(line.split_once(text)?.1.to_owned()))
-        })
     }
 
     /// Asks the emulator.

@@ -12,7 +12,7 @@ use recipe_test_kit::until;
 
 use super::board::{self, Machine, Wires};
 use super::case::Case;
-use super::environment::{Cable, Environment, Gateway, Plan, ports};
+use super::environment::{Cable, Environment, Gateway, Plan};
 use super::field::LineClient;
 use super::program::Program;
 use super::refusal::Spoil;
@@ -45,28 +45,15 @@ impl Environment for Qemu {
 
     #[track_caller]
     fn start(&self, plan: &Plan<'_>) -> Box<dyn Gateway> {
-        let image = plan.case.folder.path().join("gateway.img");
-        board::make_image(plan, &image);
-        let mut board = Board::start(&self.elf, plan, &image);
-        board.until_log("configuration: ");
-        // Others can connect from now on.
-        if !ports(&plan.config(), board::listens).is_empty() {
-            board.until_log(board::ADDRESS);
-        }
+        let mut board = Board::start(&self.elf, plan, &board::make_image(plan));
+        board.until_started(&plan.config());
         Box::new(board)
     }
 
     #[track_caller]
     fn refuses(&self, plan: &Plan<'_>, spoil: Spoil) -> String {
-        let image = plan.case.folder.path().join("gateway.img");
-        board::make_spoilt_image(plan, &image, spoil);
-        let mut board = Board::start(&self.elf, plan, &image);
-        board.until_log("nothing runs: ");
-        let reason = until("the whole line", || {
-            let log = board.log();
-            let (_, rest) = log.split_once("nothing runs: ")?;
-            Some(rest.split_once('\r')?.0.to_owned())
-        });
+        let mut board = Board::start(&self.elf, plan, &board::make_spoilt_image(plan, spoil));
+        let reason = board.until_refused();
         for uart in UARTS {
             let mut line = LineClient::new(Box::new(board.wires.socket(uart)));
             line.send(b"\xFF\xFF\x01\xEE\xEEO\rt001101\r");
@@ -119,14 +106,6 @@ impl Board {
         });
         board.wires.ask_forwarded(&config, "qmp");
         board
-    }
-
-    #[track_caller]
-    fn until_log(&mut self, text: &str) {
-        until(&format!("{text:?} in the board's log"), || {
-            self.must_run();
-            self.log().contains(text).then_some(())
-        });
     }
 
     /// One command to QEMU; what it returns.

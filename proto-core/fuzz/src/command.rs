@@ -7,7 +7,7 @@ use proto_core::command::{
 use proto_core::time::Instant;
 use proto_core::wire::dialect::Dialect;
 
-use crate::reference_command::{Client, Command, Heard, Server, Told, Turn};
+use crate::reference_command::{Client, Command, Event, Heard, Server, Turn};
 use crate::source::{Source, cut};
 
 /// Bytes of a connection that one input may lead to.
@@ -213,7 +213,7 @@ fn ask(client: &mut CommandClient, expected: &mut Client, now: u64, text: &[u8],
 fn hear(client: &mut CommandClient, expected: &mut Client, now: u64, chunk: &[u8]) {
     let word = |request: &Option<(String, u64)>| request.as_ref().map(|(word, _)| word.clone());
     let mut words = [word(&expected.waiting), word(&expected.beside)];
-    let (mut rest, mut told) = (chunk, Vec::new());
+    let (mut rest, mut events) = (chunk, Vec::new());
     // What silence ends, and a timeout, take no bytes: one a text that was held.
     let mut free = 2 + 320;
     loop {
@@ -223,21 +223,21 @@ fn hear(client: &mut CommandClient, expected: &mut Client, now: u64, chunk: &[u8
             free -= 1;
             assert!(free > 0, "no end of events");
         }
-        told.push(match event {
-            ClientEvent::ScriptFinish => Told::ScriptFinish,
-            ClientEvent::Unsolicited { text } => Told::Unsolicited(text.to_vec()),
-            ClientEvent::Timeout => Told::Timeout,
+        events.push(match event {
+            ClientEvent::ScriptFinish => Event::ScriptFinish,
+            ClientEvent::Unsolicited { text } => Event::Unsolicited(text.to_vec()),
+            ClientEvent::Timeout => Event::Timeout,
             ClientEvent::Reply { beside, kind, reply, text } => {
                 let word = words[usize::from(beside)].as_deref();
                 reply_again(word.expect("only a request is answered"), kind, &reply, text);
                 // What is left is the older one.
                 words = if beside { [words[0].take(), None] } else { [words[1].take(), None] };
-                Told::Reply(if beside { Turn::Beside } else { Turn::InTurn }, text.to_vec())
+                Event::Reply(if beside { Turn::Beside } else { Turn::InTurn }, text.to_vec())
             }
         });
     }
     assert!(rest.is_empty(), "None means that all was taken");
-    assert_eq!(told, expected.receive(now, chunk));
+    assert_eq!(events, expected.receive(now, chunk));
     assert_eq!(client.busy(), expected.waiting.is_some());
     assert_eq!(client.busy_beside(), expected.beside.is_some());
     assert_eq!(client.dropped_bytes(), expected.dropped);

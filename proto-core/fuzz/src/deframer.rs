@@ -7,7 +7,7 @@ use proto_core::sysvar::IMAGE_BYTES;
 use proto_core::wire::scalar::Scalar;
 
 use crate::recipes::Part;
-use crate::reference::{self, Line};
+use crate::reference::{self, PlainDeframer};
 use crate::source::{Source, cut};
 
 /// Bytes of line that one input may lead to.
@@ -21,7 +21,7 @@ pub(crate) fn run(input: &[u8]) {
     let Some(layout) = part.layout() else { return };
     let mut test = Test {
         deframer: Deframer::new(),
-        line: Line::new(&layout),
+        line: PlainDeframer::new(&layout),
         received: 0,
         payloads: 0,
         fields: &part.fields,
@@ -67,7 +67,7 @@ pub(crate) fn run(input: &[u8]) {
 
 struct Test<'a> {
     deframer: Deframer,
-    line: Line,
+    line: PlainDeframer,
     received: u64,
     payloads: usize,
     fields: &'a [Field],

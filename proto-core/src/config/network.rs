@@ -50,7 +50,7 @@ impl From<Option<Network>> for BoardAddress {
 
 impl Network {
     /// Whether an address is in the board's own network.
-    pub fn contains(&self, other: Ipv4Addr) -> bool {
+    fn contains(&self, other: Ipv4Addr) -> bool {
         (self.address.to_bits() ^ other.to_bits()) & self.mask() == 0
     }
 

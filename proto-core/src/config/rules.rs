@@ -7,12 +7,11 @@ use heapless::String;
 
 use super::error::{ConfigError, ConfigErrorKind as Kind, Counted, Place, PortKey};
 use super::listen::ipv6;
+use super::port::MIN_CYCLE;
 use super::{MAX_ADDRESS, MAX_NAME, Name, Rs485, Span};
 use crate::sysvar::{COUNT, SysVar};
 use crate::time::Duration;
 
-/// The shortest cycle, of the controller and of a port.
-pub(crate) const MIN_CYCLE: Duration = Duration::from_millis(4);
 /// The longest cycle, timeout or staleness that a configuration may have.
 pub(crate) const MAX_TIME: Duration = Duration::from_secs(3_600);
 /// The longest idle gap and turnaround of a serial line.

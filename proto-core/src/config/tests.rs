@@ -9,8 +9,10 @@ use std::string::ToString;
 use super::*;
 use crate::command::ParseError;
 use crate::recipe::PartError;
-use crate::sysvar::Direction;
-use crate::wire::scalar::Scalar;
+use crate::recipe::model::Mode;
+use crate::sysvar::{Direction, SysVar};
+use crate::time::Duration;
+use crate::wire::scalar::{Scalar, ScalarType};
 
 fn var(name: &str) -> SysVar {
     SysVar::parse(name).unwrap()

@@ -6,11 +6,7 @@
 use heapless::VecView;
 
 use super::network::Network;
-use super::{
-    CommandEntry, ControllerLink, FieldSpec, InputBinding, OutputBinding, Parts, Port, Recipe, SafeValue,
-    Span,
-};
-use crate::recipe::model::Field;
+use super::{CommandEntry, ControllerLink, FieldSpec, Port, Recipe, SafeValue};
 use crate::sysvar::{Direction, SysVar};
 
 /// A configuration of any size, borrowed; [`GatewayConfig`](super::GatewayConfig) describes the
@@ -119,52 +115,6 @@ impl ConfigMut<'_> {
             fields: self.fields,
             commands: self.commands,
             safe_values: self.safe_values,
-        }
-    }
-}
-
-impl Recipe {
-    /// The field ranges of one part: one for a stream part, one for each CAN frame.
-    pub fn frames(&self, part: Direction) -> impl Iterator<Item = (u8, Span)> + '_ {
-        let (stream, can) = match (&self.parts, part) {
-            (Parts::Stream { input, .. }, Direction::Input) => (input.as_ref(), None),
-            (Parts::Stream { output, .. }, Direction::Output) => (output.as_ref(), None),
-            (Parts::Can { input, .. }, Direction::Input) => (None, Some(input)),
-            (Parts::Can { output, .. }, Direction::Output) => (None, Some(output)),
-        };
-        let can = can.into_iter().flatten().map(|frame| frame.fields);
-        (0..).zip(stream.map(|part| part.fields).into_iter().chain(can))
-    }
-
-    /// Whether the recipe has this part.
-    pub fn has(&self, part: Direction) -> bool {
-        self.frames(part).next().is_some()
-    }
-}
-
-impl FieldSpec {
-    /// The field as the controller's recipes have it; `None` if only frames of devices have it.
-    pub fn field(&self) -> Option<Field> {
-        match *self {
-            Self::System(var) => Some(Field::System(var)),
-            Self::UserInput { ty, .. } | Self::UserOutput { ty, .. } => Some(Field::User(ty)),
-            _ => None,
-        }
-    }
-
-    /// The system variable that the field is, or that it is bound to.
-    pub fn variable(&self) -> Option<SysVar> {
-        match *self {
-            Self::System(var) => Some(var),
-            Self::UserInput { to, .. } | Self::DeviceInput { to, .. } => match to {
-                InputBinding::Variable { var, .. } => Some(var),
-                InputBinding::Unused | InputBinding::Commands { .. } => None,
-            },
-            Self::UserOutput { from, .. } | Self::DeviceOutput { from, .. } => match from {
-                OutputBinding::Variable { var, .. } => Some(var),
-                OutputBinding::Constant(_) | OutputBinding::Counter | OutputBinding::Reply => None,
-            },
-            Self::Fixed { .. } | Self::Padding { .. } | Self::Checksum(_) => None,
         }
     }
 }

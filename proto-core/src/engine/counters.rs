@@ -118,10 +118,10 @@ impl LinkCounters {
     };
 
     /// Counts an answer that came `micros` after its request.
-    pub(super) fn answered(&mut self, micros: u64) {
+    pub(super) fn answered(&mut self, micros: u32) {
         bump(&mut self.received);
-        self.round_trip_us = u32::try_from(micros).unwrap_or(u32::MAX);
-        self.round_trip_max_us = self.round_trip_max_us.max(self.round_trip_us);
+        self.round_trip_us = micros;
+        self.round_trip_max_us = self.round_trip_max_us.max(micros);
     }
 }
 

@@ -203,9 +203,10 @@ impl FieldPort {
         bindings: &[InputBind],
         store: &mut Store<PORTS>,
         commands: Option<&mut CommandLink>,
-    ) -> Result<Accepted, Rejection> {
+        accepted: &mut Accepted,
+    ) -> Result<(), Rejection> {
         let (now, usable) = (store.now, self.is_usable());
-        let Codec::Device(device) = &self.codec else { return Ok(Accepted::default()) };
+        let Codec::Device(device) = &self.codec else { return Ok(()) };
         let mut frames = Frames {
             mode: self.mode,
             bindings,
@@ -223,8 +224,7 @@ impl FieldPort {
         }
         let formats = (0..).zip(device.input());
         let Some((nth, format)) = formats.into_iter().find(|(_, format)| format.id == frame.id()) else {
-            frames.rejected(Rejection::ForeignId)?;
-            return Ok(Accepted::default());
+            return frames.rejected(Rejection::ForeignId);
         };
         match probe(format, bindings, frame.data()) {
             Probe::Frame(len) if len == frame.data().len() => {}
@@ -235,10 +235,9 @@ impl FieldPort {
             _ => frames.rejected(Rejection::WrongLength)?,
         }
         let slot = usize::from(self.first_frame).saturating_add(nth);
-        let mut accepted = Accepted::default();
-        frames.take_device(format, frame.data(), slot, &mut accepted)?;
+        frames.take_device(format, frame.data(), slot, accepted)?;
         self.sender.frames_accepted(1, usable, &mut self.counters, now);
-        Ok(accepted)
+        Ok(())
     }
 
     /// The frame of the device that is due.

@@ -229,16 +229,11 @@ impl FieldPort {
         };
         let mut left = bytes;
         while let Some(payload) = deframer.next_frame(layout, &mut left) {
-            let taken = frames.take(layout, payload, usize::from(self.first_frame));
-            let verdict = taken.map(|_| ());
+            let verdict = frames.take(layout, payload, usize::from(self.first_frame), &mut accepted);
             tap.record(|| came(self.id, now, verdict, None, [layout.head(), payload, layout.tail()]));
-            match taken {
-                Ok(set) => {
-                    accepted = Accepted { frames: accepted.frames.wrapping_add(1), set };
-                    if frames.store.watches_bits {
-                        break;
-                    }
-                }
+            match verdict {
+                Ok(()) if frames.store.watches_bits => break,
+                Ok(()) => {}
                 Err(why) => keep(&mut self.last_rejection, why, None, payload, now),
             }
         }
@@ -264,20 +259,16 @@ impl FieldPort {
         tap: &mut Tap<TAP>,
     ) -> Accepted {
         let now = store.now;
-        match self.take_can(frame, bindings, store, commands) {
-            Ok(accepted) => {
-                tap.record(|| came(self.id, now, Ok(()), Some(frame.id()), [frame.data(), &[], &[]]));
-                accepted
-            }
-            Err(why) => {
-                tap.record(|| came(self.id, now, Err(why), Some(frame.id()), [frame.data(), &[], &[]]));
-                // On a shared bus, frames for others are no news.
-                if why != Rejection::ForeignId || self.last_rejection.is_none() {
-                    keep(&mut self.last_rejection, why, Some(frame.id()), frame.data(), now);
-                }
-                Accepted::default()
-            }
+        let mut accepted = Accepted::default();
+        let verdict = self.take_can(frame, bindings, store, commands, &mut accepted);
+        tap.record(|| came(self.id, now, verdict, Some(frame.id()), [frame.data(), &[], &[]]));
+        // On a shared bus, frames for others are no news.
+        if let Err(why) = verdict
+            && (why != Rejection::ForeignId || self.last_rejection.is_none())
+        {
+            keep(&mut self.last_rejection, why, Some(frame.id()), frame.data(), now);
         }
+        accepted
     }
 
     #[inline(always)]
@@ -287,21 +278,21 @@ impl FieldPort {
         bindings: &[InputBind],
         store: &mut Store<PORTS>,
         commands: Option<&mut CommandLink>,
-    ) -> Result<Accepted, Rejection> {
+        accepted: &mut Accepted,
+    ) -> Result<(), Rejection> {
         let now = store.now;
         add(&mut self.counters.bytes_in, frame.data().len());
         let usable = self.is_usable();
         let Codec::Can { input, .. } = &self.codec else {
-            return self.device_can(frame, bindings, store, commands);
+            return self.device_can(frame, bindings, store, commands, accepted);
         };
         let Some(layout) = input else {
             bump(&mut self.counters.rejected_no_input);
             return Err(Rejection::NoInput);
         };
-        let accepted = layout.accept(frame);
-        let (Ok(index), Some(frame_layout)) = (accepted, accepted.ok().and_then(|nth| layout.frame(nth)))
-        else {
-            let (counter, why) = match accepted {
+        let index = layout.accept(frame);
+        let (Ok(index), Some(frame_layout)) = (index, index.ok().and_then(|nth| layout.frame(nth))) else {
+            let (counter, why) = match index {
                 Err(CanReject::Remote { .. }) => (&mut self.counters.rejected_remote, Rejection::Remote),
                 Err(CanReject::WrongLength { .. }) => {
                     (&mut self.counters.rejected_length, Rejection::WrongLength)
@@ -321,9 +312,9 @@ impl FieldPort {
             commands,
         };
         let slot = usize::from(self.first_frame).saturating_add(index);
-        let set = frames.take(&frame_layout, frame.data(), slot)?;
+        frames.take(&frame_layout, frame.data(), slot, accepted)?;
         self.sender.frames_accepted(1, usable, &mut self.counters, now);
-        Ok(Accepted { frames: 1, set })
+        Ok(())
     }
 
     /// One of the port's commands has its result.
@@ -460,14 +451,15 @@ pub(super) struct Frames<'a, const PORTS: usize> {
 }
 
 impl<const PORTS: usize> Frames<'_, PORTS> {
-    /// Applies a frame as a whole or not at all. Returns its variables whose link is up, or why it
-    /// was rejected.
+    /// Applies a frame as a whole or not at all, and counts it in `accepted`.
+    // A result with the set in it would be copied byte by byte: its tag is one byte.
     fn take(
         &mut self,
         layout: &impl InputLayout,
         payload: &[u8],
         slot: usize,
-    ) -> Result<InputSet, Rejection> {
+        accepted: &mut Accepted,
+    ) -> Result<(), Rejection> {
         match self.mode {
             Mode::Realtime => match layout.apply(payload, self.store.image.bytes_mut()) {
                 Ok(applied) => {
@@ -500,7 +492,9 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
             }
         }
         bump(&mut self.counters.frames_in);
-        Ok(self.store.accepted(slot, self.counters))
+        accepted.frames = accepted.frames.wrapping_add(1);
+        accepted.set = self.store.accepted(slot, self.counters);
+        Ok(())
     }
 
     pub(super) fn apply_user(&mut self, binding: &InputTo, value: Scalar) {

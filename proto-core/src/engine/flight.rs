@@ -4,7 +4,8 @@
 
 use heapless::Deque;
 
-use crate::time::{Duration, Instant};
+use super::latency::Since;
+use crate::time::Instant;
 
 /// Transmissions in order, at most `N` of them unacknowledged.
 #[derive(Debug, Clone)]
@@ -20,9 +21,8 @@ struct Transmission {
     end: u32,
     /// The end of the time in which it may be delivered.
     until: Instant,
-    /// The low half of the time, in microseconds, at which its first value was received; 0 if that
-    /// is not measured.
-    born: u32,
+    /// Since when its oldest value had waited.
+    born: Since,
 }
 
 impl<const N: usize> Flight<N> {
@@ -38,15 +38,15 @@ impl<const N: usize> Flight<N> {
 
     /// `len` bytes were handed over, to be delivered before `until`, which is not earlier than that
     /// of the previous transmission. The caller has checked [`Self::is_full`].
-    pub(super) fn sent(&mut self, len: usize, until: Instant, born: Instant) {
+    pub(super) fn sent(&mut self, len: usize, until: Instant, born: Since) {
         self.total = self.total.wrapping_add(len as u32);
-        let _ = self.transmissions.push_back(Transmission { end: self.total, until, born: low(born) });
+        let _ = self.transmissions.push_back(Transmission { end: self.total, until, born });
     }
 
     /// This many of the bytes handed over are not acknowledged; a number larger than all of them is
-    /// ignored. `arrived` gets, for each transmission that is acknowledged, the time since its
-    /// first value was received.
-    pub(super) fn acked(&mut self, left: u32, now: Instant, mut arrived: impl FnMut(Duration)) {
+    /// ignored. `arrived` gets, for each transmission that is acknowledged, since when its oldest
+    /// value had waited.
+    pub(super) fn acked(&mut self, left: u32, mut arrived: impl FnMut(Since)) {
         if left > i32::MAX as u32 {
             return;
         }
@@ -54,9 +54,7 @@ impl<const N: usize> Flight<N> {
         while let Some(first) = self.transmissions.front()
             && acked.wrapping_sub(first.end) as i32 >= 0
         {
-            if first.born != 0 {
-                arrived(Duration::from_micros(u64::from(low(now).wrapping_sub(first.born))));
-            }
+            arrived(first.born);
             self.transmissions.pop_front();
         }
     }
@@ -82,11 +80,6 @@ impl<const N: usize> Flight<N> {
     }
 }
 
-/// The measured times are shorter than the hour after which the low half wraps.
-fn low(at: Instant) -> u32 {
-    if at == Instant::NEVER { 0 } else { at.as_micros() as u32 }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -98,14 +91,14 @@ mod tests {
         let mut flight = Flight::<3>::new();
         assert!(flight.is_empty() && flight.deadline() == Instant::NEVER);
         for (len, until) in [(10, 1), (20, 2), (30, 3)] {
-            flight.sent(len, MS(until), Instant::NEVER);
+            flight.sent(len, MS(until), Since::NONE);
         }
         assert!(flight.is_full());
-        flight.acked(55, MS(0), |_| ());
+        flight.acked(55, |_| ());
         assert_eq!(flight.deadline(), MS(1), "half a transmission is none");
-        flight.acked(49, MS(0), |_| ());
+        flight.acked(49, |_| ());
         assert_eq!(flight.deadline(), MS(2));
-        flight.acked(0, MS(0), |_| ());
+        flight.acked(0, |_| ());
         assert!(flight.is_empty());
     }
 
@@ -113,15 +106,15 @@ mod tests {
     fn the_count_of_bytes_may_wrap() {
         let mut flight = Flight::<2>::new();
         for _ in 0..70_000 {
-            flight.sent(65_536, MS(5), Instant::NEVER);
-            flight.acked(0, MS(0), |_| ());
+            flight.sent(65_536, MS(5), Since::NONE);
+            flight.acked(0, |_| ());
         }
-        flight.sent(100, MS(7), MS(6));
-        flight.acked(100, MS(0), |_| ());
+        flight.sent(100, MS(7), Since::at(MS(6)));
+        flight.acked(100, |_| ());
         assert_eq!(flight.deadline(), MS(7));
         let mut took = None;
-        flight.acked(0, MS(9), |time| took = Some(time));
-        assert_eq!(took, Some(Duration::from_millis(3)));
+        flight.acked(0, |born| took = Some(born.micros_until(MS(9))));
+        assert_eq!(took, Some(3_000));
         assert!(flight.is_empty());
     }
 }

@@ -1,6 +1,52 @@
 //! The latencies of a gateway since the start.
 
 use crate::histogram::Histogram;
+use crate::time::{Duration, Instant};
+
+/// Since when something waits: the low half of the instant in microseconds, and 0 if nothing waits
+/// or that is not measured. Waits are shorter than the 71 minutes after which it wraps.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Since(u32);
+
+impl Since {
+    /// Nothing waits.
+    pub(super) const NONE: Self = Self(0);
+
+    pub(super) const fn at(at: Instant) -> Self {
+        Self(at.as_micros() as u32)
+    }
+
+    /// Whether something waits.
+    pub(super) fn is_some(self) -> bool {
+        self != Self::NONE
+    }
+
+    #[must_use]
+    pub(super) const fn earlier_by(self, span: Duration) -> Self {
+        Self(self.0.wrapping_sub(span.as_micros() as u32))
+    }
+
+    /// Something else waits from now on; what waits already is older.
+    #[inline]
+    pub(super) fn or_at(&mut self, now: Instant) {
+        if !self.is_some() {
+            *self = Self::at(now);
+        }
+    }
+
+    /// The time until `now` in microseconds.
+    pub(super) fn micros_until(self, now: Instant) -> u32 {
+        Self::at(now).0.wrapping_sub(self.0)
+    }
+
+    /// The wait is over: records it, if there was one.
+    #[inline]
+    pub(super) fn record(self, now: Instant, histogram: &mut Histogram) {
+        if self.is_some() {
+            histogram.record_micros(self.micros_until(now));
+        }
+    }
+}
 
 /// Latencies as the engine sees them: from the call that reported something to the call that handed
 /// something over. The driver's own times before and after are not included.

@@ -173,23 +173,15 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         match input {
             Input::PortBytes { port, bytes } => self.port_bytes(port, bytes, now),
             Input::PortCan { port, frame } => self.port_can(port, &frame, now),
-            Input::PortSent { port } => self.change_port(port, |port| port.sender.sent()),
-            Input::PortUp { port } => self.change_port(port, FieldPort::up),
+            Input::PortSent { port } => self.port_sent(port),
+            Input::PortUp { port } => self.port_up(port),
             Input::PortDown { port } => self.port_down(port, now),
             Input::PortBus { port, state } => self.port_bus(port, state, now),
             Input::LinkUp { link } => self.link_up(link),
             Input::LinkDown { link } => self.link_down(link),
             Input::LinkBytes { link, bytes } => self.link_bytes(link, bytes, now),
-            Input::LinkSent { link } => {
-                let deadline = self.links.sent(link);
-                self.ask.links = true;
-                self.arm(deadline);
-            }
-            Input::LinkAcked { link, left } => {
-                self.links.acked(link, left, &mut self.store);
-                self.ask.links = true;
-                self.arm(self.links.deadline_of(link));
-            }
+            Input::LinkSent { link } => self.link_sent(link),
+            Input::LinkAcked { link, left } => self.link_acked(link, left),
             Input::Tick => self.tick(now),
         }
     }
@@ -319,10 +311,24 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             return port.discard(frame.data(), Some(frame.id()), &mut self.tap, now);
         }
         let accepted = port.can(frame, &self.bindings.inputs, store, command, &mut self.tap);
+        if accepted.frames == 0 {
+            // Most are for other nodes of the bus.
+            return;
+        }
         self.ask.ports |= port.sender.is_due();
         let deadline = port.deadline();
         self.arm(deadline);
         self.after_field(id, &accepted, now);
+    }
+
+    #[inline(never)]
+    fn port_sent(&mut self, id: PortId) {
+        self.change_port(id, |port| port.sender.sent());
+    }
+
+    #[cold]
+    fn port_up(&mut self, id: PortId) {
+        self.change_port(id, FieldPort::up);
     }
 
     #[cold]
@@ -354,6 +360,20 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         self.links.down(link, &mut self.store);
         self.carry_results();
         self.arm_link(link);
+    }
+
+    #[inline(never)]
+    fn link_sent(&mut self, link: LinkId) {
+        let deadline = self.links.sent(link);
+        self.ask.links = true;
+        self.arm(deadline);
+    }
+
+    #[inline(never)]
+    fn link_acked(&mut self, link: LinkId, left: u32) {
+        self.links.acked(link, left, &mut self.store);
+        self.ask.links = true;
+        self.arm(self.links.deadline_of(link));
     }
 
     #[inline(never)]
@@ -582,11 +602,12 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             return;
         }
         self.ask.links = true;
-        let deadline = self.store.deadline();
+        let mut deadline = self.store.deadline();
         if deadline <= now {
             self.expire_waiting();
+            deadline = self.store.deadline();
         }
-        self.arm(self.store.deadline());
+        self.arm(deadline);
         if let Some(command) = self.links.command.first_mut() {
             command.drop_overtaken();
             let deadline = command.deadline();
@@ -599,14 +620,14 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         let mut waits = false;
         for link in &mut self.links.recipes {
             if !dirty.and(&link.writes).is_empty() {
-                link.offered_at = link.offered_at.min(now);
+                link.offered.or_at(now);
                 waits = waits || link.supervisor.is_up() && !link.is_ready(&self.store, state);
             }
         }
         if let Some(link) = self.links.modbus.first_mut()
             && !dirty.and(&link.writes).is_empty()
         {
-            link.offered_at = link.offered_at.min(now);
+            link.offered.or_at(now);
         }
         if waits && let Some(port) = find_port(&mut self.ports, port) {
             add(&mut port.counters.withheld, accepted.frames as usize);
@@ -635,10 +656,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             if port.may_send(now)
                 && let Some(downward) = port.next_output(image, bindings, out, now)
             {
-                let due_at = port.sender.take_due_at();
-                if due_at <= now {
-                    self.store.latency.lateness.record(now.saturating_since(due_at));
-                }
+                port.sender.take_due_since().record(now, &mut self.store.latency.lateness);
                 return Some((port.id, downward));
             }
         }

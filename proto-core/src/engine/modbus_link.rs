@@ -8,6 +8,7 @@ use super::connection::Connection;
 use super::counters::{LinkCounters, bump};
 use super::flight::Flight;
 use super::io::Transport;
+use super::latency::Since;
 use super::store::Store;
 use crate::image::{GroupId, InputSet};
 use crate::link::{LinkTimings, Supervisor};
@@ -50,16 +51,21 @@ struct Block {
 
 #[derive(Debug, Clone, Copy)]
 enum Asked {
-    Write { safe: InputSet },
-    Poll { block: usize },
+    Write {
+        safe: InputSet,
+        /// Since when the oldest value has waited.
+        born: Since,
+    },
+    Poll {
+        block: usize,
+    },
 }
 
 #[derive(Debug, Clone, Copy)]
 struct InFlight {
     asked: Asked,
-    since: Instant,
-    /// Since when the oldest value of a write has waited.
-    born: Instant,
+    /// When it is given up.
+    until: Instant,
 }
 
 /// What goes first when both a write and a poll are due.
@@ -80,9 +86,8 @@ pub(super) struct ModbusLink {
     polled: Vec<SysVar, MAX_POLLED>,
     blocks: Vec<Block, MAX_POLL_BLOCKS>,
     in_flight: Option<InFlight>,
-    /// Since when a value from a field frame has waited to be handed over; [`Instant::NEVER`] if
-    /// none waits.
-    pub offered_at: Instant,
+    /// Since when a value from a field frame has waited to be handed over.
+    pub offered: Since,
     /// The transport has not taken the newest request yet.
     unsent: bool,
     flight: Flight<2>,
@@ -106,7 +111,7 @@ impl ModbusLink {
             polled: Vec::new(),
             blocks: Vec::new(),
             in_flight: None,
-            offered_at: Instant::NEVER,
+            offered: Since::NONE,
             unsent: false,
             flight: Flight::new(),
             timeouts_in_a_row: 0,
@@ -167,13 +172,12 @@ impl ModbusLink {
         let poll = self.due_block(now);
         let pending = store.outbox.dirty().and(&self.writes);
         if pending.is_empty() {
-            self.offered_at = Instant::NEVER;
+            self.offered = Since::NONE;
         }
-        let mut born = Instant::NEVER;
         let asked = match (pending.is_empty(), poll) {
             (true, None) => return None,
-            (false, Some(_)) if self.first == First::Write => self.write(&pending, store, out, &mut born),
-            (false, None) => self.write(&pending, store, out, &mut born),
+            (false, Some(_)) if self.first == First::Write => self.write(&pending, store, out),
+            (false, None) => self.write(&pending, store, out),
             (_, Some(block)) => self.poll(block, out, now),
         };
         let (len, asked) = asked?;
@@ -182,22 +186,36 @@ impl ModbusLink {
             Asked::Poll { .. } => First::Write,
         };
         bump(&mut self.counters.sent);
-        self.in_flight = Some(InFlight { asked, since: now, born });
+        let until = now + ANSWER_TIMEOUT;
+        self.in_flight = Some(InFlight { asked, until });
         self.unsent = true;
-        self.flight.sent(len, now + ANSWER_TIMEOUT, Instant::NEVER);
+        self.flight.sent(len, until, Since::NONE);
         Some(len)
     }
 
     fn answer_deadline(&self) -> Instant {
-        self.in_flight.map_or(Instant::NEVER, |asked| asked.since + ANSWER_TIMEOUT)
+        self.in_flight.map_or(Instant::NEVER, |asked| asked.until)
     }
 
     /// Gives up the transaction in flight. It is not known whether a write was carried out; only
     /// safe values are written again.
     fn abort<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
         self.client.abort();
-        if let Some(InFlight { asked: Asked::Write { safe }, .. }) = self.in_flight.take() {
+        if let Some(InFlight { asked: Asked::Write { safe, .. }, .. }) = self.in_flight.take() {
             store.again(&safe);
+        }
+    }
+
+    /// The controller has refused a request.
+    #[cold]
+    #[inline(never)]
+    fn refused(&mut self, asked: &Asked, now: Instant) {
+        bump(&mut self.counters.refused);
+        if let Asked::Write { safe, .. } = asked
+            && !safe.is_empty()
+        {
+            self.refused = self.refused.or(safe);
+            self.ask_again_at = self.ask_again_at.min(now + REFUSED_PAUSE);
         }
     }
 
@@ -232,7 +250,6 @@ impl ModbusLink {
         pending: &InputSet,
         store: &mut Store<PORTS>,
         out: &mut [u8],
-        born: &mut Instant,
     ) -> Option<(usize, Asked)> {
         let first = pending.iter().find(|var| var.ordinal() >= self.cursor).or(pending.iter().next())?;
         let (address, kind) = place_of(first)?;
@@ -265,14 +282,14 @@ impl ModbusLink {
             }
         };
         let len = self.client.start(request, out).ok()?;
-        *born = self.offered_at;
-        store.handed_over(*born);
+        let born = self.offered;
+        born.record(store.now, &mut store.latency.handed_over);
         let safe = store.safe.and(&vars);
         store.taken(&vars);
         if pending.minus(&vars).is_empty() {
-            self.offered_at = Instant::NEVER;
+            self.offered = Since::NONE;
         }
-        Some((len, Asked::Write { safe }))
+        Some((len, Asked::Write { safe, born }))
     }
 }
 
@@ -285,6 +302,7 @@ impl Connection for ModbusLink {
 
     fn lost<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
         self.abort(store);
+        self.offered = Since::NONE;
         self.unsent = false;
         self.flight.clear();
         self.write_refused_again(store);
@@ -297,46 +315,36 @@ impl Connection for ModbusLink {
         let now = store.now;
         let mut rest = bytes;
         while let Some(event) = self.client.receive(&mut rest) {
-            let answered = self.in_flight.take();
-            match (event, answered) {
-                (ClientEvent::Violation(_), answered) => {
+            let response = match event {
+                ClientEvent::Response(response) => Some(response),
+                ClientEvent::Exception(_) => None,
+                ClientEvent::Violation(_) => {
                     bump(&mut self.counters.malformed);
-                    self.in_flight = answered;
                     self.supervisor.give_up(now);
                     self.lost(store);
                     return &[];
                 }
-                (_, None) => bump(&mut self.counters.malformed),
-                (ClientEvent::Exception(_), Some(asked)) => {
-                    self.flight.answered();
-                    bump(&mut self.counters.refused);
-                    if let Asked::Write { safe } = asked.asked
-                        && !safe.is_empty()
-                    {
-                        self.refused = self.refused.or(&safe);
-                        self.ask_again_at = self.ask_again_at.min(now + REFUSED_PAUSE);
-                    }
-                    self.counters.answered(now.saturating_since(asked.since).as_micros());
-                    store.latency.modbus.record(now.saturating_since(asked.since));
-                    self.timeouts_in_a_row = 0;
+            };
+            let Some(InFlight { asked, until }) = self.in_flight.take() else {
+                bump(&mut self.counters.malformed);
+                continue;
+            };
+            let micros = Since::at(until).earlier_by(ANSWER_TIMEOUT).micros_until(now);
+            self.counters.answered(micros);
+            store.latency.modbus.record_micros(micros);
+            self.timeouts_in_a_row = 0;
+            self.flight.answered();
+            match (asked, response) {
+                (Asked::Write { safe, born }, Some(_)) => {
+                    born.record(now, &mut store.latency.arrived);
+                    store.confirm(&safe);
                 }
-                (ClientEvent::Response(response), Some(asked)) => {
-                    self.counters.answered(now.saturating_since(asked.since).as_micros());
-                    store.latency.modbus.record(now.saturating_since(asked.since));
-                    self.timeouts_in_a_row = 0;
-                    self.flight.answered();
-                    match asked.asked {
-                        Asked::Write { safe } => {
-                            store.arrived(asked.born);
-                            store.confirm(&safe);
-                        }
-                        Asked::Poll { block } => {
-                            if let Some(block) = self.blocks.get(block) {
-                                take_poll(block, &self.polled, response, store);
-                            }
-                        }
+                (Asked::Poll { block }, Some(response)) => {
+                    if let Some(block) = self.blocks.get(block) {
+                        take_poll(block, &self.polled, response, store);
                     }
                 }
+                (asked, None) => self.refused(&asked, now),
             }
         }
         &[]
@@ -347,7 +355,7 @@ impl Connection for ModbusLink {
     }
 
     fn acked<const PORTS: usize>(&mut self, left: u32, _store: &mut Store<PORTS>) {
-        self.flight.acked(left, Instant::ZERO, |_| ());
+        self.flight.acked(left, |_| ());
     }
 
     fn advance<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {

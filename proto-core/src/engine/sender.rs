@@ -3,6 +3,7 @@
 //! The cycle keeps its phase and never bursts; cycles that could not be served are counted.
 
 use super::counters::{PortCounters, add, bump};
+use super::latency::Since;
 use crate::config::{OnStale, SendOn};
 use crate::image::{GroupId, Image, MAX_GROUPS, VarSet};
 use crate::schedule::Grid;
@@ -42,8 +43,8 @@ pub(super) struct Sender {
     /// The variables: all must be readable.
     pub shown: VarSet,
     due: bool,
-    /// When the due frame became due; [`Instant::NEVER`] after that was taken.
-    due_at: Instant,
+    /// Since when the frame has been due, until that is taken.
+    due_since: Since,
     in_flight: bool,
     /// The next CAN frame of a cycle that is being handed over.
     pub next_can: usize,
@@ -70,7 +71,7 @@ impl Sender {
             sources: GroupSet::default(),
             shown: VarSet::EMPTY,
             due: false,
-            due_at: Instant::NEVER,
+            due_since: Since::NONE,
             in_flight: false,
             next_can: 0,
             digest: None,
@@ -109,9 +110,9 @@ impl Sender {
         self.in_flight = false;
     }
 
-    /// When the frame, or the first CAN frame of the cycle, became due; returned once.
-    pub(super) fn take_due_at(&mut self) -> Instant {
-        core::mem::replace(&mut self.due_at, Instant::NEVER)
+    /// Since when the frame, or the first CAN frame of the cycle, has been due; returned once.
+    pub(super) fn take_due_since(&mut self) -> Since {
+        core::mem::replace(&mut self.due_since, Since::NONE)
     }
 
     /// The frame, or the last CAN frame of the cycle, was handed over.
@@ -134,11 +135,11 @@ impl Sender {
         if !usable {
             return;
         }
-        let due_at = grid.next() - grid.period();
+        let due_since = Since::at(grid.next()).earlier_by(grid.period());
         if self.frames_sent > 0 {
             add(&mut counters.skipped_cycles, usize::try_from(missed).unwrap_or(usize::MAX));
         }
-        self.raise(counters, due_at);
+        self.raise(counters, due_since);
     }
 
     /// This many input frames were accepted at once: the newest is answered.
@@ -151,7 +152,7 @@ impl Sender {
     ) {
         if self.on == SendOn::Frame && usable && count > 0 {
             counters.skipped_cycles = counters.skipped_cycles.wrapping_add(count.wrapping_sub(1));
-            self.raise(counters, now);
+            self.raise(counters, Since::at(now));
         }
     }
 
@@ -169,7 +170,7 @@ impl Sender {
         }
         let on = bit_of(image, var, bit);
         if on && self.last_bit == Some(false) && usable {
-            self.raise(counters, now);
+            self.raise(counters, Since::at(now));
         }
         self.last_bit = Some(on);
     }
@@ -200,13 +201,13 @@ impl Sender {
         if self.is_due() { cycle.min(quiet_at) } else { cycle }
     }
 
-    fn raise(&mut self, counters: &mut PortCounters, at: Instant) {
+    fn raise(&mut self, counters: &mut PortCounters, since: Since) {
         if self.due {
             // This frame replaces the one that was due.
             bump(&mut counters.skipped_cycles);
         }
         self.due = true;
-        self.due_at = at;
+        self.due_since = since;
     }
 }
 

@@ -4,6 +4,7 @@
 use super::counters::{LinkCounters, add, bump};
 use super::flight::Flight;
 use super::io::ReplyCode;
+use super::latency::Since;
 use super::stops::Waiting;
 use crate::command::{ClientEvent, CommandClient, Keyword, ReplyKind, StartError};
 use crate::link::{LinkTimings, Supervisor};
@@ -91,7 +92,7 @@ impl Session {
         };
         bump(&mut self.counters.sent);
         self.unsent = true;
-        self.flight.sent(len, until, Instant::NEVER);
+        self.flight.sent(len, until, Since::NONE);
         Ok(len)
     }
 
@@ -102,7 +103,7 @@ impl Session {
 
     /// The peer's transport has acknowledged all but `left` bytes.
     pub(super) fn acked(&mut self, left: u32) {
-        self.flight.acked(left, Instant::ZERO, |_| ());
+        self.flight.acked(left, |_| ());
     }
 
     /// Bytes arrived.
@@ -166,7 +167,8 @@ impl Session {
             self.flight.answered();
         }
         let Some(sent) = sent else { return Some(Event::Other) };
-        self.counters.answered(now.saturating_since(sent.at).as_micros());
+        let micros = now.saturating_since(sent.at).as_micros();
+        self.counters.answered(u32::try_from(micros).unwrap_or(u32::MAX));
         if code == ReplyCode::Fail {
             bump(&mut self.counters.refused);
         }

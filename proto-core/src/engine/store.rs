@@ -220,20 +220,6 @@ impl<const PORTS: usize> Store<PORTS> {
         self.next_overdue.get().min(self.next_expiry.get())
     }
 
-    /// A value that has waited since `born` has been handed over.
-    pub(super) fn handed_over(&mut self, born: Instant) {
-        if born <= self.now {
-            self.latency.handed_over.record(self.now.saturating_since(born));
-        }
-    }
-
-    /// A value that has waited since `born` has arrived.
-    pub(super) fn arrived(&mut self, born: Instant) {
-        if born <= self.now {
-            self.latency.arrived.record(self.now.saturating_since(born));
-        }
-    }
-
     /// These values have been handed over to their link.
     pub(super) fn taken(&mut self, vars: &InputSet) {
         self.outbox.taken(vars);

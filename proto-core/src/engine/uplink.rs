@@ -7,6 +7,7 @@ use super::connection::Connection;
 use super::counters::{LinkCounters, add, bump};
 use super::flight::Flight;
 use super::io::{LinkId, LinkKind, Transport};
+use super::latency::Since;
 use super::store::{Store, is_gap};
 use crate::config::Name;
 use crate::image::{GroupId, Image, InputSet};
@@ -54,9 +55,8 @@ pub(super) struct Uplink {
     pub group: Option<GroupId>,
     /// Of the variables written here, those for which something shows the controller's value.
     pub shown: InputSet,
-    /// Since when a value from a field frame has waited to be handed over; [`Instant::NEVER`] if
-    /// none waits.
-    pub offered_at: Instant,
+    /// Since when a value from a field frame has waited to be handed over.
+    pub offered: Since,
     /// The time in which a frame must be acknowledged.
     patience: Duration,
     busy: bool,
@@ -110,7 +110,7 @@ impl Uplink {
             writes,
             group,
             shown: InputSet::EMPTY,
-            offered_at: Instant::NEVER,
+            offered: Since::NONE,
             patience,
             busy: false,
             flight: Flight::new(),
@@ -133,7 +133,7 @@ impl Uplink {
         }
         let wanted = !store.outbox.dirty().and(&self.writes).is_empty();
         if !wanted {
-            self.offered_at = Instant::NEVER;
+            self.offered = Since::NONE;
             if store.now < self.speaks_at() {
                 return None;
             }
@@ -150,12 +150,12 @@ impl Uplink {
         state: Option<GroupId>,
         out: &mut [u8],
     ) -> Option<usize> {
-        let (now, mut born) = (store.now, Instant::NEVER);
+        let (now, mut born) = (store.now, Since::NONE);
         let len = match &self.input {
             Some(layout) if wanted && self.is_ready(store, state) => {
                 let len = encode(layout, store, out)?;
-                born = core::mem::replace(&mut self.offered_at, Instant::NEVER);
-                store.handed_over(born);
+                born = core::mem::replace(&mut self.offered, Since::NONE);
+                born.record(now, &mut store.latency.handed_over);
                 store.taken(&self.writes);
                 self.handed_over = Some((now, store.era));
                 let repeats = self.repeat_at == Instant::NEVER || is_new(store);
@@ -243,6 +243,7 @@ impl Connection for Uplink {
 
     fn lost<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
         self.busy = false;
+        self.offered = Since::NONE;
         self.flight.clear();
         self.greet_at = Instant::NEVER;
         self.speak_at = Instant::NEVER;
@@ -305,7 +306,8 @@ impl Connection for Uplink {
     }
 
     fn acked<const PORTS: usize>(&mut self, left: u32, store: &mut Store<PORTS>) {
-        self.flight.acked(left, store.now, |time| store.latency.arrived.record(time));
+        let now = store.now;
+        self.flight.acked(left, |born| born.record(now, &mut store.latency.arrived));
     }
 
     fn advance<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {

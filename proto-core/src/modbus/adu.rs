@@ -116,6 +116,9 @@ impl AduReader {
 
     #[inline]
     pub(super) fn advance<'c>(&mut self, chunk: &mut &'c [u8]) -> Option<Result<Place<'c>, AduError>> {
+        if chunk.is_empty() {
+            return None;
+        }
         if self.filled != 0 {
             return self.advance_buffered(chunk);
         }

@@ -76,6 +76,9 @@ impl Deframer {
         layout: &StreamLayout,
         chunk: &mut &'c [u8],
     ) -> Option<&'s [u8]> {
+        if chunk.is_empty() {
+            return None;
+        }
         if self.len != 0 {
             match self.complete(layout, chunk) {
                 Held::Frame { at } => return layout.payload_of(self.ring.get(at..)?),

@@ -16,7 +16,7 @@ use super::rig::*;
 
 pub const IDLE_GAP: Duration = Duration::from_millis(50);
 pub const READ_BACK: Duration = Duration::from_millis(500);
-pub const DEAF: Duration = Duration::from_millis(50);
+pub const DISCARDS_FOR: Duration = Duration::from_millis(50);
 pub const UDP: LinkId = LinkId::RECIPE_UDP;
 
 /// Modbus: a bit byte that becomes safe, and a word that holds.
@@ -93,9 +93,9 @@ pub struct Known {
     pub silent: bool,
 }
 
-/// The literal reading of D19.
+/// The deframer of a port, by the letter of D19.
 #[derive(Debug, Clone, Default)]
-pub struct Line {
+pub struct PortDeframer {
     pub held: Vec<u8>,
     pub heard: Option<Instant>,
     pub bytes: u32,
@@ -104,7 +104,7 @@ pub struct Line {
 
 pub struct Model {
     pub vars: BTreeMap<&'static str, Known>,
-    pub lines: BTreeMap<PortId, Line>,
+    pub deframers: BTreeMap<PortId, PortDeframer>,
     /// When links came up.
     pub up: BTreeMap<LinkId, Instant>,
     /// The newest good state packet: when, and what it said of variables that can be read back.
@@ -126,7 +126,7 @@ pub struct Model {
     pub bus_off: bool,
     pub sleeps: u32,
     /// The gateway slept: until a tick at or after this, nothing that arrives from the field counts.
-    pub deaf_until: Option<Instant>,
+    pub discards_until: Option<Instant>,
     pub asleep: [u32; 4],
     /// What the newest state packet or frame says of a shown variable cannot be read.
     pub bus_is_unreadable: bool,
@@ -182,7 +182,7 @@ impl Model {
         let names = FRAMES.iter().flat_map(|(_, names)| names.iter().copied());
         Self {
             vars: names.map(|name| (name, Known::default())).collect(),
-            lines: BTreeMap::new(),
+            deframers: BTreeMap::new(),
             up: BTreeMap::new(),
             packet: None,
             heard: None,
@@ -199,7 +199,7 @@ impl Model {
             port_up: [true; 4],
             bus_off: false,
             sleeps: 0,
-            deaf_until: None,
+            discards_until: None,
             asleep: [0; 4],
             bus_is_unreadable: false,
             knob_is_unreadable: false,
@@ -209,7 +209,7 @@ impl Model {
 
     /// A tick: deadlines pass.
     pub fn tick(&mut self, now: Instant) {
-        self.deaf_until = self.deaf_until.filter(|&until| now < until);
+        self.discards_until = self.discards_until.filter(|&until| now < until);
         self.advance(now);
     }
 
@@ -217,12 +217,12 @@ impl Model {
     pub fn slept(&mut self, now: Instant) {
         self.sleeps += 1;
         self.advance(now);
-        for line in self.lines.values_mut() {
+        for line in self.deframers.values_mut() {
             line.dropped += line.held.len() as u32;
             line.held.clear();
         }
         self.up.clear();
-        self.deaf_until = Some(now + DEAF);
+        self.discards_until = Some(now + DISCARDS_FOR);
     }
 
     pub fn live(&self, name: &str) -> bool {
@@ -247,7 +247,7 @@ impl Model {
                 }
             }
         }
-        for line in self.lines.values_mut() {
+        for line in self.deframers.values_mut() {
             if line.heard.is_some_and(|heard| now >= heard + IDLE_GAP) {
                 line.dropped += line.held.len() as u32;
                 line.held.clear();
@@ -283,17 +283,17 @@ impl Model {
     pub fn line(&mut self, port: PortId, bytes: &[u8], now: Instant) {
         let frame = FRAMES.iter().position(|&(of, _)| of == port).unwrap();
         let len = 4 + FRAMES[frame].1.iter().map(|name| size(name)).sum::<usize>();
-        let line = self.lines.entry(port).or_default();
+        let line = self.deframers.entry(port).or_default();
         line.heard = Some(now);
         line.bytes += bytes.len() as u32;
-        if self.deaf_until.is_some() {
+        if self.discards_until.is_some() {
             line.dropped += bytes.len() as u32;
             self.asleep[usize::from(port.0)] += 1;
             return;
         }
         line.held.extend(bytes);
         loop {
-            let held = &mut self.lines.get_mut(&port).unwrap();
+            let held = &mut self.deframers.get_mut(&port).unwrap();
             let begins = held.held.iter().zip([255, 255]).all(|(a, b)| *a == b);
             if held.held.is_empty() || begins && held.held.len() < len {
                 return;

@@ -46,8 +46,8 @@ pub enum Op {
         remote: bool,
     },
     Wait(Duration),
-    /// Nobody calls the engine for a while; what comes next is told before the tick that is due. After
-    /// half a second the gateway slept.
+    /// The driver does not call the engine for a while; what comes next is reported before the tick that
+    /// is due. After half a second the gateway slept.
     Late(Duration),
     Port {
         port: PortId,
@@ -101,7 +101,7 @@ impl Test {
         Self { rig, model: Model::new(), unanswered: Vec::new(), prompt: true }
     }
 
-    /// Something is about to be told: did the gateway sleep?
+    /// An input is about to be reported: did the gateway sleep?
     fn wake(&mut self) {
         if self.rig.now.saturating_since(self.rig.called) > ASLEEP {
             self.model.slept(self.rig.now);
@@ -182,7 +182,7 @@ impl Test {
         if port == BUS {
             self.wake();
             let id = CanId::Standard(if frame == 1 { 1 } else { 5 });
-            match self.model.deaf_until {
+            match self.model.discards_until {
                 Some(_) => self.model.asleep[usize::from(BUS.0)] += 1,
                 None => self.model.accept(frame, payload, self.rig.now),
             }
@@ -231,7 +231,7 @@ impl Test {
                     if *remote { CanFrame::remote(id, *len) } else { CanFrame::new(id, &vec![1; *len]) };
                 if *remote || !right {
                     self.wake();
-                    match self.model.deaf_until {
+                    match self.model.discards_until {
                         Some(_) => self.model.asleep[usize::from(BUS.0)] += 1,
                         None => self.model.wrong_can += 1,
                     }
@@ -240,7 +240,7 @@ impl Test {
             }
             Op::Wait(span) => return self.run(*span),
             Op::Late(span) => {
-                // What was due before is told before.
+                // What was due before is reported before.
                 if self.rig.wake <= self.rig.now {
                     self.input(Input::Tick)?;
                 }
@@ -252,7 +252,7 @@ impl Test {
                 if *up {
                     return self.input(Input::PortUp { port: *port });
                 }
-                if let Some(line) = self.model.lines.get_mut(port) {
+                if let Some(line) = self.model.deframers.get_mut(port) {
                     line.dropped += line.held.len() as u32;
                     line.held.clear();
                 }
@@ -410,7 +410,7 @@ impl Test {
             if port == BUS {
                 let rejected = counters.rejected_id + counters.rejected_length + counters.rejected_remote;
                 prop_assert_eq!(rejected, model.wrong_can);
-            } else if let Some(line) = model.lines.get(&port) {
+            } else if let Some(line) = model.deframers.get(&port) {
                 let whole = counters.bytes_in - counters.resync_bytes - counters.discarded_bytes;
                 prop_assert_eq!(counters.bytes_in, line.bytes);
                 prop_assert_eq!(counters.resync_bytes + counters.discarded_bytes, line.dropped, "{:?}", port);

@@ -259,8 +259,14 @@ impl Scribe {
     }
 
     fn word(&mut self, text: &[u8]) {
-        if self.field == Field::Shown && matches!(text, b"None" | b"Some") {
-            return;
+        match text {
+            b"None" | b"Some" if self.field == Field::Shown => return,
+            // Whether there is one is only shown, too.
+            b"LastRejection" => {
+                self.word = Word::Struct(Kind::LeftOut);
+                return;
+            }
+            _ => {}
         }
         // The next word is the name of the next field.
         match std::mem::replace(&mut self.field, Field::Other) {
@@ -272,9 +278,7 @@ impl Scribe {
         self.word = match text {
             b"Instant" => Word::Instant,
             b"PortCounters" | b"LinkCounters" | b"LinkHistory" | b"DeframerStats" | b"StreamLayout"
-            | b"CanLayout" | b"Dialect" | b"Latency" | b"LastRejection" | b"Tap" => {
-                Word::Struct(Kind::LeftOut)
-            }
+            | b"CanLayout" | b"Dialect" | b"Latency" | b"Tap" => Word::Struct(Kind::LeftOut),
             b"Sent" => Word::Struct(Kind::Sent),
             b"Up" => Word::Struct(Kind::Up),
             b"LineTiming" => Word::Struct(Kind::Line),
@@ -287,7 +291,7 @@ impl Scribe {
             b"bytes" | b"group" | b"ring" | b"buffer" | b"mask" | b"codes" | b"picked" => {
                 Word::Field(Field::Buffer)
             }
-            b"last_rejection" | b"offered_at" | b"due_at" | b"born" => Word::Field(Field::Shown),
+            b"last_rejection" | b"offered" | b"due_since" | b"born" => Word::Field(Field::Shown),
             b"stamps" | b"packet_at" | b"source_at" | b"frame_at" => Word::Field(Field::Stamps),
             b"unconfirmed_since" => Word::Field(Field::Unconfirmed),
             b"confirmed_at" => Word::Field(Field::Confirmed),

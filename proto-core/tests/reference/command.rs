@@ -186,9 +186,9 @@ impl Server {
     }
 }
 
-/// What a client is told.
+/// An event in the bytes that a client received.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Told {
+pub enum Event {
     /// To the older request, or to the one beside it.
     Reply(Turn, Vec<u8>),
     ScriptFinish,
@@ -265,9 +265,9 @@ impl Client {
         }
     }
 
-    pub fn receive(&mut self, now: u64, bytes: &[u8]) -> Vec<Told> {
-        let mut told = Vec::new();
-        self.settle(now, &mut told);
+    pub fn receive(&mut self, now: u64, bytes: &[u8]) -> Vec<Event> {
+        let mut events = Vec::new();
+        self.settle(now, &mut events);
         for &byte in bytes {
             self.newest = now;
             if self.dropping {
@@ -276,19 +276,19 @@ impl Client {
                 continue;
             }
             self.bytes.push(byte);
-            self.settle(now, &mut told);
+            self.settle(now, &mut events);
         }
         if self.until().is_some_and(|until| now >= until) {
             (self.waiting, self.beside) = (None, None);
-            told.push(Told::Timeout);
+            events.push(Event::Timeout);
             // What was the beginning of a reply is now a text that nobody asked for.
-            self.settle(now, &mut told);
+            self.settle(now, &mut events);
         }
-        told
+        events
     }
 
     /// Hands out what is complete at the front, as often as something is.
-    fn settle(&mut self, now: u64, told: &mut Vec<Told>) {
+    fn settle(&mut self, now: u64, events: &mut Vec<Event>) {
         loop {
             let blanks = self.bytes.iter().take_while(|&&byte| is_blank(byte)).count();
             self.bytes.drain(..blanks);
@@ -300,19 +300,19 @@ impl Client {
             let (len, full) = (self.bytes.len(), self.bytes.len() == LONGEST_REPLY);
             match (self.front(), self.bytes.iter().position(|&byte| is_end(byte))) {
                 _ if self.bytes.is_empty() => return,
-                (Front::Complete(len), _) => self.hand_out(len, told),
-                (Front::Other, Some(end)) => self.hand_out(end, told),
+                (Front::Complete(len), _) => self.hand_out(len, events),
+                (Front::Other, Some(end)) => self.hand_out(end, events),
                 (Front::Open(_) | Front::Other, _) if full || silent => {
                     // The rest of a message goes nowhere; a text that we do not know comes in pieces.
                     self.dropping = full && matches!(self.front(), Front::Open(_));
-                    self.hand_out(len, told);
+                    self.hand_out(len, events);
                 }
                 _ => return,
             }
         }
     }
 
-    fn hand_out(&mut self, len: usize, told: &mut Vec<Told>) {
+    fn hand_out(&mut self, len: usize, events: &mut Vec<Event>) {
         let front = self.front();
         let mut len = len;
         if let Front::Other = front {
@@ -326,16 +326,16 @@ impl Client {
         let answers = |request: &Option<(String, u64)>| {
             is_reply && request.as_ref().is_some_and(|(word, _)| answers(word, &text))
         };
-        told.push(if text == b"script finish" {
-            Told::ScriptFinish
+        events.push(if text == b"script finish" {
+            Event::ScriptFinish
         } else if answers(&self.waiting) {
             self.waiting = self.beside.take();
-            Told::Reply(Turn::InTurn, text)
+            Event::Reply(Turn::InTurn, text)
         } else if answers(&self.beside) {
             self.beside = None;
-            Told::Reply(Turn::Beside, text)
+            Event::Reply(Turn::Beside, text)
         } else {
-            Told::Unsolicited(text)
+            Event::Unsolicited(text)
         });
     }
 

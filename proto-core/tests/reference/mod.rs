@@ -9,7 +9,7 @@ use proto_core::wire::scalar::ScalarType;
 
 /// Section 4, D19: every byte of a line since the last silence, and how far it was understood.
 #[derive(Debug, Clone)]
-pub struct Line {
+pub struct PlainDeframer {
     head: Vec<u8>,
     tail: Vec<u8>,
     frame_len: usize,
@@ -25,7 +25,7 @@ pub struct Line {
     pub discarded: u64,
 }
 
-impl Line {
+impl PlainDeframer {
     pub fn new(layout: &StreamLayout) -> Self {
         Self {
             head: layout.head().to_vec(),

@@ -141,11 +141,16 @@ pub fn user_out(ty: ScalarType, from: OutputBinding) -> FieldSpec {
     FieldSpec::UserOutput { ty, from }
 }
 
-/// What the controller's Modbus server was told.
+/// A write that the controller's Modbus server carried out.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Written {
     Coils(u16, Vec<bool>),
     Registers(u16, Vec<u16>),
+}
+
+/// A write of eight coils, the first in the least significant bit.
+pub fn coils(address: u16, byte: u8) -> Written {
+    Written::Coils(address, (0..8).map(|bit| byte >> bit & 1 == 1).collect())
 }
 
 /// The controller's Modbus map, as far as a test needs it.
@@ -202,7 +207,7 @@ pub enum Out {
     Open(LinkId),
     Close(LinkId),
     Link(LinkId, Vec<u8>),
-    /// Nothing: a tick was told, and deadlines passed. Only where a test asks for it.
+    /// No output: a tick was reported. Only with [`Rig::logs_ticks`].
     Tick,
 }
 
@@ -218,7 +223,7 @@ pub struct Rig {
     reacted: bool,
     /// Links that come up as soon as they are opened.
     pub reachable: BTreeSet<u8>,
-    /// Links of which nothing is heard when they are opened.
+    /// Links that neither come up nor are refused when they are opened.
     pub unanswered: BTreeSet<u8>,
     /// Whether Modbus requests are answered at once.
     pub modbus_answers: bool,
@@ -226,9 +231,9 @@ pub struct Rig {
     pub reports_sent: bool,
     /// Whether the controller's TCP acknowledges at once what has left.
     pub acknowledges: bool,
-    /// Whether ticks stand in the log.
+    /// Whether ticks are in the log.
     pub logs_ticks: bool,
-    /// Everything handed over since the last look.
+    /// Everything handed over that no test has taken yet.
     pub log: Vec<(Instant, Out)>,
 }
 

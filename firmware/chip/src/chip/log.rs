@@ -4,7 +4,7 @@ use super::{Chip, RAM};
 use crate::program::texts;
 
 impl Chip {
-    /// What the debugger reads of the log: the ring of the first channel (SEGGER's RTT).
+    /// Empties the ring buffer of SEGGER RTT's first channel.
     pub(super) fn read_log(&mut self) {
         let engine = self.core.engine();
         let Some(channel) = self.program.rtt.map(|address| address + 24) else { return };

@@ -1,4 +1,4 @@
-//! The CAN bus at FDCAN1's pins: its speed, who acknowledges, what disturbs it, and the frames of others.
+//! The CAN bus at FDCAN1's pins: its bit rate, its faults, and the frames of other nodes.
 
 use std::collections::VecDeque;
 
@@ -7,20 +7,20 @@ use crate::device::*;
 /// A classic frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Frame {
-    /// 11 or 29 bits.
+    /// Identifier of 11 or 29 bits.
     pub id: u32,
-    /// 29 bits.
+    /// Whether the identifier has 29 bits.
     pub is_extended: bool,
-    /// It asks for data.
+    /// Whether it is a remote frame.
     pub is_remote: bool,
-    /// As the length code says.
+    /// Data length code.
     pub len: u8,
-    /// Of these, `len` count.
+    /// Data, of which `len` bytes are valid.
     pub data: [u8; 8],
 }
 
 impl Frame {
-    /// A frame with 11 bits of id.
+    /// A data frame with an identifier of 11 bits.
     ///
     /// # Panics
     /// More than 8 bytes.
@@ -35,7 +35,7 @@ impl Frame {
         &self.data[..usize::from(self.len.min(8))]
     }
 
-    /// As an element of the message RAM (RM0433, "FDCAN Tx buffer element").
+    /// The element of the message RAM (RM0433, "FDCAN Tx buffer element").
     pub(super) fn words(&self) -> [u32; 4] {
         let id = if self.is_extended { self.id | 1 << 30 } else { self.id << 18 };
         let [a, b, c, d, e, f, g, h] = self.data;
@@ -56,102 +56,102 @@ impl Frame {
         Self { id, is_extended, is_remote: head >> 29 & 1 != 0, len: (control >> 16 & 0xF) as u8, data }
     }
 
-    /// How many bits an attempt takes, without stuff bits, with the pause behind it.
+    /// Bits that an attempt takes, with the intermission but without stuff bits.
     pub(crate) fn bits(&self, attempt: Attempt) -> u64 {
         let data = if self.is_remote { 0 } else { 8 * self.bytes().len() as u64 };
         let whole = if self.is_extended { 67 } else { 47 } + data;
         match attempt {
             Attempt::Acknowledged => whole,
-            // Up to the missing acknowledge, an error frame, the pause.
+            // Up to the missing acknowledge, then an error frame and the intermission.
             Attempt::NotAcknowledged => whole - 11 + 14,
             Attempt::Disturbed => 20 + 14,
         }
     }
 }
 
-/// What becomes of a transmission.
+/// Result of an attempt to send.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Attempt {
-    /// Somebody has heard it.
+    /// Acknowledged by another node.
     Acknowledged,
-    /// Nobody has.
+    /// Not acknowledged.
     NotAcknowledged,
-    /// A bit was another than the one that was sent.
+    /// Bit error.
     Disturbed,
 }
 
-/// What is wrong with the bus.
+/// A fault of the bus.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Trouble {
-    /// Nothing.
+pub enum BusFault {
+    /// No fault.
     #[default]
     None,
-    /// Nobody else is there.
-    Alone,
-    /// A short circuit: no bit is as it was sent.
-    Short,
+    /// No other node is on the bus.
+    NoAcknowledge,
+    /// A short circuit: every frame has a bit error.
+    ShortCircuit,
 }
 
 /// The bus.
 #[derive(Debug, Default)]
 pub struct CanBus {
-    /// Bit/s of all others; 0 for as fast as the chip.
+    /// Bit rate of the other nodes in bit/s; 0 for that of the chip.
     pub bitrate: u32,
-    /// What is wrong.
-    pub trouble: Trouble,
-    /// What the chip has sent, with the end of each.
+    /// Its fault.
+    pub fault: BusFault,
+    /// Frames sent by the chip, with the end of each.
     pub sent: Vec<(Picos, Frame)>,
-    /// Attempts of the chip to send.
+    /// Number of attempts of the chip to send.
     pub attempts: u64,
-    /// Frames of others that the chip acknowledged.
-    pub heard: u64,
-    /// Frames of others that it was not there for.
+    /// Number of frames that the chip acknowledged.
+    pub received: u64,
+    /// Number of frames that the chip could not receive.
     pub missed: u64,
-    /// Frames of others that a filter let pass.
-    pub passed: u64,
-    /// Frames that the chip broke off in the middle.
-    pub broken_off: u64,
-    /// When it went bus-off.
+    /// Number of frames that passed the acceptance filters.
+    pub accepted: u64,
+    /// Number of frames that the chip aborted.
+    pub aborted: u64,
+    /// Times at which the chip went bus-off.
     pub bus_offs: Vec<Picos>,
-    /// What others send: when each has ended.
+    /// Frames of other nodes, each with its end.
     arriving: VecDeque<(Picos, Arrival)>,
 }
 
-/// What others put on the bus.
+/// A frame of another node.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Arrival {
     Frame(Frame),
-    /// Nobody can read it.
-    Broken,
+    /// With an error that all receivers detect.
+    ErrorFrame,
 }
 
 impl CanBus {
-    /// Another node sends a frame, which has ended then; later than all before.
+    /// Another node sends a frame that ends at `ended`, after all earlier ones.
     pub fn send(&mut self, ended: Picos, frame: Frame) {
         self.arriving.push_back((ended, Arrival::Frame(frame)));
     }
 
-    /// As [`CanBus::send`], a frame with a wrong check sum or too many equal bits.
-    pub fn send_broken(&mut self, ended: Picos) {
-        self.arriving.push_back((ended, Arrival::Broken));
+    /// Like [`CanBus::send`], for a frame with a wrong CRC or a stuff error.
+    pub fn send_error_frame(&mut self, ended: Picos) {
+        self.arriving.push_back((ended, Arrival::ErrorFrame));
     }
 
-    /// Whether a receiver with such bits understands the others: within half a percent.
+    /// Whether a node with this bit time can receive the others: within 0.5 %.
     pub(super) fn is_understood(&self, bit: Picos) -> bool {
         let theirs = if self.bitrate == 0 { bit } else { SECOND / Picos::from(self.bitrate) };
         theirs.abs_diff(bit) * 200 <= theirs
     }
 
-    pub(super) fn attempt(&mut self, bit: Picos, at: &Moment<'_>) -> Result<Attempt, Refusal> {
+    pub(super) fn attempt(&mut self, bit: Picos, at: &Context<'_>) -> Result<Attempt, Refusal> {
         let (tx, rx) = (Pin('D', 1), Pin('D', 0));
         if !tx.is(at.functions, 9) || !rx.is(at.functions, 9) {
             return refuse("a frame is sent, but PD0 and PD1 are not its pins");
         }
         self.attempts += 1;
-        Ok(match self.trouble {
-            Trouble::None if self.is_understood(bit) => Attempt::Acknowledged,
-            Trouble::Alone => Attempt::NotAcknowledged,
-            Trouble::None | Trouble::Short => Attempt::Disturbed,
+        Ok(match self.fault {
+            BusFault::None if self.is_understood(bit) => Attempt::Acknowledged,
+            BusFault::NoAcknowledge => Attempt::NotAcknowledged,
+            BusFault::None | BusFault::ShortCircuit => Attempt::Disturbed,
         })
     }
 

@@ -1,9 +1,8 @@
-//! The Ethernet MAC with its DMA, on RMII. RM0433, "Ethernet: media access control with
-//! DMA controller".
+//! The Ethernet MAC with its DMA, on RMII. RM0433, "Ethernet: media access control with DMA controller".
 //!
-//! The DMA walks the rings of descriptors in the chip's memory ("Descriptors"); it reaches AXI SRAM and not the
-//! DTCM. Strict: the reset needs RMII chosen and the PHY's 50 MHz on the pin, MDC may not be faster than
-//! 2.5 MHz, a packet is one descriptor, a buffer that is too short is told.
+//! The DMA processes descriptor rings in AXI SRAM; it does not reach the DTCM. A software reset completes only
+//! with the PHY's 50 MHz on the pin. Refused: a software reset before RMII is selected, MDC above 2.5 MHz,
+//! packets in several descriptors, and receive buffers that are too short.
 
 use std::collections::VecDeque;
 
@@ -28,37 +27,37 @@ const IER: u32 = 0x1134;
 const CSR: u32 = 0x1160;
 
 static REGISTERS: [Register; 24] = [
-    keeps(MACCR, "MACCR", 0, 0xFFFB_7F7F),
-    keeps(MACPFR, "MACPFR", 0, 0x8031_07FF),
-    keeps(0x070, "MACQTXFCR", 0, 0xFFFF_00F3),
-    keeps(MDIOAR, "MACMDIOAR", 0, 0x0FFF_7F1F),
-    keeps(MDIODR, "MACMDIODR", 0, !0),
-    keeps(MACA0HR, "MACA0HR", 0x8000_FFFF, 0xFFFF),
-    keeps(MACA0LR, "MACA0LR", !0, !0),
-    keeps(0x70C, "MMC_RX_INTERRUPT_MASK", 0, 0x0C02_0060),
-    keeps(0x710, "MMC_TX_INTERRUPT_MASK", 0, 0x0C20_C000),
-    keeps(0xD00, "MTLTXQOMR", 0x7_0008, 0x7_0073),
-    keeps(0xD30, "MTLRXQOMR", 0x70_0000, 0x0071_C7FB),
-    keeps(DMAMR, "DMAMR", 0, 0x3_7803),
-    keeps(0x1004, "DMASBMR", 0x0101_0000, 0xD001),
-    keeps(TXCR, "DMACTXCR", 0, 0x3F_1011),
-    keeps(RXCR, "DMACRXCR", 0, 0x803F_7FFF),
-    keeps(TXDLAR, "DMACTXDLAR", 0, !3),
-    keeps(RXDLAR, "DMACRXDLAR", 0, !3),
-    keeps(TXDTPR, "DMACTXDTPR", 0, !3),
-    keeps(0x1128, "DMACRXDTPR", 0, !3),
-    keeps(TXRLR, "DMACTXRLR", 0, 0x3FF),
-    keeps(RXRLR, "DMACRXRLR", 0, 0x3FF),
-    keeps(IER, "DMACIER", 0, 0xFFC7),
-    does(CSR, "DMACSR", 0xFFC7),
-    reads(0x114C, "DMACCARXDR", 0),
+    read_write(MACCR, "MACCR", 0, 0xFFFB_7F7F),
+    read_write(MACPFR, "MACPFR", 0, 0x8031_07FF),
+    read_write(0x070, "MACQTXFCR", 0, 0xFFFF_00F3),
+    read_write(MDIOAR, "MACMDIOAR", 0, 0x0FFF_7F1F),
+    read_write(MDIODR, "MACMDIODR", 0, !0),
+    read_write(MACA0HR, "MACA0HR", 0x8000_FFFF, 0xFFFF),
+    read_write(MACA0LR, "MACA0LR", !0, !0),
+    read_write(0x70C, "MMC_RX_INTERRUPT_MASK", 0, 0x0C02_0060),
+    read_write(0x710, "MMC_TX_INTERRUPT_MASK", 0, 0x0C20_C000),
+    read_write(0xD00, "MTLTXQOMR", 0x7_0008, 0x7_0073),
+    read_write(0xD30, "MTLRXQOMR", 0x70_0000, 0x0071_C7FB),
+    read_write(DMAMR, "DMAMR", 0, 0x3_7803),
+    read_write(0x1004, "DMASBMR", 0x0101_0000, 0xD001),
+    read_write(TXCR, "DMACTXCR", 0, 0x3F_1011),
+    read_write(RXCR, "DMACRXCR", 0, 0x803F_7FFF),
+    read_write(TXDLAR, "DMACTXDLAR", 0, !3),
+    read_write(RXDLAR, "DMACRXDLAR", 0, !3),
+    read_write(TXDTPR, "DMACTXDTPR", 0, !3),
+    read_write(0x1128, "DMACRXDTPR", 0, !3),
+    read_write(TXRLR, "DMACTXRLR", 0, 0x3FF),
+    read_write(RXRLR, "DMACRXRLR", 0, 0x3FF),
+    read_write(IER, "DMACIER", 0, 0xFFC7),
+    command(CSR, "DMACSR", 0xFFC7),
+    read_only(0x114C, "DMACCARXDR", 0),
 ];
 
-/// The chip's memory, as a DMA has it.
+/// The chip's memory, for a DMA.
 pub trait Memory {
-    /// Reads; false where there is none.
+    /// Reads; `false` if there is none.
     fn fetch(&self, address: u32, bytes: &mut [u8]) -> bool;
-    /// Writes; false where there is none.
+    /// Writes; `false` if there is none.
     fn store(&mut self, address: u32, bytes: &[u8]) -> bool;
 }
 
@@ -77,56 +76,56 @@ impl Memory for crate::unicorn::Engine {
 #[derive(Debug)]
 pub struct Ethernet {
     bank: Bank,
-    /// At its pins.
+    /// The PHY at its pins.
     pub phy: Phy,
-    /// What it has sent.
+    /// Frames sent.
     pub sent: VecDeque<Vec<u8>>,
-    /// Frames that it has sent while there was no link.
-    pub unheard: u64,
-    /// Frames that arrived and were not for it, or that there was no room for.
+    /// Number of frames sent without a link.
+    pub lost: u64,
+    /// Number of frames dropped: for other addresses, or without a free descriptor.
     pub dropped: u64,
-    /// Frames that it took.
-    pub taken: u64,
+    /// Number of frames received.
+    pub received: u64,
     arriving: VecDeque<Vec<u8>>,
-    resets: Option<Picos>,
-    managing: Option<Picos>,
-    /// Descriptors that come next.
+    reset_until: Option<Picos>,
+    mdio_until: Option<Picos>,
+    /// Index of the next descriptor of each ring.
     next: [u32; 2],
-    /// On the wire, with the descriptor that it came from.
+    /// The frame on the wire, the address of its descriptor, and its end.
     sending: Option<(Vec<u8>, u32, Picos)>,
-    is_asked: bool,
+    tx_resumed: bool,
 }
 
 const RECEIVE: usize = 0;
 const TRANSMIT: usize = 1;
 
 impl Ethernet {
-    /// As after power came.
+    /// The state after power-on.
     pub fn new() -> Self {
         Self {
             bank: Bank::new(&REGISTERS),
             phy: Phy::new(),
             sent: VecDeque::new(),
-            unheard: 0,
+            lost: 0,
             dropped: 0,
-            taken: 0,
+            received: 0,
             arriving: VecDeque::new(),
-            resets: None,
-            managing: None,
+            reset_until: None,
+            mdio_until: None,
             next: [0; 2],
             sending: None,
-            is_asked: false,
+            tx_resumed: false,
         }
     }
 
-    /// A frame arrives from the cable, without its check sum.
+    /// A frame arrives from the cable, given without its FCS.
     pub fn receive(&mut self, frame: &[u8]) {
         let mut frame = frame.to_vec();
         frame.resize(frame.len().max(60), 0);
         self.arriving.push_back(frame);
     }
 
-    /// The board's address.
+    /// The MAC address.
     pub fn address(&self) -> [u8; 6] {
         let (low, high) = (self.bank.get(MACA0LR).to_le_bytes(), self.bank.get(MACA0HR).to_le_bytes());
         [low[0], low[1], low[2], low[3], high[0], high[1]]
@@ -136,7 +135,7 @@ impl Ethernet {
         self.bank.get(register) & bits == bits
     }
 
-    fn has_reference(&self, at: &Moment<'_>) -> bool {
+    fn has_reference(&self, at: &Context<'_>) -> bool {
         self.phy.has_clock && at.is_rmii && Pin('A', 1).is(at.functions, FUNCTION)
     }
 
@@ -151,7 +150,7 @@ impl Ethernet {
         frame[..6] == self.address() || all || multicast && self.has(MACPFR, 1 << 4) || self.has(MACPFR, 1)
     }
 
-    fn manage(&mut self, command: u32, at: &Moment<'_>) -> Result<(), Refusal> {
+    fn access_phy(&mut self, command: u32, at: &Context<'_>) -> Result<(), Refusal> {
         const DIVIDERS: [u32; 8] = [42, 62, 16, 26, 102, 124, 0, 0];
         let divider = DIVIDERS[(command >> 8 & 7) as usize];
         let clock = at.clocks.hclk.checked_div(divider).unwrap_or(0);
@@ -171,51 +170,51 @@ impl Ethernet {
             (1, false) => {}
             _ => return refuse("neither a read nor a write of clause 22"),
         }
-        self.managing = Some(until);
+        self.mdio_until = Some(until);
         Ok(())
     }
 
     fn descriptor(&self, ring: usize, memory: &dyn Memory) -> Result<(u32, [u32; 4]), Refusal> {
         let list = self.bank.get([RXDLAR, TXDLAR][ring]);
         let place = list + 16 * self.next[ring];
-        reachable(place, 16)?;
+        check_dma_range(place, 16)?;
         let mut bytes = [0; 16];
         memory.fetch(place, &mut bytes);
         let word = |index: usize| u32::from_le_bytes(bytes[4 * index..][..4].try_into().expect("four"));
         Ok((place, std::array::from_fn(word)))
     }
 
-    fn step(&mut self, ring: usize) {
+    fn advance_ring(&mut self, ring: usize) {
         let len = (self.bank.get([RXRLR, TXRLR][ring]) & 0x3FF) + 1;
         self.next[ring] = (self.next[ring] + 1) % len;
     }
 
-    /// What the DMA has to do now.
+    /// Processes the descriptor rings.
     ///
     /// # Errors
-    /// The descriptors cannot be done as they are.
-    pub fn transfer(&mut self, memory: &mut dyn Memory, at: &Moment<'_>) -> Result<(), Refusal> {
+    /// A descriptor is wrong, or of a kind that is not modelled.
+    pub fn transfer(&mut self, memory: &mut dyn Memory, at: &Context<'_>) -> Result<(), Refusal> {
         loop {
             if let Some((frame, place, _)) = self.sending.take_if(|(.., until)| at.now >= *until) {
                 let mut word = [0; 4];
                 memory.fetch(place + 12, &mut word);
-                // OWN goes back, and the status is written there: no error.
+                // Write back without OWN and error flags.
                 memory.store(place + 12, &(u32::from_le_bytes(word) & 0x3000_0000).to_le_bytes());
                 if self.phy.is_up(at.now) {
                     self.sent.push_back(frame);
                 } else {
-                    self.unheard += 1;
+                    self.lost += 1;
                 }
                 self.raise(1);
                 continue;
             }
-            if self.sending.is_some() || !self.has(TXCR, 1) || !self.has(MACCR, 2) || !self.is_asked {
+            if self.sending.is_some() || !self.has(TXCR, 1) || !self.has(MACCR, 2) || !self.tx_resumed {
                 break;
             }
             let (place, [buffer, _, lengths, control]) = self.descriptor(TRANSMIT, memory)?;
             if control >> 31 == 0 {
-                // It waits for the tail pointer to be written ("DMA transmission").
-                self.is_asked = false;
+                // Suspended until the tail pointer is written.
+                self.tx_resumed = false;
                 self.raise(1 << 2);
                 break;
             }
@@ -223,13 +222,13 @@ impl Ethernet {
                 return refuse("a packet in several descriptors, or a context, is not modelled");
             }
             let len = lengths & 0x3FFF;
-            reachable(buffer, len)?;
+            check_dma_range(buffer, len)?;
             let mut frame = vec![0; len as usize];
             memory.fetch(buffer, &mut frame);
             frame.resize(frame.len().max(60), 0);
             let wire = (frame.len() as u64 + 24) * 8 * cycle(100_000_000);
             self.sending = Some((frame, place, at.now + wire));
-            self.step(TRANSMIT);
+            self.advance_ring(TRANSMIT);
         }
         while let Some(frame) = self.arriving.pop_front() {
             let is_on = self.has(RXCR, 1) && self.has(MACCR, 1) && self.phy.is_up(at.now);
@@ -247,20 +246,20 @@ impl Ethernet {
             if control >> 24 & 1 == 0 || len > self.bank.get(RXCR) >> 1 & 0x3FFF {
                 return refuse("a receive descriptor without a buffer that a frame fits in");
             }
-            reachable(buffer, len)?;
+            check_dma_range(buffer, len)?;
             memory.store(buffer, &frame);
             memory.store(buffer + frame.len() as u32, &[0; 4]);
             memory.store(place + 12, &(0x3000_0000 | len).to_le_bytes());
-            self.step(RECEIVE);
-            self.taken += 1;
+            self.advance_ring(RECEIVE);
+            self.received += 1;
             self.raise(if control >> 30 & 1 != 0 { 1 << 6 } else { 0 });
         }
         Ok(())
     }
 }
 
-/// The DMA reaches AXI SRAM; of what else it reaches, nothing is used.
-fn reachable(address: u32, len: u32) -> Result<(), Refusal> {
+/// Refuses addresses that the DMA does not reach. It also reaches other RAM, which is not used.
+fn check_dma_range(address: u32, len: u32) -> Result<(), Refusal> {
     if (0x2400_0000..=0x2408_0000).contains(&address) && address + len <= 0x2408_0000 {
         return Ok(());
     }
@@ -278,34 +277,34 @@ impl Peripheral for Ethernet {
         &REGISTERS
     }
 
-    fn read(&mut self, offset: u32, at: &Moment<'_>) -> Result<u32, Refusal> {
+    fn read(&mut self, offset: u32, at: &Context<'_>) -> Result<u32, Refusal> {
         self.advance(at)?;
         let busy = match offset {
-            DMAMR => u32::from(self.resets.is_some()),
-            MDIOAR => u32::from(self.managing.is_some()),
+            DMAMR => u32::from(self.reset_until.is_some()),
+            MDIOAR => u32::from(self.mdio_until.is_some()),
             _ => 0,
         };
         Ok(self.bank.read(offset)? | busy)
     }
 
-    fn write(&mut self, offset: u32, value: u32, at: &Moment<'_>) -> Result<(), Refusal> {
+    fn write(&mut self, offset: u32, value: u32, at: &Context<'_>) -> Result<(), Refusal> {
         self.advance(at)?;
-        if self.resets.is_some() {
-            return refuse("it is written while it resets (DMAMR.SWR)");
+        if self.reset_until.is_some() {
+            return refuse("written during its software reset (DMAMR.SWR)");
         }
         match offset {
             DMAMR if value & 1 != 0 => {
                 if !at.is_rmii {
-                    return refuse("the reset comes before RMII is chosen");
+                    return refuse("software reset before RMII is selected");
                 }
                 let done = if self.has_reference(at) { at.now + MICRO } else { Picos::MAX };
-                self.resets = Some(done);
+                self.reset_until = Some(done);
                 return Ok(());
             }
-            MDIOAR | MDIODR if self.managing.is_some() => return refuse("MDIO is busy (MB)"),
+            MDIOAR | MDIODR if self.mdio_until.is_some() => return refuse("MDIO is busy (MB)"),
             MDIOAR if value & 1 != 0 => {
                 self.bank.write(MDIOAR, value & !1)?;
-                return self.manage(value, at);
+                return self.access_phy(value, at);
             }
             CSR => {
                 self.bank.check(CSR, value)?;
@@ -315,12 +314,12 @@ impl Peripheral for Ethernet {
             TXDLAR | RXDLAR | TXRLR | RXRLR => {
                 let ring = usize::from(matches!(offset, TXDLAR | TXRLR));
                 if self.has([RXCR, TXCR][ring], 1) {
-                    return refuse("the ring is changed while its DMA runs");
+                    return refuse("the ring is changed while its DMA channel runs");
                 }
                 self.next[ring] = 0;
             }
-            TXDTPR => self.is_asked = true,
-            TXCR if value & 1 != 0 => self.is_asked = true,
+            TXDTPR => self.tx_resumed = true,
+            TXCR if value & 1 != 0 => self.tx_resumed = true,
             _ => {}
         }
         let strobes = if offset == 0xD00 { 1 } else { 0 };
@@ -329,37 +328,37 @@ impl Peripheral for Ethernet {
         Ok(())
     }
 
-    fn advance(&mut self, at: &Moment<'_>) -> Result<(), Refusal> {
-        if self.resets.is_some_and(|until| at.now >= until) {
+    fn advance(&mut self, at: &Context<'_>) -> Result<(), Refusal> {
+        if self.reset_until.is_some_and(|until| at.now >= until) {
             self.bank = Bank::new(&REGISTERS);
-            self.resets = None;
+            self.reset_until = None;
             self.next = [0; 2];
             self.sending = None;
         }
-        if self.managing.is_some_and(|until| at.now >= until) {
-            self.managing = None;
+        if self.mdio_until.is_some_and(|until| at.now >= until) {
+            self.mdio_until = None;
         }
         Ok(())
     }
 
-    fn deadline(&self, at: &Moment<'_>) -> Option<Picos> {
-        let resets = self.resets.filter(|until| *until != Picos::MAX);
+    fn deadline(&self, at: &Context<'_>) -> Option<Picos> {
+        let reset_until = self.reset_until.filter(|until| *until != Picos::MAX);
         let sent = self.sending.as_ref().map(|(.., until)| *until);
         let arrived = (!self.arriving.is_empty()).then_some(at.now);
-        [sent, resets, self.managing, arrived].into_iter().flatten().min()
+        [sent, reset_until, self.mdio_until, arrived].into_iter().flatten().min()
     }
 
-    fn interrupts(&self) -> bool {
+    fn interrupt_line(&self) -> bool {
         let asked = self.bank.get(CSR) & self.bank.get(IER);
         asked & 0x8000 != 0 && asked & 0x7FF != 0
     }
 
     fn reset(&mut self) {
         let (phy, sent) = (std::mem::take(&mut self.phy), std::mem::take(&mut self.sent));
-        let (unheard, dropped, taken) = (self.unheard, self.dropped, self.taken);
-        *self = Self { phy, sent, unheard, dropped, taken, ..Self::new() };
+        let (lost, dropped, received) = (self.lost, self.dropped, self.received);
+        *self = Self { phy, sent, lost, dropped, received, ..Self::new() };
     }
 }
 
-/// Of all its pins.
+/// Alternate function of its pins.
 const FUNCTION: u8 = 11;

@@ -1,9 +1,9 @@
-//! FDCAN1 as the program sees it: registers, message RAM, FIFOs, filters, error states. RM0433,
-//! "Controller area network with flexible data rate"; Bosch's M_CAN manual where that leaves something out. Classic frames only.
+//! FDCAN1: registers, message RAM, FIFOs, filters, error states. RM0433, "Controller area network with flexible
+//! data rate", and Bosch's M_CAN manual where that is incomplete. Classic frames only.
 //!
-//! Strict: what CCE and INIT protect (said at each register), INIT that needs some cycles to arrive
-//! and CCE that is set before it has, the index of TXBAR and of the acknowledges, message RAM that is
-//! written while it waits to be sent, and the clock calibration unit, which has to be bypassed.
+//! Refused: writes that need INIT and CCE without these, CCE before a change of INIT has taken effect, wrong
+//! indices in TXBAR and in acknowledges, a write to a transmit buffer with a pending request, and leaving INIT
+//! without bypassing the clock calibration unit.
 
 mod control;
 mod filters;
@@ -21,15 +21,15 @@ use crate::device::*;
 pub struct Fdcan {
     bank: Bank,
     ram: Vec<u32>,
-    /// The bus, and who else is there.
+    /// The bus at its pins.
     pub bus: CanBus,
-    /// INIT as the bus' side has it follows later.
-    init_arrives: Option<(bool, Picos)>,
+    /// A change of INIT, and when it has crossed to the CAN clock domain.
+    init_change: Option<(bool, Picos)>,
     is_on_bus: bool,
     transmit_errors: u32,
     receive_errors: u32,
     is_bus_off: bool,
-    /// After bus-off, when enough of recessive bits were seen.
+    /// End of the bus-off recovery sequence.
     recovers: Option<Picos>,
     waiting: VecDeque<u32>,
     put: u32,
@@ -39,14 +39,14 @@ pub struct Fdcan {
 }
 
 impl Fdcan {
-    /// As after power came.
+    /// The state after power-on.
     pub fn new() -> Self {
         Self {
             bank: Bank::new(&REGISTERS),
-            // After power on it holds anything.
+            // Its contents are undefined after power-on.
             ram: vec![0xDEAD_BEEF; WORDS],
             bus: CanBus::default(),
-            init_arrives: None,
+            init_change: None,
             is_on_bus: false,
             transmit_errors: 0,
             receive_errors: 0,
@@ -59,12 +59,12 @@ impl Fdcan {
         }
     }
 
-    /// It takes part in what happens on the bus.
+    /// Whether it takes part in the bus' traffic.
     pub fn is_on_bus(&self) -> bool {
         self.is_on_bus && self.bank.get(CCCR) & RESTRICTED == 0
     }
 
-    /// A late access to the message RAM: MRAF, and from then on only listening ("Restricted operation mode").
+    /// A message RAM access failure: sets MRAF and enters restricted operation mode.
     pub fn fail_message_ram(&mut self) {
         self.bank.set(CCCR, self.bank.get(CCCR) | RESTRICTED);
         self.raise(1 << 17);
@@ -74,7 +74,7 @@ impl Fdcan {
         self.bank.set(IR, self.bank.get(IR) | flags);
     }
 
-    /// How long a bit is; `None` without a clock.
+    /// Bit time; `None` without a clock.
     pub fn bit(&self, clocks: Clocks) -> Option<Picos> {
         let timing = self.bank.get(NBTP);
         let quanta = 3 + (timing >> 8 & 0xFF) + (timing & 0x7F);
@@ -88,8 +88,8 @@ impl Fdcan {
             | u32::from(self.is_bus_off) << 7
     }
 
-    /// Does something to the error counters, and tells of a changed state.
-    fn count(&mut self, change: impl FnOnce(&mut Self)) {
+    /// Changes the error counters, and sets the flags of a changed error state.
+    fn update_errors(&mut self, change: impl FnOnce(&mut Self)) {
         let before = self.error_state();
         change(self);
         let changed = before ^ self.error_state();
@@ -97,7 +97,7 @@ impl Fdcan {
         self.raise(flag(5, EP) | flag(6, EW) | flag(7, BO));
     }
 
-    fn end(&mut self, index: u32, frame: Frame, attempt: Attempt, at: Picos) {
+    fn finish(&mut self, index: u32, frame: Frame, attempt: Attempt, at: Picos) {
         match attempt {
             Attempt::Acknowledged => {
                 self.bus.sent.push((at, frame));
@@ -106,20 +106,22 @@ impl Fdcan {
                 if self.bank.get(TXBTIE) & bit != 0 {
                     self.raise(TC);
                 }
-                self.count(|can| can.transmit_errors = can.transmit_errors.saturating_sub(1));
+                self.update_errors(|can| can.transmit_errors = can.transmit_errors.saturating_sub(1));
                 return;
             }
-            // An error-passive node that is alone does not count its missing acknowledges (ISO 11898-1).
+            // An error-passive node does not count missing acknowledges (ISO 11898-1).
             Attempt::NotAcknowledged if self.transmit_errors >= 128 => {}
-            Attempt::NotAcknowledged | Attempt::Disturbed => self.count(|can| can.transmit_errors += 8),
+            Attempt::NotAcknowledged | Attempt::Disturbed => {
+                self.update_errors(|can| can.transmit_errors += 8)
+            }
         }
         if self.transmit_errors > 255 {
-            self.count(|can| can.is_bus_off = true);
+            self.update_errors(|can| can.is_bus_off = true);
             self.is_on_bus = false;
             self.bank.set(CCCR, self.bank.get(CCCR) | INIT);
             self.bus.bus_offs.push(at);
         }
-        // It is sent again, before the others.
+        // It is retransmitted before the others.
         self.waiting.push_front(index);
     }
 }
@@ -135,7 +137,7 @@ impl Peripheral for Fdcan {
         &REGISTERS
     }
 
-    fn read(&mut self, offset: u32, at: &Moment<'_>) -> Result<u32, Refusal> {
+    fn read(&mut self, offset: u32, at: &Context<'_>) -> Result<u32, Refusal> {
         self.advance(at)?;
         let pending = self.waiting.iter().fold(0_u32, |bits, index| bits | 1 << index);
         let status = |fifo: usize| {
@@ -144,7 +146,7 @@ impl Peripheral for Fdcan {
             fill | get << 8 | put << 16 | u32::from(size > 0 && fill == size) << 24
         };
         Ok(match offset {
-            // From 128 on, RP says so in the place of REC's eighth bit.
+            // REC has 7 bits; from 128 on, RP is set.
             ECR => {
                 let passive = u32::from(self.receive_errors >= 128) << 15;
                 self.transmit_errors.min(255) | self.receive_errors.min(127) << 8 | passive
@@ -162,7 +164,7 @@ impl Peripheral for Fdcan {
         })
     }
 
-    fn write(&mut self, offset: u32, value: u32, at: &Moment<'_>) -> Result<(), Refusal> {
+    fn write(&mut self, offset: u32, value: u32, at: &Context<'_>) -> Result<(), Refusal> {
         self.advance(at)?;
         self.bank.check(offset, value)?;
         if PROTECTED.contains(&offset) && self.bank.get(CCCR) & (INIT | CCE) != INIT | CCE {
@@ -176,7 +178,7 @@ impl Peripheral for Fdcan {
             }
             TXBAR => self.request(value),
             TXBCR => {
-                // What is on the bus is ended first ("Transmit cancellation"); what waits is forgotten at once.
+                // A frame on the bus is completed; pending ones are cancelled at once ("Transmit cancellation").
                 let is_meant = |index: &u32| value >> index & 1 != 0;
                 let cancelled = self.waiting.iter().filter(|index| is_meant(index));
                 let bits = cancelled.fold(0, |bits, index| bits | 1 << index);
@@ -185,24 +187,24 @@ impl Peripheral for Fdcan {
                 self.raise(if bits & self.bank.get(0xE4) != 0 { TCF } else { 0 });
                 Ok(())
             }
-            _ if offset == RXFA[0] => self.take(0, value),
-            _ if offset == RXFA[1] => self.take(1, value),
+            _ if offset == RXFA[0] => self.acknowledge(0, value),
+            _ if offset == RXFA[1] => self.acknowledge(1, value),
             _ => self.bank.write(offset, value),
         }
     }
 
-    fn advance(&mut self, at: &Moment<'_>) -> Result<(), Refusal> {
-        if let Some((is_init, when)) = self.init_arrives
+    fn advance(&mut self, at: &Context<'_>) -> Result<(), Refusal> {
+        if let Some((is_init, when)) = self.init_change
             && at.now >= when
         {
-            self.init_arrives = None;
+            self.init_change = None;
             self.bank.set(CCCR, self.bank.get(CCCR) & !INIT | u32::from(is_init));
             let bit = self.bit(at.clocks).unwrap_or(0);
             if is_init {
                 self.is_on_bus = false;
                 self.recovers = None;
                 if self.sending.is_some() {
-                    self.forget();
+                    self.cancel_all();
                 }
             } else if self.is_bus_off {
                 self.recovers = Some(when + 129 * 11 * bit);
@@ -215,7 +217,7 @@ impl Peripheral for Fdcan {
         {
             self.recovers = None;
             self.is_on_bus = true;
-            self.count(|can| {
+            self.update_errors(|can| {
                 can.is_bus_off = false;
                 can.transmit_errors = 0;
                 can.receive_errors = 0;
@@ -227,7 +229,7 @@ impl Peripheral for Fdcan {
                 && at.now >= until
             {
                 self.sending = None;
-                self.end(index, frame, attempt, until);
+                self.finish(index, frame, attempt, until);
                 continue;
             }
             let can_send = self.is_on_bus && self.bank.get(CCCR) & RESTRICTED == 0;
@@ -243,27 +245,29 @@ impl Peripheral for Fdcan {
             let Some(arrival) = self.bus.arrival(at.now) else { break };
             match arrival {
                 Arrival::Frame(frame) if self.is_on_bus && self.bus.is_understood(bit) => {
-                    self.bus.heard += 1;
-                    // Out of error-passive at once (ISO 11898-1).
-                    self.count(|can| can.receive_errors = can.receive_errors.saturating_sub(1).min(127));
+                    self.bus.received += 1;
+                    // A received frame ends error-passive (ISO 11898-1).
+                    self.update_errors(|can| {
+                        can.receive_errors = can.receive_errors.saturating_sub(1).min(127)
+                    });
                     self.store(&frame);
                 }
-                Arrival::Broken if self.is_on_bus => {
-                    self.count(|can| can.receive_errors = (can.receive_errors + 1).min(128));
+                Arrival::ErrorFrame if self.is_on_bus => {
+                    self.update_errors(|can| can.receive_errors = (can.receive_errors + 1).min(128));
                 }
-                Arrival::Frame(_) | Arrival::Broken => self.bus.missed += 1,
+                Arrival::Frame(_) | Arrival::ErrorFrame => self.bus.missed += 1,
             }
         }
         Ok(())
     }
 
-    fn deadline(&self, _: &Moment<'_>) -> Option<Picos> {
+    fn deadline(&self, _: &Context<'_>) -> Option<Picos> {
         let sent = self.sending.map(|(.., until)| until);
-        let init = self.init_arrives.map(|(_, when)| when);
+        let init = self.init_change.map(|(_, when)| when);
         [sent, init, self.recovers, self.bus.next_arrival()].into_iter().flatten().min()
     }
 
-    fn interrupts(&self) -> bool {
+    fn interrupt_line(&self) -> bool {
         self.bank.get(IR) & self.bank.get(IE) & !self.bank.get(0x58) != 0 && self.bank.get(ILE) & 1 != 0
     }
 

@@ -1,16 +1,16 @@
-//! Flash's interface, and what its cells allow. RM0433, "Embedded Flash memory".
+//! The flash interface and its memory. RM0433, "Embedded Flash memory".
 //!
-//! A flash word has 32 bytes and check bits. It is written whole, once after its sector was erased: written
-//! twice, or cut off in the middle, its check bits do not match, and reading it is a bus fault. Sectors have
-//! 128 KiB. Strict: the keys, LOCK, PG before a write, words that are written whole and one at a time,
-//! nothing changed in a register while the bank is busy, wait states for the clock.
+//! A flash word has 32 bytes and an ECC. It is programmed as a whole, once after its sector (128 KiB) was
+//! erased. If it is programmed twice or interrupted, the ECC does not match, and reading it is a bus fault.
+//! Refused: wrong keys, writes with LOCK set or without PG, incomplete flash words, register changes while the
+//! bank is busy, and too few wait states for the clock.
 
 use std::collections::BTreeSet;
 
 use crate::device::*;
 
 const ACR: u32 = 0x00;
-/// Of each bank.
+// Registers of bank 1; those of bank 2 are SECOND_BANK above.
 const KEYR: u32 = 0x04;
 const CR: u32 = 0x0C;
 const SR: u32 = 0x10;
@@ -18,16 +18,16 @@ const CCR: u32 = 0x14;
 const SECOND_BANK: u32 = 0x100;
 
 static REGISTERS: [Register; 10] = [
-    keeps(ACR, "ACR", 0x37, 0x3F),
-    does(KEYR, "KEYR1", !0),
-    keeps(CR, "CR1", 0x31, 0x0FEF_07FF),
-    reads(SR, "SR1", 0),
-    does(CCR, "CCR1", 0x0FEF_0000),
-    keeps(SECOND_BANK + ACR, "ACR", 0x37, 0x3F),
-    does(SECOND_BANK + KEYR, "KEYR2", !0),
-    keeps(SECOND_BANK + CR, "CR2", 0x31, 0x0FEF_07FF),
-    reads(SECOND_BANK + SR, "SR2", 0),
-    does(SECOND_BANK + CCR, "CCR2", 0x0FEF_0000),
+    read_write(ACR, "ACR", 0x37, 0x3F),
+    command(KEYR, "KEYR1", !0),
+    read_write(CR, "CR1", 0x31, 0x0FEF_07FF),
+    read_only(SR, "SR1", 0),
+    command(CCR, "CCR1", 0x0FEF_0000),
+    read_write(SECOND_BANK + ACR, "ACR", 0x37, 0x3F),
+    command(SECOND_BANK + KEYR, "KEYR2", !0),
+    read_write(SECOND_BANK + CR, "CR2", 0x31, 0x0FEF_07FF),
+    read_only(SECOND_BANK + SR, "SR2", 0),
+    command(SECOND_BANK + CCR, "CCR2", 0x0FEF_0000),
 ];
 
 const LOCK: u32 = 1;
@@ -48,7 +48,7 @@ const BANK: u32 = 0x10_0000;
 const ERASE: Picos = 1_000 * MILLI;
 const PROGRAM: Picos = 100 * MICRO;
 
-/// What a bank does at the moment.
+/// An operation of a bank.
 #[derive(Debug, Clone, PartialEq, Eq)]
 enum Work {
     Erase { first: u32, until: Picos },
@@ -65,12 +65,12 @@ impl Work {
 
 #[derive(Debug, Default)]
 struct Half {
-    /// Right keys so far; none are taken behind a wrong one.
+    /// Number of correct keys so far.
     keys: Option<usize>,
-    is_shut: bool,
+    is_locked_out: bool,
     flags: u32,
     work: Option<Work>,
-    /// The flash word that is being collected: its address, its bytes, which of them are there.
+    /// The write buffer: address of the flash word, its bytes, and which of them were written.
     collected: Option<(u32, [u8; 32], u32)>,
 }
 
@@ -80,16 +80,16 @@ pub struct Flash {
     bank: Bank,
     halves: [Half; 2],
     cells: Vec<u8>,
-    /// Flash words whose check bits do not match, as offsets.
+    /// Offsets of the flash words whose ECC does not match.
     torn: BTreeSet<u32>,
-    /// Ranges that have changed since somebody asked.
+    /// Ranges that have changed since [`Flash::take_changed`].
     changed: Vec<(u32, u32)>,
-    /// Sectors that were erased.
+    /// Number of erased sectors.
     pub erases: u64,
 }
 
 impl Flash {
-    /// Both banks erased.
+    /// Both banks are erased.
     pub fn new() -> Self {
         Self {
             bank: Bank::new(&REGISTERS),
@@ -101,33 +101,33 @@ impl Flash {
         }
     }
 
-    /// Puts bytes there, as a debugger does.
+    /// Programs bytes without checks, like a debugger.
     pub fn load(&mut self, offset: u32, bytes: &[u8]) {
         self.cells[offset as usize..][..bytes.len()].copy_from_slice(bytes);
     }
 
-    /// What the cells hold.
+    /// The contents of both banks.
     pub fn cells(&self) -> &[u8] {
         &self.cells
     }
 
-    /// A flash word's check bits do not match from now on.
+    /// Makes the ECC of a flash word invalid.
     pub fn tear(&mut self, offset: u32) {
         self.torn.insert(offset & !(WORD - 1));
     }
 
-    /// Flash words that cannot be read.
+    /// Offsets of the flash words whose ECC does not match.
     pub fn torn(&self) -> impl Iterator<Item = u32> {
         self.torn.iter().copied()
     }
 
-    /// What has changed since this was asked last: offset and length.
+    /// The ranges that have changed since the last call: offset and length.
     pub fn take_changed(&mut self) -> Vec<(u32, u32)> {
         std::mem::take(&mut self.changed)
     }
 
-    /// Power fails now: a word that is being written is torn, a sector that is being erased as a whole.
-    pub fn cut(&mut self) {
+    /// A power failure: tears the flash word being programmed, or the whole sector being erased.
+    pub fn lose_power(&mut self) {
         for half in &mut self.halves {
             let (first, len) = match half.work.take() {
                 Some(Work::Erase { first, .. }) => (first, SECTOR),
@@ -138,10 +138,10 @@ impl Flash {
         }
     }
 
-    /// Whether its wait states are enough for this bus clock, at the highest voltage but one (VOS1).
+    /// Checks the wait states for this bus clock, at VOS1.
     ///
     /// # Errors
-    /// They are not.
+    /// There are too few.
     pub fn check_speed(&self, hclk: u32) -> Result<(), Refusal> {
         let (latency, delay) = (self.bank.get(ACR) & 0xF, self.bank.get(ACR) >> 4 & 3);
         let needed = match hclk {
@@ -157,10 +157,10 @@ impl Flash {
         Ok(())
     }
 
-    /// The program writes to flash itself.
+    /// A write by the program to flash memory.
     ///
     /// # Errors
-    /// The bank is locked, not set to programming or busy; the word is not erased, or written in pieces.
+    /// PG is 0, the bank is busy, or the flash word is not erased or not written as a whole.
     pub fn program(&mut self, offset: u32, bytes: &[u8], now: Picos) -> Result<(), Refusal> {
         let index = (offset / BANK) as usize;
         let control = self.bank.get(CR + SECOND_BANK * index as u32);
@@ -220,8 +220,8 @@ impl Flash {
     fn unlock(&mut self, index: usize, key: u32) -> Result<(), Refusal> {
         let half = &mut self.halves[index];
         let right = half.keys.unwrap_or(0);
-        if half.is_shut || KEYS.get(right) != Some(&key) {
-            half.is_shut = true;
+        if half.is_locked_out || KEYS.get(right) != Some(&key) {
+            half.is_locked_out = true;
             return refuse("a wrong key: the bank stays locked until a reset");
         }
         half.keys = Some(right + 1);
@@ -259,7 +259,7 @@ impl Peripheral for Flash {
         &REGISTERS
     }
 
-    fn read(&mut self, offset: u32, at: &Moment<'_>) -> Result<u32, Refusal> {
+    fn read(&mut self, offset: u32, at: &Context<'_>) -> Result<u32, Refusal> {
         self.advance(at)?;
         let half = &self.halves[usize::from(offset >= SECOND_BANK)];
         match offset % SECOND_BANK {
@@ -272,7 +272,7 @@ impl Peripheral for Flash {
         }
     }
 
-    fn write(&mut self, offset: u32, value: u32, at: &Moment<'_>) -> Result<(), Refusal> {
+    fn write(&mut self, offset: u32, value: u32, at: &Context<'_>) -> Result<(), Refusal> {
         self.advance(at)?;
         let index = usize::from(offset >= SECOND_BANK);
         match offset % SECOND_BANK {
@@ -287,7 +287,7 @@ impl Peripheral for Flash {
         }
     }
 
-    fn advance(&mut self, at: &Moment<'_>) -> Result<(), Refusal> {
+    fn advance(&mut self, at: &Context<'_>) -> Result<(), Refusal> {
         for index in 0..2 {
             if let Some(work) = self.halves[index].work.take_if(|work| at.now >= work.until()) {
                 self.halves[index].flags |= EOP;
@@ -297,13 +297,13 @@ impl Peripheral for Flash {
         Ok(())
     }
 
-    fn deadline(&self, _: &Moment<'_>) -> Option<Picos> {
+    fn deadline(&self, _: &Context<'_>) -> Option<Picos> {
         self.halves.iter().filter_map(|half| half.work.as_ref().map(Work::until)).min()
     }
 
-    /// What is in the middle of being written is lost.
+    /// An operation in progress is interrupted.
     fn reset(&mut self) {
-        self.cut();
+        self.lose_power();
         self.bank = Bank::new(&REGISTERS);
         self.halves = Default::default();
     }
@@ -315,8 +315,8 @@ mod tests {
 
     static NONE: Functions = [[None; 16]; 11];
 
-    fn at(now: Picos) -> Moment<'static> {
-        Moment { now, clocks: Clocks::default(), functions: &NONE, is_rmii: false }
+    fn at(now: Picos) -> Context<'static> {
+        Context { now, clocks: Clocks::default(), functions: &NONE, is_rmii: false }
     }
 
     fn unlocked() -> Flash {

@@ -1,7 +1,7 @@
 //! GPIO ports A to K. RM0433, "General-purpose I/Os".
 //!
-//! Outputs are kept with the time at which they changed; inputs read 1, as nothing drives them. What
-//! function a pin has is what other models ask.
+//! Changes of outputs are recorded with their times. Inputs read 1, as nothing drives them. Other models
+//! check the alternate functions of their pins.
 
 use crate::device::*;
 
@@ -14,42 +14,42 @@ const AFRL: u32 = 0x20;
 const AFRH: u32 = 0x24;
 
 static REGISTERS: [Register; 9] = [
-    keeps(MODER, "MODER", !0, !0),
-    keeps(0x04, "OTYPER", 0, 0xFFFF),
-    keeps(0x08, "OSPEEDR", 0, !0),
-    keeps(0x0C, "PUPDR", 0, !0),
-    reads(IDR, "IDR", 0xFFFF),
-    keeps(ODR, "ODR", 0, 0xFFFF),
-    does(BSRR, "BSRR", !0),
-    keeps(AFRL, "AFRL", 0, !0),
-    keeps(AFRH, "AFRH", 0, !0),
+    read_write(MODER, "MODER", !0, !0),
+    read_write(0x04, "OTYPER", 0, 0xFFFF),
+    read_write(0x08, "OSPEEDR", 0, !0),
+    read_write(0x0C, "PUPDR", 0, !0),
+    read_only(IDR, "IDR", 0xFFFF),
+    read_write(ODR, "ODR", 0, 0xFFFF),
+    command(BSRR, "BSRR", !0),
+    read_write(AFRL, "AFRL", 0, !0),
+    read_write(AFRH, "AFRH", 0, !0),
 ];
 
 /// One port.
 #[derive(Debug)]
 pub struct Port {
     bank: Bank,
-    /// Each change of an output: when, which pin, to what.
+    /// Changes of outputs: time, pin, level.
     pub changes: Vec<(Picos, u8, bool)>,
-    /// Each time that a pin got another mode: when, which pin, the mode.
+    /// Changes of modes: time, pin, mode.
     pub modes: Vec<(Picos, u8, Mode)>,
 }
 
-/// What a pin is.
+/// The mode of a pin.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Mode {
-    /// Read by the program.
+    /// Input.
     Input,
-    /// Set by it.
+    /// General-purpose output.
     Output,
-    /// A peripheral's.
+    /// Alternate function.
     Function(u8),
-    /// Not connected to anything digital.
+    /// Analog.
     Analog,
 }
 
 impl Port {
-    /// As after power came. Port A and B have debug pins.
+    /// The state after power-on: ports A and B have debug pins.
     pub fn new(letter: char) -> Self {
         let mut bank = Bank::new(&REGISTERS);
         let (mode, speed, pull) = match letter {
@@ -63,7 +63,7 @@ impl Port {
         Self { bank, changes: Vec::new(), modes: Vec::new() }
     }
 
-    /// What a pin is now.
+    /// The mode of a pin.
     pub fn mode(&self, pin: u8) -> Mode {
         match self.bank.get(MODER) >> (2 * pin) & 3 {
             0 => Mode::Input,
@@ -76,12 +76,12 @@ impl Port {
         }
     }
 
-    /// What an output shows.
+    /// The level of an output; `None` in other modes.
     pub fn output(&self, pin: u8) -> Option<bool> {
         (self.mode(pin) == Mode::Output).then(|| self.bank.get(ODR) >> pin & 1 != 0)
     }
 
-    /// Which alternate function each pin has.
+    /// The alternate function of each pin.
     pub fn functions(&self) -> [Option<u8>; 16] {
         std::array::from_fn(|pin| match self.mode(pin as u8) {
             Mode::Function(function) => Some(function),
@@ -95,7 +95,7 @@ impl Peripheral for Port {
         &REGISTERS
     }
 
-    fn read(&mut self, offset: u32, _: &Moment<'_>) -> Result<u32, Refusal> {
+    fn read(&mut self, offset: u32, _: &Context<'_>) -> Result<u32, Refusal> {
         match offset {
             BSRR => refuse("can only be written"),
             LCKR => refuse("locks are not modelled"),
@@ -103,11 +103,11 @@ impl Peripheral for Port {
         }
     }
 
-    fn write(&mut self, offset: u32, value: u32, at: &Moment<'_>) -> Result<(), Refusal> {
+    fn write(&mut self, offset: u32, value: u32, at: &Context<'_>) -> Result<(), Refusal> {
         let outputs = self.bank.get(ODR);
         let modes: [Mode; 16] = std::array::from_fn(|pin| self.mode(pin as u8));
         if offset == BSRR {
-            // Setting comes before resetting (BSRR).
+            // If both bits of a pin are written, set wins (BSRR).
             self.bank.set(ODR, outputs & !(value >> 16) | value & 0xFFFF);
         } else {
             self.bank.write(offset, value)?;
@@ -128,7 +128,7 @@ impl Peripheral for Port {
         for (offset, value) in [(ODR, 0), (AFRL, 0), (AFRH, 0), (0x04, 0)] {
             self.bank.set(offset, value);
         }
-        // Debug pins included: nobody asks for them.
+        // Also the debug pins, which no model uses.
         self.bank.set(MODER, !0);
     }
 }

@@ -1,4 +1,4 @@
-//! An RS-485 line: what the chip put on it, and what others do.
+//! An RS-485 line: what the chip and other devices send.
 
 use std::collections::VecDeque;
 
@@ -13,22 +13,22 @@ pub struct Sent {
     pub start: Picos,
     /// The end of its last stop bit.
     pub end: Picos,
-    /// How long each bit was.
+    /// Bit time.
     pub bit: Picos,
-    /// Its parity bit, if there is one.
+    /// Parity bit; `None` without parity.
     pub parity: Option<bool>,
-    /// How many there were.
+    /// Number of stop bits.
     pub stop_bits: u8,
-    /// The driver was on from its beginning to its end: otherwise nobody has heard it.
+    /// Whether the driver was enabled from its start to its end; otherwise it did not reach the line.
     pub is_driven: bool,
 }
 
-/// How another device sends.
+/// The serial format of another device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Format {
     /// Bit/s.
     pub baud: u32,
-    /// `Some(true)` for odd.
+    /// `None` without parity, `Some(true)` for odd parity.
     pub odd_parity: Option<bool>,
     /// 1 or 2.
     pub stop_bits: u8,
@@ -37,22 +37,22 @@ pub struct Format {
 /// The line.
 #[derive(Debug, Default)]
 pub struct Line {
-    /// What the chip has sent.
+    /// Characters sent by the chip.
     pub sent: Vec<Sent>,
-    /// Each change of driver-enable, as the transceiver sees it.
+    /// Each change of driver-enable at the transceiver.
     pub driver: Vec<(Picos, bool)>,
-    /// A pair of wires for each direction: the chip hears others while it sends.
+    /// A pair of wires for each direction: the chip receives while it sends.
     pub has_four_wires: bool,
-    /// What others do: edges and the level behind them. At rest it is high.
+    /// The edges of other devices, each with the level after it. An idle line is high.
     edges: VecDeque<(Picos, bool)>,
-    /// It is low before the first edge that is kept.
+    /// The level before the first of `edges` is low.
     is_low: bool,
-    /// Up to here the receiver has heard it.
-    heard: Picos,
+    /// The receiver has sampled the line up to this time.
+    consumed: Picos,
 }
 
 impl Line {
-    /// Another device sends these bytes, one behind the other, from then on. Returns when it has ended.
+    /// Another device sends these bytes without gaps, starting at `from`. Returns the end of the last.
     pub fn send(&mut self, from: Picos, bytes: &[u8], format: Format) -> Picos {
         bytes.iter().fold(from, |start, byte| {
             let parity = format.odd_parity.map(|is_odd| byte.count_ones().is_multiple_of(2) == is_odd);
@@ -64,7 +64,7 @@ impl Line {
         })
     }
 
-    /// Levels of so long each, from then on; the line is at rest behind them.
+    /// Another device drives these levels, `bit` long each, starting at `from`; then the line is idle.
     pub fn put(&mut self, from: Picos, bit: Picos, bits: &[bool]) -> Picos {
         let mut before = self.edges.back().is_none_or(|(_, level)| *level);
         for (index, level) in (0..).zip(bits) {
@@ -86,40 +86,40 @@ impl Line {
         }
     }
 
-    /// Takes out what the chip has sent, and forgets what the driver did before.
+    /// Removes what the chip has sent, and the old changes of driver-enable.
     pub fn take_sent(&mut self) -> std::vec::Drain<'_, Sent> {
         let old = self.driver.len().saturating_sub(DRIVER_KEPT);
         self.driver.drain(..old);
         self.sent.drain(..)
     }
 
-    /// Whether the chip's driver was on at that time.
+    /// Whether driver-enable was active at a time.
     pub fn is_driven(&self, at: Picos) -> bool {
         let behind = self.driver.partition_point(|(time, _)| *time <= at);
-        // At the very edge it is on.
+        // At the time of an edge it counts as active.
         let before = behind.checked_sub(1).map(|index| self.driver[index]);
         before.is_some_and(|(time, is_on)| is_on || time == at)
     }
 
-    /// What the chip's receiver sees: nothing of its own transmission.
+    /// The level at the chip's receiver, which is off while the chip's own driver is on.
     pub(super) fn level(&self, at: Picos) -> bool {
         let last = self.edges.iter().take_while(|(time, _)| *time <= at).last();
         !self.has_four_wires && self.is_driven(at) || last.map_or(!self.is_low, |(_, level)| *level)
     }
 
-    /// The next falling edge that is not heard yet.
+    /// The next falling edge that was not sampled yet, up to `now`.
     pub(super) fn start_bit(&self, now: Picos) -> Option<Picos> {
-        let falls = self.edges.iter().find(|(time, level)| !level && *time >= self.heard);
+        let falls = self.edges.iter().find(|(time, level)| !level && *time >= self.consumed);
         falls.map(|(time, _)| *time).filter(|time| *time <= now)
     }
 
-    /// As above, ahead too.
+    /// The same, also in the future.
     pub(super) fn next_start_bit(&self) -> Option<Picos> {
         self.start_bit(Picos::MAX)
     }
 
-    pub(super) fn heard(&mut self, until: Picos) {
-        self.heard = until;
+    pub(super) fn consume(&mut self, until: Picos) {
+        self.consumed = until;
         while let Some(&(time, level)) = self.edges.front()
             && time < until
         {
@@ -129,5 +129,5 @@ impl Line {
     }
 }
 
-/// Changes of driver-enable that are left when what was sent is taken out: more than a character has.
+/// Changes of driver-enable that [`Line::take_sent`] keeps: more than one character has.
 const DRIVER_KEPT: usize = 16;

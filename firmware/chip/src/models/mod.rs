@@ -1,4 +1,4 @@
-//! The models, one file each.
+//! The models of the peripherals, and of what is connected to the pins.
 
 pub mod can_bus;
 pub mod ethernet;

@@ -1,10 +1,9 @@
-//! RCC: oscillators, PLL1, the clock tree, clock gates and resets. RM0433, "Reset and clock
-//! control".
+//! RCC: oscillators, PLL1, the clock tree, clock gates and resets. RM0433, "Reset and clock control".
 //!
-//! Strict: writes that the hardware ignores are ignored here too (PLLSRC and DIVM1 while a PLL runs,
-//! at PLLCKSELR); the system clock is switched only to a clock that is ready (at CFGR.SW). A peripheral may
-//! be used when its clock is on and its reset is not; and not right behind the write that switched it on,
-//! which takes two cycles of its bus ("Peripheral clock gating"): something has to be read in between.
+//! Writes that the hardware ignores are ignored (PLLSRC and DIVM1 while PLL1 is on). Refused: a switch of the
+//! system clock to a clock that is not ready, and accesses to a peripheral whose clock is off or that is held
+//! in reset. Enabling a clock takes two bus cycles ("Peripheral clock gating"), so a read must come between
+//! that and the first access.
 
 mod registers;
 mod tree;
@@ -12,17 +11,17 @@ mod tree;
 use self::registers::*;
 use crate::device::*;
 
-/// What has to be on before a peripheral may be used: the enable register's offset, and the bits.
+/// The clock enable of a peripheral.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Gate {
-    /// RCC's register.
+    /// Offset of the enable register.
     pub enable: u32,
-    /// All of them.
+    /// Its bits, of which all must be set.
     pub bits: u32,
 }
 
 impl Gate {
-    /// The reset register has the peripheral at the same bit.
+    /// Offset of the reset register, in which the peripheral has the same bits.
     fn reset(self) -> u32 {
         self.enable - 0x58
     }
@@ -32,25 +31,25 @@ impl Gate {
 #[derive(Debug)]
 pub struct Rcc {
     bank: Bank,
-    /// The board's 8 MHz arrive.
+    /// Whether the board provides the external 8 MHz clock.
     pub has_external: bool,
-    /// When each oscillator is ready; by the place of its ready flag.
+    /// Ready flag of each oscillator, and when it is set.
     ready: [(u32, Picos); 5],
     low_speed: Option<Picos>,
-    /// Just switched on, with nothing read since.
+    /// Clocks that were enabled and not followed by a read yet.
     fresh: Option<Gate>,
 }
 
-/// The bits of oscillators in CR: on, ready, and how long it takes (datasheet DS12110, 6.3.9 to 6.3.11).
+/// Oscillators in CR: enable bit, ready flag, start-up time (datasheet DS12110).
 const OSCILLATORS: [(u32, u32, Picos); 5] =
     [(0, 2, 2 * MICRO), (7, 8, 3 * MICRO), (12, 13, 4 * MICRO), (16, 17, 2 * MICRO), (24, 25, 100 * MICRO)];
 /// HSEBYP.
 const BYPASS: u32 = 1 << 18;
-/// LSI, longest.
+/// Longest start-up time of LSI.
 const LOW_SPEED: Picos = 130 * MICRO;
 
 impl Rcc {
-    /// As after power came.
+    /// The state after power-on.
     pub fn new() -> Self {
         let mut rcc = Self {
             bank: Bank::new(&REGISTERS),
@@ -63,17 +62,17 @@ impl Rcc {
         rcc
     }
 
-    /// The watchdog's reset: its flag is set (RSR).
+    /// A reset by the watchdog, which sets a flag in RSR.
     pub fn reset_by_watchdog(&mut self) {
         let causes = self.bank.get(RSR) | 1 << 26;
         self.reset();
         self.bank.set(RSR, causes);
     }
 
-    /// Whether a peripheral may be used now.
+    /// Checks that a peripheral may be accessed.
     ///
     /// # Errors
-    /// Why not.
+    /// Its clock is off or was enabled just now, or it is held in reset.
     pub fn check(&self, gate: Gate) -> Result<(), Refusal> {
         if self.bank.get(gate.enable) & gate.bits != gate.bits {
             return refuse("its clock is off");
@@ -82,27 +81,27 @@ impl Rcc {
             return refuse("it is held in reset");
         }
         if self.fresh.is_some_and(|fresh| fresh.enable == gate.enable && fresh.bits & gate.bits != 0) {
-            return refuse("its clock was switched on right before: read something back first");
+            return refuse("its clock was enabled just before: a read must come first");
         }
         Ok(())
     }
 
-    /// Something was read: a clock that was switched on before runs.
+    /// A read: clocks that were enabled before it are running now.
     pub fn settle(&mut self) {
         self.fresh = None;
     }
 
-    /// Whether LSI runs, which the watchdog needs.
+    /// Whether LSI is ready.
     pub fn low_speed_runs(&self, now: Picos) -> bool {
         self.low_speed.is_some_and(|ready| now >= ready)
     }
 
-    /// Whether the peripheral is held in reset.
+    /// Whether a peripheral is held in reset.
     pub fn is_held(&self, gate: Gate) -> bool {
         self.bank.get(gate.reset()) & gate.bits != 0
     }
 
-    /// The watchdog switches LSI on.
+    /// Starts LSI, unless it runs.
     pub fn start_low_speed(&mut self, now: Picos) {
         let _ = self.low_speed.get_or_insert(now + LOW_SPEED);
     }
@@ -128,7 +127,7 @@ impl Rcc {
                 continue;
             }
             let runs = match flag {
-                // What arrives is a clock and no crystal.
+                // The board has an external clock, not a crystal.
                 17 => self.has_external && value & BYPASS != 0,
                 25 => self.check_pll(now).map(|()| true)?,
                 _ => true,
@@ -149,7 +148,7 @@ impl Rcc {
 
     fn ready_flags(&self, now: Picos) -> u32 {
         let ready = self.ready.iter().filter(|(_, from)| now >= *from);
-        // The clocks of both domains run as soon as there is one.
+        // D1CKRDY and D2CKRDY.
         ready.fold(1 << 14 | 1 << 15, |flags, (flag, _)| flags | 1 << flag)
     }
 }
@@ -165,7 +164,7 @@ impl Peripheral for Rcc {
         &REGISTERS
     }
 
-    fn read(&mut self, offset: u32, at: &Moment<'_>) -> Result<u32, Refusal> {
+    fn read(&mut self, offset: u32, at: &Context<'_>) -> Result<u32, Refusal> {
         let value = self.bank.read(offset)?;
         Ok(match offset {
             CR => value | self.ready_flags(at.now),
@@ -175,7 +174,7 @@ impl Peripheral for Rcc {
         })
     }
 
-    fn write(&mut self, offset: u32, value: u32, at: &Moment<'_>) -> Result<(), Refusal> {
+    fn write(&mut self, offset: u32, value: u32, at: &Context<'_>) -> Result<(), Refusal> {
         match offset {
             CR => {
                 let value = value & !0x2A02_E124;
@@ -196,13 +195,13 @@ impl Peripheral for Rcc {
                 Ok(())
             }
             PLLCKSELR => {
-                // What is locked while PLL1 is on stays as it is (PLLSRC, DIVM1).
+                // PLLSRC and DIVM1 are locked while PLL1 is on.
                 let locked = if self.bank.get(CR) & 1 << 24 != 0 { 0x3F3 } else { 0 };
                 let value = value & !locked | self.bank.get(PLLCKSELR) & locked;
                 self.bank.write(PLLCKSELR, value)
             }
             PLLCFGR | PLL1DIVR if self.bank.get(CR) & 1 << 24 != 0 => {
-                // Only what belongs to PLL2 and PLL3 may change.
+                // Only fields of PLL2 and PLL3 may change.
                 let changed = value ^ self.bank.get(offset);
                 if offset == PLL1DIVR || changed & 0x7_000F != 0 {
                     return refuse("PLL1 is on");
@@ -230,7 +229,6 @@ impl Peripheral for Rcc {
                 if ENABLES.contains(&offset) && value & !before != 0 {
                     self.fresh = Some(Gate { enable: offset, bits: value & !before });
                 }
-                debug_assert!(!RESETS.contains(&offset) || !ENABLES.contains(&offset));
                 Ok(())
             }
         }

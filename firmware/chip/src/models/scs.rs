@@ -1,7 +1,7 @@
 //! The core's own registers: NVIC, SysTick, fault status, MPU. Armv7-M ARM sections B3.2 (system control),
-//! B3.3 (SysTick), B3.4 (NVIC), B3.5 (MPU); priorities by B1.5.4, with the four bits that the chip has.
+//! B3.3 (SysTick), B3.4 (NVIC), B3.5 (MPU); priorities by B1.5.4, with the chip's four bits.
 //!
-//! Of the MPU's regions only one that closes a range to everybody is modelled: the stack's guard.
+//! The only MPU region modelled is one without access rights: the stack guard.
 
 use crate::device::*;
 
@@ -24,41 +24,41 @@ const PRIORITIES: std::ops::Range<u32> = 0x400..0x400 + LINES as u32;
 const SYSTEM_PRIORITIES: std::ops::Range<u32> = 0xD18..0xD24;
 
 static REGISTERS: [Register; 25] = [
-    keeps(CSR, "SYST_CSR", 0, 7),
-    keeps(RVR, "SYST_RVR", 0, 0xFF_FFFF),
-    keeps(CVR, "SYST_CVR", 0, !0),
-    reads(0xD00, "CPUID", 0x411F_C271),
-    does(ICSR, "ICSR", 0x9E00_0000),
-    keeps(VTOR, "VTOR", 0x0800_0000, 0xFFFF_FF80),
-    keeps(AIRCR, "AIRCR", 0xFA05_0000, 0xFFFF_0707),
-    keeps(0xD10, "SCR", 0, 0x16),
-    keeps(CCR, "CCR", 0x4_0200, 0x7_031B),
-    keeps(0xD24, "SHCSR", 0, 0x7_FD8B),
-    does(CFSR, "CFSR", 0x30F_BFBB),
-    does(HFSR, "HFSR", 0xC000_0002),
-    keeps(MMFAR, "MMFAR", 0, !0),
-    keeps(BFAR, "BFAR", 0, !0),
-    reads(0xD78, "CLIDR", 0x0900_0003),
-    reads(0xD80, "CCSIDR", 0xF007_E019),
-    keeps(0xD84, "CSSELR", 0, 0xF),
-    keeps(0xD88, "CPACR", 0, 0x00F0_0000),
-    reads(0xD90, "MPU_TYPE", 0x1000),
-    keeps(MPU_CTRL, "MPU_CTRL", 0, 7),
-    keeps(0xD98, "MPU_RNR", 0, 0xF),
-    keeps(MPU_RBAR, "MPU_RBAR", 0, !0),
-    keeps(MPU_RASR, "MPU_RASR", 0, 0x173F_FF3F),
-    keeps(0xF34, "FPCCR", 0xC000_0000, 0xC000_0001),
-    does(0xF50, "ICIALLU", !0),
+    read_write(CSR, "SYST_CSR", 0, 7),
+    read_write(RVR, "SYST_RVR", 0, 0xFF_FFFF),
+    read_write(CVR, "SYST_CVR", 0, !0),
+    read_only(0xD00, "CPUID", 0x411F_C271),
+    command(ICSR, "ICSR", 0x9E00_0000),
+    read_write(VTOR, "VTOR", 0x0800_0000, 0xFFFF_FF80),
+    read_write(AIRCR, "AIRCR", 0xFA05_0000, 0xFFFF_0707),
+    read_write(0xD10, "SCR", 0, 0x16),
+    read_write(CCR, "CCR", 0x4_0200, 0x7_031B),
+    read_write(0xD24, "SHCSR", 0, 0x7_FD8B),
+    command(CFSR, "CFSR", 0x30F_BFBB),
+    command(HFSR, "HFSR", 0xC000_0002),
+    read_write(MMFAR, "MMFAR", 0, !0),
+    read_write(BFAR, "BFAR", 0, !0),
+    read_only(0xD78, "CLIDR", 0x0900_0003),
+    read_only(0xD80, "CCSIDR", 0xF007_E019),
+    read_write(0xD84, "CSSELR", 0, 0xF),
+    read_write(0xD88, "CPACR", 0, 0x00F0_0000),
+    read_only(0xD90, "MPU_TYPE", 0x1000),
+    read_write(MPU_CTRL, "MPU_CTRL", 0, 7),
+    read_write(0xD98, "MPU_RNR", 0, 0xF),
+    read_write(MPU_RBAR, "MPU_RBAR", 0, !0),
+    read_write(MPU_RASR, "MPU_RASR", 0, 0x173F_FF3F),
+    read_write(0xF34, "FPCCR", 0xC000_0000, 0xC000_0001),
+    command(0xF50, "ICIALLU", !0),
 ];
 
-/// Interrupt lines of the chip.
+/// Number of interrupt lines.
 pub const LINES: usize = 160;
-/// Numbers of exceptions.
+/// The number of the HardFault exception.
 pub const HARD_FAULT: u16 = 3;
 const SYSTICK: u16 = 15;
 const FIRST_LINE: u16 = 16;
 
-/// What the core's mask registers say.
+/// The core's mask registers.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Masks {
     /// PRIMASK.
@@ -75,22 +75,22 @@ pub struct Scs {
     bank: Bank,
     enabled: [u32; LINES / 32],
     pending: [u32; LINES / 32],
-    /// The level of each line, as peripherals hold it.
+    /// Level of each interrupt line.
     lines: [u32; LINES / 32],
     priorities: [u8; LINES],
     system_priorities: [u8; 12],
     systick_pends: bool,
     ticks: Option<Picos>,
-    /// Exceptions that are active, the outermost first.
+    /// Active exceptions, the outermost first.
     active: Vec<u16>,
     /// The event register (B1.5.18).
     pub event: bool,
-    /// Interrupts and exceptions that were taken, by number.
+    /// How often each exception was taken, by number.
     pub taken: Vec<u64>,
 }
 
 impl Scs {
-    /// As after a reset.
+    /// The state after a reset.
     pub fn new() -> Self {
         Self {
             bank: Bank::new(&REGISTERS),
@@ -107,36 +107,36 @@ impl Scs {
         }
     }
 
-    /// As after a reset, but for the counters.
+    /// Resets all but the counters.
     pub fn reset(&mut self) {
         let taken = std::mem::take(&mut self.taken);
         *self = Self { taken, ..Self::new() };
     }
 
-    /// The vector table.
+    /// Address of the vector table.
     pub fn vectors(&self) -> u32 {
         self.bank.get(VTOR)
     }
 
-    /// The range that nobody may touch, if it is closed now.
+    /// Start and size of the guard region, if the MPU enforces it now.
     pub fn guard(&self) -> Option<(u32, u32)> {
         let (control, region) = (self.bank.get(MPU_CTRL), self.bank.get(MPU_RASR));
         let is_off = control & 1 == 0 || region & 1 == 0;
-        // In a fault's handler the MPU is off (HFNMIENA).
+        // In the HardFault handler the MPU is off, unless HFNMIENA is set.
         if is_off || control & 2 == 0 && self.active.contains(&HARD_FAULT) {
             return None;
         }
         Some((self.bank.get(MPU_RBAR) & !0x1F, 2 << (region >> 1 & 31)))
     }
 
-    /// Whether bus faults are ignored: in a handler of faults, or with FAULTMASK (CCR.BFHFNMIGN).
+    /// Whether bus faults are ignored (CCR.BFHFNMIGN): in the HardFault handler, or with FAULTMASK.
     pub fn ignores_bus_faults(&self, masks: Masks) -> bool {
         self.bank.get(CCR) & 1 << 8 != 0 && self.priority(masks) < 0
     }
 
-    /// Notes a fault (CFSR, and the address for the bits that say that it is valid); a fault of its own
-    /// kind is off, so it escalates.
-    pub fn note_fault(&mut self, status: u32, address: u32, is_forced: bool) {
+    /// Sets the fault registers: CFSR, and the fault address if `status` declares it valid. All faults escalate to
+    /// HardFault, since the configurable ones are disabled.
+    pub fn record_fault(&mut self, status: u32, address: u32, is_single_step: bool) {
         self.bank.set(CFSR, self.bank.get(CFSR) | status);
         if status & 1 << 7 != 0 {
             self.bank.set(MMFAR, address);
@@ -144,12 +144,12 @@ impl Scs {
         if status & 1 << 15 != 0 {
             self.bank.set(BFAR, address);
         }
-        if is_forced {
+        if is_single_step {
             self.bank.set(HFSR, self.bank.get(HFSR) | 1 << 30);
         }
     }
 
-    /// The level of an interrupt line.
+    /// Sets the level of an interrupt line.
     pub fn set_line(&mut self, line: u16, level: bool) {
         let (word, bit) = (usize::from(line / 32), 1 << (line % 32));
         if level {
@@ -163,7 +163,7 @@ impl Scs {
         self.active.contains(&(line + FIRST_LINE))
     }
 
-    fn level(&self, number: u16) -> i16 {
+    fn priority_of(&self, number: u16) -> i16 {
         match number {
             HARD_FAULT => -1,
             4..=15 => i16::from(self.system_priorities[usize::from(number - 4)] >> 4),
@@ -173,7 +173,7 @@ impl Scs {
 
     /// The execution priority.
     fn priority(&self, masks: Masks) -> i16 {
-        let mut priority = self.active.iter().map(|number| self.level(*number)).min().unwrap_or(256);
+        let mut priority = self.active.iter().map(|number| self.priority_of(*number)).min().unwrap_or(256);
         if masks.basepri != 0 {
             priority = priority.min(i16::from(masks.basepri >> 4));
         }
@@ -183,8 +183,8 @@ impl Scs {
         if masks.faultmask { priority.min(-1) } else { priority }
     }
 
-    /// What is pending and enabled, the most urgent first.
-    pub fn wanted(&self) -> Option<u16> {
+    /// The pending and enabled exception of the highest priority.
+    pub fn most_urgent(&self) -> Option<u16> {
         let systick = self.systick_pends.then_some(SYSTICK);
         let lines = (0..LINES / 32).flat_map(|word| {
             let mut bits = (self.pending[word] | self.lines[word]) & self.enabled[word];
@@ -195,15 +195,15 @@ impl Scs {
             })
         });
         let lines = lines.filter(|line| !self.is_active(*line)).map(|line| line + FIRST_LINE);
-        systick.into_iter().chain(lines).min_by_key(|number| (self.level(*number), *number))
+        systick.into_iter().chain(lines).min_by_key(|number| (self.priority_of(*number), *number))
     }
 
-    /// The exception that is to be taken now.
+    /// The exception to be taken now.
     pub fn due(&self, masks: Masks) -> Option<u16> {
-        self.wanted().filter(|number| self.level(*number) < self.priority(masks))
+        self.most_urgent().filter(|number| self.priority_of(*number) < self.priority(masks))
     }
 
-    /// It is taken.
+    /// An exception is taken.
     pub fn enter(&mut self, number: u16) {
         if number == SYSTICK {
             self.systick_pends = false;
@@ -216,19 +216,19 @@ impl Scs {
         self.event = true;
     }
 
-    /// Its handler has returned.
+    /// The handler of the innermost exception returns.
     pub fn leave(&mut self) {
         self.active.pop();
         self.event = true;
     }
 
-    /// Whether a fault now would be one too many.
+    /// Whether a fault now locks up the core.
     pub fn would_lock_up(&self) -> bool {
         self.active.contains(&HARD_FAULT)
     }
 
-    /// Does what SysTick has to do by now.
-    pub fn advance(&mut self, at: &Moment<'_>) {
+    /// Lets SysTick carry out what is due.
+    pub fn advance(&mut self, at: &Context<'_>) {
         while let Some(next) = self.ticks
             && at.now >= next
         {
@@ -237,12 +237,12 @@ impl Scs {
         }
     }
 
-    fn tick_period(&self, at: &Moment<'_>) -> Picos {
+    fn tick_period(&self, at: &Context<'_>) -> Picos {
         let divider = if self.bank.get(CSR) & 4 != 0 { 1 } else { 8 };
         Picos::from(self.bank.get(RVR) + 1) * cycle(at.clocks.core / divider)
     }
 
-    /// When SysTick is due.
+    /// When SysTick reaches zero next.
     pub fn deadline(&self) -> Option<Picos> {
         self.ticks
     }
@@ -264,8 +264,8 @@ impl Scs {
     /// A read.
     ///
     /// # Errors
-    /// Not modelled.
-    pub fn read(&mut self, offset: u32, _: u32, _: &Moment<'_>) -> Result<u32, Refusal> {
+    /// The register is not modelled.
+    pub fn read(&mut self, offset: u32, _: u32, _: &Context<'_>) -> Result<u32, Refusal> {
         if NVIC.contains(&offset) {
             let word = (offset % 0x80 / 4) as usize;
             let table = if offset < 0x200 { &self.enabled } else { &self.pending };
@@ -284,18 +284,18 @@ impl Scs {
         match offset {
             ICSR => {
                 let active = self.active.last().copied().unwrap_or(0);
-                Ok(u32::from(active) | u32::from(self.wanted().unwrap_or(0)) << 12)
+                Ok(u32::from(active) | u32::from(self.most_urgent().unwrap_or(0)) << 12)
             }
             CVR => refuse("the present count is not modelled"),
             _ => self.bank.read(offset),
         }
     }
 
-    /// A write of so many bytes.
+    /// A write of `size` bytes.
     ///
     /// # Errors
-    /// Not modelled, or forbidden.
-    pub fn write(&mut self, offset: u32, value: u32, size: u32, at: &Moment<'_>) -> Result<(), Refusal> {
+    /// The register or the value is not modelled, or it is forbidden.
+    pub fn write(&mut self, offset: u32, value: u32, size: u32, at: &Context<'_>) -> Result<(), Refusal> {
         if NVIC.contains(&offset) {
             let Some(word) = Some((offset % 0x80 / 4) as usize).filter(|word| *word < LINES / 32) else {
                 return refuse("no such line");

@@ -1,8 +1,8 @@
-//! A general-purpose timer of 16 bits that counts up: TIM12, which keeps the program's time. RM0433,
-//! "General-purpose timers (TIM12/TIM13/TIM14)".
+//! A 16-bit general-purpose timer that counts up: TIM12, the program's time base. RM0433, "General-purpose
+//! timers (TIM12/TIM13/TIM14)".
 //!
-//! Flags are cleared by writing zeros; the counter may be written only while it stands, which is all that
-//! the program does.
+//! Flags are cleared by writing zeros. The counter may be written only while it is stopped, which is all that the
+//! program does.
 
 use crate::device::*;
 
@@ -16,33 +16,33 @@ const ARR: u32 = 0x2C;
 const CCR: [u32; 2] = [0x34, 0x38];
 
 static REGISTERS: [Register; 10] = [
-    keeps(CR1, "CR1", 0, 0xB8F),
-    keeps(DIER, "DIER", 0, 0x47),
-    keeps(SR, "SR", 0, 0x647),
-    does(EGR, "EGR", 0x47),
-    keeps(0x18, "CCMR1", 0, 0x0101_7F7F),
-    keeps(CNT, "CNT", 0, 0xFFFF),
-    keeps(PSC, "PSC", 0, 0xFFFF),
-    keeps(ARR, "ARR", 0xFFFF, 0xFFFF),
-    keeps(CCR[0], "CCR1", 0, 0xFFFF),
-    keeps(CCR[1], "CCR2", 0, 0xFFFF),
+    read_write(CR1, "CR1", 0, 0xB8F),
+    read_write(DIER, "DIER", 0, 0x47),
+    read_write(SR, "SR", 0, 0x647),
+    command(EGR, "EGR", 0x47),
+    read_write(0x18, "CCMR1", 0, 0x0101_7F7F),
+    read_write(CNT, "CNT", 0, 0xFFFF),
+    read_write(PSC, "PSC", 0, 0xFFFF),
+    read_write(ARR, "ARR", 0xFFFF, 0xFFFF),
+    read_write(CCR[0], "CCR1", 0, 0xFFFF),
+    read_write(CCR[1], "CCR2", 0, 0xFFFF),
 ];
 
 /// The model.
 #[derive(Debug)]
 pub struct Timer {
     bank: Bank,
-    /// When the counter was 0.
+    /// When the counter was 0 for the first time.
     zero: Picos,
-    /// Up to when events were looked for, in ticks since then.
+    /// Ticks since `zero` whose events were handled.
     seen: u64,
     tick: Picos,
-    /// The prescaler takes effect at an update.
+    /// The prescaler in effect: PSC is loaded at an update event.
     prescaler: u32,
 }
 
 impl Timer {
-    /// As after power came.
+    /// The state after power-on.
     pub fn new() -> Self {
         Self { bank: Bank::new(&REGISTERS), zero: 0, seen: 0, tick: 1, prescaler: 0 }
     }
@@ -55,18 +55,18 @@ impl Timer {
         now.saturating_sub(self.zero) / self.tick
     }
 
-    /// The counts at which something happens, with their flags: the overflow, and the compare channels.
+    /// Counts that set a flag, with the flag: overflow and the compare channels.
     fn events(&self) -> [(u64, u32); 3] {
         let compare = |channel: usize| u64::from(self.bank.get(CCR[channel]));
         [(0, 1), (compare(0), 2), (compare(1), 4)]
     }
 
-    fn look(&mut self, now: Picos) {
+    fn update(&mut self, now: Picos) {
         if !self.runs() {
             return;
         }
         let (from, to) = (self.seen, self.ticks(now));
-        // How often a count has come since the start.
+        // How often the counter has reached `count`.
         let often = |ticks: u64, count: u64| (ticks + ROUND - count) / ROUND;
         let mut flags = self.bank.get(SR);
         for (count, flag) in self.events() {
@@ -90,18 +90,18 @@ impl Peripheral for Timer {
         &REGISTERS
     }
 
-    fn read(&mut self, offset: u32, at: &Moment<'_>) -> Result<u32, Refusal> {
-        self.look(at.now);
+    fn read(&mut self, offset: u32, at: &Context<'_>) -> Result<u32, Refusal> {
+        self.update(at.now);
         match offset {
             CNT if self.runs() => Ok((self.ticks(at.now) % ROUND) as u32),
             _ => self.bank.read(offset),
         }
     }
 
-    fn write(&mut self, offset: u32, value: u32, at: &Moment<'_>) -> Result<(), Refusal> {
-        self.look(at.now);
+    fn write(&mut self, offset: u32, value: u32, at: &Context<'_>) -> Result<(), Refusal> {
+        self.update(at.now);
         match offset {
-            // Bits that there are not may be written as ones: they stay zeros.
+            // Reserved bits may be written as ones.
             SR => {
                 self.bank.set(SR, self.bank.get(SR) & value);
                 return Ok(());
@@ -117,8 +117,8 @@ impl Peripheral for Timer {
                 }
                 return Ok(());
             }
-            CNT if self.runs() => return refuse("the counter runs; not modelled"),
-            ARR if value != 0xFFFF => return refuse("another period than 65536 is not modelled"),
+            CNT if self.runs() => return refuse("writing a running counter is not modelled"),
+            ARR if value != 0xFFFF => return refuse("only a period of 65536 is modelled"),
             CR1 if value & !5 != 0 => return refuse("modes other than counting up are not modelled"),
             CR1 if value & 1 != 0 && !self.runs() => {
                 if at.clocks.timers == 0 {
@@ -137,12 +137,12 @@ impl Peripheral for Timer {
         self.bank.write(offset, value)
     }
 
-    fn advance(&mut self, at: &Moment<'_>) -> Result<(), Refusal> {
-        self.look(at.now);
+    fn advance(&mut self, at: &Context<'_>) -> Result<(), Refusal> {
+        self.update(at.now);
         Ok(())
     }
 
-    fn deadline(&self, at: &Moment<'_>) -> Option<Picos> {
+    fn deadline(&self, at: &Context<'_>) -> Option<Picos> {
         let wanted = self.bank.get(DIER) & !self.bank.get(SR);
         if !self.runs() {
             return None;
@@ -155,11 +155,11 @@ impl Peripheral for Timer {
         next.min()
     }
 
-    fn takes_halves(&self) -> bool {
+    fn accepts_halfwords(&self) -> bool {
         true
     }
 
-    fn interrupts(&self) -> bool {
+    fn interrupt_line(&self) -> bool {
         self.bank.get(SR) & self.bank.get(DIER) & 7 != 0
     }
 
@@ -174,24 +174,24 @@ const ROUND: u64 = 0x1_0000;
 mod tests {
     use super::*;
 
-    fn moment(now: Picos) -> Moment<'static> {
+    fn context(now: Picos) -> Context<'static> {
         static NONE: Functions = [[None; 16]; 11];
         let clocks = Clocks { timers: 200_000_000, ..Clocks::default() };
-        Moment { now, clocks, functions: &NONE, is_rmii: false }
+        Context { now, clocks, functions: &NONE, is_rmii: false }
     }
 
     #[test]
     fn a_compare_match_is_due_at_its_count_and_once_a_round() {
         let mut timer = Timer::new();
         for (register, value) in [(PSC, 199), (EGR, 1), (SR, 0), (CCR[0], 300), (DIER, 2), (CR1, 1)] {
-            timer.write(register, value, &moment(0)).expect("allowed");
+            timer.write(register, value, &context(0)).expect("allowed");
         }
-        assert_eq!(timer.deadline(&moment(0)), Some(300 * MICRO));
-        timer.advance(&moment(300 * MICRO - 1)).expect("nothing is due");
-        assert!(!timer.interrupts());
-        timer.advance(&moment(300 * MICRO)).expect("it is due");
-        assert!(timer.interrupts());
-        timer.write(SR, !2, &moment(300 * MICRO)).expect("allowed");
-        assert_eq!(timer.deadline(&moment(300 * MICRO)), Some((65_536 + 300) * MICRO));
+        assert_eq!(timer.deadline(&context(0)), Some(300 * MICRO));
+        timer.advance(&context(300 * MICRO - 1)).expect("nothing is due");
+        assert!(!timer.interrupt_line());
+        timer.advance(&context(300 * MICRO)).expect("it is due");
+        assert!(timer.interrupt_line());
+        timer.write(SR, !2, &context(300 * MICRO)).expect("allowed");
+        assert_eq!(timer.deadline(&context(300 * MICRO)), Some((65_536 + 300) * MICRO));
     }
 }

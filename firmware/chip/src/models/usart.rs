@@ -1,11 +1,10 @@
-//! A USART with FIFOs and driver-enable, and the RS-485 line at its pins. RM0433, "Universal
-//! synchronous receiver transmitter".
+//! A USART with FIFOs and driver-enable, and the RS-485 line at its pins. RM0433, "Universal synchronous
+//! receiver transmitter".
 //!
-//! Time is exact: characters have the length that BRR and PRESC give them, and driver-enable the times of
-//! DEAT and DEDT. Characters that arrive are sampled three times in the middle of each bit, so a wrong speed,
-//! a wrong parity and noise show as they would. The transceiver's receiver is off while its driver is on (DE
-//! and /RE are tied). Settings that only a disabled USART takes are refused while it runs (said at each
-//! field).
+//! Timing is exact: BRR and PRESC give the length of a bit, DEAT and DEDT the times of driver-enable. Received
+//! bits are sampled three times in the middle, so a wrong baud rate, a wrong parity and noise have the effects
+//! they have on the chip. The transceiver's receiver is off while its driver is on (DE and /RE are
+//! connected). Fields that may be written only while the USART is disabled are refused otherwise.
 
 mod receiver;
 mod registers;
@@ -27,7 +26,7 @@ pub struct Pins {
     pub rx: Pin,
     /// Driver-enable.
     pub de: Pin,
-    /// Of all three.
+    /// Alternate function of all three.
     pub function: u8,
 }
 
@@ -39,21 +38,21 @@ pub struct Usart {
     /// The line at its pins.
     pub line: Line,
     flags: u32,
-    /// Each with its parity bit and its error flags.
+    /// The receive FIFO: each character with its parity bit, and its error flags.
     received: VecDeque<(u16, u32)>,
     waiting: VecDeque<u8>,
-    /// What is on the line: its start, its end.
+    /// The character being sent, its start and its end.
     sending: Option<(u8, Picos, Picos)>,
-    /// When driver-enable falls.
+    /// When driver-enable is released.
     releases: Option<Picos>,
-    /// When the character that is being received began.
+    /// Start of the character being received.
     receiving: Option<Picos>,
-    /// When the line counts as idle.
+    /// When the line is detected as idle.
     idles: Option<Picos>,
 }
 
 impl Usart {
-    /// As after power came.
+    /// The state after power-on.
     pub fn new(pins: Pins) -> Self {
         Self {
             bank: Bank::new(&REGISTERS),
@@ -73,7 +72,7 @@ impl Usart {
         self.bank.get(register) & bits == bits
     }
 
-    /// How long a bit is.
+    /// Bit time.
     fn bit(&self, clocks: Clocks) -> Picos {
         const PRESCALERS: [u64; 16] = [1, 2, 4, 6, 8, 10, 12, 16, 32, 64, 128, 256, 256, 256, 256, 256];
         let prescaler = PRESCALERS[self.bank.get(PRESC) as usize & 0xF];
@@ -81,7 +80,7 @@ impl Usart {
         SECOND / 1_000 * prescaler * divider / u64::from((clocks.usart / 1_000).max(1))
     }
 
-    /// Bits of data, the parity bit included.
+    /// Data bits, including the parity bit.
     fn data_bits(&self) -> u32 {
         match self.bank.get(CR1) >> 12 & 1 | self.bank.get(CR1) >> 27 & 2 {
             0 => 8,
@@ -94,14 +93,14 @@ impl Usart {
         if self.bank.get(CR2) >> 12 & 3 == 2 { 2 } else { 1 }
     }
 
-    /// As it sends, and as another device has to that it is to understand.
+    /// Its serial format.
     pub fn format(&self, clocks: Clocks) -> Format {
         let odd_parity = self.has(CR1, 1 << 10).then(|| self.has(CR1, 1 << 9));
         let baud = (SECOND / self.bit(clocks).max(1)) as u32;
         Format { baud, odd_parity, stop_bits: self.stop_bits() as u8 }
     }
 
-    /// Whether it is switched on.
+    /// Whether it is enabled.
     pub fn is_on(&self) -> bool {
         self.has(CR1, UE)
     }
@@ -130,7 +129,7 @@ impl Usart {
         status | self.received.front().map_or(0, |(_, flags)| *flags)
     }
 
-    /// What only a disabled USART takes.
+    /// Refuses changes of fields that are locked while the USART is enabled.
     fn check_locked(&self, offset: u32, value: u32) -> Result<(), Refusal> {
         if !self.has(CR1, UE) {
             return Ok(());
@@ -154,13 +153,13 @@ impl Peripheral for Usart {
         &REGISTERS
     }
 
-    fn read(&mut self, offset: u32, at: &Moment<'_>) -> Result<u32, Refusal> {
+    fn read(&mut self, offset: u32, at: &Context<'_>) -> Result<u32, Refusal> {
         self.advance(at)?;
         match offset {
             ISR => Ok(self.status()),
             RDR => match self.received.pop_front() {
                 Some((word, flags)) => {
-                    // Not cleared before, they stay, and are there for the next character too.
+                    // Flags that were not cleared before the read stay set for the next character.
                     self.flags |= flags;
                     Ok(word.into())
                 }
@@ -171,7 +170,7 @@ impl Peripheral for Usart {
         }
     }
 
-    fn write(&mut self, offset: u32, value: u32, at: &Moment<'_>) -> Result<(), Refusal> {
+    fn write(&mut self, offset: u32, value: u32, at: &Context<'_>) -> Result<(), Refusal> {
         self.advance(at)?;
         match offset {
             ICR => {
@@ -195,7 +194,7 @@ impl Peripheral for Usart {
                     self.waiting.push_back(value as u8);
                     return Ok(());
                 }
-                // Behind the last stop bit the driver is still on, or it is switched on first.
+                // Unless the driver is still enabled after the last character, the assertion time comes first.
                 let sixteenths = u64::from(self.bank.get(CR1) >> 21 & 0x1F);
                 let wait = if self.has(CR3, DEM) { sixteenths * self.bit(at.clocks) / 16 } else { 0 };
                 let wait = if self.releases.take().is_some() { 0 } else { wait };
@@ -220,25 +219,25 @@ impl Peripheral for Usart {
         Ok(())
     }
 
-    fn advance(&mut self, at: &Moment<'_>) -> Result<(), Refusal> {
+    fn advance(&mut self, at: &Context<'_>) -> Result<(), Refusal> {
         self.transmit(at)?;
-        // The function of the pin may have come since.
+        // The pin's function may have changed.
         self.show_driver(self.is_driving(), at);
         self.receive(at);
         Ok(())
     }
 
-    fn deadline(&self, at: &Moment<'_>) -> Option<Picos> {
+    fn deadline(&self, at: &Context<'_>) -> Option<Picos> {
         let bits = Picos::from(self.data_bits() + 1);
         let bit = self.bit(at.clocks);
-        // Edges inside of a character are looked at when it is sampled.
+        // A character is handled when its last bit has been sampled.
         let start = self.receiving.or_else(|| self.line.next_start_bit());
         let sampled = start.map(|start| start + bits * bit + bit / 2 + receiver::spread(bit));
         let sent = self.sending.map(|(_, _, end)| end);
         [sent, self.releases, sampled, self.idles].into_iter().flatten().min()
     }
 
-    fn interrupts(&self) -> bool {
+    fn interrupt_line(&self) -> bool {
         let (status, cr1, cr3) = (self.status(), self.bank.get(CR1), self.bank.get(CR3));
         let asked = [
             (IDLE | TC | TXFNF) & cr1,

@@ -1,5 +1,5 @@
-//! A CAN bus whose other nodes are slcan clients (proto-core/docs/wire/slcan.md). Each frame of theirs takes its bits' time
-//! on the bus, one after the other. The chip is acknowledged while a client's channel is open to send.
+//! A CAN bus whose other nodes are slcan clients (proto-core/docs/wire/slcan.md). Their frames take their time on
+//! the bus, one after the other. The chip's frames are acknowledged while a client's channel is open to send.
 
 use std::collections::VecDeque;
 
@@ -10,14 +10,14 @@ use rustix::event::PollFd;
 
 use super::socket::{Client, Listener};
 use crate::device::*;
-use crate::models::can_bus::{Attempt, Frame, Trouble};
+use crate::models::can_bus::{Attempt, BusFault, Frame};
 use crate::models::fdcan::Fdcan;
 
-/// How far the bus is filled ahead: more than the chip runs at a time.
+/// How far ahead frames are scheduled: more than one slice of the chip's run.
 const AHEAD: Picos = 2 * MILLI;
-/// Frames that wait for the bus; further lines stay in the sockets.
+/// Frames that wait for the bus; more stay in the sockets.
 const WAITING: usize = 64;
-/// Bytes read at once.
+/// Bytes per read.
 const CHUNK: usize = 512;
 
 /// The bus' other nodes.
@@ -27,12 +27,12 @@ pub(super) struct Can {
     nodes: Vec<Node>,
     joined: u64,
     waiting: VecDeque<(u64, CanFrame)>,
-    /// On the bus: whose, what, and when it has ended.
+    /// Frames on the bus: sender, frame, end.
     crossing: VecDeque<(u64, CanFrame, Picos)>,
-    free: Picos,
-    /// Frames that the chip was sent.
+    free_at: Picos,
+    /// Frames to the chip.
     pub(super) frames_in: u64,
-    /// Frames that it has sent.
+    /// Frames from the chip.
     pub(super) frames_out: u64,
 }
 
@@ -45,7 +45,7 @@ struct Node {
 }
 
 impl Can {
-    /// With a place to connect to.
+    /// A bus whose clients connect to `listener`.
     pub(super) fn new(listener: Listener) -> Self {
         Self {
             listener,
@@ -53,13 +53,13 @@ impl Can {
             joined: 0,
             waiting: VecDeque::new(),
             crossing: VecDeque::new(),
-            free: 0,
+            free_at: 0,
             frames_in: 0,
             frames_out: 0,
         }
     }
 
-    /// Carries frames both ways.
+    /// Moves frames both ways.
     pub(super) fn exchange(&mut self, can: &mut Fdcan, clocks: Clocks, now: Picos) {
         while let Some(client) = self.listener.accept() {
             self.joined += 1;
@@ -79,19 +79,19 @@ impl Can {
             let others = self.nodes.iter_mut().filter(|node| node.number != from);
             others.for_each(|node| node.deliver(&frame, at));
         }
-        while self.free < now + AHEAD
+        while self.free_at < now + AHEAD
             && let Some(bit) = bit
             && let Some((from, frame)) = self.waiting.pop_front()
         {
             let sent = from_core(&frame);
-            self.free = self.free.max(now) + sent.bits(Attempt::Acknowledged) * bit;
-            can.bus.send(self.free, sent);
+            self.free_at = self.free_at.max(now) + sent.bits(Attempt::Acknowledged) * bit;
+            can.bus.send(self.free_at, sent);
             self.frames_in += 1;
-            self.crossing.push_back((from, frame, self.free));
+            self.crossing.push_back((from, frame, self.free_at));
         }
         self.nodes.retain(|node| !node.client.is_gone());
         let can_acknowledge = self.nodes.iter().any(Node::is_open);
-        can.bus.trouble = if can_acknowledge { Trouble::None } else { Trouble::Alone };
+        can.bus.fault = if can_acknowledge { BusFault::None } else { BusFault::NoAcknowledge };
     }
 
     /// Frames wait for the bus.

@@ -1,6 +1,6 @@
-//! The network at the Ethernet cable's other end: QEMU's user network (slirp) without a machine. QEMU is started
-//! and ended with this program, however that ends; frames are on a stream, each behind its length (QEMU's
-//! `-netdev socket`), so none is lost.
+//! The network at the other end of the Ethernet cable: QEMU's user network (slirp) without a machine. QEMU is
+//! started here and ends with this program, even if that is killed. Frames are sent over a stream, each after its
+//! length (QEMU's `-netdev socket`), so none is lost.
 
 use std::collections::VecDeque;
 use std::os::unix::net::UnixStream;
@@ -15,16 +15,16 @@ use super::socket::Client;
 use crate::device::*;
 use crate::models::ethernet::Ethernet;
 
-/// First argument of this program when it is to become another one that ends with its parent.
+/// First argument of this program that makes it execute another one, which ends with its parent.
 pub(super) const END_WITH: &str = "--end-with";
-/// Bytes read at once.
+/// Bytes per read.
 const CHUNK: usize = 1 << 16;
-/// Longest frame, as QEMU has it.
+/// QEMU's longest frame.
 const LONGEST: usize = 1 << 16;
-/// Frames that wait for the cable; further ones stay in the stream.
+/// Frames that wait for the cable; more stay in the stream.
 const WAITING: usize = 64;
 
-/// QEMU, and what is on its way.
+/// QEMU, and the frames on their way to the chip.
 #[derive(Debug)]
 pub(super) struct Network {
     qemu: Child,
@@ -32,18 +32,18 @@ pub(super) struct Network {
     stream: Client,
     unread: Vec<u8>,
     arriving: VecDeque<Vec<u8>>,
-    free: Picos,
-    /// Frames for the chip.
+    free_at: Picos,
+    /// Frames to the chip.
     pub(super) frames_in: u64,
-    /// Frames of the chip.
+    /// Frames from the chip.
     pub(super) frames_out: u64,
 }
 
 impl Network {
-    /// Starts QEMU. `options` are those of its `-netdev user`; `qmp` is where it can be asked (`-qmp`).
+    /// Starts QEMU. `options` are those of its `-netdev user`; `qmp` is the path of its QMP socket.
     ///
     /// # Errors
-    /// It cannot be started.
+    /// QEMU cannot be started.
     pub(super) fn new(options: &str, qmp: Option<&str>) -> Result<Self, String> {
         let failed = |error: std::io::Error| format!("qemu-system-arm: {error}");
         let (ours, its) = UnixStream::pair().map_err(failed)?;
@@ -56,7 +56,7 @@ impl Network {
             .args(["-M", "none", "-display", "none", "-monitor", "none", "-serial", "none"])
             .args(["-netdev", &format!("user,id=u{separator}{options}"), "-netdev", "socket,id=s,fd=0"])
             .args(["-netdev", "hubport,hubid=0,id=a,netdev=u", "-netdev", "hubport,hubid=0,id=b,netdev=s"])
-            // Ctrl-C is for this program, which ends it then.
+            // Ctrl-C must reach only this program, which then ends QEMU.
             .process_group(0)
             .stdin(Stdio::from(std::os::fd::OwnedFd::from(its)))
             .stdout(Stdio::null());
@@ -67,10 +67,10 @@ impl Network {
         let (unread, arriving) = (Vec::new(), VecDeque::new());
         let stream = Client::new(ours.into());
         let qmp = qmp.map(PathBuf::from);
-        Ok(Self { qemu, qmp, stream, unread, arriving, free: 0, frames_in: 0, frames_out: 0 })
+        Ok(Self { qemu, qmp, stream, unread, arriving, free_at: 0, frames_in: 0, frames_out: 0 })
     }
 
-    /// Carries frames both ways; those for the chip with as much time between them as 100 Mbit/s gives.
+    /// Moves frames both ways; those to the chip at 100 Mbit/s.
     ///
     /// # Errors
     /// QEMU has ended.
@@ -93,11 +93,11 @@ impl Network {
             self.arriving.push_back(frame.to_vec());
             self.unread.drain(..4 + len);
         }
-        while self.free <= now
+        while self.free_at <= now
             && let Some(frame) = self.arriving.pop_front()
         {
-            // Preamble, check sum and the gap between frames are 24 bytes.
-            self.free = self.free.max(now) + (frame.len() as u64 + 24) * 8 * cycle(100_000_000);
+            // Preamble, FCS and inter-frame gap are 24 bytes.
+            self.free_at = self.free_at.max(now) + (frame.len() as u64 + 24) * 8 * cycle(100_000_000);
             ethernet.receive(&frame);
             self.frames_in += 1;
         }
@@ -107,9 +107,9 @@ impl Network {
         }
     }
 
-    /// When the next frame can arrive, if one waits.
+    /// When the next waiting frame can arrive.
     pub(super) fn next(&self) -> Option<Picos> {
-        (!self.arriving.is_empty()).then_some(self.free)
+        (!self.arriving.is_empty()).then_some(self.free_at)
     }
 
     pub(super) fn poll(&self) -> PollFd<'_> {
@@ -127,19 +127,19 @@ impl Drop for Network {
     }
 }
 
-/// When these arguments begin with `--end-with`, becomes the program that is named; returns only when it
-/// cannot, or when nothing like that was asked for.
+/// If the arguments are `--end-with PARENT PROGRAM ...`, executes the program so that it is killed when the
+/// process PARENT ends. Otherwise returns.
 ///
 /// # Errors
-/// It cannot.
-pub fn become_other(mut arguments: impl Iterator<Item = String>) -> Result<(), String> {
+/// The program cannot be executed, or PARENT has ended.
+pub fn exec_if_requested(mut arguments: impl Iterator<Item = String>) -> Result<(), String> {
     if arguments.next().as_deref() != Some(END_WITH) {
         return Ok(());
     }
     let (parent, program) = arguments.next().zip(arguments.next()).ok_or("not enough arguments")?;
     rustix::process::set_parent_process_death_signal(Some(Signal::KILL))
         .map_err(|error| error.to_string())?;
-    // The parent may have ended before.
+    // The parent may have ended before the signal was set.
     if rustix::process::getppid().map(|pid| pid.as_raw_pid().to_string()) != Some(parent) {
         return Err("the program that started this has ended".into());
     }

@@ -1,4 +1,4 @@
-//! Sockets that programs connect to as devices: never waited for, each with what it did not take yet.
+//! Non-blocking sockets that clients connect to as devices, with a buffer for unsent bytes.
 
 use std::io;
 use std::net::TcpListener;
@@ -8,10 +8,10 @@ use std::path::{Path, PathBuf};
 
 use rustix::event::{PollFd, PollFlags};
 
-/// Bytes that are kept for a client that does not read; what comes then is lost, as on a line.
+/// Bytes buffered for a client that does not read; more are lost, as on a line.
 const KEPT: usize = 1 << 20;
 
-/// Where clients connect: `HOST:PORT`, or a path.
+/// A listening socket: `HOST:PORT`, or a path.
 #[derive(Debug)]
 pub(super) struct Listener {
     fd: OwnedFd,
@@ -22,7 +22,7 @@ impl Listener {
     /// Listens.
     ///
     /// # Errors
-    /// The place cannot be had.
+    /// The address cannot be bound.
     pub(super) fn new(place: &str) -> Result<Self, String> {
         let listener = if place.contains(':') && !place.contains('/') {
             TcpListener::bind(place).and_then(|listener| {
@@ -38,7 +38,7 @@ impl Listener {
         listener.map_err(|error| format!("{place}: {error}"))
     }
 
-    /// The next that has connected.
+    /// The next client that has connected.
     pub(super) fn accept(&self) -> Option<Client> {
         use rustix::net::SocketFlags;
         let flags = SocketFlags::NONBLOCK | SocketFlags::CLOEXEC;
@@ -60,7 +60,7 @@ impl Drop for Listener {
     }
 }
 
-/// A connection that is never waited for.
+/// A non-blocking connection.
 #[derive(Debug)]
 pub(super) struct Client {
     fd: OwnedFd,
@@ -69,17 +69,17 @@ pub(super) struct Client {
 }
 
 impl Client {
-    /// With a socket that does not block.
+    /// A client on a non-blocking socket.
     pub(super) fn new(fd: OwnedFd) -> Self {
         Self { fd, unsent: Vec::new(), is_gone: false }
     }
 
-    /// Whether its other end has closed it.
+    /// Whether the peer has closed it.
     pub(super) fn is_gone(&self) -> bool {
         self.is_gone
     }
 
-    /// Reads what is there, at most `most` bytes.
+    /// Reads what has arrived, at most `most` bytes.
     pub(super) fn read(&mut self, most: usize) -> Vec<u8> {
         let mut bytes = vec![0; most];
         let len = match rustix::io::read(&self.fd, &mut bytes) {
@@ -97,12 +97,12 @@ impl Client {
         bytes
     }
 
-    /// Whether what is written now would be kept.
+    /// Whether a write would be kept.
     pub(super) fn has_room(&self) -> bool {
         self.unsent.len() < KEPT
     }
 
-    /// Writes; what it does not take now is kept.
+    /// Writes; what the socket does not accept now is kept.
     pub(super) fn write(&mut self, bytes: &[u8]) {
         if self.has_room() {
             self.unsent.extend_from_slice(bytes);
@@ -110,7 +110,7 @@ impl Client {
         self.flush();
     }
 
-    /// Writes what is left.
+    /// Writes what was kept.
     pub(super) fn flush(&mut self) {
         while !self.unsent.is_empty() && !self.is_gone {
             match rustix::net::send(&self.fd, &self.unsent, rustix::net::SendFlags::NOSIGNAL) {

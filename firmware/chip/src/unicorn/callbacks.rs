@@ -1,11 +1,11 @@
-//! What the library calls while a core runs: it finds the handler of that run.
+//! The library's callbacks, which call the handler of the present run.
 
 use std::ffi::{c_int, c_void};
 
 use super::library::Uc;
 use super::{Engine, Exit, Flow, Handler, Shared};
 
-/// Calls the handler of the run that is going on.
+/// Calls the handler of the present run.
 fn with<T>(
     uc: Uc,
     user: *mut c_void,
@@ -14,7 +14,7 @@ fn with<T>(
     // SAFETY: `user` is the core's `shared`, which lives as long as the engine.
     let shared = unsafe { &*user.cast::<Shared>() };
     let handler = shared.handler.get()?;
-    // SAFETY: it was lent to `run`, which has not returned; callbacks do not nest.
+    // SAFETY: it is borrowed by `run`, which has not returned; callbacks do not nest.
     let handler = unsafe { &mut *handler };
     Some(call(handler, Engine { api: shared.api, uc }, shared))
 }

@@ -10,7 +10,7 @@ use super::LIBRARY;
 /// The library's handle of a core.
 pub(super) type Uc = *mut c_void;
 
-/// The functions of the library. It is never unloaded, so they are always there.
+/// The functions of the library. It is never unloaded, so they stay valid.
 pub(super) struct Api {
     pub(super) open: unsafe extern "C" fn(c_int, c_int, *mut Uc) -> c_int,
     pub(super) close: unsafe extern "C" fn(Uc) -> c_int,
@@ -38,13 +38,13 @@ impl Api {
     fn load() -> Result<Self, String> {
         let path: OsString = std::env::var_os(LIBRARY)
             .ok_or_else(|| format!("{LIBRARY} does not say where libunicorn.so.2 is (docs/chip.md)"))?;
-        // SAFETY: the library's initialisers touch nothing of ours.
+        // SAFETY: the library's initialisers have no effect on this program.
         let library = unsafe { Library::new(&path) };
         let library = library.map_err(|error| format!("{}: {error}", path.display()))?;
         macro_rules! symbols {
             ($($field:ident = $name:literal),* $(,)?) => {
                 Self { $($field: {
-                    // SAFETY: the declaration of this function in unicorn.h.
+                    // SAFETY: the field's type is that of the function in unicorn.h.
                     let symbol = unsafe { library.get($name) };
                     *symbol.map_err(|error| error.to_string())?
                 }),* }

@@ -1,5 +1,5 @@
-//! A board on the table: the chip with its firmware, and a robot's controller at the other end of the
-//! Ethernet cable when the test wants one.
+//! The test bench: the chip with the firmware, and optionally a robot controller at the other end of the Ethernet
+//! cable.
 
 use std::sync::OnceLock;
 
@@ -17,9 +17,9 @@ pub(crate) struct Bench {
     seen: usize,
 }
 
-/// Says where the firmware is.
+/// The environment variable with the firmware's path.
 const ELF: &str = "CHIP_ELF";
-/// As long as a frame of 60 bytes takes on the cable, nearly.
+/// About the duration of a frame of 60 bytes on the cable.
 const CABLE: Picos = 20 * MICRO;
 
 fn program() -> &'static Program {
@@ -32,7 +32,7 @@ fn program() -> &'static Program {
     })
 }
 
-/// The configuration image of a gateway's file.
+/// The configuration image of a gateway file.
 pub(crate) fn image_of(toml: &str) -> Vec<u8> {
     let config = parse_gateway(Text { name: "cell.toml", toml }, &[]).expect("a right configuration");
     let mut bytes = vec![0; image::MAX_IMAGE];
@@ -42,12 +42,12 @@ pub(crate) fn image_of(toml: &str) -> Vec<u8> {
 }
 
 impl Bench {
-    /// The board with an erased configuration.
+    /// A board without a configuration.
     pub(crate) fn blank() -> Self {
         Self::with_image(&[])
     }
 
-    /// The board with that file's image.
+    /// A board with the image of a gateway file.
     pub(crate) fn new(toml: &str) -> Self {
         Self::with_image(&image_of(toml))
     }
@@ -57,13 +57,13 @@ impl Bench {
         Self { chip, robot: None, seen: 0 }
     }
 
-    /// With a controller at 192.168.12.10.
+    /// Adds a controller at 192.168.12.10.
     pub(crate) fn with_robot(mut self) -> Self {
         self.robot = Some(Robot::new(&SimConfig::default()));
         self
     }
 
-    /// With the controller of that file, at 192.168.12.10.
+    /// Adds the controller of a file, at 192.168.12.10.
     pub(crate) fn with_robot_of(mut self, toml: &str) -> Self {
         let config = parse_controller(Text { name: "controller.toml", toml }, &[]);
         self.robot = Some(Robot::new(&config.expect("a right configuration")));
@@ -74,7 +74,7 @@ impl Bench {
         self.chip.now()
     }
 
-    /// Runs for so long.
+    /// Runs for `span`.
     #[track_caller]
     pub(crate) fn run(&mut self, span: Picos) {
         let end = self.now() + span;
@@ -92,7 +92,7 @@ impl Bench {
         }
     }
 
-    /// Runs until something is so, and for no longer than that.
+    /// Runs until `is_so`, at most for `span`.
     #[track_caller]
     pub(crate) fn until(&mut self, what: &str, span: Picos, mut is_so: impl FnMut(&mut Self) -> bool) {
         let end = self.now() + span;
@@ -102,7 +102,7 @@ impl Bench {
         }
     }
 
-    /// Runs until the log has a line with that, behind those that were asked for before.
+    /// Runs until the log has a line with `text`, after the lines found before; returns its time.
     #[track_caller]
     pub(crate) fn until_log(&mut self, text: &str, span: Picos) -> Picos {
         let mut found = None;
@@ -119,9 +119,14 @@ impl Bench {
         at
     }
 
-    /// Whether the log has such a line.
+    /// Whether the log has a line with this text.
     pub(crate) fn has_logged(&self, text: &str) -> bool {
-        self.chip.log.iter().any(|(_, line)| line.contains(text))
+        self.times_logged(text) > 0
+    }
+
+    /// The number of lines with this text.
+    pub(crate) fn times_logged(&self, text: &str) -> usize {
+        self.chip.log.iter().filter(|(_, line)| line.contains(text)).count()
     }
 
     /// The log and the last accesses.

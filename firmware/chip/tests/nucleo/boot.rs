@@ -1,4 +1,4 @@
-//! From power on to idle; and with each part missing.
+//! From power-on to operation, also with each external part missing.
 
 use chip::CONFIG;
 use chip::device::{MILLI, SECOND};
@@ -64,7 +64,7 @@ fn it_boots_and_reaches_the_controller() {
     bench.until_log("info: started", 10 * MILLI);
     bench.until_log("field ports", 10 * MILLI);
     let at = bench.until_log("address 192.168.12.20/24", 2 * SECOND);
-    assert!(at > bench.chip.devices().ethernet.phy.negotiation, "told while nobody can be reached at it");
+    assert!(at > bench.chip.devices().ethernet.phy.negotiation, "logged before it can be reached");
     bench.until("a Modbus connection", 5 * SECOND, |bench| {
         bench.robot.as_ref().is_some_and(|robot| robot.counters().modbus.open == 1)
     });
@@ -74,9 +74,9 @@ fn it_boots_and_reaches_the_controller() {
         (400_000_000, 200_000_000, 100_000_000, 80_000_000)
     );
     assert!(!bench.has_logged("no 8 MHz clock"), "it runs on the external clock");
-    // The MAC is set to 100 Mbit/s full duplex, so nothing else may be agreed on.
-    assert_eq!(bench.chip.devices().ethernet.phy.offer(), 0x0101);
-    // The link's LED, and no fault's.
+    // The MAC is set to 100 Mbit/s full duplex, so the PHY must advertise nothing else.
+    assert_eq!(bench.chip.devices().ethernet.phy.advertised(), 0x0101);
+    // The link's LED is on, the fault's is off.
     assert_eq!(bench.chip.devices().gpio[4].output(1), Some(true));
     assert_eq!(bench.chip.devices().gpio[1].output(14), Some(false));
     assert!(bench.chip.resets.is_empty() && bench.chip.faults.is_empty());
@@ -87,7 +87,7 @@ fn it_boots_and_reaches_the_controller() {
 fn only_a_chip_of_the_old_revision_reads_its_ram_one_by_one() {
     for (identity, mode) in [(0x1003_6450, 1), (0x2003_6450, 0)] {
         let mut bench = Bench::blank();
-        bench.chip.devices().debug.put(0, identity);
+        bench.chip.devices().dbgmcu.put(0, identity);
         bench.until_log("info: started", 10 * MILLI);
         assert_eq!(bench.chip.devices().axi.get(0x108), mode, "{identity:08X}");
     }
@@ -110,14 +110,13 @@ fn without_a_configuration_the_buses_stay_silent() {
     let mut bench = Bench::blank();
     bench.until_log("nothing runs: not a configuration image", SECOND);
     bench.run(12 * SECOND);
-    let again = bench.chip.log.iter().filter(|(_, line)| line.contains("nothing runs")).count();
-    assert_eq!(again, 2, "it is told every ten seconds");
+    assert_eq!(bench.times_logged("nothing runs"), 2, "the reason is logged every ten seconds");
     // Fast blinking: five a second.
     let changes = &bench.chip.devices().gpio[1].changes;
     let status =
         changes.iter().filter(|(at, pin, _)| *pin == 0 && *at > 2 * SECOND && *at <= 12 * SECOND).count();
     assert!((98..=102).contains(&status), "{status} changes in 10 s");
-    assert!(bench.chip.devices().first.line.driver.is_empty() && bench.chip.resets.is_empty());
+    assert!(bench.chip.devices().usart2.line.driver.is_empty() && bench.chip.resets.is_empty());
 }
 
 #[test]
@@ -146,7 +145,7 @@ fn without_the_external_clock_it_runs_on_its_own() {
 #[ignore = "needs CHIP_UNICORN and CHIP_ELF"]
 fn without_the_phy_the_field_buses_run() {
     let mut bench = Bench::new(CELL);
-    bench.chip.devices().ethernet.phy.is_there = false;
+    bench.chip.devices().ethernet.phy.is_present = false;
     bench.until_log("no controller: no Ethernet: the PHY's identifier reads FFFF", SECOND);
     bench.run(5 * SECOND);
     assert!(bench.chip.resets.is_empty());

@@ -1,14 +1,14 @@
-//! CAN: frames, a bus that nobody else is on, and one that is broken.
+//! CAN: frames, a bus without other nodes, and a short circuit.
 
 use chip::device::{MICRO, MILLI, SECOND};
-use chip::models::can_bus::{Frame, Trouble};
+use chip::models::can_bus::{BusFault, Frame};
 
 use crate::Bench;
 use crate::boot::CELL;
 use crate::serial::{ready, word};
 
 fn send(bench: &mut Bench, frame: Frame) {
-    // It begins now.
+    // Its end, if it begins now.
     let at = bench.now() + 200 * MICRO;
     bench.chip.devices().can.bus.send(at, frame);
 }
@@ -28,7 +28,7 @@ fn a_frame_goes_up_to_the_controller_and_is_answered() {
     let bus = &bench.chip.devices().can.bus;
     let frames: Vec<Frame> = bus.sent.iter().map(|(_, frame)| *frame).collect();
     assert_eq!(frames, [Frame::standard(2, &[77])]);
-    assert_eq!((bus.heard, bus.missed, bus.attempts), (1, 0, 1));
+    assert_eq!((bus.received, bus.missed, bus.attempts), (1, 0, 1));
 }
 
 #[test]
@@ -40,12 +40,12 @@ fn what_no_filter_names_is_acknowledged_and_not_looked_at() {
         send(&mut bench, Frame { is_extended: true, ..Frame::standard(id, &[9]) });
         bench.run(MILLI);
     }
-    // The same number as an extended id is another id.
+    // An extended id with the same number is another id.
     send(&mut bench, Frame { is_extended: true, ..Frame::standard(1, &[9]) });
     bench.run(20 * MILLI);
     assert_eq!((word(&bench, "WordInputReg[4]"), sent(&mut bench)), (0.0, 0));
     let bus = &bench.chip.devices().can.bus;
-    assert_eq!((bus.passed, bus.missed), (0, 0));
+    assert_eq!((bus.accepted, bus.missed), (0, 0));
 }
 
 #[test]
@@ -53,11 +53,11 @@ fn what_no_filter_names_is_acknowledged_and_not_looked_at() {
 fn alone_on_the_bus_it_says_so_and_sends_again_when_somebody_comes() {
     let mut bench = ready(CELL);
     send(&mut bench, Frame::standard(1, &[1]));
-    bench.chip.devices().can.bus.trouble = Trouble::Alone;
+    bench.chip.devices().can.bus.fault = BusFault::NoAcknowledge;
     bench.until_log("error-passive", SECOND);
     bench.until_log("frames are not acknowledged by any node; transmit errors 128", SECOND);
     assert_eq!((sent(&mut bench), bench.chip.devices().can.bus.bus_offs.len()), (0, 0));
-    bench.chip.devices().can.bus.trouble = Trouble::None;
+    bench.chip.devices().can.bus.fault = BusFault::None;
     bench.run(SECOND);
     assert_eq!(sent(&mut bench), 0, "what waited is old and was dropped");
     send(&mut bench, Frame::standard(1, &[2]));
@@ -71,18 +71,18 @@ fn a_short_circuit_ends_in_bus_off_and_each_pause_is_longer() {
     let mut bench = ready(CELL);
     send(&mut bench, Frame::standard(1, &[1]));
     bench.run(150 * MICRO);
-    bench.chip.devices().can.bus.trouble = Trouble::Short;
+    bench.chip.devices().can.bus.fault = BusFault::ShortCircuit;
     let first = bench.until_log("bus-off; restart in 100 ms", SECOND);
     bench.run(50 * MILLI);
     let offs = &bench.chip.devices().can.bus.bus_offs;
     assert_eq!(offs.len(), 1);
     assert!(first - offs[0] < 5 * MILLI, "told {} us later", (first - offs[0]) / MICRO);
-    // Still broken when it is back, and asked to send again.
+    // The short circuit persists when it sends again.
     bench.until_log("error-active", SECOND);
     assert!(bench.now() - first >= 100 * MILLI);
     send(&mut bench, Frame::standard(1, &[2]));
     bench.until_log("bus-off; restart in 200 ms", SECOND);
-    bench.chip.devices().can.bus.trouble = Trouble::None;
+    bench.chip.devices().can.bus.fault = BusFault::None;
     bench.until_log("error-active", SECOND);
     let before = sent(&mut bench);
     send(&mut bench, Frame::standard(1, &[3]));
@@ -95,15 +95,15 @@ fn a_short_circuit_ends_in_bus_off_and_each_pause_is_longer() {
 fn a_burst_as_long_as_the_fifo_is_taken_whole() {
     let mut bench = ready(CELL);
     let begin = bench.now();
-    // As fast as 1-byte frames can follow each other.
+    // Back-to-back frames of 1 byte.
     for number in 1..=64_u64 {
         let frame = Frame::standard(1, &[number as u8]);
         bench.chip.devices().can.bus.send(begin + number * 110 * MICRO, frame);
     }
     bench.run(50 * MILLI);
-    assert_eq!(bench.chip.devices().can.bus.heard, 64);
+    assert_eq!(bench.chip.devices().can.bus.received, 64);
     assert_eq!((word(&bench, "WordInputReg[4]"), sent(&mut bench) > 0), (64.0, true));
-    assert!(!bench.has_logged("frames lost"));
+    assert!(!bench.has_logged("frames were lost"));
 }
 
 #[test]

@@ -1,4 +1,4 @@
-//! A cell at work: both field buses, the controller, the watchdog, for a while.
+//! A cell in operation for some time: both field buses, the controller, the watchdog.
 
 use chip::device::{MICRO, MILLI, SECOND};
 use chip::models::can_bus::Frame;
@@ -16,7 +16,7 @@ fn every_frame_of_both_buses_is_answered_and_arrives() {
     let mut bench = ready(CELL);
     for round in 1..=ROUNDS {
         let now = bench.now();
-        bench.chip.devices().first.line.send(now, &[255, 255, round, 0, 7, 238, 238], FORMAT);
+        bench.chip.devices().usart2.line.send(now, &[255, 255, round, 0, 7, 238, 238], FORMAT);
         bench.chip.devices().can.bus.send(now + 500 * MICRO, Frame::standard(1, &[round]));
         bench.run(20 * MILLI);
         assert_eq!(
@@ -25,12 +25,12 @@ fn every_frame_of_both_buses_is_answered_and_arrives() {
         );
     }
     let devices = bench.chip.devices();
-    let line = &devices.first.line;
+    let line = &devices.usart2.line;
     assert_eq!(line.sent.len(), 7 * usize::from(ROUNDS));
     assert_eq!(line.driver.len(), 2 * usize::from(ROUNDS));
     assert!(line.sent.iter().all(|sent| sent.is_driven));
     let bus = &devices.can.bus;
-    assert_eq!((bus.sent.len(), bus.heard, bus.broken_off), (ROUNDS.into(), ROUNDS.into(), 0));
+    assert_eq!((bus.sent.len(), bus.received, bus.aborted), (ROUNDS.into(), ROUNDS.into(), 0));
     assert_eq!(devices.ethernet.dropped, 0);
     assert!(bench.chip.resets.is_empty() && bench.chip.faults.is_empty());
     assert!(bench.now() > 5 * SECOND);
@@ -44,13 +44,13 @@ fn outputs_leave_every_four_milliseconds_on_both_buses() {
     let begin = bench.now();
     bench.run(SECOND);
     let devices = bench.chip.devices();
-    let frames = devices.first.line.sent.chunks_exact(7).map(|frame| frame[0].start);
+    let frames = devices.usart2.line.sent.chunks_exact(7).map(|frame| frame[0].start);
     let lines = frames.filter(|at| *at >= begin).collect::<Vec<_>>();
     let bus = devices.can.bus.sent.iter().map(|(at, _)| *at).filter(|at| *at >= begin).collect::<Vec<_>>();
     for (what, times) in [("RS-485", lines), ("CAN", bus)] {
         assert!((249..=251).contains(&times.len()), "{what}: {} in a second", times.len());
         let worst = times.windows(2).map(|pair| (pair[1] - pair[0]).abs_diff(4 * MILLI)).max();
-        // As long as another task or an interrupt may take.
+        // The delay that another task or an interrupt may cause.
         assert!(worst < Some(300 * MICRO), "{what}: off by {worst:?}");
         println!("{what}: off by {worst:?} at most");
     }
@@ -72,14 +72,14 @@ fn forces_of_a_sensor_go_up_by_udp() {
         let mut frame = vec![0x48, 0xAA];
         frame.extend((1..=6_u16).flat_map(|axis| (f32::from(round) + f32::from(axis) / 10.0).to_le_bytes()));
         frame.extend([0x0D, 0x0A]);
-        bench.chip.devices().first.line.send(now, &frame, FORMAT);
+        bench.chip.devices().usart2.line.send(now, &frame, FORMAT);
         bench.run(2 * MILLI);
     }
     assert_eq!(word(&bench, "ForceEnd[1]") as f32, 200.1);
     assert_eq!(word(&bench, "ForceEnd[6]") as f32, 200.6);
     let robot = bench.robot.as_ref().expect("there is one");
     assert_eq!(robot.counters().ports["udp2011"].frames_in, 200);
-    // Nobody measures any more.
+    // The device is silent from here on.
     bench.run(500 * MILLI);
     assert_eq!(word(&bench, "ForceEnd[6]"), 0.0);
     assert!(!bench.has_logged("discarded"));

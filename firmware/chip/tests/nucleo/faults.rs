@@ -1,4 +1,4 @@
-//! Whatever happens to the program: the watchdog starts it again, and its last words are told.
+//! Hangs, faults and panics: the watchdog resets the chip, and the crash record is logged.
 
 use chip::device::{MILLI, Picos, SECOND};
 
@@ -9,15 +9,15 @@ const FOR_EVER: [u8; 2] = [0xFE, 0xE7];
 const UNDEFINED: [u8; 2] = [0x00, 0xDE];
 /// cpsid i; b .
 const MASKED: [u8; 4] = [0x72, 0xB6, 0xFE, 0xE7];
-/// push {r4-r7, lr}, and again.
+/// push {r4-r7, lr}; b back.
 const OVERFLOW: [u8; 4] = [0xF0, 0xB5, 0xFD, 0xE7];
-/// cmp r0, r0; it ne; movne r0, #3; b back. Where it lies, a block of the core's ends behind `it`.
+/// cmp r0, r0; it ne; movne r0, #3; b back. At its address the emulator ends a basic block after `it`.
 const IT_BLOCKS: [u8; 8] = [0x80, 0x42, 0x18, 0xBF, 0x03, 0x20, 0xFB, 0xE7];
 const IT_BLOCKS_AT: u32 = 0x080F_FC00 - 4;
-/// movw r0, #0xFBFD; movt r0, #0x080F; bx r0: there.
+/// movw r0, #0xFBFD; movt r0, #0x080F; bx r0: jumps there.
 const TO_IT_BLOCKS: [u8; 10] = [0x4F, 0xF6, 0xFD, 0x30, 0xC0, 0xF6, 0x0F, 0x00, 0x00, 0x47];
 
-/// Something goes wrong where the tasks begin to wait for time; returns when.
+/// Patches `code` into the function that starts timers; returns the time.
 fn break_it(bench: &mut Bench, code: &[u8]) -> Picos {
     bench.run(3 * SECOND);
     let place = bench.chip.program().function(&["embassy_time::timer::Timer>::after"]);
@@ -26,7 +26,7 @@ fn break_it(bench: &mut Bench, code: &[u8]) -> Picos {
     bench.now()
 }
 
-/// The watchdog's four seconds, counted from the last feed before.
+/// Checks that the reset comes four seconds after the last feed.
 fn check_reset(bench: &mut Bench, broken: Picos) {
     bench.until("a reset", 6 * SECOND, |bench| bench.chip.resets.len() == 1);
     let fed = bench.chip.devices().watchdog.feeds.iter().copied().filter(|at| *at <= broken + SECOND).max();
@@ -55,7 +55,7 @@ fn a_task_that_hangs_is_named() {
     let broken = break_it(&mut bench, &FOR_EVER);
     check_reset(&mut bench, broken);
     bench.until_log("previous run: the watchdog was not fed, task ", 100 * MILLI);
-    // And then it runs as ever.
+    // Then it runs normally.
     bench.run(10 * SECOND);
     assert_eq!(bench.chip.resets.len(), 1);
 }
@@ -71,11 +71,10 @@ fn a_hang_without_interrupts_has_no_words_and_does_not_repeat_old_ones() {
     bench.until("another reset", 6 * SECOND, |bench| bench.chip.resets.len() == 2);
     bench.until_log("restarted by the watchdog", 100 * MILLI);
     bench.run(SECOND);
-    let told = bench.chip.log.iter().filter(|(_, line)| line.contains("previous run")).count();
-    assert_eq!(told, 1, "{}", bench.history());
+    assert_eq!(bench.times_logged("previous run"), 1, "{}", bench.history());
 }
 
-/// A handler whose first instruction were in that block would save no registers.
+/// If the state of the IT block were kept, the first instruction of the handler would not be executed.
 #[test]
 #[ignore = "needs CHIP_UNICORN and CHIP_ELF"]
 fn an_interrupt_within_an_it_block_does_no_harm() {
@@ -112,7 +111,7 @@ fn a_stack_overflow_meets_the_guard() {
     assert_eq!(bench.chip.faults.len(), 1);
     check_reset(&mut bench, broken);
     bench.until_log("previous run: fault at ", 100 * MILLI);
-    // The guard is below 0x20004000; what of the frame was in it could not be written.
+    // The part of the frame in the guard, below 0x20004000, could not be written.
     assert!(bench.has_logged("CFSR 00000092, address 20003F"), "{}", bench.history());
 }
 

@@ -1,4 +1,4 @@
-//! Flash that is written: the firmware does not yet, so a few instructions in the place of its `main` do.
+//! Programming flash: the firmware does not do it, so a few instructions replace its `main`.
 
 use chip::device::{MICRO, MILLI};
 

@@ -1,6 +1,5 @@
-//! The NUCLEO-H743ZI2's binary, unchanged, on the modelled chip. Each test needs the emulator's library
-//! and the firmware (`CHIP_UNICORN`, `CHIP_ELF`; docs/chip.md); the step of `.ci/run` has both and runs
-//! them all.
+//! The NUCLEO-H743ZI2's binary, unchanged, on the modelled chip. Each test needs the emulator's library and the
+//! firmware (`CHIP_UNICORN`, `CHIP_ELF`; docs/chip.md); `.ci/run nucleo` provides both and runs all tests.
 
 mod bench;
 mod boot;

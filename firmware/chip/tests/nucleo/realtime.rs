@@ -1,5 +1,5 @@
-//! The program of this crate in real time: its sockets, its pace, and that nothing is left behind. What a cell
-//! does there is in `host-sim/tests/scenarios`.
+//! The program of this crate in real time: its sockets, its pace, and that it leaves nothing behind. Whole cells
+//! are in `host-sim/tests/scenarios`.
 
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read, Write};
@@ -14,7 +14,7 @@ use tempfile::TempDir;
 
 use crate::bench::image_of;
 
-/// Frames go out without a controller: `FF 01` on a line at 9600 baud, a count on CAN.
+/// Sends without a controller: `FF 01` on a line at 9600 baud, a counter on CAN.
 const TALKER: &str = r#"
 [controller]
 address = "10.0.2.2"
@@ -67,7 +67,7 @@ fn until<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
     }
 }
 
-/// The program under way; it is killed when nobody ended it.
+/// The running program; killed if it has not ended.
 struct Board {
     child: Child,
     folder: TempDir,
@@ -120,7 +120,7 @@ impl Board {
         serde_json::from_str(&self.ask("figures")).unwrap()
     }
 
-    /// The process of QEMU, once it is one.
+    /// QEMU's process, once it runs.
     #[track_caller]
     fn qemu(&self) -> PathBuf {
         let pid = self.child.id();
@@ -144,7 +144,7 @@ impl Drop for Board {
     }
 }
 
-/// Gone, or dead and not yet asked for.
+/// Waits until a process has ended, or is a zombie.
 #[track_caller]
 fn until_gone(process: &Path) {
     until("QEMU's end", || match std::fs::read_to_string(process.join("stat")) {
@@ -159,7 +159,7 @@ fn a_line_has_its_speed_and_virtual_time_is_never_ahead() {
     let board = Board::start();
     board.until_log("configuration: ");
     let mut line = board.connect("line");
-    // It may have connected in the middle of a frame.
+    // The connection may begin in the middle of a frame.
     let mut bytes = [0; 40];
     line.read_exact(&mut bytes[..1]).unwrap();
     let whole = usize::from(bytes[0] == 0xFF);
@@ -172,13 +172,13 @@ fn a_line_has_its_speed_and_virtual_time_is_never_ahead() {
         (figures["serial_in"] == 480).then_some(figures)
     });
     let seconds = |figures: &Value, name: &str| figures[name].as_f64().unwrap();
-    // Of 480 characters the last two milliseconds are put there ahead.
+    // The characters of the last two milliseconds are scheduled ahead.
     let taken = seconds(&after, "virtual_s") - seconds(&before, "virtual_s");
     assert!(taken > 0.49, "480 characters at 9600 baud in {taken} s");
     for figures in [before, after] {
         assert!(seconds(&figures, "virtual_s") <= seconds(&figures, "wall_s"), "{figures}");
     }
-    board.until_log("port line: in 120 frames, 480 bytes");
+    board.until_log(": in 120 frames, 480 bytes");
 }
 
 #[test]
@@ -200,7 +200,7 @@ fn clients_acknowledge_and_hear_each_other() {
         second.read_until(b'\r', &mut line).unwrap();
         String::from_utf8(line).unwrap()
     };
-    // What waited while nobody was there may come first.
+    // Earlier frames may come first.
     let number = |line: &str| u32::from_str_radix(&line[5..13], 16).unwrap().swap_bytes();
     let mut before = number(&next());
     until("two frames without a gap", || {
@@ -209,7 +209,7 @@ fn clients_acknowledge_and_hear_each_other() {
     });
     first.write_all(b"t1232BEEF\r").unwrap();
     until("the other's frame", || (next() == "t1232BEEF\r").then_some(()));
-    // The sender hears that it was taken, and all but its own.
+    // A sender gets the answer to its command, and all frames but its own.
     let mut heard = BufReader::new(first);
     let mut lines = std::iter::from_fn(|| {
         let mut line = Vec::new();
@@ -230,7 +230,7 @@ fn time_can_be_stopped() {
     board.until_log("configuration: ");
     let now = || board.figures()["virtual_s"].as_f64().unwrap();
     assert_eq!(board.ask("stop"), "done");
-    // What was behind catches up first.
+    // It may have to catch up first.
     let still = until("time to stand still", || {
         let before = now();
         let begin = Instant::now();
@@ -242,7 +242,7 @@ fn time_can_be_stopped() {
     let going = Instant::now();
     assert_eq!(board.ask("go"), "done");
     let after = until("time to go on", || Some(now()).filter(|now| *now > still + 0.2));
-    // The pause is no time that would have to be made up for.
+    // The pause does not count as lag.
     assert!(after - still <= going.elapsed().as_secs_f64(), "{still} s, then {after} s");
     assert_eq!(board.ask("sto"), "unknown: sto");
 }

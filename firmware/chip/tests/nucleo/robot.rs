@@ -1,5 +1,5 @@
-//! The simulated controller at the other end of the cable, in the chip's virtual time: smoltcp carries
-//! what `host_sim`'s controller says.
+//! The simulated controller at the other end of the cable, in the chip's virtual time, with smoltcp as its
+//! network stack.
 
 use std::collections::{HashMap, VecDeque};
 use std::net::{IpAddr, SocketAddr};
@@ -25,11 +25,11 @@ pub(crate) struct Robot {
     unsent: HashMap<ConnId, VecDeque<u8>>,
     numbers: u64,
     wake: Instant,
-    /// Frames that came from the board.
+    /// Frames from the board.
     pub(crate) frames: Vec<(Picos, Vec<u8>)>,
 }
 
-/// A place for one connection to a port.
+/// A socket for one connection to a port.
 struct Server {
     port: u16,
     socket: SocketHandle,
@@ -92,7 +92,7 @@ impl Robot {
         self.controller.counters()
     }
 
-    /// Carries frames both ways, and lets the controller do what is due.
+    /// Moves frames both ways, and lets the controller carry out what is due.
     pub(crate) fn exchange(&mut self, now: Picos, board: &mut Ethernet) {
         let time = Instant::from_micros(now / MICRO);
         let has_frames = !board.sent.is_empty();
@@ -116,7 +116,7 @@ impl Robot {
         }
     }
 
-    /// What has come in.
+    /// Handles received data.
     fn take(&mut self, now: Instant) {
         for index in 0..self.servers.len() {
             let Server { port, socket, conn } = self.servers[index];
@@ -171,7 +171,7 @@ impl Robot {
         }
     }
 
-    /// What is to go out.
+    /// Sends the controller's output.
     fn drain(&mut self, now: Instant) {
         loop {
             match self.controller.poll_output(now) {

@@ -1,5 +1,5 @@
-//! The log's line: UART 3, without interrupts. What does not go out at once is dropped, because the log
-//! must not hold up the buses.
+//! The console: UART 3, without interrupts. What cannot be sent at once is dropped, because the log must not delay
+//! the buses.
 
 use core::fmt::{self, Write};
 
@@ -9,7 +9,7 @@ const UART: u32 = UARTS[3];
 const STATE: u32 = UART + 0x4;
 const STATE_TX_FULL: u32 = 1;
 
-/// Starts the line.
+/// Starts the UART.
 pub(super) fn start() {
     write(UART + 0x10, 16);
     write(UART + 0x8, 1);
@@ -33,7 +33,7 @@ pub(super) fn print(text: fmt::Arguments<'_>) {
     let _ = Console.write_fmt(text);
 }
 
-/// Prints which task has the processor.
+/// Prints the running task.
 pub(super) fn print_running() {
     match firmware::tasks::watchdog::running() {
         Some(task) => print(format_args!("task {task} was running\r\n")),

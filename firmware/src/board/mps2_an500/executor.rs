@@ -1,11 +1,11 @@
-//! An executor that sleeps. QEMU takes WFE for nothing, so the stock one would burn a host's core.
+//! An executor that sleeps with WFI. QEMU ignores WFE, so Embassy's own would keep a core of the host busy.
 
 use core::sync::atomic::{AtomicBool, Ordering};
 
 use embassy_executor::{Spawner, raw};
 use static_cell::StaticCell;
 
-/// Some task is to be polled.
+/// A task was woken.
 static PENDING: AtomicBool = AtomicBool::new(true);
 
 #[unsafe(export_name = "__pender")]
@@ -20,15 +20,15 @@ pub(super) fn run(init: impl FnOnce(Spawner)) -> ! {
     init(executor.spawner());
     loop {
         while PENDING.swap(false, Ordering::AcqRel) {
-            // SAFETY: this is the only place that polls it, and it is not called by a task.
+            // SAFETY: polled only here, and not from a task.
             unsafe { executor.poll() };
         }
-        // An interrupt between the look and WFI stays pending and ends WFI at once.
+        // With interrupts disabled, one after this check stays pending and ends WFI at once.
         cortex_m::interrupt::disable();
         if !PENDING.load(Ordering::Acquire) {
             cortex_m::asm::wfi();
         }
-        // SAFETY: no critical section is open here.
+        // SAFETY: not within a critical section.
         unsafe { cortex_m::interrupt::enable() };
     }
 }

@@ -1,4 +1,4 @@
-//! Log records to the console, each with its time in seconds.
+//! Prints log records to the console, with their time in seconds.
 
 use log::{LevelFilter, Log, Metadata, Record};
 
@@ -21,7 +21,7 @@ impl Log for Output {
     fn flush(&self) {}
 }
 
-/// From here on records are printed.
+/// Installs the logger.
 pub(super) fn start() {
     let _ = log::set_logger(&OUTPUT);
     log::set_max_level(LevelFilter::Info);

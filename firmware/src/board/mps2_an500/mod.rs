@@ -1,15 +1,15 @@
 //! QEMU's `mps2-an500`: a Cortex-M7 with five UARTs and a LAN9118. RS-485 on UART 0 and 1, CAN as slcan
 //! on UART 2, the log on UART 3; the configuration is a file of the host, named by semihosting.
 //!
-//! There is no such hardware: it exists so that the firmware runs end to end in CI.
+//! It exists so that the firmware runs end to end in CI.
 
 mod console;
 mod executor;
+mod fault_injection;
 mod log_output;
 mod registers;
 mod storage;
 mod time;
-mod trouble;
 mod uart;
 mod watchdog;
 
@@ -19,12 +19,12 @@ use embassy_sync::waitqueue::AtomicWaker;
 use embassy_time::Duration;
 use firmware::drivers::lan9118::{Lan9118, Registers, StartError};
 use firmware::drivers::slcan::SlcanPort;
-use firmware::platform::{self, Lamp};
+use firmware::platform::{self, StatusLed};
 use proto_core::config::Rs485;
 
 use watchdog::Watchdog;
 
-/// The board's devices that nobody has yet.
+/// The numbers of the next devices to hand out.
 pub(crate) struct Board {
     serial: usize,
     can: usize,
@@ -48,7 +48,7 @@ impl platform::Board for Board {
         storage::read()
     }
 
-    /// The speed is not emulated.
+    /// Baud rate and format are not emulated.
     fn serial(&mut self, _: &Rs485) -> Option<Self::Serial> {
         let port = self.serial;
         (port < Self::SERIAL_PORTS).then(|| {
@@ -71,7 +71,7 @@ impl platform::Board for Board {
         Ok(driver)
     }
 
-    /// It runs from now on.
+    /// Starts it.
     fn watchdog(&mut self) -> Watchdog {
         Watchdog::start()
     }
@@ -89,11 +89,11 @@ impl platform::Board for Board {
     }
 }
 
-/// LED 0 of the FPGA's.
+/// LED 0 of the FPGA.
 #[derive(Debug)]
 pub(crate) struct Led;
 
-impl Lamp for Led {
+impl StatusLed for Led {
     fn set(&mut self, is_lit: bool) {
         registers::write(registers::FPGAIO, u32::from(is_lit));
     }
@@ -108,11 +108,11 @@ fn main() -> ! {
     time::start();
     executor::run(|spawner| {
         let tasks = crate::start::start(spawner, Board { serial: 0, can: 0 });
-        trouble::start(&tasks);
+        fault_injection::start(&tasks);
     })
 }
 
-/// Ends the emulation with this exit code.
+/// Ends QEMU with this exit code.
 fn end(code: i32) -> ! {
     semihosting::process::exit(code)
 }
@@ -145,10 +145,10 @@ impl Registers for LanRegisters {
         registers::write(registers::LAN9118 + u32::from(offset), value);
     }
 
-    /// QEMU does not look at its host's sockets because the guest sent something; an expired timer makes
-    /// it look. Without this a connection to the host takes a second.
+    /// QEMU does not poll the host's sockets when the guest sends, but when a timer expires. Without this a connection
+    /// to the host takes a second.
     fn transmitted(&self) {
-        time::kick();
+        time::wake_emulator();
     }
 }
 
@@ -167,7 +167,7 @@ impl Irq {
     const LAN9118: Self = Self(13);
 
     fn enable(self) {
-        // SAFETY: its handler is in the vector table, and masks no critical section.
+        // SAFETY: its handler is in the vector table; critical sections are not affected.
         unsafe { NVIC::unmask(self) }
     }
 }

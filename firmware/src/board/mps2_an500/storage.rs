@@ -16,7 +16,7 @@ use static_cell::ConstStaticCell;
 pub(crate) enum StorageError {
     /// No file was named.
     NoName,
-    /// It cannot be read.
+    /// The file cannot be read.
     Unreadable,
 }
 
@@ -29,7 +29,7 @@ impl fmt::Display for StorageError {
     }
 }
 
-/// Reads the image; once.
+/// Reads the image; called once.
 pub(super) fn read() -> Result<&'static [u8], StorageError> {
     static IMAGE: ConstStaticCell<[u8; MAX_IMAGE]> = ConstStaticCell::new([0; MAX_IMAGE]);
     let opened = argument(1, |path| {
@@ -52,16 +52,16 @@ pub(super) fn read() -> Result<&'static [u8], StorageError> {
     Ok(&image[..len])
 }
 
-/// Looks at one of the semihosting arguments.
+/// Passes one of the semihosting arguments to `look`.
 pub(super) fn argument<T>(nth: usize, look: impl FnOnce(&str) -> T) -> Option<T> {
     let args = env::args::<MAX_ARGUMENTS>().ok()?;
     (&args).nth(nth).and_then(Result::ok).map(look)
 }
 
-/// All arguments together, in bytes.
+/// Maximum length of all arguments together, in bytes.
 const MAX_ARGUMENTS: usize = 512;
 
-/// The host's clock in seconds: another for every start.
+/// The host's clock in seconds.
 pub(super) fn host_time() -> u64 {
     SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).map_or(0, |time| time.as_secs())
 }

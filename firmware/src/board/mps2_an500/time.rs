@@ -1,4 +1,4 @@
-//! The clock and its alarm: microseconds since start.
+//! The time driver: microseconds since the start, and an alarm.
 
 use core::cell::RefCell;
 use core::task::Waker;
@@ -10,17 +10,17 @@ use embassy_time_queue_utils::Queue;
 use super::Irq;
 use super::registers::{DUAL_TIMER, FPGAIO, TIMER0, read, write};
 
-/// FPGAIO: a counter that goes up by one each `PRESCALE + 1` cycles of 25 MHz.
+/// FPGAIO's counter, which increments every `PRESCALE + 1` cycles of 25 MHz.
 const COUNTER: u32 = FPGAIO + 0x18;
 const PRESCALE: u32 = FPGAIO + 0x1C;
-/// TIMER0.
+// Registers of TIMER0.
 const CTRL: u32 = TIMER0;
 const RELOAD: u32 = TIMER0 + 0x8;
 const INTCLEAR: u32 = TIMER0 + 0xC;
 /// Enabled, with interrupt.
 const CTRL_ALARM: u32 = 0b1001;
 const CYCLES_PER_MICRO: u64 = 25;
-/// Longest alarm; a later one is set again then. The counter is also looked at often enough by it.
+/// Longest alarm: a later one is set in steps. It also ensures that no overflow of the counter is missed.
 const LONGEST: u64 = 60_000_000;
 
 struct Clock {
@@ -29,7 +29,7 @@ struct Clock {
 
 struct State {
     queue: Queue,
-    /// The counter as it was last seen, and how often it went round.
+    /// The last value of the counter, and its number of overflows.
     last: u32,
     rounds: u32,
 }
@@ -93,8 +93,8 @@ pub(super) fn on_alarm() {
     CLOCK.with(State::rearm);
 }
 
-/// Lets a timer of the emulator expire soon.
-pub(super) fn kick() {
+/// Lets a timer of the emulator expire soon ([`super::LanRegisters`]).
+pub(super) fn wake_emulator() {
     const LOAD: u32 = DUAL_TIMER;
     const CONTROL: u32 = DUAL_TIMER + 0x8;
     /// Enabled, one shot, 32 bits, no interrupt.

@@ -1,7 +1,7 @@
-//! UARTs with interrupts, both ways buffered.
+//! UARTs with interrupts and buffers in both directions.
 //!
-//! What arrives while nobody reads is kept in a ring; when it is full the byte stays in the UART, and
-//! QEMU holds the sender back: nothing is lost here that a line at its real speed would lose.
+//! Received bytes are buffered; when the buffer is full, the next byte stays in the UART and QEMU stops the
+//! sender, so nothing is lost.
 
 use core::cell::RefCell;
 use core::convert::Infallible;
@@ -19,7 +19,7 @@ use super::registers::{UARTS, read, write};
 
 /// UARTs with interrupts.
 const COUNT: usize = 3;
-/// Bytes kept each way.
+/// Bytes buffered in each direction.
 const RING: usize = 2048;
 
 const DATA: u32 = 0x0;
@@ -36,7 +36,7 @@ const CTRL_RX_IRQ: u32 = 8;
 const INT_TX: u32 = 1;
 const INT_RX: u32 = 2;
 
-/// One UART; there is one of each.
+/// The only handle of a UART.
 #[derive(Debug)]
 pub(crate) struct Uart(usize);
 
@@ -49,7 +49,7 @@ struct State {
 
 static STATES: [Mutex<RefCell<State>>; COUNT] = [const { Mutex::new(RefCell::new(State::new())) }; COUNT];
 
-/// Its registers and what is shared with its interrupts, for a moment alone.
+/// Calls `f` with the registers and the shared state, in a critical section.
 fn with<T>(port: usize, f: impl FnOnce(&mut Access<'_>) -> T) -> T {
     critical_section::with(|cs| {
         f(&mut Access { base: UARTS[port], state: &mut STATES[port].borrow_ref_mut(cs) })
@@ -81,7 +81,7 @@ impl Access<'_> {
         write(self.base + CTRL, read(self.base + CTRL) & !bit);
     }
 
-    /// Takes what the UART has, as long as there is room.
+    /// Reads the UART while there is room.
     fn drain(&mut self) {
         write(self.base + INTCLEAR, INT_RX);
         while read(self.base + STATE) & STATE_RX_FULL != 0 {
@@ -94,7 +94,7 @@ impl Access<'_> {
         }
     }
 
-    /// Gives the UART what it takes.
+    /// Writes to the UART while it has room.
     fn fill(&mut self) {
         write(self.base + INTCLEAR, INT_TX);
         while !self.state.waiting.is_empty() {

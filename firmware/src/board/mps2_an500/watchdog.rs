@@ -1,8 +1,8 @@
-//! The watchdog: a counter that interrupts at its first zero, which no mask holds up, and resets the
-//! machine at its second. `qemu-system-arm -no-reboot` ends the emulation instead.
+//! The watchdog: a counter that raises a non-maskable interrupt at its first zero and resets the machine at its
+//! second. `qemu-system-arm -no-reboot` ends the emulation instead.
 
 use embassy_time::Duration;
-use firmware::platform::Feed;
+use firmware::platform::FeedWatchdog;
 
 use super::console;
 use super::registers::{WATCHDOG, write};
@@ -12,11 +12,11 @@ const CONTROL: u32 = WATCHDOG + 0x8;
 const INTCLEAR: u32 = WATCHDOG + 0xC;
 const LOCK: u32 = WATCHDOG + 0xC00;
 const UNLOCK: u32 = 0x1ACC_E551;
-/// With interrupt and reset.
+/// Interrupt and reset enabled.
 const CONTROL_ON: u32 = 0b11;
 const CYCLES_PER_MICRO: u64 = 25;
 
-/// From the last feed to the reset. Long, because the emulator's host may be busy with something else.
+/// Time without a feed until the reset. Long, because the emulator's host may be busy.
 pub(super) const PERIOD: Duration = Duration::from_secs(8);
 
 /// The watchdog.
@@ -33,7 +33,7 @@ impl Watchdog {
     }
 }
 
-impl Feed for Watchdog {
+impl FeedWatchdog for Watchdog {
     fn feed(&mut self) {
         write(LOCK, UNLOCK);
         write(INTCLEAR, 1);
@@ -41,7 +41,7 @@ impl Feed for Watchdog {
     }
 }
 
-/// Half of the time is over.
+/// Half of the period has passed.
 #[cortex_m_rt::exception]
 unsafe fn NonMaskableInt() {
     console::print(format_args!("the watchdog was not fed\r\n"));

@@ -11,7 +11,7 @@ use firmware::drivers::mcan::{MESSAGE_RAM_WORDS, Mcan, Registers, StartError};
 /// The CAN controller.
 pub(crate) type CanDevice = Mcan<CanRegisters>;
 
-/// The registers and the message RAM of FDCAN1, which has all of the RAM: FDCAN2 is not used.
+/// The registers of FDCAN1, and the message RAM, which FDCAN2 does not use.
 pub(crate) struct CanRegisters;
 
 impl Registers for CanRegisters {
@@ -21,7 +21,7 @@ impl Registers for CanRegisters {
     }
 
     fn write(&self, offset: u8, value: u32) {
-        // SAFETY: as above; the controller touches no memory but its own.
+        // SAFETY: as above; the controller accesses no memory but its message RAM.
         unsafe { FDCAN1.as_ptr().cast::<u8>().add(usize::from(offset)).cast::<u32>().write_volatile(value) }
     }
 
@@ -36,7 +36,7 @@ impl Registers for CanRegisters {
     }
 }
 
-/// 10 KiB.
+// The message RAM has 10 KiB.
 const _: () = assert!(MESSAGE_RAM_WORDS <= 2_560);
 
 static WAKER: AtomicWaker = AtomicWaker::new();
@@ -50,13 +50,12 @@ impl Handler<typelevel::FDCAN1_IT0> for CanInterrupt {
     }
 }
 
-/// The clock calibration unit, which is between the clock and the controllers, lets the clock through. After
-/// a reset it does not say so, and what it gives before it is set up is no valid clock (RM0433,
-/// "Clock calibration on CAN"). It can be written in the state that [`Mcan::start`] leaves.
+/// Bypasses the clock calibration unit between the kernel clock and the controllers. After a reset its output is
+/// no valid clock (RM0433, "Clock calibration on CAN"). It is writable in the state that [`Mcan::start`] leaves.
 fn bypass_calibration() {
     const CCFG: usize = 0x804;
     const BYPASS: u32 = 1 << 6;
-    // SAFETY: a register of the controllers' part that nobody else uses, aligned.
+    // SAFETY: an aligned register of FDCAN, which nothing else uses.
     unsafe {
         let register = FDCAN1.as_ptr().cast::<u8>().add(CCFG).cast::<u32>();
         register.write_volatile(register.read_volatile() | BYPASS);
@@ -72,13 +71,13 @@ pub(super) fn start(pins: Pins, bitrate: u32) -> Result<CanDevice, StartError> {
     let (mut rx, mut tx) = (Flex::new(pins.0), Flex::new(pins.1));
     rx.set_as_af_unchecked(FUNCTION, AfType::input(Pull::Up));
     tx.set_as_af_unchecked(FUNCTION, AfType::output(OutputType::PushPull, Speed::High));
-    // Its for ever.
+    // Dropping them would disconnect the pins.
     core::mem::forget((rx, tx));
     rcc::enable_and_reset::<peripherals::FDCAN1>();
     let clock = rcc::frequency::<peripherals::FDCAN1>().0;
     let started = Mcan::start(CanRegisters, 0, &WAKER, bitrate, clock)?;
     bypass_calibration();
-    // SAFETY: its handler is bound, and masks no critical section.
+    // SAFETY: its handler is bound; critical sections are not affected.
     unsafe { typelevel::FDCAN1_IT0::enable() };
     Ok(started)
 }

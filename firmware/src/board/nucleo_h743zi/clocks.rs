@@ -1,5 +1,5 @@
-//! Clocks: 400 MHz for the core, 200 MHz for the buses, 100 MHz for the UARTs, 80 MHz for the CAN
-//! controller, all from the 8 MHz that the board's debugger feeds in.
+//! Clocks: 400 MHz for the core, 200 MHz for the buses, 100 MHz for the UARTs, 80 MHz for the CAN controller, all
+//! from the 8 MHz clock of the board's debugger.
 
 use embassy_stm32::Config;
 use embassy_stm32::pac::{DBGMCU, RCC};
@@ -9,20 +9,20 @@ use embassy_stm32::rcc::{
 };
 use embassy_stm32::time::Hertz;
 
-/// What the clocks are made from.
+/// The source of the clocks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Source {
     /// The 8 MHz of the debugger's crystal.
     External,
-    /// The chip's own 64 MHz, within 1 %: good for everything but CAN.
+    /// The chip's own 64 MHz, within 1 %: good enough for everything but CAN.
     Internal,
 }
 
-/// Looks whether the external clock runs. Without this look a missing one would be waited for for ever.
+/// Checks for the external clock; the initialisation would wait for it for ever.
 pub(super) fn source() -> Source {
     RCC.cr().modify(|w| w.set_hsebyp(true));
     RCC.cr().modify(|w| w.set_hseon(true));
-    // Ready after a few of its cycles; this is some ms.
+    // It is ready after a few of its cycles; this waits for some milliseconds.
     for _ in 0..50_000 {
         if RCC.cr().read().hserdy() {
             return Source::External;
@@ -33,14 +33,14 @@ pub(super) fn source() -> Source {
     Source::Internal
 }
 
-/// How the chip is set up.
+/// The chip's configuration.
 pub(super) fn config(source: Source) -> Config {
     let mut config = Config::default();
     let rcc = &mut config.rcc;
     rcc.hsi = Some(HSIPrescaler::DIV1);
-    // Of the random number generator.
+    // For the random number generator.
     rcc.hsi48 = Some(Default::default());
-    // 2 MHz times 400, by 2 and by 10.
+    // 2 MHz times 400, divided by 2 and by 10.
     let (source, prediv) = match source {
         Source::External => {
             rcc.hse = Some(Hse { freq: Hertz(8_000_000), mode: HseMode::Bypass });
@@ -69,8 +69,8 @@ pub(super) fn config(source: Source) -> Config {
     config
 }
 
-/// Before anything moves: chips of revision Y read AXI SRAM wrongly unless they read one thing at a time
-/// (errata ES0392, "reading from AXI SRAM may lead to data read corruption").
+/// Limits AXI SRAM to one read at a time on chips of revision Y (errata ES0392, "reading from AXI SRAM may lead to
+/// data read corruption"). Comes before all DMA.
 pub(super) fn errata() {
     const AXI_TARG7_FN_MOD: usize = 0x5100_8108;
     const REVISION_Y: u16 = 0x1003;

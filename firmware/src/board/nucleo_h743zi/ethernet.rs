@@ -1,7 +1,7 @@
 //! Ethernet: RMII with the board's LAN8742A, 100 Mbit/s full duplex.
 //!
-//! The MAC's reset waits for ever for the PHY's 50 MHz, and the PHY may be missing or dead. Both are
-//! looked for with a limit before the driver is started.
+//! The driver waits for ever for the MAC's reset, which needs the PHY's 50 MHz, and for a PHY that may be missing.
+//! Both are checked with a limit before the driver is started.
 
 use core::fmt;
 use core::future::Future;
@@ -18,7 +18,7 @@ use embassy_time::{Duration, Instant, Timer};
 use static_cell::ConstStaticCell;
 
 use super::leds::Led;
-use firmware::platform::Lamp;
+use firmware::platform::StatusLed;
 
 /// The Ethernet controller.
 pub(crate) type Ethernet = eth::Ethernet<'static, peripherals::ETH, Lan8742>;
@@ -26,9 +26,9 @@ pub(crate) type Ethernet = eth::Ethernet<'static, peripherals::ETH, Lan8742>;
 /// Why there is no Ethernet.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum EthernetError {
-    /// The PHY's clock does not arrive.
+    /// There is no clock from the PHY.
     NoClock,
-    /// At the PHY's address nobody answers as one.
+    /// There is no PHY at the expected address.
     NoPhy {
         /// The identifier that was read.
         found: u16,
@@ -63,7 +63,7 @@ pub(super) struct Parts {
 }
 
 impl Parts {
-    /// Starts the controller; takes half a second at most, when the PHY gives its clock and does not answer.
+    /// Starts the controller. Takes half a second at most, if the PHY provides its clock but does not answer.
     pub(super) fn start<I>(mut self, irqs: I, address: [u8; 6], led: Led) -> Result<Ethernet, EthernetError>
     where
         I: interrupt::typelevel::Binding<interrupt::typelevel::ETH, eth::InterruptHandler> + 'static,
@@ -72,8 +72,8 @@ impl Parts {
             return Err(EthernetError::NoClock);
         }
         let mut sma = Sma::new(self.sma, self.mdio, self.mdc);
-        // One that has just got its power may not answer yet.
-        let until = Instant::now() + PATIENCE;
+        // After power-on it may not answer yet.
+        let until = Instant::now() + TIMEOUT;
         loop {
             match sma.smi_read(PHY_ADDRESS, PHY_ID1) {
                 PHY_VENDOR => break,
@@ -81,7 +81,7 @@ impl Parts {
                 _ => {}
             }
         }
-        // In AXI SRAM, as all statics: the DMA reaches it, and the data cache is off.
+        // Statics are in AXI SRAM, which the DMA reaches.
         static QUEUE: ConstStaticCell<PacketQueue<TX_FRAMES, RX_FRAMES>> =
             ConstStaticCell::new(PacketQueue::new());
         let queue = QUEUE.try_take().ok_or(EthernetError::Taken)?;
@@ -97,17 +97,17 @@ impl Parts {
             self.txd1,
             self.tx_en,
             address,
-            Lan8742 { sma, led, is_up: false, look: Instant::MIN },
+            Lan8742 { sma, led, is_up: false, next_poll: Instant::MIN },
         ))
     }
 }
 
-/// Whether the MAC can be reset, for which it needs the PHY's clock.
+/// Resets the MAC; returns whether that succeeded, for which it needs the PHY's clock.
 fn has_clock(ref_clk: Peri<'_, PA1>) -> bool {
     const FUNCTION: u8 = 11;
     let mut pin = Flex::new(ref_clk);
     pin.set_as_af_unchecked(FUNCTION, AfType::output(OutputType::PushPull, Speed::VeryHigh));
-    // Dropped it would be disconnected, and the MAC without its clock until the driver connects it again.
+    // Dropping it would disconnect the clock.
     core::mem::forget(pin);
     critical_section::with(|_| {
         RCC.ahb1enr().modify(|w| {
@@ -117,11 +117,11 @@ fn has_clock(ref_clk: Peri<'_, PA1>) -> bool {
         });
         SYSCFG.pmcr().modify(|w| w.set_eth_sel_phy(EthSelPhy::RMII));
     });
-    // The choice has to have arrived before the reset.
+    // The write has to be complete before the reset.
     SYSCFG.pmcr().read();
     let mode = ETH.ethernet_dma().dmamr();
     mode.modify(|w| w.set_swr(true));
-    let until = Instant::now() + PATIENCE;
+    let until = Instant::now() + TIMEOUT;
     while mode.read().swr() {
         if Instant::now() > until {
             return false;
@@ -130,15 +130,15 @@ fn has_clock(ref_clk: Peri<'_, PA1>) -> bool {
     true
 }
 
-/// The PHY. It offers 100 Mbit/s full duplex only, because that is what the MAC is set to: with a peer
-/// that cannot do it there is no link, instead of one that loses frames.
+/// The PHY. It advertises only 100 Mbit/s full duplex, the MAC's setting: with a peer that does not support it
+/// there is no link, instead of one that loses frames.
 pub(crate) struct Lan8742 {
     sma: Sma<'static, ETH_SMA>,
     led: Led,
-    /// As it was looked at last.
+    /// The link was up at the last poll.
     is_up: bool,
-    /// When it is looked at again: reading the PHY takes 0.1 ms, and the network asks with each frame.
-    look: Instant,
+    /// Time of the next poll: it takes 0.1 ms, and the network stack asks with each frame.
+    next_poll: Instant,
 }
 
 impl Lan8742 {
@@ -152,57 +152,57 @@ impl Lan8742 {
 }
 
 impl Phy for Lan8742 {
-    /// Takes up to half a second, which is not waited for here: `poll_link` sees the end of it.
+    /// Only starts the reset, which takes up to half a second; `poll_link` continues after it.
     fn phy_reset(&mut self) {
         self.write(PHY_CONTROL, CONTROL_RESET);
-        self.look = Instant::now() + LINK_PERIOD;
+        self.next_poll = Instant::now() + LINK_PERIOD;
     }
 
     fn phy_init(&mut self) {
         if self.read(PHY_CONTROL) & CONTROL_RESET != 0 {
             return;
         }
-        self.write(PHY_OFFER, OFFER_100_FULL);
+        self.write(PHY_ADVERTISE, ADVERTISE_100_FULL);
         self.write(PHY_CONTROL, CONTROL_NEGOTIATE);
     }
 
     fn poll_link(&mut self, cx: &mut Context<'_>) -> bool {
         let now = Instant::now();
-        if now >= self.look {
-            self.look = now + LINK_PERIOD;
-            // After its reset the PHY has no settings; after one by a disturbance neither.
-            if self.read(PHY_OFFER) != OFFER_100_FULL {
+        if now >= self.next_poll {
+            self.next_poll = now + LINK_PERIOD;
+            // A reset, also one caused by a disturbance, clears the PHY's settings.
+            if self.read(PHY_ADVERTISE) != ADVERTISE_100_FULL {
                 self.phy_init();
             }
             self.is_up = self.read(PHY_STATUS) & STATUS_UP == STATUS_UP
                 && self.read(PHY_RESULT) & RESULT_MASK == RESULT_100_FULL;
             self.led.set(self.is_up);
         }
-        // Wakes the network's task, which asks again. A timer that is dropped still does.
-        let _ = pin!(Timer::at(self.look)).poll(cx);
+        // Wakes the network's task for the next poll, also after the timer is dropped.
+        let _ = pin!(Timer::at(self.next_poll)).poll(cx);
         self.is_up
     }
 }
 
 const TX_FRAMES: usize = 4;
 const RX_FRAMES: usize = 4;
-const PATIENCE: Duration = Duration::from_millis(250);
+const TIMEOUT: Duration = Duration::from_millis(250);
 const LINK_PERIOD: Duration = Duration::from_millis(250);
 
 const PHY_ADDRESS: u8 = 0;
 const PHY_CONTROL: u8 = 0;
 const PHY_STATUS: u8 = 1;
 const PHY_ID1: u8 = 2;
-const PHY_OFFER: u8 = 4;
+const PHY_ADVERTISE: u8 = 4;
 const PHY_RESULT: u8 = 31;
-/// Microchip's, formerly SMSC's.
+/// Microchip, formerly SMSC.
 const PHY_VENDOR: u16 = 0x0007;
 const CONTROL_RESET: u16 = 1 << 15;
-/// Negotiate, and begin now.
+/// Enable and restart auto-negotiation.
 const CONTROL_NEGOTIATE: u16 = 1 << 12 | 1 << 9;
 /// 100BASE-TX full duplex, IEEE 802.3.
-const OFFER_100_FULL: u16 = 1 << 8 | 1;
-/// Negotiated, and the link is up.
+const ADVERTISE_100_FULL: u16 = 1 << 8 | 1;
+/// Auto-negotiation complete, link up.
 const STATUS_UP: u16 = 1 << 5 | 1 << 2;
 const RESULT_MASK: u16 = 0b111 << 2;
 const RESULT_100_FULL: u16 = 0b110 << 2;

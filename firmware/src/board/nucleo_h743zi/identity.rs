@@ -1,4 +1,4 @@
-//! What is different on each board, and at each start.
+//! The board's address, and a seed for each start.
 
 use embassy_stm32::pac::{RCC, RNG};
 use embassy_stm32::uid;
@@ -9,12 +9,12 @@ pub(super) fn ethernet_address() -> [u8; 6] {
     firmware::identity::ethernet_address(&uid::uid())
 }
 
-/// What local port numbers are drawn from. A random number generator that does not work leaves what
-/// is the board's own, and the time.
+/// A seed for local port numbers, from the chip's number, the time and the random number generator, which may
+/// fail.
 pub(crate) fn seed() -> u64 {
     let own = firmware::identity::hash(&uid::uid()) ^ Instant::now().as_ticks();
     RCC.ahb2enr().modify(|w| w.set_rngen(true));
-    // The clock takes two cycles to arrive; what is written before that is lost.
+    // Enabling the clock takes two cycles; earlier writes are lost.
     RCC.ahb2enr().read();
     RNG.cr().modify(|w| w.set_rngen(true));
     (0..2).fold(own, |seed, _| seed.rotate_left(32) ^ u64::from(random_word().unwrap_or(0)))

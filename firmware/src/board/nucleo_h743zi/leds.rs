@@ -1,23 +1,23 @@
-//! The board's three LEDs: LD1 is the status task's, LD2 is lit while the Ethernet link is up, LD3 is
-//! lit after a panic or a fault, until the watchdog starts the board again.
+//! The board's three LEDs: LD1 shows the status, LD2 is on while the Ethernet link is up, LD3 is on after a panic
+//! or a fault, until the watchdog resets the board.
 
 use embassy_stm32::Peri;
 use embassy_stm32::gpio::{Level, Output, Speed};
 use embassy_stm32::pac::gpio::vals::Moder;
 use embassy_stm32::pac::{GPIOB, RCC};
 use embassy_stm32::peripherals::{PB0, PB14, PE1};
-use firmware::platform::Lamp;
+use firmware::platform::StatusLed;
 
 /// An LED.
 pub(crate) struct Led(Output<'static>);
 
-impl Lamp for Led {
+impl StatusLed for Led {
     fn set(&mut self, is_lit: bool) {
         self.0.set_level(is_lit.into());
     }
 }
 
-/// All of them.
+/// The LEDs with an owner.
 pub(super) struct Leds {
     pub(super) status: Led,
     pub(super) link: Led,
@@ -29,7 +29,7 @@ impl Leds {
         yellow: Peri<'static, PE1>,
         red: Peri<'static, PB14>,
     ) -> Self {
-        // The fault's, which needs no owner.
+        // [`fault`] sets it through its registers.
         core::mem::forget(Output::new(red, Level::Low, Speed::Low));
         Self {
             status: Led(Output::new(green, Level::Low, Speed::Low)),
@@ -38,10 +38,10 @@ impl Leds {
     }
 }
 
-/// Lights LD3, whatever else is going on: the fault may have come before anything was set up.
+/// Switches LD3 on, also if the fault occurred before anything was set up.
 pub(super) fn fault() {
     RCC.ahb4enr().modify(|w| w.set_gpioben(true));
-    // The clock takes two cycles to arrive.
+    // Enabling the clock takes two cycles.
     RCC.ahb4enr().read();
     GPIOB.moder().modify(|w| w.set_moder(14, Moder::OUTPUT));
     GPIOB.bsrr().write(|w| w.set_bs(14, true));

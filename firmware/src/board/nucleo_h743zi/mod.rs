@@ -1,12 +1,11 @@
-//! ST's NUCLEO-H743ZI2: an STM32H743ZI with a LAN8742A. RS-485 on USART2 and UART7, CAN on FDCAN1, the
-//! log over the debugger (defmt, RTT); the configuration image is in flash. Pins and wiring are in
-//! firmware/README.md.
+//! ST's NUCLEO-H743ZI2: an STM32H743ZI with a LAN8742A. RS-485 on USART2 and UART7, CAN on FDCAN1; the log goes
+//! to the debugger (defmt, RTT); the configuration image is in flash. Pins and wiring are in firmware/README.md.
 
 mod can;
 mod clocks;
+mod crash_record;
 mod ethernet;
 mod identity;
-mod last_words;
 mod leds;
 mod serial;
 mod storage;
@@ -27,15 +26,15 @@ use leds::Led;
 use watchdog::Watchdog;
 
 bind_interrupts!(struct Irqs {
-    USART2 => serial::FirstInterrupt;
-    UART7 => serial::SecondInterrupt;
+    USART2 => serial::Usart2Interrupt;
+    UART7 => serial::Uart7Interrupt;
     FDCAN1_IT0 => can::CanInterrupt;
     ETH => eth::InterruptHandler;
 });
 
 defmt::timestamp!("{=u64:us}", embassy_time::Instant::now().as_micros());
 
-/// The board's devices that nobody has yet.
+/// The devices that were not handed out yet.
 pub(crate) struct Board {
     serial: serial::Lines,
     can: Option<can::Pins>,
@@ -76,7 +75,7 @@ impl platform::Board for Board {
         parts.start(Irqs, identity::ethernet_address(), led)
     }
 
-    /// It runs since the reset.
+    /// It has been running since the reset.
     fn watchdog(&mut self) -> Watchdog {
         self.watchdog.take().expect("asked for once")
     }
@@ -101,21 +100,21 @@ fn main() -> ! {
     clocks::errata();
     let mut core = Core::take();
     if let Some(core) = &mut core {
-        // The data cache stays off: the Ethernet DMA and the debugger see memory as it is.
+        // The data cache stays off, because the Ethernet DMA and the debugger access memory directly.
         core.SCB.enable_icache();
     }
     let watchdog = Watchdog::start();
     let source = clocks::source();
     let p = embassy_stm32::init(clocks::config(source));
     let leds = leds::Leds::new(p.PB0, p.PE1, p.PB14);
-    tell_start(source);
+    log_start(source);
     if let Some(core) = &mut core {
-        watchdog::look_after(&mut core.SYST);
+        watchdog::supervise(&mut core.SYST);
     }
     let board = Board {
         serial: serial::Lines::new(serial::Pins {
-            first: (p.PD5, p.PD6, p.PD4),
-            second: (p.PE8, p.PE7, p.PE9),
+            usart2: (p.PD5, p.PD6, p.PD4),
+            uart7: (p.PE8, p.PE7, p.PE9),
         }),
         can: Some((p.PD0, p.PD1)),
         ethernet: Some(ethernet::Parts {
@@ -141,8 +140,8 @@ fn main() -> ! {
     })
 }
 
-/// Says why the board starts, and on which clock.
-fn tell_start(source: clocks::Source) {
+/// Logs why the board was reset, and a missing external clock.
+fn log_start(source: clocks::Source) {
     let cause = embassy_stm32::pac::RCC.rsr().read();
     embassy_stm32::pac::RCC.rsr().modify(|w| w.set_rmvf(true));
     if cause.iwdg1rstf() {
@@ -150,18 +149,18 @@ fn tell_start(source: clocks::Source) {
     } else {
         info!("started");
     }
-    last_words::tell();
+    crash_record::log();
     if source == clocks::Source::Internal {
         warn!("no 8 MHz clock from the debugger: using the internal clock, too inaccurate for fast CAN");
     }
 }
 
-/// Also where a panic ends. The watchdog starts the board again; a debugger finds it here.
+/// Also the end of a panic. Waits for the watchdog's reset, so that a debugger can be attached.
 #[cortex_m_rt::exception]
 unsafe fn HardFault(frame: &cortex_m_rt::ExceptionFrame) -> ! {
-    Watchdog::start_anyhow();
+    Watchdog::ensure_running();
     leds::fault();
-    last_words::keep(frame);
+    crash_record::save_fault(frame);
     loop {
         cortex_m::asm::nop();
     }

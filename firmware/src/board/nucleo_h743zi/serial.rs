@@ -1,4 +1,4 @@
-//! RS-485: USART2 and UART7, with driver-enable by the hardware.
+//! RS-485: USART2 and UART7, with driver-enable by hardware.
 
 use embassy_stm32::gpio::{AfType, Flex, OutputType, Pull, Speed};
 use embassy_stm32::interrupt::typelevel::{self, Handler, Interrupt};
@@ -27,70 +27,70 @@ impl Registers for UsartRegisters {
     }
 }
 
-static FIRST: Shared = Shared::new();
-static SECOND: Shared = Shared::new();
+static USART2_STATE: Shared = Shared::new();
+static UART7_STATE: Shared = Shared::new();
 
 /// USART2's interrupt.
-pub(super) struct FirstInterrupt;
+pub(super) struct Usart2Interrupt;
 /// UART7's.
-pub(super) struct SecondInterrupt;
+pub(super) struct Uart7Interrupt;
 
-impl Handler<typelevel::USART2> for FirstInterrupt {
+impl Handler<typelevel::USART2> for Usart2Interrupt {
     unsafe fn on_interrupt() {
-        Usart::interrupt(&UsartRegisters(USART2), &FIRST);
+        Usart::interrupt(&UsartRegisters(USART2), &USART2_STATE);
     }
 }
 
-impl Handler<typelevel::UART7> for SecondInterrupt {
+impl Handler<typelevel::UART7> for Uart7Interrupt {
     unsafe fn on_interrupt() {
-        Usart::interrupt(&UsartRegisters(UART7), &SECOND);
+        Usart::interrupt(&UsartRegisters(UART7), &UART7_STATE);
     }
 }
 
 /// The pins of both lines: transmit, receive, driver-enable.
 pub(super) struct Pins {
-    pub(super) first: (Peri<'static, PD5>, Peri<'static, PD6>, Peri<'static, PD4>),
-    pub(super) second: (Peri<'static, PE8>, Peri<'static, PE7>, Peri<'static, PE9>),
+    pub(super) usart2: (Peri<'static, PD5>, Peri<'static, PD6>, Peri<'static, PD4>),
+    pub(super) uart7: (Peri<'static, PE8>, Peri<'static, PE7>, Peri<'static, PE9>),
 }
 
-/// The lines that nobody has yet.
+/// The lines that were not handed out yet.
 pub(super) struct Lines {
-    first: Option<[Flex<'static>; 3]>,
-    second: Option<[Flex<'static>; 3]>,
+    usart2: Option<[Flex<'static>; 3]>,
+    uart7: Option<[Flex<'static>; 3]>,
 }
 
 impl Lines {
     pub(super) fn new(pins: Pins) -> Self {
-        let Pins { first: (tx, rx, de), second } = pins;
+        let Pins { usart2: (tx, rx, de), uart7 } = pins;
         Self {
-            first: Some([Flex::new(tx), Flex::new(rx), Flex::new(de)]),
-            second: Some([Flex::new(second.0), Flex::new(second.1), Flex::new(second.2)]),
+            usart2: Some([Flex::new(tx), Flex::new(rx), Flex::new(de)]),
+            uart7: Some([Flex::new(uart7.0), Flex::new(uart7.1), Flex::new(uart7.2)]),
         }
     }
 
     /// Starts the next line.
     pub(super) fn next(&mut self, line: &Rs485) -> Option<Result<SerialDevice, BaudError>> {
-        if let Some(pins) = self.first.take() {
+        if let Some(pins) = self.usart2.take() {
             rcc::enable_and_reset::<peripherals::USART2>();
             let clock = rcc::frequency::<peripherals::USART2>().0;
-            let started = Usart::start(UsartRegisters(USART2), &FIRST, line, clock);
+            let started = Usart::start(UsartRegisters(USART2), &USART2_STATE, line, clock);
             connect(pins);
             enable::<typelevel::USART2>();
             return Some(started);
         }
-        let pins = self.second.take()?;
+        let pins = self.uart7.take()?;
         rcc::enable_and_reset::<peripherals::UART7>();
         let clock = rcc::frequency::<peripherals::UART7>().0;
-        let started = Usart::start(UsartRegisters(UART7), &SECOND, line, clock);
+        let started = Usart::start(UsartRegisters(UART7), &UART7_STATE, line, clock);
         connect(pins);
         enable::<typelevel::UART7>();
         Some(started)
     }
 }
 
-/// Hands transmit, receive and driver-enable over to the USART, for ever; it has to run, because before
-/// that its driver-enable is raised. The transceiver lets its output float while it sends: that must not
-/// be taken for a start bit.
+/// Connects transmit, receive and driver-enable to the USART. It has to run already, because its driver-enable is
+/// active before. The receive pin has a pull-up, because the transceiver's output floats while it sends and must
+/// not be taken for a start bit.
 fn connect(pins: [Flex<'static>; 3]) {
     const FUNCTION: u8 = 7;
     let output = AfType::output(OutputType::PushPull, Speed::High);
@@ -101,6 +101,6 @@ fn connect(pins: [Flex<'static>; 3]) {
 }
 
 fn enable<I: Interrupt>() {
-    // SAFETY: its handler is bound, and masks no critical section.
+    // SAFETY: its handler is bound; critical sections are not affected.
     unsafe { I::enable() }
 }

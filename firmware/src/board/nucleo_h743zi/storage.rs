@@ -1,8 +1,8 @@
 //! The configuration image: in the second flash bank, at `_config_start` (memory.x).
 //!
-//! A flash word that was written twice, or whose writing lost its power, has no valid error correction
-//! code, and reading it is a bus fault. So each flash word of the image is read once with bus faults
-//! held back, before anybody looks at it.
+//! A flash word that was programmed twice, or not completely because of a power failure, has no valid error
+//! correction code, and reading it is a bus fault. So each flash word of the image is first read once with bus
+//! faults ignored.
 
 use core::arch::asm;
 use core::fmt;
@@ -14,7 +14,7 @@ unsafe extern "C" {
     static _config_start: u8;
 }
 
-/// What flash is written and checked in.
+/// Size of a flash word, the unit of programming and error correction.
 const FLASH_WORD: usize = 32;
 
 const _: () = assert!(HEADER <= FLASH_WORD);
@@ -22,7 +22,7 @@ const _: () = assert!(HEADER <= FLASH_WORD);
 /// Why there is no image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum StorageError {
-    /// A word of it cannot be read.
+    /// A flash word of it cannot be read.
     Torn {
         /// The word's address.
         address: usize,
@@ -42,11 +42,11 @@ impl fmt::Display for StorageError {
     }
 }
 
-/// The image, or as much of the flash as shows that there is none.
+/// The image, or the first flash word if that is not the header of an image.
 pub(super) fn read() -> Result<&'static [u8], StorageError> {
     let start = &raw const _config_start;
     check(start.addr(), FLASH_WORD)?;
-    // SAFETY: flash that can be read and that nobody writes.
+    // SAFETY: readable flash, which is not written.
     let header = unsafe { core::slice::from_raw_parts(start, FLASH_WORD) };
     let len = image_len(header).map_or(FLASH_WORD, |len| len.clamp(HEADER, MAX_IMAGE));
     check(start.addr(), len)?;
@@ -54,7 +54,7 @@ pub(super) fn read() -> Result<&'static [u8], StorageError> {
     Ok(unsafe { core::slice::from_raw_parts(start, len) })
 }
 
-/// Whether all flash words of a range can be read.
+/// Checks that all flash words of a range can be read.
 fn check(start: usize, len: usize) -> Result<(), StorageError> {
     (start..start + len)
         .step_by(FLASH_WORD)
@@ -64,8 +64,8 @@ fn check(start: usize, len: usize) -> Result<(), StorageError> {
 fn can_read(address: usize) -> bool {
     const CCR_IGNORE_BUS_FAULTS: u32 = 1 << 8;
     const CFSR_BUS: u32 = 0xBF << 8;
-    // SAFETY: for one load, whose address is flash, all interrupts and faults are masked, and bus faults
-    // then leave only their mark. The mark is taken away; everything else is as it was.
+    // SAFETY: during one load from flash all interrupts and faults are masked, so that a bus fault only sets its
+    // flag. The flag is cleared, and everything else restored.
     unsafe {
         let scb = &*SCB::PTR;
         scb.cfsr.write(CFSR_BUS);

@@ -1,7 +1,7 @@
-//! The independent watchdog: it has its own clock, so it also restarts a board whose clock stopped.
+//! The independent watchdog: it has its own clock, so it also resets a board whose clock stopped.
 //!
-//! It gives no warning. The system timer looks after it instead, and keeps the name of the task that has
-//! the processor for the next start when half of the period has gone by without a feed.
+//! It has no early interrupt. Instead, when half of the period has passed without a feed, the SysTick handler
+//! saves the name of the running task for the next start.
 
 use core::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 
@@ -12,11 +12,11 @@ use embassy_stm32::pac::{DBGMCU, IWDG1 as IWDG1_REGISTERS};
 use embassy_stm32::peripherals::IWDG1;
 use embassy_stm32::wdg::IndependentWatchdog;
 use embassy_time::{Duration, Instant};
-use firmware::platform::Feed;
+use firmware::platform::FeedWatchdog;
 
-use super::last_words;
+use super::crash_record;
 
-/// Without being fed for so long, the board starts again.
+/// Time without a feed until the reset.
 pub(super) const PERIOD: Duration = Duration::from_secs(4);
 
 /// The watchdog; it cannot be stopped.
@@ -25,34 +25,34 @@ pub(crate) struct Watchdog(IndependentWatchdog<'static, IWDG1>);
 impl Watchdog {
     /// Starts it.
     pub(super) fn start() -> Self {
-        // A debugger that halts the core halts it too.
+        // It stops while a debugger halts the core.
         DBGMCU.apb4fzr1().modify(|w| w.set_iwdg1(true));
-        // SAFETY: called once; nobody else has it.
+        // SAFETY: called once; nothing else uses it.
         let device = unsafe { IWDG1::steal() };
         let mut watchdog = IndependentWatchdog::new(device, PERIOD.as_micros() as u32);
         watchdog.unleash();
         Self(watchdog)
     }
 
-    /// Starts it where nothing else can be relied on, such as in a fault that comes before the start: with
-    /// its shortest divider it bites after half a second. One that runs goes on as it does.
-    pub(super) fn start_anyhow() {
+    /// Starts it if it is not running, for a fault that occurs before the start: with its shortest divider it
+    /// resets after half a second.
+    pub(super) fn ensure_running() {
         IWDG1_REGISTERS.kr().write(|w| w.set_key(Key::START));
     }
 }
 
-impl Feed for Watchdog {
+impl FeedWatchdog for Watchdog {
     fn feed(&mut self) {
         self.0.pet();
         FED.store(millis(), Ordering::Relaxed);
         if IS_LATE.swap(false, Ordering::Relaxed) {
-            last_words::forget();
+            crash_record::clear();
         }
     }
 }
 
-/// Looks after it from now on, twelve times a second. Only once there is a time.
-pub(super) fn look_after(timer: &mut SYST) {
+/// Starts the SysTick handler, twelve times a second. The clock has to run already.
+pub(super) fn supervise(timer: &mut SYST) {
     FED.store(millis(), Ordering::Relaxed);
     timer.set_clock_source(SystClkSource::External);
     timer.set_reload(EIGHTHS);
@@ -65,9 +65,9 @@ pub(super) fn look_after(timer: &mut SYST) {
 fn SysTick() {
     let unfed = millis().wrapping_sub(FED.load(Ordering::Relaxed));
     let is_late = u64::from(unfed) >= PERIOD.as_millis() / 2;
-    // Once: a reset in the middle of it would leave nothing.
+    // Only once, because a reset during the write would destroy the record.
     if is_late && !IS_LATE.swap(true, Ordering::Relaxed) {
-        last_words::keep_hang();
+        crash_record::save_hang();
     }
 }
 
@@ -75,9 +75,9 @@ fn millis() -> u32 {
     Instant::now().as_millis() as u32
 }
 
-/// When it was fed last, in milliseconds.
+/// Time of the last feed, in milliseconds.
 static FED: AtomicU32 = AtomicU32::new(0);
-/// A hang is kept that may not be one.
+/// A hang was saved, which a feed may still disprove.
 static IS_LATE: AtomicBool = AtomicBool::new(false);
 /// Cycles of an eighth of the core's clock, from one look to the next.
 const EIGHTHS: u32 = 4_000_000;

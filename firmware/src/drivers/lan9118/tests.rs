@@ -1,4 +1,4 @@
-//! The driver against a model of the controller that keeps its FIFOs and its order of accesses.
+//! The driver with a model of the controller that checks its FIFOs and the order of accesses.
 
 use core::cell::RefCell;
 use core::task::Waker;
@@ -22,7 +22,7 @@ struct Model {
     mac: [u32; 12],
     mac_data: u32,
     phy: [u32; 32],
-    /// Arrives when interrupts are next enabled: between the look and the sleep.
+    /// Arrives when interrupts are enabled next: between the check and the sleep.
     late: Option<Vec<u8>>,
     sent: usize,
 }

@@ -1,8 +1,8 @@
-//! Where everything is: the message RAM as the driver lays it out, the registers, and their bits.
+//! Layout of the message RAM, registers, and their bits.
 
 use proto_core::recipe::model::MAX_CAN_IDS;
 
-/// What the driver uses of the message RAM.
+/// Size of the message RAM that the driver uses.
 pub const MESSAGE_RAM_WORDS: u16 = TX_FIFO + ELEMENT_WORDS * TX_ELEMENTS;
 pub(super) const FILTERS: u16 = MAX_CAN_IDS as u16;
 pub(super) const STANDARD_FILTERS: u16 = 0;
@@ -10,10 +10,10 @@ pub(super) const EXTENDED_FILTERS: u16 = STANDARD_FILTERS + FILTERS;
 pub(super) const RX_ELEMENTS: u16 = 64;
 pub(super) const RX_FIFOS: [u16; 2] =
     [EXTENDED_FILTERS + 2 * FILTERS, EXTENDED_FILTERS + 2 * FILTERS + ELEMENT_WORDS * RX_ELEMENTS];
-/// As many as a port sends in one cycle.
+/// The frames that a port sends in one cycle.
 pub(super) const TX_ELEMENTS: u16 = 32;
 pub(super) const TX_FIFO: u16 = RX_FIFOS[1] + ELEMENT_WORDS * RX_ELEMENTS;
-/// Two of head, and 8 bytes.
+/// Two header words and 8 bytes of data.
 pub(super) const ELEMENT_WORDS: u16 = 4;
 
 const _: () = assert!(MAX_CAN_IDS <= TX_ELEMENTS as usize);
@@ -47,19 +47,19 @@ pub(super) const RX_REGISTERS: [(u8, u8); 2] = [(0xA4, 0xA8), (0xB4, 0xB8)];
 pub(super) const CCCR_INIT: u32 = 1;
 pub(super) const CCCR_CONFIGURE: u32 = 1 << 1;
 pub(super) const CCCR_RESTRICTED: u32 = 1 << 2;
-/// Neither of the three above, nor what sets the controller asleep or to test.
+/// All bits but the three above, clock stop and test mode.
 pub(super) const CCCR_KEPT: u32 = 0xF340;
 pub(super) const PSR_PASSIVE: u32 = 1 << 5;
 pub(super) const PSR_WARNING: u32 = 1 << 6;
 pub(super) const PSR_BUS_OFF: u32 = 1 << 7;
 pub(super) const TXFQS_FULL: u32 = 1 << 21;
-/// A frame was lost, in either FIFO.
+/// A frame was lost, in FIFO 0 or 1.
 pub(super) const LOST: u32 = 1 << 3 | 1 << 7;
-/// New frames, transmitted, message RAM too late, and each change of the error state.
+/// New frame, transmission completed, message RAM access failure, changes of the error state.
 pub(super) const INTERRUPTS: u32 = 1 | 1 << 4 | 1 << 9 | 1 << 17 | 1 << 23 | 1 << 24 | 1 << 25;
-/// What matches no filter, of both lengths of id.
+/// Reject frames that match no filter, with standard and extended ids.
 pub(super) const GFC_REJECT_OTHERS: u32 = 2 << 2 | 2 << 4;
-/// A filter's type, at the same place for both lengths of id.
+/// Dual-id filter, for standard and extended ids.
 pub(super) const TWO_IDS: u32 = 1 << 30;
 pub(super) const TO_FIFO_0: u32 = 1;
 pub(super) const TO_FIFO_1: u32 = 2;

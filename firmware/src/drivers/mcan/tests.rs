@@ -1,4 +1,4 @@
-//! The driver on the model of FDCAN1 that the board's binary runs on, with a bus and who else is there.
+//! The driver with the model of FDCAN1 that the board's binary is tested on.
 
 use core::pin::pin;
 use core::task::Context;
@@ -10,7 +10,7 @@ use std::task::{Wake, Waker};
 use std::vec::Vec;
 
 use chip::device::{Clocks, MICRO, MILLI, Picos, Pin};
-use chip::models::can_bus::{Frame as Wire, Trouble};
+use chip::models::can_bus::{BusFault, Frame as Wire};
 use chip::models::fdcan::Fdcan;
 
 use super::*;
@@ -18,7 +18,7 @@ use crate::drivers::test_chip::Device;
 
 const CLOCK: u32 = 80_000_000;
 const BIT: Picos = 2 * MICRO;
-/// Another place than 0, so that a forgotten offset shows.
+/// Not 0, so that a missing offset is noticed.
 const OFFSET: u16 = 0x300;
 
 type Model = Rc<Device<Fdcan>>;
@@ -57,10 +57,10 @@ fn reset() -> Model {
 /// On the bus, with filters for these ids.
 fn on_the_bus(ids: &[CanId]) -> Bench {
     let (model, waker) = (reset(), &*Box::leak(Box::new(AtomicWaker::new())));
-    // The speed of all others.
+    // The bit rate of the other nodes.
     model.with(|can| can.bus.bitrate = 500_000);
     let mut mcan = Mcan::start(Rc::clone(&model), OFFSET, waker, 500_000, CLOCK).unwrap();
-    // The clock calibration unit, which is the board's affair.
+    // The board bypasses the clock calibration unit.
     Device::write(&model, 0x804, Device::read(&model, 0x804) | 1 << 6);
     let is_on_bus = || model.with(|can| can.is_on_bus());
     assert!(!is_on_bus());
@@ -69,7 +69,7 @@ fn on_the_bus(ids: &[CanId]) -> Bench {
     Bench { model, mcan, waker }
 }
 
-/// A data frame of somebody else; what is behind its data is not 0.
+/// A data frame of another node; the bytes after its data are not 0.
 fn wire(id: CanId, data: &[u8]) -> Wire {
     let mut bytes = [0xEE; 8];
     bytes[..data.len()].copy_from_slice(data);
@@ -81,7 +81,7 @@ fn wire(id: CanId, data: &[u8]) -> Wire {
 }
 
 impl Bench {
-    /// What there is now.
+    /// The next event, if there is one now.
     fn next(&mut self) -> Option<CanEvent<CanFrame>> {
         let mut receiving = pin!(self.mcan.receive());
         match receiving.as_mut().poll(&mut Context::from_waker(Waker::noop())) {
@@ -90,7 +90,7 @@ impl Bench {
         }
     }
 
-    /// What there is next, within 10 ms.
+    /// The next event within 10 ms.
     #[track_caller]
     fn wait(&mut self) -> CanEvent<CanFrame> {
         let end = self.model.now() + 10 * MILLI;
@@ -108,7 +108,7 @@ impl Bench {
         assert!(matches!(told, CanEvent::Bus(now) if now == state), "{told:?} and not {state:?}");
     }
 
-    /// Time passes until something is so, 10 ms at most.
+    /// Advances time until a condition is true, at most 10 ms.
     #[track_caller]
     fn until(&mut self, is_so: impl Fn(&Self) -> bool) {
         let end = self.model.now() + 10 * MILLI;
@@ -123,7 +123,7 @@ impl Bench {
         frame
     }
 
-    /// Somebody else sends a frame, which has ended when this returns.
+    /// Another node sends a frame; returns after its end.
     fn arrive(&self, frame: Wire) {
         let ended = self.model.now() + 140 * BIT;
         self.model.with(|can| can.bus.send(ended, frame));
@@ -134,7 +134,7 @@ impl Bench {
         self.arrive(wire(id, data));
     }
 
-    /// Other bits in the control word of a FIFO's newest element.
+    /// Sets bits in the control word of a FIFO's newest element.
     fn mark(&self, fifo: usize, bits: u32) {
         let (status, _) = RX_REGISTERS[fifo];
         let status = self.get(status);
@@ -146,21 +146,21 @@ impl Bench {
     fn broken(&self, times: usize) {
         for _ in 0..times {
             let ended = self.model.now() + 140 * BIT;
-            self.model.with(|can| can.bus.send_broken(ended));
+            self.model.with(|can| can.bus.send_error_frame(ended));
             self.model.pass(141 * BIT);
         }
     }
 
-    fn trouble(&self, trouble: Trouble) {
-        self.model.with(|can| can.bus.trouble = trouble);
+    fn trouble(&self, trouble: BusFault) {
+        self.model.with(|can| can.bus.fault = trouble);
     }
 
-    /// What it is sending goes into a short circuit, which is over then.
+    /// A short circuit during the present frame.
     #[track_caller]
     fn bus_off(&mut self) {
-        self.trouble(Trouble::Short);
+        self.trouble(BusFault::ShortCircuit);
         self.until(|cell| cell.model.with(|can| !can.bus.bus_offs.is_empty()));
-        self.trouble(Trouble::None);
+        self.trouble(BusFault::None);
     }
 
     /// The next frame leaves.
@@ -175,7 +175,7 @@ impl Bench {
         self.model.with(|can| can.bus.sent.last().map(|(_, frame)| *frame))
     }
 
-    /// Whether it was taken.
+    /// Whether the frame was queued.
     fn send(&mut self, id: CanId, data: &[u8]) -> Poll<Result<(), BusOff>> {
         let frame = CanFrame::new(id, data).unwrap();
         let mut sending = pin!(self.mcan.send(&frame));
@@ -212,7 +212,7 @@ fn parts_of_the_message_ram_do_not_overlap() {
     assert!(parts.windows(2).all(|pair| pair[0].0 + pair[0].1 <= pair[1].0), "{parts:?}");
     assert_eq!(parts[4].0 + parts[4].1, usize::from(MESSAGE_RAM_WORDS));
     assert!((0..MESSAGE_RAM_WORDS).all(|word| cell.model.ram_read(word) == 0));
-    // What is not its own it leaves alone.
+    // It does not write outside its part.
     let others = (0..OFFSET).chain(OFFSET + MESSAGE_RAM_WORDS..2560);
     assert!(
         cell.model
@@ -233,8 +233,8 @@ fn frames_of_the_ids_come_whole_and_nothing_else_does() {
     let near = [CanId::Standard(0), CanId::Standard(2), CanId::Extended(0x7FF), CanId::Extended(2)];
     near.into_iter().for_each(|id| cell.data(id, &[1]));
     assert!(cell.next().is_none());
-    // They were acknowledged all the same.
-    assert_eq!(cell.model.with(|can| (can.bus.heard, can.bus.missed, can.bus.passed)), (8, 0, 4));
+    // They were acknowledged nevertheless.
+    assert_eq!(cell.model.with(|can| (can.bus.received, can.bus.missed, can.bus.accepted)), (8, 0, 4));
 }
 
 #[test]
@@ -262,11 +262,11 @@ fn a_remote_frame_is_one_and_a_frame_of_can_fd_is_none() {
     let mut cell = on_the_bus(&[A, C]);
     cell.arrive(Wire { is_remote: true, len: 3, ..wire(A, &[]) });
     assert_eq!(cell.frame(), CanFrame::remote(A, 3).unwrap());
-    // The controller stores none while CAN FD is off: it is made of a classic one.
+    // The controller stores no CAN FD frame while that is off, so a classic one is changed.
     cell.data(C, &[1, 2, 3, 4, 5, 6, 7, 8]);
     cell.mark(1, 9 << 16 | CONTROL_FD);
     cell.arrive(Wire { len: 15, ..wire(C, &[1, 2, 3, 4, 5, 6, 7, 8]) });
-    // Of a classic frame a length beyond 8 means 8.
+    // In a classic frame a DLC above 8 means 8.
     assert_eq!(cell.frame(), CanFrame::new(C, &[1, 2, 3, 4, 5, 6, 7, 8]).unwrap());
     assert!(cell.next().is_none());
 }
@@ -286,9 +286,9 @@ fn a_burst_is_kept_in_order_by_id_and_what_has_no_room_is_counted() {
         }
     }
     assert_eq!(of_a, (0..64).collect::<Vec<_>>());
-    // Losses behind one another are seen as one.
+    // Consecutive losses count once.
     assert_eq!(cell.mcan.counters().lost, 1);
-    // Round the end of the FIFO.
+    // Past the wrap-around of the FIFO.
     for n in 0..100 {
         cell.data(A, &[n]);
         assert_eq!(cell.frame().data(), [n]);
@@ -330,7 +330,7 @@ fn a_cycle_leaves_in_its_order_and_its_end_is_told_once() {
     let words = Wire { is_remote: true, len: 5, ..Wire::standard(1, &[]) };
     assert_eq!(cell.transmit(), Some(words));
     // One attempt each.
-    assert_eq!(cell.model.with(|can| (can.bus.attempts, can.bus.broken_off)), (34, 0));
+    assert_eq!(cell.model.with(|can| (can.bus.attempts, can.bus.aborted)), (34, 0));
 }
 
 #[test]
@@ -342,7 +342,7 @@ fn bus_off_is_told_and_nothing_stale_is_sent_when_it_is_over() {
     assert!(cell.next().is_none());
     assert_eq!(cell.send(B, &[2]), Poll::Ready(Err(BusOff)));
     cell.mcan.recover();
-    // Not yet there: 129 times 11 recessive bits are to be seen.
+    // Not before 129 times 11 recessive bits.
     cell.model.pass(128 * 11 * BIT);
     assert!(cell.next().is_none());
     assert_eq!(cell.send(B, &[2]), Poll::Ready(Err(BusOff)));
@@ -369,8 +369,8 @@ fn bus_off_found_when_sending_is_not_told_again() {
 fn error_states_are_told_as_they_change() {
     let mut cell = on_the_bus(&[]);
     assert_eq!(cell.send(A, &[1]), Poll::Ready(Ok(())));
-    // Nobody acknowledges: 8 for each attempt, and no more from 128 on.
-    cell.trouble(Trouble::Alone);
+    // Without acknowledge: 8 for each attempt, and none from 128 on.
+    cell.trouble(BusFault::NoAcknowledge);
     cell.wait_for(BusState::Warning);
     assert_eq!(cell.mcan.counters().transmit_errors, 96);
     assert!(cell.next().is_none());
@@ -379,8 +379,8 @@ fn error_states_are_told_as_they_change() {
     cell.model.pass(5 * MILLI);
     assert_eq!(cell.mcan.counters().transmit_errors, 128);
     assert!(cell.next().is_none());
-    // Somebody is there again: 1 less for each frame.
-    cell.trouble(Trouble::None);
+    // With acknowledge: 1 less for each frame.
+    cell.trouble(BusFault::None);
     cell.wait_for(BusState::Warning);
     assert!(matches!(cell.wait(), CanEvent::Sent));
     for errors in (95..127).rev() {
@@ -400,11 +400,11 @@ fn error_counters_are_those_of_the_controller() {
     cell.broken(17);
     assert!(cell.next().is_none());
     assert_eq!(cell.send(A, &[1]), Poll::Ready(Ok(())));
-    cell.trouble(Trouble::Short);
+    cell.trouble(BusFault::ShortCircuit);
     cell.until(|cell| cell.get(ECR) & 0xFF == 0xF8);
     let counters = CanCounters { transmit_errors: 0xF8, receive_errors: 17, lost: 0 };
     assert_eq!(cell.mcan.counters(), counters);
-    // As a receiver it ends at 127, beside a bit that says more.
+    // The receive error counter reads at most 127, beside the error-passive bit.
     let mut cell = on_the_bus(&[]);
     cell.broken(130);
     cell.wait_for(BusState::Passive);
@@ -440,17 +440,17 @@ fn the_interrupt_wakes_who_waits_and_falls_silent_whatever_happened() {
             let task = Waker::from(Arc::clone(&wakes));
             assert!(pin!(cell.mcan.receive()).poll(&mut Context::from_waker(&task)).is_pending());
         }
-        assert!(!cell.model.interrupts());
+        assert!(!cell.model.interrupt_line());
         happens(cell);
-        assert!(cell.model.interrupts());
+        assert!(cell.model.interrupt_line());
         Mcan::interrupt(&cell.model, waker);
-        assert!(!cell.model.interrupts(), "it would come again for ever");
+        assert!(!cell.model.interrupt_line(), "it would come again for ever");
         assert_eq!(wakes.0.load(Ordering::Relaxed), before + 1);
         core::iter::from_fn(|| cell.next()).last()
     };
     let comes = |cell: &Bench| {
         let end = cell.model.now() + 10 * MILLI;
-        while !cell.model.interrupts() && cell.model.hop(end) {}
+        while !cell.model.interrupt_line() && cell.model.hop(end) {}
     };
     interrupted(&mut cell, &|cell| cell.data(A, &[1]));
     interrupted(&mut cell, &|cell| cell.data(B, &[1]));
@@ -461,12 +461,12 @@ fn the_interrupt_wakes_who_waits_and_falls_silent_whatever_happened() {
     assert!(matches!(last, Some(CanEvent::Sent)));
     // Each change of the error state.
     assert_eq!(cell.send(A, &[1]), Poll::Ready(Ok(())));
-    cell.trouble(Trouble::Short);
+    cell.trouble(BusFault::ShortCircuit);
     for state in [BusState::Warning, BusState::Passive, BusState::BusOff] {
         let last = interrupted(&mut cell, &comes);
         assert!(matches!(last, Some(CanEvent::Bus(now)) if now == state), "{last:?} and not {state:?}");
     }
-    cell.trouble(Trouble::None);
+    cell.trouble(BusFault::None);
     cell.mcan.recover();
     let last = interrupted(&mut cell, &comes);
     assert!(matches!(last, Some(CanEvent::Bus(BusState::Active))));

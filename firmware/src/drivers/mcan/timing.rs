@@ -1,24 +1,24 @@
-//! How a bit of the bus is made of the controller's clock.
+//! The bit timing of a CAN controller.
 
 use core::fmt;
 
 /// The nominal bit time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct BitTiming {
-    /// Clock cycles in a quantum, 1..=512.
+    /// Clock cycles per time quantum, 1..=512.
     pub prescaler: u16,
-    /// Quanta between the first, in which an edge is expected, and the sample point; 2..=256.
+    /// Quanta between the synchronisation segment and the sample point, 2..=256.
     pub before_sample: u16,
-    /// Quanta behind the sample point, 2..=128; as many a bit may be longer or shorter.
+    /// Quanta after the sample point, 2..=128; also the synchronisation jump width.
     pub behind_sample: u16,
 }
 
-/// A bit of the bus is not some number of clock cycles.
+/// The bit rate cannot be derived from the clock.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct BitrateError {
-    /// What was asked for, in bit/s.
+    /// Requested bit rate, in bit/s.
     pub bitrate: u32,
-    /// What drives the controller, in Hz.
+    /// The controller's kernel clock, in Hz.
     pub clock: u32,
 }
 
@@ -31,10 +31,10 @@ impl fmt::Display for BitrateError {
 impl core::error::Error for BitrateError {}
 
 impl BitTiming {
-    /// With as fine quanta as can be, and the sample point at 7/8 of the bit, as CiA has it.
+    /// The timing with the shortest possible quanta and the sample point at 7/8 of the bit, as CiA recommends.
     ///
     /// # Errors
-    /// [`BitrateError`] when the speed would be off by more than 0.1 %.
+    /// [`BitrateError`] if the bit rate would be off by more than 0.1 %.
     pub fn of(bitrate: u32, clock: u32) -> Result<Self, BitrateError> {
         let error = BitrateError { bitrate, clock };
         let cycles = clock.saturating_add(bitrate / 2).checked_div(bitrate).ok_or(error)?;

@@ -1,4 +1,4 @@
-//! The driver on the model of the USARTs that the board's binary runs on, with a line that others send on.
+//! The driver with the model of the USARTs that the board's binary is tested on.
 
 use core::future::Future;
 use core::pin::pin;
@@ -46,7 +46,7 @@ struct Bench {
     model: Model,
     line: Usart<Model>,
     wakes: Arc<Wakes>,
-    /// How the others send.
+    /// The format of other devices.
     format: Format,
 }
 
@@ -77,15 +77,15 @@ impl Bench {
         Registers::read(&self.model, register)
     }
 
-    /// Something at the pins.
+    /// Direct access to the line.
     fn wires<T>(&self, f: impl FnOnce(&mut Wires) -> T) -> T {
         self.model.with(|usart| f(&mut usart.line))
     }
 
-    /// The interrupts that are due; how many.
+    /// Handles pending interrupts; returns their number.
     fn interrupts(&self) -> usize {
         let mut count = 0;
-        while self.model.interrupts() {
+        while self.model.interrupt_line() {
             count += 1;
             assert!(count < 10, "the interrupt comes again for ever");
             Usart::interrupt(&self.model, self.line.shared);
@@ -93,7 +93,7 @@ impl Bench {
         count
     }
 
-    /// Time passes, and interrupts come when they are due.
+    /// Advances time and handles interrupts.
     #[track_caller]
     fn pass_until(&self, end: Picos) {
         while self.model.hop(end) {
@@ -102,24 +102,24 @@ impl Bench {
         self.interrupts();
     }
 
-    /// A bit of the others, in sixteen parts.
+    /// A sixteenth of a bit of other devices.
     fn bit(&self) -> Picos {
         SECOND / Picos::from(self.format.baud) / 16 * 16
     }
 
-    /// How long a character is.
+    /// Duration of a character.
     fn character(&self) -> Picos {
         Picos::from(9 + u8::from(self.format.odd_parity.is_some()) + self.format.stop_bits) * self.bit()
     }
 
-    /// Another device sends; its last stop bit has ended when this returns.
+    /// Another device sends; returns after its last stop bit.
     fn arrive(&self, bytes: impl IntoIterator<Item = u8>) {
         for byte in bytes {
             self.pass_until(self.wires(|line| line.send(self.model.now(), &[byte], self.format)));
         }
     }
 
-    /// The same while interrupts are off, with these errors.
+    /// The same with interrupts disabled, with these errors.
     fn damaged(&self, byte: u8, errors: u32) {
         let mut bits = vec![false];
         bits.extend((0..8).map(|index| byte >> index & 1 != 0));
@@ -128,7 +128,7 @@ impl Bench {
         bits.extend([errors & FRAMING_ERROR == 0, true]);
         let mut parts: Vec<bool> = bits.into_iter().flat_map(|bit| [bit; 16]).collect();
         if errors & NOISE != 0 {
-            // In the middle of a bit, too short for two samples.
+            // In the middle of a bit, shorter than two samples.
             parts[3 * 16 + 8] ^= true;
         }
         let now = self.model.now();
@@ -199,7 +199,7 @@ fn speed_parity_and_stop_bits_are_the_configurations() {
         let on = CR1_ENABLE | CR1_TX | CR1_RX | CR1_FIFO;
         assert_eq!(bench.get(CR1) & on, on);
         assert_ne!(bench.get(CR3) & CR3_DRIVER_ENABLE, 0);
-        // On the line: five ones, of eight bits.
+        // On the line: five ones in eight bits.
         assert_eq!(bench.write(&[0xA7]), Some(1));
         assert!(bench.leave());
         let [sent] = bench.sent()[..] else { panic!("one character") };
@@ -288,7 +288,7 @@ fn a_character_with_an_error_is_left_out_by_itself() {
         bench.damaged(byte, errors);
     }
     bench.silence();
-    // Noise in a bit whose majority was clear is none of an error.
+    // Noise that leaves a majority is no error.
     assert_eq!(bench.read(), [1, 3, 5, 6]);
     let errors = LineErrors { parity: 1, framing: 1, ..LineErrors::NONE };
     assert_eq!(bench.line.errors(), errors);
@@ -313,7 +313,7 @@ fn garbage_without_end_does_not_stop_what_is_behind_it() {
 #[test]
 fn an_overrun_is_counted_and_reception_goes_on() {
     let mut bench = Bench::new();
-    // Interrupts are off for 20 characters.
+    // Interrupts are disabled for 20 characters.
     (0..20).for_each(|byte| bench.damaged(byte, 0));
     bench.interrupts();
     bench.arrive([100]);
@@ -349,7 +349,7 @@ fn a_frame_longer_than_everything_leaves_whole_and_without_a_gap() {
             assert!(bench.leave(), "the line fell silent inside a frame");
         }
     }
-    // While something waits, the next character is there when one has left.
+    // Queued characters follow without a gap.
     while !bench.is_flushed() {
         assert!(bench.leave(), "nobody is woken at the end");
     }
@@ -362,7 +362,7 @@ fn a_frame_longer_than_everything_leaves_whole_and_without_a_gap() {
 #[test]
 fn flushed_is_when_the_last_character_has_left_and_who_waits_is_woken() {
     let mut bench = Bench::new();
-    // Of nothing, the end is there.
+    // Nothing to flush.
     assert!(bench.is_flushed());
     for frame in [&[1][..], &[2, 3], &[4; 17], &[5; 40]] {
         assert_eq!(bench.write(frame), Some(frame.len()));
@@ -374,7 +374,7 @@ fn flushed_is_when_the_last_character_has_left_and_who_waits_is_woken() {
         }
         assert!(bench.is_flushed());
         assert!(!bench.leave());
-        // Driver-enable: half a bit before and behind.
+        // Driver-enable: half a bit before and after.
         let sent = bench.sent();
         let (first, last) = (sent[sent.len() - frame.len()], sent[sent.len() - 1]);
         let edges = bench.wires(|line| line.driver[line.driver.len() - 2..].to_vec());

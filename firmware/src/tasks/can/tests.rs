@@ -1,4 +1,4 @@
-//! The task against a controller that a test moves, in virtual time.
+//! The task with a scripted controller, in virtual time.
 
 use core::future::Future;
 use core::pin::Pin;
@@ -22,21 +22,21 @@ use crate::tasks::watchdog::{TaskName, Watch};
 
 const PORT: PortId = PortId(0);
 const BITRATE: u32 = 500_000;
-/// Cycles are of 4 ms.
+/// The cycle time is 4 ms.
 const CYCLE: u64 = 4;
-/// More than is asked for in 102 turns.
+/// More frames than are received in 102 turns.
 const FLOOD: u32 = 10_000;
 
-/// A controller, as the test sees it.
+/// State of the scripted controller.
 #[derive(Default)]
 struct Controller {
     arriving: VecDeque<CanEvent<CanFrame>>,
-    /// As many frames, as fast as they are asked for.
+    /// Number of frames that can be received without a wait.
     flood: u32,
-    /// A frame that was handed over leaves at once.
+    /// Queued frames leave at once.
     is_acknowledged: bool,
     is_off: bool,
-    /// Has no room for a frame.
+    /// Its transmit queue is full.
     is_full: bool,
     bitrate: u32,
     waiting: Vec<CanFrame>,
@@ -136,7 +136,7 @@ impl Wake for Woken {
     }
 }
 
-/// A future that is polled when it was woken, as a task is.
+/// A future that is polled only when it was woken, like a task.
 struct Running {
     future: Pin<Box<dyn Future<Output = ()>>>,
     woken: Arc<Woken>,
@@ -193,7 +193,7 @@ impl Cell {
         cell
     }
 
-    /// Until nobody was woken.
+    /// Runs until no task is woken.
     fn settle(&mut self) {
         let rounds = (0..1_000).take_while(|_| self.engine.poll() | self.task.poll()).count();
         assert!(rounds < 1_000, "a task wakes itself for ever");
@@ -224,7 +224,7 @@ impl Cell {
     }
 }
 
-/// Takes ids 1 and 0x12345, sends ids 2 and 3 each cycle.
+/// Receives ids 1 and 0x12345, sends ids 2 and 3 each cycle.
 fn config() -> GatewayConfig {
     let (input, output) =
         ([InputField::unused(ScalarType::Byte)], [OutputField::constant(ScalarType::Byte, 7.0)]);
@@ -285,7 +285,7 @@ fn bus_off_is_told_and_waited_out_and_nothing_is_sent_until_the_controller_is_ba
     assert!(cell.recoveries().is_empty());
     cell.millis(1);
     assert_eq!(cell.recoveries(), [off_at + 100]);
-    // On its way back: 129 times 11 bits.
+    // During the recovery of 129 times 11 bits.
     cell.millis(3);
     assert_eq!(cell.sent(), before);
     cell.controller(Controller::come_back);
@@ -347,7 +347,7 @@ fn what_nobody_acknowledges_is_given_up_and_never_sent_late() {
     // Receiving goes on meanwhile.
     cell.controller(|can| can.bring(CanEvent::Frame(input_frame())));
     assert_eq!(cell.counters().frames_in, 1);
-    // What waited is forgotten: one cycle's frames leave, and then one cycle's each cycle.
+    // Waiting frames were dropped: the frames of one cycle leave, then those of each cycle.
     cell.controller(|can| can.is_acknowledged = true);
     let before = cell.sent();
     cell.millis(5 * CYCLE);
@@ -382,7 +382,7 @@ fn a_flood_starves_neither_the_other_tasks_nor_what_is_to_be_sent() {
     assert!((1..=IN_A_ROW as u32).contains(&a_turn), "{a_turn} frames in a turn");
     let before = cell.controller.borrow().waiting.len();
     advance(Duration::from_millis(CYCLE));
-    // A tick lets others have a turn before it.
+    // Before a tick, other tasks get a turn.
     while cell.engine.poll() {}
     cell.task.poll();
     assert!(cell.controller.borrow().waiting.len() > before);
@@ -392,7 +392,7 @@ fn a_flood_starves_neither_the_other_tasks_nor_what_is_to_be_sent() {
 #[test]
 fn what_waited_while_the_processor_was_stopped_is_not_heard_of_only_when_a_frame_has_left() {
     let mut cell = Cell::new();
-    // A frame is waited for for seconds.
+    // A frame may take seconds.
     cell.controller(|can| (can.is_full, can.bitrate) = (true, 100));
     cell.millis(2 * CYCLE);
     cell.controller.borrow_mut().bring(CanEvent::Frame(input_frame()));

@@ -1,4 +1,4 @@
-//! A link among three hosts on one Ethernet: the gateway, its controller and a stranger.
+//! Links among three hosts on one Ethernet: the gateway, its controller and another host.
 
 mod datagrams;
 mod delivery;
@@ -37,22 +37,22 @@ const CONTROLLER: u8 = 2;
 const STRANGER: u8 = 3;
 const PORT: u16 = 50_000;
 const FIELD: PortId = PortId(0);
-/// How old a frame may be delivered.
+/// Maximum age of a delivered frame.
 const TIMEOUT: Duration = Duration::from_secs(1);
 /// Of the controller.
 const FRAME: [u8; 5] = [0xFF, 0xFF, 0x01, 0xEE, 0xEE];
 
-/// What waits for each host, and which one does not hear or speak any more.
+/// Frames that wait for each host, and which hosts are cut off.
 struct Wire {
     waiting: RefCell<[VecDeque<Vec<u8>>; 3]>,
     wakers: RefCell<[Option<Waker>; 3]>,
     deaf: Cell<u8>,
     mute: Cell<u8>,
-    /// Frames of all that somebody heard.
+    /// Number of delivered frames.
     spoken: Cell<usize>,
-    /// Each frame's host, and the frame, also when nobody heard it.
+    /// Sender and contents of all frames, also of those not delivered.
     log: RefCell<Vec<(u8, Vec<u8>)>>,
-    /// How fast time passes.
+    /// Speed of time.
     step: Cell<Duration>,
 }
 
@@ -69,7 +69,7 @@ impl Wire {
         }
     }
 
-    /// One host does not hear any more and one does not speak; 0 is none.
+    /// From now on one host receives nothing and one sends nothing; 0 is none.
     fn silence(&self, deaf: u8, mute: u8) {
         self.deaf.set(deaf);
         self.mute.set(mute);
@@ -107,7 +107,7 @@ impl Segment {
     }
 }
 
-/// A host's end of the wire.
+/// A host's network interface.
 struct End {
     wire: Rc<Wire>,
     host: u8,
@@ -222,7 +222,7 @@ fn rs485() -> Bus {
     })
 }
 
-/// A field port, and a listening port that its frames go out by.
+/// A field port, and the listening port to which its frames are forwarded.
 fn config(bus: Bus, controller: Speaks) -> GatewayConfig {
     let mut config = controller_only();
     let mut field = |name: &str| {
@@ -267,7 +267,7 @@ fn listens(kind: LinkKind) -> bool {
 /// Of a frame of the field.
 const LEN: usize = 2 + 1 + 32 * 2 + 16 * 4 + 2;
 
-/// A frame of the field that switches these outputs; the same goes on to the controller.
+/// A field frame that switches these outputs; it is forwarded to the controller unchanged.
 fn switching(outputs: u8) -> [u8; LEN] {
     let mut frame = [0; LEN];
     (frame[0], frame[1], frame[2]) = (0xFF, 0xFF, outputs);
@@ -275,7 +275,7 @@ fn switching(outputs: u8) -> [u8; LEN] {
     frame
 }
 
-/// What a test has to do with.
+/// What a test works with.
 #[derive(Clone, Copy)]
 struct Net<'a> {
     gateway: &'a Gateway,
@@ -294,7 +294,7 @@ impl Net<'_> {
         self.gateway.input(Input::PortBytes { port: FIELD, bytes });
     }
 
-    /// How often the link was up, whether it is, and what was counted.
+    /// How often the link was up, whether it is, and its counters.
     fn link(&self) -> (u32, bool, LinkCounters) {
         self.gateway.report(|status| {
             let link = status.links().find(|link| link.id == self.link).unwrap();
@@ -303,24 +303,24 @@ impl Net<'_> {
         })
     }
 
-    /// Waits until the link was up so often and so many were turned away.
-    async fn seen(&self, connects: u32, strangers: u32) {
-        let turned_away = || self.gateway.strangers().map(|(_, count)| count).max();
-        until(|| (self.link().0, turned_away()) == (connects, Some(strangers))).await;
+    /// Waits until the link was up so often and so many peers were refused.
+    async fn seen(&self, connects: u32, refused_peers: u32) {
+        let turned_away = || self.gateway.refused_peers().map(|(_, count)| count).max();
+        until(|| (self.link().0, turned_away()) == (connects, Some(refused_peers))).await;
     }
 }
 
-/// Waits. All are polled all the time, so nobody has to be woken.
+/// Waits. All futures are polled all the time, so no waker is needed.
 async fn until(mut is_so: impl FnMut() -> bool) {
     poll_fn(|_| if is_so() { Poll::Ready(()) } else { Poll::Pending }).await;
 }
 
-/// Where the gateway listens.
+/// The gateway's listening address.
 fn gateway_port() -> IpEndpoint {
     IpEndpoint::new(address(GATEWAY).into(), PORT)
 }
 
-/// Runs what the controller and the stranger do beside the gateway's link, until they are done.
+/// Runs the controller and the other host beside the gateway's link, until they are done.
 fn among(config: &GatewayConfig, which: impl Fn(LinkKind) -> bool, act: impl AsyncFnOnce(Net<'_>)) {
     let _clock = Clock::take();
     let mut gateway = Box::new(Gateway::idle());

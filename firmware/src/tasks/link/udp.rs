@@ -9,19 +9,19 @@ use embassy_net::{IpAddress, IpEndpoint};
 use embassy_time::{Duration, Timer};
 use proto_core::engine::Input;
 
-use super::{Buffers, Driver, Way, resolve};
+use super::{Buffers, Driver, Role, resolve};
 
 impl Driver<'_> {
     /// Datagrams both ways; on a listening socket, answers go to the sender of the controller's
     /// newest frame.
-    pub(super) async fn udp(&self, turn: u32, controller: &str, way: Way, buffers: &mut Buffers<'_>) {
+    pub(super) async fn udp(&self, turn: u32, controller: &str, role: Role, buffers: &mut Buffers<'_>) {
         let mut received = [PacketMetadata::EMPTY; DATAGRAMS];
-        // One at a time, so that it is known when it has left.
+        // One datagram at a time, so that it is known when it has left.
         let mut waiting = [PacketMetadata::EMPTY; 1];
         let mut socket = UdpSocket::new(self.stack, &mut received, buffers.rx, &mut waiting, buffers.tx);
-        let own = match way {
-            Way::To(_) => 0,
-            Way::At(port) => port,
+        let own = match role {
+            Role::Client(_) => 0,
+            Role::Server(port) => port,
         };
         if socket.bind(own).is_err() {
             return;
@@ -29,30 +29,30 @@ impl Driver<'_> {
         let own = socket.endpoint().port;
         let resolving = select(self.control.over(turn), resolve(self.stack, controller));
         let Either::Second(Some(address)) = self.pulse.idle(pin!(resolving)).await else { return };
-        let fixed = match way {
-            Way::To(port) => Some(IpEndpoint::new(address, port)),
-            Way::At(_) => None,
+        let fixed = match role {
+            Role::Client(port) => Some(IpEndpoint::new(address, port)),
+            Role::Server(_) => None,
         };
         let peer = Cell::new(fixed);
-        if fixed.is_some() && !self.tell(turn, Input::LinkUp { link: self.link }) {
+        if fixed.is_some() && !self.report(turn, Input::LinkUp { link: self.link }) {
             return;
         }
         loop {
             let over = async {
                 self.receive(turn, &socket, fixed, address, &peer, buffers.chunk).await;
-                After::TheEnd
+                Next::End
             };
             let sending = self.send(turn, &socket, &peer);
             let after = match self.pulse.idle(pin!(select(over, sending))).await {
                 Either::First(after) | Either::Second(after) => after,
             };
             match after {
-                After::TheEnd => return,
-                // The peer is not found on the network. Waiting data would be delivered when it is
-                // there again, however old it is then.
-                After::Stuck => {
+                Next::End => return,
+                // The peer is not found on the network. The waiting datagram would be sent when it comes back,
+                // however old it is then.
+                Next::Reopen => {
                     socket.close();
-                    if socket.bind(own).is_err() || !self.tell(turn, Input::LinkSent { link: self.link }) {
+                    if socket.bind(own).is_err() || !self.report(turn, Input::LinkSent { link: self.link }) {
                         return;
                     }
                 }
@@ -70,7 +70,7 @@ impl Driver<'_> {
         chunk: &mut [u8],
     ) {
         loop {
-            // A datagram that is too long for any frame is dropped.
+            // Datagrams longer than the chunk are dropped.
             let Ok((len, from)) = socket.recv_from(chunk).await else { continue };
             let from = from.endpoint;
             let bytes = chunk.get(..len).unwrap_or(&[]);
@@ -81,12 +81,12 @@ impl Driver<'_> {
                 (Some(fixed), _) if from != fixed => continue,
                 (Some(_), _) => {}
                 (None, _) if from.addr != controller => {
-                    self.control.turn_away();
+                    self.control.count_refused_peer();
                     continue;
                 }
                 (None, None) => {
                     peer.set(Some(from));
-                    if !self.tell(turn, Input::LinkUp { link: self.link }) {
+                    if !self.report(turn, Input::LinkUp { link: self.link }) {
                         return;
                     }
                 }
@@ -94,42 +94,43 @@ impl Driver<'_> {
                 (None, Some(_)) if self.gateway.is_frame(self.link, bytes) => peer.set(Some(from)),
                 (None, Some(_)) => {}
             }
-            if !self.tell(turn, Input::LinkBytes { link: self.link, bytes }) {
+            if !self.report(turn, Input::LinkBytes { link: self.link, bytes }) {
                 return;
             }
         }
     }
 
-    async fn send(&self, turn: u32, socket: &UdpSocket<'_>, peer: &Cell<Option<IpEndpoint>>) -> After {
+    async fn send(&self, turn: u32, socket: &UdpSocket<'_>, peer: &Cell<Option<IpEndpoint>>) -> Next {
         while let Some(datagram) = self.control.next(turn).await {
             if let Some(peer) = peer.get() {
                 if socket.send_to(&datagram, peer).await.is_err() {
-                    return After::TheEnd;
+                    return Next::End;
                 }
-                let left = select3(self.control.over(turn), socket.wait_send_ready(), Timer::after(STUCK));
+                let left =
+                    select3(self.control.over(turn), socket.wait_send_ready(), Timer::after(SEND_TIMEOUT));
                 match left.await {
-                    Either3::First(()) => return After::TheEnd,
+                    Either3::First(()) => return Next::End,
                     Either3::Second(()) => {}
-                    Either3::Third(()) => return After::Stuck,
+                    Either3::Third(()) => return Next::Reopen,
                 }
             }
-            if !self.tell(turn, Input::LinkSent { link: self.link }) {
-                return After::TheEnd;
+            if !self.report(turn, Input::LinkSent { link: self.link }) {
+                return Next::End;
             }
         }
-        After::TheEnd
+        Next::End
     }
 }
 
-/// What follows.
-enum After {
-    /// The turn is over, or the socket is of no use.
-    TheEnd,
-    /// A datagram cannot be sent.
-    Stuck,
+/// How to continue.
+enum Next {
+    /// The turn is over, or the socket has failed.
+    End,
+    /// A datagram cannot be sent: open the socket again.
+    Reopen,
 }
 
 /// Datagrams that wait to be read.
 const DATAGRAMS: usize = 8;
-/// How old a datagram may be when it leaves: as old as a frame on TCP may be when it is delivered.
-const STUCK: Duration = Duration::from_millis(250);
+/// Maximum age of a datagram when it leaves: that of a frame on TCP when it is delivered.
+const SEND_TIMEOUT: Duration = Duration::from_millis(250);

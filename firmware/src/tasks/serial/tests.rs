@@ -1,4 +1,4 @@
-//! Lines whose bytes wait, because the processor is busy with something else or was stopped.
+//! Lines whose bytes wait in the device, because the processor is busy or was stopped.
 
 use core::cell::{Cell, RefCell};
 use core::convert::Infallible;
@@ -26,13 +26,13 @@ const IDLE_GAP: Duration = Duration::from_millis(100);
 const TIMEOUT: Duration = Duration::from_millis(200);
 const BAUD: u32 = 115_200;
 
-/// What a device keeps, and what has become of it.
+/// State of a device.
 #[derive(Default)]
 struct Device {
     received: VecDeque<u8>,
-    /// What was sent does not leave.
+    /// Sent bytes do not leave.
     is_stuck: bool,
-    /// Bytes read so far when a frame was begun.
+    /// Number of bytes read before each frame was begun.
     read_before: Vec<usize>,
     read: usize,
     reader: Option<Waker>,
@@ -138,26 +138,26 @@ impl Bench {
         let mut executor = Executor::new(order);
         executor.spawn(gateway.keep_time(pulses[0]));
         executor.spawn(run(gateway, pulses[1], PORT, line, baud));
-        // The engine takes an instant of 0 for none.
+        // The engine treats instant 0 as absent.
         advance(Duration::from_millis(1));
         Self { gateway, device, executor, _clock: clock }
     }
 
-    /// Bytes arrive; nobody has the time to look yet.
+    /// Bytes arrive, but the task is not polled yet.
     fn arrive(&self, bytes: impl IntoIterator<Item = u8>) {
         let mut device = self.device.borrow_mut();
         device.received.extend(bytes);
         device.reader.take().inspect(Waker::wake_by_ref);
     }
 
-    /// What was sent leaves, or does not.
+    /// Whether sent bytes leave.
     fn stick(&self, is_stuck: bool) {
         let mut device = self.device.borrow_mut();
         device.is_stuck = is_stuck;
         device.writer.take().inspect(Waker::wake_by_ref);
     }
 
-    /// Until the next frame is sent.
+    /// Runs until the next frame is sent.
     fn wait_until_it_sends(&mut self) {
         let before = self.device.borrow().read_before.len();
         for _ in 0..500 {
@@ -189,7 +189,7 @@ fn bytes_that_wait_for_a_busy_processor_do_not_make_a_silence() {
         bench.wait(IDLE_GAP * 2);
         let counters = bench.counters();
         assert_eq!((counters.frames_in, counters.discarded_bytes, counters.resync_bytes), (1, 0, 0));
-        // And a silence is one.
+        // A real silence is noticed.
         bench.arrive(FRAME[..3].iter().copied());
         bench.wait(Duration::from_millis(1));
         bench.wait(IDLE_GAP * 2);
@@ -204,7 +204,7 @@ fn all_that_waits_in_a_device_is_heard_before_a_frame_is_overdue() {
         bench.arrive(FRAME);
         bench.wait(Duration::from_millis(1));
         assert_eq!(bench.counters().frames_in, 1);
-        // More than is read at once.
+        // More than one read.
         bench.arrive([0; 1_000].into_iter().chain(FRAME));
         bench.wait(TIMEOUT * 2);
         let counters = bench.counters();
@@ -244,18 +244,18 @@ fn what_waits_is_heard_before_anything_is_sent() {
 #[test]
 fn what_waited_while_the_processor_was_stopped_is_not_heard_of_only_when_a_frame_has_left() {
     for order in Order::ALL {
-        // At this speed a frame takes seconds.
+        // At this baud rate a frame takes seconds.
         let mut bench = Bench::new(order, SendOn::Period, 10);
         bench.stick(true);
         bench.wait_until_it_sends();
-        // The processor is stopped, what keeps the device's bytes is not.
+        // The processor is stopped while the device goes on receiving.
         bench.arrive(FRAME);
         bench.wait(Duration::from_secs(2));
         let counters = bench.counters();
         let slept = (counters.bytes_in, counters.discarded_bytes, counters.asleep, counters.frames_in);
         assert_eq!(slept, (5, 5, 1, 0));
         assert!(bench.device.borrow().is_stuck && counters.downs == 0, "it still sends");
-        // What comes later is heard when the frame has left.
+        // Later bytes are read when the frame has left.
         bench.wait(Duration::from_millis(60));
         bench.arrive(FRAME);
         bench.stick(false);
@@ -310,7 +310,7 @@ impl Write for Flood<'_> {
 
 impl Line for Flood<'_> {}
 
-/// A device behind whose bytes the flood comes.
+/// A device whose bytes are followed by a flood.
 struct FloodAndScript(Script, Rc<Cell<u32>>);
 
 impl ErrorType for FloodAndScript {
@@ -374,7 +374,7 @@ fn a_line_that_never_falls_silent_does_not_starve_the_other_tasks() {
     }
 }
 
-/// A line of which nothing is heard but errors.
+/// A line on which only errors are received.
 struct Wrong<'a>(&'a Cell<u32>);
 
 impl ErrorType for Wrong<'_> {

@@ -20,7 +20,7 @@ impl Wake for Wakes {
     }
 }
 
-/// One round: whether the dog is fed, and who is told of.
+/// One round: whether the watchdog is fed, and what is logged.
 fn round<const N: usize>(watch: &Watch<N>) -> (bool, Vec<(TaskName, Answer)>) {
     let mut told = Vec::new();
     let fed = watch.round(|name, answer| told.push((name, answer)));
@@ -70,13 +70,13 @@ fn the_question_wakes_a_task_that_waits() {
     assert_eq!(wakes.0.load(Ordering::Relaxed), 0);
     assert!(round(&watch).0);
     assert_eq!(wakes.0.load(Ordering::Relaxed), 1);
-    // Woken is not enough.
+    // Being woken is not an answer.
     assert!(!round(&watch).0);
     assert!(waiting.as_mut().poll(&mut cx).is_pending());
     assert!(round(&watch).0);
 }
 
-/// A task that always has something to do never waits, and has to be seen to run all the same.
+/// A task that always has something to do never waits, but has to answer.
 #[test]
 fn what_is_there_at_once_is_an_answer_too() {
     let watch = Watch::<1>::new();

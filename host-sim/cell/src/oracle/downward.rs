@@ -7,23 +7,23 @@ use proto_core::wire::scalar::ScalarType;
 
 use super::Invariant;
 use super::field::as_number;
-use super::sheet::{Frame, Origin, PortSheet, Sheet, shown};
+use super::spec::{Frame, Origin, PortSpec, Spec, shown};
 use super::upward::{Upward, Wrong};
 
-/// One port's sending.
+/// The model of one port's transmissions.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Downward {
     pub is_up: bool,
     pub is_bus_off: bool,
-    /// A frame is to be sent as soon as the line is free.
+    /// A frame is due as soon as the line is free.
     pub due: bool,
     in_flight: bool,
     /// The next CAN frame of a cycle that has begun.
     next_can: usize,
-    /// The newest point of the grid so far.
+    /// Number of the newest cycle on the grid.
     slot: Option<u64>,
     next_slot_at: Instant,
-    /// The newest cycle's bytes, for a port that sends changes.
+    /// The newest cycle's bytes, for a port that sends on changes.
     newest: Option<Vec<u8>>,
     /// The bytes of the cycle that has begun.
     begun: Vec<u8>,
@@ -42,11 +42,11 @@ impl Downward {
         self.is_up && !self.is_bus_off
     }
 
-    fn may_send(&self, port: &PortSheet, now: Instant) -> bool {
+    fn may_send(&self, port: &PortSpec, now: Instant) -> bool {
         self.due && !self.in_flight && self.is_usable() && now >= self.heard + port.turnaround
     }
 
-    /// When the line will be silent for long enough, if a frame waits.
+    /// A frame becomes due; one that is due already is skipped.
     pub(super) fn raise(&mut self) {
         if self.due {
             self.skipped = self.skipped.wrapping_add(1);
@@ -54,8 +54,8 @@ impl Downward {
         self.due = true;
     }
 
-    /// Points of the grid that have passed.
-    pub(super) fn tick(&mut self, port: &PortSheet, now: Instant) {
+    /// Handles the cycles that have begun since the last call.
+    pub(super) fn tick(&mut self, port: &PortSpec, now: Instant) {
         if port.outputs.is_empty() || !matches!(port.send, SendOn::Period | SendOn::Change) {
             return;
         }
@@ -64,7 +64,7 @@ impl Downward {
         }
         let slot = now.as_micros() / port.cycle.as_micros();
         self.next_slot_at = Instant::from_micros((slot + 1) * port.cycle.as_micros());
-        // The first call finds a past point of the grid.
+        // On the first call, the present cycle has just begun.
         let before = self.slot.replace(slot).unwrap_or(slot.saturating_sub(1));
         if slot == before || !self.is_usable() {
             return;
@@ -75,7 +75,7 @@ impl Downward {
         self.raise();
     }
 
-    /// The device or the bus is gone.
+    /// The device or the bus is gone: nothing is due or in flight.
     pub(super) fn reset(&mut self) {
         self.due = false;
         self.in_flight = false;
@@ -87,22 +87,22 @@ impl Downward {
         self.in_flight = false;
     }
 
-    /// The gateway slept: due frames are dropped, but frames that were handed over are in flight.
+    /// The gateway slept: due frames are dropped, frames that were handed over stay in flight.
     pub(super) fn slept(&mut self) {
         let in_flight = self.in_flight;
         self.reset();
         self.in_flight = in_flight;
     }
 
-    /// This many input frames were accepted at once.
-    pub(super) fn answered(&mut self, port: &PortSheet, frames: u32) {
+    /// This many input frames were accepted together.
+    pub(super) fn answered(&mut self, port: &PortSpec, frames: u32) {
         if port.send == SendOn::Frame && self.is_usable() && !port.outputs.is_empty() {
             (0..frames).for_each(|_| self.raise());
         }
     }
 
-    /// A value changed: the bit that triggers may have risen.
-    pub(super) fn watch(&mut self, port: &PortSheet, up: &Upward) {
+    /// A value changed: checks for a rising edge of the trigger.
+    pub(super) fn watch(&mut self, port: &PortSpec, up: &Upward) {
         let SendOn::Rising { var, bit } = port.send else { return };
         let Some((raw, _)) = up.known(var).value else { return };
         let on = raw[0] >> bit & 1 == 1;
@@ -112,8 +112,8 @@ impl Downward {
         self.last_bit = Some(on);
     }
 
-    /// Whether all values of the port are known and, where it matters, fresh.
-    fn may_show(&self, sheet: &Sheet, port: &PortSheet, up: &Upward, now: Instant) -> Result<(), Wrong> {
+    /// Whether all values of the port are known and, if the recipe requires it, not stale.
+    fn may_show(&self, spec: &Spec, port: &PortSpec, up: &Upward, now: Instant) -> Result<(), Wrong> {
         let trigger = match port.send {
             SendOn::Rising { var, .. } => Some(var),
             _ => None,
@@ -128,7 +128,7 @@ impl Downward {
             };
             let age = now.saturating_since(at);
             if port.stops_when_stale && age > port.stale_after {
-                let is_own = sheet.origin[var.ordinal()] == Some(Origin::Field);
+                let is_own = spec.origin[var.ordinal()] == Some(Origin::Field);
                 let invariant = if is_own { Invariant::OwnAge } else { Invariant::Age };
                 return Err((invariant, format!("{var} is {age} old")));
             }
@@ -136,17 +136,17 @@ impl Downward {
         Ok(())
     }
 
-    /// The engine hands a frame over; `id` is that of a CAN frame.
+    /// Checks a frame that the engine hands over; `id` is that of a CAN frame.
     pub(super) fn check(
         &mut self,
-        sheet: &Sheet,
+        spec: &Spec,
         nth: usize,
         up: &Upward,
         id: Option<proto_core::wire::can::CanId>,
         bytes: &[u8],
         now: Instant,
     ) -> Result<(), Wrong> {
-        let port = &sheet.ports[nth];
+        let port = &spec.ports[nth];
         if !self.is_usable() {
             return Err((Invariant::Line, "sent while the device was gone".to_owned()));
         }
@@ -169,7 +169,7 @@ impl Downward {
             ));
         }
         if self.next_can == 0 {
-            self.may_show(sheet, port, up, now)?;
+            self.may_show(spec, port, up, now)?;
             self.begun.clear();
         }
         let shown = frame.payload_of(bytes);
@@ -195,9 +195,9 @@ impl Downward {
         Ok(())
     }
 
-    /// The engine has nothing more to do: nothing that could be sent may be left.
-    pub(super) fn rest(&mut self, sheet: &Sheet, nth: usize, up: &Upward, now: Instant) -> Result<(), Wrong> {
-        let port = &sheet.ports[nth];
+    /// The engine has nothing to do: checks that no frame is due that could be sent.
+    pub(super) fn rest(&mut self, spec: &Spec, nth: usize, up: &Upward, now: Instant) -> Result<(), Wrong> {
+        let port = &spec.ports[nth];
         if !self.may_send(port, now) {
             return Ok(());
         }
@@ -205,7 +205,7 @@ impl Downward {
             self.due = false;
             return Ok(());
         }
-        if self.may_show(sheet, port, up, now).is_err() {
+        if self.may_show(spec, port, up, now).is_err() {
             self.due = false;
             self.stale = self.stale.wrapping_add(1);
             return Ok(());
@@ -219,7 +219,7 @@ impl Downward {
         Err((Invariant::Cycle, "a frame was due and could be sent, but was not".to_owned()))
     }
 
-    fn is_same(&self, port: &PortSheet, up: &Upward, newest: &[u8]) -> bool {
+    fn is_same(&self, port: &PortSpec, up: &Upward, newest: &[u8]) -> bool {
         let mut rest = newest;
         port.outputs.iter().all(|frame| {
             let Some((part, after)) = rest.split_at_checked(frame.payload) else { return false };
@@ -228,7 +228,7 @@ impl Downward {
         })
     }
 
-    /// Whether the fields' bytes are the present values.
+    /// Whether the payload has the present values.
     fn agrees(&self, frame: &Frame, up: &Upward, payload: &[u8]) -> bool {
         let mut rest = payload;
         frame.fields.iter().all(|field| {
@@ -245,14 +245,14 @@ impl Downward {
             rest = after;
             match (number, field) {
                 (Some(number), _) => field_bytes(ty, number)[..ty.size()] == *value,
-                // The result of a command is checked elsewhere.
+                // Reply codes are not modelled.
                 (None, FieldSpec::UserOutput { from: OutputBinding::Reply, .. }) => true,
                 (None, _) => false,
             }
         })
     }
 
-    /// The value of a bound field, before it is made to fit.
+    /// The value of a bound field, before it is rounded and saturated.
     fn number(&self, up: &Upward, ty: ScalarType, from: OutputBinding) -> Option<f64> {
         match from {
             OutputBinding::Variable { var, scale, offset } => {
@@ -274,11 +274,11 @@ impl Downward {
     }
 }
 
-fn raw_of(up: &Upward, var: SysVar) -> Option<super::sheet::Raw> {
+fn raw_of(up: &Upward, var: SysVar) -> Option<super::spec::Raw> {
     up.known(var).value.map(|value| value.0)
 }
 
-/// A number as a field carries it: rounded, halves away from zero, saturated.
+/// The bytes of a number in a field: rounded half away from zero, and saturated.
 fn field_bytes(ty: ScalarType, number: f64) -> [u8; 8] {
     let number = if number.is_nan() { 0.0 } else { number };
     let whole = number.round();

@@ -1,5 +1,5 @@
-//! The frames in the bytes that the line delivered to one field port, and their values. Written the
-//! slow way, straight from proto-core/docs/wire/recipes.md sections 4, 6 and 7.
+//! The frames in the bytes that a field port received, and their values: a plain implementation of
+//! proto-core/docs/wire/recipes.md sections 4, 6 and 7.
 
 use proto_core::config::{CommandWhen, FieldSpec, InputBinding, Span};
 use proto_core::recipe::model::Mode;
@@ -8,9 +8,9 @@ use proto_core::time::Instant;
 use proto_core::wire::can::CanFrame;
 use proto_core::wire::scalar::{Scalar, ScalarType};
 
-use super::sheet::{Frame, PortSheet, Raw};
+use super::spec::{Frame, PortSpec, Raw};
 
-/// The content of a frame.
+/// Whether a frame is accepted.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Verdict {
     Accepted(Accepted),
@@ -18,20 +18,20 @@ pub(super) enum Verdict {
     OutOfRange,
 }
 
-/// A frame that is to be applied.
+/// An accepted frame.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub(super) struct Accepted {
-    /// Which of the port's input frames it is.
+    /// Index of the port's input frame.
     pub frame: usize,
     pub values: Vec<(SysVar, Raw)>,
     /// Reserved bits were set.
     pub masked: bool,
-    /// Values of command fields: the field's place in the port, its table, and when it takes
-    /// effect.
-    pub orders: Vec<(usize, Span, CommandWhen, i64)>,
+    /// Values of command fields: the field's index in the frame, its table, when it picks a command, and the
+    /// value.
+    pub commands: Vec<(usize, Span, CommandWhen, i64)>,
 }
 
-/// Why a CAN frame is not a frame of the recipe.
+/// Why a CAN frame does not match the recipe.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Refused {
     Remote,
@@ -39,7 +39,7 @@ pub(super) enum Refused {
     Length,
 }
 
-/// Bytes of a line that are not checked yet.
+/// Received bytes in which no frame was found yet.
 #[derive(Debug, Clone, Default)]
 pub(super) struct LineWatch {
     pub held: Vec<u8>,
@@ -51,8 +51,8 @@ pub(super) struct LineWatch {
 }
 
 impl LineWatch {
-    /// A partial frame is not continued after silence.
-    pub(super) fn tick(&mut self, port: &PortSheet, now: Instant) {
+    /// Discards a partial frame after the idle gap.
+    pub(super) fn tick(&mut self, port: &PortSpec, now: Instant) {
         if !self.held.is_empty() && now >= self.heard + port.idle_gap {
             self.discard();
         }
@@ -63,15 +63,15 @@ impl LineWatch {
         self.held.clear();
     }
 
-    /// The frames that these bytes complete.
-    pub(super) fn bytes(&mut self, port: &PortSheet, bytes: &[u8], now: Instant) -> Vec<Verdict> {
+    /// Receives bytes; returns the frames that they complete.
+    pub(super) fn bytes(&mut self, port: &PortSpec, bytes: &[u8], now: Instant) -> Vec<Verdict> {
         self.heard = now;
         let Some(frame) = port.inputs.first() else { return Vec::new() };
         self.held.extend_from_slice(bytes);
         self.cut(frame).iter().map(|payload| judge(port.mode, frame, 0, payload)).collect()
     }
 
-    /// Removes whole frames from the held bytes; returns the bytes of their fields.
+    /// Removes complete frames from the held bytes; returns the bytes of their fields.
     pub(super) fn cut(&mut self, frame: &Frame) -> Vec<Vec<u8>> {
         let mut found = Vec::new();
         let mut at = 0;
@@ -98,8 +98,8 @@ impl LineWatch {
     }
 }
 
-/// The content of a CAN frame.
-pub(super) fn can(port: &PortSheet, received: &CanFrame) -> Result<Verdict, Refused> {
+/// Receives a CAN frame.
+pub(super) fn can(port: &PortSpec, received: &CanFrame) -> Result<Verdict, Refused> {
     if received.is_remote() {
         return Err(Refused::Remote);
     }
@@ -144,7 +144,7 @@ fn judge(mode: Mode, frame: &Frame, nth: usize, payload: &[u8]) -> Verdict {
                 }
             }
             (_, FieldSpec::UserInput { to: InputBinding::Commands { table, when }, .. }) => {
-                accepted.orders.push((place, *table, *when, number as i64));
+                accepted.commands.push((place, *table, *when, number as i64));
             }
             _ => {}
         }
@@ -152,7 +152,7 @@ fn judge(mode: Mode, frame: &Frame, nth: usize, payload: &[u8]) -> Verdict {
     if out_of_range { Verdict::OutOfRange } else { Verdict::Accepted(accepted) }
 }
 
-/// A number as a value of a variable: rounded, halves away from zero, or rejected (D22).
+/// A number as a value of a variable, rounded half away from zero; `None` if it does not fit (D22).
 fn bound(var: SysVar, value: f64) -> Option<Raw> {
     let mut raw = Raw::default();
     match var.ty() {
@@ -180,7 +180,7 @@ fn bound(var: SysVar, value: f64) -> Option<Raw> {
     Some(raw)
 }
 
-/// A field's number; every type fits without loss.
+/// A field's value; an `f64` can represent each type exactly.
 fn read(ty: ScalarType, bytes: &[u8]) -> f64 {
     let mut wide = [0; 8];
     wide[..bytes.len()].copy_from_slice(bytes);
@@ -202,7 +202,7 @@ pub(super) fn as_number(var: SysVar, raw: Raw) -> f64 {
     read(var.ty(), &raw[..var.size()])
 }
 
-/// Raw bytes in readable form.
+/// A value as text.
 pub(super) fn show(var: SysVar, raw: Raw) -> String {
     let value = Scalar::decode(var.ty(), &raw);
     value.map_or_else(String::new, |value| value.to_string())

@@ -1,4 +1,4 @@
-//! The gateway's side: what each input must lead to, and whether it did.
+//! The gateway's side: what each input of the engine must lead to, and checks of its outputs.
 
 use proto_core::engine::{Engine, LinkId, PortId};
 use proto_core::link::LinkState;
@@ -7,54 +7,55 @@ use proto_core::time::{Duration, Instant};
 use proto_core::wire::can::CanFrame;
 
 use super::field::{self, Accepted, LineWatch, Refused, Verdict};
-use super::sheet::{Origin, Owned, Raw, shown, written};
+use super::spec::{Origin, Owned, Raw, shown, written};
 use super::upward::{Wrong, is_gap};
 use super::wire::Asked;
 use super::{Invariant, LinkWatch, Oracle, PortWatch, place};
 
 impl Oracle {
-    /// Lets deadlines pass.
+    /// Handles deadlines that have passed.
     pub(super) fn pass(&mut self, now: Instant) {
-        let overdue = self.up.overdue(&self.sheet, now);
+        let overdue = self.up.overdue(&self.spec, now);
         for &(nth, frame) in &overdue {
-            self.forget_orders(nth, Some(frame), now);
+            self.forget_commands(nth, Some(frame), now);
         }
         if !overdue.is_empty() {
             self.values_changed();
         }
-        self.up.expire(&self.sheet, now);
-        for (watch, port) in self.ports.iter_mut().zip(&self.sheet.ports) {
+        self.up.expire(&self.spec, now);
+        for (watch, port) in self.ports.iter_mut().zip(&self.spec.ports) {
             watch.line.tick(port, now);
             watch.down.tick(port, now);
         }
-        if now >= self.again_at {
+        if now >= self.rewrite_at {
             self.write_refused_again();
         }
         let given_up = self.modbus.tick(now);
-        self.up.write_again(&self.sheet, given_up);
-        self.orders.tick(now);
+        self.up.write_again(&self.spec, given_up);
+        self.commands.tick(now);
     }
 
-    /// The gateway itself slept: nothing that had begun is continued.
+    /// The gateway slept: frames that had begun are not continued.
     pub(super) fn slept(&mut self, now: Instant) {
         for watch in &mut self.ports {
             watch.down.slept();
             watch.line.discard();
         }
-        self.deaf_until = Some(now + DEAF);
+        self.discards_until = Some(now + DISCARD_AFTER_SLEEP);
     }
 
-    pub(super) fn forget_orders(&mut self, nth: usize, frame: Option<usize>, now: Instant) {
-        self.orders.forget(nth, frame, now);
-        let orders = &self.orders;
-        self.robot.no_longer_asked(|order| orders.is_asked(order), now);
+    pub(super) fn forget_commands(&mut self, nth: usize, frame: Option<usize>, now: Instant) {
+        self.commands.forget(nth, frame, now);
+        let commands = &self.commands;
+        self.robot.no_longer_asked(|command| commands.is_asked(command), now);
     }
 
-    /// Links that the engine has given up by itself; the input accounts for those in `told`.
-    pub(super) fn look_at_links(&mut self, engine: &Engine, told: Option<LinkId>, now: Instant) {
+    /// Finds the links that the engine has given up by itself. `reported` is the link of the input, which
+    /// handles it.
+    pub(super) fn find_lost_links(&mut self, engine: &Engine, reported: Option<LinkId>, now: Instant) {
         for link in engine.links() {
             let is_lost = !matches!(link.state, LinkState::Up { .. });
-            if is_lost && Some(link.id) != told && self.up.is_up(link.id) {
+            if is_lost && Some(link.id) != reported && self.up.is_up(link.id) {
                 self.link_lost(link.id, now);
             }
         }
@@ -67,38 +68,38 @@ impl Oracle {
         match link {
             LinkId::MODBUS => {
                 let given_up = self.modbus.lost();
-                self.up.write_again(&self.sheet, given_up);
+                self.up.write_again(&self.spec, given_up);
                 self.write_refused_again();
             }
-            LinkId::COMMAND | LinkId::URGENT => self.orders.lost(link, now),
+            LinkId::COMMAND | LinkId::URGENT => self.commands.lost(link, now),
             _ => {}
         }
         self.links[place(link)] = LinkWatch::default();
-        self.up.link_lost(&self.sheet, link);
+        self.up.link_lost(&self.spec, link);
     }
 
     pub(super) fn write_refused_again(&mut self) {
         let refused = std::mem::take(&mut self.refused);
-        self.up.write_again(&self.sheet, refused);
-        self.again_at = Instant::NEVER;
+        self.up.write_again(&self.spec, refused);
+        self.rewrite_at = Instant::NEVER;
     }
 
-    /// A value that a port shows may have changed: bits may have risen.
+    /// Shown values may have changed: looks for rising bits that trigger a port.
     pub(super) fn values_changed(&mut self) {
-        if !self.sheet.has_triggers {
+        if !self.spec.has_triggers {
             return;
         }
-        for (watch, port) in self.ports.iter_mut().zip(&self.sheet.ports) {
+        for (watch, port) in self.ports.iter_mut().zip(&self.spec.ports) {
             watch.down.watch(port, &self.up);
         }
     }
 
     pub(super) fn port_bytes(&mut self, nth: usize, bytes: &[u8], now: Instant) {
-        let port = &self.sheet.ports[nth];
+        let port = &self.spec.ports[nth];
         let watch = &mut self.ports[nth];
         watch.counters.bytes_in = watch.counters.bytes_in.wrapping_add(bytes.len() as u32);
         watch.down.heard = now;
-        if self.deaf_until.is_some() {
+        if self.discards_until.is_some() {
             watch.counters.asleep += 1;
             if !port.inputs.is_empty() {
                 watch.line.discarded += bytes.len() as u64;
@@ -117,10 +118,10 @@ impl Oracle {
     }
 
     pub(super) fn port_can(&mut self, nth: usize, frame: &CanFrame, now: Instant) {
-        let port = &self.sheet.ports[nth];
+        let port = &self.spec.ports[nth];
         let counters = &mut self.ports[nth].counters;
         counters.bytes_in = counters.bytes_in.wrapping_add(frame.data().len() as u32);
-        if self.deaf_until.is_some() {
+        if self.discards_until.is_some() {
             counters.asleep += 1;
             let verdict = field::can(port, frame);
             self.waited_in_sleep(verdict.into_iter().collect());
@@ -138,19 +139,19 @@ impl Oracle {
         }
     }
 
-    /// Frames that had waited while the gateway slept: they are discarded.
+    /// Remembers discarded frames that had waited while the gateway slept.
     fn waited_in_sleep(&mut self, verdicts: Vec<Verdict>) {
         for verdict in verdicts {
             let Verdict::Accepted(frame) = verdict else { continue };
             self.checks[Invariant::FromSleep as usize] += 1;
-            self.orders.waited_in_sleep(&self.sheet, &frame);
+            self.commands.waited_in_sleep(&self.spec, &frame);
             for (var, raw) in frame.values {
                 self.up.known[var.ordinal()].slept.get_or_insert_default().push(raw);
             }
         }
     }
 
-    /// Frames that came in one piece.
+    /// Applies frames that came in one piece.
     pub(super) fn take(&mut self, nth: usize, verdicts: Vec<Verdict>, now: Instant) {
         let mut frames = 0;
         let mut newest: Option<Accepted> = None;
@@ -172,26 +173,26 @@ impl Oracle {
             self.frames[nth].0 += 1;
             frames += 1;
             let commands_up = self.up.is_up(LinkId::COMMAND);
-            if !frame.orders.is_empty() {
-                let urgent = self.orders.accepted(&self.sheet, nth, &frame, commands_up, now);
-                let orders = &self.orders;
-                self.robot.no_longer_asked(|order| orders.is_asked(order), now);
+            if !frame.commands.is_empty() {
+                let urgent = self.commands.accepted(&self.spec, nth, &frame, commands_up, now);
+                let commands = &self.commands;
+                self.robot.no_longer_asked(|command| commands.is_asked(command), now);
                 self.robot.asked(urgent);
             }
-            self.up.accepted(&self.sheet, nth, &frame, now);
+            self.up.accepted(&self.spec, nth, &frame, now);
             self.values_changed();
             newest = Some(frame);
-            // Either the image is checked after each frame, or after all of them.
-            if self.sheet.has_triggers {
+            // The engine does this after each frame if there are triggers, otherwise after all of them.
+            if self.spec.has_triggers {
                 self.after_frames(now);
             }
         }
         let Some(newest) = newest else { return };
         self.after_frames(now);
-        self.ports[nth].down.answered(&self.sheet.ports[nth], frames);
-        let waits = self.sheet.links.iter().any(|link| {
+        self.ports[nth].down.answered(&self.spec.ports[nth], frames);
+        let waits = self.spec.links.iter().any(|link| {
             let wants = newest.values.iter().any(|(var, _)| {
-                let way = self.sheet.owned[var.ordinal()].map(|owned| owned.way);
+                let way = self.spec.owned[var.ordinal()].map(|owned| owned.way);
                 way == Some(link.id) && !self.up.known(*var).waiting.is_empty()
             });
             wants && self.up.is_up(link.id) && !self.up.is_ready(link, now)
@@ -201,10 +202,10 @@ impl Oracle {
         }
     }
 
-    /// Drops what was overtaken, and what has waited too long.
+    /// Drops overtaken commands and values that have waited too long.
     fn after_frames(&mut self, now: Instant) {
-        self.orders.drop_overtaken();
-        self.up.expire(&self.sheet, now);
+        self.commands.drop_overtaken();
+        self.up.expire(&self.spec, now);
     }
 
     pub(super) fn port_send(
@@ -216,7 +217,7 @@ impl Oracle {
     ) {
         let nth = usize::from(port.0);
         self.frames[nth].1 += 1;
-        let result = self.ports[nth].down.check(&self.sheet, nth, &self.up, id, bytes, now);
+        let result = self.ports[nth].down.check(&self.spec, nth, &self.up, id, bytes, now);
         let invariants = [
             Invariant::Known,
             Invariant::Age,
@@ -234,14 +235,14 @@ impl Oracle {
             LinkId::MODBUS => {
                 let (read, refused) = self.modbus.received(&self.map, bytes);
                 for (var, raw) in read {
-                    if self.sheet.origin[var.ordinal()] == Some(Origin::Modbus) {
+                    if self.spec.origin[var.ordinal()] == Some(Origin::Modbus) {
                         self.up.received(var, raw, now);
                     }
                 }
-                self.up.doubt_by_witnesses(&self.sheet, now);
+                self.up.doubt_by_witnesses(&self.spec, now);
                 if !refused.is_empty() {
                     self.refused.extend(refused);
-                    self.again_at = self.again_at.min(now + REFUSED_PAUSE);
+                    self.rewrite_at = self.rewrite_at.min(now + REFUSED_PAUSE);
                 }
                 self.values_changed();
             }
@@ -249,20 +250,20 @@ impl Oracle {
                 self.links[place(link)].line.held.extend_from_slice(bytes);
                 while let Some(packet) = first_packet(&mut self.links[place(link)].line) {
                     if self.links[place(link)].stream.takes(&packet) {
-                        self.up.state_packet(&self.sheet, &packet, now);
+                        self.up.state_packet(&self.spec, &packet, now);
                         self.values_changed();
                     }
                 }
             }
-            LinkId::COMMAND | LinkId::URGENT => self.orders.hears(link, bytes),
+            LinkId::COMMAND | LinkId::URGENT => self.commands.hears(link, bytes),
             _ => self.recipe_bytes(link, bytes, now),
         }
     }
 
     pub(super) fn recipe_bytes(&mut self, link: LinkId, bytes: &[u8], now: Instant) {
-        let Some(sheet) = self.sheet.link(link) else { return };
-        let Some(frame) = sheet.output.clone() else { return };
-        let found = if sheet.is_datagram {
+        let Some(spec) = self.spec.link(link) else { return };
+        let Some(frame) = spec.output.clone() else { return };
+        let found = if spec.is_datagram {
             frame.payload_of(bytes).map(<[u8]>::to_vec).into_iter().collect()
         } else {
             let line = &mut self.links[place(link)].line;
@@ -275,7 +276,7 @@ impl Oracle {
         let before = self.up.frame_at[place(link)].replace(now);
         self.up.heard(now);
         if before.is_some() && is_gap(before, now) {
-            self.up.controller_was_away(&self.sheet, now);
+            self.up.controller_was_away(&self.spec, now);
         }
         for payload in found {
             let mut values: Vec<(SysVar, Raw)> = Vec::new();
@@ -293,7 +294,7 @@ impl Oracle {
             for (var, raw) in values {
                 self.up.received(var, raw, now);
             }
-            self.up.doubt_by_witnesses(&self.sheet, now);
+            self.up.doubt_by_witnesses(&self.spec, now);
             self.values_changed();
         }
     }
@@ -305,8 +306,8 @@ impl Oracle {
         match link {
             LinkId::COMMAND | LinkId::URGENT => {
                 self.checks[Invariant::Once as usize] += 1;
-                let order = self.orders.sent(link, bytes, now)?;
-                self.robot.hands_over_order(order);
+                let command = self.commands.sent(link, bytes, now)?;
+                self.robot.hands_over_command(command);
                 Ok(())
             }
             LinkId::STATE => Err((Invariant::Ownership, "sent on the state link".to_owned())),
@@ -346,7 +347,7 @@ impl Oracle {
             self.checks[invariant as usize] += 1;
         }
         self.checks[Invariant::Edges as usize] += u64::from(var.is_bits());
-        let carried = self.up.wrote(&self.sheet, link, var, raw, now)?;
+        let carried = self.up.wrote(&self.spec, link, var, raw, now)?;
         self.robot.hands_over(var, raw, carried);
         Ok(())
     }
@@ -358,13 +359,13 @@ impl Oracle {
                 "sent before the transport had taken the previous frame".to_owned(),
             ));
         }
-        let sheet = self.sheet.link(link).cloned();
-        let found = sheet.as_ref().and_then(|sheet| {
-            let frame = sheet.input.as_ref()?;
-            Some((sheet, frame, frame.payload_of(bytes)?))
+        let spec = self.spec.link(link).cloned();
+        let found = spec.as_ref().and_then(|spec| {
+            let frame = spec.input.as_ref()?;
+            Some((spec, frame, frame.payload_of(bytes)?))
         });
-        let Some((link_sheet, frame, payload)) = found else {
-            // The greeting of the UDP server.
+        let Some((link_spec, frame, payload)) = found else {
+            // The greeting to the UDP server.
             let is_greeting = link == LinkId::RECIPE_UDP && bytes.len() <= 2 && bytes.iter().all(|&b| b == 0);
             let wrong = (Invariant::Sent, "sent data that is neither a frame nor a greeting".to_owned());
             return if is_greeting { Ok(()) } else { Err(wrong) };
@@ -376,7 +377,7 @@ impl Oracle {
             rest = after;
             let mut raw = Raw::default();
             raw[..bytes.len()].copy_from_slice(bytes);
-            let is_ours = self.sheet.owned[var.ordinal()].is_some_and(|owned| owned.way == link);
+            let is_ours = self.spec.owned[var.ordinal()].is_some_and(|owned| owned.way == link);
             if is_ours && !self.up.known(var).waiting.is_empty() {
                 wanted = true;
                 self.wrote(link, var, raw, now)?;
@@ -384,7 +385,7 @@ impl Oracle {
                 self.writes += 1;
                 self.checks[Invariant::Sent as usize] += 1;
                 self.checks[Invariant::InTime as usize] += 1;
-                let carried = self.up.carried(&self.sheet, link_sheet, (var, raw), now)?;
+                let carried = self.up.carried(&self.spec, link_spec, (var, raw), now)?;
                 wanted |= is_ours && self.up.known(var).safe;
                 self.robot.hands_over(var, raw, carried);
             }
@@ -393,17 +394,17 @@ impl Oracle {
             return Err((Invariant::Sent, "a frame although no value waited".to_owned()));
         }
         self.up.handed_over[place(link)] = Some((now, self.up.era));
-        self.up.sent_frame(&self.sheet, link, now);
+        self.up.sent_frame(&self.spec, link, now);
         Ok(())
     }
 
-    /// Finds values that could be sent to the controller and are not.
+    /// Checks that no value waits although it could be sent.
     pub(super) fn nothing_waits(&mut self, now: Instant) -> Result<(), Wrong> {
         let mut left = self.up.waits;
         while left != 0 {
             let nth = left.trailing_zeros() as usize;
             left &= left - 1;
-            let Some(Owned { way, .. }) = self.sheet.owned[nth] else { continue };
+            let Some(Owned { way, .. }) = self.spec.owned[nth] else { continue };
             if self.up.known[nth].waiting.is_empty() {
                 self.up.waits &= !(1 << nth);
                 continue;
@@ -411,7 +412,7 @@ impl Oracle {
             if !self.up.is_up(way) {
                 continue;
             }
-            let is_free = match self.sheet.link(way) {
+            let is_free = match self.spec.link(way) {
                 None => self.modbus.is_free() && !self.links[place(way)].busy,
                 Some(link) => self.links[place(way)].has_room() && self.up.is_ready(link, now),
             };
@@ -423,12 +424,12 @@ impl Oracle {
         Ok(())
     }
 
-    /// Whether the engine's counters are the model's.
+    /// Compares the engine's counters with the model's.
     pub(super) fn count(&mut self, nth: usize, engine: &Engine) -> Result<(), Wrong> {
         let Some(actual) = engine.port_counters(PortId(nth as u8)) else { return Ok(()) };
         let PortWatch { line, down, counters } = &self.ports[nth];
         let up = self.up.counted[nth];
-        let orders = self.orders.counted[nth];
+        let commands = self.commands.counted[nth];
         let mut expected = *counters;
         expected.tail_mismatches = line.mismatches as u32;
         expected.resync_bytes = line.dropped as u32;
@@ -441,8 +442,8 @@ impl Oracle {
         expected.values_expired = up.values_expired;
         expected.undelivered = up.undelivered;
         expected.timeouts = up.timeouts;
-        expected.commands = orders.0;
-        expected.commands_dropped = orders.1;
+        expected.commands = commands.0;
+        expected.commands_dropped = commands.1;
         if actual.timeouts > expected.timeouts {
             let what = format!("port {nth} counted a timeout although its device was not silent");
             return Err((Invariant::FalseTimeout, what));
@@ -451,8 +452,8 @@ impl Oracle {
             return Err((Invariant::Counted, format!("port {nth} counted {actual:?}, not {expected:?}")));
         }
         let accounted = line.frame_bytes + line.dropped + line.discarded + line.held.len() as u64;
-        let sheet = &self.sheet.ports[nth];
-        if !sheet.is_can && !sheet.inputs.is_empty() && accounted as u32 != actual.bytes_in {
+        let spec = &self.spec.ports[nth];
+        if !spec.is_can && !spec.inputs.is_empty() && accounted as u32 != actual.bytes_in {
             let what =
                 format!("port {nth} received {} bytes, {accounted} are accounted for", actual.bytes_in);
             return Err((Invariant::Bytes, what));
@@ -467,6 +468,6 @@ fn first_packet(line: &mut LineWatch) -> Option<Vec<u8>> {
 
 const PACKET: usize = 1_468;
 /// After sleep, the gateway discards input from the field for this long.
-const DEAF: Duration = Duration::from_millis(50);
-/// A safe value that the controller refused is written again after this time.
+const DISCARD_AFTER_SLEEP: Duration = Duration::from_millis(50);
+/// A safe value that the controller refused is repeated after this time.
 const REFUSED_PAUSE: Duration = Duration::from_millis(500);

@@ -2,21 +2,22 @@
 //! 4).
 //!
 //! In: all inputs and outputs of the engine, and what reaches the controller. Out: how often each
-//! [`Invariant`] was checked, and the first [`Violation`]. The model is slow and plain: it cuts
+//! [`Invariant`] was checked, and the first [`Violation`]. The model is slow and simple: it finds
 //! frames by the rules of proto-core/docs/wire/recipes.md, keeps a queue per variable, and uses
-//! neither the engine's recipes nor its plan. Garbage that happens to be a frame is a frame: what
-//! the line delivered to the port decides.
+//! neither the engine's recipes nor its plan. Garbage that happens to be a valid frame counts as one:
+//! the model sees what the port received, not what the device sent.
 //!
-//! Of the engine it reads only the counters, and which links it considers up.
+//! It reads nothing of the engine but the counters and the states of the links.
 
+mod arrivals;
+mod commands;
 mod downward;
-mod far;
 mod field;
 mod gateway;
-mod orders;
+mod invariant;
 mod robot;
 mod safe;
-mod sheet;
+mod spec;
 mod stream;
 mod upward;
 mod wire;
@@ -29,145 +30,17 @@ use proto_core::link::LinkState;
 use proto_core::sysvar::SysVar;
 use proto_core::time::{Duration, Instant};
 
+use commands::Commands;
 use downward::Downward;
 use field::LineWatch;
-use orders::Orders;
+use invariant::ALL;
+pub use invariant::{Invariant, Violation};
 pub(super) use robot::Path;
 use robot::Robot;
-use sheet::Sheet;
+use spec::Spec;
 use upward::{Upward, Wrong};
 pub(super) use wire::inputs_of;
 use wire::{Controller, Map, Modbus};
-
-/// The invariants.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub enum Invariant {
-    /// Every value written is the next one that its owner sent, or a safe value, or was read back.
-    Sent,
-    /// No value is written after its time to live.
-    InTime,
-    /// Nothing is written before the first valid field frame.
-    FirstFrame,
-    /// Only variables that a port owns are written, whole, on their way up.
-    Ownership,
-    /// Nothing from before a reconnect is written after it.
-    NoReplay,
-    /// The edges of bits are written in order, or counted.
-    Edges,
-    /// A waiting value is handed over as soon as its link is free.
-    Delivered,
-    /// Every frame on the wire is applied or counted: all counters agree with the model's.
-    Counted,
-    /// Every received byte is in a frame, dropped, discarded, or held.
-    Bytes,
-    /// A command is sent once, in time, or not at all.
-    Once,
-    /// No value is shown before it was received.
-    Known,
-    /// No value is shown that is older than promised.
-    Age,
-    /// The value shown is the newest one received.
-    Shown,
-    /// Never faster than the cycle, and each cycle, request and trigger is served or counted.
-    Cycle,
-    /// One transmission at a time, on a silent line, to a device that is there.
-    Line,
-    /// The controller receives what the gateway sent.
-    Transport,
-    /// The controller's inputs are the values written, and nothing else writes them.
-    Registers,
-    /// No value that the controller applies is older than promised.
-    ValueAge,
-    /// A command that the controller accepts was picked, or asked for, not long ago.
-    CommandAge,
-    /// No command that was picked before one that stops the robot arrives after it.
-    Overtaken,
-    /// The controller understands every command that arrives.
-    Understood,
-    /// A command that stops the robot arrives as soon as a way to the controller works.
-    StopArrives,
-    /// The safe value of a silent owner arrives as soon as a way to the controller works.
-    SafeArrives,
-    /// An unreadable value is neither shown nor written back.
-    Unreadable,
-    /// Values of our own ports are not shown when they are older than promised.
-    OwnAge,
-    /// A short stall of the gateway is not taken for silence of a device.
-    FalseTimeout,
-    /// Nothing that waited while the gateway slept is applied or commanded.
-    FromSleep,
-    /// Datagrams go only to the controller's client.
-    Destination,
-    /// The work of one call is bounded.
-    Work,
-    /// Every queue is bounded.
-    Memory,
-    /// There is no panic.
-    NoPanic,
-}
-
-impl Invariant {
-    /// A short name.
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Sent => "values-were-sent",
-            Self::InTime => "values-in-time",
-            Self::FirstFrame => "nothing-before-a-frame",
-            Self::Ownership => "ownership",
-            Self::NoReplay => "no-replay",
-            Self::Edges => "edges-in-order",
-            Self::Delivered => "nothing-is-left-waiting",
-            Self::Counted => "applied-or-counted",
-            Self::Bytes => "bytes-add-up",
-            Self::Once => "commands-once",
-            Self::Known => "shown-is-known",
-            Self::Age => "shown-is-young",
-            Self::Shown => "shown-is-newest",
-            Self::Cycle => "cycle",
-            Self::Line => "one-at-a-time",
-            Self::Transport => "received-is-sent",
-            Self::Registers => "registers",
-            Self::ValueAge => "value-age",
-            Self::CommandAge => "command-age",
-            Self::Overtaken => "stop-is-last",
-            Self::Understood => "commands-understood",
-            Self::StopArrives => "stop-arrives",
-            Self::SafeArrives => "safe-arrives",
-            Self::Unreadable => "unreadable-shown",
-            Self::OwnAge => "own-values-age",
-            Self::FalseTimeout => "no-false-timeout",
-            Self::FromSleep => "nothing-from-sleep",
-            Self::Destination => "destination",
-            Self::Work => "bounded-work",
-            Self::Memory => "bounded-memory",
-            Self::NoPanic => "no-panic",
-        }
-    }
-}
-
-/// A violated invariant.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Violation {
-    /// The invariant.
-    pub invariant: Invariant,
-    /// When it was violated.
-    pub at: Instant,
-    /// A description, with the numbers.
-    pub what: String,
-}
-
-impl Violation {
-    /// A run ended in a panic.
-    pub(crate) fn panic(at: Instant) -> Self {
-        Self { invariant: Invariant::NoPanic, at, what: "a panic: see its message".to_owned() }
-    }
-}
-
-impl std::fmt::Display for Violation {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "{}: {}", self.invariant.name(), self.what)
-    }
-}
 
 /// The model's state of one field port.
 #[derive(Debug, Clone, Default)]
@@ -183,14 +56,15 @@ struct LinkWatch {
     line: LineWatch,
     stream: stream::Stream,
     busy: bool,
-    /// Bytes handed over since the link came up, after each unacknowledged transmission.
+    /// Number of bytes handed over since the link came up, in total and up to the end of each
+    /// unacknowledged transmission.
     total: u64,
     unacked: VecDeque<u64>,
 }
 
 impl LinkWatch {
     fn has_room(&self) -> bool {
-        !self.busy && self.unacked.len() < MOST_UNACKED
+        !self.busy && self.unacked.len() < MAX_UNACKED
     }
 
     fn hands_over(&mut self, bytes: &[u8]) {
@@ -206,10 +80,10 @@ impl LinkWatch {
     }
 }
 
-/// The model and its findings.
+/// The model and its results.
 #[derive(Debug, Clone)]
 pub(super) struct Oracle {
-    sheet: Sheet,
+    spec: Spec,
     map: Map,
     up: Upward,
     ports: Vec<PortWatch>,
@@ -217,25 +91,25 @@ pub(super) struct Oracle {
     modbus: Modbus,
     /// Safe values that the controller refused, and when they are written again.
     refused: Vec<SysVar>,
-    again_at: Instant,
-    orders: Orders,
+    rewrite_at: Instant,
+    commands: Commands,
     controller: Controller,
     robot: Robot,
     /// When the engine was called last.
     called_at: Option<Instant>,
-    /// When the engine asked to be called, and whether it had another input since.
+    /// When the engine asked to be called, and whether another input came first at that time.
     announced: Instant,
     is_late: bool,
-    /// Input from the field until then waited while the gateway slept.
-    deaf_until: Option<Instant>,
-    /// The gateway was not called for a while, but did not sleep.
+    /// Field input is discarded until this instant: it waited while the gateway slept.
+    discards_until: Option<Instant>,
+    /// The input ended a stall that was too short to count as sleep.
     after_stall: bool,
-    /// Size of what is remembered, at the last check.
+    /// Size of the model's own queues at the last check.
     remembered: usize,
-    /// Outputs since the newest input, and their limit.
+    /// Number of outputs since the newest input, and its limit.
     outputs: u32,
-    most_outputs: u32,
-    /// Frames in and out per port; sends and receives per link. They survive a restart.
+    max_outputs: u32,
+    /// Frames in and out per port, sends and receives per link, across restarts of the gateway.
     pub frames: Vec<(u64, u64)>,
     pub traffic: [(u64, u64); LINKS],
     pub writes: u64,
@@ -245,39 +119,40 @@ pub(super) struct Oracle {
 
 impl Oracle {
     pub(super) fn new(config: &GatewayConfig) -> Self {
-        let sheet = Sheet::new(config);
-        let parts: usize = sheet.ports.iter().map(|port| port.outputs.len()).sum();
+        let spec = Spec::new(config);
+        let parts: usize = spec.ports.iter().map(|port| port.outputs.len()).sum();
         Self {
             map: Map::new(),
-            up: Upward::new(&sheet),
-            ports: vec![PortWatch::default(); sheet.ports.len()],
+            up: Upward::new(&spec),
+            ports: vec![PortWatch::default(); spec.ports.len()],
             links: std::array::from_fn(|_| LinkWatch::default()),
             modbus: Modbus::default(),
             refused: Vec::new(),
-            again_at: Instant::NEVER,
-            orders: Orders::default(),
+            rewrite_at: Instant::NEVER,
+            commands: Commands::default(),
             controller: Controller::new(),
             robot: Robot::default(),
             called_at: None,
             announced: Instant::NEVER,
             is_late: false,
-            deaf_until: None,
+            discards_until: None,
             after_stall: false,
             remembered: 0,
             outputs: 0,
-            // A frame per port and id; opening or closing, and one transmission, per link, and one
+            // Per port one frame of each id, per link one open or close and one transmission, and one
             // more command.
-            most_outputs: parts as u32 + 1 + 2 * (4 + sheet.links.len() as u32),
-            frames: vec![(0, 0); sheet.ports.len()],
+            max_outputs: parts as u32 + 1 + 2 * (4 + spec.links.len() as u32),
+            frames: vec![(0, 0); spec.ports.len()],
             traffic: [(0, 0); LINKS],
             writes: 0,
             checks: [0; ALL.len()],
             violation: None,
-            sheet,
+            spec,
         }
     }
 
-    /// The cell was switched on before: its ports are up, and the engine expects a tick then.
+    /// Begins with a cell that is switched on: its ports are up, and the engine expects a tick at
+    /// `announced`.
     pub(super) fn begin(&mut self, engine: &Engine, announced: Instant, now: Instant) {
         self.called_at = Some(now);
         self.announced = announced;
@@ -286,20 +161,20 @@ impl Oracle {
         }
     }
 
-    /// The gateway restarts without any state, so nothing may be expected of it.
+    /// The gateway has restarted without any state.
     pub(super) fn restarted(&mut self, now: Instant) {
-        self.up = Upward::new(&self.sheet);
-        self.ports = vec![PortWatch::default(); self.sheet.ports.len()];
+        self.up = Upward::new(&self.spec);
+        self.ports = vec![PortWatch::default(); self.spec.ports.len()];
         self.links = std::array::from_fn(|_| LinkWatch::default());
         self.modbus.lost();
         self.refused.clear();
-        self.again_at = Instant::NEVER;
-        self.orders = Orders::default();
+        self.rewrite_at = Instant::NEVER;
+        self.commands = Commands::default();
         self.robot.restarted(now);
         self.called_at = None;
         self.announced = Instant::ZERO;
         self.is_late = false;
-        self.deaf_until = None;
+        self.discards_until = None;
     }
 
     pub(super) fn violation(&self) -> Option<&Violation> {
@@ -319,7 +194,7 @@ impl Oracle {
         }
     }
 
-    /// The engine has handled an input and was not asked for outputs yet.
+    /// The engine has handled an input; its outputs follow.
     pub(super) fn input(&mut self, now: Instant, input: &Input<'_>, engine: &Engine) {
         if self.violation.is_some() {
             return;
@@ -334,9 +209,9 @@ impl Oracle {
             self.announced = Instant::NEVER;
         }
         if has_slept {
-            self.orders.slept(now);
+            self.commands.slept(now);
             self.robot.forget_all(now);
-            self.look_at_links(engine, None, now);
+            self.find_lost_links(engine, None, now);
         }
         if is_tick || has_slept {
             self.pass(now);
@@ -344,17 +219,17 @@ impl Oracle {
         if has_slept {
             self.slept(now);
         }
-        let told = match input {
+        let reported = match input {
             // After sleep, links have been given up before any input is handled.
             _ if has_slept => None,
             Input::LinkDown { link } | Input::LinkBytes { link, .. } => Some(*link),
             _ => None,
         };
-        self.look_at_links(engine, told, now);
+        self.find_lost_links(engine, reported, now);
         if is_tick || has_slept {
-            self.up.repeat(&self.sheet, now);
+            self.up.repeat(&self.spec, now);
         }
-        self.deaf_until = self.deaf_until.filter(|until| !is_tick || now < *until);
+        self.discards_until = self.discards_until.filter(|until| !is_tick || now < *until);
         match *input {
             Input::PortBytes { port, bytes } => self.port_bytes(usize::from(port.0), bytes, now),
             Input::PortCan { port, frame } => self.port_can(usize::from(port.0), &frame, now),
@@ -367,7 +242,7 @@ impl Oracle {
                 watch.down.is_up = false;
                 watch.down.reset();
                 watch.line.discard();
-                self.forget_orders(nth, None, now);
+                self.forget_commands(nth, None, now);
             }
             Input::PortBus { port, state } => {
                 let nth = usize::from(port.0);
@@ -378,12 +253,12 @@ impl Oracle {
                 if is_news {
                     watch.counters.bus_offs += 1;
                     watch.down.reset();
-                    self.forget_orders(nth, None, now);
+                    self.forget_commands(nth, None, now);
                 }
             }
             Input::LinkUp { link } => {
-                self.nobody_spoke(link);
-                self.up.controller_was_away(&self.sheet, now);
+                self.forget_sender(link);
+                self.up.controller_was_away(&self.spec, now);
                 if !self.up.is_up(link) && is_up(engine, link) {
                     self.up.link_up(link, now);
                     self.links[place(link)] = LinkWatch::default();
@@ -395,9 +270,9 @@ impl Oracle {
             Input::LinkAcked { link, left } => self.links[place(link)].acked(left),
             _ => {}
         }
-        self.orders.look_at_replies(engine);
-        if told.is_some() {
-            self.look_at_links(engine, None, now);
+        self.commands.match_replies(engine);
+        if reported.is_some() {
+            self.find_lost_links(engine, None, now);
         }
     }
 
@@ -407,8 +282,8 @@ impl Oracle {
             return;
         }
         self.outputs += 1;
-        let result = if self.outputs > self.most_outputs {
-            Err((Invariant::Work, format!("more than {} outputs for one input", self.most_outputs)))
+        let result = if self.outputs > self.max_outputs {
+            Err((Invariant::Work, format!("more than {} outputs for one input", self.max_outputs)))
         } else {
             Ok(())
         };
@@ -419,9 +294,9 @@ impl Oracle {
             Output::LinkClose { link } => self.link_lost(link, now),
             Output::LinkSend { link, bytes } => {
                 self.traffic[place(link)].0 += 1;
-                // Data handed over to a lost connection never leaves.
+                // Values handed over to a lost connection never leave: start with none.
                 self.robot.hands_over_nothing();
-                if self.sheet.link(link).is_some_and(|link| !link.is_datagram) {
+                if self.spec.link(link).is_some_and(|link| !link.is_datagram) {
                     self.links[place(link)].hands_over(bytes);
                 }
                 let result = self.link_send(link, bytes, now);
@@ -431,17 +306,17 @@ impl Oracle {
         }
     }
 
-    /// The engine has nothing more to do before `until`; the cell itself holds this many later
-    /// events.
-    pub(super) fn rest(&mut self, now: Instant, engine: &Engine, until: Instant, things: usize) {
+    /// The engine has nothing to do before `until`. `pending` is the number of events and connections
+    /// in the cell.
+    pub(super) fn rest(&mut self, now: Instant, engine: &Engine, until: Instant, pending: usize) {
         if self.violation.is_some() {
             return;
         }
         self.announced = self.announced.min(until);
         for nth in 0..self.ports.len() {
-            if self.sheet.ports[nth].is_field {
+            if self.spec.ports[nth].is_field {
                 if !self.is_late {
-                    let result = self.ports[nth].down.rest(&self.sheet, nth, &self.up, now);
+                    let result = self.ports[nth].down.rest(&self.spec, nth, &self.up, now);
                     self.judge(now, &[Invariant::Cycle], result);
                 }
                 let result = self.count(nth, engine);
@@ -455,15 +330,17 @@ impl Oracle {
             self.judge(now, &[Invariant::Delivered], result);
         }
         let remembered = self.remembered;
-        let result = match (remembered, things) {
-            (0..MOST_BYTES, 0..MOST_THINGS) => Ok(()),
-            _ => Err((Invariant::Memory, format!("{remembered} bytes and {things} things wait in the cell"))),
+        let result = match (remembered, pending) {
+            (0..MAX_BYTES, 0..MAX_PENDING) => Ok(()),
+            _ => {
+                Err((Invariant::Memory, format!("{remembered} bytes and {pending} things wait in the cell")))
+            }
         };
         self.judge(now, &[Invariant::Memory], result);
     }
 }
 
-/// Index of a link in per-link state.
+/// Index of a link in arrays of per-link state.
 pub(super) fn place(link: LinkId) -> usize {
     usize::from(link.0) % LINKS
 }
@@ -472,49 +349,15 @@ fn is_up(engine: &Engine, id: LinkId) -> bool {
     engine.links().any(|link| link.id == id && matches!(link.state, LinkState::Up { .. }))
 }
 
-/// Four links to fixed ports of the controller, and one per listening port.
+/// Maximum number of links: those to the controller's fixed ports, and one per listening port.
 const LINKS: usize = 16;
-/// Frames of a recipe link that the controller's TCP has not acknowledged.
-const MOST_UNACKED: usize = 64;
-/// A gateway that is not called for longer was asleep.
+/// Maximum number of unacknowledged frames of a recipe link.
+const MAX_UNACKED: usize = 64;
+/// A gateway that is not called for longer has slept.
 const ASLEEP: Duration = Duration::from_millis(500);
-/// More than any stall can gather.
-const MOST_BYTES: usize = 1 << 20;
-const MOST_THINGS: usize = 100_000;
-
-const ALL: [Invariant; 31] = [
-    Invariant::Sent,
-    Invariant::InTime,
-    Invariant::FirstFrame,
-    Invariant::Ownership,
-    Invariant::NoReplay,
-    Invariant::Edges,
-    Invariant::Delivered,
-    Invariant::Counted,
-    Invariant::Bytes,
-    Invariant::Once,
-    Invariant::Known,
-    Invariant::Age,
-    Invariant::Shown,
-    Invariant::Cycle,
-    Invariant::Line,
-    Invariant::Transport,
-    Invariant::Registers,
-    Invariant::ValueAge,
-    Invariant::CommandAge,
-    Invariant::Overtaken,
-    Invariant::Understood,
-    Invariant::StopArrives,
-    Invariant::SafeArrives,
-    Invariant::Unreadable,
-    Invariant::OwnAge,
-    Invariant::FalseTimeout,
-    Invariant::FromSleep,
-    Invariant::Destination,
-    Invariant::Work,
-    Invariant::Memory,
-    Invariant::NoPanic,
-];
+/// More than can gather in any stall.
+const MAX_BYTES: usize = 1 << 20;
+const MAX_PENDING: usize = 100_000;
 
 #[cfg(test)]
 mod robot_tests;

@@ -1,5 +1,4 @@
-//! The model notices what goes wrong at the robot's side: gateways and drivers that break each promise
-//! about what reaches it.
+//! Gateways and drivers that break one promise each about what reaches the robot: the model reports it.
 
 use proto_core::engine::{Input, LinkId, Output, PortId};
 use proto_core::sysvar::SysVar;
@@ -8,19 +7,19 @@ use proto_core::time::{Duration, Instant};
 use super::tests::{CELL, DEVICE, cell, coils, frame, is_rest, modbus};
 use super::upward::Carried;
 use super::*;
-use crate::network::Speaker;
+use crate::network::Sender;
 use crate::soak::Scenario;
 use crate::tamper::{Forged, Outward};
 use crate::{Cell, LineId, Talker, Way};
 use recipe_config::file::{self, Text};
 use recipe_test_kit::toml;
 
-/// A panel that starts and stops, a value with a safe one.
+/// A panel that starts and stops, and a variable with a safe value.
 fn panel_cell() -> String {
     toml::panel(r#"1 = "speed(10)", 2 = "speed(20)", 9 = "stop""#, 100) + MIRROR
 }
 
-/// What the controller's outputs are is shown.
+/// Outputs of the controller are shown.
 const MIRROR: &str = r#"
 [[recipe]]
 name = "mirror"
@@ -40,7 +39,7 @@ cycle_ms = 20
 stale_after_ms = 300
 "#;
 
-/// One float is sent, its neighbour in the frame is read back.
+/// One float is sent; the other one in its frame is read back.
 const NEIGHBOUR: &str = r#"
 [controller]
 address = "127.0.0.1"
@@ -73,7 +72,7 @@ fn panel(order: u8, bits: u8) -> Vec<u8> {
     vec![0xFF, 0xFF, order, bits, 0xEE, 0xEE]
 }
 
-/// The cell after a second, with a device that has sent its first frame.
+/// The cell after one second; its device has sent a first frame.
 fn ready(toml: &str, first: &[u8]) -> (Cell, LineId) {
     let mut cell = cell(toml);
     cell.run_ms(1_000);
@@ -131,7 +130,7 @@ fn a_value_that_the_network_delivers_when_it_is_old() {
     cell.cut_way(LinkId::MODBUS, Way::Up);
     cell.send(line, &frame(2));
     cell.run_ms(1_000);
-    cell.mend_way(LinkId::MODBUS, Way::Up);
+    cell.repair_way(LinkId::MODBUS, Way::Up);
     cell.run_ms(390);
     assert_eq!(cell.violation(), None);
     cell.run_ms(100);
@@ -145,7 +144,7 @@ fn a_command_that_the_network_delivers_when_it_is_old() {
     cell.cut_way(LinkId::COMMAND, Way::Up);
     cell.send(line, &panel(1, 1));
     cell.run_ms(1_200);
-    cell.mend_way(LinkId::COMMAND, Way::Up);
+    cell.repair_way(LinkId::COMMAND, Way::Up);
     cell.run_ms(300);
     assert_eq!(broken(&cell), Invariant::CommandAge);
 }
@@ -161,7 +160,7 @@ fn a_stop_that_nobody_has_asked_for_any_more_for_long() {
     let conn = cell.gate(LinkId::URGENT).conn.unwrap();
     for (late, expected) in [(1_900, None), (2_100, Some(Invariant::CommandAge))] {
         let mut oracle = cell.oracle.clone().unwrap();
-        oracle.came(conn, 100, Duration::ZERO, cell.now() + Duration::from_millis(late));
+        oracle.delivered(conn, 100, Duration::ZERO, cell.now() + Duration::from_millis(late));
         assert_eq!(oracle.violation().map(|broken| broken.invariant), expected, "{late} ms");
     }
 }
@@ -210,7 +209,7 @@ fn a_safe_value_that_is_not_there() {
         oracle.survey(&paths, &without, now);
         oracle.violation().map(|broken| broken.invariant)
     };
-    // As if what came last had left it so.
+    // As if the newest arrival had set it.
     let arrives = |oracle: &mut Oracle| oracle.robot.applied(&inputs, &without, now);
     assert_eq!(judged(&arrives, &mut cell), Some(Invariant::SafeArrives));
     assert_eq!(judged(&|_| (), &mut cell), None, "somebody else has written it");
@@ -346,7 +345,7 @@ fn a_driver_that_answers_a_stranger() {
     cell.send_can(bus, proto_core::wire::can::CanFrame::new(id, &[0, 1]).unwrap());
     for _ in 0..200 {
         cell.run(Duration::from_micros(50));
-        cell.gate(link).partner = Some(Speaker::Stranger);
+        cell.gate(link).answers_to = Some(Sender::Stranger);
     }
     assert_eq!(broken(&cell), Invariant::Destination);
 }
@@ -378,7 +377,7 @@ fn a_held_value_from_before_the_controller_began_anew() {
     let now = cell.now();
     oracle.robot.hands_over(SysVar::parse("ForceEnd[1]").unwrap(), 7.5_f32.to_le_bytes(), held);
     oracle.sent(7, LinkId::of_port(PortId(0)), b"frame", Duration::ZERO, now);
-    oracle.came(7, 5, Duration::ZERO, now);
+    oracle.delivered(7, 5, Duration::ZERO, now);
     assert_eq!(oracle.violation().map(|broken| broken.invariant), Some(Invariant::NoReplay));
 }
 
@@ -392,7 +391,7 @@ fn a_command_that_comes_behind_the_stop_that_overtook_it() {
     cell.send(line, &panel(9, 1));
     cell.run_ms(300);
     assert_eq!(cell.violation(), None);
-    cell.mend_way(LinkId::COMMAND, Way::Up);
+    cell.repair_way(LinkId::COMMAND, Way::Up);
     cell.run_ms(300);
     assert_eq!(broken(&cell), Invariant::Overtaken);
 }

@@ -1,19 +1,19 @@
-//! The packets in the state stream (proto-core/docs/wire/state.md section 3, D8), read slowly from
-//! the fields themselves.
+//! The packets in the state stream (proto-core/docs/wire/state.md section 3, D8), judged by their decoded
+//! fields.
 
 use proto_core::wire::state::StatePacket;
 
 /// One connection's packets.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Stream {
-    /// The newest packet, and the newest with a started controller's codes.
+    /// The newest packet, and the newest one of a started controller.
     newest: Option<StatePacket>,
     started: Option<StatePacket>,
     wrong_in_a_row: u32,
 }
 
 impl Stream {
-    /// Whether this is the next packet. After three misaligned ones, nothing is.
+    /// Whether this is the next packet. After three misaligned ones in a row, nothing is.
     pub(super) fn takes(&mut self, bytes: &[u8]) -> bool {
         let Ok(packet) = StatePacket::parse(bytes) else { return false };
         if self.wrong_in_a_row >= 3 || !is_packet(&packet) || self.is_elsewhere(&packet) {
@@ -28,7 +28,7 @@ impl Stream {
         true
     }
 
-    /// Other codes, and the arm more than 0.5 rad or m from where it was.
+    /// Whether the codes differ and the arm is more than 0.5 rad or m from where it was.
     fn is_elsewhere(&self, packet: &StatePacket) -> bool {
         let (Some(started), Some(newest)) = (&self.started, &self.newest) else { return false };
         let tcp = if is_started(packet) { 0 } else { 3 };
@@ -75,7 +75,7 @@ fn is_packet(packet: &StatePacket) -> bool {
     joints < 3 && bools <= 8 && (is_started(packet) || strange(packet) < 3)
 }
 
-/// Quantities that are not finite, too large for their unit, or tiny.
+/// Number of quantities that are not finite, too large for their unit, or tiny.
 fn strange(packet: &StatePacket) -> usize {
     let joints = [
         (packet.joint_position, 1_000.0),

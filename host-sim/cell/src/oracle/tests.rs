@@ -1,4 +1,4 @@
-//! The model notices: gateways that break each promise, each caught by the invariant of that name.
+//! Gateways that break one promise each: the model reports the violated invariant.
 
 use std::cell::RefCell;
 use std::rc::Rc;
@@ -12,7 +12,7 @@ use crate::{Cell, Talker};
 use recipe_config::SimConfig;
 use recipe_config::file::{self, Text};
 
-/// DO1..8 and a word from a device, the pose back to it, nothing shown that is older than 300 ms.
+/// DO1..8 and a word from a device, the pose back to it, nothing older than 300 ms.
 pub(super) const CELL: &str = r#"
 [controller]
 address = "127.0.0.1"
@@ -70,7 +70,7 @@ pub(super) fn cell(toml: &str) -> Cell {
     cell
 }
 
-/// The n-th frame: bits that change each time, two of them differ; a word that counts.
+/// The n-th frame: two bits that change each time, and a word that counts.
 pub(super) fn frame(n: u64) -> Vec<u8> {
     let bits = if n.is_multiple_of(2) { 0b01 } else { 0b10 };
     let [low, high] = (n as u16).to_le_bytes();
@@ -382,7 +382,7 @@ fn work_without_an_end() {
 fn what_waits_without_a_bound() {
     let cell = cell(CELL);
     let mut oracle = Oracle::new(cell.gateway());
-    oracle.rest(cell.now(), cell.engine(), Instant::NEVER, MOST_THINGS);
+    oracle.rest(cell.now(), cell.engine(), Instant::NEVER, MAX_PENDING);
     assert_eq!(oracle.violation().map(|broken| broken.invariant), Some(Invariant::Memory));
 }
 

@@ -1,4 +1,4 @@
-//! The values that are still to be written to the controller, and the checks of each write
+//! The values that are to be written to the controller, and the checks of each write
 //! (proto-core/docs/engine.md section 5).
 
 use std::collections::VecDeque;
@@ -9,9 +9,9 @@ use proto_core::time::{Duration, Instant};
 
 use super::Invariant;
 use super::field::{Accepted, show};
-use super::sheet::{LinkSheet, Origin, Owned, Raw, Sheet};
+use super::spec::{LinkSpec, Origin, Owned, Raw, Spec};
 
-/// Number of values per port that wait behind the next ones.
+/// Maximum number of values per port that wait behind the next ones.
 const EDGES: usize = 16;
 /// Maximum age of a value that was read back.
 const READ_BACK: Duration = Duration::from_millis(500);
@@ -19,7 +19,7 @@ const READ_BACK: Duration = Duration::from_millis(500);
 /// After this long without the data that the controller sends steadily, it may have restarted.
 const AWAY: Duration = Duration::from_millis(500);
 
-/// Whether so much time lies between the newest data and now.
+/// Whether no data has come for longer than [`AWAY`].
 pub(super) fn is_gap(last: Option<Instant>, now: Instant) -> bool {
     last.is_none_or(|at| now.saturating_since(at) > AWAY)
 }
@@ -27,32 +27,32 @@ pub(super) fn is_gap(last: Option<Instant>, now: Instant) -> bool {
 /// The state of one variable.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Known {
-    /// The value that a port would show now, and since when.
+    /// The value that a port would show now, and when it came.
     pub value: Option<(Raw, Instant)>,
     /// Values to be written, the next one first, each with the time of its frame.
     pub waiting: VecDeque<(Raw, Instant)>,
-    /// When the newest frame with it was accepted.
+    /// When the newest field frame with it was accepted.
     pub accepted: Option<Instant>,
-    /// Its owner sent it in time, or it has its safe value.
+    /// Its owner is not overdue, or it has its safe value.
     pub live: bool,
     /// It has its safe value.
     pub safe: bool,
-    /// Since when: a safe value that is written again is as old as it was.
+    /// Since when it has it, repetitions included.
     pub safe_at: Instant,
-    /// The state stream has shown it since its owner fell silent, or ever.
+    /// The state stream has shown it since its owner became overdue, or ever.
     pub read_back: bool,
     /// The newest value from the controller was not finite.
     pub unreadable: bool,
     /// It has its safe value, and the controller is not known to have it.
     pub unconfirmed: bool,
-    /// Its owner fell silent before the last value was handed over.
+    /// Its owner became overdue before the last value was handed over.
     pub unsent: bool,
-    /// Values that waited while the gateway slept and have not come since.
+    /// Values that waited while the gateway slept; `None` once a frame has come since.
     pub slept: Option<Vec<Raw>>,
 }
 
 impl Known {
-    /// No accepted frame and no safe value has this value.
+    /// Whether it is neither the current value nor waiting.
     fn is_news(&self, raw: Raw) -> bool {
         self.value.is_none_or(|value| value.0 != raw) && self.waiting.iter().all(|next| next.0 != raw)
     }
@@ -63,14 +63,14 @@ impl Known {
 pub(super) enum Carried {
     /// It is a safe value.
     Safe,
-    /// The controller holds it already, as far as is known, since its silent owner's last frame.
+    /// The controller holds it already, as far as is known, since the last frame of its overdue owner.
     Held { accepted: Instant },
-    /// It came at this time, in its owner's frame or from the state stream, and may be this old
-    /// when it is handed over.
+    /// It came at this time, in its owner's frame or from the state stream, and may have this age when it
+    /// is handed over.
     Of { arrived: Instant, timeout: Duration },
 }
 
-/// The counters that a port must have.
+/// The counters that a port is expected to have.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Counted {
     pub edges_lost: u32,
@@ -79,7 +79,7 @@ pub(super) struct Counted {
     pub timeouts: u32,
 }
 
-/// What is wrong with a write.
+/// A violated invariant, and a description.
 pub(super) type Wrong = (Invariant, String);
 
 /// The values of all variables, and their progress.
@@ -92,33 +92,33 @@ pub(super) struct Upward {
     /// When the links that carry values came up; `None` while they are down.
     pub up: [Option<Instant>; 16],
     pub state_at: Option<Instant>,
-    /// When the newest frame of each recipe link came, whatever connection it was.
+    /// When the newest frame of each recipe link came, on any connection.
     pub frame_at: [Option<Instant>; 16],
-    /// When any data came that the controller sends steadily, and how often after a gap.
+    /// When data came that the controller sends steadily, and how often after a gap.
     heard_at: Option<Instant>,
     pub era: u64,
-    /// When a frame was handed over on each recipe link's present connection, and in which era.
+    /// When a frame was last handed over on each recipe link's present connection, and in which era.
     pub handed_over: [Option<(Instant, u64)>; 16],
     /// When a safe value was last in doubt.
     pub doubted_at: Instant,
-    /// When a safe value of a recipe link was last seen to be there.
+    /// When a safe value of a recipe link was last confirmed.
     pub confirmed_at: Option<Instant>,
-    /// When each recipe link sends safe values again.
-    pub again_at: [Instant; 16],
+    /// When each recipe link repeats safe values.
+    pub rewrite_at: [Instant; 16],
     /// No frame is overdue before this.
     next_overdue: Instant,
     /// No value has waited too long before this.
     next_expiry: Instant,
-    /// Variables that may have something waiting, by ordinal: inputs come first.
+    /// Bit set of variables that may have waiting values, by ordinal: inputs come first.
     pub waits: u128,
 }
 
 impl Upward {
-    pub(super) fn new(sheet: &Sheet) -> Self {
+    pub(super) fn new(spec: &Spec) -> Self {
         Self {
             known: vec![Known::default(); COUNT],
-            overdue: sheet.ports.iter().map(|port| vec![None; port.inputs.len()]).collect(),
-            counted: vec![Counted::default(); sheet.ports.len()],
+            overdue: spec.ports.iter().map(|port| vec![None; port.inputs.len()]).collect(),
+            counted: vec![Counted::default(); spec.ports.len()],
             up: [None; 16],
             state_at: None,
             frame_at: [None; 16],
@@ -127,7 +127,7 @@ impl Upward {
             handed_over: [None; 16],
             doubted_at: Instant::ZERO,
             confirmed_at: None,
-            again_at: [Instant::NEVER; 16],
+            rewrite_at: [Instant::NEVER; 16],
             next_overdue: Instant::NEVER,
             next_expiry: Instant::NEVER,
             waits: 0,
@@ -146,14 +146,14 @@ impl Upward {
         self.up[usize::from(link.0)].is_some()
     }
 
-    /// Frames that are overdue; their ports and places.
-    pub(super) fn overdue(&mut self, sheet: &Sheet, now: Instant) -> Vec<(usize, usize)> {
+    /// The frames that became overdue, as port and index; their variables get safe values or hold.
+    pub(super) fn overdue(&mut self, spec: &Spec, now: Instant) -> Vec<(usize, usize)> {
         let mut overdue = Vec::new();
         if now < self.next_overdue {
             return overdue;
         }
         self.next_overdue = Instant::NEVER;
-        for (nth, port) in sheet.ports.iter().enumerate().filter(|(_, port)| port.is_field) {
+        for (nth, port) in spec.ports.iter().enumerate().filter(|(_, port)| port.is_field) {
             for (frame, part) in port.inputs.iter().enumerate() {
                 match self.overdue[nth][frame] {
                     Some(at) if now >= at => {}
@@ -166,22 +166,22 @@ impl Upward {
                 self.overdue[nth][frame] = None;
                 self.counted[nth].timeouts += 1;
                 overdue.push((nth, frame));
-                for var in part.fields.iter().filter_map(super::sheet::written) {
-                    self.fell_silent(sheet, var, now);
+                for var in part.fields.iter().filter_map(super::spec::written) {
+                    self.fell_silent(spec, var, now);
                 }
             }
         }
         overdue
     }
 
-    /// Values of bits that waited too long are dropped.
-    pub(super) fn expire(&mut self, sheet: &Sheet, now: Instant) {
+    /// Drops values of bits that waited too long.
+    pub(super) fn expire(&mut self, spec: &Spec, now: Instant) {
         if now < self.next_expiry {
             return;
         }
         self.next_expiry = Instant::NEVER;
-        for (nth, port) in sheet.ports.iter().enumerate().filter(|(_, port)| port.is_field) {
-            for var in port.inputs.iter().flat_map(|part| &part.fields).filter_map(super::sheet::written) {
+        for (nth, port) in spec.ports.iter().enumerate().filter(|(_, port)| port.is_field) {
+            for var in port.inputs.iter().flat_map(|part| &part.fields).filter_map(super::spec::written) {
                 let known = &mut self.known[var.ordinal()];
                 if !var.is_bits() || known.safe {
                     continue;
@@ -196,8 +196,8 @@ impl Upward {
         }
     }
 
-    fn fell_silent(&mut self, sheet: &Sheet, var: SysVar, now: Instant) {
-        let Some(Owned { port, safe, .. }) = sheet.owned[var.ordinal()] else { return };
+    fn fell_silent(&mut self, spec: &Spec, var: SysVar, now: Instant) {
+        let Some(Owned { port, safe, .. }) = spec.owned[var.ordinal()] else { return };
         self.waits |= 1 << var.ordinal();
         let known = self.known_mut(var);
         if let Some(safe) = safe {
@@ -219,17 +219,17 @@ impl Upward {
     }
 
     /// Applies a frame.
-    pub(super) fn accepted(&mut self, sheet: &Sheet, nth: usize, frame: &Accepted, now: Instant) {
-        let timeout = sheet.ports[nth].timeout;
+    pub(super) fn accepted(&mut self, spec: &Spec, nth: usize, frame: &Accepted, now: Instant) {
+        let timeout = spec.ports[nth].timeout;
         self.overdue[nth][frame.frame] = Some(now + timeout);
         self.next_overdue = self.next_overdue.min(now + timeout);
         self.next_expiry = self.next_expiry.min(now + timeout + Duration::from_micros(1));
         let mut undelivered = false;
         for &(var, raw) in &frame.values {
-            let Some(Owned { way, .. }) = sheet.owned[var.ordinal()] else { continue };
+            let Some(Owned { way, .. }) = spec.owned[var.ordinal()] else { continue };
             self.waits |= 1 << var.ordinal();
             let is_up = self.is_up(way);
-            let queued: usize = if var.is_bits() { self.queued(sheet, nth) } else { 0 };
+            let queued: usize = if var.is_bits() { self.queued(spec, nth) } else { 0 };
             let known = self.known_mut(var);
             known.value = Some((raw, now));
             known.accepted = Some(now);
@@ -238,7 +238,7 @@ impl Upward {
             known.unreadable = false;
             known.slept = None;
             if std::mem::take(&mut known.safe) {
-                // A safe value that still waits may be too old by now.
+                // Its safe value may still wait, and can expire from now on.
                 self.next_expiry = now;
             }
             let known = &mut self.known[var.ordinal()];
@@ -265,10 +265,10 @@ impl Upward {
         self.counted[nth].undelivered += u32::from(undelivered);
     }
 
-    /// How many values of the port wait behind others.
-    fn queued(&self, sheet: &Sheet, nth: usize) -> usize {
-        let vars = sheet.ports[nth].inputs.iter().flat_map(|part| &part.fields);
-        let waiting = vars.filter_map(super::sheet::written).filter(|var| var.is_bits());
+    /// Number of the port's values that wait behind others.
+    fn queued(&self, spec: &Spec, nth: usize) -> usize {
+        let vars = spec.ports[nth].inputs.iter().flat_map(|part| &part.fields);
+        let waiting = vars.filter_map(super::spec::written).filter(|var| var.is_bits());
         waiting.map(|var| self.known(var).waiting.len().saturating_sub(1)).sum()
     }
 
@@ -279,12 +279,12 @@ impl Upward {
     }
 
     /// A link was lost: waiting values are dropped, except safe values.
-    pub(super) fn link_lost(&mut self, sheet: &Sheet, link: LinkId) {
+    pub(super) fn link_lost(&mut self, spec: &Spec, link: LinkId) {
         if self.up[usize::from(link.0)].take().is_none() {
             return;
         }
-        self.again_at[usize::from(link.0)] = Instant::NEVER;
-        for (known, owned) in self.known.iter_mut().zip(&sheet.owned) {
+        self.rewrite_at[usize::from(link.0)] = Instant::NEVER;
+        for (known, owned) in self.known.iter_mut().zip(&spec.owned) {
             if let Some(owned) = owned
                 && owned.way == link
                 && !known.safe
@@ -296,13 +296,13 @@ impl Upward {
     }
 
     /// A packet of the state stream was accepted.
-    pub(super) fn state_packet(&mut self, sheet: &Sheet, packet: &[u8], now: Instant) {
+    pub(super) fn state_packet(&mut self, spec: &Spec, packet: &[u8], now: Instant) {
         self.state_at = Some(now);
         self.heard(now);
-        for &var in &sheet.in_packet {
+        for &var in &spec.in_packet {
             let nth = var.ordinal();
-            let is_shown = sheet.origin[nth] == Some(Origin::State);
-            let is_read_back = sheet.read_back[nth] && !self.known[nth].live;
+            let is_shown = spec.origin[nth] == Some(Origin::State);
+            let is_read_back = spec.read_back[nth] && !self.known[nth].live;
             if !is_shown && !is_read_back {
                 continue;
             }
@@ -316,34 +316,34 @@ impl Upward {
                 known.value = Some((raw, now));
             }
         }
-        if sheet.safe_vars.iter().any(|var| self.known(*var).safe) {
-            self.compare_safe(sheet, packet, now);
+        if spec.safe_vars.iter().any(|var| self.known(*var).safe) {
+            self.compare_safe(spec, packet, now);
         }
     }
 
-    /// A packet or a recipe frame came. After a gap the controller may have begun anew: what was handed
-    /// over before, without a connection, counts no more.
+    /// A packet or a recipe frame came. After a gap the controller may have restarted: what was handed
+    /// over before by datagram counts no more.
     pub(super) fn heard(&mut self, now: Instant) {
         if is_gap(self.heard_at.replace(now), now) {
             self.era += 1;
         }
     }
 
-    /// When a frame was handed over last to the controller that is there now, as far as a link can tell.
-    fn handed_over(&self, link: &LinkSheet, now: Instant) -> Option<Instant> {
+    /// When a frame was last handed over to a controller that has not restarted since, as far as is known.
+    fn handed_over(&self, link: &LinkSpec, now: Instant) -> Option<Instant> {
         let (at, era) = self.handed_over[usize::from(link.id.0)]?;
         let is_there = !link.is_datagram || era == self.era && !is_gap(self.heard_at, now);
         is_there.then_some(at)
     }
 
-    /// When the newest frame that brought a variable which nothing reads back was accepted; `None` when the
-    /// controller does not have its value.
-    fn held(&self, link: &LinkSheet, known: &Known, now: Instant) -> Option<Instant> {
+    /// For a variable that is not read back: when its newest value was accepted; `None` if the controller
+    /// does not have that value.
+    fn held(&self, link: &LinkSpec, known: &Known, now: Instant) -> Option<Instant> {
         let handed_over = self.handed_over(link, now)?;
         known.accepted.filter(|&at| handed_over >= at && !known.unsent)
     }
 
-    /// The newest value from a link; one that is not finite makes the variable unreadable.
+    /// A value came on a link; one that is not finite makes the variable unreadable.
     pub(super) fn received(&mut self, var: SysVar, raw: Raw, now: Instant) {
         let known = self.known_mut(var);
         known.unreadable = !super::field::as_number(var, raw).is_finite();
@@ -352,19 +352,19 @@ impl Upward {
         }
     }
 
-    /// A variable was written on the link that is its way up; returns the value.
+    /// Checks a write of a variable and takes its value from the queue; returns the value's origin.
     pub(super) fn wrote(
         &mut self,
-        sheet: &Sheet,
+        spec: &Spec,
         link: LinkId,
         var: SysVar,
         raw: Raw,
         now: Instant,
     ) -> Result<Carried, Wrong> {
-        let Some(owned) = sheet.owned[var.ordinal()].filter(|owned| owned.way == link) else {
+        let Some(owned) = spec.owned[var.ordinal()].filter(|owned| owned.way == link) else {
             return Err((Invariant::Ownership, format!("{var} was written, but no port writes it there")));
         };
-        let timeout = sheet.ports[owned.port].timeout;
+        let timeout = spec.ports[owned.port].timeout;
         let up = self.up[usize::from(link.0)];
         let known = &mut self.known[var.ordinal()];
         if known.slept.as_ref().is_some_and(|slept| slept.contains(&raw)) && known.is_news(raw) {
@@ -383,7 +383,7 @@ impl Upward {
         let Some(&(next, at)) = known.waiting.front() else {
             let value = show(var, raw);
             if known.safe && owned.safe == Some(raw) {
-                // One more write is always allowed.
+                // Safe values may be repeated.
                 return Ok(Carried::Safe);
             }
             return Err(if up.is_some_and(|up| accepted < up) {
@@ -409,11 +409,11 @@ impl Upward {
         Ok(if known.safe { Carried::Safe } else { Carried::Of { arrived: at, timeout } })
     }
 
-    /// A variable was in a frame that was sent because of others.
+    /// Checks a variable in a frame that was sent for others; returns the value's origin.
     pub(super) fn carried(
         &self,
-        sheet: &Sheet,
-        link: &LinkSheet,
+        spec: &Spec,
+        link: &LinkSpec,
         (var, raw): (SysVar, Raw),
         now: Instant,
     ) -> Result<Carried, Wrong> {
@@ -431,7 +431,7 @@ impl Upward {
             return Err((Invariant::Sent, what));
         }
         if known.live {
-            let timeout = sheet.owned[var.ordinal()].map(|owned| sheet.ports[owned.port].timeout);
+            let timeout = spec.owned[var.ordinal()].map(|owned| spec.ports[owned.port].timeout);
             return Ok(match (known.safe, known.accepted, timeout) {
                 (false, Some(arrived), Some(timeout)) => Carried::Of { arrived, timeout },
                 _ => Carried::Safe,
@@ -453,17 +453,17 @@ impl Upward {
         }
         let is_fresh = self.state_at.is_some_and(|at| now.saturating_since(at) <= READ_BACK);
         if let (true, true, true, Some(arrived)) =
-            (sheet.read_back[var.ordinal()], known.read_back, is_fresh, self.state_at)
+            (spec.read_back[var.ordinal()], known.read_back, is_fresh, self.state_at)
         {
             return Ok(Carried::Of { arrived, timeout: READ_BACK });
         }
         Err((Invariant::InTime, format!("{var} = {} was sent along, read back too long ago", value())))
     }
 
-    /// Whether a recipe link's frame may be sent: each of its variables has a value.
-    pub(super) fn is_ready(&self, link: &LinkSheet, now: Instant) -> bool {
+    /// Whether a recipe link's frame may be sent: each of its variables is known.
+    pub(super) fn is_ready(&self, link: &LinkSpec, now: Instant) -> bool {
         let is_fresh = self.state_at.is_some_and(|at| now.saturating_since(at) <= READ_BACK);
-        let mut vars = link.input.iter().flat_map(|up| up.fields.iter().filter_map(super::sheet::written));
+        let mut vars = link.input.iter().flat_map(|up| up.fields.iter().filter_map(super::spec::written));
         vars.all(|var| {
             let known = self.known(var);
             match var.stream() {
@@ -475,7 +475,7 @@ impl Upward {
     }
 }
 
-/// A variable's value in a state packet; `None` when it is not there or not finite.
+/// A variable's value in a state packet; `None` if it is not in it or not finite.
 pub(super) fn in_packet(var: SysVar, packet: &[u8]) -> Option<Raw> {
     let place = var.stream()?;
     let bytes = packet.get(usize::from(place.offset)..)?.get(..usize::from(place.len))?;

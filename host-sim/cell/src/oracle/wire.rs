@@ -1,5 +1,5 @@
-//! Traffic between the gateway and the controller: Modbus by hand (proto-core/docs/wire/modbus.md),
-//! and whether the data that arrives is the data sent.
+//! Traffic between the gateway and the controller: an independent reading of Modbus
+//! (proto-core/docs/wire/modbus.md), and whether the data that arrives is the data sent.
 
 use std::collections::{BTreeMap, VecDeque};
 
@@ -7,13 +7,13 @@ use proto_core::sysvar::{COUNT, Direction, ModbusPlace, SysVar};
 use proto_core::time::{Duration, Instant};
 
 use super::Invariant;
-use super::sheet::Raw;
+use super::spec::Raw;
 use super::upward::Wrong;
 
 /// A request without an answer is given up after this.
 const ANSWER: Duration = Duration::from_millis(500);
 
-/// What a request asks.
+/// The content of a request.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Asked {
     Read { coils: bool, first: u16, count: u16 },
@@ -24,7 +24,7 @@ pub(super) enum Asked {
 #[derive(Debug, Clone, Default)]
 pub(super) struct Modbus {
     in_flight: Option<([u8; 2], Asked, Instant)>,
-    /// Variables of the write in flight that had their safe values.
+    /// Variables whose safe values are in the write in flight.
     safe: Vec<SysVar>,
     held: Vec<u8>,
 }
@@ -34,7 +34,7 @@ impl Modbus {
         self.in_flight.is_none()
     }
 
-    /// Gives up a request that was not answered in time; returns its safe values.
+    /// Gives up a request that was not answered in time; returns the variables of its safe values.
     pub(super) fn tick(&mut self, now: Instant) -> Vec<SysVar> {
         if self.in_flight.as_ref().is_none_or(|asked| now < asked.2 + ANSWER) {
             return Vec::new();
@@ -43,17 +43,17 @@ impl Modbus {
         std::mem::take(&mut self.safe)
     }
 
-    /// The connection is gone; returns the safe values in flight.
+    /// The connection is lost; returns the variables whose safe values were in flight.
     pub(super) fn lost(&mut self) -> Vec<SysVar> {
         std::mem::take(self).safe
     }
 
-    /// The write that was just sent carries these safe values.
+    /// The write that was just sent has safe values of these variables.
     pub(super) fn carries_safe(&mut self, safe: Vec<SysVar>) {
         self.safe = safe;
     }
 
-    /// The gateway sends a request.
+    /// Checks a request that the gateway sends, and returns its content.
     pub(super) fn sent(&mut self, map: &Map, bytes: &[u8], now: Instant) -> Result<Asked, Wrong> {
         let wrong = |what: &str| (Invariant::Ownership, format!("a Modbus request that {what}"));
         if self.in_flight.is_some() {
@@ -66,7 +66,7 @@ impl Modbus {
         Ok(asked)
     }
 
-    /// The controller's bytes: what was read, and safe values that were refused.
+    /// Handles the controller's bytes; returns the values read, and variables whose safe values were refused.
     pub(super) fn received(&mut self, map: &Map, bytes: &[u8]) -> (Vec<(SysVar, Raw)>, Vec<SysVar>) {
         self.held.extend_from_slice(bytes);
         let (mut found, mut refused) = (Vec::new(), Vec::new());
@@ -125,8 +125,8 @@ impl Map {
         map
     }
 
-    /// A request; `None` if it is not one of the four that a gateway sends, or writes a part of a
-    /// variable or something else.
+    /// Parses a request; `None` if it is not one of the four that a gateway sends, or does not write whole
+    /// variables.
     pub(super) fn request(&self, pdu: &[u8]) -> Option<Asked> {
         let word = |at: usize| Some(u16::from_be_bytes([*pdu.get(at)?, *pdu.get(at + 1)?]));
         let (first, count) = (word(1)?, word(3)?);
@@ -166,7 +166,7 @@ impl Map {
         }
     }
 
-    /// The variables that lie whole in what was read.
+    /// The variables that are completely in the range that was read.
     fn read(&self, coils: bool, first: u16, count: u16, data: &[u8]) -> Vec<(SysVar, Raw)> {
         let mut found = Vec::new();
         for address in first..first.saturating_add(count) {
@@ -196,16 +196,16 @@ impl Map {
     }
 }
 
-/// Data that was sent and has not arrived yet, and what the controller must have.
+/// Data that was sent and has not arrived yet, and partial frames at the controller.
 #[derive(Debug, Clone)]
 pub(super) struct Controller {
     sent: BTreeMap<u64, VecDeque<u8>>,
-    /// Datagrams, the newest ones of each link.
+    /// The newest datagrams of each link.
     datagrams: BTreeMap<u64, VecDeque<Vec<u8>>>,
     held: BTreeMap<u64, Vec<u8>>,
 }
 
-/// Datagrams that may still arrive.
+/// Maximum number of datagrams that may still arrive.
 const DATAGRAMS: usize = 4_096;
 
 impl Controller {
@@ -250,7 +250,7 @@ impl Controller {
         Err((Invariant::Transport, "the controller received a datagram that was not sent".to_owned()))
     }
 
-    /// The whole Modbus requests in the data that has arrived.
+    /// The complete Modbus requests in the data that has arrived.
     pub(super) fn requests(&mut self, conn: u64, bytes: &[u8]) -> Vec<Vec<u8>> {
         let held = self.held.entry(conn).or_default();
         held.extend_from_slice(bytes);
@@ -261,18 +261,18 @@ impl Controller {
         found
     }
 
-    /// The same of a recipe connection, whose frames the caller cuts.
+    /// Received bytes of a recipe connection; the caller finds the frames.
     pub(super) fn held(&mut self, conn: u64) -> &mut Vec<u8> {
         self.held.entry(conn).or_default()
     }
 
-    /// How much is remembered.
+    /// Number of bytes remembered.
     pub(super) fn size(&self) -> usize {
         self.sent.values().map(VecDeque::len).sum::<usize>() + self.held.values().map(Vec::len).sum::<usize>()
     }
 }
 
-/// The controller's input variables, as its image has them.
+/// The input variables in the controller's image.
 pub(crate) fn inputs_of(image: &[u8]) -> Vec<u8> {
     image[..INPUT_BYTES].to_vec()
 }

@@ -1,4 +1,4 @@
-//! Many runs, on several threads, whose results do not depend on how many.
+//! Many runs on several threads; the results do not depend on the number of threads.
 
 use std::collections::BTreeMap;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -8,12 +8,12 @@ use std::sync::{Mutex, PoisonError};
 use proto_core::time::Duration;
 
 use super::{Level, Report, Scenario, Soak};
-use crate::{Invariant, Rng, TroubleKind, Violation};
+use crate::{FaultKind, Invariant, Rng, Violation};
 
 /// Maximum length of one run.
 pub const RUN_LENGTH: Duration = Duration::from_secs(600);
 
-/// A number of virtual hours, cut into runs with seeds of their own.
+/// A span of virtual time, split into runs with separate seeds.
 #[derive(Debug)]
 pub struct Batch {
     scenarios: Vec<Scenario>,
@@ -33,7 +33,7 @@ pub struct Batch {
 /// A failed run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Failure {
-    /// The run's place in the batch.
+    /// The run's index in the batch.
     pub run: usize,
     /// The run's own seed.
     pub seed: u64,
@@ -50,11 +50,11 @@ pub struct Failure {
 pub struct Progress {
     /// Virtual time that has passed.
     pub elapsed: Duration,
-    /// Runs that are finished.
+    /// Number of finished runs.
     pub runs: usize,
 }
 
-/// The sums of all finished runs, in their order.
+/// The sums of all finished runs.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Total {
     /// Number of finished runs.
@@ -66,7 +66,7 @@ pub struct Total {
     /// Runs of each cell, and their virtual time.
     pub cells: BTreeMap<String, (usize, Duration)>,
     /// Faults of each kind.
-    pub faults: BTreeMap<TroubleKind, u64>,
+    pub faults: BTreeMap<FaultKind, u64>,
     /// Frames in and out, by cell and port.
     pub ports: BTreeMap<(String, String), (u64, u64)>,
     /// Sent and received, by kind of link.
@@ -84,7 +84,7 @@ pub struct Total {
 impl Batch {
     /// `span` of virtual time in these cells, in turn.
     pub fn new(scenarios: Vec<Scenario>, level: Level, seed: u64, span: Duration) -> Self {
-        // However short it is, each cell gets a run.
+        // Each cell gets a run, even if the span is short.
         let share = span.as_micros().div_ceil(scenarios.len().max(1) as u64).max(1);
         let run_length = RUN_LENGTH.min(Duration::from_micros(share));
         let runs = span.as_micros().div_ceil(run_length.as_micros()) as usize;
@@ -112,7 +112,7 @@ impl Batch {
     pub fn seed_of(&self, run: usize) -> u64 {
         let cells = self.scenarios.len().max(1) as u64;
         let mut rng = Rng::new(self.seed ^ (run as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15));
-        // Short enough to be typed.
+        // Short enough to type.
         let drawn = rng.below(1 << 40);
         drawn - drawn % cells + run as u64 % cells
     }
@@ -168,7 +168,7 @@ impl Batch {
         let length = Duration::from_micros(self.span.as_micros() - begins.as_micros()).min(self.run_length);
         let mut soak = match Soak::new(scenario, seed, self.level) {
             Ok(soak) => soak,
-            // Every cell was tried before the batch began.
+            // The caller has made each cell once before.
             Err(error) => panic!("{}: {error}", scenario.name),
         };
         let mut reached = Duration::ZERO;

@@ -10,11 +10,11 @@ use recipe_config::file::{self, FileError, Text};
 /// A gateway and a controller.
 #[derive(Debug, Clone)]
 pub struct Scenario {
-    /// Its name.
+    /// The cell's name.
     pub name: String,
-    /// The gateway's file.
+    /// The gateway's configuration.
     pub gateway: Box<GatewayConfig>,
-    /// The controller's file.
+    /// The controller's configuration.
     pub controller: SimConfig,
 }
 
@@ -39,8 +39,8 @@ macro_rules! embedded {
     };
 }
 
-/// Their order is part of what a seed means. Some worked examples have a controller with a port of
-/// its own, where nobody would be: they get one without.
+/// A seed selects by position, so the order must not change. Controllers of examples that have field ports
+/// of their own are replaced, since no device would be connected to them.
 const EMBEDDED: [Embedded; 11] = [
     embedded!("/../configs/", "rs485-system", "can-hand"),
     embedded!("/../configs/", "udp-server", "udp-server"),
@@ -64,23 +64,23 @@ impl Scenario {
     /// All embedded cells.
     ///
     /// # Errors
-    /// Never: a test reads the embedded files.
+    /// Never: a test parses the embedded files.
     pub fn all() -> Result<Vec<Self>, FileError> {
         EMBEDDED.iter().map(Self::parse).collect()
     }
 
-    /// The embedded cell of this name; `None` when there is none.
+    /// The embedded cell of this name; `None` if there is none.
     ///
     /// # Errors
-    /// As [`Scenario::all`].
+    /// Same as [`Scenario::all`].
     pub fn named(name: &str) -> Result<Option<Self>, FileError> {
         EMBEDDED.iter().find(|cell| cell.name == name).map(Self::parse).transpose()
     }
 
-    /// A cell from two files.
+    /// A cell from two configuration files.
     ///
     /// # Errors
-    /// [`FileError`] says what is wrong in which of them.
+    /// [`FileError`] if one of them cannot be used.
     pub fn load(gateway: &Path, controller: &Path) -> Result<Self, FileError> {
         let name = gateway.file_stem().map_or_else(String::new, |stem| stem.to_string_lossy().into_owned());
         Ok(Self {

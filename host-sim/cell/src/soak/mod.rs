@@ -1,14 +1,14 @@
-//! Soak runs: cells in virtual time under faults, for hours, with everything that the gateway
-//! does checked at every step (docs/cell.md sections 4 and 5).
+//! Soak runs: hours of cells in virtual time with random faults, and every step of the gateway checked
+//! (docs/cell.md sections 4 and 5).
 //!
-//! In: cells, a seed, a level of faults, a number of virtual hours. Out: a [`Total`], the same for
-//! the same seed on every machine and for any number of threads, or the first violation and how to
-//! repeat it. Does not print: `host-sim soak` does.
+//! In: cells, a seed, a level of faults, virtual time. Out: a [`Total`], the same for the same seed on
+//! every machine and for any number of threads, or the first violation and how to repeat it. Does not
+//! print: `host-sim soak` does.
 
 mod batch;
 mod cells;
+mod random_device;
 mod show;
-mod station;
 mod world;
 
 use std::collections::BTreeMap;
@@ -21,18 +21,18 @@ pub use batch::{Batch, Progress, RUN_LENGTH, Total};
 pub use cells::Scenario;
 pub use show::show_trace;
 
-use crate::{Cell, CellError, Chunking, Invariant, Rng, Trouble, TroubleKind, Violation, Wiring};
-use station::Station;
+use crate::{Cell, CellError, Chunking, FaultInjector, FaultKind, Invariant, Rng, Violation, Wiring};
+use random_device::RandomDevice;
 use world::World;
 
-/// How many faults.
+/// How many faults are injected.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Level {
-    /// None; devices send carelessly all the same.
+    /// No faults; devices still send invalid frames.
     None,
     /// A fault every 30 s, on a quiet network.
     Mild,
-    /// A fault every second, on a network that delays, splits and joins.
+    /// A fault every second, on a network that delays, splits and joins data.
     Harsh,
 }
 
@@ -59,7 +59,7 @@ impl Level {
 #[derive(Debug)]
 pub struct Soak {
     cell: Cell,
-    trouble: Option<Trouble>,
+    injector: Option<FaultInjector>,
     world: World,
     start: Instant,
 }
@@ -67,14 +67,14 @@ pub struct Soak {
 /// The report of one run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Report {
-    /// How long it was.
+    /// Virtual time that has passed.
     pub span: Duration,
     /// The hash of its trace.
     pub digest: u64,
     /// Entries of its trace.
     pub events: u64,
     /// Faults of each kind.
-    pub faults: BTreeMap<TroubleKind, u64>,
+    pub faults: BTreeMap<FaultKind, u64>,
     /// Frames in and out of each of the gateway's field ports, by name.
     pub ports: Vec<(String, u64, u64)>,
     /// Sends and receives on each link, by name.
@@ -88,16 +88,16 @@ pub struct Report {
 }
 
 impl Soak {
-    /// The cell of this scenario and seed, switched on now.
+    /// A cell of this scenario with this seed, switched on now.
     ///
     /// # Errors
-    /// [`CellError`] when a configuration cannot run.
+    /// [`CellError`] if a configuration cannot run.
     pub fn new(scenario: &Scenario, seed: u64, level: Level) -> Result<Self, CellError> {
         let mut cell = Cell::new(&scenario.gateway, &scenario.controller, seed)?;
         let mut rng = cell.fork_rng();
         cell.watch();
         cell.keep_heard(0);
-        attach_stations(&mut cell, &scenario.gateway, level, &mut rng);
+        attach_devices(&mut cell, &scenario.gateway, level, &mut rng);
         if level == Level::Harsh {
             cell.every_network(|network| {
                 network.delay = rng.up_to(Duration::from_millis(2));
@@ -115,9 +115,9 @@ impl Soak {
             });
         }
         let world = World::new(&scenario.gateway, cell.now(), rng.fork());
-        let trouble = level.pause().map(|pause| Trouble::new(&mut cell, &TroubleKind::ALL, pause));
+        let injector = level.pause().map(|pause| FaultInjector::new(&mut cell, &FaultKind::ALL, pause));
         let start = cell.now();
-        Ok(Self { cell, trouble, world, start })
+        Ok(Self { cell, injector, world, start })
     }
 
     /// The cell.
@@ -125,7 +125,7 @@ impl Soak {
         &self.cell
     }
 
-    /// The cell, to keep its trace.
+    /// The cell, mutable, such as to keep its trace.
     pub fn cell_mut(&mut self) -> &mut Cell {
         &mut self.cell
     }
@@ -135,15 +135,15 @@ impl Soak {
         self.cell.now().saturating_since(self.start)
     }
 
-    /// Advances time until this long after the start, or until an invariant is violated. It does
-    /// not matter how the time is split into calls.
+    /// Advances time until this long after the start, or until an invariant is violated. How the time is
+    /// split into calls makes no difference.
     pub fn run_to(&mut self, elapsed: Duration) {
         let end = self.start + elapsed;
         while self.cell.violation().is_none() {
             let next = self.world.next().min(end);
             let span = next.saturating_since(self.cell.now());
-            match &mut self.trouble {
-                Some(trouble) => trouble.run(&mut self.cell, span),
+            match &mut self.injector {
+                Some(injector) => injector.run(&mut self.cell, span),
                 None => self.cell.run(span),
             }
             if next >= end {
@@ -169,11 +169,11 @@ impl Soak {
             span: self.elapsed(),
             digest: self.cell.trace().digest(),
             events: self.cell.trace().count(),
-            faults: self.trouble.as_ref().map(|trouble| trouble.counts().clone()).unwrap_or_default(),
+            faults: self.injector.as_ref().map(|injector| injector.counts().clone()).unwrap_or_default(),
             ports: ports.collect(),
             links: links.collect(),
             writes: self.cell.watched_writes(),
-            // A panic would have left no report.
+            // There is no report after a panic.
             checks: self.cell.checks().into_iter().chain([(Invariant::NoPanic, 1)]).collect(),
             violation: self
                 .cell
@@ -183,11 +183,11 @@ impl Soak {
     }
 }
 
-/// A device at each field port, and lines with various deliveries.
-fn attach_stations(cell: &mut Cell, config: &GatewayConfig, level: Level, rng: &mut Rng) {
+/// Attaches a device to each field port and sets how its line delivers bytes.
+fn attach_devices(cell: &mut Cell, config: &GatewayConfig, level: Level, rng: &mut Rng) {
     for port in &config.ports {
         let mut rng = rng.fork();
-        let station = Station::new(config, port, cell.now(), rng.fork());
+        let device = RandomDevice::new(config, port, cell.now(), rng.fork());
         match port.bus {
             Bus::Rs485(_) => {
                 let line = cell.line_of(&port.name);
@@ -200,14 +200,14 @@ fn attach_stations(cell: &mut Cell, config: &GatewayConfig, level: Level, rng: &
                 if level == Level::Harsh && rng.below(4) == 0 {
                     cell.line(line).wiring = Wiring::TwoWire;
                 }
-                if let Some(station) = station {
-                    cell.attach(line, station);
+                if let Some(device) = device {
+                    cell.attach(line, device);
                 }
             }
             Bus::Can { .. } => {
                 let bus = cell.bus_of(&port.name);
-                if let Some(station) = station {
-                    cell.attach_can(bus, station);
+                if let Some(device) = device {
+                    cell.attach_can(bus, device);
                 }
             }
             Bus::TcpListen { .. } | Bus::UdpListen { .. } => {}

@@ -1,4 +1,4 @@
-//! The end of a run as people read it.
+//! The last part of a run's trace as text.
 
 use proto_core::engine::LinkKind;
 use proto_core::modbus::adu;
@@ -9,8 +9,8 @@ use proto_core::wire::state;
 use super::Soak;
 use crate::{Entry, What};
 
-/// What the cell's trace has kept, a line each: seconds since the run's start, what, of which port or
-/// link, the bytes, and what they say where that is not the recipe's business.
+/// The kept entries of the cell's trace, one per line: seconds since the run's start, kind, port or link,
+/// bytes; Modbus and commands also in words.
 pub fn show_trace(soak: &Soak) -> String {
     let mut text = String::new();
     for entry in soak.cell().trace().entries() {
@@ -91,13 +91,13 @@ fn shown(soak: &Soak, entry: &Entry) -> String {
         }
         _ => None,
     };
-    let hex: Vec<String> = bytes.iter().take(MOST_BYTES).map(|byte| format!("{byte:02X}")).collect();
-    let more = if bytes.len() > MOST_BYTES { " ..." } else { "" };
+    let hex: Vec<String> = bytes.iter().take(MAX_BYTES).map(|byte| format!("{byte:02X}")).collect();
+    let more = if bytes.len() > MAX_BYTES { " ..." } else { "" };
     let says = says.map_or_else(String::new, |says| format!("  {says}"));
     format!("{}{more}{says}", hex.join(" "))
 }
 
-/// The numbers of a request; `None` for what is none.
+/// A request in words; `None` if it is not a complete one.
 fn request(adu: &[u8]) -> Option<String> {
     let (transaction, pdu) = split(adu)?;
     let says = match Request::parse(pdu).ok()? {
@@ -115,7 +115,7 @@ fn request(adu: &[u8]) -> Option<String> {
     Some(format!("#{transaction}: {says}"))
 }
 
-/// Which request is answered, and whether it was carried out; `None` for a piece of an answer.
+/// A response in words; `None` if it is not a complete one.
 fn answer(adu: &[u8]) -> Option<String> {
     let (transaction, pdu) = split(adu)?;
     let (&code, rest) = pdu.split_first()?;
@@ -127,12 +127,12 @@ fn answer(adu: &[u8]) -> Option<String> {
     })
 }
 
-/// The transaction, and the PDU.
+/// The transaction id and the PDU.
 fn split(adu: &[u8]) -> Option<(u16, &[u8])> {
     let (head, pdu) = adu.split_first_chunk::<{ adu::HEADER_LEN }>()?;
     let [high, low, ..] = *head;
     let len = usize::from(u16::from_be_bytes([head[4], head[5]]));
-    // The unit counts, and is in the head.
+    // The length includes the unit id, which is part of the header.
     (len == pdu.len() + 1).then_some((u16::from_be_bytes([high, low]), pdu))
 }
 
@@ -140,7 +140,7 @@ fn list<T: ToString>(values: impl Iterator<Item = T>) -> String {
     values.map(|value| value.to_string()).collect::<Vec<_>>().join(" ")
 }
 
-const MOST_BYTES: usize = 48;
+const MAX_BYTES: usize = 48;
 
 #[cfg(test)]
 mod tests {

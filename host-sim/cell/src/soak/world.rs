@@ -1,5 +1,5 @@
-//! What happens around the controller while a cell runs: inputs change, programs set registers,
-//! somebody presses a button.
+//! Random events at the controller while a cell runs: inputs change, programs set registers, someone
+//! presses a button.
 
 use proto_core::config::GatewayConfig;
 use proto_core::engine::Plan;
@@ -11,7 +11,7 @@ use proto_core::wire::state::OperationMode;
 use crate::{Cell, Rng};
 use recipe_config::InitialTarget;
 
-/// Changes what the ports show.
+/// Changes the variables that ports show, and the controller's state.
 #[derive(Debug)]
 pub(super) struct World {
     rng: Rng,
@@ -23,7 +23,7 @@ impl World {
     pub(super) fn new(config: &GatewayConfig, now: Instant, rng: Rng) -> Self {
         let plan = Plan::new(config).ok();
         let is_shown = |var: &SysVar| plan.as_ref().is_some_and(|plan| plan.source(*var).is_some());
-        // Where the arm is, is the arm's business.
+        // The simulated motion sets the arm's position.
         let shown =
             SysVar::all().filter(|var| var.direction() == Direction::Output && var.group() != "RobotState");
         Self { rng, shown: shown.filter(is_shown).collect(), next: now }
@@ -47,7 +47,7 @@ impl World {
                 let var = self.shown[self.rng.below(self.shown.len() as u64) as usize];
                 let before = cell.controller().registers().var(var).as_f64();
                 let value = match var.ty() {
-                    // One bit, so that each has edges of its own.
+                    // One bit at a time, so that each has its own edges.
                     ScalarType::Byte => {
                         let bit = 1 << self.rng.below(8);
                         f64::from((before as u8 ^ bit) & var.valid_bits())
@@ -55,7 +55,7 @@ impl World {
                     ScalarType::Word => self.rng.below(65_536) as f64,
                     _ => self.rng.below(20_000) as f64 / 16.0,
                 };
-                // An output that follows a command takes what fits it.
+                // Refused if the variable cannot have this value; then nothing changes.
                 let _ = cell.controller_mut().force(InitialTarget::Var(var), value);
             }
         }

@@ -1,5 +1,5 @@
-//! What can happen to the controller's side: the gateway counts it, comes back by itself, replays
-//! nothing stale, and the next good field frame gets through to the controller's registers.
+//! Faults of the controller's side: the gateway counts them, recovers by itself, replays nothing old, and
+//! the next valid field frame reaches the controller's registers.
 
 use proto_core::engine::{LinkId, PortId};
 use proto_core::link::LinkState;
@@ -26,7 +26,7 @@ fn wait_for_up(cell: &mut Cell, link: LinkId, limit_ms: u64) {
     assert!(found, "{link:?} is not up: {:?}", cell.link(link));
 }
 
-/// The pose on the line follows the controller's.
+/// Checks that the pose on the line follows the controller's.
 #[track_caller]
 fn pose_gets_through(cell: &mut Cell, line: LineId) {
     cell.run_ms(150);
@@ -69,7 +69,7 @@ fn what_waited_when_the_connection_was_lost_is_not_written_after_it_is_back() {
     let line = cell.line_of("rs485-1");
     cell.run_ms(500);
     outputs_get_through(&mut cell, line);
-    // One write is under way, two edges wait behind it.
+    // One write is in flight, two edges wait behind it.
     cell.hold(LinkId::MODBUS, Way::Up);
     for byte in [1, 2, 3] {
         cell.send(line, &outputs(byte));
@@ -110,7 +110,7 @@ fn no_answer_to_a_connection_is_given_up_and_tried_again() {
     cell.black_hole(LinkId::MODBUS);
     cell.reset(LinkId::MODBUS);
     cell.run_ms(5_000);
-    // 0.1 s, then 2 s to connect and 0.2 s of waiting, then 2 s again.
+    // 0.1 s, then 2 s to connect and 0.2 s of backoff, then 2 s again.
     assert_eq!(cell.link(LinkId::MODBUS).history.failed_opens, 2);
     cell.admit(LinkId::MODBUS);
     wait_for_up(&mut cell, LinkId::MODBUS, 5_000);
@@ -213,7 +213,7 @@ fn a_mute_state_server_is_reopened_and_the_ports_show_it() {
     cell.run_ms(10_000);
     let link = cell.link(LinkId::STATE);
     assert!((3..=5).contains(&link.history.silences), "{:?}", link.history);
-    // This recipe holds: the pose goes on, as it was.
+    // This recipe holds stale values: the pose is still sent.
     cell.line(line).take_heard();
     cell.run_ms(40);
     assert_eq!(heard(&mut cell, line).len(), 10);
@@ -382,7 +382,7 @@ fn datagrams_that_get_lost_cost_only_themselves() {
     cell.send(line, &force_frame([-7.0; 6]));
     cell.run_ms(3);
     assert_eq!(force(&cell), [-7.0; 6]);
-    // The stream down starts again by itself: the gateway asks when nothing comes.
+    // Frames from the controller start again by themselves: the gateway repeats its greeting when none come.
     let before = cell.link(LinkId::RECIPE_UDP).counters.received;
     cell.run_ms(1_000);
     assert!(cell.link(LinkId::RECIPE_UDP).counters.received >= before + 249);
@@ -446,7 +446,7 @@ fn a_tcp_client_that_falls_silent_is_dropped_and_may_come_back() {
 
 #[test]
 fn a_recipe_swap_on_the_controllers_side_is_counted_and_shows_nothing_wrong() {
-    // The controller's port is set to a recipe that is one float shorter.
+    // The controller's port has a recipe with one float less.
     let (gateway, mut controller) = files("udp-server");
     if let recipe_config::SimParts::Stream { output: Some(output), .. } = &mut controller.recipes[0].parts {
         output.fields.pop();
@@ -464,30 +464,30 @@ fn a_recipe_swap_on_the_controllers_side_is_counted_and_shows_nothing_wrong() {
 fn a_slow_command_server_says_so_and_no_reply_is_taken_for_another() {
     let mut cell = cell("request-response");
     let line = cell.line_of("station");
-    let ask = |cell: &mut Cell, order: u8| {
+    let send_command = |cell: &mut Cell, order: u8| {
         cell.line(line).take_heard();
         cell.send(line, &[0xFF, 0xFF, order, 0, 0, 0xEE, 0xEE]);
         cell.run_ms(60);
         heard(cell, line)[0][3]
     };
     cell.controller_mut().mute(Link::Command);
-    // What stops has a connection of its own, and is asked for no longer.
-    assert_eq!(ask(&mut cell, 9), 1);
-    assert_eq!(ask(&mut cell, 0), 1);
+    // The stop uses the urgent link, and is no longer requested.
+    assert_eq!(send_command(&mut cell, 9), 1);
+    assert_eq!(send_command(&mut cell, 0), 1);
     cell.run_ms(10_000);
-    assert_eq!(ask(&mut cell, 0), 5, "no reply");
+    assert_eq!(send_command(&mut cell, 0), 5, "no reply");
     let link = cell.link(LinkId::URGENT);
     assert_eq!((link.counters.timeouts, link.history.losses), (1, 1));
     assert_eq!(cell.link(LinkId::COMMAND).history.losses, 0);
     cell.controller_mut().unmute(Link::Command);
     cell.run_ms(500);
-    assert_eq!(ask(&mut cell, 1), 1);
-    assert_eq!(ask(&mut cell, 0), 2, "the program was started");
-    // Late, but in time.
+    assert_eq!(send_command(&mut cell, 1), 1);
+    assert_eq!(send_command(&mut cell, 0), 2, "the program was started");
+    // Late, but within the time limit.
     cell.run_ms(1_000);
     cell.controller_mut().delay_answers(Link::Command, Duration::from_millis(500));
-    assert_eq!(ask(&mut cell, 1), 1);
-    assert_eq!(ask(&mut cell, 0), 1);
+    assert_eq!(send_command(&mut cell, 1), 1);
+    assert_eq!(send_command(&mut cell, 0), 1);
     cell.run_ms(500);
-    assert_eq!(ask(&mut cell, 0), 2);
+    assert_eq!(send_command(&mut cell, 0), 2);
 }

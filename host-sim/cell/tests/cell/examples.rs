@@ -1,5 +1,5 @@
-//! The worked examples and the example devices through the gateway, byte for byte: from a device's
-//! bytes to the simulated controller's registers and back.
+//! The worked examples and the example devices through the gateway, byte for byte: from a device's bytes
+//! to the simulated controller's registers and back.
 
 use proto_core::config::Bus;
 use proto_core::engine::{LinkId, PortId, ReplyCode};
@@ -76,13 +76,13 @@ fn example_3_a_can_frame_and_the_answer() {
 fn example_4_the_pose_in_three_frames_and_an_output() {
     let mut cell = cell("can-system");
     let bus = cell.bus_of("can-1");
-    // To where the bus is quiet between two cycles.
+    // Until the bus is idle between two cycles.
     cell.run_ms(2);
     cell.bus(bus).take_heard();
     cell.run_ms(40);
     let frames: Vec<_> = cell.bus(bus).take_heard().into_iter().map(|(_, frame)| frame).collect();
     assert_eq!(frames.len(), 30, "three each 4 ms");
-    // The frame of the captured run.
+    // The captured frame.
     assert_eq!(frames[0], can(2, &[0xEF, 0x54, 0xEF, 0x3E, 0xA7, 0xE7, 0xD1, 0x3E]));
     let data = |pair: [&str; 2]| pair.map(|name| (cell.value(name) as f32).to_le_bytes()).concat();
     assert_eq!(frames[1], can(3, &data([POSE[2], POSE[3]])));
@@ -182,7 +182,7 @@ fn the_force_sensor_at_960_frames_a_second_loses_nothing_in_ten_seconds() {
     assert_eq!((refused, field.withheld, field.values_expired), ([0; 4], 0, 0));
     assert_eq!((controller.rejected_values, controller.wrong_datagrams), (0, before.wrong_datagrams));
 
-    // Each frame arrived as it was, in order, and within a millisecond of its last byte.
+    // Each frame arrived unchanged, in order, and within a millisecond of its last byte.
     let arrived: Vec<_> =
         cell.trace().entries().iter().filter(|entry| entry.what == What::ControllerReceived).collect();
     let frames: Vec<_> = arrived.iter().filter(|entry| entry.bytes.len() == 28).collect();
@@ -195,7 +195,7 @@ fn the_force_sensor_at_960_frames_a_second_loses_nothing_in_ten_seconds() {
         assert!(entry.at.saturating_since(began + on_the_line) <= Duration::from_millis(1));
     }
 
-    // The sensor falls silent: its forces become 0, once.
+    // The sensor falls silent: its forces are set to 0, once.
     assert_eq!(force(&cell), values(FRAMES - 1));
     cell.run_ms(50);
     assert_eq!(force(&cell), [0.0; 6]);
@@ -206,7 +206,7 @@ fn the_force_sensor_at_960_frames_a_second_loses_nothing_in_ten_seconds() {
 fn the_hand_moves_reports_and_is_missed() {
     let mut cell = cell("can-hand");
     let bus = cell.bus_of("hand");
-    assert_eq!(cell.ask("run(grip.jspf)"), "run start");
+    assert_eq!(cell.send_command("run(grip.jspf)"), "run start");
     cell.run_ms(300);
     cell.bus(bus).take_heard();
     cell.attach_can(bus, Talker::new(cell.now(), 50, 25, |n| can(0x502, &[2, 0, n as u8, 1])));
@@ -220,7 +220,7 @@ fn the_hand_moves_reports_and_is_missed() {
     let state = ["WordInputReg[1]", "WordInputReg[3]"].map(|name| cell.value(name));
     assert_eq!(state, [0.0, f64::from(0x118)], "the hand is not there; what it said last is held");
     assert_eq!(cell.port("hand").timeouts, 1);
-    // Fingers follow the registers within the poll and the cycle.
+    // The fingers follow the registers within one poll and one cycle.
     cell.bus(bus).take_heard();
     cell.set_value("WordOutputReg[3]", 17.0);
     cell.run_ms(60);
@@ -236,7 +236,7 @@ fn order(order: u8, part: u16) -> Vec<u8> {
 
 /// Sends a request and returns the answer's code and busy bits.
 #[track_caller]
-fn ask(cell: &mut Cell, request: &[u8]) -> (u8, u8) {
+fn send_command(cell: &mut Cell, request: &[u8]) -> (u8, u8) {
     let line = cell.line_of("station");
     cell.line(line).take_heard();
     cell.send(line, request);
@@ -251,20 +251,20 @@ fn ask(cell: &mut Cell, request: &[u8]) -> (u8, u8) {
 fn a_station_starts_programs_and_reads_the_reply_code() {
     let code = |code: ReplyCode| code as u8;
     let mut cell = cell("request-response");
-    assert_eq!(ask(&mut cell, &order(0, 7)), (code(ReplyCode::None), 0), "no order, no command");
+    assert_eq!(send_command(&mut cell, &order(0, 7)), (code(ReplyCode::None), 0), "no order, no command");
     assert_eq!(cell.value("WordInputReg[1]"), 7.0);
-    assert_eq!(ask(&mut cell, &order(1, 42)).0, code(ReplyCode::Pending));
-    assert_eq!(ask(&mut cell, &order(0, 42)), (code(ReplyCode::Success), 1), "pick runs");
+    assert_eq!(send_command(&mut cell, &order(1, 42)).0, code(ReplyCode::Pending));
+    assert_eq!(send_command(&mut cell, &order(0, 42)), (code(ReplyCode::Success), 1), "pick runs");
     assert_eq!(cell.controller().counters().programs_started, 1);
     assert_eq!(cell.value("WordInputReg[1]"), 42.0);
-    // One at a time: the second is refused, and the answer says so.
-    assert_eq!(ask(&mut cell, &order(2, 42)).0, code(ReplyCode::Pending));
-    assert_eq!(ask(&mut cell, &order(0, 42)).0, code(ReplyCode::Fail));
+    // Only one program at a time: the second one is refused, and the answer says so.
+    assert_eq!(send_command(&mut cell, &order(2, 42)).0, code(ReplyCode::Pending));
+    assert_eq!(send_command(&mut cell, &order(0, 42)).0, code(ReplyCode::Fail));
     cell.run_ms(500);
-    assert_eq!(ask(&mut cell, &order(0, 42)), (code(ReplyCode::Fail), 0), "pick has ended");
-    assert_eq!(ask(&mut cell, &order(2, 42)).0, code(ReplyCode::Pending));
-    assert_eq!(ask(&mut cell, &order(9, 42)).0, code(ReplyCode::Pending));
-    assert_eq!(ask(&mut cell, &order(0, 42)).0, code(ReplyCode::Success), "stopped");
+    assert_eq!(send_command(&mut cell, &order(0, 42)), (code(ReplyCode::Fail), 0), "pick has ended");
+    assert_eq!(send_command(&mut cell, &order(2, 42)).0, code(ReplyCode::Pending));
+    assert_eq!(send_command(&mut cell, &order(9, 42)).0, code(ReplyCode::Pending));
+    assert_eq!(send_command(&mut cell, &order(0, 42)).0, code(ReplyCode::Success), "stopped");
     assert_eq!(cell.controller().counters().programs_started, 2);
     let port = cell.port("station");
     assert_eq!((port.commands, port.commands_dropped, port.frames_out), (4, 0, port.frames_in));
@@ -275,10 +275,10 @@ fn a_station_starts_programs_and_reads_the_reply_code() {
     // Without the controller an order is refused at once, and not carried out later.
     cell.refuse(LinkId::COMMAND);
     cell.reset(LinkId::COMMAND);
-    assert_eq!(ask(&mut cell, &order(1, 1)).0, code(ReplyCode::NotSent));
+    assert_eq!(send_command(&mut cell, &order(1, 1)).0, code(ReplyCode::NotSent));
     cell.admit(LinkId::COMMAND);
     cell.run_ms(6_000);
     assert_eq!(cell.controller().counters().programs_started, 2);
-    assert_eq!(ask(&mut cell, &order(1, 1)).0, code(ReplyCode::Pending));
-    assert_eq!(ask(&mut cell, &order(0, 1)), (code(ReplyCode::Success), 1));
+    assert_eq!(send_command(&mut cell, &order(1, 1)).0, code(ReplyCode::Pending));
+    assert_eq!(send_command(&mut cell, &order(0, 1)), (code(ReplyCode::Success), 1));
 }

@@ -1,5 +1,5 @@
-//! What a device can do wrong, seen from both ends: the gateway counts it, the controller never
-//! gets a value that nobody sent, and the next good frame gets through to its registers.
+//! Faults of field devices, seen from both ends: the gateway counts them, the controller gets only values
+//! that were sent, and the next valid frame reaches its registers.
 
 use proto_core::engine::{LinkId, PortCounters};
 use proto_core::time::Duration;
@@ -7,7 +7,7 @@ use recipe_cell::{Cell, Chunking, LineId, Rng, Wiring};
 
 use crate::kit::*;
 
-/// Values that tell frames apart.
+/// Values that differ from frame to frame.
 fn values(n: u32) -> [f32; 6] {
     std::array::from_fn(|axis| 1.5 + n as f32 + 10.0 * axis as f32)
 }
@@ -19,7 +19,7 @@ fn sensor() -> (Cell, LineId) {
     (cell, line)
 }
 
-/// What a fault added to the port's counters, after it was over.
+/// What a fault added to the port's counters.
 #[track_caller]
 fn faulty(fault: impl FnOnce(&mut Cell, LineId)) -> PortCounters {
     let (mut cell, line) = sensor();
@@ -61,7 +61,7 @@ fn garbage_between_frames() {
 #[test]
 fn garbage_that_begins_like_a_frame() {
     let counters = faulty(|cell, line| {
-        // The head, and behind it a good frame where the payload should be.
+        // A head, and a valid frame in place of the payload.
         cell.send(line, &[0x48, 0xAA, 0x01]);
         cell.send(line, &force_frame(values(100)));
         cell.run_ms(3);
@@ -75,7 +75,7 @@ fn noise_that_nobody_sent_never_reaches_the_controller_as_a_value() {
     let (mut cell, line) = sensor();
     let mut rng = Rng::new(20);
     for n in 0..300 {
-        // No head can be in it.
+        // It cannot contain a head.
         let noise: Vec<u8> = rng.bytes(40).into_iter().map(|byte| byte & !0x08).collect();
         cell.send(line, &noise[..rng.between(1, 40) as usize]);
         next_good_frame(&mut cell, line, n);
@@ -108,7 +108,7 @@ fn a_frame_cut_at_every_byte_and_the_next_at_its_heels() {
             assert_eq!(force(cell), values(101), "cut at {cut}");
         });
         assert_eq!((counters.frames_in, counters.resync_bytes), (1, cut), "cut at {cut}");
-        // A first byte alone is not yet a head.
+        // The first byte alone is no head yet.
         assert_eq!(counters.tail_mismatches, u32::from(cut >= 2), "cut at {cut}");
     }
 }
@@ -235,14 +235,14 @@ fn a_recipe_swap_and_back() {
     assert_eq!(counters.resync_bytes + counters.discarded_bytes, 250 * 5);
     assert_eq!(force(&cell), [0.0; 6], "the safe values: nobody measures");
     let after = cell.controller().counters().ports["udp2011"].frames_in;
-    // Nothing would show them: each 4 ms for a second.
+    // Nothing shows whether they have arrived, so they are repeated each 4 ms for a second.
     assert!((240..=250).contains(&(after - before)), "the safe values, {} times", after - before);
     next_good_frame(&mut cell, line, 2);
 }
 
 #[test]
 fn a_swap_to_a_longer_recipe_with_the_same_head_takes_nothing_wrong() {
-    // The same head and tail around eight floats: the tail is not where it should be.
+    // The same head and tail around eight floats: the tail is not where the recipe has it.
     let longer = |n: f32| {
         let mut frame = vec![0x48, 0xAA];
         frame.extend([n; 8].iter().flat_map(|value| value.to_le_bytes()));
@@ -279,8 +279,8 @@ fn a_value_that_is_no_number_rejects_its_frame_alone() {
 
 #[test]
 fn a_noisy_line_passes_on_only_what_it_cannot_tell() {
-    // On a line that flips a bit of each thousandth byte, a frame is whole, or rejected, or has a
-    // wrong bit that no check of the format can see; counters account for all of them.
+    // With one bit flipped in every thousandth byte, a frame is intact, or rejected, or has a wrong bit that
+    // no check of the format can detect. The counters account for all of them.
     let (mut cell, line) = sensor();
     cell.line(line).noise_ppm = 1_000;
     for n in 0..2_000 {
@@ -302,7 +302,7 @@ fn a_noisy_line_passes_on_only_what_it_cannot_tell() {
 }
 
 #[test]
-fn a_line_cut_and_mended() {
+fn a_line_that_is_cut_and_repaired() {
     let (mut cell, line) = sensor();
     for round in 0..3 {
         next_good_frame(&mut cell, line, round);
@@ -313,7 +313,7 @@ fn a_line_cut_and_mended() {
         }
         assert_eq!(force(&cell), [0.0; 6]);
         assert_eq!(cell.port("force").timeouts, round + 1);
-        cell.mend(line);
+        cell.repair(line);
     }
     next_good_frame(&mut cell, line, 9);
 }
@@ -337,8 +337,8 @@ fn an_adapter_pulled_out_and_back() {
 
 #[test]
 fn two_on_one_pair_still_get_something_through() {
-    // On a shared pair a device that speaks unasked collides with the cyclic output; what is
-    // garbled is dropped, what is not gets through.
+    // On two wires a device that sends without a request collides with the cyclic output. Garbled frames are
+    // dropped, the others get through.
     let mut cell = cell("rs485-system");
     let line = cell.line_of("rs485-1");
     cell.line(line).wiring = Wiring::TwoWire;
@@ -364,7 +364,7 @@ fn a_can_bus_that_loses_goes_off_and_carries_strangers() {
         assert_eq!(cell.value("DigitalOutputCommand[1]"), f64::from(byte));
     };
     switch(&mut cell, 1);
-    // Strangers, wrong lengths, a remote frame.
+    // Unknown ids, wrong lengths, a remote frame.
     cell.send_can(bus, can(9, &[0]));
     cell.send_can(bus, can(1, &[]));
     cell.send_can(bus, can(1, &[0, 0]));
@@ -376,7 +376,7 @@ fn a_can_bus_that_loses_goes_off_and_carries_strangers() {
     assert_eq!(cell.value("DO[1]"), 1.0);
     let counters = *cell.port("can-1");
     assert_eq!((counters.rejected_id, counters.rejected_length, counters.rejected_remote), (2, 2, 1));
-    // Bus-off: nothing is handed over, and afterwards the cycle goes on.
+    // Bus-off: nothing is handed over; afterwards the cycles go on.
     cell.bus_off(bus);
     cell.bus(bus).take_heard();
     cell.run_ms(400);

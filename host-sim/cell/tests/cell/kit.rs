@@ -1,4 +1,4 @@
-//! What the tests of whole cells share.
+//! Helpers for the tests of whole cells.
 
 use proto_core::config::GatewayConfig;
 use proto_core::wire::can::{CanFrame, CanId};
@@ -6,7 +6,7 @@ use recipe_cell::{Cell, LineId};
 use recipe_config::{SimConfig, file};
 use recipe_test_kit::example;
 
-/// The gateway file of this name, and the controller's beside it.
+/// The gateway's example file of this name, and the controller's.
 #[track_caller]
 pub(crate) fn files(name: &str) -> (Box<GatewayConfig>, SimConfig) {
     let gateway = file::load_gateway(&example(&format!("{name}.toml")), &[]);
@@ -31,7 +31,7 @@ pub(crate) const fn outputs(byte: u8) -> [u8; 5] {
     [0xFF, 0xFF, byte, 0xEE, 0xEE]
 }
 
-/// What the port has sent on its line since the last look.
+/// What the port has sent on its line since the last call.
 pub(crate) fn heard(cell: &mut Cell, line: LineId) -> Vec<Vec<u8>> {
     cell.line(line).take_heard().into_iter().map(|(_, bytes)| bytes).collect()
 }
@@ -48,12 +48,12 @@ pub(crate) fn force_frame(values: [f32; 6]) -> Vec<u8> {
     frame
 }
 
-/// What the controller has as the end force sensor's values.
+/// The force sensor's values in the controller.
 pub(crate) fn force(cell: &Cell) -> [f32; 6] {
     std::array::from_fn(|nth| cell.value(&format!("ForceEnd[{}]", nth + 1)) as f32)
 }
 
-/// A frame gets through from the device to DO1..8 of the controller, and back to rest.
+/// Checks that frames get through from the device to DO1..8 of the controller; leaves them all off.
 #[track_caller]
 pub(crate) fn outputs_get_through(cell: &mut Cell, line: LineId) {
     for byte in [0xA5, 0x5A, 0x00] {

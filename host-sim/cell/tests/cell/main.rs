@@ -1,9 +1,9 @@
-//! Whole cells in virtual time: the worked examples, what can go wrong on each side, and soaks.
+//! Whole cells in virtual time: the worked examples, faults on each side, random faults, and soak runs.
 
 mod controller_faults;
 mod examples;
 mod field_faults;
 mod kit;
+mod random_faults;
 mod robot;
 mod soak;
-mod trouble;

@@ -1,5 +1,5 @@
-//! What reaches the robot when the network, the controller or the gateway itself fails it: nothing old,
-//! the safe values, and what stops it. The model watches each of these.
+//! What reaches the robot when the network, the controller or the gateway fails: nothing old, but safe
+//! values and stops. The model watches every test.
 
 use proto_core::engine::LinkId;
 use proto_core::time::Duration;
@@ -12,7 +12,7 @@ use recipe_test_kit::toml;
 
 use crate::kit::*;
 
-/// A cell of these files a second after it was switched on, watched.
+/// A watched cell of these configurations, one second after it was switched on.
 fn watched(gateway: &str, controller: Option<&str>) -> Cell {
     let gateway = file::parse_gateway(Text { name: "gateway", toml: gateway }, &[]);
     let gateway = gateway.unwrap_or_else(|error| panic!("{error}"));
@@ -24,7 +24,7 @@ fn watched(gateway: &str, controller: Option<&str>) -> Cell {
     cell
 }
 
-/// One of the soak's cells.
+/// An embedded cell of the soak runs, same.
 fn scenario(name: &str) -> Cell {
     let scenario = Scenario::named(name).unwrap().unwrap();
     let mut cell = Cell::new(&scenario.gateway, &scenario.controller, 1).unwrap();
@@ -38,12 +38,12 @@ fn assert_good(cell: &Cell) {
     assert_eq!(cell.violation(), None, "at {:?}", cell.now());
 }
 
-/// A panel that starts and stops.
+/// A panel with commands that start and stop.
 fn panel() -> String {
     toml::panel(r#"1 = "speed(10)", 2 = "stop", 3 = "pause", 4 = "disable""#, 300)
 }
 
-/// The device holds an order for some time.
+/// The device sends an order for some time.
 fn hold(cell: &mut Cell, order: u8, millis: u64) {
     let line = cell.line_of("device");
     for _ in 0..millis / 50 {
@@ -63,10 +63,10 @@ fn a_cable_that_was_out_brings_nothing_old() {
         hold(&mut cell, 0, 500);
         let links: Vec<LinkId> = cell.link_ids().collect();
         links.iter().for_each(|link| cell.cut_cable(*link));
-        // Pressed for a moment while the cable is out.
+        // Pressed briefly while the cable is out.
         hold(&mut cell, 1, 50);
         hold(&mut cell, 0, millis - 50);
-        links.iter().for_each(|link| cell.mend_cable(*link));
+        links.iter().for_each(|link| cell.repair_cable(*link));
         hold(&mut cell, 0, 8_000);
         assert_good(&cell);
         let expected = u64::from(millis < 700);
@@ -83,7 +83,7 @@ fn a_stop_arrives_when_the_cable_is_in_again() {
     links.iter().for_each(|link| cell.cut_cable(*link));
     hold(&mut cell, 2, 6_000);
     assert_eq!(requests(&cell), 0);
-    links.iter().for_each(|link| cell.mend_cable(*link));
+    links.iter().for_each(|link| cell.repair_cable(*link));
     hold(&mut cell, 2, 8_000);
     assert_eq!(requests(&cell), 1, "once");
     assert_good(&cell);
@@ -92,7 +92,7 @@ fn a_stop_arrives_when_the_cable_is_in_again() {
 #[test]
 fn a_stop_does_not_wait_behind_one_that_nobody_answered() {
     let mut cell = watched(&panel(), None);
-    cell.ails(Link::Command);
+    cell.server_fault_begins(Link::Command);
     cell.controller_mut().mute(Link::Command);
     hold(&mut cell, 0, 500);
     for nth in 1..=3 {
@@ -129,7 +129,7 @@ fn a_safe_value_gets_there_through_a_burst_and_late_packets_that_show_it() {
             cell.run_ms(50);
         }
     };
-    // 128 is the safe value, and packets that show it lie on the way.
+    // 128 is the safe value; packets that show it are held on their way.
     send(&mut cell, 128, 20);
     cell.hold(LinkId::STATE, Way::Down);
     send(&mut cell, 128, 6);
@@ -139,7 +139,7 @@ fn a_safe_value_gets_there_through_a_burst_and_late_packets_that_show_it() {
     cell.run_ms(500);
     cell.release(LinkId::STATE, Way::Down);
     cell.run_ms(50);
-    cell.mend_way(LinkId::RECIPE_UDP, Way::Up);
+    cell.repair_way(LinkId::RECIPE_UDP, Way::Up);
     cell.run_ms(4_000);
     assert_eq!(cell.value("DigitalOutputCommand[1]"), 128.0);
     assert_good(&cell);
@@ -166,7 +166,7 @@ fn a_safe_value_is_written_again_to_a_controller_that_was_without_power() {
             }
             _ => {
                 let (bus, sensor) = (cell.bus_of(port), cell.line_of("sensor"));
-                // The two share a frame.
+                // Both are in one frame of the link.
                 cell.send(sensor, &force_frame([3.0; 6]));
                 cell.send_can(bus, can(5, &[7, 7]));
                 1.0
@@ -194,12 +194,12 @@ fn another_stop_takes_the_place_that_is_free_beside_one_that_nobody_answered() {
     // The second connection is refused: both stops go over the first.
     cell.refuse(LinkId::URGENT);
     cell.reset(LinkId::URGENT);
-    cell.ails(Link::Command);
+    cell.server_fault_begins(Link::Command);
     cell.controller_mut().mute(Link::Command);
     hold(&mut cell, 2, 1_000);
     hold(&mut cell, 0, 100);
     cell.controller_mut().unmute(Link::Command);
-    // One reply for two of a kind.
+    // One reply for two stops.
     hold(&mut cell, 2, 1_500);
     let before = requests(&cell);
     hold(&mut cell, 3, 1_600);
@@ -223,15 +223,15 @@ fn a_safe_value_gets_there_though_a_late_answer_shows_it_from_before() {
         send(&mut cell, 128, 10);
         cell.run_ms(offset * 30);
         cell.send(line, &[1, 128, 0, 4]);
-        cell.ails(Link::Modbus);
+        cell.server_fault_begins(Link::Modbus);
         cell.controller_mut().delay_answers(Link::Modbus, Duration::from_millis(480));
         cell.run_ms(90);
         send(&mut cell, 5, 1);
         cell.cut_way(LinkId::RECIPE_UDP, Way::Up);
         cell.run_ms(600);
         cell.controller_mut().delay_answers(Link::Modbus, Duration::ZERO);
-        cell.recovers(Link::Modbus);
-        cell.mend_way(LinkId::RECIPE_UDP, Way::Up);
+        cell.server_fault_ends(Link::Modbus);
+        cell.repair_way(LinkId::RECIPE_UDP, Way::Up);
         cell.run_ms(4_000);
         assert_eq!(cell.value("DigitalOutputCommand[1]"), 128.0, "{offset}");
         assert_good(&cell);

@@ -1,4 +1,4 @@
-//! Soaks: one seed is one trace, whoever runs it and however it is cut.
+//! Soak runs: one seed gives one trace, on every machine and however the run is split.
 
 use std::sync::Arc;
 
@@ -18,8 +18,8 @@ fn soaked(level: Level, seed: u64, span: Duration, jobs: usize) -> Total {
     batch.total()
 }
 
-/// What these seeds mean, on every machine. A change of what the engine, the controller or the cell
-/// does, or when, changes them: then the new ones belong here. Nothing else may.
+/// The hashes of these runs on every machine. Only a change of what the engine, the controller or the cell
+/// does, or when, may change them; then enter the new ones here.
 const HASHES: [(Level, u64); 2] =
     [(Level::None, 0xACBF_5417_418A_76DB), (Level::Harsh, 0xC29B_8A0D_F398_6191)];
 
@@ -36,7 +36,7 @@ fn the_number_of_threads_changes_nothing() {
     assert_eq!(one, soaked(Level::Harsh, 7, span, 3));
     assert_eq!(one.span, span);
     assert!(one.cells.len() > 9 && one.writes > 500, "{one:?}");
-    // Commands and safe values take their time.
+    // Commands and safe values are checked in longer runs of the cell that has most of them.
     let scenario = Scenario::named("orders").unwrap().unwrap();
     let mut checks = one.checks.clone();
     for seed in 1..=3 {

@@ -1,5 +1,5 @@
-//! A cell in which everything is scaled: floats and doubles that two processors might treat
-//! differently, to and from variables of every kind.
+//! A cell in which every value is scaled: floats and doubles on which two processors might disagree, to and
+//! from variables of every kind.
 
 use proto_core::time::Duration;
 use proto_core::wire::can::CanFrame;
@@ -9,7 +9,7 @@ use recipe_config::file::{self, Text};
 
 use crate::cells::{can, recorded};
 
-/// What a device sends: the type of the one field of each CAN id, and what becomes of it.
+/// What a device sends: for each CAN id the type of its only field, and the variable that it is bound to.
 const INPUTS: [(&str, &str); 16] = [
     ("double", r#"to = "FloatInputReg[1]""#),
     ("double", r#"to = "FloatInputReg[2]", scale = 0.1, offset = -3.3"#),
@@ -29,7 +29,7 @@ const INPUTS: [(&str, &str); 16] = [
     ("byte", r#"to = "WordInputReg[6]", scale = 257"#),
 ];
 
-/// The types of a display's fields; each shows every source.
+/// The types of the display's fields; there is one of each type for every source.
 const TYPES: [&str; 8] = ["byte", "char", "word", "short", "dword", "int", "float", "double"];
 const SOURCES: [&str; 5] = [
     r#"from = "FloatOutputReg[1]""#,
@@ -116,7 +116,7 @@ recipe = "up"
 
 const FIRST_ID: u16 = 0x100;
 
-/// What happened, and that it was worth recording.
+/// The recording, after checking that enough happened in it.
 pub(crate) fn record() -> Vec<u8> {
     let gateway = file::parse_gateway(Text { name: "arithmetic.toml", toml: &gateway() }, &[]);
     let gateway = gateway.unwrap_or_else(|error| panic!("{error}"));
@@ -139,7 +139,7 @@ pub(crate) fn record() -> Vec<u8> {
     cell.into_recording()
 }
 
-/// The controller has other numbers to show.
+/// Gives the controller other numbers to show.
 fn show(cell: &mut Cell, rng: &mut Rng) {
     for nth in 1..=3 {
         let value = std::iter::repeat_with(|| float(rng)).find(|value| value.is_finite()).unwrap_or(0.0);
@@ -160,7 +160,7 @@ fn frame(nth: u64, rng: &mut Rng) -> CanFrame {
     can(FIRST_ID + input as u16, &data)
 }
 
-/// A double that somebody might treat in a way of his own.
+/// A double on which implementations might disagree.
 fn double(rng: &mut Rng) -> f64 {
     let sign = if rng.below(2) == 0 { 1.0 } else { -1.0 };
     sign * match rng.below(10) {
@@ -168,16 +168,16 @@ fn double(rng: &mut Rng) -> f64 {
         0 => f64::from_bits(rng.next_u64()),
         1 => f64::from_bits(0x7FF << 52 | rng.next_u64() >> (12 + rng.below(52))),
         2 => f64::from_bits(rng.next_u64() >> 12),
-        // Halves, and what is next to them.
+        // Halves, and their neighbours.
         3 => rng.below(70_000) as f64 + 0.5,
         4 => (rng.below(70_000) as f64 + 0.5).next_down(),
-        // Where a float ends, becomes subnormal, and is rounded to even.
+        // Limits of the float range, subnormal floats, and ties that are rounded to even.
         5 => f64::from(f32::MAX) * (1.0 + (rng.below(5) as f64 - 2.0) * 3e-8),
         6 => f64::from(f32::from_bits(rng.below(0x0100_0000) as u32)) * (1.0 + rng.below(3) as f64 * 3e-8),
         7 => f64::from_bits(
             f64::from(f32::from_bits(0x3F80_0000 | rng.below(0x80_0000) as u32)).to_bits() | 1 << 28,
         ),
-        // With the second input nothing is left but what was rounded off: shows a fused multiply-add.
+        // The offset cancels all but the rounding error, which a fused multiply-add would not have.
         8 => (f64::from(3.3_f32) / f64::from(0.1_f32)) * (1.0 + rng.below(8) as f64 * f64::EPSILON),
         _ => rng.below(60_000) as f64 / 7.0,
     }

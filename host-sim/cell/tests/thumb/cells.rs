@@ -4,14 +4,14 @@ use proto_core::config::GatewayConfig;
 use proto_core::time::Duration;
 use proto_core::wire::can::CanFrame;
 use proto_core::wire::can::CanId;
-use recipe_cell::{Cell, Chunking, Rng, Talker, Trouble, TroubleKind};
+use recipe_cell::{Cell, Chunking, FaultInjector, FaultKind, Rng, Talker};
 use recipe_config::SimConfig;
 use recipe_config::file::{self, Text};
 use recipe_test_kit::{example, repository};
 
 use crate::arithmetic;
 
-/// A cell, and what makes its recording.
+/// A cell's name, and the function that makes its recording.
 pub(crate) struct Recorded {
     pub(crate) name: String,
     pub(crate) record: fn(&str) -> Vec<u8>,
@@ -19,16 +19,16 @@ pub(crate) struct Recorded {
 
 /// What a device of a cell sends.
 enum Frames {
-    /// So many bytes between head and tail.
+    /// This many bytes between head and tail.
     Stream { head: [u8; 2], payload: usize, tail: [u8; 2] },
-    /// So many bytes with this id.
+    /// This many bytes with this id.
     Can { id: u16, payload: usize },
 }
 
 const FF: [u8; 2] = [0xFF, 0xFF];
 const EE: [u8; 2] = [0xEE, 0xEE];
 
-/// The example files with a field port, what its device sends, and how often a second.
+/// The example files with a field port, what its device sends, and at what rate per second.
 const EXAMPLES: [(&str, Frames, u64); 9] = [
     ("rs485-user", Frames::Stream { head: FF, payload: 3, tail: EE }, 50),
     ("rs485-system", Frames::Stream { head: FF, payload: 1, tail: EE }, 100),
@@ -37,47 +37,47 @@ const EXAMPLES: [(&str, Frames, u64); 9] = [
     ("udp-server", Frames::Stream { head: FF, payload: 1, tail: EE }, 100),
     // The controller's TCP client connects to the gateway.
     ("client", Frames::Stream { head: FF, payload: 1, tail: EE }, 100),
-    // With payloads that are any bits: some are no finite floats.
+    // Payloads are random bits: some are no finite floats.
     ("force-sensor", Frames::Stream { head: [0x48, 0xAA], payload: 24, tail: [0x0D, 0x0A] }, 960),
     ("can-hand", Frames::Can { id: 0x502, payload: 4 }, 50),
     ("request-response", Frames::Stream { head: FF, payload: 3, tail: EE }, 20),
 ];
 
-/// Not an example: the cell whose instructions are counted.
+/// The cell whose instructions are counted; it is no example.
 const FOUR_PORTS: &str = "four ports";
 
-/// All of them: in peace, in trouble, and one for its arithmetic.
+/// All cells: without faults, with faults, and one for arithmetic.
 pub(crate) fn all() -> Vec<Recorded> {
     let names = || EXAMPLES.iter().map(|example| example.0).chain([FOUR_PORTS]);
-    let peaceful = names().map(|name| Recorded { name: name.to_owned(), record: in_peace });
-    let troubled = names().map(|name| Recorded { name: format!("{name} in trouble"), record: in_trouble });
+    let undisturbed = names().map(|name| Recorded { name: name.to_owned(), record: without_faults });
+    let disturbed = names().map(|name| Recorded { name: format!("{name} with faults"), record: with_faults });
     let arithmetic = Recorded { name: "arithmetic".to_owned(), record: |_| arithmetic::record() };
-    peaceful.chain(troubled).chain([arithmetic]).collect()
+    undisturbed.chain(disturbed).chain([arithmetic]).collect()
 }
 
-fn in_peace(name: &str) -> Vec<u8> {
+fn without_faults(name: &str) -> Vec<u8> {
     let mut cell = talking(name, Chunking::Random(40));
     cell.run(Duration::from_millis(1_500));
-    // The devices fall silent: their timeouts and safe values.
+    // The devices fall silent: timeouts and safe values.
     silence(&mut cell);
     cell.run(Duration::from_millis(700));
     cell.into_recording()
 }
 
-fn in_trouble(name: &str) -> Vec<u8> {
-    let mut cell = talking(name.trim_end_matches(" in trouble"), Chunking::Random(9));
+fn with_faults(name: &str) -> Vec<u8> {
+    let mut cell = talking(name.trim_end_matches(" with faults"), Chunking::Random(9));
     cell.every_network(|network| {
         network.jitter = Duration::from_millis(1);
         network.longest_segment = Some(100);
     });
-    let mut trouble = Trouble::new(&mut cell, &TroubleKind::ALL, Duration::from_millis(60));
-    // Faults that last keep the others from having something to break.
+    let mut injector = FaultInjector::new(&mut cell, &FaultKind::ALL, Duration::from_millis(60));
+    // Long faults would leave little for the others to act on.
     for _ in 0..4 {
-        trouble.run(&mut cell, Duration::from_secs(1));
-        trouble.mend(&mut cell);
+        injector.run(&mut cell, Duration::from_secs(1));
+        injector.end_all(&mut cell);
         cell.run(Duration::from_millis(700));
     }
-    assert!(trouble.counts().len() > 8, "{name}: {:?}", trouble.counts());
+    assert!(injector.counts().len() > 8, "{name}: {:?}", injector.counts());
     cell.into_recording()
 }
 
@@ -102,7 +102,7 @@ fn talking(name: &str, chunking: Chunking) -> Cell {
         }
         Frames::Can { id, payload } => {
             let bus = cell.buses().next().expect("a bus");
-            // Now and then another id, or another length.
+            // Sometimes another id, or another length.
             let frame = move |nth| match nth % 16 {
                 14 => can(id + 1, &rng.bytes(payload)),
                 15 => can(id, &rng.bytes(payload + 1)),
@@ -114,7 +114,7 @@ fn talking(name: &str, chunking: Chunking) -> Cell {
     cell
 }
 
-/// Everything at once: a PLC to Modbus, a force sensor to UDP, CAN both ways, a display.
+/// All kinds of ports: a PLC to Modbus, a force sensor to UDP, CAN in both directions, a display.
 fn four_ports(chunking: Chunking) -> Cell {
     let path = repository().join("firmware/examples/counts.toml");
     let set = ["plc.timeout_ms=50", "sensor.timeout_ms=20", "devices.timeout_ms=100", "devices.cycle_ms=4"];
@@ -140,7 +140,7 @@ fn four_ports(chunking: Chunking) -> Cell {
     cell
 }
 
-/// The controller of the four ports: its UDP server takes forces.
+/// The controller of the cell with four ports: its UDP server receives forces.
 const FORCES: &str = r#"
 [[recipe]]
 name = "up"
@@ -167,7 +167,7 @@ fn silence(cell: &mut Cell) {
     }
 }
 
-/// The gateway file of this name, and the controller's beside it.
+/// The gateway's example file of this name, and the controller's.
 fn files(name: &str) -> (Box<GatewayConfig>, SimConfig) {
     let gateway = file::load_gateway(&example(&format!("{name}.toml")), &[]);
     let controller = file::load_controller(&example(&format!("{name}-controller.toml")), &[]);

@@ -1,8 +1,8 @@
-//! The engine on a Cortex-M7 says the same as on this host, byte for byte (docs/cortex-m7.md section 2):
-//! what the engine of a cell did is recorded, and its inputs are given to engines of a board's size, here
-//! and in QEMU.
+//! The engine on a Cortex-M7 has the same outputs as on this host, byte for byte (docs/cortex-m7.md section
+//! 2): the engine of a cell is recorded, and its inputs are replayed to engines of a board's size, here and
+//! in QEMU.
 //!
-//! `HOST_SIM_REPLAY` is the program for QEMU; without it, what needs QEMU is counted as ignored:
+//! `HOST_SIM_REPLAY` is the program for QEMU. Without it, the tests that need QEMU are counted as ignored:
 //!
 //! ```text
 //! cargo firmware-examples
@@ -36,7 +36,7 @@ fn main() -> ExitCode {
     if program.is_none() {
         eprintln!("thumb: what needs QEMU is skipped; {HOW}");
     }
-    // A test runs in its package's folder, not where it was named.
+    // Cargo runs tests in the package's folder; the path is relative to the workspace.
     let program = program.map(|path| match path.exists() {
         true => path,
         false => recipe_test_kit::repository().join(path),
@@ -66,7 +66,7 @@ fn main() -> ExitCode {
     libtest_mimic::run(&arguments, trials).exit_code()
 }
 
-/// What is replayed is what was recorded.
+/// The replay has the same outputs as the recording.
 fn same(recording: &[u8], replay: impl Fn(&[u8]) -> Vec<u8>) -> Result<(), Failed> {
     let inputs = entries(recording).filter(|(_, entry)| matches!(entry, Entry::Input { .. })).count();
     assert!(inputs > 400, "only {inputs} inputs");
@@ -76,8 +76,7 @@ fn same(recording: &[u8], replay: impl Fn(&[u8]) -> Vec<u8>) -> Result<(), Faile
     }
 }
 
-/// A changed value in a field frame is another request; a changed request in the recording is not what
-/// the engine says.
+/// A changed input makes the replay differ from the recording, and so does a changed output.
 fn other_bytes_are_seen(replay: impl Fn(&[u8]) -> Vec<u8>) -> Result<(), Failed> {
     let example = cells::all().swap_remove(0);
     let recording = (example.record)(&example.name);
@@ -93,7 +92,7 @@ fn other_bytes_are_seen(replay: impl Fn(&[u8]) -> Vec<u8>) -> Result<(), Failed>
     other[end - 3] ^= 1;
     let expected = recording_difference(&recording, &replay(&other)).unwrap_or_default();
     assert!(expected.contains("PortBytes"), "the input is another: {expected}");
-    // With that input in both, it is the request that differs.
+    // With the same input in both, the request differs.
     let difference = recording_difference(&other, &replay(&other)).expect("another request");
     let request = difference.contains("found     Output(LinkSend { link: LinkId(02)");
     assert!(request, "{difference}");
@@ -144,7 +143,7 @@ fn in_qemu(program: &Path, recording: &[u8]) -> Vec<u8> {
         from.to_str().unwrap(),
         to.to_str().unwrap()
     );
-    // `timeout` keeps a program that hangs from hanging the test.
+    // `timeout` ends a program that hangs.
     let output = Command::new("timeout")
         .args(["-k", "5", "120", "qemu-system-arm", "-M", "mps2-an500", "-display", "none"])
         .args(["-monitor", "none", "-serial", "null", "-nic", "none", "-semihosting-config", &semihosting])

@@ -1,7 +1,7 @@
 //! The error numbers that `getlasterror` and the state stream show
 //! (docs/simulated-controller.md section 2).
 //!
-//! The interface description lists none; these are the simulated controller's own.
+//! The interface description lists none; these numbers are the simulated controller's own.
 
 /// An error's number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -14,18 +14,18 @@ pub enum ErrorId {
     WrongState,
     /// A command's argument is out of range.
     BadArgument,
-    /// A command was accepted and its transition did not complete.
+    /// A command was accepted, but its transition did not complete.
     NotCompleted,
     /// The emergency stop was pressed.
     EmergencyStop,
     /// A protective stop.
     ProtectiveStop,
-    /// The arm has hit something.
+    /// The arm has collided.
     Collision,
 }
 
 impl ErrorId {
-    /// The number as clients see it.
+    /// The number that clients receive.
     pub const fn code(self) -> u32 {
         match self {
             Self::NoSuchProgram => 0x1001,
@@ -39,7 +39,7 @@ impl ErrorId {
         }
     }
 
-    /// Whether it only says how a command went.
+    /// Whether it only concerns one command, not the robot or a program.
     pub const fn is_refusal(self) -> bool {
         matches!(self, Self::NoSuchProgram | Self::WrongState | Self::BadArgument | Self::NotCompleted)
     }
@@ -50,6 +50,6 @@ impl ErrorId {
 pub struct ErrorEntry {
     /// Its number.
     pub id: ErrorId,
-    /// What happened, one line.
+    /// One line of text.
     pub message: String,
 }

@@ -1,10 +1,10 @@
-//! What commands begin, and what becomes of it (D25).
+//! Transitions: how an accepted command is followed to its end (D25).
 
 use proto_core::command::Action;
 
 use super::{Machine, Program, Robot};
 
-/// Counts of transitions begun: of two of a kind only the newest can still be under way.
+/// Numbers of transitions. Of each kind only the newest can be in progress.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct Begun {
     pub(super) robot: u64,
@@ -25,20 +25,20 @@ impl Transition {
     }
 }
 
-/// What became of a [`Transition`].
+/// The state of a [`Transition`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Progress {
-    /// It goes on.
-    UnderWay,
-    /// It came to where the command wanted it.
+    /// It is in progress.
+    InProgress,
+    /// It has reached the state that the command asked for.
     Done,
-    /// Another one began before.
-    BrokenOff,
+    /// Another one began before its end.
+    Superseded,
 }
 
 impl Machine {
-    /// What became of a transition. To be asked after every change: when another one was begun, it
-    /// counts as broken off, even if it was done before.
+    /// The state of a transition. To be called after every change: once another transition has begun, this one
+    /// counts as superseded, even if it was done.
     pub fn progress(&self, transition: Transition) -> Progress {
         let program_rests = self.program == Program::Stopped;
         let done = match transition.action {
@@ -49,7 +49,7 @@ impl Machine {
             Action::Stop => program_rests,
             Action::Pause => self.program == Program::Paused,
             Action::Resume => self.program == Program::Running,
-            // Its end is the end of every connection: it is answered while it can be.
+            // It is answered at once, because its end closes every connection.
             Action::Shutdown => true,
         };
         let is_newest = match transition.action {
@@ -57,9 +57,9 @@ impl Machine {
             _ => transition.begun.robot == self.begun.robot,
         };
         match (is_newest, done) {
-            (false, _) => Progress::BrokenOff,
+            (false, _) => Progress::Superseded,
             (true, true) => Progress::Done,
-            (true, false) => Progress::UnderWay,
+            (true, false) => Progress::InProgress,
         }
     }
 

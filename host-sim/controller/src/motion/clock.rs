@@ -1,23 +1,23 @@
-//! How far a move has come: its own time, which runs at a rate that changes in ramps.
+//! The progress of a move: its path time, which runs at a rate that changes in ramps.
 
 use proto_core::time::{Duration, Instant};
 
 use super::Braking;
 
-/// A clock along a move's path.
+/// The path time of a move.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct PathClock {
     anchor: Instant,
-    /// At the anchor.
+    /// Path time at the anchor.
     position_s: f64,
-    /// At the anchor.
+    /// Rate at the anchor.
     rate: f64,
     target: f64,
     /// Change of the rate per second while it differs from the target; positive.
     slope: f64,
 }
 
-/// The clock's reading.
+/// Path time and its derivatives at one instant.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Reading {
     /// Seconds of path time.
@@ -61,7 +61,7 @@ impl PathClock {
         Reading { position_s, rate: self.target, rate_change: 0.0 }
     }
 
-    /// When the clock shows `goal_s`; `None` when it never does.
+    /// When the path time reaches `goal_s`; `None` if it never does.
     pub(super) fn reaches(&self, goal_s: f64) -> Option<Instant> {
         let missing = goal_s - self.position_s;
         if missing <= 0.0 {
@@ -70,7 +70,7 @@ impl PathClock {
         let (ramp_s, slope) = self.ramp();
         let after_ramp = self.after_ramp();
         let dt = if after_ramp >= goal_s {
-            // rate·t + slope/2·t² = missing, in the form that does not cancel.
+            // rate·t + slope/2·t² = missing, in the form without cancellation.
             let root = (self.rate * self.rate + 2.0 * slope * missing).max(0.0).sqrt();
             2.0 * missing / (self.rate + root)
         } else if self.target > 0.0 {
@@ -81,12 +81,12 @@ impl PathClock {
         Some(self.anchor + micros(dt))
     }
 
-    /// When the clock stands still; `None` when it does not.
+    /// When the clock stops; `None` if it does not.
     pub(super) fn halts(&self) -> Option<Instant> {
         (self.target <= 0.0).then(|| self.anchor + micros(self.ramp().0))
     }
 
-    /// How long the ramp lasts from the anchor, and its signed slope.
+    /// Duration of the ramp from the anchor, s, and its signed slope.
     fn ramp(&self) -> (f64, f64) {
         let change = self.target - self.rate;
         (change.abs() / self.slope, self.slope.copysign(change))
@@ -98,10 +98,10 @@ impl PathClock {
     }
 }
 
-/// Rounded up, so that at the instant the goal is certainly reached.
+/// Rounded up, so that the goal is reached at that instant.
 fn micros(seconds: f64) -> Duration {
     Duration::from_micros((seconds * 1e6).ceil() as u64)
 }
 
-/// Full rate to rest in 100 ms.
+/// From full rate to rest in 100 ms.
 const NORMAL_SLOPE: f64 = 10.0;

@@ -1,12 +1,12 @@
 //! Forward kinematics: joints to frames, poses and twists.
 //!
-//! The trigonometry is libm's, not the system's: a pose is the same to the last bit on every machine,
-//! and with it the trace of a soak run.
+//! Trigonometry is from libm, not from the system, so that poses, and with them the traces of soak runs, are
+//! identical on every machine.
 
-/// How many joints the arm has.
+/// Number of joints.
 pub(super) const JOINTS: usize = 6;
 
-/// A place and an orientation.
+/// A position and an orientation.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Frame {
     rotation: [[f64; 3]; 3],
@@ -14,11 +14,11 @@ pub struct Frame {
 }
 
 impl Frame {
-    /// No offset, no turn.
+    /// No translation, no rotation.
     pub const IDENTITY: Self =
         Self { rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], origin: [0.0; 3] };
 
-    /// The frame with this pose: X, Y, Z in m, then turns about the fixed X, Y and Z axes, rad.
+    /// The frame with this pose: X, Y, Z in m, then rotations about the fixed X, Y and Z axes in rad.
     pub fn from_pose(pose: &[f64; 6]) -> Self {
         let [x, y, z, rx, ry, rz] = *pose;
         let ((sx, cx), (sy, cy), (sz, cz)) = (libm::sincos(rx), libm::sincos(ry), libm::sincos(rz));
@@ -40,30 +40,30 @@ impl Frame {
         [x, y, z, rx, ry, rz]
     }
 
-    /// `other`, given in this frame, in this frame's parent.
+    /// `other`, given in this frame, transformed to the parent frame.
     pub fn then(&self, other: &Self) -> Self {
-        let [x, y, z] = self.turned(&other.origin);
+        let [x, y, z] = self.rotated(&other.origin);
         let [ox, oy, oz] = self.origin;
-        let column = |nth: usize| self.turned(&other.rotation.map(|row| row[nth]));
+        let column = |nth: usize| self.rotated(&other.rotation.map(|row| row[nth]));
         let (a, b, c) = (column(0), column(1), column(2));
         Self { rotation: [0, 1, 2].map(|row| [a[row], b[row], c[row]]), origin: [ox + x, oy + y, oz + z] }
     }
 
-    /// A force and torque given in this frame, as they act in the parent's origin and axes.
+    /// A force (N) and torque (Nm) given in this frame, transformed to the parent frame.
     pub fn wrench_in_parent(&self, wrench: [f64; 6]) -> [f64; 6] {
         let [fx, fy, fz, tx, ty, tz] = wrench;
-        let (force, torque) = (self.turned(&[fx, fy, fz]), self.turned(&[tx, ty, tz]));
+        let (force, torque) = (self.rotated(&[fx, fy, fz]), self.rotated(&[tx, ty, tz]));
         let lever = cross(&self.origin, &force);
         let [fx, fy, fz] = force;
         [fx, fy, fz, torque[0] + lever[0], torque[1] + lever[1], torque[2] + lever[2]]
     }
 
-    /// A vector given in this frame's axes, in the parent's.
-    fn turned(&self, vector: &[f64; 3]) -> [f64; 3] {
+    /// A vector given in this frame's axes, rotated to the parent's.
+    fn rotated(&self, vector: &[f64; 3]) -> [f64; 3] {
         self.rotation.map(|row| row.iter().zip(vector).map(|(a, b)| a * b).sum())
     }
 
-    /// The flange with the joints at `q`.
+    /// The flange at joint positions `q`.
     pub(super) fn of_joints(q: &[f64; JOINTS]) -> Self {
         q.iter().zip(&LINKS).fold(Self::IDENTITY, |frame, (&angle, link)| frame.then(&link.at(angle)))
     }
@@ -94,8 +94,7 @@ fn cross(a: &[f64; 3], b: &[f64; 3]) -> [f64; 3] {
     [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
 
-/// One link in Denavit-Hartenberg terms: turn about Z, go `d_m` along Z and `a_m` along X, twist
-/// about X.
+/// Denavit-Hartenberg parameters of one link: rotation about Z, `d_m` along Z, `a_m` along X, twist about X.
 struct Link {
     d_m: f64,
     a_m: f64,

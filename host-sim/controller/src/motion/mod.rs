@@ -1,13 +1,11 @@
-//! The arm: where its joints are at any instant, and what follows from that
+//! The arm: positions of its joints at any instant, and the values derived from them
 //! (docs/simulated-controller.md section 3).
 //!
-//! In: moves, the rate at which they are run through, an instant. Out: positions, speeds,
-//! torques and the TCP's pose. Everything is a closed formula of time, so nothing has to be
-//! stepped and the same instant always gives the same numbers. Knows nothing of programs,
-//! registers or states: it is told when to slow down.
+//! In: moves, the rate of motion, an instant. Out: positions, speeds, torques and the TCP's pose. Everything is a closed
+//! formula of time: nothing is stepped, and the same instant always gives the same numbers. Does not know programs,
+//! registers or states.
 //!
-//! The geometry is that of some six-axis cobot with a reach of about 0.9 m; it is not a
-//! product's calibration.
+//! The geometry is that of a generic six-axis cobot with a reach of about 0.9 m, not the calibration of a product.
 
 mod clock;
 mod geometry;
@@ -23,14 +21,14 @@ use geometry::{JOINTS, Twist};
 /// The arm's motion.
 #[derive(Debug, Clone)]
 pub struct Arm {
-    /// Joint positions where the present move began, rad.
+    /// Joint positions at the start of the present move, rad.
     origin: [f64; JOINTS],
-    /// What the present move adds to them, rad.
+    /// Joint travel of the present move, rad.
     travel: [f64; JOINTS],
-    /// How long the present move takes at full rate, in seconds; 0 while there is none.
+    /// Duration of the present move at full rate, s; 0 if there is none.
     length_s: f64,
     clock: PathClock,
-    /// Added to the computed pose: lets a cell start at a pose that it was given.
+    /// Added to the computed pose, so that the initial pose can be configured.
     pose_offset: [f64; 6],
 }
 
@@ -67,7 +65,7 @@ impl std::fmt::Display for MoveError {
 
 impl std::error::Error for MoveError {}
 
-/// What the arm does at one instant; every joint group's seventh item is reserved and 0.
+/// The arm's state at one instant. The seventh item of each joint group is reserved and 0.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct ArmState {
     /// rad.
@@ -90,17 +88,17 @@ pub struct ArmState {
     pub tcp_acceleration: [f32; 6],
 }
 
-/// How quickly the arm comes to rest.
+/// How fast the arm comes to rest.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Braking {
-    /// As a pause or a program's end does: full speed to rest in 100 ms.
+    /// At a pause or the end of a program: from full speed to rest in 100 ms.
     Normal,
-    /// As an emergency stop does: four times as fast.
+    /// At an emergency stop: four times as fast.
     Hard,
 }
 
 impl Arm {
-    /// An arm at rest with its joints here, rad.
+    /// An arm at rest with these joint positions, rad.
     pub fn at(joints: [f64; JOINTS]) -> Self {
         Self {
             origin: joints,
@@ -111,7 +109,7 @@ impl Arm {
         }
     }
 
-    /// Moves the pose's origin so that the arm, as it is, shows `pose`; `None` items stay.
+    /// Sets the pose offset so that the present pose is `pose`; `None` items stay.
     pub fn calibrate(&mut self, pose: [Option<f64>; 6], tool: &Frame) {
         let computed = Frame::of_joints(&self.origin).then(tool).pose();
         for ((offset, wanted), computed) in self.pose_offset.iter_mut().zip(pose).zip(computed) {
@@ -148,17 +146,17 @@ impl Arm {
         }
         self.length_s =
             (PEAK_SPEED * longest / speed_rad_s).max((PEAK_ACCELERATION * longest / MAX_ACCEL_RAD_S2).sqrt());
-        // The profile itself starts from rest, so the rate need not be ramped up.
+        // The profile starts from rest, so the rate needs no ramp.
         self.clock = PathClock::running(now, rate);
         Ok(())
     }
 
-    /// Runs the present move through at this share of its planned speed from now on; 0 stops.
+    /// Continues the present move at this fraction of its planned speed; 0 stops it.
     pub fn set_rate(&mut self, now: Instant, rate: f64, braking: Braking) {
         self.clock.set_rate(now, rate, braking);
     }
 
-    /// Forgets the rest of the present move: the arm stays where it is.
+    /// Ends the present move: the arm stays where it is.
     pub fn settle(&mut self, now: Instant) {
         self.origin = self.joints(now).0;
         self.travel = [0.0; JOINTS];
@@ -166,12 +164,12 @@ impl Arm {
         self.clock = PathClock::stopped();
     }
 
-    /// When the present move ends at the present rate; `None` when it never does.
+    /// When the present move ends at the present rate; `None` if it does not.
     pub fn arrival(&self) -> Option<Instant> {
         self.clock.reaches(self.length_s)
     }
 
-    /// When the arm comes to rest at the present rate; `None` when it never does.
+    /// When the arm comes to rest at the present rate; `None` if it does not.
     pub fn rest(&self) -> Option<Instant> {
         match (self.clock.halts(), self.arrival()) {
             (Some(halt), Some(arrival)) => Some(halt.min(arrival)),
@@ -179,7 +177,7 @@ impl Arm {
         }
     }
 
-    /// What the arm does at `now`, with this tool and payload (kg).
+    /// The arm's state at `now`, with this tool and payload (kg).
     pub fn observe(&self, now: Instant, tool: &Frame, payload_kg: f64) -> ArmState {
         let (q, qd, qdd) = self.joints(now);
         let flange = Frame::of_joints(&q).then(tool);
@@ -188,7 +186,7 @@ impl Arm {
             *item += offset;
         }
         let twist = Twist::of(&q, &qd, tool);
-        // The twist a moment later, for its derivative.
+        // The twist a little later, for its derivative.
         let (mut q_next, mut qd_next) = (q, qd);
         for nth in 0..JOINTS {
             q_next[nth] += qd[nth] * STEP_S;
@@ -254,19 +252,19 @@ fn torque(nth: usize, q: &[f64], qd: &[f64], qdd: &[f64], payload_kg: f64) -> f6
     gravity + INERTIA[nth] * qdd[nth] + FRICTION[nth] * qd[nth]
 }
 
-/// Where the arm stands when nothing else is said, rad.
+/// Joint positions at the start, unless configured, rad.
 pub const HOME: [f64; JOINTS] = [0.0, -FRAC_PI_4, -FRAC_PI_2, -FRAC_PI_4, FRAC_PI_2, 0.0];
-/// No joint goes further than this from zero, rad.
+/// Maximum joint position in both directions, rad.
 pub const JOINT_RANGE_RAD: f64 = 2.0 * std::f64::consts::PI;
-/// The fastest move, rad/s.
+/// Maximum speed of a move, rad/s.
 pub const MAX_SPEED_RAD_S: f64 = std::f64::consts::PI;
-/// No move accelerates faster, rad/s².
+/// Maximum acceleration of a move, rad/s².
 const MAX_ACCEL_RAD_S2: f64 = 12.0;
 /// Peak of the quintic's first derivative, 15/8.
 const PEAK_SPEED: f64 = 1.875;
 /// Peak of its second derivative, 10/√3.
 const PEAK_ACCELERATION: f64 = 5.773_502_691_896_258;
-/// For the difference quotient of the TCP's acceleration, s.
+/// Step of the difference quotient for the TCP's acceleration, s.
 const STEP_S: f64 = 1e-5;
 const INERTIA: [f64; JOINTS] = [3.0, 3.5, 1.4, 0.25, 0.2, 0.1];
 const FRICTION: [f64; JOINTS] = [12.0, 12.0, 8.0, 3.0, 3.0, 2.0];

@@ -1,27 +1,27 @@
-//! Who gets the UDP server's frames (docs/simulated-controller.md section 5, D24, D30).
+//! The clients of the UDP server (docs/simulated-controller.md section 5, D24, D30).
 
 use std::cmp::Reverse;
 use std::net::SocketAddr;
 
 use proto_core::time::{Duration, Instant};
 
-/// The addresses a UDP server streams to.
+/// The addresses that the UDP server streams to.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Clients {
+    /// Each with the time of its newest datagram.
     known: Vec<(SocketAddr, Instant)>,
 }
 
-/// Most of them at a time.
+/// Maximum number of UDP clients.
 pub const MAX_UDP_CLIENTS: usize = 8;
-/// Who is expected to send and has not for this long is streamed to no more (D30): whoever can forge an
-/// address could point the stream at it for ever.
+/// A client that should send and has been silent for this long is removed (D30). Otherwise a forged address would
+/// get the stream for ever.
 const SILENCE: Duration = Duration::from_secs(60);
 
 impl Clients {
-    /// A datagram came from `peer`. Returns whether another client had to make room: of the address that
-    /// has the most clients, the newcomer among them, the one that has been silent longest. So a host that
-    /// sends from ever new ports displaces itself.
-    pub(super) fn heard(&mut self, now: Instant, peer: SocketAddr) -> bool {
+    /// A datagram came from `peer`. Returns whether another client was displaced: the one silent for longest, of the
+    /// address with most clients, including the new one. So a host that sends from many ports displaces itself.
+    pub(super) fn add(&mut self, now: Instant, peer: SocketAddr) -> bool {
         if let Some(client) = self.known.iter_mut().find(|client| client.0 == peer) {
             client.1 = now;
             return false;
@@ -33,8 +33,9 @@ impl Clients {
                 addresses.filter(|&address| address == client.ip()).count()
             };
             let clients = self.known.iter().enumerate();
-            let gives = clients.max_by_key(|(_, (client, heard))| (of_its_address(client), Reverse(*heard)));
-            if let Some(nth) = gives.map(|(nth, _)| nth) {
+            let displaced =
+                clients.max_by_key(|(_, (client, heard))| (of_its_address(client), Reverse(*heard)));
+            if let Some(nth) = displaced.map(|(nth, _)| nth) {
                 self.known.remove(nth);
             }
         }
@@ -42,14 +43,14 @@ impl Clients {
         full
     }
 
-    /// Forgets those that have been silent for too long, and returns how many.
+    /// Removes clients that have been silent for too long, and returns their number.
     pub(super) fn forget_silent(&mut self, now: Instant) -> usize {
         let before = self.known.len();
         self.known.retain(|&(_, heard)| now.saturating_since(heard) < SILENCE);
         before - self.known.len()
     }
 
-    /// `peer` cannot be reached: nobody listens there any more. Returns whether it was a client.
+    /// Removes `peer`, which cannot be reached. Returns whether it was a client.
     pub(super) fn unreachable(&mut self, peer: SocketAddr) -> bool {
         let before = self.known.len();
         self.known.retain(|client| client.0 != peer);
@@ -78,29 +79,29 @@ mod tests {
     }
 
     #[test]
-    fn the_one_that_has_been_silent_longest_makes_room() {
+    fn the_client_silent_for_longest_is_displaced() {
         let mut clients = Clients::default();
         for port in 0..8 {
-            assert!(!clients.heard(at(u64::from(port)), peer(1, port)));
+            assert!(!clients.add(at(u64::from(port)), peer(1, port)));
         }
-        assert!(!clients.heard(at(10), peer(1, 0)));
-        assert!(clients.heard(at(11), peer(1, 8)));
+        assert!(!clients.add(at(10), peer(1, 0)));
+        assert!(clients.add(at(11), peer(1, 8)));
         assert!(clients.iter().all(|client| client != peer(1, 1)));
         assert_eq!(clients.iter().count(), MAX_UDP_CLIENTS);
     }
 
     #[test]
-    fn a_host_with_ever_new_ports_displaces_only_itself() {
+    fn a_host_with_many_ports_displaces_only_itself() {
         let mut clients = Clients::default();
-        clients.heard(at(0), peer(1, 1));
-        clients.heard(at(1), peer(2, 1));
+        clients.add(at(0), peer(1, 1));
+        clients.add(at(1), peer(2, 1));
         for port in 0..1_000 {
-            clients.heard(at(2 + u64::from(port)), peer(3, port));
+            clients.add(at(2 + u64::from(port)), peer(3, port));
         }
         let kept: Vec<_> = clients.iter().collect();
         assert!(kept.contains(&peer(1, 1)) && kept.contains(&peer(2, 1)), "{kept:?}");
-        // And makes room for those that come from elsewhere.
-        clients.heard(at(2_000), peer(4, 1));
+        // It is also displaced by clients of other hosts.
+        clients.add(at(2_000), peer(4, 1));
         assert_eq!(clients.iter().filter(|client| client.ip() == peer(3, 0).ip()).count(), 5);
     }
 }

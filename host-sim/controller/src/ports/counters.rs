@@ -1,50 +1,50 @@
-//! What a port has seen.
+//! The counters of a recipe port.
 
-/// A recipe port's counters since the controller was made.
+/// A recipe port's counters since the controller was created.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize)]
 pub struct PortCounters {
     /// Times the port came up.
     pub ups: u64,
     /// Bytes received; on CAN, data bytes.
     pub bytes_in: u64,
-    /// Frames found in them that the recipe has.
+    /// Frames of the recipe found in them.
     pub frames_in: u64,
-    /// Frames sent; a datagram to each client counts.
+    /// Frames sent; each datagram to a UDP client counts.
     pub frames_out: u64,
-    /// Bytes of them.
+    /// Bytes of the frames sent.
     pub bytes_out: u64,
-    /// Cycles without a frame of their own.
+    /// Cycles in which no frame was sent.
     pub skipped_cycles: u64,
-    /// Bytes dropped because no frame begins there.
+    /// Bytes discarded because no frame begins there.
     pub skipped_bytes: u64,
-    /// Frames whose tail was something else.
+    /// Frames with a wrong tail.
     pub tail_mismatches: u64,
-    /// Bytes of partial frames that were dropped after silence.
+    /// Bytes of partial frames, discarded after silence.
     pub discarded_bytes: u64,
     /// Bytes at a port whose recipe has no input part.
     pub unexpected_bytes: u64,
-    /// Bytes that came while the port was sending on its half-duplex line.
+    /// Bytes received while the port was sending on its half-duplex line.
     pub bytes_while_sending: u64,
-    /// Datagrams of another length, or with another head or tail.
+    /// Datagrams with a wrong length, head or tail.
     pub wrong_datagrams: u64,
-    /// CAN frames with an id the recipe does not have.
+    /// CAN frames with an id that is not in the recipe.
     pub unknown_ids: u64,
-    /// CAN frames whose data is not as long as the fields.
+    /// CAN frames with a wrong length.
     pub wrong_lengths: u64,
     /// Remote frames.
     pub remote_frames: u64,
     /// Frames rejected because a float was not finite.
     pub rejected_values: u64,
-    /// Fields whose reserved bits were set and cleared.
+    /// Fields with reserved bits set, which were cleared.
     pub masked_fields: u64,
-    /// Frames of a user recipe while no program was there.
+    /// Frames of a user recipe while no program ran.
     pub frames_without_program: u64,
-    /// Frames of a user recipe that made room for newer ones.
+    /// Frames of a user recipe dropped for newer ones.
     pub inbox_overflows: u64,
-    /// UDP clients that made room for newer ones.
+    /// UDP clients displaced by new ones.
     pub clients_displaced: u64,
-    /// UDP clients that had not sent anything for a minute.
+    /// UDP clients removed after a minute of silence.
     pub clients_silent: u64,
-    /// UDP clients that could not be reached any more.
+    /// UDP clients removed because they could not be reached.
     pub clients_gone: u64,
 }

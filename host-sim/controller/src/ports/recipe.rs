@@ -1,4 +1,4 @@
-//! A port's recipe, compiled once.
+//! The recipe of a port, with its layouts computed once.
 
 use proto_core::recipe::model::{Framing, Mode, Rules};
 use proto_core::recipe::{CanLayout, PartError, StreamLayout};
@@ -7,20 +7,20 @@ use proto_core::wire::can::CanId;
 
 use recipe_config::{SimBus, SimCanFrame, SimField, SimParts, SimRecipe, SimStreamPart};
 
-/// A recipe's parts as a port uses them.
+/// The layouts of a recipe's parts.
 #[derive(Debug, Clone)]
 pub(super) enum Parts {
     Stream { input: Option<Box<StreamLayout>>, output: Option<Box<StreamLayout>> },
     Can { input: Option<Box<CanLayout>>, output: Option<Box<CanLayout>> },
 }
 
-/// Why a port cannot have its recipe.
+/// Why a port cannot carry its recipe.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum RecipeError {
-    /// The port names a recipe that is not there.
+    /// There is no such recipe.
     NoSuchRecipe,
-    /// A CAN recipe on a port of bytes, or the other way round (D16).
+    /// A CAN recipe on a port that is no CAN bus, or a stream recipe on a CAN bus (D16).
     WrongKind,
     /// A user-defined recipe on a TCP or UDP port (D16).
     UserOnNetwork,
@@ -48,7 +48,7 @@ impl std::fmt::Display for RecipeError {
 impl std::error::Error for RecipeError {}
 
 impl Parts {
-    /// Checks that `bus` takes the recipe, and compiles it.
+    /// Checks that `bus` can carry the recipe, and computes the layouts.
     pub(super) fn new(recipe: &SimRecipe, bus: &SimBus) -> Result<Self, RecipeError> {
         let framing = match bus {
             SimBus::Rs485(_) | SimBus::TcpClient { .. } => Framing::Bytes,
@@ -114,7 +114,7 @@ fn fields(fields: &[SimField]) -> impl Iterator<Item = proto_core::recipe::model
     fields.iter().map(|field| field.field)
 }
 
-/// The id a program means by a number: the part's frame that has it, whichever kind it is.
+/// The frame that a program names by an id, whether that is standard or extended.
 pub(super) fn frame_of(layout: &CanLayout, id: i64) -> Option<usize> {
     layout.ids().position(|own| match own {
         CanId::Standard(own) => i64::from(own) == id,

@@ -1,4 +1,4 @@
-//! The script's side of the lock-step: what runs on its thread.
+//! The thread of a script, and its end of the lock-step with the model.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 use std::sync::mpsc::{Receiver, SyncSender};
@@ -26,16 +26,16 @@ pub(super) struct Link {
     variables: Arc<Mutex<Variables>>,
     /// When the present slice began, in the model's time, µs.
     slice_began: AtomicU64,
-    /// What the script has spent of it.
+    /// Operations used in this slice.
     spent: AtomicU64,
-    /// What an operation is taken for: who copies much does less in a slice.
+    /// Operations that one operation counts for: more if the variables are large, because they may be copied.
     charge: AtomicU64,
-    /// Operations until the variables' size is looked at again.
+    /// Operations until the size of the variables is checked again.
     weigh_in: AtomicU64,
-    /// A call has returned since the variables were looked at.
+    /// A call has returned since the variables were published.
     stale: AtomicBool,
-    /// The program must end, or the model is gone. Functions that cannot fail, such as `print`,
-    /// leave it to the next operation to end the script.
+    /// The program must end, or the model is gone. After a function that cannot fail, such as `print`, the next
+    /// operation ends the script.
     over: AtomicBool,
 }
 
@@ -44,7 +44,7 @@ type Outcome<T> = Result<T, Box<EvalAltResult>>;
 /// Runs the script to its end and reports how it ended.
 pub(super) fn run(link: Link, ast: &AST) {
     let link = Arc::new(link);
-    let engine = equip(script::engine(), &link);
+    let engine = register(script::engine(), &link);
     let mut scope = Scope::new();
     let result = engine.run_ast_with_scope(&mut scope, ast);
     link.show(&scope);
@@ -58,7 +58,7 @@ pub(super) fn run(link: Link, ast: &AST) {
             other => End::Failed(one_line(&other.to_string())),
         },
     };
-    // Fails only when nobody wants to know any more.
+    // Fails only if the model is gone.
     let _ = link.events.send(Progress::Ended(end));
 }
 
@@ -85,26 +85,25 @@ impl Link {
     /// Hands control to the model until it answers.
     fn call(&self, call: Call) -> Outcome<Answer> {
         self.spend(CALL_OPERATIONS)?;
-        let answer = self.ask(call)?;
+        let answer = self.exchange(call)?;
         self.stale.store(true, Relaxed);
         Ok(answer)
     }
 
-    /// Counts what the script does. When it has done enough for now, the model goes on without it
-    /// until the next slice.
+    /// Counts operations. At the end of the slice the script waits for the next one.
     fn spend(&self, operations: u64) -> Outcome<()> {
         if self.spent.fetch_add(operations, Relaxed) + operations <= SLICE_OPERATIONS {
             return Ok(());
         }
         let until = Instant::from_micros(self.slice_began.load(Relaxed)) + SLICE;
-        self.ask(Call::GiveWay { until }).map(|_| ())
+        self.exchange(Call::GiveWay { until }).map(|_| ())
     }
 
-    fn ask(&self, call: Call) -> Outcome<Answer> {
+    fn exchange(&self, call: Call) -> Outcome<Answer> {
         if self.over.load(Relaxed) {
             return Err(terminated());
         }
-        let Some(Stamped { now, answer }) = self.exchange(call) else {
+        let Some(Stamped { now, answer }) = self.send(call) else {
             self.over.store(true, Relaxed);
             return Err(terminated());
         };
@@ -122,14 +121,14 @@ impl Link {
         }
     }
 
-    /// `None` when the model is gone.
-    fn exchange(&self, call: Call) -> Option<Stamped> {
+    /// The model's answer; `None` if it is gone.
+    fn send(&self, call: Call) -> Option<Stamped> {
         self.events.send(Progress::Calling(call)).ok()?;
         self.answers.lock().unwrap_or_else(PoisonError::into_inner).recv().ok()
     }
 
-    /// Ends a script whose variables have grown too large. The interpreter's own limits are for
-    /// single values, and not all of them are checked when an item is added.
+    /// Ends a script whose variables are too large in total. The interpreter limits single values only, and does not
+    /// check all limits when an item is added.
     fn weigh(&self, scope: &Scope<'_>) -> Outcome<()> {
         if self.weigh_in.load(Relaxed) > 0 {
             return Ok(());
@@ -159,12 +158,12 @@ impl Link {
     }
 }
 
-/// Adds the robot's functions, the bounds on work, and the look at the variables.
-fn equip(mut engine: Engine, link: &Arc<Link>) -> Engine {
+/// Registers the robot's functions, the bounds on work, and the publication of variables.
+fn register(mut engine: Engine, link: &Arc<Link>) -> Engine {
     let with = || Arc::clone(link);
 
     let l = with();
-    // Called once an operation.
+    // Called for each operation.
     engine.on_progress(move |_| {
         if l.over.load(Relaxed) {
             return Some(Dynamic::UNIT);
@@ -173,7 +172,7 @@ fn equip(mut engine: Engine, link: &Arc<Link>) -> Engine {
         l.spend(l.charge.load(Relaxed)).err().map(|_| Dynamic::UNIT)
     });
 
-    // The variables are looked at when a call has returned and before the next one.
+    // Variables are published after a call has returned and before the next one.
     let l = with();
     #[expect(deprecated, reason = "marked so by its authors only because it may change")]
     engine.register_debugger(
@@ -267,7 +266,7 @@ fn equip(mut engine: Engine, link: &Arc<Link>) -> Engine {
         let _ = l.call(Call::Log(one_line(text)));
     });
 
-    // The interpreter's own would stop the model, or read the machine's clock.
+    // The interpreter's own functions would block the model, or read the machine's clock.
     engine.register_fn("sleep", |_: INT| -> Outcome<()> { Err("sleep: use wait_ms".into()) });
     engine.register_fn("sleep", |_: FLOAT| -> Outcome<()> { Err("sleep: use wait_ms".into()) });
     engine.register_fn("timestamp", || -> Outcome<()> { Err("timestamp: programs have no clock".into()) });
@@ -301,7 +300,7 @@ fn dynamic(value: Scalar) -> Dynamic {
     }
 }
 
-/// The value as the statistics show it; `room` bounds how many items are taken.
+/// The value for statistics, with at most `room` items.
 fn shown(value: &Dynamic, room: &mut usize) -> serde_json::Value {
     use serde_json::Value;
     if *room == 0 {
@@ -329,7 +328,7 @@ fn shown(value: &Dynamic, room: &mut usize) -> serde_json::Value {
     }
 }
 
-/// Items in a value, itself included, a long string counting as several; at most `limit`.
+/// Number of items in a value, including itself; a long string counts as several. At most `limit`.
 fn weight(value: &Dynamic, limit: usize) -> usize {
     let mut sum = 1;
     if let Some(items) = value.read_lock::<Array>() {
@@ -354,7 +353,7 @@ fn weight(value: &Dynamic, limit: usize) -> usize {
     sum.min(limit)
 }
 
-/// On one line, and not too long for a reply.
+/// The text on one line, not too long for a reply.
 fn one_line(text: &str) -> String {
     let mut line: String =
         text.chars().map(|c| if c.is_control() { ' ' } else { c }).take(MAX_LINE).collect();
@@ -362,16 +361,16 @@ fn one_line(text: &str) -> String {
     line
 }
 
-/// The functions that hand control to the model.
+/// Functions that call the model.
 const CALLS: [&str; 7] = ["comm_recv", "comm_send", "get", "set", "movej", "wait_ms", "log"];
-/// Most items in all variables together.
+/// Maximum number of items in all variables.
 const MAX_WEIGHT: usize = 65_536;
-/// Operations between two looks at that.
+/// Operations between two checks of it.
 const WEIGH_EVERY: u64 = 1_000;
-/// Items that are copied in the time of an operation.
+/// Number of items that can be copied in the time of one operation.
 const ITEMS_AN_OPERATION: usize = 16;
 const MAX_WAIT_MS: f64 = 1e9;
-/// Longest log line or error text, in characters.
+/// Maximum length of a log line or error text, in characters.
 const MAX_LINE: usize = 200;
-/// Most variables and items shown.
+/// Maximum number of variables and items in statistics.
 const MAX_SHOWN: usize = 1_024;

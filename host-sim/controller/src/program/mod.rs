@@ -1,18 +1,17 @@
 //! Robot programs: Rhai scripts that run in lock-step with the model's clock
 //! (docs/simulated-controller.md section 4).
 //!
-//! In: a compiled [`Script`] and answers to its calls. Out: one [`Call`] after the other, the
-//! program's variables, and how it ended. Knows nothing of ports, registers or motion.
+//! In: a compiled [`Script`], and answers to its calls. Out: one [`Call`] after the other, the program's variables, and
+//! how it ended. Does not know ports, registers or motion.
 //!
-//! A script runs on a thread of its own, but never beside the model: each of its calls hands
-//! control to the model, and the model's answer hands it back and waits for the next call. So a
-//! program sees the same instants in the same order in every run, however fast the machine is.
+//! A script runs on a thread of its own, but never in parallel with the model: each call hands control to the model,
+//! which hands it back with the answer and waits for the next call. So a program sees the same instants in the same
+//! order in every run, whatever the speed of the machine.
 //!
-//! A script that does not wait for anything is cut in slices by what it does, not by a clock: after
-//! [`SLICE_OPERATIONS`] operations the model goes on without it until [`SLICE`] after the slice began.
-//! So everything else keeps its timing, and every run is still the same.
+//! A script that never waits is suspended after [`SLICE_OPERATIONS`] operations, until [`SLICE`] after the start of the
+//! slice. So everything else keeps its timing, and every run is still the same.
 //!
-//! Bounds: the sizes at the end of this file. A program that exceeds one ends with an error.
+//! The bounds are at the end of this file. A program that exceeds one ends with an error.
 
 mod link;
 mod script;
@@ -31,10 +30,10 @@ pub use script::{Script, ScriptError};
 /// A program's variables by name: numbers, booleans, strings, arrays and maps of them.
 pub type Variables = BTreeMap<String, serde_json::Value>;
 
-/// What a program asks the model to do.
+/// A call of a program to the model.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Call {
-    /// The next frame of the port's user recipe, whenever it comes.
+    /// Wait for the next frame of the port's user recipe.
     Receive {
         /// The port's name.
         port: String,
@@ -43,45 +42,45 @@ pub enum Call {
     Send {
         /// The port's name.
         port: String,
-        /// Which frame, on CAN.
+        /// On CAN, the id of the frame; needed if the output part has several.
         id: Option<i64>,
-        /// One value a field.
+        /// One value for each field.
         values: Vec<f64>,
     },
-    /// The value of an item.
+    /// Return the value of an item.
     Get {
         /// Its name.
         name: String,
     },
-    /// Give an item a value.
+    /// Set an item.
     Set {
         /// Its name.
         name: String,
         /// The value.
         value: f64,
     },
-    /// Move the joints and wait for their arrival.
+    /// Move the joints, and wait for the end of the move.
     MoveJ {
         /// rad.
         target: [f64; 6],
         /// rad/s.
         speed_rad_s: f64,
     },
-    /// Wait.
+    /// Wait for this time.
     Wait(Duration),
-    /// A line for the log.
+    /// Write a line to the log.
     Log(String),
-    /// Go on at the next slice. No script asks for this, what it does is enough.
+    /// Continue in the next slice. No function of a script calls this; its number of operations does.
     GiveWay {
-        /// When the next slice begins, at the earliest.
+        /// Earliest start of the next slice.
         until: Instant,
     },
 }
 
-/// What the model answers.
+/// The model's answer to a [`Call`].
 #[derive(Debug, Clone, PartialEq)]
 pub enum Answer {
-    /// Done.
+    /// It is done.
     Done,
     /// A received frame; on CAN with its id.
     Frame {
@@ -94,7 +93,7 @@ pub enum Answer {
     Value(Scalar),
     /// A bit's value.
     Bit(bool),
-    /// It cannot be done; the program may catch this.
+    /// It failed; the program may catch the error.
     Error(String),
     /// The program must end.
     Abort,
@@ -103,15 +102,15 @@ pub enum Answer {
 /// How a program ended.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum End {
-    /// It came to its last line.
+    /// It reached its end.
     Finished,
-    /// It was told to.
+    /// It was aborted.
     Aborted,
-    /// An error that it did not catch: one line, with the place in the script.
+    /// An error that it did not catch: one line, with the position in the script.
     Failed(String),
 }
 
-/// Where a program stands.
+/// The state of a program.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Progress {
     /// It waits for the answer to a call.
@@ -120,7 +119,7 @@ pub enum Progress {
     Ended(End),
 }
 
-/// A program that was started.
+/// A started program.
 #[derive(Debug)]
 pub struct Program {
     name: String,
@@ -133,10 +132,10 @@ pub struct Program {
 }
 
 impl Program {
-    /// Starts the script and lets it run up to its first call.
+    /// Starts the script and runs it up to its first call.
     ///
     /// # Errors
-    /// The operating system's, when it gives no thread.
+    /// If the operating system cannot create a thread.
     pub fn start(script: &Script, now: Instant) -> std::io::Result<Self> {
         let (answers, answers_end) = sync_channel(0);
         let (events_end, events) = sync_channel(0);
@@ -164,25 +163,24 @@ impl Program {
         &self.name
     }
 
-    /// Where it stands.
+    /// The program's state.
     pub fn progress(&self) -> &Progress {
         &self.progress
     }
 
-    /// Answers the call it waits for and lets it run up to the next one.
+    /// Answers the pending call and runs the program up to the next one.
     pub fn answer(&mut self, now: Instant, answer: Answer) {
         if matches!(self.progress, Progress::Ended(_)) {
             return;
         }
         if let Some(answers) = &self.answers {
-            // An error means that the thread is gone, which `wait` finds out.
+            // Fails only if the thread has ended, which `wait` notices.
             let _ = answers.send(link::Stamped { now, answer });
         }
         self.wait();
     }
 
-    /// The variables as they were when the program last called, those that have gone out of scope
-    /// included.
+    /// The variables at the program's last call, including those that have gone out of scope.
     pub fn variables(&self) -> Variables {
         self.variables.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
@@ -197,7 +195,7 @@ impl Program {
 
 impl Drop for Program {
     fn drop(&mut self) {
-        // With both ends gone the script's pending call returns an error that it cannot catch.
+        // Without the channels the script's pending call returns an error that it cannot catch.
         self.answers = None;
         self.events = None;
         if let Some(thread) = self.thread.take() {
@@ -206,21 +204,21 @@ impl Drop for Program {
     }
 }
 
-/// How long a slice is, in the model's time.
+/// Duration of a slice, in the model's time.
 pub const SLICE: Duration = Duration::from_millis(1);
-/// Operations of a script in a slice: some 0.1 ms on a machine of today.
+/// Operations of a script in a slice: about 0.1 ms on a present machine.
 pub const SLICE_OPERATIONS: u64 = 500;
-/// What a call counts for, since it hands control to and fro.
+/// Operations that a call counts for, because it switches threads twice.
 const CALL_OPERATIONS: u64 = 50;
-/// Longest string.
+/// Maximum length of a string.
 const MAX_STRING: usize = 4_096;
-/// Most items in an array, those of arrays inside it included; and in a map.
+/// Maximum number of items in an array, with those of nested arrays, and in a map.
 const MAX_ITEMS: usize = 1_024;
-/// Most variables at a time.
+/// Maximum number of variables.
 const MAX_VARIABLES: usize = 128;
-/// Deepest nesting of function calls.
+/// Maximum depth of function calls.
 const MAX_CALLS: usize = 24;
-/// Deepest nesting of expressions.
+/// Maximum depth of expressions.
 const MAX_DEPTH: usize = 32;
 const STACK_BYTES: usize = 8 << 20;
 

@@ -42,7 +42,7 @@ impl Script {
     /// Compiles `text`.
     ///
     /// # Errors
-    /// [`ScriptError`] with the place.
+    /// [`ScriptError`] with the line.
     pub fn compile(name: &str, text: &str) -> Result<Self, ScriptError> {
         match engine().compile(text) {
             Ok(ast) => Ok(Self { name: name.to_owned(), ast: Arc::new(ast) }),
@@ -63,7 +63,7 @@ impl Script {
     }
 }
 
-/// An interpreter with the bounds set, and nothing in it that reads a clock or waits for one.
+/// An interpreter with all bounds set, and without functions that read a clock or wait.
 pub(super) fn engine() -> Engine {
     let mut engine = Engine::new();
     engine

@@ -1,7 +1,6 @@
-//! The registers as Modbus shows them (proto-core/docs/wire/modbus.md sections 7 and 8, D10-D12).
+//! The registers on Modbus (proto-core/docs/wire/modbus.md sections 7 and 8, D10-D12).
 //!
-//! Which coil or word is which variable comes from the table of system variables; only what is no
-//! system variable is listed here.
+//! The places of system variables come from their table; only other items are listed here.
 
 use std::sync::LazyLock;
 
@@ -15,7 +14,7 @@ use super::Registers;
 /// Eight coils: every group of the map begins at a multiple of eight.
 #[derive(Debug, Clone, Copy, Default)]
 struct CoilByte {
-    /// In the image; `None` for the tool's buttons.
+    /// Offset in the image; `None` for the tool's buttons.
     offset: Option<usize>,
     valid_bits: u8,
 }
@@ -58,7 +57,7 @@ static MAP: LazyLock<Map> = LazyLock::new(|| {
     for var in SysVar::all() {
         let offset = var.image_offset();
         match var.modbus() {
-            // Inputs come first: an output's status does not replace the command that can be written.
+            // Inputs come first, so that an output's status does not replace its command, which can be written.
             Some(ModbusPlace::Coils { first, .. }) => {
                 let byte = &mut coils[usize::from(first / 8)];
                 if byte.offset.is_none() {
@@ -183,9 +182,9 @@ impl RegisterBank for Registers {
     }
 }
 
-/// Current inputs: hundredths of a mA.
+/// Counts of current inputs: 0.01 mA each.
 pub(super) const COUNTS_PER_MA: u16 = 100;
-/// Voltage inputs: mV.
+/// Counts of voltage inputs: 1 mV each.
 pub(super) const COUNTS_PER_V: u16 = 1_000;
 const COIL_BYTES: usize = (COILS / 8) as usize;
 const WORDS: usize = HOLDING as usize;

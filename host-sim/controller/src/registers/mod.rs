@@ -1,13 +1,11 @@
 //! Every register and every input and output of the controller, in one place.
 //!
-//! In: recipe frames, Modbus writes, programs, and what the arm and the state machines do. Out:
-//! the same values through port 2001, Modbus, recipes and programs. Knows
-//! neither connections nor time.
+//! In: values of recipe frames, Modbus writes and programs, and the states of the arm and the machine. Out: the same
+//! values on port 2001, Modbus, recipe ports and in programs. Does not know connections or time.
 //!
-//! The system variables stand in one process image, as everywhere in `proto_core`; the few items
-//! of the map that are no system variables stand beside it. An output that can be commanded has
-//! two names, such as `DigitalOutputCommand[1]` and `DigitalSignalStatus[4]`: the second always
-//! follows the first.
+//! System variables are in one process image, as everywhere in `proto_core`; the few other items of the Modbus map are
+//! beside it. An output that can be commanded has two variables, such as `DigitalOutputCommand[1]` and
+//! `DigitalSignalStatus[4]`: the second always follows the first.
 
 mod bank;
 mod packet;
@@ -20,12 +18,12 @@ use proto_core::wire::scalar::Scalar;
 use super::motion::{ArmState, Frame};
 use recipe_config::{AnalogInput, BitGroup, InitialTarget};
 
-/// What the state machines show.
+/// The codes of the state machines.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Status {
-    /// Operation mode, as the 2001 stream shows it.
+    /// Operation mode, as in the state packet.
     pub mode: u8,
-    /// Operation mode, as holding register 0 shows it.
+    /// Operation mode, as in holding register 0.
     pub mode_register: u16,
     /// Robot state.
     pub robot: u8,
@@ -33,9 +31,9 @@ pub struct Status {
     pub program: u8,
     /// Safety state.
     pub safety: u8,
-    /// The collision axis while a collision is reported, see proto-core/docs/wire/state.md section 2.
+    /// The axis of a collision, while there is one (proto-core/docs/wire/state.md section 2).
     pub collision_axis: Option<u8>,
-    /// The newest error's code, 0 when there is none.
+    /// The newest error's code, 0 if there is none.
     pub error: u32,
     /// Global speed, per cent.
     pub speed_percent: u8,
@@ -62,13 +60,13 @@ pub struct Registers {
     status: Status,
 }
 
-/// Why a value cannot be given to an item.
+/// Why an item was not set.
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
 pub enum SetError {
-    /// A program may not write it.
+    /// Programs cannot write the item.
     ReadOnly(InitialTarget),
-    /// The value does not fit.
+    /// The value is out of range.
     Value {
         /// The item.
         target: InitialTarget,
@@ -110,7 +108,7 @@ impl Registers {
         &self.image
     }
 
-    /// Lets `write` change input variables; what follows from them is brought up to date after.
+    /// Lets `write` change the image, and then updates the variables that depend on others.
     pub fn write_inputs<R>(&mut self, write: impl FnOnce(&mut [u8; IMAGE_BYTES]) -> R) -> R {
         let force_before = self.vector(PLACES.force_end);
         let result = write(&mut self.image);
@@ -129,17 +127,17 @@ impl Registers {
         Scalar::decode(var.ty(), bytes).unwrap_or(Scalar::Byte(0))
     }
 
-    /// What the state machines show.
+    /// The codes of the state machines.
     pub fn status(&self) -> &Status {
         &self.status
     }
 
-    /// What the arm does.
+    /// The arm's state.
     pub fn arm(&self) -> &ArmState {
         &self.arm
     }
 
-    /// An item's value; a bit is 0 or 1.
+    /// An item's value, in its unit; a bit is 0 or 1.
     pub fn value(&self, target: InitialTarget) -> f64 {
         match target {
             InitialTarget::Var(var) => self.var(var).as_f64(),
@@ -166,11 +164,10 @@ impl Registers {
         byte >> (nth % 8) & 1 == 1
     }
 
-    /// Gives an item a value whatever it is: the start's values, and what a test's "outside world"
-    /// does to inputs.
+    /// Sets any item: for initial values, and for inputs that a test drives.
     ///
     /// # Errors
-    /// [`SetError::Value`] when the item cannot have the value; nothing changed.
+    /// [`SetError::Value`] if the value is out of range; nothing changed.
     pub fn force(&mut self, target: InitialTarget, value: f64) -> Result<(), SetError> {
         let wrong = SetError::Value { target, value };
         match target {
@@ -180,7 +177,7 @@ impl Registers {
                     scalar => scalar,
                 };
                 let offset = var.image_offset();
-                // The other name of an output that can be commanded decides; set that one.
+                // The status of an output follows its command, so the command is set.
                 let offset = command_of(var).map_or(offset, SysVar::image_offset);
                 self.write_inputs(|image| {
                     image.get_mut(offset..).and_then(|bytes| scalar.encode(bytes));
@@ -224,7 +221,7 @@ impl Registers {
         Ok(())
     }
 
-    /// Gives an item a value as a program may: registers toward the user, and outputs.
+    /// Sets an item that programs can write: an output register or an output.
     ///
     /// # Errors
     /// [`SetError`]; nothing changed.
@@ -246,7 +243,7 @@ impl Registers {
         if writable { self.force(target, value) } else { Err(SetError::ReadOnly(target)) }
     }
 
-    /// Registers and outputs are 0.
+    /// Sets all registers and outputs to 0.
     pub fn clear(&mut self) {
         self.write_inputs(|image| {
             for var in SysVar::all().filter(|&var| is_kept(var)) {
@@ -271,7 +268,7 @@ impl Registers {
         bytes.map_or(0.0, |bytes| f64::from(f32::from_le_bytes(*bytes)))
     }
 
-    /// Takes over what the arm does; `target` is what its controller asks of it.
+    /// Sets the arm's state, actual and commanded.
     pub fn show_arm(&mut self, actual: ArmState, target: ArmState) {
         self.arm = actual;
         self.target = target;
@@ -282,7 +279,7 @@ impl Registers {
         }
     }
 
-    /// Takes over what the state machines show.
+    /// Sets the codes of the state machines.
     pub fn show_status(&mut self, status: Status) {
         self.status = status;
     }
@@ -304,7 +301,7 @@ impl Registers {
         }
     }
 
-    /// Outputs show what they were commanded.
+    /// Copies commands of outputs to their status.
     fn follow(&mut self) {
         for &(command, status, valid_bits) in &PLACES.commanded {
             let bits = self.image[command] & valid_bits;
@@ -314,9 +311,9 @@ impl Registers {
     }
 }
 
-/// Offsets in the image that are needed often.
+/// Offsets in the image, looked up once.
 struct Places {
-    /// Of a command, of what shows it, and the bits that mean something.
+    /// Of a command and of its status, and the valid bits.
     commanded: [(usize, usize, u8); 3],
     force_end: usize,
     force_base: usize,
@@ -342,7 +339,7 @@ static PLACES: LazyLock<Places> = LazyLock::new(|| {
     }
 });
 
-/// Whether the variable is what was last written to it, and neither measured nor wired from outside.
+/// Whether the variable keeps what was written to it: it is neither measured nor an input.
 fn is_kept(var: SysVar) -> bool {
     match var.group() {
         "RobotState" => false,
@@ -351,7 +348,7 @@ fn is_kept(var: SysVar) -> bool {
     }
 }
 
-/// The variable that commands the output `var` shows.
+/// The command of the output whose status is `var`; `None` if `var` is something else.
 fn command_of(var: SysVar) -> Option<SysVar> {
     if var.direction() == Direction::Input || var.group() != "DigitalSignalStatus" {
         return None;
@@ -382,5 +379,5 @@ fn named(group: &str, index: u32) -> Option<SysVar> {
     SysVar::named(group, index).ok()
 }
 
-/// `DigitalOutputCommand[a]` is shown as `DigitalSignalStatus[b]`.
+/// The status of `DigitalOutputCommand[a]` is `DigitalSignalStatus[b]`.
 const COMMANDED: [(u32, u32); 3] = [(1, 4), (2, 5), (3, 6)];

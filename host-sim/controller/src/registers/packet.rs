@@ -1,4 +1,4 @@
-//! The registers as the 2001 stream shows them (proto-core/docs/wire/state.md section 2).
+//! The registers in the state packet of port 2001 (proto-core/docs/wire/state.md section 2).
 
 use proto_core::modbus::map::unscaled;
 use proto_core::sysvar::SysVar;
@@ -8,8 +8,7 @@ use super::bank::{COUNTS_PER_MA, COUNTS_PER_V};
 use super::{PLACES, Registers};
 
 impl Registers {
-    /// The whole state, every field filled; `global_speed` is where the dialect puts the global
-    /// speed.
+    /// The state packet of 1468 bytes. `global_speed` is the offset of the global speed, if the dialect has one.
     pub fn packet(&self, global_speed: Option<u16>) -> Box<[u8; LEN]> {
         let (arm, target, status) = (&self.arm, &self.target, &self.status);
         let mut packet = StatePacket {
@@ -47,7 +46,7 @@ impl Registers {
             *value = unscaled(counts, if nth < 4 { COUNTS_PER_MA } else { COUNTS_PER_V });
         }
         let mut bytes = Box::new([0; LEN]);
-        // It cannot be too short: it is a packet's length.
+        // It cannot fail: the buffer has a packet's length.
         let _ = packet.encode(&mut bytes[..]);
         self.put_variables(&mut bytes);
         if let Some(place) = global_speed.and_then(|offset| bytes.get_mut(usize::from(offset))) {
@@ -56,7 +55,7 @@ impl Registers {
         bytes
     }
 
-    /// Every system variable that has a place in the packet.
+    /// Writes every system variable that is in the packet.
     fn put_variables(&self, packet: &mut [u8; LEN]) {
         for var in SysVar::all() {
             let Some(place) = var.stream() else { continue };
@@ -75,6 +74,6 @@ impl Registers {
     }
 }
 
-/// Servo drive status words in the manner of CiA 402: operation enabled, switch on disabled.
+/// Status words of the servo drives as in CiA 402: operation enabled, switch on disabled.
 const DRIVE_ENABLED: u32 = 0x0637;
 const DRIVE_DISABLED: u32 = 0x0650;

@@ -1,8 +1,8 @@
-//! Port 2000: commands are carried out one after the other, and answered when they are done
+//! Port 2000: the commands of a connection are carried out one after the other, and answered when they are done
 //! (proto-core/docs/wire/command.md section 8, D25).
 //!
-//! A command that begins a transition is answered at its end. What else comes on the connection
-//! meanwhile waits for that; other connections are served.
+//! A command that begins a transition is answered at its end. Until then further commands of the connection wait;
+//! other connections are served.
 
 use std::collections::VecDeque;
 
@@ -19,21 +19,22 @@ use crate::{ConnId, Controller, ControllerOutput};
 #[derive(Debug, Default)]
 pub(super) struct Session {
     parser: CommandServer,
-    /// Commands behind the one that is not answered yet.
-    orders: VecDeque<Order>,
-    awaited: Option<Awaited>,
+    /// Commands that wait until the one before is answered.
+    waiting: VecDeque<Command>,
+    pending: Option<Pending>,
 }
 
-/// A command that is answered when its transition is over.
+/// A command that is answered at the end of its transition.
 #[derive(Debug, Clone, Copy)]
-struct Awaited {
+struct Pending {
     transition: Transition,
+    /// It is answered with fail at this time.
     until: Instant,
 }
 
-/// A command, whole.
+/// A complete command.
 #[derive(Debug, Clone, PartialEq)]
-enum Order {
+enum Command {
     Run { program: String, speed: Option<Percent> },
     Speed(Option<Percent>),
     Do(Action),
@@ -43,13 +44,13 @@ enum Order {
     Unknown,
 }
 
-/// What a connection is to do next.
-enum Turn {
+/// The next step of a connection.
+enum Step {
     Answer(Action, Progress),
-    CarryOut(Order),
+    CarryOut(Command),
 }
 
-impl From<ServerEvent<'_>> for Order {
+impl From<ServerEvent<'_>> for Command {
     fn from(event: ServerEvent<'_>) -> Self {
         match event {
             ServerEvent::Request(Request::Run { program, speed }) => {
@@ -66,10 +67,10 @@ impl From<ServerEvent<'_>> for Order {
 }
 
 impl Session {
-    /// When silence completes a command, or the patience with a transition ends.
+    /// When silence completes a command, or the time limit of a transition is reached.
     pub(super) fn deadline(&self) -> Option<Instant> {
-        let awaited = self.awaited.map(|awaited| awaited.until);
-        [self.parser.deadline(), awaited].into_iter().flatten().min()
+        let pending = self.pending.map(|pending| pending.until);
+        [self.parser.deadline(), pending].into_iter().flatten().min()
     }
 }
 
@@ -79,16 +80,16 @@ impl Controller {
             self.counters.command.bytes_in += bytes.len() as u64;
         }
         let mut rest = bytes;
-        // Carrying one out may end the connection.
+        // A command may close the connection.
         while let Some(session) = self.server.command.get_mut(&conn)
             && let Some(event) = session.parser.receive(now, &mut rest)
         {
-            let order = event.into();
-            self.take(now, conn, order);
+            let command = event.into();
+            self.queue(now, conn, command);
         }
     }
 
-    /// What silence completes.
+    /// Carries out commands that silence has completed.
     pub(super) fn poll_commands(&mut self, now: Instant) {
         let due = |session: &Session| session.parser.deadline().is_some_and(|deadline| now >= deadline);
         let sessions = self.server.command.iter();
@@ -98,78 +99,78 @@ impl Controller {
             while let Some(session) = self.server.command.get_mut(&conn)
                 && let Some(event) = session.parser.poll(now)
             {
-                let order = event.into();
-                self.take(now, conn, order);
+                let command = event.into();
+                self.queue(now, conn, command);
             }
         }
     }
 
-    fn take(&mut self, now: Instant, conn: ConnId, order: Order) {
+    fn queue(&mut self, now: Instant, conn: ConnId, command: Command) {
         self.counters.command.requests += 1;
-        if order != Order::Unknown {
-            self.server.places.asked(now, conn);
+        if command != Command::Unknown {
+            self.server.places.active(now, conn);
         }
         let Some(session) = self.server.command.get_mut(&conn) else { return };
-        if session.orders.len() >= MAX_ORDERS {
+        if session.waiting.len() >= MAX_ORDERS {
             self.counters.command.violations += 1;
             self.closed(Link::Command, conn);
             self.outputs.push_back(ControllerOutput::Close { conn });
             return;
         }
-        session.orders.push_back(order);
+        session.waiting.push_back(command);
         self.settle(now);
     }
 
-    /// Answers the commands whose transitions are over and carries out what waited for that. To be
-    /// called after everything that happens to the state machines.
+    /// Answers commands whose transitions have ended, and carries out those that waited. To be called after every
+    /// change of the state machines.
     pub(crate) fn settle(&mut self, now: Instant) {
-        while let Some((conn, turn)) = self.next_turn(now) {
-            match turn {
-                Turn::CarryOut(order) => self.carry_out(now, conn, order),
-                Turn::Answer(action, progress) => {
+        while let Some((conn, step)) = self.next_step(now) {
+            match step {
+                Step::CarryOut(command) => self.carry_out(now, conn, command),
+                Step::Answer(action, progress) => {
                     let outcome = match progress {
                         Progress::Done => Outcome::Success,
-                        Progress::BrokenOff => {
+                        Progress::Superseded => {
                             self.machine.not_completed(action, "another operation began before it was done");
                             Outcome::Fail
                         }
-                        Progress::UnderWay => {
-                            let why = format!("not done after {} s", LIMIT.as_millis() / 1_000);
+                        Progress::InProgress => {
+                            let why = format!("not done after {} s", MAX_TRANSITION.as_millis() / 1_000);
                             self.machine.not_completed(action, &why);
                             Outcome::Fail
                         }
                     };
-                    self.server.places.asked(now, conn);
+                    self.server.places.active(now, conn);
                     self.reply(now, conn, &Reply::Did { action, outcome });
                 }
             }
         }
     }
 
-    /// First those that are over, so that none is looked at too late.
-    fn next_turn(&mut self, now: Instant) -> Option<(ConnId, Turn)> {
+    /// Ended transitions come first: a further command would supersede them.
+    fn next_step(&mut self, now: Instant) -> Option<(ConnId, Step)> {
         for (&conn, session) in &mut self.server.command {
-            let Some(Awaited { transition, until }) = session.awaited else { continue };
+            let Some(Pending { transition, until }) = session.pending else { continue };
             let progress = self.machine.progress(transition);
-            if progress != Progress::UnderWay || now >= until {
-                session.awaited = None;
-                return Some((conn, Turn::Answer(transition.action(), progress)));
+            if progress != Progress::InProgress || now >= until {
+                session.pending = None;
+                return Some((conn, Step::Answer(transition.action(), progress)));
             }
         }
-        let mut free = self.server.command.iter_mut().filter(|(_, session)| session.awaited.is_none());
-        free.find_map(|(&conn, session)| Some((conn, Turn::CarryOut(session.orders.pop_front()?))))
+        let mut free = self.server.command.iter_mut().filter(|(_, session)| session.pending.is_none());
+        free.find_map(|(&conn, session)| Some((conn, Step::CarryOut(session.waiting.pop_front()?))))
     }
 
-    fn carry_out(&mut self, now: Instant, conn: ConnId, order: Order) {
-        match order {
-            Order::Run { program, speed } => {
+    fn carry_out(&mut self, now: Instant, conn: ConnId, command: Command) {
+        match command {
+            Command::Run { program, speed } => {
                 let outcome = match self.run(now, conn, &program, speed) {
                     Ok(()) => Outcome::Success,
                     Err(_) => Outcome::Fail,
                 };
                 self.reply(now, conn, &Reply::Run(outcome));
             }
-            Order::Speed(speed) => {
+            Command::Speed(speed) => {
                 let reply = match self.machine.set_speed(speed) {
                     Ok(()) => Reply::SpeedSet(speed),
                     Err(_) => Reply::SpeedRefused,
@@ -177,16 +178,16 @@ impl Controller {
                 self.speed_changed(now);
                 self.reply(now, conn, &reply);
             }
-            Order::Do(action) => match self.machine.act(now, action) {
+            Command::Do(action) => match self.machine.act(now, action) {
                 Ok((effect, transition)) => {
                     self.apply(now, effect);
                     if let Some(session) = self.server.command.get_mut(&conn) {
-                        session.awaited = Some(Awaited { transition, until: now + LIMIT });
+                        session.pending = Some(Pending { transition, until: now + MAX_TRANSITION });
                     }
                 }
                 Err(_) => self.reply(now, conn, &Reply::Did { action, outcome: Outcome::Fail }),
             },
-            Order::State => {
+            Command::State => {
                 let machine = &self.machine;
                 let codes = StateCodes::new(
                     &self.dialect,
@@ -197,22 +198,22 @@ impl Controller {
                 );
                 self.reply(now, conn, &Reply::State(codes));
             }
-            Order::IsProgFinish => {
+            Command::IsProgFinish => {
                 let finished = self.machine.program() == ProgramState::Stopped;
                 self.reply(now, conn, &Reply::ProgramFinished(finished));
             }
-            Order::GetLastError => {
+            Command::GetLastError => {
                 let (id, message) = match self.machine.error() {
                     Some(error) => (error.id.code(), error.message.clone()),
                     None => (0, "no error".to_owned()),
                 };
                 self.reply(now, conn, &Reply::LastError { id, message: message.as_bytes() });
             }
-            Order::Unknown => self.reply(now, conn, &Reply::UnknownCommand),
+            Command::Unknown => self.reply(now, conn, &Reply::UnknownCommand),
         }
     }
 
-    /// `run`: the program is found first, so that its absence is reported in every state.
+    /// The command `run`. The program is looked up first, so that a missing one is reported in every state.
     fn run(&mut self, now: Instant, conn: ConnId, name: &str, speed: Option<Percent>) -> Result<(), ErrorId> {
         let Some(script) = self.script_named(name) else {
             self.machine.fail(ErrorId::NoSuchProgram, format!("run: there is no program {name}"));
@@ -225,7 +226,7 @@ impl Controller {
         self.start_program(now, &script, conn)
     }
 
-    /// A program by its name as configured, or by the last part of a path.
+    /// The program with this name, or with the last part of this path.
     fn script_named(&self, name: &str) -> Option<Script> {
         let base = name.rsplit('/').next().unwrap_or(name);
         let by = |wanted: &str| self.scripts.iter().find(|script| script.name() == wanted);
@@ -254,9 +255,9 @@ impl Controller {
     }
 }
 
-/// A transition that takes longer is answered with fail, and goes on.
-const LIMIT: Duration = Duration::from_secs(5);
-/// Most commands of a connection behind one that is not answered yet; the connection ends with one more.
+/// The command of a longer transition is answered with fail; the transition continues.
+const MAX_TRANSITION: Duration = Duration::from_secs(5);
+/// Maximum number of commands that wait on a connection; one more closes it.
 pub const MAX_ORDERS: usize = 64;
-/// Longest reply, the error's text included.
+/// Maximum length of a reply, with an error's text.
 const MAX_REPLY: usize = 1_024;

@@ -1,7 +1,7 @@
-//! The controller's TCP servers and its UDP server: connections in, answers out.
+//! The controller's TCP servers and its UDP server (docs/simulated-controller.md section 5).
 //!
-//! Every number of connections is bounded; one too many is closed at once and counted. An answer
-//! is handed over whole, for the shell to send as the connection takes it.
+//! The number of connections is bounded; one more is closed at once and counted. An answer is handed over as a whole;
+//! the shell sends it as fast as the connection takes it.
 
 mod commands;
 mod room;
@@ -21,16 +21,16 @@ pub use commands::MAX_ORDERS;
 use commands::Session;
 use room::Places;
 
-/// Most clients of port 2000 at a time.
+/// Maximum number of clients of port 2000.
 pub const MAX_COMMAND_CONNECTIONS: usize = 32;
-/// Most clients of port 2001 at a time.
+/// Maximum number of clients of port 2001.
 pub const MAX_STATE_CONNECTIONS: usize = 32;
-/// Most Modbus clients at a time.
+/// Maximum number of Modbus clients.
 pub const MAX_MODBUS_CONNECTIONS: usize = 128;
-/// Most delayed answers at a time, when a test asked for delays; further ones get lost.
+/// Maximum number of answers that a fault delays; further ones are dropped.
 const MAX_DELAYED: usize = 1_024;
 
-/// The connections.
+/// The connections of all servers.
 #[derive(Debug, Default)]
 pub(super) struct Server {
     command: BTreeMap<ConnId, Box<Session>>,
@@ -67,7 +67,7 @@ impl Server {
         }
     }
 
-    /// How many connections a server has.
+    /// The number of a server's connections.
     pub(super) fn open(&self, link: Link) -> usize {
         match link {
             Link::Command => self.command.len(),
@@ -109,7 +109,7 @@ impl Controller {
         self.counters.of(link).opened += 1;
     }
 
-    /// Whether there is a place for one more. Somebody may have to go for it.
+    /// Whether one more client is accepted. Another one may be disconnected for it.
     fn make_room(&mut self, now: Instant, link: Link, from: IpAddr) -> bool {
         let open = self.server.open(link);
         match (link, self.faults.command_clients()) {
@@ -121,18 +121,18 @@ impl Controller {
             }
             _ => {}
         }
-        let most = match link {
+        let max = match link {
             Link::Command => MAX_COMMAND_CONNECTIONS,
             Link::State => MAX_STATE_CONNECTIONS,
             Link::Modbus => MAX_MODBUS_CONNECTIONS,
         };
-        if open < most {
+        if open < max {
             return true;
         }
-        let Some(gives) = self.server.places.gives(now, link, from, most) else { return false };
+        let Some(displaced) = self.server.places.to_displace(now, link, from, max) else { return false };
         self.counters.of(link).displaced += 1;
-        self.closed(link, gives);
-        self.outputs.push_back(ControllerOutput::Close { conn: gives });
+        self.closed(link, displaced);
+        self.outputs.push_back(ControllerOutput::Close { conn: displaced });
         true
     }
 
@@ -166,7 +166,7 @@ impl Controller {
                 violated = true;
                 break;
             };
-            self.server.places.asked(now, conn);
+            self.server.places.active(now, conn);
             counters.requests += 1;
             // The function code follows the seven bytes of the header.
             counters.refusals += u64::from(answer[7] & 0x80 != 0);
@@ -186,14 +186,14 @@ impl Controller {
         let listening = self.listening();
         match self.ports.iter_mut().find(|port| port.is_udp_server()) {
             Some(port) => {
-                port.heard(now, peer);
+                port.client_sent(now, peer);
                 port.receive(now, bytes, &mut self.registers, listening);
             }
             None => self.counters.stray_datagrams += 1,
         }
     }
 
-    /// What silence completes, transitions that take too long, and answers that were held back.
+    /// Handles commands completed by silence, transitions that take too long, and delayed answers.
     pub(super) fn poll_server(&mut self, now: Instant) {
         self.poll_commands(now);
         self.settle(now);
@@ -218,11 +218,11 @@ impl Controller {
             return;
         }
         counters.bytes_out += bytes.len() as u64;
-        // An answer never overtakes an earlier one of its connection.
+        // Answers of a connection stay in order.
         let earlier = self.server.delayed.iter().rev().find(|delayed| delayed.1 == conn);
         let due = (now + self.faults.delay(link)).max(earlier.map_or(now, |delayed| delayed.0));
         if due <= now && earlier.is_none() {
-            // Answers to requests that came together leave together.
+            // Answers to requests that arrived together are sent together.
             match self.outputs.back_mut() {
                 Some(ControllerOutput::Send { conn: last, bytes: waiting })
                     if *last == conn && waiting.len() < MAX_JOINED =>
@@ -239,7 +239,7 @@ impl Controller {
     }
 }
 
-/// The registers, or the exception that a test wants.
+/// The registers, or the exception that a fault demands.
 struct Bank<'a> {
     registers: &'a mut Registers,
     exception: Option<Exception>,
@@ -273,5 +273,5 @@ impl RegisterBank for Bank<'_> {
     }
 }
 
-/// Answers are joined up to about this many bytes.
+/// Answers are joined up to about this number of bytes.
 const MAX_JOINED: usize = 4_096;

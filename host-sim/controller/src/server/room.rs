@@ -1,7 +1,6 @@
-//! Who makes room at a server that has no place left (docs/devices.md section 7).
+//! Which client is disconnected when a full server gets another one (docs/devices.md section 7).
 //!
-//! A host that only holds connections must not keep out those that have something to ask, and must
-//! not get their places either.
+//! A host that only holds connections open must neither keep out clients that send requests nor displace them.
 
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
@@ -11,7 +10,7 @@ use proto_core::time::{Duration, Instant};
 
 use super::{ConnId, Link};
 
-/// What is known of the clients of all servers.
+/// The clients of all servers.
 #[derive(Debug, Default)]
 pub(super) struct Places(BTreeMap<ConnId, Place>);
 
@@ -19,8 +18,9 @@ pub(super) struct Places(BTreeMap<ConnId, Place>);
 struct Place {
     link: Link,
     from: IpAddr,
+    /// Whether it has sent a complete request.
     has_asked: bool,
-    /// When it asked last or, before that, came.
+    /// The newest request or answer, or the connection's start.
     newest: Instant,
 }
 
@@ -29,8 +29,8 @@ impl Places {
         self.0.insert(conn, Place { link, from, has_asked: false, newest: now });
     }
 
-    /// It asked for something whole, or was answered.
-    pub(super) fn asked(&mut self, now: Instant, conn: ConnId) {
+    /// The client has sent a complete request, or was answered.
+    pub(super) fn active(&mut self, now: Instant, conn: ConnId) {
         if let Some(place) = self.0.get_mut(&conn) {
             place.has_asked = true;
             place.newest = now;
@@ -41,30 +41,31 @@ impl Places {
         self.0.remove(&conn);
     }
 
-    /// Who makes room for a client from this address, of a server with `most` places and none left.
-    pub(super) fn gives(&self, now: Instant, link: Link, from: IpAddr, most: usize) -> Option<ConnId> {
+    /// The client to disconnect for a new one from this address, at a full server of `max` clients; `None` if the
+    /// new one is refused.
+    pub(super) fn to_displace(&self, now: Instant, link: Link, from: IpAddr, max: usize) -> Option<ConnId> {
         let here = || self.0.iter().filter(|(_, place)| place.link == link);
-        // With the newcomer.
+        // Clients of an address, with the new one.
         let share =
             |of: IpAddr| here().filter(|(_, place)| place.from == of).count() + usize::from(of == from);
         let own = share(from);
         let shares = here().map(|(&conn, place)| (conn, place, share(place.from)));
-        // Of the address that has most: first who never asked, then who asked longest ago. Who only
-        // listens is never idle.
+        // Idle clients of the address with most clients: first those that never sent a request, then the one whose
+        // request is oldest. Clients of port 2001 send none, so they are never idle.
         let idle = shares.clone().filter(|(_, place, share)| {
             link != Link::State && now.saturating_since(place.newest) >= IDLE && *share >= own
         });
         let idle = idle.max_by_key(|(conn, place, share)| {
             (*share, !place.has_asked, Reverse(place.newest), Reverse(*conn))
         });
-        // Even those that ask all the time, when one host has more than half of all places.
+        // Even active clients, if one host has more than half of all connections.
         let hog = || {
-            let hogs = shares.filter(|(_, place, share)| place.from != from && *share > most / 2);
+            let hogs = shares.filter(|(_, place, share)| place.from != from && *share > max / 2);
             hogs.min_by_key(|(_, place, _)| place.newest)
         };
         idle.or_else(hog).map(|(conn, ..)| conn)
     }
 }
 
-/// Who has asked for nothing for this long makes room when there is none.
+/// A client without a request for this long is idle.
 const IDLE: Duration = Duration::from_secs(5);

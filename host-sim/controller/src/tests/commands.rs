@@ -1,5 +1,7 @@
 //! Port 2000: replies, states, and the right failure in each wrong state.
 
+use proto_core::wire::state::OperationMode;
+
 use super::*;
 
 const LOOP: &str = "loop { wait_ms(10); }";

@@ -21,10 +21,11 @@ use proto_core::time::Duration;
 use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::ScalarType;
 
-use super::test_controller::NEAR;
+use super::test_controller::CLIENT_ADDRESS;
 use super::*;
 use recipe_config::{
-    Initial, Power, SimBus, SimCanFrame, SimField, SimParts, SimPort, SimProgram, SimRecipe, SimStreamPart,
+    Initial, InitialTarget, Power, SimBus, SimCanFrame, SimField, SimParts, SimPort, SimProgram, SimRecipe,
+    SimStreamPart,
 };
 
 /// The shell may keep it in a task of any runtime.

@@ -1,5 +1,7 @@
 //! Who is let in when a server is full, and who has to go.
 
+use std::net::IpAddr;
+
 use super::*;
 
 fn host(nth: u8) -> IpAddr {
@@ -24,7 +26,7 @@ fn several(cell: &mut TestController, count: usize, from: IpAddr) -> Vec<ConnId>
 #[test]
 fn connections_are_bounded() {
     let mut cell = robot(&SimConfig::default());
-    let conns = several(&mut cell, MAX_COMMAND_CONNECTIONS, NEAR);
+    let conns = several(&mut cell, MAX_COMMAND_CONNECTIONS, CLIENT_ADDRESS);
     assert_eq!(cell.closed, []);
     let refused = cell.command_client();
     assert_eq!(cell.closed, [refused]);
@@ -40,7 +42,7 @@ fn connections_are_bounded() {
 fn who_only_holds_a_connection_makes_room_for_who_has_something_to_ask() {
     let mut cell = robot(&SimConfig::default());
     let good = cell.command_client();
-    let idle = several(&mut cell, MAX_COMMAND_CONNECTIONS - 1, NEAR);
+    let idle = several(&mut cell, MAX_COMMAND_CONNECTIONS - 1, CLIENT_ADDRESS);
     cell.run_ms(1_000);
     assert_eq!(cell.ask(good, "state"), "6:0:5:2");
     // A byte now and then is nothing whole.
@@ -61,7 +63,7 @@ fn who_only_holds_a_connection_makes_room_for_who_has_something_to_ask() {
 fn clients_that_asked_once_make_room_for_the_next_ones_stop() {
     let config = with_program(SimConfig::default(), "t", "loop { wait_ms(10); }");
     let mut cell = robot(&config);
-    let mut clients = several(&mut cell, MAX_COMMAND_CONNECTIONS, NEAR);
+    let mut clients = several(&mut cell, MAX_COMMAND_CONNECTIONS, CLIENT_ADDRESS);
     assert_eq!(cell.ask(clients[0], "run(t)"), "run start");
     for &conn in &clients[1..] {
         cell.run_ms(10);
@@ -103,7 +105,7 @@ fn who_waits_for_an_answer_is_not_idle() {
     let waits = cell.command_client();
     assert_eq!(cell.ask(waits, "poweron"), "");
     assert_eq!(cell.ask(waits, "state"), "");
-    let others = several(&mut cell, MAX_COMMAND_CONNECTIONS - 1, NEAR);
+    let others = several(&mut cell, MAX_COMMAND_CONNECTIONS - 1, CLIENT_ADDRESS);
     for _ in 0..7 {
         cell.run_ms(1_000);
         for &conn in &others {

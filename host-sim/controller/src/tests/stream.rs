@@ -1,6 +1,6 @@
 //! Port 2001.
 
-use proto_core::wire::state::StateView;
+use proto_core::wire::state::{LEN, StateView};
 
 use super::*;
 
@@ -103,7 +103,7 @@ fn every_field_is_filled() {
         (packet.operation_mode, packet.robot_state, packet.program_state, packet.safety_state),
         (2, 6, 2, 5)
     );
-    let mut bytes = [0xA5; state::LEN];
+    let mut bytes = [0xA5; LEN];
     packet.encode(&mut bytes).unwrap();
     assert_eq!(StateView::new(&bytes).unwrap().check_alignment(), Ok(()));
 }

@@ -216,7 +216,7 @@ fn a_connection_that_goes_takes_what_waited_with_it_and_nothing_else() {
     cell.controller.restart(cell.now);
     cell.drain();
     assert_eq!(cell.closed, [b]);
-    cell.input(ControllerInput::CommandOpened { conn: b, from: NEAR });
+    cell.input(ControllerInput::CommandOpened { conn: b, from: CLIENT_ADDRESS });
     cell.run_ms(10_000);
     assert_eq!(got(&mut cell, b), "");
     assert_eq!(cell.ask(b, "state"), "4:0:4:2");

@@ -1,24 +1,24 @@
-//! CCCR: what INIT and CCE protect, and what has to be right before it goes onto the bus.
+//! CCCR: INIT, CCE, and the checks before the controller joins the bus.
 
 use super::Fdcan;
 use super::registers::*;
 use crate::device::*;
 
 impl Fdcan {
-    pub(super) fn forget(&mut self) {
+    pub(super) fn cancel_all(&mut self) {
         if self.sending.take().is_some() {
-            self.bus.broken_off += 1;
+            self.bus.aborted += 1;
         }
         self.waiting.clear();
         self.put = 0;
         self.fifos = [(0, 0, 0); 2];
     }
 
-    pub(super) fn write_control(&mut self, value: u32, at: &Moment<'_>) -> Result<(), Refusal> {
+    pub(super) fn write_control(&mut self, value: u32, at: &Context<'_>) -> Result<(), Refusal> {
         let before = self.bank.get(CCCR);
-        let arrived = self.init_arrives.is_none();
+        let arrived = self.init_change.is_none();
         if (value ^ before) & INIT != 0 && !arrived {
-            return refuse("INIT is changed before the value before has arrived (read it back)");
+            return refuse("INIT is changed before an earlier change has taken effect (read it back)");
         }
         if value & CCE != 0 && (before & INIT == 0 || !arrived) {
             return refuse("CCE is set while INIT is not");
@@ -35,22 +35,22 @@ impl Fdcan {
         }
         let cycles = 4 * cycle(at.clocks.fdcan);
         if value & INIT != 0 && before & INIT == 0 {
-            self.init_arrives = Some((true, at.now + cycles));
+            self.init_change = Some((true, at.now + cycles));
         } else if value & INIT == 0 && before & INIT != 0 {
             self.check_set_up(at)?;
-            self.init_arrives = Some((false, at.now + cycles));
+            self.init_change = Some((false, at.now + cycles));
         }
-        // CCE falls with INIT; INIT itself reads as before until it has arrived.
+        // CCE is cleared with INIT. INIT reads as before until the change has taken effect.
         let value = if value & INIT == 0 { value & !CCE } else { value };
         if value & CCE != 0 && before & CCE == 0 {
-            self.forget();
+            self.cancel_all();
         }
         self.bank.set(CCCR, value & !INIT | before & INIT);
         Ok(())
     }
 
-    /// What has to be right before it goes onto the bus.
-    fn check_set_up(&self, at: &Moment<'_>) -> Result<(), Refusal> {
+    /// Checks the configuration when INIT is cleared.
+    fn check_set_up(&self, at: &Context<'_>) -> Result<(), Refusal> {
         if self.bank.get(CCFG) & BYPASS == 0 {
             return refuse("the clock calibration unit is neither bypassed nor set up (CCU_CCFG.BCC)");
         }

@@ -1,8 +1,8 @@
-//! Acceptance filtering of FDCAN1. RM0433, "Acceptance filtering" and the elements of the filter lists.
+//! Acceptance filtering of FDCAN1. RM0433, "Acceptance filtering" and the sections on filter elements.
 
 use crate::models::can_bus::Frame;
 
-/// The registers that say where the lists are, and what becomes of frames that are in none.
+/// The values of the filter registers.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Filters {
     /// GFC.
@@ -16,7 +16,7 @@ pub(super) struct Filters {
 }
 
 impl Filters {
-    /// Which FIFO takes a frame, and the index of the filter that says so; `None` for one in no list.
+    /// The FIFO for a frame, and the index of the matching filter, if one matches; `None` for a rejected frame.
     pub(super) fn accept(&self, frame: &Frame, ram: &[u32]) -> Option<(usize, Option<u32>)> {
         let filters = self.others;
         let fifo = |code: u32| match code {

@@ -1,4 +1,4 @@
-//! The message RAM: transmit buffers, and the FIFOs of what was received.
+//! The message RAM: transmit buffers and receive FIFOs.
 
 use super::Fdcan;
 use super::filters::Filters;
@@ -7,18 +7,18 @@ use crate::device::*;
 use crate::models::can_bus::Frame;
 
 impl Fdcan {
-    /// A word of the message RAM.
+    /// Reads a word of the message RAM.
     ///
     /// # Errors
-    /// It ends before.
+    /// `word` is out of range.
     pub fn ram_read(&self, word: usize) -> Result<u32, Refusal> {
         self.ram.get(word).copied().ok_or_else(|| Refusal("behind the message RAM's end".into()))
     }
 
-    /// Writes it.
+    /// Writes a word of the message RAM.
     ///
     /// # Errors
-    /// It ends before, or a frame there waits to be sent.
+    /// `word` is out of range, or belongs to a transmit buffer with a pending request.
     pub fn ram_write(&mut self, word: usize, value: u32) -> Result<(), Refusal> {
         let buffers = self.bank.get(TXBC);
         let first = (buffers & 0xFFFC) as usize / 4;
@@ -74,7 +74,7 @@ impl Fdcan {
             mask: self.bank.get(XIDAM),
         };
         let Some((fifo, filter)) = filters.accept(frame, &self.ram) else { return };
-        self.bus.passed += 1;
+        self.bus.accepted += 1;
         let config = self.bank.get(RXFC[fifo]);
         let size = config >> 16 & 0x7F;
         let (get, put, fill) = self.fifos[fifo];
@@ -86,13 +86,13 @@ impl Fdcan {
         for (place, word) in self.ram[begin..begin + ELEMENT].iter_mut().zip(frame.words()) {
             *place = word;
         }
-        // FIDX, or ANMF ("FDCAN Rx buffer and FIFO element").
+        // FIDX, or ANMF if no filter matched (RM0433, "FDCAN Rx buffer and FIFO element").
         self.ram[begin + 1] |= filter.map_or(1 << 31, |index| index << 24);
         self.fifos[fifo] = (get, (put + 1) % size, fill + 1);
         self.raise(1 << (4 * fifo) | u32::from(fill + 1 == size) << (2 + 4 * fifo));
     }
 
-    pub(super) fn take(&mut self, fifo: usize, index: u32) -> Result<(), Refusal> {
+    pub(super) fn acknowledge(&mut self, fifo: usize, index: u32) -> Result<(), Refusal> {
         let (get, put, fill) = self.fifos[fifo];
         if fill == 0 || index != get {
             return refuse(format!("not the FIFO's get index, which is {get}; {fill} are there"));

@@ -1,11 +1,11 @@
-//! The clock tree: what runs how fast, and what PLL1 needs before it is switched on.
+//! The clock tree: its frequencies, and the limits of PLL1.
 
 use super::Rcc;
 use super::registers::*;
 use crate::device::*;
 
 impl Rcc {
-    /// What runs how fast ("Core and bus clock generation").
+    /// The present frequencies (RM0433, "Core and bus clock generation").
     pub fn clocks(&self) -> Clocks {
         let (p, q) = self.pll();
         let system = match self.bank.get(CFGR) >> 3 & 7 {
@@ -50,7 +50,7 @@ impl Rcc {
         }
     }
 
-    /// What the datasheet asks of PLL1 ("PLL characteristics") before it is switched on.
+    /// Checks the settings of PLL1 when it is enabled (datasheet DS12110, "PLL characteristics").
     pub(super) fn check_pll(&self, now: Picos) -> Result<(), Refusal> {
         let (source, flag) = match self.bank.get(PLLCKSELR) & 3 {
             0 => ("HSI", 2),
@@ -79,7 +79,7 @@ impl Rcc {
         Ok(())
     }
 
-    /// HSI, by its divider.
+    /// HSI after its divider.
     fn internal(&self) -> u32 {
         64_000_000 >> (self.bank.get(CR) >> 3 & 3)
     }

@@ -1,4 +1,4 @@
-//! The registers of a USART and their bits. RM0433, "USART registers".
+//! Registers and bits of a USART. RM0433, "USART registers".
 
 use crate::device::*;
 
@@ -13,16 +13,16 @@ pub(super) const TDR: u32 = 0x28;
 pub(super) const PRESC: u32 = 0x2C;
 
 pub(super) static REGISTERS: [Register; 10] = [
-    keeps(CR1, "CR1", 0, !0),
-    keeps(CR2, "CR2", 0, 0xFFFF_FF79),
-    keeps(CR3, "CR3", 0, !0x0001_0000),
-    keeps(BRR, "BRR", 0, 0xFFFF),
-    does(0x18, "RQR", 0x1F),
-    reads(ISR, "ISR", 0),
-    does(ICR, "ICR", 0x0012_3BFF),
-    reads(RDR, "RDR", 0),
-    does(TDR, "TDR", 0x1FF),
-    keeps(PRESC, "PRESC", 0, 0xF),
+    read_write(CR1, "CR1", 0, !0),
+    read_write(CR2, "CR2", 0, 0xFFFF_FF79),
+    read_write(CR3, "CR3", 0, !0x0001_0000),
+    read_write(BRR, "BRR", 0, 0xFFFF),
+    command(0x18, "RQR", 0x1F),
+    read_only(ISR, "ISR", 0),
+    command(ICR, "ICR", 0x0012_3BFF),
+    read_only(RDR, "RDR", 0),
+    command(TDR, "TDR", 0x1FF),
+    read_write(PRESC, "PRESC", 0, 0xF),
 ];
 
 pub(super) const PE: u32 = 1;

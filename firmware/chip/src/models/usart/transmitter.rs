@@ -1,4 +1,4 @@
-//! What is sent: characters one behind the other, and driver-enable around them.
+//! Transmission: characters, and driver-enable around them.
 
 use super::Usart;
 use super::registers::*;
@@ -6,9 +6,9 @@ use crate::device::*;
 use crate::models::line::Sent;
 
 impl Usart {
-    /// The pin of driver-enable, as the transceiver sees it: pulled down while nobody drives it. One that is
-    /// not set up for driver-enable is the request to send, which is high at rest.
-    pub(super) fn show_driver(&mut self, is_active: bool, at: &Moment<'_>) {
+    /// Driver-enable at the transceiver. Its pin has a pull-down while it is not driven; without DEM it is RTS,
+    /// which is high when inactive.
+    pub(super) fn show_driver(&mut self, is_active: bool, at: &Context<'_>) {
         let is_connected = self.pins.de.is(at.functions, self.pins.function);
         let is_set_up = self.has(CR1, UE) && self.has(CR3, DEM);
         let level = is_connected && (!is_set_up || is_active != self.has(CR3, DEP));
@@ -20,13 +20,13 @@ impl Usart {
     }
 
     pub(super) fn begin(&mut self, byte: u8, from: Picos, clocks: Clocks) {
-        // The parity bit takes the place of the word's last bit.
+        // The parity bit replaces the last data bit.
         let bits = self.data_bits() - u32::from(self.has(CR1, PCE));
         let byte = byte & (0xFF >> 8_u32.saturating_sub(bits));
         self.sending = Some((byte, from, from + self.character(clocks)));
     }
 
-    pub(super) fn transmit(&mut self, at: &Moment<'_>) -> Result<(), Refusal> {
+    pub(super) fn transmit(&mut self, at: &Context<'_>) -> Result<(), Refusal> {
         let bit = self.bit(at.clocks);
         while let Some((byte, start, end)) = self.sending {
             if at.now < end {
@@ -53,7 +53,7 @@ impl Usart {
             && at.now >= until
         {
             self.releases = None;
-            let then = Moment { now: until, ..*at };
+            let then = Context { now: until, ..*at };
             self.show_driver(false, &then);
         }
         Ok(())

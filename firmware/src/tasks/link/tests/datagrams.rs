@@ -1,4 +1,4 @@
-//! Where the datagrams of a listening port go, and how old they are.
+//! Destination and age of the datagrams of a listening port.
 
 use embassy_net::udp::{PacketMetadata, UdpSocket};
 use embassy_time::{Instant, Timer};
@@ -14,7 +14,7 @@ macro_rules! socket {
     };
 }
 
-/// The next frame of the gateway: which outputs it switches.
+/// The outputs that the next frame of the gateway switches.
 async fn next(socket: &UdpSocket<'_>) -> u8 {
     let mut frame = [0; 256];
     let (len, _) = socket.recv_from(&mut frame).await.unwrap();
@@ -28,7 +28,7 @@ fn frames_go_to_whoever_sent_a_frame_last_and_to_nobody_for_less() {
         let at = gateway_port();
         socket!(client, net, 1);
         socket!(other, net, 2);
-        // Whatever it is, the first one opens the link.
+        // The first datagram opens the link, whatever it contains.
         client.send_to(&[0; 3], at).await.unwrap();
         net.seen(1, 0).await;
         net.hear(&switching(1));
@@ -67,7 +67,7 @@ fn what_waits_for_a_host_that_is_not_found_is_not_sent_when_it_is_old() {
         net.seen(1, 0).await;
         net.hear(&switching(1));
         assert_eq!(next(&client).await, 1);
-        // Long enough that its hardware address is forgotten.
+        // Long enough for its ARP entry to expire.
         net.wire.silence(CONTROLLER, CONTROLLER);
         net.wire.step.set(Duration::from_millis(2));
         let end = Instant::now() + Duration::from_secs(70);

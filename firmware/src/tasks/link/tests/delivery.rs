@@ -1,4 +1,4 @@
-//! What is handed over to TCP and does not arrive in time never arrives.
+//! Data that TCP does not deliver in time is never delivered.
 
 use embassy_futures::select::Either;
 use embassy_net::tcp::TcpSocket;
@@ -20,7 +20,7 @@ async fn connected<'a>(net: &Net<'a>, rx: &'a mut [u8], tx: &'a mut [u8]) -> Tcp
     own
 }
 
-/// The next frame of the gateway: which outputs it switches.
+/// The outputs that the next frame of the gateway switches.
 async fn next(own: &mut TcpSocket<'_>) -> u8 {
     let mut frame = [0; LEN];
     let mut len = 0;
@@ -64,7 +64,7 @@ fn what_was_acknowledged_is_told_in_time_and_before_the_answer() {
                 let begin = Instant::now();
                 until(|| net.control().unacknowledged() == 0).await;
                 let delay = Instant::now() - begin;
-                // The peer's delayed acknowledgement, and a look.
+                // The peer's delayed acknowledgement, and the interval of checking.
                 assert!(delay <= Duration::from_millis(21), "{delay}");
             }
         };
@@ -89,7 +89,7 @@ fn a_peer_that_acknowledges_late_slows_nothing() {
                 assert!(time <= Duration::from_millis(1), "{time}");
                 Timer::at(begin + Duration::from_millis(4)).await;
             }
-            // One acknowledges all.
+            // One acknowledgement covers all.
             net.wire.mute.set(0);
             net.hear(&switching(31));
             assert_eq!(next(&mut own).await, 31);
@@ -122,7 +122,7 @@ fn what_is_not_acknowledged_in_time_ends_in_a_reset_and_is_never_delivered() {
             let (reset, before) = sent.split_last().unwrap();
             assert_eq!((reset.flags & RST, reset.payload.len()), (RST, 0));
             assert!(before.iter().any(|segment| segment.payload == switching(2)));
-            // It hears and speaks again, and is not told of it any more.
+            // It is connected again, and does not receive it any more.
             if mute == CONTROLLER {
                 assert_eq!(next(&mut own).await, 2);
             }
@@ -131,7 +131,7 @@ fn what_is_not_acknowledged_in_time_ends_in_a_reset_and_is_never_delivered() {
             Timer::after(Duration::from_secs(20)).await;
             assert!(wire.segments().iter().all(|segment| segment.payload.is_empty()));
             assert_eq!(own.recv_queue(), 0);
-            // Who has not heard of the reset hears of it when it speaks.
+            // A peer that missed the reset gets one when it sends.
             let _ = own.write(&[0]).await;
             assert!(own.read(&mut [0; 8]).await.is_err());
         });
@@ -208,7 +208,7 @@ fn what_must_not_be_delivered_any_more_ends_a_polite_close() {
     });
 }
 
-/// A field port whose first byte picks commands.
+/// A field port whose first byte selects commands.
 fn commanding() -> GatewayConfig {
     let mut config = controller_only();
     config.commands.push(CommandEntry { value: 1, text: "stop".try_into().unwrap() }).unwrap();
@@ -280,7 +280,7 @@ fn a_link_that_is_given_up_while_it_opens_begins_anew() {
         |kind| kind == LinkKind::Urgent,
         async |net| {
             let wire = net.wire;
-            // Refused, so the hosts know each other.
+            // Refused, but ARP is done.
             until(|| wire.has(SYN)).await;
             until(|| net.control().is_turn(2)).await;
             wire.deaf.set(CONTROLLER);

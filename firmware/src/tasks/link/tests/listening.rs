@@ -1,4 +1,4 @@
-//! Who may come to a listening port.
+//! Who may connect to a listening port.
 
 use embassy_futures::select::Either;
 use embassy_net::tcp::TcpSocket;
@@ -7,7 +7,7 @@ use embassy_time::Timer;
 
 use super::*;
 
-/// Longer than a connection may leave probes without an answer.
+/// Longer than keep-alives may be unanswered.
 const LONG: Duration = Duration::from_secs(40);
 
 #[test]
@@ -19,7 +19,7 @@ fn a_tcp_listener_takes_the_controller_only() {
         let [rx, tx, other_rx, other_tx] = &mut buffers;
         let mut other = TcpSocket::new(stranger, other_rx, other_tx);
         for round in 1..=3 {
-            // The listener may be busy with turning the one before away.
+            // The listener may still be refusing the one before.
             while other.connect(at).await.is_err() {
                 other.abort();
             }
@@ -32,10 +32,10 @@ fn a_tcp_listener_takes_the_controller_only() {
             own.abort();
         }
         net.seen(1, 3).await;
-        // A controller that has nothing to say is no less there.
+        // A silent controller stays connected.
         Timer::after(LONG).await;
         net.seen(1, 3).await;
-        // There is one socket, and it is taken.
+        // The only socket is in use.
         assert!(other.connect(at).await.is_err());
         own.abort();
         let _ = own.flush().await;
@@ -54,7 +54,7 @@ fn a_connection_that_never_comes_about_does_not_keep_the_listener() {
         net.seen(0, 1).await;
         other.abort();
         other.flush().await.unwrap();
-        // Now the hosts know each other. It asks for a connection and is gone before it is answered.
+        // ARP is done now. It sends a SYN and disappears before the answer.
         wire.deaf.set(STRANGER);
         let before = wire.spoken.get();
         let asked = poll_fn(|_| if wire.spoken.get() == before { Poll::Pending } else { Poll::Ready(()) });
@@ -81,7 +81,7 @@ fn a_controller_that_was_switched_off_finds_the_listener_free_again() {
         let mut own = TcpSocket::new(controller, rx, tx);
         own.connect(at).await.unwrap();
         net.seen(1, 0).await;
-        // Nobody hears that it goes.
+        // It disappears without a notice.
         wire.mute.set(CONTROLLER);
         own.abort();
         own.flush().await.unwrap();

@@ -1,4 +1,4 @@
-//! What arrived before a deadline is heard before it passes, in whatever order the tasks run.
+//! Data that arrived before a deadline is handled before it, in whatever order the tasks run.
 
 use embassy_net::tcp::TcpSocket;
 use embassy_sync::blocking_mutex::raw::NoopRawMutex;
@@ -10,14 +10,14 @@ use crate::tasks::test_executor::{Executor, Order};
 /// How long a controller's client may be silent (proto-core/docs/engine.md section 9).
 const SILENCE: Duration = Duration::from_secs(2);
 
-/// The gateway's processor and the controller's.
+/// The processors of the gateway and the controller.
 struct Pair<'a> {
     gateway: Executor<'a>,
     controller: Executor<'a>,
 }
 
 impl Pair<'_> {
-    /// Time passes, and both do what they have to.
+    /// Advances time and runs both.
     fn run(&mut self, time: Duration) {
         for _ in 0..time.as_millis() {
             advance(Duration::from_millis(1));
@@ -74,8 +74,8 @@ fn bytes_that_wait_in_the_ethernet_controller_are_heard_before_silence_is_too_lo
         assert_eq!(net.link().2.received, 1);
         pair.run(SILENCE - Duration::from_millis(20));
         for round in 2..10 {
-            // It has spoken in time. Something keeps the gateway's processor meanwhile, or the time was
-            // looked at a moment before the interrupt.
+            // It sent in time, but the gateway's processor was busy, or read the time just before the
+            // interrupt.
             speak.signal(());
             if round % 2 == 0 {
                 pair.controller.settle();

@@ -1,16 +1,17 @@
-//! The far end: what reaches the controller, and its effect.
+//! What the controller receives, and its effect on the controller's inputs.
 
 use proto_core::engine::LinkId;
 use proto_core::sysvar::SysVar;
 use proto_core::time::{Duration, Instant};
 
 use super::field::LineWatch;
-use super::sheet::{Frame, Raw, written};
+use super::spec::{Frame, Raw, written};
 use super::wire::Asked;
 use super::{Invariant, Oracle};
 
 impl Oracle {
-    /// Bytes of a connection have reached the controller, whose inputs were `before` and are `after`.
+    /// The controller has received bytes on a connection, which changed its inputs from `before` to
+    /// `after`.
     pub(crate) fn arrived(
         &mut self,
         conn: u64,
@@ -22,7 +23,7 @@ impl Oracle {
     ) {
         let result = self.controller.arrived(conn, bytes);
         self.judge(now, &[Invariant::Transport], result);
-        self.came(conn, bytes.len(), slowest, now);
+        self.delivered(conn, bytes.len(), slowest, now);
         self.robot.applied(before, after, now);
         let mut expected = before.to_vec();
         match link {
@@ -35,7 +36,7 @@ impl Oracle {
             }
             LinkId::COMMAND | LinkId::URGENT | LinkId::STATE => {}
             _ => {
-                let Some(frame) = self.sheet.link(link).and_then(|link| link.input.clone()) else { return };
+                let Some(frame) = self.spec.link(link).and_then(|link| link.input.clone()) else { return };
                 let mut held = std::mem::take(self.controller.held(conn));
                 held.extend_from_slice(bytes);
                 let mut line = LineWatch { held, ..LineWatch::default() };
@@ -60,10 +61,10 @@ impl Oracle {
     ) {
         let result = self.controller.arrived_datagram(u64::from(link.0), bytes);
         self.judge(now, &[Invariant::Transport], result);
-        self.datagram_came(tag, slowest, now);
+        self.datagram_delivered(tag, slowest, now);
         self.robot.applied(before, after, now);
         let mut expected = before.to_vec();
-        if let Some(frame) = self.sheet.link(link).and_then(|link| link.input.as_ref())
+        if let Some(frame) = self.spec.link(link).and_then(|link| link.input.as_ref())
             && let Some(payload) = frame.payload_of(bytes)
         {
             put_all(&mut expected, &values_of(frame, payload));
@@ -71,7 +72,7 @@ impl Oracle {
         self.registers(before, &expected, after, now);
     }
 
-    /// As a whole or, if the controller refuses it, not at all.
+    /// A write is applied as a whole or, if the controller refuses it, not at all.
     fn registers(&mut self, before: &[u8], expected: &[u8], after: &[u8], now: Instant) {
         let result = if after == expected || after == before {
             Ok(())

@@ -1,34 +1,33 @@
-//! Cells under everything that can go wrong, by chance: no value that nobody sent, nothing old
-//! after something new, and afterwards everything works again. A failing seed is printed and runs
-//! the same again.
+//! Cells under random faults: only values that were sent, none of them older than one before, and
+//! afterwards everything works again. A failing seed is printed; it repeats the run.
 
 use proto_core::engine::{LinkId, LinkKind};
 use proto_core::link::LinkState;
 use proto_core::time::Duration;
-use recipe_cell::{Cell, LineId, Talker, Trouble, TroubleKind};
+use recipe_cell::{Cell, FaultInjector, FaultKind, LineId, Talker};
 use recipe_config::file::{self, Text};
 
 use crate::kit::*;
 
-/// A few seeds, or as many as `CELL_SEEDS` says.
+/// The first `few` seeds, or as many as `CELL_SEEDS` says.
 fn seeds(few: u64) -> std::ops::Range<u64> {
     let wanted = std::env::var("CELL_SEEDS").ok().and_then(|count| count.parse().ok());
     0..wanted.unwrap_or(few)
 }
 
-/// Everything but what makes wrong values that no check of the format can see, and but restarts that
+/// All faults but those that make wrong values which no check of the format can detect, and restarts that
 /// are not counted as such.
-fn honest() -> Vec<TroubleKind> {
-    let lies = [TroubleKind::Noise, TroubleKind::Garbage, TroubleKind::Dialect];
-    TroubleKind::ALL.into_iter().filter(|kind| !lies.contains(kind)).collect()
+fn honest() -> Vec<FaultKind> {
+    let lies = [FaultKind::Noise, FaultKind::Garbage, FaultKind::Dialect];
+    FaultKind::ALL.into_iter().filter(|kind| !lies.contains(kind)).collect()
 }
 
-/// All links are up, each with one connection at the controller, and no other connection is there.
+/// Checks that all links are up, each with one connection at the controller, and that it has no others.
 #[track_caller]
 fn assert_whole(cell: &Cell, seed: u64) {
     let counters = cell.controller().counters();
     let open = [counters.command.open, counters.state.open, counters.modbus.open];
-    // One that a controller has refused, which takes one client only, is not asked for again.
+    // A link that a controller with a single client has refused is not opened again.
     let is_shared = |id: LinkId| cell.link(id).state == LinkState::Shared;
     let needed = [&[LinkId::COMMAND, LinkId::URGENT][..], &[LinkId::STATE], &[LinkId::MODBUS]]
         .map(|ids| cell.link_ids().filter(|link| ids.contains(link) && !is_shared(*link)).count());
@@ -40,6 +39,19 @@ fn assert_whole(cell: &Cell, seed: u64) {
         assert!(up || may_wait, "seed {seed}: {link:?}");
     }
 }
+
+/// A minute of all faults, and time to recover from them.
+#[track_caller]
+fn survive(cell: &mut Cell, seed: u64) {
+    let mut injector = FaultInjector::new(cell, &FaultKind::ALL, Duration::from_millis(500));
+    injector.run(cell, Duration::from_secs(60));
+    injector.end_all(cell);
+    cell.run(RECOVERY);
+    assert_whole(cell, seed);
+}
+
+/// Enough for backoff and TCP's timeouts.
+const RECOVERY: Duration = Duration::from_secs(40);
 
 const COUNTING: &str = r#"
 [controller]
@@ -66,7 +78,7 @@ cycle_ms = 20
 timeout_ms = 100
 "#;
 
-/// A device that counts: each frame's word is one more than the one before.
+/// A cell with a device that counts: each frame's word is one more than the previous one.
 fn counting(seed: u64) -> (Cell, LineId) {
     let gateway = file::parse_gateway(Text { name: "count.toml", toml: COUNTING }, &[]);
     let gateway = gateway.unwrap_or_else(|error| panic!("{error}"));
@@ -89,16 +101,16 @@ fn values_are_never_made_up_and_never_go_back() {
             network.jitter = Duration::from_millis(2);
             network.longest_segment = Some(30);
         });
-        let mut trouble = Trouble::new(&mut cell, &honest(), Duration::from_millis(400));
+        let mut injector = FaultInjector::new(&mut cell, &honest(), Duration::from_millis(400));
         let (mut newest, mut restarts, mut cleared) = (0, 0, 0);
         for _ in 0..20_000 {
-            trouble.run(&mut cell, Duration::from_millis(2));
+            injector.run(&mut cell, Duration::from_millis(2));
             let value = cell.value("WordInputReg[1]") as u64;
             assert!(value < cell.line(line).counters.device_sent.max(1), "seed {seed}: {value} was not sent");
-            let times = |kind| trouble.counts().get(&kind).copied().unwrap_or(0);
-            let now = times(TroubleKind::ControllerRestart);
-            // A controller without power begins anew when it has power again.
-            let has_power_again = value < newest && value == 0 && cleared < times(TroubleKind::PowerCut);
+            let times = |kind| injector.counts().get(&kind).copied().unwrap_or(0);
+            let now = times(FaultKind::ControllerRestart);
+            // After a power cut the controller starts at 0.
+            let has_power_again = value < newest && value == 0 && cleared < times(FaultKind::PowerCut);
             cleared += u64::from(has_power_again);
             if now != restarts || has_power_again {
                 (newest, restarts) = (0, now);
@@ -106,9 +118,8 @@ fn values_are_never_made_up_and_never_go_back() {
             assert!(value >= newest, "seed {seed}: {value} after {newest} at {:?}", cell.now());
             newest = value;
         }
-        trouble.mend(&mut cell);
-        // Backoff and TCP's own patience.
-        cell.run(Duration::from_secs(40));
+        injector.end_all(&mut cell);
+        cell.run(RECOVERY);
         assert_whole(&cell, seed);
         let before = cell.value("WordInputReg[1]");
         cell.run(Duration::from_secs(1));
@@ -131,17 +142,13 @@ fn every_example_survives_everything_and_works_again() {
                 "request-response" => vec![0xFF, 0xFF, 2, 1, 0, 0xEE, 0xEE],
                 _ => outputs(3).to_vec(),
             };
-            // More often than the force sensor's timeout of 20 ms, whatever is broken in between.
+            // Often enough for the force sensor's timeout of 20 ms, even if single frames are damaged.
             let device = Talker::new(cell.now(), 150, u64::MAX, move |_| match rng.below(20) {
                 0 => rng.bytes(9),
                 _ => frame.clone(),
             });
             cell.attach(line, device);
-            let mut trouble = Trouble::new(&mut cell, &TroubleKind::ALL, Duration::from_millis(500));
-            trouble.run(&mut cell, Duration::from_secs(60));
-            trouble.mend(&mut cell);
-            cell.run(Duration::from_secs(40));
-            assert_whole(&cell, seed);
+            survive(&mut cell, seed);
             let value = match name {
                 "rs485-user" => cell.value("WordInputReg[3]") == 3.0,
                 "force-sensor" => force(&cell) == [1.0; 6],
@@ -175,11 +182,7 @@ fn can_cells_survive_everything_and_work_again() {
                 _ => frame,
             });
             cell.attach_can(bus, device);
-            let mut trouble = Trouble::new(&mut cell, &TroubleKind::ALL, Duration::from_millis(500));
-            trouble.run(&mut cell, Duration::from_secs(60));
-            trouble.mend(&mut cell);
-            cell.run(Duration::from_secs(40));
-            assert_whole(&cell, seed);
+            survive(&mut cell, seed);
             let value = match name {
                 "can-user" => cell.value("WordInputReg[3]") == 3.0,
                 "can-hand" => cell.value("WordInputReg[1]") == 4.0,
@@ -197,9 +200,9 @@ fn can_cells_survive_everything_and_work_again() {
 fn the_same_seed_breaks_the_same_things_at_the_same_time() {
     let run = |seed| {
         let (mut cell, _) = counting(seed);
-        let mut trouble = Trouble::new(&mut cell, &TroubleKind::ALL, Duration::from_millis(200));
-        trouble.run(&mut cell, Duration::from_secs(30));
-        (cell.trace().digest(), cell.trace().count(), trouble.counts().clone())
+        let mut injector = FaultInjector::new(&mut cell, &FaultKind::ALL, Duration::from_millis(200));
+        injector.run(&mut cell, Duration::from_secs(30));
+        (cell.trace().digest(), cell.trace().count(), injector.counts().clone())
     };
     assert_eq!(run(5), run(5));
     assert_ne!(run(5).0, run(6).0);

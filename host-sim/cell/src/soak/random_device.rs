@@ -1,8 +1,7 @@
-//! A field device made up from a port's own recipe: what it sends is right most of the time, and
-//! everything else sometimes.
+//! A simulated field device that sends random frames of a port's recipe, most of them valid.
 //!
-//! In: the gateway's configuration and a seed. Out: frames, at times that no cycle of the gateway
-//! shares. A device has moods that last for seconds: steady, hasty, silent, stuck, careless.
+//! In: the gateway's configuration and a seed. Out: frames at random times. A device changes its behaviour
+//! every few seconds: steady, hasty, silent, stuck, careless.
 
 use proto_core::config::{Bus, FieldSpec, GatewayConfig, InputBinding, Port};
 use proto_core::sysvar::{Direction, SysVar};
@@ -21,20 +20,20 @@ struct Template {
     fields: Vec<Content>,
 }
 
-/// What a field's values are like.
+/// The kind of values of a field.
 #[derive(Debug, Clone)]
 enum Content {
-    /// Bits that come and go one by one.
+    /// Bits, which mostly change one at a time.
     Bits,
-    /// Numbers of this type; `most` keeps them where a bound variable takes most of them.
+    /// Numbers of this type, mostly up to `most`, which most bound variables accept.
     Number { ty: ScalarType, most: f64 },
-    /// Numbers that pick commands, now and then.
-    Orders { ty: ScalarType, values: Vec<i64> },
+    /// Numbers that sometimes pick commands.
+    Commands { ty: ScalarType, values: Vec<i64> },
 }
 
-/// How the device behaves at present.
+/// How the device behaves for some time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Mood {
+enum Behaviour {
     Steady,
     Hasty,
     Silent,
@@ -44,25 +43,25 @@ enum Mood {
 
 /// One device for all frames of a port.
 #[derive(Debug)]
-pub(super) struct Station {
+pub(super) struct RandomDevice {
     rng: Rng,
     templates: Vec<Template>,
-    /// The values of the frame before, a template.
+    /// The newest values, by template.
     values: Vec<Vec<Scalar>>,
-    /// How long the device may take before it is overdue.
+    /// The port's timeout.
     timeout: Duration,
-    /// What a frame takes on the line.
+    /// Time of a frame on the line.
     frame_time: Duration,
-    mood: Mood,
-    mood_ends: Instant,
-    /// Until then orders stay as they are, as long as somebody's finger is on the button.
+    behaviour: Behaviour,
+    behaviour_ends: Instant,
+    /// Values of command fields do not change before this, like a button that is held.
     pressed_until: Instant,
     next: Instant,
     nth: usize,
 }
 
-impl Station {
-    /// A device for the port; `None` for a port without an input part, and for a listening one.
+impl RandomDevice {
+    /// A device for the port; `None` if the port has no input part or is a listening one.
     pub(super) fn new(config: &GatewayConfig, port: &Port, start: Instant, mut rng: Rng) -> Option<Self> {
         let recipe = config.recipes.get(usize::from(port.recipe))?;
         let mut templates = Vec::new();
@@ -98,8 +97,8 @@ impl Station {
             values,
             timeout: port.timeout,
             frame_time,
-            mood: Mood::Steady,
-            mood_ends: start,
+            behaviour: Behaviour::Steady,
+            behaviour_ends: start,
             pressed_until: start,
             next,
             nth: 0,
@@ -110,50 +109,51 @@ impl Station {
         self.next
     }
 
-    fn change_mood(&mut self, now: Instant) {
+    fn change_behaviour(&mut self, now: Instant) {
         let rng = &mut self.rng;
-        (self.mood, self.mood_ends) = match rng.below(20) {
-            0..12 => (Mood::Steady, now + rng.up_to(Duration::from_secs(20))),
-            12..15 => (Mood::Hasty, now + rng.up_to(Duration::from_secs(2))),
-            15 => (Mood::Silent, now + rng.up_to(self.timeout.saturating_mul(4))),
-            16 => (Mood::Silent, now + self.timeout + rng.up_to(Duration::from_secs(10))),
-            17 => (Mood::Stuck, now + rng.up_to(Duration::from_secs(5))),
-            _ => (Mood::Careless, now + rng.up_to(Duration::from_secs(3))),
+        (self.behaviour, self.behaviour_ends) = match rng.below(20) {
+            0..12 => (Behaviour::Steady, now + rng.up_to(Duration::from_secs(20))),
+            12..15 => (Behaviour::Hasty, now + rng.up_to(Duration::from_secs(2))),
+            15 => (Behaviour::Silent, now + rng.up_to(self.timeout.saturating_mul(4))),
+            16 => (Behaviour::Silent, now + self.timeout + rng.up_to(Duration::from_secs(10))),
+            17 => (Behaviour::Stuck, now + rng.up_to(Duration::from_secs(5))),
+            _ => (Behaviour::Careless, now + rng.up_to(Duration::from_secs(3))),
         };
     }
 
-    /// Which template is next, with new values, and when the one after it leaves.
+    /// Advances to the next template, with new values, and sets the next deadline. Returns the template's
+    /// index; `None` if the device is silent.
     fn step(&mut self, now: Instant) -> Option<usize> {
-        if now >= self.mood_ends {
-            self.change_mood(now);
+        if now >= self.behaviour_ends {
+            self.change_behaviour(now);
         }
         let timeout = self.timeout.as_micros();
-        let pause = match self.mood {
-            Mood::Steady => self.rng.between(timeout / 8, timeout * 6 / 10),
-            // As fast as the line can, and now and then faster.
-            Mood::Hasty => self.rng.between(0, self.frame_time.as_micros() * 2),
-            Mood::Silent => {
-                self.next = self.mood_ends.max(now + Duration::from_micros(1));
+        let pause = match self.behaviour {
+            Behaviour::Steady => self.rng.between(timeout / 8, timeout * 6 / 10),
+            // About as fast as the line allows, sometimes faster.
+            Behaviour::Hasty => self.rng.between(0, self.frame_time.as_micros() * 2),
+            Behaviour::Silent => {
+                self.next = self.behaviour_ends.max(now + Duration::from_micros(1));
                 return None;
             }
-            Mood::Stuck => timeout / 3,
-            Mood::Careless => self.rng.between(timeout / 20, timeout * 2),
+            Behaviour::Stuck => timeout / 3,
+            Behaviour::Careless => self.rng.between(timeout / 20, timeout * 2),
         };
-        // What the line cannot carry in time would only pile up at its beginning.
+        // Frames beyond the line's rate would only queue up.
         let floor = self.frame_time.as_micros().max(100);
         self.next = now + Duration::from_micros(pause.max(floor));
         self.nth = (self.nth + 1) % self.templates.len();
-        if self.mood != Mood::Stuck {
+        if self.behaviour != Behaviour::Stuck {
             let template = &self.templates[self.nth];
             let is_pressed = now < self.pressed_until;
             for (value, content) in self.values[self.nth].iter_mut().zip(&template.fields) {
-                let is_order = matches!(content, Content::Orders { .. });
-                if is_order && is_pressed {
+                let is_command = matches!(content, Content::Commands { .. });
+                if is_command && is_pressed {
                     continue;
                 }
                 let before = std::mem::replace(value, changed(&mut self.rng, content, *value));
-                // A button is pressed for a moment, or for seconds.
-                if is_order && before != *value && self.rng.below(2) == 0 {
+                // A button is pressed briefly, or for seconds.
+                if is_command && before != *value && self.rng.below(2) == 0 {
                     self.pressed_until = now + self.rng.up_to(Duration::from_secs(6));
                 }
             }
@@ -170,7 +170,7 @@ impl Station {
     }
 }
 
-impl Device<Vec<u8>> for Station {
+impl Device<Vec<u8>> for RandomDevice {
     fn deadline(&self) -> Instant {
         self.deadline()
     }
@@ -181,7 +181,7 @@ impl Device<Vec<u8>> for Station {
         let mut frame = template.head.clone();
         frame.extend(self.payload(nth));
         frame.extend(&template.tail);
-        if self.mood == Mood::Careless {
+        if self.behaviour == Behaviour::Careless {
             let rng = &mut self.rng;
             let len = frame.len() as u64;
             match rng.below(6) {
@@ -195,7 +195,7 @@ impl Device<Vec<u8>> for Station {
                     let more = rng.between(1, 20) as usize;
                     frame.extend(rng.bytes(more));
                 }
-                // A head, and then the frame.
+                // A head before the frame.
                 4 => drop(frame.splice(..0, template.head.clone())),
                 _ => {
                     let twice = frame.clone();
@@ -207,7 +207,7 @@ impl Device<Vec<u8>> for Station {
     }
 }
 
-impl Device<CanFrame> for Station {
+impl Device<CanFrame> for RandomDevice {
     fn deadline(&self) -> Instant {
         self.deadline()
     }
@@ -217,7 +217,7 @@ impl Device<CanFrame> for Station {
         let mut data = self.payload(nth);
         let mut id = self.templates[nth].id.unwrap_or(CanId::Standard(0));
         let mut is_remote = false;
-        if self.mood == Mood::Careless {
+        if self.behaviour == Behaviour::Careless {
             match self.rng.below(4) {
                 0 => data.truncate(self.rng.below(8) as usize),
                 1 => id = CanId::Standard(self.rng.below(0x800) as u16),
@@ -238,7 +238,7 @@ fn content(config: &GatewayConfig, field: &FieldSpec) -> Content {
     match *field {
         FieldSpec::System(var) => of_var(var),
         FieldSpec::UserInput { ty, to: InputBinding::Commands { table, .. } } => {
-            Content::Orders { ty, values: table.of(&config.commands).iter().map(|e| e.value).collect() }
+            Content::Commands { ty, values: table.of(&config.commands).iter().map(|e| e.value).collect() }
         }
         FieldSpec::UserInput { ty: ScalarType::Byte, .. } => Content::Bits,
         FieldSpec::UserInput { ty, .. } | FieldSpec::UserOutput { ty, .. } => {
@@ -250,7 +250,7 @@ fn content(config: &GatewayConfig, field: &FieldSpec) -> Content {
 fn zero(content: &Content) -> Scalar {
     match content {
         Content::Bits => Scalar::Byte(0),
-        Content::Number { ty, .. } | Content::Orders { ty, .. } => number(*ty, 0.0),
+        Content::Number { ty, .. } | Content::Commands { ty, .. } => number(*ty, 0.0),
     }
 }
 
@@ -283,12 +283,12 @@ fn changed(rng: &mut Rng, content: &Content, before: Scalar) -> Scalar {
             },
             1..40 => before,
             _ => {
-                // Sixteenths, so that decimal and binary agree for whoever reads a trace.
+                // Multiples of 1/16, which are exact in decimal and in binary: traces are easier to read.
                 let steps = (most * 32.0) as u64;
                 number(*ty, rng.below(steps) as f64 / 16.0 - most)
             }
         },
-        Content::Orders { ty, values } => {
+        Content::Commands { ty, values } => {
             let picks = rng.below(25) == 0 && !values.is_empty();
             let value = if picks { values[rng.below(values.len() as u64) as usize] } else { 0 };
             match rng.below(30) {
@@ -299,7 +299,7 @@ fn changed(rng: &mut Rng, content: &Content, before: Scalar) -> Scalar {
     }
 }
 
-/// Little-endian, by hand.
+/// Appends a value in little-endian order, independent of proto-core's encoder.
 fn put(value: Scalar, bytes: &mut Vec<u8>) {
     match value {
         Scalar::Byte(value) => bytes.push(value),

@@ -1,7 +1,7 @@
-//! The configuration's promises, computed once the slow way: owners, ways up and sources
-//! (proto-core/docs/engine.md section 4).
+//! What the configuration specifies: owners, ways up and sources (proto-core/docs/engine.md section 4),
+//! computed once.
 //!
-//! Written from that page, without the engine's own plan.
+//! Written from that page, independent of the engine's plan.
 
 use proto_core::config::{Bus, FieldSpec, GatewayConfig, InputBinding, OutputBinding, Parts, Recipe, SendOn};
 use proto_core::engine::{LinkId, PortId};
@@ -10,7 +10,7 @@ use proto_core::sysvar::{COUNT, Direction, ModbusPlace, SysVar};
 use proto_core::time::Duration;
 use proto_core::wire::can::CanId;
 
-/// A value as on the wire; unused bytes are zero.
+/// A value as on the wire; unused bytes are 0.
 pub(super) type Raw = [u8; 4];
 
 /// A variable's owner and way up.
@@ -18,7 +18,7 @@ pub(super) type Raw = [u8; 4];
 pub(super) struct Owned {
     /// The port's index in the configuration.
     pub port: usize,
-    /// Which of the port's input frames brings it.
+    /// The input frame of the port that carries it.
     pub frame: usize,
     pub way: LinkId,
     pub safe: Option<Raw>,
@@ -40,13 +40,13 @@ pub(super) struct Frame {
     pub tail: Vec<u8>,
     pub id: Option<CanId>,
     pub fields: Vec<FieldSpec>,
-    /// Bytes of the fields.
+    /// Number of bytes of all fields.
     pub payload: usize,
 }
 
 /// A field port.
 #[derive(Debug, Clone)]
-pub(super) struct PortSheet {
+pub(super) struct PortSpec {
     pub is_field: bool,
     pub is_can: bool,
     pub mode: Mode,
@@ -63,51 +63,51 @@ pub(super) struct PortSheet {
 
 /// A recipe link.
 #[derive(Debug, Clone)]
-pub(super) struct LinkSheet {
+pub(super) struct LinkSpec {
     pub id: LinkId,
     pub is_datagram: bool,
     pub input: Option<Frame>,
     pub output: Option<Frame>,
-    /// Variables in its frames up that are read back while no port sends them.
+    /// Variables in its frames up are read back while their owners are overdue.
     pub reads_back: bool,
 }
 
-/// All of it.
+/// The specification of a whole gateway.
 #[derive(Debug, Clone)]
-pub(super) struct Sheet {
-    pub ports: Vec<PortSheet>,
-    pub links: Vec<LinkSheet>,
+pub(super) struct Spec {
+    pub ports: Vec<PortSpec>,
+    pub links: Vec<LinkSpec>,
     pub owned: [Option<Owned>; COUNT],
     pub origin: [Option<Origin>; COUNT],
     pub read_back: [bool; COUNT],
-    /// Variables that the state stream may bring.
+    /// Variables that are taken from the state stream.
     pub in_packet: Vec<SysVar>,
     /// Variables that have a safe value.
     pub safe_vars: Vec<SysVar>,
-    /// There is a state link.
+    /// The gateway has a state link.
     pub has_state: bool,
-    /// The output that shows what an input was set to, when some port or recipe link brings it.
+    /// The output that shows an input's value at the controller; `None` if the gateway does not receive it.
     pub witness: [Option<SysVar>; COUNT],
-    /// Some port sends on a rising bit.
+    /// At least one port sends on a rising bit.
     pub has_triggers: bool,
     /// The texts and values of all command tables.
     pub commands: Vec<(i64, String)>,
 }
 
-impl Sheet {
+impl Spec {
     pub(super) fn new(config: &GatewayConfig) -> Self {
-        let ports: Vec<PortSheet> = config.ports.iter().map(|port| port_sheet(config, port)).collect();
-        let mut links: Vec<LinkSheet> = Vec::new();
+        let ports: Vec<PortSpec> = config.ports.iter().map(|port| port_spec(config, port)).collect();
+        let mut links: Vec<LinkSpec> = Vec::new();
         if let Some(own) = config.controller.recipe_link {
             let recipe = &config.recipes[usize::from(own.recipe)];
-            links.push(link_sheet(config, LinkId::RECIPE_UDP, recipe, true));
+            links.push(link_spec(config, LinkId::RECIPE_UDP, recipe, true));
         }
         for (nth, port) in config.ports.iter().enumerate() {
             let recipe = &config.recipes[usize::from(port.recipe)];
             let id = LinkId::of_port(PortId(nth as u8));
             match port.bus {
-                Bus::TcpListen { .. } => links.push(link_sheet(config, id, recipe, false)),
-                Bus::UdpListen { .. } => links.push(link_sheet(config, id, recipe, true)),
+                Bus::TcpListen { .. } => links.push(link_spec(config, id, recipe, false)),
+                Bus::UdpListen { .. } => links.push(link_spec(config, id, recipe, true)),
                 Bus::Rs485(_) | Bus::Can { .. } => {}
             }
         }
@@ -115,7 +115,7 @@ impl Sheet {
         for (nth, port) in ports.iter().enumerate().filter(|(_, port)| port.is_field) {
             for (frame, part) in port.inputs.iter().enumerate() {
                 for var in part.fields.iter().filter_map(written) {
-                    let carries = |link: &&LinkSheet| link.input.as_ref().is_some_and(|up| up.has(var));
+                    let carries = |link: &&LinkSpec| link.input.as_ref().is_some_and(|up| up.has(var));
                     let way = links.iter().find(carries).map_or(LinkId::MODBUS, |link| link.id);
                     let safe = config.ports[nth].on_timeout.of(&config.safe_values);
                     let safe = safe.iter().find(|safe| safe.var == var).map(|safe| {
@@ -163,7 +163,7 @@ impl Sheet {
         let is_safe = |var: &SysVar| owned[var.ordinal()].is_some_and(|owned: Owned| owned.safe.is_some());
         let safe_vars = SysVar::all().filter(is_safe).collect();
         let has_triggers = ports.iter().any(|port| matches!(port.send, SendOn::Rising { .. }));
-        let brings = |link: &LinkSheet, var| link.output.as_ref().is_some_and(|down| down.shows(var));
+        let brings = |link: &LinkSpec, var| link.output.as_ref().is_some_and(|down| down.shows(var));
         let mut witness = [None; COUNT];
         for nth in 1..=3 {
             let both = [format!("DigitalOutputCommand[{nth}]"), format!("DigitalSignalStatus[{}]", nth + 3)];
@@ -187,11 +187,11 @@ impl Sheet {
         }
     }
 
-    pub(super) fn link(&self, id: LinkId) -> Option<&LinkSheet> {
+    pub(super) fn link(&self, id: LinkId) -> Option<&LinkSpec> {
         self.links.iter().find(|link| link.id == id)
     }
 
-    /// Whether anything shows the variable's value at the controller.
+    /// Whether anything shows the variable's value in the controller.
     pub(super) fn can_be_shown(&self, var: SysVar) -> bool {
         self.has_state && var.stream().is_some() || self.witness[var.ordinal()].is_some()
     }
@@ -210,7 +210,7 @@ impl Frame {
         self.fields.iter().any(|field| shown(field) == Some(var))
     }
 
-    /// The fields' bytes, when head, tail and length agree.
+    /// The fields' bytes; `None` if head, tail or length differ.
     pub(super) fn payload_of<'b>(&self, bytes: &'b [u8]) -> Option<&'b [u8]> {
         let rest = bytes.strip_prefix(self.head.as_slice())?.strip_suffix(self.tail.as_slice())?;
         (rest.len() == self.payload).then_some(rest)
@@ -266,7 +266,7 @@ fn frames(config: &GatewayConfig, recipe: &Recipe, direction: Direction) -> Vec<
     }
 }
 
-fn port_sheet(config: &GatewayConfig, port: &proto_core::config::Port) -> PortSheet {
+fn port_spec(config: &GatewayConfig, port: &proto_core::config::Port) -> PortSpec {
     let recipe = &config.recipes[usize::from(port.recipe)];
     let (idle_gap, turnaround) = match port.bus {
         Bus::Rs485(line) => {
@@ -278,7 +278,7 @@ fn port_sheet(config: &GatewayConfig, port: &proto_core::config::Port) -> PortSh
         }
         _ => (Duration::MAX, Duration::ZERO),
     };
-    PortSheet {
+    PortSpec {
         is_field: port.bus.is_field(),
         is_can: matches!(port.bus, Bus::Can { .. }),
         mode: recipe.mode,
@@ -294,15 +294,15 @@ fn port_sheet(config: &GatewayConfig, port: &proto_core::config::Port) -> PortSh
     }
 }
 
-fn link_sheet(config: &GatewayConfig, id: LinkId, recipe: &Recipe, is_datagram: bool) -> LinkSheet {
+fn link_spec(config: &GatewayConfig, id: LinkId, recipe: &Recipe, is_datagram: bool) -> LinkSpec {
     let part = |direction| frames(config, recipe, direction).into_iter().next();
     let (input, output) = (part(Direction::Input), part(Direction::Output));
-    LinkSheet { id, is_datagram, input, output, reads_back: false }
+    LinkSpec { id, is_datagram, input, output, reads_back: false }
 }
 
-/// Whether one field frame fills the link's frame completely, with safe values for all of it or
+/// Whether one field frame has all variables of the link's frame, with safe values for all of them or for
 /// none.
-fn is_one_frame(ports: &[PortSheet], owned: &[Option<Owned>; COUNT], link: &LinkSheet) -> bool {
+fn is_one_frame(ports: &[PortSpec], owned: &[Option<Owned>; COUNT], link: &LinkSpec) -> bool {
     let Some(up) = &link.input else { return true };
     let vars: Vec<SysVar> = up.fields.iter().filter_map(written).collect();
     ports.iter().enumerate().filter(|(_, port)| port.is_field).any(|(nth, port)| {

@@ -1,4 +1,4 @@
-//! Commands that field values pick: once or not at all, and urgent ones before everything else
+//! Commands that field values pick: each is sent once or not at all, and urgent ones go first
 //! (proto-core/docs/engine.md section 7).
 
 use std::collections::{BTreeMap, VecDeque};
@@ -9,69 +9,68 @@ use proto_core::time::{Duration, Instant};
 
 use super::Invariant;
 use super::field::Accepted;
-use super::sheet::Sheet;
+use super::spec::Spec;
 use super::upward::Wrong;
 
-/// Number of commands that can wait.
+/// Maximum number of waiting commands.
 const QUEUE: usize = 8;
-/// A command that could not be sent within this time is dropped; an urgent one when it has not been
-/// asked for during this time.
+/// A command that waits longer is dropped; an urgent one, if it was not requested for this time.
 const TTL: Duration = Duration::from_secs(1);
 
-/// A command field: its port, frame and place.
+/// A command field: indices of port, frame and field.
 pub(super) type Place = (usize, usize, usize);
 
 /// A command that a value picked.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Order {
+pub(super) struct Command {
     pub place: Place,
     value: i64,
     pub text: String,
     /// When it was picked.
     pub picked: Instant,
-    /// For an urgent one, since when it is not asked for any more, or since when it waits again.
+    /// For an urgent one: since when it is no longer requested, or since when it waits again.
     since: Instant,
 }
 
 /// Commands that wait, commands that are unanswered, and counters.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Orders {
-    queue: VecDeque<Order>,
-    stops: Vec<Order>,
-    unanswered: Vec<(LinkId, Order)>,
+pub(super) struct Commands {
+    queue: VecDeque<Command>,
+    urgent: Vec<Command>,
+    unanswered: Vec<(LinkId, Command)>,
     /// Number of waiting commands that an urgent command has overtaken.
     overtaken: usize,
     /// The value in the previous frame.
     base: BTreeMap<Place, i64>,
-    /// Picked and dropped, by port.
+    /// Number of picked and of dropped commands, by port.
     pub counted: [(u32, u32); MAX_PORTS],
     /// Text of the newest command sent.
     newest: Option<String>,
-    /// Texts of what waited while the gateway slept.
+    /// Texts of the commands that were picked by frames that waited while the gateway slept.
     slept: Vec<String>,
-    /// Answers that the engine has counted, and what came since the newest one, on the two links.
+    /// Number of replies that the engine has counted, and text received since, on each of the two links.
     answered: [u32; 2],
     heard: [String; 2],
 }
 
-impl Order {
+impl Command {
     pub(super) fn is_urgent(&self) -> bool {
         is_urgent(&self.text)
     }
 }
 
-impl Orders {
-    /// Values of an accepted frame pick commands; urgent ones are passed to `urgent`.
+impl Commands {
+    /// Queues the commands that an accepted frame picks; returns the urgent ones.
     pub(super) fn accepted(
         &mut self,
-        sheet: &Sheet,
+        spec: &Spec,
         nth: usize,
         frame: &Accepted,
         is_up: bool,
         now: Instant,
-    ) -> Vec<Order> {
+    ) -> Vec<Command> {
         let mut urgent = Vec::new();
-        for &(field, table, when, value) in &frame.orders {
+        for &(field, table, when, value) in &frame.commands {
             let place = (nth, frame.frame, field);
             let before = self.base.insert(place, value);
             let changed = before.is_some_and(|before| before != value);
@@ -79,7 +78,7 @@ impl Orders {
                 self.no_longer_asked(place, now);
             }
             let acts = when == CommandWhen::Frame || changed;
-            let Some((_, text)) = table.of(&sheet.commands).iter().find(|entry| entry.0 == value) else {
+            let Some((_, text)) = table.of(&spec.commands).iter().find(|entry| entry.0 == value) else {
                 continue;
             };
             if !acts {
@@ -87,21 +86,21 @@ impl Orders {
             }
             let counted = &mut self.counted[nth];
             counted.0 += 1;
-            let order = Order { place, value, text: plain(text.as_bytes()), picked: now, since: now };
-            if order.is_urgent() {
-                urgent.push(order.clone());
-                match self.stops.iter_mut().find(|other| other.same_kind(&order)) {
-                    Some(other) => *other = order,
-                    None => self.stops.push(order),
+            let command = Command { place, value, text: plain(text.as_bytes()), picked: now, since: now };
+            if command.is_urgent() {
+                urgent.push(command.clone());
+                match self.urgent.iter_mut().find(|other| other.same_kind(&command)) {
+                    Some(other) => *other = command,
+                    None => self.urgent.push(command),
                 }
             } else if is_up && self.queue.len() < QUEUE {
-                self.queue.push_back(order);
+                self.queue.push_back(command);
             } else {
                 counted.1 += 1;
             }
         }
         if !urgent.is_empty() {
-            // Whatever the order of the fields.
+            // They overtake everything, also commands of later fields of the frame.
             self.overtaken = self.queue.len();
         }
         urgent
@@ -114,7 +113,7 @@ impl Orders {
         }
     }
 
-    /// After silence the next value only sets the base, and this device's waiting commands are
+    /// A device's frame is overdue: its next value only sets the base, and its waiting commands are
     /// dropped.
     pub(super) fn forget(&mut self, nth: usize, frame: Option<usize>, now: Instant) {
         let is_of = |place: &Place| place.0 == nth && frame.is_none_or(|frame| frame == place.1);
@@ -124,46 +123,50 @@ impl Orders {
             self.no_longer_asked(place, now);
         }
         let (base, counted) = (&self.base, &mut self.counted);
-        self.queue.retain(|order| {
-            let stays = base.contains_key(&order.place);
-            counted[order.place.0].1 += u32::from(!stays);
+        self.queue.retain(|command| {
+            let stays = base.contains_key(&command.place);
+            counted[command.place.0].1 += u32::from(!stays);
             stays
         });
     }
 
     fn no_longer_asked(&mut self, place: Place, now: Instant) {
-        for stop in self.stops.iter_mut().filter(|stop| stop.place == place) {
+        for stop in self.urgent.iter_mut().filter(|stop| stop.place == place) {
             stop.since = now;
         }
     }
 
-    /// Whether the device's newest value is the one that picked the command.
-    pub(super) fn is_asked(&self, order: &Order) -> bool {
-        self.base.get(&order.place) == Some(&order.value)
+    /// Whether the device still sends the value that picked the command.
+    pub(super) fn is_asked(&self, command: &Command) -> bool {
+        self.base.get(&command.place) == Some(&command.value)
     }
 
-    /// Commands that waited too long.
+    /// Drops commands that waited too long.
     pub(super) fn tick(&mut self, now: Instant) {
         while self.queue.front().is_some_and(|first| now >= first.picked + TTL) {
             self.drop_first();
         }
-        let is_old = |orders: &Self, stop: &Order| now >= stop.since + TTL && !orders.is_asked(stop);
-        while let Some(old) = self.stops.iter().position(|stop| is_old(self, stop)) {
-            let old = self.stops.remove(old);
+        let is_old = |commands: &Self, stop: &Command| now >= stop.since + TTL && !commands.is_asked(stop);
+        while let Some(old) = self.urgent.iter().position(|stop| is_old(self, stop)) {
+            let old = self.urgent.remove(old);
             self.counted[old.place.0].1 += 1;
         }
     }
 
-    /// A link is gone: an urgent command waits again while it is asked for.
+    /// A link is lost: unanswered urgent commands wait again if they are still requested.
     pub(super) fn lost(&mut self, link: LinkId, now: Instant) {
-        let gone: Vec<Order> =
-            self.unanswered.iter().filter(|(on, _)| *on == link).map(|(_, order)| order.clone()).collect();
+        let gone: Vec<Command> = self
+            .unanswered
+            .iter()
+            .filter(|(on, _)| *on == link)
+            .map(|(_, command)| command.clone())
+            .collect();
         self.unanswered.retain(|(on, _)| *on != link);
-        // Of two of a kind the newer one is sent again.
-        for order in gone.into_iter().rev() {
-            let waits = self.stops.iter().any(|other| other.same_kind(&order));
-            if order.is_urgent() && self.is_asked(&order) && !waits {
-                self.stops.push(Order { since: now, ..order });
+        // Of two equal ones the newer one is sent again.
+        for command in gone.into_iter().rev() {
+            let waits = self.urgent.iter().any(|other| other.same_kind(&command));
+            if command.is_urgent() && self.is_asked(&command) && !waits {
+                self.urgent.push(Command { since: now, ..command });
             }
         }
         if link == LinkId::COMMAND {
@@ -179,33 +182,33 @@ impl Orders {
         self.base.clear();
         self.lost(LinkId::COMMAND, now);
         self.lost(LinkId::URGENT, now);
-        for stop in std::mem::take(&mut self.stops) {
+        for stop in std::mem::take(&mut self.urgent) {
             self.counted[stop.place.0].1 += 1;
         }
         self.slept.clear();
     }
 
-    /// The commands that a discarded frame would have picked.
-    pub(super) fn waited_in_sleep(&mut self, sheet: &Sheet, frame: &Accepted) {
-        for &(_, table, _, value) in &frame.orders {
-            let picked = table.of(&sheet.commands).iter().find(|entry| entry.0 == value);
+    /// Remembers the commands that a discarded frame would have picked.
+    pub(super) fn waited_in_sleep(&mut self, spec: &Spec, frame: &Accepted) {
+        for &(_, table, _, value) in &frame.commands {
+            let picked = table.of(&spec.commands).iter().find(|entry| entry.0 == value);
             self.slept.extend(picked.map(|(_, text)| plain(text.as_bytes())));
         }
     }
 
     fn drop_first(&mut self) {
-        if let Some(order) = self.queue.pop_front() {
-            self.counted[order.place.0].1 += 1;
+        if let Some(command) = self.queue.pop_front() {
+            self.counted[command.place.0].1 += 1;
         }
     }
 
-    /// The controller sends something on one of the links to port 2000.
+    /// The controller sends on one of the links to port 2000.
     pub(super) fn hears(&mut self, link: LinkId, bytes: &[u8]) {
         self.heard[side(link)].push_str(&String::from_utf8_lossy(bytes));
     }
 
-    /// Replies that the engine has handled.
-    pub(super) fn look_at_replies(&mut self, engine: &Engine) {
+    /// Matches the replies that the engine has counted with unanswered commands.
+    pub(super) fn match_replies(&mut self, engine: &Engine) {
         if self.unanswered.is_empty() {
             self.heard.iter_mut().for_each(String::clear);
             return;
@@ -218,15 +221,15 @@ impl Orders {
             let news = info.counters.received.wrapping_sub(self.answered[place]);
             self.answered[place] = info.counters.received;
             for _ in 0..news {
-                let mine = |(on, _): &&(LinkId, Order)| *on == info.id;
-                let is_named = |order: &Order| self.heard[place].contains(word(&order.text));
+                let mine = |(on, _): &&(LinkId, Command)| *on == info.id;
+                let is_named = |command: &Command| self.heard[place].contains(word(&command.text));
                 let named = self.unanswered.iter().position(|sent| mine(&sent) && is_named(&sent.1));
                 let first = self.unanswered.iter().position(|sent| mine(&sent));
                 let Some(nth) = named.or(first) else { continue };
-                let (_, order) = self.unanswered.remove(nth);
-                // The other one's reply may be in the same piece.
+                let (_, command) = self.unanswered.remove(nth);
+                // The same piece may contain the reply to another command.
                 let heard = &mut self.heard[place];
-                *heard = heard.replacen(word(&order.text), "", 1);
+                *heard = heard.replacen(word(&command.text), "", 1);
             }
             if self.unanswered.iter().all(|(on, _)| *on != info.id) {
                 self.heard[place].clear();
@@ -234,15 +237,15 @@ impl Orders {
         }
     }
 
-    /// The engine sends a command; returns which.
-    pub(super) fn sent(&mut self, link: LinkId, bytes: &[u8], now: Instant) -> Result<Order, Wrong> {
+    /// Checks a command that the engine sends, and returns it.
+    pub(super) fn sent(&mut self, link: LinkId, bytes: &[u8], now: Instant) -> Result<Command, Wrong> {
         let text = plain(bytes);
         let shown = String::from_utf8_lossy(bytes).trim().to_owned();
-        let order = if is_urgent(&text) {
-            let Some(nth) = self.stops.iter().position(|stop| stop.text == text) else {
+        let command = if is_urgent(&text) {
+            let Some(nth) = self.urgent.iter().position(|stop| stop.text == text) else {
                 return Err(self.nobody_picked(&shown, &text));
             };
-            let stop = self.stops.remove(nth);
+            let stop = self.urgent.remove(nth);
             if now >= stop.since + TTL && !self.is_asked(&stop) {
                 return Err((Invariant::Once, format!("{shown} was sent too late")));
             }
@@ -254,7 +257,7 @@ impl Orders {
                     format!("{shown} was sent where only urgent commands may be sent"),
                 ));
             }
-            if !self.stops.is_empty() || self.unanswered.iter().any(|(_, order)| order.is_urgent()) {
+            if !self.urgent.is_empty() || self.unanswered.iter().any(|(_, command)| command.is_urgent()) {
                 let what = format!("{shown} was sent while an urgent command waits or is unanswered");
                 return Err((Invariant::Once, what));
             }
@@ -268,8 +271,8 @@ impl Orders {
             next
         };
         self.newest = Some(text);
-        self.unanswered.push((link, order.clone()));
-        Ok(order)
+        self.unanswered.push((link, command.clone()));
+        Ok(command)
     }
 
     fn nobody_picked(&self, shown: &str, text: &str) -> Wrong {
@@ -285,11 +288,11 @@ impl Orders {
     }
 
     pub(super) fn len(&self) -> usize {
-        self.queue.len() + self.stops.len() + self.heard.iter().map(String::len).sum::<usize>()
+        self.queue.len() + self.urgent.len() + self.heard.iter().map(String::len).sum::<usize>()
     }
 }
 
-impl Order {
+impl Command {
     fn same_kind(&self, other: &Self) -> bool {
         self.place.0 == other.place.0 && self.text == other.text
     }
@@ -299,7 +302,7 @@ fn side(link: LinkId) -> usize {
     usize::from(link == LinkId::URGENT)
 }
 
-/// Its keyword.
+/// The command's keyword.
 fn word(text: &str) -> &str {
     text.split('(').next().unwrap_or(text)
 }
@@ -308,7 +311,7 @@ fn is_urgent(text: &str) -> bool {
     matches!(text, "stop" | "pause" | "disable" | "poweroff")
 }
 
-/// A command without the additions of dialects.
+/// A command's text without what dialects add.
 pub(super) fn plain(text: &[u8]) -> String {
     let text = String::from_utf8_lossy(text);
     text.chars()

@@ -1,0 +1,75 @@
+//! Fault injection for tests, chosen by the third semihosting argument (`arg=stall`). It exists only in the image
+//! of this emulated board.
+
+use core::future::pending;
+use core::hint::{black_box, spin_loop};
+use core::pin::pin;
+
+use embassy_time::{Duration, Timer};
+use firmware::tasks::watchdog::{Pulse, TaskName};
+
+use super::storage;
+use crate::start::Tasks;
+
+#[derive(Debug, Clone, Copy)]
+enum InjectedFault {
+    /// Waits for ever without answering the watchdog's checks.
+    Stall,
+    /// Never yields.
+    Spin,
+    Panic,
+    /// Endless recursion.
+    Overflow,
+    /// Reads an address without memory.
+    Fault,
+}
+
+/// Starts the fault that was asked for.
+pub(super) fn start(tasks: &Tasks) {
+    let asked = storage::argument(2, |name| {
+        Some(match name {
+            "stall" => InjectedFault::Stall,
+            "spin" => InjectedFault::Spin,
+            "panic" => InjectedFault::Panic,
+            "overflow" => InjectedFault::Overflow,
+            "fault" => InjectedFault::Fault,
+            _ => return None,
+        })
+    });
+    if let Some(fault) = asked.flatten() {
+        tasks.spawn(TaskName::Board(0), |pulse| make(pulse, fault));
+    }
+}
+
+#[embassy_executor::task]
+async fn make(pulse: &'static Pulse, fault: InjectedFault) -> ! {
+    let making = async {
+        pulse.idle(pin!(Timer::after(AFTER))).await;
+        match fault {
+            InjectedFault::Stall => pending().await,
+            InjectedFault::Spin => loop {
+                spin_loop();
+            },
+            InjectedFault::Panic => panic!("as asked"),
+            InjectedFault::Overflow => panic!("{} levels deep and still there", overflow(0)),
+            InjectedFault::Fault => {
+                let nowhere = core::ptr::with_exposed_provenance::<u32>(NOWHERE);
+                // SAFETY: there is no memory at this address: the read faults, as intended.
+                let value = unsafe { nowhere.read_volatile() };
+                panic!("{value} where nothing is")
+            }
+        }
+    };
+    pulse.run(pin!(making)).await
+}
+
+#[allow(unconditional_recursion, reason = "overflows the stack")]
+fn overflow(depth: u32) -> u32 {
+    let room = black_box([depth; 64]);
+    overflow(depth + 1) + room[0]
+}
+
+/// Time from the start to the fault.
+const AFTER: Duration = Duration::from_millis(500);
+/// An address without memory.
+const NOWHERE: usize = 0xB000_0000;

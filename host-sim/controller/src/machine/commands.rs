@@ -1,0 +1,154 @@
+//! Commands of clients: what is allowed in which state, and the transition that each begins (D25).
+
+use proto_core::command::{Action, Percent};
+use proto_core::time::{Duration, Instant};
+use proto_core::wire::state::{OperationMode, RobotState};
+
+use super::{
+    DISABLE, ENABLE, Effect, ErrorId, Machine, PAUSE, POWER_OFF, POWER_ON, Program, Robot, SHUT_DOWN, STOP,
+    Safety, Transition,
+};
+use crate::motion::Braking;
+
+impl Machine {
+    /// The command `speed(V)`; `None` if V is out of range.
+    ///
+    /// # Errors
+    /// The error that was recorded; nothing else changed.
+    pub fn set_speed(&mut self, speed: Option<Percent>) -> Result<(), ErrorId> {
+        match speed {
+            Some(speed) => {
+                self.speed_percent = speed.value();
+                Ok(())
+            }
+            None => Err(self.refuse(ErrorId::BadArgument, "speed: not within (0, 100]")),
+        }
+    }
+
+    /// Whether `run` is allowed now. The caller then starts the program and reports [`Machine::program_started`].
+    ///
+    /// # Errors
+    /// The error that was recorded.
+    pub fn check_run(&mut self) -> Result<(), ErrorId> {
+        let why = if self.robot != Robot::Enabled {
+            "run: the robot is not enabled"
+        } else if self.mode == OperationMode::Manual {
+            "run: the robot is in manual mode"
+        } else if self.stopped_by_safety() {
+            "run: a safety stop is active"
+        } else if self.program != Program::Stopped {
+            "run: a program is already running"
+        } else {
+            return Ok(());
+        };
+        Err(self.refuse(ErrorId::WrongState, why))
+    }
+
+    /// A command that is answered with success or fail: begins its transition.
+    ///
+    /// # Errors
+    /// The error that was recorded; nothing else changed.
+    pub fn act(&mut self, now: Instant, action: Action) -> Result<(Effect, Transition), ErrorId> {
+        let effect = match self.begin(now, action) {
+            Ok(effect) => effect,
+            Err(why) => return Err(self.refuse(ErrorId::WrongState, why)),
+        };
+        Ok((effect, Transition { action, begun: self.begun }))
+    }
+
+    /// The effect on the rest of the controller, or why the command is refused.
+    fn begin(&mut self, now: Instant, action: Action) -> Result<Effect, &'static str> {
+        let begins = now + self.delay;
+        let after = |length: Duration| begins + length;
+        match action {
+            Action::PowerOn => match self.robot {
+                Robot::Off => {
+                    self.begin_robot(Robot::PoweringOn { until: after(POWER_ON) });
+                    Ok(Effect::None)
+                }
+                _ => Err("poweron: the robot is not powered off"),
+            },
+            Action::PowerOff => match self.robot {
+                // Allowed during every transition, which must not keep the power on.
+                Robot::PoweringOn { .. }
+                | Robot::Disabled
+                | Robot::Enabling { .. }
+                | Robot::Enabled
+                | Robot::Disabling { .. } => {
+                    let shown = match self.robot {
+                        Robot::PoweringOn { .. } => RobotState::PowerOff,
+                        _ => RobotState::Disable,
+                    };
+                    self.begin_robot(Robot::PoweringOff { shown, until: after(POWER_OFF) });
+                    Ok(self.abort(after(STOP), Braking::Hard))
+                }
+                _ => Err("poweroff: the robot is not powered, or is losing power"),
+            },
+            Action::Enable => match self.robot {
+                Robot::Disabled if self.stopped_by_safety() => Err("enable: a safety stop is active"),
+                Robot::Disabled => {
+                    self.begin_robot(Robot::Enabling { until: after(ENABLE) });
+                    Ok(Effect::None)
+                }
+                _ => Err("enable: the robot is not powered on, or already enabled"),
+            },
+            Action::Disable => match self.robot {
+                Robot::Enabling { .. } | Robot::Enabled => {
+                    self.begin_robot(Robot::Disabling { shown: self.robot(), until: after(DISABLE) });
+                    Ok(self.abort(after(STOP), Braking::Hard))
+                }
+                _ => Err("disable: the robot is not enabled"),
+            },
+            Action::Stop => match self.program {
+                Program::Running | Program::Pausing { .. } | Program::Paused => {
+                    Ok(self.abort(after(STOP), Braking::Normal))
+                }
+                Program::Stopped | Program::Stopping { .. } => Err("stop: no program is running"),
+            },
+            Action::Pause => match self.program {
+                Program::Running => {
+                    self.begin_program(Program::Pausing { until: after(PAUSE) });
+                    Ok(Effect::Hold)
+                }
+                _ => Err("pause: no program is running"),
+            },
+            Action::Resume => match self.program {
+                Program::Paused if self.stopped_by_safety() => Err("resume: a safety stop is active"),
+                Program::Paused => {
+                    self.begin_program(Program::Running);
+                    Ok(Effect::Continue)
+                }
+                _ => Err("resume: no program is paused"),
+            },
+            Action::Shutdown => match self.robot {
+                Robot::Off => {
+                    self.begin_robot(Robot::ShuttingDown { until: now + SHUT_DOWN });
+                    Ok(Effect::None)
+                }
+                _ => Err("shutdown: the robot is not powered off"),
+            },
+        }
+    }
+
+    /// Records that an accepted command is answered with fail. If a safety stop was the cause, its error stays.
+    pub fn not_completed(&mut self, action: Action, why: &str) {
+        if !matches!(self.safety, Safety::Stopped(_)) {
+            self.fail(ErrorId::NotCompleted, format!("{}: {why}", action.word()));
+        }
+    }
+
+    pub(super) fn abort(&mut self, until: Instant, braking: Braking) -> Effect {
+        match self.program {
+            Program::Stopped | Program::Stopping { .. } => Effect::None,
+            Program::Running | Program::Pausing { .. } | Program::Paused => {
+                self.begin_program(Program::Stopping { until });
+                Effect::Abort(braking)
+            }
+        }
+    }
+
+    fn refuse(&mut self, id: ErrorId, message: &str) -> ErrorId {
+        self.fail(id, message);
+        id
+    }
+}

@@ -1,0 +1,136 @@
+//! Ports as the configuration has them: bus, recipe, times, safe values.
+//!
+//! Plain data: nothing here has been checked.
+
+use heapless::String;
+
+use super::{MAX_LISTEN, Name, Span};
+use crate::sysvar::SysVar;
+use crate::time::Duration;
+use crate::wire::scalar::Scalar;
+
+/// One port.
+#[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[non_exhaustive]
+pub struct Port {
+    /// Its name, as `--bind` and `--stats` use it.
+    pub name: Name,
+    /// Its bus.
+    pub bus: Bus,
+    /// Index into [`GatewayConfig::recipes`](super::GatewayConfig::recipes).
+    pub recipe: u8,
+    /// How often the output part is sent; at least 4 ms.
+    pub cycle: Duration,
+    /// After this long without an accepted frame the port's inputs take their safe values.
+    pub timeout: Duration,
+    /// The safe values that inputs take then; inputs without a safe value hold.
+    pub on_timeout: Span,
+    /// Outputs whose source is older than this are stale.
+    pub stale_after: Duration,
+}
+
+impl Port {
+    /// A port with the file's defaults: a cycle of 4 ms, a timeout of 100 ms, stale after 500 ms, and
+    /// inputs that hold.
+    pub const fn new(name: Name, bus: Bus, recipe: u8) -> Self {
+        Self {
+            name,
+            bus,
+            recipe,
+            cycle: MIN_CYCLE,
+            timeout: Duration::from_millis(100),
+            on_timeout: Span { start: 0, len: 0 },
+            stale_after: Duration::from_millis(500),
+        }
+    }
+}
+
+/// The bus of a port.
+#[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub enum Bus {
+    /// Half-duplex serial line on the field side.
+    Rs485(Rs485),
+    /// CAN bus on the field side.
+    Can {
+        /// Bit/s, 10_000..=1_000_000; a file's default is [`Bus::BITRATE`].
+        bitrate: u32,
+    },
+    /// Where the controller's TCP client connects to: a way up, like the recipe link.
+    TcpListen {
+        /// Address and port, such as `0.0.0.0:50000`.
+        listen: String<MAX_LISTEN>,
+    },
+    /// Where the controller's UDP client sends to: a way up, like the recipe link.
+    UdpListen {
+        /// Address and port.
+        listen: String<MAX_LISTEN>,
+    },
+}
+
+impl Bus {
+    /// Default bit rate of a CAN bus, in bit/s.
+    pub const BITRATE: u32 = 500_000;
+
+    /// Whether devices (not the controller) are at the other end.
+    pub fn is_field(&self) -> bool {
+        matches!(self, Self::Rs485(_) | Self::Can { .. })
+    }
+}
+
+/// A serial line's settings (D19, D20, D21).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct Rs485 {
+    /// Bit/s, 1200..=4_000_000.
+    pub baud: u32,
+    /// Parity bit.
+    pub parity: Parity,
+    /// 1 or 2.
+    pub stop_bits: u8,
+    /// A partial frame is discarded after the line has been silent for this long.
+    pub idle_gap: Duration,
+    /// The line must have been silent for this long before a frame is sent.
+    pub turnaround: Duration,
+}
+
+impl Default for Rs485 {
+    /// The defaults of a file: 115 200 bit/s, no parity, 1 stop bit, an idle gap of 50 ms, a
+    /// turnaround of 100 µs.
+    fn default() -> Self {
+        Self {
+            baud: 115_200,
+            parity: Parity::None,
+            stop_bits: 1,
+            idle_gap: Duration::from_millis(50),
+            turnaround: Duration::from_micros(100),
+        }
+    }
+}
+
+/// A serial line's parity.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub enum Parity {
+    /// No parity bit.
+    #[default]
+    None,
+    /// Even parity.
+    Even,
+    /// Odd parity.
+    Odd,
+}
+
+/// The value that an input variable takes when its port times out.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct SafeValue {
+    /// An input variable that the port owns.
+    pub var: SysVar,
+    /// Its safe value.
+    pub value: Scalar,
+}
+
+/// The shortest cycle, of the controller and of a port.
+pub(crate) const MIN_CYCLE: Duration = Duration::from_millis(4);

@@ -1,0 +1,299 @@
+//! Recipes as the configuration has them: parts, fields and their bindings, triggers.
+//!
+//! Plain data: nothing here has been checked. Fields and commands are ranges of the configuration's
+//! lists.
+
+use heapless::{String, Vec};
+
+use super::{Delimiter, Name};
+use crate::device::{Checksum, Encoding, Overflow};
+use crate::recipe::model::{Field, MAX_CAN_IDS, Mode};
+use crate::sysvar::{Direction, SysVar};
+use crate::wire::can::CanId;
+use crate::wire::scalar::ScalarType;
+
+/// One recipe.
+#[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[non_exhaustive]
+pub struct Recipe {
+    /// Its name.
+    pub name: Name,
+    /// System variables, or user-defined fields.
+    pub mode: Mode,
+    /// Stream or CAN, with the parts.
+    pub parts: Parts,
+    /// What a port does while the sources of its output are stale.
+    pub on_stale: OnStale,
+    /// What makes a port send the output part.
+    pub send: SendOn,
+}
+
+impl Recipe {
+    /// A recipe with these parts that is sent every cycle and holds stale values.
+    pub const fn new(name: Name, mode: Mode, parts: Parts) -> Self {
+        Self { name, mode, parts, on_stale: OnStale::Hold, send: SendOn::Period }
+    }
+
+    /// The field ranges of one part: one for a stream part, one for each CAN frame.
+    pub(crate) fn frames(&self, part: Direction) -> impl Iterator<Item = (u8, Span)> + '_ {
+        let (stream, can) = match (&self.parts, part) {
+            (Parts::Stream { input, .. }, Direction::Input) => (input.as_ref(), None),
+            (Parts::Stream { output, .. }, Direction::Output) => (output.as_ref(), None),
+            (Parts::Can { input, .. }, Direction::Input) => (None, Some(input)),
+            (Parts::Can { output, .. }, Direction::Output) => (None, Some(output)),
+        };
+        let can = can.into_iter().flatten().map(|frame| frame.fields);
+        (0..).zip(stream.map(|part| part.fields).into_iter().chain(can))
+    }
+
+    /// Whether the recipe has this part.
+    pub(crate) fn has(&self, part: Direction) -> bool {
+        self.frames(part).next().is_some()
+    }
+}
+
+/// A recipe's two parts; either may be absent, not both.
+#[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[allow(clippy::large_enum_variant, reason = "without an allocator there is no box to put the larger one in")]
+pub enum Parts {
+    /// Byte streams and datagrams.
+    Stream {
+        /// User to robot.
+        input: Option<StreamPart>,
+        /// Robot to user.
+        output: Option<StreamPart>,
+    },
+    /// CAN; an absent part has no frames.
+    Can {
+        /// User to robot.
+        input: Vec<CanFramePart, MAX_CAN_IDS>,
+        /// Robot to user.
+        output: Vec<CanFramePart, MAX_CAN_IDS>,
+    },
+}
+
+/// One part of a stream recipe.
+#[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct StreamPart {
+    /// Bytes before the fields.
+    pub head: Delimiter,
+    /// Bytes after the fields.
+    pub tail: Delimiter,
+    /// The fields.
+    pub fields: Span,
+}
+
+/// One frame id of a CAN recipe's part.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct CanFramePart {
+    /// The frame's id.
+    pub id: CanId,
+    /// The fields, at most 8 bytes together.
+    pub fields: Span,
+}
+
+/// A range of one of the pools of [`GatewayConfig`](super::GatewayConfig).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct Span {
+    /// First index.
+    pub start: u16,
+    /// Number of entries.
+    pub len: u16,
+}
+
+impl Span {
+    /// The part of `pool` that this range covers; empty if it does not fit.
+    pub fn of<T>(self, pool: &[T]) -> &[T] {
+        let start = usize::from(self.start);
+        pool.get(start..start.saturating_add(usize::from(self.len))).unwrap_or(&[])
+    }
+}
+
+/// One field, and what the gateway does with it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub enum FieldSpec {
+    /// A system variable of a realtime recipe.
+    System(SysVar),
+    /// A field of a user-defined recipe's input part.
+    UserInput {
+        /// The field's type on the wire.
+        ty: ScalarType,
+        /// What is done with its value.
+        to: InputBinding,
+    },
+    /// A field of a user-defined recipe's output part.
+    UserOutput {
+        /// The field's type on the wire.
+        ty: ScalarType,
+        /// Where its value comes from.
+        from: OutputBinding,
+    },
+    /// A field of a device's frame, in the input part of a user recipe.
+    DeviceInput {
+        /// How it is written.
+        encoding: Encoding,
+        /// What becomes of a number that its variable cannot hold.
+        overflow: Overflow,
+        /// What is done with its value.
+        to: InputBinding,
+    },
+    /// A field of a device's frame, in the output part of a user recipe.
+    DeviceOutput {
+        /// How it is written.
+        encoding: Encoding,
+        /// What becomes of a number that it cannot hold.
+        overflow: Overflow,
+        /// Where its value comes from.
+        from: OutputBinding,
+    },
+    /// An integer that is the same in every frame; a received frame with another one is not this
+    /// frame.
+    Fixed {
+        /// How it is written.
+        encoding: Encoding,
+        /// The integer.
+        value: i64,
+    },
+    /// Bytes without a meaning: any are accepted.
+    Padding {
+        /// Number of bytes.
+        len: u8,
+        /// What is sent.
+        fill: u8,
+    },
+    /// The frame's checksum stands here.
+    Checksum(Checksum),
+}
+
+impl FieldSpec {
+    /// The field as the controller's recipes have it; `None` if only frames of devices have it.
+    pub(crate) fn field(&self) -> Option<Field> {
+        match *self {
+            Self::System(var) => Some(Field::System(var)),
+            Self::UserInput { ty, .. } | Self::UserOutput { ty, .. } => Some(Field::User(ty)),
+            _ => None,
+        }
+    }
+
+    /// The system variable that the field is, or that it is bound to.
+    pub fn variable(&self) -> Option<SysVar> {
+        match *self {
+            Self::System(var) => Some(var),
+            Self::UserInput { to, .. } | Self::DeviceInput { to, .. } => match to {
+                InputBinding::Variable { var, .. } => Some(var),
+                InputBinding::Unused | InputBinding::Commands { .. } => None,
+            },
+            Self::UserOutput { from, .. } | Self::DeviceOutput { from, .. } => match from {
+                OutputBinding::Variable { var, .. } => Some(var),
+                OutputBinding::Constant(_) | OutputBinding::Counter | OutputBinding::Reply => None,
+            },
+            Self::Fixed { .. } | Self::Padding { .. } | Self::Checksum(_) => None,
+        }
+    }
+}
+
+/// What is done with a received user-defined value.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub enum InputBinding {
+    /// It is ignored.
+    Unused,
+    /// `value * scale + offset` becomes the variable's value.
+    Variable {
+        /// An input variable.
+        var: SysVar,
+        /// Scale.
+        scale: f32,
+        /// Offset, added after scaling.
+        offset: f32,
+    },
+    /// The value picks a port-2000 command from a table; a value not in the table does nothing.
+    Commands {
+        /// The table, in [`GatewayConfig::commands`](super::GatewayConfig::commands).
+        table: Span,
+        /// When a value takes effect.
+        when: CommandWhen,
+    },
+}
+
+/// When a value that picks a command takes effect.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub enum CommandWhen {
+    /// When it differs from the previous frame; the first frame after silence only sets the base.
+    #[default]
+    Change,
+    /// With every accepted frame: for devices that send a frame only when they mean it.
+    Frame,
+}
+
+/// Where a user-defined output value comes from.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub enum OutputBinding {
+    /// `variable * scale + offset`, saturated to the field's type.
+    Variable {
+        /// Any variable that the controller shows.
+        var: SysVar,
+        /// Scale.
+        scale: f32,
+        /// Offset, added after scaling.
+        offset: f32,
+    },
+    /// A constant.
+    Constant(f64),
+    /// Frames sent so far, wrapping in the field's type.
+    Counter,
+    /// The result of this port's newest command: see [`crate::engine::ReplyCode`].
+    Reply,
+}
+
+/// One entry of a command table.
+#[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct CommandEntry {
+    /// The field's value that picks the command.
+    pub value: i64,
+    /// The command as port 2000 takes it, such as `run(pick.jspf,50)`.
+    pub text: String<MAX_COMMAND_TEXT>,
+}
+
+/// What a port does while the sources of its output are older than `stale_after`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub enum OnStale {
+    /// Keep sending the last values.
+    #[default]
+    Hold,
+    /// Send nothing.
+    Stop,
+}
+
+/// What makes a port send its output part.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub enum SendOn {
+    /// The port's cycle; the only choice for realtime recipes.
+    #[default]
+    Period,
+    /// Each cycle in which a value changed.
+    Change,
+    /// Every accepted input frame: request and response.
+    Frame,
+    /// A bit going from 0 to 1.
+    Rising {
+        /// A bit variable that the controller shows.
+        var: SysVar,
+        /// Bit 0..=7.
+        bit: u8,
+    },
+}
+
+/// Maximum length of a command in a table, in bytes; well below the controller's limit (D5).
+pub const MAX_COMMAND_TEXT: usize = 96;
