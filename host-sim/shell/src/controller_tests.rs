@@ -118,11 +118,11 @@ fn a_state_client_that_takes_nothing_for_two_seconds_is_dropped_and_others_lose_
             }
             shell.send_state(&packet, now());
         };
-        let patient = blocked_at + STATE_PATIENCE - Duration::from_micros(1);
+        let patient = blocked_at + STATE_TIMEOUT - Duration::from_micros(1);
         shell.send_state(&packet, patient);
         assert_eq!(shell.counters.get().slow_clients, 0);
         assert!(shell.counters.get().skipped_state_packets > 0);
-        shell.send_state(&packet, blocked_at + STATE_PATIENCE);
+        shell.send_state(&packet, blocked_at + STATE_TIMEOUT);
         shell.drain(now());
         assert_eq!(shell.counters.get().slow_clients, 1);
         assert_eq!(shell.controller.borrow().counters().state.open, 1);
@@ -198,7 +198,7 @@ fn of_too_many_closed_connections_that_still_send_the_oldest_is_cut() {
         for &conn in &conns {
             // Answers that nobody takes, until they are kept.
             let connection = Rc::clone(&shell.connections.borrow()[&conn].connection);
-            while connection.send(&[0; 4_096]) == Taken::All {}
+            while connection.send(&[0; 4_096]) == Accepted::All {}
             shell.carry_out(ControllerOutput::Close { conn }, now());
         }
         assert_eq!(shell.lingering.borrow().len(), MAX_LINGERING);
