@@ -48,8 +48,7 @@ pub fn set_deadline(deadline: Instant) {
     DEADLINE.set(deadline);
 }
 
-/// Lets all other tasks report input that had arrived by the deadline, before the engine is told that it has
-/// passed.
+/// Lets all other tasks report input that had arrived by the deadline, before the engine handles it.
 ///
 /// tokio polls the sockets before a task that has yielded continues, and runs each task that has input once.
 /// That is enough if the deadline is kept. If the thread was blocked, more input may wait than a task reads

@@ -12,7 +12,7 @@ use tokio::task::LocalSet;
 use tracing::warn;
 
 use super::{RunOptions, Signals, StartError};
-use crate::out::{is_enough, tell};
+use crate::out::{is_broken_pipe, print_stderr};
 
 /// Stack size: an engine is built by value, and unoptimised code has several copies of it on the stack.
 const STACK: usize = 16 << 20;
@@ -163,7 +163,7 @@ pub(super) fn foreground(handle: Handle, options: &RunOptions) -> Result<(), Sta
                 }
                 Some(failure) = stdout.failures.recv() => match failure {
                     Failure::Closed if options.stats.is_some() => {
-                        tell("stdout was closed; ended, because nobody reads the statistics");
+                        print_stderr("stdout was closed; ended, because nobody reads the statistics");
                         break Ok(());
                     }
                     // Nothing more would be printed.
@@ -225,7 +225,7 @@ impl Stdout {
                 count.fetch_add(1, Relaxed);
                 if !std::mem::replace(&mut failing, true) {
                     let _ = report.send(match nth {
-                        _ if is_enough(&error) => Failure::Closed,
+                        _ if is_broken_pipe(&error) => Failure::Closed,
                         0 => Failure::NotReady(error),
                         _ => Failure::Lost(error),
                     });

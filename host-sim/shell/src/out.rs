@@ -29,9 +29,9 @@ impl<W: Write> Out<W> {
         let _ = self.flush();
         match self.failed {
             None => done(Printed::Whole),
-            Some(error) if is_enough(&error) => done(Printed::Enough),
+            Some(error) if is_broken_pipe(&error) => done(Printed::Enough),
             Some(error) => {
-                tell(format_args!("stdout: {error}"));
+                print_stderr(format_args!("stdout: {error}"));
                 ExitCode::FAILURE
             }
         }
@@ -69,12 +69,12 @@ impl<W: Write> Write for Out<W> {
 }
 
 /// Whether a failure only means that the reader closed the pipe.
-pub fn is_enough(error: &io::Error) -> bool {
+pub fn is_broken_pipe(error: &io::Error) -> bool {
     error.kind() == io::ErrorKind::BrokenPipe
 }
 
 /// Prints a line to stderr; a failure is ignored.
-pub fn tell(message: impl std::fmt::Display) {
+pub fn print_stderr(message: impl std::fmt::Display) {
     let _ = writeln!(stderr(), "{message}");
 }
 
