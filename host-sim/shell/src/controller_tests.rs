@@ -118,11 +118,11 @@ fn a_state_client_that_takes_nothing_for_two_seconds_is_dropped_and_others_lose_
             }
             shell.send_state(&packet, now());
         };
-        let patient = blocked_at + STATE_PATIENCE - Duration::from_micros(1);
+        let patient = blocked_at + STATE_TIMEOUT - Duration::from_micros(1);
         shell.send_state(&packet, patient);
         assert_eq!(shell.counters.get().slow_clients, 0);
         assert!(shell.counters.get().skipped_state_packets > 0);
-        shell.send_state(&packet, blocked_at + STATE_PATIENCE);
+        shell.send_state(&packet, blocked_at + STATE_TIMEOUT);
         shell.drain(now());
         assert_eq!(shell.counters.get().slow_clients, 1);
         assert_eq!(shell.controller.borrow().counters().state.open, 1);
@@ -196,9 +196,9 @@ fn of_too_many_closed_connections_that_still_send_the_oldest_is_cut() {
         }
         let conns: Vec<_> = shell.connections.borrow().keys().copied().collect();
         for &conn in &conns {
-            // Answers that nobody takes, until they are kept.
+            // Unread answers, until some wait in this process.
             let connection = Rc::clone(&shell.connections.borrow()[&conn].connection);
-            while connection.send(&[0; 4_096]) == Taken::All {}
+            while connection.send(&[0; 4_096]) == Accepted::All {}
             shell.carry_out(ControllerOutput::Close { conn }, now());
         }
         assert_eq!(shell.lingering.borrow().len(), MAX_LINGERING);
@@ -310,7 +310,7 @@ fn a_udp_client_is_streamed_to_until_its_port_is_unreachable() {
 
 #[test]
 fn the_clients_connect_out_when_they_can_and_again() {
-    // An address of its own: no other test is given the port while nobody listens.
+    // A loopback address of its own, so that no other test gets the port while nothing listens.
     let listener = StdListener::bind("127.0.0.77:0").unwrap();
     let at = listener.local_addr().unwrap();
     drop(listener);

@@ -231,7 +231,7 @@ fn a_listening_link_has_one_connection_and_takes_the_next_after_it() {
         link.expect(Seen::Up).await;
         let mut second = TcpStream::connect(at).await.unwrap();
         assert_eq!(second.read(&mut [0; 4]).await.unwrap(), 0, "turned away");
-        assert_eq!(link.control.turned_away(), TurnedAway { strangers: 0, refused: 1 });
+        assert_eq!(link.control.refusals(), Refusals { strangers: 0, refused: 1 });
         first.write_all(b"here").await.unwrap();
         link.expect(Seen::Bytes(b"here".to_vec())).await;
         drop(first);
@@ -375,7 +375,7 @@ fn only_the_controller_is_taken_and_others_do_it_no_harm() {
         knock().await;
         controller.write_all(b"here").await.unwrap();
         link.expect(Seen::Bytes(b"here".to_vec())).await;
-        assert_eq!(link.control.turned_away(), TurnedAway { strangers: 2, refused: 0 });
+        assert_eq!(link.control.refusals(), Refusals { strangers: 2, refused: 0 });
     });
 }
 
@@ -400,7 +400,7 @@ fn a_strangers_datagrams_are_neither_taken_nor_answered() {
         let mut got = [0; 32];
         let (len, _) = controller.recv_from(&mut got).await.unwrap();
         assert_eq!(&got[..len], b"to the controller");
-        assert_eq!(link.control.turned_away().strangers, 2);
+        assert_eq!(link.control.refusals().strangers, 2);
     });
 }
 
@@ -424,6 +424,6 @@ fn who_is_on_this_host_may_stand_for_the_controller() {
         peer.send_to(b"here", at).await.unwrap();
         link.expect(Seen::Up).await;
         link.expect(Seen::Bytes(b"here".to_vec())).await;
-        assert_eq!(link.control.turned_away(), TurnedAway::default());
+        assert_eq!(link.control.refusals(), Refusals::default());
     });
 }

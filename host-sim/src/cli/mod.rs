@@ -23,7 +23,7 @@ use proto_core::sysvar::Direction;
 
 use recipe_config::file;
 use recipe_device::bind::Bind;
-use recipe_shell::out::{Out, Printed, tell};
+use recipe_shell::out::{Out, Printed, print_stderr};
 use recipe_shell::{self as shell, ReadyFile, RunOptions, StartError};
 
 /// Everything that can be typed.
@@ -263,7 +263,7 @@ fn not_run(error: &clap::Error) -> ExitCode {
 type Outcome = Result<(), String>;
 
 fn wrong(message: impl std::fmt::Display) -> ExitCode {
-    tell(message);
+    print_stderr(message);
     ExitCode::from(2)
 }
 
@@ -294,7 +294,7 @@ fn finished(result: Result<(), StartError>) -> ExitCode {
     match result {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            tell(&error);
+            print_stderr(&error);
             ExitCode::from(error.exit_code())
         }
     }

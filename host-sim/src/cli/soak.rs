@@ -16,7 +16,7 @@ use tokio::signal::unix::{Signal, SignalKind, signal};
 use super::wrong;
 use recipe_cell::Cell;
 use recipe_cell::soak::{Batch, Level, Progress, Scenario, Soak, Total, show_trace};
-use recipe_shell::out::tell;
+use recipe_shell::out::print_stderr;
 
 pub(super) const EXAMPLES: &str = "\
 Runs the gateway's engine against the simulated controller in virtual time: devices
@@ -195,7 +195,7 @@ async fn watch(
             if is_terminal {
                 show(format_args!("\r{line}\x1B[K"));
             } else {
-                tell(line);
+                print_stderr(line);
             }
         }
         if workers.iter().all(std::thread::JoinHandle::is_finished) {
@@ -204,7 +204,7 @@ async fn watch(
         tokio::select! {
             _ = interrupt.recv() => {
                 if is_terminal {
-                    tell("");
+                    print_stderr("");
                 }
                 return true;
             }

@@ -15,7 +15,7 @@ use std::time::Instant;
 
 use folder::Folder;
 use recipe_shell::Signals;
-use recipe_shell::out::tell;
+use recipe_shell::out::print_stderr;
 use show::Show;
 
 /// Runs the cell and prints what it does, until nobody reads it; success only when every example passes
@@ -25,7 +25,7 @@ pub fn run() -> ExitCode {
     let folder = match prepare() {
         Ok(folder) => folder,
         Err(error) => {
-            tell(format_args!("no folder for the devices: {error}"));
+            print_stderr(format_args!("no folder for the devices: {error}"));
             return ExitCode::FAILURE;
         }
     };
@@ -46,7 +46,7 @@ fn prepare() -> io::Result<Folder> {
     let remover = folder.remover();
     std::thread::Builder::new().name("signals".to_owned()).spawn(move || {
         let signal = runtime.block_on(signals.next());
-        tell("interrupted");
+        print_stderr("interrupted");
         // The exit code as shells have it.
         remover.remove_and_exit(128 + signal)
     })?;

@@ -1,5 +1,5 @@
-//! What becomes of bytes that were handed over, with peers that have no room for them: what does not fit there
-//! is not acknowledged.
+//! What becomes of bytes that were handed over, with peers that have no room for them: what does not fit
+//! there is not acknowledged.
 
 use std::io::Read;
 
@@ -8,7 +8,7 @@ use tokio::net::TcpSocket;
 use tokio::task::yield_now;
 
 use super::super::tests::{Running, Seen, connected, inside, tcp_listen};
-use super::super::{Endpoint, TurnedAway};
+use super::super::{Endpoint, Refusals};
 use super::*;
 
 /// A link that is up, and its peer, whose system takes little.
@@ -68,7 +68,7 @@ fn what_is_taken_and_not_acknowledged_is_told_when_it_is() {
     inside(async || {
         let (link, _listener, mut peer) = pair().await;
         fill(&link).await;
-        sleep(3 * LOOK).await;
+        sleep(3 * ACK_POLL).await;
         // All that was said is how little there was room for.
         let mut left = ALL as u32;
         while let Some(event) = link.seen.events.borrow_mut().pop_front() {
@@ -199,7 +199,7 @@ fn the_system_gives_up_a_peer_that_acknowledges_nothing() {
         let begin = Instant::now();
         fill(&link).await;
         link.expect(Seen::Down).await;
-        assert!(begin.elapsed() >= PATIENCE / 2, "{:?}", begin.elapsed());
+        assert!(begin.elapsed() >= USER_TIMEOUT / 2, "{:?}", begin.elapsed());
         gets_nothing_more(peer).await;
     });
 }
@@ -226,6 +226,6 @@ fn who_connected_while_the_link_was_closed_has_to_do_it_again() {
         again.write_all(b"fresh").await.unwrap();
         link.expect(Seen::Up).await;
         link.expect(Seen::Bytes(b"fresh".to_vec())).await;
-        assert_eq!(link.control.turned_away(), TurnedAway { strangers: 0, refused: 1 });
+        assert_eq!(link.control.refusals(), Refusals { strangers: 0, refused: 1 });
     });
 }
