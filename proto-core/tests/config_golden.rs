@@ -64,7 +64,7 @@ fn every_kept_image_means_what_it_meant() {
     }
 }
 
-/// Whoever breaks this has changed a serialized type: that takes a new version.
+/// A change that breaks this has changed a serialized type, which takes a new version.
 #[test]
 fn the_newest_version_is_written_as_it_always_was() {
     for (name, bytes) in images(VERSION) {
