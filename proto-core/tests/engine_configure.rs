@@ -1,4 +1,4 @@
-//! An engine that is configured where it stands is one that was made so, whatever it ran before.
+//! An engine that is configured in place equals a new one, whatever it ran before.
 
 mod rig;
 
