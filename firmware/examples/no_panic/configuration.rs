@@ -86,7 +86,6 @@ fn plan_new(config: &GatewayConfig) {
         for var in SysVar::all() {
             black_box((plan.owner(var), plan.way_up(var), plan.source(var)));
         }
-        black_box((plan.needs_state(), plan.needs_modbus()));
     }
 }
 

@@ -172,12 +172,12 @@ impl Plan {
     }
 
     /// Whether the 2001 stream is needed.
-    pub fn needs_state(&self) -> bool {
+    pub(crate) fn needs_state(&self) -> bool {
         !self.read_back.is_empty() || self.sources.contains(&Some(Source::State))
     }
 
     /// Whether Modbus is needed.
-    pub fn needs_modbus(&self) -> bool {
+    pub(crate) fn needs_modbus(&self) -> bool {
         self.ways.contains(&Some(WayUp::Modbus)) || self.sources.contains(&Some(Source::Modbus))
     }
 
