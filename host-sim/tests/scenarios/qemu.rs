@@ -11,11 +11,10 @@ use serde_json::{Value, json};
 use recipe_test_kit::until;
 
 use super::board::{self, Machine, Wires};
-use super::case::Case;
 use super::environment::{Cable, Environment, Gateway, Plan, ports};
 use super::field::LineClient;
 use super::program::Program;
-use super::refusal::Spoil;
+use super::refusal::Defect;
 
 /// The firmware in QEMU.
 pub(crate) struct Qemu {
@@ -25,7 +24,7 @@ pub(crate) struct Qemu {
 /// The board's stack (firmware/boards/mps2-an500/mps2-an500.x).
 const STACK: u64 = 0x2030_0000;
 const STACK_SIZE: u64 = 1 << 20;
-/// The sockets of its UARTs: RS-485, RS-485, CAN.
+/// The sockets of the UARTs: RS-485, RS-485, CAN.
 const UARTS: [&str; 3] = ["uart0", "uart1", "uart2"];
 
 impl Environment for Qemu {
@@ -33,23 +32,13 @@ impl Environment for Qemu {
         "qemu"
     }
 
-    /// The guest's timers stand still while the machine is stopped, as those of a processor that a debugger
-    /// halts together with them: no time has passed, and nothing that a program could look at says so
-    /// (proto-core/docs/engine.md section 2).
-    fn sleeps_noticeably(&self) -> bool {
-        false
-    }
-
-    /// The board's is one.
-    fn lay_true_cable(&self, _case: &Case) {}
-
     #[track_caller]
     fn start(&self, plan: &Plan<'_>) -> Box<dyn Gateway> {
         let image = plan.case.folder.path().join("gateway.img");
         board::make_image(plan, &image);
         let mut board = Board::start(&self.elf, plan, &image);
         board.until_log("configuration: ");
-        // Others can connect from now on.
+        // Clients can connect from now on.
         if !ports(&plan.config(), board::listens).is_empty() {
             board.until_log(board::ADDRESS);
         }
@@ -57,9 +46,9 @@ impl Environment for Qemu {
     }
 
     #[track_caller]
-    fn refuses(&self, plan: &Plan<'_>, spoil: Spoil) -> String {
+    fn refuses(&self, plan: &Plan<'_>, defect: Defect) -> String {
         let image = plan.case.folder.path().join("gateway.img");
-        board::make_spoilt_image(plan, &image, spoil);
+        board::make_defective_image(plan, &image, defect);
         let mut board = Board::start(&self.elf, plan, &image);
         board.until_log("nothing runs: ");
         let reason = until("the whole line", || {
@@ -112,12 +101,12 @@ impl Board {
         arguments.extend(["-kernel".into(), elf.into()]);
         let program = Program::start(plan.case, "qemu", Path::new("qemu-system-arm"), &arguments);
         let mut board = Self { program, log, wires };
-        // The last of its sockets. That its file is there does not mean that it listens.
+        // The last socket that QEMU opens. Its file may exist before it listens.
         until("QEMU's sockets", || {
             board.must_run();
             UnixStream::connect(board.wires.folder.join("qmp")).ok()
         });
-        board.wires.ask_forwarded(&config, "qmp");
+        board.wires.read_forwarded(&config, "qmp");
         board
     }
 
@@ -129,7 +118,7 @@ impl Board {
         });
     }
 
-    /// One command to QEMU; what it returns.
+    /// Sends a command to QEMU; returns the result.
     #[track_caller]
     fn qmp(&self, command: &str, arguments: Value) -> Value {
         board::qmp(&self.wires.folder.join("qmp"), command, arguments)
