@@ -1,7 +1,7 @@
 //! A whole cell in one process: simulated controller, gateway, field devices.
 //!
-//! The devices are pseudoterminals, sockets and slcan connections like those of any other client;
-//! nothing is passed on inside the process.
+//! The devices use pseudoterminals, sockets and slcan connections like any other client; nothing is passed
+//! inside the process.
 
 mod cell;
 mod device;
@@ -18,8 +18,8 @@ use recipe_shell::Signals;
 use recipe_shell::out::print_stderr;
 use show::Show;
 
-/// Runs the cell and prints what it does, until nobody reads it; success only when every example passes
-/// that was run.
+/// Runs the cell and prints what it does, until the reader is gone; success if all examples that were run
+/// passed.
 pub fn run() -> ExitCode {
     let started = Instant::now();
     let folder = match prepare() {
@@ -35,7 +35,7 @@ pub fn run() -> ExitCode {
     show.verdict(started.elapsed().as_secs_f64())
 }
 
-/// The folder for the devices. Ctrl-C and its like remove it; everything else ends with the process.
+/// The folder for the devices. Ctrl-C and other signals remove it; everything else ends with the process.
 fn prepare() -> io::Result<Folder> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     let mut signals = {
