@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""What an image for a Cortex-M calls: where it could panic, and how much stack it takes.
+"""Call graph of an image for a Cortex-M: where it could panic, and how much stack it needs.
 
     call_graph.py --panics ELF         every place that calls a panic, with what was inlined around it
-    call_graph.py --stack REGEX ELF    the deepest stack of each function whose name begins so
+    call_graph.py --stack REGEX ELF    the deepest stack of each function whose name matches
 
-Both fail when they found something wrong: a panic outside the functions that --except allows to have
-one, recursion, a call through a pointer.
+Both fail on what they find: a panic outside the functions that --except allows to have one, recursion, a
+call through a pointer.
 
 The image has to be linked with `-C link-arg=--emit-relocs`: calls are read from the relocations, which
 the linker itself acted on, not from a disassembly. For --stack it also has to be built with

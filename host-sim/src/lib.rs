@@ -1,4 +1,4 @@
-//! The command line of `host-sim`: what a person types, and the demo.
+//! The command line of `host-sim`, and the demo.
 
 pub mod cli;
 pub mod demo;

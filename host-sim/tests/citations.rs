@@ -1,6 +1,6 @@
-//! What the code and the documents cite exists: `docs/PAGE.md section N` names a numbered heading
-//! of a page that is there, and relative links in Markdown lead somewhere. A page is that of the
-//! citing file's own package, or else its path is from the root.
+//! Everything that code and documents cite exists: `docs/PAGE.md section N` names a numbered heading of an
+//! existing page, and relative links in Markdown have a target. A page is that of the citing file's own
+//! package, or else its path is from the root.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -68,7 +68,7 @@ fn citations_are_read_however_they_are_written() {
     assert_eq!(cited("docs/wire/*.md, docs/wire/NAME.md"), []);
 }
 
-/// Those whose pages others cite.
+/// Packages whose pages are cited elsewhere.
 const PACKAGES_WITH_PAGES: [&str; 1] = ["proto-core/"];
 
 #[derive(Debug, PartialEq)]
@@ -84,7 +84,7 @@ fn citations(text: &str) -> Vec<Citation> {
     starts.filter_map(|at| text.get(at..)).filter_map(citation).collect()
 }
 
-/// One citation at the start of `text`; placeholders such as `docs/wire/NAME.md` are none.
+/// The citation at the start of `text`; placeholders such as `docs/wire/NAME.md` are none.
 fn citation(text: &str) -> Option<Citation> {
     let end = text.find(".md")? + ".md".len();
     let page = &text[..end];
@@ -151,7 +151,7 @@ fn files() -> Vec<(String, String)> {
             }
         }
     }
-    // What this test writes about citations is none.
+    // The examples in this file are no citations.
     files.retain(|(name, _)| !name.ends_with("tests/citations.rs"));
     files.sort();
     files

@@ -30,7 +30,7 @@ fn refused<const PORTS: usize, const RECIPES: usize, const FIELDS: usize, const 
     (place, kind)
 }
 
-/// docs/configuration.md says these.
+/// The defaults that docs/configuration.md states.
 #[test]
 fn defaults_are_those_of_a_file() {
     let config: GatewayConfig = GatewayConfig::builder()
@@ -281,7 +281,7 @@ fn mistakes_have_places() {
     let (place, kind) = refused(base().controller("a").recipe(sensor()).port(safe));
     assert_eq!(place, Place::SafeValue { entry: 0 });
     assert!(matches!(kind, ConfigErrorKind::Constant(ScalarError::OutOfRange { .. })), "{kind:?}");
-    // What fits nothing is found when everything is there.
+    // Mistakes that concern several items are found at the end.
     let twice = base().controller("a").recipe(sensor()).recipe(sensor());
     assert_eq!(
         refused(twice),

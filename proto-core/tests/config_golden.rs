@@ -1,8 +1,8 @@
-//! Configuration images as they were written, one of each kind for each version.
+//! Configuration images of every version, one of each kind.
 //!
 //! Never change an image in `tests/golden`: boards in the field hold such bytes. A change of a
-//! serialized type takes a new version, with images of its own beside these. The text beside an image is
-//! what it means; it grows when a configuration can say more.
+//! serialized type needs a new version, with images of its own beside these. The text beside an image
+//! is its configuration; it grows when a configuration gets new fields.
 #![cfg(feature = "image")]
 
 use std::path::{Path, PathBuf};
@@ -36,7 +36,7 @@ fn images(version: u32) -> Vec<(String, Vec<u8>)> {
     images
 }
 
-/// Compares with a kept text; `GOLDEN=write` writes one that is not there.
+/// Compares with a stored text; `GOLDEN=write` writes a missing one.
 #[track_caller]
 fn matches_text(path: &Path, said: &str) {
     if !path.exists() && std::env::var_os("GOLDEN").is_some_and(|value| value == "write") {
@@ -58,13 +58,13 @@ fn every_kept_image_means_what_it_meant() {
             assert_eq!(bytes[4..8], version.to_le_bytes(), "v{version}/{name}");
             assert_eq!(image_len(&bytes), Ok(bytes.len()), "v{version}/{name}");
             let config = decode(&bytes).unwrap_or_else(|error| panic!("v{version}/{name}: {error}"));
-            // What was kept in an older version is the same today.
+            // An image of an older version gives the same configuration today.
             matches_text(&golden().join(format!("{name}.txt")), &format!("{config:#?}\n"));
         }
     }
 }
 
-/// Whoever breaks this has changed a serialized type: that takes a new version.
+/// If this fails, a serialized type has changed, which needs a new version.
 #[test]
 fn the_newest_version_is_written_as_it_always_was() {
     for (name, bytes) in images(VERSION) {
@@ -75,7 +75,7 @@ fn the_newest_version_is_written_as_it_always_was() {
     }
 }
 
-/// An older image that is written again is one of today.
+/// An image of an older version that is written again has the newest version.
 #[test]
 fn migrated_images_are_of_the_newest_version() {
     for version in OLDEST_VERSION..VERSION {

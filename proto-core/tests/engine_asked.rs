@@ -1,4 +1,4 @@
-//! Who had nothing to say is asked again in time, whatever the engine was called for.
+//! A port or link that had nothing to send is looked at again when it is due, whichever input comes first.
 
 mod rig;
 
@@ -10,7 +10,7 @@ use proto_core::wire::scalar::ScalarType;
 use rig::*;
 
 #[test]
-fn a_port_whose_line_is_free_now_without_another_input() {
+fn a_port_sends_when_its_line_becomes_free_without_another_input() {
     let mut cell = Cell::new();
     let request = cell.fields([user_in(ScalarType::Byte, InputBinding::Unused)]);
     let input = cell.part(&[255, 255], &[238, 238], request);
@@ -33,7 +33,7 @@ fn a_port_whose_line_is_free_now_without_another_input() {
 }
 
 #[test]
-fn a_stop_whose_like_nobody_has_answered_for_a_second() {
+fn a_stop_is_sent_beside_one_that_had_no_reply_for_a_second() {
     const STOP: u8 = 3;
     let mut cell = Cell::new();
     let table = cell.commands(&[(i64::from(STOP), "stop")]);
@@ -55,7 +55,7 @@ fn a_stop_whose_like_nobody_has_answered_for_a_second() {
     assert_eq!(rig.sent_on(LinkId::URGENT), [b"stop"]);
     press(&mut rig, 0);
     press(&mut rig, STOP);
-    // Half a head: when it is discarded, the engine works its deadlines out anew.
+    // Half a head: when it is discarded, the engine recomputes its deadlines.
     rig.bytes(other, &[255]);
     rig.run(MS(999));
     assert!(rig.sent_on(LinkId::COMMAND).is_empty(), "the first one may still be answered");
@@ -65,6 +65,6 @@ fn a_stop_whose_like_nobody_has_answered_for_a_second() {
     assert_eq!(
         rig.sent_on(LinkId::COMMAND),
         [b"stop"],
-        "at the next call, although that was for something else"
+        "at the next call, although that was for another port"
     );
 }

@@ -1,4 +1,4 @@
-//! What waited while the gateway itself slept (stopped, suspended, in a debugger) counts for nothing
+//! What waited while the gateway itself slept (stopped, suspended, in a debugger) is discarded
 //! (docs/engine.md section 2).
 
 mod rig;
@@ -71,7 +71,7 @@ impl Full {
         full
     }
 
-    /// The controller and all devices talk.
+    /// The controller and all devices send.
     fn live(&mut self, millis: u64) {
         for _ in 0..millis / 50 {
             self.rig.link_bytes(STATE, &[0; 1468]);
@@ -350,7 +350,7 @@ fn nothing_is_commanded_from_what_was_asked_before() {
         assert!(commands.is_empty(), "{values:?}: {held} is held, and was no order: {commands:?}");
         full.press(0);
         full.press(2);
-        assert_eq!(full.rig.sent_on(COMMAND), [b"resume"], "what is asked for now counts");
+        assert_eq!(full.rig.sent_on(COMMAND), [b"resume"], "a command that is picked now counts");
     }
 }
 
@@ -416,7 +416,7 @@ fn what_was_due_for_the_field_then_is_not_sent_now() {
     rig.run(MS(4));
     assert_eq!(rig.sent_to(cycles).len(), 1, "the next one on the grid");
     rig.run(MS(1_000));
-    assert!(rig.sent_to(asks).is_empty(), "whoever asked then does not wait any more");
+    assert!(rig.sent_to(asks).is_empty(), "that request is too old to be answered");
     rig.bytes(asks, &[255, 255, 9, 238, 238]);
     rig.run(MS(200));
     assert_eq!(rig.sent_to(asks).len(), 1);

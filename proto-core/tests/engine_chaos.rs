@@ -1,4 +1,4 @@
-//! An engine whose driver keeps no rule: wrong ids, reports that nobody asked for, bytes on
+//! An engine whose driver keeps no rule: wrong ids, reports of nothing that was started, bytes on
 //! everything, clocks that jump, stand still and go back. It never panics, always comes to rest,
 //! and does no more for one input than its size allows.
 

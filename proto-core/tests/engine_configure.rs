@@ -1,10 +1,9 @@
-//! An engine that is configured where it stands is one that was made so, whatever it ran before.
+//! An engine that is configured in place equals a new one, whatever it ran before.
 
 mod rig;
 
 use proto_core::config::{
-    CanFields, CommandWhen, ConfigBuilder, Counted, GatewayConfig, InputBinding, InputField, Parts, Port,
-    Recipe,
+    CanFields, CommandWhen, ConfigBuilder, GatewayConfig, InputBinding, InputField, Parts, Port, Recipe,
 };
 use proto_core::engine::{BuildError, Engine, Input, OUTPUT_BUFFER, Output, PortId};
 use proto_core::recipe::model::Mode;
@@ -115,21 +114,27 @@ fn what_it_has_no_room_for_is_counted() {
     let refused = |builder: ConfigBuilder| {
         let config = builder.build().unwrap();
         match Small::new(&config).map(|_| ()) {
-            Err(BuildError::TooMany { what, needed, room }) => (what, needed, room),
+            Err(error @ BuildError::TooMany { .. }) => error.to_string(),
             other => panic!("{other:?}"),
         }
     };
     let output = || Recipe::realtime("out").stream_output(&[255], &[], &["RobotState[8]"]);
     let base = || GatewayConfig::builder().controller("10.0.0.2").recipe(output());
     let ports = ["a", "b", "c"].into_iter().fold(base(), |base, name| base.port(Port::rs485(name, "out")));
-    assert_eq!(refused(ports), (Counted::FieldPorts, 3, 2));
+    assert_eq!(refused(ports), "too many field ports: 3 are needed; this gateway has room for 2");
     let links = ["a", "b", "c"].into_iter().enumerate().fold(base(), |base, (nth, name)| {
         base.port(Port::udp_listen(name, "out", ["1.1.1.1:1", "1.1.1.1:2", "1.1.1.1:3"][nth]))
     });
-    assert_eq!(refused(links.recipe_link("out")), (Counted::RecipeLinks, 4, 1));
+    assert_eq!(
+        refused(links.recipe_link("out")),
+        "too many recipe links: 4 are needed; this gateway has room for 1"
+    );
     let fields = [InputField::unused(ScalarType::Byte); 17];
     let user = base().recipe(Recipe::user("user").stream_input(&[255], &[], &fields));
-    assert_eq!(refused(user.port(Port::rs485("a", "user"))), (Counted::UserFields, 17, 16));
+    assert_eq!(
+        refused(user.port(Port::rs485("a", "user"))),
+        "too many user-defined fields in one direction: 17 are needed; this gateway has room for 16"
+    );
     let frames =
         |first: u16| (first..first + 25).map(|id| CanFields::standard(id, &fields[..1])).collect::<Vec<_>>();
     let (one, two) = (frames(0), frames(100));
@@ -138,5 +143,5 @@ fn what_it_has_no_room_for_is_counted() {
         .recipe(Recipe::user("two").can_input(&two))
         .port(Port::can("a", "one"))
         .port(Port::can("b", "two"));
-    assert_eq!(refused(can), (Counted::InputFrames, 50, 48));
+    assert_eq!(refused(can), "too many input frames: 50 are needed; this gateway has room for 48");
 }

@@ -86,7 +86,7 @@ fn a_reply_is_an_acknowledgement() {
     rig.link_bytes(LinkId::URGENT, b"stop success");
     assert_eq!(rig.sent_on(LinkId::URGENT), [b"stop"]);
     rig.run(MS(5_000));
-    assert_eq!(rig.closed(), [], "nobody said so, but it is known");
+    assert_eq!(rig.closed(), [], "an answer implies the acknowledgement");
     // What follows counts from zero.
     press(&mut rig, port, 2);
     let picked = rig.now;
@@ -131,7 +131,7 @@ fn an_urgent_command_has_a_second_from_when_it_was_handed_over_and_is_sent_again
     assert_eq!(reply(&rig, port), ReplyCode::Success);
     rig.run(MS(10_000));
     assert!(rig.sent_on(LinkId::URGENT).is_empty() && rig.sent_on(LinkId::COMMAND).is_empty());
-    assert_eq!(rig.link(LinkId::URGENT).state.name(), "up", "no verdict on the second connection");
+    assert_eq!(rig.link(LinkId::URGENT).state.name(), "up", "the second connection is not to blame");
     assert_eq!(rig.counters(port).commands, 1, "picked once");
 }
 
@@ -384,7 +384,7 @@ fn a_new_connection_begins_from_nothing() {
     let sent = rig.now;
     assert_eq!(rig.sent_on(link), [float(7)]);
     rig.run(MS(300));
-    assert_eq!(rig.closed(), [], "the frames of the first connection are no matter any more");
+    assert_eq!(rig.closed(), [], "frames of the first connection do not count any more");
     rig.acked(link, float(7).len());
     rig.run(MS(100));
     assert_eq!(rig.closed(), [(sent + MS(400), link)], "none of it was acknowledged");

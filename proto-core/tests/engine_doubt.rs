@@ -1,5 +1,5 @@
-//! A safe value that something late seemed to show is taken back by what shows otherwise soon after
-//! (docs/engine.md section 6).
+//! A late packet may seem to confirm a safe value; a newer one that shows another value soon after
+//! withdraws the confirmation (docs/engine.md section 6).
 
 mod rig;
 
@@ -46,7 +46,7 @@ fn shows(rig: &mut Rig, by: LinkId, bits: u8) {
     }
 }
 
-/// Time passes, the controller shows these bits; how many frames went up.
+/// Time passes while the controller shows these bits; returns how many frames went up.
 fn sent_in(rig: &mut Rig, by: LinkId, bits: u8, millis: u64) -> usize {
     rig.log.clear();
     for _ in 0..millis / 4 {

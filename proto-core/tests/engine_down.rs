@@ -202,7 +202,7 @@ fn a_recipe_link_beats_modbus_and_the_stream() {
     rig.run(MS(10));
     assert!(rig.engine.links().all(|link| link.id == LinkId::RECIPE_UDP));
     let greetings = rig.sent_on(LinkId::RECIPE_UDP);
-    assert_eq!(greetings, [[0]], "the server streams to whoever sent it something");
+    assert_eq!(greetings, [[0]], "the server streams to addresses that sent it something");
     let values =
         [&1.5_f32.to_le_bytes()[..], &2.5_f32.to_le_bytes(), &[7, 0], &3.0_f32.to_le_bytes()].concat();
     let frame = [&[255, 255], &values[..], &[254, 254]].concat();
@@ -262,7 +262,7 @@ fn the_controllers_own_udp_client_may_fall_silent_and_come_back() {
     rig.run(MS(2_100));
     assert_eq!(rig.link(link).history.silences, 1);
     rig.bytes(port, &[255, 255, 1, 238, 238]);
-    assert!(rig.sent_on(link).is_empty(), "nobody is there");
+    assert!(rig.sent_on(link).is_empty(), "no client is connected");
     assert_eq!(rig.counters(port).undelivered, 1);
     rig.reachable.insert(link.0);
     rig.run(MS(200));

@@ -1,4 +1,4 @@
-//! A device that is gone takes what it asked for with it, and comes back with nothing but a base
+//! Commands of a device that is gone are dropped; its first frame afterwards is only a base
 //! (docs/engine.md section 7).
 
 mod rig;
@@ -52,7 +52,7 @@ fn press(rig: &mut Rig, value: u8) {
     rig.bytes(LINE, &[255, 255, value, 238, 238]);
 }
 
-/// A run is under way and a resume waits, of one port; another port's resume waits too.
+/// One port's run is in flight and its resume waits; another port's resume waits too.
 fn busy(port: PortId) -> Rig {
     let mut rig = panels();
     let other = if port == LINE { BUS } else { LINE };
@@ -76,7 +76,7 @@ fn dropped(rig: &Rig, port: PortId) -> u32 {
     rig.counters(port).commands_dropped
 }
 
-/// Of what was asked for, only the other port's resume is sent when the run is answered.
+/// When the run is answered, only the other port's resume is sent.
 #[track_caller]
 fn only_the_others_is_sent(rig: &mut Rig, gone: PortId) {
     let other = if gone == LINE { BUS } else { LINE };

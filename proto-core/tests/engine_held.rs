@@ -1,5 +1,5 @@
-//! What a silent owner sent last, and nothing reads back, goes along in a recipe link's frame for as
-//! long as the controller has had it all along, and not to one that began anew (docs/engine.md
+//! The last value of a silent owner, if nothing reads it back, stays in a recipe link's frame as long as
+//! the controller has been there since; a controller that restarted does not get it (docs/engine.md
 //! section 5).
 
 mod rig;
@@ -46,11 +46,11 @@ fn cell(by: By) -> (Rig, LinkId) {
     let mut rig = cell.rig();
     rig.run(MS(10));
     says(&mut rig, by, link);
-    assert_eq!(press(&mut rig, link, 1), Vec::<Vec<u8>>::new(), "nobody has measured yet");
+    assert_eq!(press(&mut rig, link, 1), Vec::<Vec<u8>>::new(), "no force has been measured yet");
     (rig, link)
 }
 
-/// The controller says something.
+/// The controller sends something.
 fn says(rig: &mut Rig, by: By, link: LinkId) {
     match by {
         By::Frames => rig.link_bytes(link, &[255, 255, 0, 0, 128, 63, 254, 254]),
@@ -59,7 +59,7 @@ fn says(rig: &mut Rig, by: By, link: LinkId) {
     }
 }
 
-/// Time passes and the controller goes on talking.
+/// Time passes while the controller goes on sending.
 fn live(rig: &mut Rig, by: By, link: LinkId, millis: u64) {
     for _ in 0..millis / 100 {
         says(rig, by, link);
@@ -147,7 +147,7 @@ fn a_recipe_link_that_came_up_leads_to_a_controller_that_has_nothing() {
 fn a_value_that_never_got_to_the_controller_is_not_delivered_later() {
     let (mut rig, link) = cell(By::Frames);
     rig.run(MS(1_000));
-    // The controller is off: it says nothing.
+    // The controller is off: it sends nothing.
     measures(&mut rig, 7.5);
     rig.run(MS(5_000));
     rig.log.clear();

@@ -1,5 +1,5 @@
 //! Late is judged by arrival: what waited while the driver was busy counts before deadlines pass. And
-//! old values are old, those of our own ports too (docs/engine.md sections 2 and 8).
+//! values age, those of our own ports too (docs/engine.md sections 2 and 8).
 
 mod rig;
 
@@ -18,7 +18,8 @@ const MODBUS: LinkId = LinkId::MODBUS;
 const COMMAND: LinkId = LinkId::COMMAND;
 const STATE: LinkId = LinkId::STATE;
 
-/// The driver does not call the engine for this long; the test's next input comes before the tick that is due.
+/// The driver does not call the engine for this long; the test's next input comes before the tick that
+/// is due.
 fn stall(rig: &mut Rig, millis: u64) {
     tick(rig);
     rig.now += MS(millis);
@@ -86,7 +87,7 @@ fn without_a_tick_nothing_passes_whatever_else_is_told_or_asked() {
         assert!(rig.wake <= rig.now, "asks for a tick");
         let mut buf = [0; OUTPUT_BUFFER];
         let early = Output::Sleep { until: rig.wake };
-        assert_eq!(rig.engine.poll_output(rig.now + MS(400), &mut buf), early, "asking lets nothing pass");
+        assert_eq!(rig.engine.poll_output(rig.now + MS(400), &mut buf), early, "no deadline passes");
     }
     assert_eq!(rig.take_written(), []);
     tick(&mut rig);
@@ -194,7 +195,7 @@ fn a_stream_that_waited_was_not_silent() {
     assert_eq!((rig.link(STATE).history.silences, rig.link(STATE).history.losses), (0, 0));
 }
 
-/// A button box with the codes of the source: 1 runs, 2 resumes, 3 stops, 7 asks for the state.
+/// A button box with the codes of the source: 1 runs, 2 resumes, 3 stops, 7 queries the state.
 fn panel() -> (Rig, PortId) {
     let mut cell = Cell::new();
     let table = cell.commands(&[(1, "run(pick.jspf,50)"), (2, "resume"), (3, "stop"), (7, "state")]);
@@ -268,7 +269,7 @@ fn a_value_that_is_too_old_by_then_is_not_written() {
     let answer = rig.answer(&request);
     rig.take_written();
     rig.link_bytes(MODBUS, &answer);
-    assert_eq!(rig.take_written(), [], "whether it may still go is for the tick to say");
+    assert_eq!(rig.take_written(), [], "the tick decides whether it may still go");
     tick(&mut rig);
     assert_eq!(rig.take_written(), [coils(192, 4)]);
     rig.run(MS(1_000));

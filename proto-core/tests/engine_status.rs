@@ -242,7 +242,7 @@ fn whoever_taps_sees_frames_requests_and_rejections_in_order() {
     pass(&mut engine, Input::Tick);
     pass(&mut engine, Input::LinkUp { link: LinkId::MODBUS });
     pass(&mut engine, Input::LinkSent { link: LinkId::MODBUS });
-    // Nobody listens yet.
+    // The tap has no listener yet.
     pass(&mut engine, Input::PortBytes { port: line, bytes: &outputs(9) });
     engine.tap().listen(true);
     let can = CanFrame::new(CanId::Standard(6), &[1]).unwrap();

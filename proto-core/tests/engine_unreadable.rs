@@ -72,7 +72,7 @@ fn in_a_state_packet_it_is_unknown_until_it_can_be_read() {
             assert_eq!(image.age(var("RobotState[8]"), rig.now), None, "not young, and not old");
             assert_eq!(image.age(var("RobotState[9]"), rig.now), Some(MS(0)));
             rig.run(MS(40));
-            assert!(rig.sent_to(both).is_empty(), "{on_stale:?}: nobody knows it, held or not");
+            assert!(rig.sent_to(both).is_empty(), "{on_stale:?}: it is unknown, held or not");
             assert_eq!(stale(&rig, both), before + 10);
             assert_eq!(rig.sent_to(second), vec![down(&[3.0]); 10], "the rest of the packet counts");
             rig.link_bytes(STATE, &good([4.0, 5.0]));
@@ -104,7 +104,7 @@ fn in_the_first_packet_it_was_never_known() {
 fn each_value_is_counted_once() {
     let (mut rig, both, second) = displays(OnStale::Hold);
     rig.link_bytes(STATE, &packet([f32::NAN, f32::NAN], [f32::NAN, f32::NAN]));
-    assert_eq!(rig.link(STATE).counters.unreadable, 2, "of those that somebody looks at");
+    assert_eq!(rig.link(STATE).counters.unreadable, 2, "of those that are used");
     rig.run(MS(40));
     assert!(rig.sent_to(both).is_empty() && rig.sent_to(second).is_empty());
 }
@@ -350,14 +350,14 @@ fn a_neighbour_that_cannot_be_read_is_not_written_back() {
 fn what_its_owner_sends_need_not_be_readable() {
     let (mut rig, port) = with_a_neighbour();
     rig.link_bytes(STATE, &packet([0.0; 2], [f32::NAN, 7.0]));
-    assert_eq!(rig.link(STATE).counters.unreadable, 1, "nobody has sent it yet");
+    assert_eq!(rig.link(STATE).counters.unreadable, 1, "its owner has not sent it yet");
     rig.bytes(port, &up(&[1.0]));
     assert_eq!(rig.sent_on(UDP), [up(&[1.0, 7.0])]);
     rig.link_bytes(STATE, &packet([0.0; 2], [f32::NAN, 8.0]));
     rig.bytes(port, &up(&[2.0]));
     assert_eq!(rig.sent_on(UDP), [up(&[2.0, 8.0])], "its owner is there");
     assert_eq!(rig.link(STATE).counters.unreadable, 1);
-    // Silent, and not to be read: nobody knows it.
+    // Its owner is silent and the packet unreadable: it is unknown.
     rig.run(MS(100));
     rig.link_bytes(STATE, &packet([0.0; 2], [f32::NAN, 8.0]));
     assert_eq!(rig.link(STATE).counters.unreadable, 2);

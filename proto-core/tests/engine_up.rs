@@ -344,7 +344,7 @@ fn a_port_that_falls_silent_on_hold_gives_its_variable_back() {
     rig.bytes(b, ON);
     assert_eq!(rig.sent_on(LinkId::RECIPE_UDP), [vec![255, 255, 1, 1, 238, 238]]);
     rig.run(MS(150));
-    // Somebody else switched DO1..8 meanwhile: b's frames must not switch them back.
+    // Another client switched DO1..8 meanwhile: b's frames must not switch them back.
     rig.link_bytes(LinkId::STATE, &state_packet(0, 0.0, 0xA5));
     rig.bytes(b, OFF);
     assert_eq!(rig.sent_on(LinkId::RECIPE_UDP), [vec![255, 255, 0xA5, 0, 238, 238]]);

@@ -69,27 +69,27 @@ impl TaskName {
     }
 
     fn from_code(code: u16) -> Option<Self> {
-        let [kind, number] = code.to_be_bytes();
+        let [_, number] = code.to_be_bytes();
         let port = PortId(number);
-        Some(match kind {
-            1 => Self::Engine,
-            2 => Self::Serial(port),
-            3 => Self::Can(port),
-            4 => Self::Link(LinkKind::Command),
-            5 => Self::Link(LinkKind::State),
-            6 => Self::Link(LinkKind::Modbus),
-            7 => Self::Link(LinkKind::RecipeUdp),
-            8 => Self::Link(LinkKind::RecipeTcpListen { port }),
-            9 => Self::Link(LinkKind::RecipeUdpListen { port }),
-            10 => Self::Network,
-            11 => Self::Address,
-            12 => Self::Status,
-            13 => Self::Led,
-            14 => Self::Refused,
-            15 => Self::Board(number),
-            16 => Self::Link(LinkKind::Urgent),
-            _ => return None,
-        })
+        let names = [
+            Self::Engine,
+            Self::Serial(port),
+            Self::Can(port),
+            Self::Link(LinkKind::Command),
+            Self::Link(LinkKind::State),
+            Self::Link(LinkKind::Modbus),
+            Self::Link(LinkKind::RecipeUdp),
+            Self::Link(LinkKind::RecipeTcpListen { port }),
+            Self::Link(LinkKind::RecipeUdpListen { port }),
+            Self::Network,
+            Self::Address,
+            Self::Status,
+            Self::Led,
+            Self::Refused,
+            Self::Board(number),
+            Self::Link(LinkKind::Urgent),
+        ];
+        names.into_iter().find(|name| name.code() == code)
     }
 }
 

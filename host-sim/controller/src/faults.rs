@@ -112,13 +112,14 @@ impl Controller {
         self.server.close_link(link, &mut self.outputs);
     }
 
-    /// Delays every answer of the server from now on. Without effect on the state stream, which has no answers.
+    /// Delays every answer of the server from now on. Without effect on the state stream, which has no
+    /// answers.
     pub fn delay_answers(&mut self, link: Link, delay: Duration) {
         self.faults.delay[link as usize] = delay;
     }
 
-    /// Makes the transitions of `poweron`, `poweroff`, `enable`, `disable`, `stop` and `pause` longer by `by` from
-    /// now on.
+    /// Makes the transitions of `poweron`, `poweroff`, `enable`, `disable`, `stop` and `pause` longer by `by`
+    /// from now on.
     pub fn delay_transitions(&mut self, by: Duration) {
         self.faults.transitions = by;
         self.machine.delay_transitions(by);
@@ -135,8 +136,8 @@ impl Controller {
         self.faults.state_cut = Some(len);
     }
 
-    /// Sends `instead`, such as NaN, in place of the item's value in state packets and in frames of recipes' output
-    /// parts. Modbus and programs still see the value.
+    /// Sends `instead`, such as NaN, in place of the item's value in state packets and in frames of recipes'
+    /// output parts. Modbus and programs still see the value.
     ///
     /// An item is a system variable such as `RobotState[8]`, an analog input such as `AI_V[1]`, or any
     /// other float of the state packet, such as `joint_torque[1]` (proto-core/docs/wire/state.md section 2).
@@ -175,9 +176,9 @@ impl Controller {
         }
     }
 
-    /// Switches the controller off and on: all connections are closed, the registers get the configuration's initial
-    /// values and otherwise 0, and the robot boots to power off (docs/simulated-controller.md section 1). Faults
-    /// stay.
+    /// Switches the controller off and on: all connections are closed, the registers get the configuration's
+    /// initial values and otherwise 0, and the robot boots to power off (docs/simulated-controller.md section
+    /// 1). Faults stay.
     pub fn restart(&mut self, now: Instant) {
         self.server.close_all(&mut self.outputs);
         self.running = None;
@@ -206,8 +207,8 @@ impl Controller {
 
 /// Loss of the registers.
 impl Controller {
-    /// As [`Self::restart`], but registers and outputs are 0 whatever their initial values are. Only wired inputs and
-    /// the arm have their initial values.
+    /// As [`Self::restart`], but registers and outputs are 0 whatever their initial values are. Only wired
+    /// inputs and the arm have their initial values.
     pub fn restart_cleared(&mut self, now: Instant) {
         self.restart(now);
         self.registers.clear();
@@ -221,8 +222,8 @@ impl Controller {
         self.dialect.name
     }
 
-    /// Switches to another dialect, as a software update would, and restarts the controller. Without effect if there
-    /// is no such dialect.
+    /// Switches to another dialect, as a software update would, and restarts the controller. Without effect
+    /// if there is no such dialect.
     pub fn replace_software(&mut self, now: Instant, dialect: &str) {
         if let Some(dialect) = Dialect::named(dialect) {
             self.dialect = dialect;

@@ -145,16 +145,16 @@ pub enum ControllerOutput {
         /// The bytes.
         bytes: Vec<u8>,
     },
-    /// Send a frame on a CAN port. Up to 32 follow each other; report [`ControllerInput::PortSent`] once, when
-    /// all of them were sent.
+    /// Send a frame on a CAN port. Up to 32 follow each other; report [`ControllerInput::PortSent`] once,
+    /// when all of them were sent.
     PortSendCan {
         /// The port.
         port: usize,
         /// The frame.
         frame: CanFrame,
     },
-    /// Close the connection of a TCP client port and connect again. Report [`ControllerInput::PortUp`] when it is
-    /// up; the controller counts it as down already.
+    /// Close the connection of a TCP client port and connect again. Report [`ControllerInput::PortUp`] when
+    /// it is up; the controller counts it as down already.
     PortClose {
         /// The port.
         port: usize,

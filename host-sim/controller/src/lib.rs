@@ -4,16 +4,16 @@
 //!
 //! [`Controller`] has port 2000, port 2001, Modbus, UDP 2011, recipe ports and programs behind one run loop.
 //!
-//! In: events of connections and devices, and the time. Out: data to send, and when to call again. Does not know
-//! sockets, devices or clocks; its caller does: a shell with sockets, or a test that jumps from deadline to
-//! deadline.
+//! In: events of connections and devices, and the time. Out: data to send, and when to call again. Does not
+//! know sockets, devices or clocks; its caller does: a shell with sockets, or a test that jumps from deadline
+//! to deadline.
 //!
 //! One rule: call [`Controller::handle`], then [`Controller::poll_output`] until it returns
 //! [`ControllerOutput::Sleep`]. Polling early is harmless. Errors of a peer are counted and ignored.
 //!
-//! Registers and IO are in [`registers`], the states and the commands that each allows in [`machine`], the arm's
-//! position in [`motion`], scripts in [`program`], recipe ports in `ports`, connections in `server`, and faults for
-//! tests in `faults`.
+//! Registers and IO are in [`registers`], the states and the commands that each allows in [`machine`], the
+//! arm's position in [`motion`], scripts in [`program`], recipe ports in `ports`, connections in `server`,
+//! and faults for tests in `faults`.
 
 mod build;
 mod counters;
@@ -128,8 +128,8 @@ impl Controller {
         })
     }
 
-    /// Handles one input. Call [`Self::poll_output`] until it returns [`ControllerOutput::Sleep`] after it. `now`
-    /// must not be earlier than in the last call.
+    /// Handles one input. Call [`Self::poll_output`] until it returns [`ControllerOutput::Sleep`] after it.
+    /// `now` must not be earlier than in the last call.
     pub fn handle(&mut self, now: Instant, input: ControllerInput<'_>) {
         self.begin(now);
         if self.is_shut_down {

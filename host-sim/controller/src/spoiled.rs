@@ -1,5 +1,5 @@
-//! A fault for tests: floats with another value, such as NaN, in state packets and in frames of recipes' output
-//! parts. The item itself keeps its value.
+//! A fault for tests: floats with another value, such as NaN, in state packets and in frames of recipes'
+//! output parts. The item itself keeps its value.
 
 use proto_core::sysvar::{IMAGE_BYTES, SysVar};
 use proto_core::wire::scalar::ScalarType;

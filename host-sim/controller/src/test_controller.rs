@@ -1,5 +1,5 @@
-//! The simulated controller in virtual time, for tests: clients and devices are method calls, and the clock jumps
-//! from deadline to deadline.
+//! The simulated controller in virtual time, for tests: clients and devices are method calls, and the clock
+//! jumps from deadline to deadline.
 
 use std::collections::BTreeMap;
 use std::error::Error;
@@ -14,11 +14,11 @@ use recipe_config::{InitialTarget, SimConfig};
 use super::faults::Link;
 use super::{BuildError, ConnId, Controller, ControllerInput, ControllerOutput};
 
-/// A simulated controller with its clients and devices, on a virtual clock. It opens no socket and never waits, so
-/// a test takes milliseconds and every run is the same.
+/// A simulated controller with its clients and devices, on a virtual clock. It opens no socket and never
+/// waits, so a test takes milliseconds and every run is the same.
 ///
-/// Calls that send return at once; what follows happens in [`Self::run`]. Errors of the test itself, such as the
-/// name of an item that does not exist, panic at the caller's line.
+/// Calls that send return at once; what follows happens in [`Self::run`]. Errors of the test itself, such as
+/// the name of an item that does not exist, panic at the caller's line.
 ///
 /// ```
 /// use proto_core::time::Duration;
@@ -138,8 +138,8 @@ impl TestController {
         &mut self.controller
     }
 
-    /// Advances the clock by `span`, a [`std::time::Duration`] or a [`proto_core::time::Duration`], and handles every
-    /// deadline on the way. A span of zero handles what is due now.
+    /// Advances the clock by `span`, a [`std::time::Duration`] or a [`proto_core::time::Duration`], and
+    /// handles every deadline on the way. A span of zero handles what is due now.
     ///
     /// # Panics
     /// If the controller does not handle its deadline, which would be a bug of this crate.
@@ -163,8 +163,8 @@ impl TestController {
         }
     }
 
-    /// Connects a client to one of the servers, from 127.0.0.1. Returns its connection even if the server refuses
-    /// it: [`Self::is_closed`] is true then.
+    /// Connects a client to one of the servers, from 127.0.0.1. Returns its connection even if the server
+    /// refuses it: [`Self::is_closed`] is true then.
     pub fn connect(&mut self, link: Link) -> ConnId {
         let conn = self.new_conn();
         self.links.insert(conn, link);
@@ -178,8 +178,8 @@ impl TestController {
     }
 
     /// Sends bytes from a client, in one piece: commands (proto-core/docs/wire/command.md section 2), or a
-    /// Modbus TCP request (proto-core/docs/wire/modbus.md section 2). Without effect on a closed connection, and on
-    /// port 2001, which reads nothing.
+    /// Modbus TCP request (proto-core/docs/wire/modbus.md section 2). Without effect on a closed connection,
+    /// and on port 2001, which reads nothing.
     ///
     /// A command ends with a line end, or when nothing follows it (section 5).
     pub fn send(&mut self, conn: ConnId, bytes: &[u8]) {
@@ -200,8 +200,8 @@ impl TestController {
         }
     }
 
-    /// The bytes that the client has received since the last call; empty if there are none. On port 2001 they are
-    /// packets of 1468 bytes (proto-core/docs/wire/state.md section 2).
+    /// The bytes that the client has received since the last call; empty if there are none. On port 2001 they
+    /// are packets of 1468 bytes (proto-core/docs/wire/state.md section 2).
     pub fn take(&mut self, conn: ConnId) -> Vec<u8> {
         self.received.remove(&conn).unwrap_or_default()
     }
@@ -211,20 +211,20 @@ impl TestController {
         self.closed.contains(&conn)
     }
 
-    /// Delivers bytes to an RS-485 or TCP client port, in one piece, or one datagram to a UDP client port. `port` is
-    /// its index in the configuration, from 0; without effect if there is no such port.
+    /// Delivers bytes to an RS-485 or TCP client port, in one piece, or one datagram to a UDP client port.
+    /// `port` is its index in the configuration, from 0; without effect if there is no such port.
     pub fn port_bytes(&mut self, port: usize, bytes: &[u8]) {
         self.input(ControllerInput::PortBytes { port, bytes });
     }
 
-    /// Delivers a frame to a CAN port. `port` is its index in the configuration, from 0; without effect if there is
-    /// no such port.
+    /// Delivers a frame to a CAN port. `port` is its index in the configuration, from 0; without effect if
+    /// there is no such port.
     pub fn port_frame(&mut self, port: usize, frame: CanFrame) {
         self.input(ControllerInput::PortCan { port, frame });
     }
 
-    /// Delivers a datagram from `peer` to the UDP server (port 2011). The server streams to `peer` from then on
-    /// (docs/simulated-controller.md section 5).
+    /// Delivers a datagram from `peer` to the UDP server (port 2011). The server streams to `peer` from then
+    /// on (docs/simulated-controller.md section 5).
     pub fn datagram(&mut self, peer: SocketAddr, bytes: &[u8]) {
         self.input(ControllerInput::Udp2011 { peer, bytes });
     }
@@ -234,8 +234,8 @@ impl TestController {
         std::mem::take(&mut self.sent)
     }
 
-    /// The value of a system variable or an input or output, such as `FloatInputReg[3]` or `DO[1]`. A bit is 0.0 or
-    /// 1.0; other units are those of the item (docs/configuration.md section 5).
+    /// The value of a system variable or an input or output, such as `FloatInputReg[3]` or `DO[1]`. A bit is
+    /// 0.0 or 1.0; other units are those of the item (docs/configuration.md section 5).
     ///
     /// # Panics
     /// If there is no such item.
@@ -244,7 +244,8 @@ impl TestController {
         self.controller.registers().value(target(name))
     }
 
-    /// Sets a system variable or an input or output, as outside wiring would. Name and unit are as in [`Self::value`].
+    /// Sets a system variable or an input or output, as outside wiring would. Name and unit are as in
+    /// [`Self::value`].
     ///
     /// # Panics
     /// If there is no such item, or the value is out of its range.

@@ -1,5 +1,5 @@
-//! How many wrong alignments of the simulated controller's state stream are taken for right ones:
-//! the table of proto-core/docs/wire/state.md section 3.
+//! Counts wrong alignments of the simulated controller's state stream that are not detected: the table of
+//! proto-core/docs/wire/state.md section 3.
 
 use std::net::Ipv4Addr;
 
@@ -12,7 +12,7 @@ use recipe_config::{
 use recipe_controller::motion::HOME;
 use recipe_controller::{ConnId, Controller, ControllerInput, ControllerOutput};
 
-/// A joint that is level with the next one hides a shift: poses of every kind.
+/// Poses of different kinds: equal joint positions hide a shift.
 const POSES: [(&str, [f64; 6]); 4] = [
     ("home", HOME),
     ("at work", [0.3, -1.2, 1.9, 0.7, 1.5, -0.1]),
@@ -54,7 +54,7 @@ fn config(pose: [f64; 6], power: Power, used: Use) -> SimConfig {
     SimConfig { robot, initial, ..SimConfig::default() }
 }
 
-/// What the controller sends within so many milliseconds, given commands at these.
+/// The packets of the first `millis` milliseconds, with commands at given times.
 fn packets(config: &SimConfig, commands: &[(u64, &str)], millis: u64) -> Vec<[u8; LEN]> {
     let mut controller = Controller::new(config).unwrap();
     let begin = Instant::from_millis(1_000);
@@ -83,14 +83,14 @@ fn packets(config: &SimConfig, commands: &[(u64, &str)], millis: u64) -> Vec<[u8
     }
 }
 
-/// Wrong alignments that are not seen.
+/// Numbers of wrong alignments that are not detected.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 struct Unseen {
-    /// Where nothing but six joint positions and the bools is looked at.
+    /// By a check of six joint positions and the bools only.
     by_joints_and_bools: usize,
-    /// By a packet alone.
+    /// By a check of a single packet.
     by_itself: usize,
-    /// In a stream that was right before.
+    /// In a stream that was aligned before.
     in_a_stream: usize,
 }
 
@@ -102,7 +102,7 @@ impl Unseen {
             unseen.by_joints_and_bools += usize::from(has_joints_and_bools(&shifted));
             let alone = StateView::from_array(&shifted).check_alignment().is_ok();
             unseen.by_itself += usize::from(alone);
-            // Bytes are lost between two packets: every one from there on begins too late.
+            // Bytes are lost between two packets: all later packets are shifted.
             let mut stream = StateStream::new();
             let bytes = [&packet[..], &packet[lost..], &packet[..], &packet[..], &packet[..]].concat();
             let mut rest = &bytes[..];
@@ -122,7 +122,7 @@ fn has_joints_and_bools(packet: &[u8; LEN]) -> bool {
 }
 
 #[test]
-fn no_wrong_alignment_of_a_resting_robots_stream_stays_unseen() {
+fn every_wrong_alignment_of_a_resting_robots_stream_is_detected() {
     let mut written = String::new();
     for (name, pose) in POSES {
         for (power, used) in [
@@ -170,12 +170,12 @@ fn one_packet_at_most_is_wrong_wherever_bytes_are_lost() {
             mixed += wrong;
         }
     }
-    // The one that the bytes were lost from: what stands before them is right.
+    // The packet from which bytes were lost, since its first part is correct.
     assert!(mixed > 0);
 }
 
 #[test]
-fn whatever_the_simulated_controller_does_is_right() {
+fn every_packet_of_the_simulated_controller_is_aligned() {
     let mut config = config(POSES[1].1, Power::Off, Use::Registers);
     config.robot.mode = RobotMode::Remote;
     let script =

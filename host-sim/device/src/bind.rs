@@ -1,7 +1,7 @@
-//! `--bind NAME=DEVICE`: which device a configured port is tied to.
+//! `--bind NAME=DEVICE`: the device that a configured port is bound to.
 //!
-//! Text goes in, a [`Bind`] or one message comes out. Nothing is opened here and no configuration is
-//! known: whether a port of that name exists and takes such a device is the shells' business.
+//! In: text. Out: a [`Bind`], or one error message. Opens nothing and does not know the configuration: the
+//! shells check that the port exists and can have such a device.
 
 use std::fmt;
 use std::path::PathBuf;
@@ -12,11 +12,11 @@ use std::str::FromStr;
 pub struct Bind {
     /// The configured port's name.
     pub port: String,
-    /// What it is tied to.
+    /// The device it is bound to.
     pub device: Device,
 }
 
-/// What a port can be tied to.
+/// A device that a port can be bound to.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Device {
@@ -24,10 +24,10 @@ pub enum Device {
     Pty {
         /// Where the link to the pseudoterminal appears.
         link: PathBuf,
-        /// Whether sent bytes appear at the line's speed.
+        /// Whether sent bytes appear at the baud rate.
         pace: Pace,
     },
-    /// `serial:PATH`: a serial device that exists.
+    /// `serial:PATH`: an existing serial device.
     Serial {
         /// The device, such as `/dev/ttyUSB0`.
         path: PathBuf,
@@ -37,59 +37,59 @@ pub enum Device {
         /// The interface, such as `vcan0`.
         interface: String,
     },
-    /// `slcan-pty:PATH` or `slcan-pty-unpaced:PATH`: a CAN bus of our own with a client on a new
-    /// pseudoterminal.
+    /// `slcan-pty:PATH` or `slcan-pty-unpaced:PATH`: a CAN bus in this process, with an slcan client on a
+    /// new pseudoterminal.
     SlcanPty {
         /// Where the link to the pseudoterminal appears.
         link: PathBuf,
-        /// Whether frames take their time on the bus.
+        /// Whether frames take as long as on a real bus.
         pace: Pace,
     },
-    /// `slcan-tcp:HOST:PORT[,PATH]` or `slcan-tcp-unpaced:HOST:PORT[,PATH]`: a CAN bus of our own whose
-    /// clients connect here.
+    /// `slcan-tcp:HOST:PORT[,PATH]` or `slcan-tcp-unpaced:HOST:PORT[,PATH]`: a CAN bus in this process, whose
+    /// slcan clients connect over TCP.
     SlcanTcp {
-        /// Where to listen; port 0 is any free one.
+        /// The address to listen on; port 0 is any free port.
         listen: HostPort,
-        /// Where the link to a pseudoterminal for one client more appears.
+        /// Where the link to a pseudoterminal for one more client appears.
         link: Option<PathBuf>,
-        /// Whether frames take their time on the bus.
+        /// Whether frames take as long as on a real bus.
         pace: Pace,
     },
-    /// `tcp:HOST:PORT`: a raw byte stream to somebody who listens there.
+    /// `tcp:HOST:PORT`: a raw byte stream to a TCP server.
     Tcp {
-        /// Whom to connect to.
+        /// The server's address.
         to: HostPort,
     },
-    /// `tcp-listen:HOST:PORT`, also `tcp:HOST:0`: a raw byte stream of whoever connects, one at a time.
+    /// `tcp-listen:HOST:PORT`, also `tcp:HOST:0`: a raw byte stream of one TCP client at a time.
     TcpListen {
-        /// Where to listen; port 0 is any free one.
+        /// The address to listen on; port 0 is any free port.
         listen: HostPort,
     },
 }
 
-/// Whether what is sent appears all at once or at the speed of the line or bus.
+/// The speed at which sent data appears.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Pace {
-    /// At once. On a serial line the time until the next frame may be sent still follows its speed.
+    /// At once. On a serial line, the next frame still waits as long as this one takes at the baud rate.
     #[default]
     AtOnce,
-    /// Byte by byte as a UART at the line's speed would deliver them, frame by frame on a CAN bus.
-    Line,
+    /// At the bit rate: byte by byte on a serial line, as a UART delivers them; frame by frame on a CAN bus.
+    BitRate,
 }
 
 impl Device {
-    /// Whether a serial port of the configuration can be tied to it.
+    /// Whether a serial port of the configuration can be bound to it.
     pub fn is_serial(&self) -> bool {
         !self.is_can()
     }
 
-    /// Whether a CAN port of the configuration can be tied to it.
+    /// Whether a CAN port of the configuration can be bound to it.
     pub fn is_can(&self) -> bool {
         matches!(self, Self::SocketCan { .. } | Self::SlcanPty { .. } | Self::SlcanTcp { .. })
     }
 }
 
-/// The forms `DEVICE` takes, for messages.
+/// The forms of `DEVICE`, for messages.
 pub const DEVICE_FORMS: &str = "pty:PATH, pty-paced:PATH, serial:PATH, socketcan:INTERFACE, slcan-pty:PATH, \
                                 slcan-pty-unpaced:PATH, slcan-tcp:HOST:PORT[,PATH], \
                                 slcan-tcp-unpaced:HOST:PORT[,PATH], tcp:HOST:PORT or tcp-listen:HOST:PORT";
@@ -130,13 +130,13 @@ impl FromStr for Device {
         };
         Ok(match kind {
             "pty" => Self::Pty { link: path()?, pace: Pace::AtOnce },
-            "pty-paced" => Self::Pty { link: path()?, pace: Pace::Line },
+            "pty-paced" => Self::Pty { link: path()?, pace: Pace::BitRate },
             "serial" => Self::Serial { path: path()? },
             "socketcan" if rest.is_empty() => return Err(BindError::Empty { kind: kind.to_owned() }),
             "socketcan" => Self::SocketCan { interface: rest.to_owned() },
-            "slcan-pty" => Self::SlcanPty { link: path()?, pace: Pace::Line },
+            "slcan-pty" => Self::SlcanPty { link: path()?, pace: Pace::BitRate },
             "slcan-pty-unpaced" => Self::SlcanPty { link: path()?, pace: Pace::AtOnce },
-            "slcan-tcp" => slcan_tcp(Pace::Line)?,
+            "slcan-tcp" => slcan_tcp(Pace::BitRate)?,
             "slcan-tcp-unpaced" => slcan_tcp(Pace::AtOnce)?,
             "tcp" => match address()? {
                 listen @ HostPort { port: 0, .. } => Self::TcpListen { listen },
@@ -152,7 +152,7 @@ impl fmt::Display for Device {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Pty { link, pace: Pace::AtOnce } => write!(f, "pty:{}", link.display()),
-            Self::Pty { link, pace: Pace::Line } => write!(f, "pty-paced:{}", link.display()),
+            Self::Pty { link, pace: Pace::BitRate } => write!(f, "pty-paced:{}", link.display()),
             Self::Serial { path } => write!(f, "serial:{}", path.display()),
             Self::SocketCan { interface } => write!(f, "socketcan:{interface}"),
             Self::SlcanPty { link, pace } => write!(f, "slcan-pty{}:{}", unpaced(*pace), link.display()),
@@ -169,7 +169,7 @@ impl fmt::Display for Device {
 fn unpaced(pace: Pace) -> &'static str {
     match pace {
         Pace::AtOnce => "-unpaced",
-        Pace::Line => "",
+        Pace::BitRate => "",
     }
 }
 
@@ -179,7 +179,7 @@ impl fmt::Display for Bind {
     }
 }
 
-/// A host name or address with a port, as `HOST:PORT`; an IPv6 address stands in brackets.
+/// A host name or address with a port, as `HOST:PORT`, with an IPv6 address in brackets.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct HostPort {
     /// Name or address, without brackets.
@@ -230,7 +230,7 @@ pub enum BindError {
         /// What was given.
         text: String,
     },
-    /// Not one of the forms.
+    /// Not a known form.
     UnknownDevice {
         /// The device as given.
         text: String,
@@ -245,7 +245,7 @@ pub enum BindError {
         /// The device's kind.
         kind: String,
     },
-    /// The address is not one.
+    /// The address is malformed.
     Address {
         /// The device's kind.
         kind: String,
@@ -281,7 +281,7 @@ pub enum HostPortError {
     NoHost,
     /// The port is not a number of 0..=65535.
     BadPort,
-    /// An IPv6 address without its brackets, or half of them.
+    /// An IPv6 address without brackets, or with only one.
     Brackets,
 }
 
@@ -303,7 +303,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_form_is_read_and_written_alike() {
+    fn every_form_is_written_as_it_was_read() {
         for text in [
             "rs485-1=pty:run/rs485-1",
             "rs485-1=pty-paced:run/rs485-1",

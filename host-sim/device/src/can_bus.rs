@@ -1,4 +1,5 @@
-//! A CAN bus in user space (proto-core/docs/wire/slcan.md section 4): a port of ours and any number of slcan clients.
+//! A CAN bus in user space (proto-core/docs/wire/slcan.md section 4), with one port and any number of slcan
+//! clients.
 
 use std::cell::{Cell, RefCell};
 use std::collections::VecDeque;
@@ -19,13 +20,13 @@ use tracing::{info, warn};
 use super::bind::{Device, Pace};
 use super::exchange::{Backlog, PortEvent, PortTx};
 use super::pty::Pty;
-use super::stream::{ByteStream, accept};
-use super::wire::{Crossed, Full, NodeId, Pacing, Wire};
-use recipe_net::peer;
+use super::stream::{self, ByteStream, accept};
+use super::wire::{Full, NodeId, Pacing, Transmitted, Wire};
+use recipe_net::fairness::{arrival_time, yield_fairly};
+use recipe_net::tcp_options;
 use recipe_net::timer::{Timer, now};
-use recipe_net::turns::{arrival, give_way};
 
-/// The bus itself; clones are the same bus.
+/// A bus; a clone is the same bus.
 #[derive(Debug, Clone)]
 pub struct CanBus {
     shared: Rc<Shared>,
@@ -35,26 +36,26 @@ pub struct CanBus {
 struct Shared {
     wire: RefCell<Wire>,
     nodes: RefCell<Vec<Rc<NodeState>>>,
-    /// The wire's deadline has moved.
-    moved: Notify,
-    /// Where dropped frames are counted.
+    deadline_moved: Notify,
+    /// For the counter of dropped frames.
     tx: Rc<PortTx>,
 }
 
 #[derive(Debug)]
 struct NodeState {
     id: NodeId,
+    /// Received frames, each with the time of its end.
     queue: RefCell<VecDeque<(Instant, CanFrame)>>,
     wake: Notify,
-    deaf: Cell<bool>,
+    is_receiving: Cell<bool>,
     dropped: Cell<u64>,
-    left: Cell<Left>,
-    left_wake: Notify,
+    sent: Cell<Sent>,
+    sent_wake: Notify,
 }
 
-/// What a node has sent and not yet been told of.
+/// Transmissions of a node since the last report.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct Left {
+pub struct Sent {
     /// Frames.
     pub frames: u64,
     /// Their data bytes.
@@ -62,28 +63,30 @@ pub struct Left {
 }
 
 impl CanBus {
-    /// A bus without nodes. What they drop is counted at `tx`.
+    /// A bus without nodes. Frames that they drop are counted at `tx`.
     pub fn new(pacing: Pacing, tx: Rc<PortTx>) -> Self {
         let wire = RefCell::new(Wire::new(pacing));
-        Self { shared: Rc::new(Shared { wire, nodes: RefCell::default(), moved: Notify::new(), tx }) }
+        Self {
+            shared: Rc::new(Shared { wire, nodes: RefCell::default(), deadline_moved: Notify::new(), tx }),
+        }
     }
 
-    /// Joins the bus with a node that hears everything.
+    /// Adds a node that receives all frames.
     pub fn join(&self) -> Node {
         let state = Rc::new(NodeState {
             id: self.shared.wire.borrow_mut().join(),
             queue: RefCell::default(),
             wake: Notify::new(),
-            deaf: Cell::new(false),
+            is_receiving: Cell::new(true),
             dropped: Cell::new(0),
-            left: Cell::default(),
-            left_wake: Notify::new(),
+            sent: Cell::default(),
+            sent_wake: Notify::new(),
         });
         self.shared.nodes.borrow_mut().push(Rc::clone(&state));
         Node { bus: self.clone(), state }
     }
 
-    /// Lets time pass on the bus until dropped.
+    /// Advances the bus with the clock until dropped.
     ///
     /// # Errors
     /// As [`Timer::new`] and [`Timer::expired`].
@@ -97,25 +100,25 @@ impl CanBus {
                     expired?;
                     self.advance(now());
                 }
-                () = self.shared.moved.notified() => {}
+                () = self.shared.deadline_moved.notified() => {}
             }
         }
     }
 
-    /// Hands out what has crossed the wire by now: every node but the sender gets it that hears, or
-    /// drops and counts it when [`MAX_WAITING`] frames wait there already.
+    /// Delivers the frames that were transmitted by now to every receiving node except the sender. A node
+    /// with [`MAX_WAITING`] frames waiting drops and counts a frame.
     pub fn advance(&self, now: Instant) {
         loop {
-            let crossed = self.shared.wire.borrow_mut().poll(now);
-            let Some(Crossed { from, frame, at }) = crossed else { return };
+            let transmitted = self.shared.wire.borrow_mut().poll(now);
+            let Some(Transmitted { from, frame, at }) = transmitted else { return };
             for node in self.shared.nodes.borrow().iter() {
                 if node.id == from {
-                    let Left { frames, bytes } = node.left.get();
-                    node.left.set(Left { frames: frames + 1, bytes: bytes + frame.data().len() as u64 });
-                    node.left_wake.notify_one();
+                    let Sent { frames, bytes } = node.sent.get();
+                    node.sent.set(Sent { frames: frames + 1, bytes: bytes + frame.data().len() as u64 });
+                    node.sent_wake.notify_one();
                     continue;
                 }
-                if node.deaf.get() {
+                if !node.is_receiving.get() {
                     continue;
                 }
                 let mut queue = node.queue.borrow_mut();
@@ -131,7 +134,7 @@ impl CanBus {
     }
 }
 
-/// One member of a bus; leaves it when dropped, and what it has not sent by then is given up.
+/// A node of a bus. Dropping it removes it from the bus and drops its waiting frames.
 #[derive(Debug)]
 pub struct Node {
     bus: CanBus,
@@ -139,10 +142,10 @@ pub struct Node {
 }
 
 impl Node {
-    /// Queues a frame for the wire.
+    /// Queues a frame for transmission.
     ///
     /// # Errors
-    /// When too many wait, see [`Full`].
+    /// [`Full`] if too many wait.
     pub fn send(&self, now: Instant, frame: CanFrame) -> Result<(), Full> {
         let wire = &self.bus.shared.wire;
         self.bus.advance(now);
@@ -150,7 +153,7 @@ impl Node {
         wire.borrow_mut().send(now, self.state.id, frame)?;
         self.bus.advance(now);
         if wire.borrow().deadline() != before {
-            self.bus.shared.moved.notify_one();
+            self.bus.shared.deadline_moved.notify_one();
         }
         Ok(())
     }
@@ -160,23 +163,23 @@ impl Node {
         self.bus.shared.wire.borrow().is_full(self.state.id)
     }
 
-    /// Frames of this node that have not left.
+    /// Number of frames of this node that have not been transmitted.
     pub fn waiting(&self) -> usize {
         self.bus.shared.wire.borrow().waiting(self.state.id)
     }
 
-    /// Waits until frames of this node have left. Cancel safe.
-    pub async fn left(&self) -> Left {
+    /// Waits until frames of this node have been transmitted, and returns their number. Cancel safe.
+    pub async fn sent(&self) -> Sent {
         loop {
-            let left = self.state.left.take();
-            if left.frames > 0 {
-                return left;
+            let sent = self.state.sent.take();
+            if sent.frames > 0 {
+                return sent;
             }
-            self.state.left_wake.notified().await;
+            self.state.sent_wake.notified().await;
         }
     }
 
-    /// The next frame that others sent, with the time of its end.
+    /// The next received frame, with the time of its end.
     pub fn try_recv(&self) -> Option<(Instant, CanFrame)> {
         self.state.queue.borrow_mut().pop_front()
     }
@@ -191,15 +194,15 @@ impl Node {
         }
     }
 
-    /// Whether frames of others come here from now on; those that wait are given up when they don't.
-    pub fn set_hears(&self, hears: bool) {
-        self.state.deaf.set(!hears);
-        if !hears {
+    /// Starts or stops receiving frames of other nodes. Stopping drops those that wait.
+    pub fn set_receiving(&self, is_receiving: bool) {
+        self.state.is_receiving.set(is_receiving);
+        if !is_receiving {
             self.state.queue.borrow_mut().clear();
         }
     }
 
-    /// Frames dropped here because too many waited.
+    /// Number of received frames dropped because too many waited.
     pub fn dropped(&self) -> u64 {
         self.state.dropped.get()
     }
@@ -212,7 +215,7 @@ impl Drop for Node {
     }
 }
 
-/// A CAN port of the configuration, on a bus of its own that slcan clients join.
+/// A CAN port of the configuration, on a bus of its own that slcan clients connect to.
 #[derive(Debug)]
 pub(super) struct CanPort {
     pty: Option<Pty>,
@@ -233,28 +236,22 @@ impl CanPort {
             }
         };
         let listener = match listen {
-            Some(listen) => {
-                let listener = TcpListener::bind((listen.host.as_str(), listen.port)).await;
-                let listener =
-                    listener.map_err(|error| io::Error::new(error.kind(), format!("{listen}: {error}")))?;
-                // Frames that wait in the kernel are old when they are read, and are not counted.
-                peer::bound(&listener);
-                Some(listener)
-            }
+            Some(at) => Some(stream::listen(at).await?),
             None => None,
         };
         let pty = link.map(|link| Pty::open(link)).transpose()?;
         let pacing = match pace {
             Pace::AtOnce => Pacing::AtOnce,
-            Pace::Line => Pacing::Bitrate(bitrate),
+            Pace::BitRate => Pacing::Bitrate(bitrate),
         };
         Ok(Self { pty, listener, bitrate, pacing, tx })
     }
 
-    /// Of a bus with both, where it listens: the terminal's link is in the configuration anyway.
+    /// If there are a listener and a terminal, the listener's address: the terminal's link is in the
+    /// `--bind`.
     pub(super) fn place(&self) -> String {
         match (&self.listener, &self.pty) {
-            (Some(listener), _) => listener.local_addr().map_or_else(|_| String::new(), |at| at.to_string()),
+            (Some(listener), _) => stream::address_of(listener),
             (None, Some(pty)) => pty.link().display().to_string(),
             (None, None) => String::new(),
         }
@@ -299,10 +296,10 @@ async fn port_node(node: &Node, tx: &PortTx, events: &mut impl FnMut(PortEvent<'
                 events(PortEvent::Frame { frame });
             }
             () = tx.wake.notified() => hand_over(node, tx),
-            left = node.left() => {
+            sent = node.sent() => {
                 tx.count(|counters| {
-                    counters.frames_out += left.frames;
-                    counters.bytes_out += left.bytes;
+                    counters.frames_out += sent.frames;
+                    counters.bytes_out += sent.bytes;
                 });
                 hand_over(node, tx);
                 if node.waiting() == 0 {
@@ -317,7 +314,7 @@ async fn port_node(node: &Node, tx: &PortTx, events: &mut impl FnMut(PortEvent<'
 fn hand_over(node: &Node, tx: &PortTx) {
     while !node.is_full() {
         let Some(frame) = tx.frames.borrow_mut().pop_front() else { return };
-        // There is room, so it is taken.
+        // It cannot fail: there is room.
         let _ = node.send(now(), frame);
     }
 }
@@ -330,23 +327,23 @@ async fn serve_all(listener: TcpListener, bus: &CanBus, bitrate: u32, tx: &Rc<Po
                 if clients.len() == MAX_CLIENTS {
                     drop(stream);
                     tx.count(|counters| counters.refused += 1);
-                    if let Some(more) = tx.complaints.take(now()) {
+                    if let Some(more) = tx.log_limit.allow(now()) {
                         warn!(%peer, more, "refused: the bus already has {MAX_CLIENTS} slcan clients");
                     }
-                    give_way().await;
+                    yield_fairly().await;
                     continue;
                 }
                 info!(%peer, "slcan client connected");
-                peer::watch(&stream);
+                tcp_options::enable_keepalive(&stream);
                 let (node, tx) = (bus.join(), Rc::clone(tx));
                 clients.spawn_local(async move {
                     let error = serve(&stream, &node, bitrate, &tx).await;
                     info!(%peer, %error, "slcan client disconnected");
                     drop(stream);
-                    // What was answered as sent is sent.
-                    node.set_hears(false);
+                    // Frames that were acknowledged to the client are still sent.
+                    node.set_receiving(false);
                     while node.waiting() > 0 {
-                        node.left().await;
+                        node.sent().await;
                     }
                 });
             }
@@ -355,20 +352,20 @@ async fn serve_all(listener: TcpListener, bus: &CanBus, bitrate: u32, tx: &Rc<Po
     }
 }
 
-/// Ties one client to the bus until its connection fails.
+/// Serves one client until its connection fails.
 async fn serve(io: &impl ByteStream, node: &Node, bitrate: u32, tx: &PortTx) -> io::Error {
     let mut channel = Channel::new(bitrate);
-    node.set_hears(false);
+    node.set_receiving(false);
     let mut out = Vec::new();
-    let mut buf = [0; OLD_CHUNK];
+    let mut buf = [0; BACKLOG_CHUNK];
     let mut unread = 0..0;
-    let mut told_dropped = 0;
+    let mut reported_dropped = 0;
     let (mut backlog, mut is_old) = (Backlog::default(), false);
     loop {
-        // A frame waits in the bounded queue until the client has taken what is before it, and a
-        // client's line until its frames before it have left.
+        // A frame waits in the bounded queue until the client has read what is before it, and a command until
+        // the frames before it have been transmitted.
         let room = out.len() < MAX_PENDING;
-        let most = if backlog.is_open(tx) { OLD_CHUNK } else { CHUNK };
+        let most = if backlog.is_open(tx) { BACKLOG_CHUNK } else { CHUNK };
         let mut read = None;
         let done = tokio::select! {
             received = io.receive(&mut buf[..most]), if room && unread.is_empty() => {
@@ -377,14 +374,14 @@ async fn serve(io: &impl ByteStream, node: &Node, bitrate: u32, tx: &PortTx) -> 
                     Ok(count) => {
                         unread = 0..count;
                         read = Some(count);
-                        // Taking its time on the bus a frame would be believed when it is over.
+                        // Dropped here: after its time on the bus the engine would no longer discard it.
                         is_old = backlog.has(tx, count == most) || tx.is_stale();
                         Ok(())
                     }
                     Err(error) => Err(error),
                 }
             }
-            _ = node.left(), if !unread.is_empty() => Ok(()),
+            _ = node.sent(), if !unread.is_empty() => Ok(()),
             (at, frame) = node.recv(), if room => {
                 let mut next = Some((at, frame));
                 while let Some((at, frame)) = next {
@@ -394,30 +391,30 @@ async fn serve(io: &impl ByteStream, node: &Node, bitrate: u32, tx: &PortTx) -> 
                 Ok(())
             }
             ready = io.writable(), if !out.is_empty() => ready,
-            () = tokio::time::sleep(STALE_LOOK), if io.may_be_stale() => Ok(()),
+            () = tokio::time::sleep(CLIENT_POLL), if io.may_hold_unread() => Ok(()),
         };
-        take_lines(&mut channel, node, is_old.then_some(tx), &buf, &mut unread, &mut out);
+        execute_commands(&mut channel, node, is_old.then_some(tx), &buf, &mut unread, &mut out);
         let done = done.and_then(|()| flush(io, &mut out, tx));
-        if node.dropped() != told_dropped {
-            told_dropped = node.dropped();
+        if node.dropped() != reported_dropped {
+            reported_dropped = node.dropped();
             channel.note_overrun();
         }
         match done {
             Err(error) if error.kind() != io::ErrorKind::WouldBlock => return error,
             _ => {}
         }
-        // One read holds fewer frames than a node keeps: others take them in between.
+        // One read holds fewer frames than a node's queue; other tasks empty the queue in between.
         match read {
-            Some(count) if count == most && !tx.is_stale() => give_way().await,
+            Some(count) if count == most && !tx.is_stale() => yield_fairly().await,
             Some(_) => yield_now().await,
             None => {}
         }
     }
 }
 
-/// Carries out a client's lines as long as the node has room for the frames in them. Old frames are dropped
-/// and counted.
-fn take_lines(
+/// Executes a client's commands as long as the node has room for their frames. Old frames are dropped and
+/// counted.
+fn execute_commands(
     channel: &mut Channel,
     node: &Node,
     old: Option<&PortTx>,
@@ -431,24 +428,24 @@ fn take_lines(
             out.extend_from_slice(reaction.answer);
             match (reaction.frame, old) {
                 (Some(_), Some(tx)) => tx.count(|counters| counters.dropped += 1),
-                // There is room, so it is taken.
-                (Some(frame), None) => drop(node.send(arrival(), frame)),
+                // It cannot fail: there is room.
+                (Some(frame), None) => drop(node.send(arrival_time(), frame)),
                 (None, _) => {}
             }
         }
         unread.start = unread.end - bytes.len();
     }
-    // Frames that nobody could look at when they came have crossed the bus meanwhile.
+    // Frames read late may already have been transmitted.
     node.bus.advance(now());
-    let hears = channel.state() != ChannelState::Closed;
-    if node.state.deaf.get() == hears {
-        node.set_hears(hears);
+    let is_receiving = channel.state() != ChannelState::Closed;
+    if node.state.is_receiving.get() != is_receiving {
+        node.set_receiving(is_receiving);
     }
 }
 
-/// Writes what the client takes; what nobody would hear is given up.
+/// Writes as much as the client takes; without a client everything is dropped and counted.
 fn flush(io: &impl ByteStream, out: &mut Vec<u8>, tx: &PortTx) -> io::Result<()> {
-    if !io.is_heard() {
+    if !io.has_client() {
         tx.count(|counters| counters.unheard += out.len() as u64);
         out.clear();
     }
@@ -459,19 +456,19 @@ fn flush(io: &impl ByteStream, out: &mut Vec<u8>, tx: &PortTx) -> io::Result<()>
     Ok(())
 }
 
-/// Most frames that wait for one node.
+/// Maximum number of received frames that wait at one node.
 pub const MAX_WAITING: usize = 256;
-/// Most slcan clients on TCP.
+/// Maximum number of slcan clients on TCP.
 const MAX_CLIENTS: usize = 32;
-/// Most bytes read from a client at once.
+/// Maximum number of bytes per read from a client.
 const CHUNK: usize = 256;
-/// The same of what waited while the process slept: of that no frames come. A terminal that had more gives
-/// exactly this.
-const OLD_CHUNK: usize = 4_095;
-/// Bytes made out for a client and not yet taken; beyond it frames wait in the node's queue.
+/// The same for bytes that waited while the process slept, whose frames are dropped. A terminal with more
+/// waiting returns exactly this number.
+const BACKLOG_CHUNK: usize = 4_095;
+/// Maximum number of bytes that wait for a client; beyond it frames wait in the node's queue.
 const MAX_PENDING: usize = 4_096;
-/// Between two looks for a client that went away and left bytes behind.
-const STALE_LOOK: StdDuration = StdDuration::from_millis(100);
+/// Interval at which is checked whether a client has gone and left bytes unread.
+const CLIENT_POLL: StdDuration = StdDuration::from_millis(100);
 
 #[cfg(test)]
 #[path = "can_bus_tests.rs"]

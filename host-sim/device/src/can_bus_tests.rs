@@ -1,4 +1,4 @@
-//! The bus with real slcan clients on TCP and a terminal.
+//! The bus with real slcan clients, on TCP and a terminal.
 
 use std::io::Write;
 
@@ -9,7 +9,7 @@ use tokio::net::TcpStream;
 
 use super::super::port::{Port, PortBus};
 use super::super::test_kit::{Client, Running, Seen, run};
-use super::super::wire::{MAX_QUEUED, bits_on_the_wire};
+use super::super::wire::{MAX_QUEUED, frame_bits};
 use super::*;
 
 const START: Instant = Instant::from_micros(1_000);
@@ -22,12 +22,12 @@ fn frame(id: u16, data: &[u8]) -> CanFrame {
 /// An slcan client on TCP that opened its channel.
 async fn client(port: &Running) -> TcpStream {
     let mut stream = TcpStream::connect(&port.place).await.unwrap();
-    say(&mut stream, b"C\rS6\r\rO\rO\r", b"\r\r\r\r").await;
+    exchange(&mut stream, b"C\rS6\r\rO\rO\r", b"\r\r\r\r").await;
     stream
 }
 
 #[track_caller]
-fn say(stream: &mut TcpStream, text: &[u8], answer: &[u8]) -> impl Future<Output = ()> {
+fn exchange(stream: &mut TcpStream, text: &[u8], answer: &[u8]) -> impl Future<Output = ()> {
     let at = std::panic::Location::caller();
     async move {
         stream.write_all(text).await.unwrap();
@@ -41,25 +41,25 @@ fn bus(pacing: Pacing) -> CanBus {
     CanBus::new(pacing, Rc::default())
 }
 
-/// The frame that waits at a node.
-fn heard(node: &Node) -> Option<CanFrame> {
+/// The next frame received at a node.
+fn received(node: &Node) -> Option<CanFrame> {
     node.try_recv().map(|(_, frame)| frame)
 }
 
 #[test]
-fn a_node_hears_all_others_and_never_itself() {
+fn a_node_receives_all_others_and_never_itself() {
     let bus = bus(Pacing::AtOnce);
     let (a, b, c) = (bus.join(), bus.join(), bus.join());
-    c.set_hears(false);
+    c.set_receiving(false);
     a.send(START, frame(1, &[])).unwrap();
     b.send(START, frame(2, &[])).unwrap();
-    assert_eq!((heard(&a), heard(&a)), (Some(frame(2, &[])), None));
-    assert_eq!((heard(&b), heard(&b)), (Some(frame(1, &[])), None));
-    assert_eq!(heard(&c), None);
+    assert_eq!((received(&a), received(&a)), (Some(frame(2, &[])), None));
+    assert_eq!((received(&b), received(&b)), (Some(frame(1, &[])), None));
+    assert_eq!(received(&c), None);
     drop(b);
-    c.set_hears(true);
+    c.set_receiving(true);
     a.send(START, frame(3, &[])).unwrap();
-    assert_eq!(heard(&c), Some(frame(3, &[])));
+    assert_eq!(received(&c), Some(frame(3, &[])));
 }
 
 #[test]
@@ -70,12 +70,12 @@ fn a_node_that_does_not_read_keeps_the_oldest_frames_and_counts_the_rest() {
         fast.send(START, frame(id, &[])).unwrap();
     }
     assert_eq!((slow.dropped(), bus.shared.tx.counters().dropped), (10, 10));
-    assert_eq!(heard(&slow), Some(frame(0, &[])));
-    assert_eq!(std::iter::from_fn(|| heard(&slow)).count(), MAX_WAITING - 1);
+    assert_eq!(received(&slow), Some(frame(0, &[])));
+    assert_eq!(std::iter::from_fn(|| received(&slow)).count(), MAX_WAITING - 1);
 }
 
 #[test]
-fn nobody_hears_a_frame_before_its_end() {
+fn no_frame_is_received_before_its_end() {
     let bus = bus(Pacing::Bitrate(500_000));
     let (a, b) = (bus.join(), bus.join());
     a.send(START, frame(0, &[])).unwrap();
@@ -94,20 +94,20 @@ fn clients_on_tcp_and_the_port_are_one_bus() {
         port.expect(Seen::Up).await;
         let mut one = client(&port).await;
         let mut two = client(&port).await;
-        say(&mut one, b"t0013010203\r", b"z\r").await;
-        say(&mut two, b"", b"t0013010203\r").await;
+        exchange(&mut one, b"t0013010203\r", b"z\r").await;
+        exchange(&mut two, b"", b"t0013010203\r").await;
         port.expect(Seen::Frame(frame(1, &[1, 2, 3]))).await;
         let start = now();
         for id in 2..4 {
             port.tx.send_frame(frame(id, &[0x7D; 3]));
         }
-        say(&mut one, b"", b"t00237D7D7D\rt00337D7D7D\r").await;
-        say(&mut two, b"", b"t00237D7D7D\rt00337D7D7D\r").await;
+        exchange(&mut one, b"", b"t00237D7D7D\rt00337D7D7D\r").await;
+        exchange(&mut two, b"", b"t00237D7D7D\rt00337D7D7D\r").await;
         // Twice 71 bits and more at 500 kbit/s.
         assert!(port.expect(Seen::Sent).await.saturating_since(start) >= Duration::from_micros(284));
         drop(one);
-        say(&mut two, b"T000000050\rr7FF0\r", b"").await;
-        say(&mut two, b"C\r", b"Z\rz\r\r").await;
+        exchange(&mut two, b"T000000050\rr7FF0\r", b"").await;
+        exchange(&mut two, b"C\r", b"Z\rz\r\r").await;
         port.expect(Seen::Frame(CanFrame::new(CanId::Extended(5), &[]).unwrap())).await;
         port.expect(Seen::Frame(CanFrame::remote(CanId::Standard(0x7FF), 0).unwrap())).await;
         let counters = port.tx.counters();
@@ -144,24 +144,24 @@ fn a_client_that_does_not_read_loses_frames_and_others_do_not() {
     run(async |_| {
         let port = Running::start("slcan-tcp-unpaced:127.0.0.1:0", BUS).await;
         port.expect(Seen::Up).await;
-        let _lazy = client(&port).await;
+        let _slow = client(&port).await;
         let mut busy = client(&port).await;
         let mut count = 0_u64;
         while port.tx.counters().dropped == 0 {
             let burst: Vec<u8> = (0..200).flat_map(|_| b"t00181122334455667788\r".to_owned()).collect();
-            say(&mut busy, &burst, &b"z\r".repeat(200)).await;
+            exchange(&mut busy, &burst, &b"z\r".repeat(200)).await;
             count += 200;
             for _ in 0..200 {
                 port.expect(Seen::Frame(frame(1, &[0x11, 0x22, 0x33, 0x44, 0x55, 0x66, 0x77, 0x88]))).await;
             }
             assert!(count < 2_000_000, "buffered without bound");
         }
-        say(&mut busy, b"F\r", b"F00\r").await;
+        exchange(&mut busy, b"F\r", b"F00\r").await;
     });
 }
 
-/// Reads frames' lines until there are `count`, skipping `z` and CR answers; their ids.
-async fn ids_heard(stream: &mut TcpStream, count: usize) -> Vec<u16> {
+/// Reads `count` frames, skipping `z` and CR answers; returns their ids.
+async fn received_ids(stream: &mut TcpStream, count: usize) -> Vec<u16> {
     let mut ids = Vec::new();
     let mut line = Vec::new();
     while ids.len() < count {
@@ -179,7 +179,7 @@ async fn ids_heard(stream: &mut TcpStream, count: usize) -> Vec<u16> {
 }
 
 #[test]
-fn bursts_of_two_clients_and_the_port_take_turns_by_id_and_their_time_on_the_wire() {
+fn bursts_of_two_clients_and_the_port_are_arbitrated_and_take_their_time() {
     run(async |dir| {
         let bus = PortBus::Can { bitrate: 10_000 };
         let link = dir.join("can").display().to_string();
@@ -188,28 +188,28 @@ fn bursts_of_two_clients_and_the_port_take_turns_by_id_and_their_time_on_the_wir
         let mut watcher = TcpStream::connect(&port.place).await.unwrap();
         let mut one = TcpStream::connect(&port.place).await.unwrap();
         let mut two = Client::open(&link);
-        say(&mut watcher, b"O\r", b"\r").await;
-        say(&mut one, b"O\r", b"\r").await;
+        exchange(&mut watcher, b"O\r", b"\r").await;
+        exchange(&mut one, b"O\r", b"\r").await;
         two.0.write_all(b"O\r").unwrap();
         assert_eq!(two.read_exact(1).await, b"\r");
         let start = now();
-        // These win against all others and take a quarter of a second: the others are in by then.
+        // These win the arbitration and take a quarter of a second; the others are queued by then.
         for _ in 0..24 {
             port.tx.send_frame(frame(0, &[0x55; 8]));
         }
         for id in [0x250, 0x010, 0x400] {
             port.tx.send_frame(frame(id, &[]));
         }
-        say(&mut one, b"t3000\rt1000\r", b"z\rz\r").await;
+        exchange(&mut one, b"t3000\rt1000\r", b"z\rz\r").await;
         two.0.write_all(b"t2000\rt2010\r").unwrap();
-        // A client that leaves at once has sent all the same.
+        // A client that disconnects at once has sent all the same.
         let mut brief = TcpStream::connect(&port.place).await.unwrap();
-        say(&mut brief, b"O\rt3500\r", b"\rz\r").await;
+        exchange(&mut brief, b"O\rt3500\r", b"\rz\r").await;
         drop(brief);
         let order = [0x200, 0x201, 0x250, 0x010, 0x300, 0x100, 0x350, 0x400];
-        assert_eq!(ids_heard(&mut watcher, 24 + order.len()).await[24..], order);
-        let bits = order.map(|id| bits_on_the_wire(&frame(id, &[]))).iter().sum::<u32>()
-            + 24 * bits_on_the_wire(&frame(0, &[0x55; 8]));
+        assert_eq!(received_ids(&mut watcher, 24 + order.len()).await[24..], order);
+        let bits = order.map(|id| frame_bits(&frame(id, &[]))).iter().sum::<u32>()
+            + 24 * frame_bits(&frame(0, &[0x55; 8]));
         let took = now().saturating_since(start);
         assert!(took >= Duration::from_micros(100 * u64::from(bits)), "{took:?} for {bits} bits");
         let counters = port.tx.counters();
@@ -230,9 +230,9 @@ fn a_burst_longer_than_the_queue_waits_in_its_connection_and_nothing_is_lost() {
         for id in 0..count {
             port.expect(Seen::Frame(frame(id, &[]))).await;
         }
-        let bits: u32 = (0..count).map(|id| bits_on_the_wire(&frame(id, &[]))).sum();
+        let bits: u32 = (0..count).map(|id| frame_bits(&frame(id, &[]))).sum();
         assert!(now().saturating_since(start) >= Duration::from_micros(bits.into()));
-        say(&mut one, b"", format!("\r{}\r", "z\r".repeat(count.into())).as_bytes()).await;
+        exchange(&mut one, b"", format!("\r{}\r", "z\r".repeat(count.into())).as_bytes()).await;
     });
 }
 
@@ -242,13 +242,13 @@ fn a_client_that_reads_loses_nothing_of_an_unpaced_burst() {
         let port = Running::start("slcan-tcp-unpaced:127.0.0.1:0", BUS).await;
         let (mut one, mut two) = (client(&port).await, client(&port).await);
         one.write_all(&b"t0010\r".repeat(2_000)).await.unwrap();
-        assert_eq!(ids_heard(&mut two, 2_000).await, [1; 2_000]);
+        assert_eq!(received_ids(&mut two, 2_000).await, [1; 2_000]);
         assert_eq!(port.tx.counters().dropped, 0);
     });
 }
 
 #[test]
-fn more_clients_than_the_bound_are_turned_away() {
+fn more_clients_than_the_maximum_are_refused() {
     run(async |_| {
         let port = Running::start("slcan-tcp:127.0.0.1:0", BUS).await;
         let mut clients = Vec::new();
@@ -259,17 +259,17 @@ fn more_clients_than_the_bound_are_turned_away() {
         assert_eq!(late.read(&mut [0; 8]).await.unwrap(), 0);
         assert_eq!(port.tx.counters().refused, 1);
         let mut first = clients.swap_remove(0);
-        say(&mut first, b"V\r", b"V1013\r").await;
+        exchange(&mut first, b"V\r", b"V1013\r").await;
     });
 }
 
 #[test]
-fn what_does_not_suit_the_bus_is_refused_by_name() {
+fn an_unsuitable_device_is_refused_by_name() {
     run(async |_| {
         let refused =
             async |device: &str| Port::open(&device.parse().unwrap(), BUS).await.unwrap_err().to_string();
         assert!(refused("pty:x").await.contains("is a serial device"));
-        // Whether this machine has CAN interfaces or not.
+        // With and without CAN interfaces on this machine.
         let why = refused("socketcan:no-such-can").await;
         assert!(
             why.starts_with("no-such-can: ") && why.ends_with("docs/socketcan.md says how to get one"),

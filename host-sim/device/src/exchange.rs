@@ -1,5 +1,4 @@
-//! The exchange between a port's device and the port's owner: events one way, a handle to send with
-//! the other way, and the device's counters.
+//! Between a port's device and the port's owner: events, a handle for sending, and the device's counters.
 
 use std::cell::{Cell, RefCell};
 use std::collections::VecDeque;
@@ -10,7 +9,7 @@ use proto_core::wire::can::CanFrame;
 use serde::Serialize;
 use tokio::sync::Notify;
 
-use recipe_net::quota::Quota;
+use recipe_net::log_limit::LogLimit;
 use recipe_net::timer::now;
 
 /// An event of a device.
@@ -27,8 +26,8 @@ pub enum PortEvent<'a> {
         /// The frame.
         frame: CanFrame,
     },
-    /// A CAN controller's error state changed; reported after each [`PortEvent::Up`] if it is
-    /// known.
+    /// The error state of a CAN controller; reported after each [`PortEvent::Up`], if it is known, and when
+    /// it changes.
     Bus(BusState),
     /// Everything handed over has left.
     Sent,
@@ -41,16 +40,16 @@ pub struct PortTx {
     pub(super) frames: RefCell<VecDeque<CanFrame>>,
     pub(super) wake: Notify,
     pub(super) counters: Cell<DeviceCounters>,
-    /// Limits the log lines about clients.
-    pub(super) complaints: Quota,
-    /// Data read before this may have waited while the process slept.
+    /// For lines about clients.
+    pub(super) log_limit: LogLimit,
+    /// Data read before this instant may have waited while the process slept.
     stale_until: Cell<Instant>,
     pub(super) slept: Notify,
 }
 
 impl PortTx {
-    /// The process slept until just now: the age of data that waits in the device is unknown. The
-    /// port's owner discards everything for [`STALE`]; by then no old data may be left.
+    /// The process slept until now, so the age of data waiting in the device is unknown. The port's owner
+    /// discards everything for [`STALE`]; no old data may be left then.
     pub fn note_sleep(&self, now: Instant) {
         self.stale_until.set(now + STALE);
         self.slept.notify_one();
@@ -130,7 +129,7 @@ impl Backlog {
         }
         let is_over = !is_more && now.saturating_since(since) >= PAUSE;
         // A peer that never pauses is read again after some time.
-        self.is_behind = !is_over && now.saturating_since(tx.stale_until.get()) < MOST_BACKLOG;
+        self.is_behind = !is_over && now.saturating_since(tx.stale_until.get()) < MAX_BACKLOG;
         self.is_behind
     }
 }
@@ -153,13 +152,13 @@ pub struct DeviceCounters {
     pub dropped: u64,
     /// Clients refused because there was one already, or too many.
     pub refused: u64,
-    /// Clients that the system could not hand over, probably for lack of descriptors.
+    /// Failed accepts, probably for lack of descriptors.
     pub accept_failures: u64,
     /// Times the device became usable.
     pub ups: u64,
     /// Frames that the kernel dropped because they were not read in time (SO_RXQ_OVFL).
     pub overruns: u64,
-    /// Times the kernel did not accept a CAN frame; it was tried again.
+    /// Times the kernel did not accept a CAN frame, which was then retried.
     pub refusals: u64,
     /// Error frames of a CAN interface.
     pub error_frames: u64,
@@ -186,7 +185,7 @@ pub const STALE: Duration = Duration::from_millis(50);
 /// one. The engine's links are not up earlier.
 const PAUSE: Duration = Duration::from_millis(100);
 /// A longer backlog counts as new data after this.
-const MOST_BACKLOG: Duration = Duration::from_secs(10);
+const MAX_BACKLOG: Duration = Duration::from_secs(10);
 /// A frame of every port's recipe fits several times; a port waits for one to leave.
 const MAX_QUEUED_BYTES: usize = 4_096;
 /// Twice the maximum number of ids in a recipe's part.

@@ -1,7 +1,7 @@
-//! Files and links that appear at their place whole or not at all.
+//! Files and symbolic links that are created atomically: under a temporary name in the same folder, and then
+//! renamed.
 //!
-//! Each is made under a name of its own beside its place and moved there. Nothing here knows what is in
-//! them; whether something may be replaced is the caller's business.
+//! Does not know their contents. The caller decides whether an existing one may be replaced.
 
 use std::fs;
 use std::io;
@@ -11,7 +11,7 @@ use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 use rustix::fs::{CWD, RenameFlags, renameat_with};
 use rustix::io::Errno;
 
-/// Something beside its place; removed when dropped before it was moved there.
+/// A file or link under its temporary name; removed if dropped before it was moved to its place.
 #[derive(Debug)]
 pub struct Beside {
     name: PathBuf,
@@ -19,17 +19,17 @@ pub struct Beside {
 }
 
 impl Beside {
-    /// Has `make` make it under a name in `place`'s folder that nothing has.
+    /// Calls `make` with an unused name in the folder of `place`.
     ///
     /// # Errors
-    /// Those of `make`; it must refuse a name that is taken with [`io::ErrorKind::AlreadyExists`].
+    /// Those of `make`, which must refuse a name in use with [`io::ErrorKind::AlreadyExists`].
     pub fn make<T>(place: &Path, make: impl Fn(&Path) -> io::Result<T>) -> io::Result<(Self, T)> {
-        let mut left = MOST_NAMES;
+        let mut left = MAX_NAMES;
         loop {
             let nth = NEXT.fetch_add(1, Relaxed);
             let name = place.with_file_name(format!(".host-sim-{}-{nth}", std::process::id()));
             match make(&name) {
-                // A run that was killed left it.
+                // Left by a run that was killed.
                 Err(error) if error.kind() == io::ErrorKind::AlreadyExists && left > 0 => left -= 1,
                 made => return made.map(|made| (Self { name, moved: false }, made)),
             }
@@ -39,7 +39,7 @@ impl Beside {
     /// A new file with this content, opened for reading and writing.
     ///
     /// # Errors
-    /// As of [`Beside::make`], and when the bytes cannot be written.
+    /// As [`Beside::make`], or if the bytes cannot be written.
     pub fn file(place: &Path, bytes: &[u8]) -> io::Result<(Self, fs::File)> {
         let new = |name: &Path| fs::File::options().read(true).write(true).create_new(true).open(name);
         let (beside, mut file) = Self::make(place, new)?;
@@ -47,18 +47,18 @@ impl Beside {
         Ok((beside, file))
     }
 
-    /// What it is called until then.
+    /// The temporary name.
     pub fn name(&self) -> &Path {
         &self.name
     }
 
-    /// Moves it to `place`, where nothing may be.
+    /// Moves it to `place`, where nothing may exist.
     ///
     /// # Errors
-    /// [`io::ErrorKind::AlreadyExists`] when there is something.
+    /// [`io::ErrorKind::AlreadyExists`] if something does.
     pub fn put_new(mut self, place: &Path) -> io::Result<()> {
         match renameat_with(CWD, &self.name, CWD, place, RenameFlags::NOREPLACE) {
-            // Not every file system can look and move in one step.
+            // Not every file system can check and rename in one step.
             Err(Errno::INVAL | Errno::NOSYS | Errno::OPNOTSUPP) => {
                 if fs::symlink_metadata(place).is_ok() {
                     return Err(io::ErrorKind::AlreadyExists.into());
@@ -71,10 +71,10 @@ impl Beside {
         Ok(())
     }
 
-    /// Moves it to `place`, in the stead of the file or link that is there.
+    /// Moves it to `place` and replaces the file or link there.
     ///
     /// # Errors
-    /// When it cannot be moved there, as to the place of a folder.
+    /// If it cannot be moved, such as to the path of a folder.
     pub fn replace(mut self, place: &Path) -> io::Result<()> {
         fs::rename(&self.name, place)?;
         self.moved = true;
@@ -90,8 +90,8 @@ impl Drop for Beside {
     }
 }
 
-/// Which file or link it is; what has been deleted and made again is another one, as long as the first
-/// is open or still there.
+/// The identity of a file or link. One that was deleted and created again is another one, as long as the
+/// first is open or linked elsewhere.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Identity {
     device: u64,
@@ -99,7 +99,7 @@ pub struct Identity {
 }
 
 impl Identity {
-    /// The identity that the system gives.
+    /// Device and inode number.
     pub fn of(metadata: &fs::Metadata) -> Self {
         use std::os::unix::fs::MetadataExt;
         Self { device: metadata.dev(), inode: metadata.ino() }
@@ -107,8 +107,8 @@ impl Identity {
 }
 
 static NEXT: AtomicU32 = AtomicU32::new(0);
-/// Names that are tried: a process that was killed can have left some under the number that is ours now.
-const MOST_NAMES: u32 = 100;
+/// Names to try: a killed process may have had our process id and left files.
+const MAX_NAMES: u32 = 100;
 
 #[cfg(test)]
 mod tests {
@@ -124,7 +124,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_there_is_replaced_only_when_that_is_meant() {
+    fn an_existing_file_is_replaced_only_on_request() {
         let folder = tempfile::tempdir().unwrap();
         let place = folder.path().join("place");
         let make = |text: &str| Beside::file(&place, text.as_bytes()).unwrap().0;
@@ -150,7 +150,7 @@ mod tests {
     }
 
     #[test]
-    fn names_that_a_killed_run_left_are_passed_over() {
+    fn names_left_by_a_killed_run_are_skipped() {
         let folder = tempfile::tempdir().unwrap();
         let place = folder.path().join("place");
         let taken = std::cell::Cell::new(3);

@@ -1,8 +1,8 @@
-//! Devices that a configured port can be bound to: pseudoterminals, serial lines, byte streams over
-//! TCP and a CAN bus in user space, CAN interfaces of the kernel.
+//! Devices that a configured port can be bound to: pseudoterminals, serial devices, byte streams over
+//! TCP, a CAN bus in user space, and CAN interfaces of the kernel.
 //!
-//! In and out: bytes and frames. Does not know recipes, controller or engine, except the engine's
-//! type for a CAN controller's error state.
+//! In and out: bytes and frames. Does not know recipes, the controller or the engine, except the engine's
+//! type for the error state of a CAN controller.
 
 #[cfg(not(target_os = "linux"))]
 compile_error!(
@@ -13,12 +13,12 @@ pub mod bind;
 pub mod can_bus;
 pub mod exchange;
 pub mod files;
-mod line;
 pub mod port;
 pub mod pty;
-mod pty_link;
+mod serial;
 mod socketcan;
 mod stream;
+mod symlink;
 #[cfg(test)]
 mod test_kit;
 pub mod wire;

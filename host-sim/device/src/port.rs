@@ -1,8 +1,7 @@
-//! One port's device of any kind: opened from a `--bind`, driven by one task, used through a
-//! handle.
+//! The device of one port, of any kind: opened as `--bind` says, driven by one task, used through a handle.
 //!
-//! The task reports events of the device as [`PortEvent`]s. The port's owner sends through
-//! [`PortTx`], which takes everything at once and never more than a fixed amount.
+//! The task reports events of the device as [`PortEvent`]s. The port's owner sends through [`PortTx`], which
+//! never waits: its queue is bounded.
 
 use std::io;
 use std::rc::Rc;
@@ -13,10 +12,10 @@ use proto_core::wire::can::CanId;
 use super::bind::Device;
 use super::can_bus::CanPort;
 use super::exchange::{PortEvent, PortTx};
-use super::line::LinePort;
+use super::serial::SerialPort;
 use super::socketcan::KernelCan;
 
-/// The settings of a port's bus in the configuration.
+/// A port's bus and its settings, from the configuration.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum PortBus {
     /// A serial line.
@@ -37,7 +36,7 @@ pub struct Port {
 
 #[derive(Debug)]
 enum Driver {
-    Line(LinePort),
+    Serial(SerialPort),
     Can(CanPort),
     Kernel(KernelCan),
 }
@@ -51,7 +50,7 @@ impl Port {
         let tx = Rc::new(PortTx::default());
         let driver = match (bus, device) {
             (PortBus::Serial(settings), _) => {
-                Driver::Line(LinePort::open(device, settings, Rc::clone(&tx)).await?)
+                Driver::Serial(SerialPort::open(device, settings, Rc::clone(&tx)).await?)
             }
             (PortBus::Can { bitrate }, Device::SocketCan { interface }) => {
                 Driver::Kernel(KernelCan::open(interface, bitrate, Rc::clone(&tx))?)
@@ -63,17 +62,18 @@ impl Port {
         Ok(Self { driver, tx })
     }
 
-    /// The port's public place: the link of a pseudoterminal, the address of a socket.
+    /// Where a client finds the device: the link to a pseudoterminal, the address of a socket, the name of an
+    /// interface.
     pub fn place(&self) -> String {
         match &self.driver {
-            Driver::Line(line) => line.place(),
+            Driver::Serial(serial) => serial.place(),
             Driver::Can(can) => can.place(),
             Driver::Kernel(can) => can.place(),
         }
     }
 
-    /// Sets the ids that are used in either direction: a CAN interface of the kernel then passes on
-    /// no others. Other devices, and an interface before this call, pass on everything.
+    /// Sets the CAN ids that are used in either direction. A CAN interface of the kernel then reports no
+    /// others; other devices report all frames, and so does an interface before this call.
     pub fn listen_to(&mut self, ids: Vec<CanId>) {
         if let Driver::Kernel(can) = &mut self.driver {
             can.listen_to(ids);
@@ -85,13 +85,13 @@ impl Port {
         Rc::clone(&self.tx)
     }
 
-    /// Drives the device until the future is dropped, which closes it.
+    /// Runs the device until the future is dropped, which closes it.
     ///
     /// # Errors
-    /// Only if the device is permanently unusable; otherwise the task waits for it to come back.
+    /// Only if the device fails permanently; otherwise this waits until it is back.
     pub async fn run(self, events: impl FnMut(PortEvent<'_>)) -> io::Result<()> {
         match self.driver {
-            Driver::Line(line) => line.run(events).await,
+            Driver::Serial(serial) => serial.run(events).await,
             Driver::Can(can) => can.run(events).await,
             Driver::Kernel(can) => can.run(events).await,
         }

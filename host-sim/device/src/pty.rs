@@ -1,7 +1,7 @@
-//! A pseudoterminal with a link: one end of a serial line that any program can open.
+//! A pseudoterminal with a symbolic link: a serial line that any program can open.
 //!
-//! We keep the terminal end open too, so that the line survives its clients and the reactor never sees
-//! a hang-up. Bytes that nobody listens to are lost, as on a wire, and are not kept for the next client.
+//! The terminal side is kept open here too, so that the line survives its clients and the reactor never sees
+//! a hang-up. Bytes that no client reads are lost, as on a line, and not kept for the next client.
 
 use std::cell::{Cell, RefCell};
 use std::io;
@@ -16,30 +16,31 @@ use rustix::termios::{OptionalActions, QueueSelector, ioctl_tiocnxcl, tcflush, t
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 
-use super::pty_link::Link;
+use super::symlink::Symlink;
 use recipe_net::reactor::register;
 
-/// One pseudoterminal. For a current-thread runtime: see [`Pty::is_heard`].
+/// One pseudoterminal. For a current-thread runtime: see [`Pty::has_client`].
 #[derive(Debug)]
 pub struct Pty {
-    // Removed first: as long as there is one, it leads somewhere.
-    link: Link,
+    // Dropped first, so that the link never leads to a terminal that is gone.
+    link: Symlink,
     master: AsyncFd<OwnedFd>,
-    // None only when a client took the terminal exclusively in the very moment of a look.
+    // `None` only if a client opened the terminal exclusively during `has_client`.
     terminal: RefCell<Option<OwnedFd>>,
     // Whether something was written that a client may have left unread.
     unread: Cell<bool>,
 }
 
 impl Pty {
-    /// A new pseudoterminal in raw mode with a link to it at `link`, in the current tokio runtime.
+    /// Opens a new pseudoterminal in raw mode, with a symbolic link to it at `link`, in the current tokio
+    /// runtime.
     ///
-    /// A link that is already there is replaced when it was one to a pseudoterminal and the program that
-    /// made it is gone. Anything else is not touched.
+    /// An existing link is replaced if it leads to a pseudoterminal and the program that made it is gone.
+    /// Anything else there stays.
     ///
     /// # Errors
-    /// With the path in the message: the link's directory cannot be made, something else is there, or
-    /// the system has no pseudoterminal left.
+    /// With the path in the message: the link's folder cannot be created, something else is there, or the
+    /// system has no pseudoterminal left.
     pub fn open(link: &Path) -> io::Result<Self> {
         let flags = OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC;
         let master = openpt(flags)?;
@@ -50,11 +51,11 @@ impl Pty {
         let terminal = ioctl_tiocgptpeer(&master, flags)?;
         set_raw(&terminal)?;
         let master = register(master)?;
-        let link = Link::place(link, Path::new(&target))?;
+        let link = Symlink::create(link, Path::new(&target))?;
         Ok(Self { link, master, terminal: RefCell::new(Some(terminal)), unread: Cell::new(false) })
     }
 
-    /// Where the link is.
+    /// The path of the link.
     pub fn link(&self) -> &Path {
         self.link.path()
     }
@@ -62,7 +63,7 @@ impl Pty {
     /// Waits until a client's bytes can be read. Cancel safe.
     ///
     /// # Errors
-    /// When the runtime is going away.
+    /// If the runtime is shutting down.
     pub async fn readable(&self) -> io::Result<()> {
         self.master.readable().await?.retain_ready();
         Ok(())
@@ -71,11 +72,11 @@ impl Pty {
     /// Reads what clients wrote.
     ///
     /// # Errors
-    /// [`io::ErrorKind::WouldBlock`] when there is nothing.
+    /// [`io::ErrorKind::WouldBlock`] if there is nothing.
     pub fn try_read(&self, buf: &mut [u8]) -> io::Result<usize> {
         let read = self.attempt(Interest::READABLE, |fd| rustix::io::read(fd, &mut *buf));
         match read {
-            // No terminal end is open for the moment: see `is_heard`.
+            // No terminal side is open at the moment: see `has_client`.
             Err(error) if error.raw_os_error() == Some(Errno::IO.raw_os_error()) => {
                 self.reopen();
                 Err(io::ErrorKind::WouldBlock.into())
@@ -84,60 +85,61 @@ impl Pty {
         }
     }
 
-    /// Throws away what clients wrote and nobody has read, also what the system has yet to make readable.
+    /// Drops unread bytes of clients, also those that the kernel has not made readable yet.
     pub fn discard_unread(&self) {
-        // It fails only when no client can have written anything.
+        // Fails only if no client can have written anything.
         let _ = tcflush(self.master.get_ref(), QueueSelector::IFlush);
     }
 
     /// Waits until bytes can be written. Cancel safe.
     ///
     /// # Errors
-    /// When the runtime is going away.
+    /// If the runtime is shutting down.
     pub async fn writable(&self) -> io::Result<()> {
         self.master.writable().await?.retain_ready();
         Ok(())
     }
 
-    /// Writes what a client can still take, without asking whether there is one.
+    /// Writes as much as fits the buffer, without a check that there is a client.
     ///
     /// # Errors
-    /// [`io::ErrorKind::WouldBlock`] when the client has left tens of kilobytes unread.
+    /// [`io::ErrorKind::WouldBlock`] if the client has left tens of kilobytes unread.
     pub fn try_write(&self, bytes: &[u8]) -> io::Result<usize> {
         self.unread.set(true);
         self.attempt(Interest::WRITABLE, |fd| rustix::io::write(fd, bytes))
     }
 
-    /// Whether a client has the terminal open at this moment. If none has, whatever the last one left
-    /// unread is thrown away and the raw mode restored.
+    /// Whether a client has the terminal open now. If not, bytes that the last one left unread are dropped
+    /// and raw mode is restored.
     ///
-    /// The only way to ask is to close our own terminal end for an instant and look for a hang-up. The
-    /// thread that polls this runtime's reactor must be the one that asks, or the reactor would see it.
-    pub fn is_heard(&self) -> bool {
+    /// The only way to find out is to close our own terminal side for an instant and look for a hang-up. Only
+    /// the thread that polls this runtime's reactor may do this, or the reactor would see the hang-up.
+    pub fn has_client(&self) -> bool {
         if let Some(terminal) = self.terminal.take() {
-            // A client's exclusive lock would keep us out of our own terminal.
+            // A client's exclusive lock would prevent us from opening it again.
             let _ = ioctl_tiocnxcl(&terminal);
         }
         let mut fds = [PollFd::new(self.master.get_ref(), PollFlags::empty())];
         let polled = poll(&mut fds, Some(&Timespec { tv_sec: 0, tv_nsec: 0 }));
-        let heard = !matches!(polled, Ok(1) if fds[0].revents().contains(PollFlags::HUP));
+        let has_client = !matches!(polled, Ok(1) if fds[0].revents().contains(PollFlags::HUP));
         self.reopen();
-        if !heard
+        if !has_client
             && self.unread.take()
             && let Some(terminal) = &*self.terminal.borrow()
         {
             let _ = tcflush(terminal, QueueSelector::IFlush);
             let _ = set_raw(terminal);
         }
-        heard
+        has_client
     }
 
-    /// Whether a client may have left bytes unread: [`Pty::is_heard`] should be asked now and then.
-    pub fn may_be_stale(&self) -> bool {
+    /// Whether a client may have left bytes unread: then [`Pty::has_client`] must be called at times, because
+    /// it drops them.
+    pub fn may_hold_unread(&self) -> bool {
         self.unread.get()
     }
 
-    /// Makes the call whatever the reactor believes, since it has not looked at a new descriptor yet.
+    /// Makes the call whatever readiness the reactor knows: it has not polled a new descriptor yet.
     fn attempt(
         &self,
         interest: Interest,
@@ -209,7 +211,7 @@ mod tests {
             let mut peer = client(link);
             peer.write_all(&all).unwrap();
             assert_eq!(read_from(&pty, 256).await, all);
-            assert!(pty.is_heard());
+            assert!(pty.has_client());
             assert_eq!(pty.try_write(&all).unwrap(), 256);
             let mut got = vec![0; 256];
             peer.read_exact(&mut got).unwrap();
@@ -219,22 +221,22 @@ mod tests {
     }
 
     #[test]
-    fn nobody_hears_a_line_without_a_client_and_what_one_left_unread_is_not_kept() {
+    fn bytes_that_a_client_left_unread_are_not_kept_for_the_next_one() {
         run(async |link| {
             let pty = Pty::open(link).unwrap();
-            assert!(!pty.is_heard());
+            assert!(!pty.has_client());
             let first = client(link);
             let second = client(link);
-            assert!(pty.is_heard());
+            assert!(pty.has_client());
             pty.try_write(b"stale").unwrap();
             drop(first);
-            assert!(pty.is_heard(), "the second one still listens");
-            assert!(pty.may_be_stale());
+            assert!(pty.has_client(), "the second one has it open");
+            assert!(pty.may_hold_unread());
             drop(second);
-            assert!(!pty.is_heard());
-            assert!(!pty.may_be_stale());
+            assert!(!pty.has_client());
+            assert!(!pty.may_hold_unread());
             let mut third = client(link);
-            assert!(pty.is_heard());
+            assert!(pty.has_client());
             pty.try_write(b"fresh").unwrap();
             let mut got = [0; 16];
             assert_eq!(third.read(&mut got).unwrap(), 5);
@@ -248,27 +250,27 @@ mod tests {
             let pty = Pty::open(link).unwrap();
             for round in 0..50_u8 {
                 let mut peer = client(link);
-                // An exclusive client, as tokio-serial opens it, does not lock us out.
+                // An exclusive client, as tokio-serial is, does not lock us out.
                 rustix::termios::ioctl_tiocexcl(&peer).unwrap();
-                assert!(pty.is_heard());
+                assert!(pty.has_client());
                 peer.write_all(&[round]).unwrap();
                 drop(peer);
                 assert_eq!(read_from(&pty, 1).await, [round]);
-                assert!(!pty.is_heard());
+                assert!(!pty.has_client());
             }
         });
     }
 
     #[test]
-    fn what_is_thrown_away_is_gone_however_much_it_was() {
+    fn unread_bytes_are_dropped_however_many_there_are() {
         run(async |link| {
             let pty = Pty::open(link).unwrap();
             let mut peer = client(link);
-            let mut waits = 0;
+            let mut waiting = 0;
             while let Ok(count @ 1..) = peer.write(&[0xA5; 512]) {
-                waits += count;
+                waiting += count;
             }
-            assert!(waits > 4_096, "{waits}");
+            assert!(waiting > 4_096, "{waiting}");
             pty.discard_unread();
             peer.write_all(b"new").unwrap();
             assert_eq!(read_from(&pty, 3).await, b"new");
@@ -276,7 +278,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_client_wrote_before_it_left_is_not_lost_by_looking_for_it() {
+    fn bytes_of_a_client_that_has_gone_are_not_lost() {
         run(async |link| {
             let pty = Pty::open(link).unwrap();
             for round in 0..20 {
@@ -284,7 +286,7 @@ mod tests {
                 pty.try_write(b"unread").unwrap();
                 peer.write_all(&[round, 0xEE]).unwrap();
                 drop(peer);
-                assert!(!pty.is_heard());
+                assert!(!pty.has_client());
                 assert_eq!(read_from(&pty, 2).await, [round, 0xEE]);
             }
         });
@@ -295,7 +297,7 @@ mod tests {
         run(async |link| {
             let pty = Pty::open(link).unwrap();
             drop(client(link));
-            assert!(!pty.is_heard());
+            assert!(!pty.has_client());
             let quiet = tokio::time::timeout(std::time::Duration::from_millis(50), async {
                 let mut wakes = 0;
                 loop {

@@ -1,7 +1,7 @@
-//! A serial line on a pseudoterminal, a serial device or a TCP byte stream.
+//! A serial port on a pseudoterminal, a serial device or a TCP byte stream.
 //!
-//! Only a serial device has a real line. On the others a transmission takes as long as it would on the
-//! wire: `Sent` comes when the last stop bit would have left, so cycles behave alike everywhere.
+//! Only a serial device has a real line. On the others a transmission takes as long as on a line: `Sent` is
+//! reported when the last stop bit would have left, so that cycles have the same timing everywhere.
 
 use std::cell::RefCell;
 use std::io;
@@ -18,16 +18,16 @@ use tracing::{debug, info, warn};
 use super::bind::{Device, HostPort, Pace};
 use super::exchange::{Backlog, PortEvent, PortTx};
 use super::pty::Pty;
-use super::stream::{ByteStream, accept};
+use super::stream::{self, ByteStream, accept};
 use recipe_net::backoff::Backoff;
 use recipe_net::connect::connect;
-use recipe_net::peer;
+use recipe_net::fairness::yield_fairly;
+use recipe_net::tcp_options;
 use recipe_net::timer::{Timer, now};
-use recipe_net::turns::give_way;
 
 /// A serial port's device.
 #[derive(Debug)]
-pub(super) struct LinePort {
+pub(super) struct SerialPort {
     source: Source,
     settings: Rs485,
     tx: Rc<PortTx>,
@@ -41,7 +41,7 @@ enum Source {
     Listen(TcpListener),
 }
 
-impl LinePort {
+impl SerialPort {
     pub(super) async fn open(device: &Device, settings: Rs485, tx: Rc<PortTx>) -> io::Result<Self> {
         let source = match device {
             Device::Pty { link, pace } => Source::Pty(Pty::open(link)?, *pace),
@@ -52,13 +52,7 @@ impl LinePort {
                 Source::Serial(path, stream)
             }
             Device::Tcp { to } => Source::Connect(to.clone()),
-            Device::TcpListen { listen } => {
-                let listener = TcpListener::bind((listen.host.as_str(), listen.port)).await;
-                let listener =
-                    listener.map_err(|error| io::Error::new(error.kind(), format!("{listen}: {error}")))?;
-                peer::bound(&listener);
-                Source::Listen(listener)
-            }
+            Device::TcpListen { listen } => Source::Listen(stream::listen(listen).await?),
             Device::SocketCan { .. } | Device::SlcanPty { .. } | Device::SlcanTcp { .. } => {
                 let what = format!("`{device}` is a CAN device; the port is a serial line");
                 return Err(io::Error::new(io::ErrorKind::InvalidInput, what));
@@ -72,9 +66,7 @@ impl LinePort {
             Source::Pty(pty, _) => pty.link().display().to_string(),
             Source::Serial(path, _) => path.clone(),
             Source::Connect(to) => to.to_string(),
-            Source::Listen(listener) => {
-                listener.local_addr().map_or_else(|_| String::new(), |at| at.to_string())
-            }
+            Source::Listen(listener) => stream::address_of(listener),
         }
     }
 
@@ -83,7 +75,7 @@ impl LinePort {
         let mut sender = Sender::new(settings, Rc::clone(&tx))?;
         match source {
             Source::Pty(pty, pace) => {
-                sender.paced = pace == Pace::Line;
+                sender.paced = pace == Pace::BitRate;
                 sender.up(&mut events);
                 Err(pump(&pty, &mut sender, &mut events).await)
             }
@@ -113,7 +105,7 @@ impl LinePort {
                         Ok(stream) => {
                             info!(%to, "connected");
                             backoff.reset();
-                            peer::watch(&stream);
+                            tcp_options::enable_keepalive(&stream);
                             sender.up(&mut events);
                             let error = pump(&stream, &mut sender, &mut events).await;
                             info!(%to, %error, "connection lost");
@@ -127,7 +119,7 @@ impl LinePort {
             Source::Listen(listener) => loop {
                 let (stream, peer) = accept(&listener, &tx).await;
                 info!(%peer, "client connected");
-                peer::watch(&stream);
+                tcp_options::enable_keepalive(&stream);
                 sender.up(&mut events);
                 tokio::select! {
                     error = pump(&stream, &mut sender, &mut events) => info!(%peer, %error, "client disconnected"),
@@ -144,10 +136,10 @@ async fn refuse_all(listener: &TcpListener, tx: &PortTx) {
         let (stream, peer) = accept(listener, tx).await;
         drop(stream);
         tx.count(|counters| counters.refused += 1);
-        if let Some(more) = tx.complaints.take(now()) {
+        if let Some(more) = tx.log_limit.allow(now()) {
             warn!(%peer, more, "refused: the line already has a client");
         }
-        give_way().await;
+        yield_fairly().await;
     }
 }
 
@@ -161,7 +153,7 @@ fn open_serial(path: &str, settings: Rs485) -> io::Result<SerialStream> {
         if settings.stop_bits == 2 { tokio_serial::StopBits::Two } else { tokio_serial::StopBits::One };
     let builder = tokio_serial::new(path, settings.baud).stop_bits(stop_bits);
     match builder.clone().parity(parity).open_native_async() {
-        // Pseudoterminals have no parity bit; some systems say so instead of ignoring it.
+        // A pseudoterminal has no parity bit; some systems refuse one instead of ignoring it.
         Err(_) if settings.parity != Parity::None => {
             let stream = builder.open_native_async()?;
             warn!(path, "the device does not support parity; used without");
@@ -171,16 +163,16 @@ fn open_serial(path: &str, settings: Rs485) -> io::Result<SerialStream> {
     }
 }
 
-/// Moves bytes both ways until the device fails.
+/// Moves bytes in both directions until the device fails.
 async fn pump(
     device: &impl ByteStream,
     sender: &mut Sender,
     events: &mut impl FnMut(PortEvent<'_>),
 ) -> io::Error {
-    let mut buf = vec![0; OLD_CHUNK];
+    let mut buf = vec![0; BACKLOG_CHUNK];
     let mut backlog = Backlog::default();
     loop {
-        let most = if backlog.is_open(&sender.tx) { OLD_CHUNK } else { CHUNK };
+        let most = if backlog.is_open(&sender.tx) { BACKLOG_CHUNK } else { CHUNK };
         let done = tokio::select! {
             read = device.receive(&mut buf[..most]) => match read {
                 Ok(0) => Err(io::ErrorKind::UnexpectedEof.into()),
@@ -192,17 +184,17 @@ async fn pump(
                     } else {
                         events(PortEvent::Bytes(&buf[..count]));
                     }
-                    // A device that never pauses must not keep everybody else waiting. What is refused takes
-                    // little time, and has to be gone soon.
+                    // A device that never pauses must not delay other tasks. Bytes that the engine discards
+                    // take little time, and must be read before it accepts input again.
                     let is_much = is_full && !sender.tx.is_stale();
-                    if is_much { give_way().await } else { yield_now().await }
+                    if is_much { yield_fairly().await } else { yield_now().await }
                     Ok(())
                 }
                 Err(error) if error.kind() == io::ErrorKind::Interrupted => Ok(()),
                 Err(error) => Err(error),
             },
             () = sender.tx.slept.notified() => {
-                swallow(device, &sender.tx, &mut buf, events);
+                discard_backlog(device, &sender.tx, &mut buf, events);
                 Ok(())
             }
             () = sender.tx.wake.notified(), if !sender.sending => sender.begin(device, events),
@@ -212,8 +204,8 @@ async fn pump(
             ready = device.writable(), if sender.blocked => {
                 ready.and_then(|()| sender.advance(device, events))
             }
-            () = tokio::time::sleep(STALE_LOOK), if device.may_be_stale() => {
-                device.is_heard();
+            () = tokio::time::sleep(CLIENT_POLL), if device.may_hold_unread() => {
+                device.has_client();
                 Ok(())
             }
         };
@@ -223,10 +215,15 @@ async fn pump(
     }
 }
 
-/// Tells what waited while the process slept, which is refused and counted, and throws away what of it cannot be
-/// read yet: a terminal's system makes it readable piece by piece, when it has the time.
-fn swallow(device: &impl ByteStream, tx: &PortTx, buf: &mut [u8], events: &mut impl FnMut(PortEvent<'_>)) {
-    for _ in 0..MOST_SWALLOWED {
+/// Reports what waited while the process slept, so that the engine counts and discards it, and drops the
+/// rest: the kernel makes a terminal's bytes readable in pieces, some of them later.
+fn discard_backlog(
+    device: &impl ByteStream,
+    tx: &PortTx,
+    buf: &mut [u8],
+    events: &mut impl FnMut(PortEvent<'_>),
+) {
+    for _ in 0..MAX_BACKLOG_READS {
         let Ok(count @ 1..) = device.try_read(buf) else { break };
         tx.count(|counters| counters.bytes_in += count as u64);
         events(PortEvent::Bytes(&buf[..count]));
@@ -234,10 +231,10 @@ fn swallow(device: &impl ByteStream, tx: &PortTx, buf: &mut [u8], events: &mut i
     device.discard_unread();
 }
 
-/// The transmission under way on a line, and the time it takes.
+/// The transmission in progress, and its timing.
 struct Sender {
     tx: Rc<PortTx>,
-    line: Rs485,
+    settings: Rs485,
     timer: Timer,
     paced: bool,
     bytes: Vec<u8>,
@@ -251,7 +248,7 @@ impl Sender {
     fn new(settings: Rs485, tx: Rc<PortTx>) -> io::Result<Self> {
         Ok(Self {
             tx,
-            line: settings,
+            settings,
             timer: Timer::new()?,
             paced: false,
             bytes: Vec::new(),
@@ -274,7 +271,7 @@ impl Sender {
         events(PortEvent::Down);
     }
 
-    /// Begins the next transmission with everything handed over so far.
+    /// Starts a transmission of everything handed over so far.
     fn begin(&mut self, device: &impl ByteStream, events: &mut impl FnMut(PortEvent<'_>)) -> io::Result<()> {
         self.bytes.clear();
         self.bytes.append(&mut self.tx.bytes.borrow_mut());
@@ -287,16 +284,16 @@ impl Sender {
         self.advance(device, events)
     }
 
-    /// Writes what is due and sets the timer to what comes next.
+    /// Writes what is due and sets the timer for the next step.
     fn advance(
         &mut self,
         device: &impl ByteStream,
         events: &mut impl FnMut(PortEvent<'_>),
     ) -> io::Result<()> {
         let at = now();
-        let end = self.start + self.line.time_on_line(self.bytes.len());
+        let end = self.start + self.settings.time_on_line(self.bytes.len());
         let due = match self.paced {
-            true => bytes_in(&self.line, at.saturating_since(self.start)).min(self.bytes.len()),
+            true => bytes_in(&self.settings, at.saturating_since(self.start)).min(self.bytes.len()),
             false => self.bytes.len(),
         };
         self.write_up_to(due, device)?;
@@ -304,14 +301,14 @@ impl Sender {
             return Ok(());
         }
         if self.written < self.bytes.len() {
-            let next = self.start + self.line.time_on_line(self.written + 1);
-            return self.timer.arm(next.max(at + CLUMP).min(end));
+            let next = self.start + self.settings.time_on_line(self.written + 1);
+            return self.timer.arm(next.max(at + MIN_WRITE_INTERVAL).min(end));
         }
         if at < end {
             return self.timer.arm(end);
         }
         if device.is_draining() {
-            return self.timer.arm(at + DRAIN_LOOK);
+            return self.timer.arm(at + DRAIN_POLL);
         }
         self.sending = false;
         if self.tx.bytes.borrow().is_empty() {
@@ -324,7 +321,7 @@ impl Sender {
 
     fn write_up_to<D: ByteStream>(&mut self, due: usize, device: &D) -> io::Result<()> {
         self.blocked = false;
-        if self.written < due && !device.is_heard() {
+        if self.written < due && !device.has_client() {
             let lost = (due - self.written) as u64;
             self.tx.count(|counters| counters.unheard += lost);
             self.written = due;
@@ -352,25 +349,25 @@ impl Sender {
     }
 }
 
-/// How many bytes have ended on the line after `time`.
-fn bytes_in(line: &Rs485, time: Duration) -> usize {
-    let bits = u128::from(time.as_micros()) * u128::from(line.baud) / 1_000_000;
-    usize::try_from(bits / u128::from(line.bits_per_character())).unwrap_or(usize::MAX)
+/// Number of bytes that have left the line after `time`.
+fn bytes_in(settings: &Rs485, time: Duration) -> usize {
+    let bits = u128::from(time.as_micros()) * u128::from(settings.baud) / 1_000_000;
+    usize::try_from(bits / u128::from(settings.bits_per_character())).unwrap_or(usize::MAX)
 }
 
-/// Most bytes read at once: the frames in them go through the engine before anybody else has a turn.
+/// Maximum number of bytes per read: the engine handles all frames in them before another task runs.
 const CHUNK: usize = 512;
-/// The same of what waited while the process slept.
-const OLD_CHUNK: usize = 16 * 1_024;
-/// Reads at the end of a sleep before others have a turn.
-const MOST_SWALLOWED: usize = 64;
-/// Paced bytes closer together than this appear together, as out of a UART's FIFO.
-const CLUMP: Duration = Duration::from_micros(500);
-/// Between two looks at what a serial device still holds.
-const DRAIN_LOOK: Duration = Duration::from_micros(200);
-/// Between two looks for a client that went away and left bytes behind.
-const STALE_LOOK: StdDuration = StdDuration::from_millis(100);
+/// The same for bytes that waited while the process slept.
+const BACKLOG_CHUNK: usize = 16 * 1_024;
+/// Maximum number of reads after a sleep before other tasks run.
+const MAX_BACKLOG_READS: usize = 64;
+/// Paced bytes closer together than this are written together, as if from a UART's FIFO.
+const MIN_WRITE_INTERVAL: Duration = Duration::from_micros(500);
+/// Interval at which a serial device's output buffer is checked.
+const DRAIN_POLL: Duration = Duration::from_micros(200);
+/// Interval at which is checked whether a client has gone and left bytes unread.
+const CLIENT_POLL: StdDuration = StdDuration::from_millis(100);
 
 #[cfg(test)]
-#[path = "line_tests.rs"]
+#[path = "serial_tests.rs"]
 mod tests;

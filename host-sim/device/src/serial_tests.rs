@@ -1,4 +1,4 @@
-//! The three kinds of lines, with real terminals and sockets.
+//! Serial ports on real terminals and sockets.
 
 use std::io::Write;
 
@@ -9,7 +9,7 @@ use super::super::port::{Port, PortBus};
 use super::super::test_kit::{Client, Running, Seen, is_gone, run};
 use super::*;
 
-fn line(baud: u32) -> PortBus {
+fn serial(baud: u32) -> PortBus {
     PortBus::Serial(Rs485 {
         baud,
         parity: Parity::None,
@@ -21,7 +21,7 @@ fn line(baud: u32) -> PortBus {
 
 #[test]
 fn a_byte_takes_its_start_data_parity_and_stop_bits() {
-    let PortBus::Serial(mut settings) = line(115_200) else { unreachable!() };
+    let PortBus::Serial(mut settings) = serial(115_200) else { unreachable!() };
     let micros = |settings: Rs485| settings.time_on_line(28).as_micros();
     assert_eq!(micros(settings), 2_431);
     settings.parity = Parity::Even;
@@ -38,7 +38,7 @@ fn a_byte_takes_its_start_data_parity_and_stop_bits() {
 fn a_pty_carries_both_ways_and_reports_sent_when_the_line_would_be_free() {
     run(async |dir| {
         let link = dir.join("rs485").display().to_string();
-        let port = Running::start(&format!("pty:{link}"), line(9_600)).await;
+        let port = Running::start(&format!("pty:{link}"), serial(9_600)).await;
         assert_eq!(port.place, link);
         port.expect(Seen::Up).await;
         let mut client = Client::open(&link);
@@ -62,7 +62,7 @@ fn a_pty_carries_both_ways_and_reports_sent_when_the_line_would_be_free() {
 fn a_paced_pty_shows_no_byte_before_its_time() {
     run(async |dir| {
         let link = dir.join("rs485").display().to_string();
-        let port = Running::start(&format!("pty-paced:{link}"), line(9_600)).await;
+        let port = Running::start(&format!("pty-paced:{link}"), serial(9_600)).await;
         port.expect(Seen::Up).await;
         let mut client = Client::open(&link);
         let start = now();
@@ -71,7 +71,7 @@ fn a_paced_pty_shows_no_byte_before_its_time() {
         while seen < 24 {
             seen += client.read().len() as u64;
             let ended = now().saturating_since(start).as_micros() * 9_600 / 10_000_000;
-            assert!(seen <= ended, "{seen} bytes where {ended} can have ended");
+            assert!(seen <= ended, "{seen} bytes but {ended} can have left");
             tokio::task::yield_now().await;
         }
         port.expect(Seen::Sent).await;
@@ -79,10 +79,10 @@ fn a_paced_pty_shows_no_byte_before_its_time() {
 }
 
 #[test]
-fn what_nobody_hears_is_counted_and_the_next_client_gets_only_new_bytes() {
+fn bytes_without_a_client_are_counted_and_the_next_client_gets_only_new_ones() {
     run(async |dir| {
         let link = dir.join("rs485").display().to_string();
-        let port = Running::start(&format!("pty:{link}"), line(115_200)).await;
+        let port = Running::start(&format!("pty:{link}"), serial(115_200)).await;
         port.expect(Seen::Up).await;
         port.tx.send(b"lost");
         port.expect(Seen::Sent).await;
@@ -104,7 +104,7 @@ fn what_nobody_hears_is_counted_and_the_next_client_gets_only_new_bytes() {
 fn a_client_that_does_not_read_loses_bytes_and_blocks_nothing() {
     run(async |dir| {
         let link = dir.join("rs485").display().to_string();
-        let port = Running::start(&format!("pty:{link}"), line(4_000_000)).await;
+        let port = Running::start(&format!("pty:{link}"), serial(4_000_000)).await;
         port.expect(Seen::Up).await;
         let _client = Client::open(&link);
         let mut sent = 0;
@@ -123,7 +123,7 @@ fn a_client_that_does_not_read_loses_bytes_and_blocks_nothing() {
 fn two_transmissions_follow_each_other_and_too_much_is_dropped() {
     run(async |dir| {
         let link = dir.join("rs485").display().to_string();
-        let port = Running::start(&format!("pty:{link}"), line(1_000_000)).await;
+        let port = Running::start(&format!("pty:{link}"), serial(1_000_000)).await;
         port.expect(Seen::Up).await;
         let mut client = Client::open(&link);
         port.tx.send(b"one");
@@ -139,11 +139,11 @@ fn two_transmissions_follow_each_other_and_too_much_is_dropped() {
 #[test]
 fn a_serial_device_is_opened_with_any_rate_and_parity() {
     run(async |dir| {
-        // Our own pseudoterminal stands in for the device.
+        // A pseudoterminal replaces the device.
         let link = dir.join("device").display().to_string();
-        let device = Running::start(&format!("pty:{link}"), line(460_800)).await;
+        let device = Running::start(&format!("pty:{link}"), serial(460_800)).await;
         device.expect(Seen::Up).await;
-        let PortBus::Serial(settings) = line(460_800) else { unreachable!() };
+        let PortBus::Serial(settings) = serial(460_800) else { unreachable!() };
         let even = PortBus::Serial(Rs485 { parity: Parity::Even, ..settings });
         let port = Running::start(&format!("serial:{link}"), even).await;
         port.expect(Seen::Up).await;
@@ -160,13 +160,13 @@ fn a_serial_device_is_opened_with_any_rate_and_parity() {
 fn a_serial_device_that_vanishes_is_opened_again() {
     run(async |dir| {
         let link = dir.join("device").display().to_string();
-        let device = Running::start(&format!("pty:{link}"), line(115_200)).await;
-        let port = Running::start(&format!("serial:{link}"), line(115_200)).await;
+        let device = Running::start(&format!("pty:{link}"), serial(115_200)).await;
+        let port = Running::start(&format!("serial:{link}"), serial(115_200)).await;
         port.expect(Seen::Up).await;
         drop(device);
         port.expect(Seen::Down).await;
         port.tx.send(b"into the void");
-        let device = Running::start(&format!("pty:{link}"), line(115_200)).await;
+        let device = Running::start(&format!("pty:{link}"), serial(115_200)).await;
         device.expect(Seen::Up).await;
         port.expect(Seen::Up).await;
         port.tx.send(b"back");
@@ -176,13 +176,13 @@ fn a_serial_device_that_vanishes_is_opened_again() {
 }
 
 #[test]
-fn a_tcp_line_connects_when_its_server_appears_and_again_after_a_loss() {
+fn a_tcp_port_connects_when_its_server_appears_and_again_after_a_loss() {
     run(async |_| {
-        // An address of its own: no other test is given the port while nobody listens.
+        // A loopback address of its own, so that no other test gets the port while nothing listens.
         let listener = TcpListener::bind("127.0.0.78:0").await.unwrap();
         let at = listener.local_addr().unwrap();
         drop(listener);
-        let port = Running::start(&format!("tcp:{at}"), line(115_200)).await;
+        let port = Running::start(&format!("tcp:{at}"), serial(115_200)).await;
         assert_eq!(port.place, at.to_string());
         let listener = TcpListener::bind(at).await.unwrap();
         for _ in 0..2 {
@@ -203,13 +203,13 @@ fn a_tcp_line_connects_when_its_server_appears_and_again_after_a_loss() {
 }
 
 #[test]
-fn a_listening_line_has_one_client_at_a_time() {
+fn a_listening_port_has_one_client_at_a_time() {
     run(async |_| {
-        let port = Running::start("tcp:127.0.0.1:0", line(115_200)).await;
+        let port = Running::start("tcp:127.0.0.1:0", serial(115_200)).await;
         let mut first = TcpStream::connect(&port.place).await.unwrap();
         port.expect(Seen::Up).await;
         let mut second = TcpStream::connect(&port.place).await.unwrap();
-        assert_eq!(second.read(&mut [0; 8]).await.unwrap(), 0, "turned away");
+        assert_eq!(second.read(&mut [0; 8]).await.unwrap(), 0, "refused");
         assert_eq!(port.tx.counters().refused, 1);
         first.write_all(b"still here").await.unwrap();
         assert_eq!(port.bytes(10).await, b"still here");
@@ -225,10 +225,10 @@ fn a_listening_line_has_one_client_at_a_time() {
 }
 
 #[test]
-fn what_does_not_suit_the_line_is_refused_by_name() {
+fn an_unsuitable_device_is_refused_by_name() {
     run(async |dir| {
         let refused = async |device: &str| {
-            Port::open(&device.parse().unwrap(), line(115_200)).await.unwrap_err().to_string()
+            Port::open(&device.parse().unwrap(), serial(115_200)).await.unwrap_err().to_string()
         };
         assert!(refused("slcan-tcp:127.0.0.1:0").await.contains("is a CAN device"));
         let missing = dir.join("ttyUSB9").display().to_string();

@@ -1,14 +1,14 @@
 //! A CAN interface of the Linux kernel (docs/socketcan.md).
 //!
-//! In: frames to send, in order. Out: frames, the interface's error state, and whether it is there. Refuses to know recipes: it is told which ids matter.
+//! In: frames to send, in order. Out: received frames, the interface's error state, and whether it exists.
+//! Does not know recipes; the port's owner sets the ids to receive.
 //!
-//! A frame has left when the kernel gives it back: the interface's driver does that when the frame was
-//! on the bus, so that a bus that nobody acknowledges holds one cycle's frames and not a queue of old
-//! ones.
+//! A frame counts as sent when the kernel echoes it, which the interface's driver does after the frame was on
+//! the bus. So, if no node acknowledges, one cycle's frames wait and not a queue of old ones.
 
-mod link;
+mod error_frame;
+mod interface;
 mod message;
-mod state;
 
 use std::io;
 use std::os::fd::AsFd;
@@ -22,21 +22,21 @@ use socketcan::{CanErrorFrame, CanFdSocket, CanFilter, EmbeddedFrame, Socket, So
 use tokio::io::Interest;
 use tracing::{debug, info, warn};
 
-use self::link::Link;
+use self::error_frame::StateChange;
+use self::interface::Interface;
 use self::message::{Content, Message};
-use self::state::News;
 use super::exchange::{DeviceCounters, PortEvent, PortTx};
 use recipe_net::backoff::Backoff;
-use recipe_net::quota::Quota;
+use recipe_net::fairness::yield_fairly;
+use recipe_net::log_limit::LogLimit;
 use recipe_net::reactor::register;
 use recipe_net::timer::{Timer, now};
-use recipe_net::turns::give_way;
 
 /// A port on an interface of the kernel.
 #[derive(Debug)]
 pub(super) struct KernelCan {
     interface: String,
-    /// Bit/s, of the configuration.
+    /// Bit/s, from the configuration.
     bitrate: u32,
     ids: Option<Vec<CanId>>,
     tx: Rc<PortTx>,
@@ -44,7 +44,7 @@ pub(super) struct KernelCan {
 
 impl KernelCan {
     pub(super) fn open(interface: &str, bitrate: u32, tx: Rc<PortTx>) -> io::Result<Self> {
-        // Only to say at once what is wrong; it may still be down.
+        // Only to report errors at once; the interface may still be down.
         match CanFdSocket::open(interface) {
             Ok(_) => Ok(Self { interface: interface.to_owned(), bitrate, ids: None, tx }),
             Err(error) => {
@@ -67,12 +67,12 @@ impl KernelCan {
         self.ids = Some(ids);
     }
 
-    /// The interface's bit rate is the administrator's business, but a mistake is worth a word.
+    /// Logs a difference. The administrator sets the interface's bit rate, so it is not an error.
     fn compare_bitrates(&self) {
         let (interface, configured) = (&self.interface, self.bitrate);
-        // A controller may not come nearer.
+        // A controller's clock may not allow the exact rate.
         let tolerance = configured / 100;
-        match Link::of(interface).bitrate {
+        match Interface::of(interface).bitrate {
             Some(bitrate) if bitrate.abs_diff(configured) > tolerance => {
                 warn!(interface, bitrate, configured, "the interface and the port have different bit rates");
             }
@@ -82,7 +82,7 @@ impl KernelCan {
 
     pub(super) async fn run(self, mut events: impl FnMut(PortEvent<'_>)) -> io::Result<()> {
         let interface = &self.interface;
-        let mut backoff = Backoff::new(LEAST_PAUSE, MOST_PAUSE);
+        let mut backoff = Backoff::new(MIN_PAUSE, MAX_PAUSE);
         loop {
             match Attached::new(&self) {
                 Ok(mut attached) => {
@@ -109,21 +109,21 @@ struct Attached<'a> {
     socket: CanFdSocket,
     timer: Timer,
     state: BusState,
-    /// Of each kind: a bus that is shorted changes its state many times a second.
-    off_lines: Quota,
-    passive_lines: Quota,
-    /// Frames that the kernel took and did not give back yet.
-    on_their_way: usize,
-    /// [`Self::lost`] when the kernel took the first of them.
-    lost_before: u32,
-    /// Since when the kernel has not taken the next frame.
+    // A limit for each state: a shorted bus changes its state many times a second.
+    bus_off_log: LogLimit,
+    passive_log: LogLimit,
+    /// Frames that the kernel accepted and has not echoed.
+    in_flight: usize,
+    /// [`Self::lost`] when the kernel accepted the first of them.
+    lost_at_send: u32,
+    /// Since when the kernel has refused the next frame.
     refused_since: Option<Instant>,
     /// Frames that the kernel dropped on this socket.
     lost: u32,
-    /// When to look after what is waited for, while something is.
-    look_at: Instant,
-    /// Pauses between looks at an interface that is bus-off.
-    looks: Backoff,
+    /// When to call [`Self::check`], if something is waited for.
+    check_at: Instant,
+    /// Interval of checks of an interface that is bus-off.
+    bus_off_polls: Backoff,
 }
 
 impl<'a> Attached<'a> {
@@ -136,95 +136,95 @@ impl<'a> Attached<'a> {
         }
         socket.set_error_filter_accept_all()?;
         socket.set_recv_own_msgs(true)?;
-        // As much as the system allows; what does not fit is dropped by the kernel, and counted.
+        // As much as the system allows; the kernel drops and counts the rest.
         let (level, forced) = (libc::SOL_SOCKET, libc::SO_RCVBUFFORCE);
         if socket.set_socket_option_int(level, forced, RECEIVE_BUFFER).is_err() {
             let _ = socket.set_socket_option_int(level, libc::SO_RCVBUF, RECEIVE_BUFFER);
         }
-        // A socket on an interface that is down begins with this error.
+        // A socket on an interface that is down has an error from the start.
         if let Some(error) = socket.as_raw_socket().take_error()? {
             return Err(error);
         }
-        // No longer those of the controller that was there before.
+        // Not those of the controller before.
         port.tx.count(|counters| (counters.tx_error_counter, counters.rx_error_counter) = (None, None));
         Ok(Self {
             port,
             socket,
             timer: Timer::new()?,
-            state: Link::of(&port.interface).bus(),
-            off_lines: Quota::default(),
-            passive_lines: Quota::default(),
-            on_their_way: 0,
-            lost_before: 0,
+            state: Interface::of(&port.interface).bus(),
+            bus_off_log: LogLimit::default(),
+            passive_log: LogLimit::default(),
+            in_flight: 0,
+            lost_at_send: 0,
             refused_since: None,
             lost: 0,
-            look_at: Instant::ZERO,
-            looks: Backoff::new(LEAST_LOOK, MOST_LOOK),
+            check_at: Instant::ZERO,
+            bus_off_polls: Backoff::new(MIN_POLL, MAX_POLL),
         })
     }
 
-    /// Moves frames both ways until the interface is gone.
+    /// Moves frames in both directions until the interface is gone.
     async fn work(&mut self, events: &mut impl FnMut(PortEvent<'_>)) -> io::Error {
         let ready = match self.socket.as_fd().try_clone_to_owned().and_then(register) {
             Ok(ready) => ready,
             Err(error) => return error,
         };
-        self.enter(self.state, events);
+        self.enter_state(self.state, events);
         loop {
-            let mut left = Left::Nothing;
+            let mut more = MoreData::No;
             let done = tokio::select! {
-                // Waiting for data alone, as the crate's own async socket does, sleeps on when the
-                // interface goes down: that is an error of the socket and no data.
+                // The crate's own async socket waits for data only, and so would not notice that the
+                // interface went down: that is an error of the socket, without data.
                 ready = ready.ready(Interest::READABLE | Interest::ERROR) => ready.and_then(|mut ready| {
-                    left = self.receive_some(events)?;
-                    if left == Left::Nothing {
+                    more = self.receive_some(events)?;
+                    if more == MoreData::No {
                         ready.clear_ready();
                     }
                     Ok(())
                 }),
                 () = self.port.tx.wake.notified(), if !self.is_sending() => self.send(events),
-                expired = self.timer.expired() => expired.and_then(|()| self.look(events)),
+                expired = self.timer.expired() => expired.and_then(|()| self.check(events)),
             };
             if let Err(error) = done.and_then(|()| self.timer.arm(self.deadline())) {
                 return error;
             }
-            if left == Left::Perhaps && !self.port.tx.is_stale() {
-                give_way().await;
+            if more == MoreData::Maybe && !self.port.tx.is_stale() {
+                yield_fairly().await;
             }
         }
     }
 
-    /// Takes what waits in the socket, but lets others run now and then.
-    fn receive_some(&mut self, events: &mut impl FnMut(PortEvent<'_>)) -> io::Result<Left> {
+    /// Reads a batch of what waits in the socket.
+    fn receive_some(&mut self, events: &mut impl FnMut(PortEvent<'_>)) -> io::Result<MoreData> {
         for _ in 0..BATCH {
             match message::receive(self.socket.as_fd()) {
                 Ok(message) => self.take(message, events)?,
                 Err(error) if error.kind() == io::ErrorKind::WouldBlock => {
-                    self.note_lost()?;
-                    return Ok(Left::Nothing);
+                    self.count_lost()?;
+                    return Ok(MoreData::No);
                 }
                 Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
                 Err(error) => return Err(error),
             }
         }
-        Ok(Left::Perhaps)
+        Ok(MoreData::Maybe)
     }
 
     fn take(&mut self, message: Message, events: &mut impl FnMut(PortEvent<'_>)) -> io::Result<()> {
         let tx = &self.port.tx;
         match message.content {
             Content::Frame(_) if message.is_own => {
-                self.on_their_way = self.on_their_way.saturating_sub(1);
-                return self.go_on(events);
+                self.in_flight = self.in_flight.saturating_sub(1);
+                return self.continue_sending(events);
             }
             Content::Frame(frame) => {
                 tx.count(|counters| {
                     counters.frames_in += 1;
                     counters.bytes_in += frame.data().len() as u64;
                 });
-                // Who hears is on the bus. Adapters with an old firmware tell in no other way.
-                if self.is_off() && !message.is_local && Link::of(&self.port.interface).has_carrier {
-                    self.enter(BusState::Active, events);
+                // A node that receives is not bus-off. Adapters with old firmware report it in no other way.
+                if self.is_off() && !message.is_local && Interface::of(&self.port.interface).has_carrier {
+                    self.enter_state(BusState::Active, events);
                 }
                 events(PortEvent::Frame { frame });
             }
@@ -237,54 +237,54 @@ impl<'a> Attached<'a> {
 
     fn take_error(&mut self, frame: CanErrorFrame, events: &mut impl FnMut(PortEvent<'_>)) {
         let tx = &self.port.tx;
-        let told = state::counters(frame);
+        let counters_of_frame = error_frame::counters(frame);
         tx.count(|counters| {
             counters.error_frames += 1;
-            counters.overflows += u64::from(state::is_overflow(frame));
-            if let Some((transmit, receive)) = told {
+            counters.overflows += u64::from(error_frame::is_overflow(frame));
+            if let Some((transmit, receive)) = counters_of_frame {
                 (counters.tx_error_counter, counters.rx_error_counter) = (Some(transmit), Some(receive));
             }
         });
-        match state::news(frame) {
-            News::Restarted => {
+        match error_frame::state_change(frame) {
+            StateChange::Restarted => {
                 tx.count(|counters| counters.restarts += 1);
-                self.enter(BusState::Active, events);
+                self.enter_state(BusState::Active, events);
             }
-            // Some drivers tell a milder state before the controller was started again.
-            News::State(state) if self.is_off() && Link::of(&self.port.interface).is_off() => {
+            // Some drivers report a better state before the controller is restarted.
+            StateChange::State(state) if self.is_off() && Interface::of(&self.port.interface).is_off() => {
                 debug!(?state, "state reported during bus-off");
             }
-            News::State(state) if state != self.state => self.enter(state, events),
-            News::State(_) | News::Other => {}
+            StateChange::State(state) if state != self.state => self.enter_state(state, events),
+            StateChange::State(_) | StateChange::Other => {}
         }
     }
 
-    /// The controller's state is this from now on.
-    fn enter(&mut self, state: BusState, events: &mut impl FnMut(PortEvent<'_>)) {
+    /// Sets and reports the controller's state.
+    fn enter_state(&mut self, state: BusState, events: &mut impl FnMut(PortEvent<'_>)) {
         let interface = &self.port.interface;
         self.state = state;
-        self.port.tx.count(|counters| counters.bus = state::name(state));
+        self.port.tx.count(|counters| counters.bus = error_frame::name(state));
         let DeviceCounters { tx_error_counter, rx_error_counter, .. } = self.port.tx.counters();
         match state {
             BusState::BusOff => {
-                if let Some(more) = self.off_lines.take(now()) {
+                if let Some(more) = self.bus_off_log.allow(now()) {
                     warn!(interface, more, "bus-off: nothing is sent until the interface is restarted");
                 }
             }
             BusState::Passive => {
-                if let Some(more) = self.passive_lines.take(now()) {
+                if let Some(more) = self.passive_log.allow(now()) {
                     let what = "error-passive: no node acknowledges, bit rates differ, or the cable is bad";
                     warn!(interface, more, tx_error_counter, rx_error_counter, "{what}");
                 }
             }
-            _ => info!(interface, state = state::name(state), "bus state"),
+            _ => info!(interface, state = error_frame::name(state), "bus state"),
         }
         if state == BusState::BusOff {
-            self.looks.reset();
-            self.look_at = now() + pause(self.looks.pause());
-            // What was under way will not leave, or would be old when it did.
-            self.on_their_way = 0;
-            self.give_up_queue();
+            self.bus_off_polls.reset();
+            self.check_at = now() + pause(self.bus_off_polls.pause());
+            // Frames in flight will not be sent, or too late.
+            self.in_flight = 0;
+            self.drop_queue();
         }
         events(PortEvent::Bus(state));
     }
@@ -294,13 +294,13 @@ impl<'a> Attached<'a> {
     }
 
     fn is_sending(&self) -> bool {
-        self.on_their_way > 0 || self.refused_since.is_some()
+        self.in_flight > 0 || self.refused_since.is_some()
     }
 
-    /// Hands the queue over to the kernel, in order, as far as it takes it.
+    /// Hands frames of the queue over to the kernel, in order, until it refuses one.
     fn send(&mut self, events: &mut impl FnMut(PortEvent<'_>)) -> io::Result<()> {
         if self.is_off() {
-            self.give_up_queue();
+            self.drop_queue();
             return Ok(());
         }
         let tx = &self.port.tx;
@@ -314,31 +314,31 @@ impl<'a> Attached<'a> {
                         counters.frames_out += 1;
                         counters.bytes_out += frame.data().len() as u64;
                     });
-                    if self.on_their_way == 0 {
-                        self.lost_before = self.lost;
+                    if self.in_flight == 0 {
+                        self.lost_at_send = self.lost;
                     }
-                    self.on_their_way += 1;
-                    self.look_at = now() + ECHO_TIME;
+                    self.in_flight += 1;
+                    self.check_at = now() + ECHO_TIMEOUT;
                     self.refused_since = None;
                 }
                 Err(error) if is_full(&error) => {
                     tx.count(|counters| counters.refusals += 1);
                     let since = *self.refused_since.get_or_insert_with(now);
-                    if now().saturating_since(since) < PATIENCE {
-                        self.look_at = now() + RETRY;
+                    if now().saturating_since(since) < MAX_REFUSED {
+                        self.check_at = now() + RETRY;
                         return Ok(());
                     }
-                    // A whole cycle or nothing of its rest: the next one is newer.
-                    self.give_up_queue();
-                    return self.go_on(events);
+                    // The rest of the cycle is dropped: the next cycle is newer.
+                    self.drop_queue();
+                    return self.continue_sending(events);
                 }
                 Err(error) => return Err(error),
             }
         }
     }
 
-    /// Says that everything has left, once it has.
-    fn go_on(&mut self, events: &mut impl FnMut(PortEvent<'_>)) -> io::Result<()> {
+    /// Sends the next frames, or reports that everything was sent.
+    fn continue_sending(&mut self, events: &mut impl FnMut(PortEvent<'_>)) -> io::Result<()> {
         if self.is_sending() {
             return Ok(());
         }
@@ -349,7 +349,7 @@ impl<'a> Attached<'a> {
         Ok(())
     }
 
-    fn give_up_queue(&mut self) {
+    fn drop_queue(&mut self) {
         self.refused_since = None;
         let mut queue = self.port.tx.frames.borrow_mut();
         self.port.tx.count(|counters| counters.dropped += queue.len() as u64);
@@ -357,36 +357,36 @@ impl<'a> Attached<'a> {
     }
 
     fn deadline(&self) -> Instant {
-        if self.is_off() || self.is_sending() { self.look_at } else { Instant::NEVER }
+        if self.is_off() || self.is_sending() { self.check_at } else { Instant::NEVER }
     }
 
-    /// Time has passed: what was waited for?
-    fn look(&mut self, events: &mut impl FnMut(PortEvent<'_>)) -> io::Result<()> {
+    /// Handles the timer: polls a bus-off interface, retries a refused frame, or looks for lost echoes.
+    fn check(&mut self, events: &mut impl FnMut(PortEvent<'_>)) -> io::Result<()> {
         if self.is_off() {
-            self.look_at = now() + pause(self.looks.pause());
-            let link = Link::of(&self.port.interface);
-            if !link.is_off() {
-                self.enter(link.bus(), events);
+            self.check_at = now() + pause(self.bus_off_polls.pause());
+            let interface = Interface::of(&self.port.interface);
+            if !interface.is_off() {
+                self.enter_state(interface.bus(), events);
             }
             return Ok(());
         }
         if self.refused_since.is_some() {
             return self.send(events);
         }
-        self.look_at = now() + ECHO_TIME;
-        self.note_lost()?;
-        if self.on_their_way > 0 && self.lost != self.lost_before {
-            // What was to tell that they have left may be among what was lost.
-            self.on_their_way = 0;
-            return self.go_on(events);
+        self.check_at = now() + ECHO_TIMEOUT;
+        self.count_lost()?;
+        if self.in_flight > 0 && self.lost != self.lost_at_send {
+            // Their echoes may be among the lost messages.
+            self.in_flight = 0;
+            return self.continue_sending(events);
         }
         Ok(())
     }
 
-    /// Counts what the kernel dropped because it was not read in time: the number that SO_RXQ_OVFL
-    /// attaches to the next frame. Asking for it does not need one.
-    fn note_lost(&mut self) -> io::Result<()> {
-        let mut info = [0; MEMINFO];
+    /// Counts messages that the kernel dropped because they were not read in time. SO_RXQ_OVFL would report
+    /// the same number, but only with the next frame.
+    fn count_lost(&mut self) -> io::Result<()> {
+        let mut info = [0; MEMINFO_LEN];
         self.socket.get_socket_option_bytes(libc::SOL_SOCKET, libc::SO_MEMINFO, &mut info)?;
         let [.., a, b, c, d] = info;
         let lost = u32::from_ne_bytes([a, b, c, d]);
@@ -397,14 +397,14 @@ impl<'a> Attached<'a> {
     }
 }
 
-/// Whether a socket may have more to read.
+/// Whether a socket may have more data.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Left {
-    Nothing,
-    Perhaps,
+enum MoreData {
+    No,
+    Maybe,
 }
 
-/// Data and remote frames with this id.
+/// A filter for data and remote frames with this id.
 fn filter(id: CanId) -> CanFilter {
     match id {
         CanId::Standard(id) => CanFilter::new(u32::from(id), libc::CAN_SFF_MASK | libc::CAN_EFF_FLAG),
@@ -424,8 +424,8 @@ fn kernel_frame(frame: &CanFrame) -> io::Result<socketcan::CanFrame> {
     made.ok_or_else(|| io::ErrorKind::InvalidInput.into())
 }
 
-/// Whether the interface's queue (ENOBUFS) or the socket's (EAGAIN) has no room for the moment. Nothing
-/// tells when the former has some again.
+/// Whether the queue of the interface (ENOBUFS) or of the socket (EAGAIN) is full. The kernel does not report
+/// when the former has room again.
 fn is_full(error: &io::Error) -> bool {
     matches!(error.raw_os_error(), Some(libc::ENOBUFS | libc::EAGAIN | libc::EINTR))
 }
@@ -434,21 +434,21 @@ fn pause(pause: StdDuration) -> Duration {
     Duration::from_micros(u64::try_from(pause.as_micros()).unwrap_or(u64::MAX))
 }
 
-/// Between two attempts to open an interface.
-const LEAST_PAUSE: StdDuration = StdDuration::from_millis(20);
-const MOST_PAUSE: StdDuration = StdDuration::from_millis(500);
-/// Between two looks whether an interface is still bus-off, should nobody tell.
-const LEAST_LOOK: StdDuration = StdDuration::from_millis(50);
-const MOST_LOOK: StdDuration = StdDuration::from_secs(1);
-/// Until a frame that the kernel did not take is tried again: about a frame's time on a usual bus.
+/// Pause between attempts to open an interface.
+const MIN_PAUSE: StdDuration = StdDuration::from_millis(20);
+const MAX_PAUSE: StdDuration = StdDuration::from_millis(500);
+/// Interval at which a bus-off interface is checked, in case its restart is not reported.
+const MIN_POLL: StdDuration = StdDuration::from_millis(50);
+const MAX_POLL: StdDuration = StdDuration::from_secs(1);
+/// Time until a refused frame is retried: about one frame on a usual bus.
 const RETRY: Duration = Duration::from_micros(250);
-/// How long the kernel may refuse the next frame before the rest of the cycle is given up.
-const PATIENCE: Duration = Duration::from_millis(100);
-/// How long a frame may be on its way before a look whether its return was lost.
-const ECHO_TIME: Duration = Duration::from_millis(20);
-/// Frames taken before others run.
+/// How long the kernel may refuse the next frame before the rest of the cycle is dropped.
+const MAX_REFUSED: Duration = Duration::from_millis(100);
+/// Time after which a frame's echo may have been lost.
+const ECHO_TIMEOUT: Duration = Duration::from_millis(20);
+/// Maximum number of frames read before other tasks run.
 const BATCH: usize = 64;
-/// Bytes: half a second of a full bus at 500 kbit/s. Without privileges the system allows a fifth.
+/// Bytes: half a second of a full bus at 500 kbit/s. Without privileges the system allows a fifth of it.
 const RECEIVE_BUFFER: i32 = 1_024 * 1_024;
-/// Nine numbers; the last is of dropped messages.
-const MEMINFO: usize = 9 * 4;
+/// Length of SO_MEMINFO: nine numbers, the last of which counts dropped messages.
+const MEMINFO_LEN: usize = 9 * 4;

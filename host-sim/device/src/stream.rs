@@ -1,5 +1,5 @@
-//! Byte streams that a line or an slcan client is connected by: a pseudoterminal, a serial device, a TCP
-//! connection; and how TCP clients are taken.
+//! The byte stream of a serial port or an slcan client: a pseudoterminal, a serial device or a TCP
+//! connection; and how TCP clients are accepted.
 
 use std::cell::RefCell;
 use std::future::poll_fn;
@@ -12,13 +12,15 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio_serial::{ClearBuffer, SerialPort, SerialStream};
 use tracing::warn;
 
+use super::bind::HostPort;
 use super::exchange::PortTx;
 use super::pty::Pty;
+use recipe_net::tcp_options;
 use recipe_net::timer::now;
 
-/// A connected device or client: what tells the three kinds apart while bytes flow.
+/// A connected device or client: what differs between the three kinds.
 pub(super) trait ByteStream {
-    /// Whether what cannot be written at once is lost, as on a wire, instead of waiting.
+    /// Whether bytes that cannot be written at once are lost, as on a line, instead of waiting.
     const LOSSY: bool;
 
     /// Waits for bytes. Cancel safe.
@@ -27,21 +29,22 @@ pub(super) trait ByteStream {
     async fn writable(&self) -> io::Result<()>;
     fn try_write(&self, bytes: &[u8]) -> io::Result<usize>;
 
-    /// Throws away what has arrived and was not read, if the system can.
+    /// Drops bytes that have arrived and were not read, if the system can.
     fn discard_unread(&self) {}
 
-    /// Whether the device still holds bytes that were written.
+    /// Whether the device has not yet sent all written bytes.
     fn is_draining(&self) -> bool {
         false
     }
 
-    /// Whether anybody listens.
-    fn is_heard(&self) -> bool {
+    /// Whether a client can receive.
+    fn has_client(&self) -> bool {
         true
     }
 
-    /// Whether `is_heard` should be asked now and then, even if nothing is to be sent.
-    fn may_be_stale(&self) -> bool {
+    /// Whether a client may have left bytes unread: then `has_client` must be called at times, because it
+    /// drops them.
+    fn may_hold_unread(&self) -> bool {
         false
     }
 }
@@ -70,11 +73,11 @@ impl ByteStream for Pty {
     fn discard_unread(&self) {
         Self::discard_unread(self);
     }
-    fn is_heard(&self) -> bool {
-        Self::is_heard(self)
+    fn has_client(&self) -> bool {
+        Self::has_client(self)
     }
-    fn may_be_stale(&self) -> bool {
-        Self::may_be_stale(self)
+    fn may_hold_unread(&self) -> bool {
+        Self::may_hold_unread(self)
     }
 }
 
@@ -82,7 +85,7 @@ impl ByteStream for RefCell<SerialStream> {
     const LOSSY: bool = false;
 
     async fn receive(&self, buf: &mut [u8]) -> io::Result<usize> {
-        // The stream's own `readable` and `try_read` never take the readiness back.
+        // The stream's own `readable` and `try_read` never clear the readiness.
         let mut buf = ReadBuf::new(buf);
         poll_fn(|cx| Pin::new(&mut *self.borrow_mut()).poll_read(cx, &mut buf)).await?;
         Ok(buf.filled().len())
@@ -91,7 +94,7 @@ impl ByteStream for RefCell<SerialStream> {
         self.borrow_mut().try_read(buf)
     }
     async fn writable(&self) -> io::Result<()> {
-        // A frame fits the system's buffer; when it does not, it empties at the line's speed.
+        // A frame usually fits the system's buffer; if not, the buffer empties at the baud rate.
         tokio::time::sleep(StdDuration::from_millis(1)).await;
         Ok(())
     }
@@ -129,14 +132,28 @@ impl ByteStream for TcpStream {
     }
 }
 
-/// Accepts one client, waiting out what is wrong with the system for the moment.
+/// Listens at `at`, with limited buffers for each client: what waits in the kernel becomes old, and nothing
+/// counts it.
+pub(super) async fn listen(at: &HostPort) -> io::Result<TcpListener> {
+    let listener = TcpListener::bind((at.host.as_str(), at.port)).await;
+    let listener = listener.map_err(|error| io::Error::new(error.kind(), format!("{at}: {error}")))?;
+    tcp_options::limit_buffers(&listener);
+    Ok(listener)
+}
+
+/// The address of a listening socket, as text; empty if the system does not say.
+pub(super) fn address_of(listener: &TcpListener) -> String {
+    listener.local_addr().map_or_else(|_| String::new(), |at| at.to_string())
+}
+
+/// Accepts one client. Errors of the system, such as too few descriptors, are waited out.
 pub(super) async fn accept(listener: &TcpListener, tx: &PortTx) -> (TcpStream, std::net::SocketAddr) {
     loop {
         match listener.accept().await {
             Ok(accepted) => return accepted,
             Err(error) => {
                 tx.count(|counters| counters.accept_failures += 1);
-                if let Some(more) = tx.complaints.take(now()) {
+                if let Some(more) = tx.log_limit.allow(now()) {
                     warn!(%error, more, "cannot accept a client");
                 }
                 tokio::time::sleep(StdDuration::from_millis(50)).await;

@@ -1,9 +1,9 @@
-//! The link to a pseudoterminal, by which other programs find it.
+//! The symbolic link by which other programs find a pseudoterminal.
 //!
-//! A link belongs to the process that made it for as long as that lives. It holds a lock on a file beside
-//! the link, `.NAME.lock`, which the system lets go of however the process ends, and in which it says which
-//! link it made: so one that a killed run left is told from one of a program that still uses it, even when
-//! the terminal's number has been given to somebody else since.
+//! A link belongs to the process that created it, as long as that runs. The process holds a lock on a file
+//! beside the link, `.NAME.lock`, which the kernel releases however the process ends. The file says which
+//! link was created: so a link left by a killed run is distinguished from one still in use, even if another
+//! program has the terminal's number now.
 
 use std::fs;
 use std::io::{self, Read, Seek, Write};
@@ -14,23 +14,23 @@ use rustix::fs::{FlockOperation, OFlags, flock};
 
 use crate::files::{Beside, Identity};
 
-/// A link to a pseudoterminal; removed when dropped, if it is still ours.
+/// A link to a pseudoterminal; removed when dropped, if it is still the one that was created.
 #[derive(Debug)]
-pub(super) struct Link {
+pub(super) struct Symlink {
     path: PathBuf,
     made: Made,
-    /// Let go of after the link has been removed.
+    /// Released after the link has been removed.
     _lock: Lock,
 }
 
-impl Link {
-    /// Makes a link to `target` at `path`, and `path`'s folder if there is none.
+impl Symlink {
+    /// Creates a link to `target` at `path`, and the folder if it does not exist.
     ///
     /// # Errors
-    /// With the path in the message: the folder cannot be made, or the path is something other than a
-    /// link that nobody uses any more.
-    pub(super) fn place(path: &Path, target: &Path) -> io::Result<Self> {
-        let placed = || -> io::Result<Self> {
+    /// With the path in the message: the folder cannot be created, or there is something else at the path
+    /// than a link that is no longer in use.
+    pub(super) fn create(path: &Path, target: &Path) -> io::Result<Self> {
+        let create = || -> io::Result<Self> {
             path.parent().map_or(Ok(()), fs::create_dir_all)?;
             let mut lock = Lock::take(path)?;
             let is_free = is_free(path, lock.left)?;
@@ -44,7 +44,7 @@ impl Link {
             }
             Ok(Self { path: path.to_owned(), made, _lock: lock })
         };
-        placed().map_err(|error| io::Error::new(error.kind(), format!("{}: {error}", path.display())))
+        create().map_err(|error| io::Error::new(error.kind(), format!("{}: {error}", path.display())))
     }
 
     pub(super) fn path(&self) -> &Path {
@@ -52,7 +52,7 @@ impl Link {
     }
 }
 
-impl Drop for Link {
+impl Drop for Symlink {
     fn drop(&mut self) {
         if fs::symlink_metadata(&self.path).is_ok_and(|there| Made::of(&there) == self.made) {
             let _ = fs::remove_file(&self.path);
@@ -60,8 +60,8 @@ impl Drop for Link {
     }
 }
 
-/// Whether nothing is at `path`; otherwise it is a link that nobody uses, or an error. `left` is the link
-/// that the last run made here.
+/// Whether nothing is at `path`; `false` for a link that may be replaced, an error for anything else. `left`
+/// is the link that the last run left here.
 fn is_free(path: &Path, left: Option<Made>) -> io::Result<bool> {
     let refused = |message: String| Err(io::Error::new(io::ErrorKind::AlreadyExists, message));
     let found = match fs::symlink_metadata(path) {
@@ -78,7 +78,7 @@ fn is_free(path: &Path, left: Option<Made>) -> io::Result<bool> {
         return Ok(false);
     }
     match fs::symlink_metadata(&target) {
-        // Pseudoterminals go with the program that made them.
+        // A pseudoterminal disappears with the program that opened it.
         Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(false),
         _ => refused(format!(
             "a link to {}, which a program has open; give another path or end that program; if \
@@ -88,12 +88,12 @@ fn is_free(path: &Path, left: Option<Made>) -> io::Result<bool> {
     }
 }
 
-/// The right to a path, for as long as it is held.
+/// The lock of a path.
 #[derive(Debug)]
 struct Lock {
     path: PathBuf,
     file: fs::File,
-    /// The link that the last holder made and did not remove.
+    /// The link that the last holder created and did not remove.
     left: Option<Made>,
 }
 
@@ -106,7 +106,7 @@ impl Lock {
         hidden.push(name);
         hidden.push(".lock");
         let path = link.with_file_name(hidden);
-        for _ in 0..MOST_TRIES {
+        for _ in 0..MAX_TRIES {
             let mut file = fs::File::options()
                 .read(true)
                 .write(true)
@@ -116,7 +116,7 @@ impl Lock {
                 .open(&path)
                 .map_err(|error| named(&path, &error))?;
             let mut text = String::new();
-            let read = |file: &mut fs::File, text: &mut String| file.take(MOST_BYTES).read_to_string(text);
+            let read = |file: &mut fs::File, text: &mut String| file.take(MAX_RECORD).read_to_string(text);
             match flock(&file, FlockOperation::NonBlockingLockExclusive) {
                 Ok(()) => {}
                 Err(rustix::io::Errno::WOULDBLOCK) => {
@@ -125,7 +125,7 @@ impl Lock {
                 }
                 Err(error) => return Err(named(&path, &error.into())),
             }
-            // The holder before may have removed the file in the very moment.
+            // The last holder may have removed the file since it was opened.
             let own = Identity::of(&file.metadata()?);
             if !fs::symlink_metadata(&path).is_ok_and(|there| Identity::of(&there) == own) {
                 continue;
@@ -141,18 +141,19 @@ impl Lock {
         Err(in_use(None))
     }
 
-    /// Says which link is ours. It is not at its place yet: whatever happens, what is there is known.
+    /// Records the identity of the link before it is moved to its place, so that there is never an unknown
+    /// one.
     fn record(&mut self, made: Made) -> io::Result<()> {
         let record = Record { process: std::process::id(), made };
         self.file.rewind()?;
         self.file.set_len(0)?;
-        self.file.write_all(record.show().as_bytes())
+        self.file.write_all(record.to_line().as_bytes())
     }
 }
 
 impl Drop for Lock {
     fn drop(&mut self) {
-        // While it is held: whoever takes it next makes a new one.
+        // While the lock is held: the next holder creates a new file.
         let _ = fs::remove_file(&self.path);
     }
 }
@@ -174,7 +175,7 @@ fn in_use(holder: Option<Record>) -> io::Error {
     io::Error::new(io::ErrorKind::ResourceBusy, message)
 }
 
-/// What a lock's file says: who holds it, and which link it made.
+/// The content of a lock's file: the holder, and the link that it created.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Record {
     process: u32,
@@ -182,12 +183,12 @@ struct Record {
 }
 
 impl Record {
-    fn show(self) -> String {
+    fn to_line(self) -> String {
         let Self { process, made: Made { inode, seconds, nanos } } = self;
         format!("{WORD} {process} {inode} {seconds} {nanos}\n")
     }
 
-    /// `None` for what no run wrote.
+    /// `None` if no run wrote this.
     fn parse(text: &str) -> Option<Self> {
         let words: Vec<_> = text.strip_suffix('\n')?.split(' ').collect();
         let [WORD, process, inode, seconds, nanos] = words[..] else { return None };
@@ -197,7 +198,7 @@ impl Record {
     }
 }
 
-/// Which link it is. Nobody changes a link; a later one at the same place is another one.
+/// The identity of a link. A link is never modified, so another time means another link.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Made {
     inode: u64,
@@ -212,15 +213,15 @@ impl Made {
 }
 
 const WORD: &str = "host-sim";
-/// The longest record that is read.
-const MOST_BYTES: u64 = 256;
-const MOST_TRIES: usize = 100;
+/// Maximum length of a record, bytes.
+const MAX_RECORD: u64 = 256;
+const MAX_TRIES: usize = 100;
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// A terminal that exists as long as it is held, as another program would have it.
+    /// A terminal of another program; it exists until the descriptor is dropped.
     fn terminal() -> (std::os::fd::OwnedFd, PathBuf) {
         let master =
             rustix::pty::openpt(rustix::pty::OpenptFlags::RDWR | rustix::pty::OpenptFlags::NOCTTY).unwrap();
@@ -228,14 +229,14 @@ mod tests {
         (master, name.into())
     }
 
-    /// The name of a terminal that is gone; a low number would soon be another's.
+    /// The name of a terminal that is gone. A low number would soon be in use.
     const GONE: &str = "/dev/pts/4000000";
 
-    /// Puts somebody else's link in the place of the one at `path`.
+    /// Replaces the link at `path` by one of another program.
     fn put_another(path: &Path, target: &Path) {
         let made = || Made::of(&fs::symlink_metadata(path).unwrap());
         let before = made();
-        // The clock of a file system may not have moved yet.
+        // The file system's clock may not have advanced yet.
         while made() == before {
             fs::remove_file(path).unwrap();
             symlink(target, path).unwrap();
@@ -252,39 +253,39 @@ mod tests {
         fs::read_dir(path.parent().unwrap()).unwrap().count()
     }
 
-    /// What a run that is killed leaves: nobody holds the lock, and nothing is removed.
-    fn kill(link: Link) {
+    /// Leaves what a killed run leaves: the lock is released, and nothing is removed.
+    fn kill(link: Symlink) {
         flock(&link._lock.file, FlockOperation::Unlock).unwrap();
         std::mem::forget(link);
     }
 
     #[test]
-    fn a_link_is_one_runs_alone_and_goes_with_it() {
+    fn a_link_belongs_to_one_run_and_is_removed_with_it() {
         let (_folder, path) = place();
         let (_terminal, name) = terminal();
-        let link = Link::place(&path, &name).unwrap();
+        let link = Symlink::create(&path, &name).unwrap();
         assert_eq!((link.path(), fs::read_link(&path).unwrap()), (&*path, name.clone()));
-        let message = Link::place(&path, &name).unwrap_err().to_string();
+        let message = Symlink::create(&path, &name).unwrap_err().to_string();
         assert_eq!(
             message,
             format!("{}: another port uses this path; give each port its own path", path.display())
         );
-        // Even when somebody has removed it.
+        // Even after it was removed from outside.
         fs::remove_file(&path).unwrap();
-        Link::place(&path, &name).unwrap_err();
+        Symlink::create(&path, &name).unwrap_err();
         drop(link);
-        drop(Link::place(&path, &name).unwrap());
+        drop(Symlink::create(&path, &name).unwrap());
         assert_eq!(count(&path), 0);
     }
 
     #[test]
-    fn what_a_killed_run_left_is_replaced_whoever_has_its_terminals_number_now() {
+    fn a_link_left_by_a_killed_run_is_replaced_even_if_its_terminals_number_is_in_use() {
         let (_folder, path) = place();
         let (_another, name) = terminal();
         for target in [&*name, Path::new(GONE)] {
-            kill(Link::place(&path, target).unwrap());
+            kill(Symlink::create(&path, target).unwrap());
             let (_own, own) = terminal();
-            let link = Link::place(&path, &own).unwrap();
+            let link = Symlink::create(&path, &own).unwrap();
             assert_eq!(fs::read_link(&path).unwrap(), own);
             drop(link);
             assert_eq!(count(&path), 0);
@@ -292,13 +293,13 @@ mod tests {
     }
 
     #[test]
-    fn a_link_of_a_program_that_runs_stays() {
+    fn a_link_of_a_running_program_stays() {
         let (_folder, path) = place();
         let (_another, name) = terminal();
-        // Its number is that of a run that was killed; the link is another one.
-        kill(Link::place(&path, &name).unwrap());
+        // It has the terminal's number of a killed run, but the link is another one.
+        kill(Symlink::create(&path, &name).unwrap());
         put_another(&path, &name);
-        let message = Link::place(&path, Path::new(GONE)).unwrap_err().to_string();
+        let message = Symlink::create(&path, Path::new(GONE)).unwrap_err().to_string();
         let expected =
             format!("{}: a link to {}, which a program has open; ", path.display(), name.display());
         assert!(message.starts_with(&expected), "{message}");
@@ -310,18 +311,18 @@ mod tests {
         let (_folder, path) = place();
         symlink(GONE, &path).unwrap();
         let (_terminal, name) = terminal();
-        let link = Link::place(&path, &name).unwrap();
+        let link = Symlink::create(&path, &name).unwrap();
         assert_eq!(fs::read_link(&path).unwrap(), name);
-        // Somebody else's is not removed, not even one to the same terminal.
+        // Another program's is not removed, not even one to the same terminal.
         put_another(&path, &name);
         drop(link);
         assert_eq!((fs::read_link(&path).unwrap(), count(&path)), (name, 1));
     }
 
     #[test]
-    fn whatever_else_is_at_the_path_or_in_the_place_of_the_lock_stays() {
+    fn anything_else_at_the_path_or_in_place_of_the_lock_stays() {
         let (_folder, path) = place();
-        let refused = || Link::place(&path, Path::new(GONE)).unwrap_err().to_string();
+        let refused = || Symlink::create(&path, Path::new(GONE)).unwrap_err().to_string();
         fs::write(&path, "precious").unwrap();
         assert!(refused().contains("line: this exists and is not a link"), "{}", refused());
         assert_eq!((fs::read(&path).unwrap().as_slice(), count(&path)), (&b"precious"[..], 1));
@@ -345,7 +346,7 @@ mod tests {
     #[test]
     fn records_are_read_as_they_were_written() {
         let record = Record { process: 7, made: Made { inode: 8, seconds: -9, nanos: 10 } };
-        assert_eq!(Record::parse(&record.show()), Some(record));
+        assert_eq!(Record::parse(&record.to_line()), Some(record));
         for other in [
             "",
             "\n",

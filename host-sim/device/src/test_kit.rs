@@ -1,4 +1,4 @@
-//! What the tests of devices share: a port under way, its events, and clients.
+//! Shared by the tests of devices: a running port, its events, and clients.
 
 use std::cell::RefCell;
 use std::fs::{self, File, OpenOptions};
@@ -18,7 +18,7 @@ use super::exchange::{PortEvent, PortTx};
 use super::port::{Port, PortBus};
 use recipe_net::timer::now;
 
-/// A device's event, with its time apart.
+/// A device's event.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Seen {
     Up,
@@ -34,11 +34,11 @@ struct Log {
     wake: Notify,
 }
 
-/// A port that runs as a local task; its events are kept until a test takes them.
+/// A port that runs as a local task. Its events wait until a test takes them.
 pub(super) struct Running {
     pub(super) place: String,
     pub(super) tx: Rc<PortTx>,
-    seen: Rc<Log>,
+    log: Rc<Log>,
     task: JoinHandle<()>,
 }
 
@@ -46,8 +46,8 @@ impl Running {
     pub(super) async fn start(bind: &str, bus: PortBus) -> Self {
         let port = Port::open(&bind.parse().unwrap(), bus).await.unwrap();
         let (place, tx) = (port.place(), port.tx());
-        let seen = Rc::new(Log::default());
-        let sink = Rc::clone(&seen);
+        let log = Rc::new(Log::default());
+        let sink = Rc::clone(&log);
         let task = tokio::task::spawn_local(async move {
             let ended = port.run(|event| {
                 let event = match event {
@@ -63,16 +63,16 @@ impl Running {
             });
             panic!("the port ended: {:?}", ended.await);
         });
-        Self { place, tx, seen, task }
+        Self { place, tx, log, task }
     }
 
     /// The next event and its time.
     pub(super) async fn next(&self) -> (Instant, Seen) {
         loop {
-            if !self.seen.events.borrow().is_empty() {
-                return self.seen.events.borrow_mut().remove(0);
+            if !self.log.events.borrow().is_empty() {
+                return self.log.events.borrow_mut().remove(0);
             }
-            self.seen.wake.notified().await;
+            self.log.wake.notified().await;
         }
     }
 
@@ -86,7 +86,7 @@ impl Running {
         }
     }
 
-    /// Bytes until there are `count`, whatever the chunks.
+    /// The next `count` bytes, in chunks of any size.
     pub(super) async fn bytes(&self, count: usize) -> Vec<u8> {
         let mut all = Vec::new();
         while all.len() < count {
@@ -105,7 +105,7 @@ impl Drop for Running {
     }
 }
 
-/// Runs a test with a directory of its own, in the kind of runtime that the shells have.
+/// Runs a test with a directory of its own, in a runtime like that of the shells.
 pub(super) fn run(test: impl AsyncFnOnce(&Path)) {
     let dir = tempfile::tempdir().unwrap();
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
@@ -116,7 +116,7 @@ pub(super) fn run(test: impl AsyncFnOnce(&Path)) {
     });
 }
 
-/// A program that has a terminal open.
+/// A program with the terminal open.
 pub(super) struct Client(pub(super) File);
 
 impl Client {
@@ -125,7 +125,7 @@ impl Client {
         Self(OpenOptions::new().read(true).write(true).custom_flags(flags).open(link).unwrap())
     }
 
-    /// What can be read now.
+    /// All bytes that can be read now.
     pub(super) fn read(&mut self) -> Vec<u8> {
         let mut buf = vec![0; 4_096];
         match self.0.read(&mut buf) {
@@ -138,7 +138,7 @@ impl Client {
         buf
     }
 
-    /// Reads until there are `count` bytes, while the port's task runs.
+    /// Reads `count` bytes, while the port's task runs.
     pub(super) async fn read_exact(&mut self, count: usize) -> Vec<u8> {
         let mut all = Vec::new();
         while all.len() < count {
@@ -152,7 +152,7 @@ impl Client {
     }
 }
 
-/// Whether nothing is at the path, not even a link that leads nowhere.
+/// Whether nothing is at the path, not even a dangling link.
 pub(super) fn is_gone(path: &str) -> bool {
     fs::symlink_metadata(path).is_err()
 }

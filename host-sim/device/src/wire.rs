@@ -1,7 +1,7 @@
-//! A CAN bus as a wire (proto-core/docs/wire/slcan.md section 4): frames of its nodes and the time go in, frames
-//! that have crossed it come out, one after the other in the order of arbitration.
+//! The medium of a CAN bus (proto-core/docs/wire/slcan.md section 4).
 //!
-//! No clock and no I/O here, and no bit errors: every frame is received well by all.
+//! In: frames of its nodes, and the time. Out: transmitted frames, one after the other in the order of
+//! arbitration. No clock, no I/O, and no bit errors: every node receives every frame.
 
 use std::collections::{BTreeMap, VecDeque};
 
@@ -12,39 +12,39 @@ use proto_core::wire::can::{CanFrame, CanId};
 /// How long frames take.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Pacing {
-    /// None at all: a frame has crossed as soon as it is given.
+    /// None at all: a frame is transmitted as soon as it is queued.
     AtOnce,
     /// As long as their bits take at this rate, in bit/s.
     Bitrate(u32),
 }
 
-/// One node of a wire. Of nodes that joined earlier it is the greater.
+/// A node of the bus; one that joined later is greater.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub struct NodeId(u64);
 
-/// A frame that has crossed the wire.
+/// A frame that was transmitted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Crossed {
-    /// Whose it was.
+pub struct Transmitted {
+    /// The sender.
     pub from: NodeId,
     /// The frame.
     pub frame: CanFrame,
-    /// When it ended.
+    /// The end of the transmission.
     pub at: Instant,
 }
 
-/// The node has [`MAX_QUEUED`] frames waiting already; the frame was not taken.
+/// The node has [`MAX_QUEUED`] frames waiting already; the frame was not queued.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Full;
 
-/// The wire.
+/// The medium, and the frames that wait for it.
 #[derive(Debug)]
 pub struct Wire {
     pacing: Pacing,
     nodes: BTreeMap<NodeId, VecDeque<Waiting>>,
     joined: u64,
-    on_the_wire: Option<UnderWay>,
-    /// When the last frame ended.
+    in_progress: Option<InProgress>,
+    /// The end of the last frame.
     free_since: Instant,
 }
 
@@ -55,7 +55,7 @@ struct Waiting {
 }
 
 #[derive(Debug, Clone, Copy)]
-struct UnderWay {
+struct InProgress {
     from: NodeId,
     what: Waiting,
     start: Instant,
@@ -63,18 +63,18 @@ struct UnderWay {
 }
 
 impl Wire {
-    /// An idle wire without nodes.
+    /// An idle bus without nodes.
     pub fn new(pacing: Pacing) -> Self {
         Self {
             pacing,
             nodes: BTreeMap::new(),
             joined: 0,
-            on_the_wire: None,
+            in_progress: None,
             free_since: Instant::from_micros(0),
         }
     }
 
-    /// One node more.
+    /// Adds a node.
     pub fn join(&mut self) -> NodeId {
         let id = NodeId(self.joined);
         self.joined += 1;
@@ -82,15 +82,15 @@ impl Wire {
         id
     }
 
-    /// One node less. What waits there is given up; a frame on the wire still crosses it.
+    /// Removes a node and drops its waiting frames. Its frame in progress is still transmitted.
     pub fn leave(&mut self, node: NodeId) {
         self.nodes.remove(&node);
     }
 
-    /// Frames of the node that have not left, the one on the wire among them.
+    /// Number of the node's frames that have not been transmitted, including the one in progress.
     pub fn waiting(&self, node: NodeId) -> usize {
         let queued = self.nodes.get(&node).map_or(0, VecDeque::len);
-        queued + usize::from(self.on_the_wire.is_some_and(|frame| frame.from == node))
+        queued + usize::from(self.in_progress.is_some_and(|frame| frame.from == node))
     }
 
     /// Whether the node's next frame would be refused.
@@ -98,20 +98,20 @@ impl Wire {
         self.nodes.get(&node).is_none_or(|queue| queue.len() >= MAX_QUEUED)
     }
 
-    /// Takes a frame to send; [`Wire::poll`] is due after it.
+    /// Queues a frame. Call [`Wire::poll`] after it.
     ///
     /// # Errors
     /// See [`Full`].
     pub fn send(&mut self, now: Instant, node: NodeId, frame: CanFrame) -> Result<(), Full> {
         let queue = self.nodes.get_mut(&node).filter(|queue| queue.len() < MAX_QUEUED).ok_or(Full)?;
         queue.push_back(Waiting { since: now, frame });
-        match self.on_the_wire {
+        match self.in_progress {
             None => self.arbitrate(),
-            // Nobody has told the first bit from another's yet, so this frame takes part.
+            // Still within the first bit of that frame, so this one takes part in the arbitration.
             Some(first) if now <= first.start + self.bit_time() => {
                 if let Some(queue) = self.nodes.get_mut(&first.from) {
                     queue.push_front(first.what);
-                    self.on_the_wire = None;
+                    self.in_progress = None;
                     self.arbitrate();
                 }
             }
@@ -120,22 +120,22 @@ impl Wire {
         Ok(())
     }
 
-    /// When the frame on the wire ends; [`Instant::NEVER`] when there is none.
+    /// The end of the frame in progress, or [`Instant::NEVER`].
     pub fn deadline(&self) -> Instant {
-        self.on_the_wire.map_or(Instant::NEVER, |frame| frame.end)
+        self.in_progress.map_or(Instant::NEVER, |frame| frame.end)
     }
 
-    /// The next frame that has ended by now. Late polls lose no time: the frame after it began when it
-    /// ended, and only nodes that had one by then contended.
-    pub fn poll(&mut self, now: Instant) -> Option<Crossed> {
-        let UnderWay { from, what, end, .. } = self.on_the_wire.take_if(|frame| frame.end <= now)?;
+    /// The next frame that has ended by now. A late call changes nothing: the following frame began at this
+    /// one's end, with arbitration among the nodes that had one queued by then.
+    pub fn poll(&mut self, now: Instant) -> Option<Transmitted> {
+        let InProgress { from, what, end, .. } = self.in_progress.take_if(|frame| frame.end <= now)?;
         self.free_since = end;
         self.arbitrate();
-        Some(Crossed { from, frame: what.frame, at: end })
+        Some(Transmitted { from, frame: what.frame, at: end })
     }
 
-    /// Of the nodes that had a frame when the wire became free, or the first one after that, the one
-    /// with the lowest arbitration field begins.
+    /// Starts the frame with the lowest arbitration field, of those queued when the bus became idle, or of
+    /// the first one after that.
     fn arbitrate(&mut self) {
         let heads = || self.nodes.iter().filter_map(|(&node, queue)| queue.front().map(|&what| (node, what)));
         let Some(first) = heads().map(|(_, what)| what.since).min() else { return };
@@ -150,9 +150,9 @@ impl Wire {
         }
         let time = match self.pacing {
             Pacing::AtOnce => Duration::from_micros(0),
-            Pacing::Bitrate(bitrate) => bits_time(bits_on_the_wire(&what.frame), bitrate),
+            Pacing::Bitrate(bitrate) => bits_time(frame_bits(&what.frame), bitrate),
         };
-        self.on_the_wire = Some(UnderWay { from, what, start, end: start + time });
+        self.in_progress = Some(InProgress { from, what, start, end: start + time });
     }
 
     fn bit_time(&self) -> Duration {
@@ -163,8 +163,8 @@ impl Wire {
     }
 }
 
-/// What nodes send bit by bit while they contend, as a number: the lowest wins. A standard frame beats
-/// an extended one with the same leading 11 bits, and a data frame beats a remote one.
+/// A frame's arbitration field as a number: the lowest wins. A standard frame wins over an extended one with
+/// the same leading 11 bits, and a data frame over a remote one.
 pub fn arbitration_field(frame: &CanFrame) -> u32 {
     let remote = u32::from(frame.is_remote());
     match frame.id() {
@@ -173,15 +173,15 @@ pub fn arbitration_field(frame: &CanFrame) -> u32 {
     }
 }
 
-/// The bits of a frame with its stuff bits and the three bits of pause after it.
-pub fn bits_on_the_wire(frame: &CanFrame) -> u32 {
+/// Length of a frame in bits, with stuff bits and the three bits of intermission.
+pub fn frame_bits(frame: &CanFrame) -> u32 {
     let mut bits = Bits::default();
     let field = arbitration_field(frame);
     bits.push(0, 1);
     match frame.id() {
-        // With the bits IDE and r0.
+        // With IDE and r0.
         CanId::Standard(_) => bits.push(field >> 20 << 2, 14),
-        // With the bits r1 and r0.
+        // With r1 and r0.
         CanId::Extended(_) => {
             bits.push(field, 32);
             bits.push(0, 2);
@@ -195,7 +195,7 @@ pub fn bits_on_the_wire(frame: &CanFrame) -> u32 {
     bits.count + BITS_AFTER_CRC
 }
 
-/// Counts bits as they are stuffed: after five equal ones comes another.
+/// Counts bits with stuffing: after five equal bits, an opposite one is inserted.
 #[derive(Debug, Default)]
 struct Bits {
     count: u32,
@@ -225,11 +225,11 @@ fn bits_time(bits: u32, bitrate: u32) -> Duration {
     Duration::from_micros((u64::from(bits) * 1_000_000).div_ceil(u64::from(bitrate.max(1))))
 }
 
-/// Most frames of one node that wait for the wire.
+/// Maximum number of one node's frames that wait for the bus.
 pub const MAX_QUEUED: usize = 64;
-/// CRC delimiter, acknowledgement with its delimiter, 7 bits of end, 3 bits of pause.
+/// CRC delimiter, acknowledgement with its delimiter, 7 bits of end of frame, 3 bits of intermission.
 const BITS_AFTER_CRC: u32 = 13;
-/// Of CRC-15/CAN.
+/// CRC-15/CAN.
 const CRC_POLYNOMIAL: u16 = 0x4599;
 
 #[cfg(test)]

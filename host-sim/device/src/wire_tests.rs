@@ -1,4 +1,4 @@
-//! The wire on a virtual clock.
+//! The bus on a virtual clock.
 
 use proptest::prelude::*;
 use proto_core::config::can_frame_time;
@@ -17,20 +17,20 @@ fn at(micros: u64) -> Instant {
     Instant::from_micros(micros)
 }
 
-/// Everything that crosses from now on, polled at each deadline, with the time of its end.
+/// All further transmissions, polled at each deadline, with the time of their end.
 fn run(wire: &mut Wire) -> Vec<(NodeId, CanFrame, u64)> {
     std::iter::from_fn(|| {
-        let Crossed { from, frame, at } = wire.poll(wire.deadline())?;
+        let Transmitted { from, frame, at } = wire.poll(wire.deadline())?;
         Some((from, frame, at.as_micros()))
     })
     .collect()
 }
 
-fn frames(crossed: &[(NodeId, CanFrame, u64)]) -> Vec<CanFrame> {
-    crossed.iter().map(|&(_, frame, _)| frame).collect()
+fn frames(transmitted: &[(NodeId, CanFrame, u64)]) -> Vec<CanFrame> {
+    transmitted.iter().map(|&(_, frame, _)| frame).collect()
 }
 
-/// A wire that is busy from 0 on, with the node that keeps it so.
+/// A bus that is busy from 0 on, and when it becomes idle.
 fn busy() -> (Wire, u64) {
     let mut wire = Wire::new(Pacing::Bitrate(500_000));
     let node = wire.join();
@@ -40,7 +40,7 @@ fn busy() -> (Wire, u64) {
 }
 
 #[test]
-fn those_that_wait_when_the_wire_becomes_free_go_in_the_order_of_arbitration() {
+fn waiting_frames_are_sent_in_the_order_of_arbitration() {
     let (mut wire, _) = busy();
     let order = [
         standard(0x100, &[9]),
@@ -59,7 +59,7 @@ fn those_that_wait_when_the_wire_becomes_free_go_in_the_order_of_arbitration() {
 }
 
 #[test]
-fn a_node_keeps_its_own_order_and_contends_with_its_first_frame_only() {
+fn a_node_keeps_its_order_and_arbitrates_with_its_first_frame_only() {
     let (mut wire, _) = busy();
     let (one, two) = (wire.join(), wire.join());
     for id in [7, 1, 2] {
@@ -73,13 +73,13 @@ fn a_node_keeps_its_own_order_and_contends_with_its_first_frame_only() {
 }
 
 #[test]
-fn of_equal_ids_the_one_that_waits_longest_goes_first_then_who_joined_first() {
+fn of_equal_ids_the_longest_waiting_is_first_then_the_node_that_joined_first() {
     let (mut wire, _) = busy();
     let nodes = [wire.join(), wire.join(), wire.join()];
     wire.send(at(9), nodes[0], standard(5, &[0])).unwrap();
     wire.send(at(8), nodes[2], standard(5, &[2])).unwrap();
     wire.send(at(8), nodes[1], standard(5, &[1])).unwrap();
-    let from: Vec<_> = run(&mut wire)[1..].iter().map(|crossed| crossed.0).collect();
+    let from: Vec<_> = run(&mut wire)[1..].iter().map(|transmitted| transmitted.0).collect();
     assert_eq!(from, [nodes[1], nodes[2], nodes[0]]);
 }
 
@@ -90,17 +90,17 @@ fn within_the_first_bit_a_better_frame_still_wins_and_later_it_waits() {
         let (one, two) = (wire.join(), wire.join());
         wire.send(at(100), one, standard(9, &[])).unwrap();
         wire.send(at(100 + delay), two, standard(1, &[])).unwrap();
-        let crossed = run(&mut wire);
-        assert_eq!(frames(&crossed), order.map(|id| standard(id, &[])), "after {delay} us");
-        let times = order.map(|id| 2 * u64::from(bits_on_the_wire(&standard(id, &[]))));
-        assert_eq!((crossed[0].2, crossed[1].2), (100 + times[0], 100 + times[0] + times[1]));
+        let transmitted = run(&mut wire);
+        assert_eq!(frames(&transmitted), order.map(|id| standard(id, &[])), "after {delay} us");
+        let times = order.map(|id| 2 * u64::from(frame_bits(&standard(id, &[]))));
+        assert_eq!((transmitted[0].2, transmitted[1].2), (100 + times[0], 100 + times[0] + times[1]));
     }
 }
 
 #[test]
-fn a_burst_takes_the_time_of_its_bits_however_late_it_is_polled() {
+fn a_burst_takes_the_time_of_its_bits_even_if_polled_late() {
     let burst: Vec<_> = (0..MAX_QUEUED as u16).map(|id| standard(id, &[0xFF; 8])).collect();
-    let bits: u32 = burst.iter().map(bits_on_the_wire).sum();
+    let bits: u32 = burst.iter().map(frame_bits).sum();
     for lateness in [0, 40, 1_000_000] {
         let mut wire = Wire::new(Pacing::Bitrate(250_000));
         let node = wire.join();
@@ -112,8 +112,8 @@ fn a_burst_takes_the_time_of_its_bits_however_late_it_is_polled() {
         let mut count = 0;
         while wire.deadline() != Instant::NEVER {
             let now = wire.deadline() + Duration::from_micros(lateness);
-            while let Some(crossed) = wire.poll(now) {
-                (last, count) = (crossed.at, count + 1);
+            while let Some(transmitted) = wire.poll(now) {
+                (last, count) = (transmitted.at, count + 1);
             }
         }
         assert_eq!((last.as_micros(), count), (1_000 + 4 * u64::from(bits), burst.len()));
@@ -121,11 +121,11 @@ fn a_burst_takes_the_time_of_its_bits_however_late_it_is_polled() {
 }
 
 #[test]
-fn who_comes_after_the_end_of_a_frame_did_not_contend_then() {
+fn a_frame_queued_after_the_end_of_another_was_not_in_that_arbitration() {
     let (mut wire, end) = busy();
     let (early, late) = (wire.join(), wire.join());
     wire.send(at(5), early, standard(0x700, &[])).unwrap();
-    // Nobody polled at the end.
+    // Not polled at the end.
     wire.send(at(end + 50), late, standard(1, &[])).unwrap();
     assert_eq!(frames(&run(&mut wire))[1..], [standard(0x700, &[]), standard(1, &[])]);
 }
@@ -142,7 +142,7 @@ fn an_idle_wire_begins_at_once_and_not_in_the_past() {
 }
 
 #[test]
-fn a_full_queue_refuses_and_a_node_that_leaves_takes_its_frames_along() {
+fn a_full_queue_refuses_and_a_node_that_leaves_loses_its_frames() {
     let (mut wire, end) = busy();
     let (node, other) = (wire.join(), wire.join());
     for _ in 0..MAX_QUEUED {
@@ -164,15 +164,15 @@ fn without_pacing_nothing_waits() {
     let nodes = [wire.join(), wire.join()];
     for (node, id) in [(nodes[0], 9), (nodes[1], 1), (nodes[0], 5)] {
         wire.send(at(50), node, standard(id, &[8; 8])).unwrap();
-        let crossed = wire.poll(at(50));
-        assert_eq!(crossed, Some(Crossed { from: node, frame: standard(id, &[8; 8]), at: at(50) }));
+        let transmitted = wire.poll(at(50));
+        assert_eq!(transmitted, Some(Transmitted { from: node, frame: standard(id, &[8; 8]), at: at(50) }));
     }
 }
 
 #[test]
 fn bits_of_known_frames() {
     // 34 zeros with their CRC: a stuff bit after every fifth.
-    assert_eq!(bits_on_the_wire(&standard(0, &[])), 47 + 6);
+    assert_eq!(frame_bits(&standard(0, &[])), 47 + 6);
     let mut bits = Bits::default();
     for byte in *b"123456789" {
         bits.push(u32::from(byte), 8);
@@ -234,19 +234,19 @@ proptest! {
             text += &format!("{byte:08b}");
         }
         text += &crc_text(&text);
-        let bits = bits_on_the_wire(&frame);
+        let bits = frame_bits(&frame);
         prop_assert_eq!(bits as usize, stuffed_length(&text) + 13);
         let len = if remote { 0 } else { data.len() };
         prop_assert!(u64::from(bits) <= can_frame_time(id, len, 1_000_000).as_micros());
     }
 
     #[test]
-    fn nothing_is_lost_twice_or_out_of_its_order_whoever_sends_when(
+    fn no_frame_is_lost_doubled_or_out_of_order(
         sends in proptest::collection::vec((0..200_u64, 0..4_usize, 0..6_u16), 0..60),
     ) {
         let mut wire = Wire::new(Pacing::Bitrate(1_000_000));
         let nodes: Vec<_> = (0..4).map(|_| wire.join()).collect();
-        let (mut now, mut given, mut crossed) = (at(0), vec![Vec::new(); 4], vec![Vec::new(); 4]);
+        let (mut now, mut given, mut transmitted) = (at(0), vec![Vec::new(); 4], vec![Vec::new(); 4]);
         let mut ends = Vec::new();
         for (nth, (pause, node, id)) in (0_u8..).zip(sends) {
             now += Duration::from_micros(pause);
@@ -254,11 +254,11 @@ proptest! {
             wire.send(now, nodes[node], frame).unwrap();
             given[node].push(frame);
         }
-        while let Some(Crossed { from, frame, at }) = wire.poll(wire.deadline()) {
-            crossed[nodes.iter().position(|&node| node == from).unwrap()].push(frame);
-            ends.push((at, bits_on_the_wire(&frame)));
+        while let Some(Transmitted { from, frame, at }) = wire.poll(wire.deadline()) {
+            transmitted[nodes.iter().position(|&node| node == from).unwrap()].push(frame);
+            ends.push((at, frame_bits(&frame)));
         }
-        prop_assert_eq!(given, crossed);
+        prop_assert_eq!(given, transmitted);
         for pair in ends.windows(2) {
             prop_assert!(pair[1].0.saturating_since(pair[0].0) >= Duration::from_micros(pair[1].1.into()));
         }

@@ -1,5 +1,5 @@
-//! A file, damaged or not, and `--set` overrides: one line says what is wrong, or the configuration
-//! is one that an engine and a board can take (docs/configuration.md).
+//! Configuration files, damaged or not, with `--set` overrides: either one line says what is wrong, or an
+//! engine and a board accept the configuration (docs/configuration.md).
 
 use proto_core::config::GatewayConfig;
 use proto_core::config::image::{MAX_IMAGE, decode, encode};
@@ -12,7 +12,7 @@ use toml::{Table, Value};
 
 const NAME: &str = "fuzz.toml";
 
-/// What overrides say.
+/// Values of overrides.
 const VALUES: [&str; 24] = [
     "0",
     "1",
@@ -64,7 +64,7 @@ pub(crate) fn run(input: &[u8]) {
     }
 }
 
-/// One of the example files with pieces put in and taken out.
+/// One of the example files with pieces inserted and removed.
 fn damaged(input: &mut Source<'_>) -> String {
     let mut text = input.one_of(&FILES).to_owned();
     for _ in 0..input.below(5) {
@@ -87,7 +87,7 @@ fn one_line(error: &FileError) {
     assert!(!message.chars().any(char::is_control), "{message:?}");
 }
 
-/// The file by itself.
+/// Checks the file without overrides.
 fn alone(text: &str) {
     let read = parse_text(text, &[]);
     let named = Text { name: NAME, toml: text };
@@ -103,7 +103,7 @@ fn alone(text: &str) {
             assert_eq!(controller.as_ref(), Ok(config));
             assert!(gateway.is_err() && recipes.is_ok());
         }
-        // What has no section of either kind is what the caller says it is.
+        // A file with sections of neither kind is of the kind that the caller expects.
         Err(_) => assert!(gateway.is_err() || controller.is_err()),
     }
     for error in [read.err(), gateway.err(), controller.err(), recipes.err()].into_iter().flatten() {
@@ -111,7 +111,7 @@ fn alone(text: &str) {
     }
 }
 
-/// Whatever a file says that was taken, an engine and a board can take it too.
+/// Checks that an engine and a board accept a configuration that was read.
 fn usable(config: &GatewayConfig) {
     config.validate().expect("it was checked");
     let engine = Engine::<8, 4, 512>::new(config);
@@ -122,7 +122,7 @@ fn usable(config: &GatewayConfig) {
     }
 }
 
-/// One override, and what it means where that is plain.
+/// An override, and its equivalent in the file where there is a simple one.
 struct Override {
     text: String,
     means: Option<(Vec<String>, String)>,
@@ -143,7 +143,7 @@ impl Override {
         };
         let quoted = |name: &String| if name.contains('.') { format!("\"{name}\"") } else { name.clone() };
         let key = path.iter().map(quoted).collect::<Vec<_>>().join(".");
-        // Quotes in a name, or none of it, have no plain form.
+        // A name that is empty or has quotes has no simple form.
         let plain = path
             .iter()
             .all(|name| !name.is_empty() && !name.contains(['"', '=', '[', ']']) && name.trim() == name);
@@ -151,7 +151,7 @@ impl Override {
     }
 }
 
-/// The names on the way to some value of the file, or to one that is not there yet.
+/// The path of keys to a random value of the file, or to a new one.
 fn path(input: &mut Source<'_>, table: &Table) -> Option<Vec<String>> {
     let mut path = Vec::new();
     let mut at = &Value::Table(table.clone());
@@ -187,16 +187,16 @@ fn path(input: &mut Source<'_>, table: &Table) -> Option<Vec<String>> {
     }
 }
 
-/// Section 1: an override does what the same words in the file do.
+/// Section 1: an override has the same effect as the same text in the file.
 fn against_the_file(table: &Table, overrides: &[Override]) {
-    // Written anew, so that both ways have their keys in the same order.
+    // Serialized again, so that the keys have the same order in both.
     let text = toml::to_string(table).expect("what was read can be written");
     assert_eq!(parse_text(&text, &[]).is_ok(), parse_text(&table.to_string(), &[]).is_ok());
     let mut changed = table.clone();
     let mut fits = true;
     for one in overrides {
         let Some((path, value)) = &one.means else { return };
-        // The order of a table's lines counts here, and a new one would be the last.
+        // The order of lines in this table matters, and a new one would be the last.
         if path.iter().any(|name| name == "to" || name == "initial" || name == "on_timeout") {
             return;
         }
@@ -253,7 +253,7 @@ fn put_into(inner: &mut Value, path: &[String], value: Value) -> bool {
     }
 }
 
-/// Without an order of what has none.
+/// The configuration with those items sorted whose order has no meaning.
 fn sorted(config: &Config) -> Config {
     match config.clone() {
         Config::Controller(SimConfig { mut initial, listen, robot, recipes, ports, programs }) => {
@@ -280,7 +280,7 @@ files! {
 pub(crate) fn seeds() -> Vec<Vec<u8>> {
     let mut seeds = Vec::new();
     for nth in 0..FILES.len() as u8 {
-        // As it is; with overrides of what is there, by name and by number, and of what is not.
+        // Unchanged; with overrides of existing items by name and by index, and of new ones.
         seeds.push(vec![1, nth, 0]);
         for turns in
             [[0, 0, 0, 0], [1, 1, 1, 1], [2, 0, 5, 0], [2, 1, 7, 250], [3, 2, 240, 250], [31, 0, 0, 0]]
@@ -291,7 +291,7 @@ pub(crate) fn seeds() -> Vec<Vec<u8>> {
         }
         seeds.push([&[0xC1, nth, 1, 50, 1, 7, 21], &[5, 1, 0, 2, 3, 6, 2, 0, 2, 5, 21, 0, 15][..]].concat());
     }
-    // Section 1's own examples, on a file that has the items.
+    // The examples of section 1, on a file with these items.
     for text in [
         "controller.address",
         "controller.ports.modbus",
@@ -301,7 +301,7 @@ pub(crate) fn seeds() -> Vec<Vec<u8>> {
     ] {
         seeds.push([&[0x40, 0, 2, text.len() as u8], text.as_bytes()].concat());
     }
-    // Texts alone.
+    // Other files, without overrides.
     for text in [
         "",
         "[controller]\naddress = 1",

@@ -1,5 +1,4 @@
-//! The fuzz target with what is kept for it and a fixed number of inputs by chance
-//! (docs/fuzzing.md).
+//! The fuzz target with its corpus and a fixed number of random inputs (docs/fuzzing.md).
 
 use std::path::Path;
 

@@ -1,34 +1,34 @@
-//! How long to wait before the next attempt: doubling between two bounds.
+//! Exponential backoff: the pause between attempts doubles from a minimum to a maximum.
 
 use std::time::Duration;
 
 /// The pauses between attempts.
 #[derive(Debug, Clone)]
 pub struct Backoff {
-    least: Duration,
-    most: Duration,
+    min: Duration,
+    max: Duration,
     next: Duration,
 }
 
 impl Backoff {
-    /// Pauses from `least`, doubling up to `most`.
-    pub fn new(least: Duration, most: Duration) -> Self {
-        Self { least, most, next: least }
+    /// Pauses from `min`, doubling up to `max`.
+    pub fn new(min: Duration, max: Duration) -> Self {
+        Self { min, max, next: min }
     }
 
-    /// Begins again with the shortest pause: an attempt succeeded.
+    /// Starts again with the shortest pause, after an attempt succeeded.
     pub fn reset(&mut self) {
-        self.next = self.least;
+        self.next = self.min;
     }
 
-    /// The pause that is due now; the next one is twice as long.
+    /// The pause before the next attempt; the one after it is twice as long.
     pub fn pause(&mut self) -> Duration {
         let pause = self.next;
-        self.next = pause.saturating_mul(2).min(self.most);
+        self.next = pause.saturating_mul(2).min(self.max);
         pause
     }
 
-    /// Waits out the pause that is due now.
+    /// Waits before the next attempt, as long as [`Self::pause`] says.
     pub async fn wait(&mut self) {
         tokio::time::sleep(self.pause()).await;
     }
@@ -39,7 +39,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn pauses_double_up_to_the_bound_and_begin_again() {
+    fn pauses_double_up_to_the_maximum_and_start_again() {
         let mut backoff = Backoff::new(Duration::from_millis(20), Duration::from_millis(100));
         let pauses: Vec<_> = (0..5).map(|_| backoff.pause().as_millis()).collect();
         assert_eq!(pauses, [20, 40, 80, 100, 100]);

@@ -4,11 +4,11 @@ use std::io;
 
 use tokio::net::{TcpStream, ToSocketAddrs};
 
-/// Connects, but never to itself: who tries a local port that nobody listens on, again and again, is
-/// one day given that very port to try from, and TCP then connects the socket to itself.
+/// Connects, but never to itself. A client that keeps trying a local port without a listener is sooner or
+/// later given that port as its own, and TCP then connects the socket to itself.
 ///
 /// # Errors
-/// As [`TcpStream::connect`]; a connection to itself counts as refused.
+/// As [`TcpStream::connect`]; a connection to itself is reported as refused.
 pub async fn connect(to: impl ToSocketAddrs) -> io::Result<TcpStream> {
     let stream = TcpStream::connect(to).await?;
     if stream.local_addr()? == stream.peer_addr()? {
@@ -23,10 +23,10 @@ mod tests {
     use tokio::net::TcpSocket;
 
     #[test]
-    fn a_socket_can_connect_to_itself_which_is_no_connection() {
+    fn a_socket_can_connect_to_itself_and_others_still_can() {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
         runtime.block_on(async {
-            // What the system does by chance, done on purpose.
+            // On purpose, what the system does by chance.
             let socket = TcpSocket::new_v4().unwrap();
             socket.bind("127.0.0.1:0".parse().unwrap()).unwrap();
             let own = socket.local_addr().unwrap();

@@ -1,4 +1,5 @@
-//! Who has a turn when on a shell's thread, where everybody who has something to do is served in order.
+//! Fair scheduling of the tasks on a shell's thread: a peer that sends without end must delay neither the
+//! others nor the engine's deadlines.
 
 use std::cell::Cell;
 use std::rc::Rc;
@@ -11,82 +12,82 @@ use super::timer::now;
 
 thread_local! {
     static TURN: Rc<Semaphore> = Rc::new(Semaphore::new(1));
-    /// How many have more to do than their turn allowed.
-    static UNFINISHED: Cell<usize> = const { Cell::new(0) };
-    /// The next deadline of this thread's engine, until it has been told that it has passed.
+    /// Number of tasks in [`yield_fairly`].
+    static WAITING: Cell<usize> = const { Cell::new(0) };
+    /// The next deadline of this thread's engine.
     static DEADLINE: Cell<Instant> = const { Cell::new(Instant::NEVER) };
 }
 
-/// For those who come back at once: sockets and timers are looked at and all others served before this
-/// returns, and of those that wait here only one goes on each time. So however many send without end, no
-/// deadline waits for more than one of them.
-pub async fn give_way() {
-    let _unfinished = Unfinished::new();
+/// Yields, for a task that has more to do at once. tokio polls sockets and timers and runs all other tasks
+/// before this returns, and only one of the tasks that wait here continues each time. So a deadline waits for
+/// one busy task at most, however many there are.
+pub async fn yield_fairly() {
+    let _waiting = Waiting::new();
     let turn = TURN.with(Rc::clone);
-    let _mine = turn.acquire().await;
+    let _permit = turn.acquire().await;
     yield_now().await;
 }
 
-struct Unfinished;
+struct Waiting;
 
-impl Unfinished {
+impl Waiting {
     fn new() -> Self {
-        UNFINISHED.set(UNFINISHED.get() + 1);
+        WAITING.set(WAITING.get() + 1);
         Self
     }
 }
 
-impl Drop for Unfinished {
+impl Drop for Waiting {
     fn drop(&mut self) {
-        UNFINISHED.set(UNFINISHED.get() - 1);
+        WAITING.set(WAITING.get() - 1);
     }
 }
 
-/// The engine of this thread wants to be told when `deadline` has passed.
-pub fn expect(deadline: Instant) {
+/// Sets the next deadline of this thread's engine, for [`let_others_run`] and [`arrival_time`].
+pub fn set_deadline(deadline: Instant) {
     DEADLINE.set(deadline);
 }
 
-/// For who is to tell that the deadline has passed: first everybody takes what had come by then.
+/// Lets all other tasks report input that had arrived by the deadline, before the engine handles it.
 ///
-/// tokio looks at the sockets before it lets go on who has yielded, and everybody who has something is
-/// served once. That is enough on time. When the thread was kept from looking, more may wait than one turn
-/// takes: then until all of it is taken, but not for long, since it may have no end.
-pub async fn all_others() {
+/// tokio polls the sockets before a task that has yielded continues, and runs each task that has input once.
+/// That is enough if the deadline is kept. If the thread was blocked, more input may wait than a task reads
+/// at once: then this waits until all of it is read, for a bounded time, because there may be no end of it.
+pub async fn let_others_run() {
     yield_now().await;
     let mut before = now();
-    if held_up_at(before).is_none() {
+    if missed_deadline(before).is_none() {
         return;
     }
-    let (mut spent, mut quiet_rounds) = (Duration::ZERO, 0);
-    // One round more than anybody needs: what one took he may have passed on to another.
-    while quiet_rounds < 2 && spent < CATCHING_UP {
+    let (mut spent, mut idle_rounds) = (Duration::ZERO, 0);
+    // Two, because a task may have passed input on to another one.
+    while idle_rounds < 2 && spent < MAX_CATCH_UP {
         yield_now().await;
         let round = now().saturating_since(before);
         before += round;
-        // The thread may be held up once more.
-        let is_quiet = UNFINISHED.get() == 0 && round < HELD_UP;
-        quiet_rounds = if is_quiet { quiet_rounds + 1 } else { 0 };
-        spent = spent + round.min(HELD_UP);
+        // The thread may have been blocked again.
+        let is_idle = WAITING.get() == 0 && round < BLOCKED;
+        idle_rounds = if is_idle { idle_rounds + 1 } else { 0 };
+        spent = spent + round.min(BLOCKED);
     }
 }
 
-/// When what is read now arrived: now, but by the deadline that this thread should have kept if it was kept
-/// from looking.
-pub fn arrival() -> Instant {
+/// The latest time at which input that is read now can count as arrived: now, or the engine's deadline if the
+/// thread was blocked when it passed.
+pub fn arrival_time() -> Instant {
     let now = now();
-    held_up_at(now).unwrap_or(now)
+    missed_deadline(now).unwrap_or(now)
 }
 
-fn held_up_at(now: Instant) -> Option<Instant> {
+fn missed_deadline(now: Instant) -> Option<Instant> {
     let deadline = DEADLINE.get();
-    (now.saturating_since(deadline) >= HELD_UP).then_some(deadline)
+    (now.saturating_since(deadline) >= BLOCKED).then_some(deadline)
 }
 
-/// What others do takes less, so being this late has another reason.
-const HELD_UP: Duration = Duration::from_millis(5);
-/// How much later a deadline is told so that more of what came before it is told first.
-const CATCHING_UP: Duration = Duration::from_millis(20);
+/// A deadline missed by this much means that the thread was blocked: the other tasks take less.
+const BLOCKED: Duration = Duration::from_millis(5);
+/// How long [`let_others_run`] waits for late input, without the time for which the thread was blocked.
+const MAX_CATCH_UP: Duration = Duration::from_millis(20);
 
 #[cfg(test)]
 mod tests {
@@ -94,7 +95,7 @@ mod tests {
     use tokio::task::{JoinSet, LocalSet};
 
     #[test]
-    fn of_many_that_never_stop_one_goes_on_at_a_time() {
+    fn of_many_busy_tasks_one_continues_at_a_time() {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
         LocalSet::new().block_on(&runtime, async {
             let turns = Rc::new(Cell::new(0));
@@ -104,22 +105,22 @@ mod tests {
                 tasks.spawn_local(async move {
                     loop {
                         turns.set(turns.get() + 1);
-                        give_way().await;
+                        yield_fairly().await;
                     }
                 });
             }
             yield_now().await;
-            let begun = turns.get();
+            let before = turns.get();
             for _ in 0..100 {
                 yield_now().await;
             }
-            let taken = turns.get() - begun;
+            let taken = turns.get() - before;
             assert!((50..=101).contains(&taken), "{taken} in 100 rounds");
         });
     }
 
     #[test]
-    fn who_never_ends_does_not_keep_a_late_deadline_from_being_told() {
+    fn a_busy_task_does_not_delay_a_missed_deadline_for_ever() {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
         LocalSet::new().block_on(&runtime, async {
             let turns = Rc::new(Cell::new(0));
@@ -127,14 +128,14 @@ mod tests {
             tokio::task::spawn_local(async move {
                 loop {
                     own.set(own.get() + 1);
-                    give_way().await;
+                    yield_fairly().await;
                 }
             });
-            expect(now() + Duration::from_secs(3_600));
-            all_others().await;
+            set_deadline(now() + Duration::from_secs(3_600));
+            let_others_run().await;
             let on_time = turns.get();
-            expect(now() - HELD_UP);
-            all_others().await;
+            set_deadline(now() - BLOCKED);
+            let_others_run().await;
             assert!((1..5).contains(&on_time), "{on_time}");
             assert!(turns.get() > 2 * on_time, "it had time to catch up");
         });

@@ -1,6 +1,6 @@
 //! Sockets, timers and scheduling of this host, for tasks that share one thread.
 //!
-//! Bytes and instants go in and out; no device, no recipe, no controller and no engine is known here.
+//! Does not know devices, recipes, the controller or the engine.
 
 #[cfg(not(target_os = "linux"))]
 compile_error!(
@@ -9,9 +9,9 @@ compile_error!(
 
 pub mod backoff;
 pub mod connect;
-pub mod peer;
-pub mod quota;
+pub mod fairness;
+pub mod log_limit;
 pub mod reactor;
 pub mod realtime;
+pub mod tcp_options;
 pub mod timer;
-pub mod turns;

@@ -1,51 +1,51 @@
-//! How often a peer's doing is worth a line of the log.
+//! A rate limit for log lines that a peer can cause.
 
 use std::cell::Cell;
 
 use proto_core::time::{Duration, Instant};
 
-/// Lets the first few of a stretch of time through and counts the others.
+/// Allows the first few lines of each interval and counts the others.
 #[derive(Debug, Default)]
-pub struct Quota {
-    since: Cell<Instant>,
-    passed: Cell<u32>,
-    held_back: Cell<u64>,
+pub struct LogLimit {
+    interval_start: Cell<Instant>,
+    logged: Cell<u32>,
+    suppressed: Cell<u64>,
 }
 
-impl Quota {
-    /// Whether this one passes; if so, how many were held back since the one before.
-    pub fn take(&self, now: Instant) -> Option<u64> {
-        if now.saturating_since(self.since.get()) >= STRETCH {
-            self.since.set(now);
-            self.passed.set(0);
+impl LogLimit {
+    /// `Some` if a line may be logged now, with the number of lines suppressed since the last one.
+    pub fn allow(&self, now: Instant) -> Option<u64> {
+        if now.saturating_since(self.interval_start.get()) >= INTERVAL {
+            self.interval_start.set(now);
+            self.logged.set(0);
         }
-        if self.passed.get() == MOST {
-            self.held_back.set(self.held_back.get() + 1);
+        if self.logged.get() == MAX_LINES {
+            self.suppressed.set(self.suppressed.get() + 1);
             return None;
         }
-        self.passed.set(self.passed.get() + 1);
-        Some(self.held_back.take())
+        self.logged.set(self.logged.get() + 1);
+        Some(self.suppressed.take())
     }
 }
 
-const STRETCH: Duration = Duration::from_secs(10);
-const MOST: u32 = 5;
+const INTERVAL: Duration = Duration::from_secs(10);
+const MAX_LINES: u32 = 5;
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn a_few_pass_and_the_first_later_one_tells_of_the_others() {
-        let quota = Quota::default();
+    fn the_first_line_of_the_next_interval_has_the_number_of_suppressed_ones() {
+        let limit = LogLimit::default();
         let at = |seconds| Instant::ZERO + Duration::from_secs(seconds);
-        for _ in 0..MOST {
-            assert_eq!(quota.take(at(100)), Some(0));
+        for _ in 0..MAX_LINES {
+            assert_eq!(limit.allow(at(100)), Some(0));
         }
         for second in 100..110 {
-            assert_eq!(quota.take(at(second)), None);
+            assert_eq!(limit.allow(at(second)), None);
         }
-        assert_eq!(quota.take(at(110)), Some(10));
-        assert_eq!(quota.take(at(110)), Some(0));
+        assert_eq!(limit.allow(at(110)), Some(10));
+        assert_eq!(limit.allow(at(110)), Some(0));
     }
 }

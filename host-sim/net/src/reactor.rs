@@ -1,16 +1,16 @@
-//! Descriptors of our own in tokio's reactor.
+//! File descriptors in tokio's reactor.
 
 use std::io;
 use std::os::fd::OwnedFd;
 
 use tokio::io::unix::AsyncFd;
 
-/// Puts a non-blocking descriptor into the current runtime's reactor.
+/// Registers a non-blocking descriptor with the current runtime's reactor.
 ///
 /// # Errors
-/// When the reactor refuses it, as it does with regular files.
+/// If the reactor refuses it, as it does a regular file.
 pub fn register(fd: OwnedFd) -> io::Result<AsyncFd<OwnedFd>> {
-    // SAFETY: an `OwnedFd` is an open descriptor that always answers with the same number, and the
-    // `AsyncFd` owns it, so it leaves the reactor before it is closed.
+    // SAFETY: an `OwnedFd` is open and its number never changes; the `AsyncFd` owns it, so it is
+    // deregistered before it is closed.
     Ok(unsafe { AsyncFd::register(fd) }?)
 }

@@ -3,18 +3,18 @@
 use std::fmt;
 use std::io;
 
-/// How a thread is scheduled.
+/// The scheduling a thread asks for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Scheduling {
-    /// Like any other thread.
+    /// As any other thread.
     #[default]
     Ordinary,
-    /// SCHED_FIFO at its lowest priority if the system allows it: ahead of ordinary threads, behind
-    /// every other real-time one.
+    /// SCHED_FIFO at its lowest priority if the system allows it: before ordinary threads, after every
+    /// other real-time thread.
     FifoIfAllowed,
 }
 
-/// What came of it.
+/// The scheduling a thread got.
 #[derive(Debug)]
 pub enum Scheduled {
     /// Not asked for.
@@ -26,7 +26,7 @@ pub enum Scheduled {
 }
 
 impl Scheduled {
-    /// A word for ready lines and counters.
+    /// One word for `ready` lines and counters.
     pub fn word(&self) -> &'static str {
         match self {
             Self::Ordinary | Self::Refused(_) => "ordinary",
@@ -45,7 +45,7 @@ impl fmt::Display for Scheduled {
     }
 }
 
-/// Schedules the calling thread as asked.
+/// Applies the scheduling to the calling thread.
 pub fn apply(scheduling: Scheduling) -> Scheduled {
     match scheduling {
         Scheduling::Ordinary => Scheduled::Ordinary,
@@ -65,8 +65,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_answer_tells_what_the_system_did() {
-        // On its own thread: the scheduling ends with it.
+    fn the_result_is_what_the_system_did() {
+        // On a thread of its own, so that no other test is affected.
         let (outcome, policy) = std::thread::spawn(|| {
             let outcome = apply(Scheduling::FifoIfAllowed);
             // SAFETY: 0 names the calling thread; nothing is passed by reference.

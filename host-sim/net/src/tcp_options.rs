@@ -1,5 +1,5 @@
-//! What the system is asked to do for a TCP connection: bounds on what it holds, an end when the peer has
-//! vanished, and word of what the peer has got.
+//! Socket options of TCP connections: buffer sizes, detection of a lost peer, and how much the peer has
+//! acknowledged.
 
 use std::io;
 use std::os::fd::{AsFd, AsRawFd};
@@ -8,54 +8,55 @@ use std::time::Duration;
 use rustix::net::sockopt;
 use tokio::net::{TcpListener, TcpStream};
 
-/// Bounds what waits in the system for each connection of a listening socket, each way.
-pub fn bound(listener: &TcpListener) {
-    // Connections take it over. A system that refuses has bounds of its own.
+/// Limits the system's buffers of each connection that a listening socket accepts, in both directions.
+pub fn limit_buffers(listener: &TcpListener) {
+    // Accepted connections inherit the sizes. A system that refuses has limits of its own.
     let _ = sockopt::set_socket_recv_buffer_size(listener, BUFFER);
     let _ = sockopt::set_socket_send_buffer_size(listener, BUFFER);
 }
 
-/// Nothing waits for more to come, and a peer that has vanished without a word is found after 20 s.
-pub fn watch(stream: &TcpStream) {
-    // A stream that refuses works all the same, and a peer that is gone already is found by the next read.
+/// Sends small segments at once (TCP_NODELAY), and ends the connection 20 s after its peer was last heard
+/// (SO_KEEPALIVE).
+pub fn enable_keepalive(stream: &TcpStream) {
+    // Without the options the stream still works; if the peer is gone already, the next read fails.
     let _ = stream.set_nodelay(true);
     let fd = stream.as_fd();
-    let _ = sockopt::set_tcp_keepidle(fd, PROBE);
-    let _ = sockopt::set_tcp_keepintvl(fd, PROBE);
-    let _ = sockopt::set_tcp_keepcnt(fd, PROBES);
+    let _ = sockopt::set_tcp_keepidle(fd, PROBE_INTERVAL);
+    let _ = sockopt::set_tcp_keepintvl(fd, PROBE_INTERVAL);
+    let _ = sockopt::set_tcp_keepcnt(fd, MAX_PROBES);
     let _ = sockopt::set_socket_keepalive(fd, true);
 }
 
-/// The connection ends when its peer takes nothing of what waits for it for this long.
+/// Ends the connection when sent data stays unacknowledged for this long (TCP_USER_TIMEOUT).
 ///
-/// While such a limit stands, the first question of [`watch`] that is lost ends the connection too.
-pub fn give_up_after(stream: &TcpStream, patience: Duration) {
-    let millis = u32::try_from(patience.as_millis()).unwrap_or(u32::MAX);
+/// With this timeout set, the first lost keepalive probe ends the connection too.
+pub fn set_user_timeout(stream: &TcpStream, timeout: Duration) {
+    let millis = u32::try_from(timeout.as_millis()).unwrap_or(u32::MAX);
     let _ = sockopt::set_tcp_user_timeout(stream, millis);
 }
 
-/// Takes the limit of [`give_up_after`] away.
-pub fn be_patient(stream: &TcpStream) {
-    give_up_after(stream, Duration::ZERO);
+/// Removes the timeout of [`set_user_timeout`].
+pub fn clear_user_timeout(stream: &TcpStream) {
+    set_user_timeout(stream, Duration::ZERO);
 }
 
-/// However the connection ends from now on, even with this process, the peer is told by a reset and gets
-/// nothing that it had not got by then.
+/// However the connection ends from now on, even with this process, it is reset: data that the peer has not
+/// received by then is dropped.
 ///
 /// # Errors
-/// When the system refuses the option.
-pub fn abandon_at_end(stream: &TcpStream) -> io::Result<()> {
+/// If the system refuses the option.
+pub fn reset_on_close(stream: &TcpStream) -> io::Result<()> {
     stream.set_zero_linger()
 }
 
-/// How many of the bytes that the system took its peer has not acknowledged (SIOCOUTQ).
+/// Number of written bytes that the peer has not acknowledged (SIOCOUTQ).
 ///
 /// # Errors
-/// When the system does not tell.
+/// If the system does not know.
 pub fn unacknowledged(stream: &TcpStream) -> io::Result<usize> {
     let mut count: libc::c_int = 0;
-    // SAFETY: the descriptor is open while `stream` is borrowed, and the call writes one int to `count`,
-    // which outlives it.
+    // SAFETY: the descriptor is open while `stream` is borrowed; the call writes one int to `count`, which
+    // outlives it.
     let done = unsafe { libc::ioctl(stream.as_raw_fd(), libc::TIOCOUTQ, &raw mut count) };
     if done < 0 {
         return Err(io::Error::last_os_error());
@@ -63,15 +64,15 @@ pub fn unacknowledged(stream: &TcpStream) -> io::Result<usize> {
     Ok(usize::try_from(count).unwrap_or(0))
 }
 
-/// Bytes each way.
+/// Bytes in each direction.
 const BUFFER: usize = 64 * 1_024;
-/// Silence before the first question whether a peer is there, and between two.
-const PROBE: Duration = Duration::from_secs(5);
-/// Questions without an answer.
-const PROBES: u32 = 3;
-/// Silence until a peer counts as vanished.
+/// Silence before the first keepalive probe, and time between two.
+const PROBE_INTERVAL: Duration = Duration::from_secs(5);
+/// Probes without an answer after which the peer is lost.
+const MAX_PROBES: u32 = 3;
+/// Silence after which a peer is lost.
 #[cfg(test)]
-const VANISHED: Duration = Duration::from_secs(20);
+const LOST: Duration = Duration::from_secs(20);
 
 #[cfg(test)]
 mod tests {
@@ -85,50 +86,51 @@ mod tests {
 
     async fn pair() -> (TcpStream, TcpStream) {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
-        bound(&listener);
+        limit_buffers(&listener);
         let near = TcpStream::connect(listener.local_addr().unwrap()).await.unwrap();
         (listener.accept().await.unwrap().0, near)
     }
 
     #[test]
-    fn what_the_system_holds_for_a_connection_is_bounded() {
+    fn an_accepted_connection_has_limited_buffers() {
         run(async {
-            let (taken, _peer) = pair().await;
-            let own = |size: usize| size <= 2 * BUFFER;
-            assert!(own(sockopt::socket_recv_buffer_size(&taken).unwrap()));
-            assert!(own(sockopt::socket_send_buffer_size(&taken).unwrap()));
+            let (accepted, _peer) = pair().await;
+            // Linux doubles the size that it is given.
+            let is_limited = |size: usize| size <= 2 * BUFFER;
+            assert!(is_limited(sockopt::socket_recv_buffer_size(&accepted).unwrap()));
+            assert!(is_limited(sockopt::socket_send_buffer_size(&accepted).unwrap()));
         });
     }
 
     #[test]
-    fn a_vanished_peer_is_asked_for() {
+    fn keepalive_finds_a_lost_peer_in_time() {
         run(async {
-            let (taken, _peer) = pair().await;
-            watch(&taken);
-            assert!(sockopt::socket_keepalive(&taken).unwrap());
-            let probe = sockopt::tcp_keepidle(&taken).unwrap();
-            let between = sockopt::tcp_keepintvl(&taken).unwrap();
-            assert_eq!(probe + between * sockopt::tcp_keepcnt(&taken).unwrap(), VANISHED);
+            let (accepted, _peer) = pair().await;
+            enable_keepalive(&accepted);
+            assert!(sockopt::socket_keepalive(&accepted).unwrap());
+            let probe = sockopt::tcp_keepidle(&accepted).unwrap();
+            let between = sockopt::tcp_keepintvl(&accepted).unwrap();
+            assert_eq!(probe + between * sockopt::tcp_keepcnt(&accepted).unwrap(), LOST);
         });
     }
 
     #[test]
-    fn a_peer_that_takes_nothing_is_given_up() {
+    fn a_peer_that_acknowledges_nothing_is_given_up() {
         run(async {
-            let (taken, _peer) = pair().await;
-            give_up_after(&taken, Duration::from_millis(300));
+            let (accepted, _peer) = pair().await;
+            set_user_timeout(&accepted, Duration::from_millis(300));
             let gone = async {
                 loop {
-                    match taken.try_write(&[0; 4_096]) {
+                    match accepted.try_write(&[0; 4_096]) {
                         Ok(_) => {}
                         Err(error) if error.kind() == ErrorKind::WouldBlock => {
-                            taken.writable().await.unwrap();
+                            accepted.writable().await.unwrap();
                         }
                         Err(error) => return error,
                     }
                 }
             };
-            let error = tokio::time::timeout(Duration::from_secs(20), gone).await.expect("it is kept");
+            let error = tokio::time::timeout(Duration::from_secs(20), gone).await.expect("it is still open");
             assert_eq!(error.kind(), ErrorKind::TimedOut);
         });
     }

@@ -1,10 +1,10 @@
 //! The clock and its timers: CLOCK_BOOTTIME in microseconds, and `timerfd`s on absolute times.
 //!
-//! CLOCK_BOOTTIME goes on while the machine is suspended. After that everything that waited is as old as it
-//! is, and the gap shows.
+//! CLOCK_BOOTTIME continues while the machine is suspended, so that the age of waiting data is right after
+//! it.
 //!
-//! tokio's own timers have slots of a millisecond and run late by more than one; a `timerfd` in the
-//! same reactor is off by tens of microseconds, which a grid of 4 ms needs.
+//! tokio's own timers have a resolution of 1 ms and fire later than that; a `timerfd` in the same reactor is
+//! late by tens of microseconds, which a grid of 4 ms needs.
 
 use std::cell::Cell;
 use std::io;
@@ -19,7 +19,7 @@ use tokio::io::unix::AsyncFd;
 
 use super::reactor::register;
 
-/// The time since boot, as every core in this process sees it.
+/// The time since boot: the clock of every state machine in this process.
 pub fn now() -> Instant {
     let time = clock_gettime(ClockId::Boottime);
     let seconds = u64::try_from(time.tv_sec).unwrap_or(0);
@@ -27,7 +27,7 @@ pub fn now() -> Instant {
     Instant::from_micros(seconds.saturating_mul(1_000_000).saturating_add(nanos / 1_000))
 }
 
-/// A one-shot timer on an absolute deadline that may be moved at any time.
+/// A one-shot timer with an absolute deadline, which may be moved at any time.
 #[derive(Debug)]
 pub struct Timer {
     fd: AsyncFd<OwnedFd>,
@@ -38,27 +38,27 @@ impl Timer {
     /// A timer without a deadline, in the current tokio runtime.
     ///
     /// # Errors
-    /// When the system has no descriptor left.
+    /// If the system has no descriptor left.
     pub fn new() -> io::Result<Self> {
         let flags = TimerfdFlags::NONBLOCK | TimerfdFlags::CLOEXEC;
         let fd = timerfd_create(TimerfdClockId::Boottime, flags)?;
         Ok(Self { fd: register(fd)?, armed: Cell::new(Instant::NEVER) })
     }
 
-    /// The deadline; [`Instant::NEVER`] when there is none.
+    /// The deadline, or [`Instant::NEVER`].
     pub fn deadline(&self) -> Instant {
         self.armed.get()
     }
 
-    /// Moves the deadline. One in the past expires at once; [`Instant::NEVER`] takes it away.
+    /// Moves the deadline. One in the past expires at once; [`Instant::NEVER`] disarms the timer.
     ///
     /// # Errors
-    /// Only what `timerfd_settime` refuses, which no instant does.
+    /// As `timerfd_settime`, which refuses no instant.
     pub fn arm(&self, deadline: Instant) -> io::Result<()> {
         if deadline == self.armed.get() {
             return Ok(());
         }
-        // A zero time would disarm, hence at least 1 µs after boot.
+        // Zero would disarm the timer, hence at least 1 µs.
         let value = if deadline == Instant::NEVER { 0 } else { deadline.as_micros().max(1) };
         timerfd_settime(
             self.fd.get_ref(),
@@ -69,10 +69,10 @@ impl Timer {
         Ok(())
     }
 
-    /// Waits until the deadline has passed, then has none. Cancel safe.
+    /// Waits until the deadline has passed; the timer is disarmed then. Cancel safe.
     ///
     /// # Errors
-    /// When the descriptor cannot be read, which does not happen in a living runtime.
+    /// If the descriptor cannot be read, which does not happen while the runtime lives.
     pub async fn expired(&self) -> io::Result<()> {
         loop {
             let mut ready = self.fd.readable().await?;
@@ -97,8 +97,8 @@ impl Timer {
     }
 }
 
-/// A grid of absolute times, `period` apart. Keeps its phase: late ticks are skipped and counted, never
-/// made up for.
+/// Ticks on a grid of absolute times, `period` apart. Keeps its phase: missed ticks are skipped and counted,
+/// never sent in a burst.
 #[derive(Debug)]
 pub struct Grid {
     timer: Timer,
@@ -107,7 +107,7 @@ pub struct Grid {
 }
 
 impl Grid {
-    /// A grid whose first tick is at `first`. A period of zero counts as one microsecond.
+    /// A grid whose first tick is at `first`. A period of zero means one microsecond.
     ///
     /// # Errors
     /// As [`Timer::new`].
@@ -134,12 +134,12 @@ impl Grid {
 pub struct GridTick {
     /// When it was due.
     pub due: Instant,
-    /// How many ticks before it were missed.
+    /// Number of missed ticks before it.
     pub skipped: u64,
 }
 
 fn timespec(micros: u64) -> Timespec {
-    // More seconds than an i64 holds are far beyond any deadline; the timer then just never fires.
+    // More seconds than an i64 holds: the timer never fires.
     let seconds = i64::try_from(micros / 1_000_000).unwrap_or(i64::MAX);
     let nanos = i64::try_from(micros % 1_000_000).unwrap_or(0).saturating_mul(1_000);
     Timespec { tv_sec: seconds, tv_nsec: nanos }
@@ -167,7 +167,7 @@ mod tests {
     }
 
     #[test]
-    fn a_deadline_in_the_past_fires_at_once_and_one_moved_earlier_counts() {
+    fn a_deadline_in_the_past_fires_at_once_and_one_can_be_moved_earlier() {
         run(async {
             let timer = Timer::new().unwrap();
             timer.sleep_until(Instant::ZERO).await.unwrap();
@@ -191,7 +191,7 @@ mod tests {
     }
 
     #[test]
-    fn a_late_grid_keeps_its_phase_and_counts_what_it_skipped() {
+    fn a_late_grid_keeps_its_phase_and_counts_skipped_ticks() {
         run(async {
             let period = Duration::from_millis(4);
             let first = now() - Duration::from_millis(10);

@@ -1,8 +1,8 @@
-//! The simulated controller's Modbus server beside a bare epoll server that sends as many bytes for as
-//! many, at 8 and 64 connections: requests a second, and the server thread's own time a request.
+//! The simulated controller's Modbus server compared with a bare epoll server that sends the same number of
+//! bytes, at 8 and 64 connections: requests per second, and CPU time of the server thread per request.
 //!
-//! Rounds of both are interleaved, so that whatever else the machine does hits both. One client thread
-//! keeps one request under way on every connection.
+//! Rounds of both are interleaved, so that other load of the machine affects both. One client thread keeps
+//! one request in flight on every connection.
 
 use std::collections::BTreeMap;
 use std::io::{Read, Write};
@@ -23,7 +23,7 @@ const ROUNDS: usize = 25;
 const ROUND: Duration = Duration::from_millis(120);
 
 fn main() {
-    // `cargo test` runs benchmarks too, to see that they compile and start.
+    // `cargo test` runs benchmarks too, to check that they compile and start.
     if !std::env::args().any(|arg| arg == "--bench") {
         return;
     }
@@ -95,7 +95,7 @@ fn median(values: &mut [f64]) -> f64 {
     values[values.len() / 2]
 }
 
-/// How long a thread of this process has run, in nanoseconds.
+/// CPU time of a thread of this process, in nanoseconds.
 fn thread_nanos(name: &str) -> u64 {
     for task in std::fs::read_dir("/proc/self/task").unwrap() {
         let path = task.unwrap().path();
@@ -108,7 +108,7 @@ fn thread_nanos(name: &str) -> u64 {
     panic!("no thread {name}");
 }
 
-/// The least a server can do: wait, read, write.
+/// A minimal server: wait, read, write.
 fn start_echo() -> SocketAddr {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let at = listener.local_addr().unwrap();

@@ -1,4 +1,4 @@
-//! The simulated controller on real sockets: what the shell adds to the model, and what it refuses.
+//! The simulated controller on real sockets: what the shell adds to the state machine, and what it refuses.
 
 use std::io::{Read, Write};
 use std::net::{TcpListener as StdListener, TcpStream as StdStream, UdpSocket as StdUdp};
@@ -40,7 +40,7 @@ fn ask(stream: &mut StdStream, request: &[u8], answer: &[u8]) {
     assert_eq!(String::from_utf8_lossy(&got), String::from_utf8_lossy(answer));
 }
 
-/// Counters that are as wanted, in time.
+/// Waits until the counters are as expected, and returns them.
 #[track_caller]
 fn wait_for(handle: &Handle, wanted: impl Fn(&Value) -> bool) -> Value {
     let end = StdInstant::now() + PATIENCE;
@@ -54,12 +54,12 @@ fn wait_for(handle: &Handle, wanted: impl Fn(&Value) -> bool) -> Value {
     }
 }
 
-/// Whether the peer has closed: nothing more comes, however it said so.
+/// Whether the peer has closed the connection, by an end or a reset.
 fn is_closed(stream: &mut StdStream) -> bool {
     !matches!(stream.read(&mut [0; 16]), Ok(1..))
 }
 
-/// Runs a test inside the controller's own runtime, with everything of it at hand.
+/// Runs a test in the controller's own runtime, with access to its state.
 fn inside(config: SimConfig, test: impl AsyncFnOnce(&Rc<ControllerShell>, &Value)) {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
     LocalSet::new().block_on(&runtime, async {
@@ -83,7 +83,7 @@ fn the_two_example_ports_of_the_controller_answer() {
     for packet in packets.chunks(state::LEN) {
         assert_eq!(packet[1448..1452], [2, 6, 0, 5]);
     }
-    // FC 3, holding registers 0..4, and FC 5 on coil 192; both in one segment, the second cut.
+    // FC 3, holding registers 0..4, and FC 5 on coil 192, in one segment, with the second one truncated.
     let mut modbus = connect(&handle, "modbus");
     modbus.write_all(&[0, 1, 0, 0, 0, 6, 1, 3, 0, 0, 0, 4, 0, 2, 0, 0, 0, 6, 1, 5, 0]).unwrap();
     modbus.write_all(&[192, 0xFF, 0]).unwrap();
@@ -99,7 +99,7 @@ fn the_two_example_ports_of_the_controller_answer() {
 }
 
 #[test]
-fn a_state_client_that_takes_nothing_for_two_seconds_is_dropped_and_others_lose_nothing() {
+fn a_state_client_that_reads_nothing_for_two_seconds_is_dropped_and_others_lose_nothing() {
     inside(example("udp-server-controller.toml", &[]), async |shell, ready| {
         let at: SocketAddr = ready["state"].as_str().unwrap().parse().unwrap();
         let slow = TcpSocket::new_v4().unwrap();
@@ -108,7 +108,7 @@ fn a_state_client_that_takes_nothing_for_two_seconds_is_dropped_and_others_lose_
         let mut good = tokio::net::TcpStream::connect(at).await.unwrap();
         let packet = [0x5A; state::LEN];
         let mut whole = vec![0; state::LEN];
-        // The good client reads whole packets all the while, as the slow one's buffers fill.
+        // The other client reads whole packets while the buffers of the slow one fill.
         let blocked_at = loop {
             good.read_exact(&mut whole).await.unwrap();
             let slow =
@@ -118,11 +118,11 @@ fn a_state_client_that_takes_nothing_for_two_seconds_is_dropped_and_others_lose_
             }
             shell.send_state(&packet, now());
         };
-        let patient = blocked_at + STATE_PATIENCE - Duration::from_micros(1);
+        let patient = blocked_at + STATE_TIMEOUT - Duration::from_micros(1);
         shell.send_state(&packet, patient);
         assert_eq!(shell.counters.get().slow_clients, 0);
         assert!(shell.counters.get().skipped_state_packets > 0);
-        shell.send_state(&packet, blocked_at + STATE_PATIENCE);
+        shell.send_state(&packet, blocked_at + STATE_TIMEOUT);
         shell.drain(now());
         assert_eq!(shell.counters.get().slow_clients, 1);
         assert_eq!(shell.controller.borrow().counters().state.open, 1);
@@ -134,7 +134,7 @@ fn a_state_client_that_takes_nothing_for_two_seconds_is_dropped_and_others_lose_
 }
 
 #[test]
-fn who_asks_without_taking_answers_is_not_read_further_and_loses_nothing() {
+fn a_client_that_does_not_read_answers_is_not_read_and_loses_nothing() {
     let handle = start(example("udp-server-controller.toml", &[]), Vec::new()).unwrap();
     let mut modbus = connect(&handle, "modbus");
     modbus.set_nonblocking(true).unwrap();
@@ -145,7 +145,7 @@ fn who_asks_without_taking_answers_is_not_read_further_and_loses_nothing() {
     };
     let mut asked = 0_u32;
     let mut rest = Vec::new();
-    // Until both sides are full: no room to write although the controller answers nothing more.
+    // Until the buffers of both sides are full.
     let mut answered = None;
     loop {
         if rest.is_empty() {
@@ -167,7 +167,7 @@ fn who_asks_without_taking_answers_is_not_read_further_and_loses_nothing() {
         }
         assert!(asked < 3_000_000, "taken without bound");
     }
-    // Another client is served meanwhile.
+    // Another client is still served.
     let mut other = connect(&handle, "modbus");
     ask(&mut other, &[9, 9, 0, 0, 0, 6, 1, 3, 0, 1, 0, 1], &[9, 9, 0, 0, 0, 5, 1, 3, 2, 0, 6]);
     modbus.set_nonblocking(false).unwrap();
@@ -182,7 +182,7 @@ fn who_asks_without_taking_answers_is_not_read_further_and_loses_nothing() {
 }
 
 #[test]
-fn of_too_many_closed_connections_that_still_send_the_oldest_is_cut() {
+fn of_too_many_closed_connections_that_still_send_the_oldest_is_aborted() {
     inside(example("udp-server-controller.toml", &[]), async |shell, ready| {
         let at: SocketAddr = ready["modbus"].as_str().unwrap().parse().unwrap();
         let mut peers = Vec::new();
@@ -196,15 +196,15 @@ fn of_too_many_closed_connections_that_still_send_the_oldest_is_cut() {
         }
         let conns: Vec<_> = shell.connections.borrow().keys().copied().collect();
         for &conn in &conns {
-            // Answers that nobody takes, until they are kept.
+            // Unread answers, until some wait in this process.
             let connection = Rc::clone(&shell.connections.borrow()[&conn].connection);
-            while connection.send(&[0; 4_096]) == Taken::All {}
+            while connection.send(&[0; 4_096]) == Accepted::All {}
             shell.carry_out(ControllerOutput::Close { conn }, now());
         }
         assert_eq!(shell.lingering.borrow().len(), MAX_LINGERING);
         assert_eq!(shell.counters.get().cut_answers, 3);
         assert!(shell.connections.borrow().is_empty());
-        // Those that are left go when their peers have gone.
+        // The others end when their peers close.
         drop(peers);
         while !shell.lingering.borrow().is_empty() {
             tokio::task::yield_now().await;
@@ -213,7 +213,7 @@ fn of_too_many_closed_connections_that_still_send_the_oldest_is_cut() {
 }
 
 #[test]
-fn one_client_too_many_is_turned_away() {
+fn one_client_too_many_is_refused() {
     let handle = start(example("udp-server-controller.toml", &[]), Vec::new()).unwrap();
     for (name, most) in [("command", MAX_COMMAND_CONNECTIONS), ("state", MAX_STATE_CONNECTIONS)] {
         let mut clients: Vec<_> = (0..most).map(|_| connect(&handle, name)).collect();
@@ -228,14 +228,14 @@ fn one_client_too_many_is_turned_away() {
 }
 
 #[test]
-fn clients_that_asked_once_make_room_for_the_next_one() {
+fn clients_with_one_request_are_displaced_by_the_next_one() {
     let handle = start(example("udp-server-controller.toml", &[]), Vec::new()).unwrap();
     let mut clients: Vec<_> = (0..MAX_COMMAND_CONNECTIONS).map(|_| connect(&handle, "command")).collect();
     for client in &mut clients {
         ask(client, b"state\n", b"6:0:5:2");
     }
     let end = StdInstant::now() + PATIENCE;
-    // Turned away at first: those that are there may be about to ask again.
+    // Refused at first: the connected clients may be active again.
     let mut stop = loop {
         assert!(StdInstant::now() < end, "never let in");
         ask(&mut clients[0], b"state\n", b"6:0:5:2");
@@ -255,7 +255,7 @@ fn clients_that_asked_once_make_room_for_the_next_one() {
 }
 
 #[test]
-fn port_2000_takes_as_many_clients_as_the_file_says() {
+fn port_2000_accepts_as_many_clients_as_configured() {
     let config = |clients| example("udp-server-controller.toml", &[clients]);
     let handle = start(config("robot.command_clients=one"), Vec::new()).unwrap();
     let mut first = connect(&handle, "command");
@@ -302,15 +302,15 @@ fn a_udp_client_is_streamed_to_until_its_port_is_unreachable() {
     other.recv(&mut frame).unwrap();
     drop(client);
     wait_for(&handle, |stats| stats["ports"]["udp2011"]["clients_gone"] == 1);
-    // The one that is left gets every frame: no error of the other's costs it one.
+    // The other client gets every frame: an ICMP error of the first one costs none.
     let before = handle.stats().unwrap();
     other.recv(&mut frame).unwrap();
     assert_eq!(before["connections"]["dropped_datagrams"], 0);
 }
 
 #[test]
-fn the_clients_connect_out_when_they_can_and_again() {
-    // An address of its own: no other test is given the port while nobody listens.
+fn client_ports_connect_and_reconnect() {
+    // A loopback address of its own, so that no other test gets the port while nothing listens.
     let listener = StdListener::bind("127.0.0.77:0").unwrap();
     let at = listener.local_addr().unwrap();
     drop(listener);
@@ -320,7 +320,7 @@ fn the_clients_connect_out_when_they_can_and_again() {
     let config = example("client-controller.toml", &to.each_ref().map(String::as_str));
     let handle = start(config, Vec::new()).unwrap();
     assert_eq!(handle.place("ports/tcp1"), at.to_string());
-    // UDP does not wait for anybody.
+    // UDP does not wait for a peer.
     let mut frame = [0; 64];
     let (count, controller) = udp.recv_from(&mut frame).unwrap();
     assert_eq!((count, &frame[..2], &frame[26..28]), (28, &[0xFF, 0xFF][..], &[0xFE, 0xFE][..]));
@@ -339,7 +339,7 @@ fn the_clients_connect_out_when_they_can_and_again() {
         wait_for(&handle, |stats| stats["registers"]["DigitalOutputCommand[1]"] == f64::from(4 * round));
         assert_eq!(handle.stats().unwrap()["ports"]["tcp1"]["ups"], round);
     }
-    // Somebody who never listens again does not fill memory, nor stop the other port.
+    // A peer that is gone neither fills memory nor stops the other port.
     drop(listener);
     udp.recv_from(&mut frame).unwrap();
 }
@@ -378,7 +378,7 @@ fn the_serial_and_can_ports_work_on_their_devices() {
 }
 
 #[test]
-fn what_keeps_it_from_starting_is_one_message_and_nothing_stays() {
+fn a_failed_start_is_one_message_and_leaves_nothing() {
     let refused = |config: SimConfig, binds: &[&str]| {
         let binds = binds.iter().map(|text| text.parse().unwrap()).collect();
         start(config, binds).unwrap_err().to_string()
@@ -399,7 +399,7 @@ fn what_keeps_it_from_starting_is_one_message_and_nothing_stays() {
     let link = folder.path().join("rs485").display().to_string();
     let once = format!("rs485=pty:{link}");
     assert!(refused(serial(), &[&once, &once]).contains("the port is already bound"));
-    // The device was opened, then a server's port turned out to be taken.
+    // The device was opened before a server's port was found in use.
     let held = StdListener::bind("127.0.0.1:0").unwrap();
     let mut config = serial();
     config.listen.modbus = held.local_addr().unwrap().port();

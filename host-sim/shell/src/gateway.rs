@@ -1,8 +1,8 @@
 //! The gateway's engine on real sockets and devices.
 //!
-//! Everything runs on one thread. Input of a device or socket goes into the engine at once, and the
-//! engine's outputs are carried out before anything else is read: one engine pass lies between the
-//! last byte of a field frame and the request on its way to the controller.
+//! Everything runs on one thread. Input of a device or socket is reported to the engine at once, and the
+//! outputs are carried out before anything else is read. So only one call of the engine is between the last
+//! byte of a field frame and the request to the controller.
 
 use std::cell::{Cell, RefCell};
 use std::collections::BTreeMap;
@@ -23,10 +23,10 @@ use super::{RunOptions, StartError};
 use recipe_device::bind::Bind;
 use recipe_device::exchange::{PortEvent, PortTx};
 use recipe_device::port::{Port, PortBus};
-use recipe_net::peer;
+use recipe_net::fairness;
 use recipe_net::realtime::{self, Scheduling};
+use recipe_net::tcp_options;
 use recipe_net::timer::{Timer, now};
-use recipe_net::turns;
 
 /// A gateway with its ports and links, before it runs.
 struct Gateway {
@@ -36,13 +36,13 @@ struct Gateway {
     ready: Value,
 }
 
-/// What all tasks of the gateway share.
+/// Shared by all tasks of the gateway.
 struct Core {
     engine: RefCell<Box<Engine>>,
     ports: BTreeMap<PortId, (String, Rc<PortTx>)>,
     links: BTreeMap<LinkId, Rc<LinkControl>>,
     deadline: Cell<Instant>,
-    /// How often the engine noticed that the gateway slept.
+    /// The engine's count of sleeps at the last call.
     sleeps: Cell<u32>,
     deadline_moved: Notify,
 }
@@ -139,19 +139,19 @@ impl Shell for Gateway {
 }
 
 impl Core {
-    /// Calls the engine when it has asked to be called.
+    /// Calls the engine at its deadlines.
     async fn keep_time(&self) -> Result<(), StartError> {
         let clock = |error| StartError::new(format!("timerfd: {error}"));
         let timer = Timer::new().map_err(clock)?;
         self.input(Input::Tick);
         loop {
             timer.arm(self.deadline.get()).map_err(clock)?;
-            turns::expect(self.deadline.get());
+            fairness::set_deadline(self.deadline.get());
             tokio::select! {
                 expired = timer.expired() => {
                     expired.map_err(clock)?;
                     // Input that had arrived by the deadline is not overdue.
-                    turns::all_others().await;
+                    fairness::let_others_run().await;
                     self.input(Input::Tick);
                 }
                 () = self.deadline_moved.notified() => {}
@@ -180,7 +180,7 @@ impl Core {
         }
     }
 
-    /// Handles one input and all outputs that follow.
+    /// Reports one input and carries out all outputs.
     fn input(&self, input: Input<'_>) {
         let at = now();
         trace!(?input, "in");
@@ -255,7 +255,7 @@ impl Core {
             if let LinkKind::RecipeTcpListen { .. } | LinkKind::RecipeUdpListen { .. } = link.kind
                 && let Some(control) = self.links.get(&link.id)
             {
-                shown["turned_away"] = json!(control.turned_away());
+                shown["turned_away"] = json!(control.refusals());
                 lift(shown, "turned_away");
             }
         }
@@ -263,7 +263,7 @@ impl Core {
     }
 }
 
-/// Adds the entries of one object to another.
+/// Moves the entries of the inner object `key` to the outer one.
 fn lift(outer: &mut Value, key: &str) {
     if let Some(outer) = outer.as_object_mut()
         && let Some(Value::Object(inner)) = outer.remove(key)
@@ -333,7 +333,7 @@ async fn open_endpoint(to: proto_core::engine::Endpoint<'_>) -> Result<Endpoint,
         Transport::Udp { port } => Endpoint::Udp { host, port },
         Transport::TcpListen { local } => {
             let listener = TcpListener::bind(local).await.map_err(|error| refused(local, error))?;
-            peer::bound(&listener);
+            tcp_options::limit_buffers(&listener);
             Endpoint::TcpListen { listener, controller: host }
         }
         Transport::UdpListen { local } => {

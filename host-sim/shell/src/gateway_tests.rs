@@ -13,7 +13,7 @@ use tokio::task::{LocalSet, spawn_local, yield_now};
 use super::*;
 use recipe_config::file::{Text, parse_gateway};
 
-/// A line, a CAN bus and a controller's TCP and UDP clients.
+/// A serial line and a CAN bus.
 const CELL: &str = r#"
 [controller]
 address = "127.0.0.1"

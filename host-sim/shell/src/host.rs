@@ -1,5 +1,5 @@
-//! The environment of every shell: a thread with a runtime, a handle, and in the foreground the
-//! `ready` line, statistics and a clean end.
+//! What every shell needs: a thread with a runtime, a handle, and in the foreground the `ready` line,
+//! statistics and a clean end.
 
 use std::io::{self, Write};
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
@@ -12,18 +12,18 @@ use tokio::task::LocalSet;
 use tracing::warn;
 
 use super::{RunOptions, Signals, StartError};
-use crate::out::{is_enough, tell};
+use crate::out::{is_broken_pipe, print_stderr};
 
-/// An engine is built by value, and unoptimised code copies it on the stack several times over.
+/// Stack size: an engine is built by value, and unoptimised code has several copies of it on the stack.
 const STACK: usize = 16 << 20;
 
-/// Something that runs on one thread until it is dropped.
+/// A gateway or a controller that runs on one thread until it is dropped.
 pub(super) trait Shell {
-    /// The addresses and paths of `ready`, by name.
+    /// The addresses and paths for the `ready` line, by name.
     fn ready(&self) -> Value;
-    /// How to take one line of statistics while the shell runs.
+    /// A function that returns one line of statistics while the shell runs.
     fn stats(&self) -> impl Fn() -> Value + 'static;
-    /// Runs inside a [`LocalSet`]; ends by itself only if something fails permanently.
+    /// Runs in a [`LocalSet`]; returns only if something fails permanently, or after a shutdown command.
     fn run(self) -> impl Future<Output = Result<(), StartError>>;
 }
 
@@ -74,12 +74,12 @@ pub(super) fn start<S: Shell>(
     match outcome.recv() {
         Ok(Ok(ready)) => Ok(Handle { ready, requests, thread: Some(thread) }),
         Ok(Err(error)) => Err(error),
-        // The thread ended without a report: its result says why.
+        // The thread ended before it sent a result; its own result says why.
         Err(_) => Err(joined(thread).err().unwrap_or_else(|| StartError::new(format!("{name} ended")))),
     }
 }
 
-/// Answers requests until it is to end.
+/// Answers requests until one asks for the end.
 async fn serve(mut inbox: mpsc::UnboundedReceiver<Request>, stats: impl Fn() -> Value) {
     while let Some(request) = inbox.recv().await {
         match request {
@@ -117,7 +117,7 @@ impl Handle {
     /// Ends the shell and waits for it.
     ///
     /// # Errors
-    /// Why it had ended by itself.
+    /// If it had ended by itself, the reason.
     pub fn shutdown(mut self) -> Result<(), StartError> {
         self.end()
     }
@@ -142,38 +142,38 @@ fn joined(thread: JoinHandle<Result<(), StartError>>) -> Result<(), StartError> 
 pub(super) fn foreground(handle: Handle, options: &RunOptions) -> Result<(), StartError> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
     let runtime = runtime.map_err(|error| StartError::new(format!("cannot start the runtime: {error}")))?;
-    let mut lines = Lines::start()
+    let mut stdout = Stdout::start()
         .map_err(|error| StartError::new(format!("cannot start the thread for statistics: {error}")))?;
     let result = runtime.block_on(async {
-        // Signals are handled before anybody can know that we are ready.
+        // Signals are handled before `ready` is printed.
         let refused = |error: io::Error| StartError::new(format!("signals: {error}"));
         let mut signals = Signals::catch().map_err(refused)?;
         let ready = options.ready.as_ref().map(|file| file.write(handle.ready())).transpose()?;
-        lines.print(format!("ready {}", handle.ready()));
+        stdout.print(format!("ready {}", handle.ready()));
         let mut ticks = options.stats.map(tokio::time::interval);
-        let mut watch = tokio::time::interval(WATCH);
+        let mut check = tokio::time::interval(CHECK_INTERVAL);
         let result = loop {
             tokio::select! {
                 _ = signals.next() => break Ok(()),
                 () = tick(&mut ticks) => {
                     if let Some(mut stats) = handle.stats() {
-                        stats["lost_lines"] = lines.lost().into();
-                        lines.print(stats.to_string());
+                        stats["lost_lines"] = stdout.lost().into();
+                        stdout.print(stats.to_string());
                     }
                 }
-                Some(failure) = lines.failures.recv() => match failure {
-                    Failure::Unread if options.stats.is_some() => {
-                        tell("stdout was closed; ended, because nobody reads the statistics");
+                Some(failure) = stdout.failures.recv() => match failure {
+                    Failure::Closed if options.stats.is_some() => {
+                        print_stderr("stdout was closed; ended, because nobody reads the statistics");
                         break Ok(());
                     }
-                    // There is nothing more to be said there.
-                    Failure::Unread => {}
+                    // Nothing more would be printed.
+                    Failure::Closed => {}
                     Failure::NotReady(error) => {
                         break Err(StartError::new(format!("stdout: {error}")).after_start());
                     }
                     Failure::Lost(error) => warn!(%error, "cannot write statistics to stdout"),
                 },
-                _ = watch.tick() => {
+                _ = check.tick() => {
                     if handle.has_ended() {
                         break Ok(());
                     }
@@ -183,13 +183,13 @@ pub(super) fn foreground(handle: Handle, options: &RunOptions) -> Result<(), Sta
         drop(ready);
         result.and(handle.shutdown())
     });
-    lines.finish();
+    stdout.finish();
     result
 }
 
-/// Lines for stdout, written by a thread of its own: a slow reader must not delay signals. Lines
-/// that are not read or cannot be written are lost and counted.
-struct Lines {
+/// Lines for stdout, written by a thread of its own, because a slow reader must not delay signals. Lines that
+/// are not read or cannot be written are lost and counted.
+struct Stdout {
     waiting: blocking::SyncSender<String>,
     failures: mpsc::UnboundedReceiver<Failure>,
     /// Closed when everything has been written.
@@ -197,21 +197,21 @@ struct Lines {
     lost: Arc<AtomicU64>,
 }
 
-/// Why a line was not written; reported once, until one is written again.
+/// Why a line was not written; reported once until a line is written again.
 enum Failure {
-    /// Nobody will ever read it.
-    Unread,
-    /// It was the first one, which says `ready`.
+    /// The reader has closed stdout.
+    Closed,
+    /// It was the first line, `ready`.
     NotReady(io::Error),
-    /// It was another one; the next may succeed, as on a disk that is full.
+    /// It was another line; the next may succeed, such as after a full disk.
     Lost(io::Error),
 }
 
-impl Lines {
+impl Stdout {
     fn start() -> io::Result<Self> {
-        let (waiting, inbox) = blocking::sync_channel::<String>(MOST_LINES);
+        let (waiting, inbox) = blocking::sync_channel::<String>(MAX_LINES);
         let (open, written) = blocking::channel();
-        let (told, failures) = mpsc::unbounded_channel();
+        let (report, failures) = mpsc::unbounded_channel();
         let lost = Arc::<AtomicU64>::default();
         let count = Arc::clone(&lost);
         std::thread::Builder::new().name("stdout".to_owned()).spawn(move || {
@@ -224,8 +224,8 @@ impl Lines {
                 };
                 count.fetch_add(1, Relaxed);
                 if !std::mem::replace(&mut failing, true) {
-                    let _ = told.send(match nth {
-                        _ if is_enough(&error) => Failure::Unread,
+                    let _ = report.send(match nth {
+                        _ if is_broken_pipe(&error) => Failure::Closed,
                         0 => Failure::NotReady(error),
                         _ => Failure::Lost(error),
                     });
@@ -245,20 +245,20 @@ impl Lines {
         self.lost.load(Relaxed)
     }
 
-    /// Waits for the reader, but not for long.
+    /// Waits until all lines are written, for [`FLUSH_TIMEOUT`] at most.
     fn finish(self) {
         drop(self.waiting);
-        let _ = self.written.recv_timeout(FAREWELL);
+        let _ = self.written.recv_timeout(FLUSH_TIMEOUT);
     }
 }
 
-/// Lines that wait for a reader of stdout.
-const MOST_LINES: usize = 16;
-/// How long the end waits for it.
-const FAREWELL: std::time::Duration = std::time::Duration::from_millis(500);
+/// Maximum number of lines that wait for the reader of stdout.
+const MAX_LINES: usize = 16;
+/// How long the end of the program waits for the reader.
+const FLUSH_TIMEOUT: std::time::Duration = std::time::Duration::from_millis(500);
 
 /// Interval at which the foreground checks that the shell still runs.
-const WATCH: std::time::Duration = std::time::Duration::from_millis(100);
+const CHECK_INTERVAL: std::time::Duration = std::time::Duration::from_millis(100);
 
 async fn tick(ticks: &mut Option<tokio::time::Interval>) {
     match ticks {

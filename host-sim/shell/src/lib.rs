@@ -1,9 +1,7 @@
-//! The tokio shells, which connect the controller and the gateway to sockets, devices and the
-//! clock.
+//! The tokio shells, which connect the engine and the simulated controller to sockets, devices and the clock.
 //!
-//! A shell is one thread with a current-thread runtime. It owns every socket and device of its
-//! side, hands received data to the core and carries out the core's outputs; it does not know
-//! protocols.
+//! A shell is one thread with a current-thread runtime. It owns all its sockets and devices, reports received
+//! data to the state machine, and carries out its outputs. It does not know protocols.
 
 pub mod controller;
 pub mod gateway;
@@ -29,13 +27,13 @@ use recipe_device::bind::Bind;
 pub struct RunOptions {
     /// The device that each serial or CAN port is bound to.
     pub binds: Vec<Bind>,
-    /// Where the addresses are written once everything is listening.
+    /// The file for the addresses, written when everything is listening.
     pub ready: Option<ReadyFile>,
     /// Interval at which a line of counters is printed.
     pub stats: Option<Duration>,
 }
 
-/// Why a run could not start, or could not continue: one message; nothing was left behind.
+/// Why a run could not start or continue: one message. Nothing is left behind.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct StartError {
     message: String,
@@ -48,7 +46,7 @@ impl StartError {
         Self { message: message.into(), had_started: false }
     }
 
-    /// The same, for a run that had started.
+    /// The same error, of a run that had started.
     #[must_use]
     pub fn after_start(self) -> Self {
         Self { had_started: true, ..self }

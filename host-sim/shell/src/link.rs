@@ -1,10 +1,9 @@
-//! One link of the gateway to the controller: opened, closed and fed as the engine says.
+//! A link of the gateway to the controller, opened and closed as the engine decides.
 //!
-//! A link is one task. It owns its socket, hands what arrives to the gateway and sends what is in
-//! its outbox; it knows no protocol and makes no decision. Supervision is the engine's: a link that
-//! fails says so once and waits to be opened again.
+//! A link is one task. It owns its socket, reports what arrives, and sends what is in its outbox. It does not
+//! know protocols. The engine supervises it: a link that fails reports it once and waits to be opened again.
 //!
-//! What waited in a socket while its link was closed is never reported: nothing tells how old it is.
+//! Data that waited in a socket while the link was closed is never reported, because its age is unknown.
 
 mod tcp;
 mod udp;
@@ -21,51 +20,51 @@ use tokio::sync::Notify;
 use tokio::time::Instant;
 use tracing::{debug, info, warn};
 
-use recipe_net::quota::Quota;
+use recipe_net::log_limit::LogLimit;
 use recipe_net::timer::now;
 
-/// What a link connects to.
+/// The other end of a link.
 #[derive(Debug)]
 pub(super) enum Endpoint {
     /// The controller's TCP server.
     Tcp { host: String, port: u16 },
     /// The controller's UDP server.
     Udp { host: String, port: u16 },
-    /// Where the controller's TCP client connects to. Nobody else does.
+    /// A server for the controller's TCP client; others are refused.
     TcpListen { listener: TcpListener, controller: String },
-    /// Where the controller's UDP client sends to. Nobody else does.
+    /// A server for the controller's UDP client; others are ignored.
     UdpListen { socket: UdpSocket, controller: String },
 }
 
-/// What a link tells the gateway.
+/// An event of a link.
 #[derive(Debug)]
 pub(super) enum LinkEvent<'a> {
     Up,
     Down,
     Bytes(&'a [u8]),
-    /// Everything that was handed over was taken by the system.
+    /// The system has accepted everything handed over.
     Sent,
-    /// Of the bytes that were handed over since the link came up, so many are not acknowledged.
+    /// So many of the bytes handed over since the link came up are not acknowledged.
     Acked(u32),
 }
 
-/// The engine's side of a link: never waits.
+/// The engine's side of a link. It never waits.
 #[derive(Debug, Default)]
 pub(super) struct LinkControl {
-    turn: Cell<Turn>,
+    session: Cell<Session>,
     outbox: RefCell<VecDeque<Vec<u8>>>,
-    /// Bytes that were handed over in this turn.
+    /// Bytes handed over in this session.
     handed: Cell<u64>,
     changed: Notify,
-    turned_away: Cell<TurnedAway>,
-    complaints: Quota,
+    refusals: Cell<Refusals>,
+    log_limit: LogLimit,
 }
 
-/// One more for each opening and closing: odd while the link is to be open.
+/// Counts openings and closings: odd while the link should be open.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-struct Turn(u64);
+struct Session(u64);
 
-impl Turn {
+impl Session {
     const FIRST: Self = Self(1);
 
     const fn is_open(self) -> bool {
@@ -73,28 +72,28 @@ impl Turn {
     }
 }
 
-/// Who came to a listening link and was not taken.
+/// Connections and datagrams that a listening link did not accept.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
-pub(super) struct TurnedAway {
+pub(super) struct Refusals {
     /// Connections and datagrams from other addresses than the controller's.
     pub(super) strangers: u64,
-    /// Connections of the controller's address while there was one, or while the link was closed.
+    /// Connections from the controller's address while there was one already, or while the link was closed.
     pub(super) refused: u64,
 }
 
-/// One transmission is in flight at a time, so this is never reached by a living link.
+/// The engine has one transmission in flight at a time, so a working link never reaches this.
 const MAX_QUEUED: usize = 8;
 
 impl LinkControl {
     pub(super) fn open(&self) {
-        if !self.turn.get().is_open() {
-            self.turn_over();
+        if !self.session.get().is_open() {
+            self.next_session();
         }
     }
 
     pub(super) fn close(&self) {
-        if self.turn.get().is_open() {
-            self.turn_over();
+        if self.session.get().is_open() {
+            self.next_session();
         }
     }
 
@@ -107,57 +106,57 @@ impl LinkControl {
         self.changed.notify_one();
     }
 
-    /// Who was not taken so far.
-    pub(super) fn turned_away(&self) -> TurnedAway {
-        self.turned_away.get()
+    /// Counters of what was not accepted.
+    pub(super) fn refusals(&self) -> Refusals {
+        self.refusals.get()
     }
 
-    fn turn_away(&self, name: &str, peer: SocketAddr, why: &str, count: impl FnOnce(&mut TurnedAway)) {
-        let mut turned_away = self.turned_away.get();
-        count(&mut turned_away);
-        self.turned_away.set(turned_away);
-        if let Some(more) = self.complaints.take(now()) {
+    fn refuse(&self, name: &str, peer: SocketAddr, why: &str, count: impl FnOnce(&mut Refusals)) {
+        let mut refusals = self.refusals.get();
+        count(&mut refusals);
+        self.refusals.set(refusals);
+        if let Some(more) = self.log_limit.allow(now()) {
             warn!(link = name, %peer, more, "refused: {why}");
         }
     }
 
-    /// Whether it is the controller that came, or somebody on this host, who could speak to the controller as
-    /// well.
-    fn knows(&self, name: &str, controller: &[IpAddr], peer: SocketAddr) -> bool {
+    /// Whether the peer is the controller, or a program on this host, which could connect to the controller
+    /// as well.
+    fn is_controller(&self, name: &str, controller: &[IpAddr], peer: SocketAddr) -> bool {
         let address = peer.ip().to_canonical();
         let known = controller.contains(&address) || THIS_HOST.contains(&address);
         if !known {
-            let count = |turned_away: &mut TurnedAway| turned_away.strangers += 1;
-            self.turn_away(name, peer, "not controller.address", count);
+            let count = |refusals: &mut Refusals| refusals.strangers += 1;
+            self.refuse(name, peer, "not controller.address", count);
         }
         known
     }
 
-    fn turn_over(&self) {
-        self.turn.set(Turn(self.turn.get().0 + 1));
+    fn next_session(&self) {
+        self.session.set(Session(self.session.get().0 + 1));
         self.outbox.borrow_mut().clear();
         self.handed.set(0);
         self.changed.notify_one();
     }
 
-    /// Waits until the link is to be open; the turn it is.
-    async fn opened(&self) -> Turn {
+    /// Waits until the link should be open, and returns the session.
+    async fn opened(&self) -> Session {
         loop {
-            let turn = self.turn.get();
-            if turn.is_open() {
-                return turn;
+            let session = self.session.get();
+            if session.is_open() {
+                return session;
             }
             self.changed.notified().await;
         }
     }
 
-    fn is_over(&self, turn: Turn) -> bool {
-        self.turn.get() != turn
+    fn is_over(&self, session: Session) -> bool {
+        self.session.get() != session
     }
 
-    /// Waits until this turn is over. Eats notifications, so nothing else may wait for them.
-    async fn over(&self, turn: Turn) {
-        while !self.is_over(turn) {
+    /// Waits until this session is over. It consumes notifications, so nothing else may wait for them.
+    async fn over(&self, session: Session) {
+        while !self.is_over(session) {
             self.changed.notified().await;
         }
     }
@@ -167,20 +166,20 @@ impl LinkControl {
         self.outbox.borrow_mut().pop_front()
     }
 
-    /// Bytes of the transmissions that nobody has taken up.
+    /// Number of bytes in the outbox.
     fn waiting(&self) -> usize {
         self.outbox.borrow().iter().map(Vec::len).sum()
     }
 }
 
-/// What a link's task works with.
+/// The context of a link's task.
 struct Link<'a> {
     name: &'a str,
     control: &'a LinkControl,
 }
 
-/// Drives the link until the future is dropped. `is_frame` tells whether a datagram is one that the
-/// controller's client sends.
+/// Runs the link until the future is dropped. `is_frame` returns whether a datagram is a frame of the
+/// controller's client.
 pub(super) async fn run(
     name: &str,
     endpoint: &Endpoint,
@@ -190,19 +189,19 @@ pub(super) async fn run(
 ) {
     let link = Link { name, control };
     loop {
-        let turn = control.opened().await;
+        let session = control.opened().await;
         let result = match endpoint {
-            Endpoint::Tcp { host, port } => link.connect_tcp(turn, host, *port, &mut events).await,
+            Endpoint::Tcp { host, port } => link.connect_tcp(session, host, *port, &mut events).await,
             Endpoint::TcpListen { listener, controller } => {
-                link.accept_tcp(turn, listener, controller, &mut events).await
+                link.accept_tcp(session, listener, controller, &mut events).await
             }
-            Endpoint::Udp { host, port } => link.connect_udp(turn, host, *port, &mut events).await,
+            Endpoint::Udp { host, port } => link.connect_udp(session, host, *port, &mut events).await,
             Endpoint::UdpListen { socket, controller } => {
-                link.await_udp(turn, socket, controller, &is_frame, &mut events).await
+                link.await_udp(session, socket, controller, &is_frame, &mut events).await
             }
         };
-        // A turn that is over was ended by the engine: it expects no report.
-        if !control.is_over(turn) {
+        // A session that is over was closed by the engine, which expects no report.
+        if !control.is_over(session) {
             match result {
                 Ok(()) => info!(link = name, "closed by the controller"),
                 Err(error) => debug!(link = name, %error, "cannot connect"),
@@ -214,33 +213,33 @@ pub(super) async fn run(
 }
 
 impl Link<'_> {
-    /// What `opening` gives; `None` when the turn is over, even if both happen in one moment.
+    /// The result of `opening`; `None` if the session is over, even if both happen together.
     async fn while_open<T>(
         &self,
-        turn: Turn,
+        session: Session,
         opening: impl Future<Output = io::Result<T>>,
     ) -> io::Result<Option<T>> {
         let opened = tokio::select! {
             opened = opening => opened?,
-            () = self.control.over(turn) => return Ok(None),
+            () = self.control.over(session) => return Ok(None),
         };
-        Ok((!self.control.is_over(turn)).then_some(opened))
+        Ok((!self.control.is_over(session)).then_some(opened))
     }
 
-    /// The controller's addresses, and whether what waits at a listening socket may be from before this
-    /// opening. What came before the first one came while the gateway started.
-    async fn look_up(&self, turn: Turn, controller: &str) -> io::Result<(Vec<IpAddr>, bool)> {
+    /// The controller's addresses, and whether data at a listening socket may be from before this session. In
+    /// the first session it is not: the gateway has just started.
+    async fn look_up(&self, session: Session, controller: &str) -> io::Result<(Vec<IpAddr>, bool)> {
         let began = Instant::now();
         let found = tokio::net::lookup_host((controller, 0)).await?;
         let known = found.map(|address| address.ip().to_canonical()).collect();
-        Ok((known, turn != Turn::FIRST || began.elapsed() >= FRESH))
+        Ok((known, session != Session::FIRST || began.elapsed() >= MAX_LOOKUP))
     }
 }
 
-/// Where a process of this host comes from when it does not choose.
+/// The default source addresses of programs on this host.
 const THIS_HOST: [IpAddr; 2] = [IpAddr::V4(Ipv4Addr::LOCALHOST), IpAddr::V6(Ipv6Addr::LOCALHOST)];
-/// A name that takes longer to look up than this makes what waits meanwhile old.
-const FRESH: Duration = Duration::from_millis(100);
+/// If the name's lookup takes longer, data that waited meanwhile is old.
+const MAX_LOOKUP: Duration = Duration::from_millis(100);
 
 #[cfg(test)]
 #[path = "link_tests.rs"]

@@ -1,4 +1,4 @@
-//! Links against real sockets that do what controllers do.
+//! Links against real sockets that behave like a controller.
 
 use std::rc::Rc;
 
@@ -8,7 +8,7 @@ use tokio::task::{JoinHandle, LocalSet, spawn_local};
 
 use super::*;
 
-/// A link's event, to be kept.
+/// A link's event, owned.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Seen {
     Up,
@@ -18,7 +18,7 @@ pub(super) enum Seen {
     Acked(u32),
 }
 
-/// A link under way, in the place of the engine.
+/// A running link, controlled by the test in place of the engine.
 pub(super) struct Running {
     pub(super) control: Rc<LinkControl>,
     pub(super) seen: Rc<Log>,
@@ -62,7 +62,7 @@ impl Running {
         }
     }
 
-    /// The next event that says another thing than what is acknowledged: that comes when the system likes.
+    /// The next event that is no acknowledgement, whose timing depends on the system.
     #[track_caller]
     pub(super) fn expect(&self, expected: Seen) -> impl Future<Output = ()> {
         let at = std::panic::Location::caller();
@@ -77,7 +77,7 @@ impl Running {
         }
     }
 
-    /// Whether nothing was said but what is acknowledged.
+    /// Whether there is no event but acknowledgements.
     pub(super) fn is_silent(&self) -> bool {
         self.seen.events.borrow().iter().all(|event| matches!(event, Seen::Acked(_)))
     }
@@ -110,7 +110,7 @@ pub(super) async fn server() -> (TcpListener, Endpoint) {
     (listener, Endpoint::Tcp { host: at.ip().to_string(), port: at.port() })
 }
 
-/// A TCP link that is up, its server, and the server's end of the connection.
+/// A TCP link that is up, its server, and the server's side of the connection.
 pub(super) async fn connected() -> (Running, TcpListener, TcpStream) {
     let (listener, endpoint) = server().await;
     let link = Running::start(endpoint);
@@ -120,7 +120,7 @@ pub(super) async fn connected() -> (Running, TcpListener, TcpStream) {
     (link, listener, peer)
 }
 
-/// A link that waits for datagrams, and where.
+/// A link that waits for datagrams, and its address.
 async fn udp_listening() -> (Running, std::net::SocketAddr) {
     let socket = UdpSocket::bind("127.0.0.1:0").await.unwrap();
     let at = socket.local_addr().unwrap();
@@ -130,7 +130,7 @@ async fn udp_listening() -> (Running, std::net::SocketAddr) {
 }
 
 #[test]
-fn a_tcp_link_opens_carries_and_tells_once_when_it_is_lost() {
+fn a_tcp_link_opens_carries_and_reports_its_loss_once() {
     inside(async || {
         let (listener, endpoint) = server().await;
         let link = Running::start(endpoint);
@@ -146,7 +146,7 @@ fn a_tcp_link_opens_carries_and_tells_once_when_it_is_lost() {
             peer.write_all(&[round, 2]).await.unwrap();
             link.expect(Seen::Bytes(vec![round, 2])).await;
             if round == 1 {
-                // A reset instead of an end.
+                // A reset, no orderly end.
                 rustix::net::sockopt::set_socket_linger(&peer, Some(Duration::ZERO)).unwrap();
             }
             drop(peer);
@@ -157,7 +157,7 @@ fn a_tcp_link_opens_carries_and_tells_once_when_it_is_lost() {
 }
 
 #[test]
-fn a_refused_connection_is_reported_and_tried_again_only_when_asked() {
+fn a_refused_connection_is_reported_and_retried_only_on_request() {
     inside(async || {
         let (listener, endpoint) = server().await;
         let at = listener.local_addr().unwrap();
@@ -180,7 +180,7 @@ fn after_a_close_nothing_is_reported_and_nothing_old_is_sent() {
         link.control.send(b"old");
         link.control.close();
         let mut rest = Vec::new();
-        // Bytes that were under way reset the connection.
+        // Bytes in flight reset the connection.
         let _ = peer.read_to_end(&mut rest).await;
         assert_eq!(rest, b"");
         link.control.open();
@@ -195,7 +195,7 @@ fn after_a_close_nothing_is_reported_and_nothing_old_is_sent() {
 }
 
 #[test]
-fn a_peer_that_takes_nothing_does_not_keep_the_link_from_being_closed() {
+fn a_peer_that_reads_nothing_does_not_prevent_the_close() {
     inside(async || {
         let small = TcpSocket::new_v4().unwrap();
         small.set_recv_buffer_size(4_096).unwrap();
@@ -206,7 +206,7 @@ fn a_peer_that_takes_nothing_does_not_keep_the_link_from_being_closed() {
         link.control.open();
         let (mut deaf, _) = listener.accept().await.unwrap();
         link.expect(Seen::Up).await;
-        // More than any buffer takes, so this is never sent.
+        // More than any buffer holds, so this is never sent.
         link.control.send(&vec![0; 64 << 20]);
         deaf.read_exact(&mut [0]).await.unwrap();
         link.control.close();
@@ -214,14 +214,14 @@ fn a_peer_that_takes_nothing_does_not_keep_the_link_from_being_closed() {
         let (_fresh, _) = listener.accept().await.unwrap();
         link.expect(Seen::Up).await;
         assert!(link.is_silent());
-        // What it has not taken by now it never gets: by then it is old.
+        // It never gets what it has not read by now, which would be old.
         let ended = deaf.read_to_end(&mut Vec::new()).await;
         assert_eq!(ended.unwrap_err().kind(), io::ErrorKind::ConnectionReset);
     });
 }
 
 #[test]
-fn a_listening_link_has_one_connection_and_takes_the_next_after_it() {
+fn a_listening_link_accepts_one_connection_at_a_time() {
     inside(async || {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let at = listener.local_addr().unwrap();
@@ -231,7 +231,7 @@ fn a_listening_link_has_one_connection_and_takes_the_next_after_it() {
         link.expect(Seen::Up).await;
         let mut second = TcpStream::connect(at).await.unwrap();
         assert_eq!(second.read(&mut [0; 4]).await.unwrap(), 0, "turned away");
-        assert_eq!(link.control.turned_away(), TurnedAway { strangers: 0, refused: 1 });
+        assert_eq!(link.control.refusals(), Refusals { strangers: 0, refused: 1 });
         first.write_all(b"here").await.unwrap();
         link.expect(Seen::Bytes(b"here".to_vec())).await;
         drop(first);
@@ -248,7 +248,7 @@ fn a_listening_link_has_one_connection_and_takes_the_next_after_it() {
 }
 
 #[test]
-fn a_udp_link_is_down_when_nobody_is_there() {
+fn a_udp_link_is_down_if_the_peer_is_unreachable() {
     inside(async || {
         let peer = UdpSocket::bind("127.0.0.1:0").await.unwrap();
         let at = peer.local_addr().unwrap();
@@ -270,7 +270,7 @@ fn a_udp_link_is_down_when_nobody_is_there() {
 }
 
 #[test]
-fn a_listening_udp_link_answers_where_the_newest_frame_came_from() {
+fn a_listening_udp_link_answers_the_sender_of_the_newest_frame() {
     inside(async || {
         let (link, at) = udp_listening().await;
         let (one, two) =
@@ -288,11 +288,11 @@ fn a_listening_udp_link_answers_where_the_newest_frame_came_from() {
     });
 }
 
-/// How what is no frame begins.
+/// The first bytes of a datagram that is no frame.
 const GARBAGE: &[u8] = b"?";
 
 #[test]
-fn what_is_no_frame_is_told_and_does_not_take_the_answers_away() {
+fn a_datagram_that_is_no_frame_is_reported_and_does_not_change_the_peer() {
     inside(async || {
         let (link, at) = udp_listening().await;
         let (robot, other) =
@@ -311,7 +311,7 @@ fn what_is_no_frame_is_told_and_does_not_take_the_answers_away() {
 }
 
 #[test]
-fn the_first_datagram_of_an_opening_is_answered_whatever_it_is() {
+fn the_sender_of_the_first_datagram_is_answered_whatever_it_sent() {
     inside(async || {
         let (link, at) = udp_listening().await;
         let robot = UdpSocket::bind("127.0.0.1:0").await.unwrap();
@@ -326,13 +326,13 @@ fn the_first_datagram_of_an_opening_is_answered_whatever_it_is() {
 }
 
 #[test]
-fn datagrams_that_came_while_the_link_was_closed_are_never_told() {
+fn datagrams_that_came_while_the_link_was_closed_are_never_reported() {
     inside(async || {
         let socket = UdpSocket::bind("127.0.0.1:0").await.unwrap();
         let at = socket.local_addr().unwrap();
         let link = Running::start(udp_listen(socket));
         let robot = UdpSocket::bind("127.0.0.1:0").await.unwrap();
-        // Before the first opening nothing was closed: the gateway just started.
+        // In the first session nothing is old: the gateway has just started.
         robot.send_to(b"early", at).await.unwrap();
         link.control.open();
         link.expect(Seen::Up).await;
@@ -344,7 +344,7 @@ fn datagrams_that_came_while_the_link_was_closed_are_never_told() {
                 robot.send_to(b"stale", at).await.unwrap();
             }
             link.control.open();
-            // What comes once the link waits for it is taken.
+            // Datagrams after the opening are reported.
             tokio::task::yield_now().await;
             robot.send_to(&[round], at).await.unwrap();
             link.expect(Seen::Up).await;
@@ -357,7 +357,7 @@ fn datagrams_that_came_while_the_link_was_closed_are_never_told() {
 const STRANGER: &str = "127.0.0.2:0";
 
 #[test]
-fn only_the_controller_is_taken_and_others_do_it_no_harm() {
+fn only_the_controller_is_accepted_and_others_do_it_no_harm() {
     inside(async || {
         let listener = TcpListener::bind("0.0.0.0:0").await.unwrap();
         let at = SocketAddr::from(([127, 0, 0, 1], listener.local_addr().unwrap().port()));
@@ -375,12 +375,12 @@ fn only_the_controller_is_taken_and_others_do_it_no_harm() {
         knock().await;
         controller.write_all(b"here").await.unwrap();
         link.expect(Seen::Bytes(b"here".to_vec())).await;
-        assert_eq!(link.control.turned_away(), TurnedAway { strangers: 2, refused: 0 });
+        assert_eq!(link.control.refusals(), Refusals { strangers: 2, refused: 0 });
     });
 }
 
 #[test]
-fn a_strangers_datagrams_are_neither_taken_nor_answered() {
+fn a_strangers_datagrams_are_neither_reported_nor_answered() {
     inside(async || {
         let socket = UdpSocket::bind("0.0.0.0:0").await.unwrap();
         let at = SocketAddr::from(([127, 0, 0, 1], socket.local_addr().unwrap().port()));
@@ -400,12 +400,12 @@ fn a_strangers_datagrams_are_neither_taken_nor_answered() {
         let mut got = [0; 32];
         let (len, _) = controller.recv_from(&mut got).await.unwrap();
         assert_eq!(&got[..len], b"to the controller");
-        assert_eq!(link.control.turned_away().strangers, 2);
+        assert_eq!(link.control.refusals().strangers, 2);
     });
 }
 
 #[test]
-fn who_is_on_this_host_may_stand_for_the_controller() {
+fn a_program_on_this_host_may_replace_the_controller() {
     inside(async || {
         let elsewhere = || "192.0.2.1".to_owned();
         for address in ["127.0.0.1:0", "[::1]:0"] {
@@ -424,6 +424,6 @@ fn who_is_on_this_host_may_stand_for_the_controller() {
         peer.send_to(b"here", at).await.unwrap();
         link.expect(Seen::Up).await;
         link.expect(Seen::Bytes(b"here".to_vec())).await;
-        assert_eq!(link.control.turned_away(), TurnedAway::default());
+        assert_eq!(link.control.refusals(), Refusals::default());
     });
 }

@@ -1,12 +1,12 @@
-//! Printing, and the handling of its failures.
+//! Printing to stdout and stderr, with handling of failures.
 //!
-//! Writing never panics. The first failure is kept and ends its command: quietly if the reader had
-//! enough, as `head` has; with one message if output is lost.
+//! Writing never panics. The first failure ends the command: silently if the reader closed the pipe, as
+//! `head` does; otherwise with one message.
 
 use std::io::{self, Write, stderr};
 use std::process::ExitCode;
 
-/// An output that keeps its first failure; nothing is written after it.
+/// An output that stores its first failure; nothing is written after it.
 #[derive(Debug)]
 pub struct Out<W> {
     to: W,
@@ -24,14 +24,14 @@ impl<W: Write> Out<W> {
         self.failed.is_some()
     }
 
-    /// The exit code of a command that did all its writing here and came to `done` otherwise.
+    /// The exit code of a command: that of `done`, unless output was lost.
     pub fn finish(mut self, done: impl FnOnce(Printed) -> ExitCode) -> ExitCode {
         let _ = self.flush();
         match self.failed {
             None => done(Printed::Whole),
-            Some(error) if is_enough(&error) => done(Printed::Enough),
+            Some(error) if is_broken_pipe(&error) => done(Printed::Enough),
             Some(error) => {
-                tell(format_args!("stdout: {error}"));
+                print_stderr(format_args!("stdout: {error}"));
                 ExitCode::FAILURE
             }
         }
@@ -49,12 +49,12 @@ impl<W: Write> Out<W> {
     }
 }
 
-/// How much of the output was read.
+/// How much of the output was written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Printed {
     /// All of it.
     Whole,
-    /// As much as the reader wanted.
+    /// A part of it: the reader closed the pipe.
     Enough,
 }
 
@@ -68,17 +68,17 @@ impl<W: Write> Write for Out<W> {
     }
 }
 
-/// Whether a failure only means that the reader had enough.
-pub fn is_enough(error: &io::Error) -> bool {
+/// Whether a failure only means that the reader closed the pipe.
+pub fn is_broken_pipe(error: &io::Error) -> bool {
     error.kind() == io::ErrorKind::BrokenPipe
 }
 
-/// A line for a person on stderr; lost if nobody can read it.
-pub fn tell(message: impl std::fmt::Display) {
+/// Prints a line to stderr; a failure is ignored.
+pub fn print_stderr(message: impl std::fmt::Display) {
     let _ = writeln!(stderr(), "{message}");
 }
 
-/// The same failure once more, with the system's own words.
+/// A copy of an error, with the system's text.
 fn again(error: &io::Error) -> io::Error {
     error.raw_os_error().map_or_else(|| error.kind().into(), io::Error::from_raw_os_error)
 }

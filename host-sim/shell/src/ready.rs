@@ -1,7 +1,6 @@
-//! `--ready FILE`: the file with all addresses, which exists while they are listened on.
+//! `--ready FILE`: a file with all addresses, which exists while they are open.
 //!
-//! It appears whole, and it is removed at the end. A file at its place is replaced only if it is
-//! such a file; any other belongs to somebody else.
+//! It is created atomically and removed at the end. An existing file is replaced only if it is a ready file.
 
 use std::fs;
 use std::io;
@@ -12,7 +11,7 @@ use serde_json::Value;
 use super::StartError;
 use recipe_device::files::{Beside, Identity};
 
-/// Where the file is to be.
+/// The path of a ready file.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ReadyFile {
     path: PathBuf,
@@ -22,18 +21,18 @@ impl ReadyFile {
     /// The file at `path`, which is not written yet.
     ///
     /// # Errors
-    /// If there is another kind of file, or it could not be written.
+    /// If another kind of file is there, or it could not be written.
     pub fn at(path: PathBuf) -> Result<Self, StartError> {
         let file = Self { path };
         file.is_free()?;
-        // A folder that cannot be written to is found before anything is started.
+        // Reports a folder without write permission before anything is started.
         if file.folder().is_dir() {
             Beside::file(&file.path, b"").map_err(|error| file.refused(error))?;
         }
         Ok(file)
     }
 
-    /// Writes the file; it is there until the result is dropped.
+    /// Writes the file. Dropping the result removes it.
     pub(super) fn write(&self, ready: &Value) -> Result<Written, StartError> {
         let is_free = self.is_free()?;
         let text = format!("{ready}\n");
@@ -49,7 +48,7 @@ impl ReadyFile {
         written().map_err(|error| self.refused(error))
     }
 
-    /// Whether there is nothing; otherwise it was left by an earlier run, or it is an error.
+    /// Whether the path is free; `false` for a ready file of an earlier run, an error for anything else.
     fn is_free(&self) -> Result<bool, StartError> {
         let refused = |message: &str| Err(self.refused(message));
         if self.path.file_name().is_none() || self.path.as_os_str().as_encoded_bytes().ends_with(b"/") {
@@ -79,12 +78,12 @@ impl ReadyFile {
     }
 }
 
-/// A ready file that was written; dropping it removes it, if it still is what was written.
+/// A written ready file. Dropping it removes the file, unless that was changed.
 #[derive(Debug)]
 pub(super) struct Written {
     path: PathBuf,
     text: String,
-    /// As long as it is open, no other file gets its number.
+    /// As long as it is open, no other file gets its inode number.
     file: fs::File,
 }
 
@@ -101,16 +100,16 @@ impl Drop for Written {
     }
 }
 
-/// The text of a file that is short enough to be a ready file; `None` if it is not text.
+/// The text of a file; `None` if it is not text, or too long for a ready file.
 fn read(path: &Path, len: u64) -> io::Result<Option<String>> {
-    if len > MOST_BYTES {
+    if len > MAX_BYTES {
         return Ok(None);
     }
     Ok(String::from_utf8(fs::read(path)?).ok())
 }
 
-/// Whether this is what a run writes: an object of addresses, and one of ports. Nothing is lost with an
-/// empty file, which `mktemp` makes.
+/// Whether this is the text of a ready file: an object of addresses, with an object of ports. An empty file
+/// counts too: `mktemp` creates one, and nothing is lost with it.
 fn is_ready(text: &str) -> bool {
     let addresses =
         |value: &Value| value.as_object().is_some_and(|ports| ports.values().all(Value::is_string));
@@ -125,8 +124,8 @@ fn is_ready(text: &str) -> bool {
 }
 
 const FOLDER: &str = "a folder; give the name of a file in it";
-/// Maximum length that is read.
-const MOST_BYTES: u64 = 1 << 16;
+/// Maximum length of a ready file.
+const MAX_BYTES: u64 = 1 << 16;
 
 #[cfg(test)]
 mod tests {
@@ -144,11 +143,11 @@ mod tests {
     }
 
     #[test]
-    fn it_is_there_as_long_as_it_is_true() {
+    fn it_exists_as_long_as_the_run() {
         let (_folder, path) = place();
         let path = path.with_file_name("run").join("ready.json");
         let file = ReadyFile::at(path.clone()).unwrap();
-        assert!(!path.exists() && !path.parent().unwrap().exists(), "nothing is said yet");
+        assert!(!path.exists() && !path.parent().unwrap().exists(), "not yet written");
         let written = file.write(&ready()).unwrap();
         assert_eq!(fs::read_to_string(&path).unwrap(), format!("{}\n", ready()));
         drop(written);
@@ -156,7 +155,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_killed_run_left_is_replaced() {
+    fn a_file_left_by_a_killed_run_is_replaced() {
         let (_folder, path) = place();
         for left in [format!("{}\n", ready()), json!({ "ports": {} }).to_string(), String::new()] {
             fs::write(&path, left).unwrap();
@@ -168,7 +167,7 @@ mod tests {
     }
 
     #[test]
-    fn whatever_else_is_there_stays() {
+    fn any_other_file_stays() {
         let (_folder, path) = place();
         let long = format!("{}{}", ready(), " ".repeat(1 << 16));
         for other in ["[port]\n", "{}", "[]", "\n", r#"{"ports":[]}"#, r#"{"ports":{},"n":1}"#, &long] {
@@ -195,7 +194,7 @@ mod tests {
     }
 
     #[test]
-    fn what_came_while_the_run_started_stays_too() {
+    fn a_file_created_during_the_start_stays_too() {
         let (_folder, path) = place();
         let file = ReadyFile::at(path.clone()).unwrap();
         fs::write(&path, "somebody's").unwrap();
@@ -204,7 +203,7 @@ mod tests {
     }
 
     #[test]
-    fn only_what_was_written_is_removed() {
+    fn only_the_written_file_is_removed() {
         let (_folder, path) = place();
         let file = ReadyFile::at(path.clone()).unwrap();
         let written = file.write(&ready()).unwrap();
@@ -212,7 +211,7 @@ mod tests {
         drop(written);
         assert_eq!(fs::read_to_string(&path).unwrap(), "somebody's");
         fs::remove_file(&path).unwrap();
-        // Another run has written the same at the same place.
+        // Another run has written the same text to the same path.
         let first = file.write(&ready()).unwrap();
         let second = file.write(&ready()).unwrap();
         drop(first);

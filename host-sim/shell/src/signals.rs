@@ -1,30 +1,30 @@
-//! What tells a program to end: Ctrl-C, SIGTERM, and a terminal that is closed.
+//! The signals that end a program: Ctrl-C (SIGINT), SIGTERM, and SIGHUP when its terminal is closed.
 
 use std::io;
 
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
-/// The signals that end a run, caught.
+/// Handlers for the signals that end a run.
 #[derive(Debug)]
 pub struct Signals {
     interrupt: Signal,
     terminate: Signal,
-    /// `None` under `nohup`, which means it.
+    /// `None` if SIGHUP is ignored, as under `nohup`.
     hang_up: Option<Signal>,
 }
 
 impl Signals {
-    /// Catches them, in the current tokio runtime. From now on they no longer end the process.
+    /// Installs the handlers in the current tokio runtime. From now on the signals do not end the process.
     pub fn catch() -> io::Result<Self> {
         Ok(Self {
-            // Looked up first: whoever catches a signal no longer ignores it.
+            // Checked first: a handler replaces the setting.
             hang_up: if ignores_hang_up() { None } else { Some(signal(SignalKind::hangup())?) },
             interrupt: signal(SignalKind::interrupt())?,
             terminate: signal(SignalKind::terminate())?,
         })
     }
 
-    /// Waits for one of them; returns its number. Cancel safe.
+    /// Waits for a signal and returns its number. Cancel safe.
     pub async fn next(&mut self) -> i32 {
         let hang_up = async {
             match &mut self.hang_up {
@@ -41,13 +41,13 @@ impl Signals {
     }
 }
 
-/// Whether whoever started this process wanted it to outlive its terminal.
+/// Whether this process was started with SIGHUP ignored.
 fn ignores_hang_up() -> bool {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     ignored(&status) & 1 << (SignalKind::hangup().as_raw_value() - 1) != 0
 }
 
-/// The set of ignored signals in `/proc/PID/status`, the first one in bit 0.
+/// The set of ignored signals in `/proc/PID/status`; signal 1 is bit 0.
 fn ignored(status: &str) -> u64 {
     let set = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
     set.and_then(|set| u64::from_str_radix(set.trim(), 16).ok()).unwrap_or(0)
@@ -58,13 +58,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn ignored_signals_are_read_as_the_system_shows_them() {
+    fn ignored_signals_are_read_from_proc() {
         assert_eq!(
             ignored("Name:\thost-sim\nSigIgn:\t0000000000001001\nSigCgt:\t0000000000000002\n"),
             0x1001
         );
         assert_eq!(ignored("Name:\thost-sim\n"), 0);
-        // Rust's own start-up ignores SIGPIPE.
+        // Rust's runtime ignores SIGPIPE.
         let status = std::fs::read_to_string("/proc/self/status").unwrap();
         assert_ne!(ignored(&status) & 1 << (libc::SIGPIPE - 1), 0);
     }

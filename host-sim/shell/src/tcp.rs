@@ -1,5 +1,5 @@
-//! One TCP connection: bytes are sent at once where the transport takes them, and kept, up to a bound,
-//! where it does not.
+//! A TCP connection of the simulated controller. Bytes are sent at once as far as the socket accepts them;
+//! the rest waits, up to a bound.
 
 use std::cell::{Cell, RefCell};
 use std::future::poll_fn;
@@ -13,8 +13,8 @@ use tokio::io::{AsyncRead, ReadBuf};
 use tokio::net::TcpStream;
 use tokio::net::tcp::{OwnedReadHalf, OwnedWriteHalf};
 
+use recipe_net::fairness::yield_fairly;
 use recipe_net::timer::now;
-use recipe_net::turns::give_way;
 
 /// The sending side of a connection.
 #[derive(Debug)]
@@ -23,42 +23,43 @@ pub(super) struct Connection {
     out: RefCell<Vec<u8>>,
     blocked_since: Cell<Option<Instant>>,
     end: Cell<End>,
-    /// Of the task that runs it; one task does, so this is cheaper than a [`tokio::sync::Notify`].
+    /// Waker of the task in [`Connection::run`]. There is only one, so this is cheaper than a
+    /// [`tokio::sync::Notify`].
     runner: RefCell<Option<Waker>>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum End {
-    /// Not yet.
+    /// Open.
     Open,
-    /// When everything has been sent.
+    /// Close when everything was sent.
     Flush,
-    /// Now.
+    /// Close now.
     Abort,
 }
 
-/// What became of bytes to be sent.
+/// The result of [`Connection::send`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Taken {
-    /// The transport took all of them.
+pub(super) enum Accepted {
+    /// The socket accepted all bytes.
     All,
-    /// Some are kept; [`Event::Drained`] tells when they are gone.
+    /// Some wait; [`Event::Drained`] reports when they were sent.
     Later,
-    /// The connection has failed, or the peer has left more unread than is kept.
+    /// The connection has failed, or too many bytes wait.
     Failed,
 }
 
-/// What a connection did.
+/// An event of a connection.
 #[derive(Debug)]
 pub(super) enum Event<'a> {
     /// Bytes arrived.
     Bytes(&'a [u8]),
-    /// What was kept is gone.
+    /// No bytes wait any more.
     Drained,
 }
 
 impl Connection {
-    /// Splits a connected stream into what sends and what [`Connection::run`] reads from.
+    /// Splits a connected stream into the sending side and the side that [`Connection::run`] reads from.
     pub(super) fn split(stream: TcpStream) -> (Rc<Self>, OwnedReadHalf) {
         let (read, write) = stream.into_split();
         let connection = Self {
@@ -71,10 +72,10 @@ impl Connection {
         (Rc::new(connection), read)
     }
 
-    /// Sends bytes; at most [`MAX_KEPT`] are kept.
-    pub(super) fn send(&self, bytes: &[u8]) -> Taken {
+    /// Sends bytes; at most [`MAX_UNSENT`] wait.
+    pub(super) fn send(&self, bytes: &[u8]) -> Accepted {
         if self.end.get() != End::Open {
-            return Taken::Failed;
+            return Accepted::Failed;
         }
         let mut out = self.out.borrow_mut();
         let mut rest = bytes;
@@ -84,31 +85,31 @@ impl Connection {
                 Err(error) if error.kind() == io::ErrorKind::WouldBlock => break,
                 Err(_) => {
                     self.abort();
-                    return Taken::Failed;
+                    return Accepted::Failed;
                 }
             }
         }
         if rest.is_empty() {
-            return Taken::All;
+            return Accepted::All;
         }
-        if out.len() + rest.len() > MAX_KEPT {
+        if out.len() + rest.len() > MAX_UNSENT {
             self.abort();
-            return Taken::Failed;
+            return Accepted::Failed;
         }
         if out.is_empty() {
             self.blocked_since.set(Some(now()));
             self.wake();
         }
         out.extend_from_slice(rest);
-        Taken::Later
+        Accepted::Later
     }
 
-    /// Since when bytes have been kept, if any are.
+    /// Since when the socket has accepted none of the waiting bytes; `None` if none wait.
     pub(super) fn blocked_since(&self) -> Option<Instant> {
         self.blocked_since.get()
     }
 
-    /// Closes when everything has been sent, or the peer takes nothing for [`LINGER`].
+    /// Closes when everything was sent, but after [`LINGER`] at the latest.
     pub(super) fn close(&self) {
         if self.end.get() == End::Open {
             self.end.set(End::Flush);
@@ -122,18 +123,18 @@ impl Connection {
         self.wake();
     }
 
-    /// Whether bytes are kept.
-    pub(super) fn has_kept(&self) -> bool {
+    /// Whether bytes wait.
+    pub(super) fn has_unsent(&self) -> bool {
         !self.out.borrow().is_empty()
     }
 
-    /// Whether it was closed from this side.
+    /// Whether it was closed by this side.
     pub(super) fn is_closed(&self) -> bool {
         self.end.get() != End::Open
     }
 
-    /// Reads and sends until either side closes. While bytes are kept nothing more is read: who does
-    /// not take answers gets to ask no more.
+    /// Reads and sends until either side closes. While bytes wait, nothing is read: a client that does not
+    /// read its answers cannot send more requests.
     pub(super) async fn run(
         &self,
         mut read: OwnedReadHalf,
@@ -154,7 +155,7 @@ impl Connection {
                         count => {
                             event(Event::Bytes(&buf[..count]));
                             if count == CHUNK {
-                                give_way().await;
+                                yield_fairly().await;
                             }
                         }
                     },
@@ -169,7 +170,7 @@ impl Connection {
         }
     }
 
-    /// Bytes, or `None` when there is something else to do first.
+    /// Received bytes, or `None` if there is something else to do first.
     fn poll_received(
         &self,
         cx: &mut Context<'_>,
@@ -189,7 +190,7 @@ impl Connection {
         }
     }
 
-    /// Room to send in, or a reason to look at the end.
+    /// Ready when there is room to send, or the connection was closed.
     fn poll_room(&self, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
         if self.is_closed() {
             return Poll::Ready(Ok(()));
@@ -217,14 +218,14 @@ impl Connection {
             match self.write.try_write(&out) {
                 Ok(count) => drop(out.drain(..count)),
                 Err(error) if error.kind() == io::ErrorKind::WouldBlock => {
-                    // Progress starts the peer's patience anew.
+                    // The peer has read something.
                     self.blocked_since.set(Some(now()));
                     return Ok(());
                 }
                 Err(error) => return Err(error),
             }
         }
-        // What was once needed for a slow peer is not held for ever.
+        // Releases the memory that a slow peer needed.
         *out = Vec::new();
         self.blocked_since.set(None);
         Ok(())
@@ -242,10 +243,10 @@ impl Connection {
     }
 }
 
-/// Most bytes read at once: their requests are carried out before anybody else has a turn. The longest
+/// Maximum number of bytes per read, whose requests are carried out before other tasks run: the longest
 /// Modbus request.
 const CHUNK: usize = 260;
-/// Most bytes kept for a peer that does not take them. More than one read's requests are answered with.
-const MAX_KEPT: usize = 64 * 1_024;
-/// How long a closed connection may take to send what it has.
+/// Maximum number of bytes that wait for a peer; more than the answers to the requests of one read.
+const MAX_UNSENT: usize = 64 * 1_024;
+/// How long a closed connection may take to send the rest.
 const LINGER: std::time::Duration = std::time::Duration::from_secs(2);

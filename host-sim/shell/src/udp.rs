@@ -1,4 +1,4 @@
-//! UDP sockets that learn which of their peers cannot be reached.
+//! UDP sockets that report peers that cannot be reached.
 
 use std::io::{self, IoSliceMut};
 use std::net::SocketAddr;
@@ -7,19 +7,19 @@ use std::os::fd::AsRawFd;
 use rustix::net::{RecvAncillaryBuffer, RecvFlags, recvmsg};
 use tokio::net::UdpSocket;
 
-/// Makes the system keep the ICMP errors that datagrams of an unconnected socket provoke (D24): the
-/// next call on the socket fails, and [`unreachable_peers`] tells for whom.
+/// Enables reports of ICMP errors on an unconnected socket (D24): after one, the next call on the socket
+/// fails, and [`unreachable_peers`] returns the peers.
 ///
 /// # Errors
-/// When the system refuses the option.
+/// If the system refuses the option.
 pub(super) fn keep_errors(socket: &UdpSocket) -> io::Result<()> {
     let on: libc::c_int = 1;
     let (level, name) = match socket.local_addr()? {
         SocketAddr::V4(_) => (libc::SOL_IP, libc::IP_RECVERR),
         SocketAddr::V6(_) => (libc::SOL_IPV6, libc::IPV6_RECVERR),
     };
-    // SAFETY: the descriptor is open while `socket` is borrowed, and the option's value is an int that
-    // outlives the call.
+    // SAFETY: the descriptor is open while `socket` is borrowed; the option's value is an int that outlives
+    // the call.
     let done = unsafe {
         libc::setsockopt(
             socket.as_raw_fd(),
@@ -32,7 +32,7 @@ pub(super) fn keep_errors(socket: &UdpSocket) -> io::Result<()> {
     if done == 0 { Ok(()) } else { Err(io::Error::last_os_error()) }
 }
 
-/// The peers whose datagrams came back since the last call.
+/// Peers for which ICMP errors arrived since the last call.
 pub(super) fn unreachable_peers(socket: &UdpSocket) -> Vec<SocketAddr> {
     let mut peers = Vec::new();
     while peers.len() < MAX_AT_ONCE {
@@ -47,7 +47,7 @@ pub(super) fn unreachable_peers(socket: &UdpSocket) -> Vec<SocketAddr> {
     peers
 }
 
-/// One round of errors; more come with the next failing call.
+/// Maximum number of errors per call; the rest remains for the next one.
 const MAX_AT_ONCE: usize = 64;
 
 #[cfg(test)]
@@ -55,7 +55,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_datagram_to_nobody_names_its_peer() {
+    fn an_undeliverable_datagram_names_its_peer() {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
         runtime.block_on(async {
             let socket = UdpSocket::bind("127.0.0.1:0").await.unwrap();

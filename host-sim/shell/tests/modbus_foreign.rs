@@ -1,4 +1,4 @@
-//! The simulated controller's Modbus server with a client that we did not write, over real TCP:
+//! The simulated controller's Modbus server with a foreign client, over real TCP:
 //! every function, both ends of every block of the map, every exception (proto-core/docs/wire/modbus.md
 //! sections 3 to 8).
 
@@ -14,7 +14,7 @@ use tokio::time::timeout;
 use tokio_modbus::client::{Context, tcp};
 use tokio_modbus::prelude::*;
 
-/// The map as the controller's documentation gives it: first and last address, whether writable.
+/// The map in the controller's documentation: first and last address, whether writable.
 const COILS: [(u16, u16, bool); 11] = [
     (0, 15, true),
     (16, 31, false),
@@ -42,7 +42,7 @@ const REGISTERS: [(u16, u16, bool); 12] = [
     (112, 117, false),
     (118, 118, false),
 ];
-/// Coils that the documentation calls reserved: writing them does nothing.
+/// Coils that the documentation calls reserved: writing them has no effect.
 const RESERVED_COILS: std::ops::RangeInclusive<u16> = 218..=223;
 
 /// A simulated controller with its Modbus server on a free port.
@@ -78,7 +78,7 @@ impl Robot {
     }
 }
 
-/// A connection for what a well-behaved client cannot send.
+/// A raw connection, for requests that the client cannot send.
 struct Raw(TcpStream);
 
 impl Raw {
@@ -102,10 +102,10 @@ impl Raw {
     }
 }
 
-/// Every wait for an answer ends after this.
+/// Time limit of every wait for an answer.
 const PATIENCE: Duration = Duration::from_secs(20);
 
-/// An answer, or the exception, of a request that must not fail otherwise.
+/// The answer or the exception of a request that must not fail otherwise.
 async fn answer<T>(call: impl Future<Output = tokio_modbus::Result<T>>) -> Result<T, ExceptionCode> {
     timeout(PATIENCE, call).await.expect("an answer in time").expect("no error below Modbus")
 }
@@ -222,7 +222,7 @@ async fn counts_of_nothing_and_beyond_the_standard() {
     assert_eq!(answer(client.write_multiple_coils(0, &[true; 1968])).await, Err(ILLEGAL_ADDRESS));
     assert_eq!(answer(client.write_multiple_registers(8, &[])).await, Err(ILLEGAL_VALUE));
     assert_eq!(answer(client.write_multiple_registers(0, &[0; 123])).await, Err(ILLEGAL_ADDRESS));
-    // The count is looked at before the address.
+    // The count is checked before the address.
     assert_eq!(answer(client.read_coils(9999, 2001)).await, Err(ILLEGAL_VALUE));
 }
 
@@ -236,7 +236,7 @@ async fn functions_that_the_controller_does_not_have() {
     assert_eq!(answer(client.read_write_multiple_registers(8, 1, 8, &[1])).await, Err(ILLEGAL_FUNCTION));
     assert!(answer(client.read_coils(0, 1)).await.is_ok(), "the connection stays");
 
-    // The client has no requests for most of the others.
+    // The client has no functions for most of the others.
     let mut client = robot.raw().await;
     for function in (0..=0x7F).filter(|function| ![1, 3, 5, 6, 15, 16].contains(function)) {
         client.send(&[0, function, 0, 0, 0, 4, 1, function, 0, 0]).await;
@@ -262,7 +262,7 @@ async fn requests_that_contradict_themselves() {
     // A request that is longer than its function's.
     client.send(&[0, 7, 0, 0, 0, 7, 1, 3, 0, 0, 0, 1, 0]).await;
     client.expect(&refused(7, 3, 3)).await;
-    // Nothing was written, and the connection is as good as before.
+    // Nothing was written, and the connection still works.
     client.send(&[0, 8, 0, 0, 0, 6, 1, 1, 0, 192, 0, 8]).await;
     client.expect(&[0, 8, 0, 0, 0, 4, 1, 1, 1, 0]).await;
 }

@@ -1,4 +1,4 @@
-//! `check`: is a file right, how full are its lines, and what must be set on the pendant.
+//! `check`: whether a file is valid, how busy its buses are, and what to set on the pendant.
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -42,21 +42,21 @@ pub(super) fn run(args: &CheckArgs, out: &mut dyn Write) -> Result<(), String> {
     write!(out, "{report}").map_err(|error| error.to_string())
 }
 
-/// A controller file whose programs compile and whose values fit.
+/// Loads a controller file and checks that its programs compile and its values fit.
 pub(super) fn load_controller(path: &Path, overrides: &[String]) -> Result<SimConfig, FileError> {
     let config = file::load_controller(path, overrides)?;
     check_build(path, overrides, &config)?;
     Ok(config)
 }
 
-/// A gateway file that the engine of this host has room for.
+/// Loads a gateway file and checks that this host's engine has room for it.
 pub(super) fn load_gateway(path: &Path, overrides: &[String]) -> Result<Box<GatewayConfig>, FileError> {
     let config = file::load_gateway(path, overrides)?;
     check_room(path, overrides, &config)?;
     Ok(config)
 }
 
-/// What only the engine itself can refuse.
+/// Checks what only the engine can refuse.
 fn check_room(path: &Path, overrides: &[String], config: &GatewayConfig) -> Result<(), FileError> {
     match Engine::<MAX_PORTS>::new(config) {
         Ok(_) => Ok(()),
@@ -64,7 +64,7 @@ fn check_room(path: &Path, overrides: &[String], config: &GatewayConfig) -> Resu
     }
 }
 
-/// What only the controller itself can refuse.
+/// Checks what only the controller can refuse.
 fn check_build(path: &Path, overrides: &[String], config: &SimConfig) -> Result<(), FileError> {
     let Err(error) = Controller::new(config) else { return Ok(()) };
     let at = |key: &[&str], message: &dyn std::fmt::Display| file::error_at(path, overrides, key, message);
@@ -78,7 +78,7 @@ fn check_build(path: &Path, overrides: &[String], config: &SimConfig) -> Result<
     })
 }
 
-/// Everything about a gateway file.
+/// The report on a gateway file.
 fn gateway(config: &GatewayConfig, recipes: &[SimRecipe]) -> String {
     let link = &config.controller;
     let mut report = format!(
@@ -100,7 +100,7 @@ fn gateway(config: &GatewayConfig, recipes: &[SimRecipe]) -> String {
             Bus::UdpListen { listen } => format!("the controller's UDP client sends to {listen}"),
         };
         report += &format!("\nport {}: {bus}, recipe {recipe}\n", port.name);
-        // Devices speak on a field port, the controller on a way up.
+        // On a field port input comes from the devices, on a listening port from the controller.
         for part in [Direction::Input, Direction::Output] {
             if let Some(budget) = config.view().budget(port, part) {
                 report += &show_budget(part, budget, port.cycle);
@@ -120,7 +120,7 @@ fn gateway(config: &GatewayConfig, recipes: &[SimRecipe]) -> String {
     report
 }
 
-/// Everything about a controller file.
+/// The report on a controller file.
 fn controller(config: &SimConfig) -> String {
     let listen = &config.listen;
     let any = |port: u16| if port == 0 { "any".to_owned() } else { port.to_string() };
@@ -159,7 +159,7 @@ fn controller(config: &SimConfig) -> String {
     report
 }
 
-/// What must be set on the controller for the gateway's ways up.
+/// What to set on the controller's pendant for the gateway's recipe links.
 fn pendant_of_gateway(config: &GatewayConfig, recipes: &[SimRecipe]) -> String {
     let mut report = String::new();
     let mut add = |what: String, recipe: u8| {
@@ -207,7 +207,7 @@ fn show_sim_bus(bus: &SimBus, udp2011: u16) -> String {
     }
 }
 
-/// One line: how long, how often, how much of the line.
+/// One line: size and time of a part, how often it can be sent, and its share of the cycle.
 fn show_budget(part: Direction, budget: PartBudget, cycle: Duration) -> String {
     let name = match part {
         Direction::Input => "input ",

@@ -1,6 +1,6 @@
-//! One part of a recipe, compiled, with the names and units of its fields.
+//! A compiled part of a recipe, with the names and units of its fields.
 //!
-//! In: recipes as a file has them. Out: frames from values and values from frames.
+//! In: recipes from a file. Out: frames from values and values from frames.
 
 use proto_core::recipe::model::{Field, Framing, Rules};
 use proto_core::recipe::{CanLayout, StreamLayout};
@@ -14,7 +14,7 @@ use recipe_config::{SimField, SimParts, SimRecipe};
 #[derive(Debug)]
 pub(super) struct Part {
     pub(super) layout: Layout,
-    /// One in a stream part, one for each id in a CAN part.
+    /// One for a stream part, one per id for a CAN part.
     pub(super) frames: Vec<FrameFields>,
 }
 
@@ -22,7 +22,7 @@ pub(super) struct Part {
 pub(super) enum Layout {
     /// Frames in a stream of bytes.
     Stream(Box<StreamLayout>),
-    /// One frame a datagram, with neither head nor tail.
+    /// One frame per datagram, without head and tail.
     Datagram(Box<StreamLayout>),
     Can(Box<CanLayout>),
 }
@@ -42,7 +42,7 @@ pub(super) struct NamedField {
 }
 
 impl Part {
-    /// The recipe called `name` (or the only one), and its part (or the only one).
+    /// Chooses the recipe called `name`, or the only one, and its part, or the only one.
     pub(super) fn choose(
         recipes: &[SimRecipe],
         name: Option<&str>,
@@ -87,7 +87,7 @@ impl Part {
 
     fn compile(recipe: &SimRecipe, direction: Direction) -> Result<Self, String> {
         let rules = Rules { mode: recipe.mode, direction };
-        // The file's reader has compiled the same parts before.
+        // Cannot fail: reading the file compiled the same parts.
         let refused = |error| format!("recipe {:?}: {error}", recipe.name);
         let fields = |fields: &[SimField]| fields.iter().map(|field| field.field).collect::<Vec<_>>();
         match &recipe.parts {
@@ -153,8 +153,8 @@ impl FrameFields {
     }
 }
 
-/// The unit of one variable. Poses and forces have two units in their row of the table: the first
-/// for X, Y, Z and the second for the rotations.
+/// The unit of a variable. Rows of poses and forces in the table have two units: for X, Y, Z and for the
+/// rotations.
 fn unit_of(var: SysVar) -> &'static str {
     match var.unit().split_once(", ") {
         None => var.unit(),

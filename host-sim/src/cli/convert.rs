@@ -1,7 +1,7 @@
 //! `encode` and `decode`: frames as text to values as text, and back.
 //!
-//! In: hex bytes, candump lines, or the lines that `decode` prints. Out: the other. What `decode`
-//! prints, `encode` turns into the same bytes again.
+//! In: hex bytes or candump lines; or the lines that `decode` prints, which `encode` turns into the same
+//! bytes again. Out: the other form.
 
 use std::collections::BTreeMap;
 use std::io::{BufRead, Write};
@@ -15,7 +15,7 @@ use super::text::{self, CanLine, Prefix};
 
 type Outcome = Result<(), String>;
 
-/// A CAN id as an argument: decimal or `0x` and hexadecimal.
+/// Parses a CAN id: decimal, or hexadecimal with `0x`.
 pub(super) fn parse_id(text: &str) -> Result<u32, String> {
     let id = match text.strip_prefix("0x") {
         Some(hex) => u32::from_str_radix(hex, 16),
@@ -24,13 +24,13 @@ pub(super) fn parse_id(text: &str) -> Result<u32, String> {
     id.map_err(|_| format!("{text:?} is not an id; write 2 or 0x501"))
 }
 
-/// Makes one frame.
+/// Writes the frame with these values.
 pub(super) fn encode_values(part: &Part, id: Option<u32>, values: &[String], out: &mut dyn Write) -> Outcome {
     let wanted = id.map(Wanted::Number);
     write_line(out, &encode(part, wanted, &Prefix::default(), values)?)
 }
 
-/// Makes a frame of each line that `decode` printed, or of each line of values.
+/// Writes a frame for each line that `decode` printed, or for each line of values.
 pub(super) fn encode_lines(
     part: &Part,
     id: Option<u32>,
@@ -56,7 +56,7 @@ pub(super) fn encode_lines(
     Ok(())
 }
 
-/// Shows the values of every frame in `input`; what is no frame goes to `notes`, counted.
+/// Writes the values of every frame in `input`; counts other input in `notes`.
 pub(super) fn decode_lines(
     part: &Part,
     input: impl BufRead,
@@ -71,9 +71,9 @@ pub(super) fn decode_lines(
     if frames == 0 { Err("the input has no frame of this recipe".into()) } else { Ok(()) }
 }
 
-/// Which frame of a CAN part is meant.
+/// Selects a frame of a CAN part.
 enum Wanted {
-    /// As an argument: the kind of id follows from the recipe.
+    /// From an argument: the recipe decides whether it is a standard or an extended id.
     Number(u32),
     Exactly(CanId),
 }
@@ -110,7 +110,7 @@ fn find_frame(part: &Part, wanted: Option<Wanted>) -> Result<usize, String> {
     found.ok_or_else(|| format!("id {shown} is not in this part; there are {}", known()))
 }
 
-/// Values in field order, or as `NAME=VALUE`; a field's unit may follow its value.
+/// Parses values in field order or as `NAME=VALUE`; a field's unit may follow its value.
 fn scalars(frame: &FrameFields, tokens: &[String]) -> Result<Vec<Scalar>, String> {
     let mut values: Vec<Option<Scalar>> = vec![None; frame.fields.len()];
     let mut newest: Option<&NamedField> = None;
@@ -293,7 +293,7 @@ fn write_line(out: &mut dyn Write, line: &str) -> Outcome {
     writeln!(out, "{line}").map_err(|error| error.to_string())
 }
 
-/// Notes are for people; nothing is lost when nobody can read them.
+/// Writes a note; errors are ignored, since notes are no result.
 fn note(notes: &mut dyn Write, message: &str) {
     let _ = writeln!(notes, "{message}");
 }

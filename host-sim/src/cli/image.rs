@@ -1,4 +1,4 @@
-//! `image`: the configuration image that a board keeps, from the checked file.
+//! `image`: writes the configuration image for a board from a checked file.
 
 use std::fs;
 use std::io::{self, Read, Write};
@@ -16,10 +16,10 @@ use recipe_device::files::{Beside, Identity};
 pub(super) struct ImageArgs {
     /// A gateway file
     file: PathBuf,
-    /// Where the image is written; an older image there is replaced
+    /// Where to write the image; an older image is replaced
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
-    /// Replace a file even if it is not an image; never the file that is read
+    /// Replace a file even if it is no image; never the input file
     #[arg(long)]
     force: bool,
     #[command(flatten)]
@@ -31,14 +31,14 @@ pub(super) fn run(args: &ImageArgs, out: &mut dyn Write) -> Outcome {
     let mut bytes = vec![0; image::MAX_IMAGE];
     let len = image::encode(&*config, &mut bytes).map_err(|error| error.to_string())?;
     bytes.truncate(len);
-    // What a board would refuse is never written.
+    // An image that a board would refuse is never written.
     image::decode(&bytes).map_err(|error| error.to_string())?;
     let name = args.output.display();
     write(args, &bytes).map_err(|error| format!("{name}: {error}"))?;
     writeln!(out, "{name}: {len} bytes, version {}", image::VERSION).map_err(|error| error.to_string())
 }
 
-/// Writes the image where nothing is lost by it.
+/// Writes the image unless that would replace another file.
 fn write(args: &ImageArgs, bytes: &[u8]) -> io::Result<()> {
     let refused = |message: &str| Err(io::Error::new(io::ErrorKind::AlreadyExists, message));
     let found = match fs::metadata(&args.output) {
@@ -52,7 +52,7 @@ fn write(args: &ImageArgs, bytes: &[u8]) -> io::Result<()> {
     };
     let kind = found.file_type();
     if kind.is_char_device() || kind.is_fifo() {
-        // What is written there is passed on.
+        // A pipe or a device: nothing is replaced.
         return fs::File::options().write(true).open(&args.output)?.write_all(bytes);
     }
     if kind.is_dir() {
@@ -67,13 +67,12 @@ fn write(args: &ImageArgs, bytes: &[u8]) -> io::Result<()> {
     if !args.force && !is_image(&args.output)? {
         return refused("this file exists and is not an image; give another name or --force");
     }
-    // Behind a link, it is the file that is replaced.
+    // Replace the target of a symbolic link, not the link.
     let place = fs::canonicalize(&args.output)?;
     Beside::file(&place, bytes)?.0.replace(&place)
 }
 
-/// Whether it begins as images do, of whatever version. Nothing is lost with an empty file, which
-/// `mktemp` makes.
+/// Whether a file begins like an image of any version, or is empty, as `mktemp` makes it.
 fn is_image(path: &Path) -> io::Result<bool> {
     let mut begins = Vec::new();
     fs::File::open(path)?.take(image::MAGIC.len() as u64).read_to_end(&mut begins)?;

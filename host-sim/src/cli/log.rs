@@ -1,7 +1,7 @@
 //! Logging to stderr: stdout is for results.
 //!
-//! A thread of its own writes. Whoever logs is never kept waiting by a reader that has stopped reading:
-//! beyond [`MOST_WAITING`] bytes lines are lost, and the next line that is not tells how many.
+//! A separate thread writes, so that a reader that stops reading never blocks the caller. Beyond
+//! [`MAX_WAITING`] bytes lines are lost, and the next one that is not says how many.
 
 use std::io::{self, IsTerminal, Write, stderr};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use tracing_subscriber::EnvFilter;
 
-/// Warnings always; `-v` what happens, `-vv` everything. `RUST_LOG` decides when it is set.
+/// Logs warnings; with `-v` events, with `-vv` every frame. `RUST_LOG` overrides this.
 pub(super) fn start(verbose: u8) -> Log {
     let level = match verbose {
         0 => "warn",
@@ -21,12 +21,12 @@ pub(super) fn start(verbose: u8) -> Log {
     let lines = Arc::clone(&log.lines);
     let format = tracing_subscriber::fmt().with_env_filter(filter);
     let format = format.with_writer(move || LogLine(Arc::clone(&lines)));
-    // Fails only when somebody has set up logging before, which is as good.
+    // Fails only if logging is set up already.
     let _ = format.with_ansi(stderr().is_terminal()).try_init();
     log
 }
 
-/// The log; when it is dropped, what waits is written, if that does not take long.
+/// The log. When it is dropped, waiting lines are written if that takes less than [`LAST_WRITE`].
 #[derive(Debug)]
 pub(super) struct Log {
     lines: Arc<Lines>,
@@ -42,7 +42,7 @@ struct Lines {
 struct Waiting {
     bytes: Vec<u8>,
     lost: u64,
-    /// The thread is writing what it took from here.
+    /// The thread is writing lines that it has taken.
     writing: bool,
 }
 
@@ -50,7 +50,7 @@ impl Log {
     fn start(mut out: impl Write + Send + 'static) -> Self {
         let lines = Arc::new(Lines::default());
         let own = Arc::clone(&lines);
-        // Without a thread nothing is written, and nothing else suffers.
+        // Without the thread nothing is logged; the program still works.
         let _ = std::thread::Builder::new().name("log".to_owned()).spawn(move || {
             loop {
                 let bytes = own.take();
@@ -68,7 +68,7 @@ impl Drop for Log {
     fn drop(&mut self) {
         let waiting = self.lines.lock();
         let busy = |waiting: &mut Waiting| waiting.writing || !waiting.bytes.is_empty();
-        drop(self.lines.changed.wait_timeout_while(waiting, FAREWELL, busy));
+        drop(self.lines.changed.wait_timeout_while(waiting, LAST_WRITE, busy));
     }
 }
 
@@ -79,7 +79,7 @@ impl Lines {
 
     fn put(&self, line: &[u8]) {
         let mut waiting = self.lock();
-        if waiting.bytes.len() + line.len() > MOST_WAITING {
+        if waiting.bytes.len() + line.len() > MAX_WAITING {
             waiting.lost += 1;
             return;
         }
@@ -101,7 +101,7 @@ impl Lines {
     }
 }
 
-/// One event's line.
+/// Writer of one line.
 struct LogLine(Arc<Lines>);
 
 impl Write for LogLine {
@@ -115,16 +115,16 @@ impl Write for LogLine {
     }
 }
 
-const MOST_WAITING: usize = 1 << 20;
-/// How long the end waits for a reader.
-const FAREWELL: Duration = Duration::from_millis(500);
+const MAX_WAITING: usize = 1 << 20;
+/// How long the end of the program waits for a reader.
+const LAST_WRITE: Duration = Duration::from_millis(500);
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use std::sync::mpsc::{Receiver, Sender, channel};
 
-    /// Tells what it is to write, and writes it when it is let to.
+    /// Reports what it is to write, and waits for permission to write it.
     struct Slow(Sender<Vec<u8>>, Receiver<()>);
 
     impl Write for Slow {
@@ -140,18 +140,18 @@ mod tests {
     }
 
     #[test]
-    fn a_reader_that_stops_costs_lines_and_nothing_else() {
+    fn a_reader_that_stops_loses_lines_and_blocks_nothing() {
         let (begins, begun) = channel();
         let (go, may) = channel();
         let log = Log::start(Slow(begins, may));
         log.lines.put(b"first\n");
         assert_eq!(begun.recv().unwrap(), b"first\n");
-        // Nobody reads: what there is room for waits, the rest is lost.
+        // The reader has stopped: lines wait while there is room, the rest is lost.
         for _ in 0..3 << 10 {
             log.lines.put(&[b'x'; 1 << 10]);
         }
         go.send(()).unwrap();
-        assert_eq!(begun.recv().unwrap().len(), MOST_WAITING);
+        assert_eq!(begun.recv().unwrap().len(), MAX_WAITING);
         log.lines.put(b"last\n");
         go.send(()).unwrap();
         assert_eq!(begun.recv().unwrap(), b"2048 log lines lost\nlast\n");
@@ -159,7 +159,7 @@ mod tests {
     }
 
     #[test]
-    fn the_end_waits_for_what_was_said() {
+    fn the_end_waits_until_lines_are_written() {
         let (begins, begun) = channel();
         let (go, may) = channel();
         let log = Log::start(Slow(begins, may));

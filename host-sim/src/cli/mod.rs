@@ -1,8 +1,8 @@
-//! The command line: what a person types, turned into calls.
+//! The command line.
 //!
-//! In: arguments. Out: text and an exit code: 0 when everything went well, 1 when a run failed or what
-//! it said could not be written, 2 for a file or an argument that cannot be used (nothing was started
-//! then). A reader that had enough is no failure.
+//! In: arguments. Out: text and an exit code: 0 for success, 1 if a run failed or its output could not be
+//! written, 2 if a file or an argument cannot be used (nothing was started then). A reader that closes the
+//! pipe is no failure.
 
 mod check;
 mod codec;
@@ -23,10 +23,10 @@ use proto_core::sysvar::Direction;
 
 use recipe_config::file;
 use recipe_device::bind::Bind;
-use recipe_shell::out::{Out, Printed, tell};
+use recipe_shell::out::{Out, Printed, print_stderr};
 use recipe_shell::{self as shell, ReadyFile, RunOptions, StartError};
 
-/// Everything that can be typed.
+/// The arguments of `host-sim`.
 #[derive(Debug, Parser)]
 #[command(
     name = "host-sim",
@@ -40,7 +40,7 @@ use recipe_shell::{self as shell, ReadyFile, RunOptions, StartError};
 pub struct Cli {
     #[command(subcommand)]
     command: Option<Command>,
-    /// Log more to stderr: -v what happens, -vv every frame
+    /// Log more to stderr: -v events, -vv every frame
     #[arg(short, long, action = clap::ArgAction::Count, global = true)]
     verbose: u8,
 }
@@ -86,8 +86,8 @@ enum Command {
 }
 
 const DEMO_EXAMPLES: &str = "\
-Prints one line for each example, PASS or FAIL. Exit code 0 only when all pass.
-Ctrl-C ends it; nothing stays behind.";
+Prints PASS or FAIL for each example. Exit code 0 only if all pass. Ctrl-C ends it
+and removes its temporary files.";
 
 const CONTROLLER_EXAMPLES: &str = "\
 Examples:
@@ -132,8 +132,8 @@ Frames are hex bytes (FF FF 01 EE EE, FFFF01EEEE); for a CAN recipe, what
 candump prints:
   (1436509052.249713) can0 123#AABB
     can0  123   [2]  AA BB
-Without frames, --log or stdin is read. What is no frame of the recipe is counted
-on stderr.
+Without frames, --log or stdin is read. Input that is no frame of the recipe is
+counted on stderr.
 
 Examples:
   host-sim decode cell.toml --part input FF FF 01 EE EE
@@ -142,7 +142,7 @@ Examples:
 /// Arguments of `controller` and `gateway`.
 #[derive(Debug, Args)]
 struct Run {
-    /// The file
+    /// The configuration file
     #[arg(short, long, value_name = "FILE")]
     config: PathBuf,
     #[command(flatten)]
@@ -160,7 +160,7 @@ struct Run {
     stats: Option<Duration>,
 }
 
-/// `--set`, wherever a file is read.
+/// `--set`, for commands that read a file.
 #[derive(Debug, Args)]
 struct Overrides {
     /// Override one key of the file, such as port.rs485-1.baud=9600
@@ -168,7 +168,7 @@ struct Overrides {
     set: Vec<String>,
 }
 
-/// Which recipe of which file.
+/// A recipe's part in a file.
 #[derive(Debug, Args)]
 struct Which {
     /// A gateway file or a controller file
@@ -221,7 +221,7 @@ struct DecodeArgs {
     frames: Vec<String>,
 }
 
-/// Runs what was typed.
+/// Runs the command.
 pub fn main() -> ExitCode {
     let cli = match Cli::try_parse() {
         Ok(cli) => cli,
@@ -248,7 +248,7 @@ pub fn main() -> ExitCode {
     })
 }
 
-/// Shows help, the version, or what is wrong with the arguments.
+/// Prints help, the version, or an error in the arguments.
 fn not_run(error: &clap::Error) -> ExitCode {
     if error.use_stderr() {
         let _ = error.print();
@@ -259,11 +259,11 @@ fn not_run(error: &clap::Error) -> ExitCode {
     out.finish(|_| ExitCode::SUCCESS)
 }
 
-/// A message for a person; exit code 2.
+/// The error is a message for the user, with exit code 2.
 type Outcome = Result<(), String>;
 
 fn wrong(message: impl std::fmt::Display) -> ExitCode {
-    tell(message);
+    print_stderr(message);
     ExitCode::from(2)
 }
 
@@ -294,7 +294,7 @@ fn finished(result: Result<(), StartError>) -> ExitCode {
     match result {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            tell(&error);
+            print_stderr(&error);
             ExitCode::from(error.exit_code())
         }
     }

@@ -1,12 +1,12 @@
-//! Which way each variable goes, as `check` prints it.
+//! The way up or the source of each variable, as `check` prints it.
 
 use proto_core::config::{Bus, FieldSpec, GatewayConfig, InputBinding, SendOn};
 use proto_core::engine::{LinkId, Plan, PortId, Source, WayUp};
 use proto_core::sysvar::{Direction, ModbusPlace, SysVar};
 
-/// The ways of every field port's variables, one line a run of neighbours.
+/// The ways and sources of all field ports' variables, one line per run of neighbours.
 pub(super) fn show(config: &GatewayConfig) -> String {
-    // A valid configuration has a way for everything.
+    // Cannot fail for a valid configuration.
     let Ok(plan) = Plan::new(config) else { return String::new() };
     let mut report = String::from("\nways\n");
     let mut lines: Vec<(String, String, String)> = Vec::new();
@@ -49,7 +49,7 @@ pub(super) fn show(config: &GatewayConfig) -> String {
     report
 }
 
-/// Adds one line for each run of neighbours that go the same way.
+/// Adds one line per run of neighbours with the same way or source.
 fn add(lines: &mut Vec<(String, String, String)>, port: &str, ways: impl Iterator<Item = (SysVar, String)>) {
     let mut runs: Vec<(SysVar, SysVar, String)> = Vec::new();
     for (var, way) in ways {

@@ -1,5 +1,5 @@
-//! `soak`: cells in virtual time, under faults, with everything that the gateway does checked; and
-//! the replay of a run that failed.
+//! `soak`: cells in virtual time with faults and checks of everything that the gateway does, and the
+//! replay of a failed run.
 //!
 //! Progress goes to stderr, the table to stdout.
 
@@ -16,21 +16,21 @@ use tokio::signal::unix::{Signal, SignalKind, signal};
 use super::wrong;
 use recipe_cell::Cell;
 use recipe_cell::soak::{Batch, Level, Progress, Scenario, Soak, Total, show_trace};
-use recipe_shell::out::tell;
+use recipe_shell::out::print_stderr;
 
 pub(super) const EXAMPLES: &str = "\
-Runs the gateway's engine against the simulated controller in virtual time: devices
-send valid and invalid data, networks and lines break, both
-programs restart. At every step an independent model checks what the gateway does:
-that every value written was sent by somebody, in time and once, that no edge is lost
-without being counted, that nothing stale is shown, and so on; and at the robot's
-side that what arrives is recent, and that what stops it arrives (docs/cell.md).
+Runs the gateway's engine against the simulated controller in virtual time. Devices
+send valid and invalid data, networks and lines fail, both programs restart. An
+independent model checks every step of the gateway: each value written was sent by its
+owner, in time and once; lost edges are counted; nothing stale is shown; and so on. At
+the robot's side it checks that values and commands are recent when they arrive, and
+that stops and safe values do arrive (docs/cell.md).
 
-The same seed gives the same trace hash on every machine, whatever --jobs is. A
+The same seed gives the same trace hash on every machine and for any --jobs. A
 violation is printed with the command that repeats it.
 
 Examples:
-  host-sim soak                                  an hour
+  host-sim soak                                  one hour
   host-sim soak --hours 24 --seed 42 --faults harsh
   host-sim soak --hours 2 --cell force-sensor --cell can-hand
   host-sim soak --cell cell.toml,robot.toml      your own gateway and controller
@@ -41,37 +41,37 @@ Exit codes: 0 all invariants held; 1 one was violated; 2 an argument is invalid.
 /// Arguments of `soak`.
 #[derive(Debug, Args)]
 pub(super) struct SoakArgs {
-    /// Virtual hours, over all runs together
+    /// Virtual hours of all runs together
     #[arg(long, value_name = "HOURS", default_value = "1", value_parser = parse_hours)]
     hours: Duration,
-    /// The seed that all others are derived from
+    /// The seed from which the seeds of all runs are derived
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// How many faults
+    /// How often faults are injected
     #[arg(long, value_name = "LEVEL", default_value = "harsh")]
     faults: LevelName,
-    /// An embedded cell by name, or GATEWAY.toml,CONTROLLER.toml; repeat it for more cells
+    /// An embedded cell by name, or GATEWAY.toml,CONTROLLER.toml; can be repeated
     /// [default: all embedded cells]
     #[arg(long, value_name = "CELL")]
     cell: Vec<String>,
-    /// Number of threads [default: one for each processor]
+    /// Number of threads [default: one per processor]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
     jobs: Option<u16>,
     /// Repeat one run up to this instant, with the same --cell and --faults
     #[arg(long, value_name = "SEED@SECONDS", value_parser = parse_replay)]
     replay: Option<(u64, Duration)>,
-    /// With --replay: show what happened in the last seconds
+    /// With --replay: show the trace of the last two seconds
     #[arg(long, requires = "replay")]
     trace: bool,
 }
 
 #[derive(Debug, Clone, Copy, ValueEnum)]
 enum LevelName {
-    /// No faults; devices send carelessly
+    /// No faults; devices still send invalid frames
     None,
     /// A fault every 30 s
     Mild,
-    /// A fault every second, on a network that delays, splits and joins
+    /// A fault every second, on a network that delays, splits and joins data
     Harsh,
 }
 
@@ -85,7 +85,7 @@ impl From<LevelName> for Level {
     }
 }
 
-/// Runs what was asked for.
+/// Runs a batch, or replays one run.
 pub(super) fn run(args: &SoakArgs, out: &mut dyn Write) -> ExitCode {
     let scenarios = match scenarios(&args.cell) {
         Ok(scenarios) => scenarios,
@@ -131,7 +131,7 @@ fn batch(args: &SoakArgs, scenarios: Vec<Scenario>, out: &mut dyn Write) -> Exit
         Ok(runtime) => runtime,
         Err(error) => return wrong(error),
     };
-    // Listened for once: a signal between two looks is heard by the next one.
+    // Registered once, so that a signal between two calls of `recv` is not lost.
     let interrupt = {
         let _inside = runtime.enter();
         signal(SignalKind::interrupt())
@@ -149,7 +149,7 @@ fn batch(args: &SoakArgs, scenarios: Vec<Scenario>, out: &mut dyn Write) -> Exit
     let interrupted = runtime.block_on(watch(&batch, &workers, interrupt, args.hours, began));
     batch.stop();
     for worker in workers {
-        // It catches its own panics.
+        // Workers catch the panics of their runs.
         let _ = worker.join();
     }
     let total = batch.total();
@@ -177,7 +177,7 @@ fn batch(args: &SoakArgs, scenarios: Vec<Scenario>, out: &mut dyn Write) -> Exit
     ExitCode::SUCCESS
 }
 
-/// Shows progress until all workers are done; true when somebody interrupted it.
+/// Shows progress until all workers are done; returns true after SIGINT.
 async fn watch(
     batch: &Batch,
     workers: &[std::thread::JoinHandle<()>],
@@ -188,14 +188,14 @@ async fn watch(
     let is_terminal = std::io::stderr().is_terminal();
     let mut shown = WallInstant::now();
     loop {
-        let wait = if is_terminal { TERMINAL_EVERY } else { LINE_EVERY };
+        let wait = if is_terminal { REDRAW_EVERY } else { LINE_EVERY };
         if shown.elapsed() >= wait {
             shown = WallInstant::now();
             let line = progress_line(batch.progress(), hours, began.elapsed());
             if is_terminal {
                 show(format_args!("\r{line}\x1B[K"));
             } else {
-                tell(line);
+                print_stderr(line);
             }
         }
         if workers.iter().all(std::thread::JoinHandle::is_finished) {
@@ -204,11 +204,11 @@ async fn watch(
         tokio::select! {
             _ = interrupt.recv() => {
                 if is_terminal {
-                    tell("");
+                    print_stderr("");
                 }
                 return true;
             }
-            () = tokio::time::sleep(LOOK_EVERY) => {}
+            () = tokio::time::sleep(POLL_EVERY) => {}
         }
     }
     if is_terminal {
@@ -217,7 +217,7 @@ async fn watch(
     false
 }
 
-/// Progress is for people; nothing is lost when nobody can see it.
+/// Writes progress; errors are ignored, since it is no result.
 fn show(text: impl std::fmt::Display) {
     let _ = write!(std::io::stderr(), "{text}");
 }
@@ -232,7 +232,7 @@ fn progress_line(progress: Progress, hours: Duration, wall: WallTime) -> String 
     )
 }
 
-/// The table. Only the two lines about this machine's time differ between runs of one seed.
+/// The table of results. For one seed, only the two lines about wall time differ.
 fn table(total: &Total, args: &SoakArgs, wall: WallTime) -> String {
     let mut lines = vec![
         format!("virtual hours       {:.3}", in_hours(total.span)),
@@ -286,9 +286,9 @@ fn replay(args: &SoakArgs, scenarios: &[Scenario], seed: u64, at: Duration, out:
     let shown = Duration::from_micros(at.as_micros().saturating_sub(SHOWN.as_micros()));
     soak.run_to(shown);
     if args.trace {
-        soak.cell_mut().keep_trace(MOST_SHOWN);
+        soak.cell_mut().keep_trace(MAX_ENTRIES);
     }
-    // Just after the instant, so that what happens at it is seen.
+    // One millisecond longer, to include the instant itself.
     soak.run_to(at + Duration::from_millis(1));
     if args.trace {
         let _ = write!(out, "{}", show_trace(&soak));
@@ -353,12 +353,12 @@ fn parse_replay(text: &str) -> Result<(u64, Duration), String> {
     Ok((seed.parse().map_err(|_| refused())?, Duration::from_micros(seconds * 1_000_000 + micros)))
 }
 
-/// How much of a replay is shown.
+/// Time before the end of a replay that the trace shows.
 const SHOWN: Duration = Duration::from_secs(2);
-const MOST_SHOWN: usize = 100_000;
-const TERMINAL_EVERY: WallTime = WallTime::from_millis(500);
+const MAX_ENTRIES: usize = 100_000;
+const REDRAW_EVERY: WallTime = WallTime::from_millis(500);
 const LINE_EVERY: WallTime = WallTime::from_secs(15);
-const LOOK_EVERY: WallTime = WallTime::from_millis(20);
+const POLL_EVERY: WallTime = WallTime::from_millis(20);
 
 #[cfg(test)]
 mod tests {

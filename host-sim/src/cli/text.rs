@@ -1,11 +1,11 @@
-//! Frames and values as text: hex bytes, candump lines, numbers that survive the round trip.
+//! Frames and values as text: hex bytes, candump lines, numbers that are read back exactly.
 
 use std::fmt;
 
 use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::{Scalar, ScalarType};
 
-/// What stands before a frame in a log: a time, an interface.
+/// What precedes a frame in a log: a time, an interface.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(super) struct Prefix {
     /// With its parentheses.
@@ -22,14 +22,14 @@ impl fmt::Display for Prefix {
     }
 }
 
-/// One frame of a CAN log, or what else it is that no recipe takes.
+/// A frame of a CAN log; `Err` names a kind of frame that no recipe accepts.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct CanLine {
     pub(super) prefix: Prefix,
     pub(super) frame: Result<CanFrame, &'static str>,
 }
 
-/// The time and interface before the first `NAME=VALUE` or value, and the rest.
+/// Splits a line into time and interface, and the `NAME=VALUE` or values behind them.
 pub(super) fn split_prefix(line: &str) -> Result<(Prefix, Vec<String>), String> {
     let (time, rest) = split_time(line)?;
     let mut tokens: Vec<String> = rest.split_whitespace().map(str::to_owned).collect();
@@ -49,8 +49,8 @@ fn split_time(line: &str) -> Result<(Option<String>, &str), String> {
     Ok((Some(format!("{time})")), rest.trim_start()))
 }
 
-/// What candump prints, on the screen or with `-L`, and what cansend takes. `None`: an empty line
-/// or a comment.
+/// Parses what candump prints, with or without `-L`, and what cansend accepts. `None` for an empty line or
+/// a comment.
 pub(super) fn parse_can_line(line: &str) -> Result<Option<CanLine>, String> {
     if line.trim().is_empty() || line.trim_start().starts_with('#') {
         return Ok(None);
@@ -121,12 +121,12 @@ fn parse_columns(id: &str, len: usize, data: &[&str]) -> Result<FrameOrNot, Stri
     CanFrame::new(id, &bytes).map(Ok).ok_or_else(|| "more than 8 bytes".into())
 }
 
-/// candump marks an error frame by a bit above the 29 of an id.
+/// candump marks an error frame by a bit above the 29 bits of an id.
 fn is_error(id: &str) -> bool {
     id.len() == 8 && u32::from_str_radix(id, 16).is_ok_and(|id| id & 0x2000_0000 != 0)
 }
 
-/// Up to three hexadecimal digits are a standard id, eight an extended one, as candump has it.
+/// As in candump, up to three hexadecimal digits are a standard id, eight an extended one.
 pub(super) fn parse_can_id(digits: &str) -> Result<CanId, String> {
     let refused =
         || format!("{digits:?} is not a CAN id; write three hexadecimal digits, or eight for an extended id");
@@ -147,8 +147,8 @@ pub(super) fn show_id(id: CanId) -> String {
     }
 }
 
-/// A frame as candump prints it: its log form after a time, its screen form after an interface
-/// alone, else what cansend takes.
+/// A frame in candump's log format if there is a time, in its screen format if there is only an interface,
+/// otherwise in cansend's format.
 pub(super) fn can_line(prefix: &Prefix, id: CanId, data: &[u8]) -> String {
     let digits = show_id(id).split_off(2);
     let compact = || data.iter().map(|byte| format!("{byte:02X}")).collect::<String>();
@@ -158,13 +158,12 @@ pub(super) fn can_line(prefix: &Prefix, id: CanId, data: &[u8]) -> String {
     }
 }
 
-/// Bytes with blanks between them.
+/// Hex bytes with spaces between them.
 pub(super) fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02X}")).collect::<Vec<_>>().join(" ")
 }
 
-/// Hex bytes with or without blanks, commas and `0x`; comments and the headers of `socat -x` are
-/// skipped.
+/// Parses hex bytes with or without spaces, commas and `0x`; skips comments and the headers of `socat -x`.
 pub(super) fn parse_hex_line(line: &str) -> Result<Vec<u8>, String> {
     if line.trim_start().starts_with(['#', '<', '>']) {
         return Ok(Vec::new());
@@ -188,7 +187,7 @@ fn parse_hex(digits: &str) -> Result<Vec<u8>, String> {
     digits.as_bytes().chunks(2).map(|pair| byte(pair).ok_or_else(refused)).collect()
 }
 
-/// A value as [`parse_scalar`] takes it back, bit by bit.
+/// A value in the form that [`parse_scalar`] reads back exactly.
 pub(super) fn show_scalar(value: Scalar) -> String {
     match value {
         Scalar::Float(v) if v.is_nan() => format!("nan:{:#010X}", v.to_bits()),
@@ -197,7 +196,7 @@ pub(super) fn show_scalar(value: Scalar) -> String {
     }
 }
 
-/// A value of type `ty`: decimal, `0x1F` for integers, `inf` and `nan:0x7FC00000` for floats.
+/// Parses a value of type `ty`: decimal, `0x1F` for integers, `inf` and `nan:0x7FC00000` for floats.
 pub(super) fn parse_scalar(ty: ScalarType, text: &str) -> Result<Scalar, String> {
     let not_a_number = || format!("{text:?} is not a number");
     match ty {
@@ -215,7 +214,7 @@ pub(super) fn parse_scalar(ty: ScalarType, text: &str) -> Result<Scalar, String>
 fn parse_float(ty: ScalarType, text: &str) -> Option<Scalar> {
     let bits = text.strip_prefix("nan:").map(|bits| bits.trim_start_matches("0x").trim_start_matches("0X"));
     let is_infinity = text.trim_start_matches(['-', '+']) == "inf";
-    // Each type is parsed as itself: a detour over the wider one would round twice.
+    // Parsing a float as a double would round twice.
     if ty == ScalarType::Float {
         let value = match bits {
             Some(bits) => f32::from_bits(u32::from_str_radix(bits, 16).ok()?),

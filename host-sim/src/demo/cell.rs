@@ -1,5 +1,5 @@
-//! The cell of the demo: a simulated controller and a gateway on this host, from the example files,
-//! every port number free.
+//! The cell of the demo: a simulated controller and a gateway on this host, from the example files, on free
+//! port numbers.
 
 use std::io;
 use std::net::SocketAddr;
@@ -30,7 +30,7 @@ pub(super) struct Robot(Handle);
 pub(super) struct Gateway(Handle);
 
 impl Robot {
-    /// Starts from an example file, all ports free.
+    /// Starts one from an example file on free port numbers.
     pub(super) fn start(example: Example, overrides: &[String], binds: &[String]) -> io::Result<Self> {
         let mut set: Vec<String> =
             ["command", "state", "modbus", "udp2011"].map(|port| format!("listen.{port}=0")).to_vec();
@@ -57,23 +57,23 @@ impl Robot {
         until(|| Ok(self.0.stats().is_some_and(|stats| stats["variables"][name] == *value)))
     }
 
-    /// Waits until a Modbus client sees the coil so.
+    /// Waits until a Modbus client reads this value of the coil.
     pub(super) fn coil(&self, address: u16, on: bool) -> io::Result<()> {
         let mut modbus = Modbus::connect(self.address("modbus")?)?;
         until(|| {
-            modbus.ask(Request::ReadCoils { address, count: 1 }, |response| match response {
+            modbus.request(Request::ReadCoils { address, count: 1 }, |response| match response {
                 Response::Coils(coils) => coils.coil(0) == Some(on),
                 _ => false,
             })
         })
     }
 
-    /// Waits until a Modbus client sees these holding registers.
+    /// Waits until a Modbus client reads these values of the holding registers.
     pub(super) fn registers(&self, address: u16, values: &[u16]) -> io::Result<()> {
         let mut modbus = Modbus::connect(self.address("modbus")?)?;
         let count = values.len() as u16;
         until(|| {
-            modbus.ask(Request::ReadHolding { address, count }, |response| match response {
+            modbus.request(Request::ReadHolding { address, count }, |response| match response {
                 Response::Registers(registers) => registers.iter().eq(values.iter().copied()),
                 _ => false,
             })
@@ -82,7 +82,7 @@ impl Robot {
 }
 
 impl Gateway {
-    /// Starts from an example file; `robot` is where the controller is, when it is there already.
+    /// Starts one from an example file; `robot` is the controller, if it is running already.
     pub(super) fn start(
         example: Example,
         robot: Option<&Robot>,
@@ -118,7 +118,7 @@ pub(super) fn serial(path: &Path) -> io::Result<FieldStream<std::fs::File>> {
     FieldStream::open(path)
 }
 
-/// A Modbus client for looking at the controller from outside.
+/// A Modbus client that reads the controller.
 struct Modbus {
     line: FieldStream<std::net::TcpStream>,
     client: Client,
@@ -129,7 +129,7 @@ impl Modbus {
         Ok(Self { line: FieldStream::connect(address)?, client: Client::new(1) })
     }
 
-    fn ask(&mut self, request: Request<'_>, is_so: impl Fn(Response<'_>) -> bool) -> io::Result<bool> {
+    fn request(&mut self, request: Request<'_>, is_so: impl Fn(Response<'_>) -> bool) -> io::Result<bool> {
         let mut frame = [0; MAX_ADU];
         let len = self.client.start(request, &mut frame).map_err(io::Error::other)?;
         self.line.send(&frame[..len])?;
@@ -145,21 +145,21 @@ impl Modbus {
     }
 }
 
-/// Looks again and again until it is so.
+/// Calls `is_so` repeatedly until it returns true.
 fn until(mut is_so: impl FnMut() -> io::Result<bool>) -> io::Result<()> {
     let deadline = Instant::now() + PATIENCE;
     while !is_so()? {
         if Instant::now() > deadline {
             return Err(io::Error::new(io::ErrorKind::TimedOut, "it did not happen in time"));
         }
-        std::thread::sleep(BETWEEN_LOOKS);
+        std::thread::sleep(POLL_INTERVAL);
     }
     Ok(())
 }
 
-/// Whoever asks without a pause keeps the processor from what he waits for: what is written into a
-/// pseudoterminal, and at times what crosses a socket, is carried on by threads of the kernel.
-const BETWEEN_LOOKS: Duration = Duration::from_millis(2);
+/// Polling without a pause would keep the processor from kernel threads that pass on what was written to a
+/// pseudoterminal, and sometimes to a socket.
+const POLL_INTERVAL: Duration = Duration::from_millis(2);
 
 fn address(handle: &Handle, name: &str) -> io::Result<SocketAddr> {
     handle.place(name).parse().map_err(|_| io::Error::other(format!("no address called {name}")))
@@ -174,15 +174,15 @@ mod tests {
     use super::*;
 
     #[test]
-    fn whoever_waits_leaves_the_processor_alone() {
+    fn waiting_does_not_occupy_the_processor() {
         let begun = Instant::now();
-        let mut looks = 0;
+        let mut calls = 0;
         until(|| {
-            looks += 1;
-            Ok(begun.elapsed() >= 25 * BETWEEN_LOOKS)
+            calls += 1;
+            Ok(begun.elapsed() >= 25 * POLL_INTERVAL)
         })
         .unwrap();
-        let most = begun.elapsed().as_micros() / BETWEEN_LOOKS.as_micros() + 1;
-        assert!(looks <= most, "{looks} looks in {:?}", begun.elapsed());
+        let most = begun.elapsed().as_micros() / POLL_INTERVAL.as_micros() + 1;
+        assert!(calls <= most, "{calls} calls in {:?}", begun.elapsed());
     }
 }

@@ -1,8 +1,8 @@
-//! Field devices of the demo: what a technician would have on the bench. A serial line on a
-//! pseudoterminal or a TCP connection, a CAN adapter that speaks slcan, a UDP socket.
+//! Field devices of the demo: a serial line on a pseudoterminal or a TCP connection, a CAN adapter with
+//! slcan, a UDP socket.
 //!
-//! They use plain blocking system calls and know nothing of recipes: bytes in, bytes out, each
-//! wait with a deadline.
+//! In: bytes. Out: bytes. They use blocking system calls, each wait with a deadline, and do not know
+//! recipes.
 
 use std::fs::File;
 use std::io::{self, Read, Write};
@@ -14,8 +14,7 @@ use std::time::{Duration, Instant};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::fs::{Mode, OFlags, open};
 
-/// How long a device waits for what should come at once. Only a failure takes so long; a busy machine
-/// must not look like one.
+/// How long a device waits for what should come at once: longer than the busiest machine needs.
 pub(super) const PATIENCE: Duration = Duration::from_secs(30);
 
 /// A stream of bytes: a serial line, or a TCP connection.
@@ -33,14 +32,14 @@ impl FieldStream<File> {
 }
 
 impl FieldStream<TcpStream> {
-    /// Connects.
+    /// Connects to a server.
     pub(super) fn connect(address: SocketAddr) -> io::Result<Self> {
         let stream = TcpStream::connect_timeout(&address, PATIENCE)?;
         stream.set_nodelay(true)?;
         Ok(Self { stream, received: Vec::new() })
     }
 
-    /// Waits for somebody to connect.
+    /// Accepts a connection.
     pub(super) fn accept(listener: &TcpListener) -> io::Result<Self> {
         wait_readable(listener.as_fd(), Instant::now() + PATIENCE)?;
         let (stream, _) = listener.accept()?;
@@ -54,8 +53,8 @@ impl<S: Read + Write + AsFd> FieldStream<S> {
         self.stream.write_all(bytes)
     }
 
-    /// Reads until what was received satisfies `found`, which is given all of it and returns what it
-    /// found and how many bytes that used up.
+    /// Reads until `found` returns something. It gets all received bytes, and returns its result and the
+    /// number of bytes to remove.
     pub(super) fn wait_for<T>(
         &mut self,
         mut found: impl FnMut(&[u8]) -> Option<(T, usize)>,
@@ -75,7 +74,7 @@ impl<S: Read + Write + AsFd> FieldStream<S> {
         }
     }
 
-    /// The next frame with this head, tail and length.
+    /// Waits for the next frame with this head, tail and length.
     pub(super) fn frame(&mut self, head: &[u8], tail: &[u8], len: usize) -> io::Result<Vec<u8>> {
         self.wait_for(|received| {
             let is_frame = |frame: &&[u8]| frame.starts_with(head) && frame.ends_with(tail);
@@ -104,7 +103,7 @@ impl Adapter {
         self.line.send(format!("t{id:03X}{:X}{data}\r", data.len() / 2).as_bytes())
     }
 
-    /// The next data frame with this standard id.
+    /// Waits for the next data frame with this standard id.
     pub(super) fn frame(&mut self, id: u16) -> io::Result<Vec<u8>> {
         let wanted = format!("t{id:03X}");
         loop {
@@ -143,7 +142,7 @@ impl Datagrams {
         self.socket.send(bytes).map(drop)
     }
 
-    /// The next datagram; from now on the socket talks to whoever sent it.
+    /// Waits for the next datagram, and connects the socket to its sender.
     pub(super) fn receive(&self) -> io::Result<Vec<u8>> {
         wait_readable(self.socket.as_fd(), Instant::now() + PATIENCE)?;
         let mut datagram = vec![0; 2048];
@@ -154,7 +153,7 @@ impl Datagrams {
     }
 }
 
-/// Waits until there is something to read; an error of kind `TimedOut` when the deadline passes.
+/// Waits until there is something to read; returns an error of kind `TimedOut` after the deadline.
 fn wait_readable(fd: BorrowedFd<'_>, deadline: Instant) -> io::Result<()> {
     let mut fds = [PollFd::new(&fd, PollFlags::IN)];
     loop {

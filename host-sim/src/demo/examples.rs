@@ -1,5 +1,5 @@
 //! The specification's six worked examples (proto-core/docs/wire/recipes.md section 8), each against the
-//! simulated controller's own ports and, for what a gateway bridges, through the gateway.
+//! simulated controller's own ports and, where a gateway can take part, through the gateway.
 
 use std::io;
 use std::net::TcpListener;
@@ -13,10 +13,10 @@ use super::show::Show;
 
 const HEAD: [u8; 2] = [0xFF, 0xFF];
 const OUT_TAIL: [u8; 2] = [0xFE, 0xFE];
-/// Example 1: three bytes to the robot, and what the program answers.
+/// Example 1: three bytes to the robot, and the program's answer.
 const THREE_BYTES: [u8; 7] = [0xFF, 0xFF, 1, 2, 3, 0xEE, 0xEE];
 const ANSWER: [u8; 7] = [0xFF, 0xFF, 0x7D, 0x7D, 0x7D, 0xFE, 0xFE];
-/// Examples 2, 5 and 6: DO1 on, and everything off.
+/// Examples 2, 5 and 6: DO1 on, and all off.
 const DO1_ON: [u8; 5] = [0xFF, 0xFF, 1, 0xEE, 0xEE];
 const DO1_OFF: [u8; 5] = [0xFF, 0xFF, 0, 0xEE, 0xEE];
 /// Example 4's captured frame.
@@ -178,7 +178,7 @@ fn can_user_gateway(show: &Show) -> io::Result<()> {
 
 fn can_pose_and_do1(show: &Show, adapter: &mut Adapter, robot: &Robot) -> io::Result<()> {
     let pose = loop {
-        // Behind a gateway the first cycles may have been before the first state packet.
+        // A gateway's first cycles may come before the first state packet.
         let frame = adapter.frame(2)?;
         if frame.iter().any(|&byte| byte != 0) {
             break frame;
@@ -200,7 +200,7 @@ fn can_system(show: &Show) -> io::Result<()> {
 }
 
 fn can_system_gateway(show: &Show) -> io::Result<()> {
-    // The controller's own CAN port is there too, with nobody on its bus.
+    // The controller's own CAN port exists too, without a device.
     let robot = Robot::start(example!("can-system-controller"), &[], &[bind("can", "slcan-tcp", LOOPBACK)])?;
     let binds = [bind("can-1", "slcan-tcp", LOOPBACK)];
     let gateway = Gateway::start(example!("can-system"), Some(&robot), &[], &binds)?;

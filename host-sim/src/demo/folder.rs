@@ -1,27 +1,27 @@
-//! The folder that the demo's pseudoterminals are linked in. It is there while the demo runs.
+//! The temporary folder with the links to the demo's pseudoterminals.
 
 use std::io;
 use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-/// A folder of our own, removed with everything in it when it is dropped.
+/// A temporary folder, removed with its content when it is dropped.
 #[derive(Debug)]
 pub(super) struct Folder(Arc<Owned>);
 
-/// Removes the folder before that.
+/// Removes the folder earlier.
 #[derive(Debug)]
 pub(super) struct Remover(Arc<Owned>);
 
 #[derive(Debug)]
 struct Owned {
     path: PathBuf,
-    /// Held by whoever makes something in the folder, and by whoever removes it.
+    /// Held while something is made in the folder, and while it is removed.
     making: Mutex<()>,
 }
 
 impl Folder {
-    /// A new folder among the system's temporary ones.
+    /// Makes a folder in the system's folder for temporary files.
     pub(super) fn new() -> io::Result<Self> {
         Self::within(&std::env::temp_dir())
     }
@@ -31,7 +31,7 @@ impl Folder {
         loop {
             let path = folder.join(format!("host-sim-demo-{}-{nth}", std::process::id()));
             match std::fs::DirBuilder::new().mode(0o700).create(&path) {
-                // Another's, or left by one that was killed.
+                // It belongs to another process, or to one that was killed.
                 Err(error) if error.kind() == io::ErrorKind::AlreadyExists && nth < MOST_NAMES => nth += 1,
                 made => return made.map(|()| Self(Arc::new(Owned { path, making: Mutex::new(()) }))),
             }
@@ -42,7 +42,7 @@ impl Folder {
         self.0.path.join(name)
     }
 
-    /// Has `make` make something in the folder.
+    /// Calls `make` to make something in the folder.
     pub(super) fn fill<T>(&self, make: impl FnOnce() -> T) -> T {
         let _making = self.0.lock();
         make()
@@ -61,7 +61,7 @@ impl Drop for Folder {
 }
 
 impl Remover {
-    /// Removes the folder and ends the process. Nobody makes anything in the folder in between.
+    /// Removes the folder and ends the process. Nothing is made in the folder in between.
     pub(super) fn remove_and_exit(&self, code: i32) -> ! {
         let _making = self.0.lock();
         self.0.remove();
@@ -75,7 +75,7 @@ impl Owned {
     }
 
     fn remove(&self) {
-        // Links that go at the same moment can be in the way once.
+        // Can fail once if links are removed at the same time.
         for _ in 0..MOST_TRIES {
             match std::fs::remove_dir_all(&self.path) {
                 Err(error) if error.kind() != io::ErrorKind::NotFound => {}

@@ -1,7 +1,7 @@
 //! A whole cell in one process: simulated controller, gateway, field devices.
 //!
-//! The devices are pseudoterminals, sockets and slcan connections like those of any other client;
-//! nothing is passed on inside the process.
+//! The devices use pseudoterminals, sockets and slcan connections like any other client; nothing is passed
+//! inside the process.
 
 mod cell;
 mod device;
@@ -15,17 +15,17 @@ use std::time::Instant;
 
 use folder::Folder;
 use recipe_shell::Signals;
-use recipe_shell::out::tell;
+use recipe_shell::out::print_stderr;
 use show::Show;
 
-/// Runs the cell and prints what it does, until nobody reads it; success only when every example passes
-/// that was run.
+/// Runs the cell and prints what it does, until the reader is gone; success if all examples that were run
+/// passed.
 pub fn run() -> ExitCode {
     let started = Instant::now();
     let folder = match prepare() {
         Ok(folder) => folder,
         Err(error) => {
-            tell(format_args!("no folder for the devices: {error}"));
+            print_stderr(format_args!("no folder for the devices: {error}"));
             return ExitCode::FAILURE;
         }
     };
@@ -35,7 +35,7 @@ pub fn run() -> ExitCode {
     show.verdict(started.elapsed().as_secs_f64())
 }
 
-/// The folder for the devices. Ctrl-C and its like remove it; everything else ends with the process.
+/// The folder for the devices. Ctrl-C and other signals remove it; everything else ends with the process.
 fn prepare() -> io::Result<Folder> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     let mut signals = {
@@ -46,7 +46,7 @@ fn prepare() -> io::Result<Folder> {
     let remover = folder.remover();
     std::thread::Builder::new().name("signals".to_owned()).spawn(move || {
         let signal = runtime.block_on(signals.next());
-        tell("interrupted");
+        print_stderr("interrupted");
         // The exit code as shells have it.
         remover.remove_and_exit(128 + signal)
     })?;

@@ -1,4 +1,4 @@
-//! What the demo prints: each example as it happens, and its verdict.
+//! The demo's output: each example as it runs, and its verdict.
 
 use std::cell::RefCell;
 use std::fmt::Arguments;
@@ -15,7 +15,7 @@ const QUIET: Style = Style::new().dimmed();
 const GOOD: Style = AnsiColor::Green.on_default().bold();
 const BAD: Style = AnsiColor::Red.on_default().bold();
 
-/// The printer; it counts verdicts.
+/// Prints, and counts verdicts.
 #[derive(Debug)]
 pub(super) struct Show {
     out: RefCell<Out<AutoStream<Stdout>>>,
@@ -28,22 +28,22 @@ impl Show {
         Self { out: RefCell::new(Out::new(anstream::stdout())), passed: 0, failed: 0 }
     }
 
-    /// What it is about.
+    /// The introduction.
     pub(super) fn introduce(&self, text: &str) {
         self.print(format_args!("{text}"));
     }
 
-    /// A whole example.
+    /// The heading of an example.
     pub(super) fn heading(&self, text: &str) {
         self.print(format_args!("\n{HEADING}{text}{HEADING:#}"));
     }
 
-    /// Bytes on their way into the cell.
+    /// Bytes that are sent into the cell.
     pub(super) fn sends(&self, who: &str, bytes: &[u8], meaning: &str) {
         self.line(who, '>', &hex(bytes), meaning);
     }
 
-    /// Bytes that came out of it.
+    /// Bytes that were received from it.
     pub(super) fn sees(&self, who: &str, bytes: &[u8], meaning: &str) {
         self.line(who, '<', &hex(bytes), meaning);
     }
@@ -53,7 +53,7 @@ impl Show {
         self.line(who, ' ', what, meaning);
     }
 
-    /// Runs one half of an example and prints its verdict; neither when nobody reads it.
+    /// Runs one half of an example and prints its verdict; does nothing if the reader is gone.
     pub(super) fn judge(&mut self, what: &str, run: impl FnOnce(&Self) -> io::Result<()>) {
         if self.out.get_mut().has_failed() {
             return;
@@ -83,13 +83,13 @@ impl Show {
     }
 
     fn print(&self, line: Arguments<'_>) {
-        // The first failure is kept.
+        // Keep the first error.
         let _ = writeln!(self.out.borrow_mut(), "{line}");
     }
 
     fn line(&self, who: &str, arrow: char, what: &str, meaning: &str) {
         let mut what = what.to_owned();
-        // A long frame keeps its explanation on a line of its own.
+        // The explanation of a long frame is on a separate line.
         if what.len() > WIDTH && !meaning.is_empty() {
             self.print(format_args!("    {who:<8}{arrow} {what}"));
             what.clear();

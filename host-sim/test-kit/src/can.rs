@@ -1,13 +1,13 @@
-//! A CAN bus of the kernel, and the can-utils on it.
+//! CAN interfaces of the kernel, and can-utils on them.
 
 use std::process::{Command, Stdio};
 
 use super::{Process, until};
 
-/// Runs a tool to its end; it must succeed.
+/// Runs a tool to its end and returns its stdout.
 ///
 /// # Panics
-/// When that fails.
+/// If that fails.
 #[track_caller]
 pub fn tool(command: &str) -> String {
     let mut words = command.split_whitespace();
@@ -19,10 +19,10 @@ pub fn tool(command: &str) -> String {
     String::from_utf8(output.stdout).unwrap()
 }
 
-/// Puts a frame on the bus, as `001#0102`.
+/// Sends a frame such as `001#0102`.
 ///
 /// # Panics
-/// When that fails.
+/// If that fails.
 #[track_caller]
 pub fn cansend(interface: &str, frame: &str) {
     tool(&format!("cansend {interface} {frame}"));
@@ -33,10 +33,10 @@ pub fn cansend(interface: &str, frame: &str) {
 pub struct Candump(Process);
 
 impl Candump {
-    /// Starts it and waits until it hears the bus.
+    /// Starts it and waits until it receives frames.
     ///
     /// # Panics
-    /// When that fails.
+    /// If that fails.
     #[track_caller]
     pub fn start(interface: &str) -> Self {
         let mut command = Command::new("stdbuf");
@@ -55,15 +55,15 @@ impl Candump {
         lines.iter().filter(|line| line.starts_with('(') && !line.ends_with(MARK)).cloned().collect()
     }
 
-    /// The frames so far, as `001#0102`.
+    /// The frames so far, such as `001#0102`.
     pub fn frames(&self) -> Vec<String> {
         self.log().iter().filter_map(|line| line.split_whitespace().nth(2)).map(str::to_owned).collect()
     }
 
-    /// Waits until the frame is on the bus.
+    /// Waits until the frame was on the bus.
     ///
     /// # Panics
-    /// When that fails.
+    /// If that fails.
     #[track_caller]
     pub fn wait_for(&self, frame: &str) {
         until(frame, || self.frames().iter().any(|seen| seen == frame).then_some(()));
@@ -75,10 +75,10 @@ impl Candump {
 pub struct Vcan(pub &'static str);
 
 impl Vcan {
-    /// A virtual one that is up.
+    /// Makes a virtual interface and brings it up.
     ///
     /// # Panics
-    /// When that fails.
+    /// If that fails.
     #[track_caller]
     pub fn new(name: &'static str) -> Self {
         let _ = Command::new("ip").args(["link", "del", name]).stderr(Stdio::null()).status();
@@ -94,5 +94,5 @@ impl Drop for Vcan {
     }
 }
 
-/// No recipe has it.
+/// A frame that no recipe has.
 const MARK: &str = "7FE#";

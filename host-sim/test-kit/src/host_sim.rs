@@ -1,4 +1,4 @@
-//! The program `host-sim`, as a process that is ready.
+//! A running `host-sim` process that is ready.
 
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream};
@@ -14,17 +14,18 @@ use super::{PATIENCE, Process, until};
 /// The controller's servers.
 pub const SERVERS: [&str; 4] = ["command", "state", "modbus", "udp2011"];
 
-/// The arguments that let a controller's servers listen on ports that are free.
+/// Arguments that make a controller's servers listen on free ports.
 pub fn free_servers() -> [String; 4] {
     SERVERS.map(|server| format!("--set=listen.{server}=0"))
 }
 
-/// Where the program is: `Binary(env!("CARGO_BIN_EXE_host-sim"))`, which only tests of its package know.
+/// Path of the program: `Binary(env!("CARGO_BIN_EXE_host-sim"))`, which Cargo sets only for tests of its
+/// package.
 #[derive(Debug, Clone, Copy)]
 pub struct Binary(pub &'static str);
 
 impl Binary {
-    /// A call of it: nothing on stdin, stdout and stderr piped.
+    /// A command that runs it: no stdin, stdout and stderr piped.
     pub fn command(self) -> Command {
         let mut command = Command::new(self.0);
         command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
@@ -41,16 +42,16 @@ impl Binary {
     /// A simulated controller on free ports.
     ///
     /// # Panics
-    /// When it is not ready in time.
+    /// If it is not ready in time.
     #[track_caller]
     pub fn controller(self, file: &Path, extra: &[&str]) -> HostSim {
         HostSim::start(self.run("controller", file).args(free_servers()).args(extra))
     }
 
-    /// A gateway to that controller; its links are up.
+    /// A gateway that is connected to this controller, with all links up.
     ///
     /// # Panics
-    /// When they are not in time.
+    /// If they are not up in time.
     #[track_caller]
     pub fn gateway(self, file: &Path, robot: &HostSim, extra: &[&str]) -> HostSim {
         let links = robot.links(&["command", "state", "modbus"]);
@@ -62,11 +63,25 @@ impl Binary {
     }
 }
 
-/// A `host-sim` that said that it is ready.
+/// Sends a command to a controller's port 2000, at `address`, and checks the reply.
+///
+/// # Panics
+/// If the reply is another, or there is none.
+#[track_caller]
+pub fn command(address: SocketAddr, request: &str, reply: &str) {
+    let mut stream = TcpStream::connect(address).unwrap();
+    stream.set_read_timeout(Some(PATIENCE)).unwrap();
+    stream.write_all(request.as_bytes()).unwrap();
+    let mut answer = vec![0; reply.len()];
+    stream.read_exact(&mut answer).unwrap();
+    assert_eq!(String::from_utf8_lossy(&answer), reply);
+}
+
+/// A `host-sim` that has printed its `ready` line.
 #[derive(Debug)]
 pub struct HostSim {
     process: Process,
-    /// What it said.
+    /// The JSON of the `ready` line.
     pub ready: Value,
 }
 
@@ -74,7 +89,7 @@ impl HostSim {
     /// Starts it and waits until it is ready.
     ///
     /// # Panics
-    /// When it is not in time.
+    /// If it is not ready in time.
     #[track_caller]
     pub fn start(command: &mut Command) -> Self {
         let process = Process::start(command);
@@ -83,10 +98,10 @@ impl HostSim {
         Self { ready: serde_json::from_str(json).unwrap(), process }
     }
 
-    /// The same, of one whose output nobody reads; `file` is its ready file.
+    /// Same, if nobody reads its output; `file` is its ready file.
     ///
     /// # Panics
-    /// When it is not in time.
+    /// If it is not ready in time.
     #[track_caller]
     pub fn unread(command: &mut Command, file: &Path) -> Self {
         let process = Process::unread(command);
@@ -100,55 +115,50 @@ impl HostSim {
     /// The address of a server, or of `ports/NAME`.
     ///
     /// # Panics
-    /// When it has none.
+    /// If it has none.
     #[track_caller]
     pub fn at(&self, name: &str) -> SocketAddr {
         let place = self.ready.pointer(&format!("/{name}")).and_then(Value::as_str);
         place.unwrap_or_else(|| panic!("{name} is nowhere: {}", self.ready)).parse().unwrap()
     }
 
-    /// The arguments that lead these links of a gateway to this controller.
+    /// Arguments that make these links of a gateway use this controller.
     ///
     /// # Panics
-    /// When one of them is not there.
+    /// If it has no such server.
     #[track_caller]
     pub fn links(&self, names: &[&str]) -> Vec<String> {
         let link = |name: &&str| format!("--set=controller.ports.{name}={}", self.at(name).port());
         names.iter().map(link).collect()
     }
 
-    /// The lines of its log so far that have these words.
+    /// The lines of its log so far that contain `words`.
     pub fn log(&self, words: &str) -> Vec<String> {
         self.errors().iter().filter(|line| line.contains(words)).cloned().collect()
     }
 
-    /// A command on this controller's port 2000.
+    /// Sends a command to this controller's port 2000 and checks the reply.
     ///
     /// # Panics
-    /// When the reply is another, or none.
+    /// If the reply is another, or there is none.
     #[track_caller]
     pub fn command(&self, request: &str, reply: &str) {
-        let mut stream = TcpStream::connect(self.at("command")).unwrap();
-        stream.set_read_timeout(Some(PATIENCE)).unwrap();
-        stream.write_all(request.as_bytes()).unwrap();
-        let mut answer = vec![0; reply.len()];
-        stream.read_exact(&mut answer).unwrap();
-        assert_eq!(String::from_utf8_lossy(&answer), reply);
+        command(self.at("command"), request, reply);
     }
 
-    /// Ends it as a person would; it must end well.
+    /// Ends it by SIGINT, as Ctrl-C does.
     ///
     /// # Panics
-    /// When it does not.
+    /// If the exit code is not 0.
     #[track_caller]
     pub fn end(self) {
         self.ended_by(Signal::INT);
     }
 
-    /// The same by another signal.
+    /// Ends it by a signal.
     ///
     /// # Panics
-    /// When it does not end well.
+    /// If the exit code is not 0.
     #[track_caller]
     pub fn ended_by(mut self, signal: Signal) {
         self.process.end_by(signal);

@@ -1,7 +1,7 @@
-//! What the tests of host-sim's crates share: programs that run, waiting, files.
+//! Helpers that the tests of host-sim's crates share: processes, waiting, files.
 //!
-//! Every helper panics when what a test needs does not happen. Nothing here knows a recipe, a
-//! controller or an engine, so every crate can use it.
+//! A helper panics if what the test needs does not happen. None of them depends on recipes, the controller
+//! or the engine, so that every crate can use them.
 
 pub mod can;
 mod host_sim;
@@ -11,16 +11,16 @@ pub mod toml;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-pub use host_sim::{Binary, HostSim, SERVERS, free_servers};
+pub use host_sim::{Binary, HostSim, SERVERS, command, free_servers};
 pub use process::{Process, ended};
 
-/// Longest wait for anything, far above what a busy machine needs.
+/// The timeout of every wait, far longer than a busy machine needs.
 pub const PATIENCE: Duration = Duration::from_secs(20);
 
-/// Looks again and again until there is something.
+/// Calls `look` repeatedly until it returns something.
 ///
 /// # Panics
-/// When there is nothing for [`PATIENCE`].
+/// If it returns nothing for [`PATIENCE`].
 #[track_caller]
 pub fn until<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
     let deadline = Instant::now() + PATIENCE;
@@ -33,7 +33,7 @@ pub fn until<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
     }
 }
 
-/// The top folder of the repository.
+/// The root folder of the repository.
 pub fn repository() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../..")
 }
@@ -46,7 +46,7 @@ pub fn example(name: &str) -> PathBuf {
 /// All example files, sorted.
 ///
 /// # Panics
-/// When their folder cannot be read.
+/// If their folder cannot be read.
 pub fn examples() -> Vec<PathBuf> {
     let mut files: Vec<_> =
         std::fs::read_dir(example("")).unwrap().map(|entry| entry.unwrap().path()).collect();
@@ -54,10 +54,10 @@ pub fn examples() -> Vec<PathBuf> {
     files
 }
 
-/// The names of what is in a folder, sorted.
+/// The names of a folder's entries, sorted.
 ///
 /// # Panics
-/// When it cannot be read.
+/// If it cannot be read.
 #[track_caller]
 pub fn names(folder: &Path) -> Vec<String> {
     let names = std::fs::read_dir(folder).unwrap();

@@ -1,4 +1,4 @@
-//! A program that runs until it is dropped, and what it says line by line.
+//! A process that runs until it is dropped, and its output by lines.
 
 use std::io::{BufRead, BufReader, Read};
 use std::process::{Child, Command, ExitStatus};
@@ -11,79 +11,79 @@ use serde_json::Value;
 
 use super::{PATIENCE, until};
 
-/// A running program. It is killed when it is dropped; a test that fails shows what it said on stderr.
+/// A running process. It is killed when it is dropped; its stderr is shown if the test fails.
 #[derive(Debug)]
 pub struct Process {
     child: Child,
-    out: Said,
-    errors: Said,
-    /// How many lines [`Self::line`] has returned.
+    out: PipeLines,
+    errors: PipeLines,
+    /// Number of lines that [`Self::line`] has returned.
     taken: AtomicUsize,
 }
 
 impl Process {
-    /// Starts it. Of stdout and stderr, what is piped is read, all the time.
+    /// Starts it. Stdout and stderr are read continuously, if they are piped.
     ///
     /// # Panics
     /// When it cannot be started.
     #[track_caller]
     pub fn start(command: &mut Command) -> Self {
         let mut process = Self::unread(command);
-        process.out = Said::of(process.child.stdout.take());
-        process.errors = Said::of(process.child.stderr.take());
+        process.out = PipeLines::of(process.child.stdout.take());
+        process.errors = PipeLines::of(process.child.stderr.take());
         process
     }
 
-    /// The same, and nobody reads what it says.
+    /// Same, without reading its output.
     ///
     /// # Panics
     /// When it cannot be started.
     #[track_caller]
     pub fn unread(command: &mut Command) -> Self {
         let child = command.spawn().unwrap_or_else(|error| panic!("{command:?}: {error}"));
-        Self { child, out: Said::default(), errors: Said::default(), taken: AtomicUsize::new(0) }
+        Self { child, out: PipeLines::default(), errors: PipeLines::default(), taken: AtomicUsize::new(0) }
     }
 
-    /// Its number.
+    /// The process id.
     pub fn pid(&self) -> Pid {
         Pid::from_child(&self.child)
     }
 
-    /// What it said on stdout so far, by lines.
+    /// The lines of stdout so far.
     pub fn lines(&self) -> MutexGuard<'_, Vec<String>> {
         self.out.lines()
     }
 
-    /// What it said on stderr so far, by lines.
+    /// The lines of stderr so far.
     pub fn errors(&self) -> MutexGuard<'_, Vec<String>> {
         self.errors.lines()
     }
 
-    /// Everything it said on stderr. Only of a program that has ended or soon will.
+    /// All of stderr. Waits until the process has closed it.
     pub fn all_errors(&mut self) -> String {
-        self.errors.read_whole();
+        self.errors.read_to_end();
         self.errors().join("\n")
     }
 
     /// The next line of stdout.
     ///
     /// # Panics
-    /// When none comes.
+    /// If none comes.
     #[track_caller]
     pub fn line(&self) -> String {
         let next = self.taken.fetch_add(1, Relaxed);
         until("a line on stdout", || self.lines().get(next).cloned())
     }
 
-    /// The next line is one that has not come yet.
+    /// Skips the lines that have come so far: [`Self::line`] returns a later one.
     pub fn skip_lines(&self) {
         self.taken.store(self.lines().len(), Relaxed);
     }
 
-    /// The next statistics that satisfy `found`, each in its turn.
+    /// Reads statistics line by line until some satisfy `found`.
     ///
     /// # Panics
-    /// When none come that do.
+    /// If none do.
     #[track_caller]
     pub fn next_stats(&self, found: impl Fn(&Value) -> bool) -> Value {
         let deadline = Instant::now() + PATIENCE;
@@ -96,7 +96,7 @@ impl Process {
         }
     }
 
-    /// The newest statistics; null when there are none.
+    /// The newest statistics; null if there are none.
     pub fn newest(&self) -> Value {
         self.lines().iter().rev().find_map(|line| serde_json::from_str(line).ok()).unwrap_or_default()
     }
@@ -104,7 +104,7 @@ impl Process {
     /// The newest statistics, once they satisfy `found`.
     ///
     /// # Panics
-    /// When they never do.
+    /// If they never do.
     #[track_caller]
     pub fn stats(&self, what: &str, found: impl Fn(&Value) -> bool) -> Value {
         let deadline = Instant::now() + PATIENCE;
@@ -118,22 +118,22 @@ impl Process {
         }
     }
 
-    /// Statistics that were begun after this call.
+    /// Statistics that were collected after this call.
     ///
     /// # Panics
-    /// When none come.
+    /// If none come.
     #[track_caller]
     pub fn fresh(&self) -> Value {
         self.skip_lines();
-        // One may have been under way.
+        // The next line may have been collected before.
         self.line();
         serde_json::from_str(&self.line()).unwrap()
     }
 
-    /// Fails when it has ended by itself.
+    /// Checks that it is still running.
     ///
     /// # Panics
-    /// Then.
+    /// If it has ended.
     #[track_caller]
     pub fn must_run(&mut self) {
         if let Some(status) = self.child.try_wait().unwrap() {
@@ -144,16 +144,16 @@ impl Process {
     /// Sends it a signal.
     ///
     /// # Panics
-    /// When it has ended and somebody knows.
+    /// If it has ended and was waited for.
     #[track_caller]
     pub fn signal(&self, signal: Signal) {
         rustix::process::kill_process(self.pid(), signal).unwrap();
     }
 
-    /// Stops it, and returns once none of its threads runs.
+    /// Stops it; returns once none of its threads runs.
     ///
     /// # Panics
-    /// When it does not stop.
+    /// If it does not stop.
     #[track_caller]
     pub fn freeze(&self) {
         self.signal(Signal::STOP);
@@ -168,19 +168,19 @@ impl Process {
         });
     }
 
-    /// How it has ended, by itself or because it was told to.
+    /// Waits until it ends; returns its exit status.
     ///
     /// # Panics
-    /// When it has not, in time.
+    /// If it does not end in time.
     #[track_caller]
     pub fn ended(&mut self) -> ExitStatus {
         ended(&mut self.child, PATIENCE)
     }
 
-    /// Ends it by this signal; it must end well.
+    /// Ends it by this signal.
     ///
     /// # Panics
-    /// When it does not.
+    /// If the exit code is not 0.
     #[track_caller]
     pub fn end_by(&mut self, signal: Signal) {
         self.signal(signal);
@@ -188,10 +188,10 @@ impl Process {
         assert_eq!(status.code(), Some(0), "after {signal:?}: {status}");
     }
 
-    /// Kills it, as nothing that it could prepare for.
+    /// Kills it by SIGKILL.
     ///
     /// # Panics
-    /// When the system does not.
+    /// If the system refuses.
     pub fn kill(&mut self) {
         self.child.kill().unwrap();
         self.child.wait().unwrap();
@@ -203,19 +203,19 @@ impl Drop for Process {
         let _ = self.child.kill();
         let _ = self.child.wait();
         if std::thread::panicking() {
-            self.errors.read_whole();
+            self.errors.read_to_end();
             self.errors().iter().for_each(|line| eprintln!("{}: {line}", self.pid().as_raw_pid()));
         }
     }
 }
 
-/// How a child has ended; one that does not is killed.
+/// Waits until a child ends; returns its exit status. A child that does not end is killed.
 ///
 /// # Panics
-/// When it does not end within `patience`.
+/// If it does not end within `timeout`.
 #[track_caller]
-pub fn ended(child: &mut Child, patience: Duration) -> ExitStatus {
-    let deadline = Instant::now() + patience;
+pub fn ended(child: &mut Child, timeout: Duration) -> ExitStatus {
+    let deadline = Instant::now() + timeout;
     loop {
         if let Some(status) = child.try_wait().unwrap() {
             return status;
@@ -230,12 +230,12 @@ pub fn ended(child: &mut Child, patience: Duration) -> ExitStatus {
 
 /// The lines of a pipe, read by a thread.
 #[derive(Debug, Default)]
-struct Said {
+struct PipeLines {
     lines: Arc<Mutex<Vec<String>>>,
     reader: Option<std::thread::JoinHandle<()>>,
 }
 
-impl Said {
+impl PipeLines {
     fn of(pipe: Option<impl Read + Send + 'static>) -> Self {
         let lines = Arc::<Mutex<Vec<String>>>::default();
         let sink = Arc::clone(&lines);
@@ -254,7 +254,7 @@ impl Said {
     }
 
     /// Waits until the pipe is closed.
-    fn read_whole(&mut self) {
+    fn read_to_end(&mut self) {
         if let Some(reader) = self.reader.take() {
             let _ = reader.join();
         }

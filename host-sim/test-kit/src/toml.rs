@@ -1,8 +1,8 @@
-//! Texts of configuration files that several tests use.
+//! Configuration files that several tests use.
 
-/// A gateway with one field port, `device`, at which there is a panel: `FF FF order outputs EE EE`. The
-/// order's `commands`, such as `1 = "stop"`, are sent when it changes. The outputs are DO1 to DO8, of
-/// which only DO8 is on when the panel says nothing for `timeout_ms`.
+/// A gateway with one field port, `device`, for a panel that sends `FF FF order outputs EE EE`. A changed
+/// order sends one of `commands`, such as `1 = "stop"`. The outputs are DO1 to DO8; if the panel is silent
+/// for `timeout_ms`, only DO8 is on.
 pub fn panel(commands: &str, timeout_ms: u32) -> String {
     format!(
         r#"
@@ -31,8 +31,8 @@ on_timeout = {{ "DigitalOutputCommand[1]" = 128 }}
     )
 }
 
-/// Pieces that mean something to a configuration file, and some that mean trouble. Seeds of a fuzzer
-/// are numbers of them: new ones belong at the end.
+/// Pieces of configuration files, valid and harmful ones. Inputs of a fuzzer refer to them by index: add new
+/// ones at the end.
 pub const PIECES: [&str; 48] = [
     "[",
     "]",

@@ -1,5 +1,5 @@
-//! Peers that mean no good. Each attack is a few threads at the lowest priority, so that what it takes
-//! from others is not the processor but what the process under attack gives it.
+//! Hostile peers. Each attack is a few threads at the lowest priority, so that it takes from other clients
+//! what the attacked process gives it, and not the processor.
 
 use std::io::{Read, Write};
 use std::net::{Ipv4Addr, SocketAddr, TcpListener, TcpStream, UdpSocket};
@@ -12,13 +12,13 @@ use std::time::Duration;
 
 use rustix::net::{AddressFamily, SocketType, sockopt};
 
-/// An attack under way; ends when dropped.
+/// A running attack; it ends when it is dropped.
 pub(crate) struct Attack {
     shared: Arc<Shared>,
     threads: Vec<JoinHandle<()>>,
 }
 
-/// What an attack's threads see of each other.
+/// What an attack's threads share.
 #[derive(Default)]
 pub(crate) struct Shared {
     stop: AtomicBool,
@@ -40,7 +40,7 @@ impl Shared {
 }
 
 impl Attack {
-    /// `threads` times the same, each told which it is.
+    /// Starts `threads` threads; each gets its number.
     fn start(threads: usize, run: impl Fn(usize, &Shared) + Clone + Send + 'static) -> Self {
         let shared = Arc::new(Shared::default());
         let begin = |nth| {
@@ -54,17 +54,17 @@ impl Attack {
         Self { shared, threads }
     }
 
-    /// It holds what it has and does nothing for a while.
+    /// Pauses it; it keeps its connections.
     pub(crate) fn pause(&self) {
         self.shared.pause.store(true, Ordering::Relaxed);
     }
 
-    /// It goes on.
+    /// Ends the pause.
     pub(crate) fn resume(&self) {
         self.shared.pause.store(false, Ordering::Relaxed);
     }
 
-    /// Connections made, bytes or datagrams sent: what the attack counts itself by.
+    /// Progress: number of connections made, or of bytes or datagrams sent.
     pub(crate) fn done(&self) -> u64 {
         self.shared.done.load(Ordering::Relaxed)
     }
@@ -91,7 +91,7 @@ pub(crate) fn scan(at: SocketAddr) -> Attack {
     })
 }
 
-/// Opens connections and keeps them, more and more; those that are closed are opened again.
+/// Opens more and more connections and keeps them; those that are closed are opened again.
 pub(crate) fn hoard(at: SocketAddr, most: usize) -> Attack {
     Attack::start(1, move |_, shared| {
         let mut held: Vec<TcpStream> = Vec::new();
@@ -109,7 +109,7 @@ pub(crate) fn hoard(at: SocketAddr, most: usize) -> Attack {
     })
 }
 
-/// `clients` that send as fast as they are read from, and take what they are answered.
+/// `clients` that send as fast as the server reads, and read its answers.
 pub(crate) fn pour(at: SocketAddr, clients: usize, bytes: &'static [u8]) -> Attack {
     let chunk = filled(bytes);
     Attack::start(clients, move |_, shared| {
@@ -122,7 +122,7 @@ pub(crate) fn pour(at: SocketAddr, clients: usize, bytes: &'static [u8]) -> Atta
     })
 }
 
-/// The same through a device.
+/// Same, through a device.
 pub(crate) fn pour_device(path: PathBuf, bytes: &'static [u8]) -> Attack {
     let chunk = filled(bytes);
     Attack::start(1, move |_, shared| {
@@ -132,16 +132,16 @@ pub(crate) fn pour_device(path: PathBuf, bytes: &'static [u8]) -> Attack {
     })
 }
 
-/// What a server does with those that it has answered.
+/// What a server does with clients that it has answered.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Hold {
-    /// It goes on.
+    /// It keeps the connection.
     Open,
     /// It closes.
     Close,
 }
 
-/// A server that pours into everybody who connects, and where it is.
+/// A server that floods everyone who connects; returns its address.
 pub(crate) fn server(bytes: &'static [u8], hold: Hold) -> (SocketAddr, Attack) {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let at = listener.local_addr().unwrap();
@@ -152,7 +152,7 @@ pub(crate) fn server(bytes: &'static [u8], hold: Hold) -> (SocketAddr, Attack) {
         while shared.goes_on() {
             match listener.accept() {
                 Ok((mut stream, _)) if hold == Hold::Close => {
-                    // Counts as much as many bytes: each makes the other side begin anew.
+                    // Counts like many bytes, since each makes the other side connect again.
                     shared.count(10);
                     let _ = stream.write_all(&chunk);
                 }
@@ -167,7 +167,7 @@ pub(crate) fn server(bytes: &'static [u8], hold: Hold) -> (SocketAddr, Attack) {
     (at, attack)
 }
 
-/// Sends as fast as is taken, and takes what comes, until the other side closes.
+/// Sends as fast as the other side reads, and reads what it sends, until it closes.
 fn pour_into(mut to: impl Read + Write, chunk: &[u8], shared: &Shared) {
     let mut got = vec![0; 1 << 16];
     let mut rest = chunk;
@@ -194,7 +194,7 @@ fn pour_into(mut to: impl Read + Write, chunk: &[u8], shared: &Shared) {
     }
 }
 
-/// `clients` that send as much as is taken and never read; each begins anew when it is closed.
+/// `clients` that send as much as possible and never read; each connects again when it is closed.
 pub(crate) fn never_read(at: SocketAddr, clients: usize, bytes: &'static [u8]) -> Attack {
     let chunk = filled(bytes);
     Attack::start(1, move |_, shared| {
@@ -223,8 +223,8 @@ pub(crate) fn never_read(at: SocketAddr, clients: usize, bytes: &'static [u8]) -
     })
 }
 
-/// Connects, asks for much, breaks the protocol in the same breath and takes nothing: what it is answered
-/// waits at a connection that is closed already. Over and over, holding what it has opened.
+/// Connects, requests much data, then violates the protocol, and never reads: answers wait at connections
+/// that are closed already. Repeats this, and keeps what it has opened.
 pub(crate) fn ask_and_break(at: SocketAddr, bytes: &'static [u8], keep: usize) -> Attack {
     Attack::start(2, move |_, shared| {
         let mut held = std::collections::VecDeque::new();
@@ -241,7 +241,7 @@ pub(crate) fn ask_and_break(at: SocketAddr, bytes: &'static [u8], keep: usize) -
     })
 }
 
-/// `clients` that send a byte every `pause`, none of them ever a whole request.
+/// `clients` that send a byte every `pause`, and never a complete request.
 pub(crate) fn drip(at: SocketAddr, clients: usize, bytes: &'static [u8], pause: Duration) -> Attack {
     Attack::start(1, move |_, shared| {
         let mut streams: Vec<TcpStream> = Vec::new();
@@ -266,16 +266,16 @@ pub(crate) fn drip(at: SocketAddr, clients: usize, bytes: &'static [u8], pause: 
     })
 }
 
-/// Whether datagrams come from ports that stay.
+/// Whether the sockets that datagrams come from stay open.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Ports {
-    /// They stay, and nobody reads what comes to them.
+    /// They stay open, and nobody reads them.
     Kept,
-    /// Each datagram comes from another, which is closed behind it.
+    /// Each datagram comes from another socket, which is closed after it.
     New,
 }
 
-/// Datagrams from many ports, each of `datagrams` in turn.
+/// Sends `datagrams` in turn from many ports.
 pub(crate) fn datagrams(
     at: SocketAddr,
     source: Ipv4Addr,
@@ -301,7 +301,7 @@ pub(crate) fn datagrams(
     })
 }
 
-/// A connection with as little room for answers as the system gives.
+/// A connection with the smallest receive buffer that the system allows.
 fn small(at: SocketAddr) -> Option<TcpStream> {
     let socket = rustix::net::socket(AddressFamily::INET, SocketType::STREAM, None).ok()?;
     sockopt::set_socket_recv_buffer_size(&socket, 2_048).ok()?;
@@ -309,7 +309,7 @@ fn small(at: SocketAddr) -> Option<TcpStream> {
     Some(TcpStream::from(socket))
 }
 
-/// About 16 KiB of it.
+/// About 16 KiB of copies.
 fn filled(bytes: &[u8]) -> Vec<u8> {
     bytes.repeat((16 << 10) / bytes.len() + 1)
 }

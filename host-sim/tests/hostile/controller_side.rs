@@ -7,9 +7,9 @@ use std::time::Duration;
 use recipe_test_kit::HostSim;
 
 use crate::attack::{self, Attack, Ports};
+use crate::clients::{Clients, connect};
 use crate::process::host_sim;
-use crate::witness::{Witnesses, connect};
-use crate::{ATTACK, QUIET, Scene, alone, in_some_stretch};
+use crate::{ATTACK, QUIET, Scene, alone, in_one_of_several_tries};
 
 const READ_WORDS: &[u8] = &[9, 9, 0, 0, 0, 6, 1, 3, 0, 0, 0, 118];
 const READ_ONE: &[u8] = &[9, 9, 0, 0, 0, 6, 1, 3, 0, 1, 0, 1];
@@ -24,15 +24,15 @@ pub(crate) fn controller(to: SocketAddr) -> HostSim {
     )
 }
 
-/// Somebody at each of its servers.
-pub(crate) fn clients(process: &HostSim, witnesses: &mut Witnesses) {
-    witnesses.udp2011(process.at("udp2011"));
-    witnesses.state(process.at("state"));
-    witnesses.asks("command", process.at("command"), b"state\n", b"6:0:5:2");
-    witnesses.asks("modbus", process.at("modbus"), READ_ONE, READ_ONE_ANSWER);
+/// A client for each of its servers.
+pub(crate) fn attach(process: &HostSim, clients: &mut Clients) {
+    clients.udp2011(process.at("udp2011"));
+    clients.state(process.at("state"));
+    clients.request_answer("command", process.at("command"), b"state\n", b"6:0:5:2");
+    clients.request_answer("modbus", process.at("modbus"), READ_ONE, READ_ONE_ANSWER);
 }
 
-/// A bit of everything.
+/// Some of each attack.
 pub(crate) fn everything(process: &HostSim) -> Vec<Attack> {
     vec![
         attack::scan(process.at("command")),
@@ -48,15 +48,15 @@ pub(crate) fn everything(process: &HostSim) -> Vec<Attack> {
     ]
 }
 
-/// As the controller takes it, and not.
+/// Requests that the controller accepts, and others.
 const DATAGRAMS: &[&[u8]] = &[&[0xFF, 0xFF, 0x02, 0xEE, 0xEE], b"", b"?", &[0; 4_000]];
 
 fn robot_with(to: SocketAddr) -> Scene {
     let alone = alone();
     let process = controller(to);
-    let mut witnesses = Witnesses::default();
-    clients(&process, &mut witnesses);
-    Scene::new(alone, process, witnesses)
+    let mut clients = Clients::default();
+    attach(&process, &mut clients);
+    Scene::new(alone, process, clients)
 }
 
 fn robot() -> Scene {
@@ -69,7 +69,7 @@ pub(crate) const NOBODY: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCAL
 fn a_port_scan_of_every_server() {
     let mut scene = robot();
     let at = scene.process.at("command");
-    scene.joined_by(|witnesses| witnesses.newcomers("newcomers", at, b"state\n", b"6:0:5:2"));
+    scene.joined_by(|clients| clients.newcomers("newcomers", at, b"state\n", b"6:0:5:2"));
     let servers = ["command", "state", "modbus", "ports/rs485", "ports/can"];
     let attacks = servers.map(|server| attack::scan(scene.process.at(server))).into();
     scene.survives(attacks);
@@ -115,7 +115,7 @@ fn garbage_without_end() {
 
 #[test]
 fn a_few_peers_that_ask_and_never_read() {
-    // Few enough to fill what the system holds for them at once: what comes then is ours to hold or not.
+    // So few that they fill the kernel's buffers at once: what comes then, the process has to hold or drop.
     let scene = robot();
     let attacks = vec![
         attack::never_read(scene.process.at("command"), 2, b"getlasterror\n"),
@@ -161,7 +161,7 @@ fn a_byte_now_and_then() {
 #[test]
 fn datagrams_from_everywhere() {
     let scene = robot();
-    // One host with many ports; another with ports that nobody listens on any more when they are answered.
+    // One host with many ports; another one with ports that are closed when the answers arrive.
     let many = Ipv4Addr::new(127, 0, 0, 2);
     let gone = Ipv4Addr::new(127, 0, 0, 3);
     let server = scene.process.at("udp2011");
@@ -186,13 +186,13 @@ fn a_host_that_the_controller_connects_to() {
 fn a_program_that_never_waits() {
     let _alone = alone();
     let process = controller(NOBODY);
-    let mut witnesses = Witnesses::default();
-    witnesses.udp2011(process.at("udp2011"));
-    witnesses.state(process.at("state"));
-    witnesses.asks("command", process.at("command"), b"getlasterror\n", b"0:no error\n");
-    witnesses.asks("modbus", process.at("modbus"), READ_ONE, READ_ONE_ANSWER);
-    witnesses.lap(QUIET);
-    let quiet = witnesses.lap(QUIET);
+    let mut clients = Clients::default();
+    clients.udp2011(process.at("udp2011"));
+    clients.state(process.at("state"));
+    clients.request_answer("command", process.at("command"), b"getlasterror\n", b"0:no error\n");
+    clients.request_answer("modbus", process.at("modbus"), READ_ONE, READ_ONE_ANSWER);
+    clients.measure(QUIET);
+    let quiet = clients.measure(QUIET);
     let mut command = connect(process.at("command"));
     let mut ask = |request: &[u8], answer: &[u8]| {
         command.write_all(request).unwrap();
@@ -201,13 +201,13 @@ fn a_program_that_never_waits() {
         assert_eq!(String::from_utf8_lossy(&got), String::from_utf8_lossy(answer));
     };
     ask(b"run(busy.jspf)\n", b"run start");
-    in_some_stretch(|| {
-        let lap = witnesses.lap(ATTACK);
-        println!("quiet {quiet}\nbusy  {lap}");
-        lap.is_like(&quiet).and(lap.waits_at_most(Duration::from_millis(150)))
+    in_one_of_several_tries(|| {
+        let measure = clients.measure(ATTACK);
+        println!("quiet {quiet}\nbusy  {measure}");
+        measure.is_like(&quiet).and(measure.waits_at_most(Duration::from_millis(150)))
     });
     ask(b"state\n", b"6:2:5:2");
     ask(b"stop\n", b"stop success");
-    drop(witnesses);
+    drop(clients);
     process.end();
 }

@@ -6,14 +6,14 @@ use std::time::Duration;
 use recipe_test_kit::{HostSim, free_servers};
 
 use crate::attack::{self, Attack, Hold, Ports};
+use crate::clients::Clients;
 use crate::process::host_sim;
-use crate::witness::Witnesses;
 use crate::{Scene, alone};
 
 /// A gateway with ports of every kind, and its controller, which connects to it.
 pub(crate) fn gateway(arguments: &[&str]) -> (HostSim, HostSim) {
     let given = |key: &str| arguments.iter().any(|argument| argument.contains(key));
-    // The controller's other servers have to be there before the gateway is.
+    // The controller's other servers have to run before the gateway.
     let mut command = host_sim("controller", "../../configs/client-controller.toml");
     let free = free_servers();
     let ways = reserve();
@@ -39,12 +39,12 @@ pub(crate) fn gateway(arguments: &[&str]) -> (HostSim, HostSim) {
 }
 
 /// A device at the first line and one on the bus.
-pub(crate) fn devices(process: &HostSim, witnesses: &mut Witnesses) {
-    witnesses.field("field", process.at("ports/rs485-1"), &[0xFF, 0xFF, 1, 0xEE, 0xEE], 28, &[0xFF, 0xFF]);
-    witnesses.slcan("can", process.at("ports/can-1"), b"t0028");
+pub(crate) fn devices(process: &HostSim, clients: &mut Clients) {
+    clients.field("field", process.at("ports/rs485-1"), &[0xFF, 0xFF, 1, 0xEE, 0xEE], 28, &[0xFF, 0xFF]);
+    clients.slcan("can", process.at("ports/can-1"), b"t0028");
 }
 
-/// A bit of everything.
+/// Some of each attack.
 pub(crate) fn everything(process: &HostSim) -> Vec<Attack> {
     vec![
         attack::scan(process.at("ports/up")),
@@ -59,16 +59,16 @@ pub(crate) fn everything(process: &HostSim) -> Vec<Attack> {
 fn cell(arguments: &[&str]) -> (Scene, HostSim) {
     let alone = alone();
     let (process, robot) = gateway(arguments);
-    let mut witnesses = Witnesses::default();
-    devices(&process, &mut witnesses);
-    (Scene::new(alone, process, witnesses), robot)
+    let mut clients = Clients::default();
+    devices(&process, &mut clients);
+    (Scene::new(alone, process, clients), robot)
 }
 
 const OWN: Ipv4Addr = Ipv4Addr::new(127, 0, 0, 77);
 
-/// Two places that are free and stay so until somebody listens there.
+/// Two addresses that stay free until someone listens there.
 fn reserve() -> [SocketAddr; 2] {
-    // An address of its own: no connection is given the port meanwhile.
+    // A separate loopback address: no connection is given the port meanwhile.
     [(), ()].map(|()| std::net::TcpListener::bind((OWN, 0)).unwrap().local_addr().unwrap())
 }
 
@@ -132,7 +132,7 @@ fn a_byte_now_and_then() {
 fn datagrams_of_strangers() {
     let (scene, _robot) = cell(&["--set=port.up.bus=udp-listen"]);
     let up = scene.process.at("ports/up");
-    // A frame as the controller sends it, and others.
+    // A frame that the controller could send, and others.
     let frame: &[u8] = &[[0xFF; 2].as_slice(), &[0x41; 24], &[0xFE; 2]].concat().leak()[..];
     let kinds: &[&[u8]] = Vec::from([frame, b"?", b"", &[0; 2_000]]).leak();
     let stranger = Ipv4Addr::new(127, 0, 0, 2);

@@ -1,5 +1,4 @@
-//! What a process does at the limits of what it was given: descriptors, a reader of its output, places for
-//! clients.
+//! A process at its limits: no descriptors left, output that nobody reads, as many clients as allowed.
 
 use std::io::Read;
 use std::net::TcpStream;
@@ -9,13 +8,13 @@ use std::time::Duration;
 use recipe_test_kit::HostSim;
 use rustix::process::Signal;
 
+use crate::clients::{Clients, connect};
 use crate::process::{host_sim, usage};
-use crate::witness::{Witnesses, connect};
-use crate::{MOST_GROWTH_KIB, alone, attack, in_some_stretch, within_bounds};
+use crate::{MAX_GROWTH_KIB, alone, attack, in_one_of_several_tries, within_bounds};
 
 const ROBOT: [&str; 2] = ["--bind=rs485=tcp-listen:127.0.0.1:0", "--bind=can=slcan-tcp:127.0.0.1:0"];
 
-/// Whether somebody is served at port 2000.
+/// Whether a client is served at port 2000.
 fn answers(process: &HostSim) -> Option<TcpStream> {
     let mut stream = connect(process.at("command"));
     let mut answer = [0; 7];
@@ -32,18 +31,18 @@ fn out_of_descriptors_those_that_are_in_go_on_and_others_come_when_there_is_room
     command.args(["-c", "ulimit -n 48; exec \"$0\" \"$@\""]).arg(inner.get_program()).args(inner.get_args());
     command.args(ROBOT).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
     let mut process = HostSim::start(&mut command);
-    let mut witnesses = Witnesses::default();
-    witnesses.udp2011(process.at("udp2011"));
-    witnesses.state(process.at("state"));
-    witnesses.lap(Duration::from_millis(100));
-    let quiet = witnesses.lap(Duration::from_millis(500));
+    let mut clients = Clients::default();
+    clients.udp2011(process.at("udp2011"));
+    clients.state(process.at("state"));
+    clients.measure(Duration::from_millis(100));
+    let quiet = clients.measure(Duration::from_millis(500));
     let hoard = attack::hoard(process.at("modbus"), 100);
     process.next_stats(|stats| stats["connections"]["accept_failures"].as_u64() > Some(3));
-    in_some_stretch(|| witnesses.lap(Duration::from_millis(500)).is_like(&quiet));
+    in_one_of_several_tries(|| clients.measure(Duration::from_millis(500)).is_like(&quiet));
     drop(hoard);
     process.next_stats(|stats| stats["modbus"]["open"] == 0);
     assert!(answers(&process).is_some());
-    drop(witnesses);
+    drop(clients);
     process.end_by(Signal::TERM);
     let said = process.all_errors();
     assert!(said.contains("cannot accept a connection"), "{said}");
@@ -54,32 +53,32 @@ fn out_of_descriptors_those_that_are_in_go_on_and_others_come_when_there_is_room
 #[test]
 fn a_reader_that_does_not_read_keeps_nothing_from_going_on() {
     let _alone = alone();
-    // Everything is logged, and neither stdout nor stderr is read.
+    // Everything is logged; neither stdout nor stderr is read.
     let mut command = host_sim("controller", "robot.toml");
     command.args(ROBOT).arg("-vv").stderr(Stdio::piped());
     let file = tempfile::NamedTempFile::new().unwrap();
     command.arg("--ready").arg(file.path());
     let mut process = HostSim::unread(&mut command, file.path());
-    let mut witnesses = Witnesses::default();
-    witnesses.udp2011(process.at("udp2011"));
-    witnesses.state(process.at("state"));
-    witnesses.asks("command", process.at("command"), b"state\n", b"6:0:5:2");
-    let quiet = witnesses.lap(Duration::from_millis(500));
-    // Two lines of the log for each connection fill pipes and queues soon.
+    let mut clients = Clients::default();
+    clients.udp2011(process.at("udp2011"));
+    clients.state(process.at("state"));
+    clients.request_answer("command", process.at("command"), b"state\n", b"6:0:5:2");
+    let quiet = clients.measure(Duration::from_millis(500));
+    // Two lines per connection soon fill pipes and queues.
     let scan = attack::scan(process.at("command"));
     while scan.done() < 1_000 {
-        witnesses.lap(Duration::from_millis(50));
+        clients.measure(Duration::from_millis(50));
     }
-    in_some_stretch(|| witnesses.lap(Duration::from_millis(500)).is_like(&quiet));
+    in_one_of_several_tries(|| clients.measure(Duration::from_millis(500)).is_like(&quiet));
     drop(scan);
-    in_some_stretch(|| {
+    in_one_of_several_tries(|| {
         let before = usage(&process);
-        witnesses.lap(Duration::from_millis(500));
+        clients.measure(Duration::from_millis(500));
         let after = usage(&process);
         within_bounds(&after);
-        let flat = after.rss_kib <= before.rss_kib + MOST_GROWTH_KIB;
+        let flat = after.rss_kib <= before.rss_kib + MAX_GROWTH_KIB;
         if flat { Ok(()) } else { Err(format!("{before:?} grew to {after:?}")) }
     });
-    drop(witnesses);
+    drop(clients);
     process.end_by(Signal::INT);
 }

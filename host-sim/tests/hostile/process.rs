@@ -1,11 +1,11 @@
-//! A `host-sim` process, and what the system says of it.
+//! A `host-sim` process, and its use of resources.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use recipe_test_kit::{Binary, HostSim};
 
-/// What a process holds.
+/// Resources that a process holds.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Usage {
     /// Resident memory.
@@ -14,12 +14,12 @@ pub(crate) struct Usage {
     pub(crate) threads: u64,
 }
 
-/// `host-sim KIND -c FILE` with statistics, ready to be given more.
+/// A command for `host-sim KIND -c FILE` with statistics, to which arguments can be added.
 pub(crate) fn host_sim(kind: &str, file: &str) -> Command {
     let here = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/hostile");
     let mut command = Binary(env!("CARGO_BIN_EXE_host-sim")).command();
     command.args([kind, "--stats", "20ms", "-c"]).arg(here.join(file));
-    // What attacks make it say is not for a person.
+    // Attacks fill the log.
     command.stderr(Stdio::null());
     command
 }

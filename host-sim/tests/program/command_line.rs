@@ -1,4 +1,4 @@
-//! The binary as a person or a script meets it: texts, exit codes, pipes.
+//! The command line: texts, exit codes, pipes.
 
 use std::io::Write;
 use std::process::{Output, Stdio};
@@ -9,7 +9,7 @@ use super::BINARY;
 
 fn host_sim(args: &[&str], stdin: &str) -> Output {
     let mut child = BINARY.command().args(args).stdin(Stdio::piped()).spawn().unwrap();
-    // Refused arguments leave nobody to read this; that is the test's business, not a failure here.
+    // If the arguments are refused, nobody reads this; the test checks the exit code.
     let _ = child.stdin.take().unwrap().write_all(stdin.as_bytes());
     child.wait_with_output().unwrap()
 }
@@ -21,7 +21,7 @@ fn ok(args: &[&str], stdin: &str) -> String {
     String::from_utf8(output.stdout).unwrap()
 }
 
-/// Exit code 2, nothing on stdout; what stderr says.
+/// Checks for exit code 2 and an empty stdout; returns stderr.
 #[track_caller]
 fn refused(args: &[&str]) -> String {
     let output = host_sim(args, "");
@@ -35,7 +35,7 @@ fn path(name: &str) -> String {
     example(name).to_str().unwrap().to_owned()
 }
 
-/// What `check` prints below the file's name.
+/// The output of `check` below the file's name.
 #[track_caller]
 fn checked(name: &str, more: &[&str]) -> String {
     let report = ok(&[&["check", &path(name)], more].concat(), "");
@@ -114,13 +114,13 @@ fn an_image_is_what_a_board_takes() {
     let image = image.to_str().unwrap();
     let file = path("force-sensor.toml");
     let set = "controller.address=10.0.2.2";
-    let said = ok(&["image", &file, "--set", set, "-o", image], "");
+    let output = ok(&["image", &file, "--set", set, "-o", image], "");
     let bytes = std::fs::read(image).unwrap();
-    assert_eq!(said, format!("{image}: {} bytes, version 2\n", bytes.len()));
+    assert_eq!(output, format!("{image}: {} bytes, version 2\n", bytes.len()));
     let config = proto_core::config::image::decode(&bytes).unwrap();
     assert_eq!(config.controller.address, "10.0.2.2");
     assert_eq!(config.ports[0].name, "force");
-    // Of a wrong file there is no image.
+    // No image is made of an invalid file.
     std::fs::remove_file(image).unwrap();
     refused(&["image", &file, "--set", "port.force.cycle_ms=3", "-o", image]);
     refused(&["image", &path("force-sensor-controller.toml"), "-o", image]);
@@ -142,40 +142,43 @@ fn an_image_replaces_nothing_but_images() {
     std::fs::copy(example("rs485-system.toml"), &file).unwrap();
     let toml = std::fs::read(&file).unwrap();
 
-    // What it is made of is never lost, by whatever name and whatever is said.
+    // The input file is never replaced, by any name and with any option.
     std::os::unix::fs::symlink(&file, at("link")).unwrap();
     for output in [&file, &at("link")] {
         for force in [&["--force"][..], &[]] {
-            let said = refused(&[&["image", &file, "-o", output], force].concat());
+            let message = refused(&[&["image", &file, "-o", output], force].concat());
             assert!(
-                said.starts_with(&format!("{output}: this is the file that the image is made from")),
-                "{said}"
+                message.starts_with(&format!("{output}: this is the file that the image is made from")),
+                "{message}"
             );
-            assert_eq!(said.lines().count(), 1);
+            assert_eq!(message.lines().count(), 1);
         }
     }
-    // Others only when it is said.
+    // Other files are replaced only with --force.
     std::fs::write(&image, "precious").unwrap();
-    let said = refused(&["image", &file, "-o", &image]);
-    assert!(said.contains("this file exists and is not an image; give another name or --force"), "{said}");
+    let message = refused(&["image", &file, "-o", &image]);
+    assert!(
+        message.contains("this file exists and is not an image; give another name or --force"),
+        "{message}"
+    );
     assert_eq!(std::fs::read(&image).unwrap(), b"precious");
     ok(&["image", &file, "-o", &image, "--force"], "");
     let first = std::fs::read(&image).unwrap();
     assert!(first.starts_with(b"RGCI"));
-    // An image makes room, one of another version too.
+    // An image is replaced, even one of another version.
     std::fs::write(&image, [b"RGCI", &[0; 30][..]].concat()).unwrap();
     ok(&["image", &file, "-o", &image], "");
     assert_eq!(std::fs::read(&image).unwrap(), first);
 
     std::fs::create_dir(at("folder")).unwrap();
-    let said = refused(&["image", &file, "-o", &at("folder"), "--force"]);
-    assert!(said.contains("a folder; give the name of a file in it"), "{said}");
+    let message = refused(&["image", &file, "-o", &at("folder"), "--force"]);
+    assert!(message.contains("a folder; give the name of a file in it"), "{message}");
     std::os::unix::fs::symlink(at("nothing"), at("dangling")).unwrap();
     refused(&["image", &file, "-o", &at("dangling")]);
     refused(&["image", &file, "-o", &at("no-such-folder/cell.img")]);
     assert_eq!(std::fs::read(&file).unwrap(), toml);
     assert_eq!(names(), ["cell.img", "cell.toml", "dangling", "folder", "link"]);
-    // What is no place but passes things on may have it.
+    // The image can be written to a pipe.
     ok(&["image", &file, "-o", "/dev/null"], "");
     assert!(!std::path::Path::new("/dev/null").is_file());
 }
@@ -186,9 +189,9 @@ fn check_shows_a_boards_own_address() {
         ["network.address=192.168.12.20/24", "network.router=192.168.12.1", "network.dns=192.168.12.2"];
     let file = path("rs485-system.toml");
     let arguments = ["check", &file].into_iter().chain(sets.iter().flat_map(|set| ["--set", *set]));
-    let said = ok(&arguments.collect::<Vec<_>>(), "");
+    let output = ok(&arguments.collect::<Vec<_>>(), "");
     let line = "a board's address is 192.168.12.20/24, router 192.168.12.1, name server 192.168.12.2; a host has its own\n";
-    assert!(said.contains(line), "{said}");
+    assert!(output.contains(line), "{output}");
     assert!(!ok(&["check", &file], "").contains("a board's address"));
 }
 
@@ -212,8 +215,8 @@ fn an_image_that_no_board_takes_is_not_written() {
     text += "recipe = \"a-recipe-whose-name-is-long-0\"\n";
     std::fs::write(&file, text).unwrap();
     ok(&["check", file.to_str().unwrap()], "");
-    let said = refused(&["image", file.to_str().unwrap(), "-o", image.to_str().unwrap()]);
-    assert!(said.contains("16384 bytes"), "{said}");
+    let message = refused(&["image", file.to_str().unwrap(), "-o", image.to_str().unwrap()]);
+    assert!(message.contains("16384 bytes"), "{message}");
     assert!(!image.exists());
 }
 

@@ -1,4 +1,4 @@
-//! The program as a person or a script meets it.
+//! The program as users and scripts run it.
 
 mod command_line;
 mod output;

@@ -1,4 +1,4 @@
-//! Every command's output where it cannot be written: on a disk that is full, to a reader that had enough.
+//! Every command with output that cannot be written: to a full disk, or to a reader that closes the pipe.
 
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
@@ -14,7 +14,7 @@ use rustix::process::{Pid, Signal, kill_process};
 
 use super::BINARY;
 
-/// One command line of each command, everything it makes in `folder`.
+/// A command line for each command; everything it makes is in `folder`.
 fn command_lines(folder: &Path) -> Vec<Vec<String>> {
     let config = |name: &str| example(name).to_str().unwrap().to_owned();
     let at = |name: &str| folder.join(name).to_str().unwrap().to_owned();
@@ -47,7 +47,7 @@ fn command_lines(folder: &Path) -> Vec<Vec<String>> {
     ]
 }
 
-/// Whether it says `ready` and prints statistics until it is told to end.
+/// Whether it prints `ready` and statistics until a signal ends it.
 fn runs_on(line: &[String]) -> bool {
     line.first().is_some_and(|command| command == "controller" || command == "gateway")
 }
@@ -56,13 +56,13 @@ fn runs_on(line: &[String]) -> bool {
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum To {
     FullDisk,
-    /// Nobody reads.
+    /// A pipe without a reader.
     Nobody,
     /// `head -1`.
     Head,
 }
 
-/// The exit code, and what it said on stderr.
+/// The exit code, and stderr.
 #[track_caller]
 fn outcome(line: &[String], to: To, folder: &Path) -> (Option<i32>, String) {
     let mut command = Command::new(BINARY.0);
@@ -79,7 +79,7 @@ fn outcome(line: &[String], to: To, folder: &Path) -> (Option<i32>, String) {
         }
     };
     let mut child = command.spawn().unwrap();
-    // The other end of the pipe is the child's alone.
+    // Only the child keeps the other end of the pipe.
     drop(command);
     if let Some(reader) = reader {
         let mut first = String::new();
@@ -87,14 +87,14 @@ fn outcome(line: &[String], to: To, folder: &Path) -> (Option<i32>, String) {
         assert!(!first.is_empty(), "{line:?} says something");
     }
     let status = ended(&mut child, PATIENCE);
-    let mut said = String::new();
-    child.stderr.take().unwrap().read_to_string(&mut said).unwrap();
-    (status.code(), said)
+    let mut output = String::new();
+    child.stderr.take().unwrap().read_to_string(&mut output).unwrap();
+    (status.code(), output)
 }
 
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// What is in the folder, but for what `image` is told to make.
+/// The folder's content, without the output of `image`.
 fn left_behind(folder: &Path) -> Vec<PathBuf> {
     let names = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path());
     names.filter(|path| path.file_name().unwrap() != "cell.img").collect()
@@ -113,9 +113,9 @@ fn every_command_is_tried() {
 fn what_cannot_be_written_is_one_message_and_exit_code_1() {
     let folder = tempfile::tempdir().unwrap();
     for line in command_lines(folder.path()) {
-        let (code, said) = outcome(&line, To::FullDisk, folder.path());
+        let (code, output) = outcome(&line, To::FullDisk, folder.path());
         assert_eq!(
-            (code, said.as_str()),
+            (code, output.as_str()),
             (Some(1), "stdout: No space left on device (os error 28)\n"),
             "{line:?}"
         );
@@ -128,13 +128,13 @@ fn a_reader_that_had_enough_ends_a_command_quietly() {
     let folder = tempfile::tempdir().unwrap();
     for line in command_lines(folder.path()) {
         for to in [To::Nobody, To::Head] {
-            let (code, said) = outcome(&line, to, folder.path());
+            let (code, output) = outcome(&line, to, folder.path());
             let why = if runs_on(&line) {
                 "stdout was closed; ended, because nobody reads the statistics\n"
             } else {
                 ""
             };
-            assert_eq!((code, said.as_str()), (Some(0), why), "{line:?} to {to:?}");
+            assert_eq!((code, output.as_str()), (Some(0), why), "{line:?} to {to:?}");
             assert_eq!(left_behind(folder.path()), [""; 0].map(PathBuf::from), "{line:?} to {to:?}");
         }
     }
@@ -160,7 +160,7 @@ fn a_disk_that_fills_up_later_costs_statistics_and_does_not_end_a_gateway() {
     let folder = tempfile::tempdir().unwrap();
     let lines = command_lines(folder.path());
     let gateway = lines.iter().find(|line| line.first().is_some_and(|command| command == "gateway")).unwrap();
-    // Files of a few kilobytes: room for the ready line and not for many others.
+    // A file size limit of a few kilobytes: room for the ready line, but not for many others.
     let limited = ["--ignore-signal=XFSZ", "sh", "-c", "ulimit -f 8; exec \"$0\" \"$@\""];
     let mut command = Command::new("env");
     command.args(limited).arg(BINARY.0).args(gateway).stdin(Stdio::null());
@@ -169,13 +169,13 @@ fn a_disk_that_fills_up_later_costs_statistics_and_does_not_end_a_gateway() {
     let stderr = BufReader::new(child.stderr.take().unwrap());
     let (sender, lines) = channel();
     std::thread::spawn(move || stderr.lines().map_while(Result::ok).try_for_each(|line| sender.send(line)));
-    let said = lines.recv_timeout(PATIENCE).unwrap_or_else(|_| {
+    let output = lines.recv_timeout(PATIENCE).unwrap_or_else(|_| {
         child.kill().unwrap();
         panic!("nothing is said")
     });
-    assert!(said.contains("cannot write statistics to stdout"), "{said}");
+    assert!(output.contains("cannot write statistics to stdout"), "{output}");
     assert!(std::fs::read_to_string(&log).unwrap().starts_with("ready {"));
-    // It runs on, and says so only once.
+    // It keeps running, and reports the error once.
     assert!(folder.path().join("ready.json").exists() && folder.path().join("line").exists());
     kill_process(Pid::from_child(&child), Signal::TERM).unwrap();
     assert_eq!(child.wait().unwrap().code(), Some(0));

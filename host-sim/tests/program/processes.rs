@@ -1,4 +1,4 @@
-//! The program as a person or a script runs it: real processes, real signals.
+//! The program as users and scripts run it: real processes, real signals.
 
 use std::os::fd::OwnedFd;
 use std::os::unix::ffi::OsStrExt;
@@ -84,7 +84,7 @@ fn a_gateway_and_a_controller_find_each_other_and_end_cleanly() {
     assert_eq!(stats["ports"]["rs485-1"]["resync_bytes"], 1);
     robot.next_stats(|stats| stats["registers"]["DigitalOutputCommand[1]"].as_f64() == Some(5.0));
 
-    // The controller goes away and comes back on the same ports.
+    // The controller ends and is started again on the same ports.
     let ports = SERVERS.map(|name| format!("--set=listen.{name}={}", robot.at(name).port()));
     robot.ended_by(Signal::TERM);
     assert!(!robot_ready.exists(), "nothing says ready that is not");
@@ -107,7 +107,7 @@ fn a_gateway_and_a_controller_find_each_other_and_end_cleanly() {
     robot.ended_by(Signal::INT);
 }
 
-/// `gateway` with a pseudoterminal at `line`; its controller is nowhere.
+/// `gateway` with a pseudoterminal at `line`, without a controller.
 fn gateway(line: &Path) -> Command {
     gateway_of(&example("rs485-system.toml"), line)
 }
@@ -119,7 +119,7 @@ fn gateway_of(file: &Path, line: &Path) -> Command {
     command
 }
 
-/// Exit code 2 and one line on stderr, which is returned.
+/// Checks for exit code 2 and one line on stderr, and returns the line.
 #[track_caller]
 fn refused(command: &mut Command) -> String {
     let mut child = command.spawn().unwrap();
@@ -145,20 +145,20 @@ fn a_ready_file_costs_nobody_anything() {
     assert_eq!(std::fs::read(&file).unwrap(), toml);
     assert_eq!(names(folder.path()), ["cell.toml", "folder"], "nothing was started");
 
-    // What a killed run left is replaced; what somebody put there since is not removed.
+    // A link that a killed run has left is replaced; another file in its place is not removed.
     let mut first = HostSim::start(gateway(&line).arg("--ready").arg(&ready));
     first.kill();
     assert!(ready.exists());
     let second = HostSim::start(gateway(&line).arg("--ready").arg(&ready));
-    let said: Value = serde_json::from_str(&std::fs::read_to_string(&ready).unwrap()).unwrap();
-    assert_eq!(said, second.ready);
+    let output: Value = serde_json::from_str(&std::fs::read_to_string(&ready).unwrap()).unwrap();
+    assert_eq!(output, second.ready);
     std::fs::write(&ready, "somebody's").unwrap();
     second.ended_by(Signal::TERM);
     assert_eq!(std::fs::read_to_string(&ready).unwrap(), "somebody's");
     assert_eq!(names(folder.path()), ["cell.toml", "folder", "ready.json"]);
 }
 
-/// The same program, started with or without hearing SIGHUP, whatever the tests were started with.
+/// The same command, started with SIGHUP ignored or not, however the tests were started.
 fn under(hang_up: &str, command: &Command) -> Command {
     let mut env = Command::new("env");
     env.args(["--default-signal=INT", &format!("--{hang_up}-signal=HUP")]).arg(command.get_program());
@@ -185,7 +185,7 @@ fn a_line_that_another_program_uses_is_not_taken_away() {
     assert!(message.contains(&holder), "{message}");
     assert_eq!(std::fs::read_link(&line).unwrap(), leads_to);
 
-    // Killed, it leaves a link to a terminal whose number the next program may get, here this test.
+    // A killed process leaves a link to a terminal whose number another process may get; here this test.
     first.kill();
     assert_eq!(std::fs::read_link(&line).unwrap(), leads_to);
     let (number, foreign) = terminal_called(&leads_to);
@@ -193,7 +193,7 @@ fn a_line_that_another_program_uses_is_not_taken_away() {
     HostSim::start(&mut gateway(&line)).ended_by(Signal::TERM);
     assert_eq!(names(folder.path()), [""; 0]);
 
-    // The same link made by that program is in use.
+    // The same link is in use if that process made it.
     std::os::unix::fs::symlink(&leads_to, &line).unwrap();
     let message = refused(&mut gateway(&line));
     assert!(
@@ -208,12 +208,12 @@ fn a_line_that_another_program_uses_is_not_taken_away() {
     assert_eq!(names(folder.path()), [""; 0]);
 }
 
-/// A pseudoterminal that is called so, and others that were in its way.
+/// A pseudoterminal with this name, and others that were opened to get it.
 fn terminal_called(name: &Path) -> (OwnedFd, Vec<OwnedFd>) {
     let deadline = Instant::now() + PATIENCE;
     loop {
         let mut others = Vec::new();
-        // The system gives away the lowest number that is free. Another test may have this one for a while.
+        // The kernel assigns the lowest free number. Another test may have this one for a while.
         for _ in 0..64 {
             let master = rustix::pty::openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC);
             let master = master.unwrap();
@@ -244,7 +244,7 @@ fn a_terminal_that_is_closed_ends_a_run_cleanly_unless_it_is_to_outlive_it() {
         let under_nohup = HostSim::start(&mut under("ignore", &command));
         under_nohup.signal(Signal::HUP);
         under_nohup.skip_lines();
-        // More than it could say while it ended.
+        // More than it could write while ending.
         (0..20).for_each(|_| drop(under_nohup.line()));
         assert!(line.exists() && ready.exists(), "{command:?}");
         under_nohup.ended_by(Signal::TERM);
@@ -257,7 +257,7 @@ fn a_demo_that_is_interrupted_leaves_nothing_behind() {
     for (signal, code) in [(Signal::HUP, 129), (Signal::INT, 130), (Signal::TERM, 143)] {
         let folder = tempfile::tempdir().unwrap();
         let deadline = Instant::now() + PATIENCE;
-        // It may be over before anybody looks; then another one is.
+        // It may have ended already; then another one is tried.
         while interrupted_demo(folder.path(), signal) != Some(code) {
             assert!(Instant::now() < deadline, "{signal:?}");
         }
@@ -265,7 +265,7 @@ fn a_demo_that_is_interrupted_leaves_nothing_behind() {
     }
 }
 
-/// Sends a demo the signal as soon as its first device is there; how it ended.
+/// Sends a demo the signal as soon as its first device exists; returns how it ended.
 fn interrupted_demo(folder: &Path, signal: Signal) -> Option<i32> {
     let mut command = BINARY.command();
     command.arg("demo");
@@ -291,7 +291,7 @@ fn what_runs_long_and_leaves_nothing_ends_when_it_is_interrupted() {
     let mut command = BINARY.command();
     command.args(["soak", "--hours", "1000", "--cell", "rs485-system"]);
     let soak = under("default", &command).spawn().unwrap();
-    // Before it listens for the signal, the signal ends it without a word.
+    // Before it handles the signal, the signal ends it without a message.
     until("a signal that is caught", || has_signal(&soak, "SigCgt:", 2).then_some(()));
     send(Signal::INT, &soak);
     let output = soak.wait_with_output().unwrap();
@@ -302,14 +302,13 @@ fn what_runs_long_and_leaves_nothing_ends_when_it_is_interrupted() {
     let mut command = BINARY.command();
     command.args(["decode", "--part", "input"]).arg(example("rs485-system.toml"));
     let mut decode = under("default", &command).stdin(Stdio::piped()).spawn().unwrap();
-    // What started the tests may ignore it, and so does a child until its disposition is set.
+    // The tests may have been started with the signal ignored, and a child inherits that until it sets a handler.
     until("a signal that is heard", || (!has_signal(&decode, "SigIgn:", 2)).then_some(()));
     send(Signal::INT, &decode);
     assert_eq!(decode.wait().unwrap().signal(), Some(2));
 }
 
-/// Whether a process has the signal of this number in a set of `/proc/PID/status`: those it catches,
-/// those it ignores.
+/// Whether a signal is in a set of `/proc/PID/status`, such as those caught or ignored.
 fn has_signal(child: &Child, set: &str, signal: u32) -> bool {
     let status = std::fs::read_to_string(format!("/proc/{}/status", child.id())).unwrap();
     let set = status.lines().find_map(|line| line.strip_prefix(set)).unwrap();
@@ -363,7 +362,7 @@ fn what_a_device_said_while_the_gateway_was_stopped_never_reaches_the_controller
     robot.ended_by(Signal::TERM);
 }
 
-/// Longer than a gateway may be away without having slept.
+/// Longer than a stall that does not count as sleep.
 const STOPPED: Duration = Duration::from_millis(800);
 
 #[test]

@@ -1,4 +1,4 @@
-//! `host-sim soak`: what goes wrong can be repeated; what it says.
+//! `host-sim soak`: its output, and the replay of a failed run.
 
 use std::process::Output;
 
@@ -15,7 +15,7 @@ fn text(output: &Output, code: i32) -> String {
     text
 }
 
-/// The table's shape: numbers mean what they mean elsewhere.
+/// The text with numbers replaced, since other tests check them.
 fn shape(text: &str) -> String {
     let lines = text.lines().map(|line| {
         let words = line.split(' ').map(|word| {

@@ -1,4 +1,4 @@
-//! What boards have in common that are emulated: an image of the configuration, a log, QEMU's user network.
+//! What emulated boards have in common: a configuration image, a log, QEMU's user network.
 
 use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader, Write};
@@ -15,9 +15,9 @@ use serde_json::{Value, json};
 use super::environment::{Cable, Gateway, Link, LinkStatus, Plan, PortStatus};
 use super::field::{CanClient, LineClient};
 use super::program::Program;
-use super::refusal::Spoil;
+use super::refusal::Defect;
 
-/// The host as QEMU's guest sees it.
+/// The host's address for QEMU's guest.
 const HOST: &str = "10.0.2.2";
 /// The log's line about the guest's address, which is QEMU's first.
 const ADDRESS: &str = "address 10.0.2.15";
@@ -42,36 +42,36 @@ pub(crate) fn make_image(plan: &Plan<'_>) -> PathBuf {
     image
 }
 
-/// The same, with something wrong.
+/// Same, with a defect.
 #[track_caller]
-pub(crate) fn make_spoilt_image(plan: &Plan<'_>, spoil: Spoil) -> PathBuf {
+pub(crate) fn make_defective_image(plan: &Plan<'_>, defect: Defect) -> PathBuf {
     let image = make_image(plan);
     let mut bytes = std::fs::read(&image).unwrap();
-    match spoil {
-        Spoil::Damaged => bytes[40] ^= 1,
-        Spoil::Cut => bytes.truncate(bytes.len() - 1),
-        Spoil::Missing => {
+    match defect {
+        Defect::Damaged => bytes[40] ^= 1,
+        Defect::Cut => bytes.truncate(bytes.len() - 1),
+        Defect::Missing => {
             std::fs::remove_file(&image).unwrap();
             return image;
         }
-        Spoil::NoDevice => {}
+        Defect::NoDevice => {}
     }
     std::fs::write(&image, bytes).unwrap();
     image
 }
 
-/// How the host reaches a board: sockets in a folder of its own, since those of one that was ended stay
-/// behind, and what the user network forwards.
+/// How the host reaches a board: sockets, in a new folder since an ended board leaves its own behind, and
+/// forwarded ports of the user network.
 pub(crate) struct Wires {
     pub(crate) folder: PathBuf,
     /// The sockets of the field ports, by name.
     ports: BTreeMap<String, &'static str>,
-    /// Listening ports by name.
+    /// Addresses of the listening ports, by name.
     listens: BTreeMap<String, SocketAddr>,
 }
 
 impl Wires {
-    /// The file's RS-485 ports and CAN ports get these sockets, in their order.
+    /// Gives the file's RS-485 and CAN ports these sockets, in order.
     pub(crate) fn new(
         plan: &Plan<'_>,
         config: &GatewayConfig,
@@ -92,9 +92,9 @@ impl Wires {
         Self { folder, ports, listens: BTreeMap::new() }
     }
 
-    /// Asks the QEMU whose socket this is what it forwards.
+    /// Reads the forwarded ports from QEMU, by its QMP socket.
     #[track_caller]
-    pub(crate) fn ask_forwarded(&mut self, config: &GatewayConfig, socket: &str) {
+    pub(crate) fn read_forwarded(&mut self, config: &GatewayConfig, socket: &str) {
         self.listens = forwarded(config, &self.folder.join(socket)).into_iter().collect();
     }
 
@@ -124,7 +124,7 @@ impl Wires {
     }
 }
 
-/// What runs a board's firmware: a gateway that says what it does in its log.
+/// An emulator that runs a board's firmware. Its state is read from the log.
 pub(crate) trait Machine {
     fn program(&self) -> &Program;
 
@@ -132,18 +132,18 @@ pub(crate) trait Machine {
 
     fn wires(&self) -> &Wires;
 
-    /// What the firmware said so far.
+    /// The firmware's log so far.
     fn log(&self) -> String;
 
     fn cable(&self, cable: Cable);
 
-    /// Stops the board where it is.
+    /// Stops the board.
     fn stop(&self);
 
-    /// Lets it go on.
+    /// Continues it.
     fn go_on(&self);
 
-    /// Writes what is in the memory of the board's stack to a file.
+    /// Writes the memory of the board's stack to a file.
     fn save_stack(&self, to: &Path);
 
     /// Waits for a whole line of the log with this text, and returns what follows it in the line.
@@ -225,7 +225,7 @@ impl<M: Machine> Gateway for M {
         self.program().processor_time()
     }
 
-    /// Its stack, which is painted before it is used; everything else is static.
+    /// The used part of its stack, which is painted at start; everything else is static.
     #[track_caller]
     fn memory(&self) -> u64 {
         let path = self.wires().folder.join("memory");
@@ -244,13 +244,13 @@ impl<M: Machine> Gateway for M {
     }
 }
 
-/// Options of the user network that let the host reach the listening ports.
+/// Options of the user network that forward the listening ports.
 pub(crate) fn forwards(config: &GatewayConfig) -> Vec<String> {
     let inside = config.ports.iter().filter_map(|port| forward(&port.bus));
     inside.map(|(kind, at)| format!("hostfwd={kind}:127.0.0.1:0-:{at}")).collect()
 }
 
-/// Kind and number of a listening port.
+/// Protocol and number of a listening port.
 fn forward(bus: &Bus) -> Option<(&'static str, u16)> {
     let (kind, listen) = match bus {
         Bus::TcpListen { listen } => ("tcp", listen),
@@ -260,7 +260,7 @@ fn forward(bus: &Bus) -> Option<(&'static str, u16)> {
     Some((kind, listen.parse::<SocketAddr>().unwrap().port()))
 }
 
-/// Listening ports by name, as the host reaches them; asked of the QEMU whose socket this is.
+/// The forwarded listening ports by name, read from QEMU by its QMP socket.
 #[track_caller]
 fn forwarded(config: &GatewayConfig, socket: &Path) -> Vec<(String, SocketAddr)> {
     let table = qmp(socket, "human-monitor-command", json!({ "command-line": "info usernet" }));
@@ -278,7 +278,7 @@ fn forwarded(config: &GatewayConfig, socket: &Path) -> Vec<(String, SocketAddr)>
     ports.filter_map(|port| Some((port.name.as_str().to_owned(), place(forward(&port.bus)?)))).collect()
 }
 
-/// One command to QEMU; what it returns.
+/// Sends a command to QEMU; returns the result.
 #[track_caller]
 pub(crate) fn qmp(socket: &Path, command: &str, arguments: Value) -> Value {
     let mut stream = UnixStream::connect(socket).unwrap();
@@ -287,7 +287,7 @@ pub(crate) fn qmp(socket: &Path, command: &str, arguments: Value) -> Value {
     let mut answer = Value::Null;
     for (command, arguments) in [("qmp_capabilities", json!({})), (command, arguments)] {
         writeln!(stream, "{}", json!({ "execute": command, "arguments": arguments })).unwrap();
-        // Events come between, and the greeting of a connection that was closed at once.
+        // Skip events and the greeting.
         answer = loop {
             let line: Value = serde_json::from_str(&lines.next().unwrap().unwrap()).unwrap();
             if line.get("event").is_none() && line.get("QMP").is_none() {
@@ -310,9 +310,10 @@ fn link_status(log: &str, link: Link<'_>) -> LinkStatus {
     };
     let mut status = LinkStatus::default();
     for line in log.lines() {
-        let Some((_, said)) = line.split_once(&format!("link {name}: ")) else { continue };
-        status.is_up = said.starts_with("up");
-        if let Some(count) = said.strip_prefix("up (").and_then(|rest| rest.trim_end().strip_suffix(')')) {
+        let Some((_, to_server)) = line.split_once(&format!("link {name}: ")) else { continue };
+        status.is_up = to_server.starts_with("up");
+        if let Some(count) = to_server.strip_prefix("up (").and_then(|rest| rest.trim_end().strip_suffix(')'))
+        {
             status.connects = count.parse().unwrap();
         }
     }
@@ -322,12 +323,12 @@ fn link_status(log: &str, link: Link<'_>) -> LinkStatus {
 /// From the newest line `port NAME: in FRAMES frames, BYTES bytes; out ...` of a log.
 fn port_status(log: &str, name: &str) -> PortStatus {
     let start = format!("port {name}: in ");
-    // The newest line may not be whole yet.
+    // The newest line may be incomplete.
     let whole = log.split_inclusive('\n').filter(|line| line.ends_with('\n'));
-    let Some(said) = whole.filter_map(|line| line.split_once(&start)).next_back() else {
+    let Some(to_server) = whole.filter_map(|line| line.split_once(&start)).next_back() else {
         return PortStatus::default();
     };
-    let mut numbers = said.1.split_whitespace().filter_map(|word| word.parse().ok());
+    let mut numbers = to_server.1.split_whitespace().filter_map(|word| word.parse().ok());
     let mut next = || numbers.next().unwrap_or(0);
     PortStatus {
         frames_in: next(),
@@ -339,13 +340,13 @@ fn port_status(log: &str, name: &str) -> PortStatus {
     }
 }
 
-/// The address that a log tells.
+/// The address in a log.
 fn own_address(log: &str) -> Option<String> {
-    let (_, said) = log.rsplit_once(" address ")?;
-    said.split_whitespace().next().map(str::to_owned)
+    let (_, to_server) = log.rsplit_once(" address ")?;
+    to_server.split_whitespace().next().map(str::to_owned)
 }
 
-/// How much of a stack was used: all but its painted lower end.
+/// Number of used bytes of a stack: all but the painted ones at its lower end.
 #[track_caller]
 fn stack_used(memory: &Path) -> u64 {
     let memory = std::fs::read(memory).unwrap();

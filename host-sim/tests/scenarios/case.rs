@@ -12,19 +12,19 @@ use super::namespace::Namespace;
 use super::program::Running;
 use super::robot::{Robot, RobotPlan};
 
-/// How long a scenario may take.
+/// The time limit of a scenario.
 const LIMIT: Duration = Duration::from_secs(90);
-/// Lines of each log that are shown of a case that failed.
+/// Number of lines of each log that are shown if a case fails.
 const SHOWN: usize = 12;
 
-/// What is to be shown, whoever the gateway is.
+/// A scenario, for every environment.
 pub(crate) struct Scenario {
     pub(crate) name: &'static str,
     run: fn(&Case),
     limit: Duration,
     is_alone: bool,
     pub(crate) has_true_cable: bool,
-    /// Only where a gateway can notice that it was stopped.
+    /// It needs a gateway that can notice that it was stopped.
     pub(crate) is_of_sleep: bool,
 }
 
@@ -33,12 +33,12 @@ impl Scenario {
         Self { name, run, limit: LIMIT, is_alone: false, has_true_cable: false, is_of_sleep: false }
     }
 
-    /// It takes so long, beside what every scenario takes.
+    /// It takes this long in addition to the usual time.
     pub(crate) fn lasting(self, time: Duration) -> Self {
         Self { limit: LIMIT + time, ..self }
     }
 
-    /// It pulls the cable, and nobody may acknowledge what did not get through.
+    /// It pulls the cable, and nothing may acknowledge what did not get through.
     pub(crate) fn with_true_cable(self) -> Self {
         Self { has_true_cable: true, ..self }
     }
@@ -48,21 +48,21 @@ impl Scenario {
         Self { is_of_sleep: true, ..self }
     }
 
-    /// It measures something, so nothing else runs meanwhile.
+    /// It measures time or load, so no other case runs meanwhile.
     pub(crate) fn alone(self) -> Self {
         Self { is_alone: true, ..self }
     }
 }
 
-/// A scenario under way.
+/// A running scenario.
 pub(crate) struct Case {
     pub(crate) environment: Arc<dyn Environment>,
-    /// For sockets, links and files: a short path, gone afterwards.
+    /// Temporary folder for sockets, links and files, with a short path.
     pub(crate) folder: tempfile::TempDir,
-    /// For what programs say.
+    /// Folder for logs.
     pub(crate) logs: PathBuf,
     pub(crate) running: Running,
-    /// Where its programs are, when not in the network of the tests.
+    /// The network namespace of its programs, if they have one.
     pub(crate) namespace: OnceLock<Arc<Namespace>>,
 }
 
@@ -91,14 +91,14 @@ impl Case {
         Plan::new(self, path)
     }
 
-    /// An example's gateway at this robot, its links up.
+    /// Starts an example's gateway with this controller, and waits for its links.
     #[track_caller]
     pub(crate) fn cell(&self, file: &str, robot: &Robot) -> Box<dyn Gateway> {
         self.gateway(file).robot(robot).start()
     }
 }
 
-/// Runs the scenario on a thread of its own, so that a hang ends with its limit.
+/// Runs the scenario on a separate thread, so that its time limit ends a hang.
 pub(crate) fn run(
     name: &str,
     scenario: &Scenario,
@@ -128,7 +128,7 @@ pub(crate) fn run(
             }
             run(&case);
         }));
-        // Its folder is gone before anybody hears that it ended.
+        // Remove its folder before the end is reported.
         drop(case);
         let _ = done.send(result);
     })?;
@@ -154,15 +154,15 @@ pub(crate) fn run(
     }
 }
 
-/// How each log ends.
+/// The end of each log.
 fn ends_of(logs: &Path) -> String {
     let mut files: Vec<_> = std::fs::read_dir(logs).into_iter().flatten().flatten().collect();
     files.sort_by_key(|file| file.file_name());
     let mut text = String::new();
     for file in files {
-        let said = std::fs::read(file.path()).unwrap_or_default();
-        let said = String::from_utf8_lossy(&said);
-        let lines: Vec<&str> = said.lines().collect();
+        let log = std::fs::read(file.path()).unwrap_or_default();
+        let log = String::from_utf8_lossy(&log);
+        let lines: Vec<&str> = log.lines().collect();
         let end = lines[lines.len().saturating_sub(SHOWN)..].join("\n    ");
         text.push_str(&format!("{}:\n    {end}\n", file.path().display()));
     }

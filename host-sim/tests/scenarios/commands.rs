@@ -28,12 +28,13 @@ pub(crate) fn all() -> Vec<Scenario> {
     ]
 }
 
-/// A panel: an order that acts when it changes, and DO1 to DO8, of which DO8 says that nobody is there.
+/// A gateway for a panel: an order, which sends a command when it changes, and DO1 to DO8. DO8 is the safe
+/// value.
 fn panel() -> String {
     toml::panel(r#"1 = "run(endless.jspf)", 9 = "stop""#, 1_000)
 }
 
-/// A controller with a program that nobody can overlook, once it was started.
+/// A controller with a program that does not end by itself.
 const ENDLESS: &str = r#"
 [listen]
 address = "127.0.0.1"
@@ -54,16 +55,16 @@ const NOTHING: u8 = 0;
 const RUN: u8 = 1;
 const STOP: u8 = 9;
 
-/// What follows a start that was not prevented is there within this time, even on a busy machine.
+/// A start that was not prevented shows within this time, even on a busy machine.
 const WATCHED: Duration = Duration::from_secs(3);
-/// How often a panel says what its switches are.
+/// How often a panel sends its switches.
 const PERIOD: Duration = Duration::from_millis(20);
 
 fn order(order: u8, outputs: u8) -> [u8; 6] {
     [0xFF, 0xFF, order, outputs, 0xEE, 0xEE]
 }
 
-/// The panel's switches stand like this for so long.
+/// The panel sends this frame for some time.
 fn hold(panel: &mut LineClient, frame: &[u8], time: Duration, mut meanwhile: impl FnMut()) {
     let begin = Instant::now();
     while begin.elapsed() < time {
@@ -73,7 +74,7 @@ fn hold(panel: &mut LineClient, frame: &[u8], time: Duration, mut meanwhile: imp
     }
 }
 
-/// An order is given while everything works, and carried out.
+/// Starts the program by an order while everything works.
 #[track_caller]
 fn start(panel: &mut LineClient, gateway: &mut dyn Gateway, robot: &Robot) {
     // The first frame only sets the base.
@@ -88,15 +89,15 @@ fn start(panel: &mut LineClient, gateway: &mut dyn Gateway, robot: &Robot) {
     });
 }
 
-/// A transport tries again after about twice the time that it has tried. What it still holds after a cable
-/// was `out` for 4 s is therefore there within the next 5 s, before the missing reply ends the connection.
+/// A transport retransmits after about twice the time before. What it still holds after a cable was `out` for
+/// 4 s therefore arrives within the next 5 s, before the missing reply ends the connection.
 fn late_start(case: &Case, out: Duration, watched: Duration) {
     const PRESSED: Duration = Duration::from_millis(200);
     let robot = case.robot_of(ENDLESS).start();
     let mut gateway = case.gateway_of(&panel()).robot(&robot).with_cable().start();
     gateway.until_up(Link::Command, 1);
     let mut panel = gateway.line("device");
-    // Known to be there, and the link to be in use.
+    // This also shows that the panel and the command link work.
     start(&mut panel, &mut *gateway, &robot);
     until("the program ends", || {
         panel.send(&order(STOP, 0));
@@ -122,7 +123,7 @@ fn late_start(case: &Case, out: Duration, watched: Duration) {
 
 fn asleep(case: &Case) {
     const STOPPED: Duration = Duration::from_secs(8);
-    /// What the device asks for while nobody listens.
+    /// What the device sends while the gateway is stopped.
     const DO1: u8 = 1;
     const BEFORE: u8 = 2;
     let robot = case.robot_of(ENDLESS).start();
@@ -161,22 +162,22 @@ fn stop_behind(case: &Case) {
     const HELD: Duration = Duration::from_secs(3);
     const SOON: Duration = Duration::from_millis(1_500);
     let robot = case.robot_of(ENDLESS).start();
-    // No answer comes over a connection once it has carried a start: it owes one for 10 s.
+    // A connection that has carried a start returns no more answers: one is missing for 10 s.
     let mut way = Network::default();
     let command = way.tcp_through(robot.address("command"), |_| {
         let is_mute = Arc::new(AtomicBool::new(false));
-        let hears = Arc::clone(&is_mute);
-        let said: Box<Filter> = Box::new(move |bytes| {
-            hears.fetch_or(bytes.windows(4).any(|word| word == b"run("), Ordering::SeqCst);
+        let mutes = Arc::clone(&is_mute);
+        let to_server: Box<Filter> = Box::new(move |bytes| {
+            mutes.fetch_or(bytes.windows(4).any(|word| word == b"run("), Ordering::SeqCst);
             Pass::On
         });
-        let told: Box<Filter> = Box::new(move |bytes| {
+        let to_client: Box<Filter> = Box::new(move |bytes| {
             if is_mute.load(Ordering::SeqCst) {
                 bytes.clear();
             }
             Pass::On
         });
-        [said, told]
+        [to_server, to_client]
     });
     let plan: Plan<'_> = case.gateway_of(&panel()).robot(&robot).server_at("command", command);
     let mut gateway = plan.start();

@@ -1,4 +1,4 @@
-//! What a scenario asks of a gateway, whoever it is.
+//! What a scenario needs of a gateway, in every environment.
 
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
@@ -11,29 +11,33 @@ use recipe_test_kit::{SERVERS, until};
 
 use super::case::Case;
 use super::field::{CanClient, LineClient};
-use super::refusal::Spoil;
+use super::refusal::Defect;
 use super::robot::Robot;
 
-/// Where gateways run.
+/// A kind of gateway and how to run it.
 pub(crate) trait Environment: Send + Sync {
-    /// As in the names of the tests.
+    /// Its name in the names of the tests.
     fn name(&self) -> &'static str;
 
-    /// Whether the clock of a gateway goes on while it is stopped.
-    fn sleeps_noticeably(&self) -> bool;
+    /// Whether a gateway's clock goes on while it is stopped. That of an emulated board stops with it, as if a
+    /// debugger halted the timers too: for the program no time has passed (proto-core/docs/engine.md section 2).
+    fn sleeps_noticeably(&self) -> bool {
+        false
+    }
 
-    /// Makes a cable of which no end acknowledges what did not get through to the other.
-    fn lay_true_cable(&self, case: &Case);
+    /// Makes a cable behind which nothing acknowledges what does not reach the other end. QEMU's network is one
+    /// already.
+    fn lay_true_cable(&self, _case: &Case) {}
 
-    /// Starts a gateway; its field ports are there when this returns.
+    /// Starts a gateway, and waits for its field ports.
     fn start(&self, plan: &Plan<'_>) -> Box<dyn Gateway>;
 
-    /// Starts a gateway whose configuration cannot be used. Returns what it says about it, once it
-    /// is certain that its field ports stay silent.
-    fn refuses(&self, plan: &Plan<'_>, spoil: Spoil) -> String;
+    /// Starts a gateway with a configuration that cannot be used, and checks that its field ports stay silent.
+    /// Returns its message.
+    fn refuses(&self, plan: &Plan<'_>, defect: Defect) -> String;
 }
 
-/// A running gateway. It fails the scenario when it panics or ends.
+/// A running gateway. The scenario fails if it panics or ends.
 pub(crate) trait Gateway {
     /// The device at an RS-485 port.
     fn line(&self, port: &str) -> LineClient;
@@ -41,44 +45,44 @@ pub(crate) trait Gateway {
     /// A node on the bus of a CAN port.
     fn can(&self, port: &str) -> CanClient;
 
-    /// Where the controller's client reaches a listening port.
+    /// The address at which the controller's client reaches a listening port.
     fn listens(&self, port: &str) -> SocketAddr;
 
-    /// What has become of a link so far.
+    /// The state of a link.
     fn link(&self, link: Link<'_>) -> LinkStatus;
 
-    /// What went through a field port so far.
+    /// The counters of a field port.
     fn port(&self, port: &str) -> PortStatus;
 
     /// Pulls the Ethernet cable, or plugs it in.
     fn cable(&self, cable: Cable);
 
-    /// Stops it where it is; its clock goes on.
+    /// Stops it; its clock goes on.
     fn freeze(&self);
 
-    /// Lets it go on.
+    /// Continues it.
     fn thaw(&self);
 
-    /// The address that it says it has; a host's gateway says none.
+    /// The address in its log; `None` for a host's gateway.
     fn own_address(&self) -> Option<String>;
 
-    /// The processor time that its host spent on it.
+    /// The processor time that its process took.
     fn processor_time(&self) -> Duration;
 
-    /// The memory that it took so far at most, in bytes.
+    /// Its maximum memory so far, in bytes.
     fn memory(&self) -> u64;
 
-    /// What its emulator counts, where there is one that counts.
+    /// Its emulator's counters; null if there are none.
     fn figures(&self) -> Value {
         Value::Null
     }
 
-    /// Fails when it has ended, or said that it panicked.
+    /// Fails if it has ended or panicked.
     fn must_run(&mut self);
 }
 
 impl dyn Gateway + '_ {
-    /// Waits until a link has come up for the `connects`th time, or more often, and is up.
+    /// Waits until a link is up and has come up at least `connects` times.
     #[track_caller]
     pub(crate) fn until_up(&mut self, link: Link<'_>, connects: u32) {
         until(&format!("{link:?} up ({connects})"), || {
@@ -97,7 +101,7 @@ impl dyn Gateway + '_ {
         });
     }
 
-    /// Waits until a field port has received so many bytes.
+    /// Waits until a field port has received this many bytes.
     #[track_caller]
     pub(crate) fn until_bytes_in(&mut self, port: &str, bytes: u64) -> PortStatus {
         let mut newest = PortStatus::default();
@@ -109,7 +113,7 @@ impl dyn Gateway + '_ {
         newest
     }
 
-    /// Waits until a field port has accepted so many frames.
+    /// Waits until a field port has accepted this many frames.
     #[track_caller]
     pub(crate) fn until_frames_in(&mut self, port: &str, frames: u64) -> PortStatus {
         let mut newest = PortStatus::default();
@@ -130,21 +134,21 @@ pub(crate) enum Link<'a> {
     Modbus,
     /// The controller's UDP 2011 server.
     Udp2011,
-    /// A port of this name that the controller's TCP client connects to.
+    /// A listening port, to which the controller's TCP client connects.
     TcpListen(&'a str),
-    /// One that its UDP client sends to.
+    /// A listening port, to which its UDP client sends.
     UdpListen(&'a str),
 }
 
-/// What has become of a link.
+/// State of a link.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct LinkStatus {
     pub(crate) is_up: bool,
-    /// How often it came up.
+    /// Number of times that it came up.
     pub(crate) connects: u32,
 }
 
-/// What went through a field port.
+/// Counters of a field port.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(crate) struct PortStatus {
     pub(crate) frames_in: u64,
@@ -162,19 +166,18 @@ pub(crate) enum Cable {
     Plugged,
 }
 
-/// No silence ends a frame here, since a busy machine makes silences that no line has. QEMU hands a UART
-/// one byte at a time, and may be stopped between two: by the guest's own clock tens of milliseconds passed
-/// within a frame that was sent at once. A pseudoterminal's bytes are moved by a worker of the kernel, which
-/// the gateway preempts in the middle of a frame.
+/// An idle gap that never ends a frame, since a busy machine makes pauses that no line has. QEMU passes a UART
+/// one byte at a time and may be stopped in between: tens of milliseconds of the guest's clock can pass within a
+/// frame. A pseudoterminal's bytes are moved by a kernel thread, which the gateway can preempt within a frame.
 const IDLE_GAP_MS: u32 = 1_000;
 
 /// How a gateway is started.
 pub(crate) struct Plan<'a> {
     pub(crate) case: &'a Case,
     pub(crate) file: PathBuf,
-    /// `KEY=VALUE`, for what is the scenario's own.
+    /// The scenario's own overrides, as `KEY=VALUE`.
     pub(crate) sets: Vec<String>,
-    /// The controller's servers; none when the gateway is there first.
+    /// The controller's servers; empty if the gateway starts first.
     pub(crate) servers: Vec<(&'static str, SocketAddr)>,
     /// Whether the scenario pulls the cable.
     pub(crate) pulls_cable: bool,
@@ -191,13 +194,13 @@ impl<'a> Plan<'a> {
         self
     }
 
-    /// The controller that it is to be connected to.
+    /// Sets the controller.
     pub(crate) fn robot(mut self, robot: &Robot) -> Self {
         self.servers = SERVERS.map(|server| (server, robot.address(server))).into();
         self
     }
 
-    /// One of the controller's servers is reached somewhere else.
+    /// Sets another address for one of the controller's servers.
     pub(crate) fn server_at(mut self, server: &str, address: SocketAddr) -> Self {
         for (name, place) in &mut self.servers {
             if *name == server {
@@ -207,7 +210,7 @@ impl<'a> Plan<'a> {
         self
     }
 
-    /// The controller will be on these ports of this host, later.
+    /// The controller will be started later, on these ports of this host.
     pub(crate) fn set_servers(&mut self, ports: [u16; 4]) {
         let place = |port| SocketAddr::from(([127, 0, 0, 1], port));
         self.servers = SERVERS.into_iter().zip(ports.map(place)).collect();
@@ -218,16 +221,16 @@ impl<'a> Plan<'a> {
         Self { pulls_cable: true, ..self }
     }
 
-    /// Starts it.
+    /// Starts the gateway.
     #[track_caller]
     pub(crate) fn start(&self) -> Box<dyn Gateway> {
         self.case.environment.start(self)
     }
 
-    /// Starts it with a configuration that cannot be used; what it says.
+    /// Starts it with a configuration that cannot be used; returns its message.
     #[track_caller]
-    pub(crate) fn refused(&self, spoil: Spoil) -> String {
-        self.case.environment.refuses(self, spoil)
+    pub(crate) fn refused(&self, defect: Defect) -> String {
+        self.case.environment.refuses(self, defect)
     }
 
     /// All overrides, for a controller at `host` whose servers are on these ports.
@@ -262,13 +265,13 @@ impl<'a> Plan<'a> {
         self.servers.iter().map(|(name, address)| (*name, address.port())).collect()
     }
 
-    /// What `host-sim` is given as the file.
+    /// The path of the file for `host-sim`.
     pub(crate) fn file(&self) -> &Path {
         &self.file
     }
 }
 
-/// The names of the ports with such a bus, in file order.
+/// The names of the ports whose bus satisfies `bus`, in file order.
 pub(crate) fn ports(config: &GatewayConfig, bus: impl Fn(&Bus) -> bool) -> Vec<String> {
     config.ports.iter().filter(|port| bus(&port.bus)).map(|port| port.name.as_str().to_owned()).collect()
 }

@@ -1,4 +1,4 @@
-//! The specification's worked examples as a gateway bridges them, and the example files' cells.
+//! The specification's worked examples through a gateway, and the cells of the example files.
 
 use std::time::{Duration, Instant};
 
@@ -39,15 +39,15 @@ const POSE: [u8; 24] = [
 /// The floats of example 4's captured frame with id 2.
 const CAN_POSE: [u8; 8] = [0xEF, 0x54, 0xEF, 0x3E, 0xA7, 0xE7, 0xD1, 0x3E];
 
-/// A controller that shows the captured pose and has no port of its own on the field.
+/// A controller that shows the captured pose and has no field ports of its own.
 pub(crate) const ROBOT: &str = "udp-server-controller.toml";
 
-/// A frame with so many of the pose's floats.
+/// A frame with the first floats of the pose.
 pub(crate) fn pose_frame(floats: usize) -> Vec<u8> {
     [&HEAD[..], &POSE[..4 * floats], &OUT_TAIL].concat()
 }
 
-/// The device sees this pose each cycle and switches DO1.
+/// Checks that the device receives this pose each cycle and can switch DO1.
 #[track_caller]
 pub(crate) fn pose_and_output(robot: &Robot, device: &mut LineClient, pose: &[u8]) {
     device.until(pose);
@@ -124,12 +124,12 @@ fn example_5(case: &Case) {
     pose_and_output(&robot, &mut gateway.line("rs485-1"), &pose_frame(6));
 }
 
-/// A gateway that is there before the controller, whose client is to connect to it.
+/// A gateway that is started before the controller, whose client connects to it.
 #[track_caller]
 pub(crate) fn listening<'a>(case: &'a Case, bus: &str) -> (Box<dyn Gateway>, RobotPlan<'a>) {
     let gateway = case.gateway("client.toml").set("port.up.bus", bus).start();
     let (used, other) = if bus == "tcp-listen" { ("tcp1", "udp1") } else { ("udp1", "tcp1") };
-    // Nobody is there for the other client; it goes on trying.
+    // The other client has no server and keeps trying.
     let robot = case
         .robot("client-controller.toml")
         .set(&format!("port.{used}.to"), gateway.listens("up"))
@@ -155,7 +155,7 @@ fn force_sensor(case: &Case) {
     const RATE: u32 = 960;
     const FRAMES: u32 = 3 * RATE;
     let robot = case.robot("force-sensor-controller.toml").start();
-    // The file's 20 ms are less than a busy machine may take between two frames.
+    // A busy machine may pause longer between two frames than the 20 ms of the file.
     let plan = case.gateway("force-sensor.toml").robot(&robot).set("port.force.timeout_ms", 2_000);
     let mut gateway = plan.start();
     gateway.until_up(Link::Udp2011, 1);
@@ -171,7 +171,7 @@ fn force_sensor(case: &Case) {
     let status = gateway.until_bytes_in("force", u64::from(FRAMES) * 28);
     assert_eq!((status.frames_in, status.skipped_bytes), (u64::from(FRAMES), 0), "{status:?}");
     robot.until("ForceEnd[1]", f64::from(FRAMES - 1) / 8.0);
-    // A robot that follows a force must not follow one that nobody measures any more.
+    // A robot that follows a force must not follow one that is no longer measured.
     for axis in 1..=6 {
         robot.until(&format!("ForceEnd[{axis}]"), 0.0);
     }
@@ -187,12 +187,12 @@ fn hand(case: &Case) {
     until("closed fingers", || (hand.frame(0x501) == [200; 6]).then_some(()));
     // State 3, no error, 1500 g.
     until_reported(&mut hand, &robot, [3, 0, 0xDC, 0x05], [3.0, 0.0, 1500.0]);
-    // Unplugged: 0 says that it is not there, the other two hold.
+    // Unplugged: the state becomes 0, the other two hold.
     word_inputs(&robot, [0.0, 0.0, 1500.0]);
     until_reported(&mut hand, &robot, [2, 7, 0xFF, 0xFF], [2.0, 7.0, 65_535.0]);
 }
 
-/// The hand reports this until the controller has it.
+/// The hand sends this until the controller has it.
 #[track_caller]
 fn until_reported(hand: &mut CanClient, robot: &Robot, report: [u8; 4], values: [f64; 3]) {
     until("the report at the controller", || {
@@ -209,7 +209,7 @@ fn station(case: &Case) {
     gateway.until_up(Link::Command, 1);
     let mut station = gateway.line("station");
     let mut count = None;
-    // Each order has one answer; the reply code is that of the orders before.
+    // Each order has one answer, with the reply code of the orders before.
     let mut order = |number: u8, part: u16| {
         let part = part.to_le_bytes();
         station.send(&[0xFF, 0xFF, number, part[0], part[1], 0xEE, 0xEE]);
@@ -228,7 +228,7 @@ fn station(case: &Case) {
     until("the reply code: success", || (order(0, 513).0 == 2).then_some(()));
     until("the program is seen to be busy, or has ended", || (order(0, 513).1 == 0).then_some(()));
     robot.until_stats("the program has ended", |stats| stats["program_state"] == 0);
-    // Nothing runs that could be stopped.
+    // No program runs that could be stopped.
     order(9, 513);
     until("the reply code: fail", || (order(0, 513).0 == 3).then_some(()));
 }

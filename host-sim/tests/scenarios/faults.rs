@@ -1,4 +1,4 @@
-//! What breaks between gateway and controller, and what a gateway does with silence.
+//! Faults between gateway and controller, and silent devices.
 
 use std::time::{Duration, Instant};
 
@@ -21,7 +21,7 @@ pub(crate) fn all() -> Vec<Scenario> {
     ]
 }
 
-/// A board has the address of the file; a host keeps its own and works all the same.
+/// A board has the file's address; a host keeps its own and still works.
 fn own_address(case: &Case) {
     let robot = case.robot(ROBOT).start();
     let plan = case.gateway("rs485-system.toml").robot(&robot);
@@ -51,7 +51,7 @@ fn restart(case: &Case) {
     let robot = case.robot(ROBOT).on(ports).start();
     gateway.until_up(Link::Modbus, 2);
     gateway.until_up(Link::State, 2);
-    // A pose in the controller's own words has gone through the state link since.
+    // Since then, a pose of the new controller has come on the state link.
     device.forget();
     device.until(&pose_frame(4));
     assert_eq!(robot.variable(DO1), 0.0, "what was sent while the controller was away was written after all");
@@ -73,19 +73,19 @@ fn cable(case: &Case) {
         let is_up = [Link::Modbus, Link::State].map(|link| gateway.link(link).is_up);
         (is_up == [false; 2]).then_some(())
     });
-    // None of them is still on the line.
+    // None of the old frames is still on the line.
     gateway.until_frames_in("rs485-1", frames);
     gateway.cable(Cable::Plugged);
     gateway.until_up(Link::Modbus, 2);
     gateway.until_up(Link::State, 2);
-    // What the connection before still held would be written by now.
+    // What the previous connection still held would be written by now.
     device.forget();
     device.until(&pose_frame(4));
     assert_eq!(robot.variable(DO1), 0.0, "what was sent while the cable was pulled was written after all");
     pose_and_output(&robot, &mut device, &pose_frame(4));
 }
 
-/// The server takes connections and says nothing more; the rest of the controller works.
+/// The server accepts connections and sends nothing; the rest of the controller works.
 fn modbus_stalls(case: &Case) {
     let robot = case.robot(ROBOT).start();
     let mut way = Network::default();
@@ -102,19 +102,19 @@ fn modbus_stalls(case: &Case) {
         device.send(&DO1_ON);
         (!gateway.link(Link::Modbus).is_up).then_some(())
     });
-    // The rest goes on.
+    // The other links still work.
     gateway.until_up(Link::State, 1);
     device.forget();
     device.until(&pose_frame(4));
     assert!(!gateway.link(Link::Modbus).is_up, "nobody answers there");
     way.set(Cable::Plugged);
     gateway.until_up(Link::Modbus, 2);
-    // The device has been silent: its safe value is written after the return.
+    // The device has been silent: its safe value is written when the link is back.
     robot.until(DO1, 128.0);
     robot.until_after(DO1, 1.0, || device.send(&DO1_ON));
 }
 
-/// What DO1 to DO8 become when nothing comes any more.
+/// DO1 to DO8 after the device falls silent.
 const SAFE: &str = "{ 'DigitalOutputCommand[1]' = 0x80 }";
 
 fn safe_value(case: &Case) {
@@ -125,10 +125,10 @@ fn safe_value(case: &Case) {
     let mut device = gateway.line("rs485-1");
     for value in [1, 2] {
         device.send(&[0xFF, 0xFF, value, 0xEE, 0xEE]);
-        // The safe value follows 100 ms later, which may be sooner than anybody looks.
+        // The safe value follows 100 ms later, maybe before the statistics show this value.
         robot.until(DO1, 128.0);
     }
-    // While frames come in time, their value stands.
+    // While frames come in time, their value stays.
     let begin = Instant::now();
     while begin.elapsed() < Duration::from_millis(500) {
         device.send(&DO1_ON);

@@ -1,4 +1,4 @@
-//! Field devices: what is at the other end of a serial line or on a CAN bus.
+//! Field devices on a serial line or a CAN bus.
 
 use std::io::{Read, Write};
 use std::sync::{Arc, Condvar, Mutex};
@@ -22,14 +22,14 @@ macro_rules! stream {
 }
 stream!(std::fs::File, std::net::TcpStream, std::os::unix::net::UnixStream);
 
-/// What came, and that something came.
+/// Received bytes, and a signal that more have come.
 #[derive(Default)]
 struct Inbox {
     bytes: Mutex<Vec<u8>>,
     arrived: Condvar,
 }
 
-/// A device on a serial line. It takes what comes, whether anybody looks or not.
+/// A device on a serial line. It reads continuously.
 pub(crate) struct LineClient {
     writer: Box<dyn Write + Send>,
     inbox: Arc<Inbox>,
@@ -56,18 +56,18 @@ impl LineClient {
         self.writer.write_all(bytes).unwrap();
     }
 
-    /// The way to the other end, for somebody else; from here on nothing is sent by this.
+    /// Moves the sending half out; this client can no longer send.
     pub(crate) fn take_writer(&mut self) -> Box<dyn Write + Send> {
         std::mem::replace(&mut self.writer, Box::new(std::io::sink()))
     }
 
-    /// Everything that has come so far.
+    /// All bytes that have come so far.
     pub(crate) fn take_all(&mut self) -> Vec<u8> {
         self.more(Duration::ZERO);
         std::mem::take(&mut self.received)
     }
 
-    /// Waits until something has come; `false` when nothing did.
+    /// Waits for bytes; returns false if none came.
     fn more(&mut self, patience: Duration) -> bool {
         let bytes = self.inbox.bytes.lock().unwrap();
         let (mut bytes, _) =
@@ -76,7 +76,7 @@ impl LineClient {
         !self.received.is_empty()
     }
 
-    /// What came so far is of no interest.
+    /// Drops what has come so far.
     pub(crate) fn forget(&mut self) {
         self.more(Duration::ZERO);
         self.received.clear();
@@ -111,7 +111,7 @@ impl LineClient {
         }
     }
 
-    /// Nothing may come for so long.
+    /// Checks that nothing comes for this long.
     #[track_caller]
     pub(crate) fn is_silent(&mut self, time: Duration) {
         if self.more(time) {
@@ -121,11 +121,11 @@ impl LineClient {
     }
 }
 
-/// A node on a CAN bus, by slcan (proto-core/docs/wire/slcan.md).
+/// A node on a CAN bus, connected by slcan (proto-core/docs/wire/slcan.md).
 pub(crate) struct CanClient(LineClient);
 
 impl CanClient {
-    /// Joins the bus.
+    /// Opens the channel.
     #[track_caller]
     pub(crate) fn join(stream: Box<dyn Stream>) -> Self {
         let mut line = LineClient::new(stream);
@@ -153,7 +153,7 @@ impl CanClient {
             while !text.ends_with('\r') {
                 text.push(char::from(self.0.take(1)[0]));
             }
-            // What was sent is confirmed by a `z`.
+            // A `z` confirms a frame that was sent.
             let text = text.trim_start_matches('z').trim_end();
             let Some(frame) = text.strip_prefix('t') else { continue };
             let id = u16::from_str_radix(&frame[..3], 16).unwrap();
@@ -170,24 +170,24 @@ impl CanClient {
         self.0.send(slcan(id, data).as_bytes());
     }
 
-    /// Bytes that need not be any of slcan's.
+    /// Sends bytes, which need not be valid slcan.
     #[track_caller]
     pub(crate) fn send_raw(&mut self, bytes: &[u8]) {
         self.0.send(bytes);
     }
 
-    /// The bare line.
+    /// The serial line itself.
     pub(crate) fn into_line(self) -> LineClient {
         self.0
     }
 
-    /// What came so far is of no interest.
+    /// Drops what has come so far.
     pub(crate) fn forget(&mut self) {
         self.0.forget();
     }
 }
 
-/// A frame as slcan's line.
+/// A frame as a line of slcan.
 pub(crate) fn slcan(id: u16, data: &[u8]) -> String {
     let hex: String = data.iter().map(|byte| format!("{byte:02X}")).collect();
     format!("t{id:03X}{}{hex}\r", data.len())

@@ -1,4 +1,4 @@
-//! Bytes that are nobody's frames, on every way into a gateway.
+//! Invalid bytes on every path into a gateway.
 
 use std::io::{ErrorKind, Read, Write};
 use std::net::{Ipv4Addr, SocketAddr, TcpStream, UdpSocket};
@@ -28,7 +28,7 @@ fn rs485(case: &Case) {
     gateway.until_up(Link::Modbus, 1);
     let mut device = gateway.line("rs485-1");
     let mut garbage: Vec<u8> = (0..=255).cycle().take(2048).collect();
-    // Ends in heads, and in a frame without its end.
+    // It ends in heads, and in a partial frame.
     garbage.extend_from_slice(&[0xFF, 0xFF, 0xFF]);
     garbage.extend_from_slice(&DO1_OFF[..4]);
     for (value, frame) in [(1.0, DO1_ON), (0.0, DO1_OFF)] {
@@ -45,8 +45,8 @@ fn can(case: &Case) {
     gateway.until_up(Link::Modbus, 1);
     let mut bus = gateway.can("can-1");
     for value in [1, 0] {
-        // No lines of slcan, lines too long, and frames that the recipe does not have: another id, another
-        // length, a remote frame, an extended id.
+        // Invalid lines of slcan, lines that are too long, and frames that are not in the recipe: another id,
+        // another length, a remote frame, an extended id.
         for garbage in [&[0x80, 0xFF, 0x00][..], b"\r", &[b'7'; 200], b"\r", b"t9991\rtXYZ\r", b"t0020\r"] {
             bus.send_raw(garbage);
         }
@@ -61,7 +61,7 @@ fn can(case: &Case) {
     assert_eq!(bus.frame(2).len(), 8, "the cycle goes on");
 }
 
-/// Nothing of it is a frame, and it ends in the middle of one.
+/// It has no complete frame, and ends in a partial one.
 fn no_frames() -> Vec<u8> {
     let noise = (0_u32..4_096).map(|number| (number.wrapping_mul(2_654_435_761) >> 24) as u8);
     noise.chain(pose_frame(6).into_iter().take(9)).collect()
@@ -78,26 +78,26 @@ fn stranger(gateway: &dyn Gateway, from: Ipv4Addr) -> TcpStream {
     stranger
 }
 
-/// Where the controller is, as far as the gateway knows.
+/// The controller's address in the gateway's configuration.
 const HERE: Ipv4Addr = Ipv4Addr::LOCALHOST;
-/// A process of this host may stand for the controller, from its usual address only.
+/// A process of this host can act as the controller, but only from its usual address.
 const ELSEWHERE: Ipv4Addr = Ipv4Addr::new(127, 0, 0, 2);
 
 fn tcp(case: &Case) {
     let link = Link::TcpListen("up");
     let (mut gateway, plan) = listening(case, "tcp-listen");
-    // One who was there first: what he says is no frame, and nothing of it reaches the device.
+    // A client comes first: what it sends is no frame, and nothing of it reaches the device.
     let mut device = gateway.line("rs485-1");
     let mut first = stranger(&*gateway, HERE);
     gateway.until_up(link, 1);
     first.write_all(&no_frames()).unwrap();
-    // Then he leaves, and the controller is served.
+    // When it has left, the controller is served.
     drop(first);
     gateway.until_down(link);
     let robot = plan.start();
     gateway.until_up(link, 2);
     pose_and_output(&robot, &mut device, &pose_frame(6));
-    // One more is turned away, and the controller's connection goes on.
+    // Another client is refused, and the controller's connection stays.
     let mut second = stranger(&*gateway, HERE);
     let _ = second.write_all(&no_frames());
     assert!(is_turned_away(&mut second), "a second client was served, or left waiting");
@@ -105,13 +105,13 @@ fn tcp(case: &Case) {
     assert_eq!(gateway.link(link).connects, 2, "the controller's connection was disturbed");
 }
 
-/// Whoever comes is a stranger, since the controller is said to be far away.
+/// Every client is a stranger, since the controller is configured with another address.
 fn other_addresses(case: &Case) {
     for bus in ["tcp-listen", "udp-listen"] {
         let plan = case.gateway("client.toml").set("controller.address", "192.0.2.1");
         let mut gateway = plan.set("port.up.bus", bus).start();
         let mut device = gateway.line("rs485-1");
-        // What the controller would say: the device would be sent it within a cycle.
+        // A valid frame: from the controller, the device would be sent its values within a cycle.
         if bus == "tcp-listen" {
             let mut stranger = stranger(&*gateway, ELSEWHERE);
             let _ = stranger.write_all(&pose_frame(6));
@@ -127,7 +127,7 @@ fn other_addresses(case: &Case) {
     }
 }
 
-/// Whether the connection has ended without a word.
+/// Whether the connection was closed without data.
 fn is_turned_away(stranger: &mut TcpStream) -> bool {
     match stranger.read(&mut [0]) {
         Ok(len) => len == 0,
@@ -153,7 +153,7 @@ fn udp(case: &Case) {
     for _ in 0..3 {
         say(&stranger);
         for value in [1, 0] {
-            // Answers go to whoever sent last, and that may be the stranger: a device sends again.
+            // Answers go to the newest sender, which may be the stranger: the device sends again.
             robot.until_after(DO1, f64::from(value), || device.send(&[0xFF, 0xFF, value, 0xEE, 0xEE]));
         }
     }

@@ -15,7 +15,7 @@ use super::field::{CanClient, LineClient};
 use super::namespace::Namespace;
 use super::network::Network;
 use super::program::HostSim;
-use super::refusal::Spoil;
+use super::refusal::Defect;
 
 /// This host.
 pub(crate) struct Host;
@@ -62,16 +62,16 @@ impl Environment for Host {
     }
 
     #[track_caller]
-    fn refuses(&self, plan: &Plan<'_>, spoil: Spoil) -> String {
+    fn refuses(&self, plan: &Plan<'_>, defect: Defect) -> String {
         let all = |plan: &Plan<'_>| arguments(plan, &plan.server_ports());
         let file = plan.case.folder.path().join("spoilt.toml");
         let text = std::fs::read_to_string(plan.file()).unwrap();
-        let (text, arguments) = match spoil {
-            Spoil::Damaged => (Some(text.replacen("[[port]]", "[[prot]]", 1)), all(plan)),
-            Spoil::Cut => (Some(text[..text.rfind('=').unwrap()].to_owned()), all(plan)),
-            Spoil::Missing => (None, all(plan)),
-            // One bind less than there are ports.
-            Spoil::NoDevice => {
+        let (text, arguments) = match defect {
+            Defect::Damaged => (Some(text.replacen("[[port]]", "[[prot]]", 1)), all(plan)),
+            Defect::Cut => (Some(text[..text.rfind('=').unwrap()].to_owned()), all(plan)),
+            Defect::Missing => (None, all(plan)),
+            // One bind is missing.
+            Defect::NoDevice => {
                 let mut arguments = all(plan);
                 arguments.pop();
                 (Some(text), arguments)
@@ -93,7 +93,7 @@ impl Environment for Host {
     }
 }
 
-/// What `host-sim gateway` is given beside the file; devices come last.
+/// Arguments of `host-sim gateway` besides the file; devices come last.
 fn arguments(plan: &Plan<'_>, servers: &[(&'static str, u16)]) -> Vec<String> {
     let mut arguments = Vec::new();
     for value in plan.overrides("127.0.0.1", servers) {
@@ -123,11 +123,11 @@ fn arguments(plan: &Plan<'_>, servers: &[(&'static str, u16)]) -> Vec<String> {
 
 struct HostGateway {
     host_sim: HostSim,
-    /// The cable, when the scenario pulls it.
+    /// The proxy, if the scenario pulls the cable.
     network: Option<Network>,
-    /// The true one, when the scenario has it.
+    /// The network namespace, if the scenario needs one.
     namespace: Option<Arc<Namespace>>,
-    /// Listening ports as the controller reaches them.
+    /// Addresses at which the controller reaches listening ports.
     listens: BTreeMap<String, SocketAddr>,
 }
 

@@ -1,6 +1,6 @@
 //! A cell at full load: every frame that a wire delivered is accounted for, on both sides.
 //!
-//! `HOST_SIM_LOAD_SECONDS` is how long it takes (5).
+//! `HOST_SIM_LOAD_SECONDS` is its length (default 5).
 
 use std::io::Write;
 use std::sync::Arc;
@@ -26,15 +26,15 @@ fn duration() -> Duration {
     Duration::from_secs_f64(seconds.map_or(5.0, |text| text.parse().expect("HOST_SIM_LOAD_SECONDS")))
 }
 
-/// Frames a second of the force sensor.
+/// Frames per second of the force sensor.
 const SENSOR_RATE: u32 = 960;
-/// Frames a second that come on CAN.
+/// Frames per second that come on CAN.
 const CAN_RATE: u32 = 500;
-/// Ids that go out on CAN each cycle.
+/// Ids that are sent on CAN each cycle.
 const CAN_OUT: [u16; 3] = [2, 3, 4];
 
-/// A force sensor; a panel that is shown words and a count each cycle; a CAN bus with a count in, and
-/// three frames out each cycle. Words go by Modbus: as many writes as CAN frames, and a poll a cycle.
+/// A force sensor; a panel that receives words and a count each cycle; a CAN bus with a count in, and three
+/// frames out each cycle. Words use Modbus: one write per CAN frame, and one poll per cycle.
 const CELL: &str = r#"
 [controller]
 address = "127.0.0.1"
@@ -127,7 +127,7 @@ fn full_load(case: &Case) {
     let mut plan = case.gateway_of(CELL).set("controller.recipe_link.udp", ports[3]);
     plan.set_servers(ports);
     let mut gateway = plan.start();
-    // The devices are there before the first frame can be sent to them.
+    // The devices are connected before the first frame can be sent to them.
     let mut sensor = gateway.line("force");
     let mut panel = Panel::default();
     let mut panel_line = gateway.line("panel");
@@ -165,14 +165,14 @@ fn full_load(case: &Case) {
     let (sensor, can) = (sensor.end(), can.end());
     let (before, after) = (memory.unwrap_or_default(), gateway.memory());
 
-    // In: what was sent is what was taken, and its end has reached the controller.
+    // In: all that was sent was accepted, and the newest value has reached the controller.
     let force_port = gateway.until_bytes_in("force", sensor.bytes);
     robot.until("WordInputReg[1]", f64::from((can.frames - 1) as u16));
     robot.until("WordInputReg[2]", f64::from(((can.frames - 1) >> 16) as u16));
     robot.until("ForceEnd[1]", f64::from((sensor.frames - 1) as f32));
     let requests = robot.count("/modbus/requests");
     let datagrams = robot.count("/ports/udp2011/frames_in");
-    // Out: without the controller it ends, and then what was sent is what was heard.
+    // Out: it ends without the controller; then all that was sent was received.
     robot.end();
     gateway.until_down(Link::State);
     let heard = |gateway: &dyn super::environment::Gateway, panel: &Panel, bus: &Bus| {
@@ -216,7 +216,7 @@ fn full_load(case: &Case) {
     assert!(after <= before + MEMORY_NOISE, "memory grew from {before} to {after} bytes");
 }
 
-/// What an emulator counted meanwhile, with how much that is a second.
+/// The difference of an emulator's counters, with rates per second.
 fn growth(before: &Value, after: &Value, elapsed: Duration) -> String {
     let mut text = String::new();
     for (name, after) in after.as_object().into_iter().flatten() {
@@ -227,7 +227,7 @@ fn growth(before: &Value, after: &Value, elapsed: Duration) -> String {
     text
 }
 
-/// Pages that the allocator of a host's process may take later.
+/// Memory that the allocator of a host's process may take later.
 const MEMORY_NOISE: u64 = 256 << 10;
 
 fn sensor_frame(number: u32, frame: &mut Vec<u8>) {
@@ -250,7 +250,7 @@ struct Generator(JoinHandle<Sent>);
 struct Sent {
     frames: u32,
     bytes: u64,
-    /// Frames that were due before the one before them had left.
+    /// Number of frames that were due before the previous one had left.
     together: u32,
 }
 
@@ -288,7 +288,7 @@ impl Generator {
     }
 }
 
-/// Whoever takes numbered frames and misses none.
+/// Receives numbered frames, and checks that none is missing.
 #[derive(Debug, Default)]
 struct Panel {
     rest: Vec<u8>,
@@ -312,7 +312,7 @@ impl Panel {
     }
 }
 
-/// The same on CAN, of all ids in turn.
+/// Same on CAN, for all ids in turn.
 #[derive(Debug, Default)]
 struct Bus {
     rest: Vec<u8>,
@@ -325,7 +325,7 @@ impl Bus {
         self.rest.extend_from_slice(bytes);
         let whole = self.rest.iter().rposition(|&byte| byte == b'\r').map_or(0, |at| at + 1);
         for line in self.rest[..whole].split(|&byte| byte == b'\r') {
-            // What was sent is confirmed by a `z`.
+            // A `z` confirms a frame that was sent.
             let line = line.trim_ascii();
             let Some(at) = line.iter().position(|&byte| byte == b't') else { continue };
             let text = std::str::from_utf8(&line[at..]).unwrap();

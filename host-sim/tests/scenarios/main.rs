@@ -1,21 +1,21 @@
 //! The cell's scenarios, written once and run against the gateway on this host, against the firmware in
 //! QEMU, and against the NUCLEO's firmware on its modelled chip.
 //!
-//! Each scenario is counted three times, as `host::NAME`, `qemu::NAME` and `nucleo::NAME`; what a gateway does
-//! that was stopped for seconds is shown on the host only, since a guest's clock stops with it. The field
-//! devices are on pseudoterminals and slcan by TCP, on the emulated UARTs, or on modelled lines and a modelled CAN
-//! bus; the controller is `host-sim controller` in all, reached over loopback or over the emulated Ethernet.
+//! Each scenario is counted three times, as `host::NAME`, `qemu::NAME` and `nucleo::NAME`. Scenarios that stop
+//! the gateway for seconds run on the host only, since a guest's clock stops with it. The field devices are on
+//! pseudoterminals and slcan over TCP, on emulated UARTs, or on modelled lines and a modelled CAN bus. The
+//! controller is always `host-sim controller`, reached over loopback or over the emulated Ethernet.
 //!
-//! * `HOST_SIM_FIRMWARE=ELF` names the firmware for QEMU (`qemu-system-arm` has to be there). Without
-//!   it the cases of QEMU are counted as ignored.
-//! * `HOST_SIM_NUCLEO=ELF` names the firmware for the NUCLEO; `CHIP_UNICORN` the library that its instructions
-//!   are emulated with (docs/chip.md). `cargo build -p chip` comes before, and `qemu-system-arm` is the
-//!   network. Without it the cases of the NUCLEO are counted as ignored.
-//! * `HOST_SIM_NAMESPACES=required` fails where no user and network namespace can be made (Debian:
-//!   util-linux, iproute2). Else what needs one is counted as ignored there.
-//! * `HOST_SIM_LOAD_SECONDS` is how long the run under full load takes.
+//! * `HOST_SIM_FIRMWARE=ELF` names the firmware for QEMU (`qemu-system-arm` has to be installed). Without it
+//!   the cases of QEMU are counted as ignored.
+//! * `HOST_SIM_NUCLEO=ELF` names the firmware for the NUCLEO; `CHIP_UNICORN` the library that emulates its
+//!   instructions (docs/chip.md). Run `cargo build -p chip` before; `qemu-system-arm` is the network. Without
+//!   it the cases of the NUCLEO are counted as ignored.
+//! * `HOST_SIM_NAMESPACES=required` fails if no user and network namespace can be made (Debian: util-linux,
+//!   iproute2). Otherwise the cases that need one are counted as ignored.
+//! * `HOST_SIM_LOAD_SECONDS` is the length of the run under full load.
 //!
-//! What each program said is under `target/tmp/scenarios/`; it stays there when a case fails.
+//! The logs of all programs are under `target/tmp/scenarios/`; they are kept if a case fails.
 
 mod board;
 mod case;
@@ -46,14 +46,14 @@ use libtest_mimic::{Arguments, Trial};
 use case::Scenario;
 use environment::Environment;
 
-/// Where the firmware comes from, for who has none.
+/// How to get the firmware.
 const HOW: &str = "HOST_SIM_FIRMWARE=ELF cargo test --test scenarios (Debian: apt-get install \
                    qemu-system-arm; the ELF: rustup target add thumbv7em-none-eabihf, cargo firmware-qemu, \
                    then it is target/thumbv7em-none-eabihf/firmware/firmware)";
-/// As above, for the NUCLEO.
+/// Same, for the NUCLEO.
 const HOW_NUCLEO: &str =
     "HOST_SIM_NUCLEO=ELF CHIP_UNICORN=LIBRARY cargo test --test scenarios (docs/chip.md)";
-/// Cases at a time. Most of a case is waiting.
+/// Number of cases at a time. They mostly wait.
 const THREADS: usize = 4;
 
 fn main() -> ExitCode {
@@ -89,7 +89,7 @@ fn main() -> ExitCode {
         ];
         all.into_iter().flatten().filter(move |scenario| sleeps || !scenario.is_of_sleep)
     };
-    // Who measures has the machine for himself.
+    // A case that measures runs alone.
     let machine = Arc::new(RwLock::new(()));
     let mut trials = Vec::new();
     let host: Arc<dyn Environment> = Arc::new(host::Host);
@@ -135,7 +135,7 @@ enum Missing {
     Fail(String),
 }
 
-/// The firmware, or `None` where its cases are to be skipped.
+/// The firmware; `None` if its cases are to be ignored.
 fn found(variable: &str, how: &str, firmware: Result<PathBuf, Missing>) -> Result<Option<PathBuf>, ()> {
     match firmware {
         Ok(firmware) => Ok(Some(firmware)),
@@ -154,7 +154,7 @@ fn firmware(variable: &str) -> Result<PathBuf, Missing> {
     let Some(named) = std::env::var_os(variable).filter(|named| !named.is_empty()) else {
         return Err(Missing::Skip("it names no firmware".into()));
     };
-    // Cargo runs tests in the package's folder; what is typed is relative to the workspace's.
+    // Cargo runs tests in the package's folder; the path is relative to the workspace.
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(&named);
     if !path.is_file() {
         return Err(Missing::Fail(format!("{variable}={}: no such file", named.display())));
@@ -165,7 +165,7 @@ fn firmware(variable: &str) -> Result<PathBuf, Missing> {
     Ok(path)
 }
 
-/// The NUCLEO's, which needs its emulator as well.
+/// The NUCLEO's firmware, which needs its emulator as well.
 fn nucleo() -> Result<PathBuf, Missing> {
     let path = firmware("HOST_SIM_NUCLEO")?;
     if std::env::var_os("CHIP_UNICORN").is_none() {

@@ -1,5 +1,5 @@
-//! A network of its own for the programs of a case, without being root: its only cable is the loopback
-//! interface, and when that is down nobody acknowledges anything, as a proxy's kernel would.
+//! A network namespace for the programs of a case, without root: its only cable is the loopback interface.
+//! When that is down nothing is acknowledged; behind a proxy, the proxy's kernel would acknowledge.
 
 use std::ffi::OsString;
 use std::path::Path;
@@ -11,10 +11,10 @@ use super::case::Case;
 use super::environment::Cable;
 use super::program::{Program, exists};
 
-/// What it is made with: util-linux and iproute2.
+/// The tools that make it, from util-linux and iproute2.
 const TOOLS: [&str; 3] = ["unshare", "nsenter", "ip"];
 
-/// Why there can be none here.
+/// Why none can be made here.
 pub(crate) fn refused() -> Option<String> {
     if let Some(tool) = TOOLS.into_iter().find(|tool| !exists(tool)) {
         return Some(format!("there is no {tool}"));
@@ -27,20 +27,20 @@ pub(crate) fn refused() -> Option<String> {
     }
 }
 
-/// A network, for as long as this is there.
+/// A network namespace that exists until it is dropped.
 #[derive(Debug)]
 pub(crate) struct Namespace {
     holder: Program,
 }
 
 impl Namespace {
-    /// A new one, its cable plugged in.
+    /// Makes one with the cable plugged in.
     #[track_caller]
     pub(crate) fn new(case: &Case) -> Self {
         let arguments = ["-Urn", "sleep", "infinity"].map(OsString::from);
         let holder = Program::start(case, "namespace", Path::new("unshare"), &arguments);
         let mut namespace = Self { holder };
-        // It becomes `sleep` once everything is made.
+        // The shell becomes `sleep` once everything is set up.
         let name = format!("/proc/{}/comm", namespace.holder.pid().as_raw_pid());
         until("the namespace", || {
             namespace.holder.must_run();
@@ -59,7 +59,7 @@ impl Namespace {
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     }
 
-    /// A command whose first argument becomes a program in there, with the process that this starts.
+    /// A command that runs its first argument as a program in the namespace, in the same process.
     pub(crate) fn inside(&self) -> Command {
         let mut command = Command::new("nsenter");
         let target = self.holder.pid().as_raw_pid().to_string();

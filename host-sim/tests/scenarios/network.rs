@@ -1,8 +1,7 @@
-//! An Ethernet cable between programs of this host, which can be pulled.
+//! A proxy between programs of this host that simulates an Ethernet cable, which can be pulled.
 //!
-//! While it is pulled nothing gets through and nobody is told: connections stall, what their ends send is
-//! kept as TCP keeps it, a connection's end or reset is not heard on the other side, connection requests
-//! remain without an answer, datagrams are lost.
+//! While it is pulled nothing gets through and no end is told: connections stall and TCP keeps what was
+//! sent, closes and resets do not arrive, connection requests get no answer, datagrams are lost.
 
 use std::io::{ErrorKind, Read, Write};
 use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream, UdpSocket};
@@ -11,19 +10,20 @@ use std::time::{Duration, Instant};
 
 use super::environment::Cable;
 
-/// What becomes of the bytes of one way of a connection. It may change them, or leave none.
+/// Filters the bytes of one direction of a connection: it may change or remove them.
 pub(crate) type Filter = dyn FnMut(&mut Vec<u8>) -> Pass + Send;
 
-/// What becomes of a connection with what it carries.
+/// Whether a connection goes on after these bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Pass {
     /// It goes on.
     On,
-    /// It ends here, both ways.
+    /// It ends here, in both directions.
     Cut,
 }
 
-/// Datagrams that are lost, both ways, from the first one on that is a certain one; by default none.
+/// A loss of all datagrams in both directions, which begins with a certain datagram; by default none are
+/// lost.
 #[derive(Debug, Default)]
 pub(crate) struct Loss {
     first: Vec<u8>,
@@ -36,7 +36,7 @@ impl Loss {
         Arc::new(Self { first: first.to_vec(), lasting, begun: Mutex::default() })
     }
 
-    /// Since when, once it has begun.
+    /// When it began; `None` if it has not.
     pub(crate) fn begun(&self) -> Option<Instant> {
         *self.begun.lock().unwrap()
     }
@@ -50,11 +50,11 @@ impl Loss {
     }
 }
 
-/// Ways through the cable. They end when it is dropped.
+/// Paths through the cable. They end when it is dropped.
 #[derive(Debug, Default)]
 pub(crate) struct Network {
     shared: Arc<Shared>,
-    doors: Vec<Arc<TcpListener>>,
+    listeners: Vec<Arc<TcpListener>>,
 }
 
 #[derive(Debug, Default)]
@@ -67,45 +67,46 @@ struct Shared {
 struct State {
     is_pulled: bool,
     has_ended: bool,
-    /// Connections that fill the doors while the cable is pulled, and where they come from.
+    /// Connections that fill the listeners' queues while the cable is pulled, and their addresses.
     fillers: Vec<TcpStream>,
     filled_from: Vec<SocketAddr>,
 }
 
 impl Network {
-    /// A place that leads to this TCP server.
+    /// Adds an address that leads to this TCP server.
     pub(crate) fn tcp(&mut self, to: SocketAddr) -> SocketAddr {
         self.tcp_through(to, |_| -> [Box<Filter>; 2] {
             [Box::new(|_: &mut Vec<u8>| Pass::On), Box::new(|_: &mut Vec<u8>| Pass::On)]
         })
     }
 
-    /// The same through filters: what they are for the connection with this number, counted from 0;
-    /// first the one of what the client says, then the one of what it is told.
+    /// Same, with filters. `filters` gets the connection's number, from 0, and returns those to the server and
+    /// to the client.
     pub(crate) fn tcp_through(
         &mut self,
         to: SocketAddr,
         mut filters: impl FnMut(u32) -> [Box<Filter>; 2] + Send + 'static,
     ) -> SocketAddr {
-        let door = TcpListener::bind("127.0.0.1:0").unwrap();
-        door.set_nonblocking(true).unwrap();
-        let place = door.local_addr().unwrap();
-        let door = Arc::new(door);
-        self.doors.push(Arc::clone(&door));
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        listener.set_nonblocking(true).unwrap();
+        let place = listener.local_addr().unwrap();
+        let listener = Arc::new(listener);
+        self.listeners.push(Arc::clone(&listener));
         let shared = Arc::clone(&self.shared);
         std::thread::spawn(move || {
             let mut number = 0;
-            while let Some(client) = shared.next_client(&door) {
-                // A server that is not there refuses; here it closes.
+            while let Some(client) = shared.next_client(&listener) {
+                // A missing server would refuse; here the connection is closed.
                 let Ok(server) = TcpStream::connect(to) else { continue };
                 for stream in [&client, &server] {
                     stream.set_nodelay(true).unwrap();
-                    stream.set_read_timeout(Some(TURN)).unwrap();
+                    stream.set_read_timeout(Some(POLL_INTERVAL)).unwrap();
                 }
                 let (client, server) = (Arc::new(client), Arc::new(server));
-                let [said, told] = filters(number);
+                let [to_server, to_client] = filters(number);
                 number += 1;
-                let ways = [(Arc::clone(&client), Arc::clone(&server), said), (server, client, told)];
+                let ways =
+                    [(Arc::clone(&client), Arc::clone(&server), to_server), (server, client, to_client)];
                 for (from, to, filter) in ways {
                     let shared = Arc::clone(&shared);
                     std::thread::spawn(move || shared.carry(&from, &to, filter));
@@ -115,28 +116,29 @@ impl Network {
         place
     }
 
-    /// A place that leads to this UDP server; answers go to whoever sent last.
+    /// Adds an address that leads to this UDP server; answers go to the newest sender.
     pub(crate) fn udp(&self, to: SocketAddr) -> SocketAddr {
         self.udp_losing(to, &Arc::default())
     }
 
-    /// The same, with datagrams that are lost on the way.
+    /// Same, with a loss of datagrams.
     pub(crate) fn udp_losing(&self, to: SocketAddr, loss: &Arc<Loss>) -> SocketAddr {
-        let (door, way) = (UdpSocket::bind("127.0.0.1:0").unwrap(), UdpSocket::bind("127.0.0.1:0").unwrap());
+        let (listener, way) =
+            (UdpSocket::bind("127.0.0.1:0").unwrap(), UdpSocket::bind("127.0.0.1:0").unwrap());
         way.connect(to).unwrap();
-        let place = door.local_addr().unwrap();
-        let ends = [door, way].map(|socket| {
-            socket.set_read_timeout(Some(TURN)).unwrap();
+        let place = listener.local_addr().unwrap();
+        let ends = [listener, way].map(|socket| {
+            socket.set_read_timeout(Some(POLL_INTERVAL)).unwrap();
             Arc::new(socket)
         });
         let client = Arc::<Mutex<Option<SocketAddr>>>::default();
         for is_request in [true, false] {
             let shared = Arc::clone(&self.shared);
-            let ([door, way], client, loss) = (ends.clone(), Arc::clone(&client), Arc::clone(loss));
+            let ([listener, way], client, loss) = (ends.clone(), Arc::clone(&client), Arc::clone(loss));
             std::thread::spawn(move || {
                 let mut datagram = [0; 2048];
                 while !shared.lock().has_ended {
-                    let from = if is_request { &door } else { &way };
+                    let from = if is_request { &listener } else { &way };
                     let Ok((len, sender)) = from.recv_from(&mut datagram) else { continue };
                     if is_request {
                         *client.lock().unwrap() = Some(sender);
@@ -147,7 +149,7 @@ impl Network {
                     let peer = *client.lock().unwrap();
                     let _ = match peer {
                         _ if is_request => way.send(&datagram[..len]),
-                        Some(peer) => door.send_to(&datagram[..len], peer),
+                        Some(peer) => listener.send_to(&datagram[..len], peer),
                         None => Ok(0),
                     };
                 }
@@ -162,11 +164,11 @@ impl Network {
         match cable {
             Cable::Pulled => {
                 state.is_pulled = true;
-                for door in &self.doors {
+                for listener in &self.listeners {
                     // A full queue drops further requests without an answer.
-                    rustix::net::listen(door, 0).unwrap();
-                    let place = door.local_addr().unwrap();
-                    while let Ok(filler) = TcpStream::connect_timeout(&place, TURN) {
+                    rustix::net::listen(listener, 0).unwrap();
+                    let place = listener.local_addr().unwrap();
+                    while let Ok(filler) = TcpStream::connect_timeout(&place, POLL_INTERVAL) {
                         state.filled_from.push(filler.local_addr().unwrap());
                         state.fillers.push(filler);
                     }
@@ -174,8 +176,8 @@ impl Network {
             }
             Cable::Plugged => {
                 state.fillers.clear();
-                for door in &self.doors {
-                    rustix::net::listen(door, 64).unwrap();
+                for listener in &self.listeners {
+                    rustix::net::listen(listener, 64).unwrap();
                 }
                 state.is_pulled = false;
             }
@@ -196,12 +198,12 @@ impl Shared {
         self.state.lock().unwrap()
     }
 
-    /// The next one who comes through the door; `None` at the end.
-    fn next_client(&self, door: &TcpListener) -> Option<TcpStream> {
+    /// The next client; `None` at the end.
+    fn next_client(&self, listener: &TcpListener) -> Option<TcpStream> {
         let mut state = self.lock();
         while !state.has_ended {
             if !state.is_pulled
-                && let Ok((client, from)) = door.accept()
+                && let Ok((client, from)) = listener.accept()
             {
                 if !state.filled_from.contains(&from) {
                     client.set_nonblocking(false).unwrap();
@@ -222,7 +224,7 @@ impl Shared {
                 Err(error) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) => continue,
                 result => result,
             };
-            // What was on its way when the sender gave the connection up is lost with it.
+            // If the sender gives up the connection meanwhile, these bytes are lost with it.
             let mut state = self.lock();
             let was_held = state.is_pulled;
             while state.is_pulled && !state.has_ended {
@@ -250,5 +252,5 @@ impl Shared {
     }
 }
 
-/// How long nobody looks whether the cable was pulled meanwhile.
-const TURN: Duration = Duration::from_millis(20);
+/// How often a blocked thread checks for the end.
+const POLL_INTERVAL: Duration = Duration::from_millis(20);

@@ -12,11 +12,10 @@ use serde_json::Value;
 use recipe_test_kit::until;
 
 use super::board::{self, Machine, Wires};
-use super::case::Case;
 use super::environment::{Cable, Environment, Gateway, Plan};
 use super::field::{CanClient, LineClient};
 use super::program::Program;
-use super::refusal::Spoil;
+use super::refusal::Defect;
 
 /// The firmware for the board, on its modelled chip.
 pub(crate) struct Nucleo {
@@ -27,21 +26,13 @@ pub(crate) struct Nucleo {
 
 /// The board's stack above its guard (memory.x).
 const STACK: [&str; 2] = ["20004000", "1C000"];
-/// Its sockets: RS-485 A and B, CAN.
+/// The emulator's sockets: RS-485 A and B, CAN.
 const BUSES: [&str; 3] = ["a", "b", "can"];
 
 impl Environment for Nucleo {
     fn name(&self) -> &'static str {
         "nucleo"
     }
-
-    /// Its time stands still with it, as under a debugger that stops the timers too.
-    fn sleeps_noticeably(&self) -> bool {
-        false
-    }
-
-    /// The board's is one.
-    fn lay_true_cable(&self, _case: &Case) {}
 
     #[track_caller]
     fn start(&self, plan: &Plan<'_>) -> Box<dyn Gateway> {
@@ -51,9 +42,9 @@ impl Environment for Nucleo {
     }
 
     #[track_caller]
-    fn refuses(&self, plan: &Plan<'_>, spoil: Spoil) -> String {
-        let image = board::make_spoilt_image(plan, spoil);
-        if spoil == Spoil::Missing {
+    fn refuses(&self, plan: &Plan<'_>, defect: Defect) -> String {
+        let image = board::make_defective_image(plan, defect);
+        if defect == Defect::Missing {
             // Erased flash.
             std::fs::write(&image, []).unwrap();
         }
@@ -64,7 +55,7 @@ impl Environment for Nucleo {
             line.send(b"\xFF\xFF\x01\xEE\xEE");
             line.is_silent(Duration::from_millis(300));
         }
-        // Here the adapter is not the board; what it says is not the board's.
+        // The slcan adapter belongs to the emulator: its answers are not from the board.
         let mut bus = CanClient::join(Box::new(chip.wires.socket("can"))).into_line();
         bus.send(b"t001101\r");
         assert_eq!(bus.take(2), b"z\r");
@@ -95,20 +86,20 @@ impl Chip {
         arguments.extend(["--control".into(), place("control")]);
         let program = Program::start(plan.case, "chip", &nucleo.emulator, &arguments);
         let mut chip = Self { program, wires };
-        // The last of each program's sockets. That its file is there does not mean that it listens.
+        // The last socket that each program opens. Its file may exist before it listens.
         for last in ["control", "qmp"] {
             until("the emulator's sockets", || {
                 chip.must_run();
                 UnixStream::connect(chip.wires.folder.join(last)).ok()
             });
         }
-        chip.wires.ask_forwarded(&config, "qmp");
+        chip.wires.read_forwarded(&config, "qmp");
         chip
     }
 
     /// Asks the emulator.
     #[track_caller]
-    fn ask(&self, words: &str) -> String {
+    fn request(&self, words: &str) -> String {
         let mut stream = self.wires.socket("control");
         writeln!(stream, "{words}").unwrap();
         let mut answer = String::new();
@@ -117,8 +108,8 @@ impl Chip {
     }
 
     #[track_caller]
-    fn order(&self, words: &str) {
-        assert_eq!(self.ask(words), "done", "{words}");
+    fn command(&self, words: &str) {
+        assert_eq!(self.request(words), "done", "{words}");
     }
 }
 
@@ -141,28 +132,28 @@ impl Machine for Chip {
 
     #[track_caller]
     fn cable(&self, cable: Cable) {
-        self.order(if cable == Cable::Plugged { "cable in" } else { "cable out" });
+        self.command(if cable == Cable::Plugged { "cable in" } else { "cable out" });
     }
 
     #[track_caller]
     fn stop(&self) {
-        self.order("stop");
+        self.command("stop");
     }
 
     #[track_caller]
     fn go_on(&self) {
-        self.order("go");
+        self.command("go");
     }
 
     #[track_caller]
     fn save_stack(&self, to: &Path) {
         let [start, len] = STACK;
-        self.order(&format!("save {start} {len} {}", to.display()));
+        self.command(&format!("save {start} {len} {}", to.display()));
     }
 
     #[track_caller]
     fn counts(&self) -> Value {
-        serde_json::from_str(&self.ask("figures")).unwrap()
+        serde_json::from_str(&self.request("figures")).unwrap()
     }
 }
 

@@ -1,4 +1,4 @@
-//! Child processes that never outlive a case, nor the tests that started them.
+//! Child processes that outlive neither their case nor the tests.
 
 use std::ffi::OsString;
 use std::fs::File;
@@ -15,12 +15,12 @@ use serde_json::Value;
 
 use super::case::Case;
 
-/// Ticks of `/proc/PID/stat` in a second, on every Linux since 2.6.
+/// Ticks per second in `/proc/PID/stat`, on every Linux since 2.6.
 const USER_HZ: u64 = 100;
-/// First argument of this program when it is to become another one that ends with its parent.
+/// First argument that makes this program run another one, which ends with its parent.
 const END_WITH: &str = "--end-with";
 
-/// With [`END_WITH`], becomes the program that is named; returns only when it cannot.
+/// With [`END_WITH`], executes the named program; returns only if that fails.
 pub(crate) fn is_started_to_end_with_us() -> Option<ExitCode> {
     let mut arguments = std::env::args_os().skip(1);
     if arguments.next()? != END_WITH {
@@ -29,7 +29,7 @@ pub(crate) fn is_started_to_end_with_us() -> Option<ExitCode> {
     let parent: i32 = arguments.next()?.to_str()?.parse().ok()?;
     let program = arguments.next()?;
     let asked = rustix::process::set_parent_process_death_signal(Some(Signal::KILL));
-    // The parent may have ended before the question.
+    // The parent may have ended before the signal was set.
     if asked.is_err() || rustix::process::getppid().map(|pid| pid.as_raw_pid()) != Some(parent) {
         return Some(ExitCode::FAILURE);
     }
@@ -38,7 +38,7 @@ pub(crate) fn is_started_to_end_with_us() -> Option<ExitCode> {
     Some(ExitCode::FAILURE)
 }
 
-/// Whether a program of this name can be started.
+/// Whether a program of this name exists.
 pub(crate) fn exists(name: &str) -> bool {
     let path = std::env::var_os("PATH").unwrap_or_default();
     std::env::split_paths(&path).any(|folder| folder.join(name).is_file())
@@ -49,7 +49,7 @@ pub(crate) fn exists(name: &str) -> bool {
 pub(crate) struct Running(Arc<Mutex<Vec<Pid>>>);
 
 impl Running {
-    /// Ends those that are still there.
+    /// Kills those that still run.
     pub(crate) fn kill(&self) {
         for pid in self.0.lock().unwrap().drain(..) {
             let _ = rustix::process::kill_process(pid, Signal::KILL);
@@ -65,7 +65,7 @@ impl Running {
     }
 }
 
-/// A program of a case; it is asked nothing, it only says things.
+/// A program of a case, without stdin.
 #[derive(Debug)]
 pub(crate) struct Program {
     process: Process,
@@ -74,7 +74,7 @@ pub(crate) struct Program {
 }
 
 impl Program {
-    /// Starts it; what it says on stderr goes to a log that is called `name`.
+    /// Starts it, with stderr in the log `name`.
     #[track_caller]
     pub(crate) fn start(case: &Case, name: &str, program: &Path, arguments: &[OsString]) -> Self {
         let log = case.logs.join(format!("{name}.log"));
@@ -95,7 +95,7 @@ impl Program {
         program
     }
 
-    /// Everything it said on stderr.
+    /// All of stderr.
     pub(crate) fn errors(&self) -> String {
         std::fs::read_to_string(&self.log).unwrap_or_default()
     }
@@ -105,13 +105,13 @@ impl Program {
     pub(crate) fn processor_time(&self) -> Duration {
         let path = format!("/proc/{}/stat", self.pid().as_raw_pid());
         let stat = std::fs::read_to_string(path).unwrap();
-        // After the name, which may hold blanks: user and system time are the 12th and 13th.
+        // After the name, which may contain spaces, user and system time are fields 12 and 13.
         let fields: Vec<&str> = stat.rsplit(')').next().unwrap().split_whitespace().collect();
         let ticks: u64 = fields[11..13].iter().map(|field| field.parse::<u64>().unwrap()).sum();
         Duration::from_millis(ticks * 1_000 / USER_HZ)
     }
 
-    /// Ends it as a person would; it must end well.
+    /// Ends it by SIGINT; the exit code must be 0.
     #[track_caller]
     pub(crate) fn interrupt(&mut self) {
         self.end_by(Signal::INT);

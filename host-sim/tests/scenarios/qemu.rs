@@ -11,11 +11,10 @@ use serde_json::{Value, json};
 use recipe_test_kit::until;
 
 use super::board::{self, Machine, Wires};
-use super::case::Case;
 use super::environment::{Cable, Environment, Gateway, Plan};
 use super::field::LineClient;
 use super::program::Program;
-use super::refusal::Spoil;
+use super::refusal::Defect;
 
 /// The firmware in QEMU.
 pub(crate) struct Qemu {
@@ -25,23 +24,13 @@ pub(crate) struct Qemu {
 /// The board's stack (firmware/boards/mps2-an500/mps2-an500.x).
 const STACK: u64 = 0x2030_0000;
 const STACK_SIZE: u64 = 1 << 20;
-/// The sockets of its UARTs: RS-485, RS-485, CAN.
+/// The sockets of the UARTs: RS-485, RS-485, CAN.
 const UARTS: [&str; 3] = ["uart0", "uart1", "uart2"];
 
 impl Environment for Qemu {
     fn name(&self) -> &'static str {
         "qemu"
     }
-
-    /// The guest's timers stand still while the machine is stopped, as those of a processor that a debugger
-    /// halts together with them: no time has passed, and nothing that a program could look at says so
-    /// (proto-core/docs/engine.md section 2).
-    fn sleeps_noticeably(&self) -> bool {
-        false
-    }
-
-    /// The board's is one.
-    fn lay_true_cable(&self, _case: &Case) {}
 
     #[track_caller]
     fn start(&self, plan: &Plan<'_>) -> Box<dyn Gateway> {
@@ -51,8 +40,8 @@ impl Environment for Qemu {
     }
 
     #[track_caller]
-    fn refuses(&self, plan: &Plan<'_>, spoil: Spoil) -> String {
-        let mut board = Board::start(&self.elf, plan, &board::make_spoilt_image(plan, spoil));
+    fn refuses(&self, plan: &Plan<'_>, defect: Defect) -> String {
+        let mut board = Board::start(&self.elf, plan, &board::make_defective_image(plan, defect));
         let reason = board.until_refused();
         for uart in UARTS {
             let mut line = LineClient::new(Box::new(board.wires.socket(uart)));
@@ -99,12 +88,12 @@ impl Board {
         arguments.extend(["-kernel".into(), elf.into()]);
         let program = Program::start(plan.case, "qemu", Path::new("qemu-system-arm"), &arguments);
         let mut board = Self { program, log, wires };
-        // The last of its sockets. That its file is there does not mean that it listens.
+        // The last socket that QEMU opens. Its file may exist before it listens.
         until("QEMU's sockets", || {
             board.must_run();
             UnixStream::connect(board.wires.folder.join("qmp")).ok()
         });
-        board.wires.ask_forwarded(&config, "qmp");
+        board.wires.read_forwarded(&config, "qmp");
         board
     }
 

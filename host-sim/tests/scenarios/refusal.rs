@@ -6,43 +6,43 @@ use super::examples::ROBOT;
 
 pub(crate) fn all() -> Vec<Scenario> {
     vec![
-        Scenario::new("a_damaged_configuration_is_refused", |case| refused(case, Spoil::Damaged)),
-        Scenario::new("a_cut_configuration_is_refused", |case| refused(case, Spoil::Cut)),
-        Scenario::new("a_missing_configuration_is_refused", |case| refused(case, Spoil::Missing)),
-        Scenario::new("a_port_without_a_device_is_refused", |case| refused(case, Spoil::NoDevice)),
+        Scenario::new("a_damaged_configuration_is_refused", |case| refused(case, Defect::Damaged)),
+        Scenario::new("a_cut_configuration_is_refused", |case| refused(case, Defect::Cut)),
+        Scenario::new("a_missing_configuration_is_refused", |case| refused(case, Defect::Missing)),
+        Scenario::new("a_port_without_a_device_is_refused", |case| refused(case, Defect::NoDevice)),
     ]
 }
 
-/// What is wrong with a configuration.
+/// A defect of a configuration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Spoil {
-    /// A part is another than was written.
+pub(crate) enum Defect {
+    /// Its content is damaged.
     Damaged,
     /// Its end is missing.
     Cut,
-    /// It is not there.
+    /// It does not exist.
     Missing,
-    /// It asks for a port that nothing is there for.
+    /// It has a port without a device.
     NoDevice,
 }
 
-fn refused(case: &Case, spoil: Spoil) {
+fn refused(case: &Case, defect: Defect) {
     let robot = case.robot(ROBOT).start();
-    let plan: Plan<'_> = match spoil {
-        Spoil::NoDevice => case.gateway_of(THREE_LINES),
+    let plan: Plan<'_> = match defect {
+        Defect::NoDevice => case.gateway_of(THREE_LINES),
         _ => case.gateway("rs485-system.toml"),
     };
-    let reason = plan.robot(&robot).refused(spoil);
-    let expected: &[&str] = match spoil {
-        Spoil::Damaged => &["unknown key", "damaged"],
-        Spoil::Cut => &["spoilt.toml", "cut", BEHIND_THE_END],
-        Spoil::Missing => &["No such file", "cannot read", ERASED],
-        Spoil::NoDevice => &["port line-3 needs exactly one device", "this board has 2 RS-485 ports"],
+    let reason = plan.robot(&robot).refused(defect);
+    let expected: &[&str] = match defect {
+        Defect::Damaged => &["unknown key", "damaged"],
+        Defect::Cut => &["spoilt.toml", "cut", BEHIND_THE_END],
+        Defect::Missing => &["No such file", "cannot read", ERASED],
+        Defect::NoDevice => &["port line-3 needs exactly one device", "this board has 2 RS-485 ports"],
     };
-    assert!(expected.iter().any(|words| reason.contains(words)), "{spoil:?}: {reason}");
+    assert!(expected.iter().any(|words| reason.contains(words)), "{defect:?}: {reason}");
 }
 
-/// In flash an image that was cut goes on with erased bytes.
+/// In flash, erased bytes follow a truncated image.
 const BEHIND_THE_END: &str = "the image is damaged";
 /// Flash without an image.
 const ERASED: &str = "not a configuration image: it begins with [FF, FF, FF, FF]";

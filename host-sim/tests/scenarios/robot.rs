@@ -1,11 +1,10 @@
-//! The simulated controller of a case, as a process of its own.
+//! The simulated controller of a case, as a separate process.
 
-use std::io::{Read, Write};
-use std::net::{SocketAddr, TcpListener, TcpStream, UdpSocket};
+use std::net::{SocketAddr, TcpListener, UdpSocket};
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU16, Ordering};
 
-use recipe_test_kit::{PATIENCE, SERVERS, until};
+use recipe_test_kit::{SERVERS, until};
 
 use super::case::Case;
 use super::program::HostSim;
@@ -29,13 +28,13 @@ impl<'a> RobotPlan<'a> {
         self
     }
 
-    /// A device for one of its own ports.
+    /// Binds one of its own ports to a device.
     pub(crate) fn bind(mut self, port: &str, device: &str) -> Self {
         self.extra.push(format!("--bind={port}={device}"));
         self
     }
 
-    /// Where it listens; else on ports that are free.
+    /// Listens on these ports instead of free ones.
     pub(crate) fn on(self, ports: [u16; 4]) -> Self {
         Self { ports, ..self }
     }
@@ -56,19 +55,19 @@ pub(crate) struct Robot {
 }
 
 impl Robot {
-    /// Where one of its servers is.
+    /// The address of one of its servers.
     #[track_caller]
     pub(crate) fn address(&self, server: &str) -> SocketAddr {
         self.host_sim.ready[server].as_str().unwrap().parse().unwrap()
     }
 
-    /// The value of a variable, now.
+    /// The present value of a variable.
     #[track_caller]
     pub(crate) fn variable(&self, name: &str) -> f64 {
         self.host_sim.program.fresh()["registers"][name].as_f64().unwrap_or(0.0)
     }
 
-    /// The value of a variable, as it was last told.
+    /// The value of a variable in the newest statistics.
     pub(crate) fn newest(&self, name: &str) -> f64 {
         self.host_sim.program.newest()["registers"][name].as_f64().unwrap_or(0.0)
     }
@@ -81,7 +80,7 @@ impl Robot {
         });
     }
 
-    /// The same, while something is done again and again for it.
+    /// Same, and calls `act` repeatedly until then.
     #[track_caller]
     pub(crate) fn until_after(&self, name: &str, value: f64, mut act: impl FnMut()) {
         until(&format!("{name} = {value}"), || {
@@ -90,18 +89,18 @@ impl Robot {
         });
     }
 
-    /// Waits until something its statistics count satisfies `found`.
+    /// Waits until its statistics satisfy `found`.
     #[track_caller]
     pub(crate) fn until_stats(&self, what: &str, found: impl Fn(&serde_json::Value) -> bool) {
         self.host_sim.program.stats(what, found);
     }
 
-    /// Whether a program runs, as it was last told.
+    /// Whether a program runs, by the newest statistics.
     pub(crate) fn is_running(&self) -> bool {
         self.host_sim.program.newest()["program_state"].as_u64().is_some_and(|state| state != 0)
     }
 
-    /// A count of its statistics, now.
+    /// The present value of a counter in its statistics.
     #[track_caller]
     pub(crate) fn count(&self, pointer: &str) -> u64 {
         let stats = self.host_sim.program.fresh();
@@ -109,26 +108,21 @@ impl Robot {
         count.unwrap_or_else(|| panic!("no {pointer} in {stats}"))
     }
 
-    /// A command on port 2000, and its reply.
+    /// Sends a command to port 2000 and checks the reply.
     #[track_caller]
     pub(crate) fn command(&self, request: &str, reply: &str) {
-        let mut stream = TcpStream::connect(self.address("command")).unwrap();
-        stream.set_read_timeout(Some(PATIENCE)).unwrap();
-        stream.write_all(request.as_bytes()).unwrap();
-        let mut answer = vec![0; reply.len()];
-        stream.read_exact(&mut answer).unwrap();
-        assert_eq!(String::from_utf8_lossy(&answer), reply);
+        recipe_test_kit::command(self.address("command"), request, reply);
     }
 
-    /// Ends it as a person would.
+    /// Ends it by SIGINT.
     #[track_caller]
     pub(crate) fn end(mut self) {
         self.host_sim.program.interrupt();
     }
 }
 
-/// Ports for servers that go and come back. They are below those that systems give to clients, so that
-/// nobody gets them meanwhile.
+/// Ports for servers that are restarted. They are below the range for clients, so that no other program gets
+/// them meanwhile.
 #[track_caller]
 pub(crate) fn reserved_ports() -> [u16; 4] {
     static NEXT: AtomicU16 = AtomicU16::new(0);

@@ -1,4 +1,4 @@
-//! Safe values that reach the controller although the way to it fails in the worst moment.
+//! Safe values reach the controller although the path to it fails at the worst moment.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
@@ -22,16 +22,16 @@ pub(crate) fn all() -> Vec<Scenario> {
 
 /// DO1 to DO8 off.
 const OFF: &str = "{ 'DigitalOutputCommand[1]' = 0 }";
-/// Only DO8 on, which no controller has by itself.
+/// Only DO8 on, which no controller starts with.
 const MARK: &str = "{ 'DigitalOutputCommand[1]' = 0x80 }";
-/// How soon a value is there when nothing is in its way: far above what a busy machine needs, and far below
-/// what another attempt by somebody else could explain.
+/// Maximum time in which a value arrives without faults: far longer than a busy machine needs, and too short
+/// for other causes.
 const SOON: Duration = Duration::from_secs(5);
 
 fn lost_datagrams(case: &Case) {
-    // More than a busy machine takes from a frame to the controller's statistics.
+    // Longer than a busy machine needs from a frame to the controller's statistics.
     const TIMEOUT_MS: u32 = 1_000;
-    // The link is not away for the 500 ms after which everything would be said again anyway.
+    // Shorter than the 500 ms without data after which everything would be sent again anyway.
     const LOST: Duration = Duration::from_millis(300);
     let robot = case.robot(ROBOT).start();
     let way = Network::default();
@@ -44,26 +44,26 @@ fn lost_datagrams(case: &Case) {
     gateway.until_up(Link::Udp2011, 1);
     let mut device = gateway.line("rs485-1");
     robot.until_after(DO1, 1.0, || device.send(&DO1_ON));
-    // It is dead from now on.
+    // The device is silent from now on.
     let begun = until("the safe value is lost", || {
         gateway.must_run();
         loss.begun()
     });
     robot.until(DO1, 0.0);
     let elapsed = begun.elapsed();
-    // Or else it did not hear of it by what came through afterwards.
+    // Otherwise the value did not come from a repetition.
     assert!(elapsed >= LOST, "the controller had it after {elapsed:?}");
     assert!(elapsed < LOST + SOON, "the controller had it only after {elapsed:?}");
 }
 
 fn dropped_connection(case: &Case) {
-    // More than a busy machine takes from a frame to the controller's statistics.
+    // Longer than a busy machine needs from a frame to the controller's statistics.
     const TIMEOUT_MS: u32 = 1_000;
     let plan = case.gateway("client.toml").set("port.rs485-1.timeout_ms", TIMEOUT_MS);
     let mut gateway = plan.set("port.rs485-1.on_timeout", OFF).start();
     let link = Link::TcpListen("up");
-    // The connection that carries the first frame that switches off ends there, and the frame with it: its
-    // sender's transport has it acknowledged, the controller never sees it.
+    // The connection is closed when it carries the first frame that switches off: the sender's transport got
+    // an acknowledgement, but the controller never receives the frame.
     let (is_armed, cuts) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicU32::new(0)));
     let mut way = Network::default();
     let place = way.tcp_through(gateway.listens("up"), {
@@ -71,8 +71,8 @@ fn dropped_connection(case: &Case) {
         move |_| {
             let (is_armed, cuts) = (Arc::clone(&is_armed), Arc::clone(&cuts));
             let mut end = Vec::new();
-            // The controller is the client here, so this is what the gateway says.
-            let told: Box<Filter> = Box::new(move |bytes| {
+            // The controller is the client here, so this is what the gateway sends.
+            let to_client: Box<Filter> = Box::new(move |bytes| {
                 end.extend_from_slice(bytes);
                 let switches_off = end.windows(DO1_OFF.len()).any(|frame| frame == DO1_OFF);
                 end.drain(..end.len().saturating_sub(DO1_OFF.len() - 1));
@@ -82,17 +82,17 @@ fn dropped_connection(case: &Case) {
                 }
                 Pass::On
             });
-            [Box::new(|_: &mut Vec<u8>| Pass::On), told]
+            [Box::new(|_: &mut Vec<u8>| Pass::On), to_client]
         }
     });
-    // Nobody is there for the other client; it goes on trying.
+    // The other client has no server and keeps trying.
     let robot = case.robot("client-controller.toml").set("port.tcp1.to", place);
     let robot = robot.set("port.udp1.to", "127.0.0.1:9").start();
     gateway.until_up(link, 1);
     let mut device = gateway.line("rs485-1");
     is_armed.store(true, Ordering::SeqCst);
     robot.until_after(DO1, 1.0, || device.send(&DO1_ON));
-    // The device is dead from now on.
+    // The device is silent from now on.
     until("the safe frame is lost with its connection", || {
         gateway.must_run();
         (cuts.load(Ordering::SeqCst) == 1).then_some(())
@@ -112,7 +112,7 @@ fn restart(case: &Case) {
     let mut device = gateway.line("rs485-1");
     device.send(&DO1_ON);
     robot.until(DO1, 128.0);
-    // Answered long ago, and the device stays silent.
+    // The write was answered long ago, and the device stays silent.
     gateway.until_frames_in("rs485-1", 1);
     robot.end();
     gateway.until_down(Link::Modbus);

@@ -1,4 +1,4 @@
-//! A state stream with a value in it that is no number: nobody shows it, and nobody invents one.
+//! A state stream with a value that is not finite: it is not shown, and no other value in its place.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
@@ -18,22 +18,22 @@ pub(crate) fn all() -> Vec<Scenario> {
     ]
 }
 
-/// The packet of the state stream, and `RobotState[8]` in it.
+/// Length of a packet of the state stream, and place of `RobotState[8]` in it.
 const PACKET: usize = 1_468;
 const X: std::ops::Range<usize> = 368..372;
-/// Longer than a port waits before it calls a value stale.
+/// Longer than the time after which a value is stale.
 const WATCHED: Duration = Duration::from_secs(1);
 
-/// What a way overwrites.
+/// Overwrites a value in the packets of a connection.
 #[derive(Debug, Default)]
 struct Spoiler {
     is_on: AtomicBool,
-    /// Packets spoiled so far.
+    /// Number of packets changed so far.
     spoiled: AtomicU32,
 }
 
 impl Spoiler {
-    /// For one connection: a packet that has begun stays what it is.
+    /// The filter for a connection. A packet that has begun is not changed.
     fn filter(self: Arc<Self>) -> Box<Filter> {
         let (mut at, mut spoils) = (0, false);
         Box::new(move |bytes| {
@@ -53,7 +53,7 @@ impl Spoiler {
         })
     }
 
-    /// Waits until so many more have gone: of all but the newest it is certain that they were taken.
+    /// Waits until this many more have passed: all but the newest one have certainly been received.
     #[track_caller]
     fn until_spoiled(&self, more: u32) {
         let wanted = self.spoiled.load(Ordering::SeqCst) + more;
@@ -61,7 +61,7 @@ impl Spoiler {
     }
 }
 
-/// Whatever the recipe says of values that are stale.
+/// The same for both settings of `on_stale`.
 fn pose(case: &Case, on_stale: &str) {
     let robot = case.robot(ROBOT).start();
     let spoiler = Arc::new(Spoiler::default());
@@ -85,7 +85,7 @@ fn pose(case: &Case, on_stale: &str) {
         }
         spoiler.is_on.store(true, Ordering::SeqCst);
         spoiler.until_spoiled(3);
-        // Nothing but the pose came while it could be read, in whole frames.
+        // The device received complete frames, and only with the readable pose.
         let frames = device.take_all();
         let mut frames = frames.chunks(pose.len());
         assert!(frames.all(|frame| frame == pose), "something else than the pose was sent");

@@ -1,4 +1,4 @@
-//! A CAN adapter on a serial line, which the kernel's slcan driver makes an interface of.
+//! A CAN adapter on a serial line, with an interface by the kernel's slcan driver.
 
 use std::fs::File;
 use std::io::{Read, Write};
@@ -12,18 +12,18 @@ use rustix::termios::{OptionalActions, tcgetattr, tcsetattr};
 use recipe_test_kit::can::tool;
 use recipe_test_kit::until;
 
-/// The adapter's end, and the interface that it became.
+/// The adapter's end of the line, and its interface.
 pub(crate) struct Adapter {
     pub(crate) interface: &'static str,
     master: File,
     received: Arc<Mutex<Vec<u8>>>,
     daemon: Child,
-    /// Held open: without it the adapter reads errors before the driver is there.
+    /// Held open: otherwise the adapter reads errors until the driver opens it.
     _line: File,
 }
 
 impl Adapter {
-    /// Plugs it in and brings the interface up.
+    /// Attaches the driver and brings the interface up.
     #[track_caller]
     pub(crate) fn new(interface: &'static str) -> Self {
         let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).unwrap();
@@ -59,7 +59,7 @@ impl Adapter {
         adapter
     }
 
-    /// What the driver wrote so far.
+    /// The driver's output so far.
     pub(crate) fn received(&self) -> String {
         String::from_utf8_lossy(&self.received.lock().unwrap()).into_owned()
     }
@@ -68,8 +68,8 @@ impl Adapter {
         self.received.lock().unwrap().clear();
     }
 
-    /// What the adapter says, without the CR at its end.
-    pub(crate) fn say(&self, line: &str) {
+    /// Sends a line, without its CR, to the driver.
+    pub(crate) fn send(&self, line: &str) {
         (&self.master).write_all(format!("{line}\r").as_bytes()).unwrap();
     }
 }

@@ -11,7 +11,7 @@ use recipe_test_kit::{HostSim, example, until};
 
 /// Example 4's captured frame.
 const POSE: &str = "002#EF54EF3EA7E7D13E";
-/// Example 3: three bytes to the robot, and what it answers.
+/// Example 3: three bytes to the robot, and its answer.
 const THREE_BYTES: &str = "001#010203";
 const ANSWER: &str = "002#7D7D7D";
 
@@ -40,7 +40,7 @@ fn controller(file: &str, interface: &str) -> HostSim {
     BINARY.controller(&example(file), &[&bind("can", interface)])
 }
 
-/// A controller without a CAN port of its own on this bus, and a gateway that is on it.
+/// A controller without a CAN port on this bus, and a gateway with one.
 fn cell(file: &str, interface: &str) -> (HostSim, HostSim) {
     let robot = BINARY.controller(&example("can-hand-controller.toml"), &[]);
     let gateway = BINARY.gateway(&example(file), &robot, &[&bind("can-1", interface)]);
@@ -78,7 +78,7 @@ fn user_gateway(interface: &str) {
     robot.end();
 }
 
-/// The pose comes out in cycles of three frames, and id 1 switches DO1.
+/// The pose is sent in cycles of three frames, and id 1 switches DO1.
 fn system(interface: &str, robot: &HostSim) {
     let dump = Candump::start(interface);
     let frames = until("ten cycles", || Some(dump.frames()).filter(|frames| frames.len() > 32));
@@ -101,7 +101,7 @@ fn system_controller(interface: &str) {
 }
 
 fn system_gateway(interface: &str) {
-    // The controller's own CAN port is on another bus: a user-space one.
+    // The controller's own CAN port is on another bus, in user space.
     let file = example("can-system-controller.toml");
     let robot = BINARY.controller(&file, &["--bind=can=slcan-tcp:127.0.0.1:0"]);
     let gateway = BINARY.gateway(&example("can-system.toml"), &robot, &[&bind("can-1", interface)]);
@@ -119,7 +119,7 @@ fn hand(interface: &str) {
     dump.wait_for("501#C8C8C8C8C8C8");
     cansend(interface, "502#0307F401");
     register(&robot, "WordInputReg[3]", 500.0);
-    // The hand says no more: it is not there.
+    // The hand is silent: its state becomes 0.
     register(&robot, "WordInputReg[1]", 0.0);
     register(&robot, "WordInputReg[3]", 500.0);
     gateway.end();
@@ -149,10 +149,10 @@ fn python_can(interface: &str) {
 
 fn refused_frames(interface: &str) {
     let robot = controller("can-system-controller.toml", interface);
-    // Not of the recipe: an id, a kind of id. The kernel keeps them back, and they are not counted.
+    // An unknown id, and the other kind of id: the kernel filters them out, so they are not counted.
     cansend(interface, "005#01");
     cansend(interface, "00000001#01");
-    // Of the recipe, but not as declared.
+    // Ids of the recipe with another content.
     cansend(interface, "001#R1");
     cansend(interface, "001#0101");
     cansend(interface, "001#");
@@ -180,7 +180,7 @@ fn replay(interface: &str) {
     });
     robot.end();
     for part in ["input", "output"] {
-        // What `decode` prints is what `encode` takes.
+        // `encode` reads what `decode` prints.
         let values = convert("decode", part, &log.join("\n"));
         let again = convert("encode", part, &values);
         let is_input = |line: &&String| line.contains(" 001#") == (part == "input");
@@ -188,7 +188,7 @@ fn replay(interface: &str) {
         assert!(expected.len() >= 40);
         assert_eq!(again.lines().collect::<Vec<_>>(), expected, "{part}");
     }
-    // The log put on the bus again, by canplayer, does to another controller what it did to the first.
+    // canplayer replays the log: it has the same effect on another controller as on the first.
     let robot = controller("can-system-controller.toml", interface);
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("bus.log");

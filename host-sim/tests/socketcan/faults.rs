@@ -1,4 +1,4 @@
-//! What goes wrong on a bus and with an interface, for real where the kernel has it.
+//! Faults of a bus and of an interface, by the kernel itself where it can make them.
 
 use std::time::Duration;
 
@@ -30,7 +30,7 @@ pub(crate) fn trials(interface: &str) -> Vec<Test> {
     ]
 }
 
-/// The hand's gateway, which sends one frame each 20 ms.
+/// The gateway of the hand's example, which sends one frame each 20 ms.
 fn hand(interface: &str) -> (HostSim, HostSim) {
     let robot = BINARY.controller(&example("can-hand-controller.toml"), &[]);
     let bind = format!("--bind=hand=socketcan:{interface}");
@@ -50,27 +50,27 @@ fn bus_off() {
     let open = "t5016000000000000\r";
     let closed = "t5016C8C8C8C8C8C8\r";
     until("the open hand", || adapter.received().contains(open).then_some(()));
-    adapter.say("t50240001F401");
+    adapter.send("t50240001F401");
     gateway.stats("a frame in", |stats| stats["ports"]["hand"]["frames_in"] == 1);
     let reported =
         |state: &str| gateway.stats(state, |stats| stats["ports"]["hand"]["device"]["bus"] == state);
     reported("active");
-    adapter.say("sw100010");
+    adapter.send("sw100010");
     reported("warning");
-    adapter.say("sp130010");
+    adapter.send("sp130010");
     reported("passive");
     adapter.forget();
     until("frames while passive", || adapter.received().contains(open).then_some(()));
 
-    adapter.say("sb000256");
+    adapter.send("sb000256");
     reported("bus-off");
     let stats = gateway.fresh();
     assert_eq!(stats["ports"]["hand"]["bus_offs"], 1, "{stats}");
     until("a warning", || gateway.log("bus-off: nothing is sent").pop());
     let sent = stats["ports"]["hand"]["frames_out"].as_u64();
     adapter.forget();
-    // Told by the adapter, but the driver was not started again.
-    adapter.say("sa000000");
+    // The adapter reports it, but the driver was not restarted.
+    adapter.send("sa000000");
     robot.command("run(grip.jspf)", "run start");
     robot.stats("the grip", |stats| stats["registers"]["WordOutputReg[6]"].as_f64() == Some(200.0));
     let links = |stats: &serde_json::Value| {
@@ -83,7 +83,7 @@ fn bus_off() {
     assert_eq!(stats["ports"]["hand"]["device"]["bus"], "bus-off", "{stats}");
     assert_eq!(adapter.received(), "", "nothing reaches the adapter");
 
-    // This driver is started again by hand; others have `restart-ms`.
+    // This driver is restarted by taking the interface down and up; others have `restart-ms`.
     tool("ip link set hsslc0 down");
     tool("ip link set hsslc0 up");
     until("the closed hand", || adapter.received().contains(closed).then_some(()));
@@ -110,7 +110,7 @@ fn error_frames(interface: &str) {
         cansend(interface, frame);
         reported(state);
     }
-    // CAN_ERR_BUSOFF. This interface is not really off: the driver's carrier tells that at the next look.
+    // CAN_ERR_BUSOFF. This interface is not really off: the next check of its carrier shows that.
     cansend(interface, "20000040#0000000000000000");
     let stats = gateway.stats("bus-off", |stats| stats["ports"]["hand"]["bus_offs"] == 1);
     assert_eq!(stats["ports"]["hand"]["device"]["restarts"], 0, "{stats}");
@@ -131,7 +131,7 @@ fn error_frames(interface: &str) {
     robot.end();
 }
 
-/// Frames flow both ways, and this is how often the port came up.
+/// Checks that frames pass in both directions, and how often the port came up.
 #[track_caller]
 fn works(interface: &str, robot: &HostSim, value: u8, ups: u64) {
     let dump = Candump::start(interface);
@@ -146,7 +146,7 @@ fn works(interface: &str, robot: &HostSim, value: u8, ups: u64) {
 fn down_and_up() {
     let bus = Vcan::new("hsdown0");
     tool("ip link set hsdown0 down");
-    // An interface that is down is no mistake: it may come up later.
+    // An interface that is down is no error: it may come up later.
     let robot = system(bus.0);
     assert_eq!(robot.fresh()["ports"]["can"]["device"]["ups"], 0);
     for (value, ups) in [(1, 1), (2, 2), (3, 3)] {
@@ -190,7 +190,7 @@ fn deleted() {
 
 fn no_room() {
     let bus = Vcan::new("hstbf0");
-    // A third of what the cycle of three frames needs, and room for ten.
+    // A third of the bit rate that the cycle of three frames needs, and a queue of ten.
     tool("tc qdisc add dev hstbf0 root tbf rate 32kbit burst 64b limit 160");
     let dump = Candump::start(bus.0);
     let robot = system(bus.0);
@@ -204,7 +204,7 @@ fn no_room() {
     for pair in ids.windows(2) {
         assert!(matches!(pair, b"23" | b"34" | b"42"), "out of order: {}", String::from_utf8_lossy(&ids));
     }
-    // As good as no room: what waits too long is given up, and the program stays well.
+    // A queue of one: frames that wait too long are given up, and the program keeps running.
     tool("tc qdisc change dev hstbf0 root tbf rate 80bit burst 64b limit 160");
     robot.stats("given up", |stats| stats["ports"]["can"]["device"]["dropped"].as_u64() > Some(3));
     tool("tc qdisc del dev hstbf0 root");
@@ -251,7 +251,7 @@ fn overrun(interface: &str) {
     let port = &stats["ports"]["can-1"];
     assert!(port["device"]["overruns"].as_u64() > Some(0), "{port}");
     assert!(port["device"]["frames_in"].as_u64() > Some(100), "{port}");
-    // Taken, or refused if that took so long that it was a sleep.
+    // Accepted, or rejected if the stall was so long that it counts as sleep.
     let count = |name: &str| port[name].as_u64().unwrap();
     assert_eq!(count("frames_in") + count("asleep"), port["device"]["frames_in"], "{port}");
     goes_on(interface, &gateway, &robot);
@@ -278,7 +278,7 @@ fn stopped(interface: &str) {
     robot.end();
 }
 
-/// It goes on as if nothing had been, once its links are up.
+/// Checks that it works as before, once its links are up.
 fn goes_on(interface: &str, gateway: &HostSim, robot: &HostSim) {
     let links_up =
         |stats: &Value| stats["links"].as_object().unwrap().values().all(|link| link["state"] == "up");
@@ -289,7 +289,7 @@ fn goes_on(interface: &str, gateway: &HostSim, robot: &HostSim) {
     robot.stats("the newest", |stats| stats["registers"]["WordInputReg[1]"].as_f64() == Some(4.0));
 }
 
-/// Longer than a gateway may be away without having slept.
+/// Longer than a stall that does not count as sleep.
 const STOPPED: Duration = Duration::from_secs(1);
 
 fn no_interface(_: &str) {

@@ -14,9 +14,9 @@ pub(crate) fn trials(interface: &str) -> Vec<Test> {
     vec![("a_bus_at_full_load", Needs::Nothing, Box::new(move || full_load(&interface)))]
 }
 
-/// A frame with eight bytes and the space after it has 111 bits without stuffing: at 500 kbit/s.
+/// Time of a frame of eight bytes and the space after it at 500 kbit/s: 111 bits without stuffing.
 const FRAME_NANOS: u64 = 222_000;
-/// As many as come in the pause of a thread that the system wakes 100 times a second, and some more.
+/// More than come between two wake-ups of a thread that the system wakes 100 times a second.
 const BURST: u64 = 64;
 
 /// Each frame carries its number and is answered with a number.
@@ -64,7 +64,7 @@ fn full_load(interface: &str) {
     while begin.elapsed().as_secs_f64() < seconds {
         let due = paced.elapsed().as_nanos() as u64 / FRAME_NANOS;
         paced += Duration::from_nanos(due * FRAME_NANOS);
-        // A bus does not make up for time in which this machine did something else.
+        // A bus does not catch up after time in which this machine was busy.
         for _ in 0..due.min(BURST) {
             sent += 1;
             sender.write_frame(&numbered(sent)).unwrap();
@@ -101,7 +101,7 @@ fn full_load(interface: &str) {
         f64::from(sent) / seconds,
         answers.count,
     );
-    // What the kernel dropped may also have been a returned answer.
+    // The kernel may also have dropped a received answer.
     assert!(read <= u64::from(sent) && read + lost + backlog >= u64::from(sent), "{port}");
     assert_eq!(number(&port["frames_in"]), read, "no frame is lost that the kernel delivered");
     assert_eq!(number(&port["frames_out"]), answered, "{port}");
@@ -112,7 +112,7 @@ fn full_load(interface: &str) {
     robot.end();
 }
 
-/// Frames and packets that the kernel dropped before any socket could count them: its queue was full.
+/// Number of frames and packets that the kernel dropped from a full queue, before sockets could count them.
 fn dropped_before_sockets() -> u64 {
     let per_processor = std::fs::read_to_string("/proc/net/softnet_stat").unwrap();
     let dropped = per_processor.lines().filter_map(|line| line.split_whitespace().nth(1));
@@ -125,7 +125,7 @@ fn numbered(number: u32) -> CanFrame {
     CanFrame::new(StandardId::new(1).unwrap(), &data).unwrap()
 }
 
-/// The gateway's answers, whose numbers must not miss one.
+/// The gateway's answers, whose numbers must have no gaps.
 struct Answers {
     socket: CanSocket,
     count: u32,

@@ -1,15 +1,15 @@
-//! CAN interfaces of the kernel: the programs as separate processes on a bus of Linux.
+//! CAN interfaces of the kernel: the programs as separate processes on a CAN interface of Linux.
 //!
 //! `HOST_SIM_VCAN` chooses where:
 //!
-//! * `HOST_SIM_VCAN=uml cargo test --test socketcan`: on a kernel of its own, which is an ordinary
-//!   process (`tests/uml/run`); no privileges are needed.
-//! * `HOST_SIM_VCAN=vcan0 cargo test --test socketcan`: on this machine's interface of that name. What
-//!   changes interfaces needs root, and is skipped without.
+//! * `HOST_SIM_VCAN=uml cargo test --test socketcan`: on a separate kernel that runs as an ordinary process
+//!   (`tests/uml/run`); no privileges are needed.
+//! * `HOST_SIM_VCAN=vcan0 cargo test --test socketcan`: on this machine's interface of that name. Tests that
+//!   change interfaces need root; without it they are counted as ignored.
 //! * Without it every test is counted as ignored.
 //!
-//! `HOST_SIM_PYTHON` is a Python that has python-can. `HOST_SIM_LOAD_SECONDS` is how long the run under
-//! full load takes (2).
+//! `HOST_SIM_PYTHON` is a Python with python-can. `HOST_SIM_LOAD_SECONDS` is the length of the run under full
+//! load (default 2).
 
 mod adapter;
 mod examples;
@@ -25,13 +25,13 @@ use recipe_test_kit::Binary;
 
 const BINARY: Binary = Binary(env!("CARGO_BIN_EXE_host-sim"));
 
-/// What a test needs beside the interface.
+/// What a test needs in addition to the interface.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Needs {
     Nothing,
-    /// To make interfaces and take them down.
+    /// Permission to make interfaces and take them down.
     Root,
-    /// A Python that has python-can.
+    /// A Python with python-can.
     Python,
     /// Root, and the kernel's driver for adapters on serial lines.
     Slcan,
@@ -42,7 +42,7 @@ const HOW: &str = "HOST_SIM_VCAN=uml cargo test --test socketcan (Debian: apt-ge
 
 fn main() -> ExitCode {
     let mut arguments = Arguments::from_args();
-    // They share a bus.
+    // The tests share a bus.
     arguments.test_threads = Some(1);
     let chosen = std::env::var("HOST_SIM_VCAN").ok().filter(|chosen| !chosen.is_empty());
     if chosen.as_deref() == Some("uml") && !arguments.list {
@@ -72,10 +72,10 @@ fn main() -> ExitCode {
     libtest_mimic::run(&arguments, trials.collect()).exit_code()
 }
 
-/// A test's name, needs and what it does.
+/// A test's name, needs and function.
 type Test = (&'static str, Needs, Box<dyn FnOnce() + Send>);
 
-/// What keeps a test from running.
+/// What a test needs and this machine lacks.
 fn missing(interface: &str, needs: Needs) -> Option<&'static str> {
     let root = rustix::process::geteuid().is_root();
     if interface.is_empty() {
@@ -89,7 +89,7 @@ fn missing(interface: &str, needs: Needs) -> Option<&'static str> {
     }
 }
 
-/// The Python to run: the named one, or that of the foreign clients when it is there.
+/// The Python to run: the configured one, or that of the foreign clients if it exists.
 fn python() -> Option<PathBuf> {
     if let Some(python) = std::env::var_os("HOST_SIM_PYTHON") {
         return Some(python.into());

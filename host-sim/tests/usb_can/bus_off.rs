@@ -1,4 +1,4 @@
-//! Bus-off: this driver leaves the interface its carrier, and cannot start the adapter again.
+//! Bus-off: this driver does not take the interface's carrier away, and cannot restart the adapter.
 
 use std::process::Command;
 
@@ -26,7 +26,7 @@ fn bus_off() {
     let port = cell.bus("bus-off");
     assert_eq!(port["bus_offs"], 1, "{port}");
     until("a warning", || cell.gateway.log("bus-off: nothing is sent").pop());
-    // The driver says nothing of it by the carrier, and cannot end it.
+    // The carrier does not show it, and the driver cannot end it.
     let carrier = std::fs::read_to_string(format!("/sys/class/net/{INTERFACE}/carrier")).unwrap();
     assert_eq!(carrier.trim(), "1");
     let restart = Command::new("ip").args(["link", "set", INTERFACE, "type", "can", "restart"]).output();
@@ -40,7 +40,7 @@ fn bus_off() {
         assert_eq!(port["device"]["frames_out"], sent, "nothing is sent: {port}");
     });
     assert_eq!(adapter.given(), given);
-    // As root one can do without the adapter: the interface is started anew.
+    // Root can take the interface down and up, whatever the adapter does.
     adapter.forget();
     adapter.becomes(Bus::Sound);
     tool(&format!("ip link set {INTERFACE} down"));
@@ -55,16 +55,16 @@ fn restarts() {
     let adapter = Adapter::up(1_000_000);
     let cell = Cell::hand();
     adapter.sends_a(OPEN);
-    let ways = [Restart::Firmware, Restart::Controller, Restart::Unsaid];
+    let ways = [Restart::Firmware, Restart::Controller, Restart::Silent];
     for (bus_offs, how) in (1_u16..).zip(ways) {
         adapter.becomes(Bus::Shorted);
         cell.port("bus-off", |port| port["bus_offs"] == bus_offs);
         adapter.forget();
         adapter.becomes(Bus::Sound);
         adapter.restarts(how);
-        if how == Restart::Unsaid {
-            // Only that it hears something shows that it is back.
-            adapter.hears("502#0307F401");
+        if how == Restart::Silent {
+            // Only a received frame shows that it is back.
+            adapter.receive_from_bus("502#0307F401");
         }
         let port = cell.bus("active");
         assert_eq!(port["device"]["restarts"], 1, "only the first says so, {how:?}: {port}");
@@ -99,10 +99,10 @@ fn stays_shorted() {
 fn starts() {
     let adapter = Adapter::up(1_000_000);
     adapter.becomes(Bus::Shorted);
-    // Another program's frame.
+    // A frame of another program.
     cansend(INTERFACE, "123#");
-    let told = || tool(&format!("ip -details link show {INTERFACE}"));
-    until("the driver knows", || told().contains("state BUS-OFF").then_some(()));
+    let details = || tool(&format!("ip -details link show {INTERFACE}"));
+    until("the driver knows", || details().contains("state BUS-OFF").then_some(()));
     let given = adapter.given();
     let cell = Cell::hand();
     cell.looks_on(|port| {

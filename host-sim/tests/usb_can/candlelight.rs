@@ -1,59 +1,58 @@
-//! A candleLight adapter: its firmware's protocol (gs_usb), a CAN controller that counts errors as ISO
-//! 11898-1 has it, and the bus that it is on.
+//! A candleLight adapter: its firmware's protocol (gs_usb), a CAN controller that counts errors by ISO
+//! 11898-1, and its bus.
 //!
-//! In: what the driver sends, and what happens on the bus. Out: what the driver hears, and the frames that
-//! were on the bus. Refuses to know USB/IP and the kernel. Time does not pass here: a frame that can leave
-//! leaves at once, what takes an adapter 100 ms is told by the test.
+//! In: what the driver sends, and events on the bus. Out: what the driver receives, and the frames that were
+//! on the bus. Does not know USB/IP and the kernel. There is no time: frames are sent at once, and the test
+//! triggers what takes an adapter 100 ms.
 //!
-//! As the firmware of 2026 for bxCAN does it (candleLight_fw, `src/can_common.c`, `src/can/bxcan.c`): a
-//! frame is echoed when it is in one of three mailboxes, before it was on the bus.
+//! Like the firmware of 2026 for bxCAN (candleLight_fw, `src/can_common.c`, `src/can/bxcan.c`), it echoes a
+//! frame when it is put into one of three mailboxes, before it is on the bus.
 
 use std::collections::VecDeque;
 
 use super::usb::{Function, Request};
 
-/// What frames meet on the bus.
+/// The state of the bus.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Bus {
-    /// Somebody acknowledges.
+    /// Another node acknowledges.
     Sound,
-    /// Nobody else is there.
+    /// There is no other node.
     Empty,
-    /// No bit comes back as it was sent.
+    /// Every bit is read back wrong.
     Shorted,
 }
 
-/// How an adapter gets on the bus again after bus-off.
+/// How an adapter recovers from bus-off.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Restart {
-    /// By its firmware, which empties the mailboxes and says so: since 2026.
+    /// The firmware empties the mailboxes and reports it: since 2026.
     Firmware,
-    /// By its controller, which sends what is in the mailboxes; the firmware says that it is error-active:
-    /// since 2020.
+    /// The CAN controller sends what is in the mailboxes, and the firmware reports error-active: since 2020.
     Controller,
-    /// The same, and nobody says anything: before.
-    Unsaid,
+    /// Same, without a report: before 2020.
+    Silent,
 }
 
 /// The adapter.
 pub(crate) struct CandleLight {
     bus: Bus,
-    /// Bit/s, once the driver has set it.
+    /// In bit/s; `None` until the driver has set it.
     bitrate: Option<u32>,
     on: bool,
     transmit_errors: u16,
     receive_errors: u16,
-    /// The state that was told last.
-    told: State,
-    /// From the driver, not in a mailbox yet.
+    /// The state that was last reported.
+    reported: State,
+    /// Frames from the driver that are not in a mailbox yet.
     queue: VecDeque<HostFrame>,
     mailboxes: VecDeque<HostFrame>,
     to_host: VecDeque<HostFrame>,
-    /// Frames that were on the bus, as `501#0102`.
+    /// Frames that were on the bus, such as `501#0102`.
     sent: Vec<String>,
-    /// How many the driver has sent.
+    /// Number of frames from the driver.
     given: usize,
-    /// How many frames of others the driver was told.
+    /// Number of other nodes' frames that were passed to the driver.
     heard: u64,
 }
 
@@ -65,7 +64,7 @@ impl CandleLight {
             on: false,
             transmit_errors: 0,
             receive_errors: 0,
-            told: State::Active,
+            reported: State::Active,
             queue: VecDeque::new(),
             mailboxes: VecDeque::new(),
             to_host: VecDeque::new(),
@@ -83,34 +82,34 @@ impl CandleLight {
         self.on
     }
 
-    /// The frames that were on the bus since the last call, as `501#0102`.
+    /// The frames that were on the bus since the last call, such as `501#0102`.
     pub(crate) fn sent(&mut self) -> Vec<String> {
         std::mem::take(&mut self.sent)
     }
 
-    /// How many frames the driver has sent so far, whatever became of them.
+    /// Number of frames that the driver has sent so far, whether they were on the bus or not.
     pub(crate) fn given(&self) -> usize {
         self.given
     }
 
-    /// How many frames of others the driver was told so far.
+    /// Number of other nodes' frames that were passed to the driver so far.
     pub(crate) fn heard(&self) -> u64 {
         self.heard
     }
 
-    /// The bus is like this from now on.
+    /// Changes the state of the bus.
     pub(crate) fn becomes(&mut self, bus: Bus) {
         self.bus = bus;
         self.work();
     }
 
-    /// Somebody else sends a frame.
-    pub(crate) fn hears(&mut self, frame: &str) {
+    /// Another node sends a frame.
+    pub(crate) fn receive_from_bus(&mut self, frame: &str) {
         self.hear(HostFrame::heard(frame, 0));
     }
 
-    /// Somebody else sent more than the adapter could keep, and then this. Firmware that tells of it
-    /// marks the frame; candleLight's own never does.
+    /// Another node sends this frame after others that the adapter has lost. Some firmware marks such a frame;
+    /// candleLight's never does.
     pub(crate) fn hears_after_a_loss(&mut self, frame: &str) {
         self.hear(HostFrame::heard(frame, FLAG_OVERFLOW));
     }
@@ -124,7 +123,7 @@ impl CandleLight {
         }
     }
 
-    /// Somebody else sends frames that cannot be read, at another bit rate perhaps.
+    /// Another node sends unreadable frames, as with another bit rate.
     pub(crate) fn hears_noise(&mut self, frames: u16) {
         for _ in 0..frames {
             self.receive_errors = (self.receive_errors + 1).min(PASSIVE);
@@ -132,7 +131,7 @@ impl CandleLight {
         }
     }
 
-    /// Gets on the bus again after bus-off.
+    /// Recovers from bus-off.
     pub(crate) fn restarts(&mut self, how: Restart) {
         assert_eq!(self.state(), State::BusOff);
         (self.transmit_errors, self.receive_errors) = (0, 0);
@@ -143,7 +142,7 @@ impl CandleLight {
                 self.tell_state();
             }
             Restart::Controller => self.tell_state(),
-            Restart::Unsaid => self.told = State::Active,
+            Restart::Silent => self.reported = State::Active,
         }
         self.work();
     }
@@ -152,7 +151,7 @@ impl CandleLight {
         State::of(self.transmit_errors.max(self.receive_errors))
     }
 
-    /// Whatever can be done now is done.
+    /// Sends what can be sent, and fills the mailboxes.
     fn work(&mut self) {
         self.tell_state();
         while self.on {
@@ -167,7 +166,7 @@ impl CandleLight {
         }
     }
 
-    /// Tries to send the first frame. `false` when there is none, or when trying again changes nothing.
+    /// Tries to send the first frame. Returns false if there is none, or if another try would change nothing.
     fn try_to_send(&mut self) -> bool {
         let Some(frame) = self.mailboxes.front() else { return false };
         match self.bus {
@@ -176,7 +175,7 @@ impl CandleLight {
                 self.mailboxes.pop_front();
                 self.transmit_errors = self.transmit_errors.saturating_sub(1);
             }
-            // An error-passive sender does not count that nobody acknowledges: it never goes bus-off.
+            // An error-passive sender does not count missing acknowledgements, so it never goes bus-off.
             Bus::Empty if self.transmit_errors >= PASSIVE => return false,
             Bus::Empty | Bus::Shorted => self.transmit_errors += 8,
         }
@@ -184,13 +183,13 @@ impl CandleLight {
         true
     }
 
-    /// An error frame, if the state is another than the one that was told.
+    /// Reports the state by an error frame, if it has changed.
     fn tell_state(&mut self) {
         let state = self.state();
-        if !self.on || state == self.told {
+        if !self.on || state == self.reported {
             return;
         }
-        self.told = state;
+        self.reported = state;
         if state == State::BusOff {
             self.to_host.push_back(HostFrame::error(ERROR_BUS_OFF, [0; 8]));
             return;
@@ -203,7 +202,7 @@ impl CandleLight {
         if receiver >= sender {
             data[1] |= receiver.flag(0);
         }
-        // It counts no further than this, once it is not bus-off.
+        // The counter stops here unless the node is bus-off.
         data[6] = self.transmit_errors.min(255) as u8;
         data[7] = self.receive_errors.min(255) as u8;
         self.to_host.push_back(HostFrame::error(ERROR_CONTROLLER | ERROR_COUNTERS, data));
@@ -211,7 +210,7 @@ impl CandleLight {
 
     fn start(&mut self) {
         (self.transmit_errors, self.receive_errors) = (0, 0);
-        self.told = State::Active;
+        self.reported = State::Active;
         self.on = true;
         self.work();
     }
@@ -242,7 +241,7 @@ impl Function for CandleLight {
             (SET_DEVICE | SET_INTERFACE, SET_CONFIGURATION | CLEAR_FEATURE | SET_ALTERNATE) => Some(vec![]),
             (SET, HOST_FORMAT) => Some(vec![]),
             (GET, DEVICE_CONFIG) => Some(words(&[0, 2, 1])),
-            // Features, clock, bounds of both segments, of the jump width, and of the prescaler.
+            // Features, clock, limits of both segments, of the jump width, and of the prescaler.
             (GET, BIT_TIMING_LIMITS) => Some(words(&[ONE_SHOT, CLOCK, 1, 16, 1, 8, 4, 1, 1_024, 1])),
             (SET, BIT_TIMING) => {
                 let (propagation, first, second, prescaler) = (word(0)?, word(1)?, word(2)?, word(4)?);
@@ -295,7 +294,7 @@ impl State {
         }
     }
 
-    /// In the second byte of an error frame: of the receiver, or, one place higher, of the sender.
+    /// The bit in the second byte of an error frame for the receiver; the next higher one is for the sender.
     fn flag(self, place: u32) -> u8 {
         match self {
             Self::Active => 0x40,
@@ -306,7 +305,7 @@ impl State {
     }
 }
 
-/// `struct gs_host_frame`: which echo it is, id and flags, length, channel, flags, reserved, data.
+/// `struct gs_host_frame`: echo id, CAN id and flags, length, channel, flags, reserved, data.
 #[derive(Debug, Clone, Copy)]
 struct HostFrame([u8; 20]);
 
@@ -325,7 +324,7 @@ impl HostFrame {
         Self::new(ERROR_FLAG | class, 0, &data)
     }
 
-    /// A data frame with a standard id, from its text.
+    /// A data frame with a standard id, from text such as `501#0102`.
     fn heard(frame: &str, flags: u8) -> Self {
         let (id, data) = frame.split_once('#').unwrap();
         let places = (0..data.len()).step_by(2);
@@ -333,7 +332,7 @@ impl HostFrame {
         Self::new(u32::from_str_radix(id, 16).unwrap(), flags, &data)
     }
 
-    /// As can-utils write it.
+    /// As text in the format of can-utils.
     fn text(&self) -> String {
         let id = u32::from_le_bytes(self.0[4..8].try_into().unwrap());
         let data = &self.0[12..][..usize::from(self.0[8])];
@@ -353,28 +352,29 @@ fn string(text: &str) -> Vec<u8> {
     bytes
 }
 
-/// Full speed, 0x1d50:0x606f.
+/// The device descriptor: full speed, 0x1d50:0x606f.
 const DEVICE: [u8; 18] = [18, 1, 0x00, 0x02, 0, 0, 0, 64, 0x50, 0x1D, 0x6F, 0x60, 0, 0, 1, 1, 1, 1];
-/// One interface of the vendor's class, with endpoints 0x81 and 0x02 for bulk transfers of 64 bytes.
+/// The configuration descriptor: one vendor-specific interface, with endpoints 0x81 and 0x02 for bulk transfers
+/// of 64 bytes.
 const CONFIGURATION: [u8; 32] = [
     9, 2, 32, 0, 1, 1, 0, 0x80, 75, // 150 mA
     9, 4, 0, 0, 2, 0xFF, 0xFF, 0xFF, 0, //
     7, 5, 0x81, 2, 64, 0, 0, //
     7, 5, 0x02, 2, 64, 0, 0,
 ];
-/// Kinds of control requests: of USB itself, and the vendor's to the interface.
+/// Kinds of control requests: standard ones, and vendor-specific ones to the interface.
 const GET_FROM_DEVICE: u8 = 0x80;
 const SET_DEVICE: u8 = 0x00;
 const SET_INTERFACE: u8 = 0x01;
 const GET: u8 = 0xC1;
 const SET: u8 = 0x41;
-/// USB's own.
+/// Standard requests.
 const GET_STATUS: u8 = 0;
 const CLEAR_FEATURE: u8 = 1;
 const GET_DESCRIPTOR: u8 = 6;
 const SET_CONFIGURATION: u8 = 9;
 const SET_ALTERNATE: u8 = 11;
-/// The vendor's.
+/// Vendor-specific requests.
 const HOST_FORMAT: u8 = 0;
 const BIT_TIMING: u8 = 1;
 const MODE: u8 = 2;
@@ -382,21 +382,21 @@ const BIT_TIMING_LIMITS: u8 = 4;
 const DEVICE_CONFIG: u8 = 5;
 const MODE_START: u32 = 1;
 const ONE_SHOT: u32 = 1 << 3;
-/// Hz.
+/// Clock in Hz.
 const CLOCK: u32 = 48_000_000;
-/// Of a frame that is no echo.
+/// Echo id of a frame that is no echo.
 const NO_ECHO: u32 = u32::MAX;
-/// Frames were lost before this one.
+/// Flag: frames were lost before this one.
 const FLAG_OVERFLOW: u8 = 1;
-/// Error frames, as Linux has them in linux/can/error.h.
+/// Error frames (linux/can/error.h).
 const ERROR_FLAG: u32 = 0x2000_0000;
 const ERROR_CONTROLLER: u32 = 0x004;
 const ERROR_BUS_OFF: u32 = 0x040;
 const ERROR_RESTARTED: u32 = 0x100;
 const ERROR_COUNTERS: u32 = 0x200;
-/// Where error states begin.
+/// Values of the error counters at which error states begin.
 const WARNING: u16 = 96;
 const PASSIVE: u16 = 128;
 const BUS_OFF: u16 = 256;
-/// Of the controller.
+/// Modes of the channel.
 const MAILBOXES: usize = 3;

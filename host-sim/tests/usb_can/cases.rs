@@ -1,4 +1,4 @@
-//! An adapter that works, one that is alone, hears noise, loses frames, is pulled out and plugged in.
+//! An adapter that works, is alone on the bus, receives noise, loses frames, is unplugged and plugged in.
 
 use std::fmt::Write;
 
@@ -22,7 +22,7 @@ pub(crate) const CASES: &[Case] = &[
 /// The worked example's captured frame.
 const POSE: &str = "002#EF54EF3EA7E7D13E";
 
-/// The pose goes out, in cycles of three frames, and id 1 switches DO1..8.
+/// The pose is sent in cycles of three frames, and id 1 switches DO1..8.
 #[track_caller]
 fn serves(adapter: &Adapter, robot: &HostSim, value: u8) {
     adapter.forget();
@@ -74,20 +74,20 @@ fn nobody_acknowledges() {
     adapter.becomes(Bus::Empty);
     adapter.forget();
     let port = cell.bus("passive");
-    // The sender's errors are counted up to here and no further: it is on the bus, alone.
+    // The transmit error counter stops here: the adapter stays on the bus, alone.
     let counters = (&port["device"]["tx_error_counter"], &port["device"]["rx_error_counter"]);
     assert_eq!(counters, (&128.into(), &0.into()), "{port}");
     until("a warning", || cell.gateway.log("error-passive").pop());
     let (sent, given) = (port["device"]["frames_out"].as_u64().unwrap(), adapter.given());
     let skipped = cell.port("skipped cycles", |port| port["skipped_cycles"].as_u64() > Some(20));
-    // Three that the adapter keeps, and a cycle that waits for them.
+    // Three in the adapter, and a cycle that waits for them.
     assert!(skipped["device"]["frames_out"].as_u64() <= Some(sent + 6), "{skipped}");
     assert!(adapter.given() <= given + 6);
     assert_eq!((&skipped["device"]["dropped"], &skipped["downs"]), (&0.into(), &0.into()), "{skipped}");
 
     adapter.becomes(Bus::Sound);
     in_order(&adapter.sends(60));
-    // Each frame that left takes one error off.
+    // Each frame that is sent decrements the error counter.
     let port = cell.bus("active");
     assert!(port["device"]["tx_error_counter"].as_u64() < Some(96), "{port}");
     serves(&adapter, &cell.robot, 2);
@@ -112,8 +112,8 @@ fn no_buffers() {
     let adapter = Adapter::up(500_000);
     adapter.becomes(Bus::Empty);
     let cell = Cell::of(&path);
-    // Three in the adapter's mailboxes, ten in the driver, ten and sometimes one more in the interface's
-    // queue; the others are refused, again and again, and at last given up.
+    // Three in the adapter's mailboxes, ten in the driver, ten or eleven in the interface's queue. The others
+    // are refused repeatedly, and then given up.
     let port = cell.port("given up", |port| port["device"]["dropped"].as_u64() > Some(0));
     let count = |name: &str| port["device"][name].as_u64().unwrap();
     let taken = count("frames_out");
@@ -131,7 +131,7 @@ fn no_buffers() {
     let sent = ids(&adapter.sends(4 * whole.len()));
     let cycles: Vec<&[u64]> = sent.chunk_by(|first, second| first < second).collect();
     for cycle in &cycles {
-        // A machine that is slow for 100 ms may give up the rest of a later one, too.
+        // On a machine that is slow for 100 ms, the rest of a later cycle may be given up, too.
         assert_eq!(*cycle, &whole[..cycle.len()], "in order: {sent:?}");
     }
     assert_eq!(cycles[0].len() as u64, taken, "those that waited: {sent:?}");
@@ -153,9 +153,9 @@ fn error_passive() {
     }
     let warning = until("a warning", || cell.gateway.log("error-passive").pop());
     assert!(warning.contains("tx_error_counter=0 rx_error_counter=128"), "{warning}");
-    // Each frame that can be read takes one off.
+    // Each readable frame decrements the error counter.
     for value in 0..40 {
-        adapter.hears(&format!("001#{value:02X}"));
+        adapter.receive_from_bus(&format!("001#{value:02X}"));
     }
     let port = cell.bus("active");
     assert_eq!(port["device"]["rx_error_counter"], 95, "{port}");
@@ -200,11 +200,11 @@ fn unplugged() {
             let warnings = cell.gateway.log("interface lost, will be reopened");
             (warnings.len() == usize::from(round)).then_some(())
         });
-        // The hand is not there.
+        // There is no hand.
         cell.register("WordInputReg[1]", 0.0);
         cell.robot.command("run(grip.jspf)", "run start");
 
-        // Plugged in, but nobody has set its bit rate and brought it up.
+        // Plugged in, but without bit rate and not up.
         adapter = Adapter::new();
         if round == 1 {
             cell.looks_on(|port| assert_eq!(port["device"]["ups"], round, "{port}"));

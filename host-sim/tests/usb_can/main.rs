@@ -1,15 +1,15 @@
-//! CAN interfaces that a real driver made of a USB adapter: the programs as separate processes on an
-//! adapter without hardware ([`candlelight`]), under the kernel's `gs_usb`.
+//! CAN interfaces of a USB adapter with a real driver: the programs as separate processes, on a simulated
+//! adapter ([`candlelight`]) with the kernel's `gs_usb`.
 //!
 //! `HOST_SIM_USB_CAN` chooses where:
 //!
-//! * `HOST_SIM_USB_CAN=qemu cargo test --test usb_can`: on Debian's stock kernel in an emulated PC
-//!   (`tests/pc/run`), which `host-sim/tests/pc/kernel` gets; no privileges are needed.
+//! * `HOST_SIM_USB_CAN=qemu cargo test --test usb_can`: on Debian's stock kernel, which
+//!   `host-sim/tests/pc/kernel` downloads, in an emulated PC (`tests/pc/run`); no privileges are needed.
 //! * `HOST_SIM_USB_CAN=here cargo test --test usb_can`: on this machine's kernel, as root, after
 //!   `modprobe -a vhci_hcd gs_usb`. There must be no interface `can0`.
 //! * Without it every test is counted as ignored.
 //!
-//! Only what a real driver does otherwise is tested here; the rest is in `tests/socketcan`.
+//! Only what is different with a real driver is tested here; the rest is in `tests/socketcan`.
 
 mod bus_off;
 mod candlelight;
@@ -32,7 +32,7 @@ const HOW: &str = "host-sim/tests/pc/kernel && HOST_SIM_USB_CAN=qemu cargo test 
 
 fn main() -> ExitCode {
     let mut arguments = Arguments::from_args();
-    // They all use can0.
+    // All tests use can0.
     arguments.test_threads = Some(1);
     let chosen = std::env::var("HOST_SIM_USB_CAN").unwrap_or_default();
     if chosen == "qemu" && !arguments.list {
@@ -56,5 +56,5 @@ fn main() -> ExitCode {
     libtest_mimic::run(&arguments, trials.collect()).exit_code()
 }
 
-/// A test's name, and what it does.
+/// A test's name and function.
 type Case = (&'static str, fn());

@@ -1,4 +1,4 @@
-//! An adapter that is plugged in, and programs on its interface.
+//! A plugged-in adapter, and programs on its interface.
 
 use std::path::Path;
 
@@ -10,17 +10,17 @@ use super::usb::Plugged;
 use recipe_test_kit::can::tool;
 use recipe_test_kit::{HostSim, example, until};
 
-/// What the kernel calls the first adapter.
+/// The kernel's name of the first adapter's interface.
 pub(crate) const INTERFACE: &str = "can0";
 
 /// An adapter that is plugged in.
 pub(crate) struct Adapter(Plugged<CandleLight>);
 
 impl Adapter {
-    /// Plugs it in; its interface is there, and down.
+    /// Plugs it in; its interface exists and is down.
     #[track_caller]
     pub(crate) fn new() -> Self {
-        // The port is free before its interface is gone.
+        // A USB port is free before the previous interface is gone.
         until("no adapter is left", || (!is_there()).then_some(()));
         let adapter = Self(Plugged::new(CandleLight::new()));
         until("the adapter's interface", || is_there().then_some(()));
@@ -42,7 +42,7 @@ impl Adapter {
         assert_eq!(self.0.with(|adapter| (adapter.is_on(), adapter.bitrate())), (true, Some(bitrate)));
     }
 
-    /// Pulls it out.
+    /// Unplugs it.
     #[track_caller]
     pub(crate) fn unplug(self) {
         drop(self);
@@ -53,21 +53,21 @@ impl Adapter {
         self.0.with(|adapter| adapter.becomes(bus));
     }
 
-    pub(crate) fn hears(&self, frame: &str) {
-        self.0.with(|adapter| adapter.hears(frame));
+    pub(crate) fn receive_from_bus(&self, frame: &str) {
+        self.0.with(|adapter| adapter.receive_from_bus(frame));
     }
 
-    /// How many frames of others the driver was told so far.
+    /// Number of other nodes' frames that were passed to the driver so far.
     pub(crate) fn heard(&self) -> u64 {
         self.0.with(|adapter| adapter.heard())
     }
 
-    /// Somebody else sends a frame again and again, as devices do, until the controller's register is this:
-    /// a gateway that was held up for half a second discards what waited.
+    /// Another node sends a frame repeatedly, as devices do, until the controller's register has this value. A
+    /// gateway that was stalled for half a second discards waiting frames.
     #[track_caller]
     pub(crate) fn hears_until(&self, frame: &str, robot: &HostSim, register: &str, value: f64) {
         until(&format!("{register} = {value}"), || {
-            self.hears(frame);
+            self.receive_from_bus(frame);
             let found = robot.fresh()["registers"][register].as_f64().unwrap_or(0.0);
             (found == value).then_some(())
         });
@@ -85,7 +85,7 @@ impl Adapter {
         self.0.with(|adapter| adapter.restarts(how));
     }
 
-    /// How many frames the driver has sent so far, whatever became of them.
+    /// Number of frames that the driver has sent so far, whether they were on the bus or not.
     pub(crate) fn given(&self) -> usize {
         self.0.with(|adapter| adapter.given())
     }
@@ -95,7 +95,7 @@ impl Adapter {
         self.0.with(CandleLight::sent);
     }
 
-    /// The frames that are on the bus from now on, once there are so many.
+    /// Waits for this many frames on the bus, from now on.
     #[track_caller]
     pub(crate) fn sends(&self, count: usize) -> Vec<String> {
         let mut sent = Vec::new();
@@ -106,7 +106,7 @@ impl Adapter {
         sent
     }
 
-    /// Waits for a frame on the bus; those up to it are forgotten.
+    /// Waits for a frame on the bus; drops those up to it.
     #[track_caller]
     pub(crate) fn sends_a(&self, frame: &str) {
         until(frame, || self.0.with(CandleLight::sent).iter().any(|sent| sent == frame).then_some(()));
@@ -125,7 +125,7 @@ pub(crate) struct Cell {
 }
 
 impl Cell {
-    /// The hand's: one frame each 20 ms, which follows the controller's word registers.
+    /// The hand's gateway: one frame each 20 ms, which follows the controller's word registers.
     #[track_caller]
     pub(crate) fn hand() -> Self {
         let robot = BINARY.controller(&example("can-hand-controller.toml"), &[]);
@@ -133,7 +133,7 @@ impl Cell {
         Self { robot, gateway, port: "hand" }
     }
 
-    /// The worked example's, but three frames each 20 ms: an emulated processor is no faster.
+    /// The worked example's gateway, with three frames each 20 ms, since an emulated processor is slow.
     #[track_caller]
     pub(crate) fn system() -> Self {
         let elsewhere = "--bind=can=slcan-tcp:127.0.0.1:0";
@@ -142,7 +142,7 @@ impl Cell {
         Self { robot, gateway, port: "can-1" }
     }
 
-    /// One of the hand's controller and this file, whose port is `can`.
+    /// A gateway with this file, whose port is `can`, and the hand's controller.
     #[track_caller]
     pub(crate) fn of(file: &Path) -> Self {
         let robot = BINARY.controller(&example("can-hand-controller.toml"), &[]);
@@ -150,25 +150,25 @@ impl Cell {
         Self { robot, gateway, port: "can" }
     }
 
-    /// What the gateway tells of its port, once it satisfies `found`.
+    /// The gateway's statistics of its port, once they satisfy `found`.
     #[track_caller]
     pub(crate) fn port(&self, what: &str, found: impl Fn(&Value) -> bool) -> Value {
         self.gateway.stats(what, |stats| found(&stats["ports"][self.port]))["ports"][self.port].clone()
     }
 
-    /// What it tells of its port from now on.
+    /// Statistics of its port that were collected after this call.
     #[track_caller]
     pub(crate) fn fresh(&self) -> Value {
         self.gateway.fresh()["ports"][self.port].clone()
     }
 
-    /// What it tells of its port, once the bus is in this state.
+    /// Statistics of its port, once the bus is in this state.
     #[track_caller]
     pub(crate) fn bus(&self, state: &str) -> Value {
         self.port(state, |port| port["device"]["bus"] == state)
     }
 
-    /// A hand tells of its grip until the controller knows.
+    /// The hand sends its grip until the controller has it.
     #[track_caller]
     pub(crate) fn grips(&self, adapter: &Adapter, grip: u16) {
         let [low, high] = grip.to_le_bytes();
@@ -184,10 +184,10 @@ impl Cell {
         });
     }
 
-    /// Looks on for half a second of the gateway's life: it looks at a bus that is off three times in that.
+    /// Waits for half a second of the gateway's time, in which it checks a bus that is off three times.
     #[track_caller]
     pub(crate) fn looks_on(&self, look: impl Fn(&Value)) {
-        // Its statistics come each 50 ms, and these are of two lines later.
+        // Statistics come each 50 ms, and each call takes two lines.
         for _ in 0..5 {
             look(&self.fresh());
         }

@@ -1,9 +1,9 @@
-//! A USB device without hardware: the kernel's `vhci_hcd` has ports that are plugged into a socket, on
-//! which it speaks USB/IP (the kernel's Documentation/usb/usbip_protocol.rst).
+//! A USB device without hardware: a port of the kernel's `vhci_hcd` is connected to a socket, with the
+//! protocol USB/IP (the kernel's Documentation/usb/usbip_protocol.rst).
 //!
-//! In: a [`Function`], which says what the device does with transfers. Out: the device on a port, with
-//! whatever driver the kernel has for it. Refuses to know what the transfers mean. Full speed, control
-//! transfers and one bulk endpoint for each direction; nothing is ever late or lost.
+//! In: a [`Function`], which handles transfers. Out: the device on a port, with the kernel's driver for it.
+//! Does not know what the transfers mean. Full speed, control transfers and one bulk endpoint for each
+//! direction; nothing is ever late or lost.
 
 use std::collections::VecDeque;
 use std::fs;
@@ -15,9 +15,9 @@ use std::sync::{Arc, Mutex, MutexGuard};
 
 use recipe_test_kit::until;
 
-/// What a device does.
+/// The function of a device.
 pub(crate) trait Function: Send + 'static {
-    /// Carries out a control request and answers it; `None` is a stall.
+    /// Carries out a control request and returns the answer; `None` for a stall.
     fn control(&mut self, request: Request, data: &[u8]) -> Option<Vec<u8>>;
     /// Takes a packet of the bulk endpoint from the host.
     fn take(&mut self, packet: &[u8]);
@@ -25,7 +25,7 @@ pub(crate) trait Function: Send + 'static {
     fn next(&mut self) -> Option<Vec<u8>>;
 }
 
-/// The setup packet of a control transfer, as far as devices here look at it.
+/// The used parts of a control transfer's setup packet.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Request {
     /// Direction, kind and recipient.
@@ -34,14 +34,14 @@ pub(crate) struct Request {
     pub(crate) value: u16,
 }
 
-/// A device that is plugged in; dropping it pulls it out.
+/// A device that is plugged in; dropping it unplugs it.
 pub(crate) struct Plugged<F: Function> {
     port: u32,
     device: Arc<Mutex<Device<F>>>,
 }
 
 impl<F: Function> Plugged<F> {
-    /// Plugs it into the first port that is free.
+    /// Plugs it into the first free port.
     #[track_caller]
     pub(crate) fn new(function: F) -> Self {
         let (ours, kernels) = UnixStream::pair().unwrap();
@@ -56,7 +56,7 @@ impl<F: Function> Plugged<F> {
         Self { port, device }
     }
 
-    /// Looks at the function, or has something happen to it; what it then has for the host is sent.
+    /// Calls `look` with the function, then sends what the function has for the host.
     pub(crate) fn with<T>(&self, look: impl FnOnce(&mut F) -> T) -> T {
         let mut device = lock(&self.device);
         let seen = look(&mut device.function);
@@ -79,7 +79,7 @@ impl<F: Function> Drop for Plugged<F> {
 struct Device<F> {
     function: F,
     socket: UnixStream,
-    /// Numbers of the host's transfers that wait for a packet.
+    /// Numbers of the host's transfers that wait for packets.
     waiting: VecDeque<u32>,
 }
 
@@ -93,7 +93,7 @@ impl<F: Function> Device<F> {
         }
     }
 
-    /// The end of a transfer. A host that is gone does not hear it.
+    /// Ends a transfer; errors are ignored, since the host may be gone.
     fn answer(&mut self, kind: u32, number: u32, status: i32, length: usize, data: &[u8]) {
         let mut bytes = Vec::with_capacity(HEADER + data.len());
         for word in [kind, number, 0, 0, 0, status.cast_unsigned(), u32::try_from(length).unwrap()] {
@@ -135,7 +135,7 @@ impl<F: Function> Device<F> {
     }
 }
 
-/// Serves the host's next command; `None` when it has unplugged the device.
+/// Serves the host's next command; `None` if it has unplugged the device.
 fn serve<F: Function>(from_host: &mut UnixStream, device: &Mutex<Device<F>>) -> Option<()> {
     let mut header = Header([0; HEADER]);
     from_host.read_exact(&mut header.0).ok()?;
@@ -176,20 +176,20 @@ struct Port {
 
 /// The ports for devices up to high speed.
 fn ports() -> Vec<Port> {
-    let told = fs::read_to_string(format!("{HUB}/status"));
-    let told = told.unwrap_or_else(|error| panic!("{HUB}: {error}; modprobe vhci_hcd"));
-    let words = told.lines().map(|line| line.split_whitespace().collect::<Vec<_>>());
+    let status = fs::read_to_string(format!("{HUB}/status"));
+    let status = status.unwrap_or_else(|error| panic!("{HUB}: {error}; modprobe vhci_hcd"));
+    let words = status.lines().map(|line| line.split_whitespace().collect::<Vec<_>>());
     let ports = words.filter(|words| words.first() == Some(&"hs"));
     ports.map(|words| Port { number: words[1].parse().unwrap(), is_free: words[2] == FREE }).collect()
 }
 
-/// Also after a test has failed with it locked.
+/// Also if a test has failed while it held the lock.
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
 }
 
 const HUB: &str = "/sys/devices/platform/vhci_hcd.0";
-/// The state of a port with nothing in it.
+/// The state of an empty port.
 const FREE: &str = "004";
 const DEVICE_ID: u32 = 1;
 const FULL_SPEED: u32 = 2;

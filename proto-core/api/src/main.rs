@@ -1,12 +1,12 @@
-//! What others see of proto-core.
+//! The public interfaces of proto-core: for Rust, and for C.
 //!
-//!     proto-core-api items JSON             the public items, one a line
-//!     proto-core-api check JSON RELEASE     fails when something that RELEASE has is gone or is another
-//!     proto-core-api header                 the header of capi
+//!     proto-core-api items JSON             prints the version and the public items, one per line
+//!     proto-core-api check JSON RELEASE     fails if an item of RELEASE is gone or has changed
+//!     proto-core-api header                 prints the header of capi
 //!
-//! JSON is what rustdoc makes of proto-core (`.ci/run api` has the command). RELEASE is what `items` said
-//! at the last release, behind a line with its version: `proto-core/api.txt`. A change that is no addition
-//! needs a version that Cargo takes for another: `0.3.0` after `0.2.x`, `2.0.0` after `1.x.y`.
+//! JSON is rustdoc's description of proto-core (`.ci/run api` has the command). RELEASE is the output of
+//! `items` at the last release: `proto-core/api.txt`. A change that is no addition needs a version that
+//! Cargo takes as incompatible: `0.3.0` after `0.2.x`, `2.0.0` after `1.x.y`.
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -42,7 +42,7 @@ fn items(json: &str) -> Result<BTreeSet<String>, Failure> {
     let builder = public_api::Builder::from_rustdoc_json(json);
     let api = builder.omit_blanket_impls(true).omit_auto_trait_impls(true).build()?;
     let items = api.items().map(ToString::to_string);
-    // The pages of docs/ are modules only when documentation is built.
+    // The pages of docs/ are modules only in the documentation.
     Ok(items.filter(|item| !item.contains("proto_core::docs")).collect())
 }
 

@@ -1,6 +1,6 @@
 //! Versions as Cargo compares them.
 
-/// Whether who asks for `old` may be given `new`.
+/// Whether Cargo takes `new` where `old` is required.
 ///
 /// # Errors
 /// A version that is not three numbers.

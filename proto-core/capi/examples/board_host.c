@@ -1,8 +1,8 @@
-/* A board made of a Linux process: the device on the serial line is a TCP server, links are sockets.
+/* A Linux process as a board: the device on the serial line is a TCP server, links are sockets.
  *
- *     gateway IMAGE PORT        PORT: where the device is, at 127.0.0.1
+ *     gateway IMAGE PORT        PORT: TCP port of the device at 127.0.0.1
  *
- * It ends when there is something to read on its standard input, or that ends. */
+ * It ends when its standard input has something to read, or ends. */
 #include <arpa/inet.h>
 #include <errno.h>
 #include <linux/sockios.h>
@@ -22,7 +22,7 @@
 struct link {
     int fd;
     bool opening, failed, sent;
-    int left; /* as told last */
+    int left; /* as reported last */
 };
 static struct link links[LINKS] = { [0 ... LINKS - 1] = { .fd = -1 } };
 static int field = -1;
@@ -78,7 +78,7 @@ void board_link_open(uint8_t link, rgw_transport transport, const uint8_t *host,
 
 void board_link_close(uint8_t link)
 {
-    /* What has not been acknowledged is not delivered later. */
+    /* With a reset, nothing unacknowledged is delivered later. */
     struct linger reset = { .l_onoff = 1, .l_linger = 0 };
     if (link >= LINKS || links[link].fd < 0)
         return;
@@ -89,7 +89,7 @@ void board_link_close(uint8_t link)
 
 void board_link_send(uint8_t link, const uint8_t *bytes, size_t len)
 {
-    /* One request is on its way at a time: a socket has room for it. */
+    /* Only one request is in flight at a time; a socket has room for it. */
     if (link < LINKS && links[link].fd >= 0 && send(links[link].fd, bytes, len, MSG_NOSIGNAL) == (ssize_t)len)
         links[link].sent = true;
     else if (link < LINKS)
@@ -168,7 +168,7 @@ struct board_event board_wait(uint64_t until_us)
 
 void board_say(const char *what, uint32_t number) { printf("%s %u\n", what, number); }
 
-/* Before main of gateway.c. */
+/* Runs before main of gateway.c. */
 __attribute__((constructor)) static void board_start(int argc, char **argv)
 {
     FILE *file = argc == 3 ? fopen(argv[1], "rb") : NULL;

@@ -1,7 +1,7 @@
-/* A Cortex-M7: QEMU's mps2-an500, without a library but memcpy and its like. UART 0 is the serial line
- * of the device; UART 1, 2 and 3 are the links 0, 1 and 2 (commands, state, Modbus), to which QEMU ties
- * TCP connections: such a line is up when it is opened, cannot be closed, and has no acknowledgements of
- * its own. UART 4 is the console; what is typed there ends the program. */
+/* A Cortex-M7: QEMU's mps2-an500, with memcpy and the like as its only library. UART 0 is the serial line
+ * of the device. UARTs 1, 2 and 3 are the links 0, 1 and 2 (commands, state, Modbus); QEMU connects them
+ * to TCP connections. Such a line is up when it is opened, cannot be closed, and has no acknowledgements
+ * of its own. UART 4 is the console; a byte received there ends the program. */
 #include "board.h"
 
 #define REGISTER(address) (*(volatile uint32_t *)(address))
@@ -25,7 +25,7 @@ const uint8_t *board_image(size_t *len)
 
 uint64_t board_now_us(void)
 {
-    /* A counter of 32 bits that goes on every microsecond. */
+    /* A counter of 32 bits that counts microseconds. */
     static uint32_t low, high;
     uint32_t now = REGISTER(0x40028018);
     if (now < low)
@@ -64,7 +64,7 @@ void board_port_send(uint8_t port, const uint8_t *bytes, size_t len)
 
 void board_link_open(uint8_t link, rgw_transport transport, const uint8_t *host, size_t len, uint16_t port)
 {
-    (void)transport, (void)host, (void)len, (void)port; /* QEMU was told */
+    (void)transport, (void)host, (void)len, (void)port; /* QEMU has connected it */
     if (link < LINES)
         is_open[link] = was_open[link] = link_up[link] = true;
     else if (link < LINKS)
@@ -111,8 +111,8 @@ struct board_event board_wait(uint64_t until_us)
                 return (struct board_event){ .kind = BOARD_LINK_SENT, .id = id };
             if (told(&link_acked[id]))
                 return (struct board_event){ .kind = BOARD_LINK_ACKED, .id = id };
-            /* What came before the first opening is the beginning of the stream; after a closing, it is
-             * of a connection that is no more. */
+            /* Bytes before the first opening are the beginning of the stream; bytes after a closing
+             * belong to a connection that is gone. */
             len = was_open[id] ? take(1u + id) : 0;
             if (len > 0 && is_open[id])
                 return (struct board_event){ .kind = BOARD_LINK_BYTES, .id = id, .bytes = received, .len = len };

@@ -1,5 +1,5 @@
-/* A whole gateway in one loop, on a board that board.h describes: one RS-485 port, the controller behind
- * links. Everything is static; nothing is allocated, nothing is called back. */
+/* A whole gateway in one loop, on a board as in board.h: one RS-485 port, and links to the controller.
+ * All memory is static; nothing is allocated, nothing is called back. */
 #include "board.h"
 
 static _Alignas(RGW_ALIGN) uint8_t gateway_memory[RGW_GATEWAY_SIZE];
@@ -28,7 +28,7 @@ static rgw_gateway *start(void)
     return gateway; /* the configuration's memory is free now */
 }
 
-/* Carries out everything that is to be done; when to be back at the latest. */
+/* Carries out all tasks, and returns when to call the gateway again at the latest. */
 static uint64_t carry_out(rgw_gateway *gateway)
 {
     rgw_task task;

@@ -1,8 +1,8 @@
-//! The gateway in C (examples/gateway.c) against the simulated controller, which is another process: a
-//! device sends a frame, the controller switches an output, and its pose comes back; then it ends by
-//! itself, and says what it counted.
+//! The gateway in C (examples/gateway.c) against the simulated controller in another process: a device
+//! sends a frame, the controller switches an output, and its pose comes back. Then the program ends by
+//! itself and prints its counters.
 //!
-//! `.ci/run capi` builds the programs and runs these; alone:
+//! `.ci/run capi` builds the programs and runs these tests; alone:
 //! `HOST_SIM=target/debug/host-sim CAPI_HOST=... CAPI_CORTEX_M7=... cargo test -p proto-core-capi -- --ignored`
 
 use std::io::{BufRead, BufReader, Read, Write};
@@ -82,7 +82,7 @@ fn a_device_works_through_it(mut line: TcpStream) {
     }
 }
 
-/// What it says at its end.
+/// Checks the counters that it prints at its end.
 #[track_caller]
 fn it_counted(said: &str) {
     let numbers = |what: &str| -> Vec<u32> {
@@ -92,7 +92,7 @@ fn it_counted(said: &str) {
     assert!(matches!(numbers("frames in ")[..], [(1..)]), "{said}");
     assert!(matches!(numbers("frames out ")[..], [(1..)]), "{said}");
     assert_eq!(numbers("link "), [1, 2], "state and Modbus:\n{said}");
-    // A machine that is busy may let a connection go and come back.
+    // On a busy machine a connection may be lost and opened again.
     assert!(numbers("connects ").iter().all(|&connects| connects > 0), "{said}");
     assert!(numbers("answers ").iter().all(|&answers| answers > 0), "{said}");
     assert_eq!(numbers("sleeps ").len(), 1, "{said}");
@@ -174,7 +174,7 @@ fn accept(listener: &TcpListener) -> TcpStream {
     }
 }
 
-/// A path that an environment variable has, absolute or from the repository's root.
+/// The path in an environment variable, absolute or relative to the repository's root.
 fn variable(name: &str) -> PathBuf {
     let value = std::env::var_os(name).unwrap_or_else(|| panic!("{name} is not set"));
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").join(value)

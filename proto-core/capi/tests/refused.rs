@@ -22,13 +22,13 @@ impl<const SIZE: usize> Memory<SIZE> {
 
 fn init(memory: *mut c_void, len: usize) -> (Status, *mut Gateway) {
     let mut gateway = null_mut();
-    // SAFETY: all callers have memory of that length, or none.
+    // SAFETY: all callers have memory of that length, or pass null.
     let status = unsafe { rgw_gateway_init(RGW_ABI_VERSION, memory, len, &mut gateway) };
     (status, gateway)
 }
 
 #[test]
-fn memory_that_does_not_do() {
+fn unusable_memory_is_refused() {
     let mut memory = Memory::<{ RGW_GATEWAY_SIZE + RGW_ALIGN }>::new();
     let size = rgw_gateway_size();
     assert!(size <= RGW_GATEWAY_SIZE, "{size} bytes");
@@ -39,7 +39,7 @@ fn memory_that_does_not_do() {
     assert_eq!(init(start.wrapping_byte_add(8), size).0, Status::Misaligned);
     assert!(memory.0.iter().all(|&byte| byte == 0xA5), "nothing was written");
     let start = memory.start();
-    // SAFETY: there is room; the pointer that is given back is null.
+    // SAFETY: there is room; one pointer for the result is null.
     unsafe {
         assert_eq!(rgw_gateway_init(RGW_ABI_VERSION, start, size, null_mut()), Status::Null);
         let mut gateway = null_mut();
@@ -48,11 +48,11 @@ fn memory_that_does_not_do() {
     }
     let (status, gateway) = init(start, size);
     assert_eq!((status, gateway.cast::<c_void>()), (Status::Ok, start));
-    assert!(memory.0[size..].iter().all(|&byte| byte == 0xA5), "nothing is written behind it");
+    assert!(memory.0[size..].iter().all(|&byte| byte == 0xA5), "nothing is written after it");
 }
 
 #[test]
-fn a_configuration_that_is_none() {
+fn an_invalid_image_is_refused() {
     let mut memory = Memory::<RGW_CONFIG_SIZE>::new();
     let start = memory.start();
     assert!(rgw_config_size() <= RGW_CONFIG_SIZE);
@@ -108,7 +108,11 @@ fn a_gateway_without_a_configuration_sleeps_for_ever() {
         assert_eq!(rgw_port_bytes(gateway, 0, 0, out, usize::MAX), Status::Invalid);
         assert_eq!(rgw_port_bus(gateway, 0, 0, 4), Status::Invalid);
         assert_eq!(rgw_port_can(gateway, 0, 0, null()), Status::Null);
-        assert_eq!(rgw_port_can(gateway, 0, 0, &frame), Status::Invalid, "12 bits are no id of 11");
+        assert_eq!(
+            rgw_port_can(gateway, 0, 0, &frame),
+            Status::Invalid,
+            "an id of 12 bits is not a standard id"
+        );
         assert_eq!(rgw_port_can(gateway, 0, 0, &CanFrame { id: 1, len: 9, ..frame }), Status::Invalid);
         assert_eq!(rgw_port_can(gateway, 0, 0, &CanFrame { id: 1, ..frame }), Status::Ok);
         assert_eq!(rgw_port_info(gateway, 0, null_mut()), Status::NotThere);
@@ -120,7 +124,7 @@ fn a_gateway_without_a_configuration_sleeps_for_ever() {
 #[test]
 fn every_status_has_a_text_of_its_own() {
     let text = |status: u32| {
-        // SAFETY: it is a text for ever.
+        // SAFETY: it is a static text.
         unsafe { CStr::from_ptr(rgw_status_text(status)) }.to_str().unwrap()
     };
     let header = include_str!("../include/rgw.h");

@@ -151,7 +151,7 @@ pub enum Warning {
         shortest: Duration,
     },
     /// A way up carries a variable that no port writes: it is read back from the state stream and
-    /// sent on, so a change made by somebody else can be undone within that time.
+    /// sent on, so for 100 ms a change made by somebody else can be undone.
     ReadBack {
         /// The recipe of the way up.
         recipe: u8,

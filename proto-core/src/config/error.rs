@@ -256,7 +256,7 @@ pub enum ConfigErrorKind {
         /// The length of the list.
         len: u32,
     },
-    /// More entries than there is room for: in this configuration's type, or in any.
+    /// More entries than there is room for in this type of configuration, or in any.
     TooMany {
         /// The list.
         what: Counted,

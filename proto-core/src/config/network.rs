@@ -20,7 +20,6 @@ pub struct Network {
 
 /// Where a board's address comes from. A tag of its own makes DHCP all zeros, so that an empty
 /// configuration takes no flash.
-// The tag stands for itself, so that DHCP is a zero: nothing of an empty configuration takes flash.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[repr(u8)]

@@ -1,5 +1,5 @@
-//! What a file cannot say but a stored or hand-made configuration can, and where each mistake is
-//! found. The messages for files are tested with the files.
+//! Mistakes that a file cannot have but a stored or hand-made configuration can, each with its
+//! place. The messages for files are tested with the files.
 
 #[cfg(feature = "serde")]
 use proptest::prelude::*;
@@ -109,7 +109,7 @@ fn good_configurations_pass() {
     Builder::one_port().stream(&["DigitalOutputCommand[1]"], &["RobotState[26]"]).link(1).valid();
     let listen = Bus::TcpListen { listen: text("[::]:50000") };
     Builder::one_port().port(0, listen).valid();
-    // Doing nothing is not a mistake.
+    // A configuration without ports is valid.
     Builder::new().valid();
 }
 
@@ -150,7 +150,7 @@ fn indices_that_name_nothing_are_refused() {
 
 #[test]
 fn fields_of_the_wrong_kind_are_refused() {
-    // The layout knows a realtime recipe's fields; what a user field does, only the recipe's part.
+    // The layout checks the fields of a realtime recipe; only the recipe's check sees bindings.
     Builder::new().user(&[constant()], &[]).refused(
         field(0, Direction::Input, 0),
         ConfigErrorKind::WrongField { mode: Mode::User, part: Direction::Input },
@@ -223,7 +223,7 @@ fn a_variable_has_one_owner() {
         Place::Port { port: 1, key: PortKey::Recipe },
         ConfigErrorKind::OwnedTwice { var, other: 0 },
     );
-    // A way up carries what a port owns; it does not own anything itself.
+    // A way up carries what a port owns, and owns nothing itself.
     Builder::one_port().port(0, Bus::UdpListen { listen: text("0.0.0.0:0") }).valid();
 }
 
@@ -287,7 +287,7 @@ fn warnings_are_not_errors() {
     assert_eq!(Builder::one_port().valid().view().warnings().count(), 0);
 }
 
-/// A field of each kind, on a stream port and behind a command table.
+/// Fields of all kinds, a command table, a safe value and a board's own address.
 #[cfg(feature = "serde")]
 pub(super) fn every_kind() -> GatewayConfig {
     let table = InputBinding::Commands { table: Span { start: 0, len: 1 }, when: CommandWhen::Frame };
@@ -329,7 +329,7 @@ proptest! {
         }
         let Ok(config) = postcard::from_bytes::<GatewayConfig>(&bytes[..len]) else { return Ok(()) };
         match config.validate() {
-            // What passes must not surprise anybody who runs it.
+            // An engine must be able to plan what passes.
             Ok(()) => {
                 prop_assert!(config.view().warnings().count() < 1_000);
                 prop_assert!(crate::engine::Plan::new(&config).is_ok());
@@ -362,7 +362,7 @@ fn network() -> Network {
     }
 }
 
-/// What a check says of one port, a controller there, and a network changed so.
+/// The result of checking one port, a controller at this address, and a changed network.
 fn checked(controller: &str, change: impl FnOnce(&mut Network)) -> Result<(), (NetworkKey, ConfigErrorKind)> {
     let mut config = Builder::one_port().0;
     config.controller.address = text(controller);
@@ -401,7 +401,7 @@ fn a_board_its_router_and_its_name_server_have_addresses_of_hosts() {
         let refused = checked("192.168.12.138", |network| network.prefix = prefix);
         assert_eq!(refused, Err((NetworkKey::Address, ConfigErrorKind::Prefix { prefix })));
     }
-    // The network's own address, its broadcast address, and what is no host's anywhere.
+    // The network's own address, its broadcast address, and addresses that no host has.
     let nobody = ["192.168.12.0", "192.168.12.255", "0.0.0.1", "127.0.0.1", "224.0.0.1", "255.255.255.255"];
     for address in nobody.map(|address| address.parse::<Ipv4Addr>().unwrap()) {
         let is_refused = |refused, wanted| {

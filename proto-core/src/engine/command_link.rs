@@ -19,9 +19,9 @@ use crate::wire::dialect::Dialect;
 use crate::wire::scalar::Scalar;
 
 /// Fields bound to command tables, over all ports.
-pub const MAX_COMMAND_FIELDS: usize = 16;
+pub(super) const MAX_COMMAND_FIELDS: usize = 16;
 /// Bytes of command texts, over all tables.
-pub const MAX_COMMAND_BYTES: usize = 1024;
+pub(super) const MAX_COMMAND_BYTES: usize = 1024;
 /// A command that is not acknowledged this long after it was picked is dropped.
 const COMMAND_TTL: Duration = Duration::from_secs(1);
 /// Two losses of the second connection within this time mean that the controller takes only one

@@ -10,7 +10,7 @@ use super::io::{BusState, PortId, PortState, ReplyCode};
 use super::outcome::Outcome;
 use super::rejection::{LastRejection, Rejection};
 use super::sender::Sender;
-use super::store::{InputFrame, Store};
+use super::store::Store;
 use super::tap::{Tap, TapDirection, TapPlace, TapVerdict, Tapped};
 use super::user::{InputBind, InputTo, fit, forget_commands};
 use crate::config::{Name, Rs485, Span};
@@ -401,13 +401,13 @@ impl FieldPort {
         }
     }
 
-    /// Health of the port, given the state of its input frames in `frames`.
-    pub(super) fn state<'f>(&self, mut frames: impl Iterator<Item = &'f InputFrame>) -> PortState {
+    /// Health of the port; `is_silent` says whether one of its input frames is overdue.
+    pub(super) fn state(&self, is_silent: bool) -> PortState {
         if !self.is_up {
             PortState::Gone
         } else if self.bus == BusState::BusOff {
             PortState::BusOff
-        } else if frames.any(|frame| frame.overdue_at == Instant::NEVER) {
+        } else if is_silent {
             PortState::Silent
         } else {
             PortState::Working

@@ -13,6 +13,7 @@
 //! run loop, and nothing is applied in part.
 
 mod build;
+mod clock;
 mod command_link;
 mod connection;
 mod counters;
@@ -27,6 +28,7 @@ mod modbus_link;
 mod outbox;
 mod outcome;
 mod plan;
+mod questions;
 mod rejection;
 mod sender;
 mod session;
@@ -41,34 +43,30 @@ mod uplink;
 mod user;
 
 pub use build::BuildError;
-pub use command_link::{MAX_COMMAND_BYTES, MAX_COMMAND_FIELDS};
+pub use clock::ASLEEP;
 pub use counters::{LinkCounters, PortCounters};
 pub use io::{BusState, Endpoint, Input, LinkId, LinkKind, Output, PortId, PortState, ReplyCode, Transport};
 pub use latency::Latency;
 pub use links::LinkInfo;
-pub use modbus_link::MAX_POLL_BLOCKS;
-pub use outbox::EDGE_QUEUE;
 pub use plan::{Plan, PlanError, Source, WayUp};
 pub use rejection::{KEPT_BYTES, LastRejection, Rejection};
 pub use status::{ControllerStatus, FieldBus, Health, PortStatus, Status, VariableStatus};
 pub use stops::COMMAND_QUEUE;
-pub use store::MAX_INPUT_FRAMES;
 pub use tap::{MAX_TAPPED, TAP_OVERHEAD, Tap, TapDirection, TapPlace, TapRecord, TapVerdict};
 
 use heapless::Vec;
 
-use counters::{add, bump};
+use counters::add;
 use field_output::Downward;
 use field_port::{Accepted, FieldPort};
 use links::Links;
 use store::{SafeBytes, Store};
-use user::{Bindings, forget_commands};
+use user::Bindings;
 
 use crate::config::MAX_SAFE_VALUES;
-use crate::image::Image;
 use crate::link::LinkAction;
 use crate::recipe::model::MAX_STREAM_FRAME;
-use crate::time::{Duration, Instant};
+use crate::time::Instant;
 use crate::wire::can::CanFrame;
 use crate::wire::state::LEN;
 
@@ -80,21 +78,6 @@ pub const OUTPUT_BUFFER: usize = MAX_STREAM_FRAME;
 /// longer than any frame. Bytes may be reported in pieces of any other size.
 pub const INPUT_BUFFER: usize = 1536;
 const _: () = assert!(INPUT_BUFFER >= LEN && INPUT_BUFFER > MAX_STREAM_FRAME);
-
-/// If two calls of the engine are further apart than this, the gateway was asleep: stopped,
-/// suspended, or in a debugger.
-pub const ASLEEP: Duration = Duration::from_millis(500);
-
-/// The engine asks to be called at least this often, even if it has nothing to do, so that it
-/// notices sleep.
-const HEARTBEAT: Duration = Duration::from_millis(250);
-
-/// After sleep, input from the field is discarded for this long, and until the next tick: drivers
-/// read what waits in devices in pieces.
-const DEAF: Duration = Duration::from_millis(50);
-
-/// The clock's last instant. [`Instant::NEVER`] is after it, so that "no deadline" never comes.
-const LAST: Instant = Instant::from_micros(u64::MAX - 1);
 
 /// The gateway engine for up to `PORTS` field ports, `UPLINKS` recipe links and, over all ports,
 /// `FIELDS` user-defined input fields and as many output fields.
@@ -186,14 +169,6 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
     }
 
-    fn tick(&mut self, now: Instant) {
-        (self.is_late, self.announced) = (false, Instant::NEVER);
-        self.is_deaf &= now < self.deaf_until;
-        if now >= self.timer_at {
-            self.advance(now);
-        }
-    }
-
     /// The next output for the driver. Call it again until it is [`Output::Sleep`]. Nothing is sent
     /// between a deadline and the [`Input::Tick`] that lets it pass.
     ///
@@ -268,15 +243,6 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         self.links.next_upward(&mut self.store, out).is_none()
             && self.links.next_action().is_none()
             && self.next_downward(out, now).is_none()
-    }
-
-    /// When the engine has something to do without an input, computed exactly. [`Output::Sleep`]
-    /// may be earlier, never later.
-    pub fn deadline(&self) -> Instant {
-        let ports = self.ports.iter().map(FieldPort::deadline);
-        let ports = ports.min().unwrap_or(Instant::NEVER);
-        let hears_at = if self.is_deaf { self.deaf_until } else { Instant::NEVER };
-        ports.min(self.links.deadline()).min(self.store.deadline()).min(hears_at)
     }
 
     // Each input has its own function, so that no other pays for the registers it needs.
@@ -396,46 +362,6 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
     }
 
-    /// The present, and whether the gateway has slept until now.
-    fn present(&mut self, now: Instant) -> Instant {
-        let now = self.forward(now);
-        self.store.now = now;
-        if now >= self.beat_at {
-            // A configured engine is called at every beat; before the first call nothing was late.
-            if self.now != Instant::ZERO && now.saturating_since(self.now) > ASLEEP {
-                self.wake(now);
-            }
-            self.beat_at = now + HEARTBEAT;
-            self.ask = Ask::ALL;
-        }
-        self.now = now;
-        now
-    }
-
-    /// `now`, but no earlier than the previous call, and no later than the clock's last instant.
-    fn forward(&self, now: Instant) -> Instant {
-        if now < self.now || now > LAST { self.clamped(now) } else { now }
-    }
-
-    #[cold]
-    fn clamped(&self, now: Instant) -> Instant {
-        now.min(LAST).max(self.now)
-    }
-
-    /// The gateway itself slept: the age of everything that waits is unknown. Overdue safe values
-    /// go first, no command is sent, and every connection is opened again.
-    #[cold]
-    fn wake(&mut self, now: Instant) {
-        self.sleeps = self.sleeps.wrapping_add(1);
-        // Before deadlines pass: one of them may be to open a link that has been down.
-        self.links.slept(&mut self.store);
-        self.advance(now);
-        self.ports.iter_mut().for_each(|port| port.slept(&mut self.tap, now));
-        self.is_deaf = true;
-        self.deaf_until = now + DEAF;
-        self.arm(self.deaf_until);
-    }
-
     /// Drops commands whose device is gone.
     fn drop_forgotten(&mut self) {
         if let Some(command) = self.links.command.first_mut() {
@@ -444,80 +370,6 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             self.arm(deadline);
         }
         self.carry_outcomes();
-    }
-
-    /// The process image.
-    pub fn image(&self) -> &Image {
-        &self.store.image
-    }
-
-    /// Counters of a field port; `None` if no such port is configured.
-    pub fn port_counters(&self, port: PortId) -> Option<&PortCounters> {
-        self.ports.iter().find(|other| other.id == port).map(|port| &port.counters)
-    }
-
-    /// Health of a field port; `None` if no such port is configured.
-    pub fn port_state(&self, port: PortId) -> Option<PortState> {
-        let (index, port) = self.ports.iter().enumerate().find(|(_, other)| other.id == port)?;
-        Some(port.state(self.store.frames.iter().filter(|frame| usize::from(frame.port) == index)))
-    }
-
-    /// Result of the newest command that a port's values picked; `None` if no such port is configured.
-    pub fn reply_code(&self, port: PortId) -> Option<ReplyCode> {
-        self.ports.iter().find(|other| other.id == port).map(|port| port.reply)
-    }
-
-    /// The field ports, in configuration order.
-    pub fn field_ports(&self) -> impl Iterator<Item = PortId> + '_ {
-        self.ports.iter().map(|port| port.id)
-    }
-
-    /// The links that the configuration needs.
-    pub fn links(&self) -> impl Iterator<Item = LinkInfo<'_>> + '_ {
-        self.links.infos()
-    }
-
-    /// Whether a datagram is a frame of the link's output part. The driver of a listening UDP link
-    /// checks this before it answers another sender than before.
-    pub fn is_frame(&self, link: LinkId, datagram: &[u8]) -> bool {
-        self.links.recipes.iter().any(|other| other.id == link && other.is_frame(datagram))
-    }
-
-    /// How often the gateway itself slept: it was not called for longer than [`ASLEEP`], so waiting
-    /// input was discarded. Wraps.
-    pub fn sleeps(&self) -> u32 {
-        self.sleeps
-    }
-
-    /// A snapshot of the whole gateway at `now`.
-    pub fn status(&self, now: Instant) -> Status<'_> {
-        Status {
-            at: self.forward(now),
-            ports: &self.ports,
-            frames: &self.store.frames,
-            image: &self.store.image,
-            links: self.links.view(),
-            latency: &self.store.latency,
-            sleeps: self.sleeps,
-        }
-    }
-
-    /// The latencies since the start.
-    pub fn latency(&self) -> &Latency {
-        &self.store.latency
-    }
-
-    /// The ring of records of everything that goes over ports and links.
-    pub fn tap(&mut self) -> &mut Tap<TAP> {
-        &mut self.tap
-    }
-
-    /// Something depends on the clock from `at` on. If it is due already, it is handled before the
-    /// engine sleeps, or at the tick that is late.
-    fn arm(&mut self, at: Instant) {
-        if at > self.now {
-            self.timer_at = self.timer_at.min(at);
-        }
     }
 
     /// Something happened on a link that may change its deadline, or close it.
@@ -535,22 +387,6 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
     }
 
-    /// Handles everything that depends on the clock.
-    fn advance(&mut self, now: Instant) {
-        // At one instant the clock is checked once: what is done now is due later.
-        self.timer_at = now + Duration::from_micros(1);
-        self.ask = Ask::ALL;
-        self.is_armed = false;
-        self.expire_frames(now);
-        for index in 0..self.ports.len() {
-            if let Some(port) = self.ports.get_mut(index) {
-                port.advance(&mut self.tap, now);
-            }
-        }
-        self.links.advance(&mut self.store);
-        self.carry_results();
-    }
-
     /// Passes the results of values and commands on a link on to their ports.
     fn carry_results(&mut self) {
         self.carry_outcomes();
@@ -565,33 +401,6 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         command.outcomes.take(|outcome| {
             if let Some(port) = find_port(&mut self.ports, outcome.port) {
                 port.command_ended(outcome);
-            }
-        });
-    }
-
-    fn expire_frames(&mut self, now: Instant) {
-        let mut timed_out = false;
-        while let Some((frame, dropped)) = self.store.next_timeout(&self.safe_values) {
-            timed_out = true;
-            if let Some(port) = self.ports.get_mut(usize::from(frame.port)) {
-                bump(&mut port.counters.timeouts);
-                add(&mut port.counters.values_expired, dropped);
-            }
-            forget_commands(frame.bindings.of(&self.bindings.inputs), self.links.command.first_mut(), now);
-        }
-        if timed_out {
-            self.drop_forgotten();
-            self.image_changed();
-        }
-        self.expire_waiting();
-    }
-
-    /// Drops values that have waited too long.
-    fn expire_waiting(&mut self) {
-        let ports = &mut self.ports;
-        self.store.expire_waiting(|port, dropped| {
-            if let Some(port) = ports.get_mut(port) {
-                add(&mut port.counters.values_expired, dropped);
             }
         });
     }

@@ -22,7 +22,7 @@ use crate::time::{Duration, Instant};
 use crate::wire::scalar::Scalar;
 
 /// Blocks of neighbouring coils or registers that are polled together.
-pub const MAX_POLL_BLOCKS: usize = 16;
+pub(super) const MAX_POLL_BLOCKS: usize = 16;
 /// Variables polled by Modbus.
 const MAX_POLLED: usize = 64;
 /// Maximum number of unneeded coils or registers that are read to join two blocks.

@@ -12,7 +12,7 @@ use crate::sysvar::{BIT_INPUT_COUNT, SysVar};
 use crate::time::{Duration, Instant};
 
 /// Number of bit values per port that can wait behind the one that is written next.
-pub const EDGE_QUEUE: usize = 16;
+const EDGE_QUEUE: usize = 16;
 
 #[derive(Debug, Clone, Copy)]
 struct Edge {

@@ -185,10 +185,11 @@ impl<'a> Status<'a> {
     }
 
     fn port(&self, index: usize, port: &'a FieldPort) -> PortStatus<'a> {
-        let own = |frame: &&InputFrame| usize::from(frame.port) == index;
-        let groups = (0..).zip(self.frames).filter(|(_, frame)| own(frame)).map(|(group, _)| group);
-        let heard_at = groups.filter_map(|group| self.image.stamp_of(GroupId(group))).max();
-        let overdue = self.frames.iter().filter(own).filter(|frame| frame.overdue_at == Instant::NEVER);
+        let (mut heard_at, mut overdue) = (None, 0_usize);
+        for (group, frame) in (0..).zip(self.frames).filter(|(_, frame)| usize::from(frame.port) == index) {
+            heard_at = heard_at.max(self.image.stamp_of(GroupId(group)));
+            overdue = overdue.saturating_add(usize::from(frame.is_overdue()));
+        }
         let is_can = match &port.codec {
             Codec::Stream { .. } => false,
             Codec::Can { .. } => true,
@@ -200,9 +201,9 @@ impl<'a> Status<'a> {
             name: &port.name,
             bus,
             recipe: port.recipe,
-            state: port.state(self.frames.iter().filter(own)),
+            state: port.state(overdue > 0),
             age: heard_at.map(|at| self.at.saturating_since(at)),
-            overdue: overdue.count(),
+            overdue,
             reply: port.reply,
             command: self.links.command.and_then(|link| link.newest_of(port.id)),
             last_rejection: port.last_rejection.as_ref(),

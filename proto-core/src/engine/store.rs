@@ -13,7 +13,7 @@ use crate::time::{Duration, Instant, Stamp};
 
 /// Maximum number of input frames over all field ports: a stream recipe has one, a CAN recipe one
 /// per id.
-pub const MAX_INPUT_FRAMES: usize = 48;
+pub(super) const MAX_INPUT_FRAMES: usize = 48;
 
 /// One input frame of a device.
 #[derive(Debug, Clone, Copy)]
@@ -28,6 +28,13 @@ pub(super) struct InputFrame {
     pub overdue_at: Instant,
     /// Its timeout.
     pub timeout: Duration,
+}
+
+impl InputFrame {
+    /// Whether it is overdue or has never come.
+    pub(super) fn is_overdue(&self) -> bool {
+        self.overdue_at == Instant::NEVER
+    }
 }
 
 /// A safe value in the form of the image.

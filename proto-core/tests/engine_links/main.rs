@@ -209,7 +209,7 @@ fn a_refused_link_is_tried_again_and_costs_only_what_it_carries() {
         full.rig.reachable.remove(&link.0);
         full.rig.input(Input::LinkDown { link });
         full.rig.log.clear();
-        // Pauses of 100, 200, 400 .. 5000 ms: six more tries in ten seconds; a listener does not pause longer.
+        // Pauses of 100, 200, 400 .. 5000 ms: six more tries in ten seconds; a listener's do not grow.
         for _ in 0..200 {
             full.live(50);
             full.plc();

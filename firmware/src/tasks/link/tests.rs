@@ -34,7 +34,7 @@ use crate::tasks::watchdog::{TaskName, Watch};
 
 const GATEWAY: u8 = 1;
 const CONTROLLER: u8 = 2;
-const STRANGER: u8 = 3;
+const OTHER: u8 = 3;
 const PORT: u16 = 50_000;
 const FIELD: PortId = PortId(0);
 /// Maximum age of a delivered frame.
@@ -46,10 +46,10 @@ const FRAME: [u8; 5] = [0xFF, 0xFF, 0x01, 0xEE, 0xEE];
 struct Wire {
     waiting: RefCell<[VecDeque<Vec<u8>>; 3]>,
     wakers: RefCell<[Option<Waker>; 3]>,
-    deaf: Cell<u8>,
-    mute: Cell<u8>,
-    /// Number of delivered frames.
-    spoken: Cell<usize>,
+    no_receive: Cell<u8>,
+    no_send: Cell<u8>,
+    /// Number of frames sent by hosts that can send.
+    frames_sent: Cell<usize>,
     /// Sender and contents of all frames, also of those not delivered.
     log: RefCell<Vec<(u8, Vec<u8>)>>,
     /// Speed of time.
@@ -61,18 +61,18 @@ impl Wire {
         Self {
             waiting: RefCell::default(),
             wakers: RefCell::default(),
-            deaf: Cell::new(0),
-            mute: Cell::new(0),
-            spoken: Cell::new(0),
+            no_receive: Cell::new(0),
+            no_send: Cell::new(0),
+            frames_sent: Cell::new(0),
             log: RefCell::default(),
             step: Cell::new(Duration::from_micros(200)),
         }
     }
 
     /// From now on one host receives nothing and one sends nothing; 0 is none.
-    fn silence(&self, deaf: u8, mute: u8) {
-        self.deaf.set(deaf);
-        self.mute.set(mute);
+    fn cut_off(&self, no_receive: u8, no_send: u8) {
+        self.no_receive.set(no_receive);
+        self.no_send.set(no_send);
     }
 
     /// The TCP segments of the gateway since the log was cleared.
@@ -129,14 +129,14 @@ impl embassy_net::driver::TxToken for Sends<'_> {
         let result = fill(&mut frame);
         let End { wire, host: own } = self.0;
         wire.log.borrow_mut().push((*own, frame.clone()));
-        if wire.mute.get() == *own {
+        if wire.no_send.get() == *own {
             return result;
         }
-        wire.spoken.set(wire.spoken.get() + 1);
+        wire.frames_sent.set(wire.frames_sent.get() + 1);
         let mut wakers = wire.wakers.borrow_mut();
         for ((host, queue), waker) in (GATEWAY..).zip(wire.waiting.borrow_mut().iter_mut()).zip(&mut *wakers)
         {
-            if host != *own && host != wire.deaf.get() {
+            if host != *own && host != wire.no_receive.get() {
                 queue.push_back(frame.clone());
                 if let Some(waker) = waker.take() {
                     waker.wake();
@@ -281,7 +281,7 @@ struct Net<'a> {
     gateway: &'a Gateway,
     link: LinkId,
     controller: Stack<'a>,
-    stranger: Stack<'a>,
+    other_host: Stack<'a>,
     wire: &'a Wire,
 }
 
@@ -331,15 +331,15 @@ fn among(config: &GatewayConfig, which: impl Fn(LinkKind) -> bool, act: impl Asy
     let pulses = [TaskName::Engine, TaskName::Link(kind)].map(|name| watch.register(name).unwrap());
     let wire = Rc::new(Wire::new());
     let mut resources: [Resources; 3] = core::array::from_fn(|_| StackResources::new());
-    let [of_gateway, of_controller, of_stranger] = &mut resources;
+    let [of_gateway, of_controller, of_other] = &mut resources;
     let (own, mut own_runner) = host(&wire, GATEWAY, of_gateway);
     let (controller, mut controller_runner) = host(&wire, CONTROLLER, of_controller);
-    let (stranger, mut stranger_runner) = host(&wire, STRANGER, of_stranger);
+    let (other_host, mut other_runner) = host(&wire, OTHER, of_other);
     let mut memory = [0; Buffers::SIZE];
     let buffers = Buffers::take(&mut memory.as_mut_slice(), &endpoint).unwrap();
-    let network = join3(own_runner.run(), controller_runner.run(), stranger_runner.run());
+    let network = join3(own_runner.run(), controller_runner.run(), other_runner.run());
     let driven = join(gateway.keep_time(pulses[0]), run(&gateway, pulses[1], link, own, &endpoint, buffers));
-    let net = Net { gateway: &gateway, link, controller, stranger, wire: &wire };
+    let net = Net { gateway: &gateway, link, controller, other_host, wire: &wire };
     let act = async {
         gateway.input(Input::PortUp { port: FIELD });
         with_timeout(Duration::from_secs(200), act(net)).await.expect("it hangs");

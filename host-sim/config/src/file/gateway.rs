@@ -242,17 +242,10 @@ impl<'a> Builder<'a> {
         let bus = read_bus(table, kind)?;
         let item = table.required("recipe", "the name of a recipe of this file")?;
         let recipe = recipes::find(recipes, &item)?;
-        let framing = match kind {
-            BusKind::Rs485 | BusKind::TcpListen => Some(Framing::Bytes),
-            BusKind::UdpListen => Some(Framing::Datagram),
-            BusKind::Can => None,
-        };
-        if let (Some(framing), Some(recipe)) = (framing, recipes.get(recipe).filter(|recipe| !recipe.is_can))
-        {
-            // The check of the configuration has the better message for a user recipe on UDP.
-            if framing == Framing::Bytes {
-                recipe.check_framing(framing).map_err(|message| item.error(message))?;
-            }
+        // The check of the whole configuration refuses kinds of recipes that the bus does not take.
+        let is_byte_stream = matches!(kind, BusKind::Rs485 | BusKind::TcpListen);
+        if let Some(recipe) = recipes.get(recipe).filter(|recipe| is_byte_stream && !recipe.is_can) {
+            recipe.check_framing(Framing::Bytes).map_err(|message| item.error(message))?;
         }
         let mut port = Port::new(bounded(&name), bus, recipe as u8);
         port.cycle = read_cycle(table)?;

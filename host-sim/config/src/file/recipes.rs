@@ -162,7 +162,7 @@ fn read_part(item: &Item<'_>, rules: Rules, is_can: bool, flavour: Flavour) -> R
         let spot = table.spot.clone();
         part.frames.push(FileFrame { spot: spot.clone(), id: CanId::Standard(0), id_spot: spot, fields });
     }
-    // UDP has the lowest demands; user-defined recipes are for RS-485 only (D16).
+    // UDP needs the least of a stream recipe; it does not take user-defined recipes (D16).
     let framing = if rules.mode == Mode::User { Framing::Bytes } else { Framing::Datagram };
     match part.check(rules, is_can, framing) {
         Ok(()) => Ok(part),

@@ -1,4 +1,4 @@
-//! Nothing a file or an override says can do more than be refused with one line.
+//! Any file and any override is read, or refused with a message of one line.
 
 use proptest::prelude::*;
 use recipe_config::file::{Text, parse, parse_recipes};

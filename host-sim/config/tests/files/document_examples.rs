@@ -1,4 +1,4 @@
-//! The TOML that the documents show is valid as it stands, and says what it is there to say.
+//! The TOML in the documents is valid.
 
 use std::fs;
 

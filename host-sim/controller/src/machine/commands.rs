@@ -25,7 +25,8 @@ impl Machine {
         }
     }
 
-    /// Whether `run` is allowed now. The caller then starts the program and reports [`Machine::program_started`].
+    /// Whether `run` is allowed now. The caller then starts the program and reports
+    /// [`Machine::program_started`].
     ///
     /// # Errors
     /// The error that was recorded.
@@ -130,7 +131,8 @@ impl Machine {
         }
     }
 
-    /// Records that an accepted command is answered with fail. If a safety stop was the cause, its error stays.
+    /// Records that an accepted command is answered with fail. If a safety stop was the cause, its error
+    /// stays.
     pub fn not_completed(&mut self, action: Action, why: &str) {
         if !matches!(self.safety, Safety::Stopped(_)) {
             self.fail(ErrorId::NotCompleted, format!("{}: {why}", action.word()));

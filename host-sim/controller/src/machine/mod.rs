@@ -1,12 +1,12 @@
 //! The controller's states: power and enable, program, safety, mode
 //! (docs/simulated-controller.md section 1; the codes are in proto-core/docs/wire/state.md section 4).
 //!
-//! In: commands, faults, the time, and when the arm comes to rest. Out: whether a command is allowed, the effect on
-//! arm and program, and the states that clients see. Does not know command texts or connections, and neither runs
-//! programs nor moves the arm.
+//! In: commands, faults, the time, and when the arm comes to rest. Out: whether a command is allowed, the
+//! effect on arm and program, and the states that clients see. Does not know command texts or connections,
+//! and neither runs programs nor moves the arm.
 //!
-//! An accepted command begins a [`Transition`]. [`Machine::progress`] returns its state, so that the command can be
-//! answered at its end (D25).
+//! An accepted command begins a [`Transition`]. [`Machine::progress`] returns its state, so that the command
+//! can be answered at its end (D25).
 
 mod commands;
 mod errors;

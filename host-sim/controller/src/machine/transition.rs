@@ -37,8 +37,8 @@ pub enum Progress {
 }
 
 impl Machine {
-    /// The state of a transition. To be called after every change: once another transition has begun, this one
-    /// counts as superseded, even if it was done.
+    /// The state of a transition. To be called after every change: once another transition has begun, this
+    /// one counts as superseded, even if it was done.
     pub fn progress(&self, transition: Transition) -> Progress {
         let program_rests = self.program == Program::Stopped;
         let done = match transition.action {

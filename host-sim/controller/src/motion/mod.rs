@@ -1,11 +1,12 @@
 //! The arm: positions of its joints at any instant, and the values derived from them
 //! (docs/simulated-controller.md section 3).
 //!
-//! In: moves, the rate of motion, an instant. Out: positions, speeds, torques and the TCP's pose. Everything is a closed
-//! formula of time: nothing is stepped, and the same instant always gives the same numbers. Does not know programs,
-//! registers or states.
+//! In: moves, the rate of motion, an instant. Out: positions, speeds, torques and the TCP's pose. Everything
+//! is a closed formula of time: nothing is stepped, and the same instant always gives the same numbers. Does
+//! not know programs, registers or states.
 //!
-//! The geometry is that of a generic six-axis cobot with a reach of about 0.9 m, not the calibration of a product.
+//! The geometry is that of a generic six-axis cobot with a reach of about 0.9 m, not the calibration of a
+//! product.
 
 mod clock;
 mod geometry;

@@ -73,7 +73,7 @@ fn rate_zero_stops_on_the_path_and_the_rest_is_kept() {
     assert_eq!(held.velocity, [0.0; 7]);
     assert_eq!(observe(&arm, ms(60_000)), held);
     arm.set_rate(ms(60_000), 1.0, Braking::Normal);
-    // What the ramp down still covers is missing from the ramp up: only the pause itself is lost.
+    // The ramps down and up add up to full speed: only the time of the pause is lost.
     let expected = unhindered + ms(60_000).saturating_since(ms(700));
     let difference = arm.arrival().unwrap().as_micros().abs_diff(expected.as_micros());
     assert!(difference <= 2, "{difference} µs");
@@ -105,7 +105,7 @@ fn impossible_moves_change_nothing() {
 }
 
 #[test]
-fn a_given_start_pose_is_shown_to_the_last_bit() {
+fn a_configured_start_pose_is_exact() {
     let wanted = [-0.543_689, 0.576_287, 1.232_353, -1.570_197, -0.607_912, -0.458_957_f32];
     let mut arm = Arm::at(HOME);
     let tool = Frame::from_pose(&[0.0, 0.02, 0.1, 0.1, 0.0, 0.3]);
@@ -114,7 +114,7 @@ fn a_given_start_pose_is_shown_to_the_last_bit() {
 }
 
 #[test]
-fn poses_survive_the_way_there_and_back() {
+fn poses_survive_conversion_to_frames_and_back() {
     let pose = [0.1, -0.2, 0.3, -2.0, 0.7, 3.0];
     for (there, back) in pose.iter().zip(Frame::from_pose(&pose).pose()) {
         assert!((there - back).abs() < 1e-12, "{there} {back}");

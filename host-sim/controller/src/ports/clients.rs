@@ -14,13 +14,14 @@ pub(super) struct Clients {
 
 /// Maximum number of UDP clients.
 pub const MAX_UDP_CLIENTS: usize = 8;
-/// A client that should send and has been silent for this long is removed (D30). Otherwise a forged address would
-/// get the stream for ever.
+/// A client that should send and has been silent for this long is removed (D30). Otherwise a forged address
+/// would get the stream for ever.
 const SILENCE: Duration = Duration::from_secs(60);
 
 impl Clients {
-    /// A datagram came from `peer`. Returns whether another client was displaced: the one silent for longest, of the
-    /// address with most clients, including the new one. So a host that sends from many ports displaces itself.
+    /// A datagram came from `peer`. Returns whether another client was displaced: the one silent for longest,
+    /// of the address with most clients, including the new one. So a host that sends from many ports
+    /// displaces itself.
     pub(super) fn add(&mut self, now: Instant, peer: SocketAddr) -> bool {
         if let Some(client) = self.known.iter_mut().find(|client| client.0 == peer) {
             client.1 = now;

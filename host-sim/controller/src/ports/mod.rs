@@ -1,11 +1,11 @@
 //! The controller's recipe ports (docs/simulated-controller.md section 5, proto-core/docs/wire/recipes.md).
 //!
-//! In: received bytes, datagrams and CAN frames, the time, and frames of a program. Out: values of input variables,
-//! output frames on a fixed grid, and frames for a program. Does not know devices or sockets.
+//! In: received bytes, datagrams and CAN frames, the time, and frames of a program. Out: values of input
+//! variables, output frames on a fixed grid, and frames for a program. Does not know devices or sockets.
 //!
-//! A realtime output part is sent on an absolute grid that all ports share. A cycle that is due while the frame before
-//! is still being sent, or while the line is not quiet, is skipped and counted, never sent later. Every received
-//! frame is applied at once.
+//! A realtime output part is sent on an absolute grid that all ports share. A cycle that is due while the
+//! frame before is still being sent, or while the line is not quiet, is skipped and counted, never sent
+//! later. Every received frame is applied at once.
 
 mod clients;
 mod counters;
@@ -97,8 +97,8 @@ impl Port {
         })
     }
 
-    /// Gives the port the recipe that `port` has now. Partial frames, frames that wait for a program, and UDP clients
-    /// are dropped with the old recipe (D24).
+    /// Gives the port the recipe that `port` has now. Partial frames, frames that wait for a program, and UDP
+    /// clients are dropped with the old recipe (D24).
     pub(super) fn assign(
         &mut self,
         now: Instant,

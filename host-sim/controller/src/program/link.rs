@@ -34,8 +34,8 @@ pub(super) struct Link {
     weigh_in: AtomicU64,
     /// A call has returned since the variables were published.
     stale: AtomicBool,
-    /// The program must end, or the model is gone. After a function that cannot fail, such as `print`, the next
-    /// operation ends the script.
+    /// The program must end, or the model is gone. After a function that cannot fail, such as `print`, the
+    /// next operation ends the script.
     over: AtomicBool,
 }
 
@@ -127,8 +127,8 @@ impl Link {
         self.answers.lock().unwrap_or_else(PoisonError::into_inner).recv().ok()
     }
 
-    /// Ends a script whose variables are too large in total. The interpreter limits single values only, and does not
-    /// check all limits when an item is added.
+    /// Ends a script whose variables are too large in total. The interpreter limits single values only, and
+    /// does not check all limits when an item is added.
     fn weigh(&self, scope: &Scope<'_>) -> Outcome<()> {
         if self.weigh_in.load(Relaxed) > 0 {
             return Ok(());

@@ -1,15 +1,15 @@
 //! Robot programs: Rhai scripts that run in lock-step with the model's clock
 //! (docs/simulated-controller.md section 4).
 //!
-//! In: a compiled [`Script`], and answers to its calls. Out: one [`Call`] after the other, the program's variables, and
-//! how it ended. Does not know ports, registers or motion.
+//! In: a compiled [`Script`], and answers to its calls. Out: one [`Call`] after the other, the program's
+//! variables, and how it ended. Does not know ports, registers or motion.
 //!
-//! A script runs on a thread of its own, but never in parallel with the model: each call hands control to the model,
-//! which hands it back with the answer and waits for the next call. So a program sees the same instants in the same
-//! order in every run, whatever the speed of the machine.
+//! A script runs on a thread of its own, but never in parallel with the model: each call hands control to the
+//! model, which hands it back with the answer and waits for the next call. So a program sees the same
+//! instants in the same order in every run, whatever the speed of the machine.
 //!
-//! A script that never waits is suspended after [`SLICE_OPERATIONS`] operations, until [`SLICE`] after the start of the
-//! slice. So everything else keeps its timing, and every run is still the same.
+//! A script that never waits is suspended after [`SLICE_OPERATIONS`] operations, until [`SLICE`] after the
+//! start of the slice. So everything else keeps its timing, and every run is still the same.
 //!
 //! The bounds are at the end of this file. A program that exceeds one ends with an error.
 

@@ -6,14 +6,14 @@ fn start(text: &str) -> Program {
     Program::start(&Script::compile("t", text).unwrap(), NOW).unwrap()
 }
 
-/// As far as it comes without an answer, however many slices that takes.
+/// Runs the script until it needs an answer, in as many slices as it takes.
 fn start_slices(text: &str) -> Program {
     let mut program = start(text);
     give_slices(&mut program);
     program
 }
 
-/// Lets it go on through its slices, to the next call that a script makes.
+/// Continues through its slices to the next call of a function.
 fn give_slices(program: &mut Program) {
     while let Progress::Calling(Call::GiveWay { until }) = *program.progress() {
         program.answer(until, Answer::Done);
@@ -87,7 +87,7 @@ fn a_received_can_frame_begins_with_its_id() {
 }
 
 #[test]
-fn variables_are_seen_while_a_loop_never_reads_them() {
+fn variables_are_published_while_a_loop_never_reads_them() {
     let mut program = start(r#"loop { let list1 = comm_recv("a"); comm_send("a", [125]); }"#);
     for nth in 0..3 {
         program.answer(NOW, Answer::Frame { id: None, values: vec![Scalar::Byte(nth)] });
@@ -98,7 +98,7 @@ fn variables_are_seen_while_a_loop_never_reads_them() {
 }
 
 #[test]
-fn variables_changed_before_a_call_are_seen_during_it() {
+fn variables_changed_before_a_call_are_published_during_it() {
     let mut program =
         start("let n = [1]; let s = #{ a: \"x\", b: () }; n[0] = 9; wait_ms(1); n += 2; wait_ms(1);");
     assert_eq!(program.variables()["n"], serde_json::json!([9]));
@@ -115,13 +115,13 @@ fn a_script_that_does_not_wait_is_cut_in_slices() {
         assert_eq!(call(&program), Call::GiveWay { until: at(6 + slice) });
         program.answer(at(6 + slice), Answer::Done);
     }
-    // A slice that begins late does not make the next one shorter.
+    // After a late slice the next one has its full length.
     program.answer(at(100), Answer::Done);
     assert_eq!(call(&program), Call::GiveWay { until: at(101) });
     program.answer(at(101), Answer::Abort);
     assert_eq!(program.progress(), &Progress::Ended(End::Aborted));
 
-    // Calls count, too; those that take their time begin a slice of their own.
+    // Calls count too; a call that takes time begins a new slice.
     let mut program = start("loop { wait_ms(0); }");
     let mut calls = 0;
     while call(&program) == Call::Wait(Duration::ZERO) {
@@ -160,7 +160,7 @@ fn a_script_gets_as_far_in_a_slice_in_every_run() {
 }
 
 #[test]
-fn who_copies_much_does_less_in_a_slice() {
+fn a_script_that_copies_much_does_less_in_a_slice() {
     let copies = |items: usize| {
         let text = format!(
             "let a = []; for i in 0..{items} {{ a.push(i); }} let n = 0; log(0); \
@@ -204,7 +204,7 @@ fn memory_is_bounded() {
 }
 
 #[test]
-fn errors_name_their_place_and_can_be_caught() {
+fn errors_name_their_line_and_can_be_caught() {
     let message = failure(&start("let x = 1;\nlet y = x / 0;"));
     assert!(message.contains("line 2"), "{message}");
     assert!(failure(&start("wait_ms(-1);")).contains("wait_ms takes 0"), "negative wait");
@@ -241,6 +241,6 @@ fn an_abort_during_a_print_ends_the_script_too() {
 #[test]
 fn a_dropped_program_leaves_no_thread() {
     let program = start("loop { try { wait_ms(10); } catch { } }");
-    // Joins: a thread that does not end would hang the test.
+    // It joins the thread: one that does not end would hang the test.
     drop(program);
 }

@@ -57,7 +57,8 @@ static MAP: LazyLock<Map> = LazyLock::new(|| {
     for var in SysVar::all() {
         let offset = var.image_offset();
         match var.modbus() {
-            // Inputs come first, so that an output's status does not replace its command, which can be written.
+            // Inputs come first, so that an output's status does not replace its command, which can be
+            // written.
             Some(ModbusPlace::Coils { first, .. }) => {
                 let byte = &mut coils[usize::from(first / 8)];
                 if byte.offset.is_none() {

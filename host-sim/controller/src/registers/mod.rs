@@ -1,11 +1,11 @@
 //! Every register and every input and output of the controller, in one place.
 //!
-//! In: values of recipe frames, Modbus writes and programs, and the states of the arm and the machine. Out: the same
-//! values on port 2001, Modbus, recipe ports and in programs. Does not know connections or time.
+//! In: values of recipe frames, Modbus writes and programs, and the states of the arm and the machine. Out:
+//! the same values on port 2001, Modbus, recipe ports and in programs. Does not know connections or time.
 //!
-//! System variables are in one process image, as everywhere in `proto_core`; the few other items of the Modbus map are
-//! beside it. An output that can be commanded has two variables, such as `DigitalOutputCommand[1]` and
-//! `DigitalSignalStatus[4]`: the second always follows the first.
+//! System variables are in one process image, as everywhere in `proto_core`; the few other items of the
+//! Modbus map are beside it. An output that can be commanded has two variables, such as
+//! `DigitalOutputCommand[1]` and `DigitalSignalStatus[4]`: the second always follows the first.
 
 mod bank;
 mod packet;

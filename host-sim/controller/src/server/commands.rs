@@ -1,8 +1,8 @@
-//! Port 2000: the commands of a connection are carried out one after the other, and answered when they are done
-//! (proto-core/docs/wire/command.md section 8, D25).
+//! Port 2000: the commands of a connection are carried out one after the other, and answered when they are
+//! done (proto-core/docs/wire/command.md section 8, D25).
 //!
-//! A command that begins a transition is answered at its end. Until then further commands of the connection wait;
-//! other connections are served.
+//! A command that begins a transition is answered at its end. Until then further commands of the connection
+//! wait; other connections are served.
 
 use std::collections::VecDeque;
 
@@ -121,8 +121,8 @@ impl Controller {
         self.settle(now);
     }
 
-    /// Answers commands whose transitions have ended, and carries out those that waited. To be called after every
-    /// change of the state machines.
+    /// Answers commands whose transitions have ended, and carries out those that waited. To be called after
+    /// every change of the state machines.
     pub(crate) fn settle(&mut self, now: Instant) {
         while let Some((conn, step)) = self.next_step(now) {
             match step {

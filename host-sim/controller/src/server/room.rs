@@ -1,6 +1,7 @@
 //! Which client is disconnected when a full server gets another one (docs/devices.md section 7).
 //!
-//! A host that only holds connections open must neither keep out clients that send requests nor displace them.
+//! A host that only holds connections open must neither keep out clients that send requests nor displace
+//! them.
 
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
@@ -41,8 +42,8 @@ impl Places {
         self.0.remove(&conn);
     }
 
-    /// The client to disconnect for a new one from this address, at a full server of `max` clients; `None` if the
-    /// new one is refused.
+    /// The client to disconnect for a new one from this address, at a full server of `max` clients; `None` if
+    /// the new one is refused.
     pub(super) fn to_displace(&self, now: Instant, link: Link, from: IpAddr, max: usize) -> Option<ConnId> {
         let here = || self.0.iter().filter(|(_, place)| place.link == link);
         // Clients of an address, with the new one.
@@ -50,8 +51,8 @@ impl Places {
             |of: IpAddr| here().filter(|(_, place)| place.from == of).count() + usize::from(of == from);
         let own = share(from);
         let shares = here().map(|(&conn, place)| (conn, place, share(place.from)));
-        // Idle clients of the address with most clients: first those that never sent a request, then the one whose
-        // request is oldest. Clients of port 2001 send none, so they are never idle.
+        // Idle clients of the address with most clients: first those that never sent a request, then the one
+        // whose request is oldest. Clients of port 2001 send none, so they are never idle.
         let idle = shares.clone().filter(|(_, place, share)| {
             link != Link::State && now.saturating_since(place.newest) >= IDLE && *share >= own
         });

@@ -1,4 +1,4 @@
-//! Anything in any order: nothing panics, every call ends, and what must hold holds after each.
+//! Random inputs in any order: nothing panics, every call ends, and the invariants hold after each.
 
 use proptest::prelude::*;
 use proto_core::command::Action;

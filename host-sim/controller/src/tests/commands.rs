@@ -16,8 +16,8 @@ fn a_robot_is_powered_enabled_run_and_shut_down() {
     let (c, d) = (cell.command_client(), cell.command_client());
     assert_eq!(cell.ask(c, "state"), "4:0:4:2");
     assert_eq!(cell.ask(c, "poweron"), "");
-    assert_eq!(cell.ask(d, "state"), "4:0:4:2", "it takes its time");
-    assert_eq!(cell.ask(d, "poweron"), "poweron fail", "it is on its way already");
+    assert_eq!(cell.ask(d, "state"), "4:0:4:2", "the transition takes time");
+    assert_eq!(cell.ask(d, "poweron"), "poweron fail", "a transition is in progress");
     cell.run_ms(299);
     assert_eq!(cell.take(c), b"");
     cell.run_ms(1);
@@ -61,15 +61,15 @@ fn a_robot_is_powered_enabled_run_and_shut_down() {
     assert!(cell.shut_down);
     assert_eq!(cell.closed, [c, d]);
     assert_eq!(cell.drain(), Instant::NEVER);
-    assert_eq!(cell.ask(c, "state"), "", "nobody is there any more");
+    assert_eq!(cell.ask(c, "state"), "", "the controller is shut down");
 }
 
-/// Which of the commands succeed in which state, and how long that takes.
+/// The commands that succeed in each state, with the duration of their transitions.
 #[test]
 fn every_command_fails_in_every_wrong_state() {
     #[rustfmt::skip]
     let table: [(&str, &[&str], &str); 11] = [
-        // how to get there, what is begun there, and what succeeds there
+        // The commands to get there, the command begun there, and those that succeed there.
         ("off",      &[],                                             "poweron shutdown"),
         ("powering", &["poweron.."],                                  "poweroff"),
         ("on",       &["poweron"],                                    "poweroff enable"),
@@ -200,7 +200,7 @@ fn nothing_marks_the_end_of_a_command_and_pieces_are_joined() {
     assert_eq!(cell.take(c), b"1");
     cell.run_ms(20);
     assert_eq!(cell.take(c), b"6:0:5:2");
-    // Other connections have their own.
+    // Other connections have their own buffers.
     let d = cell.command_client();
     cell.input(ControllerInput::CommandBytes { conn: c, bytes: b"sta" });
     assert_eq!(cell.ask(d, "te"), "unknown command");

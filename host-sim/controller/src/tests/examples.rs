@@ -13,7 +13,7 @@ const POSE: [(&str, f64); 6] = [
     ("RobotState[13]", -0.458_957),
 ];
 
-/// The values above are the capture's, rounded to six places; these are the capture's own.
+/// The values above are rounded to six places; these are the exact ones of the capture.
 fn captured_pose() -> SimConfig {
     let bytes = [
         0x39, 0x2F, 0x0B, 0xBF, 0x86, 0x87, 0x13, 0x3F, 0xBF, 0xBD, 0x9D, 0x3F, 0x37, 0xFC, 0xC8, 0xBF, 0x17,

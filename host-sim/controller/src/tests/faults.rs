@@ -1,11 +1,11 @@
-//! The knobs: what a gateway meets when a controller misbehaves.
+//! Faults: what a gateway sees of a controller that misbehaves.
 
 use proto_core::modbus::Exception;
 
 use super::*;
 
 #[test]
-fn a_mute_server_carries_out_and_says_nothing() {
+fn a_mute_server_carries_out_requests_without_answers() {
     let mut cell = robot(&with_power(SimConfig::default(), Power::Off));
     let (c, m, _) = (cell.command_client(), cell.modbus_client(), cell.state_client());
     for link in [Link::Command, Link::Modbus, Link::State] {
@@ -28,7 +28,7 @@ fn a_mute_server_carries_out_and_says_nothing() {
 }
 
 #[test]
-fn a_refusing_server_closes_what_comes() {
+fn a_refusing_server_closes_new_connections() {
     let mut cell = robot(&SimConfig::default());
     cell.controller.refuse(Link::Modbus);
     let refused = cell.modbus_client();
@@ -63,7 +63,7 @@ fn port_2000_may_take_one_client_only() {
     let fourth = cell.command_client();
     assert_eq!(cell.closed, [second, fourth], "nor does an idle one make room");
 
-    // Or the newest only: what the first one waits for gets lost with it.
+    // Or the newest only: the answer that the first one waits for is dropped with it.
     cell.controller.command_clients(CommandClients::DropFirst);
     cell.ask(third, "enable");
     let fifth = cell.command_client();
@@ -78,7 +78,7 @@ fn port_2000_may_take_one_client_only() {
     assert_eq!(cell.closed.last(), Some(&refused), "refused before it could displace anybody");
     cell.controller.accept(Link::Command);
 
-    // It outlives a restart.
+    // It remains after a restart.
     cell.controller.restart(cell.now);
     cell.drain();
     assert!(cell.closed.ends_with(&[fifth, s, m, ConnId(6)]), "{:?}", cell.closed);
@@ -104,7 +104,7 @@ fn modbus_answers_with_an_exception_and_changes_nothing() {
 }
 
 #[test]
-fn delayed_answers_keep_their_order_and_die_with_their_connection() {
+fn delayed_answers_keep_their_order_and_are_dropped_with_their_connection() {
     let mut cell = robot(&SimConfig::default());
     let (c, d) = (cell.command_client(), cell.command_client());
     cell.controller.delay_answers(Link::Command, Duration::from_millis(250));
@@ -173,7 +173,7 @@ fn a_restart_closes_everything_and_boots_to_power_off() {
     }
     assert_eq!(states, ["0:0:13:2", "1:0:0:2", "2:0:0:2", "3:0:0:2", "4:0:4:2"]);
     assert_eq!(cell.order(c, "poweron"), "poweron success");
-    // The serial line goes on, the TCP client waits for its connection.
+    // The serial line continues; the TCP client port waits for its connection.
     cell.sent.clear();
     cell.run_ms(4);
     assert_eq!(cell.sent.iter().map(|sent| sent.1).collect::<Vec<_>>(), [0]);
@@ -198,7 +198,7 @@ fn a_mute_port_goes_on_receiving() {
 }
 
 #[test]
-fn floats_can_be_shown_as_what_they_are_not() {
+fn floats_can_be_sent_with_other_values() {
     let recipe = stream_recipe(
         Mode::Realtime,
         system(&["DigitalOutputCommand[1]"]),
@@ -232,7 +232,7 @@ fn floats_can_be_shown_as_what_they_are_not() {
     assert_eq!((packet.float_outputs[0], packet.analog_inputs[4]), (f32::INFINITY, f32::NEG_INFINITY));
     assert_eq!(packet.tool_analog_inputs, [0.0, f32::MIN_POSITIVE / 2.0]);
     assert!(packet.joint_torque[6].is_nan());
-    // Everything else is as it was.
+    // Everything else is unchanged.
     let mut rest = packet;
     rest.tcp_pose[0] = honest.tcp_pose[0];
     rest.float_outputs[0] = 2.5;
@@ -243,7 +243,7 @@ fn floats_can_be_shown_as_what_they_are_not() {
     let Out::Bytes(frame) = &cell.sent[0].2 else { panic!("{:?}", cell.sent[0]) };
     let expected = [0xFFC1_2345_u32, 0.5_f32.to_bits(), f32::INFINITY.to_bits()].map(u32::to_le_bytes);
     assert_eq!(frame[2..14], expected.concat());
-    // The values themselves are what they were, and Modbus shows them.
+    // The values themselves are unchanged, and Modbus returns them.
     assert_eq!(cell.value("FloatOutputReg[1]"), 2.5);
     let m = cell.modbus_client();
     let x = (honest.tcp_pose[0] * 10_000.0).round() as i16;

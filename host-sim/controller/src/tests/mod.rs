@@ -28,7 +28,7 @@ use recipe_config::{
     SimStreamPart,
 };
 
-/// The shell may keep it in a task of any runtime.
+/// A shell may keep it in a task of any runtime.
 const _: fn() = || {
     fn is_send<T: Send>() {}
     is_send::<Controller>();
@@ -63,7 +63,7 @@ impl TestController {
         String::from_utf8(self.take(conn)).unwrap()
     }
 
-    /// Sends a command and lets time go by until it is answered.
+    /// Sends a command and advances the clock until it is answered.
     #[track_caller]
     pub(super) fn order(&mut self, conn: ConnId, text: &str) -> String {
         let asked = self.now;
@@ -76,7 +76,7 @@ impl TestController {
         reply
     }
 
-    /// Sends a Modbus PDU and returns the answer's, function code and all.
+    /// Sends a Modbus PDU and returns that of the answer, with its function code.
     #[track_caller]
     pub(super) fn modbus(&mut self, conn: ConnId, pdu: &[u8]) -> Vec<u8> {
         let mut adu = vec![0x12, 0x34, 0, 0, 0, pdu.len() as u8 + 1, 9];
@@ -89,7 +89,7 @@ impl TestController {
         answer[7..].to_vec()
     }
 
-    /// One coil, through Modbus.
+    /// Reads one coil over Modbus.
     #[track_caller]
     pub(super) fn coil(&mut self, address: u8) -> bool {
         let conn = self.modbus_client();
@@ -150,7 +150,7 @@ pub(super) fn can_recipe(mode: Mode, input: Vec<SimCanFrame>, output: Vec<SimCan
     SimRecipe { name: "r".to_owned(), mode, parts: SimParts::Can { input, output } }
 }
 
-/// One port called `p` with one recipe.
+/// A configuration with one port `p` and one recipe.
 pub(super) fn one_port(bus: SimBus, recipe: SimRecipe) -> SimConfig {
     let port = SimPort { name: "p".to_owned(), bus, recipe: Some(0), cycle: Duration::from_millis(4) };
     SimConfig { recipes: vec![recipe], ports: vec![port], ..SimConfig::default() }

@@ -1,4 +1,5 @@
-//! The Modbus map (proto-core/docs/wire/modbus.md, D10-D12), and that its items are those of the other views.
+//! The Modbus map (proto-core/docs/wire/modbus.md, D10-D12), and its agreement with recipes and the state
+//! stream.
 
 use proto_core::modbus::map::{Access, COILS, HOLDING, MAP, Space};
 
@@ -18,7 +19,7 @@ fn word(address: u16) -> [u8; 2] {
 }
 
 #[test]
-fn every_address_of_the_map_is_read_and_only_what_may_be_is_written() {
+fn every_address_of_the_map_is_readable_and_only_some_are_writable() {
     let mut cell = robot(&SimConfig::default());
     let c = cell.modbus_client();
     for address in 0..COILS + 2 {
@@ -58,7 +59,7 @@ fn every_address_of_the_map_is_read_and_only_what_may_be_is_written() {
 }
 
 #[test]
-fn coils_are_the_bits_that_recipes_and_the_stream_show() {
+fn coils_are_the_bits_of_recipes_and_of_the_stream() {
     let mut cell = robot(&SimConfig::default());
     let (c, _) = (cell.modbus_client(), cell.state_client());
     // The writable groups, each in one request.
@@ -87,7 +88,7 @@ fn coils_are_the_bits_that_recipes_and_the_stream_show() {
         assert_eq!(registers.value(target(name)) == 1.0, coil_pattern(nth), "{name}");
     }
     assert_eq!(cell.value("DigitalOutputCommand[1]"), cell.value("DigitalSignalStatus[4]"));
-    // Read across every boundary at once, from an odd address.
+    // One read across all boundaries, from an odd address.
     let answer = cell.modbus(c, &[1, 0, 3, 0, 225]);
     assert_eq!(answer.len(), 2 + 29);
     for nth in 3..228_u16 {
@@ -135,7 +136,7 @@ fn quantities_are_scaled_signed_and_saturated() {
     assert_eq!((read(72), read(79), read(89)), (1_234, 9_999, 1));
     assert_eq!(read(71), -1);
     assert_eq!((read(0), read(1), read(2), read(3)), (2, 6, 0, 5));
-    // Analog outputs are counts too, and the stream shows them in mA and V.
+    // Analog outputs are counts too; the stream has them in mA and V.
     cell.modbus(c, &[16, 0, 83, 0, 2, 4, 0x04, 0xD2, 0x13, 0x88]);
     cell.modbus(c, &[6, 0, 91, 0x03, 0xE8]);
     cell.run_ms(100);

@@ -55,7 +55,7 @@ fn a_partial_frame_does_not_survive_silence() {
 }
 
 #[test]
-fn values_that_cannot_be_are_rejected_or_masked() {
+fn invalid_values_are_rejected_or_masked() {
     let input = system(&["ForceEnd[1..6]", "DigitalOutputCommand[3]"]);
     let recipe = stream_recipe(Mode::Realtime, input, system(&["RobotState[14..19]"]));
     let mut cell = robot(&one_port(rs485(), recipe));
@@ -87,7 +87,7 @@ fn a_slow_line_skips_cycles_and_stays_on_the_grid() {
 }
 
 #[test]
-fn a_late_call_never_makes_up_for_missed_cycles() {
+fn a_late_call_never_sends_missed_cycles() {
     let mut cell = robot(&system_port(rs485()));
     cell.run_ms(1);
     cell.now += Duration::from_millis(14);
@@ -109,7 +109,7 @@ fn a_half_duplex_line_is_driven_only_after_silence() {
     cell.run_ms(4);
     let times: Vec<_> = cell.sent.iter().map(|sent| sent.0.as_micros() - 1_000_000).collect();
     assert_eq!(times, [4_350, 8_000], "300 µs after the last byte, then on the grid again");
-    // What comes while we send is taken, and counted.
+    // Bytes that arrive while the port sends are accepted and counted.
     cell.port_bytes(0, &OFF);
     assert!(!do1(&cell));
     assert_eq!(cell.counters("p").bytes_while_sending, 5);
@@ -129,7 +129,7 @@ fn datagrams_are_frames_or_nothing() {
 }
 
 #[test]
-fn the_udp_server_keeps_eight_clients_the_silent_one_makes_room() {
+fn the_udp_server_keeps_eight_clients_and_displaces_a_silent_one() {
     let mut cell = robot(&system_port(SimBus::UdpServer));
     for nth in 0..8 {
         cell.input(ControllerInput::Udp2011 { peer: peer(5_000 + nth), bytes: &[] });
@@ -163,7 +163,7 @@ fn the_udp_server_keeps_eight_clients_the_silent_one_makes_room() {
     assert_eq!(cell.controller.counters().stray_datagrams, 1);
 }
 
-/// To whom datagrams went since the last look.
+/// The receivers of datagrams since the last call.
 fn streamed_to(cell: &mut TestController) -> Vec<u16> {
     let port = |sent: (Instant, usize, Out)| match sent.2 {
         Out::Datagram(peer, _) => peer.port(),
@@ -173,7 +173,7 @@ fn streamed_to(cell: &mut TestController) -> Vec<u16> {
 }
 
 #[test]
-fn a_udp_client_that_is_silent_for_a_minute_is_streamed_to_no_more() {
+fn a_udp_client_that_is_silent_for_a_minute_is_removed() {
     let mut cell = robot(&system_port(SimBus::UdpServer));
     let send = |cell: &mut TestController, from: u16, bytes: &[u8]| {
         cell.input(ControllerInput::Udp2011 { peer: peer(from), bytes });
@@ -181,7 +181,7 @@ fn a_udp_client_that_is_silent_for_a_minute_is_streamed_to_no_more() {
     send(&mut cell, 1, b"");
     send(&mut cell, 2, &ON);
     cell.run_ms(30_000);
-    // Whatever it is that it sends.
+    // Any datagram counts.
     send(&mut cell, 2, b"?");
     cell.run_ms(29_992);
     streamed_to(&mut cell);
@@ -194,11 +194,11 @@ fn a_udp_client_that_is_silent_for_a_minute_is_streamed_to_no_more() {
     cell.run_ms(1_000);
     assert!(streamed_to(&mut cell).is_empty());
     assert_eq!(cell.counters("p").clients_silent, 2);
-    // Who sends again is there again at once.
+    // A client that sends again is added at once.
     send(&mut cell, 1, b"");
     cell.run_ms(4);
     assert_eq!(streamed_to(&mut cell), [1]);
-    // Those that have been silent do not count when places are short.
+    // Silent clients are removed before one is displaced.
     cell.run_ms(60_000);
     for from in 10..18 {
         send(&mut cell, from, b"");
@@ -226,7 +226,7 @@ fn without_an_input_part_a_udp_client_has_nothing_to_send() {
 }
 
 #[test]
-fn can_frames_that_are_not_the_recipes_are_counted_and_ignored() {
+fn can_frames_of_no_recipe_are_counted_and_ignored() {
     let recipe = can_recipe(Mode::Realtime, vec![can(1, system(&["DigitalOutputCommand[1]"]))], vec![]);
     let mut cell = robot(&one_port(SimBus::Can { bitrate: 500_000 }, recipe));
     let send =
@@ -246,7 +246,7 @@ fn can_frames_that_are_not_the_recipes_are_counted_and_ignored() {
 }
 
 #[test]
-fn an_idle_port_takes_bytes_and_does_nothing() {
+fn an_idle_port_counts_bytes_and_does_nothing() {
     let mut config = system_port(rs485());
     config.ports[0].recipe = None;
     let mut cell = robot(&config);
@@ -254,14 +254,14 @@ fn an_idle_port_takes_bytes_and_does_nothing() {
     cell.run_ms(20);
     assert!(!do1(&cell));
     assert_eq!((cell.sent.len(), cell.counters("p").unexpected_bytes), (0, 5));
-    // Ports that are not there are no reason to panic.
+    // An input for a port that does not exist is ignored.
     cell.port_bytes(7, &ON);
     cell.input(ControllerInput::PortUp { port: 7 });
     cell.input(ControllerInput::PortSent { port: 7 });
 }
 
 #[test]
-fn what_no_port_can_have_is_refused_with_its_name() {
+fn a_recipe_that_a_port_cannot_carry_is_refused_by_name() {
     let stream = || stream_recipe(Mode::User, user(&[Byte]), user(&[Float]));
     let can = || can_recipe(Mode::Realtime, vec![can(1, system(&["DigitalOutputCommand[1]"]))], vec![]);
     let refused = |bus: SimBus, recipe| Controller::new(&one_port(bus, recipe)).unwrap_err().to_string();
@@ -290,7 +290,7 @@ fn what_no_port_can_have_is_refused_with_its_name() {
 }
 
 #[test]
-fn another_recipe_takes_over_at_once_and_forgets_the_old_ones_bytes() {
+fn another_recipe_applies_at_once_and_drops_the_old_ones_bytes() {
     let mut config = system_port(SimBus::UdpServer);
     config.recipes.push(stream_recipe(
         Mode::Realtime,

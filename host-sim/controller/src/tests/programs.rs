@@ -19,7 +19,7 @@ fn frame(values: [u8; 3]) -> Vec<u8> {
 }
 
 #[test]
-fn waits_last_exactly_as_long_as_they_say() {
+fn waits_last_exactly_as_long_as_asked() {
     let (mut cell, c) =
         runs(SimConfig::default(), "for n in 0..1000 { wait_ms(3.5); set(\"WordOutputReg[1]\", n); }");
     cell.run(Duration::from_micros(3_500 * 500 - 1));
@@ -91,7 +91,7 @@ fn speed_scales_motion_and_pause_holds_it() {
         }
         cell.now.saturating_since(begin).as_millis()
     };
-    // The longest way of HOME to there is joint 3's.
+    // From HOME, joint 3 has the longest way.
     let whole = duration(&[]);
     assert!((2_900..3_000).contains(&whole), "{whole}");
     let slow = duration(&[(0, "speed(50)")]);
@@ -173,7 +173,7 @@ fn frames_wait_for_the_program_and_only_for_it() {
 }
 
 #[test]
-fn sends_wait_for_the_line_and_say_what_is_wrong() {
+fn sends_wait_for_the_line_and_report_errors() {
     let script = r#"
         for n in 0..3 { comm_send("p", [0.5, n]); }
         let errors = [];
@@ -204,7 +204,7 @@ fn sends_wait_for_the_line_and_say_what_is_wrong() {
 }
 
 #[test]
-fn a_port_that_goes_away_fails_the_send() {
+fn a_port_that_goes_down_fails_the_send() {
     let script = r#"
         try { comm_send("p", [0, 1]); } catch (e) { log(e); }
         try { comm_send("p", [0, 1]); } catch (e) { log(e); }
@@ -218,7 +218,7 @@ fn a_port_that_goes_away_fails_the_send() {
 }
 
 #[test]
-fn errors_stop_the_program_and_are_told_everywhere() {
+fn errors_stop_the_program_and_are_reported_everywhere() {
     let (mut cell, c) = runs(SimConfig::default(), "wait_ms(10);\nlet x = [1];\nlet y = x[5];");
     cell.state_client();
     cell.run_ms(100);
@@ -284,7 +284,7 @@ fn a_program_is_the_same_however_often_the_model_is_called() {
 }
 
 #[test]
-fn a_new_program_waits_until_the_old_ones_frame_has_left() {
+fn a_new_program_waits_until_the_old_ones_frame_was_sent() {
     let (mut cell, c) = runs(user_port(), "comm_send(\"p\", [0, 1]);");
     cell.line_time = Duration::from_millis(30);
     cell.sent.clear();

@@ -1,4 +1,4 @@
-//! Who is let in when a server is full, and who has to go.
+//! Which clients a full server accepts, and which it displaces.
 
 use std::net::IpAddr;
 
@@ -39,13 +39,13 @@ fn connections_are_bounded() {
 }
 
 #[test]
-fn who_only_holds_a_connection_makes_room_for_who_has_something_to_ask() {
+fn an_idle_client_is_displaced_by_one_with_requests() {
     let mut cell = robot(&SimConfig::default());
     let good = cell.command_client();
     let idle = several(&mut cell, MAX_COMMAND_CONNECTIONS - 1, CLIENT_ADDRESS);
     cell.run_ms(1_000);
     assert_eq!(cell.ask(good, "state"), "6:0:5:2");
-    // A byte now and then is nothing whole.
+    // Single bytes are not a complete request.
     cell.input(ControllerInput::CommandBytes { conn: idle[0], bytes: b"run(" });
     cell.run_ms(3_999);
     let early = cell.command_client();
@@ -60,7 +60,7 @@ fn who_only_holds_a_connection_makes_room_for_who_has_something_to_ask() {
 }
 
 #[test]
-fn clients_that_asked_once_make_room_for_the_next_ones_stop() {
+fn clients_with_one_request_are_displaced_for_the_next_ones_stop() {
     let config = with_program(SimConfig::default(), "t", "loop { wait_ms(10); }");
     let mut cell = robot(&config);
     let mut clients = several(&mut cell, MAX_COMMAND_CONNECTIONS, CLIENT_ADDRESS);
@@ -69,20 +69,20 @@ fn clients_that_asked_once_make_room_for_the_next_ones_stop() {
         cell.run_ms(10);
         assert_eq!(cell.ask(conn, "isprogfinish"), "0");
     }
-    // The first of them goes on asking, the second is the one that asked longest ago.
+    // The first client remains active; the second has the oldest request.
     cell.run_ms(4_000);
     assert_eq!(cell.ask(clients[0], "isprogfinish"), "0");
     cell.run_ms(1_000);
     let new = cell.command_client();
     assert_eq!(cell.closed, [clients[1]]);
     assert_eq!(cell.order(new, "stop"), "stop success");
-    // Who never asked goes before those who did.
+    // A client that never sent a request is displaced first.
     let silent = cell.command_client();
     assert_eq!(cell.closed, [clients[1], clients[2]]);
     cell.run_ms(5_000);
     cell.command_client();
     assert_eq!(cell.closed[2..], [silent]);
-    // Whoever asks is not displaced, however many come.
+    // Active clients are not displaced, however many connect.
     clients.drain(1..3);
     clients.push(new);
     for &conn in &clients {
@@ -99,7 +99,7 @@ fn clients_that_asked_once_make_room_for_the_next_ones_stop() {
 }
 
 #[test]
-fn who_waits_for_an_answer_is_not_idle() {
+fn a_client_that_waits_for_an_answer_is_not_idle() {
     let mut cell = robot(&with_power(SimConfig::default(), Power::Off));
     cell.controller.delay_transitions(Duration::from_secs(60));
     let waits = cell.command_client();
@@ -124,9 +124,9 @@ fn who_waits_for_an_answer_is_not_idle() {
 }
 
 #[test]
-fn a_host_with_many_connections_displaces_its_own_and_gives_way_to_others() {
+fn a_host_with_many_connections_displaces_its_own_and_is_displaced_by_others() {
     let mut cell = robot(&SimConfig::default());
-    // Two idle clients of another host, such as a gateway that has nothing to say.
+    // Two idle clients of another host, such as a gateway without values to write.
     let gateway = several(&mut cell, 2, host(1));
     cell.run_ms(60_000);
     several(&mut cell, MAX_COMMAND_CONNECTIONS - 2, host(2));
@@ -140,7 +140,7 @@ fn a_host_with_many_connections_displaces_its_own_and_gives_way_to_others() {
     assert!(gateway.iter().all(|conn| !cell.closed.contains(conn)), "not its, though it is idle longer");
     assert!(refused < 1_000 && cell.closed.len() > refused, "its own make room when they are idle");
 
-    // Those that ask all the time keep out none but their own host's.
+    // Active clients only prevent further ones of their own host.
     let mut cell = robot(&SimConfig::default());
     let gateway = several(&mut cell, 2, host(1));
     cell.ask(gateway[0], "state");
@@ -162,7 +162,7 @@ fn a_host_with_many_connections_displaces_its_own_and_gives_way_to_others() {
 }
 
 #[test]
-fn a_host_with_its_share_is_not_displaced_while_it_asks() {
+fn an_active_host_with_its_share_is_not_displaced() {
     let mut cell = robot(&SimConfig::default());
     let half = several(&mut cell, MAX_COMMAND_CONNECTIONS / 2, host(1));
     let other_half = several(&mut cell, MAX_COMMAND_CONNECTIONS / 2, host(2));
@@ -178,15 +178,15 @@ fn a_host_with_its_share_is_not_displaced_while_it_asks() {
 }
 
 #[test]
-fn the_state_stream_and_modbus_know_the_same_rules() {
-    // Who listens to port 2001 never asks, and is not idle for that.
+fn the_state_stream_and_modbus_have_the_same_rules() {
+    // A client of port 2001 never sends a request, but is not idle.
     let mut cell = robot(&SimConfig::default());
     let listeners: Vec<_> =
         (0..MAX_STATE_CONNECTIONS).map(|_| open(&mut cell, Link::State, host(1))).collect();
     cell.run_ms(60_000);
     let own = open(&mut cell, Link::State, host(1));
     assert_eq!(cell.closed, [own]);
-    // But a host of its own gets a place of the one that has most of them.
+    // But a new host displaces a client of the host that has most.
     open(&mut cell, Link::State, host(2));
     assert_eq!(cell.closed, [own, listeners[0]]);
     assert_eq!(cell.controller.counters().state.open, MAX_STATE_CONNECTIONS);

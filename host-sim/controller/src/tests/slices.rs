@@ -1,8 +1,8 @@
-//! Programs that never wait: everything else keeps its time.
+//! Programs that never wait: everything else keeps its timing.
 
 use super::*;
 
-/// The UDP server and a line, both each 4 ms, and a program.
+/// The UDP server and a serial line, both with a cycle of 4 ms, and a program.
 fn config(script: &str) -> SimConfig {
     let recipe =
         stream_recipe(Mode::Realtime, system(&["DigitalOutputCommand[1]"]), system(&["RobotState[8..11]"]));
@@ -41,7 +41,7 @@ fn servers_streams_and_ports_keep_their_time() {
         assert_eq!(on(1).collect::<Vec<_>>(), grid, "{script}");
         let packets: Vec<_> = cell.packets.iter().map(|packet| after(packet.0)).collect();
         assert_eq!(packets, (1..=10).map(|nth| nth * 100_000).collect::<Vec<_>>(), "{script}");
-        // And it sees what it waits for.
+        // And the program sees the input that it waits for.
         cell.controller.force(target("DI[1]"), 1.0).unwrap();
         cell.run_ms(100);
         assert_eq!(cell.ask(c, "isprogfinish"), "1", "{script}");
@@ -64,7 +64,7 @@ fn a_slice_is_a_millisecond_of_a_few_calls() {
         let done = cell.value("WordOutputReg[1]") - before;
         assert!((5.0..=10.0).contains(&done), "{done} in slice {slice}");
     }
-    // A pause keeps it from the next slice, a stop ends it at once.
+    // A pause prevents the next slice; a stop ends the program at once.
     assert_eq!(cell.order(c, "pause"), "pause success");
     let held = cell.value("WordOutputReg[1]");
     cell.run_ms(1_000);

@@ -7,7 +7,7 @@ use super::*;
 const MOVE: &str = "movej([1.0, -1.2, -1.0, 0.3, 0.9, -0.5], 1.0);";
 
 #[test]
-fn packets_come_on_a_fixed_grid_to_whoever_is_there() {
+fn packets_come_on_a_fixed_grid_to_every_client() {
     let mut cell = robot(&SimConfig::default());
     cell.run_ms(350);
     assert_eq!(cell.packets, []);

@@ -1,4 +1,4 @@
-//! Port 2000: replies come when what was asked for is done (D25).
+//! Port 2000: a command is answered at the end of its transition (D25).
 
 use super::*;
 
@@ -43,7 +43,7 @@ fn a_stop_and_a_pause_are_answered_when_the_arm_rests() {
 }
 
 #[test]
-fn what_follows_on_the_connection_is_answered_after_in_order() {
+fn further_commands_of_the_connection_are_answered_after_it_in_order() {
     let (mut cell, a, b) = with(Power::Off);
     cell.input(ControllerInput::CommandBytes {
         conn: a,
@@ -51,7 +51,7 @@ fn what_follows_on_the_connection_is_answered_after_in_order() {
     });
     assert_eq!(cell.ask(b, "state"), "4:0:4:2", "others are served");
     cell.run_ms(100);
-    // A keyword that silence ends, while another command is awaited.
+    // A command that is completed by silence, while another one is pending.
     cell.input(ControllerInput::CommandBytes { conn: a, bytes: b"op" });
     cell.run_ms(30);
     cell.input(ControllerInput::CommandBytes { conn: a, bytes: b"state" });
@@ -71,7 +71,7 @@ fn what_follows_on_the_connection_is_answered_after_in_order() {
 }
 
 #[test]
-fn what_breaks_a_transition_off_fails_its_command_at_once() {
+fn a_superseded_transition_fails_its_command_at_once() {
     // Power off while enabling, from another connection.
     let (mut cell, a, b) = with(Power::On);
     assert_eq!(cell.ask(a, "enable"), "");
@@ -84,7 +84,7 @@ fn what_breaks_a_transition_off_fails_its_command_at_once() {
     assert_eq!(got(&mut cell, b), "poweroff success");
     assert_eq!(cell.ask(a, "state"), "4:0:4:2");
 
-    // Power off while powering on: the power never comes.
+    // Power off while powering on: the power is never on.
     assert_eq!(cell.ask(a, "poweron"), "");
     cell.run_ms(50);
     assert_eq!(cell.ask(b, "poweroff"), "");
@@ -94,7 +94,7 @@ fn what_breaks_a_transition_off_fails_its_command_at_once() {
     cell.run_ms(1_000);
     assert_eq!(cell.ask(a, "state"), "4:0:4:2");
 
-    // Disable while enabling: never shown as enabled.
+    // Disable while enabling: the robot is never enabled.
     let (mut cell, a, b) = with(Power::On);
     cell.ask(a, "enable");
     cell.run_ms(50);
@@ -119,7 +119,7 @@ fn what_breaks_a_transition_off_fails_its_command_at_once() {
 }
 
 #[test]
-fn a_safety_stop_fails_what_it_undoes_and_not_what_it_does_itself() {
+fn a_safety_stop_fails_commands_against_it_and_not_those_with_the_same_effect() {
     let (mut cell, a, b) = with(Power::On);
     cell.ask(a, "enable");
     cell.controller.emergency_stop(cell.now);
@@ -146,7 +146,7 @@ fn a_safety_stop_fails_what_it_undoes_and_not_what_it_does_itself() {
 }
 
 #[test]
-fn a_disabled_robot_has_no_program_any_more_either() {
+fn a_disabled_robot_has_no_program_either() {
     for (command, state) in [("disable", "5:0:5:2"), ("poweroff", "4:0:4:2")] {
         let (mut cell, a, b) = enabled();
         cell.ask(a, "run(t)");
@@ -167,7 +167,7 @@ fn a_disabled_robot_has_no_program_any_more_either() {
 }
 
 #[test]
-fn a_transition_over_its_limit_is_a_fail_and_goes_on() {
+fn a_transition_over_its_limit_fails_and_continues() {
     let (mut cell, a, b) = with(Power::On);
     cell.controller.delay_transitions(Duration::from_secs(6));
     assert_eq!(cell.ask(a, "enable"), "");
@@ -181,7 +181,7 @@ fn a_transition_over_its_limit_is_a_fail_and_goes_on() {
     cell.run_ms(1);
     assert_eq!(cell.ask(b, "state"), "6:0:5:2");
     assert_eq!(got(&mut cell, a), "");
-    // Stopping is late alike, and the delay outlives a restart.
+    // A stop is delayed too, and the delay remains after a restart.
     cell.controller.delay_transitions(Duration::from_secs(1));
     cell.ask(a, "run(t)");
     assert_eq!(cell.ask(a, "stop"), "");
@@ -200,7 +200,7 @@ fn a_transition_over_its_limit_is_a_fail_and_goes_on() {
 }
 
 #[test]
-fn a_connection_that_goes_takes_what_waited_with_it_and_nothing_else() {
+fn a_closed_connection_drops_its_waiting_commands_and_nothing_else() {
     let (mut cell, a, b) = with(Power::Off);
     cell.ask(a, "poweron");
     assert_eq!(cell.ask(a, "enable"), "");
@@ -210,7 +210,7 @@ fn a_connection_that_goes_takes_what_waited_with_it_and_nothing_else() {
     assert_eq!(cell.ask(b, "state"), "5:0:5:2", "powered on, and never enabled");
     assert_eq!(cell.controller.deadline(), Instant::NEVER, "nothing waits any more");
 
-    // A restart closes everything; the number is free for another client, which gets nothing of it.
+    // A restart closes everything. Another client with the same number gets none of its answers.
     cell.ask(b, "enable");
     cell.ask(b, "state");
     cell.controller.restart(cell.now);
@@ -222,7 +222,7 @@ fn a_connection_that_goes_takes_what_waited_with_it_and_nothing_else() {
     assert_eq!(cell.ask(b, "state"), "4:0:4:2");
     assert_eq!(cell.controller.deadline(), Instant::NEVER);
 
-    // Shut down behind one that waits: it is closed with all others.
+    // Shutdown while a command waits: its connection is closed with all others.
     assert_eq!(cell.ask(b, "poweron"), "");
     cell.input(ControllerInput::CommandClosed { conn: b });
     let (c, d) = (cell.command_client(), cell.command_client());
@@ -234,7 +234,7 @@ fn a_connection_that_goes_takes_what_waited_with_it_and_nothing_else() {
 }
 
 #[test]
-fn only_so_many_commands_wait() {
+fn the_number_of_waiting_commands_is_bounded() {
     let (mut cell, a, b) = with(Power::Off);
     cell.ask(a, "poweron");
     for _ in 0..MAX_ORDERS {
@@ -243,7 +243,7 @@ fn only_so_many_commands_wait() {
     assert_eq!(cell.closed, []);
     cell.run_ms(300);
     assert_eq!(got(&mut cell, a), format!("poweron success{}", "1".repeat(MAX_ORDERS)));
-    // One more, in one piece with the rest: what waited is not carried out.
+    // One more, in one piece with the rest: the waiting commands are not carried out.
     let mut bytes = b"poweroff\nenable\n".to_vec();
     bytes.extend(b"isprogfinish\n".repeat(MAX_ORDERS));
     cell.input(ControllerInput::CommandBytes { conn: a, bytes: &bytes });
@@ -251,13 +251,13 @@ fn only_so_many_commands_wait() {
     assert_eq!(cell.controller.counters().command.violations, 1);
     cell.run_ms(1_000);
     assert_eq!((got(&mut cell, a).as_str(), cell.ask(b, "state").as_str()), ("", "4:0:4:2"));
-    // Without anything to wait for there is no bound.
+    // There is no bound if no command is pending.
     cell.input(ControllerInput::CommandBytes { conn: b, bytes: &b"isprogfinish\n".repeat(1_000) });
     assert_eq!(got(&mut cell, b).len(), 1_000);
 }
 
 #[test]
-fn mute_and_late_answers_are_so_at_the_end_of_the_transition() {
+fn mute_and_delay_apply_at_the_end_of_the_transition() {
     let (mut cell, a, b) = with(Power::Off);
     cell.controller.mute(Link::Command);
     cell.ask(a, "poweron");
@@ -275,7 +275,7 @@ fn mute_and_late_answers_are_so_at_the_end_of_the_transition() {
     assert_eq!(got(&mut cell, a), "");
     cell.run_ms(1);
     assert_eq!(got(&mut cell, a), "disable success5:0:5:2");
-    // Who goes before the late answer comes gets none, nor does anybody else.
+    // A client that disconnects before the delayed answer gets none, and nobody else gets it.
     cell.ask(a, "enable");
     cell.run_ms(300);
     cell.input(ControllerInput::CommandClosed { conn: a });
@@ -285,17 +285,17 @@ fn mute_and_late_answers_are_so_at_the_end_of_the_transition() {
 }
 
 #[test]
-fn a_late_call_answers_all_the_same() {
+fn a_late_call_still_answers() {
     let (mut cell, a, b) = with(Power::Off);
     cell.ask(a, "poweron");
     cell.ask(a, "enable");
-    // Nobody looked for two seconds: what was done then is done, and what waited begins now.
+    // After two seconds without a call, the transition is done, and the waiting command begins now.
     cell.now += Duration::from_secs(2);
     assert_eq!(cell.ask(b, "state"), "5:0:5:2");
     assert_eq!(got(&mut cell, a), "poweron success");
     cell.run_ms(200);
     assert_eq!(got(&mut cell, a), "enable success");
-    // Nor for longer than a command's limit: done counts.
+    // The same after more than a command's time limit: the transition is done.
     cell.ask(a, "disable");
     cell.now += Duration::from_secs(20);
     cell.drain();

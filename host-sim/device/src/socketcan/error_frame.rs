@@ -1,65 +1,64 @@
-//! Error frames of the kernel, as news of a CAN controller's error state.
+//! Error frames of the kernel: the error state and the error counters of a CAN controller.
 
 use proto_core::engine::BusState;
 use socketcan::errors::ControllerProblems;
 use socketcan::{CanErrorFrame, EmbeddedFrame};
 
-/// What an error frame says.
+/// What an error frame says about the controller's state.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum News {
-    /// The controller's state is this now.
+pub(super) enum StateChange {
+    /// The new state.
     State(BusState),
-    /// The controller was started again after bus-off.
+    /// The controller was restarted after bus-off.
     Restarted,
-    /// Nothing of its state.
+    /// Nothing.
     Other,
 }
 
-/// Decodes an error frame. The worst that it says counts: one frame may tell the state of either
-/// direction.
-pub(super) fn news(frame: CanErrorFrame) -> News {
+/// The state in an error frame. The worst one counts: a frame may contain the states of both directions.
+pub(super) fn state_change(frame: CanErrorFrame) -> StateChange {
     let error = frame.into_error();
     if error.is_bus_off() {
-        return News::State(BusState::BusOff);
+        return StateChange::State(BusState::BusOff);
     }
     if error.is_restarted() {
-        return News::Restarted;
+        return StateChange::Restarted;
     }
     let problems = error.controller().unwrap_or(ControllerProblems::empty());
     let says = |state| problems.intersects(state);
     if says(ControllerProblems::RX_PASSIVE | ControllerProblems::TX_PASSIVE) {
-        News::State(BusState::Passive)
+        StateChange::State(BusState::Passive)
     } else if says(ControllerProblems::RX_WARNING | ControllerProblems::TX_WARNING) {
-        News::State(BusState::Warning)
+        StateChange::State(BusState::Warning)
     } else if says(ControllerProblems::ACTIVE) {
-        News::State(BusState::Active)
+        StateChange::State(BusState::Active)
     } else {
-        News::Other
+        StateChange::Other
     }
 }
 
-/// The transmit and the receive error counter, if the frame tells them.
+/// The transmit and the receive error counter, if the frame contains them.
 pub(super) fn counters(frame: CanErrorFrame) -> Option<(u8, u8)> {
     let &[.., transmit, receive] = frame.data().first_chunk::<8>()?;
-    match news(frame) {
-        News::Restarted => Some((0, 0)),
-        News::State(BusState::BusOff) => None,
-        // The flag is as new as Linux 5.19, and the counters were there before.
-        News::State(_) => Some((transmit, receive)),
-        News::Other => {
+    match state_change(frame) {
+        StateChange::Restarted => Some((0, 0)),
+        StateChange::State(BusState::BusOff) => None,
+        // Linux before 5.19 sets the counters without the flag.
+        StateChange::State(_) => Some((transmit, receive)),
+        StateChange::Other => {
             let flagged = frame.error_bits() & libc::CAN_ERR_CNT != 0;
             (flagged || (transmit, receive) != (0, 0)).then_some((transmit, receive))
         }
     }
 }
 
-/// Whether the adapter lost frames that it had received.
+/// Whether the adapter lost received frames.
 pub(super) fn is_overflow(frame: CanErrorFrame) -> bool {
     let problems = frame.into_error().controller().unwrap_or(ControllerProblems::empty());
     problems.contains(ControllerProblems::RX_OVERFLOW)
 }
 
-/// As people and statistics call it.
+/// The state's name in logs and statistics.
 pub(super) const fn name(state: BusState) -> &'static str {
     match state {
         BusState::Active => "active",
@@ -73,32 +72,32 @@ pub(super) const fn name(state: BusState) -> &'static str {
 mod tests {
     use super::*;
 
-    fn of(class: u32, controller: i32) -> News {
+    fn of(class: u32, controller: i32) -> StateChange {
         let data = [0, u8::try_from(controller).unwrap(), 0, 0, 0, 0, 0, 0];
-        news(CanErrorFrame::new_error(class, &data).unwrap())
+        state_change(CanErrorFrame::new_error(class, &data).unwrap())
     }
 
     #[test]
     fn states_as_drivers_report_them() {
         let controller = libc::CAN_ERR_CRTL | libc::CAN_ERR_CNT;
-        for (said, state) in [
+        for (problems, state) in [
             (libc::CAN_ERR_CRTL_RX_WARNING | libc::CAN_ERR_CRTL_TX_WARNING, BusState::Warning),
             (libc::CAN_ERR_CRTL_TX_WARNING, BusState::Warning),
             (libc::CAN_ERR_CRTL_RX_PASSIVE, BusState::Passive),
             (libc::CAN_ERR_CRTL_TX_PASSIVE | libc::CAN_ERR_CRTL_RX_WARNING, BusState::Passive),
             (libc::CAN_ERR_CRTL_ACTIVE, BusState::Active),
         ] {
-            assert_eq!(of(controller, said), News::State(state), "{said:#x}");
+            assert_eq!(of(controller, problems), StateChange::State(state), "{problems:#x}");
         }
-        assert_eq!(of(libc::CAN_ERR_BUSOFF | libc::CAN_ERR_CNT, 0), News::State(BusState::BusOff));
-        assert_eq!(of(libc::CAN_ERR_BUSOFF | controller, 0x40), News::State(BusState::BusOff));
-        assert_eq!(of(libc::CAN_ERR_RESTARTED, 0), News::Restarted);
+        assert_eq!(of(libc::CAN_ERR_BUSOFF | libc::CAN_ERR_CNT, 0), StateChange::State(BusState::BusOff));
+        assert_eq!(of(libc::CAN_ERR_BUSOFF | controller, 0x40), StateChange::State(BusState::BusOff));
+        assert_eq!(of(libc::CAN_ERR_RESTARTED, 0), StateChange::Restarted);
     }
 
     #[test]
-    fn counters_are_the_senders_and_the_receivers() {
-        let of = |class: u32, controller: i32, told: [u8; 2]| {
-            let data = [0, u8::try_from(controller).unwrap(), 0, 0, 0, 0, told[0], told[1]];
+    fn counters_are_transmit_and_receive() {
+        let of = |class: u32, controller: i32, counters_of: [u8; 2]| {
+            let data = [0, u8::try_from(controller).unwrap(), 0, 0, 0, 0, counters_of[0], counters_of[1]];
             counters(CanErrorFrame::new_error(class, &data).unwrap())
         };
         let controller = libc::CAN_ERR_CRTL;
@@ -106,19 +105,19 @@ mod tests {
             of(controller | libc::CAN_ERR_CNT, libc::CAN_ERR_CRTL_TX_PASSIVE, [128, 3]),
             Some((128, 3))
         );
-        // Without the flag they are where it would put them.
+        // Without the flag they are at the same place.
         assert_eq!(of(controller, libc::CAN_ERR_CRTL_RX_PASSIVE, [0, 128]), Some((0, 128)));
         assert_eq!(of(controller, libc::CAN_ERR_CRTL_ACTIVE, [0, 0]), Some((0, 0)));
         assert_eq!(of(libc::CAN_ERR_ACK, 0, [8, 0]), Some((8, 0)));
         assert_eq!(of(libc::CAN_ERR_RESTARTED, 0, [0, 0]), Some((0, 0)));
-        // Nothing is told.
+        // No counters.
         assert_eq!(of(libc::CAN_ERR_ACK, 0, [0, 0]), None);
         assert_eq!(of(controller, libc::CAN_ERR_CRTL_RX_OVERFLOW, [0, 0]), None);
         assert_eq!(of(libc::CAN_ERR_BUSOFF, 0, [0, 0]), None);
     }
 
     #[test]
-    fn an_overflow_is_of_what_was_received() {
+    fn only_a_receive_overflow_counts() {
         let of = |controller: i32| {
             let data = [0, u8::try_from(controller).unwrap(), 0, 0, 0, 0, 0, 0];
             is_overflow(CanErrorFrame::new_error(libc::CAN_ERR_CRTL, &data).unwrap())
@@ -129,10 +128,13 @@ mod tests {
     }
 
     #[test]
-    fn what_says_nothing_of_the_state_changes_none() {
-        assert_eq!(of(libc::CAN_ERR_CRTL, libc::CAN_ERR_CRTL_RX_OVERFLOW), News::Other);
-        assert_eq!(of(libc::CAN_ERR_CRTL, 0), News::Other);
-        assert_eq!(of(libc::CAN_ERR_ACK | libc::CAN_ERR_PROT | libc::CAN_ERR_BUSERROR, 0), News::Other);
-        assert_eq!(of(0, 0), News::Other);
+    fn other_errors_do_not_change_the_state() {
+        assert_eq!(of(libc::CAN_ERR_CRTL, libc::CAN_ERR_CRTL_RX_OVERFLOW), StateChange::Other);
+        assert_eq!(of(libc::CAN_ERR_CRTL, 0), StateChange::Other);
+        assert_eq!(
+            of(libc::CAN_ERR_ACK | libc::CAN_ERR_PROT | libc::CAN_ERR_BUSERROR, 0),
+            StateChange::Other
+        );
+        assert_eq!(of(0, 0), StateChange::Other);
     }
 }

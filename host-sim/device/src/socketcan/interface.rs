@@ -1,10 +1,10 @@
-//! What the kernel says of a CAN interface when it is asked (rtnetlink, as `ip -details link show` does).
+//! The state of a CAN interface, queried from the kernel by rtnetlink, as `ip -details link show` does.
 //!
 //! In: an interface's name, or the kernel's answer as bytes. Out: whether it has a carrier, and the bit rate
-//! and the error state that its driver knows. Refuses to know what was heard before. No privileges are needed.
+//! and the error state that its driver knows. Does not know error frames. No privileges are needed.
 //!
-//! Neither alone tells of bus-off: some drivers take the carrier away and know no state, `gs_usb` keeps the
-//! carrier and knows the state that its adapter told last.
+//! Bus-off needs both carrier and state: some drivers switch the carrier off and know no state; `gs_usb`
+//! keeps the carrier and knows the last state that its adapter reported.
 
 use std::io;
 
@@ -13,31 +13,31 @@ use rustix::net::{AddressFamily, RecvFlags, SendFlags, SocketFlags, SocketType, 
 
 /// An interface, as the kernel sees it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Link {
-    /// Whether it has a carrier; also when the kernel does not say.
+pub(super) struct Interface {
+    /// Whether it has a carrier; `true` if the kernel does not say.
     pub(super) has_carrier: bool,
-    /// Bit/s; `None` for an interface without a controller, or where others set it.
+    /// Bit/s; `None` for an interface without a controller, or if the driver does not know it.
     pub(super) bitrate: Option<u32>,
-    /// What its driver knows of the controller; `None` for an interface without one.
+    /// The controller's error state; `None` if there is no controller or the driver does not know it.
     state: Option<BusState>,
 }
 
-impl Link {
-    /// Asks the kernel, which answers at once.
-    pub(super) fn ask(interface: &str) -> io::Result<Self> {
+impl Interface {
+    /// Queries the kernel, which answers at once.
+    pub(super) fn query(interface: &str) -> io::Result<Self> {
         let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
-        // Its protocol 0 is NETLINK_ROUTE.
+        // Protocol 0 is NETLINK_ROUTE.
         let socket = socket_with(AddressFamily::NETLINK, SocketType::RAW, flags, None)?;
-        send(&socket, &question(interface), SendFlags::empty())?;
-        let mut answer = [0; MOST];
+        send(&socket, &request(interface), SendFlags::empty())?;
+        let mut answer = [0; MAX_ANSWER];
         let (_, length) = recv(&socket, &mut answer, RecvFlags::empty())?;
         Self::parse(answer.get(..length).unwrap_or(&answer))
             .ok_or_else(|| io::Error::other("not told of the interface"))
     }
 
-    /// As [`Self::ask`]; an interface that the kernel says nothing of is taken for one without errors.
+    /// As [`Self::query`]; if that fails, an interface without errors.
     pub(super) fn of(interface: &str) -> Self {
-        Self::ask(interface).unwrap_or(Self { has_carrier: true, bitrate: None, state: None })
+        Self::query(interface).unwrap_or(Self { has_carrier: true, bitrate: None, state: None })
     }
 
     /// The controller's state.
@@ -49,14 +49,14 @@ impl Link {
         self.bus() == BusState::BusOff
     }
 
-    /// A message of the kernel's; `None` if it is not about an interface.
+    /// Parses a message of the kernel; `None` if it does not describe an interface.
     fn parse(message: &[u8]) -> Option<Self> {
         let length = usize::try_from(word(message)?).ok()?;
         let kind = half(message.get(4..)?)?;
         if kind != libc::RTM_NEWLINK {
             return None;
         }
-        let attributes = message.get(HEADER + INTERFACE..length)?;
+        let attributes = message.get(NLMSGHDR + IFINFOMSG..length)?;
         let carrier = find(attributes, libc::IFLA_CARRIER).and_then(<[u8]>::first);
         let info = find(attributes, libc::IFLA_LINKINFO).unwrap_or_default();
         let is_can = find(info, libc::IFLA_INFO_KIND).is_some_and(|kind| kind.starts_with(b"can\0"));
@@ -67,26 +67,26 @@ impl Link {
             1 => Some(BusState::Warning),
             2 => Some(BusState::Passive),
             3 => Some(BusState::BusOff),
-            // Stopped and sleeping: it is down.
+            // Stopped or sleeping: the interface is down.
             _ => None,
         });
         Some(Self { has_carrier: carrier != Some(&0), bitrate, state })
     }
 }
 
-/// RTM_GETLINK of the interface with this name.
-fn question(interface: &str) -> Vec<u8> {
-    let mut bytes = vec![0; HEADER + INTERFACE];
+/// An RTM_GETLINK request for the interface with this name.
+fn request(interface: &str) -> Vec<u8> {
+    let mut bytes = vec![0; NLMSGHDR + IFINFOMSG];
     let value = interface.len() + 1;
-    bytes.extend(u16::try_from(ATTRIBUTE + value).unwrap_or(u16::MAX).to_ne_bytes());
+    bytes.extend(u16::try_from(RTATTR + value).unwrap_or(u16::MAX).to_ne_bytes());
     bytes.extend(libc::IFLA_IFNAME.to_ne_bytes());
     bytes.extend(interface.as_bytes());
     bytes.push(0);
-    bytes.resize(bytes.len().next_multiple_of(ALIGNMENT), 0);
+    bytes.resize(bytes.len().next_multiple_of(RTA_ALIGNTO), 0);
     let length = u32::try_from(bytes.len()).unwrap_or(u32::MAX);
     bytes[..4].copy_from_slice(&length.to_ne_bytes());
     bytes[4..6].copy_from_slice(&libc::RTM_GETLINK.to_ne_bytes());
-    bytes[6..8].copy_from_slice(&REQUEST.to_ne_bytes());
+    bytes[6..8].copy_from_slice(&NLM_F_REQUEST.to_ne_bytes());
     bytes
 }
 
@@ -95,11 +95,11 @@ fn find(mut attributes: &[u8], kind: u16) -> Option<&[u8]> {
     loop {
         let length = usize::from(half(attributes)?);
         let found = half(attributes.get(2..)?)? & !FLAGS;
-        let value = attributes.get(ATTRIBUTE..length)?;
+        let value = attributes.get(RTATTR..length)?;
         if found == kind {
             return Some(value);
         }
-        attributes = attributes.get(length.next_multiple_of(ALIGNMENT)..)?;
+        attributes = attributes.get(length.next_multiple_of(RTA_ALIGNTO)..)?;
     }
 }
 
@@ -111,38 +111,37 @@ fn word(bytes: &[u8]) -> Option<u32> {
     bytes.first_chunk().map(|bytes| u32::from_ne_bytes(*bytes))
 }
 
-/// `struct nlmsghdr`: length, kind, flags, and two words of no interest.
-const HEADER: usize = 16;
-/// `struct ifinfomsg`; the question's is zero.
-const INTERFACE: usize = 16;
-/// `struct rtattr`: length, kind.
-const ATTRIBUTE: usize = 4;
-const ALIGNMENT: usize = 4;
-/// NLM_F_REQUEST.
-const REQUEST: u16 = 1;
+/// Length of `struct nlmsghdr`: length, kind, flags, and two words that are not used here.
+const NLMSGHDR: usize = 16;
+/// Length of `struct ifinfomsg`, which is zero in a request.
+const IFINFOMSG: usize = 16;
+/// Length of `struct rtattr`: length, kind.
+const RTATTR: usize = 4;
+const RTA_ALIGNTO: usize = 4;
+const NLM_F_REQUEST: u16 = 1;
 /// In an attribute's kind: nested, network byte order.
 const FLAGS: u16 = 0xC000;
 /// IFLA_CAN_BITTIMING: a structure that begins with the bit rate.
 const CAN_BIT_TIMING: u16 = 1;
 /// IFLA_CAN_STATE.
 const CAN_STATE: u16 = 4;
-/// Longest answer: an interface's takes 2 KiB.
-const MOST: usize = 16 * 1_024;
+/// Maximum length of an answer; one about an interface has about 2 KiB.
+const MAX_ANSWER: usize = 16 * 1_024;
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
     fn attribute(kind: u16, value: &[u8]) -> Vec<u8> {
-        let mut bytes = u16::try_from(ATTRIBUTE + value.len()).unwrap().to_ne_bytes().to_vec();
+        let mut bytes = u16::try_from(RTATTR + value.len()).unwrap().to_ne_bytes().to_vec();
         bytes.extend(kind.to_ne_bytes());
         bytes.extend(value);
-        bytes.resize(bytes.len().next_multiple_of(ALIGNMENT), 0xA5);
+        bytes.resize(bytes.len().next_multiple_of(RTA_ALIGNTO), 0xA5);
         bytes
     }
 
     fn answer(kind: u16, attributes: &[Vec<u8>]) -> Vec<u8> {
-        let mut bytes = vec![0xA5; HEADER + INTERFACE];
+        let mut bytes = vec![0xA5; NLMSGHDR + IFINFOMSG];
         bytes.extend(attributes.concat());
         let length = u32::try_from(bytes.len()).unwrap();
         bytes[..4].copy_from_slice(&length.to_ne_bytes());
@@ -165,8 +164,8 @@ mod tests {
     }
 
     #[test]
-    fn bus_off_is_told_by_either() {
-        let bus = |carrier, state| Link::parse(&can(carrier, b"can\0", state)).unwrap().bus();
+    fn bus_off_is_found_by_carrier_or_state() {
+        let bus = |carrier, state| Interface::parse(&can(carrier, b"can\0", state)).unwrap().bus();
         for (state, expected) in
             [BusState::Active, BusState::Warning, BusState::Passive, BusState::BusOff].into_iter().enumerate()
         {
@@ -174,37 +173,40 @@ mod tests {
             assert_eq!((bus(1, state), bus(0, state)), (expected, BusState::BusOff));
         }
         assert_eq!(bus(1, 4), BusState::Active, "stopped");
-        assert_eq!(Link::parse(&can(1, b"can\0", 0)).unwrap().bitrate, Some(500_000));
+        assert_eq!(Interface::parse(&can(1, b"can\0", 0)).unwrap().bitrate, Some(500_000));
     }
 
     #[test]
     fn an_interface_without_a_controller_has_only_its_carrier() {
-        let virtual_one = Link::parse(&can(1, b"vcan\0", 3)).unwrap();
-        assert_eq!(virtual_one, Link { has_carrier: true, bitrate: None, state: None });
-        let bare = Link::parse(&answer(libc::RTM_NEWLINK, &[])).unwrap();
+        let virtual_one = Interface::parse(&can(1, b"vcan\0", 3)).unwrap();
+        assert_eq!(virtual_one, Interface { has_carrier: true, bitrate: None, state: None });
+        let bare = Interface::parse(&answer(libc::RTM_NEWLINK, &[])).unwrap();
         assert_eq!(bare.bus(), BusState::Active);
     }
 
     #[test]
-    fn an_answer_cut_short_or_of_another_kind_is_none() {
+    fn a_truncated_answer_or_one_of_another_kind_is_none() {
         let whole = can(1, b"can\0", 3);
-        assert_eq!(Link::parse(&whole).map(Link::bus), Some(BusState::BusOff));
+        assert_eq!(Interface::parse(&whole).map(Interface::bus), Some(BusState::BusOff));
         for length in 0..whole.len() {
-            assert_eq!(Link::parse(&whole[..length]), None, "{length}");
+            assert_eq!(Interface::parse(&whole[..length]), None, "{length}");
         }
-        assert_eq!(Link::parse(&answer(2, &[])), None, "an error");
-        // Attributes that claim to be empty or longer than there is end the search.
+        assert_eq!(Interface::parse(&answer(2, &[])), None, "an error");
+        // An attribute with an impossible length ends the search.
         for length in [0_u16, 3, 200] {
             let mut broken = whole.clone();
-            broken[HEADER + INTERFACE..][..2].copy_from_slice(&length.to_ne_bytes());
-            assert_eq!(Link::parse(&broken).map(Link::bus), Some(BusState::Active), "{length}");
+            broken[NLMSGHDR + IFINFOMSG..][..2].copy_from_slice(&length.to_ne_bytes());
+            assert_eq!(Interface::parse(&broken).map(Interface::bus), Some(BusState::Active), "{length}");
         }
     }
 
     #[test]
     fn the_kernel_answers() {
-        assert_eq!(Link::ask("lo").unwrap(), Link { has_carrier: true, bitrate: None, state: None });
-        assert!(Link::ask("no-such-one").is_err());
-        assert!(Link::ask(&"x".repeat(70_000)).is_err());
+        assert_eq!(
+            Interface::query("lo").unwrap(),
+            Interface { has_carrier: true, bitrate: None, state: None }
+        );
+        assert!(Interface::query("no-such-one").is_err());
+        assert!(Interface::query(&"x".repeat(70_000)).is_err());
     }
 }

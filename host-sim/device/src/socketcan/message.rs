@@ -1,6 +1,6 @@
 //! One message of a CAN_RAW socket: a frame, and whether it is our own.
 //!
-//! The `socketcan` crate reads frames, but not the flag that marks an echo of our own.
+//! The `socketcan` crate does not report the flag that marks the echo of an own frame.
 
 use std::io;
 use std::mem::{size_of_val, zeroed};
@@ -9,13 +9,13 @@ use std::os::fd::{AsRawFd, BorrowedFd};
 use proto_core::wire::can::{CanFrame, CanId};
 use socketcan::CanErrorFrame;
 
-/// What a read of the socket gave.
+/// A received message.
 #[derive(Debug)]
 pub(super) struct Message {
     pub(super) content: Content,
-    /// The frame is one of ours, which has just left.
+    /// The echo of an own frame, which was sent.
     pub(super) is_own: bool,
-    /// The frame was sent by a program on this machine, whether or not it has left.
+    /// The frame was sent by a program on this machine, whether or not it got onto the bus.
     pub(super) is_local: bool,
 }
 
@@ -23,26 +23,26 @@ pub(super) struct Message {
 pub(super) enum Content {
     /// A data or remote frame.
     Frame(CanFrame),
-    /// What the interface says about itself and the bus.
+    /// The interface's report about itself and the bus.
     Error(CanErrorFrame),
     /// A CAN FD frame.
     Fd,
-    /// Nothing that the kernel's interface describes.
+    /// Not a message of the documented kinds.
     Unknown,
 }
 
 /// Reads the next message.
 ///
 /// # Errors
-/// `WouldBlock` when there is none; what is wrong with the interface otherwise.
+/// `WouldBlock` if there is none; otherwise the error of the interface.
 pub(super) fn receive(socket: BorrowedFd<'_>) -> io::Result<Message> {
     let mut bytes = [0_u8; libc::CANFD_MTU];
     let mut part = libc::iovec { iov_base: bytes.as_mut_ptr().cast(), iov_len: size_of_val(&bytes) };
-    // SAFETY: a `msghdr` is pointers and numbers, for which zero is a value.
+    // SAFETY: a `msghdr` consists of pointers and numbers, for which zero is valid.
     let mut header: libc::msghdr = unsafe { zeroed() };
     header.msg_iov = &raw mut part;
     header.msg_iovlen = 1;
-    // SAFETY: the header leads to `bytes` with their length; they outlive the call.
+    // SAFETY: the header points to `bytes`, with their length; both outlive the call.
     let count = unsafe { libc::recvmsg(socket.as_raw_fd(), &raw mut header, libc::MSG_DONTWAIT) };
     let count = usize::try_from(count).map_err(|_| io::Error::last_os_error())?;
     Ok(Message {
@@ -56,7 +56,7 @@ pub(super) fn receive(socket: BorrowedFd<'_>) -> io::Result<Message> {
     })
 }
 
-/// A `struct can_frame`: id and flags, length, three bytes of no interest, data.
+/// A `struct can_frame`: id and flags, length, three unused bytes, data.
 fn classic(bytes: &[u8; libc::CANFD_MTU]) -> Content {
     let [i0, i1, i2, i3, len, _, _, _, data @ ..] = bytes;
     let word = u32::from_ne_bytes([*i0, *i1, *i2, *i3]);
@@ -104,7 +104,7 @@ mod tests {
     }
 
     #[test]
-    fn error_frames_are_told_apart() {
+    fn error_frames_are_distinguished() {
         let off = libc::CAN_ERR_FLAG | libc::CAN_ERR_BUSOFF;
         assert!(matches!(classic(&raw(off, 8, [0; 8])), Content::Error(_)));
     }

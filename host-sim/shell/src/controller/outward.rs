@@ -1,4 +1,4 @@
-//! The controller's recipe ports: devices, and the TCP and UDP clients that connect out.
+//! The controller's recipe ports: devices, and TCP and UDP clients.
 
 use std::io;
 use std::rc::Rc;
@@ -9,15 +9,15 @@ use tracing::{debug, info};
 
 use super::servers::DATAGRAMS_AT_ONCE;
 use super::{ControllerShell, Outward, Report};
-use crate::tcp::{Connection, Event, Taken};
+use crate::tcp::{Accepted, Connection, Event};
 use recipe_controller::ControllerInput;
 use recipe_net::backoff::Backoff;
 use recipe_net::connect::connect;
-use recipe_net::peer;
-use recipe_net::turns::give_way;
+use recipe_net::fairness::yield_fairly;
+use recipe_net::tcp_options;
 
 impl ControllerShell {
-    /// Sends on a port; what a client takes at once has left at once.
+    /// Sends on a port. Data that the socket accepts at once counts as sent.
     pub(super) fn send_port(&self, port: usize, bytes: &[u8]) {
         let sent = match self.ports.get(port) {
             Some(Outward::Device(tx)) => {
@@ -25,7 +25,7 @@ impl ControllerShell {
                 false
             }
             Some(Outward::Tcp(connection)) => match connection.borrow().as_ref() {
-                Some(connection) => connection.send(bytes) == Taken::All,
+                Some(connection) => connection.send(bytes) == Accepted::All,
                 None => false,
             },
             Some(Outward::Udp(socket)) => {
@@ -37,20 +37,20 @@ impl ControllerShell {
             Some(Outward::UdpServer) | None => false,
         };
         if sent {
-            self.pending.borrow_mut().push_back(Report::PortSent(port));
+            self.reports.borrow_mut().push_back(Report::PortSent(port));
         }
     }
 
-    /// A TCP client: connects, and again whenever the connection is lost.
+    /// A TCP client port: connects, and connects again when the connection is lost.
     pub(super) async fn connect_out(self: Rc<Self>, port: usize, to: String) {
         let Some(Outward::Tcp(slot)) = self.ports.get(port) else { return };
-        let mut backoff = Backoff::new(LEAST_PAUSE, MOST_PAUSE);
+        let mut backoff = Backoff::new(MIN_PAUSE, MAX_PAUSE);
         loop {
             match tokio::time::timeout(CONNECT_TIMEOUT, connect(&to)).await {
                 Ok(Ok(stream)) => {
                     info!(%to, "connected");
                     backoff.reset();
-                    peer::watch(&stream);
+                    tcp_options::enable_keepalive(&stream);
                     let (connection, read) = Connection::split(stream);
                     *slot.borrow_mut() = Some(Rc::clone(&connection));
                     self.input(ControllerInput::PortUp { port });
@@ -70,10 +70,10 @@ impl ControllerShell {
         }
     }
 
-    /// A UDP client: it is up as soon as the peer has an address, whether anybody listens there or not.
+    /// A UDP client port: up as soon as the peer's address is known, whether it can be reached or not.
     pub(super) async fn send_out(self: Rc<Self>, port: usize, to: String) {
         let Some(Outward::Udp(slot)) = self.ports.get(port) else { return };
-        let mut backoff = Backoff::new(LEAST_PAUSE, MOST_PAUSE);
+        let mut backoff = Backoff::new(MIN_PAUSE, MAX_PAUSE);
         let socket = loop {
             match connected(&to).await {
                 Ok(socket) => break Rc::new(socket),
@@ -86,9 +86,9 @@ impl ControllerShell {
         let mut buf = [0; 2_048];
         for nth in 1_u64.. {
             if nth.is_multiple_of(DATAGRAMS_AT_ONCE) {
-                give_way().await;
+                yield_fairly().await;
             }
-            // An error is of a datagram of ours that came back; the peer may appear yet.
+            // An error means that a datagram could not be delivered; the peer may appear later.
             if let Ok(count) = socket.recv(&mut buf).await {
                 self.input(ControllerInput::PortBytes { port, bytes: &buf[..count] });
             }
@@ -96,7 +96,7 @@ impl ControllerShell {
     }
 }
 
-/// A socket that sends to, and hears, one peer only.
+/// A socket connected to one peer.
 async fn connected(to: &str) -> io::Result<UdpSocket> {
     let mut last = io::Error::from(io::ErrorKind::NotFound);
     for peer in tokio::net::lookup_host(to).await? {
@@ -114,12 +114,12 @@ async fn connected(to: &str) -> io::Result<UdpSocket> {
 }
 
 fn send_datagram(shell: &ControllerShell, socket: &UdpSocket, bytes: &[u8]) {
-    // The error of an earlier datagram makes one call fail.
+    // One call fails with the error of an earlier datagram.
     if socket.try_send(bytes).or_else(|_| socket.try_send(bytes)).is_err() {
         shell.count(|counters| counters.dropped_datagrams += 1);
     }
 }
 
 const CONNECT_TIMEOUT: StdDuration = StdDuration::from_secs(2);
-const LEAST_PAUSE: StdDuration = StdDuration::from_millis(20);
-const MOST_PAUSE: StdDuration = StdDuration::from_secs(1);
+const MIN_PAUSE: StdDuration = StdDuration::from_millis(20);
+const MAX_PAUSE: StdDuration = StdDuration::from_secs(1);

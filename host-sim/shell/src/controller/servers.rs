@@ -1,4 +1,4 @@
-//! The controller's servers: connections and datagrams that come in.
+//! The controller's servers: TCP connections and datagrams of port 2011.
 
 use std::io;
 use std::net::SocketAddr;
@@ -14,23 +14,23 @@ use super::{Client, ControllerShell, Report, closed};
 use crate::tcp::{Connection, Event};
 use crate::udp;
 use recipe_controller::{ConnId, ControllerInput, Link};
-use recipe_net::peer;
+use recipe_net::fairness::yield_fairly;
+use recipe_net::tcp_options;
 use recipe_net::timer::now;
-use recipe_net::turns::give_way;
 
 impl ControllerShell {
-    /// Takes the connections of one TCP server.
+    /// Accepts the connections of one TCP server.
     pub(super) async fn serve(self: Rc<Self>, link: Link, listener: TcpListener) {
-        peer::bound(&listener);
+        tcp_options::limit_buffers(&listener);
         loop {
             match listener.accept().await {
                 Ok((stream, peer)) => {
-                    self.take(link, stream, peer);
-                    give_way().await;
+                    self.accept(link, stream, peer);
+                    yield_fairly().await;
                 }
                 Err(error) => {
                     self.count(|counters| counters.accept_failures += 1);
-                    if let Some(more) = self.complaints.take(now()) {
+                    if let Some(more) = self.log_limit.allow(now()) {
                         warn!(?link, %error, more, "cannot accept a connection");
                     }
                     tokio::time::sleep(StdDuration::from_millis(50)).await;
@@ -39,19 +39,19 @@ impl ControllerShell {
         }
     }
 
-    fn take(self: &Rc<Self>, link: Link, stream: TcpStream, peer: SocketAddr) {
+    fn accept(self: &Rc<Self>, link: Link, stream: TcpStream, peer: SocketAddr) {
         let conn = ConnId(self.next_connection.get());
         self.next_connection.set(conn.0 + 1);
         match link {
-            // What waits in the system is old when it is read: a second's worth is enough.
+            // Waiting packets become old: a second of the stream is enough.
             Link::State => drop(sockopt::set_socket_send_buffer_size(&stream, STATE_BUFFER)),
-            Link::Command | Link::Modbus => peer::give_up_after(&stream, ANSWER_PATIENCE),
+            Link::Command | Link::Modbus => tcp_options::set_user_timeout(&stream, ANSWER_TIMEOUT),
         }
-        peer::watch(&stream);
+        tcp_options::enable_keepalive(&stream);
         let (connection, read) = Connection::split(stream);
         let client = Client { link, connection: Rc::clone(&connection), subscribed: false };
         self.connections.borrow_mut().insert(conn, client);
-        // An IPv4 address is the same host however the listener names it.
+        // An IPv4 client of an IPv6 listener.
         let from = peer.ip().to_canonical();
         self.input(match link {
             Link::Command => ControllerInput::CommandOpened { conn, from },
@@ -62,7 +62,7 @@ impl ControllerShell {
             client.subscribed = link == Link::State;
         }
         if connection.is_closed() {
-            if let Some(more) = self.refusals.take(now()) {
+            if let Some(more) = self.refusal_log.allow(now()) {
                 warn!(?link, %peer, more, "refused");
             }
             return;
@@ -71,14 +71,14 @@ impl ControllerShell {
         let shell = Rc::clone(self);
         spawn_local(async move {
             let ended = connection.run(read, |event| {
-                // After a close nothing more is reported.
+                // After a close, nothing more is reported.
                 if let Event::Bytes(bytes) = event
                     && !connection.is_closed()
                 {
                     match link {
                         Link::Command => shell.input(ControllerInput::CommandBytes { conn, bytes }),
                         Link::Modbus => shell.input(ControllerInput::ModbusBytes { conn, bytes }),
-                        // Port 2001 only speaks.
+                        // Port 2001 reads nothing.
                         Link::State => {}
                     }
                 }
@@ -93,12 +93,12 @@ impl ControllerShell {
         });
     }
 
-    /// Takes the datagrams of port 2011, and the errors that ours provoked.
+    /// Receives the datagrams of port 2011, and the errors of datagrams that were sent.
     pub(super) async fn serve_udp(self: Rc<Self>) {
         let mut buf = [0; 2_048];
         for nth in 1_u64.. {
             if nth.is_multiple_of(DATAGRAMS_AT_ONCE) {
-                give_way().await;
+                yield_fairly().await;
             }
             match self.udp.recv_from(&mut buf).await {
                 Ok((count, peer)) => self.input(ControllerInput::Udp2011 { peer, bytes: &buf[..count] }),
@@ -113,7 +113,7 @@ impl ControllerShell {
 
     /// Sends a datagram from port 2011.
     pub(super) fn send_datagram(&self, peer: SocketAddr, bytes: &[u8]) {
-        // The error of an earlier datagram makes one call fail that has nothing to do with it.
+        // One call may fail with the error of an earlier datagram.
         for _ in 0..2 {
             match self.udp.try_send_to(bytes, peer) {
                 Ok(_) => return,
@@ -121,10 +121,10 @@ impl ControllerShell {
                 Err(_) => {
                     let peers = udp::unreachable_peers(&self.udp);
                     if peers.contains(&peer) {
-                        self.pending.borrow_mut().extend(peers.into_iter().map(Report::Unreachable));
+                        self.reports.borrow_mut().extend(peers.into_iter().map(Report::Unreachable));
                         return;
                     }
-                    self.pending.borrow_mut().extend(peers.into_iter().map(Report::Unreachable));
+                    self.reports.borrow_mut().extend(peers.into_iter().map(Report::Unreachable));
                 }
             }
         }
@@ -134,7 +134,7 @@ impl ControllerShell {
 
 /// About a second of the state stream.
 const STATE_BUFFER: usize = 16 * 1_024;
-/// How long a client of port 2000 or Modbus may leave its answers to us.
-const ANSWER_PATIENCE: StdDuration = StdDuration::from_secs(30);
-/// Most datagrams taken before the others have a turn.
+/// How long a client of port 2000 or Modbus may leave answers unacknowledged.
+const ANSWER_TIMEOUT: StdDuration = StdDuration::from_secs(30);
+/// Number of datagrams before other tasks run.
 pub(super) const DATAGRAMS_AT_ONCE: u64 = 16;

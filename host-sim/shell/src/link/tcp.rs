@@ -1,7 +1,7 @@
 //! Links over TCP.
 //!
-//! Handed over is not delivered: beside what the system has taken, a connection reports what the peer's
-//! system has acknowledged. However it ends, what was not acknowledged by then is never delivered.
+//! Besides what the system has accepted, a connection reports what the peer has acknowledged. However the
+//! connection ends, data that was not acknowledged by then is never delivered.
 
 use std::io;
 use std::net::IpAddr;
@@ -16,66 +16,66 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::time::{Instant, sleep};
 use tracing::info;
 
-use super::{Link, LinkEvent, Turn, TurnedAway};
+use super::{Link, LinkEvent, Refusals, Session};
 use recipe_net::connect::connect;
-use recipe_net::peer;
-use recipe_net::turns::give_way;
+use recipe_net::fairness::yield_fairly;
+use recipe_net::tcp_options;
 
 impl Link<'_> {
-    /// A connection to the controller's server.
+    /// Connects to the controller's server.
     pub(super) async fn connect_tcp(
         &self,
-        turn: Turn,
+        session: Session,
         host: &str,
         port: u16,
         events: &mut impl FnMut(LinkEvent<'_>),
     ) -> io::Result<()> {
-        let Some(mut stream) = self.while_open(turn, connect((host, port))).await? else { return Ok(()) };
-        let (connection, reader) = Connection::new(self, turn, &mut stream)?;
+        let Some(mut stream) = self.while_open(session, connect((host, port))).await? else { return Ok(()) };
+        let (connection, reader) = Connection::new(self, session, &mut stream)?;
         connection.carry(reader, None, events).await
     }
 
-    /// The next connection of the controller's client.
+    /// Accepts the next connection of the controller's client.
     pub(super) async fn accept_tcp(
         &self,
-        turn: Turn,
+        session: Session,
         listener: &TcpListener,
         controller: &str,
         events: &mut impl FnMut(LinkEvent<'_>),
     ) -> io::Result<()> {
-        let accepted = self.while_open(turn, self.accept(turn, listener, controller)).await?;
+        let accepted = self.while_open(session, self.accept(session, listener, controller)).await?;
         let Some((mut stream, known)) = accepted else { return Ok(()) };
-        let (connection, reader) = Connection::new(self, turn, &mut stream)?;
+        let (connection, reader) = Connection::new(self, session, &mut stream)?;
         connection.carry(reader, Some((listener, &known)), events).await
     }
 
-    /// The next connection of the controller, and its addresses.
+    /// The next connection of the controller, and the controller's addresses.
     async fn accept(
         &self,
-        turn: Turn,
+        session: Session,
         listener: &TcpListener,
         controller: &str,
     ) -> io::Result<(TcpStream, Vec<IpAddr>)> {
-        let (known, is_late) = self.look_up(turn, controller).await?;
+        let (known, is_late) = self.look_up(session, controller).await?;
         if is_late {
-            self.turn_away_waiting(listener, &known).await;
+            self.refuse_waiting(listener, &known).await;
         }
         loop {
             let (stream, peer) = listener.accept().await?;
-            if self.control.knows(self.name, &known, peer) {
+            if self.control.is_controller(self.name, &known, peer) {
                 info!(link = self.name, %peer, "the controller connected");
                 return Ok((stream, known));
             }
             drop(stream);
-            give_way().await;
+            yield_fairly().await;
         }
     }
 
-    /// Ends the connections that were made while nobody took them, and with them what was sent there: its
-    /// age is not known. Who still wants to be connected tries again.
-    async fn turn_away_waiting(&self, listener: &TcpListener, known: &[IpAddr]) {
-        for nth in 1..=MOST_WAITING {
-            // Asked of the system, since the reactor may not have looked yet.
+    /// Closes connections that waited while the link was closed, because the age of their data is unknown. A
+    /// client that still runs connects again.
+    async fn refuse_waiting(&self, listener: &TcpListener, known: &[IpAddr]) {
+        for nth in 1..=MAX_WAITING {
+            // A system call, because the reactor may not have polled the socket yet.
             let (stream, peer) = match acceptfrom_with(listener, SocketFlags::CLOEXEC) {
                 Ok((stream, peer)) => (stream, peer.and_then(|peer| peer.try_into().ok())),
                 Err(Errno::CONNABORTED | Errno::INTR) => continue,
@@ -83,62 +83,66 @@ impl Link<'_> {
             };
             drop(stream);
             if let Some(peer) = peer
-                && self.control.knows(self.name, known, peer)
+                && self.control.is_controller(self.name, known, peer)
             {
-                let count = |turned_away: &mut TurnedAway| turned_away.refused += 1;
-                self.control.turn_away(self.name, peer, "the link is closed", count);
+                let count = |refusals: &mut Refusals| refusals.refused += 1;
+                self.control.refuse(self.name, peer, "the link is closed", count);
             }
-            // Not each time: who comes back at once comes in time.
-            if nth.is_multiple_of(ENDED_AT_ONCE) {
-                give_way().await;
+            // Not each time, so that a client that connects again at once is not closed again.
+            if nth.is_multiple_of(CLOSED_AT_ONCE) {
+                yield_fairly().await;
             }
         }
     }
 
-    /// A second client of a listening link is turned away: one connection carries one recipe.
+    /// Refuses further clients of a listening link: one connection carries one recipe.
     async fn refuse_others(&self, others: Option<(&TcpListener, &[IpAddr])>) {
         let Some((listener, known)) = others else { return std::future::pending().await };
         loop {
             match listener.accept().await {
                 Ok((stream, peer)) => {
                     drop(stream);
-                    if self.control.knows(self.name, known, peer) {
-                        let count = |turned_away: &mut TurnedAway| turned_away.refused += 1;
-                        self.control.turn_away(self.name, peer, "there is already a connection", count);
+                    if self.control.is_controller(self.name, known, peer) {
+                        let count = |refusals: &mut Refusals| refusals.refused += 1;
+                        self.control.refuse(self.name, peer, "there is already a connection", count);
                     }
-                    give_way().await;
+                    yield_fairly().await;
                 }
-                // Out of descriptors, most likely: they come back when connections end.
+                // Probably too few descriptors, until connections end.
                 Err(_) => sleep(Duration::from_millis(100)).await,
             }
         }
     }
 }
 
-/// A connection while its turn lasts.
+/// A connection of one session.
 struct Connection<'a> {
     link: &'a Link<'a>,
-    turn: Turn,
+    session: Session,
     writer: WriteHalf<'a>,
-    /// What the system has not taken of the transmission under way.
+    /// The part of the present transmission that the system has not accepted.
     unwritten: Vec<u8>,
-    /// How many of the bytes handed over the peer is known to have acknowledged.
+    /// Number of bytes that the peer is known to have acknowledged.
     acked: u64,
-    /// Whether that is looked at again and again, since some are not.
-    is_watched: bool,
+    /// Whether acknowledgements are polled, because some are missing.
+    is_polled: bool,
     reads: u64,
 }
 
 impl<'a> Connection<'a> {
-    fn new(link: &'a Link<'a>, turn: Turn, stream: &'a mut TcpStream) -> io::Result<(Self, ReadHalf<'a>)> {
-        peer::abandon_at_end(stream)?;
-        peer::watch(stream);
+    fn new(
+        link: &'a Link<'a>,
+        session: Session,
+        stream: &'a mut TcpStream,
+    ) -> io::Result<(Self, ReadHalf<'a>)> {
+        tcp_options::reset_on_close(stream)?;
+        tcp_options::enable_keepalive(stream);
         let (reader, writer) = stream.split();
-        let own = Self { link, turn, writer, unwritten: Vec::new(), acked: 0, is_watched: false, reads: 0 };
+        let own = Self { link, session, writer, unwritten: Vec::new(), acked: 0, is_polled: false, reads: 0 };
         Ok((own, reader))
     }
 
-    /// Moves bytes both ways until the peer closes, an error, or the turn is over.
+    /// Moves bytes in both directions until the peer closes, an error, or the end of the session.
     async fn carry(
         mut self,
         mut reader: ReadHalf<'_>,
@@ -148,17 +152,17 @@ impl<'a> Connection<'a> {
         events(LinkEvent::Up);
         let changed = &self.link.control.changed;
         let mut refusing = pin!(self.link.refuse_others(others));
-        let mut look = pin!(sleep(LOOK));
+        let mut poll = pin!(sleep(ACK_POLL));
         let mut chunk = vec![0; CHUNK];
         while !self.is_over() {
             self.write(events)?;
             if self.is_over() {
                 break;
             }
-            if self.is_outstanding() && !self.is_watched {
-                self.is_watched = true;
-                peer::give_up_after(self.writer.as_ref(), PATIENCE);
-                look.as_mut().reset(Instant::now() + LOOK);
+            if self.is_outstanding() && !self.is_polled {
+                self.is_polled = true;
+                tcp_options::set_user_timeout(self.writer.as_ref(), USER_TIMEOUT);
+                poll.as_mut().reset(Instant::now() + ACK_POLL);
             }
             tokio::select! {
                 read = reader.read(&mut chunk) => match read? {
@@ -167,13 +171,13 @@ impl<'a> Connection<'a> {
                 },
                 ready = self.writer.writable(), if !self.unwritten.is_empty() => ready?,
                 () = changed.notified() => {}
-                () = &mut look, if self.is_watched => {
-                    self.look(events)?;
-                    self.is_watched = self.is_outstanding();
-                    if self.is_watched {
-                        look.as_mut().reset(Instant::now() + LOOK);
+                () = &mut poll, if self.is_polled => {
+                    self.poll_acked(events)?;
+                    self.is_polled = self.is_outstanding();
+                    if self.is_polled {
+                        poll.as_mut().reset(Instant::now() + ACK_POLL);
                     } else {
-                        peer::be_patient(self.writer.as_ref());
+                        tcp_options::clear_user_timeout(self.writer.as_ref());
                     }
                 }
                 () = &mut refusing => {}
@@ -183,26 +187,26 @@ impl<'a> Connection<'a> {
     }
 
     fn is_over(&self) -> bool {
-        self.link.control.is_over(self.turn)
+        self.link.control.is_over(self.session)
     }
 
-    /// Bytes that arrived; what was acknowledged before them is told first.
+    /// Reports received bytes, after the acknowledgements before them.
     async fn take(&mut self, bytes: &[u8], events: &mut impl FnMut(LinkEvent<'_>)) -> io::Result<()> {
-        self.look(events)?;
+        self.poll_acked(events)?;
         if self.is_over() {
             return Ok(());
         }
         events(LinkEvent::Bytes(bytes));
         self.reads += 1;
         if bytes.len() == CHUNK || self.reads.is_multiple_of(READS_AT_ONCE) {
-            // What the engine answered goes before the others have their turn.
+            // The engine's answers are sent before other tasks run.
             self.write(events)?;
-            give_way().await;
+            yield_fairly().await;
         }
         Ok(())
     }
 
-    /// Gives the system what it takes.
+    /// Writes as much as the system accepts.
     fn write(&mut self, events: &mut impl FnMut(LinkEvent<'_>)) -> io::Result<()> {
         while !self.is_over() {
             if self.unwritten.is_empty() {
@@ -223,18 +227,19 @@ impl<'a> Connection<'a> {
         Ok(())
     }
 
-    /// Whether something that was handed over is not known to be acknowledged.
+    /// Whether anything handed over is not known to be acknowledged.
     fn is_outstanding(&self) -> bool {
         self.link.control.handed.get() != self.acked
     }
 
-    /// Tells how much the peer has acknowledged, if that has changed.
-    fn look(&mut self, events: &mut impl FnMut(LinkEvent<'_>)) -> io::Result<()> {
+    /// Reports acknowledgements, if there are new ones.
+    fn poll_acked(&mut self, events: &mut impl FnMut(LinkEvent<'_>)) -> io::Result<()> {
         if self.is_over() || !self.is_outstanding() {
             return Ok(());
         }
         let control = self.link.control;
-        let left = peer::unacknowledged(self.writer.as_ref())? + self.unwritten.len() + control.waiting();
+        let left =
+            tcp_options::unacknowledged(self.writer.as_ref())? + self.unwritten.len() + control.waiting();
         let acked = control.handed.get().saturating_sub(left as u64);
         if acked != self.acked {
             self.acked = acked;
@@ -244,19 +249,19 @@ impl<'a> Connection<'a> {
     }
 }
 
-/// Between two looks at what is acknowledged, while something is not.
-const LOOK: Duration = Duration::from_millis(10);
-/// After this the system itself ends a connection whose peer acknowledges nothing, should this process be
-/// kept from it.
-const PATIENCE: Duration = Duration::from_secs(2);
-/// Most bytes read at once.
+/// Interval at which acknowledgements are polled, while some are missing.
+const ACK_POLL: Duration = Duration::from_millis(10);
+/// After this time without acknowledgement the system itself ends the connection, in case this process
+/// cannot.
+const USER_TIMEOUT: Duration = Duration::from_secs(2);
+/// Maximum number of bytes per read.
 const CHUNK: usize = 2_048;
-/// Most reads before the others have a turn.
+/// Number of reads before other tasks run.
 const READS_AT_ONCE: u64 = 16;
-/// Our listening sockets let fewer wait: those behind them are not old.
-const MOST_WAITING: usize = 2_048;
-/// Connections turned away before the others have a turn.
-const ENDED_AT_ONCE: usize = 16;
+/// More than the backlog of a listening socket: connections after these are not old.
+const MAX_WAITING: usize = 2_048;
+/// Number of connections closed before other tasks run.
+const CLOSED_AT_ONCE: usize = 16;
 
 #[cfg(test)]
 #[path = "tcp_tests.rs"]

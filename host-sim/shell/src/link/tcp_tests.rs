@@ -1,5 +1,4 @@
-//! What becomes of bytes that were handed over, with peers that have no room for them: what does not fit there
-//! is not acknowledged.
+//! Acknowledgement of bytes that were handed over, with peers whose buffers are too small for them.
 
 use std::io::Read;
 
@@ -8,10 +7,10 @@ use tokio::net::TcpSocket;
 use tokio::task::yield_now;
 
 use super::super::tests::{Running, Seen, connected, inside, tcp_listen};
-use super::super::{Endpoint, TurnedAway};
+use super::super::{Endpoint, Refusals};
 use super::*;
 
-/// A link that is up, and its peer, whose system takes little.
+/// A link that is up, and its peer, which has a small receive buffer.
 async fn pair() -> (Running, TcpListener, TcpStream) {
     let socket = TcpSocket::new_v4().unwrap();
     socket.set_recv_buffer_size(1).unwrap();
@@ -29,7 +28,7 @@ const PIECE: usize = 1_024;
 const PIECES: u8 = 16;
 const ALL: usize = PIECE * PIECES as usize;
 
-/// Hands over more than the peer's system takes and less than ours does.
+/// Hands over more than fits the peer's buffer, and less than fits ours.
 async fn fill(link: &Running) {
     for piece in 1..=PIECES {
         link.control.send(&[piece; PIECE]);
@@ -37,7 +36,7 @@ async fn fill(link: &Running) {
     }
 }
 
-/// Who reads on now finds what its system had acknowledged, and then a reset.
+/// The peer reads what its system had acknowledged, and then gets a reset.
 async fn gets_nothing_more(mut peer: TcpStream) {
     let mut got = Vec::new();
     let ended = peer.read_to_end(&mut got).await;
@@ -46,7 +45,7 @@ async fn gets_nothing_more(mut peer: TcpStream) {
 }
 
 #[test]
-fn what_was_acknowledged_is_told_before_what_arrived() {
+fn acknowledgements_are_reported_before_later_data() {
     inside(async || {
         let (link, _listener, mut peer) = connected().await;
         for round in 0..50_u8 {
@@ -57,19 +56,19 @@ fn what_was_acknowledged_is_told_before_what_arrived() {
             assert_eq!(link.next().await, Seen::Acked(0));
             assert_eq!(link.next().await, Seen::Bytes(vec![round]));
         }
-        // Nothing is outstanding, so nothing is said of it.
+        // Nothing is outstanding, so nothing is reported.
         peer.write_all(b"more").await.unwrap();
         assert_eq!(link.next().await, Seen::Bytes(b"more".to_vec()));
     });
 }
 
 #[test]
-fn what_is_taken_and_not_acknowledged_is_told_when_it_is() {
+fn a_late_acknowledgement_is_reported() {
     inside(async || {
         let (link, _listener, mut peer) = pair().await;
         fill(&link).await;
-        sleep(3 * LOOK).await;
-        // All that was said is how little there was room for.
+        sleep(3 * ACK_POLL).await;
+        // Only the part that fits was reported.
         let mut left = ALL as u32;
         while let Some(event) = link.seen.events.borrow_mut().pop_front() {
             match event {
@@ -91,10 +90,10 @@ fn what_is_taken_and_not_acknowledged_is_told_when_it_is() {
 }
 
 #[test]
-fn what_the_link_itself_still_holds_is_not_acknowledged_either() {
+fn bytes_that_the_link_still_holds_are_not_acknowledged_either() {
     inside(async || {
         let (link, _listener, mut peer) = pair().await;
-        // More than the buffers of both ends take.
+        // More than fits the buffers of both sides.
         const MUCH: u32 = 16 << 20;
         link.control.send(&vec![0; MUCH as usize]);
         let Seen::Acked(mut left) = link.next().await else { panic!("sent") };
@@ -125,7 +124,7 @@ fn what_the_link_itself_still_holds_is_not_acknowledged_either() {
 }
 
 #[test]
-fn what_was_not_acknowledged_when_the_link_was_closed_never_arrives() {
+fn bytes_not_acknowledged_at_the_close_never_arrive() {
     inside(async || {
         let (link, listener, peer) = pair().await;
         fill(&link).await;
@@ -139,7 +138,7 @@ fn what_was_not_acknowledged_when_the_link_was_closed_never_arrives() {
 }
 
 #[test]
-fn nor_does_what_was_handed_over_when_the_gateway_ended() {
+fn nor_do_those_not_acknowledged_at_the_end_of_the_gateway() {
     inside(async || {
         let (link, _listener, peer) = pair().await;
         fill(&link).await;
@@ -149,7 +148,7 @@ fn nor_does_what_was_handed_over_when_the_gateway_ended() {
 }
 
 #[test]
-fn nor_what_a_listening_link_sent() {
+fn nor_those_of_a_listening_link() {
     inside(async || {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let at = listener.local_addr().unwrap();
@@ -166,7 +165,7 @@ fn nor_what_a_listening_link_sent() {
 }
 
 #[test]
-fn a_connection_that_is_made_in_the_moment_of_the_close_is_not_taken_for_the_next() {
+fn a_connection_made_during_the_close_is_not_used_by_the_next_session() {
     inside(async || {
         let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
         let at = listener.local_addr().unwrap();
@@ -174,7 +173,8 @@ fn a_connection_that_is_made_in_the_moment_of_the_close_is_not_taken_for_the_nex
         for round in 0..40_u8 {
             link.control.open();
             yield_now().await;
-            // The link's task does not run until it is made and the engine has changed its mind twice.
+            // The link's task does not run until the connection is made and the engine has closed and opened
+            // again.
             let (mut first, _) = listener.accept().unwrap();
             link.control.close();
             link.control.open();
@@ -193,24 +193,24 @@ fn a_connection_that_is_made_in_the_moment_of_the_close_is_not_taken_for_the_nex
 }
 
 #[test]
-fn the_system_gives_up_a_peer_that_acknowledges_nothing() {
+fn the_system_ends_a_connection_whose_peer_acknowledges_nothing() {
     inside(async || {
         let (link, _listener, peer) = pair().await;
         let begin = Instant::now();
         fill(&link).await;
         link.expect(Seen::Down).await;
-        assert!(begin.elapsed() >= PATIENCE / 2, "{:?}", begin.elapsed());
+        assert!(begin.elapsed() >= USER_TIMEOUT / 2, "{:?}", begin.elapsed());
         gets_nothing_more(peer).await;
     });
 }
 
 #[test]
-fn who_connected_while_the_link_was_closed_has_to_do_it_again() {
+fn a_client_that_connected_while_the_link_was_closed_must_connect_again() {
     inside(async || {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let at = listener.local_addr().unwrap();
         let link = Running::start(tcp_listen(listener));
-        // Before the first opening nothing was closed: the gateway just started.
+        // In the first session nothing is old: the gateway has just started.
         let mut first = TcpStream::connect(at).await.unwrap();
         first.write_all(b"early").await.unwrap();
         link.control.open();
@@ -226,6 +226,6 @@ fn who_connected_while_the_link_was_closed_has_to_do_it_again() {
         again.write_all(b"fresh").await.unwrap();
         link.expect(Seen::Up).await;
         link.expect(Seen::Bytes(b"fresh".to_vec())).await;
-        assert_eq!(link.control.turned_away(), TurnedAway { strangers: 0, refused: 1 });
+        assert_eq!(link.control.refusals(), Refusals { strangers: 0, refused: 1 });
     });
 }

@@ -8,70 +8,71 @@ use rustix::net::RecvFlags;
 use tokio::net::UdpSocket;
 use tracing::info;
 
-use super::{Link, LinkEvent, Turn};
-use recipe_net::turns::give_way;
+use super::{Link, LinkEvent, Session};
+use recipe_net::fairness::yield_fairly;
 
 impl Link<'_> {
-    /// A socket of its own for each turn, connected to the controller's server.
+    /// Opens a socket for this session, connected to the controller's server.
     pub(super) async fn connect_udp(
         &self,
-        turn: Turn,
+        session: Session,
         host: &str,
         port: u16,
         events: &mut impl FnMut(LinkEvent<'_>),
     ) -> io::Result<()> {
-        let Some(socket) = self.while_open(turn, connect(host, port)).await? else { return Ok(()) };
+        let Some(socket) = self.while_open(session, connect(host, port)).await? else { return Ok(()) };
         events(LinkEvent::Up);
-        self.pump(turn, &socket, None, events).await
+        self.pump(session, &socket, None, events).await
     }
 
-    /// Waits for the controller's client, and answers where it sends from.
+    /// Waits for the controller's client, and sends to the address that it sends from.
     pub(super) async fn await_udp(
         &self,
-        turn: Turn,
+        session: Session,
         socket: &UdpSocket,
         controller: &str,
         is_frame: &dyn Fn(&[u8]) -> bool,
         events: &mut impl FnMut(LinkEvent<'_>),
     ) -> io::Result<()> {
-        let first = self.while_open(turn, self.first_datagram(turn, socket, controller)).await?;
+        let first = self.while_open(session, self.first_datagram(session, socket, controller)).await?;
         let Some((peer, known, datagram)) = first else { return Ok(()) };
         info!(link = self.name, %peer, "the controller's first datagram");
         events(LinkEvent::Up);
-        if !self.control.is_over(turn) {
+        if !self.control.is_over(session) {
             events(LinkEvent::Bytes(&datagram));
         }
         let client = Client { peer, known, is_frame };
-        self.pump(turn, socket, Some(client), events).await
+        self.pump(session, socket, Some(client), events).await
     }
 
-    /// The controller's first datagram of this turn, where it came from, and the controller's addresses.
+    /// The controller's first datagram of this session: its sender, the controller's addresses, and the
+    /// datagram.
     async fn first_datagram(
         &self,
-        turn: Turn,
+        session: Session,
         socket: &UdpSocket,
         controller: &str,
     ) -> io::Result<(SocketAddr, Vec<IpAddr>, Vec<u8>)> {
-        let (known, is_late) = self.look_up(turn, controller).await?;
+        let (known, is_late) = self.look_up(session, controller).await?;
         if is_late {
             discard_waiting(socket);
         }
         let mut datagram = vec![0; MAX_DATAGRAM];
         for nth in 1_u64.. {
             let (len, peer) = socket.recv_from(&mut datagram).await?;
-            if self.control.knows(self.name, &known, peer) {
+            if self.control.is_controller(self.name, &known, peer) {
                 datagram.truncate(len);
                 return Ok((peer, known, datagram));
             }
-            take_turns(nth).await;
+            yield_sometimes(nth).await;
         }
         Err(io::ErrorKind::Interrupted.into())
     }
 
-    /// Moves datagrams both ways until an error, or the turn is over.
+    /// Moves datagrams in both directions until an error, or the end of the session.
     async fn pump(
         &self,
-        turn: Turn,
+        session: Session,
         socket: &UdpSocket,
         mut client: Option<Client<'_>>,
         events: &mut impl FnMut(LinkEvent<'_>),
@@ -79,7 +80,7 @@ impl Link<'_> {
         let mut datagram = vec![0; MAX_DATAGRAM];
         let mut next = None;
         let mut reads = 0_u64;
-        while !self.control.is_over(turn) {
+        while !self.control.is_over(session) {
             next = next.or_else(|| self.control.next());
             if let Some(bytes) = &next {
                 let sent = match &client {
@@ -104,7 +105,7 @@ impl Link<'_> {
                     let datagram = &datagram[..len];
                     let is_known = match (&mut client, from) {
                         (Some(client), Some(from)) => {
-                            let is_known = self.control.knows(self.name, &client.known, from);
+                            let is_known = self.control.is_controller(self.name, &client.known, from);
                             if is_known && (client.is_frame)(datagram) {
                                 client.peer = from;
                             }
@@ -116,7 +117,7 @@ impl Link<'_> {
                         events(LinkEvent::Bytes(datagram));
                     }
                     reads += 1;
-                    take_turns(reads).await;
+                    yield_sometimes(reads).await;
                 }
                 ready = socket.writable(), if next.is_some() => ready?,
                 () = self.control.changed.notified() => {}
@@ -128,7 +129,7 @@ impl Link<'_> {
 
 /// The controller's client of a listening socket.
 struct Client<'a> {
-    /// Where its newest frame came from: there the answers go. What is no frame does not move it.
+    /// The sender of the newest frame, which gets the answers. Other datagrams do not change it.
     peer: SocketAddr,
     known: Vec<IpAddr>,
     is_frame: &'a dyn Fn(&[u8]) -> bool,
@@ -143,13 +144,13 @@ async fn connect(host: &str, port: u16) -> io::Result<UdpSocket> {
     Ok(socket)
 }
 
-/// The next datagram, and of a socket that is not connected where it came from.
+/// The next datagram, with its sender if the socket is not connected.
 async fn receive(
     socket: &UdpSocket,
-    tells_sender: bool,
+    wants_sender: bool,
     datagram: &mut [u8],
 ) -> io::Result<(usize, Option<SocketAddr>)> {
-    if tells_sender {
+    if wants_sender {
         let (len, from) = socket.recv_from(datagram).await?;
         Ok((len, Some(from)))
     } else {
@@ -157,10 +158,11 @@ async fn receive(
     }
 }
 
-/// Throws away what waits in the socket: nothing tells how old it is.
+/// Drops datagrams that wait in the socket, because their age is unknown.
 fn discard_waiting(socket: &UdpSocket) {
-    for _ in 0..MOST_WAITING {
-        // Asked of the system, since the reactor may not have looked yet. An error waited like a datagram.
+    for _ in 0..MAX_WAITING {
+        // A system call, because the reactor may not have polled the socket yet. An error counts as a
+        // datagram.
         let discarded = rustix::net::recv(socket, &mut [0_u8; 1], RecvFlags::DONTWAIT | RecvFlags::TRUNC);
         if discarded == Err(Errno::AGAIN) {
             return;
@@ -168,16 +170,16 @@ fn discard_waiting(socket: &UdpSocket) {
     }
 }
 
-/// However many datagrams there are, the others come first now and then.
-async fn take_turns(nth: u64) {
+/// Lets other tasks run after every few datagrams.
+async fn yield_sometimes(nth: u64) {
     if nth.is_multiple_of(DATAGRAMS_AT_ONCE) {
-        give_way().await;
+        yield_fairly().await;
     }
 }
 
-/// Most datagrams taken before the others have a turn.
+/// Number of datagrams before other tasks run.
 const DATAGRAMS_AT_ONCE: u64 = 16;
-/// Longer than any frame, so that a datagram that is too long is seen to be.
+/// Longer than any frame, so that a datagram that is too long is recognised.
 const MAX_DATAGRAM: usize = 2_048;
-/// More datagrams than a socket's buffer holds: those behind them are not old.
-const MOST_WAITING: usize = 4_096;
+/// More than a socket's buffer holds: datagrams after these are not old.
+const MAX_WAITING: usize = 4_096;

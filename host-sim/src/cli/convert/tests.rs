@@ -43,7 +43,7 @@ fn part(toml: &str, part: Direction) -> Part {
     Part::choose(&recipes, None, Some(part)).unwrap()
 }
 
-/// What `decode` prints, and its notes.
+/// The output of `decode`, and its notes.
 fn decoded(part: &Part, input: &str) -> (String, String) {
     let (mut out, mut notes) = (Vec::new(), Vec::new());
     decode_lines(part, input.as_bytes(), &mut out, &mut notes).unwrap();

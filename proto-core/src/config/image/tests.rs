@@ -10,7 +10,7 @@ use crate::config::tests::every_kind;
 fn image() -> Vec<u8> {
     let mut out = vec![0xA5; 1024];
     let len = encode(&every_kind(), &mut out).unwrap();
-    assert!(out[len..].iter().all(|&byte| byte == 0xA5), "nothing is written behind the image");
+    assert!(out[len..].iter().all(|&byte| byte == 0xA5), "nothing is written after the image");
     out.truncate(len);
     out
 }
@@ -25,7 +25,7 @@ fn a_configuration_survives_and_what_follows_does_not_matter() {
 }
 
 #[test]
-fn the_header_stands_as_it_always_did() {
+fn the_header_has_its_fixed_layout() {
     let image = image();
     assert_eq!(image[..4], *b"RGCI");
     assert_eq!(image[4..8], [2, 0, 0, 0]);
@@ -43,7 +43,7 @@ fn every_changed_byte_and_bit_is_refused() {
             let expected = match place {
                 0..4 => matches!(refused, ImageError::NotAnImage { .. }),
                 4..8 => matches!(refused, ImageError::Version { .. }),
-                // A longer payload is not there, or not possible; a shorter one has another CRC.
+                // A longer payload is cut short or too long; a shorter one has another CRC.
                 8..12 => matches!(
                     refused,
                     ImageError::TooShort { .. } | ImageError::TooLong { .. } | ImageError::Crc { .. }
@@ -66,7 +66,7 @@ fn every_cut_is_refused_with_what_is_missing() {
 }
 
 #[test]
-fn what_was_there_before_does_not_shine_through() {
+fn nothing_of_the_previous_configuration_remains() {
     let mut config = every_kind();
     let mut small = every_kind();
     small.safe_values.clear();
@@ -80,7 +80,7 @@ fn what_was_there_before_does_not_shine_through() {
     assert_eq!(config, small);
 }
 
-/// Reading piece by piece is reading the whole.
+/// The image can be read piece by piece or as a whole.
 #[test]
 fn the_payload_is_the_configuration_in_postcard() {
     let image = image();
@@ -99,7 +99,7 @@ fn erased_flash_is_no_image() {
     );
 }
 
-/// An image around any payload, with all its numbers right.
+/// An image around any payload, with a correct header.
 fn around(payload: &[u8]) -> Vec<u8> {
     let length = payload.len() as u32;
     let mut image = MAGIC.to_vec();

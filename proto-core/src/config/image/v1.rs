@@ -1,5 +1,7 @@
-//! Version 1: as version 2, but boards asked DHCP, always. Its images could have 64 KiB; one of more than 16 KiB is
-//! too long today, as its configuration is.
+//! Version 1: like version 2 without a board's own address, because every board used DHCP.
+//!
+//! Images could have up to 64 KiB then. One of more than 16 KiB is too long today, and so is its
+//! configuration.
 
 use super::{ConfigMut, ImageError, item, v2};
 

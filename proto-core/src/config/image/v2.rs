@@ -1,7 +1,6 @@
-//! Version 2: the configuration's own types, as postcard writes them one behind the other.
+//! Version 2, the newest: the configuration's own types, as postcard writes them one after the other.
 //!
-//! It is the newest, so these are the types of the configuration themselves. Whoever changes one of them
-//! raises the version, and leaves a copy of the old one here.
+//! A change of one of these types raises the version, and leaves a copy of the old type here.
 
 use serde::Serialize;
 
@@ -11,8 +10,8 @@ pub(super) use crate::config::{
     BoardAddress, CommandEntry, ControllerLink, FieldSpec, Port, Recipe, SafeValue,
 };
 
-/// A whole configuration, borrowed: postcard writes a struct as its fields, and a list as its length and
-/// its items.
+/// A whole configuration, borrowed. Postcard writes a struct as its fields, and a list as its length
+/// and its items.
 #[derive(Serialize)]
 struct Payload<'c> {
     controller: &'c ControllerLink,
@@ -36,7 +35,7 @@ pub(super) fn read(rest: &mut &[u8], config: &mut ConfigMut<'_>) -> Result<(), I
     read_lists(rest, config)
 }
 
-/// What version 1 has as well.
+/// The lists, which version 1 has too.
 pub(super) fn read_lists(rest: &mut &[u8], config: &mut ConfigMut<'_>) -> Result<(), ImageError> {
     items::<Recipe>(rest, Counted::Recipes, config.recipes)?;
     items::<Port>(rest, Counted::Ports, config.ports)?;

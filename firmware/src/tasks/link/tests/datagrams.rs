@@ -68,7 +68,7 @@ fn what_waits_for_a_host_that_is_not_found_is_not_sent_when_it_is_old() {
         net.hear(&switching(1));
         assert_eq!(next(&client).await, 1);
         // Long enough for its ARP entry to expire.
-        net.wire.silence(CONTROLLER, CONTROLLER);
+        net.wire.cut_off(CONTROLLER, CONTROLLER);
         net.wire.step.set(Duration::from_millis(2));
         let end = Instant::now() + Duration::from_secs(70);
         while Instant::now() < end {
@@ -80,15 +80,15 @@ fn what_waits_for_a_host_that_is_not_found_is_not_sent_when_it_is_old() {
             net.hear(&switching(2));
             Timer::after(Duration::from_millis(20)).await;
         }
-        net.wire.silence(0, 0);
+        net.wire.cut_off(0, 0);
         net.wire.step.set(Duration::from_micros(200));
-        let mut heard = 0;
-        while heard < 50 {
+        let mut received = 0;
+        while received < 50 {
             net.hear(&switching(2));
             Timer::after(Duration::from_millis(20)).await;
             while client.may_recv() {
                 assert_eq!(next(&client).await, 2, "it is old");
-                heard += 1;
+                received += 1;
             }
         }
         assert_eq!(net.link().0, 1, "the link stays up");

@@ -80,7 +80,7 @@ fn a_peer_that_acknowledges_late_slows_nothing() {
         let (mut rx, mut tx) = ([0; 8192], [0; 256]);
         let mut own = connected(&net, &mut rx, &mut tx).await;
         for _ in 0..5 {
-            net.wire.mute.set(CONTROLLER);
+            net.wire.no_send.set(CONTROLLER);
             for outputs in 1..=30 {
                 let begin = Instant::now();
                 net.hear(&switching(outputs));
@@ -90,7 +90,7 @@ fn a_peer_that_acknowledges_late_slows_nothing() {
                 Timer::at(begin + Duration::from_millis(4)).await;
             }
             // One acknowledgement covers all.
-            net.wire.mute.set(0);
+            net.wire.no_send.set(0);
             net.hear(&switching(31));
             assert_eq!(next(&mut own).await, 31);
             until(|| net.control().unacknowledged() == 0).await;
@@ -101,7 +101,7 @@ fn a_peer_that_acknowledges_late_slows_nothing() {
 
 #[test]
 fn what_is_not_acknowledged_in_time_ends_in_a_reset_and_is_never_delivered() {
-    for (deaf, mute) in [(CONTROLLER, 0), (0, CONTROLLER)] {
+    for (no_receive, no_send) in [(CONTROLLER, 0), (0, CONTROLLER)] {
         among(&config(tcp_listen(), Speaks::Nothing), listens, async |net| {
             let mut buffers = [[0; 512]; 2];
             let [rx, tx] = &mut buffers;
@@ -110,7 +110,7 @@ fn what_is_not_acknowledged_in_time_ends_in_a_reset_and_is_never_delivered() {
             assert_eq!(next(&mut own).await, 1);
             until(|| net.control().unacknowledged() == 0).await;
             let wire = net.wire;
-            wire.silence(deaf, mute);
+            wire.cut_off(no_receive, no_send);
             wire.log.borrow_mut().clear();
             let begin = Instant::now();
             net.hear(&switching(2));
@@ -123,10 +123,10 @@ fn what_is_not_acknowledged_in_time_ends_in_a_reset_and_is_never_delivered() {
             assert_eq!((reset.flags & RST, reset.payload.len()), (RST, 0));
             assert!(before.iter().any(|segment| segment.payload == switching(2)));
             // It is connected again, and does not receive it any more.
-            if mute == CONTROLLER {
+            if no_send == CONTROLLER {
                 assert_eq!(next(&mut own).await, 2);
             }
-            wire.silence(0, 0);
+            wire.cut_off(0, 0);
             wire.log.borrow_mut().clear();
             Timer::after(Duration::from_secs(20)).await;
             assert!(wire.segments().iter().all(|segment| segment.payload.is_empty()));
@@ -148,7 +148,7 @@ fn a_link_whose_task_waits_for_room_is_reset_all_the_same() {
         assert_eq!(next(&mut own).await, 0);
         until(|| net.control().unacknowledged() == 0).await;
         let wire = net.wire;
-        wire.mute.set(CONTROLLER);
+        wire.no_send.set(CONTROLLER);
         wire.log.borrow_mut().clear();
         let begin = Instant::now();
         for outputs in 1..=40 {
@@ -161,7 +161,7 @@ fn a_link_whose_task_waits_for_room_is_reset_all_the_same() {
         let time = Instant::now() - begin;
         assert!((TIMEOUT..TIMEOUT + Duration::from_millis(5)).contains(&time), "reset after {time}");
         wire.log.borrow_mut().clear();
-        wire.mute.set(0);
+        wire.no_send.set(0);
         Timer::after(Duration::from_secs(10)).await;
         assert!(wire.segments().iter().all(|segment| segment.payload.is_empty()));
         // And the port is free for the next connection.
@@ -196,7 +196,7 @@ fn what_must_not_be_delivered_any_more_ends_a_polite_close() {
         let mut buffers = [[0; 256]; 2];
         let [rx, tx] = &mut buffers;
         let mut own = connected(&net, rx, tx).await;
-        net.wire.deaf.set(CONTROLLER);
+        net.wire.no_receive.set(CONTROLLER);
         let begin = Instant::now();
         net.hear(&switching(1));
         Timer::at(begin + TIMEOUT - Duration::from_millis(30)).await;
@@ -283,7 +283,7 @@ fn a_link_that_is_given_up_while_it_opens_begins_anew() {
             // Refused, but ARP is done.
             until(|| wire.has(SYN)).await;
             until(|| net.control().is_turn(2)).await;
-            wire.deaf.set(CONTROLLER);
+            wire.no_receive.set(CONTROLLER);
             wire.log.borrow_mut().clear();
             let ports = || {
                 let sent = wire.segments().into_iter().filter(|segment| segment.flags & SYN != 0);
@@ -296,7 +296,7 @@ fn a_link_that_is_given_up_while_it_opens_begins_anew() {
             different.sort_unstable();
             different.dedup();
             assert_eq!(different.len(), 3, "an attempt goes on behind the next");
-            wire.deaf.set(0);
+            wire.no_receive.set(0);
             let mut buffers = [[0; 256]; 2];
             let [rx, tx] = &mut buffers;
             let mut own = TcpSocket::new(net.controller, rx, tx);

@@ -10,14 +10,24 @@ use super::*;
 /// Longer than keep-alives may be unanswered.
 const LONG: Duration = Duration::from_secs(40);
 
+/// Connects again and again to a listener that is busy at first.
+async fn connect_after_refusals(socket: &mut TcpSocket<'_>, at: IpEndpoint) {
+    let mut refused = 0;
+    while socket.connect(at).await.is_err() {
+        socket.abort();
+        refused += 1;
+    }
+    assert!(refused > 0, "nothing was in its way");
+}
+
 #[test]
 fn a_tcp_listener_takes_the_controller_only() {
     among(&config(tcp_listen(), Speaks::Nothing), listens, async |net| {
-        let Net { controller, stranger, .. } = net;
+        let Net { controller, other_host, .. } = net;
         let at = gateway_port();
         let mut buffers = [[0; 256]; 4];
         let [rx, tx, other_rx, other_tx] = &mut buffers;
-        let mut other = TcpSocket::new(stranger, other_rx, other_tx);
+        let mut other = TcpSocket::new(other_host, other_rx, other_tx);
         for round in 1..=3 {
             // The listener may still be refusing the one before.
             while other.connect(at).await.is_err() {
@@ -45,28 +55,24 @@ fn a_tcp_listener_takes_the_controller_only() {
 #[test]
 fn a_connection_that_never_comes_about_does_not_keep_the_listener() {
     among(&config(tcp_listen(), Speaks::Nothing), listens, async |net| {
-        let Net { controller, stranger, wire, .. } = net;
+        let Net { controller, other_host, wire, .. } = net;
         let at = gateway_port();
         let mut buffers = [[0; 256]; 4];
         let [rx, tx, other_rx, other_tx] = &mut buffers;
-        let mut other = TcpSocket::new(stranger, other_rx, other_tx);
+        let mut other = TcpSocket::new(other_host, other_rx, other_tx);
         other.connect(at).await.unwrap();
         net.seen(0, 1).await;
         other.abort();
         other.flush().await.unwrap();
         // ARP is done now. It sends a SYN and disappears before the answer.
-        wire.deaf.set(STRANGER);
-        let before = wire.spoken.get();
-        let asked = poll_fn(|_| if wire.spoken.get() == before { Poll::Pending } else { Poll::Ready(()) });
+        wire.no_receive.set(OTHER);
+        let before = wire.frames_sent.get();
+        let asked =
+            poll_fn(|_| if wire.frames_sent.get() == before { Poll::Pending } else { Poll::Ready(()) });
         assert!(matches!(select(other.connect(at), asked).await, Either::Second(())));
-        wire.mute.set(STRANGER);
+        wire.no_send.set(OTHER);
         let mut own = TcpSocket::new(controller, rx, tx);
-        let mut refused = 0;
-        while own.connect(at).await.is_err() {
-            own.abort();
-            refused += 1;
-        }
-        assert!(refused > 0, "nothing was in its way");
+        connect_after_refusals(&mut own, at).await;
         net.seen(1, 1).await;
     });
 }
@@ -82,16 +88,11 @@ fn a_controller_that_was_switched_off_finds_the_listener_free_again() {
         own.connect(at).await.unwrap();
         net.seen(1, 0).await;
         // It disappears without a notice.
-        wire.mute.set(CONTROLLER);
+        wire.no_send.set(CONTROLLER);
         own.abort();
         own.flush().await.unwrap();
-        wire.mute.set(0);
-        let mut refused = 0;
-        while own.connect(at).await.is_err() {
-            own.abort();
-            refused += 1;
-        }
-        assert!(refused > 0, "nothing was in its way");
+        wire.no_send.set(0);
+        connect_after_refusals(&mut own, at).await;
         net.seen(2, 0).await;
     });
 }
@@ -99,13 +100,13 @@ fn a_controller_that_was_switched_off_finds_the_listener_free_again() {
 #[test]
 fn a_udp_listener_takes_the_controller_only() {
     among(&config(udp_listen(), Speaks::Nothing), listens, async |net| {
-        let Net { controller, stranger, .. } = net;
+        let Net { controller, other_host, .. } = net;
         let at = gateway_port();
         let mut buffers = [[0; 256]; 4];
         let mut metadata = [[PacketMetadata::EMPTY; 4]; 4];
         let [rx, tx, other_rx, other_tx] = &mut buffers;
         let [rx_meta, tx_meta, other_rx_meta, other_tx_meta] = &mut metadata;
-        let mut other = UdpSocket::new(stranger, other_rx_meta, other_rx, other_tx_meta, other_tx);
+        let mut other = UdpSocket::new(other_host, other_rx_meta, other_rx, other_tx_meta, other_tx);
         other.bind(1).unwrap();
         for round in 1..=3 {
             other.send_to(&FRAME, at).await.unwrap();

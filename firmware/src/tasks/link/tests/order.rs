@@ -67,7 +67,7 @@ fn bytes_that_wait_in_the_ethernet_controller_are_heard_before_silence_is_too_lo
                 client.write(&FRAME).await.unwrap();
             }
         });
-        let net = Net { gateway, link, controller, stranger: controller, wire: &wire };
+        let net = Net { gateway, link, controller, other_host: controller, wire: &wire };
         pair.run(Duration::from_millis(100));
         speak.signal(());
         pair.settle();

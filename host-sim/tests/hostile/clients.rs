@@ -1,4 +1,4 @@
-//! Well-behaved clients, each on a thread of its own: what they get is what an attack is judged by.
+//! Well-behaved clients, each on a thread: an attack is judged by how they are served meanwhile.
 
 use std::collections::BTreeMap;
 use std::io::{BufRead, Read, Write};
@@ -10,19 +10,19 @@ use std::time::{Duration, Instant};
 
 use recipe_test_kit::PATIENCE;
 
-/// What one client got so far.
+/// How a client was served so far.
 #[derive(Default)]
 struct Tally {
     count: AtomicU64,
-    /// The longest wait for one of them since the newest lap began, in microseconds.
+    /// The longest wait since the newest measurement began, in microseconds.
     worst: AtomicU64,
     stop: AtomicBool,
-    trouble: Mutex<Option<String>>,
+    error: Mutex<Option<String>>,
 }
 
 /// The clients.
 #[derive(Default)]
-pub(crate) struct Witnesses {
+pub(crate) struct Clients {
     clients: BTreeMap<&'static str, Client>,
 }
 
@@ -32,24 +32,24 @@ struct Client {
     _thread: JoinHandle<()>,
 }
 
-/// Who decides how much a client gets.
+/// Who decides how often a client is served.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum PacedBy {
-    /// The process: a grid of its own, that nothing may keep it from.
+    /// The process, at a fixed rate, which an attack must not change.
     Process,
-    /// The client, which asks again when it was answered: it shares with whoever else asks, and must not wait
-    /// long.
+    /// The client, which sends the next request after each answer. It shares the server with others, and must
+    /// not wait long.
     Client,
 }
 
-/// What the clients got in a stretch of time.
-pub(crate) struct Lap {
+/// How the clients were served within some time.
+pub(crate) struct Service {
     took: f64,
     clients: BTreeMap<&'static str, (PacedBy, f64, Duration)>,
 }
 
-impl Witnesses {
-    /// A client that gets one thing whenever `next` returns; it ends with its error.
+impl Clients {
+    /// Adds a client, which is served whenever `next` returns; an error ends it.
     fn watch(
         &mut self,
         name: &'static str,
@@ -62,7 +62,7 @@ impl Witnesses {
             while !own.stop.load(Ordering::Relaxed) {
                 let begin = Instant::now();
                 if let Err(error) = next() {
-                    *own.trouble.lock().unwrap() = Some(error.to_string());
+                    *own.error.lock().unwrap() = Some(error.to_string());
                     return;
                 }
                 own.worst.fetch_max(begin.elapsed().as_micros() as u64, Ordering::Relaxed);
@@ -72,7 +72,7 @@ impl Witnesses {
         self.clients.insert(name, Client { tally, paced_by, _thread: thread });
     }
 
-    /// Whole chunks of a stream that begin as they should.
+    /// A client that reads chunks of a stream, each of which begins with `begin`.
     #[track_caller]
     pub(crate) fn stream(&mut self, name: &'static str, at: SocketAddr, len: usize, begin: &'static [u8]) {
         let mut stream = connect(at);
@@ -83,7 +83,7 @@ impl Witnesses {
         });
     }
 
-    /// A field device: sends a frame whenever it got one.
+    /// A field device that sends a frame after each one that it receives.
     #[track_caller]
     pub(crate) fn field(
         &mut self,
@@ -103,7 +103,7 @@ impl Witnesses {
         });
     }
 
-    /// An slcan client that is there for frames that begin so.
+    /// An slcan client that waits for frames that begin with `begin`.
     #[track_caller]
     pub(crate) fn slcan(&mut self, name: &'static str, at: SocketAddr, begin: &'static [u8]) {
         let mut stream = connect(at);
@@ -122,13 +122,13 @@ impl Witnesses {
         });
     }
 
-    /// The packets of port 2001.
+    /// A client of port 2001.
     #[track_caller]
     pub(crate) fn state(&mut self, at: SocketAddr) {
         self.stream("state", at, 1_468, &[]);
     }
 
-    /// The frames of UDP 2011.
+    /// A client of UDP 2011.
     #[track_caller]
     pub(crate) fn udp2011(&mut self, at: SocketAddr) {
         let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
@@ -138,7 +138,7 @@ impl Witnesses {
         let mut frame = [0; 64];
         let mut count = 0_u32;
         self.watch("udp2011", PacedBy::Process, move || {
-            // Who is silent for a minute is forgotten.
+            // The server forgets a client that is silent for a minute.
             count += 1;
             if count.is_multiple_of(1_000) {
                 socket.send(&[0xFF, 0xFF, 0x01, 0xEE, 0xEE])?;
@@ -150,9 +150,9 @@ impl Witnesses {
         });
     }
 
-    /// Asks, takes the answer, waits a little.
+    /// A client that sends a request, reads the answer, and waits a little.
     #[track_caller]
-    pub(crate) fn asks(
+    pub(crate) fn request_answer(
         &mut self,
         name: &'static str,
         at: SocketAddr,
@@ -172,7 +172,7 @@ impl Witnesses {
         });
     }
 
-    /// One client after the other: connects, asks, is answered, goes.
+    /// Clients one after the other: each connects, sends a request, reads the answer and closes.
     pub(crate) fn newcomers(
         &mut self,
         name: &'static str,
@@ -191,33 +191,33 @@ impl Witnesses {
         });
     }
 
-    /// What the clients get from now on, for as long as `window`.
+    /// Measures how the clients are served during the next `window`.
     #[track_caller]
-    pub(crate) fn lap(&self, window: Duration) -> Lap {
+    pub(crate) fn measure(&self, window: Duration) -> Service {
         let begin = Instant::now();
-        let before: Vec<_> = self.clients.values().map(|client| client.tally.begin_lap()).collect();
+        let before: Vec<_> = self.clients.values().map(|client| client.tally.begin()).collect();
         std::thread::sleep(window);
         let took = begin.elapsed().as_secs_f64();
         let mut clients = BTreeMap::new();
         for ((name, client), before) in self.clients.iter().zip(before) {
-            let trouble = client.tally.trouble.lock().unwrap().clone();
-            assert_eq!(trouble, None, "{name}");
+            let error = client.tally.error.lock().unwrap().clone();
+            assert_eq!(error, None, "{name}");
             let count = client.tally.count.load(Ordering::Relaxed) - before;
             let worst = Duration::from_micros(client.tally.worst.load(Ordering::Relaxed));
             clients.insert(*name, (client.paced_by, count as f64 / took, worst));
         }
-        Lap { took, clients }
+        Service { took, clients }
     }
 }
 
 impl Tally {
-    fn begin_lap(&self) -> u64 {
+    fn begin(&self) -> u64 {
         self.worst.store(0, Ordering::Relaxed);
         self.count.load(Ordering::Relaxed)
     }
 }
 
-impl Drop for Witnesses {
+impl Drop for Clients {
     fn drop(&mut self) {
         for client in self.clients.values() {
             client.tally.stop.store(true, Ordering::Relaxed);
@@ -225,9 +225,9 @@ impl Drop for Witnesses {
     }
 }
 
-impl Lap {
-    /// Less than before, but a client that gets next to nothing without any attack has been lost to the one
-    /// before.
+impl Service {
+    /// Raises low rates to a quarter of the rates `before`: a client that is hardly served although no attack
+    /// goes on was lost to an earlier one.
     pub(crate) fn at_least(mut self, before: &Self) -> Self {
         for (name, (_, own, _)) in &mut self.clients {
             *own = own.max(before.clients[name].1 / 4.0);
@@ -235,18 +235,18 @@ impl Lap {
         self
     }
 
-    /// Whether nobody waited longer for anything; who did, if somebody did.
+    /// Checks that no client waited longer than `limit`.
     pub(crate) fn waits_at_most(&self, limit: Duration) -> Result<(), String> {
         let late = self.clients.iter().find(|(_, (_, _, worst))| *worst > limit);
         late.map_or(Ok(()), |(name, (_, _, worst))| Err(format!("{name} waited {worst:?}")))
     }
 
-    /// Whether nothing much is missing that there was `before`; what is, if something is. What an attack must
-    /// not do is to take the clients' share, which would leave next to nothing of it.
+    /// Checks that the clients were served about as well as `before`. An attack that takes their share would
+    /// leave hardly anything.
     pub(crate) fn is_like(&self, before: &Self) -> Result<(), String> {
         for (name, &(paced_by, own, worst)) in &self.clients {
             let least = match paced_by {
-                // The end of a lap may cut one off.
+                // One may be just after the end.
                 PacedBy::Process => before.clients[name].1 * LEAST_SHARE - 1.0 / self.took,
                 PacedBy::Client => LEAST_ANSWERS.min(before.clients[name].1 * LEAST_SHARE),
             };
@@ -261,7 +261,7 @@ impl Lap {
     }
 }
 
-impl std::fmt::Display for Lap {
+impl std::fmt::Display for Service {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         for (name, (_, per_second, worst)) in &self.clients {
             write!(f, "{name} {per_second:.1}/s, worst {worst:.1?}; ")?;
@@ -279,6 +279,6 @@ pub(crate) fn connect(at: SocketAddr) -> TcpStream {
 }
 
 const LEAST_SHARE: f64 = 0.3;
-/// A second, when a client asks.
+/// Per second, for clients that send requests.
 const LEAST_ANSWERS: f64 = 5.0;
 const LONGEST_WAIT: Duration = Duration::from_secs(2);
