@@ -401,6 +401,8 @@ impl Driver {
                 .map(|spec| match spec {
                     FieldSpec::System(var) => var.size(),
                     FieldSpec::UserInput { ty, .. } | FieldSpec::UserOutput { ty, .. } => ty.size(),
+                    // This configuration has none.
+                    _ => 0,
                 })
                 .sum()
         };

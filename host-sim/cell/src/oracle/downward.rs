@@ -240,6 +240,7 @@ impl Downward {
                 }
                 FieldSpec::UserOutput { ty, from } => (ty, self.number(up, ty, from)),
                 FieldSpec::UserInput { ty, .. } => (ty, None),
+                _ => unimplemented!("frames of devices are not modelled"),
             };
             let (value, after) = rest.split_at(ty.size());
             rest = after;

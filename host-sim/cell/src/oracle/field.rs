@@ -120,6 +120,7 @@ fn judge(mode: Mode, frame: &Frame, nth: usize, payload: &[u8]) -> Verdict {
         let ty = match field {
             FieldSpec::System(var) => var.ty(),
             FieldSpec::UserInput { ty, .. } | FieldSpec::UserOutput { ty, .. } => *ty,
+            _ => unimplemented!("frames of devices are not modelled"),
         };
         let (bytes, after) = rest.split_at(ty.size());
         rest = after;

@@ -239,6 +239,7 @@ fn size(field: &FieldSpec) -> usize {
     match field {
         FieldSpec::System(var) => var.size(),
         FieldSpec::UserInput { ty, .. } | FieldSpec::UserOutput { ty, .. } => ty.size(),
+        _ => unimplemented!("frames of devices are not modelled"),
     }
 }
 

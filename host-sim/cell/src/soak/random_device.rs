@@ -244,6 +244,7 @@ fn content(config: &GatewayConfig, field: &FieldSpec) -> Content {
         FieldSpec::UserInput { ty, .. } | FieldSpec::UserOutput { ty, .. } => {
             Content::Number { ty, most: 1e3 }
         }
+        _ => unimplemented!("frames of devices are not modelled"),
     }
 }
 
