@@ -339,6 +339,8 @@ pub enum ConfigErrorKind {
     NeedsIntegers,
     /// Only integers wrap around.
     OnlyIntegersWrap,
+    /// No checksum has this name.
+    UnknownChecksum,
     /// A command table has no entries.
     EmptyTable,
     /// The field can never have a command's value.

@@ -97,7 +97,7 @@ fn without_a_checksum_another_constant_is_no_frame() {
 fn a_checksum_stands_where_its_device_has_it() {
     let elements = [big(ScalarType::Byte), big(ScalarType::Word)];
     let place = |behind, first, last| {
-        let sum = Checksum { first, last, ..Checksum::standard(Algorithm::Xor8) };
+        let sum = Checksum::standard(Algorithm::Xor8).over(first, last);
         FrameLayout::new(Carrier::Stream, Direction::Output, &[0x55], &[0xEE], &elements, Some((sum, behind)))
     };
     let behind = place(2, 0, None).unwrap();
