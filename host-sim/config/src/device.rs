@@ -79,6 +79,8 @@ pub struct DeviceField {
     pub spec: FieldSpec,
     /// It is a second use of the bytes of the field before, under the same name.
     pub repeats: bool,
+    /// Its value picks a command.
+    pub picks_commands: bool,
 }
 
 impl NamedFrame {

@@ -22,7 +22,7 @@ pub(super) fn show(recipe: &DeviceRecipe, part: Direction) -> String {
         if let Some(id) = frame.id {
             report += &format!("    id {}\n", text::show_id(id));
         }
-        let rows = rows(frame);
+        let rows = rows(frame, part);
         let width = |column: fn(&Row) -> &String| {
             rows.iter().map(|row| column(row).chars().count()).max().unwrap_or(0)
         };
@@ -34,7 +34,7 @@ pub(super) fn show(recipe: &DeviceRecipe, part: Direction) -> String {
     report
 }
 
-fn rows(frame: &NamedFrame) -> Vec<Row> {
+fn rows(frame: &NamedFrame, part: Direction) -> Vec<Row> {
     let mut rows = Vec::new();
     let mut cursor = Cursor { at: Some(0), before: String::new() };
     let mut add =
@@ -57,14 +57,17 @@ fn rows(frame: &NamedFrame) -> Vec<Row> {
                 add(place, "checksum", show_checksum(&sum));
             }
             FieldSpec::Padding { len, fill } => {
-                add(cursor.step(Some(usize::from(len))), "padding", format!("sent as {fill:#04X}"));
+                let what = match part {
+                    Direction::Input => "any bytes".to_owned(),
+                    Direction::Output => format!("{fill:02X}"),
+                };
+                add(cursor.step(Some(usize::from(len))), "padding", what);
             }
             spec => {
                 let Some(encoding) = spec.element().and_then(|element| element.encoding()) else { continue };
                 let place =
                     if encoding.shared { cursor.before.clone() } else { cursor.step(encoding.size()) };
-                // The second use of the same bytes is the one that picks a command.
-                let uses = if field.repeats { ", picks commands".to_owned() } else { show_use(&spec) };
+                let uses = if field.picks_commands { " -> commands".to_owned() } else { show_use(&spec) };
                 add(place, &field.name, show_encoding(&encoding) + uses.as_str());
             }
         }

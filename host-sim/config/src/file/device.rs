@@ -12,7 +12,7 @@ use proto_core::recipe::model::{MAX_CAN_IDS, MAX_DELIMITER, MAX_STREAM_FRAME, Mo
 use proto_core::sysvar::Direction;
 use proto_core::wire::scalar::ScalarType;
 
-use super::bindings;
+use super::bindings::{self, FileInput};
 use super::encoding::{self, OpenNumber, Order, refuse};
 use super::reader::{Item, Reader, Result};
 use super::recipes::{FileField, FileFieldKind, FileFrame, FilePart, FileRecipe, Flavour, Written};
@@ -125,7 +125,7 @@ impl FieldReader {
         let written = Written::plain(encoding::read_plain_type(table)?);
         Ok(match self.direction {
             Direction::Input => {
-                FileFieldKind::UserInput { name, written, to: bindings::FileInput::Unused, again: false }
+                FileFieldKind::UserInput { name, written, to: FileInput::Unused, again: false }
             }
             Direction::Output => {
                 FileFieldKind::UserOutput { name, written, from: bindings::FileOutput::Program }
@@ -402,7 +402,9 @@ impl FileRecipe {
 impl FileField {
     fn named(&self) -> DeviceField {
         let repeats = matches!(self.kind, FileFieldKind::UserInput { again: true, .. });
-        DeviceField { name: self.name(), spec: self.spec(), repeats }
+        let picks_commands =
+            matches!(self.kind, FileFieldKind::UserInput { to: FileInput::Commands { .. }, .. });
+        DeviceField { name: self.name(), spec: self.spec(), repeats, picks_commands }
     }
 
     /// What the field is, without a table of commands.
