@@ -142,7 +142,7 @@ impl<'a> Builder<'a> {
         let Some(file) = from.part(part) else { return Ok(None) };
         self.spots.insert(Place::Part { recipe, part }, file.spot.clone());
         let fields = self.add_fields(recipe, part, file, 0)?;
-        Ok(Some(StreamPart { head: delimiter(&file.head), tail: delimiter(&file.tail), fields }))
+        Ok(Some(StreamPart::new(delimiter(&file.head), delimiter(&file.tail), fields)))
     }
 
     fn can_part(
