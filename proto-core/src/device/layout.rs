@@ -126,8 +126,8 @@ pub enum Carrier {
 /// What bytes are, seen as a frame that begins at the first of them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Probe {
-    /// Not the beginning of a frame.
-    No,
+    /// Not the beginning of a frame; it took so many steps to see that.
+    No(usize),
     /// Perhaps the beginning of one; at least so many more bytes are needed to tell.
     Partial(usize),
     /// A frame of so many bytes.
@@ -646,8 +646,8 @@ impl FrameLayout {
         bytes: &[u8],
         end: Option<usize>,
     ) -> Probe {
-        if self.head.iter().zip(bytes).any(|(expected, byte)| expected != byte) {
-            return Probe::No;
+        if let Some(differs) = self.head.iter().zip(bytes).position(|(expected, byte)| expected != byte) {
+            return Probe::No(differs.saturating_add(1));
         }
         if let Some(missing @ 1..) = usize::from(self.shortest).checked_sub(bytes.len()) {
             return Probe::Partial(missing);
@@ -660,7 +660,7 @@ impl FrameLayout {
                 Err(Unplaced::Partial(missing)) if is_ours || self.checksum.is_some() => {
                     return Probe::Partial(missing);
                 }
-                Err(_) => return Probe::No,
+                Err(_) => return Probe::No(places.nth.saturating_add(self.head.len())),
             };
             let ends_at = place.end;
             let field = bytes.get(place).unwrap_or(&[]);
@@ -669,12 +669,13 @@ impl FrameLayout {
                     is_ours &= encoding.read(field).is_ok_and(|read| read.as_f64() == *value as f64);
                 }
                 Element::Length(length) => {
-                    let Ok(number) = length.encoding.read(field) else { return Probe::No };
+                    let steps = places.nth.saturating_add(self.head.len());
+                    let Ok(number) = length.encoding.read(field) else { return Probe::No(steps) };
                     let end = places.counted_from(length, ends_at).saturating_add(number.as_f64() as i64);
                     let is_possible = (i64::from(self.shortest)..=i64::from(self.longest)).contains(&end);
                     let end = end as usize;
                     if !is_possible || places.end.is_some_and(|known| known != end) {
-                        return Probe::No;
+                        return Probe::No(steps);
                     }
                     places.end = Some(end);
                 }
@@ -683,18 +684,19 @@ impl FrameLayout {
         }
         let tail_at = places.at;
         let len = tail_at.saturating_add(self.tail.len());
+        let steps = places.nth.saturating_add(len);
         if places.end.is_some_and(|end| end != len) {
-            return Probe::No;
+            return Probe::No(steps);
         }
         let rest = bytes.get(tail_at..).unwrap_or(&[]);
         if self.tail.iter().zip(rest).any(|(expected, byte)| expected != byte) {
-            return Probe::No;
+            return Probe::No(steps);
         }
         if let Some(missing @ 1..) = len.checked_sub(bytes.len()) {
             return Probe::Partial(missing);
         }
         match (self.checksum_is_right(bytes, places.checksum_at), is_ours) {
-            (None, false) => Probe::No,
+            (None, false) => Probe::No(steps),
             (None | Some(true), true) => Probe::Frame(len),
             (Some(true), false) => Probe::Other(len),
             (Some(false), _) => Probe::Wrong(len),

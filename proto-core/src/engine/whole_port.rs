@@ -218,8 +218,8 @@ fn judge<'f>(
             Probe::Frame(_) => return Ok((nth, format)),
             Probe::Wrong(_) => Rejection::Checksum,
             Probe::Other(_) => Rejection::OtherDevice,
-            Probe::No if (shortest..=longest).contains(&frame.len()) => Rejection::OtherDevice,
-            Probe::No | Probe::Partial(_) => Rejection::WrongLength,
+            Probe::No(_) if (shortest..=longest).contains(&frame.len()) => Rejection::OtherDevice,
+            Probe::No(_) | Probe::Partial(_) => Rejection::WrongLength,
         };
         // What is nearest to a frame says most.
         verdict = match (verdict, why) {

@@ -90,8 +90,8 @@ fn without_a_checksum_another_constant_is_no_frame() {
     let elements = [fixed(ScalarType::Byte, 9), big(ScalarType::Word)];
     let layout = FrameLayout::new(Carrier::Stream, Direction::Output, &[], &[0xEE], &elements, None).unwrap();
     assert_eq!(layout.probe(&elements, &[9, 1, 2, 0xEE]), Probe::Frame(4));
-    assert_eq!(layout.probe(&elements, &[8, 1, 2, 0xEE]), Probe::No);
-    assert_eq!(layout.probe(&elements, &[9, 1, 2, 0xEF]), Probe::No);
+    assert_eq!(layout.probe(&elements, &[8, 1, 2, 0xEE]), Probe::No(6));
+    assert_eq!(layout.probe(&elements, &[9, 1, 2, 0xEF]), Probe::No(6));
     assert_eq!(layout.probe(&elements, &[9, 1]), Probe::Partial(2));
 }
 
@@ -154,7 +154,8 @@ fn fields_of_varying_length_end_where_their_delimiter_is() {
         let probe = layout.probe(&elements, &b"ST,17,-  3.25\r\n"[..len]);
         assert!(matches!(probe, Probe::Partial(1..)), "{len} bytes: {probe:?}");
     }
-    assert_eq!(layout.probe(&elements, b"ST,17,123456789012345678\r\n"), Probe::No, "too long");
+    assert_eq!(layout.probe(&elements, b"ST,17,123456789012345678\r\n"), Probe::No(4), "too long");
+    assert_eq!(layout.probe(&elements, b"SA"), Probe::No(2), "seen at once");
     // Found, and refused by its value.
     let frame = b"ST,x,1\r\n";
     assert_eq!(layout.probe(&elements, frame), Probe::Frame(8));
@@ -271,7 +272,7 @@ fn a_length_tells_where_the_frame_ends() {
         let longer = [&frame[..], &[3, 3]].concat();
         assert_eq!(layout.probe(&elements, &longer), Probe::Frame(frame.len()));
         assert_eq!(layout.probe_whole(&elements, &frame), Probe::Frame(frame.len()));
-        assert_eq!(layout.probe_whole(&elements, &longer), Probe::No);
+        assert!(matches!(layout.probe_whole(&elements, &longer), Probe::No(_)));
         assert_eq!(layout.text(&elements, &frame, 2), Some(&b"AB"[..]));
         assert_eq!((layout.text(&elements, &frame, 1), layout.text(&elements, &frame, 9)), (None, None));
     }
@@ -285,7 +286,7 @@ fn a_length_out_of_range_is_no_frame() {
     for (number, is_possible) in [(0, false), (1, false), (2, true), (130, true), (131, false), (255, false)]
     {
         let found = layout.probe(&elements, &[2, number, 7, 3]);
-        assert_eq!(found != Probe::No, is_possible, "{number}: {found:?}");
+        assert_eq!(!matches!(found, Probe::No(_)), is_possible, "{number}: {found:?}");
     }
 }
 
@@ -294,7 +295,7 @@ fn a_frame_of_fixed_fields_has_the_length_it_says() {
     let elements = [length(Counts::Rest, 0), value(Kind::Scalar(ScalarType::Word), ByteOrder::Big)];
     let layout = FrameLayout::new(Carrier::Stream, Direction::Input, &[2], &[], &elements, None).unwrap();
     assert_eq!(layout.probe(&elements, &[2, 2, 1, 2]), Probe::Frame(4));
-    assert_eq!(layout.probe(&elements, &[2, 3, 1, 2]), Probe::No);
+    assert!(matches!(layout.probe(&elements, &[2, 3, 1, 2]), Probe::No(_)));
     assert_eq!(encoded(&layout, &elements, &[0.0, 258.0]), [2, 2, 1, 2]);
 }
 
