@@ -348,7 +348,12 @@ fn what_cannot_be_is_refused_with_its_place() {
             text(2, "FloatInputReg[1]"),
             ", field 1: 2 word variables are needed, such as WordInputReg[1]; found: FloatInputReg[1]",
         ),
-        (SCANNER, text(2, "WordOutputReg[1]"), ", field 1: WordOutputReg[1] is not an input of the robot"),
+        (
+            SCANNER,
+            text(2, "WordOutputReg[1]"),
+            ", field 1: WordOutputReg[1] is an output of the robot and cannot be written; inputs are \
+             DigitalOutputCommand, BitInputReg, WordInputReg, FloatInputReg, ForceEnd, ForceBase",
+        ),
         (Frames { tail: &[], ..SCANNER }, text(2, "WordInputReg[1]"), ": framing = \"tail\" needs a tail"),
         (
             Frames { escape: Some(Escape::Cobs), ..SCANNER },

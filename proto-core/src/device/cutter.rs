@@ -155,9 +155,12 @@ impl Cutter {
     pub fn discard(&mut self) -> usize {
         let dropped = self.held().len();
         let was_cut = self.has_begun() || !self.is_done && self.fault.is_some();
+        let newest = if self.is_done { (0, 0) } else { (self.newest, self.newest_len) };
         self.begin();
         if was_cut && self.ends != Ends::Escape(Escape::Dle) {
             self.fault = Some(Fault::Cut);
+            // The tail itself may have been cut.
+            (self.newest, self.newest_len) = newest;
         }
         dropped
     }

@@ -4,7 +4,9 @@
 //! are one and the values in it, or the frame. The elements stay with the caller, so that the frames
 //! of many devices share one pool; every call takes the ones that [`FrameLayout::new`] checked.
 
+use core::borrow::Borrow;
 use core::fmt;
+use core::num::NonZeroU16;
 
 use heapless::Vec;
 
@@ -61,15 +63,24 @@ pub struct Checksum {
     pub text: bool,
     /// The first byte of the frame that it covers; 0 is the first of the head.
     pub first: u16,
-    /// The last one; `None` is the one before the checksum.
-    pub last: Option<u16>,
+    /// The byte behind the last one; `None` is that of the checksum.
+    pub end: Option<NonZeroU16>,
 }
 
 impl Checksum {
     /// This algorithm as its standard has it: over everything before it, in the standard's byte
     /// order.
     pub const fn standard(algorithm: Algorithm) -> Self {
-        Self { algorithm, order: algorithm.order(), text: false, first: 0, last: None }
+        Self { algorithm, order: algorithm.order(), text: false, first: 0, end: None }
+    }
+
+    /// Over these bytes of the frame, the last one included; `None` is the one before the checksum.
+    pub const fn over(self, first: u16, last: Option<u16>) -> Self {
+        let end = match last {
+            Some(last) => NonZeroU16::new(last.saturating_add(1)),
+            None => None,
+        };
+        Self { first, end, ..self }
     }
 
     /// Number of bytes in the frame, 1..=8.
@@ -84,7 +95,7 @@ impl Checksum {
 
     /// The bytes it covers, if it stands at `at` itself.
     fn covered(&self, at: usize) -> core::ops::Range<usize> {
-        let end = self.last.map_or(at, |last| usize::from(last).saturating_add(1));
+        let end = self.end.map_or(at, |end| usize::from(end.get()));
         usize::from(self.first)..end
     }
 
@@ -138,19 +149,15 @@ pub enum Probe {
     Wrong(usize),
 }
 
-/// A checksum, and the number of elements before it.
-#[derive(Debug, Clone, Copy)]
-struct Placed {
-    sum: Checksum,
-    behind: u8,
-}
-
 /// A frame, checked and ready to find, decode and encode.
 #[derive(Debug, Clone)]
 pub struct FrameLayout {
-    head: Vec<u8, MAX_DELIMITER>,
-    tail: Vec<u8, MAX_DELIMITER>,
-    checksum: Option<Placed>,
+    // Their lengths in a byte: every port has room for many layouts.
+    head: Vec<u8, MAX_DELIMITER, u8>,
+    tail: Vec<u8, MAX_DELIMITER, u8>,
+    checksum: Option<Checksum>,
+    /// Number of elements before the checksum.
+    behind: u8,
     shortest: u16,
     longest: u16,
     /// Number of bytes behind a text that takes the rest: elements, checksum and tail.
@@ -399,7 +406,7 @@ enum Unplaced {
 impl Places {
     fn new(layout: &FrameLayout, end: Option<usize>) -> Self {
         let (behind, len) =
-            layout.checksum.map_or((usize::MAX, 0), |placed| (usize::from(placed.behind), placed.sum.len()));
+            layout.checksum.map_or((usize::MAX, 0), |sum| (usize::from(layout.behind), sum.len()));
         let mut places = Self {
             at: layout.head.len(),
             shared_at: 0,
@@ -511,17 +518,17 @@ impl FrameLayout {
             return Err(LayoutError::TooManyElements);
         }
         check_elements(elements, direction)?;
-        let checksum = match checksum {
+        let (checksum, behind) = match checksum {
             Some((sum, behind)) => {
                 let splits = elements.get(behind).is_some_and(Element::is_shared);
                 if behind > elements.len() || splits {
                     return Err(LayoutError::ChecksumPlace);
                 }
-                Some(Placed { sum, behind: behind as u8 })
+                (Some(sum), behind as u8)
             }
-            None => None,
+            None => (None, 0),
         };
-        let mut layout = Self { head, tail, checksum, shortest: 0, longest: 0, behind_rest: 0 };
+        let mut layout = Self { head, tail, checksum, behind, shortest: 0, longest: 0, behind_rest: 0 };
         let shortest = layout.length_with(elements, |_| 0);
         let longest = layout.length_with(elements, Element::most);
         let is_searched = carrier == Carrier::Stream && direction == Direction::Input;
@@ -587,7 +594,7 @@ impl FrameLayout {
     }
 
     fn check_checksum(&self, elements: &[Element]) -> Result<(), LayoutError> {
-        let Some(Placed { sum, .. }) = self.checksum else { return Ok(()) };
+        let Some(sum) = self.checksum else { return Ok(()) };
         let is_valid = match sum.algorithm {
             Algorithm::Crc(crc) => crc.is_valid(),
             _ => true,
@@ -609,7 +616,7 @@ impl FrameLayout {
         let own = at..at.saturating_add(sum.len());
         let covered = sum.covered(at);
         let overlaps = covered.start < own.end && own.start < covered.end;
-        let end = if sum.last.is_some() { numbered.unwrap_or(places.at) } else { places.at };
+        let end = if sum.end.is_some() { numbered.unwrap_or(places.at) } else { places.at };
         let comes_late = numbered.is_some_and(|numbered| usize::from(sum.first) > numbered);
         // An empty text leaves nothing to cover.
         let covers_nothing = covered.is_empty() && (numbered.is_none() || covered.start > covered.end);
@@ -630,19 +637,19 @@ impl FrameLayout {
     }
 
     /// What `bytes` are, seen as a frame that begins at the first of them.
-    pub fn probe<'e>(&self, elements: impl IntoIterator<Item = &'e Element>, bytes: &[u8]) -> Probe {
+    pub fn probe(&self, elements: impl IntoIterator<Item: Borrow<Element>>, bytes: &[u8]) -> Probe {
         self.probe_to(elements, bytes, None)
     }
 
     /// What `bytes` are, seen as one whole frame: too few of them are [`Probe::Partial`].
-    pub fn probe_whole<'e>(&self, elements: impl IntoIterator<Item = &'e Element>, bytes: &[u8]) -> Probe {
+    pub fn probe_whole(&self, elements: impl IntoIterator<Item: Borrow<Element>>, bytes: &[u8]) -> Probe {
         self.probe_to(elements, bytes, Some(bytes.len()))
     }
 
     /// `end` is where the frame ends, if that is known from outside.
-    fn probe_to<'e>(
+    fn probe_to(
         &self,
-        elements: impl IntoIterator<Item = &'e Element>,
+        elements: impl IntoIterator<Item: Borrow<Element>>,
         bytes: &[u8],
         end: Option<usize>,
     ) -> Probe {
@@ -655,6 +662,7 @@ impl FrameLayout {
         let mut places = Places::new(self, end);
         let mut is_ours = true;
         for element in elements {
+            let element = element.borrow();
             let place = match places.find(element, bytes) {
                 Ok(place) => place,
                 Err(Unplaced::Partial(missing)) if is_ours || self.checksum.is_some() => {
@@ -705,7 +713,7 @@ impl FrameLayout {
 
     /// Whether the checksum at `at` is right; `None` without one.
     fn checksum_is_right(&self, frame: &[u8], at: usize) -> Option<bool> {
-        let sum = self.checksum?.sum;
+        let sum = self.checksum?;
         let found = frame.get(at..at.saturating_add(sum.len())).unwrap_or(&[]);
         let mut expected = [0; 8];
         let expected = expected.get_mut(..sum.len())?;
@@ -715,13 +723,14 @@ impl FrameLayout {
 
     /// The elements of a frame that [`Self::probe`] found, each with its value; `None` for what is
     /// not a value.
-    pub fn values<'a>(
+    pub fn values(
         &self,
-        elements: impl IntoIterator<Item = &'a Element>,
-        frame: &'a [u8],
+        elements: impl IntoIterator<Item: Borrow<Element>>,
+        frame: &[u8],
     ) -> impl Iterator<Item = Result<Option<Scalar>, Unreadable>> {
         let mut places = Places::new(self, Some(frame.len()));
         elements.into_iter().map(move |element| {
+            let element = element.borrow();
             let place = places.find(element, frame).map_err(|_| Unreadable::Length)?;
             match element {
                 Element::Value { encoding, .. } => encoding.read(frame.get(place).unwrap_or(&[])).map(Some),
@@ -735,12 +744,13 @@ impl FrameLayout {
     /// The text that the `nth` element of such a frame is; `None` if it is no text.
     pub fn text<'a>(
         &self,
-        elements: impl IntoIterator<Item = &'a Element>,
+        elements: impl IntoIterator<Item: Borrow<Element>>,
         frame: &'a [u8],
         nth: usize,
     ) -> Option<&'a [u8]> {
         let mut places = Places::new(self, Some(frame.len()));
         for (at, element) in elements.into_iter().enumerate() {
+            let element = element.borrow();
             let place = places.find(element, frame).ok()?;
             match element {
                 Element::Text(text) if at == nth => return Some(text.trimmed(frame.get(place)?)),
@@ -752,9 +762,9 @@ impl FrameLayout {
     }
 
     /// Writes a frame without texts; see [`Self::encode_with`].
-    pub fn encode<'e>(
+    pub fn encode(
         &self,
-        elements: impl IntoIterator<Item = &'e Element>,
+        elements: impl IntoIterator<Item: Borrow<Element>>,
         value: impl FnMut(usize) -> f64,
         out: &mut [u8],
     ) -> Option<usize> {
@@ -765,9 +775,9 @@ impl FrameLayout {
     /// of each element that is a value, by its index; `text` writes each text, and returns its
     /// length. `None` if one is not a number, or cannot be wrapped, if a text does not fit its
     /// width or the length its field, or if there is no room.
-    pub fn encode_with<'e>(
+    pub fn encode_with(
         &self,
-        elements: impl IntoIterator<Item = &'e Element>,
+        elements: impl IntoIterator<Item: Borrow<Element>>,
         mut value: impl FnMut(usize) -> f64,
         mut text: impl FnMut(usize, &mut [u8]) -> Option<usize>,
         out: &mut [u8],
@@ -776,6 +786,7 @@ impl FrameLayout {
         let mut length_at = None;
         put(out, 0, &self.head)?;
         for (nth, element) in elements.into_iter().enumerate() {
+            let element = element.borrow();
             let at = if element.is_shared() { places.shared_at } else { places.at };
             let rest = out.get_mut(at..)?;
             let (encoding, number) = match *element {
@@ -833,7 +844,7 @@ impl FrameLayout {
             }
             length.encoding.write(number, out.get_mut(at..)?)?;
         }
-        if let Some(Placed { sum, .. }) = self.checksum {
+        if let Some(sum) = self.checksum {
             let mut bytes = [0; 8];
             let bytes = bytes.get_mut(..sum.len())?;
             sum.write(out.get(sum.covered(places.checksum_at))?, bytes);

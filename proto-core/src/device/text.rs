@@ -78,7 +78,7 @@ pub struct Length {
     /// Which bytes it counts.
     pub counts: Counts,
     /// So many bytes more than it says: 2 if it leaves out two of those that it should count.
-    pub plus: i16,
+    pub plus: i8,
 }
 
 /// Which bytes a length counts.

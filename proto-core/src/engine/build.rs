@@ -359,7 +359,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 }
                 InputBinding::Unused => InputTo::Unused,
             };
-            self.bindings.inputs.push(InputBind { to, element }).map_err(|_| full())?;
+            self.bindings.inputs.push(InputBind::new(to, element)).map_err(|_| full())?;
             inputs.len = inputs.len.saturating_add(1);
         }
         let mut outputs = Span { start: self.bindings.outputs.len() as u16, len: 0 };
@@ -371,7 +371,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 FieldSpec::DeviceOutput { from, .. } => (ScalarType::Double, from),
                 _ => (ScalarType::Double, OutputBinding::Constant(0.0)),
             };
-            self.bindings.outputs.push(OutputBind { ty, from, element }).map_err(|_| full())?;
+            self.bindings.outputs.push(OutputBind::new(ty, from, element)).map_err(|_| full())?;
             outputs.len = outputs.len.saturating_add(1);
         }
         self.store.watches_bits |= matches!(recipe.send, SendOn::Rising { .. });

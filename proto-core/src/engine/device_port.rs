@@ -14,7 +14,7 @@ use super::rejection::Rejection;
 use super::sender::{DIGEST_SEED, digest};
 use super::store::Store;
 use super::tap::Tap;
-use super::user::{InputBind, InputTo, OutputBind, number_of};
+use super::user::{InputBind, InputTo, OutputBind, Written, number_of};
 use super::whole_port::{self, MAX_TEXTS, Reader, TextBind, texts_of};
 use crate::config::{CanFramePart, ConfigView, Counted, DeviceFrame, Parts, Recipe, Span};
 use crate::device::{Cutter, Element, Encoding, Escape, Found, FrameLayout, Framer, Overflow, Probe};
@@ -25,7 +25,7 @@ use crate::wire::can::{CanFrame, CanId, MAX_CAN_DATA};
 use crate::wire::scalar::Scalar;
 
 /// Maximum number of frames of one port with a device's own frames, both ways together.
-pub(super) const MAX_DEVICE_FRAMES: usize = 24;
+pub(super) const MAX_DEVICE_FRAMES: usize = 20;
 
 /// One frame of the device.
 #[derive(Debug, Clone)]
@@ -80,8 +80,8 @@ fn probe(format: &DeviceFormat, bindings: &[InputBind], bytes: &[u8]) -> Probe {
     format.layout.probe(elements(format.bindings.of(bindings)), bytes)
 }
 
-pub(super) fn elements(bindings: &[InputBind]) -> impl Iterator<Item = &Element> + Clone {
-    bindings.iter().map(|binding| &binding.element)
+pub(super) fn elements(bindings: &[InputBind]) -> impl Iterator<Item = Element> {
+    bindings.iter().map(InputBind::element)
 }
 
 impl DeviceCodec {
@@ -390,7 +390,7 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
 /// a variable.
 fn bound(binding: &InputBind, value: Scalar) -> Option<(SysVar, Scalar)> {
     let InputTo::Variable { var, scale, offset } = binding.to else { return None };
-    let Element::Value { overflow: Overflow::Wrap, .. } = binding.element else {
+    let Written::Value { overflow: Overflow::Wrap, .. } = binding.written else {
         return binding.to.bound(value);
     };
     let number = value.as_f64() * f64::from(scale) + f64::from(offset);

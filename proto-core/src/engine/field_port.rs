@@ -506,7 +506,7 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
 
     pub(super) fn apply_user(&mut self, binding: &InputTo, value: Scalar) {
         match *binding {
-            InputTo::Unused => {}
+            InputTo::Unused | InputTo::Fixed { .. } => {}
             InputTo::Variable { .. } => {
                 if let Some((var, value)) = binding.bound(value) {
                     // It fits: all values were tried before the first was applied.

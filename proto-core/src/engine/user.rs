@@ -5,18 +5,70 @@ use heapless::Vec;
 use super::command_link::CommandLink;
 use super::io::ReplyCode;
 use crate::config::OutputBinding;
-use crate::device::{Element, wrap};
+use crate::device::{Element, Encoding, Length, Overflow, Text, wrap};
 use crate::image::{Image, bind_to_variable, saturate_to_field};
 use crate::recipe::model::MAX_FIELDS;
 use crate::sysvar::SysVar;
 use crate::time::Instant;
 use crate::wire::scalar::{Scalar, ScalarType};
 
+/// How a field is written in a device's own frame: an [`Element`] without its constant, in half its
+/// size. There is one for every field of every port.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Written {
+    Value { encoding: Encoding, overflow: Overflow },
+    Fixed { encoding: Encoding },
+    Padding { len: u8, fill: u8 },
+    Text(Text),
+    Length(Length),
+}
+
+impl Written {
+    pub(super) const fn new(element: Element) -> Self {
+        match element {
+            Element::Value { encoding, overflow } => Self::Value { encoding, overflow },
+            Element::Fixed { encoding, .. } => Self::Fixed { encoding },
+            Element::Padding { len, fill } => Self::Padding { len, fill },
+            Element::Text(text) => Self::Text(text),
+            Element::Length(length) => Self::Length(length),
+        }
+    }
+
+    const fn element(self, constant: i64) -> Element {
+        match self {
+            Self::Value { encoding, overflow } => Element::Value { encoding, overflow },
+            Self::Fixed { encoding } => Element::Fixed { encoding, value: constant },
+            Self::Padding { len, fill } => Element::Padding { len, fill },
+            Self::Text(text) => Element::Text(text),
+            Self::Length(length) => Element::Length(length),
+        }
+    }
+}
+
 /// An input field: what is done with its value, and how it is written in a device's own frame.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct InputBind {
     pub to: InputTo,
-    pub element: Element,
+    pub written: Written,
+}
+
+impl InputBind {
+    pub(super) fn new(to: InputTo, element: Element) -> Self {
+        let to = match element {
+            Element::Fixed { value, .. } => {
+                InputTo::Fixed { high: value.unbounded_shr(32) as i32, low: value as u32 }
+            }
+            _ => to,
+        };
+        Self { to, written: Written::new(element) }
+    }
+
+    pub(super) fn element(&self) -> Element {
+        self.written.element(match self.to {
+            InputTo::Fixed { high, low } => i64::from(high).unbounded_shl(32) | i64::from(low),
+            _ => 0,
+        })
+    }
 }
 
 /// What is done with the value of an input field.
@@ -30,6 +82,11 @@ pub(super) enum InputTo {
     },
     /// Index of a command field of the command link.
     Command(u8),
+    /// The halves of a constant, so that they need no more alignment than the others.
+    Fixed {
+        high: i32,
+        low: u32,
+    },
 }
 
 impl InputTo {
@@ -69,7 +126,25 @@ pub(super) fn forget_commands(bindings: &[InputBind], commands: Option<&mut Comm
 pub(super) struct OutputBind {
     pub ty: ScalarType,
     pub from: OutputBinding,
-    pub element: Element,
+    pub written: Written,
+}
+
+impl OutputBind {
+    pub(super) fn new(ty: ScalarType, from: OutputBinding, element: Element) -> Self {
+        let from = match element {
+            // Exact: no constant has more than 53 bits.
+            Element::Fixed { value, .. } => OutputBinding::Constant(value as f64),
+            _ => from,
+        };
+        Self { ty, from, written: Written::new(element) }
+    }
+
+    pub(super) fn element(&self) -> Element {
+        self.written.element(match self.from {
+            OutputBinding::Constant(value) => value as i64,
+            _ => 0,
+        })
+    }
 }
 
 /// The values of the fields.
@@ -104,7 +179,7 @@ pub(super) fn number_of(binding: &OutputBind, image: &Image, frames_sent: u32, r
         OutputBinding::Constant(value) => value,
         OutputBinding::Counter => {
             // It never turns negative, nor stays at the highest number.
-            let high = binding.element.encoding().map_or(0.0, |encoding| encoding.range().1);
+            let high = binding.element().encoding().map_or(0.0, |encoding| encoding.range().1);
             wrap(f64::from(frames_sent), 0.0, high.min(f64::from(u32::MAX))).unwrap_or(f64::NAN)
         }
         OutputBinding::Reply => f64::from(reply as u8),

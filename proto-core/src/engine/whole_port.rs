@@ -366,7 +366,7 @@ pub(super) fn encode(
     number: impl FnMut(usize) -> f64,
     out: &mut [u8],
 ) -> Option<usize> {
-    let elements = format.bindings.of(bindings).iter().map(|binding| &binding.element);
+    let elements = format.bindings.of(bindings).iter().map(OutputBind::element);
     let text = |nth: usize, out: &mut [u8]| codec.write_text(format, nth, image, out);
     let len = format.layout.encode_with(elements, number, text, out)?;
     match codec.escape {

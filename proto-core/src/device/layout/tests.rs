@@ -99,7 +99,7 @@ fn without_a_checksum_another_constant_is_no_frame() {
 fn a_checksum_stands_where_its_device_has_it() {
     let elements = [big(ScalarType::Byte), big(ScalarType::Word)];
     let place = |behind, first, last| {
-        let sum = Checksum { first, last, ..Checksum::standard(Algorithm::Xor8) };
+        let sum = Checksum::standard(Algorithm::Xor8).over(first, last);
         FrameLayout::new(Carrier::Stream, Direction::Output, &[0x55], &[0xEE], &elements, Some((sum, behind)))
     };
     let behind = place(2, 0, None).unwrap();
@@ -226,12 +226,12 @@ fn text(width: TextWidth) -> Element {
     Element::Text(Text { width, fill: None })
 }
 
-fn length(counts: Counts, plus: i16) -> Element {
+fn length(counts: Counts, plus: i8) -> Element {
     Element::Length(Length { encoding: Encoding::scalar(ScalarType::Byte), counts, plus })
 }
 
 /// A length, a byte, and a text; CRC and tail as asked.
-fn sized(counts: Counts, plus: i16, checked: bool) -> (Vec<Element>, FrameLayout) {
+fn sized(counts: Counts, plus: i8, checked: bool) -> (Vec<Element>, FrameLayout) {
     let elements = vec![length(counts, plus), fixed(ScalarType::Byte, 7), text(TextWidth::Rest)];
     let checksum = if checked { standard("crc16-modbus", 3) } else { None };
     let layout =
