@@ -1,8 +1,9 @@
 //! The bindings of fields and the triggers of output parts in a gateway file.
 
-use proto_core::config::{CommandWhen, OnStale, OutputBinding, SendOn};
+use proto_core::config::{CommandWhen, InputBinding, OnStale, OutputBinding, SendOn};
 use proto_core::sysvar::SysVar;
 
+use super::encoding::refuse;
 use super::reader::{Item, Reader, Result, Spot};
 
 /// The binding of an input field.
@@ -10,6 +11,16 @@ pub(super) enum FileInput {
     Unused,
     Variable { var: SysVar, scale: f32, offset: f32 },
     Commands { entries: Vec<FileCommand>, when: CommandWhen },
+}
+
+impl FileInput {
+    /// The binding, if it needs no table of commands.
+    pub(super) fn without_commands(&self) -> InputBinding {
+        match *self {
+            Self::Variable { var, scale, offset } => InputBinding::Variable { var, scale, offset },
+            Self::Unused | Self::Commands { .. } => InputBinding::Unused,
+        }
+    }
 }
 
 pub(super) struct FileCommand {
@@ -68,7 +79,8 @@ fn read_send(item: &Item<'_>) -> Result<SendOn> {
     Ok(SendOn::Rising { var, bit })
 }
 
-pub(super) fn read_input(field: &Reader<'_>) -> Result<FileInput> {
+/// The bindings of an input field: `to`, `commands`, or both.
+pub(super) fn read_input(field: &Reader<'_>) -> Result<(FileInput, Option<FileInput>)> {
     let (to, commands) = (field.optional("to"), field.optional("commands"));
     if to.is_none() {
         refuse(field, &["scale", "offset"], "allowed only together with to")?;
@@ -76,27 +88,31 @@ pub(super) fn read_input(field: &Reader<'_>) -> Result<FileInput> {
     if commands.is_none() {
         refuse(field, &["when"], "allowed only together with commands")?;
     }
-    match (to, commands) {
-        (None, None) => Ok(FileInput::Unused),
-        (Some(to), None) => {
+    let to = match to {
+        Some(to) => {
             let (scale, offset) = read_scale(field)?;
-            Ok(FileInput::Variable { var: read_var(&to)?, scale, offset })
+            Some(FileInput::Variable { var: read_var(&to)?, scale, offset })
         }
-        (None, Some(commands)) => {
-            let when = match field.optional("when") {
-                Some(item) => {
-                    item.choice(&[("change", CommandWhen::Change), ("frame", CommandWhen::Frame)])?
-                }
-                None => CommandWhen::default(),
-            };
-            let entries = commands.any_table()?.entries().map(read_command).collect::<Result<Vec<_>>>()?;
-            if entries.is_empty() {
-                return Err(commands.error("no commands; write for example { 1 = \"run(pick.jspf,50)\" }"));
-            }
-            Ok(FileInput::Commands { entries, when })
-        }
-        (Some(_), Some(commands)) => Err(commands.error("a field takes to or commands, not both")),
+        None => None,
+    };
+    let commands = commands.map(|commands| read_commands(field, &commands)).transpose()?;
+    Ok(match (to, commands) {
+        (Some(to), commands) => (to, commands),
+        (None, Some(commands)) => (commands, None),
+        (None, None) => (FileInput::Unused, None),
+    })
+}
+
+fn read_commands(field: &Reader<'_>, commands: &Item<'_>) -> Result<FileInput> {
+    let when = match field.optional("when") {
+        Some(item) => item.choice(&[("change", CommandWhen::Change), ("frame", CommandWhen::Frame)])?,
+        None => CommandWhen::default(),
+    };
+    let entries = commands.any_table()?.entries().map(read_command).collect::<Result<Vec<_>>>()?;
+    if entries.is_empty() {
+        return Err(commands.error("no commands; write for example { 1 = \"run(pick.jspf,50)\" }"));
     }
+    Ok(FileInput::Commands { entries, when })
 }
 
 fn read_command((key, key_spot, item): (&str, Spot, Item<'_>)) -> Result<FileCommand> {
@@ -152,11 +168,4 @@ fn read_scale(field: &Reader<'_>) -> Result<(f32, f32)> {
         None => Ok(default),
     };
     Ok((read("scale", 1.0)?, read("offset", 0.0)?))
-}
-
-fn refuse(field: &Reader<'_>, keys: &[&str], why: &str) -> Result<()> {
-    match keys.iter().find_map(|key| Some((key, field.optional(key)?))) {
-        Some((_, item)) => Err(item.error(why)),
-        None => Ok(()),
-    }
 }

@@ -6,20 +6,20 @@ use heapless::Vec as Bounded;
 use proto_core::config::{
     Bus, CanFramePart, CommandEntry, ConfigError, ControllerKey, ControllerLink, Delimiter, FieldSpec,
     GatewayConfig, InputBinding, MAX_ADDRESS, MAX_ALL_FIELDS, MAX_COMMAND_TEXT, MAX_COMMANDS, MAX_LISTEN,
-    MAX_PORTS, MAX_RECIPES, MAX_SAFE_VALUES, NetworkKey, OutputBinding, Parts, Place, Port, PortKey, Recipe,
-    RecipeKey, RecipeLink, SafeValue, Span, StreamPart, check_address,
+    MAX_PORTS, MAX_RECIPES, MAX_SAFE_VALUES, NetworkKey, Parts, Place, Port, PortKey, Recipe, RecipeKey,
+    RecipeLink, SafeValue, Span, StreamPart, check_address,
 };
 use proto_core::recipe::model::{Framing, MAX_CAN_IDS};
 use proto_core::sysvar::{Direction, SysVar};
 use proto_core::wire::dialect::Dialect;
 use proto_core::wire::scalar::Scalar;
 
-use super::bindings::{FileInput, FileOutput};
+use super::bindings::FileInput;
 use super::document::Document;
 use super::lines::{LINE_KEYS, key_name, read_bitrate, read_cycle, read_line};
 use super::network;
 use super::reader::{Item, Reader, Result, Spot};
-use super::recipes::{self, FileField, FileFieldKind, FilePart, FileRecipe, Flavour};
+use super::recipes::{self, FileField, FilePart, FileRecipe, Flavour};
 
 /// The top-level keys of a gateway file.
 pub(super) const KEYS: [&str; 4] = ["controller", "network", "recipe", "port"];
@@ -178,33 +178,18 @@ impl<'a> Builder<'a> {
     }
 
     fn field_spec(&mut self, field: &FileField) -> Result<FieldSpec> {
-        Ok(match &field.kind {
-            FileFieldKind::System(var) => FieldSpec::System(*var),
-            FileFieldKind::UserInput { ty, to, .. } => {
-                let to = match to {
-                    FileInput::Unused => InputBinding::Unused,
-                    FileInput::Variable { var, scale, offset } => {
-                        InputBinding::Variable { var: *var, scale: *scale, offset: *offset }
-                    }
-                    FileInput::Commands { entries, when } => {
-                        let start = self.config.commands.len() as u16;
-                        for entry in entries {
-                            self.add_command(entry.value, &entry.text, &entry.spot)?;
-                        }
-                        let table = Span { start, len: entries.len() as u16 };
-                        InputBinding::Commands { table, when: *when }
-                    }
-                };
-                FieldSpec::UserInput { ty: *ty, to }
+        let mut added = Ok(());
+        let spec = field.bound_spec(|to| match to {
+            FileInput::Commands { entries, when } => {
+                let start = self.config.commands.len() as u16;
+                added = entries
+                    .iter()
+                    .try_for_each(|entry| self.add_command(entry.value, &entry.text, &entry.spot));
+                InputBinding::Commands { table: Span { start, len: entries.len() as u16 }, when: *when }
             }
-            FileFieldKind::UserOutput { ty, from, .. } => {
-                let from = match from {
-                    FileOutput::Bound(binding) => *binding,
-                    FileOutput::Program => OutputBinding::Constant(0.0),
-                };
-                FieldSpec::UserOutput { ty: *ty, from }
-            }
-        })
+            _ => to.without_commands(),
+        });
+        added.map(|()| spec)
     }
 
     fn add_command(&mut self, value: i64, text: &str, spot: &Spot) -> Result<()> {

@@ -1,6 +1,8 @@
 //! Configuration files as people write them: the examples, those of the documents, wrong and damaged ones.
 
 mod damaged_files;
+mod device_files;
 mod document_examples;
 mod example_files;
+mod wrong_devices;
 mod wrong_files;
