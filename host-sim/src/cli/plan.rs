@@ -17,7 +17,8 @@ pub(super) fn show(config: &GatewayConfig) -> String {
             .view()
             .fields_of(recipe, Direction::Input)
             .filter_map(|(_, _, field)| match field {
-                FieldSpec::UserInput { to: InputBinding::Commands { table, .. }, .. } => Some(table.len),
+                FieldSpec::UserInput { to: InputBinding::Commands { table, .. }, .. }
+                | FieldSpec::DeviceInput { to: InputBinding::Commands { table, .. }, .. } => Some(table.len),
                 _ => None,
             })
             .sum();
