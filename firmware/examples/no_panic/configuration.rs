@@ -71,6 +71,7 @@ fn config_questions(config: &GatewayConfig) {
     }
     for field in &config.fields {
         black_box(field.variable());
+        field.variables().for_each(|var| _ = black_box(var));
     }
     let part = any(CanFramePart { id: CanId::Standard(1), fields: Span::default() });
     black_box(part.fields.of(bytes()));

@@ -33,7 +33,7 @@ pub(super) fn show(config: &GatewayConfig) -> String {
         let shown = config
             .view()
             .fields_of(recipe, Direction::Output)
-            .filter_map(|(_, _, field)| field.variable())
+            .flat_map(|(_, _, field)| field.variables())
             .chain(trigger);
         add(&mut lines, &port.name, shown.map(|var| (var, source(config, &plan, var))));
     }

@@ -174,7 +174,7 @@ impl ConfigMut<'_> {
             Delimiter::from_slice(bytes).map_err(|_| ConfigError { place, kind: too_long })
         };
         let (head, tail) = (bytes(head)?, bytes(tail)?);
-        Ok(Some(StreamPart { head, tail, fields: self.fields_of_part(recipe, part, 0, fields)? }))
+        Ok(Some(StreamPart::new(head, tail, self.fields_of_part(recipe, part, 0, fields)?)))
     }
 
     fn can_part(

@@ -5,14 +5,13 @@ use super::error::{ConfigErrorKind as Kind, Place, RecipeKey};
 use super::rules::{Check, check_new_name, check_pool, fail, is_marked, mark};
 use super::{
     CanFramePart, ConfigView, DeviceFrame, FieldSpec, InputBinding, OutputBinding, Parts, Recipe, SendOn,
-    Span,
+    Span, Words,
 };
 use crate::command::Request;
-use crate::device::{Encoding, Overflow};
-use crate::recipe::model::Rules;
-use crate::recipe::model::{Framing, Mode};
+use crate::device::{Boundary, Encoding, LayoutError, Overflow};
+use crate::recipe::model::{Framing, MAX_STREAM_FRAME, Mode, Rules};
 use crate::recipe::{CanLayout, PartError, StreamLayout};
-use crate::sysvar::{COUNT, Direction};
+use crate::sysvar::{COUNT, Direction, SysVar};
 use crate::wire::scalar::{Scalar, ScalarType};
 
 /// One recipe under check.
@@ -41,6 +40,7 @@ impl<'a> RecipeCheck<'a> {
                 check_pool(place, span, self.config.fields.len())?;
             }
             if self.config.is_device(self.recipe) {
+                self.check_framing(part)?;
                 self.check_device_frames(part)?;
             } else if let Err(error) = check_layout(self.config, self.recipe, part, framing) {
                 return fail(self.place_of(part, error), Kind::Part(error));
@@ -91,8 +91,26 @@ impl<'a> RecipeCheck<'a> {
                 }
                 check_device_output(place, &encoding, from)
             }
-            (Mode::User, _, FieldSpec::Fixed { .. } | FieldSpec::Padding { .. } | FieldSpec::Checksum(_)) => {
-                Ok(())
+            (
+                Mode::User,
+                _,
+                FieldSpec::Fixed { .. }
+                | FieldSpec::Padding { .. }
+                | FieldSpec::Checksum(_)
+                | FieldSpec::Length(_),
+            ) => Ok(()),
+            (Mode::User, Direction::Input, FieldSpec::TextInput { to, length_to, count_to, .. }) => {
+                let is_input = |var: SysVar| var.direction() == Direction::Input;
+                let vars = to.iter().map(|words| words.first).chain(length_to).chain(count_to);
+                if let Some(var) = vars.into_iter().find(|&var| !is_input(var)) {
+                    return fail(place, Kind::NotAnInput { var });
+                }
+                check_words(place, to)?;
+                check_word(place, length_to.into_iter().chain(count_to))
+            }
+            (Mode::User, Direction::Output, FieldSpec::TextOutput { from, length_from, .. }) => {
+                check_words(place, Some(from))?;
+                check_word(place, length_from)
             }
             (mode, part, _) => fail(place, Kind::WrongField { mode, part }),
         }
@@ -145,11 +163,34 @@ impl<'a> RecipeCheck<'a> {
         Ok(())
     }
 
+    /// What tells the frames of a stream part apart.
+    fn check_framing(&self, part: Direction) -> Check {
+        let Some(stream) = self.recipe.stream_part(part).filter(|stream| stream.is_cut()) else {
+            return Ok(());
+        };
+        let place = Place::Part { recipe: self.index, part };
+        let kind = match (stream.framing, stream.escape) {
+            _ if self.recipe.mode != Mode::User => Kind::FramingNeedsUser,
+            (Boundary::Tail | Boundary::Silence, Some(_)) => Kind::TwoFramings,
+            (Boundary::Tail, None) if stream.tail.is_empty() => Kind::NoTail,
+            _ => return Ok(()),
+        };
+        fail(place, kind)
+    }
+
     fn check_device_frames(&self, part: Direction) -> Check {
         let recipe = self.index;
         for frame in self.config.device_frames(self.recipe, part) {
-            let Err(error) = DeviceFrame::new(frame.carrier, part, frame.delimiters, frame.fields) else {
-                continue;
+            let error = match DeviceFrame::new(frame.carrier, part, frame.delimiters, frame.fields) {
+                Err(error) => error,
+                Ok(device) => {
+                    let escape = self.recipe.stream_part(part).and_then(|stream| stream.escape);
+                    let len = escape.map_or(0, |escape| escape.longest(device.layout.lengths().1));
+                    if part == Direction::Input || len <= MAX_STREAM_FRAME {
+                        continue;
+                    }
+                    LayoutError::TooLong { len, room: MAX_STREAM_FRAME }
+                }
             };
             // A checksum is a field, and no element.
             let element = error.element().map(usize::from);
@@ -198,12 +239,13 @@ impl<'a> RecipeCheck<'a> {
     fn check_written_once(&self) -> Check {
         let mut seen = [false; COUNT];
         for (frame, field, spec) in self.config.fields_of(self.recipe, Direction::Input) {
-            let Some(var) = spec.variable() else { continue };
-            if is_marked(&seen, var) {
-                let place = Place::Field { recipe: self.index, part: Direction::Input, frame, field };
-                return fail(place, Kind::WrittenTwice { var });
+            for var in spec.variables() {
+                if is_marked(&seen, var) {
+                    let place = Place::Field { recipe: self.index, part: Direction::Input, frame, field };
+                    return fail(place, Kind::WrittenTwice { var });
+                }
+                mark(&mut seen, var);
             }
-            mark(&mut seen, var);
         }
         Ok(())
     }
@@ -270,6 +312,21 @@ fn check_device_output(place: Place, encoding: &Encoding, from: OutputBinding) -
         OutputBinding::Counter if !encoding.is_integer() => fail(place, Kind::NeedsIntegers),
         OutputBinding::Counter | OutputBinding::Reply => Ok(()),
     }
+}
+
+/// Texts are in word variables of one group.
+fn check_words(place: Place, words: Option<Words>) -> Check {
+    let Some(words @ Words { first, count, order }) = words else { return Ok(()) };
+    let is_one_run = words.iter().all(|var| var.group() == first.group() && var.ty() == ScalarType::Word);
+    if !is_one_run || words.iter().count() != usize::from(count) || count == 0 {
+        return fail(place, Kind::NotWords { var: first, count });
+    }
+    if order.swaps_words() { fail(place, Kind::TextOrder) } else { Ok(()) }
+}
+
+fn check_word(place: Place, vars: impl IntoIterator<Item = SysVar>) -> Check {
+    let other = vars.into_iter().find(|var| var.ty() != ScalarType::Word);
+    other.map_or(Ok(()), |var| fail(place, Kind::NotWords { var, count: 1 }))
 }
 
 fn check_scale(place: Place, scale: f32, offset: f32) -> Check {

@@ -252,6 +252,15 @@ impl fmt::Display for DescribedKind<'_> {
                 names.try_for_each(|name| write!(f, " {name}"))
             }
             Kind::OnlyIntegersWrap => f.write_str("only integers wrap; this one may have a fraction"),
+            Kind::NotWords { var, count } => {
+                write!(f, "{count} word variables are needed, such as WordInputReg[1]; found: {var}")
+            }
+            Kind::TextOrder => f.write_str("the order of a text's characters is little or big"),
+            Kind::FramingNeedsUser => f.write_str("framing and escape need mode = \"user\""),
+            Kind::TwoFramings => {
+                f.write_str("escape bytes tell frames apart already; framing is not needed beside them")
+            }
+            Kind::NoTail => f.write_str("framing = \"tail\" needs a tail"),
             Kind::EmptyTable => f.write_str("a command table needs at least one command"),
             Kind::CommandValue { value, ty } => {
                 let (low, high) = ty.range();

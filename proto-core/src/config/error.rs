@@ -183,6 +183,8 @@ pub enum Counted {
     CommandBytes,
     /// Frames of one port with a device's own frames.
     DeviceFrames,
+    /// Texts of one port.
+    Texts,
     /// Groups of variables that arrive together.
     Groups,
     /// Blocks of neighbouring variables that are polled by Modbus.
@@ -199,6 +201,7 @@ impl core::fmt::Display for Counted {
             Self::Commands => "commands in all recipes together",
             Self::SafeValues => "safe values on all ports together",
             Self::FieldPorts => "field ports",
+            Self::Texts => "texts of one port",
             Self::DeviceFrames => "frames of a device on one port",
             Self::InputFrames => "input frames",
             Self::RecipeLinks => "recipe links",
@@ -341,6 +344,21 @@ pub enum ConfigErrorKind {
     OnlyIntegersWrap,
     /// No checksum has this name.
     UnknownChecksum,
+    /// A text, its length or its count needs so many word variables that follow each other.
+    NotWords {
+        /// The first variable.
+        var: SysVar,
+        /// Number of variables.
+        count: u8,
+    },
+    /// A word has two characters, so their order is little or big.
+    TextOrder,
+    /// Frames that are told apart by something else than their fields, in a realtime recipe.
+    FramingNeedsUser,
+    /// Escape bytes and something else tell frames apart.
+    TwoFramings,
+    /// Frames are told apart by a tail that the part does not have.
+    NoTail,
     /// A command table has no entries.
     EmptyTable,
     /// The field can never have a command's value.

@@ -39,7 +39,7 @@ pub(crate) use port::MIN_CYCLE;
 pub use port::{Bus, Parity, Port, Rs485, SafeValue};
 pub use recipe::{
     CanFramePart, CommandEntry, CommandWhen, FieldSpec, InputBinding, MAX_COMMAND_TEXT, OnStale,
-    OutputBinding, Parts, Recipe, SendOn, Span, StreamPart,
+    OutputBinding, Parts, Recipe, SendOn, Span, StreamPart, Words,
 };
 pub use rules::{check_address, check_bitrate, check_cycle, check_name};
 pub(crate) use view::ConfigMut;

@@ -6,7 +6,7 @@
 use heapless::{String, Vec};
 
 use super::{Delimiter, Name};
-use crate::device::{Checksum, Encoding, Overflow};
+use crate::device::{Boundary, ByteOrder, Checksum, Encoding, Escape, Length, Overflow, Text};
 use crate::recipe::model::{Field, MAX_CAN_IDS, Mode};
 use crate::sysvar::{Direction, SysVar};
 use crate::wire::can::CanId;
@@ -47,6 +47,15 @@ impl Recipe {
         (0..).zip(stream.map(|part| part.fields).into_iter().chain(can))
     }
 
+    /// One part of a stream recipe.
+    pub(crate) fn stream_part(&self, part: Direction) -> Option<&StreamPart> {
+        match (&self.parts, part) {
+            (Parts::Stream { input: stream, .. }, Direction::Input)
+            | (Parts::Stream { output: stream, .. }, Direction::Output) => stream.as_ref(),
+            (Parts::Can { .. }, _) => None,
+        }
+    }
+
     /// Whether the recipe has this part.
     pub(crate) fn has(&self, part: Direction) -> bool {
         self.frames(part).next().is_some()
@@ -84,6 +93,22 @@ pub struct StreamPart {
     pub tail: Delimiter,
     /// The fields.
     pub fields: Span,
+    /// What tells its frames apart; only in recipes of devices.
+    pub framing: Boundary,
+    /// Its frames stand between escape bytes, which then tell them apart.
+    pub escape: Option<Escape>,
+}
+
+impl StreamPart {
+    /// A part as the controller's recipes have it.
+    pub const fn new(head: Delimiter, tail: Delimiter, fields: Span) -> Self {
+        Self { head, tail, fields, framing: Boundary::Fields, escape: None }
+    }
+
+    /// Whether something else than its fields tells where frames end.
+    pub(crate) fn is_cut(&self) -> bool {
+        self.framing != Boundary::Fields || self.escape.is_some()
+    }
 }
 
 /// One frame id of a CAN recipe's part.
@@ -169,6 +194,54 @@ pub enum FieldSpec {
     },
     /// The frame's checksum stands here.
     Checksum(Checksum),
+    /// A text of a device's input frame.
+    TextInput {
+        /// How it is written.
+        text: Text,
+        /// The registers that take it, zeros behind its end; a frame with a longer one is rejected.
+        to: Option<Words>,
+        /// The variable that becomes its number of characters.
+        length_to: Option<SysVar>,
+        /// The variable that counts the frames accepted, so that the same text twice is seen.
+        count_to: Option<SysVar>,
+    },
+    /// A text of a device's output frame.
+    TextOutput {
+        /// How it is written.
+        text: Text,
+        /// The registers that have it.
+        from: Words,
+        /// The variable that has its number of characters; without one it ends before the first
+        /// zero.
+        length_from: Option<SysVar>,
+    },
+    /// The frame's length stands here.
+    Length(Length),
+}
+
+/// A run of word variables that holds a text, two characters each.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct Words {
+    /// The first of them.
+    pub first: SysVar,
+    /// How many.
+    pub count: u8,
+    /// Big: the first character is the high byte. Little: the low one.
+    pub order: ByteOrder,
+}
+
+impl Words {
+    /// The variables, in order.
+    pub fn iter(self) -> impl Iterator<Item = SysVar> + Clone {
+        let first = self.first.ordinal();
+        (first..first.saturating_add(usize::from(self.count))).filter_map(SysVar::from_ordinal)
+    }
+
+    /// Maximum number of characters.
+    pub const fn room(&self) -> usize {
+        (self.count as usize).saturating_mul(2)
+    }
 }
 
 impl FieldSpec {
@@ -181,7 +254,8 @@ impl FieldSpec {
         }
     }
 
-    /// The system variable that the field is, or that it is bound to.
+    /// The system variable that the field is, or that its value is bound to; texts have several, see
+    /// [`Self::variables`].
     pub fn variable(&self) -> Option<SysVar> {
         match *self {
             Self::System(var) => Some(var),
@@ -193,8 +267,18 @@ impl FieldSpec {
                 OutputBinding::Variable { var, .. } => Some(var),
                 OutputBinding::Constant(_) | OutputBinding::Counter | OutputBinding::Reply => None,
             },
-            Self::Fixed { .. } | Self::Padding { .. } | Self::Checksum(_) => None,
+            _ => None,
         }
+    }
+
+    /// All system variables that the field is bound to.
+    pub fn variables(&self) -> impl Iterator<Item = SysVar> + Clone + use<> {
+        let (words, others) = match *self {
+            Self::TextInput { to, length_to, count_to, .. } => (to, [length_to, count_to]),
+            Self::TextOutput { from, length_from, .. } => (Some(from), [length_from, None]),
+            _ => (None, [self.variable(), None]),
+        };
+        words.into_iter().flat_map(Words::iter).chain(others.into_iter().flatten())
     }
 }
 

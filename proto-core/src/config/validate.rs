@@ -190,8 +190,8 @@ impl<'c> ConfigView<'c> {
     fn check_ways_up(&self) -> Check {
         for (port, port_config, recipe) in self.field_ports() {
             for (frame, field, spec) in self.fields_of(recipe, Direction::Input) {
-                let Some(var) = spec.variable() else { continue };
-                if var.modbus().is_none() && !self.carried(Direction::Input, var) {
+                let is_lost = |var: &SysVar| var.modbus().is_none() && !self.carried(Direction::Input, *var);
+                if let Some(var) = spec.variables().find(is_lost) {
                     let recipe = port_config.recipe;
                     let place = Place::Field { recipe, part: Direction::Input, frame, field };
                     return fail(place, Kind::NoWayUp { var, port });
@@ -222,7 +222,7 @@ impl<'c> ConfigView<'c> {
                     || self.is_owned(var)
             };
             for (frame, field, spec) in self.fields_of(recipe, Direction::Output) {
-                if let Some(var) = spec.variable().filter(|&var| !is_shown(var)) {
+                if let Some(var) = spec.variables().find(|&var| !is_shown(var)) {
                     let place = Place::Field { recipe: index, part: Direction::Output, frame, field };
                     return fail(place, Kind::NoSource { var, port });
                 }

@@ -74,7 +74,7 @@ impl<'c> ConfigView<'c> {
 
     /// The input variables that a field port writes.
     pub fn written_by(self, recipe: &'c Recipe) -> impl Iterator<Item = SysVar> + 'c {
-        self.fields_of(recipe, Direction::Input).filter_map(|(_, _, field)| field.variable())
+        self.fields_of(recipe, Direction::Input).flat_map(|(_, _, field)| field.variables())
     }
 
     /// Whether a field port writes the variable.

@@ -320,7 +320,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         let mut next_binding = self.bindings.inputs.len() as u16;
         for (_, fields) in recipe.frames(Direction::Input) {
             let fields = fields.of(config.fields);
-            let set = fields.iter().filter_map(FieldSpec::variable).collect();
+            let set = fields.iter().flat_map(FieldSpec::variables).collect();
             let is_bound = |field: &&FieldSpec| field.element().is_some();
             let bound = fields.iter().filter(is_bound).count() as u16;
             let bindings = Span { start: next_binding, len: bound };

@@ -78,9 +78,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         self.sleeps = self.sleeps.wrapping_add(1);
         // Before deadlines pass: one of them may be to open a link that has been down.
         self.links.slept(&mut self.store);
+        self.is_deaf = true;
         self.advance(now);
         self.ports.iter_mut().for_each(|port| port.slept(&mut self.tap, now));
-        self.is_deaf = true;
         self.deaf_until = now + DEAF;
         self.arm(self.deaf_until);
     }
@@ -101,8 +101,11 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         self.is_armed = false;
         self.expire_frames(now);
         for index in 0..self.ports.len() {
-            if let Some(port) = self.ports.get_mut(index) {
-                port.advance(&mut self.tap, now);
+            if let Some(port) = self.ports.get_mut(index)
+                && port.advance(&mut self.tap, now)
+            {
+                let id = port.id;
+                self.port_silent(id, now);
             }
         }
         self.links.advance(&mut self.store);

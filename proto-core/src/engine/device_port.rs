@@ -15,10 +15,12 @@ use super::sender::{DIGEST_SEED, digest};
 use super::store::Store;
 use super::tap::Tap;
 use super::user::{InputBind, InputTo, OutputBind, Written, number_of};
+use super::whole_port::{self, MAX_TEXTS, Reader, TextBind, texts_of};
 use crate::config::{CanFramePart, ConfigView, Counted, DeviceFrame, Parts, Recipe, Span};
-use crate::device::{Element, Encoding, Found, FrameLayout, Framer, Overflow, Probe};
+use crate::device::{Cutter, Element, Encoding, Escape, Found, FrameLayout, Framer, Overflow, Probe};
 use crate::image::{Image, bind_to_variable};
 use crate::sysvar::{Direction, SysVar};
+use crate::time::Instant;
 use crate::wire::can::{CanFrame, CanId, MAX_CAN_DATA};
 use crate::wire::scalar::Scalar;
 
@@ -42,7 +44,12 @@ pub(super) struct DeviceCodec {
     pub formats: Vec<DeviceFormat, MAX_DEVICE_FRAMES>,
     pub inputs: u8,
     /// `None` on a CAN bus.
-    pub framer: Option<Framer>,
+    pub reader: Option<Reader>,
+    /// What output frames are sent with.
+    pub escape: Option<Escape>,
+    pub texts: Vec<TextBind, MAX_TEXTS>,
+    /// Bytes outside whole frames that have been counted.
+    pub skipped_bytes: u32,
 }
 
 impl DeviceCodec {
@@ -73,7 +80,7 @@ fn probe(format: &DeviceFormat, bindings: &[InputBind], bytes: &[u8]) -> Probe {
     format.layout.probe(elements(format.bindings.of(bindings)), bytes)
 }
 
-fn elements(bindings: &[InputBind]) -> impl Iterator<Item = Element> {
+pub(super) fn elements(bindings: &[InputBind]) -> impl Iterator<Item = Element> {
     bindings.iter().map(InputBind::element)
 }
 
@@ -87,11 +94,24 @@ impl DeviceCodec {
         mut next_input: u16,
         mut next_output: u16,
     ) -> Result<Self, BuildError> {
-        let mut codec = Self { formats: Vec::new(), inputs: 0, framer: None };
+        let texts = texts_of(config, recipe, [next_input, next_output]);
+        let mut codec = Self {
+            formats: Vec::new(),
+            inputs: 0,
+            reader: None,
+            escape: recipe.stream_part(Direction::Output).and_then(|part| part.escape),
+            texts: texts.ok_or(one_too_many(Counted::Texts, MAX_TEXTS))?,
+            skipped_bytes: 0,
+        };
         let ids: [&[CanFramePart]; 2] = match &recipe.parts {
             Parts::Can { input, output } => [input, output],
             Parts::Stream { .. } => {
-                codec.framer = Some(Framer::new());
+                let cut = recipe.stream_part(Direction::Input);
+                let cutter = cut.and_then(|part| Cutter::new(part.framing, part.escape));
+                codec.reader = Some(match cutter {
+                    Some(cutter) => Reader::Whole { cutter, heard: Instant::ZERO },
+                    None => Reader::Search(Framer::new()),
+                });
                 [&[], &[]]
             }
         };
@@ -133,16 +153,25 @@ impl FieldPort {
         let mut accepted = Accepted::default();
         let (now, usable, bytes) = (store.now, self.is_usable(), *rest);
         let mut left = core::mem::take(rest);
-        let Codec::Device(DeviceCodec { formats, inputs, framer: Some(framer) }) = &mut self.codec else {
-            return accepted;
+        let framer = match &mut self.codec {
+            Codec::Device(DeviceCodec { inputs: 0, .. }) => {
+                self.not_asked_for(bytes, tap, now);
+                return accepted;
+            }
+            Codec::Device(DeviceCodec { reader: Some(Reader::Whole { .. }), .. }) => {
+                *rest = bytes;
+                return self.whole_frames(rest, bindings, store, commands, tap);
+            }
+            Codec::Device(DeviceCodec {
+                formats,
+                inputs,
+                texts,
+                reader: Some(Reader::Search(framer)),
+                ..
+            }) => Some((formats.get(..usize::from(*inputs)).unwrap_or(&[]), texts, framer)),
+            _ => None,
         };
-        let formats = formats.get(..usize::from(*inputs)).unwrap_or(&[]);
-        if formats.is_empty() {
-            bump(&mut self.counters.rejected_no_input);
-            tap.record(|| came(self.id, now, Err(Rejection::NoInput), None, [bytes, &[], &[]]));
-            keep(&mut self.last_rejection, Rejection::NoInput, None, bytes, now);
-            return accepted;
-        }
+        let Some((formats, texts, framer)) = framer else { return accepted };
         let mut frames = Frames {
             mode: self.mode,
             bindings,
@@ -165,7 +194,7 @@ impl FieldPort {
                     let taken =
                         (0..).zip(formats).find(|(_, format)| is_this(format)).map(|(nth, format)| {
                             let slot = usize::from(self.first_frame).saturating_add(nth);
-                            frames.take_device(format, frame, slot, &mut accepted)
+                            frames.take_device(format, texts, frame, slot, &mut accepted)
                         });
                     (frame, taken.unwrap_or(Err(Rejection::NoFrame)))
                 }
@@ -226,16 +255,17 @@ impl FieldPort {
         let Some((nth, format)) = formats.into_iter().find(|(_, format)| format.id == frame.id()) else {
             return frames.rejected(Rejection::ForeignId);
         };
-        match probe(format, bindings, frame.data()) {
-            Probe::Frame(len) if len == frame.data().len() => {}
-            Probe::Wrong(len) if len == frame.data().len() => frames.rejected(Rejection::Checksum)?,
+        let fields = elements(format.bindings.of(bindings));
+        match format.layout.probe_whole(fields, frame.data()) {
+            Probe::Frame(_) => {}
+            Probe::Wrong(_) => frames.rejected(Rejection::Checksum)?,
             Probe::Other(_) | Probe::No(_) if frame.data().len() == format.layout.lengths().0 => {
                 frames.rejected(Rejection::OtherDevice)?;
             }
             _ => frames.rejected(Rejection::WrongLength)?,
         }
         let slot = usize::from(self.first_frame).saturating_add(nth);
-        frames.take_device(format, frame.data(), slot, accepted)?;
+        frames.take_device(format, &device.texts, frame.data(), slot, accepted)?;
         self.sender.frames_accepted(1, usable, &mut self.counters, now);
         Ok(())
     }
@@ -252,11 +282,12 @@ impl FieldPort {
         let nth = self.sender.next_can;
         let (frames_sent, reply) = (self.sender.frames_sent, self.reply);
         let encode = |format: &DeviceFormat, out: &mut [u8]| {
-            let bindings = format.bindings.of(bindings);
+            let all = bindings;
+            let bindings = format.bindings.of(all);
             let number = |nth: usize| {
                 bindings.get(nth).map_or(f64::NAN, |binding| number_of(binding, image, frames_sent, reply))
             };
-            format.layout.encode(bindings.iter().map(OutputBind::element), number, out)
+            whole_port::encode(device, format, all, image, number, out)
         };
         let formats = device.output();
         if nth == 0 && self.sender.sends_changes() {
@@ -276,7 +307,7 @@ impl FieldPort {
             return None;
         };
         let frame = out.get(..len).unwrap_or(&[]);
-        let downward = match device.framer {
+        let downward = match device.reader {
             Some(_) => Downward::Bytes(len),
             None => Downward::Can(CanFrame::filled(format.id, len.min(MAX_CAN_DATA) as u8, |data| {
                 for (slot, &byte) in data.iter_mut().zip(frame) {
@@ -298,7 +329,7 @@ impl FieldPort {
 
 impl<const PORTS: usize> Frames<'_, PORTS> {
     /// Counts a rejection, and is one.
-    fn rejected(&mut self, why: Rejection) -> Result<(), Rejection> {
+    pub(super) fn rejected(&mut self, why: Rejection) -> Result<(), Rejection> {
         let counters = &mut *self.counters;
         bump(match why {
             Rejection::NoInput => &mut counters.rejected_no_input,
@@ -307,7 +338,7 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
             Rejection::WrongLength => &mut counters.rejected_length,
             Rejection::Checksum => &mut counters.rejected_checksum,
             Rejection::OtherDevice => &mut counters.rejected_other_device,
-            Rejection::Unreadable => &mut counters.rejected_unreadable,
+            Rejection::Unreadable | Rejection::Escape => &mut counters.rejected_unreadable,
             Rejection::NotFinite => &mut counters.rejected_not_finite,
             _ => &mut counters.rejected_out_of_range,
         });
@@ -315,9 +346,10 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
     }
 
     /// Applies a frame as a whole or not at all, and counts it in `accepted`.
-    fn take_device(
+    pub(super) fn take_device(
         &mut self,
         format: &DeviceFormat,
+        texts: &[TextBind],
         frame: &[u8],
         slot: usize,
         accepted: &mut Accepted,
@@ -332,6 +364,7 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
                 Ok(_) => {}
             }
         }
+        self.texts_fit(texts, format, frame).or_else(|why| self.rejected(why))?;
         for (binding, value) in values() {
             let Ok(Some(value)) = value else { continue };
             match bound(binding, value) {
@@ -342,6 +375,7 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
                 None => self.apply_user(&binding.to, value),
             }
         }
+        self.take_texts(texts, format, frame);
         if let Some(link) = &mut self.commands {
             link.frame_ends();
         }

@@ -179,11 +179,12 @@ impl FieldPort {
         bump(&mut self.counters.asleep);
         let reads_bytes = match &self.codec {
             Codec::Stream { input, .. } => input.is_some(),
-            Codec::Device(device) => device.framer.is_some(),
+            Codec::Device(device) => device.reader.is_some(),
             Codec::Can { .. } => false,
         };
         if reads_bytes {
             add(&mut self.counters.discarded_bytes, bytes.len());
+            self.lose(bytes);
         }
         self.line.heard = now;
     }
@@ -327,12 +328,18 @@ impl FieldPort {
         }
     }
 
-    /// Handles the clock: cycles and silence.
-    pub(super) fn advance<const TAP: usize>(&mut self, tap: &mut Tap<TAP>, now: Instant) {
+    /// Handles the clock: cycles and silence. Returns whether silence has ended a frame, which is
+    /// still to be read with [`Self::frames`].
+    pub(super) fn advance<const TAP: usize>(&mut self, tap: &mut Tap<TAP>, now: Instant) -> bool {
+        let mut is_ended = false;
         if now >= self.partial_until() {
-            self.discard_partial(tap, now);
+            is_ended = self.ends_by_silence();
+            if !is_ended {
+                self.discard_partial(tap, now);
+            }
         }
         self.sender.advance(self.is_usable(), &mut self.counters, now);
+        is_ended
     }
 
     /// When something happens on the port without an input.
@@ -353,7 +360,7 @@ impl FieldPort {
     fn partial_until(&self) -> Instant {
         match &self.codec {
             Codec::Stream { deframer, .. } if deframer.pending() > 0 => self.line.heard + self.line.idle_gap,
-            Codec::Device(DeviceCodec { framer: Some(framer), .. }) if !framer.held().is_empty() => {
+            Codec::Device(DeviceCodec { reader: Some(reader), .. }) if reader.has_begun() => {
                 self.line.heard + self.line.idle_gap
             }
             _ => Instant::NEVER,
@@ -361,16 +368,16 @@ impl FieldPort {
     }
 
     #[cold]
-    fn discard_partial<const TAP: usize>(&mut self, tap: &mut Tap<TAP>, now: Instant) {
+    pub(super) fn discard_partial<const TAP: usize>(&mut self, tap: &mut Tap<TAP>, now: Instant) {
         let deframer = match &mut self.codec {
             Codec::Stream { deframer, .. } => deframer,
-            Codec::Device(DeviceCodec { framer: Some(framer), .. }) => {
-                let held = framer.held();
+            Codec::Device(DeviceCodec { reader: Some(reader), .. }) => {
+                let held = reader.held();
                 if !held.is_empty() {
                     tap.record(|| came(self.id, now, Err(Rejection::Partial), None, [held, &[], &[]]));
                     keep(&mut self.last_rejection, Rejection::Partial, None, held, now);
                 }
-                let dropped = framer.discard();
+                let dropped = reader.discard();
                 return add(&mut self.counters.discarded_bytes, dropped);
             }
             _ => return,

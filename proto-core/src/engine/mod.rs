@@ -41,6 +41,7 @@ mod store;
 mod tap;
 mod uplink;
 mod user;
+mod whole_port;
 
 pub use build::BuildError;
 pub use clock::ASLEEP;
@@ -267,6 +268,24 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 return;
             }
         }
+    }
+
+    /// The line was silent, which ends a frame.
+    #[cold]
+    fn port_silent(&mut self, id: PortId, now: Instant) {
+        if self.is_deaf {
+            // Nobody knows how long it has waited.
+            if let Some(port) = find_port(&mut self.ports, id) {
+                port.discard_partial(&mut self.tap, now);
+            }
+            return;
+        }
+        let (store, command) = (&mut self.store, self.links.command.first_mut());
+        let Some(port) = find_port(&mut self.ports, id) else { return };
+        let accepted = port.frames(&mut &[][..], &self.bindings.inputs, store, command, &mut self.tap);
+        let deadline = port.deadline();
+        self.arm(deadline);
+        self.after_field(id, &accepted, now);
     }
 
     #[inline(never)]

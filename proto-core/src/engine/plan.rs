@@ -6,7 +6,7 @@
 use core::fmt;
 
 use super::io::{LinkId, PortId};
-use crate::config::{ConfigView, Recipe, SendOn};
+use crate::config::{ConfigView, FieldSpec, Recipe, SendOn};
 use crate::image::InputSet;
 use crate::sysvar::{COUNT, Direction, INPUT_COUNT, ModbusPlace, SysVar};
 
@@ -206,7 +206,9 @@ impl Plan {
         }
         uplinks(config)
             .find(|(_, recipe)| {
-                config.fields_of(recipe, Direction::Output).any(|(_, _, field)| field.variable() == Some(var))
+                config
+                    .fields_of(recipe, Direction::Output)
+                    .any(|(_, _, field)| field.variables().any(|shown| shown == var))
             })
             .map(|(link, _)| Source::Recipe(link))
             .or_else(|| is_exact_modbus(var).then_some(Source::Modbus))
@@ -246,7 +248,7 @@ fn is_one_frame(config: ConfigView<'_>, link: &Recipe) -> bool {
     config.field_ports().any(|(_, port, recipe)| {
         recipe.frames(Direction::Input).any(|(_, fields)| {
             let fields = fields.of(config.fields);
-            let brings = |var| fields.iter().any(|field| field.variable() == Some(var));
+            let brings = |var| fields.iter().flat_map(FieldSpec::variables).any(|brought| brought == var);
             let safe = |var| port.on_timeout.of(config.safe_values).iter().any(|safe| safe.var == var);
             let mut vars = inputs_of(config, link).peekable();
             let first_is_safe = vars.peek().is_some_and(|&var| safe(var));
@@ -261,5 +263,5 @@ pub(super) fn shown_by<'a>(config: ConfigView<'a>, recipe: &'a Recipe) -> impl I
         SendOn::Rising { var, .. } => Some(var),
         _ => None,
     };
-    config.fields_of(recipe, Direction::Output).filter_map(|(_, _, field)| field.variable()).chain(trigger)
+    config.fields_of(recipe, Direction::Output).flat_map(|(_, _, field)| field.variables()).chain(trigger)
 }

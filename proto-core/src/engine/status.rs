@@ -193,7 +193,7 @@ impl<'a> Status<'a> {
         let is_can = match &port.codec {
             Codec::Stream { .. } => false,
             Codec::Can { .. } => true,
-            Codec::Device(device) => device.framer.is_none(),
+            Codec::Device(device) => device.reader.is_none(),
         };
         let bus = if is_can { FieldBus::Can { state: port.bus } } else { FieldBus::Rs485 };
         PortStatus {

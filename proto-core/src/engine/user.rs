@@ -5,7 +5,7 @@ use heapless::Vec;
 use super::command_link::CommandLink;
 use super::io::ReplyCode;
 use crate::config::OutputBinding;
-use crate::device::{Element, Encoding, Overflow, wrap};
+use crate::device::{Element, Encoding, Length, Overflow, Text, wrap};
 use crate::image::{Image, bind_to_variable, saturate_to_field};
 use crate::recipe::model::MAX_FIELDS;
 use crate::sysvar::SysVar;
@@ -19,6 +19,8 @@ pub(super) enum Written {
     Value { encoding: Encoding, overflow: Overflow },
     Fixed { encoding: Encoding },
     Padding { len: u8, fill: u8 },
+    Text(Text),
+    Length(Length),
 }
 
 impl Written {
@@ -27,6 +29,8 @@ impl Written {
             Element::Value { encoding, overflow } => Self::Value { encoding, overflow },
             Element::Fixed { encoding, .. } => Self::Fixed { encoding },
             Element::Padding { len, fill } => Self::Padding { len, fill },
+            Element::Text(text) => Self::Text(text),
+            Element::Length(length) => Self::Length(length),
         }
     }
 
@@ -35,6 +39,8 @@ impl Written {
             Self::Value { encoding, overflow } => Element::Value { encoding, overflow },
             Self::Fixed { encoding } => Element::Fixed { encoding, value: constant },
             Self::Padding { len, fill } => Element::Padding { len, fill },
+            Self::Text(text) => Element::Text(text),
+            Self::Length(length) => Element::Length(length),
         }
     }
 }

@@ -5,7 +5,8 @@
 
 use proto_core::config::{DeviceFrame, FieldSpec};
 use proto_core::device::{
-    Algorithm, ByteOrder, Carrier, Checksum, Crc, Element, Encoding, LayoutError, Overflow,
+    Algorithm, Boundary, ByteOrder, Carrier, Checksum, Crc, Element, Encoding, LayoutError, Overflow,
+    TextWidth,
 };
 use proto_core::recipe::PartError;
 use proto_core::recipe::model::{MAX_CAN_IDS, MAX_DELIMITER, MAX_STREAM_FRAME, Mode, Rules};
@@ -14,12 +15,15 @@ use proto_core::wire::scalar::ScalarType;
 
 use super::bindings::{self, FileInput};
 use super::encoding::{self, OpenNumber, Order, refuse};
+use super::framings;
 use super::reader::{Item, Reader, Result};
 use super::recipes::{FileField, FileFieldKind, FileFrame, FilePart, FileRecipe, Flavour, Written};
 use crate::device::{DeviceField, DeviceRecipe, NamedFrame};
 
-/// The keys of a stream part or of a CAN frame.
+/// The keys of a CAN frame.
 const FRAME_KEYS: [&str; 3] = ["endian", "word_order", "checksum"];
+/// The keys of a stream part.
+const STREAM_KEYS: [&str; 5] = ["endian", "word_order", "checksum", "framing", "escape"];
 /// The keys of a field or what stands in its place, beside those that say how it is written.
 const FIELD_KEYS: [&str; 5] = ["equals", "overflow", "pad", "fill", "text"];
 
@@ -45,15 +49,34 @@ pub(super) fn frame_keys(
     mode: Mode,
     flavour: Flavour,
 ) -> Result<&'static [&'static str]> {
+    own_keys(&FRAME_KEYS, table, mode, flavour)
+}
+
+/// The same for a stream part.
+pub(super) fn stream_keys(
+    table: &Reader<'_>,
+    mode: Mode,
+    flavour: Flavour,
+) -> Result<&'static [&'static str]> {
+    own_keys(&STREAM_KEYS, table, mode, flavour)
+}
+
+fn own_keys(
+    keys: &'static [&'static str],
+    table: &Reader<'_>,
+    mode: Mode,
+    flavour: Flavour,
+) -> Result<&'static [&'static str]> {
     match why_plain(mode, flavour) {
-        None => Ok(&FRAME_KEYS),
-        Some(why) => refuse(table, &FRAME_KEYS, why).map(|()| -> &[&str] { &[] }),
+        None => Ok(keys),
+        Some(why) => refuse(table, keys, why).map(|()| -> &[&str] { &[] }),
     }
 }
 
 /// Refuses the keys of a frame in a CAN part, which has several frames.
 pub(super) fn refuse_in_can_part(part: &Reader<'_>, mode: Mode, flavour: Flavour) -> Result<()> {
-    frame_keys(part, mode, flavour)?;
+    stream_keys(part, mode, flavour)?;
+    refuse(part, &framings::PART_KEYS, "a CAN bus tells frames apart itself")?;
     refuse(part, &FRAME_KEYS, "in a CAN recipe each frame has its own; write it below the frame's id")
 }
 
@@ -79,7 +102,7 @@ impl FieldReader {
             Direction::Output => " in an output field",
         };
         if let Some(why) = why_plain(Mode::User, self.flavour) {
-            refuse(&table, &[&FIELD_KEYS[..], &encoding::KEYS].concat(), why)?;
+            refuse(&table, &[&FIELD_KEYS[..], &framings::FIELD_KEYS, &encoding::KEYS].concat(), why)?;
             table.check_keys(&["name", "type"], when)?;
             push(self.read_plain(&table)?);
             return Ok(());
@@ -91,7 +114,22 @@ impl FieldReader {
             push(FileFieldKind::Padding { len: pad.integer(1..=255)?, fill });
             return Ok(());
         }
-        refuse(&table, &["fill"], "allowed only together with pad")?;
+        if table.optional("type").and_then(|item| item.as_string()) == Some("text") {
+            self.open = None;
+            let name = table.optional("name").map(|item| item.string().map(str::to_owned)).transpose()?;
+            push(FileFieldKind::Device { name, spec: framings::read_text(&table, self.direction)? });
+            return Ok(());
+        }
+        refuse(&table, &framings::TEXT_KEYS, "allowed only together with type = \"text\"")?;
+        if table.optional("length").is_some() {
+            table.check_keys(&[&framings::LENGTH_KEYS[..], &encoding::KEYS].concat(), " in a length")?;
+            let encoding = encoding::read(&table, self.order, &mut self.open)?;
+            let name = table.optional("name").map(|item| item.string().map(str::to_owned)).transpose()?;
+            push(FileFieldKind::Device { name, spec: framings::read_length(&table, encoding)? });
+            return Ok(());
+        }
+        refuse(&table, &["counts", "plus"], "allowed only together with length = true")?;
+        refuse(&table, &["fill"], "allowed only together with pad, or with type = \"text\" and width")?;
         if let Some(text) = table.optional("text") {
             table.check_keys(&["text"], " in a text")?;
             self.open = None;
@@ -212,7 +250,8 @@ pub(super) fn read_checksum(frame: &Reader<'_>, head: usize, fields: &mut Vec<Fi
     let algorithm = read_algorithm(&table)?;
     let mut sum = Checksum::standard(algorithm);
     if let Some(item) = table.optional("over") {
-        (sum.first, sum.last) = read_covered(&item)?;
+        let (first, last) = read_covered(&item)?;
+        sum = sum.over(first, last);
     }
     if let Some(item) = table.optional("order") {
         sum.order = item.choice(&[("little", ByteOrder::Little), ("big", ByteOrder::Big)])?;
@@ -294,6 +333,10 @@ fn find_place(item: &Item<'_>, head: usize, fields: &[FileField]) -> Result<usiz
         places.extend(offset.map(|offset| (offset, nth)));
         let len = match (element, encoding) {
             (Some(Element::Padding { len, .. }), _) => Some(usize::from(len)),
+            (Some(Element::Text(text)), _) => match text.width {
+                TextWidth::Fixed(width) => Some(usize::from(width)),
+                TextWidth::Until(_) | TextWidth::Rest => None,
+            },
             (_, Some(encoding)) => encoding.size(),
             _ => Some(0),
         };
@@ -310,6 +353,11 @@ fn find_place(item: &Item<'_>, head: usize, fields: &[FileField]) -> Result<usiz
 }
 
 impl FilePart {
+    /// Whether something else than its fields tells where frames end.
+    fn is_cut(&self) -> bool {
+        self.framing != (Boundary::Fields, None)
+    }
+
     /// Checks the part of a recipe with a device's own frames.
     pub(super) fn check_device(
         &self,
@@ -371,12 +419,17 @@ impl FileRecipe {
     pub(super) fn is_device(&self) -> bool {
         let parts = [&self.input, &self.output].into_iter().flatten();
         let mut fields = parts.flat_map(|part| &part.frames).flat_map(|frame| &frame.fields);
-        fields.any(|field| field.spec().is_device())
+        let is_cut = [&self.input, &self.output].into_iter().flatten().any(FilePart::is_cut);
+        is_cut || fields.any(|field| field.spec().is_device())
     }
 
-    /// What carries the frames.
-    pub(super) fn carrier(&self) -> Carrier {
-        if self.is_can { Carrier::Can } else { Carrier::Stream }
+    /// What carries the frames of a part.
+    pub(super) fn carrier(&self, part: Direction) -> Carrier {
+        match self.part(part) {
+            _ if self.is_can => Carrier::Can,
+            Some(part) if part.is_cut() => Carrier::Whole,
+            _ => Carrier::Stream,
+        }
     }
 
     /// The recipe with the names of its fields.
@@ -392,7 +445,11 @@ impl FileRecipe {
         };
         DeviceRecipe {
             name: self.name.clone(),
-            carrier: self.carrier(),
+            carrier: [Direction::Input, Direction::Output]
+                .map(|part| self.carrier(part))
+                .into_iter()
+                .find(|&carrier| carrier == Carrier::Whole)
+                .unwrap_or(self.carrier(Direction::Input)),
             input: frames(&self.input),
             output: frames(&self.output),
         }

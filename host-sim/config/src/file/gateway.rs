@@ -142,7 +142,9 @@ impl<'a> Builder<'a> {
         let Some(file) = from.part(part) else { return Ok(None) };
         self.spots.insert(Place::Part { recipe, part }, file.spot.clone());
         let fields = self.add_fields(recipe, part, file, 0)?;
-        Ok(Some(StreamPart { head: delimiter(&file.head), tail: delimiter(&file.tail), fields }))
+        let mut stream = StreamPart::new(delimiter(&file.head), delimiter(&file.tail), fields);
+        (stream.framing, stream.escape) = file.framing;
+        Ok(Some(stream))
     }
 
     fn can_part(

@@ -9,6 +9,7 @@ mod device;
 mod document;
 mod encoding;
 mod error;
+mod framings;
 mod gateway;
 mod lines;
 mod network;

@@ -3,7 +3,7 @@
 //! In: tables. Out: [`FileRecipe`], which keeps the places for later checks.
 
 use proto_core::config::{FieldSpec, InputBinding, OutputBinding};
-use proto_core::device::{Checksum, Encoding, Kind, Overflow};
+use proto_core::device::{Boundary, Checksum, Encoding, Escape, Kind, Overflow};
 use proto_core::recipe::CanLayout;
 use proto_core::recipe::PartError;
 use proto_core::recipe::StreamLayout;
@@ -14,6 +14,7 @@ use proto_core::wire::scalar::ScalarType;
 
 use super::bindings::{self, FileInput, FileOutput};
 use super::device::{self, FieldReader};
+use super::framings;
 use super::reader::{Item, Reader, Result, Spot};
 use crate::device::AnyRecipe;
 use crate::sim::{SimCanFrame, SimField, SimParts, SimRecipe, SimStreamPart};
@@ -45,6 +46,8 @@ pub(super) struct FilePart {
     pub(super) frames: Vec<FileFrame>,
     /// The gateway's keys of an output part.
     pub(super) sending: bindings::Sending,
+    /// What tells the frames of a stream apart.
+    pub(super) framing: (Boundary, Option<Escape>),
 }
 
 pub(super) struct FileFrame {
@@ -84,6 +87,11 @@ pub(super) enum FileFieldKind {
         fill: u8,
     },
     Checksum(Checksum),
+    /// What has no binding of a number: a text, or a length.
+    Device {
+        name: Option<String>,
+        spec: FieldSpec,
+    },
 }
 
 /// How a field with a value is written.
@@ -145,6 +153,7 @@ impl FileField {
             &FileFieldKind::Fixed { encoding, value, .. } => FieldSpec::Fixed { encoding, value },
             &FileFieldKind::Padding { len, fill } => FieldSpec::Padding { len, fill },
             FileFieldKind::Checksum(sum) => FieldSpec::Checksum(*sum),
+            FileFieldKind::Device { spec, .. } => *spec,
         }
     }
 
@@ -153,7 +162,9 @@ impl FileField {
         match &self.kind {
             FileFieldKind::System(var) => var.to_string(),
             FileFieldKind::UserInput { name, .. } | FileFieldKind::UserOutput { name, .. } => name.clone(),
-            FileFieldKind::Fixed { name, .. } => name.clone().unwrap_or_default(),
+            FileFieldKind::Fixed { name, .. } | FileFieldKind::Device { name, .. } => {
+                name.clone().unwrap_or_default()
+            }
             FileFieldKind::Padding { .. } | FileFieldKind::Checksum(_) => String::new(),
         }
     }
@@ -213,7 +224,7 @@ fn read(table: &Reader<'_>, flavour: Flavour) -> Result<FileRecipe> {
     for direction in [Direction::Input, Direction::Output] {
         let Some(part) = recipe.part(direction) else { continue };
         if is_device {
-            part.check_device(table, recipe.carrier(), direction)?;
+            part.check_device(table, recipe.carrier(direction), direction)?;
             continue;
         }
         // UDP needs the least of a stream recipe; it does not take user-defined recipes (D16).
@@ -234,7 +245,7 @@ fn read_part(item: &Item<'_>, rules: Rules, is_can: bool, flavour: Flavour) -> R
         device::refuse_in_can_part(&table, rules.mode, flavour)?;
         &[]
     } else {
-        device::frame_keys(&table, rules.mode, flavour)?
+        device::stream_keys(&table, rules.mode, flavour)?
     };
     table.check_keys(&[own, frame_keys, sending_keys].concat(), when)?;
 
@@ -246,6 +257,7 @@ fn read_part(item: &Item<'_>, rules: Rules, is_can: bool, flavour: Flavour) -> R
         tail_spot: None,
         frames: Vec::new(),
         sending: bindings::read_sending(&table)?,
+        framing: framings::read_part(&table)?,
     };
     if is_can {
         for frame in table.any_tables("frame")? {

@@ -136,7 +136,7 @@ struct StreamPart {
 
 impl From<StreamPart> for config::StreamPart {
     fn from(StreamPart { head, tail, fields }: StreamPart) -> Self {
-        Self { head, tail, fields: fields.into() }
+        Self::new(head, tail, fields.into())
     }
 }
 
