@@ -323,6 +323,9 @@ impl fmt::Display for DescribedKind<'_> {
                 write!(f, "not a value for {var}: not finite, or reserved bits are set")
             }
             Kind::SafeTwice { var } => write!(f, "{var} already has a safe value"),
+            Kind::BackwardRange { first, last } => {
+                write!(f, "{first}..{last} contains no value; allowed: {last}..{first}")
+            }
         }
     }
 }

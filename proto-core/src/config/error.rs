@@ -486,4 +486,11 @@ pub enum ConfigErrorKind {
         /// The variable.
         var: SysVar,
     },
+    /// The values of a command run backwards.
+    BackwardRange {
+        /// The first value.
+        first: i64,
+        /// The last value.
+        last: i64,
+    },
 }

@@ -111,7 +111,26 @@ pub struct InputField<'a> {
 pub(super) enum Does<'a> {
     Nothing,
     Writes { var: Var<'a>, scale: f32, offset: f32 },
-    Commands { entries: &'a [(i64, &'a str)], when: CommandWhen },
+    Commands { entries: Entries<'a>, when: CommandWhen, idle: Option<i64> },
+}
+
+/// The entries of a command table.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum Entries<'a> {
+    Values(&'a [(i64, &'a str)]),
+    Ranges(&'a [(i64, i64, &'a str)]),
+}
+
+impl<'a> Entries<'a> {
+    /// First and last value, and the text.
+    pub(super) fn iter(self) -> impl Iterator<Item = (i64, i64, &'a str)> {
+        let (values, ranges) = match self {
+            Self::Values(values) => (values, &[][..]),
+            Self::Ranges(ranges) => (&[][..], ranges),
+        };
+        let values = values.iter().map(|&(value, text)| (value, value, text));
+        values.chain(ranges.iter().copied())
+    }
 }
 
 impl<'a> InputField<'a> {
@@ -128,7 +147,15 @@ impl<'a> InputField<'a> {
     /// A field whose value picks a command of port 2000 when it changes: pairs of value and command,
     /// such as `(1, "run(pick.jspf,50)")`. Integer types only.
     pub const fn commands(ty: ScalarType, entries: &'a [(i64, &'a str)]) -> Self {
-        Self { ty, does: Does::Commands { entries, when: CommandWhen::Change } }
+        let entries = Entries::Values(entries);
+        Self { ty, does: Does::Commands { entries, when: CommandWhen::Change, idle: None } }
+    }
+
+    /// As [`Self::commands`], with ranges of values: first value, last value and command, such as
+    /// `(1, 100, "speed({value})")`. `{value}` stands for the field's value.
+    pub const fn command_ranges(ty: ScalarType, entries: &'a [(i64, i64, &'a str)]) -> Self {
+        let entries = Entries::Ranges(entries);
+        Self { ty, does: Does::Commands { entries, when: CommandWhen::Change, idle: None } }
     }
 
     /// Makes the variable `value * scale + offset`. No effect on other fields.
@@ -147,9 +174,20 @@ impl<'a> InputField<'a> {
         self
     }
 
+    /// Sets the value at which the device asks for nothing, if it is not 0: every other value that
+    /// picks no command is counted as unknown. No effect on other fields.
+    pub fn idle(mut self, value: i64) -> Self {
+        if let Does::Commands { idle, .. } = &mut self.does {
+            *idle = Some(value);
+        }
+        self
+    }
+
     fn commands_len(&self) -> usize {
         match self.does {
-            Does::Commands { entries, .. } => entries.len(),
+            Does::Commands { entries, idle, .. } => {
+                entries.iter().count().saturating_add(usize::from(idle.is_some()))
+            }
             Does::Nothing | Does::Writes { .. } => 0,
         }
     }

@@ -3,7 +3,7 @@
 //! In: the gateway's configuration and a seed. Out: frames at random times. A device changes its behaviour
 //! every few seconds: steady, hasty, silent, stuck, careless.
 
-use proto_core::config::{Bus, FieldSpec, GatewayConfig, InputBinding, Port};
+use proto_core::config::{Bus, CommandEntry, FieldSpec, GatewayConfig, InputBinding, Port};
 use proto_core::sysvar::{Direction, SysVar};
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::can::{CanFrame, CanId};
@@ -238,7 +238,7 @@ fn content(config: &GatewayConfig, field: &FieldSpec) -> Content {
     match *field {
         FieldSpec::System(var) => of_var(var),
         FieldSpec::UserInput { ty, to: InputBinding::Commands { table, .. } } => {
-            Content::Commands { ty, values: table.of(&config.commands).iter().map(|e| e.value).collect() }
+            Content::Commands { ty, values: table.of(&config.commands).iter().flat_map(ends).collect() }
         }
         FieldSpec::UserInput { ty: ScalarType::Byte, .. } => Content::Bits,
         FieldSpec::UserInput { ty, .. } | FieldSpec::UserOutput { ty, .. } => {
@@ -246,6 +246,12 @@ fn content(config: &GatewayConfig, field: &FieldSpec) -> Content {
         }
         _ => unimplemented!("frames of devices are not modelled"),
     }
+}
+
+/// The first and the last value of a command.
+fn ends(entry: &CommandEntry) -> impl Iterator<Item = i64> + use<> {
+    let (first, last) = (entry.first, entry.last);
+    [first, last].into_iter().take(if first == last { 1 } else { 2 })
 }
 
 fn zero(content: &Content) -> Scalar {

@@ -1,21 +1,16 @@
 //! The bindings of fields and the triggers of output parts in a gateway file.
 
-use proto_core::config::{CommandWhen, OnStale, OutputBinding, SendOn};
+use proto_core::config::{OnStale, OutputBinding, SendOn};
 use proto_core::sysvar::SysVar;
 
+use super::commands::{self, FileCommands};
 use super::reader::{Item, Reader, Result, Spot};
 
 /// The binding of an input field.
 pub(super) enum FileInput {
     Unused,
     Variable { var: SysVar, scale: f32, offset: f32 },
-    Commands { entries: Vec<FileCommand>, when: CommandWhen },
-}
-
-pub(super) struct FileCommand {
-    pub(super) spot: Spot,
-    pub(super) value: i64,
-    pub(super) text: String,
+    Commands(FileCommands),
 }
 
 /// The source of an output field.
@@ -74,7 +69,7 @@ pub(super) fn read_input(field: &Reader<'_>) -> Result<FileInput> {
         refuse(field, &["scale", "offset"], "allowed only together with to")?;
     }
     if commands.is_none() {
-        refuse(field, &["when"], "allowed only together with commands")?;
+        refuse(field, &commands::KEYS, "allowed only together with commands")?;
     }
     match (to, commands) {
         (None, None) => Ok(FileInput::Unused),
@@ -82,34 +77,9 @@ pub(super) fn read_input(field: &Reader<'_>) -> Result<FileInput> {
             let (scale, offset) = read_scale(field)?;
             Ok(FileInput::Variable { var: read_var(&to)?, scale, offset })
         }
-        (None, Some(commands)) => {
-            let when = match field.optional("when") {
-                Some(item) => {
-                    item.choice(&[("change", CommandWhen::Change), ("frame", CommandWhen::Frame)])?
-                }
-                None => CommandWhen::default(),
-            };
-            let entries = commands.any_table()?.entries().map(read_command).collect::<Result<Vec<_>>>()?;
-            if entries.is_empty() {
-                return Err(commands.error("no commands; write for example { 1 = \"run(pick.jspf,50)\" }"));
-            }
-            Ok(FileInput::Commands { entries, when })
-        }
+        (None, Some(commands)) => commands::read(field, &commands).map(FileInput::Commands),
         (Some(_), Some(commands)) => Err(commands.error("a field takes to or commands, not both")),
     }
-}
-
-fn read_command((key, key_spot, item): (&str, Spot, Item<'_>)) -> Result<FileCommand> {
-    let number = match key.strip_prefix("0x") {
-        Some(hex) => i64::from_str_radix(hex, 16),
-        None => key.parse(),
-    };
-    let Ok(value) = number else {
-        return Err(item
-            .at(key_spot)
-            .error(format!("{key:?} is not an integer; the keys of commands are values of the field")));
-    };
-    Ok(FileCommand { value, text: item.string()?.to_owned(), spot: item.spot })
 }
 
 pub(super) fn read_output(field: &Reader<'_>) -> Result<FileOutput> {

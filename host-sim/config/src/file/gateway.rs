@@ -15,6 +15,7 @@ use proto_core::wire::dialect::Dialect;
 use proto_core::wire::scalar::Scalar;
 
 use super::bindings::{FileInput, FileOutput};
+use super::commands::FileCommand;
 use super::document::Document;
 use super::lines::{LINE_KEYS, key_name, read_bitrate, read_cycle, read_line};
 use super::network;
@@ -186,13 +187,13 @@ impl<'a> Builder<'a> {
                     FileInput::Variable { var, scale, offset } => {
                         InputBinding::Variable { var: *var, scale: *scale, offset: *offset }
                     }
-                    FileInput::Commands { entries, when } => {
+                    FileInput::Commands(commands) => {
                         let start = self.config.commands.len() as u16;
-                        for entry in entries {
-                            self.add_command(entry.value, &entry.text, &entry.spot)?;
+                        for command in &commands.entries {
+                            self.add_command(command)?;
                         }
-                        let table = Span { start, len: entries.len() as u16 };
-                        InputBinding::Commands { table, when: *when }
+                        let table = Span { start, len: commands.entries.len() as u16 };
+                        InputBinding::Commands { table, when: commands.when }
                     }
                 };
                 FieldSpec::UserInput { ty: *ty, to }
@@ -207,14 +208,15 @@ impl<'a> Builder<'a> {
         })
     }
 
-    fn add_command(&mut self, value: i64, text: &str, spot: &Spot) -> Result<()> {
-        let Ok(bounded) = heapless::String::try_from(text) else {
+    fn add_command(&mut self, command: &FileCommand) -> Result<()> {
+        let FileCommand { spot, first, last, text } = command;
+        let Ok(bounded) = heapless::String::try_from(text.as_str()) else {
             let message = format!("the command has {} bytes; at most {MAX_COMMAND_TEXT}", text.len());
             return Err(self.error(spot, message));
         };
         let entry = self.config.commands.len() as u16;
         self.spots.insert(Place::Command { entry }, spot.clone());
-        self.config.commands.push(CommandEntry { value, text: bounded }).map_err(|_| {
+        self.config.commands.push(CommandEntry { first: *first, last: *last, text: bounded }).map_err(|_| {
             self.error(spot, format!("too many commands; at most {MAX_COMMANDS} in all recipes together"))
         })
     }

@@ -235,7 +235,9 @@ fn read_user_field(item: &Item<'_>, direction: Direction, flavour: Flavour) -> R
     let table = item.any_table()?;
     let bound: &[&str] = match (flavour, direction) {
         (Flavour::Controller, _) => &[],
-        (Flavour::Gateway, Direction::Input) => &["to", "commands", "when", "scale", "offset"],
+        (Flavour::Gateway, Direction::Input) => {
+            &["to", "commands", "when", "base", "idle", "scale", "offset"]
+        }
         (Flavour::Gateway, Direction::Output) => &["from", "value", "scale", "offset"],
     };
     let when = match direction {
