@@ -74,12 +74,13 @@ fn a_stop_for_several_values_is_asked_for_by_each_of_them() {
 
 #[test]
 fn what_a_range_cannot_be_is_refused_with_its_place() {
-    let speed = ConfigErrorKind::Command(ParseError::InvalidSpeed);
+    let wrong = |value, error| ConfigErrorKind::CommandFor { value, error };
+    let speed = |value| wrong(value, ParseError::InvalidSpeed);
     for (entries, kind) in [
-        (vec![(1, 101, "speed({value})")], speed),
-        (vec![(0, 100, "speed({value})")], speed),
-        (vec![(1, 100, "speed({value}0)")], speed),
-        (vec![(1, 2, "{value}()")], ConfigErrorKind::Command(ParseError::UnknownWord)),
+        (vec![(1, 101, "speed({value})")], speed(101)),
+        (vec![(0, 100, "speed({value})")], speed(0)),
+        (vec![(1, 100, "speed({value}0)")], speed(100)),
+        (vec![(1, 2, "{value}()")], wrong(1, ParseError::UnknownWord)),
         (vec![(9, 3, "stop")], ConfigErrorKind::BackwardRange { first: 9, last: 3 }),
         (vec![(1, 256, "stop")], ConfigErrorKind::CommandValue { value: 256, ty: T::Byte }),
         (vec![(-1, 4, "stop")], ConfigErrorKind::CommandValue { value: -1, ty: T::Byte }),

@@ -62,7 +62,7 @@ fn read_values(field: &Reader<'_>, commands: &Item<'_>, table: &Reader<'_>) -> R
         when = CommandWhen::Kept;
     }
     if let Some(item) = field.optional("idle") {
-        let value = item.integer(i64::MIN..=i64::MAX)?;
+        let value = item.integer(i64::from(i32::MIN)..=i64::from(u32::MAX))?;
         entries.push(FileCommand { spot: item.spot, first: value, last: value, text: String::new() });
     }
     Ok(FileCommands { entries, when })
