@@ -166,7 +166,7 @@ fn everything_that_is_said_is_in_it() {
             },
         ]
     );
-    let texts: Vec<_> = table.of(&config.commands).iter().map(|entry| (entry.value, &*entry.text)).collect();
+    let texts: Vec<_> = table.of(&config.commands).iter().map(|entry| (entry.first, &*entry.text)).collect();
     assert_eq!(texts, commands);
     let Parts::Can { input, output } = &config.recipes[1].parts else { panic!("{:?}", config.recipes[1]) };
     assert_eq!((input[0].id, output[0].id), (CanId::Standard(0x501), CanId::Extended(0x12345)));

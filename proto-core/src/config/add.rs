@@ -4,17 +4,18 @@
 //! configuration's lists with their ranges, or what is wrong and where. A refused recipe or port
 //! leaves nothing behind. Whether everything fits together is checked by [`ConfigView::validate`].
 
-use heapless::Vec;
+use heapless::{String, Vec};
 
 use super::draft::{ControllerBuilder, PartFields, PortBuilder, PortBus, RecipeBuilder, Trigger};
 use super::error::{ConfigError, ConfigErrorKind as Kind, ControllerKey, Counted, Place, PortKey, RecipeKey};
-use super::fields::{CanFields, Does, Fields, InputField, OutputField, Sends, plain};
+use super::fields::{CanFields, Does, Entries, Fields, InputField, OutputField, Sends, plain};
 use super::rules::{check_name, check_room, text};
 use super::view::ConfigMut;
 use super::{
     CanFramePart, CommandEntry, ControllerLink, Delimiter, FieldSpec, GatewayConfig, InputBinding, Name,
     OutputBinding, Parts, Port, Recipe, RecipeLink, SafeValue, SafeValues, SendOn, Span, StreamPart,
 };
+use crate::command::ParseError;
 use crate::recipe::model::{MAX_CAN_IDS, MAX_DELIMITER};
 use crate::sysvar::{Direction, SysVar, VarRange};
 use crate::wire::dialect::Dialect;
@@ -240,8 +241,8 @@ impl ConfigMut<'_> {
                 Does::Writes { var, scale, offset } => {
                     InputBinding::Variable { var: var.read().map_err(Kind::Variable)?, scale, offset }
                 }
-                Does::Commands { entries, when } => {
-                    InputBinding::Commands { table: self.add_commands(entries)?, when }
+                Does::Commands { entries, when, idle } => {
+                    InputBinding::Commands { table: self.add_commands(entries, idle)?, when }
                 }
             };
             Ok(match plain(encoding, overflow) {
@@ -252,10 +253,16 @@ impl ConfigMut<'_> {
     }
 
     /// There is room: checked when the recipe was begun.
-    fn add_commands(&mut self, entries: &[(i64, &str)]) -> Result<Span, Kind> {
+    fn add_commands(&mut self, entries: Entries<'_>, idle: Option<i64>) -> Result<Span, Kind> {
         let start = self.commands.len();
-        for &(value, command) in entries {
-            let _ = self.commands.push(CommandEntry { value, text: text(command)? });
+        for (first, last, command) in entries.iter() {
+            if command.is_empty() {
+                return Err(Kind::Command(ParseError::Empty));
+            }
+            let _ = self.commands.push(CommandEntry { first, last, text: text(command)? });
+        }
+        if let Some(value) = idle {
+            let _ = self.commands.push(CommandEntry::new(value, String::new()));
         }
         Ok(span(start, self.commands.len()))
     }

@@ -4,8 +4,8 @@
 use super::error::{ConfigErrorKind as Kind, Place, RecipeKey};
 use super::rules::{Check, check_new_name, check_pool, fail, is_marked, mark};
 use super::{
-    CanFramePart, ConfigView, DeviceFrame, FieldSpec, InputBinding, OutputBinding, Parts, Recipe, SendOn,
-    Span, Words,
+    CanFramePart, CommandEntry, ConfigView, DeviceFrame, FieldSpec, InputBinding, MAX_COMMAND_TEXT,
+    OutputBinding, PLACEHOLDER, Parts, Recipe, SendOn, Span, Words,
 };
 use crate::command::Request;
 use crate::device::{Boundary, Encoding, LayoutError, Overflow};
@@ -140,24 +140,29 @@ impl<'a> RecipeCheck<'a> {
     fn check_commands(&self, place: Place, numbers: Numbers, table: Span) -> Check {
         let commands = self.config.commands;
         check_pool(place, table, commands.len())?;
-        if table.len == 0 {
+        if table.of(commands).iter().all(CommandEntry::is_idle) {
             return fail(place, Kind::EmptyTable);
         }
         let entries = || (table.start..).zip(table.of(commands));
         for (entry, command) in entries() {
             let place = Place::Command { entry };
-            if let Err(error) = Request::parse_strict(command.text.as_bytes()) {
-                return fail(place, Kind::Command(error));
+            let &CommandEntry { first, last, .. } = command;
+            if first > last {
+                return fail(place, Kind::BackwardRange { first, last });
             }
+            check_command_text(place, command)?;
             let Numbers { low, high, ty, .. } = numbers;
-            let value = command.value as f64;
-            if !(low..=high).contains(&value) {
-                let written = Kind::NotInField { value, low, high };
-                let value = command.value;
-                return fail(place, ty.map_or(written, |ty| Kind::CommandValue { value, ty }));
+            for end in [first, last] {
+                let value = end as f64;
+                if !(low..=high).contains(&value) {
+                    let written = Kind::NotInField { value, low, high };
+                    return fail(place, ty.map_or(written, |ty| Kind::CommandValue { value: end, ty }));
+                }
             }
-            if entries().any(|(other, before)| other < entry && before.value == command.value) {
-                return fail(place, Kind::DuplicateCommand { value: command.value });
+            let earlier = entries().take_while(|(other, _)| *other < entry);
+            let mut common = earlier.map(|(_, before)| (first.max(before.first), last.min(before.last)));
+            if let Some((value, _)) = common.find(|(first, last)| first <= last) {
+                return fail(place, Kind::DuplicateCommand { value });
             }
         }
         Ok(())
@@ -327,6 +332,27 @@ fn check_words(place: Place, words: Option<Words>) -> Check {
 fn check_word(place: Place, vars: impl IntoIterator<Item = SysVar>) -> Check {
     let other = vars.into_iter().find(|var| var.ty() != ScalarType::Word);
     other.map_or(Ok(()), |var| fail(place, Kind::NotWords { var, count: 1 }))
+}
+
+/// A command must be one with each of its values: with the first and the last one, it is with all.
+fn check_command_text(place: Place, command: &CommandEntry) -> Check {
+    if command.is_idle() {
+        return Ok(());
+    }
+    for value in [command.first, command.last] {
+        let Some(text) = command.text_for(value) else {
+            let (len, longest) = (command.len_for(value), MAX_COMMAND_TEXT);
+            return fail(place, Kind::TooLong { len, longest });
+        };
+        if let Err(error) = Request::parse_strict(text.as_bytes()) {
+            let kind = match command.text.contains(PLACEHOLDER) {
+                false => Kind::Command(error),
+                true => Kind::CommandFor { value, error },
+            };
+            return fail(place, kind);
+        }
+    }
+    Ok(())
 }
 
 fn check_scale(place: Place, scale: f32, offset: f32) -> Check {

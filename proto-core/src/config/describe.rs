@@ -338,6 +338,10 @@ impl fmt::Display for DescribedKind<'_> {
                 write!(f, "not a value for {var}: not finite, or reserved bits are set")
             }
             Kind::SafeTwice { var } => write!(f, "{var} already has a safe value"),
+            Kind::CommandFor { value, error } => write!(f, "with the value {value}: {error}"),
+            Kind::BackwardRange { first, last } => {
+                write!(f, "{first}..{last} contains no value; allowed: {last}..{first}")
+            }
         }
     }
 }

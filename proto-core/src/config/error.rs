@@ -506,4 +506,18 @@ pub enum ConfigErrorKind {
         /// The variable.
         var: SysVar,
     },
+    /// The text of a command is not a request of port 2000 with one of its values.
+    CommandFor {
+        /// The value.
+        value: i64,
+        /// What is wrong with the text.
+        error: ParseError,
+    },
+    /// The values of a command run backwards.
+    BackwardRange {
+        /// The first value.
+        first: i64,
+        /// The last value.
+        last: i64,
+    },
 }

@@ -184,7 +184,26 @@ pub struct InputField<'a> {
 pub(super) enum Does<'a> {
     Nothing,
     Writes { var: Var<'a>, scale: f32, offset: f32 },
-    Commands { entries: &'a [(i64, &'a str)], when: CommandWhen },
+    Commands { entries: Entries<'a>, when: CommandWhen, idle: Option<i64> },
+}
+
+/// The entries of a command table.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum Entries<'a> {
+    Values(&'a [(i64, &'a str)]),
+    Ranges(&'a [(i64, i64, &'a str)]),
+}
+
+impl<'a> Entries<'a> {
+    /// First and last value, and the text.
+    pub(super) fn iter(self) -> impl Iterator<Item = (i64, i64, &'a str)> {
+        let (values, ranges) = match self {
+            Self::Values(values) => (values, &[][..]),
+            Self::Ranges(ranges) => (&[][..], ranges),
+        };
+        let values = values.iter().map(|&(value, text)| (value, value, text));
+        values.chain(ranges.iter().copied())
+    }
 }
 
 impl<'a> InputField<'a> {
@@ -202,7 +221,16 @@ impl<'a> InputField<'a> {
     /// A field whose value picks a command of port 2000 when it changes: pairs of value and command,
     /// such as `(1, "run(pick.jspf,50)")`. Integer types only.
     pub fn commands(encoding: impl Into<Encoding>, entries: &'a [(i64, &'a str)]) -> Self {
-        let does = Does::Commands { entries, when: CommandWhen::Change };
+        let does =
+            Does::Commands { entries: Entries::Values(entries), when: CommandWhen::Change, idle: None };
+        Self { on_wire: OnWire::value(encoding), does }
+    }
+
+    /// As [`Self::commands`], with ranges of values: first value, last value and command, such as
+    /// `(1, 100, "speed({value})")`. `{value}` stands for the field's value.
+    pub fn command_ranges(encoding: impl Into<Encoding>, entries: &'a [(i64, i64, &'a str)]) -> Self {
+        let does =
+            Does::Commands { entries: Entries::Ranges(entries), when: CommandWhen::Change, idle: None };
         Self { on_wire: OnWire::value(encoding), does }
     }
 
@@ -243,9 +271,20 @@ impl<'a> InputField<'a> {
         self
     }
 
+    /// Sets the value at which the device asks for nothing, if it is not 0: every other value that
+    /// picks no command is counted as unknown. No effect on other fields.
+    pub fn idle(mut self, value: i64) -> Self {
+        if let Does::Commands { idle, .. } = &mut self.does {
+            *idle = Some(value);
+        }
+        self
+    }
+
     fn commands_len(&self) -> usize {
         match self.does {
-            Does::Commands { entries, .. } => entries.len(),
+            Does::Commands { entries, idle, .. } => {
+                entries.iter().count().saturating_add(usize::from(idle.is_some()))
+            }
             Does::Nothing | Does::Writes { .. } => 0,
         }
     }

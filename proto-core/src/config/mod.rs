@@ -10,6 +10,7 @@ mod add;
 mod budget;
 mod builder;
 mod check_recipe;
+mod command_text;
 mod describe;
 mod device;
 mod draft;
@@ -27,6 +28,8 @@ mod view;
 
 pub use budget::{PartBudget, Warning, can_frame_time};
 pub use builder::ConfigBuilder;
+pub use command_text::CommandText;
+pub(crate) use command_text::{PLACEHOLDER, fill_in};
 pub use device::DeviceFrame;
 pub use draft::{Can, ControllerBuilder, Listen, PortBuilder, PortBus, RecipeBuilder, SafeValues};
 pub use error::{

@@ -297,7 +297,8 @@ pub enum InputBinding {
         /// Offset, added after scaling.
         offset: f32,
     },
-    /// The value picks a port-2000 command from a table; a value not in the table does nothing.
+    /// The value picks a port-2000 command from a table. A value that is not in the table does
+    /// nothing; it is counted, unless it is 0 and the table names no idle values.
     Commands {
         /// The table, in [`GatewayConfig::commands`](super::GatewayConfig::commands).
         table: Span,
@@ -315,6 +316,10 @@ pub enum CommandWhen {
     Change,
     /// With every accepted frame: for devices that send a frame only when they mean it.
     Frame,
+    /// When it differs from the previous frame, also after silence: for devices that send a frame
+    /// only when something changes. After a lost device, bus-off or sleep, the first frame only
+    /// sets the base.
+    Kept,
 }
 
 /// Where a user-defined output value comes from.
@@ -342,9 +347,13 @@ pub enum OutputBinding {
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct CommandEntry {
-    /// The field's value that picks the command.
-    pub value: i64,
-    /// The command as port 2000 takes it, such as `run(pick.jspf,50)`.
+    /// The first of the field's values that pick the command.
+    pub first: i64,
+    /// The last of them; the same as the first for a single value.
+    pub last: i64,
+    /// The command as port 2000 takes it, such as `run(pick.jspf,50)`. `{value}` in it stands for
+    /// the field's value. If empty, the values are idle: they pick nothing, and are not counted as
+    /// unknown.
     pub text: String<MAX_COMMAND_TEXT>,
 }
 

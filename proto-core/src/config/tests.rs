@@ -178,9 +178,9 @@ fn numbers_that_no_file_can_hold_are_refused() {
     let to = InputBinding::Commands { table, when: CommandWhen::Frame };
     for (value, text, kind) in [
         (i64::MAX, "stop", ConfigErrorKind::CommandValue { value: i64::MAX, ty: ScalarType::Byte }),
-        (1, "", ConfigErrorKind::Command(ParseError::Empty)),
+        (1, " ", ConfigErrorKind::Command(ParseError::Empty)),
     ] {
-        let entry = CommandEntry { value, text: self::text(text) };
+        let entry = CommandEntry::new(value, self::text(text));
         Builder::new()
             .user(&[user_input(to)], &[])
             .with(|config| config.commands.push(entry).unwrap())
@@ -304,7 +304,7 @@ pub(super) fn every_kind() -> GatewayConfig {
         .stream(&["ForceEnd[1]"], &["RobotState[26]"])
         .rs485(2)
         .with(|config| {
-            config.commands.push(CommandEntry { value: 1, text: text("stop") }).unwrap();
+            config.commands.push(CommandEntry::new(1, text("stop"))).unwrap();
             config
                 .safe_values
                 .push(SafeValue { var: var("ForceEnd[1]"), value: Scalar::Float(0.0) })

@@ -341,7 +341,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
         let full = || one_too_many(Counted::UserFields, FIELDS);
         let mut inputs = Span { start: self.bindings.inputs.len() as u16, len: 0 };
-        for (_, _, field) in config.fields_of(recipe, Direction::Input) {
+        for (frame, nth, field) in config.fields_of(recipe, Direction::Input) {
             let Some(element) = field.element() else { continue };
             let to = match *field {
                 FieldSpec::UserInput { to, .. } | FieldSpec::DeviceInput { to, .. } => to,
@@ -354,7 +354,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                         self.add_command_link(config, dialect)?;
                     }
                     let Some(link) = self.links.command.first_mut() else { continue };
-                    let field = link.add_field(table, when);
+                    let field = link.add_field(table, when, (frame, nth));
                     InputTo::Command(field.ok_or(one_too_many(Counted::CommandFields, MAX_COMMAND_FIELDS))?)
                 }
                 InputBinding::Unused => InputTo::Unused,

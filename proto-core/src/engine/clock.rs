@@ -5,7 +5,7 @@
 
 use super::counters::{add, bump};
 use super::field_port::FieldPort;
-use super::user::forget_commands;
+use super::user::silence_commands;
 use super::{Ask, Engine};
 use crate::time::{Duration, Instant};
 
@@ -120,10 +120,10 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 bump(&mut port.counters.timeouts);
                 add(&mut port.counters.values_expired, dropped);
             }
-            forget_commands(frame.bindings.of(&self.bindings.inputs), self.links.command.first_mut(), now);
+            silence_commands(frame.bindings.of(&self.bindings.inputs), self.links.command.first_mut(), now);
         }
         if timed_out {
-            self.drop_forgotten();
+            self.drop_forgotten(now);
             self.image_changed();
         }
         self.expire_waiting();

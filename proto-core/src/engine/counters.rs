@@ -67,6 +67,11 @@ pub struct PortCounters {
     pub commands: u32,
     /// Commands that could not be sent.
     pub commands_dropped: u32,
+    /// Values that are in no command table: neither a command nor idle.
+    pub commands_unknown: u32,
+    /// Values that would have picked a command, but only set the base: the first ones after the
+    /// start, silence or a lost device.
+    pub commands_based: u32,
 }
 
 /// Counters of a controller link, in addition to [`crate::link::LinkHistory`]. They wrap.

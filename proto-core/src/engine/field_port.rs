@@ -3,7 +3,7 @@
 //! In: bytes and CAN frames. Out: values in the store, and frames when they are due. Does not know
 //! how values reach the controller.
 
-use super::command_link::CommandLink;
+use super::command_link::{CommandLink, Picked};
 use super::counters::{PortCounters, add, bump};
 use super::device_port::DeviceCodec;
 use super::io::{BusState, PortId, PortState, ReplyCode};
@@ -516,11 +516,16 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
             InputTo::Command(field) => {
                 if let Some(link) = &mut self.commands {
                     let nth = self.counters.commands.wrapping_add(1);
-                    if let Some(code) = link.value(field, value, (self.port, nth), self.store.now) {
-                        self.counters.commands = nth;
-                        *self.reply = code;
-                        if code == ReplyCode::NotSent {
-                            bump(&mut self.counters.commands_dropped);
+                    match link.value(field, value, (self.port, nth), self.store.now) {
+                        Picked::Nothing => {}
+                        Picked::Unknown => bump(&mut self.counters.commands_unknown),
+                        Picked::Based => bump(&mut self.counters.commands_based),
+                        Picked::Command { reply, is_dropped } => {
+                            self.counters.commands = nth;
+                            *self.reply = reply;
+                            if is_dropped {
+                                bump(&mut self.counters.commands_dropped);
+                            }
                         }
                     }
                 }

@@ -25,6 +25,7 @@ mod io;
 mod latency;
 mod links;
 mod modbus_link;
+mod not_given;
 mod outbox;
 mod outcome;
 mod plan;
@@ -49,6 +50,7 @@ pub use counters::{LinkCounters, PortCounters};
 pub use io::{BusState, Endpoint, Input, LinkId, LinkKind, Output, PortId, PortState, ReplyCode, Transport};
 pub use latency::Latency;
 pub use links::LinkInfo;
+pub use not_given::{LastNotGiven, NotGiven};
 pub use plan::{Plan, PlanError, Source, WayUp};
 pub use rejection::{KEPT_BYTES, LastRejection, Rejection};
 pub use status::{ControllerStatus, FieldBus, Health, PortStatus, Status, VariableStatus};
@@ -321,7 +323,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         let Some(port) = find_port(&mut self.ports, id) else { return };
         self.ask = Ask::ALL;
         port.down(&self.bindings.inputs, self.links.command.first_mut(), &mut self.tap, now);
-        self.drop_forgotten();
+        self.drop_forgotten(now);
     }
 
     #[cold]
@@ -331,7 +333,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         port.bus_state(state, &self.bindings.inputs, self.links.command.first_mut(), now);
         let deadline = port.deadline();
         self.arm(deadline);
-        self.drop_forgotten();
+        self.drop_forgotten(now);
     }
 
     #[cold]
@@ -382,9 +384,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     }
 
     /// Drops commands whose device is gone.
-    fn drop_forgotten(&mut self) {
+    fn drop_forgotten(&mut self, now: Instant) {
         if let Some(command) = self.links.command.first_mut() {
-            command.drop_forgotten();
+            command.drop_forgotten(now);
             let deadline = command.deadline();
             self.arm(deadline);
         }
@@ -437,7 +439,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
         self.arm(deadline);
         if let Some(command) = self.links.command.first_mut() {
-            command.drop_overtaken();
+            command.drop_overtaken(now);
             let deadline = command.deadline();
             self.arm(deadline);
         }

@@ -10,8 +10,10 @@ use super::field_port::{Codec, FieldPort};
 use super::io::{BusState, PortId, PortState, ReplyCode};
 use super::latency::Latency;
 use super::links::{LinkInfo, LinksView};
+use super::not_given::LastNotGiven;
 use super::rejection::LastRejection;
 use super::store::InputFrame;
+use crate::config::CommandText;
 use crate::image::{GroupId, Image};
 use crate::link::LinkState;
 use crate::sysvar::{Direction, SysVar};
@@ -80,8 +82,10 @@ pub struct PortStatus<'a> {
     pub overdue: usize,
     /// Result of the newest command that one of its values picked.
     pub reply: ReplyCode,
-    /// The text of that command, such as `run(pick.jspf)`.
-    pub command: Option<&'a str>,
+    /// That command, such as `run(pick.jspf)`.
+    pub command: Option<CommandText<'a>>,
+    /// The newest value that gave no command, and why.
+    pub last_not_given: Option<&'a LastNotGiven>,
     /// The newest rejection. A CAN frame with an unknown id replaces no other rejection: on a
     /// shared bus it is for another node.
     pub last_rejection: Option<&'a LastRejection>,
@@ -206,6 +210,7 @@ impl<'a> Status<'a> {
             overdue,
             reply: port.reply,
             command: self.links.command.and_then(|link| link.newest_of(port.id)),
+            last_not_given: self.links.command.and_then(|link| link.not_given_of(port.id)),
             last_rejection: port.last_rejection.as_ref(),
             counters: &port.counters,
         }

@@ -110,7 +110,18 @@ pub(super) fn fit(bindings: &[InputBind], values: impl Iterator<Item = Scalar>) 
     })
 }
 
-/// After silence the next values pick no commands; they only set the base.
+/// The frame with these fields is overdue: the next values pick no commands, unless the fields keep
+/// their base.
+pub(super) fn silence_commands(bindings: &[InputBind], commands: Option<&mut CommandLink>, now: Instant) {
+    let Some(link) = commands else { return };
+    for binding in bindings {
+        if let InputTo::Command(field) = binding.to {
+            link.silent(field, now);
+        }
+    }
+}
+
+/// The device is gone: the next values pick no commands; they only set the base.
 pub(super) fn forget_commands(bindings: &[InputBind], commands: Option<&mut CommandLink>, now: Instant) {
     let Some(link) = commands else { return };
     for binding in bindings {

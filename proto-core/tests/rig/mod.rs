@@ -119,7 +119,7 @@ impl Cell {
         let start = self.0.commands.len() as u16;
         for &(value, text) in entries {
             let text = heapless::String::try_from(text).unwrap();
-            self.0.commands.push(CommandEntry { value, text }).unwrap();
+            self.0.commands.push(CommandEntry::new(value, text)).unwrap();
         }
         Span { start, len: entries.len() as u16 }
     }

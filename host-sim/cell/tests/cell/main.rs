@@ -1,5 +1,6 @@
 //! Whole cells in virtual time: the worked examples, faults on each side, random faults, and soak runs.
 
+mod commands;
 mod controller_faults;
 mod examples;
 mod field_faults;

@@ -1,8 +1,9 @@
 //! The bindings of fields and the triggers of output parts in a gateway file.
 
-use proto_core::config::{CommandWhen, InputBinding, OnStale, OutputBinding, SendOn};
+use proto_core::config::{InputBinding, OnStale, OutputBinding, SendOn};
 use proto_core::sysvar::SysVar;
 
+use super::commands::{self, FileCommands};
 use super::encoding::refuse;
 use super::reader::{Item, Reader, Result, Spot};
 
@@ -10,7 +11,7 @@ use super::reader::{Item, Reader, Result, Spot};
 pub(super) enum FileInput {
     Unused,
     Variable { var: SysVar, scale: f32, offset: f32 },
-    Commands { entries: Vec<FileCommand>, when: CommandWhen },
+    Commands(FileCommands),
 }
 
 impl FileInput {
@@ -18,15 +19,9 @@ impl FileInput {
     pub(super) fn without_commands(&self) -> InputBinding {
         match *self {
             Self::Variable { var, scale, offset } => InputBinding::Variable { var, scale, offset },
-            Self::Unused | Self::Commands { .. } => InputBinding::Unused,
+            Self::Unused | Self::Commands(_) => InputBinding::Unused,
         }
     }
-}
-
-pub(super) struct FileCommand {
-    pub(super) spot: Spot,
-    pub(super) value: i64,
-    pub(super) text: String,
 }
 
 /// The source of an output field.
@@ -86,7 +81,7 @@ pub(super) fn read_input(field: &Reader<'_>) -> Result<(FileInput, Option<FileIn
         refuse(field, &["scale", "offset"], "allowed only together with to")?;
     }
     if commands.is_none() {
-        refuse(field, &["when"], "allowed only together with commands")?;
+        refuse(field, &commands::KEYS, "allowed only together with commands")?;
     }
     let to = match to {
         Some(to) => {
@@ -95,37 +90,12 @@ pub(super) fn read_input(field: &Reader<'_>) -> Result<(FileInput, Option<FileIn
         }
         None => None,
     };
-    let commands = commands.map(|commands| read_commands(field, &commands)).transpose()?;
+    let commands = commands.map(|item| commands::read(field, &item).map(FileInput::Commands)).transpose()?;
     Ok(match (to, commands) {
         (Some(to), commands) => (to, commands),
         (None, Some(commands)) => (commands, None),
         (None, None) => (FileInput::Unused, None),
     })
-}
-
-fn read_commands(field: &Reader<'_>, commands: &Item<'_>) -> Result<FileInput> {
-    let when = match field.optional("when") {
-        Some(item) => item.choice(&[("change", CommandWhen::Change), ("frame", CommandWhen::Frame)])?,
-        None => CommandWhen::default(),
-    };
-    let entries = commands.any_table()?.entries().map(read_command).collect::<Result<Vec<_>>>()?;
-    if entries.is_empty() {
-        return Err(commands.error("no commands; write for example { 1 = \"run(pick.jspf,50)\" }"));
-    }
-    Ok(FileInput::Commands { entries, when })
-}
-
-fn read_command((key, key_spot, item): (&str, Spot, Item<'_>)) -> Result<FileCommand> {
-    let number = match key.strip_prefix("0x") {
-        Some(hex) => i64::from_str_radix(hex, 16),
-        None => key.parse(),
-    };
-    let Ok(value) = number else {
-        return Err(item
-            .at(key_spot)
-            .error(format!("{key:?} is not an integer; the keys of commands are values of the field")));
-    };
-    Ok(FileCommand { value, text: item.string()?.to_owned(), spot: item.spot })
 }
 
 pub(super) fn read_output(field: &Reader<'_>) -> Result<FileOutput> {

@@ -142,7 +142,7 @@ impl FieldReader {
         let bound: &[&str] = match self.direction {
             Direction::Input => {
                 refuse(&table, &["value"], "an input field has equals = 9 for a constant")?;
-                &["to", "commands", "when", "scale", "offset", "equals", "overflow"]
+                &["to", "commands", "when", "base", "idle", "scale", "offset", "equals", "overflow"]
             }
             Direction::Output => {
                 refuse(&table, &["equals"], "an output field has value = 9 for a constant")?;
@@ -173,7 +173,7 @@ impl FieldReader {
 
     /// An integer that must match.
     fn read_constant(&mut self, table: &Reader<'_>, equals: &Item<'_>) -> Result<FileFieldKind> {
-        let bindings = ["to", "commands", "when", "scale", "offset", "overflow"];
+        let bindings = ["to", "commands", "when", "base", "idle", "scale", "offset", "overflow"];
         refuse(table, &bindings, "a field with equals is a constant and has nothing else")?;
         let name = table.optional("name").map(|item| item.string().map(str::to_owned)).transpose()?;
         let encoding = encoding::read(table, self.order, &mut self.open)?;

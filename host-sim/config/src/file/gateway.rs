@@ -15,6 +15,7 @@ use proto_core::wire::dialect::Dialect;
 use proto_core::wire::scalar::Scalar;
 
 use super::bindings::FileInput;
+use super::commands::FileCommand;
 use super::document::Document;
 use super::lines::{LINE_KEYS, key_name, read_bitrate, read_cycle, read_line};
 use super::network;
@@ -182,26 +183,26 @@ impl<'a> Builder<'a> {
     fn field_spec(&mut self, field: &FileField) -> Result<FieldSpec> {
         let mut added = Ok(());
         let spec = field.bound_spec(|to| match to {
-            FileInput::Commands { entries, when } => {
+            FileInput::Commands(commands) => {
                 let start = self.config.commands.len() as u16;
-                added = entries
-                    .iter()
-                    .try_for_each(|entry| self.add_command(entry.value, &entry.text, &entry.spot));
-                InputBinding::Commands { table: Span { start, len: entries.len() as u16 }, when: *when }
+                added = commands.entries.iter().try_for_each(|entry| self.add_command(entry));
+                let table = Span { start, len: commands.entries.len() as u16 };
+                InputBinding::Commands { table, when: commands.when }
             }
             _ => to.without_commands(),
         });
         added.map(|()| spec)
     }
 
-    fn add_command(&mut self, value: i64, text: &str, spot: &Spot) -> Result<()> {
-        let Ok(bounded) = heapless::String::try_from(text) else {
+    fn add_command(&mut self, command: &FileCommand) -> Result<()> {
+        let FileCommand { spot, first, last, text } = command;
+        let Ok(bounded) = heapless::String::try_from(text.as_str()) else {
             let message = format!("the command has {} bytes; at most {MAX_COMMAND_TEXT}", text.len());
             return Err(self.error(spot, message));
         };
         let entry = self.config.commands.len() as u16;
         self.spots.insert(Place::Command { entry }, spot.clone());
-        self.config.commands.push(CommandEntry { value, text: bounded }).map_err(|_| {
+        self.config.commands.push(CommandEntry { first: *first, last: *last, text: bounded }).map_err(|_| {
             self.error(spot, format!("too many commands; at most {MAX_COMMANDS} in all recipes together"))
         })
     }

@@ -4,6 +4,7 @@
 //! [`FileError`]; the keys are those of docs/configuration.md.
 
 mod bindings;
+mod commands;
 mod controller;
 mod device;
 mod document;

@@ -242,7 +242,7 @@ struct CommandEntry {
 
 impl From<CommandEntry> for config::CommandEntry {
     fn from(CommandEntry { value, text }: CommandEntry) -> Self {
-        Self { value, text }
+        Self { first: value, last: value, text }
     }
 }
 
