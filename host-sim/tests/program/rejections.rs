@@ -41,11 +41,7 @@ fn statistics_count_wrong_checksums_and_other_devices_apart() {
     counted(
         "gripper.toml",
         "gripper",
-        &[
-            (&OTHER, "rejected_other_device", 1),
-            (&WRONG, "rejected_checksum", 1),
-            (&REPLY, "frames_in", 1),
-        ],
+        &[(&OTHER, "rejected_other_device", 1), (&WRONG, "rejected_checksum", 1), (&REPLY, "frames_in", 1)],
     );
 }
 
