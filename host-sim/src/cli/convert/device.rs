@@ -75,15 +75,15 @@ impl DevicePart {
         let effort = format.frame.layout.lengths().1 + format.frame.elements.len();
         let mut framer = Framer::new();
         let mut frames = 0;
-        // Bytes at the end that were already told of as a frame with a wrong checksum.
-        let mut told = 0;
+        // Bytes of frames with a wrong checksum, which are told of: all of them, and those that are held.
+        let (mut told, mut held) = (0, 0);
         for (number, line) in lines {
             let at = |message| format!("line {number}: {message}");
             let line = line.map_err(|error| at(error.to_string()))?;
             let bytes = text::parse_hex_line(&line).map_err(at)?;
             let mut chunk = &bytes[..];
             while let Some(found) = framer.next_frame(&mut chunk, effort, |bytes| format.probe(bytes)) {
-                told = 0;
+                held = 0;
                 match found {
                     Found::Frame(frame) => match format.show(frame) {
                         Ok(values) => {
@@ -97,18 +97,19 @@ impl DevicePart {
                         note(notes, &at(format!("{}: other constants, so not this frame", text::hex(frame))));
                     }
                     Found::Wrong(frame) => {
-                        told = frame.len() - 1;
+                        told += frame.len();
+                        held = frame.len() - 1;
                         note(notes, &at(format!("{}: {}", text::hex(frame), format.wrong_checksum(frame))));
                     }
                 }
             }
         }
-        let skipped = framer.stats().skipped_bytes;
+        let skipped = (framer.stats().skipped_bytes as usize).saturating_sub(told);
         if skipped > 0 {
-            note(notes, &format!("{skipped} bytes skipped outside of good frames"));
+            note(notes, &format!("{skipped} bytes skipped outside of frames"));
         }
         let pending = framer.held().len();
-        if pending > told {
+        if pending > held {
             note(notes, &format!("{pending} bytes of an unfinished frame at the end"));
         }
         Ok(frames)
