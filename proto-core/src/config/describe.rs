@@ -120,6 +120,9 @@ impl PortKey {
             Self::Turnaround => "turnaround",
             Self::Bitrate => "bitrate",
             Self::Listen => "listen",
+            Self::Health => "health",
+            Self::SafeAtStart => "safe at start",
+            Self::Refresh => "refresh",
         }
     }
 }
@@ -323,6 +326,20 @@ impl fmt::Display for DescribedKind<'_> {
                 write!(f, "not a value for {var}: not finite, or reserved bits are set")
             }
             Kind::SafeTwice { var } => write!(f, "{var} already has a safe value"),
+            Kind::StateValue(error) => error.fmt(f),
+            Kind::NoFieldPort { port } => {
+                write!(f, "{} is no field port; only field ports have a health", port_name(port))
+            }
+            Kind::ScaledCount => f.write_str("a count wraps, so scale and offset are not allowed"),
+            Kind::NotForHealth { var } => {
+                write!(f, "{var} cannot tell a port's health; allowed: WordInputReg, FloatInputReg")
+            }
+            Kind::HealthTwice { var } => write!(f, "this port already writes {var}"),
+            Kind::OnlyFieldPorts => f.write_str("allowed only on field ports: rs485, can"),
+            Kind::NoSafeValues => f.write_str("the port has no safe values; write them in on_timeout"),
+            Kind::OnlyChangesRefresh => {
+                f.write_str("allowed only with a recipe whose output part has send = \"change\"")
+            }
         }
     }
 }

@@ -19,6 +19,7 @@ use crate::config::{CanFramePart, ConfigView, Counted, DeviceFrame, Parts, Recip
 use crate::device::{Element, Encoding, Found, FrameLayout, Framer, Overflow, Probe};
 use crate::image::{Image, bind_to_variable};
 use crate::sysvar::{Direction, SysVar};
+use crate::time::Instant;
 use crate::wire::can::{CanFrame, CanId, MAX_CAN_DATA};
 use crate::wire::scalar::Scalar;
 
@@ -247,6 +248,7 @@ impl FieldPort {
         image: &Image,
         bindings: &[OutputBind],
         out: &mut [u8],
+        now: Instant,
     ) -> Option<Downward> {
         let Codec::Device(device) = &self.codec else { return None };
         let nth = self.sender.next_can;
@@ -265,7 +267,7 @@ impl FieldPort {
                 let len = encode(format, out).unwrap_or(0);
                 hash = digest(hash, out.get(..len).unwrap_or(&[]));
             }
-            if !self.sender.is_news(hash) {
+            if !self.sender.is_news(hash, now) {
                 self.sender.dismiss();
                 return None;
             }

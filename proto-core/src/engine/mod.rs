@@ -28,6 +28,7 @@ mod modbus_link;
 mod outbox;
 mod outcome;
 mod plan;
+mod port_health;
 mod questions;
 mod rejection;
 mod sender;
@@ -60,6 +61,7 @@ use counters::add;
 use field_output::Downward;
 use field_port::{Accepted, FieldPort};
 use links::Links;
+use port_health::PortsHealth;
 use store::{SafeBytes, Store};
 use user::Bindings;
 
@@ -97,6 +99,7 @@ pub struct Engine<
     bindings: Bindings<FIELDS>,
     safe_values: Vec<SafeBytes, MAX_SAFE_VALUES>,
     links: Links<UPLINKS>,
+    health: PortsHealth,
     /// Nothing depends on the clock before this. It may be earlier than needed, never later.
     timer_at: Instant,
     /// `timer_at` was computed after the clock was last checked.
@@ -295,6 +298,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     #[cold]
     fn port_up(&mut self, id: PortId) {
         self.change_port(id, FieldPort::up);
+        self.tell_alive(self.now);
     }
 
     #[cold]
@@ -303,6 +307,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         self.ask = Ask::ALL;
         port.down(&self.bindings.inputs, self.links.command.first_mut(), &mut self.tap, now);
         self.drop_forgotten();
+        self.tell_alive(now);
     }
 
     #[cold]
@@ -313,6 +318,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         let deadline = port.deadline();
         self.arm(deadline);
         self.drop_forgotten();
+        self.tell_alive(now);
     }
 
     #[cold]
@@ -448,6 +454,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         if !self.store.watches_bits {
             return;
         }
+        self.show_health(self.store.now);
         self.ask.ports = true;
         let mut first = Instant::NEVER;
         for port in &mut self.ports {
