@@ -259,6 +259,9 @@ fn a_device_that_is_dead_from_the_start_is_told() {
     rig.run(MS(20));
     assert_eq!(robot_sees(&rig), [0, 0, 0xFFFF, 0]);
     assert_eq!(rig.map.registers[register("WordInputReg[1]")], 99, "its own value is not invented");
+    let status = rig.engine.status(rig.now);
+    let owned: Vec<_> = status.variables().map(|known| (known.var, known.owner)).collect();
+    assert_eq!(owned, TOLD.map(|(_, name)| (var(name), Some("port0"))));
 }
 
 #[test]

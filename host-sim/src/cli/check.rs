@@ -106,6 +106,12 @@ fn gateway(config: &GatewayConfig, recipes: &[SimRecipe]) -> String {
                 report += &show_budget(part, budget, port.cycle);
             }
         }
+        if port.safe_at_start {
+            report += "  safe values from the start until the device speaks\n";
+        }
+        if let Some(refresh) = port.refresh {
+            report += &format!("  output sent on change, and after {refresh} without one\n");
+        }
     }
     report += &plan::show(config);
     report += &pendant_of_gateway(config, recipes);

@@ -269,6 +269,7 @@ impl ConfigMut<'_> {
         port.cycle = from.cycle.unwrap_or(port.cycle);
         port.timeout = from.timeout.unwrap_or(port.timeout);
         port.stale_after = from.stale_after.unwrap_or(port.stale_after);
+        (port.health, port.safe_at_start, port.refresh) = (from.health, from.safe_at_start, from.refresh);
         self.put_port(port, &from.safe)
     }
 
@@ -328,6 +329,8 @@ fn output_spec(field: &OutputField<'_>) -> Result<FieldSpec, Kind> {
         Sends::Constant(value) => OutputBinding::Constant(value),
         Sends::Counter => OutputBinding::Counter,
         Sends::Reply => OutputBinding::Reply,
+        Sends::State { value, scale, offset } => OutputBinding::State { value, scale, offset },
+        Sends::Health { port, value, scale, offset } => OutputBinding::Port { port, value, scale, offset },
     };
     Ok(FieldSpec::UserOutput { ty: field.ty, from })
 }

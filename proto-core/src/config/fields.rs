@@ -4,7 +4,7 @@
 //! Out: the same, borrowed; [`GatewayConfig::add_recipe`](super::GatewayConfig::add_recipe) reads
 //! the names.
 
-use super::{CommandWhen, FieldSpec};
+use super::{CommandWhen, FieldSpec, PortValue, StateValue};
 use crate::sysvar::{ParseError, SysVar, VarRange};
 use crate::wire::can::CanId;
 use crate::wire::scalar::ScalarType;
@@ -168,6 +168,8 @@ pub(super) enum Sends<'a> {
     Constant(f64),
     Counter,
     Reply,
+    State { value: StateValue, scale: f32, offset: f32 },
+    Health { port: Option<u8>, value: PortValue, scale: f32, offset: f32 },
 }
 
 impl<'a> OutputField<'a> {
@@ -191,9 +193,25 @@ impl<'a> OutputField<'a> {
         Self { ty, sends: Sends::Reply }
     }
 
-    /// Makes the field `variable * scale + offset`. No effect on other fields.
+    /// A value of the controller's state packet, saturated to the field's type. A program takes it
+    /// from [`StateValue::parse`].
+    pub const fn state(ty: ScalarType, value: StateValue) -> Self {
+        Self { ty, sends: Sends::State { value, scale: 1.0, offset: 0.0 } }
+    }
+
+    /// The health of the port that sends the field, or of the port with this index. Counts wrap in
+    /// the field's type and need an integer type; the others saturate.
+    pub const fn health(ty: ScalarType, port: Option<u8>, value: PortValue) -> Self {
+        Self { ty, sends: Sends::Health { port, value, scale: 1.0, offset: 0.0 } }
+    }
+
+    /// Makes the field `value * scale + offset` of a variable, of a value of the state packet or of a
+    /// port's health; counts refuse it. No effect on other fields.
     pub fn scaled(mut self, scale: f32, offset: f32) -> Self {
-        if let Sends::Variable { scale: own_scale, offset: own_offset, .. } = &mut self.sends {
+        if let Sends::Variable { scale: own_scale, offset: own_offset, .. }
+        | Sends::State { scale: own_scale, offset: own_offset, .. }
+        | Sends::Health { scale: own_scale, offset: own_offset, .. } = &mut self.sends
+        {
             (*own_scale, *own_offset) = (scale, offset);
         }
         self

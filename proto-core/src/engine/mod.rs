@@ -451,9 +451,14 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
 
     /// Values in the image changed: checks for rising bits that trigger.
     fn image_changed(&mut self) {
-        if !self.store.watches_bits {
-            return;
+        if self.store.watches_bits {
+            self.check_triggers();
         }
+    }
+
+    // On its own, so that engines without triggers do not pay for its registers.
+    #[inline(never)]
+    fn check_triggers(&mut self) {
         self.show_health(self.store.now);
         self.ask.ports = true;
         let mut first = Instant::NEVER;

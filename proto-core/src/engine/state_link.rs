@@ -74,6 +74,17 @@ impl StateLink {
         }
     }
 
+    /// Keeps the packet's other values that ports show. On its own, so that a gateway without them
+    /// does not pay for its registers.
+    #[inline(never)]
+    fn keep<const PORTS: usize>(&mut self, view: &StateView<'_>, store: &mut Store<PORTS>) {
+        for kept in &self.kept {
+            if !store.image.receive_extra(kept.extra, kept.read(view)) {
+                bump(&mut self.counters.unreadable);
+            }
+        }
+    }
+
     pub(super) fn transport(&self) -> Transport {
         Transport::Tcp { port: self.port }
     }
@@ -101,10 +112,8 @@ impl Connection for StateLink {
                             bump(&mut self.counters.unreadable);
                         }
                     }
-                    for kept in &self.kept {
-                        if !store.image.receive_extra(kept.extra, kept.read(&view)) {
-                            bump(&mut self.counters.unreadable);
-                        }
+                    if !self.kept.is_empty() {
+                        self.keep(&view, store);
                     }
                     for var in not_live.iter() {
                         if view.read_var(var).is_some_and(|value| store.image.set(var, value).is_ok()) {
