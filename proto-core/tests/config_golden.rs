@@ -12,7 +12,7 @@ use proto_core::config::image::{
 };
 use proto_core::config::{
     BoardAddress, Bus, CommandWhen, FieldSpec, GatewayConfig, InputBinding, OnStale, OutputBinding, Parity,
-    Parts, SendOn,
+    Parts, PortValue, SendOn,
 };
 use proto_core::device::{Algorithm, ByteOrder, Kind, Overflow, Width};
 use proto_core::recipe::model::Mode;
@@ -169,6 +169,7 @@ fn serialized_types_are_those_of_the_version() {
         OutputBinding,
         Parity,
         Parts,
+        PortValue,
         Scalar,
         ScalarType,
         SendOn,

@@ -110,6 +110,12 @@ fn gateway(config: &GatewayConfig, recipes: &[AnyRecipe]) -> String {
                 }
             }
         }
+        if port.safe_at_start {
+            report += "  safe values from the start until the device speaks\n";
+        }
+        if let Some(refresh) = port.refresh {
+            report += &format!("  output sent on change, and after {refresh} without one\n");
+        }
     }
     report += &plan::show(config);
     report += &pendant_of_gateway(config, recipes);

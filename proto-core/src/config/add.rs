@@ -281,6 +281,7 @@ impl ConfigMut<'_> {
         port.cycle = from.cycle.unwrap_or(port.cycle);
         port.timeout = from.timeout.unwrap_or(port.timeout);
         port.stale_after = from.stale_after.unwrap_or(port.stale_after);
+        (port.health, port.safe_at_start, port.refresh) = (from.health, from.safe_at_start, from.refresh);
         self.put_port(port, &from.safe)
     }
 
@@ -341,6 +342,10 @@ fn output_spec(field: &OutputField<'_>) -> Result<FieldSpec, Kind> {
             Sends::Constant(value) => OutputBinding::Constant(value),
             Sends::Counter => OutputBinding::Counter,
             Sends::Reply => OutputBinding::Reply,
+            Sends::State { value, scale, offset } => OutputBinding::State { value, scale, offset },
+            Sends::Health { port, value, scale, offset } => {
+                OutputBinding::Port { port, value, scale, offset }
+            }
         };
         Ok(match plain(encoding, overflow) {
             Some(ty) => FieldSpec::UserOutput { ty, from },

@@ -12,6 +12,7 @@ use crate::device::{Boundary, Encoding, LayoutError, Overflow};
 use crate::recipe::model::{Framing, MAX_STREAM_FRAME, Mode, Rules};
 use crate::recipe::{CanLayout, PartError, StreamLayout};
 use crate::sysvar::{COUNT, Direction, SysVar};
+use crate::wire::dialect::Dialect;
 use crate::wire::scalar::{Scalar, ScalarType};
 
 /// One recipe under check.
@@ -76,6 +77,7 @@ impl<'a> RecipeCheck<'a> {
                 self.check_input(place, Numbers::of(ty), to)
             }
             (Mode::User, Direction::Output, FieldSpec::UserOutput { ty, from }) => {
+                self.check_source(place, from)?;
                 check_output(place, ty, from)
             }
             (Mode::User, Direction::Input, FieldSpec::DeviceInput { encoding, overflow, to }) => {
@@ -89,6 +91,7 @@ impl<'a> RecipeCheck<'a> {
                 if overflow == Overflow::Wrap && !encoding.is_integer() {
                     return fail(place, Kind::OnlyIntegersWrap);
                 }
+                self.check_source(place, from)?;
                 check_device_output(place, &encoding, from)
             }
             (
@@ -134,6 +137,32 @@ impl<'a> RecipeCheck<'a> {
                 }
                 self.check_commands(place, numbers, table)
             }
+        }
+    }
+
+    /// The checks of sources that are no variables, the same for every field.
+    fn check_source(&self, place: Place, from: OutputBinding) -> Check {
+        match from {
+            OutputBinding::State { value, scale, offset } => {
+                // An unknown dialect is refused first.
+                let dialect = Dialect::named(&self.config.controller.dialect).unwrap_or(Dialect::V2_3);
+                if let Err(error) = value.place(&dialect) {
+                    return fail(place, Kind::StateValue(error));
+                }
+                check_scale(place, scale, offset)
+            }
+            OutputBinding::Port { port, value, scale, offset } => {
+                if let Some(port) = port
+                    && !self.config.field_ports().any(|(index, _, _)| index == port)
+                {
+                    return fail(place, Kind::NoFieldPort { port });
+                }
+                if value.is_count() && (scale, offset) != (1.0, 0.0) {
+                    return fail(place, Kind::ScaledCount);
+                }
+                check_scale(place, scale, offset)
+            }
+            _ => Ok(()),
         }
     }
 
@@ -315,7 +344,10 @@ fn check_device_output(place: Place, encoding: &Encoding, from: OutputBinding) -
             if is_whole { Ok(()) } else { fail(place, Kind::NeedsIntegers) }
         }
         OutputBinding::Counter if !encoding.is_integer() => fail(place, Kind::NeedsIntegers),
-        OutputBinding::Counter | OutputBinding::Reply => Ok(()),
+        OutputBinding::Port { value, .. } if value.is_count() && !encoding.is_integer() => {
+            fail(place, Kind::NeedsIntegers)
+        }
+        _ => Ok(()),
     }
 }
 
@@ -373,7 +405,12 @@ fn check_output(place: Place, ty: ScalarType, from: OutputBinding) -> Check {
         OutputBinding::Counter if matches!(ty, ScalarType::Float | ScalarType::Double) => {
             fail(place, Kind::NeedsInteger { ty })
         }
-        OutputBinding::Counter | OutputBinding::Reply => Ok(()),
+        OutputBinding::Port { value, .. }
+            if value.is_count() && matches!(ty, ScalarType::Float | ScalarType::Double) =>
+        {
+            fail(place, Kind::NeedsInteger { ty })
+        }
+        _ => Ok(()),
     }
 }
 

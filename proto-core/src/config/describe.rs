@@ -121,6 +121,9 @@ impl PortKey {
             Self::Turnaround => "turnaround",
             Self::Bitrate => "bitrate",
             Self::Listen => "listen",
+            Self::Health => "health",
+            Self::SafeAtStart => "safe at start",
+            Self::Refresh => "refresh",
         }
     }
 }
@@ -341,6 +344,20 @@ impl fmt::Display for DescribedKind<'_> {
             Kind::CommandFor { value, error } => write!(f, "with the value {value}: {error}"),
             Kind::BackwardRange { first, last } => {
                 write!(f, "{first}..{last} contains no value; allowed: {last}..{first}")
+            }
+            Kind::StateValue(error) => error.fmt(f),
+            Kind::NoFieldPort { port } => {
+                write!(f, "{} is no field port; only field ports have a health", port_name(port))
+            }
+            Kind::ScaledCount => f.write_str("a count wraps, so scale and offset are not allowed"),
+            Kind::NotForHealth { var } => {
+                write!(f, "{var} cannot tell a port's health; allowed: WordInputReg, FloatInputReg")
+            }
+            Kind::HealthTwice { var } => write!(f, "this port already writes {var}"),
+            Kind::OnlyFieldPorts => f.write_str("allowed only on field ports: rs485, can"),
+            Kind::NoSafeValues => f.write_str("the port has no safe values; write them in on_timeout"),
+            Kind::OnlyChangesRefresh => {
+                f.write_str("allowed only with a recipe whose output part has send = \"change\"")
             }
         }
     }

@@ -2,7 +2,7 @@
 
 use core::net::Ipv4Addr;
 
-use super::Network;
+use super::{Network, StateValueError};
 use crate::command::ParseError;
 use crate::device::LayoutError;
 use crate::recipe::PartError;
@@ -151,6 +151,12 @@ pub enum PortKey {
     Bitrate,
     /// The address to listen on.
     Listen,
+    /// The variables of its health.
+    Health,
+    /// Whether it starts with safe values.
+    SafeAtStart,
+    /// When it sends without a change.
+    Refresh,
 }
 
 /// A list with a limited number of entries: of a configuration, or of the engine that runs it.
@@ -189,6 +195,8 @@ pub enum Counted {
     Groups,
     /// Blocks of neighbouring variables that are polled by Modbus.
     PollBlocks,
+    /// Values of the state packet and of the health of ports that all ports send.
+    Sources,
 }
 
 impl core::fmt::Display for Counted {
@@ -210,6 +218,7 @@ impl core::fmt::Display for Counted {
             Self::CommandBytes => "bytes of command texts",
             Self::Groups => "groups",
             Self::PollBlocks => "Modbus poll blocks",
+            Self::Sources => "values of the controller's state and of the health of ports",
         })
     }
 }
@@ -520,4 +529,29 @@ pub enum ConfigErrorKind {
         /// The last value.
         last: i64,
     },
+    /// The controller's state packet has no such value.
+    StateValue(StateValueError),
+    /// There is no field port with this index.
+    NoFieldPort {
+        /// The index.
+        port: u8,
+    },
+    /// Counts have no scale and offset: they wrap.
+    ScaledCount,
+    /// The variable cannot tell the health of a port.
+    NotForHealth {
+        /// The variable.
+        var: SysVar,
+    },
+    /// The port itself writes the variable, from its frames or as another value of its health.
+    HealthTwice {
+        /// The variable.
+        var: SysVar,
+    },
+    /// Only field ports have this key.
+    OnlyFieldPorts,
+    /// Safe values at the start, but the port has no safe values.
+    NoSafeValues,
+    /// Only a recipe that is sent on change is refreshed.
+    OnlyChangesRefresh,
 }

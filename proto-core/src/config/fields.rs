@@ -5,7 +5,7 @@
 //! the names.
 
 use super::error::ConfigErrorKind as Kind;
-use super::{CommandWhen, FieldSpec};
+use super::{CommandWhen, FieldSpec, PortValue, StateValue};
 use crate::device::{Algorithm, Checksum, Encoding, Kind as EncodingKind, Overflow};
 use crate::sysvar::{ParseError, SysVar, VarRange};
 use crate::wire::can::CanId;
@@ -303,6 +303,8 @@ pub(super) enum Sends<'a> {
     Constant(f64),
     Counter,
     Reply,
+    State { value: StateValue, scale: f32, offset: f32 },
+    Health { port: Option<u8>, value: PortValue, scale: f32, offset: f32 },
 }
 
 impl<'a> OutputField<'a> {
@@ -346,9 +348,25 @@ impl<'a> OutputField<'a> {
         Self { on_wire: self.on_wire.wrapping(), ..self }
     }
 
-    /// Makes the field `variable * scale + offset`. No effect on other fields.
+    /// A value of the controller's state packet, saturated to the field's type. A program takes it
+    /// from [`StateValue::parse`].
+    pub fn state(encoding: impl Into<Encoding>, value: StateValue) -> Self {
+        Self::new(encoding, Sends::State { value, scale: 1.0, offset: 0.0 })
+    }
+
+    /// The health of the port that sends the field, or of the port with this index. Counts wrap in
+    /// the field's type and need an integer type; the others saturate.
+    pub fn health(encoding: impl Into<Encoding>, port: Option<u8>, value: PortValue) -> Self {
+        Self::new(encoding, Sends::Health { port, value, scale: 1.0, offset: 0.0 })
+    }
+
+    /// Makes the field `value * scale + offset` of a variable, of a value of the state packet or of a
+    /// port's health; counts refuse it. No effect on other fields.
     pub fn scaled(mut self, scale: f32, offset: f32) -> Self {
-        if let Sends::Variable { scale: own_scale, offset: own_offset, .. } = &mut self.sends {
+        if let Sends::Variable { scale: own_scale, offset: own_offset, .. }
+        | Sends::State { scale: own_scale, offset: own_offset, .. }
+        | Sends::Health { scale: own_scale, offset: own_offset, .. } = &mut self.sends
+        {
             (*own_scale, *own_offset) = (scale, offset);
         }
         self

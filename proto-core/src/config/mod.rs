@@ -23,6 +23,7 @@ mod network;
 mod port;
 mod recipe;
 mod rules;
+mod source;
 mod validate;
 mod view;
 
@@ -45,6 +46,7 @@ pub use recipe::{
     OutputBinding, Parts, Recipe, SendOn, Span, StreamPart, Words,
 };
 pub use rules::{check_address, check_bitrate, check_cycle, check_name};
+pub use source::{PortHealth, PortValue, StateValue, StateValueError};
 pub(crate) use view::ConfigMut;
 pub use view::ConfigView;
 

@@ -5,7 +5,7 @@
 
 use heapless::{String, Vec};
 
-use super::{Delimiter, Name};
+use super::{Delimiter, Name, PortValue, StateValue};
 use crate::device::{Boundary, ByteOrder, Checksum, Encoding, Escape, Length, Overflow, Text};
 use crate::recipe::model::{Field, MAX_CAN_IDS, Mode};
 use crate::sysvar::{Direction, SysVar};
@@ -254,6 +254,14 @@ impl FieldSpec {
         }
     }
 
+    /// Where the value of a user-defined output field comes from.
+    pub fn source(&self) -> Option<OutputBinding> {
+        match *self {
+            Self::UserOutput { from, .. } | Self::DeviceOutput { from, .. } => Some(from),
+            _ => None,
+        }
+    }
+
     /// The system variable that the field is, or that its value is bound to; texts have several, see
     /// [`Self::variables`].
     pub fn variable(&self) -> Option<SysVar> {
@@ -265,7 +273,7 @@ impl FieldSpec {
             },
             Self::UserOutput { from, .. } | Self::DeviceOutput { from, .. } => match from {
                 OutputBinding::Variable { var, .. } => Some(var),
-                OutputBinding::Constant(_) | OutputBinding::Counter | OutputBinding::Reply => None,
+                _ => None,
             },
             _ => None,
         }
@@ -341,6 +349,28 @@ pub enum OutputBinding {
     Counter,
     /// The result of this port's newest command: see [`crate::engine::ReplyCode`].
     Reply,
+    /// `value * scale + offset` of the controller's newest state packet, saturated to the field's
+    /// type.
+    State {
+        /// The value.
+        value: StateValue,
+        /// Scale.
+        scale: f32,
+        /// Offset, added after scaling.
+        offset: f32,
+    },
+    /// The health of a field port. Counts wrap in the field's type, and take no scale and offset;
+    /// the others are `value * scale + offset`, saturated.
+    Port {
+        /// Index of the port in the configuration; `None` is the port that sends the field.
+        port: Option<u8>,
+        /// What is sent.
+        value: PortValue,
+        /// Scale.
+        scale: f32,
+        /// Offset, added after scaling.
+        offset: f32,
+    },
 }
 
 /// One entry of a command table.

@@ -14,6 +14,7 @@ use super::links::Links;
 use super::modbus_link::{MAX_POLL_BLOCKS, ModbusLink};
 use super::outbox::EdgeQueue;
 use super::plan::{Plan, PlanError, Source, WayUp, shown_by, uplinks};
+use super::port_health::PortsHealth;
 use super::sender::Sender;
 use super::state_link::StateLink;
 use super::store::{InputFrame, MAX_INPUT_FRAMES, SafeBytes, Store};
@@ -108,10 +109,10 @@ pub(super) fn one_too_many(what: Counted, room: usize) -> BuildError {
 }
 
 /// Groups are assigned in order: field frames first.
-struct Groups(u8);
+pub(super) struct Groups(u8);
 
 impl Groups {
-    fn next(&mut self) -> Option<GroupId> {
+    pub(super) fn next(&mut self) -> Option<GroupId> {
         let group = GroupId(self.0);
         (usize::from(self.0) < MAX_GROUPS).then(|| self.0 = self.0.saturating_add(1))?;
         Some(group)
@@ -131,6 +132,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             bindings: Bindings { inputs: Vec::new(), outputs: Vec::new() },
             safe_values: Vec::new(),
             links: Links::new(),
+            health: PortsHealth::new(),
             timer_at: Instant::ZERO,
             is_armed: false,
             now: Instant::ZERO,
@@ -184,6 +186,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             bindings,
             safe_values,
             links,
+            health,
             timer_at,
             is_armed,
             now,
@@ -208,6 +211,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         state.clear();
         modbus.clear();
         recipes.clear();
+        health.clear();
         *timer_at = Instant::ZERO;
         *is_armed = false;
         *now = Instant::ZERO;
@@ -250,6 +254,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
         self.assign_read_back(&plan);
         self.assign_sources(config, &plan, &mut groups)?;
+        self.assign_extra(&dialect)?;
+        self.assign_health(config, &mut groups)?;
         self.assign_witnesses();
         Ok(())
     }
@@ -317,6 +323,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             _ => LineTiming::none(),
         };
         let first_frame = self.store.frames.len() as u8;
+        if port.safe_at_start {
+            self.store.is_overdue_from_start();
+        }
         let mut next_binding = self.bindings.inputs.len() as u16;
         for (_, fields) in recipe.frames(Direction::Input) {
             let fields = fields.of(config.fields);
@@ -329,7 +338,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 set,
                 port: self.ports.len() as u8,
                 bindings,
-                overdue_at: Instant::NEVER,
+                overdue_at: if port.safe_at_start { Instant::ZERO } else { Instant::NEVER },
                 timeout: port.timeout,
             };
             let group = GroupId(self.store.frames.len() as u8);
@@ -376,7 +385,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
         self.store.watches_bits |= matches!(recipe.send, SendOn::Rising { .. });
         let has_output = recipe.has(Direction::Output);
-        let sender = Sender::new(recipe.send, recipe.on_stale, port.stale_after, port.cycle, has_output);
+        let mut sender = Sender::new(recipe.send, recipe.on_stale, port.stale_after, port.cycle, has_output);
+        sender.refresh = port.refresh.unwrap_or(Duration::MAX);
         let port = FieldPort {
             id: PortId(index),
             name: port.name.clone(),

@@ -5,6 +5,7 @@
 
 use super::counters::{add, bump};
 use super::field_port::FieldPort;
+use super::store::Overdue;
 use super::user::silence_commands;
 use super::{Ask, Engine};
 use crate::time::{Duration, Instant};
@@ -114,7 +115,11 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
 
     fn expire_frames(&mut self, now: Instant) {
         let mut timed_out = false;
-        while let Some((frame, dropped)) = self.store.next_timeout(&self.safe_values) {
+        while let Some(overdue) = self.store.next_timeout(&self.safe_values) {
+            let Overdue::Frame(frame, dropped) = overdue else {
+                self.check_health(now);
+                continue;
+            };
             timed_out = true;
             if let Some(port) = self.ports.get_mut(usize::from(frame.port)) {
                 bump(&mut port.counters.timeouts);
@@ -125,6 +130,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         if timed_out {
             self.drop_forgotten(now);
             self.image_changed();
+            self.tell_alive(now);
         }
         self.expire_waiting();
     }

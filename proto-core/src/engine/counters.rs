@@ -106,6 +106,23 @@ pub struct LinkCounters {
     pub round_trip_max_us: u32,
 }
 
+impl PortCounters {
+    /// Frames that were rejected; those for other nodes of a CAN bus are not.
+    pub(super) fn rejected(&self) -> u32 {
+        let all = [
+            self.rejected_not_finite,
+            self.rejected_out_of_range,
+            self.rejected_length,
+            self.rejected_checksum,
+            self.rejected_unreadable,
+            self.rejected_other_device,
+            self.rejected_no_input,
+            self.tail_mismatches,
+        ];
+        all.into_iter().fold(0, u32::wrapping_add)
+    }
+}
+
 impl LinkCounters {
     /// All zero.
     pub(super) const ZERO: Self = Self {

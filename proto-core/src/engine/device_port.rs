@@ -277,6 +277,7 @@ impl FieldPort {
         image: &Image,
         bindings: &[OutputBind],
         out: &mut [u8],
+        now: Instant,
     ) -> Option<Downward> {
         let Codec::Device(device) = &self.codec else { return None };
         let nth = self.sender.next_can;
@@ -296,7 +297,7 @@ impl FieldPort {
                 let len = encode(format, out).unwrap_or(0);
                 hash = digest(hash, out.get(..len).unwrap_or(&[]));
             }
-            if !self.sender.is_news(hash) {
+            if !self.sender.is_news(hash, now) {
                 self.sender.dismiss();
                 return None;
             }

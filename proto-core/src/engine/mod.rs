@@ -29,6 +29,7 @@ mod not_given;
 mod outbox;
 mod outcome;
 mod plan;
+mod port_health;
 mod questions;
 mod rejection;
 mod sender;
@@ -63,6 +64,7 @@ use counters::add;
 use field_output::Downward;
 use field_port::{Accepted, FieldPort};
 use links::Links;
+use port_health::PortsHealth;
 use store::{SafeBytes, Store};
 use user::Bindings;
 
@@ -100,6 +102,7 @@ pub struct Engine<
     bindings: Bindings<FIELDS>,
     safe_values: Vec<SafeBytes, MAX_SAFE_VALUES>,
     links: Links<UPLINKS>,
+    health: PortsHealth,
     /// Nothing depends on the clock before this. It may be earlier than needed, never later.
     timer_at: Instant,
     /// `timer_at` was computed after the clock was last checked.
@@ -316,6 +319,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     #[cold]
     fn port_up(&mut self, id: PortId) {
         self.change_port(id, FieldPort::up);
+        self.tell_alive(self.now);
     }
 
     #[cold]
@@ -324,6 +328,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         self.ask = Ask::ALL;
         port.down(&self.bindings.inputs, self.links.command.first_mut(), &mut self.tap, now);
         self.drop_forgotten(now);
+        self.tell_alive(now);
     }
 
     #[cold]
@@ -334,6 +339,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         let deadline = port.deadline();
         self.arm(deadline);
         self.drop_forgotten(now);
+        self.tell_alive(now);
     }
 
     #[cold]
@@ -466,9 +472,15 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
 
     /// Values in the image changed: checks for rising bits that trigger.
     fn image_changed(&mut self) {
-        if !self.store.watches_bits {
-            return;
+        if self.store.watches_bits {
+            self.check_triggers();
         }
+    }
+
+    // On its own, so that engines without triggers do not pay for its registers.
+    #[inline(never)]
+    fn check_triggers(&mut self) {
+        self.show_health(self.store.now);
         self.ask.ports = true;
         let mut first = Instant::NEVER;
         for port in &mut self.ports {

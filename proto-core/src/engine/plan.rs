@@ -39,6 +39,7 @@ pub struct Plan {
     ways: [Option<WayUp>; INPUT_COUNT],
     sources: [Option<Source>; COUNT],
     read_back: InputSet,
+    shows_state: bool,
 }
 
 /// Why a variable has no way.
@@ -121,10 +122,11 @@ impl Plan {
             ways: [None; INPUT_COUNT],
             sources: [None; COUNT],
             read_back: InputSet::EMPTY,
+            shows_state: config.shows_state(),
         };
-        for (port, recipe) in field_ports(config) {
-            for var in inputs_of(config, recipe) {
-                plan.claim(config, var, port)?;
+        for (id, port, recipe) in config.field_ports() {
+            for var in config.owned_by(port, recipe) {
+                plan.claim(config, var, PortId(id))?;
             }
         }
         for (port, recipe) in field_ports(config) {
@@ -173,7 +175,7 @@ impl Plan {
 
     /// Whether the 2001 stream is needed.
     pub(super) fn needs_state(&self) -> bool {
-        !self.read_back.is_empty() || self.sources.contains(&Some(Source::State))
+        self.shows_state || !self.read_back.is_empty() || self.sources.contains(&Some(Source::State))
     }
 
     /// Whether Modbus is needed.

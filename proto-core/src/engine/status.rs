@@ -11,6 +11,7 @@ use super::io::{BusState, PortId, PortState, ReplyCode};
 use super::latency::Latency;
 use super::links::{LinkInfo, LinksView};
 use super::not_given::LastNotGiven;
+use super::port_health::PortsHealth;
 use super::rejection::LastRejection;
 use super::store::InputFrame;
 use crate::config::CommandText;
@@ -27,6 +28,7 @@ pub struct Status<'a> {
     pub(super) at: Instant,
     pub(super) ports: &'a [FieldPort],
     pub(super) frames: &'a [InputFrame],
+    pub(super) health: &'a PortsHealth,
     pub(super) image: &'a Image,
     pub(super) links: LinksView<'a>,
     pub(super) latency: &'a Latency,
@@ -184,8 +186,9 @@ impl<'a> Status<'a> {
         if var.direction() != Direction::Input {
             return None;
         }
-        let frame = self.frames.iter().find(|frame| frame.set.contains(var))?;
-        self.ports.get(usize::from(frame.port)).map(|port| port.name.as_str())
+        let frame = self.frames.iter().find(|frame| frame.set.contains(var));
+        let port = frame.map(|frame| frame.port).or_else(|| self.health.owner(var))?;
+        self.ports.get(usize::from(port)).map(|port| port.name.as_str())
     }
 
     fn port(&self, index: usize, port: &'a FieldPort) -> PortStatus<'a> {

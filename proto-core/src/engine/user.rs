@@ -137,6 +137,8 @@ pub(super) fn forget_commands(bindings: &[InputBind], commands: Option<&mut Comm
 pub(super) struct OutputBind {
     pub ty: ScalarType,
     pub from: OutputBinding,
+    /// The place of its value among the image's extra values, if it is there.
+    pub extra: u8,
     pub written: Written,
 }
 
@@ -147,7 +149,7 @@ impl OutputBind {
             Element::Fixed { value, .. } => OutputBinding::Constant(value as f64),
             _ => from,
         };
-        Self { ty, from, written: Written::new(element) }
+        Self { ty, from, extra: 0, written: Written::new(element) }
     }
 
     pub(super) fn element(&self) -> Element {
@@ -166,7 +168,7 @@ pub(super) fn values(
     reply: ReplyCode,
 ) -> Vec<Scalar, MAX_FIELDS> {
     let mut values = Vec::new();
-    for &OutputBind { ty, from, .. } in bindings {
+    for &OutputBind { ty, from, extra, .. } in bindings {
         let value = match from {
             OutputBinding::Variable { var, scale, offset } => {
                 saturate_to_field(ty, image.value(var).as_f64(), scale, offset)
@@ -174,6 +176,12 @@ pub(super) fn values(
             OutputBinding::Constant(value) => saturate_to_field(ty, value, 1.0, 0.0),
             OutputBinding::Counter => wrapping_count(ty, frames_sent),
             OutputBinding::Reply => saturate_to_field(ty, f64::from(reply as u8), 1.0, 0.0),
+            OutputBinding::Port { value, .. } if value.is_count() => {
+                wrapping_count(ty, image.extra(extra) as u32)
+            }
+            OutputBinding::State { scale, offset, .. } | OutputBinding::Port { scale, offset, .. } => {
+                saturate_to_field(ty, image.extra(extra), scale, offset)
+            }
         };
         // A part has no more fields than there is room for.
         let _ = values.push(value);
@@ -188,13 +196,22 @@ pub(super) fn number_of(binding: &OutputBind, image: &Image, frames_sent: u32, r
             image.value(var).as_f64() * f64::from(scale) + f64::from(offset)
         }
         OutputBinding::Constant(value) => value,
-        OutputBinding::Counter => {
-            // It never turns negative, nor stays at the highest number.
-            let high = binding.element().encoding().map_or(0.0, |encoding| encoding.range().1);
-            wrap(f64::from(frames_sent), 0.0, high.min(f64::from(u32::MAX))).unwrap_or(f64::NAN)
-        }
+        OutputBinding::Counter => wrapping_number(binding, f64::from(frames_sent)),
         OutputBinding::Reply => f64::from(reply as u8),
+        OutputBinding::Port { value, .. } if value.is_count() => {
+            wrapping_number(binding, image.extra(binding.extra))
+        }
+        OutputBinding::State { scale, offset, .. } | OutputBinding::Port { scale, offset, .. } => {
+            image.extra(binding.extra) * f64::from(scale) + f64::from(offset)
+        }
     }
+}
+
+/// A count as the field of a device's frame shows it: it never turns negative, nor stays at the
+/// highest number.
+fn wrapping_number(binding: &OutputBind, count: f64) -> f64 {
+    let high = binding.element().encoding().map_or(0.0, |encoding| encoding.range().1);
+    wrap(count, 0.0, high.min(f64::from(u32::MAX))).unwrap_or(f64::NAN)
 }
 
 /// The bindings of all ports; ports name ranges of it.
@@ -205,7 +222,7 @@ pub(super) struct Bindings<const FIELDS: usize> {
 }
 
 /// The count in the field's type, wrapping.
-fn wrapping_count(ty: ScalarType, count: u32) -> Scalar {
+pub(super) fn wrapping_count(ty: ScalarType, count: u32) -> Scalar {
     match ty {
         ScalarType::Byte => Scalar::Byte(count as u8),
         ScalarType::Char => Scalar::Char((count & 0x7F) as i8),

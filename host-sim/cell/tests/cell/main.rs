@@ -8,3 +8,4 @@ mod kit;
 mod random_faults;
 mod robot;
 mod soak;
+mod sources;

@@ -6,6 +6,7 @@ use proto_core::sysvar::SysVar;
 use super::commands::{self, FileCommands};
 use super::encoding::refuse;
 use super::reader::{Item, Reader, Result, Spot};
+use super::sources;
 
 /// The binding of an input field.
 pub(super) enum FileInput {
@@ -29,6 +30,12 @@ pub(super) enum FileOutput {
     /// A program of the controller sets it.
     Program,
     Bound(OutputBinding),
+    /// The health of a port with this name, which may stand behind the recipe.
+    PortNamed {
+        name: String,
+        spot: Spot,
+        binding: OutputBinding,
+    },
 }
 
 /// When an output part is sent.
@@ -112,6 +119,10 @@ pub(super) fn read_output(field: &Reader<'_>) -> Result<FileOutput> {
         (Some(from), None) => match from.string()? {
             "counter" => OutputBinding::Counter,
             "reply" => OutputBinding::Reply,
+            text if sources::is_source(text) => {
+                let (scale, offset) = read_scale(field)?;
+                return sources::read(&from, text, scale, offset);
+            }
             _ => {
                 let (scale, offset) = read_scale(field)?;
                 OutputBinding::Variable { var: read_var(&from)?, scale, offset }
@@ -119,7 +130,11 @@ pub(super) fn read_output(field: &Reader<'_>) -> Result<FileOutput> {
         },
     };
     if !matches!(binding, OutputBinding::Variable { .. }) {
-        refuse(field, &["scale", "offset"], "allowed only together with from = a variable")?;
+        refuse(
+            field,
+            &["scale", "offset"],
+            "allowed only together with from = a variable or another value that it can scale",
+        )?;
     }
     Ok(FileOutput::Bound(binding))
 }

@@ -21,6 +21,7 @@ use super::lines::{LINE_KEYS, key_name, read_bitrate, read_cycle, read_line};
 use super::network;
 use super::reader::{Item, Reader, Result, Spot};
 use super::recipes::{self, FileField, FilePart, FileRecipe, Flavour};
+use super::sources;
 
 /// The top-level keys of a gateway file.
 pub(super) const KEYS: [&str; 4] = ["controller", "network", "recipe", "port"];
@@ -30,11 +31,15 @@ pub(super) fn read(document: &Document) -> Result<Box<GatewayConfig>> {
     let root = Reader::root(document, &KEYS)?;
     let recipes = recipes::read_all(&root, Flavour::Gateway)?;
     let mut builder = Builder::new(&root, &recipes)?;
+    let port_keys = [&COMMON_KEYS[..], &FIELD_KEYS, &LINE_KEYS, &["bitrate", "listen"]].concat();
+    let ports = root.tables("port", &port_keys)?;
+    // Recipes may name ports.
+    builder.port_names =
+        ports.iter().filter_map(|port| port.optional("name")?.as_string()).map(str::to_owned).collect();
     for (index, recipe) in recipes.iter().enumerate() {
         builder.add_recipe(index, recipe)?;
     }
-    let port_keys = [&COMMON_KEYS[..], &["on_timeout"], &LINE_KEYS, &["bitrate", "listen"]].concat();
-    for port in root.tables("port", &port_keys)? {
+    for port in ports {
         builder.add_port(&port, &recipes)?;
     }
     builder.finish()
@@ -42,6 +47,9 @@ pub(super) fn read(document: &Document) -> Result<Box<GatewayConfig>> {
 
 /// The keys of a port on any bus.
 const COMMON_KEYS: [&str; 6] = ["name", "bus", "recipe", "cycle_ms", "timeout_ms", "stale_after_ms"];
+
+/// The keys of a field port, on any bus.
+const FIELD_KEYS: [&str; 4] = ["on_timeout", "safe_at_start", "refresh_ms", "health"];
 
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum BusKind {
@@ -63,6 +71,8 @@ struct Builder<'a> {
     document: &'a Document,
     config: Box<GatewayConfig>,
     spots: HashMap<Place, Spot>,
+    /// The names of all ports, also of those that have not been read yet.
+    port_names: Vec<String>,
 }
 
 impl<'a> Builder<'a> {
@@ -98,7 +108,7 @@ impl<'a> Builder<'a> {
         let mut config = Box::new(GatewayConfig::empty());
         config.controller = controller;
         config.network = network.into();
-        Ok(Self { document: root.document, config, spots })
+        Ok(Self { document: root.document, config, spots, port_names: Vec::new() })
     }
 
     fn error(&self, spot: &Spot, message: impl ToString) -> super::FileError {
@@ -191,7 +201,21 @@ impl<'a> Builder<'a> {
             }
             _ => to.without_commands(),
         });
-        added.map(|()| spec)
+        added?;
+        match field.port_named() {
+            Some((binding, name, spot)) => {
+                let from = sources::of_port(binding, name, &self.port_names)
+                    .map_err(|message| self.error(spot, message))?;
+                Ok(match spec {
+                    FieldSpec::UserOutput { ty, .. } => FieldSpec::UserOutput { ty, from },
+                    FieldSpec::DeviceOutput { encoding, overflow, .. } => {
+                        FieldSpec::DeviceOutput { encoding, overflow, from }
+                    }
+                    other => other,
+                })
+            }
+            None => Ok(spec),
+        }
     }
 
     fn add_command(&mut self, command: &FileCommand) -> Result<()> {
@@ -215,7 +239,7 @@ impl<'a> Builder<'a> {
             BusKind::Can => &["bitrate"],
             BusKind::TcpListen | BusKind::UdpListen => &["listen"],
         };
-        let safe: &[&str] = if matches!(kind, BusKind::Rs485 | BusKind::Can) { &["on_timeout"] } else { &[] };
+        let safe: &[&str] = if matches!(kind, BusKind::Rs485 | BusKind::Can) { &FIELD_KEYS } else { &[] };
         let bus_name = BUSES.iter().find(|(_, bus)| *bus == kind).map_or("", |(name, _)| name);
         table.check_keys(&[&COMMON_KEYS, own, safe].concat(), &format!(" on bus = {bus_name:?}"))?;
 
@@ -243,6 +267,15 @@ impl<'a> Builder<'a> {
             }
         }
         port.on_timeout = self.add_safe_values(table)?;
+        if let Some(item) = table.optional("safe_at_start") {
+            port.safe_at_start = item.bool()?;
+        }
+        if let Some(item) = table.optional("refresh_ms") {
+            port.refresh = Some(item.time(1e3)?);
+        }
+        if let Some(item) = table.optional("health") {
+            port.health = sources::read_health(&item)?;
+        }
         // There is room: the count was checked above.
         let _ = self.config.ports.push(port);
         Ok(())
@@ -288,7 +321,7 @@ impl<'a> Builder<'a> {
     }
 }
 
-const PORT_PLACES: [PortKey; 12] = [
+const PORT_PLACES: [PortKey; 15] = [
     PortKey::Name,
     PortKey::Recipe,
     PortKey::Cycle,
@@ -301,6 +334,9 @@ const PORT_PLACES: [PortKey; 12] = [
     PortKey::Turnaround,
     PortKey::Bitrate,
     PortKey::Listen,
+    PortKey::Health,
+    PortKey::SafeAtStart,
+    PortKey::Refresh,
 ];
 
 fn read_controller(table: &Reader<'_>, recipes: &[FileRecipe]) -> Result<ControllerLink> {

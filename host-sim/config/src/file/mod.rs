@@ -16,6 +16,7 @@ mod lines;
 mod network;
 mod reader;
 mod recipes;
+mod sources;
 
 use std::path::Path;
 

@@ -142,7 +142,8 @@ impl FileField {
             FileFieldKind::UserOutput { written, from, .. } => {
                 let from = match from {
                     FileOutput::Bound(binding) => *binding,
-                    FileOutput::Program => OutputBinding::Constant(0.0),
+                    // Of a port: put in when all ports are known.
+                    FileOutput::Program | FileOutput::PortNamed { .. } => OutputBinding::Constant(0.0),
                 };
                 let Written { encoding, overflow } = *written;
                 match written.as_plain() {
@@ -154,6 +155,16 @@ impl FileField {
             &FileFieldKind::Padding { len, fill } => FieldSpec::Padding { len, fill },
             FileFieldKind::Checksum(sum) => FieldSpec::Checksum(*sum),
             FileFieldKind::Device { spec, .. } => *spec,
+        }
+    }
+
+    /// The source of an output field that shows the health of a port with this name.
+    pub(super) fn port_named(&self) -> Option<(OutputBinding, &str, &Spot)> {
+        match &self.kind {
+            FileFieldKind::UserOutput { from: FileOutput::PortNamed { name, spot, binding }, .. } => {
+                Some((*binding, name, spot))
+            }
+            _ => None,
         }
     }
 

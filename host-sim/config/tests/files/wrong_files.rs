@@ -6,6 +6,7 @@
 use std::collections::HashSet;
 use std::fmt::Write;
 
+use proto_core::config::{FieldSpec, OutputBinding, PortValue, StateValue};
 use recipe_config::file::{Text, parse, parse_controller, parse_gateway};
 
 const GATEWAY: &str = include_str!("good/cell.toml");
@@ -203,6 +204,25 @@ const CASES: &[Case] = &[
     controller("an initial word of 70000", "= 7", "= 70000"),
     controller("an initial value in reserved bits", "\"DI[3]\" = true", "\"DigitalSignalStatus[3]\" = 4"),
     controller("an initial voltage of 12 V", "= 2.5", "= 12"),
+    // Sources beside the variables, health and safe values at the start.
+    gateway("an unknown value of the state packet", "from = \"reply\"", "from = \"controller.temperature\""),
+    gateway("a value without its number", "from = \"reply\"", "from = \"controller.joint_position\""),
+    gateway("a joint that is not there", "from = \"reply\"", "from = \"controller.joint_torque[7]\""),
+    gateway("a reserved value", "from = \"reply\"", "from = \"controller.reserved_336[1]\""),
+    gateway("a number where there is one", "from = \"reply\"", "from = \"controller.mode[1]\""),
+    gateway("a speed that the dialect does not send", "from = \"reply\"", "from = \"controller.speed\""),
+    gateway("a reply of port 2000 as a source", "from = \"reply\"", "from = \"controller.last_error\""),
+    gateway("an unknown value of a port", "from = \"reply\"", "from = \"port.speed\""),
+    gateway("the health of an unknown port", "from = \"reply\"", "from = \"port.rs485-9.alive\""),
+    gateway("the health of a listening port", "from = \"reply\"", "from = \"port.up-tcp.alive\""),
+    gateway("a count with a scale", "from = \"reply\"", "from = \"port.frames\", scale = 2"),
+    gateway("health in a bit", "recipe = \"orders\"\n\n[[port]]", "recipe = \"orders\"\nhealth = { alive = \"BitInputReg[3].0\" }\n\n[[port]]"),
+    gateway("health in a byte of bits", "recipe = \"orders\"\n\n[[port]]", "recipe = \"orders\"\nhealth = { alive = \"BitInputReg[3]\" }\n\n[[port]]"),
+    gateway("health in a variable of the port's frames", "recipe = \"orders\"\n\n[[port]]", "recipe = \"orders\"\nhealth = { age_ms = \"WordInputReg[1]\" }\n\n[[port]]"),
+    gateway("unknown health", "recipe = \"orders\"\n\n[[port]]", "recipe = \"orders\"\nhealth = { dead = \"WordInputReg[2]\" }\n\n[[port]]"),
+    gateway("health of a listening port", "listen = \"0.0.0.0:50000\"", "listen = \"0.0.0.0:50000\"\nhealth = { alive = \"WordInputReg[2]\" }"),
+    gateway("safe at the start without safe values", "recipe = \"orders\"\n\n[[port]]", "recipe = \"orders\"\nsafe_at_start = true\n\n[[port]]"),
+    gateway("a refreshed output that is not sent on change", "recipe = \"orders\"\n\n[[port]]", "recipe = \"orders\"\nrefresh_ms = 1000\n\n[[port]]"),
     controller("an initial value twice", "\"DI[3]\" = true", "__WordOutputReg_1 = 8"),
     controller("a gateway's binding in a controller's file", "{ name = \"input1\", type = \"byte\" }", "{ name = \"input1\", type = \"byte\", to = \"WordInputReg[1]\" }"),
     controller("a gateway's trigger in a controller's file", "[recipe.output]\n", "[recipe.output]\nsend = \"period\"\n"),
@@ -222,6 +242,34 @@ fn the_good_files_are_good() {
     parse_gateway(Text { name: "cell.toml", toml: GATEWAY }, &[]).unwrap_or_else(|error| panic!("{error}"));
     parse_controller(Text { name: "robot.toml", toml: CONTROLLER }, &[])
         .unwrap_or_else(|error| panic!("{error}"));
+}
+
+/// Every source and key of a port's health, in an otherwise good file.
+#[test]
+fn sources_and_health_are_read() {
+    let toml = GATEWAY
+        .replacen("from = \"reply\"", "from = \"port.rs485-1.age_ms\", scale = 0.1", 1)
+        .replacen("value = 125", "from = \"controller.joint_position[6]\", scale = 100, offset = 1", 1)
+        .replacen("send = \"frame\"", "send = \"change\"", 1)
+        .replacen("cycle_ms = 4\n", "cycle_ms = 4\nsafe_at_start = true\n", 1)
+        .replacen(
+            "recipe = \"orders\"\n\n[[port]]",
+            "recipe = \"orders\"\nrefresh_ms = 1000\nhealth = { alive = \"WordInputReg[20]\", frames = \
+             \"WordInputReg[21]\", age_ms = \"WordInputReg[22]\", rejected = \"WordInputReg[23]\" }\n\n[[port]]",
+            1,
+        );
+    let config =
+        parse_gateway(Text { name: "cell.toml", toml: &toml }, &[]).unwrap_or_else(|error| panic!("{error}"));
+    let sources: Vec<_> = config.fields.iter().filter_map(FieldSpec::source).collect();
+    let age = OutputBinding::Port { port: Some(0), value: PortValue::Age, scale: 0.1, offset: 0.0 };
+    let value = StateValue::parse("joint_position[6]").unwrap();
+    let joint = OutputBinding::State { value, scale: 100.0, offset: 1.0 };
+    assert_eq!(sources, [OutputBinding::Counter, age, joint]);
+    assert!(config.ports[0].safe_at_start && !config.ports[1].safe_at_start);
+    assert_eq!(config.ports[1].refresh.map(|refresh| refresh.as_millis()), Some(1_000));
+    let told: Vec<_> =
+        config.ports[1].health.iter().map(|(value, var)| (value.name(), var.index())).collect();
+    assert_eq!(told, [("alive", 20), ("frames", 21), ("age_ms", 22), ("rejected", 23)]);
 }
 
 #[test]
