@@ -3,11 +3,11 @@
 use heapless::Vec;
 
 use super::connection::Connection;
-use super::counters::{LinkCounters, bump};
+use super::counters::{LinkCounters, add, bump};
 use super::io::Transport;
 use super::store::Store;
 use crate::config::StateValue;
-use crate::image::{GroupId, InputSet, MAX_EXTRA};
+use crate::image::{GroupId, Image, InputSet, MAX_EXTRA};
 use crate::link::{LinkTimings, Supervisor};
 use crate::sysvar::{COUNT, SysVar};
 use crate::time::Duration;
@@ -74,17 +74,6 @@ impl StateLink {
         }
     }
 
-    /// Keeps the packet's other values that ports show. On its own, so that a gateway without them
-    /// does not pay for its registers.
-    #[inline(never)]
-    fn keep<const PORTS: usize>(&mut self, view: &StateView<'_>, store: &mut Store<PORTS>) {
-        for kept in &self.kept {
-            if !store.image.receive_extra(kept.extra, kept.read(view)) {
-                bump(&mut self.counters.unreadable);
-            }
-        }
-    }
-
     pub(super) fn transport(&self) -> Transport {
         Transport::Tcp { port: self.port }
     }
@@ -113,7 +102,7 @@ impl Connection for StateLink {
                         }
                     }
                     if !self.kept.is_empty() {
-                        self.keep(&view, store);
+                        add(&mut self.counters.unreadable, keep(&self.kept, &view, &mut store.image));
                     }
                     for var in not_live.iter() {
                         if view.read_var(var).is_some_and(|value| store.image.set(var, value).is_ok()) {
@@ -145,6 +134,14 @@ impl Connection for StateLink {
         }
         &[]
     }
+}
+
+/// Keeps the packet's other values that ports show; returns how many are unreadable. On its own, so
+/// that a gateway without them does not pay for its registers.
+#[inline(never)]
+fn keep(kept: &[Kept], view: &StateView<'_>, image: &mut Image) -> usize {
+    let unreadable = kept.iter().filter(|kept| !image.receive_extra(kept.extra, kept.read(view)));
+    unreadable.count()
 }
 
 /// Confirms safe values that the controller shows. A value shown by an old packet, or overwritten
