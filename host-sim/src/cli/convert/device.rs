@@ -136,7 +136,7 @@ impl DevicePart {
                 note(notes, &format!("line {line}: {}: {}", text::hex(data), format.wrong_checksum(data)));
                 Err(format!("id {id}: a wrong checksum"))
             }
-            Probe::Other(_) | Probe::No if data.len() == format.frame.layout.lengths().0 => {
+            Probe::Other(_) | Probe::No(_) if data.len() == format.frame.layout.lengths().0 => {
                 Err(format!("id {id}: other constants, so not this frame"))
             }
             _ => Err(format!("id {id}: {} bytes instead of {}", data.len(), format.frame.layout.lengths().0)),
@@ -310,7 +310,7 @@ impl Format {
             };
         }
         let (at, sum) = found?;
-        let end = sum.last.map_or(at, |last| usize::from(last) + 1);
+        let end = sum.end.map_or(at, |end| usize::from(end.get()));
         let covered = frame.get(usize::from(sum.first)..end)?;
         let mut right = vec![0; sum.algorithm.len()];
         ByteOrder::write(sum.order, u64::from(sum.algorithm.of([covered])), &mut right);
