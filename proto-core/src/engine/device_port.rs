@@ -167,11 +167,12 @@ impl FieldPort {
                 inputs,
                 texts,
                 reader: Some(Reader::Search(framer)),
+                skipped_bytes,
                 ..
-            }) => Some((formats.get(..usize::from(*inputs)).unwrap_or(&[]), texts, framer)),
+            }) => Some((formats.get(..usize::from(*inputs)).unwrap_or(&[]), texts, framer, skipped_bytes)),
             _ => None,
         };
-        let Some((formats, texts, framer)) = framer else { return accepted };
+        let Some((formats, texts, framer, noise_bytes)) = framer else { return accepted };
         let mut frames = Frames {
             mode: self.mode,
             bindings,
@@ -211,14 +212,12 @@ impl FieldPort {
         }
         *rest = left;
         let stats = framer.stats();
-        let skipped = stats.skipped_bytes.wrapping_sub(self.counters.resync_bytes);
-        if skipped > 0 {
-            self.counters.resync_bytes = stats.skipped_bytes;
-            // The bytes of a frame with a wrong checksum are kept as that.
-            if !matches!(&self.last_rejection, Some(last) if last.why == Rejection::Checksum && last.at == now)
-            {
-                self.no_frame(bytes, skipped as usize, tap, now);
-            }
+        self.counters.resync_bytes = stats.skipped_bytes;
+        // The bytes of a frame with a wrong checksum were reported as that.
+        let noise = stats.noise_bytes.wrapping_sub(*noise_bytes);
+        if noise > 0 {
+            *noise_bytes = stats.noise_bytes;
+            self.no_frame(bytes, noise as usize, tap, now);
         }
         self.sender.frames_accepted(accepted.frames, usable, &mut self.counters, now);
         accepted
