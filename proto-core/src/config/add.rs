@@ -8,7 +8,7 @@ use heapless::Vec;
 
 use super::draft::{ControllerBuilder, PartFields, PortBuilder, PortBus, RecipeBuilder, Trigger};
 use super::error::{ConfigError, ConfigErrorKind as Kind, ControllerKey, Counted, Place, PortKey, RecipeKey};
-use super::fields::{CanFields, Does, Fields, InputField, OutputField, Sends};
+use super::fields::{CanFields, Does, Fields, InputField, OutputField, Sends, plain};
 use super::rules::{check_name, check_room, text};
 use super::view::ConfigMut;
 use super::{
@@ -234,16 +234,21 @@ impl ConfigMut<'_> {
     }
 
     fn input_spec(&mut self, field: &InputField<'_>) -> Result<FieldSpec, Kind> {
-        let to = match field.does {
-            Does::Nothing => InputBinding::Unused,
-            Does::Writes { var, scale, offset } => {
-                InputBinding::Variable { var: var.read().map_err(Kind::Variable)?, scale, offset }
-            }
-            Does::Commands { entries, when } => {
-                InputBinding::Commands { table: self.add_commands(entries)?, when }
-            }
-        };
-        Ok(FieldSpec::UserInput { ty: field.ty, to })
+        field.on_wire.spec(|encoding, overflow| {
+            let to = match field.does {
+                Does::Nothing => InputBinding::Unused,
+                Does::Writes { var, scale, offset } => {
+                    InputBinding::Variable { var: var.read().map_err(Kind::Variable)?, scale, offset }
+                }
+                Does::Commands { entries, when } => {
+                    InputBinding::Commands { table: self.add_commands(entries)?, when }
+                }
+            };
+            Ok(match plain(encoding, overflow) {
+                Some(ty) => FieldSpec::UserInput { ty, to },
+                None => FieldSpec::DeviceInput { encoding, overflow, to },
+            })
+        })
     }
 
     /// There is room: checked when the recipe was begun.
@@ -321,15 +326,20 @@ impl ConfigMut<'_> {
 }
 
 fn output_spec(field: &OutputField<'_>) -> Result<FieldSpec, Kind> {
-    let from = match field.sends {
-        Sends::Variable { var, scale, offset } => {
-            OutputBinding::Variable { var: var.read().map_err(Kind::Variable)?, scale, offset }
-        }
-        Sends::Constant(value) => OutputBinding::Constant(value),
-        Sends::Counter => OutputBinding::Counter,
-        Sends::Reply => OutputBinding::Reply,
-    };
-    Ok(FieldSpec::UserOutput { ty: field.ty, from })
+    field.on_wire.spec(|encoding, overflow| {
+        let from = match field.sends {
+            Sends::Variable { var, scale, offset } => {
+                OutputBinding::Variable { var: var.read().map_err(Kind::Variable)?, scale, offset }
+            }
+            Sends::Constant(value) => OutputBinding::Constant(value),
+            Sends::Counter => OutputBinding::Counter,
+            Sends::Reply => OutputBinding::Reply,
+        };
+        Ok(match plain(encoding, overflow) {
+            Some(ty) => FieldSpec::UserOutput { ty, from },
+            None => FieldSpec::DeviceOutput { encoding, overflow, from },
+        })
+    })
 }
 
 fn safe_value(var: SysVar, value: f64) -> Result<SafeValue, Kind> {

@@ -7,6 +7,7 @@ use core::fmt;
 
 use super::error::{ConfigError, ConfigErrorKind, ControllerKey, NetworkKey, Place, PortKey, RecipeKey};
 use super::{ConfigView, MAX_NAME, Name};
+use crate::device::Algorithm;
 use crate::recipe::model::Mode;
 use crate::sysvar::Direction;
 use crate::wire::dialect::Dialect;
@@ -245,6 +246,11 @@ impl fmt::Display for DescribedKind<'_> {
                 write!(f, "the field cannot be {value}; allowed: {low}..={high}")
             }
             Kind::NeedsIntegers => f.write_str("needs a field that has integers only"),
+            Kind::UnknownChecksum => {
+                f.write_str("no checksum has this name; allowed:")?;
+                let mut names = Algorithm::names();
+                names.try_for_each(|name| write!(f, " {name}"))
+            }
             Kind::OnlyIntegersWrap => f.write_str("only integers wrap; this one may have a fraction"),
             Kind::NotWords { var, count } => {
                 write!(f, "{count} word variables are needed, such as WordInputReg[1]; found: {var}")

@@ -342,6 +342,8 @@ pub enum ConfigErrorKind {
     NeedsIntegers,
     /// Only integers wrap around.
     OnlyIntegersWrap,
+    /// No checksum has this name.
+    UnknownChecksum,
     /// A text, its length or its count needs so many word variables that follow each other.
     NotWords {
         /// The first variable.

@@ -4,7 +4,9 @@
 //! Out: the same, borrowed; [`GatewayConfig::add_recipe`](super::GatewayConfig::add_recipe) reads
 //! the names.
 
+use super::error::ConfigErrorKind as Kind;
 use super::{CommandWhen, FieldSpec};
+use crate::device::{Algorithm, Checksum, Encoding, Kind as EncodingKind, Overflow};
 use crate::sysvar::{ParseError, SysVar, VarRange};
 use crate::wire::can::CanId;
 use crate::wire::scalar::ScalarType;
@@ -100,10 +102,81 @@ fields_from! {
     FieldSpec => Specs,
 }
 
+/// A checksum, by its name in files or with its parameters.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Sum<'a> {
+    /// Such as `crc16-modbus`, as its standard has it.
+    Name(&'a str),
+    /// The checksum.
+    Checksum(Checksum),
+}
+
+impl<'a> From<&'a str> for Sum<'a> {
+    fn from(name: &'a str) -> Self {
+        Self::Name(name)
+    }
+}
+
+impl From<Checksum> for Sum<'_> {
+    fn from(sum: Checksum) -> Self {
+        Self::Checksum(sum)
+    }
+}
+
+/// What a field is on the wire.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum OnWire<'a> {
+    Value(Encoding, Overflow),
+    Fixed(Encoding, i64),
+    Padding { len: u8, fill: u8 },
+    Checksum(Sum<'a>),
+}
+
+impl OnWire<'_> {
+    fn value(encoding: impl Into<Encoding>) -> Self {
+        Self::Value(encoding.into(), Overflow::Usual)
+    }
+
+    fn wrapping(self) -> Self {
+        if let Self::Value(encoding, _) = self { Self::Value(encoding, Overflow::Wrap) } else { self }
+    }
+
+    /// The field; `with_value` is asked for one with a value.
+    pub(super) fn spec(
+        self,
+        with_value: impl FnOnce(Encoding, Overflow) -> Result<FieldSpec, Kind>,
+    ) -> Result<FieldSpec, Kind> {
+        match self {
+            Self::Value(encoding, overflow) => with_value(encoding, overflow),
+            Self::Fixed(encoding, value) => Ok(FieldSpec::Fixed { encoding, value }),
+            Self::Padding { len, fill } => Ok(FieldSpec::Padding { len, fill }),
+            Self::Checksum(Sum::Checksum(sum)) => Ok(FieldSpec::Checksum(sum)),
+            Self::Checksum(Sum::Name(name)) => {
+                let algorithm = Algorithm::named(name).ok_or(Kind::UnknownChecksum)?;
+                Ok(FieldSpec::Checksum(Checksum::standard(algorithm)))
+            }
+        }
+    }
+}
+
+/// The type of a value that recipes of the controller can have too.
+pub(super) fn plain(encoding: Encoding, overflow: Overflow) -> Option<ScalarType> {
+    match encoding.kind {
+        EncodingKind::Scalar(ty) if encoding == Encoding::scalar(ty) && overflow == Overflow::Usual => {
+            Some(ty)
+        }
+        _ => None,
+    }
+}
+
 /// A field of a user-defined recipe's input part.
+///
+/// A type such as `ScalarType::Word` is a value as the controller's own recipes have it. An
+/// [`Encoding`] is what only devices have: big-endian numbers, bits, digits. A recipe with one of
+/// these, a constant, padding or a checksum is a device's, and is for field ports.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct InputField<'a> {
-    pub(super) ty: ScalarType,
+    pub(super) on_wire: OnWire<'a>,
     pub(super) does: Does<'a>,
 }
 
@@ -116,19 +189,42 @@ pub(super) enum Does<'a> {
 
 impl<'a> InputField<'a> {
     /// A field whose value is ignored.
-    pub const fn unused(ty: ScalarType) -> Self {
-        Self { ty, does: Does::Nothing }
+    pub fn unused(encoding: impl Into<Encoding>) -> Self {
+        Self { on_wire: OnWire::value(encoding), does: Does::Nothing }
     }
 
     /// A field whose value is written to an input variable.
-    pub fn variable(ty: ScalarType, var: impl Into<Var<'a>>) -> Self {
-        Self { ty, does: Does::Writes { var: var.into(), scale: 1.0, offset: 0.0 } }
+    pub fn variable(encoding: impl Into<Encoding>, var: impl Into<Var<'a>>) -> Self {
+        let does = Does::Writes { var: var.into(), scale: 1.0, offset: 0.0 };
+        Self { on_wire: OnWire::value(encoding), does }
     }
 
     /// A field whose value picks a command of port 2000 when it changes: pairs of value and command,
     /// such as `(1, "run(pick.jspf,50)")`. Integer types only.
-    pub const fn commands(ty: ScalarType, entries: &'a [(i64, &'a str)]) -> Self {
-        Self { ty, does: Does::Commands { entries, when: CommandWhen::Change } }
+    pub fn commands(encoding: impl Into<Encoding>, entries: &'a [(i64, &'a str)]) -> Self {
+        let does = Does::Commands { entries, when: CommandWhen::Change };
+        Self { on_wire: OnWire::value(encoding), does }
+    }
+
+    /// An integer that a frame must have here; one with another is not this frame.
+    pub fn constant(encoding: impl Into<Encoding>, value: i64) -> Self {
+        Self { on_wire: OnWire::Fixed(encoding.into(), value), does: Does::Nothing }
+    }
+
+    /// Bytes without a meaning.
+    pub const fn padding(len: u8) -> Self {
+        Self { on_wire: OnWire::Padding { len, fill: 0 }, does: Does::Nothing }
+    }
+
+    /// The frame's checksum: its name in files, such as `"crc16-modbus"`, or a [`Checksum`].
+    pub fn checksum(sum: impl Into<Sum<'a>>) -> Self {
+        Self { on_wire: OnWire::Checksum(sum.into()), does: Does::Nothing }
+    }
+
+    /// Makes what the variable cannot hold wrap around; otherwise such a frame is rejected. Integers
+    /// only.
+    pub fn wrapping(self) -> Self {
+        Self { on_wire: self.on_wire.wrapping(), ..self }
     }
 
     /// Makes the variable `value * scale + offset`. No effect on other fields.
@@ -155,10 +251,10 @@ impl<'a> InputField<'a> {
     }
 }
 
-/// A field of a user-defined recipe's output part.
+/// A field of a user-defined recipe's output part; see [`InputField`] about types and encodings.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct OutputField<'a> {
-    pub(super) ty: ScalarType,
+    pub(super) on_wire: OnWire<'a>,
     pub(super) sends: Sends<'a>,
 }
 
@@ -172,23 +268,43 @@ pub(super) enum Sends<'a> {
 
 impl<'a> OutputField<'a> {
     /// A variable's value, saturated to the field's type.
-    pub fn variable(ty: ScalarType, var: impl Into<Var<'a>>) -> Self {
-        Self { ty, sends: Sends::Variable { var: var.into(), scale: 1.0, offset: 0.0 } }
+    pub fn variable(encoding: impl Into<Encoding>, var: impl Into<Var<'a>>) -> Self {
+        Self::new(encoding, Sends::Variable { var: var.into(), scale: 1.0, offset: 0.0 })
     }
 
     /// A constant.
-    pub const fn constant(ty: ScalarType, value: f64) -> Self {
-        Self { ty, sends: Sends::Constant(value) }
+    pub fn constant(encoding: impl Into<Encoding>, value: f64) -> Self {
+        Self::new(encoding, Sends::Constant(value))
     }
 
     /// The number of frames sent so far, wrapping in the field's type. Integer types only.
-    pub const fn counter(ty: ScalarType) -> Self {
-        Self { ty, sends: Sends::Counter }
+    pub fn counter(encoding: impl Into<Encoding>) -> Self {
+        Self::new(encoding, Sends::Counter)
     }
 
     /// The result of the port's newest command: see [`crate::engine::ReplyCode`].
-    pub const fn reply(ty: ScalarType) -> Self {
-        Self { ty, sends: Sends::Reply }
+    pub fn reply(encoding: impl Into<Encoding>) -> Self {
+        Self::new(encoding, Sends::Reply)
+    }
+
+    /// So many bytes of this value.
+    pub const fn padding(len: u8, fill: u8) -> Self {
+        Self { on_wire: OnWire::Padding { len, fill }, sends: Sends::Constant(0.0) }
+    }
+
+    /// The frame's checksum: its name in files, such as `"crc16-modbus"`, or a [`Checksum`].
+    pub fn checksum(sum: impl Into<Sum<'a>>) -> Self {
+        Self { on_wire: OnWire::Checksum(sum.into()), sends: Sends::Constant(0.0) }
+    }
+
+    fn new(encoding: impl Into<Encoding>, sends: Sends<'a>) -> Self {
+        Self { on_wire: OnWire::value(encoding), sends }
+    }
+
+    /// Makes what the field cannot hold wrap around, instead of becoming the nearest number.
+    /// Integers only.
+    pub fn wrapping(self) -> Self {
+        Self { on_wire: self.on_wire.wrapping(), ..self }
     }
 
     /// Makes the field `variable * scale + offset`. No effect on other fields.

@@ -32,7 +32,7 @@ pub use draft::{Can, ControllerBuilder, Listen, PortBuilder, PortBus, RecipeBuil
 pub use error::{
     ConfigError, ConfigErrorKind, ControllerKey, Counted, NetworkKey, Place, PortKey, RecipeKey,
 };
-pub use fields::{CanFields, Fields, InputField, OutputField, Var};
+pub use fields::{CanFields, Fields, InputField, OutputField, Sum, Var};
 pub use listen::listen_address;
 pub use network::{BoardAddress, Network};
 pub(crate) use port::MIN_CYCLE;

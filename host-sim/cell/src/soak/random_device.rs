@@ -286,7 +286,12 @@ fn content(config: &GatewayConfig, field: &FieldSpec) -> Content {
         FieldSpec::DeviceInput { .. } | FieldSpec::DeviceOutput { .. } => {
             Content::Number { ty: ScalarType::Double, most: 1e3 }
         }
-        FieldSpec::Fixed { .. } | FieldSpec::Padding { .. } => Content::Constant,
+        // The soak makes no texts and no lengths yet.
+        FieldSpec::Fixed { .. }
+        | FieldSpec::Padding { .. }
+        | FieldSpec::TextInput { .. }
+        | FieldSpec::TextOutput { .. }
+        | FieldSpec::Length(_) => Content::Constant,
         FieldSpec::Checksum(_) => Content::Checksum,
     }
 }
