@@ -48,6 +48,10 @@ impl DeviceSpec {
                 FieldSpec::Padding { len, .. } => (usize::from(*len), false),
                 FieldSpec::Checksum(sum) => (sum_bytes(sum), false),
                 FieldSpec::System(var) => (var.size(), false),
+                // The model has frames of fixed length.
+                FieldSpec::TextInput { .. } | FieldSpec::TextOutput { .. } | FieldSpec::Length(_) => {
+                    return None;
+                }
             };
             if !is_shared {
                 first = at;

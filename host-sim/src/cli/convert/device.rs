@@ -162,7 +162,7 @@ fn values_of(named: &NamedFrame) -> Vec<Value> {
         let constant = match field.spec {
             FieldSpec::UserOutput { from: OutputBinding::Constant(value), .. }
             | FieldSpec::DeviceOutput { from: OutputBinding::Constant(value), .. } => Some(value),
-            FieldSpec::Fixed { .. } | FieldSpec::Padding { .. } => continue,
+            FieldSpec::Fixed { .. } | FieldSpec::Padding { .. } | FieldSpec::Length(_) => continue,
             _ => None,
         };
         match (values.last_mut(), element.encoding()) {
@@ -309,7 +309,7 @@ impl Format {
             };
         }
         let (at, sum) = found?;
-        let end = sum.last.map_or(at, |last| usize::from(last) + 1);
+        let end = sum.end.map_or(at, |end| usize::from(end.get()));
         let covered = frame.get(usize::from(sum.first)..end)?;
         let mut right = vec![0; sum.algorithm.len()];
         ByteOrder::write(sum.order, u64::from(sum.algorithm.of([covered])), &mut right);
