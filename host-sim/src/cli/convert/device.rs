@@ -135,7 +135,7 @@ impl DevicePart {
                 note(notes, &format!("line {line}: {}: {}", text::hex(data), format.wrong_checksum(data)));
                 Err(format!("id {id}: a wrong checksum"))
             }
-            Probe::Other(_) | Probe::No if data.len() == format.frame.layout.lengths().0 => {
+            Probe::Other(_) | Probe::No(_) if data.len() == format.frame.layout.lengths().0 => {
                 Err(format!("id {id}: other constants, so not this frame"))
             }
             _ => Err(format!("id {id}: {} bytes instead of {}", data.len(), format.frame.layout.lengths().0)),
