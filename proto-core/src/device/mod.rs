@@ -1,5 +1,6 @@
 //! Frames of field devices, beyond what the controller's own recipes can describe
-//! (docs/devices.md): checksums, byte orders, bits, digits, texts, and what tells one frame from the next.
+//! (docs/devices.md): checksums, byte orders, bits, digits, texts,
+//! and what tells one frame from the next.
 //!
 //! A recipe with such fields is for a field port. A gripper's status, read by Modbus RTU: slave 9,
 //! function 3, six bytes, a CRC.

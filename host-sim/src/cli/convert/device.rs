@@ -163,7 +163,7 @@ fn values_of(named: &NamedFrame) -> Vec<Value> {
         let constant = match field.spec {
             FieldSpec::UserOutput { from: OutputBinding::Constant(value), .. }
             | FieldSpec::DeviceOutput { from: OutputBinding::Constant(value), .. } => Some(value),
-            FieldSpec::Fixed { .. } | FieldSpec::Padding { .. } => continue,
+            FieldSpec::Fixed { .. } | FieldSpec::Padding { .. } | FieldSpec::Length(_) => continue,
             _ => None,
         };
         match (values.last_mut(), element.encoding()) {

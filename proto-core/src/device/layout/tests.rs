@@ -1,3 +1,5 @@
+#![allow(clippy::needless_borrows_for_generic_args, reason = "the same elements are looked at again")]
+
 use std::vec;
 use std::vec::Vec;
 
