@@ -26,7 +26,8 @@ fn values_are_where_they_belong(line: &Line, table: &[Exchange]) {
 fn late_replies_are_never_taken_for_those_of_another_exchange() {
     // Two blocks of the same length of one slave: their replies look alike.
     for retries in [0, 1, 2] {
-        for delay in (0..30).map(|step| Duration::from_micros(step * 2_000 + 1_350)) {
+        // Up to twice the timeout, with the time of request and reply.
+        for delay in (0..28).map(|step| Duration::from_micros(step * 2_000 + 1_350)) {
             let late = |address| Exchange { retries, ..read(5, address, 4, 40) };
             let table = [late(0), late(100), read(6, 0, 4, 40)];
             let mut line = Line::new(FAST, Echo::Absent, &[5, 6], &table);
