@@ -178,7 +178,7 @@ fn show_checksum(sum: &Checksum) -> String {
         _ => ", high byte first",
     };
     let digits = if sum.text { ", as hexadecimal digits" } else { "" };
-    let covered = match (sum.first, sum.end.map(|end| end.get() - 1)) {
+    let covered = match (sum.first, sum.last()) {
         (0, None) => "all bytes before it".to_owned(),
         (first, None) => format!("bytes from {first} up to it"),
         (first, Some(last)) => format!("bytes {first}..{last}"),

@@ -5,7 +5,7 @@ use super::error::{ConfigErrorKind as Kind, Place, RecipeKey};
 use super::rules::{Check, check_new_name, check_pool, fail, is_marked, mark};
 use super::{
     CanFramePart, CommandEntry, ConfigView, DeviceFrame, FieldSpec, InputBinding, MAX_COMMAND_TEXT,
-    OutputBinding, PLACEHOLDER, Parts, Recipe, SendOn, Span, Words,
+    OutputBinding, Parts, Recipe, SendOn, Span, Words, placeholders,
 };
 use crate::command::Request;
 use crate::device::{Boundary, Encoding, LayoutError, Overflow};
@@ -377,9 +377,9 @@ fn check_command_text(place: Place, command: &CommandEntry) -> Check {
             return fail(place, Kind::TooLong { len, longest });
         };
         if let Err(error) = Request::parse_strict(text.as_bytes()) {
-            let kind = match command.text.contains(PLACEHOLDER) {
-                false => Kind::Command(error),
-                true => Kind::CommandFor { value, error },
+            let kind = match placeholders(&command.text) {
+                0 => Kind::Command(error),
+                _ => Kind::CommandFor { value, error },
             };
             return fail(place, kind);
         }

@@ -10,7 +10,7 @@ use heapless::{String, Vec};
 use super::{CommandEntry, MAX_COMMAND_TEXT};
 
 /// What stands for the field's value in the text of a command.
-pub(crate) const PLACEHOLDER: &str = "{value}";
+const PLACEHOLDER: &str = "{value}";
 
 impl CommandEntry {
     /// A command for one value.
@@ -36,7 +36,7 @@ impl CommandEntry {
 
     /// Length of the command for a value, in bytes.
     pub(super) fn len_for(&self, value: i64) -> usize {
-        let places = self.text.matches(PLACEHOLDER).count();
+        let places = placeholders(&self.text);
         let shorter = places.saturating_mul(PLACEHOLDER.len());
         let longer = places.saturating_mul(decimal(value).len());
         self.text.len().saturating_sub(shorter).saturating_add(longer)
@@ -59,6 +59,12 @@ impl fmt::Display for CommandText<'_> {
         }
         f.write_str(rest)
     }
+}
+
+/// How often the value stands in the text. Searching for a `str` could panic.
+pub(crate) fn placeholders(text: &str) -> usize {
+    let is_one = |part: &&[u8]| *part == PLACEHOLDER.as_bytes();
+    text.as_bytes().windows(PLACEHOLDER.len()).filter(is_one).count()
 }
 
 /// The text with the value in it; `None` if it is too long.

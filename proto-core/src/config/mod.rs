@@ -30,7 +30,7 @@ mod view;
 pub use budget::{PartBudget, Warning, can_frame_time};
 pub use builder::ConfigBuilder;
 pub use command_text::CommandText;
-pub(crate) use command_text::{PLACEHOLDER, fill_in};
+pub(crate) use command_text::{fill_in, placeholders};
 pub use device::DeviceFrame;
 pub use draft::{Can, ControllerBuilder, Listen, PortBuilder, PortBus, RecipeBuilder, SafeValues};
 pub use error::{

@@ -6,7 +6,6 @@
 
 use core::borrow::Borrow;
 use core::fmt;
-use core::num::NonZeroU16;
 
 use heapless::Vec;
 
@@ -63,24 +62,29 @@ pub struct Checksum {
     pub text: bool,
     /// The first byte of the frame that it covers; 0 is the first of the head.
     pub first: u16,
-    /// The byte behind the last one; `None` is that of the checksum.
-    pub end: Option<NonZeroU16>,
+    /// The byte behind the last one; 0 is that of the checksum.
+    end: u16,
 }
 
 impl Checksum {
     /// This algorithm as its standard has it: over everything before it, in the standard's byte
     /// order.
     pub const fn standard(algorithm: Algorithm) -> Self {
-        Self { algorithm, order: algorithm.order(), text: false, first: 0, end: None }
+        Self { algorithm, order: algorithm.order(), text: false, first: 0, end: 0 }
     }
 
     /// Over these bytes of the frame, the last one included; `None` is the one before the checksum.
     pub const fn over(self, first: u16, last: Option<u16>) -> Self {
         let end = match last {
-            Some(last) => NonZeroU16::new(last.saturating_add(1)),
-            None => None,
+            Some(last) => last.saturating_add(1),
+            None => 0,
         };
         Self { first, end, ..self }
+    }
+
+    /// The last byte that it covers; `None` is the one before the checksum.
+    pub const fn last(&self) -> Option<u16> {
+        self.end.checked_sub(1)
     }
 
     /// Number of bytes in the frame, 1..=8.
@@ -95,7 +99,7 @@ impl Checksum {
 
     /// The bytes it covers, if it stands at `at` itself.
     fn covered(&self, at: usize) -> core::ops::Range<usize> {
-        let end = self.end.map_or(at, |end| usize::from(end.get()));
+        let end = self.last().map_or(at, |last| usize::from(last).saturating_add(1));
         usize::from(self.first)..end
     }
 

@@ -14,7 +14,7 @@ use super::session::{Event, Sent, Session};
 use super::stops::{COMMAND_QUEUE, STOP_TTL, Stops, Waiting};
 use crate::command::{Keyword, Request};
 use crate::config::{
-    CommandEntry, CommandText, CommandWhen, MAX_COMMANDS, MAX_PORTS, PLACEHOLDER, Span, fill_in,
+    CommandEntry, CommandText, CommandWhen, MAX_COMMANDS, MAX_PORTS, Span, fill_in, placeholders,
 };
 use crate::link::LinkState;
 use crate::time::{Duration, Instant};
@@ -123,7 +123,7 @@ impl Tables {
             // Validation has refused everything that is not a command.
             let keyword = Request::parse(entry.text.as_bytes()).map_or(Keyword::State, |r| r.keyword());
             let &CommandEntry { first, last, .. } = entry;
-            let (len, has_value) = (entry.text.len() as u16, entry.text.contains(PLACEHOLDER));
+            let (len, has_value) = (entry.text.len() as u16, placeholders(&entry.text) > 0);
             tables.entries.push(Entry { first, last, start, len, keyword, has_value }).ok()?;
         }
         Some(tables)

@@ -56,7 +56,7 @@ impl DeviceSpec {
             }
             spec.places.push(first..first + len);
             if let FieldSpec::Checksum(sum) = field {
-                let end = sum.end.map_or(first, |end| usize::from(end.get()));
+                let end = sum.last().map_or(first, |last| usize::from(last) + 1);
                 spec.sum = Some((*sum, first..first + len, usize::from(sum.first)..end));
             }
         }

@@ -310,7 +310,7 @@ impl Format {
             };
         }
         let (at, sum) = found?;
-        let end = sum.end.map_or(at, |end| usize::from(end.get()));
+        let end = sum.last().map_or(at, |last| usize::from(last) + 1);
         let covered = frame.get(usize::from(sum.first)..end)?;
         let mut right = vec![0; sum.algorithm.len()];
         ByteOrder::write(sum.order, u64::from(sum.algorithm.of([covered])), &mut right);
