@@ -93,6 +93,10 @@ pub struct PortCounters {
     pub commands: u32,
     /// Commands that could not be sent.
     pub commands_dropped: u32,
+    /// Values in no entry of their command table.
+    pub commands_unknown: u32,
+    /// Values in a command table that only set the base.
+    pub commands_based: u32,
 }
 
 /// Counters of a link. They wrap after 2^32.
@@ -145,7 +149,7 @@ impl From<&engine::PortCounters> for PortCounters {
                 tail_mismatches resync_bytes discarded_bytes asleep masked
                 edges_lost values_expired undelivered withheld
                 skipped_cycles stale_cycles timeouts downs bus_offs
-                commands commands_dropped
+                commands commands_dropped commands_unknown commands_based
         }
     }
 }

@@ -63,7 +63,7 @@ pub struct Checksum {
     /// The first byte of the frame that it covers; 0 is the first of the head.
     pub first: u16,
     /// The byte behind the last one; 0 is that of the checksum.
-    end: u16,
+    pub end: u16,
 }
 
 impl Checksum {
@@ -620,7 +620,7 @@ impl FrameLayout {
         let own = at..at.saturating_add(sum.len());
         let covered = sum.covered(at);
         let overlaps = covered.start < own.end && own.start < covered.end;
-        let end = if sum.end.is_some() { numbered.unwrap_or(places.at) } else { places.at };
+        let end = if sum.last().is_some() { numbered.unwrap_or(places.at) } else { places.at };
         let comes_late = numbered.is_some_and(|numbered| usize::from(sum.first) > numbered);
         // An empty text leaves nothing to cover.
         let covers_nothing = covered.is_empty() && (numbered.is_none() || covered.start > covered.end);

@@ -164,7 +164,7 @@ fn a_checksum_stands_where_it_should() {
         let fields = input(&format!("checksum = {{ kind = \"crc16-xmodem\"{keys} }}"), fields);
         let place = fields.iter().position(|field| matches!(field, FieldSpec::Checksum(_))).unwrap();
         let FieldSpec::Checksum(sum) = fields[place] else { unreachable!() };
-        (place, sum.first, sum.end.map(|end| end.get() - 1), sum.order, sum.text)
+        (place, sum.first, sum.last(), sum.order, sum.text)
     };
     use ByteOrder::{Big, Little};
     assert_eq!(place(""), (4, 0, None, Big, false));
