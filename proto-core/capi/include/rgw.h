@@ -24,7 +24,7 @@
 #define RGW_MAX_FIELDS 128
 
 // Memory for a gateway, in bytes: enough on every machine.
-#define RGW_GATEWAY_SIZE 40960
+#define RGW_GATEWAY_SIZE 45056
 
 // Number of the link to port 2000.
 #define RGW_LINK_COMMAND 0
@@ -395,6 +395,10 @@ typedef struct rgw_port_counters {
   uint32_t commands;
   // Commands that could not be sent.
   uint32_t commands_dropped;
+  // Values in no entry of their command table.
+  uint32_t commands_unknown;
+  // Values in a command table that only set the base.
+  uint32_t commands_based;
 } rgw_port_counters;
 
 // A field port.
