@@ -20,7 +20,7 @@
 //! let mut out = [0; MAX_ADU];
 //! let mut now = master.deadline();
 //! # let mut weights = [0; 2].iter_mut();
-//! for received in [&[][..], &[], &[9, 4, 2], &[0x03, 0xE8, 0x18, 0x4F]] {
+//! for received in [&[][..], &[], &[9, 4, 2], &[0x03, 0xE8, 0x58, 0x4F]] {
 //!     master.received(received, now);
 //!     // The table writes nothing, so nobody asks for values.
 //!     while let Some(output) = master.poll(now, |_, _| false, &mut out) {
@@ -34,7 +34,7 @@
 //!         }
 //!     }
 //!     // ... wait until `master.deadline()` or until bytes arrive
-//!     now = master.deadline().min(now + Duration::from_millis(5));
+//!     now = master.deadline().min(now + Duration::from_millis(3));
 //! }
 //! # assert_eq!(weights.len(), 1);
 //! # Ok::<(), proto_core::modbus::rtu::TableError>(())
