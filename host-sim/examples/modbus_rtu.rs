@@ -100,8 +100,12 @@ fn master(mut line: Line) -> io::Result<()> {
             },
             When::START,
         ),
+        // What was written.
+        row(Operation::ReadHoldingRegisters { address: 20, count: 4 }, cyclic),
+        row(Operation::ReadCoils { address: 20, count: 12 }, cyclic),
+        row(Operation::ReadHoldingRegisters { address: 30, count: 1 }, cyclic),
     ];
-    let mut master = Master::<9>::new(TIMING, Echo::Absent, &table, line.now()).map_err(io::Error::other)?;
+    let mut master = Master::<12>::new(TIMING, Echo::Absent, &table, line.now()).map_err(io::Error::other)?;
     let (mut out, mut counter, mut presence) = ([0; MAX_ADU], 0_u16, Presence::Unknown);
     let mut deadline = master.deadline();
     while let Some(bytes) = line.wait(deadline) {
