@@ -109,6 +109,8 @@ impl InputLayout for StreamLayout {
 }
 
 impl InputLayout for crate::recipe::CanFrameLayout<'_> {
+    // As in a stream: without the frames of devices it would be inlined anyway.
+    #[inline(always)]
     fn apply(&self, payload: &[u8], image: &mut ImageBytes) -> Result<Applied, ValueError> {
         Self::apply(self, payload, image)
     }
@@ -351,13 +353,12 @@ impl FieldPort {
     }
 
     fn partial_until(&self) -> Instant {
-        match &self.codec {
-            Codec::Stream { deframer, .. } if deframer.pending() > 0 => self.line.heard + self.line.idle_gap,
-            Codec::Device(DeviceCodec { framer: Some(framer), .. }) if !framer.held().is_empty() => {
-                self.line.heard + self.line.idle_gap
-            }
-            _ => Instant::NEVER,
-        }
+        let is_partial = match &self.codec {
+            Codec::Stream { deframer, .. } => deframer.pending() > 0,
+            Codec::Can { .. } => false,
+            Codec::Device(device) => device.is_partial(),
+        };
+        if is_partial { self.line.heard + self.line.idle_gap } else { Instant::NEVER }
     }
 
     #[cold]
