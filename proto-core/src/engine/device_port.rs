@@ -50,12 +50,6 @@ impl DeviceCodec {
         self.formats.get(..usize::from(self.inputs)).unwrap_or(&[])
     }
 
-    /// Whether a frame has begun. Not inlined: plain ports ask in every pass, and are not devices.
-    #[inline(never)]
-    pub(super) fn is_partial(&self) -> bool {
-        self.framer.as_ref().is_some_and(|framer| !framer.held().is_empty())
-    }
-
     fn output(&self) -> &[DeviceFormat] {
         self.formats.get(usize::from(self.inputs)..).unwrap_or(&[])
     }

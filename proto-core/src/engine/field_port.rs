@@ -353,12 +353,13 @@ impl FieldPort {
     }
 
     fn partial_until(&self) -> Instant {
-        let is_partial = match &self.codec {
-            Codec::Stream { deframer, .. } => deframer.pending() > 0,
-            Codec::Can { .. } => false,
-            Codec::Device(device) => device.is_partial(),
-        };
-        if is_partial { self.line.heard + self.line.idle_gap } else { Instant::NEVER }
+        match &self.codec {
+            Codec::Stream { deframer, .. } if deframer.pending() > 0 => self.line.heard + self.line.idle_gap,
+            Codec::Device(DeviceCodec { framer: Some(framer), .. }) if !framer.held().is_empty() => {
+                self.line.heard + self.line.idle_gap
+            }
+            _ => Instant::NEVER,
+        }
     }
 
     #[cold]
