@@ -116,7 +116,7 @@ impl PlainFrame {
     }
 
     fn is_right(&self, sum: &Checksum, frame: &[u8], at: usize) -> bool {
-        let end = sum.end.map_or(at, |end| usize::from(end.get()));
+        let end = sum.end.map_or(at, |end| usize::from(end));
         let number = compute(&sum.algorithm, &frame[usize::from(sum.first)..end]);
         let len = algorithm_len(&sum.algorithm);
         let mut expected = number.to_le_bytes()[..len].to_vec();

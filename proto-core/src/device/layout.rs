@@ -6,7 +6,6 @@
 
 use core::borrow::Borrow;
 use core::fmt;
-use core::num::NonZeroU16;
 
 use heapless::Vec;
 
@@ -59,7 +58,7 @@ pub struct Checksum {
     /// The first byte of the frame that it covers; 0 is the first of the head.
     pub first: u16,
     /// The byte behind the last one; `None` is that of the checksum.
-    pub end: Option<NonZeroU16>,
+    pub end: Option<u16>,
 }
 
 impl Checksum {
@@ -72,7 +71,7 @@ impl Checksum {
     /// Over these bytes of the frame, the last one included; `None` is the one before the checksum.
     pub const fn over(self, first: u16, last: Option<u16>) -> Self {
         let end = match last {
-            Some(last) => NonZeroU16::new(last.saturating_add(1)),
+            Some(last) => Some(last.saturating_add(1)),
             None => None,
         };
         Self { first, end, ..self }
@@ -90,7 +89,7 @@ impl Checksum {
 
     /// The bytes it covers, if it stands at `at` itself.
     fn covered(&self, at: usize) -> core::ops::Range<usize> {
-        let end = self.end.map_or(at, |end| usize::from(end.get()));
+        let end = self.end.map_or(at, |end| usize::from(end));
         usize::from(self.first)..end
     }
 
