@@ -67,6 +67,7 @@ fn config_questions(config: &GatewayConfig) {
     config.view().field_ports().for_each(|port| _ = black_box(port));
     for recipe in &config.recipes {
         config.view().fields_of(recipe, any(Direction::Input)).for_each(|field| _ = black_box(field));
+        black_box(config.view().is_device(recipe));
         config.view().written_by(recipe).for_each(|var| _ = black_box(var));
     }
     for field in &config.fields {

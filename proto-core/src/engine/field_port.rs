@@ -109,6 +109,8 @@ impl InputLayout for StreamLayout {
 }
 
 impl InputLayout for crate::recipe::CanFrameLayout<'_> {
+    // As in a stream: without the frames of devices it would be inlined anyway.
+    #[inline(always)]
     fn apply(&self, payload: &[u8], image: &mut ImageBytes) -> Result<Applied, ValueError> {
         Self::apply(self, payload, image)
     }
