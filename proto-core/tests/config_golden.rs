@@ -14,7 +14,7 @@ use proto_core::config::{
     BoardAddress, Bus, CommandWhen, FieldSpec, GatewayConfig, InputBinding, OnStale, OutputBinding, Parity,
     Parts, PortValue, SendOn,
 };
-use proto_core::device::{Algorithm, ByteOrder, Kind, Overflow, Width};
+use proto_core::device::{Algorithm, Boundary, ByteOrder, Counts, Escape, Kind, Overflow, TextWidth, Width};
 use proto_core::recipe::model::Mode;
 use proto_core::sysvar::SysVar;
 use proto_core::wire::can::CanId;
@@ -178,6 +178,10 @@ fn serialized_types_are_those_of_the_version() {
         Kind,
         Overflow,
         Width,
+        Boundary,
+        Escape,
+        Counts,
+        TextWidth,
         GatewayConfig,
     );
     let mut said = String::new();
