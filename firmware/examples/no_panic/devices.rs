@@ -87,7 +87,7 @@ fn device_framer(framer: &mut Framer, layout: &FrameLayout) {
         black_box(found);
     }
     // A probe that keeps no promise.
-    black_box(framer.next_frame(&mut chunk, any(9), |_| any(proto_core::device::Probe::No)));
+    black_box(framer.next_frame(&mut chunk, any(9), |_| any(proto_core::device::Probe::No(1))));
     black_box(framer.held());
     black_box((framer.discard(), framer.stats()));
 }

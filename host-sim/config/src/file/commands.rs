@@ -162,7 +162,9 @@ mod tests {
     use super::*;
 
     /// The entries, when they act, or the message, of a field with these keys.
-    fn field(text: &str) -> std::result::Result<(Vec<(i64, i64, String)>, CommandWhen), String> {
+    type Entries = Vec<(i64, i64, String)>;
+
+    fn field(text: &str) -> std::result::Result<(Entries, CommandWhen), String> {
         let document = Document::parse("field.toml", text, &[]).unwrap();
         let field = Reader::root(&document, &["bits", "commands", "when", "base", "idle"]).unwrap();
         let commands = field.optional("commands").unwrap();
