@@ -104,7 +104,7 @@ impl Line {
 
     /// So long that a partial frame is discarded.
     fn silence(&mut self) {
-        self.now = self.now + Duration::from_millis(51);
+        self.now += Duration::from_millis(51);
         self.handle(Input::Tick);
     }
 }

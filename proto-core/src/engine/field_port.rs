@@ -358,13 +358,12 @@ impl FieldPort {
     }
 
     fn partial_until(&self) -> Instant {
-        match &self.codec {
-            Codec::Stream { deframer, .. } if deframer.pending() > 0 => self.line.heard + self.line.idle_gap,
-            Codec::Device(DeviceCodec { reader: Some(reader), .. }) if reader.has_begun() => {
-                self.line.heard + self.line.idle_gap
-            }
-            _ => Instant::NEVER,
-        }
+        let has_begun = match &self.codec {
+            Codec::Stream { deframer, .. } => deframer.pending() > 0,
+            Codec::Can { .. } => false,
+            Codec::Device(device) => device.has_begun(),
+        };
+        if has_begun { self.line.heard + self.line.idle_gap } else { Instant::NEVER }
     }
 
     #[cold]
