@@ -109,6 +109,7 @@ impl InputLayout for StreamLayout {
 }
 
 impl InputLayout for crate::recipe::CanFrameLayout<'_> {
+    #[inline(always)]
     fn apply(&self, payload: &[u8], image: &mut ImageBytes) -> Result<Applied, ValueError> {
         Self::apply(self, payload, image)
     }
@@ -343,6 +344,7 @@ impl FieldPort {
     }
 
     /// When something happens on the port without an input.
+    #[inline]
     pub(super) fn deadline(&self) -> Instant {
         self.partial_until().min(self.sender.deadline(self.line.quiet_at()))
     }
