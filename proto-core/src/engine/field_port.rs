@@ -480,28 +480,47 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
                     return Err(Rejection::NotFinite);
                 }
             },
-            Mode::User => {
-                if layout.check(payload).is_err() {
-                    bump(&mut self.counters.rejected_not_finite);
-                    return Err(Rejection::NotFinite);
-                }
-                let frame = self.store.frames.get(slot).ok_or(Rejection::NoInput)?;
-                let bindings = frame.bindings.of(self.bindings);
-                if !fit(bindings, layout.values(payload)) {
-                    bump(&mut self.counters.rejected_out_of_range);
-                    return Err(Rejection::OutOfRange);
-                }
-                for (binding, value) in bindings.iter().zip(layout.values(payload)) {
-                    self.apply_user(&binding.to, value);
-                }
-                if let Some(link) = &mut self.commands {
-                    link.frame_ends();
-                }
-            }
+            // With a context of its own, so that the other mode's can stay in registers.
+            Mode::User => self.again().take_user(layout, payload, slot)?,
         }
         bump(&mut self.counters.frames_in);
         accepted.frames = accepted.frames.wrapping_add(1);
         accepted.set = self.store.accepted(slot, self.counters);
+        Ok(())
+    }
+
+    #[inline(always)]
+    fn again(&mut self) -> Frames<'_, PORTS> {
+        Frames {
+            mode: self.mode,
+            bindings: self.bindings,
+            reply: self.reply,
+            counters: self.counters,
+            port: self.port,
+            store: self.store,
+            commands: self.commands.as_deref_mut(),
+        }
+    }
+
+    /// Applies the values of a user-defined frame, all or none.
+    #[inline(never)]
+    fn take_user(&mut self, layout: &impl InputLayout, payload: &[u8], slot: usize) -> Result<(), Rejection> {
+        if layout.check(payload).is_err() {
+            bump(&mut self.counters.rejected_not_finite);
+            return Err(Rejection::NotFinite);
+        }
+        let frame = self.store.frames.get(slot).ok_or(Rejection::NoInput)?;
+        let bindings = frame.bindings.of(self.bindings);
+        if !fit(bindings, layout.values(payload)) {
+            bump(&mut self.counters.rejected_out_of_range);
+            return Err(Rejection::OutOfRange);
+        }
+        for (binding, value) in bindings.iter().zip(layout.values(payload)) {
+            self.apply_user(&binding.to, value);
+        }
+        if let Some(link) = &mut self.commands {
+            link.frame_ends();
+        }
         Ok(())
     }
 

@@ -345,6 +345,7 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
     }
 
     /// When something happens on one link without an input.
+    #[inline(never)]
     pub(super) fn deadline_of(&self, id: LinkId) -> Instant {
         let of = |own: Instant, supervisor: &Supervisor| own.min(supervisor.deadline());
         let deadline = match id {
