@@ -211,8 +211,11 @@ impl FieldPort {
         let bytes = core::mem::take(rest);
         let usable = self.is_usable();
         let Codec::Stream { input, deframer, .. } = &mut self.codec else {
-            *rest = bytes;
-            return self.device_frames(rest, bindings, store, commands, tap);
+            // In a place of its own, so that `rest` can stay in registers.
+            let mut left = bytes;
+            accepted = self.device_frames(&mut left, bindings, store, commands, tap);
+            *rest = left;
+            return accepted;
         };
         let Some(layout) = input else {
             bump(&mut self.counters.rejected_no_input);
