@@ -167,20 +167,20 @@ fn the_speed_needs_a_dialect_that_has_it() {
 }
 
 #[test]
-fn there_is_room_for_sixty_four_values() {
+fn there_is_room_for_thirty_two_values() {
     let mut cell = Cell::new();
     let all =
         |count: usize| (1..=count).map(|nth| (T::Byte, state(&format!("bool_inputs[{nth}]"), 1.0, 0.0)));
-    let some: Vec<_> = all(60).collect();
+    let some: Vec<_> = all(28).collect();
     // The same value on two ports needs one place.
     lamp(&mut cell, &some);
     let more = ["mode", "robot_state", "program_state", "safety_state"];
-    let more: Vec<_> = more.iter().map(|name| (T::Byte, state(name, 1.0, 0.0))).chain(all(60)).collect();
+    let more: Vec<_> = more.iter().map(|name| (T::Byte, state(name, 1.0, 0.0))).chain(all(28)).collect();
     lamp(&mut cell, &more);
     assert!(Engine::<8, 4, 512>::new(&cell.0).is_ok());
     lamp(&mut cell, &[(T::Byte, health(None, PortValue::Alive))]);
     let refused = Engine::<8, 4, 512>::new(&cell.0).unwrap_err();
-    assert_eq!(refused, BuildError::TooMany { what: Counted::Sources, needed: 65, room: 64 });
+    assert_eq!(refused, BuildError::TooMany { what: Counted::Sources, needed: 33, room: 32 });
 }
 
 // The health of ports, for the field.

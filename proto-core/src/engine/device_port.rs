@@ -25,7 +25,7 @@ use crate::wire::can::{CanFrame, CanId, MAX_CAN_DATA};
 use crate::wire::scalar::Scalar;
 
 /// Maximum number of frames of one port with a device's own frames, both ways together.
-pub(super) const MAX_DEVICE_FRAMES: usize = 20;
+pub(super) const MAX_DEVICE_FRAMES: usize = 18;
 
 /// One frame of the device.
 #[derive(Debug, Clone)]
@@ -53,6 +53,13 @@ pub(super) struct DeviceCodec {
 }
 
 impl DeviceCodec {
+    /// Whether silence has something to end. On its own, so that other ports do not pay for it.
+    #[cold]
+    #[inline(never)]
+    pub(super) fn has_begun(&self) -> bool {
+        self.reader.as_ref().is_some_and(Reader::has_begun)
+    }
+
     fn input(&self) -> &[DeviceFormat] {
         self.formats.get(..usize::from(self.inputs)).unwrap_or(&[])
     }

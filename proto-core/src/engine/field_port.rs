@@ -109,7 +109,6 @@ impl InputLayout for StreamLayout {
 }
 
 impl InputLayout for crate::recipe::CanFrameLayout<'_> {
-    // As in a stream: without the frames of devices it would be inlined anyway.
     #[inline(always)]
     fn apply(&self, payload: &[u8], image: &mut ImageBytes) -> Result<Applied, ValueError> {
         Self::apply(self, payload, image)
@@ -212,8 +211,11 @@ impl FieldPort {
         let bytes = core::mem::take(rest);
         let usable = self.is_usable();
         let Codec::Stream { input, deframer, .. } = &mut self.codec else {
-            *rest = bytes;
-            return self.device_frames(rest, bindings, store, commands, tap);
+            // In a place of its own, so that `rest` can stay in registers.
+            let mut left = bytes;
+            accepted = self.device_frames(&mut left, bindings, store, commands, tap);
+            *rest = left;
+            return accepted;
         };
         let Some(layout) = input else {
             bump(&mut self.counters.rejected_no_input);
@@ -345,6 +347,7 @@ impl FieldPort {
     }
 
     /// When something happens on the port without an input.
+    #[inline]
     pub(super) fn deadline(&self) -> Instant {
         self.partial_until().min(self.sender.deadline(self.line.quiet_at()))
     }
@@ -360,13 +363,12 @@ impl FieldPort {
     }
 
     fn partial_until(&self) -> Instant {
-        match &self.codec {
-            Codec::Stream { deframer, .. } if deframer.pending() > 0 => self.line.heard + self.line.idle_gap,
-            Codec::Device(DeviceCodec { reader: Some(reader), .. }) if reader.has_begun() => {
-                self.line.heard + self.line.idle_gap
-            }
-            _ => Instant::NEVER,
-        }
+        let has_begun = match &self.codec {
+            Codec::Stream { deframer, .. } => deframer.pending() > 0,
+            Codec::Can { .. } => false,
+            Codec::Device(device) => device.has_begun(),
+        };
+        if has_begun { self.line.heard + self.line.idle_gap } else { Instant::NEVER }
     }
 
     #[cold]
@@ -481,28 +483,47 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
                     return Err(Rejection::NotFinite);
                 }
             },
-            Mode::User => {
-                if layout.check(payload).is_err() {
-                    bump(&mut self.counters.rejected_not_finite);
-                    return Err(Rejection::NotFinite);
-                }
-                let frame = self.store.frames.get(slot).ok_or(Rejection::NoInput)?;
-                let bindings = frame.bindings.of(self.bindings);
-                if !fit(bindings, layout.values(payload)) {
-                    bump(&mut self.counters.rejected_out_of_range);
-                    return Err(Rejection::OutOfRange);
-                }
-                for (binding, value) in bindings.iter().zip(layout.values(payload)) {
-                    self.apply_user(&binding.to, value);
-                }
-                if let Some(link) = &mut self.commands {
-                    link.frame_ends();
-                }
-            }
+            // With a context of its own, so that the other mode's can stay in registers.
+            Mode::User => self.again().take_user(layout, payload, slot)?,
         }
         bump(&mut self.counters.frames_in);
         accepted.frames = accepted.frames.wrapping_add(1);
         accepted.set = self.store.accepted(slot, self.counters);
+        Ok(())
+    }
+
+    #[inline(always)]
+    fn again(&mut self) -> Frames<'_, PORTS> {
+        Frames {
+            mode: self.mode,
+            bindings: self.bindings,
+            reply: self.reply,
+            counters: self.counters,
+            port: self.port,
+            store: self.store,
+            commands: self.commands.as_deref_mut(),
+        }
+    }
+
+    /// Applies the values of a user-defined frame, all or none.
+    #[inline(never)]
+    fn take_user(&mut self, layout: &impl InputLayout, payload: &[u8], slot: usize) -> Result<(), Rejection> {
+        if layout.check(payload).is_err() {
+            bump(&mut self.counters.rejected_not_finite);
+            return Err(Rejection::NotFinite);
+        }
+        let frame = self.store.frames.get(slot).ok_or(Rejection::NoInput)?;
+        let bindings = frame.bindings.of(self.bindings);
+        if !fit(bindings, layout.values(payload)) {
+            bump(&mut self.counters.rejected_out_of_range);
+            return Err(Rejection::OutOfRange);
+        }
+        for (binding, value) in bindings.iter().zip(layout.values(payload)) {
+            self.apply_user(&binding.to, value);
+        }
+        if let Some(link) = &mut self.commands {
+            link.frame_ends();
+        }
         Ok(())
     }
 

@@ -16,8 +16,9 @@ pub(super) const MAX_STOPS: usize = 4 * MAX_PORTS;
 /// take to be acknowledged.
 pub(super) const STOP_TTL: Duration = Duration::from_secs(1);
 
-/// A command that a value picked.
+/// A command that a value picked. Packed, because there is room for many.
 #[derive(Debug, Clone, Copy)]
+#[repr(C, packed(4))]
 pub(super) struct Waiting {
     /// When it was picked; for an urgent one whose device no longer asks for it, when that ended.
     pub since: Instant,

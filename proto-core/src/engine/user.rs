@@ -132,11 +132,12 @@ pub(super) fn forget_commands(bindings: &[InputBind], commands: Option<&mut Comm
 }
 
 /// An output field: its type, the source of its value, and how it is written in a device's own
-/// frame.
+/// frame. Packed, because there is room for many and the constant alone would align it.
 #[derive(Debug, Clone, Copy)]
+#[repr(C, packed(2))]
 pub(super) struct OutputBind {
-    pub ty: ScalarType,
     pub from: OutputBinding,
+    pub ty: ScalarType,
     /// The place of its value among the image's extra values, if it is there.
     pub extra: u8,
     pub written: Written,

@@ -20,7 +20,7 @@ pub(crate) type ImageBytes = [u8; IMAGE_BYTES];
 pub(crate) const MAX_GROUPS: usize = 96;
 
 /// Maximum number of values beside the system variables that ports show.
-pub(crate) const MAX_EXTRA: usize = 64;
+pub(crate) const MAX_EXTRA: usize = 32;
 
 /// A group of variables that arrive together and so have one age: a field frame, a Modbus block, a
 /// packet.

@@ -161,9 +161,9 @@ impl VarSet {
 
 /// A set of the image's extra values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub(crate) struct ExtraSet(u64);
+pub(crate) struct ExtraSet(u32);
 
-const _: () = assert!(super::MAX_EXTRA <= 64);
+const _: () = assert!(super::MAX_EXTRA <= 32);
 
 impl ExtraSet {
     /// The empty set.
@@ -171,7 +171,7 @@ impl ExtraSet {
 
     /// Adds or removes a value.
     pub(crate) fn set(&mut self, nth: u8, is_in: bool) {
-        let bit = 1_u64.checked_shl(nth.into()).unwrap_or(0);
+        let bit = 1_u32.checked_shl(nth.into()).unwrap_or(0);
         self.0 = if is_in { self.0 | bit } else { self.0 & !bit };
     }
 
