@@ -24,7 +24,7 @@
 #define RGW_MAX_FIELDS 128
 
 // Memory for a gateway, in bytes: enough on every machine.
-#define RGW_GATEWAY_SIZE 45056
+#define RGW_GATEWAY_SIZE 40960
 
 // Number of the link to port 2000.
 #define RGW_LINK_COMMAND 0
