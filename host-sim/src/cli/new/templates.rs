@@ -1,0 +1,37 @@
+//! The table of the templates.
+
+/// A gateway file for a device.
+#[derive(Debug)]
+pub(super) struct Template {
+    pub(super) name: &'static str,
+    pub(super) text: &'static str,
+}
+
+impl Template {
+    /// The device in one line: the first comment of the file.
+    pub(super) fn title(&self) -> &'static str {
+        self.text.lines().next().map_or("", |line| line.trim_start_matches(['#', ' ']))
+    }
+}
+
+macro_rules! templates {
+    ($($name:literal,)*) => {
+        &[$(Template {
+            name: $name,
+            text: include_str!(concat!(env!("CARGO_MANIFEST_DIR"), "/templates/", $name, ".toml")),
+        },)*]
+    };
+}
+
+/// All templates, sorted by name.
+pub(super) const ALL: &[Template] = templates![
+    "advantech-adam-4017",
+    "and-balance",
+    "bota-rokubi",
+    "dimetix-dls-c",
+    "kunwei-kwr75",
+    "mettler-toledo-sics",
+    "patlite-nhl",
+    "robotiq-ft300",
+    "witmotion-imu",
+];
