@@ -33,5 +33,6 @@ pub(super) const ALL: &[Template] = templates![
     "mettler-toledo-sics",
     "patlite-nhl",
     "robotiq-ft300",
+    "sick-ahm36",
     "witmotion-imu",
 ];
