@@ -1,10 +1,13 @@
 //! The frames of a device as `check` draws them: which bytes are what.
 
-use proto_core::config::{FieldSpec, OutputBinding};
-use proto_core::device::{Algorithm, Bits, ByteOrder, Checksum, Digits, Encoding, Kind, Width};
-use proto_core::sysvar::Direction;
+use proto_core::config::{FieldSpec, OutputBinding, Words};
+use proto_core::device::{
+    Algorithm, Bits, Boundary, ByteOrder, Checksum, Counts, Digits, Encoding, Escape, Kind, Length, Text,
+    TextWidth, Width,
+};
+use proto_core::sysvar::{Direction, SysVar};
 use proto_core::wire::scalar::ScalarType;
-use recipe_config::{DeviceField, DeviceRecipe, NamedFrame};
+use recipe_config::{DeviceField, DeviceRecipe, FrameEnds, NamedFrame};
 
 use super::text;
 
@@ -17,7 +20,15 @@ struct Row {
 
 /// The frames of one part, a line for each run of bytes.
 pub(super) fn show(recipe: &DeviceRecipe, part: Direction) -> String {
-    let mut report = String::new();
+    let mut report = match recipe.ends(part) {
+        FrameEnds { escape: Some(Escape::Dle), .. } => "    between DLE STX and DLE ETX:\n",
+        FrameEnds { escape: Some(Escape::Slip), .. } => "    with the escape bytes of SLIP:\n",
+        FrameEnds { escape: Some(Escape::Cobs), .. } => "    with the escape bytes of COBS:\n",
+        FrameEnds { boundary: Boundary::Tail, .. } => "    up to each tail:\n",
+        FrameEnds { boundary: Boundary::Silence, .. } => "    between silences of the line:\n",
+        FrameEnds { boundary: Boundary::Fields, .. } => "",
+    }
+    .to_owned();
     for frame in recipe.part(part) {
         if let Some(id) = frame.id {
             report += &format!("    id {}\n", text::show_id(id));
@@ -62,6 +73,25 @@ fn rows(frame: &NamedFrame, part: Direction) -> Vec<Row> {
                     Direction::Output => format!("{fill:02X}"),
                 };
                 add(cursor.step(Some(usize::from(len))), "padding", what);
+            }
+            FieldSpec::TextInput { text, to, length_to, count_to } => {
+                let uses = [
+                    (to.map(show_words), "-> "),
+                    (length_to.map(show_name), "length -> "),
+                    (count_to.map(show_name), "count -> "),
+                ];
+                add(cursor.step(text_len(&text)), &field.name, show_text(&text) + show_uses(uses).as_str());
+            }
+            FieldSpec::TextOutput { text, from, length_from } => {
+                let uses =
+                    [(Some(show_words(from)), "<- "), (length_from.map(show_name), "length <- "), (None, "")];
+                add(cursor.step(text_len(&text)), &field.name, show_text(&text) + show_uses(uses).as_str());
+            }
+            FieldSpec::Length(length) => {
+                let encoding = &length.encoding;
+                let place =
+                    if encoding.shared { cursor.before.clone() } else { cursor.step(encoding.size()) };
+                add(place, &field.name, show_length(&length));
             }
             spec => {
                 let Some(encoding) = spec.element().and_then(|element| element.encoding()) else { continue };
@@ -147,6 +177,54 @@ fn show_encoding(encoding: &Encoding) -> String {
     kind + order
 }
 
+/// The number of bytes, if it is always the same.
+fn text_len(text: &Text) -> Option<usize> {
+    match text.width {
+        TextWidth::Fixed(width) => Some(usize::from(width)),
+        TextWidth::Until(_) | TextWidth::Rest => None,
+    }
+}
+
+fn show_text(text: &Text) -> String {
+    let fill = text.fill.map(|fill| format!(", filled up with {:?}", char::from(fill))).unwrap_or_default();
+    match text.width {
+        TextWidth::Fixed(width) => format!("text, {width} characters{fill}"),
+        TextWidth::Until(end) => format!("text, characters up to {:?}", char::from(end)),
+        TextWidth::Rest => "text, all characters".into(),
+    }
+}
+
+fn show_name(var: SysVar) -> String {
+    var.to_string()
+}
+
+fn show_words(words: Words) -> String {
+    let first = words.first.to_string();
+    match (words.count, words.iter().last()) {
+        (2.., Some(last)) => format!("{}..{}]", first.trim_end_matches(']'), last.index()),
+        _ => first,
+    }
+}
+
+/// The variables of a text.
+fn show_uses(uses: [(Option<String>, &str); 3]) -> String {
+    let shown = uses.into_iter().filter_map(|(var, arrow)| Some(format!(" {arrow}{}", var?)));
+    shown.collect::<Vec<_>>().join(",")
+}
+
+fn show_length(length: &Length) -> String {
+    let counts = match length.counts {
+        Counts::Rest => "of what follows",
+        Counts::Frame => "of the frame",
+        Counts::Fields => "of the fields behind it",
+    };
+    let plus = match length.plus {
+        0 => String::new(),
+        plus => format!(", plus {plus}"),
+    };
+    format!("{}, the length {counts}{plus}", show_encoding(&length.encoding))
+}
+
 /// The constant, or the variable, behind how the field is written.
 fn show_use(spec: &FieldSpec) -> String {
     match (*spec, spec.variable()) {
@@ -184,4 +262,64 @@ fn show_checksum(sum: &Checksum) -> String {
         (first, Some(last)) => format!("bytes {first}..{last}"),
     };
     format!("{algorithm}{order}{digits}, over {covered}")
+}
+
+#[cfg(test)]
+mod tests {
+    use recipe_config::AnyRecipe;
+    use recipe_config::file::{Text, parse_recipes};
+
+    use super::*;
+
+    /// The picture of a stream part with these lines.
+    #[track_caller]
+    fn picture(part: &str, lines: &str) -> String {
+        let toml = format!(
+            "[controller]\naddress = \"a\"\n[[recipe]]\nname = \"r\"\nkind = \"stream\"\nmode = \"user\"\n\
+             [recipe.{part}]\n{lines}"
+        );
+        let recipes = parse_recipes(Text { name: "test.toml", toml: &toml }, &[]).unwrap();
+        let part = if part == "input" { Direction::Input } else { Direction::Output };
+        match &recipes[0] {
+            AnyRecipe::Device(recipe) => show(recipe, part),
+            AnyRecipe::Plain(_) => panic!("a recipe of the controller"),
+        }
+    }
+
+    #[test]
+    fn texts_and_lengths_have_places() {
+        let lines = r#"
+            head = [2]
+            fields = [
+                { type = "word", endian = "big", length = true, counts = "frame", plus = 2 },
+                { name = "lot", type = "text", width = 4, fill = " ", to = "WordInputReg[1..2]" },
+                { name = "n", type = "byte" },
+                { name = "code", type = "text", to = "WordInputReg[3..4]", length_to = "WordInputReg[5]" },
+                { name = "last", type = "byte", equals = 3 },
+            ]"#;
+        let expected = "    0     head  02\n    1..2        word, big-endian, the length of the frame, plus 2\n    \
+                        3..6  lot   text, 4 characters, filled up with ' ' -> WordInputReg[1..2]\n    \
+                        7     n     byte\n    \
+                        8..   code  text, all characters -> WordInputReg[3..4], length -> WordInputReg[5]\n    \
+                        then  last  byte = 3\n";
+        assert_eq!(picture("input", lines), expected);
+    }
+
+    #[test]
+    fn the_ends_of_frames_stand_above_them() {
+        let fields = |keys: &str| format!("{keys}\nfields = [{{ name = \"a\", type = \"byte\" }}]");
+        let ends = |keys| picture("input", &fields(keys)).lines().next().unwrap().to_owned();
+        assert_eq!(ends("escape = \"dle\""), "    between DLE STX and DLE ETX:");
+        assert_eq!(ends("escape = \"slip\""), "    with the escape bytes of SLIP:");
+        assert_eq!(ends("escape = \"cobs\""), "    with the escape bytes of COBS:");
+        assert_eq!(ends("framing = \"silence\""), "    between silences of the line:");
+        let text = "{ name = \"t\", type = \"text\", until = \";\", from = \"WordOutputReg[1]\", \
+                    length_from = \"WordOutputReg[2]\" }";
+        let sent = picture("output", &format!("tail = [13]\nfields = [{text}]"));
+        assert_eq!(
+            sent,
+            "    0..   t     text, characters up to ';' <- WordOutputReg[1], length <- WordOutputReg[2]\n    \
+             then  tail  0D\n"
+        );
+    }
 }

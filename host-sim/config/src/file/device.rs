@@ -18,7 +18,7 @@ use super::encoding::{self, OpenNumber, Order, refuse};
 use super::framings;
 use super::reader::{Item, Reader, Result};
 use super::recipes::{FileField, FileFieldKind, FileFrame, FilePart, FileRecipe, Flavour, Written};
-use crate::device::{DeviceField, DeviceRecipe, NamedFrame};
+use crate::device::{DeviceField, DeviceRecipe, FrameEnds, NamedFrame};
 
 /// The keys of a CAN frame.
 const FRAME_KEYS: [&str; 3] = ["endian", "word_order", "checksum"];
@@ -354,6 +354,11 @@ fn find_place(item: &Item<'_>, head: usize, fields: &[FileField]) -> Result<usiz
 
 impl FilePart {
     /// Whether something else than its fields tells where frames end.
+    fn ends(&self) -> FrameEnds {
+        let (boundary, escape) = self.framing;
+        FrameEnds { boundary, escape }
+    }
+
     fn is_cut(&self) -> bool {
         self.framing != (Boundary::Fields, None)
     }
@@ -452,6 +457,8 @@ impl FileRecipe {
                 .unwrap_or(self.carrier(Direction::Input)),
             input: frames(&self.input),
             output: frames(&self.output),
+            input_ends: self.input.as_ref().map_or(FrameEnds::default(), FilePart::ends),
+            output_ends: self.output.as_ref().map_or(FrameEnds::default(), FilePart::ends),
         }
     }
 }
