@@ -330,7 +330,7 @@ impl FrameLayout {
                 Element::Fixed { encoding, value } => (encoding, value as f64),
                 Element::Value { encoding, overflow } => (encoding, encoding.fit(value(nth), overflow)?),
             };
-            if let Some((bits, _)) = element.bits()
+            if let Some(bits) = element.bits()
                 && !element.is_shared()
             {
                 rest.get_mut(..usize::from(bits.bytes))?.fill(0);

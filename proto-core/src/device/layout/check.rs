@@ -250,10 +250,7 @@ pub(super) fn check_elements(elements: &[Element], direction: Direction) -> Resu
                 return Err(LayoutError::Constant { element: nth });
             }
         }
-        let ones = element.bits().map_or(u32::MAX, |(bits, _)| {
-            let ones = u32::MAX.unbounded_shr(32_u32.saturating_sub(u32::from(bits.count)));
-            ones.unbounded_shl(u32::from(bits.first))
-        });
+        let ones = element.bits().map_or(u32::MAX, |bits| bits.mask());
         place = match place {
             _ if !encoding.shared => Some((encoding, ones)),
             Some((first, taken)) if may_share(&first, &encoding, taken & ones, direction) => {

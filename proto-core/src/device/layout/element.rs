@@ -1,7 +1,6 @@
 //! One element of a frame, and how many bytes it takes.
 
 use crate::device::encoding::{Bits, Encoding, Kind, MAX_DIGITS, Overflow};
-use crate::device::order::ByteOrder;
 use crate::device::text::{Length, MAX_TEXT, Text, TextWidth};
 
 /// One element of a frame, in the order of the wire.
@@ -80,9 +79,9 @@ impl Element {
         }
     }
 
-    pub(super) fn bits(&self) -> Option<(Bits, ByteOrder)> {
-        match self.encoding()? {
-            Encoding { kind: Kind::Bits(bits), order, .. } => Some((bits, order)),
+    pub(super) fn bits(&self) -> Option<Bits> {
+        match self.encoding()?.kind {
+            Kind::Bits(bits) => Some(bits),
             _ => None,
         }
     }
