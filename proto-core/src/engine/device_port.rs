@@ -335,23 +335,6 @@ impl FieldPort {
 }
 
 impl<const PORTS: usize> Frames<'_, PORTS> {
-    /// Counts a rejection, and is one.
-    pub(super) fn rejected(&mut self, why: Rejection) -> Result<(), Rejection> {
-        let counters = &mut *self.counters;
-        bump(match why {
-            Rejection::NoInput => &mut counters.rejected_no_input,
-            Rejection::Remote => &mut counters.rejected_remote,
-            Rejection::ForeignId => &mut counters.rejected_id,
-            Rejection::WrongLength => &mut counters.rejected_length,
-            Rejection::Checksum => &mut counters.rejected_checksum,
-            Rejection::OtherDevice => &mut counters.rejected_other_device,
-            Rejection::Unreadable | Rejection::Escape => &mut counters.rejected_unreadable,
-            Rejection::NotFinite => &mut counters.rejected_not_finite,
-            _ => &mut counters.rejected_out_of_range,
-        });
-        Err(why)
-    }
-
     /// Applies a frame as a whole or not at all, and counts it in `accepted`.
     pub(super) fn take_device(
         &mut self,

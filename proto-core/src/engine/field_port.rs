@@ -218,9 +218,7 @@ impl FieldPort {
             return accepted;
         };
         let Some(layout) = input else {
-            bump(&mut self.counters.rejected_no_input);
-            tap.record(|| came(self.id, now, Err(Rejection::NoInput), None, [bytes, &[], &[]]));
-            keep(&mut self.last_rejection, Rejection::NoInput, None, bytes, now);
+            self.not_asked_for(bytes, tap, now);
             return accepted;
         };
         let mut frames = Frames {
@@ -252,6 +250,14 @@ impl FieldPort {
         }
         self.sender.frames_accepted(accepted.frames, usable, &mut self.counters, now);
         accepted
+    }
+
+    /// Bytes for a port whose recipe has no input part.
+    #[cold]
+    pub(super) fn not_asked_for<const TAP: usize>(&mut self, bytes: &[u8], tap: &mut Tap<TAP>, now: Instant) {
+        bump(&mut self.counters.rejected_no_input);
+        tap.record(|| came(self.id, now, Err(Rejection::NoInput), None, [bytes, &[], &[]]));
+        keep(&mut self.last_rejection, Rejection::NoInput, None, bytes, now);
     }
 
     /// A frame from the bus.
@@ -462,6 +468,23 @@ pub(super) struct Frames<'a, const PORTS: usize> {
 }
 
 impl<const PORTS: usize> Frames<'_, PORTS> {
+    /// Counts a rejection, and is one.
+    pub(super) fn rejected(&mut self, why: Rejection) -> Result<(), Rejection> {
+        let counters = &mut *self.counters;
+        bump(match why {
+            Rejection::NoInput => &mut counters.rejected_no_input,
+            Rejection::Remote => &mut counters.rejected_remote,
+            Rejection::ForeignId => &mut counters.rejected_id,
+            Rejection::WrongLength => &mut counters.rejected_length,
+            Rejection::Checksum => &mut counters.rejected_checksum,
+            Rejection::OtherDevice => &mut counters.rejected_other_device,
+            Rejection::Unreadable | Rejection::Escape => &mut counters.rejected_unreadable,
+            Rejection::NotFinite => &mut counters.rejected_not_finite,
+            _ => &mut counters.rejected_out_of_range,
+        });
+        Err(why)
+    }
+
     /// Applies a frame as a whole or not at all, and counts it in `accepted`.
     // A result with the set in it would be copied byte by byte: its tag is one byte.
     fn take(
@@ -478,10 +501,7 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
                         bump(&mut self.counters.masked);
                     }
                 }
-                Err(_) => {
-                    bump(&mut self.counters.rejected_not_finite);
-                    return Err(Rejection::NotFinite);
-                }
+                Err(_) => return self.rejected(Rejection::NotFinite),
             },
             // With a context of its own, so that the other mode's can stay in registers.
             Mode::User => self.again().take_user(layout, payload, slot)?,
@@ -509,14 +529,12 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
     #[inline(never)]
     fn take_user(&mut self, layout: &impl InputLayout, payload: &[u8], slot: usize) -> Result<(), Rejection> {
         if layout.check(payload).is_err() {
-            bump(&mut self.counters.rejected_not_finite);
-            return Err(Rejection::NotFinite);
+            return self.rejected(Rejection::NotFinite);
         }
         let frame = self.store.frames.get(slot).ok_or(Rejection::NoInput)?;
         let bindings = frame.bindings.of(self.bindings);
         if !fit(bindings, layout.values(payload)) {
-            bump(&mut self.counters.rejected_out_of_range);
-            return Err(Rejection::OutOfRange);
+            return self.rejected(Rejection::OutOfRange);
         }
         for (binding, value) in bindings.iter().zip(layout.values(payload)) {
             self.apply_user(&binding.to, value);
