@@ -180,15 +180,8 @@ impl FieldPort {
             _ => None,
         };
         let Some((formats, texts, framer, noise_bytes)) = framer else { return accepted };
-        let mut frames = Frames {
-            mode: self.mode,
-            bindings,
-            reply: &mut self.reply,
-            counters: &mut self.counters,
-            port: self.id,
-            store,
-            commands,
-        };
+        let (reply, counters) = (&mut self.reply, &mut self.counters);
+        let mut frames = Frames::new((self.id, self.mode), reply, counters, bindings, store, commands);
         let effort = formats
             .iter()
             .map(|format| format.layout.lengths().1.saturating_add(usize::from(format.bindings.len)));
@@ -242,15 +235,8 @@ impl FieldPort {
     ) -> Result<(), Rejection> {
         let (now, usable) = (store.now, self.is_usable());
         let Codec::Device(device) = &self.codec else { return Ok(()) };
-        let mut frames = Frames {
-            mode: self.mode,
-            bindings,
-            reply: &mut self.reply,
-            counters: &mut self.counters,
-            port: self.id,
-            store,
-            commands,
-        };
+        let (reply, counters) = (&mut self.reply, &mut self.counters);
+        let mut frames = Frames::new((self.id, self.mode), reply, counters, bindings, store, commands);
         if device.inputs == 0 {
             frames.rejected(Rejection::NoInput)?;
         }

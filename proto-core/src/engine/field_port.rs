@@ -221,15 +221,8 @@ impl FieldPort {
             self.not_asked_for(bytes, tap, now);
             return accepted;
         };
-        let mut frames = Frames {
-            mode: self.mode,
-            bindings,
-            reply: &mut self.reply,
-            counters: &mut self.counters,
-            port: self.id,
-            store,
-            commands,
-        };
+        let (reply, counters) = (&mut self.reply, &mut self.counters);
+        let mut frames = Frames::new((self.id, self.mode), reply, counters, bindings, store, commands);
         let mut left = bytes;
         while let Some(payload) = deframer.next_frame(layout, &mut left) {
             let verdict = frames.take(layout, payload, usize::from(self.first_frame), &mut accepted);
@@ -313,15 +306,8 @@ impl FieldPort {
             bump(counter);
             return Err(why);
         };
-        let mut frames = Frames {
-            mode: self.mode,
-            bindings,
-            reply: &mut self.reply,
-            counters: &mut self.counters,
-            port: self.id,
-            store,
-            commands,
-        };
+        let (reply, counters) = (&mut self.reply, &mut self.counters);
+        let mut frames = Frames::new((self.id, self.mode), reply, counters, bindings, store, commands);
         let slot = usize::from(self.first_frame).saturating_add(index);
         frames.take(&frame_layout, frame.data(), slot, accepted)?;
         self.sender.frames_accepted(1, usable, &mut self.counters, now);
@@ -467,6 +453,21 @@ pub(super) struct Frames<'a, const PORTS: usize> {
     pub commands: Option<&'a mut CommandLink>,
 }
 
+impl<'a, const PORTS: usize> Frames<'a, PORTS> {
+    // The parts of a port one by one: its codec is in use meanwhile.
+    #[inline(always)]
+    pub(super) fn new(
+        (port, mode): (PortId, Mode),
+        reply: &'a mut ReplyCode,
+        counters: &'a mut PortCounters,
+        bindings: &'a [InputBind],
+        store: &'a mut Store<PORTS>,
+        commands: Option<&'a mut CommandLink>,
+    ) -> Self {
+        Self { mode, bindings, reply, counters, port, store, commands }
+    }
+}
+
 impl<const PORTS: usize> Frames<'_, PORTS> {
     /// Counts a rejection, and is one.
     pub(super) fn rejected(&mut self, why: Rejection) -> Result<(), Rejection> {
@@ -514,15 +515,8 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
 
     #[inline(always)]
     fn again(&mut self) -> Frames<'_, PORTS> {
-        Frames {
-            mode: self.mode,
-            bindings: self.bindings,
-            reply: self.reply,
-            counters: self.counters,
-            port: self.port,
-            store: self.store,
-            commands: self.commands.as_deref_mut(),
-        }
+        let commands = self.commands.as_deref_mut();
+        Frames::new((self.port, self.mode), self.reply, self.counters, self.bindings, self.store, commands)
     }
 
     /// Applies the values of a user-defined frame, all or none.

@@ -294,15 +294,8 @@ impl FieldPort {
         };
         let formats = formats.get(..usize::from(*inputs)).unwrap_or(&[]);
         let tail = formats.first().map_or(&[][..], |format| format.layout.tail());
-        let mut frames = Frames {
-            mode: self.mode,
-            bindings,
-            reply: &mut self.reply,
-            counters: &mut self.counters,
-            port: self.id,
-            store,
-            commands,
-        };
+        let (reply, counters) = (&mut self.reply, &mut self.counters);
+        let mut frames = Frames::new((self.id, self.mode), reply, counters, bindings, store, commands);
         let mut left = core::mem::take(rest);
         if !bytes.is_empty() {
             *heard = now;
