@@ -3,7 +3,8 @@
 //! In: bytes and CAN frames. Out: values in the store, and frames when they are due. Does not know
 //! how values reach the controller.
 
-use super::command_link::{CommandLink, Picked};
+use super::command_link::CommandLink;
+use super::command_tables::Picked;
 use super::counters::{PortCounters, add, bump};
 use super::device_port::DeviceCodec;
 use super::io::{BusState, PortId, PortState, ReplyCode};
