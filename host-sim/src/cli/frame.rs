@@ -1,11 +1,11 @@
 //! The frames of a device as `check` draws them: which bytes are what.
 
-use proto_core::config::{FieldSpec, OutputBinding, Words};
+use proto_core::config::{DeviceFrame, FieldSpec, OutputBinding, Words};
 use proto_core::device::{
-    Algorithm, Bits, Boundary, ByteOrder, Checksum, Counts, Digits, Encoding, Escape, Kind, Length, Text,
-    TextWidth, Width,
+    Algorithm, Bits, Boundary, ByteOrder, Checksum, Counts, Digits, Encoding, Escape, Kind, Length, Place,
+    Text, TextWidth, Width,
 };
-use proto_core::sysvar::{Direction, SysVar};
+use proto_core::sysvar::Direction;
 use proto_core::wire::scalar::ScalarType;
 use recipe_config::{DeviceField, DeviceRecipe, FrameEnds, NamedFrame};
 
@@ -33,7 +33,9 @@ pub(super) fn show(recipe: &DeviceRecipe, part: Direction) -> String {
         if let Some(id) = frame.id {
             report += &format!("    id {}\n", text::show_id(id));
         }
-        let rows = rows(frame, part);
+        // Cannot fail: reading the file laid out the same frames.
+        let Ok(laid_out) = frame.lay_out(recipe.carrier, part) else { continue };
+        let rows = rows(frame, &laid_out, part);
         let width = |column: fn(&Row) -> &String| {
             rows.iter().map(|row| column(row).chars().count()).max().unwrap_or(0)
         };
@@ -45,86 +47,68 @@ pub(super) fn show(recipe: &DeviceRecipe, part: Direction) -> String {
     report
 }
 
-fn rows(frame: &NamedFrame, part: Direction) -> Vec<Row> {
+fn rows(frame: &NamedFrame, laid_out: &DeviceFrame, part: Direction) -> Vec<Row> {
+    let mut places = Vec::new();
+    laid_out.layout.parts(&laid_out.elements, |_, place| places.push(place));
+    // Head, fields with the checksum among them, tail: as below.
+    let mut places = places.into_iter();
     let mut rows = Vec::new();
-    let mut cursor = Cursor { at: Some(0), before: String::new() };
-    let mut add =
-        |place: String, name: &str, what: String| rows.push(Row { place, name: name.to_owned(), what });
+    let mut add = |place: Option<Place>, name: &str, what: String| {
+        let place = place.map(show_place).unwrap_or_default();
+        rows.push(Row { place, name: name.to_owned(), what });
+    };
     if !frame.head.is_empty() {
-        add(cursor.step(Some(frame.head.len())), "head", text::hex(&frame.head));
+        add(places.next(), "head", text::hex(&frame.head));
     }
     let mut fields = &frame.fields[..];
     while let Some((field, rest)) = fields.split_first() {
         fields = rest;
+        let place = places.next();
         let text = text_of(std::iter::once(field).chain(rest));
         if text.len() > 1 {
-            add(cursor.step(Some(text.len())), "text", format!("{text:?}"));
+            let place = place.map(|place| Place { len: Some(text.len()), ..place });
+            add(place, "text", format!("{text:?}"));
             fields = &rest[text.len() - 1..];
+            places.nth(text.len() - 2);
             continue;
         }
         match field.spec {
-            FieldSpec::Checksum(sum) => {
-                let place = cursor.step(Some(sum.len()));
-                add(place, "checksum", show_checksum(&sum));
-            }
-            FieldSpec::Padding { len, fill } => {
+            FieldSpec::Checksum(sum) => add(place, "checksum", show_checksum(&sum)),
+            FieldSpec::Padding { fill, .. } => {
                 let what = match part {
                     Direction::Input => "any bytes".to_owned(),
                     Direction::Output => format!("{fill:02X}"),
                 };
-                add(cursor.step(Some(usize::from(len))), "padding", what);
+                add(place, "padding", what);
             }
-            FieldSpec::TextInput { text, to, length_to, count_to } => {
-                let uses = [
-                    (to.map(show_words), "-> "),
-                    (length_to.map(show_name), "length -> "),
-                    (count_to.map(show_name), "count -> "),
-                ];
-                add(cursor.step(text_len(&text)), &field.name, show_text(&text) + show_uses(uses).as_str());
+            FieldSpec::TextInput { text, to, .. } => {
+                let to = to.map(|words| format!(" -> {}", show_words(words)));
+                add(place, &field.name, show_text(&text) + to.as_deref().unwrap_or(""));
             }
-            FieldSpec::TextOutput { text, from, length_from } => {
-                let uses =
-                    [(Some(show_words(from)), "<- "), (length_from.map(show_name), "length <- "), (None, "")];
-                add(cursor.step(text_len(&text)), &field.name, show_text(&text) + show_uses(uses).as_str());
+            FieldSpec::TextOutput { text, from, .. } => {
+                add(place, &field.name, format!("{} <- {}", show_text(&text), show_words(from)));
             }
-            FieldSpec::Length(length) => {
-                let encoding = &length.encoding;
-                let place =
-                    if encoding.shared { cursor.before.clone() } else { cursor.step(encoding.size()) };
-                add(place, &field.name, show_length(&length));
-            }
+            FieldSpec::Length(length) => add(place, &field.name, show_length(&length)),
             spec => {
                 let Some(encoding) = spec.element().and_then(|element| element.encoding()) else { continue };
-                let place =
-                    if encoding.shared { cursor.before.clone() } else { cursor.step(encoding.size()) };
                 let uses = if field.picks_commands { " -> commands".to_owned() } else { show_use(&spec) };
                 add(place, &field.name, show_encoding(&encoding) + uses.as_str());
             }
         }
     }
     if !frame.tail.is_empty() {
-        add(cursor.step(Some(frame.tail.len())), "tail", text::hex(&frame.tail));
+        add(places.next(), "tail", text::hex(&frame.tail));
     }
     rows
 }
 
-/// Where the next bytes are, while that is known.
-struct Cursor {
-    at: Option<usize>,
-    before: String,
-}
-
-impl Cursor {
-    /// The place of the next field; `None` is a length that varies.
-    fn step(&mut self, len: Option<usize>) -> String {
-        self.before = match (self.at, len) {
-            (Some(at), Some(1)) => at.to_string(),
-            (Some(at), Some(len)) => format!("{at}..{}", at + len - 1),
-            (Some(at), None) => format!("{at}.."),
-            (None, _) => "then".into(),
-        };
-        self.at = self.at.zip(len).map(|(at, len)| at + len);
-        self.before.clone()
+/// `0`, `0..1`, `2..` for a length that varies, or `then` behind that.
+fn show_place(place: Place) -> String {
+    match (place.at, place.len) {
+        (Some(at), Some(1)) => at.to_string(),
+        (Some(at), Some(len)) => format!("{at}..{}", at + len - 1),
+        (Some(at), None) => format!("{at}.."),
+        (None, _) => "then".into(),
     }
 }
 
@@ -138,6 +122,36 @@ fn text_of<'f>(fields: impl Iterator<Item = &'f DeviceField>) -> String {
         _ => None,
     };
     fields.map_while(byte).collect()
+}
+
+fn show_text(text: &Text) -> String {
+    match text.width {
+        TextWidth::Fixed(1) => "text, 1 character".to_owned(),
+        TextWidth::Fixed(count) => format!("text, {count} characters"),
+        TextWidth::Until(end) => format!("text, characters up to {:?}", char::from(end)),
+        TextWidth::Rest => "text, all that is left".to_owned(),
+    }
+}
+
+fn show_length(length: &Length) -> String {
+    let counts = match length.counts {
+        Counts::Rest => "of what follows",
+        Counts::Frame => "of the frame",
+        Counts::Fields => "of the fields behind it",
+    };
+    let plus = match length.plus {
+        0 => String::new(),
+        plus => format!(", plus {plus}"),
+    };
+    format!("{}, the length {counts}{plus}", show_encoding(&length.encoding))
+}
+
+/// The registers of a text.
+fn show_words(words: Words) -> String {
+    match words.iter().last().filter(|_| words.count > 1) {
+        Some(last) => format!("{} to {last}", words.first),
+        None => words.first.to_string(),
+    }
 }
 
 fn show_encoding(encoding: &Encoding) -> String {
@@ -175,54 +189,6 @@ fn show_encoding(encoding: &Encoding) -> String {
         _ => String::new(),
     };
     kind + order
-}
-
-/// The number of bytes, if it is always the same.
-fn text_len(text: &Text) -> Option<usize> {
-    match text.width {
-        TextWidth::Fixed(width) => Some(usize::from(width)),
-        TextWidth::Until(_) | TextWidth::Rest => None,
-    }
-}
-
-fn show_text(text: &Text) -> String {
-    let fill = text.fill.map(|fill| format!(", filled up with {:?}", char::from(fill))).unwrap_or_default();
-    match text.width {
-        TextWidth::Fixed(width) => format!("text, {width} characters{fill}"),
-        TextWidth::Until(end) => format!("text, characters up to {:?}", char::from(end)),
-        TextWidth::Rest => "text, all characters".into(),
-    }
-}
-
-fn show_name(var: SysVar) -> String {
-    var.to_string()
-}
-
-fn show_words(words: Words) -> String {
-    let first = words.first.to_string();
-    match (words.count, words.iter().last()) {
-        (2.., Some(last)) => format!("{}..{}]", first.trim_end_matches(']'), last.index()),
-        _ => first,
-    }
-}
-
-/// The variables of a text.
-fn show_uses(uses: [(Option<String>, &str); 3]) -> String {
-    let shown = uses.into_iter().filter_map(|(var, arrow)| Some(format!(" {arrow}{}", var?)));
-    shown.collect::<Vec<_>>().join(",")
-}
-
-fn show_length(length: &Length) -> String {
-    let counts = match length.counts {
-        Counts::Rest => "of what follows",
-        Counts::Frame => "of the frame",
-        Counts::Fields => "of the fields behind it",
-    };
-    let plus = match length.plus {
-        0 => String::new(),
-        plus => format!(", plus {plus}"),
-    };
-    format!("{}, the length {counts}{plus}", show_encoding(&length.encoding))
 }
 
 /// The constant, or the variable, behind how the field is written.
@@ -271,55 +237,91 @@ mod tests {
 
     use super::*;
 
-    /// The picture of a stream part with these lines.
+    const READER: &str = r#"
+[controller]
+address = "127.0.0.1"
+
+[[recipe]]
+name = "reader"
+kind = "stream"
+mode = "user"
+[recipe.input]
+head = [2]
+tail = [13, 10]
+checksum = { kind = "crc16-modbus" }
+fields = [
+    { name = "station", type = "byte" },
+    { name = "code", type = "text", width = 8, to = "WordInputReg[1..4]" },
+    { text = "OK" },
+    { name = "name", type = "text", until = ",", to = "WordInputReg[5]" },
+    { name = "count", type = "word", to = "WordInputReg[6]" },
+]
+
+[[port]]
+name = "reader"
+bus = "rs485"
+recipe = "reader"
+"#;
+
+    #[test]
+    fn texts_have_their_bytes() {
+        let recipes = parse_recipes(Text { name: "reader.toml", toml: READER }, &[]).unwrap();
+        let [AnyRecipe::Device(recipe)] = &recipes[..] else { panic!("{recipes:?}") };
+        let shown = show(recipe, Direction::Input);
+        let shown: Vec<_> = shown.lines().map(str::trim).collect();
+        assert_eq!(
+            shown,
+            [
+                "0       head      02",
+                "1       station   byte",
+                "2..9    code      text, 8 characters -> WordInputReg[1] to WordInputReg[4]",
+                "10..11  text      \"OK\"",
+                "12..    name      text, characters up to ',' -> WordInputReg[5]",
+                "then    count     word, little-endian -> WordInputReg[6]",
+                "then    checksum  crc16-modbus, low byte first, over all bytes before it",
+                "then    tail      0D 0A",
+            ]
+        );
+    }
+
+    /// The picture of a stream input with these lines.
     #[track_caller]
-    fn picture(part: &str, lines: &str) -> String {
+    fn picture(lines: &str) -> String {
         let toml = format!(
             "[controller]\naddress = \"a\"\n[[recipe]]\nname = \"r\"\nkind = \"stream\"\nmode = \"user\"\n\
-             [recipe.{part}]\n{lines}"
+             [recipe.input]\n{lines}"
         );
         let recipes = parse_recipes(Text { name: "test.toml", toml: &toml }, &[]).unwrap();
-        let part = if part == "input" { Direction::Input } else { Direction::Output };
-        match &recipes[0] {
-            AnyRecipe::Device(recipe) => show(recipe, part),
-            AnyRecipe::Plain(_) => panic!("a recipe of the controller"),
-        }
+        let [AnyRecipe::Device(recipe)] = &recipes[..] else { panic!("{recipes:?}") };
+        show(recipe, Direction::Input)
     }
 
     #[test]
-    fn texts_and_lengths_have_places() {
+    fn a_length_has_its_bytes() {
         let lines = r#"
             head = [2]
             fields = [
                 { type = "word", endian = "big", length = true, counts = "frame", plus = 2 },
-                { name = "lot", type = "text", width = 4, fill = " ", to = "WordInputReg[1..2]" },
-                { name = "n", type = "byte" },
-                { name = "code", type = "text", to = "WordInputReg[3..4]", length_to = "WordInputReg[5]" },
+                { name = "code", type = "text", to = "WordInputReg[1..4]" },
                 { name = "last", type = "byte", equals = 3 },
             ]"#;
-        let expected = "    0     head  02\n    1..2        word, big-endian, the length of the frame, plus 2\n    \
-                        3..6  lot   text, 4 characters, filled up with ' ' -> WordInputReg[1..2]\n    \
-                        7     n     byte\n    \
-                        8..   code  text, all characters -> WordInputReg[3..4], length -> WordInputReg[5]\n    \
+        let expected = "    0     head  02\n    \
+                        1..2        word, big-endian, the length of the frame, plus 2\n    \
+                        3..   code  text, all that is left -> WordInputReg[1] to WordInputReg[4]\n    \
                         then  last  byte = 3\n";
-        assert_eq!(picture("input", lines), expected);
+        assert_eq!(picture(lines), expected);
     }
 
     #[test]
     fn the_ends_of_frames_stand_above_them() {
-        let fields = |keys: &str| format!("{keys}\nfields = [{{ name = \"a\", type = \"byte\" }}]");
-        let ends = |keys| picture("input", &fields(keys)).lines().next().unwrap().to_owned();
-        assert_eq!(ends("escape = \"dle\""), "    between DLE STX and DLE ETX:");
-        assert_eq!(ends("escape = \"slip\""), "    with the escape bytes of SLIP:");
-        assert_eq!(ends("escape = \"cobs\""), "    with the escape bytes of COBS:");
-        assert_eq!(ends("framing = \"silence\""), "    between silences of the line:");
-        let text = "{ name = \"t\", type = \"text\", until = \";\", from = \"WordOutputReg[1]\", \
-                    length_from = \"WordOutputReg[2]\" }";
-        let sent = picture("output", &format!("tail = [13]\nfields = [{text}]"));
-        assert_eq!(
-            sent,
-            "    0..   t     text, characters up to ';' <- WordOutputReg[1], length <- WordOutputReg[2]\n    \
-             then  tail  0D\n"
-        );
+        let first = |keys| {
+            let picture = picture(&format!("{keys}\nfields = [{{ name = \"a\", type = \"byte\" }}]"));
+            picture.lines().next().unwrap().to_owned()
+        };
+        assert_eq!(first("escape = \"dle\""), "    between DLE STX and DLE ETX:");
+        assert_eq!(first("escape = \"slip\""), "    with the escape bytes of SLIP:");
+        assert_eq!(first("escape = \"cobs\""), "    with the escape bytes of COBS:");
+        assert_eq!(first("framing = \"silence\""), "    between silences of the line:");
+        assert_eq!(first("framing = \"tail\"\ntail = [3]"), "    up to each tail:");
     }
 }

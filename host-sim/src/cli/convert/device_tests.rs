@@ -210,7 +210,7 @@ fn silence_is_where_a_line_ends() {
     assert_eq!(values, "n=7 code=A\n");
     let lines: Vec<&str> = notes.lines().collect();
     assert!(lines[0].starts_with("line 2: 02 07 41: "), "{notes}");
-    assert!(lines[1].starts_with("line 3: 02 07 41 45: the checksum is wrong"), "{notes}");
+    assert!(lines[1].starts_with("line 3: 02 07 41 45: the checksum is 45 instead of 44"), "{notes}");
     assert!(lines[2].starts_with("line 4: 03 07 41 45: another length or other constants"), "{notes}");
     assert_eq!(encoded(&part, &values).unwrap(), "02 07 41 44\n");
 }
