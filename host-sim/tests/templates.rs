@@ -98,18 +98,38 @@ fn worked_bytes_are_what_the_program_makes_of_them() {
 }
 
 #[test]
-fn every_direction_has_worked_bytes() {
+fn every_frame_has_worked_bytes() {
     for name in names() {
         let report = ok(&["check", &file(&name)], "");
-        let has = |part: &str| report.contains(&format!("\n  {part} "));
         let examples = examples(&text(&name));
-        for part in ["input", "output"] {
-            let shows = |example: &Example| example.args.contains(&format!("--part {part} "));
-            // A recipe with one part needs no --part.
-            let only = has(part) && (has("input") != has("output"));
-            assert!(!has(part) || examples.iter().any(|example| only || shows(example)), "{name}: no {part}");
+        let has = |words: &[&str]| examples.iter().any(|example| example.has(words));
+        // Of a recipe with one part, or with one exchange, it need not be named.
+        let parts: Vec<&str> =
+            ["input", "output"].into_iter().filter(|part| is_in(&report, part, ' ')).collect();
+        for part in &parts {
+            assert!(parts.len() == 1 || has(&["--part", part]), "{name}: no {part}");
         }
+        for part in ["request", "reply", "refusal"] {
+            let is_there =
+                is_in(&report, &format!(" {part}"), ',') || is_in(&report, &format!(" {part}"), '\n');
+            assert!(!is_there || has(&["--part", part]), "{name}: no {part}");
+        }
+        let numbers: Vec<String> = (1..)
+            .map(|nth: usize| nth.to_string())
+            .take_while(|nth| {
+                ["exchange", "block"].iter().any(|what| is_in(&report, &format!("{what} {nth}"), ':'))
+            })
+            .collect();
+        for nth in &numbers {
+            assert!(numbers.len() == 1 || has(&["--exchange", nth]), "{name}: no exchange {nth}");
+        }
+        assert!(!parts.is_empty() || !numbers.is_empty(), "{name}: {report}");
     }
+}
+
+/// Whether a port of the report has a line that begins with this.
+fn is_in(report: &str, what: &str, behind: char) -> bool {
+    report.contains(&format!("\n  {what}{behind}"))
 }
 
 #[test]
@@ -146,6 +166,14 @@ fn an_unknown_device_is_answered_with_near_ones() {
 struct Example {
     args: String,
     shown: String,
+}
+
+impl Example {
+    /// Whether these words are among the arguments, one behind the other.
+    fn has(&self, words: &[&str]) -> bool {
+        let args: Vec<&str> = self.args.split_whitespace().collect();
+        args.windows(words.len()).any(|window| window == words)
+    }
 }
 
 fn examples(text: &str) -> Vec<Example> {
