@@ -53,8 +53,13 @@ impl LineTiming {
     }
 
     /// When the line is free for the gateway.
-    fn quiet_at(&self) -> Instant {
+    pub(super) fn quiet_at(&self) -> Instant {
         self.heard + self.turnaround
+    }
+
+    /// When the line has been silent for so long that a frame has ended.
+    pub(super) fn silent_at(&self) -> Instant {
+        self.heard + self.idle_gap
     }
 }
 
