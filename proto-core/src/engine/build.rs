@@ -5,7 +5,9 @@ use core::net::{IpAddr, Ipv4Addr, SocketAddr};
 
 use heapless::Vec;
 
-use super::command_link::{CommandLink, MAX_COMMAND_BYTES, MAX_COMMAND_FIELDS};
+use super::codecs::{can_codec, index_of, stream_codec, stream_layout};
+use super::command_link::CommandLink;
+use super::command_tables::{MAX_COMMAND_BYTES, MAX_COMMAND_FIELDS};
 use super::counters::PortCounters;
 use super::device_port::DeviceCodec;
 use super::field_port::{Codec, FieldPort, LineTiming};
@@ -23,15 +25,14 @@ use super::uplink::{Uplink, UplinkSetup};
 use super::user::{Bindings, InputBind, InputTo, OutputBind};
 use super::{Ask, Engine};
 use crate::config::{
-    Bus, CanFramePart, ConfigError, ConfigView, Counted, FieldSpec, InputBinding, OutputBinding, Parts, Port,
-    Recipe, SendOn, Span, StreamPart, listen_address,
+    Bus, ConfigError, ConfigView, Counted, FieldSpec, InputBinding, MIN_CYCLE, OutputBinding, Parts, Port,
+    Recipe, SendOn, Span, listen_address,
 };
 use crate::device::LayoutError;
 use crate::image::{GroupId, InputSet, MAX_GROUPS};
 use crate::link::LinkTimings;
-use crate::recipe::Deframer;
-use crate::recipe::model::{Framing, Rules};
-use crate::recipe::{CanLayout, PartError, StreamLayout};
+use crate::recipe::PartError;
+use crate::recipe::model::Framing;
 use crate::sysvar::{Direction, SysVar};
 use crate::time::{Duration, Instant};
 use crate::wire::dialect::Dialect;
@@ -447,7 +448,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             LinkKind::RecipeTcpListen { .. } => Framing::Bytes,
             _ => Framing::Datagram,
         };
-        let index = recipe_index(config, recipe);
+        let index = index_of(config, recipe);
         let Parts::Stream { input, output } = &recipe.parts else { return Ok(()) };
         let input = stream_layout(config, index, recipe, input.as_ref(), Direction::Input, framing)?;
         let output = stream_layout(config, index, recipe, output.as_ref(), Direction::Output, framing)?;
@@ -537,7 +538,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             let _ = polled.insert(place.min(polled.len()), var);
         }
         for &var in &polled {
-            let period = periods.get(var.ordinal()).copied().flatten().unwrap_or(port_cycle_floor());
+            let period = periods.get(var.ordinal()).copied().flatten().unwrap_or(MIN_CYCLE);
             let Some(modbus) = self.links.modbus.first_mut() else { break };
             let group = modbus.poll_var(var, period, || groups.next());
             let group = group.ok_or(one_too_many(Counted::PollBlocks, MAX_POLL_BLOCKS))?;
@@ -588,10 +589,6 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
 /// timeouts are: peers acknowledge up to 200 ms late.
 const PATIENCE: Duration = Duration::from_millis(250);
 
-const fn port_cycle_floor() -> Duration {
-    crate::config::MIN_CYCLE
-}
-
 fn modbus_address(var: SysVar) -> (u8, u16) {
     use crate::sysvar::ModbusPlace;
     match var.modbus() {
@@ -599,63 +596,4 @@ fn modbus_address(var: SysVar) -> (u8, u16) {
         Some(ModbusPlace::Register { address } | ModbusPlace::Scaled { address, .. }) => (1, address),
         None => (2, 0),
     }
-}
-
-fn recipe_index(config: ConfigView<'_>, recipe: &Recipe) -> u8 {
-    (0..).zip(config.recipes).find(|(_, other)| other.name == recipe.name).map_or(0, |(index, _)| index)
-}
-
-#[inline(never)]
-fn stream_codec(
-    config: ConfigView<'_>,
-    index: u8,
-    recipe: &Recipe,
-    [input, output]: [&Option<StreamPart>; 2],
-) -> Result<Codec, BuildError> {
-    let layout = |part: &Option<StreamPart>, direction| {
-        stream_layout(config, index, recipe, part.as_ref(), direction, Framing::Bytes)
-    };
-    Ok(Codec::Stream {
-        input: layout(input, Direction::Input)?,
-        output: layout(output, Direction::Output)?,
-        deframer: Deframer::new(),
-    })
-}
-
-fn stream_layout(
-    config: ConfigView<'_>,
-    index: u8,
-    recipe: &Recipe,
-    part: Option<&StreamPart>,
-    direction: Direction,
-    framing: Framing,
-) -> Result<Option<StreamLayout>, BuildError> {
-    let Some(part) = part else { return Ok(None) };
-    let rules = Rules { mode: recipe.mode, direction };
-    let fields = part.fields.of(config.fields).iter().filter_map(FieldSpec::field);
-    StreamLayout::new(rules, &part.head, &part.tail, fields, framing)
-        .map(Some)
-        .map_err(|error| BuildError::Part { recipe: index, part: direction, error })
-}
-
-#[inline(never)]
-fn can_codec(
-    config: ConfigView<'_>,
-    index: u8,
-    recipe: &Recipe,
-    [input, output]: [&[CanFramePart]; 2],
-) -> Result<Codec, BuildError> {
-    let layout = |frames: &[CanFramePart], direction| {
-        if frames.is_empty() {
-            return Ok(None);
-        }
-        let frames = frames.iter().map(|frame| {
-            let fields = frame.fields.of(config.fields).iter().filter_map(FieldSpec::field);
-            (frame.id, fields)
-        });
-        CanLayout::new(Rules { mode: recipe.mode, direction }, frames)
-            .map(Some)
-            .map_err(|error| BuildError::Part { recipe: index, part: direction, error })
-    };
-    Ok(Codec::Can { input: layout(input, Direction::Input)?, output: layout(output, Direction::Output)? })
 }

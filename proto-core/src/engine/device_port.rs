@@ -180,15 +180,8 @@ impl FieldPort {
             _ => None,
         };
         let Some((formats, texts, framer, noise_bytes)) = framer else { return accepted };
-        let mut frames = Frames {
-            mode: self.mode,
-            bindings,
-            reply: &mut self.reply,
-            counters: &mut self.counters,
-            port: self.id,
-            store,
-            commands,
-        };
+        let (reply, counters) = (&mut self.reply, &mut self.counters);
+        let mut frames = Frames::new((self.id, self.mode), reply, counters, bindings, store, commands);
         let effort = formats
             .iter()
             .map(|format| format.layout.lengths().1.saturating_add(usize::from(format.bindings.len)));
@@ -242,15 +235,8 @@ impl FieldPort {
     ) -> Result<(), Rejection> {
         let (now, usable) = (store.now, self.is_usable());
         let Codec::Device(device) = &self.codec else { return Ok(()) };
-        let mut frames = Frames {
-            mode: self.mode,
-            bindings,
-            reply: &mut self.reply,
-            counters: &mut self.counters,
-            port: self.id,
-            store,
-            commands,
-        };
+        let (reply, counters) = (&mut self.reply, &mut self.counters);
+        let mut frames = Frames::new((self.id, self.mode), reply, counters, bindings, store, commands);
         if device.inputs == 0 {
             frames.rejected(Rejection::NoInput)?;
         }
@@ -335,23 +321,6 @@ impl FieldPort {
 }
 
 impl<const PORTS: usize> Frames<'_, PORTS> {
-    /// Counts a rejection, and is one.
-    pub(super) fn rejected(&mut self, why: Rejection) -> Result<(), Rejection> {
-        let counters = &mut *self.counters;
-        bump(match why {
-            Rejection::NoInput => &mut counters.rejected_no_input,
-            Rejection::Remote => &mut counters.rejected_remote,
-            Rejection::ForeignId => &mut counters.rejected_id,
-            Rejection::WrongLength => &mut counters.rejected_length,
-            Rejection::Checksum => &mut counters.rejected_checksum,
-            Rejection::OtherDevice => &mut counters.rejected_other_device,
-            Rejection::Unreadable | Rejection::Escape => &mut counters.rejected_unreadable,
-            Rejection::NotFinite => &mut counters.rejected_not_finite,
-            _ => &mut counters.rejected_out_of_range,
-        });
-        Err(why)
-    }
-
     /// Applies a frame as a whole or not at all, and counts it in `accepted`.
     pub(super) fn take_device(
         &mut self,

@@ -14,7 +14,9 @@
 
 mod build;
 mod clock;
+mod codecs;
 mod command_link;
+mod command_tables;
 mod connection;
 mod counters;
 mod device_port;

@@ -7,7 +7,7 @@
 use heapless::Vec;
 
 use super::command_link::CommandLink;
-use super::counters::{add, bump};
+use super::counters::add;
 use super::device_port::{DeviceCodec, DeviceFormat, elements};
 use super::field_port::{Accepted, Codec, FieldPort, Frames, came, keep};
 use super::rejection::Rejection;
@@ -294,15 +294,8 @@ impl FieldPort {
         };
         let formats = formats.get(..usize::from(*inputs)).unwrap_or(&[]);
         let tail = formats.first().map_or(&[][..], |format| format.layout.tail());
-        let mut frames = Frames {
-            mode: self.mode,
-            bindings,
-            reply: &mut self.reply,
-            counters: &mut self.counters,
-            port: self.id,
-            store,
-            commands,
-        };
+        let (reply, counters) = (&mut self.reply, &mut self.counters);
+        let mut frames = Frames::new((self.id, self.mode), reply, counters, bindings, store, commands);
         let mut left = core::mem::take(rest);
         if !bytes.is_empty() {
             *heard = now;
@@ -346,14 +339,6 @@ impl FieldPort {
         }
         self.sender.frames_accepted(accepted.frames, usable, &mut self.counters, now);
         accepted
-    }
-
-    /// Bytes for a port whose recipe has no input part.
-    #[cold]
-    pub(super) fn not_asked_for<const TAP: usize>(&mut self, bytes: &[u8], tap: &mut Tap<TAP>, now: Instant) {
-        bump(&mut self.counters.rejected_no_input);
-        tap.record(|| came(self.id, now, Err(Rejection::NoInput), None, [bytes, &[], &[]]));
-        keep(&mut self.last_rejection, Rejection::NoInput, None, bytes, now);
     }
 }
 

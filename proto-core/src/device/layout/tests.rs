@@ -6,6 +6,11 @@ use std::vec::Vec;
 use proptest::prelude::*;
 
 use super::*;
+use crate::device::checksum::Algorithm;
+use crate::device::encoding::{Bits, Digits, Encoding, Kind, Width};
+use crate::device::order::ByteOrder;
+use crate::device::text::{Counts, Length, Text, TextWidth};
+use crate::wire::scalar::ScalarType;
 
 fn value(kind: Kind, order: ByteOrder) -> Element {
     Element::value(Encoding { kind, order, shared: false })
