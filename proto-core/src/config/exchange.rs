@@ -118,7 +118,11 @@ impl Exchange {
 
     /// The fields of its frames that come from the device (input), a reply before a refusal, or go to
     /// it (output).
-    pub(crate) fn fields(&self, config: ConfigView<'_>, part: Direction) -> impl Iterator<Item = Span> + use<> {
+    pub(crate) fn fields(
+        &self,
+        config: ConfigView<'_>,
+        part: Direction,
+    ) -> impl Iterator<Item = Span> + use<> {
         let of = |nth: Option<u8>| Some(config.frames.get(usize::from(nth?))?.fields);
         let some = |span: Span| (span.len > 0).then_some(span);
         let spans = match (self.talk, part) {

@@ -102,6 +102,9 @@ pub struct Rs485 {
     pub idle_gap: Duration,
     /// The line must have been silent for this long before a frame is sent.
     pub turnaround: Duration,
+    /// What is sent is heard as well, as with a 2-wire adapter whose receiver is always on. Only with
+    /// a recipe of exchanges.
+    pub echo: bool,
 }
 
 impl Default for Rs485 {
@@ -114,6 +117,7 @@ impl Default for Rs485 {
             stop_bits: 1,
             idle_gap: Duration::from_millis(50),
             turnaround: Duration::from_micros(100),
+            echo: false,
         }
     }
 }

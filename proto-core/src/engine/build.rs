@@ -10,12 +10,13 @@ use super::command_link::CommandLink;
 use super::command_tables::{MAX_COMMAND_BYTES, MAX_COMMAND_FIELDS};
 use super::counters::PortCounters;
 use super::device_port::DeviceCodec;
+use super::exchanges::{Exchanges, Places};
 use super::field_port::{Codec, FieldPort, LineTiming};
 use super::io::{BusState, LinkId, LinkKind, PortId, ReplyCode, Transport};
 use super::links::Links;
 use super::modbus_link::{MAX_POLL_BLOCKS, ModbusLink};
 use super::outbox::EdgeQueue;
-use super::plan::{Plan, PlanError, Source, WayUp, shown_by, uplinks};
+use super::plan::{Plan, PlanError, Source, WayUp, sent_by, shown_by, uplinks};
 use super::port_health::PortsHealth;
 use super::sender::Sender;
 use super::state_link::StateLink;
@@ -146,6 +147,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             // The first call asks every port and link, because `timer_at` has come.
             ask: Ask::NONE,
             tap: Tap::new(),
+            exchanges: Exchanges::new(),
         }
     }
 
@@ -198,9 +200,11 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             is_deaf,
             deaf_until,
             ask,
+            exchanges,
             // A tap that listens continues.
             tap: _,
         } = self;
+        exchanges.clear();
         *store = Store::new();
         ports.clear();
         bindings.inputs.clear();
@@ -310,7 +314,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         dialect: Dialect,
     ) -> Result<(), BuildError> {
         // Validation has refused recipes that the bus cannot carry.
-        let codec = match &recipe.parts {
+        let mut codec = match &recipe.parts {
             _ if config.is_device(recipe) => {
                 let inputs = self.bindings.inputs.len() as u16;
                 let outputs = self.bindings.outputs.len() as u16;
@@ -319,6 +323,17 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             Parts::Stream { input, output } => stream_codec(config, port.recipe, recipe, [input, output])?,
             Parts::Can { input, output } => can_codec(config, port.recipe, recipe, [input, output])?,
         };
+        if recipe.exchanges.len > 0
+            && let Codec::Device(device) = &mut codec
+        {
+            let (inputs, outputs) = device.fields();
+            let places = Places {
+                inputs: (self.bindings.inputs.len() as u16).saturating_add(inputs),
+                outputs: (self.bindings.outputs.len() as u16).saturating_add(outputs),
+                slot: (self.store.frames.len() as u8).saturating_add(device.inputs),
+            };
+            device.line = Some(self.add_exchanges(config, port, recipe, places)?);
+        }
         let line = match &port.bus {
             Bus::Rs485(settings) => LineTiming::new(settings),
             _ => LineTiming::none(),
@@ -561,7 +576,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             }
         }
         for ((_, _, recipe), port) in config.field_ports().zip(&mut self.ports) {
-            for var in shown_by(config, recipe) {
+            for var in sent_by(config, recipe) {
                 let Some(group) = self.store.image.group(var) else { continue };
                 port.sender.sources.insert(group);
                 port.sender.shown.insert(var);

@@ -140,7 +140,8 @@ impl Formats<'_> {
             (Direction::Input, [nth, _]) => (&mut self.places.inputs, nth),
             (Direction::Output, [_, nth]) => (&mut self.places.outputs, nth),
         };
-        let frame = frame.map_err(|error| BuildError::Layout { recipe: self.recipe, part, frame: *nth, error })?;
+        let frame =
+            frame.map_err(|error| BuildError::Layout { recipe: self.recipe, part, frame: *nth, error })?;
         let bindings = Span { start: *next, len: frame.elements.len() as u16 };
         *next = next.saturating_add(bindings.len);
         *nth = nth.saturating_add(1);
@@ -193,7 +194,6 @@ impl Formats<'_> {
                     item.reply = Some(self.input(data, None)?);
                 }
             }
-            // TODO
             Talk::Served { .. } => {}
             Talk::Frames { request, reply, refusal } => {
                 let config = self.config;

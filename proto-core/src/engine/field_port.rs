@@ -39,18 +39,22 @@ pub(super) enum Codec {
 pub(super) struct LineTiming {
     pub idle_gap: Duration,
     pub turnaround: Duration,
+    /// After this long without a byte, what was sent is complete.
+    silence: Duration,
     heard: Instant,
 }
 
 impl LineTiming {
     pub(super) fn new(settings: &Rs485) -> Self {
-        let idle_gap = settings.idle_gap.max(settings.characters_and_a_half(3));
-        Self { idle_gap, turnaround: settings.turnaround, heard: Instant::ZERO }
+        let characters = settings.characters_and_a_half(3);
+        let (idle_gap, turnaround) = (settings.idle_gap.max(characters), settings.turnaround);
+        Self { idle_gap, turnaround, silence: turnaround.max(characters), heard: Instant::ZERO }
     }
 
     /// For a bus that arbitrates by itself.
     pub(super) const fn none() -> Self {
-        Self { idle_gap: Duration::MAX, turnaround: Duration::ZERO, heard: Instant::ZERO }
+        let (idle_gap, turnaround) = (Duration::MAX, Duration::ZERO);
+        Self { idle_gap, turnaround, silence: Duration::ZERO, heard: Instant::ZERO }
     }
 
     /// When the line is free for the gateway.
@@ -58,9 +62,9 @@ impl LineTiming {
         self.heard + self.turnaround
     }
 
-    /// When the line has been silent for so long that a frame has ended.
+    /// When the line has been silent for so long that what was sent is complete.
     pub(super) fn silent_at(&self) -> Instant {
-        self.heard + self.idle_gap
+        self.heard + self.silence
     }
 }
 

@@ -209,6 +209,13 @@ impl Line {
         is_answered
     }
 
+    /// A frame with a wrong checksum came: perhaps the reply.
+    pub(super) fn heard_wrong(&mut self) {
+        if let Phase::Sending(flight) | Phase::Waiting(flight) = &mut self.phase {
+            flight.is_wrong = true;
+        }
+    }
+
     /// The peer has answered, whatever it says.
     pub(super) fn answered(&mut self, talks: &mut Talks<'_>, flight: Flight, times: Times, now: Instant) {
         // The reply may be a late one to the first of the requests. Then that to the repetition is
@@ -318,6 +325,13 @@ impl Line {
 
     fn turns<T>(&mut self, talks: &mut Talks<'_>, ask: impl FnOnce(&mut Turns<'_, PeerState>) -> T) -> T {
         ask(&mut Turns { rows: talks.rows, peers: talks.peers, run: &mut self.run })
+    }
+}
+
+impl PeerState {
+    /// Whether it did not answer when it was last asked.
+    pub(super) fn is_down(&self) -> bool {
+        self.turn.presence() == Presence::Down
     }
 }
 

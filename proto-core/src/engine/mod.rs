@@ -60,7 +60,7 @@ pub use links::LinkInfo;
 pub use not_given::{LastNotGiven, NotGiven};
 pub use plan::{Plan, PlanError, Source, WayUp};
 pub use rejection::{KEPT_BYTES, LastRejection, Rejection};
-pub use status::{ControllerStatus, FieldBus, Health, PortStatus, Status, VariableStatus};
+pub use status::{ControllerStatus, FieldBus, Health, PeerStatus, PortStatus, Status, VariableStatus};
 pub use stops::COMMAND_QUEUE;
 pub use tap::{MAX_TAPPED, TAP_OVERHEAD, Tap, TapDirection, TapPlace, TapRecord, TapVerdict};
 

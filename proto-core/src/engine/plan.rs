@@ -259,11 +259,24 @@ fn is_one_frame(config: ConfigView<'_>, link: &Recipe) -> bool {
     })
 }
 
-/// The variables that a recipe's output part shows, and the one whose bit triggers it.
+/// The variables that a recipe's output part shows, and the one whose bit triggers it; those of
+/// exchanges are looked at when they are asked.
+pub(super) fn sent_by<'a>(config: ConfigView<'a>, recipe: &'a Recipe) -> impl Iterator<Item = SysVar> + 'a {
+    let trigger = match recipe.send {
+        SendOn::Rising { var, .. } => Some(var),
+        _ => None,
+    };
+    let fields = recipe.part_frames(Direction::Output).flat_map(move |span| span.of(config.fields));
+    fields.flat_map(FieldSpec::variables).chain(trigger)
+}
+
+/// The variables that a recipe's outputs show, and those whose bits trigger them.
 pub(super) fn shown_by<'a>(config: ConfigView<'a>, recipe: &'a Recipe) -> impl Iterator<Item = SysVar> + 'a {
     let trigger = match recipe.send {
         SendOn::Rising { var, .. } => Some(var),
         _ => None,
     };
-    config.fields_of(recipe, Direction::Output).flat_map(|(_, _, field)| field.variables()).chain(trigger)
+    let asks = config.exchanges_of(recipe).iter().filter_map(|exchange| Some(exchange.when.rising?.0));
+    let fields = config.fields_of(recipe, Direction::Output).flat_map(|(_, _, field)| field.variables());
+    fields.chain(trigger).chain(asks)
 }

@@ -4,6 +4,7 @@ use super::Engine;
 use super::counters::PortCounters;
 use super::io::{LinkId, PortId, PortState, ReplyCode};
 use super::latency::Latency;
+use super::line::PeerState;
 use super::links::LinkInfo;
 use super::status::Status;
 use super::tap::Tap;
@@ -27,7 +28,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     pub fn port_state(&self, port: PortId) -> Option<PortState> {
         let (index, port) = self.ports.iter().enumerate().find(|(_, other)| other.id == port)?;
         let mut own = self.store.frames.iter().filter(|frame| usize::from(frame.port) == index);
-        Some(port.state(own.any(|frame| frame.is_overdue())))
+        let peers = port.line().map_or(&[][..], |line| line.peers.of(self.exchanges.peers()));
+        Some(port.state(own.any(|frame| frame.is_overdue()) || peers.iter().any(PeerState::is_down)))
     }
 
     /// Result of the newest command that a port's values picked; `None` if no such port is configured.
@@ -68,6 +70,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             links: self.links.view(),
             latency: &self.store.latency,
             sleeps: self.sleeps,
+            peers: self.exchanges.peers(),
         }
     }
 

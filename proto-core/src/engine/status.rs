@@ -9,6 +9,7 @@ use super::counters::PortCounters;
 use super::field_port::{Codec, FieldPort};
 use super::io::{BusState, PortId, PortState, ReplyCode};
 use super::latency::Latency;
+use super::line::{PeerCounters, PeerState};
 use super::links::{LinkInfo, LinksView};
 use super::not_given::LastNotGiven;
 use super::port_health::PortsHealth;
@@ -17,6 +18,7 @@ use super::store::InputFrame;
 use crate::config::CommandText;
 use crate::image::{GroupId, Image};
 use crate::link::LinkState;
+use crate::schedule::Presence;
 use crate::sysvar::{Direction, SysVar};
 use crate::time::{Duration, Instant};
 use crate::wire::scalar::Scalar;
@@ -33,6 +35,7 @@ pub struct Status<'a> {
     pub(super) links: LinksView<'a>,
     pub(super) latency: &'a Latency,
     pub(super) sleeps: u32,
+    pub(super) peers: &'a [PeerState],
 }
 
 /// The bus of a field port.
@@ -93,6 +96,33 @@ pub struct PortStatus<'a> {
     pub last_rejection: Option<&'a LastRejection>,
     /// Counters since the start.
     pub counters: &'a PortCounters,
+    peers: &'a [PeerState],
+}
+
+/// A slave, or another peer that exchanges of a port are with.
+#[derive(Debug, Clone, Copy)]
+#[non_exhaustive]
+pub struct PeerStatus {
+    /// Its address, or its number in the configuration; 0 on Modbus stands for all slaves.
+    pub number: u8,
+    /// Whether it answers; [`Presence::Unknown`] if it is never asked for an answer.
+    pub presence: Presence,
+    /// Periods that went by while it was not down, because the line had too much to do.
+    pub missed_periods: u32,
+    /// Counters since the start.
+    pub counters: PeerCounters,
+}
+
+impl<'a> PortStatus<'a> {
+    /// The peers of the port's exchanges.
+    pub fn peers(&self) -> impl Iterator<Item = PeerStatus> + use<'a> {
+        self.peers.iter().map(|peer| PeerStatus {
+            number: peer.number,
+            presence: peer.turn.presence(),
+            missed_periods: peer.turn.missed(),
+            counters: peer.counters,
+        })
+    }
 }
 
 /// A known variable and its value.
@@ -197,6 +227,7 @@ impl<'a> Status<'a> {
             heard_at = heard_at.max(self.image.stamp_of(GroupId(group)));
             overdue = overdue.saturating_add(usize::from(frame.is_overdue()));
         }
+        let peers = port.line().map_or(&[][..], |line| line.peers.of(self.peers));
         let is_can = match &port.codec {
             Codec::Stream { .. } => false,
             Codec::Can { .. } => true,
@@ -208,7 +239,7 @@ impl<'a> Status<'a> {
             name: &port.name,
             bus,
             recipe: port.recipe,
-            state: port.state(overdue > 0),
+            state: port.state(overdue > 0 || peers.iter().any(PeerState::is_down)),
             age: heard_at.map(|at| self.at.saturating_since(at)),
             overdue,
             reply: port.reply,
@@ -216,6 +247,7 @@ impl<'a> Status<'a> {
             last_not_given: self.links.command.and_then(|link| link.not_given_of(port.id)),
             last_rejection: port.last_rejection.as_ref(),
             counters: &port.counters,
+            peers,
         }
     }
 }

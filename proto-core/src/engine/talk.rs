@@ -4,13 +4,12 @@
 //! and requests. Which exchange is next is the line's business ([`super::line`]); ports without
 //! exchanges do not come here.
 
-use super::Engine;
 use super::command_link::CommandLink;
 use super::counters::{add, bump};
-use super::device_port::{DeviceCodec, DeviceFormat, better, elements, probe, probe_all};
+use super::device_port::{DeviceCodec, DeviceFormat, better, elements, probe};
 use super::exchanges::{Asks, InputFormat, Item, View};
 use super::field_output::Downward;
-use super::field_port::{Accepted, Codec, FieldPort, Frames, came, find_port, keep};
+use super::field_port::{Accepted, Codec, FieldPort, Frames, came, keep};
 use super::io::PortId;
 use super::line::{Flight, Line, Phase, Talks};
 use super::rejection::Rejection;
@@ -19,6 +18,7 @@ use super::store::Store;
 use super::tap::Tap;
 use super::user::{InputBind, OutputBind, number_of};
 use super::whole_port::{self, Reader};
+use super::{Engine, find_port};
 use crate::config::OutputBinding;
 use crate::device::{Found, Probe};
 use crate::image::Image;
@@ -84,7 +84,9 @@ impl<'i> Awaited<'i> {
             },
             None => Probe::No(1),
         };
-        for format in self.answers().map(|answer| &answer.format).chain(self.unasked().map(|(format, _)| format)) {
+        for format in
+            self.answers().map(|answer| &answer.format).chain(self.unasked().map(|(format, _)| format))
+        {
             best = better(best, probe(format, self.bindings, bytes));
         }
         best
@@ -92,9 +94,7 @@ impl<'i> Awaited<'i> {
 
     /// What a frame of a line is that [`Self::probe`] has found.
     fn heard(&self, frame: &[u8]) -> Option<Heard<'i>> {
-        let is = |format: &DeviceFormat| {
-            matches!(probe(format, self.bindings, frame), Probe::Frame(len) if len == frame.len())
-        };
+        let is = |format: &DeviceFormat| matches!(probe(format, self.bindings, frame), Probe::Frame(len) if len == frame.len());
         if let Some(expected) = self.expected() {
             match expected.probe(frame) {
                 rtu::Probe::Reply(_) => return Some(Heard::Reply(self.asked()?.reply.as_ref())),
@@ -184,7 +184,7 @@ impl FieldPort {
         let formats = formats.get(..usize::from(*inputs)).unwrap_or(&[]);
         let (items, mut talks) = view.of(line);
         let mut frames =
-            Frames::new(self.mode, bindings, &mut self.reply, &mut self.counters, self.id, store, commands);
+            Frames::new((self.id, self.mode), &mut self.reply, &mut self.counters, bindings, store, commands);
         let mut awaited =
             Awaited { formats, first_frame: self.first_frame, items, flight: line.flight(), bindings };
         let effort = |awaited: &Awaited<'_>| {
@@ -203,7 +203,13 @@ impl FieldPort {
                                 Some(_) => frame.get(3..frame.len().saturating_sub(2)).unwrap_or(&[]),
                                 None => frame,
                             };
-                            frames.take_device(&reply.format, texts, data, usize::from(reply.slot), &mut accepted)
+                            frames.take_device(
+                                &reply.format,
+                                texts,
+                                data,
+                                usize::from(reply.slot),
+                                &mut accepted,
+                            )
                         }
                         Some(Heard::Refusal(Some(refusal))) => frames.take_device(
                             &refusal.format,
@@ -283,7 +289,7 @@ impl FieldPort {
         let formats = formats.get(..usize::from(*inputs)).unwrap_or(&[]);
         let (items, mut talks) = view.of(line);
         let mut frames =
-            Frames::new(self.mode, bindings, &mut self.reply, &mut self.counters, self.id, store, commands);
+            Frames::new((self.id, self.mode), &mut self.reply, &mut self.counters, bindings, store, commands);
         if frame.is_remote() {
             return frames.rejected(Rejection::Remote);
         }
@@ -529,7 +535,8 @@ impl Maker<'_> {
                     format.as_ref().is_none_or(|format| {
                         let codec = self.codec;
                         let elements = fields.iter().map(OutputBind::element);
-                        let text = |nth: usize, out: &mut [u8]| codec.write_text(format, nth, self.image, out);
+                        let text =
+                            |nth: usize, out: &mut [u8]| codec.write_text(format, nth, self.image, out);
                         let len = format.layout.encode_with(elements, number, text, data);
                         len == Some(data.len())
                     })
@@ -676,17 +683,18 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         if self.ports.iter().any(|port| port.line().is_some_and(|line| line.is_free(now))) {
             self.show_health(now);
         }
+        let mut first = Instant::NEVER;
+        let mut found = None;
         for port in &mut self.ports {
-            if !port.line().is_some_and(|line| line.is_free(now)) {
+            if found.is_some() || !port.line().is_some_and(|line| line.is_free(now)) {
                 continue;
             }
             let view = self.exchanges.view();
-            if let Some(downward) =
-                port.next_request(&self.store.image, &self.bindings.outputs, view, out, now)
-            {
-                return Some((port.id, downward));
-            }
+            let request = port.next_request(&self.store.image, &self.bindings.outputs, view, out, now);
+            found = request.map(|downward| (port.id, downward));
+            first = first.min(port.talk_deadline());
         }
-        None
+        self.arm(first);
+        found
     }
 }

@@ -57,8 +57,8 @@ pub use adu::{
 };
 pub use exchange::{Exchange, MAX_SLAVES, TableError, When};
 pub use master::{Failure, Master, Output, SlaveCounters, SlaveStatus};
-pub(crate) use operation::{Expected, Probe};
 pub use operation::{CountError, Operation, Reply, Table};
+pub(crate) use operation::{Expected, Probe, REFUSAL_LEN};
 pub use slave::{Counters, Slave};
 pub use timing::Timing;
 

@@ -1,0 +1,1 @@
+//! Conversations with frames of a device's own, on lines and on CAN.
