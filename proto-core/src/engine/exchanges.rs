@@ -56,8 +56,8 @@ pub(super) enum Asks {
     Rtu { slave: u8, operation: Operation },
     /// With a frame of the device's own.
     Frame,
-    /// With a remote frame on a CAN bus.
-    Remote,
+    /// With a remote frame on a CAN bus, which says how long the reply is.
+    Remote { id: CanId, len: u8 },
     /// Not at all: the reply comes unasked.
     Nothing,
 }
@@ -199,9 +199,18 @@ impl Formats<'_> {
                 let config = self.config;
                 let frame = |nth: Option<u8>| config.frames.get(usize::from(nth?));
                 if let Some(request) = frame(request) {
-                    item.asks = if request.remote { Asks::Remote } else { Asks::Frame };
-                    let layout = request.layout(config, Direction::Output);
-                    item.request = Some(self.format(Direction::Output, layout, request.id)?);
+                    item.asks = match request.id {
+                        Some(id) if request.remote => {
+                            let reply = frame(reply).map(|reply| reply.layout(config, Direction::Input));
+                            let len = reply.and_then(Result::ok).map_or(0, |reply| reply.layout.lengths().1);
+                            Asks::Remote { id, len: len as u8 }
+                        }
+                        _ => Asks::Frame,
+                    };
+                    if matches!(item.asks, Asks::Frame) {
+                        let layout = request.layout(config, Direction::Output);
+                        item.request = Some(self.format(Direction::Output, layout, request.id)?);
+                    }
                 }
                 if let Some(reply) = frame(reply) {
                     let layout = reply.layout(config, Direction::Input);

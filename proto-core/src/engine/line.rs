@@ -203,7 +203,7 @@ impl Line {
         self.phase = if is_answered {
             Phase::Waiting(Flight { until: until(|times| times.timeout), ..flight })
         } else {
-            Phase::Resting(until(|times| times.pause))
+            resting(until(|times| times.pause), now)
         };
         self.look_at = now;
         is_answered
@@ -227,7 +227,7 @@ impl Line {
     }
 
     fn rest(&mut self, pause: Duration, now: Instant) {
-        self.phase = if pause == Duration::ZERO { Phase::Idle } else { Phase::Resting(now + pause) };
+        self.phase = resting(now + pause, now);
         self.look_at = now;
         self.echo = 0;
     }
@@ -345,6 +345,10 @@ impl AsRef<Peer> for PeerState {
     fn as_ref(&self) -> &Peer {
         &self.turn
     }
+}
+
+fn resting(until: Instant, now: Instant) -> Phase {
+    if until > now { Phase::Resting(until) } else { Phase::Idle }
 }
 
 /// Whether an exchange needs its values or a bit to be looked at.

@@ -61,7 +61,7 @@ impl<'i> Awaited<'i> {
 
     /// The reply and the refusal that a device's own frames are.
     fn answers(&self) -> impl Iterator<Item = &'i InputFormat> {
-        let item = self.asked().filter(|item| matches!(item.asks, Asks::Frame | Asks::Remote));
+        let item = self.asked().filter(|item| matches!(item.asks, Asks::Frame | Asks::Remote { .. }));
         item.into_iter().flat_map(|item| item.reply.iter().chain(&item.refusal))
     }
 
@@ -368,17 +368,16 @@ impl FieldPort {
             return Some(Downward::Bytes(len));
         }
         let item = view_item(&mut view, self.line()?, item)?;
-        let format = item.request.as_ref()?;
+        if let Asks::Remote { id, len } = item.asks {
+            return CanFrame::remote(id, len.into()).map(Downward::Can);
+        }
         let frame = out.get(..len).unwrap_or(&[]);
-        Some(Downward::Can(if matches!(item.asks, Asks::Remote) {
-            CanFrame::remote(format.id, 0)?
-        } else {
-            CanFrame::filled(format.id, len.min(MAX_CAN_DATA) as u8, |data| {
-                for (slot, &byte) in data.iter_mut().zip(frame) {
-                    *slot = byte;
-                }
-            })
-        }))
+        let id = item.request.as_ref()?.id;
+        Some(Downward::Can(CanFrame::filled(id, len.min(MAX_CAN_DATA) as u8, |data| {
+            for (slot, &byte) in data.iter_mut().zip(frame) {
+                *slot = byte;
+            }
+        })))
     }
 
     /// The request has left.
@@ -545,7 +544,7 @@ impl Maker<'_> {
             (Asks::Frame, Some(format)) => {
                 whole_port::encode(self.codec, format, self.bindings, self.image, number, out)
             }
-            (Asks::Remote, _) => Some(0),
+            (Asks::Remote { .. }, _) => Some(0),
             _ => None,
         }
     }
