@@ -24,7 +24,7 @@ use places::{Places, Unplaced};
 
 pub use check::LayoutError;
 pub use element::Element;
-pub use frame_checksum::Checksum;
+pub use frame_checksum::{Checksum, MAX_CHECKSUM};
 
 /// What carries the frames.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -52,6 +52,30 @@ pub enum Probe {
     Other(usize),
     /// A frame of so many bytes with a checksum that is wrong.
     Wrong(usize),
+}
+
+/// A part of a frame.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum Part {
+    /// The bytes before the elements.
+    Head,
+    /// The element with this index.
+    Element(usize),
+    /// The checksum.
+    Checksum,
+    /// The bytes behind the elements.
+    Tail,
+}
+
+/// Where a part is in all frames.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub struct Place {
+    /// Its first byte, 0 is the first of the frame; `None` behind a field of varying length.
+    pub at: Option<usize>,
+    /// Number of bytes; `None` if it varies.
+    pub len: Option<usize>,
 }
 
 /// A frame, checked and ready to find, decode and encode.
@@ -225,11 +249,63 @@ impl FrameLayout {
     /// Whether the checksum at `at` is right; `None` without one.
     fn checksum_is_right(&self, frame: &[u8], at: usize) -> Option<bool> {
         let sum = self.checksum?;
-        let found = frame.get(at..at.saturating_add(sum.len())).unwrap_or(&[]);
-        let mut expected = [0; 8];
-        let expected = expected.get_mut(..sum.len())?;
-        sum.write(frame.get(sum.covered(at)).unwrap_or(&[]), expected);
-        Some(if sum.text { found.eq_ignore_ascii_case(expected) } else { found == expected })
+        let (found, right) = checksums_at(&sum, frame, at);
+        let right = right.get(..sum.len())?;
+        Some(if sum.text { found.eq_ignore_ascii_case(right) } else { found == right })
+    }
+
+    /// The checksum in a frame that [`Self::probe`] found, and the one that would be right; `None`
+    /// without one.
+    pub fn checksums<'f>(
+        &self,
+        elements: impl IntoIterator<Item: Borrow<Element>>,
+        frame: &'f [u8],
+    ) -> Option<(&'f [u8], Vec<u8, MAX_CHECKSUM>)> {
+        let sum = self.checksum?;
+        let mut places = Places::new(self, Some(frame.len()));
+        for element in elements {
+            places.find(element.borrow(), frame).ok()?;
+        }
+        let (found, right) = checksums_at(&sum, frame, places.checksum_at);
+        Some((found, Vec::from_slice(right.get(..sum.len())?).ok()?))
+    }
+
+    /// Tells the parts of the frame in the order of the wire, each with its place. Head and tail are
+    /// left out if they have no bytes.
+    pub fn parts(
+        &self,
+        elements: impl IntoIterator<Item: Borrow<Element>>,
+        mut tell: impl FnMut(Part, Place),
+    ) {
+        let mut places = Places::new(self, None);
+        // Behind a field of varying length no byte has a number.
+        let (mut is_numbered, mut shared_is_numbered) = (true, true);
+        let checksum = |places: &Places, is_numbered: bool| {
+            let sum = self.checksum.filter(|_| usize::from(self.behind) == places.nth)?;
+            Some(Place { at: is_numbered.then_some(places.checksum_at), len: Some(sum.len()) })
+        };
+        if !self.head.is_empty() {
+            tell(Part::Head, Place { at: Some(0), len: Some(self.head.len()) });
+        }
+        if let Some(place) = checksum(&places, true) {
+            tell(Part::Checksum, place);
+        }
+        for (nth, element) in elements.into_iter().enumerate() {
+            let element = element.borrow();
+            let len = element.len();
+            let at = places.next(element, len.unwrap_or(0), 0).start;
+            if !element.is_shared() {
+                shared_is_numbered = is_numbered;
+                is_numbered &= len.is_some();
+            }
+            tell(Part::Element(nth), Place { at: shared_is_numbered.then_some(at), len });
+            if let Some(place) = checksum(&places, is_numbered) {
+                tell(Part::Checksum, place);
+            }
+        }
+        if !self.tail.is_empty() {
+            tell(Part::Tail, Place { at: is_numbered.then_some(places.at), len: Some(self.tail.len()) });
+        }
     }
 
     /// The elements of a frame that [`Self::probe`] found, each with its value; `None` for what is
@@ -356,7 +432,7 @@ impl FrameLayout {
             length.encoding.write(number, out.get_mut(at..)?)?;
         }
         if let Some(sum) = self.checksum {
-            let mut bytes = [0; 8];
+            let mut bytes = [0; MAX_CHECKSUM];
             let bytes = bytes.get_mut(..sum.len())?;
             sum.write(out.get(sum.covered(places.checksum_at))?, bytes);
             put(out, places.checksum_at, bytes)?;
@@ -365,6 +441,16 @@ impl FrameLayout {
         put(out, tail_at, &self.tail)?;
         Some(tail_at.saturating_add(self.tail.len()))
     }
+}
+
+/// The bytes where a checksum stands, and the right ones, of which it has the first.
+fn checksums_at<'f>(sum: &Checksum, frame: &'f [u8], at: usize) -> (&'f [u8], [u8; MAX_CHECKSUM]) {
+    let found = frame.get(at..at.saturating_add(sum.len())).unwrap_or(&[]);
+    let mut right = [0; MAX_CHECKSUM];
+    if let Some(right) = right.get_mut(..sum.len()) {
+        sum.write(frame.get(sum.covered(at)).unwrap_or(&[]), right);
+    }
+    (found, right)
 }
 
 fn put(out: &mut [u8], at: usize, bytes: &[u8]) -> Option<()> {

@@ -3,6 +3,9 @@
 use crate::device::checksum::Algorithm;
 use crate::device::order::ByteOrder;
 
+/// Maximum number of bytes of a checksum in a frame: eight digits.
+pub const MAX_CHECKSUM: usize = 8;
+
 /// The checksum of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
