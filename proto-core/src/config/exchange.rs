@@ -116,6 +116,11 @@ impl Exchange {
         Self { peer, talk, when, timeout: DEFAULT_REPLY_TIMEOUT, retries: 1, pause: Duration::ZERO }
     }
 
+    /// Whether a master asks, and the gateway answers.
+    pub(crate) const fn is_served(&self) -> bool {
+        matches!(self.talk, Talk::Served { .. })
+    }
+
     /// The fields of its frames that come from the device (input), a reply before a refusal, or go to
     /// it (output).
     pub(crate) fn fields(

@@ -318,7 +318,11 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             _ if config.is_device(recipe) => {
                 let inputs = self.bindings.inputs.len() as u16;
                 let outputs = self.bindings.outputs.len() as u16;
-                Codec::Device(DeviceCodec::new(config, port.recipe, recipe, inputs, outputs)?)
+                let line = match &port.bus {
+                    Bus::Rs485(line) => Some(line),
+                    _ => None,
+                };
+                Codec::Device(DeviceCodec::new(config, port.recipe, recipe, [inputs, outputs], line)?)
             }
             Parts::Stream { input, output } => stream_codec(config, port.recipe, recipe, [input, output])?,
             Parts::Can { input, output } => can_codec(config, port.recipe, recipe, [input, output])?,

@@ -17,7 +17,7 @@ use super::store::Store;
 use super::tap::Tap;
 use super::user::{InputBind, InputTo, OutputBind, Written, number_of};
 use super::whole_port::{self, MAX_TEXTS, Reader, TextBind, texts_of};
-use crate::config::{CanFramePart, ConfigView, Counted, DeviceFrame, Parts, Recipe, Span};
+use crate::config::{CanFramePart, ConfigView, Counted, DeviceFrame, Parts, Recipe, Rs485, Span};
 use crate::device::{Cutter, Element, Encoding, Escape, Found, FrameLayout, Framer, Overflow, Probe};
 use crate::image::{Image, bind_to_variable};
 use crate::sysvar::{Direction, SysVar};
@@ -114,8 +114,8 @@ impl DeviceCodec {
         config: ConfigView<'_>,
         index: u8,
         recipe: &Recipe,
-        mut next_input: u16,
-        mut next_output: u16,
+        [mut next_input, mut next_output]: [u16; 2],
+        line: Option<&Rs485>,
     ) -> Result<Self, BuildError> {
         let texts = texts_of(config, recipe, [next_input, next_output]);
         let mut codec = Self {
@@ -132,9 +132,12 @@ impl DeviceCodec {
             Parts::Stream { .. } => {
                 let cut = recipe.stream_part(Direction::Input);
                 let cutter = cut.and_then(|part| Cutter::new(part.framing, part.escape));
-                codec.reader = Some(match cutter {
-                    Some(cutter) => Reader::Whole { cutter, heard: Instant::ZERO },
-                    None => Reader::Search(Framer::new()),
+                let served = config.exchanges_of(recipe).iter().find(|exchange| exchange.is_served());
+                let slave = served.zip(line).and_then(|(exchange, line)| line.slave(exchange.peer));
+                codec.reader = Some(match (slave, cutter) {
+                    (Some(slave), _) => Reader::Slave(slave),
+                    (None, Some(cutter)) => Reader::Whole { cutter, heard: Instant::ZERO },
+                    (None, None) => Reader::Search(Framer::new()),
                 });
                 [&[], &[]]
             }

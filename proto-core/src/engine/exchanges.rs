@@ -11,7 +11,7 @@ use super::device_port::DeviceFormat;
 use super::line::{Line, PeerCounters, PeerState, Talks, Times, is_looked_at};
 use crate::config::{Bus, ConfigView, Counted, DeviceFrame, Exchange, FieldSpec, Port, Recipe, Span, Talk};
 use crate::device::{Carrier, LayoutError};
-use crate::modbus::rtu::Operation;
+use crate::modbus::rtu::{Operation, Table};
 use crate::schedule::{Grid, Peer, Row};
 use crate::sysvar::{Direction, SysVar};
 use crate::time::{Duration, Instant};
@@ -58,6 +58,8 @@ pub(super) enum Asks {
     Frame,
     /// With a remote frame on a CAN bus, which says how long the reply is.
     Remote { id: CanId, len: u8 },
+    /// Not at all: a master asks, and these are registers or coils of ours.
+    Served { table: Table, address: u16, count: u16 },
     /// Not at all: the reply comes unasked.
     Nothing,
 }
@@ -194,7 +196,16 @@ impl Formats<'_> {
                     item.reply = Some(self.input(data, None)?);
                 }
             }
-            Talk::Served { .. } => {}
+            Talk::Served { operation, written, read } => {
+                let (table, address, count) = operation.place();
+                item.asks = Asks::Served { table, address, count };
+                if let Some(data) = self.data(Direction::Output, read) {
+                    item.request = Some(self.format(Direction::Output, data, None)?);
+                }
+                if let Some(data) = self.data(Direction::Input, written) {
+                    item.reply = Some(self.input(data, None)?);
+                }
+            }
             Talk::Frames { request, reply, refusal } => {
                 let config = self.config;
                 let frame = |nth: Option<u8>| config.frames.get(usize::from(nth?));

@@ -37,6 +37,7 @@ mod port_health;
 mod questions;
 mod rejection;
 mod sender;
+mod served;
 mod session;
 mod state_link;
 mod status;

@@ -141,7 +141,8 @@ impl FieldPort {
             Some(line) if self.is_usable() => {
                 let deadline = line.deadline(&self.line);
                 // Until the line is free, there is only that to wait for.
-                if self.sender.is_busy() && line.may_ask() { Instant::NEVER } else { deadline }
+                let own = if self.sender.is_busy() && line.may_ask() { Instant::NEVER } else { deadline };
+                own.min(self.slave_deadline()).min(self.reply_deadline())
             }
             _ => Instant::NEVER,
         }
@@ -153,6 +154,15 @@ impl FieldPort {
         let echoed = usize::from(line.echo).min(bytes.len());
         line.echo = line.echo.saturating_sub(echoed as u16);
         bytes.get(echoed..).unwrap_or(&[])
+    }
+
+    /// Whether the gateway is the slave of a line, which takes its bytes.
+    fn hears_master(&mut self, bytes: &[u8], now: Instant) -> bool {
+        let Codec::Device(DeviceCodec { reader: Some(Reader::Slave(slave)), .. }) = &mut self.codec else {
+            return false;
+        };
+        slave.received(bytes, now);
+        true
     }
 
     /// Reads the frames in `rest`; stops after the first accepted one if the image is to be checked
@@ -521,7 +531,7 @@ impl Maker<'_> {
     /// Writes a request to the front of `out`; `None` if a value of it is unknown or stale.
     fn make(&self, item: &Item, out: &mut [u8]) -> Option<usize> {
         let fields = item.request.as_ref().map_or(&[][..], |format| format.bindings.of(self.bindings));
-        if !fields.iter().all(|field| self.may_send(field)) {
+        if !fields.iter().all(|field| may_send(self.sender, self.image, field, self.now)) {
             return None;
         }
         let number = |nth: usize| {
@@ -548,15 +558,16 @@ impl Maker<'_> {
             _ => None,
         }
     }
+}
 
-    fn may_send(&self, field: &OutputBind) -> bool {
-        match field.from {
-            OutputBinding::Variable { var, .. } => {
-                self.image.known_since(var).is_some_and(|at| self.sender.is_fresh(at, self.now))
-            }
-            OutputBinding::State { .. } => self.sender.may_show(self.image, self.now),
-            _ => true,
+/// Whether a field's value is known, and fresh unless the recipe holds.
+pub(super) fn may_send(sender: &Sender, image: &Image, field: &OutputBind, now: Instant) -> bool {
+    match field.from {
+        OutputBinding::Variable { var, .. } => {
+            image.known_since(var).is_some_and(|at| sender.is_fresh(at, now))
         }
+        OutputBinding::State { .. } => sender.may_show(image, now),
+        _ => true,
     }
 }
 
@@ -584,6 +595,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             return port.discard(bytes, None, &mut self.tap, now);
         }
         port.heard(bytes, now);
+        if port.hears_master(bytes, now) {
+            return self.after_talk(id);
+        }
         let mut rest = port.behind_echo(bytes);
         loop {
             let (store, command) = (&mut self.store, self.links.command.first_mut());
@@ -660,9 +674,28 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
 
     #[inline(never)]
     pub(super) fn advance_talk(&mut self, now: Instant) {
-        for port in &mut self.ports {
+        for index in 0..self.ports.len() {
+            let Some(port) = self.ports.get_mut(index) else { break };
             port.advance_talk(self.exchanges.view(), now);
+            if port.is_asked(now) {
+                let id = port.id;
+                self.serve(id, now);
+            }
         }
+    }
+
+    /// A master's request has ended.
+    fn serve(&mut self, id: PortId, now: Instant) {
+        self.show_health(now);
+        let (store, command) = (&mut self.store, self.links.command.first_mut());
+        let Some(port) = find_port(&mut self.ports, id) else { return };
+        if self.is_deaf {
+            return port.discard_partial(&mut self.tap, now);
+        }
+        let bindings = (&self.bindings.inputs[..], &self.bindings.outputs[..]);
+        let accepted = port.serve(bindings, store, command, &mut self.tap, self.exchanges.view());
+        self.after_talk(id);
+        self.after_field(id, &accepted, now);
     }
 
     #[inline(never)]
@@ -685,6 +718,11 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         let mut first = Instant::NEVER;
         let mut found = None;
         for port in &mut self.ports {
+            if found.is_none()
+                && let Some(len) = port.next_reply(out, now)
+            {
+                found = Some((port.id, Downward::Bytes(len)));
+            }
             if found.is_some() || !port.line().is_some_and(|line| line.is_free(now)) {
                 continue;
             }

@@ -5,3 +5,4 @@ mod line;
 #[path = "../rig/mod.rs"]
 mod rig;
 mod rtu;
+mod slave;
