@@ -12,7 +12,7 @@
 
 // Memory for a configuration, in bytes: enough on every machine. It is needed until
 // `rgw_gateway_configure` has returned.
-#define RGW_CONFIG_SIZE 20480
+#define RGW_CONFIG_SIZE 21504
 
 // Field ports that a gateway has room for.
 #define RGW_MAX_PORTS 4

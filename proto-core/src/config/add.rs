@@ -27,7 +27,8 @@ impl<
     const ALL_FIELDS: usize,
     const COMMANDS: usize,
     const SAFE_VALUES: usize,
-> GatewayConfig<PORTS, RECIPES, ALL_FIELDS, COMMANDS, SAFE_VALUES>
+    const EXCHANGES: usize,
+> GatewayConfig<PORTS, RECIPES, ALL_FIELDS, COMMANDS, SAFE_VALUES, EXCHANGES>
 {
     /// Sets the controller's address, ports and dialect; the recipe link stays.
     ///

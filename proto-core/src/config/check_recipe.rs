@@ -1,6 +1,7 @@
 //! The checks that concern one recipe alone: its parts, the bindings of its user fields, its
 //! trigger.
 
+use super::check_exchange::ExchangeCheck;
 use super::error::{ConfigErrorKind as Kind, Place, RecipeKey};
 use super::rules::{Check, check_new_name, check_pool, fail, is_marked, mark};
 use super::{
@@ -30,13 +31,14 @@ impl<'a> RecipeCheck<'a> {
     pub(super) fn check(&self) -> Check {
         let names = self.config.recipes.iter().map(|recipe| &recipe.name);
         check_new_name(self.at(RecipeKey::Name), &self.recipe.name, self.index, names)?;
-        if !self.recipe.has(Direction::Input) && !self.recipe.has(Direction::Output) {
+        ExchangeCheck { config: self.config, index: self.index, recipe: self.recipe }.check()?;
+        if !self.has(Direction::Input) && !self.has(Direction::Output) {
             return fail(self.at(RecipeKey::Whole), Kind::NoParts);
         }
         // UDP needs the least of a stream recipe; it does not take user-defined recipes (D16).
         let framing = if self.recipe.mode == Mode::User { Framing::Bytes } else { Framing::Datagram };
         for part in [Direction::Input, Direction::Output] {
-            for (frame, span) in self.recipe.frames(part) {
+            for (frame, span) in self.config.frames_of(self.recipe, part) {
                 let place = Place::Frame { recipe: self.index, part, frame };
                 check_pool(place, span, self.config.fields.len())?;
             }
@@ -55,6 +57,10 @@ impl<'a> RecipeCheck<'a> {
             self.check_written_once()?;
         }
         self.check_send()
+    }
+
+    fn has(&self, part: Direction) -> bool {
+        self.config.has_frames(self.recipe, part)
     }
 
     fn at(&self, key: RecipeKey) -> Place {
@@ -293,22 +299,25 @@ impl<'a> RecipeCheck<'a> {
         if recipe.mode == Mode::Realtime {
             return fail(place, Kind::RealtimeSendsByPeriod);
         }
-        if !recipe.has(Direction::Output) {
+        if recipe.part_frames(Direction::Output).next().is_none() {
             return fail(place, Kind::NothingToSend);
         }
         match recipe.send {
             SendOn::Period | SendOn::Change => Ok(()),
-            SendOn::Frame if recipe.has(Direction::Input) => Ok(()),
+            SendOn::Frame if self.has(Direction::Input) => Ok(()),
             SendOn::Frame => fail(place, Kind::NoInputToAnswer),
-            SendOn::Rising { var, bit } => {
-                if !var.is_bits() {
-                    return fail(place, Kind::NotBits { var });
-                }
-                let is_there = 1_u8.checked_shl(bit.into()).is_some_and(|mask| var.valid_bits() & mask != 0);
-                if is_there { Ok(()) } else { fail(place, Kind::NoSuchBit { var, bit }) }
-            }
+            SendOn::Rising { var, bit } => check_bit(place, var, bit),
         }
     }
+}
+
+/// A bit that triggers.
+pub(super) fn check_bit(place: Place, var: SysVar, bit: u8) -> Check {
+    if !var.is_bits() {
+        return fail(place, Kind::NotBits { var });
+    }
+    let is_there = 1_u8.checked_shl(bit.into()).is_some_and(|mask| var.valid_bits() & mask != 0);
+    if is_there { Ok(()) } else { fail(place, Kind::NoSuchBit { var, bit }) }
 }
 
 /// The numbers that a field can have.

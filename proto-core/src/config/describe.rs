@@ -77,6 +77,9 @@ impl fmt::Display for Described<'_> {
                 }
                 write!(f, "field {}", one_based(field))?;
             }
+            Place::Exchange { recipe, exchange } => {
+                write!(f, "{}, exchange {}", RecipeName(*config, recipe), one_based(exchange))?;
+            }
             Place::Command { entry } => write!(f, "command {}", u32::from(entry).saturating_add(1))?,
             Place::Port { port, key } => write!(f, "{}, {}", PortName(*config, port), key.name())?,
             Place::SafeValue { entry } => write!(f, "safe value {}", u32::from(entry).saturating_add(1))?,
@@ -245,6 +248,7 @@ impl fmt::Display for DescribedKind<'_> {
                 write!(f, "needs an integer field (byte, char, word, short, dword, int); this one is a {ty}")
             }
             Kind::Layout(error) => error.fmt(f),
+            Kind::Exchange(error) => error.fmt(f),
             Kind::NotInField { value, low, high } => {
                 write!(f, "the field cannot be {value}; allowed: {low}..={high}")
             }

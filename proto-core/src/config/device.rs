@@ -116,7 +116,7 @@ impl<'c> ConfigView<'c> {
             _ => Carrier::Stream,
         };
         let delimiters = stream.map_or((&[][..], &[][..]), |part| (&*part.head, &*part.tail));
-        recipe.frames(part).map(move |(nth, span)| FrameFields {
+        (0..).zip(recipe.part_frames(part)).map(move |(nth, span)| FrameFields {
             nth,
             carrier,
             delimiters,
@@ -127,9 +127,10 @@ impl<'c> ConfigView<'c> {
     /// Whether a port with this recipe speaks a device's own frames, beyond what the controller's
     /// recipes can describe.
     pub fn is_device(self, recipe: &Recipe) -> bool {
-        [Direction::Input, Direction::Output].into_iter().any(|part| {
-            recipe.stream_part(part).is_some_and(StreamPart::is_cut)
-                || self.fields_of(recipe, part).any(|(_, _, field)| field.is_device())
-        })
+        recipe.exchanges.len > 0
+            || [Direction::Input, Direction::Output].into_iter().any(|part| {
+                recipe.stream_part(part).is_some_and(StreamPart::is_cut)
+                    || self.fields_of(recipe, part).any(|(_, _, field)| field.is_device())
+            })
     }
 }

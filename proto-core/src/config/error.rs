@@ -2,7 +2,7 @@
 
 use core::net::Ipv4Addr;
 
-use super::{Network, StateValueError};
+use super::{ExchangeError, Network, StateValueError};
 use crate::command::ParseError;
 use crate::device::LayoutError;
 use crate::recipe::PartError;
@@ -61,10 +61,18 @@ pub enum Place {
         recipe: u8,
         /// Input or output part.
         part: Direction,
-        /// Index of the CAN frame in the part; 0 in a stream recipe.
+        /// Index of the CAN frame in the part; 0 in a stream recipe. The frames of exchanges are counted
+        /// on behind those of the part.
         frame: u8,
         /// Index of the field in the part or frame.
         field: u8,
+    },
+    /// One exchange.
+    Exchange {
+        /// Index of the recipe.
+        recipe: u8,
+        /// Index of the exchange in the recipe.
+        exchange: u8,
     },
     /// One entry of a command table.
     Command {
@@ -197,6 +205,10 @@ pub enum Counted {
     PollBlocks,
     /// Values of the state packet and of the health of ports that all ports send.
     Sources,
+    /// Exchanges of all recipes.
+    Exchanges,
+    /// Frames of all exchanges.
+    ExchangeFrames,
 }
 
 impl core::fmt::Display for Counted {
@@ -218,6 +230,8 @@ impl core::fmt::Display for Counted {
             Self::CommandBytes => "bytes of command texts",
             Self::Groups => "groups",
             Self::PollBlocks => "Modbus poll blocks",
+            Self::Exchanges => "exchanges in all recipes together",
+            Self::ExchangeFrames => "frames of exchanges in all recipes together",
             Self::Sources => "values of the controller's state and of the health of ports",
         })
     }
@@ -338,6 +352,8 @@ pub enum ConfigErrorKind {
     },
     /// The frame of a device cannot be laid out.
     Layout(LayoutError),
+    /// The exchange cannot be.
+    Exchange(ExchangeError),
     /// A number that its field cannot have.
     NotInField {
         /// The number.

@@ -27,16 +27,21 @@ pub struct Recipe {
     pub on_stale: OnStale,
     /// What makes a port send the output part.
     pub send: SendOn,
+    /// What is asked beside the parts, a range of
+    /// [`GatewayConfig::exchanges`](super::GatewayConfig::exchanges); the parts of a stream may then
+    /// both be absent.
+    pub exchanges: Span,
 }
 
 impl Recipe {
     /// A recipe with these parts that is sent every cycle and holds stale values.
     pub const fn new(name: Name, mode: Mode, parts: Parts) -> Self {
-        Self { name, mode, parts, on_stale: OnStale::Hold, send: SendOn::Period }
+        let exchanges = Span { start: 0, len: 0 };
+        Self { name, mode, parts, on_stale: OnStale::Hold, send: SendOn::Period, exchanges }
     }
 
     /// The field ranges of one part: one for a stream part, one for each CAN frame.
-    pub(crate) fn frames(&self, part: Direction) -> impl Iterator<Item = (u8, Span)> + '_ {
+    pub(crate) fn part_frames(&self, part: Direction) -> impl Iterator<Item = Span> + '_ {
         let (stream, can) = match (&self.parts, part) {
             (Parts::Stream { input, .. }, Direction::Input) => (input.as_ref(), None),
             (Parts::Stream { output, .. }, Direction::Output) => (output.as_ref(), None),
@@ -44,7 +49,7 @@ impl Recipe {
             (Parts::Can { output, .. }, Direction::Output) => (None, Some(output)),
         };
         let can = can.into_iter().flatten().map(|frame| frame.fields);
-        (0..).zip(stream.map(|part| part.fields).into_iter().chain(can))
+        stream.map(|part| part.fields).into_iter().chain(can)
     }
 
     /// One part of a stream recipe.
@@ -55,14 +60,9 @@ impl Recipe {
             (Parts::Can { .. }, _) => None,
         }
     }
-
-    /// Whether the recipe has this part.
-    pub(crate) fn has(&self, part: Direction) -> bool {
-        self.frames(part).next().is_some()
-    }
 }
 
-/// A recipe's two parts; either may be absent, not both.
+/// A recipe's two parts; either may be absent, and both if it has exchanges.
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[allow(clippy::large_enum_variant, reason = "without an allocator there is no box to put the larger one in")]

@@ -12,8 +12,8 @@ use super::rules::{
     check_time, fail, is_marked, mark,
 };
 use super::{
-    Bus, ConfigView, FieldSpec, MAX_ALL_FIELDS, MAX_COMMANDS, MAX_PORTS, MAX_RECIPES, MAX_SAFE_VALUES, Parts,
-    Port, PortHealth, Recipe, SendOn,
+    Bus, ConfigView, FieldSpec, MAX_ALL_FIELDS, MAX_COMMANDS, MAX_EXCHANGES, MAX_PORTS, MAX_RECIPES,
+    MAX_SAFE_VALUES, Parts, Port, PortHealth, Recipe, SendOn,
 };
 use crate::recipe::model::{Framing, Mode};
 use crate::sysvar::{COUNT, Direction, INPUT_COUNT, SysVar};
@@ -49,6 +49,8 @@ impl<'c> ConfigView<'c> {
             (Counted::Fields, self.fields.len(), MAX_ALL_FIELDS),
             (Counted::Commands, self.commands.len(), MAX_COMMANDS),
             (Counted::SafeValues, self.safe_values.len(), MAX_SAFE_VALUES),
+            (Counted::Exchanges, self.exchanges.len(), MAX_EXCHANGES),
+            (Counted::ExchangeFrames, self.frames.len(), MAX_EXCHANGES),
         ] {
             check_room(Place::Whole, what, needed, room)?;
         }

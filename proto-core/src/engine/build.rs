@@ -266,7 +266,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             (0_usize, 0_usize, 0_usize, 0_usize, 0_usize);
         for (_, _, recipe) in config.field_ports() {
             ports = ports.saturating_add(1);
-            frames = frames.saturating_add(recipe.frames(Direction::Input).count());
+            frames = frames.saturating_add(config.frames_of(recipe, Direction::Input).count());
             for (_, _, field) in config.fields_of(recipe, Direction::Input) {
                 let to = match field {
                     FieldSpec::UserInput { to, .. } | FieldSpec::DeviceInput { to, .. } => *to,
@@ -327,7 +327,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             self.store.is_overdue_from_start();
         }
         let mut next_binding = self.bindings.inputs.len() as u16;
-        for (_, fields) in recipe.frames(Direction::Input) {
+        for (_, fields) in config.frames_of(recipe, Direction::Input) {
             let fields = fields.of(config.fields);
             let set = fields.iter().flat_map(FieldSpec::variables).collect();
             let is_bound = |field: &&FieldSpec| field.element().is_some();
@@ -384,7 +384,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             outputs.len = outputs.len.saturating_add(1);
         }
         self.store.watches_bits |= matches!(recipe.send, SendOn::Rising { .. });
-        let has_output = recipe.has(Direction::Output);
+        let has_output = recipe.part_frames(Direction::Output).next().is_some();
         let mut sender = Sender::new(recipe.send, recipe.on_stale, port.stale_after, port.cycle, has_output);
         sender.refresh = port.refresh.unwrap_or(Duration::MAX);
         let port = FieldPort {

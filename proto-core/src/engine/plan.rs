@@ -248,7 +248,7 @@ fn inputs_of<'a>(config: ConfigView<'a>, recipe: &'a Recipe) -> impl Iterator<It
 /// safe values or none. Then all of them are known whenever one is written.
 fn is_one_frame(config: ConfigView<'_>, link: &Recipe) -> bool {
     config.field_ports().any(|(_, port, recipe)| {
-        recipe.frames(Direction::Input).any(|(_, fields)| {
+        config.frames_of(recipe, Direction::Input).any(|(_, fields)| {
             let fields = fields.of(config.fields);
             let brings = |var| fields.iter().flat_map(FieldSpec::variables).any(|brought| brought == var);
             let safe = |var| port.on_timeout.of(config.safe_values).iter().any(|safe| safe.var == var);

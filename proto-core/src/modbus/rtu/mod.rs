@@ -57,7 +57,7 @@ pub use adu::{
 };
 pub use exchange::{Exchange, MAX_SLAVES, TableError, When};
 pub use master::{Failure, Master, Output, SlaveCounters, SlaveStatus};
-pub use operation::{CountError, Operation, Reply};
+pub use operation::{CountError, Operation, Reply, Table};
 pub use schedule::Presence;
 pub use slave::{Counters, Slave};
 pub use timing::Timing;

@@ -101,6 +101,20 @@ impl fmt::Display for CountError {
 
 impl core::error::Error for CountError {}
 
+/// The four tables of a slave.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum Table {
+    /// Single bits that can be written.
+    Coils,
+    /// Single bits.
+    DiscreteInputs,
+    /// Registers that can be written.
+    HoldingRegisters,
+    /// Registers.
+    InputRegisters,
+}
+
 /// The content of a reply.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
@@ -170,6 +184,29 @@ impl Operation {
                 (count as usize).saturating_mul(2)
             }
             _ => 0,
+        }
+    }
+
+    /// Bytes of data that a reply carries; 0 for a write.
+    pub const fn read_len(&self) -> usize {
+        match self.reply_data_len() {
+            Some(len) => len,
+            None => 0,
+        }
+    }
+
+    /// The table that it is about, its first address there and the count; what FC 23 reads.
+    pub const fn place(&self) -> (Table, u16, u16) {
+        let table = match self {
+            Self::ReadCoils { .. } | Self::WriteCoil { .. } | Self::WriteCoils { .. } => Table::Coils,
+            Self::ReadDiscreteInputs { .. } => Table::DiscreteInputs,
+            Self::ReadInputRegisters { .. } => Table::InputRegisters,
+            _ => Table::HoldingRegisters,
+        };
+        let (address, count) = self.head();
+        match self {
+            Self::WriteCoil { .. } | Self::WriteRegister { .. } => (table, address, 1),
+            _ => (table, address, count),
         }
     }
 
