@@ -200,7 +200,7 @@ mod tests {
 
     fn line(baud: u32, parity: Parity, stop_bits: u8) -> Rs485 {
         let (idle_gap, turnaround) = (Duration::from_millis(50), Duration::ZERO);
-        Rs485 { baud, parity, stop_bits, idle_gap, turnaround }
+        Rs485 { baud, parity, stop_bits, idle_gap, turnaround, echo: false }
     }
 
     #[test]

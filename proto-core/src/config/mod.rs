@@ -37,7 +37,7 @@ pub(crate) use command_text::{fill_in, placeholders};
 pub use device::DeviceFrame;
 pub use draft::{Can, ControllerBuilder, Listen, PortBuilder, PortBus, RecipeBuilder, SafeValues};
 pub use error::{
-    ConfigError, ConfigErrorKind, ControllerKey, Counted, NetworkKey, Place, PortKey, RecipeKey,
+    ConfigError, ConfigErrorKind, ControllerKey, Counted, ExchangeKey, NetworkKey, Place, PortKey, RecipeKey,
 };
 pub use exchange::{AskWhen, DEFAULT_REPLY_TIMEOUT, Exchange, FrameSpec, Talk};
 pub use fields::{CanFields, Fields, InputField, OutputField, Sum, Var};
