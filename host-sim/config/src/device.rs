@@ -113,6 +113,8 @@ pub struct DeviceField {
     pub repeats: bool,
     /// Its value picks a command.
     pub picks_commands: bool,
+    /// It is the coil of Modbus function 5, which is FF for 1.
+    pub is_coil: bool,
 }
 
 impl NamedFrame {

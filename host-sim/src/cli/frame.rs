@@ -1,7 +1,7 @@
 //! The frames of a device as `check` draws them: which bytes are what.
 
 use proto_core::config::{FieldSpec, OutputBinding};
-use proto_core::device::{Algorithm, Bits, ByteOrder, Checksum, Digits, Encoding, Kind, Width};
+use proto_core::device::{Algorithm, Bits, ByteOrder, Checksum, Digits, Encoding, Kind, TextWidth, Width};
 use proto_core::sysvar::Direction;
 use proto_core::wire::scalar::ScalarType;
 use recipe_config::{DeviceField, DeviceRecipe, NamedFrame};
@@ -22,16 +22,19 @@ pub(super) fn show(recipe: &DeviceRecipe, part: Direction) -> String {
         if let Some(id) = frame.id {
             report += &format!("    id {}\n", text::show_id(id));
         }
-        let rows = rows(frame, part);
-        let width = |column: fn(&Row) -> &String| {
-            rows.iter().map(|row| column(row).chars().count()).max().unwrap_or(0)
-        };
-        let (places, names) = (width(|row| &row.place), width(|row| &row.name));
-        for Row { place, name, what } in &rows {
-            report += &format!("    {place:places$}  {name:names$}  {what}\n");
-        }
+        report += &show_bytes(frame, part);
     }
     report
+}
+
+/// One frame, a line for each run of bytes.
+pub(super) fn show_bytes(frame: &NamedFrame, part: Direction) -> String {
+    let rows = rows(frame, part);
+    let width =
+        |column: fn(&Row) -> &String| rows.iter().map(|row| column(row).chars().count()).max().unwrap_or(0);
+    let (places, names) = (width(|row| &row.place), width(|row| &row.name));
+    let show = |Row { place, name, what }: &Row| format!("    {place:places$}  {name:names$}  {what}\n");
+    rows.iter().map(show).collect()
 }
 
 fn rows(frame: &NamedFrame, part: Direction) -> Vec<Row> {
@@ -62,6 +65,20 @@ fn rows(frame: &NamedFrame, part: Direction) -> Vec<Row> {
                     Direction::Output => format!("{fill:02X}"),
                 };
                 add(cursor.step(Some(usize::from(len))), "padding", what);
+            }
+            FieldSpec::TextInput { text, .. } | FieldSpec::TextOutput { text, .. } => {
+                let len = match text.width {
+                    TextWidth::Fixed(width) => Some(usize::from(width)),
+                    TextWidth::Until(_) | TextWidth::Rest => None,
+                };
+                add(cursor.step(len), &field.name, show_text(text.width) + show_words(&field.spec).as_str());
+            }
+            FieldSpec::UserOutput { .. } | FieldSpec::DeviceOutput { .. } if field.is_coil => {
+                add(
+                    cursor.step(Some(1)),
+                    &field.name,
+                    format!("FF for 1, 00 for 0{}", show_use(&field.spec)),
+                );
             }
             spec => {
                 let Some(encoding) = spec.element().and_then(|element| element.encoding()) else { continue };
@@ -145,6 +162,28 @@ fn show_encoding(encoding: &Encoding) -> String {
         _ => String::new(),
     };
     kind + order
+}
+
+fn show_text(width: TextWidth) -> String {
+    match width {
+        TextWidth::Fixed(1) => "text, 1 character".to_owned(),
+        TextWidth::Fixed(width) => format!("text, {width} characters"),
+        TextWidth::Until(end) => format!("text up to {:?}", char::from(end)),
+        TextWidth::Rest => "text up to the end".to_owned(),
+    }
+}
+
+/// The registers of a text.
+fn show_words(spec: &FieldSpec) -> String {
+    let (arrow, words) = match *spec {
+        FieldSpec::TextInput { to: Some(to), .. } => ("->", to),
+        FieldSpec::TextOutput { from, .. } => ("<-", from),
+        _ => return String::new(),
+    };
+    match (words.count, words.first.index()) {
+        (1, _) => format!(" {arrow} {}", words.first),
+        (count, first) => format!(" {arrow} {}[{first}..{}]", words.first.group(), first + count - 1),
+    }
 }
 
 /// The constant, or the variable, behind how the field is written.

@@ -20,6 +20,7 @@ mod exchange;
 mod fields;
 #[cfg(feature = "image")]
 pub mod image;
+mod line_budget;
 mod listen;
 mod network;
 mod port;
@@ -41,6 +42,7 @@ pub use error::{
 };
 pub use exchange::{AskWhen, DEFAULT_REPLY_TIMEOUT, Exchange, FrameSpec, Talk};
 pub use fields::{CanFields, Fields, InputField, OutputField, Sum, Var};
+pub use line_budget::ExchangeBudget;
 pub use listen::listen_address;
 pub use network::{BoardAddress, Network};
 pub(crate) use port::MIN_CYCLE;

@@ -520,7 +520,7 @@ impl FileField {
         let repeats = matches!(self.kind, FileFieldKind::UserInput { again: true, .. });
         let picks_commands =
             matches!(self.kind, FileFieldKind::UserInput { to: FileInput::Commands { .. }, .. });
-        DeviceField { name: self.name(), spec: self.spec(), repeats, picks_commands }
+        DeviceField { name: self.name(), spec: self.spec(), repeats, picks_commands, is_coil: false }
     }
 
     /// What the field is, without a table of commands.

@@ -28,6 +28,7 @@ use proto_core::config::GatewayConfig;
 use proto_core::wire::dialect::Dialect;
 
 pub use error::{FileError, Source};
+pub use modbus::function_name;
 
 use super::device::AnyRecipe;
 use super::sim::SimConfig;

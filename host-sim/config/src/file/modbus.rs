@@ -43,6 +43,12 @@ const FUNCTIONS: [(&str, i64, Function); 9] = [
     ("read-write-registers", 23, Function::ReadWriteRegisters),
 ];
 
+/// The name of a function of Modbus, such as `read-coils` for 1.
+pub fn function_name(operation: &Operation) -> &'static str {
+    let code = i64::from(operation.function());
+    FUNCTIONS.iter().find(|(_, known, _)| *known == code).map_or("", |(name, ..)| name)
+}
+
 /// What a block of a slave holds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Table {

@@ -53,7 +53,8 @@ impl Frame {
     }
 
     fn push(&mut self, name: &str, spec: FieldSpec) {
-        self.0.push(DeviceField { name: name.to_owned(), spec, repeats: false, picks_commands: false });
+        let (repeats, picks_commands, is_coil) = (false, false, false);
+        self.0.push(DeviceField { name: name.to_owned(), spec, repeats, picks_commands, is_coil });
     }
 
     fn byte(&mut self, name: &str, value: u8) {
@@ -73,7 +74,9 @@ impl Frame {
     fn request(self, operation: &Operation, written: &[DeviceField]) -> Self {
         match *operation {
             Operation::WriteCoil { address } => {
-                let mut frame = self.words(&[("address", address)]).fields(written);
+                let coils: Vec<_> =
+                    written.iter().map(|field| DeviceField { is_coil: true, ..field.clone() }).collect();
+                let mut frame = self.words(&[("address", address)]).fields(&coils);
                 frame.byte("", 0);
                 frame
             }
