@@ -212,8 +212,7 @@ fn direction_of(block: &Reader<'_>, holds: Table) -> Result<Direction> {
             match found.replace(direction) {
                 Some(before) if before != direction => {
                     return Err(key.error(
-                        "a master writes the fields before this one, or reads them, and this one is the other way; \
-                         write two blocks",
+                        "a master reads some fields of this block and writes others; these are two blocks",
                     ));
                 }
                 _ => {}
@@ -233,7 +232,7 @@ fn read_function(table: &Reader<'_>) -> Result<Function> {
     if item.as_string().is_some() {
         return item.choice_nearly(&names);
     }
-    let number: i64 = item.integer(i64::MIN..=i64::MAX)?;
+    let Some(number) = item.as_integer() else { return item.choice(&names) };
     let known = FUNCTIONS.iter().find(|(_, code, _)| *code == number);
     known.map(|(.., function)| *function).ok_or_else(|| {
         let codes: Vec<_> = FUNCTIONS.iter().map(|(name, code, _)| format!("{code} ({name})")).collect();

@@ -168,6 +168,14 @@ impl<'a> Item<'a> {
         }
     }
 
+    /// The integer, if it is one.
+    pub(super) fn as_integer(&self) -> Option<i64> {
+        match self.node.value {
+            Value::Int(Ok(value)) => Some(value),
+            _ => None,
+        }
+    }
+
     /// An integer in `range`.
     pub(super) fn integer<T: TryFrom<i64>>(&self, range: RangeInclusive<i64>) -> Result<T> {
         let refused = |shown: &str| {

@@ -267,6 +267,8 @@ fn check_keys(table: &Reader<'_>, flavour: Flavour) -> Result<()> {
         refuse(table, &["exchange"], why)?;
     }
     match kind {
+        // Refused with its kind.
+        Some(kind) if kind.is_modbus() && flavour == Flavour::Controller => Ok(()),
         Some(kind) if kind.is_modbus() => {
             refuse(
                 table,

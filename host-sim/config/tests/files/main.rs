@@ -7,4 +7,5 @@ mod example_files;
 mod exchange_files;
 mod framing_files;
 mod wrong_devices;
+mod wrong_exchanges;
 mod wrong_files;
