@@ -121,24 +121,20 @@ impl Exchange {
         matches!(self.talk, Talk::Served { .. })
     }
 
-    /// The fields of its frames that come from the device (input), a reply before a refusal, or go to
-    /// it (output).
-    pub(crate) fn fields(
-        &self,
-        config: ConfigView<'_>,
-        part: Direction,
-    ) -> impl Iterator<Item = Span> + use<> {
-        let of = |nth: Option<u8>| Some(config.frames.get(usize::from(nth?))?.fields);
-        let some = |span: Span| (span.len > 0).then_some(span);
-        let spans = match (self.talk, part) {
-            (Talk::Rtu { read, .. }, Direction::Input) => [some(read), None],
-            (Talk::Rtu { written, .. }, Direction::Output) => [some(written), None],
-            (Talk::Served { written, .. }, Direction::Input) => [some(written), None],
-            (Talk::Served { read, .. }, Direction::Output) => [some(read), None],
-            (Talk::Frames { reply, refusal, .. }, Direction::Input) => [of(reply), of(refusal)],
-            (Talk::Frames { request, .. }, Direction::Output) => [of(request), None],
+    /// The fields that come from the device (input) or go to it (output); `None` if it has no such
+    /// frame. A refusal only tells that the device refuses.
+    pub(crate) fn fields(&self, config: ConfigView<'_>, part: Direction) -> Option<Span> {
+        let span = match (self.talk, part) {
+            (Talk::Rtu { read, .. }, Direction::Input) => read,
+            (Talk::Rtu { written, .. }, Direction::Output) => written,
+            (Talk::Served { written, .. }, Direction::Input) => written,
+            (Talk::Served { read, .. }, Direction::Output) => read,
+            (Talk::Frames { reply: nth, .. }, Direction::Input)
+            | (Talk::Frames { request: nth, .. }, Direction::Output) => {
+                return Some(config.frames.get(usize::from(nth?))?.fields);
+            }
         };
-        spans.into_iter().flatten()
+        (span.len > 0).then_some(span)
     }
 }
 
@@ -156,7 +152,7 @@ impl<'c> ConfigView<'c> {
         part: Direction,
     ) -> impl Iterator<Item = (u8, Span)> + 'c {
         let exchanges = self.exchanges_of(recipe).iter();
-        let spans = exchanges.flat_map(move |exchange| exchange.fields(self, part));
+        let spans = exchanges.filter_map(move |exchange| exchange.fields(self, part));
         (0..).zip(recipe.part_frames(part).chain(spans))
     }
 

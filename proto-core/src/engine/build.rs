@@ -327,17 +327,6 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             Parts::Stream { input, output } => stream_codec(config, port.recipe, recipe, [input, output])?,
             Parts::Can { input, output } => can_codec(config, port.recipe, recipe, [input, output])?,
         };
-        if recipe.exchanges.len > 0
-            && let Codec::Device(device) = &mut codec
-        {
-            let (inputs, outputs) = device.fields();
-            let places = Places {
-                inputs: (self.bindings.inputs.len() as u16).saturating_add(inputs),
-                outputs: (self.bindings.outputs.len() as u16).saturating_add(outputs),
-                slot: (self.store.frames.len() as u8).saturating_add(device.inputs),
-            };
-            device.line = Some(self.add_exchanges(config, port, recipe, places)?);
-        }
         let line = match &port.bus {
             Bus::Rs485(settings) => LineTiming::new(settings),
             _ => LineTiming::none(),
@@ -402,6 +391,17 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             };
             self.bindings.outputs.push(OutputBind::new(ty, from, element)).map_err(|_| full())?;
             outputs.len = outputs.len.saturating_add(1);
+        }
+        if recipe.exchanges.len > 0
+            && let Codec::Device(device) = &mut codec
+        {
+            let of_parts = device.fields();
+            let places = Places {
+                inputs: inputs.start.saturating_add(of_parts.0),
+                outputs: outputs.start.saturating_add(of_parts.1),
+                slot: first_frame.saturating_add(device.inputs),
+            };
+            device.line = Some(self.add_exchanges(config, port, recipe, places)?);
         }
         self.store.watches_bits |= matches!(recipe.send, SendOn::Rising { .. });
         let has_output = recipe.part_frames(Direction::Output).next().is_some();

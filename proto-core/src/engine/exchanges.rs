@@ -3,12 +3,13 @@
 //! In: the exchanges of a configuration. Out: for each port with exchanges a [`Line`], and the frames
 //! that it sends and takes. One list for all ports, so that a port without exchanges takes no room.
 
-use heapless::Vec;
+use heapless::{Vec, VecView};
 
 use super::Engine;
 use super::build::{BuildError, one_too_many};
 use super::device_port::DeviceFormat;
 use super::line::{Line, PeerCounters, PeerState, Talks, Times, is_looked_at};
+use super::user::{InputBind, InputTo};
 use crate::config::{Bus, ConfigView, Counted, DeviceFrame, Exchange, FieldSpec, Port, Recipe, Span, Talk};
 use crate::device::{Carrier, LayoutError};
 use crate::modbus::rtu::{Operation, Table};
@@ -38,7 +39,7 @@ pub(super) struct Item {
     pub asks: Asks,
     pub request: Option<DeviceFormat>,
     pub reply: Option<InputFormat>,
-    pub refusal: Option<InputFormat>,
+    pub refusal: Option<DeviceFormat>,
     pub times: Times,
     /// It is asked when a value of the request changes.
     pub on_change: bool,
@@ -129,6 +130,8 @@ struct Formats<'c> {
     places: Places,
     /// Frames of each direction so far, for messages.
     frames: [u8; 2],
+    /// The bindings of all ports, which refusals are added to.
+    refusals: &'c mut VecView<InputBind>,
 }
 
 impl Formats<'_> {
@@ -159,6 +162,25 @@ impl Formats<'_> {
         let slot = self.places.slot;
         self.places.slot = slot.saturating_add(1);
         Ok(InputFormat { format, slot })
+    }
+
+    /// A refusal's fields are behind those of the recipe.
+    fn refusal(
+        &mut self,
+        frame: Result<DeviceFrame, LayoutError>,
+        id: Option<CanId>,
+    ) -> Result<DeviceFormat, BuildError> {
+        let (recipe, part, [frames, _]) = (self.recipe, Direction::Input, self.frames);
+        let frame = frame.map_err(|error| BuildError::Layout { recipe, part, frame: frames, error })?;
+        let len = frame.elements.len() as u16;
+        let bindings = Span { start: self.refusals.len() as u16, len };
+        for &element in &frame.elements {
+            let bind = InputBind::new(InputTo::Unused, element);
+            self.refusals
+                .push(bind)
+                .map_err(|_| one_too_many(Counted::UserFields, self.refusals.capacity()))?;
+        }
+        Ok(DeviceFormat { layout: frame.layout, id: id.unwrap_or(CanId::Standard(0)), bindings })
     }
 
     /// The data of Modbus registers or coils.
@@ -229,7 +251,7 @@ impl Formats<'_> {
                 }
                 if let Some(refusal) = frame(refusal) {
                     let layout = refusal.layout(config, Direction::Input);
-                    item.refusal = Some(self.input(layout, refusal.id)?);
+                    item.refusal = Some(self.refusal(layout, refusal.id)?);
                 }
                 item.times.is_answered = item.reply.is_some();
             }
@@ -257,7 +279,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         let first_peer = self.exchanges.peers.len();
         let part_frames = |part| recipe.part_frames(part).count() as u8;
         let frames = [part_frames(Direction::Input), part_frames(Direction::Output)];
-        let mut formats = Formats { config, recipe: port.recipe, places, frames };
+        let refusals = self.bindings.inputs.as_mut_view();
+        let mut formats = Formats { config, recipe: port.recipe, places, frames, refusals };
         let looks = exchanges.iter().any(|exchange| is_looked_at(&exchange.when));
         let looks = looks.then(|| Grid::starting_at(Instant::ZERO, port.cycle));
         let line_of = match &port.bus {

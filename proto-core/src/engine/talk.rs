@@ -34,7 +34,7 @@ enum Heard<'i> {
     /// The awaited reply; the data of a Modbus frame, or the frame.
     Reply(Option<&'i InputFormat>),
     /// The device refuses the request.
-    Refusal(Option<&'i InputFormat>),
+    Refusal,
     /// A frame that comes unasked, and its place in the store.
     Unasked(&'i DeviceFormat, usize),
 }
@@ -60,9 +60,10 @@ impl<'i> Awaited<'i> {
     }
 
     /// The reply and the refusal that a device's own frames are.
-    fn answers(&self) -> impl Iterator<Item = &'i InputFormat> {
+    fn answers(&self) -> impl Iterator<Item = &'i DeviceFormat> {
         let item = self.asked().filter(|item| matches!(item.asks, Asks::Frame | Asks::Remote { .. }));
-        item.into_iter().flat_map(|item| item.reply.iter().chain(&item.refusal))
+        let reply = |item: &'i Item| item.reply.iter().map(|reply| &reply.format).chain(&item.refusal);
+        item.into_iter().flat_map(reply)
     }
 
     fn unasked(&self) -> impl Iterator<Item = (&'i DeviceFormat, usize)> {
@@ -84,9 +85,7 @@ impl<'i> Awaited<'i> {
             },
             None => Probe::No(1),
         };
-        for format in
-            self.answers().map(|answer| &answer.format).chain(self.unasked().map(|(format, _)| format))
-        {
+        for format in self.answers().chain(self.unasked().map(|(format, _)| format)) {
             best = better(best, probe(format, self.bindings, bytes));
         }
         best
@@ -98,7 +97,7 @@ impl<'i> Awaited<'i> {
         if let Some(expected) = self.expected() {
             match expected.probe(frame) {
                 rtu::Probe::Reply(_) => return Some(Heard::Reply(self.asked()?.reply.as_ref())),
-                rtu::Probe::Refused(_) => return Some(Heard::Refusal(None)),
+                rtu::Probe::Refused(_) => return Some(Heard::Refusal),
                 _ => {}
             }
         }
@@ -109,9 +108,10 @@ impl<'i> Awaited<'i> {
     }
 
     fn answer(&self, is: impl Fn(&DeviceFormat) -> bool) -> Option<Heard<'i>> {
-        let found = self.answers().find(|answer| is(&answer.format))?;
-        let is_reply = self.asked()?.reply.as_ref().is_some_and(|reply| core::ptr::eq(reply, found));
-        Some(if is_reply { Heard::Reply(Some(found)) } else { Heard::Refusal(Some(found)) })
+        let found = self.answers().find(|answer| is(answer))?;
+        let reply = self.asked()?.reply.as_ref();
+        let reply = reply.filter(|reply| core::ptr::eq(&reply.format, found));
+        Some(reply.map_or(Heard::Refusal, |reply| Heard::Reply(Some(reply))))
     }
 }
 
@@ -198,8 +198,7 @@ impl FieldPort {
         let mut awaited =
             Awaited { formats, first_frame: self.first_frame, items, flight: line.flight(), bindings };
         let effort = |awaited: &Awaited<'_>| {
-            let formats = awaited.answers().map(|answer| &answer.format);
-            let all = formats.chain(awaited.unasked().map(|(format, _)| format));
+            let all = awaited.answers().chain(awaited.unasked().map(|(format, _)| format));
             all.map(|format| format.layout.lengths().1.saturating_add(usize::from(format.bindings.len)))
                 .fold(MAX_ADU, usize::saturating_add)
         };
@@ -221,25 +220,18 @@ impl FieldPort {
                                 &mut accepted,
                             )
                         }
-                        Some(Heard::Refusal(Some(refusal))) => frames.take_device(
-                            &refusal.format,
-                            texts,
-                            frame,
-                            usize::from(refusal.slot),
-                            &mut accepted,
-                        ),
                         Some(Heard::Unasked(format, slot)) => {
                             frames.take_device(format, texts, frame, *slot, &mut accepted)
                         }
                         // A write was carried out.
                         Some(Heard::Reply(None)) => Ok(()),
-                        Some(Heard::Refusal(None)) => Err(Rejection::Refused),
+                        Some(Heard::Refusal) => Err(Rejection::Refused),
                         None => Err(Rejection::NoFrame),
                     };
-                    if let (Some(Heard::Reply(_) | Heard::Refusal(_)), Some(flight), Some(item)) =
+                    if let (Some(Heard::Reply(_) | Heard::Refusal), Some(flight), Some(item)) =
                         (&heard, awaited.flight, awaited.asked())
                     {
-                        let is_refused = matches!(heard, Some(Heard::Refusal(_)));
+                        let is_refused = matches!(heard, Some(Heard::Refusal));
                         let code = frame.get(2).copied().unwrap_or(0);
                         note_answer(&mut talks, flight, is_refused.then_some(code));
                         if is_refused {
@@ -312,10 +304,14 @@ impl FieldPort {
         if let Some(heard) = awaited.answer(is)
             && let (Some(flight), Some(item)) = (flight, awaited.asked())
         {
-            let (Heard::Reply(Some(answer)) | Heard::Refusal(Some(answer))) = heard else { return Ok(()) };
-            let is_refused = matches!(heard, Heard::Refusal(_));
-            let slot = usize::from(answer.slot);
-            let verdict = frames.take_device(&answer.format, texts, frame.data(), slot, accepted);
+            let verdict = match heard {
+                Heard::Reply(Some(reply)) => {
+                    let slot = usize::from(reply.slot);
+                    frames.take_device(&reply.format, texts, frame.data(), slot, accepted)
+                }
+                _ => Err(Rejection::Refused),
+            };
+            let is_refused = verdict == Err(Rejection::Refused);
             note_answer(&mut talks, flight, is_refused.then_some(0));
             if is_refused {
                 bump(&mut frames.counters.refused);
@@ -324,8 +320,7 @@ impl FieldPort {
             return verdict;
         }
         let Some((format, slot)) = awaited.unasked().find(|(format, _)| is(format)) else {
-            let answers = awaited.answers().map(|answer| &answer.format);
-            let mut all = answers.chain(awaited.unasked().map(|(format, _)| format));
+            let mut all = awaited.answers().chain(awaited.unasked().map(|(format, _)| format));
             let Some(format) = all.find(|format| format.id == frame.id()) else {
                 return frames.rejected(Rejection::ForeignId);
             };

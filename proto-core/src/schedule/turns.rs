@@ -36,6 +36,17 @@ pub enum Presence {
     Down,
 }
 
+impl Presence {
+    /// Its name in statistics: `unknown`, `up` or `down`.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Unknown => "unknown",
+            Self::Up => "up",
+            Self::Down => "down",
+        }
+    }
+}
+
 /// The exchanges of one line, and the peers that they are with.
 #[derive(Debug)]
 pub(crate) struct Turns<'a, P> {
