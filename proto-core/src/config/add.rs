@@ -16,7 +16,7 @@ use super::{
     OutputBinding, Parts, Port, Recipe, RecipeLink, SafeValue, SafeValues, SendOn, Span, StreamPart,
 };
 use crate::recipe::model::{MAX_CAN_IDS, MAX_DELIMITER};
-use crate::sysvar::{Direction, SysVar, VarRange};
+use crate::sysvar::{Direction, ParseError, SysVar, VarBit, VarRange};
 use crate::wire::dialect::Dialect;
 use crate::wire::scalar::Scalar;
 
@@ -239,6 +239,10 @@ impl ConfigMut<'_> {
             Does::Writes { var, scale, offset } => {
                 InputBinding::Variable { var: var.read().map_err(Kind::Variable)?, scale, offset }
             }
+            Does::WritesBit { name } => {
+                let bit = VarBit::parse(name).unwrap_or(Err(ParseError::Syntax)).map_err(Kind::Variable)?;
+                InputBinding::Bit { var: bit.var, bit: bit.bit }
+            }
             Does::Commands { entries, when } => {
                 InputBinding::Commands { table: self.add_commands(entries)?, when }
             }
@@ -287,9 +291,14 @@ impl ConfigMut<'_> {
             check_room(Place::Port { port: index, key }, what, needed, room)?;
         }
         let added = match *safe {
-            SafeValues::Names(named) => self.add_safe_values(named.iter().map(|&(name, value)| {
-                SysVar::parse(name).map_err(Kind::Variable).and_then(|var| safe_value(var, value))
-            })),
+            SafeValues::Names(named) => {
+                self.add_safe_values(named.iter().map(|&(name, value)| match VarBit::parse(name) {
+                    Some(bit) => bit.map_err(Kind::Variable).and_then(|bit| safe_bit(bit, value)),
+                    None => {
+                        SysVar::parse(name).map_err(Kind::Variable).and_then(|var| safe_value(var, value))
+                    }
+                }))
+            }
             SafeValues::Vars(vars) => {
                 self.add_safe_values(vars.iter().map(|&(var, value)| safe_value(var, value)))
             }
@@ -334,7 +343,21 @@ fn output_spec(field: &OutputField<'_>) -> Result<FieldSpec, Kind> {
 
 fn safe_value(var: SysVar, value: f64) -> Result<SafeValue, Kind> {
     let value = Scalar::from_f64(var.ty(), value).map_err(Kind::Constant)?;
-    Ok(SafeValue { var, value })
+    Ok(SafeValue::new(var, value))
+}
+
+/// 0 or 1: that of a bit.
+fn safe_bit(bit: VarBit, value: f64) -> Result<SafeValue, Kind> {
+    let VarBit { var, bit: nth } = bit;
+    bit.mask().ok_or(if var.is_bits() {
+        Kind::NoSuchBit { var, bit: nth }
+    } else {
+        Kind::HasNoBits { var }
+    })?;
+    if value != 0.0 && value != 1.0 {
+        return Err(Kind::NotInField { value, low: 0.0, high: 1.0 });
+    }
+    Ok(SafeValue::bit(bit, value != 0.0))
 }
 
 fn name(given: &str, place: Place) -> Result<Name, ConfigError> {

@@ -9,10 +9,11 @@ use super::{
 };
 use crate::command::Request;
 use crate::device::{Encoding, Overflow};
+use crate::image::BitSet;
 use crate::recipe::model::Rules;
 use crate::recipe::model::{Framing, Mode};
 use crate::recipe::{CanLayout, PartError, StreamLayout};
-use crate::sysvar::{COUNT, Direction};
+use crate::sysvar::{COUNT, Direction, VarBit};
 use crate::wire::scalar::{Scalar, ScalarType};
 
 /// One recipe under check.
@@ -107,6 +108,17 @@ impl<'a> RecipeCheck<'a> {
                 }
                 check_scale(place, scale, offset)
             }
+            InputBinding::Bit { var, bit } => {
+                let kind = match numbers.ty {
+                    _ if var.direction() != Direction::Input => Kind::NotAnInput { var },
+                    _ if !var.is_bits() => Kind::HasNoBits { var },
+                    _ if (VarBit { var, bit }).mask().is_none() => Kind::NoSuchBit { var, bit },
+                    _ if numbers.integers => return Ok(()),
+                    Some(ty) => Kind::NeedsInteger { ty },
+                    None => Kind::NeedsIntegers,
+                };
+                fail(place, kind)
+            }
             InputBinding::Commands { table, .. } => {
                 if !numbers.integers {
                     return fail(
@@ -197,11 +209,27 @@ impl<'a> RecipeCheck<'a> {
     /// In a realtime recipe the layout checks this.
     fn check_written_once(&self) -> Check {
         let mut seen = [false; COUNT];
+        let mut bits = BitSet::EMPTY;
         for (frame, field, spec) in self.config.fields_of(self.recipe, Direction::Input) {
+            let place = Place::Field { recipe: self.index, part: Direction::Input, frame, field };
+            if let Some(bit) = spec.bit() {
+                let own = BitSet::of(bit.var, bit.mask().unwrap_or(0));
+                if is_marked(&seen, bit.var) {
+                    return fail(place, Kind::WholeAndBit { bit });
+                }
+                if !bits.and(own).is_empty() {
+                    return fail(place, Kind::BitWrittenTwice { bit });
+                }
+                bits = bits.or(own);
+            }
             let Some(var) = spec.variable() else { continue };
             if is_marked(&seen, var) {
-                let place = Place::Field { recipe: self.index, part: Direction::Input, frame, field };
                 return fail(place, Kind::WrittenTwice { var });
+            }
+            let before = bits.byte(var);
+            if before != 0 {
+                let bit = VarBit { var, bit: before.trailing_zeros() as u8 };
+                return fail(place, Kind::WholeAndBit { bit });
             }
             mark(&mut seen, var);
         }

@@ -111,6 +111,7 @@ pub struct InputField<'a> {
 pub(super) enum Does<'a> {
     Nothing,
     Writes { var: Var<'a>, scale: f32, offset: f32 },
+    WritesBit { name: &'a str },
     Commands { entries: &'a [(i64, &'a str)], when: CommandWhen },
 }
 
@@ -123,6 +124,12 @@ impl<'a> InputField<'a> {
     /// A field whose value is written to an input variable.
     pub fn variable(ty: ScalarType, var: impl Into<Var<'a>>) -> Self {
         Self { ty, does: Does::Writes { var: var.into(), scale: 1.0, offset: 0.0 } }
+    }
+
+    /// A field that switches one bit of an input variable, such as `BitInputReg[3].4`: off for 0, on
+    /// for any other value. Integer types only.
+    pub const fn bit(ty: ScalarType, name: &'a str) -> Self {
+        Self { ty, does: Does::WritesBit { name } }
     }
 
     /// A field whose value picks a command of port 2000 when it changes: pairs of value and command,
@@ -150,7 +157,7 @@ impl<'a> InputField<'a> {
     fn commands_len(&self) -> usize {
         match self.does {
             Does::Commands { entries, .. } => entries.len(),
-            Does::Nothing | Does::Writes { .. } => 0,
+            Does::Nothing | Does::Writes { .. } | Does::WritesBit { .. } => 0,
         }
     }
 }

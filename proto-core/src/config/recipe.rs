@@ -8,7 +8,7 @@ use heapless::{String, Vec};
 use super::{Delimiter, Name};
 use crate::device::{Checksum, Encoding, Overflow};
 use crate::recipe::model::{Field, MAX_CAN_IDS, Mode};
-use crate::sysvar::{Direction, SysVar};
+use crate::sysvar::{Direction, SysVar, VarBit};
 use crate::wire::can::CanId;
 use crate::wire::scalar::ScalarType;
 
@@ -181,13 +181,22 @@ impl FieldSpec {
         }
     }
 
-    /// The system variable that the field is, or that it is bound to.
+    /// The bit that an input field is bound to.
+    pub const fn bit(&self) -> Option<VarBit> {
+        match *self {
+            Self::UserInput { to: InputBinding::Bit { var, bit }, .. }
+            | Self::DeviceInput { to: InputBinding::Bit { var, bit }, .. } => Some(VarBit { var, bit }),
+            _ => None,
+        }
+    }
+
+    /// The system variable that the field is, or that it is bound to as a whole.
     pub fn variable(&self) -> Option<SysVar> {
         match *self {
             Self::System(var) => Some(var),
             Self::UserInput { to, .. } | Self::DeviceInput { to, .. } => match to {
                 InputBinding::Variable { var, .. } => Some(var),
-                InputBinding::Unused | InputBinding::Commands { .. } => None,
+                InputBinding::Unused | InputBinding::Commands { .. } | InputBinding::Bit { .. } => None,
             },
             Self::UserOutput { from, .. } | Self::DeviceOutput { from, .. } => match from {
                 OutputBinding::Variable { var, .. } => Some(var),
@@ -219,6 +228,14 @@ pub enum InputBinding {
         table: Span,
         /// When a value takes effect.
         when: CommandWhen,
+    },
+    /// One bit of a byte variable: off for 0, on for any other integer. Other bits of the byte may
+    /// have other owners.
+    Bit {
+        /// An input variable made of bits.
+        var: SysVar,
+        /// Bit 0..=7.
+        bit: u8,
     },
 }
 

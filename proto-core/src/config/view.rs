@@ -7,7 +7,7 @@ use heapless::VecView;
 
 use super::network::Network;
 use super::{CommandEntry, ControllerLink, FieldSpec, Port, Recipe, SafeValue};
-use crate::sysvar::{Direction, SysVar};
+use crate::sysvar::{Direction, SysVar, VarBit};
 
 /// A configuration of any size, borrowed; [`GatewayConfig`](super::GatewayConfig) describes the
 /// fields.
@@ -72,9 +72,14 @@ impl<'c> ConfigView<'c> {
         })
     }
 
-    /// The input variables that a field port writes.
+    /// The input variables that a field port writes as a whole.
     pub fn written_by(self, recipe: &'c Recipe) -> impl Iterator<Item = SysVar> + 'c {
         self.fields_of(recipe, Direction::Input).filter_map(|(_, _, field)| field.variable())
+    }
+
+    /// The bits that a field port writes one by one.
+    pub fn bits_written_by(self, recipe: &'c Recipe) -> impl Iterator<Item = VarBit> + 'c {
+        self.fields_of(recipe, Direction::Input).filter_map(|(_, _, field)| field.bit())
     }
 
     /// Whether a field port writes the variable.

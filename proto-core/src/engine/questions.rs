@@ -64,6 +64,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             ports: &self.ports,
             frames: &self.store.frames,
             image: &self.store.image,
+            bits: &self.store.bits,
             links: self.links.view(),
             latency: &self.store.latency,
             sleeps: self.sleeps,

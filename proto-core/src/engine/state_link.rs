@@ -11,6 +11,7 @@ use crate::link::{LinkTimings, Supervisor};
 use crate::sysvar::{COUNT, SysVar};
 use crate::time::Duration;
 use crate::wire::dialect::Dialect;
+use crate::wire::scalar::Scalar;
 use crate::wire::state::{StateStream, StateView};
 
 /// A stream that is silent for this long is reopened: twenty packets are missing.
@@ -30,6 +31,8 @@ pub(super) struct StateLink {
     pub shown: Vec<SysVar, COUNT>,
     /// Input variables whose present value is read back while no port sends them.
     pub read_back: InputSet,
+    /// The same for variables of whose bits each has its owner.
+    read_back_bits: InputSet,
     /// Codes of mode, robot, program and safety in the newest packet.
     pub codes: [u8; 4],
 }
@@ -45,8 +48,15 @@ impl StateLink {
             stream: StateStream::new(),
             shown: Vec::new(),
             read_back,
+            read_back_bits: InputSet::EMPTY,
             codes: [0; 4],
         }
+    }
+
+    /// These variables have bits with owners.
+    pub(super) fn share(&mut self, bytes: &InputSet) {
+        self.read_back_bits = self.read_back.and(bytes);
+        self.read_back = self.read_back.minus(bytes);
     }
 
     pub(super) fn transport(&self) -> Transport {
@@ -87,6 +97,9 @@ impl Connection for StateLink {
                             }
                         }
                     }
+                    if store.bits.is_used {
+                        read_bits(&view, &self.read_back_bits, store);
+                    }
                     if !store.safe.is_empty() {
                         compare_safe(&view, store);
                     }
@@ -108,12 +121,29 @@ impl Connection for StateLink {
     }
 }
 
+/// Reads back the bits that none of our ports has sent.
+#[cold]
+#[inline(never)]
+fn read_bits<const PORTS: usize>(view: &StateView<'_>, bytes: &InputSet, store: &mut Store<PORTS>) {
+    for var in bytes.iter() {
+        if let Some(Scalar::Byte(shown)) = view.read_var(var) {
+            store.show_bits(var, shown);
+            store.read_back.insert(var);
+        }
+    }
+}
+
 /// Confirms safe values that the controller shows. A value shown by an old packet, or overwritten
 /// by late data, loses its confirmation.
 fn compare_safe<const PORTS: usize>(view: &StateView<'_>, store: &mut Store<PORTS>) {
     let (may_confirm, may_doubt) = (store.may_confirm(), store.may_doubt());
     for var in store.safe.iter() {
         let Some(shown) = view.read_var(var) else { continue };
+        if store.bits.bytes.contains(var) {
+            let Scalar::Byte(shown) = shown else { continue };
+            store.compare_bits(var, shown, may_confirm, may_doubt);
+            continue;
+        }
         let is_there = shown == store.image.value(var);
         match store.unconfirmed.contains(var) {
             true if is_there && may_confirm => store.confirm(&InputSet::from_iter([var])),

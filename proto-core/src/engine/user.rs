@@ -30,6 +30,11 @@ pub(super) enum InputTo {
     },
     /// Index of a command field of the command link.
     Command(u8),
+    /// Bits of a byte variable: on unless the value is 0.
+    Bits {
+        var: SysVar,
+        mask: u8,
+    },
 }
 
 impl InputTo {

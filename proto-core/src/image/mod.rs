@@ -5,8 +5,10 @@
 //! neighbouring fields of a recipe are one copy. A variable has the age of its group: the
 //! frame, poll or packet that brings it. The image does not know recipes, ports or links.
 
+mod bit_set;
 mod set;
 
+pub(crate) use bit_set::BitSet;
 pub(crate) use set::{InputSet, VarSet};
 
 use crate::sysvar::{COUNT, IMAGE_BYTES, SysVar};
@@ -84,6 +86,18 @@ impl Image {
             value.encode(place);
         }
         Ok(())
+    }
+
+    /// The value of a byte variable, known or not.
+    pub(crate) fn byte(&self, var: SysVar) -> u8 {
+        self.bytes.get(var.image_offset()).copied().unwrap_or(0)
+    }
+
+    /// Sets some bits of a byte variable.
+    pub(crate) fn set_bits(&mut self, var: SysVar, mask: u8, value: u8) {
+        if let Some(byte) = self.bytes.get_mut(var.image_offset()).filter(|_| var.is_bits()) {
+            *byte = *byte & !mask | value & mask;
+        }
     }
 
     /// Assigns the variable to the group that it arrives with.
