@@ -14,6 +14,7 @@ use proto_core::config::{
     BoardAddress, Bus, CommandWhen, FieldSpec, GatewayConfig, InputBinding, OnStale, OutputBinding, Parity,
     Parts, SendOn,
 };
+use proto_core::device::{Algorithm, ByteOrder, Kind, Overflow, Width};
 use proto_core::recipe::model::Mode;
 use proto_core::sysvar::SysVar;
 use proto_core::wire::can::CanId;
@@ -36,12 +37,17 @@ fn images(version: u32) -> Vec<(String, Vec<u8>)> {
     images
 }
 
-/// Compares with a stored text; `GOLDEN=write` writes a missing one.
+/// Writes what is missing with `GOLDEN=write`.
+fn write_missing(path: &Path, bytes: &[u8]) {
+    if !path.exists() && std::env::var_os("GOLDEN").is_some_and(|value| value == "write") {
+        std::fs::write(path, bytes).unwrap();
+    }
+}
+
+/// Compares with a stored text.
 #[track_caller]
 fn matches_text(path: &Path, said: &str) {
-    if !path.exists() && std::env::var_os("GOLDEN").is_some_and(|value| value == "write") {
-        std::fs::write(path, said).unwrap();
-    }
+    write_missing(path, said.as_bytes());
     let kept = std::fs::read_to_string(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
     if kept != said {
         let line = kept.lines().zip(said.lines()).position(|(kept, said)| kept != said);
@@ -83,6 +89,7 @@ fn migrated_images_are_of_the_newest_version() {
             let config = decode(&bytes).unwrap();
             let mut out = [0; MAX_IMAGE];
             let len = encode(&config, &mut out).unwrap();
+            write_missing(&golden().join(format!("v{VERSION}/{name}.img")), &out[..len]);
             let (_, newest) = images(VERSION).into_iter().find(|(other, _)| *other == name).unwrap();
             assert_eq!(out[..len], newest, "{name} of version {version}");
         }
@@ -165,6 +172,11 @@ fn serialized_types_are_those_of_the_version() {
         Scalar,
         ScalarType,
         SendOn,
+        Algorithm,
+        ByteOrder,
+        Kind,
+        Overflow,
+        Width,
         GatewayConfig,
     );
     let mut said = String::new();

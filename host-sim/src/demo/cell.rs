@@ -4,6 +4,7 @@
 use std::io;
 use std::net::SocketAddr;
 use std::path::Path;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 use proto_core::modbus::adu::MAX_ADU;
@@ -112,6 +113,20 @@ impl Gateway {
         })
     }
 }
+
+impl Drop for Gateway {
+    fn drop(&mut self) {
+        let sleeps = self.0.stats().and_then(|stats| stats["sleeps"].as_u64()).unwrap_or(0);
+        HELD_UP.fetch_add(usize::from(sleeps > 0), Ordering::Relaxed);
+    }
+}
+
+/// How many gateways of this process were kept from the processor for so long that they discarded input.
+pub(super) fn gateways_held_up() -> usize {
+    HELD_UP.load(Ordering::Relaxed)
+}
+
+static HELD_UP: AtomicUsize = AtomicUsize::new(0);
 
 /// Opens the device end of a bound pseudoterminal.
 pub(super) fn serial(path: &Path) -> io::Result<FieldStream<std::fs::File>> {

@@ -61,7 +61,7 @@ pub(super) fn run_all(show: &mut Show, folder: &Folder) {
     show.judge("on the controller's own port", can_system);
     show.judge("through the gateway: DO1 by Modbus, the pose from port 2001", can_system_gateway);
 
-    show.heading("5  UDP 2011: whoever sends a datagram gets the pose every 4 ms");
+    show.heading("5  UDP 2011: every client that sends a datagram gets the pose every 4 ms");
     show.judge("on the controller's own port", udp_server);
     show.judge("through the gateway: an RS-485 device on the far side of UDP 2011", |show| {
         udp_server_gateway(show, folder)
@@ -247,7 +247,7 @@ fn clients(show: &Show) -> io::Result<()> {
     show.sees("UDP", &frame, "the same frame, a datagram each");
     same(&frame, &POSE)?;
     datagrams.send(&DO1_ON)?;
-    show.sends("UDP", &DO1_ON, "");
+    show.sends("UDP", &DO1_ON, "head, DigitalOutputCommand[1] = 1, tail");
     do1(show, &robot, true)
 }
 

@@ -8,7 +8,7 @@
 #include <stdint.h>
 
 // Newest version of the configuration images that this library reads. Older versions are read too.
-#define RGW_IMAGE_VERSION 2
+#define RGW_IMAGE_VERSION 3
 
 // Memory for a configuration, in bytes: enough on every machine. It is needed until
 // `rgw_gateway_configure` has returned.

@@ -8,7 +8,7 @@ use crate::Status;
 use crate::memory::{bytes, give, place, shared};
 
 /// Newest version of the configuration images that this library reads. Older versions are read too.
-pub const RGW_IMAGE_VERSION: u32 = 2;
+pub const RGW_IMAGE_VERSION: u32 = 3;
 const _: () = assert!(RGW_IMAGE_VERSION == image::VERSION);
 
 /// Memory for a configuration, in bytes: enough on every machine. It is needed until

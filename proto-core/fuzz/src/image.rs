@@ -55,13 +55,24 @@ fn look_at(bytes: &[u8]) {
             panic!("taken: {read:?}")
         }
         (Err(()), Err(_)) => {}
-        (Ok((version, payload)), _) => match contents(version, payload) {
+        (Ok((VERSION, payload)), _) => match postcard::take_from_bytes::<GatewayConfig>(payload) {
             Ok((config, [])) => match config.validate() {
                 Ok(()) => assert_eq!(read.as_ref(), Ok(&config)),
                 Err(error) => assert_eq!(read, Err(ImageError::Config(error))),
             },
             _ => assert!(matches!(read, Err(ImageError::Contents | ImageError::TooMany { .. })), "{read:?}"),
         },
+        (Ok((2, _)), Ok(config)) => assert_eq!(config.fields.iter().find(|field| field.is_device()), None),
+        (Ok((1, payload)), _) => {
+            // Version 1 had no network of the board's.
+            let newer =
+                after_controller(payload).map(|(controller, lists)| [controller, &[0], lists].concat());
+            match newer {
+                Some(newer) => assert_eq!(decode(&with_header(2, &newer)), read),
+                None => assert_eq!(read, Err(ImageError::Contents)),
+            }
+        }
+        (Ok(_), _) => assert!(!matches!(read, Err(ImageError::Crc { .. } | ImageError::Version { .. }))),
     }
     if let Ok(config) = read {
         let again = image_of(&config).expect("it was in an image");
@@ -72,16 +83,10 @@ fn look_at(bytes: &[u8]) {
     }
 }
 
-/// Version 1 had no network of the board's.
-fn contents(version: u32, payload: &[u8]) -> postcard::Result<(GatewayConfig, &[u8])> {
-    if version == VERSION {
-        return postcard::take_from_bytes(payload);
-    }
-    let (_, lists) = postcard::take_from_bytes::<ControllerLink>(payload)?;
-    let (controller, dhcp) = (&payload[..payload.len() - lists.len()], [0]);
-    let newer = [controller, &dhcp, lists].concat();
-    let (config, rest) = postcard::take_from_bytes(&newer)?;
-    Ok((config, &payload[payload.len() - rest.len()..]))
+/// The controller, and what follows it. Versions 1 and 2 have it in common.
+fn after_controller(payload: &[u8]) -> Option<(&[u8], &[u8])> {
+    let (_, rest) = postcard::take_from_bytes::<ControllerLink>(payload).ok()?;
+    payload.split_at_checked(payload.len() - rest.len())
 }
 
 /// `None` for the largest configurations.

@@ -13,8 +13,9 @@
 use super::layout::Probe;
 use crate::recipe::model::MAX_STREAM_FRAME;
 
-/// Steps that a received byte pays for; a probe that finds no frame takes `effort` of them.
-const EFFORT: i32 = 16;
+/// Steps that a received byte pays for. It is enough for frames of 30 bytes to be looked for at every
+/// byte; longer ones can have a head, which most bytes are not.
+const EFFORT: i32 = 64;
 /// Unused steps are kept for a whole frame's worth of bytes.
 const MAX_CREDIT: i32 = EFFORT * MAX_STREAM_FRAME as i32;
 /// Twice the longest frame, so that held bytes move to the front once in a frame's worth of bytes.
@@ -77,14 +78,13 @@ impl Framer {
     /// returns `None`, even when the rest is empty: frames can be held behind a broken one.
     ///
     /// `probe` is always the same between two [`Self::discard`]s, and never asks for more than a
-    /// frame of 512 bytes; `effort` is about how many steps it takes.
+    /// frame of 512 bytes; `effort` is about how many steps it takes to see that a checksum is wrong.
     pub fn next_frame(
         &mut self,
         chunk: &mut &[u8],
         effort: usize,
         probe: impl Fn(&[u8]) -> Probe,
     ) -> Option<Found<'_>> {
-        let effort = i32::try_from(effort).unwrap_or(i32::MAX);
         loop {
             let missing = match self.held() {
                 [] => 1,
@@ -105,7 +105,11 @@ impl Framer {
                         self.expected = Some(len.saturating_sub(1) as u16);
                         return Some(Found::Wrong(self.buffer.get(at..at.saturating_add(len))?));
                     }
-                    Probe::No | Probe::Wrong(_) => {
+                    Probe::No(steps) => {
+                        self.skip(steps);
+                        continue;
+                    }
+                    Probe::Wrong(_) => {
                         self.skip(effort);
                         continue;
                     }
@@ -146,8 +150,8 @@ impl Framer {
     }
 
     /// Drops the byte at the start, and all that there are if the probes have taken too long.
-    fn skip(&mut self, effort: i32) {
-        self.credit = self.credit.saturating_sub(effort);
+    fn skip(&mut self, steps: usize) {
+        self.credit = self.credit.saturating_sub(i32::try_from(steps).unwrap_or(i32::MAX));
         let skipped = if self.credit < 0 { self.end.saturating_sub(self.start) } else { 1 };
         self.start = self.start.saturating_add(skipped);
         self.expected = self.expected.and_then(|expected| expected.checked_sub(skipped));

@@ -118,8 +118,8 @@ pub enum Carrier {
 /// What bytes are, seen as a frame that begins at the first of them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Probe {
-    /// Not the beginning of a frame.
-    No,
+    /// Not the beginning of a frame; it took so many steps to see that.
+    No(usize),
     /// Perhaps the beginning of one; at least so many more bytes are needed to tell.
     Partial(usize),
     /// A frame of so many bytes.
@@ -480,8 +480,8 @@ impl FrameLayout {
 
     /// What `bytes` are, seen as a frame that begins at the first of them.
     pub fn probe<'e>(&self, elements: impl IntoIterator<Item = &'e Element>, bytes: &[u8]) -> Probe {
-        if self.head.iter().zip(bytes).any(|(expected, byte)| expected != byte) {
-            return Probe::No;
+        if let Some(differs) = self.head.iter().zip(bytes).position(|(expected, byte)| expected != byte) {
+            return Probe::No(differs.saturating_add(1));
         }
         if let Some(missing @ 1..) = usize::from(self.shortest).checked_sub(bytes.len()) {
             return Probe::Partial(missing);
@@ -494,7 +494,7 @@ impl FrameLayout {
                 Err(Unplaced::Partial(missing)) if is_ours || self.checksum.is_some() => {
                     return Probe::Partial(missing);
                 }
-                Err(_) => return Probe::No,
+                Err(_) => return Probe::No(places.nth.saturating_add(self.head.len())),
             };
             if let Element::Fixed { encoding, value } = *element {
                 let field = bytes.get(place).unwrap_or(&[]);
@@ -504,14 +504,15 @@ impl FrameLayout {
         let tail_at = places.at;
         let len = tail_at.saturating_add(self.tail.len());
         let rest = bytes.get(tail_at..).unwrap_or(&[]);
+        let steps = places.nth.saturating_add(len);
         if self.tail.iter().zip(rest).any(|(expected, byte)| expected != byte) {
-            return Probe::No;
+            return Probe::No(steps);
         }
         if let Some(missing @ 1..) = len.checked_sub(bytes.len()) {
             return Probe::Partial(missing);
         }
         match (self.checksum_is_right(bytes, places.checksum_at), is_ours) {
-            (None, false) => Probe::No,
+            (None, false) => Probe::No(steps),
             (None | Some(true), true) => Probe::Frame(len),
             (Some(true), false) => Probe::Other(len),
             (Some(false), _) => Probe::Wrong(len),

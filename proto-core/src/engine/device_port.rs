@@ -59,13 +59,13 @@ impl DeviceCodec {
 /// these over a wrong checksum.
 fn probe_all(formats: &[DeviceFormat], bindings: &[InputBind], bytes: &[u8]) -> Probe {
     let probes = formats.iter().map(|format| probe(format, bindings, bytes));
-    probes.fold(Probe::No, |best, probe| match (best, probe) {
+    probes.fold(Probe::No(0), |best, probe| match (best, probe) {
         (Probe::Frame(len), _) | (_, Probe::Frame(len)) => Probe::Frame(len),
         (Probe::Other(len), _) | (_, Probe::Other(len)) => Probe::Other(len),
         (Probe::Partial(one), Probe::Partial(other)) => Probe::Partial(one.min(other)),
         (Probe::Partial(missing), _) | (_, Probe::Partial(missing)) => Probe::Partial(missing),
         (Probe::Wrong(len), _) | (_, Probe::Wrong(len)) => Probe::Wrong(len),
-        (Probe::No, Probe::No) => Probe::No,
+        (Probe::No(one), Probe::No(other)) => Probe::No(one.saturating_add(other)),
     })
 }
 
@@ -229,7 +229,7 @@ impl FieldPort {
         match probe(format, bindings, frame.data()) {
             Probe::Frame(len) if len == frame.data().len() => {}
             Probe::Wrong(len) if len == frame.data().len() => frames.rejected(Rejection::Checksum)?,
-            Probe::Other(_) | Probe::No if frame.data().len() == format.layout.lengths().0 => {
+            Probe::Other(_) | Probe::No(_) if frame.data().len() == format.layout.lengths().0 => {
                 frames.rejected(Rejection::OtherDevice)?;
             }
             _ => frames.rejected(Rejection::WrongLength)?,

@@ -1,11 +1,13 @@
 //! What each field port must send, and when (proto-core/docs/engine.md section 8).
 
 use proto_core::config::{FieldSpec, OutputBinding, SendOn};
+use proto_core::device::{Encoding, Overflow};
 use proto_core::sysvar::SysVar;
 use proto_core::time::Instant;
 use proto_core::wire::scalar::ScalarType;
 
 use super::Invariant;
+use super::device;
 use super::field::as_number;
 use super::spec::{Frame, Origin, PortSpec, Spec, shown};
 use super::upward::{Upward, Wrong};
@@ -230,6 +232,15 @@ impl Downward {
 
     /// Whether the payload has the present values.
     fn agrees(&self, frame: &Frame, up: &Upward, payload: &[u8]) -> bool {
+        if let Some(device) = &frame.device {
+            let whole = [&frame.head[..], payload, &frame.tail].concat();
+            return device.sum_is_right(&whole) != Some(false)
+                && frame
+                    .fields
+                    .iter()
+                    .zip(&device.places)
+                    .all(|(field, place)| self.device_field_agrees(field, up, &whole[place.clone()]));
+        }
         let mut rest = payload;
         frame.fields.iter().all(|field| {
             let (ty, number) = match *field {
@@ -240,7 +251,8 @@ impl Downward {
                 }
                 FieldSpec::UserOutput { ty, from } => (ty, self.number(up, ty, from)),
                 FieldSpec::UserInput { ty, .. } => (ty, None),
-                _ => unimplemented!("frames of devices are not modelled"),
+                // A plain recipe has no others.
+                _ => return false,
             };
             let (value, after) = rest.split_at(ty.size());
             rest = after;
@@ -251,6 +263,30 @@ impl Downward {
                 (None, _) => false,
             }
         })
+    }
+
+    fn device_field_agrees(&self, field: &FieldSpec, up: &Upward, bytes: &[u8]) -> bool {
+        let (encoding, overflow, from) = match *field {
+            FieldSpec::DeviceOutput { encoding, overflow, from } => (encoding, overflow, from),
+            FieldSpec::UserOutput { ty, from } => (Encoding::scalar(ty), Overflow::Usual, from),
+            FieldSpec::Fixed { encoding, value } => {
+                return device::read(&encoding, bytes) == Some(value as f64);
+            }
+            FieldSpec::Padding { fill, .. } => return bytes.iter().all(|&byte| byte == fill),
+            FieldSpec::Checksum(_) => return true,
+            _ => return false,
+        };
+        let number = match from {
+            // Reply codes are not modelled.
+            OutputBinding::Reply => return true,
+            OutputBinding::Counter => {
+                let highest = device::range(&encoding).1.min(f64::from(u32::MAX));
+                Some(f64::from(self.cycles) % (highest + 1.0))
+            }
+            _ => self.number(up, ScalarType::Double, from),
+        };
+        let Some(number) = number else { return false };
+        device::read(&encoding, bytes) == Some(device::shown_as(&encoding, overflow, number))
     }
 
     /// The value of a bound field, before it is rounded and saturated.

@@ -2,12 +2,14 @@
 //! proto-core/docs/wire/recipes.md sections 4, 6 and 7.
 
 use proto_core::config::{CommandWhen, FieldSpec, InputBinding, Span};
+use proto_core::device::{Encoding, Overflow};
 use proto_core::recipe::model::Mode;
 use proto_core::sysvar::SysVar;
 use proto_core::time::Instant;
 use proto_core::wire::can::CanFrame;
 use proto_core::wire::scalar::{Scalar, ScalarType};
 
+use super::device::{self, DeviceSpec, Seen};
 use super::spec::{Frame, PortSpec, Raw};
 
 /// Whether a frame is accepted.
@@ -16,6 +18,12 @@ pub(super) enum Verdict {
     Accepted(Accepted),
     NotFinite,
     OutOfRange,
+    /// A field of a device's frame is not a number.
+    Unreadable,
+    /// The checksum of a device's frame is wrong.
+    WrongChecksum,
+    /// A frame of another device.
+    OtherDevice,
 }
 
 /// An accepted frame.
@@ -48,6 +56,18 @@ pub(super) struct LineWatch {
     pub dropped: u64,
     pub discarded: u64,
     pub frame_bytes: u64,
+    /// How many bytes before the place where a device's next frame is expected; `None` if that is unknown.
+    pub missing: Missing,
+}
+
+/// At first, and after silence, a frame is expected to begin at once.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Missing(Option<usize>);
+
+impl Default for Missing {
+    fn default() -> Self {
+        Self(Some(0))
+    }
 }
 
 impl LineWatch {
@@ -61,6 +81,7 @@ impl LineWatch {
     pub(super) fn discard(&mut self) {
         self.discarded += self.held.len() as u64;
         self.held.clear();
+        self.missing = Missing::default();
     }
 
     /// Receives bytes; returns the frames that they complete.
@@ -68,7 +89,43 @@ impl LineWatch {
         self.heard = now;
         let Some(frame) = port.inputs.first() else { return Vec::new() };
         self.held.extend_from_slice(bytes);
+        if let Some(device) = &frame.device {
+            return self.cut_device(frame, device);
+        }
         self.cut(frame).iter().map(|payload| judge(port.mode, frame, 0, payload)).collect()
+    }
+
+    /// Removes complete frames of a device from the held bytes.
+    fn cut_device(&mut self, frame: &Frame, device: &DeviceSpec) -> Vec<Verdict> {
+        let mut found = Vec::new();
+        while !self.held.is_empty() {
+            let seen = self.held.len().min(frame.head.len());
+            let begins = self.held[..seen] == frame.head[..seen];
+            if begins && self.held.len() < frame.len() {
+                break;
+            }
+            let whole = self.held.get(..frame.len()).filter(|whole| begins && whole.ends_with(&frame.tail));
+            let (verdict, taken) = match whole.map_or(Seen::Nothing, |whole| device.see(&frame.fields, whole))
+            {
+                Seen::Ours => (Some(judge_device(frame, 0, &self.held[..frame.len()])), frame.len()),
+                Seen::Other => (Some(Verdict::OtherDevice), frame.len()),
+                Seen::WrongChecksum if self.missing.0 == Some(0) => {
+                    self.missing.0 = Some(frame.len());
+                    (Some(Verdict::WrongChecksum), 1)
+                }
+                Seen::WrongChecksum | Seen::Nothing => (None, 1),
+            };
+            if taken == 1 {
+                self.dropped += 1;
+                self.missing.0 = self.missing.0.and_then(|missing| missing.checked_sub(1));
+            } else {
+                self.frame_bytes += taken as u64;
+                self.missing = Missing::default();
+            }
+            self.held.drain(..taken);
+            found.extend(verdict);
+        }
+        found
     }
 
     /// Removes complete frames from the held bytes; returns the bytes of their fields.
@@ -109,7 +166,51 @@ pub(super) fn can(port: &PortSpec, received: &CanFrame) -> Result<Verdict, Refus
     if received.data().len() != frame.payload {
         return Err(Refused::Length);
     }
-    Ok(judge(port.mode, frame, nth, received.data()))
+    let Some(device) = &frame.device else { return Ok(judge(port.mode, frame, nth, received.data())) };
+    Ok(match device.see(&frame.fields, received.data()) {
+        Seen::Ours => judge_device(frame, nth, received.data()),
+        Seen::Other | Seen::Nothing => Verdict::OtherDevice,
+        Seen::WrongChecksum => Verdict::WrongChecksum,
+    })
+}
+
+/// The fields are judged one after the other: the first that cannot be used rejects the frame.
+fn judge_device(frame: &Frame, nth: usize, whole: &[u8]) -> Verdict {
+    let mut accepted = Accepted { frame: nth, ..Accepted::default() };
+    let places = frame.device.iter().flat_map(|device| &device.places);
+    // Command fields are counted without the checksum, as they are no elements of it.
+    let mut element = 0;
+    for (field, place) in frame.fields.iter().zip(places) {
+        let at = element;
+        element += usize::from(!matches!(field, FieldSpec::Checksum(_)));
+        let (encoding, overflow, to) = match *field {
+            FieldSpec::DeviceInput { encoding, overflow, to } => (encoding, overflow, to),
+            FieldSpec::UserInput { ty, to } => (Encoding::scalar(ty), Overflow::Usual, to),
+            _ => continue,
+        };
+        let Some(number) = device::read(&encoding, &whole[place.clone()]) else { return Verdict::Unreadable };
+        if !number.is_finite() {
+            return Verdict::NotFinite;
+        }
+        match to {
+            InputBinding::Variable { var, scale, offset } => {
+                let number = number * f64::from(scale) + f64::from(offset);
+                let number = match overflow {
+                    Overflow::Wrap => device::shown_as(&Encoding::scalar(var.ty()), overflow, number),
+                    Overflow::Usual => number,
+                };
+                match bound(var, number) {
+                    Some(raw) => accepted.values.push((var, raw)),
+                    None => return Verdict::OutOfRange,
+                }
+            }
+            InputBinding::Commands { table, when } => {
+                accepted.commands.push((at, table, when, number as i64));
+            }
+            InputBinding::Unused => {}
+        }
+    }
+    Verdict::Accepted(accepted)
 }
 
 fn judge(mode: Mode, frame: &Frame, nth: usize, payload: &[u8]) -> Verdict {
@@ -120,7 +221,8 @@ fn judge(mode: Mode, frame: &Frame, nth: usize, payload: &[u8]) -> Verdict {
         let ty = match field {
             FieldSpec::System(var) => var.ty(),
             FieldSpec::UserInput { ty, .. } | FieldSpec::UserOutput { ty, .. } => *ty,
-            _ => unimplemented!("frames of devices are not modelled"),
+            // A plain recipe has no others.
+            _ => continue,
         };
         let (bytes, after) = rest.split_at(ty.size());
         rest = after;

@@ -166,6 +166,18 @@ impl Oracle {
                     counters.rejected_out_of_range += 1;
                     continue;
                 }
+                Verdict::Unreadable => {
+                    counters.rejected_unreadable += 1;
+                    continue;
+                }
+                Verdict::WrongChecksum => {
+                    counters.rejected_checksum += 1;
+                    continue;
+                }
+                Verdict::OtherDevice => {
+                    counters.rejected_other_device += 1;
+                    continue;
+                }
                 Verdict::Accepted(frame) => frame,
             };
             counters.frames_in += 1;

@@ -11,6 +11,7 @@
 
 mod arrivals;
 mod commands;
+mod device;
 mod downward;
 mod field;
 mod gateway;

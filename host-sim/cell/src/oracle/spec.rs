@@ -10,6 +10,8 @@ use proto_core::sysvar::{COUNT, Direction, ModbusPlace, SysVar};
 use proto_core::time::Duration;
 use proto_core::wire::can::CanId;
 
+use super::device::DeviceSpec;
+
 /// A value as on the wire; unused bytes are 0.
 pub(super) type Raw = [u8; 4];
 
@@ -40,8 +42,10 @@ pub(super) struct Frame {
     pub tail: Vec<u8>,
     pub id: Option<CanId>,
     pub fields: Vec<FieldSpec>,
-    /// Number of bytes of all fields.
+    /// Number of bytes of all fields, checksum included.
     pub payload: usize,
+    /// The places of the fields in a device's own frame.
+    pub device: Option<DeviceSpec>,
 }
 
 /// A field port.
@@ -221,7 +225,8 @@ impl Frame {
 pub(super) fn written(field: &FieldSpec) -> Option<SysVar> {
     match *field {
         FieldSpec::System(var) => Some(var),
-        FieldSpec::UserInput { to: InputBinding::Variable { var, .. }, .. } => Some(var),
+        FieldSpec::UserInput { to: InputBinding::Variable { var, .. }, .. }
+        | FieldSpec::DeviceInput { to: InputBinding::Variable { var, .. }, .. } => Some(var),
         _ => None,
     }
 }
@@ -230,16 +235,18 @@ pub(super) fn written(field: &FieldSpec) -> Option<SysVar> {
 pub(super) fn shown(field: &FieldSpec) -> Option<SysVar> {
     match *field {
         FieldSpec::System(var) => Some(var),
-        FieldSpec::UserOutput { from: OutputBinding::Variable { var, .. }, .. } => Some(var),
+        FieldSpec::UserOutput { from: OutputBinding::Variable { var, .. }, .. }
+        | FieldSpec::DeviceOutput { from: OutputBinding::Variable { var, .. }, .. } => Some(var),
         _ => None,
     }
 }
 
+/// The size of a plain recipe's field.
 fn size(field: &FieldSpec) -> usize {
     match field {
         FieldSpec::System(var) => var.size(),
         FieldSpec::UserInput { ty, .. } | FieldSpec::UserOutput { ty, .. } => ty.size(),
-        _ => unimplemented!("frames of devices are not modelled"),
+        _ => 0,
     }
 }
 
@@ -248,8 +255,9 @@ fn by_modbus(var: SysVar) -> bool {
 }
 
 fn frame(head: &[u8], tail: &[u8], id: Option<CanId>, fields: &[FieldSpec]) -> Frame {
-    let payload = fields.iter().map(size).sum();
-    Frame { head: head.to_vec(), tail: tail.to_vec(), id, fields: fields.to_vec(), payload }
+    let device = DeviceSpec::new(head.len(), fields);
+    let payload = device.as_ref().map_or_else(|| fields.iter().map(size).sum(), |device| device.len);
+    Frame { head: head.to_vec(), tail: tail.to_vec(), id, fields: fields.to_vec(), payload, device }
 }
 
 fn frames(config: &GatewayConfig, recipe: &Recipe, direction: Direction) -> Vec<Frame> {

@@ -3,7 +3,8 @@
 //! In: the gateway's configuration and a seed. Out: frames at random times. A device changes its behaviour
 //! every few seconds: steady, hasty, silent, stuck, careless.
 
-use proto_core::config::{Bus, FieldSpec, GatewayConfig, InputBinding, Port};
+use proto_core::config::{Bus, DeviceFrame, FieldSpec, GatewayConfig, InputBinding, Port, Span};
+use proto_core::device::Carrier;
 use proto_core::sysvar::{Direction, SysVar};
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::can::{CanFrame, CanId};
@@ -18,6 +19,8 @@ struct Template {
     tail: Vec<u8>,
     id: Option<CanId>,
     fields: Vec<Content>,
+    /// A device's own frame, whose elements are the fields without the checksum.
+    device: Option<Box<DeviceFrame>>,
 }
 
 /// The kind of values of a field.
@@ -27,6 +30,10 @@ enum Content {
     Bits,
     /// Numbers of this type, mostly up to `most`, which most bound variables accept.
     Number { ty: ScalarType, most: f64 },
+    /// A constant, or padding.
+    Constant,
+    /// No element of the frame: the layout makes it.
+    Checksum,
     /// Numbers that sometimes pick commands.
     Commands { ty: ScalarType, values: Vec<i64> },
 }
@@ -73,6 +80,7 @@ impl RandomDevice {
                     tail: part.tail.to_vec(),
                     id: None,
                     fields: fields.map(|field| content(config, field)).collect(),
+                    device: device_frame(config, Carrier::Stream, (&part.head, &part.tail), part.fields),
                 });
             }
             (Bus::Can { .. }, proto_core::config::Parts::Can { input, .. }) => {
@@ -81,6 +89,7 @@ impl RandomDevice {
                     tail: Vec::new(),
                     id: Some(frame.id),
                     fields: frame.fields.of(&config.fields).iter().map(|f| content(config, f)).collect(),
+                    device: device_frame(config, Carrier::Can, (&[], &[]), frame.fields),
                 }));
             }
             _ => return None,
@@ -161,7 +170,19 @@ impl RandomDevice {
         Some(self.nth)
     }
 
+    /// The bytes between head and tail; in a device's own frame, with its checksum.
     fn payload(&self, nth: usize) -> Vec<u8> {
+        let template = &self.templates[nth];
+        if let Some(device) = &template.device {
+            let elements = template.fields.iter().zip(&self.values[nth]);
+            let elements = elements.filter(|(content, _)| !matches!(content, Content::Checksum));
+            let numbers: Vec<f64> = elements.map(|(_, value)| value.as_f64()).collect();
+            let mut bytes = [0; 512];
+            let len = device.layout.encode(&device.elements, |nth| numbers[nth], &mut bytes);
+            let len = len.unwrap_or(0);
+            let tail = len.saturating_sub(template.tail.len());
+            return bytes.get(template.head.len()..tail).unwrap_or(&[]).to_vec();
+        }
         let mut bytes = Vec::with_capacity(64);
         for value in &self.values[nth] {
             put(*value, &mut bytes);
@@ -230,6 +251,20 @@ impl Device<CanFrame> for RandomDevice {
     }
 }
 
+/// The frame, if it is a device's own.
+fn device_frame(
+    config: &GatewayConfig,
+    carrier: Carrier,
+    delimiters: (&[u8], &[u8]),
+    fields: Span,
+) -> Option<Box<DeviceFrame>> {
+    let fields = fields.of(&config.fields);
+    let is_device = fields.iter().any(FieldSpec::is_device);
+    // Validation has refused what cannot be laid out.
+    let frame = is_device.then(|| DeviceFrame::new(carrier, Direction::Input, delimiters, fields).ok());
+    frame.flatten().map(Box::new)
+}
+
 fn content(config: &GatewayConfig, field: &FieldSpec) -> Content {
     let of_var = |var: SysVar| match var.ty() {
         ScalarType::Byte => Content::Bits,
@@ -244,13 +279,21 @@ fn content(config: &GatewayConfig, field: &FieldSpec) -> Content {
         FieldSpec::UserInput { ty, .. } | FieldSpec::UserOutput { ty, .. } => {
             Content::Number { ty, most: 1e3 }
         }
-        _ => unimplemented!("frames of devices are not modelled"),
+        FieldSpec::DeviceInput { to: InputBinding::Commands { table, .. }, .. } => Content::Commands {
+            ty: ScalarType::Double,
+            values: table.of(&config.commands).iter().map(|entry| entry.value).collect(),
+        },
+        FieldSpec::DeviceInput { .. } | FieldSpec::DeviceOutput { .. } => {
+            Content::Number { ty: ScalarType::Double, most: 1e3 }
+        }
+        FieldSpec::Fixed { .. } | FieldSpec::Padding { .. } => Content::Constant,
+        FieldSpec::Checksum(_) => Content::Checksum,
     }
 }
 
 fn zero(content: &Content) -> Scalar {
     match content {
-        Content::Bits => Scalar::Byte(0),
+        Content::Bits | Content::Constant | Content::Checksum => Scalar::Byte(0),
         Content::Number { ty, .. } | Content::Commands { ty, .. } => number(*ty, 0.0),
     }
 }
@@ -267,6 +310,7 @@ fn number(ty: ScalarType, value: f64) -> Scalar {
 
 fn changed(rng: &mut Rng, content: &Content, before: Scalar) -> Scalar {
     match content {
+        Content::Constant | Content::Checksum => before,
         Content::Bits => match (rng.below(8), before) {
             (0, _) => Scalar::Byte(rng.next_u64() as u8),
             (1..5, Scalar::Byte(bits)) => Scalar::Byte(bits ^ 1 << rng.below(8)),

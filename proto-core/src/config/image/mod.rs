@@ -7,12 +7,13 @@
 //! are ignored, because flash is erased in whole sectors.
 //!
 //! **To change a serialized type,** raise [`VERSION`], copy the types as they were into the module
-//! of the old version, which is never changed afterwards, with `From` into those of the next
-//! version, and give `decode_into` a new first reader. `tests/golden` has the images that must
+//! of the old version, with `From` into today's, and give `decode_into` a new first reader. What an
+//! old version reads is never changed afterwards. `tests/golden` has the images that must
 //! remain readable.
 
 mod v1;
 mod v2;
+mod v3;
 
 use core::fmt;
 
@@ -26,7 +27,7 @@ use super::{ConfigError, ConfigMut, ConfigView, GatewayConfig};
 /// The first bytes of every image.
 pub const MAGIC: [u8; 4] = *b"RGCI";
 /// The version of the payload: one more for every change of a serialized type.
-pub const VERSION: u32 = 2;
+pub const VERSION: u32 = 3;
 /// The oldest version that is read.
 pub const OLDEST_VERSION: u32 = 1;
 /// Length of the header: magic, version, payload length and CRC-32, four bytes each, little-endian.
@@ -163,7 +164,7 @@ pub fn encode<'c>(config: impl Into<ConfigView<'c>>, out: &mut [u8]) -> Result<u
 fn encode_view(config: ConfigView<'_>, out: &mut [u8]) -> Result<usize, NoSpace> {
     let no_space = NoSpace { available: out.len() };
     let (header, room) = out.split_at_mut_checked(HEADER).ok_or(no_space)?;
-    let payload = v2::write(config, room).map_err(|_| no_space)?;
+    let payload = v3::write(config, room).map_err(|_| no_space)?;
     let length = u32::try_from(payload.len()).map_err(|_| no_space)?;
     let crc = checksum(VERSION, length, payload);
     let words = [u32::from_le_bytes(MAGIC), VERSION, length, crc];
@@ -205,7 +206,8 @@ fn decode_view(bytes: &[u8], mut config: ConfigMut<'_>) -> Result<(), ImageError
     let (version, mut rest) = payload(bytes)?;
     match version {
         1 => v1::read(&mut rest, &mut config),
-        _ => v2::read(&mut rest, &mut config),
+        2 => v2::read(&mut rest, &mut config),
+        _ => v3::read(&mut rest, &mut config),
     }?;
     if !rest.is_empty() {
         return Err(ImageError::Contents);
@@ -219,11 +221,11 @@ fn item<T: DeserializeOwned>(rest: &mut &[u8]) -> Result<T, ImageError> {
     Ok(item)
 }
 
-/// The number of entries, and the entries.
-fn items<T: DeserializeOwned>(
+/// The number of entries, and the entries, which may be of an older version's type.
+fn items<T: DeserializeOwned + Into<Today>, Today>(
     rest: &mut &[u8],
     what: Counted,
-    all: &mut VecView<T>,
+    all: &mut VecView<Today>,
 ) -> Result<(), ImageError> {
     all.clear();
     let needed: usize = item(rest)?;
@@ -232,7 +234,7 @@ fn items<T: DeserializeOwned>(
         return Err(ImageError::TooMany { what, needed, room });
     }
     for _ in 0..needed {
-        all.push(item(rest)?).map_err(|_| ImageError::Contents)?;
+        all.push(item::<T>(rest)?.into()).map_err(|_| ImageError::Contents)?;
     }
     Ok(())
 }

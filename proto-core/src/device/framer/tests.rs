@@ -104,6 +104,15 @@ fn silence_discards_what_is_partial() {
 }
 
 #[test]
+fn a_frame_behind_much_noise_is_taken() {
+    // Whatever the noise is: no byte of it is a head.
+    let noise: Vec<u8> =
+        (0..100_000_u32).map(|nth| (nth.wrapping_mul(2_654_435_761) >> 24) as u8 & 0x7F).collect();
+    let events = run(&mut Framer::new(), &[&noise, &frame([1, 2])]);
+    assert_eq!(events, [Event::Frame(frame([1, 2]))]);
+}
+
+#[test]
 fn endless_false_beginnings_cost_bounded_work() {
     let elements = vec![byte(); 100];
     let checksum = Checksum::standard(Algorithm::named("crc32").unwrap());
@@ -152,7 +161,7 @@ fn reference(stream: &[u8]) -> Vec<Vec<u8>> {
             }
             Probe::Partial(_) => break,
             Probe::Other(len) => at += len,
-            Probe::No | Probe::Wrong(_) => at += 1,
+            Probe::No(_) | Probe::Wrong(_) => at += 1,
         }
     }
     frames

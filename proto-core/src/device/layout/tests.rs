@@ -88,8 +88,8 @@ fn without_a_checksum_another_constant_is_no_frame() {
     let elements = [fixed(ScalarType::Byte, 9), big(ScalarType::Word)];
     let layout = FrameLayout::new(Carrier::Stream, Direction::Output, &[], &[0xEE], &elements, None).unwrap();
     assert_eq!(layout.probe(&elements, &[9, 1, 2, 0xEE]), Probe::Frame(4));
-    assert_eq!(layout.probe(&elements, &[8, 1, 2, 0xEE]), Probe::No);
-    assert_eq!(layout.probe(&elements, &[9, 1, 2, 0xEF]), Probe::No);
+    assert_eq!(layout.probe(&elements, &[8, 1, 2, 0xEE]), Probe::No(6));
+    assert_eq!(layout.probe(&elements, &[9, 1, 2, 0xEF]), Probe::No(6));
     assert_eq!(layout.probe(&elements, &[9, 1]), Probe::Partial(2));
 }
 
@@ -152,7 +152,8 @@ fn fields_of_varying_length_end_where_their_delimiter_is() {
         let probe = layout.probe(&elements, &b"ST,17,-  3.25\r\n"[..len]);
         assert!(matches!(probe, Probe::Partial(1..)), "{len} bytes: {probe:?}");
     }
-    assert_eq!(layout.probe(&elements, b"ST,17,123456789012345678\r\n"), Probe::No, "too long");
+    assert_eq!(layout.probe(&elements, b"ST,17,123456789012345678\r\n"), Probe::No(4), "too long");
+    assert_eq!(layout.probe(&elements, b"SA"), Probe::No(2), "seen at once");
     // Found, and refused by its value.
     let frame = b"ST,x,1\r\n";
     assert_eq!(layout.probe(&elements, frame), Probe::Frame(8));

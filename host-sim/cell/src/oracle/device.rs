@@ -1,0 +1,268 @@
+//! Frames of devices: a plain implementation of docs/configuration.md section 4, for frames whose fields
+//! always have the same length.
+//!
+//! Written from that page, independent of the engine's layouts and encodings.
+
+use std::ops::Range;
+
+use proto_core::config::FieldSpec;
+use proto_core::device::{Algorithm, ByteOrder, Checksum, Crc, Encoding, Kind, Overflow, Width};
+use proto_core::wire::scalar::ScalarType;
+
+/// The places of a frame's fields.
+#[derive(Debug, Clone, Default)]
+pub(super) struct DeviceSpec {
+    /// Of each field, in the whole frame.
+    pub places: Vec<Range<usize>>,
+    /// The checksum, its place, and the bytes that it covers.
+    sum: Option<(Checksum, Range<usize>, Range<usize>)>,
+    /// Bytes of fields and checksum.
+    pub len: usize,
+}
+
+/// What a whole frame turns out to be.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Seen {
+    Ours,
+    /// The checksum is right, and a constant is another device's.
+    Other,
+    WrongChecksum,
+    /// Not a frame.
+    Nothing,
+}
+
+impl DeviceSpec {
+    /// `None` for the fields of a plain recipe.
+    pub(super) fn new(head: usize, fields: &[FieldSpec]) -> Option<Self> {
+        if !fields.iter().any(FieldSpec::is_device) {
+            return None;
+        }
+        let mut spec = Self::default();
+        let (mut at, mut first) = (head, head);
+        for field in fields {
+            let (len, is_shared) = match field {
+                FieldSpec::UserInput { ty, .. } | FieldSpec::UserOutput { ty, .. } => (ty.size(), false),
+                FieldSpec::DeviceInput { encoding, .. }
+                | FieldSpec::DeviceOutput { encoding, .. }
+                | FieldSpec::Fixed { encoding, .. } => (length(encoding), encoding.shared),
+                FieldSpec::Padding { len, .. } => (usize::from(*len), false),
+                FieldSpec::Checksum(sum) => (sum_bytes(sum), false),
+                FieldSpec::System(var) => (var.size(), false),
+            };
+            if !is_shared {
+                first = at;
+                at += len;
+            }
+            spec.places.push(first..first + len);
+            if let FieldSpec::Checksum(sum) = field {
+                let end = sum.last.map_or(first, |last| usize::from(last) + 1);
+                spec.sum = Some((*sum, first..first + len, usize::from(sum.first)..end));
+            }
+        }
+        spec.len = at - head;
+        Some(spec)
+    }
+
+    /// What a whole frame with the right head, tail and length is.
+    pub(super) fn see(&self, fields: &[FieldSpec], frame: &[u8]) -> Seen {
+        let is_ours = fields.iter().zip(&self.places).all(|(field, place)| match field {
+            FieldSpec::Fixed { encoding, value } => {
+                read(encoding, &frame[place.clone()]) == Some(*value as f64)
+            }
+            _ => true,
+        });
+        match (self.sum_is_right(frame), is_ours) {
+            (None, false) => Seen::Nothing,
+            (None | Some(true), true) => Seen::Ours,
+            (Some(true), false) => Seen::Other,
+            (Some(false), _) => Seen::WrongChecksum,
+        }
+    }
+
+    /// `None` without a checksum.
+    pub(super) fn sum_is_right(&self, frame: &[u8]) -> Option<bool> {
+        let (sum, place, covered) = self.sum.as_ref()?;
+        let number = checksum(&sum.algorithm, &frame[covered.clone()]);
+        let len = if sum.text { place.len() / 2 } else { place.len() };
+        let mut bytes = number.to_be_bytes()[4 - len..].to_vec();
+        if sum.order == ByteOrder::Little {
+            bytes.reverse();
+        }
+        let found = &frame[place.clone()];
+        Some(if sum.text {
+            let text: String = bytes.iter().map(|byte| format!("{byte:02x}")).collect();
+            found.to_ascii_lowercase() == text.as_bytes()
+        } else {
+            found == bytes
+        })
+    }
+}
+
+fn sum_bytes(sum: &Checksum) -> usize {
+    let bytes = match sum.algorithm {
+        Algorithm::Crc(crc) => usize::from(crc.width).div_ceil(8),
+        Algorithm::Sum16 => 2,
+        _ => 1,
+    };
+    if sum.text { 2 * bytes } else { bytes }
+}
+
+fn checksum(algorithm: &Algorithm, bytes: &[u8]) -> u32 {
+    let sum: u32 = bytes.iter().map(|&byte| u32::from(byte)).sum();
+    match algorithm {
+        Algorithm::Sum8 => sum % 256,
+        Algorithm::Sum16 => sum % 65_536,
+        Algorithm::Lrc => (256 - sum % 256) % 256,
+        Algorithm::Xor8 => u32::from(bytes.iter().fold(0, |xor, byte| xor ^ byte)),
+        Algorithm::Crc(crc) => crc_of(crc, bytes),
+        other => panic!("{other:?} has no model"),
+    }
+}
+
+/// The remainder, a bit at a time.
+fn crc_of(crc: &Crc, bytes: &[u8]) -> u32 {
+    let width = u32::from(crc.width);
+    let top = 1_u64 << width;
+    let mut register = u64::from(crc.init);
+    for &byte in bytes {
+        let byte = if crc.refin { byte.reverse_bits() } else { byte };
+        for bit in (0..8).rev() {
+            let carry = register >> (width - 1) & 1 ^ u64::from(byte >> bit & 1);
+            register = register << 1 & (top - 1);
+            if carry == 1 {
+                register ^= u64::from(crc.poly);
+            }
+        }
+    }
+    let register = register as u32;
+    let result = if crc.refout { register.reverse_bits() >> (32 - width) } else { register };
+    result ^ crc.xorout
+}
+
+/// Number of bytes of a field. Fields of varying length are refused before a run.
+fn length(encoding: &Encoding) -> usize {
+    match encoding.kind {
+        Kind::Scalar(ty) => ty.size(),
+        Kind::Uint24 | Kind::Int24 => 3,
+        Kind::Bcd { bytes } => usize::from(bytes),
+        Kind::Bits(bits) => usize::from(bits.bytes),
+        Kind::Decimal(digits) => fixed(digits.width),
+        Kind::Hex(width) => fixed(width),
+        other => panic!("{other:?} has no model"),
+    }
+}
+
+fn fixed(width: Width) -> usize {
+    match width {
+        Width::Fixed(width) => usize::from(width),
+        Width::Until(_) => panic!("a field of varying length has no model"),
+    }
+}
+
+/// The bytes with the highest first.
+fn ordered(order: ByteOrder, bytes: &[u8]) -> Vec<u8> {
+    let mut bytes = bytes.to_vec();
+    match order {
+        ByteOrder::Big => {}
+        ByteOrder::Little => bytes.reverse(),
+        ByteOrder::BigSwapped => bytes = bytes.chunks(2).rev().flatten().copied().collect(),
+        ByteOrder::LittleSwapped => bytes.chunks_mut(2).for_each(<[u8]>::reverse),
+    }
+    bytes
+}
+
+/// The number of a field's bytes; `None` if it is not readable.
+pub(super) fn read(encoding: &Encoding, bytes: &[u8]) -> Option<f64> {
+    let ordered = ordered(encoding.order, bytes);
+    let unsigned = ordered.iter().fold(0_u64, |number, &byte| number << 8 | u64::from(byte));
+    let signed = |number: u64, bits: u32| (number << (64 - bits)).cast_signed() >> (64 - bits);
+    Some(match encoding.kind {
+        Kind::Scalar(ty) => match ty {
+            ScalarType::Byte | ScalarType::Word | ScalarType::Dword => unsigned as f64,
+            ScalarType::Char => signed(unsigned, 8) as f64,
+            ScalarType::Short => signed(unsigned, 16) as f64,
+            ScalarType::Int => signed(unsigned, 32) as f64,
+            ScalarType::Float => f64::from(f32::from_bits(unsigned as u32)),
+            ScalarType::Double => f64::from_bits(unsigned),
+        },
+        Kind::Uint24 => unsigned as f64,
+        Kind::Int24 => signed(unsigned, 24) as f64,
+        Kind::Bits(bits) => {
+            let number = unsigned >> bits.first & ((1 << bits.count) - 1);
+            if bits.signed { signed(number, bits.count.into()) as f64 } else { number as f64 }
+        }
+        Kind::Bcd { .. } => {
+            let digits: String = ordered.iter().map(|byte| format!("{byte:02x}")).collect();
+            digits.parse::<u32>().ok()?.into()
+        }
+        Kind::Hex(_) => {
+            let is_hex = bytes.iter().all(u8::is_ascii_hexdigit);
+            let text = std::str::from_utf8(bytes).ok().filter(|_| is_hex)?;
+            u32::from_str_radix(text, 16).ok()?.into()
+        }
+        Kind::Decimal(_) => {
+            let text = std::str::from_utf8(bytes).ok()?.trim_start_matches([' ', '\t', '\n', '\r', '\x0C']);
+            let (sign, digits) = match text.strip_prefix('-') {
+                Some(digits) => (-1.0, digits),
+                None => (1.0, text.strip_prefix('+').unwrap_or(text)),
+            };
+            let digits = digits.trim_matches([' ', '\t', '\n', '\r', '\x0C']);
+            let is_decimal = digits.bytes().all(|byte| byte.is_ascii_digit() || byte == b'.');
+            // At most 16 characters, of which a binary64 keeps 15 digits apart.
+            let significant = digits.replace('.', "").trim_start_matches('0').len();
+            if !is_decimal || significant > 15 {
+                return None;
+            }
+            sign * digits.parse::<f64>().ok()?
+        }
+        other => panic!("{other:?} has no model"),
+    })
+}
+
+/// The number that a field shows for `number`: rounded, and the nearest that it can have or wrapped.
+pub(super) fn shown_as(encoding: &Encoding, overflow: Overflow, number: f64) -> f64 {
+    let (low, high) = range(encoding);
+    let is_float = matches!(encoding.kind, Kind::Scalar(ScalarType::Float | ScalarType::Double));
+    let unit = match encoding.kind {
+        Kind::Decimal(digits) => 10_f64.powi(digits.decimals.into()),
+        _ => 1.0,
+    };
+    let number = if is_float { number } else { (number * unit).round() / unit };
+    let number = match overflow {
+        Overflow::Wrap if unit == 1.0 && !is_float => {
+            let span = high - low + 1.0;
+            (number - low).rem_euclid(span) + low
+        }
+        _ => number.clamp(low, high),
+    };
+    match encoding.kind {
+        Kind::Scalar(ScalarType::Float) => f64::from(number as f32),
+        _ => number,
+    }
+}
+
+/// The smallest and the largest number of a field.
+pub(super) fn range(encoding: &Encoding) -> (f64, f64) {
+    match encoding.kind {
+        Kind::Scalar(ty) => ty.range(),
+        Kind::Uint24 => (0.0, 16_777_215.0),
+        Kind::Int24 => (-8_388_608.0, 8_388_607.0),
+        Kind::Bcd { bytes } => (0.0, 100_f64.powi(bytes.into()) - 1.0),
+        Kind::Hex(width) => (0.0, 16_f64.powi(fixed(width) as i32) - 1.0),
+        Kind::Bits(bits) => {
+            let count = 2_f64.powi(bits.count.into());
+            if bits.signed { (-count / 2.0, count / 2.0 - 1.0) } else { (0.0, count - 1.0) }
+        }
+        Kind::Decimal(digits) => {
+            let point = if digits.decimals == 0 { 0 } else { usize::from(digits.decimals) + 1 };
+            let whole = fixed(digits.width) - point;
+            let unit = 10_f64.powi(digits.decimals.into());
+            let most = |whole: usize| {
+                let all = (whole + usize::from(digits.decimals)).min(15);
+                (10_f64.powi(all as i32) - 1.0) / unit
+            };
+            (-most(whole - 1), most(whole))
+        }
+        other => panic!("{other:?} has no model"),
+    }
+}
