@@ -7,6 +7,7 @@ use crate::wire::scalar::Scalar;
 
 /// The value that an input variable takes when its port times out.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct SafeValue {
     /// An input variable that the port owns, as a whole or some of its bits.
     pub var: SysVar,
@@ -31,68 +32,5 @@ impl SafeValue {
     /// Whether it is for a variable as a whole.
     pub const fn is_whole(&self) -> bool {
         self.mask == u8::MAX
-    }
-}
-
-/// As images have it: a whole variable as ordinal and value, as they always had it; bits with
-/// [`BITS`] in the ordinal, and their mask behind it.
-#[cfg(feature = "serde")]
-mod stored {
-    use core::fmt;
-
-    use serde::de::{Error, SeqAccess, Visitor};
-    use serde::ser::SerializeTuple;
-    use serde::{Deserialize, Deserializer, Serialize, Serializer};
-
-    use super::SafeValue;
-    use crate::sysvar::{INPUT_COUNT, SysVar};
-
-    const BITS: u8 = 0x80;
-    const _: () = assert!(INPUT_COUNT < BITS as usize);
-
-    impl Serialize for SafeValue {
-        fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-            let &Self { var, value, mask } = self;
-            let ordinal = var.ordinal() as u8;
-            if self.is_whole() {
-                let mut tuple = serializer.serialize_tuple(2)?;
-                tuple.serialize_element(&ordinal)?;
-                tuple.serialize_element(&value)?;
-                return tuple.end();
-            }
-            let mut tuple = serializer.serialize_tuple(3)?;
-            tuple.serialize_element(&(ordinal | BITS))?;
-            tuple.serialize_element(&mask)?;
-            tuple.serialize_element(&value)?;
-            tuple.end()
-        }
-    }
-
-    impl<'de> Deserialize<'de> for SafeValue {
-        fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-            deserializer.deserialize_tuple(3, Stored)
-        }
-    }
-
-    struct Stored;
-
-    impl<'de> Visitor<'de> for Stored {
-        type Value = SafeValue;
-
-        fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-            f.write_str("a safe value")
-        }
-
-        fn visit_seq<A: SeqAccess<'de>>(self, mut seq: A) -> Result<SafeValue, A::Error> {
-            let short = || A::Error::custom("a safe value is cut short");
-            let ordinal: u8 = seq.next_element()?.ok_or_else(short)?;
-            let var = SysVar::from_ordinal(usize::from(ordinal & !BITS))
-                .ok_or_else(|| A::Error::custom("no system variable has this ordinal"))?;
-            let mask = match ordinal & BITS {
-                0 => u8::MAX,
-                _ => seq.next_element()?.ok_or_else(short)?,
-            };
-            Ok(SafeValue { var, value: seq.next_element()?.ok_or_else(short)?, mask })
-        }
     }
 }

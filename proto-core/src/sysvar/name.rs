@@ -140,7 +140,7 @@ impl VarRange {
 }
 
 /// One bit of a byte variable, as `BitInputReg[3].4` names it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct VarBit {
     /// The variable; [`Self::mask`] says whether it has the bit.
     pub var: SysVar,

@@ -1,7 +1,7 @@
 //! The bindings of fields and the triggers of output parts in a gateway file.
 
 use proto_core::config::{CommandWhen, OnStale, OutputBinding, SendOn};
-use proto_core::sysvar::SysVar;
+use proto_core::sysvar::{SysVar, VarBit};
 
 use super::reader::{Item, Reader, Result, Spot};
 
@@ -9,6 +9,7 @@ use super::reader::{Item, Reader, Result, Spot};
 pub(super) enum FileInput {
     Unused,
     Variable { var: SysVar, scale: f32, offset: f32 },
+    Bit(VarBit),
     Commands { entries: Vec<FileCommand>, when: CommandWhen },
 }
 
@@ -78,10 +79,7 @@ pub(super) fn read_input(field: &Reader<'_>) -> Result<FileInput> {
     }
     match (to, commands) {
         (None, None) => Ok(FileInput::Unused),
-        (Some(to), None) => {
-            let (scale, offset) = read_scale(field)?;
-            Ok(FileInput::Variable { var: read_var(&to)?, scale, offset })
-        }
+        (Some(to), None) => read_to(field, &to),
         (None, Some(commands)) => {
             let when = match field.optional("when") {
                 Some(item) => {
@@ -97,6 +95,21 @@ pub(super) fn read_input(field: &Reader<'_>) -> Result<FileInput> {
         }
         (Some(_), Some(commands)) => Err(commands.error("a field takes to or commands, not both")),
     }
+}
+
+/// A variable, or one bit of it.
+fn read_to(field: &Reader<'_>, to: &Item<'_>) -> Result<FileInput> {
+    let name = to.string()?;
+    if let Some(bit) = VarBit::parse(name) {
+        refuse(
+            field,
+            &["scale", "offset"],
+            "not allowed for a bit: it is off for 0 and on for any other value",
+        )?;
+        return bit.map(FileInput::Bit).map_err(|error| to.error(format!("{name:?}: {error}")));
+    }
+    let (scale, offset) = read_scale(field)?;
+    Ok(FileInput::Variable { var: read_var(to)?, scale, offset })
 }
 
 fn read_command((key, key_spot, item): (&str, Spot, Item<'_>)) -> Result<FileCommand> {
