@@ -2,7 +2,7 @@
 
 use proto_core::config::{Bus, FieldSpec, GatewayConfig, InputBinding, SendOn};
 use proto_core::engine::{LinkId, Plan, PortId, Source, WayUp};
-use proto_core::sysvar::{Direction, ModbusPlace, SysVar};
+use proto_core::sysvar::{Direction, ModbusPlace, SysVar, VarBit};
 
 /// The ways and sources of all field ports' variables, one line per run of neighbours.
 pub(super) fn show(config: &GatewayConfig) -> String {
@@ -13,6 +13,9 @@ pub(super) fn show(config: &GatewayConfig) -> String {
     for (_, port, recipe) in config.view().field_ports() {
         let up = config.view().written_by(recipe).map(|var| (var, way_up(config, &plan, var)));
         add(&mut lines, &port.name, up);
+        add_bits(&mut lines, &port.name, config.view().bits_written_by(recipe), |var| {
+            way_up(config, &plan, var)
+        });
         let commands: u16 = config
             .view()
             .fields_of(recipe, Direction::Input)
@@ -69,6 +72,27 @@ fn add(lines: &mut Vec<(String, String, String)>, port: &str, ways: impl Iterato
             format!("{}[{}..{}]", first.group(), first.index(), last.index())
         };
         lines.push((port.to_owned(), name, way));
+    }
+}
+
+/// Adds one line per byte of which the port writes some bits.
+fn add_bits(
+    lines: &mut Vec<(String, String, String)>,
+    port: &str,
+    bits: impl Iterator<Item = VarBit>,
+    way: impl Fn(SysVar) -> String,
+) {
+    let mut bytes: Vec<(SysVar, Vec<u8>)> = Vec::new();
+    for VarBit { var, bit } in bits {
+        match bytes.iter_mut().find(|(other, _)| *other == var) {
+            Some((_, bits)) => bits.push(bit),
+            None => bytes.push((var, vec![bit])),
+        }
+    }
+    for (var, mut bits) in bytes {
+        bits.sort_unstable();
+        let bits: Vec<_> = bits.iter().map(u8::to_string).collect();
+        lines.push((port.to_owned(), format!("{var}.{}", bits.join(",")), way(var)));
     }
 }
 
