@@ -434,6 +434,10 @@ enum Step {
     },
     /// The link is lost.
     Lost,
+    /// The controller's Modbus server is slow: so many frames come before it answers.
+    Slow {
+        frames: [(usize, u8); 5],
+    },
 }
 
 fn steps() -> impl Strategy<Value = Vec<Step>> {
@@ -444,6 +448,7 @@ fn steps() -> impl Strategy<Value = Vec<Step>> {
         4 => (0..40_u64).prop_map(|ms| Step::Run { ms }),
         1 => (90..250_u64).prop_map(|ms| Step::Run { ms }),
         1 => Just(Step::Lost),
+        2 => prop::array::uniform5((0..3_usize, any::<u8>())).prop_map(|frames| Step::Slow { frames }),
     ];
     prop::collection::vec(step, 1..60)
 }
@@ -505,6 +510,40 @@ fn play(udp: bool, steps: &[Step]) -> Result<(), TestCaseError> {
                 let byte = robot(&rig) & 0x7F | nobodys;
                 set_robot(&mut rig, byte);
                 continue;
+            }
+            Step::Slow { frames } => {
+                let is_up = matches!(rig.link(link).state, LinkState::Up { .. });
+                rig.modbus_answers = false;
+                rig.sent_on(LinkId::MODBUS);
+                let mut edges: [Vec<u8>; 3] = MASKS.map(|mask| vec![before & mask]);
+                for (device, value) in frames {
+                    let values: Vec<u8> = bits_of(MASKS[device]).iter().map(|bit| value >> bit & 1).collect();
+                    last[device] = Some((value & MASKS[device], rig.now, is_up));
+                    allowed[device].push(value & MASKS[device]);
+                    edges[device].push(value & MASKS[device]);
+                    rig.bytes(ports[device], &frame(&values));
+                }
+                // One answer after the other: each bit goes through every value that was sent.
+                let mut seen: [Vec<u8>; 8] = Default::default();
+                let mut note = |rig: &Rig| {
+                    (0..8).for_each(|bit: usize| seen[bit].push(robot(rig) >> bit & 1));
+                };
+                note(&rig);
+                while let Some(request) = rig.sent_on(LinkId::MODBUS).pop() {
+                    let answer = rig.answer(&request);
+                    note(&rig);
+                    rig.link_bytes(LinkId::MODBUS, &answer);
+                }
+                rig.modbus_answers = true;
+                for (mask, edges) in MASKS.iter().zip(&edges).filter(|_| !udp && is_up) {
+                    for bit in bits_of(*mask) {
+                        let mut sent: Vec<u8> = edges.iter().map(|value| value >> bit & 1).collect();
+                        let mut seen = seen[usize::from(bit)].clone();
+                        sent.dedup();
+                        seen.dedup();
+                        prop_assert_eq!(seen, sent, "bit {}", bit);
+                    }
+                }
             }
             Step::Packet => {
                 shown = [shown[1], robot(&rig)];

@@ -207,7 +207,8 @@ fn judge_device(frame: &Frame, nth: usize, whole: &[u8]) -> Verdict {
             InputBinding::Commands { table, when } => {
                 accepted.commands.push((at, table, when, number as i64));
             }
-            InputBinding::Unused => {}
+            // The model does not follow single bits yet.
+            InputBinding::Unused | InputBinding::Bit { .. } => {}
         }
     }
     Verdict::Accepted(accepted)
