@@ -59,13 +59,6 @@ enum Asked {
     Poll {
         block: usize,
     },
-    /// Bits of a byte of whose bits each has its owner.
-    WriteBits {
-        var: SysVar,
-        /// Those at their safe value.
-        safe: u8,
-        born: Since,
-    },
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -100,6 +93,8 @@ pub(super) struct ModbusLink {
     polled: Vec<SysVar, MAX_POLLED>,
     blocks: Vec<Block, MAX_POLL_BLOCKS>,
     in_flight: Option<InFlight>,
+    /// Bits with owners that are written in it and have their safe value.
+    safe_bits: Option<(SysVar, u8)>,
     /// Since when a value from a field frame has waited to be handed over.
     pub offered: Since,
     /// The transport has not taken the newest request yet.
@@ -128,6 +123,7 @@ impl ModbusLink {
             polled: Vec::new(),
             blocks: Vec::new(),
             in_flight: None,
+            safe_bits: None,
             offered: Since::NONE,
             unsent: false,
             flight: Flight::new(),
@@ -201,7 +197,7 @@ impl ModbusLink {
         };
         let (len, asked) = asked?;
         self.first = match asked {
-            Asked::Write { .. } | Asked::WriteBits { .. } => First::Poll,
+            Asked::Write { .. } => First::Poll,
             Asked::Poll { .. } => First::Write,
         };
         bump(&mut self.counters.sent);
@@ -220,10 +216,11 @@ impl ModbusLink {
     /// safe values are written again.
     fn abort<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
         self.client.abort();
-        match self.in_flight.take().map(|in_flight| in_flight.asked) {
-            Some(Asked::Write { safe, .. }) => store.again(&safe),
-            Some(Asked::WriteBits { var, safe, .. }) => store.bits_again(BitSet::of(var, safe)),
-            Some(Asked::Poll { .. }) | None => {}
+        if let Some(InFlight { asked: Asked::Write { safe, .. }, .. }) = self.in_flight.take() {
+            store.again(&safe);
+            if let Some((var, bits)) = self.safe_bits.take() {
+                store.bits_again(BitSet::of(var, bits));
+            }
         }
     }
 
@@ -238,10 +235,8 @@ impl ModbusLink {
             self.refused = self.refused.or(safe);
             self.ask_again_at = self.ask_again_at.min(now + REFUSED_PAUSE);
         }
-        if let Asked::WriteBits { var, safe, .. } = *asked
-            && safe != 0
-        {
-            self.refused_bits = self.refused_bits.or(BitSet::of(var, safe));
+        if let Some((var, bits)) = self.safe_bits.take() {
+            self.refused_bits = self.refused_bits.or(BitSet::of(var, bits));
             self.ask_again_at = self.ask_again_at.min(now + REFUSED_PAUSE);
         }
     }
@@ -280,15 +275,46 @@ impl ModbusLink {
         store: &mut Store<PORTS>,
         out: &mut [u8],
     ) -> Option<(usize, Asked)> {
-        let mut first = pending.iter().find(|var| var.ordinal() >= self.cursor).or(pending.iter().next())?;
-        let mut pending = *pending;
         if store.bits.is_used {
-            first = match self.bits_turn(&pending, store)? {
-                Turn::Bits(var, mask) => return self.write_bits(var, mask, store, out),
-                Turn::Whole(var) => var,
-            };
-            pending = pending.minus(&store.bits.bytes);
+            return self.write_beside_bits(pending, store, out);
         }
+        let first = pending.iter().find(|var| var.ordinal() >= self.cursor).or(pending.iter().next())?;
+        self.write_whole(first, pending, store, out)
+    }
+
+    /// The same where bits have owners.
+    #[cold]
+    #[inline(never)]
+    fn write_beside_bits<const PORTS: usize>(
+        &mut self,
+        pending: &InputSet,
+        store: &mut Store<PORTS>,
+        out: &mut [u8],
+    ) -> Option<(usize, Asked)> {
+        match self.bits_turn(pending, store)? {
+            Turn::Bits(var, mask) => self.write_bits(var, mask, store, out),
+            Turn::Whole(var) => {
+                self.bit_cursor = 0;
+                let sent = self.write_whole(var, &pending.minus(&store.bits.bytes), store, out);
+                if !store.outbox.dirty().and(&self.writes).is_empty()
+                    && let Some((_, Asked::Write { born, .. })) = sent
+                {
+                    self.offered = born;
+                }
+                sent
+            }
+        }
+    }
+
+    /// One request for a variable and those that follow it without a gap.
+    #[inline(always)]
+    fn write_whole<const PORTS: usize>(
+        &mut self,
+        first: SysVar,
+        pending: &InputSet,
+        store: &mut Store<PORTS>,
+        out: &mut [u8],
+    ) -> Option<(usize, Asked)> {
         let (address, kind) = place_of(first)?;
         let (each, most) = match (kind, first.modbus()) {
             (Kind::Coils, Some(ModbusPlace::Coils { count, .. })) => (count.max(1), MAX_WRITE_COILS),
@@ -301,7 +327,6 @@ impl ModbusLink {
         let items = each.saturating_mul(count as u16);
         let vars = InputSet::run(first, count);
         self.cursor = first.ordinal().saturating_add(count);
-        self.bit_cursor = 0;
         let mut bits = [0; BIT_INPUT_COUNT];
         if kind == Kind::Coils {
             for (place, var) in bits.iter_mut().zip(vars.iter()) {
@@ -377,7 +402,8 @@ impl ModbusLink {
         if store.outbox.dirty().and(&self.writes).is_empty() {
             self.offered = Since::NONE;
         }
-        Some((len, Asked::WriteBits { var, safe, born }))
+        self.safe_bits = (safe != 0).then_some((var, safe));
+        Some((len, Asked::Write { safe: InputSet::EMPTY, born }))
     }
 }
 
@@ -426,10 +452,9 @@ impl Connection for ModbusLink {
                 (Asked::Write { safe, born }, Some(_)) => {
                     born.record(now, &mut store.latency.arrived);
                     store.confirm(&safe);
-                }
-                (Asked::WriteBits { var, safe, born }, Some(_)) => {
-                    born.record(now, &mut store.latency.arrived);
-                    store.confirm_bits(var, safe & store.bits.safe.byte(var));
+                    if let Some((var, bits)) = self.safe_bits.take() {
+                        store.confirm_bits(var, bits & store.bits.safe.byte(var));
+                    }
                 }
                 (Asked::Poll { block }, Some(response)) => {
                     if let Some(block) = self.blocks.get(block) {
