@@ -30,6 +30,7 @@ pub mod driver {}
 /// [state]: wire::state
 /// [command]: wire::command
 /// [modbus]: wire::modbus
+/// [modbus_rtu]: wire::modbus_rtu
 /// [slcan]: wire::slcan
 #[doc = ""]
 #[doc = include_str!("../docs/wire/README.md")]
@@ -40,4 +41,9 @@ pub mod wire {
     page!(command: state);
     page!(modbus: sysvars);
     page!(slcan: );
+
+    /// [modbus]: modbus
+    #[doc = ""]
+    #[doc = include_str!("../docs/wire/modbus-rtu.md")]
+    pub mod modbus_rtu {}
 }

@@ -3,9 +3,11 @@
 use std::net::Ipv4Addr;
 
 use proto_core::config::*;
+use proto_core::device::{Algorithm, Bits, ByteOrder, Checksum, Digits, Encoding, Kind, Overflow, Width};
 use proto_core::sysvar::{Direction, ParseError, SysVar};
 use proto_core::time::Duration;
 use proto_core::wire::can::CanId;
+use proto_core::wire::scalar::ScalarType::{Byte, Double, Dword, Short, Word};
 use proto_core::wire::scalar::{Scalar, ScalarError, ScalarType};
 
 const HEAD: &[u8] = &[0xFF, 0xFF];
@@ -164,7 +166,7 @@ fn everything_that_is_said_is_in_it() {
             },
         ]
     );
-    let texts: Vec<_> = table.of(&config.commands).iter().map(|entry| (entry.value, &*entry.text)).collect();
+    let texts: Vec<_> = table.of(&config.commands).iter().map(|entry| (entry.first, &*entry.text)).collect();
     assert_eq!(texts, commands);
     let Parts::Can { input, output } = &config.recipes[1].parts else { panic!("{:?}", config.recipes[1]) };
     assert_eq!((input[0].id, output[0].id), (CanId::Standard(0x501), CanId::Extended(0x12345)));
@@ -287,6 +289,115 @@ fn mistakes_have_places() {
         refused(twice),
         (Place::Recipe { recipe: 1, key: RecipeKey::Name }, ConfigErrorKind::DuplicateName { other: 0 })
     );
+}
+
+fn only_fields(recipe: RecipeBuilder<'_>) -> Vec<FieldSpec> {
+    let config: GatewayConfig =
+        GatewayConfig::builder().controller("a").recipe(recipe).port(Port::rs485("p", "r")).build().unwrap();
+    config.fields.to_vec()
+}
+
+#[test]
+fn fields_of_devices_are_written_as_their_manuals_have_them() {
+    let to = |name| InputBinding::Variable { var: var(name), scale: 1.0, offset: 0.0 };
+    let value = |encoding, to| FieldSpec::DeviceInput { encoding, overflow: Overflow::Usual, to };
+    let status = Encoding::bits(Byte, 4..=5);
+    let table = [(1, "stop")];
+    let fields = only_fields(Recipe::user("r").stream_input(
+        &[],
+        &[],
+        &[
+            InputField::constant(Byte, 9),
+            InputField::variable(Word, "WordInputReg[1]"),
+            InputField::variable(status, "WordInputReg[2]").scaled(2.0, 1.0),
+            InputField::variable(Encoding::bit(Byte, 7).shared(), "WordInputReg[3]"),
+            InputField::commands(Encoding::bcd(2), &table),
+            InputField::variable(Encoding::from(Short).big_endian(), "WordInputReg[4]").wrapping(),
+            InputField::unused(Encoding::int24()),
+            InputField::padding(3),
+            InputField::checksum("crc16-modbus"),
+        ],
+    ));
+    let commands = InputBinding::Commands { table: Span { start: 0, len: 1 }, when: CommandWhen::Change };
+    let scaled = InputBinding::Variable { var: var("WordInputReg[2]"), scale: 2.0, offset: 1.0 };
+    let crc = Checksum::standard(Algorithm::named("crc16-modbus").unwrap());
+    let bit = Bits { bytes: 1, first: 7, count: 1, signed: false };
+    let bit = Encoding { kind: Kind::Bits(bit), order: ByteOrder::Little, shared: true };
+    assert_eq!(
+        fields,
+        [
+            FieldSpec::Fixed { encoding: Encoding::scalar(Byte), value: 9 },
+            // As the controller's own recipes have it.
+            FieldSpec::UserInput { ty: Word, to: to("WordInputReg[1]") },
+            value(status, scaled),
+            value(bit, to("WordInputReg[3]")),
+            value(Encoding::bcd(2), commands),
+            FieldSpec::DeviceInput {
+                encoding: Encoding { order: ByteOrder::Big, ..Encoding::scalar(Short) },
+                overflow: Overflow::Wrap,
+                to: to("WordInputReg[4]"),
+            },
+            value(Encoding::int24(), InputBinding::Unused),
+            FieldSpec::Padding { len: 3, fill: 0 },
+            FieldSpec::Checksum(crc),
+        ]
+    );
+}
+
+#[test]
+fn requests_to_devices_are_written_as_their_manuals_have_them() {
+    let sum = Checksum::standard(Algorithm::Xor8).over(1, Some(2));
+    let fields = only_fields(Recipe::user("r").stream_output(
+        b"#",
+        b"\r",
+        &[
+            OutputField::constant(Encoding::hex(2), 255.0),
+            OutputField::counter(Encoding::decimal_until(b',')),
+            OutputField::reply(Encoding::uint24()),
+            OutputField::variable(Encoding::decimal(8).decimals(2), "RobotState[8]"),
+            OutputField::variable(Encoding::hex_until(b';'), "BitOutputReg[1]"),
+            OutputField::variable(Encoding::bits(Dword, 0..=7).signed(), "WordOutputReg[1]").wrapping(),
+            OutputField::padding(2, 0xFF),
+            OutputField::checksum(sum),
+            OutputField::constant(Double, 0.5),
+        ],
+    ));
+    let from = |name| OutputBinding::Variable { var: var(name), scale: 1.0, offset: 0.0 };
+    let value = |encoding, from| FieldSpec::DeviceOutput { encoding, overflow: Overflow::Usual, from };
+    let decimals = Kind::Decimal(Digits { width: Width::Fixed(8), decimals: 2 });
+    let signed = Kind::Bits(Bits { bytes: 4, first: 0, count: 8, signed: true });
+    let little = |kind| Encoding { kind, order: ByteOrder::Little, shared: false };
+    assert_eq!(
+        fields,
+        [
+            value(little(Kind::Hex(Width::Fixed(2))), OutputBinding::Constant(255.0)),
+            value(Encoding::decimal_until(b','), OutputBinding::Counter),
+            value(little(Kind::Uint24), OutputBinding::Reply),
+            value(little(decimals), from("RobotState[8]")),
+            value(little(Kind::Hex(Width::Until(b';'))), from("BitOutputReg[1]")),
+            FieldSpec::DeviceOutput {
+                encoding: little(signed),
+                overflow: Overflow::Wrap,
+                from: from("WordOutputReg[1]"),
+            },
+            FieldSpec::Padding { len: 2, fill: 0xFF },
+            FieldSpec::Checksum(sum),
+            FieldSpec::UserOutput { ty: Double, from: OutputBinding::Constant(0.5) },
+        ]
+    );
+}
+
+#[test]
+fn an_unknown_checksum_is_refused_with_the_names() {
+    let fields = [InputField::constant(Byte, 1), InputField::checksum("crc16")];
+    let recipe = Recipe::user("r").stream_input(&[], &[], &fields);
+    let builder: ConfigBuilder = GatewayConfig::builder().controller("a").recipe(recipe);
+    let (place, kind) = refused(builder);
+    assert_eq!(place, Place::Field { recipe: 0, part: Direction::Input, frame: 0, field: 1 });
+    assert_eq!(kind, ConfigErrorKind::UnknownChecksum);
+    let said = kind.to_string();
+    assert!(said.starts_with("no checksum has this name; allowed: crc8 crc8-autosar "), "{said}");
+    assert!(said.ends_with(" sum8 sum16 xor8 lrc"), "{said}");
 }
 
 #[test]

@@ -12,9 +12,9 @@ use proto_core::config::image::{
 };
 use proto_core::config::{
     BoardAddress, Bus, CommandWhen, FieldSpec, GatewayConfig, InputBinding, OnStale, OutputBinding, Parity,
-    Parts, SendOn,
+    Parts, PortValue, SendOn,
 };
-use proto_core::device::{Algorithm, ByteOrder, Kind, Overflow, Width};
+use proto_core::device::{Algorithm, Boundary, ByteOrder, Counts, Escape, Kind, Overflow, TextWidth, Width};
 use proto_core::recipe::model::Mode;
 use proto_core::sysvar::SysVar;
 use proto_core::wire::can::CanId;
@@ -169,6 +169,7 @@ fn serialized_types_are_those_of_the_version() {
         OutputBinding,
         Parity,
         Parts,
+        PortValue,
         Scalar,
         ScalarType,
         SendOn,
@@ -177,6 +178,10 @@ fn serialized_types_are_those_of_the_version() {
         Kind,
         Overflow,
         Width,
+        Boundary,
+        Escape,
+        Counts,
+        TextWidth,
         GatewayConfig,
     );
     let mut said = String::new();

@@ -158,7 +158,7 @@ fn the_newest_command_of_a_port_is_told_with_its_outcome() {
     let newest_command = |rig: &Rig| {
         let status = rig.engine.status(rig.now);
         let panel = port(&status, "port0");
-        (panel.command.map(str::to_owned), panel.reply)
+        (panel.command.map(|command| command.to_string()), panel.reply)
     };
     assert_eq!(newest_command(&rig), (None, ReplyCode::None));
     rig.run(MS(10));

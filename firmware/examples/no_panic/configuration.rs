@@ -67,10 +67,12 @@ fn config_questions(config: &GatewayConfig) {
     config.view().field_ports().for_each(|port| _ = black_box(port));
     for recipe in &config.recipes {
         config.view().fields_of(recipe, any(Direction::Input)).for_each(|field| _ = black_box(field));
+        black_box(config.view().is_device(recipe));
         config.view().written_by(recipe).for_each(|var| _ = black_box(var));
     }
     for field in &config.fields {
         black_box(field.variable());
+        field.variables().for_each(|var| _ = black_box(var));
     }
     let part = any(CanFramePart { id: CanId::Standard(1), fields: Span::default() });
     black_box(part.fields.of(bytes()));

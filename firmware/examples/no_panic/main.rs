@@ -8,6 +8,7 @@
 #![cfg_attr(target_os = "none", no_std, no_main)]
 
 mod configuration;
+mod devices;
 mod engine;
 mod protocols;
 mod recipes;
@@ -35,6 +36,7 @@ fn room(buffer: &mut [u8]) -> &mut [u8] {
 
 fn exercise() {
     configuration::all();
+    devices::all();
     engine::all();
     recipes::all();
     protocols::all();

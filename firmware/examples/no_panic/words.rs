@@ -5,6 +5,7 @@ use core::hint::black_box;
 
 use proto_core::command::{self, Percent, StateCodes};
 use proto_core::config::{GatewayConfig, image};
+use proto_core::device::{LayoutError, Unreadable};
 use proto_core::engine::{BuildError, PlanError};
 use proto_core::modbus::{Exception, adu, client, pdu};
 use proto_core::recipe::CanReject;
@@ -52,6 +53,7 @@ pub(crate) fn all() {
     say(any(Scalar::Byte(0)));
     say(any(ScalarError::OutOfRange { ty: ScalarType::Byte, value: 0.0 }));
     recipes();
+    devices();
     protocols();
 }
 
@@ -62,6 +64,11 @@ fn recipes() {
     say(any(NoSpace { needed: 1, available: 0 }));
     say(any(EncodeError::Count { expected: 1, got: 0 }));
     say(any(CanReject::WrongLength { frame: 0, expected: 1, got: 0 }));
+}
+
+fn devices() {
+    say(any(LayoutError::Empty));
+    say(any(Unreadable::Length));
 }
 
 fn protocols() {

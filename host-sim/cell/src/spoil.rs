@@ -25,7 +25,9 @@ impl Cell {
 
     /// The floats that the gateway's configuration names.
     pub fn floats(&self) -> Vec<SysVar> {
-        let named = |var: &SysVar| self.gateway.fields.iter().any(|field| field.variable() == Some(*var));
+        let named = |var: &SysVar| {
+            self.gateway.fields.iter().any(|field| field.variables().any(|bound| bound == *var))
+        };
         SysVar::all().filter(|var| var.ty() == ScalarType::Float && named(var)).collect()
     }
 
@@ -33,7 +35,7 @@ impl Cell {
     pub(super) fn frame_len(&self, link: LinkId) -> Option<usize> {
         let port = self.gateway.ports.get(usize::from(link.port()?.0))?;
         let recipe = self.gateway.recipes.get(usize::from(port.recipe))?;
-        let Parts::Stream { output: Some(StreamPart { head, fields, tail }), .. } = &recipe.parts else {
+        let Parts::Stream { output: Some(StreamPart { head, fields, tail, .. }), .. } = &recipe.parts else {
             return None;
         };
         let fields = fields.of(&self.gateway.fields).iter().filter_map(FieldSpec::variable);

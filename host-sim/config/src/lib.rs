@@ -5,10 +5,12 @@
 //! In: TOML text and `--set` overrides. Out: [`SimConfig`] for the simulated controller, or
 //! `proto_core::config::GatewayConfig` for the gateway. Nothing here opens a device or a socket.
 
+mod device;
 pub mod file;
 mod sim;
 mod target;
 
+pub use device::{AnyRecipe, DeviceField, DeviceRecipe, NamedFrame};
 pub use sim::{
     AnalogInput, BitGroup, CommandClients, Initial, InitialTarget, Listen, Power, Robot, RobotMode, SimBus,
     SimCanFrame, SimConfig, SimField, SimParts, SimPort, SimProgram, SimRecipe, SimStreamPart,

@@ -11,9 +11,9 @@ use proto_core::sysvar::{Direction, SysVar};
 use proto_core::time::Duration;
 use proto_core::wire::can::CanId;
 
-use super::{Overrides, plan, text};
+use super::{Overrides, frame, plan, text};
 use recipe_config::file::{self, Config, FileError};
-use recipe_config::{SimBus, SimConfig, SimField, SimParts, SimPort, SimRecipe, SimStreamPart};
+use recipe_config::{AnyRecipe, SimBus, SimConfig, SimField, SimParts, SimPort, SimRecipe, SimStreamPart};
 use recipe_controller::{BuildError, Controller};
 
 /// Arguments of `check`.
@@ -79,7 +79,7 @@ fn check_build(path: &Path, overrides: &[String], config: &SimConfig) -> Result<
 }
 
 /// The report on a gateway file.
-fn gateway(config: &GatewayConfig, recipes: &[SimRecipe]) -> String {
+fn gateway(config: &GatewayConfig, recipes: &[AnyRecipe]) -> String {
     let link = &config.controller;
     let mut report = format!(
         "controller {} ({}): command {}, state {}, Modbus {}\n",
@@ -92,19 +92,29 @@ fn gateway(config: &GatewayConfig, recipes: &[SimRecipe]) -> String {
             &format!("a board's address is {network}{}; a host has its own\n", others.collect::<String>());
     }
     for port in &config.ports {
-        let recipe = recipes.get(usize::from(port.recipe)).map_or("", |recipe| &recipe.name);
+        let recipe = recipes.get(usize::from(port.recipe));
+        let name = recipe.map_or("", |recipe| recipe.name());
         let bus = match &port.bus {
             Bus::Rs485(line) => show_line(line),
             Bus::Can { bitrate } => show_can_bus(*bitrate),
             Bus::TcpListen { listen } => format!("the controller's TCP client connects to {listen}"),
             Bus::UdpListen { listen } => format!("the controller's UDP client sends to {listen}"),
         };
-        report += &format!("\nport {}: {bus}, recipe {recipe}\n", port.name);
+        report += &format!("\nport {}: {bus}, recipe {name}\n", port.name);
         // On a field port input comes from the devices, on a listening port from the controller.
         for part in [Direction::Input, Direction::Output] {
             if let Some(budget) = config.view().budget(port, part) {
                 report += &show_budget(part, budget, port.cycle);
+                if let Some(AnyRecipe::Device(recipe)) = recipe {
+                    report += &frame::show(recipe, part);
+                }
             }
+        }
+        if port.safe_at_start {
+            report += "  safe values from the start until the device speaks\n";
+        }
+        if let Some(refresh) = port.refresh {
+            report += &format!("  output sent on change, and after {refresh} without one\n");
         }
     }
     report += &plan::show(config);
@@ -160,10 +170,11 @@ fn controller(config: &SimConfig) -> String {
 }
 
 /// What to set on the controller's pendant for the gateway's recipe links.
-fn pendant_of_gateway(config: &GatewayConfig, recipes: &[SimRecipe]) -> String {
+fn pendant_of_gateway(config: &GatewayConfig, recipes: &[AnyRecipe]) -> String {
     let mut report = String::new();
     let mut add = |what: String, recipe: u8| {
-        if let Some(recipe) = recipes.get(usize::from(recipe)) {
+        // The check of the file let no device's recipe come here.
+        if let Some(recipe) = recipes.get(usize::from(recipe)).and_then(AnyRecipe::plain) {
             report += &format!("  {what}: recipe {}\n{}", recipe.name, show_pendant(recipe));
         }
     };

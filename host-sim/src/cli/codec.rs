@@ -8,7 +8,9 @@ use proto_core::sysvar::{Direction, SysVar};
 use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::{Scalar, ScalarType};
 
-use recipe_config::{SimField, SimParts, SimRecipe};
+use recipe_config::{AnyRecipe, DeviceRecipe, SimField, SimParts, SimRecipe};
+
+use super::convert::device::DevicePart;
 
 /// A compiled part.
 #[derive(Debug)]
@@ -25,6 +27,8 @@ pub(super) enum Layout {
     /// One frame per datagram, without head and tail.
     Datagram(Box<StreamLayout>),
     Can(Box<CanLayout>),
+    /// Frames of a device, on a stream or on CAN.
+    Device(Box<DevicePart>),
 }
 
 /// The fields of one frame.
@@ -44,45 +48,52 @@ pub(super) struct NamedField {
 impl Part {
     /// Chooses the recipe called `name`, or the only one, and its part, or the only one.
     pub(super) fn choose(
-        recipes: &[SimRecipe],
+        recipes: &[AnyRecipe],
         name: Option<&str>,
         part: Option<Direction>,
     ) -> Result<Self, String> {
         let names =
-            || recipes.iter().map(|recipe| format!("{:?}", recipe.name)).collect::<Vec<_>>().join(", ");
+            || recipes.iter().map(|recipe| format!("{:?}", recipe.name())).collect::<Vec<_>>().join(", ");
         let recipe = match (name, recipes) {
             (_, []) => return Err("there is no recipe in this file".into()),
             (None, [only]) => only,
             (None, _) => return Err(format!("several recipes; choose one with --recipe NAME: {}", names())),
             (Some(name), _) => recipes
                 .iter()
-                .find(|recipe| recipe.name == name)
+                .find(|recipe| recipe.name() == name)
                 .ok_or_else(|| format!("there is no recipe {name:?}; there are {}", names()))?,
         };
-        let has = |part| match (&recipe.parts, part) {
-            (SimParts::Stream { input, .. }, Direction::Input) => input.is_some(),
-            (SimParts::Stream { output, .. }, Direction::Output) => output.is_some(),
-            (SimParts::Can { input, .. }, Direction::Input) => !input.is_empty(),
-            (SimParts::Can { output, .. }, Direction::Output) => !output.is_empty(),
+        let has = |part| match recipe {
+            AnyRecipe::Plain(recipe) => has_part(recipe, part),
+            AnyRecipe::Device(recipe) => !recipe.part(part).is_empty(),
         };
+        let name = recipe.name();
         let part = match (part, has(Direction::Input), has(Direction::Output)) {
             (Some(Direction::Input), false, _) => {
-                return Err(format!("recipe {:?} has no input part", recipe.name));
+                return Err(format!("recipe {name:?} has no input part"));
             }
             (Some(Direction::Output), _, false) => {
-                return Err(format!("recipe {:?} has no output part", recipe.name));
+                return Err(format!("recipe {name:?} has no output part"));
             }
             (Some(part), _, _) => part,
             (None, true, false) => Direction::Input,
             (None, false, _) => Direction::Output,
             (None, true, true) => {
                 return Err(format!(
-                    "recipe {:?} has both parts; choose one: --part input (user to robot) or --part output (robot to user)",
-                    recipe.name
+                    "recipe {name:?} has both parts; choose one: --part input (user to robot) or --part output (robot to user)"
                 ));
             }
         };
-        Self::compile(recipe, part)
+        match recipe {
+            AnyRecipe::Plain(recipe) => Self::compile(recipe, part),
+            AnyRecipe::Device(recipe) => Self::lay_out(recipe, part),
+        }
+    }
+
+    fn lay_out(recipe: &DeviceRecipe, direction: Direction) -> Result<Self, String> {
+        let device = DevicePart::new(recipe, direction)?;
+        let frames = device.ids().map(|id| FrameFields { id, fields: Vec::new() }).collect();
+        Ok(Self { layout: Layout::Device(Box::new(device)), frames })
     }
 
     fn compile(recipe: &SimRecipe, direction: Direction) -> Result<Self, String> {
@@ -115,7 +126,7 @@ impl Part {
 
     /// Whether frames are CAN frames.
     pub(super) fn is_can(&self) -> bool {
-        matches!(self.layout, Layout::Can(_))
+        self.frames.iter().any(|frame| frame.id.is_some())
     }
 
     /// The bytes of a stream frame or datagram.
@@ -136,6 +147,15 @@ impl Part {
     ) -> Result<CanFrame, String> {
         let frame = layout.frame(index).ok_or("no such frame")?;
         frame.encode_values(values).map_err(|error| error.to_string())
+    }
+}
+
+fn has_part(recipe: &SimRecipe, part: Direction) -> bool {
+    match (&recipe.parts, part) {
+        (SimParts::Stream { input, .. }, Direction::Input) => input.is_some(),
+        (SimParts::Stream { output, .. }, Direction::Output) => output.is_some(),
+        (SimParts::Can { input, .. }, Direction::Input) => !input.is_empty(),
+        (SimParts::Can { output, .. }, Direction::Output) => !output.is_empty(),
     }
 }
 

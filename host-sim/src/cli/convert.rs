@@ -3,6 +3,8 @@
 //! In: hex bytes or candump lines; or the lines that `decode` prints, which `encode` turns into the same
 //! bytes again. Out: the other form.
 
+pub(super) mod device;
+
 use std::collections::BTreeMap;
 use std::io::{BufRead, Write};
 
@@ -66,7 +68,8 @@ pub(super) fn decode_lines(
     let frames = match &part.layout {
         Layout::Stream(layout) => decode_stream(part, layout, input, out, notes)?,
         Layout::Datagram(layout) => decode_datagrams(part, layout, input, out, notes)?,
-        Layout::Can(_) => decode_can(part, input, out, notes)?,
+        Layout::Device(device) if !part.is_can() => device.decode_stream(numbered(input), out, notes)?,
+        Layout::Can(_) | Layout::Device(_) => decode_can(part, input, out, notes)?,
     };
     if frames == 0 { Err("the input has no frame of this recipe".into()) } else { Ok(()) }
 }
@@ -84,6 +87,12 @@ fn encode(part: &Part, wanted: Option<Wanted>, prefix: &Prefix, values: &[String
             let Some(frame) = part.frames.first() else { return Err("no fields".into()) };
             let bytes = part.encode_stream(layout, &scalars(frame, values)?)?;
             Ok(text::hex(&bytes))
+        }
+        Layout::Device(device) if !part.is_can() => Ok(text::hex(&device.encode(0, values)?)),
+        Layout::Device(device) => {
+            let index = find_frame(part, wanted)?;
+            let id = part.frames.get(index).and_then(|frame| frame.id).ok_or("no such frame")?;
+            Ok(text::can_line(prefix, id, &device.encode(index, values)?))
         }
         Layout::Can(layout) => {
             let index = find_frame(part, wanted)?;
@@ -258,7 +267,11 @@ fn decode_can(
 }
 
 fn show_can(part: &Part, frame: &CanFrame, line: usize, notes: &mut dyn Write) -> Result<String, String> {
-    let Layout::Can(layout) = &part.layout else { return Err("not a CAN recipe".into()) };
+    let layout = match &part.layout {
+        Layout::Can(layout) => layout,
+        Layout::Device(device) => return device.decode_can(frame, line, notes),
+        Layout::Stream(_) | Layout::Datagram(_) => return Err("not a CAN recipe".into()),
+    };
     let index = layout.accept(frame).map_err(|reject| match reject {
         CanReject::UnknownId { id } => format!("id {} is not in the recipe", text::show_id(id)),
         CanReject::Remote { id } => format!("id {}: a remote frame", text::show_id(id)),
@@ -298,5 +311,7 @@ fn note(notes: &mut dyn Write, message: &str) {
     let _ = writeln!(notes, "{message}");
 }
 
+#[cfg(test)]
+mod device_tests;
 #[cfg(test)]
 mod tests;

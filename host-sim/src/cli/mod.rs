@@ -7,6 +7,7 @@
 mod check;
 mod codec;
 mod convert;
+mod frame;
 mod image;
 mod log;
 mod plan;

@@ -1,8 +1,10 @@
 //! The way up or the source of each variable, as `check` prints it.
 
-use proto_core::config::{Bus, FieldSpec, GatewayConfig, InputBinding, SendOn};
+use proto_core::config::{Bus, FieldSpec, GatewayConfig, InputBinding, OutputBinding, SendOn};
 use proto_core::engine::{LinkId, Plan, PortId, Source, WayUp};
 use proto_core::sysvar::{Direction, ModbusPlace, SysVar, VarBit};
+
+const STATE_STREAM: &str = "<- controller: state stream, 10 a second";
 
 /// The ways and sources of all field ports' variables, one line per run of neighbours.
 pub(super) fn show(config: &GatewayConfig) -> String {
@@ -16,11 +18,16 @@ pub(super) fn show(config: &GatewayConfig) -> String {
         add_bits(&mut lines, &port.name, config.view().bits_written_by(recipe), |var| {
             way_up(config, &plan, var)
         });
+        for (value, var) in port.health.iter() {
+            let what = format!("{} in {var}", value.name());
+            lines.push((port.name.to_string(), what, way_up(config, &plan, var)));
+        }
         let commands: u16 = config
             .view()
             .fields_of(recipe, Direction::Input)
             .filter_map(|(_, _, field)| match field {
-                FieldSpec::UserInput { to: InputBinding::Commands { table, .. }, .. } => Some(table.len),
+                FieldSpec::UserInput { to: InputBinding::Commands { table, .. }, .. }
+                | FieldSpec::DeviceInput { to: InputBinding::Commands { table, .. }, .. } => Some(table.len),
                 _ => None,
             })
             .sum();
@@ -35,9 +42,23 @@ pub(super) fn show(config: &GatewayConfig) -> String {
         let shown = config
             .view()
             .fields_of(recipe, Direction::Output)
-            .filter_map(|(_, _, field)| field.variable())
+            .flat_map(|(_, _, field)| field.variables())
             .chain(trigger);
         add(&mut lines, &port.name, shown.map(|var| (var, source(config, &plan, var))));
+        for (_, _, field) in config.view().fields_of(recipe, Direction::Output) {
+            let (what, from) = match field.source() {
+                Some(OutputBinding::State { value, .. }) => (value.to_string(), STATE_STREAM.into()),
+                Some(OutputBinding::Port { port: None, value, .. }) => {
+                    (format!("port.{}", value.name()), "<- this port".into())
+                }
+                Some(OutputBinding::Port { port: Some(of), value, .. }) => {
+                    let from = format!("<- port {}", port_name(config, PortId(of)));
+                    (format!("port.{}.{}", port_name(config, PortId(of)), value.name()), from)
+                }
+                _ => continue,
+            };
+            lines.push((port.name.to_string(), what, from));
+        }
     }
     let width = |column: fn(&(String, String, String)) -> &String| {
         lines.iter().map(|line| column(line).chars().count()).max().unwrap_or(0)
@@ -108,7 +129,7 @@ fn source(config: &GatewayConfig, plan: &Plan, var: SysVar) -> String {
     match plan.source(var) {
         Some(Source::Recipe(link)) => format!("<- controller: {}", link_name(config, link)),
         Some(Source::Modbus) => format!("<- controller: Modbus {}", modbus_kind(var)),
-        Some(Source::State) => "<- controller: state stream, 10 a second".into(),
+        Some(Source::State) => STATE_STREAM.into(),
         Some(Source::Field(port)) => format!("<- port {}", port_name(config, port)),
         None => "<- nowhere".into(),
     }

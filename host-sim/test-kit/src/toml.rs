@@ -33,7 +33,7 @@ on_timeout = {{ "DigitalOutputCommand[1]" = 128 }}
 
 /// Pieces of configuration files, valid and harmful ones. Inputs of a fuzzer refer to them by index: add new
 /// ones at the end.
-pub const PIECES: [&str; 48] = [
+pub const PIECES: [&str; 62] = [
     "[",
     "]",
     "[[",
@@ -82,4 +82,18 @@ pub const PIECES: [&str; 48] = [
     "from = \"counter\"",
     "send = \"frame\"",
     "#",
+    "endian = \"big\"",
+    "word_order = \"low-first\"",
+    "checksum = { kind = \"crc16-modbus\" }",
+    "over = \"1..\"",
+    "at = 4",
+    "bits = \"4..7\"",
+    "bits = 3",
+    "equals = 9",
+    "{ pad = 3 }",
+    "{ text = \"ST,\" }",
+    "overflow = \"wrap\"",
+    "type = \"decimal\"",
+    "until = \",\"",
+    "width = 4",
 ];

@@ -3,6 +3,7 @@
 mod command_line;
 mod output;
 mod processes;
+mod rejections;
 mod soak;
 
 use recipe_test_kit::Binary;

@@ -19,6 +19,7 @@
 
 mod board;
 mod case;
+mod checked;
 mod commands;
 mod environment;
 mod examples;
@@ -84,6 +85,7 @@ fn main() -> ExitCode {
             refusal::all(),
             safe::all(),
             commands::all(),
+            checked::all(),
             unreadable::all(),
             load::all(),
         ];

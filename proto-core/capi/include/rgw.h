@@ -12,7 +12,7 @@
 
 // Memory for a configuration, in bytes: enough on every machine. It is needed until
 // `rgw_gateway_configure` has returned.
-#define RGW_CONFIG_SIZE 16640
+#define RGW_CONFIG_SIZE 20480
 
 // Field ports that a gateway has room for.
 #define RGW_MAX_PORTS 4
@@ -24,7 +24,7 @@
 #define RGW_MAX_FIELDS 128
 
 // Memory for a gateway, in bytes: enough on every machine.
-#define RGW_GATEWAY_SIZE 37888
+#define RGW_GATEWAY_SIZE 40960
 
 // Number of the link to port 2000.
 #define RGW_LINK_COMMAND 0
@@ -55,7 +55,7 @@
 
 // Version of this interface: one more for every change of a function, a type or a number in it.
 // `rgw_gateway_init` refuses a program that was compiled with another version of the header.
-#define RGW_ABI_VERSION 1
+#define RGW_ABI_VERSION 2
 
 // Status of a call. Zero is success. After any other status nothing has changed, unless the function says
 // otherwise.
@@ -353,6 +353,12 @@ typedef struct rgw_port_counters {
   uint32_t rejected_length;
   // Remote frames ignored (D17).
   uint32_t rejected_remote;
+  // Frames rejected because their checksum is wrong.
+  uint32_t rejected_checksum;
+  // Frames rejected because a field is not a number, such as a letter among digits.
+  uint32_t rejected_unreadable;
+  // Frames that are right and of another device: a constant is not ours.
+  uint32_t rejected_other_device;
   // Frames received on a port whose recipe has no input part.
   uint32_t rejected_no_input;
   // Frames that began with the head but did not end with the tail (D19).
@@ -389,6 +395,10 @@ typedef struct rgw_port_counters {
   uint32_t commands;
   // Commands that could not be sent.
   uint32_t commands_dropped;
+  // Values in no entry of their command table.
+  uint32_t commands_unknown;
+  // Values in a command table that only set the base.
+  uint32_t commands_based;
 } rgw_port_counters;
 
 // A field port.

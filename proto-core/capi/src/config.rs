@@ -13,7 +13,7 @@ const _: () = assert!(RGW_IMAGE_VERSION == image::VERSION);
 
 /// Memory for a configuration, in bytes: enough on every machine. It is needed until
 /// `rgw_gateway_configure` has returned.
-pub const RGW_CONFIG_SIZE: usize = 16_640;
+pub const RGW_CONFIG_SIZE: usize = 20_480;
 const _: () = assert!(size_of::<Config>() <= RGW_CONFIG_SIZE);
 
 /// A configuration in the caller's memory: at most 6 ports, 6 recipes with 256 fields together, 32

@@ -15,7 +15,7 @@ pub const RGW_MAX_RECIPE_LINKS: usize = 2;
 pub const RGW_MAX_FIELDS: usize = 128;
 
 /// Memory for a gateway, in bytes: enough on every machine.
-pub const RGW_GATEWAY_SIZE: usize = 37_888;
+pub const RGW_GATEWAY_SIZE: usize = 40_960;
 const _: () = assert!(size_of::<Gateway>() <= RGW_GATEWAY_SIZE);
 
 /// A gateway in the caller's memory; it must not be moved.

@@ -51,6 +51,12 @@ pub struct PortCounters {
     pub rejected_length: u32,
     /// Remote frames ignored (D17).
     pub rejected_remote: u32,
+    /// Frames rejected because their checksum is wrong.
+    pub rejected_checksum: u32,
+    /// Frames rejected because a field is not a number, such as a letter among digits.
+    pub rejected_unreadable: u32,
+    /// Frames that are right and of another device: a constant is not ours.
+    pub rejected_other_device: u32,
     /// Frames received on a port whose recipe has no input part.
     pub rejected_no_input: u32,
     /// Frames that began with the head but did not end with the tail (D19).
@@ -87,6 +93,10 @@ pub struct PortCounters {
     pub commands: u32,
     /// Commands that could not be sent.
     pub commands_dropped: u32,
+    /// Values in no entry of their command table.
+    pub commands_unknown: u32,
+    /// Values in a command table that only set the base.
+    pub commands_based: u32,
 }
 
 /// Counters of a link. They wrap after 2^32.
@@ -134,11 +144,12 @@ impl From<&engine::PortCounters> for PortCounters {
     fn from(counters: &engine::PortCounters) -> Self {
         copied! {
             counters: frames_in bytes_in frames_out bytes_out
-                rejected_not_finite rejected_out_of_range rejected_id rejected_length rejected_remote rejected_no_input
+                rejected_not_finite rejected_out_of_range rejected_id rejected_length rejected_remote
+                rejected_checksum rejected_unreadable rejected_other_device rejected_no_input
                 tail_mismatches resync_bytes discarded_bytes asleep masked
                 edges_lost values_expired undelivered withheld
                 skipped_cycles stale_cycles timeouts downs bus_offs
-                commands commands_dropped
+                commands commands_dropped commands_unknown commands_based
         }
     }
 }

@@ -7,7 +7,7 @@ use proto_core::engine::BuildError;
 
 /// Version of this interface: one more for every change of a function, a type or a number in it.
 /// `rgw_gateway_init` refuses a program that was compiled with another version of the header.
-pub const RGW_ABI_VERSION: u32 = 1;
+pub const RGW_ABI_VERSION: u32 = 2;
 
 /// Status of a call. Zero is success. After any other status nothing has changed, unless the function says
 /// otherwise.

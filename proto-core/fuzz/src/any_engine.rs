@@ -115,7 +115,11 @@ fn fields(
                     0 => InputBinding::Unused,
                     1 => InputBinding::Commands {
                         table,
-                        when: if kind & 32 == 0 { CommandWhen::Change } else { CommandWhen::Frame },
+                        when: match kind >> 5 & 3 {
+                            0 => CommandWhen::Change,
+                            2 => CommandWhen::Kept,
+                            _ => CommandWhen::Frame,
+                        },
                     },
                     _ => InputBinding::Variable { var: var(input, Direction::Input), scale, offset },
                 },

@@ -13,8 +13,10 @@ mod can;
 mod command;
 mod deframer;
 mod engine;
+mod framer;
 mod image;
 mod modbus;
+mod plain_frame;
 mod recipes;
 mod slcan;
 mod state;
@@ -38,6 +40,7 @@ use harness::Target;
 /// All targets.
 pub const TARGETS: &[Target] = &[
     Target { name: "deframer", run: deframer::run, seeds: deframer::seeds, runs: 6_000, longest: 2_000 },
+    Target { name: "framer", run: framer::run, seeds: framer::seeds, runs: 6_000, longest: 1_000 },
     Target { name: "can", run: can::run, seeds: can::seeds, runs: 10_000, longest: 600 },
     Target { name: "state", run: state::run, seeds: state::seeds, runs: 1_000, longest: 6_000 },
     Target { name: "slcan", run: slcan::run, seeds: slcan::seeds, runs: 10_000, longest: 1_000 },

@@ -4,19 +4,20 @@
 //! configuration's lists with their ranges, or what is wrong and where. A refused recipe or port
 //! leaves nothing behind. Whether everything fits together is checked by [`ConfigView::validate`].
 
-use heapless::Vec;
+use heapless::{String, Vec};
 
 use super::draft::{ControllerBuilder, PartFields, PortBuilder, PortBus, RecipeBuilder, Trigger};
 use super::error::{ConfigError, ConfigErrorKind as Kind, ControllerKey, Counted, Place, PortKey, RecipeKey};
-use super::fields::{CanFields, Does, Fields, InputField, OutputField, Sends};
+use super::fields::{CanFields, Does, Entries, Fields, InputField, OutputField, Sends, plain};
 use super::rules::{check_name, check_room, text};
 use super::view::ConfigMut;
 use super::{
     CanFramePart, CommandEntry, ControllerLink, Delimiter, FieldSpec, GatewayConfig, InputBinding, Name,
     OutputBinding, Parts, Port, Recipe, RecipeLink, SafeValue, SafeValues, SendOn, Span, StreamPart,
 };
+use crate::command::ParseError;
 use crate::recipe::model::{MAX_CAN_IDS, MAX_DELIMITER};
-use crate::sysvar::{Direction, ParseError, SysVar, VarBit, VarRange};
+use crate::sysvar::{Direction, ParseError as VarError, SysVar, VarBit, VarRange};
 use crate::wire::dialect::Dialect;
 use crate::wire::scalar::Scalar;
 
@@ -174,7 +175,7 @@ impl ConfigMut<'_> {
             Delimiter::from_slice(bytes).map_err(|_| ConfigError { place, kind: too_long })
         };
         let (head, tail) = (bytes(head)?, bytes(tail)?);
-        Ok(Some(StreamPart { head, tail, fields: self.fields_of_part(recipe, part, 0, fields)? }))
+        Ok(Some(StreamPart::new(head, tail, self.fields_of_part(recipe, part, 0, fields)?)))
     }
 
     fn can_part(
@@ -234,27 +235,38 @@ impl ConfigMut<'_> {
     }
 
     fn input_spec(&mut self, field: &InputField<'_>) -> Result<FieldSpec, Kind> {
-        let to = match field.does {
-            Does::Nothing => InputBinding::Unused,
-            Does::Writes { var, scale, offset } => {
-                InputBinding::Variable { var: var.read().map_err(Kind::Variable)?, scale, offset }
-            }
-            Does::WritesBit { name } => {
-                let bit = VarBit::parse(name).unwrap_or(Err(ParseError::Syntax)).map_err(Kind::Variable)?;
-                InputBinding::Bit { var: bit.var, bit: bit.bit }
-            }
-            Does::Commands { entries, when } => {
-                InputBinding::Commands { table: self.add_commands(entries)?, when }
-            }
-        };
-        Ok(FieldSpec::UserInput { ty: field.ty, to })
+        field.on_wire.spec(|encoding, overflow| {
+            let to = match field.does {
+                Does::Nothing => InputBinding::Unused,
+                Does::Writes { var, scale, offset } => {
+                    InputBinding::Variable { var: var.read().map_err(Kind::Variable)?, scale, offset }
+                }
+                Does::WritesBit { name } => {
+                    let bit = VarBit::parse(name).unwrap_or(Err(VarError::Syntax)).map_err(Kind::Variable)?;
+                    InputBinding::Bit { var: bit.var, bit: bit.bit }
+                }
+                Does::Commands { entries, when, idle } => {
+                    InputBinding::Commands { table: self.add_commands(entries, idle)?, when }
+                }
+            };
+            Ok(match plain(encoding, overflow) {
+                Some(ty) => FieldSpec::UserInput { ty, to },
+                None => FieldSpec::DeviceInput { encoding, overflow, to },
+            })
+        })
     }
 
     /// There is room: checked when the recipe was begun.
-    fn add_commands(&mut self, entries: &[(i64, &str)]) -> Result<Span, Kind> {
+    fn add_commands(&mut self, entries: Entries<'_>, idle: Option<i64>) -> Result<Span, Kind> {
         let start = self.commands.len();
-        for &(value, command) in entries {
-            let _ = self.commands.push(CommandEntry { value, text: text(command)? });
+        for (first, last, command) in entries.iter() {
+            if command.is_empty() {
+                return Err(Kind::Command(ParseError::Empty));
+            }
+            let _ = self.commands.push(CommandEntry { first, last, text: text(command)? });
+        }
+        if let Some(value) = idle {
+            let _ = self.commands.push(CommandEntry::new(value, String::new()));
         }
         Ok(span(start, self.commands.len()))
     }
@@ -273,6 +285,7 @@ impl ConfigMut<'_> {
         port.cycle = from.cycle.unwrap_or(port.cycle);
         port.timeout = from.timeout.unwrap_or(port.timeout);
         port.stale_after = from.stale_after.unwrap_or(port.stale_after);
+        (port.health, port.safe_at_start, port.refresh) = (from.health, from.safe_at_start, from.refresh);
         self.put_port(port, &from.safe)
     }
 
@@ -330,15 +343,24 @@ impl ConfigMut<'_> {
 }
 
 fn output_spec(field: &OutputField<'_>) -> Result<FieldSpec, Kind> {
-    let from = match field.sends {
-        Sends::Variable { var, scale, offset } => {
-            OutputBinding::Variable { var: var.read().map_err(Kind::Variable)?, scale, offset }
-        }
-        Sends::Constant(value) => OutputBinding::Constant(value),
-        Sends::Counter => OutputBinding::Counter,
-        Sends::Reply => OutputBinding::Reply,
-    };
-    Ok(FieldSpec::UserOutput { ty: field.ty, from })
+    field.on_wire.spec(|encoding, overflow| {
+        let from = match field.sends {
+            Sends::Variable { var, scale, offset } => {
+                OutputBinding::Variable { var: var.read().map_err(Kind::Variable)?, scale, offset }
+            }
+            Sends::Constant(value) => OutputBinding::Constant(value),
+            Sends::Counter => OutputBinding::Counter,
+            Sends::Reply => OutputBinding::Reply,
+            Sends::State { value, scale, offset } => OutputBinding::State { value, scale, offset },
+            Sends::Health { port, value, scale, offset } => {
+                OutputBinding::Port { port, value, scale, offset }
+            }
+        };
+        Ok(match plain(encoding, overflow) {
+            Some(ty) => FieldSpec::UserOutput { ty, from },
+            None => FieldSpec::DeviceOutput { encoding, overflow, from },
+        })
+    })
 }
 
 fn safe_value(var: SysVar, value: f64) -> Result<SafeValue, Kind> {

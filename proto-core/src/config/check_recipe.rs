@@ -4,16 +4,16 @@
 use super::error::{ConfigErrorKind as Kind, Place, RecipeKey};
 use super::rules::{Check, check_new_name, check_pool, fail, is_marked, mark};
 use super::{
-    CanFramePart, ConfigView, DeviceFrame, FieldSpec, InputBinding, OutputBinding, Parts, Recipe, SendOn,
-    Span,
+    CanFramePart, CommandEntry, ConfigView, DeviceFrame, FieldSpec, InputBinding, MAX_COMMAND_TEXT,
+    OutputBinding, Parts, Recipe, SendOn, Span, Words, placeholders,
 };
 use crate::command::Request;
-use crate::device::{Encoding, Overflow};
+use crate::device::{Boundary, Encoding, LayoutError, Overflow};
 use crate::image::BitSet;
-use crate::recipe::model::Rules;
-use crate::recipe::model::{Framing, Mode};
+use crate::recipe::model::{Framing, MAX_STREAM_FRAME, Mode, Rules};
 use crate::recipe::{CanLayout, PartError, StreamLayout};
-use crate::sysvar::{COUNT, Direction, VarBit};
+use crate::sysvar::{COUNT, Direction, SysVar, VarBit};
+use crate::wire::dialect::Dialect;
 use crate::wire::scalar::{Scalar, ScalarType};
 
 /// One recipe under check.
@@ -42,6 +42,7 @@ impl<'a> RecipeCheck<'a> {
                 check_pool(place, span, self.config.fields.len())?;
             }
             if self.config.is_device(self.recipe) {
+                self.check_framing(part)?;
                 self.check_device_frames(part)?;
             } else if let Err(error) = check_layout(self.config, self.recipe, part, framing) {
                 return fail(self.place_of(part, error), Kind::Part(error));
@@ -77,6 +78,7 @@ impl<'a> RecipeCheck<'a> {
                 self.check_input(place, Numbers::of(ty), to)
             }
             (Mode::User, Direction::Output, FieldSpec::UserOutput { ty, from }) => {
+                self.check_source(place, from)?;
                 check_output(place, ty, from)
             }
             (Mode::User, Direction::Input, FieldSpec::DeviceInput { encoding, overflow, to }) => {
@@ -90,10 +92,29 @@ impl<'a> RecipeCheck<'a> {
                 if overflow == Overflow::Wrap && !encoding.is_integer() {
                     return fail(place, Kind::OnlyIntegersWrap);
                 }
+                self.check_source(place, from)?;
                 check_device_output(place, &encoding, from)
             }
-            (Mode::User, _, FieldSpec::Fixed { .. } | FieldSpec::Padding { .. } | FieldSpec::Checksum(_)) => {
-                Ok(())
+            (
+                Mode::User,
+                _,
+                FieldSpec::Fixed { .. }
+                | FieldSpec::Padding { .. }
+                | FieldSpec::Checksum(_)
+                | FieldSpec::Length(_),
+            ) => Ok(()),
+            (Mode::User, Direction::Input, FieldSpec::TextInput { to, length_to, count_to, .. }) => {
+                let is_input = |var: SysVar| var.direction() == Direction::Input;
+                let vars = to.iter().map(|words| words.first).chain(length_to).chain(count_to);
+                if let Some(var) = vars.into_iter().find(|&var| !is_input(var)) {
+                    return fail(place, Kind::NotAnInput { var });
+                }
+                check_words(place, to)?;
+                check_word(place, length_to.into_iter().chain(count_to))
+            }
+            (Mode::User, Direction::Output, FieldSpec::TextOutput { from, length_from, .. }) => {
+                check_words(place, Some(from))?;
+                check_word(place, length_from)
             }
             (mode, part, _) => fail(place, Kind::WrongField { mode, part }),
         }
@@ -131,37 +152,91 @@ impl<'a> RecipeCheck<'a> {
         }
     }
 
+    /// The checks of sources that are no variables, the same for every field.
+    fn check_source(&self, place: Place, from: OutputBinding) -> Check {
+        match from {
+            OutputBinding::State { value, scale, offset } => {
+                // An unknown dialect is refused first.
+                let dialect = Dialect::named(&self.config.controller.dialect).unwrap_or(Dialect::V2_3);
+                if let Err(error) = value.place(&dialect) {
+                    return fail(place, Kind::StateValue(error));
+                }
+                check_scale(place, scale, offset)
+            }
+            OutputBinding::Port { port, value, scale, offset } => {
+                if let Some(port) = port
+                    && !self.config.field_ports().any(|(index, _, _)| index == port)
+                {
+                    return fail(place, Kind::NoFieldPort { port });
+                }
+                if value.is_count() && (scale, offset) != (1.0, 0.0) {
+                    return fail(place, Kind::ScaledCount);
+                }
+                check_scale(place, scale, offset)
+            }
+            _ => Ok(()),
+        }
+    }
+
     fn check_commands(&self, place: Place, numbers: Numbers, table: Span) -> Check {
         let commands = self.config.commands;
         check_pool(place, table, commands.len())?;
-        if table.len == 0 {
+        if table.of(commands).iter().all(CommandEntry::is_idle) {
             return fail(place, Kind::EmptyTable);
         }
         let entries = || (table.start..).zip(table.of(commands));
         for (entry, command) in entries() {
             let place = Place::Command { entry };
-            if let Err(error) = Request::parse_strict(command.text.as_bytes()) {
-                return fail(place, Kind::Command(error));
+            let &CommandEntry { first, last, .. } = command;
+            if first > last {
+                return fail(place, Kind::BackwardRange { first, last });
             }
+            check_command_text(place, command)?;
             let Numbers { low, high, ty, .. } = numbers;
-            let value = command.value as f64;
-            if !(low..=high).contains(&value) {
-                let written = Kind::NotInField { value, low, high };
-                let value = command.value;
-                return fail(place, ty.map_or(written, |ty| Kind::CommandValue { value, ty }));
+            for end in [first, last] {
+                let value = end as f64;
+                if !(low..=high).contains(&value) {
+                    let written = Kind::NotInField { value, low, high };
+                    return fail(place, ty.map_or(written, |ty| Kind::CommandValue { value: end, ty }));
+                }
             }
-            if entries().any(|(other, before)| other < entry && before.value == command.value) {
-                return fail(place, Kind::DuplicateCommand { value: command.value });
+            let earlier = entries().take_while(|(other, _)| *other < entry);
+            let mut common = earlier.map(|(_, before)| (first.max(before.first), last.min(before.last)));
+            if let Some((value, _)) = common.find(|(first, last)| first <= last) {
+                return fail(place, Kind::DuplicateCommand { value });
             }
         }
         Ok(())
     }
 
+    /// What tells the frames of a stream part apart.
+    fn check_framing(&self, part: Direction) -> Check {
+        let Some(stream) = self.recipe.stream_part(part).filter(|stream| stream.is_cut()) else {
+            return Ok(());
+        };
+        let place = Place::Part { recipe: self.index, part };
+        let kind = match (stream.framing, stream.escape) {
+            _ if self.recipe.mode != Mode::User => Kind::FramingNeedsUser,
+            (Boundary::Tail | Boundary::Silence, Some(_)) => Kind::TwoFramings,
+            (Boundary::Tail, None) if stream.tail.is_empty() => Kind::NoTail,
+            _ => return Ok(()),
+        };
+        fail(place, kind)
+    }
+
     fn check_device_frames(&self, part: Direction) -> Check {
         let recipe = self.index;
         for frame in self.config.device_frames(self.recipe, part) {
-            let Err(error) = DeviceFrame::new(frame.carrier, part, frame.delimiters, frame.fields) else {
-                continue;
+            let error = match DeviceFrame::new(frame.carrier, part, frame.delimiters, frame.fields) {
+                Err(error) => error,
+                Ok(device) => {
+                    let escape = self.recipe.stream_part(part).and_then(|stream| stream.escape);
+                    let len = escape.map_or(0, |escape| escape.longest(device.layout.lengths().1));
+                    if part == Direction::Input || len <= MAX_STREAM_FRAME {
+                        continue;
+                    }
+                    LayoutError::TooLong { len, room: MAX_STREAM_FRAME }
+                }
             };
             // A checksum is a field, and no element.
             let element = error.element().map(usize::from);
@@ -222,16 +297,17 @@ impl<'a> RecipeCheck<'a> {
                 }
                 bits = bits.or(own);
             }
-            let Some(var) = spec.variable() else { continue };
-            if is_marked(&seen, var) {
-                return fail(place, Kind::WrittenTwice { var });
+            for var in spec.variables() {
+                if is_marked(&seen, var) {
+                    return fail(place, Kind::WrittenTwice { var });
+                }
+                let before = bits.byte(var);
+                if before != 0 {
+                    let bit = VarBit { var, bit: before.trailing_zeros() as u8 };
+                    return fail(place, Kind::WholeAndBit { bit });
+                }
+                mark(&mut seen, var);
             }
-            let before = bits.byte(var);
-            if before != 0 {
-                let bit = VarBit { var, bit: before.trailing_zeros() as u8 };
-                return fail(place, Kind::WholeAndBit { bit });
-            }
-            mark(&mut seen, var);
         }
         Ok(())
     }
@@ -296,8 +372,47 @@ fn check_device_output(place: Place, encoding: &Encoding, from: OutputBinding) -
             if is_whole { Ok(()) } else { fail(place, Kind::NeedsIntegers) }
         }
         OutputBinding::Counter if !encoding.is_integer() => fail(place, Kind::NeedsIntegers),
-        OutputBinding::Counter | OutputBinding::Reply => Ok(()),
+        OutputBinding::Port { value, .. } if value.is_count() && !encoding.is_integer() => {
+            fail(place, Kind::NeedsIntegers)
+        }
+        _ => Ok(()),
     }
+}
+
+/// Texts are in word variables of one group.
+fn check_words(place: Place, words: Option<Words>) -> Check {
+    let Some(words @ Words { first, count, order }) = words else { return Ok(()) };
+    let is_one_run = words.iter().all(|var| var.group() == first.group() && var.ty() == ScalarType::Word);
+    if !is_one_run || words.iter().count() != usize::from(count) || count == 0 {
+        return fail(place, Kind::NotWords { var: first, count });
+    }
+    if order.swaps_words() { fail(place, Kind::TextOrder) } else { Ok(()) }
+}
+
+fn check_word(place: Place, vars: impl IntoIterator<Item = SysVar>) -> Check {
+    let other = vars.into_iter().find(|var| var.ty() != ScalarType::Word);
+    other.map_or(Ok(()), |var| fail(place, Kind::NotWords { var, count: 1 }))
+}
+
+/// A command must be one with each of its values: with the first and the last one, it is with all.
+fn check_command_text(place: Place, command: &CommandEntry) -> Check {
+    if command.is_idle() {
+        return Ok(());
+    }
+    for value in [command.first, command.last] {
+        let Some(text) = command.text_for(value) else {
+            let (len, longest) = (command.len_for(value), MAX_COMMAND_TEXT);
+            return fail(place, Kind::TooLong { len, longest });
+        };
+        if let Err(error) = Request::parse_strict(text.as_bytes()) {
+            let kind = match placeholders(&command.text) {
+                0 => Kind::Command(error),
+                _ => Kind::CommandFor { value, error },
+            };
+            return fail(place, kind);
+        }
+    }
+    Ok(())
 }
 
 fn check_scale(place: Place, scale: f32, offset: f32) -> Check {
@@ -318,7 +433,12 @@ fn check_output(place: Place, ty: ScalarType, from: OutputBinding) -> Check {
         OutputBinding::Counter if matches!(ty, ScalarType::Float | ScalarType::Double) => {
             fail(place, Kind::NeedsInteger { ty })
         }
-        OutputBinding::Counter | OutputBinding::Reply => Ok(()),
+        OutputBinding::Port { value, .. }
+            if value.is_count() && matches!(ty, ScalarType::Float | ScalarType::Double) =>
+        {
+            fail(place, Kind::NeedsInteger { ty })
+        }
+        _ => Ok(()),
     }
 }
 

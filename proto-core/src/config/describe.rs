@@ -7,6 +7,7 @@ use core::fmt;
 
 use super::error::{ConfigError, ConfigErrorKind, ControllerKey, NetworkKey, Place, PortKey, RecipeKey};
 use super::{ConfigView, MAX_NAME, Name};
+use crate::device::Algorithm;
 use crate::recipe::model::Mode;
 use crate::sysvar::Direction;
 use crate::wire::dialect::Dialect;
@@ -120,6 +121,9 @@ impl PortKey {
             Self::Turnaround => "turnaround",
             Self::Bitrate => "bitrate",
             Self::Listen => "listen",
+            Self::Health => "health",
+            Self::SafeAtStart => "safe at start",
+            Self::Refresh => "refresh",
         }
     }
 }
@@ -245,7 +249,21 @@ impl fmt::Display for DescribedKind<'_> {
                 write!(f, "the field cannot be {value}; allowed: {low}..={high}")
             }
             Kind::NeedsIntegers => f.write_str("needs a field that has integers only"),
+            Kind::UnknownChecksum => {
+                f.write_str("no checksum has this name; allowed:")?;
+                let mut names = Algorithm::names();
+                names.try_for_each(|name| write!(f, " {name}"))
+            }
             Kind::OnlyIntegersWrap => f.write_str("only integers wrap; this one may have a fraction"),
+            Kind::NotWords { var, count } => {
+                write!(f, "{count} word variables are needed, such as WordInputReg[1]; found: {var}")
+            }
+            Kind::TextOrder => f.write_str("the order of a text's characters is little or big"),
+            Kind::FramingNeedsUser => f.write_str("framing and escape need mode = \"user\""),
+            Kind::TwoFramings => {
+                f.write_str("escape bytes tell frames apart already; framing is not needed beside them")
+            }
+            Kind::NoTail => f.write_str("framing = \"tail\" needs a tail"),
             Kind::EmptyTable => f.write_str("a command table needs at least one command"),
             Kind::CommandValue { value, ty } => {
                 let (low, high) = ty.range();
@@ -351,6 +369,24 @@ impl fmt::Display for DescribedKind<'_> {
                 write!(f, "not a value for {var}: not finite, or reserved bits are set")
             }
             Kind::SafeTwice { var } => write!(f, "{var} already has a safe value"),
+            Kind::CommandFor { value, error } => write!(f, "with the value {value}: {error}"),
+            Kind::BackwardRange { first, last } => {
+                write!(f, "{first}..{last} contains no value; allowed: {last}..{first}")
+            }
+            Kind::StateValue(error) => error.fmt(f),
+            Kind::NoFieldPort { port } => {
+                write!(f, "{} is no field port; only field ports have a health", port_name(port))
+            }
+            Kind::ScaledCount => f.write_str("a count wraps, so scale and offset are not allowed"),
+            Kind::NotForHealth { var } => {
+                write!(f, "{var} cannot tell a port's health; allowed: WordInputReg, FloatInputReg")
+            }
+            Kind::HealthTwice { var } => write!(f, "this port already writes {var}"),
+            Kind::OnlyFieldPorts => f.write_str("allowed only on field ports: rs485, can"),
+            Kind::NoSafeValues => f.write_str("the port has no safe values; write them in on_timeout"),
+            Kind::OnlyChangesRefresh => {
+                f.write_str("allowed only with a recipe whose output part has send = \"change\"")
+            }
         }
     }
 }

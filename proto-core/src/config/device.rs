@@ -4,9 +4,9 @@
 
 use heapless::Vec;
 
-use super::{FieldSpec, Parts, Recipe};
+use super::{FieldSpec, Parts, Recipe, StreamPart};
 use crate::config::ConfigView;
-use crate::device::{Carrier, Checksum, Element, Encoding, FrameLayout, LayoutError, MAX_DIGITS};
+use crate::device::{Carrier, Checksum, Element, Encoding, FrameLayout, LayoutError};
 use crate::recipe::model::MAX_FIELDS;
 use crate::sysvar::Direction;
 
@@ -57,7 +57,10 @@ impl FieldSpec {
             | Self::DeviceOutput { .. }
             | Self::Fixed { .. }
             | Self::Padding { .. }
-            | Self::Checksum(_) => true,
+            | Self::Checksum(_)
+            | Self::TextInput { .. }
+            | Self::TextOutput { .. }
+            | Self::Length(_) => true,
         }
     }
 
@@ -71,6 +74,8 @@ impl FieldSpec {
             }
             Self::Fixed { encoding, value } => Element::Fixed { encoding, value },
             Self::Padding { len, fill } => Element::Padding { len, fill },
+            Self::TextInput { text, .. } | Self::TextOutput { text, .. } => Element::Text(text),
+            Self::Length(length) => Element::Length(length),
             Self::System(_) | Self::Checksum(_) => return None,
         })
     }
@@ -80,11 +85,7 @@ impl FieldSpec {
         match (self.element(), self) {
             (_, Self::System(var)) => var.size(),
             (_, Self::Checksum(sum)) => sum.len(),
-            (Some(Element::Padding { len, .. }), _) => usize::from(len),
-            (Some(Element::Value { encoding, .. } | Element::Fixed { encoding, .. }), _) => {
-                let varying = MAX_DIGITS.saturating_add(1);
-                if encoding.shared { 0 } else { encoding.size().unwrap_or(varying) }
-            }
+            (Some(element), _) => element.longest(),
             (None, _) => 0,
         }
     }
@@ -107,14 +108,14 @@ impl<'c> ConfigView<'c> {
         recipe: &'c Recipe,
         part: Direction,
     ) -> impl Iterator<Item = FrameFields<'c>> {
-        let (carrier, delimiters) = match (&recipe.parts, part) {
-            (Parts::Can { .. }, _) => (Carrier::Can, None),
-            (Parts::Stream { input: stream, .. }, Direction::Input)
-            | (Parts::Stream { output: stream, .. }, Direction::Output) => {
-                (Carrier::Stream, stream.as_ref().map(|part| (&*part.head, &*part.tail)))
-            }
+        let is_can = matches!(recipe.parts, Parts::Can { .. });
+        let stream = recipe.stream_part(part);
+        let carrier = match stream {
+            _ if is_can => Carrier::Can,
+            Some(part) if part.is_cut() => Carrier::Whole,
+            _ => Carrier::Stream,
         };
-        let delimiters = delimiters.unwrap_or((&[], &[]));
+        let delimiters = stream.map_or((&[][..], &[][..]), |part| (&*part.head, &*part.tail));
         recipe.frames(part).map(move |(nth, span)| FrameFields {
             nth,
             carrier,
@@ -126,8 +127,9 @@ impl<'c> ConfigView<'c> {
     /// Whether a port with this recipe speaks a device's own frames, beyond what the controller's
     /// recipes can describe.
     pub fn is_device(self, recipe: &Recipe) -> bool {
-        [Direction::Input, Direction::Output]
-            .into_iter()
-            .any(|part| self.fields_of(recipe, part).any(|(_, _, field)| field.is_device()))
+        [Direction::Input, Direction::Output].into_iter().any(|part| {
+            recipe.stream_part(part).is_some_and(StreamPart::is_cut)
+                || self.fields_of(recipe, part).any(|(_, _, field)| field.is_device())
+        })
     }
 }

@@ -7,7 +7,7 @@
 use super::error::ConfigErrorKind as Kind;
 use super::fields::{CanFields, Fields, Var};
 use super::rules::text;
-use super::{Bus, OnStale, Parity, Port, Recipe, Rs485, SafeValue, SendOn};
+use super::{Bus, OnStale, Parity, Port, PortHealth, Recipe, Rs485, SafeValue, SendOn};
 use crate::recipe::model::Mode;
 use crate::sysvar::SysVar;
 use crate::time::Duration;
@@ -203,6 +203,9 @@ pub struct PortBuilder<'a, B = Rs485> {
     pub(super) timeout: Option<Duration>,
     pub(super) stale_after: Option<Duration>,
     pub(super) safe: SafeValues<'a>,
+    pub(super) safe_at_start: bool,
+    pub(super) refresh: Option<Duration>,
+    pub(super) health: PortHealth,
 }
 
 /// The bus of a [`PortBuilder`] that listens.
@@ -290,7 +293,18 @@ impl Port {
 impl<'a, B> PortBuilder<'a, B> {
     const fn new(name: &'a str, recipe: &'a str, bus: B) -> Self {
         let safe = SafeValues::Values(&[]);
-        Self { name, recipe, bus, cycle: None, timeout: None, stale_after: None, safe }
+        Self {
+            name,
+            recipe,
+            bus,
+            cycle: None,
+            timeout: None,
+            stale_after: None,
+            safe,
+            safe_at_start: false,
+            refresh: None,
+            health: PortHealth::NONE,
+        }
     }
 
     /// The cycle: how often the output part is sent, 4 ms to an hour.
@@ -315,6 +329,24 @@ impl<'a, B> PortBuilder<'a, B> {
     /// The safe values; other variables hold. Refused on listening ports, which own no variable.
     pub fn safe(mut self, values: impl Into<SafeValues<'a>>) -> Self {
         self.safe = values.into();
+        self
+    }
+
+    /// The safe values hold from the start, until the device speaks.
+    pub fn safe_at_start(mut self) -> Self {
+        self.safe_at_start = true;
+        self
+    }
+
+    /// A recipe that is sent on change is also sent after this long without a change.
+    pub fn refresh(mut self, refresh: Duration) -> Self {
+        self.refresh = Some(refresh);
+        self
+    }
+
+    /// The variables that tell the robot the port's health. Refused on listening ports.
+    pub fn health(mut self, health: PortHealth) -> Self {
+        self.health = health;
         self
     }
 }

@@ -2,7 +2,7 @@
 
 use core::net::Ipv4Addr;
 
-use super::Network;
+use super::{Network, StateValueError};
 use crate::command::ParseError;
 use crate::device::LayoutError;
 use crate::recipe::PartError;
@@ -151,6 +151,12 @@ pub enum PortKey {
     Bitrate,
     /// The address to listen on.
     Listen,
+    /// The variables of its health.
+    Health,
+    /// Whether it starts with safe values.
+    SafeAtStart,
+    /// When it sends without a change.
+    Refresh,
 }
 
 /// A list with a limited number of entries: of a configuration, or of the engine that runs it.
@@ -185,10 +191,14 @@ pub enum Counted {
     DeviceFrames,
     /// Bytes of whose bits an input frame writes some, over all input frames.
     BitShares,
+    /// Texts of one port.
+    Texts,
     /// Groups of variables that arrive together.
     Groups,
     /// Blocks of neighbouring variables that are polled by Modbus.
     PollBlocks,
+    /// Values of the state packet and of the health of ports that all ports send.
+    Sources,
 }
 
 impl core::fmt::Display for Counted {
@@ -201,6 +211,7 @@ impl core::fmt::Display for Counted {
             Self::Commands => "commands in all recipes together",
             Self::SafeValues => "safe values on all ports together",
             Self::FieldPorts => "field ports",
+            Self::Texts => "texts of one port",
             Self::DeviceFrames => "frames of a device on one port",
             Self::InputFrames => "input frames",
             Self::RecipeLinks => "recipe links",
@@ -210,6 +221,7 @@ impl core::fmt::Display for Counted {
             Self::BitShares => "bytes in input frames that write single bits",
             Self::Groups => "groups",
             Self::PollBlocks => "Modbus poll blocks",
+            Self::Sources => "values of the controller's state and of the health of ports",
         })
     }
 }
@@ -342,6 +354,23 @@ pub enum ConfigErrorKind {
     NeedsIntegers,
     /// Only integers wrap around.
     OnlyIntegersWrap,
+    /// No checksum has this name.
+    UnknownChecksum,
+    /// A text, its length or its count needs so many word variables that follow each other.
+    NotWords {
+        /// The first variable.
+        var: SysVar,
+        /// Number of variables.
+        count: u8,
+    },
+    /// A word has two characters, so their order is little or big.
+    TextOrder,
+    /// Frames that are told apart by something else than their fields, in a realtime recipe.
+    FramingNeedsUser,
+    /// Escape bytes and something else tell frames apart.
+    TwoFramings,
+    /// Frames are told apart by a tail that the part does not have.
+    NoTail,
     /// A command table has no entries.
     EmptyTable,
     /// The field can never have a command's value.
@@ -525,4 +554,43 @@ pub enum ConfigErrorKind {
         /// The variable.
         var: SysVar,
     },
+    /// The text of a command is not a request of port 2000 with one of its values.
+    CommandFor {
+        /// The value.
+        value: i64,
+        /// What is wrong with the text.
+        error: ParseError,
+    },
+    /// The values of a command run backwards.
+    BackwardRange {
+        /// The first value.
+        first: i64,
+        /// The last value.
+        last: i64,
+    },
+    /// The controller's state packet has no such value.
+    StateValue(StateValueError),
+    /// There is no field port with this index.
+    NoFieldPort {
+        /// The index.
+        port: u8,
+    },
+    /// Counts have no scale and offset: they wrap.
+    ScaledCount,
+    /// The variable cannot tell the health of a port.
+    NotForHealth {
+        /// The variable.
+        var: SysVar,
+    },
+    /// The port itself writes the variable, from its frames or as another value of its health.
+    HealthTwice {
+        /// The variable.
+        var: SysVar,
+    },
+    /// Only field ports have this key.
+    OnlyFieldPorts,
+    /// Safe values at the start, but the port has no safe values.
+    NoSafeValues,
+    /// Only a recipe that is sent on change is refreshed.
+    OnlyChangesRefresh,
 }

@@ -4,7 +4,9 @@
 //! Out: the same, borrowed; [`GatewayConfig::add_recipe`](super::GatewayConfig::add_recipe) reads
 //! the names.
 
-use super::{CommandWhen, FieldSpec};
+use super::error::ConfigErrorKind as Kind;
+use super::{CommandWhen, FieldSpec, PortValue, StateValue};
+use crate::device::{Algorithm, Checksum, Encoding, Kind as EncodingKind, Overflow};
 use crate::sysvar::{ParseError, SysVar, VarRange};
 use crate::wire::can::CanId;
 use crate::wire::scalar::ScalarType;
@@ -100,10 +102,81 @@ fields_from! {
     FieldSpec => Specs,
 }
 
+/// A checksum, by its name in files or with its parameters.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Sum<'a> {
+    /// Such as `crc16-modbus`, as its standard has it.
+    Name(&'a str),
+    /// The checksum.
+    Checksum(Checksum),
+}
+
+impl<'a> From<&'a str> for Sum<'a> {
+    fn from(name: &'a str) -> Self {
+        Self::Name(name)
+    }
+}
+
+impl From<Checksum> for Sum<'_> {
+    fn from(sum: Checksum) -> Self {
+        Self::Checksum(sum)
+    }
+}
+
+/// What a field is on the wire.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum OnWire<'a> {
+    Value(Encoding, Overflow),
+    Fixed(Encoding, i64),
+    Padding { len: u8, fill: u8 },
+    Checksum(Sum<'a>),
+}
+
+impl OnWire<'_> {
+    fn value(encoding: impl Into<Encoding>) -> Self {
+        Self::Value(encoding.into(), Overflow::Usual)
+    }
+
+    fn wrapping(self) -> Self {
+        if let Self::Value(encoding, _) = self { Self::Value(encoding, Overflow::Wrap) } else { self }
+    }
+
+    /// The field; `with_value` is asked for one with a value.
+    pub(super) fn spec(
+        self,
+        with_value: impl FnOnce(Encoding, Overflow) -> Result<FieldSpec, Kind>,
+    ) -> Result<FieldSpec, Kind> {
+        match self {
+            Self::Value(encoding, overflow) => with_value(encoding, overflow),
+            Self::Fixed(encoding, value) => Ok(FieldSpec::Fixed { encoding, value }),
+            Self::Padding { len, fill } => Ok(FieldSpec::Padding { len, fill }),
+            Self::Checksum(Sum::Checksum(sum)) => Ok(FieldSpec::Checksum(sum)),
+            Self::Checksum(Sum::Name(name)) => {
+                let algorithm = Algorithm::named(name).ok_or(Kind::UnknownChecksum)?;
+                Ok(FieldSpec::Checksum(Checksum::standard(algorithm)))
+            }
+        }
+    }
+}
+
+/// The type of a value that recipes of the controller can have too.
+pub(super) fn plain(encoding: Encoding, overflow: Overflow) -> Option<ScalarType> {
+    match encoding.kind {
+        EncodingKind::Scalar(ty) if encoding == Encoding::scalar(ty) && overflow == Overflow::Usual => {
+            Some(ty)
+        }
+        _ => None,
+    }
+}
+
 /// A field of a user-defined recipe's input part.
+///
+/// A type such as `ScalarType::Word` is a value as the controller's own recipes have it. An
+/// [`Encoding`] is what only devices have: big-endian numbers, bits, digits. A recipe with one of
+/// these, a constant, padding or a checksum is a device's, and is for field ports.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct InputField<'a> {
-    pub(super) ty: ScalarType,
+    pub(super) on_wire: OnWire<'a>,
     pub(super) does: Does<'a>,
 }
 
@@ -112,30 +185,81 @@ pub(super) enum Does<'a> {
     Nothing,
     Writes { var: Var<'a>, scale: f32, offset: f32 },
     WritesBit { name: &'a str },
-    Commands { entries: &'a [(i64, &'a str)], when: CommandWhen },
+    Commands { entries: Entries<'a>, when: CommandWhen, idle: Option<i64> },
+}
+
+/// The entries of a command table.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum Entries<'a> {
+    Values(&'a [(i64, &'a str)]),
+    Ranges(&'a [(i64, i64, &'a str)]),
+}
+
+impl<'a> Entries<'a> {
+    /// First and last value, and the text.
+    pub(super) fn iter(self) -> impl Iterator<Item = (i64, i64, &'a str)> {
+        let (values, ranges) = match self {
+            Self::Values(values) => (values, &[][..]),
+            Self::Ranges(ranges) => (&[][..], ranges),
+        };
+        let values = values.iter().map(|&(value, text)| (value, value, text));
+        values.chain(ranges.iter().copied())
+    }
 }
 
 impl<'a> InputField<'a> {
     /// A field whose value is ignored.
-    pub const fn unused(ty: ScalarType) -> Self {
-        Self { ty, does: Does::Nothing }
+    pub fn unused(encoding: impl Into<Encoding>) -> Self {
+        Self { on_wire: OnWire::value(encoding), does: Does::Nothing }
     }
 
     /// A field whose value is written to an input variable.
-    pub fn variable(ty: ScalarType, var: impl Into<Var<'a>>) -> Self {
-        Self { ty, does: Does::Writes { var: var.into(), scale: 1.0, offset: 0.0 } }
+    pub fn variable(encoding: impl Into<Encoding>, var: impl Into<Var<'a>>) -> Self {
+        let does = Does::Writes { var: var.into(), scale: 1.0, offset: 0.0 };
+        Self { on_wire: OnWire::value(encoding), does }
     }
 
     /// A field that switches one bit of an input variable, such as `BitInputReg[3].4`: off for 0, on
     /// for any other value. Integer types only.
-    pub const fn bit(ty: ScalarType, name: &'a str) -> Self {
-        Self { ty, does: Does::WritesBit { name } }
+    pub fn bit(encoding: impl Into<Encoding>, name: &'a str) -> Self {
+        Self { on_wire: OnWire::value(encoding), does: Does::WritesBit { name } }
     }
 
     /// A field whose value picks a command of port 2000 when it changes: pairs of value and command,
     /// such as `(1, "run(pick.jspf,50)")`. Integer types only.
-    pub const fn commands(ty: ScalarType, entries: &'a [(i64, &'a str)]) -> Self {
-        Self { ty, does: Does::Commands { entries, when: CommandWhen::Change } }
+    pub fn commands(encoding: impl Into<Encoding>, entries: &'a [(i64, &'a str)]) -> Self {
+        let does =
+            Does::Commands { entries: Entries::Values(entries), when: CommandWhen::Change, idle: None };
+        Self { on_wire: OnWire::value(encoding), does }
+    }
+
+    /// As [`Self::commands`], with ranges of values: first value, last value and command, such as
+    /// `(1, 100, "speed({value})")`. `{value}` stands for the field's value.
+    pub fn command_ranges(encoding: impl Into<Encoding>, entries: &'a [(i64, i64, &'a str)]) -> Self {
+        let does =
+            Does::Commands { entries: Entries::Ranges(entries), when: CommandWhen::Change, idle: None };
+        Self { on_wire: OnWire::value(encoding), does }
+    }
+
+    /// An integer that a frame must have here; one with another is not this frame.
+    pub fn constant(encoding: impl Into<Encoding>, value: i64) -> Self {
+        Self { on_wire: OnWire::Fixed(encoding.into(), value), does: Does::Nothing }
+    }
+
+    /// Bytes without a meaning.
+    pub const fn padding(len: u8) -> Self {
+        Self { on_wire: OnWire::Padding { len, fill: 0 }, does: Does::Nothing }
+    }
+
+    /// The frame's checksum: its name in files, such as `"crc16-modbus"`, or a [`Checksum`].
+    pub fn checksum(sum: impl Into<Sum<'a>>) -> Self {
+        Self { on_wire: OnWire::Checksum(sum.into()), does: Does::Nothing }
+    }
+
+    /// Makes what the variable cannot hold wrap around; otherwise such a frame is rejected. Integers
+    /// only.
+    pub fn wrapping(self) -> Self {
+        Self { on_wire: self.on_wire.wrapping(), ..self }
     }
 
     /// Makes the variable `value * scale + offset`. No effect on other fields.
@@ -154,18 +278,29 @@ impl<'a> InputField<'a> {
         self
     }
 
+    /// Sets the value at which the device asks for nothing, if it is not 0: every other value that
+    /// picks no command is counted as unknown. No effect on other fields.
+    pub fn idle(mut self, value: i64) -> Self {
+        if let Does::Commands { idle, .. } = &mut self.does {
+            *idle = Some(value);
+        }
+        self
+    }
+
     fn commands_len(&self) -> usize {
         match self.does {
-            Does::Commands { entries, .. } => entries.len(),
+            Does::Commands { entries, idle, .. } => {
+                entries.iter().count().saturating_add(usize::from(idle.is_some()))
+            }
             Does::Nothing | Does::Writes { .. } | Does::WritesBit { .. } => 0,
         }
     }
 }
 
-/// A field of a user-defined recipe's output part.
+/// A field of a user-defined recipe's output part; see [`InputField`] about types and encodings.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct OutputField<'a> {
-    pub(super) ty: ScalarType,
+    pub(super) on_wire: OnWire<'a>,
     pub(super) sends: Sends<'a>,
 }
 
@@ -175,32 +310,70 @@ pub(super) enum Sends<'a> {
     Constant(f64),
     Counter,
     Reply,
+    State { value: StateValue, scale: f32, offset: f32 },
+    Health { port: Option<u8>, value: PortValue, scale: f32, offset: f32 },
 }
 
 impl<'a> OutputField<'a> {
     /// A variable's value, saturated to the field's type.
-    pub fn variable(ty: ScalarType, var: impl Into<Var<'a>>) -> Self {
-        Self { ty, sends: Sends::Variable { var: var.into(), scale: 1.0, offset: 0.0 } }
+    pub fn variable(encoding: impl Into<Encoding>, var: impl Into<Var<'a>>) -> Self {
+        Self::new(encoding, Sends::Variable { var: var.into(), scale: 1.0, offset: 0.0 })
     }
 
     /// A constant.
-    pub const fn constant(ty: ScalarType, value: f64) -> Self {
-        Self { ty, sends: Sends::Constant(value) }
+    pub fn constant(encoding: impl Into<Encoding>, value: f64) -> Self {
+        Self::new(encoding, Sends::Constant(value))
     }
 
     /// The number of frames sent so far, wrapping in the field's type. Integer types only.
-    pub const fn counter(ty: ScalarType) -> Self {
-        Self { ty, sends: Sends::Counter }
+    pub fn counter(encoding: impl Into<Encoding>) -> Self {
+        Self::new(encoding, Sends::Counter)
     }
 
     /// The result of the port's newest command: see [`crate::engine::ReplyCode`].
-    pub const fn reply(ty: ScalarType) -> Self {
-        Self { ty, sends: Sends::Reply }
+    pub fn reply(encoding: impl Into<Encoding>) -> Self {
+        Self::new(encoding, Sends::Reply)
     }
 
-    /// Makes the field `variable * scale + offset`. No effect on other fields.
+    /// So many bytes of this value.
+    pub const fn padding(len: u8, fill: u8) -> Self {
+        Self { on_wire: OnWire::Padding { len, fill }, sends: Sends::Constant(0.0) }
+    }
+
+    /// The frame's checksum: its name in files, such as `"crc16-modbus"`, or a [`Checksum`].
+    pub fn checksum(sum: impl Into<Sum<'a>>) -> Self {
+        Self { on_wire: OnWire::Checksum(sum.into()), sends: Sends::Constant(0.0) }
+    }
+
+    fn new(encoding: impl Into<Encoding>, sends: Sends<'a>) -> Self {
+        Self { on_wire: OnWire::value(encoding), sends }
+    }
+
+    /// Makes what the field cannot hold wrap around, instead of becoming the nearest number.
+    /// Integers only.
+    pub fn wrapping(self) -> Self {
+        Self { on_wire: self.on_wire.wrapping(), ..self }
+    }
+
+    /// A value of the controller's state packet, saturated to the field's type. A program takes it
+    /// from [`StateValue::parse`].
+    pub fn state(encoding: impl Into<Encoding>, value: StateValue) -> Self {
+        Self::new(encoding, Sends::State { value, scale: 1.0, offset: 0.0 })
+    }
+
+    /// The health of the port that sends the field, or of the port with this index. Counts wrap in
+    /// the field's type and need an integer type; the others saturate.
+    pub fn health(encoding: impl Into<Encoding>, port: Option<u8>, value: PortValue) -> Self {
+        Self::new(encoding, Sends::Health { port, value, scale: 1.0, offset: 0.0 })
+    }
+
+    /// Makes the field `value * scale + offset` of a variable, of a value of the state packet or of a
+    /// port's health; counts refuse it. No effect on other fields.
     pub fn scaled(mut self, scale: f32, offset: f32) -> Self {
-        if let Sends::Variable { scale: own_scale, offset: own_offset, .. } = &mut self.sends {
+        if let Sends::Variable { scale: own_scale, offset: own_offset, .. }
+        | Sends::State { scale: own_scale, offset: own_offset, .. }
+        | Sends::Health { scale: own_scale, offset: own_offset, .. } = &mut self.sends
+        {
             (*own_scale, *own_offset) = (scale, offset);
         }
         self

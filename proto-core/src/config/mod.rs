@@ -10,6 +10,7 @@ mod add;
 mod budget;
 mod builder;
 mod check_recipe;
+mod command_text;
 mod describe;
 mod device;
 mod draft;
@@ -23,27 +24,31 @@ mod port;
 mod recipe;
 mod rules;
 mod safe_value;
+mod source;
 mod validate;
 mod view;
 
 pub use budget::{PartBudget, Warning, can_frame_time};
 pub use builder::ConfigBuilder;
+pub use command_text::CommandText;
+pub(crate) use command_text::{fill_in, placeholders};
 pub use device::DeviceFrame;
 pub use draft::{Can, ControllerBuilder, Listen, PortBuilder, PortBus, RecipeBuilder, SafeValues};
 pub use error::{
     ConfigError, ConfigErrorKind, ControllerKey, Counted, NetworkKey, Place, PortKey, RecipeKey,
 };
-pub use fields::{CanFields, Fields, InputField, OutputField, Var};
+pub use fields::{CanFields, Fields, InputField, OutputField, Sum, Var};
 pub use listen::listen_address;
 pub use network::{BoardAddress, Network};
 pub(crate) use port::MIN_CYCLE;
 pub use port::{Bus, Parity, Port, Rs485};
 pub use recipe::{
     CanFramePart, CommandEntry, CommandWhen, FieldSpec, InputBinding, MAX_COMMAND_TEXT, OnStale,
-    OutputBinding, Parts, Recipe, SendOn, Span, StreamPart,
+    OutputBinding, Parts, Recipe, SendOn, Span, StreamPart, Words,
 };
 pub use rules::{check_address, check_bitrate, check_cycle, check_name};
 pub use safe_value::SafeValue;
+pub use source::{PortHealth, PortValue, StateValue, StateValueError};
 pub(crate) use view::ConfigMut;
 pub use view::ConfigView;
 

@@ -4,7 +4,7 @@
 
 use heapless::String;
 
-use super::{MAX_LISTEN, Name, Span};
+use super::{MAX_LISTEN, Name, PortHealth, Span};
 use crate::time::Duration;
 
 /// One port.
@@ -26,11 +26,17 @@ pub struct Port {
     pub on_timeout: Span,
     /// Outputs whose source is older than this are stale.
     pub stale_after: Duration,
+    /// The variables that tell the robot the port's health.
+    pub health: PortHealth,
+    /// Whether inputs have their safe values from the start until their device speaks.
+    pub safe_at_start: bool,
+    /// A recipe that is sent on change is also sent after this long without a change.
+    pub refresh: Option<Duration>,
 }
 
 impl Port {
     /// A port with the file's defaults: a cycle of 4 ms, a timeout of 100 ms, stale after 500 ms, and
-    /// inputs that hold.
+    /// inputs that hold, also at the start.
     pub const fn new(name: Name, bus: Bus, recipe: u8) -> Self {
         Self {
             name,
@@ -40,6 +46,9 @@ impl Port {
             timeout: Duration::from_millis(100),
             on_timeout: Span { start: 0, len: 0 },
             stale_after: Duration::from_millis(500),
+            health: PortHealth::NONE,
+            safe_at_start: false,
+            refresh: None,
         }
     }
 }

@@ -5,8 +5,8 @@
 
 use heapless::{String, Vec};
 
-use super::{Delimiter, Name};
-use crate::device::{Checksum, Encoding, Overflow};
+use super::{Delimiter, Name, PortValue, StateValue};
+use crate::device::{Boundary, ByteOrder, Checksum, Encoding, Escape, Length, Overflow, Text};
 use crate::recipe::model::{Field, MAX_CAN_IDS, Mode};
 use crate::sysvar::{Direction, SysVar, VarBit};
 use crate::wire::can::CanId;
@@ -47,6 +47,15 @@ impl Recipe {
         (0..).zip(stream.map(|part| part.fields).into_iter().chain(can))
     }
 
+    /// One part of a stream recipe.
+    pub(crate) fn stream_part(&self, part: Direction) -> Option<&StreamPart> {
+        match (&self.parts, part) {
+            (Parts::Stream { input: stream, .. }, Direction::Input)
+            | (Parts::Stream { output: stream, .. }, Direction::Output) => stream.as_ref(),
+            (Parts::Can { .. }, _) => None,
+        }
+    }
+
     /// Whether the recipe has this part.
     pub(crate) fn has(&self, part: Direction) -> bool {
         self.frames(part).next().is_some()
@@ -84,6 +93,22 @@ pub struct StreamPart {
     pub tail: Delimiter,
     /// The fields.
     pub fields: Span,
+    /// What tells its frames apart; only in recipes of devices.
+    pub framing: Boundary,
+    /// Its frames stand between escape bytes, which then tell them apart.
+    pub escape: Option<Escape>,
+}
+
+impl StreamPart {
+    /// A part as the controller's recipes have it.
+    pub const fn new(head: Delimiter, tail: Delimiter, fields: Span) -> Self {
+        Self { head, tail, fields, framing: Boundary::Fields, escape: None }
+    }
+
+    /// Whether something else than its fields tells where frames end.
+    pub(crate) fn is_cut(&self) -> bool {
+        self.framing != Boundary::Fields || self.escape.is_some()
+    }
 }
 
 /// One frame id of a CAN recipe's part.
@@ -169,6 +194,54 @@ pub enum FieldSpec {
     },
     /// The frame's checksum stands here.
     Checksum(Checksum),
+    /// A text of a device's input frame.
+    TextInput {
+        /// How it is written.
+        text: Text,
+        /// The registers that take it, zeros behind its end; a frame with a longer one is rejected.
+        to: Option<Words>,
+        /// The variable that becomes its number of characters.
+        length_to: Option<SysVar>,
+        /// The variable that counts the frames accepted, so that the same text twice is seen.
+        count_to: Option<SysVar>,
+    },
+    /// A text of a device's output frame.
+    TextOutput {
+        /// How it is written.
+        text: Text,
+        /// The registers that have it.
+        from: Words,
+        /// The variable that has its number of characters; without one it ends before the first
+        /// zero.
+        length_from: Option<SysVar>,
+    },
+    /// The frame's length stands here.
+    Length(Length),
+}
+
+/// A run of word variables that holds a text, two characters each.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct Words {
+    /// The first of them.
+    pub first: SysVar,
+    /// How many.
+    pub count: u8,
+    /// Big: the first character is the high byte. Little: the low one.
+    pub order: ByteOrder,
+}
+
+impl Words {
+    /// The variables, in order.
+    pub fn iter(self) -> impl Iterator<Item = SysVar> + Clone {
+        let first = self.first.ordinal();
+        (first..first.saturating_add(usize::from(self.count))).filter_map(SysVar::from_ordinal)
+    }
+
+    /// Maximum number of characters.
+    pub const fn room(&self) -> usize {
+        (self.count as usize).saturating_mul(2)
+    }
 }
 
 impl FieldSpec {
@@ -190,7 +263,16 @@ impl FieldSpec {
         }
     }
 
-    /// The system variable that the field is, or that it is bound to as a whole.
+    /// Where the value of a user-defined output field comes from.
+    pub fn source(&self) -> Option<OutputBinding> {
+        match *self {
+            Self::UserOutput { from, .. } | Self::DeviceOutput { from, .. } => Some(from),
+            _ => None,
+        }
+    }
+
+    /// The system variable that the field is, or that its value is bound to as a whole; texts have
+    /// several, see [`Self::variables`].
     pub fn variable(&self) -> Option<SysVar> {
         match *self {
             Self::System(var) => Some(var),
@@ -200,10 +282,20 @@ impl FieldSpec {
             },
             Self::UserOutput { from, .. } | Self::DeviceOutput { from, .. } => match from {
                 OutputBinding::Variable { var, .. } => Some(var),
-                OutputBinding::Constant(_) | OutputBinding::Counter | OutputBinding::Reply => None,
+                _ => None,
             },
-            Self::Fixed { .. } | Self::Padding { .. } | Self::Checksum(_) => None,
+            _ => None,
         }
+    }
+
+    /// All system variables that the field is bound to.
+    pub fn variables(&self) -> impl Iterator<Item = SysVar> + Clone + use<> {
+        let (words, others) = match *self {
+            Self::TextInput { to, length_to, count_to, .. } => (to, [length_to, count_to]),
+            Self::TextOutput { from, length_from, .. } => (Some(from), [length_from, None]),
+            _ => (None, [self.variable(), None]),
+        };
+        words.into_iter().flat_map(Words::iter).chain(others.into_iter().flatten())
     }
 }
 
@@ -222,7 +314,8 @@ pub enum InputBinding {
         /// Offset, added after scaling.
         offset: f32,
     },
-    /// The value picks a port-2000 command from a table; a value not in the table does nothing.
+    /// The value picks a port-2000 command from a table. A value that is not in the table does
+    /// nothing; it is counted, unless it is 0 and the table names no idle values.
     Commands {
         /// The table, in [`GatewayConfig::commands`](super::GatewayConfig::commands).
         table: Span,
@@ -248,6 +341,10 @@ pub enum CommandWhen {
     Change,
     /// With every accepted frame: for devices that send a frame only when they mean it.
     Frame,
+    /// When it differs from the previous frame, also after silence: for devices that send a frame
+    /// only when something changes. After a lost device, bus-off or sleep, the first frame only
+    /// sets the base.
+    Kept,
 }
 
 /// Where a user-defined output value comes from.
@@ -269,15 +366,41 @@ pub enum OutputBinding {
     Counter,
     /// The result of this port's newest command: see [`crate::engine::ReplyCode`].
     Reply,
+    /// `value * scale + offset` of the controller's newest state packet, saturated to the field's
+    /// type.
+    State {
+        /// The value.
+        value: StateValue,
+        /// Scale.
+        scale: f32,
+        /// Offset, added after scaling.
+        offset: f32,
+    },
+    /// The health of a field port. Counts wrap in the field's type, and take no scale and offset;
+    /// the others are `value * scale + offset`, saturated.
+    Port {
+        /// Index of the port in the configuration; `None` is the port that sends the field.
+        port: Option<u8>,
+        /// What is sent.
+        value: PortValue,
+        /// Scale.
+        scale: f32,
+        /// Offset, added after scaling.
+        offset: f32,
+    },
 }
 
 /// One entry of a command table.
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct CommandEntry {
-    /// The field's value that picks the command.
-    pub value: i64,
-    /// The command as port 2000 takes it, such as `run(pick.jspf,50)`.
+    /// The first of the field's values that pick the command.
+    pub first: i64,
+    /// The last of them; the same as the first for a single value.
+    pub last: i64,
+    /// The command as port 2000 takes it, such as `run(pick.jspf,50)`. `{value}` in it stands for
+    /// the field's value. If empty, the values are idle: they pick nothing, and are not counted as
+    /// unknown.
     pub text: String<MAX_COMMAND_TEXT>,
 }
 

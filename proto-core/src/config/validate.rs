@@ -13,7 +13,7 @@ use super::rules::{
 };
 use super::{
     Bus, ConfigView, FieldSpec, MAX_ALL_FIELDS, MAX_COMMANDS, MAX_PORTS, MAX_RECIPES, MAX_SAFE_VALUES, Parts,
-    Port, Recipe, SafeValue, SendOn,
+    Port, PortHealth, Recipe, SafeValue, SendOn,
 };
 use crate::image::BitSet;
 use crate::recipe::model::{Framing, Mode};
@@ -131,7 +131,25 @@ impl<'c> ConfigView<'c> {
         check_cycle(port.cycle).map_err(|kind| ConfigError { place: at(PortKey::Cycle), kind })?;
         check_time(at(PortKey::Timeout), port.timeout, MAX_TIME)?;
         check_time(at(PortKey::StaleAfter), port.stale_after, MAX_TIME)?;
-        check_pool(at(PortKey::OnTimeout), port.on_timeout, self.safe_values.len())
+        check_pool(at(PortKey::OnTimeout), port.on_timeout, self.safe_values.len())?;
+        if port.safe_at_start && port.on_timeout.len == 0 {
+            return fail(at(PortKey::SafeAtStart), Kind::NoSafeValues);
+        }
+        if let Some(refresh) = port.refresh {
+            check_time(at(PortKey::Refresh), refresh, MAX_TIME)?;
+            if recipe.send != SendOn::Change {
+                return fail(at(PortKey::Refresh), Kind::OnlyChangesRefresh);
+            }
+        }
+        for (_, var) in port.health.iter() {
+            if !port.bus.is_field() {
+                return fail(at(PortKey::Health), Kind::OnlyFieldPorts);
+            }
+            if !PortHealth::can_write(var) {
+                return fail(at(PortKey::Health), Kind::NotForHealth { var });
+            }
+        }
+        Ok(())
     }
 
     /// A byte stream needs a head or a tail to find frames by (D18); everything else is valid on
@@ -170,7 +188,7 @@ impl<'c> ConfigView<'c> {
     /// Each variable has one owner, or its bits have.
     fn check_owners(&self) -> Check {
         let mut owners = [None; INPUT_COUNT];
-        for (index, _, recipe) in self.field_ports() {
+        for (index, port, recipe) in self.field_ports() {
             let place = Place::Port { port: index, key: PortKey::Recipe };
             for (other, _, earlier) in self.field_ports().take_while(|(other, ..)| *other < index) {
                 for bit in self.bits_written_by(recipe) {
@@ -198,6 +216,15 @@ impl<'c> ConfigView<'c> {
                     _ => *owner = Some(index),
                 }
             }
+            for (_, var) in port.health.iter() {
+                let place = Place::Port { port: index, key: PortKey::Health };
+                match owners.get_mut(var.ordinal()) {
+                    Some(Some(other)) if *other == index => return fail(place, Kind::HealthTwice { var }),
+                    Some(Some(other)) => return fail(place, Kind::OwnedTwice { var, other: *other }),
+                    Some(owner) => *owner = Some(index),
+                    None => {}
+                }
+            }
         }
         Ok(())
     }
@@ -207,10 +234,18 @@ impl<'c> ConfigView<'c> {
     fn check_ways_up(&self) -> Check {
         for (port, port_config, recipe) in self.field_ports() {
             for (frame, field, spec) in self.fields_of(recipe, Direction::Input) {
-                let Some(var) = spec.variable() else { continue };
-                if var.modbus().is_none() && !self.carried(Direction::Input, var) {
+                let is_lost = |var: &SysVar| var.modbus().is_none() && !self.carried(Direction::Input, *var);
+                if let Some(var) = spec.variables().find(is_lost) {
                     let recipe = port_config.recipe;
                     let place = Place::Field { recipe, part: Direction::Input, frame, field };
+                    return fail(place, Kind::NoWayUp { var, port });
+                }
+            }
+        }
+        for (port, port_config, _) in self.field_ports() {
+            for (_, var) in port_config.health.iter() {
+                if var.modbus().is_none() && !self.carried(Direction::Input, var) {
+                    let place = Place::Port { port, key: PortKey::Health };
                     return fail(place, Kind::NoWayUp { var, port });
                 }
             }
@@ -239,7 +274,7 @@ impl<'c> ConfigView<'c> {
                     || self.is_owned(var)
             };
             for (frame, field, spec) in self.fields_of(recipe, Direction::Output) {
-                if let Some(var) = spec.variable().filter(|&var| !is_shown(var)) {
+                if let Some(var) = spec.variables().find(|&var| !is_shown(var)) {
                     let place = Place::Field { recipe: index, part: Direction::Output, frame, field };
                     return fail(place, Kind::NoSource { var, port });
                 }

@@ -6,7 +6,7 @@
 use heapless::VecView;
 
 use super::network::Network;
-use super::{CommandEntry, ControllerLink, FieldSpec, Port, Recipe, SafeValue};
+use super::{CommandEntry, ControllerLink, FieldSpec, OutputBinding, Port, Recipe, SafeValue};
 use crate::sysvar::{Direction, SysVar, VarBit};
 
 /// A configuration of any size, borrowed; [`GatewayConfig`](super::GatewayConfig) describes the
@@ -74,7 +74,20 @@ impl<'c> ConfigView<'c> {
 
     /// The input variables that a field port writes as a whole.
     pub fn written_by(self, recipe: &'c Recipe) -> impl Iterator<Item = SysVar> + 'c {
-        self.fields_of(recipe, Direction::Input).filter_map(|(_, _, field)| field.variable())
+        self.fields_of(recipe, Direction::Input).flat_map(|(_, _, field)| field.variables())
+    }
+
+    /// The input variables that a field port owns: those that its frames write, and those of its
+    /// health.
+    pub fn owned_by(self, port: &'c Port, recipe: &'c Recipe) -> impl Iterator<Item = SysVar> + 'c {
+        self.written_by(recipe).chain(port.health.iter().map(|(_, var)| var))
+    }
+
+    /// Whether the output part of a field port shows a value of the controller's state packet.
+    pub(crate) fn shows_state(self) -> bool {
+        let shows = |field: &FieldSpec| matches!(field.source(), Some(OutputBinding::State { .. }));
+        self.field_ports()
+            .any(|(_, _, recipe)| self.fields_of(recipe, Direction::Output).any(|(_, _, field)| shows(field)))
     }
 
     /// The bits that a field port writes one by one.
@@ -84,7 +97,7 @@ impl<'c> ConfigView<'c> {
 
     /// Whether a field port writes the variable.
     pub(super) fn is_owned(self, var: SysVar) -> bool {
-        self.field_ports().any(|(_, _, recipe)| self.written_by(recipe).any(|owned| owned == var))
+        self.field_ports().any(|(_, port, recipe)| self.owned_by(port, recipe).any(|owned| owned == var))
     }
 }
 

@@ -63,7 +63,7 @@ const NAMED: [(&str, Algorithm); 23] = [
     ("crc16-dnp", crc(16, 0x3D65, 0, true, 0xFFFF)),
     ("crc16-kermit", crc(16, 0x1021, 0, true, 0)),
     ("crc16-mcrf4xx", crc(16, 0x1021, 0xFFFF, true, 0)),
-    ("crc16-modbus", crc(16, 0x8005, 0xFFFF, true, 0)),
+    ("crc16-modbus", Algorithm::CRC16_MODBUS),
     ("crc16-umts", crc(16, 0x8005, 0, false, 0)),
     ("crc16-usb", crc(16, 0x8005, 0xFFFF, true, 0xFFFF)),
     ("crc16-x25", crc(16, 0x1021, 0xFFFF, true, 0xFFFF)),
@@ -147,6 +147,9 @@ impl Crc {
 }
 
 impl Algorithm {
+    /// The checksum of Modbus RTU.
+    pub const CRC16_MODBUS: Self = crc(16, 0x8005, 0xFFFF, true, 0);
+
     /// The algorithm with this name in configuration files, such as `crc16-modbus`.
     pub fn named(name: &str) -> Option<Self> {
         NAMED.iter().find(|(known, _)| *known == name).map(|&(_, algorithm)| algorithm)

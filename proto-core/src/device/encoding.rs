@@ -4,6 +4,7 @@
 //! nor what its value is for.
 
 use core::fmt;
+use core::ops::RangeInclusive;
 
 use super::order::ByteOrder;
 use crate::image::round;
@@ -127,9 +128,91 @@ pub enum Overflow {
 }
 
 impl Encoding {
+    const fn of(kind: Kind) -> Self {
+        Self { kind, order: ByteOrder::Little, shared: false }
+    }
+
     /// A value of this type, lowest byte first: as recipes have it.
     pub const fn scalar(ty: ScalarType) -> Self {
-        Self { kind: Kind::Scalar(ty), order: ByteOrder::Little, shared: false }
+        Self::of(Kind::Scalar(ty))
+    }
+
+    /// Unsigned, three bytes.
+    pub const fn uint24() -> Self {
+        Self::of(Kind::Uint24)
+    }
+
+    /// Signed, three bytes.
+    pub const fn int24() -> Self {
+        Self::of(Kind::Int24)
+    }
+
+    /// Packed decimal digits, two a byte; 1..=4 bytes.
+    pub const fn bcd(bytes: u8) -> Self {
+        Self::of(Kind::Bcd { bytes })
+    }
+
+    /// A decimal number of so many characters in ASCII, 1..=16.
+    pub const fn decimal(width: u8) -> Self {
+        Self::of(Kind::Decimal(Digits { width: Width::Fixed(width), decimals: 0 }))
+    }
+
+    /// A decimal number in ASCII, which ends before this byte.
+    pub const fn decimal_until(end: u8) -> Self {
+        Self::of(Kind::Decimal(Digits { width: Width::Until(end), decimals: 0 }))
+    }
+
+    /// A hexadecimal number of so many digits in ASCII, 1..=8.
+    pub const fn hex(width: u8) -> Self {
+        Self::of(Kind::Hex(Width::Fixed(width)))
+    }
+
+    /// A hexadecimal number in ASCII, which ends before this byte.
+    pub const fn hex_until(end: u8) -> Self {
+        Self::of(Kind::Hex(Width::Until(end)))
+    }
+
+    /// These bits of a number of this type: a byte, word or dword.
+    pub const fn bits(ty: ScalarType, bits: RangeInclusive<u8>) -> Self {
+        let (first, last) = (*bits.start(), *bits.end());
+        let count = last.saturating_add(1).saturating_sub(first);
+        Self::of(Kind::Bits(Bits { bytes: ty.size() as u8, first, count, signed: false }))
+    }
+
+    /// One bit of a number of this type.
+    pub const fn bit(ty: ScalarType, bit: u8) -> Self {
+        Self::bits(ty, bit..=bit)
+    }
+
+    /// Highest byte first.
+    pub const fn big_endian(self) -> Self {
+        self.ordered(ByteOrder::Big)
+    }
+
+    /// With the bytes in this order.
+    pub const fn ordered(self, order: ByteOrder) -> Self {
+        Self { order, ..self }
+    }
+
+    /// Other bits of the number before, or a second use of the same bytes.
+    pub const fn shared(self) -> Self {
+        Self { shared: true, ..self }
+    }
+
+    /// The highest of the bits is a sign. No effect on other kinds.
+    pub const fn signed(mut self) -> Self {
+        if let Kind::Bits(bits) = &mut self.kind {
+            bits.signed = true;
+        }
+        self
+    }
+
+    /// Written with so many digits behind a point. No effect on what is not decimal.
+    pub const fn decimals(mut self, decimals: u8) -> Self {
+        if let Kind::Decimal(digits) = &mut self.kind {
+            digits.decimals = decimals;
+        }
+        self
     }
 
     /// Number of bytes in the frame, the byte that ends the field not included; `None` if it varies.
@@ -274,6 +357,12 @@ impl Encoding {
         };
         self.order.write(raw, out.get_mut(..len)?);
         Some(len)
+    }
+}
+
+impl From<ScalarType> for Encoding {
+    fn from(ty: ScalarType) -> Self {
+        Self::scalar(ty)
     }
 }
 

@@ -42,8 +42,10 @@ pub struct FramerStats {
     pub others: u32,
     /// Frames with a wrong checksum, where a frame was expected.
     pub wrong: u32,
-    /// Bytes that belong to no frame.
+    /// Bytes dropped while looking for a frame.
     pub skipped_bytes: u32,
+    /// Those of them that are no part of a frame with a wrong checksum.
+    pub noise_bytes: u32,
     /// Bytes of partial frames that [`Framer::discard`] dropped.
     pub discarded_bytes: u32,
 }
@@ -70,7 +72,14 @@ impl Default for Framer {
 impl Framer {
     /// An empty framer; the first byte is expected to begin a frame.
     pub const fn new() -> Self {
-        let stats = FramerStats { frames: 0, others: 0, wrong: 0, skipped_bytes: 0, discarded_bytes: 0 };
+        let stats = FramerStats {
+            frames: 0,
+            others: 0,
+            wrong: 0,
+            skipped_bytes: 0,
+            noise_bytes: 0,
+            discarded_bytes: 0,
+        };
         Self { buffer: [0; BUFFER], start: 0, end: 0, expected: Some(0), credit: 0, stats }
     }
 
@@ -101,16 +110,16 @@ impl Framer {
                     Probe::Wrong(len) if self.expected == Some(0) => {
                         let at = usize::from(self.start);
                         self.stats.wrong = self.stats.wrong.wrapping_add(1);
-                        self.skip(effort);
+                        self.skip(effort, false);
                         self.expected = Some(len.saturating_sub(1) as u16);
                         return Some(Found::Wrong(self.buffer.get(at..at.saturating_add(len))?));
                     }
                     Probe::No(steps) => {
-                        self.skip(steps);
+                        self.skip(steps, true);
                         continue;
                     }
                     Probe::Wrong(_) => {
-                        self.skip(effort);
+                        self.skip(effort, true);
                         continue;
                     }
                 },
@@ -150,12 +159,17 @@ impl Framer {
     }
 
     /// Drops the byte at the start, and all that there are if the probes have taken too long.
-    fn skip(&mut self, steps: usize) {
+    fn skip(&mut self, steps: usize, is_noise: bool) {
+        // Behind the first byte of a frame with a wrong checksum, its end is expected.
+        let is_noise = is_noise && !matches!(self.expected, Some(1..));
         self.credit = self.credit.saturating_sub(i32::try_from(steps).unwrap_or(i32::MAX));
         let skipped = if self.credit < 0 { self.end.saturating_sub(self.start) } else { 1 };
         self.start = self.start.saturating_add(skipped);
         self.expected = self.expected.and_then(|expected| expected.checked_sub(skipped));
         self.stats.skipped_bytes = self.stats.skipped_bytes.wrapping_add(u32::from(skipped));
+        if is_noise {
+            self.stats.noise_bytes = self.stats.noise_bytes.wrapping_add(u32::from(skipped));
+        }
     }
 
     /// Holds up to `missing` more bytes.

@@ -4,6 +4,7 @@
 //! are one and the values in it, or the frame. The elements stay with the caller, so that the frames
 //! of many devices share one pool; every call takes the ones that [`FrameLayout::new`] checked.
 
+use core::borrow::Borrow;
 use core::fmt;
 
 use heapless::Vec;
@@ -11,6 +12,7 @@ use heapless::Vec;
 use super::checksum::Algorithm;
 use super::encoding::{Bits, Digits, Encoding, Kind, MAX_DIGITS, Overflow, Unreadable, Width};
 use super::order::ByteOrder;
+use super::text::{Counts, Length, MAX_TEXT, Text, TextWidth};
 use crate::recipe::model::{MAX_DELIMITER, MAX_FIELDS, MAX_STREAM_FRAME};
 use crate::sysvar::Direction;
 use crate::wire::can::MAX_CAN_DATA;
@@ -41,6 +43,10 @@ pub enum Element {
         /// What is sent.
         fill: u8,
     },
+    /// Characters.
+    Text(Text),
+    /// The frame's length.
+    Length(Length),
 }
 
 /// The checksum of a frame.
@@ -56,15 +62,29 @@ pub struct Checksum {
     pub text: bool,
     /// The first byte of the frame that it covers; 0 is the first of the head.
     pub first: u16,
-    /// The last one; `None` is the one before the checksum.
-    pub last: Option<u16>,
+    /// The byte behind the last one; 0 is that of the checksum.
+    pub end: u16,
 }
 
 impl Checksum {
     /// This algorithm as its standard has it: over everything before it, in the standard's byte
     /// order.
     pub const fn standard(algorithm: Algorithm) -> Self {
-        Self { algorithm, order: algorithm.order(), text: false, first: 0, last: None }
+        Self { algorithm, order: algorithm.order(), text: false, first: 0, end: 0 }
+    }
+
+    /// Over these bytes of the frame, the last one included; `None` is the one before the checksum.
+    pub const fn over(self, first: u16, last: Option<u16>) -> Self {
+        let end = match last {
+            Some(last) => last.saturating_add(1),
+            None => 0,
+        };
+        Self { first, end, ..self }
+    }
+
+    /// The last byte that it covers; `None` is the one before the checksum.
+    pub const fn last(&self) -> Option<u16> {
+        self.end.checked_sub(1)
     }
 
     /// Number of bytes in the frame, 1..=8.
@@ -79,7 +99,7 @@ impl Checksum {
 
     /// The bytes it covers, if it stands at `at` itself.
     fn covered(&self, at: usize) -> core::ops::Range<usize> {
-        let end = self.last.map_or(at, |last| usize::from(last).saturating_add(1));
+        let end = self.last().map_or(at, |last| usize::from(last).saturating_add(1));
         usize::from(self.first)..end
     }
 
@@ -113,6 +133,9 @@ pub enum Carrier {
     Stream,
     /// CAN frames, which their id tells apart; at most 8 bytes.
     Can,
+    /// A stream in which something else than the fields tells where frames end, such as escape
+    /// bytes; at most 512 bytes.
+    Whole,
 }
 
 /// What bytes are, seen as a frame that begins at the first of them.
@@ -130,21 +153,19 @@ pub enum Probe {
     Wrong(usize),
 }
 
-/// A checksum, and the number of elements before it.
-#[derive(Debug, Clone, Copy)]
-struct Placed {
-    sum: Checksum,
-    behind: u8,
-}
-
 /// A frame, checked and ready to find, decode and encode.
 #[derive(Debug, Clone)]
 pub struct FrameLayout {
-    head: Vec<u8, MAX_DELIMITER>,
-    tail: Vec<u8, MAX_DELIMITER>,
-    checksum: Option<Placed>,
+    // Their lengths in a byte: every port has room for many layouts.
+    head: Vec<u8, MAX_DELIMITER, u8>,
+    tail: Vec<u8, MAX_DELIMITER, u8>,
+    checksum: Option<Checksum>,
+    /// Number of elements before the checksum.
+    behind: u8,
     shortest: u16,
     longest: u16,
+    /// Number of bytes behind a text that takes the rest: elements, checksum and tail.
+    behind_rest: u16,
 }
 
 /// Why a frame cannot be laid out.
@@ -198,6 +219,27 @@ pub enum LayoutError {
     ChecksumPlace,
     /// The checksum covers nothing, itself, the tail, or bytes behind a field of varying length.
     ChecksumRange,
+    /// The frame begins with a text or with what may be anything, so that the last bytes of another
+    /// frame could be taken for it.
+    NoBeginning {
+        /// Index of the text.
+        element: u8,
+    },
+    /// Nothing tells where the frame and its last text end.
+    NoEnd {
+        /// Index of the text.
+        element: u8,
+    },
+    /// A field of varying length behind a text that takes the rest of the frame.
+    BehindRest {
+        /// Index of the field.
+        element: u8,
+    },
+    /// A length that is no integer, varies in its own length, or is the second one.
+    Length {
+        /// Index of the element.
+        element: u8,
+    },
 }
 
 impl fmt::Display for LayoutError {
@@ -228,6 +270,19 @@ impl fmt::Display for LayoutError {
             Self::ChecksumRange => f.write_str(
                 "the checksum must cover bytes of head and fields, and not itself",
             ),
+            Self::NoBeginning { .. } => f.write_str(
+                "a text at the beginning of a frame could be the end of a longer one; a head, a checksum, \
+                 framing = \"tail\" or \"silence\", or escape is needed",
+            ),
+            Self::NoEnd { .. } => f.write_str(
+                "nothing tells where the text ends; width, until, a length before it, framing or escape is needed",
+            ),
+            Self::BehindRest { .. } => {
+                f.write_str("the text before takes the rest of the frame; no field of varying length may follow")
+            }
+            Self::Length { .. } => {
+                f.write_str("a frame has one length, an integer in a fixed number of bytes")
+            }
         }
     }
 }
@@ -241,7 +296,11 @@ impl LayoutError {
             Self::Encoding { element }
             | Self::NotWords { element }
             | Self::NotShared { element }
-            | Self::Constant { element } => Some(element),
+            | Self::Constant { element }
+            | Self::NoBeginning { element }
+            | Self::NoEnd { element }
+            | Self::BehindRest { element }
+            | Self::Length { element } => Some(element),
             _ => None,
         }
     }
@@ -258,11 +317,42 @@ impl Element {
         Self::Value { encoding, overflow: Overflow::Usual }
     }
 
-    /// How it is written; `None` for padding.
+    /// How it is written; `None` for padding and text.
     pub const fn encoding(&self) -> Option<Encoding> {
         match *self {
             Self::Value { encoding, .. } | Self::Fixed { encoding, .. } => Some(encoding),
-            Self::Padding { .. } => None,
+            Self::Length(Length { encoding, .. }) => Some(encoding),
+            Self::Padding { .. } | Self::Text(_) => None,
+        }
+    }
+
+    /// The byte that ends it, if its length varies.
+    fn until(&self) -> Option<u8> {
+        match self {
+            Self::Text(Text { width: TextWidth::Until(end), .. }) => Some(*end),
+            Self::Text(_) | Self::Padding { .. } => None,
+            _ => self.encoding()?.until(),
+        }
+    }
+
+    fn is_rest(&self) -> bool {
+        matches!(self, Self::Text(Text { width: TextWidth::Rest, .. }))
+    }
+
+    /// Maximum number of bytes, with the one that ends it; 0 if it is shared.
+    pub(crate) fn longest(&self) -> usize {
+        match self.len() {
+            _ if self.is_shared() => 0,
+            Some(len) => len,
+            None => self.most().saturating_add(1),
+        }
+    }
+
+    /// Maximum number of bytes if its length varies.
+    const fn most(&self) -> usize {
+        match self {
+            Self::Text(_) => MAX_TEXT,
+            _ => MAX_DIGITS,
         }
     }
 
@@ -282,6 +372,9 @@ impl Element {
         match self {
             Self::Padding { len, .. } => Some(usize::from(*len)),
             Self::Value { encoding, .. } | Self::Fixed { encoding, .. } => encoding.size(),
+            Self::Text(Text { width: TextWidth::Fixed(width), .. }) => Some(usize::from(*width)),
+            Self::Text(_) => None,
+            Self::Length(Length { encoding, .. }) => encoding.size(),
         }
     }
 }
@@ -300,6 +393,10 @@ struct Places {
     checksum_len: usize,
     /// Where the checksum stands, once it is known.
     checksum_at: usize,
+    tail_len: usize,
+    /// Where the frame ends, once it is known.
+    end: Option<usize>,
+    behind_rest: usize,
 }
 
 /// Why the place of an element is unknown.
@@ -311,9 +408,9 @@ enum Unplaced {
 }
 
 impl Places {
-    fn new(layout: &FrameLayout) -> Self {
+    fn new(layout: &FrameLayout, end: Option<usize>) -> Self {
         let (behind, len) =
-            layout.checksum.map_or((usize::MAX, 0), |placed| (usize::from(placed.behind), placed.sum.len()));
+            layout.checksum.map_or((usize::MAX, 0), |sum| (usize::from(layout.behind), sum.len()));
         let mut places = Self {
             at: layout.head.len(),
             shared_at: 0,
@@ -322,6 +419,9 @@ impl Places {
             checksum_behind: behind,
             checksum_len: len,
             checksum_at: 0,
+            tail_len: layout.tail.len(),
+            end,
+            behind_rest: usize::from(layout.behind_rest),
         };
         places.step_over_checksum();
         places
@@ -356,12 +456,21 @@ impl Places {
         let (len, further) = match element.len() {
             Some(len) => (len, 0),
             None if element.is_shared() => (self.shared_len, 0),
+            None if element.is_rest() => {
+                let end = self.end.ok_or(Unplaced::No)?;
+                let stop = end.checked_sub(self.behind_rest).ok_or(Unplaced::No)?;
+                let len = stop.checked_sub(self.at).ok_or(Unplaced::No)?;
+                if len > MAX_TEXT {
+                    return Err(Unplaced::No);
+                }
+                (len, 0)
+            }
             None => {
-                let end = element.encoding().and_then(|encoding| encoding.until()).ok_or(Unplaced::No)?;
+                let (end, most) = (element.until().ok_or(Unplaced::No)?, element.most());
                 let rest = bytes.get(self.at..).unwrap_or(&[]);
-                match rest.iter().take(MAX_DIGITS.saturating_add(1)).position(|&byte| byte == end) {
+                match rest.iter().take(most.saturating_add(1)).position(|&byte| byte == end) {
                     Some(len) => (len, 1),
-                    None if rest.len() > MAX_DIGITS => return Err(Unplaced::No),
+                    None if rest.len() > most => return Err(Unplaced::No),
                     None => return Err(Unplaced::Partial(1)),
                 }
             }
@@ -371,6 +480,21 @@ impl Places {
             None | Some(0) => Ok(place),
             Some(missing) => Err(Unplaced::Partial(missing)),
         }
+    }
+
+    /// Number of bytes of a frame whose length field, which ends at `at`, says 0. To be called
+    /// behind that field.
+    fn counted_from(&self, length: &Length, at: usize) -> i64 {
+        let first = match length.counts {
+            Counts::Frame => 0,
+            Counts::Rest => at,
+            Counts::Fields => {
+                let is_behind = self.checksum_behind != usize::MAX && self.checksum_behind >= self.nth;
+                let sum = if is_behind { self.checksum_len } else { 0 };
+                at.saturating_add(sum).saturating_add(self.tail_len)
+            }
+        };
+        (first as i64).saturating_add(i64::from(length.plus))
     }
 }
 
@@ -398,21 +522,23 @@ impl FrameLayout {
             return Err(LayoutError::TooManyElements);
         }
         check_elements(elements, direction)?;
-        let checksum = match checksum {
+        let (checksum, behind) = match checksum {
             Some((sum, behind)) => {
                 let splits = elements.get(behind).is_some_and(Element::is_shared);
                 if behind > elements.len() || splits {
                     return Err(LayoutError::ChecksumPlace);
                 }
-                Some(Placed { sum, behind: behind as u8 })
+                (Some(sum), behind as u8)
             }
-            None => None,
+            None => (None, 0),
         };
-        let mut layout = Self { head, tail, checksum, shortest: 0, longest: 0 };
-        let shortest = layout.length_with(elements, 0);
-        let longest = layout.length_with(elements, MAX_DIGITS);
+        let mut layout = Self { head, tail, checksum, behind, shortest: 0, longest: 0, behind_rest: 0 };
+        let shortest = layout.length_with(elements, |_| 0);
+        let longest = layout.length_with(elements, Element::most);
+        let is_searched = carrier == Carrier::Stream && direction == Direction::Input;
+        layout.check_texts(is_searched, elements)?;
         let room = match carrier {
-            Carrier::Stream => MAX_STREAM_FRAME,
+            Carrier::Stream | Carrier::Whole => MAX_STREAM_FRAME,
             Carrier::Can => MAX_CAN_DATA,
         };
         if longest > room {
@@ -429,21 +555,50 @@ impl FrameLayout {
         Ok(layout)
     }
 
-    /// The bytes of the whole frame if every field of varying length has so many.
-    fn length_with(&self, elements: &[Element], varying: usize) -> usize {
-        let mut places = Places::new(self);
+    /// The bytes of the whole frame if the fields of varying length have so many.
+    fn length_with(&self, elements: &[Element], varying: impl Fn(&Element) -> usize) -> usize {
+        let mut places = Places::new(self, None);
         for element in elements {
-            match element.len() {
-                Some(len) => places.next(element, len, 0),
-                None if element.is_shared() => places.next(element, varying, 0),
-                None => places.next(element, varying, 1),
-            };
+            let further = usize::from(element.until().is_some() && !element.is_shared());
+            let len = element.len().unwrap_or_else(|| varying(element));
+            places.next(element, len, further);
         }
         places.at.saturating_add(self.tail.len())
     }
 
+    /// Where texts begin and end, and what is behind one that takes the rest.
+    fn check_texts(&mut self, is_searched: bool, elements: &[Element]) -> Result<(), LayoutError> {
+        let mut begins = !is_searched || !self.head.is_empty() || self.checksum.is_some();
+        let mut ends = !is_searched;
+        let mut rest_from = None;
+        let mut places = Places::new(self, None);
+        for (nth, element) in elements.iter().enumerate() {
+            let nth = nth as u8;
+            match element {
+                Element::Text(_) if !begins => return Err(LayoutError::NoBeginning { element: nth }),
+                _ if rest_from.is_some() && element.len().is_none() => {
+                    return Err(LayoutError::BehindRest { element: nth });
+                }
+                Element::Text(_) if element.is_rest() && !ends => {
+                    return Err(LayoutError::NoEnd { element: nth });
+                }
+                Element::Fixed { .. } => begins = true,
+                Element::Length(_) => ends = true,
+                _ => {}
+            }
+            if element.is_rest() {
+                // A checksum right behind the text is behind it, too.
+                rest_from = Some(places.at);
+            }
+            places.next(element, element.len().unwrap_or(0), 0);
+        }
+        let all = places.at.saturating_add(self.tail.len());
+        self.behind_rest = rest_from.map_or(0, |from| all.saturating_sub(from)) as u16;
+        Ok(())
+    }
+
     fn check_checksum(&self, elements: &[Element]) -> Result<(), LayoutError> {
-        let Some(Placed { sum, .. }) = self.checksum else { return Ok(()) };
+        let Some(sum) = self.checksum else { return Ok(()) };
         let is_valid = match sum.algorithm {
             Algorithm::Crc(crc) => crc.is_valid(),
             _ => true,
@@ -452,22 +607,24 @@ impl FrameLayout {
             return Err(LayoutError::Algorithm);
         }
         // Behind a field of varying length no byte has a number.
-        let mut places = Places::new(self);
+        let mut places = Places::new(self, None);
         let mut numbered = None;
         for element in elements {
             let len = element.len();
             if len.is_none() {
                 numbered = numbered.or(Some(places.at));
             }
-            places.next(element, len.unwrap_or(0), usize::from(len.is_none()));
+            places.next(element, len.unwrap_or(0), usize::from(element.until().is_some()));
         }
         let at = places.checksum_at;
         let own = at..at.saturating_add(sum.len());
         let covered = sum.covered(at);
         let overlaps = covered.start < own.end && own.start < covered.end;
-        let end = if sum.last.is_some() { numbered.unwrap_or(places.at) } else { places.at };
+        let end = if sum.last().is_some() { numbered.unwrap_or(places.at) } else { places.at };
         let comes_late = numbered.is_some_and(|numbered| usize::from(sum.first) > numbered);
-        if covered.is_empty() || overlaps || covered.end > end || comes_late {
+        // An empty text leaves nothing to cover.
+        let covers_nothing = covered.is_empty() && (numbered.is_none() || covered.start > covered.end);
+        if covers_nothing || overlaps || covered.end > end || comes_late {
             return Err(LayoutError::ChecksumRange);
         }
         Ok(())
@@ -478,17 +635,38 @@ impl FrameLayout {
         (usize::from(self.shortest), usize::from(self.longest))
     }
 
+    /// The bytes behind the fields.
+    pub fn tail(&self) -> &[u8] {
+        &self.tail
+    }
+
     /// What `bytes` are, seen as a frame that begins at the first of them.
-    pub fn probe<'e>(&self, elements: impl IntoIterator<Item = &'e Element>, bytes: &[u8]) -> Probe {
+    pub fn probe(&self, elements: impl IntoIterator<Item: Borrow<Element>>, bytes: &[u8]) -> Probe {
+        self.probe_to(elements, bytes, None)
+    }
+
+    /// What `bytes` are, seen as one whole frame: too few of them are [`Probe::Partial`].
+    pub fn probe_whole(&self, elements: impl IntoIterator<Item: Borrow<Element>>, bytes: &[u8]) -> Probe {
+        self.probe_to(elements, bytes, Some(bytes.len()))
+    }
+
+    /// `end` is where the frame ends, if that is known from outside.
+    fn probe_to(
+        &self,
+        elements: impl IntoIterator<Item: Borrow<Element>>,
+        bytes: &[u8],
+        end: Option<usize>,
+    ) -> Probe {
         if let Some(differs) = self.head.iter().zip(bytes).position(|(expected, byte)| expected != byte) {
             return Probe::No(differs.saturating_add(1));
         }
         if let Some(missing @ 1..) = usize::from(self.shortest).checked_sub(bytes.len()) {
             return Probe::Partial(missing);
         }
-        let mut places = Places::new(self);
+        let mut places = Places::new(self, end);
         let mut is_ours = true;
         for element in elements {
+            let element = element.borrow();
             let place = match places.find(element, bytes) {
                 Ok(place) => place,
                 Err(Unplaced::Partial(missing)) if is_ours || self.checksum.is_some() => {
@@ -496,15 +674,33 @@ impl FrameLayout {
                 }
                 Err(_) => return Probe::No(places.nth.saturating_add(self.head.len())),
             };
-            if let Element::Fixed { encoding, value } = *element {
-                let field = bytes.get(place).unwrap_or(&[]);
-                is_ours &= encoding.read(field).is_ok_and(|read| read.as_f64() == value as f64);
+            let ends_at = place.end;
+            let field = bytes.get(place).unwrap_or(&[]);
+            match element {
+                Element::Fixed { encoding, value } => {
+                    is_ours &= encoding.read(field).is_ok_and(|read| read.as_f64() == *value as f64);
+                }
+                Element::Length(length) => {
+                    let steps = places.nth.saturating_add(self.head.len());
+                    let Ok(number) = length.encoding.read(field) else { return Probe::No(steps) };
+                    let end = places.counted_from(length, ends_at).saturating_add(number.as_f64() as i64);
+                    let is_possible = (i64::from(self.shortest)..=i64::from(self.longest)).contains(&end);
+                    let end = end as usize;
+                    if !is_possible || places.end.is_some_and(|known| known != end) {
+                        return Probe::No(steps);
+                    }
+                    places.end = Some(end);
+                }
+                _ => {}
             }
         }
         let tail_at = places.at;
         let len = tail_at.saturating_add(self.tail.len());
-        let rest = bytes.get(tail_at..).unwrap_or(&[]);
         let steps = places.nth.saturating_add(len);
+        if places.end.is_some_and(|end| end != len) {
+            return Probe::No(steps);
+        }
+        let rest = bytes.get(tail_at..).unwrap_or(&[]);
         if self.tail.iter().zip(rest).any(|(expected, byte)| expected != byte) {
             return Probe::No(steps);
         }
@@ -521,7 +717,7 @@ impl FrameLayout {
 
     /// Whether the checksum at `at` is right; `None` without one.
     fn checksum_is_right(&self, frame: &[u8], at: usize) -> Option<bool> {
-        let sum = self.checksum?.sum;
+        let sum = self.checksum?;
         let found = frame.get(at..at.saturating_add(sum.len())).unwrap_or(&[]);
         let mut expected = [0; 8];
         let expected = expected.get_mut(..sum.len())?;
@@ -531,33 +727,70 @@ impl FrameLayout {
 
     /// The elements of a frame that [`Self::probe`] found, each with its value; `None` for what is
     /// not a value.
-    pub fn values<'a>(
+    pub fn values(
         &self,
-        elements: impl IntoIterator<Item = &'a Element>,
-        frame: &'a [u8],
+        elements: impl IntoIterator<Item: Borrow<Element>>,
+        frame: &[u8],
     ) -> impl Iterator<Item = Result<Option<Scalar>, Unreadable>> {
-        let mut places = Places::new(self);
+        let mut places = Places::new(self, Some(frame.len()));
         elements.into_iter().map(move |element| {
+            let element = element.borrow();
             let place = places.find(element, frame).map_err(|_| Unreadable::Length)?;
             match element {
                 Element::Value { encoding, .. } => encoding.read(frame.get(place).unwrap_or(&[])).map(Some),
-                Element::Fixed { .. } | Element::Padding { .. } => Ok(None),
+                Element::Fixed { .. } | Element::Padding { .. } | Element::Text(_) | Element::Length(_) => {
+                    Ok(None)
+                }
             }
         })
     }
 
-    /// Writes a frame to the front of `out` and returns its length. `value` is asked for the number
-    /// of each element that is a value, by its index. `None` if one is not a number, or cannot be
-    /// wrapped, or if there is no room.
-    pub fn encode<'e>(
+    /// The text that the `nth` element of such a frame is; `None` if it is no text.
+    pub fn text<'a>(
         &self,
-        elements: impl IntoIterator<Item = &'e Element>,
-        mut value: impl FnMut(usize) -> f64,
+        elements: impl IntoIterator<Item: Borrow<Element>>,
+        frame: &'a [u8],
+        nth: usize,
+    ) -> Option<&'a [u8]> {
+        let mut places = Places::new(self, Some(frame.len()));
+        for (at, element) in elements.into_iter().enumerate() {
+            let element = element.borrow();
+            let place = places.find(element, frame).ok()?;
+            match element {
+                Element::Text(text) if at == nth => return Some(text.trimmed(frame.get(place)?)),
+                _ if at == nth => return None,
+                _ => {}
+            }
+        }
+        None
+    }
+
+    /// Writes a frame without texts; see [`Self::encode_with`].
+    pub fn encode(
+        &self,
+        elements: impl IntoIterator<Item: Borrow<Element>>,
+        value: impl FnMut(usize) -> f64,
         out: &mut [u8],
     ) -> Option<usize> {
-        let mut places = Places::new(self);
+        self.encode_with(elements, value, |_, _| None, out)
+    }
+
+    /// Writes a frame to the front of `out` and returns its length. `value` is asked for the number
+    /// of each element that is a value, by its index; `text` writes each text, and returns its
+    /// length. `None` if one is not a number, or cannot be wrapped, if a text does not fit its
+    /// width or the length its field, or if there is no room.
+    pub fn encode_with(
+        &self,
+        elements: impl IntoIterator<Item: Borrow<Element>>,
+        mut value: impl FnMut(usize) -> f64,
+        mut text: impl FnMut(usize, &mut [u8]) -> Option<usize>,
+        out: &mut [u8],
+    ) -> Option<usize> {
+        let mut places = Places::new(self, None);
+        let mut length_at = None;
         put(out, 0, &self.head)?;
         for (nth, element) in elements.into_iter().enumerate() {
+            let element = element.borrow();
             let at = if element.is_shared() { places.shared_at } else { places.at };
             let rest = out.get_mut(at..)?;
             let (encoding, number) = match *element {
@@ -565,6 +798,26 @@ impl FrameLayout {
                     let len = usize::from(len);
                     rest.get_mut(..len)?.fill(fill);
                     places.next(element, len, 0);
+                    continue;
+                }
+                Element::Text(field) => {
+                    let room = rest.len().min(MAX_TEXT.saturating_add(1));
+                    let rest = rest.get_mut(..room)?;
+                    let len = field.complete(text(nth, rest)?, rest)?;
+                    if len > MAX_TEXT {
+                        return None;
+                    }
+                    places.next(element, len, usize::from(element.until().is_some()));
+                    continue;
+                }
+                Element::Length(length) => {
+                    // It is written when the length is known.
+                    let len = length.encoding.size()?;
+                    if !element.is_shared() {
+                        rest.get_mut(..len)?.fill(0);
+                    }
+                    places.next(element, len, 0);
+                    length_at = Some((at, length, places.counted_from(&length, at.saturating_add(len))));
                     continue;
                 }
                 Element::Fixed { encoding, value } => (encoding, value as f64),
@@ -586,7 +839,16 @@ impl FrameLayout {
                 }
             }
         }
-        if let Some(Placed { sum, .. }) = self.checksum {
+        if let Some((at, length, from)) = length_at {
+            let all = places.at.saturating_add(self.tail.len());
+            let number = (all as i64).saturating_sub(from) as f64;
+            let (low, high) = length.encoding.range();
+            if !(low..=high).contains(&number) {
+                return None;
+            }
+            length.encoding.write(number, out.get_mut(at..)?)?;
+        }
+        if let Some(sum) = self.checksum {
             let mut bytes = [0; 8];
             let bytes = bytes.get_mut(..sum.len())?;
             sum.write(out.get(sum.covered(places.checksum_at))?, bytes);
@@ -610,10 +872,18 @@ fn check_elements(elements: &[Element], direction: Direction) -> Result<(), Layo
     // The newest element that shares its place with none before: its length and the byte that ends
     // it, its order, and which of its bits are taken.
     let mut place: Option<(Encoding, u32)> = None;
+    let mut has_length = false;
     for (nth, element) in elements.iter().enumerate() {
         let nth = nth as u8;
+        if let Element::Length(Length { encoding, .. }) = element {
+            if has_length || encoding.size().is_none() || !encoding.is_integer() {
+                return Err(LayoutError::Length { element: nth });
+            }
+            has_length = true;
+        }
         let Some(encoding) = element.encoding() else {
-            if element.len() == Some(0) {
+            let longest = if matches!(element, Element::Text(_)) { MAX_TEXT } else { usize::MAX };
+            if element.len().is_some_and(|len| !(1..=longest).contains(&len)) {
                 return Err(LayoutError::Encoding { element: nth });
             }
             place = None;

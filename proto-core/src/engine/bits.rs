@@ -238,6 +238,8 @@ impl Bits {
                 self.dirty = self.dirty.or(own);
                 self.safe = self.safe.or(own);
                 self.unconfirmed = self.unconfirmed.or(own);
+                // Their owner may never have sent them.
+                self.live = self.live.or(own);
                 share.at = now;
                 done.is_safe = true;
             }

@@ -15,6 +15,7 @@ use super::links::Links;
 use super::modbus_link::{MAX_POLL_BLOCKS, ModbusLink};
 use super::outbox::EdgeQueue;
 use super::plan::{Plan, PlanError, Source, WayUp, shown_by, uplinks};
+use super::port_health::PortsHealth;
 use super::sender::Sender;
 use super::state_link::StateLink;
 use super::store::{InputFrame, MAX_INPUT_FRAMES, SafeBytes, Store};
@@ -109,10 +110,10 @@ pub(super) fn one_too_many(what: Counted, room: usize) -> BuildError {
 }
 
 /// Groups are assigned in order: field frames first.
-struct Groups(u8);
+pub(super) struct Groups(u8);
 
 impl Groups {
-    fn next(&mut self) -> Option<GroupId> {
+    pub(super) fn next(&mut self) -> Option<GroupId> {
         let group = GroupId(self.0);
         (usize::from(self.0) < MAX_GROUPS).then(|| self.0 = self.0.saturating_add(1))?;
         Some(group)
@@ -132,6 +133,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             bindings: Bindings { inputs: Vec::new(), outputs: Vec::new() },
             safe_values: Vec::new(),
             links: Links::new(),
+            health: PortsHealth::new(),
             timer_at: Instant::ZERO,
             is_armed: false,
             now: Instant::ZERO,
@@ -185,6 +187,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             bindings,
             safe_values,
             links,
+            health,
             timer_at,
             is_armed,
             now,
@@ -209,6 +212,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         state.clear();
         modbus.clear();
         recipes.clear();
+        health.clear();
         *timer_at = Instant::ZERO;
         *is_armed = false;
         *now = Instant::ZERO;
@@ -252,6 +256,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
         self.assign_read_back(&plan);
         self.assign_sources(config, &plan, &mut groups)?;
+        self.assign_extra(&dialect)?;
+        self.assign_health(config, &mut groups)?;
         self.assign_witnesses();
         Ok(())
     }
@@ -319,10 +325,13 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             _ => LineTiming::none(),
         };
         let first_frame = self.store.frames.len() as u8;
+        if port.safe_at_start {
+            self.store.is_overdue_from_start();
+        }
         let mut next_binding = self.bindings.inputs.len() as u16;
         for (_, fields) in recipe.frames(Direction::Input) {
             let fields = fields.of(config.fields);
-            let whole: InputSet = fields.iter().filter_map(FieldSpec::variable).collect();
+            let whole: InputSet = fields.iter().flat_map(FieldSpec::variables).collect();
             let mut set = whole;
             for bit in fields.iter().filter_map(FieldSpec::bit) {
                 set.insert(bit.var);
@@ -337,7 +346,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 set,
                 port: self.ports.len() as u8,
                 bindings,
-                overdue_at: Instant::NEVER,
+                overdue_at: if port.safe_at_start { Instant::ZERO } else { Instant::NEVER },
                 timeout: port.timeout,
             };
             let group = GroupId(self.store.frames.len() as u8);
@@ -349,7 +358,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
         let full = || one_too_many(Counted::UserFields, FIELDS);
         let mut inputs = Span { start: self.bindings.inputs.len() as u16, len: 0 };
-        for (_, _, field) in config.fields_of(recipe, Direction::Input) {
+        for (frame, nth, field) in config.fields_of(recipe, Direction::Input) {
             let Some(element) = field.element() else { continue };
             let to = match *field {
                 FieldSpec::UserInput { to, .. } | FieldSpec::DeviceInput { to, .. } => to,
@@ -362,7 +371,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                         self.add_command_link(config, dialect)?;
                     }
                     let Some(link) = self.links.command.first_mut() else { continue };
-                    let field = link.add_field(table, when);
+                    let field = link.add_field(table, when, (frame, nth));
                     InputTo::Command(field.ok_or(one_too_many(Counted::CommandFields, MAX_COMMAND_FIELDS))?)
                 }
                 InputBinding::Bit { var, bit } => {
@@ -370,7 +379,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 }
                 InputBinding::Unused => InputTo::Unused,
             };
-            self.bindings.inputs.push(InputBind { to, element }).map_err(|_| full())?;
+            self.bindings.inputs.push(InputBind::new(to, element)).map_err(|_| full())?;
             inputs.len = inputs.len.saturating_add(1);
         }
         let mut outputs = Span { start: self.bindings.outputs.len() as u16, len: 0 };
@@ -382,12 +391,13 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 FieldSpec::DeviceOutput { from, .. } => (ScalarType::Double, from),
                 _ => (ScalarType::Double, OutputBinding::Constant(0.0)),
             };
-            self.bindings.outputs.push(OutputBind { ty, from, element }).map_err(|_| full())?;
+            self.bindings.outputs.push(OutputBind::new(ty, from, element)).map_err(|_| full())?;
             outputs.len = outputs.len.saturating_add(1);
         }
         self.store.watches_bits |= matches!(recipe.send, SendOn::Rising { .. });
         let has_output = recipe.has(Direction::Output);
-        let sender = Sender::new(recipe.send, recipe.on_stale, port.stale_after, port.cycle, has_output);
+        let mut sender = Sender::new(recipe.send, recipe.on_stale, port.stale_after, port.cycle, has_output);
+        sender.refresh = port.refresh.unwrap_or(Duration::MAX);
         let port = FieldPort {
             id: PortId(index),
             name: port.name.clone(),

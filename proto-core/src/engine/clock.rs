@@ -5,7 +5,8 @@
 
 use super::counters::{add, bump};
 use super::field_port::FieldPort;
-use super::user::forget_commands;
+use super::store::Overdue;
+use super::user::silence_commands;
 use super::{Ask, Engine};
 use crate::time::{Duration, Instant};
 
@@ -78,9 +79,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         self.sleeps = self.sleeps.wrapping_add(1);
         // Before deadlines pass: one of them may be to open a link that has been down.
         self.links.slept(&mut self.store);
+        self.is_deaf = true;
         self.advance(now);
         self.ports.iter_mut().for_each(|port| port.slept(&mut self.tap, now));
-        self.is_deaf = true;
         self.deaf_until = now + DEAF;
         self.arm(self.deaf_until);
     }
@@ -101,8 +102,11 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         self.is_armed = false;
         self.expire_frames(now);
         for index in 0..self.ports.len() {
-            if let Some(port) = self.ports.get_mut(index) {
-                port.advance(&mut self.tap, now);
+            if let Some(port) = self.ports.get_mut(index)
+                && port.advance(&mut self.tap, now)
+            {
+                let id = port.id;
+                self.port_silent(id, now);
             }
         }
         self.links.advance(&mut self.store);
@@ -111,17 +115,22 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
 
     fn expire_frames(&mut self, now: Instant) {
         let mut timed_out = false;
-        while let Some((frame, dropped)) = self.store.next_timeout(&self.safe_values) {
+        while let Some(overdue) = self.store.next_timeout(&self.safe_values) {
+            let Overdue::Frame(frame, dropped) = overdue else {
+                self.check_health(now);
+                continue;
+            };
             timed_out = true;
             if let Some(port) = self.ports.get_mut(usize::from(frame.port)) {
                 bump(&mut port.counters.timeouts);
                 add(&mut port.counters.values_expired, dropped);
             }
-            forget_commands(frame.bindings.of(&self.bindings.inputs), self.links.command.first_mut(), now);
+            silence_commands(frame.bindings.of(&self.bindings.inputs), self.links.command.first_mut(), now);
         }
         if timed_out {
-            self.drop_forgotten();
+            self.drop_forgotten(now);
             self.image_changed();
+            self.tell_alive(now);
         }
         self.expire_waiting();
     }

@@ -8,11 +8,14 @@
 use heapless::{Deque, String, Vec};
 
 use super::io::{LinkId, PortId, ReplyCode, Transport};
+use super::not_given::{LastNotGiven, NotGiven};
 use super::outcome::Outcomes;
 use super::session::{Event, Sent, Session};
 use super::stops::{COMMAND_QUEUE, STOP_TTL, Stops, Waiting};
 use crate::command::{Keyword, Request};
-use crate::config::{CommandEntry, CommandWhen, MAX_COMMANDS, MAX_PORTS, Span};
+use crate::config::{
+    CommandEntry, CommandText, CommandWhen, MAX_COMMANDS, MAX_PORTS, Span, fill_in, placeholders,
+};
 use crate::link::LinkState;
 use crate::time::{Duration, Instant};
 use crate::wire::dialect::Dialect;
@@ -41,6 +44,26 @@ pub(super) struct CommandField {
     pub when: CommandWhen,
     /// The value in the previous frame; none after silence.
     pub last: Option<i64>,
+    /// Index of its input frame, and its index in the frame.
+    pub place: (u8, u8),
+    /// The table names the values that pick nothing; otherwise it is 0.
+    pub names_idle: bool,
+}
+
+/// What a field's value leads to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Picked {
+    Nothing,
+    /// The table does not have the value.
+    Unknown,
+    /// It would pick a command, but there is no value before it.
+    Based,
+    /// One more command of the port, with the reply code until its result is known.
+    Command {
+        reply: ReplyCode,
+        /// It will not be sent, and there is no further result.
+        is_dropped: bool,
+    },
 }
 
 /// All command tables.
@@ -54,10 +77,14 @@ struct Tables {
 /// One entry of a command table.
 #[derive(Debug, Clone, Copy)]
 struct Entry {
-    value: i64,
+    first: i64,
+    last: i64,
     start: u16,
+    /// 0 if the values pick nothing.
     len: u16,
     keyword: Keyword,
+    /// The text contains the value.
+    has_value: bool,
 }
 
 #[derive(Debug, Clone)]
@@ -79,8 +106,10 @@ pub(super) struct CommandLink {
     struck_at: Option<Instant>,
     /// Until then no connection is given up for a stop that cannot be sent.
     way_made_until: Instant,
-    /// The newest command that each port's values picked.
-    picked: [Option<u16>; MAX_PORTS],
+    /// The newest command that each port's values picked, and the value.
+    picked: [Option<(u16, i64)>; MAX_PORTS],
+    /// The newest value of each port that gave no command.
+    not_given: [Option<LastNotGiven>; MAX_PORTS],
     /// Results of commands since the engine asked last.
     pub outcomes: Outcomes,
 }
@@ -93,8 +122,9 @@ impl Tables {
             tables.texts.push_str(&entry.text).ok()?;
             // Validation has refused everything that is not a command.
             let keyword = Request::parse(entry.text.as_bytes()).map_or(Keyword::State, |r| r.keyword());
-            let entry = Entry { value: entry.value, start, len: entry.text.len() as u16, keyword };
-            tables.entries.push(entry).ok()?;
+            let &CommandEntry { first, last, .. } = entry;
+            let (len, has_value) = (entry.text.len() as u16, placeholders(&entry.text) > 0);
+            tables.entries.push(Entry { first, last, start, len, keyword, has_value }).ok()?;
         }
         Some(tables)
     }
@@ -126,14 +156,20 @@ impl CommandLink {
             struck_at: None,
             way_made_until: Instant::ZERO,
             picked: [None; MAX_PORTS],
+            not_given: [None; MAX_PORTS],
             outcomes: Outcomes::new(),
         })
     }
 
     /// The text of the newest command that a port's values picked.
-    pub(super) fn newest_of(&self, port: PortId) -> Option<&str> {
-        let entry = (*self.picked.get(usize::from(port.0))?)?;
-        self.tables.entry(entry).map(|(_, text)| text)
+    pub(super) fn newest_of(&self, port: PortId) -> Option<CommandText<'_>> {
+        let (entry, value) = (*self.picked.get(usize::from(port.0))?)?;
+        self.tables.entry(entry).map(|(_, text)| CommandText { text, value })
+    }
+
+    /// The newest value of a port that gave no command.
+    pub(super) fn not_given_of(&self, port: PortId) -> Option<&LastNotGiven> {
+        self.not_given.get(usize::from(port.0))?.as_ref()
     }
 
     pub(super) fn transport(&self) -> Transport {
@@ -141,47 +177,106 @@ impl CommandLink {
     }
 
     /// Adds a field and returns its index, or `None` if there are too many.
-    pub(super) fn add_field(&mut self, table: Span, when: CommandWhen) -> Option<u8> {
+    pub(super) fn add_field(&mut self, table: Span, when: CommandWhen, place: (u8, u8)) -> Option<u8> {
         let index = self.fields.len() as u8;
-        self.fields.push(CommandField { table, when, last: None }).ok()?;
+        let names_idle = table.of(&self.tables.entries).iter().any(|entry| entry.len == 0);
+        self.fields.push(CommandField { table, when, last: None, place, names_idle }).ok()?;
         Some(index)
     }
 
-    /// An accepted frame brought a value of a command field. If it picks a command, returns what is
-    /// known at once about `port`'s `nth` command: it waits, or is not sent. [`Self::frame_ends`]
-    /// and [`Self::drop_overtaken`] follow.
+    /// An accepted frame brought a value of a command field. If it picks a command, that is `port`'s
+    /// `nth`, and what is known at once about it is returned: it waits, or is not sent.
+    /// [`Self::frame_ends`] and [`Self::drop_overtaken`] follow.
     pub(super) fn value(
         &mut self,
         field: u8,
         value: Scalar,
         (port, nth): (PortId, u32),
         now: Instant,
-    ) -> Option<ReplyCode> {
-        let place = self.fields.get_mut(usize::from(field))?;
+    ) -> Picked {
+        let Some(place) = self.fields.get_mut(usize::from(field)) else { return Picked::Nothing };
         // Only integer fields can be bound to a table.
         let value = value.as_f64() as i64;
         let before = place.last.replace(value);
-        let (table, when) = (place.table, place.when);
+        let CommandField { table, when, names_idle, .. } = *place;
         let changed = before.is_some_and(|before| before != value);
         if changed {
             self.stops.no_longer_asked(field, now);
         }
         let acts = when == CommandWhen::Frame || changed;
+        if !acts && before.is_some() {
+            return Picked::Nothing;
+        }
         let entries = table.of(&self.tables.entries);
-        let picked = (table.start..).zip(entries).find(|(_, entry)| entry.value == value);
-        let (true, Some((entry, Entry { keyword, .. }))) = (acts, picked) else { return None };
-        if let Some(newest) = self.picked.get_mut(usize::from(port.0)) {
-            *newest = Some(entry);
+        let has = |entry: &Entry| entry.first <= value && value <= entry.last;
+        let found = (table.start..).zip(entries).find(|(_, entry)| has(entry));
+        let Some((entry, &Entry { keyword, len, .. })) = found else {
+            if value == 0 && !names_idle {
+                return Picked::Nothing;
+            }
+            self.tell(port, NotGiven::Unknown, (field, value), now);
+            return Picked::Unknown;
+        };
+        if len == 0 {
+            return Picked::Nothing;
         }
-        let waiting = Waiting { port, entry, field, since: now, nth };
+        if !acts {
+            self.tell(port, NotGiven::Based, (field, value), now);
+            return Picked::Based;
+        }
+        let mut waiting = Waiting { port, entry, field, value, since: now, nth };
         if keyword.is_urgent() {
+            self.is_newest(&waiting);
             self.stops_now = true;
-            self.stops.push(*keyword, waiting);
+            self.stops.push(keyword, waiting);
             self.no_way_before(now + ROOM_WITHIN);
-            return Some(ReplyCode::Pending);
+            return Picked::Command { reply: ReplyCode::Pending, is_dropped: false };
         }
-        let is_queued = self.ordinary.supervisor.is_up() && self.queue.push_back(waiting).is_ok();
-        Some(if is_queued { ReplyCode::Pending } else { ReplyCode::NotSent })
+        if self.stops_now {
+            // Whatever the order of the fields, the port tells what becomes of the stop.
+            self.stops.stays_newest(port, nth);
+            waiting.nth = nth.wrapping_sub(1);
+        } else {
+            self.is_newest(&waiting);
+        }
+        let why = match self.ordinary.supervisor.is_up() {
+            true => self.queue.push_back(waiting).err().map(|_| NotGiven::QueueFull),
+            false => Some(NotGiven::NoLink),
+        };
+        if let Some(why) = why {
+            self.tell(port, why, (field, value), now);
+        }
+        let is_dropped = why.is_some();
+        let reply = if is_dropped && !self.stops_now { ReplyCode::NotSent } else { ReplyCode::Pending };
+        Picked::Command { reply, is_dropped }
+    }
+
+    /// The command is the newest that its port's values picked.
+    fn is_newest(&mut self, command: &Waiting) {
+        if let Some(newest) = self.picked.get_mut(usize::from(command.port.0)) {
+            *newest = Some((command.entry, command.value));
+        }
+    }
+
+    /// Notes why a value gave no command.
+    fn tell(&mut self, port: PortId, why: NotGiven, (field, value): (u8, i64), now: Instant) {
+        let place = self.fields.get(usize::from(field)).map_or((0, 0), |field| field.place);
+        if let Some(last) = self.not_given.get_mut(usize::from(port.0)) {
+            *last = Some(LastNotGiven { at: now, why, frame: place.0, field: place.1, value });
+        }
+    }
+
+    /// A command that waited is not sent.
+    fn drop_command(&mut self, command: Waiting, why: NotGiven, now: Instant) {
+        self.tell(command.port, why, (command.field, command.value), now);
+        self.outcomes.push(command, ReplyCode::NotSent);
+    }
+
+    /// All other commands than urgent ones that wait are not sent.
+    fn drop_queue(&mut self, why: NotGiven, now: Instant) {
+        while let Some(waiting) = self.queue.pop_front() {
+            self.drop_command(waiting, why, now);
+        }
     }
 
     /// All fields of a frame have been handled: an urgent command overtakes the rest, whatever
@@ -193,16 +288,24 @@ impl CommandLink {
     }
 
     /// Drops the commands that an urgent command has overtaken.
-    pub(super) fn drop_overtaken(&mut self) {
+    pub(super) fn drop_overtaken(&mut self, now: Instant) {
         for _ in 0..core::mem::take(&mut self.overtaken) {
             if let Some(waiting) = self.queue.pop_front() {
-                self.outcomes.push(waiting, ReplyCode::NotSent);
+                self.drop_command(waiting, NotGiven::Overtaken, now);
             }
         }
     }
 
-    /// After silence the next value of the field only sets the base. [`Self::drop_forgotten`]
-    /// follows.
+    /// The field's frame is overdue. A field that keeps its base is taken to have its last value
+    /// still: its device sends only changes. [`Self::drop_forgotten`] follows.
+    pub(super) fn silent(&mut self, field: u8, now: Instant) {
+        let when = self.fields.get(usize::from(field)).map(|place| place.when);
+        if when != Some(CommandWhen::Kept) {
+            self.forget(field, now);
+        }
+    }
+
+    /// The next value of the field only sets the base. [`Self::drop_forgotten`] follows.
     pub(super) fn forget(&mut self, field: u8, now: Instant) {
         if let Some(place) = self.fields.get_mut(usize::from(field))
             && place.last.take().is_some()
@@ -212,13 +315,13 @@ impl CommandLink {
     }
 
     /// The device is gone: its waiting commands are dropped.
-    pub(super) fn drop_forgotten(&mut self) {
+    pub(super) fn drop_forgotten(&mut self, now: Instant) {
         for _ in 0..self.queue.len() {
             let Some(waiting) = self.queue.pop_front() else { return };
             let is_there = self.fields.get(usize::from(waiting.field)).is_some_and(|f| f.last.is_some());
             // The queue has moved up by one.
             if !is_there || self.queue.push_back(waiting).is_err() {
-                self.outcomes.push(waiting, ReplyCode::NotSent);
+                self.drop_command(waiting, NotGiven::DeviceGone, now);
             }
         }
     }
@@ -297,9 +400,7 @@ impl CommandLink {
             }
         }
         if link == LinkId::COMMAND {
-            while let Some(waiting) = self.queue.pop_front() {
-                self.outcomes.push(waiting, ReplyCode::NotSent);
-            }
+            self.drop_queue(NotGiven::NoLink, now);
         }
     }
 
@@ -310,6 +411,7 @@ impl CommandLink {
     /// The gateway itself slept: commands picked before are dropped.
     pub(super) fn slept(&mut self, now: Instant) {
         self.fields.iter_mut().for_each(|field| field.last = None);
+        self.drop_queue(NotGiven::Asleep, now);
         for link in [LinkId::COMMAND, LinkId::URGENT] {
             if let Some(session) = self.session(link) {
                 session.supervisor.give_up(now);
@@ -317,7 +419,7 @@ impl CommandLink {
             self.lost(link, now);
         }
         while let Some((_, waiting)) = self.stops.pop(|_| true) {
-            self.outcomes.push(waiting, ReplyCode::NotSent);
+            self.drop_command(waiting, NotGiven::Asleep, now);
         }
     }
 
@@ -380,11 +482,10 @@ impl CommandLink {
             && now >= waiting.since + COMMAND_TTL
         {
             self.queue.pop_front();
-            self.outcomes.push(waiting, ReplyCode::NotSent);
+            self.drop_command(waiting, NotGiven::TooOld, now);
         }
-        let fields = &self.fields;
-        while let Some(old) = self.stops.pop_old(now, |waiting| is_asked(fields, &self.tables, waiting)) {
-            self.outcomes.push(old, ReplyCode::NotSent);
+        while let Some(old) = self.stops.pop_old(now, |waiting| is_asked(&self.fields, waiting)) {
+            self.drop_command(old, NotGiven::TooOld, now);
         }
     }
 
@@ -492,12 +593,17 @@ impl CommandLink {
             LinkId::URGENT => self.urgent.as_mut()?,
             _ => &mut self.ordinary,
         };
-        let (_, text) = self.tables.entry(command.1.entry)?;
-        let sent = session.send(command, text, &self.dialect, out, times);
-        if sent.is_err() {
-            self.outcomes.push(command.1, ReplyCode::NotSent);
+        let (entry, text) = self.tables.entry(command.1.entry)?;
+        let sent = match entry.has_value {
+            false => session.send(command, text, &self.dialect, out, times).ok(),
+            // The configuration was refused if the text were too long.
+            true => fill_in(text, command.1.value)
+                .and_then(|text| session.send(command, &text, &self.dialect, out, times).ok()),
+        };
+        if sent.is_none() {
+            self.drop_command(command.1, NotGiven::Unwritable, times.0);
         }
-        sent.ok()
+        sent
     }
 
     /// Whether an urgent command waits or is unanswered.
@@ -540,7 +646,7 @@ impl CommandLink {
 
     /// Whether the field still has the value that picked the command.
     fn is_asked(&self, waiting: &Waiting) -> bool {
-        is_asked(&self.fields, &self.tables, waiting)
+        is_asked(&self.fields, waiting)
     }
 
     /// Takes the events in `rest`, or those that the clock has completed.
@@ -570,8 +676,6 @@ fn may_go_at(sessions: [Option<&Session>; 2], keyword: Keyword) -> Instant {
     same.map(|sent| sent.at + STOP_TTL).max().unwrap_or(Instant::ZERO)
 }
 
-fn is_asked(fields: &[CommandField], tables: &Tables, waiting: &Waiting) -> bool {
-    let last = fields.get(usize::from(waiting.field)).and_then(|field| field.last);
-    let value = tables.entries.get(usize::from(waiting.entry)).map(|entry| entry.value);
-    last.is_some() && last == value
+fn is_asked(fields: &[CommandField], waiting: &Waiting) -> bool {
+    fields.get(usize::from(waiting.field)).and_then(|field| field.last) == Some(waiting.value)
 }

@@ -67,6 +67,11 @@ pub struct PortCounters {
     pub commands: u32,
     /// Commands that could not be sent.
     pub commands_dropped: u32,
+    /// Values that are in no command table: neither a command nor idle.
+    pub commands_unknown: u32,
+    /// Values that would have picked a command, but only set the base: the first ones after the
+    /// start, silence or a lost device.
+    pub commands_based: u32,
 }
 
 /// Counters of a controller link, in addition to [`crate::link::LinkHistory`]. They wrap.
@@ -99,6 +104,23 @@ pub struct LinkCounters {
     pub round_trip_us: u32,
     /// The longest such time, in microseconds.
     pub round_trip_max_us: u32,
+}
+
+impl PortCounters {
+    /// Frames that were rejected; those for other nodes of a CAN bus are not.
+    pub(super) fn rejected(&self) -> u32 {
+        let all = [
+            self.rejected_not_finite,
+            self.rejected_out_of_range,
+            self.rejected_length,
+            self.rejected_checksum,
+            self.rejected_unreadable,
+            self.rejected_other_device,
+            self.rejected_no_input,
+            self.tail_mismatches,
+        ];
+        all.into_iter().fold(0, u32::wrapping_add)
+    }
 }
 
 impl LinkCounters {

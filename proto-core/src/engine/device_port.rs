@@ -14,16 +14,18 @@ use super::rejection::Rejection;
 use super::sender::{DIGEST_SEED, digest};
 use super::store::Store;
 use super::tap::Tap;
-use super::user::{InputBind, InputTo, OutputBind, number_of};
+use super::user::{InputBind, InputTo, OutputBind, Written, number_of};
+use super::whole_port::{self, MAX_TEXTS, Reader, TextBind, texts_of};
 use crate::config::{CanFramePart, ConfigView, Counted, DeviceFrame, Parts, Recipe, Span};
-use crate::device::{Element, Encoding, Found, FrameLayout, Framer, Overflow, Probe};
+use crate::device::{Cutter, Element, Encoding, Escape, Found, FrameLayout, Framer, Overflow, Probe};
 use crate::image::{Image, bind_to_variable};
 use crate::sysvar::{Direction, SysVar};
+use crate::time::Instant;
 use crate::wire::can::{CanFrame, CanId, MAX_CAN_DATA};
 use crate::wire::scalar::Scalar;
 
 /// Maximum number of frames of one port with a device's own frames, both ways together.
-pub(super) const MAX_DEVICE_FRAMES: usize = 24;
+pub(super) const MAX_DEVICE_FRAMES: usize = 18;
 
 /// One frame of the device.
 #[derive(Debug, Clone)]
@@ -42,10 +44,22 @@ pub(super) struct DeviceCodec {
     pub formats: Vec<DeviceFormat, MAX_DEVICE_FRAMES>,
     pub inputs: u8,
     /// `None` on a CAN bus.
-    pub framer: Option<Framer>,
+    pub reader: Option<Reader>,
+    /// What output frames are sent with.
+    pub escape: Option<Escape>,
+    pub texts: Vec<TextBind, MAX_TEXTS>,
+    /// Bytes outside whole frames that have been counted.
+    pub skipped_bytes: u32,
 }
 
 impl DeviceCodec {
+    /// Whether silence has something to end. On its own, so that other ports do not pay for it.
+    #[cold]
+    #[inline(never)]
+    pub(super) fn has_begun(&self) -> bool {
+        self.reader.as_ref().is_some_and(Reader::has_begun)
+    }
+
     fn input(&self) -> &[DeviceFormat] {
         self.formats.get(..usize::from(self.inputs)).unwrap_or(&[])
     }
@@ -73,8 +87,8 @@ fn probe(format: &DeviceFormat, bindings: &[InputBind], bytes: &[u8]) -> Probe {
     format.layout.probe(elements(format.bindings.of(bindings)), bytes)
 }
 
-fn elements(bindings: &[InputBind]) -> impl Iterator<Item = &Element> + Clone {
-    bindings.iter().map(|binding| &binding.element)
+pub(super) fn elements(bindings: &[InputBind]) -> impl Iterator<Item = Element> {
+    bindings.iter().map(InputBind::element)
 }
 
 impl DeviceCodec {
@@ -87,11 +101,24 @@ impl DeviceCodec {
         mut next_input: u16,
         mut next_output: u16,
     ) -> Result<Self, BuildError> {
-        let mut codec = Self { formats: Vec::new(), inputs: 0, framer: None };
+        let texts = texts_of(config, recipe, [next_input, next_output]);
+        let mut codec = Self {
+            formats: Vec::new(),
+            inputs: 0,
+            reader: None,
+            escape: recipe.stream_part(Direction::Output).and_then(|part| part.escape),
+            texts: texts.ok_or(one_too_many(Counted::Texts, MAX_TEXTS))?,
+            skipped_bytes: 0,
+        };
         let ids: [&[CanFramePart]; 2] = match &recipe.parts {
             Parts::Can { input, output } => [input, output],
             Parts::Stream { .. } => {
-                codec.framer = Some(Framer::new());
+                let cut = recipe.stream_part(Direction::Input);
+                let cutter = cut.and_then(|part| Cutter::new(part.framing, part.escape));
+                codec.reader = Some(match cutter {
+                    Some(cutter) => Reader::Whole { cutter, heard: Instant::ZERO },
+                    None => Reader::Search(Framer::new()),
+                });
                 [&[], &[]]
             }
         };
@@ -133,16 +160,26 @@ impl FieldPort {
         let mut accepted = Accepted::default();
         let (now, usable, bytes) = (store.now, self.is_usable(), *rest);
         let mut left = core::mem::take(rest);
-        let Codec::Device(DeviceCodec { formats, inputs, framer: Some(framer) }) = &mut self.codec else {
-            return accepted;
+        let framer = match &mut self.codec {
+            Codec::Device(DeviceCodec { inputs: 0, .. }) => {
+                self.not_asked_for(bytes, tap, now);
+                return accepted;
+            }
+            Codec::Device(DeviceCodec { reader: Some(Reader::Whole { .. }), .. }) => {
+                *rest = bytes;
+                return self.whole_frames(rest, bindings, store, commands, tap);
+            }
+            Codec::Device(DeviceCodec {
+                formats,
+                inputs,
+                texts,
+                reader: Some(Reader::Search(framer)),
+                skipped_bytes,
+                ..
+            }) => Some((formats.get(..usize::from(*inputs)).unwrap_or(&[]), texts, framer, skipped_bytes)),
+            _ => None,
         };
-        let formats = formats.get(..usize::from(*inputs)).unwrap_or(&[]);
-        if formats.is_empty() {
-            bump(&mut self.counters.rejected_no_input);
-            tap.record(|| came(self.id, now, Err(Rejection::NoInput), None, [bytes, &[], &[]]));
-            keep(&mut self.last_rejection, Rejection::NoInput, None, bytes, now);
-            return accepted;
-        }
+        let Some((formats, texts, framer, noise_bytes)) = framer else { return accepted };
         let mut frames = Frames {
             mode: self.mode,
             bindings,
@@ -165,7 +202,7 @@ impl FieldPort {
                     let taken =
                         (0..).zip(formats).find(|(_, format)| is_this(format)).map(|(nth, format)| {
                             let slot = usize::from(self.first_frame).saturating_add(nth);
-                            frames.take_device(format, frame, slot, &mut accepted)
+                            frames.take_device(format, texts, frame, slot, &mut accepted)
                         });
                     (frame, taken.unwrap_or(Err(Rejection::NoFrame)))
                 }
@@ -182,14 +219,12 @@ impl FieldPort {
         }
         *rest = left;
         let stats = framer.stats();
-        let skipped = stats.skipped_bytes.wrapping_sub(self.counters.resync_bytes);
-        if skipped > 0 {
-            self.counters.resync_bytes = stats.skipped_bytes;
-            // The bytes of a frame with a wrong checksum are kept as that.
-            if !matches!(&self.last_rejection, Some(last) if last.why == Rejection::Checksum && last.at == now)
-            {
-                self.no_frame(bytes, skipped as usize, tap, now);
-            }
+        self.counters.resync_bytes = stats.skipped_bytes;
+        // The bytes of a frame with a wrong checksum were reported as that.
+        let noise = stats.noise_bytes.wrapping_sub(*noise_bytes);
+        if noise > 0 {
+            *noise_bytes = stats.noise_bytes;
+            self.no_frame(bytes, noise as usize, tap, now);
         }
         self.sender.frames_accepted(accepted.frames, usable, &mut self.counters, now);
         accepted
@@ -226,16 +261,17 @@ impl FieldPort {
         let Some((nth, format)) = formats.into_iter().find(|(_, format)| format.id == frame.id()) else {
             return frames.rejected(Rejection::ForeignId);
         };
-        match probe(format, bindings, frame.data()) {
-            Probe::Frame(len) if len == frame.data().len() => {}
-            Probe::Wrong(len) if len == frame.data().len() => frames.rejected(Rejection::Checksum)?,
+        let fields = elements(format.bindings.of(bindings));
+        match format.layout.probe_whole(fields, frame.data()) {
+            Probe::Frame(_) => {}
+            Probe::Wrong(_) => frames.rejected(Rejection::Checksum)?,
             Probe::Other(_) | Probe::No(_) if frame.data().len() == format.layout.lengths().0 => {
                 frames.rejected(Rejection::OtherDevice)?;
             }
             _ => frames.rejected(Rejection::WrongLength)?,
         }
         let slot = usize::from(self.first_frame).saturating_add(nth);
-        frames.take_device(format, frame.data(), slot, accepted)?;
+        frames.take_device(format, &device.texts, frame.data(), slot, accepted)?;
         self.sender.frames_accepted(1, usable, &mut self.counters, now);
         Ok(())
     }
@@ -247,16 +283,18 @@ impl FieldPort {
         image: &Image,
         bindings: &[OutputBind],
         out: &mut [u8],
+        now: Instant,
     ) -> Option<Downward> {
         let Codec::Device(device) = &self.codec else { return None };
         let nth = self.sender.next_can;
         let (frames_sent, reply) = (self.sender.frames_sent, self.reply);
         let encode = |format: &DeviceFormat, out: &mut [u8]| {
-            let bindings = format.bindings.of(bindings);
+            let all = bindings;
+            let bindings = format.bindings.of(all);
             let number = |nth: usize| {
                 bindings.get(nth).map_or(f64::NAN, |binding| number_of(binding, image, frames_sent, reply))
             };
-            format.layout.encode(bindings.iter().map(|binding| &binding.element), number, out)
+            whole_port::encode(device, format, all, image, number, out)
         };
         let formats = device.output();
         if nth == 0 && self.sender.sends_changes() {
@@ -265,7 +303,7 @@ impl FieldPort {
                 let len = encode(format, out).unwrap_or(0);
                 hash = digest(hash, out.get(..len).unwrap_or(&[]));
             }
-            if !self.sender.is_news(hash) {
+            if !self.sender.is_news(hash, now) {
                 self.sender.dismiss();
                 return None;
             }
@@ -276,7 +314,7 @@ impl FieldPort {
             return None;
         };
         let frame = out.get(..len).unwrap_or(&[]);
-        let downward = match device.framer {
+        let downward = match device.reader {
             Some(_) => Downward::Bytes(len),
             None => Downward::Can(CanFrame::filled(format.id, len.min(MAX_CAN_DATA) as u8, |data| {
                 for (slot, &byte) in data.iter_mut().zip(frame) {
@@ -298,7 +336,7 @@ impl FieldPort {
 
 impl<const PORTS: usize> Frames<'_, PORTS> {
     /// Counts a rejection, and is one.
-    fn rejected(&mut self, why: Rejection) -> Result<(), Rejection> {
+    pub(super) fn rejected(&mut self, why: Rejection) -> Result<(), Rejection> {
         let counters = &mut *self.counters;
         bump(match why {
             Rejection::NoInput => &mut counters.rejected_no_input,
@@ -307,7 +345,7 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
             Rejection::WrongLength => &mut counters.rejected_length,
             Rejection::Checksum => &mut counters.rejected_checksum,
             Rejection::OtherDevice => &mut counters.rejected_other_device,
-            Rejection::Unreadable => &mut counters.rejected_unreadable,
+            Rejection::Unreadable | Rejection::Escape => &mut counters.rejected_unreadable,
             Rejection::NotFinite => &mut counters.rejected_not_finite,
             _ => &mut counters.rejected_out_of_range,
         });
@@ -315,9 +353,10 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
     }
 
     /// Applies a frame as a whole or not at all, and counts it in `accepted`.
-    fn take_device(
+    pub(super) fn take_device(
         &mut self,
         format: &DeviceFormat,
+        texts: &[TextBind],
         frame: &[u8],
         slot: usize,
         accepted: &mut Accepted,
@@ -332,6 +371,7 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
                 Ok(_) => {}
             }
         }
+        self.texts_fit(texts, format, frame).or_else(|why| self.rejected(why))?;
         for (binding, value) in values() {
             let Ok(Some(value)) = value else { continue };
             match bound(binding, value) {
@@ -342,6 +382,7 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
                 None => self.apply_user(&binding.to, value),
             }
         }
+        self.take_texts(texts, format, frame);
         if let Some(link) = &mut self.commands {
             link.frame_ends();
         }
@@ -356,7 +397,7 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
 /// a variable.
 fn bound(binding: &InputBind, value: Scalar) -> Option<(SysVar, Scalar)> {
     let InputTo::Variable { var, scale, offset } = binding.to else { return None };
-    let Element::Value { overflow: Overflow::Wrap, .. } = binding.element else {
+    let Written::Value { overflow: Overflow::Wrap, .. } = binding.written else {
         return binding.to.bound(value);
     };
     let number = value.as_f64() * f64::from(scale) + f64::from(offset);

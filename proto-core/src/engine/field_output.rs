@@ -34,13 +34,19 @@ impl FieldPort {
             return None;
         }
         match self.codec {
-            Codec::Stream { .. } => self.next_stream(image, self.outputs.of(bindings), out),
-            Codec::Can { .. } => self.next_can(image, self.outputs.of(bindings)),
-            Codec::Device(_) => self.next_device(image, bindings, out),
+            Codec::Stream { .. } => self.next_stream(image, self.outputs.of(bindings), out, now),
+            Codec::Can { .. } => self.next_can(image, self.outputs.of(bindings), now),
+            Codec::Device(_) => self.next_device(image, bindings, out, now),
         }
     }
 
-    fn next_stream(&mut self, image: &Image, bindings: &[OutputBind], out: &mut [u8]) -> Option<Downward> {
+    fn next_stream(
+        &mut self,
+        image: &Image,
+        bindings: &[OutputBind],
+        out: &mut [u8],
+        now: Instant,
+    ) -> Option<Downward> {
         let Codec::Stream { output: Some(layout), .. } = &self.codec else {
             self.sender.dismiss();
             return None;
@@ -54,7 +60,7 @@ impl FieldPort {
         };
         let frame = encoded.and_then(|len| out.get(..len));
         match frame {
-            Some(frame) if self.sender.is_news(digest(DIGEST_SEED, frame)) => {
+            Some(frame) if self.sender.is_news(digest(DIGEST_SEED, frame), now) => {
                 let len = frame.len();
                 bump(&mut self.counters.frames_out);
                 add(&mut self.counters.bytes_out, len);
@@ -68,8 +74,8 @@ impl FieldPort {
         }
     }
 
-    fn next_can(&mut self, image: &Image, bindings: &[OutputBind]) -> Option<Downward> {
-        if self.sender.next_can == 0 && !self.can_is_news(image, bindings) {
+    fn next_can(&mut self, image: &Image, bindings: &[OutputBind], now: Instant) -> Option<Downward> {
+        if self.sender.next_can == 0 && !self.can_is_news(image, bindings, now) {
             self.sender.dismiss();
             return None;
         }
@@ -105,7 +111,7 @@ impl FieldPort {
         Some((frame, is_last))
     }
 
-    fn can_is_news(&mut self, image: &Image, bindings: &[OutputBind]) -> bool {
+    fn can_is_news(&mut self, image: &Image, bindings: &[OutputBind], now: Instant) -> bool {
         if !self.sender.sends_changes() {
             return true;
         }
@@ -115,6 +121,6 @@ impl FieldPort {
             hash = digest(hash, frame.data());
             nth = nth.saturating_add(1);
         }
-        self.sender.is_news(hash)
+        self.sender.is_news(hash, now)
     }
 }

@@ -3,7 +3,7 @@
 //! In: bytes and CAN frames. Out: values in the store, and frames when they are due. Does not know
 //! how values reach the controller.
 
-use super::command_link::CommandLink;
+use super::command_link::{CommandLink, Picked};
 use super::counters::{PortCounters, add, bump};
 use super::device_port::DeviceCodec;
 use super::io::{BusState, PortId, PortState, ReplyCode};
@@ -109,6 +109,7 @@ impl InputLayout for StreamLayout {
 }
 
 impl InputLayout for crate::recipe::CanFrameLayout<'_> {
+    #[inline(always)]
     fn apply(&self, payload: &[u8], image: &mut ImageBytes) -> Result<Applied, ValueError> {
         Self::apply(self, payload, image)
     }
@@ -179,11 +180,12 @@ impl FieldPort {
         bump(&mut self.counters.asleep);
         let reads_bytes = match &self.codec {
             Codec::Stream { input, .. } => input.is_some(),
-            Codec::Device(device) => device.framer.is_some(),
+            Codec::Device(device) => device.reader.is_some(),
             Codec::Can { .. } => false,
         };
         if reads_bytes {
             add(&mut self.counters.discarded_bytes, bytes.len());
+            self.lose(bytes);
         }
         self.line.heard = now;
     }
@@ -209,8 +211,11 @@ impl FieldPort {
         let bytes = core::mem::take(rest);
         let usable = self.is_usable();
         let Codec::Stream { input, deframer, .. } = &mut self.codec else {
-            *rest = bytes;
-            return self.device_frames(rest, bindings, store, commands, tap);
+            // In a place of its own, so that `rest` can stay in registers.
+            let mut left = bytes;
+            accepted = self.device_frames(&mut left, bindings, store, commands, tap);
+            *rest = left;
+            return accepted;
         };
         let Some(layout) = input else {
             bump(&mut self.counters.rejected_no_input);
@@ -327,15 +332,22 @@ impl FieldPort {
         }
     }
 
-    /// Handles the clock: cycles and silence.
-    pub(super) fn advance<const TAP: usize>(&mut self, tap: &mut Tap<TAP>, now: Instant) {
+    /// Handles the clock: cycles and silence. Returns whether silence has ended a frame, which is
+    /// still to be read with [`Self::frames`].
+    pub(super) fn advance<const TAP: usize>(&mut self, tap: &mut Tap<TAP>, now: Instant) -> bool {
+        let mut is_ended = false;
         if now >= self.partial_until() {
-            self.discard_partial(tap, now);
+            is_ended = self.ends_by_silence();
+            if !is_ended {
+                self.discard_partial(tap, now);
+            }
         }
         self.sender.advance(self.is_usable(), &mut self.counters, now);
+        is_ended
     }
 
     /// When something happens on the port without an input.
+    #[inline]
     pub(super) fn deadline(&self) -> Instant {
         self.partial_until().min(self.sender.deadline(self.line.quiet_at()))
     }
@@ -351,26 +363,25 @@ impl FieldPort {
     }
 
     fn partial_until(&self) -> Instant {
-        match &self.codec {
-            Codec::Stream { deframer, .. } if deframer.pending() > 0 => self.line.heard + self.line.idle_gap,
-            Codec::Device(DeviceCodec { framer: Some(framer), .. }) if !framer.held().is_empty() => {
-                self.line.heard + self.line.idle_gap
-            }
-            _ => Instant::NEVER,
-        }
+        let has_begun = match &self.codec {
+            Codec::Stream { deframer, .. } => deframer.pending() > 0,
+            Codec::Can { .. } => false,
+            Codec::Device(device) => device.has_begun(),
+        };
+        if has_begun { self.line.heard + self.line.idle_gap } else { Instant::NEVER }
     }
 
     #[cold]
-    fn discard_partial<const TAP: usize>(&mut self, tap: &mut Tap<TAP>, now: Instant) {
+    pub(super) fn discard_partial<const TAP: usize>(&mut self, tap: &mut Tap<TAP>, now: Instant) {
         let deframer = match &mut self.codec {
             Codec::Stream { deframer, .. } => deframer,
-            Codec::Device(DeviceCodec { framer: Some(framer), .. }) => {
-                let held = framer.held();
+            Codec::Device(DeviceCodec { reader: Some(reader), .. }) => {
+                let held = reader.held();
                 if !held.is_empty() {
                     tap.record(|| came(self.id, now, Err(Rejection::Partial), None, [held, &[], &[]]));
                     keep(&mut self.last_rejection, Rejection::Partial, None, held, now);
                 }
-                let dropped = framer.discard();
+                let dropped = reader.discard();
                 return add(&mut self.counters.discarded_bytes, dropped);
             }
             _ => return,
@@ -472,24 +483,8 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
                     return Err(Rejection::NotFinite);
                 }
             },
-            Mode::User => {
-                if layout.check(payload).is_err() {
-                    bump(&mut self.counters.rejected_not_finite);
-                    return Err(Rejection::NotFinite);
-                }
-                let frame = self.store.frames.get(slot).ok_or(Rejection::NoInput)?;
-                let bindings = frame.bindings.of(self.bindings);
-                if !fit(bindings, layout.values(payload)) {
-                    bump(&mut self.counters.rejected_out_of_range);
-                    return Err(Rejection::OutOfRange);
-                }
-                for (binding, value) in bindings.iter().zip(layout.values(payload)) {
-                    self.apply_user(&binding.to, value);
-                }
-                if let Some(link) = &mut self.commands {
-                    link.frame_ends();
-                }
-            }
+            // With a context of its own, so that the other mode's can stay in registers.
+            Mode::User => self.again().take_user(layout, payload, slot)?,
         }
         bump(&mut self.counters.frames_in);
         accepted.frames = accepted.frames.wrapping_add(1);
@@ -497,9 +492,44 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
         Ok(())
     }
 
+    #[inline(always)]
+    fn again(&mut self) -> Frames<'_, PORTS> {
+        Frames {
+            mode: self.mode,
+            bindings: self.bindings,
+            reply: self.reply,
+            counters: self.counters,
+            port: self.port,
+            store: self.store,
+            commands: self.commands.as_deref_mut(),
+        }
+    }
+
+    /// Applies the values of a user-defined frame, all or none.
+    #[inline(never)]
+    fn take_user(&mut self, layout: &impl InputLayout, payload: &[u8], slot: usize) -> Result<(), Rejection> {
+        if layout.check(payload).is_err() {
+            bump(&mut self.counters.rejected_not_finite);
+            return Err(Rejection::NotFinite);
+        }
+        let frame = self.store.frames.get(slot).ok_or(Rejection::NoInput)?;
+        let bindings = frame.bindings.of(self.bindings);
+        if !fit(bindings, layout.values(payload)) {
+            bump(&mut self.counters.rejected_out_of_range);
+            return Err(Rejection::OutOfRange);
+        }
+        for (binding, value) in bindings.iter().zip(layout.values(payload)) {
+            self.apply_user(&binding.to, value);
+        }
+        if let Some(link) = &mut self.commands {
+            link.frame_ends();
+        }
+        Ok(())
+    }
+
     pub(super) fn apply_user(&mut self, binding: &InputTo, value: Scalar) {
         match *binding {
-            InputTo::Unused => {}
+            InputTo::Unused | InputTo::Fixed { .. } => {}
             InputTo::Variable { .. } => {
                 if let Some((var, value)) = binding.bound(value) {
                     // It fits: all values were tried before the first was applied.
@@ -513,11 +543,16 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
             InputTo::Command(field) => {
                 if let Some(link) = &mut self.commands {
                     let nth = self.counters.commands.wrapping_add(1);
-                    if let Some(code) = link.value(field, value, (self.port, nth), self.store.now) {
-                        self.counters.commands = nth;
-                        *self.reply = code;
-                        if code == ReplyCode::NotSent {
-                            bump(&mut self.counters.commands_dropped);
+                    match link.value(field, value, (self.port, nth), self.store.now) {
+                        Picked::Nothing => {}
+                        Picked::Unknown => bump(&mut self.counters.commands_unknown),
+                        Picked::Based => bump(&mut self.counters.commands_based),
+                        Picked::Command { reply, is_dropped } => {
+                            self.counters.commands = nth;
+                            *self.reply = reply;
+                            if is_dropped {
+                                bump(&mut self.counters.commands_dropped);
+                            }
                         }
                     }
                 }

@@ -336,8 +336,8 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
 
     /// When something happens without an input.
     pub(super) fn deadline(&self) -> Instant {
-        let mut first = self.deadline_of(LinkId::COMMAND);
-        first = first.min(self.deadline_of(LinkId::STATE)).min(self.deadline_of(LinkId::MODBUS));
+        let mut first = self.find_deadline(LinkId::COMMAND);
+        first = first.min(self.find_deadline(LinkId::STATE)).min(self.find_deadline(LinkId::MODBUS));
         for link in &self.recipes {
             first = first.min(link.deadline()).min(link.supervisor.deadline());
         }
@@ -345,7 +345,13 @@ impl<const UPLINKS: usize> Links<UPLINKS> {
     }
 
     /// When something happens on one link without an input.
+    #[inline(never)]
     pub(super) fn deadline_of(&self, id: LinkId) -> Instant {
+        self.find_deadline(id)
+    }
+
+    #[inline(always)]
+    fn find_deadline(&self, id: LinkId) -> Instant {
         let of = |own: Instant, supervisor: &Supervisor| own.min(supervisor.deadline());
         let deadline = match id {
             LinkId::COMMAND | LinkId::URGENT => self.command.first().map(CommandLink::deadline),

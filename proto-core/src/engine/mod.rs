@@ -26,9 +26,11 @@ mod io;
 mod latency;
 mod links;
 mod modbus_link;
+mod not_given;
 mod outbox;
 mod outcome;
 mod plan;
+mod port_health;
 mod questions;
 mod rejection;
 mod sender;
@@ -42,6 +44,7 @@ mod store;
 mod tap;
 mod uplink;
 mod user;
+mod whole_port;
 
 pub use build::BuildError;
 pub use clock::ASLEEP;
@@ -49,6 +52,7 @@ pub use counters::{LinkCounters, PortCounters};
 pub use io::{BusState, Endpoint, Input, LinkId, LinkKind, Output, PortId, PortState, ReplyCode, Transport};
 pub use latency::Latency;
 pub use links::LinkInfo;
+pub use not_given::{LastNotGiven, NotGiven};
 pub use plan::{Plan, PlanError, Source, WayUp};
 pub use rejection::{KEPT_BYTES, LastRejection, Rejection};
 pub use status::{ControllerStatus, FieldBus, Health, PortStatus, Status, VariableStatus};
@@ -61,6 +65,7 @@ use counters::add;
 use field_output::Downward;
 use field_port::{Accepted, FieldPort};
 use links::Links;
+use port_health::PortsHealth;
 use store::{SafeBytes, Store};
 use user::Bindings;
 
@@ -85,7 +90,7 @@ const _: () = assert!(INPUT_BUFFER >= LEN && INPUT_BUFFER > MAX_STREAM_FRAME);
 ///
 /// `TAP` bytes are for the ring of [`Engine::tap`]; 0 costs nothing.
 ///
-/// `Engine<4, 1, 128>` takes less than 32 KiB.
+/// `Engine<4, 1, 128>` takes less than 36 KiB.
 #[derive(Debug, Clone)]
 pub struct Engine<
     const PORTS: usize = 8,
@@ -98,6 +103,7 @@ pub struct Engine<
     bindings: Bindings<FIELDS>,
     safe_values: Vec<SafeBytes, MAX_SAFE_VALUES>,
     links: Links<UPLINKS>,
+    health: PortsHealth,
     /// Nothing depends on the clock before this. It may be earlier than needed, never later.
     timer_at: Instant,
     /// `timer_at` was computed after the clock was last checked.
@@ -270,6 +276,23 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
     }
 
+    /// The line was silent, which ends a device's frame. The timer is not armed.
+    #[cold]
+    #[inline(never)]
+    fn port_silent(&mut self, id: PortId, now: Instant) {
+        if self.is_deaf {
+            // Nobody knows how long it has waited.
+            if let Some(port) = find_port(&mut self.ports, id) {
+                port.discard_partial(&mut self.tap, now);
+            }
+            return;
+        }
+        let (store, command) = (&mut self.store, self.links.command.first_mut());
+        let Some(port) = find_port(&mut self.ports, id) else { return };
+        let accepted = port.device_frames(&mut &[][..], &self.bindings.inputs, store, command, &mut self.tap);
+        self.after_field(id, &accepted, now);
+    }
+
     #[inline(never)]
     fn port_can(&mut self, id: PortId, frame: &CanFrame, now: Instant) {
         let (store, command) = (&mut self.store, self.links.command.first_mut());
@@ -296,6 +319,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     #[cold]
     fn port_up(&mut self, id: PortId) {
         self.change_port(id, FieldPort::up);
+        self.tell_alive(self.now);
     }
 
     #[cold]
@@ -303,7 +327,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         let Some(port) = find_port(&mut self.ports, id) else { return };
         self.ask = Ask::ALL;
         port.down(&self.bindings.inputs, self.links.command.first_mut(), &mut self.tap, now);
-        self.drop_forgotten();
+        self.drop_forgotten(now);
+        self.tell_alive(now);
     }
 
     #[cold]
@@ -313,7 +338,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         port.bus_state(state, &self.bindings.inputs, self.links.command.first_mut(), now);
         let deadline = port.deadline();
         self.arm(deadline);
-        self.drop_forgotten();
+        self.drop_forgotten(now);
+        self.tell_alive(now);
     }
 
     #[cold]
@@ -364,9 +390,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     }
 
     /// Drops commands whose device is gone.
-    fn drop_forgotten(&mut self) {
+    fn drop_forgotten(&mut self, now: Instant) {
         if let Some(command) = self.links.command.first_mut() {
-            command.drop_forgotten();
+            command.drop_forgotten(now);
             let deadline = command.deadline();
             self.arm(deadline);
         }
@@ -419,7 +445,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
         self.arm(deadline);
         if let Some(command) = self.links.command.first_mut() {
-            command.drop_overtaken();
+            command.drop_overtaken(now);
             let deadline = command.deadline();
             self.arm(deadline);
         }
@@ -446,9 +472,15 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
 
     /// Values in the image changed: checks for rising bits that trigger.
     fn image_changed(&mut self) {
-        if !self.store.watches_bits {
-            return;
+        if self.store.watches_bits {
+            self.check_triggers();
         }
+    }
+
+    // On its own, so that engines without triggers do not pay for its registers.
+    #[inline(never)]
+    fn check_triggers(&mut self) {
+        self.show_health(self.store.now);
         self.ask.ports = true;
         let mut first = Instant::NEVER;
         for port in &mut self.ports {

@@ -6,7 +6,7 @@
 use core::fmt;
 
 use super::io::{LinkId, PortId};
-use crate::config::{ConfigView, Recipe, SendOn};
+use crate::config::{ConfigView, FieldSpec, Recipe, SendOn};
 use crate::image::InputSet;
 use crate::sysvar::{BIT_INPUT_COUNT, COUNT, Direction, INPUT_COUNT, ModbusPlace, SysVar, VarBit};
 
@@ -41,6 +41,7 @@ pub struct Plan {
     read_back: InputSet,
     /// The owners of single bits of byte variables.
     bit_owners: [[Option<PortId>; 8]; BIT_INPUT_COUNT],
+    shows_state: bool,
 }
 
 /// Why a variable has no way.
@@ -157,10 +158,11 @@ impl Plan {
             sources: [None; COUNT],
             read_back: InputSet::EMPTY,
             bit_owners: [[None; 8]; BIT_INPUT_COUNT],
+            shows_state: config.shows_state(),
         };
-        for (port, recipe) in field_ports(config) {
-            for var in inputs_of(config, recipe) {
-                plan.claim(config, var, port)?;
+        for (id, port, recipe) in config.field_ports() {
+            for var in config.owned_by(port, recipe) {
+                plan.claim(config, var, PortId(id))?;
             }
         }
         for (port, recipe) in field_ports(config) {
@@ -227,7 +229,7 @@ impl Plan {
 
     /// Whether the 2001 stream is needed.
     pub(super) fn needs_state(&self) -> bool {
-        !self.read_back.is_empty() || self.sources.contains(&Some(Source::State))
+        self.shows_state || !self.read_back.is_empty() || self.sources.contains(&Some(Source::State))
     }
 
     /// Whether Modbus is needed.
@@ -279,7 +281,9 @@ impl Plan {
         }
         uplinks(config)
             .find(|(_, recipe)| {
-                config.fields_of(recipe, Direction::Output).any(|(_, _, field)| field.variable() == Some(var))
+                config
+                    .fields_of(recipe, Direction::Output)
+                    .any(|(_, _, field)| field.variables().any(|shown| shown == var))
             })
             .map(|(link, _)| Source::Recipe(link))
             .or_else(|| is_exact_modbus(var).then_some(Source::Modbus))
@@ -319,7 +323,7 @@ fn is_one_frame(config: ConfigView<'_>, link: &Recipe) -> bool {
     config.field_ports().any(|(_, port, recipe)| {
         recipe.frames(Direction::Input).any(|(_, fields)| {
             let fields = fields.of(config.fields);
-            let brings = |var| fields.iter().any(|field| field.variable() == Some(var));
+            let brings = |var| fields.iter().flat_map(FieldSpec::variables).any(|brought| brought == var);
             let safe = |var| port.on_timeout.of(config.safe_values).iter().any(|safe| safe.var == var);
             let mut vars = inputs_of(config, link).peekable();
             let first_is_safe = vars.peek().is_some_and(|&var| safe(var));
@@ -334,5 +338,5 @@ pub(super) fn shown_by<'a>(config: ConfigView<'a>, recipe: &'a Recipe) -> impl I
         SendOn::Rising { var, .. } => Some(var),
         _ => None,
     };
-    config.fields_of(recipe, Direction::Output).filter_map(|(_, _, field)| field.variable()).chain(trigger)
+    config.fields_of(recipe, Direction::Output).flat_map(|(_, _, field)| field.variables()).chain(trigger)
 }

@@ -63,6 +63,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             at: self.forward(now),
             ports: &self.ports,
             frames: &self.store.frames,
+            health: &self.health,
             image: &self.store.image,
             bits: &self.store.bits,
             links: self.links.view(),

@@ -19,7 +19,7 @@ pub enum Rejection {
     OutOfRange,
     /// A CAN id that the recipe does not have (D17).
     ForeignId,
-    /// A CAN frame of another length than the recipe's (D17).
+    /// A frame of another length than the recipe's (D17).
     WrongLength,
     /// A remote frame (D17).
     Remote,
@@ -35,11 +35,13 @@ pub enum Rejection {
     Asleep,
     /// It violates the link's protocol.
     Malformed,
+    /// Escape bytes that mean nothing.
+    Escape,
 }
 
 impl Rejection {
     /// All reasons.
-    pub const ALL: [Self; 13] = [
+    pub const ALL: [Self; 14] = [
         Self::NoFrame,
         Self::Partial,
         Self::NotFinite,
@@ -53,6 +55,7 @@ impl Rejection {
         Self::NoInput,
         Self::Asleep,
         Self::Malformed,
+        Self::Escape,
     ];
 
     /// A short text, such as `no frame found`.
@@ -63,7 +66,7 @@ impl Rejection {
             Self::NotFinite => "a value is not finite",
             Self::OutOfRange => "a value does not fit its variable",
             Self::ForeignId => "a CAN id that the recipe does not have",
-            Self::WrongLength => "a CAN frame of another length",
+            Self::WrongLength => "a frame of another length",
             Self::Remote => "a remote frame",
             Self::Checksum => "a wrong checksum",
             Self::Unreadable => "a field is not a number",
@@ -71,6 +74,7 @@ impl Rejection {
             Self::NoInput => "the recipe has no input part",
             Self::Asleep => "waited while the gateway slept",
             Self::Malformed => "a violation of the protocol",
+            Self::Escape => "wrong escape bytes",
         }
     }
 }

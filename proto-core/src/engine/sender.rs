@@ -5,7 +5,7 @@
 use super::counters::{PortCounters, add, bump};
 use super::latency::Since;
 use crate::config::{OnStale, SendOn};
-use crate::image::{GroupId, Image, MAX_GROUPS, VarSet};
+use crate::image::{ExtraSet, GroupId, Image, MAX_GROUPS, VarSet};
 use crate::schedule::Grid;
 use crate::sysvar::SysVar;
 use crate::time::{Duration, Instant};
@@ -40,8 +40,11 @@ pub(super) struct Sender {
     grid: Option<Grid>,
     /// Groups of the values: all must be known, and fresh unless the recipe holds.
     pub sources: GroupSet,
-    /// The variables: all must be readable.
+    /// The variables, and the values of the state packet: all must be readable.
     pub shown: VarSet,
+    pub shown_extra: ExtraSet,
+    /// Whether it shows the health of ports.
+    pub shows_health: bool,
     due: bool,
     /// Since when the frame has been due, until that is taken.
     due_since: Since,
@@ -49,6 +52,9 @@ pub(super) struct Sender {
     /// The next CAN frame of a cycle that is being handed over.
     pub next_can: usize,
     digest: Option<u64>,
+    /// Of a port that sends only changes: after this long it sends all the same.
+    pub refresh: Duration,
+    refresh_at: Instant,
     last_bit: Option<bool>,
     pub frames_sent: u32,
 }
@@ -70,11 +76,15 @@ impl Sender {
             grid: periodic.then(|| Grid::starting_at(Instant::ZERO, cycle)),
             sources: GroupSet::default(),
             shown: VarSet::EMPTY,
+            shown_extra: ExtraSet::EMPTY,
+            shows_health: false,
             due: false,
             due_since: Since::NONE,
             in_flight: false,
             next_can: 0,
             digest: None,
+            refresh: Duration::MAX,
+            refresh_at: Instant::NEVER,
             last_bit: None,
             frames_sent: 0,
         }
@@ -103,6 +113,14 @@ impl Sender {
         self.due = false;
         self.next_can = 0;
         self.digest = None;
+    }
+
+    /// When the next cycle after `now` begins; [`Instant::NEVER`] if frames are not sent by cycle.
+    pub(super) fn next_cycle(&self, now: Instant) -> Instant {
+        self.grid.as_ref().map_or(Instant::NEVER, |grid| match grid.next() {
+            next if next > now => next,
+            next => (next + grid.period()).max(now + Duration::from_micros(1)),
+        })
     }
 
     /// Everything handed over has left.
@@ -177,20 +195,24 @@ impl Sender {
 
     /// Whether the values may be sent at `now`: all known, and fresh unless the recipe holds.
     pub(super) fn may_show(&self, image: &Image, now: Instant) -> bool {
-        image.can_read(&self.shown)
+        image.can_read(&self.shown, self.shown_extra)
             && self.sources.iter().all(|group| match image.stamp_of(group) {
                 Some(at) => self.on_stale == OnStale::Hold || now.saturating_since(at) <= self.stale_after,
                 None => false,
             })
     }
 
-    /// Whether a frame with this digest is new, on a port that sends only changes.
-    pub(super) fn is_news(&mut self, digest: u64) -> bool {
+    /// Whether a frame with this digest is new, on a port that sends only changes, or is to be sent
+    /// again.
+    pub(super) fn is_news(&mut self, digest: u64, now: Instant) -> bool {
         if self.on != SendOn::Change {
             return true;
         }
-        let news = self.digest != Some(digest);
+        let news = self.digest != Some(digest) || now >= self.refresh_at;
         self.digest = Some(digest);
+        if news {
+            self.refresh_at = now + self.refresh;
+        }
         news
     }
 

@@ -3,15 +3,16 @@
 use heapless::Vec;
 
 use super::connection::Connection;
-use super::counters::{LinkCounters, bump};
+use super::counters::{LinkCounters, add, bump};
 use super::io::Transport;
 use super::store::Store;
-use crate::image::{GroupId, InputSet};
+use crate::config::StateValue;
+use crate::image::{GroupId, Image, InputSet, MAX_EXTRA};
 use crate::link::{LinkTimings, Supervisor};
 use crate::sysvar::{COUNT, SysVar};
 use crate::time::Duration;
 use crate::wire::dialect::Dialect;
-use crate::wire::scalar::Scalar;
+use crate::wire::scalar::{Scalar, ScalarType};
 use crate::wire::state::{StateStream, StateView};
 
 /// A stream that is silent for this long is reopened: twenty packets are missing.
@@ -35,6 +36,28 @@ pub(super) struct StateLink {
     read_back_bits: InputSet,
     /// Codes of mode, robot, program and safety in the newest packet.
     pub codes: [u8; 4],
+    /// Other values of the packet that ports show.
+    pub kept: Vec<Kept, MAX_EXTRA>,
+}
+
+/// A value of the packet that is kept among the image's extra values.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Kept {
+    pub value: StateValue,
+    /// Its place among the extra values.
+    pub extra: u8,
+    /// Its place in the packet.
+    pub offset: u16,
+    pub ty: ScalarType,
+}
+
+impl Kept {
+    /// The value in a packet; not a number if it cannot be read.
+    fn read(&self, view: &StateView<'_>) -> f64 {
+        let bytes = view.as_bytes().get(usize::from(self.offset)..).unwrap_or(&[]);
+        let bytes = bytes.get(..self.ty.size()).unwrap_or(&[]);
+        Scalar::decode(self.ty, bytes).map_or(f64::NAN, |value| value.as_f64())
+    }
 }
 
 impl StateLink {
@@ -50,6 +73,7 @@ impl StateLink {
             read_back,
             read_back_bits: InputSet::EMPTY,
             codes: [0; 4],
+            kept: Vec::new(),
         }
     }
 
@@ -85,6 +109,9 @@ impl Connection for StateLink {
                         if !view.read_var(var).is_some_and(|value| store.image.receive(var, value)) {
                             bump(&mut self.counters.unreadable);
                         }
+                    }
+                    if !self.kept.is_empty() {
+                        add(&mut self.counters.unreadable, keep(&self.kept, &view, &mut store.image));
                     }
                     for var in not_live.iter() {
                         if view.read_var(var).is_some_and(|value| store.image.set(var, value).is_ok()) {
@@ -131,6 +158,14 @@ fn read_bits<const PORTS: usize>(view: &StateView<'_>, bytes: &InputSet, store: 
             store.read_back.insert(var);
         }
     }
+}
+
+/// Keeps the packet's other values that ports show; returns how many are unreadable. On its own, so
+/// that a gateway without them does not pay for its registers.
+#[inline(never)]
+fn keep(kept: &[Kept], view: &StateView<'_>, image: &mut Image) -> usize {
+    let unreadable = kept.iter().filter(|kept| !image.receive_extra(kept.extra, kept.read(view)));
+    unreadable.count()
 }
 
 /// Confirms safe values that the controller shows. A value shown by an old packet, or overwritten

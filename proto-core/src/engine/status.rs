@@ -13,8 +13,11 @@ use super::field_port::{Codec, FieldPort};
 use super::io::{BusState, PortId, PortState, ReplyCode};
 use super::latency::Latency;
 use super::links::{LinkInfo, LinksView};
+use super::not_given::LastNotGiven;
+use super::port_health::PortsHealth;
 use super::rejection::LastRejection;
 use super::store::InputFrame;
+use crate::config::CommandText;
 use crate::image::{GroupId, Image};
 use crate::link::LinkState;
 use crate::sysvar::{Direction, SysVar, VarBit};
@@ -28,6 +31,7 @@ pub struct Status<'a> {
     pub(super) at: Instant,
     pub(super) ports: &'a [FieldPort],
     pub(super) frames: &'a [InputFrame],
+    pub(super) health: &'a PortsHealth,
     pub(super) image: &'a Image,
     pub(super) bits: &'a Bits,
     pub(super) links: LinksView<'a>,
@@ -84,8 +88,10 @@ pub struct PortStatus<'a> {
     pub overdue: usize,
     /// Result of the newest command that one of its values picked.
     pub reply: ReplyCode,
-    /// The text of that command, such as `run(pick.jspf)`.
-    pub command: Option<&'a str>,
+    /// That command, such as `run(pick.jspf)`.
+    pub command: Option<CommandText<'a>>,
+    /// The newest value that gave no command, and why.
+    pub last_not_given: Option<&'a LastNotGiven>,
     /// The newest rejection. A CAN frame with an unknown id replaces no other rejection: on a
     /// shared bus it is for another node.
     pub last_rejection: Option<&'a LastRejection>,
@@ -231,8 +237,9 @@ impl<'a> Status<'a> {
         if var.direction() != Direction::Input || self.bits.bytes.contains(var) {
             return None;
         }
-        let frame = self.frames.iter().find(|frame| frame.set.contains(var))?;
-        self.ports.get(usize::from(frame.port)).map(|port| port.name.as_str())
+        let frame = self.frames.iter().find(|frame| frame.set.contains(var));
+        let port = frame.map(|frame| frame.port).or_else(|| self.health.owner(var))?;
+        self.ports.get(usize::from(port)).map(|port| port.name.as_str())
     }
 
     fn port(&self, index: usize, port: &'a FieldPort) -> PortStatus<'a> {
@@ -244,7 +251,7 @@ impl<'a> Status<'a> {
         let is_can = match &port.codec {
             Codec::Stream { .. } => false,
             Codec::Can { .. } => true,
-            Codec::Device(device) => device.framer.is_none(),
+            Codec::Device(device) => device.reader.is_none(),
         };
         let bus = if is_can { FieldBus::Can { state: port.bus } } else { FieldBus::Rs485 };
         PortStatus {
@@ -257,6 +264,7 @@ impl<'a> Status<'a> {
             overdue,
             reply: port.reply,
             command: self.links.command.and_then(|link| link.newest_of(port.id)),
+            last_not_given: self.links.command.and_then(|link| link.not_given_of(port.id)),
             last_rejection: port.last_rejection.as_ref(),
             counters: &port.counters,
         }

@@ -3,7 +3,7 @@
 //! ```text
 //! { "time_us", "sleeps",
 //!   "ports": { NAME: { "bus", "bus_state"?, "recipe", "state", "age_ms"?, "overdue", "reply",
-//!                      "command"?, "last_rejection"?, "counters" } },
+//!                      "command"?, "last_not_given"?, "last_rejection"?, "counters" } },
 //!   "links": { NAME: { "kind", "state", "history", "counters" } },
 //!   "controller"?: { "mode", "robot", "program", "safety", "age_ms" },
 //!   "values": { VARIABLE: { "value", "age_ms", "owner"? } },
@@ -17,6 +17,7 @@ use core::fmt;
 use serde::ser::{Serialize, SerializeMap, Serializer};
 
 use super::links::LinkInfo;
+use super::not_given::LastNotGiven;
 use super::rejection::LastRejection;
 use super::status::{ControllerStatus, FieldBus, PortStatus, Status, VariableStatus};
 use crate::time::Instant;
@@ -114,12 +115,29 @@ impl Serialize for At<PortStatus<'_>> {
         map.serialize_entry("overdue", &port.overdue)?;
         map.serialize_entry("reply", port.reply.name())?;
         if let Some(command) = port.command {
-            map.serialize_entry("command", command)?;
+            map.serialize_entry("command", &Text(command))?;
+        }
+        if let Some(last) = port.last_not_given {
+            map.serialize_entry("last_not_given", &At(last, *at))?;
         }
         if let Some(rejection) = port.last_rejection {
             map.serialize_entry("last_rejection", &Rejected(rejection, *at))?;
         }
         map.serialize_entry("counters", port.counters)?;
+        map.end()
+    }
+}
+
+impl Serialize for At<&LastNotGiven> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let &Self(last, at) = self;
+        let mut map = serializer.serialize_map(None)?;
+        map.serialize_entry("why", &last.why)?;
+        map.serialize_entry("text", last.why.text())?;
+        map.serialize_entry("age_ms", &at.saturating_since(last.at).as_millis())?;
+        map.serialize_entry("frame", &last.frame)?;
+        map.serialize_entry("field", &last.field)?;
+        map.serialize_entry("value", &last.value)?;
         map.end()
     }
 }

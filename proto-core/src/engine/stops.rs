@@ -16,8 +16,9 @@ pub(super) const MAX_STOPS: usize = 4 * MAX_PORTS;
 /// take to be acknowledged.
 pub(super) const STOP_TTL: Duration = Duration::from_secs(1);
 
-/// A command that a value picked.
+/// A command that a value picked. Packed, because there is room for many.
 #[derive(Debug, Clone, Copy)]
+#[repr(C, packed(4))]
 pub(super) struct Waiting {
     /// When it was picked; for an urgent one whose device no longer asks for it, when that ended.
     pub since: Instant,
@@ -27,6 +28,8 @@ pub(super) struct Waiting {
     pub port: PortId,
     /// The command field that picked it.
     pub field: u8,
+    /// The value that picked it.
+    pub value: i64,
 }
 
 /// The urgent commands that wait, in the order in which they were picked.
@@ -58,6 +61,15 @@ impl Stops {
     pub(super) fn push_again(&mut self, keyword: Keyword, command: Waiting) {
         if !self.0.iter().any(|other| other.0 == keyword && other.1.port == command.port) {
             let _ = self.0.push((keyword, command));
+        }
+    }
+
+    /// Another command of the port follows in the frame that picked the port's newest urgent one,
+    /// which stays the newest.
+    pub(super) fn stays_newest(&mut self, port: PortId, nth: u32) {
+        let newest = nth.wrapping_sub(1);
+        for (_, command) in self.0.iter_mut().filter(|(_, c)| c.port == port && c.nth == newest) {
+            command.nth = nth;
         }
     }
 

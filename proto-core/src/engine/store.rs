@@ -38,6 +38,15 @@ impl InputFrame {
     }
 }
 
+/// What is overdue.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Overdue {
+    /// A frame, and how many waiting values were dropped.
+    Frame(InputFrame, usize),
+    /// What the robot is told about the health of ports.
+    Health,
+}
+
 /// A safe value in the form of the image.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct SafeBytes {
@@ -61,8 +70,8 @@ pub(super) struct Store<const PORTS: usize> {
     pub latency: Latency,
     /// The instant of this call of the engine.
     pub now: Instant,
-    /// Some port sends on a rising bit, so the engine checks the image after each frame, even if
-    /// several came at once.
+    /// Some port sends on a rising bit, or shows the health of ports when it is asked, so the engine
+    /// checks the image after each frame, even if several came at once.
     pub watches_bits: bool,
     pub image: Image,
     pub outbox: Outbox,
@@ -93,6 +102,10 @@ pub(super) struct Store<const PORTS: usize> {
     pub reachable: InputSet,
     /// Variables of whose bits each has its owner.
     pub bits: Bits,
+    /// Variables that tell the robot the health of ports.
+    pub health: InputSet,
+    /// When they are checked again.
+    health_at: Stamp,
     /// Values dropped because a link was lost, per port.
     lost: [u32; PORTS],
     has_lost: bool,
@@ -124,6 +137,8 @@ impl<const PORTS: usize> Store<PORTS> {
             era: 0,
             reachable: InputSet::EMPTY,
             bits: Bits::new(),
+            health: InputSet::EMPTY,
+            health_at: Stamp::NEVER,
             lost: [0; PORTS],
             has_lost: false,
             next_overdue: Stamp::NEVER,
@@ -222,17 +237,21 @@ impl<const PORTS: usize> Store<PORTS> {
         }
     }
 
-    /// Handles the first overdue frame: sets its variables to their safe values. Returns the frame
-    /// and how many waiting values were dropped. Call it again until `None`.
-    pub(super) fn next_timeout(&mut self, safe: &[SafeBytes]) -> Option<(InputFrame, usize)> {
+    /// Handles the first thing overdue; the variables of a frame get their safe values. Call it again
+    /// until `None`.
+    pub(super) fn next_timeout(&mut self, safe: &[SafeBytes]) -> Option<Overdue> {
         let now = self.now;
         if now < self.next_overdue.get() {
             return None;
         }
         let overdue = self.frames.iter_mut().enumerate().find(|(_, frame)| frame.overdue_at <= now);
         let Some((nth, frame)) = overdue else {
+            if self.health_at.get() <= now {
+                self.health_at = Stamp::NEVER;
+                return Some(Overdue::Health);
+            }
             let next = self.frames.iter().map(|frame| frame.overdue_at).min();
-            self.next_overdue = Stamp::at(next.unwrap_or(Instant::NEVER));
+            self.next_overdue = Stamp::at(next.unwrap_or(Instant::NEVER).min(self.health_at.get()));
             return None;
         };
         frame.overdue_at = Instant::NEVER;
@@ -256,6 +275,8 @@ impl<const PORTS: usize> Store<PORTS> {
                 *target = byte;
             }
             self.outbox.offer_safe(queue, var, value.bytes[0], now);
+            // Its owner may never have sent it.
+            self.live.insert(var);
             self.safe.insert(var);
             self.unconfirmed.insert(var);
             self.unconfirmed_since = now;
@@ -270,7 +291,25 @@ impl<const PORTS: usize> Store<PORTS> {
             }
             self.bits_changed();
         }
-        Some((frame, dropped))
+        Some(Overdue::Frame(frame, dropped))
+    }
+
+    /// At the first tick, the frames that are overdue from the start are handled.
+    pub(super) fn is_overdue_from_start(&mut self) {
+        self.next_overdue = Stamp::at(Instant::ZERO);
+    }
+
+    /// The health of ports is checked at this time.
+    pub(super) fn check_health_at(&mut self, at: Instant) {
+        self.health_at = Stamp::at(at);
+        self.next_overdue = Stamp::at(self.next_overdue.get().min(at));
+    }
+
+    /// These variables of the health of ports have new values: they are written if their link is up,
+    /// else when it comes up.
+    pub(super) fn tell(&mut self, vars: &InputSet) {
+        self.live = self.live.or(vars);
+        self.outbox.again(&vars.and(&self.reachable));
     }
 
     /// Drops values that have waited for longer than their port's timeout, and counts them there.
@@ -336,9 +375,11 @@ impl<const PORTS: usize> Store<PORTS> {
         self.bits_changed();
     }
 
-    /// A link came up: from now on frames are passed on to it. Earlier ones are not.
+    /// A link came up: from now on frames are passed on to it. Earlier ones are not. The health of
+    /// ports is the present one.
     pub(super) fn link_up(&mut self, vars: &InputSet) {
         self.reachable = self.reachable.or(&vars.minus(&self.bits.bytes));
+        self.outbox.again(&vars.and(&self.health).and(&self.live));
         self.bits.link_up(&vars.and(&self.bits.bytes));
     }
 

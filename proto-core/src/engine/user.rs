@@ -5,18 +5,70 @@ use heapless::Vec;
 use super::command_link::CommandLink;
 use super::io::ReplyCode;
 use crate::config::OutputBinding;
-use crate::device::{Element, wrap};
+use crate::device::{Element, Encoding, Length, Overflow, Text, wrap};
 use crate::image::{Image, bind_to_variable, saturate_to_field};
 use crate::recipe::model::MAX_FIELDS;
 use crate::sysvar::SysVar;
 use crate::time::Instant;
 use crate::wire::scalar::{Scalar, ScalarType};
 
+/// How a field is written in a device's own frame: an [`Element`] without its constant, in half its
+/// size. There is one for every field of every port.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Written {
+    Value { encoding: Encoding, overflow: Overflow },
+    Fixed { encoding: Encoding },
+    Padding { len: u8, fill: u8 },
+    Text(Text),
+    Length(Length),
+}
+
+impl Written {
+    pub(super) const fn new(element: Element) -> Self {
+        match element {
+            Element::Value { encoding, overflow } => Self::Value { encoding, overflow },
+            Element::Fixed { encoding, .. } => Self::Fixed { encoding },
+            Element::Padding { len, fill } => Self::Padding { len, fill },
+            Element::Text(text) => Self::Text(text),
+            Element::Length(length) => Self::Length(length),
+        }
+    }
+
+    const fn element(self, constant: i64) -> Element {
+        match self {
+            Self::Value { encoding, overflow } => Element::Value { encoding, overflow },
+            Self::Fixed { encoding } => Element::Fixed { encoding, value: constant },
+            Self::Padding { len, fill } => Element::Padding { len, fill },
+            Self::Text(text) => Element::Text(text),
+            Self::Length(length) => Element::Length(length),
+        }
+    }
+}
+
 /// An input field: what is done with its value, and how it is written in a device's own frame.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct InputBind {
     pub to: InputTo,
-    pub element: Element,
+    pub written: Written,
+}
+
+impl InputBind {
+    pub(super) fn new(to: InputTo, element: Element) -> Self {
+        let to = match element {
+            Element::Fixed { value, .. } => {
+                InputTo::Fixed { high: value.unbounded_shr(32) as i32, low: value as u32 }
+            }
+            _ => to,
+        };
+        Self { to, written: Written::new(element) }
+    }
+
+    pub(super) fn element(&self) -> Element {
+        self.written.element(match self.to {
+            InputTo::Fixed { high, low } => i64::from(high).unbounded_shl(32) | i64::from(low),
+            _ => 0,
+        })
+    }
 }
 
 /// What is done with the value of an input field.
@@ -34,6 +86,11 @@ pub(super) enum InputTo {
     Bits {
         var: SysVar,
         mask: u8,
+    },
+    /// The halves of a constant, so that they need no more alignment than the others.
+    Fixed {
+        high: i32,
+        low: u32,
     },
 }
 
@@ -58,7 +115,18 @@ pub(super) fn fit(bindings: &[InputBind], values: impl Iterator<Item = Scalar>) 
     })
 }
 
-/// After silence the next values pick no commands; they only set the base.
+/// The frame with these fields is overdue: the next values pick no commands, unless the fields keep
+/// their base.
+pub(super) fn silence_commands(bindings: &[InputBind], commands: Option<&mut CommandLink>, now: Instant) {
+    let Some(link) = commands else { return };
+    for binding in bindings {
+        if let InputTo::Command(field) = binding.to {
+            link.silent(field, now);
+        }
+    }
+}
+
+/// The device is gone: the next values pick no commands; they only set the base.
 pub(super) fn forget_commands(bindings: &[InputBind], commands: Option<&mut CommandLink>, now: Instant) {
     let Some(link) = commands else { return };
     for binding in bindings {
@@ -69,12 +137,33 @@ pub(super) fn forget_commands(bindings: &[InputBind], commands: Option<&mut Comm
 }
 
 /// An output field: its type, the source of its value, and how it is written in a device's own
-/// frame.
+/// frame. Packed, because there is room for many and the constant alone would align it.
 #[derive(Debug, Clone, Copy)]
+#[repr(C, packed(2))]
 pub(super) struct OutputBind {
-    pub ty: ScalarType,
     pub from: OutputBinding,
-    pub element: Element,
+    pub ty: ScalarType,
+    /// The place of its value among the image's extra values, if it is there.
+    pub extra: u8,
+    pub written: Written,
+}
+
+impl OutputBind {
+    pub(super) fn new(ty: ScalarType, from: OutputBinding, element: Element) -> Self {
+        let from = match element {
+            // Exact: no constant has more than 53 bits.
+            Element::Fixed { value, .. } => OutputBinding::Constant(value as f64),
+            _ => from,
+        };
+        Self { ty, from, extra: 0, written: Written::new(element) }
+    }
+
+    pub(super) fn element(&self) -> Element {
+        self.written.element(match self.from {
+            OutputBinding::Constant(value) => value as i64,
+            _ => 0,
+        })
+    }
 }
 
 /// The values of the fields.
@@ -85,7 +174,7 @@ pub(super) fn values(
     reply: ReplyCode,
 ) -> Vec<Scalar, MAX_FIELDS> {
     let mut values = Vec::new();
-    for &OutputBind { ty, from, .. } in bindings {
+    for &OutputBind { ty, from, extra, .. } in bindings {
         let value = match from {
             OutputBinding::Variable { var, scale, offset } => {
                 saturate_to_field(ty, image.value(var).as_f64(), scale, offset)
@@ -93,6 +182,12 @@ pub(super) fn values(
             OutputBinding::Constant(value) => saturate_to_field(ty, value, 1.0, 0.0),
             OutputBinding::Counter => wrapping_count(ty, frames_sent),
             OutputBinding::Reply => saturate_to_field(ty, f64::from(reply as u8), 1.0, 0.0),
+            OutputBinding::Port { value, .. } if value.is_count() => {
+                wrapping_count(ty, image.extra(extra) as u32)
+            }
+            OutputBinding::State { scale, offset, .. } | OutputBinding::Port { scale, offset, .. } => {
+                saturate_to_field(ty, image.extra(extra), scale, offset)
+            }
         };
         // A part has no more fields than there is room for.
         let _ = values.push(value);
@@ -107,13 +202,22 @@ pub(super) fn number_of(binding: &OutputBind, image: &Image, frames_sent: u32, r
             image.value(var).as_f64() * f64::from(scale) + f64::from(offset)
         }
         OutputBinding::Constant(value) => value,
-        OutputBinding::Counter => {
-            // It never turns negative, nor stays at the highest number.
-            let high = binding.element.encoding().map_or(0.0, |encoding| encoding.range().1);
-            wrap(f64::from(frames_sent), 0.0, high.min(f64::from(u32::MAX))).unwrap_or(f64::NAN)
-        }
+        OutputBinding::Counter => wrapping_number(binding, f64::from(frames_sent)),
         OutputBinding::Reply => f64::from(reply as u8),
+        OutputBinding::Port { value, .. } if value.is_count() => {
+            wrapping_number(binding, image.extra(binding.extra))
+        }
+        OutputBinding::State { scale, offset, .. } | OutputBinding::Port { scale, offset, .. } => {
+            image.extra(binding.extra) * f64::from(scale) + f64::from(offset)
+        }
     }
+}
+
+/// A count as the field of a device's frame shows it: it never turns negative, nor stays at the
+/// highest number.
+fn wrapping_number(binding: &OutputBind, count: f64) -> f64 {
+    let high = binding.element().encoding().map_or(0.0, |encoding| encoding.range().1);
+    wrap(count, 0.0, high.min(f64::from(u32::MAX))).unwrap_or(f64::NAN)
 }
 
 /// The bindings of all ports; ports name ranges of it.
@@ -124,7 +228,7 @@ pub(super) struct Bindings<const FIELDS: usize> {
 }
 
 /// The count in the field's type, wrapping.
-fn wrapping_count(ty: ScalarType, count: u32) -> Scalar {
+pub(super) fn wrapping_count(ty: ScalarType, count: u32) -> Scalar {
     match ty {
         ScalarType::Byte => Scalar::Byte(count as u8),
         ScalarType::Char => Scalar::Char((count & 0x7F) as i8),

@@ -9,7 +9,7 @@ mod bit_set;
 mod set;
 
 pub(crate) use bit_set::BitSet;
-pub(crate) use set::{InputSet, VarSet};
+pub(crate) use set::{ExtraSet, InputSet, VarSet};
 
 use crate::sysvar::{COUNT, IMAGE_BYTES, SysVar};
 use crate::time::{Duration, Instant, Stamp};
@@ -20,6 +20,9 @@ pub(crate) type ImageBytes = [u8; IMAGE_BYTES];
 
 /// Maximum number of groups of variables that arrive together.
 pub(crate) const MAX_GROUPS: usize = 96;
+
+/// Maximum number of values beside the system variables that ports show.
+pub(crate) const MAX_EXTRA: usize = 32;
 
 /// A group of variables that arrive together and so have one age: a field frame, a Modbus block, a
 /// packet.
@@ -37,8 +40,11 @@ pub struct Image {
     stamps: [Stamp; MAX_GROUPS],
     /// Variables whose newest value could not be read, whatever else their group brought.
     unreadable: VarSet,
-    /// Whether there are any.
+    /// Whether there are any, among the extra values too.
     any_unreadable: bool,
+    /// Values beside the system variables that ports show, and which of them are unreadable.
+    extra: [f64; MAX_EXTRA],
+    unreadable_extra: ExtraSet,
 }
 
 impl Image {
@@ -50,6 +56,8 @@ impl Image {
             stamps: [Stamp::NEVER; MAX_GROUPS],
             unreadable: VarSet::EMPTY,
             any_unreadable: false,
+            extra: [0.0; MAX_EXTRA],
+            unreadable_extra: ExtraSet::EMPTY,
         }
     }
 
@@ -149,7 +157,7 @@ impl Image {
     pub(crate) fn all_readable(&mut self, vars: impl Iterator<Item = SysVar>) {
         if self.any_unreadable {
             vars.for_each(|var| self.unreadable.remove(var));
-            self.any_unreadable = !self.unreadable.is_empty();
+            self.any_unreadable = !self.unreadable.is_empty() || self.unreadable_extra != ExtraSet::EMPTY;
         }
     }
 
@@ -158,9 +166,32 @@ impl Image {
         !self.unreadable.contains(var)
     }
 
-    /// Whether the newest values of all these variables were readable.
-    pub(crate) fn can_read(&self, vars: &VarSet) -> bool {
-        !self.any_unreadable || !self.unreadable.meets(vars)
+    /// Whether the newest values of all these variables, and of these extra values, were readable.
+    pub(crate) fn can_read(&self, vars: &VarSet, extra: ExtraSet) -> bool {
+        !self.any_unreadable || !self.unreadable.meets(vars) && !self.unreadable_extra.meets(extra)
+    }
+
+    /// The value in this place for extra values.
+    pub(crate) fn extra(&self, nth: u8) -> f64 {
+        self.extra.get(usize::from(nth)).copied().unwrap_or(f64::NAN)
+    }
+
+    /// Sets an extra value; one that is not finite is unknown until a readable one comes. Returns
+    /// whether it was readable.
+    pub(crate) fn receive_extra(&mut self, nth: u8, value: f64) -> bool {
+        let readable = value.is_finite();
+        if let Some(place) = self.extra.get_mut(usize::from(nth))
+            && readable
+        {
+            *place = value;
+        }
+        self.unreadable_extra.set(nth, !readable);
+        if !readable {
+            self.any_unreadable = true;
+        } else if self.any_unreadable {
+            self.all_readable(core::iter::empty());
+        }
+        readable
     }
 
     /// The age of the variable's value; `None` if it never arrived or was unreadable.

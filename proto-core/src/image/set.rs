@@ -159,6 +159,28 @@ impl VarSet {
     }
 }
 
+/// A set of the image's extra values.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub(crate) struct ExtraSet(u32);
+
+const _: () = assert!(super::MAX_EXTRA <= 32);
+
+impl ExtraSet {
+    /// The empty set.
+    pub(crate) const EMPTY: Self = Self(0);
+
+    /// Adds or removes a value.
+    pub(crate) fn set(&mut self, nth: u8, is_in: bool) {
+        let bit = 1_u32.checked_shl(nth.into()).unwrap_or(0);
+        self.0 = if is_in { self.0 | bit } else { self.0 & !bit };
+    }
+
+    /// Whether a value is in both sets.
+    pub(crate) fn meets(self, other: Self) -> bool {
+        self.0 & other.0 != 0
+    }
+}
+
 fn bit_of(var: SysVar) -> u32 {
     1_u32.wrapping_shl((var.ordinal() % 32) as u32)
 }

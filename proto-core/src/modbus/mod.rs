@@ -1,4 +1,5 @@
-//! Modbus TCP, both sides, for the six function codes of the controller's map (docs/wire/modbus.md).
+//! Modbus TCP, both sides, for the six function codes of the controller's map (docs/wire/modbus.md);
+//! Modbus RTU for lines of field devices is in [`rtu`].
 //!
 //! [`client::Client`] runs one transaction at a time and [`server::Server`] answers over a
 //! [`server::RegisterBank`]; both take received bytes in chunks of any size. [`map`] is the
@@ -34,6 +35,7 @@ pub mod client;
 mod exception;
 pub mod map;
 pub mod pdu;
+pub mod rtu;
 pub mod server;
 mod values;
 

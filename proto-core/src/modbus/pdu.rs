@@ -15,13 +15,19 @@ pub const MAX_READ_REGISTERS: u16 = 0x007D;
 pub const MAX_WRITE_COILS: u16 = 0x07B0;
 /// Most registers in one FC 16 request.
 pub const MAX_WRITE_REGISTERS: u16 = 0x007B;
+/// Most registers that one FC 23 request writes; it reads at most [`MAX_READ_REGISTERS`].
+pub const MAX_READ_WRITE_REGISTERS: u16 = 0x0079;
 
-/// The function codes.
+/// The function codes. [`Request`] has those of the controller: 1, 3, 5, 6, 15 and 16.
 pub mod function {
     /// FC 1, read coils.
     pub const READ_COILS: u8 = 0x01;
+    /// FC 2, read discrete inputs.
+    pub const READ_DISCRETE: u8 = 0x02;
     /// FC 3, read holding registers.
     pub const READ_HOLDING: u8 = 0x03;
+    /// FC 4, read input registers.
+    pub const READ_INPUT: u8 = 0x04;
     /// FC 5, write one coil.
     pub const WRITE_COIL: u8 = 0x05;
     /// FC 6, write one register.
@@ -30,6 +36,8 @@ pub mod function {
     pub const WRITE_COILS: u8 = 0x0F;
     /// FC 16, write several registers.
     pub const WRITE_REGISTERS: u8 = 0x10;
+    /// FC 23, write registers, then read registers.
+    pub const READ_WRITE_REGISTERS: u8 = 0x17;
     /// Set in the function code of an exception response.
     pub const EXCEPTION_FLAG: u8 = 0x80;
 }

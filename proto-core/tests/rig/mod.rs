@@ -46,7 +46,7 @@ impl Cell {
 
     pub fn part(&mut self, head: &[u8], tail: &[u8], fields: Span) -> Option<StreamPart> {
         let bytes = |bytes| Delimiter::from_slice(bytes).unwrap();
-        Some(StreamPart { head: bytes(head), tail: bytes(tail), fields })
+        Some(StreamPart::new(bytes(head), bytes(tail), fields))
     }
 
     pub fn recipe(&mut self, mode: Mode, parts: Parts) -> u8 {
@@ -119,7 +119,7 @@ impl Cell {
         let start = self.0.commands.len() as u16;
         for &(value, text) in entries {
             let text = heapless::String::try_from(text).unwrap();
-            self.0.commands.push(CommandEntry { value, text }).unwrap();
+            self.0.commands.push(CommandEntry::new(value, text)).unwrap();
         }
         Span { start, len: entries.len() as u16 }
     }

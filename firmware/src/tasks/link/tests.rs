@@ -206,7 +206,7 @@ fn add_port(config: &mut GatewayConfig, name: &str, bus: Bus, recipe: u8) {
 
 fn add_recipe(config: &mut GatewayConfig, mode: Mode, input: Option<Span>, output: Option<Span>) {
     let delimiter = |bytes: &[u8]| Delimiter::from_slice(bytes).unwrap();
-    let part = |fields| StreamPart { head: delimiter(&FRAME[..2]), tail: delimiter(&FRAME[3..]), fields };
+    let part = |fields| StreamPart::new(delimiter(&FRAME[..2]), delimiter(&FRAME[3..]), fields);
     let parts = Parts::Stream { input: input.map(part), output: output.map(part) };
     let name = Name::try_from(["a", "b"][config.recipes.len()]).unwrap();
     config.recipes.push(Recipe::new(name, mode, parts)).unwrap();

@@ -1,7 +1,7 @@
 //! Commands that field values pick: each is sent once or not at all, and urgent ones go first
 //! (proto-core/docs/engine.md section 7).
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use proto_core::config::{CommandWhen, MAX_PORTS};
 use proto_core::engine::{Engine, LinkId};
@@ -42,8 +42,10 @@ pub(super) struct Commands {
     overtaken: usize,
     /// The value in the previous frame.
     base: BTreeMap<Place, i64>,
-    /// Number of picked and of dropped commands, by port.
-    pub counted: [(u32, u32); MAX_PORTS],
+    /// The fields whose base survives silence.
+    kept: BTreeSet<Place>,
+    /// By port.
+    pub counted: [Counted; MAX_PORTS],
     /// Text of the newest command sent.
     newest: Option<String>,
     /// Texts of the commands that were picked by frames that waited while the gateway slept.
@@ -51,6 +53,17 @@ pub(super) struct Commands {
     /// Number of replies that the engine has counted, and text received since, on each of the two links.
     answered: [u32; 2],
     heard: [String; 2],
+}
+
+/// What became of a port's values.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Counted {
+    pub picked: u32,
+    pub dropped: u32,
+    /// Values in no table.
+    pub unknown: u32,
+    /// Values that only set the base.
+    pub based: u32,
 }
 
 impl Command {
@@ -77,16 +90,30 @@ impl Commands {
             if changed {
                 self.no_longer_asked(place, now);
             }
+            if when == CommandWhen::Kept {
+                self.kept.insert(place);
+            }
             let acts = when == CommandWhen::Frame || changed;
-            let Some((_, text)) = table.of(&spec.commands).iter().find(|entry| entry.0 == value) else {
-                continue;
-            };
-            if !acts {
+            if !acts && before.is_some() {
                 continue;
             }
+            let table = table.of(&spec.commands);
             let counted = &mut self.counted[nth];
-            counted.0 += 1;
-            let command = Command { place, value, text: plain(text.as_bytes()), picked: now, since: now };
+            let Some(entry) = table.iter().find(|entry| entry.has(value)) else {
+                let is_idle = value == 0 && table.iter().all(|entry| !entry.text.is_empty());
+                counted.unknown += u32::from(!is_idle);
+                continue;
+            };
+            if entry.text.is_empty() {
+                continue;
+            }
+            if !acts {
+                counted.based += 1;
+                continue;
+            }
+            counted.picked += 1;
+            let text = plain(entry.text_for(value).as_bytes());
+            let command = Command { place, value, text, picked: now, since: now };
             if command.is_urgent() {
                 urgent.push(command.clone());
                 match self.urgent.iter_mut().find(|other| other.same_kind(&command)) {
@@ -96,7 +123,7 @@ impl Commands {
             } else if is_up && self.queue.len() < QUEUE {
                 self.queue.push_back(command);
             } else {
-                counted.1 += 1;
+                counted.dropped += 1;
             }
         }
         if !urgent.is_empty() {
@@ -113,11 +140,13 @@ impl Commands {
         }
     }
 
-    /// A device's frame is overdue: its next value only sets the base, and its waiting commands are
-    /// dropped.
+    /// A device's frame is overdue, or without `frame` the device is gone: its next value only sets
+    /// the base, and its waiting commands are dropped. Silence is normal for fields that keep it.
     pub(super) fn forget(&mut self, nth: usize, frame: Option<usize>, now: Instant) {
         let is_of = |place: &Place| place.0 == nth && frame.is_none_or(|frame| frame == place.1);
-        let gone: Vec<Place> = self.base.keys().copied().filter(is_of).collect();
+        let keeps = |place: &Place| frame.is_some() && self.kept.contains(place);
+        let gone = self.base.keys().copied().filter(|place| is_of(place) && !keeps(place));
+        let gone: Vec<Place> = gone.collect();
         for place in gone {
             self.base.remove(&place);
             self.no_longer_asked(place, now);
@@ -125,7 +154,7 @@ impl Commands {
         let (base, counted) = (&self.base, &mut self.counted);
         self.queue.retain(|command| {
             let stays = base.contains_key(&command.place);
-            counted[command.place.0].1 += u32::from(!stays);
+            counted[command.place.0].dropped += u32::from(!stays);
             stays
         });
     }
@@ -149,7 +178,7 @@ impl Commands {
         let is_old = |commands: &Self, stop: &Command| now >= stop.since + TTL && !commands.is_asked(stop);
         while let Some(old) = self.urgent.iter().position(|stop| is_old(self, stop)) {
             let old = self.urgent.remove(old);
-            self.counted[old.place.0].1 += 1;
+            self.counted[old.place.0].dropped += 1;
         }
     }
 
@@ -183,7 +212,7 @@ impl Commands {
         self.lost(LinkId::COMMAND, now);
         self.lost(LinkId::URGENT, now);
         for stop in std::mem::take(&mut self.urgent) {
-            self.counted[stop.place.0].1 += 1;
+            self.counted[stop.place.0].dropped += 1;
         }
         self.slept.clear();
     }
@@ -191,14 +220,14 @@ impl Commands {
     /// Remembers the commands that a discarded frame would have picked.
     pub(super) fn waited_in_sleep(&mut self, spec: &Spec, frame: &Accepted) {
         for &(_, table, _, value) in &frame.commands {
-            let picked = table.of(&spec.commands).iter().find(|entry| entry.0 == value);
-            self.slept.extend(picked.map(|(_, text)| plain(text.as_bytes())));
+            let picked = table.of(&spec.commands).iter().find(|entry| entry.has(value));
+            self.slept.extend(picked.map(|entry| plain(entry.text_for(value).as_bytes())));
         }
     }
 
     fn drop_first(&mut self) {
         if let Some(command) = self.queue.pop_front() {
-            self.counted[command.place.0].1 += 1;
+            self.counted[command.place.0].dropped += 1;
         }
     }
 

@@ -5,8 +5,8 @@
 
 use std::ops::Range;
 
-use proto_core::config::FieldSpec;
-use proto_core::device::{Algorithm, ByteOrder, Checksum, Crc, Encoding, Kind, Overflow, Width};
+use proto_core::config::{FieldSpec, GatewayConfig, Parts};
+use proto_core::device::{Algorithm, Boundary, ByteOrder, Checksum, Crc, Encoding, Kind, Overflow, Width};
 use proto_core::wire::scalar::ScalarType;
 
 /// The places of a frame's fields.
@@ -48,6 +48,7 @@ impl DeviceSpec {
                 FieldSpec::Padding { len, .. } => (usize::from(*len), false),
                 FieldSpec::Checksum(sum) => (sum_bytes(sum), false),
                 FieldSpec::System(var) => (var.size(), false),
+                other => panic!("{other:?} has no model"),
             };
             if !is_shared {
                 first = at;
@@ -55,7 +56,7 @@ impl DeviceSpec {
             }
             spec.places.push(first..first + len);
             if let FieldSpec::Checksum(sum) = field {
-                let end = sum.last.map_or(first, |last| usize::from(last) + 1);
+                let end = sum.last().map_or(first, |last| usize::from(last) + 1);
                 spec.sum = Some((*sum, first..first + len, usize::from(sum.first)..end));
             }
         }
@@ -137,6 +138,22 @@ fn crc_of(crc: &Crc, bytes: &[u8]) -> u32 {
     let register = register as u32;
     let result = if crc.refout { register.reverse_bits() >> (32 - width) } else { register };
     result ^ crc.xorout
+}
+
+/// Why a configuration cannot be judged, if it cannot.
+pub(crate) fn unmodelled(config: &GatewayConfig) -> Option<&'static str> {
+    let varies = config.fields.iter().any(|field| match field {
+        FieldSpec::TextInput { .. } | FieldSpec::TextOutput { .. } | FieldSpec::Length(_) => true,
+        _ => field.element().and_then(|element| element.encoding()).is_some_and(|it| it.size().is_none()),
+    });
+    let is_cut = config.recipes.iter().any(|recipe| match &recipe.parts {
+        Parts::Stream { input, output } => [input, output]
+            .into_iter()
+            .flatten()
+            .any(|part| part.framing != Boundary::Fields || part.escape.is_some()),
+        Parts::Can { .. } => false,
+    });
+    (varies || is_cut).then_some("a soak cannot judge texts and frames of varying length")
 }
 
 /// Number of bytes of a field. Fields of varying length are refused before a run.

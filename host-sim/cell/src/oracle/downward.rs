@@ -258,8 +258,14 @@ impl Downward {
             rest = after;
             match (number, field) {
                 (Some(number), _) => field_bytes(ty, number)[..ty.size()] == *value,
-                // Reply codes are not modelled.
-                (None, FieldSpec::UserOutput { from: OutputBinding::Reply, .. }) => true,
+                // Reply codes, the state packet's other values and the health of ports are not modelled.
+                (
+                    None,
+                    FieldSpec::UserOutput {
+                        from: OutputBinding::Reply | OutputBinding::State { .. } | OutputBinding::Port { .. },
+                        ..
+                    },
+                ) => true,
                 (None, _) => false,
             }
         })
@@ -306,7 +312,7 @@ impl Downward {
                 ScalarType::Float => f64::from(self.cycles % (1 << 24)),
                 ScalarType::Dword | ScalarType::Double => f64::from(self.cycles),
             }),
-            OutputBinding::Reply => None,
+            OutputBinding::Reply | OutputBinding::State { .. } | OutputBinding::Port { .. } => None,
         }
     }
 }

@@ -454,8 +454,10 @@ impl Oracle {
         expected.values_expired = up.values_expired;
         expected.undelivered = up.undelivered;
         expected.timeouts = up.timeouts;
-        expected.commands = commands.0;
-        expected.commands_dropped = commands.1;
+        expected.commands = commands.picked;
+        expected.commands_dropped = commands.dropped;
+        expected.commands_unknown = commands.unknown;
+        expected.commands_based = commands.based;
         if actual.timeouts > expected.timeouts {
             let what = format!("port {nth} counted a timeout although its device was not silent");
             return Err((Invariant::FalseTimeout, what));

@@ -11,7 +11,7 @@
 
 mod arrivals;
 mod commands;
-mod device;
+pub(crate) mod device;
 mod downward;
 mod field;
 mod gateway;

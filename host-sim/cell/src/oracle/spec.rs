@@ -94,8 +94,28 @@ pub(super) struct Spec {
     pub witness: [Option<SysVar>; COUNT],
     /// At least one port sends on a rising bit.
     pub has_triggers: bool,
-    /// The texts and values of all command tables.
-    pub commands: Vec<(i64, String)>,
+    /// The entries of all command tables.
+    pub commands: Vec<Entry>,
+}
+
+/// A command for a range of values.
+#[derive(Debug, Clone)]
+pub(super) struct Entry {
+    first: i64,
+    last: i64,
+    /// Empty if the values pick nothing.
+    pub text: String,
+}
+
+impl Entry {
+    pub(super) fn has(&self, value: i64) -> bool {
+        (self.first..=self.last).contains(&value)
+    }
+
+    /// The command with the value in it.
+    pub(super) fn text_for(&self, value: i64) -> String {
+        self.text.replace("{value}", &value.to_string())
+    }
 }
 
 impl Spec {
@@ -159,7 +179,10 @@ impl Spec {
                 });
             }
         }
-        let commands = config.commands.iter().map(|c| (c.value, c.text.as_str().to_owned())).collect();
+        let commands = config.commands.iter();
+        let commands =
+            commands.map(|c| Entry { first: c.first, last: c.last, text: c.text.as_str().to_owned() });
+        let commands = commands.collect();
         let may_bring =
             |var: &SysVar| origin[var.ordinal()] == Some(Origin::State) || read_back[var.ordinal()];
         let in_packet: Vec<SysVar> = SysVar::all().filter(may_bring).collect();

@@ -7,6 +7,8 @@ use proto_core::config::GatewayConfig;
 use recipe_config::SimConfig;
 use recipe_config::file::{self, FileError, Text};
 
+use crate::oracle::device::unmodelled;
+
 /// A gateway and a controller.
 #[derive(Debug, Clone)]
 pub struct Scenario {
@@ -83,11 +85,12 @@ impl Scenario {
     /// [`FileError`] if one of them cannot be used.
     pub fn load(gateway: &Path, controller: &Path) -> Result<Self, FileError> {
         let name = gateway.file_stem().map_or_else(String::new, |stem| stem.to_string_lossy().into_owned());
-        Ok(Self {
-            name,
-            gateway: file::load_gateway(gateway, &[])?,
-            controller: file::load_controller(controller, &[])?,
-        })
+        let config = file::load_gateway(gateway, &[])?;
+        if let Some(reason) = unmodelled(&config) {
+            let source = file::Source::WholeFile { file: gateway.display().to_string() };
+            return Err(FileError { source, key: String::new(), message: reason.to_owned() });
+        }
+        Ok(Self { name, gateway: config, controller: file::load_controller(controller, &[])? })
     }
 
     fn parse(cell: &Embedded) -> Result<Self, FileError> {

@@ -3,7 +3,9 @@
 //! In: the gateway's configuration and a seed. Out: frames at random times. A device changes its behaviour
 //! every few seconds: steady, hasty, silent, stuck, careless.
 
-use proto_core::config::{Bus, DeviceFrame, FieldSpec, GatewayConfig, InputBinding, Port, Span};
+use proto_core::config::{
+    Bus, CommandEntry, DeviceFrame, FieldSpec, GatewayConfig, InputBinding, Port, Span,
+};
 use proto_core::device::Carrier;
 use proto_core::sysvar::{Direction, SysVar};
 use proto_core::time::{Duration, Instant};
@@ -273,7 +275,7 @@ fn content(config: &GatewayConfig, field: &FieldSpec) -> Content {
     match *field {
         FieldSpec::System(var) => of_var(var),
         FieldSpec::UserInput { ty, to: InputBinding::Commands { table, .. } } => {
-            Content::Commands { ty, values: table.of(&config.commands).iter().map(|e| e.value).collect() }
+            Content::Commands { ty, values: table.of(&config.commands).iter().flat_map(ends).collect() }
         }
         FieldSpec::UserInput { ty: ScalarType::Byte, .. } => Content::Bits,
         FieldSpec::UserInput { ty, .. } | FieldSpec::UserOutput { ty, .. } => {
@@ -281,14 +283,25 @@ fn content(config: &GatewayConfig, field: &FieldSpec) -> Content {
         }
         FieldSpec::DeviceInput { to: InputBinding::Commands { table, .. }, .. } => Content::Commands {
             ty: ScalarType::Double,
-            values: table.of(&config.commands).iter().map(|entry| entry.value).collect(),
+            values: table.of(&config.commands).iter().flat_map(ends).collect(),
         },
         FieldSpec::DeviceInput { .. } | FieldSpec::DeviceOutput { .. } => {
             Content::Number { ty: ScalarType::Double, most: 1e3 }
         }
-        FieldSpec::Fixed { .. } | FieldSpec::Padding { .. } => Content::Constant,
+        // Texts and frames of varying length are refused when the scenario is read.
+        FieldSpec::Fixed { .. }
+        | FieldSpec::Padding { .. }
+        | FieldSpec::TextInput { .. }
+        | FieldSpec::TextOutput { .. }
+        | FieldSpec::Length(_) => Content::Constant,
         FieldSpec::Checksum(_) => Content::Checksum,
     }
+}
+
+/// The first and the last value of a command.
+fn ends(entry: &CommandEntry) -> impl Iterator<Item = i64> + use<> {
+    let (first, last) = (entry.first, entry.last);
+    [first, last].into_iter().take(if first == last { 1 } else { 2 })
 }
 
 fn zero(content: &Content) -> Scalar {

@@ -1,5 +1,6 @@
 //! Whole cells in virtual time: the worked examples, faults on each side, random faults, and soak runs.
 
+mod commands;
 mod controller_faults;
 mod examples;
 mod field_faults;
@@ -7,3 +8,4 @@ mod kit;
 mod random_faults;
 mod robot;
 mod soak;
+mod sources;

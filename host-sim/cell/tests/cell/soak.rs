@@ -21,7 +21,7 @@ fn soaked(level: Level, seed: u64, span: Duration, jobs: usize) -> Total {
 /// The hashes of these runs on every machine. Only a change of what the engine, the controller or the cell
 /// does, or when, may change them; then enter the new ones here.
 const HASHES: [(Level, u64); 2] =
-    [(Level::None, 0xACBF_5417_418A_76DB), (Level::Harsh, 0xC29B_8A0D_F398_6191)];
+    [(Level::None, 0xF68C_507F_F0CA_46F5), (Level::Harsh, 0x7600_31C1_5B22_37B1)];
 
 #[test]
 fn a_seed_means_the_same_trace_on_every_machine() {

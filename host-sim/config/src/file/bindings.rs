@@ -1,22 +1,30 @@
 //! The bindings of fields and the triggers of output parts in a gateway file.
 
-use proto_core::config::{CommandWhen, OnStale, OutputBinding, SendOn};
+use proto_core::config::{InputBinding, OnStale, OutputBinding, SendOn};
 use proto_core::sysvar::{SysVar, VarBit};
 
+use super::commands::{self, FileCommands};
+use super::encoding::refuse;
 use super::reader::{Item, Reader, Result, Spot};
+use super::sources;
 
 /// The binding of an input field.
 pub(super) enum FileInput {
     Unused,
     Variable { var: SysVar, scale: f32, offset: f32 },
     Bit(VarBit),
-    Commands { entries: Vec<FileCommand>, when: CommandWhen },
+    Commands(FileCommands),
 }
 
-pub(super) struct FileCommand {
-    pub(super) spot: Spot,
-    pub(super) value: i64,
-    pub(super) text: String,
+impl FileInput {
+    /// The binding, if it needs no table of commands.
+    pub(super) fn without_commands(&self) -> InputBinding {
+        match *self {
+            Self::Variable { var, scale, offset } => InputBinding::Variable { var, scale, offset },
+            Self::Bit(VarBit { var, bit }) => InputBinding::Bit { var, bit },
+            Self::Unused | Self::Commands(_) => InputBinding::Unused,
+        }
+    }
 }
 
 /// The source of an output field.
@@ -24,6 +32,12 @@ pub(super) enum FileOutput {
     /// A program of the controller sets it.
     Program,
     Bound(OutputBinding),
+    /// The health of a port with this name, which may stand behind the recipe.
+    PortNamed {
+        name: String,
+        spot: Spot,
+        binding: OutputBinding,
+    },
 }
 
 /// When an output part is sent.
@@ -69,32 +83,22 @@ fn read_send(item: &Item<'_>) -> Result<SendOn> {
     Ok(SendOn::Rising { var, bit })
 }
 
-pub(super) fn read_input(field: &Reader<'_>) -> Result<FileInput> {
+/// The bindings of an input field: `to`, `commands`, or both.
+pub(super) fn read_input(field: &Reader<'_>) -> Result<(FileInput, Option<FileInput>)> {
     let (to, commands) = (field.optional("to"), field.optional("commands"));
     if to.is_none() {
         refuse(field, &["scale", "offset"], "allowed only together with to")?;
     }
     if commands.is_none() {
-        refuse(field, &["when"], "allowed only together with commands")?;
+        refuse(field, &commands::KEYS, "allowed only together with commands")?;
     }
-    match (to, commands) {
-        (None, None) => Ok(FileInput::Unused),
-        (Some(to), None) => read_to(field, &to),
-        (None, Some(commands)) => {
-            let when = match field.optional("when") {
-                Some(item) => {
-                    item.choice(&[("change", CommandWhen::Change), ("frame", CommandWhen::Frame)])?
-                }
-                None => CommandWhen::default(),
-            };
-            let entries = commands.any_table()?.entries().map(read_command).collect::<Result<Vec<_>>>()?;
-            if entries.is_empty() {
-                return Err(commands.error("no commands; write for example { 1 = \"run(pick.jspf,50)\" }"));
-            }
-            Ok(FileInput::Commands { entries, when })
-        }
-        (Some(_), Some(commands)) => Err(commands.error("a field takes to or commands, not both")),
-    }
+    let to = to.map(|to| read_to(field, &to)).transpose()?;
+    let commands = commands.map(|item| commands::read(field, &item).map(FileInput::Commands)).transpose()?;
+    Ok(match (to, commands) {
+        (Some(to), commands) => (to, commands),
+        (None, Some(commands)) => (commands, None),
+        (None, None) => (FileInput::Unused, None),
+    })
 }
 
 /// A variable, or one bit of it.
@@ -112,19 +116,6 @@ fn read_to(field: &Reader<'_>, to: &Item<'_>) -> Result<FileInput> {
     Ok(FileInput::Variable { var: read_var(to)?, scale, offset })
 }
 
-fn read_command((key, key_spot, item): (&str, Spot, Item<'_>)) -> Result<FileCommand> {
-    let number = match key.strip_prefix("0x") {
-        Some(hex) => i64::from_str_radix(hex, 16),
-        None => key.parse(),
-    };
-    let Ok(value) = number else {
-        return Err(item
-            .at(key_spot)
-            .error(format!("{key:?} is not an integer; the keys of commands are values of the field")));
-    };
-    Ok(FileCommand { value, text: item.string()?.to_owned(), spot: item.spot })
-}
-
 pub(super) fn read_output(field: &Reader<'_>) -> Result<FileOutput> {
     let (from, value) = (field.optional("from"), field.optional("value"));
     let binding = match (from, value) {
@@ -139,6 +130,10 @@ pub(super) fn read_output(field: &Reader<'_>) -> Result<FileOutput> {
         (Some(from), None) => match from.string()? {
             "counter" => OutputBinding::Counter,
             "reply" => OutputBinding::Reply,
+            text if sources::is_source(text) => {
+                let (scale, offset) = read_scale(field)?;
+                return sources::read(&from, text, scale, offset);
+            }
             _ => {
                 let (scale, offset) = read_scale(field)?;
                 OutputBinding::Variable { var: read_var(&from)?, scale, offset }
@@ -146,7 +141,11 @@ pub(super) fn read_output(field: &Reader<'_>) -> Result<FileOutput> {
         },
     };
     if !matches!(binding, OutputBinding::Variable { .. }) {
-        refuse(field, &["scale", "offset"], "allowed only together with from = a variable")?;
+        refuse(
+            field,
+            &["scale", "offset"],
+            "allowed only together with from = a variable or another value that it can scale",
+        )?;
     }
     Ok(FileOutput::Bound(binding))
 }
@@ -165,11 +164,4 @@ fn read_scale(field: &Reader<'_>) -> Result<(f32, f32)> {
         None => Ok(default),
     };
     Ok((read("scale", 1.0)?, read("offset", 0.0)?))
-}
-
-fn refuse(field: &Reader<'_>, keys: &[&str], why: &str) -> Result<()> {
-    match keys.iter().find_map(|key| Some((key, field.optional(key)?))) {
-        Some((_, item)) => Err(item.error(why)),
-        None => Ok(()),
-    }
 }

@@ -6,20 +6,22 @@ use heapless::Vec as Bounded;
 use proto_core::config::{
     Bus, CanFramePart, CommandEntry, ConfigError, ConfigErrorKind, ControllerKey, ControllerLink, Delimiter,
     FieldSpec, GatewayConfig, InputBinding, MAX_ADDRESS, MAX_ALL_FIELDS, MAX_COMMAND_TEXT, MAX_COMMANDS,
-    MAX_LISTEN, MAX_PORTS, MAX_RECIPES, MAX_SAFE_VALUES, NetworkKey, OutputBinding, Parts, Place, Port,
-    PortKey, Recipe, RecipeKey, RecipeLink, SafeValue, Span, StreamPart, check_address,
+    MAX_LISTEN, MAX_PORTS, MAX_RECIPES, MAX_SAFE_VALUES, NetworkKey, Parts, Place, Port, PortKey, Recipe,
+    RecipeKey, RecipeLink, SafeValue, Span, StreamPart, check_address,
 };
 use proto_core::recipe::model::{Framing, MAX_CAN_IDS};
 use proto_core::sysvar::{Direction, ParseError, SysVar, VarBit};
 use proto_core::wire::dialect::Dialect;
 use proto_core::wire::scalar::Scalar;
 
-use super::bindings::{FileInput, FileOutput};
+use super::bindings::FileInput;
+use super::commands::FileCommand;
 use super::document::Document;
 use super::lines::{LINE_KEYS, key_name, read_bitrate, read_cycle, read_line};
 use super::network;
 use super::reader::{Item, Reader, Result, Spot};
-use super::recipes::{self, FileField, FileFieldKind, FilePart, FileRecipe, Flavour};
+use super::recipes::{self, FileField, FilePart, FileRecipe, Flavour};
+use super::sources;
 
 /// The top-level keys of a gateway file.
 pub(super) const KEYS: [&str; 4] = ["controller", "network", "recipe", "port"];
@@ -29,11 +31,15 @@ pub(super) fn read(document: &Document) -> Result<Box<GatewayConfig>> {
     let root = Reader::root(document, &KEYS)?;
     let recipes = recipes::read_all(&root, Flavour::Gateway)?;
     let mut builder = Builder::new(&root, &recipes)?;
+    let port_keys = [&COMMON_KEYS[..], &FIELD_KEYS, &LINE_KEYS, &["bitrate", "listen"]].concat();
+    let ports = root.tables("port", &port_keys)?;
+    // Recipes may name ports.
+    builder.port_names =
+        ports.iter().filter_map(|port| port.optional("name")?.as_string()).map(str::to_owned).collect();
     for (index, recipe) in recipes.iter().enumerate() {
         builder.add_recipe(index, recipe)?;
     }
-    let port_keys = [&COMMON_KEYS[..], &["on_timeout"], &LINE_KEYS, &["bitrate", "listen"]].concat();
-    for port in root.tables("port", &port_keys)? {
+    for port in ports {
         builder.add_port(&port, &recipes)?;
     }
     builder.finish()
@@ -41,6 +47,9 @@ pub(super) fn read(document: &Document) -> Result<Box<GatewayConfig>> {
 
 /// The keys of a port on any bus.
 const COMMON_KEYS: [&str; 6] = ["name", "bus", "recipe", "cycle_ms", "timeout_ms", "stale_after_ms"];
+
+/// The keys of a field port, on any bus.
+const FIELD_KEYS: [&str; 4] = ["on_timeout", "safe_at_start", "refresh_ms", "health"];
 
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum BusKind {
@@ -62,6 +71,8 @@ struct Builder<'a> {
     document: &'a Document,
     config: Box<GatewayConfig>,
     spots: HashMap<Place, Spot>,
+    /// The names of all ports, also of those that have not been read yet.
+    port_names: Vec<String>,
 }
 
 impl<'a> Builder<'a> {
@@ -97,7 +108,7 @@ impl<'a> Builder<'a> {
         let mut config = Box::new(GatewayConfig::empty());
         config.controller = controller;
         config.network = network.into();
-        Ok(Self { document: root.document, config, spots })
+        Ok(Self { document: root.document, config, spots, port_names: Vec::new() })
     }
 
     fn error(&self, spot: &Spot, message: impl ToString) -> super::FileError {
@@ -142,7 +153,9 @@ impl<'a> Builder<'a> {
         let Some(file) = from.part(part) else { return Ok(None) };
         self.spots.insert(Place::Part { recipe, part }, file.spot.clone());
         let fields = self.add_fields(recipe, part, file, 0)?;
-        Ok(Some(StreamPart { head: delimiter(&file.head), tail: delimiter(&file.tail), fields }))
+        let mut stream = StreamPart::new(delimiter(&file.head), delimiter(&file.tail), fields);
+        (stream.framing, stream.escape) = file.framing;
+        Ok(Some(stream))
     }
 
     fn can_part(
@@ -178,44 +191,42 @@ impl<'a> Builder<'a> {
     }
 
     fn field_spec(&mut self, field: &FileField) -> Result<FieldSpec> {
-        Ok(match &field.kind {
-            FileFieldKind::System(var) => FieldSpec::System(*var),
-            FileFieldKind::UserInput { ty, to, .. } => {
-                let to = match to {
-                    FileInput::Unused => InputBinding::Unused,
-                    FileInput::Variable { var, scale, offset } => {
-                        InputBinding::Variable { var: *var, scale: *scale, offset: *offset }
-                    }
-                    FileInput::Bit(VarBit { var, bit }) => InputBinding::Bit { var: *var, bit: *bit },
-                    FileInput::Commands { entries, when } => {
-                        let start = self.config.commands.len() as u16;
-                        for entry in entries {
-                            self.add_command(entry.value, &entry.text, &entry.spot)?;
-                        }
-                        let table = Span { start, len: entries.len() as u16 };
-                        InputBinding::Commands { table, when: *when }
-                    }
-                };
-                FieldSpec::UserInput { ty: *ty, to }
+        let mut added = Ok(());
+        let spec = field.bound_spec(|to| match to {
+            FileInput::Commands(commands) => {
+                let start = self.config.commands.len() as u16;
+                added = commands.entries.iter().try_for_each(|entry| self.add_command(entry));
+                let table = Span { start, len: commands.entries.len() as u16 };
+                InputBinding::Commands { table, when: commands.when }
             }
-            FileFieldKind::UserOutput { ty, from, .. } => {
-                let from = match from {
-                    FileOutput::Bound(binding) => *binding,
-                    FileOutput::Program => OutputBinding::Constant(0.0),
-                };
-                FieldSpec::UserOutput { ty: *ty, from }
+            _ => to.without_commands(),
+        });
+        added?;
+        match field.port_named() {
+            Some((binding, name, spot)) => {
+                let from = sources::of_port(binding, name, &self.port_names)
+                    .map_err(|message| self.error(spot, message))?;
+                Ok(match spec {
+                    FieldSpec::UserOutput { ty, .. } => FieldSpec::UserOutput { ty, from },
+                    FieldSpec::DeviceOutput { encoding, overflow, .. } => {
+                        FieldSpec::DeviceOutput { encoding, overflow, from }
+                    }
+                    other => other,
+                })
             }
-        })
+            None => Ok(spec),
+        }
     }
 
-    fn add_command(&mut self, value: i64, text: &str, spot: &Spot) -> Result<()> {
-        let Ok(bounded) = heapless::String::try_from(text) else {
+    fn add_command(&mut self, command: &FileCommand) -> Result<()> {
+        let FileCommand { spot, first, last, text } = command;
+        let Ok(bounded) = heapless::String::try_from(text.as_str()) else {
             let message = format!("the command has {} bytes; at most {MAX_COMMAND_TEXT}", text.len());
             return Err(self.error(spot, message));
         };
         let entry = self.config.commands.len() as u16;
         self.spots.insert(Place::Command { entry }, spot.clone());
-        self.config.commands.push(CommandEntry { value, text: bounded }).map_err(|_| {
+        self.config.commands.push(CommandEntry { first: *first, last: *last, text: bounded }).map_err(|_| {
             self.error(spot, format!("too many commands; at most {MAX_COMMANDS} in all recipes together"))
         })
     }
@@ -228,7 +239,7 @@ impl<'a> Builder<'a> {
             BusKind::Can => &["bitrate"],
             BusKind::TcpListen | BusKind::UdpListen => &["listen"],
         };
-        let safe: &[&str] = if matches!(kind, BusKind::Rs485 | BusKind::Can) { &["on_timeout"] } else { &[] };
+        let safe: &[&str] = if matches!(kind, BusKind::Rs485 | BusKind::Can) { &FIELD_KEYS } else { &[] };
         let bus_name = BUSES.iter().find(|(_, bus)| *bus == kind).map_or("", |(name, _)| name);
         table.check_keys(&[&COMMON_KEYS, own, safe].concat(), &format!(" on bus = {bus_name:?}"))?;
 
@@ -256,6 +267,15 @@ impl<'a> Builder<'a> {
             }
         }
         port.on_timeout = self.add_safe_values(table)?;
+        if let Some(item) = table.optional("safe_at_start") {
+            port.safe_at_start = item.bool()?;
+        }
+        if let Some(item) = table.optional("refresh_ms") {
+            port.refresh = Some(item.time(1e3)?);
+        }
+        if let Some(item) = table.optional("health") {
+            port.health = sources::read_health(&item)?;
+        }
         // There is room: the count was checked above.
         let _ = self.config.ports.push(port);
         Ok(())
@@ -326,7 +346,7 @@ impl<'a> Builder<'a> {
     }
 }
 
-const PORT_PLACES: [PortKey; 12] = [
+const PORT_PLACES: [PortKey; 15] = [
     PortKey::Name,
     PortKey::Recipe,
     PortKey::Cycle,
@@ -339,6 +359,9 @@ const PORT_PLACES: [PortKey; 12] = [
     PortKey::Turnaround,
     PortKey::Bitrate,
     PortKey::Listen,
+    PortKey::Health,
+    PortKey::SafeAtStart,
+    PortKey::Refresh,
 ];
 
 fn read_controller(table: &Reader<'_>, recipes: &[FileRecipe]) -> Result<ControllerLink> {

@@ -4,14 +4,19 @@
 //! [`FileError`]; the keys are those of docs/configuration.md.
 
 mod bindings;
+mod commands;
 mod controller;
+mod device;
 mod document;
+mod encoding;
 mod error;
+mod framings;
 mod gateway;
 mod lines;
 mod network;
 mod reader;
 mod recipes;
+mod sources;
 
 use std::path::Path;
 
@@ -20,7 +25,8 @@ use proto_core::wire::dialect::Dialect;
 
 pub use error::{FileError, Source};
 
-use super::sim::{SimConfig, SimRecipe};
+use super::device::AnyRecipe;
+use super::sim::SimConfig;
 use document::Document;
 use reader::{Item, Reader, Result};
 use recipes::Flavour;
@@ -71,7 +77,7 @@ pub fn load_controller(path: &Path, overrides: &[String]) -> Result<SimConfig> {
 ///
 /// # Errors
 /// The first mistake in any of the recipes, with its place.
-pub fn load_recipes(path: &Path, overrides: &[String]) -> Result<Vec<SimRecipe>> {
+pub fn load_recipes(path: &Path, overrides: &[String]) -> Result<Vec<AnyRecipe>> {
     with_text(path, |text| parse_recipes(text, overrides))
 }
 
@@ -119,7 +125,7 @@ pub fn parse_controller(text: Text<'_>, overrides: &[String]) -> Result<SimConfi
 ///
 /// # Errors
 /// The first mistake in any of the recipes, with its place.
-pub fn parse_recipes(text: Text<'_>, overrides: &[String]) -> Result<Vec<SimRecipe>> {
+pub fn parse_recipes(text: Text<'_>, overrides: &[String]) -> Result<Vec<AnyRecipe>> {
     let document = Document::parse(text.name, text.toml, overrides)?;
     let flavour = kind_of(&document)?;
     let keys: &[&str] = match flavour {
@@ -127,7 +133,7 @@ pub fn parse_recipes(text: Text<'_>, overrides: &[String]) -> Result<Vec<SimReci
         Flavour::Controller => &controller::KEYS,
     };
     let root = Reader::root(&document, keys)?;
-    Ok(recipes::read_all(&root, flavour)?.iter().map(recipes::FileRecipe::to_sim).collect())
+    Ok(recipes::read_all(&root, flavour)?.iter().map(recipes::FileRecipe::named).collect())
 }
 
 /// A mistake found after the file was read, at the place of `key` (names; an item of an array by

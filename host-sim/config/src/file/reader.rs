@@ -41,11 +41,7 @@ pub(super) struct Item<'a> {
 impl<'a> Reader<'a> {
     pub(super) fn root(document: &'a Document, allowed: &[&str]) -> Result<Self> {
         let spot = Spot { at: At::File(0), key: String::new() };
-        Self::checked(document, spot, &document.root, allowed)
-    }
-
-    fn checked(document: &'a Document, spot: Spot, table: &'a Table, allowed: &[&str]) -> Result<Self> {
-        let reader = Self { document, spot, table };
+        let reader = Self { document, spot, table: &document.root };
         reader.check_keys(allowed, "")?;
         Ok(reader)
     }
@@ -92,13 +88,16 @@ impl<'a> Reader<'a> {
 
     /// The tables of the array `key`, each with its name or its number.
     pub(super) fn tables(&self, key: &str, allowed: &[&str]) -> Result<Vec<Reader<'a>>> {
+        let readers = self.any_tables(key)?;
+        readers.iter().try_for_each(|reader| reader.check_keys(allowed, ""))?;
+        Ok(readers)
+    }
+
+    /// Same as [`Self::tables`], with any keys.
+    pub(super) fn any_tables(&self, key: &str) -> Result<Vec<Reader<'a>>> {
         let Some(item) = self.optional(key) else { return Ok(Vec::new()) };
         let items = item.array(&format!("of tables, written [[{key}]]"))?;
-        let mut readers = Vec::new();
-        for item in items {
-            readers.push(item.named_table(key, &self.spot.key, allowed)?);
-        }
-        Ok(readers)
+        items.iter().map(|item| item.named_table(key, &self.spot.key)).collect()
     }
 
     fn path(&self, key: &str) -> String {
@@ -230,13 +229,13 @@ impl<'a> Item<'a> {
     }
 
     /// An item of an array of tables, called `KEY.NAME` if it has a name.
-    fn named_table(&self, key: &str, parent: &str, allowed: &[&str]) -> Result<Reader<'a>> {
+    fn named_table(&self, key: &str, parent: &str) -> Result<Reader<'a>> {
         let Value::Table(table) = &self.node.value else { return Err(self.wrong_kind("a table")) };
         let mut spot = self.spot.clone();
         if let Some(Value::Str(name)) = table.get("name").map(|entry| &entry.node.value) {
             spot.key = join(parent, &format!("{key}.{}", if name.is_empty() { "\"\"" } else { name }));
         }
-        Reader::checked(self.document, spot, table, allowed)
+        Ok(Reader { document: self.document, spot, table })
     }
 
     /// One of several strings.

@@ -2,6 +2,8 @@
 //!
 //! In: tables. Out: [`FileRecipe`], which keeps the places for later checks.
 
+use proto_core::config::{FieldSpec, InputBinding, OutputBinding};
+use proto_core::device::{Boundary, Checksum, Encoding, Escape, Kind, Overflow};
 use proto_core::recipe::CanLayout;
 use proto_core::recipe::PartError;
 use proto_core::recipe::StreamLayout;
@@ -11,7 +13,10 @@ use proto_core::wire::can::CanId;
 use proto_core::wire::scalar::ScalarType;
 
 use super::bindings::{self, FileInput, FileOutput};
+use super::device::{self, FieldReader};
+use super::framings;
 use super::reader::{Item, Reader, Result, Spot};
+use crate::device::AnyRecipe;
 use crate::sim::{SimCanFrame, SimField, SimParts, SimRecipe, SimStreamPart};
 
 /// The kind of file: only a gateway's recipes have bindings.
@@ -35,12 +40,14 @@ pub(super) struct FilePart {
     pub(super) spot: Spot,
     pub(super) head: Vec<u8>,
     pub(super) tail: Vec<u8>,
-    head_spot: Option<Spot>,
-    tail_spot: Option<Spot>,
+    pub(super) head_spot: Option<Spot>,
+    pub(super) tail_spot: Option<Spot>,
     /// One in a stream part, one for each id in a CAN part.
     pub(super) frames: Vec<FileFrame>,
     /// The gateway's keys of an output part.
     pub(super) sending: bindings::Sending,
+    /// What tells the frames of a stream apart.
+    pub(super) framing: (Boundary, Option<Escape>),
 }
 
 pub(super) struct FileFrame {
@@ -58,22 +65,118 @@ pub(super) struct FileField {
 
 pub(super) enum FileFieldKind {
     System(SysVar),
-    UserInput { name: String, ty: ScalarType, to: FileInput },
-    UserOutput { name: String, ty: ScalarType, from: FileOutput },
+    /// `again` marks a second use of the bytes of the field before.
+    UserInput {
+        name: String,
+        written: Written,
+        to: FileInput,
+        again: bool,
+    },
+    UserOutput {
+        name: String,
+        written: Written,
+        from: FileOutput,
+    },
+    Fixed {
+        name: Option<String>,
+        encoding: Encoding,
+        value: i64,
+    },
+    Padding {
+        len: u8,
+        fill: u8,
+    },
+    Checksum(Checksum),
+    /// What has no binding of a number: a text, or a length.
+    Device {
+        name: Option<String>,
+        spec: FieldSpec,
+    },
+}
+
+/// How a field with a value is written.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Written {
+    pub(super) encoding: Encoding,
+    pub(super) overflow: Overflow,
+}
+
+impl Written {
+    pub(super) fn plain(ty: ScalarType) -> Self {
+        Self { encoding: Encoding::scalar(ty), overflow: Overflow::Usual }
+    }
+
+    /// The type, if the controller's recipes have such a field.
+    fn as_plain(self) -> Option<ScalarType> {
+        match self.encoding.kind {
+            Kind::Scalar(ty) if self == Self::plain(ty) => Some(ty),
+            _ => None,
+        }
+    }
 }
 
 impl FileField {
-    pub(super) fn field(&self) -> Field {
+    /// The field as the controller's recipes have it; `None` if only frames of devices have it.
+    fn field(&self) -> Option<Field> {
         match self.kind {
-            FileFieldKind::System(var) => Field::System(var),
-            FileFieldKind::UserInput { ty, .. } | FileFieldKind::UserOutput { ty, .. } => Field::User(ty),
+            FileFieldKind::System(var) => Some(Field::System(var)),
+            FileFieldKind::UserInput { written, .. } | FileFieldKind::UserOutput { written, .. } => {
+                written.as_plain().map(Field::User)
+            }
+            _ => None,
         }
     }
 
-    fn name(&self) -> String {
+    /// The field as the configuration has it; `bind` makes the binding of an input field.
+    pub(super) fn bound_spec(&self, bind: impl FnOnce(&FileInput) -> InputBinding) -> FieldSpec {
+        match &self.kind {
+            FileFieldKind::System(var) => FieldSpec::System(*var),
+            FileFieldKind::UserInput { written, to, .. } => {
+                let to = bind(to);
+                let Written { encoding, overflow } = *written;
+                match written.as_plain() {
+                    Some(ty) => FieldSpec::UserInput { ty, to },
+                    None => FieldSpec::DeviceInput { encoding, overflow, to },
+                }
+            }
+            FileFieldKind::UserOutput { written, from, .. } => {
+                let from = match from {
+                    FileOutput::Bound(binding) => *binding,
+                    // Of a port: put in when all ports are known.
+                    FileOutput::Program | FileOutput::PortNamed { .. } => OutputBinding::Constant(0.0),
+                };
+                let Written { encoding, overflow } = *written;
+                match written.as_plain() {
+                    Some(ty) => FieldSpec::UserOutput { ty, from },
+                    None => FieldSpec::DeviceOutput { encoding, overflow, from },
+                }
+            }
+            &FileFieldKind::Fixed { encoding, value, .. } => FieldSpec::Fixed { encoding, value },
+            &FileFieldKind::Padding { len, fill } => FieldSpec::Padding { len, fill },
+            FileFieldKind::Checksum(sum) => FieldSpec::Checksum(*sum),
+            FileFieldKind::Device { spec, .. } => *spec,
+        }
+    }
+
+    /// The source of an output field that shows the health of a port with this name.
+    pub(super) fn port_named(&self) -> Option<(OutputBinding, &str, &Spot)> {
+        match &self.kind {
+            FileFieldKind::UserOutput { from: FileOutput::PortNamed { name, spot, binding }, .. } => {
+                Some((*binding, name, spot))
+            }
+            _ => None,
+        }
+    }
+
+    /// Its name; empty for what needs none.
+    pub(super) fn name(&self) -> String {
         match &self.kind {
             FileFieldKind::System(var) => var.to_string(),
             FileFieldKind::UserInput { name, .. } | FileFieldKind::UserOutput { name, .. } => name.clone(),
+            FileFieldKind::Fixed { name, .. } | FileFieldKind::Device { name, .. } => {
+                name.clone().unwrap_or_default()
+            }
+            FileFieldKind::Padding { .. } | FileFieldKind::Checksum(_) => String::new(),
         }
     }
 }
@@ -127,7 +230,20 @@ fn read(table: &Reader<'_>, flavour: Flavour) -> Result<FileRecipe> {
     if input.is_none() && output.is_none() {
         return Err(table.error("a recipe needs an input part, an output part or both"));
     }
-    Ok(FileRecipe { spot: table.spot.clone(), name, name_spot, mode, is_can, input, output })
+    let recipe = FileRecipe { spot: table.spot.clone(), name, name_spot, mode, is_can, input, output };
+    let is_device = recipe.is_device();
+    for direction in [Direction::Input, Direction::Output] {
+        let Some(part) = recipe.part(direction) else { continue };
+        if is_device {
+            part.check_device(table, recipe.carrier(direction), direction)?;
+            continue;
+        }
+        // UDP needs the least of a stream recipe; it does not take user-defined recipes (D16).
+        let framing = if mode == Mode::User { Framing::Bytes } else { Framing::Datagram };
+        part.check(Rules { mode, direction }, is_can, framing)
+            .map_err(|error| part.spot_of(error).error(table.document, error))?;
+    }
+    Ok(recipe)
 }
 
 fn read_part(item: &Item<'_>, rules: Rules, is_can: bool, flavour: Flavour) -> Result<FilePart> {
@@ -136,7 +252,13 @@ fn read_part(item: &Item<'_>, rules: Rules, is_can: bool, flavour: Flavour) -> R
     let own: &[&str] = if is_can { &["frame"] } else { &["head", "tail", "fields"] };
     let sending_keys: &[&str] = if is_gateway_output { &["on_stale", "send"] } else { &[] };
     let when = if is_can { " in a CAN recipe" } else { " in a stream recipe" };
-    table.check_keys(&[own, sending_keys].concat(), when)?;
+    let frame_keys = if is_can {
+        device::refuse_in_can_part(&table, rules.mode, flavour)?;
+        &[]
+    } else {
+        device::stream_keys(&table, rules.mode, flavour)?
+    };
+    table.check_keys(&[own, frame_keys, sending_keys].concat(), when)?;
 
     let mut part = FilePart {
         spot: table.spot.clone(),
@@ -146,28 +268,25 @@ fn read_part(item: &Item<'_>, rules: Rules, is_can: bool, flavour: Flavour) -> R
         tail_spot: None,
         frames: Vec::new(),
         sending: bindings::read_sending(&table)?,
+        framing: framings::read_part(&table)?,
     };
     if is_can {
-        let keys = ["id", "extended", "fields"];
-        for frame in table.tables("frame", &keys)? {
+        for frame in table.any_tables("frame")? {
+            let frame_keys = device::frame_keys(&frame, rules.mode, flavour)?;
+            frame.check_keys(&[&["id", "extended", "fields"], frame_keys].concat(), "")?;
             let item = frame.required("id", "the frame's CAN id")?;
             let id = read_id(&frame, &item)?;
-            let fields = read_fields(&frame, rules, flavour)?;
+            let fields = read_fields(&frame, 0, rules, flavour)?;
             part.frames.push(FileFrame { spot: frame.spot.clone(), id, id_spot: item.spot, fields });
         }
     } else {
         (part.head, part.head_spot) = read_bytes(&table, "head")?;
         (part.tail, part.tail_spot) = read_bytes(&table, "tail")?;
-        let fields = read_fields(&table, rules, flavour)?;
+        let fields = read_fields(&table, part.head.len(), rules, flavour)?;
         let spot = table.spot.clone();
         part.frames.push(FileFrame { spot: spot.clone(), id: CanId::Standard(0), id_spot: spot, fields });
     }
-    // UDP needs the least of a stream recipe; it does not take user-defined recipes (D16).
-    let framing = if rules.mode == Mode::User { Framing::Bytes } else { Framing::Datagram };
-    match part.check(rules, is_can, framing) {
-        Ok(()) => Ok(part),
-        Err(error) => Err(part.spot_of(error).error(table.document, error)),
-    }
+    Ok(part)
 }
 
 /// 11 bits, or 29 with `extended = true`.
@@ -199,7 +318,9 @@ fn read_bytes(table: &Reader<'_>, key: &str) -> Result<(Vec<u8>, Option<Spot>)> 
     Ok((bytes, Some(item.spot)))
 }
 
-fn read_fields(table: &Reader<'_>, rules: Rules, flavour: Flavour) -> Result<Vec<FileField>> {
+/// The fields of a stream part, or of one CAN frame, behind a head of so many bytes.
+fn read_fields(table: &Reader<'_>, head: usize, rules: Rules, flavour: Flavour) -> Result<Vec<FileField>> {
+    let mut reader = FieldReader::new(table, rules, flavour)?;
     let list = table.required("fields", "the list of the frame's fields")?;
     let mut fields = Vec::new();
     for item in list.array("of fields, such as [\"RobotState[8..13]\"]")? {
@@ -225,49 +346,17 @@ fn read_fields(table: &Reader<'_>, rules: Rules, flavour: Flavour) -> Result<Vec
                      for system variables set mode = \"realtime\"",
                 ));
             }
-            (Mode::User, None) => fields.push(read_user_field(&item, rules.direction, flavour)?),
+            (Mode::User, None) => reader.read(&item, &mut fields)?,
         }
     }
+    device::read_checksum(table, head, &mut fields)?;
     Ok(fields)
-}
-
-fn read_user_field(item: &Item<'_>, direction: Direction, flavour: Flavour) -> Result<FileField> {
-    let table = item.any_table()?;
-    let bound: &[&str] = match (flavour, direction) {
-        (Flavour::Controller, _) => &[],
-        (Flavour::Gateway, Direction::Input) => &["to", "commands", "when", "scale", "offset"],
-        (Flavour::Gateway, Direction::Output) => &["from", "value", "scale", "offset"],
-    };
-    let when = match direction {
-        Direction::Input => " in an input field",
-        Direction::Output => " in an output field",
-    };
-    table.check_keys(&[&["name", "type"], bound].concat(), when)?;
-    let name = table.required("name", "give the field a name")?.string()?.to_owned();
-    let types: Vec<_> = ScalarType::ALL.into_iter().map(|ty| (ty.name(), ty)).collect();
-    let ty =
-        table.required("type", "byte, char, word, short, dword, int, float or double")?.choice(&types)?;
-    let kind = match (direction, flavour) {
-        (Direction::Input, Flavour::Gateway) => {
-            FileFieldKind::UserInput { name, ty, to: bindings::read_input(&table)? }
-        }
-        (Direction::Input, Flavour::Controller) => {
-            FileFieldKind::UserInput { name, ty, to: FileInput::Unused }
-        }
-        (Direction::Output, Flavour::Gateway) => {
-            FileFieldKind::UserOutput { name, ty, from: bindings::read_output(&table)? }
-        }
-        (Direction::Output, Flavour::Controller) => {
-            FileFieldKind::UserOutput { name, ty, from: FileOutput::Program }
-        }
-    };
-    Ok(FileField { spot: item.spot.clone(), kind })
 }
 
 impl FilePart {
     /// Checks that the part fits this framing.
     fn check(&self, rules: Rules, is_can: bool, framing: Framing) -> std::result::Result<(), PartError> {
-        let fields = |frame: &FileFrame| frame.fields.iter().map(FileField::field).collect::<Vec<_>>();
+        let fields = |frame: &FileFrame| frame.fields.iter().filter_map(FileField::field).collect::<Vec<_>>();
         if is_can {
             CanLayout::new(rules, self.frames.iter().map(|frame| (frame.id, fields(frame)))).map(|_| ())
         } else {
@@ -277,7 +366,7 @@ impl FilePart {
     }
 
     /// The place of `error`.
-    fn spot_of(&self, error: PartError) -> &Spot {
+    pub(super) fn spot_of(&self, error: PartError) -> &Spot {
         let delimiter = match error {
             PartError::HeadTooLong { .. } => self.head_spot.as_ref(),
             PartError::TailTooLong { .. } => self.tail_spot.as_ref(),
@@ -305,6 +394,10 @@ impl FileRecipe {
 
     /// Checks that a port with this framing can carry the recipe.
     pub(super) fn check_framing(&self, framing: Framing) -> std::result::Result<(), String> {
+        if self.is_device() {
+            // Its frames are laid out when the recipe is read, the same for every line.
+            return Ok(());
+        }
         for direction in [Direction::Input, Direction::Output] {
             if let Some(part) = self.part(direction) {
                 part.check(Rules { mode: self.mode, direction }, self.is_can, framing)
@@ -314,10 +407,16 @@ impl FileRecipe {
         Ok(())
     }
 
-    /// The recipe with the names of its fields, without bindings.
+    /// The recipe with the names of its fields.
+    pub(super) fn named(&self) -> AnyRecipe {
+        if self.is_device() { AnyRecipe::Device(self.to_device()) } else { AnyRecipe::Plain(self.to_sim()) }
+    }
+
+    /// The recipe with the names of its fields, without bindings; frames of devices are not in it.
     pub(super) fn to_sim(&self) -> SimRecipe {
         let fields = |frame: &FileFrame| {
-            frame.fields.iter().map(|field| SimField { name: field.name(), field: field.field() }).collect()
+            let named = |field: &FileField| Some(SimField { name: field.name(), field: field.field()? });
+            frame.fields.iter().filter_map(named).collect()
         };
         let stream = |part: &Option<FilePart>| {
             part.as_ref().map(|part| SimStreamPart {

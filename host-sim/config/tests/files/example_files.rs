@@ -19,7 +19,7 @@ fn a_controller_and_its_gateway_mean_the_same_recipe() {
     // Both ends of a recipe link must agree on every byte.
     let recipe = |file: &str, name: &str| {
         let recipes = file::load_recipes(&example(file), &[]).unwrap();
-        recipes.into_iter().find(|recipe| recipe.name == name).unwrap()
+        recipes.into_iter().find(|recipe| recipe.name() == name).unwrap()
     };
     for (gateway, controller, name) in [
         ("force-sensor.toml", "force-sensor-controller.toml", "up"),

@@ -2,6 +2,9 @@
 
 mod bits;
 mod damaged_files;
+mod device_files;
 mod document_examples;
 mod example_files;
+mod framing_files;
+mod wrong_devices;
 mod wrong_files;

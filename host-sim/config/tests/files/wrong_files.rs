@@ -6,17 +6,18 @@
 use std::collections::HashSet;
 use std::fmt::Write;
 
+use proto_core::config::{FieldSpec, OutputBinding, PortValue, StateValue};
 use recipe_config::file::{Text, parse, parse_controller, parse_gateway};
 
 const GATEWAY: &str = include_str!("good/cell.toml");
-const CONTROLLER: &str = include_str!("good/robot.toml");
+pub(super) const CONTROLLER: &str = include_str!("good/robot.toml");
 
 /// One wrong file.
-struct Case {
+pub(super) struct Case {
     /// What is wrong with it.
-    what: &'static str,
+    pub(super) what: &'static str,
     /// The good text, what to look for in it, and what to put there.
-    edit: (&'static str, &'static str, &'static str),
+    pub(super) edit: (&'static str, &'static str, &'static str),
 }
 
 const fn gateway(what: &'static str, from: &'static str, to: &'static str) -> Case {
@@ -98,7 +99,6 @@ const CASES: &[Case] = &[
     gateway("a field without a name", "{ name = \"fixed\", type", "{ type"),
     gateway("a field with an unknown type", "name = \"fixed\", type = \"byte\"", "name = \"fixed\", type = \"uint8\""),
     gateway("an unknown key of an input field", "scale = 10", "factor = 10"),
-    gateway("to and commands", "scale = 10", "commands = { 1 = \"stop\" }"),
     gateway("a scale without to", "to = \"WordInputReg[1]\", ", ""),
     gateway("when without commands", "scale = 10", "when = \"frame\""),
     gateway("a scale of 0", "scale = 10", "scale = 0"),
@@ -115,6 +115,18 @@ const CASES: &[Case] = &[
     gateway("a command for a value the field never has", "2 = \"stop\"", "300 = \"stop\""),
     gateway("a command for no number", "2 = \"stop\"", "two = \"stop\""),
     gateway("two commands for one value", "2 = \"stop\"", "0x01 = \"stop\""),
+    gateway("commands that overlap", "2 = \"stop\"", "\"1..9\" = \"stop\""),
+    gateway("a range of values that runs backwards", "2 = \"stop\"", "\"9..2\" = \"stop\""),
+    gateway("a range of values without an end", "2 = \"stop\"", "\"2..\" = \"stop\""),
+    gateway("a range beyond the field", "2 = \"stop\"", "\"2..300\" = \"stop\""),
+    gateway("a speed from a range that is no speed at its end", "2 = \"stop\"", "\"2..101\" = \"speed({value})\""),
+    gateway("an empty command", "2 = \"stop\"", "2 = \"\""),
+    gateway("an idle value that picks a command", "{ 1 = \"run(pick.jspf,50)\", 2 = \"stop\" } }", "{ 1 = \"run(pick.jspf,50)\", 2 = \"stop\" }, idle = 2 }"),
+    gateway("an idle value that is no integer", "{ 1 = \"run(pick.jspf,50)\", 2 = \"stop\" } }", "{ 1 = \"run(pick.jspf,50)\", 2 = \"stop\" }, idle = \"none\" }"),
+    gateway("idle without commands", "scale = 10", "idle = 3"),
+    gateway("an unknown base", "{ 1 = \"run(pick.jspf,50)\", 2 = \"stop\" } }", "{ 1 = \"run(pick.jspf,50)\", 2 = \"stop\" }, base = \"hold\" }"),
+    gateway("a base that is kept although each frame acts", "{ 1 = \"run(pick.jspf,50)\", 2 = \"stop\" } }", "{ 1 = \"run(pick.jspf,50)\", 2 = \"stop\" }, when = \"frame\", base = \"keep\" }"),
+    gateway("an edge of a field with several bits", "2 = \"stop\"", "rising = \"stop\""),
     gateway("commands of a float field", "{ name = \"order\", type = \"byte\"", "{ name = \"order\", type = \"float\""),
     gateway("an output field without a source", "{ name = \"fixed\", type = \"byte\", value = 125 }", "{ name = \"fixed\", type = \"byte\" }"),
     gateway("from and value", "value = 125", "value = 125, from = \"reply\""),
@@ -192,6 +204,25 @@ const CASES: &[Case] = &[
     controller("an initial word of 70000", "= 7", "= 70000"),
     controller("an initial value in reserved bits", "\"DI[3]\" = true", "\"DigitalSignalStatus[3]\" = 4"),
     controller("an initial voltage of 12 V", "= 2.5", "= 12"),
+    // Sources beside the variables, health and safe values at the start.
+    gateway("an unknown value of the state packet", "from = \"reply\"", "from = \"controller.temperature\""),
+    gateway("a value without its number", "from = \"reply\"", "from = \"controller.joint_position\""),
+    gateway("a joint that is not there", "from = \"reply\"", "from = \"controller.joint_torque[7]\""),
+    gateway("a reserved value", "from = \"reply\"", "from = \"controller.reserved_336[1]\""),
+    gateway("a number where there is one", "from = \"reply\"", "from = \"controller.mode[1]\""),
+    gateway("a speed that the dialect does not send", "from = \"reply\"", "from = \"controller.speed\""),
+    gateway("a reply of port 2000 as a source", "from = \"reply\"", "from = \"controller.last_error\""),
+    gateway("an unknown value of a port", "from = \"reply\"", "from = \"port.speed\""),
+    gateway("the health of an unknown port", "from = \"reply\"", "from = \"port.rs485-9.alive\""),
+    gateway("the health of a listening port", "from = \"reply\"", "from = \"port.up-tcp.alive\""),
+    gateway("a count with a scale", "from = \"reply\"", "from = \"port.frames\", scale = 2"),
+    gateway("health in a bit", "recipe = \"orders\"\n\n[[port]]", "recipe = \"orders\"\nhealth = { alive = \"BitInputReg[3].0\" }\n\n[[port]]"),
+    gateway("health in a byte of bits", "recipe = \"orders\"\n\n[[port]]", "recipe = \"orders\"\nhealth = { alive = \"BitInputReg[3]\" }\n\n[[port]]"),
+    gateway("health in a variable of the port's frames", "recipe = \"orders\"\n\n[[port]]", "recipe = \"orders\"\nhealth = { age_ms = \"WordInputReg[1]\" }\n\n[[port]]"),
+    gateway("unknown health", "recipe = \"orders\"\n\n[[port]]", "recipe = \"orders\"\nhealth = { dead = \"WordInputReg[2]\" }\n\n[[port]]"),
+    gateway("health of a listening port", "listen = \"0.0.0.0:50000\"", "listen = \"0.0.0.0:50000\"\nhealth = { alive = \"WordInputReg[2]\" }"),
+    gateway("safe at the start without safe values", "recipe = \"orders\"\n\n[[port]]", "recipe = \"orders\"\nsafe_at_start = true\n\n[[port]]"),
+    gateway("a refreshed output that is not sent on change", "recipe = \"orders\"\n\n[[port]]", "recipe = \"orders\"\nrefresh_ms = 1000\n\n[[port]]"),
     controller("an initial value twice", "\"DI[3]\" = true", "__WordOutputReg_1 = 8"),
     controller("a gateway's binding in a controller's file", "{ name = \"input1\", type = \"byte\" }", "{ name = \"input1\", type = \"byte\", to = \"WordInputReg[1]\" }"),
     controller("a gateway's trigger in a controller's file", "[recipe.output]\n", "[recipe.output]\nsend = \"period\"\n"),
@@ -213,13 +244,49 @@ fn the_good_files_are_good() {
         .unwrap_or_else(|error| panic!("{error}"));
 }
 
+/// Every source and key of a port's health, in an otherwise good file.
+#[test]
+fn sources_and_health_are_read() {
+    let toml = GATEWAY
+        .replacen("from = \"reply\"", "from = \"port.rs485-1.age_ms\", scale = 0.1", 1)
+        .replacen("value = 125", "from = \"controller.joint_position[6]\", scale = 100, offset = 1", 1)
+        .replacen("send = \"frame\"", "send = \"change\"", 1)
+        .replacen("cycle_ms = 4\n", "cycle_ms = 4\nsafe_at_start = true\n", 1)
+        .replacen(
+            "recipe = \"orders\"\n\n[[port]]",
+            "recipe = \"orders\"\nrefresh_ms = 1000\nhealth = { alive = \"WordInputReg[20]\", frames = \
+             \"WordInputReg[21]\", age_ms = \"WordInputReg[22]\", rejected = \"WordInputReg[23]\" }\n\n[[port]]",
+            1,
+        );
+    let config =
+        parse_gateway(Text { name: "cell.toml", toml: &toml }, &[]).unwrap_or_else(|error| panic!("{error}"));
+    let sources: Vec<_> = config.fields.iter().filter_map(FieldSpec::source).collect();
+    let age = OutputBinding::Port { port: Some(0), value: PortValue::Age, scale: 0.1, offset: 0.0 };
+    let value = StateValue::parse("joint_position[6]").unwrap();
+    let joint = OutputBinding::State { value, scale: 100.0, offset: 1.0 };
+    assert_eq!(sources, [OutputBinding::Counter, age, joint]);
+    assert!(config.ports[0].safe_at_start && !config.ports[1].safe_at_start);
+    assert_eq!(config.ports[1].refresh.map(|refresh| refresh.as_millis()), Some(1_000));
+    let told: Vec<_> =
+        config.ports[1].health.iter().map(|(value, var)| (value.name(), var.index())).collect();
+    assert_eq!(told, [("alive", 20), ("frames", 21), ("age_ms", 22), ("rejected", 23)]);
+}
+
 #[test]
 fn every_wrong_file_says_what_is_wrong_with_it() {
+    assert!(CASES.len() >= 40);
+    let all = messages(CASES, |good| if good == GATEWAY { "cell.toml" } else { "robot.toml" });
+    insta::assert_snapshot!("wrong_files", all);
+}
+
+/// What each case is, and its message, which must be one line and no other case's. `name` names the good
+/// files.
+pub(super) fn messages(cases: &[Case], name: impl Fn(&str) -> &'static str) -> String {
     let mut all = String::new();
     let mut seen = HashSet::new();
-    for Case { what, edit: (good, from, to) } in CASES {
+    for Case { what, edit: (good, from, to) } in cases {
         assert!(good.contains(from), "{what}: nothing to edit");
-        let name = if *good == GATEWAY { "cell.toml" } else { "robot.toml" };
+        let name = name(good);
         let wrong = good.replacen(from, to, 1);
         let error = match parse(Text { name, toml: &wrong }, &[]) {
             Ok(_) => panic!("{what}: accepted"),
@@ -230,8 +297,7 @@ fn every_wrong_file_says_what_is_wrong_with_it() {
         assert!(seen.insert(message), "{what}: the same message as another mistake: {error}");
         writeln!(all, "{what}\n  {error}").unwrap();
     }
-    assert!(CASES.len() >= 40);
-    insta::assert_snapshot!("wrong_files", all);
+    all
 }
 
 #[test]

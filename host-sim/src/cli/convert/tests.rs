@@ -44,19 +44,19 @@ fn part(toml: &str, part: Direction) -> Part {
 }
 
 /// The output of `decode`, and its notes.
-fn decoded(part: &Part, input: &str) -> (String, String) {
+pub(super) fn decoded(part: &Part, input: &str) -> (String, String) {
     let (mut out, mut notes) = (Vec::new(), Vec::new());
     decode_lines(part, input.as_bytes(), &mut out, &mut notes).unwrap();
     (String::from_utf8(out).unwrap(), String::from_utf8(notes).unwrap())
 }
 
-fn encoded(part: &Part, input: &str) -> Result<String, String> {
+pub(super) fn encoded(part: &Part, input: &str) -> Result<String, String> {
     let mut out = Vec::new();
     encode_lines(part, None, input.as_bytes(), &mut out)?;
     Ok(String::from_utf8(out).unwrap())
 }
 
-fn from_values(part: &Part, id: Option<u32>, values: &[&str]) -> Result<String, String> {
+pub(super) fn from_values(part: &Part, id: Option<u32>, values: &[&str]) -> Result<String, String> {
     let values: Vec<String> = values.iter().map(|&value| value.to_owned()).collect();
     let mut out = Vec::new();
     encode_values(part, id, &values, &mut out)?;

@@ -119,12 +119,19 @@ impl From<Parts> for config::Parts {
             Parts::Stream { input, output } => {
                 Self::Stream { input: input.map(Into::into), output: output.map(Into::into) }
             }
-            Parts::Can { input, output } => Self::Can {
-                input: input.into_iter().map(Into::into).collect(),
-                output: output.into_iter().map(Into::into).collect(),
-            },
+            Parts::Can { input, output } => Self::Can { input: frames(&input), output: frames(&output) },
         }
     }
+}
+
+/// Not collected: that can panic.
+fn frames(old: &[CanFramePart]) -> Vec<config::CanFramePart, MAX_CAN_IDS> {
+    let mut frames = Vec::new();
+    for &frame in old {
+        // There is as much room as before.
+        let _ = frames.push(frame.into());
+    }
+    frames
 }
 
 #[derive(Deserialize)]
@@ -136,11 +143,11 @@ struct StreamPart {
 
 impl From<StreamPart> for config::StreamPart {
     fn from(StreamPart { head, tail, fields }: StreamPart) -> Self {
-        Self { head, tail, fields: fields.into() }
+        Self::new(head, tail, fields.into())
     }
 }
 
-#[derive(Deserialize)]
+#[derive(Clone, Copy, Deserialize)]
 struct CanFramePart {
     id: CanId,
     fields: Span,
@@ -152,7 +159,7 @@ impl From<CanFramePart> for config::CanFramePart {
     }
 }
 
-#[derive(Deserialize)]
+#[derive(Clone, Copy, Deserialize)]
 struct Span {
     start: u16,
     len: u16,
@@ -242,7 +249,7 @@ struct CommandEntry {
 
 impl From<CommandEntry> for config::CommandEntry {
     fn from(CommandEntry { value, text }: CommandEntry) -> Self {
-        Self { value, text }
+        Self { first: value, last: value, text }
     }
 }
 

@@ -69,7 +69,10 @@ fn frames_are_found_however_they_are_cut() {
         let events = run(&mut framer, &[first, second]);
         let expected = [frame([1, 2]), frame([0xAA, 0xAA]), frame([3, 4])].map(Event::Frame);
         assert_eq!(events, expected, "cut at {cut}");
-        assert_eq!((framer.stats().skipped_bytes, framer.stats().wrong), (1, 0));
+        assert_eq!(
+            (framer.stats().skipped_bytes, framer.stats().noise_bytes, framer.stats().wrong),
+            (1, 1, 0)
+        );
     }
 }
 
@@ -83,7 +86,7 @@ fn a_wrong_checksum_is_told_once_and_the_next_frame_is_taken() {
     let expected = [Event::Wrong(broken.clone()), Event::Wrong(broken), Event::Frame(frame([1, 2]))];
     assert_eq!(events, expected);
     let stats = framer.stats();
-    assert_eq!((stats.frames, stats.wrong, stats.skipped_bytes), (1, 2, 10));
+    assert_eq!((stats.frames, stats.wrong, stats.skipped_bytes, stats.noise_bytes), (1, 2, 10, 0));
 }
 
 #[test]

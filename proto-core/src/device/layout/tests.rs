@@ -1,5 +1,9 @@
+#![allow(clippy::needless_borrows_for_generic_args, reason = "the same elements are looked at again")]
+
 use std::vec;
 use std::vec::Vec;
+
+use proptest::prelude::*;
 
 use super::*;
 
@@ -97,7 +101,7 @@ fn without_a_checksum_another_constant_is_no_frame() {
 fn a_checksum_stands_where_its_device_has_it() {
     let elements = [big(ScalarType::Byte), big(ScalarType::Word)];
     let place = |behind, first, last| {
-        let sum = Checksum { first, last, ..Checksum::standard(Algorithm::Xor8) };
+        let sum = Checksum::standard(Algorithm::Xor8).over(first, last);
         FrameLayout::new(Carrier::Stream, Direction::Output, &[0x55], &[0xEE], &elements, Some((sum, behind)))
     };
     let behind = place(2, 0, None).unwrap();
@@ -218,4 +222,165 @@ fn what_cannot_be_laid_out_is_refused() {
     let long =
         FrameLayout::new(Carrier::Stream, Direction::Output, &[0; 9], &[], &[big(ScalarType::Byte)], None);
     assert_eq!(long.unwrap_err(), LayoutError::DelimiterTooLong { len: 9 });
+}
+
+fn text(width: TextWidth) -> Element {
+    Element::Text(Text { width, fill: None })
+}
+
+fn length(counts: Counts, plus: i8) -> Element {
+    Element::Length(Length { encoding: Encoding::scalar(ScalarType::Byte), counts, plus })
+}
+
+/// A length, a byte, and a text; CRC and tail as asked.
+fn sized(counts: Counts, plus: i8, checked: bool) -> (Vec<Element>, FrameLayout) {
+    let elements = vec![length(counts, plus), fixed(ScalarType::Byte, 7), text(TextWidth::Rest)];
+    let checksum = if checked { standard("crc16-modbus", 3) } else { None };
+    let layout =
+        FrameLayout::new(Carrier::Stream, Direction::Input, &[2], &[3], &elements, checksum).unwrap();
+    (elements, layout)
+}
+
+fn sized_frame(layout: &FrameLayout, elements: &[Element], characters: &[u8]) -> Vec<u8> {
+    let mut out = [0; 512];
+    let put = |_: usize, out: &mut [u8]| {
+        out.get_mut(..characters.len())?.copy_from_slice(characters);
+        Some(characters.len())
+    };
+    let len = layout.encode_with(elements, |_| 0.0, put, &mut out).unwrap();
+    out[..len].to_vec()
+}
+
+#[test]
+fn a_length_tells_where_the_frame_ends() {
+    // Head, length, 7, "AB", checksum, tail.
+    for (counts, plus, checked, expected) in [
+        (Counts::Rest, 0, false, 4),
+        (Counts::Rest, 1, false, 3),
+        (Counts::Rest, 0, true, 6),
+        (Counts::Frame, 0, false, 6),
+        (Counts::Frame, 0, true, 8),
+        (Counts::Fields, 0, false, 3),
+        (Counts::Fields, 0, true, 3),
+        (Counts::Fields, -2, true, 5),
+    ] {
+        let (elements, layout) = sized(counts, plus, checked);
+        let frame = sized_frame(&layout, &elements, b"AB");
+        assert_eq!(frame[1], expected, "{counts:?} {plus} {checked}");
+        for len in 0..frame.len() {
+            let found = layout.probe(&elements, &frame[..len]);
+            assert!(matches!(found, Probe::Partial(_)), "{len} of {frame:?}: {found:?}");
+        }
+        let longer = [&frame[..], &[3, 3]].concat();
+        assert_eq!(layout.probe(&elements, &longer), Probe::Frame(frame.len()));
+        assert_eq!(layout.probe_whole(&elements, &frame), Probe::Frame(frame.len()));
+        assert!(matches!(layout.probe_whole(&elements, &longer), Probe::No(_)));
+        assert_eq!(layout.text(&elements, &frame, 2), Some(&b"AB"[..]));
+        assert_eq!((layout.text(&elements, &frame, 1), layout.text(&elements, &frame, 9)), (None, None));
+    }
+}
+
+#[test]
+fn a_length_out_of_range_is_no_frame() {
+    let (elements, layout) = sized(Counts::Rest, 0, false);
+    assert_eq!(layout.lengths(), (4, 132));
+    // Head, length, 7, the text, tail: 4 + 128 bytes at most.
+    for (number, is_possible) in [(0, false), (1, false), (2, true), (130, true), (131, false), (255, false)]
+    {
+        let found = layout.probe(&elements, &[2, number, 7, 3]);
+        assert_eq!(!matches!(found, Probe::No(_)), is_possible, "{number}: {found:?}");
+    }
+}
+
+#[test]
+fn a_frame_of_fixed_fields_has_the_length_it_says() {
+    let elements = [length(Counts::Rest, 0), value(Kind::Scalar(ScalarType::Word), ByteOrder::Big)];
+    let layout = FrameLayout::new(Carrier::Stream, Direction::Input, &[2], &[], &elements, None).unwrap();
+    assert_eq!(layout.probe(&elements, &[2, 2, 1, 2]), Probe::Frame(4));
+    assert!(matches!(layout.probe(&elements, &[2, 3, 1, 2]), Probe::No(_)));
+    assert_eq!(encoded(&layout, &elements, &[0.0, 258.0]), [2, 2, 1, 2]);
+}
+
+#[test]
+fn a_length_of_some_bits_leaves_the_others() {
+    let kind = |first| Kind::Bits(Bits { bytes: 1, first, count: 4, signed: false });
+    let bits = |first, shared| Encoding { kind: kind(first), order: ByteOrder::Little, shared };
+    let elements = [
+        Element::value(bits(4, false)),
+        Element::Length(Length { encoding: bits(0, true), counts: Counts::Rest, plus: 0 }),
+        text(TextWidth::Rest),
+    ];
+    let layout = FrameLayout::new(Carrier::Stream, Direction::Output, &[2], &[], &elements, None).unwrap();
+    let mut out = [0xA5; 8];
+    let put = |_: usize, out: &mut [u8]| {
+        out[..3].copy_from_slice(b"ABC");
+        Some(3)
+    };
+    assert_eq!(layout.encode_with(&elements, |_| 9.0, put, &mut out), Some(5));
+    assert_eq!(&out[..5], b"\x02\x93ABC");
+    let too_long = |_: usize, _: &mut [u8]| Some(16);
+    assert_eq!(layout.encode_with(&elements, |_| 9.0, too_long, &mut [0; 64]), None);
+}
+
+#[test]
+fn texts_must_begin_and_end_somewhere() {
+    let layout = |carrier, direction, head: &[u8], elements: &[Element]| {
+        FrameLayout::new(carrier, direction, head, b"\r\n", elements, None).map(|layout| layout.lengths())
+    };
+    let (input, output) = (Direction::Input, Direction::Output);
+    let until = text(TextWidth::Until(b';'));
+    for width in [TextWidth::Rest, TextWidth::Until(b';'), TextWidth::Fixed(13)] {
+        let found = layout(Carrier::Stream, input, &[], &[text(width)]);
+        assert_eq!(found, Err(LayoutError::NoBeginning { element: 0 }), "{width:?}");
+        assert!(layout(Carrier::Whole, input, &[], &[text(width)]).is_ok());
+        assert!(layout(Carrier::Stream, output, &[], &[text(width)]).is_ok());
+    }
+    let found = layout(Carrier::Stream, input, &[2], &[until, text(TextWidth::Rest)]);
+    assert_eq!(found, Err(LayoutError::NoEnd { element: 1 }));
+    assert_eq!(layout(Carrier::Stream, input, &[2], &[until, until]), Ok((5, 261)));
+    let found = layout(Carrier::Whole, input, &[2], &[text(TextWidth::Rest), until]);
+    assert_eq!(found, Err(LayoutError::BehindRest { element: 1 }));
+    let found = layout(Carrier::Whole, input, &[2], &[text(TextWidth::Fixed(129))]);
+    assert_eq!(found, Err(LayoutError::Encoding { element: 0 }));
+    let twice = [length(Counts::Rest, 0), length(Counts::Rest, 0)];
+    assert_eq!(layout(Carrier::Stream, input, &[2], &twice), Err(LayoutError::Length { element: 1 }));
+}
+
+#[test]
+fn the_rest_ends_before_what_is_behind_it() {
+    let elements = [text(TextWidth::Rest), fixed(ScalarType::Byte, 9), text(TextWidth::Fixed(2))];
+    let layout =
+        FrameLayout::new(Carrier::Whole, Direction::Input, &[], b"\n", &elements, standard("xor8", 1))
+            .unwrap();
+    let frame = [b"ABC", &[b'A' ^ b'B' ^ b'C'][..], &[9], b"xy\n"].concat();
+    assert_eq!(layout.probe_whole(&elements, &frame), Probe::Frame(frame.len()));
+    assert_eq!(layout.text(&elements, &frame, 0), Some(&b"ABC"[..]));
+    assert_eq!(layout.text(&elements, &frame, 2), Some(&b"xy"[..]));
+    let mut wrong = frame.clone();
+    wrong[0] ^= 1;
+    assert_eq!(layout.probe_whole(&elements, &wrong), Probe::Wrong(frame.len()));
+    assert_eq!(layout.probe_whole(&elements, &frame[1..]), Probe::Wrong(frame.len() - 1));
+    assert!(matches!(layout.probe_whole(&elements, b"\n"), Probe::Partial(_)));
+}
+
+proptest! {
+    /// The same frames as a reader that looks at each length alone, whatever the stream.
+    #[test]
+    fn frames_with_a_length_are_those_of_a_slow_reader(
+        stream in prop::collection::vec(prop::sample::select(vec![2_u8, 3, 4, 5, 7, b'A']), 0..60),
+    ) {
+        let (elements, layout) = sized(Counts::Rest, 0, false);
+        let slow = |bytes: &[u8]| {
+            let len = 2 + usize::from(*bytes.get(1)?);
+            let frame = bytes.get(..len)?;
+            (len >= 4 && frame[0] == 2 && frame[2] == 7 && frame[len - 1] == 3).then_some(len)
+        };
+        for at in 0..stream.len() {
+            let found = match layout.probe(&elements, &stream[at..]) {
+                Probe::Frame(len) => Some(len),
+                _ => None,
+            };
+            prop_assert_eq!(found, slow(&stream[at..]));
+        }
+    }
 }

@@ -211,7 +211,7 @@ fn what_must_not_be_delivered_any_more_ends_a_polite_close() {
 /// A field port whose first byte selects commands.
 fn commanding() -> GatewayConfig {
     let mut config = controller_only();
-    config.commands.push(CommandEntry { value: 1, text: "stop".try_into().unwrap() }).unwrap();
+    config.commands.push(CommandEntry::new(1, "stop".try_into().unwrap())).unwrap();
     let table = Span { start: 0, len: 1 };
     let to = InputBinding::Commands { table, when: CommandWhen::Frame };
     config.fields.push(FieldSpec::UserInput { ty: ScalarType::Byte, to }).unwrap();

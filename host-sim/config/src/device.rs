@@ -1,0 +1,95 @@
+//! A recipe with a device's own frames, with the names of its fields, for tools that show frames.
+
+use proto_core::config::{DeviceFrame, FieldSpec};
+use proto_core::device::{Carrier, LayoutError};
+use proto_core::sysvar::Direction;
+use proto_core::wire::can::CanId;
+
+use crate::sim::SimRecipe;
+
+/// A recipe of a file.
+#[derive(Debug, Clone, PartialEq)]
+pub enum AnyRecipe {
+    /// One that the controller can have as well.
+    Plain(SimRecipe),
+    /// One with a device's own frames, for field ports of the gateway.
+    Device(DeviceRecipe),
+}
+
+impl AnyRecipe {
+    /// Its name.
+    pub fn name(&self) -> &str {
+        match self {
+            Self::Plain(recipe) => &recipe.name,
+            Self::Device(recipe) => &recipe.name,
+        }
+    }
+
+    /// The recipe, if the controller can have it as well.
+    pub fn plain(&self) -> Option<&SimRecipe> {
+        match self {
+            Self::Plain(recipe) => Some(recipe),
+            Self::Device(_) => None,
+        }
+    }
+}
+
+/// A recipe with a device's own frames.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DeviceRecipe {
+    /// Name.
+    pub name: String,
+    /// What carries the frames.
+    pub carrier: Carrier,
+    /// Device to gateway: one frame on a stream, one for each id on CAN; empty without such a part.
+    pub input: Vec<NamedFrame>,
+    /// Gateway to device.
+    pub output: Vec<NamedFrame>,
+}
+
+impl DeviceRecipe {
+    /// The frames of one part.
+    pub fn part(&self, part: Direction) -> &[NamedFrame] {
+        match part {
+            Direction::Input => &self.input,
+            Direction::Output => &self.output,
+        }
+    }
+}
+
+/// A frame with the names of its fields.
+#[derive(Debug, Clone, PartialEq)]
+pub struct NamedFrame {
+    /// Its id on CAN.
+    pub id: Option<CanId>,
+    /// Bytes before the fields.
+    pub head: Vec<u8>,
+    /// Bytes after the fields.
+    pub tail: Vec<u8>,
+    /// The fields, and the checksum at its place.
+    pub fields: Vec<DeviceField>,
+}
+
+/// A field of a device's frame. Tables of commands are left out: the field is unused instead.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DeviceField {
+    /// Name; empty for what needs none.
+    pub name: String,
+    /// What it is.
+    pub spec: FieldSpec,
+    /// It is a second use of the bytes of the field before, under the same name.
+    pub repeats: bool,
+    /// Its value picks a command.
+    pub picks_commands: bool,
+}
+
+impl NamedFrame {
+    /// Lays out the frame.
+    ///
+    /// # Errors
+    /// None for a frame from a file: reading the file laid it out.
+    pub fn lay_out(&self, carrier: Carrier, part: Direction) -> Result<DeviceFrame, LayoutError> {
+        let specs: Vec<_> = self.fields.iter().map(|field| field.spec).collect();
+        DeviceFrame::new(carrier, part, (&self.head, &self.tail), &specs)
+    }
+}

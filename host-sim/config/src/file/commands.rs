@@ -1,0 +1,215 @@
+//! The command table of an input field in a gateway file.
+//!
+//! In: `commands`, and the keys that say when a value picks a command. Out: ranges of values, and
+//! what each of them picks.
+
+use proto_core::config::CommandWhen;
+
+use super::reader::{Item, Reader, Result, Spot};
+
+/// The keys of a field that belong to its commands.
+pub(super) const KEYS: [&str; 3] = ["when", "base", "idle"];
+
+/// What the values of a field pick, and when.
+pub(super) struct FileCommands {
+    pub(super) entries: Vec<FileCommand>,
+    pub(super) when: CommandWhen,
+}
+
+/// What a range of values picks.
+pub(super) struct FileCommand {
+    pub(super) spot: Spot,
+    pub(super) first: i64,
+    pub(super) last: i64,
+    /// Empty for values that pick nothing.
+    pub(super) text: String,
+}
+
+/// An edge or a level of a field with one bit, instead of a value.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum BitKey {
+    Rising,
+    Falling,
+    Level,
+}
+
+const BIT_KEYS: [(&str, BitKey); 3] =
+    [("rising", BitKey::Rising), ("falling", BitKey::Falling), ("level", BitKey::Level)];
+
+/// Reads the commands of a field.
+pub(super) fn read(field: &Reader<'_>, commands: &Item<'_>) -> Result<FileCommands> {
+    let table = commands.any_table()?;
+    let keys: Vec<_> = table.entries().filter_map(|(key, ..)| bit_key(key)).collect();
+    if keys.is_empty() {
+        return read_values(field, commands, &table);
+    }
+    read_bit(field, &table, &keys)
+}
+
+fn read_values(field: &Reader<'_>, commands: &Item<'_>, table: &Reader<'_>) -> Result<FileCommands> {
+    let mut entries = table.entries().map(read_command).collect::<Result<Vec<_>>>()?;
+    if entries.is_empty() {
+        return Err(commands.error("no commands; write for example { 1 = \"run(pick.jspf,50)\" }"));
+    }
+    let mut when = match field.optional("when") {
+        Some(item) => item.choice(&[("change", CommandWhen::Change), ("frame", CommandWhen::Frame)])?,
+        None => CommandWhen::Change,
+    };
+    if let Some(item) = keeps_base(field)? {
+        if when == CommandWhen::Frame {
+            return Err(item.error("allowed only with when = \"change\": each frame picks its command here"));
+        }
+        when = CommandWhen::Kept;
+    }
+    if let Some(item) = field.optional("idle") {
+        let value = item.integer(i64::from(i32::MIN)..=i64::from(u32::MAX))?;
+        entries.push(FileCommand { spot: item.spot, first: value, last: value, text: String::new() });
+    }
+    Ok(FileCommands { entries, when })
+}
+
+/// Commands for the edges or the level of one bit.
+fn read_bit(field: &Reader<'_>, table: &Reader<'_>, keys: &[BitKey]) -> Result<FileCommands> {
+    let is_level = keys.contains(&BitKey::Level);
+    let mut entries = Vec::new();
+    for (key, key_spot, item) in table.entries() {
+        let wrong = |why: &str| item.clone().at(key_spot.clone()).error(why);
+        let value = match bit_key(key) {
+            _ if !has_one_bit(field) => {
+                return Err(wrong("allowed only for a field with one bit, such as bits = 3"));
+            }
+            None => return Err(wrong("a value, beside the edges of a bit; allowed: rising, falling")),
+            Some(BitKey::Level) if keys.len() > 1 => {
+                return Err(wrong("a level, beside edges; allowed: level alone, or rising and falling"));
+            }
+            Some(BitKey::Rising | BitKey::Level) => 1,
+            Some(BitKey::Falling) => 0,
+        };
+        entries.push(FileCommand { first: value, last: value, text: read_text(&item)?, spot: item.spot });
+    }
+    for key in ["when", "idle"] {
+        if let Some(item) = field.optional(key) {
+            return Err(item.error("not allowed together with rising, falling or level, which say it"));
+        }
+    }
+    let when = match keeps_base(field)? {
+        Some(item) if is_level => {
+            return Err(item.error("not allowed together with level: each frame picks its command"));
+        }
+        Some(_) => CommandWhen::Kept,
+        None if is_level => CommandWhen::Frame,
+        None => CommandWhen::Change,
+    };
+    if keys == [BitKey::Falling] {
+        // At rest the bit is set.
+        entries.push(FileCommand { spot: table.spot.clone(), first: 1, last: 1, text: String::new() });
+    }
+    Ok(FileCommands { entries, when })
+}
+
+/// `base`, if the field's base survives silence.
+fn keeps_base<'a>(field: &Reader<'a>) -> Result<Option<Item<'a>>> {
+    let Some(item) = field.optional("base") else { return Ok(None) };
+    let keeps = item.choice(&[("reset", false), ("keep", true)])?;
+    Ok(keeps.then_some(item))
+}
+
+fn bit_key(key: &str) -> Option<BitKey> {
+    BIT_KEYS.into_iter().find(|(name, _)| *name == key).map(|(_, key)| key)
+}
+
+/// `bits = 3`, or `bits = "3..3"`; what else is wrong with it, its own reader says.
+fn has_one_bit(field: &Reader<'_>) -> bool {
+    let Some(item) = field.optional("bits") else { return false };
+    match item.as_string() {
+        None => true,
+        Some(range) => range.split_once("..").is_some_and(|(first, last)| first.trim() == last.trim()),
+    }
+}
+
+fn read_command((key, key_spot, item): (&str, Spot, Item<'_>)) -> Result<FileCommand> {
+    let range = match key.split_once("..") {
+        Some((first, last)) => read_value(first).zip(read_value(last)),
+        None => read_value(key).map(|value| (value, value)),
+    };
+    let Some((first, last)) = range else {
+        return Err(item.at(key_spot).error(format!(
+            "{key:?} is not an integer; the keys of commands are values of the field, such as 1, or ranges of them, \
+             such as \"1..100\""
+        )));
+    };
+    Ok(FileCommand { first, last, text: read_text(&item)?, spot: item.spot })
+}
+
+fn read_value(text: &str) -> Option<i64> {
+    match text.strip_prefix("0x") {
+        Some(hex) => i64::from_str_radix(hex, 16),
+        None => text.parse(),
+    }
+    .ok()
+}
+
+fn read_text(item: &Item<'_>) -> Result<String> {
+    match item.string()? {
+        "" => Err(item.error("the command is empty")),
+        text => Ok(text.to_owned()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::document::Document;
+    use super::*;
+
+    /// The entries, when they act, or the message, of a field with these keys.
+    type Entries = Vec<(i64, i64, String)>;
+
+    fn field(text: &str) -> std::result::Result<(Entries, CommandWhen), String> {
+        let document = Document::parse("field.toml", text, &[]).unwrap();
+        let field = Reader::root(&document, &["bits", "commands", "when", "base", "idle"]).unwrap();
+        let commands = field.optional("commands").unwrap();
+        let read = read(&field, &commands).map_err(|error| error.to_string())?;
+        let entries = read.entries.into_iter().map(|entry| (entry.first, entry.last, entry.text));
+        Ok((entries.collect(), read.when))
+    }
+
+    #[test]
+    fn ranges_and_idle_values_are_read() {
+        let text = "commands = { 1 = 'stop', '-5..0x10' = 'speed({value})' }\nidle = 255\nbase = 'keep'";
+        let entries =
+            [(1, 1, "stop".into()), (-5, 16, "speed({value})".into()), (255, 255, String::new())].to_vec();
+        assert_eq!(field(text), Ok((entries, CommandWhen::Kept)));
+        assert_eq!(field("commands = { 1 = 'stop' }\nbase = 'reset'").unwrap().1, CommandWhen::Change);
+    }
+
+    #[test]
+    fn edges_and_levels_of_a_bit_are_values_of_it() {
+        let stop = |value: i64| (value, value, "stop".to_owned());
+        let run = (1, 1, "run(a)".to_owned());
+        for (text, entries, when) in [
+            ("{ rising = 'stop' }\nbits = 3", vec![stop(1)], CommandWhen::Change),
+            ("{ rising = 'stop' }\nbits = '3..3'\nbase = 'keep'", vec![stop(1)], CommandWhen::Kept),
+            ("{ rising = 'run(a)', falling = 'stop' }\nbits = 0", vec![run, stop(0)], CommandWhen::Change),
+            ("{ falling = 'stop' }\nbits = 3", vec![stop(0), (1, 1, String::new())], CommandWhen::Change),
+            ("{ level = 'stop' }\nbits = 3", vec![stop(1)], CommandWhen::Frame),
+        ] {
+            assert_eq!(field(&format!("commands = {text}")), Ok((entries, when)), "{text}");
+        }
+    }
+
+    #[test]
+    fn what_does_not_go_together_is_said() {
+        for (text, said) in [
+            ("{ rising = 'stop' }\nbits = '3..4'", "allowed only for a field with one bit"),
+            ("{ rising = 'stop', 2 = 'resume' }\nbits = 3", "a value, beside the edges of a bit"),
+            ("{ rising = 'resume', level = 'stop' }\nbits = 3", "allowed: level alone"),
+            ("{ level = 'stop' }\nbits = 3\nwhen = 'frame'", "which say it"),
+            ("{ falling = 'stop' }\nbits = 3\nidle = 1", "which say it"),
+            ("{ level = 'stop' }\nbits = 3\nbase = 'keep'", "not allowed together with level"),
+            ("{ rising = '' }\nbits = 3", "the command is empty"),
+        ] {
+            let message = field(&format!("commands = {text}")).unwrap_err();
+            assert!(message.contains(said), "{text}: {message}");
+        }
+    }
+}

@@ -1,0 +1,471 @@
+//! Frames of devices in a gateway file: fields beyond the plain types, and checksums.
+//!
+//! In: the tables of a part and of its fields. Out: [`FileField`]s, and frames that were laid out.
+//! The controller's own recipes have none of these keys, and are refused them with the reason.
+
+use proto_core::config::{DeviceFrame, FieldSpec};
+use proto_core::device::{
+    Algorithm, Boundary, ByteOrder, Carrier, Checksum, Crc, Element, Encoding, LayoutError, Overflow,
+    TextWidth,
+};
+use proto_core::recipe::PartError;
+use proto_core::recipe::model::{MAX_CAN_IDS, MAX_DELIMITER, MAX_STREAM_FRAME, Mode, Rules};
+use proto_core::sysvar::Direction;
+use proto_core::wire::scalar::ScalarType;
+
+use super::bindings::{self, FileInput};
+use super::encoding::{self, OpenNumber, Order, refuse};
+use super::framings;
+use super::reader::{Item, Reader, Result};
+use super::recipes::{FileField, FileFieldKind, FileFrame, FilePart, FileRecipe, Flavour, Written};
+use crate::device::{DeviceField, DeviceRecipe, NamedFrame};
+
+/// The keys of a CAN frame.
+const FRAME_KEYS: [&str; 3] = ["endian", "word_order", "checksum"];
+/// The keys of a stream part.
+const STREAM_KEYS: [&str; 5] = ["endian", "word_order", "checksum", "framing", "escape"];
+/// The keys of a field or what stands in its place, beside those that say how it is written.
+const FIELD_KEYS: [&str; 5] = ["equals", "overflow", "pad", "fill", "text"];
+
+/// Why recipes of this kind have no frames of devices; `None` if they may.
+fn why_plain(mode: Mode, flavour: Flavour) -> Option<&'static str> {
+    match (flavour, mode) {
+        (Flavour::Gateway, Mode::User) => None,
+        (Flavour::Gateway, Mode::Realtime) => Some(
+            "a realtime recipe is the controller's own: little-endian and without a checksum; for a device's own \
+             frames set mode = \"user\"",
+        ),
+        (Flavour::Controller, _) => Some(
+            "the controller's recipes are little-endian and have no checksum; only gateway files describe a \
+             device's own frames",
+        ),
+    }
+}
+
+/// The keys of a stream part or a CAN frame, beside those of any recipe; refuses them where there
+/// are none.
+pub(super) fn frame_keys(
+    table: &Reader<'_>,
+    mode: Mode,
+    flavour: Flavour,
+) -> Result<&'static [&'static str]> {
+    own_keys(&FRAME_KEYS, table, mode, flavour)
+}
+
+/// The same for a stream part.
+pub(super) fn stream_keys(
+    table: &Reader<'_>,
+    mode: Mode,
+    flavour: Flavour,
+) -> Result<&'static [&'static str]> {
+    own_keys(&STREAM_KEYS, table, mode, flavour)
+}
+
+fn own_keys(
+    keys: &'static [&'static str],
+    table: &Reader<'_>,
+    mode: Mode,
+    flavour: Flavour,
+) -> Result<&'static [&'static str]> {
+    match why_plain(mode, flavour) {
+        None => Ok(keys),
+        Some(why) => refuse(table, keys, why).map(|()| -> &[&str] { &[] }),
+    }
+}
+
+/// Refuses the keys of a frame in a CAN part, which has several frames.
+pub(super) fn refuse_in_can_part(part: &Reader<'_>, mode: Mode, flavour: Flavour) -> Result<()> {
+    stream_keys(part, mode, flavour)?;
+    refuse(part, &framings::PART_KEYS, "a CAN bus tells frames apart itself")?;
+    refuse(part, &FRAME_KEYS, "in a CAN recipe each frame has its own; write it below the frame's id")
+}
+
+/// What the fields of one frame have in common, while they are read.
+pub(super) struct FieldReader {
+    direction: Direction,
+    flavour: Flavour,
+    order: Order,
+    open: Option<OpenNumber>,
+}
+
+impl FieldReader {
+    pub(super) fn new(frame: &Reader<'_>, rules: Rules, flavour: Flavour) -> Result<Self> {
+        Ok(Self { direction: rules.direction, flavour, order: Order::read(frame)?, open: None })
+    }
+
+    /// Reads one field of a user recipe, which can be several items of the frame.
+    pub(super) fn read(&mut self, item: &Item<'_>, fields: &mut Vec<FileField>) -> Result<()> {
+        let table = item.any_table()?;
+        let mut push = |kind| fields.push(FileField { spot: item.spot.clone(), kind });
+        let when = match self.direction {
+            Direction::Input => " in an input field",
+            Direction::Output => " in an output field",
+        };
+        if let Some(why) = why_plain(Mode::User, self.flavour) {
+            refuse(&table, &[&FIELD_KEYS[..], &framings::FIELD_KEYS, &encoding::KEYS].concat(), why)?;
+            table.check_keys(&["name", "type"], when)?;
+            push(self.read_plain(&table)?);
+            return Ok(());
+        }
+        if let Some(pad) = table.optional("pad") {
+            table.check_keys(&["pad", "fill"], " in padding")?;
+            let fill = table.optional("fill").map_or(Ok(0), |item| item.integer(0..=255))?;
+            self.open = None;
+            push(FileFieldKind::Padding { len: pad.integer(1..=255)?, fill });
+            return Ok(());
+        }
+        if table.optional("type").and_then(|item| item.as_string()) == Some("text") {
+            self.open = None;
+            let name = table.optional("name").map(|item| item.string().map(str::to_owned)).transpose()?;
+            push(FileFieldKind::Device { name, spec: framings::read_text(&table, self.direction)? });
+            return Ok(());
+        }
+        refuse(&table, &framings::TEXT_KEYS, "allowed only together with type = \"text\"")?;
+        if table.optional("length").is_some() {
+            table.check_keys(&[&framings::LENGTH_KEYS[..], &encoding::KEYS].concat(), " in a length")?;
+            let encoding = encoding::read(&table, self.order, &mut self.open)?;
+            let name = table.optional("name").map(|item| item.string().map(str::to_owned)).transpose()?;
+            push(FileFieldKind::Device { name, spec: framings::read_length(&table, encoding)? });
+            return Ok(());
+        }
+        refuse(&table, &["counts", "plus"], "allowed only together with length = true")?;
+        refuse(&table, &["fill"], "allowed only together with pad, or with type = \"text\" and width")?;
+        if let Some(text) = table.optional("text") {
+            table.check_keys(&["text"], " in a text")?;
+            self.open = None;
+            for byte in read_text(&text)? {
+                let encoding = Encoding::scalar(ScalarType::Byte);
+                push(FileFieldKind::Fixed { name: None, encoding, value: i64::from(byte) });
+            }
+            return Ok(());
+        }
+        let bound: &[&str] = match self.direction {
+            Direction::Input => {
+                refuse(&table, &["value"], "an input field has equals = 9 for a constant")?;
+                &["to", "commands", "when", "base", "idle", "scale", "offset", "equals", "overflow"]
+            }
+            Direction::Output => {
+                refuse(&table, &["equals"], "an output field has value = 9 for a constant")?;
+                &["from", "value", "scale", "offset", "overflow"]
+            }
+        };
+        table.check_keys(&[&["name", "type"], bound, &encoding::KEYS].concat(), when)?;
+        match table.optional("equals") {
+            Some(equals) => push(self.read_constant(&table, &equals)?),
+            None => self.read_value(&table, push)?,
+        }
+        Ok(())
+    }
+
+    /// A field of a controller's recipe.
+    fn read_plain(&self, table: &Reader<'_>) -> Result<FileFieldKind> {
+        let name = read_name(table)?;
+        let written = Written::plain(encoding::read_plain_type(table)?);
+        Ok(match self.direction {
+            Direction::Input => {
+                FileFieldKind::UserInput { name, written, to: FileInput::Unused, again: false }
+            }
+            Direction::Output => {
+                FileFieldKind::UserOutput { name, written, from: bindings::FileOutput::Program }
+            }
+        })
+    }
+
+    /// An integer that must match.
+    fn read_constant(&mut self, table: &Reader<'_>, equals: &Item<'_>) -> Result<FileFieldKind> {
+        let bindings = ["to", "commands", "when", "base", "idle", "scale", "offset", "overflow"];
+        refuse(table, &bindings, "a field with equals is a constant and has nothing else")?;
+        let name = table.optional("name").map(|item| item.string().map(str::to_owned)).transpose()?;
+        let encoding = encoding::read(table, self.order, &mut self.open)?;
+        if !encoding.is_integer() {
+            return Err(equals.error("only integers can be constants; this field may have a fraction"));
+        }
+        let (low, high) = encoding.range();
+        let value = equals.integer(low as i64..=high as i64)?;
+        Ok(FileFieldKind::Fixed { name, encoding, value })
+    }
+
+    /// A field with a name and a value.
+    fn read_value(&mut self, table: &Reader<'_>, mut push: impl FnMut(FileFieldKind)) -> Result<()> {
+        let name = read_name(table)?;
+        let encoding = encoding::read(table, self.order, &mut self.open)?;
+        let key = match self.direction {
+            Direction::Input => "to",
+            Direction::Output => "from",
+        };
+        if table.optional(key).is_none() {
+            refuse(table, &["overflow"], &format!("allowed only together with {key}"))?;
+        }
+        let overflow = table
+            .optional("overflow")
+            .map_or(Ok(Overflow::Usual), |item| item.choice(&[("wrap", Overflow::Wrap)]))?;
+        let written = Written { encoding, overflow };
+        match self.direction {
+            Direction::Output => {
+                let from = bindings::read_output(table)?;
+                if let Some(item) = table.optional("value").filter(|_| encoding.is_integer())
+                    && item.number()?.fract() != 0.0
+                {
+                    let value = item.number()?;
+                    return Err(item.error(format!("{value} has a fraction; this field has integers only")));
+                }
+                push(FileFieldKind::UserOutput { name, written, from });
+            }
+            Direction::Input => {
+                let (first, second) = bindings::read_input(table)?;
+                push(FileFieldKind::UserInput { name: name.clone(), written, to: first, again: false });
+                if let Some(to) = second {
+                    let encoding = Encoding { shared: true, ..encoding };
+                    let written = Written { encoding, overflow: Overflow::Usual };
+                    push(FileFieldKind::UserInput { name, written, to, again: true });
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+fn read_name(table: &Reader<'_>) -> Result<String> {
+    Ok(table.required("name", "give the field a name")?.string()?.to_owned())
+}
+
+fn read_text<'a>(item: &Item<'a>) -> Result<impl Iterator<Item = u8> + use<'a>> {
+    let text = item.string()?;
+    if text.is_empty() {
+        return Err(item.error("a text of no bytes; write at least one character"));
+    }
+    match text.chars().find(|c| !c.is_ascii()) {
+        Some(c) => Err(item.error(format!("{c:?} is not ASCII; allowed: characters of one byte, 0..=127"))),
+        None => Ok(text.bytes()),
+    }
+}
+
+/// Reads the checksum of a frame and puts it at its place among the fields.
+pub(super) fn read_checksum(frame: &Reader<'_>, head: usize, fields: &mut Vec<FileField>) -> Result<()> {
+    let Some(item) = frame.optional("checksum") else { return Ok(()) };
+    if item.as_string().is_some() {
+        return Err(item.error("expected a table, such as { kind = \"crc16-modbus\" }, found a string"));
+    }
+    let table = item.any_table()?;
+    let algorithm = read_algorithm(&table)?;
+    let mut sum = Checksum::standard(algorithm);
+    if let Some(item) = table.optional("over") {
+        let (first, last) = read_covered(&item)?;
+        sum = sum.over(first, last);
+    }
+    if let Some(item) = table.optional("order") {
+        sum.order = item.choice(&[("little", ByteOrder::Little), ("big", ByteOrder::Big)])?;
+    }
+    if let Some(item) = table.optional("as") {
+        sum.text = item.choice(&[("bytes", false), ("hex", true)])?;
+    }
+    let nth = match table.optional("at") {
+        Some(item) => find_place(&item, head, fields)?,
+        None => fields.len(),
+    };
+    fields.insert(nth, FileField { spot: item.spot.clone(), kind: FileFieldKind::Checksum(sum) });
+    Ok(())
+}
+
+fn read_algorithm(table: &Reader<'_>) -> Result<Algorithm> {
+    const PLACE: [&str; 5] = ["kind", "over", "at", "order", "as"];
+    let kind = table.required("kind", "the algorithm, such as \"crc16-modbus\"")?;
+    let name = kind.string()?;
+    if name != "crc" {
+        let algorithm = Algorithm::named(name).ok_or_else(|| {
+            let known: Vec<_> = Algorithm::names().map(|name| format!("{name:?}")).collect();
+            kind.error(format!(
+                "{name:?} is unknown; allowed: {}, \"crc\" (with its parameters)",
+                known.join(", ")
+            ))
+        })?;
+        table.check_keys(&PLACE, &format!(" with kind = {name:?}"))?;
+        return Ok(algorithm);
+    }
+    let parameters = ["width", "poly", "init", "xorout", "refin", "refout"];
+    table.check_keys(&[&PLACE[..], &parameters].concat(), " with kind = \"crc\"")?;
+    let width: u8 = table.required("width", "the number of bits, 1..=32")?.integer(1..=32)?;
+    let most = i64::from(u32::MAX >> (32 - u32::from(width)));
+    let number = |key| table.optional(key).map_or(Ok(0), |item| item.integer(0..=most));
+    let flag = |key, default| table.optional(key).map_or(Ok(default), |item| item.bool());
+    table.required("poly", "the polynomial without its highest term, such as 0x1021")?;
+    let refin = flag("refin", false)?;
+    Ok(Algorithm::Crc(Crc {
+        width,
+        poly: number("poly")?,
+        init: number("init")?,
+        xorout: number("xorout")?,
+        refin,
+        refout: flag("refout", refin)?,
+    }))
+}
+
+/// `"1.."` or `"1..7"`: the first byte and the last one.
+fn read_covered(item: &Item<'_>) -> Result<(u16, Option<u16>)> {
+    let text = item.string()?;
+    let number = |text: &str| text.parse::<u16>().ok().filter(|&at| usize::from(at) < MAX_STREAM_FRAME);
+    let range = text.split_once("..").and_then(|(first, last)| {
+        let last = if last.is_empty() { None } else { Some(number(last)?) };
+        Some((number(first)?, last))
+    });
+    match range {
+        Some((first, last)) if last.is_none_or(|last| first <= last) => Ok((first, last)),
+        Some(_) => Err(item.error(format!("{text:?} runs backwards; write the first byte, then the last one"))),
+        None => Err(item.error(format!(
+            "{text:?} is not a range of bytes; write \"1..7\", or \"1..\" for all up to the checksum; byte 0 is \
+             the first of the frame"
+        ))),
+    }
+}
+
+/// The number of fields before the byte that `item` names.
+fn find_place(item: &Item<'_>, head: usize, fields: &[FileField]) -> Result<usize> {
+    let at: usize = item.integer(0..=MAX_STREAM_FRAME as i64 - 1)?;
+    // Places between two fields; behind one of varying length no byte has a number.
+    let mut places = Vec::new();
+    let mut offset = Some(head);
+    for (nth, field) in fields.iter().enumerate() {
+        let element = field.spec().element();
+        let encoding = element.and_then(|element| element.encoding());
+        if encoding.is_some_and(|encoding| encoding.shared) {
+            continue;
+        }
+        places.extend(offset.map(|offset| (offset, nth)));
+        let len = match (element, encoding) {
+            (Some(Element::Padding { len, .. }), _) => Some(usize::from(len)),
+            (Some(Element::Text(text)), _) => match text.width {
+                TextWidth::Fixed(width) => Some(usize::from(width)),
+                TextWidth::Until(_) | TextWidth::Rest => None,
+            },
+            (_, Some(encoding)) => encoding.size(),
+            _ => Some(0),
+        };
+        offset = offset.zip(len).map(|(offset, len)| offset + len);
+    }
+    places.extend(offset.map(|offset| (offset, fields.len())));
+    places.iter().find(|&&(offset, _)| offset == at).map(|&(_, nth)| nth).ok_or_else(|| {
+        let places: Vec<_> = places.iter().map(|(offset, _)| offset.to_string()).collect();
+        item.error(format!(
+            "no field begins or ends at byte {at}; allowed: {}, or no at for the place behind the fields",
+            places.join(", ")
+        ))
+    })
+}
+
+impl FilePart {
+    /// Whether something else than its fields tells where frames end.
+    fn is_cut(&self) -> bool {
+        self.framing != (Boundary::Fields, None)
+    }
+
+    /// Checks the part of a recipe with a device's own frames.
+    pub(super) fn check_device(
+        &self,
+        document: &Reader<'_>,
+        carrier: Carrier,
+        part: Direction,
+    ) -> Result<()> {
+        let refused = |error: PartError| Err(self.spot_of(error).error(document.document, error));
+        if self.frames.is_empty() {
+            return refused(PartError::NoFrames);
+        }
+        if self.frames.len() > MAX_CAN_IDS {
+            return refused(PartError::TooManyFrames);
+        }
+        for (nth, frame) in (0..).zip(&self.frames) {
+            if let Err(error) = self.lay_out(frame, carrier, part) {
+                return Err(self.spot_of_layout(frame, error).error(document.document, error));
+            }
+            let earlier = (0..nth).zip(&self.frames).find(|(_, earlier)| earlier.id == frame.id);
+            if let Some((first, _)) = earlier {
+                return refused(PartError::DuplicateId { frame: nth, first, id: frame.id });
+            }
+        }
+        Ok(())
+    }
+
+    fn lay_out(
+        &self,
+        frame: &FileFrame,
+        carrier: Carrier,
+        part: Direction,
+    ) -> std::result::Result<DeviceFrame, LayoutError> {
+        let specs: Vec<_> = frame.fields.iter().map(FileField::spec).collect();
+        DeviceFrame::new(carrier, part, (&self.head, &self.tail), &specs)
+    }
+
+    /// The place of `error`.
+    fn spot_of_layout<'f>(&'f self, frame: &'f FileFrame, error: LayoutError) -> &'f super::reader::Spot {
+        let delimiter = match error {
+            LayoutError::DelimiterTooLong { .. } if self.head.len() > MAX_DELIMITER => {
+                self.head_spot.as_ref()
+            }
+            LayoutError::DelimiterTooLong { .. } => self.tail_spot.as_ref(),
+            _ => None,
+        };
+        let is_element = |field: &&FileField| field.spec().element().is_some();
+        let is_checksum = |field: &&FileField| matches!(field.kind, FileFieldKind::Checksum(_));
+        let field = match error.element() {
+            Some(element) => frame.fields.iter().filter(is_element).nth(usize::from(element)),
+            None if error.is_of_checksum() => frame.fields.iter().find(is_checksum),
+            None => None,
+        };
+        delimiter.or(field.map(|field| &field.spot)).unwrap_or(&frame.spot)
+    }
+}
+
+impl FileRecipe {
+    /// Whether it has frames that no recipe of the controller has.
+    pub(super) fn is_device(&self) -> bool {
+        let parts = [&self.input, &self.output].into_iter().flatten();
+        let mut fields = parts.flat_map(|part| &part.frames).flat_map(|frame| &frame.fields);
+        let is_cut = [&self.input, &self.output].into_iter().flatten().any(FilePart::is_cut);
+        is_cut || fields.any(|field| field.spec().is_device())
+    }
+
+    /// What carries the frames of a part.
+    pub(super) fn carrier(&self, part: Direction) -> Carrier {
+        match self.part(part) {
+            _ if self.is_can => Carrier::Can,
+            Some(part) if part.is_cut() => Carrier::Whole,
+            _ => Carrier::Stream,
+        }
+    }
+
+    /// The recipe with the names of its fields.
+    pub(super) fn to_device(&self) -> DeviceRecipe {
+        let frames = |part: &Option<FilePart>| {
+            let named = |part: &FilePart, frame: &FileFrame| NamedFrame {
+                id: self.is_can.then_some(frame.id),
+                head: part.head.clone(),
+                tail: part.tail.clone(),
+                fields: frame.fields.iter().map(FileField::named).collect(),
+            };
+            part.iter().flat_map(|part| part.frames.iter().map(move |frame| named(part, frame))).collect()
+        };
+        DeviceRecipe {
+            name: self.name.clone(),
+            carrier: [Direction::Input, Direction::Output]
+                .map(|part| self.carrier(part))
+                .into_iter()
+                .find(|&carrier| carrier == Carrier::Whole)
+                .unwrap_or(self.carrier(Direction::Input)),
+            input: frames(&self.input),
+            output: frames(&self.output),
+        }
+    }
+}
+
+impl FileField {
+    fn named(&self) -> DeviceField {
+        let repeats = matches!(self.kind, FileFieldKind::UserInput { again: true, .. });
+        let picks_commands =
+            matches!(self.kind, FileFieldKind::UserInput { to: FileInput::Commands { .. }, .. });
+        DeviceField { name: self.name(), spec: self.spec(), repeats, picks_commands }
+    }
+
+    /// What the field is, without a table of commands.
+    pub(super) fn spec(&self) -> FieldSpec {
+        self.bound_spec(|to| to.without_commands())
+    }
+}

@@ -1,0 +1,247 @@
+//! How one field of a device's frame is written: the keys of its type, its byte order and its bits.
+//!
+//! In: a field's table, and the byte order of its part. Out: an [`Encoding`].
+
+use proto_core::device::{Bits, ByteOrder, Digits, Encoding, Kind, MAX_DIGITS, Width};
+use proto_core::wire::scalar::ScalarType;
+
+use super::reader::{Item, Reader, Result};
+
+/// The keys that say how a field is written.
+pub(super) const KEYS: [&str; 8] =
+    ["endian", "word_order", "bits", "signed", "new", "width", "until", "decimals"];
+
+/// The types of fields.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Type {
+    Scalar(ScalarType),
+    Uint24,
+    Int24,
+    Bcd,
+    Decimal,
+    Hex,
+}
+
+/// The types that only a device's frames have.
+const OWN_TYPES: [(&str, Type); 5] = [
+    ("uint24", Type::Uint24),
+    ("int24", Type::Int24),
+    ("bcd", Type::Bcd),
+    ("decimal", Type::Decimal),
+    ("hex", Type::Hex),
+];
+
+/// The byte order that a part or a field asks for.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Order {
+    is_big: Option<bool>,
+    low_word_first: Option<bool>,
+}
+
+impl Order {
+    /// The keys `endian` and `word_order` of a part or a field.
+    pub(super) fn read(table: &Reader<'_>) -> Result<Self> {
+        let read = |key, choices: [(&str, bool); 2]| {
+            table.optional(key).map(|item| item.choice(&choices)).transpose()
+        };
+        Ok(Self {
+            is_big: read("endian", [("little", false), ("big", true)])?,
+            low_word_first: read("word_order", [("high-first", false), ("low-first", true)])?,
+        })
+    }
+
+    /// The order of a number of `len` bytes; `self` is the field's, `part` the one around it.
+    fn of(self, part: Self, len: usize) -> ByteOrder {
+        let is_big = self.is_big.or(part.is_big).unwrap_or(false);
+        let low_word_first = self.low_word_first.or(part.low_word_first).unwrap_or(!is_big);
+        match (is_big, low_word_first) {
+            _ if len == 1 => ByteOrder::Little,
+            (true, true) if matches!(len, 4 | 8) => ByteOrder::BigSwapped,
+            (false, false) if matches!(len, 4 | 8) => ByteOrder::LittleSwapped,
+            (true, _) => ByteOrder::Big,
+            (false, _) => ByteOrder::Little,
+        }
+    }
+}
+
+/// The number whose bits the fields before have.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct OpenNumber {
+    bytes: u8,
+    order: ByteOrder,
+    taken: u32,
+}
+
+/// The type of a field that any recipe can have.
+pub(super) fn read_plain_type(field: &Reader<'_>) -> Result<ScalarType> {
+    let item = read_type_item(field)?;
+    if let Some((name, _)) = OWN_TYPES.iter().find(|(name, _)| item.as_string() == Some(name)) {
+        return Err(
+            item.error(format!("{name} is a type of a device's own frames; only gateway files have them"))
+        );
+    }
+    let types: Vec<_> = ScalarType::ALL.into_iter().map(|ty| (ty.name(), ty)).collect();
+    item.choice(&types)
+}
+
+fn read_type(field: &Reader<'_>) -> Result<Type> {
+    let scalars = ScalarType::ALL.into_iter().map(|ty| (ty.name(), Type::Scalar(ty)));
+    read_type_item(field)?.choice(&scalars.chain(OWN_TYPES).collect::<Vec<_>>())
+}
+
+fn read_type_item<'a>(field: &Reader<'a>) -> Result<Item<'a>> {
+    field.required("type", "byte, char, word, short, dword, int, float or double")
+}
+
+/// How a field is written. `open` is the number of bits that the field before belongs to, then that
+/// of this field.
+pub(super) fn read(field: &Reader<'_>, part: Order, open: &mut Option<OpenNumber>) -> Result<Encoding> {
+    let ty = read_type(field)?;
+    let before = open.take();
+    if let Some(item) = field.optional("bits") {
+        refuse(field, &["width", "until", "decimals"], "a field of bits has no such key")?;
+        let bits = read_bits(field, &item, ty)?;
+        let order = read_order(field, part, Some(usize::from(bits.bytes)))?;
+        let is_new = field.optional("new").map_or(Ok(false), |item| item.bool())?;
+        let ones = u32::MAX.unbounded_shr(32 - u32::from(bits.count)) << bits.first;
+        let shared = before.filter(|open| {
+            !is_new && open.bytes == bits.bytes && open.order == order && open.taken & ones == 0
+        });
+        let taken = ones | shared.map_or(0, |open| open.taken);
+        *open = Some(OpenNumber { bytes: bits.bytes, order, taken });
+        return Ok(Encoding { kind: Kind::Bits(bits), order, shared: shared.is_some() });
+    }
+    refuse(field, &["signed", "new"], "allowed only together with bits")?;
+    let kind = read_kind(field, ty)?;
+    let encoding = Encoding { kind, order: ByteOrder::Little, shared: false };
+    let len = encoding.size().filter(|_| !matches!(ty, Type::Decimal | Type::Hex));
+    Ok(Encoding { order: read_order(field, part, len)?, ..encoding })
+}
+
+fn read_kind(field: &Reader<'_>, ty: Type) -> Result<Kind> {
+    match ty {
+        Type::Scalar(_) | Type::Uint24 | Type::Int24 => {
+            refuse(field, &["width"], "only bcd, decimal and hex have a width")?;
+        }
+        Type::Bcd | Type::Decimal | Type::Hex => {}
+    }
+    if !matches!(ty, Type::Decimal | Type::Hex) {
+        refuse(field, &["until"], "only decimal and hex end with a character")?;
+    }
+    if ty != Type::Decimal {
+        refuse(field, &["decimals"], "only decimal has decimals")?;
+    }
+    Ok(match ty {
+        Type::Scalar(ty) => Kind::Scalar(ty),
+        Type::Uint24 => Kind::Uint24,
+        Type::Int24 => Kind::Int24,
+        Type::Bcd => {
+            Kind::Bcd { bytes: field.required("width", "the number of bytes, 1..=4")?.integer(1..=4)? }
+        }
+        Type::Hex => Kind::Hex(read_width(field, 8, |end| !end.is_ascii_hexdigit(), "a hexadecimal digit")?),
+        Type::Decimal => {
+            let ends = |end: char| !matches!(end, '0'..='9' | '+' | '-' | '.' | ' ');
+            let width = read_width(field, MAX_DIGITS as i64, ends, "a digit, a sign, a point or a blank")?;
+            let decimals = match (field.optional("decimals"), width) {
+                (None, _) => 0,
+                (Some(item), Width::Until(_)) => item.integer(0..=9)?,
+                (Some(item), Width::Fixed(width)) => {
+                    let decimals: u8 = item.integer(0..=9)?;
+                    // A sign, a digit and a point stand before the decimals.
+                    if decimals > 0 && width < decimals + 3 {
+                        let least = decimals + 3;
+                        return Err(item.error(format!(
+                            "{decimals} decimals need a sign, a digit and a point before them; a width of \
+                             {least} or more is needed, this one is {width}"
+                        )));
+                    }
+                    decimals
+                }
+            };
+            Kind::Decimal(Digits { width, decimals })
+        }
+    })
+}
+
+/// `width` or `until`, of a field of digits.
+fn read_width(field: &Reader<'_>, most: i64, ends: impl Fn(char) -> bool, digits: &str) -> Result<Width> {
+    match (field.optional("width"), field.optional("until")) {
+        (Some(width), None) => Ok(Width::Fixed(width.integer(1..=most)?)),
+        (None, Some(until)) => {
+            let text = until.string()?;
+            let mut characters = text.chars();
+            match (characters.next(), characters.next()) {
+                (Some(end), None) if end.is_ascii() && ends(end) => Ok(Width::Until(end as u8)),
+                (Some(end), None) if end.is_ascii() => {
+                    Err(until.error(format!("{text:?} cannot end the field; allowed: what is not {digits}")))
+                }
+                _ => {
+                    Err(until
+                        .error(format!("{text:?} is not one character of ASCII, such as \",\" or \"\\r\"")))
+                }
+            }
+        }
+        (Some(_), Some(until)) => Err(until.error("a field takes width or until, not both")),
+        (None, None) => Err(field.error(format!(
+            "width or until is missing; width is the number of characters, 1..={most}, until the character \
+             behind the field, such as \",\""
+        ))),
+    }
+}
+
+/// `bits = 3` or `bits = "4..7"`, of a byte, word or dword.
+fn read_bits(field: &Reader<'_>, item: &Item<'_>, ty: Type) -> Result<Bits> {
+    let bytes = match ty {
+        Type::Scalar(ty @ (ScalarType::Byte | ScalarType::Word | ScalarType::Dword)) => ty.size() as u8,
+        _ => {
+            return Err(
+                item.error("only byte, word and dword have bits; with signed = true they may be negative")
+            );
+        }
+    };
+    let last_bit = bytes * 8 - 1;
+    let (first, last) = match item.as_string() {
+        None => {
+            let bit = item.integer(0..=i64::from(last_bit))?;
+            (bit, bit)
+        }
+        Some(text) => {
+            let range = text.split_once("..").unwrap_or((text, text));
+            let (Ok(first), Ok(last)) = (range.0.parse::<u8>(), range.1.parse::<u8>()) else {
+                return Err(item.error(format!("{text:?} is not a range of bits; write 3 or \"4..7\"")));
+            };
+            if first > last || last > last_bit {
+                return Err(item.error(format!(
+                    "{text:?} is out of range; allowed: bits in 0..{last_bit}, the lowest first"
+                )));
+            }
+            (first, last)
+        }
+    };
+    let signed = field.optional("signed").map_or(Ok(false), |item| item.bool())?;
+    Ok(Bits { bytes, first, count: last - first + 1, signed })
+}
+
+/// The byte order of a field of `len` bytes; `None` for digits.
+fn read_order(field: &Reader<'_>, part: Order, len: Option<usize>) -> Result<ByteOrder> {
+    let own = Order::read(field)?;
+    if len.is_none_or(|len| len == 1) {
+        refuse(
+            field,
+            &["endian"],
+            "one byte, or digits, have no byte order; allowed: fields of 2 bytes or more",
+        )?;
+    }
+    if !matches!(len, Some(4 | 8)) {
+        refuse(field, &["word_order"], "only fields of 4 or 8 bytes have an order of words")?;
+    }
+    Ok(own.of(part, len.unwrap_or(1)))
+}
+
+/// Refuses the first of `keys` that the table has.
+pub(super) fn refuse(table: &Reader<'_>, keys: &[&str], why: &str) -> Result<()> {
+    match keys.iter().find_map(|key| table.optional(key)) {
+        Some(item) => Err(item.error(why)),
+        None => Ok(()),
+    }
+}

@@ -1,0 +1,120 @@
+//! What tells one frame from the next in a gateway file, texts, and lengths.
+//!
+//! In: the tables of a part and of its fields. Out: the configuration's own types.
+
+use proto_core::config::{FieldSpec, Words};
+use proto_core::device::{Boundary, ByteOrder, Counts, Encoding, Escape, Length, MAX_TEXT, Text, TextWidth};
+use proto_core::sysvar::{Direction, SysVar, VarRange};
+
+use super::encoding::refuse;
+use super::reader::{Item, Reader, Result};
+
+/// The keys of a stream part.
+pub(super) const PART_KEYS: [&str; 2] = ["framing", "escape"];
+/// The keys of a text and of a length, beside those that other fields have.
+pub(super) const FIELD_KEYS: [&str; 7] =
+    ["length_to", "count_to", "length_from", "order", "length", "counts", "plus"];
+/// Those of a text.
+pub(super) const TEXT_KEYS: [&str; 4] = ["length_to", "count_to", "length_from", "order"];
+/// The keys of a length, beside those that say how it is written.
+pub(super) const LENGTH_KEYS: [&str; 5] = ["name", "type", "length", "counts", "plus"];
+
+const TEXT_IN: [&str; 9] = ["name", "type", "width", "until", "fill", "order", "to", "length_to", "count_to"];
+const TEXT_OUT: [&str; 8] = ["name", "type", "width", "until", "fill", "order", "from", "length_from"];
+
+/// `framing` and `escape` of a stream part.
+pub(super) fn read_part(part: &Reader<'_>) -> Result<(Boundary, Option<Escape>)> {
+    let framings = [("fields", Boundary::Fields), ("tail", Boundary::Tail), ("silence", Boundary::Silence)];
+    let escapes = [("dle", Escape::Dle), ("slip", Escape::Slip), ("cobs", Escape::Cobs)];
+    let framing = part.optional("framing").map(|item| item.choice(&framings)).transpose()?;
+    let escape = part.optional("escape").map(|item| item.choice(&escapes)).transpose()?;
+    if let (Some(_), Some(item)) = (escape, part.optional("framing")) {
+        return Err(item.error("escape bytes tell frames apart already; framing is not needed beside them"));
+    }
+    if framing == Some(Boundary::Tail) && part.optional("tail").is_none() {
+        return Err(part.error("framing = \"tail\" needs a tail, such as tail = [13, 10]"));
+    }
+    Ok((framing.unwrap_or_default(), escape))
+}
+
+/// A field with `type = "text"`.
+pub(super) fn read_text(field: &Reader<'_>, direction: Direction) -> Result<FieldSpec> {
+    let keys: &[&str] = if direction == Direction::Input { &TEXT_IN } else { &TEXT_OUT };
+    field.check_keys(keys, " in a text")?;
+    let width = match (field.optional("width"), field.optional("until")) {
+        (Some(_), Some(until)) => return Err(until.error("a text takes width or until, not both")),
+        (Some(width), None) => TextWidth::Fixed(width.integer(1..=MAX_TEXT as i64)?),
+        (None, Some(until)) => TextWidth::Until(one_character(&until)?),
+        (None, None) => TextWidth::Rest,
+    };
+    if !matches!(width, TextWidth::Fixed(_)) {
+        refuse(field, &["fill"], "allowed only together with width")?;
+    }
+    let fill = field.optional("fill").map(|item| one_character(&item)).transpose()?;
+    let text = Text { width, fill };
+    let order = match field.optional("order") {
+        Some(item) => item.choice(&[("high-first", ByteOrder::Big), ("low-first", ByteOrder::Little)])?,
+        None => ByteOrder::Big,
+    };
+    let var = |key| field.optional(key).map(|item| read_var(&item)).transpose();
+    if direction == Direction::Output {
+        let from = field.required("from", "the registers of the text, such as \"WordOutputReg[1..8]\"")?;
+        return Ok(FieldSpec::TextOutput {
+            text,
+            from: read_words(&from, order)?,
+            length_from: var("length_from")?,
+        });
+    }
+    let to = field.optional("to");
+    if to.is_none() {
+        refuse(field, &["order"], "allowed only together with to")?;
+    }
+    Ok(FieldSpec::TextInput {
+        text,
+        to: to.map(|item| read_words(&item, order)).transpose()?,
+        length_to: var("length_to")?,
+        count_to: var("count_to")?,
+    })
+}
+
+/// A field with `length = true`, which is written like this.
+pub(super) fn read_length(field: &Reader<'_>, encoding: Encoding) -> Result<FieldSpec> {
+    let item = field.required("length", "true, for the field that tells the frame's length")?;
+    if !item.bool()? {
+        return Err(item.error("allowed: true; a field without it is a value"));
+    }
+    if !encoding.is_integer() || encoding.size().is_none() {
+        return Err(item.error("a length is an integer in a fixed number of bytes"));
+    }
+    let counts = match field.optional("counts") {
+        Some(item) => {
+            item.choice(&[("rest", Counts::Rest), ("frame", Counts::Frame), ("fields", Counts::Fields)])?
+        }
+        None => Counts::Rest,
+    };
+    let plus = field.optional("plus").map_or(Ok(0), |item| item.integer(-128..=127))?;
+    Ok(FieldSpec::Length(Length { encoding, counts, plus }))
+}
+
+fn one_character(item: &Item<'_>) -> Result<u8> {
+    let text = item.string()?;
+    let mut characters = text.chars();
+    match (characters.next(), characters.next()) {
+        (Some(character), None) if character.is_ascii() => Ok(character as u8),
+        _ => Err(item.error(format!("{text:?} is not one character of ASCII, such as \",\" or \"\\r\""))),
+    }
+}
+
+fn read_var(item: &Item<'_>) -> Result<SysVar> {
+    let name = item.string()?;
+    SysVar::parse(name).map_err(|error| item.error(format!("{name:?}: {error}")))
+}
+
+fn read_words(item: &Item<'_>, order: ByteOrder) -> Result<Words> {
+    let name = item.string()?;
+    let range = VarRange::parse(name).map_err(|error| item.error(format!("{name:?}: {error}")))?;
+    let mut vars = range.iter();
+    let count = vars.len() as u8;
+    let first = vars.next().ok_or_else(|| item.error("names no variable"))?;
+    Ok(Words { first, count, order })
+}

@@ -1,0 +1,83 @@
+//! Sources of output fields beside the variables, and the variables of a port's health.
+//!
+//! In: `controller.mode`, `port.alive`, `port.NAME.alive`, and `health = { ... }` of a port. Out: the
+//! bindings and variables of the configuration.
+
+use proto_core::config::{OutputBinding, PortHealth, PortValue, StateValue};
+use proto_core::sysvar::SysVar;
+
+use super::bindings::FileOutput;
+use super::reader::{Item, Result};
+
+/// The values of port 2000, which the gateway asks only when a device picks the command.
+const ASKED: [&str; 3] = ["last_error", "state", "isprogfinish"];
+
+/// Whether the text names such a source.
+pub(super) fn is_source(text: &str) -> bool {
+    text.starts_with("controller.") || text.starts_with("port.")
+}
+
+/// Reads the source of an output field.
+pub(super) fn read(item: &Item<'_>, text: &str, scale: f32, offset: f32) -> Result<FileOutput> {
+    if let Some(name) = text.strip_prefix("controller.") {
+        if ASKED.contains(&name) {
+            return Err(item.error(format!(
+                "{text:?} is not in the state packet, and replies of port 2000 are no source; \
+                 the packet has controller.error_code, .robot_state and .program_state"
+            )));
+        }
+        let value = StateValue::parse(name).map_err(|error| item.error(format!("{text:?}: {error}")))?;
+        return Ok(FileOutput::Bound(OutputBinding::State { value, scale, offset }));
+    }
+    let rest = text.strip_prefix("port.").unwrap_or(text);
+    let (name, value) = match rest.rsplit_once('.') {
+        Some((name, value)) => (Some(name), value),
+        None => (None, rest),
+    };
+    let value = read_value(item, value)?;
+    let binding = OutputBinding::Port { port: None, value, scale, offset };
+    Ok(match name {
+        Some(name) => FileOutput::PortNamed { name: name.to_owned(), spot: item.spot.clone(), binding },
+        None => FileOutput::Bound(binding),
+    })
+}
+
+fn read_value(item: &Item<'_>, name: &str) -> Result<PortValue> {
+    PortValue::named(name).ok_or_else(|| {
+        let names = PortValue::NAMES.map(|(name, _)| name).join(", ");
+        item.error(format!("{name:?} is not known of a port; allowed: {names}"))
+    })
+}
+
+/// The binding to the port of this name.
+pub(super) fn of_port(
+    binding: OutputBinding,
+    name: &str,
+    ports: &[String],
+) -> std::result::Result<OutputBinding, String> {
+    let OutputBinding::Port { value, scale, offset, .. } = binding else { return Ok(binding) };
+    let index = ports.iter().position(|port| port == name);
+    match index.and_then(|index| u8::try_from(index).ok()) {
+        Some(index) => Ok(OutputBinding::Port { port: Some(index), value, scale, offset }),
+        None => Err(format!("there is no port {name:?}; there are {}", ports.join(", "))),
+    }
+}
+
+/// Reads the variables that tell a port's health.
+pub(super) fn read_health(item: &Item<'_>) -> Result<PortHealth> {
+    let table = item.table(&PortValue::NAMES.map(|(name, _)| name))?;
+    let mut health = PortHealth::NONE;
+    for (name, value) in PortValue::NAMES {
+        let Some(item) = table.optional(name) else { continue };
+        let text = item.string()?;
+        if text.rsplit_once("].").is_some() {
+            return Err(item.error(format!(
+                "{text:?} is a bit; the health of a port goes to whole words and floats: WordInputReg, \
+                 FloatInputReg"
+            )));
+        }
+        let var = SysVar::parse(text).map_err(|error| item.error(format!("{text:?}: {error}")))?;
+        health.set(value, var);
+    }
+    Ok(health)
+}

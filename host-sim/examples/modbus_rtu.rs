@@ -1,0 +1,208 @@
+//! A Modbus RTU master or slave on the line at its standard input and output, for tests with other
+//! programs: `modbus_rtu master` or `modbus_rtu slave ADDRESS`, where both are one pseudoterminal.
+//!
+//! The master asks slave 5 for registers and coils, writes others, and prints what it hears.
+
+use std::fs::File;
+use std::io::{self, Read, Write};
+use std::os::fd::AsFd;
+use std::sync::mpsc::{self, Receiver, RecvTimeoutError};
+use std::thread;
+use std::time;
+
+use proto_core::modbus::rtu::{
+    Echo, Exchange, MAX_ADU, Master, Operation, Output, Presence, Reply, Slave, Timing, When,
+};
+use proto_core::modbus::server::RegisterBank;
+use proto_core::modbus::{Coils, Exception, Registers};
+use proto_core::time::{Duration, Instant};
+
+/// Bytes pass through other programs and the scheduler: silences of 3.5 characters are not seen.
+const TIMING: Timing = Timing::new(19_200, 11).with_silence(Duration::from_millis(20));
+
+fn main() -> io::Result<()> {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let line = Line::open()?;
+    match &arguments.iter().map(String::as_str).collect::<Vec<_>>()[..] {
+        ["master"] => master(line),
+        ["slave", address] => {
+            let address = address.parse().ok().and_then(|address| Slave::new(TIMING, Echo::Absent, address));
+            slave(line, address.ok_or_else(|| io::Error::other("an address of 1..=247 is needed"))?)
+        }
+        _ => Err(io::Error::other("usage: modbus_rtu master | modbus_rtu slave ADDRESS")),
+    }
+}
+
+/// What comes in pieces of any size, and where it goes.
+struct Line {
+    received: Receiver<Vec<u8>>,
+    out: File,
+    start: time::Instant,
+}
+
+impl Line {
+    fn open() -> io::Result<Self> {
+        let (sender, received) = mpsc::channel();
+        thread::spawn(move || {
+            let mut bytes = [0; 64];
+            while let Ok(len) = io::stdin().read(&mut bytes)
+                && len > 0
+                && sender.send(bytes[..len].to_vec()).is_ok()
+            {}
+        });
+        let out = File::from(io::stdout().as_fd().try_clone_to_owned()?);
+        Ok(Self { received, out, start: time::Instant::now() })
+    }
+
+    fn now(&self) -> Instant {
+        Instant::ZERO + Duration::from(self.start.elapsed())
+    }
+
+    /// Bytes, none when `deadline` has come; `None` at the end of the line.
+    fn wait(&self, deadline: Instant) -> Option<Vec<u8>> {
+        let span = deadline.saturating_since(self.now()).min(Duration::from_secs(1));
+        match self.received.recv_timeout(span.into()) {
+            Ok(bytes) => Some(bytes),
+            Err(RecvTimeoutError::Timeout) => Some(Vec::new()),
+            Err(RecvTimeoutError::Disconnected) => None,
+        }
+    }
+}
+
+const HOLDING: usize = 0;
+const INPUTS: usize = 1;
+const COUNTER: usize = 6;
+
+fn master(mut line: Line) -> io::Result<()> {
+    let row = |operation, when| Exchange {
+        slave: 5,
+        operation,
+        when,
+        timeout: Duration::from_millis(300),
+        retries: 1,
+    };
+    let cyclic = When::every(Duration::from_millis(100));
+    let table = [
+        row(Operation::ReadHoldingRegisters { address: 0, count: 4 }, cyclic),
+        row(Operation::ReadInputRegisters { address: 10, count: 2 }, cyclic),
+        row(Operation::ReadCoils { address: 0, count: 10 }, cyclic),
+        row(Operation::ReadDiscreteInputs { address: 3, count: 3 }, cyclic),
+        row(Operation::WriteRegisters { address: 20, count: 3 }, When::START),
+        row(Operation::WriteCoils { address: 20, count: 10 }, When::START),
+        row(Operation::WriteRegister { address: 30 }, When::REQUESTED),
+        row(Operation::WriteCoil { address: 31 }, When::START),
+        row(
+            Operation::ReadWriteRegisters {
+                read_address: 20,
+                read_count: 4,
+                write_address: 23,
+                write_count: 1,
+            },
+            When::START,
+        ),
+        // What was written.
+        row(Operation::ReadHoldingRegisters { address: 20, count: 4 }, cyclic),
+        row(Operation::ReadCoils { address: 20, count: 12 }, cyclic),
+        row(Operation::ReadHoldingRegisters { address: 30, count: 1 }, cyclic),
+    ];
+    let mut master = Master::<12>::new(TIMING, Echo::Absent, &table, line.now()).map_err(io::Error::other)?;
+    let (mut out, mut counter, mut presence) = ([0; MAX_ADU], 0_u16, Presence::Unknown);
+    let mut deadline = master.deadline();
+    while let Some(bytes) = line.wait(deadline) {
+        master.received(&bytes, line.now());
+        let values = |exchange: usize, data: &mut [u8]| {
+            match exchange {
+                COUNTER => data.copy_from_slice(&counter.to_be_bytes()),
+                _ => data.iter_mut().zip(0x31..).for_each(|(byte, value)| *byte = value),
+            }
+            true
+        };
+        let mut answered = None;
+        while let Some(output) = master.poll(line.now(), values, &mut out) {
+            match output {
+                Output::Send(len) => line.out.write_all(&out[..len])?,
+                Output::Reply { exchange, reply } => {
+                    match reply {
+                        Reply::Registers(words) => {
+                            eprintln!("{exchange} registers {:?}", words.iter().collect::<Vec<_>>());
+                        }
+                        Reply::Coils(coils) => {
+                            let coils = coils.iter().map(u8::from).collect::<Vec<_>>();
+                            eprintln!("{exchange} coils {coils:?}");
+                        }
+                        Reply::Written => eprintln!("{exchange} written"),
+                    }
+                    answered = Some(exchange);
+                }
+                other => eprintln!("{other:?}"),
+            }
+        }
+        // A value that changes: written at once.
+        if answered == Some(INPUTS) {
+            counter += 1;
+            master.request(COUNTER, line.now());
+        }
+        if answered == Some(HOLDING) {
+            let status = master.slaves().next();
+            eprintln!("status {:?}", status.map(|status| status.counters));
+        }
+        let newest = master.slaves().next().map_or(Presence::Unknown, |status| status.presence);
+        if newest != presence {
+            eprintln!("slave {newest:?}");
+            presence = newest;
+        }
+        deadline = master.deadline();
+    }
+    Ok(())
+}
+
+fn slave(mut line: Line, mut slave: Slave) -> io::Result<()> {
+    let mut bank = Bank { coils: [false; 100], words: [0; 100] };
+    let mut out = [0; MAX_ADU];
+    eprintln!("ready");
+    while let Some(bytes) = line.wait(slave.deadline()) {
+        slave.received(&bytes, line.now());
+        if let Some(len) = slave.poll(line.now(), &mut bank, &mut out) {
+            line.out.write_all(&out[..len])?;
+            eprintln!("{:?}", slave.counters());
+        }
+    }
+    Ok(())
+}
+
+/// 100 coils and 100 registers, all writable.
+struct Bank {
+    coils: [bool; 100],
+    words: [u16; 100],
+}
+
+impl RegisterBank for Bank {
+    fn read_coils(&self, address: u16, count: u16, packed: &mut [u8]) -> Result<(), Exception> {
+        let at = usize::from(address);
+        let coils = self.coils.get(at..at + usize::from(count)).ok_or(Exception::IllegalDataAddress)?;
+        Coils::pack(coils.iter().copied(), packed).map(|_| ()).ok_or(Exception::DeviceFailure)
+    }
+
+    fn write_coils(&mut self, address: u16, coils: Coils<'_>) -> Result<(), Exception> {
+        let at = usize::from(address);
+        let target = self.coils.get_mut(at..at + usize::from(coils.count()));
+        let target = target.ok_or(Exception::IllegalDataAddress)?;
+        target.iter_mut().zip(coils.iter()).for_each(|(coil, on)| *coil = on);
+        Ok(())
+    }
+
+    fn read_holding(&self, address: u16, words: &mut [[u8; 2]]) -> Result<(), Exception> {
+        let at = usize::from(address);
+        let values = self.words.get(at..at + words.len()).ok_or(Exception::IllegalDataAddress)?;
+        words.iter_mut().zip(values).for_each(|(word, value)| *word = value.to_be_bytes());
+        Ok(())
+    }
+
+    fn write_holding(&mut self, address: u16, registers: Registers<'_>) -> Result<(), Exception> {
+        let at = usize::from(address);
+        let target = self.words.get_mut(at..at + usize::from(registers.count()));
+        let target = target.ok_or(Exception::IllegalDataAddress)?;
+        target.iter_mut().zip(registers.iter()).for_each(|(word, value)| *word = value);
+        Ok(())
+    }
+}

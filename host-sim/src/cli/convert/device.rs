@@ -1,0 +1,350 @@
+//! Frames of devices: values by name to bytes, and bytes to values.
+//!
+//! In: the frames of one part as the file has them. Out: what `encode` and `decode` write. What two
+//! frames with the same values can differ in, such as padding, is kept in `raw=`.
+
+use proto_core::config::{DeviceFrame, FieldSpec, OutputBinding};
+use proto_core::device::{ByteOrder, Checksum, Digits, Encoding, Found, Framer, Kind, Probe};
+use proto_core::recipe::model::MAX_STREAM_FRAME;
+use proto_core::sysvar::Direction;
+use proto_core::wire::can::{CanFrame, CanId};
+use proto_core::wire::scalar::Scalar;
+use recipe_config::{DeviceRecipe, NamedFrame};
+
+use super::super::text;
+use super::{note, write_line};
+
+/// What keeps the bytes of a frame that its values do not tell.
+const RAW: &str = "raw";
+
+/// The frames of one part.
+#[derive(Debug)]
+pub(in super::super) struct DevicePart {
+    direction: Direction,
+    formats: Vec<Format>,
+}
+
+/// One frame.
+#[derive(Debug)]
+struct Format {
+    id: Option<CanId>,
+    named: NamedFrame,
+    frame: DeviceFrame,
+    values: Vec<Value>,
+}
+
+/// A field with a value.
+#[derive(Debug)]
+struct Value {
+    name: String,
+    encoding: Encoding,
+    /// Its elements: more than one if the bytes are used more than once.
+    elements: Vec<usize>,
+    /// What is sent if nothing else is asked for.
+    constant: Option<f64>,
+}
+
+impl DevicePart {
+    pub(in super::super) fn new(recipe: &DeviceRecipe, direction: Direction) -> Result<Self, String> {
+        let format = |named: &NamedFrame| -> Result<Format, String> {
+            // Cannot fail: reading the file laid out the same frames.
+            let frame = named.lay_out(recipe.carrier, direction).map_err(|error| error.to_string())?;
+            Ok(Format { id: named.id, named: named.clone(), frame, values: values_of(named) })
+        };
+        let formats = recipe.part(direction).iter().map(format).collect::<Result<_, _>>()?;
+        Ok(Self { direction, formats })
+    }
+
+    pub(in super::super) fn ids(&self) -> impl Iterator<Item = Option<CanId>> {
+        self.formats.iter().map(|format| format.id)
+    }
+
+    /// The bytes of the frame with this index, from values in field order or by name.
+    pub(super) fn encode(&self, index: usize, tokens: &[String]) -> Result<Vec<u8>, String> {
+        self.formats.get(index).ok_or("no such frame")?.encode(tokens)
+    }
+
+    /// Writes the values of every frame in a stream, and returns the number of frames.
+    pub(super) fn decode_stream(
+        &self,
+        lines: impl Iterator<Item = (usize, std::io::Result<String>)>,
+        out: &mut dyn std::io::Write,
+        notes: &mut dyn std::io::Write,
+    ) -> Result<usize, String> {
+        let format = self.formats.first().ok_or("no such frame")?;
+        let effort = format.frame.layout.lengths().1 + format.frame.elements.len();
+        let mut framer = Framer::new();
+        let mut frames = 0;
+        // Bytes of frames with a wrong checksum, which are told of: all of them, and those that are held.
+        let (mut told, mut held) = (0, 0);
+        for (number, line) in lines {
+            let at = |message| format!("line {number}: {message}");
+            let line = line.map_err(|error| at(error.to_string()))?;
+            let bytes = text::parse_hex_line(&line).map_err(at)?;
+            let mut chunk = &bytes[..];
+            while let Some(found) = framer.next_frame(&mut chunk, effort, |bytes| format.probe(bytes)) {
+                held = 0;
+                match found {
+                    Found::Frame(frame) => match format.show(frame) {
+                        Ok(values) => {
+                            frames += 1;
+                            self.note_values(format, frame, number, notes);
+                            write_line(out, &values)?;
+                        }
+                        Err(why) => note(notes, &at(format!("{}: {why}", text::hex(frame)))),
+                    },
+                    Found::Other(frame) => {
+                        note(notes, &at(format!("{}: other constants, so not this frame", text::hex(frame))));
+                    }
+                    Found::Wrong(frame) => {
+                        told += frame.len();
+                        held = frame.len() - 1;
+                        note(notes, &at(format!("{}: {}", text::hex(frame), format.wrong_checksum(frame))));
+                    }
+                }
+            }
+        }
+        let skipped = (framer.stats().skipped_bytes as usize).saturating_sub(told);
+        if skipped > 0 {
+            note(notes, &format!("{skipped} bytes skipped outside of frames"));
+        }
+        let pending = framer.held().len();
+        if pending > held {
+            note(notes, &format!("{pending} bytes of an unfinished frame at the end"));
+        }
+        Ok(frames)
+    }
+
+    /// The values of a CAN frame, or why it is none of this part.
+    pub(super) fn decode_can(
+        &self,
+        frame: &CanFrame,
+        line: usize,
+        notes: &mut dyn std::io::Write,
+    ) -> Result<String, String> {
+        let id = text::show_id(frame.id());
+        let format = self.formats.iter().find(|format| format.id == Some(frame.id()));
+        let format = format.ok_or_else(|| format!("id {id} is not in the recipe"))?;
+        let data = frame.data();
+        match format.probe(data) {
+            Probe::Frame(len) if len == data.len() => {
+                let values = format.show(data).map_err(|why| format!("id {id}: {why}"))?;
+                self.note_values(format, data, line, notes);
+                Ok(format!("id={id} {values}"))
+            }
+            Probe::Wrong(len) if len == data.len() => {
+                note(notes, &format!("line {line}: {}: {}", text::hex(data), format.wrong_checksum(data)));
+                Err(format!("id {id}: a wrong checksum"))
+            }
+            Probe::Other(_) | Probe::No(_) if data.len() == format.frame.layout.lengths().0 => {
+                Err(format!("id {id}: other constants, so not this frame"))
+            }
+            _ => Err(format!("id {id}: {} bytes instead of {}", data.len(), format.frame.layout.lengths().0)),
+        }
+    }
+
+    /// Says if a gateway rejects a frame for its values.
+    fn note_values(&self, format: &Format, frame: &[u8], line: usize, notes: &mut dyn std::io::Write) {
+        let Ok(values) = format.values(frame) else { return };
+        let is_wrong = |(_, value): &(&Value, Scalar)| !value.is_finite();
+        if let Some((value, _)) = format.values.iter().zip(values).find(is_wrong)
+            && self.direction == Direction::Input
+        {
+            note(notes, &format!("line {line}: a receiver rejects this frame: {} is not finite", value.name));
+        }
+    }
+}
+
+/// The fields with a value, each once.
+fn values_of(named: &NamedFrame) -> Vec<Value> {
+    let mut values: Vec<Value> = Vec::new();
+    let elements = named.fields.iter().filter_map(|field| Some((field, field.spec.element()?)));
+    for (nth, (field, element)) in elements.enumerate() {
+        let constant = match field.spec {
+            FieldSpec::UserOutput { from: OutputBinding::Constant(value), .. }
+            | FieldSpec::DeviceOutput { from: OutputBinding::Constant(value), .. } => Some(value),
+            FieldSpec::Fixed { .. } | FieldSpec::Padding { .. } | FieldSpec::Length(_) => continue,
+            _ => None,
+        };
+        match (values.last_mut(), element.encoding()) {
+            (Some(before), _) if field.repeats => before.elements.push(nth),
+            (_, Some(encoding)) => {
+                values.push(Value { name: field.name.clone(), encoding, elements: vec![nth], constant });
+            }
+            (_, None) => {}
+        }
+    }
+    values
+}
+
+impl Format {
+    fn probe(&self, bytes: &[u8]) -> Probe {
+        self.frame.layout.probe(&self.frame.elements, bytes)
+    }
+
+    /// The values of a frame, each once.
+    fn values(&self, frame: &[u8]) -> Result<Vec<Scalar>, String> {
+        let all: Vec<_> = self.frame.layout.values(&self.frame.elements, frame).collect();
+        let value = |value: &Value| {
+            let scalar = value.elements.first().and_then(|&nth| all.get(nth));
+            match scalar {
+                Some(Ok(Some(scalar))) => Ok(*scalar),
+                Some(Err(error)) => Err(format!("{}: {error}", value.name)),
+                _ => Err(format!("{}: no value", value.name)),
+            }
+        };
+        self.values.iter().map(value).collect()
+    }
+
+    fn named_values(&self, frame: &[u8]) -> Result<Vec<String>, String> {
+        let values = self.values(frame)?;
+        let shown = self.values.iter().zip(values);
+        Ok(shown.map(|(value, scalar)| format!("{}={}", value.name, text::show_scalar(scalar))).collect())
+    }
+
+    /// The line that [`Self::encode`] turns into the same bytes.
+    fn show(&self, frame: &[u8]) -> Result<String, String> {
+        let mut shown = self.named_values(frame)?;
+        if self.encode(&shown).ok().as_deref() != Some(frame) || shown.is_empty() {
+            let digits: String = frame.iter().map(|byte| format!("{byte:02X}")).collect();
+            shown.push(format!("{RAW}={digits}"));
+        }
+        Ok(shown.join(" "))
+    }
+
+    fn encode(&self, tokens: &[String]) -> Result<Vec<u8>, String> {
+        let has_raw = self.values.iter().all(|value| value.name != RAW);
+        let raw = |token: &&String| has_raw && token.starts_with("raw=");
+        if let Some(token) = tokens.iter().find(raw) {
+            let bytes = text::parse_hex_line(token.trim_start_matches("raw="))?;
+            let others: Vec<&String> = tokens.iter().filter(|token| !raw(token)).collect();
+            let is_frame = self.probe(&bytes) == Probe::Frame(bytes.len());
+            let same =
+                self.named_values(&bytes).is_ok_and(|values| others.is_empty() || values.iter().eq(others));
+            return match (is_frame, same) {
+                (true, true) => Ok(bytes),
+                (false, _) => Err(format!("{token} is not this frame")),
+                (true, false) => {
+                    Err(format!("{token} has other values; leave it out to make a frame from the values"))
+                }
+            };
+        }
+        let numbers = self.numbers(tokens)?;
+        let mut out = [0; MAX_STREAM_FRAME];
+        let number = |nth: usize| {
+            let of = self.values.iter().zip(&numbers).find(|(value, _)| value.elements.contains(&nth));
+            of.map_or(f64::NAN, |(_, &number)| number)
+        };
+        match self.frame.layout.encode(&self.frame.elements, number, &mut out) {
+            Some(len) => Ok(out.get(..len).unwrap_or(&[]).to_vec()),
+            None => Err("a value is not a number, which no gateway sends".into()),
+        }
+    }
+
+    /// The number of each value, given in order or as `NAME=VALUE`. Constants may be left out, and are
+    /// given by name only.
+    fn numbers(&self, tokens: &[String]) -> Result<Vec<f64>, String> {
+        let mut numbers: Vec<Option<f64>> = vec![None; self.values.len()];
+        for token in tokens {
+            let (name, shown) = match token.split_once('=') {
+                Some((name, shown)) => (Some(name), shown),
+                None => (None, token.as_str()),
+            };
+            let is_meant = |(value, number): (&Value, &Option<f64>)| {
+                number.is_none() && name.map_or(value.constant.is_none(), |name| name == value.name)
+            };
+            let place = self.values.iter().zip(&numbers).position(is_meant).ok_or_else(|| {
+                let names: Vec<_> = self.values.iter().map(|value| value.name.as_str()).collect();
+                match name {
+                    Some(name) if names.contains(&name) => format!("field {name:?} is given twice"),
+                    Some(name) => format!("there is no field {name:?}; there are {}", names.join(", ")),
+                    None => {
+                        format!("too many values, from {shown:?} on; the fields are {}", names.join(", "))
+                    }
+                }
+            })?;
+            let value = &self.values[place];
+            numbers[place] =
+                Some(parse(&value.encoding, shown).map_err(|error| format!("{}: {error}", value.name))?);
+        }
+        let all = self.values.iter().zip(&numbers).map(|(value, number)| number.or(value.constant));
+        let missing: Vec<_> =
+            self.values.iter().zip(all.clone()).filter(|(_, number)| number.is_none()).collect();
+        if missing.is_empty() {
+            Ok(all.flatten().collect())
+        } else {
+            let names: Vec<_> = missing.iter().map(|(value, _)| value.name.as_str()).collect();
+            Err(format!("no value for {}", names.join(", ")))
+        }
+    }
+
+    /// What is wrong with the checksum of a frame.
+    fn wrong_checksum(&self, frame: &[u8]) -> String {
+        match self.checksums(frame) {
+            Some((found, right)) => {
+                format!("the checksum is {} instead of {}, so a receiver rejects the frame", found, right)
+            }
+            None => "the checksum is wrong, so a receiver rejects the frame".into(),
+        }
+    }
+
+    /// The checksum that a frame has, and the one that it should have.
+    fn checksums(&self, frame: &[u8]) -> Option<(String, String)> {
+        let mut at = self.named.head.len();
+        let mut found: Option<(usize, Checksum)> = None;
+        for field in &self.named.fields {
+            if let FieldSpec::Checksum(sum) = field.spec {
+                found = Some((at, sum));
+                at += sum.len();
+                continue;
+            }
+            let (shared, len, until) = match (field.spec, field.spec.element()?.encoding()) {
+                (FieldSpec::Padding { len, .. }, _) => (false, Some(usize::from(len)), None),
+                (_, Some(encoding)) => (encoding.shared, encoding.size(), encoding.until()),
+                (_, None) => return None,
+            };
+            at += match (shared, len) {
+                (true, _) => 0,
+                (false, Some(len)) => len,
+                (false, None) => 1 + frame.get(at..)?.iter().position(|&byte| Some(byte) == until)?,
+            };
+        }
+        let (at, sum) = found?;
+        let end = sum.last().map_or(at, |last| usize::from(last) + 1);
+        let covered = frame.get(usize::from(sum.first)..end)?;
+        let mut right = vec![0; sum.algorithm.len()];
+        ByteOrder::write(sum.order, u64::from(sum.algorithm.of([covered])), &mut right);
+        if sum.text {
+            right = right.iter().flat_map(|byte| format!("{byte:02X}").into_bytes()).collect();
+        }
+        Some((text::hex(frame.get(at..at + sum.len())?), text::hex(&right)))
+    }
+}
+
+/// A number that a field can have, as decimal or as `0x1F`.
+fn parse(encoding: &Encoding, shown: &str) -> Result<f64, String> {
+    if let Kind::Scalar(ty) = encoding.kind {
+        return text::parse_scalar(ty, shown).map(Scalar::as_f64);
+    }
+    let number = match shown.strip_prefix("0x").or(shown.strip_prefix("0X")) {
+        Some(digits) => u32::from_str_radix(digits, 16).ok().map(f64::from),
+        None => shown.parse::<f64>().ok().filter(|number| number.is_finite()),
+    };
+    let number = number.ok_or_else(|| format!("{shown:?} is not a number"))?;
+    let (low, high) = encoding.range();
+    if !(low..=high).contains(&number) {
+        return Err(format!("{number} does not fit; allowed: {low}..={high}"));
+    }
+    let decimals = match encoding.kind {
+        Kind::Decimal(Digits { decimals, .. }) => decimals,
+        _ => 0,
+    };
+    let scaled = number * 10_f64.powi(i32::from(decimals));
+    if (scaled - scaled.round()).abs() > 1e-6 {
+        return Err(match decimals {
+            0 => format!("{number} is not an integer, but this field must be"),
+            _ => format!("{number} has more than {decimals} decimals"),
+        });
+    }
+    Ok(number)
+}

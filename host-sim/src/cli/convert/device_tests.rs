@@ -1,0 +1,216 @@
+//! Frames of devices: worked bytes of the example files, and any bytes there and back.
+
+use proptest::prelude::*;
+use proto_core::device::{Algorithm, ByteOrder};
+use proto_core::sysvar::Direction;
+use recipe_config::file::{Text, load_recipes, parse_recipes};
+use recipe_test_kit::example;
+
+use super::tests::{decoded, encoded, from_values};
+use super::*;
+
+fn example_part(file: &str, recipe: Option<&str>, part: Direction) -> Part {
+    Part::choose(&load_recipes(&example(file), &[]).unwrap(), recipe, Some(part)).unwrap()
+}
+
+const REPLY: &str = "09 17 06 F9 00 00 DC D0 1E 4E 11";
+
+#[test]
+fn the_grippers_reply_has_its_values() {
+    let part = example_part("gripper.toml", None, Direction::Input);
+    let values = "activated=1 going=1 status=3 object=3 fault=0 wanted=220 position=208 current=30\n";
+    assert_eq!(decoded(&part, REPLY), (values.into(), String::new()));
+    assert_eq!(encoded(&part, values).unwrap().trim_end(), REPLY);
+    // A reserved byte that is not as it is sent.
+    let other = "09 17 06 F9 AB 00 DC D0 1E";
+    let bytes = text::parse_hex_line(other).unwrap();
+    let crc = Algorithm::named("crc16-modbus").unwrap().of([&bytes[..]]) as u16;
+    let other = format!("{other} {}\n", text::hex(&crc.to_le_bytes()));
+    let (values, _) = decoded(&part, &other);
+    assert!(
+        values.trim_end().ends_with(&format!("current=30 raw={}", other.trim_end().replace(' ', ""))),
+        "{values}"
+    );
+    assert_eq!(encoded(&part, &values).unwrap(), other);
+    let changed = values.replace("current=30", "current=31");
+    let refused = encoded(&part, &changed).unwrap_err();
+    assert!(refused.ends_with("has other values; leave it out to make a frame from the values"), "{refused}");
+}
+
+#[test]
+fn the_grippers_request_needs_no_constants() {
+    let part = example_part("gripper.toml", None, Direction::Output);
+    let request = "09 17 07 D0 00 03 03 E8 00 03 06 09 00 00 DC FF 96 D7 DA";
+    assert_eq!(from_values(&part, None, &["220", "255", "150"]).unwrap(), request);
+    assert_eq!(from_values(&part, None, &["force=150", "position=220", "speed=255"]).unwrap(), request);
+    let (values, notes) = decoded(&part, request);
+    assert!(values.starts_with("slave=9 function=23 read=2000 read-count=3 write=1000 "), "{values}");
+    assert_eq!((encoded(&part, &values).unwrap().trim_end(), notes.as_str()), (request, ""));
+    assert_eq!(
+        from_values(&part, None, &["slave=8", "1", "2", "3"]).unwrap()[..5],
+        request.replacen("09", "08", 1)[..5]
+    );
+    assert_eq!(from_values(&part, None, &["1"]).unwrap_err(), "no value for speed, force");
+    assert_eq!(
+        from_values(&part, None, &["activate=2", "1", "2", "3"]).unwrap_err(),
+        "activate: 2 does not fit; allowed: 0..=1"
+    );
+}
+
+#[test]
+fn a_wrong_checksum_is_told_with_the_right_one() {
+    let part = example_part("gripper.toml", None, Direction::Input);
+    let wrong = REPLY.replace("1E 4E", "1F 4E");
+    let (values, notes) = decoded(&part, &format!("{wrong}\n{REPLY}\n"));
+    assert_eq!(values.lines().count(), 1);
+    assert_eq!(
+        notes,
+        "line 1: 09 17 06 F9 00 00 DC D0 1F 4E 11: the checksum is 4E 11 instead of 8F D1, so a receiver rejects the \
+         frame\n"
+    );
+    // At the end, and of another slave.
+    let (mut out, mut notes) = (Vec::new(), Vec::new());
+    let refused = decode_lines(&part, wrong.as_bytes(), &mut out, &mut notes).unwrap_err();
+    assert_eq!(refused, "the input has no frame of this recipe");
+    let notes = String::from_utf8(notes).unwrap();
+    assert!(notes.starts_with("line 1: ") && notes.lines().count() == 1, "{notes}");
+    let bytes = text::parse_hex_line("08 17 06 F9 00 00 DC D0 1E").unwrap();
+    let crc = Algorithm::named("crc16-modbus").unwrap().of([&bytes[..]]) as u16;
+    let other = format!("{} {}\n{REPLY}", text::hex(&bytes), text::hex(&crc.to_le_bytes()));
+    let (values, notes) = decoded(&part, &other);
+    assert_eq!(values.lines().count(), 1);
+    assert!(notes.starts_with("line 1: 08 17 ") && notes.contains("other constants"), "{notes}");
+}
+
+#[test]
+fn the_force_sensors_stream_is_found_in_garbage() {
+    let part = example_part("force-sensor-crc.toml", Some("force-sensor"), Direction::Input);
+    let values = ["Fx=-150", "Fy=20", "Fz=981", "Mx=0", "My=-1", "Mz=5"];
+    let frame = "20 4E 6A FF 14 00 D5 03 00 00 FF FF 05 00 74 77";
+    assert_eq!(from_values(&part, None, &values).unwrap(), frame);
+    let (shown, notes) = decoded(&part, &format!("4E 20 {frame} 20 4E 00"));
+    assert_eq!(shown.trim_end(), values.join(" "));
+    assert_eq!(notes, "2 bytes skipped outside of frames\n3 bytes of an unfinished frame at the end\n");
+}
+
+#[test]
+fn the_scales_text_is_a_number() {
+    let part = example_part("scale.toml", None, Direction::Input);
+    let line = |text: &str| text::hex(text.as_bytes());
+    let (values, notes) =
+        decoded(&part, &line("ST,GS,+  12.34kg\r\nUS,GS,+  12.30kg\r\nST,GS,-0012.34kg\r\n"));
+    let lines: Vec<&str> = values.lines().collect();
+    // Blanks are not what a gateway would write, so the bytes are kept.
+    assert_eq!(lines[0], format!("weight=12.34 raw={}", line("ST,GS,+  12.34kg\r\n").replace(' ', "")));
+    assert_eq!(lines[1], "weight=-12.34");
+    assert_eq!(notes, "18 bytes skipped outside of frames\n");
+    assert_eq!(from_values(&part, None, &["-12.34"]).unwrap(), line("ST,GS,-0012.34kg\r\n"));
+    assert_eq!(from_values(&part, None, &["12.345"]).unwrap_err(), "weight: 12.345 has more than 2 decimals");
+    let broken = format!("{} {}", line("ST,GS,12x34.00kg\r\n"), line("ST,GS,00012.34kg\r\n"));
+    let (values, notes) = decoded(&part, &broken);
+    assert_eq!(values, "weight=12.34\n");
+    assert!(notes.contains("weight: the field has a character that is not a digit"), "{notes}");
+    let request = example_part("scale.toml", None, Direction::Output);
+    assert_eq!(decoded(&request, &line("READ\r\n")).0, "raw=524541440D0A\n");
+}
+
+#[test]
+fn the_panels_frames_keep_time_and_interface() {
+    let part = example_part("can-panel.toml", None, Direction::Input);
+    let data = from_values(&part, None, &["1", "0", "5", "1000", "0x10203", "7"]).unwrap();
+    assert_eq!(data, "181#5103E801020307E9");
+    let log = format!("(1436509052.249713) can0 {data}\n");
+    let (values, notes) = decoded(&part, &log);
+    assert_eq!(
+        values,
+        "(1436509052.249713) can0 id=0x181 start=1 stop=0 program=5 setpoint=1000 pulses=66051 counter=7\n"
+    );
+    assert_eq!((encoded(&part, &values).unwrap(), notes), (log.clone(), String::new()));
+    let wrong = format!("{log}{}{}181#00\n182#00\n", log.replace("E9\n", "E8\n"), "181#5103E8\n");
+    let (values, notes) = decoded(&part, &wrong);
+    assert_eq!(values.lines().count(), 1);
+    assert_eq!(
+        notes,
+        "line 2: 51 03 E8 01 02 03 07 E8: the checksum is E8 instead of E9, so a receiver rejects the frame\n\
+         1 rejected: id 0x181: 1 bytes instead of 8\n1 rejected: id 0x181: 3 bytes instead of 8\n\
+         1 rejected: id 0x181: a wrong checksum\n1 rejected: id 0x182 is not in the recipe\n"
+    );
+}
+
+#[test]
+fn a_field_that_is_used_twice_is_one_value() {
+    let toml = r#"
+[controller]
+address = "a"
+[[recipe]]
+name = "r"
+kind = "stream"
+mode = "user"
+[recipe.input]
+head = [1]
+tail = [13]
+fields = [
+    { name = "order", type = "byte", bits = "4..7", to = "WordInputReg[1]", commands = { 1 = "stop" } },
+    { name = "raw", type = "hex", until = "," },
+]
+"#;
+    let recipes = parse_recipes(Text { name: "test.toml", toml }, &[]).unwrap();
+    let part = Part::choose(&recipes, None, None).unwrap();
+    assert_eq!(from_values(&part, None, &["3", "0x1F"]).unwrap(), "01 30 31 46 2C 0D");
+    // A field with the name of the key for bytes is a field.
+    assert_eq!(decoded(&part, "01 30 31 46 2C 0D").0, "order=3 raw=31\n");
+}
+
+const ANY: &str = r#"
+[controller]
+address = "a"
+[[recipe]]
+name = "any"
+kind = "stream"
+mode = "user"
+[recipe.input]
+head = [0x48, 0xAA]
+tail = [13]
+endian = "big"
+checksum = { kind = "crc16-xmodem", over = "2..", as = "hex" }
+fields = [
+    { name = "a", type = "byte", bits = "0..2" },
+    { name = "b", type = "byte", bits = "5..7", signed = true },
+    { pad = 2 },
+    { name = "c", type = "float", word_order = "low-first" },
+    { name = "d", type = "int24" },
+    { name = "e", type = "bcd", width = 2 },
+    { name = "f", type = "double" },
+    { name = "g", type = "decimal", width = 5 },
+    { name = "h", type = "hex", width = 3 },
+]
+"#;
+
+proptest! {
+    #[test]
+    fn what_decode_prints_encode_turns_into_the_same_bytes(
+        binary in any::<[u8; 20]>(), text in "[ +-][0-9]{2}[.0-9][0-9][0-9a-fA-F]{3}",
+    ) {
+        let recipes = parse_recipes(Text { name: "any.toml", toml: ANY }, &[]).unwrap();
+        let part = Part::choose(&recipes, None, None).unwrap();
+        let mut frame = [&[0x48, 0xAA], &binary[..10], &[0x12, 0x34], &binary[12..], text.as_bytes()].concat();
+        let mut crc = [0; 2];
+        ByteOrder::Big.write(u64::from(Algorithm::named("crc16-xmodem").unwrap().of([&frame[2..]])), &mut crc);
+        frame.extend(format!("{:02X}{:02X}\r", crc[0], crc[1]).bytes());
+        let log = text::hex(&frame) + "\n";
+        let values = decoded(&part, &log).0;
+        prop_assert_eq!(encoded(&part, &values).unwrap(), log);
+    }
+
+    #[test]
+    fn any_bytes_are_decoded_or_told_of(bytes in prop::collection::vec(any::<u8>(), 0..80)) {
+        for (file, recipe) in [("gripper.toml", None), ("force-sensor-crc.toml", Some("force-sensor")), ("scale.toml", None)] {
+            let part = example_part(file, recipe, Direction::Input);
+            let (mut out, mut notes) = (Vec::new(), Vec::new());
+            let log = format!("{}\n", text::hex(&bytes));
+            // A frame by chance is possible, a panic is not.
+            let frames = decode_lines(&part, log.as_bytes(), &mut out, &mut notes);
+            prop_assert!(frames.is_ok() || out.is_empty());
+        }
+    }
+}

@@ -1,0 +1,267 @@
+//! The health of field ports as values: for output fields, and for variables that tell the robot.
+//!
+//! In: the ports' states and counters. Out: extra values of the image just before a frame is made;
+//! variables, which go up as those of a field frame do. Does not know how they are written.
+
+use heapless::Vec;
+
+use super::Engine;
+use super::build::{BuildError, Groups, one_too_many};
+use super::io::PortState;
+use super::state_link::Kept;
+use super::user::wrapping_count;
+use crate::config::{ConfigView, Counted, MAX_PORTS, OutputBinding, PortValue};
+use crate::image::{GroupId, InputSet, MAX_EXTRA, MAX_GROUPS, saturate_to_field};
+use crate::sysvar::SysVar;
+use crate::time::{Duration, Instant};
+use crate::wire::dialect::Dialect;
+use crate::wire::scalar::Scalar;
+
+/// What the robot is told is checked this often; [`PortValue::Alive`] is also told at once when it
+/// becomes 0.
+const CHECK_EVERY: Duration = Duration::from_millis(100);
+/// Unchanged values are told again this often: an unanswered write, another master or a restarted
+/// controller may have undone them.
+const REPEAT_EVERY: Duration = Duration::from_secs(1);
+
+/// Each value of each port.
+const MOST: usize = MAX_PORTS * PortValue::NAMES.len();
+
+/// A value that an output field shows.
+#[derive(Debug, Clone, Copy)]
+struct Shown {
+    /// Index of the port in the engine.
+    port: u8,
+    value: PortValue,
+    /// Its place among the image's extra values.
+    extra: u8,
+}
+
+/// A value that the robot is told.
+#[derive(Debug, Clone, Copy)]
+struct Told {
+    port: u8,
+    value: PortValue,
+    var: SysVar,
+    /// What it was when the variable was last set.
+    last: Option<u32>,
+}
+
+/// What is shown and told of the ports' health.
+#[derive(Debug, Clone)]
+pub(super) struct PortsHealth {
+    shown: Vec<Shown, MOST>,
+    told: Vec<Told, MOST>,
+    /// The group of the variables.
+    group: GroupId,
+    tell_at: Instant,
+    repeat_at: Instant,
+}
+
+impl PortsHealth {
+    pub(super) const fn new() -> Self {
+        let (tell_at, repeat_at) = (Instant::ZERO, Instant::ZERO);
+        Self { shown: Vec::new(), told: Vec::new(), group: GroupId(0), tell_at, repeat_at }
+    }
+
+    pub(super) fn clear(&mut self) {
+        self.shown.clear();
+        self.told.clear();
+        self.group = GroupId(0);
+        self.tell_at = Instant::ZERO;
+        self.repeat_at = Instant::ZERO;
+    }
+
+    /// Index of the port whose health the variable tells.
+    pub(super) fn owner(&self, var: SysVar) -> Option<u8> {
+        self.told.iter().find(|told| told.var == var).map(|told| told.port)
+    }
+}
+
+/// The value of a variable that tells a port's health.
+fn told_as(var: SysVar, value: PortValue, number: u32) -> Scalar {
+    if value.is_count() {
+        wrapping_count(var.ty(), number)
+    } else {
+        saturate_to_field(var.ty(), f64::from(number), 1.0, 0.0)
+    }
+}
+
+impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: usize>
+    Engine<PORTS, UPLINKS, FIELDS, TAP>
+{
+    /// Gives values of the state packet and of the health of ports their places among the image's
+    /// extra values.
+    #[inline(never)]
+    pub(super) fn assign_extra(&mut self, dialect: &Dialect) -> Result<(), BuildError> {
+        let mut used = 0_u8;
+        let mut next = || {
+            let extra = used;
+            used = used.saturating_add(1);
+            let has_room = usize::from(extra) < MAX_EXTRA;
+            if has_room { Ok(extra) } else { Err(one_too_many(Counted::Sources, MAX_EXTRA)) }
+        };
+        for index in 0..self.ports.len() {
+            let outputs = self.ports.get(index).map_or(0..0, |port| {
+                let start = usize::from(port.outputs.start);
+                start..start.saturating_add(usize::from(port.outputs.len))
+            });
+            for binding in self.bindings.outputs.get_mut(outputs).into_iter().flatten() {
+                match binding.from {
+                    OutputBinding::State { value, .. } => {
+                        let Some(state) = self.links.state.first_mut() else { continue };
+                        let known = state.kept.iter().find(|kept| kept.value == value).map(|kept| kept.extra);
+                        binding.extra = match (known, value.place(dialect)) {
+                            (Some(extra), _) => extra,
+                            (None, Ok((offset, ty))) => {
+                                let extra = next()?;
+                                // As many places as there are extra values.
+                                let _ = state.kept.push(Kept { value, extra, offset, ty });
+                                extra
+                            }
+                            // Validation has refused it.
+                            (None, Err(_)) => continue,
+                        };
+                        if let Some(port) = self.ports.get_mut(index) {
+                            port.sender.sources.insert(state.group);
+                            port.sender.shown_extra.set(binding.extra, true);
+                        }
+                    }
+                    OutputBinding::Port { port, value, .. } => {
+                        let of = match port {
+                            Some(id) => self.ports.iter().position(|other| other.id.0 == id),
+                            None => Some(index),
+                        };
+                        // Validation has refused other ports.
+                        let port = of.unwrap_or(index) as u8;
+                        let is_it = |shown: &&Shown| (shown.port, shown.value) == (port, value);
+                        let known = self.health.shown.iter().find(is_it).map(|shown| shown.extra);
+                        binding.extra = match known {
+                            Some(extra) => extra,
+                            None => {
+                                let extra = next()?;
+                                // There is room for every value of every port.
+                                let _ = self.health.shown.push(Shown { port, value, extra });
+                                extra
+                            }
+                        };
+                        if let Some(port) = self.ports.get_mut(index) {
+                            port.sender.shows_health = true;
+                            // Without a cycle, a frame is made when another one has come.
+                            let has_cycle = port.sender.next_cycle(Instant::ZERO) != Instant::NEVER;
+                            self.store.watches_bits |= !has_cycle;
+                        }
+                        self.store.check_health_at(Instant::ZERO);
+                    }
+                    _ => {}
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Notes the variables that tell the health of ports.
+    pub(super) fn assign_health(
+        &mut self,
+        config: ConfigView<'_>,
+        groups: &mut Groups,
+    ) -> Result<(), BuildError> {
+        for (nth, (_, port, _)) in (0..).zip(config.field_ports()) {
+            for (value, var) in port.health.iter() {
+                if self.health.told.is_empty() {
+                    self.health.group = groups.next().ok_or(one_too_many(Counted::Groups, MAX_GROUPS))?;
+                    self.store.check_health_at(Instant::ZERO);
+                }
+                self.store.image.assign(var, self.health.group);
+                self.store.health.insert(var);
+                // There is room for every value of every port.
+                let _ = self.health.told.push(Told { port: nth, value, var, last: None });
+            }
+        }
+        Ok(())
+    }
+
+    fn health_of(&self, index: u8, value: PortValue, now: Instant) -> u32 {
+        let Some(port) = self.ports.get(usize::from(index)) else { return 0 };
+        match value {
+            PortValue::Alive => u32::from(self.port_state(port.id) == Some(PortState::Working)),
+            PortValue::Frames => port.counters.frames_in,
+            PortValue::Rejected => port.counters.rejected(),
+            PortValue::Age => {
+                let own = (0..).zip(&self.store.frames).filter(|(_, frame)| frame.port == index);
+                let heard_at = own.filter_map(|(group, _)| self.store.image.stamp_of(GroupId(group))).max();
+                heard_at.map_or(u32::MAX, |at| {
+                    u32::try_from(now.saturating_since(at).as_millis()).unwrap_or(u32::MAX)
+                })
+            }
+        }
+    }
+
+    /// Sets the extra values that output fields show of the ports' health.
+    #[cold]
+    #[inline(never)]
+    pub(super) fn show_health(&mut self, now: Instant) {
+        for nth in 0..self.health.shown.len() {
+            let Some(&Shown { port, value, extra }) = self.health.shown.get(nth) else { break };
+            let number = self.health_of(port, value, now);
+            self.store.image.receive_extra(extra, f64::from(number));
+        }
+    }
+
+    /// Tells the robot what has changed and shows the field the present, just before the cycles of
+    /// the ports that show it.
+    #[cold]
+    #[inline(never)]
+    pub(super) fn check_health(&mut self, now: Instant) {
+        if !self.health.told.is_empty() && now >= self.health.tell_at {
+            self.tell_changes(now);
+            self.health.tell_at = now + CHECK_EVERY;
+        }
+        self.show_health(now);
+        let shows = self.ports.iter().filter(|port| port.sender.shows_health);
+        let next = shows.map(|port| port.sender.next_cycle(now)).min().unwrap_or(Instant::NEVER);
+        let tell_at = if self.health.told.is_empty() { Instant::NEVER } else { self.health.tell_at };
+        self.store.check_health_at(next.min(tell_at));
+    }
+
+    /// Tells the robot what has changed, and now and then everything.
+    fn tell_changes(&mut self, now: Instant) {
+        let repeats = now >= self.health.repeat_at;
+        if repeats {
+            self.health.repeat_at = now + REPEAT_EVERY;
+        }
+        self.tell_health(|_| true, repeats, now);
+        self.store.image.stamp(self.health.group, now);
+    }
+
+    /// Tells the robot at once whether ports work.
+    #[cold]
+    #[inline(never)]
+    pub(super) fn tell_alive(&mut self, now: Instant) {
+        self.tell_health(|value| value == PortValue::Alive, false, now);
+    }
+
+    fn tell_health(&mut self, is_asked: impl Fn(PortValue) -> bool, repeats: bool, now: Instant) {
+        let mut news = InputSet::EMPTY;
+        for nth in 0..self.health.told.len() {
+            let Some(&Told { port, value, var, last }) = self.health.told.get(nth) else { break };
+            if !is_asked(value) {
+                continue;
+            }
+            let number = self.health_of(port, value, now);
+            if last == Some(number) && !repeats {
+                continue;
+            }
+            // The value has the variable's type.
+            let _ = self.store.image.set(var, told_as(var, value, number));
+            news.insert(var);
+            if let Some(told) = self.health.told.get_mut(nth) {
+                told.last = Some(number);
+            }
+        }
+        if !news.is_empty() {
+            self.store.tell(&news);
+            self.ask.links = true;
+        }
+    }
+}

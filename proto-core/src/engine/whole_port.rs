@@ -1,0 +1,376 @@
+//! Ports whose frames end where a tail, escape bytes or silence says so, and the texts in frames of
+//! devices.
+//!
+//! In: bytes, and the news that the line was silent. Out: values in the store. Which bytes are a
+//! frame is the cutter's business, what is in it the layout's.
+
+use heapless::Vec;
+
+use super::command_link::CommandLink;
+use super::counters::{add, bump};
+use super::device_port::{DeviceCodec, DeviceFormat, elements};
+use super::field_port::{Accepted, Codec, FieldPort, Frames, came, keep};
+use super::rejection::Rejection;
+use super::store::Store;
+use super::tap::Tap;
+use super::user::{InputBind, OutputBind};
+use crate::config::{ConfigView, FieldSpec, Span, Words};
+use crate::device::{ByteOrder, Cutter, FrameLayout, Framer, Piece, Probe};
+use crate::image::{Image, bind_to_variable};
+use crate::sysvar::{Direction, SysVar};
+use crate::time::{Duration, Instant};
+use crate::wire::scalar::Scalar;
+
+/// Maximum number of texts of one port, both ways together.
+pub(super) const MAX_TEXTS: usize = 8;
+
+/// Finds frames in a stream.
+#[derive(Debug, Clone)]
+#[allow(clippy::large_enum_variant, reason = "without an allocator there is no box to put the larger one in")]
+pub(super) enum Reader {
+    /// By their fields.
+    Search(Framer),
+    /// By what stands between them. `heard` is when the newest bytes came.
+    Whole { cutter: Cutter, heard: Instant },
+}
+
+impl Reader {
+    /// Whether silence has something to end.
+    pub(super) fn has_begun(&self) -> bool {
+        match self {
+            Self::Search(framer) => !framer.held().is_empty(),
+            Self::Whole { cutter, .. } => cutter.has_begun(),
+        }
+    }
+
+    /// The bytes of a frame that has begun.
+    pub(super) fn held(&self) -> &[u8] {
+        match self {
+            Self::Search(framer) => framer.held(),
+            Self::Whole { cutter, .. } => cutter.held(),
+        }
+    }
+
+    /// Drops them, and returns how many they were.
+    pub(super) fn discard(&mut self) -> usize {
+        match self {
+            Self::Search(framer) => framer.discard(),
+            Self::Whole { cutter, .. } => cutter.discard(),
+        }
+    }
+}
+
+/// Where a text goes to, or comes from.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct TextBind {
+    pub direction: Direction,
+    /// The place of its element among the bindings of its direction.
+    pub binding: u16,
+    pub words: Option<Words>,
+    pub length: Option<SysVar>,
+    pub count: Option<SysVar>,
+}
+
+/// The texts of a recipe, whose bindings begin at these places.
+pub(super) fn texts_of(
+    config: ConfigView<'_>,
+    recipe: &crate::config::Recipe,
+    starts: [u16; 2],
+) -> Option<Vec<TextBind, MAX_TEXTS>> {
+    let mut texts = Vec::new();
+    for (direction, start) in [Direction::Input, Direction::Output].into_iter().zip(starts) {
+        let fields = config.fields_of(recipe, direction).map(|(_, _, field)| field);
+        for (binding, field) in (start..).zip(fields.filter(|field| field.element().is_some())) {
+            let (words, length, count) = match *field {
+                FieldSpec::TextInput { to, length_to, count_to, .. } => (to, length_to, count_to),
+                FieldSpec::TextOutput { from, length_from, .. } => (Some(from), length_from, None),
+                _ => continue,
+            };
+            texts.push(TextBind { direction, binding, words, length, count }).ok()?;
+        }
+    }
+    Some(texts)
+}
+
+impl TextBind {
+    /// Whether there is room for a text of `len` characters.
+    fn has_room(&self, len: usize) -> bool {
+        self.words.is_none_or(|words| len <= words.room())
+    }
+
+    /// Puts an input text into its variables; `nth` is the number of the frame.
+    fn apply(&self, text: &[u8], nth: u32, image: &mut Image) {
+        let mut pairs = text.chunks(2);
+        for var in self.words.into_iter().flat_map(Words::iter) {
+            let pair = pairs.next().unwrap_or(&[]);
+            let character = |at: usize| pair.get(at).copied().unwrap_or(0);
+            let pair = [character(0), character(1)];
+            let is_low_first = self.words.is_some_and(|words| words.order == ByteOrder::Little);
+            let word = if is_low_first { u16::from_le_bytes(pair) } else { u16::from_be_bytes(pair) };
+            // Validation has refused everything but words.
+            let _ = image.set(var, Scalar::Word(word));
+        }
+        for (var, number) in [(self.length, text.len() as u32), (self.count, u32::from(nth as u16))] {
+            if let Some((var, value)) =
+                var.and_then(|var| Some((var, bind_to_variable(var, Scalar::Dword(number), 1.0, 0.0)?)))
+            {
+                let _ = image.set(var, value);
+            }
+        }
+    }
+
+    /// Writes an output text to the front of `out`, and returns its length.
+    fn write(&self, image: &Image, out: &mut [u8]) -> Option<usize> {
+        let words = self.words?;
+        let len = self.length.map(|var| image.value(var).as_f64() as usize);
+        if len.is_some_and(|len| len > words.room()) {
+            return None;
+        }
+        let mut written = 0_usize;
+        for var in words.iter() {
+            let word = image.value(var).as_f64() as u16;
+            let pair = if words.order == ByteOrder::Little { word.to_le_bytes() } else { word.to_be_bytes() };
+            for character in pair {
+                let is_end = len.map_or(character == 0, |len| written >= len);
+                if is_end {
+                    return Some(written);
+                }
+                *out.get_mut(written)? = character;
+                written = written.saturating_add(1);
+            }
+        }
+        Some(written)
+    }
+}
+
+impl DeviceCodec {
+    fn texts_in(&self, bindings: Span, direction: Direction) -> impl Iterator<Item = (usize, &TextBind)> {
+        texts_in(&self.texts, bindings, direction)
+    }
+
+    /// Writes the text of an output frame's `nth` element.
+    pub(super) fn write_text(
+        &self,
+        format: &DeviceFormat,
+        nth: usize,
+        image: &Image,
+        out: &mut [u8],
+    ) -> Option<usize> {
+        let mut texts = self.texts_in(format.bindings, Direction::Output);
+        texts.find(|(at, _)| *at == nth)?.1.write(image, out)
+    }
+}
+
+/// The texts among some bindings, with their places in them.
+fn texts_in(
+    texts: &[TextBind],
+    bindings: Span,
+    direction: Direction,
+) -> impl Iterator<Item = (usize, &TextBind)> {
+    texts.iter().filter(move |text| text.direction == direction).filter_map(move |text| {
+        let at = text.binding.checked_sub(bindings.start)?;
+        (at < bindings.len).then_some((usize::from(at), text))
+    })
+}
+
+impl<const PORTS: usize> Frames<'_, PORTS> {
+    /// Whether all texts of an input frame have room.
+    pub(super) fn texts_fit(
+        &self,
+        texts: &[TextBind],
+        format: &DeviceFormat,
+        frame: &[u8],
+    ) -> Result<(), Rejection> {
+        let bindings = format.bindings.of(self.bindings);
+        for (at, text) in texts_in(texts, format.bindings, Direction::Input) {
+            match format.layout.text(elements(bindings), frame, at) {
+                Some(found) if text.has_room(found.len()) => {}
+                Some(_) => return Err(Rejection::OutOfRange),
+                None => return Err(Rejection::Unreadable),
+            }
+        }
+        Ok(())
+    }
+
+    /// Puts all texts of an input frame into their variables.
+    pub(super) fn take_texts(&mut self, texts: &[TextBind], format: &DeviceFormat, frame: &[u8]) {
+        let bindings = format.bindings.of(self.bindings);
+        let nth = self.counters.frames_in.wrapping_add(1);
+        for (at, text) in texts_in(texts, format.bindings, Direction::Input) {
+            if let Some(found) = format.layout.text(elements(bindings), frame, at) {
+                text.apply(found, nth, &mut self.store.image);
+            }
+        }
+    }
+}
+
+/// What a whole frame is.
+fn judge<'f>(
+    formats: &'f [DeviceFormat],
+    bindings: &[InputBind],
+    frame: &[u8],
+) -> Result<(usize, &'f DeviceFormat), Rejection> {
+    let mut verdict = Rejection::WrongLength;
+    for (nth, format) in formats.iter().enumerate() {
+        let layout: &FrameLayout = &format.layout;
+        let (shortest, longest) = layout.lengths();
+        let why = match layout.probe_whole(elements(format.bindings.of(bindings)), frame) {
+            Probe::Frame(_) => return Ok((nth, format)),
+            Probe::Wrong(_) => Rejection::Checksum,
+            Probe::Other(_) => Rejection::OtherDevice,
+            Probe::No(_) if (shortest..=longest).contains(&frame.len()) => Rejection::OtherDevice,
+            Probe::No(_) | Probe::Partial(_) => Rejection::WrongLength,
+        };
+        // What is nearest to a frame says most.
+        verdict = match (verdict, why) {
+            (Rejection::Checksum, _) | (_, Rejection::Checksum) => Rejection::Checksum,
+            (Rejection::OtherDevice, _) | (_, Rejection::OtherDevice) => Rejection::OtherDevice,
+            _ => Rejection::WrongLength,
+        };
+    }
+    Err(verdict)
+}
+
+impl FieldPort {
+    /// Whether silence ends frames on this port, and one has begun.
+    #[cold]
+    pub(super) fn ends_by_silence(&self) -> bool {
+        let Codec::Device(DeviceCodec { reader: Some(Reader::Whole { cutter, .. }), .. }) = &self.codec
+        else {
+            return false;
+        };
+        cutter.ends_by_silence() && cutter.has_begun()
+    }
+
+    /// These bytes are lost; what they began cannot be trusted.
+    #[cold]
+    pub(super) fn lose(&mut self, bytes: &[u8]) {
+        let Codec::Device(DeviceCodec { reader: Some(Reader::Whole { cutter, .. }), formats, .. }) =
+            &mut self.codec
+        else {
+            return;
+        };
+        let tail = formats.first().map_or(&[][..], |format| format.layout.tail());
+        let mut rest = bytes;
+        while cutter.next_piece(&mut rest, tail).is_some() {}
+        cutter.discard();
+    }
+
+    /// Reads the frames in `rest`, or the one that silence has ended if it is empty.
+    #[inline(never)]
+    pub(super) fn whole_frames<const PORTS: usize, const TAP: usize>(
+        &mut self,
+        rest: &mut &[u8],
+        bindings: &[InputBind],
+        store: &mut Store<PORTS>,
+        commands: Option<&mut CommandLink>,
+        tap: &mut Tap<TAP>,
+    ) -> Accepted {
+        let mut accepted = Accepted::default();
+        let (now, usable, bytes) = (store.now, self.is_usable(), *rest);
+        let is_late = |heard: Instant, idle_gap: Duration| now >= heard + idle_gap;
+        let Codec::Device(DeviceCodec { reader: Some(Reader::Whole { cutter, heard }), .. }) = &self.codec
+        else {
+            return accepted;
+        };
+        if cutter.ends_by_silence()
+            && cutter.has_begun()
+            && !bytes.is_empty()
+            && is_late(*heard, self.line.idle_gap)
+        {
+            // These bytes may have waited: nobody knows whether there was silence before them.
+            self.discard_partial(tap, now);
+        }
+        let Codec::Device(DeviceCodec {
+            formats,
+            inputs,
+            reader: Some(Reader::Whole { cutter, heard }),
+            texts,
+            skipped_bytes,
+            ..
+        }) = &mut self.codec
+        else {
+            return accepted;
+        };
+        let formats = formats.get(..usize::from(*inputs)).unwrap_or(&[]);
+        let tail = formats.first().map_or(&[][..], |format| format.layout.tail());
+        let mut frames = Frames {
+            mode: self.mode,
+            bindings,
+            reply: &mut self.reply,
+            counters: &mut self.counters,
+            port: self.id,
+            store,
+            commands,
+        };
+        let mut left = core::mem::take(rest);
+        if !bytes.is_empty() {
+            *heard = now;
+        }
+        let mut silence = bytes.is_empty();
+        loop {
+            let piece = if core::mem::take(&mut silence) {
+                cutter.silence()
+            } else {
+                cutter.next_piece(&mut left, tail)
+            };
+            let Some(piece) = piece else { break };
+            let (frame, verdict) = match piece {
+                Piece::Whole(frame) => match judge(formats, bindings, frame) {
+                    Ok((nth, format)) => {
+                        let slot = usize::from(self.first_frame).saturating_add(nth);
+                        (frame, frames.take_device(format, texts, frame, slot, &mut accepted))
+                    }
+                    Err(why) => (frame, frames.rejected(why)),
+                },
+                Piece::TooLong(frame) => (frame, frames.rejected(Rejection::WrongLength)),
+                Piece::BadEscape(frame) => (frame, frames.rejected(Rejection::Escape)),
+                Piece::Cut(frame) => {
+                    add(&mut frames.counters.discarded_bytes, frame.len());
+                    (frame, Err(Rejection::Partial))
+                }
+            };
+            tap.record(|| came(self.id, now, verdict, None, [frame, &[], &[]]));
+            match verdict {
+                Ok(()) if frames.store.watches_bits && !left.is_empty() => break,
+                Ok(()) => {}
+                Err(why) => keep(&mut self.last_rejection, why, None, frame, now),
+            }
+        }
+        *rest = left;
+        let skipped = cutter.skipped_bytes().wrapping_sub(*skipped_bytes);
+        *skipped_bytes = cutter.skipped_bytes();
+        if skipped > 0 {
+            add(&mut self.counters.resync_bytes, skipped as usize);
+            self.no_frame(bytes, skipped as usize, tap, now);
+        }
+        self.sender.frames_accepted(accepted.frames, usable, &mut self.counters, now);
+        accepted
+    }
+
+    /// Bytes for a port whose recipe has no input part.
+    #[cold]
+    pub(super) fn not_asked_for<const TAP: usize>(&mut self, bytes: &[u8], tap: &mut Tap<TAP>, now: Instant) {
+        bump(&mut self.counters.rejected_no_input);
+        tap.record(|| came(self.id, now, Err(Rejection::NoInput), None, [bytes, &[], &[]]));
+        keep(&mut self.last_rejection, Rejection::NoInput, None, bytes, now);
+    }
+}
+
+/// The number and the texts of an output frame's elements, for its layout.
+pub(super) fn encode(
+    codec: &DeviceCodec,
+    format: &DeviceFormat,
+    bindings: &[OutputBind],
+    image: &Image,
+    number: impl FnMut(usize) -> f64,
+    out: &mut [u8],
+) -> Option<usize> {
+    let elements = format.bindings.of(bindings).iter().map(OutputBind::element);
+    let text = |nth: usize, out: &mut [u8]| codec.write_text(format, nth, image, out);
+    let len = format.layout.encode_with(elements, number, text, out)?;
+    match codec.escape {
+        Some(escape) => escape.stuff(len, out),
+        None => Some(len),
+    }
+}

@@ -1,0 +1,381 @@
+//! What a master asks of a slave, and which reply answers it (docs/wire/modbus-rtu.md section 3).
+//!
+//! In: an operation and the data to write. Out: the request's frame, and what its reply must look
+//! like. Does not know when it is asked.
+
+use core::{fmt, slice};
+
+use super::super::Exception;
+use super::super::pdu::{
+    MAX_READ_COILS, MAX_READ_REGISTERS, MAX_READ_WRITE_REGISTERS, MAX_WRITE_COILS, MAX_WRITE_REGISTERS,
+    function,
+};
+use super::super::values::{Coils, Registers, last_mask, packed_len};
+use super::adu::{BROADCAST, MAX_ADU, is_right, seal};
+
+/// A function with its addresses and counts, and without values.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub enum Operation {
+    /// FC 1.
+    ReadCoils {
+        /// First coil.
+        address: u16,
+        /// 1..=2000.
+        count: u16,
+    },
+    /// FC 2.
+    ReadDiscreteInputs {
+        /// First input.
+        address: u16,
+        /// 1..=2000.
+        count: u16,
+    },
+    /// FC 3.
+    ReadHoldingRegisters {
+        /// First register.
+        address: u16,
+        /// 1..=125.
+        count: u16,
+    },
+    /// FC 4.
+    ReadInputRegisters {
+        /// First register.
+        address: u16,
+        /// 1..=125.
+        count: u16,
+    },
+    /// FC 5.
+    WriteCoil {
+        /// The coil.
+        address: u16,
+    },
+    /// FC 6.
+    WriteRegister {
+        /// The register.
+        address: u16,
+    },
+    /// FC 15.
+    WriteCoils {
+        /// First coil.
+        address: u16,
+        /// 1..=1968.
+        count: u16,
+    },
+    /// FC 16.
+    WriteRegisters {
+        /// First register.
+        address: u16,
+        /// 1..=123.
+        count: u16,
+    },
+    /// FC 23: writes, then reads.
+    ReadWriteRegisters {
+        /// First register to read.
+        read_address: u16,
+        /// 1..=125.
+        read_count: u16,
+        /// First register to write.
+        write_address: u16,
+        /// 1..=121.
+        write_count: u16,
+    },
+}
+
+/// A count that a function does not allow.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub struct CountError {
+    /// The count.
+    pub count: u16,
+    /// The function's limit.
+    pub max: u16,
+}
+
+impl fmt::Display for CountError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "a count of {} is out of range; allowed: 1..={}", self.count, self.max)
+    }
+}
+
+impl core::error::Error for CountError {}
+
+/// The content of a reply.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum Reply<'a> {
+    /// FC 1 and 2: as many coils or inputs as were asked for.
+    Coils(Coils<'a>),
+    /// FC 3, 4 and 23: as many registers as were asked for.
+    Registers(Registers<'a>),
+    /// FC 5, 6, 15 and 16: the slave has taken what was written.
+    Written,
+}
+
+impl Operation {
+    /// The function code.
+    pub const fn function(&self) -> u8 {
+        match self {
+            Self::ReadCoils { .. } => function::READ_COILS,
+            Self::ReadDiscreteInputs { .. } => function::READ_DISCRETE,
+            Self::ReadHoldingRegisters { .. } => function::READ_HOLDING,
+            Self::ReadInputRegisters { .. } => function::READ_INPUT,
+            Self::WriteCoil { .. } => function::WRITE_COIL,
+            Self::WriteRegister { .. } => function::WRITE_REGISTER,
+            Self::WriteCoils { .. } => function::WRITE_COILS,
+            Self::WriteRegisters { .. } => function::WRITE_REGISTERS,
+            Self::ReadWriteRegisters { .. } => function::READ_WRITE_REGISTERS,
+        }
+    }
+
+    /// Whether the reply carries data; such a request cannot be a broadcast.
+    pub const fn reads(&self) -> bool {
+        self.reply_data_len().is_some()
+    }
+
+    /// Checks the counts.
+    ///
+    /// # Errors
+    /// A count of 0 or over the function's limit.
+    pub const fn check(&self) -> Result<(), CountError> {
+        let (count, max) = match *self {
+            Self::ReadCoils { count, .. } | Self::ReadDiscreteInputs { count, .. } => (count, MAX_READ_COILS),
+            Self::ReadHoldingRegisters { count, .. } | Self::ReadInputRegisters { count, .. } => {
+                (count, MAX_READ_REGISTERS)
+            }
+            Self::WriteCoil { .. } | Self::WriteRegister { .. } => (1, 1),
+            Self::WriteCoils { count, .. } => (count, MAX_WRITE_COILS),
+            Self::WriteRegisters { count, .. } => (count, MAX_WRITE_REGISTERS),
+            Self::ReadWriteRegisters { read_count, write_count, .. } => {
+                if matches!(write_count, 1..=MAX_READ_WRITE_REGISTERS) {
+                    (read_count, MAX_READ_REGISTERS)
+                } else {
+                    (write_count, MAX_READ_WRITE_REGISTERS)
+                }
+            }
+        };
+        if count == 0 || count > max { Err(CountError { count, max }) } else { Ok(()) }
+    }
+
+    /// Bytes of data that a request needs: 0 for a read; 1 for one coil, whose lowest bit counts;
+    /// coils packed eight per byte with the first in the lowest bit; two bytes a register, high
+    /// byte first.
+    pub const fn written_len(&self) -> usize {
+        match *self {
+            Self::WriteCoil { .. } => 1,
+            Self::WriteRegister { .. } => 2,
+            Self::WriteCoils { count, .. } => packed_len(count),
+            Self::WriteRegisters { count, .. } | Self::ReadWriteRegisters { write_count: count, .. } => {
+                (count as usize).saturating_mul(2)
+            }
+            _ => 0,
+        }
+    }
+
+    /// Length of the request's frame.
+    pub const fn request_len(&self) -> usize {
+        match self {
+            Self::WriteCoils { .. } | Self::WriteRegisters { .. } => self.written_len().saturating_add(9),
+            Self::ReadWriteRegisters { .. } => self.written_len().saturating_add(13),
+            _ => 8,
+        }
+    }
+
+    /// Length of the frame of a reply that is no exception.
+    pub const fn reply_len(&self) -> usize {
+        match self.reply_data_len() {
+            Some(len) => len.saturating_add(5),
+            None => 8,
+        }
+    }
+
+    /// Bytes of data in the reply; `None` for one that echoes the request's head.
+    const fn reply_data_len(&self) -> Option<usize> {
+        match *self {
+            Self::ReadCoils { count, .. } | Self::ReadDiscreteInputs { count, .. } => Some(packed_len(count)),
+            Self::ReadHoldingRegisters { count, .. }
+            | Self::ReadInputRegisters { count, .. }
+            | Self::ReadWriteRegisters { read_count: count, .. } => Some((count as usize).saturating_mul(2)),
+            _ => None,
+        }
+    }
+
+    /// First address and count as they are in the request; FC 5 and 6 have the value there.
+    const fn head(&self) -> (u16, u16) {
+        match *self {
+            Self::ReadCoils { address, count }
+            | Self::ReadDiscreteInputs { address, count }
+            | Self::ReadHoldingRegisters { address, count }
+            | Self::ReadInputRegisters { address, count }
+            | Self::WriteCoils { address, count }
+            | Self::WriteRegisters { address, count } => (address, count),
+            Self::WriteCoil { address } | Self::WriteRegister { address } => (address, 0),
+            Self::ReadWriteRegisters { read_address, read_count, .. } => (read_address, read_count),
+        }
+    }
+
+    /// Writes the request's frame to the front of `out` and returns its length. `fill` writes the
+    /// data into a slice of [`Self::written_len`] zeros; `None` if it has none.
+    pub(super) fn encode(
+        &self,
+        slave: u8,
+        out: &mut [u8; MAX_ADU],
+        fill: impl FnOnce(&mut [u8]) -> bool,
+    ) -> Option<usize> {
+        let (address, count) = self.head();
+        let ([a1, a0], [c1, c0]) = (address.to_be_bytes(), count.to_be_bytes());
+        let (head, rest) = out.split_first_chunk_mut::<6>()?;
+        *head = [slave, self.function(), a1, a0, c1, c0];
+        let len = self.written_len();
+        match *self {
+            Self::WriteCoil { .. } => {
+                let [.., high, _] = head;
+                if !fill(slice::from_mut(high)) {
+                    return None;
+                }
+                *high = if *high & 1 == 1 { COIL_ON } else { 0 };
+            }
+            Self::WriteRegister { .. } => {
+                let value = head.last_chunk_mut::<2>()?;
+                if !fill(value) {
+                    return None;
+                }
+            }
+            Self::WriteCoils { count, .. } => {
+                let data = behind_count(rest, len)?;
+                if !fill(data) {
+                    return None;
+                }
+                if let Some(last) = data.last_mut() {
+                    *last &= last_mask(count);
+                }
+            }
+            Self::WriteRegisters { .. } => {
+                let data = behind_count(rest, len)?;
+                if !fill(data) {
+                    return None;
+                }
+            }
+            Self::ReadWriteRegisters { write_address, write_count, .. } => {
+                let ([w1, w0], [n1, n0]) = (write_address.to_be_bytes(), write_count.to_be_bytes());
+                let (write, rest) = rest.split_first_chunk_mut::<4>()?;
+                *write = [w1, w0, n1, n0];
+                if !fill(behind_count(rest, len)?) {
+                    return None;
+                }
+            }
+            _ => {}
+        }
+        seal(out, self.request_len().saturating_sub(2))
+    }
+
+    /// The content of a reply's frame that [`Expected::probe`] has found.
+    pub(super) fn reply<'a>(&self, frame: &'a [u8]) -> Option<Reply<'a>> {
+        let data = |len: usize| frame.get(3..)?.get(..len);
+        let len = self.reply_data_len().unwrap_or(0);
+        match *self {
+            Self::ReadCoils { count, .. } | Self::ReadDiscreteInputs { count, .. } => {
+                Coils::new(data(len)?, count).map(Reply::Coils)
+            }
+            Self::ReadHoldingRegisters { .. }
+            | Self::ReadInputRegisters { .. }
+            | Self::ReadWriteRegisters { .. } => Registers::new(data(len)?).map(Reply::Registers),
+            _ => Some(Reply::Written),
+        }
+    }
+}
+
+/// The byte count and the zeroed place of `len` bytes of data behind it.
+fn behind_count(rest: &mut [u8], len: usize) -> Option<&mut [u8]> {
+    let (byte_count, data) = rest.split_first_mut()?;
+    // At most 246 by the limits of the counts.
+    *byte_count = len as u8;
+    let data = data.get_mut(..len)?;
+    data.fill(0);
+    Some(data)
+}
+
+/// What the reply to a request looks like.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Expected {
+    slave: u8,
+    function: u8,
+    body: Body,
+}
+
+#[derive(Debug, Clone, Copy)]
+enum Body {
+    /// So many bytes of data behind their count.
+    Data(u8),
+    /// The same four bytes as in the request.
+    Echo([u8; 4]),
+}
+
+/// What bytes are to a master that waits for a reply.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Probe {
+    /// Not the beginning of the reply.
+    No,
+    /// Perhaps its beginning.
+    Partial,
+    /// The reply, of so many bytes.
+    Reply(usize),
+    /// The request is refused.
+    Refused(Exception),
+    /// The reply by its head and length, with a wrong CRC.
+    Wrong,
+}
+
+impl Expected {
+    /// What answers the request in `frame`; `None` for a broadcast.
+    pub(super) fn of(operation: &Operation, frame: &[u8]) -> Option<Self> {
+        let (&[slave, function], rest) = frame.split_first_chunk()?;
+        if slave == BROADCAST {
+            return None;
+        }
+        let body = match operation.reply_data_len() {
+            // At most 250 by the limits of the counts.
+            Some(len) => Body::Data(len as u8),
+            None => Body::Echo(*rest.first_chunk()?),
+        };
+        Some(Self { slave, function, body })
+    }
+
+    /// Whether `bytes` begin with the slave and the function that were asked.
+    pub(super) fn is_from(&self, bytes: &[u8]) -> bool {
+        bytes.starts_with(&[self.slave, self.function])
+    }
+
+    /// What `bytes` begin with.
+    pub(super) fn probe(&self, bytes: &[u8]) -> Probe {
+        let [slave, rest @ ..] = bytes else { return Probe::Partial };
+        if *slave != self.slave {
+            return Probe::No;
+        }
+        let [function, rest @ ..] = rest else { return Probe::Partial };
+        if *function == self.function | function::EXCEPTION_FLAG {
+            return match (bytes.get(..5), rest) {
+                (Some(frame), [code, ..]) if is_right(frame) => Probe::Refused(Exception::from_code(*code)),
+                (Some(_), _) => Probe::Wrong,
+                (None, _) => Probe::Partial,
+            };
+        }
+        if *function != self.function {
+            return Probe::No;
+        }
+        let (fits, len) = match self.body {
+            Body::Data(len) => (rest.first().is_none_or(|count| *count == len), usize::from(len) + 5),
+            Body::Echo(head) => (rest.iter().zip(&head).all(|(byte, wanted)| byte == wanted), 8),
+        };
+        match bytes.get(..len) {
+            _ if !fits => Probe::No,
+            None => Probe::Partial,
+            Some(frame) if is_right(frame) => Probe::Reply(len),
+            Some(_) => Probe::Wrong,
+        }
+    }
+}
+
+/// High byte of the value that switches a coil on.
+const COIL_ON: u8 = 0xFF;

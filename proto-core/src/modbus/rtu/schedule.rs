@@ -1,0 +1,255 @@
+//! Which exchange has the line next (docs/wire/modbus-rtu.md section 5).
+//!
+//! In: when exchanges are wanted, and how they ended. Out: the next one, or when to look again.
+//! Does not know frames: one line, one exchange at a time, peers that may be silent.
+//!
+//! Requested exchanges go first, the oldest request before the others; after [`REQUESTED_RUN`] of
+//! them a due period has its turn. Of the periods the one that ends first goes first. A period that is
+//! not served keeps its end, while those that are served get later ones, and of equals the one that
+//! was served first is the next: so a line with too much to do serves all of them in turn. A peer that is down is asked in the
+//! gaps between the others, in which its whole timeout fits; if there is no gap for as long as the
+//! peer's wait, it is asked nevertheless. The wait grows to [`LONGEST_WAIT`] timeouts, so a peer
+//! that never answers takes at most 1 part in 65 of the line.
+
+use heapless::Vec;
+
+use super::exchange::{MAX_SLAVES, When};
+use crate::schedule::Grid;
+use crate::time::{Duration, Instant};
+
+/// Requested exchanges in a row while a period is due.
+const REQUESTED_RUN: u8 = 4;
+/// The wait after the first failure in timeouts, as a power of two.
+const FIRST_WAIT: u32 = 1;
+/// The longest wait in timeouts, as a power of two.
+const LONGEST_WAIT: u32 = 6;
+/// No wait is longer than this, or than twice the timeout.
+const WAIT_LIMIT: Duration = Duration::from_secs(30);
+
+/// Whether a slave answers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
+pub enum Presence {
+    /// It has not been asked yet.
+    Unknown,
+    /// It answered when it was last asked.
+    Up,
+    /// It did not answer when it was last asked.
+    Down,
+}
+
+/// Rows of exchanges and the peers that they are with.
+#[derive(Debug, Clone)]
+pub(super) struct Schedule<const N: usize> {
+    rows: Vec<Row, N>,
+    peers: Vec<Peer, PEERS>,
+    /// Requested exchanges since the last other one.
+    run: u8,
+}
+
+/// All slaves and the broadcast.
+const PEERS: usize = MAX_SLAVES + 1;
+
+#[derive(Debug, Clone)]
+struct Row {
+    peer: u8,
+    grid: Option<Grid>,
+    start: bool,
+    requested: Option<Instant>,
+    /// When it was taken last.
+    taken: Instant,
+    /// Time on the line if no answer comes.
+    cost: Duration,
+    timeout: Duration,
+}
+
+#[derive(Debug, Clone)]
+struct Peer {
+    presence: Presence,
+    /// Not asked before.
+    not_before: Instant,
+    /// From a failure to the next question.
+    wait: Duration,
+    failures: u32,
+    missed: u32,
+}
+
+/// How a row was taken, which [`Schedule::failed`] wants to know.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Taken {
+    requested: Option<Instant>,
+}
+
+impl<const N: usize> Schedule<N> {
+    pub(super) const fn new() -> Self {
+        Self { rows: Vec::new(), peers: Vec::new(), run: 0 }
+    }
+
+    /// A further peer; `None` if there is no room.
+    pub(super) fn add_peer(&mut self) -> Option<u8> {
+        let peer = Peer {
+            presence: Presence::Unknown,
+            not_before: Instant::ZERO,
+            wait: Duration::ZERO,
+            failures: 0,
+            missed: 0,
+        };
+        self.peers.push(peer).ok()?;
+        Some(self.peers.len().saturating_sub(1) as u8)
+    }
+
+    /// A further row; false if there is no room.
+    pub(super) fn add_row(
+        &mut self,
+        peer: u8,
+        when: When,
+        cost: Duration,
+        timeout: Duration,
+        now: Instant,
+    ) -> bool {
+        let grid = when.every.map(|period| Grid::starting_at(now, period));
+        let requested = when.start.then_some(now);
+        let row = Row { peer, grid, start: when.start, requested, taken: Instant::ZERO, cost, timeout };
+        self.rows.push(row).is_ok()
+    }
+
+    pub(super) fn presence(&self, peer: u8) -> Presence {
+        self.peers.get(usize::from(peer)).map_or(Presence::Unknown, |peer| peer.presence)
+    }
+
+    /// Periods of a peer that went by while it was not down.
+    pub(super) fn missed(&self, peer: u8) -> u32 {
+        self.peers.get(usize::from(peer)).map_or(0, |peer| peer.missed)
+    }
+
+    /// Wants a row as soon as possible; false if there is no such row.
+    pub(super) fn request(&mut self, row: usize, now: Instant) -> bool {
+        let Some(row) = self.rows.get_mut(row) else { return false };
+        row.requested.get_or_insert(now);
+        true
+    }
+
+    /// The row to take now, or when to look again.
+    pub(super) fn choose(&mut self, now: Instant) -> Result<usize, Instant> {
+        let (mut requested, mut due, mut probe) = (First::NONE, First::NONE, First::NONE);
+        let (mut look_again, mut next_due) = (Instant::NEVER, Instant::NEVER);
+        for (nth, row) in self.rows.iter().enumerate() {
+            let Some(peer) = self.peers.get(usize::from(row.peer)) else { continue };
+            let wanted = row.wanted();
+            let at = wanted.max(peer.not_before);
+            match peer.presence {
+                _ if at > now => {
+                    look_again = look_again.min(at);
+                    if peer.presence != Presence::Down {
+                        next_due = next_due.min(at);
+                    }
+                }
+                Presence::Down => probe.consider((at, row.taken), nth),
+                _ if row.requested.is_some() => requested.consider((wanted, row.taken), nth),
+                _ => due.consider((row.end_of_period(), row.taken), nth),
+            }
+        }
+        let probe = probe.nth.and_then(|nth| {
+            let row = self.rows.get(nth)?;
+            let wait = self.peers.get(usize::from(row.peer))?.wait;
+            Some((nth, probe.key.0 + wait, now + row.cost <= next_due))
+        });
+        let overdue = probe.filter(|(_, nevertheless, _)| *nevertheless <= now).map(|(nth, ..)| nth);
+        let periodic = overdue.or(due.nth);
+        if let Some(nth) = requested.nth
+            && (self.run < REQUESTED_RUN || periodic.is_none())
+        {
+            self.run = self.run.saturating_add(1);
+            return Ok(nth);
+        }
+        self.run = 0;
+        match (periodic, probe) {
+            (Some(nth), _) | (None, Some((nth, _, true))) => Ok(nth),
+            (None, Some((_, nevertheless, false))) => Err(look_again.min(nevertheless)),
+            (None, None) => Err(look_again),
+        }
+    }
+
+    /// The row is taken: its request is being sent, or there is nothing to send.
+    pub(super) fn take(&mut self, nth: usize, now: Instant) -> Taken {
+        let Some(row) = self.rows.get_mut(nth) else { return Taken { requested: None } };
+        let missed = row.grid.as_mut().and_then(|grid| grid.due(now)).unwrap_or(0);
+        if let Some(peer) = self.peers.get_mut(usize::from(row.peer))
+            && peer.presence != Presence::Down
+        {
+            let missed = u32::try_from(missed).unwrap_or(u32::MAX);
+            peer.missed = peer.missed.saturating_add(missed);
+        }
+        row.taken = now;
+        Taken { requested: row.requested.take() }
+    }
+
+    /// The peer has answered; what it says to the request does not matter. It is asked nothing
+    /// else before `not_before`.
+    pub(super) fn answered(&mut self, nth: usize, now: Instant, not_before: Instant) {
+        let Some(which) = self.rows.get(nth).map(|row| row.peer) else { return };
+        let Some(peer) = self.peers.get_mut(usize::from(which)) else { return };
+        let was_down = peer.presence == Presence::Down;
+        peer.presence = Presence::Up;
+        peer.failures = 0;
+        peer.not_before = not_before;
+        if !was_down {
+            return;
+        }
+        for (_, row) in self.rows.iter_mut().enumerate().filter(|(at, row)| row.peer == which && *at != nth) {
+            if row.start {
+                row.requested.get_or_insert(now);
+            }
+            if let Some(grid) = &mut row.grid {
+                // What went by in the meantime is not missed.
+                *grid = Grid::starting_at(grid.next().max(now), grid.period());
+            }
+        }
+    }
+
+    /// The peer has not answered, the last time to a request whose sending ended at `sent`.
+    pub(super) fn failed(&mut self, nth: usize, taken: Taken, now: Instant, sent: Instant) {
+        let Some(row) = self.rows.get_mut(nth) else { return };
+        row.requested = row.requested.or(taken.requested);
+        let timeout = row.timeout;
+        let Some(peer) = self.peers.get_mut(usize::from(row.peer)) else { return };
+        let exponent = peer.failures.saturating_add(FIRST_WAIT).min(LONGEST_WAIT);
+        peer.failures = peer.failures.saturating_add(1);
+        let longest = WAIT_LIMIT.max(timeout.saturating_mul(2));
+        peer.wait = timeout.saturating_mul(1_u64.wrapping_shl(exponent)).min(longest);
+        peer.presence = Presence::Down;
+        peer.not_before = (now + peer.wait).max(sent + timeout.saturating_mul(2));
+    }
+}
+
+impl Row {
+    /// Since when the row is to be taken, or from when.
+    fn wanted(&self) -> Instant {
+        let due = self.grid.as_ref().map_or(Instant::NEVER, Grid::next);
+        self.requested.map_or(due, |requested| requested.min(due))
+    }
+
+    /// When the period that is due, or the next one, is missed.
+    fn end_of_period(&self) -> Instant {
+        self.grid.as_ref().map_or(Instant::NEVER, |grid| grid.next() + grid.period())
+    }
+}
+
+/// The row with the smallest key; the first of several.
+#[derive(Clone, Copy)]
+struct First {
+    /// What decides, and when the row was taken last.
+    key: (Instant, Instant),
+    nth: Option<usize>,
+}
+
+impl First {
+    const NONE: Self = Self { key: (Instant::NEVER, Instant::NEVER), nth: None };
+
+    fn consider(&mut self, key: (Instant, Instant), nth: usize) {
+        if self.nth.is_none() || key < self.key {
+            *self = Self { key, nth: Some(nth) };
+        }
+    }
+}
