@@ -9,7 +9,7 @@ use heapless::{String, Vec};
 use super::draft::{ControllerBuilder, PartFields, PortBuilder, PortBus, RecipeBuilder, Trigger};
 use super::error::{ConfigError, ConfigErrorKind as Kind, ControllerKey, Counted, Place, PortKey, RecipeKey};
 use super::fields::{CanFields, Does, Entries, Fields, InputField, OutputField, Sends, plain};
-use super::rules::{check_name, check_room, text};
+use super::rules::{check_bit, check_name, check_room, text};
 use super::view::ConfigMut;
 use super::{
     CanFramePart, CommandEntry, ControllerLink, Delimiter, FieldSpec, GatewayConfig, InputBinding, Name,
@@ -242,8 +242,8 @@ impl ConfigMut<'_> {
                     InputBinding::Variable { var: var.read().map_err(Kind::Variable)?, scale, offset }
                 }
                 Does::WritesBit { name } => {
-                    let bit = VarBit::parse(name).unwrap_or(Err(VarError::Syntax)).map_err(Kind::Variable)?;
-                    InputBinding::Bit { var: bit.var, bit: bit.bit }
+                    let VarBit { var, bit } = read_bit(name)?;
+                    InputBinding::Bit { var, bit }
                 }
                 Does::Commands { entries, when, idle } => {
                     InputBinding::Commands { table: self.add_commands(entries, idle)?, when }
@@ -342,11 +342,19 @@ impl ConfigMut<'_> {
     }
 }
 
+fn read_bit(name: &str) -> Result<VarBit, Kind> {
+    VarBit::parse(name).unwrap_or(Err(VarError::Syntax)).map_err(Kind::Variable)
+}
+
 fn output_spec(field: &OutputField<'_>) -> Result<FieldSpec, Kind> {
     field.on_wire.spec(|encoding, overflow| {
         let from = match field.sends {
             Sends::Variable { var, scale, offset } => {
                 OutputBinding::Variable { var: var.read().map_err(Kind::Variable)?, scale, offset }
+            }
+            Sends::Bit { name } => {
+                let VarBit { var, bit } = read_bit(name)?;
+                OutputBinding::Bit { var, bit }
             }
             Sends::Constant(value) => OutputBinding::Constant(value),
             Sends::Counter => OutputBinding::Counter,
@@ -370,12 +378,7 @@ fn safe_value(var: SysVar, value: f64) -> Result<SafeValue, Kind> {
 
 /// 0 or 1: that of a bit.
 fn safe_bit(bit: VarBit, value: f64) -> Result<SafeValue, Kind> {
-    let VarBit { var, bit: nth } = bit;
-    bit.mask().ok_or(if var.is_bits() {
-        Kind::NoSuchBit { var, bit: nth }
-    } else {
-        Kind::HasNoBits { var }
-    })?;
+    check_bit(bit)?;
     if value != 0.0 && value != 1.0 {
         return Err(Kind::NotInField { value, low: 0.0, high: 1.0 });
     }

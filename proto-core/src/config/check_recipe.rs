@@ -1,8 +1,8 @@
 //! The checks that concern one recipe alone: its parts, the bindings of its user fields, its
 //! trigger.
 
-use super::error::{ConfigErrorKind as Kind, Place, RecipeKey};
-use super::rules::{Check, check_new_name, check_pool, fail, is_marked, mark};
+use super::error::{ConfigError, ConfigErrorKind as Kind, Place, RecipeKey};
+use super::rules::{Check, check_bit, check_new_name, check_pool, fail, is_marked, mark};
 use super::{
     CanFramePart, CommandEntry, ConfigView, DeviceFrame, FieldSpec, InputBinding, MAX_COMMAND_TEXT,
     OutputBinding, Parts, Recipe, SendOn, Span, Words, placeholders,
@@ -130,15 +130,15 @@ impl<'a> RecipeCheck<'a> {
                 check_scale(place, scale, offset)
             }
             InputBinding::Bit { var, bit } => {
-                let kind = match numbers.ty {
-                    _ if var.direction() != Direction::Input => Kind::NotAnInput { var },
-                    _ if !var.is_bits() => Kind::HasNoBits { var },
-                    _ if (VarBit { var, bit }).mask().is_none() => Kind::NoSuchBit { var, bit },
-                    _ if numbers.integers => return Ok(()),
-                    Some(ty) => Kind::NeedsInteger { ty },
-                    None => Kind::NeedsIntegers,
-                };
-                fail(place, kind)
+                if var.direction() != Direction::Input {
+                    return fail(place, Kind::NotAnInput { var });
+                }
+                check_bit(VarBit { var, bit }).map_err(|kind| ConfigError { place, kind })?;
+                match numbers.ty {
+                    _ if numbers.integers => Ok(()),
+                    Some(ty) => fail(place, Kind::NeedsInteger { ty }),
+                    None => fail(place, Kind::NeedsIntegers),
+                }
             }
             InputBinding::Commands { table, .. } => {
                 if !numbers.integers {
@@ -173,6 +173,9 @@ impl<'a> RecipeCheck<'a> {
                     return fail(place, Kind::ScaledCount);
                 }
                 check_scale(place, scale, offset)
+            }
+            OutputBinding::Bit { var, bit } => {
+                check_bit(VarBit { var, bit }).map_err(|kind| ConfigError { place, kind }).map(|_| ())
             }
             _ => Ok(()),
         }

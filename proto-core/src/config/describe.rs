@@ -290,11 +290,11 @@ impl fmt::Display for DescribedKind<'_> {
                 bit.var, bit.bit
             ),
             Kind::HasNoBits { var } => {
-                write!(
-                    f,
-                    "{var} is a {} without bits; allowed: bits of DigitalOutputCommand, BitInputReg",
-                    var.ty()
-                )
+                write!(f, "{var} is a {} without bits", var.ty())?;
+                match var.direction() {
+                    Direction::Input => f.write_str("; allowed: bits of DigitalOutputCommand, BitInputReg"),
+                    Direction::Output => Ok(()),
+                }
             }
             Kind::NotBits { var } => {
                 write!(f, "{var} is a {}; a trigger needs a variable made of bits", var.ty())

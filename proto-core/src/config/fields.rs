@@ -307,6 +307,7 @@ pub struct OutputField<'a> {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Sends<'a> {
     Variable { var: Var<'a>, scale: f32, offset: f32 },
+    Bit { name: &'a str },
     Constant(f64),
     Counter,
     Reply,
@@ -318,6 +319,11 @@ impl<'a> OutputField<'a> {
     /// A variable's value, saturated to the field's type.
     pub fn variable(encoding: impl Into<Encoding>, var: impl Into<Var<'a>>) -> Self {
         Self::new(encoding, Sends::Variable { var: var.into(), scale: 1.0, offset: 0.0 })
+    }
+
+    /// One bit of a variable, such as `DigitalOutputCommand[1].0`, as 0 or 1.
+    pub fn bit(encoding: impl Into<Encoding>, name: &'a str) -> Self {
+        Self::new(encoding, Sends::Bit { name })
     }
 
     /// A constant.

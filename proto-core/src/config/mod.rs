@@ -46,7 +46,7 @@ pub use recipe::{
     CanFramePart, CommandEntry, CommandWhen, FieldSpec, InputBinding, MAX_COMMAND_TEXT, OnStale,
     OutputBinding, Parts, Recipe, SendOn, Span, StreamPart, Words,
 };
-pub use rules::{check_address, check_bitrate, check_cycle, check_name};
+pub use rules::{check_address, check_bit, check_bitrate, check_cycle, check_name};
 pub use safe_value::SafeValue;
 pub use source::{PortHealth, PortValue, StateValue, StateValueError};
 pub(crate) use view::ConfigMut;

@@ -254,11 +254,13 @@ impl FieldSpec {
         }
     }
 
-    /// The bit that an input field is bound to.
+    /// The bit that the field is bound to.
     pub const fn bit(&self) -> Option<VarBit> {
         match *self {
             Self::UserInput { to: InputBinding::Bit { var, bit }, .. }
-            | Self::DeviceInput { to: InputBinding::Bit { var, bit }, .. } => Some(VarBit { var, bit }),
+            | Self::DeviceInput { to: InputBinding::Bit { var, bit }, .. }
+            | Self::UserOutput { from: OutputBinding::Bit { var, bit }, .. }
+            | Self::DeviceOutput { from: OutputBinding::Bit { var, bit }, .. } => Some(VarBit { var, bit }),
             _ => None,
         }
     }
@@ -271,8 +273,8 @@ impl FieldSpec {
         }
     }
 
-    /// The system variable that the field is, or that its value is bound to as a whole; texts have
-    /// several, see [`Self::variables`].
+    /// The system variable that the field is, that an input field's value becomes as a whole, or of
+    /// which an output field shows the value or a bit; texts have several, see [`Self::variables`].
     pub fn variable(&self) -> Option<SysVar> {
         match *self {
             Self::System(var) => Some(var),
@@ -281,7 +283,7 @@ impl FieldSpec {
                 InputBinding::Unused | InputBinding::Commands { .. } | InputBinding::Bit { .. } => None,
             },
             Self::UserOutput { from, .. } | Self::DeviceOutput { from, .. } => match from {
-                OutputBinding::Variable { var, .. } => Some(var),
+                OutputBinding::Variable { var, .. } | OutputBinding::Bit { var, .. } => Some(var),
                 _ => None,
             },
             _ => None,
@@ -387,6 +389,13 @@ pub enum OutputBinding {
         scale: f32,
         /// Offset, added after scaling.
         offset: f32,
+    },
+    /// One bit of a byte variable, 0 or 1.
+    Bit {
+        /// Any variable made of bits that the controller shows.
+        var: SysVar,
+        /// Bit 0..=7.
+        bit: u8,
     },
 }
 

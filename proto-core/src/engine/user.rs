@@ -188,6 +188,7 @@ pub(super) fn values(
             OutputBinding::State { scale, offset, .. } | OutputBinding::Port { scale, offset, .. } => {
                 saturate_to_field(ty, image.extra(extra), scale, offset)
             }
+            OutputBinding::Bit { var, bit } => saturate_to_field(ty, image.bit(var, bit), 1.0, 0.0),
         };
         // A part has no more fields than there is room for.
         let _ = values.push(value);
@@ -210,6 +211,7 @@ pub(super) fn number_of(binding: &OutputBind, image: &Image, frames_sent: u32, r
         OutputBinding::State { scale, offset, .. } | OutputBinding::Port { scale, offset, .. } => {
             image.extra(binding.extra) * f64::from(scale) + f64::from(offset)
         }
+        OutputBinding::Bit { var, bit } => image.bit(var, bit),
     }
 }
 

@@ -101,6 +101,11 @@ impl Image {
         self.bytes.get(var.image_offset()).copied().unwrap_or(0)
     }
 
+    /// A bit of a byte variable, 0 or 1, known or not.
+    pub(crate) fn bit(&self, var: SysVar, bit: u8) -> f64 {
+        f64::from(self.byte(var).checked_shr(bit.into()).unwrap_or(0) & 1)
+    }
+
     /// Sets some bits of a byte variable.
     pub(crate) fn set_bits(&mut self, var: SysVar, mask: u8, value: u8) {
         if let Some(byte) = self.bytes.get_mut(var.image_offset()).filter(|_| var.is_bits()) {

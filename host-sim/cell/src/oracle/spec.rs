@@ -258,8 +258,10 @@ pub(super) fn written(field: &FieldSpec) -> Option<SysVar> {
 pub(super) fn shown(field: &FieldSpec) -> Option<SysVar> {
     match *field {
         FieldSpec::System(var) => Some(var),
-        FieldSpec::UserOutput { from: OutputBinding::Variable { var, .. }, .. }
-        | FieldSpec::DeviceOutput { from: OutputBinding::Variable { var, .. }, .. } => Some(var),
+        FieldSpec::UserOutput { from, .. } | FieldSpec::DeviceOutput { from, .. } => match from {
+            OutputBinding::Variable { var, .. } | OutputBinding::Bit { var, .. } => Some(var),
+            _ => None,
+        },
         _ => None,
     }
 }

@@ -134,10 +134,18 @@ pub(super) fn read_output(field: &Reader<'_>) -> Result<FileOutput> {
                 let (scale, offset) = read_scale(field)?;
                 return sources::read(&from, text, scale, offset);
             }
-            _ => {
-                let (scale, offset) = read_scale(field)?;
-                OutputBinding::Variable { var: read_var(&from)?, scale, offset }
-            }
+            name => match VarBit::parse(name) {
+                Some(bit) => {
+                    refuse(field, &["scale", "offset"], "not allowed for a bit: it is 0 or 1")?;
+                    let VarBit { var, bit } =
+                        bit.map_err(|error| from.error(format!("{name:?}: {error}")))?;
+                    return Ok(FileOutput::Bound(OutputBinding::Bit { var, bit }));
+                }
+                None => {
+                    let (scale, offset) = read_scale(field)?;
+                    OutputBinding::Variable { var: read_var(&from)?, scale, offset }
+                }
+            },
         },
     };
     if !matches!(binding, OutputBinding::Variable { .. }) {

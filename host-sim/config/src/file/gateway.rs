@@ -4,10 +4,10 @@ use std::collections::HashMap;
 
 use heapless::Vec as Bounded;
 use proto_core::config::{
-    Bus, CanFramePart, CommandEntry, ConfigError, ConfigErrorKind, ControllerKey, ControllerLink, Delimiter,
-    FieldSpec, GatewayConfig, InputBinding, MAX_ADDRESS, MAX_ALL_FIELDS, MAX_COMMAND_TEXT, MAX_COMMANDS,
-    MAX_LISTEN, MAX_PORTS, MAX_RECIPES, MAX_SAFE_VALUES, NetworkKey, Parts, Place, Port, PortKey, Recipe,
-    RecipeKey, RecipeLink, SafeValue, Span, StreamPart, check_address,
+    Bus, CanFramePart, CommandEntry, ConfigError, ControllerKey, ControllerLink, Delimiter, FieldSpec,
+    GatewayConfig, InputBinding, MAX_ADDRESS, MAX_ALL_FIELDS, MAX_COMMAND_TEXT, MAX_COMMANDS, MAX_LISTEN,
+    MAX_PORTS, MAX_RECIPES, MAX_SAFE_VALUES, NetworkKey, Parts, Place, Port, PortKey, Recipe, RecipeKey,
+    RecipeLink, SafeValue, Span, StreamPart, check_address, check_bit,
 };
 use proto_core::recipe::model::{Framing, MAX_CAN_IDS};
 use proto_core::sysvar::{Direction, ParseError, SysVar, VarBit};
@@ -321,14 +321,7 @@ impl<'a> Builder<'a> {
         item: &Item<'_>,
     ) -> Result<SafeValue> {
         let bit = bit.map_err(|error| self.error(key_spot, error))?;
-        let VarBit { var, bit: nth } = bit;
-        if bit.mask().is_none() {
-            let kind = match var.is_bits() {
-                true => ConfigErrorKind::NoSuchBit { var, bit: nth },
-                false => ConfigErrorKind::HasNoBits { var },
-            };
-            return Err(self.error(key_spot, self.config.view().describe_kind(kind)));
-        }
+        check_bit(bit).map_err(|kind| self.error(key_spot, self.config.view().describe_kind(kind)))?;
         Ok(SafeValue::bit(bit, item.bit()?))
     }
 
