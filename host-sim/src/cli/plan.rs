@@ -15,8 +15,8 @@ pub(super) fn show(config: &GatewayConfig) -> String {
     for (_, port, recipe) in config.view().field_ports() {
         let up = config.view().written_by(recipe).map(|var| (var, way_up(config, &plan, var)));
         add(&mut lines, &port.name, up);
-        add_bits(&mut lines, &port.name, config.view().bits_written_by(recipe), |var| {
-            way_up(config, &plan, var)
+        add_bits(&mut lines, &port.name, config.view().bits_written_by(recipe), |bit| {
+            way_up(config, &plan, bit.var)
         });
         for (value, var) in port.health.iter() {
             let what = format!("{} in {var}", value.name());
@@ -39,12 +39,16 @@ pub(super) fn show(config: &GatewayConfig) -> String {
             SendOn::Rising { var, .. } => Some(var),
             _ => None,
         };
-        let shown = config
-            .view()
-            .fields_of(recipe, Direction::Output)
-            .flat_map(|(_, _, field)| field.variables())
-            .chain(trigger);
-        add(&mut lines, &port.name, shown.map(|var| (var, source(config, &plan, var))));
+        let fields = || config.view().fields_of(recipe, Direction::Output).map(|(_, _, field)| field);
+        let shown = fields().filter(|field| field.bit().is_none()).flat_map(FieldSpec::variables);
+        add(&mut lines, &port.name, shown.chain(trigger).map(|var| (var, source(config, &plan, var))));
+        add_bits(&mut lines, &port.name, fields().filter_map(FieldSpec::bit), |bit| {
+            // A bit that a port drives is shown as that port last sent it.
+            match plan.bit_owner(bit) {
+                Some(port) => format!("<- port {}", port_name(config, port)),
+                None => source(config, &plan, bit.var),
+            }
+        });
         for (_, _, field) in config.view().fields_of(recipe, Direction::Output) {
             let (what, from) = match field.source() {
                 Some(OutputBinding::State { value, .. }) => (value.to_string(), STATE_STREAM.into()),
@@ -96,24 +100,26 @@ fn add(lines: &mut Vec<(String, String, String)>, port: &str, ways: impl Iterato
     }
 }
 
-/// Adds one line per byte of which the port writes some bits.
+/// Adds one line for the bits of each byte that go the same way.
 fn add_bits(
     lines: &mut Vec<(String, String, String)>,
     port: &str,
     bits: impl Iterator<Item = VarBit>,
-    way: impl Fn(SysVar) -> String,
+    way: impl Fn(VarBit) -> String,
 ) {
-    let mut bytes: Vec<(SysVar, Vec<u8>)> = Vec::new();
-    for VarBit { var, bit } in bits {
-        match bytes.iter_mut().find(|(other, _)| *other == var) {
-            Some((_, bits)) => bits.push(bit),
-            None => bytes.push((var, vec![bit])),
+    let mut bytes: Vec<(SysVar, String, Vec<u8>)> = Vec::new();
+    for bit in bits {
+        let way = way(bit);
+        match bytes.iter_mut().find(|(var, other, _)| *var == bit.var && *other == way) {
+            Some((_, _, bits)) => bits.push(bit.bit),
+            None => bytes.push((bit.var, way, vec![bit.bit])),
         }
     }
-    for (var, mut bits) in bytes {
+    for (var, way, mut bits) in bytes {
         bits.sort_unstable();
+        bits.dedup();
         let bits: Vec<_> = bits.iter().map(u8::to_string).collect();
-        lines.push((port.to_owned(), format!("{var}.{}", bits.join(",")), way(var)));
+        lines.push((port.to_owned(), format!("{var}.{}", bits.join(",")), way));
     }
 }
 

@@ -1,7 +1,8 @@
 //! Bits of variables by name: in bindings, safe values and initial values.
 
-use proto_core::config::SafeValue;
+use proto_core::config::{FieldSpec, OutputBinding, SafeValue};
 use proto_core::sysvar::{SysVar, VarBit};
+use proto_core::wire::scalar::{Scalar, ScalarType};
 use recipe_config::InitialTarget;
 use recipe_config::file::{Text, parse_controller, parse_gateway};
 
@@ -90,6 +91,40 @@ fn a_bit_has_an_initial_value() {
     ] {
         let toml = format!("[initial]\n{wrong}\n");
         let error = parse_controller(Text { name: "robot.toml", toml: &toml }, &[]).unwrap_err().to_string();
+        assert!(error.contains(said), "{error}");
+    }
+}
+
+#[test]
+fn an_override_names_a_bit_as_a_file_does() {
+    let set = |key: &str| vec![format!("initial.{key}=1")];
+    for key in ["BitInputReg[3].4", "\"BitInputReg[3].4\"", "\"__BitInputReg_3.4\""] {
+        let config = parse_controller(Text { name: "robot.toml", toml: "" }, &set(key)).unwrap();
+        assert_eq!(config.initial[0].target.to_string(), "BitInputReg[3].4");
+    }
+    let set = ["port.one.on_timeout.BitInputReg[3].4=1".to_owned()];
+    let config = parse_gateway(Text { name: "panels.toml", toml: PANELS }, &set).unwrap();
+    assert_eq!(config.safe_values[0].value, Scalar::Byte(0x10));
+}
+
+#[test]
+fn an_output_field_shows_a_bit() {
+    let output = "[recipe.output]\nhead = [253]\nfields = [FIELD]\n\n[[port]]\nname = \"one\"";
+    let with = |field: &str| {
+        let toml = PANELS.replace("[[port]]\nname = \"one\"", &output.replace("FIELD", field));
+        parse_gateway(Text { name: "panels.toml", toml: &toml }, &[])
+    };
+    let field = "{ name = \"lit\", type = \"byte\", from = \"DigitalOutputCommand[1].0\" }";
+    let config = with(field).unwrap();
+    let var = SysVar::parse("DigitalOutputCommand[1]").unwrap();
+    let shown = FieldSpec::UserOutput { ty: ScalarType::Byte, from: OutputBinding::Bit { var, bit: 0 } };
+    assert!(config.fields.contains(&shown));
+    for (to, said) in [
+        ("DigitalOutputCommand[1].8\"", "DigitalOutputCommand[1] has no bit 8; allowed: 0..=7"),
+        ("WordOutputReg[1].0\"", "WordOutputReg[1] is a word without bits"),
+        ("DigitalOutputCommand[1].0\", scale = 2", "not allowed for a bit: it is 0 or 1"),
+    ] {
+        let error = with(&field.replace("DigitalOutputCommand[1].0\"", to)).unwrap_err().to_string();
         assert!(error.contains(said), "{error}");
     }
 }
