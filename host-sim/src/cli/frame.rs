@@ -174,8 +174,12 @@ fn show_encoding(encoding: &Encoding) -> String {
     kind + order
 }
 
-/// The constant, or the variable, behind how the field is written.
+/// The constant, the variable or the bit behind how the field is written.
 fn show_use(spec: &FieldSpec) -> String {
+    if let Some(bit) = spec.bit() {
+        let is_input = matches!(spec, FieldSpec::UserInput { .. } | FieldSpec::DeviceInput { .. });
+        return format!(" {} {bit}", if is_input { "->" } else { "<-" });
+    }
     match (*spec, spec.variable()) {
         (FieldSpec::Fixed { value, .. }, _) => format!(" = {value}"),
         (FieldSpec::UserInput { .. } | FieldSpec::DeviceInput { .. }, Some(var)) => format!(" -> {var}"),
@@ -186,7 +190,7 @@ fn show_use(spec: &FieldSpec) -> String {
             OutputBinding::Reply => " <- reply".into(),
             OutputBinding::State { value, .. } => format!(" <- {value}"),
             OutputBinding::Port { value, .. } => format!(" <- {} of the port", value.name()),
-            OutputBinding::Variable { .. } => String::new(),
+            OutputBinding::Variable { .. } | OutputBinding::Bit { .. } => String::new(),
         },
         _ => String::new(),
     }

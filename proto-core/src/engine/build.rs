@@ -5,6 +5,7 @@ use core::net::{IpAddr, Ipv4Addr, SocketAddr};
 
 use heapless::Vec;
 
+use super::bits::MAX_SHARES;
 use super::codecs::{can_codec, index_of, stream_codec, stream_layout};
 use super::command_link::CommandLink;
 use super::command_tables::{MAX_COMMAND_BYTES, MAX_COMMAND_FIELDS};
@@ -34,7 +35,7 @@ use crate::image::{GroupId, InputSet, MAX_GROUPS};
 use crate::link::LinkTimings;
 use crate::recipe::PartError;
 use crate::recipe::model::Framing;
-use crate::sysvar::{Direction, SysVar};
+use crate::sysvar::{Direction, SysVar, VarBit};
 use crate::time::{Duration, Instant};
 use crate::wire::dialect::Dialect;
 use crate::wire::scalar::ScalarType;
@@ -249,7 +250,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
         if plan.needs_state() {
             let group = groups.next().ok_or(one_too_many(Counted::Groups, MAX_GROUPS))?;
-            let link = StateLink::new(config.controller.state_port, dialect, group, plan.read_back());
+            let mut link = StateLink::new(config.controller.state_port, dialect, group, plan.read_back());
+            link.share(&self.store.bits.bytes);
             let _ = self.links.state.push(link);
         }
         if plan.needs_modbus() {
@@ -338,7 +340,13 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         let mut next_binding = self.bindings.inputs.len() as u16;
         for (_, fields) in config.frames_of(recipe, Direction::Input) {
             let fields = fields.of(config.fields);
-            let set = fields.iter().flat_map(FieldSpec::variables).collect();
+            let whole: InputSet = fields.iter().flat_map(FieldSpec::variables).collect();
+            let mut set = whole;
+            for bit in fields.iter().filter_map(FieldSpec::bit) {
+                set.insert(bit.var);
+                let (frame, port) = (self.store.frames.len() as u8, self.ports.len() as u8);
+                self.store.bits.add(bit, frame, port).ok_or(one_too_many(Counted::BitShares, MAX_SHARES))?;
+            }
             let is_bound = |field: &&FieldSpec| field.element().is_some();
             let bound = fields.iter().filter(is_bound).count() as u16;
             let bindings = Span { start: next_binding, len: bound };
@@ -355,7 +363,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 .frames
                 .push(frame)
                 .map_err(|_| one_too_many(Counted::InputFrames, MAX_INPUT_FRAMES))?;
-            frame.set.iter().for_each(|var| self.store.image.assign(var, group));
+            whole.iter().for_each(|var| self.store.image.assign(var, group));
         }
         let full = || one_too_many(Counted::UserFields, FIELDS);
         let mut inputs = Span { start: self.bindings.inputs.len() as u16, len: 0 };
@@ -374,6 +382,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                     let Some(link) = self.links.command.first_mut() else { continue };
                     let field = link.add_field(table, when, (frame, nth));
                     InputTo::Command(field.ok_or(one_too_many(Counted::CommandFields, MAX_COMMAND_FIELDS))?)
+                }
+                InputBinding::Bit { var, bit } => {
+                    InputTo::Bits { var, mask: VarBit { var, bit }.mask().unwrap_or(0) }
                 }
                 InputBinding::Unused => InputTo::Unused,
             };
@@ -502,7 +513,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         let writes: InputSet =
             set.iter().filter(|&var| plan.way_up(var) == Some(WayUp::Recipe(id))).collect();
         self.store.unanswered = self.store.unanswered.or(&writes);
-        let owners = writes.iter().filter_map(|var| plan.owner(var));
+        let owners = writes.iter().flat_map(|var| plan.owners(var));
         let timeouts =
             owners.filter_map(|port| config.ports.get(usize::from(port.0))).map(|port| port.timeout);
         let patience = timeouts.min().unwrap_or(PATIENCE).max(PATIENCE);

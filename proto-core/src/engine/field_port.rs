@@ -558,6 +558,10 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
                     let _ = self.store.image.set(var, value);
                 }
             }
+            InputTo::Bits { var, mask } => {
+                let on = if value.as_f64() == 0.0 { 0 } else { mask };
+                self.store.image.set_bits(var, mask, on);
+            }
             InputTo::Command(field) => {
                 if let Some(link) = &mut self.commands {
                     let nth = self.counters.commands.wrapping_add(1);

@@ -12,6 +12,7 @@
 //! Errors of a device or of the controller are counted and skipped. They are never an error of the
 //! run loop, and nothing is applied in part.
 
+mod bits;
 mod build;
 mod clock;
 mod codecs;

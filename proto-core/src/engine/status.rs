@@ -5,6 +5,9 @@
 //! It is a view: making it costs a few pointers, and each part is computed on request. Unknown
 //! values are absent, never 0.
 
+use core::fmt;
+
+use super::bits::Bits;
 use super::counters::PortCounters;
 use super::field_port::{Codec, FieldPort};
 use super::io::{BusState, PortId, PortState, ReplyCode};
@@ -19,7 +22,7 @@ use crate::config::CommandText;
 use crate::image::{GroupId, Image};
 use crate::link::LinkState;
 use crate::schedule::Presence;
-use crate::sysvar::{Direction, SysVar};
+use crate::sysvar::{Direction, SysVar, VarBit};
 use crate::time::{Duration, Instant};
 use crate::wire::scalar::Scalar;
 use crate::wire::state::States;
@@ -32,6 +35,7 @@ pub struct Status<'a> {
     pub(super) frames: &'a [InputFrame],
     pub(super) health: &'a PortsHealth,
     pub(super) image: &'a Image,
+    pub(super) bits: &'a Bits,
     pub(super) links: LinksView<'a>,
     pub(super) latency: &'a Latency,
     pub(super) sleeps: u32,
@@ -137,6 +141,30 @@ pub struct VariableStatus<'a> {
     pub age: Duration,
     /// The field port that owns an input variable; `None` for a value from the controller.
     pub owner: Option<&'a str>,
+    /// The bit that the value and the owner are of, in a byte of whose bits each has its owner.
+    pub bit: Option<u8>,
+}
+
+impl VariableStatus<'_> {
+    /// The name of the variable or bit.
+    pub fn name(&self) -> impl fmt::Display + use<> {
+        let &Self { var, bit, .. } = self;
+        Name { var, bit }
+    }
+}
+
+struct Name {
+    var: SysVar,
+    bit: Option<u8>,
+}
+
+impl fmt::Display for Name {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.bit {
+            Some(bit) => VarBit { var: self.var, bit }.fmt(f),
+            None => self.var.fmt(f),
+        }
+    }
 }
 
 /// The controller's states in the newest state packet.
@@ -165,8 +193,30 @@ impl<'a> Status<'a> {
         self.links.infos()
     }
 
-    /// The known variables, in the order of the table.
+    /// The known variables, in the order of the table; then bits with owners of their own.
     pub fn variables(self) -> impl Iterator<Item = VariableStatus<'a>> {
+        self.whole_variables().chain(self.bits())
+    }
+
+    fn bits(self) -> impl Iterator<Item = VariableStatus<'a>> {
+        self.bits.shares().iter().flat_map(move |share| {
+            let at = self.image.stamp_of(GroupId(share.frame));
+            let owner = self.ports.get(usize::from(share.port)).map(|port| port.name.as_str());
+            let value = self.image.byte(share.var);
+            (0..8).filter_map(move |bit| {
+                let mask = 1_u8.checked_shl(bit.into()).filter(|mask| share.mask & mask != 0)?;
+                Some(VariableStatus {
+                    var: share.var,
+                    value: Scalar::Byte(u8::from(value & mask != 0)),
+                    age: self.at.saturating_since(at?),
+                    owner,
+                    bit: Some(bit),
+                })
+            })
+        })
+    }
+
+    fn whole_variables(self) -> impl Iterator<Item = VariableStatus<'a>> {
         SysVar::all().filter_map(move |var| {
             let age = self.image.age(var, self.at)?;
             self.image.is_readable(var).then(|| VariableStatus {
@@ -174,6 +224,7 @@ impl<'a> Status<'a> {
                 value: self.image.value(var),
                 age,
                 owner: self.owner(var),
+                bit: None,
             })
         })
     }
@@ -213,7 +264,7 @@ impl<'a> Status<'a> {
 
     /// The field port that owns an input variable.
     fn owner(&self, var: SysVar) -> Option<&'a str> {
-        if var.direction() != Direction::Input {
+        if var.direction() != Direction::Input || self.bits.bytes.contains(var) {
             return None;
         }
         let frame = self.frames.iter().find(|frame| frame.set.contains(var));

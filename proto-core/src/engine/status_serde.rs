@@ -89,7 +89,7 @@ impl Serialize for Status<'_> {
         if let Some(controller) = self.controller() {
             map.serialize_entry("controller", &controller)?;
         }
-        map.serialize_entry("values", &Map(|| self.variables().map(|known| (Text(known.var), known))))?;
+        map.serialize_entry("values", &Map(|| self.variables().map(|known| (Text(known.name()), known))))?;
         map.serialize_entry("latency", self.latency())?;
         map.end()
     }

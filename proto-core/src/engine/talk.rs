@@ -558,7 +558,7 @@ impl Maker<'_> {
 /// Whether a field's value is known, and fresh unless the recipe holds.
 pub(super) fn may_send(sender: &Sender, image: &Image, field: &OutputBind, now: Instant) -> bool {
     match field.from {
-        OutputBinding::Variable { var, .. } => {
+        OutputBinding::Variable { var, .. } | OutputBinding::Bit { var, .. } => {
             image.known_since(var).is_some_and(|at| sender.is_fresh(at, now))
         }
         OutputBinding::State { .. } => sender.may_show(image, now),
