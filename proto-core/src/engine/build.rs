@@ -338,7 +338,13 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             self.store.is_overdue_from_start();
         }
         let mut next_binding = self.bindings.inputs.len() as u16;
-        for (_, fields) in config.frames_of(recipe, Direction::Input) {
+        let parts = recipe.part_frames(Direction::Input).map(|_| true);
+        let replies = config.exchanges_of(recipe).iter().filter_map(|exchange| {
+            exchange.fields(config, Direction::Input)?;
+            Some(exchange.when.every.is_some() || exchange.when.is_never())
+        });
+        let frames = config.frames_of(recipe, Direction::Input).zip(parts.chain(replies));
+        for ((_, fields), is_expected) in frames {
             let fields = fields.of(config.fields);
             let whole: InputSet = fields.iter().flat_map(FieldSpec::variables).collect();
             let mut set = whole;
@@ -357,6 +363,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 bindings,
                 overdue_at: if port.safe_at_start { Instant::ZERO } else { Instant::NEVER },
                 timeout: port.timeout,
+                is_expected,
             };
             let group = GroupId(self.store.frames.len() as u8);
             self.store

@@ -29,12 +29,14 @@ pub(super) struct InputFrame {
     pub overdue_at: Instant,
     /// Its timeout.
     pub timeout: Duration,
+    /// Whether it is missed if it does not come; not a reply that is asked for only now and then.
+    pub is_expected: bool,
 }
 
 impl InputFrame {
     /// Whether it is overdue or has never come.
     pub(super) fn is_overdue(&self) -> bool {
-        self.overdue_at == Instant::NEVER
+        self.is_expected && self.overdue_at == Instant::NEVER
     }
 }
 

@@ -151,6 +151,7 @@ fn what_is_asked_at_the_start_is_asked_again_when_the_slave_or_the_port_is_back(
     line.rig.input(Input::PortDown { port });
     line.rig.input(Input::PortUp { port });
     assert_eq!(count(&line.run(MS(500), done)), 1);
+    assert_eq!(line.rig.engine.port_state(port), Some(PortState::Working));
     line.run(MS(1_000), |_| None);
     assert_eq!(count(&line.run(MS(8_000), done)), 1, "the slave is back");
     line.rig.input(Input::PortDown { port });
@@ -248,4 +249,21 @@ fn a_late_reply_is_not_taken_for_another_exchange() {
             }
         }
     }
+}
+
+#[test]
+fn a_value_that_is_asked_once_is_not_missed_later() {
+    let mut cell = Cell::new();
+    let start = AskWhen { start: true, ..AskWhen::NEVER };
+    let version = reads(&mut cell, 4, &["WordInputReg[1]"], start);
+    let port = talking(&mut cell, &[version]);
+    let mut line = Line::new(&cell, port);
+    assert_eq!(line.run(MS(1_000), |_| Some((MS(2), registers(4, &[3])))).len(), 1);
+    assert_eq!(line.rig.map.registers[8], 3);
+    assert_eq!(line.rig.engine.port_state(port), Some(PortState::Working));
+    // If the slave is not there, the port says so.
+    line.rig.input(Input::PortDown { port });
+    line.rig.input(Input::PortUp { port });
+    line.run(MS(1_000), |_| None);
+    assert_eq!(line.rig.engine.port_state(port), Some(PortState::Silent));
 }
