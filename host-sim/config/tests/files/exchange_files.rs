@@ -282,7 +282,7 @@ fn a_program_writes_what_a_file_says() {
                     OutputField::constant(coil, 1.0),
                 ],
             ),
-            Ask::served(5, Table::Coils, 7, &[InputField::commands(coil, &[(1, "stop")])]).retries(0),
+            Ask::served(5, Table::Coils, 7, &[InputField::commands(coil, &[(1, "stop")])]),
         ]))
         .recipe(
             Recipe::user("talk").exchanges(&[Ask::request(AskFrame::stream(
