@@ -183,8 +183,8 @@ fn serialized_types_are_those_of_the_version() {
         Escape,
         Counts,
         TextWidth,
-        Talk,
         Operation,
+        Talk,
         GatewayConfig,
     );
     let mut said = String::new();

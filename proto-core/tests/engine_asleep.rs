@@ -22,17 +22,6 @@ fn tick(rig: &mut Rig) {
     rig.input(Input::Tick);
 }
 
-/// DigitalOutputCommand[1] with a safe value; its owner may be silent for 100 ms.
-fn guarded() -> (Rig, PortId) {
-    let mut cell = Cell::new();
-    let recipe = cell.stream(&["DigitalOutputCommand[1]"], &[]);
-    let port = cell.rs485(recipe);
-    cell.safe("DigitalOutputCommand[1]", 4.0);
-    let mut rig = cell.rig();
-    rig.run(MS(10));
-    (rig, port)
-}
-
 /// Everything at once: a PLC by Modbus both ways, a sensor by UDP, a panel, a CAN bus.
 struct Full {
     rig: Rig,
@@ -305,11 +294,8 @@ fn overdue_safe_values_go_first() {
 
 #[test]
 fn who_may_be_silent_for_longer_is_not_overdue() {
-    let mut cell = Cell::new();
-    let recipe = cell.stream(&["DigitalOutputCommand[1]"], &[]);
-    let port = cell.rs485(recipe);
+    let (mut cell, port) = Cell::guarded();
     cell.last_port().timeout = MS(3_000);
-    cell.safe("DigitalOutputCommand[1]", 4.0);
     let mut rig = cell.rig();
     rig.run(MS(10));
     rig.bytes(port, ON);

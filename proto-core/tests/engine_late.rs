@@ -31,17 +31,6 @@ fn tick(rig: &mut Rig) {
 
 // The driver was busy.
 
-/// DigitalOutputCommand[1] with a safe value; its owner may be silent for 100 ms.
-fn guarded() -> (Rig, PortId) {
-    let mut cell = Cell::new();
-    let recipe = cell.stream(&["DigitalOutputCommand[1]"], &[]);
-    let port = cell.rs485(recipe);
-    cell.safe("DigitalOutputCommand[1]", 4.0);
-    let mut rig = cell.rig();
-    rig.run(MS(10));
-    (rig, port)
-}
-
 #[test]
 fn a_frame_that_waited_while_the_driver_was_busy_was_not_late() {
     for busy in [60, 100, 101, 200, 450, 499] {

@@ -558,12 +558,7 @@ fn a_ports_state_tells_silence_from_bus_off_and_from_a_device_that_is_gone() {
 
 #[test]
 fn a_safe_value_that_its_owner_overtakes_grows_old_as_any_other() {
-    let mut cell = Cell::new();
-    let recipe = cell.stream(&["DigitalOutputCommand[1]"], &[]);
-    let port = cell.rs485(recipe);
-    cell.safe("DigitalOutputCommand[1]", 4.0);
-    let mut rig = cell.rig();
-    rig.run(MS(10));
+    let (mut rig, port) = guarded();
     rig.modbus_answers = false;
     rig.bytes(port, ON);
     assert_eq!(rig.sent_on(LinkId::MODBUS).len(), 1, "and no answer for 500 ms");

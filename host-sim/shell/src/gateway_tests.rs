@@ -11,7 +11,7 @@ use rustix::fs::OFlags;
 use tokio::task::{LocalSet, spawn_local, yield_now};
 
 use super::*;
-use recipe_config::file::{Text, parse_gateway};
+use recipe_test_kit::toml;
 
 /// A serial line and a CAN bus.
 const CELL: &str = r#"
@@ -62,7 +62,7 @@ impl Cell {
     fn run<T>(line: &str, test: impl AsyncFnOnce(Self) -> T) -> T {
         let folder = tempfile::tempdir().unwrap();
         let line = line.replace("FOLDER", folder.path().to_str().unwrap());
-        let config = parse_gateway(Text { name: "cell", toml: CELL }, &[]).unwrap();
+        let config = toml::gateway(CELL);
         let binds = [format!("line={line}"), "can=slcan-tcp:127.0.0.1:0".to_owned()];
         let binds = binds.map(|bind| bind.parse().unwrap());
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
@@ -298,7 +298,7 @@ fn nor_what_waited_to_go_on_a_bus() {
 /// The line's counters after these pieces, each reported later than the idle gap by a driver whose timer
 /// does not get to run.
 fn reported_late(pieces: &[&[u8]]) -> PortCounters {
-    let config = parse_gateway(Text { name: "cell", toml: CELL }, &[]).unwrap();
+    let config = toml::gateway(CELL);
     let binds =
         ["line=tcp-listen:127.0.0.1:0", "can=slcan-tcp:127.0.0.1:0"].map(|bind| bind.parse().unwrap());
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();

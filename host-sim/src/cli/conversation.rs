@@ -1,6 +1,7 @@
 //! The exchanges of a recipe as `check` draws them: what is asked when, its bytes, and its time.
 
 use proto_core::config::{AskWhen, Bus, Exchange, GatewayConfig, Port};
+use proto_core::device::Carrier;
 use proto_core::modbus::rtu::{BROADCAST, Operation, Table};
 use proto_core::sysvar::Direction;
 use recipe_config::{DeviceRecipe, ExchangeKind, NamedExchange, NamedFrame, function_name};
@@ -74,13 +75,14 @@ fn show_frame(
     is_remote: bool,
 ) -> String {
     let id = frame.id.map_or(String::new(), |id| format!(", id {}", text::show_id(id)));
+    let carrier = if frame.id.is_some() { Carrier::Can } else { Carrier::Stream };
     let size = match len {
         _ if is_remote => ", remote".to_owned(),
         Some(1) => ", 1 byte".to_owned(),
         Some(len) => format!(", {len} bytes"),
         None => String::new(),
     };
-    format!("   {name}{id}{size}\n{}", frame::show_bytes(frame, part))
+    format!("   {name}{id}{size}\n{}", frame::show_bytes(frame, carrier, part))
 }
 
 /// Who is asked, and for what.

@@ -1,7 +1,9 @@
 //! The frames of a device as `check` draws them: which bytes are what.
 
-use proto_core::config::{FieldSpec, OutputBinding};
-use proto_core::device::{Algorithm, Bits, ByteOrder, Checksum, Digits, Encoding, Kind, TextWidth, Width};
+use proto_core::config::{DeviceFrame, FieldSpec, OutputBinding, Words};
+use proto_core::device::{
+    Algorithm, Bits, ByteOrder, Carrier, Checksum, Digits, Encoding, Kind, Place, Text, TextWidth, Width,
+};
 use proto_core::sysvar::Direction;
 use proto_core::wire::scalar::ScalarType;
 use recipe_config::{DeviceField, DeviceRecipe, NamedFrame};
@@ -22,14 +24,16 @@ pub(super) fn show(recipe: &DeviceRecipe, part: Direction) -> String {
         if let Some(id) = frame.id {
             report += &format!("    id {}\n", text::show_id(id));
         }
-        report += &show_bytes(frame, part);
+        report += &show_bytes(frame, recipe.carrier, part);
     }
     report
 }
 
 /// One frame, a line for each run of bytes.
-pub(super) fn show_bytes(frame: &NamedFrame, part: Direction) -> String {
-    let rows = rows(frame, part);
+pub(super) fn show_bytes(frame: &NamedFrame, carrier: Carrier, part: Direction) -> String {
+    // Cannot fail: reading the file laid out the same frames.
+    let Ok(laid_out) = frame.lay_out(carrier, part) else { return String::new() };
+    let rows = rows(frame, &laid_out, part);
     let width =
         |column: fn(&Row) -> &String| rows.iter().map(|row| column(row).chars().count()).max().unwrap_or(0);
     let (places, names) = (width(|row| &row.place), width(|row| &row.name));
@@ -37,81 +41,70 @@ pub(super) fn show_bytes(frame: &NamedFrame, part: Direction) -> String {
     rows.iter().map(show).collect()
 }
 
-fn rows(frame: &NamedFrame, part: Direction) -> Vec<Row> {
+fn rows(frame: &NamedFrame, laid_out: &DeviceFrame, part: Direction) -> Vec<Row> {
+    let mut places = Vec::new();
+    laid_out.layout.parts(&laid_out.elements, |_, place| places.push(place));
+    // Head, fields with the checksum among them, tail: as below.
+    let mut places = places.into_iter();
     let mut rows = Vec::new();
-    let mut cursor = Cursor { at: Some(0), before: String::new() };
-    let mut add =
-        |place: String, name: &str, what: String| rows.push(Row { place, name: name.to_owned(), what });
+    let mut add = |place: Option<Place>, name: &str, what: String| {
+        let place = place.map(show_place).unwrap_or_default();
+        rows.push(Row { place, name: name.to_owned(), what });
+    };
     if !frame.head.is_empty() {
-        add(cursor.step(Some(frame.head.len())), "head", text::hex(&frame.head));
+        add(places.next(), "head", text::hex(&frame.head));
     }
     let mut fields = &frame.fields[..];
     while let Some((field, rest)) = fields.split_first() {
         fields = rest;
+        let place = places.next();
         let text = text_of(std::iter::once(field).chain(rest));
         if text.len() > 1 {
-            add(cursor.step(Some(text.len())), "text", format!("{text:?}"));
+            let place = place.map(|place| Place { len: Some(text.len()), ..place });
+            add(place, "text", format!("{text:?}"));
             fields = &rest[text.len() - 1..];
+            places.nth(text.len() - 2);
             continue;
         }
         match field.spec {
-            FieldSpec::Checksum(sum) => {
-                let place = cursor.step(Some(sum.len()));
-                add(place, "checksum", show_checksum(&sum));
-            }
-            FieldSpec::Padding { len, fill } => {
+            FieldSpec::Checksum(sum) => add(place, "checksum", show_checksum(&sum)),
+            FieldSpec::Padding { fill, .. } => {
                 let what = match part {
                     Direction::Input => "any bytes".to_owned(),
                     Direction::Output => format!("{fill:02X}"),
                 };
-                add(cursor.step(Some(usize::from(len))), "padding", what);
+                add(place, "padding", what);
             }
-            FieldSpec::TextInput { text, .. } | FieldSpec::TextOutput { text, .. } => {
-                let len = match text.width {
-                    TextWidth::Fixed(width) => Some(usize::from(width)),
-                    TextWidth::Until(_) | TextWidth::Rest => None,
-                };
-                add(cursor.step(len), &field.name, show_text(text.width) + show_words(&field.spec).as_str());
+            FieldSpec::TextInput { text, to, .. } => {
+                let to = to.map(|words| format!(" -> {}", show_words(words)));
+                add(place, &field.name, show_text(&text) + to.as_deref().unwrap_or(""));
+            }
+            FieldSpec::TextOutput { text, from, .. } => {
+                add(place, &field.name, format!("{} <- {}", show_text(&text), show_words(from)));
             }
             FieldSpec::UserOutput { .. } | FieldSpec::DeviceOutput { .. } if field.is_coil => {
-                add(
-                    cursor.step(Some(1)),
-                    &field.name,
-                    format!("FF for 1, 00 for 0{}", show_use(&field.spec)),
-                );
+                add(place, &field.name, format!("FF for 1, 00 for 0{}", show_use(&field.spec)));
             }
             spec => {
                 let Some(encoding) = spec.element().and_then(|element| element.encoding()) else { continue };
-                let place =
-                    if encoding.shared { cursor.before.clone() } else { cursor.step(encoding.size()) };
                 let uses = if field.picks_commands { " -> commands".to_owned() } else { show_use(&spec) };
                 add(place, &field.name, show_encoding(&encoding) + uses.as_str());
             }
         }
     }
     if !frame.tail.is_empty() {
-        add(cursor.step(Some(frame.tail.len())), "tail", text::hex(&frame.tail));
+        add(places.next(), "tail", text::hex(&frame.tail));
     }
     rows
 }
 
-/// Where the next bytes are, while that is known.
-struct Cursor {
-    at: Option<usize>,
-    before: String,
-}
-
-impl Cursor {
-    /// The place of the next field; `None` is a length that varies.
-    fn step(&mut self, len: Option<usize>) -> String {
-        self.before = match (self.at, len) {
-            (Some(at), Some(1)) => at.to_string(),
-            (Some(at), Some(len)) => format!("{at}..{}", at + len - 1),
-            (Some(at), None) => format!("{at}.."),
-            (None, _) => "then".into(),
-        };
-        self.at = self.at.zip(len).map(|(at, len)| at + len);
-        self.before.clone()
+/// `0`, `0..1`, `2..` for a length that varies, or `then` behind that.
+fn show_place(place: Place) -> String {
+    match (place.at, place.len) {
+        (Some(at), Some(1)) => at.to_string(),
+        (Some(at), Some(len)) => format!("{at}..{}", at + len - 1),
+        (Some(at), None) => format!("{at}.."),
+        (None, _) => "then".into(),
     }
 }
 
@@ -125,6 +118,23 @@ fn text_of<'f>(fields: impl Iterator<Item = &'f DeviceField>) -> String {
         _ => None,
     };
     fields.map_while(byte).collect()
+}
+
+fn show_text(text: &Text) -> String {
+    match text.width {
+        TextWidth::Fixed(1) => "text, 1 character".to_owned(),
+        TextWidth::Fixed(count) => format!("text, {count} characters"),
+        TextWidth::Until(end) => format!("text, characters up to {:?}", char::from(end)),
+        TextWidth::Rest => "text, all that is left".to_owned(),
+    }
+}
+
+/// The registers of a text.
+fn show_words(words: Words) -> String {
+    match words.iter().last().filter(|_| words.count > 1) {
+        Some(last) => format!("{} to {last}", words.first),
+        None => words.first.to_string(),
+    }
 }
 
 fn show_encoding(encoding: &Encoding) -> String {
@@ -164,30 +174,12 @@ fn show_encoding(encoding: &Encoding) -> String {
     kind + order
 }
 
-fn show_text(width: TextWidth) -> String {
-    match width {
-        TextWidth::Fixed(1) => "text, 1 character".to_owned(),
-        TextWidth::Fixed(width) => format!("text, {width} characters"),
-        TextWidth::Until(end) => format!("text up to {:?}", char::from(end)),
-        TextWidth::Rest => "text up to the end".to_owned(),
-    }
-}
-
-/// The registers of a text.
-fn show_words(spec: &FieldSpec) -> String {
-    let (arrow, words) = match *spec {
-        FieldSpec::TextInput { to: Some(to), .. } => ("->", to),
-        FieldSpec::TextOutput { from, .. } => ("<-", from),
-        _ => return String::new(),
-    };
-    match (words.count, words.first.index()) {
-        (1, _) => format!(" {arrow} {}", words.first),
-        (count, first) => format!(" {arrow} {}[{first}..{}]", words.first.group(), first + count - 1),
-    }
-}
-
-/// The constant, or the variable, behind how the field is written.
+/// The constant, the variable or the bit behind how the field is written.
 fn show_use(spec: &FieldSpec) -> String {
+    if let Some(bit) = spec.bit() {
+        let is_input = matches!(spec, FieldSpec::UserInput { .. } | FieldSpec::DeviceInput { .. });
+        return format!(" {} {bit}", if is_input { "->" } else { "<-" });
+    }
     match (*spec, spec.variable()) {
         (FieldSpec::Fixed { value, .. }, _) => format!(" = {value}"),
         (FieldSpec::UserInput { .. } | FieldSpec::DeviceInput { .. }, Some(var)) => format!(" -> {var}"),
@@ -198,7 +190,7 @@ fn show_use(spec: &FieldSpec) -> String {
             OutputBinding::Reply => " <- reply".into(),
             OutputBinding::State { value, .. } => format!(" <- {value}"),
             OutputBinding::Port { value, .. } => format!(" <- {} of the port", value.name()),
-            OutputBinding::Variable { .. } => String::new(),
+            OutputBinding::Variable { .. } | OutputBinding::Bit { .. } => String::new(),
         },
         _ => String::new(),
     }
@@ -223,4 +215,59 @@ fn show_checksum(sum: &Checksum) -> String {
         (first, Some(last)) => format!("bytes {first}..{last}"),
     };
     format!("{algorithm}{order}{digits}, over {covered}")
+}
+
+#[cfg(test)]
+mod tests {
+    use recipe_config::AnyRecipe;
+    use recipe_config::file::{Text, parse_recipes};
+
+    use super::*;
+
+    const READER: &str = r#"
+[controller]
+address = "127.0.0.1"
+
+[[recipe]]
+name = "reader"
+kind = "stream"
+mode = "user"
+[recipe.input]
+head = [2]
+tail = [13, 10]
+checksum = { kind = "crc16-modbus" }
+fields = [
+    { name = "station", type = "byte" },
+    { name = "code", type = "text", width = 8, to = "WordInputReg[1..4]" },
+    { text = "OK" },
+    { name = "name", type = "text", until = ",", to = "WordInputReg[5]" },
+    { name = "count", type = "word", to = "WordInputReg[6]" },
+]
+
+[[port]]
+name = "reader"
+bus = "rs485"
+recipe = "reader"
+"#;
+
+    #[test]
+    fn texts_have_their_bytes() {
+        let recipes = parse_recipes(Text { name: "reader.toml", toml: READER }, &[]).unwrap();
+        let [AnyRecipe::Device(recipe)] = &recipes[..] else { panic!("{recipes:?}") };
+        let shown = show(recipe, Direction::Input);
+        let shown: Vec<_> = shown.lines().map(str::trim).collect();
+        assert_eq!(
+            shown,
+            [
+                "0       head      02",
+                "1       station   byte",
+                "2..9    code      text, 8 characters -> WordInputReg[1] to WordInputReg[4]",
+                "10..11  text      \"OK\"",
+                "12..    name      text, characters up to ',' -> WordInputReg[5]",
+                "then    count     word, little-endian -> WordInputReg[6]",
+                "then    checksum  crc16-modbus, low byte first, over all bytes before it",
+                "then    tail      0D 0A",
+            ]
+        );
+    }
 }

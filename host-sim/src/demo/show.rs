@@ -93,6 +93,9 @@ impl Show {
         self.print(format_args!(
             "\n{style}{word}{style:#}  {passed} passed, {failed} failed, in {seconds:.1} s"
         ));
+        if failed == 0 {
+            self.print(format_args!("\n{HINTS}"));
+        }
         let code = if failed == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE };
         self.out.into_inner().finish(|_| code)
     }
@@ -116,6 +119,13 @@ impl Show {
         }
     }
 }
+
+/// What to try next: command lines for the repository's root.
+const HINTS: &str = "\
+Next:
+  cargo run -- check host-sim/configs/rs485-system.toml   what a file does, what to set on the pendant
+  cargo run -- soak --hours 0.1                           cells under faults, in virtual time
+  cargo run -- help                                       all commands; README.md has a first file";
 
 /// How often one half of an example is run on a machine that is too busy.
 const ATTEMPTS: usize = 3;

@@ -1,7 +1,7 @@
-//! Helpers that the tests of host-sim's crates share: processes, waiting, files.
+//! Helpers that the tests of host-sim's crates share: processes, waiting, files, configurations.
 //!
-//! A helper panics if what the test needs does not happen. None of them depends on recipes, the controller
-//! or the engine, so that every crate can use them.
+//! A helper panics if what the test needs does not happen. None of them depends on the simulated controller,
+//! on cells or on the shell, so that every crate can use them.
 
 pub mod can;
 mod host_sim;

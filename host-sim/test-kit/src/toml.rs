@@ -1,4 +1,31 @@
-//! Configuration files that several tests use.
+//! Configurations that several tests use, and how they are read.
+
+use proto_core::config::GatewayConfig;
+use recipe_config::SimConfig;
+use recipe_config::file::{FileError, Text, parse_controller, parse_gateway};
+
+/// The gateway of this text.
+///
+/// # Panics
+/// With the first mistake in it.
+#[track_caller]
+pub fn gateway(toml: &str) -> Box<GatewayConfig> {
+    right(parse_gateway(Text { name: "gateway.toml", toml }, &[]))
+}
+
+/// The controller of this text.
+///
+/// # Panics
+/// With the first mistake in it.
+#[track_caller]
+pub fn controller(toml: &str) -> SimConfig {
+    right(parse_controller(Text { name: "controller.toml", toml }, &[]))
+}
+
+#[track_caller]
+fn right<T>(read: Result<T, FileError>) -> T {
+    read.unwrap_or_else(|error| panic!("{error}"))
+}
 
 /// A gateway with one field port, `device`, for a panel that sends `FF FF order outputs EE EE`. A changed
 /// order sends one of `commands`, such as `1 = "stop"`. The outputs are DO1 to DO8; if the panel is silent

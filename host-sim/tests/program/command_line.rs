@@ -59,6 +59,7 @@ fn check_draws_the_frames_of_a_device() {
     insta::assert_snapshot!("check_force_sensor_crc", checked("force-sensor-crc.toml", &[]));
     insta::assert_snapshot!("check_scale", checked("scale.toml", &[]));
     insta::assert_snapshot!("check_can_panel", checked("can-panel.toml", &[]));
+    insta::assert_snapshot!("check_two_panels", checked("two-panels.toml", &[]));
 }
 
 #[test]

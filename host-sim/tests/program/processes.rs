@@ -7,7 +7,7 @@ use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
-use recipe_test_kit::{HostSim, PATIENCE, SERVERS, ended, example, free_servers, names, until};
+use recipe_test_kit::{HostSim, PATIENCE, SERVERS, ended, example, free_servers, names, repository, until};
 use rustix::process::{Pid, Signal};
 use rustix::pty::OpenptFlags;
 use serde_json::Value;
@@ -47,6 +47,20 @@ fn shows_all_examples(output: &Output) {
         assert!(out.matches(bytes).count() >= 2, "{bytes}:\n{out}");
     }
     assert!(!out.contains('\u{1b}'), "no colours off a terminal");
+}
+
+#[test]
+fn what_the_demo_suggests_works() {
+    let (out, _) = text(&BINARY.command().output().unwrap());
+    // Two blanks separate the command line from what it is for.
+    let hints =
+        out.lines().filter_map(|line| line.trim_start().strip_prefix("cargo run -- ")?.split("  ").next());
+    let hints: Vec<&str> = hints.collect();
+    assert_eq!(hints.len(), 3, "{out}");
+    for hint in hints {
+        let output = BINARY.command().args(hint.split(' ')).current_dir(repository()).output().unwrap();
+        assert!(output.status.success(), "{hint}: {:?}", text(&output));
+    }
 }
 
 #[test]

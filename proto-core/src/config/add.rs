@@ -11,7 +11,7 @@ use super::ask::Ask;
 use super::draft::{ControllerBuilder, Counts, PartFields, PortBuilder, PortBus, RecipeBuilder, Trigger};
 use super::error::{ConfigError, ConfigErrorKind as Kind, ControllerKey, Counted, Place, PortKey, RecipeKey};
 use super::fields::{CanFields, Does, Entries, Fields, InputField, OutputField, Sends, plain};
-use super::rules::{check_name, check_room, text};
+use super::rules::{check_bit, check_name, check_room, text};
 use super::view::ConfigMut;
 use super::{
     CanFramePart, CommandEntry, ControllerLink, Delimiter, FieldSpec, GatewayConfig, InputBinding, Name,
@@ -19,7 +19,7 @@ use super::{
 };
 use crate::command::ParseError;
 use crate::recipe::model::{MAX_CAN_IDS, MAX_DELIMITER};
-use crate::sysvar::{Direction, SysVar, VarRange};
+use crate::sysvar::{Direction, ParseError as VarError, SysVar, VarBit, VarRange};
 use crate::wire::dialect::Dialect;
 use crate::wire::scalar::Scalar;
 
@@ -255,6 +255,10 @@ impl ConfigMut<'_> {
                 Does::Writes { var, scale, offset } => {
                     InputBinding::Variable { var: var.read().map_err(Kind::Variable)?, scale, offset }
                 }
+                Does::WritesBit { name } => {
+                    let VarBit { var, bit } = read_bit(name)?;
+                    InputBinding::Bit { var, bit }
+                }
                 Does::Commands { entries, when, idle } => {
                     InputBinding::Commands { table: self.add_commands(entries, idle)?, when }
                 }
@@ -314,9 +318,14 @@ impl ConfigMut<'_> {
             check_room(Place::Port { port: index, key }, what, needed, room)?;
         }
         let added = match *safe {
-            SafeValues::Names(named) => self.add_safe_values(named.iter().map(|&(name, value)| {
-                SysVar::parse(name).map_err(Kind::Variable).and_then(|var| safe_value(var, value))
-            })),
+            SafeValues::Names(named) => {
+                self.add_safe_values(named.iter().map(|&(name, value)| match VarBit::parse(name) {
+                    Some(bit) => bit.map_err(Kind::Variable).and_then(|bit| safe_bit(bit, value)),
+                    None => {
+                        SysVar::parse(name).map_err(Kind::Variable).and_then(|var| safe_value(var, value))
+                    }
+                }))
+            }
             SafeValues::Vars(vars) => {
                 self.add_safe_values(vars.iter().map(|&(var, value)| safe_value(var, value)))
             }
@@ -347,11 +356,19 @@ impl ConfigMut<'_> {
     }
 }
 
+fn read_bit(name: &str) -> Result<VarBit, Kind> {
+    VarBit::parse(name).unwrap_or(Err(VarError::Syntax)).map_err(Kind::Variable)
+}
+
 fn output_spec(field: &OutputField<'_>) -> Result<FieldSpec, Kind> {
     field.on_wire.spec(|encoding, overflow| {
         let from = match field.sends {
             Sends::Variable { var, scale, offset } => {
                 OutputBinding::Variable { var: var.read().map_err(Kind::Variable)?, scale, offset }
+            }
+            Sends::Bit { name } => {
+                let VarBit { var, bit } = read_bit(name)?;
+                OutputBinding::Bit { var, bit }
             }
             Sends::Constant(value) => OutputBinding::Constant(value),
             Sends::Counter => OutputBinding::Counter,
@@ -370,7 +387,16 @@ fn output_spec(field: &OutputField<'_>) -> Result<FieldSpec, Kind> {
 
 fn safe_value(var: SysVar, value: f64) -> Result<SafeValue, Kind> {
     let value = Scalar::from_f64(var.ty(), value).map_err(Kind::Constant)?;
-    Ok(SafeValue { var, value })
+    Ok(SafeValue::new(var, value))
+}
+
+/// 0 or 1: that of a bit.
+fn safe_bit(bit: VarBit, value: f64) -> Result<SafeValue, Kind> {
+    check_bit(bit)?;
+    if value != 0.0 && value != 1.0 {
+        return Err(Kind::NotInField { value, low: 0.0, high: 1.0 });
+    }
+    Ok(SafeValue::bit(bit, value != 0.0))
 }
 
 fn name(given: &str, place: Place) -> Result<Name, ConfigError> {

@@ -6,6 +6,7 @@
 use core::fmt;
 
 use super::{Bus, ConfigView, FieldSpec, Parity, Parts, Port, Recipe, Rs485, Span};
+use crate::modbus::rtu::{Echo, Slave, Timing};
 use crate::sysvar::{Direction, SysVar};
 use crate::time::Duration;
 use crate::wire::can::CanId;
@@ -20,6 +21,12 @@ impl Rs485 {
     /// The time that `len` bytes take on the line, rounded up to the microsecond.
     pub fn time_on_line(&self, len: usize) -> Duration {
         bits_time((len as u64).saturating_mul(self.bits_per_character()), self.baud)
+    }
+
+    /// A Modbus slave on this line; `None` if that is no address of one.
+    pub(crate) fn slave(&self, address: u8) -> Option<Slave> {
+        let timing = Timing::new(self.baud, self.bits_per_character() as u8).with_silence(self.idle_gap);
+        Slave::new(timing, if self.echo { Echo::Heard } else { Echo::Absent }, address)
     }
 
     /// The time that `n` and a half characters take on the line.

@@ -180,7 +180,7 @@ impl<'a> ExchangeCheck<'a> {
                 return fail(self.at(nth, Key::Pause), kind);
             }
             if let Some((var, bit)) = exchange.when.rising {
-                super::check_recipe::check_bit(self.at(nth, Key::Rising), var, bit)?;
+                super::check_recipe::check_trigger(self.at(nth, Key::Rising), var, bit)?;
             }
         }
         Ok(())

@@ -3,17 +3,18 @@
 
 use super::check_exchange::ExchangeCheck;
 use super::device::field_of;
-use super::error::{ConfigErrorKind as Kind, Place, RecipeKey};
-use super::rules::{Check, check_new_name, check_pool, fail, is_marked, mark};
+use super::error::{ConfigError, ConfigErrorKind as Kind, Place, RecipeKey};
+use super::rules::{Check, check_bit, check_new_name, check_pool, fail, is_marked, mark};
 use super::{
     CanFramePart, CommandEntry, ConfigView, DeviceFrame, FieldSpec, InputBinding, MAX_COMMAND_TEXT,
     OutputBinding, Parts, Recipe, SendOn, Span, Words, placeholders,
 };
 use crate::command::Request;
 use crate::device::{Boundary, Encoding, LayoutError, Overflow};
+use crate::image::BitSet;
 use crate::recipe::model::{Framing, MAX_STREAM_FRAME, Mode, Rules};
 use crate::recipe::{CanLayout, PartError, StreamLayout};
-use crate::sysvar::{COUNT, Direction, SysVar};
+use crate::sysvar::{COUNT, Direction, SysVar, VarBit};
 use crate::wire::dialect::Dialect;
 use crate::wire::scalar::{Scalar, ScalarType};
 
@@ -135,6 +136,17 @@ impl<'a> RecipeCheck<'a> {
                 }
                 check_scale(place, scale, offset)
             }
+            InputBinding::Bit { var, bit } => {
+                if var.direction() != Direction::Input {
+                    return fail(place, Kind::NotAnInput { var });
+                }
+                check_bit(VarBit { var, bit }).map_err(|kind| ConfigError { place, kind })?;
+                match numbers.ty {
+                    _ if numbers.integers => Ok(()),
+                    Some(ty) => fail(place, Kind::NeedsInteger { ty }),
+                    None => fail(place, Kind::NeedsIntegers),
+                }
+            }
             InputBinding::Commands { table, .. } => {
                 if !numbers.integers {
                     return fail(
@@ -168,6 +180,9 @@ impl<'a> RecipeCheck<'a> {
                     return fail(place, Kind::ScaledCount);
                 }
                 check_scale(place, scale, offset)
+            }
+            OutputBinding::Bit { var, bit } => {
+                check_bit(VarBit { var, bit }).map_err(|kind| ConfigError { place, kind }).map(|_| ())
             }
             _ => Ok(()),
         }
@@ -267,11 +282,27 @@ impl<'a> RecipeCheck<'a> {
     /// In a realtime recipe the layout checks this.
     fn check_written_once(&self) -> Check {
         let mut seen = [false; COUNT];
+        let mut bits = BitSet::EMPTY;
         for (frame, field, spec) in self.config.fields_of(self.recipe, Direction::Input) {
+            let place = Place::Field { recipe: self.index, part: Direction::Input, frame, field };
+            if let Some(bit) = spec.bit() {
+                let own = BitSet::of(bit.var, bit.mask().unwrap_or(0));
+                if is_marked(&seen, bit.var) {
+                    return fail(place, Kind::WholeAndBit { bit });
+                }
+                if !bits.and(own).is_empty() {
+                    return fail(place, Kind::BitWrittenTwice { bit });
+                }
+                bits = bits.or(own);
+            }
             for var in spec.variables() {
                 if is_marked(&seen, var) {
-                    let place = Place::Field { recipe: self.index, part: Direction::Input, frame, field };
                     return fail(place, Kind::WrittenTwice { var });
+                }
+                let before = bits.byte(var);
+                if before != 0 {
+                    let bit = VarBit { var, bit: before.trailing_zeros() as u8 };
+                    return fail(place, Kind::WholeAndBit { bit });
                 }
                 mark(&mut seen, var);
             }
@@ -295,13 +326,13 @@ impl<'a> RecipeCheck<'a> {
             SendOn::Period | SendOn::Change => Ok(()),
             SendOn::Frame if self.has(Direction::Input) => Ok(()),
             SendOn::Frame => fail(place, Kind::NoInputToAnswer),
-            SendOn::Rising { var, bit } => check_bit(place, var, bit),
+            SendOn::Rising { var, bit } => check_trigger(place, var, bit),
         }
     }
 }
 
 /// A bit that triggers.
-pub(super) fn check_bit(place: Place, var: SysVar, bit: u8) -> Check {
+pub(super) fn check_trigger(place: Place, var: SysVar, bit: u8) -> Check {
     if !var.is_bits() {
         return fail(place, Kind::NotBits { var });
     }

@@ -309,6 +309,21 @@ impl fmt::Display for DescribedKind<'_> {
             Kind::WrittenTwice { var } => {
                 write!(f, "another field of this recipe already writes {var}")
             }
+            Kind::BitWrittenTwice { bit } => {
+                write!(f, "another field of this recipe already writes {bit}")
+            }
+            Kind::WholeAndBit { bit } => write!(
+                f,
+                "this recipe writes both {} as a whole and its bit {}; allowed: the whole or bits",
+                bit.var, bit.bit
+            ),
+            Kind::HasNoBits { var } => {
+                write!(f, "{var} is a {} without bits", var.ty())?;
+                match var.direction() {
+                    Direction::Input => f.write_str("; allowed: bits of DigitalOutputCommand, BitInputReg"),
+                    Direction::Output => Ok(()),
+                }
+            }
             Kind::NotBits { var } => {
                 write!(f, "{var} is a {}; a trigger needs a variable made of bits", var.ty())
             }
@@ -346,6 +361,16 @@ impl fmt::Display for DescribedKind<'_> {
                 "{var} is written by this port and by {}; a variable has one owner",
                 port_name(other)
             ),
+            Kind::BitOwnedTwice { bit, other } => {
+                write!(f, "{bit} is written by this port and by {}; a bit has one owner", port_name(other))
+            }
+            Kind::OwnedAndShared { bit, other } => write!(
+                f,
+                "this port and {} both write {}, one as a whole and one {bit}; allowed: one owner of the \
+                 whole, or owners of bits",
+                port_name(other),
+                bit.var
+            ),
             Kind::NoWayUp { var, port } => write!(
                 f,
                 "{} writes {var}, which only the controller's own recipe ports can carry; add it to the input of \
@@ -364,6 +389,9 @@ impl fmt::Display for DescribedKind<'_> {
                  its value would be invented; let a port write it, or remove it here and on the controller"
             ),
             Kind::NotOwned { var } => write!(f, "this port does not write {var}"),
+            Kind::BitsNotOwned { var, mask } => {
+                write!(f, "this port does not write {var}.{} by itself", mask.trailing_zeros())
+            }
             Kind::SafeType { var, ty } => write!(f, "{var} is a {}, but its safe value is a {ty}", var.ty()),
             Kind::SafeValue { var } => {
                 write!(f, "not a value for {var}: not finite, or reserved bits are set")

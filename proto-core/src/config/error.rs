@@ -7,7 +7,7 @@ use crate::command::ParseError;
 use crate::device::LayoutError;
 use crate::recipe::PartError;
 use crate::recipe::model::Mode;
-use crate::sysvar::{Direction, ParseError as VarError, SysVar};
+use crate::sysvar::{Direction, ParseError as VarError, SysVar, VarBit};
 use crate::time::Duration;
 use crate::wire::scalar::{ScalarError, ScalarType};
 
@@ -227,6 +227,8 @@ pub enum Counted {
     CommandBytes,
     /// Frames of one port with a device's own frames.
     DeviceFrames,
+    /// Bytes of whose bits an input frame writes some, over all input frames.
+    BitShares,
     /// Texts of one port.
     Texts,
     /// Groups of variables that arrive together.
@@ -258,6 +260,7 @@ impl core::fmt::Display for Counted {
             Self::UserFields => "user-defined fields in one direction",
             Self::CommandFields => "command fields",
             Self::CommandBytes => "bytes of command texts",
+            Self::BitShares => "bytes in input frames that write single bits",
             Self::Groups => "groups",
             Self::PollBlocks => "Modbus poll blocks",
             Self::Exchanges => "exchanges in all recipes together",
@@ -441,6 +444,21 @@ pub enum ConfigErrorKind {
         /// The reason.
         error: PartError,
     },
+    /// Two fields of one recipe write the same bit.
+    BitWrittenTwice {
+        /// The bit.
+        bit: VarBit,
+    },
+    /// A recipe writes a variable as a whole and one of its bits.
+    WholeAndBit {
+        /// The bit.
+        bit: VarBit,
+    },
+    /// Only variables made of bits have bits.
+    HasNoBits {
+        /// The variable.
+        var: SysVar,
+    },
     /// Input fields write input variables only.
     NotAnInput {
         /// The variable.
@@ -521,6 +539,20 @@ pub enum ConfigErrorKind {
         /// Index of the earlier port.
         other: u8,
     },
+    /// An earlier port writes the same bit; a bit has one owner.
+    BitOwnedTwice {
+        /// The bit.
+        bit: VarBit,
+        /// Index of the earlier port.
+        other: u8,
+    },
+    /// One port writes the whole variable, and the other one of its bits.
+    OwnedAndShared {
+        /// The bit.
+        bit: VarBit,
+        /// Index of the other port.
+        other: u8,
+    },
     /// A port writes a variable that no configured way up can carry (D15).
     NoWayUp {
         /// The variable.
@@ -545,6 +577,13 @@ pub enum ConfigErrorKind {
     NotOwned {
         /// The variable.
         var: SysVar,
+    },
+    /// A safe value for bits that the port does not write one by one.
+    BitsNotOwned {
+        /// The variable.
+        var: SysVar,
+        /// Its bits.
+        mask: u8,
     },
     /// A safe value's type is not its variable's.
     SafeType {

@@ -116,8 +116,13 @@ impl Exchange {
         Self { peer, talk, when, timeout: DEFAULT_REPLY_TIMEOUT, retries: 1, pause: Duration::ZERO }
     }
 
+    /// Whether a master asks, and the gateway answers.
+    pub(crate) const fn is_served(&self) -> bool {
+        matches!(self.talk, Talk::Served { .. })
+    }
+
     /// The fields that come from the device (input) or go to it (output); `None` if it has no such
-    /// frame.
+    /// frame. A refusal only tells that the device refuses.
     pub(crate) fn fields(&self, config: ConfigView<'_>, part: Direction) -> Option<Span> {
         let span = match (self.talk, part) {
             (Talk::Rtu { read, .. }, Direction::Input) => read,

@@ -28,6 +28,7 @@ mod network;
 mod port;
 mod recipe;
 mod rules;
+mod safe_value;
 mod source;
 mod validate;
 mod view;
@@ -51,12 +52,13 @@ pub use line_budget::ExchangeBudget;
 pub use listen::listen_address;
 pub use network::{BoardAddress, Network};
 pub(crate) use port::MIN_CYCLE;
-pub use port::{Bus, Parity, Port, Rs485, SafeValue};
+pub use port::{Bus, Parity, Port, Rs485};
 pub use recipe::{
     CanFramePart, CommandEntry, CommandWhen, FieldSpec, InputBinding, MAX_COMMAND_TEXT, OnStale,
     OutputBinding, Parts, Recipe, SendOn, Span, StreamPart, Words,
 };
-pub use rules::{check_address, check_bitrate, check_cycle, check_name};
+pub use rules::{check_address, check_bit, check_bitrate, check_cycle, check_name};
+pub use safe_value::SafeValue;
 pub use source::{PortHealth, PortValue, StateValue, StateValueError};
 pub(crate) use view::ConfigMut;
 pub use view::ConfigView;

@@ -6,9 +6,7 @@ use heapless::String;
 
 use super::{MAX_LISTEN, Name, PortHealth, Span};
 use crate::modbus::rtu::Timing;
-use crate::sysvar::SysVar;
 use crate::time::Duration;
-use crate::wire::scalar::Scalar;
 
 /// One port.
 #[derive(Debug, Clone, PartialEq)]
@@ -144,16 +142,6 @@ pub enum Parity {
     Even,
     /// Odd parity.
     Odd,
-}
-
-/// The value that an input variable takes when its port times out.
-#[derive(Debug, Clone, Copy, PartialEq)]
-#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
-pub struct SafeValue {
-    /// An input variable that the port owns.
-    pub var: SysVar,
-    /// Its safe value.
-    pub value: Scalar,
 }
 
 /// The shortest cycle, of the controller and of a port.

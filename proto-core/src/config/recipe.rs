@@ -8,7 +8,7 @@ use heapless::{String, Vec};
 use super::{Delimiter, Name, PortValue, StateValue};
 use crate::device::{Boundary, ByteOrder, Checksum, Encoding, Escape, Length, Overflow, Text};
 use crate::recipe::model::{Field, MAX_CAN_IDS, Mode};
-use crate::sysvar::{Direction, SysVar};
+use crate::sysvar::{Direction, SysVar, VarBit};
 use crate::wire::can::CanId;
 use crate::wire::scalar::ScalarType;
 
@@ -254,6 +254,17 @@ impl FieldSpec {
         }
     }
 
+    /// The bit that the field is bound to.
+    pub const fn bit(&self) -> Option<VarBit> {
+        match *self {
+            Self::UserInput { to: InputBinding::Bit { var, bit }, .. }
+            | Self::DeviceInput { to: InputBinding::Bit { var, bit }, .. }
+            | Self::UserOutput { from: OutputBinding::Bit { var, bit }, .. }
+            | Self::DeviceOutput { from: OutputBinding::Bit { var, bit }, .. } => Some(VarBit { var, bit }),
+            _ => None,
+        }
+    }
+
     /// Where the value of a user-defined output field comes from.
     pub fn source(&self) -> Option<OutputBinding> {
         match *self {
@@ -262,17 +273,17 @@ impl FieldSpec {
         }
     }
 
-    /// The system variable that the field is, or that its value is bound to; texts have several, see
-    /// [`Self::variables`].
+    /// The system variable that the field is, that an input field's value becomes as a whole, or of
+    /// which an output field shows the value or a bit; texts have several, see [`Self::variables`].
     pub fn variable(&self) -> Option<SysVar> {
         match *self {
             Self::System(var) => Some(var),
             Self::UserInput { to, .. } | Self::DeviceInput { to, .. } => match to {
                 InputBinding::Variable { var, .. } => Some(var),
-                InputBinding::Unused | InputBinding::Commands { .. } => None,
+                InputBinding::Unused | InputBinding::Commands { .. } | InputBinding::Bit { .. } => None,
             },
             Self::UserOutput { from, .. } | Self::DeviceOutput { from, .. } => match from {
-                OutputBinding::Variable { var, .. } => Some(var),
+                OutputBinding::Variable { var, .. } | OutputBinding::Bit { var, .. } => Some(var),
                 _ => None,
             },
             _ => None,
@@ -312,6 +323,14 @@ pub enum InputBinding {
         table: Span,
         /// When a value takes effect.
         when: CommandWhen,
+    },
+    /// One bit of a byte variable: off for 0, on for any other integer. Other bits of the byte may
+    /// have other owners.
+    Bit {
+        /// An input variable made of bits.
+        var: SysVar,
+        /// Bit 0..=7.
+        bit: u8,
     },
 }
 
@@ -370,6 +389,13 @@ pub enum OutputBinding {
         scale: f32,
         /// Offset, added after scaling.
         offset: f32,
+    },
+    /// One bit of a byte variable, 0 or 1.
+    Bit {
+        /// Any variable made of bits that the controller shows.
+        var: SysVar,
+        /// Bit 0..=7.
+        bit: u8,
     },
 }
 

@@ -9,7 +9,7 @@ use super::network::Network;
 use super::{
     CommandEntry, ControllerLink, Exchange, FieldSpec, FrameSpec, OutputBinding, Port, Recipe, SafeValue,
 };
-use crate::sysvar::{Direction, SysVar};
+use crate::sysvar::{Direction, SysVar, VarBit};
 
 /// A configuration of any size, borrowed; [`GatewayConfig`](super::GatewayConfig) describes the
 /// fields.
@@ -80,7 +80,7 @@ impl<'c> ConfigView<'c> {
         })
     }
 
-    /// The input variables that a field port writes.
+    /// The input variables that a field port writes as a whole.
     pub fn written_by(self, recipe: &'c Recipe) -> impl Iterator<Item = SysVar> + 'c {
         self.fields_of(recipe, Direction::Input).flat_map(|(_, _, field)| field.variables())
     }
@@ -96,6 +96,11 @@ impl<'c> ConfigView<'c> {
         let shows = |field: &FieldSpec| matches!(field.source(), Some(OutputBinding::State { .. }));
         self.field_ports()
             .any(|(_, _, recipe)| self.fields_of(recipe, Direction::Output).any(|(_, _, field)| shows(field)))
+    }
+
+    /// The bits that a field port writes one by one.
+    pub fn bits_written_by(self, recipe: &'c Recipe) -> impl Iterator<Item = VarBit> + 'c {
+        self.fields_of(recipe, Direction::Input).filter_map(|(_, _, field)| field.bit())
     }
 
     /// Whether a field port writes the variable.

@@ -307,7 +307,7 @@ impl Encoding {
             Kind::Uint24 => Scalar::Dword(raw() as u32),
             Kind::Int24 => Scalar::Int(sign_extended(raw() as u32, 24)),
             Kind::Bits(bits) => {
-                let value = (raw() as u32).unbounded_shr(u32::from(bits.first)) & mask(bits.count);
+                let value = (raw() as u32 & bits.mask()).unbounded_shr(u32::from(bits.first));
                 if bits.signed { Scalar::Int(sign_extended(value, bits.count)) } else { Scalar::Dword(value) }
             }
             Kind::Bcd { bytes } => {
@@ -338,7 +338,7 @@ impl Encoding {
             Kind::Scalar(_) | Kind::Uint24 | Kind::Int24 => value as i64 as u64,
             Kind::Bits(bits) => {
                 let field = out.get(..len)?;
-                let value = (value as i64 as u32 & mask(bits.count)).unbounded_shl(u32::from(bits.first));
+                let value = (value as i64 as u32).unbounded_shl(u32::from(bits.first)) & bits.mask();
                 self.order.read(field) | u64::from(value)
             }
             Kind::Bcd { bytes } => {
@@ -357,6 +357,13 @@ impl Encoding {
         };
         self.order.write(raw, out.get_mut(..len)?);
         Some(len)
+    }
+}
+
+impl Bits {
+    /// The bits, each where it stands in the number.
+    pub(super) const fn mask(&self) -> u32 {
+        mask(self.count).unbounded_shl(self.first as u32)
     }
 }
 

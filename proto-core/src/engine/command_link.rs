@@ -5,26 +5,21 @@
 //! pressed earlier. A command that stops the robot has its own connection, goes ahead of
 //! everything, and is not dropped while its device asks for it.
 
-use heapless::{Deque, String, Vec};
+use heapless::{Deque, Vec};
 
+use super::command_tables::{CommandField, Entry, MAX_COMMAND_FIELDS, Picked, Tables, is_asked};
 use super::io::{LinkId, PortId, ReplyCode, Transport};
 use super::not_given::{LastNotGiven, NotGiven};
 use super::outcome::Outcomes;
 use super::session::{Event, Sent, Session};
 use super::stops::{COMMAND_QUEUE, STOP_TTL, Stops, Waiting};
-use crate::command::{Keyword, Request};
-use crate::config::{
-    CommandEntry, CommandText, CommandWhen, MAX_COMMANDS, MAX_PORTS, Span, fill_in, placeholders,
-};
+use crate::command::Keyword;
+use crate::config::{CommandEntry, CommandText, CommandWhen, MAX_PORTS, Span, fill_in};
 use crate::link::LinkState;
 use crate::time::{Duration, Instant};
 use crate::wire::dialect::Dialect;
 use crate::wire::scalar::Scalar;
 
-/// Fields bound to command tables, over all ports.
-pub(super) const MAX_COMMAND_FIELDS: usize = 16;
-/// Bytes of command texts, over all tables.
-pub(super) const MAX_COMMAND_BYTES: usize = 1024;
 /// A command that is not acknowledged this long after it was picked is dropped.
 const COMMAND_TTL: Duration = Duration::from_secs(1);
 /// Two losses of the second connection within this time mean that the controller takes only one
@@ -36,56 +31,6 @@ const OPEN_AGAIN: Duration = Duration::from_millis(500);
 const ROOM_WITHIN: Duration = Duration::from_millis(20);
 /// A second loss within this time has the same cause as the first.
 const TOGETHER: Duration = Duration::from_secs(1);
-
-/// A field whose values pick commands.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct CommandField {
-    pub table: Span,
-    pub when: CommandWhen,
-    /// The value in the previous frame; none after silence.
-    pub last: Option<i64>,
-    /// Index of its input frame, and its index in the frame.
-    pub place: (u8, u8),
-    /// The table names the values that pick nothing; otherwise it is 0.
-    pub names_idle: bool,
-}
-
-/// What a field's value leads to.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Picked {
-    Nothing,
-    /// The table does not have the value.
-    Unknown,
-    /// It would pick a command, but there is no value before it.
-    Based,
-    /// One more command of the port, with the reply code until its result is known.
-    Command {
-        reply: ReplyCode,
-        /// It will not be sent, and there is no further result.
-        is_dropped: bool,
-    },
-}
-
-/// All command tables.
-#[derive(Debug, Clone)]
-struct Tables {
-    entries: Vec<Entry, MAX_COMMANDS>,
-    /// The texts of all entries, one after the other.
-    texts: String<MAX_COMMAND_BYTES>,
-}
-
-/// One entry of a command table.
-#[derive(Debug, Clone, Copy)]
-struct Entry {
-    first: i64,
-    last: i64,
-    start: u16,
-    /// 0 if the values pick nothing.
-    len: u16,
-    keyword: Keyword,
-    /// The text contains the value.
-    has_value: bool,
-}
 
 #[derive(Debug, Clone)]
 pub(super) struct CommandLink {
@@ -114,34 +59,11 @@ pub(super) struct CommandLink {
     pub outcomes: Outcomes,
 }
 
-impl Tables {
-    fn new(entries: &[CommandEntry]) -> Option<Self> {
-        let mut tables = Self { entries: Vec::new(), texts: String::new() };
-        for entry in entries {
-            let start = tables.texts.len() as u16;
-            tables.texts.push_str(&entry.text).ok()?;
-            // Validation has refused everything that is not a command.
-            let keyword = Request::parse(entry.text.as_bytes()).map_or(Keyword::State, |r| r.keyword());
-            let &CommandEntry { first, last, .. } = entry;
-            let (len, has_value) = (entry.text.len() as u16, placeholders(&entry.text) > 0);
-            tables.entries.push(Entry { first, last, start, len, keyword, has_value }).ok()?;
-        }
-        Some(tables)
-    }
-
-    fn entry(&self, entry: u16) -> Option<(Entry, &str)> {
-        let entry = self.entries.get(usize::from(entry))?;
-        let start = usize::from(entry.start);
-        let text = self.texts.get(start..start.saturating_add(usize::from(entry.len)))?;
-        Some((*entry, text))
-    }
-}
-
 impl CommandLink {
     /// Links with these command tables; `None` if their texts are too long together.
     pub(super) fn new(port: u16, dialect: Dialect, entries: &[CommandEntry]) -> Option<Self> {
         let tables = Tables::new(entries)?;
-        let stops = tables.entries.iter().any(|entry| entry.keyword.is_urgent());
+        let stops = tables.has_urgent();
         Some(Self {
             ordinary: Session::new(),
             urgent: stops.then(Session::new),
@@ -179,7 +101,7 @@ impl CommandLink {
     /// Adds a field and returns its index, or `None` if there are too many.
     pub(super) fn add_field(&mut self, table: Span, when: CommandWhen, place: (u8, u8)) -> Option<u8> {
         let index = self.fields.len() as u8;
-        let names_idle = table.of(&self.tables.entries).iter().any(|entry| entry.len == 0);
+        let names_idle = self.tables.names_idle(table);
         self.fields.push(CommandField { table, when, last: None, place, names_idle }).ok()?;
         Some(index)
     }
@@ -207,10 +129,7 @@ impl CommandLink {
         if !acts && before.is_some() {
             return Picked::Nothing;
         }
-        let entries = table.of(&self.tables.entries);
-        let has = |entry: &Entry| entry.first <= value && value <= entry.last;
-        let found = (table.start..).zip(entries).find(|(_, entry)| has(entry));
-        let Some((entry, &Entry { keyword, len, .. })) = found else {
+        let Some((entry, &Entry { keyword, len, .. })) = self.tables.find(table, value) else {
             if value == 0 && !names_idle {
                 return Picked::Nothing;
             }
@@ -674,8 +593,4 @@ fn may_go_at(sessions: [Option<&Session>; 2], keyword: Keyword) -> Instant {
     let sent = sessions.into_iter().flatten().flat_map(|session| [session.in_flight, session.beside]);
     let same = sent.flatten().filter(|sent| sent.keyword == keyword);
     same.map(|sent| sent.at + STOP_TTL).max().unwrap_or(Instant::ZERO)
-}
-
-fn is_asked(fields: &[CommandField], waiting: &Waiting) -> bool {
-    fields.get(usize::from(waiting.field)).and_then(|field| field.last) == Some(waiting.value)
 }

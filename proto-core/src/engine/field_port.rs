@@ -3,7 +3,8 @@
 //! In: bytes and CAN frames. Out: values in the store, and frames when they are due. Does not know
 //! how values reach the controller.
 
-use super::command_link::{CommandLink, Picked};
+use super::command_link::CommandLink;
+use super::command_tables::Picked;
 use super::counters::{PortCounters, add, bump};
 use super::device_port::DeviceCodec;
 use super::io::{BusState, PortId, PortState, ReplyCode};
@@ -38,23 +39,32 @@ pub(super) enum Codec {
 pub(super) struct LineTiming {
     pub idle_gap: Duration,
     pub turnaround: Duration,
+    /// After this long without a byte, what was sent is complete.
+    silence: Duration,
     heard: Instant,
 }
 
 impl LineTiming {
     pub(super) fn new(settings: &Rs485) -> Self {
-        let idle_gap = settings.idle_gap.max(settings.characters_and_a_half(3));
-        Self { idle_gap, turnaround: settings.turnaround, heard: Instant::ZERO }
+        let characters = settings.characters_and_a_half(3);
+        let (idle_gap, turnaround) = (settings.idle_gap.max(characters), settings.turnaround);
+        Self { idle_gap, turnaround, silence: turnaround.max(characters), heard: Instant::ZERO }
     }
 
     /// For a bus that arbitrates by itself.
     pub(super) const fn none() -> Self {
-        Self { idle_gap: Duration::MAX, turnaround: Duration::ZERO, heard: Instant::ZERO }
+        let (idle_gap, turnaround) = (Duration::MAX, Duration::ZERO);
+        Self { idle_gap, turnaround, silence: Duration::ZERO, heard: Instant::ZERO }
     }
 
     /// When the line is free for the gateway.
-    fn quiet_at(&self) -> Instant {
+    pub(super) fn quiet_at(&self) -> Instant {
         self.heard + self.turnaround
+    }
+
+    /// When the line has been silent for so long that what was sent is complete.
+    pub(super) fn silent_at(&self) -> Instant {
+        self.heard + self.silence
     }
 }
 
@@ -218,20 +228,11 @@ impl FieldPort {
             return accepted;
         };
         let Some(layout) = input else {
-            bump(&mut self.counters.rejected_no_input);
-            tap.record(|| came(self.id, now, Err(Rejection::NoInput), None, [bytes, &[], &[]]));
-            keep(&mut self.last_rejection, Rejection::NoInput, None, bytes, now);
+            self.not_asked_for(bytes, tap, now);
             return accepted;
         };
-        let mut frames = Frames {
-            mode: self.mode,
-            bindings,
-            reply: &mut self.reply,
-            counters: &mut self.counters,
-            port: self.id,
-            store,
-            commands,
-        };
+        let (reply, counters) = (&mut self.reply, &mut self.counters);
+        let mut frames = Frames::new((self.id, self.mode), reply, counters, bindings, store, commands);
         let mut left = bytes;
         while let Some(payload) = deframer.next_frame(layout, &mut left) {
             let verdict = frames.take(layout, payload, usize::from(self.first_frame), &mut accepted);
@@ -252,6 +253,14 @@ impl FieldPort {
         }
         self.sender.frames_accepted(accepted.frames, usable, &mut self.counters, now);
         accepted
+    }
+
+    /// Bytes for a port whose recipe has no input part.
+    #[cold]
+    pub(super) fn not_asked_for<const TAP: usize>(&mut self, bytes: &[u8], tap: &mut Tap<TAP>, now: Instant) {
+        bump(&mut self.counters.rejected_no_input);
+        tap.record(|| came(self.id, now, Err(Rejection::NoInput), None, [bytes, &[], &[]]));
+        keep(&mut self.last_rejection, Rejection::NoInput, None, bytes, now);
     }
 
     /// A frame from the bus.
@@ -307,15 +316,8 @@ impl FieldPort {
             bump(counter);
             return Err(why);
         };
-        let mut frames = Frames {
-            mode: self.mode,
-            bindings,
-            reply: &mut self.reply,
-            counters: &mut self.counters,
-            port: self.id,
-            store,
-            commands,
-        };
+        let (reply, counters) = (&mut self.reply, &mut self.counters);
+        let mut frames = Frames::new((self.id, self.mode), reply, counters, bindings, store, commands);
         let slot = usize::from(self.first_frame).saturating_add(index);
         frames.take(&frame_layout, frame.data(), slot, accepted)?;
         self.sender.frames_accepted(1, usable, &mut self.counters, now);
@@ -461,7 +463,39 @@ pub(super) struct Frames<'a, const PORTS: usize> {
     pub commands: Option<&'a mut CommandLink>,
 }
 
+impl<'a, const PORTS: usize> Frames<'a, PORTS> {
+    // The parts of a port one by one: its codec is in use meanwhile.
+    #[inline(always)]
+    pub(super) fn new(
+        (port, mode): (PortId, Mode),
+        reply: &'a mut ReplyCode,
+        counters: &'a mut PortCounters,
+        bindings: &'a [InputBind],
+        store: &'a mut Store<PORTS>,
+        commands: Option<&'a mut CommandLink>,
+    ) -> Self {
+        Self { mode, bindings, reply, counters, port, store, commands }
+    }
+}
+
 impl<const PORTS: usize> Frames<'_, PORTS> {
+    /// Counts a rejection, and is one.
+    pub(super) fn rejected(&mut self, why: Rejection) -> Result<(), Rejection> {
+        let counters = &mut *self.counters;
+        bump(match why {
+            Rejection::NoInput => &mut counters.rejected_no_input,
+            Rejection::Remote => &mut counters.rejected_remote,
+            Rejection::ForeignId => &mut counters.rejected_id,
+            Rejection::WrongLength => &mut counters.rejected_length,
+            Rejection::Checksum => &mut counters.rejected_checksum,
+            Rejection::OtherDevice => &mut counters.rejected_other_device,
+            Rejection::Unreadable | Rejection::Escape => &mut counters.rejected_unreadable,
+            Rejection::NotFinite => &mut counters.rejected_not_finite,
+            _ => &mut counters.rejected_out_of_range,
+        });
+        Err(why)
+    }
+
     /// Applies a frame as a whole or not at all, and counts it in `accepted`.
     // A result with the set in it would be copied byte by byte: its tag is one byte.
     fn take(
@@ -478,10 +512,7 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
                         bump(&mut self.counters.masked);
                     }
                 }
-                Err(_) => {
-                    bump(&mut self.counters.rejected_not_finite);
-                    return Err(Rejection::NotFinite);
-                }
+                Err(_) => return self.rejected(Rejection::NotFinite),
             },
             // With a context of its own, so that the other mode's can stay in registers.
             Mode::User => self.again().take_user(layout, payload, slot)?,
@@ -494,29 +525,20 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
 
     #[inline(always)]
     fn again(&mut self) -> Frames<'_, PORTS> {
-        Frames {
-            mode: self.mode,
-            bindings: self.bindings,
-            reply: self.reply,
-            counters: self.counters,
-            port: self.port,
-            store: self.store,
-            commands: self.commands.as_deref_mut(),
-        }
+        let commands = self.commands.as_deref_mut();
+        Frames::new((self.port, self.mode), self.reply, self.counters, self.bindings, self.store, commands)
     }
 
     /// Applies the values of a user-defined frame, all or none.
     #[inline(never)]
     fn take_user(&mut self, layout: &impl InputLayout, payload: &[u8], slot: usize) -> Result<(), Rejection> {
         if layout.check(payload).is_err() {
-            bump(&mut self.counters.rejected_not_finite);
-            return Err(Rejection::NotFinite);
+            return self.rejected(Rejection::NotFinite);
         }
         let frame = self.store.frames.get(slot).ok_or(Rejection::NoInput)?;
         let bindings = frame.bindings.of(self.bindings);
         if !fit(bindings, layout.values(payload)) {
-            bump(&mut self.counters.rejected_out_of_range);
-            return Err(Rejection::OutOfRange);
+            return self.rejected(Rejection::OutOfRange);
         }
         for (binding, value) in bindings.iter().zip(layout.values(payload)) {
             self.apply_user(&binding.to, value);
@@ -535,6 +557,10 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
                     // It fits: all values were tried before the first was applied.
                     let _ = self.store.image.set(var, value);
                 }
+            }
+            InputTo::Bits { var, mask } => {
+                let on = if value.as_f64() == 0.0 { 0 } else { mask };
+                self.store.image.set_bits(var, mask, on);
             }
             InputTo::Command(field) => {
                 if let Some(link) = &mut self.commands {

@@ -66,18 +66,9 @@ fn falls_silent(rig: &mut Rig, port: PortId, frame: &[u8]) -> Instant {
     due
 }
 
-/// DigitalOutputCommand[1] by Modbus.
-fn modbus() -> (Cell, PortId) {
-    let mut cell = Cell::new();
-    let recipe = cell.stream(&["DigitalOutputCommand[1]"], &[]);
-    let port = cell.rs485(recipe);
-    cell.safe("DigitalOutputCommand[1]", 4.0);
-    (cell, port)
-}
-
-/// The same with all other links beside it.
+/// DigitalOutputCommand[1] by Modbus, with all other links beside it.
 fn modbus_and_others() -> (Rig, PortId) {
-    let (mut cell, port) = modbus();
+    let (mut cell, port) = Cell::guarded();
     let table = cell.commands(&[(1, "stop")]);
     let to = InputBinding::Commands { table, when: CommandWhen::Change };
     let fields = cell.fields([user_in(ScalarType::Byte, to)]);

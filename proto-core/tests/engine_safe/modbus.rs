@@ -1,24 +1,16 @@
 //! Safe values by Modbus: written until a write is answered.
 
-use proto_core::engine::{Input, LinkId, PortId};
+use proto_core::engine::{Input, LinkId};
 use proto_core::modbus::Exception;
 
 use super::rig::*;
-use super::{ON, falls_silent, live, modbus, modbus_and_others};
+use super::{ON, falls_silent, live, modbus_and_others};
 
 const OFF: &[u8] = &[255, 255, 0, 238, 238];
 
-/// The same, running.
-fn guarded() -> (Rig, PortId) {
-    let (cell, port) = modbus();
-    let mut rig = cell.rig();
-    rig.run(MS(10));
-    (rig, port)
-}
-
 #[test]
 fn by_modbus_it_is_written_until_it_is_answered() {
-    let (cell, port) = modbus();
+    let (cell, port) = Cell::guarded();
     let mut rig = cell.rig();
     falls_silent(&mut rig, port, ON);
     rig.modbus_answers = false;
@@ -41,7 +33,7 @@ fn by_modbus_it_is_written_until_it_is_answered() {
 
 #[test]
 fn by_modbus_a_refused_one_is_written_again_after_500_ms() {
-    let (cell, port) = modbus();
+    let (cell, port) = Cell::guarded();
     let mut rig = cell.rig();
     let due = falls_silent(&mut rig, port, ON);
     rig.map.exception = Some(Exception::DeviceBusy);
@@ -82,7 +74,7 @@ fn by_modbus_it_is_written_again_after_each_link_that_came_up() {
 
 #[test]
 fn by_modbus_the_answer_to_what_the_owner_sent_confirms_nothing() {
-    let (cell, port) = modbus();
+    let (cell, port) = Cell::guarded();
     let mut rig = cell.rig();
     rig.run(MS(10));
     rig.bytes(port, ON);
@@ -117,11 +109,8 @@ fn a_refused_safe_value_gives_way_to_the_owner() {
 
 #[test]
 fn an_owners_value_is_never_kept_as_if_it_were_safe() {
-    let mut cell = Cell::new();
-    let recipe = cell.stream(&["DigitalOutputCommand[1]"], &[]);
-    let port = cell.rs485(recipe);
+    let (mut cell, port) = Cell::guarded();
     cell.last_port().timeout = MS(1_000);
-    cell.safe("DigitalOutputCommand[1]", 4.0);
     let mut rig = cell.rig();
     rig.run(MS(10));
     rig.bytes(port, ON);

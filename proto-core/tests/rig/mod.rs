@@ -32,6 +32,15 @@ impl Cell {
         Self(config)
     }
 
+    /// DigitalOutputCommand[1] by Modbus, with a safe value; its owner may be silent for 100 ms.
+    pub fn guarded() -> (Self, PortId) {
+        let mut cell = Self::new();
+        let recipe = cell.stream(&["DigitalOutputCommand[1]"], &[]);
+        let port = cell.rs485(recipe);
+        cell.safe("DigitalOutputCommand[1]", 4.0);
+        (cell, port)
+    }
+
     pub fn fields(&mut self, fields: impl IntoIterator<Item = FieldSpec>) -> Span {
         let start = self.0.fields.len() as u16;
         self.0.fields.extend(fields);
@@ -111,7 +120,7 @@ impl Cell {
     pub fn safe(&mut self, name: &str, value: f64) {
         let var = var(name);
         let value = proto_core::wire::scalar::Scalar::from_f64(var.ty(), value).unwrap();
-        self.0.safe_values.push(SafeValue { var, value }).unwrap();
+        self.0.safe_values.push(SafeValue::new(var, value)).unwrap();
         self.last_port().on_timeout.len += 1;
     }
 
@@ -127,6 +136,14 @@ impl Cell {
     pub fn rig(&self) -> Rig {
         Rig::new(&self.0)
     }
+}
+
+/// The cell of [`Cell::guarded`], running.
+pub fn guarded() -> (Rig, PortId) {
+    let (cell, port) = Cell::guarded();
+    let mut rig = cell.rig();
+    rig.run(MS(10));
+    (rig, port)
 }
 
 fn recipe_name(index: u8) -> String {

@@ -7,7 +7,7 @@ use chip::device::{MICRO, MILLI, Picos};
 use chip::{Chip, Program};
 use proto_core::config::image;
 use recipe_config::SimConfig;
-use recipe_config::file::{Text, parse_controller, parse_gateway};
+use recipe_test_kit::toml;
 
 use crate::robot::Robot;
 
@@ -34,7 +34,7 @@ fn program() -> &'static Program {
 
 /// The configuration image of a gateway file.
 pub(crate) fn image_of(toml: &str) -> Vec<u8> {
-    let config = parse_gateway(Text { name: "cell.toml", toml }, &[]).expect("a right configuration");
+    let config = toml::gateway(toml);
     let mut bytes = vec![0; image::MAX_IMAGE];
     let len = image::encode(&*config, &mut bytes).expect("it fits");
     bytes.truncate(len);
@@ -65,8 +65,7 @@ impl Bench {
 
     /// Adds the controller of a file, at 192.168.12.10.
     pub(crate) fn with_robot_of(mut self, toml: &str) -> Self {
-        let config = parse_controller(Text { name: "controller.toml", toml }, &[]);
-        self.robot = Some(Robot::new(&config.expect("a right configuration")));
+        self.robot = Some(Robot::new(&toml::controller(toml)));
         self
     }
 

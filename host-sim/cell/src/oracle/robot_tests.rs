@@ -11,7 +11,6 @@ use crate::network::Sender;
 use crate::soak::Scenario;
 use crate::tamper::{Forged, Outward};
 use crate::{Cell, LineId, Talker, Way};
-use recipe_config::file::{self, Text};
 use recipe_test_kit::toml;
 
 /// A panel that starts and stops, and a variable with a safe value.
@@ -352,12 +351,11 @@ fn a_driver_that_answers_a_stranger() {
 
 /// Forces of a sensor without safe values, in one frame with outputs of another device.
 fn two_clients_without_safe_forces() -> Cell {
-    let toml = include_str!("../soak/cells/two-clients.toml");
-    let toml: String =
-        toml.lines().filter(|line| !line.starts_with("\"ForceEnd")).map(|line| format!("{line}\n")).collect();
-    let gateway = file::parse_gateway(Text { name: "two-clients.toml", toml: &toml }, &[]).unwrap();
+    let text = include_str!("../soak/cells/two-clients.toml");
+    let text: String =
+        text.lines().filter(|line| !line.starts_with("\"ForceEnd")).map(|line| format!("{line}\n")).collect();
     let scenario = Scenario::named("two-clients").unwrap().unwrap();
-    let mut cell = Cell::new(&gateway, &scenario.controller, 1).unwrap();
+    let mut cell = Cell::new(&toml::gateway(&text), &scenario.controller, 1).unwrap();
     cell.watch();
     cell
 }

@@ -10,7 +10,7 @@ use super::*;
 use crate::tamper::{Forged, Inward, Outward};
 use crate::{Cell, Talker};
 use recipe_config::SimConfig;
-use recipe_config::file::{self, Text};
+use recipe_test_kit::toml;
 
 /// DO1..8 and a word from a device, the pose back to it, nothing older than 300 ms.
 pub(super) const CELL: &str = r#"
@@ -63,9 +63,7 @@ recipe = "device"
 pub(super) const DEVICE: PortId = PortId(0);
 
 pub(super) fn cell(toml: &str) -> Cell {
-    let gateway = file::parse_gateway(Text { name: "cell.toml", toml }, &[]);
-    let gateway = gateway.unwrap_or_else(|error| panic!("{error}"));
-    let mut cell = Cell::new(&gateway, &SimConfig::default(), 1).unwrap();
+    let mut cell = Cell::new(&toml::gateway(toml), &SimConfig::default(), 1).unwrap();
     cell.watch();
     cell
 }

@@ -5,7 +5,7 @@ use proto_core::engine::{LinkId, LinkKind};
 use proto_core::link::LinkState;
 use proto_core::time::Duration;
 use recipe_cell::{Cell, FaultInjector, FaultKind, LineId, Talker};
-use recipe_config::file::{self, Text};
+use recipe_test_kit::toml;
 
 use crate::kit::*;
 
@@ -80,9 +80,7 @@ timeout_ms = 100
 
 /// A cell with a device that counts: each frame's word is one more than the previous one.
 fn counting(seed: u64) -> (Cell, LineId) {
-    let gateway = file::parse_gateway(Text { name: "count.toml", toml: COUNTING }, &[]);
-    let gateway = gateway.unwrap_or_else(|error| panic!("{error}"));
-    let mut cell = Cell::new(&gateway, &recipe_config::SimConfig::default(), seed).unwrap();
+    let mut cell = Cell::new(&toml::gateway(COUNTING), &recipe_config::SimConfig::default(), seed).unwrap();
     let line = cell.line_of("count");
     cell.attach(line, Talker::new(cell.now(), 40, u64::MAX, count_frame));
     (cell, line)

@@ -6,7 +6,6 @@ use proto_core::time::Duration;
 use recipe_cell::soak::Scenario;
 use recipe_cell::{Cell, Way};
 use recipe_config::SimConfig;
-use recipe_config::file::{self, Text};
 use recipe_controller::Link;
 use recipe_test_kit::toml;
 
@@ -14,11 +13,8 @@ use crate::kit::*;
 
 /// A watched cell of these configurations, one second after it was switched on.
 fn watched(gateway: &str, controller: Option<&str>) -> Cell {
-    let gateway = file::parse_gateway(Text { name: "gateway", toml: gateway }, &[]);
-    let gateway = gateway.unwrap_or_else(|error| panic!("{error}"));
-    let controller = controller.map(|toml| file::parse_controller(Text { name: "controller", toml }, &[]));
-    let controller = controller.map_or_else(SimConfig::default, |controller| controller.unwrap());
-    let mut cell = Cell::new(&gateway, &controller, 1).unwrap();
+    let controller = controller.map_or_else(SimConfig::default, toml::controller);
+    let mut cell = Cell::new(&toml::gateway(gateway), &controller, 1).unwrap();
     cell.watch();
     cell.run_ms(1_000);
     cell

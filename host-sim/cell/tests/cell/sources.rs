@@ -2,8 +2,8 @@
 
 use proto_core::wire::state::OperationMode;
 use recipe_cell::{Cell, Talker};
-use recipe_config::file::{self, Text};
-use recipe_test_kit::example;
+use recipe_config::file;
+use recipe_test_kit::{example, toml};
 
 const GATEWAY: &str = r#"
 [controller]
@@ -49,9 +49,8 @@ refresh_ms = 1000
 "#;
 
 fn cell() -> Cell {
-    let gateway = file::parse_gateway(Text { name: "sources.toml", toml: GATEWAY }, &[]).unwrap();
     let controller = file::load_controller(&example("rs485-system-controller.toml"), &[]).unwrap();
-    Cell::new(&gateway, &controller, 7).unwrap()
+    Cell::new(&toml::gateway(GATEWAY), &controller, 7).unwrap()
 }
 
 /// What the tower shows: the newest frame since the last call.

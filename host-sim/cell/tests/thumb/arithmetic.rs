@@ -4,8 +4,7 @@
 use proto_core::time::Duration;
 use proto_core::wire::can::CanFrame;
 use recipe_cell::{Cell, Rng, Talker};
-use recipe_config::SimConfig;
-use recipe_config::file::{self, Text};
+use recipe_test_kit::toml;
 
 use crate::cells::{can, recorded};
 
@@ -118,12 +117,8 @@ const FIRST_ID: u16 = 0x100;
 
 /// The recording, after checking that enough happened in it.
 pub(crate) fn record() -> Vec<u8> {
-    let gateway = file::parse_gateway(Text { name: "arithmetic.toml", toml: &gateway() }, &[]);
-    let gateway = gateway.unwrap_or_else(|error| panic!("{error}"));
-    let controller = Text { name: "controller.toml", toml: &format!("{CONTROLLER}{UP}") };
-    let controller: SimConfig =
-        file::parse_controller(controller, &[]).unwrap_or_else(|error| panic!("{error}"));
-    let mut cell = recorded(&gateway, &controller);
+    let controller = toml::controller(&format!("{CONTROLLER}{UP}"));
+    let mut cell = recorded(&toml::gateway(&gateway()), &controller);
     let mut rng = Rng::new(3);
     let mut numbers = rng.fork();
     let bus = cell.bus_of("numbers");

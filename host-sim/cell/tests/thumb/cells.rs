@@ -6,8 +6,8 @@ use proto_core::wire::can::CanFrame;
 use proto_core::wire::can::CanId;
 use recipe_cell::{Cell, Chunking, FaultInjector, FaultKind, Rng, Talker};
 use recipe_config::SimConfig;
-use recipe_config::file::{self, Text};
-use recipe_test_kit::{example, repository};
+use recipe_config::file;
+use recipe_test_kit::{example, repository, toml};
 
 use crate::arithmetic;
 
@@ -120,11 +120,8 @@ fn four_ports(chunking: Chunking) -> Cell {
     let set = ["plc.timeout_ms=50", "sensor.timeout_ms=20", "devices.timeout_ms=100", "devices.cycle_ms=4"];
     let set = set.into_iter().chain(["display.cycle_ms=4"]).map(|set| format!("port.{set}"));
     let gateway = file::load_gateway(&path, &set.collect::<Vec<_>>());
-    let controller = file::parse_controller(Text { name: "controller.toml", toml: FORCES }, &[]);
-    let mut cell = match (gateway, controller) {
-        (Ok(gateway), Ok(controller)) => recorded(&gateway, &controller),
-        (gateway, controller) => panic!("{:?} {:?}", gateway.err(), controller.err()),
-    };
+    let gateway = gateway.unwrap_or_else(|error| panic!("{error}"));
+    let mut cell = recorded(&gateway, &toml::controller(FORCES));
     let start = cell.now() + Duration::from_millis(20);
     let mut rng = Rng::new(4);
     for (port, rate, head, tail) in [("plc", 150, FF, EE), ("sensor", 960, [0x48, 0xAA], [0x0D, 0x0A])] {

@@ -105,13 +105,9 @@ fn read_initial(root: &Reader<'_>) -> Result<Vec<Initial>> {
 
 fn read_value(target: InitialTarget, item: &Item<'_>) -> Result<f64> {
     match target {
-        InitialTarget::Bit { .. } => match item.as_bool() {
-            Some(bit) => Ok(f64::from(u8::from(bit))),
-            None => item.integer::<u8>(0..=1).map(f64::from).map_err(|mut error| {
-                error.message.push_str(", false or true");
-                error
-            }),
-        },
+        InitialTarget::Bit { .. } | InitialTarget::VarBit(_) => {
+            item.bit().map(|bit| f64::from(u8::from(bit)))
+        }
         InitialTarget::Analog { group, .. } => {
             let (low, high) = group.range();
             let value = item.number()?;

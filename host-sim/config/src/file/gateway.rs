@@ -9,10 +9,10 @@ use proto_core::config::{
     Bus, CanFramePart, CommandEntry, ConfigError, ControllerKey, ControllerLink, Delimiter, FieldSpec,
     GatewayConfig, InputBinding, MAX_ADDRESS, MAX_ALL_FIELDS, MAX_COMMAND_TEXT, MAX_COMMANDS, MAX_LISTEN,
     MAX_PORTS, MAX_RECIPES, MAX_SAFE_VALUES, NetworkKey, Parts, Place, Port, PortKey, Recipe, RecipeKey,
-    RecipeLink, SafeValue, Span, StreamPart, check_address,
+    RecipeLink, SafeValue, Span, StreamPart, check_address, check_bit,
 };
 use proto_core::recipe::model::{Framing, MAX_CAN_IDS};
-use proto_core::sysvar::{Direction, SysVar};
+use proto_core::sysvar::{Direction, ParseError, SysVar, VarBit};
 use proto_core::wire::dialect::Dialect;
 use proto_core::wire::scalar::Scalar;
 
@@ -335,11 +335,18 @@ impl<'a> Builder<'a> {
             };
         }
         for (name, key_spot, item) in item.any_table()?.entries() {
-            let var = SysVar::parse(name).map_err(|error| self.error(&key_spot, error))?;
-            let value = Scalar::from_f64(var.ty(), item.number()?).map_err(|error| item.error(error))?;
+            let value = match VarBit::parse(name) {
+                Some(bit) => self.safe_bit(bit, &key_spot, &item)?,
+                None => {
+                    let var = SysVar::parse(name).map_err(|error| self.error(&key_spot, error))?;
+                    let value =
+                        Scalar::from_f64(var.ty(), item.number()?).map_err(|error| item.error(error))?;
+                    SafeValue::new(var, value)
+                }
+            };
             let entry = self.config.safe_values.len() as u16;
             self.spots.insert(Place::SafeValue { entry }, item.spot.clone());
-            if self.config.safe_values.push(SafeValue { var, value }).is_err() {
+            if self.config.safe_values.push(value).is_err() {
                 let message =
                     format!("too many safe values; at most {MAX_SAFE_VALUES} on all ports together");
                 return Err(self.error(&key_spot, message));
@@ -347,6 +354,17 @@ impl<'a> Builder<'a> {
         }
         let len = self.config.safe_values.len() as u16 - start;
         Ok(Span { start, len })
+    }
+
+    fn safe_bit(
+        &self,
+        bit: std::result::Result<VarBit, ParseError>,
+        key_spot: &Spot,
+        item: &Item<'_>,
+    ) -> Result<SafeValue> {
+        let bit = bit.map_err(|error| self.error(key_spot, error))?;
+        check_bit(bit).map_err(|kind| self.error(key_spot, self.config.view().describe_kind(kind)))?;
+        Ok(SafeValue::bit(bit, item.bit()?))
     }
 
     fn finish(self) -> Result<Box<GatewayConfig>> {

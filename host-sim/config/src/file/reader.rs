@@ -176,6 +176,17 @@ impl<'a> Item<'a> {
         }
     }
 
+    /// 0 or 1, false or true.
+    pub(super) fn bit(&self) -> Result<bool> {
+        match self.as_bool() {
+            Some(bit) => Ok(bit),
+            None => self.integer::<u8>(0..=1).map(|bit| bit == 1).map_err(|mut error| {
+                error.message.push_str(", false or true");
+                error
+            }),
+        }
+    }
+
     /// An integer in `range`.
     pub(super) fn integer<T: TryFrom<i64>>(&self, range: RangeInclusive<i64>) -> Result<T> {
         let refused = |shown: &str| {

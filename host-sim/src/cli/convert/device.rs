@@ -4,7 +4,7 @@
 //! frames with the same values can differ in, such as padding, is kept in `raw=`.
 
 use proto_core::config::{DeviceFrame, FieldSpec, OutputBinding};
-use proto_core::device::{ByteOrder, Carrier, Checksum, Digits, Encoding, Found, Framer, Kind, Probe};
+use proto_core::device::{Carrier, Digits, Encoding, Found, Framer, Kind, Probe};
 use proto_core::modbus::rtu;
 use proto_core::recipe::model::MAX_STREAM_FRAME;
 use proto_core::sysvar::Direction;
@@ -328,44 +328,13 @@ impl Format {
 
     /// What is wrong with the checksum of a frame.
     fn wrong_checksum(&self, frame: &[u8]) -> String {
-        match self.checksums(frame) {
+        match self.frame.layout.checksums(&self.frame.elements, frame) {
             Some((found, right)) => {
-                format!("the checksum is {} instead of {}, so a receiver rejects the frame", found, right)
+                let (found, right) = (text::hex(found), text::hex(&right));
+                format!("the checksum is {found} instead of {right}, so a receiver rejects the frame")
             }
             None => "the checksum is wrong, so a receiver rejects the frame".into(),
         }
-    }
-
-    /// The checksum that a frame has, and the one that it should have.
-    fn checksums(&self, frame: &[u8]) -> Option<(String, String)> {
-        let mut at = self.named.head.len();
-        let mut found: Option<(usize, Checksum)> = None;
-        for field in &self.named.fields {
-            if let FieldSpec::Checksum(sum) = field.spec {
-                found = Some((at, sum));
-                at += sum.len();
-                continue;
-            }
-            let (shared, len, until) = match (field.spec, field.spec.element()?.encoding()) {
-                (FieldSpec::Padding { len, .. }, _) => (false, Some(usize::from(len)), None),
-                (_, Some(encoding)) => (encoding.shared, encoding.size(), encoding.until()),
-                (_, None) => return None,
-            };
-            at += match (shared, len) {
-                (true, _) => 0,
-                (false, Some(len)) => len,
-                (false, None) => 1 + frame.get(at..)?.iter().position(|&byte| Some(byte) == until)?,
-            };
-        }
-        let (at, sum) = found?;
-        let end = sum.last().map_or(at, |last| usize::from(last) + 1);
-        let covered = frame.get(usize::from(sum.first)..end)?;
-        let mut right = vec![0; sum.algorithm.len()];
-        ByteOrder::write(sum.order, u64::from(sum.algorithm.of([covered])), &mut right);
-        if sum.text {
-            right = right.iter().flat_map(|byte| format!("{byte:02X}").into_bytes()).collect();
-        }
-        Some((text::hex(frame.get(at..at + sum.len())?), text::hex(&right)))
     }
 }
 

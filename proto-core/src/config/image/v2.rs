@@ -369,7 +369,7 @@ struct SafeValue {
 
 impl From<SafeValue> for config::SafeValue {
     fn from(SafeValue { var, value }: SafeValue) -> Self {
-        Self { var, value }
+        Self::new(var, value)
     }
 }
 

@@ -6,6 +6,11 @@ use std::vec::Vec;
 use proptest::prelude::*;
 
 use super::*;
+use crate::device::checksum::Algorithm;
+use crate::device::encoding::{Bits, Digits, Encoding, Kind, Width};
+use crate::device::order::ByteOrder;
+use crate::device::text::{Counts, Length, Text, TextWidth};
+use crate::wire::scalar::ScalarType;
 
 fn value(kind: Kind, order: ByteOrder) -> Element {
     Element::value(Encoding { kind, order, shared: false })
@@ -383,4 +388,59 @@ proptest! {
             prop_assert_eq!(found, slow(&stream[at..]));
         }
     }
+}
+
+#[test]
+fn the_parts_of_a_frame_are_told_with_their_places() {
+    let until = Element::Text(Text { width: TextWidth::Until(b','), fill: None });
+    let word = Element::value(Encoding::scalar(ScalarType::Word));
+    let told = |elements: &[Element], behind| {
+        let layout = FrameLayout::new(
+            Carrier::Stream,
+            Direction::Input,
+            &[2],
+            &[13, 10],
+            elements,
+            standard("crc16-modbus", behind),
+        );
+        let mut told = Vec::new();
+        layout.unwrap().parts(elements, |part, place| told.push((part, place.at, place.len)));
+        told
+    };
+    assert_eq!(
+        told(&[bits(0, 4, false), bits(4, 4, true), word, until, word], 5),
+        [
+            (Part::Head, Some(0), Some(1)),
+            (Part::Element(0), Some(1), Some(1)),
+            (Part::Element(1), Some(1), Some(1)),
+            (Part::Element(2), Some(2), Some(2)),
+            (Part::Element(3), Some(4), None),
+            (Part::Element(4), None, Some(2)),
+            (Part::Checksum, None, Some(2)),
+            (Part::Tail, None, Some(2)),
+        ]
+    );
+    assert_eq!(
+        told(&[word, word], 1)[1..],
+        [
+            (Part::Element(0), Some(1), Some(2)),
+            (Part::Checksum, Some(3), Some(2)),
+            (Part::Element(1), Some(5), Some(2)),
+            (Part::Tail, Some(7), Some(2)),
+        ]
+    );
+}
+
+#[test]
+fn the_checksum_in_a_frame_is_told_with_the_right_one() {
+    let elements = [Element::Text(Text { width: TextWidth::Until(b','), fill: None })];
+    let sum = standard("xor8", 1).map(|(sum, behind)| (Checksum { text: true, ..sum }, behind));
+    let layout = FrameLayout::new(Carrier::Stream, Direction::Input, b"$", b"\r\n", &elements, sum).unwrap();
+    let frame = b"$AB,00\r\n";
+    assert_eq!(layout.probe(&elements, frame), Probe::Wrong(8));
+    let right = std::format!("{:02X}", b"$AB,".iter().fold(0, |sum, byte| sum ^ byte));
+    let (found, told) = layout.checksums(&elements, frame).unwrap();
+    assert_eq!((found, &told[..]), (&b"00"[..], right.as_bytes()));
+    let plain = FrameLayout::new(Carrier::Stream, Direction::Input, b"$", b"\r\n", &elements, None);
+    assert_eq!(plain.unwrap().checksums(&elements, b"$AB,\r\n"), None);
 }
