@@ -6,7 +6,9 @@
 
 use heapless::{String, Vec};
 
-use super::draft::{ControllerBuilder, PartFields, PortBuilder, PortBus, RecipeBuilder, Trigger};
+use super::add_exchange::FrameNumbers;
+use super::ask::Ask;
+use super::draft::{ControllerBuilder, Counts, PartFields, PortBuilder, PortBus, RecipeBuilder, Trigger};
 use super::error::{ConfigError, ConfigErrorKind as Kind, ControllerKey, Counted, Place, PortKey, RecipeKey};
 use super::fields::{CanFields, Does, Entries, Fields, InputField, OutputField, Sends, plain};
 use super::rules::{check_bit, check_name, check_room, text};
@@ -109,10 +111,13 @@ impl ConfigMut<'_> {
     /// See there.
     pub(crate) fn add_recipe(&mut self, from: &RecipeBuilder<'_>) -> Result<u8, ConfigError> {
         let (fields, commands) = (self.fields.len(), self.commands.len());
+        let (exchanges, frames) = (self.exchanges.len(), self.frames.len());
         let added = self.try_add_recipe(from);
         if added.is_err() {
             self.fields.truncate(fields);
             self.commands.truncate(commands);
+            self.exchanges.truncate(exchanges);
+            self.frames.truncate(frames);
         }
         added
     }
@@ -121,11 +126,13 @@ impl ConfigMut<'_> {
         let recipe = self.recipes.len() as u8;
         let at = |key| Place::Recipe { recipe, key };
         let name = name(from.name, at(RecipeKey::Name))?;
-        let (fields, commands) = from.counts();
+        let Counts { fields, commands, exchanges, frames } = from.counts();
         for (what, needed, room) in [
             (Counted::Recipes, self.recipes.len().saturating_add(1), self.recipes.capacity()),
             (Counted::Fields, self.fields.len().saturating_add(fields), self.fields.capacity()),
             (Counted::Commands, self.commands.len().saturating_add(commands), self.commands.capacity()),
+            (Counted::Exchanges, self.exchanges.len().saturating_add(exchanges), self.exchanges.capacity()),
+            (Counted::ExchangeFrames, self.frames.len().saturating_add(frames), self.frames.capacity()),
         ] {
             check_room(at(RecipeKey::Whole), what, needed, room)?;
         }
@@ -144,6 +151,9 @@ impl ConfigMut<'_> {
             | (PartFields::Stream { .. }, PartFields::Can(_)) => {
                 return Err(ConfigError { place: at(RecipeKey::Whole), kind: Kind::MixedParts });
             }
+            (PartFields::Absent, PartFields::Absent) if from.exchanges.iter().any(Ask::is_can) => {
+                Parts::Can { input: Vec::new(), output: Vec::new() }
+            }
             (input, output) => Parts::Stream {
                 input: self.stream_part(recipe, Direction::Input, input)?,
                 output: self.stream_part(recipe, Direction::Output, output)?,
@@ -157,7 +167,10 @@ impl ConfigMut<'_> {
                 SendOn::Rising { var, bit }
             }
         };
-        let added = Recipe { on_stale: from.on_stale, send, ..Recipe::new(name, from.mode, parts) };
+        let mut added = Recipe { on_stale: from.on_stale, send, ..Recipe::new(name, from.mode, parts) };
+        let frames = |part| added.part_frames(part).count() as u8;
+        let frames = FrameNumbers { input: frames(Direction::Input), output: frames(Direction::Output) };
+        added.exchanges = self.add_exchanges(recipe, from.exchanges, frames)?;
         // There is room: checked above.
         let _ = self.recipes.push(added);
         Ok(recipe)
@@ -195,7 +208,7 @@ impl ConfigMut<'_> {
         Ok(frames)
     }
 
-    fn fields_of_part(
+    pub(super) fn fields_of_part(
         &mut self,
         recipe: u8,
         part: Direction,
@@ -392,6 +405,6 @@ fn name(given: &str, place: Place) -> Result<Name, ConfigError> {
 
 /// The range between two lengths of a list. Lists are shorter than `u16::MAX`; the check of the
 /// counts refuses others.
-fn span(start: usize, end: usize) -> Span {
+pub(super) fn span(start: usize, end: usize) -> Span {
     Span { start: start as u16, len: end.saturating_sub(start) as u16 }
 }

@@ -35,6 +35,8 @@ struct Needed {
     fields: usize,
     commands: usize,
     safe_values: usize,
+    exchanges: usize,
+    frames: usize,
 }
 
 impl<
@@ -74,7 +76,8 @@ impl<
     /// # Ok::<(), proto_core::config::ConfigError>(())
     /// ```
     pub const fn builder() -> ConfigBuilder<PORTS, RECIPES, ALL_FIELDS, COMMANDS, SAFE_VALUES, EXCHANGES> {
-        let needed = Needed { ports: 0, recipes: 0, fields: 0, commands: 0, safe_values: 0 };
+        let needed =
+            Needed { ports: 0, recipes: 0, fields: 0, commands: 0, safe_values: 0, exchanges: 0, frames: 0 };
         ConfigBuilder { config: Self::empty(), error: None, needed }
     }
 }
@@ -103,10 +106,12 @@ impl<
 
     /// Adds a recipe.
     pub fn recipe(mut self, recipe: RecipeBuilder<'_>) -> Self {
-        let (fields, commands) = recipe.counts();
+        let counts = recipe.counts();
         self.needed.recipes = self.needed.recipes.saturating_add(1);
-        self.needed.fields = self.needed.fields.saturating_add(fields);
-        self.needed.commands = self.needed.commands.saturating_add(commands);
+        self.needed.fields = self.needed.fields.saturating_add(counts.fields);
+        self.needed.commands = self.needed.commands.saturating_add(counts.commands);
+        self.needed.exchanges = self.needed.exchanges.saturating_add(counts.exchanges);
+        self.needed.frames = self.needed.frames.saturating_add(counts.frames);
         self.attempt(|config| config.add_recipe(&recipe).map(|_| ()));
         self
     }
@@ -150,6 +155,8 @@ impl<
                 Counted::Fields => self.needed.fields,
                 Counted::Commands => self.needed.commands,
                 Counted::SafeValues => self.needed.safe_values,
+                Counted::Exchanges => self.needed.exchanges,
+                Counted::ExchangeFrames => self.needed.frames,
                 // Lists of one recipe, and those of the engine.
                 _ => *needed,
             };

@@ -48,6 +48,8 @@ pub enum ExchangeError {
     },
     /// A broadcast that reads: nobody would answer.
     BroadcastRead,
+    /// A field of coils that is not one bit.
+    NotCoils,
     /// More slaves or other peers than one port can have.
     TooManyPeers,
     /// The count of registers or coils.
@@ -111,6 +113,7 @@ impl fmt::Display for ExchangeError {
             Self::BroadcastRead => {
                 f.write_str("slave 0 is all of them, which cannot be read; allowed: writes")
             }
+            Self::NotCoils => f.write_str("the fields of coils are one bit each; their type is Coil"),
             Self::TooManyPeers => {
                 write!(f, "one slave or other peer too many; allowed: up to {MAX_SLAVES} on a port")
             }

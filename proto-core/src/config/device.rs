@@ -65,6 +65,11 @@ pub(super) fn field_of(fields: &[FieldSpec], error: LayoutError) -> Option<u8> {
 }
 
 impl FieldSpec {
+    /// Whether only a received frame has such a field.
+    pub(super) const fn is_input(&self) -> bool {
+        matches!(self, Self::UserInput { .. } | Self::DeviceInput { .. } | Self::TextInput { .. })
+    }
+
     /// Whether a received value goes to a variable or picks a command.
     pub(super) fn acts(&self) -> bool {
         match self {

@@ -7,6 +7,8 @@
 //! `GatewayConfig<1, 1, 32, 0, 4>`: one port, one recipe, 32 fields, no commands, 4 safe values.
 
 mod add;
+mod add_exchange;
+mod ask;
 mod budget;
 mod builder;
 mod check_exchange;
@@ -31,13 +33,16 @@ mod source;
 mod validate;
 mod view;
 
+pub use ask::{Ask, AskFrame, Coil};
 pub use budget::{PartBudget, Warning, can_frame_time};
 pub use builder::ConfigBuilder;
 pub use check_exchange::ExchangeError;
 pub use command_text::CommandText;
 pub(crate) use command_text::{fill_in, placeholders};
 pub use device::DeviceFrame;
-pub use draft::{Can, ControllerBuilder, Listen, PortBuilder, PortBus, RecipeBuilder, SafeValues};
+pub use draft::{
+    Can, ControllerBuilder, Listen, PortBuilder, PortBus, RecipeBuilder, RtuLine, SafeValues, SerialLine,
+};
 pub use error::{
     ConfigError, ConfigErrorKind, ControllerKey, Counted, ExchangeKey, NetworkKey, Place, PortKey, RecipeKey,
 };

@@ -204,7 +204,7 @@ impl FileFrame {
 impl AskTiming {
     /// Of what is never asked.
     pub(super) const NEVER: Self =
-        Self { when: AskWhen::NEVER, timeout: DEFAULT_REPLY_TIMEOUT, retries: 0, pause: Duration::ZERO };
+        Self { when: AskWhen::NEVER, timeout: DEFAULT_REPLY_TIMEOUT, retries: 1, pause: Duration::ZERO };
 
     pub(super) fn read(table: &Reader<'_>) -> Result<Self> {
         let time = |key, longest| table.optional(key).map(|item| read_time(&item, longest)).transpose();

@@ -1,10 +1,11 @@
 //! What the keys of exchanges and of Modbus mean in the configuration.
 
 use proto_core::config::{
-    AskWhen, Bus, Exchange, FieldSpec, GatewayConfig, InputBinding, OutputBinding, Parts, Rs485, Span, Talk,
+    Ask, AskFrame, AskWhen, Bus, CanFields, Coil, Exchange, FieldSpec, GatewayConfig, InputBinding,
+    InputField, OutputBinding, OutputField, Parity, Parts, Port, Recipe, Rs485, Span, StateValue, Talk,
 };
-use proto_core::device::{Bits, ByteOrder, Encoding, Kind};
-use proto_core::modbus::rtu::Operation;
+use proto_core::device::{Algorithm, Bits, ByteOrder, Checksum, Encoding, Kind};
+use proto_core::modbus::rtu::{Operation, Table};
 use proto_core::sysvar::SysVar;
 use proto_core::time::Duration;
 use proto_core::wire::can::CanId;
@@ -192,15 +193,194 @@ fn tools_get_whole_frames() {
 }
 
 #[test]
-fn an_exchange_of_a_file_is_that_of_the_model() {
-    let config = line();
-    let span = |start, len| Span { start, len };
-    let first = exchanges(&config, 0)[0];
-    let expected = Talk::Rtu {
-        operation: Operation::ReadInputRegisters { address: 0x07D0, count: 5 },
-        written: span(0, 0),
-        read: span(0, 6),
+fn a_program_writes_what_a_file_says() {
+    let coil = Coil;
+    let position = Encoding::scalar(ScalarType::Float).big_endian();
+    let total = Encoding::scalar(ScalarType::Dword).ordered(ByteOrder::BigSwapped);
+    let crc = Checksum::standard(Algorithm::named("xor8").unwrap());
+    let built: GatewayConfig = GatewayConfig::builder()
+        .controller("192.168.12.138")
+        .recipe(
+            Recipe::user("line").exchanges(&[
+                Ask::read_input_registers(
+                    9,
+                    0x07D0,
+                    &[
+                        InputField::variable(total, "WordInputReg[1]").wrapping(),
+                        InputField::commands(ScalarType::Byte, &[(1, "stop")]),
+                        InputField::padding(1),
+                        InputField::constant(ScalarType::Word, 7),
+                        InputField::variable(Encoding::bit(ScalarType::Word, 3), "WordInputReg[2]"),
+                        InputField::unused(Encoding::bits(ScalarType::Word, 4..=7).big_endian().shared()),
+                    ],
+                )
+                .every(ms(100))
+                .timeout(ms(50))
+                .retries(2)
+                .pause(ms(5)),
+                Ask::read_write_registers(
+                    9,
+                    (0x10, &[InputField::variable(position, "WordInputReg[3]")]),
+                    (
+                        0x20,
+                        &[
+                            OutputField::variable(ScalarType::Short, "WordOutputReg[1]"),
+                            OutputField::padding(2, 0xFF),
+                        ],
+                    ),
+                )
+                .at_start()
+                .on_change()
+                .on_rising("BitOutputReg[3]", 0),
+                Ask::read_coils(
+                    5,
+                    0,
+                    &[
+                        InputField::variable(coil, "WordInputReg[4]"),
+                        InputField::padding(3),
+                        InputField::commands(coil, &[(1, "run(pick.jspf,50)")]),
+                        InputField::constant(coil, 1),
+                        InputField::padding(12),
+                        InputField::unused(coil),
+                        InputField::padding(9),
+                    ],
+                )
+                .every(ms(20)),
+                Ask::write_coil(5, 0xAC, &[OutputField::variable(coil, "WordOutputReg[2]")]).on_change(),
+                Ask::write_coils(
+                    0,
+                    0,
+                    &[
+                        OutputField::constant(coil, 1.0),
+                        OutputField::padding(1, 0),
+                        OutputField::counter(coil),
+                    ],
+                )
+                .every(ms(1000)),
+                Ask::write_register(6, 1, &[OutputField::variable(ScalarType::Word, "WordOutputReg[3]")])
+                    .every(ms(500)),
+            ]),
+        )
+        .recipe(Recipe::user("plc").exchanges(&[
+            Ask::served(
+                5,
+                Table::HoldingRegisters,
+                0,
+                &[
+                    OutputField::variable(ScalarType::Float, "RobotState[8]"),
+                    OutputField::constant(ScalarType::Word, 1.0),
+                ],
+            ),
+            Ask::served(5, Table::HoldingRegisters, 100, &[InputField::variable(total, "WordInputReg[10]")]),
+            Ask::served(
+                5,
+                Table::DiscreteInputs,
+                0,
+                &[
+                    OutputField::state(coil, StateValue::parse("mode").unwrap()),
+                    OutputField::padding(8, 0),
+                    OutputField::constant(coil, 1.0),
+                ],
+            ),
+            Ask::served(5, Table::Coils, 7, &[InputField::commands(coil, &[(1, "stop")])]),
+        ]))
+        .recipe(
+            Recipe::user("talk").exchanges(&[Ask::request(AskFrame::stream(
+                &[2],
+                &[3],
+                &[
+                    OutputField::constant(ScalarType::Byte, 87.0),
+                    OutputField::constant(ScalarType::Byte, 63.0),
+                    OutputField::checksum(crc),
+                ],
+            ))
+            .reply(AskFrame::stream(
+                &[2],
+                &[3],
+                &[
+                    InputField::constant(ScalarType::Byte, 87),
+                    InputField::variable(total, "WordInputReg[11]").wrapping(),
+                    InputField::checksum(crc),
+                ],
+            ))
+            .refusal(AskFrame::stream(
+                &[],
+                &[],
+                &[InputField::constant(ScalarType::Byte, 0x15), InputField::unused(ScalarType::Byte)],
+            ))
+            .peer(3)
+            .every(ms(50))]),
+        )
+        .recipe(
+            Recipe::user("drive")
+                .can_input(&[CanFields::standard(
+                    0x181,
+                    &[InputField::variable(ScalarType::Word, "WordInputReg[13]")],
+                )])
+                .exchanges(&[Ask::request(AskFrame::remote(CanId::Standard(0x701)))
+                    .reply(AskFrame::can(
+                        CanId::Standard(0x701),
+                        &[InputField::variable(ScalarType::Byte, "WordInputReg[15]")],
+                    ))
+                    .peer(1)
+                    .every(ms(100))]),
+        )
+        .port(Port::modbus_rtu("line", "line").baud(19_200).parity(Parity::Even).timeout(ms(2000)).echo())
+        .port(Port::modbus_rtu("plc", "plc").idle_gap(ms(3)))
+        .port(Port::rs485("talk", "talk"))
+        .port(Port::can("drive", "drive"))
+        .build()
+        .unwrap();
+    let file = line();
+    for recipe in 0..4 {
+        let (file, built) = (shown(&file, recipe), shown(&built, recipe));
+        match recipe {
+            // The file has more of them.
+            2 => assert_eq!(file[..built.len()], built[..]),
+            3 => assert_eq!(file[1..], built[..]),
+            _ => assert_eq!(file, built),
+        }
+    }
+    assert_eq!(file.ports, built.ports);
+}
+
+/// The exchanges of a recipe, with their frames and fields in place of ranges; constants of requests are
+/// those of replies.
+fn shown(config: &GatewayConfig, recipe: usize) -> Vec<String> {
+    let fields = |span: Span| span.of(&config.fields).iter().map(show_field).collect::<Vec<_>>();
+    let frame = |nth: Option<u8>| {
+        let frame = config.frames.get(usize::from(nth?)).unwrap();
+        Some((frame.id, frame.remote, &frame.head, &frame.tail, fields(frame.fields)))
     };
-    assert_eq!(first.talk, expected);
-    assert_eq!(Encoding::scalar(ScalarType::Word).size(), Some(2));
+    let show = |exchange: &Exchange| {
+        let timing = (exchange.peer, exchange.when, exchange.timeout, exchange.retries, exchange.pause);
+        match exchange.talk {
+            Talk::Rtu { operation, written, read } | Talk::Served { operation, written, read } => {
+                format!("{timing:?} {operation:?} {:?} {:?}", fields(written), fields(read))
+            }
+            Talk::Frames { request, reply, refusal } => {
+                format!("{timing:?} {:?} {:?} {:?}", frame(request), frame(reply), frame(refusal))
+            }
+        }
+    };
+    exchanges(config, recipe).iter().map(show).collect()
+}
+
+fn show_field(field: &FieldSpec) -> String {
+    match *field {
+        // A text of a file is constants.
+        FieldSpec::Fixed { encoding, value } if encoding == Encoding::scalar(ScalarType::Byte) => {
+            format!("constant {value}")
+        }
+        FieldSpec::UserOutput { ty: ScalarType::Byte, from: OutputBinding::Constant(value) } => {
+            format!("constant {value}")
+        }
+        FieldSpec::DeviceInput { encoding, overflow, to: InputBinding::Commands { when, .. } } => {
+            format!("commands {encoding:?} {overflow:?} {when:?}")
+        }
+        FieldSpec::UserInput { ty, to: InputBinding::Commands { when, .. } } => {
+            format!("commands {ty} {when:?}")
+        }
+        other => format!("{other:?}"),
+    }
 }

@@ -7,6 +7,7 @@ mod document_examples;
 mod example_files;
 mod exchange_files;
 mod framing_files;
+mod golden_images;
 mod wrong_devices;
 mod wrong_exchanges;
 mod wrong_files;
