@@ -60,6 +60,7 @@ fn defaults_are_those_of_a_file() {
         stop_bits: 1,
         idle_gap: ms(50),
         turnaround: Duration::from_micros(100),
+        echo: false,
     };
     assert_eq!(config.ports[0].bus, Bus::Rs485(line));
     assert_eq!(config.ports[1].bus, Bus::Can { bitrate: 500_000 });
@@ -179,7 +180,7 @@ fn everything_that_is_said_is_in_it() {
     let times = [port.cycle, port.timeout, port.stale_after].map(Duration::as_millis);
     assert_eq!(times, [20, 30, 40]);
     let safe = |port: &Port| port.on_timeout.of(&config.safe_values)[0];
-    assert_eq!(safe(port), SafeValue { var: var("WordInputReg[1]"), value: Scalar::Word(7) });
+    assert_eq!(safe(port), SafeValue::new(var("WordInputReg[1]"), Scalar::Word(7)));
     assert_eq!(safe(&config.ports[1]).value, Scalar::Byte(1));
     assert_eq!(config.ports[1].bus, Bus::Can { bitrate: 250_000 });
     assert_eq!(config.ports[2].bus, Bus::UdpListen { listen: "0.0.0.0:50000".try_into().unwrap() });

@@ -12,9 +12,10 @@ use proto_core::config::image::{
 };
 use proto_core::config::{
     BoardAddress, Bus, CommandWhen, FieldSpec, GatewayConfig, InputBinding, OnStale, OutputBinding, Parity,
-    Parts, PortValue, SendOn,
+    Parts, PortValue, SendOn, Talk,
 };
 use proto_core::device::{Algorithm, Boundary, ByteOrder, Counts, Escape, Kind, Overflow, TextWidth, Width};
+use proto_core::modbus::rtu::Operation;
 use proto_core::recipe::model::Mode;
 use proto_core::sysvar::SysVar;
 use proto_core::wire::can::CanId;
@@ -182,6 +183,8 @@ fn serialized_types_are_those_of_the_version() {
         Escape,
         Counts,
         TextWidth,
+        Operation,
+        Talk,
         GatewayConfig,
     );
     let mut said = String::new();

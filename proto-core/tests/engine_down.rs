@@ -376,6 +376,6 @@ fn polling_early_is_harmless() {
 
 #[test]
 fn four_ports_and_a_recipe_link_take_less_than_36_kib() {
-    let size = size_of::<proto_core::engine::Engine<4, 1, 128>>();
+    let size = size_of::<proto_core::engine::Engine<4, 1, 128, 0, 0>>();
     assert!(size <= 36 * 1024, "{size} bytes");
 }

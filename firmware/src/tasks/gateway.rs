@@ -30,11 +30,13 @@ pub const MAX_FIELD_PORTS: usize = 4;
 pub const MAX_UPLINKS: usize = 2;
 /// User-defined fields in one direction, over all ports.
 pub const MAX_FIELDS: usize = 128;
+/// Exchanges with devices, over all ports.
+pub const MAX_EXCHANGES: usize = 32;
 /// Recipe links, and command, urgent commands, state and Modbus.
 pub const MAX_LINKS: usize = Engine::MAX_LINKS;
 
 /// The engine in the size of a board.
-pub type Engine = AnyEngine<MAX_FIELD_PORTS, MAX_UPLINKS, MAX_FIELDS>;
+pub type Engine = AnyEngine<MAX_FIELD_PORTS, MAX_UPLINKS, MAX_FIELDS, 0, MAX_EXCHANGES>;
 
 /// The engine and what every task shares with it.
 pub struct Gateway {

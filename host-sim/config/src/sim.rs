@@ -5,7 +5,7 @@ use std::net::{IpAddr, Ipv4Addr};
 
 use proto_core::config::Rs485;
 use proto_core::recipe::model;
-use proto_core::sysvar::SysVar;
+use proto_core::sysvar::{SysVar, VarBit};
 use proto_core::time::Duration;
 use proto_core::wire::can::CanId;
 
@@ -127,6 +127,8 @@ pub enum InitialTarget {
         /// 1-based.
         index: u8,
     },
+    /// One bit of a system variable, such as `BitInputReg[3].4`.
+    VarBit(VarBit),
     /// One analog input of the cabinet or the tool, in mA or V.
     Analog {
         /// The group.
@@ -140,6 +142,7 @@ impl fmt::Display for InitialTarget {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Var(var) => var.fmt(f),
+            Self::VarBit(bit) => bit.fmt(f),
             Self::Bit { group, index } => write!(f, "{}[{index}]", group.name()),
             Self::Analog { group, index } => write!(f, "{}[{index}]", group.name()),
         }

@@ -3,7 +3,7 @@
 use std::fmt;
 use std::str::FromStr;
 
-use proto_core::sysvar::{ParseError, SysVar};
+use proto_core::sysvar::{ParseError, SysVar, VarBit};
 
 use super::{AnalogInput, BitGroup, InitialTarget};
 
@@ -18,6 +18,8 @@ pub enum TargetError {
         /// Its last index; the first is 1.
         last: u8,
     },
+    /// The variable has no such bit.
+    Bit(VarBit),
     /// No group of bits or analog inputs, and no system variable either.
     Variable(ParseError),
 }
@@ -26,6 +28,11 @@ impl fmt::Display for TargetError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Index { group, last } => write!(f, "there is only {group}[1..{last}]"),
+            Self::Bit(VarBit { var, bit }) if var.is_bits() => {
+                let last = var.valid_bits().count_ones().saturating_sub(1);
+                write!(f, "{var} has no bit {bit}; allowed: 0..={last}")
+            }
+            Self::Bit(VarBit { var, .. }) => write!(f, "{var} is a {} without bits", var.ty()),
             Self::Variable(error) => {
                 let bits: Vec<_> = BitGroup::ALL.into_iter().map(BitGroup::name).collect();
                 let analog: Vec<_> = AnalogInput::ALL.into_iter().map(AnalogInput::name).collect();
@@ -53,6 +60,10 @@ impl FromStr for InitialTarget {
         }
         if let Some(group) = AnalogInput::ALL.into_iter().find(|group| group.name() == word) {
             return Ok(Self::Analog { group, index: within(group.name(), group.count())? });
+        }
+        if let Some(bit) = VarBit::parse(name) {
+            let bit = bit.map_err(TargetError::Variable)?;
+            return if bit.mask().is_some() { Ok(Self::VarBit(bit)) } else { Err(TargetError::Bit(bit)) };
         }
         SysVar::parse(name).map(Self::Var).map_err(TargetError::Variable)
     }

@@ -282,6 +282,7 @@ impl Controller {
             Call::Get { name } => Some(match name.parse() {
                 Ok(InitialTarget::Var(var)) => Answer::Value(self.registers.var(var)),
                 Ok(InitialTarget::Bit { group, index }) => Answer::Bit(self.registers.bit(group, index)),
+                Ok(target @ InitialTarget::VarBit(_)) => Answer::Bit(self.registers.value(target) != 0.0),
                 Ok(target) => Answer::Value(Scalar::Double(self.registers.value(target))),
                 Err(error) => Answer::Error(format!("{name}: {error}")),
             }),

@@ -2,8 +2,8 @@
 
 use proto_core::config::{DeviceFrame, FieldSpec, OutputBinding, Words};
 use proto_core::device::{
-    Algorithm, Bits, Boundary, ByteOrder, Checksum, Counts, Digits, Encoding, Escape, Kind, Length, Place,
-    Text, TextWidth, Width,
+    Algorithm, Bits, Boundary, ByteOrder, Carrier, Checksum, Counts, Digits, Encoding, Escape, Kind, Length,
+    Place, Text, TextWidth, Width,
 };
 use proto_core::sysvar::Direction;
 use proto_core::wire::scalar::ScalarType;
@@ -33,18 +33,21 @@ pub(super) fn show(recipe: &DeviceRecipe, part: Direction) -> String {
         if let Some(id) = frame.id {
             report += &format!("    id {}\n", text::show_id(id));
         }
-        // Cannot fail: reading the file laid out the same frames.
-        let Ok(laid_out) = frame.lay_out(recipe.carrier, part) else { continue };
-        let rows = rows(frame, &laid_out, part);
-        let width = |column: fn(&Row) -> &String| {
-            rows.iter().map(|row| column(row).chars().count()).max().unwrap_or(0)
-        };
-        let (places, names) = (width(|row| &row.place), width(|row| &row.name));
-        for Row { place, name, what } in &rows {
-            report += &format!("    {place:places$}  {name:names$}  {what}\n");
-        }
+        report += &show_bytes(frame, recipe.carrier, part);
     }
     report
+}
+
+/// One frame, a line for each run of bytes.
+pub(super) fn show_bytes(frame: &NamedFrame, carrier: Carrier, part: Direction) -> String {
+    // Cannot fail: reading the file laid out the same frames.
+    let Ok(laid_out) = frame.lay_out(carrier, part) else { return String::new() };
+    let rows = rows(frame, &laid_out, part);
+    let width =
+        |column: fn(&Row) -> &String| rows.iter().map(|row| column(row).chars().count()).max().unwrap_or(0);
+    let (places, names) = (width(|row| &row.place), width(|row| &row.name));
+    let show = |Row { place, name, what }: &Row| format!("    {place:places$}  {name:names$}  {what}\n");
+    rows.iter().map(show).collect()
 }
 
 fn rows(frame: &NamedFrame, laid_out: &DeviceFrame, part: Direction) -> Vec<Row> {
@@ -89,6 +92,9 @@ fn rows(frame: &NamedFrame, laid_out: &DeviceFrame, part: Direction) -> Vec<Row>
                 add(place, &field.name, format!("{} <- {}", show_text(&text), show_words(from)));
             }
             FieldSpec::Length(length) => add(place, &field.name, show_length(&length)),
+            FieldSpec::UserOutput { .. } | FieldSpec::DeviceOutput { .. } if field.is_coil => {
+                add(place, &field.name, format!("FF for 1, 00 for 0{}", show_use(&field.spec)));
+            }
             spec => {
                 let Some(encoding) = spec.element().and_then(|element| element.encoding()) else { continue };
                 let uses = if field.picks_commands { " -> commands".to_owned() } else { show_use(&spec) };
@@ -191,8 +197,12 @@ fn show_encoding(encoding: &Encoding) -> String {
     kind + order
 }
 
-/// The constant, or the variable, behind how the field is written.
+/// The constant, the variable or the bit behind how the field is written.
 fn show_use(spec: &FieldSpec) -> String {
+    if let Some(bit) = spec.bit() {
+        let is_input = matches!(spec, FieldSpec::UserInput { .. } | FieldSpec::DeviceInput { .. });
+        return format!(" {} {bit}", if is_input { "->" } else { "<-" });
+    }
     match (*spec, spec.variable()) {
         (FieldSpec::Fixed { value, .. }, _) => format!(" = {value}"),
         (FieldSpec::UserInput { .. } | FieldSpec::DeviceInput { .. }, Some(var)) => format!(" -> {var}"),
@@ -203,7 +213,7 @@ fn show_use(spec: &FieldSpec) -> String {
             OutputBinding::Reply => " <- reply".into(),
             OutputBinding::State { value, .. } => format!(" <- {value}"),
             OutputBinding::Port { value, .. } => format!(" <- {} of the port", value.name()),
-            OutputBinding::Variable { .. } => String::new(),
+            OutputBinding::Variable { .. } | OutputBinding::Bit { .. } => String::new(),
         },
         _ => String::new(),
     }

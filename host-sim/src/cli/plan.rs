@@ -2,7 +2,7 @@
 
 use proto_core::config::{Bus, FieldSpec, GatewayConfig, InputBinding, OutputBinding, SendOn};
 use proto_core::engine::{LinkId, Plan, PortId, Source, WayUp};
-use proto_core::sysvar::{Direction, ModbusPlace, SysVar};
+use proto_core::sysvar::{Direction, ModbusPlace, SysVar, VarBit};
 
 const STATE_STREAM: &str = "<- controller: state stream, 10 a second";
 
@@ -15,6 +15,9 @@ pub(super) fn show(config: &GatewayConfig) -> String {
     for (_, port, recipe) in config.view().field_ports() {
         let up = config.view().written_by(recipe).map(|var| (var, way_up(config, &plan, var)));
         add(&mut lines, &port.name, up);
+        add_bits(&mut lines, &port.name, config.view().bits_written_by(recipe), |bit| {
+            way_up(config, &plan, bit.var)
+        });
         for (value, var) in port.health.iter() {
             let what = format!("{} in {var}", value.name());
             lines.push((port.name.to_string(), what, way_up(config, &plan, var)));
@@ -36,12 +39,16 @@ pub(super) fn show(config: &GatewayConfig) -> String {
             SendOn::Rising { var, .. } => Some(var),
             _ => None,
         };
-        let shown = config
-            .view()
-            .fields_of(recipe, Direction::Output)
-            .flat_map(|(_, _, field)| field.variables())
-            .chain(trigger);
-        add(&mut lines, &port.name, shown.map(|var| (var, source(config, &plan, var))));
+        let fields = || config.view().fields_of(recipe, Direction::Output).map(|(_, _, field)| field);
+        let shown = fields().filter(|field| field.bit().is_none()).flat_map(FieldSpec::variables);
+        add(&mut lines, &port.name, shown.chain(trigger).map(|var| (var, source(config, &plan, var))));
+        add_bits(&mut lines, &port.name, fields().filter_map(FieldSpec::bit), |bit| {
+            // A bit that a port drives is shown as that port last sent it.
+            match plan.bit_owner(bit) {
+                Some(port) => format!("<- port {}", port_name(config, port)),
+                None => source(config, &plan, bit.var),
+            }
+        });
         for (_, _, field) in config.view().fields_of(recipe, Direction::Output) {
             let (what, from) = match field.source() {
                 Some(OutputBinding::State { value, .. }) => (value.to_string(), STATE_STREAM.into()),
@@ -90,6 +97,29 @@ fn add(lines: &mut Vec<(String, String, String)>, port: &str, ways: impl Iterato
             format!("{}[{}..{}]", first.group(), first.index(), last.index())
         };
         lines.push((port.to_owned(), name, way));
+    }
+}
+
+/// Adds one line for the bits of each byte that go the same way.
+fn add_bits(
+    lines: &mut Vec<(String, String, String)>,
+    port: &str,
+    bits: impl Iterator<Item = VarBit>,
+    way: impl Fn(VarBit) -> String,
+) {
+    let mut bytes: Vec<(SysVar, String, Vec<u8>)> = Vec::new();
+    for bit in bits {
+        let way = way(bit);
+        match bytes.iter_mut().find(|(var, other, _)| *var == bit.var && *other == way) {
+            Some((_, _, bits)) => bits.push(bit.bit),
+            None => bytes.push((bit.var, way, vec![bit.bit])),
+        }
+    }
+    for (var, way, mut bits) in bytes {
+        bits.sort_unstable();
+        bits.dedup();
+        let bits: Vec<_> = bits.iter().map(u8::to_string).collect();
+        lines.push((port.to_owned(), format!("{var}.{}", bits.join(",")), way));
     }
 }
 

@@ -55,15 +55,17 @@ fn check_says_how_full_lines_are_which_way_variables_go_and_what_goes_on_the_pen
 #[test]
 fn check_draws_the_frames_of_a_device() {
     insta::assert_snapshot!("check_gripper", checked("gripper.toml", &[]));
+    insta::assert_snapshot!("check_modbus_line", checked("modbus-line.toml", &[]));
     insta::assert_snapshot!("check_force_sensor_crc", checked("force-sensor-crc.toml", &[]));
     insta::assert_snapshot!("check_scale", checked("scale.toml", &[]));
     insta::assert_snapshot!("check_can_panel", checked("can-panel.toml", &[]));
+    insta::assert_snapshot!("check_two_panels", checked("two-panels.toml", &[]));
 }
 
 #[test]
 fn decode_says_what_the_checksum_should_be() {
     let stdin = "09 17 06 F9 00 00 DC D0 1F 4E 11\n";
-    let output = host_sim(&["decode", &path("gripper.toml"), "--part", "input"], stdin);
+    let output = host_sim(&["decode", &path("gripper.toml"), "--part", "reply"], stdin);
     let notes = String::from_utf8(output.stderr).unwrap();
     assert_eq!(output.status.code(), Some(2), "{notes}");
     assert!(notes.contains("the checksum is 4E 11 instead of 8F D1"), "{notes}");

@@ -26,9 +26,10 @@ fn gripper(case: &Case) {
     let mut gateway = case.cell("gripper.toml", &robot);
     gateway.until_up(Link::Modbus, 1);
     let mut device = gateway.line("gripper");
-    device.until(&REQUEST);
     // Each byte of the position that one bit changed, before a good reply has come.
     for bit in 0..8 {
+        device.until(&REQUEST);
+        device.forget();
         let mut wrong = REPLY;
         wrong[POSITION] ^= 1 << bit;
         device.send(&wrong);
@@ -36,6 +37,7 @@ fn gripper(case: &Case) {
     let status = gateway.until_bytes_in("gripper", 8 * REPLY.len() as u64);
     assert_eq!(status.frames_in, 0, "{status:?}");
     assert_eq!(robot.variable("WordInputReg[4]"), 0.0, "a damaged position reached the robot");
+    device.until(&REQUEST);
     device.send(&REPLY);
     robot.until("WordInputReg[4]", 208.0);
     let values = [
@@ -48,6 +50,8 @@ fn gripper(case: &Case) {
         robot.until(name, value);
     }
     // Another one keeps what was there.
+    device.forget();
+    device.until(&REQUEST);
     let mut wrong = REPLY;
     wrong[POSITION] = 66;
     device.send(&wrong);

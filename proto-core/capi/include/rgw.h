@@ -12,7 +12,7 @@
 
 // Memory for a configuration, in bytes: enough on every machine. It is needed until
 // `rgw_gateway_configure` has returned.
-#define RGW_CONFIG_SIZE 20480
+#define RGW_CONFIG_SIZE 21504
 
 // Field ports that a gateway has room for.
 #define RGW_MAX_PORTS 4
@@ -23,8 +23,11 @@
 // User-defined fields on all ports together that a gateway has room for, in each direction.
 #define RGW_MAX_FIELDS 128
 
+// Maximum number of exchanges with devices of all ports together.
+#define RGW_MAX_EXCHANGES 16
+
 // Memory for a gateway, in bytes: enough on every machine.
-#define RGW_GATEWAY_SIZE 40960
+#define RGW_GATEWAY_SIZE 49152
 
 // Number of the link to port 2000.
 #define RGW_LINK_COMMAND 0
@@ -303,7 +306,7 @@ typedef uint8_t rgw_reply_code;
 #endif // __cplusplus
 
 // A configuration in the caller's memory: at most 6 ports, 6 recipes with 256 fields together, 32
-// commands and 32 safe values.
+// commands, 32 safe values and 16 exchanges.
 typedef struct rgw_config rgw_config;
 
 // A gateway in the caller's memory; it must not be moved.
@@ -385,6 +388,10 @@ typedef struct rgw_port_counters {
   uint32_t skipped_cycles;
   // Cycles in which no output frame was sent because its sources were stale or unknown.
   uint32_t stale_cycles;
+  // Requests without a good reply, after all repetitions.
+  uint32_t unanswered;
+  // Requests that the device refused.
+  uint32_t refused;
   // Times an input frame became overdue.
   uint32_t timeouts;
   // Times the device was reported gone.

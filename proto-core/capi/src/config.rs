@@ -13,13 +13,13 @@ const _: () = assert!(RGW_IMAGE_VERSION == image::VERSION);
 
 /// Memory for a configuration, in bytes: enough on every machine. It is needed until
 /// `rgw_gateway_configure` has returned.
-pub const RGW_CONFIG_SIZE: usize = 20_480;
+pub const RGW_CONFIG_SIZE: usize = 21_504;
 const _: () = assert!(size_of::<Config>() <= RGW_CONFIG_SIZE);
 
 /// A configuration in the caller's memory: at most 6 ports, 6 recipes with 256 fields together, 32
-/// commands and 32 safe values.
+/// commands, 32 safe values and 16 exchanges.
 #[derive(Debug)]
-pub struct Config(pub(crate) GatewayConfig<6, 6, 256, 32, 32>);
+pub struct Config(pub(crate) GatewayConfig<6, 6, 256, 32, 32, { crate::gateway::RGW_MAX_EXCHANGES }>);
 
 /// The bus of a port.
 #[repr(u8)]

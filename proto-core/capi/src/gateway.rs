@@ -14,14 +14,17 @@ pub const RGW_MAX_RECIPE_LINKS: usize = 2;
 /// User-defined fields on all ports together that a gateway has room for, in each direction.
 pub const RGW_MAX_FIELDS: usize = 128;
 
+/// Maximum number of exchanges with devices of all ports together.
+pub const RGW_MAX_EXCHANGES: usize = 16;
+
 /// Memory for a gateway, in bytes: enough on every machine.
-pub const RGW_GATEWAY_SIZE: usize = 40_960;
+pub const RGW_GATEWAY_SIZE: usize = 49_152;
 const _: () = assert!(size_of::<Gateway>() <= RGW_GATEWAY_SIZE);
 
 /// A gateway in the caller's memory; it must not be moved.
 #[derive(Debug)]
 pub struct Gateway {
-    pub(crate) engine: Engine<RGW_MAX_PORTS, RGW_MAX_RECIPE_LINKS, RGW_MAX_FIELDS>,
+    pub(crate) engine: Engine<RGW_MAX_PORTS, RGW_MAX_RECIPE_LINKS, RGW_MAX_FIELDS, 0, RGW_MAX_EXCHANGES>,
 }
 
 /// Size of a gateway on this machine, in bytes; at most `RGW_GATEWAY_SIZE`.

@@ -121,6 +121,9 @@ fn fields(
                             _ => CommandWhen::Frame,
                         },
                     },
+                    2 if kind >> 6 == 3 => {
+                        InputBinding::Bit { var: var(input, Direction::Input), bit: input.u8() & 7 }
+                    }
                     _ => InputBinding::Variable { var: var(input, Direction::Input), scale, offset },
                 },
             },
@@ -130,6 +133,7 @@ fn fields(
                     0 => OutputBinding::Counter,
                     1 => OutputBinding::Reply,
                     2 => OutputBinding::Constant(f64::from(kind)),
+                    _ if kind >> 6 == 3 => OutputBinding::Bit { var: var(input, any), bit: input.u8() & 7 },
                     _ => OutputBinding::Variable { var: var(input, any), scale, offset },
                 },
             },

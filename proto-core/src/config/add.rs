@@ -6,10 +6,12 @@
 
 use heapless::{String, Vec};
 
-use super::draft::{ControllerBuilder, PartFields, PortBuilder, PortBus, RecipeBuilder, Trigger};
+use super::add_exchange::FrameNumbers;
+use super::ask::Ask;
+use super::draft::{ControllerBuilder, Counts, PartFields, PortBuilder, PortBus, RecipeBuilder, Trigger};
 use super::error::{ConfigError, ConfigErrorKind as Kind, ControllerKey, Counted, Place, PortKey, RecipeKey};
 use super::fields::{CanFields, Does, Entries, Fields, InputField, OutputField, Sends, plain};
-use super::rules::{check_name, check_room, text};
+use super::rules::{check_bit, check_name, check_room, text};
 use super::view::ConfigMut;
 use super::{
     CanFramePart, CommandEntry, ControllerLink, Delimiter, FieldSpec, GatewayConfig, InputBinding, Name,
@@ -17,7 +19,7 @@ use super::{
 };
 use crate::command::ParseError;
 use crate::recipe::model::{MAX_CAN_IDS, MAX_DELIMITER};
-use crate::sysvar::{Direction, SysVar, VarRange};
+use crate::sysvar::{Direction, ParseError as VarError, SysVar, VarBit, VarRange};
 use crate::wire::dialect::Dialect;
 use crate::wire::scalar::Scalar;
 
@@ -27,7 +29,8 @@ impl<
     const ALL_FIELDS: usize,
     const COMMANDS: usize,
     const SAFE_VALUES: usize,
-> GatewayConfig<PORTS, RECIPES, ALL_FIELDS, COMMANDS, SAFE_VALUES>
+    const EXCHANGES: usize,
+> GatewayConfig<PORTS, RECIPES, ALL_FIELDS, COMMANDS, SAFE_VALUES, EXCHANGES>
 {
     /// Sets the controller's address, ports and dialect; the recipe link stays.
     ///
@@ -108,10 +111,13 @@ impl ConfigMut<'_> {
     /// See there.
     pub(crate) fn add_recipe(&mut self, from: &RecipeBuilder<'_>) -> Result<u8, ConfigError> {
         let (fields, commands) = (self.fields.len(), self.commands.len());
+        let (exchanges, frames) = (self.exchanges.len(), self.frames.len());
         let added = self.try_add_recipe(from);
         if added.is_err() {
             self.fields.truncate(fields);
             self.commands.truncate(commands);
+            self.exchanges.truncate(exchanges);
+            self.frames.truncate(frames);
         }
         added
     }
@@ -120,11 +126,13 @@ impl ConfigMut<'_> {
         let recipe = self.recipes.len() as u8;
         let at = |key| Place::Recipe { recipe, key };
         let name = name(from.name, at(RecipeKey::Name))?;
-        let (fields, commands) = from.counts();
+        let Counts { fields, commands, exchanges, frames } = from.counts();
         for (what, needed, room) in [
             (Counted::Recipes, self.recipes.len().saturating_add(1), self.recipes.capacity()),
             (Counted::Fields, self.fields.len().saturating_add(fields), self.fields.capacity()),
             (Counted::Commands, self.commands.len().saturating_add(commands), self.commands.capacity()),
+            (Counted::Exchanges, self.exchanges.len().saturating_add(exchanges), self.exchanges.capacity()),
+            (Counted::ExchangeFrames, self.frames.len().saturating_add(frames), self.frames.capacity()),
         ] {
             check_room(at(RecipeKey::Whole), what, needed, room)?;
         }
@@ -143,6 +151,9 @@ impl ConfigMut<'_> {
             | (PartFields::Stream { .. }, PartFields::Can(_)) => {
                 return Err(ConfigError { place: at(RecipeKey::Whole), kind: Kind::MixedParts });
             }
+            (PartFields::Absent, PartFields::Absent) if from.exchanges.iter().any(Ask::is_can) => {
+                Parts::Can { input: Vec::new(), output: Vec::new() }
+            }
             (input, output) => Parts::Stream {
                 input: self.stream_part(recipe, Direction::Input, input)?,
                 output: self.stream_part(recipe, Direction::Output, output)?,
@@ -156,7 +167,10 @@ impl ConfigMut<'_> {
                 SendOn::Rising { var, bit }
             }
         };
-        let added = Recipe { on_stale: from.on_stale, send, ..Recipe::new(name, from.mode, parts) };
+        let mut added = Recipe { on_stale: from.on_stale, send, ..Recipe::new(name, from.mode, parts) };
+        let frames = |part| added.part_frames(part).count() as u8;
+        let frames = FrameNumbers { input: frames(Direction::Input), output: frames(Direction::Output) };
+        added.exchanges = self.add_exchanges(recipe, from.exchanges, frames)?;
         // There is room: checked above.
         let _ = self.recipes.push(added);
         Ok(recipe)
@@ -194,7 +208,7 @@ impl ConfigMut<'_> {
         Ok(frames)
     }
 
-    fn fields_of_part(
+    pub(super) fn fields_of_part(
         &mut self,
         recipe: u8,
         part: Direction,
@@ -240,6 +254,10 @@ impl ConfigMut<'_> {
                 Does::Nothing => InputBinding::Unused,
                 Does::Writes { var, scale, offset } => {
                     InputBinding::Variable { var: var.read().map_err(Kind::Variable)?, scale, offset }
+                }
+                Does::WritesBit { name } => {
+                    let VarBit { var, bit } = read_bit(name)?;
+                    InputBinding::Bit { var, bit }
                 }
                 Does::Commands { entries, when, idle } => {
                     InputBinding::Commands { table: self.add_commands(entries, idle)?, when }
@@ -300,9 +318,14 @@ impl ConfigMut<'_> {
             check_room(Place::Port { port: index, key }, what, needed, room)?;
         }
         let added = match *safe {
-            SafeValues::Names(named) => self.add_safe_values(named.iter().map(|&(name, value)| {
-                SysVar::parse(name).map_err(Kind::Variable).and_then(|var| safe_value(var, value))
-            })),
+            SafeValues::Names(named) => {
+                self.add_safe_values(named.iter().map(|&(name, value)| match VarBit::parse(name) {
+                    Some(bit) => bit.map_err(Kind::Variable).and_then(|bit| safe_bit(bit, value)),
+                    None => {
+                        SysVar::parse(name).map_err(Kind::Variable).and_then(|var| safe_value(var, value))
+                    }
+                }))
+            }
             SafeValues::Vars(vars) => {
                 self.add_safe_values(vars.iter().map(|&(var, value)| safe_value(var, value)))
             }
@@ -333,11 +356,19 @@ impl ConfigMut<'_> {
     }
 }
 
+fn read_bit(name: &str) -> Result<VarBit, Kind> {
+    VarBit::parse(name).unwrap_or(Err(VarError::Syntax)).map_err(Kind::Variable)
+}
+
 fn output_spec(field: &OutputField<'_>) -> Result<FieldSpec, Kind> {
     field.on_wire.spec(|encoding, overflow| {
         let from = match field.sends {
             Sends::Variable { var, scale, offset } => {
                 OutputBinding::Variable { var: var.read().map_err(Kind::Variable)?, scale, offset }
+            }
+            Sends::Bit { name } => {
+                let VarBit { var, bit } = read_bit(name)?;
+                OutputBinding::Bit { var, bit }
             }
             Sends::Constant(value) => OutputBinding::Constant(value),
             Sends::Counter => OutputBinding::Counter,
@@ -356,7 +387,16 @@ fn output_spec(field: &OutputField<'_>) -> Result<FieldSpec, Kind> {
 
 fn safe_value(var: SysVar, value: f64) -> Result<SafeValue, Kind> {
     let value = Scalar::from_f64(var.ty(), value).map_err(Kind::Constant)?;
-    Ok(SafeValue { var, value })
+    Ok(SafeValue::new(var, value))
+}
+
+/// 0 or 1: that of a bit.
+fn safe_bit(bit: VarBit, value: f64) -> Result<SafeValue, Kind> {
+    check_bit(bit)?;
+    if value != 0.0 && value != 1.0 {
+        return Err(Kind::NotInField { value, low: 0.0, high: 1.0 });
+    }
+    Ok(SafeValue::bit(bit, value != 0.0))
 }
 
 fn name(given: &str, place: Place) -> Result<Name, ConfigError> {
@@ -365,6 +405,6 @@ fn name(given: &str, place: Place) -> Result<Name, ConfigError> {
 
 /// The range between two lengths of a list. Lists are shorter than `u16::MAX`; the check of the
 /// counts refuses others.
-fn span(start: usize, end: usize) -> Span {
+pub(super) fn span(start: usize, end: usize) -> Span {
     Span { start: start as u16, len: end.saturating_sub(start) as u16 }
 }

@@ -6,7 +6,10 @@
 
 use super::draft::{ControllerBuilder, PortBuilder, PortBus, RecipeBuilder};
 use super::error::{ConfigError, ConfigErrorKind as Kind, Counted};
-use super::{GatewayConfig, MAX_ALL_FIELDS, MAX_COMMANDS, MAX_PORTS, MAX_RECIPES, MAX_SAFE_VALUES, Network};
+use super::{
+    GatewayConfig, MAX_ALL_FIELDS, MAX_COMMANDS, MAX_EXCHANGES, MAX_PORTS, MAX_RECIPES, MAX_SAFE_VALUES,
+    Network,
+};
 
 /// A configuration under construction: [`GatewayConfig::builder`].
 #[derive(Debug, Clone)]
@@ -17,8 +20,9 @@ pub struct ConfigBuilder<
     const ALL_FIELDS: usize = MAX_ALL_FIELDS,
     const COMMANDS: usize = MAX_COMMANDS,
     const SAFE_VALUES: usize = MAX_SAFE_VALUES,
+    const EXCHANGES: usize = MAX_EXCHANGES,
 > {
-    config: GatewayConfig<PORTS, RECIPES, ALL_FIELDS, COMMANDS, SAFE_VALUES>,
+    config: GatewayConfig<PORTS, RECIPES, ALL_FIELDS, COMMANDS, SAFE_VALUES, EXCHANGES>,
     error: Option<ConfigError>,
     needed: Needed,
 }
@@ -31,6 +35,8 @@ struct Needed {
     fields: usize,
     commands: usize,
     safe_values: usize,
+    exchanges: usize,
+    frames: usize,
 }
 
 impl<
@@ -39,7 +45,8 @@ impl<
     const ALL_FIELDS: usize,
     const COMMANDS: usize,
     const SAFE_VALUES: usize,
-> GatewayConfig<PORTS, RECIPES, ALL_FIELDS, COMMANDS, SAFE_VALUES>
+    const EXCHANGES: usize,
+> GatewayConfig<PORTS, RECIPES, ALL_FIELDS, COMMANDS, SAFE_VALUES, EXCHANGES>
 {
     /// Builds a configuration in one expression; a recipe comes before the ports that use it.
     ///
@@ -68,8 +75,9 @@ impl<
     /// assert_eq!(config.fields.len(), 7);
     /// # Ok::<(), proto_core::config::ConfigError>(())
     /// ```
-    pub const fn builder() -> ConfigBuilder<PORTS, RECIPES, ALL_FIELDS, COMMANDS, SAFE_VALUES> {
-        let needed = Needed { ports: 0, recipes: 0, fields: 0, commands: 0, safe_values: 0 };
+    pub const fn builder() -> ConfigBuilder<PORTS, RECIPES, ALL_FIELDS, COMMANDS, SAFE_VALUES, EXCHANGES> {
+        let needed =
+            Needed { ports: 0, recipes: 0, fields: 0, commands: 0, safe_values: 0, exchanges: 0, frames: 0 };
         ConfigBuilder { config: Self::empty(), error: None, needed }
     }
 }
@@ -80,7 +88,8 @@ impl<
     const ALL_FIELDS: usize,
     const COMMANDS: usize,
     const SAFE_VALUES: usize,
-> ConfigBuilder<PORTS, RECIPES, ALL_FIELDS, COMMANDS, SAFE_VALUES>
+    const EXCHANGES: usize,
+> ConfigBuilder<PORTS, RECIPES, ALL_FIELDS, COMMANDS, SAFE_VALUES, EXCHANGES>
 {
     /// The controller: its address, or a [`ControllerBuilder`].
     pub fn controller<'a>(mut self, controller: impl Into<ControllerBuilder<'a>>) -> Self {
@@ -97,10 +106,12 @@ impl<
 
     /// Adds a recipe.
     pub fn recipe(mut self, recipe: RecipeBuilder<'_>) -> Self {
-        let (fields, commands) = recipe.counts();
+        let counts = recipe.counts();
         self.needed.recipes = self.needed.recipes.saturating_add(1);
-        self.needed.fields = self.needed.fields.saturating_add(fields);
-        self.needed.commands = self.needed.commands.saturating_add(commands);
+        self.needed.fields = self.needed.fields.saturating_add(counts.fields);
+        self.needed.commands = self.needed.commands.saturating_add(counts.commands);
+        self.needed.exchanges = self.needed.exchanges.saturating_add(counts.exchanges);
+        self.needed.frames = self.needed.frames.saturating_add(counts.frames);
         self.attempt(|config| config.add_recipe(&recipe).map(|_| ()));
         self
     }
@@ -131,7 +142,8 @@ impl<
     /// all items that were asked for.
     pub fn build(
         self,
-    ) -> Result<GatewayConfig<PORTS, RECIPES, ALL_FIELDS, COMMANDS, SAFE_VALUES>, ConfigError> {
+    ) -> Result<GatewayConfig<PORTS, RECIPES, ALL_FIELDS, COMMANDS, SAFE_VALUES, EXCHANGES>, ConfigError>
+    {
         let Some(mut error) = self.error else {
             self.config.validate()?;
             return Ok(self.config);
@@ -143,6 +155,8 @@ impl<
                 Counted::Fields => self.needed.fields,
                 Counted::Commands => self.needed.commands,
                 Counted::SafeValues => self.needed.safe_values,
+                Counted::Exchanges => self.needed.exchanges,
+                Counted::ExchangeFrames => self.needed.frames,
                 // Lists of one recipe, and those of the engine.
                 _ => *needed,
             };
@@ -154,7 +168,7 @@ impl<
     fn attempt(
         &mut self,
         add: impl FnOnce(
-            &mut GatewayConfig<PORTS, RECIPES, ALL_FIELDS, COMMANDS, SAFE_VALUES>,
+            &mut GatewayConfig<PORTS, RECIPES, ALL_FIELDS, COMMANDS, SAFE_VALUES, EXCHANGES>,
         ) -> Result<(), ConfigError>,
     ) {
         if self.error.is_none() {

@@ -1,17 +1,20 @@
 //! The checks that concern one recipe alone: its parts, the bindings of its user fields, its
 //! trigger.
 
-use super::error::{ConfigErrorKind as Kind, Place, RecipeKey};
-use super::rules::{Check, check_new_name, check_pool, fail, is_marked, mark};
+use super::check_exchange::ExchangeCheck;
+use super::device::field_of;
+use super::error::{ConfigError, ConfigErrorKind as Kind, Place, RecipeKey};
+use super::rules::{Check, check_bit, check_new_name, check_pool, fail, is_marked, mark};
 use super::{
     CanFramePart, CommandEntry, ConfigView, DeviceFrame, FieldSpec, InputBinding, MAX_COMMAND_TEXT,
     OutputBinding, Parts, Recipe, SendOn, Span, Words, placeholders,
 };
 use crate::command::Request;
 use crate::device::{Boundary, Encoding, LayoutError, Overflow};
+use crate::image::BitSet;
 use crate::recipe::model::{Framing, MAX_STREAM_FRAME, Mode, Rules};
 use crate::recipe::{CanLayout, PartError, StreamLayout};
-use crate::sysvar::{COUNT, Direction, SysVar};
+use crate::sysvar::{COUNT, Direction, SysVar, VarBit};
 use crate::wire::dialect::Dialect;
 use crate::wire::scalar::{Scalar, ScalarType};
 
@@ -30,13 +33,14 @@ impl<'a> RecipeCheck<'a> {
     pub(super) fn check(&self) -> Check {
         let names = self.config.recipes.iter().map(|recipe| &recipe.name);
         check_new_name(self.at(RecipeKey::Name), &self.recipe.name, self.index, names)?;
-        if !self.recipe.has(Direction::Input) && !self.recipe.has(Direction::Output) {
+        ExchangeCheck { config: self.config, index: self.index, recipe: self.recipe }.check()?;
+        if !self.has(Direction::Input) && !self.has(Direction::Output) {
             return fail(self.at(RecipeKey::Whole), Kind::NoParts);
         }
         // UDP needs the least of a stream recipe; it does not take user-defined recipes (D16).
         let framing = if self.recipe.mode == Mode::User { Framing::Bytes } else { Framing::Datagram };
         for part in [Direction::Input, Direction::Output] {
-            for (frame, span) in self.recipe.frames(part) {
+            for (frame, span) in self.config.frames_of(self.recipe, part) {
                 let place = Place::Frame { recipe: self.index, part, frame };
                 check_pool(place, span, self.config.fields.len())?;
             }
@@ -55,6 +59,10 @@ impl<'a> RecipeCheck<'a> {
             self.check_written_once()?;
         }
         self.check_send()
+    }
+
+    fn has(&self, part: Direction) -> bool {
+        self.config.has_frames(self.recipe, part)
     }
 
     fn at(&self, key: RecipeKey) -> Place {
@@ -128,6 +136,17 @@ impl<'a> RecipeCheck<'a> {
                 }
                 check_scale(place, scale, offset)
             }
+            InputBinding::Bit { var, bit } => {
+                if var.direction() != Direction::Input {
+                    return fail(place, Kind::NotAnInput { var });
+                }
+                check_bit(VarBit { var, bit }).map_err(|kind| ConfigError { place, kind })?;
+                match numbers.ty {
+                    _ if numbers.integers => Ok(()),
+                    Some(ty) => fail(place, Kind::NeedsInteger { ty }),
+                    None => fail(place, Kind::NeedsIntegers),
+                }
+            }
             InputBinding::Commands { table, .. } => {
                 if !numbers.integers {
                     return fail(
@@ -161,6 +180,9 @@ impl<'a> RecipeCheck<'a> {
                     return fail(place, Kind::ScaledCount);
                 }
                 check_scale(place, scale, offset)
+            }
+            OutputBinding::Bit { var, bit } => {
+                check_bit(VarBit { var, bit }).map_err(|kind| ConfigError { place, kind }).map(|_| ())
             }
             _ => Ok(()),
         }
@@ -226,20 +248,8 @@ impl<'a> RecipeCheck<'a> {
                     LayoutError::TooLong { len, room: MAX_STREAM_FRAME }
                 }
             };
-            // A checksum is a field, and no element.
-            let element = error.element().map(usize::from);
-            let field = match element {
-                Some(element) => {
-                    let is_element = |field: &(usize, &FieldSpec)| field.1.element().is_some();
-                    frame.fields.iter().enumerate().filter(is_element).nth(element).map(|(nth, _)| nth)
-                }
-                None if error.is_of_checksum() => {
-                    frame.fields.iter().rposition(|field| matches!(field, FieldSpec::Checksum(_)))
-                }
-                None => None,
-            };
-            let place = match field {
-                Some(field) => Place::Field { recipe, part, frame: frame.nth, field: field as u8 },
+            let place = match field_of(frame.fields, error) {
+                Some(field) => Place::Field { recipe, part, frame: frame.nth, field },
                 None => Place::Frame { recipe, part, frame: frame.nth },
             };
             return fail(place, Kind::Layout(error));
@@ -272,11 +282,27 @@ impl<'a> RecipeCheck<'a> {
     /// In a realtime recipe the layout checks this.
     fn check_written_once(&self) -> Check {
         let mut seen = [false; COUNT];
+        let mut bits = BitSet::EMPTY;
         for (frame, field, spec) in self.config.fields_of(self.recipe, Direction::Input) {
+            let place = Place::Field { recipe: self.index, part: Direction::Input, frame, field };
+            if let Some(bit) = spec.bit() {
+                let own = BitSet::of(bit.var, bit.mask().unwrap_or(0));
+                if is_marked(&seen, bit.var) {
+                    return fail(place, Kind::WholeAndBit { bit });
+                }
+                if !bits.and(own).is_empty() {
+                    return fail(place, Kind::BitWrittenTwice { bit });
+                }
+                bits = bits.or(own);
+            }
             for var in spec.variables() {
                 if is_marked(&seen, var) {
-                    let place = Place::Field { recipe: self.index, part: Direction::Input, frame, field };
                     return fail(place, Kind::WrittenTwice { var });
+                }
+                let before = bits.byte(var);
+                if before != 0 {
+                    let bit = VarBit { var, bit: before.trailing_zeros() as u8 };
+                    return fail(place, Kind::WholeAndBit { bit });
                 }
                 mark(&mut seen, var);
             }
@@ -293,22 +319,25 @@ impl<'a> RecipeCheck<'a> {
         if recipe.mode == Mode::Realtime {
             return fail(place, Kind::RealtimeSendsByPeriod);
         }
-        if !recipe.has(Direction::Output) {
+        if recipe.part_frames(Direction::Output).next().is_none() {
             return fail(place, Kind::NothingToSend);
         }
         match recipe.send {
             SendOn::Period | SendOn::Change => Ok(()),
-            SendOn::Frame if recipe.has(Direction::Input) => Ok(()),
+            SendOn::Frame if self.has(Direction::Input) => Ok(()),
             SendOn::Frame => fail(place, Kind::NoInputToAnswer),
-            SendOn::Rising { var, bit } => {
-                if !var.is_bits() {
-                    return fail(place, Kind::NotBits { var });
-                }
-                let is_there = 1_u8.checked_shl(bit.into()).is_some_and(|mask| var.valid_bits() & mask != 0);
-                if is_there { Ok(()) } else { fail(place, Kind::NoSuchBit { var, bit }) }
-            }
+            SendOn::Rising { var, bit } => check_trigger(place, var, bit),
         }
     }
+}
+
+/// A bit that triggers.
+pub(super) fn check_trigger(place: Place, var: SysVar, bit: u8) -> Check {
+    if !var.is_bits() {
+        return fail(place, Kind::NotBits { var });
+    }
+    let is_there = 1_u8.checked_shl(bit.into()).is_some_and(|mask| var.valid_bits() & mask != 0);
+    if is_there { Ok(()) } else { fail(place, Kind::NoSuchBit { var, bit }) }
 }
 
 /// The numbers that a field can have.

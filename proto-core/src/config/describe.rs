@@ -5,7 +5,9 @@
 
 use core::fmt;
 
-use super::error::{ConfigError, ConfigErrorKind, ControllerKey, NetworkKey, Place, PortKey, RecipeKey};
+use super::error::{
+    ConfigError, ConfigErrorKind, ControllerKey, ExchangeKey, NetworkKey, Place, PortKey, RecipeKey,
+};
 use super::{ConfigView, MAX_NAME, Name};
 use crate::device::Algorithm;
 use crate::recipe::model::Mode;
@@ -77,6 +79,10 @@ impl fmt::Display for Described<'_> {
                 }
                 write!(f, "field {}", one_based(field))?;
             }
+            Place::Exchange { recipe, exchange, key } => {
+                write!(f, "{}, exchange {}", RecipeName(*config, recipe), one_based(exchange))?;
+                f.write_str(key.name())?;
+            }
             Place::Command { entry } => write!(f, "command {}", u32::from(entry).saturating_add(1))?,
             Place::Port { port, key } => write!(f, "{}, {}", PortName(*config, port), key.name())?,
             Place::SafeValue { entry } => write!(f, "safe value {}", u32::from(entry).saturating_add(1))?,
@@ -106,6 +112,23 @@ impl NetworkKey {
     }
 }
 
+impl ExchangeKey {
+    fn name(self) -> &'static str {
+        match self {
+            Self::Whole => "",
+            Self::Peer => ", peer",
+            Self::Registers => ", registers or coils",
+            Self::Every => ", period",
+            Self::Rising => ", rising bit",
+            Self::Timeout => ", timeout",
+            Self::Pause => ", pause",
+            Self::Request => ", request",
+            Self::Reply => ", reply",
+            Self::Refusal => ", refusal",
+        }
+    }
+}
+
 impl PortKey {
     fn name(self) -> &'static str {
         match self {
@@ -119,6 +142,7 @@ impl PortKey {
             Self::StopBits => "stop bits",
             Self::IdleGap => "idle gap",
             Self::Turnaround => "turnaround",
+            Self::Echo => "echo",
             Self::Bitrate => "bitrate",
             Self::Listen => "listen",
             Self::Health => "health",
@@ -222,7 +246,7 @@ impl fmt::Display for DescribedKind<'_> {
             Kind::DuplicateName { other } => {
                 write!(f, "entry {} already has this name; names must differ", one_based(other))
             }
-            Kind::NoParts => f.write_str("a recipe needs an input part, an output part or both"),
+            Kind::NoParts => f.write_str("a recipe needs an input part, an output part or an exchange"),
             Kind::WrongField { mode: Mode::Realtime, .. } => {
                 f.write_str("the fields of a realtime recipe are system variables")
             }
@@ -245,6 +269,10 @@ impl fmt::Display for DescribedKind<'_> {
                 write!(f, "needs an integer field (byte, char, word, short, dword, int); this one is a {ty}")
             }
             Kind::Layout(error) => error.fmt(f),
+            Kind::Exchange(error) => error.fmt(f),
+            Kind::EchoNeedsExchanges => f.write_str(
+                "allowed only with a recipe of exchanges: other frames are not told from their echo",
+            ),
             Kind::NotInField { value, low, high } => {
                 write!(f, "the field cannot be {value}; allowed: {low}..={high}")
             }
@@ -280,6 +308,21 @@ impl fmt::Display for DescribedKind<'_> {
             ),
             Kind::WrittenTwice { var } => {
                 write!(f, "another field of this recipe already writes {var}")
+            }
+            Kind::BitWrittenTwice { bit } => {
+                write!(f, "another field of this recipe already writes {bit}")
+            }
+            Kind::WholeAndBit { bit } => write!(
+                f,
+                "this recipe writes both {} as a whole and its bit {}; allowed: the whole or bits",
+                bit.var, bit.bit
+            ),
+            Kind::HasNoBits { var } => {
+                write!(f, "{var} is a {} without bits", var.ty())?;
+                match var.direction() {
+                    Direction::Input => f.write_str("; allowed: bits of DigitalOutputCommand, BitInputReg"),
+                    Direction::Output => Ok(()),
+                }
             }
             Kind::NotBits { var } => {
                 write!(f, "{var} is a {}; a trigger needs a variable made of bits", var.ty())
@@ -318,6 +361,16 @@ impl fmt::Display for DescribedKind<'_> {
                 "{var} is written by this port and by {}; a variable has one owner",
                 port_name(other)
             ),
+            Kind::BitOwnedTwice { bit, other } => {
+                write!(f, "{bit} is written by this port and by {}; a bit has one owner", port_name(other))
+            }
+            Kind::OwnedAndShared { bit, other } => write!(
+                f,
+                "this port and {} both write {}, one as a whole and one {bit}; allowed: one owner of the \
+                 whole, or owners of bits",
+                port_name(other),
+                bit.var
+            ),
             Kind::NoWayUp { var, port } => write!(
                 f,
                 "{} writes {var}, which only the controller's own recipe ports can carry; add it to the input of \
@@ -336,6 +389,9 @@ impl fmt::Display for DescribedKind<'_> {
                  its value would be invented; let a port write it, or remove it here and on the controller"
             ),
             Kind::NotOwned { var } => write!(f, "this port does not write {var}"),
+            Kind::BitsNotOwned { var, mask } => {
+                write!(f, "this port does not write {var}.{} by itself", mask.trailing_zeros())
+            }
             Kind::SafeType { var, ty } => write!(f, "{var} is a {}, but its safe value is a {ty}", var.ty()),
             Kind::SafeValue { var } => {
                 write!(f, "not a value for {var}: not finite, or reserved bits are set")

@@ -4,7 +4,7 @@
 
 use heapless::Vec;
 
-use super::{FieldSpec, Parts, Recipe, StreamPart};
+use super::{FieldSpec, InputBinding, Parts, Recipe, StreamPart};
 use crate::config::ConfigView;
 use crate::device::{Carrier, Checksum, Element, Encoding, FrameLayout, LayoutError};
 use crate::recipe::model::MAX_FIELDS;
@@ -48,7 +48,37 @@ impl DeviceFrame {
     }
 }
 
+/// The index of the field that a frame cannot be laid out for, if it is one.
+pub(super) fn field_of(fields: &[FieldSpec], error: LayoutError) -> Option<u8> {
+    // A checksum is a field, and no element.
+    let field = match error.element().map(usize::from) {
+        Some(element) => {
+            let is_element = |field: &(usize, &FieldSpec)| field.1.element().is_some();
+            fields.iter().enumerate().filter(is_element).nth(element).map(|(nth, _)| nth)
+        }
+        None if error.is_of_checksum() => {
+            fields.iter().rposition(|field| matches!(field, FieldSpec::Checksum(_)))
+        }
+        None => None,
+    };
+    field.map(|field| field as u8)
+}
+
 impl FieldSpec {
+    /// Whether only a received frame has such a field.
+    pub(super) const fn is_input(&self) -> bool {
+        matches!(self, Self::UserInput { .. } | Self::DeviceInput { .. } | Self::TextInput { .. })
+    }
+
+    /// Whether a received value goes to a variable or picks a command.
+    pub(super) fn acts(&self) -> bool {
+        match self {
+            Self::UserInput { to, .. } | Self::DeviceInput { to, .. } => *to != InputBinding::Unused,
+            Self::TextInput { .. } => self.variables().next().is_some(),
+            _ => false,
+        }
+    }
+
     /// Whether the controller's own recipes have no such field: only frames of devices have it.
     pub const fn is_device(&self) -> bool {
         match self {
@@ -116,7 +146,7 @@ impl<'c> ConfigView<'c> {
             _ => Carrier::Stream,
         };
         let delimiters = stream.map_or((&[][..], &[][..]), |part| (&*part.head, &*part.tail));
-        recipe.frames(part).map(move |(nth, span)| FrameFields {
+        (0..).zip(recipe.part_frames(part)).map(move |(nth, span)| FrameFields {
             nth,
             carrier,
             delimiters,
@@ -127,9 +157,10 @@ impl<'c> ConfigView<'c> {
     /// Whether a port with this recipe speaks a device's own frames, beyond what the controller's
     /// recipes can describe.
     pub fn is_device(self, recipe: &Recipe) -> bool {
-        [Direction::Input, Direction::Output].into_iter().any(|part| {
-            recipe.stream_part(part).is_some_and(StreamPart::is_cut)
-                || self.fields_of(recipe, part).any(|(_, _, field)| field.is_device())
-        })
+        recipe.exchanges.len > 0
+            || [Direction::Input, Direction::Output].into_iter().any(|part| {
+                recipe.stream_part(part).is_some_and(StreamPart::is_cut)
+                    || self.fields_of(recipe, part).any(|(_, _, field)| field.is_device())
+            })
     }
 }

@@ -4,6 +4,7 @@
 //! that of the file (docs/configuration.md). [`GatewayConfig`](super::GatewayConfig) takes them
 //! with `add_recipe` and `add_port`, in a builder or in place, and reports mistakes.
 
+use super::ask::Ask;
 use super::error::ConfigErrorKind as Kind;
 use super::fields::{CanFields, Fields, Var};
 use super::rules::text;
@@ -65,6 +66,16 @@ pub struct RecipeBuilder<'a> {
     pub(super) output: PartFields<'a>,
     pub(super) on_stale: OnStale,
     pub(super) trigger: Trigger<'a>,
+    pub(super) exchanges: &'a [Ask<'a>],
+}
+
+/// What a recipe takes of the configuration's lists.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub(super) struct Counts {
+    pub(super) fields: usize,
+    pub(super) commands: usize,
+    pub(super) exchanges: usize,
+    pub(super) frames: usize,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -127,7 +138,8 @@ impl Recipe {
 impl<'a> RecipeBuilder<'a> {
     const fn new(name: &'a str, mode: Mode) -> Self {
         let (input, output) = (PartFields::Absent, PartFields::Absent);
-        Self { name, mode, input, output, on_stale: OnStale::Hold, trigger: Trigger::On(SendOn::Period) }
+        let (on_stale, trigger) = (OnStale::Hold, Trigger::On(SendOn::Period));
+        Self { name, mode, input, output, on_stale, trigger, exchanges: &[] }
     }
 
     /// The input part (user to robot) as a stream: head, tail, at most 8 bytes each, and the
@@ -155,6 +167,13 @@ impl<'a> RecipeBuilder<'a> {
         self
     }
 
+    /// What is asked of devices beside the parts, or all that a recipe of Modbus has; see [`Ask`]. Of a
+    /// user-defined recipe.
+    pub const fn exchanges(mut self, exchanges: &'a [Ask<'a>]) -> Self {
+        self.exchanges = exchanges;
+        self
+    }
+
     /// What a port does while the sources of its output are stale.
     pub const fn on_stale(mut self, on_stale: OnStale) -> Self {
         self.on_stale = on_stale;
@@ -173,13 +192,16 @@ impl<'a> RecipeBuilder<'a> {
         self
     }
 
-    /// Number of fields and commands.
-    pub(super) fn counts(&self) -> (usize, usize) {
-        let mut counts = (0_usize, 0_usize);
+    /// Number of fields, commands, exchanges and their frames.
+    pub(super) fn counts(&self) -> Counts {
+        let frames = self.exchanges.iter().map(|ask| ask.frames().count()).fold(0, usize::saturating_add);
+        let mut counts = Counts { exchanges: self.exchanges.len(), frames, ..Counts::default() };
         let mut add = |fields: &Fields<'_>| {
             let (fields, commands) = fields.counts();
-            counts = (counts.0.saturating_add(fields), counts.1.saturating_add(commands));
+            counts.fields = counts.fields.saturating_add(fields);
+            counts.commands = counts.commands.saturating_add(commands);
         };
+        self.exchanges.iter().flat_map(Ask::fields).for_each(&mut add);
         for part in [&self.input, &self.output] {
             match part {
                 PartFields::Absent => {}
@@ -191,7 +213,7 @@ impl<'a> RecipeBuilder<'a> {
     }
 }
 
-/// A port under construction: [`Port::rs485`], [`Port::can`], [`Port::tcp_listen`],
+/// A port under construction: [`Port::rs485`], [`Port::modbus_rtu`], [`Port::can`], [`Port::tcp_listen`],
 /// [`Port::udp_listen`]. The defaults are those of a file: a cycle of 4 ms, a timeout of 100 ms,
 /// stale after 500 ms.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -214,6 +236,10 @@ pub struct Listen<'a> {
     is_tcp: bool,
     address: &'a str,
 }
+
+/// The bus of a [`PortBuilder`] of Modbus RTU: a line with its silences, where none are set.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct RtuLine(Rs485);
 
 /// The bus of a [`PortBuilder`] on CAN: its bit rate.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -264,6 +290,13 @@ impl Port {
     /// A half-duplex serial line; by default 115 200 baud, no parity, 1 stop bit.
     pub fn rs485<'a>(name: &'a str, recipe: &'a str) -> PortBuilder<'a, Rs485> {
         PortBuilder::new(name, recipe, Rs485::default())
+    }
+
+    /// A serial line of Modbus RTU, for a recipe with such exchanges. Idle gap and turnaround are 3.5
+    /// characters, or 1750 µs above 19 200 bit/s, unless they are set.
+    pub fn modbus_rtu<'a>(name: &'a str, recipe: &'a str) -> PortBuilder<'a, RtuLine> {
+        let unset = Rs485 { idle_gap: Duration::ZERO, turnaround: Duration::ZERO, ..Rs485::default() };
+        PortBuilder::new(name, recipe, RtuLine(unset))
     }
 
     /// A CAN bus; by default 500 kbit/s.
@@ -351,34 +384,40 @@ impl<'a, B> PortBuilder<'a, B> {
     }
 }
 
-impl PortBuilder<'_, Rs485> {
+impl<B: SerialLine> PortBuilder<'_, B> {
     /// Bit/s, 1200..=4_000_000.
     pub fn baud(mut self, baud: u32) -> Self {
-        self.bus.baud = baud;
+        self.bus.line().baud = baud;
         self
     }
 
     /// The parity bit.
     pub fn parity(mut self, parity: Parity) -> Self {
-        self.bus.parity = parity;
+        self.bus.line().parity = parity;
         self
     }
 
     /// Stop bits, 1 or 2.
     pub fn stop_bits(mut self, stop_bits: u8) -> Self {
-        self.bus.stop_bits = stop_bits;
+        self.bus.line().stop_bits = stop_bits;
         self
     }
 
     /// A partial frame is discarded after this silence: above 0, at most 1 s.
     pub fn idle_gap(mut self, idle_gap: Duration) -> Self {
-        self.bus.idle_gap = idle_gap;
+        self.bus.line().idle_gap = idle_gap;
         self
     }
 
-    /// The silence before the port sends, at most 1 s.
+    /// The silence before the port sends, at most 1 s; on a line of Modbus RTU above 0.
     pub fn turnaround(mut self, turnaround: Duration) -> Self {
-        self.bus.turnaround = turnaround;
+        self.bus.line().turnaround = turnaround;
+        self
+    }
+
+    /// What is sent is heard as well. Only with a recipe of exchanges.
+    pub fn echo(mut self) -> Self {
+        self.bus.line().echo = true;
         self
     }
 }
@@ -391,15 +430,21 @@ impl PortBuilder<'_, Can> {
     }
 }
 
-/// The bus of a [`PortBuilder`]: [`Rs485`], [`Can`], [`Listen`].
+/// The bus of a [`PortBuilder`]: [`Rs485`], [`RtuLine`], [`Can`], [`Listen`].
 pub trait PortBus: sealed::Sealed {}
 
+/// A serial line as the bus of a [`PortBuilder`]: [`Rs485`], [`RtuLine`].
+pub trait SerialLine: sealed::Line {}
+
+impl SerialLine for Rs485 {}
+impl SerialLine for RtuLine {}
 impl PortBus for Rs485 {}
+impl PortBus for RtuLine {}
 impl PortBus for Can {}
 impl PortBus for Listen<'_> {}
 
 pub(super) mod sealed {
-    use super::{Bus, Can, Kind, Listen, Rs485, text};
+    use super::{Bus, Can, Duration, Kind, Listen, Rs485, RtuLine, text};
 
     /// Buses are those of the configuration.
     pub trait Sealed {
@@ -413,6 +458,34 @@ pub(super) mod sealed {
     impl Sealed for Rs485 {
         fn bus(&self) -> Result<Bus, Kind> {
             Ok(Bus::Rs485(*self))
+        }
+    }
+
+    impl Sealed for RtuLine {
+        fn bus(&self) -> Result<Bus, Kind> {
+            let (given, standard) = (self.0, self.0.with_rtu_silence());
+            let or = |given, standard| if given == Duration::ZERO { standard } else { given };
+            let idle_gap = or(given.idle_gap, standard.idle_gap);
+            let turnaround = or(given.turnaround, standard.turnaround);
+            Ok(Bus::Rs485(Rs485 { idle_gap, turnaround, ..given }))
+        }
+    }
+
+    /// Serial lines have settings.
+    pub trait Line {
+        /// The settings.
+        fn line(&mut self) -> &mut Rs485;
+    }
+
+    impl Line for Rs485 {
+        fn line(&mut self) -> &mut Rs485 {
+            self
+        }
+    }
+
+    impl Line for RtuLine {
+        fn line(&mut self) -> &mut Rs485 {
+            &mut self.0
         }
     }
 

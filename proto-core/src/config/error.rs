@@ -2,12 +2,12 @@
 
 use core::net::Ipv4Addr;
 
-use super::{Network, StateValueError};
+use super::{ExchangeError, Network, StateValueError};
 use crate::command::ParseError;
 use crate::device::LayoutError;
 use crate::recipe::PartError;
 use crate::recipe::model::Mode;
-use crate::sysvar::{Direction, ParseError as VarError, SysVar};
+use crate::sysvar::{Direction, ParseError as VarError, SysVar, VarBit};
 use crate::time::Duration;
 use crate::wire::scalar::{ScalarError, ScalarType};
 
@@ -61,10 +61,20 @@ pub enum Place {
         recipe: u8,
         /// Input or output part.
         part: Direction,
-        /// Index of the CAN frame in the part; 0 in a stream recipe.
+        /// Index of the CAN frame in the part; 0 in a stream recipe. The frames of exchanges are counted
+        /// on behind those of the part.
         frame: u8,
         /// Index of the field in the part or frame.
         field: u8,
+    },
+    /// One exchange.
+    Exchange {
+        /// Index of the recipe.
+        recipe: u8,
+        /// Index of the exchange in the recipe.
+        exchange: u8,
+        /// What about it.
+        key: ExchangeKey,
     },
     /// One entry of a command table.
     Command {
@@ -123,6 +133,32 @@ pub enum RecipeKey {
     Send,
 }
 
+/// A key of an exchange.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[non_exhaustive]
+pub enum ExchangeKey {
+    /// The exchange as a whole.
+    Whole,
+    /// The slave or other peer.
+    Peer,
+    /// The addresses and the fields of registers or coils.
+    Registers,
+    /// Its period.
+    Every,
+    /// The bit that triggers it.
+    Rising,
+    /// How long its reply may take.
+    Timeout,
+    /// How long the line rests after it.
+    Pause,
+    /// The request.
+    Request,
+    /// The reply.
+    Reply,
+    /// The refusal.
+    Refusal,
+}
+
 /// A key of a port.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[non_exhaustive]
@@ -147,6 +183,8 @@ pub enum PortKey {
     IdleGap,
     /// A serial line's turnaround.
     Turnaround,
+    /// Whether a serial line gives back what is sent on it.
+    Echo,
     /// A CAN bus's speed.
     Bitrate,
     /// The address to listen on.
@@ -189,6 +227,8 @@ pub enum Counted {
     CommandBytes,
     /// Frames of one port with a device's own frames.
     DeviceFrames,
+    /// Bytes of whose bits an input frame writes some, over all input frames.
+    BitShares,
     /// Texts of one port.
     Texts,
     /// Groups of variables that arrive together.
@@ -197,6 +237,10 @@ pub enum Counted {
     PollBlocks,
     /// Values of the state packet and of the health of ports that all ports send.
     Sources,
+    /// Exchanges of all recipes.
+    Exchanges,
+    /// Frames of all exchanges.
+    ExchangeFrames,
 }
 
 impl core::fmt::Display for Counted {
@@ -216,8 +260,11 @@ impl core::fmt::Display for Counted {
             Self::UserFields => "user-defined fields in one direction",
             Self::CommandFields => "command fields",
             Self::CommandBytes => "bytes of command texts",
+            Self::BitShares => "bytes in input frames that write single bits",
             Self::Groups => "groups",
             Self::PollBlocks => "Modbus poll blocks",
+            Self::Exchanges => "exchanges in all recipes together",
+            Self::ExchangeFrames => "frames of exchanges in all recipes together",
             Self::Sources => "values of the controller's state and of the health of ports",
         })
     }
@@ -338,6 +385,10 @@ pub enum ConfigErrorKind {
     },
     /// The frame of a device cannot be laid out.
     Layout(LayoutError),
+    /// The exchange cannot be.
+    Exchange(ExchangeError),
+    /// An echo is told from replies in exchanges only.
+    EchoNeedsExchanges,
     /// A number that its field cannot have.
     NotInField {
         /// The number.
@@ -392,6 +443,21 @@ pub enum ConfigErrorKind {
         recipe: u8,
         /// The reason.
         error: PartError,
+    },
+    /// Two fields of one recipe write the same bit.
+    BitWrittenTwice {
+        /// The bit.
+        bit: VarBit,
+    },
+    /// A recipe writes a variable as a whole and one of its bits.
+    WholeAndBit {
+        /// The bit.
+        bit: VarBit,
+    },
+    /// Only variables made of bits have bits.
+    HasNoBits {
+        /// The variable.
+        var: SysVar,
     },
     /// Input fields write input variables only.
     NotAnInput {
@@ -473,6 +539,20 @@ pub enum ConfigErrorKind {
         /// Index of the earlier port.
         other: u8,
     },
+    /// An earlier port writes the same bit; a bit has one owner.
+    BitOwnedTwice {
+        /// The bit.
+        bit: VarBit,
+        /// Index of the earlier port.
+        other: u8,
+    },
+    /// One port writes the whole variable, and the other one of its bits.
+    OwnedAndShared {
+        /// The bit.
+        bit: VarBit,
+        /// Index of the other port.
+        other: u8,
+    },
     /// A port writes a variable that no configured way up can carry (D15).
     NoWayUp {
         /// The variable.
@@ -497,6 +577,13 @@ pub enum ConfigErrorKind {
     NotOwned {
         /// The variable.
         var: SysVar,
+    },
+    /// A safe value for bits that the port does not write one by one.
+    BitsNotOwned {
+        /// The variable.
+        var: SysVar,
+        /// Its bits.
+        mask: u8,
     },
     /// A safe value's type is not its variable's.
     SafeType {

@@ -184,6 +184,7 @@ pub struct InputField<'a> {
 pub(super) enum Does<'a> {
     Nothing,
     Writes { var: Var<'a>, scale: f32, offset: f32 },
+    WritesBit { name: &'a str },
     Commands { entries: Entries<'a>, when: CommandWhen, idle: Option<i64> },
 }
 
@@ -216,6 +217,12 @@ impl<'a> InputField<'a> {
     pub fn variable(encoding: impl Into<Encoding>, var: impl Into<Var<'a>>) -> Self {
         let does = Does::Writes { var: var.into(), scale: 1.0, offset: 0.0 };
         Self { on_wire: OnWire::value(encoding), does }
+    }
+
+    /// A field that switches one bit of an input variable, such as `BitInputReg[3].4`: off for 0, on
+    /// for any other value. Integer types only.
+    pub fn bit(encoding: impl Into<Encoding>, name: &'a str) -> Self {
+        Self { on_wire: OnWire::value(encoding), does: Does::WritesBit { name } }
     }
 
     /// A field whose value picks a command of port 2000 when it changes: pairs of value and command,
@@ -285,7 +292,7 @@ impl<'a> InputField<'a> {
             Does::Commands { entries, idle, .. } => {
                 entries.iter().count().saturating_add(usize::from(idle.is_some()))
             }
-            Does::Nothing | Does::Writes { .. } => 0,
+            Does::Nothing | Does::Writes { .. } | Does::WritesBit { .. } => 0,
         }
     }
 }
@@ -300,6 +307,7 @@ pub struct OutputField<'a> {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Sends<'a> {
     Variable { var: Var<'a>, scale: f32, offset: f32 },
+    Bit { name: &'a str },
     Constant(f64),
     Counter,
     Reply,
@@ -311,6 +319,11 @@ impl<'a> OutputField<'a> {
     /// A variable's value, saturated to the field's type.
     pub fn variable(encoding: impl Into<Encoding>, var: impl Into<Var<'a>>) -> Self {
         Self::new(encoding, Sends::Variable { var: var.into(), scale: 1.0, offset: 0.0 })
+    }
+
+    /// One bit of a variable, such as `DigitalOutputCommand[1].0`, as 0 or 1.
+    pub fn bit(encoding: impl Into<Encoding>, name: &'a str) -> Self {
+        Self::new(encoding, Sends::Bit { name })
     }
 
     /// A constant.

@@ -7,45 +7,58 @@
 //! `GatewayConfig<1, 1, 32, 0, 4>`: one port, one recipe, 32 fields, no commands, 4 safe values.
 
 mod add;
+mod add_exchange;
+mod ask;
 mod budget;
 mod builder;
+mod check_exchange;
 mod check_recipe;
 mod command_text;
 mod describe;
 mod device;
 mod draft;
 mod error;
+mod exchange;
 mod fields;
 #[cfg(feature = "image")]
 pub mod image;
+mod line_budget;
 mod listen;
 mod network;
 mod port;
 mod recipe;
 mod rules;
+mod safe_value;
 mod source;
 mod validate;
 mod view;
 
+pub use ask::{Ask, AskFrame, Coil};
 pub use budget::{PartBudget, Warning, can_frame_time};
 pub use builder::ConfigBuilder;
+pub use check_exchange::ExchangeError;
 pub use command_text::CommandText;
 pub(crate) use command_text::{fill_in, placeholders};
 pub use device::DeviceFrame;
-pub use draft::{Can, ControllerBuilder, Listen, PortBuilder, PortBus, RecipeBuilder, SafeValues};
-pub use error::{
-    ConfigError, ConfigErrorKind, ControllerKey, Counted, NetworkKey, Place, PortKey, RecipeKey,
+pub use draft::{
+    Can, ControllerBuilder, Listen, PortBuilder, PortBus, RecipeBuilder, RtuLine, SafeValues, SerialLine,
 };
+pub use error::{
+    ConfigError, ConfigErrorKind, ControllerKey, Counted, ExchangeKey, NetworkKey, Place, PortKey, RecipeKey,
+};
+pub use exchange::{AskWhen, DEFAULT_REPLY_TIMEOUT, Exchange, FrameSpec, Talk};
 pub use fields::{CanFields, Fields, InputField, OutputField, Sum, Var};
+pub use line_budget::ExchangeBudget;
 pub use listen::listen_address;
 pub use network::{BoardAddress, Network};
 pub(crate) use port::MIN_CYCLE;
-pub use port::{Bus, Parity, Port, Rs485, SafeValue};
+pub use port::{Bus, Parity, Port, Rs485};
 pub use recipe::{
     CanFramePart, CommandEntry, CommandWhen, FieldSpec, InputBinding, MAX_COMMAND_TEXT, OnStale,
     OutputBinding, Parts, Recipe, SendOn, Span, StreamPart, Words,
 };
-pub use rules::{check_address, check_bitrate, check_cycle, check_name};
+pub use rules::{check_address, check_bit, check_bitrate, check_cycle, check_name};
+pub use safe_value::SafeValue;
 pub use source::{PortHealth, PortValue, StateValue, StateValueError};
 pub(crate) use view::ConfigMut;
 pub use view::ConfigView;
@@ -65,6 +78,8 @@ pub const MAX_ALL_FIELDS: usize = 1024;
 pub const MAX_COMMANDS: usize = 32;
 /// Maximum number of safe values on all ports together.
 pub const MAX_SAFE_VALUES: usize = 64;
+/// Maximum number of exchanges in all recipes together, and of their frames.
+pub const MAX_EXCHANGES: usize = 64;
 /// Maximum length of the name of a recipe or port, in bytes.
 pub const MAX_NAME: usize = 32;
 /// Maximum length of the controller's address or host name, in bytes.
@@ -78,9 +93,10 @@ pub type Name = String<MAX_NAME>;
 pub type Delimiter = Vec<u8, MAX_DELIMITER>;
 
 /// A whole gateway file. The parameters are the numbers of ports, recipes, fields in all recipes,
-/// entries in all command tables and safe values on all ports that there is room for.
+/// entries in all command tables, safe values on all ports, and exchanges in all recipes that there
+/// is room for.
 ///
-/// The defaults are the maximum for a file and take 44 KiB. [`Self::empty`] is all zeros, so a
+/// The defaults are the maximum for a file and take 59 KiB. [`Self::empty`] is all zeros, so a
 /// static one takes no flash.
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
@@ -91,6 +107,7 @@ pub struct GatewayConfig<
     const ALL_FIELDS: usize = MAX_ALL_FIELDS,
     const COMMANDS: usize = MAX_COMMANDS,
     const SAFE_VALUES: usize = MAX_SAFE_VALUES,
+    const EXCHANGES: usize = MAX_EXCHANGES,
 > {
     /// The controller's address, ports and dialect.
     pub controller: ControllerLink,
@@ -106,6 +123,10 @@ pub struct GatewayConfig<
     pub commands: Vec<CommandEntry, COMMANDS>,
     /// The values that inputs take when their port times out; ports refer to ranges of it.
     pub safe_values: Vec<SafeValue, SAFE_VALUES>,
+    /// The exchanges of all recipes; recipes refer to ranges of it.
+    pub exchanges: Vec<Exchange, EXCHANGES>,
+    /// The frames of exchanges, which refer to it; Modbus has none.
+    pub frames: Vec<FrameSpec, EXCHANGES>,
 }
 
 impl<
@@ -114,7 +135,8 @@ impl<
     const ALL_FIELDS: usize,
     const COMMANDS: usize,
     const SAFE_VALUES: usize,
-> GatewayConfig<PORTS, RECIPES, ALL_FIELDS, COMMANDS, SAFE_VALUES>
+    const EXCHANGES: usize,
+> GatewayConfig<PORTS, RECIPES, ALL_FIELDS, COMMANDS, SAFE_VALUES, EXCHANGES>
 {
     /// An empty configuration: no controller, no recipes, no ports. All bytes are zero.
     pub const fn empty() -> Self {
@@ -126,6 +148,8 @@ impl<
             fields: Vec::new(),
             commands: Vec::new(),
             safe_values: Vec::new(),
+            exchanges: Vec::new(),
+            frames: Vec::new(),
         }
     }
 
@@ -139,6 +163,8 @@ impl<
             fields: &self.fields,
             commands: &self.commands,
             safe_values: &self.safe_values,
+            exchanges: &self.exchanges,
+            frames: &self.frames,
         }
     }
 
@@ -153,6 +179,8 @@ impl<
             fields: self.fields.as_mut_view(),
             commands: self.commands.as_mut_view(),
             safe_values: self.safe_values.as_mut_view(),
+            exchanges: self.exchanges.as_mut_view(),
+            frames: self.frames.as_mut_view(),
         }
     }
 
@@ -171,7 +199,8 @@ impl<
     const ALL_FIELDS: usize,
     const COMMANDS: usize,
     const SAFE_VALUES: usize,
-> Default for GatewayConfig<PORTS, RECIPES, ALL_FIELDS, COMMANDS, SAFE_VALUES>
+    const EXCHANGES: usize,
+> Default for GatewayConfig<PORTS, RECIPES, ALL_FIELDS, COMMANDS, SAFE_VALUES, EXCHANGES>
 {
     /// Same as [`Self::empty`].
     fn default() -> Self {
@@ -186,9 +215,10 @@ impl<
     const ALL_FIELDS: usize,
     const COMMANDS: usize,
     const SAFE_VALUES: usize,
-> From<&'c GatewayConfig<PORTS, RECIPES, ALL_FIELDS, COMMANDS, SAFE_VALUES>> for ConfigView<'c>
+    const EXCHANGES: usize,
+> From<&'c GatewayConfig<PORTS, RECIPES, ALL_FIELDS, COMMANDS, SAFE_VALUES, EXCHANGES>> for ConfigView<'c>
 {
-    fn from(config: &'c GatewayConfig<PORTS, RECIPES, ALL_FIELDS, COMMANDS, SAFE_VALUES>) -> Self {
+    fn from(config: &'c GatewayConfig<PORTS, RECIPES, ALL_FIELDS, COMMANDS, SAFE_VALUES, EXCHANGES>) -> Self {
         config.view()
     }
 }

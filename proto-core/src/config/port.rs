@@ -5,9 +5,8 @@
 use heapless::String;
 
 use super::{MAX_LISTEN, Name, PortHealth, Span};
-use crate::sysvar::SysVar;
+use crate::modbus::rtu::Timing;
 use crate::time::Duration;
-use crate::wire::scalar::Scalar;
 
 /// One port.
 #[derive(Debug, Clone, PartialEq)]
@@ -102,11 +101,14 @@ pub struct Rs485 {
     pub idle_gap: Duration,
     /// The line must have been silent for this long before a frame is sent.
     pub turnaround: Duration,
+    /// What is sent is heard as well, as with a 2-wire adapter whose receiver is always on. Only with
+    /// a recipe of exchanges.
+    pub echo: bool,
 }
 
 impl Default for Rs485 {
     /// The defaults of a file: 115 200 bit/s, no parity, 1 stop bit, an idle gap of 50 ms, a
-    /// turnaround of 100 µs.
+    /// turnaround of 100 µs, no echo.
     fn default() -> Self {
         Self {
             baud: 115_200,
@@ -114,7 +116,18 @@ impl Default for Rs485 {
             stop_bits: 1,
             idle_gap: Duration::from_millis(50),
             turnaround: Duration::from_micros(100),
+            echo: false,
         }
+    }
+}
+
+impl Rs485 {
+    /// The same with the silence of Modbus RTU as idle gap and turnaround: 3.5 characters, or 1750 µs
+    /// above 19 200 bit/s (docs/wire/modbus-rtu.md section 2).
+    #[must_use]
+    pub fn with_rtu_silence(self) -> Self {
+        let silence = Timing::new(self.baud, self.bits_per_character() as u8).silence();
+        Self { idle_gap: silence, turnaround: silence, ..self }
     }
 }
 
@@ -129,16 +142,6 @@ pub enum Parity {
     Even,
     /// Odd parity.
     Odd,
-}
-
-/// The value that an input variable takes when its port times out.
-#[derive(Debug, Clone, Copy, PartialEq)]
-#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
-pub struct SafeValue {
-    /// An input variable that the port owns.
-    pub var: SysVar,
-    /// Its safe value.
-    pub value: Scalar,
 }
 
 /// The shortest cycle, of the controller and of a port.

@@ -8,7 +8,7 @@ use heapless::{String, Vec};
 use super::{Delimiter, Name, PortValue, StateValue};
 use crate::device::{Boundary, ByteOrder, Checksum, Encoding, Escape, Length, Overflow, Text};
 use crate::recipe::model::{Field, MAX_CAN_IDS, Mode};
-use crate::sysvar::{Direction, SysVar};
+use crate::sysvar::{Direction, SysVar, VarBit};
 use crate::wire::can::CanId;
 use crate::wire::scalar::ScalarType;
 
@@ -27,16 +27,21 @@ pub struct Recipe {
     pub on_stale: OnStale,
     /// What makes a port send the output part.
     pub send: SendOn,
+    /// What is asked beside the parts, a range of
+    /// [`GatewayConfig::exchanges`](super::GatewayConfig::exchanges); the parts of a stream may then
+    /// both be absent.
+    pub exchanges: Span,
 }
 
 impl Recipe {
     /// A recipe with these parts that is sent every cycle and holds stale values.
     pub const fn new(name: Name, mode: Mode, parts: Parts) -> Self {
-        Self { name, mode, parts, on_stale: OnStale::Hold, send: SendOn::Period }
+        let exchanges = Span { start: 0, len: 0 };
+        Self { name, mode, parts, on_stale: OnStale::Hold, send: SendOn::Period, exchanges }
     }
 
     /// The field ranges of one part: one for a stream part, one for each CAN frame.
-    pub(crate) fn frames(&self, part: Direction) -> impl Iterator<Item = (u8, Span)> + '_ {
+    pub(crate) fn part_frames(&self, part: Direction) -> impl Iterator<Item = Span> + '_ {
         let (stream, can) = match (&self.parts, part) {
             (Parts::Stream { input, .. }, Direction::Input) => (input.as_ref(), None),
             (Parts::Stream { output, .. }, Direction::Output) => (output.as_ref(), None),
@@ -44,7 +49,7 @@ impl Recipe {
             (Parts::Can { output, .. }, Direction::Output) => (None, Some(output)),
         };
         let can = can.into_iter().flatten().map(|frame| frame.fields);
-        (0..).zip(stream.map(|part| part.fields).into_iter().chain(can))
+        stream.map(|part| part.fields).into_iter().chain(can)
     }
 
     /// One part of a stream recipe.
@@ -55,14 +60,9 @@ impl Recipe {
             (Parts::Can { .. }, _) => None,
         }
     }
-
-    /// Whether the recipe has this part.
-    pub(crate) fn has(&self, part: Direction) -> bool {
-        self.frames(part).next().is_some()
-    }
 }
 
-/// A recipe's two parts; either may be absent, not both.
+/// A recipe's two parts; either may be absent, and both if it has exchanges.
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[allow(clippy::large_enum_variant, reason = "without an allocator there is no box to put the larger one in")]
@@ -254,6 +254,17 @@ impl FieldSpec {
         }
     }
 
+    /// The bit that the field is bound to.
+    pub const fn bit(&self) -> Option<VarBit> {
+        match *self {
+            Self::UserInput { to: InputBinding::Bit { var, bit }, .. }
+            | Self::DeviceInput { to: InputBinding::Bit { var, bit }, .. }
+            | Self::UserOutput { from: OutputBinding::Bit { var, bit }, .. }
+            | Self::DeviceOutput { from: OutputBinding::Bit { var, bit }, .. } => Some(VarBit { var, bit }),
+            _ => None,
+        }
+    }
+
     /// Where the value of a user-defined output field comes from.
     pub fn source(&self) -> Option<OutputBinding> {
         match *self {
@@ -262,17 +273,17 @@ impl FieldSpec {
         }
     }
 
-    /// The system variable that the field is, or that its value is bound to; texts have several, see
-    /// [`Self::variables`].
+    /// The system variable that the field is, that an input field's value becomes as a whole, or of
+    /// which an output field shows the value or a bit; texts have several, see [`Self::variables`].
     pub fn variable(&self) -> Option<SysVar> {
         match *self {
             Self::System(var) => Some(var),
             Self::UserInput { to, .. } | Self::DeviceInput { to, .. } => match to {
                 InputBinding::Variable { var, .. } => Some(var),
-                InputBinding::Unused | InputBinding::Commands { .. } => None,
+                InputBinding::Unused | InputBinding::Commands { .. } | InputBinding::Bit { .. } => None,
             },
             Self::UserOutput { from, .. } | Self::DeviceOutput { from, .. } => match from {
-                OutputBinding::Variable { var, .. } => Some(var),
+                OutputBinding::Variable { var, .. } | OutputBinding::Bit { var, .. } => Some(var),
                 _ => None,
             },
             _ => None,
@@ -312,6 +323,14 @@ pub enum InputBinding {
         table: Span,
         /// When a value takes effect.
         when: CommandWhen,
+    },
+    /// One bit of a byte variable: off for 0, on for any other integer. Other bits of the byte may
+    /// have other owners.
+    Bit {
+        /// An input variable made of bits.
+        var: SysVar,
+        /// Bit 0..=7.
+        bit: u8,
     },
 }
 
@@ -370,6 +389,13 @@ pub enum OutputBinding {
         scale: f32,
         /// Offset, added after scaling.
         offset: f32,
+    },
+    /// One bit of a byte variable, 0 or 1.
+    Bit {
+        /// Any variable made of bits that the controller shows.
+        var: SysVar,
+        /// Bit 0..=7.
+        bit: u8,
     },
 }
 

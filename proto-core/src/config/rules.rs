@@ -9,7 +9,7 @@ use super::error::{ConfigError, ConfigErrorKind as Kind, Counted, Place, PortKey
 use super::listen::ipv6;
 use super::port::MIN_CYCLE;
 use super::{MAX_ADDRESS, MAX_NAME, Name, Rs485, Span};
-use crate::sysvar::{COUNT, SysVar};
+use crate::sysvar::{COUNT, SysVar, VarBit};
 use crate::time::Duration;
 
 /// The longest cycle, timeout or staleness that a configuration may have.
@@ -40,6 +40,19 @@ impl Rs485 {
             }
         }
         Ok(())
+    }
+}
+
+/// Checks that the variable has the bit; returns the bit in the variable's byte.
+///
+/// # Errors
+/// [`ConfigErrorKind::HasNoBits`](Kind::HasNoBits) or [`ConfigErrorKind::NoSuchBit`](Kind::NoSuchBit).
+pub fn check_bit(bit: VarBit) -> Result<u8, Kind> {
+    let VarBit { var, bit: nth } = bit;
+    match bit.mask() {
+        Some(mask) => Ok(mask),
+        None if var.is_bits() => Err(Kind::NoSuchBit { var, bit: nth }),
+        None => Err(Kind::HasNoBits { var }),
     }
 }
 

@@ -123,7 +123,7 @@ fn ranges_that_leave_their_pools_are_refused() {
     );
     Builder::one_port()
         .with(|config| {
-            let safe = SafeValue { var: var("DigitalOutputCommand[1]"), value: Scalar::Byte(0) };
+            let safe = SafeValue::new(var("DigitalOutputCommand[1]"), Scalar::Byte(0));
             config.safe_values.extend([safe, safe]);
             config.ports[0].on_timeout = span;
         })
@@ -199,12 +199,12 @@ fn safe_values_fit_their_variables() {
             .stream(&["DigitalOutputCommand[3]"], &[])
             .rs485(0)
             .with(|config| {
-                config.safe_values.push(SafeValue { var: digital, value }).unwrap();
+                config.safe_values.push(SafeValue::new(digital, value)).unwrap();
                 config.ports[0].on_timeout = Span { start: 0, len: 1 };
             })
             .refused(Place::SafeValue { entry: 0 }, kind);
     }
-    let force = SafeValue { var: var("ForceEnd[1]"), value: Scalar::Float(f32::NAN) };
+    let force = SafeValue::new(var("ForceEnd[1]"), Scalar::Float(f32::NAN));
     Builder::new()
         .stream(&["ForceEnd[1]"], &[])
         .rs485(0)
@@ -305,10 +305,7 @@ pub(super) fn every_kind() -> GatewayConfig {
         .rs485(2)
         .with(|config| {
             config.commands.push(CommandEntry::new(1, text("stop"))).unwrap();
-            config
-                .safe_values
-                .push(SafeValue { var: var("ForceEnd[1]"), value: Scalar::Float(0.0) })
-                .unwrap();
+            config.safe_values.push(SafeValue::new(var("ForceEnd[1]"), Scalar::Float(0.0))).unwrap();
             config.network = BoardAddress::Static(network());
             config.ports[1].on_timeout = Span { start: 0, len: 1 };
             config.recipes[0].send = SendOn::Rising { var: var("BitOutputReg[3]"), bit: 7 };

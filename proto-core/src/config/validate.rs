@@ -12,11 +12,12 @@ use super::rules::{
     check_time, fail, is_marked, mark,
 };
 use super::{
-    Bus, ConfigView, FieldSpec, MAX_ALL_FIELDS, MAX_COMMANDS, MAX_PORTS, MAX_RECIPES, MAX_SAFE_VALUES, Parts,
-    Port, PortHealth, Recipe, SendOn,
+    Bus, ConfigView, FieldSpec, MAX_ALL_FIELDS, MAX_COMMANDS, MAX_EXCHANGES, MAX_PORTS, MAX_RECIPES,
+    MAX_SAFE_VALUES, Parts, Port, PortHealth, Recipe, SafeValue, SendOn,
 };
+use crate::image::BitSet;
 use crate::recipe::model::{Framing, Mode};
-use crate::sysvar::{COUNT, Direction, INPUT_COUNT, SysVar};
+use crate::sysvar::{COUNT, Direction, INPUT_COUNT, SysVar, VarBit};
 use crate::wire::dialect::Dialect;
 use crate::wire::scalar::Scalar;
 
@@ -49,6 +50,8 @@ impl<'c> ConfigView<'c> {
             (Counted::Fields, self.fields.len(), MAX_ALL_FIELDS),
             (Counted::Commands, self.commands.len(), MAX_COMMANDS),
             (Counted::SafeValues, self.safe_values.len(), MAX_SAFE_VALUES),
+            (Counted::Exchanges, self.exchanges.len(), MAX_EXCHANGES),
+            (Counted::ExchangeFrames, self.frames.len(), MAX_EXCHANGES),
         ] {
             check_room(Place::Whole, what, needed, room)?;
         }
@@ -112,6 +115,9 @@ impl<'c> ConfigView<'c> {
                     return fail(at(PortKey::Recipe), Kind::NeedsStreamRecipe { recipe: port.recipe });
                 }
                 self.check_framing(index, port.recipe, recipe)?;
+                if line.echo && recipe.exchanges.len == 0 {
+                    return fail(at(PortKey::Echo), Kind::EchoNeedsExchanges);
+                }
             }
             Bus::Can { bitrate } => {
                 check_bitrate(*bitrate).map_err(|kind| ConfigError { place: at(PortKey::Bitrate), kind })?;
@@ -184,10 +190,26 @@ impl<'c> ConfigView<'c> {
         }
     }
 
-    /// Each variable has one owner.
+    /// Each variable has one owner, or its bits have.
     fn check_owners(&self) -> Check {
         let mut owners = [None; INPUT_COUNT];
         for (index, port, recipe) in self.field_ports() {
+            let place = Place::Port { port: index, key: PortKey::Recipe };
+            for (other, _, earlier) in self.field_ports().take_while(|(other, ..)| *other < index) {
+                for bit in self.bits_written_by(recipe) {
+                    if self.bits_written_by(earlier).any(|before| before == bit) {
+                        return fail(place, Kind::BitOwnedTwice { bit, other });
+                    }
+                    if self.written_by(earlier).any(|before| before == bit.var) {
+                        return fail(place, Kind::OwnedAndShared { bit, other });
+                    }
+                }
+                for bit in self.bits_written_by(earlier) {
+                    if self.written_by(recipe).any(|var| var == bit.var) {
+                        return fail(place, Kind::OwnedAndShared { bit, other });
+                    }
+                }
+            }
             for var in self.written_by(recipe) {
                 // An input variable's ordinal is below INPUT_COUNT; others are refused earlier.
                 let Some(owner) = owners.get_mut(var.ordinal()) else { continue };
@@ -282,9 +304,14 @@ impl<'c> ConfigView<'c> {
     fn check_safe_values(&self) -> Check {
         for (index, port) in (0..).zip(self.ports) {
             let mut seen = [false; COUNT];
+            let mut bits = BitSet::EMPTY;
             for (entry, safe) in (port.on_timeout.start..).zip(port.on_timeout.of(self.safe_values)) {
                 let place = Place::SafeValue { entry };
                 let var = safe.var;
+                if !safe.is_whole() {
+                    self.check_safe_bits(index, place, safe, &mut bits)?;
+                    continue;
+                }
                 let owns = |(port, _, recipe): (u8, &Port, &Recipe)| {
                     port == index && self.written_by(recipe).any(|written| written == var)
                 };
@@ -304,6 +331,29 @@ impl<'c> ConfigView<'c> {
                 mark(&mut seen, var);
             }
         }
+        Ok(())
+    }
+
+    fn check_safe_bits(&self, index: u8, place: Place, safe: &SafeValue, seen: &mut BitSet) -> Check {
+        let &SafeValue { var, value, mask } = safe;
+        let mut owned = 0;
+        for (_, _, recipe) in self.field_ports().filter(|(port, ..)| *port == index) {
+            let bits = self.bits_written_by(recipe).filter(|bit| bit.var == var);
+            owned |= bits.filter_map(VarBit::mask).fold(0, |all, mask| all | mask);
+        }
+        let Scalar::Byte(value) = value else {
+            return fail(place, Kind::SafeType { var, ty: value.ty() });
+        };
+        if mask == 0 || mask & !owned != 0 {
+            return fail(place, Kind::BitsNotOwned { var, mask: mask & !owned });
+        }
+        if value & !mask != 0 {
+            return fail(place, Kind::SafeValue { var });
+        }
+        if seen.byte(var) & mask != 0 {
+            return fail(place, Kind::SafeTwice { var });
+        }
+        *seen = seen.or(BitSet::of(var, mask));
         Ok(())
     }
 }

@@ -6,8 +6,10 @@
 use heapless::VecView;
 
 use super::network::Network;
-use super::{CommandEntry, ControllerLink, FieldSpec, OutputBinding, Port, Recipe, SafeValue};
-use crate::sysvar::{Direction, SysVar};
+use super::{
+    CommandEntry, ControllerLink, Exchange, FieldSpec, FrameSpec, OutputBinding, Port, Recipe, SafeValue,
+};
+use crate::sysvar::{Direction, SysVar, VarBit};
 
 /// A configuration of any size, borrowed; [`GatewayConfig`](super::GatewayConfig) describes the
 /// fields.
@@ -28,6 +30,10 @@ pub struct ConfigView<'c> {
     pub commands: &'c [CommandEntry],
     /// The values that inputs take when their port times out; ports refer to ranges of it.
     pub safe_values: &'c [SafeValue],
+    /// The exchanges of all recipes; recipes refer to ranges of it.
+    pub exchanges: &'c [Exchange],
+    /// The frames of exchanges.
+    pub frames: &'c [FrameSpec],
 }
 
 impl<'c> ConfigView<'c> {
@@ -42,6 +48,8 @@ impl<'c> ConfigView<'c> {
             fields: &[],
             commands: &[],
             safe_values: &[],
+            exchanges: &[],
+            frames: &[],
         }
     }
 
@@ -60,19 +68,19 @@ impl<'c> ConfigView<'c> {
             .filter_map(|(index, port)| Some((index, port, self.recipes.get(usize::from(port.recipe))?)))
     }
 
-    /// The fields of one part of `recipe`, with the index of the CAN frame (0 in a stream) and the
-    /// index of the field in it.
+    /// The fields of one part of `recipe`, with the number of the frame (see
+    /// `frames_of`) and the index of the field in it.
     pub fn fields_of(
         self,
         recipe: &'c Recipe,
         part: Direction,
     ) -> impl Iterator<Item = (u8, u8, &'c FieldSpec)> {
-        recipe.frames(part).flat_map(move |(frame, span)| {
+        self.frames_of(recipe, part).flat_map(move |(frame, span)| {
             (0..).zip(span.of(self.fields)).map(move |(index, field)| (frame, index, field))
         })
     }
 
-    /// The input variables that a field port writes.
+    /// The input variables that a field port writes as a whole.
     pub fn written_by(self, recipe: &'c Recipe) -> impl Iterator<Item = SysVar> + 'c {
         self.fields_of(recipe, Direction::Input).flat_map(|(_, _, field)| field.variables())
     }
@@ -88,6 +96,11 @@ impl<'c> ConfigView<'c> {
         let shows = |field: &FieldSpec| matches!(field.source(), Some(OutputBinding::State { .. }));
         self.field_ports()
             .any(|(_, _, recipe)| self.fields_of(recipe, Direction::Output).any(|(_, _, field)| shows(field)))
+    }
+
+    /// The bits that a field port writes one by one.
+    pub fn bits_written_by(self, recipe: &'c Recipe) -> impl Iterator<Item = VarBit> + 'c {
+        self.fields_of(recipe, Direction::Input).filter_map(|(_, _, field)| field.bit())
     }
 
     /// Whether a field port writes the variable.
@@ -114,6 +127,10 @@ pub(crate) struct ConfigMut<'c> {
     pub(crate) commands: &'c mut VecView<CommandEntry>,
     /// The safe values of all ports.
     pub(crate) safe_values: &'c mut VecView<SafeValue>,
+    /// The exchanges of all recipes.
+    pub(crate) exchanges: &'c mut VecView<Exchange>,
+    /// The frames of exchanges.
+    pub(crate) frames: &'c mut VecView<FrameSpec>,
 }
 
 #[cfg(feature = "image")]
@@ -128,6 +145,8 @@ impl ConfigMut<'_> {
             fields: self.fields,
             commands: self.commands,
             safe_values: self.safe_values,
+            exchanges: self.exchanges,
+            frames: self.frames,
         }
     }
 }

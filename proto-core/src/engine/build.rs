@@ -5,17 +5,19 @@ use core::net::{IpAddr, Ipv4Addr, SocketAddr};
 
 use heapless::Vec;
 
+use super::bits::MAX_SHARES;
 use super::codecs::{can_codec, index_of, stream_codec, stream_layout};
 use super::command_link::CommandLink;
 use super::command_tables::{MAX_COMMAND_BYTES, MAX_COMMAND_FIELDS};
 use super::counters::PortCounters;
 use super::device_port::DeviceCodec;
+use super::exchanges::{Exchanges, Places};
 use super::field_port::{Codec, FieldPort, LineTiming};
 use super::io::{BusState, LinkId, LinkKind, PortId, ReplyCode, Transport};
 use super::links::Links;
 use super::modbus_link::{MAX_POLL_BLOCKS, ModbusLink};
 use super::outbox::EdgeQueue;
-use super::plan::{Plan, PlanError, Source, WayUp, shown_by, uplinks};
+use super::plan::{Plan, PlanError, Source, WayUp, sent_by, shown_by, uplinks};
 use super::port_health::PortsHealth;
 use super::sender::Sender;
 use super::state_link::StateLink;
@@ -33,7 +35,7 @@ use crate::image::{GroupId, InputSet, MAX_GROUPS};
 use crate::link::LinkTimings;
 use crate::recipe::PartError;
 use crate::recipe::model::Framing;
-use crate::sysvar::{Direction, SysVar};
+use crate::sysvar::{Direction, SysVar, VarBit};
 use crate::time::{Duration, Instant};
 use crate::wire::dialect::Dialect;
 use crate::wire::scalar::ScalarType;
@@ -120,8 +122,8 @@ impl Groups {
     }
 }
 
-impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: usize>
-    Engine<PORTS, UPLINKS, FIELDS, TAP>
+impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: usize, const EXCHANGES: usize>
+    Engine<PORTS, UPLINKS, FIELDS, TAP, EXCHANGES>
 {
     /// An engine without a configuration: no ports, no links, nothing to do.
     ///
@@ -146,6 +148,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             // The first call asks every port and link, because `timer_at` has come.
             ask: Ask::NONE,
             tap: Tap::new(),
+            exchanges: Exchanges::new(),
         }
     }
 
@@ -198,9 +201,11 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             is_deaf,
             deaf_until,
             ask,
+            exchanges,
             // A tap that listens continues.
             tap: _,
         } = self;
+        exchanges.clear();
         *store = Store::new();
         ports.clear();
         bindings.inputs.clear();
@@ -245,7 +250,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
         if plan.needs_state() {
             let group = groups.next().ok_or(one_too_many(Counted::Groups, MAX_GROUPS))?;
-            let link = StateLink::new(config.controller.state_port, dialect, group, plan.read_back());
+            let mut link = StateLink::new(config.controller.state_port, dialect, group, plan.read_back());
+            link.share(&self.store.bits.bytes);
             let _ = self.links.state.push(link);
         }
         if plan.needs_modbus() {
@@ -267,7 +273,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             (0_usize, 0_usize, 0_usize, 0_usize, 0_usize);
         for (_, _, recipe) in config.field_ports() {
             ports = ports.saturating_add(1);
-            frames = frames.saturating_add(recipe.frames(Direction::Input).count());
+            frames = frames.saturating_add(config.frames_of(recipe, Direction::Input).count());
             for (_, _, field) in config.fields_of(recipe, Direction::Input) {
                 let to = match field {
                     FieldSpec::UserInput { to, .. } | FieldSpec::DeviceInput { to, .. } => *to,
@@ -310,11 +316,15 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         dialect: Dialect,
     ) -> Result<(), BuildError> {
         // Validation has refused recipes that the bus cannot carry.
-        let codec = match &recipe.parts {
+        let mut codec = match &recipe.parts {
             _ if config.is_device(recipe) => {
                 let inputs = self.bindings.inputs.len() as u16;
                 let outputs = self.bindings.outputs.len() as u16;
-                Codec::Device(DeviceCodec::new(config, port.recipe, recipe, inputs, outputs)?)
+                let line = match &port.bus {
+                    Bus::Rs485(line) => Some(line),
+                    _ => None,
+                };
+                Codec::Device(DeviceCodec::new(config, port.recipe, recipe, [inputs, outputs], line)?)
             }
             Parts::Stream { input, output } => stream_codec(config, port.recipe, recipe, [input, output])?,
             Parts::Can { input, output } => can_codec(config, port.recipe, recipe, [input, output])?,
@@ -328,9 +338,21 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             self.store.is_overdue_from_start();
         }
         let mut next_binding = self.bindings.inputs.len() as u16;
-        for (_, fields) in recipe.frames(Direction::Input) {
+        let parts = recipe.part_frames(Direction::Input).map(|_| true);
+        let replies = config.exchanges_of(recipe).iter().filter_map(|exchange| {
+            exchange.fields(config, Direction::Input)?;
+            Some(exchange.when.every.is_some() || exchange.when.is_never())
+        });
+        let frames = config.frames_of(recipe, Direction::Input).zip(parts.chain(replies));
+        for ((_, fields), is_expected) in frames {
             let fields = fields.of(config.fields);
-            let set = fields.iter().flat_map(FieldSpec::variables).collect();
+            let whole: InputSet = fields.iter().flat_map(FieldSpec::variables).collect();
+            let mut set = whole;
+            for bit in fields.iter().filter_map(FieldSpec::bit) {
+                set.insert(bit.var);
+                let (frame, port) = (self.store.frames.len() as u8, self.ports.len() as u8);
+                self.store.bits.add(bit, frame, port).ok_or(one_too_many(Counted::BitShares, MAX_SHARES))?;
+            }
             let is_bound = |field: &&FieldSpec| field.element().is_some();
             let bound = fields.iter().filter(is_bound).count() as u16;
             let bindings = Span { start: next_binding, len: bound };
@@ -341,13 +363,14 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 bindings,
                 overdue_at: if port.safe_at_start { Instant::ZERO } else { Instant::NEVER },
                 timeout: port.timeout,
+                is_expected,
             };
             let group = GroupId(self.store.frames.len() as u8);
             self.store
                 .frames
                 .push(frame)
                 .map_err(|_| one_too_many(Counted::InputFrames, MAX_INPUT_FRAMES))?;
-            frame.set.iter().for_each(|var| self.store.image.assign(var, group));
+            whole.iter().for_each(|var| self.store.image.assign(var, group));
         }
         let full = || one_too_many(Counted::UserFields, FIELDS);
         let mut inputs = Span { start: self.bindings.inputs.len() as u16, len: 0 };
@@ -367,6 +390,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                     let field = link.add_field(table, when, (frame, nth));
                     InputTo::Command(field.ok_or(one_too_many(Counted::CommandFields, MAX_COMMAND_FIELDS))?)
                 }
+                InputBinding::Bit { var, bit } => {
+                    InputTo::Bits { var, mask: VarBit { var, bit }.mask().unwrap_or(0) }
+                }
                 InputBinding::Unused => InputTo::Unused,
             };
             self.bindings.inputs.push(InputBind::new(to, element)).map_err(|_| full())?;
@@ -384,8 +410,19 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             self.bindings.outputs.push(OutputBind::new(ty, from, element)).map_err(|_| full())?;
             outputs.len = outputs.len.saturating_add(1);
         }
+        if recipe.exchanges.len > 0
+            && let Codec::Device(device) = &mut codec
+        {
+            let of_parts = device.fields();
+            let places = Places {
+                inputs: inputs.start.saturating_add(of_parts.0),
+                outputs: outputs.start.saturating_add(of_parts.1),
+                slot: first_frame.saturating_add(device.inputs),
+            };
+            device.line = Some(self.add_exchanges(config, port, recipe, places)?);
+        }
         self.store.watches_bits |= matches!(recipe.send, SendOn::Rising { .. });
-        let has_output = recipe.has(Direction::Output);
+        let has_output = recipe.part_frames(Direction::Output).next().is_some();
         let mut sender = Sender::new(recipe.send, recipe.on_stale, port.stale_after, port.cycle, has_output);
         sender.refresh = port.refresh.unwrap_or(Duration::MAX);
         let port = FieldPort {
@@ -483,7 +520,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         let writes: InputSet =
             set.iter().filter(|&var| plan.way_up(var) == Some(WayUp::Recipe(id))).collect();
         self.store.unanswered = self.store.unanswered.or(&writes);
-        let owners = writes.iter().filter_map(|var| plan.owner(var));
+        let owners = writes.iter().flat_map(|var| plan.owners(var));
         let timeouts =
             owners.filter_map(|port| config.ports.get(usize::from(port.0))).map(|port| port.timeout);
         let patience = timeouts.min().unwrap_or(PATIENCE).max(PATIENCE);
@@ -561,7 +598,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             }
         }
         for ((_, _, recipe), port) in config.field_ports().zip(&mut self.ports) {
-            for var in shown_by(config, recipe) {
+            for var in sent_by(config, recipe) {
                 let Some(group) = self.store.image.group(var) else { continue };
                 port.sender.sources.insert(group);
                 port.sender.shown.insert(var);

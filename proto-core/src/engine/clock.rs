@@ -25,8 +25,8 @@ const DEAF: Duration = Duration::from_millis(50);
 /// The clock's last instant. [`Instant::NEVER`] is after it, so that "no deadline" never comes.
 const LAST: Instant = Instant::from_micros(u64::MAX - 1);
 
-impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: usize>
-    Engine<PORTS, UPLINKS, FIELDS, TAP>
+impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: usize, const EXCHANGES: usize>
+    Engine<PORTS, UPLINKS, FIELDS, TAP, EXCHANGES>
 {
     /// The deadlines up to `now` pass.
     pub(super) fn tick(&mut self, now: Instant) {
@@ -43,7 +43,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         let ports = self.ports.iter().map(FieldPort::deadline);
         let ports = ports.min().unwrap_or(Instant::NEVER);
         let hears_at = if self.is_deaf { self.deaf_until } else { Instant::NEVER };
-        ports.min(self.links.deadline()).min(self.store.deadline()).min(hears_at)
+        let own = ports.min(self.links.deadline()).min(self.store.deadline()).min(hears_at);
+        if self.exchanges.is_used() { own.min(self.talk_deadline()) } else { own }
     }
 
     /// The present, and whether the gateway has slept until now.
@@ -82,6 +83,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         self.is_deaf = true;
         self.advance(now);
         self.ports.iter_mut().for_each(|port| port.slept(&mut self.tap, now));
+        self.talk_slept();
         self.deaf_until = now + DEAF;
         self.arm(self.deaf_until);
     }
@@ -108,6 +110,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 let id = port.id;
                 self.port_silent(id, now);
             }
+        }
+        if self.exchanges.is_used() {
+            self.advance_talk(now);
         }
         self.links.advance(&mut self.store);
         self.carry_results();

@@ -57,6 +57,10 @@ pub struct PortCounters {
     pub skipped_cycles: u32,
     /// Cycles in which no output frame was sent because its sources were stale or unknown.
     pub stale_cycles: u32,
+    /// Requests without a good reply, after all repetitions.
+    pub unanswered: u32,
+    /// Requests that the device refused.
+    pub refused: u32,
     /// Times an input frame became overdue.
     pub timeouts: u32,
     /// Times the device was reported gone.

@@ -10,13 +10,14 @@ use super::command_link::CommandLink;
 use super::counters::{add, bump};
 use super::field_output::Downward;
 use super::field_port::{Accepted, Codec, FieldPort, Frames, came, keep};
+use super::line::Line;
 use super::rejection::Rejection;
 use super::sender::{DIGEST_SEED, digest};
 use super::store::Store;
 use super::tap::Tap;
 use super::user::{InputBind, InputTo, OutputBind, Written, number_of};
 use super::whole_port::{self, MAX_TEXTS, Reader, TextBind, texts_of};
-use crate::config::{CanFramePart, ConfigView, Counted, DeviceFrame, Parts, Recipe, Span};
+use crate::config::{CanFramePart, ConfigView, Counted, DeviceFrame, Parts, Recipe, Rs485, Span};
 use crate::device::{Cutter, Element, Encoding, Escape, Found, FrameLayout, Framer, Overflow, Probe};
 use crate::image::{Image, bind_to_variable};
 use crate::sysvar::{Direction, SysVar};
@@ -50,6 +51,8 @@ pub(super) struct DeviceCodec {
     pub texts: Vec<TextBind, MAX_TEXTS>,
     /// Bytes outside whole frames that have been counted.
     pub skipped_bytes: u32,
+    /// The conversation, if the recipe has exchanges.
+    pub line: Option<Line>,
 }
 
 impl DeviceCodec {
@@ -58,6 +61,14 @@ impl DeviceCodec {
     #[inline(never)]
     pub(super) fn has_begun(&self) -> bool {
         self.reader.as_ref().is_some_and(Reader::has_begun)
+    }
+
+    /// Number of bindings of the input frames, and of the output frames.
+    pub(super) fn fields(&self) -> (u16, u16) {
+        let sum = |formats: &[DeviceFormat]| {
+            formats.iter().map(|format| format.bindings.len).fold(0, u16::saturating_add)
+        };
+        (sum(self.input()), sum(self.output()))
     }
 
     fn input(&self) -> &[DeviceFormat] {
@@ -73,17 +84,22 @@ impl DeviceCodec {
 /// these over a wrong checksum.
 fn probe_all(formats: &[DeviceFormat], bindings: &[InputBind], bytes: &[u8]) -> Probe {
     let probes = formats.iter().map(|format| probe(format, bindings, bytes));
-    probes.fold(Probe::No(0), |best, probe| match (best, probe) {
+    probes.fold(Probe::No(0), better)
+}
+
+/// What bytes are that can be seen in two ways.
+pub(super) fn better(one: Probe, other: Probe) -> Probe {
+    match (one, other) {
         (Probe::Frame(len), _) | (_, Probe::Frame(len)) => Probe::Frame(len),
         (Probe::Other(len), _) | (_, Probe::Other(len)) => Probe::Other(len),
         (Probe::Partial(one), Probe::Partial(other)) => Probe::Partial(one.min(other)),
         (Probe::Partial(missing), _) | (_, Probe::Partial(missing)) => Probe::Partial(missing),
         (Probe::Wrong(len), _) | (_, Probe::Wrong(len)) => Probe::Wrong(len),
         (Probe::No(one), Probe::No(other)) => Probe::No(one.saturating_add(other)),
-    })
+    }
 }
 
-fn probe(format: &DeviceFormat, bindings: &[InputBind], bytes: &[u8]) -> Probe {
+pub(super) fn probe(format: &DeviceFormat, bindings: &[InputBind], bytes: &[u8]) -> Probe {
     format.layout.probe(elements(format.bindings.of(bindings)), bytes)
 }
 
@@ -98,8 +114,8 @@ impl DeviceCodec {
         config: ConfigView<'_>,
         index: u8,
         recipe: &Recipe,
-        mut next_input: u16,
-        mut next_output: u16,
+        [mut next_input, mut next_output]: [u16; 2],
+        line: Option<&Rs485>,
     ) -> Result<Self, BuildError> {
         let texts = texts_of(config, recipe, [next_input, next_output]);
         let mut codec = Self {
@@ -109,15 +125,19 @@ impl DeviceCodec {
             escape: recipe.stream_part(Direction::Output).and_then(|part| part.escape),
             texts: texts.ok_or(one_too_many(Counted::Texts, MAX_TEXTS))?,
             skipped_bytes: 0,
+            line: None,
         };
         let ids: [&[CanFramePart]; 2] = match &recipe.parts {
             Parts::Can { input, output } => [input, output],
             Parts::Stream { .. } => {
                 let cut = recipe.stream_part(Direction::Input);
                 let cutter = cut.and_then(|part| Cutter::new(part.framing, part.escape));
-                codec.reader = Some(match cutter {
-                    Some(cutter) => Reader::Whole { cutter, heard: Instant::ZERO },
-                    None => Reader::Search(Framer::new()),
+                let served = config.exchanges_of(recipe).iter().find(|exchange| exchange.is_served());
+                let slave = served.zip(line).and_then(|(exchange, line)| line.slave(exchange.peer));
+                codec.reader = Some(match (slave, cutter) {
+                    (Some(slave), _) => Reader::Slave(slave),
+                    (None, Some(cutter)) => Reader::Whole { cutter, heard: Instant::ZERO },
+                    (None, None) => Reader::Search(Framer::new()),
                 });
                 [&[], &[]]
             }

@@ -39,23 +39,32 @@ pub(super) enum Codec {
 pub(super) struct LineTiming {
     pub idle_gap: Duration,
     pub turnaround: Duration,
+    /// After this long without a byte, what was sent is complete.
+    silence: Duration,
     heard: Instant,
 }
 
 impl LineTiming {
     pub(super) fn new(settings: &Rs485) -> Self {
-        let idle_gap = settings.idle_gap.max(settings.characters_and_a_half(3));
-        Self { idle_gap, turnaround: settings.turnaround, heard: Instant::ZERO }
+        let characters = settings.characters_and_a_half(3);
+        let (idle_gap, turnaround) = (settings.idle_gap.max(characters), settings.turnaround);
+        Self { idle_gap, turnaround, silence: turnaround.max(characters), heard: Instant::ZERO }
     }
 
     /// For a bus that arbitrates by itself.
     pub(super) const fn none() -> Self {
-        Self { idle_gap: Duration::MAX, turnaround: Duration::ZERO, heard: Instant::ZERO }
+        let (idle_gap, turnaround) = (Duration::MAX, Duration::ZERO);
+        Self { idle_gap, turnaround, silence: Duration::ZERO, heard: Instant::ZERO }
     }
 
     /// When the line is free for the gateway.
-    fn quiet_at(&self) -> Instant {
+    pub(super) fn quiet_at(&self) -> Instant {
         self.heard + self.turnaround
+    }
+
+    /// When the line has been silent for so long that what was sent is complete.
+    pub(super) fn silent_at(&self) -> Instant {
+        self.heard + self.silence
     }
 }
 
@@ -548,6 +557,10 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
                     // It fits: all values were tried before the first was applied.
                     let _ = self.store.image.set(var, value);
                 }
+            }
+            InputTo::Bits { var, mask } => {
+                let on = if value.as_f64() == 0.0 { 0 } else { mask };
+                self.store.image.set_bits(var, mask, on);
             }
             InputTo::Command(field) => {
                 if let Some(link) = &mut self.commands {

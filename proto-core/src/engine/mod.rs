@@ -12,6 +12,7 @@
 //! Errors of a device or of the controller are counted and skipped. They are never an error of the
 //! run loop, and nothing is applied in part.
 
+mod bits;
 mod build;
 mod clock;
 mod codecs;
@@ -20,11 +21,13 @@ mod command_tables;
 mod connection;
 mod counters;
 mod device_port;
+mod exchanges;
 mod field_output;
 mod field_port;
 mod flight;
 mod io;
 mod latency;
+mod line;
 mod links;
 mod modbus_link;
 mod not_given;
@@ -35,6 +38,7 @@ mod port_health;
 mod questions;
 mod rejection;
 mod sender;
+mod served;
 mod session;
 mod state_link;
 mod status;
@@ -42,6 +46,7 @@ mod status;
 mod status_serde;
 mod stops;
 mod store;
+mod talk;
 mod tap;
 mod uplink;
 mod user;
@@ -52,17 +57,19 @@ pub use clock::ASLEEP;
 pub use counters::{LinkCounters, PortCounters};
 pub use io::{BusState, Endpoint, Input, LinkId, LinkKind, Output, PortId, PortState, ReplyCode, Transport};
 pub use latency::Latency;
+pub use line::PeerCounters;
 pub use links::LinkInfo;
 pub use not_given::{LastNotGiven, NotGiven};
 pub use plan::{Plan, PlanError, Source, WayUp};
 pub use rejection::{KEPT_BYTES, LastRejection, Rejection};
-pub use status::{ControllerStatus, FieldBus, Health, PortStatus, Status, VariableStatus};
+pub use status::{ControllerStatus, FieldBus, Health, PeerStatus, PortStatus, Status, VariableStatus};
 pub use stops::COMMAND_QUEUE;
 pub use tap::{MAX_TAPPED, TAP_OVERHEAD, Tap, TapDirection, TapPlace, TapRecord, TapVerdict};
 
 use heapless::Vec;
 
 use counters::add;
+use exchanges::Exchanges;
 use field_output::Downward;
 use field_port::{Accepted, FieldPort};
 use links::Links;
@@ -70,7 +77,7 @@ use port_health::PortsHealth;
 use store::{SafeBytes, Store};
 use user::Bindings;
 
-use crate::config::MAX_SAFE_VALUES;
+use crate::config::{MAX_EXCHANGES, MAX_SAFE_VALUES};
 use crate::link::LinkAction;
 use crate::recipe::model::MAX_STREAM_FRAME;
 use crate::time::Instant;
@@ -89,15 +96,17 @@ const _: () = assert!(INPUT_BUFFER >= LEN && INPUT_BUFFER > MAX_STREAM_FRAME);
 /// The gateway engine for up to `PORTS` field ports, `UPLINKS` recipe links and, over all ports,
 /// `FIELDS` user-defined input fields and as many output fields.
 ///
-/// `TAP` bytes are for the ring of [`Engine::tap`]; 0 costs nothing.
+/// `TAP` bytes are for the ring of [`Engine::tap`], and `EXCHANGES` is the number of exchanges with
+/// devices over all ports; 0 costs nothing. The defaults are the maximum of a file.
 ///
-/// `Engine<4, 1, 128>` takes less than 36 KiB.
+/// `Engine<4, 1, 128, 0, 0>` takes less than 36 KiB.
 #[derive(Debug, Clone)]
 pub struct Engine<
     const PORTS: usize = 8,
     const UPLINKS: usize = 4,
     const FIELDS: usize = 512,
     const TAP: usize = 0,
+    const EXCHANGES: usize = MAX_EXCHANGES,
 > {
     store: Store<PORTS>,
     ports: Vec<FieldPort, PORTS>,
@@ -127,6 +136,7 @@ pub struct Engine<
     /// The ports and links that [`Engine::poll_output`] asks before it sleeps.
     ask: Ask,
     tap: Tap<TAP>,
+    exchanges: Exchanges<EXCHANGES>,
 }
 
 /// The ports and links that may have an output. One that had none is not asked again until
@@ -146,8 +156,8 @@ impl Ask {
     const NONE: Self = Self { links: false, actions: false, ports: false };
 }
 
-impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: usize>
-    Engine<PORTS, UPLINKS, FIELDS, TAP>
+impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: usize, const EXCHANGES: usize>
+    Engine<PORTS, UPLINKS, FIELDS, TAP, EXCHANGES>
 {
     /// Maximum number of links of this engine: port 2000 twice, port 2001, Modbus, and the recipe
     /// links.
@@ -226,6 +236,13 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                     self.tap.went(TapPlace::Port(port), Some(frame.id()), frame.data(), now);
                     return Output::PortSendCan { port, frame };
                 }
+                None if self.exchanges.is_used() => {
+                    // The kinds of output are the same, but nothing else pays for this one.
+                    if let Some(request) = self.next_request(&mut buf[..], now) {
+                        return self.request_output(request, buf, now);
+                    }
+                    self.ask.ports = false;
+                }
                 None => self.ask.ports = false,
             }
         }
@@ -251,11 +268,15 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         self.links.next_upward(&mut self.store, out).is_none()
             && self.links.next_action().is_none()
             && self.next_downward(out, now).is_none()
+            && !(self.exchanges.is_used() && self.next_request(out, now).is_some())
     }
 
     // Each input has its own function, so that no other pays for the registers it needs.
     #[inline(never)]
     fn port_bytes(&mut self, id: PortId, bytes: &[u8], now: Instant) {
+        if self.exchanges.is_used() && self.talk_bytes(id, bytes, now) {
+            return;
+        }
         if let Some(port) = find_port(&mut self.ports, id) {
             if self.is_deaf {
                 return port.discard(bytes, None, &mut self.tap, now);
@@ -296,6 +317,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
 
     #[inline(never)]
     fn port_can(&mut self, id: PortId, frame: &CanFrame, now: Instant) {
+        if self.exchanges.is_used() && self.talk_can(id, frame, now) {
+            return;
+        }
         let (store, command) = (&mut self.store, self.links.command.first_mut());
         let Some(port) = find_port(&mut self.ports, id) else { return };
         if self.is_deaf {
@@ -315,11 +339,15 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     #[inline(never)]
     fn port_sent(&mut self, id: PortId) {
         self.change_port(id, |port| port.sender.sent());
+        if self.exchanges.is_used() {
+            self.talk_sent(id);
+        }
     }
 
     #[cold]
     fn port_up(&mut self, id: PortId) {
         self.change_port(id, FieldPort::up);
+        self.talk_begins(id);
         self.tell_alive(self.now);
     }
 
@@ -328,6 +356,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         let Some(port) = find_port(&mut self.ports, id) else { return };
         self.ask = Ask::ALL;
         port.down(&self.bindings.inputs, self.links.command.first_mut(), &mut self.tap, now);
+        self.talk_ends(id);
         self.drop_forgotten(now);
         self.tell_alive(now);
     }
@@ -336,9 +365,15 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     fn port_bus(&mut self, id: PortId, state: BusState, now: Instant) {
         let Some(port) = find_port(&mut self.ports, id) else { return };
         self.ask = Ask::ALL;
+        let was_off = port.bus == BusState::BusOff;
         port.bus_state(state, &self.bindings.inputs, self.links.command.first_mut(), now);
         let deadline = port.deadline();
         self.arm(deadline);
+        match (was_off, state == BusState::BusOff) {
+            (false, true) => self.talk_ends(id),
+            (true, false) => self.talk_begins(id),
+            _ => {}
+        }
         self.drop_forgotten(now);
         self.tell_alive(now);
     }

@@ -10,7 +10,7 @@ use super::flight::Flight;
 use super::io::Transport;
 use super::latency::Since;
 use super::store::Store;
-use crate::image::{GroupId, InputSet};
+use crate::image::{BitSet, GroupId, InputSet};
 use crate::link::{LinkTimings, Supervisor};
 use crate::modbus::adu::MAX_ADU;
 use crate::modbus::client::{Client, ClientEvent};
@@ -68,6 +68,13 @@ struct InFlight {
     until: Instant,
 }
 
+/// What is written next where bits have owners.
+enum Turn {
+    Whole(SysVar),
+    /// Neighbouring bits of a variable, as a mask.
+    Bits(SysVar, u8),
+}
+
 /// What goes first when both a write and a poll are due.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum First {
@@ -86,6 +93,8 @@ pub(super) struct ModbusLink {
     polled: Vec<SysVar, MAX_POLLED>,
     blocks: Vec<Block, MAX_POLL_BLOCKS>,
     in_flight: Option<InFlight>,
+    /// Bits with owners that are written in it and have their safe value.
+    safe_bits: Option<(SysVar, u8)>,
     /// Since when a value from a field frame has waited to be handed over.
     pub offered: Since,
     /// The transport has not taken the newest request yet.
@@ -95,8 +104,11 @@ pub(super) struct ModbusLink {
     first: First,
     /// The next write starts at this variable, so that none waits for ever.
     cursor: usize,
+    /// The same for the bits of that variable.
+    bit_cursor: u8,
     /// Safe values that the controller refused; they are written again at `ask_again_at`.
     refused: InputSet,
+    refused_bits: BitSet,
     ask_again_at: Instant,
 }
 
@@ -111,13 +123,16 @@ impl ModbusLink {
             polled: Vec::new(),
             blocks: Vec::new(),
             in_flight: None,
+            safe_bits: None,
             offered: Since::NONE,
             unsent: false,
             flight: Flight::new(),
             timeouts_in_a_row: 0,
             first: First::Write,
             cursor: 0,
+            bit_cursor: 0,
             refused: InputSet::EMPTY,
+            refused_bits: BitSet::EMPTY,
             ask_again_at: Instant::NEVER,
         }
     }
@@ -203,6 +218,9 @@ impl ModbusLink {
         self.client.abort();
         if let Some(InFlight { asked: Asked::Write { safe, .. }, .. }) = self.in_flight.take() {
             store.again(&safe);
+            if let Some((var, bits)) = self.safe_bits.take() {
+                store.bits_again(BitSet::of(var, bits));
+            }
         }
     }
 
@@ -217,11 +235,17 @@ impl ModbusLink {
             self.refused = self.refused.or(safe);
             self.ask_again_at = self.ask_again_at.min(now + REFUSED_PAUSE);
         }
+        if let Some((var, bits)) = self.safe_bits.take() {
+            self.refused_bits = self.refused_bits.or(BitSet::of(var, bits));
+            self.ask_again_at = self.ask_again_at.min(now + REFUSED_PAUSE);
+        }
     }
 
     fn write_refused_again<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
         store.again(&self.refused);
+        store.bits_again(self.refused_bits);
         self.refused = InputSet::EMPTY;
+        self.refused_bits = BitSet::EMPTY;
         self.ask_again_at = Instant::NEVER;
     }
 
@@ -251,7 +275,46 @@ impl ModbusLink {
         store: &mut Store<PORTS>,
         out: &mut [u8],
     ) -> Option<(usize, Asked)> {
+        if store.bits.is_used {
+            return self.write_beside_bits(pending, store, out);
+        }
         let first = pending.iter().find(|var| var.ordinal() >= self.cursor).or(pending.iter().next())?;
+        self.write_whole(first, pending, store, out)
+    }
+
+    /// The same where bits have owners.
+    #[cold]
+    #[inline(never)]
+    fn write_beside_bits<const PORTS: usize>(
+        &mut self,
+        pending: &InputSet,
+        store: &mut Store<PORTS>,
+        out: &mut [u8],
+    ) -> Option<(usize, Asked)> {
+        match self.bits_turn(pending, store)? {
+            Turn::Bits(var, mask) => self.write_bits(var, mask, store, out),
+            Turn::Whole(var) => {
+                self.bit_cursor = 0;
+                let sent = self.write_whole(var, &pending.minus(&store.bits.bytes), store, out);
+                if !store.outbox.dirty().and(&self.writes).is_empty()
+                    && let Some((_, Asked::Write { born, .. })) = sent
+                {
+                    self.offered = born;
+                }
+                sent
+            }
+        }
+    }
+
+    /// One request for a variable and those that follow it without a gap.
+    #[inline(always)]
+    fn write_whole<const PORTS: usize>(
+        &mut self,
+        first: SysVar,
+        pending: &InputSet,
+        store: &mut Store<PORTS>,
+        out: &mut [u8],
+    ) -> Option<(usize, Asked)> {
         let (address, kind) = place_of(first)?;
         let (each, most) = match (kind, first.modbus()) {
             (Kind::Coils, Some(ModbusPlace::Coils { count, .. })) => (count.max(1), MAX_WRITE_COILS),
@@ -290,6 +353,57 @@ impl ModbusLink {
             self.offered = Since::NONE;
         }
         Some((len, Asked::Write { safe, born }))
+    }
+
+    /// Whose turn it is where bits have owners: the first variable at or behind the cursor, or the
+    /// first run of waiting bits there.
+    #[cold]
+    #[inline(never)]
+    fn bits_turn<const PORTS: usize>(&self, pending: &InputSet, store: &Store<PORTS>) -> Option<Turn> {
+        let turn = |var: SysVar, from: u8| {
+            if !store.bits.bytes.contains(var) {
+                return Some(Turn::Whole(var));
+            }
+            let behind = u8::MAX.checked_shl(from.into()).unwrap_or(0);
+            let waiting = store.bits.dirty.byte(var) & behind;
+            let first = waiting.trailing_zeros();
+            let len = waiting.checked_shr(first)?.trailing_ones();
+            let run = u8::MAX.checked_shr(8_u32.checked_sub(len)?)?;
+            Some(Turn::Bits(var, run.checked_shl(first)?))
+        };
+        let from = |var: SysVar| if var.ordinal() == self.cursor { self.bit_cursor } else { 0 };
+        let behind = pending.iter().filter(|var| var.ordinal() >= self.cursor);
+        let next = behind.filter_map(|var| turn(var, from(var))).next();
+        next.or_else(|| pending.iter().find_map(|var| turn(var, 0)))
+    }
+
+    /// One request for a run of bits that have owners.
+    #[cold]
+    #[inline(never)]
+    fn write_bits<const PORTS: usize>(
+        &mut self,
+        var: SysVar,
+        mask: u8,
+        store: &mut Store<PORTS>,
+        out: &mut [u8],
+    ) -> Option<(usize, Asked)> {
+        let (first, _) = place_of(var)?;
+        let (from, count) = (mask.trailing_zeros(), mask.count_ones());
+        let packed = [store.bits.next_bits(var).checked_shr(from)?];
+        let address = first.saturating_add(from as u16);
+        let coils = Coils::new(&packed, count as u16)?;
+        let len = self.client.start(Request::WriteCoils { address, coils }, out.get_mut(..MAX_ADU)?).ok()?;
+        self.cursor = var.ordinal();
+        self.bit_cursor = from.saturating_add(count) as u8;
+        let born = self.offered;
+        born.record(store.now, &mut store.latency.handed_over);
+        let safe = store.bits.safe.byte(var) & mask;
+        store.bits_taken(BitSet::of(var, mask));
+        if store.outbox.dirty().and(&self.writes).is_empty() {
+            self.offered = Since::NONE;
+        }
+        self.safe_bits = (safe != 0).then_some((var, safe));
+        Some((len, Asked::Write { safe: InputSet::EMPTY, born }))
     }
 }
 
@@ -338,6 +452,9 @@ impl Connection for ModbusLink {
                 (Asked::Write { safe, born }, Some(_)) => {
                     born.record(now, &mut store.latency.arrived);
                     store.confirm(&safe);
+                    if let Some((var, bits)) = self.safe_bits.take() {
+                        store.confirm_bits(var, bits & store.bits.safe.byte(var));
+                    }
                 }
                 (Asked::Poll { block }, Some(response)) => {
                     if let Some(block) = self.blocks.get(block) {
@@ -413,6 +530,28 @@ fn take_poll<const PORTS: usize>(
     response: Response<'_>,
     store: &mut Store<PORTS>,
 ) {
+    if store.bits.is_used {
+        take_values(block, polled, response, |var, value| match value {
+            Scalar::Byte(shown) if store.bits.bytes.contains(var) => store.show_bits(var, shown),
+            value => _ = store.image.set(var, value),
+        });
+    } else {
+        take_values(block, polled, response, |var, value| {
+            // The table gives the variable's type, and bits beyond it were not read.
+            let _ = store.image.set(var, value);
+        });
+    }
+    store.image.stamp(block.group, store.now);
+    store.doubt_by_witnesses();
+}
+
+#[inline(always)]
+fn take_values(
+    block: &Block,
+    polled: &[SysVar],
+    response: Response<'_>,
+    mut take: impl FnMut(SysVar, Scalar),
+) {
     for &var in polled {
         let value = match (var.modbus(), response) {
             (Some(ModbusPlace::Coils { first, count }), Response::Coils(coils)) => {
@@ -425,12 +564,9 @@ fn take_poll<const PORTS: usize>(
             _ => None,
         };
         if let Some(value) = value {
-            // The table gives the variable's type, and bits beyond it were not read.
-            let _ = store.image.set(var, value);
+            take(var, value);
         }
     }
-    store.image.stamp(block.group, store.now);
-    store.doubt_by_witnesses();
 }
 
 fn bits_at(coils: Coils<'_>, first: u16, count: u16, block: &Block) -> Option<Scalar> {

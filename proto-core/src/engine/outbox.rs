@@ -16,7 +16,8 @@ const EDGE_QUEUE: usize = 16;
 
 #[derive(Debug, Clone, Copy)]
 struct Edge {
-    var: SysVar,
+    /// The ordinal of the variable, or the place of a share of bits behind those.
+    place: u8,
     value: u8,
     at: Instant,
 }
@@ -31,6 +32,68 @@ struct BitSlot {
 /// The values of one port that wait behind the next ones.
 #[derive(Debug, Clone, Default)]
 pub(super) struct EdgeQueue(Vec<Edge, EDGE_QUEUE>);
+
+/// What becomes of a value for which another one waits already.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Offer {
+    /// It replaces the value that is written next, which is the same.
+    Next,
+    /// It is in the queue.
+    Queued,
+    /// The queue was full: it replaced the newest value of its place.
+    Lost {
+        /// That is the one which is written next.
+        is_next: bool,
+    },
+}
+
+/// The same for a share of bits; its next value is not here.
+impl EdgeQueue {
+    /// A new value of a place whose next one waits.
+    pub(super) fn offer(&mut self, place: u8, next: u8, value: u8, now: Instant) -> Offer {
+        let full = self.0.is_full();
+        match self.0.iter_mut().rev().find(|edge| edge.place == place) {
+            Some(newest) if newest.value == value => {
+                newest.at = now;
+                Offer::Queued
+            }
+            Some(newest) if full => {
+                *newest = Edge { place, value, at: now };
+                Offer::Lost { is_next: false }
+            }
+            None if next == value => Offer::Next,
+            None if full => Offer::Lost { is_next: true },
+            _ => {
+                // Cannot fail: it is not full.
+                let _ = self.0.push(Edge { place, value, at: now });
+                Offer::Queued
+            }
+        }
+    }
+
+    /// Takes the oldest value of a place.
+    pub(super) fn next(&mut self, place: u8) -> Option<(u8, Instant)> {
+        let at = self.0.iter().position(|edge| edge.place == place)?;
+        let edge = self.0.remove(at);
+        Some((edge.value, edge.at))
+    }
+
+    /// Drops all values of a place; returns their number.
+    pub(super) fn drop_all(&mut self, place: u8) -> usize {
+        let before = self.0.len();
+        self.0.retain(|edge| edge.place != place);
+        before.saturating_sub(self.0.len())
+    }
+
+    /// Drops the values of a place that have waited for longer than `timeout`. Returns their number,
+    /// and since when the oldest remaining one waits.
+    pub(super) fn expire(&mut self, place: u8, timeout: Duration, now: Instant) -> (usize, Instant) {
+        let before = self.0.len();
+        self.0.retain(|edge| edge.place != place || now.saturating_since(edge.at) <= timeout);
+        let left = self.0.iter().filter(|edge| edge.place == place).map(|edge| edge.at).min();
+        (before.saturating_sub(self.0.len()), left.unwrap_or(Instant::NEVER))
+    }
+}
 
 #[derive(Debug, Clone)]
 pub(super) struct Outbox {
@@ -55,6 +118,19 @@ impl Outbox {
         self.bits.get(var.ordinal()).map_or(0, |slot| slot.value)
     }
 
+    /// A byte of whose bits each has its owner: whether one is to be written, and the whole byte as a
+    /// recipe link writes it next.
+    pub(super) fn set_shared(&mut self, var: SysVar, is_dirty: bool, value: u8) {
+        if let Some(slot) = self.bits.get_mut(var.ordinal()) {
+            slot.value = value;
+        }
+        if is_dirty {
+            self.dirty.insert(var);
+        } else {
+            self.dirty.remove(var);
+        }
+    }
+
     /// An accepted frame set a byte variable.
     pub(super) fn offer_bits(
         &mut self,
@@ -72,10 +148,11 @@ impl Outbox {
         }
         // A value of this variable is already waiting: only a value that differs is an edge.
         let full = queue.0.is_full();
-        match queue.0.iter_mut().rev().find(|edge| edge.var == var) {
+        let place = var.ordinal() as u8;
+        match queue.0.iter_mut().rev().find(|edge| edge.place == place) {
             Some(newest) if newest.value == value => newest.at = now,
             Some(newest) if full => {
-                *newest = Edge { var, value, at: now };
+                *newest = Edge { place, value, at: now };
                 bump(&mut counters.edges_lost);
             }
             None if slot.value == value => slot.at = now,
@@ -85,7 +162,7 @@ impl Outbox {
             }
             _ => {
                 // Cannot fail: it is not full.
-                let _ = queue.0.push(Edge { var, value, at: now });
+                let _ = queue.0.push(Edge { place, value, at: now });
             }
         }
     }
@@ -98,7 +175,7 @@ impl Outbox {
     /// The owner is silent: the variable takes its safe value, which replaces everything that
     /// waits. `bits` is the safe value of a byte variable.
     pub(super) fn offer_safe(&mut self, queue: &mut EdgeQueue, var: SysVar, bits: u8, now: Instant) {
-        queue.0.retain(|edge| edge.var != var);
+        queue.0.retain(|edge| usize::from(edge.place) != var.ordinal());
         if let Some(slot) = self.bits.get_mut(var.ordinal()) {
             *slot = BitSlot { value: bits, at: now };
         }
@@ -113,7 +190,8 @@ impl Outbox {
     /// Drops everything that is to be written of these variables; returns how many values waited.
     pub(super) fn forget(&mut self, queue: &mut EdgeQueue, vars: &InputSet) -> usize {
         let before = queue.0.len();
-        queue.0.retain(|edge| !vars.contains(edge.var));
+        // Outputs have the places behind the inputs, and are in no set.
+        queue.0.retain(|edge| !SysVar::from_ordinal(edge.place.into()).is_some_and(|var| vars.contains(var)));
         let dropped = self.dirty.and(vars).iter().count();
         self.dirty = self.dirty.minus(vars);
         before.saturating_sub(queue.0.len()).saturating_add(dropped)
@@ -159,7 +237,8 @@ impl Outbox {
             return;
         }
         for var in bits.iter() {
-            let next = queue.0.iter().position(|edge| edge.var == var);
+            let place = var.ordinal() as u8;
+            let next = queue.0.iter().position(|edge| edge.place == place);
             if let (Some(at), Some(slot)) = (next, self.bits.get_mut(var.ordinal())) {
                 let edge = queue.0.remove(at);
                 *slot = BitSlot { value: edge.value, at: edge.at };

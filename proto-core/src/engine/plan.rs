@@ -8,7 +8,7 @@ use core::fmt;
 use super::io::{LinkId, PortId};
 use crate::config::{ConfigView, FieldSpec, Recipe, SendOn};
 use crate::image::InputSet;
-use crate::sysvar::{COUNT, Direction, INPUT_COUNT, ModbusPlace, SysVar};
+use crate::sysvar::{BIT_INPUT_COUNT, COUNT, Direction, INPUT_COUNT, ModbusPlace, SysVar, VarBit};
 
 /// How an input variable reaches the controller.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -39,6 +39,8 @@ pub struct Plan {
     ways: [Option<WayUp>; INPUT_COUNT],
     sources: [Option<Source>; COUNT],
     read_back: InputSet,
+    /// The owners of single bits of byte variables.
+    bit_owners: [[Option<PortId>; 8]; BIT_INPUT_COUNT],
     shows_state: bool,
 }
 
@@ -54,6 +56,24 @@ pub enum PlanError {
         first: PortId,
         /// The other.
         second: PortId,
+    },
+    /// Two ports write the same bit.
+    TwoBitOwners {
+        /// The bit.
+        bit: VarBit,
+        /// The port that writes it first.
+        first: PortId,
+        /// The other.
+        second: PortId,
+    },
+    /// One port writes the whole variable, and another one of its bits.
+    OwnedAndShared {
+        /// The bit.
+        bit: VarBit,
+        /// The port that writes the variable.
+        whole: PortId,
+        /// The port that writes the bit.
+        part: PortId,
     },
     /// No configured way up can carry the input variable (D15).
     NoWayUp {
@@ -89,6 +109,21 @@ impl fmt::Display for PlanError {
                     first.0, second.0
                 )
             }
+            Self::TwoBitOwners { bit, first, second } => {
+                write!(
+                    f,
+                    "{bit} is written by port {} and by port {}; a bit has one owner",
+                    first.0, second.0
+                )
+            }
+            Self::OwnedAndShared { bit, whole, part } => {
+                write!(
+                    f,
+                    "{} is written by port {} as a whole, and {bit} by port {}; allowed: one owner of the whole, \
+                     or owners of bits",
+                    bit.var, whole.0, part.0
+                )
+            }
             Self::NoWayUp { var, .. } => {
                 write!(f, "{var} can be written only through a recipe link whose input part carries it")
             }
@@ -122,11 +157,17 @@ impl Plan {
             ways: [None; INPUT_COUNT],
             sources: [None; COUNT],
             read_back: InputSet::EMPTY,
+            bit_owners: [[None; 8]; BIT_INPUT_COUNT],
             shows_state: config.shows_state(),
         };
         for (id, port, recipe) in config.field_ports() {
             for var in config.owned_by(port, recipe) {
                 plan.claim(config, var, PortId(id))?;
+            }
+        }
+        for (port, recipe) in field_ports(config) {
+            for bit in config.bits_written_by(recipe) {
+                plan.claim_bit(config, bit, port)?;
             }
         }
         for (port, recipe) in field_ports(config) {
@@ -152,12 +193,25 @@ impl Plan {
         Ok(plan)
     }
 
-    /// The field port that owns the variable: its frames contain it.
+    /// The field port that owns a bit of a variable, or the whole variable.
+    pub fn bit_owner(&self, bit: VarBit) -> Option<PortId> {
+        let bits = self.bit_owners.get(bit.var.ordinal());
+        let owner = bits.and_then(|bits| bits.get(usize::from(bit.bit)).copied().flatten());
+        owner.or_else(|| self.owner(bit.var))
+    }
+
+    /// The field ports that own the variable or its bits, once for each bit.
+    pub(super) fn owners(&self, var: SysVar) -> impl Iterator<Item = PortId> + '_ {
+        let bits = self.bit_owners.get(var.ordinal()).into_iter().flatten();
+        self.owner(var).into_iter().chain(bits.filter_map(|owner| *owner))
+    }
+
+    /// The field port that owns the variable as a whole: its frames contain it.
     pub fn owner(&self, var: SysVar) -> Option<PortId> {
         self.owners.get(var.ordinal()).copied().flatten()
     }
 
-    /// How an owned input variable reaches the controller.
+    /// How an input variable that is owned, or some of whose bits are, reaches the controller.
     pub fn way_up(&self, var: SysVar) -> Option<WayUp> {
         self.ways.get(var.ordinal()).copied().flatten()
     }
@@ -189,6 +243,25 @@ impl Plan {
             Some(first) if first != port => return Err(PlanError::TwoOwners { var, first, second: port }),
             _ => *owner = Some(port),
         }
+        self.find_way_up(config, var, port)
+    }
+
+    fn claim_bit(&mut self, config: ConfigView<'_>, bit: VarBit, port: PortId) -> Result<(), PlanError> {
+        if let Some(whole) = self.owner(bit.var) {
+            return Err(PlanError::OwnedAndShared { bit, whole, part: port });
+        }
+        let owner = self.bit_owners.get_mut(bit.var.ordinal());
+        let Some(owner) = owner.and_then(|bits| bits.get_mut(usize::from(bit.bit))) else { return Ok(()) };
+        match *owner {
+            Some(first) if first != port => {
+                return Err(PlanError::TwoBitOwners { bit, first, second: port });
+            }
+            _ => *owner = Some(port),
+        }
+        self.find_way_up(config, bit.var, port)
+    }
+
+    fn find_way_up(&mut self, config: ConfigView<'_>, var: SysVar, port: PortId) -> Result<(), PlanError> {
         let way = uplinks(config)
             .find(|&(_, recipe)| inputs_of(config, recipe).any(|v| v == var))
             .map(|(link, _)| WayUp::Recipe(link))
@@ -248,7 +321,7 @@ fn inputs_of<'a>(config: ConfigView<'a>, recipe: &'a Recipe) -> impl Iterator<It
 /// safe values or none. Then all of them are known whenever one is written.
 fn is_one_frame(config: ConfigView<'_>, link: &Recipe) -> bool {
     config.field_ports().any(|(_, port, recipe)| {
-        recipe.frames(Direction::Input).any(|(_, fields)| {
+        config.frames_of(recipe, Direction::Input).any(|(_, fields)| {
             let fields = fields.of(config.fields);
             let brings = |var| fields.iter().flat_map(FieldSpec::variables).any(|brought| brought == var);
             let safe = |var| port.on_timeout.of(config.safe_values).iter().any(|safe| safe.var == var);
@@ -259,11 +332,24 @@ fn is_one_frame(config: ConfigView<'_>, link: &Recipe) -> bool {
     })
 }
 
-/// The variables that a recipe's output part shows, and the one whose bit triggers it.
+/// The variables that a recipe's output part shows, and the one whose bit triggers it; those of
+/// exchanges are looked at when they are asked.
+pub(super) fn sent_by<'a>(config: ConfigView<'a>, recipe: &'a Recipe) -> impl Iterator<Item = SysVar> + 'a {
+    let trigger = match recipe.send {
+        SendOn::Rising { var, .. } => Some(var),
+        _ => None,
+    };
+    let fields = recipe.part_frames(Direction::Output).flat_map(move |span| span.of(config.fields));
+    fields.flat_map(FieldSpec::variables).chain(trigger)
+}
+
+/// The variables that a recipe's outputs show, and those whose bits trigger them.
 pub(super) fn shown_by<'a>(config: ConfigView<'a>, recipe: &'a Recipe) -> impl Iterator<Item = SysVar> + 'a {
     let trigger = match recipe.send {
         SendOn::Rising { var, .. } => Some(var),
         _ => None,
     };
-    config.fields_of(recipe, Direction::Output).flat_map(|(_, _, field)| field.variables()).chain(trigger)
+    let asks = config.exchanges_of(recipe).iter().filter_map(|exchange| Some(exchange.when.rising?.0));
+    let fields = config.fields_of(recipe, Direction::Output).flat_map(|(_, _, field)| field.variables());
+    fields.chain(trigger).chain(asks)
 }

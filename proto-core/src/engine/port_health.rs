@@ -87,8 +87,8 @@ fn told_as(var: SysVar, value: PortValue, number: u32) -> Scalar {
     }
 }
 
-impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: usize>
-    Engine<PORTS, UPLINKS, FIELDS, TAP>
+impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: usize, const EXCHANGES: usize>
+    Engine<PORTS, UPLINKS, FIELDS, TAP, EXCHANGES>
 {
     /// Gives values of the state packet and of the health of ports their places among the image's
     /// extra values.

@@ -4,14 +4,15 @@ use super::Engine;
 use super::counters::PortCounters;
 use super::io::{LinkId, PortId, PortState, ReplyCode};
 use super::latency::Latency;
+use super::line::PeerState;
 use super::links::LinkInfo;
 use super::status::Status;
 use super::tap::Tap;
 use crate::image::Image;
 use crate::time::Instant;
 
-impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: usize>
-    Engine<PORTS, UPLINKS, FIELDS, TAP>
+impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: usize, const EXCHANGES: usize>
+    Engine<PORTS, UPLINKS, FIELDS, TAP, EXCHANGES>
 {
     /// The process image.
     pub fn image(&self) -> &Image {
@@ -27,7 +28,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     pub fn port_state(&self, port: PortId) -> Option<PortState> {
         let (index, port) = self.ports.iter().enumerate().find(|(_, other)| other.id == port)?;
         let mut own = self.store.frames.iter().filter(|frame| usize::from(frame.port) == index);
-        Some(port.state(own.any(|frame| frame.is_overdue())))
+        let peers = port.line().map_or(&[][..], |line| line.peers.of(self.exchanges.peers()));
+        Some(port.state(own.any(|frame| frame.is_overdue()) || peers.iter().any(PeerState::is_down)))
     }
 
     /// Result of the newest command that a port's values picked; `None` if no such port is configured.
@@ -65,9 +67,11 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             frames: &self.store.frames,
             health: &self.health,
             image: &self.store.image,
+            bits: &self.store.bits,
             links: self.links.view(),
             latency: &self.store.latency,
             sleeps: self.sleeps,
+            peers: self.exchanges.peers(),
         }
     }
 

@@ -37,11 +37,13 @@ pub enum Rejection {
     Malformed,
     /// Escape bytes that mean nothing.
     Escape,
+    /// The device refuses a request.
+    Refused,
 }
 
 impl Rejection {
     /// All reasons.
-    pub const ALL: [Self; 14] = [
+    pub const ALL: [Self; 15] = [
         Self::NoFrame,
         Self::Partial,
         Self::NotFinite,
@@ -56,6 +58,7 @@ impl Rejection {
         Self::Asleep,
         Self::Malformed,
         Self::Escape,
+        Self::Refused,
     ];
 
     /// A short text, such as `no frame found`.
@@ -75,6 +78,7 @@ impl Rejection {
             Self::Asleep => "waited while the gateway slept",
             Self::Malformed => "a violation of the protocol",
             Self::Escape => "wrong escape bytes",
+            Self::Refused => "the device refuses the request",
         }
     }
 }

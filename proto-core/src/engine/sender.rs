@@ -123,6 +123,21 @@ impl Sender {
         })
     }
 
+    /// Whether what was handed over has not left yet, or the line is held.
+    pub(super) fn is_busy(&self) -> bool {
+        self.in_flight
+    }
+
+    /// The line is somebody else's until [`Self::sent`].
+    pub(super) fn hold(&mut self) {
+        self.in_flight = true;
+    }
+
+    /// Whether a value that came at this instant may be sent.
+    pub(super) fn is_fresh(&self, came: Instant, now: Instant) -> bool {
+        self.on_stale == OnStale::Hold || now.saturating_since(came) <= self.stale_after
+    }
+
     /// Everything handed over has left.
     pub(super) fn sent(&mut self) {
         self.in_flight = false;

@@ -32,6 +32,8 @@ pub(super) struct StateLink {
     pub shown: Vec<SysVar, COUNT>,
     /// Input variables whose present value is read back while no port sends them.
     pub read_back: InputSet,
+    /// The same for variables of whose bits each has its owner.
+    read_back_bits: InputSet,
     /// Codes of mode, robot, program and safety in the newest packet.
     pub codes: [u8; 4],
     /// Other values of the packet that ports show.
@@ -69,9 +71,16 @@ impl StateLink {
             stream: StateStream::new(),
             shown: Vec::new(),
             read_back,
+            read_back_bits: InputSet::EMPTY,
             codes: [0; 4],
             kept: Vec::new(),
         }
+    }
+
+    /// These variables have bits with owners.
+    pub(super) fn share(&mut self, bytes: &InputSet) {
+        self.read_back_bits = self.read_back.and(bytes);
+        self.read_back = self.read_back.minus(bytes);
     }
 
     pub(super) fn transport(&self) -> Transport {
@@ -115,6 +124,9 @@ impl Connection for StateLink {
                             }
                         }
                     }
+                    if store.bits.is_used {
+                        read_bits(&view, &self.read_back_bits, store);
+                    }
                     if !store.safe.is_empty() {
                         compare_safe(&view, store);
                     }
@@ -136,6 +148,18 @@ impl Connection for StateLink {
     }
 }
 
+/// Reads back the bits that none of our ports has sent.
+#[cold]
+#[inline(never)]
+fn read_bits<const PORTS: usize>(view: &StateView<'_>, bytes: &InputSet, store: &mut Store<PORTS>) {
+    for var in bytes.iter() {
+        if let Some(Scalar::Byte(shown)) = view.read_var(var) {
+            store.show_bits(var, shown);
+            store.read_back.insert(var);
+        }
+    }
+}
+
 /// Keeps the packet's other values that ports show; returns how many are unreadable. On its own, so
 /// that a gateway without them does not pay for its registers.
 #[inline(never)]
@@ -150,6 +174,11 @@ fn compare_safe<const PORTS: usize>(view: &StateView<'_>, store: &mut Store<PORT
     let (may_confirm, may_doubt) = (store.may_confirm(), store.may_doubt());
     for var in store.safe.iter() {
         let Some(shown) = view.read_var(var) else { continue };
+        if store.bits.bytes.contains(var) {
+            let Scalar::Byte(shown) = shown else { continue };
+            store.compare_bits(var, shown, may_confirm, may_doubt);
+            continue;
+        }
         let is_there = shown == store.image.value(var);
         match store.unconfirmed.contains(var) {
             true if is_there && may_confirm => store.confirm(&InputSet::from_iter([var])),

@@ -5,10 +5,14 @@
 //! It is a view: making it costs a few pointers, and each part is computed on request. Unknown
 //! values are absent, never 0.
 
+use core::fmt;
+
+use super::bits::Bits;
 use super::counters::PortCounters;
 use super::field_port::{Codec, FieldPort};
 use super::io::{BusState, PortId, PortState, ReplyCode};
 use super::latency::Latency;
+use super::line::{PeerCounters, PeerState};
 use super::links::{LinkInfo, LinksView};
 use super::not_given::LastNotGiven;
 use super::port_health::PortsHealth;
@@ -17,7 +21,8 @@ use super::store::InputFrame;
 use crate::config::CommandText;
 use crate::image::{GroupId, Image};
 use crate::link::LinkState;
-use crate::sysvar::{Direction, SysVar};
+use crate::schedule::Presence;
+use crate::sysvar::{Direction, SysVar, VarBit};
 use crate::time::{Duration, Instant};
 use crate::wire::scalar::Scalar;
 use crate::wire::state::States;
@@ -30,9 +35,11 @@ pub struct Status<'a> {
     pub(super) frames: &'a [InputFrame],
     pub(super) health: &'a PortsHealth,
     pub(super) image: &'a Image,
+    pub(super) bits: &'a Bits,
     pub(super) links: LinksView<'a>,
     pub(super) latency: &'a Latency,
     pub(super) sleeps: u32,
+    pub(super) peers: &'a [PeerState],
 }
 
 /// The bus of a field port.
@@ -93,6 +100,33 @@ pub struct PortStatus<'a> {
     pub last_rejection: Option<&'a LastRejection>,
     /// Counters since the start.
     pub counters: &'a PortCounters,
+    peers: &'a [PeerState],
+}
+
+/// A slave, or another peer that exchanges of a port are with.
+#[derive(Debug, Clone, Copy)]
+#[non_exhaustive]
+pub struct PeerStatus {
+    /// Its address, or its number in the configuration; 0 on Modbus stands for all slaves.
+    pub number: u8,
+    /// Whether it answers; [`Presence::Unknown`] if it is never asked for an answer.
+    pub presence: Presence,
+    /// Periods that went by while it was not down, because the line had too much to do.
+    pub missed_periods: u32,
+    /// Counters since the start.
+    pub counters: PeerCounters,
+}
+
+impl<'a> PortStatus<'a> {
+    /// The peers of the port's exchanges.
+    pub fn peers(&self) -> impl Iterator<Item = PeerStatus> + use<'a> {
+        self.peers.iter().map(|peer| PeerStatus {
+            number: peer.number,
+            presence: peer.turn.presence(),
+            missed_periods: peer.turn.missed(),
+            counters: peer.counters,
+        })
+    }
 }
 
 /// A known variable and its value.
@@ -107,6 +141,30 @@ pub struct VariableStatus<'a> {
     pub age: Duration,
     /// The field port that owns an input variable; `None` for a value from the controller.
     pub owner: Option<&'a str>,
+    /// The bit that the value and the owner are of, in a byte of whose bits each has its owner.
+    pub bit: Option<u8>,
+}
+
+impl VariableStatus<'_> {
+    /// The name of the variable or bit.
+    pub fn name(&self) -> impl fmt::Display + use<> {
+        let &Self { var, bit, .. } = self;
+        Name { var, bit }
+    }
+}
+
+struct Name {
+    var: SysVar,
+    bit: Option<u8>,
+}
+
+impl fmt::Display for Name {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.bit {
+            Some(bit) => VarBit { var: self.var, bit }.fmt(f),
+            None => self.var.fmt(f),
+        }
+    }
 }
 
 /// The controller's states in the newest state packet.
@@ -135,8 +193,30 @@ impl<'a> Status<'a> {
         self.links.infos()
     }
 
-    /// The known variables, in the order of the table.
+    /// The known variables, in the order of the table; then bits with owners of their own.
     pub fn variables(self) -> impl Iterator<Item = VariableStatus<'a>> {
+        self.whole_variables().chain(self.bits())
+    }
+
+    fn bits(self) -> impl Iterator<Item = VariableStatus<'a>> {
+        self.bits.shares().iter().flat_map(move |share| {
+            let at = self.image.stamp_of(GroupId(share.frame));
+            let owner = self.ports.get(usize::from(share.port)).map(|port| port.name.as_str());
+            let value = self.image.byte(share.var);
+            (0..8).filter_map(move |bit| {
+                let mask = 1_u8.checked_shl(bit.into()).filter(|mask| share.mask & mask != 0)?;
+                Some(VariableStatus {
+                    var: share.var,
+                    value: Scalar::Byte(u8::from(value & mask != 0)),
+                    age: self.at.saturating_since(at?),
+                    owner,
+                    bit: Some(bit),
+                })
+            })
+        })
+    }
+
+    fn whole_variables(self) -> impl Iterator<Item = VariableStatus<'a>> {
         SysVar::all().filter_map(move |var| {
             let age = self.image.age(var, self.at)?;
             self.image.is_readable(var).then(|| VariableStatus {
@@ -144,6 +224,7 @@ impl<'a> Status<'a> {
                 value: self.image.value(var),
                 age,
                 owner: self.owner(var),
+                bit: None,
             })
         })
     }
@@ -183,7 +264,7 @@ impl<'a> Status<'a> {
 
     /// The field port that owns an input variable.
     fn owner(&self, var: SysVar) -> Option<&'a str> {
-        if var.direction() != Direction::Input {
+        if var.direction() != Direction::Input || self.bits.bytes.contains(var) {
             return None;
         }
         let frame = self.frames.iter().find(|frame| frame.set.contains(var));
@@ -197,6 +278,7 @@ impl<'a> Status<'a> {
             heard_at = heard_at.max(self.image.stamp_of(GroupId(group)));
             overdue = overdue.saturating_add(usize::from(frame.is_overdue()));
         }
+        let peers = port.line().map_or(&[][..], |line| line.peers.of(self.peers));
         let is_can = match &port.codec {
             Codec::Stream { .. } => false,
             Codec::Can { .. } => true,
@@ -208,7 +290,7 @@ impl<'a> Status<'a> {
             name: &port.name,
             bus,
             recipe: port.recipe,
-            state: port.state(overdue > 0),
+            state: port.state(overdue > 0 || peers.iter().any(PeerState::is_down)),
             age: heard_at.map(|at| self.at.saturating_since(at)),
             overdue,
             reply: port.reply,
@@ -216,6 +298,7 @@ impl<'a> Status<'a> {
             last_not_given: self.links.command.and_then(|link| link.not_given_of(port.id)),
             last_rejection: port.last_rejection.as_ref(),
             counters: &port.counters,
+            peers,
         }
     }
 }

@@ -3,7 +3,9 @@
 //! ```text
 //! { "time_us", "sleeps",
 //!   "ports": { NAME: { "bus", "bus_state"?, "recipe", "state", "age_ms"?, "overdue", "reply",
-//!                      "command"?, "last_not_given"?, "last_rejection"?, "counters" } },
+//!                      "command"?, "last_not_given"?, "last_rejection"?,
+//!                      "peers"?: { NUMBER: { "presence", "missed_periods", "counters" } },
+//!                      "counters" } },
 //!   "links": { NAME: { "kind", "state", "history", "counters" } },
 //!   "controller"?: { "mode", "robot", "program", "safety", "age_ms" },
 //!   "values": { VARIABLE: { "value", "age_ms", "owner"? } },
@@ -19,7 +21,7 @@ use serde::ser::{Serialize, SerializeMap, Serializer};
 use super::links::LinkInfo;
 use super::not_given::LastNotGiven;
 use super::rejection::LastRejection;
-use super::status::{ControllerStatus, FieldBus, PortStatus, Status, VariableStatus};
+use super::status::{ControllerStatus, FieldBus, PeerStatus, PortStatus, Status, VariableStatus};
 use crate::time::Instant;
 use crate::wire::scalar::Scalar;
 
@@ -87,7 +89,7 @@ impl Serialize for Status<'_> {
         if let Some(controller) = self.controller() {
             map.serialize_entry("controller", &controller)?;
         }
-        map.serialize_entry("values", &Map(|| self.variables().map(|known| (Text(known.var), known))))?;
+        map.serialize_entry("values", &Map(|| self.variables().map(|known| (Text(known.name()), known))))?;
         map.serialize_entry("latency", self.latency())?;
         map.end()
     }
@@ -123,7 +125,20 @@ impl Serialize for At<PortStatus<'_>> {
         if let Some(rejection) = port.last_rejection {
             map.serialize_entry("last_rejection", &Rejected(rejection, *at))?;
         }
+        if port.peers().next().is_some() {
+            map.serialize_entry("peers", &Map(|| port.peers().map(|peer| (peer.number, peer))))?;
+        }
         map.serialize_entry("counters", port.counters)?;
+        map.end()
+    }
+}
+
+impl Serialize for PeerStatus {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let mut map = serializer.serialize_map(None)?;
+        map.serialize_entry("presence", self.presence.name())?;
+        map.serialize_entry("missed_periods", &self.missed_periods)?;
+        map.serialize_entry("counters", &self.counters)?;
         map.end()
     }
 }

@@ -3,11 +3,12 @@
 
 use heapless::Vec;
 
+use super::bits::{Bits, TimedOut};
 use super::counters::{PortCounters, bump};
 use super::latency::Latency;
 use super::outbox::{EdgeQueue, Outbox};
 use crate::config::{SafeValue, Span};
-use crate::image::{GroupId, Image, InputSet};
+use crate::image::{BitSet, GroupId, Image, InputSet};
 use crate::sysvar::SysVar;
 use crate::time::{Duration, Instant, Stamp};
 
@@ -28,12 +29,14 @@ pub(super) struct InputFrame {
     pub overdue_at: Instant,
     /// Its timeout.
     pub timeout: Duration,
+    /// Whether it is missed if it does not come; not a reply that is asked for only now and then.
+    pub is_expected: bool,
 }
 
 impl InputFrame {
     /// Whether it is overdue or has never come.
     pub(super) fn is_overdue(&self) -> bool {
-        self.overdue_at == Instant::NEVER
+        self.is_expected && self.overdue_at == Instant::NEVER
     }
 }
 
@@ -49,8 +52,10 @@ pub(super) enum Overdue {
 /// A safe value in the form of the image.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct SafeBytes {
-    var: SysVar,
-    bytes: [u8; 4],
+    pub var: SysVar,
+    pub bytes: [u8; 4],
+    /// The bits of a byte that it is for.
+    pub mask: u8,
 }
 
 impl SafeBytes {
@@ -58,7 +63,7 @@ impl SafeBytes {
         let mut bytes = [0; 4];
         // Every variable has at most four bytes, and validation has checked the type.
         safe.value.encode(&mut bytes);
-        Self { var: safe.var, bytes }
+        Self { var: safe.var, bytes, mask: safe.mask }
     }
 }
 
@@ -95,8 +100,10 @@ pub(super) struct Store<const PORTS: usize> {
     heard_at: Option<Instant>,
     /// Number of gaps in these, wrapping: the controller may have restarted in each.
     pub era: u32,
-    /// Variables whose link is up.
+    /// Variables whose link is up; none of whose bits each has an owner.
     pub reachable: InputSet,
+    /// Variables of whose bits each has its owner.
+    pub bits: Bits,
     /// Variables that tell the robot the health of ports.
     pub health: InputSet,
     /// When they are checked again.
@@ -131,6 +138,7 @@ impl<const PORTS: usize> Store<PORTS> {
             heard_at: None,
             era: 0,
             reachable: InputSet::EMPTY,
+            bits: Bits::new(),
             health: InputSet::EMPTY,
             health_at: Stamp::NEVER,
             lost: [0; PORTS],
@@ -159,18 +167,76 @@ impl<const PORTS: usize> Store<PORTS> {
             self.unconfirmed = self.unconfirmed.minus(&set);
         }
         let reachable = set.and(&self.reachable);
-        let Some(queue) = self.edges.get_mut(port) else { return InputSet::EMPTY };
         if reachable != set {
-            bump(&mut counters.undelivered);
-            // A safe value that waits for the link is replaced: its owner is back.
-            self.outbox.forget(queue, &set.minus(&reachable));
+            return self.accepted_in_part(nth, set, port, counters);
         }
-        self.outbox.offer_analog(&reachable.minus(&InputSet::BYTES));
-        for var in reachable.and(&InputSet::BYTES).iter() {
-            let value = self.image.bytes().get(var.image_offset()).copied().unwrap_or(0);
-            self.outbox.offer_bits(queue, counters, var, value, now);
-        }
+        self.offer(port, &reachable, counters);
         reachable
+    }
+
+    #[inline(always)]
+    fn offer(&mut self, port: usize, vars: &InputSet, counters: &mut PortCounters) {
+        let Some(queue) = self.edges.get_mut(port) else { return };
+        self.outbox.offer_analog(&vars.minus(&InputSet::BYTES));
+        for var in vars.and(&InputSet::BYTES).iter() {
+            let value = self.image.bytes().get(var.image_offset()).copied().unwrap_or(0);
+            self.outbox.offer_bits(queue, counters, var, value, self.now);
+        }
+    }
+
+    /// The same for a frame with variables whose link is down, or with bits that have owners.
+    #[cold]
+    #[inline(never)]
+    fn accepted_in_part(
+        &mut self,
+        nth: usize,
+        set: InputSet,
+        port: usize,
+        counters: &mut PortCounters,
+    ) -> InputSet {
+        let Some(queue) = self.edges.get_mut(port) else { return InputSet::EMPTY };
+        let now = self.now;
+        let whole = set.minus(&self.bits.bytes);
+        let mut reachable = whole.and(&self.reachable);
+        let mut undelivered = reachable != whole;
+        // A safe value that waits for the link is replaced: its owner is back.
+        self.outbox.forget(queue, &whole.minus(&reachable));
+        let mut bits = InputSet::EMPTY;
+        if whole != set {
+            let offered = self.bits.accepted(nth, queue, counters, &self.image, now);
+            undelivered |= offered.undelivered;
+            bits = offered.reachable;
+            if offered.was_safe {
+                self.next_expiry = Stamp::at(now);
+            }
+        }
+        if undelivered {
+            bump(&mut counters.undelivered);
+        }
+        self.offer(port, &reachable, counters);
+        self.bits_changed();
+        reachable = reachable.or(&bits);
+        reachable
+    }
+
+    /// The bits with owners, or the image of their bytes, have changed: so do the bytes in the sets of
+    /// whole variables.
+    pub(super) fn bits_changed(&mut self) {
+        for var in self.bits.bytes.iter() {
+            let value = self.bits.next_byte(var, &self.image);
+            self.outbox.set_shared(var, self.bits.dirty.byte(var) != 0, value);
+            for (set, is_in) in [
+                (&mut self.live, self.bits.live.byte(var) == var.valid_bits()),
+                (&mut self.safe, self.bits.safe.byte(var) != 0),
+                (&mut self.unconfirmed, self.bits.unconfirmed.byte(var) != 0),
+            ] {
+                if is_in {
+                    set.insert(var);
+                } else {
+                    set.remove(var);
+                }
+            }
+        }
     }
 
     /// Handles the first thing overdue; the variables of a frame get their safe values. Call it again
@@ -180,7 +246,8 @@ impl<const PORTS: usize> Store<PORTS> {
         if now < self.next_overdue.get() {
             return None;
         }
-        let Some(frame) = self.frames.iter_mut().find(|frame| frame.overdue_at <= now) else {
+        let overdue = self.frames.iter_mut().enumerate().find(|(_, frame)| frame.overdue_at <= now);
+        let Some((nth, frame)) = overdue else {
             if self.health_at.get() <= now {
                 self.health_at = Stamp::NEVER;
                 return Some(Overdue::Health);
@@ -193,7 +260,7 @@ impl<const PORTS: usize> Store<PORTS> {
         let frame = *frame;
         let queue = self.edges.get_mut(usize::from(frame.port))?;
         let mut dropped = 0_usize;
-        for var in frame.set.iter() {
+        for var in frame.set.minus(&self.bits.bytes).iter() {
             let Some(value) = safe.iter().find(|safe| safe.var == var) else {
                 let waited = self.outbox.forget(queue, &InputSet::from_iter([var]));
                 dropped = dropped.saturating_add(waited);
@@ -215,6 +282,16 @@ impl<const PORTS: usize> Store<PORTS> {
             self.safe.insert(var);
             self.unconfirmed.insert(var);
             self.unconfirmed_since = now;
+        }
+        if self.bits.is_used {
+            let TimedOut { dropped: bits, is_safe, held } =
+                self.bits.time_out(nth, queue, &mut self.image, safe, now);
+            dropped = dropped.saturating_add(bits);
+            self.read_back = self.read_back.minus(&held);
+            if is_safe {
+                self.unconfirmed_since = now;
+            }
+            self.bits_changed();
         }
         Some(Overdue::Frame(frame, dropped))
     }
@@ -244,20 +321,32 @@ impl<const PORTS: usize> Store<PORTS> {
             return;
         }
         self.next_expiry = Stamp::NEVER;
-        for frame in &self.frames {
-            let waiting = frame.set.and(&InputSet::BYTES).and(&self.outbox.dirty()).minus(&self.safe);
-            if waiting.is_empty() {
+        for (nth, frame) in self.frames.iter().enumerate() {
+            let bits = self.outbox.dirty().and(&self.bits.bytes).and(&frame.set);
+            let bytes = InputSet::BYTES.minus(&self.bits.bytes);
+            let waiting = frame.set.and(&bytes).and(&self.outbox.dirty()).minus(&self.safe);
+            if waiting.is_empty() && bits.is_empty() {
                 continue;
             }
             let port = usize::from(frame.port);
             if let Some(queue) = self.edges.get_mut(port) {
-                let (dropped, oldest) = self.outbox.expire(queue, &waiting, frame.timeout, now);
+                let (mut dropped, mut oldest) = (0, Instant::NEVER);
+                if !waiting.is_empty() {
+                    (dropped, oldest) = self.outbox.expire(queue, &waiting, frame.timeout, now);
+                }
+                if !bits.is_empty() {
+                    let (more, older) = self.bits.expire(nth, queue, frame.timeout, now);
+                    (dropped, oldest) = (dropped.saturating_add(more), oldest.min(older));
+                }
                 let too_old = too_old_at(oldest, frame.timeout);
                 self.next_expiry = Stamp::at(self.next_expiry.get().min(too_old));
                 if dropped > 0 {
                     count(port, dropped);
                 }
             }
+        }
+        if self.bits.is_used {
+            self.bits_changed();
         }
     }
 
@@ -274,14 +363,26 @@ impl<const PORTS: usize> Store<PORTS> {
             for queue in &mut self.edges {
                 self.outbox.next_edges(queue, &bits);
             }
+            if self.bits.is_used {
+                self.bits_taken(BitSet::all_of(&bits));
+            }
         }
+    }
+
+    /// These bits have been handed over to their link.
+    #[cold]
+    #[inline(never)]
+    pub(super) fn bits_taken(&mut self, bits: BitSet) {
+        self.bits.taken(bits, &mut self.edges);
+        self.bits_changed();
     }
 
     /// A link came up: from now on frames are passed on to it. Earlier ones are not. The health of
     /// ports is the present one.
     pub(super) fn link_up(&mut self, vars: &InputSet) {
-        self.reachable = self.reachable.or(vars);
+        self.reachable = self.reachable.or(&vars.minus(&self.bits.bytes));
         self.outbox.again(&vars.and(&self.health).and(&self.live));
+        self.bits.link_up(&vars.and(&self.bits.bytes));
     }
 
     /// A link was lost: waiting values are dropped, except safe values.
@@ -292,10 +393,23 @@ impl<const PORTS: usize> Store<PORTS> {
             let (Some(queue), Some(count)) = (self.edges.get_mut(port), self.lost.get_mut(port)) else {
                 continue;
             };
-            let dropped = self.outbox.forget(queue, &frame.set.and(vars).minus(&self.safe));
+            let whole = frame.set.and(vars).minus(&self.bits.bytes);
+            let dropped = self.outbox.forget(queue, &whole.minus(&self.safe));
             *count = count.saturating_add(dropped as u32);
             self.has_lost |= dropped > 0;
         }
+        let bytes = vars.and(&self.bits.bytes);
+        if bytes.is_empty() {
+            return;
+        }
+        let (lost, has_lost) = (&mut self.lost, &mut self.has_lost);
+        self.bits.link_lost(&bytes, &mut self.edges, |port, dropped| {
+            if let Some(count) = lost.get_mut(port) {
+                *count = count.saturating_add(dropped as u32);
+                *has_lost |= dropped > 0;
+            }
+        });
+        self.bits_changed();
     }
 
     /// Number of values per port that were dropped because their link was lost, since the last
@@ -306,7 +420,18 @@ impl<const PORTS: usize> Store<PORTS> {
 
     /// A write of safe values failed: they are written again, if they are still current.
     pub(super) fn again(&mut self, safe: &InputSet) {
-        self.outbox.again(&safe.and(&self.safe));
+        let safe = safe.and(&self.safe);
+        self.outbox.again(&safe.minus(&self.bits.bytes));
+        let bytes = safe.and(&self.bits.bytes);
+        if !bytes.is_empty() {
+            self.bits_again(BitSet::all_of(&bytes).and(self.bits.unconfirmed));
+        }
+    }
+
+    /// The same for bits with owners.
+    pub(super) fn bits_again(&mut self, bits: BitSet) {
+        self.bits.again(bits);
+        self.bits_changed();
     }
 
     /// The controller has these safe values, as far as they are still current.
@@ -315,6 +440,37 @@ impl<const PORTS: usize> Store<PORTS> {
             self.confirmed_at = self.now;
         }
         self.unconfirmed = self.unconfirmed.minus(safe);
+    }
+
+    /// The controller has these safe values of a byte's bits, as far as they are still current.
+    pub(super) fn confirm_bits(&mut self, var: SysVar, mask: u8) {
+        let bits = BitSet::of(var, mask).and(self.bits.unconfirmed);
+        if !bits.is_empty() && self.unanswered.contains(var) {
+            self.confirmed_at = self.now;
+        }
+        self.bits.unconfirmed = self.bits.unconfirmed.minus(bits);
+        self.bits_changed();
+    }
+
+    /// Compares the safe values of a byte's bits with what the controller shows.
+    pub(super) fn compare_bits(&mut self, var: SysVar, shown: u8, may_confirm: bool, may_doubt: bool) {
+        let (safe, unconfirmed) = (self.bits.safe.byte(var), self.bits.unconfirmed.byte(var));
+        let is_there = !(shown ^ self.image.byte(var));
+        if may_confirm {
+            self.confirm_bits(var, unconfirmed & is_there);
+        }
+        let doubted = BitSet::of(var, safe & !unconfirmed & !is_there);
+        if may_doubt && !doubted.is_empty() && self.unanswered.contains(var) {
+            self.bits.unconfirmed = self.bits.unconfirmed.or(doubted);
+            self.bits_again(doubted);
+        }
+    }
+
+    /// Takes the bits of a byte that the controller shows and of which none of our own has a value.
+    pub(super) fn show_bits(&mut self, var: SysVar, shown: u8) {
+        let live = self.bits.live.byte(var);
+        self.image.set_bits(var, var.valid_bits() & !live, shown);
+        self.bits_changed();
     }
 
     /// Whether the controller can have had this other value all along. Later another master has
@@ -328,7 +484,15 @@ impl<const PORTS: usize> Store<PORTS> {
         if !self.may_doubt() {
             return;
         }
-        for var in self.safe.minus(&self.unconfirmed).and(&InputSet::BYTES).iter() {
+        for var in self.safe.and(&self.bits.bytes).iter() {
+            if let Some(witness) = var.shown_by()
+                && self.image.known_since(witness) == Some(self.now)
+            {
+                self.compare_bits(var, self.image.byte(witness), false, true);
+            }
+        }
+        let whole = InputSet::BYTES.minus(&self.bits.bytes);
+        for var in self.safe.minus(&self.unconfirmed).and(&whole).iter() {
             if let Some(witness) = var.shown_by()
                 && self.image.known_since(witness) == Some(self.now)
                 && self.image.value(witness) != self.image.value(var)
@@ -362,8 +526,10 @@ impl<const PORTS: usize> Store<PORTS> {
     /// The controller may have restarted: safe values are written once more.
     pub(super) fn controller_was_away(&mut self) {
         self.unconfirmed = self.safe;
+        self.bits.unconfirmed = self.bits.safe;
         self.unconfirmed_since = self.now;
-        self.outbox.again(&self.safe);
+        let safe = self.safe;
+        self.again(&safe);
     }
 
     /// Whether a value that the controller shows now can be the result of the safe values, and not
@@ -381,9 +547,12 @@ impl<const PORTS: usize> Store<PORTS> {
         for var in self.unconfirmed.and(&InputSet::BYTES).iter() {
             if let Some(witness) = var.shown_by()
                 && self.image.known_since(witness).is_some_and(|at| at >= since)
-                && self.image.value(witness) == self.image.value(var)
             {
-                self.confirm(&InputSet::from_iter([var]));
+                if self.bits.bytes.contains(var) {
+                    self.compare_bits(var, self.image.byte(witness), true, false);
+                } else if self.image.value(witness) == self.image.value(var) {
+                    self.confirm(&InputSet::from_iter([var]));
+                }
             }
         }
     }

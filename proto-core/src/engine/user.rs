@@ -82,6 +82,11 @@ pub(super) enum InputTo {
     },
     /// Index of a command field of the command link.
     Command(u8),
+    /// Bits of a byte variable: on unless the value is 0.
+    Bits {
+        var: SysVar,
+        mask: u8,
+    },
     /// The halves of a constant, so that they need no more alignment than the others.
     Fixed {
         high: i32,
@@ -183,6 +188,7 @@ pub(super) fn values(
             OutputBinding::State { scale, offset, .. } | OutputBinding::Port { scale, offset, .. } => {
                 saturate_to_field(ty, image.extra(extra), scale, offset)
             }
+            OutputBinding::Bit { var, bit } => saturate_to_field(ty, image.bit(var, bit), 1.0, 0.0),
         };
         // A part has no more fields than there is room for.
         let _ = values.push(value);
@@ -205,6 +211,7 @@ pub(super) fn number_of(binding: &OutputBind, image: &Image, frames_sent: u32, r
         OutputBinding::State { scale, offset, .. } | OutputBinding::Port { scale, offset, .. } => {
             image.extra(binding.extra) * f64::from(scale) + f64::from(offset)
         }
+        OutputBinding::Bit { var, bit } => image.bit(var, bit),
     }
 }
 

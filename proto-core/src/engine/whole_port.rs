@@ -17,6 +17,7 @@ use super::user::{InputBind, OutputBind};
 use crate::config::{ConfigView, FieldSpec, Span, Words};
 use crate::device::{ByteOrder, Cutter, FrameLayout, Framer, Piece, Probe};
 use crate::image::{Image, bind_to_variable};
+use crate::modbus::rtu::Slave;
 use crate::sysvar::{Direction, SysVar};
 use crate::time::{Duration, Instant};
 use crate::wire::scalar::Scalar;
@@ -32,6 +33,8 @@ pub(super) enum Reader {
     Search(Framer),
     /// By what stands between them. `heard` is when the newest bytes came.
     Whole { cutter: Cutter, heard: Instant },
+    /// As the requests of a master.
+    Slave(Slave),
 }
 
 impl Reader {
@@ -40,6 +43,8 @@ impl Reader {
         match self {
             Self::Search(framer) => !framer.held().is_empty(),
             Self::Whole { cutter, .. } => cutter.has_begun(),
+            // It has its own deadline.
+            Self::Slave(_) => false,
         }
     }
 
@@ -48,6 +53,7 @@ impl Reader {
         match self {
             Self::Search(framer) => framer.held(),
             Self::Whole { cutter, .. } => cutter.held(),
+            Self::Slave(_) => &[],
         }
     }
 
@@ -56,6 +62,7 @@ impl Reader {
         match self {
             Self::Search(framer) => framer.discard(),
             Self::Whole { cutter, .. } => cutter.discard(),
+            Self::Slave(slave) => slave.discard(),
         }
     }
 }
@@ -144,10 +151,6 @@ impl TextBind {
 }
 
 impl DeviceCodec {
-    fn texts_in(&self, bindings: Span, direction: Direction) -> impl Iterator<Item = (usize, &TextBind)> {
-        texts_in(&self.texts, bindings, direction)
-    }
-
     /// Writes the text of an output frame's `nth` element.
     pub(super) fn write_text(
         &self,
@@ -156,9 +159,19 @@ impl DeviceCodec {
         image: &Image,
         out: &mut [u8],
     ) -> Option<usize> {
-        let mut texts = self.texts_in(format.bindings, Direction::Output);
-        texts.find(|(at, _)| *at == nth)?.1.write(image, out)
+        write_text(&self.texts, format, nth, image, out)
     }
+}
+
+/// Writes the text of an output frame's `nth` element.
+pub(super) fn write_text(
+    texts: &[TextBind],
+    format: &DeviceFormat,
+    nth: usize,
+    image: &Image,
+    out: &mut [u8],
+) -> Option<usize> {
+    texts_in(texts, format.bindings, Direction::Output).find(|(at, _)| *at == nth)?.1.write(image, out)
 }
 
 /// The texts among some bindings, with their places in them.

@@ -5,8 +5,10 @@
 //! neighbouring fields of a recipe are one copy. A variable has the age of its group: the
 //! frame, poll or packet that brings it. The image does not know recipes, ports or links.
 
+mod bit_set;
 mod set;
 
+pub(crate) use bit_set::BitSet;
 pub(crate) use set::{ExtraSet, InputSet, VarSet};
 
 use crate::sysvar::{COUNT, IMAGE_BYTES, SysVar};
@@ -92,6 +94,23 @@ impl Image {
             value.encode(place);
         }
         Ok(())
+    }
+
+    /// The value of a byte variable, known or not.
+    pub(crate) fn byte(&self, var: SysVar) -> u8 {
+        self.bytes.get(var.image_offset()).copied().unwrap_or(0)
+    }
+
+    /// A bit of a byte variable, 0 or 1, known or not.
+    pub(crate) fn bit(&self, var: SysVar, bit: u8) -> f64 {
+        f64::from(self.byte(var).checked_shr(bit.into()).unwrap_or(0) & 1)
+    }
+
+    /// Sets some bits of a byte variable.
+    pub(crate) fn set_bits(&mut self, var: SysVar, mask: u8, value: u8) {
+        if let Some(byte) = self.bytes.get_mut(var.image_offset()).filter(|_| var.is_bits()) {
+            *byte = *byte & !mask | value & mask;
+        }
     }
 
     /// Assigns the variable to the group that it arrives with.

@@ -457,7 +457,7 @@ impl<'a> Response<'a> {
 
 impl RequestHead {
     #[inline]
-    const fn from_bytes(&[function, a1, a0, c1, c0]: &[u8; HEAD_LEN]) -> Self {
+    pub(super) const fn from_bytes(&[function, a1, a0, c1, c0]: &[u8; HEAD_LEN]) -> Self {
         Self { function, address: u16::from_be_bytes([a1, a0]), count_or_value: u16::from_be_bytes([c1, c0]) }
     }
 

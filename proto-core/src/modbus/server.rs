@@ -5,8 +5,10 @@
 
 use super::adu::{self, AduError, AduReader, HEADER_LEN, MAX_ADU, MAX_PDU};
 use super::exception::Exception;
-use super::pdu::{HEAD_LEN, READ_HEAD_LEN, Request, RequestHead, exception_pdu};
-use super::values::{Coils, Registers, last_mask, packed_len};
+use super::pdu::{
+    HEAD_LEN, MAX_READ_REGISTERS, READ_HEAD_LEN, Request, RequestHead, exception_pdu, function,
+};
+use super::values::{Coils, MAX_READ_COILS, Registers, last_mask, packed_len};
 
 /// The registers behind a server.
 ///
@@ -39,6 +41,23 @@ pub trait RegisterBank {
     /// # Errors
     /// The exception to answer with; nothing was changed.
     fn write_holding(&mut self, address: u16, registers: Registers<'_>) -> Result<(), Exception>;
+
+    /// Same as [`Self::read_coils`] for discrete inputs, FC 2. A bank without them has not this function.
+    ///
+    /// # Errors
+    /// The exception to answer with.
+    fn read_discrete(&self, _address: u16, _count: u16, _packed: &mut [u8]) -> Result<(), Exception> {
+        Err(Exception::IllegalFunction)
+    }
+
+    /// Same as [`Self::read_holding`] for input registers, FC 4. A bank without them has not this
+    /// function.
+    ///
+    /// # Errors
+    /// The exception to answer with.
+    fn read_input(&self, _address: u16, _words: &mut [[u8; 2]]) -> Result<(), Exception> {
+        Err(Exception::IllegalFunction)
+    }
 }
 
 /// The server's side of one connection.
@@ -89,8 +108,58 @@ impl Server {
 pub fn answer<B: RegisterBank + ?Sized>(pdu: &[u8], bank: &mut B, out: &mut [u8; MAX_PDU]) -> usize {
     match Request::parse(pdu).and_then(|request| carry_out(request, bank, out)) {
         Ok(len) => len,
+        Err(Exception::IllegalFunction) => match read_inputs(pdu, bank, out) {
+            Ok(len) => len,
+            Err(exception) => refuse(pdu, exception, out),
+        },
         Err(exception) => refuse(pdu, exception, out),
     }
+}
+
+/// FC 2 and 4, which a client of this project never asks.
+#[cold]
+fn read_inputs<B: RegisterBank + ?Sized>(
+    pdu: &[u8],
+    bank: &B,
+    out: &mut [u8; MAX_PDU],
+) -> Result<usize, Exception> {
+    let head = pdu.first_chunk().map(RequestHead::from_bytes).ok_or(Exception::IllegalFunction)?;
+    let RequestHead { function, address, count_or_value: count } = head;
+    let max = match function {
+        function::READ_DISCRETE => MAX_READ_COILS,
+        function::READ_INPUT => MAX_READ_REGISTERS,
+        _ => return Err(Exception::IllegalFunction),
+    };
+    let is_right = pdu.len() == HEAD_LEN && count > 0 && count <= max;
+    let len = match function {
+        function::READ_DISCRETE => {
+            // Whether there is the function is asked before its count.
+            let mut nothing = [];
+            if !is_right {
+                bank.read_discrete(address, 0, &mut nothing)?;
+                return Err(Exception::IllegalDataValue);
+            }
+            check_end(address, count)?;
+            let packed = read_answer(out, head, packed_len(count))?;
+            packed.fill(0);
+            bank.read_discrete(address, count, packed)?;
+            if let Some(last) = packed.last_mut() {
+                *last &= last_mask(count);
+            }
+            packed.len()
+        }
+        _ => {
+            if !is_right {
+                bank.read_input(address, &mut [])?;
+                return Err(Exception::IllegalDataValue);
+            }
+            check_end(address, count)?;
+            let bytes = read_answer(out, head, usize::from(count).saturating_mul(2))?;
+            bank.read_input(address, bytes.as_chunks_mut().0)?;
+            bytes.len()
+        }
+    };
+    Ok(len.saturating_add(READ_HEAD_LEN))
 }
 
 #[inline]

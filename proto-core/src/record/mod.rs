@@ -80,8 +80,14 @@ impl<'a> Entry<'a> {
 /// its inputs, beside what it said.
 ///
 /// Of each port and link its number and its counters as postcard has them, then the image.
-pub fn totals<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: usize>(
-    engine: &Engine<PORTS, UPLINKS, FIELDS, TAP>,
+pub fn totals<
+    const PORTS: usize,
+    const UPLINKS: usize,
+    const FIELDS: usize,
+    const TAP: usize,
+    const EXCHANGES: usize,
+>(
+    engine: &Engine<PORTS, UPLINKS, FIELDS, TAP, EXCHANGES>,
 ) -> Vec<u8, MAX_TOTALS> {
     let mut totals = Vec::new();
     let mut scratch = [0; 256];

@@ -58,9 +58,15 @@ pub struct Replayed {
 ///
 /// # Errors
 /// [`ReplayError`]; what was written until then is this engine's.
-pub fn replay<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: usize>(
+pub fn replay<
+    const PORTS: usize,
+    const UPLINKS: usize,
+    const FIELDS: usize,
+    const TAP: usize,
+    const EXCHANGES: usize,
+>(
     recording: &[u8],
-    engine: &mut Engine<PORTS, UPLINKS, FIELDS, TAP>,
+    engine: &mut Engine<PORTS, UPLINKS, FIELDS, TAP, EXCHANGES>,
     config: &mut GatewayConfig,
     mut write: impl FnMut(&[u8]),
 ) -> Result<Replayed, ReplayError> {
@@ -93,8 +99,14 @@ pub fn replay<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, con
     Ok(replayed)
 }
 
-fn pass<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: usize>(
-    engine: &mut Engine<PORTS, UPLINKS, FIELDS, TAP>,
+fn pass<
+    const PORTS: usize,
+    const UPLINKS: usize,
+    const FIELDS: usize,
+    const TAP: usize,
+    const EXCHANGES: usize,
+>(
+    engine: &mut Engine<PORTS, UPLINKS, FIELDS, TAP, EXCHANGES>,
     at: Instant,
     input: Input<'_>,
     mut write: impl FnMut(&[u8]),

@@ -7,7 +7,7 @@ mod name;
 mod state;
 mod table;
 
-pub use name::{ParseError, VarRange};
+pub use name::{ParseError, VarBit, VarRange};
 pub use table::{SPANS, Span};
 
 use crate::wire::scalar::ScalarType;

@@ -139,6 +139,42 @@ impl VarRange {
     }
 }
 
+/// One bit of a byte variable, as `BitInputReg[3].4` names it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct VarBit {
+    /// The variable; [`Self::mask`] says whether it has the bit.
+    pub var: SysVar,
+    /// The bit, 0 for the least significant.
+    pub bit: u8,
+}
+
+impl VarBit {
+    /// The bit with this name: `BitInputReg[3].4` or `__BitInputReg_3.4`; `None` if no bit is named.
+    /// Whether the variable has the bit is not checked.
+    ///
+    /// # Errors
+    /// [`ParseError`] says what is wrong with the variable's name.
+    pub fn parse(name: &str) -> Option<Result<Self, ParseError>> {
+        let (var, bit) = rsplit_once(name, b'.')?;
+        // The end of a range is not a bit: its bracket is still open.
+        let bit = number(bit).ok().filter(|_| !bit.is_empty())?;
+        let bit = u8::try_from(bit).unwrap_or(u8::MAX);
+        Some(SysVar::parse(var).map(|var| Self { var, bit }))
+    }
+
+    /// The bit in the variable's byte; `None` if the variable has no such bit.
+    pub fn mask(self) -> Option<u8> {
+        let mask = 1_u8.checked_shl(self.bit.into())?;
+        (self.var.is_bits() && self.var.valid_bits() & mask != 0).then_some(mask)
+    }
+}
+
+impl fmt::Display for VarBit {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}.{}", self.var, self.bit)
+    }
+}
+
 fn number(text: &str) -> Result<u32, ParseError> {
     if text.bytes().all(|b| b.is_ascii_digit()) {
         text.parse().map_err(|_| ParseError::Syntax)

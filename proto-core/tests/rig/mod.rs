@@ -120,7 +120,7 @@ impl Cell {
     pub fn safe(&mut self, name: &str, value: f64) {
         let var = var(name);
         let value = proto_core::wire::scalar::Scalar::from_f64(var.ty(), value).unwrap();
-        self.0.safe_values.push(SafeValue { var, value }).unwrap();
+        self.0.safe_values.push(SafeValue::new(var, value)).unwrap();
         self.last_port().on_timeout.len += 1;
     }
 

@@ -4,6 +4,7 @@ use proto_core::engine::LinkId;
 use proto_core::sysvar::SysVar;
 use proto_core::time::{Duration, Instant};
 
+use super::bits::Coils;
 use super::field::LineWatch;
 use super::spec::{Frame, Raw, written};
 use super::wire::Asked;
@@ -29,8 +30,13 @@ impl Oracle {
         match link {
             LinkId::MODBUS => {
                 for pdu in self.controller.requests(conn, bytes) {
-                    if let Some(Asked::Write(values)) = self.map.request(&pdu) {
-                        put_all(&mut expected, &values);
+                    match self.map.request(&pdu) {
+                        Some(Asked::Write(values)) => put_all(&mut expected, &values),
+                        Some(Asked::WriteBits(Coils { var, mask, on })) => {
+                            let byte = &mut expected[var.image_offset()];
+                            *byte = *byte & !mask | on;
+                        }
+                        _ => {}
                     }
                 }
             }

@@ -153,7 +153,10 @@ pub(crate) fn unmodelled(config: &GatewayConfig) -> Option<&'static str> {
             .any(|part| part.framing != Boundary::Fields || part.escape.is_some()),
         Parts::Can { .. } => false,
     });
-    (varies || is_cut).then_some("a soak cannot judge texts and frames of varying length")
+    if varies || is_cut {
+        return Some("a soak cannot judge texts and frames of varying length");
+    }
+    super::bits::unmodelled(config)
 }
 
 /// Number of bytes of a field. Fields of varying length are refused before a run.

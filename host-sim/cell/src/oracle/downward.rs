@@ -302,6 +302,7 @@ impl Downward {
                 let number = as_number(var, raw_of(up, var)?);
                 Some(number * f64::from(scale) + f64::from(offset))
             }
+            OutputBinding::Bit { var, bit } => Some(f64::from(raw_of(up, var)?[0] >> bit & 1)),
             OutputBinding::Constant(value) => Some(value),
             OutputBinding::Counter => Some(match ty {
                 ScalarType::Byte => f64::from(self.cycles as u8),

@@ -9,6 +9,7 @@ use proto_core::time::Instant;
 use proto_core::wire::can::CanFrame;
 use proto_core::wire::scalar::{Scalar, ScalarType};
 
+use super::bits::Coils;
 use super::device::{self, DeviceSpec, Seen};
 use super::spec::{Frame, PortSpec, Raw};
 
@@ -32,6 +33,8 @@ pub(super) struct Accepted {
     /// Index of the port's input frame.
     pub frame: usize,
     pub values: Vec<(SysVar, Raw)>,
+    /// Single bits of byte variables.
+    pub bits: Vec<Coils>,
     /// Reserved bits were set.
     pub masked: bool,
     /// Values of command fields: the field's index in the frame, its table, when it picks a command, and the
@@ -207,6 +210,7 @@ fn judge_device(frame: &Frame, nth: usize, whole: &[u8]) -> Verdict {
             InputBinding::Commands { table, when } => {
                 accepted.commands.push((at, table, when, number as i64));
             }
+            InputBinding::Bit { var, bit } => accepted.bits.push(coil(var, bit, number)),
             InputBinding::Unused => {}
         }
     }
@@ -249,10 +253,19 @@ fn judge(mode: Mode, frame: &Frame, nth: usize, payload: &[u8]) -> Verdict {
             (_, FieldSpec::UserInput { to: InputBinding::Commands { table, when }, .. }) => {
                 accepted.commands.push((place, *table, *when, number as i64));
             }
+            (_, FieldSpec::UserInput { to: InputBinding::Bit { var, bit }, .. }) => {
+                accepted.bits.push(coil(*var, *bit, number));
+            }
             _ => {}
         }
     }
     if out_of_range { Verdict::OutOfRange } else { Verdict::Accepted(accepted) }
+}
+
+/// A number as a bit: on unless it is 0.
+fn coil(var: SysVar, bit: u8, number: f64) -> Coils {
+    let mask = 1 << bit;
+    Coils { var, mask, on: if number == 0.0 { 0 } else { mask } }
 }
 
 /// A number as a value of a variable, rounded half away from zero; `None` if it does not fit (D22).

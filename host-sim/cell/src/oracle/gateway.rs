@@ -6,10 +6,11 @@ use proto_core::sysvar::SysVar;
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::can::CanFrame;
 
+use super::bits::Coils;
 use super::field::{self, Accepted, LineWatch, Refused, Verdict};
 use super::spec::{Origin, Owned, Raw, shown, written};
 use super::upward::{Wrong, is_gap};
-use super::wire::Asked;
+use super::wire::{Asked, Safe};
 use super::{Invariant, LinkWatch, Oracle, PortWatch, place};
 
 impl Oracle {
@@ -31,7 +32,7 @@ impl Oracle {
             self.write_refused_again();
         }
         let given_up = self.modbus.tick(now);
-        self.up.write_again(&self.spec, given_up);
+        self.safe_again(given_up);
         self.commands.tick(now);
     }
 
@@ -68,7 +69,7 @@ impl Oracle {
         match link {
             LinkId::MODBUS => {
                 let given_up = self.modbus.lost();
-                self.up.write_again(&self.spec, given_up);
+                self.safe_again(given_up);
                 self.write_refused_again();
             }
             LinkId::COMMAND | LinkId::URGENT => self.commands.lost(link, now),
@@ -80,8 +81,13 @@ impl Oracle {
 
     pub(super) fn write_refused_again(&mut self) {
         let refused = std::mem::take(&mut self.refused);
-        self.up.write_again(&self.spec, refused);
+        self.safe_again(refused);
         self.rewrite_at = Instant::NEVER;
+    }
+
+    fn safe_again(&mut self, safe: Safe) {
+        self.up.write_again(&self.spec, safe.vars);
+        self.up.bits_again(&self.spec, safe.bits);
     }
 
     /// Shown values may have changed: looks for rising bits that trigger a port.
@@ -331,13 +337,18 @@ impl Oracle {
                     ));
                 }
                 let asked = self.modbus.sent(&self.map, bytes, now)?;
-                let Asked::Write(values) = asked else { return Ok(()) };
-                let mut safe = Vec::new();
-                for (var, raw) in values {
-                    if self.up.known(var).safe {
-                        safe.push(var);
+                let mut safe = Safe::default();
+                match asked {
+                    Asked::Read { .. } => return Ok(()),
+                    Asked::Write(values) => {
+                        for (var, raw) in values {
+                            if self.up.known(var).safe {
+                                safe.vars.push(var);
+                            }
+                            self.wrote(link, var, raw, now)?;
+                        }
                     }
-                    self.wrote(link, var, raw, now)?;
+                    Asked::WriteBits(coils) => safe.bits = self.wrote_bits(coils, now)?,
                 }
                 self.modbus.carries_safe(safe);
                 Ok(())
@@ -347,6 +358,24 @@ impl Oracle {
     }
 
     pub(super) fn wrote(&mut self, link: LinkId, var: SysVar, raw: Raw, now: Instant) -> Result<(), Wrong> {
+        self.looks_at_write();
+        self.checks[Invariant::Edges as usize] += u64::from(var.is_bits());
+        let carried = self.up.wrote(&self.spec, link, var, raw, now)?;
+        self.robot.hands_over(var, raw, carried);
+        Ok(())
+    }
+
+    fn wrote_bits(&mut self, coils: Coils, now: Instant) -> Result<Vec<(usize, u8)>, Wrong> {
+        self.looks_at_write();
+        self.checks[Invariant::Edges as usize] += 1;
+        let (carried, safe) = self.up.wrote_bits(&self.spec, coils, now)?;
+        for carried in carried {
+            self.robot.hands_over(coils.var, [coils.on, 0, 0, 0], carried);
+        }
+        Ok(safe)
+    }
+
+    fn looks_at_write(&mut self) {
         self.writes += 1;
         let looked_at = [
             Invariant::Sent,
@@ -358,10 +387,6 @@ impl Oracle {
         for invariant in looked_at {
             self.checks[invariant as usize] += 1;
         }
-        self.checks[Invariant::Edges as usize] += u64::from(var.is_bits());
-        let carried = self.up.wrote(&self.spec, link, var, raw, now)?;
-        self.robot.hands_over(var, raw, carried);
-        Ok(())
     }
 
     pub(super) fn recipe_send(&mut self, link: LinkId, bytes: &[u8], now: Instant) -> Result<(), Wrong> {
@@ -432,6 +457,11 @@ impl Oracle {
                 let var = SysVar::from_ordinal(nth).map_or_else(String::new, |var| var.to_string());
                 return Err((Invariant::Delivered, format!("{var} waits although its link is free")));
             }
+        }
+        let is_free =
+            self.up.is_up(LinkId::MODBUS) && self.modbus.is_free() && !self.links[place(LinkId::MODBUS)].busy;
+        if let Some(var) = self.up.waiting_bits(&self.spec).filter(|_| is_free) {
+            return Err((Invariant::Delivered, format!("bits of {var} wait although Modbus is free")));
         }
         Ok(())
     }

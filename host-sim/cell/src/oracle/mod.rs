@@ -10,6 +10,7 @@
 //! It reads nothing of the engine but the counters and the states of the links.
 
 mod arrivals;
+mod bits;
 mod commands;
 pub(crate) mod device;
 mod downward;
@@ -28,7 +29,6 @@ use std::collections::{BTreeMap, VecDeque};
 use proto_core::config::GatewayConfig;
 use proto_core::engine::{BusState, Engine, Input, LinkId, Output, PortCounters};
 use proto_core::link::LinkState;
-use proto_core::sysvar::SysVar;
 use proto_core::time::{Duration, Instant};
 
 use commands::Commands;
@@ -41,7 +41,7 @@ use robot::Robot;
 use spec::Spec;
 use upward::{Upward, Wrong};
 pub(super) use wire::inputs_of;
-use wire::{Controller, Map, Modbus};
+use wire::{Controller, Map, Modbus, Safe};
 
 /// The model's state of one field port.
 #[derive(Debug, Clone, Default)]
@@ -91,7 +91,7 @@ pub(super) struct Oracle {
     links: [LinkWatch; LINKS],
     modbus: Modbus,
     /// Safe values that the controller refused, and when they are written again.
-    refused: Vec<SysVar>,
+    refused: Safe,
     rewrite_at: Instant,
     commands: Commands,
     controller: Controller,
@@ -123,12 +123,12 @@ impl Oracle {
         let spec = Spec::new(config);
         let parts: usize = spec.ports.iter().map(|port| port.outputs.len()).sum();
         Self {
-            map: Map::new(),
+            map: Map::new(&spec),
             up: Upward::new(&spec),
             ports: vec![PortWatch::default(); spec.ports.len()],
             links: std::array::from_fn(|_| LinkWatch::default()),
             modbus: Modbus::default(),
-            refused: Vec::new(),
+            refused: Safe::default(),
             rewrite_at: Instant::NEVER,
             commands: Commands::default(),
             controller: Controller::new(),
@@ -168,7 +168,7 @@ impl Oracle {
         self.ports = vec![PortWatch::default(); self.spec.ports.len()];
         self.links = std::array::from_fn(|_| LinkWatch::default());
         self.modbus.lost();
-        self.refused.clear();
+        self.refused = Safe::default();
         self.rewrite_at = Instant::NEVER;
         self.commands = Commands::default();
         self.robot.restarted(now);

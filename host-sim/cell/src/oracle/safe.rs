@@ -34,6 +34,7 @@ impl Upward {
 
     /// The controller may have restarted: queues all safe values again.
     pub(super) fn controller_was_away(&mut self, spec: &Spec, now: Instant) {
+        self.all_bits_again(spec);
         let safe: Vec<SysVar> = spec.safe_vars.iter().copied().filter(|var| self.known(*var).safe).collect();
         if safe.is_empty() {
             return;

@@ -10,6 +10,7 @@ use proto_core::sysvar::{COUNT, Direction, ModbusPlace, SysVar};
 use proto_core::time::Duration;
 use proto_core::wire::can::CanId;
 
+use super::bits::{self, Share};
 use super::device::DeviceSpec;
 
 /// A value as on the wire; unused bytes are 0.
@@ -96,6 +97,8 @@ pub(super) struct Spec {
     pub has_triggers: bool,
     /// The entries of all command tables.
     pub commands: Vec<Entry>,
+    /// The bits that ports drive one by one.
+    pub shares: Vec<Share>,
 }
 
 /// A command for a range of values.
@@ -200,6 +203,7 @@ impl Spec {
             witness[input.ordinal()] = is_there.then_some(output);
         }
         Self {
+            shares: bits::shares(config, &ports),
             ports,
             links,
             owned,
@@ -229,7 +233,7 @@ impl Frame {
         self.head.len() + self.payload + self.tail.len()
     }
 
-    fn has(&self, var: SysVar) -> bool {
+    pub(super) fn has(&self, var: SysVar) -> bool {
         self.fields.iter().any(|field| written(field) == Some(var))
     }
 
@@ -258,8 +262,10 @@ pub(super) fn written(field: &FieldSpec) -> Option<SysVar> {
 pub(super) fn shown(field: &FieldSpec) -> Option<SysVar> {
     match *field {
         FieldSpec::System(var) => Some(var),
-        FieldSpec::UserOutput { from: OutputBinding::Variable { var, .. }, .. }
-        | FieldSpec::DeviceOutput { from: OutputBinding::Variable { var, .. }, .. } => Some(var),
+        FieldSpec::UserOutput { from, .. } | FieldSpec::DeviceOutput { from, .. } => match from {
+            OutputBinding::Variable { var, .. } | OutputBinding::Bit { var, .. } => Some(var),
+            _ => None,
+        },
         _ => None,
     }
 }

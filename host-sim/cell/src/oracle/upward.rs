@@ -8,11 +8,12 @@ use proto_core::sysvar::{COUNT, SysVar};
 use proto_core::time::{Duration, Instant};
 
 use super::Invariant;
+use super::bits::Waits;
 use super::field::{Accepted, show};
 use super::spec::{LinkSpec, Origin, Owned, Raw, Spec};
 
 /// Maximum number of values per port that wait behind the next ones.
-const EDGES: usize = 16;
+pub(super) const EDGES: usize = 16;
 /// Maximum age of a value that was read back.
 const READ_BACK: Duration = Duration::from_millis(500);
 
@@ -86,6 +87,7 @@ pub(super) type Wrong = (Invariant, String);
 #[derive(Debug, Clone)]
 pub(super) struct Upward {
     pub known: Vec<Known>,
+    pub shares: Vec<Waits>,
     /// When each input frame of each port is overdue.
     overdue: Vec<Vec<Option<Instant>>>,
     pub counted: Vec<Counted>,
@@ -108,7 +110,7 @@ pub(super) struct Upward {
     /// No frame is overdue before this.
     next_overdue: Instant,
     /// No value has waited too long before this.
-    next_expiry: Instant,
+    pub next_expiry: Instant,
     /// Bit set of variables that may have waiting values, by ordinal: inputs come first.
     pub waits: u128,
 }
@@ -117,6 +119,7 @@ impl Upward {
     pub(super) fn new(spec: &Spec) -> Self {
         Self {
             known: vec![Known::default(); COUNT],
+            shares: vec![Waits::default(); spec.shares.len()],
             overdue: spec.ports.iter().map(|port| vec![None; port.inputs.len()]).collect(),
             counted: vec![Counted::default(); spec.ports.len()],
             up: [None; 16],
@@ -169,6 +172,7 @@ impl Upward {
                 for var in part.fields.iter().filter_map(super::spec::written) {
                     self.fell_silent(spec, var, now);
                 }
+                self.bits_silent(spec, nth, frame, now);
             }
         }
         overdue
@@ -193,6 +197,7 @@ impl Upward {
                     self.next_expiry = self.next_expiry.min(*at + port.timeout + Duration::from_micros(1));
                 }
             }
+            self.expire_bits(spec, nth, port.timeout, now);
         }
     }
 
@@ -224,7 +229,7 @@ impl Upward {
         self.overdue[nth][frame.frame] = Some(now + timeout);
         self.next_overdue = self.next_overdue.min(now + timeout);
         self.next_expiry = self.next_expiry.min(now + timeout + Duration::from_micros(1));
-        let mut undelivered = false;
+        let mut undelivered = self.bits_accepted(spec, nth, frame, now);
         for &(var, raw) in &frame.values {
             let Some(Owned { way, .. }) = spec.owned[var.ordinal()] else { continue };
             self.waits |= 1 << var.ordinal();
@@ -266,10 +271,11 @@ impl Upward {
     }
 
     /// Number of the port's values that wait behind others.
-    fn queued(&self, spec: &Spec, nth: usize) -> usize {
+    pub(super) fn queued(&self, spec: &Spec, nth: usize) -> usize {
         let vars = spec.ports[nth].inputs.iter().flat_map(|part| &part.fields);
         let waiting = vars.filter_map(super::spec::written).filter(|var| var.is_bits());
-        waiting.map(|var| self.known(var).waiting.len().saturating_sub(1)).sum()
+        let whole: usize = waiting.map(|var| self.known(var).waiting.len().saturating_sub(1)).sum();
+        whole + self.queued_bits(spec, nth)
     }
 
     /// A link came up.
@@ -284,6 +290,9 @@ impl Upward {
             return;
         }
         self.rewrite_at[usize::from(link.0)] = Instant::NEVER;
+        if link == LinkId::MODBUS {
+            self.bits_lost(spec);
+        }
         for (known, owned) in self.known.iter_mut().zip(&spec.owned) {
             if let Some(owned) = owned
                 && owned.way == link

@@ -7,7 +7,8 @@ use proto_core::sysvar::{COUNT, Direction, ModbusPlace, SysVar};
 use proto_core::time::{Duration, Instant};
 
 use super::Invariant;
-use super::spec::Raw;
+use super::bits::Coils;
+use super::spec::{Raw, Spec};
 use super::upward::Wrong;
 
 /// A request without an answer is given up after this.
@@ -18,14 +19,34 @@ const ANSWER: Duration = Duration::from_millis(500);
 pub(super) enum Asked {
     Read { coils: bool, first: u16, count: u16 },
     Write(Vec<(SysVar, Raw)>),
+    WriteBits(Coils),
+}
+
+/// What a write has of safe values.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Safe {
+    pub vars: Vec<SysVar>,
+    /// Shares, and bits of them.
+    pub bits: Vec<(usize, u8)>,
+}
+
+impl Safe {
+    pub(super) fn is_empty(&self) -> bool {
+        self.vars.is_empty() && self.bits.is_empty()
+    }
+
+    pub(super) fn extend(&mut self, other: Self) {
+        self.vars.extend(other.vars);
+        self.bits.extend(other.bits);
+    }
 }
 
 /// The one transaction in flight.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Modbus {
     in_flight: Option<([u8; 2], Asked, Instant)>,
-    /// Variables whose safe values are in the write in flight.
-    safe: Vec<SysVar>,
+    /// The safe values in the write in flight.
+    safe: Safe,
     held: Vec<u8>,
 }
 
@@ -34,22 +55,22 @@ impl Modbus {
         self.in_flight.is_none()
     }
 
-    /// Gives up a request that was not answered in time; returns the variables of its safe values.
-    pub(super) fn tick(&mut self, now: Instant) -> Vec<SysVar> {
+    /// Gives up a request that was not answered in time; returns its safe values.
+    pub(super) fn tick(&mut self, now: Instant) -> Safe {
         if self.in_flight.as_ref().is_none_or(|asked| now < asked.2 + ANSWER) {
-            return Vec::new();
+            return Safe::default();
         }
         self.in_flight = None;
         std::mem::take(&mut self.safe)
     }
 
-    /// The connection is lost; returns the variables whose safe values were in flight.
-    pub(super) fn lost(&mut self) -> Vec<SysVar> {
+    /// The connection is lost; returns the safe values in flight.
+    pub(super) fn lost(&mut self) -> Safe {
         std::mem::take(self).safe
     }
 
-    /// The write that was just sent has safe values of these variables.
-    pub(super) fn carries_safe(&mut self, safe: Vec<SysVar>) {
+    /// The write that was just sent has these safe values.
+    pub(super) fn carries_safe(&mut self, safe: Safe) {
         self.safe = safe;
     }
 
@@ -61,15 +82,15 @@ impl Modbus {
         }
         let (head, pdu) = bytes.split_at_checked(7).ok_or_else(|| wrong("has no header"))?;
         let asked = map.request(pdu).ok_or_else(|| wrong("touches addresses that are not a variable"))?;
-        self.safe.clear();
+        self.safe = Safe::default();
         self.in_flight = Some(([head[0], head[1]], asked.clone(), now));
         Ok(asked)
     }
 
-    /// Handles the controller's bytes; returns the values read, and variables whose safe values were refused.
-    pub(super) fn received(&mut self, map: &Map, bytes: &[u8]) -> (Vec<(SysVar, Raw)>, Vec<SysVar>) {
+    /// Handles the controller's bytes; returns the values read, and the safe values refused.
+    pub(super) fn received(&mut self, map: &Map, bytes: &[u8]) -> (Vec<(SysVar, Raw)>, Safe) {
         self.held.extend_from_slice(bytes);
-        let (mut found, mut refused) = (Vec::new(), Vec::new());
+        let (mut found, mut refused) = (Vec::new(), Safe::default());
         while let Some(len) = frame_len(&self.held) {
             let frame: Vec<u8> = self.held.drain(..len).collect();
             let Some((id, asked, _)) = &self.in_flight else { continue };
@@ -103,11 +124,14 @@ pub(super) struct Map {
     coils: Vec<Option<SysVar>>,
     inputs: [Option<SysVar>; 512],
     words: Vec<Option<SysVar>>,
+    /// Bytes of whose bits each has its owner.
+    shared: Vec<SysVar>,
 }
 
 impl Map {
-    pub(super) fn new() -> Self {
-        let mut map = Self { coils: vec![None; 512], inputs: [None; 512], words: vec![None; 512] };
+    pub(super) fn new(spec: &Spec) -> Self {
+        let shared = spec.shares.iter().map(|share| share.var).collect();
+        let mut map = Self { coils: vec![None; 512], inputs: [None; 512], words: vec![None; 512], shared };
         for var in SysVar::all() {
             match var.modbus() {
                 Some(ModbusPlace::Coils { first, .. }) => {
@@ -126,7 +150,7 @@ impl Map {
     }
 
     /// Parses a request; `None` if it is not one of the four that a gateway sends, or does not write whole
-    /// variables.
+    /// variables or bits with owners.
     pub(super) fn request(&self, pdu: &[u8]) -> Option<Asked> {
         let word = |at: usize| Some(u16::from_be_bytes([*pdu.get(at)?, *pdu.get(at + 1)?]));
         let (first, count) = (word(1)?, word(3)?);
@@ -134,6 +158,9 @@ impl Map {
             1 | 3 if pdu.len() == 5 => Some(Asked::Read { coils: pdu[0] == 1, first, count }),
             15 => {
                 let packed = pdu.get(6..)?;
+                if let Some(coils) = self.bits(first, count, packed) {
+                    return Some(Asked::WriteBits(coils));
+                }
                 let mut written = Vec::new();
                 let mut at = 0_u16;
                 while at < count {
@@ -164,6 +191,16 @@ impl Map {
             }
             _ => None,
         }
+    }
+
+    /// The bits of a byte of whose bits each has its owner.
+    fn bits(&self, first: u16, count: u16, packed: &[u8]) -> Option<Coils> {
+        self.shared.iter().find_map(|&var| {
+            let Some(ModbusPlace::Coils { first: start, count: all }) = var.modbus() else { return None };
+            let from = first.checked_sub(start).filter(|from| from + count <= all && count > 0)?;
+            let mask = u8::MAX >> (8 - count) << from;
+            Some(Coils { var, mask, on: packed.first()? << from & mask })
+        })
     }
 
     /// The variables that are completely in the range that was read.

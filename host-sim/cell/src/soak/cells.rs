@@ -43,7 +43,7 @@ macro_rules! embedded {
 
 /// A seed selects by position, so the order must not change. Controllers of examples that have field ports
 /// of their own are replaced, since no device would be connected to them.
-const EMBEDDED: [Embedded; 11] = [
+const EMBEDDED: [Embedded; 12] = [
     embedded!("/../configs/", "rs485-system", "can-hand"),
     embedded!("/../configs/", "udp-server", "udp-server"),
     embedded!("/../configs/", "client", "client"),
@@ -55,6 +55,7 @@ const EMBEDDED: [Embedded; 11] = [
     embedded!("/src/soak/cells/", "two-clients", "two-clients"),
     embedded!("/src/soak/cells/", "orders", "orders"),
     embedded!("/src/soak/cells/", "witness", "witness"),
+    embedded!("/src/soak/cells/", "panels", "panels"),
 ];
 
 impl Scenario {

@@ -21,7 +21,7 @@ fn soaked(level: Level, seed: u64, span: Duration, jobs: usize) -> Total {
 /// The hashes of these runs on every machine. Only a change of what the engine, the controller or the cell
 /// does, or when, may change them; then enter the new ones here.
 const HASHES: [(Level, u64); 2] =
-    [(Level::None, 0xF68C_507F_F0CA_46F5), (Level::Harsh, 0x7600_31C1_5B22_37B1)];
+    [(Level::None, 0x3C4D_2F47_D383_FBB6), (Level::Harsh, 0x63D9_79BA_D246_1B5B)];
 
 #[test]
 fn a_seed_means_the_same_trace_on_every_machine() {
@@ -31,9 +31,9 @@ fn a_seed_means_the_same_trace_on_every_machine() {
 
 #[test]
 fn the_number_of_threads_changes_nothing() {
-    let span = Duration::from_secs(27);
-    let one = soaked(Level::Harsh, 7, span, 1);
-    assert_eq!(one, soaked(Level::Harsh, 7, span, 3));
+    let span = Duration::from_secs(30);
+    let one = soaked(Level::Harsh, 8, span, 1);
+    assert_eq!(one, soaked(Level::Harsh, 8, span, 3));
     assert_eq!(one.span, span);
     assert!(one.cells.len() > 9 && one.writes > 500, "{one:?}");
     // Commands and safe values are checked in longer runs of the cell that has most of them.

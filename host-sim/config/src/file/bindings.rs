@@ -1,7 +1,7 @@
 //! The bindings of fields and the triggers of output parts in a gateway file.
 
 use proto_core::config::{InputBinding, OnStale, OutputBinding, SendOn};
-use proto_core::sysvar::SysVar;
+use proto_core::sysvar::{SysVar, VarBit};
 
 use super::commands::{self, FileCommands};
 use super::encoding::refuse;
@@ -12,6 +12,7 @@ use super::sources;
 pub(super) enum FileInput {
     Unused,
     Variable { var: SysVar, scale: f32, offset: f32 },
+    Bit(VarBit),
     Commands(FileCommands),
 }
 
@@ -20,6 +21,7 @@ impl FileInput {
     pub(super) fn without_commands(&self) -> InputBinding {
         match *self {
             Self::Variable { var, scale, offset } => InputBinding::Variable { var, scale, offset },
+            Self::Bit(VarBit { var, bit }) => InputBinding::Bit { var, bit },
             Self::Unused | Self::Commands(_) => InputBinding::Unused,
         }
     }
@@ -66,10 +68,16 @@ fn read_send(item: &Item<'_>) -> Result<SendOn> {
         "frame" => return Ok(SendOn::Frame),
         _ => {}
     }
+    let (var, bit) = read_rising(item, text, "\"period\", \"change\", \"frame\"")?;
+    Ok(SendOn::Rising { var, bit })
+}
+
+/// `rising:BitOutputReg[3].0`; `others` are allowed too.
+pub(super) fn read_rising(item: &Item<'_>, text: &str, others: &str) -> Result<(SysVar, u8)> {
     let Some(place) = text.strip_prefix("rising:") else {
-        return Err(item.error(format!(
-            "{text:?} is unknown; allowed: \"period\", \"change\", \"frame\", \"rising:BitOutputReg[3].0\""
-        )));
+        return Err(
+            item.error(format!("{text:?} is unknown; allowed: {others}, \"rising:BitOutputReg[3].0\""))
+        );
     };
     let bit = place.rsplit_once('.').and_then(|(name, bit)| Some((name, bit.parse::<u8>().ok()?)));
     let Some((name, bit)) = bit else {
@@ -78,7 +86,7 @@ fn read_send(item: &Item<'_>) -> Result<SendOn> {
         );
     };
     let var = SysVar::parse(name).map_err(|error| item.error(format!("{name:?}: {error}")))?;
-    Ok(SendOn::Rising { var, bit })
+    Ok((var, bit))
 }
 
 /// The bindings of an input field: `to`, `commands`, or both.
@@ -90,19 +98,28 @@ pub(super) fn read_input(field: &Reader<'_>) -> Result<(FileInput, Option<FileIn
     if commands.is_none() {
         refuse(field, &commands::KEYS, "allowed only together with commands")?;
     }
-    let to = match to {
-        Some(to) => {
-            let (scale, offset) = read_scale(field)?;
-            Some(FileInput::Variable { var: read_var(&to)?, scale, offset })
-        }
-        None => None,
-    };
+    let to = to.map(|to| read_to(field, &to)).transpose()?;
     let commands = commands.map(|item| commands::read(field, &item).map(FileInput::Commands)).transpose()?;
     Ok(match (to, commands) {
         (Some(to), commands) => (to, commands),
         (None, Some(commands)) => (commands, None),
         (None, None) => (FileInput::Unused, None),
     })
+}
+
+/// A variable, or one bit of it.
+fn read_to(field: &Reader<'_>, to: &Item<'_>) -> Result<FileInput> {
+    let name = to.string()?;
+    if let Some(bit) = VarBit::parse(name) {
+        refuse(
+            field,
+            &["scale", "offset"],
+            "not allowed for a bit: it is off for 0 and on for any other value",
+        )?;
+        return bit.map(FileInput::Bit).map_err(|error| to.error(format!("{name:?}: {error}")));
+    }
+    let (scale, offset) = read_scale(field)?;
+    Ok(FileInput::Variable { var: read_var(to)?, scale, offset })
 }
 
 pub(super) fn read_output(field: &Reader<'_>) -> Result<FileOutput> {
@@ -123,10 +140,18 @@ pub(super) fn read_output(field: &Reader<'_>) -> Result<FileOutput> {
                 let (scale, offset) = read_scale(field)?;
                 return sources::read(&from, text, scale, offset);
             }
-            _ => {
-                let (scale, offset) = read_scale(field)?;
-                OutputBinding::Variable { var: read_var(&from)?, scale, offset }
-            }
+            name => match VarBit::parse(name) {
+                Some(bit) => {
+                    refuse(field, &["scale", "offset"], "not allowed for a bit: it is 0 or 1")?;
+                    let VarBit { var, bit } =
+                        bit.map_err(|error| from.error(format!("{name:?}: {error}")))?;
+                    return Ok(FileOutput::Bound(OutputBinding::Bit { var, bit }));
+                }
+                None => {
+                    let (scale, offset) = read_scale(field)?;
+                    OutputBinding::Variable { var: read_var(&from)?, scale, offset }
+                }
+            },
         },
     };
     if !matches!(binding, OutputBinding::Variable { .. }) {

@@ -105,13 +105,9 @@ fn read_initial(root: &Reader<'_>) -> Result<Vec<Initial>> {
 
 fn read_value(target: InitialTarget, item: &Item<'_>) -> Result<f64> {
     match target {
-        InitialTarget::Bit { .. } => match item.as_bool() {
-            Some(bit) => Ok(f64::from(u8::from(bit))),
-            None => item.integer::<u8>(0..=1).map(f64::from).map_err(|mut error| {
-                error.message.push_str(", false or true");
-                error
-            }),
-        },
+        InitialTarget::Bit { .. } | InitialTarget::VarBit(_) => {
+            item.bit().map(|bit| f64::from(u8::from(bit)))
+        }
         InitialTarget::Analog { group, .. } => {
             let (low, high) = group.range();
             let value = item.number()?;
@@ -210,10 +206,10 @@ fn read_port(table: &Reader<'_>, recipes: &[FileRecipe]) -> Result<(SimPort, Spo
 fn check_recipe(kind: BusKind, recipe: &FileRecipe) -> std::result::Result<(), String> {
     let name = &recipe.name;
     let is_can_port = kind == BusKind::Can;
-    if recipe.is_can && !is_can_port {
+    if recipe.is_can() && !is_can_port {
         return Err(format!("recipe {name:?} is a CAN recipe; only CAN ports take CAN recipes"));
     }
-    if !recipe.is_can && is_can_port {
+    if !recipe.is_can() && is_can_port {
         return Err(format!("recipe {name:?} is a stream recipe; a CAN port takes only CAN recipes"));
     }
     if recipe.mode == Mode::User && !matches!(kind, BusKind::Rs485 | BusKind::Can) {

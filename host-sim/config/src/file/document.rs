@@ -203,11 +203,16 @@ fn parse_value(text: &str, at: At) -> Result<Node, String> {
 /// Names separated by dots; a name that contains dots is in double quotes.
 fn split_path(key: &str) -> Option<Vec<String>> {
     let mut path = vec![String::new()];
-    // The dots of `RobotState[8..13]` are part of the name.
+    // The dots of `RobotState[8..13]` and `BitInputReg[3].4` are part of the name.
     let (mut quoted, mut bracket) = (false, false);
-    for c in key.chars() {
+    let mut chars = key.chars().peekable();
+    while let Some(c) = chars.next() {
+        let is_bit = || path.last().is_some_and(|name| name.ends_with(']'));
         match c {
             '"' => quoted = !quoted,
+            '.' if !quoted && is_bit() && chars.peek().is_some_and(char::is_ascii_digit) => {
+                path.last_mut()?.push(c);
+            }
             '.' if !quoted && !bracket => path.push(String::new()),
             _ => {
                 bracket = if quoted { bracket } else { c == '[' || (bracket && c != ']') };

@@ -1,9 +1,13 @@
 //! Configuration files as people write them: the examples, those of the documents, wrong and damaged ones.
 
+mod bits;
 mod damaged_files;
 mod device_files;
 mod document_examples;
 mod example_files;
+mod exchange_files;
 mod framing_files;
+mod golden_images;
 mod wrong_devices;
+mod wrong_exchanges;
 mod wrong_files;

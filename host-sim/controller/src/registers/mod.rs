@@ -12,7 +12,7 @@ mod packet;
 
 use std::sync::LazyLock;
 
-use proto_core::sysvar::{Direction, IMAGE_BYTES, SysVar};
+use proto_core::sysvar::{Direction, IMAGE_BYTES, SysVar, VarBit};
 use proto_core::wire::scalar::Scalar;
 
 use super::motion::{ArmState, Frame};
@@ -141,6 +141,10 @@ impl Registers {
     pub fn value(&self, target: InitialTarget) -> f64 {
         match target {
             InitialTarget::Var(var) => self.var(var).as_f64(),
+            InitialTarget::VarBit(VarBit { var, bit }) => {
+                let byte = self.image.get(var.image_offset()).copied().unwrap_or(0);
+                f64::from(byte.checked_shr(bit.into()).unwrap_or(0) & 1)
+            }
             InitialTarget::Bit { group, index } => f64::from(self.bit(group, index) as u8),
             InitialTarget::Analog { group, index } => {
                 let nth = usize::from(index.saturating_sub(1));
@@ -181,6 +185,21 @@ impl Registers {
                 let offset = command_of(var).map_or(offset, SysVar::image_offset);
                 self.write_inputs(|image| {
                     image.get_mut(offset..).and_then(|bytes| scalar.encode(bytes));
+                });
+            }
+            InitialTarget::VarBit(bit) => {
+                let mask = bit.mask().ok_or_else(|| wrong.clone())?;
+                let on = match value {
+                    0.0 => 0,
+                    1.0 => mask,
+                    _ => return Err(wrong),
+                };
+                // The status of an output follows its command, so the command is set.
+                let offset = command_of(bit.var).unwrap_or(bit.var).image_offset();
+                self.write_inputs(|image| {
+                    if let Some(byte) = image.get_mut(offset) {
+                        *byte = *byte & !mask | on;
+                    }
                 });
             }
             InitialTarget::Bit { group, index } => {
@@ -227,7 +246,7 @@ impl Registers {
     /// [`SetError`]; nothing changed.
     pub fn set_by_program(&mut self, target: InitialTarget, value: f64) -> Result<(), SetError> {
         let writable = match target {
-            InitialTarget::Var(var) => {
+            InitialTarget::Var(var) | InitialTarget::VarBit(VarBit { var, .. }) => {
                 command_of(var).is_some()
                     || matches!(
                         var.group(),

@@ -73,6 +73,42 @@ fn registers_and_io_are_read_and_outputs_written() {
 }
 
 #[test]
+fn single_bits_of_variables_are_read_and_written() {
+    let config = with_initial(
+        SimConfig::default(),
+        &[("BitInputReg[3].4", 1.0), ("BitOutputReg[2]", 129.0), ("DigitalOutputCommand[1].3", 1.0)],
+    );
+    let script = r#"
+        let shown = [get("BitInputReg[3].4"), get("__BitInputReg_3.5"), get("BitInputReg[3]")];
+        set("BitOutputReg[2].0", false);
+        set("BitOutputReg[2].6", 1);
+        set("DigitalOutputCommand[1].7", get("BitInputReg[3].4"));
+        for name in ["BitInputReg[3].4", "BitOutputReg[2].8", "WordOutputReg[1].0"] {
+            try { set(name, 1); log("written " + name); } catch (e) { log(e); }
+        }
+        try { set("BitOutputReg[2].1", 2) } catch (e) { log(e); }
+    "#;
+    let (mut cell, _) = runs(config, script);
+    cell.run_ms(10);
+    assert_eq!(cell.controller.machine().error(), None);
+    assert_eq!(cell.controller.program_variables()["shown"], serde_json::json!([true, false, 16]));
+    assert_eq!(cell.value("BitOutputReg[2]"), f64::from(0b1100_0000), "the other bits stay");
+    assert_eq!(cell.value("DigitalOutputCommand[1]"), f64::from(0b1000_1000));
+    assert_eq!([cell.value("DO[4]"), cell.value("DO[8]")], [1.0, 1.0]);
+    assert_eq!(cell.value("BitOutputReg[2].6"), 1.0);
+    let log: Vec<_> = cell.controller.program_log().collect();
+    assert_eq!(
+        log,
+        [
+            "a program cannot write BitInputReg[3].4",
+            "BitOutputReg[2].8: BitOutputReg[2] has no bit 8; allowed: 0..=7",
+            "WordOutputReg[1].0: WordOutputReg[1] is a word without bits",
+            "BitOutputReg[2].1 cannot be 2",
+        ]
+    );
+}
+
+#[test]
 fn speed_scales_motion_and_pause_holds_it() {
     let script = "movej([1.0, 0, 0, 0, 0, 0], 1.0);";
     let config = || with_initial(SimConfig::default(), &[("RobotState[1]", 0.0)]);

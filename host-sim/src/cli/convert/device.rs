@@ -4,12 +4,13 @@
 //! frames with the same values can differ in, such as padding, is kept in `raw=`.
 
 use proto_core::config::{DeviceFrame, FieldSpec, OutputBinding};
-use proto_core::device::{Cutter, Digits, Element, Encoding, Found, Framer, Kind, Piece, Probe};
+use proto_core::device::{Carrier, Cutter, Digits, Element, Encoding, Found, Framer, Kind, Piece, Probe};
+use proto_core::modbus::rtu;
 use proto_core::recipe::model::MAX_STREAM_FRAME;
 use proto_core::sysvar::Direction;
 use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::Scalar;
-use recipe_config::{DeviceRecipe, FrameEnds, NamedFrame};
+use recipe_config::{DeviceRecipe, ExchangeKind, FrameEnds, NamedExchange, NamedFrame};
 
 use super::super::text;
 use super::{note, write_line};
@@ -29,6 +30,7 @@ pub(in super::super) struct DevicePart {
 #[derive(Debug)]
 struct Format {
     id: Option<CanId>,
+    named: NamedFrame,
     frame: DeviceFrame,
     values: Vec<Value>,
     tail: Vec<u8>,
@@ -69,15 +71,37 @@ struct Seen {
 impl DevicePart {
     pub(in super::super) fn new(recipe: &DeviceRecipe, direction: Direction) -> Result<Self, String> {
         let ends = recipe.ends(direction);
-        let format = |named: &NamedFrame| -> Result<Format, String> {
-            // Cannot fail: reading the file laid out the same frames.
-            let frame = named.lay_out(recipe.carrier, direction).map_err(|error| error.to_string())?;
-            let is_whole = ends != FrameEnds::default();
-            let tail = named.tail.clone();
-            Ok(Format { id: named.id, frame, values: values_of(named), tail, is_whole })
-        };
+        let is_whole = ends != FrameEnds::default();
+        let format = |named: &NamedFrame| Format::new(named, recipe.carrier, direction, is_whole);
         let formats = recipe.part(direction).iter().map(format).collect::<Result<_, _>>()?;
         Ok(Self { direction, ends, formats })
+    }
+
+    /// One frame of an exchange.
+    pub(in super::super) fn of_exchange(
+        exchange: &NamedExchange,
+        named: &NamedFrame,
+        is_request: bool,
+    ) -> Result<Self, String> {
+        if exchange.remote && is_request {
+            return Err("a remote request has no data".into());
+        }
+        // A slave receives requests.
+        let direction = match exchange.kind {
+            ExchangeKind::Slave(_) if is_request => Direction::Input,
+            ExchangeKind::Slave(_) => Direction::Output,
+            _ if is_request => Direction::Output,
+            _ => Direction::Input,
+        };
+        let carrier = if named.id.is_some() { Carrier::Can } else { Carrier::Stream };
+        let format = Format::new(named, carrier, direction, false)?;
+        Ok(Self { direction, ends: FrameEnds::default(), formats: vec![format] })
+    }
+
+    /// Whether it is one frame that has no value to be given.
+    pub(in super::super) fn is_constant(&self) -> bool {
+        let [format] = &self.formats[..] else { return false };
+        format.values.iter().all(|value| value.constant.is_some())
     }
 
     pub(in super::super) fn ids(&self) -> impl Iterator<Item = Option<CanId>> {
@@ -258,6 +282,32 @@ fn values_of(named: &NamedFrame) -> Vec<Value> {
 }
 
 impl Format {
+    fn new(
+        named: &NamedFrame,
+        carrier: Carrier,
+        direction: Direction,
+        is_whole: bool,
+    ) -> Result<Self, String> {
+        // Cannot fail for the frames of files: reading the file laid them out.
+        let frame = named.lay_out(carrier, direction).map_err(|error| error.to_string())?;
+        let (named, values, tail) = (named.clone(), values_of(named), named.tail.clone());
+        Ok(Self { id: named.id, named, frame, values, tail, is_whole })
+    }
+
+    /// Makes the coil of Modbus function 5 what it is on the line: FF for 1.
+    fn switch_coil(&self, frame: &mut [u8]) {
+        if !self.named.fields.iter().any(|field| field.is_coil) {
+            return;
+        }
+        // Behind slave, function and address; the CRC is the end.
+        if let [head @ .., low, high] = frame {
+            if let Some(coil) = head.get_mut(4) {
+                *coil = if *coil & 1 == 1 { 0xFF } else { 0 };
+            }
+            [*low, *high] = rtu::checksum(head).to_le_bytes();
+        }
+    }
+
     fn probe(&self, bytes: &[u8]) -> Probe {
         let DeviceFrame { layout, elements } = &self.frame;
         if self.is_whole { layout.probe_whole(elements, bytes) } else { layout.probe(elements, bytes) }
@@ -354,7 +404,11 @@ impl Format {
             _ => None,
         };
         match self.frame.layout.encode_with(&self.frame.elements, number, characters, &mut out) {
-            Some(len) => Ok(out.get(..len).unwrap_or(&[]).to_vec()),
+            Some(len) => {
+                let mut frame = out.get(..len).unwrap_or(&[]).to_vec();
+                self.switch_coil(&mut frame);
+                Ok(frame)
+            }
             None if self.values.iter().any(|value| matches!(value.kind, ValueKind::Text)) => {
                 Err("a text does not fit its field, or a value is not a number".into())
             }

@@ -6,6 +6,7 @@ use proto_core::sysvar::Direction;
 use recipe_config::file::{Text, load_recipes, parse_recipes};
 use recipe_test_kit::example;
 
+use super::super::codec::TalkPart;
 use super::tests::{decoded, encoded, from_values};
 use super::*;
 
@@ -13,11 +14,17 @@ fn example_part(file: &str, recipe: Option<&str>, part: Direction) -> Part {
     Part::choose(&load_recipes(&example(file), &[]).unwrap(), recipe, Some(part)).unwrap()
 }
 
+/// A frame of an exchange of an example, which has one recipe.
+fn exchange_part(file: &str, number: usize, talk: TalkPart) -> Part {
+    let recipes = load_recipes(&example(file), &[]).unwrap();
+    Part::choose_exchange(&recipes, None, Some(number), Some(talk)).unwrap()
+}
+
 const REPLY: &str = "09 17 06 F9 00 00 DC D0 1E 4E 11";
 
 #[test]
 fn the_grippers_reply_has_its_values() {
-    let part = example_part("gripper.toml", None, Direction::Input);
+    let part = exchange_part("gripper.toml", 1, TalkPart::Reply);
     let values = "activated=1 going=1 status=3 object=3 fault=0 wanted=220 position=208 current=30\n";
     assert_eq!(decoded(&part, REPLY), (values.into(), String::new()));
     assert_eq!(encoded(&part, values).unwrap().trim_end(), REPLY);
@@ -39,17 +46,15 @@ fn the_grippers_reply_has_its_values() {
 
 #[test]
 fn the_grippers_request_needs_no_constants() {
-    let part = example_part("gripper.toml", None, Direction::Output);
+    let part = exchange_part("gripper.toml", 1, TalkPart::Request);
     let request = "09 17 07 D0 00 03 03 E8 00 03 06 09 00 00 DC FF 96 D7 DA";
     assert_eq!(from_values(&part, None, &["220", "255", "150"]).unwrap(), request);
     assert_eq!(from_values(&part, None, &["force=150", "position=220", "speed=255"]).unwrap(), request);
     let (values, notes) = decoded(&part, request);
-    assert!(values.starts_with("slave=9 function=23 read=2000 read-count=3 write=1000 "), "{values}");
+    assert_eq!(values, "activate=1 go=1 position=220 speed=255 force=150\n");
     assert_eq!((encoded(&part, &values).unwrap().trim_end(), notes.as_str()), (request, ""));
-    assert_eq!(
-        from_values(&part, None, &["slave=8", "1", "2", "3"]).unwrap()[..5],
-        request.replacen("09", "08", 1)[..5]
-    );
+    let stopped = from_values(&part, None, &["go=0", "220", "255", "150"]).unwrap();
+    assert_eq!(stopped[..41], request.replacen("06 09", "06 01", 1)[..41]);
     assert_eq!(from_values(&part, None, &["1"]).unwrap_err(), "no value for speed, force");
     assert_eq!(
         from_values(&part, None, &["activate=2", "1", "2", "3"]).unwrap_err(),
@@ -59,7 +64,7 @@ fn the_grippers_request_needs_no_constants() {
 
 #[test]
 fn a_wrong_checksum_is_told_with_the_right_one() {
-    let part = example_part("gripper.toml", None, Direction::Input);
+    let part = exchange_part("gripper.toml", 1, TalkPart::Reply);
     let wrong = REPLY.replace("1E 4E", "1F 4E");
     let (values, notes) = decoded(&part, &format!("{wrong}\n{REPLY}\n"));
     assert_eq!(values.lines().count(), 1);
@@ -80,6 +85,90 @@ fn a_wrong_checksum_is_told_with_the_right_one() {
     let (values, notes) = decoded(&part, &other);
     assert_eq!(values.lines().count(), 1);
     assert!(notes.starts_with("line 1: 08 17 ") && notes.contains("other constants"), "{notes}");
+}
+
+#[test]
+fn frames_of_exchanges_are_whole() {
+    for (number, talk, values, bytes) in [
+        (1, TalkPart::Request, &[][..], "01 02 00 00 00 08 79 CC"),
+        (1, TalkPart::Reply, &["1", "0", "0", "1"], "01 02 01 81 61 E8"),
+        (1, TalkPart::Refusal, &["2"], "01 82 02 C1 61"),
+        (2, TalkPart::Request, &["1", "0", "1"], "01 0F 00 00 00 04 01 0D FF 53"),
+        (2, TalkPart::Reply, &[], "01 0F 00 00 00 04 54 08"),
+        (4, TalkPart::Request, &["zero=1"], "02 05 01 00 FF 00 8D F5"),
+        (4, TalkPart::Reply, &["zero=0"], "02 05 01 00 00 00 CC 05"),
+        (13, TalkPart::Request, &["3"], "00 06 00 F0 00 03 C8 29"),
+    ] {
+        let part = exchange_part("modbus-line.toml", number, talk);
+        let values: Vec<String> = values.iter().map(|value| (*value).to_owned()).collect();
+        let mut out = Vec::new();
+        encode_values(&part, None, &values, &mut out).unwrap();
+        let found = String::from_utf8(out).unwrap();
+        assert_eq!(found.trim_end(), bytes, "exchange {number}");
+        let (values, notes) = decoded(&part, &found);
+        assert_eq!((encoded(&part, &values).unwrap(), notes.as_str()), (found, ""), "{values}");
+        let needs_values =
+            matches!((number, talk), (1, TalkPart::Reply | TalkPart::Refusal) | (2 | 13, TalkPart::Request));
+        assert_eq!(part.is_constant(), !needs_values, "{values}");
+    }
+    let recipes = load_recipes(&example("modbus-line.toml"), &[]).unwrap();
+    let refused = |number, talk| Part::choose_exchange(&recipes, None, number, talk).unwrap_err();
+    assert_eq!(refused(Some(13), Some(TalkPart::Reply)), "the exchange has no reply; there are request");
+    assert_eq!(refused(Some(14), None), "there is no exchange 14 in recipe \"line\"; allowed: 1..=13");
+    assert_eq!(refused(Some(0), None), "there is no exchange 0 in recipe \"line\"; allowed: 1..=13");
+    assert_eq!(
+        refused(None, None),
+        "recipe \"line\" has several exchanges; choose one with --exchange N: 1..=13"
+    );
+    assert_eq!(
+        refused(Some(1), None),
+        "the exchange has several frames; choose one with --part: request, reply, refusal"
+    );
+    assert_eq!(Part::choose(&recipes, None, None).unwrap_err(), refused(None, None));
+}
+
+/// The fenced blocks of a part of docs/configuration.md, and its text.
+fn documented(part: &str) -> (String, String) {
+    let path = recipe_test_kit::repository().join("docs/configuration.md");
+    let document = std::fs::read_to_string(path).unwrap();
+    let (_, text) = document.split_once(&format!("\n### {part}\n")).unwrap();
+    let text = text.split("\n## ").next().unwrap().split("\n### ").next().unwrap();
+    let blocks: Vec<_> = text.split("```\n").skip(1).step_by(2).collect();
+    (blocks.concat(), text.to_owned())
+}
+
+#[test]
+fn the_worked_bytes_of_conversations_are_right() {
+    for (title, recipe, frames) in [
+        (
+            "Conversations",
+            "[[recipe]]\nname = \"r\"\nkind = \"stream\"\nmode = \"user\"\n",
+            &[(1, TalkPart::Request, ""), (1, TalkPart::Reply, "1000")][..],
+        ),
+        (
+            "Modbus RTU master",
+            "[[recipe]]\nname = \"r\"\nkind = \"modbus-rtu\"\n",
+            &[
+                (1, TalkPart::Request, ""),
+                (1, TalkPart::Reply, "1000"),
+                (2, TalkPart::Request, "1 1"),
+                (2, TalkPart::Refusal, "2"),
+            ],
+        ),
+        ("Modbus RTU slave", "", &[(2, TalkPart::Request, ""), (2, TalkPart::Reply, "0.5")]),
+    ] {
+        let (blocks, text) = documented(title);
+        let toml = format!("[controller]\naddress = \"a\"\n{recipe}{blocks}");
+        let recipes = parse_recipes(Text { name: title, toml: &toml }, &[]).unwrap();
+        for &(number, talk, values) in frames {
+            let part = Part::choose_exchange(&recipes, None, Some(number), Some(talk)).unwrap();
+            let values: Vec<_> = values.split_whitespace().map(str::to_owned).collect();
+            let mut out = Vec::new();
+            encode_values(&part, None, &values, &mut out).unwrap();
+            let bytes = String::from_utf8(out).unwrap();
+            assert!(text.contains(&format!("`{}`", bytes.trim_end())), "{title}, {number}: {bytes}");
+        }
+    }
 }
 
 #[test]
@@ -293,8 +382,12 @@ proptest! {
 
     #[test]
     fn any_bytes_are_decoded_or_told_of(bytes in prop::collection::vec(any::<u8>(), 0..80)) {
-        for (file, recipe) in [("gripper.toml", None), ("force-sensor-crc.toml", Some("force-sensor")), ("scale.toml", None)] {
-            let part = example_part(file, recipe, Direction::Input);
+        let parts = [
+            exchange_part("gripper.toml", 1, TalkPart::Reply),
+            example_part("force-sensor-crc.toml", Some("force-sensor"), Direction::Input),
+            example_part("scale.toml", None, Direction::Input),
+        ];
+        for part in parts {
             let (mut out, mut notes) = (Vec::new(), Vec::new());
             let log = format!("{}\n", text::hex(&bytes));
             // A frame by chance is possible, a panic is not.

@@ -185,7 +185,7 @@ pub fn decode(bytes: &[u8]) -> Result<GatewayConfig, ImageError> {
 }
 
 /// Same as [`decode`], in place and into a configuration of any size: for boards whose stack is
-/// smaller than a few configurations of more than 40 KiB each.
+/// smaller than a few configurations of almost 60 KiB each.
 ///
 /// # Errors
 /// Same as [`decode`]; `config` must not be used then.
@@ -195,9 +195,10 @@ pub fn decode_into<
     const FIELDS: usize,
     const COMMANDS: usize,
     const SAFE_VALUES: usize,
+    const EXCHANGES: usize,
 >(
     bytes: &[u8],
-    config: &mut GatewayConfig<PORTS, RECIPES, FIELDS, COMMANDS, SAFE_VALUES>,
+    config: &mut GatewayConfig<PORTS, RECIPES, FIELDS, COMMANDS, SAFE_VALUES, EXCHANGES>,
 ) -> Result<(), ImageError> {
     decode_view(bytes, config.view_mut())
 }

@@ -340,7 +340,7 @@ struct Rs485 {
 
 impl From<Rs485> for config::Rs485 {
     fn from(Rs485 { baud, parity, stop_bits, idle_gap, turnaround }: Rs485) -> Self {
-        Self { baud, parity: parity.into(), stop_bits, idle_gap, turnaround }
+        Self { baud, parity: parity.into(), stop_bits, idle_gap, turnaround, echo: false }
     }
 }
 
@@ -369,7 +369,7 @@ struct SafeValue {
 
 impl From<SafeValue> for config::SafeValue {
     fn from(SafeValue { var, value }: SafeValue) -> Self {
-        Self { var, value }
+        Self::new(var, value)
     }
 }
 

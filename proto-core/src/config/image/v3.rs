@@ -6,7 +6,9 @@ use serde::Serialize;
 
 use super::{ConfigMut, ConfigView, ImageError, item, items};
 use crate::config::error::Counted;
-use crate::config::{BoardAddress, CommandEntry, ControllerLink, FieldSpec, Port, Recipe, SafeValue};
+use crate::config::{
+    BoardAddress, CommandEntry, ControllerLink, Exchange, FieldSpec, FrameSpec, Port, Recipe, SafeValue,
+};
 
 /// A whole configuration, borrowed. Postcard writes a struct as its fields, and a list as its length
 /// and its items.
@@ -19,12 +21,17 @@ struct Payload<'c> {
     fields: &'c [FieldSpec],
     commands: &'c [CommandEntry],
     safe_values: &'c [SafeValue],
+    exchanges: &'c [Exchange],
+    frames: &'c [FrameSpec],
 }
 
 pub(super) fn write<'o>(config: ConfigView<'_>, out: &'o mut [u8]) -> postcard::Result<&'o mut [u8]> {
-    let ConfigView { controller, network, recipes, ports, fields, commands, safe_values } = config;
+    let ConfigView { controller, network, recipes, ports, fields, commands, safe_values, exchanges, frames } =
+        config;
     let network = network.copied().into();
-    postcard::to_slice(&Payload { controller, network, recipes, ports, fields, commands, safe_values }, out)
+    let payload =
+        Payload { controller, network, recipes, ports, fields, commands, safe_values, exchanges, frames };
+    postcard::to_slice(&payload, out)
 }
 
 pub(super) fn read(rest: &mut &[u8], config: &mut ConfigMut<'_>) -> Result<(), ImageError> {
@@ -34,5 +41,7 @@ pub(super) fn read(rest: &mut &[u8], config: &mut ConfigMut<'_>) -> Result<(), I
     items::<Port, _>(rest, Counted::Ports, config.ports)?;
     items::<FieldSpec, _>(rest, Counted::Fields, config.fields)?;
     items::<CommandEntry, _>(rest, Counted::Commands, config.commands)?;
-    items::<SafeValue, _>(rest, Counted::SafeValues, config.safe_values)
+    items::<SafeValue, _>(rest, Counted::SafeValues, config.safe_values)?;
+    items::<Exchange, _>(rest, Counted::Exchanges, config.exchanges)?;
+    items::<FrameSpec, _>(rest, Counted::ExchangeFrames, config.frames)
 }

@@ -7,11 +7,11 @@ use heapless::Vec;
 
 use super::super::Exception;
 use super::adu::{BROADCAST, MAX_ADU};
-use super::exchange::{Exchange, TableError};
+use super::exchange::{Exchange, TableError, When};
 use super::operation::{Expected, Reply};
 use super::receiver::{Found, Receiver};
-use super::schedule::{Presence, Schedule, Taken};
 use super::{Echo, Timing};
+use crate::schedule::{Peer, Presence, Row, Taken, Turns};
 use crate::time::{Duration, Instant};
 
 /// A master with room for `N` exchanges.
@@ -24,9 +24,11 @@ pub struct Master<const N: usize> {
     timing: Timing,
     echo: Echo,
     table: Vec<Exchange, N>,
-    /// Addresses and counters, in the order of the schedule's peers.
+    /// Addresses and counters, in the order of the peers.
     slaves: Vec<Slave, { super::MAX_SLAVES + 1 }>,
-    schedule: Schedule<N>,
+    rows: Vec<Row, N>,
+    peers: Vec<Peer, { super::MAX_SLAVES + 1 }>,
+    run: u8,
     phase: Phase,
     receiver: Receiver,
     /// End of the newest own frame.
@@ -164,7 +166,9 @@ impl<const N: usize> Master<N> {
             echo,
             table: Vec::from_slice(table).map_err(|_| no_room)?,
             slaves: Vec::new(),
-            schedule: Schedule::new(),
+            rows: Vec::new(),
+            peers: Vec::new(),
+            run: 0,
             phase: Phase::Idle,
             receiver: Receiver::new(),
             sent: now,
@@ -176,9 +180,9 @@ impl<const N: usize> Master<N> {
             exchange.check(nth)?;
             let peer = master.peer(exchange.slave).ok_or(TableError::TooManySlaves)?;
             let cost = master.cost(exchange);
-            if !master.schedule.add_row(peer, exchange.when, cost, exchange.timeout, now) {
-                return Err(no_room);
-            }
+            let When { every, start } = exchange.when;
+            let row = Row::new(peer, (every, start), (cost, exchange.timeout), now);
+            master.rows.push(row).map_err(|_| no_room)?;
         }
         Ok(master)
     }
@@ -206,7 +210,7 @@ impl<const N: usize> Master<N> {
         if matches!(self.phase, Phase::Idle) {
             self.deadline = self.deadline.min(now);
         }
-        self.schedule.request(exchange, now)
+        self.turns().request(exchange, now)
     }
 
     /// The next thing to do or to know; `None` if there is nothing until [`Self::deadline`].
@@ -263,9 +267,9 @@ impl<const N: usize> Master<N> {
     pub fn slaves(&self) -> impl ExactSizeIterator<Item = SlaveStatus> {
         self.slaves.iter().enumerate().map(|(peer, slave)| SlaveStatus {
             address: slave.address,
-            presence: self.schedule.presence(peer as u8),
+            presence: self.presence(peer),
             counters: slave.counters,
-            missed_periods: self.schedule.missed(peer as u8),
+            missed_periods: self.peers.get(peer).map_or(0, Peer::missed),
         })
     }
 
@@ -273,6 +277,14 @@ impl<const N: usize> Master<N> {
     /// were not expected.
     pub const fn stray_bytes(&self) -> u32 {
         self.receiver.stray()
+    }
+
+    fn turns(&mut self) -> Turns<'_, Peer> {
+        Turns { rows: &mut self.rows, peers: &mut self.peers, run: &mut self.run }
+    }
+
+    fn presence(&self, peer: usize) -> Presence {
+        self.peers.get(peer).map_or(Presence::Unknown, Peer::presence)
     }
 
     /// The peer with this address, new if there is none yet.
@@ -285,7 +297,8 @@ impl<const N: usize> Master<N> {
         if self.slaves.len().saturating_sub(is_broadcast) > super::MAX_SLAVES {
             return None;
         }
-        self.schedule.add_peer()
+        self.peers.push(Peer::NEW).ok()?;
+        Some(self.peers.len().saturating_sub(1) as u8)
     }
 
     /// How long an exchange has the line if no reply comes.
@@ -315,14 +328,14 @@ impl<const N: usize> Master<N> {
         }
         // Each exchange that has no values yet is passed over once.
         for _ in 0..=self.table.len() {
-            let exchange = match self.schedule.choose(now) {
+            let exchange = match self.turns().choose(now) {
                 Ok(exchange) => exchange,
                 Err(later) => {
                     self.deadline = later;
                     return None;
                 }
             };
-            let taken = self.schedule.take(exchange, now);
+            let taken = self.turns().take(exchange, now);
             let flight =
                 Flight { exchange, taken, repeated: 0, timed_out: false, stray: 0, until: Instant::NEVER };
             if let Some(len) = self.send(flight, now, values, out) {
@@ -390,7 +403,7 @@ impl<const N: usize> Master<N> {
         // The reply may be a late one to the first of the requests. Then that to the repetition is
         // still to come, and must not be taken for one to another exchange.
         let not_before = if flight.timed_out { self.sent + timeout.saturating_mul(2) } else { Instant::ZERO };
-        self.schedule.answered(flight.exchange, now, not_before);
+        self.turns().answered(flight.exchange, now, not_before);
         self.phase = Phase::Idle;
         self.receiver.end();
     }
@@ -414,7 +427,7 @@ impl<const N: usize> Master<N> {
             Failure::Checksum => &mut counters.checksums,
             _ => &mut counters.timeouts,
         });
-        let is_up = self.schedule.presence(self.peer_of(exchange) as u8) == Presence::Up;
+        let is_up = self.presence(self.peer_of(exchange)) == Presence::Up;
         let retries = if is_up { self.table.get(exchange)?.retries } else { 0 };
         // The late reply of another slave may have destroyed the request.
         let disturbed = self.receiver.stray() != flight.stray;
@@ -425,7 +438,8 @@ impl<const N: usize> Master<N> {
             self.phase = Phase::Repeat(Flight { repeated, timed_out, ..flight });
             return None;
         }
-        self.schedule.failed(exchange, flight.taken, now, self.sent);
+        let sent = self.sent;
+        self.turns().failed(exchange, flight.taken, now, sent);
         self.phase = Phase::Idle;
         Some(Output::Failed { exchange, failure })
     }

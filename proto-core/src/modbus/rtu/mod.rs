@@ -48,17 +48,17 @@ mod exchange;
 mod master;
 mod operation;
 mod receiver;
-mod schedule;
 mod slave;
 mod timing;
 
+pub use crate::schedule::Presence;
 pub use adu::{
     Adu, AduError, BROADCAST, FrameLen, MAX_ADDRESS, MAX_ADU, MIN_ADU, checksum, reply_len, request_len,
 };
 pub use exchange::{Exchange, MAX_SLAVES, TableError, When};
 pub use master::{Failure, Master, Output, SlaveCounters, SlaveStatus};
-pub use operation::{CountError, Operation, Reply};
-pub use schedule::Presence;
+pub use operation::{CountError, Operation, Reply, Table};
+pub(crate) use operation::{Expected, Probe, REFUSAL_LEN};
 pub use slave::{Counters, Slave};
 pub use timing::Timing;
 

@@ -101,6 +101,20 @@ impl fmt::Display for CountError {
 
 impl core::error::Error for CountError {}
 
+/// The four tables of a slave.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum Table {
+    /// Single bits that can be written.
+    Coils,
+    /// Single bits.
+    DiscreteInputs,
+    /// Registers that can be written.
+    HoldingRegisters,
+    /// Registers.
+    InputRegisters,
+}
+
 /// The content of a reply.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
@@ -173,6 +187,29 @@ impl Operation {
         }
     }
 
+    /// Bytes of data that a reply carries; 0 for a write.
+    pub const fn read_len(&self) -> usize {
+        match self.reply_data_len() {
+            Some(len) => len,
+            None => 0,
+        }
+    }
+
+    /// The table that it is about, its first address there and the count; what FC 23 reads.
+    pub const fn place(&self) -> (Table, u16, u16) {
+        let table = match self {
+            Self::ReadCoils { .. } | Self::WriteCoil { .. } | Self::WriteCoils { .. } => Table::Coils,
+            Self::ReadDiscreteInputs { .. } => Table::DiscreteInputs,
+            Self::ReadInputRegisters { .. } => Table::InputRegisters,
+            _ => Table::HoldingRegisters,
+        };
+        let (address, count) = self.head();
+        match self {
+            Self::WriteCoil { .. } | Self::WriteRegister { .. } => (table, address, 1),
+            _ => (table, address, count),
+        }
+    }
+
     /// Length of the request's frame.
     pub const fn request_len(&self) -> usize {
         match self {
@@ -217,7 +254,7 @@ impl Operation {
 
     /// Writes the request's frame to the front of `out` and returns its length. `fill` writes the
     /// data into a slice of [`Self::written_len`] zeros; `None` if it has none.
-    pub(super) fn encode(
+    pub(crate) fn encode(
         &self,
         slave: u8,
         out: &mut [u8; MAX_ADU],
@@ -298,7 +335,7 @@ fn behind_count(rest: &mut [u8], len: usize) -> Option<&mut [u8]> {
 
 /// What the reply to a request looks like.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Expected {
+pub(crate) struct Expected {
     slave: u8,
     function: u8,
     body: Body,
@@ -314,7 +351,7 @@ enum Body {
 
 /// What bytes are to a master that waits for a reply.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Probe {
+pub(crate) enum Probe {
     /// Not the beginning of the reply.
     No,
     /// Perhaps its beginning.
@@ -329,7 +366,7 @@ pub(super) enum Probe {
 
 impl Expected {
     /// What answers the request in `frame`; `None` for a broadcast.
-    pub(super) fn of(operation: &Operation, frame: &[u8]) -> Option<Self> {
+    pub(crate) fn of(operation: &Operation, frame: &[u8]) -> Option<Self> {
         let (&[slave, function], rest) = frame.split_first_chunk()?;
         if slave == BROADCAST {
             return None;
@@ -347,8 +384,17 @@ impl Expected {
         bytes.starts_with(&[self.slave, self.function])
     }
 
+    /// Length of the frame that `bytes` begin, if it is not refused.
+    pub(crate) fn len_of(&self, bytes: &[u8]) -> usize {
+        match (bytes.get(1), self.body) {
+            (Some(function), _) if *function == self.function | function::EXCEPTION_FLAG => REFUSAL_LEN,
+            (_, Body::Data(len)) => usize::from(len).saturating_add(5),
+            (_, Body::Echo(_)) => 8,
+        }
+    }
+
     /// What `bytes` begin with.
-    pub(super) fn probe(&self, bytes: &[u8]) -> Probe {
+    pub(crate) fn probe(&self, bytes: &[u8]) -> Probe {
         let [slave, rest @ ..] = bytes else { return Probe::Partial };
         if *slave != self.slave {
             return Probe::No;
@@ -376,6 +422,9 @@ impl Expected {
         }
     }
 }
+
+/// Length of the frame of an exception.
+pub(crate) const REFUSAL_LEN: usize = 5;
 
 /// High byte of the value that switches a coil on.
 const COIL_ON: u8 = 0xFF;

@@ -28,6 +28,8 @@ pub struct Slave {
     heard: Instant,
     /// Length and CRC of the own reply, whose echo comes first.
     sent: Option<(usize, [u8; CRC_LEN])>,
+    /// Length of a reply that is kept in the buffer, and is sent later.
+    kept: usize,
     counters: Counters,
 }
 
@@ -67,6 +69,7 @@ impl Slave {
             overrun: false,
             heard: Instant::ZERO,
             sent: None,
+            kept: 0,
             counters: Counters { answered: 0, refused: 0, broadcasts: 0, others: 0, late: 0, wrong: 0 },
         })
     }
@@ -77,6 +80,8 @@ impl Slave {
         if bytes.is_empty() {
             return;
         }
+        // The line goes on: a reply that was not sent is too late.
+        self.kept = 0;
         let began = now - self.timing.of(bytes.len());
         if self.len != 0 && began >= self.heard + self.timing.silence() {
             self.counters.late = self.counters.late.saturating_add(1);
@@ -115,6 +120,37 @@ impl Slave {
     /// When to call [`Self::poll`]; [`Instant::NEVER`] while nothing has come.
     pub fn deadline(&self) -> Instant {
         if self.len == 0 { Instant::NEVER } else { self.heard + self.timing.silence() }
+    }
+
+    /// Copies the bytes that came to the front of `out`, as many as fit, and returns how many.
+    pub(crate) fn copy_to(&self, out: &mut [u8]) -> usize {
+        let held = self.buffer.iter().take(self.len);
+        out.iter_mut().zip(held).map(|(slot, &byte)| *slot = byte).count()
+    }
+
+    /// Keeps the reply of [`Self::poll`] until it can be sent.
+    pub(crate) fn keep(&mut self, reply: &[u8]) {
+        self.kept = self.buffer.iter_mut().zip(reply).map(|(slot, &byte)| *slot = byte).count();
+    }
+
+    pub(crate) const fn has_kept(&self) -> bool {
+        self.kept > 0
+    }
+
+    /// Takes the reply that was kept, if there is one.
+    pub(crate) fn take_kept(&mut self, out: &mut [u8]) -> Option<usize> {
+        let kept = self.buffer.iter().take(core::mem::take(&mut self.kept));
+        let len = out.iter_mut().zip(kept).map(|(slot, &byte)| *slot = byte).count();
+        (len > 0).then_some(len)
+    }
+
+    /// Drops what came and what was to be sent: the line is gone, or nobody knows how old it is. Returns
+    /// the number of bytes that came.
+    pub(crate) fn discard(&mut self) -> usize {
+        let len = self.len;
+        self.forget();
+        self.kept = 0;
+        len
     }
 
     /// Counters since the start.

@@ -73,6 +73,28 @@ impl Robot {
                 return Err((Invariant::SafeArrives, what));
             }
         }
+        for (share, state) in spec.shares.iter().zip(&up.shares) {
+            let (Some(safe), Some(accepted)) = (share.safe, state.accepted) else { continue };
+            let silent = accepted + spec.ports[share.port].timeout;
+            let could = silent.max(all);
+            let at = share.var.image_offset();
+            let is_foreign = self.foreign_writes.get(&at).is_some_and(|when| *when > silent);
+            if now.saturating_since(could) <= SAFE_ARRIVES || now < could || is_foreign {
+                continue;
+            }
+            checked += 1;
+            let there = self.inputs.get(at).map(|byte| byte & share.mask);
+            if there.is_some_and(|there| there != safe) {
+                let what = format!(
+                    "bits {:#010b} of {} are not their safe values {safe:#010b} at the controller; their owner has \
+                     been silent for {}",
+                    share.mask,
+                    share.var,
+                    now.saturating_since(accepted)
+                );
+                return Err((Invariant::SafeArrives, what));
+            }
+        }
         Ok(checked)
     }
 }

@@ -1,4 +1,4 @@
-//! Which exchange has the line next (docs/wire/modbus-rtu.md section 5).
+//! Which exchange has a line next (docs/wire/modbus-rtu.md section 5).
 //!
 //! In: when exchanges are wanted, and how they ended. Out: the next one, or when to look again.
 //! Does not know frames: one line, one exchange at a time, peers that may be silent.
@@ -11,10 +11,7 @@
 //! peer's wait, it is asked nevertheless. The wait grows to [`LONGEST_WAIT`] timeouts, so a peer
 //! that never answers takes at most 1 part in 65 of the line.
 
-use heapless::Vec;
-
-use super::exchange::{MAX_SLAVES, When};
-use crate::schedule::Grid;
+use super::Grid;
 use crate::time::{Duration, Instant};
 
 /// Requested exchanges in a row while a period is due.
@@ -39,20 +36,29 @@ pub enum Presence {
     Down,
 }
 
-/// Rows of exchanges and the peers that they are with.
-#[derive(Debug, Clone)]
-pub(super) struct Schedule<const N: usize> {
-    rows: Vec<Row, N>,
-    peers: Vec<Peer, PEERS>,
-    /// Requested exchanges since the last other one.
-    run: u8,
+impl Presence {
+    /// Its name in statistics: `unknown`, `up` or `down`.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Unknown => "unknown",
+            Self::Up => "up",
+            Self::Down => "down",
+        }
+    }
 }
 
-/// All slaves and the broadcast.
-const PEERS: usize = MAX_SLAVES + 1;
+/// The exchanges of one line, and the peers that they are with.
+#[derive(Debug)]
+pub(crate) struct Turns<'a, P> {
+    pub rows: &'a mut [Row],
+    pub peers: &'a mut [P],
+    /// Requested exchanges since the last other one.
+    pub run: &'a mut u8,
+}
 
+/// One exchange.
 #[derive(Debug, Clone)]
-struct Row {
+pub(crate) struct Row {
     peer: u8,
     grid: Option<Grid>,
     start: bool,
@@ -64,8 +70,9 @@ struct Row {
     timeout: Duration,
 }
 
+/// One that answers, or does not.
 #[derive(Debug, Clone)]
-struct Peer {
+pub(crate) struct Peer {
     presence: Presence,
     /// Not asked before.
     not_before: Instant,
@@ -75,67 +82,77 @@ struct Peer {
     missed: u32,
 }
 
-/// How a row was taken, which [`Schedule::failed`] wants to know.
+/// How a row was taken, which [`Turns::failed`] wants to know.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Taken {
+pub(crate) struct Taken {
     requested: Option<Instant>,
 }
 
-impl<const N: usize> Schedule<N> {
-    pub(super) const fn new() -> Self {
-        Self { rows: Vec::new(), peers: Vec::new(), run: 0 }
+impl Peer {
+    /// Nothing is known of it.
+    pub(crate) const NEW: Self = Self {
+        presence: Presence::Unknown,
+        not_before: Instant::ZERO,
+        wait: Duration::ZERO,
+        failures: 0,
+        missed: 0,
+    };
+
+    /// It may be another one.
+    pub(crate) fn forget(&mut self) {
+        *self = Self { missed: self.missed, ..Self::NEW };
     }
 
-    /// A further peer; `None` if there is no room.
-    pub(super) fn add_peer(&mut self) -> Option<u8> {
-        let peer = Peer {
-            presence: Presence::Unknown,
-            not_before: Instant::ZERO,
-            wait: Duration::ZERO,
-            failures: 0,
-            missed: 0,
-        };
-        self.peers.push(peer).ok()?;
-        Some(self.peers.len().saturating_sub(1) as u8)
+    pub(crate) const fn presence(&self) -> Presence {
+        self.presence
     }
 
-    /// A further row; false if there is no room.
-    pub(super) fn add_row(
-        &mut self,
+    /// Its periods that went by while it was not down.
+    pub(crate) const fn missed(&self) -> u32 {
+        self.missed
+    }
+}
+
+impl Row {
+    /// An exchange with a peer, each `every` and at the start if it says so, that takes the line for
+    /// `cost` if no answer comes.
+    pub(crate) fn new(
         peer: u8,
-        when: When,
-        cost: Duration,
-        timeout: Duration,
+        (every, start): (Option<Duration>, bool),
+        (cost, timeout): (Duration, Duration),
         now: Instant,
-    ) -> bool {
-        let grid = when.every.map(|period| Grid::starting_at(now, period));
-        let requested = when.start.then_some(now);
-        let row = Row { peer, grid, start: when.start, requested, taken: Instant::ZERO, cost, timeout };
-        self.rows.push(row).is_ok()
+    ) -> Self {
+        let grid = every.map(|period| Grid::starting_at(now, period));
+        Self { peer, grid, start, requested: start.then_some(now), taken: Instant::ZERO, cost, timeout }
     }
 
-    pub(super) fn presence(&self, peer: u8) -> Presence {
-        self.peers.get(usize::from(peer)).map_or(Presence::Unknown, |peer| peer.presence)
+    pub(crate) const fn peer(&self) -> u8 {
+        self.peer
     }
 
-    /// Periods of a peer that went by while it was not down.
-    pub(super) fn missed(&self, peer: u8) -> u32 {
-        self.peers.get(usize::from(peer)).map_or(0, |peer| peer.missed)
+    /// The line begins anew: what is asked at the start is asked again, and periods begin now.
+    pub(crate) fn restart(&mut self, now: Instant) {
+        self.requested = self.start.then_some(now);
+        if let Some(grid) = &mut self.grid {
+            *grid = Grid::starting_at(now, grid.period());
+        }
     }
+}
 
+impl<P: AsRef<Peer> + AsMut<Peer>> Turns<'_, P> {
     /// Wants a row as soon as possible; false if there is no such row.
-    pub(super) fn request(&mut self, row: usize, now: Instant) -> bool {
+    pub(crate) fn request(&mut self, row: usize, now: Instant) -> bool {
         let Some(row) = self.rows.get_mut(row) else { return false };
         row.requested.get_or_insert(now);
         true
     }
 
     /// The row to take now, or when to look again.
-    pub(super) fn choose(&mut self, now: Instant) -> Result<usize, Instant> {
+    pub(crate) fn choose(&mut self, now: Instant) -> Result<usize, Instant> {
         let (mut requested, mut due, mut probe) = (First::NONE, First::NONE, First::NONE);
         let (mut look_again, mut next_due) = (Instant::NEVER, Instant::NEVER);
         for (nth, row) in self.rows.iter().enumerate() {
-            let Some(peer) = self.peers.get(usize::from(row.peer)) else { continue };
+            let Some(peer) = self.peers.get(usize::from(row.peer)).map(AsRef::as_ref) else { continue };
             let wanted = row.wanted();
             let at = wanted.max(peer.not_before);
             match peer.presence {
@@ -152,18 +169,18 @@ impl<const N: usize> Schedule<N> {
         }
         let probe = probe.nth.and_then(|nth| {
             let row = self.rows.get(nth)?;
-            let wait = self.peers.get(usize::from(row.peer))?.wait;
+            let wait = self.peers.get(usize::from(row.peer))?.as_ref().wait;
             Some((nth, probe.key.0 + wait, now + row.cost <= next_due))
         });
         let overdue = probe.filter(|(_, nevertheless, _)| *nevertheless <= now).map(|(nth, ..)| nth);
         let periodic = overdue.or(due.nth);
         if let Some(nth) = requested.nth
-            && (self.run < REQUESTED_RUN || periodic.is_none())
+            && (*self.run < REQUESTED_RUN || periodic.is_none())
         {
-            self.run = self.run.saturating_add(1);
+            *self.run = self.run.saturating_add(1);
             return Ok(nth);
         }
-        self.run = 0;
+        *self.run = 0;
         match (periodic, probe) {
             (Some(nth), _) | (None, Some((nth, _, true))) => Ok(nth),
             (None, Some((_, nevertheless, false))) => Err(look_again.min(nevertheless)),
@@ -172,10 +189,10 @@ impl<const N: usize> Schedule<N> {
     }
 
     /// The row is taken: its request is being sent, or there is nothing to send.
-    pub(super) fn take(&mut self, nth: usize, now: Instant) -> Taken {
+    pub(crate) fn take(&mut self, nth: usize, now: Instant) -> Taken {
         let Some(row) = self.rows.get_mut(nth) else { return Taken { requested: None } };
         let missed = row.grid.as_mut().and_then(|grid| grid.due(now)).unwrap_or(0);
-        if let Some(peer) = self.peers.get_mut(usize::from(row.peer))
+        if let Some(peer) = self.peers.get_mut(usize::from(row.peer)).map(AsMut::as_mut)
             && peer.presence != Presence::Down
         {
             let missed = u32::try_from(missed).unwrap_or(u32::MAX);
@@ -187,9 +204,9 @@ impl<const N: usize> Schedule<N> {
 
     /// The peer has answered; what it says to the request does not matter. It is asked nothing
     /// else before `not_before`.
-    pub(super) fn answered(&mut self, nth: usize, now: Instant, not_before: Instant) {
+    pub(crate) fn answered(&mut self, nth: usize, now: Instant, not_before: Instant) {
         let Some(which) = self.rows.get(nth).map(|row| row.peer) else { return };
-        let Some(peer) = self.peers.get_mut(usize::from(which)) else { return };
+        let Some(peer) = self.peers.get_mut(usize::from(which)).map(AsMut::as_mut) else { return };
         let was_down = peer.presence == Presence::Down;
         peer.presence = Presence::Up;
         peer.failures = 0;
@@ -209,11 +226,11 @@ impl<const N: usize> Schedule<N> {
     }
 
     /// The peer has not answered, the last time to a request whose sending ended at `sent`.
-    pub(super) fn failed(&mut self, nth: usize, taken: Taken, now: Instant, sent: Instant) {
+    pub(crate) fn failed(&mut self, nth: usize, taken: Taken, now: Instant, sent: Instant) {
         let Some(row) = self.rows.get_mut(nth) else { return };
         row.requested = row.requested.or(taken.requested);
         let timeout = row.timeout;
-        let Some(peer) = self.peers.get_mut(usize::from(row.peer)) else { return };
+        let Some(peer) = self.peers.get_mut(usize::from(row.peer)).map(AsMut::as_mut) else { return };
         let exponent = peer.failures.saturating_add(FIRST_WAIT).min(LONGEST_WAIT);
         peer.failures = peer.failures.saturating_add(1);
         let longest = WAIT_LIMIT.max(timeout.saturating_mul(2));
@@ -233,6 +250,25 @@ impl Row {
     /// When the period that is due, or the next one, is missed.
     fn end_of_period(&self) -> Instant {
         self.grid.as_ref().map_or(Instant::NEVER, |grid| grid.next() + grid.period())
+    }
+}
+
+impl Taken {
+    /// Whether something wanted it beside its period.
+    pub(crate) const fn was_requested(&self) -> bool {
+        self.requested.is_some()
+    }
+}
+
+impl AsRef<Peer> for Peer {
+    fn as_ref(&self) -> &Peer {
+        self
+    }
+}
+
+impl AsMut<Peer> for Peer {
+    fn as_mut(&mut self) -> &mut Peer {
+        self
     }
 }
 

@@ -3,6 +3,11 @@
 //! In: the present instant. Out: whether the period is due, and how many whole periods went by
 //! unserved. Refuses to know what is done each period.
 
+mod turns;
+
+pub use turns::Presence;
+pub(crate) use turns::{Peer, Row, Taken, Turns};
+
 use crate::time::{Duration, Instant};
 
 /// A period with an absolute grid: the n-th deadline is `start + n * period`, however late each

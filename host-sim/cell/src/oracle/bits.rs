@@ -1,0 +1,257 @@
+//! Bits with owners (proto-core/docs/engine.md section 5): the bits that one input frame writes in one byte
+//! wait together, and are written by Modbus as coils.
+//!
+//! Bytes that a recipe link carries or that an output part shows have no model: [`unmodelled`].
+
+use std::collections::VecDeque;
+
+use proto_core::config::GatewayConfig;
+use proto_core::engine::LinkId;
+use proto_core::sysvar::SysVar;
+use proto_core::time::{Duration, Instant};
+
+use super::Invariant;
+use super::field::Accepted;
+use super::spec::{Frame, LinkSpec, PortSpec, Spec};
+use super::upward::{Carried, EDGES, Upward, Wrong};
+
+/// The bits that one input frame writes in one byte.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Share {
+    pub port: usize,
+    pub frame: usize,
+    pub var: SysVar,
+    pub mask: u8,
+    pub safe: Option<u8>,
+}
+
+/// Bits of one byte.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Coils {
+    pub var: SysVar,
+    pub mask: u8,
+    pub on: u8,
+}
+
+/// The state of one share.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Waits {
+    /// Values to be written, the next one first, each with the time of its frame.
+    waiting: VecDeque<(u8, Instant)>,
+    /// The bits of the next one that were not written yet.
+    left: u8,
+    pub accepted: Option<Instant>,
+    /// It has its safe value, and since when.
+    safe: bool,
+    safe_at: Instant,
+}
+
+/// The shares of all field ports, in the order of their first fields.
+pub(super) fn shares(config: &GatewayConfig, ports: &[PortSpec]) -> Vec<Share> {
+    let mut shares: Vec<Share> = Vec::new();
+    for (port, spec) in ports.iter().enumerate().filter(|(_, port)| port.is_field) {
+        for (frame, part) in spec.inputs.iter().enumerate() {
+            for bit in part.fields.iter().filter_map(|field| field.bit()) {
+                let own = 1 << bit.bit;
+                let is_it =
+                    |share: &&mut Share| (share.port, share.frame, share.var) == (port, frame, bit.var);
+                match shares.iter_mut().find(is_it) {
+                    Some(share) => share.mask |= own,
+                    None => shares.push(Share { port, frame, var: bit.var, mask: own, safe: None }),
+                }
+            }
+        }
+        let safe = config.ports[port].on_timeout.of(&config.safe_values);
+        for share in shares.iter_mut().filter(|share| share.port == port) {
+            let of = |safe: &&proto_core::config::SafeValue| !safe.is_whole() && safe.var == share.var;
+            let values = safe.iter().filter(of).map(|safe| (safe.mask, safe.value.as_f64() as u8));
+            let (mask, on) = values.fold((0, 0), |all, one| (all.0 | one.0, all.1 | one.1));
+            share.safe = (mask & share.mask == share.mask).then_some(on & share.mask);
+        }
+    }
+    shares
+}
+
+/// Why the bits of a configuration cannot be judged, if they cannot.
+pub(super) fn unmodelled(config: &GatewayConfig) -> Option<&'static str> {
+    let spec = Spec::new(config);
+    let carries = |link: &LinkSpec, var| link.input.as_ref().is_some_and(|up: &Frame| up.has(var));
+    let is_odd = |share: &Share| {
+        let safe = config.ports[share.port].on_timeout.of(&config.safe_values);
+        let some_are_safe = safe.iter().any(|safe| safe.var == share.var && safe.mask & share.mask != 0);
+        spec.links.iter().any(|link| carries(link, share.var))
+            || spec.origin[share.var.ordinal()].is_some()
+            || some_are_safe && share.safe.is_none()
+    };
+    spec.shares.iter().any(is_odd).then_some(
+        "a soak cannot judge bits with owners in a byte that a recipe link carries or an output part shows, \
+         nor safe values for only some of a frame's bits",
+    )
+}
+
+impl Upward {
+    /// Applies the bits of a frame; returns whether their link is down.
+    pub(super) fn bits_accepted(&mut self, spec: &Spec, nth: usize, frame: &Accepted, now: Instant) -> bool {
+        let is_up = self.is_up(LinkId::MODBUS);
+        let mut undelivered = false;
+        for (place, share) in spec.shares.iter().enumerate() {
+            if (share.port, share.frame) != (nth, frame.frame) {
+                continue;
+            }
+            let own = frame.bits.iter().filter(|coils| coils.var == share.var);
+            let value = own.fold(0, |all, coils| all | coils.on);
+            let queued = self.queued(spec, nth);
+            let state = &mut self.shares[place];
+            state.accepted = Some(now);
+            if std::mem::take(&mut state.safe) {
+                self.next_expiry = now;
+            }
+            if !is_up {
+                undelivered = true;
+                state.waiting.clear();
+                continue;
+            }
+            match state.waiting.back_mut() {
+                Some(newest) if newest.0 == value => newest.1 = now,
+                Some(newest) if queued >= EDGES => {
+                    *newest = (value, now);
+                    self.counted[nth].edges_lost += 1;
+                }
+                _ => state.waiting.push_back((value, now)),
+            }
+            if state.waiting.len() == 1 {
+                state.left = share.mask;
+            }
+        }
+        undelivered
+    }
+
+    /// A frame is overdue: its bits take their safe values, or hold.
+    pub(super) fn bits_silent(&mut self, spec: &Spec, nth: usize, frame: usize, now: Instant) {
+        for (state, share) in self.shares.iter_mut().zip(&spec.shares) {
+            if (share.port, share.frame) != (nth, frame) {
+                continue;
+            }
+            let waited = state.waiting.len() as u32;
+            state.waiting.clear();
+            match share.safe {
+                Some(safe) => {
+                    state.waiting.push_back((safe, now));
+                    (state.left, state.safe, state.safe_at) = (share.mask, true, now);
+                }
+                None => self.counted[nth].values_expired += waited,
+            }
+        }
+    }
+
+    /// Drops values of a port that waited too long.
+    pub(super) fn expire_bits(&mut self, spec: &Spec, nth: usize, timeout: Duration, now: Instant) {
+        for (state, share) in self.shares.iter_mut().zip(&spec.shares) {
+            if share.port != nth || state.safe {
+                continue;
+            }
+            let (before, next) = (state.waiting.len(), state.waiting.front().copied());
+            state.waiting.retain(|(_, at)| now.saturating_since(*at) <= timeout);
+            self.counted[nth].values_expired += (before - state.waiting.len()) as u32;
+            if state.waiting.front().copied() != next {
+                state.left = share.mask;
+            }
+            for (_, at) in &state.waiting {
+                self.next_expiry = self.next_expiry.min(*at + timeout + Duration::from_micros(1));
+            }
+        }
+    }
+
+    /// Modbus was lost: waiting values are dropped, except safe values.
+    pub(super) fn bits_lost(&mut self, spec: &Spec) {
+        for (state, share) in self.shares.iter_mut().zip(&spec.shares).filter(|(state, _)| !state.safe) {
+            self.counted[share.port].values_expired += state.waiting.len() as u32;
+            state.waiting.clear();
+        }
+    }
+
+    /// Queues safe bits again, if they are still current: each a share and its bits.
+    pub(super) fn bits_again(&mut self, spec: &Spec, bits: impl IntoIterator<Item = (usize, u8)>) {
+        for (place, mask) in bits {
+            let state = &mut self.shares[place];
+            let (true, Some(safe)) = (state.safe, spec.shares[place].safe) else { continue };
+            if state.waiting.is_empty() {
+                state.waiting.push_back((safe, state.safe_at));
+                state.left = 0;
+            }
+            state.left |= mask;
+        }
+    }
+
+    /// Queues all safe bits again.
+    pub(super) fn all_bits_again(&mut self, spec: &Spec) {
+        let all: Vec<_> = spec.shares.iter().enumerate().map(|(place, share)| (place, share.mask)).collect();
+        self.bits_again(spec, all);
+    }
+
+    /// Checks a write of coils and takes their values from the queues; returns the origin of each share's part,
+    /// and the safe bits among them.
+    #[allow(clippy::type_complexity, reason = "two lists that belong together")]
+    pub(super) fn wrote_bits(
+        &mut self,
+        spec: &Spec,
+        coils: Coils,
+        now: Instant,
+    ) -> Result<(Vec<Carried>, Vec<(usize, u8)>), Wrong> {
+        let Coils { var, mask, on } = coils;
+        let (mut carried, mut safe, mut owned) = (Vec::new(), Vec::new(), 0);
+        let what = |what: &str| format!("bits {mask:#010b} of {var} were written as {on:#010b}: {what}");
+        for (state, (place, share)) in self.shares.iter_mut().zip(spec.shares.iter().enumerate()) {
+            let own = share.mask & mask;
+            if share.var != var || own == 0 {
+                continue;
+            }
+            owned |= own;
+            if state.accepted.is_none() {
+                return Err((Invariant::FirstFrame, what("no frame had them yet")));
+            }
+            let Some(&(next, at)) = state.waiting.front() else {
+                return Err((Invariant::Sent, what("nothing of that port waited")));
+            };
+            if own & !state.left != 0 {
+                return Err((Invariant::Sent, what("some had been written")));
+            }
+            if on & own != next & own {
+                let later = state.waiting.iter().any(|(value, _)| value & own == on & own);
+                let invariant = if later { Invariant::Edges } else { Invariant::Sent };
+                return Err((invariant, what("other values were next")));
+            }
+            let timeout = spec.ports[share.port].timeout;
+            if !state.safe && now.saturating_since(at) > timeout {
+                return Err((Invariant::InTime, what("they had waited for longer than their timeout")));
+            }
+            if state.safe {
+                safe.push((place, own));
+                carried.push(Carried::Safe);
+            } else {
+                carried.push(Carried::Of { arrived: at, timeout });
+            }
+            state.left &= !own;
+            if state.left == 0 {
+                state.waiting.pop_front();
+                state.left = share.mask;
+            }
+        }
+        if owned != mask {
+            return Err((Invariant::Ownership, what("no port drives some of them")));
+        }
+        Ok((carried, safe))
+    }
+
+    /// Number of the port's values of bits that wait behind others.
+    pub(super) fn queued_bits(&self, spec: &Spec, nth: usize) -> usize {
+        let own = self.shares.iter().zip(&spec.shares).filter(|(_, share)| share.port == nth);
+        own.map(|(state, _)| state.waiting.len().saturating_sub(1)).sum()
+    }
+
+    /// A byte with bits that wait.
+    pub(super) fn waiting_bits(&self, spec: &Spec) -> Option<SysVar> {
+        let mut shares = self.shares.iter().zip(&spec.shares);
+        shares.find(|(state, _)| !state.waiting.is_empty()).map(|(_, share)| share.var)
+    }
+}

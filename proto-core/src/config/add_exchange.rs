@@ -1,0 +1,301 @@
+//! Exchanges are added to a configuration with their recipe.
+//!
+//! In: what a program wrote ([`Ask`]). Out: entries of the configuration's lists. Coils are packed into
+//! bytes, and registers and coils counted. Room was checked when the recipe was begun.
+
+use super::ask::{Ask, AskFrame, AskTalk, of_block};
+use super::error::{ConfigError, ConfigErrorKind as Kind, ExchangeKey, Place};
+use super::exchange::{Exchange, FrameSpec, Talk};
+use super::fields::Fields;
+use super::view::ConfigMut;
+use super::{AskWhen, Delimiter, ExchangeError, FieldSpec, Span};
+use crate::device::{Bits, ByteOrder, Encoding, Kind as EncodingKind, Overflow};
+use crate::modbus::rtu::{Operation, Table};
+use crate::recipe::model::MAX_DELIMITER;
+use crate::sysvar::Direction;
+
+/// The numbers of the next frames: of the input part, and of the output part.
+#[derive(Clone, Copy)]
+pub(super) struct FrameNumbers {
+    pub(super) input: u8,
+    pub(super) output: u8,
+}
+
+impl FrameNumbers {
+    fn next(&mut self, part: Direction) -> u8 {
+        let number = match part {
+            Direction::Input => &mut self.input,
+            Direction::Output => &mut self.output,
+        };
+        let next = number.saturating_add(1);
+        core::mem::replace(number, next)
+    }
+}
+
+impl ConfigMut<'_> {
+    /// Adds the exchanges of a recipe; `frames` counts the frames of its parts.
+    pub(super) fn add_exchanges(
+        &mut self,
+        recipe: u8,
+        asks: &[Ask<'_>],
+        mut frames: FrameNumbers,
+    ) -> Result<Span, ConfigError> {
+        let start = self.exchanges.len();
+        for (nth, ask) in asks.iter().enumerate() {
+            let at = |key| Place::Exchange { recipe, exchange: nth as u8, key };
+            let talk = self.talk(recipe, ask, &at, &mut frames)?;
+            let mut when = AskWhen { rising: None, ..ask.when };
+            if let Some((var, bit)) = ask.rising {
+                let place = at(ExchangeKey::Rising);
+                let var = var.read().map_err(|error| ConfigError { place, kind: Kind::Variable(error) })?;
+                when.rising = Some((var, bit));
+            }
+            let Ask { peer, timeout, retries, pause, .. } = *ask;
+            let _ = self.exchanges.push(Exchange { peer, talk, when, timeout, retries, pause });
+        }
+        Ok(super::add::span(start, self.exchanges.len()))
+    }
+
+    fn talk(
+        &mut self,
+        recipe: u8,
+        ask: &Ask<'_>,
+        at: &impl Fn(ExchangeKey) -> Place,
+        frames: &mut FrameNumbers,
+    ) -> Result<Talk, ConfigError> {
+        let refused = |kind| ConfigError { place: at(ExchangeKey::Registers), kind };
+        match &ask.talk {
+            AskTalk::Rtu { operation, written, read } => {
+                let is_of_coils = matches!(operation.place().0, Table::Coils | Table::DiscreteInputs);
+                let mut add = |fields: &Option<Fields<'_>>, part: Direction| match fields {
+                    Some(fields) => {
+                        let at = (recipe, part, frames.next(part));
+                        self.data(at, fields, is_of_coils).map_err(|error| error.placed(refused))
+                    }
+                    None => Ok((Span::default(), 0)),
+                };
+                let (written, write_count) = add(written, Direction::Output)?;
+                let (read, read_count) = add(read, Direction::Input)?;
+                Ok(Talk::Rtu { operation: with_counts(*operation, read_count, write_count), written, read })
+            }
+            &AskTalk::Served { table, address, fields } => {
+                let part = match fields {
+                    Fields::Inputs(_) => Direction::Input,
+                    Fields::Outputs(_) => Direction::Output,
+                    Fields::Specs(specs) if specs.iter().any(FieldSpec::is_input) => Direction::Input,
+                    _ => Direction::Output,
+                };
+                let is_of_coils = matches!(table, Table::Coils | Table::DiscreteInputs);
+                let at = (recipe, part, frames.next(part));
+                let (span, count) =
+                    self.data(at, &fields, is_of_coils).map_err(|error| error.placed(refused))?;
+                let operation = with_counts(of_block(table, address, part), count, count);
+                let none = Span::default();
+                let (written, read) = if part == Direction::Input { (span, none) } else { (none, span) };
+                Ok(Talk::Served { operation, written, read })
+            }
+            AskTalk::Frames { request, reply, refusal } => {
+                let mut add = |frame: &Option<AskFrame<'_>>, part: Direction, key, number: u8| match frame {
+                    Some(frame) => self.add_frame((recipe, part, number), frame, at(key)).map(Some),
+                    None => Ok(None),
+                };
+                let mut number = |frame: &Option<AskFrame<'_>>, part| {
+                    if frame.is_some() { frames.next(part) } else { 0 }
+                };
+                let sent = number(request, Direction::Output);
+                let received = number(reply, Direction::Input);
+                Ok(Talk::Frames {
+                    request: add(request, Direction::Output, ExchangeKey::Request, sent)?,
+                    reply: add(reply, Direction::Input, ExchangeKey::Reply, received)?,
+                    refusal: add(refusal, Direction::Input, ExchangeKey::Refusal, u8::MAX)?,
+                })
+            }
+        }
+    }
+
+    fn add_frame(
+        &mut self,
+        (recipe, part, number): (u8, Direction, u8),
+        from: &AskFrame<'_>,
+        place: Place,
+    ) -> Result<u8, ConfigError> {
+        let bytes = |bytes: &[u8]| {
+            let kind = Kind::TooLong { len: bytes.len(), longest: MAX_DELIMITER };
+            Delimiter::from_slice(bytes).map_err(|_| ConfigError { place, kind })
+        };
+        let (head, tail) = (bytes(from.head)?, bytes(from.tail)?);
+        let fields = self.fields_of_part(recipe, part, number, &from.fields)?;
+        let index = self.frames.len() as u8;
+        let _ = self.frames.push(FrameSpec { id: from.id, remote: from.remote, head, tail, fields });
+        Ok(index)
+    }
+
+    /// Adds the fields of registers or coils, and counts these.
+    fn data(
+        &mut self,
+        (recipe, part, number): (u8, Direction, u8),
+        from: &Fields<'_>,
+        is_of_coils: bool,
+    ) -> Result<(Span, u16), Refused> {
+        let span = self.fields_of_part(recipe, part, number, from).map_err(Refused::Placed)?;
+        let start = usize::from(span.start);
+        if matches!(from, Fields::Specs(_)) && is_of_coils {
+            // As in the configuration: packed already.
+            let fields = self.fields.get(start..).unwrap_or(&[]);
+            return Ok((span, bits_of(fields)));
+        }
+        if is_of_coils {
+            let (len, count) = pack(self.fields.get_mut(start..).unwrap_or(&mut []))?;
+            self.fields.truncate(start.saturating_add(len));
+            return Ok((Span { len: len as u16, ..span }, count));
+        }
+        let fields = self.fields.get_mut(start..).unwrap_or(&mut []);
+        if !matches!(from, Fields::Specs(_)) {
+            fields.iter_mut().for_each(into_register);
+        }
+        // Fields of varying length are refused by the check.
+        let bytes = fields.iter().map(FieldSpec::longest).fold(0, usize::saturating_add);
+        Ok((span, (bytes / 2) as u16))
+    }
+}
+
+/// A mistake, with or without its place.
+enum Refused {
+    Placed(ConfigError),
+    Kind(Kind),
+}
+
+impl Refused {
+    fn placed(self, at: impl FnOnce(Kind) -> ConfigError) -> ConfigError {
+        match self {
+            Self::Placed(error) => error,
+            Self::Kind(kind) => at(kind),
+        }
+    }
+}
+
+fn with_counts(operation: Operation, read: u16, written: u16) -> Operation {
+    match operation {
+        Operation::ReadCoils { address, .. } => Operation::ReadCoils { address, count: read },
+        Operation::ReadDiscreteInputs { address, .. } => {
+            Operation::ReadDiscreteInputs { address, count: read }
+        }
+        Operation::ReadHoldingRegisters { address, .. } => {
+            Operation::ReadHoldingRegisters { address, count: read }
+        }
+        Operation::ReadInputRegisters { address, .. } => {
+            Operation::ReadInputRegisters { address, count: read }
+        }
+        Operation::WriteCoils { address, .. } => Operation::WriteCoils { address, count: written },
+        Operation::WriteRegisters { address, .. } => Operation::WriteRegisters { address, count: written },
+        Operation::ReadWriteRegisters { read_address, write_address, .. } => Operation::ReadWriteRegisters {
+            read_address,
+            read_count: read,
+            write_address,
+            write_count: written,
+        },
+        Operation::WriteCoil { .. } | Operation::WriteRegister { .. } => operation,
+    }
+}
+
+/// The usual order becomes that of registers.
+fn into_register(field: &mut FieldSpec) {
+    let big = |encoding: Encoding| {
+        let is_number = !matches!(encoding.kind, EncodingKind::Decimal(_) | EncodingKind::Hex(_));
+        let is_usual = encoding.order == ByteOrder::Little && encoding.size().is_some_and(|size| size > 1);
+        if is_number && is_usual { encoding.big_endian() } else { encoding }
+    };
+    *field = match *field {
+        FieldSpec::UserInput { ty, to } if ty.size() > 1 => {
+            let encoding = Encoding::scalar(ty).big_endian();
+            FieldSpec::DeviceInput { encoding, overflow: Overflow::Usual, to }
+        }
+        FieldSpec::UserOutput { ty, from } if ty.size() > 1 => {
+            let encoding = Encoding::scalar(ty).big_endian();
+            FieldSpec::DeviceOutput { encoding, overflow: Overflow::Usual, from }
+        }
+        FieldSpec::DeviceInput { encoding, overflow, to } => {
+            FieldSpec::DeviceInput { encoding: big(encoding), overflow, to }
+        }
+        FieldSpec::DeviceOutput { encoding, overflow, from } => {
+            FieldSpec::DeviceOutput { encoding: big(encoding), overflow, from }
+        }
+        FieldSpec::Fixed { encoding, value } => FieldSpec::Fixed { encoding: big(encoding), value },
+        other => other,
+    };
+}
+
+/// The coils of packed fields: up to the last bit of the last byte that has a field, or all of it.
+fn bits_of(fields: &[FieldSpec]) -> u16 {
+    let bytes = fields.iter().map(FieldSpec::longest).fold(0, usize::saturating_add);
+    let all = bytes.saturating_mul(8);
+    let highest = fields.iter().rev().map_while(bit_of).max();
+    let last = highest.map_or(0, |highest| 7_usize.saturating_sub(usize::from(highest)));
+    all.saturating_sub(last) as u16
+}
+
+/// The bit of a byte that a field is.
+fn bit_of(field: &FieldSpec) -> Option<u8> {
+    match field.element()?.encoding()?.kind {
+        EncodingKind::Bits(Bits { bytes: 1, first, count: 1, .. }) => Some(first),
+        _ => None,
+    }
+}
+
+/// Packs coils, the first in the lowest bit; returns the number of fields that are left, and of coils.
+fn pack(fields: &mut [FieldSpec]) -> Result<(usize, u16), Refused> {
+    let (mut kept, mut count, mut bytes) = (0_usize, 0_usize, 0_usize);
+    for nth in 0..fields.len() {
+        let Some(&field) = fields.get(nth) else { break };
+        if let FieldSpec::Padding { len, .. } = field {
+            count = count.saturating_add(usize::from(len));
+            continue;
+        }
+        let (byte, first) = (count / 8, (count % 8) as u8);
+        put_padding(fields, &mut kept, &mut bytes, byte);
+        let shared = bytes > byte;
+        let packed =
+            as_coil(field, first, shared).ok_or(Refused::Kind(Kind::Exchange(ExchangeError::NotCoils)))?;
+        // No more fields than there were: each one, or each padding, leaves at most one.
+        put(fields, &mut kept, packed);
+        (bytes, count) = (byte.saturating_add(1), count.saturating_add(1));
+    }
+    put_padding(fields, &mut kept, &mut bytes, count.div_ceil(8));
+    Ok((kept, u16::try_from(count).unwrap_or(u16::MAX)))
+}
+
+fn put(fields: &mut [FieldSpec], kept: &mut usize, field: FieldSpec) {
+    if let Some(place) = fields.get_mut(*kept) {
+        *place = field;
+        *kept = kept.saturating_add(1);
+    }
+}
+
+/// Fills bytes in which all coils are skipped; at most 255, which a check of the count refuses.
+fn put_padding(fields: &mut [FieldSpec], kept: &mut usize, bytes: &mut usize, up_to: usize) {
+    let missing = up_to.saturating_sub(*bytes);
+    if missing > 0 {
+        let len = u8::try_from(missing).unwrap_or(u8::MAX);
+        put(fields, kept, FieldSpec::Padding { len, fill: 0 });
+        *bytes = up_to;
+    }
+}
+
+fn as_coil(field: FieldSpec, first: u8, shared: bool) -> Option<FieldSpec> {
+    let coil = |encoding: Encoding| {
+        let bits = Bits { bytes: 1, first: 0, count: 1, signed: false };
+        let is_coil = encoding.kind == EncodingKind::Bits(bits);
+        let kind = EncodingKind::Bits(Bits { first, ..bits });
+        is_coil.then_some(Encoding { kind, order: ByteOrder::Little, shared })
+    };
+    Some(match field {
+        FieldSpec::DeviceInput { encoding, overflow, to } => {
+            FieldSpec::DeviceInput { encoding: coil(encoding)?, overflow, to }
+        }
+        FieldSpec::DeviceOutput { encoding, overflow, from } => {
+            FieldSpec::DeviceOutput { encoding: coil(encoding)?, overflow, from }
+        }
+        FieldSpec::Fixed { encoding, value } => FieldSpec::Fixed { encoding: coil(encoding)?, value },
+        _ => return None,
+    })
+}

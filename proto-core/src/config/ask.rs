@@ -1,0 +1,293 @@
+//! Exchanges as a program writes them.
+//!
+//! In: addresses, numbers and slices of the caller. Out: the same, borrowed and small; every default
+//! is that of the file (docs/configuration.md). [`Recipe::user`](super::Recipe::user) takes them with
+//! [`RecipeBuilder::exchanges`](super::RecipeBuilder::exchanges).
+
+use super::exchange::{AskWhen, DEFAULT_REPLY_TIMEOUT};
+use super::fields::{Fields, InputField, OutputField, Var};
+use crate::device::Encoding;
+use crate::modbus::rtu::{Operation, Table};
+use crate::sysvar::Direction;
+use crate::time::Duration;
+use crate::wire::can::CanId;
+use crate::wire::scalar::ScalarType;
+
+/// An exchange of a recipe, or a block of a slave, under construction.
+///
+/// The numbers of registers and coils follow from the fields. In registers the fields are big-endian,
+/// unless their encoding has another order than the usual little-endian one. The fields of coils have
+/// the type [`Coil`], and padding skips so many coils.
+///
+/// ```
+/// use proto_core::config::{Ask, Coil, GatewayConfig, InputField, OutputField, Port, Recipe};
+/// use proto_core::time::Duration;
+/// use proto_core::wire::scalar::ScalarType::Word;
+///
+/// let config: GatewayConfig<1, 1, 4, 0, 0, 2> = GatewayConfig::builder()
+///     .controller("192.168.12.138")
+///     .recipe(Recipe::user("line").exchanges(&[
+///         // Slave 9: two registers from 0x07D0, every 100 ms.
+///         Ask::read_input_registers(
+///             9,
+///             0x07D0,
+///             &[InputField::variable(Word, "WordInputReg[1]"), InputField::padding(2)],
+///         )
+///         .every(Duration::from_millis(100)),
+///         // Slave 5: two coils from 8, when one of them changes.
+///         Ask::write_coils(
+///             5,
+///             8,
+///             &[
+///                 OutputField::variable(Coil, "WordOutputReg[1]"),
+///                 OutputField::variable(Coil, "WordOutputReg[2]"),
+///             ],
+///         )
+///         .on_change(),
+///     ]))
+///     .port(Port::modbus_rtu("line", "line").baud(19_200).timeout(Duration::from_secs(1)))
+///     .build()?;
+/// assert_eq!(config.exchanges.len(), 2);
+/// # Ok::<(), proto_core::config::ConfigError>(())
+/// ```
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Ask<'a> {
+    pub(super) peer: u8,
+    pub(super) talk: AskTalk<'a>,
+    pub(super) when: AskWhen,
+    pub(super) rising: Option<(Var<'a>, u8)>,
+    pub(super) timeout: Duration,
+    pub(super) retries: u8,
+    pub(super) pause: Duration,
+}
+
+/// Operations have counts of 0 here.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum AskTalk<'a> {
+    Rtu { operation: Operation, written: Option<Fields<'a>>, read: Option<Fields<'a>> },
+    Served { table: Table, address: u16, fields: Fields<'a> },
+    Frames { request: Option<AskFrame<'a>>, reply: Option<AskFrame<'a>>, refusal: Option<AskFrame<'a>> },
+}
+
+/// A frame of an exchange.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct AskFrame<'a> {
+    pub(super) id: Option<CanId>,
+    pub(super) remote: bool,
+    pub(super) head: &'a [u8],
+    pub(super) tail: &'a [u8],
+    pub(super) fields: Fields<'a>,
+}
+
+impl<'a> AskFrame<'a> {
+    /// A frame on a line: head, tail, at most 8 bytes each, and the fields.
+    pub fn stream(head: &'a [u8], tail: &'a [u8], fields: impl Into<Fields<'a>>) -> Self {
+        Self { id: None, remote: false, head, tail, fields: fields.into() }
+    }
+
+    /// A frame on a CAN bus, at most 8 bytes.
+    pub fn can(id: CanId, fields: impl Into<Fields<'a>>) -> Self {
+        Self { id: Some(id), remote: false, head: &[], tail: &[], fields: fields.into() }
+    }
+
+    /// A remote request on a CAN bus, which has no data.
+    pub const fn remote(id: CanId) -> Self {
+        Self { id: Some(id), remote: true, head: &[], tail: &[], fields: Fields::Specs(&[]) }
+    }
+}
+
+/// The type of a field that is one coil.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Coil;
+
+impl From<Coil> for Encoding {
+    fn from(_: Coil) -> Self {
+        Self::bit(ScalarType::Byte, 0)
+    }
+}
+
+impl<'a> Ask<'a> {
+    /// FC 1: reads coils of a slave, 1..=247.
+    pub fn read_coils(slave: u8, address: u16, coils: &'a [InputField<'a>]) -> Self {
+        Self::read(slave, Operation::ReadCoils { address, count: 0 }, coils)
+    }
+
+    /// FC 2: reads discrete inputs.
+    pub fn read_discrete_inputs(slave: u8, address: u16, inputs: &'a [InputField<'a>]) -> Self {
+        Self::read(slave, Operation::ReadDiscreteInputs { address, count: 0 }, inputs)
+    }
+
+    /// FC 3: reads holding registers.
+    pub fn read_holding_registers(slave: u8, address: u16, fields: &'a [InputField<'a>]) -> Self {
+        Self::read(slave, Operation::ReadHoldingRegisters { address, count: 0 }, fields)
+    }
+
+    /// FC 4: reads input registers.
+    pub fn read_input_registers(slave: u8, address: u16, fields: &'a [InputField<'a>]) -> Self {
+        Self::read(slave, Operation::ReadInputRegisters { address, count: 0 }, fields)
+    }
+
+    /// FC 5: writes one coil; slave 0 is all of them.
+    pub fn write_coil(slave: u8, address: u16, coil: &'a [OutputField<'a>; 1]) -> Self {
+        Self::write(slave, Operation::WriteCoil { address }, coil)
+    }
+
+    /// FC 6: writes one register; slave 0 is all of them.
+    pub fn write_register(slave: u8, address: u16, fields: &'a [OutputField<'a>]) -> Self {
+        Self::write(slave, Operation::WriteRegister { address }, fields)
+    }
+
+    /// FC 15: writes coils; slave 0 is all of them. Skipped coils are written as 0.
+    pub fn write_coils(slave: u8, address: u16, coils: &'a [OutputField<'a>]) -> Self {
+        Self::write(slave, Operation::WriteCoils { address, count: 0 }, coils)
+    }
+
+    /// FC 16: writes holding registers; slave 0 is all of them.
+    pub fn write_registers(slave: u8, address: u16, fields: &'a [OutputField<'a>]) -> Self {
+        Self::write(slave, Operation::WriteRegisters { address, count: 0 }, fields)
+    }
+
+    /// FC 23: writes holding registers, then reads some.
+    pub fn read_write_registers(
+        slave: u8,
+        (read_address, read): (u16, &'a [InputField<'a>]),
+        (write_address, written): (u16, &'a [OutputField<'a>]),
+    ) -> Self {
+        let (read_count, write_count) = (0, 0);
+        let operation =
+            Operation::ReadWriteRegisters { read_address, read_count, write_address, write_count };
+        Self::new(slave, AskTalk::Rtu { operation, written: Some(written.into()), read: Some(read.into()) })
+    }
+
+    /// A block of the gateway as a slave with this address, 1..=247: input fields are written by the
+    /// master, output fields are read by it.
+    pub fn served(own: u8, table: Table, address: u16, fields: impl Into<Fields<'a>>) -> Self {
+        Self::new(own, AskTalk::Served { table, address, fields: fields.into() })
+    }
+
+    /// A request of a device's own; of device 0, unless [`Self::peer`] says otherwise.
+    pub fn request(request: AskFrame<'a>) -> Self {
+        Self::new(0, AskTalk::Frames { request: Some(request), reply: None, refusal: None })
+    }
+
+    /// A frame that may come at any time.
+    pub fn unasked(frame: AskFrame<'a>) -> Self {
+        Self::new(0, AskTalk::Frames { request: None, reply: Some(frame), refusal: None })
+    }
+
+    fn read(slave: u8, operation: Operation, fields: &'a [InputField<'a>]) -> Self {
+        Self::new(slave, AskTalk::Rtu { operation, written: None, read: Some(fields.into()) })
+    }
+
+    fn write(slave: u8, operation: Operation, fields: &'a [OutputField<'a>]) -> Self {
+        Self::new(slave, AskTalk::Rtu { operation, written: Some(fields.into()), read: None })
+    }
+
+    const fn new(peer: u8, talk: AskTalk<'a>) -> Self {
+        let (when, timeout, pause) = (AskWhen::NEVER, DEFAULT_REPLY_TIMEOUT, Duration::ZERO);
+        Self { peer, talk, when, rising: None, timeout, retries: 1, pause }
+    }
+
+    /// What answers the request. No effect on Modbus, whose replies are known.
+    pub fn reply(mut self, frame: AskFrame<'a>) -> Self {
+        if let AskTalk::Frames { reply, .. } = &mut self.talk {
+            *reply = Some(frame);
+        }
+        self
+    }
+
+    /// What the device sends if it refuses the request. No effect on Modbus.
+    pub fn refusal(mut self, frame: AskFrame<'a>) -> Self {
+        if let AskTalk::Frames { refusal, .. } = &mut self.talk {
+            *refusal = Some(frame);
+        }
+        self
+    }
+
+    /// The device of an exchange with frames of its own; exchanges of one device share its presence.
+    pub const fn peer(mut self, peer: u8) -> Self {
+        self.peer = peer;
+        self
+    }
+
+    /// Asked with this period, up to an hour.
+    pub const fn every(mut self, period: Duration) -> Self {
+        self.when.every = Some(period);
+        self
+    }
+
+    /// Asked at the start, and each time that the device has come back.
+    pub const fn at_start(mut self) -> Self {
+        self.when.start = true;
+        self
+    }
+
+    /// Asked when a value of the request has changed.
+    pub const fn on_change(mut self) -> Self {
+        self.when.change = true;
+        self
+    }
+
+    /// Asked when this bit, 0..=7, of a bit variable goes from 0 to 1.
+    pub fn on_rising(mut self, var: impl Into<Var<'a>>, bit: u8) -> Self {
+        self.rising = Some((var.into(), bit));
+        self
+    }
+
+    /// How long the reply may take, from the end of the request to its own end; 100 ms by default.
+    pub const fn timeout(mut self, timeout: Duration) -> Self {
+        self.timeout = timeout;
+        self
+    }
+
+    /// How often a request without a good reply is repeated at once; once by default.
+    pub const fn retries(mut self, retries: u8) -> Self {
+        self.retries = retries;
+        self
+    }
+
+    /// How long the line rests after it, up to 10 s; not at all by default.
+    pub const fn pause(mut self, pause: Duration) -> Self {
+        self.pause = pause;
+        self
+    }
+
+    /// Whether its frames are on a CAN bus.
+    pub(super) fn is_can(&self) -> bool {
+        self.frames().any(|frame| frame.id.is_some())
+    }
+
+    /// The frames of a device's own.
+    pub(super) fn frames(&self) -> impl Iterator<Item = &AskFrame<'a>> {
+        let frames = match &self.talk {
+            AskTalk::Frames { request, reply, refusal } => {
+                [request.as_ref(), reply.as_ref(), refusal.as_ref()]
+            }
+            AskTalk::Rtu { .. } | AskTalk::Served { .. } => [None; 3],
+        };
+        frames.into_iter().flatten()
+    }
+
+    /// All lists of fields.
+    pub(super) fn fields(&self) -> impl Iterator<Item = &Fields<'a>> {
+        let own = match &self.talk {
+            AskTalk::Rtu { written, read, .. } => [written.as_ref(), read.as_ref()],
+            AskTalk::Served { fields, .. } => [Some(fields), None],
+            AskTalk::Frames { .. } => [None; 2],
+        };
+        own.into_iter().flatten().chain(self.frames().map(|frame| &frame.fields))
+    }
+}
+
+/// The operation that reads or writes all of a block; its count is 0 here.
+pub(super) fn of_block(table: Table, address: u16, fields: Direction) -> Operation {
+    let count = 0;
+    match (table, fields) {
+        (Table::Coils, Direction::Input) => Operation::WriteCoils { address, count },
+        (Table::Coils, Direction::Output) => Operation::ReadCoils { address, count },
+        (Table::DiscreteInputs, _) => Operation::ReadDiscreteInputs { address, count },
+        (Table::HoldingRegisters, Direction::Input) => Operation::WriteRegisters { address, count },
+        (Table::HoldingRegisters, Direction::Output) => Operation::ReadHoldingRegisters { address, count },
+        (Table::InputRegisters, _) => Operation::ReadInputRegisters { address, count },
+    }
+}

@@ -1,0 +1,379 @@
+//! The checks that concern the exchanges of one recipe.
+
+use core::fmt;
+
+use super::error::{ConfigErrorKind as Kind, ExchangeKey as Key, Place};
+use super::exchange::{Exchange, FrameSpec, Talk};
+use super::rules::{Check, MAX_TIME, check_pool, check_time, fail};
+use super::{ConfigView, DeviceFrame, FieldSpec, Parts, Recipe, Span};
+use crate::device::{Carrier, LayoutError};
+use crate::modbus::rtu::{BROADCAST, CountError, MAX_ADDRESS, MAX_SLAVES, Operation};
+use crate::recipe::PartError;
+use crate::recipe::model::Mode;
+use crate::sysvar::Direction;
+
+/// The longest pause after an exchange.
+const MAX_PAUSE: crate::time::Duration = crate::time::Duration::from_secs(10);
+
+/// Why an exchange is refused.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum ExchangeError {
+    /// The recipe is realtime.
+    NeedsUser,
+    /// Modbus master, Modbus slave and frames of a device's own are mixed in one recipe.
+    Mixed,
+    /// A recipe of Modbus has parts.
+    PartsBesideModbus,
+    /// A frame for a line in a CAN recipe, or one with an id in a stream recipe.
+    WrongBus,
+    /// The slave's address.
+    Slave {
+        /// The address.
+        address: u8,
+    },
+    /// The address of the gateway as a slave.
+    OwnAddress {
+        /// The address.
+        address: u8,
+    },
+    /// Blocks of one slave with different addresses.
+    OtherAddress,
+    /// Registers or coils behind the last one.
+    BeyondLast {
+        /// The first of them.
+        address: u16,
+        /// How many there are.
+        count: u16,
+    },
+    /// A broadcast that reads: nobody would answer.
+    BroadcastRead,
+    /// A field of coils that is not one bit.
+    NotCoils,
+    /// More slaves or other peers than one port can have.
+    TooManyPeers,
+    /// The count of registers or coils.
+    Count(CountError),
+    /// The fields do not fill their registers or coils.
+    Fields {
+        /// The bytes of the registers or coils.
+        needed: usize,
+        /// The bytes of the fields.
+        found: usize,
+    },
+    /// The fields have no fixed length.
+    Varying,
+    /// An operation that a slave does not serve.
+    NotServed,
+    /// Registers or coils that another block has.
+    Overlap,
+    /// Neither request nor reply.
+    Nothing,
+    /// A refusal without a request and its reply.
+    LoneRefusal,
+    /// A request that is never sent.
+    Never,
+    /// A reply that comes unasked has a time at which it is asked.
+    Unasked,
+    /// A remote request with fields.
+    RemoteFields,
+    /// A remote frame that the gateway would receive.
+    RemoteReply,
+    /// A refusal with values for variables or commands.
+    RefusalValues,
+}
+
+impl fmt::Display for ExchangeError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::NeedsUser => f.write_str("exchanges need mode = \"user\""),
+            Self::Mixed => {
+                f.write_str("a recipe has exchanges of one kind: Modbus master, Modbus slave, or frames")
+            }
+            Self::PartsBesideModbus => {
+                f.write_str("a recipe of Modbus has exchanges only, no input and output part")
+            }
+            Self::WrongBus => {
+                f.write_str("frames of a CAN recipe have an id, those of a stream recipe have none")
+            }
+            Self::Slave { address } => {
+                write!(
+                    f,
+                    "slave {address} is out of range; allowed: 1..={MAX_ADDRESS}, or 0 to write to all of them"
+                )
+            }
+            Self::OwnAddress { address } => {
+                write!(f, "address {address} is out of range; allowed: 1..={MAX_ADDRESS}")
+            }
+            Self::OtherAddress => f.write_str("the blocks of a slave have one address"),
+            Self::BeyondLast { address, count } => {
+                let last = u32::from(*address).saturating_add(u32::from(*count)).saturating_sub(1);
+                write!(f, "{address} to {last} are out of range; the last register or coil is 65535")
+            }
+            Self::BroadcastRead => {
+                f.write_str("slave 0 is all of them, which cannot be read; allowed: writes")
+            }
+            Self::NotCoils => f.write_str("the fields of coils are one bit each; their type is Coil"),
+            Self::TooManyPeers => {
+                write!(f, "one slave or other peer too many; allowed: up to {MAX_SLAVES} on a port")
+            }
+            Self::Count(error) => error.fmt(f),
+            Self::Fields { needed, found } => {
+                write!(f, "the fields have {found} bytes, the registers or coils {needed}; pad fills them up")
+            }
+            Self::Varying => f.write_str("fields in registers have a fixed length; give the text a width"),
+            Self::NotServed => {
+                f.write_str("a block has holding registers, input registers, coils or discrete inputs")
+            }
+            Self::Overlap => f.write_str("an earlier block has some of these registers or coils"),
+            Self::Nothing => f.write_str("an exchange needs a request, a reply or both"),
+            Self::LoneRefusal => f.write_str("a refusal answers a request that has a reply"),
+            Self::Never => f.write_str("it would never be asked; set every_ms or on"),
+            Self::Unasked => f.write_str("there is no request to send; remove every_ms and on"),
+            Self::RemoteFields => f.write_str("a remote request has no fields"),
+            Self::RemoteReply => f.write_str("only a request can be remote"),
+            Self::RefusalValues => f.write_str(
+                "a refusal only tells that the device refuses; its fields have no to and no commands",
+            ),
+        }
+    }
+}
+
+/// The exchanges of one recipe under check.
+pub(super) struct ExchangeCheck<'a> {
+    pub config: ConfigView<'a>,
+    pub index: u8,
+    pub recipe: &'a Recipe,
+}
+
+impl<'a> ExchangeCheck<'a> {
+    pub(super) fn check(&self) -> Check {
+        check_pool(self.at(0, Key::Whole), self.recipe.exchanges, self.config.exchanges.len())?;
+        let exchanges = self.config.exchanges_of(self.recipe);
+        let (mut peers, mut count) = ([false; 256], 0_usize);
+        for (nth, exchange) in (0..).zip(exchanges) {
+            self.check_one(nth, exchange)?;
+            if let Some(seen) = peers.get_mut(usize::from(exchange.peer))
+                && !core::mem::replace(seen, true)
+                && !matches!(exchange.talk, Talk::Rtu { .. } if exchange.peer == BROADCAST)
+            {
+                count = count.saturating_add(1);
+            }
+            if count > MAX_SLAVES {
+                return self.refuse(nth, Key::Peer, ExchangeError::TooManyPeers);
+            }
+            let earlier = exchanges.iter().take(usize::from(nth));
+            for before in earlier {
+                if core::mem::discriminant(&before.talk) != core::mem::discriminant(&exchange.talk) {
+                    return self.refuse(nth, Key::Whole, ExchangeError::Mixed);
+                }
+                if overlap(before, exchange) {
+                    return self.refuse(nth, Key::Registers, ExchangeError::Overlap);
+                }
+            }
+            check_time(self.at(nth, Key::Timeout), exchange.timeout, MAX_TIME)?;
+            if let Some(every) = exchange.when.every {
+                check_time(self.at(nth, Key::Every), every, MAX_TIME)?;
+            }
+            if exchange.pause > MAX_PAUSE {
+                let kind = Kind::TimeTooLong { time: exchange.pause, longest: MAX_PAUSE };
+                return fail(self.at(nth, Key::Pause), kind);
+            }
+            if let Some((var, bit)) = exchange.when.rising {
+                super::check_recipe::check_trigger(self.at(nth, Key::Rising), var, bit)?;
+            }
+        }
+        Ok(())
+    }
+
+    fn at(&self, exchange: u8, key: Key) -> Place {
+        Place::Exchange { recipe: self.index, exchange, key }
+    }
+
+    fn refuse(&self, exchange: u8, key: Key, error: ExchangeError) -> Check {
+        fail(self.at(exchange, key), Kind::Exchange(error))
+    }
+
+    fn check_one(&self, nth: u8, exchange: &Exchange) -> Check {
+        if self.recipe.mode != Mode::User {
+            return self.refuse(nth, Key::Whole, ExchangeError::NeedsUser);
+        }
+        let is_alone = matches!(self.recipe.parts, Parts::Stream { input: None, output: None });
+        let (peer, is_never) = (exchange.peer, exchange.when.is_never());
+        match exchange.talk {
+            Talk::Rtu { .. } | Talk::Served { .. } if !is_alone => {
+                self.refuse(nth, Key::Whole, ExchangeError::PartsBesideModbus)
+            }
+            Talk::Rtu { operation, written, read } => {
+                if peer > MAX_ADDRESS {
+                    return self.refuse(nth, Key::Peer, ExchangeError::Slave { address: peer });
+                }
+                if peer == BROADCAST && operation.reads() {
+                    return self.refuse(nth, Key::Peer, ExchangeError::BroadcastRead);
+                }
+                if is_never {
+                    return self.refuse(nth, Key::Whole, ExchangeError::Never);
+                }
+                self.check_operation(nth, operation, [(Direction::Output, written), (Direction::Input, read)])
+            }
+            Talk::Served { operation, written, read } => {
+                if peer == BROADCAST || peer > MAX_ADDRESS {
+                    return self.refuse(nth, Key::Peer, ExchangeError::OwnAddress { address: peer });
+                }
+                let first = self.config.exchanges_of(self.recipe).first();
+                if first.is_some_and(|first| first.peer != peer) {
+                    return self.refuse(nth, Key::Peer, ExchangeError::OtherAddress);
+                }
+                if !is_never {
+                    return self.refuse(nth, Key::Whole, ExchangeError::Unasked);
+                }
+                match operation {
+                    Operation::ReadWriteRegisters { .. }
+                    | Operation::WriteCoil { .. }
+                    | Operation::WriteRegister { .. } => {
+                        self.refuse(nth, Key::Registers, ExchangeError::NotServed)
+                    }
+                    _ => {
+                        let spans = [(Direction::Input, written), (Direction::Output, read)];
+                        self.check_operation(nth, operation, spans)
+                    }
+                }
+            }
+            Talk::Frames { request, reply, refusal } => {
+                self.check_frames(nth, is_never, [request, reply, refusal])
+            }
+        }
+    }
+
+    /// Counts, and that the fields fill them: those that are written, and those that are read.
+    fn check_operation(&self, nth: u8, operation: Operation, spans: [(Direction, Span); 2]) -> Check {
+        let refuse = |error| self.refuse(nth, Key::Registers, error);
+        if let Err(error) = operation.check() {
+            return refuse(ExchangeError::Count(error));
+        }
+        if let Some((address, count)) = beyond_last(&operation) {
+            return refuse(ExchangeError::BeyondLast { address, count });
+        }
+        let needed = [operation.written_len(), operation.read_len()];
+        for ((part, span), needed) in spans.into_iter().zip(needed) {
+            check_pool(self.at(nth, Key::Registers), span, self.config.fields.len())?;
+            let fields = span.of(self.config.fields);
+            if fields.is_empty() && needed == 0 {
+                continue;
+            }
+            let layout = match DeviceFrame::new(Carrier::Whole, part, (&[], &[]), fields) {
+                Ok(frame) => frame.layout,
+                Err(error) => return fail(self.place_of(nth, part, fields, error), Kind::Layout(error)),
+            };
+            let (shortest, longest) = layout.lengths();
+            if shortest != longest {
+                return refuse(ExchangeError::Varying);
+            }
+            if longest != needed {
+                return refuse(ExchangeError::Fields { needed, found: longest });
+            }
+        }
+        Ok(())
+    }
+
+    fn check_frames(&self, nth: u8, is_never: bool, frames: [Option<u8>; 3]) -> Check {
+        let refused = match frames {
+            [None, None, _] => Some((Key::Whole, ExchangeError::Nothing)),
+            [None, _, Some(_)] | [_, None, Some(_)] => Some((Key::Refusal, ExchangeError::LoneRefusal)),
+            [Some(_), ..] if is_never => Some((Key::Whole, ExchangeError::Never)),
+            [None, ..] if !is_never => Some((Key::Whole, ExchangeError::Unasked)),
+            _ => None,
+        };
+        if let Some((key, error)) = refused {
+            return self.refuse(nth, key, error);
+        }
+        let [request, reply, refusal] = frames;
+        for (key, part, index) in [
+            (Key::Request, Direction::Output, request),
+            (Key::Reply, Direction::Input, reply),
+            (Key::Refusal, Direction::Input, refusal),
+        ] {
+            let Some(index) = index else { continue };
+            check_pool(self.at(nth, key), Span { start: index.into(), len: 1 }, self.config.frames.len())?;
+            let Some(frame) = self.config.frames.get(usize::from(index)) else { continue };
+            self.check_frame(nth, key, part, frame)?;
+        }
+        Ok(())
+    }
+
+    fn check_frame(&self, nth: u8, key: Key, part: Direction, frame: &FrameSpec) -> Check {
+        let place = self.at(nth, key);
+        check_pool(place, frame.fields, self.config.fields.len())?;
+        let is_can = matches!(self.recipe.parts, Parts::Can { .. });
+        if frame.id.is_some() != is_can || (frame.remote && !is_can) {
+            return self.refuse(nth, key, ExchangeError::WrongBus);
+        }
+        if let Some(id) = frame.id.filter(|id| !id.is_valid()) {
+            return fail(place, Kind::Part(PartError::InvalidId { frame: 0, id }));
+        }
+        let fields = frame.fields.of(self.config.fields);
+        if frame.remote {
+            return match (key, fields) {
+                (Key::Request, []) => Ok(()),
+                (Key::Request, _) => self.refuse(nth, key, ExchangeError::RemoteFields),
+                _ => self.refuse(nth, key, ExchangeError::RemoteReply),
+            };
+        }
+        if key == Key::Refusal && fields.iter().any(FieldSpec::acts) {
+            return self.refuse(nth, key, ExchangeError::RefusalValues);
+        }
+        match frame.layout(self.config, part) {
+            Ok(_) => Ok(()),
+            Err(error) if key == Key::Refusal => fail(place, Kind::Layout(error)),
+            Err(error) => fail(self.place_of(nth, part, fields, error), Kind::Layout(error)),
+        }
+    }
+
+    /// The place of a mistake in the frame of an exchange that has one in this part.
+    fn place_of(&self, nth: u8, part: Direction, fields: &[FieldSpec], error: LayoutError) -> Place {
+        let recipe = self.index;
+        let earlier = self.config.exchanges_of(self.recipe).iter().take(usize::from(nth));
+        let before = earlier.filter(|exchange| exchange.fields(self.config, part).is_some()).count();
+        let frame = self.recipe.part_frames(part).count().saturating_add(before) as u8;
+        match super::device::field_of(fields, error) {
+            Some(field) => Place::Field { recipe, part, frame, field },
+            None => Place::Frame { recipe, part, frame },
+        }
+    }
+}
+
+impl FrameSpec {
+    /// The frame's elements and layout.
+    ///
+    /// # Errors
+    /// [`LayoutError`]: its elements are counted without the checksum.
+    pub(crate) fn layout(&self, config: ConfigView<'_>, part: Direction) -> Result<DeviceFrame, LayoutError> {
+        let fields: &[FieldSpec] = self.fields.of(config.fields);
+        let carrier = if self.id.is_some() { Carrier::Can } else { Carrier::Stream };
+        DeviceFrame::new(carrier, part, (&self.head, &self.tail), fields)
+    }
+}
+
+/// Whether two blocks of a slave have a register or coil in common.
+fn overlap(one: &Exchange, other: &Exchange) -> bool {
+    let (Talk::Served { operation: one, .. }, Talk::Served { operation: other, .. }) =
+        (&one.talk, &other.talk)
+    else {
+        return false;
+    };
+    let ((table, from, count), (others, at, len)) = (one.place(), other.place());
+    let end = |from: u16, count: u16| u32::from(from).saturating_add(u32::from(count));
+    table == others && u32::from(from) < end(at, len) && u32::from(at) < end(from, count)
+}
+
+/// The address and count that go beyond the last register or coil, 65535.
+fn beyond_last(operation: &Operation) -> Option<(u16, u16)> {
+    let (_, address, count) = operation.place();
+    let written = match *operation {
+        Operation::ReadWriteRegisters { write_address, write_count, .. } => (write_address, write_count),
+        _ => (0, 1),
+    };
+    let is_beyond =
+        |&(address, count): &(u16, u16)| u32::from(address).saturating_add(u32::from(count)) > 0x1_0000;
+    [(address, count), written].into_iter().find(is_beyond)
+}

@@ -1,0 +1,327 @@
+//! The exchanges of all ports: their frames, their turns and what is known of their peers.
+//!
+//! In: the exchanges of a configuration. Out: for each port with exchanges a [`Line`], and the frames
+//! that it sends and takes. One list for all ports, so that a port without exchanges takes no room.
+
+use heapless::{Vec, VecView};
+
+use super::Engine;
+use super::build::{BuildError, one_too_many};
+use super::device_port::DeviceFormat;
+use super::line::{Line, PeerCounters, PeerState, Talks, Times, is_looked_at};
+use super::user::{InputBind, InputTo};
+use crate::config::{Bus, ConfigView, Counted, DeviceFrame, Exchange, FieldSpec, Port, Recipe, Span, Talk};
+use crate::device::{Carrier, LayoutError};
+use crate::modbus::rtu::{Operation, Table};
+use crate::schedule::{Grid, Peer, Row};
+use crate::sysvar::{Direction, SysVar};
+use crate::time::{Duration, Instant};
+use crate::wire::can::CanId;
+
+/// The exchanges of all ports; ports name ranges of them.
+#[derive(Debug, Clone)]
+pub(super) struct Exchanges<const N: usize> {
+    items: Vec<Item, N>,
+    rows: Vec<Row, N>,
+    peers: Vec<PeerState, N>,
+}
+
+/// The same, of any size.
+pub(super) struct View<'a> {
+    items: &'a mut [Item],
+    rows: &'a mut [Row],
+    peers: &'a mut [PeerState],
+}
+
+/// What is asked, and what answers.
+#[derive(Debug, Clone)]
+pub(super) struct Item {
+    pub asks: Asks,
+    pub request: Option<DeviceFormat>,
+    pub reply: Option<InputFormat>,
+    pub refusal: Option<DeviceFormat>,
+    pub times: Times,
+    /// It is asked when a value of the request changes.
+    pub on_change: bool,
+    /// It is asked when this bit rises.
+    pub rising: Option<(SysVar, u8)>,
+    /// The newest request, to tell a change.
+    pub digest: Option<u64>,
+    pub last_bit: Option<bool>,
+}
+
+/// How a request is made.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Asks {
+    /// As a master on Modbus; request and reply are the data in their frames.
+    Rtu { slave: u8, operation: Operation },
+    /// With a frame of the device's own.
+    Frame,
+    /// With a remote frame on a CAN bus, which says how long the reply is.
+    Remote { id: CanId, len: u8 },
+    /// Not at all: a master asks, and these are registers or coils of ours.
+    Served { table: Table, address: u16, count: u16 },
+    /// Not at all: the reply comes unasked.
+    Nothing,
+}
+
+/// An input frame and its place in the store.
+#[derive(Debug, Clone)]
+pub(super) struct InputFormat {
+    pub format: DeviceFormat,
+    pub slot: u8,
+}
+
+impl<const N: usize> Exchanges<N> {
+    pub(super) const fn new() -> Self {
+        Self { items: Vec::new(), rows: Vec::new(), peers: Vec::new() }
+    }
+
+    pub(super) fn clear(&mut self) {
+        self.items.clear();
+        self.rows.clear();
+        self.peers.clear();
+    }
+
+    #[inline(always)]
+    pub(super) fn is_used(&self) -> bool {
+        N > 0 && !self.items.is_empty()
+    }
+
+    pub(super) fn view(&mut self) -> View<'_> {
+        View { items: &mut self.items, rows: &mut self.rows, peers: &mut self.peers }
+    }
+
+    pub(super) fn peers(&self) -> &[PeerState] {
+        &self.peers
+    }
+}
+
+impl View<'_> {
+    /// The exchanges of a port.
+    pub(super) fn of(&mut self, line: &Line) -> (&mut [Item], Talks<'_>) {
+        let range = |span: Span| {
+            let start = usize::from(span.start);
+            start..start.saturating_add(usize::from(span.len))
+        };
+        let (exchanges, peers) = (range(line.exchanges), range(line.peers));
+        (
+            self.items.get_mut(exchanges.clone()).unwrap_or(&mut []),
+            Talks {
+                rows: self.rows.get_mut(exchanges).unwrap_or(&mut []),
+                peers: self.peers.get_mut(peers).unwrap_or(&mut []),
+            },
+        )
+    }
+}
+
+/// Where the next fields are among the bindings of their direction, and the next input frame in the
+/// store.
+pub(super) struct Places {
+    pub inputs: u16,
+    pub outputs: u16,
+    pub slot: u8,
+}
+
+/// Makes the formats of one recipe's exchanges.
+struct Formats<'c> {
+    config: ConfigView<'c>,
+    recipe: u8,
+    places: Places,
+    /// Frames of each direction so far, for messages.
+    frames: [u8; 2],
+    /// The bindings of all ports, which refusals are added to.
+    refusals: &'c mut VecView<InputBind>,
+}
+
+impl Formats<'_> {
+    fn format(
+        &mut self,
+        part: Direction,
+        frame: Result<DeviceFrame, LayoutError>,
+        id: Option<CanId>,
+    ) -> Result<DeviceFormat, BuildError> {
+        let (next, nth) = match (part, &mut self.frames) {
+            (Direction::Input, [nth, _]) => (&mut self.places.inputs, nth),
+            (Direction::Output, [_, nth]) => (&mut self.places.outputs, nth),
+        };
+        let frame =
+            frame.map_err(|error| BuildError::Layout { recipe: self.recipe, part, frame: *nth, error })?;
+        let bindings = Span { start: *next, len: frame.elements.len() as u16 };
+        *next = next.saturating_add(bindings.len);
+        *nth = nth.saturating_add(1);
+        Ok(DeviceFormat { layout: frame.layout, id: id.unwrap_or(CanId::Standard(0)), bindings })
+    }
+
+    fn input(
+        &mut self,
+        frame: Result<DeviceFrame, LayoutError>,
+        id: Option<CanId>,
+    ) -> Result<InputFormat, BuildError> {
+        let format = self.format(Direction::Input, frame, id)?;
+        let slot = self.places.slot;
+        self.places.slot = slot.saturating_add(1);
+        Ok(InputFormat { format, slot })
+    }
+
+    /// A refusal's fields are behind those of the recipe.
+    fn refusal(
+        &mut self,
+        frame: Result<DeviceFrame, LayoutError>,
+        id: Option<CanId>,
+    ) -> Result<DeviceFormat, BuildError> {
+        let (recipe, part, [frames, _]) = (self.recipe, Direction::Input, self.frames);
+        let frame = frame.map_err(|error| BuildError::Layout { recipe, part, frame: frames, error })?;
+        let len = frame.elements.len() as u16;
+        let bindings = Span { start: self.refusals.len() as u16, len };
+        for &element in &frame.elements {
+            let bind = InputBind::new(InputTo::Unused, element);
+            self.refusals
+                .push(bind)
+                .map_err(|_| one_too_many(Counted::UserFields, self.refusals.capacity()))?;
+        }
+        Ok(DeviceFormat { layout: frame.layout, id: id.unwrap_or(CanId::Standard(0)), bindings })
+    }
+
+    /// The data of Modbus registers or coils.
+    fn data(&self, part: Direction, span: Span) -> Option<Result<DeviceFrame, LayoutError>> {
+        let fields: &[FieldSpec] = span.of(self.config.fields);
+        (!fields.is_empty()).then(|| DeviceFrame::new(Carrier::Whole, part, (&[], &[]), fields))
+    }
+
+    #[inline(never)]
+    fn item(&mut self, exchange: &Exchange) -> Result<Item, BuildError> {
+        let mut item = Item {
+            asks: Asks::Nothing,
+            request: None,
+            reply: None,
+            refusal: None,
+            times: Times {
+                timeout: exchange.timeout,
+                pause: exchange.pause,
+                retries: exchange.retries,
+                is_answered: true,
+            },
+            on_change: exchange.when.change,
+            rising: exchange.when.rising,
+            digest: None,
+            last_bit: None,
+        };
+        match exchange.talk {
+            Talk::Rtu { operation, written, read } => {
+                item.asks = Asks::Rtu { slave: exchange.peer, operation };
+                item.times.is_answered = exchange.peer != crate::modbus::rtu::BROADCAST;
+                if let Some(data) = self.data(Direction::Output, written) {
+                    item.request = Some(self.format(Direction::Output, data, None)?);
+                }
+                if let Some(data) = self.data(Direction::Input, read) {
+                    item.reply = Some(self.input(data, None)?);
+                }
+            }
+            Talk::Served { operation, written, read } => {
+                let (table, address, count) = operation.place();
+                item.asks = Asks::Served { table, address, count };
+                if let Some(data) = self.data(Direction::Output, read) {
+                    item.request = Some(self.format(Direction::Output, data, None)?);
+                }
+                if let Some(data) = self.data(Direction::Input, written) {
+                    item.reply = Some(self.input(data, None)?);
+                }
+            }
+            Talk::Frames { request, reply, refusal } => {
+                let config = self.config;
+                let frame = |nth: Option<u8>| config.frames.get(usize::from(nth?));
+                if let Some(request) = frame(request) {
+                    item.asks = match request.id {
+                        Some(id) if request.remote => {
+                            let reply = frame(reply).map(|reply| reply.layout(config, Direction::Input));
+                            let len = reply.and_then(Result::ok).map_or(0, |reply| reply.layout.lengths().1);
+                            Asks::Remote { id, len: len as u8 }
+                        }
+                        _ => Asks::Frame,
+                    };
+                    if matches!(item.asks, Asks::Frame) {
+                        let layout = request.layout(config, Direction::Output);
+                        item.request = Some(self.format(Direction::Output, layout, request.id)?);
+                    }
+                }
+                if let Some(reply) = frame(reply) {
+                    let layout = reply.layout(config, Direction::Input);
+                    item.reply = Some(self.input(layout, reply.id)?);
+                }
+                if let Some(refusal) = frame(refusal) {
+                    let layout = refusal.layout(config, Direction::Input);
+                    item.refusal = Some(self.refusal(layout, refusal.id)?);
+                }
+                item.times.is_answered = item.reply.is_some();
+            }
+        }
+        Ok(item)
+    }
+}
+
+impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: usize, const EXCHANGES: usize>
+    Engine<PORTS, UPLINKS, FIELDS, TAP, EXCHANGES>
+{
+    /// Adds the exchanges of a port, whose fields and input frames behind those of its parts are at
+    /// these places.
+    #[inline(never)]
+    pub(super) fn add_exchanges(
+        &mut self,
+        config: ConfigView<'_>,
+        port: &Port,
+        recipe: &Recipe,
+        places: Places,
+    ) -> Result<Line, BuildError> {
+        let full = || one_too_many(Counted::Exchanges, EXCHANGES);
+        let exchanges = config.exchanges_of(recipe);
+        let start = self.exchanges.items.len() as u16;
+        let first_peer = self.exchanges.peers.len();
+        let part_frames = |part| recipe.part_frames(part).count() as u8;
+        let frames = [part_frames(Direction::Input), part_frames(Direction::Output)];
+        let refusals = self.bindings.inputs.as_mut_view();
+        let mut formats = Formats { config, recipe: port.recipe, places, frames, refusals };
+        let looks = exchanges.iter().any(|exchange| is_looked_at(&exchange.when));
+        let looks = looks.then(|| Grid::starting_at(Instant::ZERO, port.cycle));
+        let line_of = match &port.bus {
+            Bus::Rs485(line) => Some(line),
+            _ => None,
+        };
+        let mut hears_unasked = part_frames(Direction::Input) > 0;
+        for exchange in exchanges {
+            let item = formats.item(exchange)?;
+            hears_unasked |= matches!(item.asks, Asks::Nothing);
+            let own = self.exchanges.peers.get(first_peer..).unwrap_or(&[]);
+            let peer = match own.iter().position(|peer| peer.number == exchange.peer) {
+                Some(peer) => peer,
+                None => {
+                    let peer = own.len();
+                    let counters = PeerCounters::default();
+                    let new = PeerState { number: exchange.peer, counters, turn: Peer::NEW };
+                    self.exchanges.peers.push(new).map_err(|_| full())?;
+                    peer
+                }
+            };
+            let on_line = |len: usize| line_of.map_or(Duration::ZERO, |line| line.time_on_line(len));
+            let request_len = match (item.asks, &item.request) {
+                (Asks::Rtu { operation, .. }, _) => operation.request_len(),
+                (_, Some(request)) => request.layout.lengths().1,
+                (_, None) => 0,
+            };
+            let cost = on_line(request_len) + exchange.timeout + exchange.pause;
+            let when = (exchange.when.every, exchange.when.start);
+            let row = Row::new(peer as u8, when, (cost, exchange.timeout), Instant::ZERO);
+            self.exchanges.rows.push(row).map_err(|_| full())?;
+            self.exchanges.items.push(item).map_err(|_| full())?;
+        }
+        let peers = self.exchanges.peers.len().saturating_sub(first_peer) as u16;
+        let mut line = Line::new(
+            Span { start, len: exchanges.len() as u16 },
+            Span { start: first_peer as u16, len: peers },
+            looks,
+            line_of.is_some_and(|line| line.echo),
+        );
+        line.hears_unasked = hears_unasked;
+        Ok(line)
+    }
+}

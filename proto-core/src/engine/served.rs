@@ -1,0 +1,253 @@
+//! Field ports on which the gateway is a slave: a master reads and writes blocks of registers.
+//!
+//! In: requests that the slave of the line has found. Out: values in the store, and replies. A block
+//! is written as a whole or not at all; one with a value that is unknown or stale is not read.
+
+use super::command_link::CommandLink;
+use super::counters::bump;
+use super::device_port::{DeviceCodec, DeviceFormat};
+use super::exchanges::{Asks, InputFormat, Item, View};
+use super::field_port::{Accepted, Codec, FieldPort, Frames, came, keep};
+use super::rejection::Rejection;
+use super::sender::Sender;
+use super::store::Store;
+use super::talk::may_send;
+use super::tap::Tap;
+use super::user::{InputBind, OutputBind, number_of};
+use super::whole_port::{Reader, TextBind, write_text};
+use crate::modbus::rtu::{MAX_ADU, Table};
+use crate::modbus::server::RegisterBank;
+use crate::modbus::{Coils, Exception, Registers};
+use crate::time::Instant;
+
+/// Data of the longest block.
+const MAX_DATA: usize = 256;
+
+/// The blocks of a slave.
+struct Blocks<'a, const PORTS: usize> {
+    items: &'a [Item],
+    texts: &'a [TextBind],
+    outputs: &'a [OutputBind],
+    sender: &'a Sender,
+    frames: Frames<'a, PORTS>,
+    accepted: &'a mut Accepted,
+    now: Instant,
+}
+
+impl<const PORTS: usize> Blocks<'_, PORTS> {
+    /// The blocks of a table that a master reads, with their first address and count.
+    fn read_from(&self, table: Table) -> impl Iterator<Item = (u16, u16, &DeviceFormat)> {
+        self.items.iter().filter_map(move |item| {
+            let Asks::Served { table: own, address, count } = item.asks else { return None };
+            (own == table).then_some((address, count, item.request.as_ref()?))
+        })
+    }
+
+    fn data<'o>(&self, format: &DeviceFormat, out: &'o mut [u8; MAX_DATA]) -> Result<&'o [u8], Exception> {
+        let fields = format.bindings.of(self.outputs);
+        let image = &self.frames.store.image;
+        if !fields.iter().all(|field| may_send(self.sender, image, field, self.now)) {
+            return Err(Exception::DeviceFailure);
+        }
+        let number = |nth: usize| {
+            let field = fields.get(nth);
+            field.map_or(f64::NAN, |field| {
+                number_of(field, image, self.sender.frames_sent, *self.frames.reply)
+            })
+        };
+        let text = |nth: usize, out: &mut [u8]| write_text(self.texts, format, nth, image, out);
+        let elements = fields.iter().map(OutputBind::element);
+        let len = format.layout.encode_with(elements, number, text, out).ok_or(Exception::DeviceFailure)?;
+        out.get(..len).ok_or(Exception::DeviceFailure)
+    }
+
+    fn registers(&self, table: Table, address: u16, words: &mut [[u8; 2]]) -> Result<(), Exception> {
+        let mut at = address;
+        let mut words = words.iter_mut();
+        let mut left = words.len();
+        while left > 0 {
+            let is_here =
+                |block: &(u16, u16, &DeviceFormat)| at.checked_sub(block.0).is_some_and(|nth| nth < block.1);
+            let block = self.read_from(table).find(is_here).ok_or(Exception::IllegalDataAddress)?;
+            let mut buffer = [0; MAX_DATA];
+            let data = self.data(block.2, &mut buffer)?;
+            let behind = usize::from(at.saturating_sub(block.0)).saturating_mul(2);
+            let (pairs, _) = data.get(behind..).unwrap_or(&[]).as_chunks::<2>();
+            // Before the words, so that none is lost when the block ends.
+            for (pair, word) in pairs.iter().zip(&mut words) {
+                *word = *pair;
+                at = at.wrapping_add(1);
+                left = left.saturating_sub(1);
+            }
+            if pairs.is_empty() {
+                return Err(Exception::DeviceFailure);
+            }
+        }
+        Ok(())
+    }
+
+    fn coils(&self, table: Table, address: u16, count: u16, packed: &mut [u8]) -> Result<(), Exception> {
+        for nth in 0..count {
+            let at = address.wrapping_add(nth);
+            let is_here =
+                |block: &(u16, u16, &DeviceFormat)| at.checked_sub(block.0).is_some_and(|nth| nth < block.1);
+            let block = self.read_from(table).find(is_here).ok_or(Exception::IllegalDataAddress)?;
+            let mut buffer = [0; MAX_DATA];
+            let data = self.data(block.2, &mut buffer)?;
+            let bit = at.saturating_sub(block.0);
+            let is_on = data.get(usize::from(bit / 8)).is_some_and(|byte| byte >> (bit % 8) & 1 == 1);
+            if let Some(byte) = packed.get_mut(usize::from(nth / 8)) {
+                *byte |= u8::from(is_on) << (nth % 8);
+            }
+        }
+        Ok(())
+    }
+
+    /// Writes the block that begins at this address and has so many registers or coils.
+    fn write(&mut self, table: Table, address: u16, count: u16, data: &[u8]) -> Result<(), Exception> {
+        let is_it = |asks: Asks| matches!(asks, Asks::Served { table: own, address: at, count: len } if (own, at, len) == (table, address, count));
+        let block = self.items.iter().find(|item| item.reply.is_some() && is_it(item.asks));
+        let Some(InputFormat { format, slot }) = block.and_then(|item| item.reply.as_ref()) else {
+            return Err(Exception::IllegalDataAddress);
+        };
+        self.frames
+            .take_device(format, self.texts, data, usize::from(*slot), self.accepted)
+            .map_err(|_| Exception::IllegalDataValue)
+    }
+}
+
+impl<const PORTS: usize> RegisterBank for Blocks<'_, PORTS> {
+    fn read_coils(&self, address: u16, count: u16, packed: &mut [u8]) -> Result<(), Exception> {
+        self.coils(Table::Coils, address, count, packed)
+    }
+
+    fn read_discrete(&self, address: u16, count: u16, packed: &mut [u8]) -> Result<(), Exception> {
+        self.coils(Table::DiscreteInputs, address, count, packed)
+    }
+
+    fn read_holding(&self, address: u16, words: &mut [[u8; 2]]) -> Result<(), Exception> {
+        self.registers(Table::HoldingRegisters, address, words)
+    }
+
+    fn read_input(&self, address: u16, words: &mut [[u8; 2]]) -> Result<(), Exception> {
+        self.registers(Table::InputRegisters, address, words)
+    }
+
+    fn write_coils(&mut self, address: u16, coils: Coils<'_>) -> Result<(), Exception> {
+        let mut data = [0; MAX_DATA];
+        let mut len = 0_usize;
+        for first in (0..coils.count()).step_by(8) {
+            if let (Some(slot), Some(byte)) = (data.get_mut(len), coils.byte(first)) {
+                *slot = byte;
+                len = len.saturating_add(1);
+            }
+        }
+        self.write(Table::Coils, address, coils.count(), data.get(..len).unwrap_or(&[]))
+    }
+
+    fn write_holding(&mut self, address: u16, registers: Registers<'_>) -> Result<(), Exception> {
+        self.write(Table::HoldingRegisters, address, registers.count(), registers.as_be_bytes())
+    }
+}
+
+impl FieldPort {
+    /// Whether a request has ended that is to be served.
+    pub(super) fn is_asked(&self, now: Instant) -> bool {
+        self.slave_deadline() <= now
+    }
+
+    /// When a master's request ends; [`Instant::NEVER`] if none has begun, and on other ports.
+    pub(super) fn slave_deadline(&self) -> Instant {
+        match &self.codec {
+            Codec::Device(DeviceCodec { reader: Some(Reader::Slave(slave)), .. }) => slave.deadline(),
+            _ => Instant::NEVER,
+        }
+    }
+
+    /// Carries out what a master asks; its reply is kept until the line is free.
+    #[inline(never)]
+    pub(super) fn serve<const PORTS: usize, const TAP: usize>(
+        &mut self,
+        (inputs, outputs): (&[InputBind], &[OutputBind]),
+        store: &mut Store<PORTS>,
+        commands: Option<&mut CommandLink>,
+        tap: &mut Tap<TAP>,
+        mut view: View<'_>,
+    ) -> Accepted {
+        let mut accepted = Accepted::default();
+        let now = store.now;
+        let Codec::Device(DeviceCodec {
+            texts, reader: Some(Reader::Slave(slave)), line: Some(line), ..
+        }) = &mut self.codec
+        else {
+            return accepted;
+        };
+        let (items, talks) = view.of(line);
+        let frames =
+            Frames::new((self.id, self.mode), &mut self.reply, &mut self.counters, inputs, store, commands);
+        let sender = &self.sender;
+        let mut blocks = Blocks { items, texts, outputs, sender, frames, accepted: &mut accepted, now };
+        let (before, mut request, mut reply) = (slave.counters(), [0; MAX_ADU], [0; MAX_ADU]);
+        let heard = slave.copy_to(&mut request);
+        let len = slave.poll(now, &mut blocks, &mut reply);
+        let after = slave.counters();
+        if let Some(len) = len {
+            slave.keep(reply.get(..len).unwrap_or(&[]));
+        }
+        if let Some(peer) = talks.peers.first_mut() {
+            peer.counters.requests = after.answered;
+            peer.counters.replies = after.answered.wrapping_sub(after.refused);
+            peer.counters.refused = after.refused;
+            peer.counters.checksums = after.wrong;
+            if after.refused != before.refused {
+                peer.counters.refusal = reply.get(2).copied().unwrap_or(0);
+            }
+        }
+        let verdict = if after.wrong != before.wrong {
+            bump(&mut self.counters.rejected_checksum);
+            Err(Rejection::Checksum)
+        } else if after.refused != before.refused {
+            bump(&mut self.counters.refused);
+            Err(Rejection::Refused)
+        } else if after.others != before.others && len.is_none() {
+            bump(&mut self.counters.rejected_other_device);
+            Err(Rejection::OtherDevice)
+        } else {
+            Ok(())
+        };
+        let request = request.get(..heard).unwrap_or(&[]);
+        tap.record(|| came(self.id, now, verdict, None, [request, &[], &[]]));
+        if let Err(why) = verdict
+            && why != Rejection::OtherDevice
+        {
+            keep(&mut self.last_rejection, why, None, request, now);
+        }
+        accepted
+    }
+
+    /// The reply that waits for the line.
+    pub(super) fn next_reply(&mut self, out: &mut [u8], now: Instant) -> Option<usize> {
+        let may_send = self.is_usable() && !self.sender.is_busy() && now >= self.line.quiet_at();
+        let Codec::Device(DeviceCodec { reader: Some(Reader::Slave(slave)), .. }) = &mut self.codec else {
+            return None;
+        };
+        let len = if may_send { slave.take_kept(out)? } else { return None };
+        self.sender.hold();
+        self.sender.frames_sent = self.sender.frames_sent.wrapping_add(1);
+        bump(&mut self.counters.frames_out);
+        super::counters::add(&mut self.counters.bytes_out, len);
+        Some(len)
+    }
+
+    /// When a reply may be sent that waits.
+    pub(super) fn reply_deadline(&self) -> Instant {
+        match &self.codec {
+            Codec::Device(DeviceCodec { reader: Some(Reader::Slave(slave)), .. })
+                if slave.has_kept() && !self.sender.is_busy() =>
+            {
+                self.line.quiet_at()
+            }
+            _ => Instant::NEVER,
+        }
+    }
+}

@@ -1,0 +1,765 @@
+//! Conversations on field ports: requests out, replies in, and what happens without them.
+//!
+//! In: bytes and CAN frames of ports whose recipe has exchanges, the time. Out: values in the store,
+//! and requests. Which exchange is next is the line's business ([`super::line`]); ports without
+//! exchanges do not come here.
+
+use super::command_link::CommandLink;
+use super::counters::{add, bump};
+use super::device_port::{DeviceCodec, DeviceFormat, better, elements, probe};
+use super::exchanges::{Asks, InputFormat, Item, View};
+use super::field_output::Downward;
+use super::field_port::{Accepted, Codec, FieldPort, Frames, came, keep};
+use super::io::{Output, PortId};
+use super::line::{Flight, Line, Phase, Talks};
+use super::rejection::Rejection;
+use super::sender::{DIGEST_SEED, Sender, digest};
+use super::store::Store;
+use super::tap::{Tap, TapPlace};
+use super::user::{InputBind, OutputBind, number_of};
+use super::whole_port::{self, Reader};
+use super::{Engine, OUTPUT_BUFFER, find_port};
+use crate::config::OutputBinding;
+use crate::device::{Found, Probe};
+use crate::image::Image;
+use crate::modbus::rtu::{self, Expected, MAX_ADU, REFUSAL_LEN};
+use crate::schedule::Row;
+use crate::sysvar::SysVar;
+use crate::time::Instant;
+use crate::wire::can::{CanFrame, MAX_CAN_DATA};
+use crate::wire::scalar::Scalar;
+
+/// What a received frame is.
+enum Heard<'i> {
+    /// The awaited reply; the data of a Modbus frame, or the frame.
+    Reply(Option<&'i InputFormat>),
+    /// The device refuses the request.
+    Refusal,
+    /// A frame that comes unasked, and its place in the store.
+    Unasked(&'i DeviceFormat, usize),
+}
+
+/// What may come now.
+#[derive(Clone, Copy)]
+struct Awaited<'i> {
+    /// The frames of the recipe's part.
+    formats: &'i [DeviceFormat],
+    first_frame: u8,
+    items: &'i [Item],
+    flight: Option<Flight>,
+    bindings: &'i [InputBind],
+}
+
+impl<'i> Awaited<'i> {
+    fn asked(&self) -> Option<&'i Item> {
+        self.items.get(usize::from(self.flight?.exchange))
+    }
+
+    fn expected(&self) -> Option<Expected> {
+        self.flight?.expected
+    }
+
+    /// The reply and the refusal that a device's own frames are.
+    fn answers(&self) -> impl Iterator<Item = &'i DeviceFormat> {
+        let item = self.asked().filter(|item| matches!(item.asks, Asks::Frame | Asks::Remote { .. }));
+        let reply = |item: &'i Item| item.reply.iter().map(|reply| &reply.format).chain(&item.refusal);
+        item.into_iter().flat_map(reply)
+    }
+
+    fn unasked(&self) -> impl Iterator<Item = (&'i DeviceFormat, usize)> {
+        let part = (usize::from(self.first_frame)..).zip(self.formats).map(|(slot, format)| (format, slot));
+        let others = self.items.iter().filter(|item| matches!(item.asks, Asks::Nothing));
+        let others = others.filter_map(|item| item.reply.as_ref());
+        part.chain(others.map(|reply| (&reply.format, usize::from(reply.slot))))
+    }
+
+    /// What bytes of a line are.
+    fn probe(&self, bytes: &[u8]) -> Probe {
+        let mut best = match self.expected() {
+            Some(expected) => match expected.probe(bytes) {
+                rtu::Probe::No => Probe::No(1),
+                rtu::Probe::Partial => Probe::Partial(1),
+                rtu::Probe::Reply(len) => Probe::Frame(len),
+                rtu::Probe::Refused(_) => Probe::Frame(REFUSAL_LEN),
+                rtu::Probe::Wrong => Probe::Wrong(expected.len_of(bytes)),
+            },
+            None => Probe::No(1),
+        };
+        for format in self.answers().chain(self.unasked().map(|(format, _)| format)) {
+            best = better(best, probe(format, self.bindings, bytes));
+        }
+        best
+    }
+
+    /// What a frame of a line is that [`Self::probe`] has found.
+    fn heard(&self, frame: &[u8]) -> Option<Heard<'i>> {
+        let is = |format: &DeviceFormat| matches!(probe(format, self.bindings, frame), Probe::Frame(len) if len == frame.len());
+        if let Some(expected) = self.expected() {
+            match expected.probe(frame) {
+                rtu::Probe::Reply(_) => return Some(Heard::Reply(self.asked()?.reply.as_ref())),
+                rtu::Probe::Refused(_) => return Some(Heard::Refusal),
+                _ => {}
+            }
+        }
+        self.answer(is).or_else(|| {
+            let (format, slot) = self.unasked().find(|(format, _)| is(format))?;
+            Some(Heard::Unasked(format, slot))
+        })
+    }
+
+    fn answer(&self, is: impl Fn(&DeviceFormat) -> bool) -> Option<Heard<'i>> {
+        let found = self.answers().find(|answer| is(answer))?;
+        let reply = self.asked()?.reply.as_ref();
+        let reply = reply.filter(|reply| core::ptr::eq(&reply.format, found));
+        Some(reply.map_or(Heard::Refusal, |reply| Heard::Reply(Some(reply))))
+    }
+}
+
+impl FieldPort {
+    /// The conversation, if the recipe has exchanges.
+    pub(super) fn line(&self) -> Option<&Line> {
+        match &self.codec {
+            Codec::Device(device) => device.line.as_ref(),
+            _ => None,
+        }
+    }
+
+    fn line_mut(&mut self) -> Option<&mut Line> {
+        match &mut self.codec {
+            Codec::Device(device) => device.line.as_mut(),
+            _ => None,
+        }
+    }
+
+    fn is_on_can(&self) -> bool {
+        matches!(&self.codec, Codec::Device(device) if device.reader.is_none())
+    }
+
+    /// When its conversation has something to do without an input.
+    pub(super) fn talk_deadline(&self) -> Instant {
+        match self.line() {
+            Some(line) if self.is_usable() => {
+                let deadline = line.deadline(&self.line);
+                // Until the line is free, there is only that to wait for.
+                let own = if self.sender.is_busy() && line.may_ask() { Instant::NEVER } else { deadline };
+                own.min(self.slave_deadline()).min(self.reply_deadline())
+            }
+            _ => Instant::NEVER,
+        }
+    }
+
+    /// The bytes behind the echo of the own request.
+    fn behind_echo<'b>(&mut self, bytes: &'b [u8]) -> &'b [u8] {
+        let Some(line) = self.line_mut() else { return bytes };
+        let echoed = usize::from(line.echo).min(bytes.len());
+        line.echo = line.echo.saturating_sub(echoed as u16);
+        bytes.get(echoed..).unwrap_or(&[])
+    }
+
+    /// Whether the gateway is the slave of a line, which takes its bytes.
+    fn hears_master(&mut self, bytes: &[u8], now: Instant) -> bool {
+        let Codec::Device(DeviceCodec { reader: Some(Reader::Slave(slave)), .. }) = &mut self.codec else {
+            return false;
+        };
+        slave.received(bytes, now);
+        true
+    }
+
+    /// Reads the frames in `rest`; stops after the first accepted one if the image is to be checked
+    /// after each frame.
+    fn talk_frames<const PORTS: usize, const TAP: usize>(
+        &mut self,
+        rest: &mut &[u8],
+        bindings: &[InputBind],
+        store: &mut Store<PORTS>,
+        commands: Option<&mut CommandLink>,
+        tap: &mut Tap<TAP>,
+        mut view: View<'_>,
+    ) -> Accepted {
+        let mut accepted = Accepted::default();
+        let (now, usable, bytes) = (store.now, self.is_usable(), *rest);
+        let mut left = core::mem::take(rest);
+        let Codec::Device(DeviceCodec {
+            formats,
+            inputs,
+            texts,
+            reader: Some(Reader::Search(framer)),
+            skipped_bytes: noise_bytes,
+            line: Some(line),
+            ..
+        }) = &mut self.codec
+        else {
+            return accepted;
+        };
+        let formats = formats.get(..usize::from(*inputs)).unwrap_or(&[]);
+        let (items, mut talks) = view.of(line);
+        let mut frames =
+            Frames::new((self.id, self.mode), &mut self.reply, &mut self.counters, bindings, store, commands);
+        let mut awaited =
+            Awaited { formats, first_frame: self.first_frame, items, flight: line.flight(), bindings };
+        let effort = |awaited: &Awaited<'_>| {
+            let all = awaited.answers().chain(awaited.unasked().map(|(format, _)| format));
+            all.map(|format| format.layout.lengths().1.saturating_add(usize::from(format.bindings.len)))
+                .fold(MAX_ADU, usize::saturating_add)
+        };
+        while let Some(found) = framer.next_frame(&mut left, effort(&awaited), |bytes| awaited.probe(bytes)) {
+            let (frame, verdict) = match found {
+                Found::Frame(frame) => {
+                    let heard = awaited.heard(frame);
+                    let verdict = match &heard {
+                        Some(Heard::Reply(Some(reply))) => {
+                            let data = match awaited.expected() {
+                                Some(_) => frame.get(3..frame.len().saturating_sub(2)).unwrap_or(&[]),
+                                None => frame,
+                            };
+                            frames.take_device(
+                                &reply.format,
+                                texts,
+                                data,
+                                usize::from(reply.slot),
+                                &mut accepted,
+                            )
+                        }
+                        Some(Heard::Unasked(format, slot)) => {
+                            frames.take_device(format, texts, frame, *slot, &mut accepted)
+                        }
+                        // A write was carried out.
+                        Some(Heard::Reply(None)) => Ok(()),
+                        Some(Heard::Refusal) => Err(Rejection::Refused),
+                        None => Err(Rejection::NoFrame),
+                    };
+                    if let (Some(Heard::Reply(_) | Heard::Refusal), Some(flight), Some(item)) =
+                        (&heard, awaited.flight, awaited.asked())
+                    {
+                        let is_refused = matches!(heard, Some(Heard::Refusal));
+                        let code = frame.get(2).copied().unwrap_or(0);
+                        note_answer(&mut talks, flight, is_refused.then_some(code));
+                        if is_refused {
+                            bump(&mut frames.counters.refused);
+                        }
+                        if matches!(line.phase, Phase::Waiting(_)) {
+                            self.sender.sent();
+                        }
+                        line.answered(&mut talks, flight, item.times, now);
+                    }
+                    (frame, verdict)
+                }
+                Found::Other(frame) => (frame, frames.rejected(Rejection::OtherDevice)),
+                Found::Wrong(frame) => {
+                    line.heard_wrong();
+                    (frame, frames.rejected(Rejection::Checksum))
+                }
+            };
+            awaited.flight = line.flight();
+            tap.record(|| came(self.id, now, verdict, None, [frame, &[], &[]]));
+            match verdict {
+                // What is held can hold further frames, so only the rest of the chunk waits.
+                Ok(()) if frames.store.watches_bits && !left.is_empty() => break,
+                Ok(()) => {}
+                Err(why) => keep(&mut self.last_rejection, why, None, frame, now),
+            }
+        }
+        *rest = left;
+        let stats = framer.stats();
+        self.counters.resync_bytes = stats.skipped_bytes;
+        // The bytes of a frame with a wrong checksum were reported as that.
+        let noise = stats.noise_bytes.wrapping_sub(*noise_bytes);
+        if noise > 0 {
+            *noise_bytes = stats.noise_bytes;
+            self.no_frame(bytes, noise as usize, tap, now);
+        }
+        self.sender.frames_accepted(accepted.frames, usable, &mut self.counters, now);
+        accepted
+    }
+
+    /// A frame from the bus.
+    fn talk_frame<const PORTS: usize>(
+        &mut self,
+        frame: &CanFrame,
+        bindings: &[InputBind],
+        store: &mut Store<PORTS>,
+        commands: Option<&mut CommandLink>,
+        mut view: View<'_>,
+        accepted: &mut Accepted,
+    ) -> Result<(), Rejection> {
+        let (now, usable) = (store.now, self.is_usable());
+        add(&mut self.counters.bytes_in, frame.data().len());
+        let Codec::Device(DeviceCodec { formats, inputs, texts, line: Some(line), .. }) = &mut self.codec
+        else {
+            return Ok(());
+        };
+        let formats = formats.get(..usize::from(*inputs)).unwrap_or(&[]);
+        let (items, mut talks) = view.of(line);
+        let mut frames =
+            Frames::new((self.id, self.mode), &mut self.reply, &mut self.counters, bindings, store, commands);
+        if frame.is_remote() {
+            return frames.rejected(Rejection::Remote);
+        }
+        let flight = line.flight();
+        let awaited = Awaited { formats, first_frame: self.first_frame, items, flight, bindings };
+        let seen = |format: &DeviceFormat| {
+            format.layout.probe_whole(elements(format.bindings.of(bindings)), frame.data())
+        };
+        let is = |format: &DeviceFormat| format.id == frame.id() && matches!(seen(format), Probe::Frame(_));
+        if let Some(heard) = awaited.answer(is)
+            && let (Some(flight), Some(item)) = (flight, awaited.asked())
+        {
+            let verdict = match heard {
+                Heard::Reply(Some(reply)) => {
+                    let slot = usize::from(reply.slot);
+                    frames.take_device(&reply.format, texts, frame.data(), slot, accepted)
+                }
+                _ => Err(Rejection::Refused),
+            };
+            let is_refused = verdict == Err(Rejection::Refused);
+            note_answer(&mut talks, flight, is_refused.then_some(0));
+            if is_refused {
+                bump(&mut frames.counters.refused);
+            }
+            line.answered(&mut talks, flight, item.times, now);
+            return verdict;
+        }
+        let Some((format, slot)) = awaited.unasked().find(|(format, _)| is(format)) else {
+            let mut all = awaited.answers().chain(awaited.unasked().map(|(format, _)| format));
+            let Some(format) = all.find(|format| format.id == frame.id()) else {
+                return frames.rejected(Rejection::ForeignId);
+            };
+            return frames.rejected(match seen(format) {
+                Probe::Wrong(_) => Rejection::Checksum,
+                Probe::Other(_) | Probe::No(_) if frame.data().len() == format.layout.lengths().0 => {
+                    Rejection::OtherDevice
+                }
+                _ => Rejection::WrongLength,
+            });
+        };
+        frames.take_device(format, texts, frame.data(), slot, accepted)?;
+        self.sender.frames_accepted(1, usable, &mut self.counters, now);
+        Ok(())
+    }
+
+    /// The next request, if the line is free for one.
+    fn next_request(
+        &mut self,
+        image: &Image,
+        bindings: &[OutputBind],
+        mut view: View<'_>,
+        out: &mut [u8],
+        now: Instant,
+    ) -> Option<Downward> {
+        if !self.is_usable() {
+            return None;
+        }
+        let is_busy = self.sender.is_busy() || now < self.line.quiet_at();
+        let Codec::Device(codec) = &mut self.codec else { return None };
+        // Apart from the rest of the codec, which makes the frames.
+        let mut line = codec.line.take()?;
+        let (items, mut talks) = view.of(&line);
+        let maker = Maker { image, bindings, codec, sender: &self.sender, reply: self.reply, now };
+        let request = maker.next(&mut line, items, &mut talks, is_busy, out);
+        let is_on_can = codec.reader.is_none();
+        if let (Some(_), Some(Reader::Search(framer))) = (&request, &mut codec.reader)
+            && !line.hears_unasked
+        {
+            // What is held is too old to be the reply.
+            add(&mut self.counters.discarded_bytes, framer.discard());
+        }
+        codec.line = Some(line);
+        let (item, len) = request?;
+        self.sender.hold();
+        bump(&mut self.counters.frames_out);
+        add(&mut self.counters.bytes_out, len);
+        self.sender.frames_sent = self.sender.frames_sent.wrapping_add(1);
+        if !is_on_can {
+            return Some(Downward::Bytes(len));
+        }
+        let item = view_item(&mut view, self.line()?, item)?;
+        if let Asks::Remote { id, len } = item.asks {
+            return CanFrame::remote(id, len.into()).map(Downward::Can);
+        }
+        let frame = out.get(..len).unwrap_or(&[]);
+        let id = item.request.as_ref()?.id;
+        Some(Downward::Can(CanFrame::filled(id, len.min(MAX_CAN_DATA) as u8, |data| {
+            for (slot, &byte) in data.iter_mut().zip(frame) {
+                *slot = byte;
+            }
+        })))
+    }
+
+    /// The request has left.
+    fn talk_sent(&mut self, mut view: View<'_>, now: Instant) {
+        let is_on_can = self.is_on_can();
+        let Some(line) = self.line_mut() else { return };
+        let (items, _) = view.of(line);
+        let times = |nth: u8| items.get(usize::from(nth)).map(|item| item.times);
+        // A bus is free for others while a reply is awaited.
+        if line.sent(times, now) && !is_on_can {
+            self.sender.hold();
+        }
+    }
+
+    /// Pauses end, and replies that have not come fail.
+    fn advance_talk(&mut self, mut view: View<'_>, now: Instant) {
+        let timing = self.line;
+        let Some(line) = self.line_mut() else { return };
+        line.advance(now);
+        let Some(failure) = line.failure(&timing, now) else { return };
+        let (items, mut talks) = view.of(line);
+        let Some(item) = items.get(usize::from(failure.0.exchange)) else { return };
+        let is_over = line.failed(&mut talks, failure, item.times, now);
+        self.sender.sent();
+        if is_over {
+            bump(&mut self.counters.unanswered);
+        }
+    }
+
+    fn abandon_talk(&mut self, mut view: View<'_>, now: Instant) {
+        let Some(line) = self.line_mut() else { return };
+        let was_waiting = matches!(line.phase, Phase::Waiting(_));
+        let (_, mut talks) = view.of(line);
+        line.abandon(&mut talks, now);
+        if was_waiting {
+            self.sender.sent();
+        }
+    }
+
+    fn begin_talk(&mut self, mut view: View<'_>, now: Instant) {
+        let Some(line) = self.line_mut() else { return };
+        let (items, mut talks) = view.of(line);
+        for item in items {
+            (item.digest, item.last_bit) = (None, None);
+        }
+        line.begin(&mut talks, now);
+        line.looks = line.looks.map(|grid| crate::schedule::Grid::starting_at(now, grid.period()));
+    }
+}
+
+fn view_item<'v>(view: &'v mut View<'_>, line: &Line, nth: u8) -> Option<&'v Item> {
+    view.of(line).0.get(usize::from(nth))
+}
+
+/// Counts an answer at its peer; a refusal comes with its code.
+fn note_answer(talks: &mut Talks<'_>, flight: Flight, refusal: Option<u8>) {
+    let peer = talks.rows.get(usize::from(flight.exchange)).map_or(0, Row::peer);
+    let Some(peer) = talks.peers.get_mut(usize::from(peer)) else { return };
+    match refusal {
+        None => bump(&mut peer.counters.replies),
+        Some(code) => {
+            bump(&mut peer.counters.refused);
+            peer.counters.refusal = code;
+        }
+    }
+}
+
+/// Makes the frames of requests.
+struct Maker<'a> {
+    image: &'a Image,
+    bindings: &'a [OutputBind],
+    codec: &'a DeviceCodec,
+    sender: &'a Sender,
+    reply: super::io::ReplyCode,
+    now: Instant,
+}
+
+impl Maker<'_> {
+    /// Looks at values and bits that ask, and makes the next request. Returns its exchange and its
+    /// length in `out`.
+    fn next(
+        &self,
+        line: &mut Line,
+        items: &mut [Item],
+        talks: &mut Talks<'_>,
+        is_busy: bool,
+        out: &mut [u8],
+    ) -> Option<(u8, usize)> {
+        let now = self.now;
+        if line.looks.as_mut().is_some_and(|grid| grid.due(now).is_some()) {
+            for (nth, item) in items.iter_mut().enumerate() {
+                if self.is_wanted(item, out) {
+                    line.request(talks, nth, now);
+                }
+            }
+        }
+        if is_busy || !line.may_ask() {
+            return None;
+        }
+        // Each exchange that has no values yet is passed over once.
+        for _ in 0..=items.len() {
+            let flight = line.next(talks, now)?;
+            let item = items.get(usize::from(flight.exchange))?;
+            let peer = talks.rows.get(usize::from(flight.exchange)).map_or(0, Row::peer);
+            let peer = talks.peers.get_mut(usize::from(peer))?;
+            let Some(len) = self.make(item, out) else {
+                bump(&mut peer.counters.unprepared);
+                continue;
+            };
+            bump(&mut peer.counters.requests);
+            let expected = match item.asks {
+                Asks::Rtu { operation, .. } => Expected::of(&operation, out.get(..len).unwrap_or(&[])),
+                _ => None,
+            };
+            line.handed_over(flight, expected, len);
+            return Some((flight.exchange, len));
+        }
+        None
+    }
+
+    /// Whether a value of the request has changed, or its bit has risen.
+    fn is_wanted(&self, item: &mut Item, out: &mut [u8]) -> bool {
+        let mut is_wanted = false;
+        if item.on_change
+            && let Some(len) = self.make(item, out)
+        {
+            let hash = digest(DIGEST_SEED, out.get(..len).unwrap_or(&[]));
+            is_wanted = item.digest != Some(hash);
+            item.digest = Some(hash);
+        }
+        if let Some((var, bit)) = item.rising
+            && self.image.is_known(var)
+        {
+            let on = is_set(self.image, var, bit);
+            is_wanted |= on && item.last_bit == Some(false);
+            item.last_bit = Some(on);
+        }
+        is_wanted
+    }
+
+    /// Writes a request to the front of `out`; `None` if a value of it is unknown or stale.
+    fn make(&self, item: &Item, out: &mut [u8]) -> Option<usize> {
+        let fields = item.request.as_ref().map_or(&[][..], |format| format.bindings.of(self.bindings));
+        if !fields.iter().all(|field| may_send(self.sender, self.image, field, self.now)) {
+            return None;
+        }
+        let number = |nth: usize| {
+            let field = fields.get(nth);
+            field.map_or(f64::NAN, |field| number_of(field, self.image, self.sender.frames_sent, self.reply))
+        };
+        match (item.asks, &item.request) {
+            (Asks::Rtu { slave, operation }, format) => {
+                operation.encode(slave, out.first_chunk_mut::<MAX_ADU>()?, |data| {
+                    format.as_ref().is_none_or(|format| {
+                        let codec = self.codec;
+                        let elements = fields.iter().map(OutputBind::element);
+                        let text =
+                            |nth: usize, out: &mut [u8]| codec.write_text(format, nth, self.image, out);
+                        let len = format.layout.encode_with(elements, number, text, data);
+                        len == Some(data.len())
+                    })
+                })
+            }
+            (Asks::Frame, Some(format)) => {
+                whole_port::encode(self.codec, format, self.bindings, self.image, number, out)
+            }
+            (Asks::Remote { .. }, _) => Some(0),
+            _ => None,
+        }
+    }
+}
+
+/// Whether a field's value is known, and fresh unless the recipe holds.
+pub(super) fn may_send(sender: &Sender, image: &Image, field: &OutputBind, now: Instant) -> bool {
+    match field.from {
+        OutputBinding::Variable { var, .. } | OutputBinding::Bit { var, .. } => {
+            image.known_since(var).is_some_and(|at| sender.is_fresh(at, now))
+        }
+        OutputBinding::State { .. } => sender.may_show(image, now),
+        _ => true,
+    }
+}
+
+fn is_set(image: &Image, var: SysVar, bit: u8) -> bool {
+    match image.value(var) {
+        Scalar::Byte(bits) => bits.checked_shr(u32::from(bit)).is_some_and(|bits| bits & 1 == 1),
+        _ => false,
+    }
+}
+
+impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: usize, const EXCHANGES: usize>
+    Engine<PORTS, UPLINKS, FIELDS, TAP, EXCHANGES>
+{
+    /// The output of a request, with its record.
+    #[cold]
+    #[inline(never)]
+    pub(super) fn request_output<'b>(
+        &mut self,
+        (port, request): (PortId, Downward),
+        buf: &'b [u8; OUTPUT_BUFFER],
+        now: Instant,
+    ) -> Output<'b> {
+        match request {
+            Downward::Bytes(len) => {
+                let bytes = buf.get(..len).unwrap_or(&[]);
+                self.tap.went(TapPlace::Port(port), None, bytes, now);
+                Output::PortSend { port, bytes }
+            }
+            Downward::Can(frame) => {
+                self.tap.went(TapPlace::Port(port), Some(frame.id()), frame.data(), now);
+                Output::PortSendCan { port, frame }
+            }
+        }
+    }
+
+    /// Takes bytes; false if the port's recipe has no exchanges.
+    #[cold]
+    #[inline(never)]
+    pub(super) fn talk_bytes(&mut self, id: PortId, bytes: &[u8], now: Instant) -> bool {
+        let Some(port) = find_port(&mut self.ports, id) else { return false };
+        if port.line().is_none() {
+            return false;
+        }
+        if self.is_deaf {
+            port.discard(bytes, None, &mut self.tap, now);
+            return true;
+        }
+        port.heard(bytes, now);
+        if port.hears_master(bytes, now) {
+            self.after_talk(id);
+            return true;
+        }
+        let mut rest = port.behind_echo(bytes);
+        loop {
+            let (store, command) = (&mut self.store, self.links.command.first_mut());
+            let Some(port) = find_port(&mut self.ports, id) else { return true };
+            let (inputs, view) = (&self.bindings.inputs, self.exchanges.view());
+            let accepted = port.talk_frames(&mut rest, inputs, store, command, &mut self.tap, view);
+            self.after_talk(id);
+            self.after_field(id, &accepted, now);
+            if rest.is_empty() {
+                return true;
+            }
+        }
+    }
+
+    /// Takes a frame; false if the port's recipe has no exchanges.
+    #[cold]
+    #[inline(never)]
+    pub(super) fn talk_can(&mut self, id: PortId, frame: &CanFrame, now: Instant) -> bool {
+        let (store, command) = (&mut self.store, self.links.command.first_mut());
+        let Some(port) = find_port(&mut self.ports, id) else { return false };
+        if port.line().is_none() {
+            return false;
+        }
+        if self.is_deaf {
+            port.discard(frame.data(), Some(frame.id()), &mut self.tap, now);
+            return true;
+        }
+        let mut accepted = Accepted::default();
+        let (inputs, view) = (&self.bindings.inputs, self.exchanges.view());
+        let verdict = port.talk_frame(frame, inputs, store, command, view, &mut accepted);
+        self.tap.record(|| came(id, now, verdict, Some(frame.id()), [frame.data(), &[], &[]]));
+        // On a shared bus, frames for others are no news.
+        if let Err(why) = verdict
+            && (why != Rejection::ForeignId || port.last_rejection.is_none())
+        {
+            keep(&mut port.last_rejection, why, Some(frame.id()), frame.data(), now);
+        }
+        self.after_talk(id);
+        self.after_field(id, &accepted, now);
+        true
+    }
+
+    /// The line may be free, or wait for something else.
+    fn after_talk(&mut self, id: PortId) {
+        self.ask.ports = true;
+        if let Some(port) = find_port(&mut self.ports, id) {
+            let deadline = port.deadline().min(port.talk_deadline());
+            self.arm(deadline);
+        }
+    }
+
+    #[cold]
+    #[inline(never)]
+    pub(super) fn talk_sent(&mut self, id: PortId) {
+        if let Some(port) = find_port(&mut self.ports, id) {
+            port.talk_sent(self.exchanges.view(), self.now);
+            self.after_talk(id);
+        }
+    }
+
+    /// The device is there.
+    pub(super) fn talk_begins(&mut self, id: PortId) {
+        if let Some(port) = find_port(&mut self.ports, id) {
+            port.begin_talk(self.exchanges.view(), self.now);
+            self.after_talk(id);
+        }
+    }
+
+    /// The device is gone.
+    pub(super) fn talk_ends(&mut self, id: PortId) {
+        if let Some(port) = find_port(&mut self.ports, id) {
+            port.abandon_talk(self.exchanges.view(), self.now);
+        }
+    }
+
+    /// The gateway slept.
+    pub(super) fn talk_slept(&mut self) {
+        for port in &mut self.ports {
+            port.abandon_talk(self.exchanges.view(), self.now);
+        }
+    }
+
+    #[cold]
+    #[inline(never)]
+    pub(super) fn advance_talk(&mut self, now: Instant) {
+        for index in 0..self.ports.len() {
+            let Some(port) = self.ports.get_mut(index) else { break };
+            port.advance_talk(self.exchanges.view(), now);
+            if port.is_asked(now) {
+                let id = port.id;
+                self.serve(id, now);
+            }
+        }
+    }
+
+    /// A master's request has ended.
+    fn serve(&mut self, id: PortId, now: Instant) {
+        self.show_health(now);
+        let (store, command) = (&mut self.store, self.links.command.first_mut());
+        let Some(port) = find_port(&mut self.ports, id) else { return };
+        if self.is_deaf {
+            return port.discard_partial(&mut self.tap, now);
+        }
+        let bindings = (&self.bindings.inputs[..], &self.bindings.outputs[..]);
+        let accepted = port.serve(bindings, store, command, &mut self.tap, self.exchanges.view());
+        self.after_talk(id);
+        self.after_field(id, &accepted, now);
+    }
+
+    #[cold]
+    #[inline(never)]
+    pub(super) fn talk_deadline(&self) -> Instant {
+        if self.is_deaf {
+            return Instant::NEVER;
+        }
+        self.ports.iter().map(FieldPort::talk_deadline).min().unwrap_or(Instant::NEVER)
+    }
+
+    /// The next request of a port.
+    #[cold]
+    #[inline(never)]
+    pub(super) fn next_request(&mut self, out: &mut [u8], now: Instant) -> Option<(PortId, Downward)> {
+        if self.is_deaf {
+            return None;
+        }
+        if self.ports.iter().any(|port| port.line().is_some_and(|line| line.is_free(now))) {
+            self.show_health(now);
+        }
+        let mut first = Instant::NEVER;
+        let mut found = None;
+        for port in &mut self.ports {
+            if found.is_none()
+                && let Some(len) = port.next_reply(out, now)
+            {
+                found = Some((port.id, Downward::Bytes(len)));
+            }
+            if found.is_some() || !port.line().is_some_and(|line| line.is_free(now)) {
+                continue;
+            }
+            let view = self.exchanges.view();
+            let request = port.next_request(&self.store.image, &self.bindings.outputs, view, out, now);
+            found = request.map(|downward| (port.id, downward));
+            first = first.min(port.talk_deadline());
+        }
+        self.arm(first);
+        found
+    }
+}

@@ -1,0 +1,312 @@
+//! Exchanges that a program writes: what is refused, where, and how long they take.
+
+use proto_core::config::*;
+use proto_core::device::Encoding;
+use proto_core::modbus::rtu::{Operation, Table};
+use proto_core::time::Duration;
+use proto_core::wire::can::CanId;
+use proto_core::wire::scalar::ScalarType::{Byte, Dword, Float, Word};
+
+type Config = GatewayConfig;
+
+fn ms(ms: u64) -> Duration {
+    Duration::from_millis(ms)
+}
+
+fn register() -> [InputField<'static>; 1] {
+    [InputField::variable(Word, "WordInputReg[1]")]
+}
+
+fn value() -> [OutputField<'static>; 1] {
+    [OutputField::variable(Word, "WordOutputReg[1]")]
+}
+
+/// A configuration with one recipe of these exchanges on a line of its own.
+fn with(asks: &[Ask<'_>]) -> Result<Config, ConfigError> {
+    let config = Config::builder().controller("10.0.0.2").recipe(Recipe::user("line").exchanges(asks));
+    match asks.iter().any(|ask| format!("{ask:?}").contains("Some(Standard")) {
+        true => config.port(Port::can("line", "line")).build(),
+        false => config.port(Port::modbus_rtu("line", "line").baud(19_200)).build(),
+    }
+}
+
+#[track_caller]
+fn refused(asks: &[Ask<'_>]) -> String {
+    with(asks).expect_err("it is wrong").to_string()
+}
+
+#[track_caller]
+fn assert_refused(asks: &[Ask<'_>], said: &str) {
+    assert_eq!(refused(asks), format!("recipe 1, exchange {}: {said}", asks.len()));
+}
+
+/// `nth` says which key, with its comma.
+#[track_caller]
+fn assert_refused_at(asks: &[Ask<'_>], key: &str, said: &str) {
+    assert_eq!(refused(asks), format!("recipe 1, exchange {}, {key}: {said}", asks.len()));
+}
+
+#[test]
+fn mistakes_in_modbus_have_their_place() {
+    let (register, value) = (register(), value());
+    let read = Ask::read_holding_registers(9, 0, &register).every(ms(100));
+    let write = Ask::write_registers(9, 0, &value).on_change();
+    assert!(with(&[read, write]).is_ok());
+    assert_refused(
+        &[Ask::read_holding_registers(9, 0, &register)],
+        "it would never be asked; set every_ms or on",
+    );
+    assert_refused_at(
+        &[read, Ask::write_registers(248, 0, &value).on_change()],
+        "peer",
+        "slave 248 is out of range; allowed: 1..=247, or 0 to write to all of them",
+    );
+    assert_refused_at(
+        &[Ask::read_holding_registers(0, 0, &register).at_start()],
+        "peer",
+        "slave 0 is all of them, which cannot be read; allowed: writes",
+    );
+    assert_refused_at(&[read.every(ms(0))], "period", "must be longer than 0");
+    assert_refused_at(&[read.timeout(ms(0))], "timeout", "must be longer than 0");
+    assert_refused_at(&[read.pause(ms(10_001))], "pause", "10001 ms is too long; at most 10000 ms");
+    assert_refused_at(
+        &[read.on_rising("WordOutputReg[1]", 0)],
+        "rising bit",
+        "WordOutputReg[1] is a word; a trigger needs a variable made of bits",
+    );
+    assert_refused_at(
+        &[Ask::read_holding_registers(9, 0xFFFF, &[InputField::padding(4)]).every(ms(100))],
+        "registers or coils",
+        "65535 to 65536 are out of range; the last register or coil is 65535",
+    );
+    assert_refused_at(
+        &[Ask::read_holding_registers(9, 0, &[InputField::padding(3)]).every(ms(100))],
+        "registers or coils",
+        "the fields have 3 bytes, the registers or coils 2; pad fills them up",
+    );
+    assert_refused_at(
+        &[Ask::read_holding_registers(9, 0, &[InputField::padding(255)]).every(ms(100))],
+        "registers or coils",
+        "a count of 127 is out of range; allowed: 1..=125",
+    );
+    assert_refused_at(
+        &[Ask::read_coils(9, 0, &register).every(ms(100))],
+        "registers or coils",
+        "the fields of coils are one bit each; their type is Coil",
+    );
+    assert_refused_at(
+        &[Ask::write_register(9, 0, &[OutputField::variable(Dword, "WordOutputReg[1]")]).on_change()],
+        "registers or coils",
+        "the fields have 4 bytes, the registers or coils 2; pad fills them up",
+    );
+    assert_refused_at(
+        &[Ask::read_holding_registers(9, 0, &[InputField::unused(Encoding::decimal_until(b','))])
+            .every(ms(100))],
+        "registers or coils",
+        "fields in registers have a fixed length; give the text a width",
+    );
+    // Frames are counted on: the first of the output part, field 2.
+    let wrong =
+        [OutputField::padding(2, 0), OutputField::variable(Word, "WordOutputReg[1]").scaled(0.0, 0.0)];
+    assert_eq!(
+        refused(&[read, write, Ask::write_registers(9, 7, &wrong).on_change()]),
+        "recipe 1, output part, frame 2, field 2: scale 0 and offset 0 must be finite numbers, and scale \
+         not 0: the value would be lost"
+    );
+    let many: Vec<_> = (1..=33).map(|slave| Ask::write_registers(slave, 0, &value).on_change()).collect();
+    assert!(with(&many[..32]).is_ok());
+    assert_refused_at(&many, "peer", "one slave or other peer too many; allowed: up to 32 on a port");
+}
+
+#[test]
+fn mistakes_in_blocks_have_their_place() {
+    let (register, value) = (register(), value());
+    let block = Ask::served(5, Table::HoldingRegisters, 10, &value);
+    assert!(with(&[block, Ask::served(5, Table::HoldingRegisters, 11, &register)]).is_ok());
+    assert!(with(&[block, Ask::served(5, Table::InputRegisters, 10, &value)]).is_ok(), "another table");
+    assert_refused_at(
+        &[block, Ask::served(5, Table::HoldingRegisters, 9, &[InputField::padding(4)])],
+        "registers or coils",
+        "an earlier block has some of these registers or coils",
+    );
+    assert_refused_at(
+        &[block, Ask::served(6, Table::Coils, 9, &[OutputField::constant(Coil, 1.0)])],
+        "peer",
+        "the blocks of a slave have one address",
+    );
+    assert_refused_at(
+        &[Ask::served(0, Table::Coils, 9, &[OutputField::constant(Coil, 1.0)])],
+        "peer",
+        "address 0 is out of range; allowed: 1..=247",
+    );
+    assert_refused(&[block.every(ms(100))], "there is no request to send; remove every_ms and on");
+    assert_refused(
+        &[block, Ask::read_holding_registers(9, 0, &register).every(ms(100))],
+        "a recipe has exchanges of one kind: Modbus master, Modbus slave, or frames",
+    );
+    // A master writes input registers: nothing such is served.
+    let mut config = with(&[block]).unwrap();
+    let Talk::Served { operation, .. } = &mut config.exchanges[0].talk else { panic!() };
+    *operation = Operation::WriteRegister { address: 10 };
+    assert_eq!(config.validate().unwrap_err().kind, ConfigErrorKind::Exchange(ExchangeError::NotServed));
+}
+
+#[test]
+fn mistakes_in_frames_have_their_place() {
+    let (register, value) = (register(), value());
+    let frame = AskFrame::stream(&[2], &[3], &value);
+    let reply = AskFrame::stream(&[2], &[3], &register);
+    let ask = Ask::request(frame).every(ms(100));
+    assert!(
+        with(&[ask.reply(reply), Ask::unasked(AskFrame::stream(&[4], &[], &[InputField::unused(Byte)]))])
+            .is_ok()
+    );
+    assert_refused(&[Ask::request(frame)], "it would never be asked; set every_ms or on");
+    assert_refused(&[Ask::unasked(reply).at_start()], "there is no request to send; remove every_ms and on");
+    assert_refused_at(&[ask.refusal(reply)], "refusal", "a refusal answers a request that has a reply");
+    assert_refused_at(
+        &[ask.reply(AskFrame::stream(&[4], &[], &[InputField::unused(Byte)])).refusal(reply)],
+        "refusal",
+        "a refusal only tells that the device refuses; its fields have no to and no commands",
+    );
+    let id = CanId::Standard(0x701);
+    let unused = [InputField::unused(Byte)];
+    let can = AskFrame::can(id, &unused);
+    assert!(with(&[Ask::request(AskFrame::remote(id)).reply(can).at_start()]).is_ok());
+    assert_refused_at(
+        &[Ask::request(frame).reply(can).at_start()],
+        "request",
+        "frames of a CAN recipe have an id, those of a stream recipe have none",
+    );
+    assert_refused_at(
+        &[Ask::request(AskFrame::can(id, &value)).reply(AskFrame::remote(id)).at_start()],
+        "reply",
+        "only a request can be remote",
+    );
+    assert_eq!(
+        refused(&[ask, ask.reply(AskFrame::stream(&[], &[], &register))]),
+        "recipe 1, input part, frame 1: nothing tells where a frame begins: a head, a tail, a checksum or \
+         a constant is needed"
+    );
+    let mut config = with(&[ask]).unwrap();
+    config.exchanges[0].talk = Talk::Frames { request: Some(7), reply: None, refusal: None };
+    let error = config.validate().unwrap_err();
+    assert_eq!(error.kind, ConfigErrorKind::OutsidePool { end: 8, len: 1 });
+    config.exchanges[0].talk = Talk::Frames { request: None, reply: None, refusal: None };
+    assert_eq!(config.validate().unwrap_err().kind, ConfigErrorKind::Exchange(ExchangeError::Nothing));
+}
+
+#[test]
+fn a_refused_recipe_leaves_nothing_behind() {
+    let value = value();
+    let mut config: GatewayConfig<1, 1, 8, 0, 0, 2> = GatewayConfig::empty();
+    let wrong = [OutputField::variable(Word, "NoSuchReg[1]")];
+    let asks = [
+        Ask::request(AskFrame::stream(&[1], &[], &value)),
+        Ask::request(AskFrame::stream(&[1], &[], &wrong)),
+    ];
+    let error = config.add_recipe(&Recipe::user("line").exchanges(&asks)).unwrap_err();
+    assert_eq!(
+        error.place,
+        Place::Field { recipe: 0, part: proto_core::sysvar::Direction::Output, frame: 1, field: 0 }
+    );
+    assert_eq!((config.exchanges.len(), config.frames.len(), config.fields.len()), (0, 0, 0));
+    let asks = [Ask::write_registers(1, 0, &value); 3];
+    let error = config.add_recipe(&Recipe::user("line").exchanges(&asks)).unwrap_err();
+    assert_eq!(error.kind, ConfigErrorKind::TooMany { what: Counted::Exchanges, needed: 3, room: 2 });
+}
+
+/// 19 200 bit/s, 10 bits a character: 520.8 µs each; 3.5 characters are 1823 µs.
+#[test]
+fn an_exchange_takes_its_frames_silences_and_pause() {
+    let (register, value) = (register(), value());
+    let config = with(&[
+        Ask::read_holding_registers(9, 0, &register).every(ms(100)).timeout(ms(50)).pause(ms(5)),
+        Ask::write_coil(0, 0, &[OutputField::constant(Coil, 1.0)]).at_start(),
+        Ask::write_registers(8, 0, &value).on_change(),
+    ])
+    .unwrap();
+    let port = &config.ports[0];
+    let budget = |nth: usize| config.view().exchange_budget(port, &config.exchanges[nth]);
+    let us = Duration::from_micros;
+    let read = budget(0);
+    assert_eq!((read.request, read.reply), (8, 7));
+    let request = us(1_823) + us(4_167);
+    assert_eq!(read.time, request + us(1_823) + us(3_646) + ms(5));
+    assert_eq!(read.time_without_reply, request + ms(50) + ms(5));
+    let broadcast = budget(1);
+    assert_eq!((broadcast.request, broadcast.reply), (8, 0));
+    assert_eq!(broadcast.time, request + ms(100), "the time that slaves have after a broadcast");
+    assert_eq!(broadcast.time_without_reply, broadcast.time);
+    assert_eq!(budget(2).request, 11);
+    // Only the first has a period: 16.459 of 100 ms.
+    assert_eq!(config.view().line_share(port), Some(17));
+}
+
+#[test]
+fn a_line_that_is_full_and_a_timeout_that_is_short_are_told() {
+    let register = register();
+    let warnings = |every, timeout| {
+        let config: Config = Config::builder()
+            .controller("10.0.0.2")
+            .recipe(Recipe::user("line").exchanges(&[
+                Ask::read_holding_registers(9, 0, &register).every(every),
+                Ask::write_registers(9, 0, &[OutputField::padding(2, 0)]).every(ms(1_000)),
+            ]))
+            .port(Port::modbus_rtu("line", "line").baud(19_200).timeout(timeout))
+            .build()
+            .unwrap();
+        let view = config.view();
+        view.warnings().map(|warning| view.describe_warning(warning).to_string()).collect::<Vec<_>>()
+    };
+    assert_eq!(warnings(ms(100), ms(300)), [""; 0]);
+    // 11.459 ms in 11, and 13.5 in 1000.
+    assert_eq!(warnings(ms(12), ms(300)), [""; 0]);
+    assert_eq!(
+        warnings(ms(11), ms(300)),
+        [
+            "port \"line\": the exchanges with a period take 106 % of the line's time, so they are asked less often"
+        ]
+    );
+    let said = "port \"line\": an exchange is asked every 300 ms, but the timeout is 300 ms, so its values are overdue \
+                until the next reply";
+    assert_eq!(warnings(ms(300), ms(300)), [said], "a write has no values that can be overdue");
+}
+
+#[test]
+fn a_conversation_on_can_takes_its_frames() {
+    let config = with(&[Ask::request(AskFrame::remote(CanId::Standard(1)))
+        .reply(AskFrame::can(
+            CanId::Standard(1),
+            &[InputField::variable(Float, "WordInputReg[1]"), InputField::padding(4)],
+        ))
+        .every(ms(10))])
+    .unwrap();
+    let budget = config.view().exchange_budget(&config.ports[0], &config.exchanges[0]);
+    let frames =
+        can_frame_time(CanId::Standard(1), 0, 500_000) + can_frame_time(CanId::Standard(1), 8, 500_000);
+    assert_eq!((budget.request, budget.reply, budget.time), (0, 8, frames));
+    assert_eq!(config.recipes[0].parts, Parts::Can { input: Default::default(), output: Default::default() });
+}
+
+#[test]
+fn an_echo_needs_exchanges() {
+    let echo = |recipe: RecipeBuilder<'_>| {
+        Config::builder()
+            .controller("10.0.0.2")
+            .recipe(recipe)
+            .port(Port::rs485("line", "line").echo())
+            .build()
+    };
+    let one = [OutputField::constant(Byte, 1.0)];
+    let plain = Recipe::user("line").stream_output(&[1], &[], &one);
+    let error = echo(plain).unwrap_err().to_string();
+    assert_eq!(
+        error,
+        "port 1, echo: allowed only with a recipe of exchanges: other frames are not told from their echo"
+    );
+    let value = value();
+    let asks = [Ask::request(AskFrame::stream(&[1], &[], &value)).at_start()];
+    let config = echo(Recipe::user("line").exchanges(&asks)).unwrap();
+    assert!(matches!(config.ports[0].bus, Bus::Rs485(line) if line.echo));
+}

@@ -1,0 +1,220 @@
+//! Conversations with frames of a device's own, on lines and on CAN.
+
+use proto_core::config::*;
+use proto_core::device::{ByteOrder, Encoding, Overflow};
+use proto_core::engine::{Input, PortId, Rejection};
+use proto_core::recipe::model::Mode;
+use proto_core::wire::can::{CanFrame, CanId};
+use proto_core::wire::scalar::ScalarType as T;
+
+use crate::line::*;
+use crate::rig::*;
+
+fn byte() -> Encoding {
+    Encoding::scalar(T::Byte)
+}
+
+fn fixed(value: i64) -> FieldSpec {
+    FieldSpec::Fixed { encoding: byte(), value }
+}
+
+fn byte_to(name: &str) -> FieldSpec {
+    FieldSpec::DeviceInput { encoding: byte(), overflow: Overflow::Usual, to: to(name) }
+}
+
+/// Adds a frame of an exchange and returns its index.
+fn frame(cell: &mut Cell, id: Option<u16>, head: &[u8], tail: &[u8], fields: Vec<FieldSpec>) -> Option<u8> {
+    let fields = cell.fields(fields);
+    let bytes = |bytes| Delimiter::from_slice(bytes).unwrap();
+    let index = cell.0.frames.len() as u8;
+    let id = id.map(CanId::Standard);
+    cell.0
+        .frames
+        .push(FrameSpec { id, remote: false, head: bytes(head), tail: bytes(tail), fields })
+        .unwrap();
+    Some(index)
+}
+
+fn asks(request: Option<u8>, reply: Option<u8>, refusal: Option<u8>, when: AskWhen) -> Exchange {
+    Exchange::new(0, Talk::Frames { request, reply, refusal }, when)
+}
+
+/// A screwdriver: `Q` asks for torque and angle, which `A` answers and `N` refuses with a code. It says
+/// `E` with a number when somebody presses its lever.
+fn screwdriver(cell: &mut Cell) -> PortId {
+    let request = frame(cell, None, &[], b"\r", vec![fixed(0x51)]);
+    let reply = frame(cell, None, b"A", b"\r", vec![byte_to("WordInputReg[1]"), byte_to("WordInputReg[2]")]);
+    let refusal = frame(cell, None, b"N", b"\r", vec![FieldSpec::Padding { len: 1, fill: 0 }]);
+    let event = frame(cell, None, b"E", b"\r", vec![byte_to("WordInputReg[4]")]);
+    let table =
+        [asks(request, reply, refusal, AskWhen::every(MS(50))), asks(None, event, None, AskWhen::NEVER)];
+    talking(cell, &table)
+}
+
+#[test]
+fn a_reply_a_refusal_and_what_comes_unasked_are_told_apart() {
+    let mut cell = Cell::new();
+    let port = screwdriver(&mut cell);
+    let mut line = Line::new(&cell, port);
+    let asked = line.run(MS(120), |request| {
+        assert_eq!(request, b"Q\r");
+        Some((MS(5), b"E\x07\rA\x0B\x16\r".to_vec()))
+    });
+    assert!(asked.len() >= 2);
+    assert_eq!(line.rig.map.registers[8..12], [11, 22, 0, 7]);
+    line.run(MS(100), |_| Some((MS(5), b"N\x63\r".to_vec())));
+    assert_eq!(line.rig.map.registers[8..12], [11, 22, 0, 7]);
+    let counters = line.rig.counters(port);
+    assert!(counters.refused >= 1 && counters.unanswered == 0, "{counters:?}");
+    line.run(MS(30), |_| None);
+    // A reply that nobody waits for is no frame: it may be any age.
+    let port = line.port;
+    line.run(MS(300), |_| None);
+    let before = line.rig.counters(port).frames_in;
+    while !line.rig.sent_to(port).is_empty() {}
+    line.rig.run(MS(1));
+    let resync = line.rig.counters(port).resync_bytes;
+    line.rig.bytes(port, b"A\x01\x02\r");
+    let counters = line.rig.counters(port);
+    let is_waiting = counters.frames_in > before;
+    assert!(is_waiting || counters.resync_bytes == resync + 4);
+    line.rig.bytes(port, b"E\x09\r");
+    assert_eq!(line.rig.map.registers[11], 9);
+}
+
+#[test]
+fn a_request_waits_for_a_frame_of_the_part_to_leave_and_the_part_for_the_reply() {
+    let mut cell = Cell::new();
+    let request = frame(&mut cell, None, &[], &[], vec![fixed(0x51)]);
+    let reply = frame(&mut cell, None, b"A", b"", vec![byte_to("WordInputReg[1]")]);
+    let lamp = cell.fields([fixed(0x4C), fixed(1)]);
+    let output = cell.part(&[], &[], lamp);
+    let recipe = cell.recipe(Mode::User, Parts::Stream { input: None, output });
+    cell.0.exchanges.push(asks(request, reply, None, AskWhen::every(MS(10)))).unwrap();
+    cell.last_recipe().exchanges = Span { start: 0, len: 1 };
+    let port = cell.rs485(recipe);
+    let mut rig = cell.rig();
+    rig.reports_sent = false;
+    rig.log.clear();
+    rig.input(Input::PortSent { port });
+    let mut sent = Vec::new();
+    for _ in 0..200 {
+        rig.run(MS(1));
+        let now = rig.sent_to(port);
+        assert!(now.len() <= 1, "two frames at once: {now:?}");
+        let Some(frame) = now.first().cloned() else { continue };
+        rig.run(MS(1));
+        assert_eq!(rig.sent_to(port), Vec::<Vec<u8>>::new(), "{frame:?} has not left");
+        rig.input(Input::PortSent { port });
+        if frame == b"Q" {
+            assert_eq!(rig.sent_to(port), Vec::<Vec<u8>>::new(), "the reply is awaited");
+            rig.run(MS(2));
+            assert_eq!(rig.sent_to(port), Vec::<Vec<u8>>::new(), "the reply is awaited");
+            rig.bytes(port, b"A\x05");
+        }
+        sent.push(frame);
+    }
+    assert!(sent.iter().filter(|frame| *frame == b"Q").count() > 10, "{sent:?}");
+    assert!(sent.iter().filter(|frame| *frame == b"L\x01").count() > 10, "{sent:?}");
+    assert_eq!(rig.counters(port).unanswered, 0);
+}
+
+/// A CANopen encoder, node 5: NMT start, its position by SDO, its heartbeat.
+fn encoder(cell: &mut Cell) -> PortId {
+    let start = frame(cell, Some(0), &[], &[], vec![fixed(1), fixed(5)]);
+    let upload =
+        |sub| vec![fixed(0x40), fixed(0x04), fixed(0x60), fixed(sub), FieldSpec::Padding { len: 4, fill: 0 }];
+    let request = frame(cell, Some(0x605), &[], &[], upload(0));
+    let position = FieldSpec::DeviceInput {
+        encoding: Encoding { order: ByteOrder::Little, ..Encoding::scalar(T::Dword) },
+        overflow: Overflow::Usual,
+        to: to("WordInputReg[1]"),
+    };
+    let reply =
+        frame(cell, Some(0x585), &[], &[], vec![fixed(0x43), fixed(4), fixed(0x60), fixed(0), position]);
+    let abort = vec![fixed(0x80), fixed(4), fixed(0x60), fixed(0), FieldSpec::Padding { len: 4, fill: 0 }];
+    let refusal = frame(cell, Some(0x585), &[], &[], abort);
+    let heartbeat = frame(cell, Some(0x705), &[], &[], vec![byte_to("WordInputReg[2]")]);
+    let once = AskWhen { start: true, ..AskWhen::NEVER };
+    let table = [
+        asks(start, None, None, once),
+        asks(request, reply, refusal, AskWhen::every(MS(20))),
+        asks(None, heartbeat, None, AskWhen::NEVER),
+    ];
+    let parts = Parts::Can { input: Default::default(), output: Default::default() };
+    let recipe = cell.recipe(Mode::User, parts);
+    cell.0.exchanges.extend(table);
+    cell.last_recipe().exchanges = Span { start: 0, len: 3 };
+    cell.can_port(recipe)
+}
+
+#[test]
+fn a_canopen_node_is_started_and_asked_by_sdo() {
+    let mut cell = Cell::new();
+    let port = encoder(&mut cell);
+    let mut rig = cell.rig();
+    let (mut starts, mut uploads) = (0, 0_u8);
+    for step in 0..100_u8 {
+        rig.run(MS(5));
+        for frame in rig.can_sent_to(port) {
+            match (frame.id(), frame.data()) {
+                (CanId::Standard(0), [1, 5]) => starts += 1,
+                (CanId::Standard(0x605), [0x40, 4, 0x60, 0, 0, 0, 0, 0]) => {
+                    uploads += 1;
+                    // Another object's reply is not ours.
+                    rig.can(port, 0x585, &[0x43, 5, 0x60, 0, 99, 0, 0, 0]);
+                    rig.can(port, 0x585, &[0x43, 4, 0x60, 0, step, 1, 0, 0]);
+                }
+                other => panic!("{other:02X?}"),
+            }
+        }
+        if step % 20 == 0 {
+            rig.can(port, 0x705, &[5]);
+        }
+    }
+    assert_eq!(starts, 1);
+    assert!(uploads > 20, "{uploads}");
+    let counters = rig.counters(port);
+    assert_eq!((counters.rejected_other_device, counters.unanswered), (u32::from(uploads), 0));
+    assert!(rig.map.registers[8] > 256 && rig.map.registers[9] == 5);
+    // An abort is told.
+    rig.run(MS(20));
+    assert!(!rig.can_sent_to(port).is_empty());
+    rig.can(port, 0x585, &[0x80, 4, 0x60, 0, 0, 0, 2, 6]);
+    assert_eq!(rig.counters(port).refused, 1);
+    // After bus-off the node may have restarted.
+    rig.input(Input::PortBus { port, state: proto_core::engine::BusState::BusOff });
+    rig.input(Input::PortBus { port, state: proto_core::engine::BusState::Active });
+    rig.run(MS(50));
+    let again = rig.can_sent_to(port);
+    assert!(again.contains(&CanFrame::new(CanId::Standard(0), &[1, 5]).unwrap()), "{again:?}");
+}
+
+#[test]
+fn a_remote_request_polls_a_node() {
+    let mut cell = Cell::new();
+    let poll = frame(&mut cell, Some(0x181), &[], &[], vec![]);
+    cell.0.frames.last_mut().unwrap().remote = true;
+    let reply = frame(&mut cell, Some(0x181), &[], &[], vec![byte_to("WordInputReg[1]")]);
+    let recipe =
+        cell.recipe(Mode::User, Parts::Can { input: Default::default(), output: Default::default() });
+    cell.0.exchanges.push(asks(poll, reply, None, AskWhen::every(MS(15)))).unwrap();
+    cell.last_recipe().exchanges = Span { start: 0, len: 1 };
+    let port = cell.can_port(recipe);
+    let mut rig = cell.rig();
+    for _ in 0..10 {
+        rig.run(MS(10));
+        for frame in rig.can_sent_to(port) {
+            assert_eq!(frame, CanFrame::remote(CanId::Standard(0x181), 1).unwrap());
+            rig.can(port, 0x181, &[42]);
+        }
+    }
+    assert_eq!(rig.map.registers[8], 42);
+    // Unasked, its age is not known.
+    rig.run(MS(1));
+    assert_eq!(rig.can_sent_to(port), []);
+    rig.can(port, 0x181, &[43]);
+    let now = rig.now;
+    let last = rig.engine.status(now).ports().next().unwrap().last_rejection.unwrap();
+    assert_eq!((last.why, rig.map.registers[8]), (Rejection::ForeignId, 42));
+}

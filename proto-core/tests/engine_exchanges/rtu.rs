@@ -1,0 +1,269 @@
+//! Modbus RTU as a master on a port.
+
+use proto_core::config::*;
+use proto_core::engine::{Input, PortState, Rejection};
+use proto_core::modbus::rtu::Operation;
+use proto_core::time::{Duration, Instant};
+
+use crate::line::*;
+use crate::rig::*;
+
+/// One slave whose register 0x10 is read each 20 ms.
+fn scale() -> Line {
+    let mut cell = Cell::new();
+    let weight = reads(&mut cell, 9, &["WordInputReg[1]"], AskWhen::every(MS(20)));
+    let port = talking(&mut cell, &[weight]);
+    cell.safe("WordInputReg[1]", 7.0);
+    Line::new(&cell, port)
+}
+
+#[test]
+fn a_register_is_read_each_period_and_reaches_the_robot() {
+    let mut line = scale();
+    let mut weight = 100;
+    let asked = line.run(MS(95), |_| {
+        weight += 1;
+        Some((MS(3), registers(9, &[weight])))
+    });
+    let request = with_crc(&[9, 3, 0, 0x10, 0, 1]);
+    assert!(asked.iter().all(|(_, sent)| *sent == request), "{asked:02X?}");
+    assert!(asked.len() >= 4, "{asked:?}");
+    let periods: Vec<_> = asked.windows(2).map(|pair| pair[1].0.saturating_since(pair[0].0)).collect();
+    assert!(periods.iter().all(|period| *period == MS(20)), "{periods:?}");
+    assert_eq!(line.rig.map.registers[8], weight);
+    let counters = line.rig.counters(line.port);
+    assert_eq!((counters.frames_in, counters.frames_out), (asked.len() as u32, asked.len() as u32));
+}
+
+#[test]
+fn a_wrong_crc_never_reaches_the_robot_and_is_asked_again() {
+    let mut line = scale();
+    line.run(MS(30), |_| Some((MS(3), registers(9, &[5]))));
+    line.rig.take_written();
+    let mut nth = 0;
+    let asked = line.run(MS(70), |_| {
+        nth += 1;
+        let mut reply = registers(9, &[6]);
+        reply[4] ^= u8::from(nth == 1) * 0x40;
+        Some((MS(3), reply))
+    });
+    let written = line.rig.take_written();
+    assert!(written.len() > 1 && written.iter().all(|written| *written == Written::Registers(8, vec![6])));
+    let counters = line.rig.counters(line.port);
+    assert_eq!((counters.rejected_checksum, counters.unanswered), (1, 0));
+    let again = asked[1].0.saturating_since(asked[0].0);
+    assert!(again < MS(4), "behind the silence, long before the timeout: {again:?}");
+}
+
+#[test]
+fn a_slave_that_falls_silent_gets_its_safe_value_to_the_robot_and_is_asked_less() {
+    let mut line = scale();
+    line.run(MS(45), |_| Some((MS(3), registers(9, &[5]))));
+    assert_eq!(line.rig.map.registers[8], 5);
+    let asked = line.run(MS(3_000), |_| None);
+    assert_eq!(line.rig.map.registers[8], 7);
+    assert_eq!(line.rig.engine.port_state(line.port), Some(PortState::Silent));
+    assert!((2..12).contains(&asked.len()), "{}", asked.len());
+    assert!(line.rig.counters(line.port).unanswered >= 2);
+    line.run(MS(8_000), |_| Some((MS(3), registers(9, &[8]))));
+    assert_eq!(
+        (line.rig.map.registers[8], line.rig.engine.port_state(line.port)),
+        (8, Some(PortState::Working))
+    );
+}
+
+#[test]
+fn a_refusal_is_told_and_the_line_goes_on() {
+    let mut line = scale();
+    let asked = line.run(MS(70), |_| Some((MS(2), with_crc(&[9, 0x83, 2]))));
+    assert!(asked.len() >= 3);
+    let now = line.rig.now;
+    let status = line.rig.engine.status(now).ports().next().unwrap();
+    let last = status.last_rejection.unwrap();
+    assert_eq!((last.why, last.bytes()), (Rejection::Refused, &with_crc(&[9, 0x83, 2])[..]));
+    let peer = status.peers().next().unwrap();
+    assert_eq!((peer.number, peer.counters.refusal), (9, 2));
+    assert_eq!(peer.counters.refused, asked.len() as u32);
+    assert_eq!(line.rig.take_written(), []);
+}
+
+#[test]
+fn a_changed_value_is_written_once_and_not_before_it_is_known() {
+    let mut cell = Cell::new();
+    let when = AskWhen { change: true, ..AskWhen::NEVER };
+    let speed = writes(&mut cell, 3, &["WordOutputReg[1]"], when);
+    let port = talking(&mut cell, &[speed]);
+    let mut line = Line::new(&cell, port);
+    line.rig.modbus_answers = false;
+    let done = |request: &[u8]| Some((MS(2), with_crc(&request[..6])));
+    assert_eq!(line.run(MS(100), done), []);
+    line.rig.modbus_answers = true;
+    line.rig.map.registers[40] = 0x1234;
+    let address = {
+        let place = var("WordOutputReg[1]").modbus().unwrap();
+        let proto_core::sysvar::ModbusPlace::Register { address } = place else { panic!() };
+        usize::from(address)
+    };
+    line.rig.map.registers[address] = 0x1234;
+    let asked = line.run(MS(6_000), done);
+    let value = |sent: &[u8]| u16::from_be_bytes([sent[7], sent[8]]);
+    assert_eq!(asked.iter().map(|(_, sent)| value(sent)).collect::<Vec<_>>(), [0x1234]);
+    line.rig.map.registers[address] = 0x1235;
+    let asked = line.run(MS(1_000), done);
+    assert_eq!(asked.iter().map(|(_, sent)| value(sent)).collect::<Vec<_>>(), [0x1235]);
+    // A slave that refuses to answer is asked until it has the value.
+    line.rig.map.registers[address] = 0x1236;
+    let asked = line.run(MS(1_000), |_| None);
+    assert!(asked.len() >= 2);
+    let asked = line.run(MS(10_000), done);
+    assert_eq!(asked.iter().map(|(_, sent)| value(sent)).collect::<Vec<_>>(), [0x1236]);
+}
+
+#[test]
+fn what_is_asked_at_the_start_is_asked_again_when_the_slave_or_the_port_is_back() {
+    let mut cell = Cell::new();
+    let start = AskWhen { start: true, ..AskWhen::NEVER };
+    let mode = Exchange {
+        talk: Talk::Rtu {
+            operation: Operation::WriteRegister { address: 1 },
+            written: cell.fields([FieldSpec::DeviceOutput {
+                encoding: proto_core::device::Encoding {
+                    order: proto_core::device::ByteOrder::Big,
+                    ..proto_core::device::Encoding::scalar(proto_core::wire::scalar::ScalarType::Word)
+                },
+                overflow: proto_core::device::Overflow::Usual,
+                from: OutputBinding::Constant(3.0),
+            }]),
+            read: Span::default(),
+        },
+        ..writes(&mut Cell::new(), 4, &[], start)
+    };
+    let poll = reads(&mut cell, 4, &["WordInputReg[1]"], AskWhen::every(MS(50)));
+    let port = talking(&mut cell, &[mode, poll]);
+    let mut line = Line::new(&cell, port);
+    let setting = with_crc(&[4, 6, 0, 1, 0, 3]);
+    let done = |request: &[u8]| {
+        let reply = if request[1] == 6 { request.to_vec() } else { registers(4, &[1]) };
+        Some((MS(2), reply))
+    };
+    let count = |asked: &[(Instant, Vec<u8>)]| asked.iter().filter(|(_, sent)| *sent == setting).count();
+    line.rig.log.clear();
+    line.rig.input(Input::PortDown { port });
+    line.rig.input(Input::PortUp { port });
+    assert_eq!(count(&line.run(MS(500), done)), 1);
+    assert_eq!(line.rig.engine.port_state(port), Some(PortState::Working));
+    line.run(MS(1_000), |_| None);
+    assert_eq!(count(&line.run(MS(8_000), done)), 1, "the slave is back");
+    line.rig.input(Input::PortDown { port });
+    assert_eq!(line.run(MS(500), done), []);
+    line.rig.input(Input::PortUp { port });
+    assert_eq!(count(&line.run(MS(500), done)), 1, "the port is back");
+}
+
+#[test]
+fn eight_slaves_of_which_two_are_dead_keep_their_periods() {
+    let mut cell = Cell::new();
+    let periods = [20, 20, 50, 50, 100, 100, 200, 500];
+    let exchanges: Vec<_> = (1..=8)
+        .zip(periods)
+        .map(|(slave, every)| {
+            let name = format!("WordInputReg[{slave}]");
+            let poll = reads(&mut cell, slave, &[&name], AskWhen::every(MS(every)));
+            Exchange { timeout: MS(10), retries: 0, ..poll }
+        })
+        .collect();
+    let port = talking(&mut cell, &exchanges);
+    cell.last_port().timeout = MS(1_500);
+    let mut line = Line::new(&cell, port);
+    let is_dead = |slave: u8| slave == 2 || slave == 5;
+    let answer = |request: &[u8]| {
+        let slave = request[0];
+        // 8 characters to the slave and 7 back at 115 200 bit/s are 1.4 ms.
+        (!is_dead(slave)).then(|| (Duration::from_micros(1_400), registers(slave, &[slave.into()])))
+    };
+    line.run(MS(2_000), answer);
+    let asked = line.run(MS(20_000), answer);
+    for (slave, every) in (1..=8).zip(periods) {
+        let times: Vec<_> = asked.iter().filter(|(_, sent)| sent[0] == slave).map(|(at, _)| *at).collect();
+        if is_dead(slave) {
+            assert!((10..60).contains(&times.len()), "slave {slave}: {}", times.len());
+            continue;
+        }
+        let wanted = 20_000 / every as usize;
+        assert!((wanted - 1..=wanted + 1).contains(&times.len()), "slave {slave}: {}", times.len());
+        let late = times.windows(2).map(|pair| pair[1].saturating_since(pair[0])).max().unwrap();
+        assert!(late < MS(every + 12), "slave {slave}: {late:?}");
+        assert_eq!(line.rig.map.registers[7 + usize::from(slave)], slave.into());
+    }
+    let now = line.rig.now;
+    let status = line.rig.engine.status(now).ports().next().unwrap();
+    assert_eq!(status.state, PortState::Silent, "two of them are");
+    for peer in status.peers() {
+        assert_eq!(peer.missed_periods, 0, "slave {}", peer.number);
+    }
+}
+
+#[test]
+fn the_echo_of_a_request_is_no_reply() {
+    let mut cell = Cell::new();
+    let when = AskWhen { start: true, ..AskWhen::NEVER };
+    let mut write = reads(&mut cell, 3, &["WordInputReg[1]"], when);
+    write.when = AskWhen::every(MS(20));
+    let port = talking(&mut cell, &[write]);
+    let Bus::Rs485(settings) = &mut cell.last_port().bus else { panic!() };
+    settings.echo = true;
+    let mut line = Line::new(&cell, port);
+    let asked = line.run(MS(95), |request| {
+        let mut heard = request.to_vec();
+        heard.extend(registers(3, &[77]));
+        Some((MS(3), heard))
+    });
+    let counters = line.rig.counters(line.port);
+    assert_eq!((counters.frames_in, counters.resync_bytes), (asked.len() as u32, 0));
+    assert_eq!(line.rig.map.registers[8], 77);
+}
+
+#[test]
+fn a_late_reply_is_not_taken_for_another_exchange() {
+    // Two blocks of one slave whose replies look alike.
+    let mut cell = Cell::new();
+    let late = |cell: &mut Cell, name, address| {
+        let mut exchange = reads(cell, 5, &[name], AskWhen::every(MS(40)));
+        let Talk::Rtu { operation, .. } = &mut exchange.talk else { panic!() };
+        *operation = Operation::ReadHoldingRegisters { address, count: 1 };
+        Exchange { timeout: MS(30), ..exchange }
+    };
+    let table = [late(&mut cell, "WordInputReg[1]", 1), late(&mut cell, "WordInputReg[2]", 2)];
+    let port = talking(&mut cell, &table);
+    for delay in (1..28).map(|step| MS(step * 2)) {
+        let mut line = Line::new(&cell, port);
+        let answer =
+            |delay| move |request: &[u8]| Some((delay, registers(5, &[u16::from(request[3]) + 100])));
+        line.run(MS(300), answer(MS(1)));
+        line.rig.take_written();
+        line.run(MS(4_005), |request| answer(delay)(request));
+        for written in line.rig.take_written() {
+            let Written::Registers(address, words) = written else { panic!() };
+            for (at, word) in (address..).zip(words) {
+                assert_eq!(word, at - 7 + 100, "delay {delay:?}");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_value_that_is_asked_once_is_not_missed_later() {
+    let mut cell = Cell::new();
+    let start = AskWhen { start: true, ..AskWhen::NEVER };
+    let version = reads(&mut cell, 4, &["WordInputReg[1]"], start);
+    let port = talking(&mut cell, &[version]);
+    let mut line = Line::new(&cell, port);
+    assert_eq!(line.run(MS(1_000), |_| Some((MS(2), registers(4, &[3])))).len(), 1);
+    assert_eq!(line.rig.map.registers[8], 3);
+    assert_eq!(line.rig.engine.port_state(port), Some(PortState::Working));
+    // If the slave is not there, the port says so.
+    line.rig.input(Input::PortDown { port });
+    line.rig.input(Input::PortUp { port });
+    line.run(MS(1_000), |_| None);
+    assert_eq!(line.rig.engine.port_state(port), Some(PortState::Silent));
+}
