@@ -1,7 +1,7 @@
 //! A recipe with a device's own frames, with the names of its fields, for tools that show frames.
 
 use proto_core::config::{DeviceFrame, FieldSpec};
-use proto_core::device::{Carrier, LayoutError};
+use proto_core::device::{Boundary, Carrier, Escape, LayoutError};
 use proto_core::modbus::rtu::Operation;
 use proto_core::sysvar::Direction;
 use proto_core::wire::can::CanId;
@@ -46,8 +46,21 @@ pub struct DeviceRecipe {
     pub input: Vec<NamedFrame>,
     /// Gateway to device.
     pub output: Vec<NamedFrame>,
+    /// What tells the frames of the input part apart.
+    pub input_ends: FrameEnds,
+    /// What tells the frames of the output part apart.
+    pub output_ends: FrameEnds,
     /// What is asked beside these frames, in the order of the file.
     pub exchanges: Vec<NamedExchange>,
+}
+
+/// What tells the frames of a stream part apart.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct FrameEnds {
+    /// Without escape bytes.
+    pub boundary: Boundary,
+    /// Escape bytes around each frame.
+    pub escape: Option<Escape>,
 }
 
 /// An exchange with the names of its fields. Its frames are whole: those of Modbus have address,
@@ -85,6 +98,14 @@ impl DeviceRecipe {
         match part {
             Direction::Input => &self.input,
             Direction::Output => &self.output,
+        }
+    }
+
+    /// What tells the frames of one part apart.
+    pub fn ends(&self, part: Direction) -> FrameEnds {
+        match part {
+            Direction::Input => self.input_ends,
+            Direction::Output => self.output_ends,
         }
     }
 }

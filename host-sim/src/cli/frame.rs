@@ -2,11 +2,12 @@
 
 use proto_core::config::{DeviceFrame, FieldSpec, OutputBinding, Words};
 use proto_core::device::{
-    Algorithm, Bits, ByteOrder, Carrier, Checksum, Digits, Encoding, Kind, Place, Text, TextWidth, Width,
+    Algorithm, Bits, Boundary, ByteOrder, Carrier, Checksum, Counts, Digits, Encoding, Escape, Kind, Length,
+    Place, Text, TextWidth, Width,
 };
 use proto_core::sysvar::Direction;
 use proto_core::wire::scalar::ScalarType;
-use recipe_config::{DeviceField, DeviceRecipe, NamedFrame};
+use recipe_config::{DeviceField, DeviceRecipe, FrameEnds, NamedFrame};
 
 use super::text;
 
@@ -19,7 +20,15 @@ struct Row {
 
 /// The frames of one part, a line for each run of bytes.
 pub(super) fn show(recipe: &DeviceRecipe, part: Direction) -> String {
-    let mut report = String::new();
+    let mut report = match recipe.ends(part) {
+        FrameEnds { escape: Some(Escape::Dle), .. } => "    between DLE STX and DLE ETX:\n",
+        FrameEnds { escape: Some(Escape::Slip), .. } => "    with the escape bytes of SLIP:\n",
+        FrameEnds { escape: Some(Escape::Cobs), .. } => "    with the escape bytes of COBS:\n",
+        FrameEnds { boundary: Boundary::Tail, .. } => "    up to each tail:\n",
+        FrameEnds { boundary: Boundary::Silence, .. } => "    between silences of the line:\n",
+        FrameEnds { boundary: Boundary::Fields, .. } => "",
+    }
+    .to_owned();
     for frame in recipe.part(part) {
         if let Some(id) = frame.id {
             report += &format!("    id {}\n", text::show_id(id));
@@ -82,6 +91,7 @@ fn rows(frame: &NamedFrame, laid_out: &DeviceFrame, part: Direction) -> Vec<Row>
             FieldSpec::TextOutput { text, from, .. } => {
                 add(place, &field.name, format!("{} <- {}", show_text(&text), show_words(from)));
             }
+            FieldSpec::Length(length) => add(place, &field.name, show_length(&length)),
             FieldSpec::UserOutput { .. } | FieldSpec::DeviceOutput { .. } if field.is_coil => {
                 add(place, &field.name, format!("FF for 1, 00 for 0{}", show_use(&field.spec)));
             }
@@ -127,6 +137,19 @@ fn show_text(text: &Text) -> String {
         TextWidth::Until(end) => format!("text, characters up to {:?}", char::from(end)),
         TextWidth::Rest => "text, all that is left".to_owned(),
     }
+}
+
+fn show_length(length: &Length) -> String {
+    let counts = match length.counts {
+        Counts::Rest => "of what follows",
+        Counts::Frame => "of the frame",
+        Counts::Fields => "of the fields behind it",
+    };
+    let plus = match length.plus {
+        0 => String::new(),
+        plus => format!(", plus {plus}"),
+    };
+    format!("{}, the length {counts}{plus}", show_encoding(&length.encoding))
 }
 
 /// The registers of a text.
@@ -269,5 +292,46 @@ recipe = "reader"
                 "then    tail      0D 0A",
             ]
         );
+    }
+
+    /// The picture of a stream input with these lines.
+    #[track_caller]
+    fn picture(lines: &str) -> String {
+        let toml = format!(
+            "[controller]\naddress = \"a\"\n[[recipe]]\nname = \"r\"\nkind = \"stream\"\nmode = \"user\"\n\
+             [recipe.input]\n{lines}"
+        );
+        let recipes = parse_recipes(Text { name: "test.toml", toml: &toml }, &[]).unwrap();
+        let [AnyRecipe::Device(recipe)] = &recipes[..] else { panic!("{recipes:?}") };
+        show(recipe, Direction::Input)
+    }
+
+    #[test]
+    fn a_length_has_its_bytes() {
+        let lines = r#"
+            head = [2]
+            fields = [
+                { type = "word", endian = "big", length = true, counts = "frame", plus = 2 },
+                { name = "code", type = "text", to = "WordInputReg[1..4]" },
+                { name = "last", type = "byte", equals = 3 },
+            ]"#;
+        let expected = "    0     head  02\n    \
+                        1..2        word, big-endian, the length of the frame, plus 2\n    \
+                        3..   code  text, all that is left -> WordInputReg[1] to WordInputReg[4]\n    \
+                        then  last  byte = 3\n";
+        assert_eq!(picture(lines), expected);
+    }
+
+    #[test]
+    fn the_ends_of_frames_stand_above_them() {
+        let first = |keys| {
+            let picture = picture(&format!("{keys}\nfields = [{{ name = \"a\", type = \"byte\" }}]"));
+            picture.lines().next().unwrap().to_owned()
+        };
+        assert_eq!(first("escape = \"dle\""), "    between DLE STX and DLE ETX:");
+        assert_eq!(first("escape = \"slip\""), "    with the escape bytes of SLIP:");
+        assert_eq!(first("escape = \"cobs\""), "    with the escape bytes of COBS:");
+        assert_eq!(first("framing = \"silence\""), "    between silences of the line:");
+        assert_eq!(first("framing = \"tail\"\ntail = [3]"), "    up to each tail:");
     }
 }

@@ -11,6 +11,7 @@ mod convert;
 mod frame;
 mod image;
 mod log;
+mod new;
 mod plan;
 mod soak;
 mod text;
@@ -51,6 +52,8 @@ pub struct Cli {
 const TOP_EXAMPLES: &str = "\
 Examples:
   host-sim                                       the demo
+  host-sim new --device robotiq-ft300 -o cell.toml
+                                                 a gateway file for a known device
   host-sim check cell.toml                       check the file; what to set on the pendant
   host-sim controller -c robot.toml --bind rs485=pty:run/rs485
   host-sim gateway -c cell.toml --bind rs485-1=serial:/dev/ttyUSB0
@@ -71,6 +74,9 @@ enum Command {
     /// Run the gateway
     #[command(after_help = GATEWAY_EXAMPLES)]
     Gateway(Run),
+    /// List known field devices; print or write a gateway file for one
+    #[command(after_help = new::EXAMPLES)]
+    New(new::NewArgs),
     /// Check a file; print the bus budget, the way of each variable and what to set on the pendant
     #[command(after_help = CHECK_EXAMPLES)]
     Check(check::CheckArgs),
@@ -258,6 +264,7 @@ pub fn main() -> ExitCode {
             let code = soak::run(&args, &mut out);
             return out.finish(|_| code);
         }
+        Command::New(args) => new::run(&args, &mut out),
         Command::Check(args) => check::run(&args, &mut out),
         Command::Image(args) => image::run(&args, &mut out),
         Command::Encode(args) => encode(&args, &mut out),

@@ -196,6 +196,38 @@ pub(super) fn show_scalar(value: Scalar) -> String {
     }
 }
 
+/// A text without blanks: `\x20` is a byte that is no letter, digit or sign of ASCII.
+pub(super) fn show_text(text: &[u8]) -> String {
+    let show = |&byte: &u8| match byte {
+        b'\\' => "\\\\".to_owned(),
+        _ if byte.is_ascii_graphic() => char::from(byte).to_string(),
+        _ => format!("\\x{byte:02X}"),
+    };
+    text.iter().map(show).collect()
+}
+
+/// Parses what [`show_text`] writes.
+pub(super) fn parse_text(shown: &str) -> Result<Vec<u8>, String> {
+    let mut text = Vec::new();
+    let mut rest = shown.as_bytes();
+    while let Some((&byte, behind)) = rest.split_first() {
+        rest = behind;
+        if byte != b'\\' {
+            text.push(byte);
+            continue;
+        }
+        let digits = |two: &[u8]| u8::from_str_radix(std::str::from_utf8(two).ok()?, 16).ok();
+        let (byte, behind) = match rest {
+            [b'\\', behind @ ..] => (Some(b'\\'), behind),
+            [b'x', high, low, behind @ ..] => (digits(&[*high, *low]), behind),
+            _ => (None, rest),
+        };
+        rest = behind;
+        text.push(byte.ok_or_else(|| format!("{shown:?}: a backslash stands only in \\\\ and \\x20"))?);
+    }
+    Ok(text)
+}
+
 /// Parses a value of type `ty`: decimal, `0x1F` for integers, `inf` and `nan:0x7FC00000` for floats.
 pub(super) fn parse_scalar(ty: ScalarType, text: &str) -> Result<Scalar, String> {
     let not_a_number = || format!("{text:?} is not a number");

@@ -241,7 +241,7 @@ fn an_image_that_no_board_takes_is_not_written() {
 
 #[test]
 fn the_help_teaches() {
-    for command in ["controller", "gateway", "check", "encode", "decode"] {
+    for command in ["controller", "gateway", "new", "check", "encode", "decode"] {
         let help = ok(&[command, "--help"], "");
         assert!(help.contains("Examples:") && help.contains(&format!("host-sim {command}")), "{help}");
     }

@@ -35,6 +35,8 @@ fn command_lines(folder: &Path) -> Vec<Vec<String>> {
         [line(&["gateway", "-c", &gateway, "--bind", &format!("rs485-1=pty:{}", at("line"))]), run.into()]
             .concat(),
         line(&["check", &gateway]),
+        line(&["new"]),
+        line(&["new", "--device", "robotiq-ft300"]),
         line(&["image", &gateway, "-o", &at("cell.img")]),
         line(&[&soak[..], &["--hours", "0.001"]].concat()),
         line(&[&soak[..], &["--replay", "9@2.5", "--trace"]].concat()),

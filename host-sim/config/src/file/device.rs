@@ -20,7 +20,7 @@ use super::framings;
 use super::reader::{Item, Reader, Result};
 use super::recipes::{FileField, FileFieldKind, FileFrame, FilePart, FileRecipe, Flavour, Written};
 use super::rtu_frames;
-use crate::device::{DeviceField, DeviceRecipe, ExchangeKind, NamedExchange, NamedFrame};
+use crate::device::{DeviceField, DeviceRecipe, ExchangeKind, FrameEnds, NamedExchange, NamedFrame};
 
 /// The keys of a CAN frame.
 const FRAME_KEYS: [&str; 3] = ["endian", "word_order", "checksum"];
@@ -389,6 +389,11 @@ fn find_place(item: &Item<'_>, head: usize, fields: &[FileField]) -> Result<usiz
 
 impl FilePart {
     /// Whether something else than its fields tells where frames end.
+    fn ends(&self) -> FrameEnds {
+        let (boundary, escape) = self.framing;
+        FrameEnds { boundary, escape }
+    }
+
     fn is_cut(&self) -> bool {
         self.framing != (Boundary::Fields, None)
     }
@@ -483,6 +488,8 @@ impl FileRecipe {
                 .unwrap_or(self.carrier(Direction::Input)),
             input: frames(&self.input),
             output: frames(&self.output),
+            input_ends: self.input.as_ref().map_or(FrameEnds::default(), FilePart::ends),
+            output_ends: self.output.as_ref().map_or(FrameEnds::default(), FilePart::ends),
             exchanges: self.exchanges.iter().map(|exchange| self.named_exchange(exchange)).collect(),
         }
     }

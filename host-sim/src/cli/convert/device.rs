@@ -4,13 +4,13 @@
 //! frames with the same values can differ in, such as padding, is kept in `raw=`.
 
 use proto_core::config::{DeviceFrame, FieldSpec, OutputBinding};
-use proto_core::device::{Carrier, Digits, Encoding, Found, Framer, Kind, Probe};
+use proto_core::device::{Carrier, Cutter, Digits, Element, Encoding, Found, Framer, Kind, Piece, Probe};
 use proto_core::modbus::rtu;
 use proto_core::recipe::model::MAX_STREAM_FRAME;
 use proto_core::sysvar::Direction;
 use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::Scalar;
-use recipe_config::{DeviceRecipe, ExchangeKind, NamedExchange, NamedFrame};
+use recipe_config::{DeviceRecipe, ExchangeKind, FrameEnds, NamedExchange, NamedFrame};
 
 use super::super::text;
 use super::{note, write_line};
@@ -22,6 +22,7 @@ const RAW: &str = "raw";
 #[derive(Debug)]
 pub(in super::super) struct DevicePart {
     direction: Direction,
+    ends: FrameEnds,
     formats: Vec<Format>,
 }
 
@@ -32,24 +33,48 @@ struct Format {
     named: NamedFrame,
     frame: DeviceFrame,
     values: Vec<Value>,
+    tail: Vec<u8>,
+    /// Its ends are known from outside.
+    is_whole: bool,
 }
 
 /// A field with a value.
 #[derive(Debug)]
 struct Value {
     name: String,
-    encoding: Encoding,
+    kind: ValueKind,
     /// Its elements: more than one if the bytes are used more than once.
     elements: Vec<usize>,
     /// What is sent if nothing else is asked for.
     constant: Option<f64>,
 }
 
+#[derive(Debug)]
+enum ValueKind {
+    Number(Encoding),
+    Text,
+}
+
+/// What a field is to be.
+#[derive(Debug, Clone)]
+enum Given {
+    Number(f64),
+    Text(Vec<u8>),
+}
+
+/// What a field of a frame is, as it is shown.
+struct Seen {
+    shown: String,
+    is_finite: bool,
+}
+
 impl DevicePart {
     pub(in super::super) fn new(recipe: &DeviceRecipe, direction: Direction) -> Result<Self, String> {
-        let format = |named: &NamedFrame| Format::new(named, recipe.carrier, direction);
+        let ends = recipe.ends(direction);
+        let is_whole = ends != FrameEnds::default();
+        let format = |named: &NamedFrame| Format::new(named, recipe.carrier, direction, is_whole);
         let formats = recipe.part(direction).iter().map(format).collect::<Result<_, _>>()?;
-        Ok(Self { direction, formats })
+        Ok(Self { direction, ends, formats })
     }
 
     /// One frame of an exchange.
@@ -69,8 +94,8 @@ impl DevicePart {
             _ => Direction::Input,
         };
         let carrier = if named.id.is_some() { Carrier::Can } else { Carrier::Stream };
-        let format = Format::new(named, carrier, direction)?;
-        Ok(Self { direction, formats: vec![format] })
+        let format = Format::new(named, carrier, direction, false)?;
+        Ok(Self { direction, ends: FrameEnds::default(), formats: vec![format] })
     }
 
     /// Whether it is one frame that has no value to be given.
@@ -85,7 +110,14 @@ impl DevicePart {
 
     /// The bytes of the frame with this index, from values in field order or by name.
     pub(super) fn encode(&self, index: usize, tokens: &[String]) -> Result<Vec<u8>, String> {
-        self.formats.get(index).ok_or("no such frame")?.encode(tokens)
+        let mut bytes = self.formats.get(index).ok_or("no such frame")?.encode(tokens)?;
+        if let Some(escape) = self.ends.escape {
+            let len = bytes.len();
+            bytes.resize(escape.longest(len), 0);
+            let len = escape.stuff(len, &mut bytes).ok_or("the frame is too long")?;
+            bytes.truncate(len);
+        }
+        Ok(bytes)
     }
 
     /// Writes the values of every frame in a stream, and returns the number of frames.
@@ -96,6 +128,9 @@ impl DevicePart {
         notes: &mut dyn std::io::Write,
     ) -> Result<usize, String> {
         let format = self.formats.first().ok_or("no such frame")?;
+        if let Some(cutter) = Cutter::new(self.ends.boundary, self.ends.escape) {
+            return self.decode_pieces(format, cutter, lines, out, notes);
+        }
         let effort = format.frame.layout.lengths().1 + format.frame.elements.len();
         let mut framer = Framer::new();
         let mut frames = 0;
@@ -139,6 +174,49 @@ impl DevicePart {
         Ok(frames)
     }
 
+    /// Writes the values of every frame in a stream whose frames do not end by their fields. Silence
+    /// is where a line ends.
+    fn decode_pieces(
+        &self,
+        format: &Format,
+        mut cutter: Cutter,
+        lines: impl Iterator<Item = (usize, std::io::Result<String>)>,
+        out: &mut dyn std::io::Write,
+        notes: &mut dyn std::io::Write,
+    ) -> Result<usize, String> {
+        let mut frames = 0;
+        for (number, line) in lines {
+            let at = |message| format!("line {number}: {message}");
+            let line = line.map_err(|error| at(error.to_string()))?;
+            let bytes = text::parse_hex_line(&line).map_err(at)?;
+            let mut chunk = &bytes[..];
+            loop {
+                let piece = match cutter.next_piece(&mut chunk, &format.tail) {
+                    Some(piece) => piece,
+                    None => match cutter.silence() {
+                        Some(piece) => piece,
+                        None => break,
+                    },
+                };
+                match format.look_at(piece) {
+                    Ok((frame, values)) => {
+                        frames += 1;
+                        self.note_values(format, frame, number, notes);
+                        write_line(out, &values)?;
+                    }
+                    Err(why) => note(notes, &at(why)),
+                }
+            }
+        }
+        if cutter.skipped_bytes() > 0 {
+            note(notes, &format!("{} bytes skipped outside of frames", cutter.skipped_bytes()));
+        }
+        if !cutter.held().is_empty() {
+            note(notes, &format!("{} bytes of an unfinished frame at the end", cutter.held().len()));
+        }
+        Ok(frames)
+    }
+
     /// The values of a CAN frame, or why it is none of this part.
     pub(super) fn decode_can(
         &self,
@@ -170,7 +248,7 @@ impl DevicePart {
     /// Says if a gateway rejects a frame for its values.
     fn note_values(&self, format: &Format, frame: &[u8], line: usize, notes: &mut dyn std::io::Write) {
         let Ok(values) = format.values(frame) else { return };
-        let is_wrong = |(_, value): &(&Value, Scalar)| !value.is_finite();
+        let is_wrong = |(_, seen): &(&Value, Seen)| !seen.is_finite;
         if let Some((value, _)) = format.values.iter().zip(values).find(is_wrong)
             && self.direction == Direction::Input
         {
@@ -190,22 +268,30 @@ fn values_of(named: &NamedFrame) -> Vec<Value> {
             FieldSpec::Fixed { .. } | FieldSpec::Padding { .. } | FieldSpec::Length(_) => continue,
             _ => None,
         };
-        match (values.last_mut(), element.encoding()) {
-            (Some(before), _) if field.repeats => before.elements.push(nth),
-            (_, Some(encoding)) => {
-                values.push(Value { name: field.name.clone(), encoding, elements: vec![nth], constant });
-            }
-            (_, None) => {}
+        let kind = match (element.encoding(), element) {
+            (Some(encoding), _) => ValueKind::Number(encoding),
+            (None, Element::Text(_)) => ValueKind::Text,
+            (None, _) => continue,
+        };
+        match values.last_mut() {
+            Some(before) if field.repeats => before.elements.push(nth),
+            _ => values.push(Value { name: field.name.clone(), kind, elements: vec![nth], constant }),
         }
     }
     values
 }
 
 impl Format {
-    fn new(named: &NamedFrame, carrier: Carrier, direction: Direction) -> Result<Self, String> {
+    fn new(
+        named: &NamedFrame,
+        carrier: Carrier,
+        direction: Direction,
+        is_whole: bool,
+    ) -> Result<Self, String> {
         // Cannot fail for the frames of files: reading the file laid them out.
         let frame = named.lay_out(carrier, direction).map_err(|error| error.to_string())?;
-        Ok(Self { id: named.id, named: named.clone(), frame, values: values_of(named) })
+        let (named, values, tail) = (named.clone(), values_of(named), named.tail.clone());
+        Ok(Self { id: named.id, named, frame, values, tail, is_whole })
     }
 
     /// Makes the coil of Modbus function 5 what it is on the line: FF for 1.
@@ -223,17 +309,44 @@ impl Format {
     }
 
     fn probe(&self, bytes: &[u8]) -> Probe {
-        self.frame.layout.probe(&self.frame.elements, bytes)
+        let DeviceFrame { layout, elements } = &self.frame;
+        if self.is_whole { layout.probe_whole(elements, bytes) } else { layout.probe(elements, bytes) }
+    }
+
+    /// The frame that came between two ends, with its values, or why it is none.
+    fn look_at<'a>(&self, piece: Piece<'a>) -> Result<(&'a [u8], String), String> {
+        let (bytes, why) = match piece {
+            Piece::Whole(bytes) => match self.probe(bytes) {
+                Probe::Frame(_) => match self.show(bytes) {
+                    Ok(values) => return Ok((bytes, values)),
+                    Err(why) => (bytes, why),
+                },
+                Probe::Wrong(_) => (bytes, self.wrong_checksum(bytes)),
+                _ => (bytes, "another length or other constants, so not this frame".into()),
+            },
+            Piece::TooLong(bytes) => (bytes, "longer than any frame".into()),
+            Piece::BadEscape(bytes) => (bytes, "then escape bytes that mean nothing".into()),
+            Piece::Cut(bytes) => (bytes, "the end of a frame".into()),
+        };
+        Err(format!("{}: {why}", text::hex(bytes)))
     }
 
     /// The values of a frame, each once.
-    fn values(&self, frame: &[u8]) -> Result<Vec<Scalar>, String> {
-        let all: Vec<_> = self.frame.layout.values(&self.frame.elements, frame).collect();
+    fn values(&self, frame: &[u8]) -> Result<Vec<Seen>, String> {
+        let DeviceFrame { layout, elements } = &self.frame;
+        let all: Vec<_> = layout.values(elements, frame).collect();
         let value = |value: &Value| {
-            let scalar = value.elements.first().and_then(|&nth| all.get(nth));
-            match scalar {
-                Some(Ok(Some(scalar))) => Ok(*scalar),
-                Some(Err(error)) => Err(format!("{}: {error}", value.name)),
+            let nth = value.elements.first().copied().unwrap_or(usize::MAX);
+            match (&value.kind, all.get(nth)) {
+                (ValueKind::Text, _) => {
+                    let text = layout.text(elements, frame, nth);
+                    let text = text.ok_or_else(|| format!("{}: no text", value.name))?;
+                    Ok(Seen { shown: text::show_text(text), is_finite: true })
+                }
+                (ValueKind::Number(_), Some(Ok(Some(scalar)))) => {
+                    Ok(Seen { shown: text::show_scalar(*scalar).to_string(), is_finite: scalar.is_finite() })
+                }
+                (_, Some(Err(error))) => Err(format!("{}: {error}", value.name)),
                 _ => Err(format!("{}: no value", value.name)),
             }
         };
@@ -243,7 +356,7 @@ impl Format {
     fn named_values(&self, frame: &[u8]) -> Result<Vec<String>, String> {
         let values = self.values(frame)?;
         let shown = self.values.iter().zip(values);
-        Ok(shown.map(|(value, scalar)| format!("{}={}", value.name, text::show_scalar(scalar))).collect())
+        Ok(shown.map(|(value, seen)| format!("{}={}", value.name, seen.shown)).collect())
     }
 
     /// The line that [`Self::encode`] turns into the same bytes.
@@ -273,35 +386,49 @@ impl Format {
                 }
             };
         }
-        let numbers = self.numbers(tokens)?;
+        let given = self.given(tokens)?;
         let mut out = [0; MAX_STREAM_FRAME];
-        let number = |nth: usize| {
-            let of = self.values.iter().zip(&numbers).find(|(value, _)| value.elements.contains(&nth));
-            of.map_or(f64::NAN, |(_, &number)| number)
+        let of = |nth: usize| {
+            let of = self.values.iter().zip(&given).find(|(value, _)| value.elements.contains(&nth));
+            of.map(|(_, given)| given)
         };
-        match self.frame.layout.encode(&self.frame.elements, number, &mut out) {
+        let number = |nth: usize| match of(nth) {
+            Some(Given::Number(number)) => *number,
+            _ => f64::NAN,
+        };
+        let characters = |nth: usize, out: &mut [u8]| match of(nth) {
+            Some(Given::Text(text)) => {
+                out.get_mut(..text.len())?.copy_from_slice(text);
+                Some(text.len())
+            }
+            _ => None,
+        };
+        match self.frame.layout.encode_with(&self.frame.elements, number, characters, &mut out) {
             Some(len) => {
                 let mut frame = out.get(..len).unwrap_or(&[]).to_vec();
                 self.switch_coil(&mut frame);
                 Ok(frame)
             }
+            None if self.values.iter().any(|value| matches!(value.kind, ValueKind::Text)) => {
+                Err("a text does not fit its field, or a value is not a number".into())
+            }
             None => Err("a value is not a number, which no gateway sends".into()),
         }
     }
 
-    /// The number of each value, given in order or as `NAME=VALUE`. Constants may be left out, and are
+    /// What each value is to be, given in order or as `NAME=VALUE`. Constants may be left out, and are
     /// given by name only.
-    fn numbers(&self, tokens: &[String]) -> Result<Vec<f64>, String> {
-        let mut numbers: Vec<Option<f64>> = vec![None; self.values.len()];
+    fn given(&self, tokens: &[String]) -> Result<Vec<Given>, String> {
+        let mut all: Vec<Option<Given>> = vec![None; self.values.len()];
         for token in tokens {
             let (name, shown) = match token.split_once('=') {
                 Some((name, shown)) => (Some(name), shown),
                 None => (None, token.as_str()),
             };
-            let is_meant = |(value, number): (&Value, &Option<f64>)| {
-                number.is_none() && name.map_or(value.constant.is_none(), |name| name == value.name)
+            let is_meant = |(value, given): (&Value, &Option<Given>)| {
+                given.is_none() && name.map_or(value.constant.is_none(), |name| name == value.name)
             };
-            let place = self.values.iter().zip(&numbers).position(is_meant).ok_or_else(|| {
+            let place = self.values.iter().zip(&all).position(is_meant).ok_or_else(|| {
                 let names: Vec<_> = self.values.iter().map(|value| value.name.as_str()).collect();
                 match name {
                     Some(name) if names.contains(&name) => format!("field {name:?} is given twice"),
@@ -312,10 +439,15 @@ impl Format {
                 }
             })?;
             let value = &self.values[place];
-            numbers[place] =
-                Some(parse(&value.encoding, shown).map_err(|error| format!("{}: {error}", value.name))?);
+            let given = match &value.kind {
+                ValueKind::Number(encoding) => parse(encoding, shown).map(Given::Number),
+                ValueKind::Text => text::parse_text(shown).map(Given::Text),
+            };
+            all[place] = Some(given.map_err(|error| format!("{}: {error}", value.name))?);
         }
-        let all = self.values.iter().zip(&numbers).map(|(value, number)| number.or(value.constant));
+        let constant = |value: &Value| value.constant.map(Given::Number);
+        let all =
+            self.values.iter().zip(&all).map(|(value, given)| given.clone().or_else(|| constant(value)));
         let missing: Vec<_> =
             self.values.iter().zip(all.clone()).filter(|(_, number)| number.is_none()).collect();
         if missing.is_empty() {

@@ -250,6 +250,80 @@ fields = [
     assert_eq!(decoded(&part, "01 30 31 46 2C 0D").0, "order=3 raw=31\n");
 }
 
+/// A part with these keys, and with a text `code` behind other fields.
+fn text_part(keys: &str, fields: &str) -> Part {
+    let toml = format!(
+        r#"
+[controller]
+address = "a"
+[[recipe]]
+name = "r"
+kind = "stream"
+mode = "user"
+[recipe.input]
+{keys}
+fields = [{fields}{{ name = "code", type = "text", to = "WordInputReg[1..4]" }}]
+"#
+    );
+    let recipes = parse_recipes(Text { name: "test.toml", toml: &toml }, &[]).unwrap();
+    Part::choose(&recipes, None, None).unwrap()
+}
+
+#[test]
+fn texts_end_with_the_tail() {
+    let part = text_part("framing = \"tail\"\ntail = [13, 10]", "");
+    let (values, notes) = decoded(&part, "41 42 0D 0A 43 20 5C\n00 E4 0D 0A 0D 0A 44");
+    assert_eq!(values, "code=AB\ncode=C\\x20\\\\\\x00\\xE4\ncode=\n");
+    assert_eq!(notes, "1 bytes of an unfinished frame at the end\n");
+    assert_eq!(encoded(&part, &values).unwrap(), "41 42 0D 0A\n43 20 5C 00 E4 0D 0A\n0D 0A\n");
+    assert_eq!(from_values(&part, None, &["A=1"]).unwrap_err(), "there is no field \"A\"; there are code");
+    assert_eq!(from_values(&part, None, &["code=A=1"]).unwrap(), "41 3D 31 0D 0A");
+    for wrong in ["A\\", "A\\n", "A\\x4", "A\\xGG"] {
+        let refused = from_values(&part, None, &[wrong]).unwrap_err();
+        assert!(refused.ends_with("a backslash stands only in \\\\ and \\x20"), "{wrong}: {refused}");
+    }
+    let long = "A".repeat(600);
+    assert_eq!(
+        from_values(&part, None, &[&long]).unwrap_err(),
+        "a text does not fit its field, or a value is not a number"
+    );
+}
+
+#[test]
+fn silence_is_where_a_line_ends() {
+    let part = text_part(
+        "framing = \"silence\"\nhead = [2]\nchecksum = { kind = \"xor8\" }",
+        "{ name = \"n\", type = \"byte\" }, ",
+    );
+    let (values, notes) = decoded(&part, "02 07 41 44\n02 07 41\n02 07 41 45\n03 07 41 45\n");
+    assert_eq!(values, "n=7 code=A\n");
+    let lines: Vec<&str> = notes.lines().collect();
+    assert!(lines[0].starts_with("line 2: 02 07 41: "), "{notes}");
+    assert!(lines[1].starts_with("line 3: 02 07 41 45: the checksum is 45 instead of 44"), "{notes}");
+    assert!(lines[2].starts_with("line 4: 03 07 41 45: another length or other constants"), "{notes}");
+    assert_eq!(encoded(&part, &values).unwrap(), "02 07 41 44\n");
+}
+
+#[test]
+fn escape_bytes_are_taken_out_and_put_in() {
+    let part = text_part("escape = \"slip\"", "{ name = \"n\", type = \"byte\", bits = \"0..3\" }, ");
+    let (values, notes) = decoded(&part, "C0 07 41 DB DC C0 C0 17 42 C0 C0 01 DB 00 C0");
+    assert_eq!(values, "n=7 code=A\\xC0\nn=7 code=B raw=1742\n");
+    assert_eq!(notes, "line 1: 01 00: then escape bytes that mean nothing\n");
+    assert_eq!(encoded(&part, &values).unwrap(), "C0 07 41 DB DC C0\nC0 17 42 C0\n");
+}
+
+#[test]
+fn a_length_is_no_value() {
+    let part = text_part("head = [2]\ntail = [3]", "{ name = \"length\", type = \"byte\", length = true }, ");
+    let (values, notes) = decoded(&part, "02 03 41 42 03 02 01 03 FF");
+    assert_eq!(
+        (values.as_str(), notes.as_str()),
+        ("code=AB\ncode=\n", "1 bytes skipped outside of frames\n")
+    );
+    assert_eq!(encoded(&part, &values).unwrap(), "02 03 41 42 03\n02 01 03\n");
+}
+
 const ANY: &str = r#"
 [controller]
 address = "a"
@@ -289,6 +363,21 @@ proptest! {
         let log = text::hex(&frame) + "\n";
         let values = decoded(&part, &log).0;
         prop_assert_eq!(encoded(&part, &values).unwrap(), log);
+    }
+
+    #[test]
+    fn any_text_is_shown_in_one_word_and_read_back(text in prop::collection::vec(any::<u8>(), 0..100)) {
+        let shown = text::show_text(&text);
+        prop_assert!(shown.bytes().all(|byte| byte.is_ascii_graphic()));
+        prop_assert_eq!(text::parse_text(&shown).unwrap(), text);
+    }
+
+    #[test]
+    fn escaped_frames_are_read_back(escape in prop::sample::select(vec!["dle", "slip", "cobs"]), texts in prop::collection::vec(prop::collection::vec(any::<u8>(), 1..100), 1..4)) {
+        let part = text_part(&format!("escape = \"{escape}\""), "");
+        let values: String = texts.iter().map(|text| format!("code={}\n", text::show_text(text))).collect();
+        let log = encoded(&part, &values).unwrap();
+        prop_assert_eq!(decoded(&part, &log), (values, String::new()));
     }
 
     #[test]
