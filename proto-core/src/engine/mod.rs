@@ -236,6 +236,13 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                     self.tap.went(TapPlace::Port(port), Some(frame.id()), frame.data(), now);
                     return Output::PortSendCan { port, frame };
                 }
+                None if self.exchanges.is_used() => {
+                    // The kinds of output are the same, but nothing else pays for this one.
+                    if let Some(request) = self.next_request(&mut buf[..], now) {
+                        return self.request_output(request, buf, now);
+                    }
+                    self.ask.ports = false;
+                }
                 None => self.ask.ports = false,
             }
         }
@@ -261,13 +268,14 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         self.links.next_upward(&mut self.store, out).is_none()
             && self.links.next_action().is_none()
             && self.next_downward(out, now).is_none()
+            && !(self.exchanges.is_used() && self.next_request(out, now).is_some())
     }
 
     // Each input has its own function, so that no other pays for the registers it needs.
     #[inline(never)]
     fn port_bytes(&mut self, id: PortId, bytes: &[u8], now: Instant) {
-        if self.exchanges.is_used() && self.is_talking(id) {
-            return self.talk_bytes(id, bytes, now);
+        if self.exchanges.is_used() && self.talk_bytes(id, bytes, now) {
+            return;
         }
         if let Some(port) = find_port(&mut self.ports, id) {
             if self.is_deaf {
@@ -309,8 +317,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
 
     #[inline(never)]
     fn port_can(&mut self, id: PortId, frame: &CanFrame, now: Instant) {
-        if self.exchanges.is_used() && self.is_talking(id) {
-            return self.talk_can(id, frame, now);
+        if self.exchanges.is_used() && self.talk_can(id, frame, now) {
+            return;
         }
         let (store, command) = (&mut self.store, self.links.command.first_mut());
         let Some(port) = find_port(&mut self.ports, id) else { return };
@@ -530,7 +538,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                 return Some((port.id, downward));
             }
         }
-        if self.exchanges.is_used() { self.next_request(out, now) } else { None }
+        None
     }
 }
 

@@ -10,15 +10,15 @@ use super::device_port::{DeviceCodec, DeviceFormat, better, elements, probe};
 use super::exchanges::{Asks, InputFormat, Item, View};
 use super::field_output::Downward;
 use super::field_port::{Accepted, Codec, FieldPort, Frames, came, keep};
-use super::io::PortId;
+use super::io::{Output, PortId};
 use super::line::{Flight, Line, Phase, Talks};
 use super::rejection::Rejection;
 use super::sender::{DIGEST_SEED, Sender, digest};
 use super::store::Store;
-use super::tap::Tap;
+use super::tap::{Tap, TapPlace};
 use super::user::{InputBind, OutputBind, number_of};
 use super::whole_port::{self, Reader};
-use super::{Engine, find_port};
+use super::{Engine, OUTPUT_BUFFER, find_port};
 use crate::config::OutputBinding;
 use crate::device::{Found, Probe};
 use crate::image::Image;
@@ -576,43 +576,71 @@ fn is_set(image: &Image, var: SysVar, bit: u8) -> bool {
 impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: usize, const EXCHANGES: usize>
     Engine<PORTS, UPLINKS, FIELDS, TAP, EXCHANGES>
 {
-    /// Whether the port's recipe has exchanges.
+    /// The output of a request, with its record.
     #[cold]
     #[inline(never)]
-    pub(super) fn is_talking(&mut self, id: PortId) -> bool {
-        find_port(&mut self.ports, id).is_some_and(|port| port.line().is_some())
+    pub(super) fn request_output<'b>(
+        &mut self,
+        (port, request): (PortId, Downward),
+        buf: &'b [u8; OUTPUT_BUFFER],
+        now: Instant,
+    ) -> Output<'b> {
+        match request {
+            Downward::Bytes(len) => {
+                let bytes = buf.get(..len).unwrap_or(&[]);
+                self.tap.went(TapPlace::Port(port), None, bytes, now);
+                Output::PortSend { port, bytes }
+            }
+            Downward::Can(frame) => {
+                self.tap.went(TapPlace::Port(port), Some(frame.id()), frame.data(), now);
+                Output::PortSendCan { port, frame }
+            }
+        }
     }
 
+    /// Takes bytes; false if the port's recipe has no exchanges.
+    #[cold]
     #[inline(never)]
-    pub(super) fn talk_bytes(&mut self, id: PortId, bytes: &[u8], now: Instant) {
-        let Some(port) = find_port(&mut self.ports, id) else { return };
+    pub(super) fn talk_bytes(&mut self, id: PortId, bytes: &[u8], now: Instant) -> bool {
+        let Some(port) = find_port(&mut self.ports, id) else { return false };
+        if port.line().is_none() {
+            return false;
+        }
         if self.is_deaf {
-            return port.discard(bytes, None, &mut self.tap, now);
+            port.discard(bytes, None, &mut self.tap, now);
+            return true;
         }
         port.heard(bytes, now);
         if port.hears_master(bytes, now) {
-            return self.after_talk(id);
+            self.after_talk(id);
+            return true;
         }
         let mut rest = port.behind_echo(bytes);
         loop {
             let (store, command) = (&mut self.store, self.links.command.first_mut());
-            let Some(port) = find_port(&mut self.ports, id) else { return };
+            let Some(port) = find_port(&mut self.ports, id) else { return true };
             let (inputs, view) = (&self.bindings.inputs, self.exchanges.view());
             let accepted = port.talk_frames(&mut rest, inputs, store, command, &mut self.tap, view);
             self.after_talk(id);
             self.after_field(id, &accepted, now);
             if rest.is_empty() {
-                return;
+                return true;
             }
         }
     }
 
+    /// Takes a frame; false if the port's recipe has no exchanges.
+    #[cold]
     #[inline(never)]
-    pub(super) fn talk_can(&mut self, id: PortId, frame: &CanFrame, now: Instant) {
+    pub(super) fn talk_can(&mut self, id: PortId, frame: &CanFrame, now: Instant) -> bool {
         let (store, command) = (&mut self.store, self.links.command.first_mut());
-        let Some(port) = find_port(&mut self.ports, id) else { return };
+        let Some(port) = find_port(&mut self.ports, id) else { return false };
+        if port.line().is_none() {
+            return false;
+        }
         if self.is_deaf {
-            return port.discard(frame.data(), Some(frame.id()), &mut self.tap, now);
+            port.discard(frame.data(), Some(frame.id()), &mut self.tap, now);
+            return true;
         }
         let mut accepted = Accepted::default();
         let (inputs, view) = (&self.bindings.inputs, self.exchanges.view());
@@ -626,6 +654,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
         self.after_talk(id);
         self.after_field(id, &accepted, now);
+        true
     }
 
     /// The line may be free, or wait for something else.
@@ -637,6 +666,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
     }
 
+    #[cold]
     #[inline(never)]
     pub(super) fn talk_sent(&mut self, id: PortId) {
         if let Some(port) = find_port(&mut self.ports, id) {
@@ -667,6 +697,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
     }
 
+    #[cold]
     #[inline(never)]
     pub(super) fn advance_talk(&mut self, now: Instant) {
         for index in 0..self.ports.len() {
@@ -693,6 +724,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         self.after_field(id, &accepted, now);
     }
 
+    #[cold]
     #[inline(never)]
     pub(super) fn talk_deadline(&self) -> Instant {
         if self.is_deaf {
@@ -702,6 +734,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     }
 
     /// The next request of a port.
+    #[cold]
     #[inline(never)]
     pub(super) fn next_request(&mut self, out: &mut [u8], now: Instant) -> Option<(PortId, Downward)> {
         if self.is_deaf {
