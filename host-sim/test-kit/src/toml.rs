@@ -60,7 +60,7 @@ on_timeout = {{ "DigitalOutputCommand[1]" = 128 }}
 
 /// Pieces of configuration files, valid and harmful ones. Inputs of a fuzzer refer to them by index: add new
 /// ones at the end.
-pub const PIECES: [&str; 62] = [
+pub const PIECES: [&str; 74] = [
     "[",
     "]",
     "[[",
@@ -123,4 +123,16 @@ pub const PIECES: [&str; 62] = [
     "type = \"decimal\"",
     "until = \",\"",
     "width = 4",
+    "[[recipe.exchange]]\n",
+    "[[recipe.block]]\n",
+    "kind = \"modbus-rtu\"",
+    "bus = \"modbus-rtu-slave\"",
+    "slave = 0",
+    "function = 23",
+    "address = 0xFFFF",
+    "read = [{ pad = 3 }]",
+    "write = [{ name = \"x\", value = 1 }]",
+    "on = [\"start\", \"change\"]",
+    "every_ms = 1",
+    "reply = { fields = [] }",
 ];

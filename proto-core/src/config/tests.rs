@@ -8,6 +8,8 @@ use std::string::ToString;
 
 use super::*;
 use crate::command::ParseError;
+#[cfg(feature = "serde")]
+use crate::modbus::rtu::Table;
 use crate::recipe::PartError;
 use crate::recipe::model::Mode;
 use crate::sysvar::{Direction, SysVar};
@@ -287,7 +289,41 @@ fn warnings_are_not_errors() {
     assert_eq!(Builder::one_port().valid().view().warnings().count(), 0);
 }
 
-/// Fields of all kinds, a command table, a safe value and a board's own address.
+/// Exchanges of all kinds, each in a recipe of its own, and their ports.
+#[cfg(feature = "serde")]
+fn add_exchanges(config: &mut GatewayConfig) {
+    let time = Duration::from_millis(50);
+    let read = [InputField::variable(ScalarType::Word, "WordInputReg[10]"), InputField::padding(2)];
+    let coils = [OutputField::constant(Coil, 1.0), OutputField::padding(9, 0), OutputField::counter(Coil)];
+    let sent = [OutputField::variable(ScalarType::Word, "WordOutputReg[1]")];
+    let byte = [InputField::constant(ScalarType::Byte, 0x15)];
+    let answer = [InputField::variable(ScalarType::Word, "WordInputReg[11]")];
+    let id = crate::wire::can::CanId::Standard(0x701);
+    let state = [InputField::variable(ScalarType::Byte, "WordInputReg[12]")];
+    let job = [InputField::variable(ScalarType::Word, "WordInputReg[13]")];
+    let master = [
+        Ask::read_input_registers(9, 16, &read).every(time).retries(2),
+        Ask::write_coils(0, 8, &coils).on_rising("BitOutputReg[3]", 7),
+    ];
+    let slave =
+        [Ask::served(5, Table::HoldingRegisters, 0, &sent), Ask::served(5, Table::HoldingRegisters, 1, &job)];
+    let talk = [Ask::request(AskFrame::stream(&[2], &[3], &sent))
+        .reply(AskFrame::stream(&[2], &[3], &answer))
+        .refusal(AskFrame::stream(&[], &[], &byte))
+        .peer(3)
+        .at_start()
+        .on_change()];
+    let remote =
+        [Ask::request(AskFrame::remote(id)).reply(AskFrame::can(id, &state)).every(time).pause(time)];
+    for (name, asks) in [("master", &master[..]), ("slave", &slave), ("talk", &talk)] {
+        config.add_recipe(&Recipe::user(name).exchanges(asks)).unwrap();
+        config.add_port(&Port::modbus_rtu(name, name).echo()).unwrap();
+    }
+    config.add_recipe(&Recipe::user("remote").exchanges(&remote)).unwrap();
+    config.add_port(&Port::can("remote", "remote")).unwrap();
+}
+
+/// Fields of all kinds, exchanges, a command table, a safe value and a board's own address.
 #[cfg(feature = "serde")]
 pub(super) fn every_kind() -> GatewayConfig {
     let table = InputBinding::Commands { table: Span { start: 0, len: 1 }, when: CommandWhen::Frame };
@@ -309,6 +345,7 @@ pub(super) fn every_kind() -> GatewayConfig {
             config.network = BoardAddress::Static(network());
             config.ports[1].on_timeout = Span { start: 0, len: 1 };
             config.recipes[0].send = SendOn::Rising { var: var("BitOutputReg[3]"), bit: 7 };
+            add_exchanges(config);
         })
         .valid()
 }
@@ -329,6 +366,10 @@ proptest! {
             // An engine must be able to plan what passes.
             Ok(()) => {
                 prop_assert!(config.view().warnings().count() < 1_000);
+                let view = config.view();
+                let budgets = |port| view.exchanges.iter().map(move |one| view.exchange_budget(port, one));
+                let mut all = config.ports.iter().flat_map(budgets);
+                prop_assert!(all.all(|budget| budget.time <= budget.time_without_reply));
                 prop_assert!(crate::engine::Plan::new(&config).is_ok());
             }
             Err(error) => prop_assert!(!config.view().describe(error).to_string().is_empty()),
