@@ -48,10 +48,14 @@ pub(super) struct Sending {
     pub(super) send_spot: Option<Spot>,
 }
 
+pub(super) fn read_on_stale(item: &Item<'_>) -> Result<OnStale> {
+    item.choice(&[("hold", OnStale::Hold), ("stop", OnStale::Stop)])
+}
+
 pub(super) fn read_sending(part: &Reader<'_>) -> Result<Sending> {
     let mut sending = Sending::default();
     if let Some(item) = part.optional("on_stale") {
-        sending.on_stale = item.choice(&[("hold", OnStale::Hold), ("stop", OnStale::Stop)])?;
+        sending.on_stale = read_on_stale(&item)?;
     }
     if let Some(item) = part.optional("send") {
         sending.send = read_send(&item)?;

@@ -174,8 +174,10 @@ impl<'a> Builder<'a> {
             }
         };
         let exchanges = self.add_exchanges(place, recipe)?;
+        let on_stale = recipe.on_stale;
         let mut recipe = Recipe::new(bounded(&recipe.name), recipe.mode, parts);
         recipe.exchanges = exchanges;
+        recipe.on_stale = on_stale.unwrap_or(recipe.on_stale);
         if let Some(sending) = sending {
             recipe.on_stale = sending.on_stale;
             recipe.send = sending.send;

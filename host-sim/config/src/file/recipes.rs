@@ -2,7 +2,7 @@
 //!
 //! In: tables. Out: [`FileRecipe`], which keeps the places for later checks.
 
-use proto_core::config::{FieldSpec, InputBinding, OutputBinding};
+use proto_core::config::{FieldSpec, InputBinding, OnStale, OutputBinding};
 use proto_core::device::{Boundary, Checksum, Encoding, Escape, Kind, Overflow};
 use proto_core::recipe::CanLayout;
 use proto_core::recipe::PartError;
@@ -39,6 +39,8 @@ pub(super) struct FileRecipe {
     pub(super) output: Option<FilePart>,
     /// What is asked of devices beside the parts, or all that a recipe of Modbus has.
     pub(super) exchanges: Vec<FileExchange>,
+    /// What requests do while a value of them is stale, if there is no output part to say it.
+    pub(super) on_stale: Option<OnStale>,
 }
 
 /// What carries a recipe.
@@ -71,9 +73,11 @@ impl RecipeKind {
     fn keys(self, flavour: Flavour) -> &'static [&'static str] {
         match (self, flavour) {
             (Self::Stream | Self::Can, Flavour::Controller) => &["name", "kind", "mode", "input", "output"],
-            (Self::Stream | Self::Can, _) => &["name", "kind", "mode", "input", "output", "exchange"],
-            (Self::ModbusMaster, _) => &["name", "kind", "mode", "exchange"],
-            (Self::ModbusSlave, _) => &["name", "kind", "mode", "address", "block"],
+            (Self::Stream | Self::Can, _) => {
+                &["name", "kind", "mode", "input", "output", "on_stale", "exchange"]
+            }
+            (Self::ModbusMaster, _) => &["name", "kind", "mode", "on_stale", "exchange"],
+            (Self::ModbusSlave, _) => &["name", "kind", "mode", "on_stale", "address", "block"],
         }
     }
 }
@@ -309,6 +313,18 @@ fn read_mode(table: &Reader<'_>, kind: RecipeKind) -> Result<Mode> {
     }
 }
 
+/// What all exchanges do while a value that they send is stale.
+fn read_on_stale(table: &Reader<'_>, has_output: bool, is_without: bool) -> Result<Option<OnStale>> {
+    let Some(item) = table.optional("on_stale") else { return Ok(None) };
+    if has_output {
+        return Err(item.error("a recipe with an output part has on_stale there, also for its exchanges"));
+    }
+    if is_without {
+        return Err(item.error("allowed only in a recipe with exchanges, or in its output part"));
+    }
+    bindings::read_on_stale(&item).map(Some)
+}
+
 fn read(table: &Reader<'_>, flavour: Flavour) -> Result<FileRecipe> {
     let (name, name_spot) = read_name(table)?;
     let kind = read_kind(table, flavour)?;
@@ -331,8 +347,9 @@ fn read(table: &Reader<'_>, flavour: Flavour) -> Result<FileRecipe> {
             Flavour::Controller => "a recipe needs an input part, an output part or both",
         }));
     }
+    let on_stale = read_on_stale(table, output.is_some(), exchanges.is_empty())?;
     let spot = table.spot.clone();
-    let recipe = FileRecipe { spot, name, name_spot, mode, kind, input, output, exchanges };
+    let recipe = FileRecipe { on_stale, spot, name, name_spot, mode, kind, input, output, exchanges };
     let is_device = recipe.is_device();
     for direction in [Direction::Input, Direction::Output] {
         let Some(part) = recipe.part(direction) else { continue };

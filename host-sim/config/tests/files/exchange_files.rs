@@ -2,7 +2,8 @@
 
 use proto_core::config::{
     Ask, AskFrame, AskWhen, Bus, CanFields, Coil, Exchange, FieldSpec, GatewayConfig, InputBinding,
-    InputField, OutputBinding, OutputField, Parity, Parts, Port, Recipe, Rs485, Span, StateValue, Talk,
+    InputField, OnStale, OutputBinding, OutputField, Parity, Parts, Port, Recipe, Rs485, Span, StateValue,
+    Talk,
 };
 use proto_core::device::{Algorithm, Bits, ByteOrder, Checksum, Encoding, Kind};
 use proto_core::modbus::rtu::{Operation, Table};
@@ -383,4 +384,13 @@ fn show_field(field: &FieldSpec) -> String {
         }
         other => format!("{other:?}"),
     }
+}
+
+#[test]
+fn a_slave_can_refuse_to_show_stale_values() {
+    let stale = LINE.replace("address = 5\n", "address = 5\non_stale = \"stop\"\n");
+    assert_ne!(LINE, stale);
+    let config = parse_gateway(Text { name: "line.toml", toml: &stale }, &[]).unwrap();
+    let on_stale: Vec<_> = config.recipes.iter().map(|recipe| recipe.on_stale).collect();
+    assert_eq!(on_stale[..3], [OnStale::Hold, OnStale::Stop, OnStale::Hold]);
 }

@@ -104,6 +104,7 @@ const CASES: &[Case] = &[
     // A slave.
     line("a slave without an address", "address = 5\n", ""),
     line("a slave that is all slaves", "address = 5\n", "address = 0\n"),
+    line("a stale value that is unknown", "address = 5\n", "address = 5\non_stale = \"wait\"\n"),
     line("a block without a table", "table = \"discrete-inputs\"\n", ""),
     line("an unknown table", "table = \"discrete-inputs\"", "table = \"discreet-inputs\""),
     line("an unknown key of a block", "word_order = \"low-first\"\nfields", "wordorder = \"low-first\"\nfields"),
