@@ -2,6 +2,7 @@
 
 use proto_core::config::{DeviceFrame, FieldSpec};
 use proto_core::device::{Carrier, LayoutError};
+use proto_core::modbus::rtu::Operation;
 use proto_core::sysvar::Direction;
 use proto_core::wire::can::CanId;
 
@@ -45,6 +46,37 @@ pub struct DeviceRecipe {
     pub input: Vec<NamedFrame>,
     /// Gateway to device.
     pub output: Vec<NamedFrame>,
+    /// What is asked beside these frames, in the order of the file.
+    pub exchanges: Vec<NamedExchange>,
+}
+
+/// An exchange with the names of its fields. Its frames are whole: those of Modbus have address,
+/// function and CRC.
+#[derive(Debug, Clone, PartialEq)]
+pub struct NamedExchange {
+    /// The slave's address on Modbus, or the number of the device.
+    pub peer: u8,
+    /// Whose frames they are.
+    pub kind: ExchangeKind,
+    /// What asks.
+    pub request: Option<NamedFrame>,
+    /// What answers.
+    pub reply: Option<NamedFrame>,
+    /// What the device sends if it refuses the request.
+    pub refusal: Option<NamedFrame>,
+    /// The request is a remote frame on CAN, without data.
+    pub remote: bool,
+}
+
+/// Whose frames an exchange has.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ExchangeKind {
+    /// The device's own.
+    Frames,
+    /// Those of Modbus RTU, which the gateway asks as master.
+    Master(Operation),
+    /// Those of Modbus RTU, which the gateway answers as slave: all of a block is read or written.
+    Slave(Operation),
 }
 
 impl DeviceRecipe {
@@ -81,6 +113,8 @@ pub struct DeviceField {
     pub repeats: bool,
     /// Its value picks a command.
     pub picks_commands: bool,
+    /// It is the coil of Modbus function 5, which is FF for 1.
+    pub is_coil: bool,
 }
 
 impl NamedFrame {

@@ -10,7 +10,8 @@ pub mod file;
 mod sim;
 mod target;
 
-pub use device::{AnyRecipe, DeviceField, DeviceRecipe, NamedFrame};
+pub use device::{AnyRecipe, DeviceField, DeviceRecipe, ExchangeKind, NamedExchange, NamedFrame};
+pub use file::function_name;
 pub use sim::{
     AnalogInput, BitGroup, CommandClients, Initial, InitialTarget, Listen, Power, Robot, RobotMode, SimBus,
     SimCanFrame, SimConfig, SimField, SimParts, SimPort, SimProgram, SimRecipe, SimStreamPart,

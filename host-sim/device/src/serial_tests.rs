@@ -16,6 +16,7 @@ fn serial(baud: u32) -> PortBus {
         stop_bits: 1,
         idle_gap: Duration::from_millis(50),
         turnaround: Duration::ZERO,
+        echo: false,
     })
 }
 

@@ -11,7 +11,7 @@ use proto_core::sysvar::{Direction, SysVar};
 use proto_core::time::Duration;
 use proto_core::wire::can::CanId;
 
-use super::{Overrides, frame, plan, text};
+use super::{Overrides, conversation, frame, plan, text};
 use recipe_config::file::{self, Config, FileError};
 use recipe_config::{AnyRecipe, SimBus, SimConfig, SimField, SimParts, SimPort, SimRecipe, SimStreamPart};
 use recipe_controller::{BuildError, Controller};
@@ -110,6 +110,9 @@ fn gateway(config: &GatewayConfig, recipes: &[AnyRecipe]) -> String {
                 }
             }
         }
+        if let Some(AnyRecipe::Device(recipe)) = recipe {
+            report += &conversation::show(config, port, recipe);
+        }
         if port.safe_at_start {
             report += "  safe values from the start until the device speaks\n";
         }
@@ -201,7 +204,8 @@ fn show_line(line: &Rs485) -> String {
         Parity::Even => 'E',
         Parity::Odd => 'O',
     };
-    format!("rs485, {} baud 8{parity}{}", line.baud, line.stop_bits)
+    let echo = if line.echo { ", with echo" } else { "" };
+    format!("rs485, {} baud 8{parity}{}{echo}", line.baud, line.stop_bits)
 }
 
 fn show_can_bus(bitrate: u32) -> String {

@@ -8,7 +8,7 @@ use proto_core::sysvar::{Direction, SysVar};
 use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::{Scalar, ScalarType};
 
-use recipe_config::{AnyRecipe, DeviceRecipe, SimField, SimParts, SimRecipe};
+use recipe_config::{AnyRecipe, DeviceRecipe, NamedExchange, NamedFrame, SimField, SimParts, SimRecipe};
 
 use super::convert::device::DevicePart;
 
@@ -52,17 +52,7 @@ impl Part {
         name: Option<&str>,
         part: Option<Direction>,
     ) -> Result<Self, String> {
-        let names =
-            || recipes.iter().map(|recipe| format!("{:?}", recipe.name())).collect::<Vec<_>>().join(", ");
-        let recipe = match (name, recipes) {
-            (_, []) => return Err("there is no recipe in this file".into()),
-            (None, [only]) => only,
-            (None, _) => return Err(format!("several recipes; choose one with --recipe NAME: {}", names())),
-            (Some(name), _) => recipes
-                .iter()
-                .find(|recipe| recipe.name() == name)
-                .ok_or_else(|| format!("there is no recipe {name:?}; there are {}", names()))?,
-        };
+        let recipe = choose_recipe(recipes, name)?;
         let has = |part| match recipe {
             AnyRecipe::Plain(recipe) => has_part(recipe, part),
             AnyRecipe::Device(recipe) => !recipe.part(part).is_empty(),
@@ -76,6 +66,7 @@ impl Part {
                 return Err(format!("recipe {name:?} has no output part"));
             }
             (Some(part), _, _) => part,
+            (None, false, false) => return Self::choose_exchange(recipes, Some(name), None, None),
             (None, true, false) => Direction::Input,
             (None, false, _) => Direction::Output,
             (None, true, true) => {
@@ -90,10 +81,61 @@ impl Part {
         }
     }
 
+    /// Chooses a frame of an exchange, or the only one.
+    pub(super) fn choose_exchange(
+        recipes: &[AnyRecipe],
+        name: Option<&str>,
+        number: Option<usize>,
+        talk: Option<TalkPart>,
+    ) -> Result<Self, String> {
+        let recipe = choose_recipe(recipes, name)?;
+        let name = recipe.name();
+        let exchanges = match recipe {
+            AnyRecipe::Device(recipe) => &recipe.exchanges[..],
+            AnyRecipe::Plain(_) => &[],
+        };
+        let exchange = match (number, exchanges) {
+            (_, []) => return Err(format!("recipe {name:?} has no exchanges")),
+            (None, [only]) => only,
+            (None, all) => {
+                return Err(format!(
+                    "recipe {name:?} has several exchanges; choose one with --exchange N: 1..={}",
+                    all.len()
+                ));
+            }
+            (Some(number), all) => number.checked_sub(1).and_then(|nth| all.get(nth)).ok_or_else(|| {
+                format!("there is no exchange {number} in recipe {name:?}; allowed: 1..={}", all.len())
+            })?,
+        };
+        let all = [TalkPart::Request, TalkPart::Reply, TalkPart::Refusal];
+        let there: Vec<_> = all.into_iter().filter(|part| part.of(exchange).is_some()).collect();
+        let names = || there.iter().map(|part| part.name()).collect::<Vec<_>>().join(", ");
+        let talk = match (talk, &there[..]) {
+            (Some(talk), _) => talk,
+            (None, [only]) => *only,
+            (None, _) => {
+                return Err(format!("the exchange has several frames; choose one with --part: {}", names()));
+            }
+        };
+        let frame = talk
+            .of(exchange)
+            .ok_or_else(|| format!("the exchange has no {}; there are {}", talk.name(), names()))?;
+        let device = DevicePart::of_exchange(exchange, frame, talk == TalkPart::Request)?;
+        Ok(Self::of_device(device))
+    }
+
     fn lay_out(recipe: &DeviceRecipe, direction: Direction) -> Result<Self, String> {
-        let device = DevicePart::new(recipe, direction)?;
+        DevicePart::new(recipe, direction).map(Self::of_device)
+    }
+
+    fn of_device(device: DevicePart) -> Self {
         let frames = device.ids().map(|id| FrameFields { id, fields: Vec::new() }).collect();
-        Ok(Self { layout: Layout::Device(Box::new(device)), frames })
+        Self { layout: Layout::Device(Box::new(device)), frames }
+    }
+
+    /// Whether its only frame is always the same, so that no values are needed.
+    pub(super) fn is_constant(&self) -> bool {
+        matches!(&self.layout, Layout::Device(device) if device.is_constant())
     }
 
     fn compile(recipe: &SimRecipe, direction: Direction) -> Result<Self, String> {
@@ -147,6 +189,46 @@ impl Part {
     ) -> Result<CanFrame, String> {
         let frame = layout.frame(index).ok_or("no such frame")?;
         frame.encode_values(values).map_err(|error| error.to_string())
+    }
+}
+
+/// The recipe called `name`, or the only one.
+fn choose_recipe<'r>(recipes: &'r [AnyRecipe], name: Option<&str>) -> Result<&'r AnyRecipe, String> {
+    let names = || recipes.iter().map(|recipe| format!("{:?}", recipe.name())).collect::<Vec<_>>().join(", ");
+    match (name, recipes) {
+        (_, []) => Err("there is no recipe in this file".into()),
+        (None, [only]) => Ok(only),
+        (None, _) => Err(format!("several recipes; choose one with --recipe NAME: {}", names())),
+        (Some(name), _) => recipes
+            .iter()
+            .find(|recipe| recipe.name() == name)
+            .ok_or_else(|| format!("there is no recipe {name:?}; there are {}", names())),
+    }
+}
+
+/// A frame of an exchange.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum TalkPart {
+    Request,
+    Reply,
+    Refusal,
+}
+
+impl TalkPart {
+    fn name(self) -> &'static str {
+        match self {
+            Self::Request => "request",
+            Self::Reply => "reply",
+            Self::Refusal => "refusal",
+        }
+    }
+
+    fn of(self, exchange: &NamedExchange) -> Option<&NamedFrame> {
+        match self {
+            Self::Request => exchange.request.as_ref(),
+            Self::Reply => exchange.reply.as_ref(),
+            Self::Refusal => exchange.refusal.as_ref(),
+        }
     }
 }
 

@@ -2,7 +2,7 @@
 
 use proto_core::config::{DeviceFrame, FieldSpec, OutputBinding, Words};
 use proto_core::device::{
-    Algorithm, Bits, ByteOrder, Checksum, Digits, Encoding, Kind, Place, Text, TextWidth, Width,
+    Algorithm, Bits, ByteOrder, Carrier, Checksum, Digits, Encoding, Kind, Place, Text, TextWidth, Width,
 };
 use proto_core::sysvar::Direction;
 use proto_core::wire::scalar::ScalarType;
@@ -24,18 +24,22 @@ pub(super) fn show(recipe: &DeviceRecipe, part: Direction) -> String {
         if let Some(id) = frame.id {
             report += &format!("    id {}\n", text::show_id(id));
         }
-        // Cannot fail: reading the file laid out the same frames.
-        let Ok(laid_out) = frame.lay_out(recipe.carrier, part) else { continue };
-        let rows = rows(frame, &laid_out, part);
-        let width = |column: fn(&Row) -> &String| {
-            rows.iter().map(|row| column(row).chars().count()).max().unwrap_or(0)
-        };
-        let (places, names) = (width(|row| &row.place), width(|row| &row.name));
-        for Row { place, name, what } in &rows {
-            report += &format!("    {place:places$}  {name:names$}  {what}\n");
-        }
+        report += &show_bytes(frame, part);
     }
     report
+}
+
+/// One frame, a line for each run of bytes.
+pub(super) fn show_bytes(frame: &NamedFrame, part: Direction) -> String {
+    let carrier = if frame.id.is_some() { Carrier::Can } else { Carrier::Whole };
+    // Cannot fail but for a remote request: reading the file laid out the same frames.
+    let Ok(laid_out) = frame.lay_out(carrier, part) else { return String::new() };
+    let rows = rows(frame, &laid_out, part);
+    let width =
+        |column: fn(&Row) -> &String| rows.iter().map(|row| column(row).chars().count()).max().unwrap_or(0);
+    let (places, names) = (width(|row| &row.place), width(|row| &row.name));
+    let show = |Row { place, name, what }: &Row| format!("    {place:places$}  {name:names$}  {what}\n");
+    rows.iter().map(show).collect()
 }
 
 fn rows(frame: &NamedFrame, laid_out: &DeviceFrame, part: Direction) -> Vec<Row> {
@@ -78,6 +82,9 @@ fn rows(frame: &NamedFrame, laid_out: &DeviceFrame, part: Direction) -> Vec<Row>
             }
             FieldSpec::TextOutput { text, from, .. } => {
                 add(place, &field.name, format!("{} <- {}", show_text(&text), show_words(from)));
+            }
+            FieldSpec::UserOutput { .. } | FieldSpec::DeviceOutput { .. } if field.is_coil => {
+                add(place, &field.name, format!("FF for 1, 00 for 0{}", show_use(&field.spec)));
             }
             spec => {
                 let Some(encoding) = spec.element().and_then(|element| element.encoding()) else { continue };

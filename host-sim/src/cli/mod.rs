@@ -6,6 +6,7 @@
 
 mod check;
 mod codec;
+mod conversation;
 mod convert;
 mod frame;
 mod image;
@@ -22,6 +23,7 @@ use std::time::Duration;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use proto_core::sysvar::Direction;
 
+use codec::TalkPart;
 use recipe_config::file;
 use recipe_device::bind::Bind;
 use recipe_shell::out::{Out, Printed, print_stderr};
@@ -118,7 +120,7 @@ Examples:
 
 const ENCODE_EXAMPLES: &str = "\
 Values are given in field order or as NAME=VALUE: decimal, 0x1F or 0.5.
-Without values, lines in the form that `decode` prints are read from stdin.
+A frame of an exchange that has only constants needs none. Else, without values, lines in the form that `decode` prints are read from stdin.
 
 Examples:
   host-sim encode cell.toml --part input 1
@@ -126,7 +128,8 @@ Examples:
   host-sim encode can.toml --part output --id 2 0.46744487 0.4099705
       002#EF54EF3EA7E7D13E
   host-sim decode can.toml --part output --log bus.log |
-      host-sim encode can.toml --part output";
+      host-sim encode can.toml --part output
+  host-sim encode line.toml --exchange 2 --part request";
 
 const DECODE_EXAMPLES: &str = "\
 Frames are hex bytes (FF FF 01 EE EE, FFFF01EEEE); for a CAN recipe, what
@@ -138,7 +141,8 @@ counted on stderr.
 
 Examples:
   host-sim decode cell.toml --part input FF FF 01 EE EE
-  candump -L can0 | host-sim decode can.toml --part output";
+  candump -L can0 | host-sim decode can.toml --part output
+  host-sim decode line.toml --exchange 2 --part reply 09 04 02 03 E8 58 4F";
 
 /// Arguments of `controller` and `gateway`.
 #[derive(Debug, Args)]
@@ -177,9 +181,13 @@ struct Which {
     /// The recipe's name; not needed when there is only one
     #[arg(long, value_name = "NAME")]
     recipe: Option<String>,
-    /// The part: input (user to robot) or output (robot to user); not needed when there is only one
+    /// The part: input (user to robot) or output (robot to user), or the frame of an exchange: request,
+    /// reply or refusal; not needed when there is only one
     #[arg(long)]
     part: Option<PartName>,
+    /// The number of the exchange or block in the recipe, from 1; not needed when there is only one
+    #[arg(long, value_name = "N")]
+    exchange: Option<usize>,
     #[command(flatten)]
     overrides: Overrides,
 }
@@ -188,13 +196,25 @@ struct Which {
 enum PartName {
     Input,
     Output,
+    Request,
+    Reply,
+    Refusal,
 }
 
-impl From<PartName> for Direction {
+/// A part of a recipe, or of one of its exchanges.
+enum Chosen {
+    Part(Direction),
+    Talk(TalkPart),
+}
+
+impl From<PartName> for Chosen {
     fn from(part: PartName) -> Self {
         match part {
-            PartName::Input => Self::Input,
-            PartName::Output => Self::Output,
+            PartName::Input => Self::Part(Direction::Input),
+            PartName::Output => Self::Part(Direction::Output),
+            PartName::Request => Self::Talk(TalkPart::Request),
+            PartName::Reply => Self::Talk(TalkPart::Reply),
+            PartName::Refusal => Self::Talk(TalkPart::Refusal),
         }
     }
 }
@@ -303,7 +323,7 @@ fn finished(result: Result<(), StartError>) -> ExitCode {
 
 fn encode(args: &EncodeArgs, out: &mut dyn Write) -> Outcome {
     let part = args.which.part()?;
-    if args.values.is_empty() {
+    if args.values.is_empty() && !(args.which.is_of_exchange() && part.is_constant()) {
         convert::encode_lines(&part, args.id, io::stdin().lock(), out)
     } else {
         convert::encode_values(&part, args.id, &args.values, out)
@@ -326,11 +346,29 @@ fn decode(args: &DecodeArgs, out: &mut dyn Write) -> Outcome {
 }
 
 impl Which {
+    /// Whether a frame of an exchange was asked for.
+    fn is_of_exchange(&self) -> bool {
+        let is_talk = matches!(self.part.map(Chosen::from), Some(Chosen::Talk(_)));
+        is_talk || self.exchange.is_some()
+    }
+
     fn part(&self) -> Result<codec::Part, String> {
         let recipes =
             file::load_recipes(&self.file, &self.overrides.set).map_err(|error| error.to_string())?;
-        codec::Part::choose(&recipes, self.recipe.as_deref(), self.part.map(Direction::from))
-            .map_err(|message| format!("{}: {message}", self.file.display()))
+        let recipe = self.recipe.as_deref();
+        let part = match (self.part.map(Chosen::from), self.exchange) {
+            (Some(Chosen::Part(_)), Some(_)) => {
+                Err("an exchange has no input and output; choose one with --part: request, reply, refusal"
+                    .into())
+            }
+            (Some(Chosen::Part(part)), None) => codec::Part::choose(&recipes, recipe, Some(part)),
+            (None, None) => codec::Part::choose(&recipes, recipe, None),
+            (Some(Chosen::Talk(talk)), number) => {
+                codec::Part::choose_exchange(&recipes, recipe, number, Some(talk))
+            }
+            (None, number) => codec::Part::choose_exchange(&recipes, recipe, number, None),
+        };
+        part.map_err(|message: String| format!("{}: {message}", self.file.display()))
     }
 }
 

@@ -102,13 +102,24 @@ impl<'c> ConfigView<'c> {
 
     /// What is valid but may not do what was intended.
     pub fn warnings(self) -> impl Iterator<Item = Warning> + 'c {
-        self.slow_ports().chain(self.read_back()).chain(self.unused_recipes())
+        self.slow_ports().chain(self.exchanges()).chain(self.read_back()).chain(self.unused_recipes())
     }
 
     fn slow_ports(self) -> impl Iterator<Item = Warning> + 'c {
         (0..).zip(self.ports).filter_map(move |(port, config)| {
             let shortest = self.shortest_cycle(config);
             (shortest > config.cycle).then_some(Warning::DoesNotFit { port, cycle: config.cycle, shortest })
+        })
+    }
+
+    /// What the exchanges of a port ask too often, or too rarely.
+    fn exchanges(self) -> impl Iterator<Item = Warning> + 'c {
+        (0..).zip(self.ports).flat_map(move |(port, config)| {
+            let percent = self.line_share(config).filter(|percent| *percent > 100);
+            let every = self.slowest_reply(config).filter(|every| *every >= config.timeout);
+            let full = percent.map(|percent| Warning::LineFull { port, percent });
+            let rare = every.map(|every| Warning::AskedRarely { port, timeout: config.timeout, every });
+            full.into_iter().chain(rare)
         })
     }
 
@@ -150,6 +161,24 @@ pub enum Warning {
         /// The shortest cycle in which the output fits.
         shortest: Duration,
     },
+    /// The exchanges of a port with a period take more than the whole time of its line: they are asked
+    /// less often.
+    LineFull {
+        /// The port.
+        port: u8,
+        /// The time that they take, in percent.
+        percent: u32,
+    },
+    /// A port's timeout is not longer than the period of one of its exchanges: the values of its reply
+    /// are overdue until the next one.
+    AskedRarely {
+        /// The port.
+        port: u8,
+        /// Its timeout.
+        timeout: Duration,
+        /// The longest period.
+        every: Duration,
+    },
     /// A way up carries a variable that no port writes: it is read back from the state stream and
     /// sent on, so for 100 ms a change made by somebody else can be undone.
     ReadBack {
@@ -174,9 +203,22 @@ impl fmt::Display for DescribedWarning<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let recipe_name =
             |index| self.config.recipes.get(usize::from(index)).map_or("", |recipe: &Recipe| &recipe.name);
+        let port_name = |index: u8| self.config.ports.get(usize::from(index)).map_or("", |port| &port.name);
         match self.warning {
+            Warning::LineFull { port, percent } => write!(
+                f,
+                "port {:?}: the exchanges with a period take {percent} % of the line's time, so they are asked less \
+                 often",
+                port_name(port)
+            ),
+            Warning::AskedRarely { port, timeout, every } => write!(
+                f,
+                "port {:?}: an exchange is asked every {every}, but the timeout is {timeout}, so its values are \
+                 overdue until the next reply",
+                port_name(port)
+            ),
             Warning::DoesNotFit { port, cycle, shortest } => {
-                let name = self.config.ports.get(usize::from(port)).map_or("", |port| &port.name);
+                let name = port_name(port);
                 write!(
                     f,
                     "port {name:?}: the output does not fit a cycle of {cycle}; the shortest possible is {shortest}, \
@@ -200,7 +242,7 @@ mod tests {
 
     fn line(baud: u32, parity: Parity, stop_bits: u8) -> Rs485 {
         let (idle_gap, turnaround) = (Duration::from_millis(50), Duration::ZERO);
-        Rs485 { baud, parity, stop_bits, idle_gap, turnaround }
+        Rs485 { baud, parity, stop_bits, idle_gap, turnaround, echo: false }
     }
 
     #[test]

@@ -2,12 +2,13 @@
 
 use core::fmt;
 
-use super::error::{ConfigErrorKind as Kind, Place};
-use super::exchange::{AskWhen, Exchange, FrameSpec, Talk};
+use super::error::{ConfigErrorKind as Kind, ExchangeKey as Key, Place};
+use super::exchange::{Exchange, FrameSpec, Talk};
 use super::rules::{Check, MAX_TIME, check_pool, check_time, fail};
 use super::{ConfigView, DeviceFrame, FieldSpec, Parts, Recipe, Span};
 use crate::device::{Carrier, LayoutError};
 use crate::modbus::rtu::{BROADCAST, CountError, MAX_ADDRESS, MAX_SLAVES, Operation};
+use crate::recipe::PartError;
 use crate::recipe::model::Mode;
 use crate::sysvar::Direction;
 
@@ -30,6 +31,20 @@ pub enum ExchangeError {
     Slave {
         /// The address.
         address: u8,
+    },
+    /// The address of the gateway as a slave.
+    OwnAddress {
+        /// The address.
+        address: u8,
+    },
+    /// Blocks of one slave with different addresses.
+    OtherAddress,
+    /// Registers or coils behind the last one.
+    BeyondLast {
+        /// The first of them.
+        address: u16,
+        /// How many there are.
+        count: u16,
     },
     /// A broadcast that reads: nobody would answer.
     BroadcastRead,
@@ -60,6 +75,8 @@ pub enum ExchangeError {
     Unasked,
     /// A remote request with fields.
     RemoteFields,
+    /// A remote frame that the gateway would receive.
+    RemoteReply,
 }
 
 impl fmt::Display for ExchangeError {
@@ -81,6 +98,14 @@ impl fmt::Display for ExchangeError {
                     "slave {address} is out of range; allowed: 1..={MAX_ADDRESS}, or 0 to write to all of them"
                 )
             }
+            Self::OwnAddress { address } => {
+                write!(f, "address {address} is out of range; allowed: 1..={MAX_ADDRESS}")
+            }
+            Self::OtherAddress => f.write_str("the blocks of a slave have one address"),
+            Self::BeyondLast { address, count } => {
+                let last = u32::from(*address).saturating_add(u32::from(*count)).saturating_sub(1);
+                write!(f, "{address} to {last} are out of range; the last register or coil is 65535")
+            }
             Self::BroadcastRead => {
                 f.write_str("slave 0 is all of them, which cannot be read; allowed: writes")
             }
@@ -99,8 +124,9 @@ impl fmt::Display for ExchangeError {
             Self::Nothing => f.write_str("an exchange needs a request, a reply or both"),
             Self::LoneRefusal => f.write_str("a refusal answers a request that has a reply"),
             Self::Never => f.write_str("it would never be asked; set every_ms or on"),
-            Self::Unasked => f.write_str("without a request there is nothing to ask; remove every_ms and on"),
+            Self::Unasked => f.write_str("there is no request to send; remove every_ms and on"),
             Self::RemoteFields => f.write_str("a remote request has no fields"),
+            Self::RemoteReply => f.write_str("only a request can be remote"),
         }
     }
 }
@@ -114,11 +140,11 @@ pub(super) struct ExchangeCheck<'a> {
 
 impl<'a> ExchangeCheck<'a> {
     pub(super) fn check(&self) -> Check {
-        check_pool(self.at(0), self.recipe.exchanges, self.config.exchanges.len())?;
+        check_pool(self.at(0, Key::Whole), self.recipe.exchanges, self.config.exchanges.len())?;
         let exchanges = self.config.exchanges_of(self.recipe);
         let (mut peers, mut count) = ([false; 256], 0_usize);
         for (nth, exchange) in (0..).zip(exchanges) {
-            self.check_one(nth, exchange).map_err(|error| error.at(self.at(nth)))?;
+            self.check_one(nth, exchange)?;
             if let Some(seen) = peers.get_mut(usize::from(exchange.peer))
                 && !core::mem::replace(seen, true)
                 && !matches!(exchange.talk, Talk::Rtu { .. } if exchange.peer == BROADCAST)
@@ -126,135 +152,197 @@ impl<'a> ExchangeCheck<'a> {
                 count = count.saturating_add(1);
             }
             if count > MAX_SLAVES {
-                return fail(self.at(nth), Kind::Exchange(ExchangeError::TooManyPeers));
+                return self.refuse(nth, Key::Peer, ExchangeError::TooManyPeers);
             }
             let earlier = exchanges.iter().take(usize::from(nth));
             for before in earlier {
                 if core::mem::discriminant(&before.talk) != core::mem::discriminant(&exchange.talk) {
-                    return fail(self.at(nth), Kind::Exchange(ExchangeError::Mixed));
+                    return self.refuse(nth, Key::Whole, ExchangeError::Mixed);
                 }
                 if overlap(before, exchange) {
-                    return fail(self.at(nth), Kind::Exchange(ExchangeError::Overlap));
+                    return self.refuse(nth, Key::Registers, ExchangeError::Overlap);
                 }
             }
-            check_time(self.at(nth), exchange.timeout, MAX_TIME)?;
+            check_time(self.at(nth, Key::Timeout), exchange.timeout, MAX_TIME)?;
             if let Some(every) = exchange.when.every {
-                check_time(self.at(nth), every, MAX_TIME)?;
+                check_time(self.at(nth, Key::Every), every, MAX_TIME)?;
             }
             if exchange.pause > MAX_PAUSE {
-                return fail(self.at(nth), Kind::TimeTooLong { time: exchange.pause, longest: MAX_PAUSE });
+                let kind = Kind::TimeTooLong { time: exchange.pause, longest: MAX_PAUSE };
+                return fail(self.at(nth, Key::Pause), kind);
             }
             if let Some((var, bit)) = exchange.when.rising {
-                super::check_recipe::check_bit(self.at(nth), var, bit)?;
+                super::check_recipe::check_bit(self.at(nth, Key::Rising), var, bit)?;
             }
         }
         Ok(())
     }
 
-    fn at(&self, exchange: u8) -> Place {
-        Place::Exchange { recipe: self.index, exchange }
+    fn at(&self, exchange: u8, key: Key) -> Place {
+        Place::Exchange { recipe: self.index, exchange, key }
     }
 
-    fn check_one(&self, nth: u8, exchange: &Exchange) -> Result<(), Wrong> {
+    fn refuse(&self, exchange: u8, key: Key, error: ExchangeError) -> Check {
+        fail(self.at(exchange, key), Kind::Exchange(error))
+    }
+
+    fn check_one(&self, nth: u8, exchange: &Exchange) -> Check {
         if self.recipe.mode != Mode::User {
-            return Err(ExchangeError::NeedsUser.into());
+            return self.refuse(nth, Key::Whole, ExchangeError::NeedsUser);
         }
         let is_alone = matches!(self.recipe.parts, Parts::Stream { input: None, output: None });
+        let (peer, is_never) = (exchange.peer, exchange.when.is_never());
         match exchange.talk {
             Talk::Rtu { .. } | Talk::Served { .. } if !is_alone => {
-                Err(ExchangeError::PartsBesideModbus.into())
+                self.refuse(nth, Key::Whole, ExchangeError::PartsBesideModbus)
             }
             Talk::Rtu { operation, written, read } => {
-                if exchange.peer > MAX_ADDRESS {
-                    return Err(ExchangeError::Slave { address: exchange.peer }.into());
+                if peer > MAX_ADDRESS {
+                    return self.refuse(nth, Key::Peer, ExchangeError::Slave { address: peer });
                 }
-                if exchange.peer == BROADCAST && operation.reads() {
-                    return Err(ExchangeError::BroadcastRead.into());
+                if peer == BROADCAST && operation.reads() {
+                    return self.refuse(nth, Key::Peer, ExchangeError::BroadcastRead);
                 }
-                if exchange.when.is_never() {
-                    return Err(ExchangeError::Never.into());
+                if is_never {
+                    return self.refuse(nth, Key::Whole, ExchangeError::Never);
                 }
-                self.check_operation(operation, written, read)
+                self.check_operation(nth, operation, [(Direction::Output, written), (Direction::Input, read)])
             }
             Talk::Served { operation, written, read } => {
-                if exchange.peer == BROADCAST || exchange.peer > MAX_ADDRESS {
-                    return Err(ExchangeError::Slave { address: exchange.peer }.into());
+                if peer == BROADCAST || peer > MAX_ADDRESS {
+                    return self.refuse(nth, Key::Peer, ExchangeError::OwnAddress { address: peer });
                 }
                 let first = self.config.exchanges_of(self.recipe).first();
-                if first.is_some_and(|first| first.peer != exchange.peer) || !exchange.when.is_never() {
-                    return Err(ExchangeError::NotServed.into());
+                if first.is_some_and(|first| first.peer != peer) {
+                    return self.refuse(nth, Key::Peer, ExchangeError::OtherAddress);
+                }
+                if !is_never {
+                    return self.refuse(nth, Key::Whole, ExchangeError::Unasked);
                 }
                 match operation {
                     Operation::ReadWriteRegisters { .. }
                     | Operation::WriteCoil { .. }
-                    | Operation::WriteRegister { .. } => Err(ExchangeError::NotServed.into()),
-                    _ => self.check_operation(operation, written, read),
+                    | Operation::WriteRegister { .. } => {
+                        self.refuse(nth, Key::Registers, ExchangeError::NotServed)
+                    }
+                    _ => {
+                        let spans = [(Direction::Input, written), (Direction::Output, read)];
+                        self.check_operation(nth, operation, spans)
+                    }
                 }
             }
             Talk::Frames { request, reply, refusal } => {
-                self.check_frames(nth, &exchange.when, [request, reply, refusal])
+                self.check_frames(nth, is_never, [request, reply, refusal])
             }
         }
     }
 
-    /// Counts, and that the fields fill them.
-    fn check_operation(&self, operation: Operation, written: Span, read: Span) -> Result<(), Wrong> {
-        operation.check().map_err(ExchangeError::Count)?;
-        let parts = [
-            (Direction::Output, written, operation.written_len()),
-            (Direction::Input, read, operation.read_len()),
-        ];
-        for (part, span, needed) in parts {
-            check_pool(self.at(0), span, self.config.fields.len()).map_err(Wrong::Other)?;
+    /// Counts, and that the fields fill them: those that are written, and those that are read.
+    fn check_operation(&self, nth: u8, operation: Operation, spans: [(Direction, Span); 2]) -> Check {
+        let refuse = |error| self.refuse(nth, Key::Registers, error);
+        if let Err(error) = operation.check() {
+            return refuse(ExchangeError::Count(error));
+        }
+        if let Some((address, count)) = beyond_last(&operation) {
+            return refuse(ExchangeError::BeyondLast { address, count });
+        }
+        let needed = [operation.written_len(), operation.read_len()];
+        for ((part, span), needed) in spans.into_iter().zip(needed) {
+            check_pool(self.at(nth, Key::Registers), span, self.config.fields.len())?;
             let fields = span.of(self.config.fields);
             if fields.is_empty() && needed == 0 {
                 continue;
             }
-            let layout = DeviceFrame::new(Carrier::Whole, part, (&[], &[]), fields)?.layout;
+            let layout = match DeviceFrame::new(Carrier::Whole, part, (&[], &[]), fields) {
+                Ok(frame) => frame.layout,
+                Err(error) => return fail(self.place_of(nth, part, fields, error), Kind::Layout(error)),
+            };
             let (shortest, longest) = layout.lengths();
             if shortest != longest {
-                return Err(ExchangeError::Varying.into());
+                return refuse(ExchangeError::Varying);
             }
             if longest != needed {
-                return Err(ExchangeError::Fields { needed, found: longest }.into());
+                return refuse(ExchangeError::Fields { needed, found: longest });
             }
         }
         Ok(())
     }
 
-    fn check_frames(&self, nth: u8, when: &AskWhen, frames: [Option<u8>; 3]) -> Result<(), Wrong> {
-        let [request, reply, refusal] = frames;
-        match (request, reply, refusal) {
-            (None, None, _) => return Err(ExchangeError::Nothing.into()),
-            (None, _, Some(_)) | (_, None, Some(_)) => return Err(ExchangeError::LoneRefusal.into()),
-            (Some(_), ..) if when.is_never() => return Err(ExchangeError::Never.into()),
-            (None, ..) if !when.is_never() => return Err(ExchangeError::Unasked.into()),
-            _ => {}
+    fn check_frames(&self, nth: u8, is_never: bool, frames: [Option<u8>; 3]) -> Check {
+        let refused = match frames {
+            [None, None, _] => Some((Key::Whole, ExchangeError::Nothing)),
+            [None, _, Some(_)] | [_, None, Some(_)] => Some((Key::Refusal, ExchangeError::LoneRefusal)),
+            [Some(_), ..] if is_never => Some((Key::Whole, ExchangeError::Never)),
+            [None, ..] if !is_never => Some((Key::Whole, ExchangeError::Unasked)),
+            _ => None,
+        };
+        if let Some((key, error)) = refused {
+            return self.refuse(nth, key, error);
         }
-        for (part, index) in [Direction::Output, Direction::Input, Direction::Input].into_iter().zip(frames) {
+        let [request, reply, refusal] = frames;
+        for (key, part, index) in [
+            (Key::Request, Direction::Output, request),
+            (Key::Reply, Direction::Input, reply),
+            (Key::Refusal, Direction::Input, refusal),
+        ] {
             let Some(index) = index else { continue };
-            let span = Span { start: index.into(), len: 1 };
-            check_pool(self.at(nth), span, self.config.frames.len()).map_err(Wrong::Other)?;
+            check_pool(self.at(nth, key), Span { start: index.into(), len: 1 }, self.config.frames.len())?;
             let Some(frame) = self.config.frames.get(usize::from(index)) else { continue };
-            check_pool(self.at(nth), frame.fields, self.config.fields.len()).map_err(Wrong::Other)?;
-            let is_can = matches!(self.recipe.parts, Parts::Can { .. });
-            if frame.id.is_some() != is_can || (frame.remote && !is_can) {
-                return Err(ExchangeError::WrongBus.into());
-            }
-            if let Some(id) = frame.id
-                && !id.is_valid()
-            {
-                return Err(crate::recipe::PartError::InvalidId { frame: 0, id }.into());
-            }
-            if frame.remote {
-                if frame.fields.len > 0 {
-                    return Err(ExchangeError::RemoteFields.into());
-                }
-                continue;
-            }
-            frame.layout(self.config, part)?;
+            self.check_frame(nth, key, part, frame)?;
         }
         Ok(())
+    }
+
+    fn check_frame(&self, nth: u8, key: Key, part: Direction, frame: &FrameSpec) -> Check {
+        let place = self.at(nth, key);
+        check_pool(place, frame.fields, self.config.fields.len())?;
+        let is_can = matches!(self.recipe.parts, Parts::Can { .. });
+        if frame.id.is_some() != is_can || (frame.remote && !is_can) {
+            return self.refuse(nth, key, ExchangeError::WrongBus);
+        }
+        if let Some(id) = frame.id.filter(|id| !id.is_valid()) {
+            return fail(place, Kind::Part(PartError::InvalidId { frame: 0, id }));
+        }
+        let fields = frame.fields.of(self.config.fields);
+        if frame.remote {
+            return match (key, fields) {
+                (Key::Request, []) => Ok(()),
+                (Key::Request, _) => self.refuse(nth, key, ExchangeError::RemoteFields),
+                _ => self.refuse(nth, key, ExchangeError::RemoteReply),
+            };
+        }
+        match frame.layout(self.config, part) {
+            Ok(_) => Ok(()),
+            Err(error) => {
+                // A refusal counts behind the reply of its exchange.
+                let before = usize::from(key == Key::Refusal);
+                fail(self.place_behind(nth, part, fields, before, error), Kind::Layout(error))
+            }
+        }
+    }
+
+    /// The place of a mistake in the frame of an exchange that has one in this part.
+    fn place_of(&self, nth: u8, part: Direction, fields: &[FieldSpec], error: LayoutError) -> Place {
+        self.place_behind(nth, part, fields, 0, error)
+    }
+
+    /// The same behind other frames of the same exchange.
+    fn place_behind(
+        &self,
+        nth: u8,
+        part: Direction,
+        fields: &[FieldSpec],
+        others: usize,
+        error: LayoutError,
+    ) -> Place {
+        let recipe = self.index;
+        let earlier = self.config.exchanges_of(self.recipe).iter().take(usize::from(nth));
+        let before = earlier.flat_map(|exchange| exchange.fields(self.config, part)).count();
+        let frame = self.recipe.part_frames(part).count().saturating_add(before).saturating_add(others) as u8;
+        match super::device::field_of(fields, error) {
+            Some(field) => Place::Field { recipe, part, frame, field },
+            None => Place::Frame { recipe, part, frame },
+        }
     }
 }
 
@@ -282,40 +370,14 @@ fn overlap(one: &Exchange, other: &Exchange) -> bool {
     table == others && u32::from(from) < end(at, len) && u32::from(at) < end(from, count)
 }
 
-/// What is wrong, before its place is known.
-enum Wrong {
-    Exchange(ExchangeError),
-    Layout(LayoutError),
-    Part(crate::recipe::PartError),
-    Other(super::ConfigError),
-}
-
-impl Wrong {
-    fn at(self, place: Place) -> super::ConfigError {
-        let kind = match self {
-            Self::Exchange(error) => Kind::Exchange(error),
-            Self::Layout(error) => Kind::Layout(error),
-            Self::Part(error) => Kind::Part(error),
-            Self::Other(error) => return super::ConfigError { place, kind: error.kind },
-        };
-        super::ConfigError { place, kind }
-    }
-}
-
-impl From<ExchangeError> for Wrong {
-    fn from(error: ExchangeError) -> Self {
-        Self::Exchange(error)
-    }
-}
-
-impl From<LayoutError> for Wrong {
-    fn from(error: LayoutError) -> Self {
-        Self::Layout(error)
-    }
-}
-
-impl From<crate::recipe::PartError> for Wrong {
-    fn from(error: crate::recipe::PartError) -> Self {
-        Self::Part(error)
-    }
+/// The address and count that go beyond the last register or coil, 65535.
+fn beyond_last(operation: &Operation) -> Option<(u16, u16)> {
+    let (_, address, count) = operation.place();
+    let written = match *operation {
+        Operation::ReadWriteRegisters { write_address, write_count, .. } => (write_address, write_count),
+        _ => (0, 1),
+    };
+    let is_beyond =
+        |&(address, count): &(u16, u16)| u32::from(address).saturating_add(u32::from(count)) > 0x1_0000;
+    [(address, count), written].into_iter().find(is_beyond)
 }

@@ -2,6 +2,7 @@
 //! trigger.
 
 use super::check_exchange::ExchangeCheck;
+use super::device::field_of;
 use super::error::{ConfigErrorKind as Kind, Place, RecipeKey};
 use super::rules::{Check, check_new_name, check_pool, fail, is_marked, mark};
 use super::{
@@ -232,20 +233,8 @@ impl<'a> RecipeCheck<'a> {
                     LayoutError::TooLong { len, room: MAX_STREAM_FRAME }
                 }
             };
-            // A checksum is a field, and no element.
-            let element = error.element().map(usize::from);
-            let field = match element {
-                Some(element) => {
-                    let is_element = |field: &(usize, &FieldSpec)| field.1.element().is_some();
-                    frame.fields.iter().enumerate().filter(is_element).nth(element).map(|(nth, _)| nth)
-                }
-                None if error.is_of_checksum() => {
-                    frame.fields.iter().rposition(|field| matches!(field, FieldSpec::Checksum(_)))
-                }
-                None => None,
-            };
-            let place = match field {
-                Some(field) => Place::Field { recipe, part, frame: frame.nth, field: field as u8 },
+            let place = match field_of(frame.fields, error) {
+                Some(field) => Place::Field { recipe, part, frame: frame.nth, field },
                 None => Place::Frame { recipe, part, frame: frame.nth },
             };
             return fail(place, Kind::Layout(error));

@@ -5,7 +5,9 @@
 
 use core::fmt;
 
-use super::error::{ConfigError, ConfigErrorKind, ControllerKey, NetworkKey, Place, PortKey, RecipeKey};
+use super::error::{
+    ConfigError, ConfigErrorKind, ControllerKey, ExchangeKey, NetworkKey, Place, PortKey, RecipeKey,
+};
 use super::{ConfigView, MAX_NAME, Name};
 use crate::device::Algorithm;
 use crate::recipe::model::Mode;
@@ -77,8 +79,9 @@ impl fmt::Display for Described<'_> {
                 }
                 write!(f, "field {}", one_based(field))?;
             }
-            Place::Exchange { recipe, exchange } => {
+            Place::Exchange { recipe, exchange, key } => {
                 write!(f, "{}, exchange {}", RecipeName(*config, recipe), one_based(exchange))?;
+                f.write_str(key.name())?;
             }
             Place::Command { entry } => write!(f, "command {}", u32::from(entry).saturating_add(1))?,
             Place::Port { port, key } => write!(f, "{}, {}", PortName(*config, port), key.name())?,
@@ -109,6 +112,23 @@ impl NetworkKey {
     }
 }
 
+impl ExchangeKey {
+    fn name(self) -> &'static str {
+        match self {
+            Self::Whole => "",
+            Self::Peer => ", peer",
+            Self::Registers => ", registers or coils",
+            Self::Every => ", period",
+            Self::Rising => ", rising bit",
+            Self::Timeout => ", timeout",
+            Self::Pause => ", pause",
+            Self::Request => ", request",
+            Self::Reply => ", reply",
+            Self::Refusal => ", refusal",
+        }
+    }
+}
+
 impl PortKey {
     fn name(self) -> &'static str {
         match self {
@@ -122,6 +142,7 @@ impl PortKey {
             Self::StopBits => "stop bits",
             Self::IdleGap => "idle gap",
             Self::Turnaround => "turnaround",
+            Self::Echo => "echo",
             Self::Bitrate => "bitrate",
             Self::Listen => "listen",
             Self::Health => "health",
@@ -225,7 +246,7 @@ impl fmt::Display for DescribedKind<'_> {
             Kind::DuplicateName { other } => {
                 write!(f, "entry {} already has this name; names must differ", one_based(other))
             }
-            Kind::NoParts => f.write_str("a recipe needs an input part, an output part or both"),
+            Kind::NoParts => f.write_str("a recipe needs an input part, an output part or an exchange"),
             Kind::WrongField { mode: Mode::Realtime, .. } => {
                 f.write_str("the fields of a realtime recipe are system variables")
             }
@@ -249,6 +270,9 @@ impl fmt::Display for DescribedKind<'_> {
             }
             Kind::Layout(error) => error.fmt(f),
             Kind::Exchange(error) => error.fmt(f),
+            Kind::EchoNeedsExchanges => f.write_str(
+                "allowed only with a recipe of exchanges: other frames are not told from their echo",
+            ),
             Kind::NotInField { value, low, high } => {
                 write!(f, "the field cannot be {value}; allowed: {low}..={high}")
             }

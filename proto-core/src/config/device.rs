@@ -48,6 +48,22 @@ impl DeviceFrame {
     }
 }
 
+/// The index of the field that a frame cannot be laid out for, if it is one.
+pub(super) fn field_of(fields: &[FieldSpec], error: LayoutError) -> Option<u8> {
+    // A checksum is a field, and no element.
+    let field = match error.element().map(usize::from) {
+        Some(element) => {
+            let is_element = |field: &(usize, &FieldSpec)| field.1.element().is_some();
+            fields.iter().enumerate().filter(is_element).nth(element).map(|(nth, _)| nth)
+        }
+        None if error.is_of_checksum() => {
+            fields.iter().rposition(|field| matches!(field, FieldSpec::Checksum(_)))
+        }
+        None => None,
+    };
+    field.map(|field| field as u8)
+}
+
 impl FieldSpec {
     /// Whether the controller's own recipes have no such field: only frames of devices have it.
     pub const fn is_device(&self) -> bool {

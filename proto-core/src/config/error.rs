@@ -73,6 +73,8 @@ pub enum Place {
         recipe: u8,
         /// Index of the exchange in the recipe.
         exchange: u8,
+        /// What about it.
+        key: ExchangeKey,
     },
     /// One entry of a command table.
     Command {
@@ -131,6 +133,32 @@ pub enum RecipeKey {
     Send,
 }
 
+/// A key of an exchange.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[non_exhaustive]
+pub enum ExchangeKey {
+    /// The exchange as a whole.
+    Whole,
+    /// The slave or other peer.
+    Peer,
+    /// The addresses and the fields of registers or coils.
+    Registers,
+    /// Its period.
+    Every,
+    /// The bit that triggers it.
+    Rising,
+    /// How long its reply may take.
+    Timeout,
+    /// How long the line rests after it.
+    Pause,
+    /// The request.
+    Request,
+    /// The reply.
+    Reply,
+    /// The refusal.
+    Refusal,
+}
+
 /// A key of a port.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[non_exhaustive]
@@ -155,6 +183,8 @@ pub enum PortKey {
     IdleGap,
     /// A serial line's turnaround.
     Turnaround,
+    /// Whether a serial line gives back what is sent on it.
+    Echo,
     /// A CAN bus's speed.
     Bitrate,
     /// The address to listen on.
@@ -354,6 +384,8 @@ pub enum ConfigErrorKind {
     Layout(LayoutError),
     /// The exchange cannot be.
     Exchange(ExchangeError),
+    /// An echo is told from replies in exchanges only.
+    EchoNeedsExchanges,
     /// A number that its field cannot have.
     NotInField {
         /// The number.

@@ -20,6 +20,7 @@ mod exchange;
 mod fields;
 #[cfg(feature = "image")]
 pub mod image;
+mod line_budget;
 mod listen;
 mod network;
 mod port;
@@ -37,10 +38,11 @@ pub(crate) use command_text::{fill_in, placeholders};
 pub use device::DeviceFrame;
 pub use draft::{Can, ControllerBuilder, Listen, PortBuilder, PortBus, RecipeBuilder, SafeValues};
 pub use error::{
-    ConfigError, ConfigErrorKind, ControllerKey, Counted, NetworkKey, Place, PortKey, RecipeKey,
+    ConfigError, ConfigErrorKind, ControllerKey, Counted, ExchangeKey, NetworkKey, Place, PortKey, RecipeKey,
 };
 pub use exchange::{AskWhen, DEFAULT_REPLY_TIMEOUT, Exchange, FrameSpec, Talk};
 pub use fields::{CanFields, Fields, InputField, OutputField, Sum, Var};
+pub use line_budget::ExchangeBudget;
 pub use listen::listen_address;
 pub use network::{BoardAddress, Network};
 pub(crate) use port::MIN_CYCLE;

@@ -5,6 +5,7 @@
 use heapless::String;
 
 use super::{MAX_LISTEN, Name, PortHealth, Span};
+use crate::modbus::rtu::Timing;
 use crate::sysvar::SysVar;
 use crate::time::Duration;
 use crate::wire::scalar::Scalar;
@@ -109,7 +110,7 @@ pub struct Rs485 {
 
 impl Default for Rs485 {
     /// The defaults of a file: 115 200 bit/s, no parity, 1 stop bit, an idle gap of 50 ms, a
-    /// turnaround of 100 µs.
+    /// turnaround of 100 µs, no echo.
     fn default() -> Self {
         Self {
             baud: 115_200,
@@ -119,6 +120,16 @@ impl Default for Rs485 {
             turnaround: Duration::from_micros(100),
             echo: false,
         }
+    }
+}
+
+impl Rs485 {
+    /// The same with the silence of Modbus RTU as idle gap and turnaround: 3.5 characters, or 1750 µs
+    /// above 19 200 bit/s (docs/wire/modbus-rtu.md section 2).
+    #[must_use]
+    pub fn with_rtu_silence(self) -> Self {
+        let silence = Timing::new(self.baud, self.bits_per_character() as u8).silence();
+        Self { idle_gap: silence, turnaround: silence, ..self }
     }
 }
 

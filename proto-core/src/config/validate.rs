@@ -114,6 +114,9 @@ impl<'c> ConfigView<'c> {
                     return fail(at(PortKey::Recipe), Kind::NeedsStreamRecipe { recipe: port.recipe });
                 }
                 self.check_framing(index, port.recipe, recipe)?;
+                if line.echo && recipe.exchanges.len == 0 {
+                    return fail(at(PortKey::Echo), Kind::EchoNeedsExchanges);
+                }
             }
             Bus::Can { bitrate } => {
                 check_bitrate(*bitrate).map_err(|kind| ConfigError { place: at(PortKey::Bitrate), kind })?;

@@ -51,7 +51,14 @@ struct Bench {
 }
 
 fn settings(baud: u32, parity: Parity, stop_bits: u8) -> Rs485 {
-    Rs485 { baud, parity, stop_bits, idle_gap: CoreDuration::ZERO, turnaround: CoreDuration::ZERO }
+    Rs485 {
+        baud,
+        parity,
+        stop_bits,
+        idle_gap: CoreDuration::ZERO,
+        turnaround: CoreDuration::ZERO,
+        echo: false,
+    }
 }
 
 impl Bench {

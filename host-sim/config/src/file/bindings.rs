@@ -66,10 +66,16 @@ fn read_send(item: &Item<'_>) -> Result<SendOn> {
         "frame" => return Ok(SendOn::Frame),
         _ => {}
     }
+    let (var, bit) = read_rising(item, text, "\"period\", \"change\", \"frame\"")?;
+    Ok(SendOn::Rising { var, bit })
+}
+
+/// `rising:BitOutputReg[3].0`; `others` are allowed too.
+pub(super) fn read_rising(item: &Item<'_>, text: &str, others: &str) -> Result<(SysVar, u8)> {
     let Some(place) = text.strip_prefix("rising:") else {
-        return Err(item.error(format!(
-            "{text:?} is unknown; allowed: \"period\", \"change\", \"frame\", \"rising:BitOutputReg[3].0\""
-        )));
+        return Err(
+            item.error(format!("{text:?} is unknown; allowed: {others}, \"rising:BitOutputReg[3].0\""))
+        );
     };
     let bit = place.rsplit_once('.').and_then(|(name, bit)| Some((name, bit.parse::<u8>().ok()?)));
     let Some((name, bit)) = bit else {
@@ -78,7 +84,7 @@ fn read_send(item: &Item<'_>) -> Result<SendOn> {
         );
     };
     let var = SysVar::parse(name).map_err(|error| item.error(format!("{name:?}: {error}")))?;
-    Ok(SendOn::Rising { var, bit })
+    Ok((var, bit))
 }
 
 /// The bindings of an input field: `to`, `commands`, or both.

@@ -118,9 +118,9 @@ fn bit_key(key: &str) -> Option<BitKey> {
     BIT_KEYS.into_iter().find(|(name, _)| *name == key).map(|(_, key)| key)
 }
 
-/// `bits = 3`, or `bits = "3..3"`; what else is wrong with it, its own reader says.
+/// `bits = 3`, `bits = "3..3"`, or a coil, which has no type; what else is wrong with it, its own reader says.
 fn has_one_bit(field: &Reader<'_>) -> bool {
-    let Some(item) = field.optional("bits") else { return false };
+    let Some(item) = field.optional("bits") else { return field.optional("type").is_none() };
     match item.as_string() {
         None => true,
         Some(range) => range.split_once("..").is_some_and(|(first, last)| first.trim() == last.trim()),

@@ -210,10 +210,10 @@ fn read_port(table: &Reader<'_>, recipes: &[FileRecipe]) -> Result<(SimPort, Spo
 fn check_recipe(kind: BusKind, recipe: &FileRecipe) -> std::result::Result<(), String> {
     let name = &recipe.name;
     let is_can_port = kind == BusKind::Can;
-    if recipe.is_can && !is_can_port {
+    if recipe.is_can() && !is_can_port {
         return Err(format!("recipe {name:?} is a CAN recipe; only CAN ports take CAN recipes"));
     }
-    if !recipe.is_can && is_can_port {
+    if !recipe.is_can() && is_can_port {
         return Err(format!("recipe {name:?} is a stream recipe; a CAN port takes only CAN recipes"));
     }
     if recipe.mode == Mode::User && !matches!(kind, BusKind::Rs485 | BusKind::Can) {

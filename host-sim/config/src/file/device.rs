@@ -15,10 +15,12 @@ use proto_core::wire::scalar::ScalarType;
 
 use super::bindings::{self, FileInput};
 use super::encoding::{self, OpenNumber, Order, refuse};
+use super::exchanges::FileExchange;
 use super::framings;
 use super::reader::{Item, Reader, Result};
 use super::recipes::{FileField, FileFieldKind, FileFrame, FilePart, FileRecipe, Flavour, Written};
-use crate::device::{DeviceField, DeviceRecipe, NamedFrame};
+use super::rtu_frames;
+use crate::device::{DeviceField, DeviceRecipe, ExchangeKind, NamedExchange, NamedFrame};
 
 /// The keys of a CAN frame.
 const FRAME_KEYS: [&str; 3] = ["endian", "word_order", "checksum"];
@@ -93,6 +95,12 @@ impl FieldReader {
         Ok(Self { direction: rules.direction, flavour, order: Order::read(frame)?, open: None })
     }
 
+    /// Fields in registers of Modbus.
+    pub(super) fn of_registers(exchange: &Reader<'_>, direction: Direction) -> Result<Self> {
+        let order = Order::of_registers(exchange)?;
+        Ok(Self { direction, flavour: Flavour::Gateway, order, open: None })
+    }
+
     /// Reads one field of a user recipe, which can be several items of the frame.
     pub(super) fn read(&mut self, item: &Item<'_>, fields: &mut Vec<FileField>) -> Result<()> {
         let table = item.any_table()?;
@@ -139,19 +147,14 @@ impl FieldReader {
             }
             return Ok(());
         }
-        let bound: &[&str] = match self.direction {
-            Direction::Input => {
-                refuse(&table, &["value"], "an input field has equals = 9 for a constant")?;
-                &["to", "commands", "when", "base", "idle", "scale", "offset", "equals", "overflow"]
-            }
-            Direction::Output => {
-                refuse(&table, &["equals"], "an output field has value = 9 for a constant")?;
-                &["from", "value", "scale", "offset", "overflow"]
-            }
-        };
-        table.check_keys(&[&["name", "type"], bound, &encoding::KEYS].concat(), when)?;
+        let bound = binding_keys(&table, self.direction)?;
+        table.check_keys(&[&["name", "type"], bound, &["overflow"], &encoding::KEYS].concat(), when)?;
         match table.optional("equals") {
-            Some(equals) => push(self.read_constant(&table, &equals)?),
+            Some(equals) => {
+                refuse_bindings(&table)?;
+                let encoding = encoding::read(&table, self.order, &mut self.open)?;
+                push(read_constant(&table, &equals, encoding)?);
+            }
             None => self.read_value(&table, push)?,
         }
         Ok(())
@@ -171,22 +174,8 @@ impl FieldReader {
         })
     }
 
-    /// An integer that must match.
-    fn read_constant(&mut self, table: &Reader<'_>, equals: &Item<'_>) -> Result<FileFieldKind> {
-        let bindings = ["to", "commands", "when", "base", "idle", "scale", "offset", "overflow"];
-        refuse(table, &bindings, "a field with equals is a constant and has nothing else")?;
-        let name = table.optional("name").map(|item| item.string().map(str::to_owned)).transpose()?;
-        let encoding = encoding::read(table, self.order, &mut self.open)?;
-        if !encoding.is_integer() {
-            return Err(equals.error("only integers can be constants; this field may have a fraction"));
-        }
-        let (low, high) = encoding.range();
-        let value = equals.integer(low as i64..=high as i64)?;
-        Ok(FileFieldKind::Fixed { name, encoding, value })
-    }
-
     /// A field with a name and a value.
-    fn read_value(&mut self, table: &Reader<'_>, mut push: impl FnMut(FileFieldKind)) -> Result<()> {
+    fn read_value(&mut self, table: &Reader<'_>, push: impl FnMut(FileFieldKind)) -> Result<()> {
         let name = read_name(table)?;
         let encoding = encoding::read(table, self.order, &mut self.open)?;
         let key = match self.direction {
@@ -199,33 +188,79 @@ impl FieldReader {
         let overflow = table
             .optional("overflow")
             .map_or(Ok(Overflow::Usual), |item| item.choice(&[("wrap", Overflow::Wrap)]))?;
-        let written = Written { encoding, overflow };
-        match self.direction {
-            Direction::Output => {
-                let from = bindings::read_output(table)?;
-                if let Some(item) = table.optional("value").filter(|_| encoding.is_integer())
-                    && item.number()?.fract() != 0.0
-                {
-                    let value = item.number()?;
-                    return Err(item.error(format!("{value} has a fraction; this field has integers only")));
-                }
-                push(FileFieldKind::UserOutput { name, written, from });
-            }
-            Direction::Input => {
-                let (first, second) = bindings::read_input(table)?;
-                push(FileFieldKind::UserInput { name: name.clone(), written, to: first, again: false });
-                if let Some(to) = second {
-                    let encoding = Encoding { shared: true, ..encoding };
-                    let written = Written { encoding, overflow: Overflow::Usual };
-                    push(FileFieldKind::UserInput { name, written, to, again: true });
-                }
-            }
-        }
-        Ok(())
+        bind(table, self.direction, name, Written { encoding, overflow }, push)
     }
 }
 
-fn read_name(table: &Reader<'_>) -> Result<String> {
+/// The keys of what a value is for; refuses those of the other direction.
+pub(super) fn binding_keys(table: &Reader<'_>, direction: Direction) -> Result<&'static [&'static str]> {
+    match direction {
+        Direction::Input => {
+            refuse(table, &["value"], "an input field has equals = 9 for a constant")?;
+            Ok(&["to", "commands", "when", "base", "idle", "scale", "offset", "equals"])
+        }
+        Direction::Output => {
+            refuse(table, &["equals"], "an output field has value = 9 for a constant")?;
+            Ok(&["from", "value", "scale", "offset"])
+        }
+    }
+}
+
+fn refuse_bindings(table: &Reader<'_>) -> Result<()> {
+    let bindings = ["to", "commands", "when", "base", "idle", "scale", "offset", "overflow"];
+    refuse(table, &bindings, "a field with equals is a constant and has nothing else")
+}
+
+/// An integer that must match.
+pub(super) fn read_constant(
+    table: &Reader<'_>,
+    equals: &Item<'_>,
+    encoding: Encoding,
+) -> Result<FileFieldKind> {
+    refuse_bindings(table)?;
+    let name = table.optional("name").map(|item| item.string().map(str::to_owned)).transpose()?;
+    if !encoding.is_integer() {
+        return Err(equals.error("only integers can be constants; this field may have a fraction"));
+    }
+    let (low, high) = encoding.range();
+    let value = equals.integer(low as i64..=high as i64)?;
+    Ok(FileFieldKind::Fixed { name, encoding, value })
+}
+
+/// A field with its binding, or two if its bytes are used twice.
+pub(super) fn bind(
+    table: &Reader<'_>,
+    direction: Direction,
+    name: String,
+    written: Written,
+    mut push: impl FnMut(FileFieldKind),
+) -> Result<()> {
+    let encoding = written.encoding;
+    match direction {
+        Direction::Output => {
+            let from = bindings::read_output(table)?;
+            if let Some(item) = table.optional("value").filter(|_| encoding.is_integer())
+                && item.number()?.fract() != 0.0
+            {
+                let value = item.number()?;
+                return Err(item.error(format!("{value} has a fraction; this field has integers only")));
+            }
+            push(FileFieldKind::UserOutput { name, written, from });
+        }
+        Direction::Input => {
+            let (first, second) = bindings::read_input(table)?;
+            push(FileFieldKind::UserInput { name: name.clone(), written, to: first, again: false });
+            if let Some(to) = second {
+                let encoding = Encoding { shared: true, ..encoding };
+                let written = Written { encoding, overflow: Overflow::Usual };
+                push(FileFieldKind::UserInput { name, written, to, again: true });
+            }
+        }
+    }
+    Ok(())
+}
+
+pub(super) fn read_name(table: &Reader<'_>) -> Result<String> {
     Ok(table.required("name", "give the field a name")?.string()?.to_owned())
 }
 
@@ -420,13 +455,13 @@ impl FileRecipe {
         let parts = [&self.input, &self.output].into_iter().flatten();
         let mut fields = parts.flat_map(|part| &part.frames).flat_map(|frame| &frame.fields);
         let is_cut = [&self.input, &self.output].into_iter().flatten().any(FilePart::is_cut);
-        is_cut || fields.any(|field| field.spec().is_device())
+        !self.exchanges.is_empty() || is_cut || fields.any(|field| field.spec().is_device())
     }
 
     /// What carries the frames of a part.
     pub(super) fn carrier(&self, part: Direction) -> Carrier {
         match self.part(part) {
-            _ if self.is_can => Carrier::Can,
+            _ if self.is_can() => Carrier::Can,
             Some(part) if part.is_cut() => Carrier::Whole,
             _ => Carrier::Stream,
         }
@@ -435,13 +470,9 @@ impl FileRecipe {
     /// The recipe with the names of its fields.
     pub(super) fn to_device(&self) -> DeviceRecipe {
         let frames = |part: &Option<FilePart>| {
-            let named = |part: &FilePart, frame: &FileFrame| NamedFrame {
-                id: self.is_can.then_some(frame.id),
-                head: part.head.clone(),
-                tail: part.tail.clone(),
-                fields: frame.fields.iter().map(FileField::named).collect(),
-            };
-            part.iter().flat_map(|part| part.frames.iter().map(move |frame| named(part, frame))).collect()
+            part.iter()
+                .flat_map(|part| part.frames.iter().map(|frame| self.named_frame(part, frame)))
+                .collect()
         };
         DeviceRecipe {
             name: self.name.clone(),
@@ -452,7 +483,35 @@ impl FileRecipe {
                 .unwrap_or(self.carrier(Direction::Input)),
             input: frames(&self.input),
             output: frames(&self.output),
+            exchanges: self.exchanges.iter().map(|exchange| self.named_exchange(exchange)).collect(),
         }
+    }
+
+    fn named_frame(&self, part: &FilePart, frame: &FileFrame) -> NamedFrame {
+        NamedFrame {
+            id: self.is_can().then_some(frame.id),
+            head: part.head.clone(),
+            tail: part.tail.clone(),
+            fields: frame.fields.iter().map(FileField::named).collect(),
+        }
+    }
+
+    fn named_exchange(&self, exchange: &FileExchange) -> NamedExchange {
+        let FileExchange { peer, kind, output, input, refusal, remote, .. } = exchange;
+        let frame = |part: &Option<FilePart>| {
+            part.as_ref().and_then(|part| Some(self.named_frame(part, part.frames.first()?)))
+        };
+        let fields = |part: &Option<FilePart>| frame(part).map_or(Vec::new(), |frame| frame.fields);
+        let [request, reply, refusal] = match kind {
+            ExchangeKind::Frames => [frame(output), frame(input), frame(refusal)],
+            ExchangeKind::Master(operation) => {
+                rtu_frames::frames(*peer, operation, &fields(output), &fields(input))
+            }
+            ExchangeKind::Slave(operation) => {
+                rtu_frames::frames(*peer, operation, &fields(input), &fields(output))
+            }
+        };
+        NamedExchange { peer: *peer, kind: *kind, request, reply, refusal, remote: *remote }
     }
 }
 
@@ -461,7 +520,7 @@ impl FileField {
         let repeats = matches!(self.kind, FileFieldKind::UserInput { again: true, .. });
         let picks_commands =
             matches!(self.kind, FileFieldKind::UserInput { to: FileInput::Commands { .. }, .. });
-        DeviceField { name: self.name(), spec: self.spec(), repeats, picks_commands }
+        DeviceField { name: self.name(), spec: self.spec(), repeats, picks_commands, is_coil: false }
     }
 
     /// What the field is, without a table of commands.

@@ -50,6 +50,11 @@ impl Order {
         })
     }
 
+    /// The order of fields in registers of Modbus, whose bytes are big-endian.
+    pub(super) fn of_registers(exchange: &Reader<'_>) -> Result<Self> {
+        Ok(Self { is_big: Some(true), ..Self::read(exchange)? })
+    }
+
     /// The order of a number of `len` bytes; `self` is the field's, `part` the one around it.
     fn of(self, part: Self, len: usize) -> ByteOrder {
         let is_big = self.is_big.or(part.is_big).unwrap_or(false);

@@ -1,5 +1,7 @@
 //! A gateway file: TOML to [`GatewayConfig`], checked.
 
+mod exchanges;
+
 use std::collections::HashMap;
 
 use heapless::Vec as Bounded;
@@ -17,10 +19,10 @@ use proto_core::wire::scalar::Scalar;
 use super::bindings::FileInput;
 use super::commands::FileCommand;
 use super::document::Document;
-use super::lines::{LINE_KEYS, key_name, read_bitrate, read_cycle, read_line};
+use super::lines::{LINE_KEYS, key_name, read_bitrate, read_cycle, read_line, read_rtu_line};
 use super::network;
 use super::reader::{Item, Reader, Result, Spot};
-use super::recipes::{self, FileField, FilePart, FileRecipe, Flavour};
+use super::recipes::{self, FileField, FileRecipe, Flavour, RecipeKind};
 use super::sources;
 
 /// The top-level keys of a gateway file.
@@ -31,7 +33,7 @@ pub(super) fn read(document: &Document) -> Result<Box<GatewayConfig>> {
     let root = Reader::root(document, &KEYS)?;
     let recipes = recipes::read_all(&root, Flavour::Gateway)?;
     let mut builder = Builder::new(&root, &recipes)?;
-    let port_keys = [&COMMON_KEYS[..], &FIELD_KEYS, &LINE_KEYS, &["bitrate", "listen"]].concat();
+    let port_keys = [&COMMON_KEYS[..], &FIELD_KEYS, &LINE_KEYS, &["echo", "bitrate", "listen"]].concat();
     let ports = root.tables("port", &port_keys)?;
     // Recipes may name ports.
     builder.port_names =
@@ -54,17 +56,49 @@ const FIELD_KEYS: [&str; 4] = ["on_timeout", "safe_at_start", "refresh_ms", "hea
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum BusKind {
     Rs485,
+    ModbusMaster,
+    ModbusSlave,
     Can,
     TcpListen,
     UdpListen,
 }
 
-const BUSES: [(&str, BusKind); 4] = [
+const BUSES: [(&str, BusKind); 6] = [
     ("rs485", BusKind::Rs485),
+    ("modbus-rtu", BusKind::ModbusMaster),
+    ("modbus-rtu-slave", BusKind::ModbusSlave),
     ("can", BusKind::Can),
     ("tcp-listen", BusKind::TcpListen),
     ("udp-listen", BusKind::UdpListen),
 ];
+
+impl BusKind {
+    /// As files have it.
+    fn name(self) -> &'static str {
+        BUSES.iter().find(|(_, bus)| *bus == self).map_or("", |(name, _)| name)
+    }
+
+    /// A recipe of Modbus and its line go together.
+    fn check_modbus(self, recipe: &FileRecipe) -> std::result::Result<(), String> {
+        let wanted = match self {
+            Self::ModbusMaster => Some(RecipeKind::ModbusMaster),
+            Self::ModbusSlave => Some(RecipeKind::ModbusSlave),
+            _ => None,
+        };
+        let (name, kind) = (&recipe.name, recipe.kind.name());
+        match wanted {
+            Some(wanted) if recipe.kind != wanted => Err(format!(
+                "recipe {name:?} has kind = {kind:?}; bus = {0:?} takes only recipes with kind = {0:?}",
+                self.name()
+            )),
+            None if recipe.kind.is_modbus() => Err(format!(
+                "recipe {name:?} has kind = {kind:?}, which needs bus = {kind:?}; this port has bus = {:?}",
+                self.name()
+            )),
+            _ => Ok(()),
+        }
+    }
+}
 
 /// The configuration read so far, with the place of everything in it.
 struct Builder<'a> {
@@ -128,7 +162,7 @@ impl<'a> Builder<'a> {
         ] {
             self.spots.insert(Place::Recipe { recipe: place, key }, spot.clone());
         }
-        let parts = if recipe.is_can {
+        let parts = if recipe.is_can() {
             Parts::Can {
                 input: self.can_part(place, Direction::Input, recipe)?,
                 output: self.can_part(place, Direction::Output, recipe)?,
@@ -139,7 +173,9 @@ impl<'a> Builder<'a> {
                 output: self.stream_part(place, Direction::Output, recipe)?,
             }
         };
+        let exchanges = self.add_exchanges(place, recipe)?;
         let mut recipe = Recipe::new(bounded(&recipe.name), recipe.mode, parts);
+        recipe.exchanges = exchanges;
         if let Some(sending) = sending {
             recipe.on_stale = sending.on_stale;
             recipe.send = sending.send;
@@ -152,7 +188,7 @@ impl<'a> Builder<'a> {
     fn stream_part(&mut self, recipe: u8, part: Direction, from: &FileRecipe) -> Result<Option<StreamPart>> {
         let Some(file) = from.part(part) else { return Ok(None) };
         self.spots.insert(Place::Part { recipe, part }, file.spot.clone());
-        let fields = self.add_fields(recipe, part, file, 0)?;
+        let fields = self.add_fields(recipe, part, 0, file.fields())?;
         let mut stream = StreamPart::new(delimiter(&file.head), delimiter(&file.tail), fields);
         (stream.framing, stream.escape) = file.framing;
         Ok(Some(stream))
@@ -170,15 +206,14 @@ impl<'a> Builder<'a> {
         // The layout accepted no more frames than there is room for.
         for (number, frame) in (0..).zip(&file.frames) {
             self.spots.insert(Place::Frame { recipe, part, frame: number }, frame.spot.clone());
-            let fields = self.add_fields(recipe, part, file, number)?;
+            let fields = self.add_fields(recipe, part, number, &frame.fields)?;
             let _ = frames.push(CanFramePart { id: frame.id, fields });
         }
         Ok(frames)
     }
 
-    fn add_fields(&mut self, recipe: u8, part: Direction, file: &FilePart, frame: u8) -> Result<Span> {
+    fn add_fields(&mut self, recipe: u8, part: Direction, frame: u8, fields: &[FileField]) -> Result<Span> {
         let start = self.config.fields.len() as u16;
-        let fields = file.frames.get(usize::from(frame)).map_or(&[][..], |frame| &frame.fields);
         for (number, field) in (0..).zip(fields) {
             self.spots.insert(Place::Field { recipe, part, frame, field: number }, field.spot.clone());
             let spec = self.field_spec(field)?;
@@ -233,14 +268,18 @@ impl<'a> Builder<'a> {
 
     fn add_port(&mut self, table: &Reader<'a>, recipes: &[FileRecipe]) -> Result<()> {
         let (name, _) = recipes::read_name(table)?;
-        let kind = table.required("bus", "rs485, can, tcp-listen or udp-listen")?.choice(&BUSES)?;
+        let kind = table
+            .required("bus", "rs485, modbus-rtu, modbus-rtu-slave, can, tcp-listen or udp-listen")?
+            .choice(&BUSES)?;
+        let line_keys = [&LINE_KEYS[..], &["echo"]].concat();
         let own: &[&str] = match kind {
-            BusKind::Rs485 => &LINE_KEYS,
+            BusKind::Rs485 | BusKind::ModbusMaster | BusKind::ModbusSlave => &line_keys,
             BusKind::Can => &["bitrate"],
             BusKind::TcpListen | BusKind::UdpListen => &["listen"],
         };
-        let safe: &[&str] = if matches!(kind, BusKind::Rs485 | BusKind::Can) { &FIELD_KEYS } else { &[] };
-        let bus_name = BUSES.iter().find(|(_, bus)| *bus == kind).map_or("", |(name, _)| name);
+        let is_listening = matches!(kind, BusKind::TcpListen | BusKind::UdpListen);
+        let safe: &[&str] = if is_listening { &[] } else { &FIELD_KEYS };
+        let bus_name = kind.name();
         table.check_keys(&[&COMMON_KEYS, own, safe].concat(), &format!(" on bus = {bus_name:?}"))?;
 
         let index = self.config.ports.len() as u8;
@@ -254,9 +293,12 @@ impl<'a> Builder<'a> {
         let bus = read_bus(table, kind)?;
         let item = table.required("recipe", "the name of a recipe of this file")?;
         let recipe = recipes::find(recipes, &item)?;
+        if let Some(recipe) = recipes.get(recipe) {
+            kind.check_modbus(recipe).map_err(|message| item.error(message))?;
+        }
         // The check of the whole configuration refuses kinds of recipes that the bus does not take.
         let is_byte_stream = matches!(kind, BusKind::Rs485 | BusKind::TcpListen);
-        if let Some(recipe) = recipes.get(recipe).filter(|recipe| is_byte_stream && !recipe.is_can) {
+        if let Some(recipe) = recipes.get(recipe).filter(|recipe| is_byte_stream && !recipe.is_can()) {
             recipe.check_framing(Framing::Bytes).map_err(|message| item.error(message))?;
         }
         let mut port = Port::new(bounded(&name), bus, recipe as u8);
@@ -321,7 +363,7 @@ impl<'a> Builder<'a> {
     }
 }
 
-const PORT_PLACES: [PortKey; 15] = [
+const PORT_PLACES: [PortKey; 16] = [
     PortKey::Name,
     PortKey::Recipe,
     PortKey::Cycle,
@@ -332,6 +374,7 @@ const PORT_PLACES: [PortKey; 15] = [
     PortKey::StopBits,
     PortKey::IdleGap,
     PortKey::Turnaround,
+    PortKey::Echo,
     PortKey::Bitrate,
     PortKey::Listen,
     PortKey::Health,
@@ -388,7 +431,12 @@ fn read_bus(table: &Reader<'_>, kind: BusKind) -> Result<Bus> {
             .map_err(|_| item.error(format!("longer than {MAX_LISTEN} bytes")))
     };
     Ok(match kind {
-        BusKind::Rs485 => Bus::Rs485(read_line(table)?),
+        BusKind::Rs485 | BusKind::ModbusMaster | BusKind::ModbusSlave => {
+            let read = if kind == BusKind::Rs485 { read_line } else { read_rtu_line };
+            let mut line = read(table)?;
+            line.echo = table.optional("echo").map_or(Ok(false), |item| item.bool())?;
+            Bus::Rs485(line)
+        }
         BusKind::Can => Bus::Can { bitrate: read_bitrate(table)? },
         BusKind::TcpListen => Bus::TcpListen { listen: listen()? },
         BusKind::UdpListen => Bus::UdpListen { listen: listen()? },

@@ -10,6 +10,15 @@ pub(super) const LINE_KEYS: [&str; 5] = ["baud", "parity", "stop_bits", "idle_ga
 
 /// The settings of a serial line, within their ranges.
 pub(super) fn read_line(port: &Reader<'_>) -> Result<Rs485> {
+    read_times(port, read_characters(port)?)
+}
+
+/// The same of a line of Modbus RTU, which has the standard's silences by default.
+pub(super) fn read_rtu_line(port: &Reader<'_>) -> Result<Rs485> {
+    read_times(port, read_characters(port)?.with_rtu_silence())
+}
+
+fn read_characters(port: &Reader<'_>) -> Result<Rs485> {
     let mut line = Rs485::default();
     if let Some(item) = port.optional("baud") {
         line.baud = item.integer(1_200..=4_000_000)?;
@@ -20,6 +29,10 @@ pub(super) fn read_line(port: &Reader<'_>) -> Result<Rs485> {
     if let Some(item) = port.optional("stop_bits") {
         line.stop_bits = item.integer(1..=2)?;
     }
+    Ok(line)
+}
+
+fn read_times(port: &Reader<'_>, mut line: Rs485) -> Result<Rs485> {
     if let Some(item) = port.optional("idle_gap_ms") {
         line.idle_gap = item.time(1e3)?;
     }
@@ -58,6 +71,7 @@ pub(super) fn key_name(key: PortKey) -> &'static str {
         PortKey::StopBits => "stop_bits",
         PortKey::IdleGap => "idle_gap_ms",
         PortKey::Turnaround => "turnaround_us",
+        PortKey::Echo => "echo",
         PortKey::Bitrate => "bitrate",
         PortKey::Listen => "listen",
         // A mistake without a key of its own concerns the port as a whole.

@@ -4,18 +4,22 @@
 //! [`FileError`]; the keys are those of docs/configuration.md.
 
 mod bindings;
+mod coils;
 mod commands;
 mod controller;
 mod device;
 mod document;
 mod encoding;
 mod error;
+mod exchanges;
 mod framings;
 mod gateway;
 mod lines;
+mod modbus;
 mod network;
 mod reader;
 mod recipes;
+mod rtu_frames;
 mod sources;
 
 use std::path::Path;
@@ -24,6 +28,7 @@ use proto_core::config::GatewayConfig;
 use proto_core::wire::dialect::Dialect;
 
 pub use error::{FileError, Source};
+pub use modbus::function_name;
 
 use super::device::AnyRecipe;
 use super::sim::SimConfig;

@@ -14,7 +14,10 @@ use proto_core::wire::scalar::ScalarType;
 
 use super::bindings::{self, FileInput, FileOutput};
 use super::device::{self, FieldReader};
+use super::encoding::refuse;
+use super::exchanges::{self, FileExchange};
 use super::framings;
+use super::modbus;
 use super::reader::{Item, Reader, Result, Spot};
 use crate::device::AnyRecipe;
 use crate::sim::{SimCanFrame, SimField, SimParts, SimRecipe, SimStreamPart};
@@ -31,9 +34,48 @@ pub(super) struct FileRecipe {
     pub(super) name: String,
     pub(super) name_spot: Spot,
     pub(super) mode: Mode,
-    pub(super) is_can: bool,
+    pub(super) kind: RecipeKind,
     pub(super) input: Option<FilePart>,
     pub(super) output: Option<FilePart>,
+    /// What is asked of devices beside the parts, or all that a recipe of Modbus has.
+    pub(super) exchanges: Vec<FileExchange>,
+}
+
+/// What carries a recipe.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum RecipeKind {
+    Stream,
+    Can,
+    ModbusMaster,
+    ModbusSlave,
+}
+
+const KINDS: [(&str, RecipeKind); 4] = [
+    ("stream", RecipeKind::Stream),
+    ("can", RecipeKind::Can),
+    ("modbus-rtu", RecipeKind::ModbusMaster),
+    ("modbus-rtu-slave", RecipeKind::ModbusSlave),
+];
+
+impl RecipeKind {
+    /// As files have it.
+    pub(super) fn name(self) -> &'static str {
+        KINDS.iter().find(|(_, kind)| *kind == self).map_or("", |(name, _)| name)
+    }
+
+    pub(super) fn is_modbus(self) -> bool {
+        matches!(self, Self::ModbusMaster | Self::ModbusSlave)
+    }
+
+    /// The keys of such a recipe.
+    fn keys(self, flavour: Flavour) -> &'static [&'static str] {
+        match (self, flavour) {
+            (Self::Stream | Self::Can, Flavour::Controller) => &["name", "kind", "mode", "input", "output"],
+            (Self::Stream | Self::Can, _) => &["name", "kind", "mode", "input", "output", "exchange"],
+            (Self::ModbusMaster, _) => &["name", "kind", "mode", "exchange"],
+            (Self::ModbusSlave, _) => &["name", "kind", "mode", "address", "block"],
+        }
+    }
 }
 
 pub(super) struct FilePart {
@@ -54,7 +96,7 @@ pub(super) struct FileFrame {
     pub(super) spot: Spot,
     /// 0 in a stream part.
     pub(super) id: CanId,
-    id_spot: Spot,
+    pub(super) id_spot: Spot,
     pub(super) fields: Vec<FileField>,
 }
 
@@ -184,7 +226,9 @@ impl FileField {
 /// Every recipe of a file, within the limits of any port.
 pub(super) fn read_all(root: &Reader<'_>, flavour: Flavour) -> Result<Vec<FileRecipe>> {
     let mut recipes: Vec<FileRecipe> = Vec::new();
-    for table in root.tables("recipe", &["name", "kind", "mode", "input", "output"])? {
+    let tables = root.any_tables("recipe")?;
+    tables.iter().try_for_each(|table| check_keys(table, flavour))?;
+    for table in tables {
         let recipe = read(&table, flavour)?;
         if recipes.iter().any(|before| before.name == recipe.name) {
             let message = format!("there is already a recipe {:?}; names must differ", recipe.name);
@@ -214,23 +258,79 @@ pub(super) fn read_name(table: &Reader<'_>) -> Result<(String, Spot)> {
     Ok((name.to_owned(), item.spot))
 }
 
+/// The keys of a recipe depend on its kind.
+fn check_keys(table: &Reader<'_>, flavour: Flavour) -> Result<()> {
+    let given = table.optional("kind").and_then(|item| item.as_string());
+    let kind = KINDS.iter().find(|(name, _)| Some(*name) == given).map(|(_, kind)| *kind);
+    if flavour == Flavour::Controller {
+        let why = "only gateway files have exchanges; the controller's recipes have input and output";
+        refuse(table, &["exchange"], why)?;
+    }
+    match kind {
+        Some(kind) if kind.is_modbus() => {
+            refuse(
+                table,
+                &["input", "output"],
+                "a recipe of Modbus has no parts; its fields are in exchanges or blocks",
+            )?;
+            table.check_keys(kind.keys(flavour), &format!(" with kind = {:?}", kind.name()))
+        }
+        Some(kind) => table.check_keys(kind.keys(flavour), ""),
+        None => {
+            table.check_keys(&["name", "kind", "mode", "input", "output", "exchange", "address", "block"], "")
+        }
+    }
+}
+
+fn read_kind(table: &Reader<'_>, flavour: Flavour) -> Result<RecipeKind> {
+    if flavour == Flavour::Gateway {
+        let item = table.required("kind", "\"stream\", \"can\", \"modbus-rtu\" or \"modbus-rtu-slave\"")?;
+        return item.choice(&KINDS);
+    }
+    let item = table.required("kind", "\"stream\" or \"can\"")?;
+    if KINDS.iter().any(|(name, kind)| kind.is_modbus() && item.as_string() == Some(name)) {
+        return Err(item.error("the controller's ports have no Modbus RTU; only gateway files do"));
+    }
+    item.choice(&KINDS[..2])
+}
+
+fn read_mode(table: &Reader<'_>, kind: RecipeKind) -> Result<Mode> {
+    let modes = [("realtime", Mode::Realtime), ("user", Mode::User)];
+    if !kind.is_modbus() {
+        let item =
+            table.required("mode", "\"realtime\" (system variables) or \"user\" (fields of your own)")?;
+        return item.choice(&modes);
+    }
+    match table.optional("mode") {
+        Some(item) => item.choice(&modes[1..]),
+        None => Ok(Mode::User),
+    }
+}
+
 fn read(table: &Reader<'_>, flavour: Flavour) -> Result<FileRecipe> {
     let (name, name_spot) = read_name(table)?;
-    let is_can =
-        table.required("kind", "\"stream\" or \"can\"")?.choice(&[("stream", false), ("can", true)])?;
-    let mode = table
-        .required("mode", "\"realtime\" (system variables) or \"user\" (fields of your own)")?
-        .choice(&[("realtime", Mode::Realtime), ("user", Mode::User)])?;
+    let kind = read_kind(table, flavour)?;
+    let mode = read_mode(table, kind)?;
+    let is_can = kind == RecipeKind::Can;
     let read_part = |key, direction| match table.optional(key) {
         Some(item) => read_part(&item, Rules { mode, direction }, is_can, flavour).map(Some),
         None => Ok(None),
     };
     let input = read_part("input", Direction::Input)?;
     let output = read_part("output", Direction::Output)?;
-    if input.is_none() && output.is_none() {
-        return Err(table.error("a recipe needs an input part, an output part or both"));
+    let exchanges = match kind {
+        RecipeKind::Stream | RecipeKind::Can => exchanges::read_all(table, mode, is_can)?,
+        RecipeKind::ModbusMaster => modbus::read_master(table)?,
+        RecipeKind::ModbusSlave => modbus::read_slave(table)?,
+    };
+    if input.is_none() && output.is_none() && exchanges.is_empty() {
+        return Err(table.error(match flavour {
+            Flavour::Gateway => "a recipe needs an input part, an output part or an exchange",
+            Flavour::Controller => "a recipe needs an input part, an output part or both",
+        }));
     }
-    let recipe = FileRecipe { spot: table.spot.clone(), name, name_spot, mode, is_can, input, output };
+    let spot = table.spot.clone();
+    let recipe = FileRecipe { spot, name, name_spot, mode, kind, input, output, exchanges };
     let is_device = recipe.is_device();
     for direction in [Direction::Input, Direction::Output] {
         let Some(part) = recipe.part(direction) else { continue };
@@ -290,7 +390,7 @@ fn read_part(item: &Item<'_>, rules: Rules, is_can: bool, flavour: Flavour) -> R
 }
 
 /// 11 bits, or 29 with `extended = true`.
-fn read_id(frame: &Reader<'_>, item: &Item<'_>) -> Result<CanId> {
+pub(super) fn read_id(frame: &Reader<'_>, item: &Item<'_>) -> Result<CanId> {
     let is_extended = frame.optional("extended").map_or(Ok(false), |item| item.bool())?;
     let number: i64 = item.integer(i64::MIN..=i64::MAX)?;
     let standard = || u16::try_from(number).ok().map(CanId::Standard);
@@ -308,7 +408,7 @@ fn read_id(frame: &Reader<'_>, item: &Item<'_>) -> Result<CanId> {
     })
 }
 
-fn read_bytes(table: &Reader<'_>, key: &str) -> Result<(Vec<u8>, Option<Spot>)> {
+pub(super) fn read_bytes(table: &Reader<'_>, key: &str) -> Result<(Vec<u8>, Option<Spot>)> {
     let Some(item) = table.optional(key) else { return Ok((Vec::new(), None)) };
     let bytes = item
         .array("of bytes, such as [255, 255]")?
@@ -319,7 +419,12 @@ fn read_bytes(table: &Reader<'_>, key: &str) -> Result<(Vec<u8>, Option<Spot>)> 
 }
 
 /// The fields of a stream part, or of one CAN frame, behind a head of so many bytes.
-fn read_fields(table: &Reader<'_>, head: usize, rules: Rules, flavour: Flavour) -> Result<Vec<FileField>> {
+pub(super) fn read_fields(
+    table: &Reader<'_>,
+    head: usize,
+    rules: Rules,
+    flavour: Flavour,
+) -> Result<Vec<FileField>> {
     let mut reader = FieldReader::new(table, rules, flavour)?;
     let list = table.required("fields", "the list of the frame's fields")?;
     let mut fields = Vec::new();
@@ -392,6 +497,10 @@ impl FileRecipe {
         }
     }
 
+    pub(super) fn is_can(&self) -> bool {
+        self.kind == RecipeKind::Can
+    }
+
     /// Checks that a port with this framing can carry the recipe.
     pub(super) fn check_framing(&self, framing: Framing) -> std::result::Result<(), String> {
         if self.is_device() {
@@ -400,7 +509,7 @@ impl FileRecipe {
         }
         for direction in [Direction::Input, Direction::Output] {
             if let Some(part) = self.part(direction) {
-                part.check(Rules { mode: self.mode, direction }, self.is_can, framing)
+                part.check(Rules { mode: self.mode, direction }, self.is_can(), framing)
                     .map_err(|error| format!("recipe {:?} does not fit this port: {error}", self.name))?;
             }
         }
@@ -429,7 +538,7 @@ impl FileRecipe {
             let frames = part.iter().flat_map(|part| &part.frames);
             frames.map(|frame| SimCanFrame { id: frame.id, fields: fields(frame) }).collect()
         };
-        let parts = if self.is_can {
+        let parts = if self.is_can() {
             SimParts::Can { input: can(&self.input), output: can(&self.output) }
         } else {
             SimParts::Stream { input: stream(&self.input), output: stream(&self.output) }

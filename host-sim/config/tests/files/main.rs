@@ -4,6 +4,7 @@ mod damaged_files;
 mod device_files;
 mod document_examples;
 mod example_files;
+mod exchange_files;
 mod framing_files;
 mod wrong_devices;
 mod wrong_files;

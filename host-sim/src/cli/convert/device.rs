@@ -4,12 +4,13 @@
 //! frames with the same values can differ in, such as padding, is kept in `raw=`.
 
 use proto_core::config::{DeviceFrame, FieldSpec, OutputBinding};
-use proto_core::device::{Digits, Encoding, Found, Framer, Kind, Probe};
+use proto_core::device::{Carrier, Digits, Encoding, Found, Framer, Kind, Probe};
+use proto_core::modbus::rtu;
 use proto_core::recipe::model::MAX_STREAM_FRAME;
 use proto_core::sysvar::Direction;
 use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::Scalar;
-use recipe_config::{DeviceRecipe, NamedFrame};
+use recipe_config::{DeviceRecipe, ExchangeKind, NamedExchange, NamedFrame};
 
 use super::super::text;
 use super::{note, write_line};
@@ -30,6 +31,8 @@ struct Format {
     id: Option<CanId>,
     frame: DeviceFrame,
     values: Vec<Value>,
+    /// One of its fields is the coil of Modbus function 5.
+    has_coil: bool,
 }
 
 /// A field with a value.
@@ -45,13 +48,36 @@ struct Value {
 
 impl DevicePart {
     pub(in super::super) fn new(recipe: &DeviceRecipe, direction: Direction) -> Result<Self, String> {
-        let format = |named: &NamedFrame| -> Result<Format, String> {
-            // Cannot fail: reading the file laid out the same frames.
-            let frame = named.lay_out(recipe.carrier, direction).map_err(|error| error.to_string())?;
-            Ok(Format { id: named.id, frame, values: values_of(named) })
-        };
+        let format = |named: &NamedFrame| Format::new(named, recipe.carrier, direction);
         let formats = recipe.part(direction).iter().map(format).collect::<Result<_, _>>()?;
         Ok(Self { direction, formats })
+    }
+
+    /// One frame of an exchange.
+    pub(in super::super) fn of_exchange(
+        exchange: &NamedExchange,
+        named: &NamedFrame,
+        is_request: bool,
+    ) -> Result<Self, String> {
+        if exchange.remote && is_request {
+            return Err("a remote request has no data".into());
+        }
+        // A slave receives requests.
+        let direction = match exchange.kind {
+            ExchangeKind::Slave(_) if is_request => Direction::Input,
+            ExchangeKind::Slave(_) => Direction::Output,
+            _ if is_request => Direction::Output,
+            _ => Direction::Input,
+        };
+        let carrier = if named.id.is_some() { Carrier::Can } else { Carrier::Stream };
+        let format = Format::new(named, carrier, direction)?;
+        Ok(Self { direction, formats: vec![format] })
+    }
+
+    /// Whether it is one frame that has no value to be given.
+    pub(in super::super) fn is_constant(&self) -> bool {
+        let [format] = &self.formats[..] else { return false };
+        format.values.iter().all(|value| value.constant.is_some())
     }
 
     pub(in super::super) fn ids(&self) -> impl Iterator<Item = Option<CanId>> {
@@ -177,6 +203,27 @@ fn values_of(named: &NamedFrame) -> Vec<Value> {
 }
 
 impl Format {
+    fn new(named: &NamedFrame, carrier: Carrier, direction: Direction) -> Result<Self, String> {
+        // Cannot fail for the frames of files: reading the file laid them out.
+        let frame = named.lay_out(carrier, direction).map_err(|error| error.to_string())?;
+        let has_coil = named.fields.iter().any(|field| field.is_coil);
+        Ok(Self { id: named.id, frame, values: values_of(named), has_coil })
+    }
+
+    /// Makes the coil of Modbus function 5 what it is on the line: FF for 1.
+    fn switch_coil(&self, frame: &mut [u8]) {
+        if !self.has_coil {
+            return;
+        }
+        // Behind slave, function and address; the CRC is the end.
+        if let [head @ .., low, high] = frame {
+            if let Some(coil) = head.get_mut(4) {
+                *coil = if *coil & 1 == 1 { 0xFF } else { 0 };
+            }
+            [*low, *high] = rtu::checksum(head).to_le_bytes();
+        }
+    }
+
     fn probe(&self, bytes: &[u8]) -> Probe {
         self.frame.layout.probe(&self.frame.elements, bytes)
     }
@@ -235,7 +282,11 @@ impl Format {
             of.map_or(f64::NAN, |(_, &number)| number)
         };
         match self.frame.layout.encode(&self.frame.elements, number, &mut out) {
-            Some(len) => Ok(out.get(..len).unwrap_or(&[]).to_vec()),
+            Some(len) => {
+                let mut frame = out.get(..len).unwrap_or(&[]).to_vec();
+                self.switch_coil(&mut frame);
+                Ok(frame)
+            }
             None => Err("a value is not a number, which no gateway sends".into()),
         }
     }

@@ -1,0 +1,80 @@
+//! The fields of coils: one bit each, without a type, packed into bytes with the first in the lowest
+//! bit.
+//!
+//! In: the list of fields of an exchange or a block of Modbus. Out: [`FileField`]s that share bytes,
+//! and how many coils they are.
+
+use proto_core::device::{Bits, ByteOrder, Encoding, Kind, Overflow};
+use proto_core::sysvar::Direction;
+
+use super::device::{bind, binding_keys, read_constant, read_name};
+use super::encoding::refuse;
+use super::reader::{Item, Reader, Result, Spot};
+use super::recipes::{FileField, FileFieldKind, Written};
+
+/// Most coils that one exchange has.
+const MAX_COILS: i64 = 2_000;
+
+/// Coils, as they are read.
+struct Packer {
+    fields: Vec<FileField>,
+    /// Coils so far.
+    count: usize,
+    /// Bytes that have fields or padding.
+    bytes: usize,
+    /// The newest pad, for bytes that have nothing else.
+    padded: Option<Spot>,
+}
+
+/// The fields of a list, and the number of coils.
+pub(super) fn read(list: &Item<'_>, direction: Direction) -> Result<(Vec<FileField>, usize)> {
+    let mut packer = Packer { fields: Vec::new(), count: 0, bytes: 0, padded: None };
+    for item in list.array("of coils, such as [{ name = \"ready\", to = \"WordInputReg[1]\" }]")? {
+        packer.read(&item.any_table()?, direction)?;
+    }
+    let bytes = packer.count.div_ceil(8);
+    packer.pad_up_to(bytes);
+    Ok((packer.fields, packer.count))
+}
+
+impl Packer {
+    fn read(&mut self, table: &Reader<'_>, direction: Direction) -> Result<()> {
+        if let Some(pad) = table.optional("pad") {
+            table.check_keys(&["pad"], " in padding of coils, which are sent as 0")?;
+            self.count += pad.integer::<usize>(1..=MAX_COILS)?;
+            self.padded = Some(table.spot.clone());
+            return Ok(());
+        }
+        refuse(table, &["type", "bits"], "a coil is one bit; it has no type and no bits")?;
+        let keys = binding_keys(table, direction)?;
+        table.check_keys(&[&["name"], keys].concat(), " of a coil")?;
+        let (byte, first) = (self.count / 8, (self.count % 8) as u8);
+        self.pad_up_to(byte);
+        let kind = Kind::Bits(Bits { bytes: 1, first, count: 1, signed: false });
+        let shared = self.bytes > byte;
+        let encoding = Encoding { kind, order: ByteOrder::Little, shared };
+        (self.bytes, self.count) = (byte + 1, self.count + 1);
+        let spot = &table.spot;
+        let mut push = |kind| self.fields.push(FileField { spot: spot.clone(), kind });
+        match table.optional("equals") {
+            Some(equals) => push(read_constant(table, &equals, encoding)?),
+            None => {
+                let written = Written { encoding, overflow: Overflow::Usual };
+                bind(table, direction, read_name(table)?, written, push)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Fills bytes in which all coils are skipped.
+    fn pad_up_to(&mut self, bytes: usize) {
+        while self.bytes < bytes {
+            let len = (bytes - self.bytes).min(usize::from(u8::MAX));
+            if let Some(spot) = self.padded.clone() {
+                let kind = FileFieldKind::Padding { len: len as u8, fill: 0 };
+                self.fields.push(FileField { spot, kind });
+            }
+            self.bytes += len;
+        }
+    }
+}

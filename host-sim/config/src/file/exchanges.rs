@@ -1,0 +1,261 @@
+//! `[[recipe.exchange]]`: what is asked of devices, what they reply, and when.
+//!
+//! In: the tables of a gateway file's recipe. Out: [`FileExchange`]s, whose frames were laid out. The
+//! frames here are a device's own; those of Modbus are in `modbus`.
+
+use proto_core::config::{AskWhen, ConfigErrorKind, DEFAULT_REPLY_TIMEOUT, ExchangeError, ExchangeKey};
+use proto_core::device::{Boundary, Carrier};
+use proto_core::recipe::model::{Mode, Rules};
+use proto_core::sysvar::Direction;
+use proto_core::time::Duration;
+use proto_core::wire::can::CanId;
+
+use super::bindings::Sending;
+use super::encoding::refuse;
+use super::reader::{Item, Reader, Result, Spot};
+use super::recipes::{self, FileField, FileFrame, FilePart, Flavour};
+use crate::device::ExchangeKind;
+
+/// One exchange, or one block of a slave.
+pub(super) struct FileExchange {
+    pub(super) spot: Spot,
+    /// The places of its keys, for later checks.
+    pub(super) spots: Vec<(ExchangeKey, Spot)>,
+    pub(super) peer: u8,
+    pub(super) kind: ExchangeKind,
+    /// What goes to the device. Of Modbus: its registers or coils only, without a frame around them.
+    pub(super) output: Option<FilePart>,
+    /// What comes from it.
+    pub(super) input: Option<FilePart>,
+    pub(super) refusal: Option<FilePart>,
+    /// Its frames are on a CAN bus.
+    pub(super) is_can: bool,
+    /// The request is a remote frame on CAN.
+    pub(super) remote: bool,
+    pub(super) timing: AskTiming,
+}
+
+/// When an exchange is asked, and how long it may take.
+pub(super) struct AskTiming {
+    pub(super) when: AskWhen,
+    pub(super) timeout: Duration,
+    pub(super) retries: u8,
+    pub(super) pause: Duration,
+}
+
+/// The keys of [`AskTiming`].
+pub(super) const TIMING_KEYS: [&str; 5] = ["every_ms", "on", "timeout_ms", "retries", "pause_ms"];
+const KEYS: [&str; 4] = ["peer", "request", "reply", "refusal"];
+const STREAM_KEYS: [&str; 6] = ["head", "tail", "endian", "word_order", "checksum", "fields"];
+const CAN_KEYS: [&str; 6] = ["id", "extended", "endian", "word_order", "checksum", "fields"];
+
+/// The longest times, as the check of the configuration has them.
+const LONGEST: Duration = Duration::from_secs(3_600);
+const LONGEST_PAUSE: Duration = Duration::from_secs(10);
+
+/// The exchanges of a stream or CAN recipe.
+pub(super) fn read_all(recipe: &Reader<'_>, mode: Mode, is_can: bool) -> Result<Vec<FileExchange>> {
+    let tables = recipe.any_tables("exchange")?;
+    if let Some(table) = tables.first().filter(|_| mode != Mode::User) {
+        return Err(table.error(ExchangeError::NeedsUser));
+    }
+    tables.iter().map(|table| read(table, is_can)).collect()
+}
+
+fn read(table: &Reader<'_>, is_can: bool) -> Result<FileExchange> {
+    table.check_keys_nearly(&[&KEYS[..], &TIMING_KEYS].concat(), " of an exchange")?;
+    let peer = table.optional("peer").map_or(Ok(0), |item| item.integer(0..=255))?;
+    let frame = |key, direction| {
+        table.optional(key).map(|item| read_frame(&item, key, direction, is_can)).transpose()
+    };
+    let request = frame("request", Direction::Output)?;
+    let reply = frame("reply", Direction::Input)?;
+    let refusal = frame("refusal", Direction::Input)?;
+    match (&request, &reply, &refusal) {
+        (None, None, _) => return Err(table.error(ExchangeError::Nothing)),
+        (None, _, Some((part, _))) | (_, None, Some((part, _))) => {
+            return Err(part.spot.error(table.document, ExchangeError::LoneRefusal));
+        }
+        (None, ..) => refuse(table, &TIMING_KEYS, "there is no request to send; allowed: reply, peer")?,
+        (Some(_), None, _) => {
+            refuse(table, &["timeout_ms", "retries"], "there is no reply to wait for")?;
+        }
+        _ => {}
+    }
+    let timing = AskTiming::read(table)?;
+    if request.is_some() {
+        timing.check_asked(table)?;
+    }
+    let spots = spots(
+        table,
+        &[
+            ("peer", ExchangeKey::Peer),
+            ("request", ExchangeKey::Request),
+            ("reply", ExchangeKey::Reply),
+            ("refusal", ExchangeKey::Refusal),
+        ],
+    );
+    let remote = request.as_ref().is_some_and(|(_, remote)| *remote);
+    let [output, input, refusal] = [request, reply, refusal].map(|frame| Some(frame?.0));
+    let kind = ExchangeKind::Frames;
+    Ok(FileExchange {
+        spot: table.spot.clone(),
+        spots,
+        peer,
+        kind,
+        output,
+        input,
+        refusal,
+        is_can,
+        remote,
+        timing,
+    })
+}
+
+/// The places of all keys of an exchange; that of the exchange for keys that it does not have.
+pub(super) fn spots(table: &Reader<'_>, own: &[(&str, ExchangeKey)]) -> Vec<(ExchangeKey, Spot)> {
+    let timing = [
+        ("every_ms", ExchangeKey::Every),
+        ("on", ExchangeKey::Rising),
+        ("timeout_ms", ExchangeKey::Timeout),
+        ("pause_ms", ExchangeKey::Pause),
+    ];
+    let spot = |key| table.optional(key).map_or(table.spot.clone(), |item| item.spot);
+    let keys = own.iter().copied().chain(timing).map(|(name, key)| (key, spot(name)));
+    keys.chain([(ExchangeKey::Whole, table.spot.clone())]).collect()
+}
+
+/// A request, a reply or a refusal, and whether it is a remote frame.
+fn read_frame(item: &Item<'_>, key: &str, direction: Direction, is_can: bool) -> Result<(FilePart, bool)> {
+    let table = item.any_table()?;
+    let is_request = direction == Direction::Output;
+    let remote: &[&str] = if is_can && is_request { &["remote"] } else { &[] };
+    let own = if is_can { &CAN_KEYS } else { &STREAM_KEYS };
+    let recipe = if is_can { "a CAN recipe" } else { "a stream recipe" };
+    table.check_keys_nearly(&[&own[..], remote].concat(), &format!(" of a {key} in {recipe}"))?;
+    let mut part = FilePart::of_exchange(&table);
+    let mut frame = FileFrame::new(table.spot.clone());
+    if is_can {
+        let id = table.required("id", "the frame's CAN id")?;
+        (frame.id, frame.id_spot) = (recipes::read_id(&table, &id)?, id.spot);
+    } else {
+        (part.head, part.head_spot) = recipes::read_bytes(&table, "head")?;
+        (part.tail, part.tail_spot) = recipes::read_bytes(&table, "tail")?;
+    }
+    if table.optional("remote").map_or(Ok(false), |item| item.bool())? {
+        refuse(&table, &["fields", "checksum", "endian", "word_order"], "a remote request has no data")?;
+        part.frames.push(frame);
+        return Ok((part, true));
+    }
+    let rules = Rules { mode: Mode::User, direction };
+    frame.fields = recipes::read_fields(&table, part.head.len(), rules, Flavour::Gateway)?;
+    part.frames.push(frame);
+    part.check_device(&table, if is_can { Carrier::Can } else { Carrier::Stream }, direction)?;
+    Ok((part, false))
+}
+
+impl FilePart {
+    /// A frame of an exchange, still without its fields.
+    pub(super) fn of_exchange(table: &Reader<'_>) -> Self {
+        Self {
+            spot: table.spot.clone(),
+            head: Vec::new(),
+            tail: Vec::new(),
+            head_spot: None,
+            tail_spot: None,
+            frames: Vec::new(),
+            sending: Sending::default(),
+            framing: (Boundary::Fields, None),
+        }
+    }
+
+    /// The fields, if it is the frame of an exchange.
+    pub(super) fn fields(&self) -> &[FileField] {
+        self.frames.first().map_or(&[], |frame| &frame.fields)
+    }
+}
+
+impl FileFrame {
+    fn new(spot: Spot) -> Self {
+        Self { id_spot: spot.clone(), spot, id: CanId::Standard(0), fields: Vec::new() }
+    }
+
+    /// Registers or coils.
+    pub(super) fn of_fields(spot: Spot, fields: Vec<FileField>) -> Self {
+        Self { fields, ..Self::new(spot) }
+    }
+}
+
+impl AskTiming {
+    /// Of what is never asked.
+    pub(super) const NEVER: Self =
+        Self { when: AskWhen::NEVER, timeout: DEFAULT_REPLY_TIMEOUT, retries: 0, pause: Duration::ZERO };
+
+    pub(super) fn read(table: &Reader<'_>) -> Result<Self> {
+        let time = |key, longest| table.optional(key).map(|item| read_time(&item, longest)).transpose();
+        let mut when = AskWhen { every: time("every_ms", LONGEST)?, ..AskWhen::NEVER };
+        let pause = match table.optional("pause_ms") {
+            Some(item) => read_pause(&item)?,
+            None => Duration::ZERO,
+        };
+        if let Some(on) = table.optional("on") {
+            let list = on.array("such as [\"start\", \"change\"]")?;
+            if list.is_empty() {
+                return Err(
+                    on.error("an empty list; allowed: \"start\", \"change\", \"rising:BitOutputReg[3].0\"")
+                );
+            }
+            list.iter().try_for_each(|item| read_on(item, &mut when))?;
+        }
+        Ok(Self {
+            when,
+            timeout: time("timeout_ms", LONGEST)?.unwrap_or(DEFAULT_REPLY_TIMEOUT),
+            retries: table.optional("retries").map_or(Ok(1), |item| item.integer(0..=255))?,
+            pause,
+        })
+    }
+
+    /// Refuses a request that is never sent.
+    pub(super) fn check_asked(&self, table: &Reader<'_>) -> Result<()> {
+        if self.when.is_never() { Err(table.error(ExchangeError::Never)) } else { Ok(()) }
+    }
+}
+
+fn read_time(item: &Item<'_>, longest: Duration) -> Result<Duration> {
+    match item.time(1e3)? {
+        Duration::ZERO => Err(item.error(ConfigErrorKind::ZeroTime)),
+        time if time > longest => Err(item.error(ConfigErrorKind::TimeTooLong { time, longest })),
+        time => Ok(time),
+    }
+}
+
+fn read_pause(item: &Item<'_>) -> Result<Duration> {
+    match item.time(1e3)? {
+        time if time > LONGEST_PAUSE => {
+            Err(item.error(ConfigErrorKind::TimeTooLong { time, longest: LONGEST_PAUSE }))
+        }
+        time => Ok(time),
+    }
+}
+
+/// One entry of `on`.
+fn read_on(item: &Item<'_>, when: &mut AskWhen) -> Result<()> {
+    let text = item.string()?;
+    let flag =
+        match text {
+            "start" => &mut when.start,
+            "change" => &mut when.change,
+            _ => {
+                let (var, bit) = super::bindings::read_rising(item, text, "\"start\", \"change\"")?;
+                return match when.rising.replace((var, bit)) {
+                    None => Ok(()),
+                    Some((before, nth)) => Err(item
+                        .error(format!("one bit can trigger an exchange, and {before}.{nth} does already"))),
+                };
+            }
+        };
+    match std::mem::replace(flag, true) {
+        false => Ok(()),
+        true => Err(item.error(format!("{text:?} is there twice"))),
+    }
+}

@@ -1,0 +1,361 @@
+//! Modbus RTU in a gateway file: the exchanges of a master, and the blocks of a slave.
+//!
+//! In: `[[recipe.exchange]]` of `kind = "modbus-rtu"` and `[[recipe.block]]` of
+//! `kind = "modbus-rtu-slave"`. Out: [`FileExchange`]s. The numbers of registers and coils follow
+//! from the fields.
+
+use proto_core::config::{DeviceFrame, ExchangeError, ExchangeKey};
+use proto_core::device::Carrier;
+use proto_core::modbus::rtu::{BROADCAST, MAX_ADDRESS, Operation};
+use proto_core::sysvar::Direction;
+
+use super::coils;
+use super::device::FieldReader;
+use super::encoding::refuse;
+use super::exchanges::{self, AskTiming, FileExchange, TIMING_KEYS};
+use super::reader::{Item, Reader, Result};
+use super::recipes::{FileField, FileFrame, FilePart};
+use crate::device::ExchangeKind;
+
+/// A function that reads or writes one table.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Function {
+    ReadCoils,
+    ReadDiscreteInputs,
+    ReadHoldingRegisters,
+    ReadInputRegisters,
+    WriteCoil,
+    WriteRegister,
+    WriteCoils,
+    WriteRegisters,
+    ReadWriteRegisters,
+}
+
+const FUNCTIONS: [(&str, i64, Function); 9] = [
+    ("read-coils", 1, Function::ReadCoils),
+    ("read-discrete-inputs", 2, Function::ReadDiscreteInputs),
+    ("read-holding-registers", 3, Function::ReadHoldingRegisters),
+    ("read-input-registers", 4, Function::ReadInputRegisters),
+    ("write-coil", 5, Function::WriteCoil),
+    ("write-register", 6, Function::WriteRegister),
+    ("write-coils", 15, Function::WriteCoils),
+    ("write-registers", 16, Function::WriteRegisters),
+    ("read-write-registers", 23, Function::ReadWriteRegisters),
+];
+
+/// The name of a function of Modbus, such as `read-coils` for 1.
+pub fn function_name(operation: &Operation) -> &'static str {
+    let code = i64::from(operation.function());
+    FUNCTIONS.iter().find(|(_, known, _)| *known == code).map_or("", |(name, ..)| name)
+}
+
+/// What a block of a slave holds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Table {
+    Coils,
+    DiscreteInputs,
+    HoldingRegisters,
+    InputRegisters,
+}
+
+const TABLES: [(&str, Table); 4] = [
+    ("coils", Table::Coils),
+    ("discrete-inputs", Table::DiscreteInputs),
+    ("holding-registers", Table::HoldingRegisters),
+    ("input-registers", Table::InputRegisters),
+];
+
+const MASTER_KEYS: [&str; 7] =
+    ["slave", "function", "address", "write_address", "word_order", "read", "write"];
+const BLOCK_KEYS: [&str; 4] = ["table", "address", "word_order", "fields"];
+
+/// The exchanges of a master.
+pub(super) fn read_master(recipe: &Reader<'_>) -> Result<Vec<FileExchange>> {
+    let exchanges = recipe.any_tables("exchange")?;
+    if exchanges.is_empty() {
+        return Err(recipe.error("a recipe of a Modbus master needs an exchange, [[recipe.exchange]]"));
+    }
+    exchanges.iter().map(read_exchange).collect()
+}
+
+/// The blocks of a slave.
+pub(super) fn read_slave(recipe: &Reader<'_>) -> Result<Vec<FileExchange>> {
+    let address = recipe.required("address", "the gateway's own address on the line, 1..=247")?;
+    let address = address.integer(1..=i64::from(MAX_ADDRESS))?;
+    let blocks = recipe.any_tables("block")?;
+    if blocks.is_empty() {
+        return Err(recipe.error("a recipe of a Modbus slave needs a block, [[recipe.block]]"));
+    }
+    blocks.iter().map(|block| read_block(block, address)).collect()
+}
+
+fn read_exchange(table: &Reader<'_>) -> Result<FileExchange> {
+    table.check_keys_nearly(&[&MASTER_KEYS[..], &TIMING_KEYS].concat(), " of an exchange of Modbus")?;
+    let slave = table.required("slave", "the slave's address, 1..=247, or 0 to write to all of them")?;
+    let function = read_function(table)?;
+    if !function.reads() {
+        refuse(table, &["read"], "this function writes only; its fields are in write")?;
+    }
+    if !function.writes() {
+        refuse(table, &["write"], "this function reads only; its fields are in read")?;
+    }
+    if function != Function::ReadWriteRegisters {
+        refuse(table, &["write_address"], "allowed only for read-write-registers, which has two addresses")?;
+    }
+    let address = |key, what| table.required(key, what)?.integer::<u16>(0..=0xFFFF);
+    let first = address("address", "the first register or coil, counted from 0 as on the line")?;
+    let write_first = match function {
+        Function::ReadWriteRegisters => address("write_address", "the first register that is written")?,
+        _ => first,
+    };
+    let list = |key, direction, is_used: bool| match is_used {
+        true => List::read(table, key, direction, function.of_coils()).map(Some),
+        false => Ok(None),
+    };
+    let read = list("read", Direction::Input, function.reads())?;
+    let write = list("write", Direction::Output, function.writes())?;
+    let peer = slave.integer(0..=i64::from(MAX_ADDRESS))?;
+    if peer == BROADCAST && function.reads() {
+        return Err(slave.error(ExchangeError::BroadcastRead));
+    }
+    if peer == BROADCAST {
+        refuse(table, &["timeout_ms", "retries"], "nobody answers what is written to all slaves")?;
+    }
+    let count = |list: &Option<List<'_>>| list.as_ref().map_or(0, |list| list.count);
+    if matches!(function, Function::WriteCoil | Function::WriteRegister) && count(&write) != 1 {
+        let (one, several) = match function {
+            Function::WriteCoil => ("one coil", "write-coils"),
+            _ => ("one register", "write-registers"),
+        };
+        return Err(table.required("write", "")?.error(format!(
+            "this function writes {one}, not {}; for several there is function = {several:?}",
+            count(&write)
+        )));
+    }
+    let operation = function.operation((first, count(&read)), (write_first, count(&write)));
+    check(table, &operation, &read, &write)?;
+    let timing = AskTiming::read(table)?;
+    timing.check_asked(table)?;
+    let spots = exchanges::spots(table, &[("slave", ExchangeKey::Peer), ("address", ExchangeKey::Registers)]);
+    Ok(FileExchange {
+        spot: table.spot.clone(),
+        spots,
+        peer,
+        kind: ExchangeKind::Master(operation),
+        output: write.map(|list| list.part),
+        input: read.map(|list| list.part),
+        refusal: None,
+        is_can: false,
+        remote: false,
+        timing,
+    })
+}
+
+fn read_block(table: &Reader<'_>, peer: u8) -> Result<FileExchange> {
+    table.check_keys_nearly(&BLOCK_KEYS, " of a block")?;
+    let holds = table.required("table", "coils, discrete-inputs, holding-registers or input-registers")?;
+    let holds = holds.choice_nearly(&TABLES)?;
+    let first = table.required("address", "the first register or coil, counted from 0 as on the line")?;
+    let first = first.integer(0..=0xFFFF)?;
+    let direction = direction_of(table, holds)?;
+    let is_coils = matches!(holds, Table::Coils | Table::DiscreteInputs);
+    let list = List::read(table, "fields", direction, is_coils)?;
+    let count = list.count;
+    let function = match (holds, direction) {
+        (Table::Coils, Direction::Input) => Function::WriteCoils,
+        (Table::Coils, Direction::Output) => Function::ReadCoils,
+        (Table::DiscreteInputs, _) => Function::ReadDiscreteInputs,
+        (Table::HoldingRegisters, Direction::Input) => Function::WriteRegisters,
+        (Table::HoldingRegisters, Direction::Output) => Function::ReadHoldingRegisters,
+        (Table::InputRegisters, _) => Function::ReadInputRegisters,
+    };
+    let operation = function.operation((first, count), (first, count));
+    let list = Some(list);
+    match direction {
+        Direction::Input => check(table, &operation, &None, &list)?,
+        Direction::Output => check(table, &operation, &list, &None)?,
+    }
+    let part = list.map(|list| list.part);
+    let (input, output) = if direction == Direction::Input { (part, None) } else { (None, part) };
+    Ok(FileExchange {
+        spot: table.spot.clone(),
+        spots: exchanges::spots(table, &[("address", ExchangeKey::Registers)]),
+        peer,
+        kind: ExchangeKind::Slave(operation),
+        output,
+        input,
+        refusal: None,
+        is_can: false,
+        remote: false,
+        timing: AskTiming::NEVER,
+    })
+}
+
+/// Who writes the block: a master, whose values go to the robot, or the gateway.
+fn direction_of(block: &Reader<'_>, holds: Table) -> Result<Direction> {
+    let list = block.required("fields", "the list of the block's fields")?;
+    let mut found: Option<Direction> = None;
+    for item in list.array("of fields")?.iter().filter(|item| item.is_table()) {
+        let field = item.any_table()?;
+        let has = |keys: &[&str]| keys.iter().find_map(|key| field.optional(key));
+        let ways = [
+            (Direction::Input, has(&["to", "commands", "equals", "length_to", "count_to"])),
+            (Direction::Output, has(&["from", "value", "length_from"])),
+        ];
+        for (direction, key) in ways.into_iter().filter_map(|(direction, key)| Some((direction, key?))) {
+            let is_read_only = matches!(holds, Table::DiscreteInputs | Table::InputRegisters);
+            if is_read_only && direction == Direction::Input {
+                return Err(key.error(
+                    "a master cannot write discrete inputs and input registers; allowed: from, value, pad",
+                ));
+            }
+            match found.replace(direction) {
+                Some(before) if before != direction => {
+                    return Err(key.error(
+                        "a master writes the fields before this one, or reads them, and this one is the other way; \
+                         write two blocks",
+                    ));
+                }
+                _ => {}
+            }
+        }
+    }
+    Ok(found.unwrap_or(match holds {
+        Table::Coils | Table::HoldingRegisters => Direction::Input,
+        Table::DiscreteInputs | Table::InputRegisters => Direction::Output,
+    }))
+}
+
+/// By name or by number.
+fn read_function(table: &Reader<'_>) -> Result<Function> {
+    let item = table.required("function", "such as \"read-input-registers\", or its number, 4")?;
+    let names = FUNCTIONS.map(|(name, _, function)| (name, function));
+    if item.as_string().is_some() {
+        return item.choice_nearly(&names);
+    }
+    let number: i64 = item.integer(i64::MIN..=i64::MAX)?;
+    let known = FUNCTIONS.iter().find(|(_, code, _)| *code == number);
+    known.map(|(.., function)| *function).ok_or_else(|| {
+        let codes: Vec<_> = FUNCTIONS.iter().map(|(name, code, _)| format!("{code} ({name})")).collect();
+        item.error(format!("function {number} is unknown; allowed: {}", codes.join(", ")))
+    })
+}
+
+/// Fields, and the registers or coils that they are.
+struct List<'a> {
+    item: Item<'a>,
+    part: FilePart,
+    count: u16,
+}
+
+impl<'a> List<'a> {
+    fn read(table: &Reader<'a>, key: &str, direction: Direction, is_coils: bool) -> Result<Self> {
+        let what = if is_coils { "the list of the coils" } else { "the list of the fields in the registers" };
+        let item = table.required(key, what)?;
+        let (fields, count) = match is_coils {
+            true => coils::read(&item, direction)?,
+            false => read_registers(table, &item, direction)?,
+        };
+        let mut part = FilePart::of_exchange(table);
+        part.spot = item.spot.clone();
+        let count = u16::try_from(count).unwrap_or(u16::MAX);
+        part.frames.push(FileFrame::of_fields(item.spot.clone(), fields));
+        part.check_device(table, Carrier::Whole, direction)?;
+        let list = Self { item, part, count };
+        if !is_coils { list.with_registers(direction) } else { Ok(list) }
+    }
+
+    /// Counts the registers.
+    fn with_registers(mut self, direction: Direction) -> Result<Self> {
+        let specs: Vec<_> = self.part.fields().iter().map(FileField::spec).collect();
+        let frame = DeviceFrame::new(Carrier::Whole, direction, (&[], &[]), &specs);
+        let (shortest, longest) = frame.map_or((0, 0), |frame| frame.layout.lengths());
+        if shortest != longest {
+            return Err(self.item.error(ExchangeError::Varying));
+        }
+        if longest % 2 == 1 {
+            return Err(self.item.error(format!(
+                "the fields have {longest} bytes, but registers have two each; fill them up with {{ pad = 1 }}"
+            )));
+        }
+        self.count = (longest / 2) as u16;
+        Ok(self)
+    }
+}
+
+fn read_registers(
+    table: &Reader<'_>,
+    list: &Item<'_>,
+    direction: Direction,
+) -> Result<(Vec<FileField>, usize)> {
+    let mut reader = FieldReader::of_registers(table, direction)?;
+    let mut fields = Vec::new();
+    for item in
+        list.array("of fields, such as [{ name = \"speed\", type = \"word\", to = \"WordInputReg[1]\" }]")?
+    {
+        if item.is_table() {
+            refuse(&item.any_table()?, &["length"], "the frames of Modbus have their own length")?;
+        }
+        reader.read(&item, &mut fields)?;
+    }
+    Ok((fields, 0))
+}
+
+/// Counts and addresses that the function allows.
+fn check(
+    table: &Reader<'_>,
+    operation: &Operation,
+    read: &Option<List<'_>>,
+    write: &Option<List<'_>>,
+) -> Result<()> {
+    let lists = [("address", read), ("write_address", write)];
+    for (key, list) in lists.into_iter().filter_map(|(key, list)| Some((key, list.as_ref()?))) {
+        if let Err(error) = operation.check()
+            && error.count == list.count
+        {
+            return Err(list.item.error(ExchangeError::Count(error)));
+        }
+        let Some(item) = table.optional(key).or_else(|| table.optional("address")) else { continue };
+        let address: u16 = item.integer(0..=0xFFFF)?;
+        if u32::from(address) + u32::from(list.count) > 0x1_0000 {
+            return Err(item.error(ExchangeError::BeyondLast { address, count: list.count }));
+        }
+    }
+    Ok(())
+}
+
+impl Function {
+    fn of_coils(self) -> bool {
+        matches!(self, Self::ReadCoils | Self::ReadDiscreteInputs | Self::WriteCoil | Self::WriteCoils)
+    }
+
+    fn reads(self) -> bool {
+        !matches!(self, Self::WriteCoil | Self::WriteRegister | Self::WriteCoils | Self::WriteRegisters)
+    }
+
+    fn writes(self) -> bool {
+        !self.reads() || self == Self::ReadWriteRegisters
+    }
+
+    /// With addresses and counts.
+    fn operation(self, read: (u16, u16), write: (u16, u16)) -> Operation {
+        let ((address, count), (write_address, write_count)) =
+            if self.reads() { (read, write) } else { (write, write) };
+        match self {
+            Self::ReadCoils => Operation::ReadCoils { address, count },
+            Self::ReadDiscreteInputs => Operation::ReadDiscreteInputs { address, count },
+            Self::ReadHoldingRegisters => Operation::ReadHoldingRegisters { address, count },
+            Self::ReadInputRegisters => Operation::ReadInputRegisters { address, count },
+            Self::WriteCoil => Operation::WriteCoil { address },
+            Self::WriteRegister => Operation::WriteRegister { address },
+            Self::WriteCoils => Operation::WriteCoils { address, count },
+            Self::WriteRegisters => Operation::WriteRegisters { address, count },
+            Self::ReadWriteRegisters => Operation::ReadWriteRegisters {
+                read_address: address,
+                read_count: count,
+                write_address,
+                write_count,
+            },
+        }
+    }
+}

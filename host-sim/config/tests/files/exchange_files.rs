@@ -1,0 +1,206 @@
+//! What the keys of exchanges and of Modbus mean in the configuration.
+
+use proto_core::config::{
+    AskWhen, Bus, Exchange, FieldSpec, GatewayConfig, InputBinding, OutputBinding, Parts, Rs485, Span, Talk,
+};
+use proto_core::device::{Bits, ByteOrder, Encoding, Kind};
+use proto_core::modbus::rtu::Operation;
+use proto_core::sysvar::SysVar;
+use proto_core::time::Duration;
+use proto_core::wire::can::CanId;
+use proto_core::wire::scalar::ScalarType;
+use recipe_config::file::{Text, parse_gateway, parse_recipes};
+
+const LINE: &str = include_str!("good/line.toml");
+
+fn line() -> Box<GatewayConfig> {
+    parse_gateway(Text { name: "line.toml", toml: LINE }, &[]).unwrap_or_else(|error| panic!("{error}"))
+}
+
+/// The exchanges of a recipe.
+fn exchanges(config: &GatewayConfig, recipe: usize) -> &[Exchange] {
+    config.view().exchanges_of(&config.recipes[recipe])
+}
+
+fn ms(ms: u64) -> Duration {
+    Duration::from_millis(ms)
+}
+
+fn to(name: &str) -> InputBinding {
+    InputBinding::Variable { var: SysVar::parse(name).unwrap(), scale: 1.0, offset: 0.0 }
+}
+
+fn rtu(config: &GatewayConfig, nth: usize) -> (Operation, &[FieldSpec], &[FieldSpec]) {
+    match exchanges(config, 0)[nth].talk {
+        Talk::Rtu { operation, written, read } => {
+            (operation, written.of(&config.fields), read.of(&config.fields))
+        }
+        other => panic!("{other:?}"),
+    }
+}
+
+fn coil(first: u8, shared: bool) -> Encoding {
+    let kind = Kind::Bits(Bits { bytes: 1, first, count: 1, signed: false });
+    Encoding { kind, order: ByteOrder::Little, shared }
+}
+
+#[test]
+fn a_master_has_its_registers() {
+    let config = line();
+    assert_eq!(config.recipes[0].parts, Parts::Stream { input: None, output: None });
+    let first = exchanges(&config, 0)[0];
+    assert_eq!((first.peer, first.timeout, first.retries, first.pause), (9, ms(50), 2, ms(5)));
+    assert_eq!(first.when, AskWhen::every(ms(100)));
+    let (operation, written, read) = rtu(&config, 0);
+    assert_eq!(operation, Operation::ReadInputRegisters { address: 0x07D0, count: 5 });
+    assert!(written.is_empty());
+    let order = |field: &FieldSpec| field.element()?.encoding().map(|encoding| encoding.order);
+    assert_eq!(order(&read[0]), Some(ByteOrder::BigSwapped), "the exchange's order of words");
+    assert_eq!(order(&read[3]), Some(ByteOrder::Big), "of a register");
+
+    let (operation, written, read) = rtu(&config, 1);
+    let (read_address, write_address) = (0x10, 0x20);
+    assert_eq!(
+        operation,
+        Operation::ReadWriteRegisters { read_address, read_count: 2, write_address, write_count: 2 }
+    );
+    assert_eq!((order(&read[0]), written.len()), (Some(ByteOrder::Big), 2));
+    let second = exchanges(&config, 0)[1];
+    let rising = Some((SysVar::parse("BitOutputReg[3]").unwrap(), 0));
+    assert_eq!(second.when, AskWhen { every: None, start: true, change: true, rising });
+    assert_eq!((second.timeout, second.retries, second.pause), (ms(100), 1, ms(0)), "the defaults");
+    assert_eq!(rtu(&config, 5).0, Operation::WriteRegister { address: 1 });
+}
+
+#[test]
+fn coils_share_bytes_lowest_first() {
+    let config = line();
+    let (operation, _, read) = rtu(&config, 2);
+    assert_eq!(operation, Operation::ReadCoils { address: 0, count: 28 });
+    assert_eq!(operation.read_len(), 4);
+    let value = |first, shared, to| FieldSpec::DeviceInput {
+        encoding: coil(first, shared),
+        overflow: Default::default(),
+        to,
+    };
+    let start = read[1];
+    assert_eq!(
+        read,
+        [
+            value(0, false, to("WordInputReg[4]")),
+            start,
+            FieldSpec::Fixed { encoding: coil(5, true), value: 1 },
+            FieldSpec::Padding { len: 1, fill: 0 },
+            value(2, false, InputBinding::Unused),
+            FieldSpec::Padding { len: 1, fill: 0 },
+        ]
+    );
+    assert!(
+        matches!(start, FieldSpec::DeviceInput { encoding, to: InputBinding::Commands { .. }, .. } if encoding == coil(4, true))
+    );
+
+    let (operation, written, _) = rtu(&config, 3);
+    assert_eq!((operation, written.len()), (Operation::WriteCoil { address: 0xAC }, 1));
+    let (operation, written, _) = rtu(&config, 4);
+    assert_eq!(operation, Operation::WriteCoils { address: 0, count: 3 });
+    let output = |first, shared, from| FieldSpec::DeviceOutput {
+        encoding: coil(first, shared),
+        overflow: Default::default(),
+        from,
+    };
+    assert_eq!(
+        written,
+        [output(0, false, OutputBinding::Constant(1.0)), output(2, true, OutputBinding::Counter)]
+    );
+}
+
+#[test]
+fn a_slave_serves_its_blocks() {
+    let config = line();
+    let blocks = exchanges(&config, 1);
+    let operations: Vec<_> = blocks
+        .iter()
+        .map(|block| match block.talk {
+            Talk::Served { operation, written, read } => (block.peer, operation, written.len, read.len),
+            other => panic!("{other:?}"),
+        })
+        .collect();
+    assert_eq!(
+        operations,
+        [
+            (5, Operation::ReadHoldingRegisters { address: 0, count: 3 }, 0, 2),
+            (5, Operation::WriteRegisters { address: 100, count: 2 }, 1, 0),
+            (5, Operation::ReadDiscreteInputs { address: 0, count: 10 }, 0, 2),
+            (5, Operation::WriteCoils { address: 7, count: 1 }, 1, 0),
+        ]
+    );
+    assert!(blocks.iter().all(|block| block.when.is_never()));
+}
+
+#[test]
+fn a_conversation_has_frames_of_its_own() {
+    let config = line();
+    let talk = exchanges(&config, 2);
+    assert_eq!((talk[0].peer, talk[0].when), (3, AskWhen::every(ms(50))));
+    assert_eq!(talk[0].talk, Talk::Frames { request: Some(0), reply: Some(1), refusal: Some(2) });
+    assert_eq!(talk[1].talk, Talk::Frames { request: None, reply: Some(3), refusal: None });
+    assert_eq!(talk[2].talk, Talk::Frames { request: Some(4), reply: None, refusal: None });
+    assert_eq!(talk[2].pause, ms(10));
+    let reply = &config.frames[1];
+    assert_eq!((&reply.head[..], &reply.tail[..], reply.id, reply.remote), (&[2][..], &[3][..], None, false));
+
+    let drive = exchanges(&config, 3);
+    assert_eq!(drive[0].when, AskWhen { start: true, ..AskWhen::NEVER });
+    let Talk::Frames { request: Some(request), .. } = drive[1].talk else { panic!("{:?}", drive[1]) };
+    let request = &config.frames[usize::from(request)];
+    assert_eq!((request.id, request.remote), (Some(CanId::Standard(0x701)), true));
+    assert_eq!(request.fields.len, 0);
+}
+
+#[test]
+fn lines_of_modbus_have_its_silences() {
+    let config = line();
+    let lines: Vec<_> = config
+        .ports
+        .iter()
+        .filter_map(|port| match port.bus {
+            Bus::Rs485(line) => Some((line.idle_gap, line.turnaround, line.echo)),
+            _ => None,
+        })
+        .collect();
+    // 3.5 characters of 11 bits at 19200 bit/s; 1750 µs above; a plain line.
+    let (slow, fast) = (Duration::from_micros(2_006), Duration::from_micros(1_750));
+    let plain = Rs485::default();
+    assert_eq!(lines, [(slow, slow, true), (ms(3), fast, false), (plain.idle_gap, plain.turnaround, false)]);
+}
+
+#[test]
+fn tools_get_whole_frames() {
+    let recipes = parse_recipes(Text { name: "line.toml", toml: LINE }, &[]).unwrap();
+    let recipe_config::AnyRecipe::Device(line) = &recipes[0] else { panic!("{:?}", recipes[0]) };
+    let names = |frame: &Option<recipe_config::NamedFrame>| -> Vec<String> {
+        frame.iter().flat_map(|frame| &frame.fields).map(|field| field.name.clone()).collect()
+    };
+    let exchange = &line.exchanges[1];
+    assert_eq!(
+        names(&exchange.request),
+        ["slave", "function", "address", "count", "write-address", "write-count", "bytes", "wanted", "", ""]
+    );
+    assert_eq!(names(&exchange.reply), ["slave", "function", "bytes", "position", ""]);
+    assert_eq!(names(&exchange.refusal), ["slave", "function", "code", ""]);
+    assert_eq!(names(&line.exchanges[4].reply), [""; 0], "nobody answers a broadcast");
+}
+
+#[test]
+fn an_exchange_of_a_file_is_that_of_the_model() {
+    let config = line();
+    let span = |start, len| Span { start, len };
+    let first = exchanges(&config, 0)[0];
+    let expected = Talk::Rtu {
+        operation: Operation::ReadInputRegisters { address: 0x07D0, count: 5 },
+        written: span(0, 0),
+        read: span(0, 6),
+    };
+    assert_eq!(first.talk, expected);
+    assert_eq!(Encoding::scalar(ScalarType::Word).size(), Some(2));
+}

@@ -1,0 +1,129 @@
+//! How long exchanges take on a line, and how much of it they take together.
+//!
+//! In: a configuration. Out: times. Nothing is refused here.
+
+use super::budget::can_frame_time;
+use super::exchange::{Exchange, FrameSpec, Talk};
+use super::{Bus, ConfigView, FieldSpec, Port, SendOn};
+use crate::modbus::rtu::{BROADCAST, Timing};
+use crate::sysvar::Direction;
+use crate::time::Duration;
+use crate::wire::can::CanId;
+
+/// How much of a port's line one exchange takes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct ExchangeBudget {
+    /// Bytes of the request, with everything around its fields; on CAN of its data. 0 without a
+    /// request.
+    pub request: usize,
+    /// Maximum number of bytes of the reply, in the same way.
+    pub reply: usize,
+    /// From the end of what was before it to the end of its pause, if the reply comes at once: the
+    /// silences, both frames and the pause.
+    pub time: Duration,
+    /// The same if no reply comes in time; as [`Self::time`] where none is expected.
+    pub time_without_reply: Duration,
+}
+
+impl ConfigView<'_> {
+    /// How much of the line of `port` an exchange of its recipe takes. Of a slave's block: what a
+    /// master takes that reads or writes all of it.
+    pub fn exchange_budget(self, port: &Port, exchange: &Exchange) -> ExchangeBudget {
+        let frame = |nth: Option<u8>| self.frames.get(usize::from(nth?));
+        let bytes = |frame: Option<&FrameSpec>| frame.map_or(0, |frame| self.bytes_of(frame));
+        let (request, reply, ids) = match exchange.talk {
+            Talk::Rtu { operation, .. } if exchange.peer == BROADCAST => {
+                (operation.request_len(), 0, [None; 2])
+            }
+            Talk::Rtu { operation, .. } | Talk::Served { operation, .. } => {
+                (operation.request_len(), operation.reply_len(), [None; 2])
+            }
+            Talk::Frames { request, reply, .. } => {
+                let (request, reply) = (frame(request), frame(reply));
+                let id = |frame: Option<&FrameSpec>| frame.and_then(|frame| frame.id);
+                (bytes(request), bytes(reply), [id(request), id(reply)])
+            }
+        };
+        let [request_id, reply_id] = ids;
+        let asks = request_on_line(port, exchange, request, request_id);
+        let answers = on_line(port, exchange, reply, reply_id);
+        let waits = if expects_reply(exchange) { answers.max(exchange.timeout) } else { answers };
+        ExchangeBudget {
+            request,
+            reply,
+            time: asks + answers + exchange.pause,
+            time_without_reply: asks + waits + exchange.pause,
+        }
+    }
+
+    /// How much of the line of `port` is taken, in percent, rounded up: by its exchanges with a period
+    /// and, if there is one, by an output part that is sent each cycle. `None` without such exchanges.
+    pub fn line_share(self, port: &Port) -> Option<u32> {
+        let recipe = self.recipes.get(usize::from(port.recipe))?;
+        let share = |time: Duration, every: Duration| {
+            let parts = time.as_micros().saturating_mul(1_000_000);
+            parts.div_ceil(every.as_micros().max(1))
+        };
+        let cyclic = |exchange: &Exchange| {
+            Some(share(self.exchange_budget(port, exchange).time, exchange.when.every?))
+        };
+        let exchanges = self.exchanges_of(recipe).iter().filter_map(cyclic);
+        let asked =
+            exchanges.fold(None, |sum: Option<u64>, one| Some(sum.unwrap_or(0).saturating_add(one)))?;
+        let sent = match (recipe.send, self.shortest_cycle(port)) {
+            (SendOn::Period, time) => share(time, port.cycle),
+            _ => 0,
+        };
+        Some(u32::try_from(asked.saturating_add(sent).div_ceil(10_000)).unwrap_or(u32::MAX))
+    }
+
+    /// The longest period of an exchange of `port` whose reply has values.
+    pub(super) fn slowest_reply(self, port: &Port) -> Option<Duration> {
+        let recipe = self.recipes.get(usize::from(port.recipe))?;
+        let with_reply = self
+            .exchanges_of(recipe)
+            .iter()
+            .filter(|exchange| exchange.fields(self, Direction::Input).next().is_some());
+        with_reply.filter_map(|exchange| exchange.when.every).max()
+    }
+
+    fn bytes_of(self, frame: &FrameSpec) -> usize {
+        let fields =
+            frame.fields.of(self.fields).iter().map(FieldSpec::longest).fold(0, usize::saturating_add);
+        fields.saturating_add(frame.head.len()).saturating_add(frame.tail.len())
+    }
+}
+
+fn expects_reply(exchange: &Exchange) -> bool {
+    match exchange.talk {
+        Talk::Rtu { .. } => exchange.peer != BROADCAST,
+        Talk::Served { .. } => false,
+        Talk::Frames { request, reply, .. } => request.is_some() && reply.is_some(),
+    }
+}
+
+/// The silence before a frame of an exchange.
+fn silence(port: &Port, exchange: &Exchange) -> Duration {
+    match (&port.bus, exchange.talk) {
+        (Bus::Rs485(line), Talk::Frames { .. }) => line.turnaround,
+        // A master sends when the silence behind the frame before has ended it.
+        (Bus::Rs485(line), _) => line.turnaround.max(line.idle_gap),
+        _ => Duration::ZERO,
+    }
+}
+
+/// A frame and the silence before it.
+fn on_line(port: &Port, exchange: &Exchange, len: usize, id: Option<CanId>) -> Duration {
+    match (&port.bus, id) {
+        (Bus::Rs485(line), _) if len > 0 => silence(port, exchange) + line.time_on_line(len),
+        (Bus::Can { bitrate }, Some(id)) => can_frame_time(id, len, *bitrate),
+        _ => Duration::ZERO,
+    }
+}
+
+/// A request, and the time that the slaves have after one to all of them.
+fn request_on_line(port: &Port, exchange: &Exchange, len: usize, id: Option<CanId>) -> Duration {
+    let is_broadcast = matches!(exchange.talk, Talk::Rtu { .. }) && exchange.peer == BROADCAST;
+    let rest = if is_broadcast { Timing::TURNAROUND } else { Duration::ZERO };
+    on_line(port, exchange, len, id) + rest
+}
