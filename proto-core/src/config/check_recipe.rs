@@ -6,8 +6,8 @@ use super::device::field_of;
 use super::error::{ConfigErrorKind as Kind, Place, RecipeKey};
 use super::rules::{Check, check_new_name, check_pool, fail, is_marked, mark};
 use super::{
-    CanFramePart, CommandEntry, ConfigView, DeviceFrame, FieldSpec, InputBinding, MAX_COMMAND_TEXT,
-    OutputBinding, Parts, Recipe, SendOn, Span, Words, placeholders,
+    CanFramePart, CommandEntry, ConfigView, Constants, DeviceFrame, FieldSpec, InputBinding,
+    MAX_COMMAND_TEXT, OutputBinding, Parts, Recipe, SendOn, Span, Words, placeholders,
 };
 use crate::command::Request;
 use crate::device::{Boundary, Encoding, LayoutError, Overflow};
@@ -251,12 +251,15 @@ impl<'a> RecipeCheck<'a> {
     /// In a plain recipe the layout checks this.
     fn check_ids(&self, part: Direction, frames: &[CanFramePart]) -> Check {
         let recipe = self.index;
+        let constants = |frame: &CanFramePart| Constants::of(frame.fields.of(self.config.fields), part);
         for (nth, frame) in (0..).zip(frames) {
             let id = frame.id;
-            let earlier = (0..nth).zip(frames).find(|(_, earlier)| earlier.id == id);
+            let same_id = |(_, earlier): &(u8, &CanFramePart)| earlier.id == id;
+            let is_same = |(_, earlier): &(u8, &CanFramePart)| !constants(earlier).differ(&constants(frame));
+            let earlier = (0..nth).zip(frames).filter(same_id).find(is_same);
             let error = match earlier {
                 _ if !id.is_valid() => PartError::InvalidId { frame: nth, id },
-                Some((first, _)) => PartError::DuplicateId { frame: nth, first, id },
+                Some((first, _)) => PartError::NotToldApart { frame: nth, first, id },
                 None => continue,
             };
             return fail(Place::Frame { recipe, part, frame: nth }, Kind::Part(error));

@@ -144,6 +144,7 @@ impl<'c> ConfigView<'c> {
     /// recipes can describe.
     pub fn is_device(self, recipe: &Recipe) -> bool {
         recipe.exchanges.len > 0
+            || recipe.repeats_ids()
             || [Direction::Input, Direction::Output].into_iter().any(|part| {
                 recipe.stream_part(part).is_some_and(StreamPart::is_cut)
                     || self.fields_of(recipe, part).any(|(_, _, field)| field.is_device())

@@ -116,6 +116,17 @@ impl Exchange {
         Self { peer, talk, when, timeout: DEFAULT_REPLY_TIMEOUT, retries: 1, pause: Duration::ZERO }
     }
 
+    /// Its frames of a device's own that come from the device (input), a reply before a refusal, or go
+    /// to it (output).
+    pub(crate) fn frames(&self, part: Direction) -> impl Iterator<Item = u8> + use<> {
+        let frames = match (self.talk, part) {
+            (Talk::Frames { reply, refusal, .. }, Direction::Input) => [reply, refusal],
+            (Talk::Frames { request, .. }, Direction::Output) => [request, None],
+            _ => [None, None],
+        };
+        frames.into_iter().flatten()
+    }
+
     /// The fields of its frames that come from the device (input), a reply before a refusal, or go to
     /// it (output).
     pub(crate) fn fields(

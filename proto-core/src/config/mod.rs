@@ -27,6 +27,7 @@ mod port;
 mod recipe;
 mod rules;
 mod source;
+mod told_apart;
 mod validate;
 mod view;
 
@@ -53,6 +54,7 @@ pub use recipe::{
 };
 pub use rules::{check_address, check_bitrate, check_cycle, check_name};
 pub use source::{PortHealth, PortValue, StateValue, StateValueError};
+pub use told_apart::Constants;
 pub(crate) use view::ConfigMut;
 pub use view::ConfigView;
 

@@ -103,6 +103,29 @@ pub(super) fn probe(format: &DeviceFormat, bindings: &[InputBind], bytes: &[u8])
     format.layout.probe(elements(format.bindings.of(bindings)), bytes)
 }
 
+/// The frame that CAN data with this id are, or why they are none: frames with one id differ in
+/// constants.
+pub(super) fn judge_can<'f, T>(
+    formats: impl Iterator<Item = (T, &'f DeviceFormat)>,
+    bindings: &[InputBind],
+    frame: &CanFrame,
+) -> Result<(T, &'f DeviceFormat), Rejection> {
+    let mut why = Rejection::ForeignId;
+    for (what, format) in formats.filter(|(_, format)| format.id == frame.id()) {
+        let fields = elements(format.bindings.of(bindings));
+        let probe = format.layout.probe_whole(fields, frame.data());
+        why = match (probe, why) {
+            (Probe::Frame(_), _) => return Ok((what, format)),
+            // Right but for a constant: another one than this, whatever the others are.
+            (Probe::Other(_), _) | (_, Rejection::OtherDevice) => Rejection::OtherDevice,
+            (Probe::Wrong(_), _) | (_, Rejection::Checksum) => Rejection::Checksum,
+            (Probe::No(_), _) if frame.data().len() == format.layout.lengths().0 => Rejection::OtherDevice,
+            _ => Rejection::WrongLength,
+        };
+    }
+    Err(why)
+}
+
 pub(super) fn elements(bindings: &[InputBind]) -> impl Iterator<Item = Element> {
     bindings.iter().map(InputBind::element)
 }
@@ -260,19 +283,10 @@ impl FieldPort {
         if frame.is_remote() {
             frames.rejected(Rejection::Remote)?;
         }
-        let formats = (0..).zip(device.input());
-        let Some((nth, format)) = formats.into_iter().find(|(_, format)| format.id == frame.id()) else {
-            return frames.rejected(Rejection::ForeignId);
+        let (nth, format) = match judge_can((0..).zip(device.input()), bindings, frame) {
+            Ok(found) => found,
+            Err(why) => return frames.rejected(why),
         };
-        let fields = elements(format.bindings.of(bindings));
-        match format.layout.probe_whole(fields, frame.data()) {
-            Probe::Frame(_) => {}
-            Probe::Wrong(_) => frames.rejected(Rejection::Checksum)?,
-            Probe::Other(_) | Probe::No(_) if frame.data().len() == format.layout.lengths().0 => {
-                frames.rejected(Rejection::OtherDevice)?;
-            }
-            _ => frames.rejected(Rejection::WrongLength)?,
-        }
         let slot = usize::from(self.first_frame).saturating_add(nth);
         frames.take_device(format, &device.texts, frame.data(), slot, accepted)?;
         self.sender.frames_accepted(1, usable, &mut self.counters, now);

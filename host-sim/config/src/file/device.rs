@@ -3,7 +3,7 @@
 //! In: the tables of a part and of its fields. Out: [`FileField`]s, and frames that were laid out.
 //! The controller's own recipes have none of these keys, and are refused them with the reason.
 
-use proto_core::config::{DeviceFrame, FieldSpec};
+use proto_core::config::{Constants, DeviceFrame, FieldSpec};
 use proto_core::device::{
     Algorithm, Boundary, ByteOrder, Carrier, Checksum, Crc, Element, Encoding, LayoutError, Overflow,
     TextWidth,
@@ -411,9 +411,11 @@ impl FilePart {
             if let Err(error) = self.lay_out(frame, carrier, part) {
                 return Err(self.spot_of_layout(frame, error).error(document.document, error));
             }
-            let earlier = (0..nth).zip(&self.frames).find(|(_, earlier)| earlier.id == frame.id);
+            let same_id = |(_, earlier): &(u8, &FileFrame)| earlier.id == frame.id;
+            let is_same = |(_, earlier): &(u8, &FileFrame)| !earlier.differs(frame, part);
+            let earlier = (0..nth).zip(&self.frames).filter(same_id).find(is_same);
             if let Some((first, _)) = earlier {
-                return refused(PartError::DuplicateId { frame: nth, first, id: frame.id });
+                return refused(PartError::NotToldApart { frame: nth, first, id: frame.id });
             }
         }
         Ok(())
@@ -449,13 +451,38 @@ impl FilePart {
     }
 }
 
+impl FileFrame {
+    /// Whether a constant tells it from `other`, which has the same id.
+    fn differs(&self, other: &Self, part: Direction) -> bool {
+        let constants = |frame: &Self| {
+            let specs: Vec<_> = frame.fields.iter().map(FileField::spec).collect();
+            Constants::of(&specs, part)
+        };
+        constants(self).differ(&constants(other))
+    }
+}
+
 impl FileRecipe {
+    /// Whether frames of a part have one id.
+    fn repeats_ids(&self) -> bool {
+        let repeats = |part: &FilePart| {
+            let ids = || part.frames.iter().map(|frame| frame.id);
+            ids().enumerate().any(|(nth, id)| ids().take(nth).any(|before| before == id))
+        };
+        self.is_can()
+            && self.mode == Mode::User
+            && [&self.input, &self.output].into_iter().flatten().any(repeats)
+    }
+
     /// Whether it has frames that no recipe of the controller has.
     pub(super) fn is_device(&self) -> bool {
         let parts = [&self.input, &self.output].into_iter().flatten();
         let mut fields = parts.flat_map(|part| &part.frames).flat_map(|frame| &frame.fields);
         let is_cut = [&self.input, &self.output].into_iter().flatten().any(FilePart::is_cut);
-        !self.exchanges.is_empty() || is_cut || fields.any(|field| field.spec().is_device())
+        !self.exchanges.is_empty()
+            || is_cut
+            || self.repeats_ids()
+            || fields.any(|field| field.spec().is_device())
     }
 
     /// What carries the frames of a part.

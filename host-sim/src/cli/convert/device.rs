@@ -44,12 +44,18 @@ struct Value {
     elements: Vec<usize>,
     /// What is sent if nothing else is asked for.
     constant: Option<f64>,
+    /// The constant tells the frame from others with the same id, so there is nothing else.
+    is_fixed: bool,
 }
 
 impl DevicePart {
     pub(in super::super) fn new(recipe: &DeviceRecipe, direction: Direction) -> Result<Self, String> {
-        let format = |named: &NamedFrame| Format::new(named, recipe.carrier, direction);
-        let formats = recipe.part(direction).iter().map(format).collect::<Result<_, _>>()?;
+        let part = recipe.part(direction);
+        let format = |named: &NamedFrame| {
+            let same_id = part.iter().filter(|other| other.id.is_some() && other.id == named.id).count();
+            Format::new(named, recipe.carrier, direction, same_id > 1)
+        };
+        let formats = part.iter().map(format).collect::<Result<_, _>>()?;
         Ok(Self { direction, formats })
     }
 
@@ -70,7 +76,7 @@ impl DevicePart {
             _ => Direction::Input,
         };
         let carrier = if named.id.is_some() { Carrier::Can } else { Carrier::Stream };
-        let format = Format::new(named, carrier, direction)?;
+        let format = Format::new(named, carrier, direction, false)?;
         Ok(Self { direction, formats: vec![format] })
     }
 
@@ -84,9 +90,19 @@ impl DevicePart {
         self.formats.iter().map(|format| format.id)
     }
 
-    /// The bytes of the frame with this index, from values in field order or by name.
+    /// The bytes of the frame with this index, from values in field order or by name; or of another one
+    /// with the same id, if only that can have these values.
     pub(super) fn encode(&self, index: usize, tokens: &[String]) -> Result<Vec<u8>, String> {
-        self.formats.get(index).ok_or("no such frame")?.encode(tokens)
+        let format = self.formats.get(index).ok_or("no such frame")?;
+        let others = self.formats.iter().filter(|other| other.id == format.id);
+        let encoded: Vec<_> = others.map(|format| format.encode(tokens)).collect();
+        if encoded.iter().filter(|result| result.is_ok()).count() > 1 {
+            return Err("several frames with this id can have these values; say which constants it has, by \
+                        name"
+                .into());
+        }
+        let first = encoded.first().cloned();
+        encoded.into_iter().find(Result::is_ok).or(first).unwrap_or(Err("no such frame".into()))
     }
 
     /// Writes the values of every frame in a stream, and returns the number of frames.
@@ -148,9 +164,11 @@ impl DevicePart {
         notes: &mut dyn std::io::Write,
     ) -> Result<String, String> {
         let id = text::show_id(frame.id());
-        let format = self.formats.iter().find(|format| format.id == Some(frame.id()));
-        let format = format.ok_or_else(|| format!("id {id} is not in the recipe"))?;
         let data = frame.data();
+        let formats = || self.formats.iter().filter(|format| format.id == Some(frame.id()));
+        let fits = |format: &&Format| format.probe(data) == Probe::Frame(data.len());
+        let format = formats().find(fits).or_else(|| formats().next());
+        let format = format.ok_or_else(|| format!("id {id} is not in the recipe"))?;
         match format.probe(data) {
             Probe::Frame(len) if len == data.len() => {
                 let values = format.show(data).map_err(|why| format!("id {id}: {why}"))?;
@@ -181,20 +199,23 @@ impl DevicePart {
 }
 
 /// The fields with a value, each once.
-fn values_of(named: &NamedFrame) -> Vec<Value> {
+fn values_of(named: &NamedFrame, is_multiplexed: bool) -> Vec<Value> {
     let mut values: Vec<Value> = Vec::new();
     let elements = named.fields.iter().filter_map(|field| Some((field, field.spec.element()?)));
     for (nth, (field, element)) in elements.enumerate() {
         let constant = match field.spec {
             FieldSpec::UserOutput { from: OutputBinding::Constant(value), .. }
             | FieldSpec::DeviceOutput { from: OutputBinding::Constant(value), .. } => Some(value),
+            FieldSpec::Fixed { value, .. } if is_multiplexed && !field.name.is_empty() => Some(value as f64),
             FieldSpec::Fixed { .. } | FieldSpec::Padding { .. } | FieldSpec::Length(_) => continue,
             _ => None,
         };
         match (values.last_mut(), element.encoding()) {
             (Some(before), _) if field.repeats => before.elements.push(nth),
             (_, Some(encoding)) => {
-                values.push(Value { name: field.name.clone(), encoding, elements: vec![nth], constant });
+                let is_fixed = is_multiplexed && constant.is_some();
+                let name = field.name.clone();
+                values.push(Value { name, encoding, elements: vec![nth], constant, is_fixed });
             }
             (_, None) => {}
         }
@@ -203,11 +224,16 @@ fn values_of(named: &NamedFrame) -> Vec<Value> {
 }
 
 impl Format {
-    fn new(named: &NamedFrame, carrier: Carrier, direction: Direction) -> Result<Self, String> {
+    fn new(
+        named: &NamedFrame,
+        carrier: Carrier,
+        direction: Direction,
+        is_multiplexed: bool,
+    ) -> Result<Self, String> {
         // Cannot fail for the frames of files: reading the file laid them out.
         let frame = named.lay_out(carrier, direction).map_err(|error| error.to_string())?;
         let has_coil = named.fields.iter().any(|field| field.is_coil);
-        Ok(Self { id: named.id, frame, values: values_of(named), has_coil })
+        Ok(Self { id: named.id, frame, values: values_of(named, is_multiplexed), has_coil })
     }
 
     /// Makes the coil of Modbus function 5 what it is on the line: FF for 1.
@@ -236,6 +262,8 @@ impl Format {
             match scalar {
                 Some(Ok(Some(scalar))) => Ok(*scalar),
                 Some(Err(error)) => Err(format!("{}: {error}", value.name)),
+                // The probe has compared it.
+                Some(Ok(None)) if value.is_fixed => Ok(Scalar::Double(value.constant.unwrap_or(f64::NAN))),
                 _ => Err(format!("{}: no value", value.name)),
             }
         };
@@ -314,8 +342,11 @@ impl Format {
                 }
             })?;
             let value = &self.values[place];
-            numbers[place] =
-                Some(parse(&value.encoding, shown).map_err(|error| format!("{}: {error}", value.name))?);
+            let number = parse(&value.encoding, shown).map_err(|error| format!("{}: {error}", value.name))?;
+            if value.is_fixed && value.constant != Some(number) {
+                return Err(format!("{}: this frame has another constant", value.name));
+            }
+            numbers[place] = Some(number);
         }
         let all = self.values.iter().zip(&numbers).map(|(value, number)| number.or(value.constant));
         let missing: Vec<_> =
