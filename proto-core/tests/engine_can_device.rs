@@ -4,7 +4,7 @@ mod rig;
 
 use proto_core::config::*;
 use proto_core::device::{Algorithm, Checksum, Encoding, Overflow};
-use proto_core::engine::PortId;
+use proto_core::engine::{PortId, Rejection};
 use proto_core::recipe::PartError;
 use proto_core::recipe::model::Mode;
 use proto_core::sysvar::Direction;
@@ -227,4 +227,112 @@ fn a_port_hears_the_ids_of_its_exchanges() {
     assert_eq!(refused(&unasked), (1, ExchangeKey::Reply, kind(0x581)));
     unasked.0.frames[usize::from(heartbeat.unwrap())].id = Some(CanId::Standard(0x181));
     assert_eq!(refused(&unasked), (1, ExchangeKey::Reply, kind(0x181)));
+}
+
+/// A sensor that counts its frames from 0 to 14, with a value that is 0 when it is silent.
+fn counting(cell: &mut Cell) -> PortId {
+    let counter = InputBinding::Counter { max: 14 };
+    let port =
+        bus(cell, [&[(0x50, vec![input(T::Byte, counter), input(T::Byte, to("WordInputReg[1]"))])], &[]]);
+    let safe = SafeValue { var: var("WordInputReg[1]"), value: Scalar::Word(0) };
+    cell.0.safe_values.push(safe).unwrap();
+    let config = &mut cell.0.ports[usize::from(port.0)];
+    (config.on_timeout, config.timeout) = (Span { start: 0, len: 1 }, Duration::from_millis(100));
+    port
+}
+
+#[test]
+fn a_frozen_device_falls_silent_although_its_frames_come() {
+    let mut cell = Cell::new();
+    let port = counting(&mut cell);
+    let mut rig = cell.rig();
+    for count in 0..40_u8 {
+        rig.run(MS(10));
+        rig.can(port, 0x50, &[count % 15, 7]);
+    }
+    rig.run(MS(10));
+    let counters = rig.counters(port);
+    assert_eq!((counters.frames_in, counters.rejected_counter, counters.counter_jumps), (40, 0, 0));
+    assert_eq!(rig.map.registers[8], 7);
+    for _ in 0..30 {
+        rig.run(MS(10));
+        rig.can(port, 0x50, &[39 % 15, 7]);
+    }
+    let counters = rig.counters(port);
+    assert_eq!((counters.frames_in, counters.rejected_counter, counters.timeouts), (40, 30, 1));
+    assert_eq!(rig.map.registers[8], 0, "its safe value");
+    let now = rig.now;
+    let last = rig.engine.status(now).ports().next().unwrap().last_rejection.unwrap();
+    assert_eq!(last.why, Rejection::Repeated);
+    // It lives again.
+    rig.can(port, 0x50, &[10, 8]);
+    rig.run(MS(10));
+    assert_eq!(rig.map.registers[8], 8);
+}
+
+#[test]
+fn frames_that_are_missing_are_counted_and_a_rejected_frame_moves_no_counter() {
+    let mut cell = Cell::new();
+    let port = counting(&mut cell);
+    let mut rig = cell.rig();
+    rig.run(MS(10));
+    for (count, value) in [(3, 1), (5, 2), (4, 3), (4, 4), (15, 5), (5, 6)] {
+        rig.can(port, 0x50, &[count, value]);
+    }
+    let counters = rig.counters(port);
+    let rejected = (counters.rejected_counter, counters.rejected_out_of_range);
+    assert_eq!((counters.frames_in, counters.counter_jumps, rejected), (4, 2, (1, 1)));
+    rig.run(MS(10));
+    assert_eq!(rig.map.registers[8], 6);
+}
+
+#[test]
+fn counters_of_multiplexed_frames_are_their_own_and_checked_only_in_frames_that_are_right() {
+    let mut cell = Cell::new();
+    let sum = FieldSpec::Checksum(Checksum::standard(Algorithm::named("xor8").unwrap()));
+    let counter = || input(T::Byte, InputBinding::Counter { max: 255 });
+    let frame = |mux, name| (0x60, vec![fixed(mux), counter(), input(T::Byte, to(name)), sum]);
+    let frames = [frame(1, "WordInputReg[1]"), frame(2, "WordInputReg[2]")];
+    let port = bus(&mut cell, [&frames, &[]]);
+    let mut rig = cell.rig();
+    rig.run(MS(10));
+    let mut send = |mux: u8, count: u8, value: u8, wrong: u8| {
+        rig.can(port, 0x60, &[mux, count, value, mux ^ count ^ value ^ wrong]);
+        let counters = rig.counters(port);
+        (counters.frames_in, counters.rejected_counter, counters.rejected_checksum, counters.counter_jumps)
+    };
+    assert_eq!(send(1, 254, 1, 0), (1, 0, 0, 0));
+    assert_eq!(send(2, 7, 1, 0), (2, 0, 0, 0));
+    assert_eq!(send(1, 255, 1, 9), (2, 0, 1, 0));
+    assert_eq!(send(1, 255, 1, 0), (3, 0, 1, 0));
+    assert_eq!(send(1, 0, 1, 0), (4, 0, 1, 0));
+    assert_eq!(send(2, 7, 1, 0), (4, 1, 1, 0));
+}
+
+#[test]
+fn a_sent_counter_goes_from_its_highest_number_to_zero() {
+    let mut cell = Cell::new();
+    let counter = FieldSpec::UserOutput { ty: T::Byte, from: OutputBinding::CounterTo { max: 14 } };
+    let port = bus(&mut cell, [&[], &[(0x70, vec![counter, fixed(1)])]]);
+    let mut rig = cell.rig();
+    rig.run(MS(400));
+    let sent: Vec<_> = rig.can_sent_to(port).iter().map(|frame| frame.data()[0]).collect();
+    assert!(sent.len() > 32, "{sent:?}");
+    assert!(sent.windows(2).all(|pair| pair[1] == (pair[0] + 1) % 15), "{sent:?}");
+}
+
+#[test]
+fn a_counter_needs_unsigned_integers() {
+    let refused = |ty, max| {
+        let mut cell = Cell::new();
+        bus(&mut cell, [&[(5, vec![input(ty, InputBinding::Counter { max })])], &[]]);
+        cell.0.validate().err().map(|error| error.kind)
+    };
+    assert_eq!(refused(T::Byte, 255), None);
+    assert_eq!(refused(T::Dword, u32::MAX), None);
+    assert_eq!(refused(T::Byte, 256), Some(ConfigErrorKind::Counter { max: 256, high: 255.0 }));
+    assert_eq!(refused(T::Byte, 0), Some(ConfigErrorKind::Counter { max: 0, high: 255.0 }));
+    for ty in [T::Char, T::Float, T::Int] {
+        assert_eq!(refused(ty, 14), Some(ConfigErrorKind::Counter { max: 14, high: -1.0 }), "{ty:?}");
+    }
 }

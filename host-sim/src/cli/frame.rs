@@ -184,6 +184,7 @@ fn show_use(spec: &FieldSpec) -> String {
         (FieldSpec::UserOutput { from, .. } | FieldSpec::DeviceOutput { from, .. }, None) => match from {
             OutputBinding::Constant(value) => format!(" = {value}"),
             OutputBinding::Counter => " <- counter".into(),
+            OutputBinding::CounterTo { max } => format!(" <- counter, 0..{max}"),
             OutputBinding::Reply => " <- reply".into(),
             OutputBinding::State { value, .. } => format!(" <- {value}"),
             OutputBinding::Port { value, .. } => format!(" <- {} of the port", value.name()),

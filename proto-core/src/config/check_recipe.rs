@@ -129,6 +129,7 @@ impl<'a> RecipeCheck<'a> {
     fn check_input(&self, place: Place, numbers: Numbers, to: InputBinding) -> Check {
         match to {
             InputBinding::Unused => Ok(()),
+            InputBinding::Counter { max } => check_counter(place, numbers, max),
             InputBinding::Variable { var, scale, offset } => {
                 if var.direction() != Direction::Input {
                     return fail(place, Kind::NotAnInput { var });
@@ -333,6 +334,14 @@ impl Numbers {
     }
 }
 
+/// An alive counter is an unsigned integer.
+fn check_counter(place: Place, numbers: Numbers, max: u32) -> Check {
+    let is_unsigned = numbers.integers && numbers.low == 0.0;
+    let high = if is_unsigned { numbers.high.min(f64::from(u32::MAX)) } else { -1.0 };
+    let is_in_range = max > 0 && f64::from(max) <= high;
+    if is_in_range { Ok(()) } else { fail(place, Kind::Counter { max, high }) }
+}
+
 fn check_device_output(place: Place, encoding: &Encoding, from: OutputBinding) -> Check {
     let (low, high) = encoding.range();
     match from {
@@ -345,6 +354,7 @@ fn check_device_output(place: Place, encoding: &Encoding, from: OutputBinding) -
             if is_whole { Ok(()) } else { fail(place, Kind::NeedsIntegers) }
         }
         OutputBinding::Counter if !encoding.is_integer() => fail(place, Kind::NeedsIntegers),
+        OutputBinding::CounterTo { max } => check_counter(place, Numbers::written(encoding), max),
         OutputBinding::Port { value, .. } if value.is_count() && !encoding.is_integer() => {
             fail(place, Kind::NeedsIntegers)
         }
@@ -403,6 +413,7 @@ fn check_output(place: Place, ty: ScalarType, from: OutputBinding) -> Check {
             Ok(_) => Ok(()),
             Err(error) => fail(place, Kind::Constant(error)),
         },
+        OutputBinding::CounterTo { max } => check_counter(place, Numbers::of(ty), max),
         OutputBinding::Counter if matches!(ty, ScalarType::Float | ScalarType::Double) => {
             fail(place, Kind::NeedsInteger { ty })
         }

@@ -4,7 +4,7 @@
 
 use heapless::Vec;
 
-use super::{FieldSpec, Parts, Recipe, StreamPart};
+use super::{FieldSpec, InputBinding, Parts, Recipe, StreamPart};
 use crate::config::ConfigView;
 use crate::device::{Carrier, Checksum, Element, Encoding, FrameLayout, LayoutError};
 use crate::recipe::model::MAX_FIELDS;
@@ -68,6 +68,7 @@ impl FieldSpec {
     /// Whether the controller's own recipes have no such field: only frames of devices have it.
     pub const fn is_device(&self) -> bool {
         match self {
+            Self::UserInput { to: InputBinding::Counter { .. }, .. } => true,
             Self::System(_) | Self::UserInput { .. } | Self::UserOutput { .. } => false,
             Self::DeviceInput { .. }
             | Self::DeviceOutput { .. }

@@ -269,7 +269,7 @@ impl FieldSpec {
             Self::System(var) => Some(var),
             Self::UserInput { to, .. } | Self::DeviceInput { to, .. } => match to {
                 InputBinding::Variable { var, .. } => Some(var),
-                InputBinding::Unused | InputBinding::Commands { .. } => None,
+                InputBinding::Unused | InputBinding::Commands { .. } | InputBinding::Counter { .. } => None,
             },
             Self::UserOutput { from, .. } | Self::DeviceOutput { from, .. } => match from {
                 OutputBinding::Variable { var, .. } => Some(var),
@@ -312,6 +312,12 @@ pub enum InputBinding {
         table: Span,
         /// When a value takes effect.
         when: CommandWhen,
+    },
+    /// It goes up by one with every frame, and from `max` to 0: a frame with the number of the one
+    /// before is a repeat, and not taken. Only in frames of devices.
+    Counter {
+        /// The highest number.
+        max: u32,
     },
 }
 
@@ -370,6 +376,11 @@ pub enum OutputBinding {
         scale: f32,
         /// Offset, added after scaling.
         offset: f32,
+    },
+    /// Frames sent so far; `max` is followed by 0.
+    CounterTo {
+        /// The highest number.
+        max: u32,
     },
 }
 

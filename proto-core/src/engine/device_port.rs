@@ -367,19 +367,24 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
             match value {
                 Err(_) => self.rejected(Rejection::Unreadable)?,
                 Ok(Some(value)) if !value.is_finite() => self.rejected(Rejection::NotFinite)?,
-                Ok(Some(value)) if !fits(binding, value) => self.rejected(Rejection::OutOfRange)?,
-                Ok(_) => {}
+                Ok(Some(value)) => self.fits(binding, value).or_else(|why| self.rejected(why))?,
+                Ok(None) => {}
             }
         }
         self.texts_fit(texts, format, frame).or_else(|why| self.rejected(why))?;
         for (binding, value) in values() {
             let Ok(Some(value)) = value else { continue };
-            match bound(binding, value) {
-                Some((var, value)) => {
+            match (bound(binding, value), binding.to) {
+                (Some((var, value)), _) => {
                     // It fits: all values were tried before the first was applied.
                     let _ = self.store.image.set(var, value);
                 }
-                None => self.apply_user(&binding.to, value),
+                (None, InputTo::Counter(nth)) => {
+                    if self.store.counts.take(nth, value) {
+                        bump(&mut self.counters.counter_jumps);
+                    }
+                }
+                (None, _) => self.apply_user(&binding.to, value),
             }
         }
         self.take_texts(texts, format, frame);
@@ -390,6 +395,15 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
         accepted.frames = accepted.frames.wrapping_add(1);
         accepted.set = self.store.accepted(slot, self.counters);
         Ok(())
+    }
+
+    /// Whether a value may be taken for its binding.
+    fn fits(&self, binding: &InputBind, value: Scalar) -> Result<(), Rejection> {
+        match binding.to {
+            InputTo::Variable { .. } if bound(binding, value).is_none() => Err(Rejection::OutOfRange),
+            InputTo::Counter(nth) => self.store.counts.check(nth, value),
+            _ => Ok(()),
+        }
     }
 }
 
@@ -403,8 +417,4 @@ fn bound(binding: &InputBind, value: Scalar) -> Option<(SysVar, Scalar)> {
     let number = value.as_f64() * f64::from(scale) + f64::from(offset);
     let number = Encoding::scalar(var.ty()).fit(number, Overflow::Wrap)?;
     bind_to_variable(var, Scalar::Double(number), 1.0, 0.0).map(|value| (var, value))
-}
-
-fn fits(binding: &InputBind, value: Scalar) -> bool {
-    !matches!(binding.to, InputTo::Variable { .. }) || bound(binding, value).is_some()
 }

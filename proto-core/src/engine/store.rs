@@ -4,6 +4,7 @@
 use heapless::Vec;
 
 use super::counters::{PortCounters, bump};
+use super::counts::Counts;
 use super::latency::Latency;
 use super::outbox::{EdgeQueue, Outbox};
 use crate::config::{SafeValue, Span};
@@ -65,6 +66,7 @@ impl SafeBytes {
 #[derive(Debug, Clone)]
 pub(super) struct Store<const PORTS: usize> {
     pub latency: Latency,
+    pub counts: Counts,
     /// The instant of this call of the engine.
     pub now: Instant,
     /// Some port sends on a rising bit, or shows the health of ports when it is asked, so the engine
@@ -116,6 +118,7 @@ impl<const PORTS: usize> Store<PORTS> {
             now: Instant::ZERO,
             watches_bits: false,
             latency: Latency::new(),
+            counts: Counts::new(),
             image: Image::new(),
             outbox: Outbox::new(),
             edges: Vec::new(),

@@ -5,7 +5,7 @@
 
 use std::ops::Range;
 
-use proto_core::config::{FieldSpec, GatewayConfig, Parts};
+use proto_core::config::{FieldSpec, GatewayConfig, InputBinding, OutputBinding, Parts};
 use proto_core::device::{Algorithm, Boundary, ByteOrder, Checksum, Crc, Encoding, Kind, Overflow, Width};
 use proto_core::wire::scalar::ScalarType;
 
@@ -153,7 +153,27 @@ pub(crate) fn unmodelled(config: &GatewayConfig) -> Option<&'static str> {
             .any(|part| part.framing != Boundary::Fields || part.escape.is_some()),
         Parts::Can { .. } => false,
     });
-    (varies || is_cut).then_some("a soak cannot judge texts and frames of varying length")
+    let counts = config.fields.iter().any(|field| {
+        let counts_input = match field {
+            FieldSpec::UserInput { to, .. } | FieldSpec::DeviceInput { to, .. } => {
+                matches!(to, InputBinding::Counter { .. })
+            }
+            _ => false,
+        };
+        counts_input || matches!(field.source(), Some(OutputBinding::CounterTo { .. }))
+    });
+    let view = config.view();
+    let has_one_id = view.recipes.iter().any(|recipe| match &recipe.parts {
+        Parts::Can { input, output } => [input, output].into_iter().any(|frames| {
+            frames.iter().enumerate().any(|(nth, frame)| frames[..nth].iter().any(|it| it.id == frame.id))
+        }),
+        Parts::Stream { .. } => false,
+    });
+    match (varies || is_cut, counts || has_one_id) {
+        (true, _) => Some("a soak cannot judge texts and frames of varying length"),
+        (_, true) => Some("a soak cannot judge counters that are checked, and CAN frames with one id"),
+        _ => None,
+    }
 }
 
 /// Number of bytes of a field. Fields of varying length are refused before a run.

@@ -207,7 +207,8 @@ fn judge_device(frame: &Frame, nth: usize, whole: &[u8]) -> Verdict {
             InputBinding::Commands { table, when } => {
                 accepted.commands.push((at, table, when, number as i64));
             }
-            InputBinding::Unused => {}
+            // A configuration with counters is not judged.
+            InputBinding::Unused | InputBinding::Counter { .. } => {}
         }
     }
     Verdict::Accepted(accepted)

@@ -1,6 +1,7 @@
 //! The bindings of fields and the triggers of output parts in a gateway file.
 
 use proto_core::config::{InputBinding, OnStale, OutputBinding, SendOn};
+use proto_core::device::Encoding;
 use proto_core::sysvar::SysVar;
 
 use super::commands::{self, FileCommands};
@@ -11,8 +12,16 @@ use super::sources;
 /// The binding of an input field.
 pub(super) enum FileInput {
     Unused,
-    Variable { var: SysVar, scale: f32, offset: f32 },
+    Variable {
+        var: SysVar,
+        scale: f32,
+        offset: f32,
+    },
     Commands(FileCommands),
+    /// An alive counter, which goes from this number to 0.
+    Counter {
+        max: u32,
+    },
 }
 
 impl FileInput {
@@ -20,6 +29,7 @@ impl FileInput {
     pub(super) fn without_commands(&self) -> InputBinding {
         match *self {
             Self::Variable { var, scale, offset } => InputBinding::Variable { var, scale, offset },
+            Self::Counter { max } => InputBinding::Counter { max },
             Self::Unused | Self::Commands(_) => InputBinding::Unused,
         }
     }
@@ -109,6 +119,24 @@ pub(super) fn read_input(field: &Reader<'_>) -> Result<(FileInput, Option<FileIn
         (None, Some(commands)) => (commands, None),
         (None, None) => (FileInput::Unused, None),
     })
+}
+
+/// `counter = true` or `counter = { max = 14 }`: the number behind which the counter is 0 again.
+pub(super) fn read_counter(field: &Reader<'_>, encoding: &Encoding) -> Result<Option<u32>> {
+    let Some(item) = field.optional("counter") else { return Ok(None) };
+    let (low, high) = encoding.range();
+    if !encoding.is_integer() || low != 0.0 {
+        return Err(item.error("a counter needs a field that has unsigned integers only"));
+    }
+    let high = high.min(f64::from(u32::MAX)) as u32;
+    if !item.is_table() {
+        return match item.bool()? {
+            true => Ok(Some(high)),
+            false => Ok(None),
+        };
+    }
+    let max = item.table(&["max"])?.required("max", "the highest number of the counter")?;
+    max.integer(1..=i64::from(high)).map(Some)
 }
 
 pub(super) fn read_output(field: &Reader<'_>) -> Result<FileOutput> {

@@ -3,7 +3,7 @@
 //! In: the tables of a part and of its fields. Out: [`FileField`]s, and frames that were laid out.
 //! The controller's own recipes have none of these keys, and are refused them with the reason.
 
-use proto_core::config::{Constants, DeviceFrame, FieldSpec};
+use proto_core::config::{Constants, DeviceFrame, FieldSpec, OutputBinding};
 use proto_core::device::{
     Algorithm, Boundary, ByteOrder, Carrier, Checksum, Crc, Element, Encoding, LayoutError, Overflow,
     TextWidth,
@@ -13,7 +13,7 @@ use proto_core::recipe::model::{MAX_CAN_IDS, MAX_DELIMITER, MAX_STREAM_FRAME, Mo
 use proto_core::sysvar::Direction;
 use proto_core::wire::scalar::ScalarType;
 
-use super::bindings::{self, FileInput};
+use super::bindings::{self, FileInput, FileOutput};
 use super::encoding::{self, OpenNumber, Order, refuse};
 use super::exchanges::FileExchange;
 use super::framings;
@@ -27,7 +27,7 @@ const FRAME_KEYS: [&str; 3] = ["endian", "word_order", "checksum"];
 /// The keys of a stream part.
 const STREAM_KEYS: [&str; 5] = ["endian", "word_order", "checksum", "framing", "escape"];
 /// The keys of a field or what stands in its place, beside those that say how it is written.
-const FIELD_KEYS: [&str; 5] = ["equals", "overflow", "pad", "fill", "text"];
+const FIELD_KEYS: [&str; 6] = ["equals", "overflow", "counter", "pad", "fill", "text"];
 
 /// Why recipes of this kind have no frames of devices; `None` if they may.
 fn why_plain(mode: Mode, flavour: Flavour) -> Option<&'static str> {
@@ -197,17 +197,17 @@ pub(super) fn binding_keys(table: &Reader<'_>, direction: Direction) -> Result<&
     match direction {
         Direction::Input => {
             refuse(table, &["value"], "an input field has equals = 9 for a constant")?;
-            Ok(&["to", "commands", "when", "base", "idle", "scale", "offset", "equals"])
+            Ok(&["to", "commands", "when", "base", "idle", "scale", "offset", "equals", "counter"])
         }
         Direction::Output => {
             refuse(table, &["equals"], "an output field has value = 9 for a constant")?;
-            Ok(&["from", "value", "scale", "offset"])
+            Ok(&["from", "value", "scale", "offset", "counter"])
         }
     }
 }
 
 fn refuse_bindings(table: &Reader<'_>) -> Result<()> {
-    let bindings = ["to", "commands", "when", "base", "idle", "scale", "offset", "overflow"];
+    let bindings = ["to", "commands", "when", "base", "idle", "scale", "offset", "overflow", "counter"];
     refuse(table, &bindings, "a field with equals is a constant and has nothing else")
 }
 
@@ -238,7 +238,14 @@ pub(super) fn bind(
     let encoding = written.encoding;
     match direction {
         Direction::Output => {
-            let from = bindings::read_output(table)?;
+            let mut from = bindings::read_output(table)?;
+            match bindings::read_counter(table, &encoding)? {
+                Some(max) if matches!(from, FileOutput::Bound(OutputBinding::Counter)) => {
+                    from = FileOutput::Bound(OutputBinding::CounterTo { max });
+                }
+                Some(_) => refuse(table, &["counter"], "allowed only together with from = \"counter\"")?,
+                None => {}
+            }
             if let Some(item) = table.optional("value").filter(|_| encoding.is_integer())
                 && item.number()?.fract() != 0.0
             {
@@ -249,11 +256,15 @@ pub(super) fn bind(
         }
         Direction::Input => {
             let (first, second) = bindings::read_input(table)?;
-            push(FileFieldKind::UserInput { name: name.clone(), written, to: first, again: false });
-            if let Some(to) = second {
-                let encoding = Encoding { shared: true, ..encoding };
-                let written = Written { encoding, overflow: Overflow::Usual };
-                push(FileFieldKind::UserInput { name, written, to, again: true });
+            let counter = bindings::read_counter(table, &encoding)?.map(|max| FileInput::Counter { max });
+            let is_used = counter.is_none() || !matches!(first, FileInput::Unused);
+            let uses = [Some(first).filter(|_| is_used), counter, second];
+            for (nth, to) in uses.into_iter().flatten().enumerate() {
+                let again = nth > 0;
+                let shared =
+                    Written { encoding: Encoding { shared: true, ..encoding }, overflow: Overflow::Usual };
+                let written = if again { shared } else { written };
+                push(FileFieldKind::UserInput { name: name.clone(), written, to, again });
             }
         }
     }
