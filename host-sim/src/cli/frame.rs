@@ -163,7 +163,9 @@ fn show_encoding(encoding: &Encoding) -> String {
             format!("decimal, {}, {decimals} decimals", width(digits))
         }
         Kind::Bits(Bits { bytes, first, count, signed }) => {
-            let number = ["", "byte", "word", "", "dword"].get(usize::from(bytes)).copied().unwrap_or("");
+            const NAMES: [&str; 9] =
+                ["", "byte", "word", "uint24", "dword", "uint40", "uint48", "uint56", "uint64"];
+            let number = NAMES.get(usize::from(bytes)).copied().unwrap_or("");
             let sign = if signed { ", signed" } else { "" };
             match count {
                 1 => format!("bit {first} of a {number}{sign}"),

@@ -32,10 +32,16 @@ fn a_counter_has_the_range_of_its_field_or_less() {
     let counter = |max| InputBinding::Counter { max };
     assert_eq!(counters(r#"{ name = "alive", type = "byte", counter = true }"#), [counter(255)]);
     assert_eq!(counters(r#"{ name = "alive", type = "byte", counter = { max = 14 } }"#), [counter(14)]);
-    assert_eq!(counters(r#"{ name = "alive", type = "byte", bits = "0..3", counter = true }"#), [counter(15)]);
+    assert_eq!(
+        counters(r#"{ name = "alive", type = "byte", bits = "0..3", counter = true }"#),
+        [counter(15)]
+    );
     assert_eq!(counters(r#"{ name = "alive", type = "byte", counter = false }"#), [InputBinding::Unused]);
     let both = counters(r#"{ name = "alive", type = "byte", counter = true, to = "WordInputReg[1]" }"#);
-    assert!(matches!(both[..], [InputBinding::Variable { .. }, InputBinding::Counter { max: 255 }]), "{both:?}");
+    assert!(
+        matches!(both[..], [InputBinding::Variable { .. }, InputBinding::Counter { max: 255 }]),
+        "{both:?}"
+    );
 }
 
 #[test]
