@@ -209,12 +209,17 @@ fn show_checksum(sum: &Checksum) -> String {
         _ => ", high byte first",
     };
     let digits = if sum.text { ", as hexadecimal digits" } else { "" };
+    let id = match (sum.data_id.bytes(), sum.data_id.is_behind()) {
+        ([], _) => String::new(),
+        (id, false) => format!(" behind the data id {}", text::hex(id)),
+        (id, true) => format!(" and the data id {}", text::hex(id)),
+    };
     let covered = match (sum.first, sum.last()) {
         (0, None) => "all bytes before it".to_owned(),
         (first, None) => format!("bytes from {first} up to it"),
         (first, Some(last)) => format!("bytes {first}..{last}"),
     };
-    format!("{algorithm}{order}{digits}, over {covered}")
+    format!("{algorithm}{order}{digits}, over {covered}{id}")
 }
 
 #[cfg(test)]

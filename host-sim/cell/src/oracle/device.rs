@@ -162,6 +162,10 @@ pub(crate) fn unmodelled(config: &GatewayConfig) -> Option<&'static str> {
         };
         counts_input || matches!(field.source(), Some(OutputBinding::CounterTo { .. }))
     });
+    let has_data_id = config
+        .fields
+        .iter()
+        .any(|field| matches!(field, FieldSpec::Checksum(sum) if !sum.data_id.bytes().is_empty()));
     let view = config.view();
     let has_one_id = view.recipes.iter().any(|recipe| match &recipe.parts {
         Parts::Can { input, output } => [input, output].into_iter().any(|frames| {
@@ -169,9 +173,11 @@ pub(crate) fn unmodelled(config: &GatewayConfig) -> Option<&'static str> {
         }),
         Parts::Stream { .. } => false,
     });
-    match (varies || is_cut, counts || has_one_id) {
+    match (varies || is_cut, counts || has_one_id || has_data_id) {
         (true, _) => Some("a soak cannot judge texts and frames of varying length"),
-        (_, true) => Some("a soak cannot judge counters that are checked, and CAN frames with one id"),
+        (_, true) => {
+            Some("a soak cannot judge counters that are checked, CAN frames with one id, and data ids")
+        }
         _ => None,
     }
 }

@@ -5,8 +5,8 @@
 
 use proto_core::config::{Constants, DeviceFrame, FieldSpec, OutputBinding};
 use proto_core::device::{
-    Algorithm, Boundary, ByteOrder, Carrier, Checksum, Crc, Element, Encoding, LayoutError, Overflow,
-    TextWidth,
+    Algorithm, Boundary, ByteOrder, Carrier, Checksum, Crc, DataId, Element, Encoding, LayoutError,
+    MAX_DATA_ID, Overflow, TextWidth,
 };
 use proto_core::recipe::PartError;
 use proto_core::recipe::model::{MAX_CAN_IDS, MAX_DELIMITER, MAX_STREAM_FRAME, Mode, Rules};
@@ -305,6 +305,7 @@ pub(super) fn read_checksum(frame: &Reader<'_>, head: usize, fields: &mut Vec<Fi
     if let Some(item) = table.optional("as") {
         sum.text = item.choice(&[("bytes", false), ("hex", true)])?;
     }
+    sum.data_id = read_data_id(&table)?;
     let nth = match table.optional("at") {
         Some(item) => find_place(&item, head, fields)?,
         None => fields.len(),
@@ -313,8 +314,26 @@ pub(super) fn read_checksum(frame: &Reader<'_>, head: usize, fields: &mut Vec<Fi
     Ok(())
 }
 
+/// `data_id = 0x1234`, low byte first, or a list of bytes.
+fn read_data_id(table: &Reader<'_>) -> Result<DataId> {
+    let Some(item) = table.optional("data_id") else {
+        refuse(table, &["data_id_at"], "allowed only together with data_id")?;
+        return Ok(DataId::NONE);
+    };
+    let bytes: Vec<u8> = if item.is_integer() {
+        item.integer::<u16>(0..=0xFFFF)?.to_le_bytes().to_vec()
+    } else {
+        let list = item.array("of bytes, such as [0x34, 0x12], or a number")?;
+        list.iter().map(|item| item.integer(0..=255)).collect::<Result<_>>()?
+    };
+    let id = DataId::new(&bytes).filter(|id| !id.bytes().is_empty());
+    let id = id.ok_or_else(|| item.error(format!("{} bytes; allowed: 1 to {MAX_DATA_ID}", bytes.len())))?;
+    let place = table.optional("data_id_at").map(|item| item.choice(&[("start", false), ("end", true)]));
+    Ok(if place.transpose()? == Some(true) { id.behind() } else { id })
+}
+
 fn read_algorithm(table: &Reader<'_>) -> Result<Algorithm> {
-    const PLACE: [&str; 5] = ["kind", "over", "at", "order", "as"];
+    const PLACE: [&str; 7] = ["kind", "over", "at", "order", "as", "data_id", "data_id_at"];
     let kind = table.required("kind", "the algorithm, such as \"crc16-modbus\"")?;
     let name = kind.string()?;
     if name != "crc" {

@@ -1,4 +1,4 @@
-//! Alive counters in files.
+//! Alive counters and data ids in files.
 
 use proto_core::config::{FieldSpec, InputBinding, OutputBinding};
 use recipe_config::file::{Text, parse_gateway};
@@ -66,6 +66,40 @@ fn what_is_no_counter_is_refused_at_its_place() {
             input(r#"{ type = "byte", equals = 3, counter = true }"#),
             output(r#"{ name = "count", type = "byte", value = 3, counter = { max = 14 } }"#),
             output(r#"{ name = "count", type = "float", from = "counter", counter = { max = 14 } }"#),
+        ]
+        .join("\n")
+    );
+}
+
+/// The data id of a frame's checksum: its bytes, and whether they are behind the frame's.
+fn data_id(keys: &str) -> Result<(Vec<u8>, bool), String> {
+    let toml = file(r#"{ name = "a", type = "byte" }"#, OUTPUT).replace(
+        "{ pad = 1 }]",
+        &format!("{{ pad = 1 }}]\nchecksum = {{ kind = \"crc8-gsm-a\", at = 0, over = \"1..2\", {keys} }}"),
+    );
+    let config =
+        parse_gateway(Text { name: "cell.toml", toml: &toml }, &[]).map_err(|error| error.to_string())?;
+    let sum = config.fields.iter().find_map(|field| match field {
+        FieldSpec::Checksum(sum) => Some(sum.data_id),
+        _ => None,
+    });
+    let id = sum.unwrap();
+    Ok((id.bytes().to_vec(), id.is_behind()))
+}
+
+#[test]
+fn a_checksum_may_have_a_data_id() {
+    assert_eq!(data_id(r#"data_id = 0x1234"#), Ok((vec![0x34, 0x12], false)));
+    assert_eq!(data_id(r#"data_id = [0x23, 0], data_id_at = "start""#), Ok((vec![0x23, 0], false)));
+    assert_eq!(data_id(r#"data_id = [7], data_id_at = "end""#), Ok((vec![7], true)));
+    insta::assert_snapshot!(
+        [
+            data_id(r#"data_id = 0x12345"#).unwrap_err(),
+            data_id(r#"data_id = []"#).unwrap_err(),
+            data_id(r#"data_id = [1, 2, 3, 4, 5]"#).unwrap_err(),
+            data_id(r#"data_id = "12""#).unwrap_err(),
+            data_id(r#"data_id = 1, data_id_at = "middle""#).unwrap_err(),
+            data_id(r#"data_id_at = "end""#).unwrap_err(),
         ]
         .join("\n")
     );
