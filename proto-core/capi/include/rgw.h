@@ -390,6 +390,10 @@ typedef struct rgw_port_counters {
   uint32_t skipped_cycles;
   // Cycles in which no output frame was sent because its sources were stale or unknown.
   uint32_t stale_cycles;
+  // Requests without a good reply, after all repetitions.
+  uint32_t unanswered;
+  // Requests that the device refused.
+  uint32_t refused;
   // Times an input frame became overdue.
   uint32_t timeouts;
   // Times the device was reported gone.

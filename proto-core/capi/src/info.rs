@@ -88,6 +88,10 @@ pub struct PortCounters {
     pub skipped_cycles: u32,
     /// Cycles in which no output frame was sent because its sources were stale or unknown.
     pub stale_cycles: u32,
+    /// Requests without a good reply, after all repetitions.
+    pub unanswered: u32,
+    /// Requests that the device refused.
+    pub refused: u32,
     /// Times an input frame became overdue.
     pub timeouts: u32,
     /// Times the device was reported gone.
@@ -154,7 +158,7 @@ impl From<&engine::PortCounters> for PortCounters {
                 rejected_no_input
                 tail_mismatches resync_bytes discarded_bytes asleep masked counter_jumps
                 edges_lost values_expired undelivered withheld
-                skipped_cycles stale_cycles timeouts downs bus_offs
+                skipped_cycles stale_cycles unanswered refused timeouts downs bus_offs
                 commands commands_dropped commands_unknown commands_based
         }
     }
