@@ -11,7 +11,7 @@ use proto_core::time::Instant;
 use proto_core::wire::scalar::ScalarType;
 use rig::*;
 
-type Small = Engine<2, 1, 16>;
+type Small = Engine<2, 1, 16, 0, 0>;
 
 fn can_cell() -> Cell {
     let mut cell = Cell::new();
@@ -91,8 +91,14 @@ fn after_a_refused_configuration_it_is_idle() {
 
 #[test]
 fn configurations_of_every_size_are_the_same_to_it() {
-    fn builder<const P: usize, const R: usize, const F: usize, const C: usize, const S: usize>()
-    -> ConfigBuilder<P, R, F, C, S> {
+    fn builder<
+        const P: usize,
+        const R: usize,
+        const F: usize,
+        const C: usize,
+        const S: usize,
+        const E: usize,
+    >() -> ConfigBuilder<P, R, F, C, S, E> {
         GatewayConfig::builder()
             .controller("10.0.0.2")
             .recipe(
@@ -102,7 +108,7 @@ fn configurations_of_every_size_are_the_same_to_it() {
             )
             .port(Port::rs485("panel", "panel").safe(&[("BitInputReg[1]", 3.0)]))
     }
-    let small: GatewayConfig<1, 1, 32, 0, 1> = builder().build().unwrap();
+    let small: GatewayConfig<1, 1, 32, 0, 1, 0> = builder().build().unwrap();
     let full: GatewayConfig = builder().build().unwrap();
     assert!(size_of_val(&small) < 4 * 1024, "{} bytes", size_of_val(&small));
     assert_eq!(state(&Small::new(&small).unwrap()), state(&Small::new(&full).unwrap()));

@@ -8,10 +8,10 @@ use critical_section::Mutex;
 use proto_core::config::GatewayConfig;
 
 /// One port, one recipe, 32 fields, 4 safe values.
-static CONFIG_SMALL: Mutex<Cell<GatewayConfig<1, 1, 32, 0, 4>>> =
+static CONFIG_SMALL: Mutex<Cell<GatewayConfig<1, 1, 32, 0, 4, 0>>> =
     Mutex::new(Cell::new(GatewayConfig::empty()));
 /// Two ports and a way up, a panel's commands.
-static CONFIG_MEDIUM: Mutex<Cell<GatewayConfig<3, 3, 128, 8, 16>>> =
+static CONFIG_MEDIUM: Mutex<Cell<GatewayConfig<3, 3, 128, 8, 16, 0>>> =
     Mutex::new(Cell::new(GatewayConfig::empty()));
 /// What a file can have.
 static CONFIG_FULL: Mutex<Cell<GatewayConfig>> = Mutex::new(Cell::new(GatewayConfig::empty()));

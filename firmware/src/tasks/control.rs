@@ -33,9 +33,12 @@ impl PortControl {
         }
     }
 
-    /// Sets the ids of a CAN port, before its task starts.
+    /// Sets the ids of a CAN port, before its task starts. A configuration has no more than there is
+    /// room for.
     pub(crate) fn set_ids(&mut self, ids: impl Iterator<Item = CanId>) {
-        self.ids.extend(ids);
+        for id in ids {
+            let _ = self.ids.push(id);
+        }
     }
 
     /// The ids that the recipe of a CAN port receives.

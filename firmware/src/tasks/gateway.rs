@@ -12,10 +12,11 @@ use embassy_futures::select::{Either, select};
 use embassy_futures::yield_now;
 use embassy_time::Timer;
 use heapless::Vec;
-use proto_core::config::{GatewayConfig, Parts};
+use proto_core::config::GatewayConfig;
 use proto_core::engine::{
     BuildError, Engine as AnyEngine, Health, Input, LinkId, LinkKind, OUTPUT_BUFFER, Output, PortId, Status,
 };
+use proto_core::sysvar::Direction;
 use proto_core::time::Instant;
 
 use super::control::{LinkControl, PortControl};
@@ -80,9 +81,7 @@ impl Gateway {
         self.ports.clear();
         self.ports.extend(engine.field_ports().map(|id| (id, PortControl::new())));
         for ((_, control), (.., recipe)) in self.ports.iter_mut().zip(config.view().field_ports()) {
-            if let Parts::Can { input, .. } = &recipe.parts {
-                control.set_ids(input.iter().map(|frame| frame.id));
-            }
+            control.set_ids(config.view().can_ids(recipe, Direction::Input));
         }
         self.links.clear();
         self.links.extend(engine.links().map(|link| (link.id, link.kind, LinkControl::new())));

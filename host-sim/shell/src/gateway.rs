@@ -10,6 +10,7 @@ use std::rc::Rc;
 
 use proto_core::config::{Bus, GatewayConfig, Parts, Port as PortConfig};
 use proto_core::engine::{Engine, Input, LinkId, LinkKind, OUTPUT_BUFFER, Output, PortId, Transport};
+use proto_core::sysvar::Direction;
 use proto_core::time::Instant;
 use serde_json::{Value, json};
 use tokio::net::{TcpListener, UdpSocket};
@@ -61,8 +62,9 @@ impl Gateway {
         let mut ports = Vec::new();
         for (index, port, recipe) in config.view().field_ports() {
             let mut device = open_port(port, binds).await?;
-            if let Parts::Can { input, output } = &recipe.parts {
-                device.listen_to(input.iter().chain(output).map(|frame| frame.id).collect());
+            if matches!(recipe.parts, Parts::Can { .. }) {
+                let ids = |part| config.view().can_ids(recipe, part);
+                device.listen_to(ids(Direction::Input).chain(ids(Direction::Output)).collect());
             }
             ports.push((PortId(index), device));
         }

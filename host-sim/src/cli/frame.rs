@@ -185,7 +185,9 @@ fn show_encoding(encoding: &Encoding) -> String {
             format!("decimal, {}, {decimals} decimals", width(digits))
         }
         Kind::Bits(Bits { bytes, first, count, signed }) => {
-            let number = ["", "byte", "word", "", "dword"].get(usize::from(bytes)).copied().unwrap_or("");
+            const NAMES: [&str; 9] =
+                ["", "byte", "word", "uint24", "dword", "uint40", "uint48", "uint56", "uint64"];
+            let number = NAMES.get(usize::from(bytes)).copied().unwrap_or("");
             let sign = if signed { ", signed" } else { "" };
             match count {
                 1 => format!("bit {first} of a {number}{sign}"),
@@ -210,6 +212,7 @@ fn show_use(spec: &FieldSpec) -> String {
         (FieldSpec::UserOutput { from, .. } | FieldSpec::DeviceOutput { from, .. }, None) => match from {
             OutputBinding::Constant(value) => format!(" = {value}"),
             OutputBinding::Counter => " <- counter".into(),
+            OutputBinding::CounterTo { max } => format!(" <- counter, 0..{max}"),
             OutputBinding::Reply => " <- reply".into(),
             OutputBinding::State { value, .. } => format!(" <- {value}"),
             OutputBinding::Port { value, .. } => format!(" <- {} of the port", value.name()),
@@ -232,12 +235,17 @@ fn show_checksum(sum: &Checksum) -> String {
         _ => ", high byte first",
     };
     let digits = if sum.text { ", as hexadecimal digits" } else { "" };
+    let id = match (sum.data_id.bytes(), sum.data_id.is_behind()) {
+        ([], _) => String::new(),
+        (id, false) => format!(" behind the data id {}", text::hex(id)),
+        (id, true) => format!(" and the data id {}", text::hex(id)),
+    };
     let covered = match (sum.first, sum.last()) {
         (0, None) => "all bytes before it".to_owned(),
         (first, None) => format!("bytes from {first} up to it"),
         (first, Some(last)) => format!("bytes {first}..{last}"),
     };
-    format!("{algorithm}{order}{digits}, over {covered}")
+    format!("{algorithm}{order}{digits}, over {covered}{id}")
 }
 
 #[cfg(test)]

@@ -362,6 +362,9 @@ typedef struct rgw_port_counters {
   uint32_t rejected_unreadable;
   // Frames that are right and of another device: a constant is not ours.
   uint32_t rejected_other_device;
+  // Frames rejected because their alive counter is that of the frame before: the device may be
+  // frozen.
+  uint32_t rejected_counter;
   // Frames received on a port whose recipe has no input part.
   uint32_t rejected_no_input;
   // Frames that began with the head but did not end with the tail (D19).
@@ -375,6 +378,8 @@ typedef struct rgw_port_counters {
   uint32_t asleep;
   // Accepted frames in which reserved bits were masked (D22).
   uint32_t masked;
+  // Accepted frames whose alive counter is not the next one: frames between are missing.
+  uint32_t counter_jumps;
   // Bit values replaced by newer ones because the queue of edges was full.
   uint32_t edges_lost;
   // Values dropped before they were written: older than the port's timeout, or waiting for a link

@@ -57,6 +57,9 @@ pub struct PortCounters {
     pub rejected_unreadable: u32,
     /// Frames that are right and of another device: a constant is not ours.
     pub rejected_other_device: u32,
+    /// Frames rejected because their alive counter is that of the frame before: the device may be
+    /// frozen.
+    pub rejected_counter: u32,
     /// Frames received on a port whose recipe has no input part.
     pub rejected_no_input: u32,
     /// Frames that began with the head but did not end with the tail (D19).
@@ -70,6 +73,8 @@ pub struct PortCounters {
     pub asleep: u32,
     /// Accepted frames in which reserved bits were masked (D22).
     pub masked: u32,
+    /// Accepted frames whose alive counter is not the next one: frames between are missing.
+    pub counter_jumps: u32,
     /// Bit values replaced by newer ones because the queue of edges was full.
     pub edges_lost: u32,
     /// Values dropped before they were written: older than the port's timeout, or waiting for a link
@@ -149,8 +154,9 @@ impl From<&engine::PortCounters> for PortCounters {
         copied! {
             counters: frames_in bytes_in frames_out bytes_out
                 rejected_not_finite rejected_out_of_range rejected_id rejected_length rejected_remote
-                rejected_checksum rejected_unreadable rejected_other_device rejected_no_input
-                tail_mismatches resync_bytes discarded_bytes asleep masked
+                rejected_checksum rejected_unreadable rejected_other_device rejected_counter
+                rejected_no_input
+                tail_mismatches resync_bytes discarded_bytes asleep masked counter_jumps
                 edges_lost values_expired undelivered withheld
                 skipped_cycles stale_cycles unanswered refused timeouts downs bus_offs
                 commands commands_dropped commands_unknown commands_based

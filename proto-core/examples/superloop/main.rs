@@ -20,7 +20,7 @@ use events::{PORT, SOURCES};
 use machine::say;
 
 /// One field port, one recipe link, one user-defined field in each direction.
-type Gateway = Engine<1, 1, 1>;
+type Gateway = Engine<1, 1, 1, 0, 0>;
 
 fn superloop() {
     static GATEWAY: ConstStaticCell<Gateway> = ConstStaticCell::new(Gateway::idle());

@@ -252,6 +252,7 @@ impl ConfigMut<'_> {
         field.on_wire.spec(|encoding, overflow| {
             let to = match field.does {
                 Does::Nothing => InputBinding::Unused,
+                Does::Counter { max } => InputBinding::Counter { max },
                 Does::Writes { var, scale, offset } => {
                     InputBinding::Variable { var: var.read().map_err(Kind::Variable)?, scale, offset }
                 }
@@ -372,6 +373,7 @@ fn output_spec(field: &OutputField<'_>) -> Result<FieldSpec, Kind> {
             }
             Sends::Constant(value) => OutputBinding::Constant(value),
             Sends::Counter => OutputBinding::Counter,
+            Sends::CounterTo { max } => OutputBinding::CounterTo { max },
             Sends::Reply => OutputBinding::Reply,
             Sends::State { value, scale, offset } => OutputBinding::State { value, scale, offset },
             Sends::Health { port, value, scale, offset } => {

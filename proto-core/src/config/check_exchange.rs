@@ -5,12 +5,13 @@ use core::fmt;
 use super::error::{ConfigErrorKind as Kind, ExchangeKey as Key, Place};
 use super::exchange::{Exchange, FrameSpec, Talk};
 use super::rules::{Check, MAX_TIME, check_pool, check_time, fail};
-use super::{ConfigView, DeviceFrame, FieldSpec, Parts, Recipe, Span};
+use super::{ConfigView, Constants, DeviceFrame, FieldSpec, Parts, Recipe, Span};
 use crate::device::{Carrier, LayoutError};
 use crate::modbus::rtu::{BROADCAST, CountError, MAX_ADDRESS, MAX_SLAVES, Operation};
 use crate::recipe::PartError;
-use crate::recipe::model::Mode;
+use crate::recipe::model::{MAX_CAN_IDS, Mode};
 use crate::sysvar::Direction;
+use crate::wire::can::CanId;
 
 /// The longest pause after an exchange.
 const MAX_PAUSE: crate::time::Duration = crate::time::Duration::from_secs(10);
@@ -81,6 +82,14 @@ pub enum ExchangeError {
     RemoteReply,
     /// A refusal with values for variables or commands.
     RefusalValues,
+    /// A frame with the id of another one that can come at the same time, and no constant that tells
+    /// them apart.
+    NotToldApart {
+        /// Their id.
+        id: CanId,
+    },
+    /// More CAN ids of received frames than one port can have.
+    TooManyIds,
 }
 
 impl fmt::Display for ExchangeError {
@@ -132,9 +141,17 @@ impl fmt::Display for ExchangeError {
             Self::Unasked => f.write_str("there is no request to send; remove every_ms and on"),
             Self::RemoteFields => f.write_str("a remote request has no fields"),
             Self::RemoteReply => f.write_str("only a request can be remote"),
+            Self::NotToldApart { id } => write!(
+                f,
+                "another frame that can come at the same time has id {id}, too, and nothing tells the two apart; give \
+                 both a constant at the same place, with another value"
+            ),
             Self::RefusalValues => f.write_str(
                 "a refusal only tells that the device refuses; its fields have no to and no commands",
             ),
+            Self::TooManyIds => {
+                write!(f, "more than {MAX_CAN_IDS} ids of received frames; a CAN port has no room for more")
+            }
         }
     }
 }
@@ -162,6 +179,7 @@ impl<'a> ExchangeCheck<'a> {
             if count > MAX_SLAVES {
                 return self.refuse(nth, Key::Peer, ExchangeError::TooManyPeers);
             }
+            self.check_ids(nth, exchange)?;
             let earlier = exchanges.iter().take(usize::from(nth));
             for before in earlier {
                 if core::mem::discriminant(&before.talk) != core::mem::discriminant(&exchange.talk) {
@@ -181,6 +199,40 @@ impl<'a> ExchangeCheck<'a> {
             }
             if let Some((var, bit)) = exchange.when.rising {
                 super::check_recipe::check_trigger(self.at(nth, Key::Rising), var, bit)?;
+            }
+        }
+        if self.config.can_ids(self.recipe, Direction::Input).nth(MAX_CAN_IDS).is_some() {
+            let last = self.recipe.exchanges.len.saturating_sub(1) as u8;
+            return self.refuse(last, Key::Whole, ExchangeError::TooManyIds);
+        }
+        Ok(())
+    }
+
+    /// Whether the frames that the exchange takes are told from all others that can come while they are
+    /// awaited: those of one exchange, and those that come unasked.
+    fn check_ids(&self, nth: u8, exchange: &Exchange) -> Check {
+        let Talk::Frames { request, reply, refusal } = exchange.talk else { return Ok(()) };
+        let frame = |index: u8| {
+            let frame = self.config.frames.get(usize::from(index))?;
+            Some((frame.id?, frame.fields))
+        };
+        let part = match &self.recipe.parts {
+            Parts::Can { input, .. } => &input[..],
+            Parts::Stream { .. } => &[],
+        };
+        let is_unasked = request.is_none();
+        for (key, own) in [(Key::Reply, reply), (Key::Refusal, refusal)] {
+            let Some((id, fields)) = own.and_then(frame) else { continue };
+            let earlier = self.config.exchanges_of(self.recipe).iter().take(usize::from(nth));
+            let earlier = earlier
+                .filter(|earlier| is_unasked || matches!(earlier.talk, Talk::Frames { request: None, .. }));
+            let earlier = earlier.flat_map(|earlier| earlier.frames(Direction::Input));
+            let of_exchanges = earlier.chain(reply.filter(|_| key == Key::Refusal)).filter_map(frame);
+            let others = part.iter().map(|frame| (frame.id, frame.fields)).chain(of_exchanges);
+            let constants = |fields: Span| Constants::of(fields.of(self.config.fields), Direction::Input);
+            let mut same_id = others.filter(|(other, _)| *other == id).map(|(_, fields)| fields);
+            if same_id.any(|other| !constants(other).differ(&constants(fields))) {
+                return self.refuse(nth, key, ExchangeError::NotToldApart { id });
             }
         }
         Ok(())

@@ -6,8 +6,8 @@ use super::device::field_of;
 use super::error::{ConfigError, ConfigErrorKind as Kind, Place, RecipeKey};
 use super::rules::{Check, check_bit, check_new_name, check_pool, fail, is_marked, mark};
 use super::{
-    CanFramePart, CommandEntry, ConfigView, DeviceFrame, FieldSpec, InputBinding, MAX_COMMAND_TEXT,
-    OutputBinding, Parts, Recipe, SendOn, Span, Words, placeholders,
+    CanFramePart, CommandEntry, ConfigView, Constants, DeviceFrame, FieldSpec, InputBinding,
+    MAX_COMMAND_TEXT, OutputBinding, Parts, Recipe, SendOn, Span, Words, placeholders,
 };
 use crate::command::Request;
 use crate::device::{Boundary, Encoding, LayoutError, Overflow};
@@ -130,6 +130,7 @@ impl<'a> RecipeCheck<'a> {
     fn check_input(&self, place: Place, numbers: Numbers, to: InputBinding) -> Check {
         match to {
             InputBinding::Unused => Ok(()),
+            InputBinding::Counter { max } => check_counter(place, numbers, max),
             InputBinding::Variable { var, scale, offset } => {
                 if var.direction() != Direction::Input {
                     return fail(place, Kind::NotAnInput { var });
@@ -266,12 +267,15 @@ impl<'a> RecipeCheck<'a> {
     /// In a plain recipe the layout checks this.
     fn check_ids(&self, part: Direction, frames: &[CanFramePart]) -> Check {
         let recipe = self.index;
+        let constants = |frame: &CanFramePart| Constants::of(frame.fields.of(self.config.fields), part);
         for (nth, frame) in (0..).zip(frames) {
             let id = frame.id;
-            let earlier = (0..nth).zip(frames).find(|(_, earlier)| earlier.id == id);
+            let same_id = |(_, earlier): &(u8, &CanFramePart)| earlier.id == id;
+            let is_same = |(_, earlier): &(u8, &CanFramePart)| !constants(earlier).differ(&constants(frame));
+            let earlier = (0..nth).zip(frames).filter(same_id).find(is_same);
             let error = match earlier {
                 _ if !id.is_valid() => PartError::InvalidId { frame: nth, id },
-                Some((first, _)) => PartError::DuplicateId { frame: nth, first, id },
+                Some((first, _)) => PartError::NotToldApart { frame: nth, first, id },
                 None => continue,
             };
             return fail(Place::Frame { recipe, part, frame: nth }, Kind::Part(error));
@@ -361,6 +365,14 @@ impl Numbers {
     }
 }
 
+/// An alive counter is an unsigned integer.
+fn check_counter(place: Place, numbers: Numbers, max: u32) -> Check {
+    let is_unsigned = numbers.integers && numbers.low == 0.0;
+    let high = if is_unsigned { numbers.high.min(f64::from(u32::MAX)) } else { -1.0 };
+    let is_in_range = max > 0 && f64::from(max) <= high;
+    if is_in_range { Ok(()) } else { fail(place, Kind::Counter { max, high }) }
+}
+
 fn check_device_output(place: Place, encoding: &Encoding, from: OutputBinding) -> Check {
     let (low, high) = encoding.range();
     match from {
@@ -373,6 +385,7 @@ fn check_device_output(place: Place, encoding: &Encoding, from: OutputBinding) -
             if is_whole { Ok(()) } else { fail(place, Kind::NeedsIntegers) }
         }
         OutputBinding::Counter if !encoding.is_integer() => fail(place, Kind::NeedsIntegers),
+        OutputBinding::CounterTo { max } => check_counter(place, Numbers::written(encoding), max),
         OutputBinding::Port { value, .. } if value.is_count() && !encoding.is_integer() => {
             fail(place, Kind::NeedsIntegers)
         }
@@ -431,6 +444,7 @@ fn check_output(place: Place, ty: ScalarType, from: OutputBinding) -> Check {
             Ok(_) => Ok(()),
             Err(error) => fail(place, Kind::Constant(error)),
         },
+        OutputBinding::CounterTo { max } => check_counter(place, Numbers::of(ty), max),
         OutputBinding::Counter if matches!(ty, ScalarType::Float | ScalarType::Double) => {
             fail(place, Kind::NeedsInteger { ty })
         }

@@ -270,6 +270,12 @@ impl fmt::Display for DescribedKind<'_> {
             }
             Kind::Layout(error) => error.fmt(f),
             Kind::Exchange(error) => error.fmt(f),
+            Kind::Counter { high, .. } if high < 1.0 => {
+                f.write_str("a counter needs a field that has unsigned integers only")
+            }
+            Kind::Counter { max, high } => {
+                write!(f, "a counter up to {max} does not fit; allowed: 1..={high}")
+            }
             Kind::EchoNeedsExchanges => f.write_str(
                 "allowed only with a recipe of exchanges: other frames are not told from their echo",
             ),

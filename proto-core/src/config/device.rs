@@ -82,6 +82,7 @@ impl FieldSpec {
     /// Whether the controller's own recipes have no such field: only frames of devices have it.
     pub const fn is_device(&self) -> bool {
         match self {
+            Self::UserInput { to: InputBinding::Counter { .. }, .. } => true,
             Self::System(_) | Self::UserInput { .. } | Self::UserOutput { .. } => false,
             Self::DeviceInput { .. }
             | Self::DeviceOutput { .. }
@@ -158,6 +159,7 @@ impl<'c> ConfigView<'c> {
     /// recipes can describe.
     pub fn is_device(self, recipe: &Recipe) -> bool {
         recipe.exchanges.len > 0
+            || recipe.repeats_ids()
             || [Direction::Input, Direction::Output].into_iter().any(|part| {
                 recipe.stream_part(part).is_some_and(StreamPart::is_cut)
                     || self.fields_of(recipe, part).any(|(_, _, field)| field.is_device())

@@ -231,6 +231,8 @@ pub enum Counted {
     BitShares,
     /// Texts of one port.
     Texts,
+    /// Alive counters of all input frames.
+    Counters,
     /// Groups of variables that arrive together.
     Groups,
     /// Blocks of neighbouring variables that are polled by Modbus.
@@ -254,6 +256,7 @@ impl core::fmt::Display for Counted {
             Self::SafeValues => "safe values on all ports together",
             Self::FieldPorts => "field ports",
             Self::Texts => "texts of one port",
+            Self::Counters => "alive counters in input frames",
             Self::DeviceFrames => "frames of a device on one port",
             Self::InputFrames => "input frames",
             Self::RecipeLinks => "recipe links",
@@ -387,6 +390,13 @@ pub enum ConfigErrorKind {
     Layout(LayoutError),
     /// The exchange cannot be.
     Exchange(ExchangeError),
+    /// The range of an alive counter.
+    Counter {
+        /// Its highest number.
+        max: u32,
+        /// The highest number of the field; below 0 if it is none of unsigned integers.
+        high: f64,
+    },
     /// An echo is told from replies in exchanges only.
     EchoNeedsExchanges,
     /// A number that its field cannot have.

@@ -121,6 +121,17 @@ impl Exchange {
         matches!(self.talk, Talk::Served { .. })
     }
 
+    /// Its frames of a device's own that come from the device (input), a reply before a refusal, or go
+    /// to it (output).
+    pub(crate) fn frames(&self, part: Direction) -> impl Iterator<Item = u8> + use<> {
+        let frames = match (self.talk, part) {
+            (Talk::Frames { reply, refusal, .. }, Direction::Input) => [reply, refusal],
+            (Talk::Frames { request, .. }, Direction::Output) => [request, None],
+            _ => [None, None],
+        };
+        frames.into_iter().flatten()
+    }
+
     /// The fields that come from the device (input) or go to it (output); `None` if it has no such
     /// frame. A refusal only tells that the device refuses.
     pub(crate) fn fields(&self, config: ConfigView<'_>, part: Direction) -> Option<Span> {

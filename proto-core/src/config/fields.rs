@@ -186,6 +186,7 @@ pub(super) enum Does<'a> {
     Writes { var: Var<'a>, scale: f32, offset: f32 },
     WritesBit { name: &'a str },
     Commands { entries: Entries<'a>, when: CommandWhen, idle: Option<i64> },
+    Counter { max: u32 },
 }
 
 /// The entries of a command table.
@@ -241,6 +242,12 @@ impl<'a> InputField<'a> {
         Self { on_wire: OnWire::value(encoding), does }
     }
 
+    /// An alive counter, which goes from `max` to 0: a frame with the number of the one before is not
+    /// taken, so that a frozen device falls silent.
+    pub fn counter(encoding: impl Into<Encoding>, max: u32) -> Self {
+        Self { on_wire: OnWire::value(encoding), does: Does::Counter { max } }
+    }
+
     /// An integer that a frame must have here; one with another is not this frame.
     pub fn constant(encoding: impl Into<Encoding>, value: i64) -> Self {
         Self { on_wire: OnWire::Fixed(encoding.into(), value), does: Does::Nothing }
@@ -292,7 +299,7 @@ impl<'a> InputField<'a> {
             Does::Commands { entries, idle, .. } => {
                 entries.iter().count().saturating_add(usize::from(idle.is_some()))
             }
-            Does::Nothing | Does::Writes { .. } | Does::WritesBit { .. } => 0,
+            Does::Nothing | Does::Writes { .. } | Does::WritesBit { .. } | Does::Counter { .. } => 0,
         }
     }
 }
@@ -310,6 +317,7 @@ pub(super) enum Sends<'a> {
     Bit { name: &'a str },
     Constant(f64),
     Counter,
+    CounterTo { max: u32 },
     Reply,
     State { value: StateValue, scale: f32, offset: f32 },
     Health { port: Option<u8>, value: PortValue, scale: f32, offset: f32 },
@@ -334,6 +342,11 @@ impl<'a> OutputField<'a> {
     /// The number of frames sent so far, wrapping in the field's type. Integer types only.
     pub fn counter(encoding: impl Into<Encoding>) -> Self {
         Self::new(encoding, Sends::Counter)
+    }
+
+    /// The number of frames sent so far; `max` is followed by 0.
+    pub fn counter_to(encoding: impl Into<Encoding>, max: u32) -> Self {
+        Self::new(encoding, Sends::CounterTo { max })
     }
 
     /// The result of the port's newest command: see [`crate::engine::ReplyCode`].

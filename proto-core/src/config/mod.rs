@@ -30,6 +30,7 @@ mod recipe;
 mod rules;
 mod safe_value;
 mod source;
+mod told_apart;
 mod validate;
 mod view;
 
@@ -60,6 +61,7 @@ pub use recipe::{
 pub use rules::{check_address, check_bit, check_bitrate, check_cycle, check_name};
 pub use safe_value::SafeValue;
 pub use source::{PortHealth, PortValue, StateValue, StateValueError};
+pub use told_apart::Constants;
 pub(crate) use view::ConfigMut;
 pub use view::ConfigView;
 

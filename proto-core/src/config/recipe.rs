@@ -280,7 +280,10 @@ impl FieldSpec {
             Self::System(var) => Some(var),
             Self::UserInput { to, .. } | Self::DeviceInput { to, .. } => match to {
                 InputBinding::Variable { var, .. } => Some(var),
-                InputBinding::Unused | InputBinding::Commands { .. } | InputBinding::Bit { .. } => None,
+                InputBinding::Unused
+                | InputBinding::Commands { .. }
+                | InputBinding::Bit { .. }
+                | InputBinding::Counter { .. } => None,
             },
             Self::UserOutput { from, .. } | Self::DeviceOutput { from, .. } => match from {
                 OutputBinding::Variable { var, .. } | OutputBinding::Bit { var, .. } => Some(var),
@@ -331,6 +334,12 @@ pub enum InputBinding {
         var: SysVar,
         /// Bit 0..=7.
         bit: u8,
+    },
+    /// It goes up by one with every frame, and from `max` to 0: a frame with the number of the one
+    /// before is a repeat, and not taken. Only in frames of devices.
+    Counter {
+        /// The highest number.
+        max: u32,
     },
 }
 
@@ -396,6 +405,11 @@ pub enum OutputBinding {
         var: SysVar,
         /// Bit 0..=7.
         bit: u8,
+    },
+    /// Frames sent so far; `max` is followed by 0.
+    CounterTo {
+        /// The highest number.
+        max: u32,
     },
 }
 

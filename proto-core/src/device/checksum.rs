@@ -51,9 +51,10 @@ const fn crc(width: u8, poly: u32, init: u32, reflected: bool, xorout: u32) -> A
 }
 
 /// The algorithms with a name, and the names as configuration files use them.
-const NAMED: [(&str, Algorithm); 23] = [
+const NAMED: [(&str, Algorithm); 24] = [
     ("crc8", crc(8, 0x07, 0, false, 0)),
     ("crc8-autosar", crc(8, 0x2F, 0xFF, false, 0xFF)),
+    ("crc8-gsm-a", crc(8, 0x1D, 0, false, 0)),
     ("crc8-maxim", crc(8, 0x31, 0, true, 0)),
     ("crc8-nrsc-5", crc(8, 0x31, 0xFF, false, 0)),
     ("crc8-sae-j1850", crc(8, 0x1D, 0xFF, false, 0xFF)),
@@ -221,6 +222,7 @@ mod tests {
         let checks = [
             ("crc8", u32::from(oracle::CRC_8_SMBUS.check)),
             ("crc8-autosar", u32::from(oracle::CRC_8_AUTOSAR.check)),
+            ("crc8-gsm-a", u32::from(oracle::CRC_8_GSM_A.check)),
             ("crc8-maxim", u32::from(oracle::CRC_8_MAXIM_DOW.check)),
             ("crc8-nrsc-5", u32::from(oracle::CRC_8_NRSC_5.check)),
             ("crc8-sae-j1850", 0x4B),

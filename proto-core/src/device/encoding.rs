@@ -75,16 +75,16 @@ pub enum Width {
     Until(u8),
 }
 
-/// Bits of a number of 8, 16 or 32 bits; the lowest is bit 0.
+/// Up to 32 bits of a number of 1 to 8 bytes; the lowest is bit 0.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct Bits {
-    /// Bytes of the number: 1, 2 or 4.
+    /// Bytes of the number, 1..=8.
     pub bytes: u8,
     /// The lowest of the bits.
     pub first: u8,
-    /// Number of bits.
+    /// Number of bits, 1..=32.
     pub count: u8,
     /// The highest of them is a sign.
     pub signed: bool,
@@ -192,6 +192,13 @@ impl Encoding {
     /// With the bytes in this order.
     pub const fn ordered(self, order: ByteOrder) -> Self {
         Self { order, ..self }
+    }
+
+    /// These bits of a number of so many bytes, as signals of CAN databases are bits of all eight.
+    pub const fn bits_of(bytes: u8, bits: RangeInclusive<u8>) -> Self {
+        let (first, last) = (*bits.start(), *bits.end());
+        let count = last.saturating_sub(first).saturating_add(1);
+        Self::of(Kind::Bits(Bits { bytes, first, count, signed: false }))
     }
 
     /// Other bits of the number before, or a second use of the same bytes.
@@ -307,7 +314,7 @@ impl Encoding {
             Kind::Uint24 => Scalar::Dword(raw() as u32),
             Kind::Int24 => Scalar::Int(sign_extended(raw() as u32, 24)),
             Kind::Bits(bits) => {
-                let value = (raw() as u32 & bits.mask()).unbounded_shr(u32::from(bits.first));
+                let value = (raw() & bits.mask()).unbounded_shr(u32::from(bits.first)) as u32;
                 if bits.signed { Scalar::Int(sign_extended(value, bits.count)) } else { Scalar::Dword(value) }
             }
             Kind::Bcd { bytes } => {
@@ -338,8 +345,8 @@ impl Encoding {
             Kind::Scalar(_) | Kind::Uint24 | Kind::Int24 => value as i64 as u64,
             Kind::Bits(bits) => {
                 let field = out.get(..len)?;
-                let value = (value as i64 as u32).unbounded_shl(u32::from(bits.first)) & bits.mask();
-                self.order.read(field) | u64::from(value)
+                let value = (value as i64 as u64).unbounded_shl(u32::from(bits.first)) & bits.mask();
+                self.order.read(field) | value
             }
             Kind::Bcd { bytes } => {
                 let digits = u32::from(bytes).saturating_mul(2);
@@ -362,8 +369,15 @@ impl Encoding {
 
 impl Bits {
     /// The bits, each where it stands in the number.
-    pub(super) const fn mask(&self) -> u32 {
-        mask(self.count).unbounded_shl(self.first as u32)
+    pub(super) const fn mask(&self) -> u64 {
+        (mask(self.count) as u64).unbounded_shl(self.first as u32)
+    }
+
+    /// The bits in the bytes of the number, in this order; the first byte is the lowest.
+    pub(super) fn places(&self, order: ByteOrder) -> u64 {
+        let mut bytes = [0; 8];
+        order.write(self.mask(), bytes.get_mut(..usize::from(self.bytes)).unwrap_or(&mut []));
+        u64::from_le_bytes(bytes)
     }
 }
 

@@ -24,7 +24,7 @@ use places::{Places, Unplaced};
 
 pub use check::LayoutError;
 pub use element::Element;
-pub use frame_checksum::{Checksum, MAX_CHECKSUM};
+pub use frame_checksum::{Checksum, DataId, MAX_CHECKSUM, MAX_DATA_ID};
 
 /// What carries the frames.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -65,7 +65,10 @@ pub use cutter::{Boundary, Cutter, Piece};
 pub use encoding::{Bits, Digits, Encoding, Kind, MAX_DIGITS, Overflow, Unreadable, Width};
 pub use escape::Escape;
 pub use framer::{Found, Framer, FramerStats};
-pub use layout::{Carrier, Checksum, Element, FrameLayout, LayoutError, MAX_CHECKSUM, Part, Place, Probe};
+pub use layout::{
+    Carrier, Checksum, DataId, Element, FrameLayout, LayoutError, MAX_CHECKSUM, MAX_DATA_ID, Part, Place,
+    Probe,
+};
 pub use order::ByteOrder;
 pub use text::{Counts, Length, MAX_TEXT, Text, TextWidth};
 

@@ -10,6 +10,7 @@ use super::codecs::{can_codec, index_of, stream_codec, stream_layout};
 use super::command_link::CommandLink;
 use super::command_tables::{MAX_COMMAND_BYTES, MAX_COMMAND_FIELDS};
 use super::counters::PortCounters;
+use super::counts::MAX_COUNTS;
 use super::device_port::DeviceCodec;
 use super::exchanges::{Exchanges, Places};
 use super::field_port::{Codec, FieldPort, LineTiming};
@@ -394,6 +395,11 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                     InputTo::Bits { var, mask: VarBit { var, bit }.mask().unwrap_or(0) }
                 }
                 InputBinding::Unused => InputTo::Unused,
+                InputBinding::Counter { max } => {
+                    let nth =
+                        self.store.counts.add(max).ok_or(one_too_many(Counted::Counters, MAX_COUNTS))?;
+                    InputTo::Counter(nth)
+                }
             };
             self.bindings.inputs.push(InputBind::new(to, element)).map_err(|_| full())?;
             inputs.len = inputs.len.saturating_add(1);

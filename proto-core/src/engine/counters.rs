@@ -30,6 +30,9 @@ pub struct PortCounters {
     pub rejected_unreadable: u32,
     /// Frames that are right and of another device: a constant is not ours.
     pub rejected_other_device: u32,
+    /// Frames rejected because their alive counter is that of the frame before: the device may be
+    /// frozen.
+    pub rejected_counter: u32,
     /// Frames received on a port whose recipe has no input part.
     pub rejected_no_input: u32,
     /// Frames that began with the head but did not end with the tail (D19).
@@ -44,6 +47,8 @@ pub struct PortCounters {
     pub asleep: u32,
     /// Accepted frames in which reserved bits were masked (D22).
     pub masked: u32,
+    /// Accepted frames whose alive counter is not the next one: frames between are missing.
+    pub counter_jumps: u32,
     /// Bit values replaced by newer ones because the queue of edges was full.
     pub edges_lost: u32,
     /// Values dropped before they were written: older than the port's timeout, or waiting for a
@@ -120,6 +125,7 @@ impl PortCounters {
             self.rejected_checksum,
             self.rejected_unreadable,
             self.rejected_other_device,
+            self.rejected_counter,
             self.rejected_no_input,
             self.tail_mismatches,
         ];

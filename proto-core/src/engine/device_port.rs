@@ -103,6 +103,29 @@ pub(super) fn probe(format: &DeviceFormat, bindings: &[InputBind], bytes: &[u8])
     format.layout.probe(elements(format.bindings.of(bindings)), bytes)
 }
 
+/// The frame that CAN data with this id are, or why they are none: frames with one id differ in
+/// constants.
+pub(super) fn judge_can<'f, T>(
+    formats: impl Iterator<Item = (T, &'f DeviceFormat)>,
+    bindings: &[InputBind],
+    frame: &CanFrame,
+) -> Result<(T, &'f DeviceFormat), Rejection> {
+    let mut why = Rejection::ForeignId;
+    for (what, format) in formats.filter(|(_, format)| format.id == frame.id()) {
+        let fields = elements(format.bindings.of(bindings));
+        let probe = format.layout.probe_whole(fields, frame.data());
+        why = match (probe, why) {
+            (Probe::Frame(_), _) => return Ok((what, format)),
+            // Right but for a constant: another one than this, whatever the others are.
+            (Probe::Other(_), _) | (_, Rejection::OtherDevice) => Rejection::OtherDevice,
+            (Probe::Wrong(_), _) | (_, Rejection::Checksum) => Rejection::Checksum,
+            (Probe::No(_), _) if frame.data().len() == format.layout.lengths().0 => Rejection::OtherDevice,
+            _ => Rejection::WrongLength,
+        };
+    }
+    Err(why)
+}
+
 pub(super) fn elements(bindings: &[InputBind]) -> impl Iterator<Item = Element> {
     bindings.iter().map(InputBind::element)
 }
@@ -263,19 +286,10 @@ impl FieldPort {
         if frame.is_remote() {
             frames.rejected(Rejection::Remote)?;
         }
-        let formats = (0..).zip(device.input());
-        let Some((nth, format)) = formats.into_iter().find(|(_, format)| format.id == frame.id()) else {
-            return frames.rejected(Rejection::ForeignId);
+        let (nth, format) = match judge_can((0..).zip(device.input()), bindings, frame) {
+            Ok(found) => found,
+            Err(why) => return frames.rejected(why),
         };
-        let fields = elements(format.bindings.of(bindings));
-        match format.layout.probe_whole(fields, frame.data()) {
-            Probe::Frame(_) => {}
-            Probe::Wrong(_) => frames.rejected(Rejection::Checksum)?,
-            Probe::Other(_) | Probe::No(_) if frame.data().len() == format.layout.lengths().0 => {
-                frames.rejected(Rejection::OtherDevice)?;
-            }
-            _ => frames.rejected(Rejection::WrongLength)?,
-        }
         let slot = usize::from(self.first_frame).saturating_add(nth);
         frames.take_device(format, &device.texts, frame.data(), slot, accepted)?;
         self.sender.frames_accepted(1, usable, &mut self.counters, now);
@@ -356,19 +370,24 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
             match value {
                 Err(_) => self.rejected(Rejection::Unreadable)?,
                 Ok(Some(value)) if !value.is_finite() => self.rejected(Rejection::NotFinite)?,
-                Ok(Some(value)) if !fits(binding, value) => self.rejected(Rejection::OutOfRange)?,
-                Ok(_) => {}
+                Ok(Some(value)) => self.fits(binding, value).or_else(|why| self.rejected(why))?,
+                Ok(None) => {}
             }
         }
         self.texts_fit(texts, format, frame).or_else(|why| self.rejected(why))?;
         for (binding, value) in values() {
             let Ok(Some(value)) = value else { continue };
-            match bound(binding, value) {
-                Some((var, value)) => {
+            match (bound(binding, value), binding.to) {
+                (Some((var, value)), _) => {
                     // It fits: all values were tried before the first was applied.
                     let _ = self.store.image.set(var, value);
                 }
-                None => self.apply_user(&binding.to, value),
+                (None, InputTo::Counter(nth)) => {
+                    if self.store.counts.take(nth, value) {
+                        bump(&mut self.counters.counter_jumps);
+                    }
+                }
+                (None, _) => self.apply_user(&binding.to, value),
             }
         }
         self.take_texts(texts, format, frame);
@@ -379,6 +398,15 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
         accepted.frames = accepted.frames.wrapping_add(1);
         accepted.set = self.store.accepted(slot, self.counters);
         Ok(())
+    }
+
+    /// Whether a value may be taken for its binding.
+    fn fits(&self, binding: &InputBind, value: Scalar) -> Result<(), Rejection> {
+        match binding.to {
+            InputTo::Variable { .. } if bound(binding, value).is_none() => Err(Rejection::OutOfRange),
+            InputTo::Counter(nth) => self.store.counts.check(nth, value),
+            _ => Ok(()),
+        }
     }
 }
 
@@ -392,8 +420,4 @@ fn bound(binding: &InputBind, value: Scalar) -> Option<(SysVar, Scalar)> {
     let number = value.as_f64() * f64::from(scale) + f64::from(offset);
     let number = Encoding::scalar(var.ty()).fit(number, Overflow::Wrap)?;
     bind_to_variable(var, Scalar::Double(number), 1.0, 0.0).map(|value| (var, value))
-}
-
-fn fits(binding: &InputBind, value: Scalar) -> bool {
-    !matches!(binding.to, InputTo::Variable { .. }) || bound(binding, value).is_some()
 }

@@ -489,6 +489,7 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
             Rejection::WrongLength => &mut counters.rejected_length,
             Rejection::Checksum => &mut counters.rejected_checksum,
             Rejection::OtherDevice => &mut counters.rejected_other_device,
+            Rejection::Repeated => &mut counters.rejected_counter,
             Rejection::Unreadable | Rejection::Escape => &mut counters.rejected_unreadable,
             Rejection::NotFinite => &mut counters.rejected_not_finite,
             _ => &mut counters.rejected_out_of_range,
@@ -551,7 +552,7 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
 
     pub(super) fn apply_user(&mut self, binding: &InputTo, value: Scalar) {
         match *binding {
-            InputTo::Unused | InputTo::Fixed { .. } => {}
+            InputTo::Unused | InputTo::Fixed { .. } | InputTo::Counter(_) => {}
             InputTo::Variable { .. } => {
                 if let Some((var, value)) = binding.bound(value) {
                     // It fits: all values were tried before the first was applied.

@@ -20,6 +20,7 @@ mod command_link;
 mod command_tables;
 mod connection;
 mod counters;
+mod counts;
 mod device_port;
 mod exchanges;
 mod field_output;

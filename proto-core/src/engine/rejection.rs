@@ -39,11 +39,13 @@ pub enum Rejection {
     Escape,
     /// The device refuses a request.
     Refused,
+    /// An alive counter that the frame before had, too.
+    Repeated,
 }
 
 impl Rejection {
     /// All reasons.
-    pub const ALL: [Self; 15] = [
+    pub const ALL: [Self; 16] = [
         Self::NoFrame,
         Self::Partial,
         Self::NotFinite,
@@ -59,6 +61,7 @@ impl Rejection {
         Self::Malformed,
         Self::Escape,
         Self::Refused,
+        Self::Repeated,
     ];
 
     /// A short text, such as `no frame found`.
@@ -79,6 +82,7 @@ impl Rejection {
             Self::Malformed => "a violation of the protocol",
             Self::Escape => "wrong escape bytes",
             Self::Refused => "the device refuses the request",
+            Self::Repeated => "the counter of the frame before",
         }
     }
 }

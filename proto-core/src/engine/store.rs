@@ -5,6 +5,7 @@ use heapless::Vec;
 
 use super::bits::{Bits, TimedOut};
 use super::counters::{PortCounters, bump};
+use super::counts::Counts;
 use super::latency::Latency;
 use super::outbox::{EdgeQueue, Outbox};
 use crate::config::{SafeValue, Span};
@@ -70,6 +71,7 @@ impl SafeBytes {
 #[derive(Debug, Clone)]
 pub(super) struct Store<const PORTS: usize> {
     pub latency: Latency,
+    pub counts: Counts,
     /// The instant of this call of the engine.
     pub now: Instant,
     /// Some port sends on a rising bit, or shows the health of ports when it is asked, so the engine
@@ -123,6 +125,7 @@ impl<const PORTS: usize> Store<PORTS> {
             now: Instant::ZERO,
             watches_bits: false,
             latency: Latency::new(),
+            counts: Counts::new(),
             image: Image::new(),
             outbox: Outbox::new(),
             edges: Vec::new(),

@@ -6,7 +6,7 @@
 
 use super::command_link::CommandLink;
 use super::counters::{add, bump};
-use super::device_port::{DeviceCodec, DeviceFormat, better, elements, probe};
+use super::device_port::{DeviceCodec, DeviceFormat, better, elements, judge_can, probe};
 use super::exchanges::{Asks, InputFormat, Item, View};
 use super::field_output::Downward;
 use super::field_port::{Accepted, Codec, FieldPort, Frames, came, keep};
@@ -297,10 +297,11 @@ impl FieldPort {
         }
         let flight = line.flight();
         let awaited = Awaited { formats, first_frame: self.first_frame, items, flight, bindings };
-        let seen = |format: &DeviceFormat| {
-            format.layout.probe_whole(elements(format.bindings.of(bindings)), frame.data())
+        let is = |format: &DeviceFormat| {
+            let fields = elements(format.bindings.of(bindings));
+            format.id == frame.id()
+                && matches!(format.layout.probe_whole(fields, frame.data()), Probe::Frame(_))
         };
-        let is = |format: &DeviceFormat| format.id == frame.id() && matches!(seen(format), Probe::Frame(_));
         if let Some(heard) = awaited.answer(is)
             && let (Some(flight), Some(item)) = (flight, awaited.asked())
         {
@@ -319,18 +320,11 @@ impl FieldPort {
             line.answered(&mut talks, flight, item.times, now);
             return verdict;
         }
-        let Some((format, slot)) = awaited.unasked().find(|(format, _)| is(format)) else {
-            let mut all = awaited.answers().chain(awaited.unasked().map(|(format, _)| format));
-            let Some(format) = all.find(|format| format.id == frame.id()) else {
-                return frames.rejected(Rejection::ForeignId);
-            };
-            return frames.rejected(match seen(format) {
-                Probe::Wrong(_) => Rejection::Checksum,
-                Probe::Other(_) | Probe::No(_) if frame.data().len() == format.layout.lengths().0 => {
-                    Rejection::OtherDevice
-                }
-                _ => Rejection::WrongLength,
-            });
+        let answers = awaited.answers().map(|format| (usize::MAX, format));
+        let all = answers.chain(awaited.unasked().map(|(format, slot)| (slot, format)));
+        let (slot, format) = match judge_can(all, bindings, frame) {
+            Ok(found) => found,
+            Err(why) => return frames.rejected(why),
         };
         frames.take_device(format, texts, frame.data(), slot, accepted)?;
         self.sender.frames_accepted(1, usable, &mut self.counters, now);

@@ -87,6 +87,8 @@ pub(super) enum InputTo {
         var: SysVar,
         mask: u8,
     },
+    /// Index of an alive counter.
+    Counter(u8),
     /// The halves of a constant, so that they need no more alignment than the others.
     Fixed {
         high: i32,
@@ -181,6 +183,7 @@ pub(super) fn values(
             }
             OutputBinding::Constant(value) => saturate_to_field(ty, value, 1.0, 0.0),
             OutputBinding::Counter => wrapping_count(ty, frames_sent),
+            OutputBinding::CounterTo { max } => wrapping_count(ty, counted_to(frames_sent, max)),
             OutputBinding::Reply => saturate_to_field(ty, f64::from(reply as u8), 1.0, 0.0),
             OutputBinding::Port { value, .. } if value.is_count() => {
                 wrapping_count(ty, image.extra(extra) as u32)
@@ -204,6 +207,7 @@ pub(super) fn number_of(binding: &OutputBind, image: &Image, frames_sent: u32, r
         }
         OutputBinding::Constant(value) => value,
         OutputBinding::Counter => wrapping_number(binding, f64::from(frames_sent)),
+        OutputBinding::CounterTo { max } => f64::from(counted_to(frames_sent, max)),
         OutputBinding::Reply => f64::from(reply as u8),
         OutputBinding::Port { value, .. } if value.is_count() => {
             wrapping_number(binding, image.extra(binding.extra))
@@ -220,6 +224,11 @@ pub(super) fn number_of(binding: &OutputBind, image: &Image, frames_sent: u32, r
 fn wrapping_number(binding: &OutputBind, count: f64) -> f64 {
     let high = binding.element().encoding().map_or(0.0, |encoding| encoding.range().1);
     wrap(count, 0.0, high.min(f64::from(u32::MAX))).unwrap_or(f64::NAN)
+}
+
+/// A count that goes from `max` to 0.
+fn counted_to(count: u32, max: u32) -> u32 {
+    max.checked_add(1).and_then(|numbers| count.checked_rem(numbers)).unwrap_or(count)
 }
 
 /// The bindings of all ports; ports name ranges of it.

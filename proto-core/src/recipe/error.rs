@@ -94,6 +94,15 @@ pub enum PartError {
         /// Its id.
         id: CanId,
     },
+    /// Two frames of a device with one id, and no constant that tells them apart.
+    NotToldApart {
+        /// The second of the two.
+        frame: u8,
+        /// The first of the two.
+        first: u8,
+        /// Their id.
+        id: CanId,
+    },
     /// Two frames of a CAN part with one id.
     DuplicateId {
         /// The second of the two.
@@ -123,6 +132,7 @@ impl PartError {
             Self::NoFields { frame } => frame,
             Self::CanFrameTooLong { frame, .. }
             | Self::InvalidId { frame, .. }
+            | Self::NotToldApart { frame, .. }
             | Self::DuplicateId { frame, .. } => Some(frame),
             Self::TooManyFrames => Some(MAX_CAN_IDS as u8),
             _ => match self.field() {
@@ -192,6 +202,14 @@ impl fmt::Display for PartError {
             }
             Self::InvalidId { id: CanId::Extended(id), .. } => {
                 write!(f, "id {id:#010x} does not fit in 29 bits (0x00000000..=0x1fffffff)")
+            }
+            Self::NotToldApart { first, id, .. } => {
+                let first = u16::from(first).saturating_add(1);
+                write!(
+                    f,
+                    "frame {first} has id {id}, too, and nothing tells the two apart; give both a constant at the \
+                     same place, with another value"
+                )
             }
             Self::DuplicateId { first, id, .. } => {
                 write!(f, "frame {} already has id {id}", u16::from(first).saturating_add(1))

@@ -11,7 +11,7 @@ use crate::rig::MS;
 use crate::scribe::Scribe;
 
 /// Room for one field port beside a listening port, one recipe link and a few fields.
-pub type Small = Engine<2, 1, 4>;
+pub type Small = Engine<2, 1, 4, 0, 0>;
 /// A promise that was broken, in words.
 pub type Broken = String;
 

@@ -5,7 +5,7 @@
 
 use std::ops::Range;
 
-use proto_core::config::{FieldSpec, GatewayConfig, Parts};
+use proto_core::config::{FieldSpec, GatewayConfig, InputBinding, OutputBinding, Parts};
 use proto_core::device::{Algorithm, Boundary, ByteOrder, Checksum, Crc, Encoding, Kind, Overflow, Width};
 use proto_core::wire::scalar::ScalarType;
 
@@ -153,10 +153,33 @@ pub(crate) fn unmodelled(config: &GatewayConfig) -> Option<&'static str> {
             .any(|part| part.framing != Boundary::Fields || part.escape.is_some()),
         Parts::Can { .. } => false,
     });
-    if varies || is_cut {
-        return Some("a soak cannot judge texts and frames of varying length");
+    let counts = config.fields.iter().any(|field| {
+        let counts_input = match field {
+            FieldSpec::UserInput { to, .. } | FieldSpec::DeviceInput { to, .. } => {
+                matches!(to, InputBinding::Counter { .. })
+            }
+            _ => false,
+        };
+        counts_input || matches!(field.source(), Some(OutputBinding::CounterTo { .. }))
+    });
+    let has_data_id = config
+        .fields
+        .iter()
+        .any(|field| matches!(field, FieldSpec::Checksum(sum) if !sum.data_id.bytes().is_empty()));
+    let view = config.view();
+    let has_one_id = view.recipes.iter().any(|recipe| match &recipe.parts {
+        Parts::Can { input, output } => [input, output].into_iter().any(|frames| {
+            frames.iter().enumerate().any(|(nth, frame)| frames[..nth].iter().any(|it| it.id == frame.id))
+        }),
+        Parts::Stream { .. } => false,
+    });
+    match (varies || is_cut, counts || has_one_id || has_data_id) {
+        (true, _) => Some("a soak cannot judge texts and frames of varying length"),
+        (_, true) => {
+            Some("a soak cannot judge counters that are checked, CAN frames with one id, and data ids")
+        }
+        _ => super::bits::unmodelled(config),
     }
-    super::bits::unmodelled(config)
 }
 
 /// Number of bytes of a field. Fields of varying length are refused before a run.

@@ -313,6 +313,7 @@ impl Downward {
                 ScalarType::Float => f64::from(self.cycles % (1 << 24)),
                 ScalarType::Dword | ScalarType::Double => f64::from(self.cycles),
             }),
+            OutputBinding::CounterTo { .. } => None,
             OutputBinding::Reply | OutputBinding::State { .. } | OutputBinding::Port { .. } => None,
         }
     }

@@ -211,7 +211,8 @@ fn judge_device(frame: &Frame, nth: usize, whole: &[u8]) -> Verdict {
                 accepted.commands.push((at, table, when, number as i64));
             }
             InputBinding::Bit { var, bit } => accepted.bits.push(coil(var, bit, number)),
-            InputBinding::Unused => {}
+            // A configuration with counters is not judged.
+            InputBinding::Unused | InputBinding::Counter { .. } => {}
         }
     }
     Verdict::Accepted(accepted)

@@ -1,6 +1,7 @@
 //! The bindings of fields and the triggers of output parts in a gateway file.
 
 use proto_core::config::{InputBinding, OnStale, OutputBinding, SendOn};
+use proto_core::device::Encoding;
 use proto_core::sysvar::{SysVar, VarBit};
 
 use super::commands::{self, FileCommands};
@@ -11,9 +12,17 @@ use super::sources;
 /// The binding of an input field.
 pub(super) enum FileInput {
     Unused,
-    Variable { var: SysVar, scale: f32, offset: f32 },
+    Variable {
+        var: SysVar,
+        scale: f32,
+        offset: f32,
+    },
     Bit(VarBit),
     Commands(FileCommands),
+    /// An alive counter, which goes from this number to 0.
+    Counter {
+        max: u32,
+    },
 }
 
 impl FileInput {
@@ -22,6 +31,7 @@ impl FileInput {
         match *self {
             Self::Variable { var, scale, offset } => InputBinding::Variable { var, scale, offset },
             Self::Bit(VarBit { var, bit }) => InputBinding::Bit { var, bit },
+            Self::Counter { max } => InputBinding::Counter { max },
             Self::Unused | Self::Commands(_) => InputBinding::Unused,
         }
     }
@@ -124,6 +134,24 @@ fn read_to(field: &Reader<'_>, to: &Item<'_>) -> Result<FileInput> {
     }
     let (scale, offset) = read_scale(field)?;
     Ok(FileInput::Variable { var: read_var(to)?, scale, offset })
+}
+
+/// `counter = true` or `counter = { max = 14 }`: the number behind which the counter is 0 again.
+pub(super) fn read_counter(field: &Reader<'_>, encoding: &Encoding) -> Result<Option<u32>> {
+    let Some(item) = field.optional("counter") else { return Ok(None) };
+    let (low, high) = encoding.range();
+    if !encoding.is_integer() || low != 0.0 {
+        return Err(item.error("a counter needs a field that has unsigned integers only"));
+    }
+    let high = high.min(f64::from(u32::MAX)) as u32;
+    if !item.is_table() {
+        return match item.bool()? {
+            true => Ok(Some(high)),
+            false => Ok(None),
+        };
+    }
+    let max = item.table(&["max"])?.required("max", "the highest number of the counter")?;
+    max.integer(1..=i64::from(high)).map(Some)
 }
 
 pub(super) fn read_output(field: &Reader<'_>) -> Result<FileOutput> {

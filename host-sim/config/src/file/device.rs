@@ -3,17 +3,17 @@
 //! In: the tables of a part and of its fields. Out: [`FileField`]s, and frames that were laid out.
 //! The controller's own recipes have none of these keys, and are refused them with the reason.
 
-use proto_core::config::{DeviceFrame, FieldSpec};
+use proto_core::config::{Constants, DeviceFrame, FieldSpec, OutputBinding};
 use proto_core::device::{
-    Algorithm, Boundary, ByteOrder, Carrier, Checksum, Crc, Element, Encoding, LayoutError, Overflow,
-    TextWidth,
+    Algorithm, Boundary, ByteOrder, Carrier, Checksum, Crc, DataId, Element, Encoding, LayoutError,
+    MAX_DATA_ID, Overflow, TextWidth,
 };
 use proto_core::recipe::PartError;
 use proto_core::recipe::model::{MAX_CAN_IDS, MAX_DELIMITER, MAX_STREAM_FRAME, Mode, Rules};
 use proto_core::sysvar::Direction;
 use proto_core::wire::scalar::ScalarType;
 
-use super::bindings::{self, FileInput};
+use super::bindings::{self, FileInput, FileOutput};
 use super::encoding::{self, OpenNumber, Order, refuse};
 use super::exchanges::FileExchange;
 use super::framings;
@@ -27,7 +27,7 @@ const FRAME_KEYS: [&str; 3] = ["endian", "word_order", "checksum"];
 /// The keys of a stream part.
 const STREAM_KEYS: [&str; 5] = ["endian", "word_order", "checksum", "framing", "escape"];
 /// The keys of a field or what stands in its place, beside those that say how it is written.
-const FIELD_KEYS: [&str; 5] = ["equals", "overflow", "pad", "fill", "text"];
+const FIELD_KEYS: [&str; 6] = ["equals", "overflow", "counter", "pad", "fill", "text"];
 
 /// Why recipes of this kind have no frames of devices; `None` if they may.
 fn why_plain(mode: Mode, flavour: Flavour) -> Option<&'static str> {
@@ -197,17 +197,17 @@ pub(super) fn binding_keys(table: &Reader<'_>, direction: Direction) -> Result<&
     match direction {
         Direction::Input => {
             refuse(table, &["value"], "an input field has equals = 9 for a constant")?;
-            Ok(&["to", "commands", "when", "base", "idle", "scale", "offset", "equals"])
+            Ok(&["to", "commands", "when", "base", "idle", "scale", "offset", "equals", "counter"])
         }
         Direction::Output => {
             refuse(table, &["equals"], "an output field has value = 9 for a constant")?;
-            Ok(&["from", "value", "scale", "offset"])
+            Ok(&["from", "value", "scale", "offset", "counter"])
         }
     }
 }
 
 fn refuse_bindings(table: &Reader<'_>) -> Result<()> {
-    let bindings = ["to", "commands", "when", "base", "idle", "scale", "offset", "overflow"];
+    let bindings = ["to", "commands", "when", "base", "idle", "scale", "offset", "overflow", "counter"];
     refuse(table, &bindings, "a field with equals is a constant and has nothing else")
 }
 
@@ -238,7 +238,14 @@ pub(super) fn bind(
     let encoding = written.encoding;
     match direction {
         Direction::Output => {
-            let from = bindings::read_output(table)?;
+            let mut from = bindings::read_output(table)?;
+            match bindings::read_counter(table, &encoding)? {
+                Some(max) if matches!(from, FileOutput::Bound(OutputBinding::Counter)) => {
+                    from = FileOutput::Bound(OutputBinding::CounterTo { max });
+                }
+                Some(_) => refuse(table, &["counter"], "allowed only together with from = \"counter\"")?,
+                None => {}
+            }
             if let Some(item) = table.optional("value").filter(|_| encoding.is_integer())
                 && item.number()?.fract() != 0.0
             {
@@ -249,11 +256,15 @@ pub(super) fn bind(
         }
         Direction::Input => {
             let (first, second) = bindings::read_input(table)?;
-            push(FileFieldKind::UserInput { name: name.clone(), written, to: first, again: false });
-            if let Some(to) = second {
-                let encoding = Encoding { shared: true, ..encoding };
-                let written = Written { encoding, overflow: Overflow::Usual };
-                push(FileFieldKind::UserInput { name, written, to, again: true });
+            let counter = bindings::read_counter(table, &encoding)?.map(|max| FileInput::Counter { max });
+            let is_used = counter.is_none() || !matches!(first, FileInput::Unused);
+            let uses = [Some(first).filter(|_| is_used), counter, second];
+            for (nth, to) in uses.into_iter().flatten().enumerate() {
+                let again = nth > 0;
+                let shared =
+                    Written { encoding: Encoding { shared: true, ..encoding }, overflow: Overflow::Usual };
+                let written = if again { shared } else { written };
+                push(FileFieldKind::UserInput { name: name.clone(), written, to, again });
             }
         }
     }
@@ -294,6 +305,7 @@ pub(super) fn read_checksum(frame: &Reader<'_>, head: usize, fields: &mut Vec<Fi
     if let Some(item) = table.optional("as") {
         sum.text = item.choice(&[("bytes", false), ("hex", true)])?;
     }
+    sum.data_id = read_data_id(&table)?;
     let nth = match table.optional("at") {
         Some(item) => find_place(&item, head, fields)?,
         None => fields.len(),
@@ -302,8 +314,26 @@ pub(super) fn read_checksum(frame: &Reader<'_>, head: usize, fields: &mut Vec<Fi
     Ok(())
 }
 
+/// `data_id = 0x1234`, low byte first, or a list of bytes.
+fn read_data_id(table: &Reader<'_>) -> Result<DataId> {
+    let Some(item) = table.optional("data_id") else {
+        refuse(table, &["data_id_at"], "allowed only together with data_id")?;
+        return Ok(DataId::NONE);
+    };
+    let bytes: Vec<u8> = if item.is_integer() {
+        item.integer::<u16>(0..=0xFFFF)?.to_le_bytes().to_vec()
+    } else {
+        let list = item.array("of bytes, such as [0x34, 0x12], or a number")?;
+        list.iter().map(|item| item.integer(0..=255)).collect::<Result<_>>()?
+    };
+    let id = DataId::new(&bytes).filter(|id| !id.bytes().is_empty());
+    let id = id.ok_or_else(|| item.error(format!("{} bytes; allowed: 1 to {MAX_DATA_ID}", bytes.len())))?;
+    let place = table.optional("data_id_at").map(|item| item.choice(&[("start", false), ("end", true)]));
+    Ok(if place.transpose()? == Some(true) { id.behind() } else { id })
+}
+
 fn read_algorithm(table: &Reader<'_>) -> Result<Algorithm> {
-    const PLACE: [&str; 5] = ["kind", "over", "at", "order", "as"];
+    const PLACE: [&str; 7] = ["kind", "over", "at", "order", "as", "data_id", "data_id_at"];
     let kind = table.required("kind", "the algorithm, such as \"crc16-modbus\"")?;
     let name = kind.string()?;
     if name != "crc" {
@@ -416,9 +446,11 @@ impl FilePart {
             if let Err(error) = self.lay_out(frame, carrier, part) {
                 return Err(self.spot_of_layout(frame, error).error(document.document, error));
             }
-            let earlier = (0..nth).zip(&self.frames).find(|(_, earlier)| earlier.id == frame.id);
+            let same_id = |(_, earlier): &(u8, &FileFrame)| earlier.id == frame.id;
+            let is_same = |(_, earlier): &(u8, &FileFrame)| !earlier.differs(frame, part);
+            let earlier = (0..nth).zip(&self.frames).filter(same_id).find(is_same);
             if let Some((first, _)) = earlier {
-                return refused(PartError::DuplicateId { frame: nth, first, id: frame.id });
+                return refused(PartError::NotToldApart { frame: nth, first, id: frame.id });
             }
         }
         Ok(())
@@ -454,13 +486,38 @@ impl FilePart {
     }
 }
 
+impl FileFrame {
+    /// Whether a constant tells it from `other`, which has the same id.
+    fn differs(&self, other: &Self, part: Direction) -> bool {
+        let constants = |frame: &Self| {
+            let specs: Vec<_> = frame.fields.iter().map(FileField::spec).collect();
+            Constants::of(&specs, part)
+        };
+        constants(self).differ(&constants(other))
+    }
+}
+
 impl FileRecipe {
+    /// Whether frames of a part have one id.
+    fn repeats_ids(&self) -> bool {
+        let repeats = |part: &FilePart| {
+            let ids = || part.frames.iter().map(|frame| frame.id);
+            ids().enumerate().any(|(nth, id)| ids().take(nth).any(|before| before == id))
+        };
+        self.is_can()
+            && self.mode == Mode::User
+            && [&self.input, &self.output].into_iter().flatten().any(repeats)
+    }
+
     /// Whether it has frames that no recipe of the controller has.
     pub(super) fn is_device(&self) -> bool {
         let parts = [&self.input, &self.output].into_iter().flatten();
         let mut fields = parts.flat_map(|part| &part.frames).flat_map(|frame| &frame.fields);
         let is_cut = [&self.input, &self.output].into_iter().flatten().any(FilePart::is_cut);
-        !self.exchanges.is_empty() || is_cut || fields.any(|field| field.spec().is_device())
+        !self.exchanges.is_empty()
+            || is_cut
+            || self.repeats_ids()
+            || fields.any(|field| field.spec().is_device())
     }
 
     /// What carries the frames of a part.

@@ -20,15 +20,21 @@ pub(super) enum Type {
     Bcd,
     Decimal,
     Hex,
+    /// An unsigned number of so many bytes that is too wide for a value, but has bits.
+    Wide(u8),
 }
 
 /// The types that only a device's frames have.
-const OWN_TYPES: [(&str, Type); 5] = [
+const OWN_TYPES: [(&str, Type); 9] = [
     ("uint24", Type::Uint24),
     ("int24", Type::Int24),
     ("bcd", Type::Bcd),
     ("decimal", Type::Decimal),
     ("hex", Type::Hex),
+    ("uint40", Type::Wide(5)),
+    ("uint48", Type::Wide(6)),
+    ("uint56", Type::Wide(7)),
+    ("uint64", Type::Wide(8)),
 ];
 
 /// The byte order that a part or a field asks for.
@@ -74,7 +80,8 @@ impl Order {
 pub(super) struct OpenNumber {
     bytes: u8,
     order: ByteOrder,
-    taken: u32,
+    /// The bits of its bytes; those of the first byte are the lowest.
+    taken: u64,
 }
 
 /// The type of a field that any recipe can have.
@@ -107,10 +114,12 @@ pub(super) fn read(field: &Reader<'_>, part: Order, open: &mut Option<OpenNumber
         refuse(field, &["width", "until", "decimals"], "a field of bits has no such key")?;
         let bits = read_bits(field, &item, ty)?;
         let order = read_order(field, part, Some(usize::from(bits.bytes)))?;
-        let is_new = field.optional("new").map_or(Ok(false), |item| item.bool())?;
-        let ones = u32::MAX.unbounded_shr(32 - u32::from(bits.count)) << bits.first;
+        let is_new = field.optional("new").map(|item| item.bool()).transpose()?;
+        let ones = places(&bits, order);
         let shared = before.filter(|open| {
-            !is_new && open.bytes == bits.bytes && open.order == order && open.taken & ones == 0
+            // Bits in another order belong to the same bytes only where that is said.
+            let may_share = is_new.map_or(open.order == order, |is_new| !is_new);
+            may_share && open.bytes == bits.bytes && open.taken & ones == 0
         });
         let taken = ones | shared.map_or(0, |open| open.taken);
         *open = Some(OpenNumber { bytes: bits.bytes, order, taken });
@@ -123,12 +132,23 @@ pub(super) fn read(field: &Reader<'_>, part: Order, open: &mut Option<OpenNumber
     Ok(Encoding { order: read_order(field, part, len)?, ..encoding })
 }
 
+/// The bits in the bytes of their number, the first byte the lowest.
+fn places(bits: &Bits, order: ByteOrder) -> u64 {
+    let ones = (u64::MAX >> (64 - u32::from(bits.count))) << bits.first;
+    let mut bytes = [0; 8];
+    order.write(ones, &mut bytes[..usize::from(bits.bytes)]);
+    u64::from_le_bytes(bytes)
+}
+
 fn read_kind(field: &Reader<'_>, ty: Type) -> Result<Kind> {
+    if let Type::Wide(_) = ty {
+        return Err(field.error("a number of more than 4 bytes has no value as a whole; give the field bits"));
+    }
     match ty {
         Type::Scalar(_) | Type::Uint24 | Type::Int24 => {
             refuse(field, &["width"], "only bcd, decimal and hex have a width")?;
         }
-        Type::Bcd | Type::Decimal | Type::Hex => {}
+        Type::Bcd | Type::Decimal | Type::Hex | Type::Wide(_) => {}
     }
     if !matches!(ty, Type::Decimal | Type::Hex) {
         refuse(field, &["until"], "only decimal and hex end with a character")?;
@@ -138,7 +158,7 @@ fn read_kind(field: &Reader<'_>, ty: Type) -> Result<Kind> {
     }
     Ok(match ty {
         Type::Scalar(ty) => Kind::Scalar(ty),
-        Type::Uint24 => Kind::Uint24,
+        Type::Uint24 | Type::Wide(_) => Kind::Uint24,
         Type::Int24 => Kind::Int24,
         Type::Bcd => {
             Kind::Bcd { bytes: field.required("width", "the number of bytes, 1..=4")?.integer(1..=4)? }
@@ -194,14 +214,16 @@ fn read_width(field: &Reader<'_>, most: i64, ends: impl Fn(char) -> bool, digits
     }
 }
 
-/// `bits = 3` or `bits = "4..7"`, of a byte, word or dword.
+/// `bits = 3` or `bits = "4..7"`, of an unsigned number.
 fn read_bits(field: &Reader<'_>, item: &Item<'_>, ty: Type) -> Result<Bits> {
     let bytes = match ty {
         Type::Scalar(ty @ (ScalarType::Byte | ScalarType::Word | ScalarType::Dword)) => ty.size() as u8,
+        Type::Uint24 => 3,
+        Type::Wide(bytes) => bytes,
         _ => {
-            return Err(
-                item.error("only byte, word and dword have bits; with signed = true they may be negative")
-            );
+            return Err(item.error(
+                "only byte, word, dword and uint24 to uint64 have bits; with signed = true they may be negative",
+            ));
         }
     };
     let last_bit = bytes * 8 - 1;
@@ -219,6 +241,9 @@ fn read_bits(field: &Reader<'_>, item: &Item<'_>, ty: Type) -> Result<Bits> {
                 return Err(item.error(format!(
                     "{text:?} is out of range; allowed: bits in 0..{last_bit}, the lowest first"
                 )));
+            }
+            if last - first >= 32 {
+                return Err(item.error(format!("{text:?} are too many; allowed: up to 32 bits")));
             }
             (first, last)
         }

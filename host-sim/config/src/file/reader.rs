@@ -237,6 +237,10 @@ impl<'a> Item<'a> {
             .collect())
     }
 
+    pub(super) fn is_integer(&self) -> bool {
+        matches!(self.node.value, Value::Int(_))
+    }
+
     pub(super) fn is_table(&self) -> bool {
         matches!(self.node.value, Value::Table(_))
     }

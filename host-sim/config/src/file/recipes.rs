@@ -350,7 +350,7 @@ fn read(table: &Reader<'_>, flavour: Flavour) -> Result<FileRecipe> {
     let on_stale = read_on_stale(table, output.is_some(), exchanges.is_empty())?;
     let spot = table.spot.clone();
     let recipe = FileRecipe { on_stale, spot, name, name_spot, mode, kind, input, output, exchanges };
-    let is_device = recipe.is_device();
+    let is_device = flavour == Flavour::Gateway && recipe.is_device();
     for direction in [Direction::Input, Direction::Output] {
         let Some(part) = recipe.part(direction) else { continue };
         if is_device {
@@ -501,7 +501,9 @@ impl FilePart {
             self.frames.get(usize::from(at.frame.unwrap_or(0)))?.fields.get(usize::from(at.field))
         });
         match error {
-            PartError::InvalidId { .. } | PartError::DuplicateId { .. } => frame.map(|frame| &frame.id_spot),
+            PartError::InvalidId { .. } | PartError::DuplicateId { .. } | PartError::NotToldApart { .. } => {
+                frame.map(|frame| &frame.id_spot)
+            }
             _ => delimiter.or(field.map(|field| &field.spot)).or(frame.map(|frame| &frame.spot)),
         }
         .unwrap_or(&self.spot)

@@ -133,7 +133,7 @@ const CASES: &[Case] = &[
     line("a key of a stream in a CAN reply", "reply = { id = 0x701", "reply = { head = [1], id = 0x701"),
     line("no id in a CAN reply", "reply = { id = 0x701, ", "reply = { "),
     line("an id beyond 11 bits in a request", "request = { id = 0x601", "request = { id = 0x801"),
-    line("nine bytes in a CAN reply", "fields = [{ pad = 4 }, { name = \"serial\"", "fields = [{ pad = 5 }, { name = \"serial\""),
+    line("nine bytes in a CAN reply", "{ pad = 3 }, { name = \"serial\"", "{ pad = 4 }, { name = \"serial\""),
     line("a remote reply", "reply = { id = 0x701, ", "reply = { id = 0x701, remote = true, "),
     line("a remote request with fields", "remote = true }", "remote = true, fields = [{ pad = 1 }] }"),
 ];

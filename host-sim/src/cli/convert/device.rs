@@ -30,12 +30,22 @@ pub(in super::super) struct DevicePart {
 #[derive(Debug)]
 struct Format {
     id: Option<CanId>,
-    named: NamedFrame,
     frame: DeviceFrame,
     values: Vec<Value>,
     tail: Vec<u8>,
     /// Its ends are known from outside.
     is_whole: bool,
+    /// One of its fields is the coil of Modbus function 5.
+    has_coil: bool,
+}
+
+/// What tells a frame from others.
+#[derive(Debug, Clone, Copy, Default)]
+struct Told {
+    /// Its ends are known from outside.
+    is_whole: bool,
+    /// Its constants: there are others with its id.
+    is_multiplexed: bool,
 }
 
 /// A field with a value.
@@ -47,6 +57,8 @@ struct Value {
     elements: Vec<usize>,
     /// What is sent if nothing else is asked for.
     constant: Option<f64>,
+    /// The constant tells the frame from others with the same id, so there is nothing else.
+    is_fixed: bool,
 }
 
 #[derive(Debug)]
@@ -72,8 +84,12 @@ impl DevicePart {
     pub(in super::super) fn new(recipe: &DeviceRecipe, direction: Direction) -> Result<Self, String> {
         let ends = recipe.ends(direction);
         let is_whole = ends != FrameEnds::default();
-        let format = |named: &NamedFrame| Format::new(named, recipe.carrier, direction, is_whole);
-        let formats = recipe.part(direction).iter().map(format).collect::<Result<_, _>>()?;
+        let part = recipe.part(direction);
+        let format = |named: &NamedFrame| {
+            let same_id = part.iter().filter(|other| other.id.is_some() && other.id == named.id).count();
+            Format::new(named, recipe.carrier, direction, Told { is_whole, is_multiplexed: same_id > 1 })
+        };
+        let formats = part.iter().map(format).collect::<Result<_, _>>()?;
         Ok(Self { direction, ends, formats })
     }
 
@@ -94,7 +110,7 @@ impl DevicePart {
             _ => Direction::Input,
         };
         let carrier = if named.id.is_some() { Carrier::Can } else { Carrier::Stream };
-        let format = Format::new(named, carrier, direction, false)?;
+        let format = Format::new(named, carrier, direction, Told::default())?;
         Ok(Self { direction, ends: FrameEnds::default(), formats: vec![format] })
     }
 
@@ -108,9 +124,20 @@ impl DevicePart {
         self.formats.iter().map(|format| format.id)
     }
 
-    /// The bytes of the frame with this index, from values in field order or by name.
+    /// The bytes of the frame with this index, from values in field order or by name; or of another one
+    /// with the same id, if only that can have these values.
     pub(super) fn encode(&self, index: usize, tokens: &[String]) -> Result<Vec<u8>, String> {
-        let mut bytes = self.formats.get(index).ok_or("no such frame")?.encode(tokens)?;
+        let format = self.formats.get(index).ok_or("no such frame")?;
+        let others = self.formats.iter().filter(|other| other.id == format.id);
+        let encoded: Vec<_> = others.map(|format| format.encode(tokens)).collect();
+        if encoded.iter().filter(|result| result.is_ok()).count() > 1 {
+            return Err("several frames with this id can have these values; say which constants it has, by \
+                        name"
+                .into());
+        }
+        let first = encoded.first().cloned();
+        let found = encoded.into_iter().find(Result::is_ok).or(first);
+        let mut bytes = found.unwrap_or(Err("no such frame".into()))?;
         if let Some(escape) = self.ends.escape {
             let len = bytes.len();
             bytes.resize(escape.longest(len), 0);
@@ -225,9 +252,11 @@ impl DevicePart {
         notes: &mut dyn std::io::Write,
     ) -> Result<String, String> {
         let id = text::show_id(frame.id());
-        let format = self.formats.iter().find(|format| format.id == Some(frame.id()));
-        let format = format.ok_or_else(|| format!("id {id} is not in the recipe"))?;
         let data = frame.data();
+        let formats = || self.formats.iter().filter(|format| format.id == Some(frame.id()));
+        let fits = |format: &&Format| format.probe(data) == Probe::Frame(data.len());
+        let format = formats().find(fits).or_else(|| formats().next());
+        let format = format.ok_or_else(|| format!("id {id} is not in the recipe"))?;
         match format.probe(data) {
             Probe::Frame(len) if len == data.len() => {
                 let values = format.show(data).map_err(|why| format!("id {id}: {why}"))?;
@@ -258,13 +287,14 @@ impl DevicePart {
 }
 
 /// The fields with a value, each once.
-fn values_of(named: &NamedFrame) -> Vec<Value> {
+fn values_of(named: &NamedFrame, is_multiplexed: bool) -> Vec<Value> {
     let mut values: Vec<Value> = Vec::new();
     let elements = named.fields.iter().filter_map(|field| Some((field, field.spec.element()?)));
     for (nth, (field, element)) in elements.enumerate() {
         let constant = match field.spec {
             FieldSpec::UserOutput { from: OutputBinding::Constant(value), .. }
             | FieldSpec::DeviceOutput { from: OutputBinding::Constant(value), .. } => Some(value),
+            FieldSpec::Fixed { value, .. } if is_multiplexed && !field.name.is_empty() => Some(value as f64),
             FieldSpec::Fixed { .. } | FieldSpec::Padding { .. } | FieldSpec::Length(_) => continue,
             _ => None,
         };
@@ -275,7 +305,11 @@ fn values_of(named: &NamedFrame) -> Vec<Value> {
         };
         match values.last_mut() {
             Some(before) if field.repeats => before.elements.push(nth),
-            _ => values.push(Value { name: field.name.clone(), kind, elements: vec![nth], constant }),
+            _ => {
+                let is_fixed = is_multiplexed && constant.is_some();
+                let name = field.name.clone();
+                values.push(Value { name, kind, elements: vec![nth], constant, is_fixed });
+            }
         }
     }
     values
@@ -286,17 +320,18 @@ impl Format {
         named: &NamedFrame,
         carrier: Carrier,
         direction: Direction,
-        is_whole: bool,
+        Told { is_whole, is_multiplexed }: Told,
     ) -> Result<Self, String> {
         // Cannot fail for the frames of files: reading the file laid them out.
         let frame = named.lay_out(carrier, direction).map_err(|error| error.to_string())?;
-        let (named, values, tail) = (named.clone(), values_of(named), named.tail.clone());
-        Ok(Self { id: named.id, named, frame, values, tail, is_whole })
+        let has_coil = named.fields.iter().any(|field| field.is_coil);
+        let (values, tail) = (values_of(named, is_multiplexed), named.tail.clone());
+        Ok(Self { id: named.id, frame, values, tail, is_whole, has_coil })
     }
 
     /// Makes the coil of Modbus function 5 what it is on the line: FF for 1.
     fn switch_coil(&self, frame: &mut [u8]) {
-        if !self.named.fields.iter().any(|field| field.is_coil) {
+        if !self.has_coil {
             return;
         }
         // Behind slave, function and address; the CRC is the end.
@@ -345,6 +380,14 @@ impl Format {
                 }
                 (ValueKind::Number(_), Some(Ok(Some(scalar)))) => {
                     Ok(Seen { shown: text::show_scalar(*scalar).to_string(), is_finite: scalar.is_finite() })
+                }
+                // The probe has compared it.
+                (_, Some(Ok(None))) if value.is_fixed => {
+                    let constant = value.constant.unwrap_or(f64::NAN);
+                    Ok(Seen {
+                        shown: text::show_scalar(Scalar::Double(constant)).to_string(),
+                        is_finite: true,
+                    })
                 }
                 (_, Some(Err(error))) => Err(format!("{}: {error}", value.name)),
                 _ => Err(format!("{}: no value", value.name)),
@@ -443,7 +486,11 @@ impl Format {
                 ValueKind::Number(encoding) => parse(encoding, shown).map(Given::Number),
                 ValueKind::Text => text::parse_text(shown).map(Given::Text),
             };
-            all[place] = Some(given.map_err(|error| format!("{}: {error}", value.name))?);
+            let given = given.map_err(|error| format!("{}: {error}", value.name))?;
+            if value.is_fixed && !matches!(given, Given::Number(number) if value.constant == Some(number)) {
+                return Err(format!("{}: this frame has another constant", value.name));
+            }
+            all[place] = Some(given);
         }
         let constant = |value: &Value| value.constant.map(Given::Number);
         let all =

@@ -396,3 +396,45 @@ proptest! {
         }
     }
 }
+
+/// A battery whose frames have one id, and the number of the first cell tells them apart.
+const BATTERY: &str = r#"
+[controller]
+address = "192.168.1.10"
+
+[[recipe]]
+name = "battery"
+kind = "can"
+mode = "user"
+
+[[recipe.input.frame]]
+id = 0x200
+fields = [{ name = "first", type = "byte", equals = 1 }, { name = "volt", type = "word", to = "WordInputReg[1]" }]
+
+[[recipe.input.frame]]
+id = 0x200
+fields = [{ name = "first", type = "byte", equals = 3 }, { name = "volt", type = "word", to = "WordInputReg[2]" }]
+
+[[recipe.input.frame]]
+id = 0x200
+fields = [{ name = "first", type = "byte", equals = 9 }, { name = "celsius", type = "byte", to = "WordInputReg[3]" }]
+"#;
+
+#[test]
+fn frames_with_one_id_are_shown_and_made_by_their_constant() {
+    let recipes = parse_recipes(Text { name: "battery.toml", toml: BATTERY }, &[]).unwrap();
+    let part = Part::choose(&recipes, None, Some(Direction::Input)).unwrap();
+    let lines = "200#030A00\n200#0937\n200#010B00\n";
+    let values = "id=0x200 first=3 volt=10\nid=0x200 first=9 celsius=55\nid=0x200 first=1 volt=11\n";
+    assert_eq!(decoded(&part, lines), (values.into(), String::new()));
+    assert_eq!(encoded(&part, values).unwrap(), lines);
+    let id = || Some(0x200);
+    assert_eq!(from_values(&part, id(), &["celsius=55"]).unwrap(), "200#0937");
+    let two = from_values(&part, id(), &["volt=10"]).unwrap_err();
+    assert!(two.starts_with("several frames with this id can have these values"), "{two}");
+    let none = from_values(&part, id(), &["first=2", "volt=10"]).unwrap_err();
+    assert_eq!(none, "first: this frame has another constant");
+    let (shown, notes) = decoded(&part, "200#040A00\n200#0937\n");
+    assert_eq!(shown, "id=0x200 first=9 celsius=55\n");
+    assert!(notes.contains("id 0x200: other constants, so not this frame"), "{notes}");
+}

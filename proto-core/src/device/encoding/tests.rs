@@ -221,3 +221,23 @@ proptest! {
         }
     }
 }
+
+/// Signals of CAN databases: the 12 bits from bit 28 of a message of 8 bytes on, which lie in its bytes
+/// 3 and 4, and the same in Motorola's order.
+#[test]
+fn bits_of_eight_bytes_cross_any_byte() {
+    let intel = Encoding::bits_of(8, 28..=39);
+    let mut bytes = [0; 8];
+    assert_eq!(intel.write(f64::from(0xABC), &mut bytes), Some(8));
+    assert_eq!(bytes, [0, 0, 0, 0xC0, 0xAB, 0, 0, 0]);
+    assert_eq!(intel.read(&bytes), Ok(Scalar::Dword(0xABC)));
+    let motorola = Encoding { order: ByteOrder::Big, ..intel };
+    let mut bytes = [0; 8];
+    motorola.write(f64::from(0xABC), &mut bytes);
+    assert_eq!(bytes, [0, 0, 0, 0xAB, 0xC0, 0, 0, 0]);
+    // Side by side, signed, and as wide as they can be.
+    let highest = Encoding::bits_of(8, 32..=63).signed();
+    highest.write(-2.0, &mut bytes);
+    assert_eq!(highest.read(&bytes), Ok(Scalar::Int(-2)));
+    assert_eq!(bytes, [0, 0, 0, 0xAB, 0xFE, 0xFF, 0xFF, 0xFF]);
+}

@@ -224,7 +224,7 @@ impl FrameLayout {
 pub(super) fn check_elements(elements: &[Element], direction: Direction) -> Result<(), LayoutError> {
     // The newest element that shares its place with none before: its length and the byte that ends
     // it, its order, and which of its bits are taken.
-    let mut place: Option<(Encoding, u32)> = None;
+    let mut place: Option<(Encoding, u64)> = None;
     let mut has_length = false;
     for (nth, element) in elements.iter().enumerate() {
         let nth = nth as u8;
@@ -250,7 +250,7 @@ pub(super) fn check_elements(elements: &[Element], direction: Direction) -> Resu
                 return Err(LayoutError::Constant { element: nth });
             }
         }
-        let ones = element.bits().map_or(u32::MAX, |bits| bits.mask());
+        let ones = element.bits().map_or(u64::MAX, |bits| bits.places(encoding.order));
         place = match place {
             _ if !encoding.shared => Some((encoding, ones)),
             Some((first, taken)) if may_share(&first, &encoding, taken & ones, direction) => {
@@ -263,7 +263,7 @@ pub(super) fn check_elements(elements: &[Element], direction: Direction) -> Resu
 }
 
 /// Whether `second` may have the place of `first`; `both` are the bits that both have.
-fn may_share(first: &Encoding, second: &Encoding, both: u32, direction: Direction) -> bool {
+fn may_share(first: &Encoding, second: &Encoding, both: u64, direction: Direction) -> bool {
     match direction {
         Direction::Input => match (first.size(), second.size()) {
             (Some(first), Some(second)) => second <= first,
@@ -271,7 +271,7 @@ fn may_share(first: &Encoding, second: &Encoding, both: u32, direction: Directio
         },
         Direction::Output => {
             let are_bits = matches!((first.kind, second.kind), (Kind::Bits(_), Kind::Bits(_)));
-            are_bits && first.size() == second.size() && first.order == second.order && both == 0
+            are_bits && first.size() == second.size() && both == 0
         }
     }
 }
@@ -293,8 +293,8 @@ fn check_encoding(encoding: &Encoding, element: u8) -> Result<(), LayoutError> {
         }
         Kind::Bits(Bits { bytes, first, count, .. }) => {
             let all = u16::from(bytes).saturating_mul(8);
-            matches!(bytes, 1 | 2 | 4)
-                && count > 0
+            matches!(bytes, 1..=8)
+                && matches!(count, 1..=32)
                 && u16::from(first).saturating_add(u16::from(count)) <= all
         }
     };

@@ -444,3 +444,39 @@ fn the_checksum_in_a_frame_is_told_with_the_right_one() {
     let plain = FrameLayout::new(Carrier::Stream, Direction::Input, b"$", b"\r\n", &elements, None);
     assert_eq!(plain.unwrap().checksums(&elements, b"$AB,\r\n"), None);
 }
+
+/// The examples of AUTOSAR's document 849 (E2E protocol specification, R20-11) for profile 11, with
+/// which profile 1 is interoperable, and for profile 22 with one data id; the crate autosar-e2e 1.0.0
+/// tests the same bytes. All data is zero.
+#[test]
+fn a_checksum_covers_a_data_id_that_is_not_in_the_frame() {
+    let counter = fixed(ScalarType::Byte, 0);
+    let frame = |kind: &str, id: DataId, header: i64| {
+        let header = match counter {
+            Element::Fixed { encoding, .. } => Element::Fixed { encoding, value: header },
+            other => other,
+        };
+        let elements = [header, Element::Padding { len: 6, fill: 0 }];
+        let sum = Checksum::standard(Algorithm::named(kind).unwrap()).over(1, Some(7)).with_data_id(id);
+        let layout =
+            FrameLayout::new(Carrier::Can, Direction::Output, &[], &[], &elements, Some((sum, 0))).unwrap();
+        let bytes = encoded(&layout, &elements, &[0.0; 2]);
+        assert_eq!(layout.probe_whole(&elements, &bytes), Probe::Frame(8));
+        let wrong = Checksum { data_id: DataId::NONE, ..sum };
+        let without =
+            FrameLayout::new(Carrier::Can, Direction::Input, &[], &[], &elements, Some((wrong, 0))).unwrap();
+        assert_eq!(without.probe_whole(&elements, &bytes), Probe::Wrong(8), "for somebody else");
+        (bytes[0], bytes[1])
+    };
+    let both = DataId::new(&0x123_u16.to_le_bytes()).unwrap();
+    assert_eq!(frame("crc8-gsm-a", both, 0), (0xCC, 0x00));
+    assert_eq!(frame("crc8-gsm-a", both, 1), (0x91, 0x01));
+    // The high nibble of the id is in the frame.
+    let nibble = DataId::new(&[0x23, 0]).unwrap();
+    assert_eq!(frame("crc8-gsm-a", nibble, 0x10), (0x2A, 0x10));
+    assert_eq!(frame("crc8-gsm-a", nibble, 0x11), (0x77, 0x11));
+    let behind = |id| DataId::new(&[id]).unwrap().behind();
+    assert_eq!(frame("crc8-autosar", behind(2), 1), (0x1B, 0x01));
+    assert_eq!(frame("crc8-autosar", behind(3), 2), (0x98, 0x02));
+    assert_eq!(DataId::new(&[0; 5]), None);
+}

@@ -1,0 +1,105 @@
+//! Frames with one CAN id, which a constant tells apart: multiplexed ones, in the words of CAN
+//! databases.
+//!
+//! In: the fields of frames. Out: which of their bits are always the same, and whether two frames
+//! differ in one of them.
+
+use super::{ConfigView, DeviceFrame, FieldSpec, OutputBinding, Parts, Recipe};
+use crate::device::{Carrier, Encoding, Kind, Overflow, Part};
+use crate::recipe::model::Mode;
+use crate::sysvar::Direction;
+use crate::wire::can::{CanId, MAX_CAN_DATA};
+
+/// The bits of a CAN frame that are the same in every frame.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Constants {
+    mask: [u8; MAX_CAN_DATA],
+    value: [u8; MAX_CAN_DATA],
+}
+
+impl Constants {
+    /// Those of a frame with these fields; none if it cannot be laid out.
+    pub fn of(fields: &[FieldSpec], part: Direction) -> Self {
+        let mut constants = Self::default();
+        let Ok(frame) = DeviceFrame::new(Carrier::Can, part, (&[], &[]), fields) else { return constants };
+        frame.layout.parts(&frame.elements, |part, place| {
+            let Part::Element(nth) = part else { return };
+            let field = fields.iter().filter(|field| field.element().is_some()).nth(nth);
+            if let (Some((encoding, value)), Some(at)) = (field.and_then(constant), place.at) {
+                constants.add(at, &encoding, value);
+            }
+        });
+        constants
+    }
+
+    fn add(&mut self, at: usize, encoding: &Encoding, value: f64) {
+        let (Some(mask), Some(bytes)) = (self.mask.get_mut(at..), self.value.get_mut(at..)) else { return };
+        match encoding.kind {
+            // All ones, beside the other bits of the number.
+            Kind::Bits(_) => {
+                encoding.write(-1.0, mask);
+            }
+            _ => mask.iter_mut().take(encoding.size().unwrap_or(0)).for_each(|byte| *byte = 0xFF),
+        }
+        encoding.write(value, bytes);
+    }
+
+    /// Whether a bit that is the same in every frame of both is not the same in both.
+    pub fn differ(&self, other: &Self) -> bool {
+        let masks = self.mask.iter().zip(&other.mask).map(|(one, other)| one & other);
+        let values = self.value.iter().zip(&other.value).map(|(one, other)| one ^ other);
+        masks.zip(values).any(|(mask, value)| mask & value != 0)
+    }
+}
+
+/// How a constant is written, and its value as it is sent.
+fn constant(field: &FieldSpec) -> Option<(Encoding, f64)> {
+    let (encoding, overflow, value) = match *field {
+        FieldSpec::Fixed { encoding, value } => (encoding, Overflow::Usual, value as f64),
+        FieldSpec::UserOutput { ty, from: OutputBinding::Constant(value) } => {
+            (Encoding::scalar(ty), Overflow::Usual, value)
+        }
+        FieldSpec::DeviceOutput { encoding, overflow, from: OutputBinding::Constant(value) } => {
+            (encoding, overflow, value)
+        }
+        _ => return None,
+    };
+    Some((encoding, encoding.fit(value, overflow)?))
+}
+
+impl<'c> ConfigView<'c> {
+    /// The CAN ids of the frames that a device sends to a port with this recipe (input), or that the
+    /// port sends (output), those of exchanges included; each once.
+    pub fn can_ids(self, recipe: &'c Recipe, part: Direction) -> impl Iterator<Item = CanId> + 'c {
+        let all = move || self.all_can_ids(recipe, part);
+        all()
+            .enumerate()
+            .filter(move |&(nth, id)| all().take(nth).all(|before| before != id))
+            .map(|(_, id)| id)
+    }
+
+    fn all_can_ids(self, recipe: &'c Recipe, part: Direction) -> impl Iterator<Item = CanId> + 'c {
+        let frames = match (&recipe.parts, part) {
+            (Parts::Can { input, .. }, Direction::Input) => &input[..],
+            (Parts::Can { output, .. }, Direction::Output) => &output[..],
+            (Parts::Stream { .. }, _) => &[],
+        };
+        let exchanges = self.exchanges_of(recipe).iter();
+        let asked = exchanges.flat_map(move |exchange| exchange.frames(part));
+        let ids = asked.filter_map(move |nth| self.frames.get(usize::from(nth))?.id);
+        frames.iter().map(|frame| frame.id).chain(ids)
+    }
+}
+
+impl Recipe {
+    /// Whether frames of a part have one id: only frames of devices do.
+    pub(crate) fn repeats_ids(&self) -> bool {
+        let Parts::Can { input, output } = &self.parts else { return false };
+        self.mode == Mode::User
+            && [input, output].into_iter().any(|frames| {
+                (0_usize..)
+                    .zip(frames)
+                    .any(|(nth, frame)| frames.iter().take(nth).any(|before| before.id == frame.id))
+            })
+    }
+}
