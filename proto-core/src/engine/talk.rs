@@ -427,6 +427,10 @@ impl FieldPort {
     }
 
     fn begin_talk(&mut self, mut view: View<'_>, now: Instant) {
+        if let Codec::Device(DeviceCodec { reader: Some(Reader::Slave(slave)), .. }) = &mut self.codec {
+            // What came while the line was not there is too old to be answered.
+            add(&mut self.counters.discarded_bytes, slave.discard());
+        }
         let Some(line) = self.line_mut() else { return };
         let (items, mut talks) = view.of(line);
         for item in items {

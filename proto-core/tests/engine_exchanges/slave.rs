@@ -124,3 +124,18 @@ fn a_reply_is_too_late_when_the_line_goes_on() {
     rig.run(MS(5));
     assert_eq!(rig.sent_to(port), Vec::<Vec<u8>>::new());
 }
+
+#[test]
+fn what_came_while_the_line_was_not_there_is_not_answered() {
+    let (mut rig, port) = plc();
+    rig.run(MS(10));
+    rig.input(proto_core::engine::Input::PortDown { port });
+    rig.take_written();
+    rig.bytes(port, &with_crc(&[5, 16, 0, 0, 0, 2, 4, 0, 1, 0, 2]));
+    rig.now = rig.now + MS(40);
+    rig.input(proto_core::engine::Input::PortUp { port });
+    rig.run(MS(10));
+    assert_eq!(rig.sent_to(port), Vec::<Vec<u8>>::new());
+    assert!(!rig.take_written().contains(&Written::Registers(8, vec![1, 2])));
+    assert_eq!(rig.counters(port).discarded_bytes, 13);
+}
