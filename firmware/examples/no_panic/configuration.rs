@@ -60,7 +60,11 @@ fn config_questions(config: &GatewayConfig) {
         black_box(port.bus.is_field());
         if let proto_core::config::Bus::Rs485(line) = &port.bus {
             let _ = black_box(line.check());
-            black_box((line.bits_per_character(), line.time_on_line(any(7))));
+            black_box((line.bits_per_character(), line.time_on_line(any(7)), line.with_rtu_silence()));
+        }
+        black_box(config.view().line_share(port));
+        for exchange in &config.exchanges {
+            black_box(config.view().exchange_budget(port, exchange));
         }
     }
     config.view().warnings().for_each(|warning| _ = black_box(warning));
@@ -69,6 +73,11 @@ fn config_questions(config: &GatewayConfig) {
         config.view().fields_of(recipe, any(Direction::Input)).for_each(|field| _ = black_box(field));
         black_box(config.view().is_device(recipe));
         config.view().written_by(recipe).for_each(|var| _ = black_box(var));
+        config.view().bits_written_by(recipe).for_each(|bit| _ = black_box(bit));
+        config.view().exchanges_of(recipe).iter().for_each(|exchange| _ = black_box(exchange));
+        for port in &config.ports {
+            config.view().owned_by(port, recipe).for_each(|var| _ = black_box(var));
+        }
     }
     for field in &config.fields {
         black_box(field.variable());

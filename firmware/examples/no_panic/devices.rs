@@ -4,7 +4,8 @@ use core::hint::black_box;
 
 use proto_core::config::{DeviceFrame, FieldSpec};
 use proto_core::device::{
-    Algorithm, ByteOrder, Carrier, Checksum, Element, Encoding, FrameLayout, Framer, Overflow,
+    Algorithm, Boundary, ByteOrder, Carrier, Checksum, Cutter, Element, Encoding, Escape, FrameLayout,
+    Framer, Overflow, Text, TextWidth,
 };
 use proto_core::sysvar::Direction;
 use proto_core::wire::scalar::ScalarType;
@@ -23,6 +24,8 @@ pub(crate) fn all() {
         }
     }
     device_frame();
+    device_cutter();
+    device_text();
 }
 
 fn elements() -> &'static [Element] {
@@ -77,7 +80,12 @@ fn device_codec(layout: &FrameLayout) {
     let mut out = [0; 512];
     black_box((layout.lengths(), layout.probe(elements(), bytes())));
     layout.values(elements(), bytes()).for_each(|value| _ = black_box(value));
+    black_box(layout.probe_whole(elements(), bytes()));
+    black_box(layout.text(elements(), bytes(), any(1)));
+    layout.parts(elements(), |part, place| _ = black_box((part, place)));
+    black_box((layout.checksums(elements(), bytes()), layout.tail()));
     black_box(layout.encode(elements(), |_| any(0.5), room(&mut out)));
+    black_box(layout.encode_with(elements(), |_| any(0.5), |_, _| any(Some(3)), room(&mut out)));
 }
 
 #[inline(never)]
@@ -103,4 +111,24 @@ fn device_frame() {
     if let Ok(frame) = DeviceFrame::new(carrier, direction, (bytes(), bytes()), fields) {
         black_box(&frame);
     }
+}
+
+#[inline(never)]
+fn device_cutter() {
+    let Some(mut cutter) = Cutter::new(any(Boundary::Fields), any(Some(Escape::Slip))) else { return };
+    let (cutter, mut chunk, mut out) = (black_box(&mut cutter), bytes(), [0; 512]);
+    while let Some(piece) = cutter.next_piece(&mut chunk, bytes()) {
+        black_box(piece);
+    }
+    black_box(cutter.silence());
+    black_box((cutter.held(), cutter.has_begun(), cutter.ends_by_silence()));
+    black_box((cutter.discard(), cutter.skipped_bytes()));
+    let escape = any(Escape::Slip);
+    black_box((escape.longest(any(7)), escape.stuff(any(7), room(&mut out))));
+}
+
+#[inline(never)]
+fn device_text() {
+    let text = any(Text { width: TextWidth::Fixed(8), fill: None });
+    black_box(text.trimmed(bytes()));
 }

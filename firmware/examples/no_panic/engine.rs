@@ -17,8 +17,10 @@ use crate::any;
 /// Stands in .bss: all its bytes are zero, which `.ci/run` looks at.
 static ENGINE: ConstStaticCell<Engine> = ConstStaticCell::new(Engine::idle());
 
-/// One that can be listened to.
-type EngineWithTap = AnyEngine<2, 1, 32, 2048>;
+/// One that can be listened to, with few exchanges.
+type EngineWithTap = AnyEngine<2, 1, 32, 2048, 4>;
+/// One that cannot have a conversation.
+type PlainEngine = AnyEngine<2, 1, 32, 0, 0>;
 
 pub(crate) fn all() {
     static CONFIG: GatewayConfig = GatewayConfig::empty();
@@ -31,6 +33,7 @@ pub(crate) fn all() {
     engine_questions(black_box(&*gateway));
     engine_status(black_box(&*gateway), any(Instant::ZERO));
     engine_tap();
+    engine_plain();
     process_image(black_box(gateway.image()));
     grid();
 }
@@ -61,6 +64,7 @@ fn engine_poll_output(gateway: &mut Engine, now: Instant, out: &mut [u8; OUTPUT_
 fn engine_questions(gateway: &Engine) {
     let port = any(PortId(0));
     black_box((gateway.deadline(), gateway.port_counters(port), gateway.reply_code(port), gateway.image()));
+    black_box((gateway.port_state(port), gateway.latency()));
     black_box((gateway.sleeps(), gateway.is_frame(any(LinkId::RECIPE_UDP), any(&[0; 8][..]))));
     gateway.field_ports().for_each(|port| _ = black_box(port));
     for link in gateway.links() {
@@ -76,6 +80,9 @@ fn engine_status(gateway: &Engine, now: Instant) {
     status.links().for_each(|link| _ = black_box(link));
     for port in status.ports() {
         black_box((port, port.state.name(), port.reply.name()));
+        for peer in port.peers() {
+            black_box((peer, peer.presence.name()));
+        }
         if let Some(rejection) = port.last_rejection {
             black_box((rejection.bytes(), rejection.why.text()));
         }
@@ -90,11 +97,24 @@ fn engine_status(gateway: &Engine, now: Instant) {
 fn engine_tap() {
     static TAPPED: ConstStaticCell<EngineWithTap> = ConstStaticCell::new(EngineWithTap::idle());
     let Some(gateway) = TAPPED.try_take() else { return };
+    static CONFIG: GatewayConfig = GatewayConfig::empty();
     let gateway = black_box(gateway);
+    let _ = black_box(gateway.configure(black_box(&CONFIG)));
     gateway.tap().listen(any(true));
     gateway.handle(any(Instant::ZERO), any(Input::Tick));
     black_box(gateway.poll_output(any(Instant::ZERO), &mut [0; OUTPUT_BUFFER]));
     black_box((gateway.tap().is_listening(), gateway.tap().next(&mut [0; MAX_TAPPED])));
+}
+
+#[inline(never)]
+fn engine_plain() {
+    static PLAIN: ConstStaticCell<PlainEngine> = ConstStaticCell::new(PlainEngine::idle());
+    static CONFIG: GatewayConfig = GatewayConfig::empty();
+    let Some(gateway) = PLAIN.try_take() else { return };
+    let gateway = black_box(gateway);
+    let _ = black_box(gateway.configure(black_box(&CONFIG)));
+    gateway.handle(any(Instant::ZERO), any(Input::Tick));
+    black_box(gateway.poll_output(any(Instant::ZERO), &mut [0; OUTPUT_BUFFER]));
 }
 
 #[inline(never)]

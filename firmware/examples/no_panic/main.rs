@@ -12,6 +12,7 @@ mod devices;
 mod engine;
 mod protocols;
 mod recipes;
+mod rtu;
 mod state;
 mod words;
 mod zeros;
@@ -40,6 +41,7 @@ fn exercise() {
     engine::all();
     recipes::all();
     protocols::all();
+    rtu::all();
     state::all();
     zeros::all();
     match VARIANT {

@@ -1,18 +1,15 @@
 //! Any configuration, any inputs of a driver that keeps the contract (docs/driver.md)
 //! or does not: the engine keeps its side of it, and does no more for one input than it may.
 
-use proto_core::config::{
-    Bus, CommandWhen, FieldSpec, GatewayConfig, InputBinding, OnStale, OutputBinding, Parts, SendOn, image,
-};
+use proto_core::config::{FieldSpec, GatewayConfig, Parts, image};
 use proto_core::engine::{BusState, Engine, Input, LinkId, LinkKind, OUTPUT_BUFFER, Output, PortId};
-use proto_core::recipe::model::Mode;
-use proto_core::sysvar::{Direction, SysVar};
 use proto_core::time::{Duration, Instant};
-use proto_core::wire::can::{CanFrame, CanId};
-use proto_core::wire::scalar::ScalarType;
+use proto_core::wire::can::CanFrame;
 
-use crate::rig::Cell;
-use crate::source::Source;
+use crate::any_config::config;
+use crate::any_device;
+use crate::any_frames::{self, Said};
+use crate::source::{Source, cut};
 
 /// Inputs of one run.
 const MOST: usize = 200;
@@ -48,181 +45,6 @@ pub(crate) fn run(input: &[u8]) {
     }
 }
 
-/// A configuration; `None` when there is no room for what the input asks.
-pub(crate) fn config(input: &mut Source<'_>) -> Option<Box<GatewayConfig>> {
-    let mut cell = Cell::new();
-    let recipes = 1 + input.below(5);
-    for _ in 0..recipes {
-        recipe(&mut cell, input)?;
-    }
-    let kind = input.u8();
-    if kind & 1 == 1 {
-        cell.recipe_link(input.below(recipes) as u8);
-    }
-    for _ in 0..=(kind >> 5) {
-        port(&mut cell, input, recipes)?;
-    }
-    Some(Box::new(cell.0))
-}
-
-fn var(input: &mut Source<'_>, direction: Direction) -> SysVar {
-    // Those of which there are many, and those with edges, alike.
-    let groups: &[&str] = match direction {
-        Direction::Input => {
-            &["DigitalOutputCommand", "BitInputReg", "WordInputReg", "FloatInputReg", "ForceEnd", "ForceBase"]
-        }
-        Direction::Output => &[
-            "DigitalSignalStatus",
-            "RobotState",
-            "BitOutputReg",
-            "WordOutputReg",
-            "FloatOutputReg",
-            "RobotState",
-        ],
-    };
-    let group = input.one_of(groups);
-    let vars: Vec<SysVar> = SysVar::all().filter(|var| var.group() == group).collect();
-    input.one_of(&vars)
-}
-
-fn fields(
-    input: &mut Source<'_>,
-    mode: Mode,
-    direction: Direction,
-    table: proto_core::config::Span,
-    most: usize,
-) -> Vec<FieldSpec> {
-    let count = 1 + input.below(most);
-    let mut fields = Vec::new();
-    for _ in 0..count {
-        let kind = input.u8();
-        let ty = ScalarType::ALL[usize::from(kind & 7)];
-        let (scale, offset) = ([1.0, 0.5, -2.0, 1000.0][usize::from(kind >> 6)], f32::from(kind >> 5 & 1));
-        let which = kind >> 3 & 3;
-        let any = if input.flag() { Direction::Input } else { Direction::Output };
-        let field = match (mode, direction) {
-            (Mode::Realtime, direction) => {
-                let first = var(input, direction);
-                let range = (first.ordinal()..first.ordinal() + usize::from(kind >> 5) + 1)
-                    .map_while(SysVar::from_ordinal);
-                fields
-                    .extend(range.skip(1).filter(|var| var.direction() == direction).map(FieldSpec::System));
-                FieldSpec::System(first)
-            }
-            (Mode::User, Direction::Input) => FieldSpec::UserInput {
-                ty,
-                to: match which {
-                    0 => InputBinding::Unused,
-                    1 => InputBinding::Commands {
-                        table,
-                        when: match kind >> 5 & 3 {
-                            0 => CommandWhen::Change,
-                            2 => CommandWhen::Kept,
-                            _ => CommandWhen::Frame,
-                        },
-                    },
-                    2 if kind >> 6 == 3 => {
-                        InputBinding::Bit { var: var(input, Direction::Input), bit: input.u8() & 7 }
-                    }
-                    _ => InputBinding::Variable { var: var(input, Direction::Input), scale, offset },
-                },
-            },
-            (Mode::User, Direction::Output) => FieldSpec::UserOutput {
-                ty,
-                from: match which {
-                    0 => OutputBinding::Counter,
-                    1 => OutputBinding::Reply,
-                    2 => OutputBinding::Constant(f64::from(kind)),
-                    _ if kind >> 6 == 3 => OutputBinding::Bit { var: var(input, any), bit: input.u8() & 7 },
-                    _ => OutputBinding::Variable { var: var(input, any), scale, offset },
-                },
-            },
-        };
-        fields.push(field);
-    }
-    fields
-}
-
-fn recipe(cell: &mut Cell, input: &mut Source<'_>) -> Option<()> {
-    let kind = input.u8();
-    let mode = if kind & 1 == 0 { Mode::Realtime } else { Mode::User };
-    let table = if mode == Mode::User && cell.0.commands.len() < 20 {
-        cell.commands(&[
-            (0, "stop"),
-            (1, "run(pick.jspf,50)"),
-            (2, "state"),
-            (3, "getlasterror"),
-            (4, "pause"),
-            (5, "poweroff"),
-        ])
-    } else {
-        proto_core::config::Span::default()
-    };
-    let room = |cell: &Cell, more: usize| (cell.0.fields.len() + more <= 1024).then_some(());
-    let parts = if kind & 2 == 0 {
-        let mut part = |which: u8, direction, delimiters: [&[u8]; 2]| {
-            if which != 0 && kind & which == 0 {
-                return Some(None);
-            }
-            let fields = fields(input, mode, direction, table, 12);
-            room(cell, fields.len())?;
-            let span = cell.fields(fields);
-            Some(cell.part(delimiters[0], delimiters[1], span))
-        };
-        let head: &[u8] = if kind & 16 == 0 { &[255, 255] } else { &[] };
-        let input = part(4, Direction::Input, [head, &[238, 238]])?;
-        let output = part(if input.is_some() { 8 } else { 0 }, Direction::Output, [head, &[254, 254]])?;
-        Parts::Stream { input, output }
-    } else {
-        let mut part = |first: u16, direction| {
-            let count = input.below(6);
-            let mut frames = heapless::Vec::new();
-            for nth in 0..count as u16 {
-                let fields = fields(input, mode, direction, table, 2);
-                room(cell, fields.len())?;
-                let id = if nth == 4 {
-                    CanId::Extended(0x1FFF_FF00 | u32::from(nth))
-                } else {
-                    CanId::Standard(first + nth)
-                };
-                frames.push(proto_core::config::CanFramePart { id, fields: cell.fields(fields) }).ok()?;
-            }
-            Some(frames)
-        };
-        Parts::Can { input: part(1, Direction::Input)?, output: part(10, Direction::Output)? }
-    };
-    cell.recipe(mode, parts);
-    cell.last_recipe().on_stale = if kind & 32 == 0 { OnStale::Hold } else { OnStale::Stop };
-    if mode == Mode::User {
-        cell.last_recipe().send = match kind >> 6 {
-            0 => SendOn::Period,
-            1 => SendOn::Change,
-            2 => SendOn::Frame,
-            _ => SendOn::Rising { var: var(input, Direction::Output), bit: input.u8() & 7 },
-        };
-    }
-    Some(())
-}
-
-fn port(cell: &mut Cell, input: &mut Source<'_>, recipes: usize) -> Option<()> {
-    let (kind, recipe) = (input.u8(), input.below(recipes) as u8);
-    let listen = || heapless::String::try_from("0.0.0.0:50000").ok();
-    match kind & 7 {
-        0..4 => drop(cell.rs485(recipe)),
-        4 | 5 => drop(cell.can_port(recipe)),
-        6 => drop(cell.port(Bus::TcpListen { listen: listen()? }, recipe)),
-        _ => drop(cell.port(Bus::UdpListen { listen: listen()? }, recipe)),
-    }
-    let port = cell.last_port();
-    port.cycle = Duration::from_millis([4, 5, 20, 100][usize::from(kind >> 3 & 3)]);
-    port.timeout = Duration::from_millis([20, 100, 1_500][usize::from(kind >> 5) % 3]);
-    if kind & 128 != 0 && cell.0.safe_values.len() < 60 {
-        let var = var(input, Direction::Input);
-        cell.safe(&var.to_string(), f64::from(input.u8() & 3));
-    }
-    Some(())
-}
-
 struct Driver {
     config: Box<GatewayConfig>,
     engine: Box<Engine<8, 4, 512>>,
@@ -234,6 +56,9 @@ struct Driver {
     links: [Link; LINKS],
     /// The newest Modbus request.
     asked: Vec<u8>,
+    said: [Said; 9],
+    /// When the engine was called last.
+    called: Instant,
 }
 
 #[derive(Clone, Copy, Default)]
@@ -263,6 +88,8 @@ impl Driver {
             ports: [Port::default(); 9],
             links: [Link::default(); LINKS],
             asked: Vec::new(),
+            said: Default::default(),
+            called: Instant::ZERO,
         };
         for info in driver.engine.links() {
             let datagram = matches!(info.kind, LinkKind::RecipeUdp | LinkKind::RecipeUdpListen { .. });
@@ -300,14 +127,21 @@ impl Driver {
         match op % 16 {
             1 => {
                 self.ports[p].up = true;
+                self.said[p].awaits = None;
                 self.handle(Input::PortUp { port });
             }
             2 => {
                 self.ports[p] = Port::default();
+                self.said[p].awaits = None;
                 self.handle(Input::PortDown { port });
             }
             3 if !self.honest || self.ports[p].sending > 0 => {
                 self.ports[p].sending = 0;
+                if self.said[p].awaits.is_some() {
+                    // From now on the reply may come.
+                    self.said[p].awaits =
+                        any_frames::shortest_wait(&self.config, p).map(|wait| self.now + wait);
+                }
                 self.handle(Input::PortSent { port });
             }
             4 => {
@@ -316,6 +150,7 @@ impl Driver {
                 if state == BusState::BusOff {
                     // What was handed over is lost with it.
                     self.ports[p].sending = 0;
+                    self.said[p].awaits = None;
                 }
                 self.handle(Input::PortBus { port, state });
             }
@@ -344,7 +179,7 @@ impl Driver {
             9 | 10 => self.field_frame(port, input, op),
             11 => {
                 let bytes = input.take(pass as usize + 1).to_vec();
-                self.handle(Input::PortBytes { port, bytes: &bytes });
+                self.port_bytes(port, &bytes);
             }
             12 => {
                 let bytes = input.take(pass as usize + 1).to_vec();
@@ -383,6 +218,12 @@ impl Driver {
         }
     }
 
+    fn port_bytes(&mut self, port: PortId, bytes: &[u8]) {
+        // Perhaps they are the reply.
+        self.said[usize::from(port.0)].awaits = None;
+        self.handle(Input::PortBytes { port, bytes });
+    }
+
     /// The right answer to the newest Modbus request.
     fn modbus_answer(&mut self, op: u8) {
         let mut answer = self.asked.clone();
@@ -401,7 +242,21 @@ impl Driver {
 
     /// A frame of the port's recipe, its values from the input.
     fn field_frame(&mut self, port: PortId, input: &mut Source<'_>, op: u8) {
-        let Some(of) = self.config.ports.get(usize::from(port.0)) else { return };
+        let nth = usize::from(port.0);
+        let Some(of) = self.config.ports.get(nth) else { return };
+        let recipe = &self.config.recipes[usize::from(of.recipe)];
+        if self.config.view().is_device(recipe) || recipe.exchanges.len > 0 {
+            if matches!(recipe.parts, Parts::Can { .. }) {
+                if let Some(frame) = any_frames::can(&self.config, nth, input) {
+                    return self.handle(Input::PortCan { port, frame });
+                }
+            } else if let Some(bytes) = any_frames::bytes(&self.config, nth, &self.said[nth], input) {
+                for piece in cut(&bytes, op) {
+                    self.port_bytes(port, piece);
+                }
+                return;
+            }
+        }
         let size = |span: proto_core::config::Span| -> usize {
             let specs = span.of(&self.config.fields);
             specs
@@ -409,12 +264,12 @@ impl Driver {
                 .map(|spec| match spec {
                     FieldSpec::System(var) => var.size(),
                     FieldSpec::UserInput { ty, .. } | FieldSpec::UserOutput { ty, .. } => ty.size(),
-                    // This configuration has none.
+                    // Nor has a frame of others.
                     _ => 0,
                 })
                 .sum()
         };
-        match &self.config.recipes[usize::from(of.recipe)].parts {
+        match &recipe.parts {
             Parts::Stream { input: Some(part), .. } => {
                 let mut payload = input.take(1 + usize::from(op >> 4)).to_vec();
                 payload.resize(size(part.fields), 0);
@@ -438,6 +293,11 @@ impl Driver {
     }
 
     fn handle(&mut self, input: Input<'_>) {
+        if self.now.saturating_since(self.called) > HEARTBEAT {
+            // It may have slept: what it waited for is forgotten.
+            self.said.iter_mut().for_each(|said| said.awaits = None);
+        }
+        self.called = self.now;
         self.engine.handle(self.now, input);
         self.drain();
         // Only a tick lets deadlines pass: before it, they may lie in the past.
@@ -456,7 +316,11 @@ impl Driver {
                     );
                     // What is due already waits for the tick that is late.
                     let needed = self.engine.deadline().max(self.now);
-                    assert!(until <= needed, "would sleep through a deadline");
+                    assert!(
+                        until <= needed,
+                        "would sleep until {until:?} at {:?}, through {needed:?}",
+                        self.now
+                    );
                     self.wake = until;
                     return;
                 }
@@ -500,33 +364,41 @@ impl Driver {
 
     fn sent(&mut self, port: PortId, bytes: &[u8]) {
         let nth = usize::from(port.0);
-        let Parts::Stream { output: Some(part), .. } =
-            &self.config.recipes[usize::from(self.config.ports[nth].recipe)].parts
-        else {
-            panic!("port {nth} has no output part");
-        };
-        assert!(bytes.starts_with(&part.head) && bytes.ends_with(&part.tail));
+        assert!(
+            any_frames::may_be_sent(&self.config, nth, bytes),
+            "port {nth} has no such frame: {bytes:02X?}"
+        );
         assert!(
             !self.honest || self.ports[nth].up && self.ports[nth].sending == 0,
             "handed over before the last left"
         );
         self.ports[nth].sending = 1;
+        let said = &mut self.said[nth];
+        let waits = any_frames::shortest_wait(&self.config, nth);
+        assert!(
+            !self.honest || said.awaits.is_none_or(|until| self.now >= until),
+            "asked before the last was answered"
+        );
+        // Nobody answers a broadcast.
+        said.awaits = waits.filter(|_| bytes.first() != Some(&0)).map(|_| Instant::NEVER);
+        said.sent = bytes.to_vec();
     }
 
     fn can_sent(&mut self, port: PortId, frame: &CanFrame) {
         let nth = usize::from(port.0);
-        let Parts::Can { output, .. } =
-            &self.config.recipes[usize::from(self.config.ports[nth].recipe)].parts
-        else {
+        assert!(
+            any_frames::may_be_sent_can(&self.config, nth, frame),
+            "port {nth} has no such frame: {frame:?}"
+        );
+        let recipe = any_frames::recipe_of(&self.config, nth);
+        let Some(Parts::Can { output, .. }) = recipe.map(|recipe| &recipe.parts) else {
             panic!("port {nth} is no CAN port");
         };
-        assert!(output.iter().any(|part| part.id == frame.id()) && !frame.is_remote());
+        // A cycle's frames, or a request.
+        let most = output.len().max(1);
         let port = &mut self.ports[nth];
         port.sending += 1;
-        assert!(
-            !self.honest || port.up && port.sending <= output.len(),
-            "more than a cycle's frames at once"
-        );
+        assert!(!self.honest || port.up && port.sending <= most, "more than a cycle's frames at once");
     }
 }
 
@@ -587,5 +459,6 @@ pub(crate) fn seeds() -> Vec<Vec<u8>> {
     all.extend([0x80, 0, 0, 0, 1, 4, 2, 0, 3, 0, 4]);
     all.extend(life(5));
     seeds.push(all);
+    seeds.extend(any_device::seeds());
     seeds
 }

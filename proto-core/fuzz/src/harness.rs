@@ -45,13 +45,15 @@ impl Target {
             return write_out(&known, &at_root(folder));
         }
         assert!(!known.is_empty(), "{} has nothing to begin with", self.name);
-        for input in &known {
-            self.run_one(input);
-        }
-        let mut random = Random::new(number("FUZZ_SEED").unwrap_or(1));
-        for _ in 0..number("FUZZ_RUNS").map_or(self.runs, |runs| runs as usize) {
-            self.run_one(&self.vary(&known, &mut random));
-        }
+        with_room(|| {
+            for input in &known {
+                self.run_one(input);
+            }
+            let mut random = Random::new(number("FUZZ_SEED").unwrap_or(1));
+            for _ in 0..number("FUZZ_RUNS").map_or(self.runs, |runs| runs as usize) {
+                self.run_one(&self.vary(&known, &mut random));
+            }
+        });
     }
 
     fn run_one(&self, input: &[u8]) {
@@ -98,6 +100,19 @@ impl Target {
         input
     }
 }
+
+/// On a stack that has room for several of the largest configurations, also without optimisation: a
+/// test's own has not.
+fn with_room(run: impl FnOnce() + Send) {
+    std::thread::scope(|scope| {
+        let thread = std::thread::Builder::new().stack_size(STACK).spawn_scoped(scope, run);
+        if let Err(panic) = thread.expect("a thread can be started").join() {
+            resume_unwind(panic);
+        }
+    });
+}
+
+const STACK: usize = 32 * 1024 * 1024;
 
 /// Bytes of inputs that are kept in the repository for a target.
 const KEPT: usize = 32 * 1024;

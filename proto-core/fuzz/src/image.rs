@@ -6,6 +6,7 @@ use proto_core::config::image::{
 use proto_core::config::{ControllerLink, GatewayConfig};
 use proto_core::engine::{BuildError, Engine};
 
+use crate::any_config;
 use crate::any_engine;
 use crate::model;
 use crate::source::Source;
@@ -20,7 +21,7 @@ pub(crate) fn run(input: &[u8]) {
         1 => with_header(1 + u32::from(kind >> 2) % VERSION, input.rest()),
         // A configuration, right or wrong, with bytes changed but for the checksum, or with it.
         _ => {
-            let Some(config) = any_engine::config(&mut input) else { return };
+            let Some(config) = any_config::config(&mut input) else { return };
             let Some(mut bytes) = image_of(&config) else { return };
             while !input.is_empty() {
                 let at = usize::from(input.u16()) % bytes.len();
@@ -146,7 +147,7 @@ pub(crate) fn seeds() -> Vec<Vec<u8>> {
     for seed in any_engine::seeds() {
         seeds.push([&[2], &seed[..seed.len().min(60)]].concat());
         seeds.push([&[3], &seed[..seed.len().min(60)]].concat());
-        if let Some(image) = any_engine::config(&mut Source::new(&seed)).and_then(|config| image_of(&config))
+        if let Some(image) = any_config::config(&mut Source::new(&seed)).and_then(|config| image_of(&config))
         {
             seeds.push([&[5], &image[HEADER..]].concat());
         }

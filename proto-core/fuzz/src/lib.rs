@@ -8,7 +8,10 @@
 pub mod harness;
 pub mod source;
 
+mod any_config;
+mod any_device;
 mod any_engine;
+mod any_frames;
 mod can;
 mod command;
 mod deframer;

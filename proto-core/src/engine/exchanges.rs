@@ -10,7 +10,9 @@ use super::build::{BuildError, one_too_many};
 use super::device_port::DeviceFormat;
 use super::line::{Line, PeerCounters, PeerState, Talks, Times, is_looked_at};
 use super::user::{InputBind, InputTo};
-use crate::config::{Bus, ConfigView, Counted, DeviceFrame, Exchange, FieldSpec, Port, Recipe, Span, Talk};
+use crate::config::{
+    Bus, ConfigView, Counted, DeviceFrame, Exchange, FieldSpec, FrameSpec, Port, Recipe, Span, Talk,
+};
 use crate::device::{Carrier, LayoutError};
 use crate::modbus::rtu::{Operation, Table};
 use crate::schedule::{Grid, Peer, Row};
@@ -134,6 +136,7 @@ struct Formats<'c> {
     refusals: &'c mut VecView<InputBind>,
 }
 
+// A frame under construction takes some kilobytes of stack: one at a time, each in a function of its own.
 impl Formats<'_> {
     fn format(
         &mut self,
@@ -183,10 +186,47 @@ impl Formats<'_> {
         Ok(DeviceFormat { layout: frame.layout, id: id.unwrap_or(CanId::Standard(0)), bindings })
     }
 
-    /// The data of Modbus registers or coils.
-    fn data(&self, part: Direction, span: Span) -> Option<Result<DeviceFrame, LayoutError>> {
+    /// The data of Modbus registers or coils that are sent.
+    #[inline(never)]
+    fn data_out(&mut self, span: Span) -> Result<Option<DeviceFormat>, BuildError> {
         let fields: &[FieldSpec] = span.of(self.config.fields);
-        (!fields.is_empty()).then(|| DeviceFrame::new(Carrier::Whole, part, (&[], &[]), fields))
+        if fields.is_empty() {
+            return Ok(None);
+        }
+        let part = Direction::Output;
+        self.format(part, DeviceFrame::new(Carrier::Whole, part, (&[], &[]), fields), None).map(Some)
+    }
+
+    /// The same for those that are received.
+    #[inline(never)]
+    fn data_in(&mut self, span: Span) -> Result<Option<InputFormat>, BuildError> {
+        let fields: &[FieldSpec] = span.of(self.config.fields);
+        if fields.is_empty() {
+            return Ok(None);
+        }
+        let frame = DeviceFrame::new(Carrier::Whole, Direction::Input, (&[], &[]), fields);
+        self.input(frame, None).map(Some)
+    }
+
+    #[inline(never)]
+    fn request_of(&mut self, spec: &FrameSpec) -> Result<DeviceFormat, BuildError> {
+        self.format(Direction::Output, spec.layout(self.config, Direction::Output), spec.id)
+    }
+
+    #[inline(never)]
+    fn reply_of(&mut self, spec: &FrameSpec) -> Result<InputFormat, BuildError> {
+        self.input(spec.layout(self.config, Direction::Input), spec.id)
+    }
+
+    #[inline(never)]
+    fn refusal_of(&mut self, spec: &FrameSpec) -> Result<DeviceFormat, BuildError> {
+        self.refusal(spec.layout(self.config, Direction::Input), spec.id)
+    }
+
+    /// Bytes of a reply to a remote request.
+    #[inline(never)]
+    fn longest_of(&self, spec: &FrameSpec) -> usize {
+        spec.layout(self.config, Direction::Input).map_or(0, |frame| frame.layout.lengths().1)
     }
 
     #[inline(never)]
@@ -211,22 +251,14 @@ impl Formats<'_> {
             Talk::Rtu { operation, written, read } => {
                 item.asks = Asks::Rtu { slave: exchange.peer, operation };
                 item.times.is_answered = exchange.peer != crate::modbus::rtu::BROADCAST;
-                if let Some(data) = self.data(Direction::Output, written) {
-                    item.request = Some(self.format(Direction::Output, data, None)?);
-                }
-                if let Some(data) = self.data(Direction::Input, read) {
-                    item.reply = Some(self.input(data, None)?);
-                }
+                item.request = self.data_out(written)?;
+                item.reply = self.data_in(read)?;
             }
             Talk::Served { operation, written, read } => {
                 let (table, address, count) = operation.place();
                 item.asks = Asks::Served { table, address, count };
-                if let Some(data) = self.data(Direction::Output, read) {
-                    item.request = Some(self.format(Direction::Output, data, None)?);
-                }
-                if let Some(data) = self.data(Direction::Input, written) {
-                    item.reply = Some(self.input(data, None)?);
-                }
+                item.request = self.data_out(read)?;
+                item.reply = self.data_in(written)?;
             }
             Talk::Frames { request, reply, refusal } => {
                 let config = self.config;
@@ -234,24 +266,20 @@ impl Formats<'_> {
                 if let Some(request) = frame(request) {
                     item.asks = match request.id {
                         Some(id) if request.remote => {
-                            let reply = frame(reply).map(|reply| reply.layout(config, Direction::Input));
-                            let len = reply.and_then(Result::ok).map_or(0, |reply| reply.layout.lengths().1);
+                            let len = frame(reply).map_or(0, |reply| self.longest_of(reply));
                             Asks::Remote { id, len: len as u8 }
                         }
                         _ => Asks::Frame,
                     };
                     if matches!(item.asks, Asks::Frame) {
-                        let layout = request.layout(config, Direction::Output);
-                        item.request = Some(self.format(Direction::Output, layout, request.id)?);
+                        item.request = Some(self.request_of(request)?);
                     }
                 }
                 if let Some(reply) = frame(reply) {
-                    let layout = reply.layout(config, Direction::Input);
-                    item.reply = Some(self.input(layout, reply.id)?);
+                    item.reply = Some(self.reply_of(reply)?);
                 }
                 if let Some(refusal) = frame(refusal) {
-                    let layout = refusal.layout(config, Direction::Input);
-                    item.refusal = Some(self.refusal(layout, refusal.id)?);
+                    item.refusal = Some(self.refusal_of(refusal)?);
                 }
                 item.times.is_answered = item.reply.is_some();
             }

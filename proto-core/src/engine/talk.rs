@@ -393,30 +393,38 @@ impl FieldPort {
 
     /// Pauses end, and replies that have not come fail.
     fn advance_talk(&mut self, mut view: View<'_>, now: Instant) {
-        let timing = self.line;
+        let (timing, is_on_can) = (self.line, self.is_on_can());
         let Some(line) = self.line_mut() else { return };
         line.advance(now);
         let Some(failure) = line.failure(&timing, now) else { return };
         let (items, mut talks) = view.of(line);
         let Some(item) = items.get(usize::from(failure.0.exchange)) else { return };
         let is_over = line.failed(&mut talks, failure, item.times, now);
-        self.sender.sent();
+        // A bus was not held while the reply was awaited: a frame of the cycle may be on its way.
+        if !is_on_can {
+            self.sender.sent();
+        }
         if is_over {
             bump(&mut self.counters.unanswered);
         }
     }
 
     fn abandon_talk(&mut self, mut view: View<'_>, now: Instant) {
+        let is_on_can = self.is_on_can();
         let Some(line) = self.line_mut() else { return };
         let was_waiting = matches!(line.phase, Phase::Waiting(_));
         let (_, mut talks) = view.of(line);
         line.abandon(&mut talks, now);
-        if was_waiting {
+        if was_waiting && !is_on_can {
             self.sender.sent();
         }
     }
 
     fn begin_talk(&mut self, mut view: View<'_>, now: Instant) {
+        if let Codec::Device(DeviceCodec { reader: Some(Reader::Slave(slave)), .. }) = &mut self.codec {
+            // What came while the line was not there is too old to be answered.
+            add(&mut self.counters.discarded_bytes, slave.discard());
+        }
         let Some(line) = self.line_mut() else { return };
         let (items, mut talks) = view.of(line);
         for item in items {
@@ -655,8 +663,9 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     fn after_talk(&mut self, id: PortId) {
         self.ask.ports = true;
         if let Some(port) = find_port(&mut self.ports, id) {
-            let deadline = port.deadline().min(port.talk_deadline());
-            self.arm(deadline);
+            // Each by itself: what is due already must not hide the other.
+            let deadlines = [port.deadline(), port.talk_deadline()];
+            deadlines.into_iter().for_each(|at| self.arm(at));
         }
     }
 
@@ -751,7 +760,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             let view = self.exchanges.view();
             let request = port.next_request(&self.store.image, &self.bindings.outputs, view, out, now);
             found = request.map(|downward| (port.id, downward));
-            first = first.min(port.talk_deadline());
+            // What is due already must not hide another port's.
+            first = Some(port.talk_deadline()).filter(|at| *at > now).map_or(first, |at| first.min(at));
         }
         self.arm(first);
         found

@@ -218,3 +218,36 @@ fn a_remote_request_polls_a_node() {
     let last = rig.engine.status(now).ports().next().unwrap().last_rejection.unwrap();
     assert_eq!((last.why, rig.map.registers[8]), (Rejection::ForeignId, 42));
 }
+
+#[test]
+fn a_frame_on_its_way_still_is_when_a_node_does_not_answer() {
+    let mut cell = Cell::new();
+    let poll = frame(&mut cell, Some(0x181), &[], &[], vec![]);
+    cell.0.frames.last_mut().unwrap().remote = true;
+    let reply = frame(&mut cell, Some(0x181), &[], &[], vec![byte_to("WordInputReg[1]")]);
+    let counter =
+        FieldSpec::DeviceOutput { encoding: byte(), overflow: Overflow::Usual, from: OutputBinding::Counter };
+    let fields = cell.fields([counter]);
+    let mut output = heapless::Vec::new();
+    output.push(CanFramePart { id: CanId::Standard(0x201), fields }).unwrap();
+    let recipe = cell.recipe(Mode::User, Parts::Can { input: Default::default(), output });
+    let silent = asks(poll, reply, None, AskWhen::every(MS(50)));
+    cell.0.exchanges.push(Exchange { timeout: MS(5), ..silent }).unwrap();
+    cell.last_recipe().exchanges = Span { start: 0, len: 1 };
+    let port = cell.can_port(recipe);
+    cell.last_port().cycle = MS(20);
+    let mut rig = cell.rig();
+    rig.reports_sent = false;
+    // The bus is so full that a frame needs longer than the timeout.
+    let mut on_its_way = 0;
+    for step in 0..60 {
+        rig.run(MS(4));
+        on_its_way += rig.can_sent_to(port).len();
+        assert!(on_its_way <= 1, "a frame was handed over before the last had left");
+        if step % 3 == 2 && on_its_way > 0 {
+            rig.input(Input::PortSent { port });
+            on_its_way = rig.can_sent_to(port).len();
+        }
+    }
+    assert!(rig.counters(port).unanswered > 0);
+}

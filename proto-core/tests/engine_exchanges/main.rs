@@ -2,6 +2,7 @@
 
 mod frames;
 mod line;
+mod properties;
 #[path = "../rig/mod.rs"]
 mod rig;
 mod rtu;

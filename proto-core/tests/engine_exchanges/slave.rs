@@ -1,10 +1,13 @@
 //! The gateway as a Modbus RTU slave of a PLC.
 
+use proptest::collection::vec;
+use proptest::prelude::*;
 use proto_core::config::*;
 use proto_core::device::{Bits, ByteOrder, Encoding, Kind, Overflow};
 use proto_core::engine::{PortId, PortState};
 use proto_core::modbus::rtu::Operation;
 use proto_core::sysvar::ModbusPlace;
+use proto_core::time::Duration;
 
 use crate::line::*;
 use crate::rig::*;
@@ -123,4 +126,126 @@ fn a_reply_is_too_late_when_the_line_goes_on() {
     rig.input(proto_core::engine::Input::PortSent { port });
     rig.run(MS(5));
     assert_eq!(rig.sent_to(port), Vec::<Vec<u8>>::new());
+}
+
+#[test]
+fn what_came_while_the_line_was_not_there_is_not_answered() {
+    let (mut rig, port) = plc();
+    rig.run(MS(10));
+    rig.input(proto_core::engine::Input::PortDown { port });
+    rig.take_written();
+    rig.bytes(port, &with_crc(&[5, 16, 0, 0, 0, 2, 4, 0, 1, 0, 2]));
+    rig.now = rig.now + MS(40);
+    rig.input(proto_core::engine::Input::PortUp { port });
+    rig.run(MS(10));
+    assert_eq!(rig.sent_to(port), Vec::<Vec<u8>>::new());
+    assert!(!rig.take_written().contains(&Written::Registers(8, vec![1, 2])));
+    assert_eq!(rig.counters(port).discarded_bytes, 13);
+}
+
+/// The words of right requests in these bytes that write registers 0 and 1 of slave 5 or of all of them,
+/// wherever they stand.
+fn whole_blocks(bytes: &[u8]) -> Vec<[u16; 2]> {
+    let word = |pair: &[u8]| u16::from_be_bytes([pair[0], pair[1]]);
+    let frames = bytes.windows(13).filter(|frame| {
+        matches!(frame[0], 0 | 5) && frame[1..7] == [16, 0, 0, 0, 2, 4] && with_crc(&frame[..11]) == **frame
+    });
+    frames.map(|frame| [word(&frame[7..9]), word(&frame[9..11])]).collect()
+}
+
+/// What a master sends, without its CRC: mostly a write of registers.
+fn request() -> impl Strategy<Value = Vec<u8>> {
+    let slave = prop_oneof![6 => Just(5_u8), 1 => Just(0), 1 => Just(6)];
+    let function = prop_oneof![6 => Just(16_u8), 1 => Just(6), 1 => Just(23), 1 => 0..24_u8];
+    let place = prop_oneof![6 => Just((0_u8, 2_u8)), 1 => (0..3_u8, 0..4_u8)];
+    (slave, function, place, any::<[u8; 4]>()).prop_map(|(slave, function, (address, count), words)| {
+        let mut request = vec![slave, function, 0, address, 0, count];
+        if matches!(function, 15 | 16) {
+            let len = usize::from(count) * 2;
+            request.push(len as u8);
+            request.extend(words.iter().cycle().take(len));
+        }
+        request
+    })
+}
+
+#[derive(Debug, Clone)]
+enum Says {
+    Right(Vec<u8>),
+    Damaged(Vec<u8>, u8, u8),
+    /// Two without a silence between them.
+    Both(Vec<u8>, Vec<u8>),
+    Noise(Vec<u8>),
+}
+
+impl Says {
+    fn bytes(&self) -> Vec<u8> {
+        match self {
+            Self::Right(request) => with_crc(request),
+            Self::Damaged(request, at, change) => {
+                let mut frame = with_crc(request);
+                let at = usize::from(*at) % frame.len();
+                frame[at] ^= change;
+                frame
+            }
+            Self::Both(one, other) => [with_crc(one), with_crc(other)].concat(),
+            Self::Noise(bytes) => bytes.clone(),
+        }
+    }
+}
+
+fn says() -> impl Strategy<Value = Says> {
+    prop_oneof![
+        3 => request().prop_map(Says::Right),
+        2 => (request(), any::<u8>(), 1..=255_u8).prop_map(|(of, at, change)| Says::Damaged(of, at, change)),
+        1 => (request(), request()).prop_map(|(one, other)| Says::Both(one, other)),
+        1 => vec(prop_oneof![any::<u8>(), Just(5), Just(16), Just(0)], 0..40).prop_map(Says::Noise),
+    ]
+}
+
+proptest! {
+    #[test]
+    fn only_a_right_request_for_a_whole_block_changes_values(
+        bursts in vec((says(), 1..20_usize, any::<bool>()), 1..30),
+    ) {
+        let (mut rig, port) = plc();
+        rig.run(MS(10));
+        // Safe values are not what this is about.
+        rig.take_written();
+        let mut allowed = Vec::new();
+        let mut all = Vec::new();
+        for (says, piece, is_silent) in &bursts {
+            let bytes = says.bytes();
+            all.extend_from_slice(&bytes);
+            allowed.extend(whole_blocks(&all).into_iter().filter(|words| !allowed.contains(words)).collect::<Vec<_>>());
+            for piece in bytes.chunks(*piece) {
+                rig.bytes(port, piece);
+                rig.run(Duration::from_micros(95 * piece.len() as u64));
+            }
+            rig.run(if *is_silent { MS(4) } else { Duration::from_micros(500) });
+            let written = rig.take_written();
+            for written in &written {
+                match written {
+                    Written::Registers(8, words) => {
+                        let is_safe = words.first() == Some(&9);
+                        let words = words.clone();
+                        prop_assert!(is_safe || allowed.iter().any(|block| block[..].starts_with(&words)), "{words:?}");
+                    }
+                    // The second register by itself, or the coils.
+                    Written::Registers(9, words) => {
+                        prop_assert!(allowed.iter().any(|block| block[1..] == words[..]), "{words:?}");
+                    }
+                    Written::Registers(10 | 11, words) => prop_assert!(words.iter().all(|word| *word <= 1)),
+                    other => prop_assert!(false, "{other:?}"),
+                }
+            }
+        }
+        // Whatever came: a right request is carried out and answered.
+        rig.run(MS(4));
+        rig.sent_to(port);
+        rig.take_written();
+        let write = [5, 16, 0, 0, 0, 2, 4, 0x12, 0x34, 0x56, 0x78];
+        prop_assert_eq!(asks(&mut rig, port, &write), [with_crc(&write[..6])]);
+        prop_assert_eq!(&rig.map.registers[8..10], [0x1234, 0x5678]);
+    }
 }

@@ -1,0 +1,77 @@
+//! Modbus RTU, both sides of a line.
+
+use core::hint::black_box;
+
+use proto_core::modbus::rtu::{
+    Adu, Echo, Exchange, MAX_ADU, Master, Operation, Slave, Timing, When, checksum, reply_len, request_len,
+};
+use proto_core::time::{Duration, Instant};
+
+use crate::protocols::Bank;
+use crate::{any, bytes, room};
+
+pub(crate) fn all() {
+    rtu_frames();
+    rtu_operations(any(Operation::ReadCoils { address: 0, count: 1 }));
+    rtu_master();
+    rtu_slave();
+}
+
+fn timing() -> Timing {
+    let timing = Timing::new(any(115_200), any(11)).with_silence(any(Duration::ZERO));
+    any(timing.with_turnaround(any(Duration::ZERO)))
+}
+
+#[inline(never)]
+fn rtu_frames() {
+    let mut out = [0; MAX_ADU];
+    let _ = black_box(Adu::parse(bytes()));
+    let adu = any(Adu { address: 1, pdu: bytes() });
+    black_box(adu.encoded_len());
+    let _ = black_box(adu.encode(room(&mut out)));
+    black_box((checksum(bytes()), request_len(bytes()), reply_len(bytes())));
+    let timing = timing();
+    black_box((timing.t1_5(), timing.silence(), timing.turnaround(), timing.of(any(7))));
+}
+
+#[inline(never)]
+fn rtu_operations(operation: Operation) {
+    let _ = black_box(operation.check());
+    black_box((operation.function(), operation.reads(), operation.place()));
+    black_box((operation.request_len(), operation.reply_len()));
+    black_box((operation.written_len(), operation.read_len()));
+}
+
+#[inline(never)]
+fn rtu_master() {
+    static TABLE: [Exchange; 4] = [Exchange {
+        slave: 1,
+        operation: Operation::ReadCoils { address: 0, count: 1 },
+        when: When::START,
+        timeout: Duration::ZERO,
+        retries: 0,
+    }; 4];
+    let (table, now) = (black_box(&TABLE[..]), any(Instant::ZERO));
+    let Ok(mut master) = Master::<4>::new(timing(), any(Echo::Absent), table, now) else { return };
+    let (master, mut out) = (black_box(&mut master), [0; MAX_ADU]);
+    master.received(bytes(), any(now));
+    black_box(master.request(any(3), any(now)));
+    let fill = |nth, data: &mut [u8]| {
+        black_box((nth, data));
+        any(true)
+    };
+    while let Some(output) = master.poll(any(now), fill, &mut out) {
+        black_box(output);
+    }
+    master.slaves().for_each(|slave| _ = black_box(slave));
+    black_box((master.deadline(), master.stray_bytes()));
+}
+
+#[inline(never)]
+fn rtu_slave() {
+    let Some(mut slave) = Slave::new(timing(), any(Echo::Absent), any(5)) else { return };
+    let (slave, now, mut out) = (black_box(&mut slave), any(Instant::ZERO), [0; MAX_ADU]);
+    slave.received(bytes(), now);
+    black_box(slave.poll(any(now), &mut Bank, &mut out));
+    black_box((slave.deadline(), slave.counters()));
+}
