@@ -1,6 +1,9 @@
 //! A Modbus RTU master or slave on the line at its standard input and output, for tests with other
 //! programs: `modbus_rtu master` or `modbus_rtu slave ADDRESS`, where both are one pseudoterminal.
 //!
+//! It shows `proto_core::modbus::rtu` alone, without an engine. A gateway with such ports needs only a
+//! configuration (docs/configuration.md section 4).
+//!
 //! The master asks slave 5 for registers and coils, writes others, and prints what it hears.
 
 use std::fs::File;

@@ -67,6 +67,12 @@ impl LineClient {
         std::mem::take(&mut self.received)
     }
 
+    /// What has come, or what comes within `patience`.
+    pub(crate) fn take_some(&mut self, patience: Duration) -> Vec<u8> {
+        self.more(patience);
+        std::mem::take(&mut self.received)
+    }
+
     /// Waits for bytes; returns false if none came.
     fn more(&mut self, patience: Duration) -> bool {
         let bytes = self.inbox.bytes.lock().unwrap();

@@ -35,6 +35,7 @@ mod program;
 mod qemu;
 mod refusal;
 mod robot;
+mod rtu;
 mod safe;
 mod unreadable;
 
@@ -86,6 +87,7 @@ fn main() -> ExitCode {
             safe::all(),
             commands::all(),
             checked::all(),
+            rtu::all(),
             unreadable::all(),
             load::all(),
         ];

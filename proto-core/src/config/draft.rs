@@ -213,8 +213,8 @@ impl<'a> RecipeBuilder<'a> {
     }
 }
 
-/// A port under construction: [`Port::rs485`], [`Port::modbus_rtu`], [`Port::can`], [`Port::tcp_listen`],
-/// [`Port::udp_listen`]. The defaults are those of a file: a cycle of 4 ms, a timeout of 100 ms,
+/// A port under construction: [`Port::rs485`], [`Port::modbus_rtu`], [`Port::modbus_rtu_slave`],
+/// [`Port::can`], [`Port::tcp_listen`], [`Port::udp_listen`]. The defaults are those of a file: a cycle of 4 ms, a timeout of 100 ms,
 /// stale after 500 ms.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PortBuilder<'a, B = Rs485> {
@@ -239,7 +239,17 @@ pub struct Listen<'a> {
 
 /// The bus of a [`PortBuilder`] of Modbus RTU: a line with its silences, where none are set.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct RtuLine(Rs485);
+pub struct RtuLine {
+    line: Rs485,
+    is_slave: bool,
+}
+
+impl RtuLine {
+    fn new(is_slave: bool) -> Self {
+        let line = Rs485 { idle_gap: Duration::ZERO, turnaround: Duration::ZERO, ..Rs485::default() };
+        Self { line, is_slave }
+    }
+}
 
 /// The bus of a [`PortBuilder`] on CAN: its bit rate.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -292,11 +302,16 @@ impl Port {
         PortBuilder::new(name, recipe, Rs485::default())
     }
 
-    /// A serial line of Modbus RTU, for a recipe with such exchanges. Idle gap and turnaround are 3.5
-    /// characters, or 1750 µs above 19 200 bit/s, unless they are set.
+    /// A serial line of which the gateway is the Modbus RTU master, for a recipe with such exchanges.
+    /// The turnaround is 3.5 characters, or 1750 µs above 19 200 bit/s, unless it is set.
     pub fn modbus_rtu<'a>(name: &'a str, recipe: &'a str) -> PortBuilder<'a, RtuLine> {
-        let unset = Rs485 { idle_gap: Duration::ZERO, turnaround: Duration::ZERO, ..Rs485::default() };
-        PortBuilder::new(name, recipe, RtuLine(unset))
+        PortBuilder::new(name, recipe, RtuLine::new(false))
+    }
+
+    /// A serial line on which the gateway is a Modbus RTU slave, for a recipe with such blocks. Idle gap
+    /// and turnaround are 3.5 characters, or 1750 µs above 19 200 bit/s, unless they are set.
+    pub fn modbus_rtu_slave<'a>(name: &'a str, recipe: &'a str) -> PortBuilder<'a, RtuLine> {
+        PortBuilder::new(name, recipe, RtuLine::new(true))
     }
 
     /// A CAN bus; by default 500 kbit/s.
@@ -463,7 +478,9 @@ pub(super) mod sealed {
 
     impl Sealed for RtuLine {
         fn bus(&self) -> Result<Bus, Kind> {
-            let (given, standard) = (self.0, self.0.with_rtu_silence());
+            let given = self.line;
+            let usual = Rs485 { idle_gap: Rs485::default().idle_gap, ..given };
+            let standard = if self.is_slave { usual.with_rtu_silence() } else { usual.with_rtu_turnaround() };
             let or = |given, standard| if given == Duration::ZERO { standard } else { given };
             let idle_gap = or(given.idle_gap, standard.idle_gap);
             let turnaround = or(given.turnaround, standard.turnaround);
@@ -485,7 +502,7 @@ pub(super) mod sealed {
 
     impl Line for RtuLine {
         fn line(&mut self) -> &mut Rs485 {
-            &mut self.0
+            &mut self.line
         }
     }
 

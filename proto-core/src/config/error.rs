@@ -243,6 +243,8 @@ pub enum Counted {
     Exchanges,
     /// Frames of all exchanges.
     ExchangeFrames,
+    /// Pieces of 32 bytes that the blocks need which masters write.
+    WrittenPieces,
 }
 
 impl core::fmt::Display for Counted {
@@ -268,6 +270,7 @@ impl core::fmt::Display for Counted {
             Self::PollBlocks => "Modbus poll blocks",
             Self::Exchanges => "exchanges in all recipes together",
             Self::ExchangeFrames => "frames of exchanges in all recipes together",
+            Self::WrittenPieces => "pieces of 32 bytes in all blocks that masters write",
             Self::Sources => "values of the controller's state and of the health of ports",
         })
     }

@@ -105,9 +105,9 @@ fn expects_reply(exchange: &Exchange) -> bool {
 /// The silence before a frame of an exchange.
 fn silence(port: &Port, exchange: &Exchange) -> Duration {
     match (&port.bus, exchange.talk) {
-        (Bus::Rs485(line), Talk::Frames { .. }) => line.turnaround,
-        // A master sends when the silence behind the frame before has ended it.
-        (Bus::Rs485(line), _) => line.turnaround.max(line.idle_gap),
+        // A slave answers when the silence behind the request has ended it.
+        (Bus::Rs485(line), Talk::Served { .. }) => line.turnaround.max(line.idle_gap),
+        (Bus::Rs485(line), _) => line.turnaround,
         _ => Duration::ZERO,
     }
 }

@@ -122,8 +122,16 @@ impl Default for Rs485 {
 }
 
 impl Rs485 {
-    /// The same with the silence of Modbus RTU as idle gap and turnaround: 3.5 characters, or 1750 µs
-    /// above 19 200 bit/s (docs/wire/modbus-rtu.md section 2).
+    /// The same with the silence of Modbus RTU as turnaround: 3.5 characters, or 1750 µs above
+    /// 19 200 bit/s (docs/wire/modbus-rtu.md section 2). For a master, which knows how long a reply
+    /// is: the idle gap stays, because systems and adapters deliver a reply in pieces.
+    #[must_use]
+    pub fn with_rtu_turnaround(self) -> Self {
+        Self { turnaround: self.with_rtu_silence().turnaround, ..self }
+    }
+
+    /// The same with the silence of Modbus RTU as idle gap and turnaround. For a slave, to which only
+    /// the silence tells where a request ends.
     #[must_use]
     pub fn with_rtu_silence(self) -> Self {
         let silence = Timing::new(self.baud, self.bits_per_character() as u8).silence();

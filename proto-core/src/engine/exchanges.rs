@@ -26,13 +26,19 @@ pub(super) struct Exchanges<const N: usize> {
     items: Vec<Item, N>,
     rows: Vec<Row, N>,
     peers: Vec<PeerState, N>,
+    /// What masters have written.
+    written: [Piece; N],
 }
+
+/// Bytes of a block that a master writes; a block takes as many pieces as it needs.
+pub(super) type Piece = [u8; 32];
 
 /// The same, of any size.
 pub(super) struct View<'a> {
     items: &'a mut [Item],
     rows: &'a mut [Row],
     peers: &'a mut [PeerState],
+    written: &'a mut [Piece],
 }
 
 /// What is asked, and what answers.
@@ -50,6 +56,10 @@ pub(super) struct Item {
     /// The newest request, to tell a change.
     pub digest: Option<u64>,
     pub last_bit: Option<bool>,
+    /// Where a block that a master writes is kept, so that the master can read it.
+    pub pieces: Span,
+    /// A master has written it.
+    pub is_written: bool,
 }
 
 /// How a request is made.
@@ -76,7 +86,7 @@ pub(super) struct InputFormat {
 
 impl<const N: usize> Exchanges<N> {
     pub(super) const fn new() -> Self {
-        Self { items: Vec::new(), rows: Vec::new(), peers: Vec::new() }
+        Self { items: Vec::new(), rows: Vec::new(), peers: Vec::new(), written: [[0; _]; N] }
     }
 
     pub(super) fn clear(&mut self) {
@@ -91,7 +101,8 @@ impl<const N: usize> Exchanges<N> {
     }
 
     pub(super) fn view(&mut self) -> View<'_> {
-        View { items: &mut self.items, rows: &mut self.rows, peers: &mut self.peers }
+        let Self { items, rows, peers, written } = self;
+        View { items, rows, peers, written }
     }
 
     pub(super) fn peers(&self) -> &[PeerState] {
@@ -102,6 +113,12 @@ impl<const N: usize> Exchanges<N> {
 impl View<'_> {
     /// The exchanges of a port.
     pub(super) fn of(&mut self, line: &Line) -> (&mut [Item], Talks<'_>) {
+        let (items, talks, _) = self.served(line);
+        (items, talks)
+    }
+
+    /// The same, and what masters have written on all ports.
+    pub(super) fn served(&mut self, line: &Line) -> (&mut [Item], Talks<'_>, &mut [Piece]) {
         let range = |span: Span| {
             let start = usize::from(span.start);
             start..start.saturating_add(usize::from(span.len))
@@ -113,6 +130,7 @@ impl View<'_> {
                 rows: self.rows.get_mut(exchanges).unwrap_or(&mut []),
                 peers: self.peers.get_mut(peers).unwrap_or(&mut []),
             },
+            &mut *self.written,
         )
     }
 }
@@ -246,6 +264,8 @@ impl Formats<'_> {
             rising: exchange.when.rising,
             digest: None,
             last_bit: None,
+            pieces: Span::default(),
+            is_written: false,
         };
         match exchange.talk {
             Talk::Rtu { operation, written, read } => {
@@ -317,7 +337,17 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         };
         let mut hears_unasked = part_frames(Direction::Input) > 0;
         for exchange in exchanges {
-            let item = formats.item(exchange)?;
+            let mut item = formats.item(exchange)?;
+            if let (Asks::Served { .. }, Some(block)) = (item.asks, &item.reply) {
+                let ends =
+                    self.exchanges.items.iter().map(|item| item.pieces.start.saturating_add(item.pieces.len));
+                let used = ends.max().unwrap_or(0);
+                let len = block.format.layout.lengths().1.div_ceil(size_of::<Piece>());
+                if usize::from(used).saturating_add(len) > EXCHANGES {
+                    return Err(one_too_many(Counted::WrittenPieces, EXCHANGES));
+                }
+                item.pieces = Span { start: used, len: len as u16 };
+            }
             hears_unasked |= matches!(item.asks, Asks::Nothing);
             let own = self.exchanges.peers.get(first_peer..).unwrap_or(&[]);
             let peer = match own.iter().position(|peer| peer.number == exchange.peer) {

@@ -1,12 +1,13 @@
 //! Field ports on which the gateway is a slave: a master reads and writes blocks of registers.
 //!
 //! In: requests that the slave of the line has found. Out: values in the store, and replies. A block
-//! is written as a whole or not at all; one with a value that is unknown or stale is not read.
+//! is written as a whole or not at all; one with a value that is unknown or stale is not read. A block
+//! that a master writes is kept, and read back as it was written.
 
 use super::command_link::CommandLink;
 use super::counters::bump;
-use super::device_port::{DeviceCodec, DeviceFormat};
-use super::exchanges::{Asks, InputFormat, Item, View};
+use super::device_port::DeviceCodec;
+use super::exchanges::{Asks, InputFormat, Item, Piece, View};
 use super::field_port::{Accepted, Codec, FieldPort, Frames, came, keep};
 use super::rejection::Rejection;
 use super::sender::Sender;
@@ -25,7 +26,8 @@ const MAX_DATA: usize = 256;
 
 /// The blocks of a slave.
 struct Blocks<'a, const PORTS: usize> {
-    items: &'a [Item],
+    items: &'a mut [Item],
+    written: &'a mut [Piece],
     texts: &'a [TextBind],
     outputs: &'a [OutputBind],
     sender: &'a Sender,
@@ -35,15 +37,19 @@ struct Blocks<'a, const PORTS: usize> {
 }
 
 impl<const PORTS: usize> Blocks<'_, PORTS> {
-    /// The blocks of a table that a master reads, with their first address and count.
-    fn read_from(&self, table: Table) -> impl Iterator<Item = (u16, u16, &DeviceFormat)> {
-        self.items.iter().filter_map(move |item| {
-            let Asks::Served { table: own, address, count } = item.asks else { return None };
-            (own == table).then_some((address, count, item.request.as_ref()?))
-        })
+    /// The block of a table with this address, and the block's first address.
+    fn block_at(&self, table: Table, at: u16) -> Result<(u16, &Item), Exception> {
+        let mut found = self.items.iter().filter_map(|item| match item.asks {
+            Asks::Served { table: own, address, count } if own == table => {
+                at.checked_sub(address).is_some_and(|nth| nth < count).then_some((address, item))
+            }
+            _ => None,
+        });
+        found.next().ok_or(Exception::IllegalDataAddress)
     }
 
-    fn data<'o>(&self, format: &DeviceFormat, out: &'o mut [u8; MAX_DATA]) -> Result<&'o [u8], Exception> {
+    fn data<'o>(&self, item: &Item, out: &'o mut [u8; MAX_DATA]) -> Result<&'o [u8], Exception> {
+        let Some(format) = &item.request else { return self.kept(item, out) };
         let fields = format.bindings.of(self.outputs);
         let image = &self.frames.store.image;
         if !fields.iter().all(|field| may_send(self.sender, image, field, self.now)) {
@@ -61,17 +67,23 @@ impl<const PORTS: usize> Blocks<'_, PORTS> {
         out.get(..len).ok_or(Exception::DeviceFailure)
     }
 
+    /// What a master has written.
+    fn kept<'o>(&self, item: &Item, out: &'o mut [u8; MAX_DATA]) -> Result<&'o [u8], Exception> {
+        let block = item.reply.as_ref().filter(|_| item.is_written).ok_or(Exception::DeviceFailure)?;
+        let kept = item.pieces.of(self.written).iter().flatten();
+        out.iter_mut().zip(kept).for_each(|(slot, &byte)| *slot = byte);
+        out.get(..block.format.layout.lengths().1).ok_or(Exception::DeviceFailure)
+    }
+
     fn registers(&self, table: Table, address: u16, words: &mut [[u8; 2]]) -> Result<(), Exception> {
         let mut at = address;
         let mut words = words.iter_mut();
         let mut left = words.len();
         while left > 0 {
-            let is_here =
-                |block: &(u16, u16, &DeviceFormat)| at.checked_sub(block.0).is_some_and(|nth| nth < block.1);
-            let block = self.read_from(table).find(is_here).ok_or(Exception::IllegalDataAddress)?;
+            let (first, item) = self.block_at(table, at)?;
             let mut buffer = [0; MAX_DATA];
-            let data = self.data(block.2, &mut buffer)?;
-            let behind = usize::from(at.saturating_sub(block.0)).saturating_mul(2);
+            let data = self.data(item, &mut buffer)?;
+            let behind = usize::from(at.saturating_sub(first)).saturating_mul(2);
             let (pairs, _) = data.get(behind..).unwrap_or(&[]).as_chunks::<2>();
             // Before the words, so that none is lost when the block ends.
             for (pair, word) in pairs.iter().zip(&mut words) {
@@ -87,17 +99,23 @@ impl<const PORTS: usize> Blocks<'_, PORTS> {
     }
 
     fn coils(&self, table: Table, address: u16, count: u16, packed: &mut [u8]) -> Result<(), Exception> {
-        for nth in 0..count {
+        let mut nth = 0;
+        while nth < count {
             let at = address.wrapping_add(nth);
-            let is_here =
-                |block: &(u16, u16, &DeviceFormat)| at.checked_sub(block.0).is_some_and(|nth| nth < block.1);
-            let block = self.read_from(table).find(is_here).ok_or(Exception::IllegalDataAddress)?;
+            let (block, item) = self.block_at(table, at)?;
             let mut buffer = [0; MAX_DATA];
-            let data = self.data(block.2, &mut buffer)?;
-            let bit = at.saturating_sub(block.0);
-            let is_on = data.get(usize::from(bit / 8)).is_some_and(|byte| byte >> (bit % 8) & 1 == 1);
-            if let Some(byte) = packed.get_mut(usize::from(nth / 8)) {
-                *byte |= u8::from(is_on) << (nth % 8);
+            let data = self.data(item, &mut buffer)?;
+            let Asks::Served { count: len, .. } = item.asks else { return Err(Exception::DeviceFailure) };
+            // To the end of the block, and at least one.
+            for bit in at.saturating_sub(block)..len {
+                let is_on = data.get(usize::from(bit / 8)).is_some_and(|byte| byte >> (bit % 8) & 1 == 1);
+                if let Some(byte) = packed.get_mut(usize::from(nth / 8)) {
+                    *byte |= u8::from(is_on) << (nth % 8);
+                }
+                nth = nth.saturating_add(1);
+                if nth >= count {
+                    break;
+                }
             }
         }
         Ok(())
@@ -106,13 +124,17 @@ impl<const PORTS: usize> Blocks<'_, PORTS> {
     /// Writes the block that begins at this address and has so many registers or coils.
     fn write(&mut self, table: Table, address: u16, count: u16, data: &[u8]) -> Result<(), Exception> {
         let is_it = |asks: Asks| matches!(asks, Asks::Served { table: own, address: at, count: len } if (own, at, len) == (table, address, count));
-        let block = self.items.iter().find(|item| item.reply.is_some() && is_it(item.asks));
-        let Some(InputFormat { format, slot }) = block.and_then(|item| item.reply.as_ref()) else {
+        let item = self.items.iter_mut().find(|item| item.reply.is_some() && is_it(item.asks));
+        let Some(Item { reply: Some(InputFormat { format, slot }), pieces, is_written, .. }) = item else {
             return Err(Exception::IllegalDataAddress);
         };
         self.frames
             .take_device(format, self.texts, data, usize::from(*slot), self.accepted)
-            .map_err(|_| Exception::IllegalDataValue)
+            .map_err(|_| Exception::IllegalDataValue)?;
+        let kept = self.written.iter_mut().skip(usize::from(pieces.start)).take(usize::from(pieces.len));
+        kept.flatten().zip(data).for_each(|(slot, &byte)| *slot = byte);
+        *is_written = true;
+        Ok(())
     }
 }
 
@@ -182,11 +204,12 @@ impl FieldPort {
         else {
             return accepted;
         };
-        let (items, talks) = view.of(line);
+        let (items, talks, written) = view.served(line);
         let frames =
             Frames::new((self.id, self.mode), &mut self.reply, &mut self.counters, inputs, store, commands);
         let sender = &self.sender;
-        let mut blocks = Blocks { items, texts, outputs, sender, frames, accepted: &mut accepted, now };
+        let mut blocks =
+            Blocks { items, written, texts, outputs, sender, frames, accepted: &mut accepted, now };
         let (before, mut request, mut reply) = (slave.counters(), [0; MAX_ADU], [0; MAX_ADU]);
         let heard = slave.copy_to(&mut request);
         let len = slave.poll(now, &mut blocks, &mut reply);

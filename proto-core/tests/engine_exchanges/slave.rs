@@ -106,6 +106,26 @@ fn what_is_not_known_is_not_read() {
 }
 
 #[test]
+fn a_master_reads_back_what_it_wrote() {
+    let (mut rig, port) = plc();
+    rig.run(MS(10));
+    assert_eq!(asks(&mut rig, port, &[5, 3, 0, 0, 0, 2]), [with_crc(&[5, 0x83, 4])], "nothing was written");
+    asks(&mut rig, port, &[5, 16, 0, 0, 0, 2, 4, 0, 44, 1, 0]);
+    assert_eq!(asks(&mut rig, port, &[5, 3, 0, 0, 0, 2]), [with_crc(&[5, 3, 4, 0, 44, 1, 0])]);
+    assert_eq!(asks(&mut rig, port, &[5, 3, 0, 1, 0, 1]), [with_crc(&[5, 3, 2, 1, 0])], "a part");
+    assert_eq!(asks(&mut rig, port, &[5, 3, 0, 1, 0, 2]), [with_crc(&[5, 0x83, 2])], "beyond it");
+    assert_eq!(asks(&mut rig, port, &[5, 1, 0, 0, 0, 3]), [with_crc(&[5, 0x81, 4])], "no coils were written");
+    asks(&mut rig, port, &[5, 15, 0, 0, 0, 3, 1, 0b101]);
+    assert_eq!(asks(&mut rig, port, &[5, 1, 0, 1, 0, 2]), [with_crc(&[5, 1, 1, 0b10])], "the last two coils");
+    // A write that is refused changes nothing, and each block has its own place.
+    asks(&mut rig, port, &[5, 6, 0, 0, 0, 1]);
+    assert_eq!(asks(&mut rig, port, &[5, 3, 0, 0, 0, 2]), [with_crc(&[5, 3, 4, 0, 44, 1, 0])]);
+    // The safe values change what the robot has, not what the master wrote.
+    rig.run(MS(300));
+    assert_eq!(asks(&mut rig, port, &[5, 3, 0, 0, 0, 1]), [with_crc(&[5, 3, 2, 0, 44])]);
+}
+
+#[test]
 fn a_broadcast_is_written_and_not_answered() {
     let (mut rig, port) = plc();
     rig.run(MS(10));

@@ -452,8 +452,10 @@ fn read_bus(table: &Reader<'_>, kind: BusKind) -> Result<Bus> {
     };
     Ok(match kind {
         BusKind::Rs485 | BusKind::ModbusMaster | BusKind::ModbusSlave => {
-            let read = if kind == BusKind::Rs485 { read_line } else { read_rtu_line };
-            let mut line = read(table)?;
+            let mut line = match kind {
+                BusKind::Rs485 => read_line(table)?,
+                _ => read_rtu_line(table, kind == BusKind::ModbusMaster)?,
+            };
             line.echo = table.optional("echo").map_or(Ok(false), |item| item.bool())?;
             Bus::Rs485(line)
         }

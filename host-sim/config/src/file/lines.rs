@@ -14,8 +14,9 @@ pub(super) fn read_line(port: &Reader<'_>) -> Result<Rs485> {
 }
 
 /// The same of a line of Modbus RTU, which has the standard's silences by default.
-pub(super) fn read_rtu_line(port: &Reader<'_>) -> Result<Rs485> {
-    read_times(port, read_characters(port)?.with_rtu_silence())
+pub(super) fn read_rtu_line(port: &Reader<'_>, is_master: bool) -> Result<Rs485> {
+    let line = read_characters(port)?;
+    read_times(port, if is_master { line.with_rtu_turnaround() } else { line.with_rtu_silence() })
 }
 
 fn read_characters(port: &Reader<'_>) -> Result<Rs485> {
