@@ -5,7 +5,7 @@ use core::fmt;
 use super::error::{ConfigErrorKind as Kind, ExchangeKey as Key, Place};
 use super::exchange::{Exchange, FrameSpec, Talk};
 use super::rules::{Check, MAX_TIME, check_pool, check_time, fail};
-use super::{ConfigView, Constants, DeviceFrame, FieldSpec, Parts, Recipe, Span};
+use super::{ConfigView, Constants, DeviceFrame, FieldSpec, Parts, Recipe, Span, StreamPart};
 use crate::device::{Carrier, LayoutError};
 use crate::modbus::rtu::{BROADCAST, CountError, MAX_ADDRESS, MAX_SLAVES, Operation};
 use crate::recipe::PartError;
@@ -24,6 +24,8 @@ pub enum ExchangeError {
     NeedsUser,
     /// Modbus master, Modbus slave and frames of a device's own are mixed in one recipe.
     Mixed,
+    /// What tells the frames of a part apart is not their fields: replies could not be found.
+    CutParts,
     /// A recipe of Modbus has parts.
     PartsBesideModbus,
     /// A frame for a line in a CAN recipe, or one with an id in a stream recipe.
@@ -99,6 +101,9 @@ impl fmt::Display for ExchangeError {
             Self::Mixed => {
                 f.write_str("a recipe has exchanges of one kind: Modbus master, Modbus slave, or frames")
             }
+            Self::CutParts => f.write_str(
+                "beside exchanges a part has framing = \"fields\" and no escape; replies could not be found",
+            ),
             Self::PartsBesideModbus => {
                 f.write_str("a recipe of Modbus has exchanges only, no input and output part")
             }
@@ -167,6 +172,11 @@ impl<'a> ExchangeCheck<'a> {
     pub(super) fn check(&self) -> Check {
         check_pool(self.at(0, Key::Whole), self.recipe.exchanges, self.config.exchanges.len())?;
         let exchanges = self.config.exchanges_of(self.recipe);
+        let mut parts = [Direction::Input, Direction::Output].into_iter();
+        let mut part = |part| self.recipe.stream_part(part).is_some_and(StreamPart::is_cut);
+        if !exchanges.is_empty() && parts.any(&mut part) {
+            return self.refuse(0, Key::Whole, ExchangeError::CutParts);
+        }
         let (mut peers, mut count) = ([false; 256], 0_usize);
         for (nth, exchange) in (0..).zip(exchanges) {
             self.check_one(nth, exchange)?;

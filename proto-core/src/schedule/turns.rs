@@ -10,6 +10,9 @@
 //! gaps between the others, in which its whole timeout fits; if there is no gap for as long as the
 //! peer's wait, it is asked nevertheless. The wait grows to [`LONGEST_WAIT`] timeouts, so a peer
 //! that never answers takes at most 1 part in 65 of the line.
+//!
+//! What a peer is asked at its start comes before anything else that it is asked, in the order of the
+//! rows: at first, and after each time that it did not answer.
 
 use super::Grid;
 use crate::time::{Duration, Instant};
@@ -62,6 +65,8 @@ pub(crate) struct Row {
     peer: u8,
     grid: Option<Grid>,
     start: bool,
+    /// It is to be asked at the start or because the peer was away, and has not been taken since.
+    opens: bool,
     requested: Option<Instant>,
     /// When it was taken last.
     taken: Instant,
@@ -123,7 +128,8 @@ impl Row {
         now: Instant,
     ) -> Self {
         let grid = every.map(|period| Grid::starting_at(now, period));
-        Self { peer, grid, start, requested: start.then_some(now), taken: Instant::ZERO, cost, timeout }
+        let (requested, taken) = (start.then_some(now), Instant::ZERO);
+        Self { peer, grid, start, opens: start, requested, taken, cost, timeout }
     }
 
     pub(crate) const fn peer(&self) -> u8 {
@@ -133,6 +139,7 @@ impl Row {
     /// The line begins anew: what is asked at the start is asked again, and periods begin now.
     pub(crate) fn restart(&mut self, now: Instant) {
         self.requested = self.start.then_some(now);
+        self.opens = self.start;
         if let Some(grid) = &mut self.grid {
             *grid = Grid::starting_at(now, grid.period());
         }
@@ -151,7 +158,11 @@ impl<P: AsRef<Peer> + AsMut<Peer>> Turns<'_, P> {
     pub(crate) fn choose(&mut self, now: Instant) -> Result<usize, Instant> {
         let (mut requested, mut due, mut probe) = (First::NONE, First::NONE, First::NONE);
         let (mut look_again, mut next_due) = (Instant::NEVER, Instant::NEVER);
+        let is_opening = self.rows.iter().any(|row| row.opens);
         for (nth, row) in self.rows.iter().enumerate() {
+            if is_opening && self.waits_for_opening(nth, row) {
+                continue;
+            }
             let Some(peer) = self.peers.get(usize::from(row.peer)).map(AsRef::as_ref) else { continue };
             let wanted = row.wanted();
             let at = wanted.max(peer.not_before);
@@ -188,6 +199,13 @@ impl<P: AsRef<Peer> + AsMut<Peer>> Turns<'_, P> {
         }
     }
 
+    /// Whether another row of the peer is to be asked at its start before this one.
+    fn waits_for_opening(&self, nth: usize, row: &Row) -> bool {
+        let mut opening =
+            self.rows.iter().enumerate().filter(|(_, other)| other.opens && other.peer == row.peer);
+        opening.next().is_some_and(|(first, _)| first != nth)
+    }
+
     /// The row is taken: its request is being sent, or there is nothing to send.
     pub(crate) fn take(&mut self, nth: usize, now: Instant) -> Taken {
         let Some(row) = self.rows.get_mut(nth) else { return Taken { requested: None } };
@@ -199,6 +217,7 @@ impl<P: AsRef<Peer> + AsMut<Peer>> Turns<'_, P> {
             peer.missed = peer.missed.saturating_add(missed);
         }
         row.taken = now;
+        row.opens = false;
         Taken { requested: row.requested.take() }
     }
 
@@ -229,8 +248,13 @@ impl<P: AsRef<Peer> + AsMut<Peer>> Turns<'_, P> {
     pub(crate) fn failed(&mut self, nth: usize, taken: Taken, now: Instant, sent: Instant) {
         let Some(row) = self.rows.get_mut(nth) else { return };
         row.requested = row.requested.or(taken.requested);
-        let timeout = row.timeout;
-        let Some(peer) = self.peers.get_mut(usize::from(row.peer)).map(AsMut::as_mut) else { return };
+        let (timeout, which) = (row.timeout, row.peer);
+        // It may have lost its power.
+        for row in self.rows.iter_mut().filter(|row| row.start && row.peer == which) {
+            row.opens = true;
+            row.requested.get_or_insert(now);
+        }
+        let Some(peer) = self.peers.get_mut(usize::from(which)).map(AsMut::as_mut) else { return };
         let exponent = peer.failures.saturating_add(FIRST_WAIT).min(LONGEST_WAIT);
         peer.failures = peer.failures.saturating_add(1);
         let longest = WAIT_LIMIT.max(timeout.saturating_mul(2));

@@ -267,3 +267,47 @@ fn a_value_that_is_asked_once_is_not_missed_later() {
     line.run(MS(1_000), |_| None);
     assert_eq!(line.rig.engine.port_state(port), Some(PortState::Silent));
 }
+
+#[test]
+fn what_a_slave_is_asked_at_its_start_comes_first_and_in_order() {
+    let mut cell = Cell::new();
+    let start = AskWhen { start: true, ..AskWhen::NEVER };
+    let at_start = |cell: &mut Cell, name, address| {
+        let mut exchange = reads(cell, 4, &[name], start);
+        let Talk::Rtu { operation, .. } = &mut exchange.talk else { panic!() };
+        *operation = Operation::ReadHoldingRegisters { address, count: 1 };
+        exchange
+    };
+    let command = writes(&mut cell, 4, &["WordOutputReg[1]"], AskWhen { change: true, ..start });
+    let poll = reads(&mut cell, 4, &["WordInputReg[1]"], AskWhen::every(MS(5)));
+    let table = [
+        poll,
+        at_start(&mut cell, "WordInputReg[2]", 0xA0),
+        at_start(&mut cell, "WordInputReg[3]", 0xA1),
+        command,
+        // Another slave is not held up.
+        reads(&mut cell, 5, &["WordInputReg[4]"], AskWhen::every(MS(50))),
+    ];
+    let port = talking(&mut cell, &table);
+    cell.last_port().timeout = MS(500);
+    let mut line = Line::new(&cell, port);
+    let done = |request: &[u8]| {
+        let reply = if request[1] == 16 { with_crc(&request[..6]) } else { registers(request[0], &[1]) };
+        Some((MS(1), reply))
+    };
+    let places = |asked: &[(Instant, Vec<u8>)]| -> Vec<u8> {
+        asked.iter().filter(|(_, sent)| sent[0] == 4).map(|(_, sent)| sent[3]).collect()
+    };
+    // While its first question is not answered it is asked nothing else, the other slave is.
+    let asked = line.run(MS(2_000), |request| if request[0] == 4 { None } else { done(request) });
+    assert!(places(&asked).iter().all(|place| *place == 0xA0), "{asked:02X?}");
+    assert!(asked.iter().filter(|(_, sent)| sent[0] == 5).count() > 20);
+    for round in 0..4 {
+        let asked = places(&line.run(MS(12_000), done));
+        let first = asked.iter().position(|place| *place == 0xA1).unwrap();
+        assert!(asked[..first].iter().all(|place| *place == 0xA0), "round {round}: {asked:02X?}");
+        assert_eq!((asked[first + 1], asked.len() > 1_000), (0x20, true), "the command, then polls");
+        // It is away, and comes back at another moment in each round.
+        line.run(MS(700 + round * 333), |request| if request[0] == 4 { None } else { done(request) });
+    }
+}
