@@ -306,6 +306,8 @@ struct Plc {
     master: Master<2>,
     block: [u16; 3],
     read: Vec<u16>,
+    /// A request was sent and has no reply yet.
+    is_waiting: bool,
 }
 
 impl Plc {
@@ -323,10 +325,10 @@ impl Plc {
         ];
         let clock = Clock(std::time::Instant::now());
         let master = Master::new(timing(), Echo::Absent, &table, clock.now()).unwrap();
-        Self { line, clock, master, block: [0; 3], read: Vec::new() }
+        Self { line, clock, master, block: [0; 3], read: Vec::new(), is_waiting: false }
     }
 
-    /// Asks until the robot, and what was read last, are as wanted.
+    /// Asks until the robot, and what was read last, are as wanted. Then the line is silent.
     #[track_caller]
     fn until(
         &mut self,
@@ -338,7 +340,7 @@ impl Plc {
         until(what, || {
             gateway.must_run();
             self.ask();
-            found(robot, &self.read).then_some(())
+            (!self.is_waiting && found(robot, &self.read)).then_some(())
         });
     }
 
@@ -353,8 +355,16 @@ impl Plc {
         };
         while let Some(output) = self.master.poll(self.clock.now(), values, &mut out) {
             match output {
-                Output::Send(len) => self.line.send(&out[..len]),
-                Output::Reply { reply: Reply::Registers(words), .. } => self.read = words.iter().collect(),
+                Output::Send(len) => {
+                    self.line.send(&out[..len]);
+                    self.is_waiting = true;
+                }
+                Output::Reply { reply, .. } => {
+                    self.is_waiting = false;
+                    if let Reply::Registers(words) = reply {
+                        self.read = words.iter().collect();
+                    }
+                }
                 _ => {}
             }
         }
