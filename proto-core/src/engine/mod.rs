@@ -30,6 +30,7 @@ mod latency;
 mod line;
 mod links;
 mod modbus_link;
+mod modbus_poll;
 mod not_given;
 mod outbox;
 mod outcome;
