@@ -28,6 +28,7 @@ mod flight;
 mod io;
 mod latency;
 mod line;
+mod line_timing;
 mod links;
 mod modbus_link;
 mod modbus_poll;
@@ -313,6 +314,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         let (store, command) = (&mut self.store, self.links.command.first_mut());
         let Some(port) = find_port(&mut self.ports, id) else { return };
         let accepted = port.device_frames(&mut &[][..], &self.bindings.inputs, store, command, &mut self.tap);
+        port.note_partial();
         self.after_field(id, &accepted, now);
     }
 

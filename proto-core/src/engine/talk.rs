@@ -365,6 +365,7 @@ impl FieldPort {
         }
         codec.line = Some(line);
         let (item, len) = request?;
+        self.note_partial();
         self.sender.hold();
         bump(&mut self.counters.frames_out);
         add(&mut self.counters.bytes_out, len);
@@ -661,6 +662,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     fn after_talk(&mut self, id: PortId) {
         self.ask.ports = true;
         if let Some(port) = find_port(&mut self.ports, id) {
+            port.note_partial();
             let deadline = port.deadline().min(port.talk_deadline());
             self.arm(deadline);
         }
