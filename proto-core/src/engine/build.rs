@@ -13,8 +13,9 @@ use super::counters::PortCounters;
 use super::counts::MAX_COUNTS;
 use super::device_port::DeviceCodec;
 use super::exchanges::{Exchanges, Places};
-use super::field_port::{Codec, FieldPort, LineTiming};
+use super::field_port::{Codec, FieldPort};
 use super::io::{BusState, LinkId, LinkKind, PortId, ReplyCode, Transport};
+use super::line_timing::LineTiming;
 use super::links::Links;
 use super::modbus_link::{MAX_POLL_BLOCKS, ModbusLink};
 use super::outbox::EdgeQueue;
@@ -438,6 +439,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             codec,
             mode: recipe.mode,
             line,
+            partial_until: Instant::NEVER,
             sender,
             inputs,
             outputs,

@@ -141,7 +141,15 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     }
 
     /// Drops values that have waited too long.
+    #[inline(always)]
     pub(super) fn expire_waiting(&mut self) {
+        if self.store.may_expire() {
+            self.drop_expired();
+        }
+    }
+
+    #[inline(never)]
+    fn drop_expired(&mut self) {
         let ports = &mut self.ports;
         self.store.expire_waiting(|port, dropped| {
             if let Some(port) = ports.get_mut(port) {

@@ -56,9 +56,7 @@ pub(super) struct DeviceCodec {
 }
 
 impl DeviceCodec {
-    /// Whether silence has something to end. On its own, so that other ports do not pay for it.
-    #[cold]
-    #[inline(never)]
+    /// Whether silence has something to end.
     pub(super) fn has_begun(&self) -> bool {
         self.reader.as_ref().is_some_and(Reader::has_begun)
     }
@@ -396,7 +394,7 @@ impl<const PORTS: usize> Frames<'_, PORTS> {
         }
         bump(&mut self.counters.frames_in);
         accepted.frames = accepted.frames.wrapping_add(1);
-        accepted.set = self.store.accepted(slot, self.counters);
+        accepted.set = self.store.accepted_apart(slot, self.counters);
         Ok(())
     }
 

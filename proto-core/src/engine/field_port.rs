@@ -8,64 +8,33 @@ use super::command_tables::Picked;
 use super::counters::{PortCounters, add, bump};
 use super::device_port::DeviceCodec;
 use super::io::{BusState, PortId, PortState, ReplyCode};
+use super::line_timing::LineTiming;
 use super::outcome::Outcome;
 use super::rejection::{LastRejection, Rejection};
 use super::sender::Sender;
 use super::store::Store;
 use super::tap::{Tap, TapDirection, TapPlace, TapVerdict, Tapped};
 use super::user::{InputBind, InputTo, fit, forget_commands};
-use crate::config::{Name, Rs485, Span};
+use crate::config::{Name, Span};
 use crate::image::{ImageBytes, InputSet};
 use crate::recipe::Deframer;
 use crate::recipe::StreamLayout;
 use crate::recipe::model::Mode;
 use crate::recipe::{Applied, ValueError, Values};
 use crate::recipe::{CanLayout, CanReject};
-use crate::time::{Duration, Instant};
+use crate::time::Instant;
 use crate::wire::can::{CanFrame, CanId};
 use crate::wire::scalar::Scalar;
 
 /// The layouts of the port's recipe.
+// With a tag of its own: to find it in the values of a layout takes several instructions, each time.
 #[derive(Debug, Clone)]
+#[repr(u8)]
 #[allow(clippy::large_enum_variant, reason = "without an allocator there is no box to put the larger one in")]
 pub(super) enum Codec {
     Stream { input: Option<StreamLayout>, output: Option<StreamLayout>, deframer: Deframer },
     Can { input: Option<CanLayout>, output: Option<CanLayout> },
     Device(DeviceCodec),
-}
-
-/// Timing of a half-duplex line.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct LineTiming {
-    pub idle_gap: Duration,
-    pub turnaround: Duration,
-    /// After this long without a byte, what was sent is complete.
-    silence: Duration,
-    heard: Instant,
-}
-
-impl LineTiming {
-    pub(super) fn new(settings: &Rs485) -> Self {
-        let characters = settings.characters_and_a_half(3);
-        let (idle_gap, turnaround) = (settings.idle_gap.max(characters), settings.turnaround);
-        Self { idle_gap, turnaround, silence: turnaround.max(characters), heard: Instant::ZERO }
-    }
-
-    /// For a bus that arbitrates by itself.
-    pub(super) const fn none() -> Self {
-        let (idle_gap, turnaround) = (Duration::MAX, Duration::ZERO);
-        Self { idle_gap, turnaround, silence: Duration::ZERO, heard: Instant::ZERO }
-    }
-
-    /// When the line is free for the gateway.
-    pub(super) fn quiet_at(&self) -> Instant {
-        self.heard + self.turnaround
-    }
-
-    /// When the line has been silent for so long that what was sent is complete.
-    pub(super) fn silent_at(&self) -> Instant {
-        self.heard + self.silence
-    }
 }
 
 #[derive(Debug, Clone)]
@@ -77,6 +46,9 @@ pub(super) struct FieldPort {
     pub codec: Codec,
     pub mode: Mode,
     pub line: LineTiming,
+    /// When the frame that has begun is given up; [`Instant::NEVER`] if none has. Noted after each
+    /// change: deadlines are asked for far more often.
+    pub partial_until: Instant,
     pub sender: Sender,
     /// The port's range of the input bindings; those of all CAN frames follow each other.
     pub inputs: Span,
@@ -198,6 +170,7 @@ impl FieldPort {
             self.lose(bytes);
         }
         self.line.heard = now;
+        self.note_partial();
     }
 
     /// Bytes came from the line; [`Self::frames`] reads them.
@@ -225,6 +198,7 @@ impl FieldPort {
             let mut left = bytes;
             accepted = self.device_frames(&mut left, bindings, store, commands, tap);
             *rest = left;
+            self.note_partial();
             return accepted;
         };
         let Some(layout) = input else {
@@ -244,6 +218,7 @@ impl FieldPort {
             }
         }
         *rest = left;
+        self.partial_until = self.line.partial_until(deframer.pending() > 0);
         let stats = deframer.stats();
         self.counters.tail_mismatches = stats.tail_mismatches as u32;
         let skipped = (stats.skipped_bytes as u32).wrapping_sub(self.counters.resync_bytes);
@@ -338,7 +313,7 @@ impl FieldPort {
     /// still to be read with [`Self::frames`].
     pub(super) fn advance<const TAP: usize>(&mut self, tap: &mut Tap<TAP>, now: Instant) -> bool {
         let mut is_ended = false;
-        if now >= self.partial_until() {
+        if now >= self.partial_until {
             is_ended = self.ends_by_silence();
             if !is_ended {
                 self.discard_partial(tap, now);
@@ -351,7 +326,8 @@ impl FieldPort {
     /// When something happens on the port without an input.
     #[inline]
     pub(super) fn deadline(&self) -> Instant {
-        self.partial_until().min(self.sender.deadline(self.line.quiet_at()))
+        debug_assert_eq!(self.partial_until, self.line.partial_until(self.has_begun()), "not noted");
+        self.partial_until.min(self.sender.deadline(self.line.quiet_at()))
     }
 
     /// Whether a frame may be handed over now.
@@ -364,13 +340,20 @@ impl FieldPort {
         self.is_up && self.bus != BusState::BusOff
     }
 
-    fn partial_until(&self) -> Instant {
-        let has_begun = match &self.codec {
+    /// Whether a frame has begun that silence ends.
+    fn has_begun(&self) -> bool {
+        match &self.codec {
             Codec::Stream { deframer, .. } => deframer.pending() > 0,
             Codec::Can { .. } => false,
             Codec::Device(device) => device.has_begun(),
-        };
-        if has_begun { self.line.heard + self.line.idle_gap } else { Instant::NEVER }
+        }
+    }
+
+    /// Bytes came, or were dropped.
+    #[cold]
+    #[inline(never)]
+    pub(super) fn note_partial(&mut self) {
+        self.partial_until = self.line.partial_until(self.has_begun());
     }
 
     #[cold]
@@ -384,7 +367,8 @@ impl FieldPort {
                     keep(&mut self.last_rejection, Rejection::Partial, None, held, now);
                 }
                 let dropped = reader.discard();
-                return add(&mut self.counters.discarded_bytes, dropped);
+                add(&mut self.counters.discarded_bytes, dropped);
+                return self.note_partial();
             }
             _ => return,
         };
@@ -395,6 +379,7 @@ impl FieldPort {
         }
         let dropped = deframer.discard();
         add(&mut self.counters.discarded_bytes, dropped);
+        self.note_partial();
     }
 
     /// `skipped` bytes of a chunk, or of bytes held before it, belong to no frame. Without silence

@@ -3,7 +3,7 @@
 //! In: requests that were handed over and have left, replies, the time. Out: the next exchange, and
 //! when to look again. Does not know frames.
 
-use super::field_port::LineTiming;
+use super::line_timing::LineTiming;
 use crate::config::{AskWhen, Span};
 use crate::modbus::rtu::Expected;
 use crate::schedule::{Grid, Peer, Presence, Row, Taken, Turns};

@@ -29,8 +29,10 @@ mod flight;
 mod io;
 mod latency;
 mod line;
+mod line_timing;
 mod links;
 mod modbus_link;
+mod modbus_poll;
 mod not_given;
 mod outbox;
 mod outcome;
@@ -174,7 +176,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         // Any input may set an earlier deadline; one that becomes later is noticed in time.
         match input {
             Input::PortBytes { port, bytes } => self.port_bytes(port, bytes, now),
-            Input::PortCan { port, frame } => self.port_can(port, &frame, now),
+            // By reference: it would be copied for the functions that may see it.
+            Input::PortCan { port, ref frame } => self.port_can(port, frame, now),
             Input::PortSent { port } => self.port_sent(port),
             Input::PortUp { port } => self.port_up(port),
             Input::PortDown { port } => self.port_down(port, now),
@@ -198,7 +201,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     pub fn poll_output<'b>(&mut self, now: Instant, buf: &'b mut [u8; OUTPUT_BUFFER]) -> Output<'b> {
         let now = self.forward(now);
         if now >= self.timer_at {
-            self.ask = Ask::ALL;
+            self.ask_all();
         }
         if self.ask.links && !self.is_late {
             // To send a command, a connection may have to be closed first.
@@ -237,13 +240,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
                     self.tap.went(TapPlace::Port(port), Some(frame.id()), frame.data(), now);
                     return Output::PortSendCan { port, frame };
                 }
-                None if self.exchanges.is_used() => {
-                    // The kinds of output are the same, but nothing else pays for this one.
-                    if let Some(request) = self.next_request(&mut buf[..], now) {
-                        return self.request_output(request, buf, now);
-                    }
-                    self.ask.ports = false;
-                }
+                // On its own, so that nothing else pays for its registers.
+                None if self.exchanges.is_used() => return self.poll_request(now, buf),
                 None => self.ask.ports = false,
             }
         }
@@ -251,6 +249,30 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             self.is_late || self.all_are_silent(&mut buf[..], now),
             "a port or link that was not asked has an output"
         );
+        self.poll_sleep()
+    }
+
+    // On its own, so that what is asked is read only once, behind it.
+    #[inline(never)]
+    fn ask_all(&mut self) {
+        self.ask = Ask::ALL;
+    }
+
+    /// The next request to a device, or sleep.
+    #[cold]
+    #[inline(never)]
+    fn poll_request<'b>(&mut self, now: Instant, buf: &'b mut [u8; OUTPUT_BUFFER]) -> Output<'b> {
+        if let Some(request) = self.next_request(&mut buf[..], now) {
+            return self.request_output(request, buf, now);
+        }
+        self.ask.ports = false;
+        debug_assert!(self.all_are_silent(&mut buf[..], now), "a port that was asked has an output");
+        self.poll_sleep()
+    }
+
+    /// Nothing is to be done until the next deadline or beat.
+    #[inline(always)]
+    fn poll_sleep<'b>(&mut self) -> Output<'b> {
         if !self.is_armed {
             self.is_armed = true;
             self.timer_at = self.deadline();
@@ -313,14 +335,27 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         let (store, command) = (&mut self.store, self.links.command.first_mut());
         let Some(port) = find_port(&mut self.ports, id) else { return };
         let accepted = port.device_frames(&mut &[][..], &self.bindings.inputs, store, command, &mut self.tap);
+        port.note_partial();
         self.after_field(id, &accepted, now);
     }
 
-    #[inline(never)]
     fn port_can(&mut self, id: PortId, frame: &CanFrame, now: Instant) {
-        if self.exchanges.is_used() && self.talk_can(id, frame, now) {
-            return;
+        if self.exchanges.is_used() {
+            return self.can_beside_exchanges(id, frame, now);
         }
+        self.plain_can(id, frame, now);
+    }
+
+    #[cold]
+    #[inline(never)]
+    fn can_beside_exchanges(&mut self, id: PortId, frame: &CanFrame, now: Instant) {
+        if !self.talk_can(id, frame, now) {
+            self.plain_can(id, frame, now);
+        }
+    }
+
+    #[inline(never)]
+    fn plain_can(&mut self, id: PortId, frame: &CanFrame, now: Instant) {
         let (store, command) = (&mut self.store, self.links.command.first_mut());
         let Some(port) = find_port(&mut self.ports, id) else { return };
         if self.is_deaf {
@@ -339,10 +374,17 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
 
     #[inline(never)]
     fn port_sent(&mut self, id: PortId) {
-        self.change_port(id, |port| port.sender.sent());
         if self.exchanges.is_used() {
-            self.talk_sent(id);
+            return self.sent_beside_exchanges(id);
         }
+        self.change_port(id, |port| port.sender.sent());
+    }
+
+    #[cold]
+    #[inline(never)]
+    fn sent_beside_exchanges(&mut self, id: PortId) {
+        self.change_port(id, |port| port.sender.sent());
+        self.talk_sent(id);
     }
 
     #[cold]

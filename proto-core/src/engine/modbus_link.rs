@@ -9,17 +9,17 @@ use super::counters::{LinkCounters, bump};
 use super::flight::Flight;
 use super::io::Transport;
 use super::latency::Since;
+use super::modbus_poll::take_poll;
 use super::store::Store;
 use crate::image::{BitSet, GroupId, InputSet};
 use crate::link::{LinkTimings, Supervisor};
 use crate::modbus::adu::MAX_ADU;
 use crate::modbus::client::{Client, ClientEvent};
-use crate::modbus::pdu::{MAX_WRITE_COILS, MAX_WRITE_REGISTERS, Request, Response};
+use crate::modbus::pdu::{MAX_WRITE_COILS, MAX_WRITE_REGISTERS, Request};
 use crate::modbus::{Coils, Registers};
 use crate::schedule::Grid;
 use crate::sysvar::{BIT_INPUT_COUNT, ModbusPlace, SysVar};
 use crate::time::{Duration, Instant};
-use crate::wire::scalar::Scalar;
 
 /// Blocks of neighbouring coils or registers that are polled together.
 pub(super) const MAX_POLL_BLOCKS: usize = 16;
@@ -35,18 +35,18 @@ const REFUSED_PAUSE: Duration = Duration::from_millis(500);
 const TIMEOUTS_IN_A_ROW: u8 = 3;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Kind {
+pub(super) enum Kind {
     Coils,
     Registers,
 }
 
 #[derive(Debug, Clone, Copy)]
-struct Block {
-    kind: Kind,
-    first: u16,
-    count: u16,
-    group: GroupId,
-    grid: Grid,
+pub(super) struct Block {
+    pub kind: Kind,
+    pub first: u16,
+    pub count: u16,
+    pub group: GroupId,
+    pub grid: Grid,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -189,11 +189,10 @@ impl ModbusLink {
         if pending.is_empty() {
             self.offered = Since::NONE;
         }
-        let asked = match (pending.is_empty(), poll) {
-            (true, None) => return None,
-            (false, Some(_)) if self.first == First::Write => self.write(&pending, store, out),
-            (false, None) => self.write(&pending, store, out),
-            (_, Some(block)) => self.poll(block, out, now),
+        let asked = match poll {
+            Some(block) if pending.is_empty() || self.first == First::Poll => self.poll(block, out, now),
+            None if pending.is_empty() => return None,
+            _ => self.write(store, out),
         };
         let (len, asked) = asked?;
         self.first = match asked {
@@ -222,6 +221,24 @@ impl ModbusLink {
                 store.bits_again(BitSet::of(var, bits));
             }
         }
+    }
+
+    /// The controller has the safe bits of the write that it has answered.
+    #[cold]
+    #[inline(never)]
+    fn confirm_bits<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
+        if let Some((var, bits)) = self.safe_bits.take() {
+            store.confirm_bits(var, bits & store.bits.safe.byte(var));
+        }
+    }
+
+    /// What came is no Modbus: the connection is closed.
+    #[cold]
+    #[inline(never)]
+    fn violated<const PORTS: usize>(&mut self, store: &mut Store<PORTS>) {
+        bump(&mut self.counters.malformed);
+        self.supervisor.give_up(store.now);
+        self.lost(store);
     }
 
     /// The controller has refused a request.
@@ -269,17 +286,19 @@ impl ModbusLink {
     }
 
     /// One request for the first pending variable and those that follow it without a gap.
+    #[inline(never)]
     fn write<const PORTS: usize>(
         &mut self,
-        pending: &InputSet,
         store: &mut Store<PORTS>,
         out: &mut [u8],
     ) -> Option<(usize, Asked)> {
         if store.bits.is_used {
-            return self.write_beside_bits(pending, store, out);
+            return self.write_beside_bits(store, out);
         }
+        // Once more: a set that is handed over does not stay in registers.
+        let pending = store.outbox.dirty().and(&self.writes);
         let first = pending.iter().find(|var| var.ordinal() >= self.cursor).or(pending.iter().next())?;
-        self.write_whole(first, pending, store, out)
+        self.write_whole(first, &pending, store, out)
     }
 
     /// The same where bits have owners.
@@ -287,11 +306,11 @@ impl ModbusLink {
     #[inline(never)]
     fn write_beside_bits<const PORTS: usize>(
         &mut self,
-        pending: &InputSet,
         store: &mut Store<PORTS>,
         out: &mut [u8],
     ) -> Option<(usize, Asked)> {
-        match self.bits_turn(pending, store)? {
+        let pending = store.outbox.dirty().and(&self.writes);
+        match self.bits_turn(&pending, store)? {
             Turn::Bits(var, mask) => self.write_bits(var, mask, store, out),
             Turn::Whole(var) => {
                 self.bit_cursor = 0;
@@ -433,9 +452,7 @@ impl Connection for ModbusLink {
                 ClientEvent::Response(response) => Some(response),
                 ClientEvent::Exception(_) => None,
                 ClientEvent::Violation(_) => {
-                    bump(&mut self.counters.malformed);
-                    self.supervisor.give_up(now);
-                    self.lost(store);
+                    self.violated(store);
                     return &[];
                 }
             };
@@ -452,8 +469,8 @@ impl Connection for ModbusLink {
                 (Asked::Write { safe, born }, Some(_)) => {
                     born.record(now, &mut store.latency.arrived);
                     store.confirm(&safe);
-                    if let Some((var, bits)) = self.safe_bits.take() {
-                        store.confirm_bits(var, bits & store.bits.safe.byte(var));
+                    if self.safe_bits.is_some() {
+                        self.confirm_bits(store);
                     }
                 }
                 (Asked::Poll { block }, Some(response)) => {
@@ -521,59 +538,4 @@ fn place_of(var: SysVar) -> Option<(u16, Kind)> {
         ModbusPlace::Register { address } => Some((address, Kind::Registers)),
         ModbusPlace::Scaled { .. } => None,
     }
-}
-
-/// Writes the answer to a poll into the image.
-fn take_poll<const PORTS: usize>(
-    block: &Block,
-    polled: &[SysVar],
-    response: Response<'_>,
-    store: &mut Store<PORTS>,
-) {
-    if store.bits.is_used {
-        take_values(block, polled, response, |var, value| match value {
-            Scalar::Byte(shown) if store.bits.bytes.contains(var) => store.show_bits(var, shown),
-            value => _ = store.image.set(var, value),
-        });
-    } else {
-        take_values(block, polled, response, |var, value| {
-            // The table gives the variable's type, and bits beyond it were not read.
-            let _ = store.image.set(var, value);
-        });
-    }
-    store.image.stamp(block.group, store.now);
-    store.doubt_by_witnesses();
-}
-
-#[inline(always)]
-fn take_values(
-    block: &Block,
-    polled: &[SysVar],
-    response: Response<'_>,
-    mut take: impl FnMut(SysVar, Scalar),
-) {
-    for &var in polled {
-        let value = match (var.modbus(), response) {
-            (Some(ModbusPlace::Coils { first, count }), Response::Coils(coils)) => {
-                (block.kind == Kind::Coils).then(|| bits_at(coils, first, count, block)).flatten()
-            }
-            (Some(ModbusPlace::Register { address }), Response::Registers(registers)) => {
-                let nth = address.checked_sub(block.first).filter(|_| block.kind == Kind::Registers);
-                nth.and_then(|nth| registers.register(nth)).map(Scalar::Word)
-            }
-            _ => None,
-        };
-        if let Some(value) = value {
-            take(var, value);
-        }
-    }
-}
-
-fn bits_at(coils: Coils<'_>, first: u16, count: u16, block: &Block) -> Option<Scalar> {
-    let start = first.checked_sub(block.first)?;
-    let mut bits = 0_u8;
-    for nth in 0..count.min(8) {
-        bits |= u8::from(coils.coil(start.saturating_add(nth))?).checked_shl(u32::from(nth))?;
-    }
-    Some(Scalar::Byte(bits))
 }

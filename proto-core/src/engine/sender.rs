@@ -209,6 +209,7 @@ impl Sender {
     }
 
     /// Whether the values may be sent at `now`: all known, and fresh unless the recipe holds.
+    #[inline(always)]
     pub(super) fn may_show(&self, image: &Image, now: Instant) -> bool {
         image.can_read(&self.shown, self.shown_extra)
             && self.sources.iter().all(|group| match image.stamp_of(group) {

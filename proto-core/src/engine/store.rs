@@ -153,6 +153,7 @@ impl<const PORTS: usize> Store<PORTS> {
 
     /// The values of an accepted frame are in the image: they are to be written. Returns those
     /// whose link is up.
+    #[inline(always)]
     pub(super) fn accepted(&mut self, nth: usize, counters: &mut PortCounters) -> InputSet {
         let now = self.now;
         let Some(frame) = self.frames.get_mut(nth) else { return InputSet::EMPTY };
@@ -169,12 +170,17 @@ impl<const PORTS: usize> Store<PORTS> {
             self.safe = self.safe.minus(&set);
             self.unconfirmed = self.unconfirmed.minus(&set);
         }
-        let reachable = set.and(&self.reachable);
-        if reachable != set {
-            return self.accepted_in_part(nth, set, port, counters);
+        if set.and(&self.reachable) != set {
+            return self.accepted_in_part(nth, counters);
         }
-        self.offer(port, &reachable, counters);
-        reachable
+        self.offer(port, &set, counters);
+        set
+    }
+
+    /// The same, on its own, where it matters less.
+    #[inline(never)]
+    pub(super) fn accepted_apart(&mut self, nth: usize, counters: &mut PortCounters) -> InputSet {
+        self.accepted(nth, counters)
     }
 
     #[inline(always)]
@@ -190,13 +196,9 @@ impl<const PORTS: usize> Store<PORTS> {
     /// The same for a frame with variables whose link is down, or with bits that have owners.
     #[cold]
     #[inline(never)]
-    fn accepted_in_part(
-        &mut self,
-        nth: usize,
-        set: InputSet,
-        port: usize,
-        counters: &mut PortCounters,
-    ) -> InputSet {
+    fn accepted_in_part(&mut self, nth: usize, counters: &mut PortCounters) -> InputSet {
+        let Some(frame) = self.frames.get(nth) else { return InputSet::EMPTY };
+        let (set, port) = (frame.set, usize::from(frame.port));
         let Some(queue) = self.edges.get_mut(port) else { return InputSet::EMPTY };
         let now = self.now;
         let whole = set.minus(&self.bits.bytes);
@@ -317,12 +319,15 @@ impl<const PORTS: usize> Store<PORTS> {
         self.outbox.again(&vars.and(&self.reachable));
     }
 
+    /// Whether a value may have waited for longer than its port's timeout.
+    #[inline(always)]
+    pub(super) fn may_expire(&self) -> bool {
+        self.now >= self.next_expiry.get()
+    }
+
     /// Drops values that have waited for longer than their port's timeout, and counts them there.
     pub(super) fn expire_waiting(&mut self, mut count: impl FnMut(usize, usize)) {
         let now = self.now;
-        if now < self.next_expiry.get() {
-            return;
-        }
         self.next_expiry = Stamp::NEVER;
         for (nth, frame) in self.frames.iter().enumerate() {
             let bits = self.outbox.dirty().and(&self.bits.bytes).and(&frame.set);

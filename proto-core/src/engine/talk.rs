@@ -359,6 +359,7 @@ impl FieldPort {
         }
         codec.line = Some(line);
         let (item, len) = request?;
+        self.note_partial();
         self.sender.hold();
         bump(&mut self.counters.frames_out);
         add(&mut self.counters.bytes_out, len);
@@ -663,6 +664,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     fn after_talk(&mut self, id: PortId) {
         self.ask.ports = true;
         if let Some(port) = find_port(&mut self.ports, id) {
+            port.note_partial();
             // Each by itself: what is due already must not hide the other.
             let deadlines = [port.deadline(), port.talk_deadline()];
             deadlines.into_iter().for_each(|at| self.arm(at));
