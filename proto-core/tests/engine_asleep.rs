@@ -4,6 +4,7 @@
 mod rig;
 
 use proto_core::config::*;
+use proto_core::device::Boundary;
 use proto_core::engine::{Engine, Input, LinkId, OUTPUT_BUFFER, Output, PortId, ReplyCode};
 use proto_core::recipe::model::Mode;
 use proto_core::time::{Duration, Instant};
@@ -443,4 +444,28 @@ fn a_new_configuration_has_never_slept() {
     rig.input(Input::PortUp { port });
     rig.bytes(port, ON);
     assert_eq!((rig.engine.sleeps(), rig.counters(port).frames_in), (0, 1), "it was not called before");
+}
+
+#[test]
+fn a_frame_that_silence_ends_is_cut_by_a_sleep_and_asks_for_no_call_at_once() {
+    let mut cell = Cell::new();
+    let fields = cell.fields([user_in(
+        ScalarType::Byte,
+        InputBinding::Variable { var: var("WordInputReg[1]"), scale: 1.0, offset: 0.0 },
+    )]);
+    let mut part = cell.part(&[], &[], fields).unwrap();
+    part.framing = Boundary::Silence;
+    let recipe = cell.recipe(Mode::User, Parts::Stream { input: Some(part), output: None });
+    let port = cell.rs485(recipe);
+    let mut rig = cell.rig();
+    rig.run(MS(10));
+    rig.bytes(port, &[7]);
+    rig.now = rig.now + MS(700);
+    // The rig fails when the engine asks to be called at once again.
+    rig.input(Input::Tick);
+    rig.run(MS(1_000));
+    rig.take_written();
+    rig.bytes(port, &[8]);
+    rig.run(MS(100));
+    assert_eq!(rig.take_written(), [Written::Registers(8, vec![8])]);
 }

@@ -329,6 +329,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             // Nobody knows how long it has waited.
             if let Some(port) = find_port(&mut self.ports, id) {
                 port.discard_partial(&mut self.tap, now);
+                // What is left of it ends with a silence that is counted from now on.
+                port.heard(&[], now);
             }
             return;
         }

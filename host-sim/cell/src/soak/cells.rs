@@ -104,6 +104,8 @@ impl Scenario {
 
 #[cfg(test)]
 mod tests {
+    use proto_core::config::{AskWhen, Exchange, Talk};
+
     use super::*;
     use crate::Cell;
 
@@ -113,5 +115,14 @@ mod tests {
             Cell::new(&scenario.gateway, &scenario.controller, 1).unwrap();
         }
         assert!(Scenario::named("no-such-cell").unwrap().is_none());
+    }
+
+    #[test]
+    fn a_cell_with_exchanges_is_refused() {
+        let mut config = Scenario::all().unwrap().remove(0).gateway;
+        assert_eq!(unmodelled(&config), None);
+        let talk = Talk::Frames { request: None, reply: None, refusal: None };
+        config.exchanges.push(Exchange::new(0, talk, AskWhen::NEVER)).unwrap();
+        assert!(unmodelled(&config).unwrap().contains("exchanges"));
     }
 }
