@@ -460,7 +460,7 @@ fn a_frame_that_silence_ends_is_cut_by_a_sleep_and_asks_for_no_call_at_once() {
     let mut rig = cell.rig();
     rig.run(MS(10));
     rig.bytes(port, &[7]);
-    rig.now = rig.now + MS(700);
+    rig.now += MS(700);
     // The rig fails when the engine asks to be called at once again.
     rig.input(Input::Tick);
     rig.run(MS(1_000));

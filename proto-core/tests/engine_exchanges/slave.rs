@@ -155,7 +155,7 @@ fn what_came_while_the_line_was_not_there_is_not_answered() {
     rig.input(proto_core::engine::Input::PortDown { port });
     rig.take_written();
     rig.bytes(port, &with_crc(&[5, 16, 0, 0, 0, 2, 4, 0, 1, 0, 2]));
-    rig.now = rig.now + MS(40);
+    rig.now += MS(40);
     rig.input(proto_core::engine::Input::PortUp { port });
     rig.run(MS(10));
     assert_eq!(rig.sent_to(port), Vec::<Vec<u8>>::new());
