@@ -136,6 +136,8 @@ pub struct DeviceField {
     pub picks_commands: bool,
     /// It is the coil of Modbus function 5, which is FF for 1.
     pub is_coil: bool,
+    /// The port whose health it shows, if that is not the port that sends it.
+    pub of_port: Option<String>,
 }
 
 impl NamedFrame {

@@ -5,7 +5,7 @@
 //! byte of a field frame and the request to the controller.
 
 use std::cell::{Cell, RefCell};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::rc::Rc;
 
 use proto_core::config::{Bus, GatewayConfig, Parts, Port as PortConfig};
@@ -45,6 +45,8 @@ struct Core {
     deadline: Cell<Instant>,
     /// The engine's count of sleeps at the last call.
     sleeps: Cell<u32>,
+    /// Links that were told of as missing.
+    unreachable: RefCell<BTreeSet<LinkId>>,
     deadline_moved: Notify,
 }
 
@@ -88,6 +90,7 @@ impl Gateway {
             engine: RefCell::new(engine),
             deadline: Cell::new(Instant::NEVER),
             sleeps: Cell::new(0),
+            unreachable: RefCell::default(),
             deadline_moved: Notify::new(),
         });
         Ok(Self { core, ports, links, ready: json!({ "ports": places }) })
@@ -174,11 +177,39 @@ impl Core {
 
     fn link_event(&self, link: LinkId, event: LinkEvent<'_>) {
         match event {
-            LinkEvent::Up => self.input(Input::LinkUp { link }),
-            LinkEvent::Down => self.input(Input::LinkDown { link }),
+            LinkEvent::Up => {
+                self.tell_link(link, true);
+                self.input(Input::LinkUp { link });
+            }
+            LinkEvent::Down => {
+                self.tell_link(link, false);
+                self.input(Input::LinkDown { link });
+            }
             LinkEvent::Bytes(bytes) => self.input(Input::LinkBytes { link, bytes }),
             LinkEvent::Sent => self.input(Input::LinkSent { link }),
             LinkEvent::Acked(left) => self.input(Input::LinkAcked { link, left }),
+        }
+    }
+
+    /// Tells once when a connection to the controller is missing, and when it is back. What the
+    /// controller opens by itself may take days, and some controllers take no second connection for
+    /// urgent commands.
+    fn tell_link(&self, id: LinkId, is_up: bool) {
+        if id == LinkId::URGENT {
+            return;
+        }
+        let engine = self.engine.borrow();
+        let Some(info) = engine.links().find(|link| link.id == id) else { return };
+        if matches!(info.kind, LinkKind::RecipeTcpListen { .. } | LinkKind::RecipeUdpListen { .. }) {
+            return;
+        }
+        let mut unreachable = self.unreachable.borrow_mut();
+        if is_up && unreachable.remove(&id) {
+            warn!(link = info.name, "connected to the controller again");
+        } else if is_up {
+            info!(link = info.name, "connected to the controller");
+        } else if unreachable.insert(id) {
+            warn!(link = info.name, "no connection to the controller; trying again");
         }
     }
 

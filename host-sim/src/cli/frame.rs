@@ -93,11 +93,11 @@ fn rows(frame: &NamedFrame, laid_out: &DeviceFrame, part: Direction) -> Vec<Row>
             }
             FieldSpec::Length(length) => add(place, &field.name, show_length(&length)),
             FieldSpec::UserOutput { .. } | FieldSpec::DeviceOutput { .. } if field.is_coil => {
-                add(place, &field.name, format!("FF for 1, 00 for 0{}", show_use(&field.spec)));
+                add(place, &field.name, format!("FF for 1, 00 for 0{}", show_use(field)));
             }
             spec => {
                 let Some(encoding) = spec.element().and_then(|element| element.encoding()) else { continue };
-                let uses = if field.picks_commands { " -> commands".to_owned() } else { show_use(&spec) };
+                let uses = if field.picks_commands { " -> commands".to_owned() } else { show_use(field) };
                 add(place, &field.name, show_encoding(&encoding) + uses.as_str());
             }
         }
@@ -200,7 +200,8 @@ fn show_encoding(encoding: &Encoding) -> String {
 }
 
 /// The constant, the variable or the bit behind how the field is written.
-fn show_use(spec: &FieldSpec) -> String {
+fn show_use(field: &DeviceField) -> String {
+    let spec = &field.spec;
     if let Some(bit) = spec.bit() {
         let is_input = matches!(spec, FieldSpec::UserInput { .. } | FieldSpec::DeviceInput { .. });
         return format!(" {} {bit}", if is_input { "->" } else { "<-" });
@@ -215,7 +216,10 @@ fn show_use(spec: &FieldSpec) -> String {
             OutputBinding::CounterTo { max } => format!(" <- counter, 0..{max}"),
             OutputBinding::Reply => " <- reply".into(),
             OutputBinding::State { value, .. } => format!(" <- {value}"),
-            OutputBinding::Port { value, .. } => format!(" <- {} of the port", value.name()),
+            OutputBinding::Port { value, .. } => match &field.of_port {
+                Some(port) => format!(" <- {} of port {port}", value.name()),
+                None => format!(" <- {} of the port", value.name()),
+            },
             OutputBinding::Variable { .. } | OutputBinding::Bit { .. } => String::new(),
         },
         _ => String::new(),

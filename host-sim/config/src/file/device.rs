@@ -584,7 +584,9 @@ impl FileField {
         let repeats = matches!(self.kind, FileFieldKind::UserInput { again: true, .. });
         let picks_commands =
             matches!(self.kind, FileFieldKind::UserInput { to: FileInput::Commands { .. }, .. });
-        DeviceField { name: self.name(), spec: self.spec(), repeats, picks_commands, is_coil: false }
+        let of_port = self.port_named().map(|(_, name, _)| name.to_owned());
+        let (name, spec) = (self.name(), self.spec());
+        DeviceField { name, spec, repeats, picks_commands, is_coil: false, of_port }
     }
 
     /// What the field is, without a table of commands.

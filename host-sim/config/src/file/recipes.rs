@@ -187,9 +187,9 @@ impl FileField {
             }
             FileFieldKind::UserOutput { written, from, .. } => {
                 let from = match from {
-                    FileOutput::Bound(binding) => *binding,
-                    // Of a port: put in when all ports are known.
-                    FileOutput::Program | FileOutput::PortNamed { .. } => OutputBinding::Constant(0.0),
+                    // Which port it is, is put in when all ports are known.
+                    FileOutput::Bound(binding) | FileOutput::PortNamed { binding, .. } => *binding,
+                    FileOutput::Program => OutputBinding::Constant(0.0),
                 };
                 let Written { encoding, overflow } = *written;
                 match written.as_plain() {

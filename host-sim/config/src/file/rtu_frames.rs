@@ -54,7 +54,14 @@ impl Frame {
 
     fn push(&mut self, name: &str, spec: FieldSpec) {
         let (repeats, picks_commands, is_coil) = (false, false, false);
-        self.0.push(DeviceField { name: name.to_owned(), spec, repeats, picks_commands, is_coil });
+        self.0.push(DeviceField {
+            name: name.to_owned(),
+            spec,
+            repeats,
+            picks_commands,
+            is_coil,
+            of_port: None,
+        });
     }
 
     fn byte(&mut self, name: &str, value: u8) {
