@@ -130,34 +130,27 @@ fn read_inputs<B: RegisterBank + ?Sized>(
         function::READ_INPUT => MAX_READ_REGISTERS,
         _ => return Err(Exception::IllegalFunction),
     };
-    let is_right = pdu.len() == HEAD_LEN && count > 0 && count <= max;
-    let len = match function {
-        function::READ_DISCRETE => {
-            // Whether there is the function is asked before its count.
-            let mut nothing = [];
-            if !is_right {
-                bank.read_discrete(address, 0, &mut nothing)?;
-                return Err(Exception::IllegalDataValue);
-            }
-            check_end(address, count)?;
-            let packed = read_answer(out, head, packed_len(count))?;
-            packed.fill(0);
-            bank.read_discrete(address, count, packed)?;
-            if let Some(last) = packed.last_mut() {
-                *last &= last_mask(count);
-            }
-            packed.len()
+    // Whether there is the function is asked before its count and address.
+    match function {
+        function::READ_DISCRETE => bank.read_discrete(address, 0, &mut [])?,
+        _ => bank.read_input(address, &mut [])?,
+    }
+    if pdu.len() != HEAD_LEN || count == 0 || count > max {
+        return Err(Exception::IllegalDataValue);
+    }
+    check_end(address, count)?;
+    let len = if function == function::READ_DISCRETE {
+        let packed = read_answer(out, head, packed_len(count))?;
+        packed.fill(0);
+        bank.read_discrete(address, count, packed)?;
+        if let Some(last) = packed.last_mut() {
+            *last &= last_mask(count);
         }
-        _ => {
-            if !is_right {
-                bank.read_input(address, &mut [])?;
-                return Err(Exception::IllegalDataValue);
-            }
-            check_end(address, count)?;
-            let bytes = read_answer(out, head, usize::from(count).saturating_mul(2))?;
-            bank.read_input(address, bytes.as_chunks_mut().0)?;
-            bytes.len()
-        }
+        packed.len()
+    } else {
+        let bytes = read_answer(out, head, usize::from(count).saturating_mul(2))?;
+        bank.read_input(address, bytes.as_chunks_mut().0)?;
+        bytes.len()
     };
     Ok(len.saturating_add(READ_HEAD_LEN))
 }
